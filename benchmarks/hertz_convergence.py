@@ -1,0 +1,95 @@
+"""Convergence of the contact pressure in Hertz' problems, in 2D and 3D.
+
+    ./run mpirun -n 2 python3 benchmarks/hertz_convergence.py
+
+Errors inside 0.9 a are taken against the closed form, which belongs to a half space, and against
+a finer solution of the same body. Results go to results/hertz_convergence.md and .json.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import petsc4py
+
+if __name__ == "__main__":
+    petsc4py.init(sys.argv[:1])
+
+import numpy as np
+from mpi4py import MPI
+from scipy.interpolate import LinearNDInterpolator
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.tables import markdown, slope, write_tables
+from demos import hertz_2d, hertz_3d
+
+OPTIONS = ["-tfeti_rtol", "1e-8"]
+
+
+def contact_of(solution):
+    """Horizontal coordinates (n, 1 or 2), pressures and areas of contact 0 of all ranks."""
+    data, comm = solution.contact(0), MPI.COMM_WORLD
+    across = solution.dofs.bs - 1
+    parts = comm.allgather((data.points[:, :across], data.pressure, data.area))
+    return [np.concatenate(part) for part in zip(*parts, strict=True)]
+
+
+def difference(coarse, fine, radius):
+    """Relative L² difference of two pressures where |x| < radius."""
+    points, pressure, area = coarse
+    inside = np.linalg.norm(points, axis=1) < radius
+    if points.shape[1] == 1:
+        order = np.argsort(fine[0][:, 0])
+        exact = np.interp(points[:, 0], fine[0][order, 0], fine[1][order])
+    else:
+        exact = LinearNDInterpolator(fine[0], fine[1])(points)
+    error = np.sum((area * (pressure - exact) ** 2)[inside])
+    return float(np.sqrt(error / np.sum((area * exact**2)[inside])))
+
+
+def study(demo, argument, values, sizes, half_width):
+    """One row per mesh, the finest being the reference of the others, and the slopes."""
+    rows, contacts = [], []
+    for value, size in zip(values, sizes, strict=True):
+        solution, report = demo.run([argument, str(value), *OPTIONS])
+        contacts.append(contact_of(solution))
+        rows.append({"h/a": size, "unknowns": report.primal_dofs, **report.errors})
+    for row, contact in zip(rows[:-1], contacts[:-1], strict=True):
+        row["pressure_l2_finer"] = difference(contact, contacts[-1], 0.9 * half_width)
+    rows = rows[:-1]
+    used = [row["h/a"] for row in rows]
+    slopes = {
+        name: slope(used, [row[name] for row in rows])
+        for name in ("pressure_l2", "pressure_l2_finer")
+    }
+    return rows, slopes
+
+
+def study_2d(elements=(8, 16, 32, 128)):
+    """Hertz in 2D: elements along the half width, the last for reference."""
+    return study(hertz_2d, "--elements", elements, [1 / n for n in elements], 0.04)
+
+
+def study_3d(unknowns=(8_000, 30_000, 120_000, 480_000)):
+    """Hertz in 3D: sizes, the last for reference."""
+    sizes = [0.2 * (4500 / n) ** (1 / 3) for n in unknowns]
+    return study(hertz_3d, "--unknowns", unknowns, sizes, 0.05)
+
+
+def main(argv):
+    tables = {}
+    for name, run in (("2D", study_2d), ("3D", study_3d)):
+        rows, slopes = run()
+        tables[f"Hertz {name}"] = rows
+        tables[f"Hertz {name}, slopes"] = [slopes]
+    if MPI.COMM_WORLD.rank == 0:
+        write_tables(Path("results"), "hertz_convergence", tables)
+        for title, rows in tables.items():
+            print(f"{title}\n\n{markdown(rows)}\n")
+    return tables
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

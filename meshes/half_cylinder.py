@@ -1,0 +1,63 @@
+"""Lower half of a disc, graded towards its lowest point: half cylinders in plane strain.
+
+python3 meshes/half_cylinder.py half_cylinder.msh --partitions 8
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import gmsh
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from meshes.tools import graded_size, partition, script, started_model
+
+
+def build(
+    radius: float = 1.0,
+    fine: float = 0.002,
+    fine_radius: float = 0.06,
+    growth: float = 0.15,
+    partitions: int = 0,
+) -> Any:
+    """Mesh the half disc x² + (y − R)² ≤ R², y ≤ R on this rank and return gmsh's model.
+
+    Physical groups: the surface "body"; the curves "contact" (the arc), "top", "axis" (x = 0,
+    inside the body).
+
+    Args:
+        radius: R.
+        fine: Element size within ``fine_radius`` of the lowest point.
+        fine_radius: Size of the fine zone.
+        growth: Growth of the element size with the distance from that zone.
+        partitions: Number of gmsh's partitions, 0 for none.
+    """
+    model = started_model("half_cylinder")
+    geo = model.geo
+    lowest = geo.addPoint(0.0, 0.0, 0.0)
+    centre = geo.addPoint(0.0, radius, 0.0)
+    right = geo.addPoint(radius, radius, 0.0)
+    left = geo.addPoint(-radius, radius, 0.0)
+    axis = geo.addLine(lowest, centre)
+    arcs = [geo.addCircleArc(lowest, centre, right), geo.addCircleArc(left, centre, lowest)]
+    top = [geo.addLine(right, centre), geo.addLine(centre, left)]
+    halves = [
+        geo.addPlaneSurface([geo.addCurveLoop([arcs[0], top[0], -axis])]),
+        geo.addPlaneSurface([geo.addCurveLoop([axis, top[1], arcs[1]])]),
+    ]
+    geo.synchronize()
+    model.addPhysicalGroup(2, halves, name="body")
+    model.addPhysicalGroup(1, arcs, name="contact")
+    model.addPhysicalGroup(1, top, name="top")
+    model.addPhysicalGroup(1, [axis], name="axis")
+    graded_size((0.0, 0.0, 0.0), fine, fine_radius, growth)
+    gmsh.model.mesh.generate(2)
+    partition(partitions)
+    return model
+
+
+if __name__ == "__main__":
+    script(__doc__, build)

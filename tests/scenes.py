@@ -1,0 +1,153 @@
+"""Small scenes that many tests use."""
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from dolfinx import mesh as dmesh
+from mpi4py import MPI
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.contact.surfaces import group_points
+
+SIDES_2D = {"left": (0, 0.0), "right": (0, 1.0), "bottom": (1, 0.0), "top": (1, 1.0)}
+SIDES_3D = {**SIDES_2D, "bottom": (2, 0.0), "top": (2, 1.0), "front": (1, 0.0), "back": (1, 1.0)}
+SIDES = {2: SIDES_2D, 3: SIDES_3D}
+
+
+def box(cell="hexahedron", n=3, comm=MPI.COMM_WORLD, degree_of_grading=1.0):
+    """Unit square or cube, with its sides tagged 1, 2, ... in the order of SIDES."""
+    cell_type = dmesh.to_type(cell)
+    gdim = 2 if cell in ("triangle", "quadrilateral") else 3
+    if gdim == 2:
+        mesh = dmesh.create_rectangle(comm, [(0, 0), (1, 1)], [n, n], cell_type)
+    else:
+        mesh = dmesh.create_box(comm, [(0, 0, 0), (1, 1, 1)], [n] * 3, cell_type)
+    names = {name: tag for tag, name in enumerate(SIDES[gdim], start=1)}
+    facets, values = [], []
+    for name, (axis, at) in SIDES[gdim].items():
+        found = dmesh.locate_entities_boundary(
+            mesh, gdim - 1, lambda x, axis=axis, at=at: np.isclose(x[axis], at)
+        )
+        facets.append(found)
+        values.append(np.full(len(found), names[name], dtype=np.int32))
+    facets, values = np.concatenate(facets), np.concatenate(values)
+    order = np.argsort(facets)
+    mesh.geometry.x[:] **= degree_of_grading
+    return mesh, dmesh.meshtags(mesh, gdim - 1, facets[order], values[order]), names
+
+
+def decomposed(cell="hexahedron", n=3, subdomains=4, comm=MPI.COMM_WORLD, grading=1.0):
+    mesh, facet_tags, names = box(cell, n, comm, grading)
+    return tfeti.decompose(mesh, subdomains, facet_tags=facet_tags, surfaces=names)
+
+
+def strain(u):
+    g = ufl.sym(ufl.grad(u))
+    if g.ufl_shape == (3, 3):
+        return g
+    return ufl.as_tensor([[g[0, 0], g[0, 1], 0], [g[1, 0], g[1, 1], 0], [0, 0, 0]])
+
+
+def hooke(E=1.0, nu=0.3):
+    """u ↦ its stress, 3×3, in plane strain in 2D."""
+    mu, lmbda = E / 2 / (1 + nu), E * nu / (1 + nu) / (1 - 2 * nu)
+
+    def stress(u):
+        return 2 * mu * strain(u) + lmbda * ufl.tr(strain(u)) * ufl.Identity(3)
+
+    return stress
+
+
+def forms(mesh, facet_tags, traction, top, degree=1, stress=None):
+    """V, a, L of elasticity with a traction on the surface of a tag."""
+    gdim = mesh.geometry.dim
+    stress = stress or hooke()
+    V = fem.functionspace(mesh, ("Lagrange", degree, (gdim,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 2 * degree})
+    ds = ufl.Measure(
+        "ds",
+        domain=mesh,
+        subdomain_data=facet_tags,
+        metadata={"quadrature_degree": 2 * degree},
+    )
+    a = ufl.inner(stress(u), strain(v)) * dx
+    return V, a, ufl.dot(fem.Constant(mesh, np.array(traction, dtype=float)), v) * ds(top)
+
+
+def clamp(V, facets, value=0.0):
+    gdim = V.mesh.geometry.dim
+    dofs = fem.locate_dofs_topological(V, gdim - 1, facets)
+    return fem.dirichletbc(np.full(gdim, value), dofs, V)
+
+
+def problem(
+    decomposition,
+    traction=None,
+    contacts=(),
+    clamped=("left",),
+    degree=1,
+    loaded="top",
+    **options,
+):
+    """A box, some sides clamped, a traction on another."""
+    gdim = decomposition.mesh.geometry.dim
+    traction = traction or (0.0,) * (gdim - 1) + (-0.05,)
+    V, a, L = forms(
+        decomposition.mesh,
+        decomposition.facet_tags,
+        traction,
+        decomposition.surface(loaded),
+        degree,
+    )
+    bcs = [clamp(V, decomposition.facets(name)) for name in clamped]
+    return tfeti.ContactProblem(
+        a,
+        L,
+        bcs,
+        list(contacts),
+        decomposition,
+        stress=hooke(),
+        petsc_options=options,
+    )
+
+
+def curved_obstacle(gdim, gap=0.02):
+    """The obstacle below the cube of the design's section 6, or its plane section."""
+    across = 0.5 if gdim == 3 else 0.0
+
+    def distance(x):
+        return x[gdim - 1] + gap + 0.1 * ((x[0] - 0.8) ** 2 + across * (x[1] - 0.5) ** 2)
+
+    def gradient(x):
+        direction = np.zeros((3, x.shape[1]))
+        direction[gdim - 1] = 1.0
+        return direction
+
+    return tfeti.SignedDistance(distance, gradient)
+
+
+def gathered(dofs, node_values):
+    """Points and values of all groups of all ranks, sorted by point, on every rank.
+
+    Args:
+        dofs: Dof maps.
+        node_values: One row per local primal node.
+    """
+    total = dofs.reduce(node_values, np.add, 0.0)
+    mean = total / dofs.multiplicity.reshape(-1, *[1] * (total.ndim - 1))
+    points = np.concatenate(dofs.comm.allgather(group_points(dofs)))
+    values = np.concatenate(dofs.comm.allgather(mean))
+    order = np.lexsort(np.rint(points.T * 1e7))
+    return points[order], values[order]
+
+
+def displacement(problem):
+    """Points and displacements of all nodes, sorted by point, on every rank."""
+    dofs = problem.dofs
+    u = dofs.to_primal(problem.u.x.array).reshape(-1, dofs.bs)
+    return gathered(dofs, u)
+
+
+def relative(a, b):
+    return np.linalg.norm(a - b) / np.linalg.norm(b)

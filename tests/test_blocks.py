@@ -1,0 +1,179 @@
+"""Blocks: generalised inverses, kernels, Schur complements."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from scenes import decomposed, hooke, strain
+from scipy.sparse import csr_array, diags_array
+
+from tfeti_dolfinx.compat import assemble_csr
+from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.subdomains.block import check_block
+from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
+from tfeti_dolfinx.subdomains.kernel import candidate_modes, fixing_nodes, kernel_of
+from tfeti_dolfinx.subdomains.sparse_block import Counters, SparseBlock
+
+RIGID = {"triangle": 3, "quadrilateral": 3, "tetrahedron": 6, "hexahedron": 6}
+
+
+def stiffness(cell, n=2, degree=1, mass=0.0, scalar=False):
+    """K and points of a box on one rank."""
+    d = decomposed(cell, n, 1, comm=MPI.COMM_SELF)
+    gdim = d.mesh.geometry.dim
+    V = fem.functionspace(d.mesh, ("Lagrange", degree, () if scalar else (gdim,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    if scalar:
+        a = ufl.inner(ufl.grad(u), ufl.grad(v)) * ufl.dx
+    else:
+        a = ufl.inner(hooke()(u), strain(v)) * ufl.dx
+    if mass:
+        a += mass * ufl.inner(u, v) * ufl.dx
+    return csr_array(assemble_csr(fem.form(a))), V.tabulate_dof_coordinates()[:, :gdim]
+
+
+def block(K, x, every=3, **changes):
+    trace = np.arange(0, K.shape[0], every)
+    f = np.random.default_rng(1).standard_normal(K.shape[0])
+    arguments = dict(
+        name="subdomain 5",
+        K=K,
+        f=f,
+        x=x,
+        trace_dofs=trace,
+        body_frame=(x.mean(axis=0), 1.0),
+        counters=Counters(),
+    )
+    return SparseBlock(**{**arguments, **changes})
+
+
+@pytest.mark.parametrize("cell", list(RIGID))
+@pytest.mark.parametrize("degree", [1, 2])
+def test_blocks_fulfil_their_contract(cell, degree):
+    K, x = stiffness(cell, 2, degree)
+    b = block(K, x)
+    check_block(b, K)
+    assert b.kernel.shape[1] == RIGID[cell]
+    b.destroy()
+
+
+def test_blocks_of_a_scalar_problem_have_the_constants():
+    K, x = stiffness("hexahedron", 3, scalar=True)
+    b = block(K, x)
+    check_block(b, K)
+    assert b.kernel.shape[1] == 1
+
+
+def test_a_mass_term_leaves_no_kernel():
+    K, x = stiffness("hexahedron", 2, mass=1e-6)
+    b = block(K, x)
+    check_block(b, K)
+    assert b.kernel.shape[1] == 0
+
+
+def test_a_spring_leaves_a_smaller_kernel():
+    K, x = stiffness("hexahedron", 2)
+    spring = np.zeros(K.shape[0])
+    spring[2::3] = 1e-3  # resists z: the translation and two rotations
+    K = csr_array(K + diags_array(spring))
+    b = block(K, x)
+    check_block(b, K)
+    assert b.kernel.shape[1] == 3
+
+
+def test_kernel_where_the_stiffness_varies_by_nine_orders():
+    K, x = stiffness("tetrahedron", 2)
+    n = K.shape[0]
+    K = csr_array(1e9 * K)
+    modes = candidate_modes(x, 3, x.mean(axis=0), 1.0)
+    assert kernel_of(K, modes).shape == (n, 6)
+
+
+def test_generalised_inverse_of_the_whole_matrix():
+    K, x = stiffness("hexahedron", 2)
+    b = block(K, x, every=1)
+    pinv = np.stack([b.apply_pinv(e) for e in np.eye(K.shape[0])], axis=1)
+    dense = K.toarray()
+    assert np.allclose(dense @ pinv @ dense, dense, atol=1e-12)
+    assert np.allclose(pinv, pinv.T, atol=1e-12 * np.abs(pinv).max())
+
+
+def test_a_new_load_leaves_the_factor_alone():
+    K, x = stiffness("hexahedron", 2)
+    counters = Counters()
+    b = block(K, x, counters=counters)
+    b.apply_pinv(np.ones(len(b.trace_dofs)))
+    first = b.condensed_load.copy()
+    b.update(f=2 * np.random.default_rng(1).standard_normal(K.shape[0]))
+    assert np.allclose(b.condensed_load, 2 * first)
+    assert counters.factorizations == 1
+    b.update(K=csr_array(2 * K))
+    assert np.allclose(b.condensed_load, first)
+    assert counters.factorizations == 2
+
+
+def test_a_new_trace_leaves_the_factor_alone():
+    K, x = stiffness("hexahedron", 2)
+    counters = Counters()
+    b = block(K, x, counters=counters)
+    b.apply_schur(np.ones(len(b.trace_dofs)))
+    b.apply_pinv(np.ones(len(b.trace_dofs)))
+    b.retrace(np.arange(0, K.shape[0], 2))
+    check_block(b, K)
+    assert counters.factorizations == 3
+
+
+def test_K_ii_is_factored_only_when_somebody_asks():
+    K, x = stiffness("hexahedron", 2)
+    counters = Counters()
+    b = block(K, x, counters=counters)
+    b.apply_stiffness(b.apply_pinv(np.ones(len(b.trace_dofs))))
+    assert counters.factorizations == 1
+    b.apply_schur(np.ones(len(b.trace_dofs)))
+    assert counters.factorizations == 2
+
+
+def test_fixing_nodes_are_spread():
+    _, x = stiffness("hexahedron", 4)
+    nodes = fixing_nodes(x, 8)
+    assert len(nodes) == 8
+    distances = np.linalg.norm(x[nodes][:, None] - x[nodes], axis=2)
+    assert distances[~np.eye(8, dtype=bool)].min() >= 0.5
+    assert len(fixing_nodes(x[:3], 8)) == 3
+
+
+def test_a_trace_that_does_not_hold_the_inside_has_a_schur_complement_too():
+    K, x = stiffness("hexahedron", 2)
+    normal_only = np.arange(2, K.shape[0], 3)[:4]
+    check_block(block(K, x, trace_dofs=normal_only), K)
+
+
+def test_a_form_that_is_not_symmetric_is_named():
+    K, x = stiffness("hexahedron", 2)
+    K = K.tolil()
+    K[0, 1] += 1.0
+    with pytest.raises(InputError, match="subdomain 5: the stiffness is not symmetric"):
+        block(csr_array(K), x)
+
+
+def test_stiffness_and_load_that_are_not_finite_are_named():
+    K, x = stiffness("hexahedron", 2)
+    with pytest.raises(InputError, match="subdomain 5: the load has 1 entries not finite"):
+        block(K, x, f=np.append(np.zeros(K.shape[0] - 1), np.nan))
+    with pytest.raises(InputError, match="subdomain 5: the stiffness has entries that are not"):
+        block(csr_array((np.full_like(K.data, np.inf), K.indices, K.indptr), shape=K.shape), x)
+
+
+def test_a_negative_stiffness_is_named():
+    K, x = stiffness("hexahedron", 2)
+    with pytest.raises(InputError, match="subdomain 5: .* diagonal entry -"):
+        block(csr_array(-K), x)
+
+
+def test_cholesky_says_when_there_is_no_factor():
+    A = csr_array(np.array([[1.0, 0.0], [0.0, 0.0]]))
+    with pytest.raises(NotPositiveDefiniteError):
+        CholeskyFactor(A)
+    factor = CholeskyFactor(csr_array(np.diag([2.0, 4.0])))
+    assert np.allclose(factor.solve(np.ones(2)), [0.5, 0.25])

@@ -1,0 +1,159 @@
+"""Tearing: subdomains, bodies, tags, tears; the same on any number of ranks."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx import mesh as dmesh
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mpi4py import MPI
+from scenes import SIDES, box, decomposed
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.mesh.partition import bisect_points, deal
+
+CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
+
+
+def integral(decomposition, measure):
+    one = fem.Constant(decomposition.mesh, 1.0)
+    return decomposition.comm.allreduce(fem.assemble_scalar(fem.form(one * measure)))
+
+
+def cells_of(decomposition):
+    """Original cells and their subdomains, sorted, of all ranks."""
+    comm = decomposition.comm
+    ids = np.concatenate(comm.allgather(decomposition.original_cells))
+    subdomains = np.concatenate(comm.allgather(decomposition.cell_subdomain))
+    order = np.argsort(ids)
+    return ids[order], subdomains[order]
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_tags_survive_the_tearing(cell):
+    d = decomposed(cell, n=4, subdomains=5)
+    gdim = d.mesh.geometry.dim
+    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+    assert integral(d, ufl.dx(domain=d.mesh)) == pytest.approx(1.0)
+    for name in SIDES[gdim]:
+        assert integral(d, ds(d.surface(name))) == pytest.approx(1.0)
+    assert d.num_subdomains == 5
+    assert d.num_bodies == 1
+    assert d.is_torn
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_no_vertex_belongs_to_two_subdomains(cell):
+    d = decomposed(cell, n=4, subdomains=6)
+    mesh = d.mesh
+    tdim = mesh.topology.dim
+    mesh.topology.create_connectivity(0, tdim)
+    vertex_cells = mesh.topology.connectivity(0, tdim)
+    for v in range(mesh.topology.index_map(0).size_local):
+        assert len(np.unique(d.cell_subdomain[vertex_cells.links(v)])) == 1
+    assert mesh.topology.index_map(tdim).num_ghosts == 0
+
+
+def test_the_boundary_is_the_exterior_without_the_tears():
+    d = decomposed("hexahedron", n=4, subdomains=lambda x: (x[0] > 0.5) + 2 * (x[1] > 0.5))
+    comm = d.comm
+    assert comm.allreduce(len(d.boundary)) == 6 * 16
+    assert comm.allreduce(len(d.tears)) == 2 * 2 * 16
+    exterior = dmesh.exterior_facet_indices(d.mesh.topology)
+    assert np.array_equal(np.union1d(d.tears, d.boundary), np.sort(exterior))
+
+
+def test_subdomains_do_not_depend_on_the_ranks():
+    d = decomposed("tetrahedron", n=4, subdomains=7)
+    alone = decomposed("tetrahedron", n=4, subdomains=7, comm=MPI.COMM_SELF)
+    ids, subdomains = cells_of(d)
+    ids_alone, subdomains_alone = cells_of(alone)
+    assert np.array_equal(ids, ids_alone)
+    assert np.array_equal(subdomains, subdomains_alone)
+
+
+def test_a_subdomain_is_on_one_rank_and_ranks_have_about_equal_shares():
+    d = decomposed("hexahedron", n=6, subdomains=24)
+    lists = d.comm.allgather(d.subdomains.tolist())
+    assert sorted(s for part in lists for s in part) == list(range(24))
+    cells = d.comm.allgather(len(d.cell_subdomain))
+    assert max(cells) <= 1.3 * min(cells)
+
+
+def test_subdomains_given_as_an_array():
+    mesh, tags, names = box("quadrilateral", 4)
+    owned = mesh.topology.index_map(2).size_local
+    x = dmesh.compute_midpoints(mesh, 2, np.arange(owned, dtype=np.int32))
+    d = tfeti.decompose(mesh, 10 * (x[:, 0] > 0.5) + 3, facet_tags=tags, surfaces=names)
+    assert d.num_subdomains == 2
+    assert not d.split
+
+
+def test_disconnected_subdomains_are_split_and_reported(caplog):
+    d = decomposed("quadrilateral", n=4, subdomains=lambda x: np.abs(x[0] - 0.5) > 0.25)
+    assert d.split == {1: [1, 2]}
+    assert d.num_subdomains == 3
+    ids, subdomains = cells_of(d)
+    assert len(np.unique(subdomains)) == 3
+    if d.comm.rank == 0:
+        assert "split" in caplog.text
+
+
+def test_a_subdomain_connected_through_a_vertex_only_is_split():
+    def checkers(x):
+        return (x[0] > 0.5) ^ (x[1] > 0.5)
+
+    d = decomposed("quadrilateral", n=2, subdomains=checkers)
+    assert d.num_subdomains == 4
+
+
+def test_bisection_leaves_no_fragments():
+    d = decomposed("tetrahedron", n=6, subdomains=11)
+    assert d.num_subdomains == 11
+    assert not d.split
+
+
+def test_bodies_are_the_components_of_the_untorn_mesh():
+    comm = MPI.COMM_WORLD
+    left = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], dtype=float)
+    x = np.concatenate((left, left + [1, 0]))  # coincident nodes, not shared
+    cells = np.array([[0, 1, 2, 3], [4, 5, 6, 7]])
+    if comm.rank:
+        x, cells = x[:0], cells[:0]
+    element = decomposed("quadrilateral", 1, 1).mesh.ufl_domain().ufl_coordinate_element()
+    mesh = dmesh.create_mesh(comm, cells=cells.astype(np.int64), x=x, e=element)
+    d = tfeti.decompose(mesh, lambda x: x[0] > 1)
+    assert d.num_bodies == 2
+    assert comm.allreduce(len(d.tears)) == 0
+    assert not d.is_torn
+
+
+def test_more_ranks_than_subdomains():
+    d = decomposed("quadrilateral", n=3, subdomains=1)
+    assert d.num_subdomains == 1
+    assert d.comm.allreduce(len(d.cell_subdomain)) == 9
+
+
+@settings(max_examples=25)
+@given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 10**6))
+def test_dealing_is_balanced_and_leaves_no_rank_idle(num_subdomains, num_ranks, seed):
+    rng = np.random.default_rng(seed)
+    weights = rng.integers(50, 100, num_subdomains).astype(float)
+    ranks = deal(weights, rng.random((num_subdomains, 3)), num_ranks)
+    assert len(np.unique(ranks)) == min(num_subdomains, num_ranks)
+    loads = np.bincount(ranks, weights, minlength=num_ranks)
+    assert loads.max() <= weights.sum() / num_ranks + 2 * weights.max()
+
+
+@settings(max_examples=25)
+@given(st.integers(1, 20), st.integers(2, 3), st.integers(0, 10**6))
+def test_bisection_of_points_is_balanced(parts, gdim, seed):
+    x = np.random.default_rng(seed).random((200, gdim))
+    own = x[MPI.COMM_WORLD.rank :: MPI.COMM_WORLD.size]
+    part = bisect_points(own, parts, MPI.COMM_WORLD)
+    counts = MPI.COMM_WORLD.allreduce(np.bincount(part, minlength=parts))
+    assert counts.min() >= 200 // parts - 5
+    assert counts.max() <= 200 // parts + 6
+    alone = bisect_points(x, parts, MPI.COMM_SELF)
+    assert np.array_equal(part, alone[MPI.COMM_WORLD.rank :: MPI.COMM_WORLD.size])

@@ -1,0 +1,67 @@
+"""Every demo runs at its quick size, serially and on ranks, with all of its outputs."""
+
+import importlib
+import json
+
+import pytest
+
+import tfeti_dolfinx as tfeti
+
+DEMOS = ["hertz_2d", "hertz_3d", "cube_3d", "linear_3d", "semicoercive_2d"]
+
+
+@pytest.mark.parametrize("name", DEMOS)
+def test_quick_size(name, comm, shared_tmp, capsys):
+    demo = importlib.import_module(f"demos.{name}")
+    report_file, folder = shared_tmp / "report.json", shared_tmp / "out"
+    arguments = ["--quick", "--report", str(report_file), "--output", str(folder), "--plot"]
+    solution = demo.main([*arguments, "-tfeti_converged_reason"])
+    comm.barrier()
+    assert isinstance(solution, tfeti.Solution)
+    report = json.loads(report_file.read_text())
+    assert report["converged_reason"].startswith("CONVERGED")
+    assert report["seconds"]["total"] > 0.0
+    assert any(folder.glob(f"{name}*.bp")) or any(folder.glob(f"{name}*.xdmf"))
+    assert any(folder.glob(f"{name}*.png"))
+    out = capsys.readouterr().out
+    assert ("TFETI solve CONVERGED" in out) == (comm.rank == 0)
+
+
+@pytest.mark.parametrize("name", DEMOS)
+def test_options_of_the_dual_solver_work_on_every_command_line(name):
+    demo = importlib.import_module(f"demos.{name}")
+    options = ["-tfeti_qp_type", "smalse", "-tfeti_pc_type", "none", "-tfeti_rtol", "1e-6"]
+    _, report = demo.run(["--quick", *options])
+    assert report.power_method_multiplications == 15
+    assert report.preconditioner_multiplications == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DEMOS)
+def test_default_size(name):
+    _, report = importlib.import_module(f"demos.{name}").run([])
+    assert report.converged_reason.startswith("CONVERGED")
+
+
+def test_unknown_arguments_are_refused():
+    demo = importlib.import_module("demos.cube_3d")
+    with pytest.raises(SystemExit):
+        demo.main(["--quick", "stray"])
+    with pytest.raises(tfeti.InputError, match="unknown option -tfeti_rtoll"):
+        demo.main(["--quick", "-tfeti_rtoll", "1e-3"])
+
+
+@pytest.mark.parametrize(("subdomains", "most"), [(8, 100), (64, 130)])
+def test_multiplications_of_the_cube(subdomains, most):
+    """The talk's frictionless 3D table: few multiplications, hardly more for more subdomains."""
+    _, report = importlib.import_module("demos.cube_3d").run(["--subdomains", str(subdomains)])
+    assert report.F_multiplications <= most
+    assert report.primal_dofs == 3993 * subdomains
+    assert report.kernel_dim == 6 * subdomains
+    assert report.factorizations == subdomains
+
+
+def test_a_free_motion_of_the_block_is_found():
+    _, report = importlib.import_module("demos.semicoercive_2d").run(["--quick", "--no-wall"])
+    assert report.free_modes == 1
+    assert abs(report.errors["force_floor"]) <= 1e-5

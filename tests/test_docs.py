@@ -1,0 +1,121 @@
+"""Documents: every program and every command in them runs, and nothing they name is missing."""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def blocks(path, language):
+    return re.findall(rf"^```{language}\n(.*?)^```", path.read_text(), re.DOTALL | re.MULTILINE)
+
+
+def commands():
+    """Commands of the README, without ./run: the tests are inside already."""
+    for block in blocks(ROOT / "README.md", "sh"):
+        for line in block.splitlines():
+            if line.startswith("./run ") and "pytest" not in line:
+                yield line.removeprefix("./run ")
+
+
+@pytest.mark.parametrize("command", list(commands()))
+def test_commands_of_the_readme(serial_only, command, tmp_path):
+    """In a copy of the tree, so that nothing is written into it."""
+    for name in ("demos", "meshes", "benchmarks", "tfeti_dolfinx"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    (tmp_path / "results").mkdir()
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    result = subprocess.run(
+        shlex.split(command),
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=500,
+        env=environment,
+    )
+    assert result.returncode == 0, result.stderr
+    assert list((tmp_path / "results").iterdir()) or "results" not in command
+
+
+def test_the_main_job_leaves_pictures(serial_only, tmp_path):
+    command = [sys.executable, ROOT / "demos/hertz_2d.py", "--plot", "--quick"]
+    subprocess.run(command, cwd=tmp_path, capture_output=True, timeout=300, check=True)
+    names = {p.name for p in (tmp_path / "results").iterdir()}
+    assert names == {"hertz_2d.png", "hertz_2d_contact.png", "hertz_2d_pressure.png"}
+
+
+@pytest.mark.parametrize("document", ["README.md", "docs/tutorial.md"])
+@pytest.mark.parametrize("ranks", [1, 2])
+def test_programs_of_documents(serial_only, document, ranks, tmp_path):
+    program = tmp_path / "program.py"
+    program.write_text("\n".join(blocks(ROOT / document, "python")))
+    (tmp_path / "meshes").mkdir()
+    mesh = [sys.executable, ROOT / "meshes/half_cylinder.py", tmp_path / "meshes/half_cylinder.msh"]
+    subprocess.run(mesh, capture_output=True, timeout=100, check=True)
+    command = ["mpirun", "-n", str(ranks), sys.executable, str(program)]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert result.returncode == 0, result.stderr
+    assert "primal_dofs" in result.stdout
+    assert "CONVERGED_RTOL" in result.stdout
+
+
+def test_links_lead_somewhere():
+    for path in [*DOCUMENTS, ROOT / "CONTRIBUTING.md", ROOT / "environment/README.md"]:
+        for target in re.findall(r"\]\(([^)#]+)\)", path.read_text()):
+            if not target.startswith("http"):
+                assert (path.parent / target).exists(), f"{path.name}: {target}"
+
+
+def test_notation_names_what_is_in_the_code():
+    code = "\n".join(p.read_text() for p in (ROOT / "tfeti_dolfinx").rglob("*.py"))
+    code += "\n".join(p.read_text() for p in (ROOT / "demos").glob("*.py"))
+    rows = (ROOT / "docs/notation.md").read_text().splitlines()
+    names = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
+    assert len(names) > 30
+    missing = [name for name in names if not re.search(rf"\b{name}\b", code)]
+    assert not missing
+
+
+def test_ci_runs_the_readme_s_test_command():
+    ci = (ROOT / ".ci/run").read_text()
+    (test_command,) = [
+        line
+        for block in blocks(ROOT / "README.md", "sh")
+        for line in block.splitlines()
+        if "pytest" in line
+    ]
+    assert f"\n{test_command} </dev/null" in ci
+    assert f"\n{test_command.replace('./run', './run mpirun -n 2')} </dev/null" in ci
+
+
+def test_the_package_installs(serial_only, tmp_path):
+    source = tmp_path / "source"
+    source.mkdir()
+    shutil.copytree(ROOT / "tfeti_dolfinx", source / "tfeti_dolfinx")
+    for name in ("pyproject.toml", "README.md"):
+        shutil.copy(ROOT / name, source)
+    site = tmp_path / "site"
+    command = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-build-isolation"]
+    command += ["--quiet", "--target", str(site), str(source)]
+    subprocess.run(command, check=True, timeout=300, cwd=tmp_path)
+    code = "import tfeti_dolfinx; print(tfeti_dolfinx.__file__, tfeti_dolfinx.__version__)"
+    result = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        env={**os.environ, "PYTHONPATH": str(site)},
+        check=True,
+    )
+    assert str(site) in result.stdout
+    installed = {p.relative_to(site) for p in site.rglob("tfeti_dolfinx/**/*.py")}
+    assert installed == {p.relative_to(ROOT) for p in ROOT.rglob("tfeti_dolfinx/**/*.py")}

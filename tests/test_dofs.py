@@ -1,0 +1,110 @@
+"""Dof maps: torn copies meet in groups, whatever the degree, the cell and the ranks."""
+
+import numpy as np
+import pytest
+from dolfinx import fem
+from mpi4py import MPI
+from scenes import box, decomposed
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.mesh.dofs import TornDofs
+
+CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
+
+
+def torn(cell="hexahedron", degree=1, n=3, subdomains=5, shape=None):
+    d = decomposed(cell, n, subdomains)
+    shape = (d.mesh.geometry.dim,) if shape is None else shape
+    return d, TornDofs(fem.functionspace(d.mesh, ("Lagrange", degree, shape)), d)
+
+
+@pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_groups_are_the_nodes_of_the_untorn_mesh(cell, degree):
+    d, dofs = torn(cell, degree)
+    mesh, _, _ = box(cell, 3)
+    V = fem.functionspace(mesh, ("Lagrange", degree, (mesh.geometry.dim,)))
+    comm = d.comm
+    assert comm.allreduce(dofs.num_groups) == V.dofmap.index_map.size_global
+    assert comm.allreduce(len(dofs.copies)) == dofs.offsets[-1]
+    x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node]
+    low, high = dofs.reduce(x, np.minimum, np.inf), dofs.reduce(x, np.maximum, -np.inf)
+    assert np.allclose(low, high, atol=1e-12)
+
+
+def test_copies_are_in_different_subdomains_the_lowest_first():
+    _, dofs = torn()
+    for g in np.flatnonzero(dofs.multiplicity > 1):
+        own = slice(dofs.copy_offsets[g], dofs.copy_offsets[g + 1])
+        assert np.all(np.diff(dofs.copy_subdomains[own]) > 0)
+    assert dofs.comm.allreduce(int(dofs.multiplicity.max(initial=0)), op=MPI.MAX) >= 4
+
+
+def test_numberings_are_inverse_to_each_other():
+    d, dofs = torn("tetrahedron", 2)
+    values = np.random.default_rng(0).random(dofs.num_nodes * dofs.bs)
+    assert np.array_equal(dofs.to_dolfinx(dofs.to_primal(values)), values)
+    assert np.array_equal(values[dofs.dolfinx_dofs()], dofs.to_primal(values))
+    nodes = np.arange(dofs.num_nodes)
+    assert np.array_equal(dofs.primal_nodes(dofs.dolfinx_node), nodes)
+    assert np.all(np.diff(dofs.node_subdomain) >= 0)
+    assert np.array_equal(np.unique(dofs.node_subdomain), d.subdomains)
+
+
+def test_reduce_spread_and_lookup():
+    _, dofs = torn()
+    start = dofs.group_offsets[dofs.comm.rank]
+    own = start + np.arange(dofs.num_groups)
+    assert np.array_equal(dofs.spread(own), dofs.group)
+    counts = dofs.reduce(np.ones(dofs.num_nodes), np.add, 0.0)
+    assert np.array_equal(counts, dofs.multiplicity)
+    asked = (own * 7 + 3) % dofs.group_offsets[-1]
+    (found,) = dofs.lookup(asked, own)
+    assert np.array_equal(found, asked)
+
+
+def test_lookup_of_copies_finds_all_of_them_with_their_values():
+    _, dofs = torn()
+    groups = np.arange(dofs.group_offsets[-1])[:: dofs.comm.rank + 2]
+    values = dofs.gather_copies(dofs.group.astype(float))
+    position, nodes, found = dofs.lookup_copies(groups, values)
+    assert np.array_equal(found, groups[position])
+    (count,) = dofs.lookup(groups, dofs.multiplicity)
+    assert np.array_equal(np.bincount(position, minlength=len(groups)), count)
+    assert len(np.unique(nodes)) == len(nodes)
+
+
+def test_coincident_nodes_of_two_bodies_are_two_groups():
+    from dolfinx import mesh as dmesh
+
+    comm = MPI.COMM_WORLD
+    square = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], dtype=float)
+    x, cells = np.concatenate((square, square + [1, 0])), np.arange(8).reshape(2, 4)
+    if comm.rank:
+        x, cells = x[:0], cells[:0]
+    element = decomposed("quadrilateral", 1, 1).mesh.ufl_domain().ufl_coordinate_element()
+    mesh = dmesh.create_mesh(comm, cells=cells.astype(np.int64), x=x, e=element)
+    d = tfeti.decompose(mesh, 2)
+    dofs = TornDofs(fem.functionspace(d.mesh, ("Lagrange", 1, (2,))), d)
+    assert comm.allreduce(dofs.num_groups) == 8
+
+
+def test_scalar_spaces():
+    _, dofs = torn(shape=())
+    assert dofs.bs == 1
+    assert dofs.comm.allreduce(dofs.num_groups) == 4**3
+
+
+@pytest.mark.parametrize("element", [("DG", 1, (3,)), ("N1curl", 1)])
+def test_other_spaces_are_refused(element):
+    d = decomposed("tetrahedron", 2, 2)
+    with pytest.raises(InputError, match="expected a continuous Lagrange space"):
+        TornDofs(fem.functionspace(d.mesh, element), d)
+
+
+def test_a_space_on_another_mesh_is_refused():
+    d = decomposed("tetrahedron", 2, 2)
+    other, _, _ = box("tetrahedron", 2)
+    with pytest.raises(InputError, match="not on decomposition.mesh"):
+        TornDofs(fem.functionspace(other, ("Lagrange", 1, (3,))), d)

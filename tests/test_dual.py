@@ -1,0 +1,134 @@
+"""Exact identities of F, G, P, Q, homogenisation and recovery."""
+
+import numpy as np
+import pytest
+from petsc4py import PETSc
+from scenes import curved_obstacle, decomposed, problem
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.dual.operator import check_operator
+from tfeti_dolfinx.dual.solvability import feasible_particular
+from tfeti_dolfinx.qp.problem import project
+
+
+@pytest.fixture(scope="module")
+def dual():
+    d = decomposed("hexahedron", 4, subdomains=6)
+    p = problem(d, contacts=[tfeti.Obstacle("bottom", curved_obstacle(3))])
+    p.solve()
+    yield p._dual
+    p.destroy()
+
+
+@pytest.fixture(scope="module")
+def held_by_contact():
+    """A block in a corner of three planes: every rigid motion is held, by contact alone."""
+    d = decomposed("hexahedron", 3, subdomains=4)
+    planes = {"bottom": (0, 0, 1), "left": (1, 0, 0), "front": (0, 1, 0)}
+    contacts = [tfeti.Obstacle(name, tfeti.Plane((0, 0, 0), n)) for name, n in planes.items()]
+    p = problem(d, (-0.01, -0.02, -0.05), contacts, clamped=())
+    p.solve()
+    yield p._dual
+    p.destroy()
+
+
+def random_vec(dual, seed=0):
+    vec = dual.d.duplicate()
+    rng = np.random.default_rng(seed + dual.coarse.comm.rank)
+    vec.array[:] = rng.standard_normal(vec.getLocalSize())
+    return vec
+
+
+def test_F_is_symmetric_and_positive(dual):
+    check_operator(dual.F, dual.d)
+
+
+def test_preconditioners_are_symmetric_and_positive(dual):
+    from tfeti_dolfinx.dual.operator import PRECONDITIONERS, ScaledGluing
+
+    scaled = ScaledGluing(dual.constraints.B, dual.constraints.weights)
+    for make in PRECONDITIONERS.values():
+        check_operator(make(scaled, dual.blocks), dual.d)
+
+
+def test_projectors(dual):
+    x, Qx, work = random_vec(dual), dual.d.duplicate(), dual.d.duplicate()
+    coarse = dual.coarse
+    coarse.apply_Q(x, Qx)
+    assert coarse.norm_Q(x) == pytest.approx(Qx.norm(), rel=1e-10)
+    assert np.allclose(coarse.G(x.array_r), coarse.G(Qx.array_r), atol=1e-11 * x.norm())
+    Px = x.copy()
+    project(coarse, Px, work)
+    assert np.abs(coarse.G(Px.array_r)).max() <= 1e-11 * x.norm()
+    assert abs(Px.dot(Qx)) <= 1e-11 * x.norm() ** 2
+    PPx = Px.copy()
+    project(coarse, PPx, work)
+    PPx.axpy(-1.0, Px)
+    assert PPx.norm() <= 1e-11 * x.norm()
+
+
+def test_P_annihilates_the_range_of_Gt(dual):
+    coarse = dual.coarse
+    y, work = dual.d.duplicate(), dual.d.duplicate()
+    coarse.combine(np.arange(1.0, coarse.dimension + 1), y)
+    size = y.norm()
+    assert np.allclose(coarse.coordinates(y), np.arange(1.0, coarse.dimension + 1), rtol=1e-8)
+    project(coarse, y, work)
+    assert y.norm() <= 1e-11 * size
+
+
+def test_the_particular_solution_solves_G_lam_e(dual):
+    lam = dual.d.duplicate()
+    dual.coarse.particular(lam)
+    assert np.allclose(dual.coarse.G(lam.array_r), dual.coarse.e, atol=1e-12)
+
+
+def test_gram_is_G_Gt(dual):
+    coarse = dual.coarse
+    y = np.random.default_rng(0).standard_normal(coarse.dimension)
+    assert np.allclose(coarse.gram() @ y, coarse.G(coarse.Gt @ y), atol=1e-11)
+
+
+def test_feasible_homogenisation(held_by_contact):
+    dual = held_by_contact
+    coarse, bounded = dual.coarse, dual.constraints.inequalities
+    lam = feasible_particular(coarse, bounded)
+    assert np.allclose(coarse.G(lam), coarse.e, atol=1e-11)
+    assert np.all(lam[bounded] >= 0.0)
+    natural = dual.d.duplicate()
+    coarse.particular(natural)
+    lowest = coarse.comm.allreduce(float(np.min(natural.array_r[bounded], initial=0.0)))
+    size = np.sqrt(coarse.comm.allreduce(float(lam @ lam)))
+    assert size >= natural.norm() * (1 - 1e-12)
+    if lowest >= 0.0:
+        assert size == pytest.approx(natural.norm())
+
+
+def test_the_feasible_homogenisation_is_the_smallest(held_by_contact):
+    """Its optimality conditions: λ̄ = Gᵀα on carrying rows, (Gᵀα) ≤ 0 on the others."""
+    dual = held_by_contact
+    coarse, bounded = dual.coarse, dual.constraints.inequalities
+    lam = feasible_particular(coarse, bounded)
+    carrying = np.ones(len(lam), dtype=bool)
+    carrying[bounded] = lam[bounded] > 0.0
+    gram = coarse.gram(carrying).toarray()
+    alpha = np.linalg.lstsq(gram, coarse.e, rcond=1e-12)[0]
+    force = coarse.Gt @ alpha
+    assert np.allclose(force[carrying], lam[carrying], atol=1e-10)
+    assert np.all(force[~carrying] <= 1e-10)
+
+
+def test_recovered_displacement_meets_the_rows(dual):
+    constraints, blocks = dual.constraints, dual.blocks
+    assert constraints.B.getLocalSize()[1] == sum(len(b.trace_dofs) for b in blocks)
+    assert isinstance(constraints.B, PETSc.Mat)
+    assert constraints.B.getType() in ("mpiaij", "seqaij")
+
+
+def test_counters_charge_who_asked(dual):
+    x, y = random_vec(dual), dual.d.duplicate()
+    before = dual.F.count["someone"], dual.F.count["solver"]
+    with dual.F.charged_to("someone"):
+        dual.F.mult(x, y)
+    dual.F.mult(x, y)
+    assert (dual.F.count["someone"], dual.F.count["solver"]) == (before[0] + 1, before[1] + 1)

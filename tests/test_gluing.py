@@ -1,0 +1,219 @@
+"""Rows of B: orthonormal, blind to continuous fields, right at torn nodes."""
+
+import numpy as np
+import pytest
+from dolfinx import fem
+from hypothesis import given
+from hypothesis import strategies as st
+from scenes import curved_obstacle, decomposed
+from scipy.sparse import csr_array
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.contact.records import concatenate
+from tfeti_dolfinx.errors import InputError, NoSolutionError
+from tfeti_dolfinx.gluing.glue import glue
+from tfeti_dolfinx.gluing.interface import _orthonormal
+from tfeti_dolfinx.mesh.dofs import TornDofs
+
+
+class Scene:
+    """B of a torn box, as one scipy matrix on every rank."""
+
+    def __init__(self, cell="hexahedron", n=4, degree=1, clamped=True, contacts=(), weights=None):
+        self.d = d = decomposed(cell, n, subdomains=lambda x: (x[0] > 0.5) + 2 * (x[1] > 0.5))
+        gdim = d.mesh.geometry.dim
+        self.V = V = fem.functionspace(d.mesh, ("Lagrange", degree, (gdim,)))
+        self.dofs = dofs = TornDofs(V, d)
+        self.bcs = []
+        if clamped:
+            left = fem.locate_dofs_topological(V, gdim - 1, d.facets("left"))
+            self.bcs = [fem.dirichletbc(np.arange(1.0, gdim + 1), left, V)]
+        records = concatenate([c.records(dofs, d, i) for i, c in enumerate(contacts)], gdim)
+        n_local = dofs.num_nodes * dofs.bs
+        self.weights = np.ones(n_local) if weights is None else weights(dofs)
+        self.gluing = glue(dofs, self.bcs, records, records.near, 1.0, self.weights)
+        self.constraints = self.gluing.constraints
+
+    @property
+    def B(self):
+        indptr, indices, data = self.constraints.B.getValuesCSR()
+        m, n = len(indptr) - 1, self.constraints.B.getSize()[1]
+        rows = self.d.comm.allgather(csr_array((data, indices, indptr), shape=(m, n)).toarray())
+        return np.concatenate(rows)
+
+    def trace(self, values):
+        """Trace values of all ranks from primal values."""
+        return np.concatenate(self.d.comm.allgather(values[self.constraints.trace]))
+
+    def rows(self, equalities):
+        """Flags of equality or inequality rows among all ranks' rows."""
+        c = self.constraints
+        flags = np.arange(c.num_rows) < c.num_equalities
+        return np.concatenate(self.d.comm.allgather(flags)) == equalities
+
+    def nodal(self, function):
+        """Primal values of a function of points of shape (n, 3)."""
+        x = self.V.tabulate_dof_coordinates()[self.dofs.dolfinx_node]
+        return function(x)[:, : self.dofs.bs].ravel()
+
+    @property
+    def rhs(self):
+        return np.concatenate(self.d.comm.allgather(np.array(self.constraints.c.array_r)))
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("clamped", [False, True])
+def test_equality_rows_are_orthonormal(cell, degree, clamped):
+    B = Scene(cell, 4 if degree == 1 else 2, degree, clamped).B
+    assert np.allclose(B @ B.T, np.eye(len(B)), atol=1e-13)
+
+
+def test_rows_are_orthonormal_in_the_inner_product_of_the_stiffness():
+    def weights(dofs):
+        return 1.0 + 1e4 * (dofs.node_subdomain.repeat(dofs.bs) % 2)
+
+    plane = tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -0.1), (0.1, 0.2, 1.0)))
+    scene = Scene(contacts=[plane], weights=weights)
+    B, D = scene.B, scene.trace(scene.weights)
+    assert np.allclose(B / D @ B.T, np.eye(len(B)), atol=1e-12)
+
+
+def test_gluing_rows_do_not_see_continuous_fields():
+    scene = Scene(clamped=False)
+    u = scene.trace(
+        scene.nodal(lambda x: np.sin(x @ np.array([[1.0, 2, 3], [4, 5, 6], [7, 8, 9]])))
+    )
+    assert np.abs(scene.B @ u).max() <= 1e-12
+
+
+def test_gluing_rows_are_as_many_as_there_are_jumps():
+    scene = Scene(clamped=False)
+    dofs = scene.dofs
+    jumps = dofs.comm.allreduce(int(np.sum(dofs.multiplicity - 1))) * dofs.bs
+    assert len(scene.B) == jumps
+    assert np.linalg.matrix_rank(scene.B) == jumps
+
+
+def test_dirichlet_rows_hold_every_copy_with_its_value():
+    scene = Scene()
+    u = scene.nodal(lambda x: np.broadcast_to([1.0, 2.0, 3.0], x.shape))
+    assert np.allclose(scene.B @ scene.trace(u), scene.rhs, atol=1e-13)
+    dofs = scene.dofs
+    left = scene.nodal(lambda x: np.isclose(x, 0.0)[:, [0, 0, 0]])
+    held = np.sum(left)
+    ones = np.sum(np.abs(scene.B).max(axis=1) == 1.0)
+    assert ones == dofs.comm.allreduce(int(held))
+
+
+def test_a_dirichlet_value_reaches_copies_that_have_no_facet_on_the_surface():
+    d = decomposed("triangle", 2, subdomains=lambda x: np.arange(x.shape[1]))
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
+    dofs = TornDofs(V, d)
+    left = fem.locate_dofs_topological(V.sub(1), 1, d.facets("left"))
+    records = concatenate([], 2)
+    ones = np.ones(dofs.num_nodes * 2)
+    bcs = [fem.dirichletbc(0.5, left, V.sub(1))]
+    gluing = glue(dofs, bcs, records, records.near, 1.0, ones)
+    found = d.comm.allreduce(int(np.sum(gluing.constraints.c.array_r == 0.5)))
+    x = V.tabulate_dof_coordinates()
+    assert found == d.comm.allreduce(int(np.sum(np.isclose(x[:, 0], 0))))
+    assert found > d.comm.allreduce(len(left))
+
+
+@given(st.integers(2, 40), st.integers(0, 1000))
+def test_gluing_pattern_of_any_multiplicity(k, seed):
+    weights = 10.0 ** np.random.default_rng(seed).uniform(-3, 3, (2, k))
+    rows = _orthonormal(weights)
+    assert np.allclose(rows.sum(axis=2), 0.0, atol=1e-9 * np.abs(rows).max())
+    for pattern, w in zip(rows, weights, strict=True):
+        assert np.allclose(pattern / w @ pattern.T, np.eye(k - 1), atol=1e-9)
+
+
+def test_equal_weights_give_the_known_pattern():
+    assert np.allclose(
+        _orthonormal(np.ones((1, 3)))[0],
+        [[1 / np.sqrt(2), -1 / np.sqrt(2), 0], [1 / np.sqrt(6), 1 / np.sqrt(6), -2 / np.sqrt(6)]],
+    )
+
+
+def test_contact_rows_are_unit_and_orthogonal_to_the_gluing():
+    scene = Scene(contacts=[tfeti.Obstacle("bottom", curved_obstacle(3))])
+    B, N = scene.B[scene.rows(True)], scene.B[scene.rows(False)]
+    assert np.allclose(np.linalg.norm(N, axis=1), 1.0)
+    assert np.abs(N @ B.T).max() <= 1e-14
+    assert np.allclose(N @ N.T, np.eye(len(N)), atol=1e-14)
+
+
+def test_contact_rows_measure_the_approach_in_scaled_lengths():
+    plane = tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -0.1), (0, 0, 2)))
+    scene = Scene(contacts=[plane], clamped=False)
+    rows = scene.rows(False)
+    u = scene.trace(scene.nodal(lambda x: np.column_stack((x[:, 0], x[:, 1], -0.3 - x[:, 0]))))
+    scale = np.concatenate(scene.d.comm.allgather(scene.gluing.inequalities.scale))
+    approach = (scene.B @ u)[rows] / scale
+    assert np.allclose(scene.rhs[rows] / scale, 0.1)
+    assert approach.min() == pytest.approx(0.3)
+    assert approach.max() == pytest.approx(1.3)
+
+
+def test_one_condition_per_contact_node_however_it_is_torn():
+    scene = Scene(contacts=[tfeti.Obstacle("bottom", curved_obstacle(3))], clamped=False)
+    assert scene.rows(False).sum() == 5 * 5
+
+
+def test_areas_of_contact_nodes_add_up_to_the_surface():
+    scene = Scene("tetrahedron", contacts=[tfeti.Obstacle("bottom", curved_obstacle(3))])
+    area = scene.gluing.records.area
+    assert scene.d.comm.allreduce(area.sum()) == pytest.approx(1.0)
+
+
+def test_conditions_that_dirichlet_values_decide_are_dropped_and_counted():
+    plane = tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -5), (0, 0, 1)))
+    scene = Scene(contacts=[plane])
+    assert scene.d.comm.allreduce(scene.gluing.inequalities.dropped) == 5
+    assert scene.rows(False).sum() == 20
+
+
+def test_prescribed_components_move_into_the_gap():
+    slanted = tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -5), (3, 0, 4)))
+    d = decomposed("hexahedron", 2, 2)
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (3,)))
+    dofs = TornDofs(V, d)
+    bottom = fem.locate_dofs_topological(V.sub(0), 2, d.facets("bottom"))
+    records = concatenate([slanted.records(dofs, d, 0)], 3)
+    bcs = [fem.dirichletbc(1.0, bottom, V.sub(0))]
+    gluing = glue(dofs, bcs, records, records.near, 1.0, np.ones(dofs.num_nodes * 3))
+    rows = gluing.constraints.inequalities
+    gap = gluing.constraints.c.array_r[rows] / gluing.inequalities.scale
+    assert np.allclose(gap, records.gap[gluing.inequalities.condition] + 0.6 * 1.0)
+
+
+def test_an_obstacle_pushed_through_a_fixed_face_is_an_error():
+    plane = tfeti.Obstacle("left", tfeti.Plane((2, 0, 0), (1, 0, 0)))
+    with pytest.raises(NoSolutionError, match="prescribed: .* penetrate by up to 1 "):
+        Scene(contacts=[plane])
+
+
+def test_contradictory_dirichlet_values_are_an_error():
+    d = decomposed("hexahedron", 2, 2)
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (3,)))
+    bcs = [
+        fem.dirichletbc(np.full(3, v), fem.locate_dofs_topological(V, 2, d.facets(name)), V)
+        for name, v in (("left", 0.0), ("bottom", 1.0))
+    ]
+    dofs, records = TornDofs(V, d), concatenate([], 3)
+    with pytest.raises(InputError, match=r"contradict each other: component \d .* 0.0 and as 1.0"):
+        glue(dofs, bcs, records, records.near, 1.0, np.ones(dofs.num_nodes * 3))
+    same = [bcs[0], fem.dirichletbc(np.zeros(3), bcs[1].dof_indices()[0][::3] // 3, V)]
+    glue(dofs, same, records, records.near, 1.0, np.ones(dofs.num_nodes * 3))
+
+
+def test_dirichlet_values_that_are_not_finite_are_an_error():
+    d = decomposed("hexahedron", 2, 2)
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (3,)))
+    left = fem.locate_dofs_topological(V, 2, d.facets("left"))
+    dofs, records = TornDofs(V, d), concatenate([], 3)
+    with pytest.raises(InputError, match="Dirichlet condition 0 has a value that is not finite"):
+        bc = fem.dirichletbc(np.full(3, np.nan), left, V)
+        glue(dofs, [bc], records, records.near, 1.0, np.ones(dofs.num_nodes * 3))

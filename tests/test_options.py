@@ -1,0 +1,101 @@
+"""Options: parsing, precedence, ranges, documents."""
+
+import subprocess
+import sys
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+from petsc4py import PETSc
+from scenes import decomposed, problem
+
+from tfeti_dolfinx import InputError, Options
+from tfeti_dolfinx.options import options_table, parse_options
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def test_defaults():
+    assert parse_options(None, "tfeti_") == Options()
+
+
+def test_values_get_the_type_of_their_option():
+    given = {"tfeti_rtol": "1e-8", "max_it": "7", "-tfeti_monitor": None, "view": "false"}
+    options = parse_options(given, "tfeti_")
+    assert (options.rtol, options.max_it, options.monitor, options.view) == (1e-8, 7, True, False)
+
+
+def test_the_command_line_beats_the_dictionary():
+    database = PETSc.Options()
+    database.setValue("-tfeti_rtol", "1e-3")
+    try:
+        assert parse_options({"tfeti_rtol": 1e-9}, "tfeti_").rtol == 1e-3
+    finally:
+        database.delValue("-tfeti_rtol")
+    assert parse_options({"tfeti_rtol": 1e-9}, "tfeti_").rtol == 1e-9
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"tfeti_rtoll": 1}, r"unknown option -tfeti_rtoll; expected one of -tfeti_qp_type"),
+        ({"tfeti_rtol": "tight"}, r"-tfeti_rtol 'tight': expected a value of type float"),
+        ({"tfeti_rtol": -1}, r"-tfeti_rtol -1.0: expected 0 or more"),
+        ({"tfeti_max_it": "1.5"}, r"-tfeti_max_it '1.5': expected a value of type int"),
+        ({"tfeti_qp_type": "newt"}, r"-tfeti_qp_type newt: expected one of auto, pcpg, smalse"),
+        ({"tfeti_monitor": "maybe"}, r"-tfeti_monitor 'maybe': expected a value of type bool"),
+        ({"tfeti_smalse_beta": 1.0}, r"-tfeti_smalse_beta 1.0: expected between 0 and 1"),
+        ({"tfeti_smalse_rho": 0}, r"-tfeti_smalse_rho 0.0: expected more than 0"),
+        ({"tfeti_mpgp_alpha": 3}, r"-tfeti_mpgp_alpha 3.0: expected more than 0, at most 2"),
+        (
+            {"tfeti_qp_type": "smalse", "tfeti_pc_type": "dirichlet"},
+            r"SMALSE-M takes no preconditioner",
+        ),
+    ],
+)
+def test_options_that_do_not_fit(given, message):
+    with pytest.raises(InputError, match=message):
+        parse_options(given, "tfeti_")
+
+
+def test_view_lists_every_option():
+    text = Options().view_text("tfeti_")
+    for f in fields(Options):
+        assert f"-tfeti_{f.name} {f.default}" in text
+
+
+def test_the_document_has_the_table():
+    assert options_table() in (ROOT / "docs/options.md").read_text()
+
+
+def test_monitor_and_view_and_reason_print(capsys):
+    d = decomposed("hexahedron", 2, 2)
+    p = problem(d, tfeti_monitor=True, tfeti_converged_reason=True, tfeti_view=True)
+    p.solve()
+    out = capsys.readouterr().out
+    if d.comm.rank:
+        assert out == ""
+        return
+    assert "|gP|" in out
+    assert "|Gλ-e|" in out
+    assert "multiplications" in out
+    assert "TFETI solve CONVERGED_RTOL after" in out
+    assert "-tfeti_rtol 1e-06" in out
+    assert "primal_dofs" in out
+
+
+def test_the_command_line_of_a_program(serial_only):
+    """petsc4py.init before DOLFINx keeps the options; -log_view shows a stage per step."""
+    command = [
+        sys.executable,
+        "demos/cube_3d.py",
+        "--quick",
+        "-tfeti_converged_reason",
+        "-log_view",
+    ]
+    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert result.returncode == 0, result.stderr
+    assert "TFETI solve CONVERGED_RTOL" in result.stdout
+    for name in ("mesh", "contact", "gluing", "assembly", "subdomains", "dual", "qp", "recovery"):
+        assert f"tfeti: {name}" in result.stdout
+    assert "unused" not in result.stdout + result.stderr

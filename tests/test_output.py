@@ -1,0 +1,160 @@
+"""Files for ParaView and pictures: complete, whole, and only when asked for."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import dolfinx
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from scenes import curved_obstacle, decomposed, problem
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx import InputError, TfetiError, draw
+from tfeti_dolfinx.output import cell_fields, nodal_fields, write_vtx, write_xdmf
+from tfeti_dolfinx.plot import check_screen, plot_deformed, plot_pressure
+
+
+@pytest.fixture(scope="module", params=["quadrilateral", "tetrahedron"])
+def solution(request):
+    gdim = 2 if request.param == "quadrilateral" else 3
+    d = decomposed(request.param, 6, 5)
+    obstacle = tfeti.Obstacle("bottom", curved_obstacle(gdim))
+    p = problem(d, (0.0,) * (gdim - 1) + (-0.05,), [obstacle])
+    p.solve()
+    return p.solution
+
+
+def test_nodal_fields_share_the_displacement_s_element(solution):
+    names = [f.name for f in nodal_fields(solution)]
+    assert names == ["displacement", "pressure", "gap", "status", "stress", "von_mises"]
+    for f in nodal_fields(solution):
+        assert f.function_space.element.basix_element.degree == 1
+        assert np.all(np.isfinite(f.x.array))
+
+
+def test_cell_fields(solution):
+    subdomain, body, material = cell_fields(solution)
+    d = solution.decomposition
+    assert np.array_equal(np.unique(subdomain.x.array), d.subdomains)
+    assert np.all(body.x.array == 0)
+    assert np.all(material.x.array == -1)
+
+
+def test_nodal_averages_have_no_jumps_at_the_tears(solution):
+    dofs = solution.dofs
+    values = solution.nodal_von_mises.x.array[dofs.dolfinx_node]
+    low, high = dofs.reduce(values, np.minimum, np.inf), dofs.reduce(values, np.maximum, -np.inf)
+    assert np.allclose(low, high, atol=1e-14)
+
+
+def test_stress_of_a_linear_displacement_is_exact():
+    d = decomposed("tetrahedron", 3, 4)
+    p = problem(d, (0, 0, -0.05), tfeti_rtol=1e-4)
+    p.solve()
+    p.u.interpolate(lambda x: np.stack((0 * x[0], 0 * x[0], 1e-3 * x[2])))
+    s = p.solution.stress.x.array.reshape(-1, 9)
+    lmbda, mu = 0.3 / (1.3 * 0.4), 0.5 / 1.3
+    exact = 1e-3 * np.diag([lmbda, lmbda, lmbda + 2 * mu]).ravel()
+    assert np.allclose(s, exact, atol=1e-15)
+    assert np.allclose(p.solution.nodal_stress.x.array.reshape(-1, 9), exact, atol=1e-15)
+    assert np.allclose(p.solution.von_mises.x.array, 2e-3 * mu, atol=1e-15)
+
+
+def test_fields_are_made_when_asked_for(solution):
+    fresh = tfeti.Solution.__new__(tfeti.Solution)
+    fresh.__dict__.update({k: v for k, v in solution.__dict__.items() if k != "stress"})
+    assert "stress" not in fresh.__dict__
+    assert fresh.stress is fresh.stress
+
+
+@pytest.mark.skipif(not dolfinx.has_adios2, reason="DOLFINx without ADIOS2")
+def test_vtx_appears_whole(solution, comm, shared_tmp):
+    path = shared_tmp / f"out{solution.dofs.bs}.bp"
+    for _ in range(2):  # the second time it replaces the first
+        files = write_vtx(path, solution)
+        assert [f.name for f in files] == [path.name, f"{path.stem}_cells.bp"]
+    comm.barrier()
+    assert all(f.is_dir() for f in files)
+    assert not list(path.parent.glob(".*"))
+    for f, name in zip(files, ("von_mises", "subdomain"), strict=True):
+        content = b"".join(part.read_bytes() for part in f.iterdir())
+        assert name.encode() in content
+
+
+def test_xdmf_appears_whole(solution, comm, shared_tmp):
+    files = write_xdmf(shared_tmp / f"out{solution.dofs.bs}.xdmf", solution)
+    comm.barrier()
+    text = files[0].read_text()
+    for name in ("displacement", "pressure", "gap", "status", "stress", "von_mises", "body"):
+        assert f'Name="{name}"' in text
+    assert files[1].name in text
+    assert files[1].is_file()
+    assert not list(shared_tmp.glob(".*"))
+
+
+def test_xdmf_stands_in_where_adios2_is_missing(solution, comm, shared_tmp, monkeypatch):
+    monkeypatch.setattr(dolfinx, "has_adios2", False)
+    files = write_vtx(shared_tmp / f"other{solution.dofs.bs}.bp", solution)
+    assert files[0].suffix == ".xdmf"
+
+
+def test_names_that_do_not_fit(solution):
+    with pytest.raises(InputError, match=r"x.vtu: expected a name that ends with .bp"):
+        write_vtx("x.vtu", solution)
+    with pytest.raises(InputError, match=r"x.bp: expected a name that ends with .xdmf"):
+        write_xdmf("x.bp", solution)
+
+
+def test_pictures(solution, comm, shared_tmp):
+    name = f"{solution.dofs.bs}.png"
+    files = [
+        plot_deformed(shared_tmp / f"deformed{name}", solution),
+        plot_pressure(shared_tmp / f"pressure{name}", solution, lambda x: x[:, 0], lambda x: 0 * x),
+    ]
+    comm.barrier()
+    if comm.rank == 0:
+        import matplotlib.image
+
+        for file in files:
+            picture = matplotlib.image.imread(file)[..., :3]
+            assert picture.shape[0] > 300
+            assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 50
+        assert {p.name for p in shared_tmp.glob("*.png")} >= {f.name for f in files}
+
+
+def test_a_picture_that_cannot_be_drawn_says_why(shared_tmp, comm, monkeypatch):
+    monkeypatch.setattr(draw, "__file__", "/nowhere/draw.py")
+    p = problem(decomposed("quadrilateral", 2, 2), (0.0, -0.05))
+    p.solve()
+    with pytest.raises(TfetiError, match=r"none.png could not be drawn"):
+        plot_deformed(shared_tmp / "none.png", p.solution)
+    assert not list(shared_tmp.iterdir())
+
+
+def test_a_missing_screen_is_said_beforehand(monkeypatch):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.setenv("PATH", "/nowhere")
+    with pytest.raises(InputError, match="pictures need an X server"):
+        check_screen()
+
+
+def test_no_plot_no_pyvista(serial_only):
+    code = "import sys, tfeti_dolfinx; print('pyvista' in sys.modules, 'matplotlib' in sys.modules)"
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert result.stdout.split() == ["False", "False"]
+
+
+def test_a_second_order_displacement_can_be_written(shared_tmp):
+    p = problem(decomposed("tetrahedron", 2, 2), degree=2)
+    p.solve()
+    write_vtx(shared_tmp / "second.bp", p.solution)
+    write_xdmf(shared_tmp / "second.xdmf", p.solution)
+    average = p.solution.nodal_von_mises
+    volume = fem.assemble_scalar(fem.form(average * ufl.dx))
+    assert p.decomposition.comm.allreduce(volume) > 0
+    assert Path(shared_tmp / "second.xdmf").is_file()

@@ -1,0 +1,214 @@
+"""QP solvers on small programs, without meshes."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from petsc4py import PETSc
+from reference import dense_qp
+from scipy.sparse import diags_array
+
+from tfeti_dolfinx.qp.feasible_sets import Bounds, Unbounded, check_feasible_set
+from tfeti_dolfinx.qp.homogenised import homogenise
+from tfeti_dolfinx.qp.mprgp import EXPANSIONS, Iterate, MprgpParameters, mprgp
+from tfeti_dolfinx.qp.pcpg import pcpg
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, NoCoarse, Start, Steps, estimate_norm
+from tfeti_dolfinx.qp.smalse import SmalseParameters, smalse
+
+SELF = PETSc.COMM_SELF
+
+
+def matrix(A):
+    A = np.asarray(A, dtype=float)
+    return PETSc.Mat().createDense(A.shape, array=A.ravel(order="F").copy(), comm=SELF)
+
+
+def vector(values):
+    return PETSc.Vec().createWithArray(np.array(values, dtype=float), comm=SELF)
+
+
+class DenseCoarse:
+    """The Coarse protocol from a dense G."""
+
+    def __init__(self, G, e):
+        self.G, self.e = G, e
+        self.inverse = np.linalg.pinv(G @ G.T)
+
+    def apply_Q(self, x, y):
+        y.array[:] = self.G.T @ (self.inverse @ (self.G @ x.array_r))
+
+    def norm_Q(self, x):
+        Gx = self.G @ x.array_r
+        return float(np.sqrt(max(Gx @ self.inverse @ Gx, 0.0)))
+
+    def particular(self, x):
+        self.combine(self.inverse @ self.e, x)
+
+    def coordinates(self, x):
+        return self.inverse @ (self.G @ x.array_r)
+
+    def combine(self, mu, x):
+        x.array[:] = self.G.T @ mu
+
+
+def random_program(seed, m=40, r=5, n_bounded=20):
+    rng = np.random.default_rng(seed)
+    X = rng.standard_normal((m, m))
+    F = X @ X.T / m + 0.05 * np.eye(m)
+    G = rng.standard_normal((r, m))
+    bounded = np.arange(m - n_bounded, m)
+    feasible = rng.standard_normal(m)
+    feasible[bounded] = np.abs(feasible[bounded])
+    return F, rng.standard_normal(m), G, G @ feasible, bounded
+
+
+def string(n=100):
+    """−u″ = −15 on (0, 1) over the obstacle of a well-known test of MPRGP, and its bounds."""
+    h = 1 / (n - 1)
+    A = diags_array([-np.ones(n - 1), 2 * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1])
+    A = A.toarray()
+    A[0, :], A[-1, :], A[:, 0], A[:, -1] = 0, 0, 0, 0
+    A[0, 0] = A[-1, -1] = 1
+    b = np.full(n, -30 * h * h)
+    b[0] = b[-1] = 0
+    lower = np.sin(4 * np.pi * np.linspace(0, 1, n) - np.pi / 6) / 2 - 2
+    lower[0] = lower[-1] = 0
+    return A, b, lower
+
+
+# steps of PERMON's MPGP on its tutorial ex1 with -n 100: 156 + 18 + 7 with the fixed step (its
+# step length comes from an estimate of ‖A‖), 134 + 14 + 12 with the projected CG step
+@pytest.mark.parametrize(
+    ("expansion", "known"), [("fixed", (156, 18, 7)), ("projcg", (134, 14, 12))]
+)
+def test_mprgp_on_a_string_over_an_obstacle(expansion, known):
+    A, b, lower = string()
+    x, g = vector(np.zeros(100)), vector(-b)
+    bounds = Bounds(slice(0, 100), lower)
+    state, steps = Iterate(matrix(A), x, g, bounds), Steps()
+    parameters = MprgpParameters(1.95 / 4, 1.0, EXPANSIONS[expansion])
+    tol = 1e-5 * np.linalg.norm(b)
+    reason = mprgp(state, parameters, lambda s: s.projected_gradient <= tol, steps, 1000)
+    assert reason == ConvergedReason.ITERATING
+    found = np.array([steps.cg, steps.expansion, steps.proportioning])
+    assert np.all(np.abs(found - known) <= (10, 3, 3))
+    if expansion == "projcg":
+        assert tuple(found) == known
+    assert np.all(x.array >= lower)
+    assert np.allclose(g.array, A @ x.array - b, atol=1e-12)
+    touching = x.array <= lower
+    assert 5 <= touching.sum() <= 20
+    assert np.all(g.array[touching] >= -1e-4 * tol)
+
+
+def test_mprgp_stops_at_max_it():
+    A, b, lower = string()
+    state = Iterate(matrix(A), vector(np.zeros(100)), vector(-b), Bounds(slice(0, 100), lower))
+    steps = Steps()
+    reason = mprgp(state, MprgpParameters(0.4), lambda s: False, steps, 7)
+    assert reason == ConvergedReason.DIVERGED_ITS
+    assert steps.inner == 7
+
+
+def test_mprgp_reports_an_indefinite_operator():
+    A = np.diag([1.0, -1.0])
+    state = Iterate(matrix(A), vector([1.0, 1.0]), vector([0.0, -2.0]), Unbounded())
+    reason = mprgp(state, MprgpParameters(0.5), lambda s: False, Steps(), 10)
+    assert reason == ConvergedReason.DIVERGED_INDEFINITE_MAT
+
+
+@pytest.mark.parametrize("feasible", [Bounds(slice(3, 20)), Bounds(slice(0, 0)), Unbounded()])
+def test_feasible_sets_fulfil_their_contract(feasible):
+    check_feasible_set(feasible, vector(np.zeros(30)))
+
+
+@given(st.integers(0, 10_000), st.floats(-2, 2))
+def test_bounds_fulfil_their_contract_for_any_bound(seed, level):
+    rng = np.random.default_rng(seed)
+    where = np.flatnonzero(rng.random(12) < 0.5)
+    lower = level + rng.standard_normal(len(where))
+    check_feasible_set(Bounds(where, lower), vector(np.zeros(12)), seed)
+
+
+@given(st.integers(0, 1000), st.sampled_from(["fixed", "projcg"]))
+def test_smalse_agrees_with_an_active_set_solver(seed, expansion):
+    F, d, G, e, bounded = random_program(seed)
+    coarse = DenseCoarse(G, e)
+    qp = QP(matrix(F), vector(d), coarse, Bounds(bounded))
+    norm = estimate_norm(qp.F, coarse, qp.d, 60)
+    homogenised = homogenise(qp)
+    parameters = SmalseParameters(expansion=expansion)
+    result = smalse(qp, homogenised, norm, parameters, rtol=1e-11, max_it=20_000)
+    exact = dense_qp(F, d, G, e, bounded)
+    assert result.reason == ConvergedReason.CONVERGED_RTOL
+    assert np.linalg.norm(result.lam.array - exact) <= 1e-8 * np.linalg.norm(exact)
+    assert np.all(result.lam.array[bounded] >= -1e-15)
+
+
+def test_smalse_from_the_solution_takes_hardly_a_step():
+    F, d, G, e, bounded = random_program(3)
+    coarse = DenseCoarse(G, e)
+    qp = QP(matrix(F), vector(d), coarse, Bounds(bounded))
+    norm = estimate_norm(qp.F, coarse, qp.d, 60)
+    homogenised = homogenise(qp)
+    cold = smalse(qp, homogenised, norm, rtol=1e-8)
+    warm = smalse(qp, homogenised, norm, rtol=1e-6, start=Start(cold.lam, cold.mu))
+    assert warm.steps.inner <= 2
+    assert np.linalg.norm(warm.lam.array - cold.lam.array) <= 1e-5 * cold.lam.norm()
+
+
+def test_smalse_without_equality_is_mprgp():
+    F, d, _, _, bounded = random_program(5)
+    qp = QP(matrix(F), vector(d), NoCoarse(), Bounds(bounded))
+    norm = estimate_norm(qp.F, qp.coarse, qp.d, 60)
+    result = smalse(qp, homogenise(qp), norm, rtol=1e-12)
+    exact = dense_qp(F, d, np.zeros((0, 40)), np.zeros(0), bounded)
+    assert result.steps.outer == 0
+    assert np.allclose(result.lam.array, exact, atol=1e-9)
+
+
+def test_smalse_says_when_it_stopped_early():
+    F, d, G, e, bounded = random_program(7)
+    coarse = DenseCoarse(G, e)
+    qp = QP(matrix(F), vector(d), coarse, Bounds(bounded))
+    result = smalse(qp, homogenise(qp), np.linalg.norm(F, 2), rtol=1e-12, max_it=3)
+    assert result.reason == ConvergedReason.DIVERGED_ITS
+    assert result.steps.inner == 3
+
+
+@given(st.integers(0, 1000))
+def test_pcpg_solves_the_saddle_point_system(seed):
+    F, d, G, e, _ = random_program(seed, n_bounded=0)
+    qp = QP(matrix(F), vector(d), DenseCoarse(G, e), Unbounded())
+    result = pcpg(qp, homogenise(qp), rtol=1e-12)
+    exact = dense_qp(F, d, G, e, np.empty(0, dtype=int))
+    assert np.linalg.norm(result.lam.array - exact) <= 1e-8 * np.linalg.norm(exact)
+    assert np.allclose(G @ result.lam.array, e)
+
+
+def test_a_good_preconditioner_makes_pcpg_fast():
+    F, d, G, e, _ = random_program(1, n_bounded=0)
+    coarse = DenseCoarse(G, e)
+    plain = QP(matrix(F), vector(d), coarse, Unbounded())
+    helped = QP(matrix(F), vector(d), coarse, Unbounded(), matrix(np.linalg.inv(F)))
+    slow = pcpg(plain, homogenise(plain), rtol=1e-10)
+    fast = pcpg(helped, homogenise(helped), rtol=1e-10)
+    assert fast.steps.cg < slow.steps.cg / 2
+    assert np.allclose(slow.lam.array, fast.lam.array, atol=1e-8)
+
+
+def test_norm_is_estimated_from_above_but_closely():
+    F, d, G, e, _ = random_program(11)
+    coarse = DenseCoarse(G, e)
+    P = np.eye(40) - G.T @ np.linalg.solve(G @ G.T, G)
+    exact = np.linalg.norm(P @ F @ P, 2)
+    estimate = estimate_norm(matrix(F), coarse, vector(d), 30)
+    assert 0.95 * exact <= estimate <= 1.06 * exact
+
+
+def test_nothing_to_do_is_no_step():
+    F, _, G, _, bounded = random_program(2)
+    qp = QP(matrix(F), vector(np.zeros(40)), DenseCoarse(G, np.zeros(5)), Bounds(bounded))
+    homogenised = homogenise(qp)
+    assert smalse(qp, homogenised, 1.0).steps.inner == 0
+    assert pcpg(qp, homogenised).steps.cg == 0

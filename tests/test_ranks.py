@@ -1,0 +1,67 @@
+"""The same answer on 1, 2 and 4 ranks, and for 4, 16 and 64 subdomains; hangs end."""
+
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scenes import relative
+
+HERE = Path(__file__).resolve().parent
+
+
+def run(ranks, *arguments, **keywords):
+    command = ["mpirun", "-n", str(ranks), sys.executable, *map(str, arguments)]
+    return subprocess.run(
+        command, cwd=HERE, capture_output=True, text=True, timeout=300, **keywords
+    )
+
+
+def solve(tmp_path, ranks, cell, subdomains, rtol):
+    path = tmp_path / f"{ranks}_{subdomains}.npz"
+    result = run(ranks, "ranks_script.py", cell, subdomains, path, rtol)
+    assert result.returncode == 0, result.stderr
+    return np.load(path)
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_ranks_do_not_matter(serial_only, tmp_path, cell):
+    one, two, four = (solve(tmp_path, ranks, cell, 6, 1e-10) for ranks in (1, 2, 4))
+    for other in (two, four):
+        assert np.allclose(one["x"], other["x"])
+        assert relative(other["u"], one["u"]) <= 1e-8
+        assert one["active"] == other["active"]
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_numbers_of_subdomains_do_not_matter(serial_only, tmp_path, cell):
+    few, some, many = (solve(tmp_path, 2, cell, n, 1e-10) for n in (4, 16, 64))
+    for other in (some, many):
+        assert relative(other["u"], few["u"]) <= 1e-6
+
+
+def test_more_ranks_than_subdomains(serial_only, tmp_path):
+    one, four = solve(tmp_path, 1, "triangle", 2, 1e-10), solve(tmp_path, 4, "triangle", 2, 1e-10)
+    assert relative(four["u"], one["u"]) <= 1e-8
+
+
+def test_a_test_that_hangs_on_one_rank_ends_on_all(serial_only, tmp_path):
+    test = tmp_path / "test_hang.py"
+    test.write_text(
+        textwrap.dedent("""
+            from mpi4py import MPI
+
+            def test_hang():
+                if MPI.COMM_WORLD.rank == 0:
+                    MPI.COMM_WORLD.recv(source=1)
+        """)
+    )
+    start = time.monotonic()
+    arguments = ["-m", "pytest", "-c", HERE.parent / "pyproject.toml", "--timeout=5", test]
+    result = run(2, *arguments)
+    assert result.returncode != 0
+    assert time.monotonic() - start < 60
+    assert "Timeout" in result.stdout + result.stderr

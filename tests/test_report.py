@@ -1,0 +1,67 @@
+"""The report: complete, physical, written whole."""
+
+import json
+from dataclasses import fields
+
+import pytest
+from scenes import curved_obstacle, decomposed, problem
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx import Report
+
+
+@pytest.fixture(scope="module")
+def report():
+    d = decomposed("hexahedron", 6, 8)
+    p = problem(d, contacts=[tfeti.Obstacle("bottom", curved_obstacle(3))])
+    p.solve()
+    return p.report
+
+
+def test_sizes(report):
+    assert report.subdomains == 8
+    assert report.bodies == 1
+    assert report.kernel_dim == 48
+    assert report.contact_rows == 42
+    assert report.dropped_contact_rows == 7
+    assert report.primal_dofs == 3 * 8 * 4**3
+    assert 0 < report.active_contacts < 42
+    assert report.peak_memory_mb > 10
+
+
+def test_every_stage_has_its_seconds(report):
+    stages = {"mesh", "contact", "gluing", "assembly", "subdomains", "dual", "qp", "recovery"}
+    assert set(report.seconds) == stages | {"total"}
+    assert all(value >= 0.0 for value in report.seconds.values())
+    total = sum(value for name, value in report.seconds.items() if name != "total")
+    assert report.seconds["total"] == pytest.approx(total, rel=0.2)
+
+
+def test_residuals_are_named(report):
+    assert set(report.residuals) == {
+        "projected_gradient",
+        "equilibrium",
+        "tolerance",
+        "gluing_jump",
+        "penetration",
+        "tension",
+        "complementarity",
+        "balance",
+    }
+
+
+def test_json_has_every_field(report, comm, shared_tmp):
+    path = shared_tmp / "deep" / "report.json"
+    report.write(path, comm)
+    data = json.loads(path.read_text())
+    assert set(data) == {f.name for f in fields(Report)}
+    assert data["contact_rows"] == report.contact_rows
+    comm.barrier()
+    assert [p.name for p in path.parent.iterdir()] == ["report.json"]
+
+
+def test_text_has_every_field(report):
+    text = str(report)
+    for f in fields(Report):
+        if f.name != "errors":
+            assert f.name in text

@@ -1,0 +1,94 @@
+"""Problems without a solution are recognised and explained, not iterated on."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import decomposed, problem
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx import NoSolutionError
+
+
+def floor(**changes):
+    return tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -0.01), (0, 0, 1)), **changes)
+
+
+@pytest.mark.parametrize(
+    ("traction", "mode"),
+    [((0.1, 0, 0), "translation in x"), ((0, 0.1, 0), "translation in y")],
+)
+def test_a_body_free_to_move_under_its_load(traction, mode):
+    d = decomposed("hexahedron", 2, 3)
+    p = problem(d, (*traction[:2], -0.05), [floor()], clamped=())
+    with pytest.raises(NoSolutionError, match=rf"body 0 is free to move \({mode}\): nothing holds"):
+        p.solve()
+
+
+def test_a_body_without_any_hold():
+    p = problem(decomposed("hexahedron", 2, 3), clamped=())
+    with pytest.raises(NoSolutionError, match=r"translation in z\): nothing holds it"):
+        p.solve()
+
+
+def test_a_load_that_lifts_the_body_off_its_contact():
+    d = decomposed("hexahedron", 2, 3)
+    p = problem(d, (0, 0, 0.05), [floor()], clamped=())
+    with pytest.raises(NoSolutionError, match=r"translation in z\): only contact could hold it"):
+        p.solve()
+
+
+def test_rows_out_of_reach_are_taken_in_before_a_body_is_called_free():
+    """Only the left end of the floor is within reach; alone it could not hold the block."""
+    d = decomposed("quadrilateral", 8, 3)
+    slope = tfeti.SignedDistance(
+        lambda x: x[1] + 0.01 + 0.01 * x[0],
+        lambda x: np.stack((np.zeros_like(x[0]), np.ones_like(x[0]), np.zeros_like(x[0]))),
+    )
+    floor = tfeti.Obstacle("bottom", slope, reach=0.0105)
+    p = problem(d, (0.0, -0.05), [floor], clamped=())
+    p.solve()
+    assert p.report.far_contact_nodes == 8
+    assert p.report.contact_rows == 9
+    force = d.comm.allreduce(p.solution.contact(0).force.sum())
+    assert force == pytest.approx(0.05, rel=1e-4)
+
+
+def test_the_body_is_named_by_its_volume():
+    from dolfinx import mesh as dmesh
+    from scenes import box
+
+    mesh, tags, names = box("hexahedron", 2)
+    cells = np.arange(mesh.topology.index_map(3).size_local, dtype=np.int32)
+    cell_tags = dmesh.meshtags(mesh, 3, cells, np.full(len(cells), 7, dtype=np.int32))
+    d = tfeti.decompose(mesh, 2, cell_tags, tags, surfaces=names, volumes={"ball": 7})
+    with pytest.raises(NoSolutionError, match=r"body 0 \(volume 'ball'\) is free to move"):
+        problem(d, clamped=()).solve()
+
+
+@settings(max_examples=15)
+@given(st.floats(-0.4, 1.4), st.floats(0.05, 1.0))
+def test_solvable_just_if_the_resultant_is_over_the_support(centre, width):
+    """A block on a flat floor, loaded by a pressure around ``centre``: it stands or tips."""
+    import ufl
+    from dolfinx import fem
+    from scenes import hooke, strain
+
+    d = decomposed("quadrilateral", 4, 2)
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+    x = ufl.SpatialCoordinate(d.mesh)
+    # a linear pressure on the top of resultant 1 at x = c; its first moment about 0 is c
+    c = centre * width + 0.5 * (1 - width)
+    pressure = (4 - 6 * c) + (12 * c - 6) * x[0]
+    L = -pressure * v[1] * ds(d.surface("top"), metadata={"quadrature_degree": 3})
+    contacts = [tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)))]
+    p = tfeti.ContactProblem(ufl.inner(hooke()(u), strain(v)) * ufl.dx, L, [], contacts, d)
+    if 1e-3 < c < 1 - 1e-3:
+        p.solve()
+        force = d.comm.allreduce(p.solution.contact(0).force.sum())
+        assert force == pytest.approx(1.0, rel=1e-4)
+    elif c < -1e-3 or c > 1 + 1e-3:
+        with pytest.raises(NoSolutionError, match="only contact could hold it"):
+            p.solve()

@@ -1,0 +1,115 @@
+"""The only place that knows DOLFINx versions (0.9 to 0.11)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.metadata import version
+from typing import Any
+
+import basix.ufl
+import numpy as np
+from dolfinx import fem, graph, la
+from dolfinx import mesh as dmesh
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.errors import InputError
+
+try:  # 0.10 renamed the module
+    from dolfinx.io import gmsh as _gmshio
+except ImportError:
+    from dolfinx.io import gmshio as _gmshio
+
+
+DOLFINX_VERSION = version("fenics-dolfinx")
+
+
+def petsc_scalar_type() -> Any:
+    """The numpy type of PETSc's scalars."""
+    return PETSc.ScalarType
+
+
+def require_real_petsc() -> None:
+    """Raise unless PETSc was built for real numbers."""
+    if np.issubdtype(petsc_scalar_type(), np.complexfloating):
+        raise InputError(
+            "this PETSc is built for complex numbers; contact needs a real build "
+            "(Debian: python3-petsc4py-real, conda: petsc=*=real_*)"
+        )
+
+
+def cell_permutation(cell_type: dmesh.CellType, num_nodes: int) -> Array:
+    """Permutation ``p`` from gmsh's node order: ``dolfinx_cell[i] = gmsh_cell[p[i]]``."""
+    return np.asarray(_gmshio.cell_perm_array(cell_type, num_nodes))
+
+
+def coordinate_element(cell_type: dmesh.CellType, degree: int, gdim: int) -> Any:
+    """Lagrange coordinate element with equispaced points, as gmsh numbers them."""
+    return basix.ufl.element(
+        "Lagrange",
+        cell_type.name,
+        degree,
+        basix.LagrangeVariant.equispaced,
+        shape=(gdim,),
+    )
+
+
+def create_mesh_in_place(comm: MPI.Intracomm, cells: Array, x: Array, element: Any) -> dmesh.Mesh:
+    """A mesh whose cells stay on the rank that gives them. Collective.
+
+    This is the one call of DOLFINx's partitioner hook.
+
+    Args:
+        comm: Communicator of the mesh.
+        cells: Global node indices of this rank's cells, shape ``(n, nodes_per_cell)``.
+        x: Coordinates of this rank's chunk of the nodes, shape ``(p, gdim)``.
+        element: Coordinate element.
+    """
+
+    def stay(*_: Any) -> Any:
+        destinations = np.full(len(cells), comm.rank, dtype=np.int32)
+        lists = graph.adjacencylist(destinations, np.arange(len(cells) + 1, dtype=np.int32))
+        return getattr(lists, "_cpp_object", lists)
+
+    return dmesh.create_mesh(comm, cells=cells, x=x, e=element, partitioner=stay)
+
+
+def geometry_dofmap(mesh: dmesh.Mesh) -> Array:
+    """Geometry nodes of the local cells, shape ``(num_cells, nodes_per_cell)``."""
+    geometry = mesh.geometry
+    return np.asarray(geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap)
+
+
+def interpolation_points(V: fem.FunctionSpace) -> Array:
+    """Points of the reference cell at which the element of ``V`` is interpolated."""
+    points = V.element.interpolation_points
+    return np.asarray(points() if callable(points) else points)
+
+
+def first_component(V: fem.FunctionSpace) -> tuple[fem.FunctionSpace, Array]:
+    """Space of the first component of a blocked space, and the dof of ``V`` of each of its dofs."""
+    S, parent = V.sub(0).collapse()
+    return S, np.ravel(parent)  # 0.11 wraps the map in a list
+
+
+def assemble_csr(form: fem.Form) -> Any:
+    """This rank's diagonal block of a bilinear form, as a scipy CSR matrix.
+
+    Needs a mesh whose vertices are never shared between ranks, so nothing is communicated.
+    """
+    A = fem.create_matrix(form, la.BlockMode.expanded)
+    fem.assemble_matrix(A, form)
+    return A.to_scipy()
+
+
+def prescribed_values(bcs: Sequence[fem.DirichletBC], size: int) -> Array:
+    """Values that the boundary conditions prescribe, NaN elsewhere; one row per condition.
+
+    Returns:
+        Array of shape ``(len(bcs), size)``, ``size`` the number of local unrolled dofs.
+    """
+    values = np.full((len(bcs), size), np.nan)
+    for row, bc in zip(values, bcs, strict=True):
+        bc.set(row)
+    return values

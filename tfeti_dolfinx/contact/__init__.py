@@ -1,0 +1,1 @@
+"""What the user says of contact, and the conditions that follow from the geometry."""

@@ -1,0 +1,138 @@
+"""Rigid obstacles: signed distances, positive where a body may be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.errors import InputError
+
+Point = tuple[float, ...] | list[float] | Array
+
+
+class Shape(Protocol):
+    """A rigid shape. Points come as in DOLFINx, shape ``(3, n)``, in 2D with z = 0."""
+
+    def distance(self, x: Array) -> Array:
+        """Signed distance, positive on the free side, shape ``(n,)``."""
+        ...
+
+    def gradient(self, x: Array) -> Array:
+        """Gradient of the signed distance, shape ``(3, n)``."""
+        ...
+
+
+def _vector(values: Point, what: str) -> Array:
+    """A vector of three components from two or three."""
+    array = np.asarray(values, dtype=float)
+    if array.shape not in ((2,), (3,)) or not np.all(np.isfinite(array)):
+        raise InputError(f"{what}={values}: expected two or three finite numbers")
+    return np.pad(array, (0, 3 - len(array)))
+
+
+def _direction(values: Point, what: str) -> Array:
+    vector = _vector(values, what)
+    length = np.linalg.norm(vector)
+    if length == 0.0:
+        raise InputError(f"{what}={values}: expected a vector that is not zero")
+    return vector / length
+
+
+def _radius(radius: float) -> float:
+    if not radius > 0.0:
+        raise InputError(f"radius={radius}: expected a positive number")
+    return float(radius)
+
+
+class Plane:
+    """A half space behind a plane.
+
+    Args:
+        point: A point of the plane.
+        normal: Its normal, towards the free side; any length.
+    """
+
+    def __init__(self, point: Point, normal: Point) -> None:
+        self.point = _vector(point, "point")
+        self.normal = _direction(normal, "normal")
+
+    def distance(self, x: Array) -> Array:
+        """Signed distance, shape ``(n,)``."""
+        return self.normal @ (x - self.point[:, None])
+
+    def gradient(self, x: Array) -> Array:
+        """Gradient of the signed distance, shape ``(3, n)``."""
+        return np.repeat(self.normal[:, None], x.shape[1], axis=1)
+
+
+class Sphere:
+    """A ball (in 2D: a disc), or with ``inside`` a spherical cavity.
+
+    Args:
+        centre: The centre.
+        radius: The radius.
+        inside: Whether the bodies are inside the sphere.
+    """
+
+    def __init__(self, centre: Point, radius: float, inside: bool = False) -> None:
+        self.centre = _vector(centre, "centre")
+        self.radius = _radius(radius)
+        self.sign = -1.0 if inside else 1.0
+
+    def _offset(self, x: Array) -> Array:
+        return x - self.centre[:, None]
+
+    def distance(self, x: Array) -> Array:
+        """Signed distance, shape ``(n,)``."""
+        return self.sign * (np.linalg.norm(self._offset(x), axis=0) - self.radius)
+
+    def gradient(self, x: Array) -> Array:
+        """Gradient of the signed distance, shape ``(3, n)``; zero at the centre."""
+        offset = self._offset(x)
+        length = np.linalg.norm(offset, axis=0)
+        return self.sign * offset / np.where(length > 0.0, length, 1.0)
+
+
+class Cylinder(Sphere):
+    """An infinite cylinder, or with ``inside`` a cylindrical bore.
+
+    Args:
+        point: A point of the axis.
+        axis: Direction of the axis, any length.
+        radius: The radius.
+        inside: Whether the bodies are inside the cylinder.
+    """
+
+    def __init__(self, point: Point, axis: Point, radius: float, inside: bool = False) -> None:
+        super().__init__(point, radius, inside)
+        self.axis = _direction(axis, "axis")
+
+    def _offset(self, x: Array) -> Array:
+        offset = super()._offset(x)
+        return offset - np.outer(self.axis, self.axis @ offset)
+
+
+@dataclass(frozen=True)
+class SignedDistance:
+    """Any shape, by two callables of points of shape ``(3, n)``.
+
+    Args:
+        distance_of: Signed distance, positive on the free side, shape ``(n,)``.
+        gradient_of: Its gradient, shape ``(3, n)`` (or ``(2, n)`` in 2D).
+    """
+
+    distance_of: Callable[[Array], Array]
+    gradient_of: Callable[[Array], Array]
+
+    def distance(self, x: Array) -> Array:
+        """Signed distance, shape ``(n,)``."""
+        return np.asarray(self.distance_of(x), dtype=float)
+
+    def gradient(self, x: Array) -> Array:
+        """Gradient of the signed distance, shape ``(3, n)``."""
+        gradient = np.asarray(self.gradient_of(x), dtype=float)
+        return np.pad(gradient, ((0, 3 - len(gradient)), (0, 0)))

@@ -1,0 +1,81 @@
+"""Contact surfaces: their facets, and the integrals of the hats of their nodes."""
+
+from __future__ import annotations
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
+
+
+def surface_facets(decomposition: Decomposition, name: str | int) -> Array:
+    """Local facets of a contact surface, ascending. Collective.
+
+    Raises:
+        InputError: The surface is unknown, empty, or lies inside a body.
+    """
+    facets = decomposition.facets(name)
+    comm = decomposition.comm
+    if comm.allreduce(len(facets)) == 0:
+        raise InputError(f"surface {name!r} has no facets; expected a part of the boundary")
+    inside = np.setdiff1d(facets, decomposition.boundary, assume_unique=True)
+    if count := comm.allreduce(len(inside)):
+        raise InputError(
+            f"surface {name!r}: {count} of its facets lie inside a body; "
+            "expected facets on the boundary only"
+        )
+    return facets
+
+
+def hat_integrals(dofs: TornDofs, decomposition: Decomposition, name: str | int) -> Array:
+    """Integrals ∫φ_i of the nodes' basis functions over a surface. Collective.
+
+    Args:
+        dofs: Dof maps of the displacement space, of degree 1.
+        decomposition: The torn mesh.
+        name: Name or tag of the surface.
+
+    Returns:
+        One integral per owned group, zero off the surface, shape ``(g,)``.
+    """
+    V = dofs.V
+    ds = ufl.Measure("ds", domain=V.mesh, subdomain_data=decomposition.facet_tags)
+    v = ufl.TestFunction(V)
+    hat = v[0] if dofs.bs > 1 else v
+    one = fem.Constant(V.mesh, 1.0)
+    integrals = fem.assemble_vector(fem.form(one * hat * ds(decomposition.surface(name)))).array
+    per_node = integrals.reshape(-1, dofs.bs)[dofs.dolfinx_node, 0]
+    return dofs.reduce(per_node, np.add, 0.0)
+
+
+def on_surface(dofs: TornDofs, decomposition: Decomposition, facets: Array) -> Array:
+    """Owned groups that have a copy on the given local facets, ascending. Collective.
+
+    A copy that touches the surface only at a vertex or an edge has no facet there, so
+    membership is found on the copies that do and spread to the group.
+    """
+    fdim = decomposition.mesh.topology.dim - 1
+    nodes = fem.locate_dofs_topological(dofs.V, fdim, facets.astype(np.int32), remote=False)
+    member = np.zeros(dofs.num_nodes, dtype=bool)
+    member[dofs.primal_nodes(nodes)] = True
+    return np.flatnonzero(dofs.reduce(member, np.logical_or, False))
+
+
+def group_points(dofs: TornDofs) -> Array:
+    """Coordinates of the owned groups, shape ``(g, 3)``. Collective."""
+    x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node]
+    return dofs.reduce(x, np.minimum, np.inf)
+
+
+def diameter(decomposition: Decomposition) -> float:
+    """Length of the diagonal of the mesh's box. Collective."""
+    x = decomposition.mesh.geometry.x
+    low, high = x.min(axis=0, initial=np.inf), x.max(axis=0, initial=-np.inf)
+    decomposition.comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
+    decomposition.comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
+    return float(np.linalg.norm(high - low))

@@ -1,0 +1,84 @@
+"""Draws one picture in a process of its own: ``python3 draw.py DATA.npz PICTURE.png``.
+
+VTK aborts its process where an X server is missing or goes away, so it is kept apart from the
+ranks. This file is run as a script and imports nothing of the package: a child of an MPI process
+must not start MPI.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+
+def start_screen() -> subprocess.Popen[bytes] | None:
+    """Xvfb, unless there is an X server already."""
+    if os.environ.get("DISPLAY"):
+        return None
+    read, write = os.pipe()
+    command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1280x1024x24"]
+    server = subprocess.Popen(
+        [*command, "-nolisten", "tcp"],
+        pass_fds=[write],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    os.close(write)
+    with os.fdopen(read) as pipe:
+        number = pipe.readline().strip()
+    if not number:
+        raise RuntimeError("Xvfb did not start")
+    os.environ["DISPLAY"] = f":{number}"
+    return server
+
+
+def draw(data: Mapping[str, Any], target: str) -> None:
+    """Draw a deformed mesh, coloured by a nodal field.
+
+    Args:
+        data: Arrays ``cells``, ``types``, ``points``, ``moved``, ``values``, and scalars ``name``,
+            ``factor`` (nan: the largest displacement becomes 5 % of the scene), ``zoom``,
+            ``focus`` (nan: the centre), ``edges``.
+        target: The ``.png`` to write.
+    """
+    import pyvista
+
+    grid = pyvista.UnstructuredGrid(data["cells"], data["types"], data["points"])
+    name, factor = str(data["name"]), float(data["factor"])
+    grid["u"], grid[name] = data["moved"], data["values"]
+    if np.isnan(factor):
+        size = np.linalg.norm(np.ptp(grid.points, axis=0))
+        factor = float(0.05 * size / max(np.abs(grid["u"]).max(), 1e-300))
+    flat = bool(np.ptp(grid.points[:, 2]) == 0.0)
+    plotter = pyvista.Plotter(off_screen=True, window_size=[1200, 900])
+    plotter.add_mesh(
+        grid.warp_by_vector("u", factor=factor),
+        scalars=name,
+        show_edges=bool(data["edges"]),
+        cmap="viridis",
+        lighting=not flat,
+    )
+    plotter.add_text(f"displacement x {factor:.3g}", font_size=10)
+    if flat:
+        plotter.view_xy()
+    if np.all(np.isfinite(data["focus"])):
+        plotter.set_focus(data["focus"])
+        if flat:
+            x, y, _ = data["focus"]
+            plotter.camera.position = (x, y, plotter.camera.position[2])
+    plotter.camera.zoom(float(data["zoom"]))
+    plotter.screenshot(target)
+
+
+if __name__ == "__main__":
+    screen = start_screen()
+    draw(np.load(sys.argv[1]), sys.argv[2])
+    sys.stderr.flush()
+    if screen is not None:
+        screen.kill()
+    os._exit(0)  # VTK's own end would want the screen

@@ -1,0 +1,1 @@
+"""The dual problem: F, G, d, e, coarse projectors, preconditioners, recovery."""

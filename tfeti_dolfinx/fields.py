@@ -1,0 +1,85 @@
+"""Fields for a user to look at: stress, von Mises, and nodal averages over cells and tears."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import ufl
+from dolfinx import fem
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.assembly import JIT_OPTIONS
+from tfeti_dolfinx.compat import interpolation_points
+from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.mesh.dofs import TornDofs
+
+Stress = Callable[[Any], Any]
+
+
+def von_mises(sigma: Any) -> Any:
+    """Von Mises stress of a 3×3 tensor, as a UFL expression."""
+    deviator = sigma - ufl.tr(sigma) / 3 * ufl.Identity(3)
+    return ufl.sqrt(1.5 * ufl.inner(deviator, deviator))
+
+
+def checked_stress(stress: Stress, u: fem.Function) -> Any:
+    """The stress of u as a UFL expression.
+
+    Raises:
+        InputError: It is not a 3×3 tensor.
+    """
+    sigma = stress(u)
+    if sigma.ufl_shape != (3, 3):
+        raise InputError(
+            f"stress(u) has shape {sigma.ufl_shape}; expected (3, 3), in plane strain with σ_zz"
+        )
+    return sigma
+
+
+def cellwise(expression: Any, dofs: TornDofs, name: str) -> fem.Function:
+    """A UFL expression at the nodes of each cell, discontinuous between cells. Collective."""
+    element = ("DG", dofs.V.element.basix_element.degree, expression.ufl_shape)
+    W = fem.functionspace(dofs.V.mesh, element if expression.ufl_shape else element[:2])
+    function = fem.Function(W, name=name)
+    points = interpolation_points(W)
+    function.interpolate(fem.Expression(expression, points, jit_options=JIT_OPTIONS))
+    return function
+
+
+def nodal(expression: Any, dofs: TornDofs, name: str) -> fem.Function:
+    """A UFL expression averaged at the nodes, weighted by the cells' volumes. Collective.
+
+    The average goes over the cells of all torn copies, so the field has no jumps at the tears.
+    """
+    in_cells = cellwise(expression, dofs, name)
+    shape = expression.ufl_shape
+    degree = dofs.V.element.basix_element.degree
+    W = fem.functionspace(
+        dofs.V.mesh, ("Lagrange", degree, shape) if shape else ("Lagrange", degree)
+    )
+    size = W.dofmap.index_map_bs
+    cells = np.asarray(W.dofmap.list)
+    weight = np.repeat(_volumes(dofs), cells.shape[1])
+    values = in_cells.x.array.reshape(-1, size)[np.asarray(in_cells.function_space.dofmap.list)]
+    sums = np.zeros((W.dofmap.index_map.size_local, size + 1))
+    np.add.at(
+        sums,
+        cells.ravel(),
+        np.column_stack((values.reshape(-1, size) * weight[:, None], weight)),
+    )
+    sums = dofs.spread(dofs.reduce(sums[dofs.dolfinx_node], np.add, 0.0))
+    averages = np.empty((len(sums), size))
+    averages[dofs.dolfinx_node] = sums[:, :-1] / sums[:, -1:]
+    function = fem.Function(W, name=name)
+    function.x.array[:] = averages.ravel()
+    return function
+
+
+def _volumes(dofs: TornDofs) -> Array:
+    """Volume of each local cell."""
+    W = fem.functionspace(dofs.V.mesh, ("DG", 0))
+    form = fem.form(ufl.TestFunction(W) * ufl.dx(metadata={"quadrature_degree": 2}))
+    volumes = fem.assemble_vector(form).array
+    return np.asarray(volumes[np.asarray(W.dofmap.list)[:, 0]])

@@ -1,0 +1,1 @@
+"""Rows of B and c: interfaces, Dirichlet values, contact."""

@@ -1,0 +1,85 @@
+"""B as a distributed PETSc matrix (dual rows × trace unknowns), and c."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from petsc4py import PETSc
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.gluing.rows import Rows, stack
+from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.parallel import Exchange, chunk_offsets, owner_of
+
+
+@dataclass(frozen=True)
+class Constraints:
+    """B u = c on equality rows, B u ≤ c on inequality rows.
+
+    A rank's rows stand in the order [E; N]. B acts on *trace* unknowns only: primal unknowns
+    that some row touches, sorted as the primal ones.
+
+    Attributes:
+        B: Dual rows × trace unknowns, MPIAIJ.
+        c: Right sides, distributed as the rows.
+        num_equalities: Local equality rows.
+        num_rows: All local rows.
+        trace: Local primal unknown of each local trace unknown, ascending.
+        weights: D on the local trace unknowns: the rows are scaled with it.
+    """
+
+    B: PETSc.Mat
+    c: PETSc.Vec
+    num_equalities: int
+    num_rows: int
+    trace: Array
+    weights: Array
+
+    @property
+    def inequalities(self) -> slice:
+        """Local rows that are inequalities."""
+        return slice(self.num_equalities, self.num_rows)
+
+    def destroy(self) -> None:
+        """Destroy the PETSc objects. Collective."""
+        self.B.destroy()
+        self.c.destroy()
+
+
+def assemble_constraints(
+    dofs: TornDofs, equalities: Rows, inequalities: Rows, weights: Array
+) -> Constraints:
+    """Assemble B and c. Collective.
+
+    Args:
+        dofs: Dof maps.
+        equalities: Gluing and Dirichlet rows of this rank.
+        inequalities: Contact rows of this rank.
+        weights: D on the local primal unknowns.
+    """
+    rows = stack([equalities, inequalities])
+    trace, column = _trace_columns(dofs, rows.column)
+    num_rows, num_columns = len(rows), len(trace)
+    order = np.lexsort((column, rows.row))
+    indptr = np.concatenate(([0], np.cumsum(np.bincount(rows.row, minlength=num_rows))))
+    index = PETSc.IntType
+    B = PETSc.Mat().createAIJ(
+        size=((num_rows, None), (num_columns, None)),
+        csr=(indptr.astype(index), column[order].astype(index), rows.value[order]),
+        comm=dofs.comm,
+    )
+    c = B.createVecLeft()
+    c.array[:] = rows.rhs
+    return Constraints(B, c, len(equalities), num_rows, trace, weights[trace])
+
+
+def _trace_columns(dofs: TornDofs, column: Array) -> tuple[Array, Array]:
+    """Local primal unknowns that rows of any rank touch, and the entries' global trace column."""
+    offsets = dofs.offsets * dofs.bs
+    needed, place = np.unique(column, return_inverse=True)
+    exchange = Exchange(dofs.comm, owner_of(offsets, needed))
+    asked = exchange.send(needed) - offsets[dofs.comm.rank]
+    trace = np.unique(asked)
+    start = chunk_offsets(dofs.comm, len(trace))[dofs.comm.rank]
+    return trace, exchange.answer(start + np.searchsorted(trace, asked))[place]

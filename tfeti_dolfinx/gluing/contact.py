@@ -1,0 +1,119 @@
+"""Non-penetration rows: spread over torn copies, freed of prescribed components, scaled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.contact.records import ContactRecords
+from tfeti_dolfinx.errors import NoSolutionError, raised_on_all_ranks
+from tfeti_dolfinx.gluing.prescribed import Prescribed
+from tfeti_dolfinx.gluing.rows import Rows
+from tfeti_dolfinx.mesh.dofs import TornDofs
+
+NOTHING_LEFT = 1e-10
+
+
+@dataclass(frozen=True)
+class InequalityRows:
+    """B_N and its right side, with what leads back to lengths and forces.
+
+    Attributes:
+        rows: The rows, of unit norm.
+        condition: Condition (of the records) of each row, shape ``(n,)``.
+        scale: The s_i that a condition was multiplied by, shape ``(n,)``: its force is s_i λ_i.
+        dropped: Conditions of this rank that prescribed components decide alone.
+    """
+
+    rows: Rows
+    condition: Array
+    scale: Array
+    dropped: int
+
+
+def inequality_rows(
+    dofs: TornDofs,
+    prescribed: Prescribed,
+    weights: Array,
+    records: ContactRecords,
+    chosen: Array,
+    length: float,
+) -> InequalityRows:
+    """B_N and its right side from contact conditions. Collective.
+
+    A coefficient a becomes a·w/Σw on each torn copy, w its weight in D (a/k on k copies of equal
+    weight): so the rows are orthogonal to the gluing rows in the inner product of D⁻¹.
+    Prescribed components move to the right side. Then the whole row is scaled to unit norm by
+    one number s_i. If less than 1e-10 of it remains, it is dropped.
+
+    Args:
+        dofs: Dof maps.
+        prescribed: Dirichlet values.
+        weights: D for each copy of the owned groups, shape ``(c, bs)``.
+        records: Conditions of this rank.
+        chosen: Which of them get a row, shape ``(n,)``.
+        length: A length of the scene; gaps below 1e-10 of it count as zero.
+
+    Raises:
+        NoSolutionError: Prescribed components alone violate a condition.
+    """
+    sums = np.add.reduceat(weights, dofs.copy_offsets[:-1]) if len(weights) else weights
+    flag, value, total = dofs.lookup(records.entry_group, prescribed.flag, prescribed.value, sums)
+
+    def squared_norms(coefficients: Array) -> Array:
+        squares = np.sum(coefficients**2 / total, axis=1)
+        return np.bincount(records.row, weights=squares, minlength=len(records))
+
+    held = np.sum(np.where(flag, records.coefficients * value, 0.0), axis=1)
+    rhs = records.gap - np.bincount(records.row, weights=held, minlength=len(records))
+    free = np.where(flag, 0.0, records.coefficients)
+    before, after = squared_norms(records.coefficients), squared_norms(free)
+    kept = chosen & (after > NOTHING_LEFT**2 * before)
+    decided = chosen & ~kept
+    with raised_on_all_ranks(dofs.comm):
+        _check_dropped(rhs[decided], length)
+    condition = np.flatnonzero(kept)
+    scale = 1.0 / np.sqrt(after[kept])
+    return InequalityRows(
+        rows=_spread(dofs, weights, records, free / total, rhs, condition, scale),
+        condition=condition,
+        scale=scale,
+        dropped=int(np.sum(decided)),
+    )
+
+
+def _check_dropped(rhs: Array, length: float) -> None:
+    if np.any(rhs < -NOTHING_LEFT * length):
+        raise NoSolutionError(
+            "an obstacle or a contact lies within a part of the surface whose displacement is "
+            f"prescribed: {np.sum(rhs < -NOTHING_LEFT * length)} nodes penetrate by up to "
+            f"{-rhs.min():.6g} whatever the rest does"
+        )
+
+
+def _spread(
+    dofs: TornDofs,
+    weights: Array,
+    records: ContactRecords,
+    per_weight: Array,
+    rhs: Array,
+    condition: Array,
+    scale: Array,
+) -> Rows:
+    """Rows of the conditions kept, their coefficients per weight spread over the copies."""
+    place = np.full(len(records), -1)
+    place[condition] = np.arange(len(condition))
+    used = np.flatnonzero(place[records.row] >= 0)
+    entry, node, weight = dofs.lookup_copies(records.entry_group[used], weights)
+    row = place[records.row[used[entry]]]
+    values = per_weight[used[entry]] * weight * scale[row][:, None]
+    columns = node[:, None] * dofs.bs + np.arange(dofs.bs)
+    return Rows(
+        group=records.group[condition],
+        rhs=rhs[condition] * scale,
+        row=np.repeat(row, dofs.bs),
+        column=columns.ravel(),
+        value=values.ravel(),
+    ).without_zeros()

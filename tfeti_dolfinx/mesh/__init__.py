@@ -1,0 +1,1 @@
+"""Meshes in, subdomains out: gmsh input, partitioning, tearing, tags."""

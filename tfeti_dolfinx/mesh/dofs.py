@@ -1,0 +1,256 @@
+"""The one home of every dof map: DOLFINx's numbering, the subdomains', and the groups of copies."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import basix
+import numpy as np
+from dolfinx import fem
+from mpi4py import MPI
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.compat import geometry_dofmap
+from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.entities import cell_entities, mix, set_key
+from tfeti_dolfinx.parallel import Exchange, chunk_offsets, owner_of
+
+
+class TornDofs:
+    """Numberings of the nodes of a Lagrange space on a torn mesh.
+
+    A *node* is a point with ``bs`` unknowns. *Primal* numbering sorts a rank's nodes by
+    subdomain. A *group* is the set of all torn copies of a node, on any rank; it is owned by the
+    rank of its lowest subdomain. Creation and all methods that say so are collective.
+
+    Args:
+        V: Lagrange space on the torn mesh, scalar or blocked.
+        decomposition: The decomposition that the mesh belongs to.
+
+    Attributes:
+        bs: Unknowns per node.
+        subdomains: Subdomains of this rank, ascending, shape ``(S,)``.
+        node_offsets: First primal node of each subdomain, shape ``(S + 1,)``.
+        dolfinx_node: DOLFINx's node for each primal node, shape ``(n,)``.
+        offsets: First global primal node of each rank, shape ``(size + 1,)``.
+        group_offsets: First global group of each rank, shape ``(size + 1,)``.
+        group: Global group of each local primal node, shape ``(n,)``.
+        copy_offsets: First copy of each owned group, shape ``(g + 1,)``.
+        copies: Global primal nodes of the owned groups, by subdomain, shape ``(c,)``.
+        copy_subdomains: Their subdomains, shape ``(c,)``.
+
+    Raises:
+        InputError: ``V`` is not a continuous Lagrange space on the torn mesh.
+    """
+
+    def __init__(self, V: fem.FunctionSpace, decomposition: Decomposition) -> None:
+        _check_space(V, decomposition)
+        self.V = V
+        self.comm = decomposition.comm
+        self.bs = V.dofmap.index_map_bs
+        self._number_nodes(decomposition)
+        self.offsets = chunk_offsets(self.comm, self.num_nodes)
+        origin, key = _node_keys(V, decomposition)
+        self._find_groups(decomposition, origin[self.dolfinx_node], key[self.dolfinx_node])
+
+    @property
+    def num_nodes(self) -> int:
+        """Primal nodes of this rank."""
+        return len(self.dolfinx_node)
+
+    @property
+    def num_groups(self) -> int:
+        """Groups owned by this rank."""
+        return len(self.copy_offsets) - 1
+
+    @property
+    def multiplicity(self) -> Array:
+        """Number of copies in each owned group, shape ``(g,)``."""
+        return np.diff(self.copy_offsets)
+
+    def to_primal(self, values: Array) -> Array:
+        """Unrolled dof values from DOLFINx's order to primal order, shape ``(n * bs,)``."""
+        return values.reshape(-1, self.bs)[self.dolfinx_node].ravel()
+
+    def to_dolfinx(self, values: Array) -> Array:
+        """Unrolled dof values from primal order to DOLFINx's order, shape ``(n * bs,)``."""
+        out = np.empty((self.num_nodes, self.bs))
+        out[self.dolfinx_node] = values.reshape(-1, self.bs)
+        return out.ravel()
+
+    def dolfinx_dofs(self) -> Array:
+        """DOLFINx's unrolled dof for each primal dof, shape ``(n * bs,)``."""
+        return (self.dolfinx_node[:, None] * self.bs + np.arange(self.bs)).ravel()
+
+    def primal_nodes(self, dolfinx_nodes: Array) -> Array:
+        """Primal nodes of DOLFINx's local nodes."""
+        return self._primal_node[dolfinx_nodes]
+
+    def reduce(self, values: Array, op: np.ufunc, initial: Any) -> Array:
+        """Combine the values of all copies of a node. Collective.
+
+        Args:
+            values: One value (or row) per local primal node, shape ``(n, ...)``.
+            op: ``np.add``, ``np.maximum``, ``np.minimum`` or ``np.logical_or``.
+            initial: Neutral element of ``op``.
+
+        Returns:
+            One value per owned group, shape ``(g, ...)``.
+        """
+        out = np.full((self.num_groups, *values.shape[1:]), initial, dtype=values.dtype)
+        op.at(out, self._to_owner_slot, self._to_owner.send(values))
+        return out
+
+    def spread(self, values: Array) -> Array:
+        """Give every copy its group's value: shape ``(g, ...)`` to ``(n, ...)``. Collective."""
+        return self._to_owner.answer(values[self._to_owner_slot])
+
+    def lookup(self, groups: Array, *tables: Array) -> tuple[Array, ...]:
+        """Rows of tables that the owners of groups hold. Collective.
+
+        Args:
+            groups: Global groups, any of them, shape ``(k,)``.
+            tables: Arrays with one row per owned group.
+
+        Returns:
+            For each table its rows for ``groups``.
+        """
+        owner = owner_of(self.group_offsets, groups)
+        exchange = Exchange(self.comm, owner)
+        asked = exchange.send(groups) - self.group_offsets[self.comm.rank]
+        return tuple(exchange.answer(table[asked]) for table in tables)
+
+    def gather_copies(self, values: Array) -> Array:
+        """Values of the local primal nodes in the order of the owned ``copies``. Collective.
+
+        Args:
+            values: One value (or row) per local primal node, shape ``(n, ...)``.
+
+        Returns:
+            One per copy, shape ``(c, ...)``.
+        """
+        return self._to_owner.send(values)[self._copy_order]
+
+    def lookup_copies(self, groups: Array, *tables: Array) -> tuple[Array, ...]:
+        """All copies of groups, wherever they are owned. Collective.
+
+        Args:
+            groups: Global groups, shape ``(k,)``.
+            tables: Arrays with one row per copy of the owned groups.
+
+        Returns:
+            Position in ``groups`` of each copy, and for ``copies`` and each table its row.
+        """
+        position, columns = np.arange(len(groups)), (self.copies, *tables)
+        (count,) = self.lookup(groups, self.multiplicity)
+        last = np.maximum(self.copy_offsets[1:] - 1, 0)
+        found: list[tuple[Array, ...]] = []
+        for j in range(self.comm.allreduce(int(count.max(initial=1)), op=MPI.MAX)):
+            asked = position[count > j]
+            jth = np.minimum(self.copy_offsets[:-1] + j, last)
+            found.append((asked, *self.lookup(groups[asked], *(c[jth] for c in columns))))
+        return tuple(np.concatenate(parts) for parts in zip(*found, strict=True))
+
+    def _number_nodes(self, decomposition: Decomposition) -> None:
+        """Sort nodes by subdomain, keeping DOLFINx's order within each."""
+        cells = np.asarray(self.V.dofmap.list)
+        num_nodes = self.V.dofmap.index_map.size_local
+        subdomain = np.empty(num_nodes, dtype=np.int64)
+        subdomain[cells] = decomposition.cell_subdomain[:, None]
+        self.dolfinx_node = np.argsort(subdomain, kind="stable")
+        self._primal_node = np.empty_like(self.dolfinx_node)
+        self._primal_node[self.dolfinx_node] = np.arange(num_nodes)
+        self.subdomains = decomposition.subdomains
+        in_order = subdomain[self.dolfinx_node]
+        self.node_offsets = np.append(np.searchsorted(in_order, self.subdomains), num_nodes)
+        self.node_subdomain = in_order
+
+    def _find_groups(self, decomposition: Decomposition, origin: Array, key: Array) -> None:
+        """Find all copies of each node.
+
+        Only nodes on the boundary of a subdomain can have copies. They meet on the rank that
+        their key names, which tells each the rank of its lowest subdomain, the owner.
+        """
+        body = decomposition.body_of_subdomain[self.node_subdomain]
+        key = mix(key + mix(body))
+        owner = np.full(self.num_nodes, self.comm.rank, dtype=np.int64)
+        shared = self._boundary_nodes(decomposition)
+        owner[shared] = _owners(self.comm, key[shared], self.node_subdomain[shared])
+        exchange = Exchange(self.comm, owner)
+        node = exchange.send(self.offsets[self.comm.rank] + np.arange(self.num_nodes))
+        subdomain = exchange.send(self.node_subdomain)
+        origin, key = exchange.send(origin), exchange.send(key)
+        order = np.lexsort((subdomain, key, origin))
+        first = np.ones(len(order), dtype=bool)
+        first[1:] = key[order[1:]] != key[order[:-1]]
+        slot = np.empty(len(order), dtype=np.int64)
+        slot[order] = np.cumsum(first) - 1
+        self.copies, self.copy_subdomains = node[order], subdomain[order]
+        self.copy_offsets = np.append(np.flatnonzero(first), len(order))
+        self._to_owner, self._to_owner_slot, self._copy_order = exchange, slot, order
+        self.group_offsets = chunk_offsets(self.comm, self.num_groups)
+        self.group = exchange.answer(self.group_offsets[self.comm.rank] + slot)
+
+    def _boundary_nodes(self, decomposition: Decomposition) -> Array:
+        facets = np.union1d(decomposition.tears, decomposition.boundary).astype(np.int32)
+        fdim = decomposition.mesh.topology.dim - 1
+        return self.primal_nodes(fem.locate_dofs_topological(self.V, fdim, facets, remote=False))
+
+
+def _check_space(V: fem.FunctionSpace, decomposition: Decomposition) -> None:
+    if V.mesh is not decomposition.mesh:
+        raise InputError("the space is not on decomposition.mesh, the torn mesh")
+    try:
+        element = V.element.basix_element
+    except RuntimeError as error:
+        raise InputError("mixed spaces are not supported, expected a Lagrange space") from error
+    if element.family != basix.ElementFamily.P or element.discontinuous or element.degree < 1:
+        raise InputError(
+            f"space {V.ufl_element()}: expected a continuous Lagrange space of degree 1 or more"
+        )
+
+
+def _owners(comm: MPI.Intracomm, key: Array, subdomain: Array) -> Array:
+    """For each key the rank that sends it with the lowest subdomain. Collective."""
+    exchange = Exchange(comm, (key % np.uint64(comm.size)).astype(np.int64))
+    key, subdomain = exchange.send(key), exchange.send(subdomain)
+    order = np.lexsort((subdomain, key))
+    _, start, inverse = np.unique(key[order], return_index=True, return_inverse=True)
+    owner = np.empty(len(key), dtype=np.int64)
+    owner[order] = exchange.source[order][start][inverse]
+    return exchange.answer(owner)
+
+
+def _node_keys(V: fem.FunctionSpace, decomposition: Decomposition) -> tuple[Array, Array]:
+    """For each DOLFINx node its lowest original vertex, and a key that all copies share.
+
+    The key comes from the vertices of the mesh entity that the node belongs to; where an entity
+    has several nodes, their relative distances to its vertices tell them apart.
+    """
+    mesh = V.mesh
+    cell_type = mesh.topology.cell_type
+    geometry = geometry_dofmap(mesh)[:, : len(cell_entities(cell_type, 0))]
+    ids = decomposition.original_nodes[geometry]
+    dofs = np.asarray(V.dofmap.list)
+    origin = np.empty(V.dofmap.index_map.size_local, dtype=np.int64)
+    key = np.empty(len(origin), dtype=np.uint64)
+    for dim, entity_dofs in enumerate(V.element.basix_element.entity_dofs):
+        for vertices, entity in zip(cell_entities(cell_type, dim), entity_dofs, strict=True):
+            for j in entity:
+                nodes = dofs[:, j]
+                origin[nodes] = ids[:, vertices].min(axis=1)
+                key[nodes] = set_key(ids[:, vertices])
+                if len(entity) > 1:
+                    corners = mesh.geometry.x[geometry[:, vertices]]
+                    key[nodes] += _place(V, nodes, corners, ids[:, vertices])
+    return origin, key
+
+
+def _place(V: fem.FunctionSpace, nodes: Array, corners: Array, ids: Array) -> Array:
+    """Key of a node's place within an entity: its relative distances to the sorted vertices."""
+    x = V.tabulate_dof_coordinates()[nodes]
+    distance = np.linalg.norm(corners - x[:, None], axis=2)
+    distance = np.take_along_axis(distance, np.argsort(ids, axis=1), axis=1)
+    share = np.rint(1e6 * distance / distance.sum(axis=1, keepdims=True))
+    return mix((share * (1 + np.arange(share.shape[1]))).sum(axis=1).astype(np.uint64))

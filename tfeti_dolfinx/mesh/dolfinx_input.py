@@ -1,0 +1,117 @@
+"""Decomposition of a mesh that was made in DOLFINx."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from dolfinx import mesh as dmesh
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.compat import geometry_dofmap
+from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.entities import NO_TAG, cell_facets
+from tfeti_dolfinx.mesh.partition import (
+    Subdomains,
+    assign_subdomains,
+    coordinate_bisection,
+    default_count,
+)
+from tfeti_dolfinx.mesh.tearing import tear
+from tfeti_dolfinx.mesh.untorn import GroupNames, UntornMesh
+from tfeti_dolfinx.timing import stage
+
+CELL_TYPES = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
+
+
+def decompose(
+    mesh: dmesh.Mesh,
+    subdomains: Subdomains | None = None,
+    cell_tags: dmesh.MeshTags | None = None,
+    facet_tags: dmesh.MeshTags | None = None,
+    *,
+    surfaces: dict[str, int] | None = None,
+    volumes: dict[str, int] | None = None,
+) -> Decomposition:
+    """Tear a DOLFINx mesh into subdomains. Collective.
+
+    Args:
+        mesh: The mesh, distributed in any way.
+        subdomains: Number of subdomains (recursive coordinate bisection); or one id for each
+            cell owned by this rank; or a callable that gets cell midpoints, shape ``(3, n)``,
+            and returns one id per cell. Default: about 4000 unknowns per subdomain.
+        cell_tags: Material tags.
+        facet_tags: Surface tags.
+        surfaces: Names of surface tags; a tag that has none is named by its number.
+        volumes: Names of cell tags.
+
+    Returns:
+        The torn mesh. Which subdomain a cell belongs to does not depend on the number of ranks.
+
+    Raises:
+        InputError: The cells are not triangles, quadrilaterals, tetrahedra or hexahedra, or
+            the subdomains do not fit.
+    """
+    seconds: dict[str, float] = {}
+    with stage("mesh", seconds):
+        untorn = _untorn(mesh, cell_tags, facet_tags, surfaces or {}, volumes or {})
+        if subdomains is None:
+            subdomains = default_count(untorn, mesh.comm)
+        subdomain = assign_subdomains(untorn, subdomains, mesh.comm, coordinate_bisection)
+        ours = isinstance(subdomains, (int, np.integer))
+        decomposition = tear(untorn, subdomain, mesh.comm, absorb=ours)
+    return replace(decomposition, seconds=seconds)
+
+
+def _untorn(
+    mesh: dmesh.Mesh,
+    cell_tags: dmesh.MeshTags | None,
+    facet_tags: dmesh.MeshTags | None,
+    surfaces: dict[str, int],
+    volumes: dict[str, int],
+) -> UntornMesh:
+    topology, gdim = mesh.topology, mesh.geometry.dim
+    if topology.cell_type.name not in CELL_TYPES or topology.dim != gdim:
+        raise InputError(
+            f"mesh of {topology.cell_type.name}s in {gdim}D: expected one of "
+            f"{', '.join(CELL_TYPES)} in its own dimension"
+        )
+    owned = topology.index_map(topology.dim).size_local
+    nodes = geometry_dofmap(mesh)[:owned]
+    ids = np.asarray(mesh.geometry.input_global_indices)
+    used, local = np.unique(ids[nodes], return_inverse=True)
+    position = np.zeros(len(used), dtype=np.int64)
+    position[local.ravel()] = nodes.ravel()
+    return UntornMesh(
+        cell_type=topology.cell_type,
+        element=mesh.ufl_domain().ufl_coordinate_element(),
+        cells=ids[nodes],
+        cell_ids=np.asarray(topology.original_cell_index[:owned], dtype=np.int64),
+        cell_tags=_values(cell_tags, np.arange(owned)),
+        facet_tags=_values(facet_tags, cell_facets(mesh)),
+        node_ids=used,
+        x=mesh.geometry.x[position, :gdim],
+        names=GroupNames(
+            surfaces=_names(mesh, facet_tags, surfaces),
+            volumes=_names(mesh, cell_tags, volumes),
+        ),
+    )
+
+
+def _values(tags: dmesh.MeshTags | None, entities: Array) -> Array:
+    """Tag of each entity, NO_TAG where there is none."""
+    if tags is None or len(tags.indices) == 0:
+        return np.full(entities.shape, NO_TAG, dtype=np.int32)
+    size = max(entities.max(initial=-1), tags.indices.max()) + 1
+    values = np.full(size, NO_TAG, dtype=np.int32)
+    values[tags.indices] = tags.values
+    return values[entities]
+
+
+def _names(mesh: dmesh.Mesh, tags: dmesh.MeshTags | None, given: dict[str, int]) -> dict[str, int]:
+    """The names given, and for tags without a name their numbers."""
+    local = set() if tags is None else set(np.unique(tags.values).tolist())
+    present = set().union(*mesh.comm.allgather(local))
+    unnamed = sorted(present - set(given.values()))
+    return {**given, **{str(tag): tag for tag in unnamed}}

@@ -1,0 +1,148 @@
+"""Files for ParaView: VTX where DOLFINx has ADIOS2, else XDMF; they appear whole."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import dolfinx
+import numpy as np
+from dolfinx import fem, io
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.entities import NO_TAG
+from tfeti_dolfinx.solution import Solution
+
+
+def write_vtx(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
+    """Write all fields of a solution for ParaView. Collective.
+
+    Nodal fields (displacement, pressure, gap, status and, if the problem has a stress, stress
+    and von Mises stress averaged at the nodes) go to ``path``; cell fields (subdomain, body,
+    material) to a second file beside it, ``<stem>_cells.bp``.
+
+    Args:
+        path: A name that ends with ``.bp``. Where DOLFINx has no ADIOS2, XDMF files with the
+            same stem are written instead.
+        solution: The solution.
+
+    Returns:
+        The files written.
+
+    Raises:
+        InputError: The name does not end with ``.bp``.
+    """
+    target = Path(path)
+    if target.suffix != ".bp":
+        raise InputError(f"{target}: expected a name that ends with .bp")
+    if not dolfinx.has_adios2:
+        return write_xdmf(target.with_suffix(".xdmf"), solution)
+    cells = target.with_name(f"{target.stem}_cells.bp")
+    for name, functions in ((target, nodal_fields(solution)), (cells, cell_fields(solution))):
+        partial = _begin(name, solution)
+        with io.VTXWriter(solution.decomposition.comm, partial, functions, engine="BP4") as vtx:
+            vtx.write(0.0)
+        _replace(partial, name, solution)
+    return [target, cells]
+
+
+def write_xdmf(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
+    """Write all fields of a solution to one XDMF file and its HDF5 companion. Collective.
+
+    Nodal fields are interpolated to the degree of the mesh geometry, which XDMF requires.
+
+    Returns:
+        The files written.
+
+    Raises:
+        InputError: The name does not end with ``.xdmf``.
+    """
+    target = Path(path)
+    if target.suffix != ".xdmf":
+        raise InputError(f"{target}: expected a name that ends with .xdmf")
+    decomposition = solution.decomposition
+    folder = _begin(target.with_name(f"{target.stem}.folder"), solution)
+    if decomposition.comm.rank == 0:
+        folder.mkdir(parents=True)
+    decomposition.comm.barrier()
+    with io.XDMFFile(decomposition.comm, folder / target.name, "w") as xdmf:
+        xdmf.write_mesh(decomposition.mesh)
+        for function in (*nodal_fields(solution), *cell_fields(solution)):
+            xdmf.write_function(_as_geometry(function, decomposition))
+    companion = target.with_suffix(".h5")
+    for name in (companion, target):
+        _replace(folder / name.name, name, solution)
+    if decomposition.comm.rank == 0:
+        folder.rmdir()
+    return [target, companion]
+
+
+def nodal_fields(solution: Solution) -> list[fem.Function]:
+    """All nodal fields, on the displacement's element. Collective."""
+    fields = [solution.displacement, solution.pressure, solution.gap, solution.status]
+    if solution.has_stress:
+        fields += [solution.nodal_stress, solution.nodal_von_mises]
+    return fields
+
+
+def cell_fields(solution: Solution) -> list[fem.Function]:
+    """Subdomain, body and material (-1 where a cell has no tag). Collective."""
+    decomposition = solution.decomposition
+    subdomain = decomposition.cell_subdomain
+    material = np.full(len(subdomain), NO_TAG)
+    material[decomposition.cell_tags.indices] = decomposition.cell_tags.values
+    W = fem.functionspace(decomposition.mesh, ("DG", 0))
+    return [
+        _cell_function(W, "subdomain", subdomain),
+        _cell_function(W, "body", decomposition.body_of_subdomain[subdomain]),
+        _cell_function(W, "material", np.where(material == NO_TAG, -1, material)),
+    ]
+
+
+def _cell_function(W: fem.FunctionSpace, name: str, values: Array) -> fem.Function:
+    function = fem.Function(W, name=name)
+    function.x.array[np.asarray(W.dofmap.list)[:, 0]] = values
+    return function
+
+
+def _as_geometry(function: fem.Function, decomposition: Decomposition) -> fem.Function:
+    """The function on the element of the mesh geometry; cell functions as they are."""
+    V = function.function_space
+    degree = decomposition.mesh.ufl_domain().ufl_coordinate_element().degree
+    if V.element.basix_element.degree in (0, degree):
+        return function
+    shape = function.ufl_shape
+    W = fem.functionspace(V.mesh, ("Lagrange", degree, shape) if shape else ("Lagrange", degree))
+    copy = fem.Function(W, name=function.name)
+    copy.interpolate(function)
+    return copy
+
+
+def _begin(name: Path, solution: Solution) -> Path:
+    """Name to write to until the file is whole; what an earlier run left there is removed."""
+    partial = name.with_name(f".{name.name}.partial")
+    comm = solution.decomposition.comm
+    with raised_on_all_ranks(comm):
+        if comm.rank == 0:
+            name.parent.mkdir(parents=True, exist_ok=True)
+            _remove(partial)
+    return partial
+
+
+def _replace(partial: Path, name: Path, solution: Solution) -> None:
+    comm = solution.decomposition.comm
+    comm.barrier()
+    with raised_on_all_ranks(comm):
+        if comm.rank == 0:
+            _remove(name)
+            os.replace(partial, name)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

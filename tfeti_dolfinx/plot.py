@@ -1,0 +1,186 @@
+"""Pictures without a screen; only here, and in the process that draws, is a plotting library."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from dolfinx import plot as dplot
+
+from tfeti_dolfinx import draw
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.errors import InputError, TfetiError, raised_on_all_ranks
+from tfeti_dolfinx.solution import Solution
+
+SECONDS = 600
+
+
+def plot_deformed(
+    path: str | os.PathLike[str],
+    solution: Solution,
+    *,
+    factor: float | None = None,
+    zoom: float = 1.0,
+    focus: tuple[float, float, float] | None = None,
+    show_edges: bool = True,
+) -> Path:
+    """Picture of the deformed bodies, coloured by von Mises stress. Collective.
+
+    Rank 0 draws; the cells of all ranks travel there.
+
+    Args:
+        path: The ``.png`` to write.
+        solution: A solution of a problem with a stress.
+        factor: Displacements are drawn times this; default such that the largest is 5 % of the
+            scene.
+        zoom: Camera zoom.
+        focus: Point that the camera looks at.
+        show_edges: Whether to draw cell edges.
+
+    Returns:
+        The file written.
+
+    Raises:
+        InputError: There is no X server and no Xvfb to start one, or the problem has no stress.
+        TfetiError: The picture could not be drawn.
+    """
+    comm = solution.decomposition.comm
+    parts = comm.gather(_grid(solution, solution.nodal_von_mises.x.array), root=0)
+    target = Path(path)
+    with raised_on_all_ranks(comm):
+        if comm.rank == 0 and parts is not None:
+            check_screen()
+            scene = {
+                "name": "von Mises",
+                "factor": np.nan if factor is None else factor,
+                "zoom": zoom,
+                "focus": np.full(3, np.nan) if focus is None else np.array(focus, dtype=float),
+                "edges": show_edges,
+            }
+            _draw(target, {**_joined(parts), **scene})
+    return target
+
+
+def plot_pressure(
+    path: str | os.PathLike[str],
+    solution: Solution,
+    coordinate: Callable[[Array], Array],
+    closed_form: Callable[[Array], Array] | None = None,
+    *,
+    contact: int = 0,
+    limit: float | None = None,
+    label: str = "x",
+) -> Path:
+    """Contact pressure over a coordinate, with a closed form if there is one. Collective.
+
+    Args:
+        path: The ``.png`` to write.
+        solution: The solution.
+        coordinate: From points of shape ``(n, 3)`` to the coordinate, shape ``(n,)``.
+        closed_form: Pressure at given coordinates.
+        contact: Index of the contact.
+        limit: Largest coordinate shown, in magnitude.
+        label: Name of the coordinate.
+
+    Returns:
+        The file written.
+    """
+    comm = solution.decomposition.comm
+    data = solution.contact(contact)
+    parts = comm.gather((coordinate(data.points), data.pressure), root=0)
+    target = Path(path)
+    with raised_on_all_ranks(comm):
+        if comm.rank == 0 and parts is not None:
+            x, p = (np.concatenate(rows) for rows in zip(*parts, strict=True))
+            _draw_curve(target, x, p, closed_form, limit, label)
+    return target
+
+
+def check_screen() -> None:
+    """Raise if there is no X server for pictures, and no Xvfb to start one.
+
+    Raises:
+        InputError: Says what to install.
+    """
+    if not os.environ.get("DISPLAY") and shutil.which("Xvfb") is None:
+        raise InputError(
+            "pictures need an X server: set DISPLAY, or install Xvfb (Debian: apt-get install xvfb)"
+        )
+
+
+def _grid(solution: Solution, values: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """Cells, types, points, displacements and values of this rank."""
+    u = solution.displacement
+    if len(u.x.array) == 0:
+        empty = np.zeros((0, 3))
+        return np.zeros(0, np.int32), np.zeros(0, np.uint8), empty, empty, np.zeros(0)
+    cells, types, points = dplot.vtk_mesh(u.function_space)
+    moved = np.zeros_like(points)
+    bs = u.function_space.dofmap.index_map_bs
+    moved[:, :bs] = u.x.array.reshape(-1, bs)
+    return cells, types, points, moved, values
+
+
+def _joined(parts: list[tuple[Array, ...]]) -> dict[str, Array]:
+    """One grid of the ranks' grids; VTK's cells are (count, nodes …) in one array."""
+    starts = np.cumsum([0, *(len(points) for _, _, points, _, _ in parts)])
+    shifted = []
+    for (cells, types, *_), start in zip(parts, starts, strict=False):
+        table = np.array(cells).reshape(len(types), -1) if len(types) else np.zeros((0, 1), int)
+        table[:, 1:] += start
+        shifted.append(table.ravel())
+    types, points, moved, values = (
+        np.concatenate(rows) for rows in list(zip(*parts, strict=True))[1:]
+    )
+    cells = np.concatenate(shifted)
+    return {"cells": cells, "types": types, "points": points, "moved": moved, "values": values}
+
+
+def _draw(target: Path, data: dict[str, object]) -> None:
+    """Let a process of its own draw; the picture appears whole."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_name(f".partial-{target.name}")
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "scene.npz"
+        np.savez(file, **data)  # type: ignore[arg-type]
+        command = [sys.executable, draw.__file__, str(file), str(partial)]
+        result = subprocess.run(
+            command, capture_output=True, text=True, timeout=SECONDS, check=False
+        )
+    if result.returncode != 0 or not partial.exists():
+        raise TfetiError(f"{target} could not be drawn:\n{result.stderr[-2000:]}")
+    os.replace(partial, target)
+
+
+def _draw_curve(
+    target: Path,
+    x: Array,
+    p: Array,
+    closed_form: Callable[[Array], Array] | None,
+    limit: float | None,
+    label: str,
+) -> None:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    shown = np.abs(x) <= (limit if limit is not None else np.abs(x).max(initial=0.0))
+    order = np.argsort(x[shown])
+    figure = Figure(figsize=(7, 4.5), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(x[shown][order], p[shown][order], "o", markersize=3, label="TFETI")
+    if closed_form is not None:
+        fine = np.linspace(x[shown].min(), x[shown].max(), 801)
+        axes.plot(fine, closed_form(fine), "-", linewidth=1, label="closed form")
+    axes.set_xlabel(label)
+    axes.set_ylabel("contact pressure")
+    axes.legend()
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_name(f".partial-{target.name}")
+    FigureCanvasAgg(figure).print_png(str(partial))
+    os.replace(partial, target)

@@ -1,0 +1,240 @@
+"""The user's door: a contact problem from forms, conditions and contacts to a solution."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.assembly import Forms, displacement_space
+from tfeti_dolfinx.compat import require_real_petsc
+from tfeti_dolfinx.contact.obstacle import Obstacle
+from tfeti_dolfinx.contact.records import ContactRecords, concatenate
+from tfeti_dolfinx.contact.surfaces import diameter
+from tfeti_dolfinx.dual.dual import Dual
+from tfeti_dolfinx.errors import ConvergenceError, NoSolutionError
+from tfeti_dolfinx.fields import Stress
+from tfeti_dolfinx.gluing.constraints import Constraints
+from tfeti_dolfinx.gluing.glue import glue
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.options import parse_options
+from tfeti_dolfinx.report import Report
+from tfeti_dolfinx.report_filling import fill_report
+from tfeti_dolfinx.solution import Solution
+from tfeti_dolfinx.solver import resolve_types, solve_dual
+from tfeti_dolfinx.subdomains.build import sparse_blocks, trace_parts
+from tfeti_dolfinx.subdomains.kernel import mode_names
+from tfeti_dolfinx.subdomains.sparse_block import Counters, SparseBlock
+from tfeti_dolfinx.timing import stage
+
+MAX_ROUNDS = 20
+
+
+class ContactProblem:
+    """Linear elasticity with contact on a torn mesh, solved by Total FETI.
+
+    Mirrors ``dolfinx.fem.petsc.LinearProblem``. Creation and all methods are collective.
+
+    Args:
+        a: Bilinear form on a Lagrange space of the torn mesh.
+        L: Linear form.
+        bcs: Dirichlet conditions; their values hold on all torn copies of a node.
+        contacts: Obstacles; none for a linear problem.
+        decomposition: The torn mesh.
+        stress: From a displacement to its 3×3 stress in UFL, for stress fields.
+        u: Function that takes the solution; default a new one.
+        petsc_options: Options, with or without the prefix; the command line beats them.
+        petsc_options_prefix: Prefix of the options.
+        form_compiler_options: As in DOLFINx.
+        jit_options: As in DOLFINx.
+
+    Attributes:
+        u: The displacement.
+        solution: Fields and contact states, after ``solve``.
+        report: Sizes, counters, residuals and times.
+
+    Raises:
+        InputError: Something given does not fit; the message names it.
+    """
+
+    solution: Solution
+
+    def __init__(
+        self,
+        a: ufl.Form,
+        L: ufl.Form,
+        bcs: Sequence[fem.DirichletBC],
+        contacts: Sequence[Obstacle],
+        decomposition: Decomposition,
+        *,
+        stress: Stress | None = None,
+        u: fem.Function | None = None,
+        petsc_options: Mapping[str, Any] | None = None,
+        petsc_options_prefix: str = "tfeti_",
+        form_compiler_options: dict[str, Any] | None = None,
+        jit_options: dict[str, Any] | None = None,
+    ) -> None:
+        require_real_petsc()
+        self.options = parse_options(petsc_options, petsc_options_prefix)
+        self.decomposition, self.bcs, self.contacts = decomposition, list(bcs), list(contacts)
+        V = displacement_space(a)
+        self.u = fem.Function(V, name="displacement") if u is None else u
+        self.report = Report(seconds=dict(decomposition.seconds))
+        self._stress, self._prefix = stress, petsc_options_prefix
+        self._constraints: Constraints | None = None
+        self._blocks: list[SparseBlock] = []
+        self._dual: Dual | None = None
+        with stage("assembly", self.report.seconds):
+            self._forms = Forms(a, L, decomposition, form_compiler_options, jit_options)
+        with stage("gluing", self.report.seconds):
+            self.dofs = TornDofs(V, decomposition)
+
+    def solve(self) -> fem.Function:
+        """Solve the problem.
+
+        Returns:
+            The displacement, on the torn mesh.
+
+        Raises:
+            InputError: Dirichlet values, contacts, stiffness or load do not fit.
+            NoSolutionError: The problem has no solution.
+            ConvergenceError: The solver stopped before its tolerance.
+        """
+        self.destroy()
+        self.report.reset_counters()
+        with stage("contact", self.report.seconds):
+            records = self._records()
+            length = diameter(self.decomposition)
+        with stage("assembly", self.report.seconds):
+            self._K, self._f = self._forms.stiffness(), self._forms.load()
+        chosen, previous = records.near, None
+        for _ in range(MAX_ROUNDS):
+            self._glue(records, chosen, length)
+            try:
+                previous = self._solve_rows(previous)
+                late = self._overlapping(chosen)
+            except NoSolutionError:  # on all ranks: rows that are far may hold the body yet
+                late = ~chosen
+                if self._count(late) == 0:
+                    raise
+            if self._count(late) == 0:
+                break
+            self.report.late_contact_rows += self._count(late)
+            chosen = chosen | late
+        else:
+            raise ConvergenceError(f"nodes out of reach still overlap after {MAX_ROUNDS} rounds")
+        if self.options.view and self.decomposition.comm.rank == 0:
+            print(self.options.view_text(self._prefix), self.report, sep="\n", flush=True)
+        return self.u
+
+    def destroy(self) -> None:
+        """Destroy the PETSc objects; solution and report stay. ``solve`` makes them anew."""
+        for item in (self._dual, *self._blocks, self._constraints):
+            if item is not None:
+                item.destroy()
+        self._dual, self._blocks, self._constraints = None, [], None
+
+    def _records(self) -> ContactRecords:
+        """Contact conditions of all contacts."""
+        dofs, decomposition = self.dofs, self.decomposition
+        records = [c.records(dofs, decomposition, i) for i, c in enumerate(self.contacts)]
+        return concatenate(records, dofs.bs)
+
+    def _glue(self, records: ContactRecords, chosen: Array, length: float) -> None:
+        """Rows of B for the chosen conditions."""
+        with stage("gluing", self.report.seconds):
+            if self._constraints is not None:
+                self._constraints.destroy()
+            weights = self._weights()
+            self._gluing = glue(self.dofs, self.bcs, records, chosen, length, weights)
+            self._constraints = self._gluing.constraints
+
+    def _weights(self) -> Array:
+        """D for the scaling of B: the diagonal of K over its smallest entry, or ones."""
+        if self.options.scaling == "multiplicity":
+            return np.ones(self.dofs.num_nodes * self.dofs.bs)
+        diagonal = self.dofs.to_primal(self._K.diagonal())
+        positive = diagonal > 0.0  # what is not is reported when Blocks are built
+        lowest = float(np.min(diagonal[positive], initial=np.inf))
+        lowest = self.decomposition.comm.allreduce(lowest, op=MPI.MIN)
+        return np.where(positive, diagonal / lowest, 1.0)
+
+    def _solve_rows(self, previous: Solution | None) -> Solution:
+        """Solve with the present rows, from an earlier solution on."""
+        gluing, report, comm = self._gluing, self.report, self.decomposition.comm
+        rows = comm.allreduce(len(gluing.inequalities.rows))
+        qp_type, pc_type = resolve_types(self.options, rows)
+        self._build_blocks()
+        with stage("dual", report.seconds):
+            dual = self._build_dual(pc_type)
+        with stage("qp", report.seconds):
+            start = None
+            if previous is not None:
+                start = (gluing.multipliers(previous.gluing, previous.lam), previous.mu)
+            result = solve_dual(dual, self.options, qp_type, start)
+        with stage("recovery", report.seconds):
+            u = np.concatenate([np.empty(0), *dual.recover(result)])
+            self.u.x.array[:] = self.dofs.to_dolfinx(u)
+            self.solution = Solution(
+                u=self.u,
+                dofs=self.dofs,
+                decomposition=self.decomposition,
+                gluing=gluing,
+                lam=np.array(result.lam.array_r),
+                mu=result.mu,
+                stress=self._stress,
+            )
+        fill_report(report, self.solution, dual, result, self._counters, self.options.rtol)
+        result.destroy()
+        return self.solution
+
+    def _build_blocks(self) -> None:
+        """Blocks for the present trace; factors are made once."""
+        trace = self._gluing.constraints.trace
+        if self._blocks:
+            with stage("subdomains", self.report.seconds):
+                for block, part in zip(self._blocks, trace_parts(self.dofs, trace), strict=True):
+                    block.retrace(part)
+            return
+        self._counters = Counters()
+        with stage("subdomains", self.report.seconds):
+            self._blocks = sparse_blocks(
+                self.dofs,
+                self.decomposition,
+                self._K,
+                self._f,
+                trace,
+                self._counters,
+                self.options.kplus_type,
+            )
+
+    def _build_dual(self, pc_type: str) -> Dual:
+        """The dual problem of the present rows."""
+        if self._dual is not None:
+            self._dual.destroy()
+        decomposition = self.decomposition
+        self._dual = Dual(
+            constraints=self._gluing.constraints,
+            blocks=self._blocks,
+            body_of_block=decomposition.body_of_subdomain[decomposition.subdomains],
+            body_names=decomposition.body_names,
+            mode_names=mode_names(decomposition.mesh.geometry.dim, self.dofs.bs),
+            pc_type=pc_type,
+        )
+        return self._dual
+
+    def _overlapping(self, chosen: Array) -> Array:
+        """Conditions without a row that the solution violates by more than its tolerance."""
+        with stage("contact", self.report.seconds):
+            gap = self.solution.remaining_gap
+        return ~chosen & (gap < -self.report.residuals["tolerance"])
+
+    def _count(self, flags: Array) -> int:
+        """Flags that are set on all ranks."""
+        return self.decomposition.comm.allreduce(int(np.sum(flags)))

@@ -1,0 +1,1 @@
+"""Quadratic programming: vectors, operators and feasible sets, nothing of meshes."""

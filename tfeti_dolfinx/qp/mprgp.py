@@ -1,0 +1,179 @@
+"""MPRGP: modified proportioning with reduced gradient projections."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from petsc4py import PETSc
+
+from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
+from tfeti_dolfinx.qp.monitors import Monitor, no_monitor
+from tfeti_dolfinx.qp.problem import ConvergedReason, Operator, Steps
+
+StoppingTest = Callable[["Iterate"], bool]
+Expansion = Callable[["Iterate", float, float, float], None]
+
+
+class Iterate:
+    """An iterate of min ½xᵀAx − bᵀx on Ω, with its gradient g = Ax − b and its parts.
+
+    Args:
+        A: Symmetric positive (semi)definite operator.
+        x: Starting point in Ω; updated in place.
+        g: Its gradient; updated in place.
+        feasible: The set Ω.
+    """
+
+    def __init__(self, A: Operator, x: PETSc.Vec, g: PETSc.Vec, feasible: FeasibleSet) -> None:
+        self.A, self.x, self.g, self.feasible = A, x, g, feasible
+        self.phi, self.beta, self.p, self.Ap = (x.duplicate() for _ in range(4))
+        self.free_squared = self.chopped_squared = 0.0
+        self.split()
+
+    def split(self) -> None:
+        """Find φ and β at x."""
+        self.feasible.split(self.x, self.g, self.phi, self.beta)
+        self.free_squared = self.phi.dot(self.phi)
+        self.chopped_squared = self.beta.dot(self.beta)
+
+    @property
+    def projected_gradient(self) -> float:
+        """‖g^P‖ = ‖φ + β‖."""
+        return float((self.free_squared + self.chopped_squared) ** 0.5)
+
+    def move(self, alpha: float, p: PETSc.Vec, Ap: PETSc.Vec) -> None:
+        """x ← x − α p and the gradient with it."""
+        self.x.axpy(-alpha, p)
+        self.g.axpy(-alpha, Ap)
+
+    def move_to(self, target: PETSc.Vec) -> None:
+        """x ← target; multiplies by A once. The target is overwritten."""
+        target.axpy(-1.0, self.x)
+        self.A.mult(target, self.Ap)
+        self.move(-1.0, target, self.Ap)
+
+    def destroy(self) -> None:
+        """Destroy the work vectors, not x and g. Collective."""
+        for vec in (self.phi, self.beta, self.p, self.Ap):
+            vec.destroy()
+
+
+def fixed_step(state: Iterate, alpha_f: float, alpha_cg: float, alpha_bar: float) -> None:
+    """Expansion by a step −ᾱφ from the face's edge, projected (Dostál, Schöberl 2005)."""
+    state.move(alpha_f, state.p, state.Ap)
+    state.feasible.project(state.x)
+    state.split()
+    target = state.x.copy()
+    target.axpy(-alpha_bar, state.phi)
+    state.feasible.project(target)
+    state.move_to(target)
+    target.destroy()
+
+
+def projected_cg(state: Iterate, alpha_f: float, alpha_cg: float, alpha_bar: float) -> None:
+    """Expansion by the whole conjugate gradient step, projected.
+
+    Taken if the cost falls at least as far as along the part of the step that is feasible;
+    else the fixed step follows, at the price of one more multiplication.
+    """
+    target, Ad = state.x.copy(), state.x.duplicate()
+    target.axpy(-alpha_cg, state.p)
+    state.feasible.project(target)
+    target.axpy(-1.0, state.x)
+    state.A.mult(target, Ad)
+    slope = state.g.dot(target)
+    decrease = slope + 0.5 * target.dot(Ad)
+    gp, pAp = state.g.dot(state.p), state.p.dot(state.Ap)
+    if decrease <= -alpha_f * gp + 0.5 * alpha_f**2 * pAp:
+        state.move(-1.0, target, Ad)
+        state.feasible.project(state.x)
+    else:
+        fixed_step(state, alpha_f, alpha_cg, alpha_bar)
+    target.destroy()
+    Ad.destroy()
+
+
+EXPANSIONS: dict[str, Expansion] = {"fixed": fixed_step, "projcg": projected_cg}
+
+
+@dataclass(frozen=True)
+class MprgpParameters:
+    """Parameters of MPRGP.
+
+    Attributes:
+        alpha_bar: Fixed step length ᾱ, in (0, 2/‖A‖].
+        gamma: Γ > 0 of the proportioning test.
+        expansion: The expansion step.
+    """
+
+    alpha_bar: float
+    gamma: float = 1.0
+    expansion: Expansion = fixed_step
+
+
+def mprgp(
+    state: Iterate,
+    parameters: MprgpParameters,
+    stop: StoppingTest,
+    steps: Steps,
+    max_it: int,
+    monitor: Monitor = no_monitor,
+) -> ConvergedReason:
+    """Minimise ½xᵀAx − bᵀx on Ω, from ``state`` on and in place. Collective.
+
+    Dostál, Schöberl, Comput. Optim. Appl. 30 (2005) 23–43; Dostál, Optimal Quadratic
+    Programming Algorithms, Springer 2009, section 5.8, whose steps are numbered here.
+
+    Multiplications by A: one per CG or proportioning step, two per expansion step.
+
+    Args:
+        state: The iterate; holds the solution afterwards.
+        parameters: Step length, Γ, expansion.
+        stop: Called with the iterate before each step; True ends the loop.
+        steps: Counts the steps.
+        max_it: Most steps in ``steps``.
+        monitor: Called after each step.
+
+    Returns:
+        ITERATING if ``stop`` ended the loop, else why it could not go on.
+    """
+    A, feasible, alpha_bar = state.A, state.feasible, parameters.alpha_bar
+    x, g, p, Ap, phi, beta = state.x, state.g, state.p, state.Ap, state.phi, state.beta
+    phi.copy(p)
+    while not stop(state):
+        if steps.inner >= max_it:
+            return ConvergedReason.DIVERGED_ITS
+        # Step 1: is x strictly proportional?
+        if state.chopped_squared <= parameters.gamma**2 * feasible.reduced(x, phi, alpha_bar):
+            # Step 2: trial conjugate gradient step
+            A.mult(p, Ap)
+            pAp = p.dot(Ap)
+            if not pAp > 0.0:
+                return ConvergedReason.DIVERGED_INDEFINITE_MAT
+            alpha_cg, alpha_f = g.dot(p) / pAp, feasible.max_step(x, p)
+            if alpha_cg <= alpha_f:
+                # Step 3: conjugate gradient step
+                state.move(alpha_cg, p, Ap)
+                state.split()
+                p.aypx(-phi.dot(Ap) / pAp, phi)
+                steps.cg += 1
+                monitor(steps, "cg", x, state.projected_gradient, -1.0)
+                continue
+            # Step 4: expansion step
+            parameters.expansion(state, alpha_f, alpha_cg, alpha_bar)
+            steps.expansion += 1
+            kind = "expansion"
+        else:
+            # Step 5: proportioning step
+            A.mult(beta, Ap)
+            bAb = beta.dot(Ap)
+            if not bAb > 0.0:
+                return ConvergedReason.DIVERGED_INDEFINITE_MAT
+            state.move(min(g.dot(beta) / bAb, feasible.max_step(x, beta)), beta, Ap)
+            steps.proportioning += 1
+            kind = "proportioning"
+        state.split()
+        phi.copy(p)
+        monitor(steps, kind, x, state.projected_gradient, -1.0)
+    return ConvergedReason.ITERATING

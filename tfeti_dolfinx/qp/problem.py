@@ -1,0 +1,198 @@
+"""The quadratic program that every solver gets, and what it gives back."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Protocol
+
+import numpy as np
+from petsc4py import PETSc
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
+
+
+class Operator(Protocol):
+    """A linear operator; any square ``PETSc.Mat`` is one."""
+
+    def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """y = A x. Collective."""
+        ...
+
+
+class Coarse(Protocol):
+    """The constraint Gλ = e through its orthogonal projectors Q = Gᵀ(GGᵀ)⁻¹G and P = I − Q."""
+
+    def apply_Q(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """y = Q x. Collective."""
+        ...
+
+    def norm_Q(self, x: PETSc.Vec) -> float:
+        """‖Q x‖. Collective."""
+        ...
+
+    def particular(self, x: PETSc.Vec) -> None:
+        """x = Gᵀ(GGᵀ)⁻¹e, the smallest solution of Gλ = e. Collective."""
+        ...
+
+    def coordinates(self, x: PETSc.Vec) -> Array:
+        """(GGᵀ)⁻¹G x, replicated. Collective."""
+        ...
+
+    def combine(self, mu: Array, x: PETSc.Vec) -> None:
+        """x = Gᵀ μ."""
+        ...
+
+
+class NoCoarse:
+    """No equality constraint: Q = 0, at no cost."""
+
+    def apply_Q(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """y = 0."""
+        y.set(0.0)
+
+    def norm_Q(self, x: PETSc.Vec) -> float:
+        """0."""
+        return 0.0
+
+    def particular(self, x: PETSc.Vec) -> None:
+        """x = 0."""
+        x.set(0.0)
+
+    def coordinates(self, x: PETSc.Vec) -> Array:
+        """None."""
+        return np.zeros(0)
+
+    def combine(self, mu: Array, x: PETSc.Vec) -> None:
+        """x = 0."""
+        x.set(0.0)
+
+
+def project(coarse: Coarse, x: PETSc.Vec, work: PETSc.Vec) -> None:
+    """x ← P x in place. Collective."""
+    coarse.apply_Q(x, work)
+    x.axpy(-1.0, work)
+
+
+@dataclass(frozen=True)
+class QP:
+    """min ½λᵀFλ − λᵀd subject to Gλ = e, λ ∈ Ω.
+
+    Attributes:
+        F: Symmetric positive semidefinite operator, m × m.
+        d: Linear term, length m.
+        coarse: Projectors of G, and a particular solution of Gλ = e.
+        feasible: The set Ω.
+        preconditioner: Approximate inverse of F, or None.
+    """
+
+    F: Operator
+    d: PETSc.Vec
+    coarse: Coarse
+    feasible: FeasibleSet
+    preconditioner: Operator | None = None
+
+
+class ConvergedReason(IntEnum):
+    """Why a solver stopped; positive: converged. Values as in KSPConvergedReason."""
+
+    CONVERGED_RTOL = 2
+    CONVERGED_ATOL = 3
+    ITERATING = 0
+    DIVERGED_ITS = -3
+    DIVERGED_BREAKDOWN = -5
+    DIVERGED_INDEFINITE_MAT = -10
+
+
+@dataclass
+class Steps:
+    """Steps that a solver has taken, by their kind."""
+
+    outer: int = 0
+    cg: int = 0
+    expansion: int = 0
+    proportioning: int = 0
+
+    @property
+    def inner(self) -> int:
+        """All inner steps."""
+        return self.cg + self.expansion + self.proportioning
+
+
+@dataclass
+class QPResult:
+    """What a solver returns.
+
+    Attributes:
+        lam: The multipliers λ.
+        mu: Multipliers of Gλ = e.
+        gradient: Fλ − d up to the range of Gᵀ; on bound components the multiplier ν.
+        reason: Why the solver stopped.
+        projected_gradient: ‖g^P‖ at the end.
+        equality: ‖Q x‖ at the end, x the homogenised unknown.
+        reference: b₀ = ‖P(d − F λ̄₀)‖ that both are compared with.
+        norm: Estimate of ‖F‖ that ‖Q x‖ is weighted with.
+        steps: Steps taken.
+    """
+
+    lam: PETSc.Vec
+    mu: Array
+    gradient: PETSc.Vec
+    reason: ConvergedReason
+    projected_gradient: float
+    equality: float
+    reference: float
+    norm: float
+    steps: Steps = field(default_factory=Steps)
+
+    def destroy(self) -> None:
+        """Destroy the vectors. Collective."""
+        self.lam.destroy()
+        self.gradient.destroy()
+
+
+@dataclass(frozen=True)
+class Start:
+    """Where a solver starts.
+
+    Attributes:
+        lam: Multipliers λ.
+        mu: Multipliers of Gλ = e.
+    """
+
+    lam: PETSc.Vec
+    mu: Array
+
+
+def estimate_norm(
+    F: Operator, coarse: Coarse, like: PETSc.Vec, steps: int = 15, safety: float = 1.05
+) -> float:
+    """‖PFP‖ by the power method, times a safety factor. Collective.
+
+    The start is random, but the same in every run on the same number of ranks.
+
+    Args:
+        F: Symmetric positive semidefinite operator.
+        coarse: Gives the projector P.
+        like: A vector of the right layout.
+        steps: Multiplications by F.
+        safety: Factor on the result, since the method gives a lower bound.
+    """
+    x, y, work = like.duplicate(), like.duplicate(), like.duplicate()
+    rng = np.random.default_rng(like.getComm().getRank())
+    x.array[:] = rng.standard_normal(x.getLocalSize())
+    project(coarse, x, work)
+    norm = 0.0
+    for _ in range(steps):
+        length = x.norm()
+        if length == 0.0:
+            break
+        x.scale(1.0 / length)
+        F.mult(x, y)
+        project(coarse, y, work)
+        norm = y.norm()
+        x, y = y, x
+    for vec in (x, y, work):
+        vec.destroy()
+    return safety * norm

@@ -1,0 +1,115 @@
+"""What a solve took and how good its answer is."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from mpi4py import MPI
+
+
+@dataclass
+class Report:
+    """Sizes, counters, residuals and times of a solve; the same on all ranks.
+
+    Attributes:
+        primal_dofs: Unknowns of the torn mesh.
+        dual_dofs: Rows of B.
+        subdomains: Number of subdomains.
+        bodies: Number of bodies.
+        split_subdomains: Subdomains that were not connected and were split.
+        kernel_dim: Dimension of the kernel of K.
+        free_modes: Rigid motions that nothing resists and the load does not drive.
+        contact_rows: Non-penetration rows.
+        far_contact_nodes: Contact nodes that were out of reach and got no row at first.
+        late_contact_rows: Rows that such nodes got after a solve, since they overlapped.
+        dropped_contact_rows: Those that prescribed components decide alone.
+        active_contacts: Rows with a positive force.
+        F_multiplications: Multiplications by F, all but the power method's.
+        preconditioner_multiplications: Multiplications by the preconditioner.
+        power_method_multiplications: Multiplications that estimated ‖PFP‖.
+        outer_iterations: Outer iterations.
+        cg_steps: Conjugate gradient steps.
+        expansion_steps: Expansion steps.
+        proportioning_steps: Proportioning steps.
+        factorizations: Factorisations of subdomain matrices.
+        converged_reason: Name of the ConvergedReason.
+        peak_memory_mb: Peak resident memory, summed over ranks.
+        seconds: Wall seconds of each stage (largest over ranks), and ``total``.
+        residuals: ``projected_gradient`` and ``equilibrium`` relative to b₀, with ``tolerance``
+            = rtol·b₀ as a length; in physical units ``gluing_jump`` and ``penetration``
+            (lengths), ``tension`` (most negative pressure), ``complementarity`` (largest
+            force times gap), ``balance`` (largest force left on a kernel mode).
+        errors: Relative errors against closed forms, filled by demos.
+    """
+
+    primal_dofs: int = 0
+    dual_dofs: int = 0
+    subdomains: int = 0
+    bodies: int = 0
+    split_subdomains: int = 0
+    kernel_dim: int = 0
+    free_modes: int = 0
+    contact_rows: int = 0
+    far_contact_nodes: int = 0
+    late_contact_rows: int = 0
+    dropped_contact_rows: int = 0
+    active_contacts: int = 0
+    F_multiplications: int = 0
+    preconditioner_multiplications: int = 0
+    power_method_multiplications: int = 0
+    outer_iterations: int = 0
+    cg_steps: int = 0
+    expansion_steps: int = 0
+    proportioning_steps: int = 0
+    factorizations: int = 0
+    converged_reason: str = "ITERATING"
+    peak_memory_mb: float = 0.0
+    seconds: dict[str, float] = field(default_factory=dict)
+    residuals: dict[str, float] = field(default_factory=dict)
+    errors: dict[str, float] = field(default_factory=dict)
+
+    def reset_counters(self) -> None:
+        """Set everything that adds up over rounds to zero."""
+        for name in (
+            "late_contact_rows",
+            "F_multiplications",
+            "preconditioner_multiplications",
+            "power_method_multiplications",
+            "outer_iterations",
+            "cg_steps",
+            "expansion_steps",
+            "proportioning_steps",
+        ):
+            setattr(self, name, 0)
+
+    def __str__(self) -> str:
+        lines = []
+        for name, value in asdict(self).items():
+            if isinstance(value, dict):
+                lines += [f"{name}.{key:<22} {item:.6g}" for key, item in value.items()]
+            else:
+                lines.append(f"{name:<31} {value}")
+        return "\n".join(lines)
+
+    def to_json(self) -> str:
+        """The report as JSON."""
+        return json.dumps(asdict(self), indent=2)
+
+    def write(self, path: str | Path, comm: MPI.Intracomm) -> None:
+        """Write the report as a JSON file; it appears whole. Collective."""
+        if comm.rank == 0:
+            target = Path(path)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            partial = target.with_name(f".{target.name}.partial")
+            partial.write_text(self.to_json() + "\n")
+            os.replace(partial, target)
+        comm.barrier()
+
+
+def peak_memory_mb(comm: MPI.Intracomm) -> float:
+    """Peak resident memory of all ranks in megabytes. Collective."""
+    return float(comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0))

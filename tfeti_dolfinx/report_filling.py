@@ -1,0 +1,83 @@
+"""The report of a solve, from the objects that took part in it."""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.dual.dual import Dual
+from tfeti_dolfinx.qp.problem import QPResult
+from tfeti_dolfinx.report import Report, peak_memory_mb
+from tfeti_dolfinx.solution import Solution
+from tfeti_dolfinx.subdomains.sparse_block import Counters
+
+
+def fill_report(
+    report: Report,
+    solution: Solution,
+    dual: Dual,
+    result: QPResult,
+    counters: Counters,
+    rtol: float,
+) -> None:
+    """Fill in everything but closed-form errors; counters add up over rounds. Collective."""
+    comm, decomposition, gluing = dual.coarse.comm, solution.decomposition, solution.gluing
+    dofs = solution.dofs
+    report.primal_dofs = int(dofs.offsets[-1]) * dofs.bs
+    report.dual_dofs = comm.allreduce(gluing.constraints.num_rows)
+    report.subdomains, report.bodies = decomposition.num_subdomains, decomposition.num_bodies
+    report.split_subdomains = len(decomposition.split)
+    report.kernel_dim = dual.coarse.dimension
+    report.free_modes = dual.coarse.free_modes.shape[1]
+    report.contact_rows = dual.num_inequalities
+    report.far_contact_nodes = comm.allreduce(int(np.sum(~gluing.records.near)))
+    report.dropped_contact_rows = comm.allreduce(gluing.inequalities.dropped)
+    active = solution.lam[gluing.constraints.inequalities] > 0.0
+    report.active_contacts = comm.allreduce(int(np.sum(active)))
+    report.F_multiplications += dual.F.count["solver"]
+    report.power_method_multiplications += dual.F.count["power method"]
+    if dual.preconditioner is not None:
+        report.preconditioner_multiplications += dual.preconditioner.count["solver"]
+    report.outer_iterations += result.steps.outer
+    report.cg_steps += result.steps.cg
+    report.expansion_steps += result.steps.expansion
+    report.proportioning_steps += result.steps.proportioning
+    report.factorizations = comm.allreduce(counters.factorizations)
+    report.converged_reason = result.reason.name
+    report.residuals = _residuals(solution, dual, result, rtol)
+    report.peak_memory_mb = peak_memory_mb(comm)
+    for name, value in report.seconds.items():
+        report.seconds[name] = comm.allreduce(value, op=MPI.MAX)
+    report.seconds["total"] = sum(v for k, v in report.seconds.items() if k != "total")
+
+
+def _residuals(solution: Solution, dual: Dual, result: QPResult, rtol: float) -> dict[str, float]:
+    comm, coarse = dual.coarse.comm, dual.coarse
+    reference = result.reference or 1.0
+    balance = coarse.G(solution.lam) - coarse.e
+
+    def largest(values: Array) -> float:
+        return float(comm.allreduce(float(np.max(values, initial=0.0)), op=MPI.MAX))
+
+    gap = solution.remaining_gap
+    return {
+        "projected_gradient": result.projected_gradient / reference,
+        "equilibrium": result.norm * result.equality / reference,
+        "tolerance": rtol * result.reference,
+        "gluing_jump": largest(_jumps(solution)),
+        "penetration": largest(-gap),
+        "tension": largest(0.0 - solution.contact_pressure),
+        "complementarity": largest(np.abs(solution.force * gap)),
+        "balance": largest(np.abs(balance)),
+    }
+
+
+def _jumps(solution: Solution) -> Array:
+    """For each owned group how far its copies are apart, and from prescribed values. Collective."""
+    dofs, prescribed = solution.dofs, solution.gluing.prescribed
+    u = dofs.to_primal(solution.displacement.x.array).reshape(-1, dofs.bs)
+    low, high = dofs.reduce(u, np.minimum, np.inf), dofs.reduce(u, np.maximum, -np.inf)
+    held_low = np.where(prescribed.flag, np.minimum(low, prescribed.value), low)
+    held_high = np.where(prescribed.flag, np.maximum(high, prescribed.value), high)
+    return held_high - held_low

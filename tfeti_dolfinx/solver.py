@@ -1,0 +1,124 @@
+"""The solver that the options choose, run on a dual problem."""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.dual.dual import Dual
+from tfeti_dolfinx.dual.solvability import feasible_particular
+from tfeti_dolfinx.errors import ConvergenceError, InputError
+from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.qp.homogenised import Homogenised, homogenise
+from tfeti_dolfinx.qp.monitors import Monitor, PrintMonitor, no_monitor
+from tfeti_dolfinx.qp.pcpg import pcpg
+from tfeti_dolfinx.qp.problem import QP, QPResult, Start, estimate_norm
+from tfeti_dolfinx.qp.smalse import smalse
+
+
+def resolve_types(options: Options, num_inequalities: int) -> tuple[str, str]:
+    """The solver and the preconditioner that ``auto`` stands for.
+
+    Raises:
+        InputError: pcpg is asked for, but the scene has inequalities.
+    """
+    qp_type = options.qp_type
+    if qp_type == "auto":
+        qp_type = "smalse" if num_inequalities else "pcpg"
+    if qp_type == "pcpg" and num_inequalities:
+        raise InputError(
+            f"qp_type pcpg: the scene has {num_inequalities} contact rows, which PCPG cannot "
+            "keep; expected auto or smalse"
+        )
+    pc_type = options.pc_type
+    if pc_type == "auto":
+        pc_type = "dirichlet" if qp_type == "pcpg" else "none"
+    return qp_type, pc_type
+
+
+def solve_dual(
+    dual: Dual, options: Options, qp_type: str, start: tuple[Array, Array] | None = None
+) -> QPResult:
+    """Solve the dual problem. Collective.
+
+    Args:
+        dual: The dual problem.
+        options: Options.
+        qp_type: pcpg or smalse.
+        start: λ on this rank's rows, and the multipliers of Gλ = e, to start from.
+
+    Raises:
+        ConvergenceError: The solver stopped before its tolerance, unless options turn it off.
+    """
+    qp = dual.qp()
+    homogenised = _homogenise(dual, qp, options)
+    monitor = _monitor(dual, homogenised, options)
+    if qp_type == "pcpg":
+        result = pcpg(
+            qp,
+            homogenised,
+            rtol=options.rtol,
+            atol=options.atol,
+            max_it=options.max_it,
+            monitor=monitor,
+        )
+    else:
+        with dual.F.charged_to("power method"):
+            norm = estimate_norm(qp.F, qp.coarse, qp.d, options.norm_steps)
+        result = smalse(
+            qp,
+            homogenised,
+            norm,
+            options.smalse(),
+            rtol=options.rtol,
+            atol=options.atol,
+            max_it=options.max_it,
+            start=_start(start, qp.d),
+            monitor=monitor,
+        )
+    homogenised.destroy()
+    _conclude(result, options, dual.constraints.c.getComm().tompi4py())
+    return result
+
+
+def _start(values: tuple[Array, Array] | None, like: PETSc.Vec) -> Start | None:
+    if values is None:
+        return None
+    lam = like.duplicate()
+    lam.array[:] = values[0]
+    return Start(lam, values[1])
+
+
+def _homogenise(dual: Dual, qp: QP, options: Options) -> Homogenised:
+    if options.homogenization == "natural" or not dual.num_inequalities:
+        return homogenise(qp)
+    lam_bar = qp.d.duplicate()
+    lam_bar.array[:] = feasible_particular(dual.coarse, dual.constraints.inequalities)
+    homogenised = homogenise(qp, lam_bar)
+    lam_bar.destroy()
+    return homogenised
+
+
+def _monitor(dual: Dual, homogenised: Homogenised, options: Options) -> Monitor:
+    if not options.monitor:
+        return no_monitor
+    comm, feasible = dual.coarse.comm, homogenised.feasible
+    return PrintMonitor(
+        touching=lambda x: comm.allreduce(feasible.num_off(x)),
+        multiplications=lambda: dual.F.count["solver"],
+    )
+
+
+def _conclude(result: QPResult, options: Options, comm: MPI.Intracomm) -> None:
+    """Say why the solver stopped, and raise where it should have gone on."""
+    name = result.reason.name
+    text = (
+        f"{name} after {result.steps.outer} outer and {result.steps.inner} inner iterations: "
+        f"‖g^P‖ = {result.projected_gradient:.3e}, ‖F‖‖Qx‖ = "
+        f"{result.norm * result.equality:.3e}, tolerance {options.rtol * result.reference:.3e}"
+    )
+    if options.converged_reason and comm.rank == 0:
+        print(f"TFETI solve {text}", flush=True)
+    if result.reason <= 0 and options.error_if_not_converged:
+        raise ConvergenceError(f"the dual solver stopped: {text}")

@@ -1,0 +1,1 @@
+"""Subdomains as the dual sees them: Blocks."""

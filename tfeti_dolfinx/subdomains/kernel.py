@@ -1,0 +1,97 @@
+"""Kernels of subdomain stiffnesses, found among candidate modes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tfeti_dolfinx.arrays import Array
+
+NULL = 1e-12
+
+
+def candidate_modes(x: Array, bs: int, centre: Array, length: float) -> Array:
+    """Rigid motions for vectors of the space's dimension, constants otherwise.
+
+    Args:
+        x: Points of the nodes, shape ``(n, gdim)``.
+        bs: Unknowns per node.
+        centre: Point that the rotations turn about, shape ``(gdim,)``.
+        length: Length that makes rotations comparable to translations.
+
+    Returns:
+        Modes as columns, shape ``(n * bs, k)``; k = 3 in 2D, 6 in 3D, bs for other fields.
+    """
+    gdim = x.shape[1]
+    modes = [np.tile(np.eye(bs)[i], len(x)) for i in range(bs)]
+    if bs == gdim and gdim > 1:
+        y = (x - centre) / length
+        for i in range(gdim):
+            for j in range(i):
+                turn = np.zeros((len(x), bs))
+                turn[:, j], turn[:, i] = -y[:, i], y[:, j]
+                modes.append(turn.ravel())
+    return np.stack(modes, axis=1)
+
+
+MODE_NAMES = {
+    (2, 2): ("translation in x", "translation in y", "rotation in the plane"),
+    (3, 3): (
+        "translation in x",
+        "translation in y",
+        "translation in z",
+        "rotation about z",
+        "rotation about y",
+        "rotation about x",
+    ),
+}
+
+
+def mode_names(gdim: int, bs: int) -> tuple[str, ...]:
+    """Names of the candidate modes of a field with bs components, in their order."""
+    constants = tuple(f"constant in component {i}" for i in range(bs))
+    return MODE_NAMES.get((gdim, bs), constants)
+
+
+def kernel_of(K: Any, modes: Array) -> Array:
+    """Orthonormal basis of the kernel of K within the span of the candidate modes.
+
+    The null space of R₀ᵀ K R₀, R₀ an orthonormal basis of the modes; it is smaller than the
+    span, or empty, where springs or mass terms hold the subdomain.
+
+    Args:
+        K: Stiffness, shape ``(n, n)``.
+        modes: Candidate modes, shape ``(n, k)``.
+
+    Returns:
+        R, shape ``(n, r)``, r ≤ k.
+    """
+    R0 = orthonormal(modes)
+    values, vectors = np.linalg.eigh(R0.T @ (K @ R0))
+    return R0 @ vectors[:, values <= NULL * np.abs(K.diagonal()).max(initial=0.0)]
+
+
+def orthonormal(modes: Array) -> Array:
+    """Orthonormal basis of the span of the columns (few of them, maybe dependent)."""
+    U, s, _ = np.linalg.svd(modes, full_matrices=False)
+    return U[:, s > 1e-10 * s.max(initial=0.0)]
+
+
+def fixing_nodes(x: Array, count: int) -> Array:
+    """Well-spread nodes: farthest-point sampling (Gonzalez 1985), from the node farthest out.
+
+    Args:
+        x: Points of the nodes, shape ``(n, gdim)``.
+        count: How many are wanted.
+
+    Returns:
+        Their indices, ascending, at most ``count``.
+    """
+    distance = np.linalg.norm(x - x.mean(axis=0), axis=1)
+    chosen = [int(np.argmax(distance))]
+    distance = np.linalg.norm(x - x[chosen[0]], axis=1)
+    while len(chosen) < min(count, len(x)):
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(x - x[chosen[-1]], axis=1))
+    return np.unique(chosen)
