@@ -148,15 +148,6 @@ def test_forms_of_other_kinds():
         tfeti.ContactProblem(L, L, [], [], d)
 
 
-def test_contact_of_a_quadratic_displacement():
-    d = decomposed("hexahedron", 2, 2)
-    p = problem(
-        d, contacts=[tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -1), (0, 0, 1)))], degree=2
-    )
-    with pytest.raises(InputError, match="surface 'bottom': expected displacement of degree 1"):
-        p.solve()
-
-
 def test_shapes_that_are_none():
     with pytest.raises(InputError, match=r"normal=\(0, 0\): expected a vector that is not zero"):
         tfeti.Plane((0, 0), (0, 0))

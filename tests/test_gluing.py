@@ -31,7 +31,7 @@ class Scene:
         records = concatenate([c.records(dofs, d, i) for i, c in enumerate(contacts)], gdim)
         n_local = dofs.num_nodes * dofs.bs
         self.weights = np.ones(n_local) if weights is None else weights(dofs)
-        self.gluing = glue(dofs, self.bcs, records, records.near, 1.0, self.weights)
+        self.gluing = glue(dofs, self.bcs, records, 1.0, self.weights)
         self.constraints = self.gluing.constraints
 
     @property
@@ -114,7 +114,7 @@ def test_a_dirichlet_value_reaches_copies_that_have_no_facet_on_the_surface():
     records = concatenate([], 2)
     ones = np.ones(dofs.num_nodes * 2)
     bcs = [fem.dirichletbc(0.5, left, V.sub(1))]
-    gluing = glue(dofs, bcs, records, records.near, 1.0, ones)
+    gluing = glue(dofs, bcs, records, 1.0, ones)
     found = d.comm.allreduce(int(np.sum(gluing.constraints.c.array_r == 0.5)))
     x = V.tabulate_dof_coordinates()
     assert found == d.comm.allreduce(int(np.sum(np.isclose(x[:, 0], 0))))
@@ -183,7 +183,7 @@ def test_prescribed_components_move_into_the_gap():
     bottom = fem.locate_dofs_topological(V.sub(0), 2, d.facets("bottom"))
     records = concatenate([slanted.records(dofs, d, 0)], 3)
     bcs = [fem.dirichletbc(1.0, bottom, V.sub(0))]
-    gluing = glue(dofs, bcs, records, records.near, 1.0, np.ones(dofs.num_nodes * 3))
+    gluing = glue(dofs, bcs, records, 1.0, np.ones(dofs.num_nodes * 3))
     rows = gluing.constraints.inequalities
     gap = gluing.constraints.c.array_r[rows] / gluing.inequalities.scale
     assert np.allclose(gap, records.gap[gluing.inequalities.condition] + 0.6 * 1.0)
@@ -204,9 +204,9 @@ def test_contradictory_dirichlet_values_are_an_error():
     ]
     dofs, records = TornDofs(V, d), concatenate([], 3)
     with pytest.raises(InputError, match=r"contradict each other: component \d .* 0.0 and as 1.0"):
-        glue(dofs, bcs, records, records.near, 1.0, np.ones(dofs.num_nodes * 3))
+        glue(dofs, bcs, records, 1.0, np.ones(dofs.num_nodes * 3))
     same = [bcs[0], fem.dirichletbc(np.zeros(3), bcs[1].dof_indices()[0][::3] // 3, V)]
-    glue(dofs, same, records, records.near, 1.0, np.ones(dofs.num_nodes * 3))
+    glue(dofs, same, records, 1.0, np.ones(dofs.num_nodes * 3))
 
 
 def test_dirichlet_values_that_are_not_finite_are_an_error():
@@ -216,4 +216,4 @@ def test_dirichlet_values_that_are_not_finite_are_an_error():
     dofs, records = TornDofs(V, d), concatenate([], 3)
     with pytest.raises(InputError, match="Dirichlet condition 0 has a value that is not finite"):
         bc = fem.dirichletbc(np.full(3, np.nan), left, V)
-        glue(dofs, [bc], records, records.near, 1.0, np.ones(dofs.num_nodes * 3))
+        glue(dofs, [bc], records, 1.0, np.ones(dofs.num_nodes * 3))

@@ -1,6 +1,7 @@
 """Multi-body elastic contact by Total FETI, as a FEniCSx application."""
 
 from tfeti_dolfinx.contact.obstacle import Obstacle
+from tfeti_dolfinx.contact.pair import Contact
 from tfeti_dolfinx.contact.shapes import Cylinder, Plane, SignedDistance, Sphere
 from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -13,6 +14,7 @@ from tfeti_dolfinx.solution import ContactStatus, Solution
 from tfeti_dolfinx.version import __version__
 
 __all__ = [
+    "Contact",
     "ContactProblem",
     "ContactStatus",
     "ConvergenceError",

@@ -13,9 +13,7 @@ from mpi4py import MPI
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.assembly import Forms, displacement_space
 from tfeti_dolfinx.compat import require_real_petsc
-from tfeti_dolfinx.contact.obstacle import Obstacle
-from tfeti_dolfinx.contact.records import ContactRecords, concatenate
-from tfeti_dolfinx.contact.surfaces import diameter
+from tfeti_dolfinx.contact.search import ContactPartner, ContactSearch
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.errors import ConvergenceError, NoSolutionError
 from tfeti_dolfinx.fields import Stress
@@ -45,7 +43,7 @@ class ContactProblem:
         a: Bilinear form on a Lagrange space of the torn mesh.
         L: Linear form.
         bcs: Dirichlet conditions; their values hold on all torn copies of a node.
-        contacts: Obstacles; none for a linear problem.
+        contacts: Obstacles and pairs of surfaces; none for a linear problem.
         decomposition: The torn mesh.
         stress: From a displacement to its 3×3 stress in UFL, for stress fields.
         u: Function that takes the solution; default a new one.
@@ -70,7 +68,7 @@ class ContactProblem:
         a: ufl.Form,
         L: ufl.Form,
         bcs: Sequence[fem.DirichletBC],
-        contacts: Sequence[Obstacle],
+        contacts: Sequence[ContactPartner],
         decomposition: Decomposition,
         *,
         stress: Stress | None = None,
@@ -109,24 +107,24 @@ class ContactProblem:
         self.destroy()
         self.report.reset_counters()
         with stage("contact", self.report.seconds):
-            records = self._records()
-            length = diameter(self.decomposition)
+            search = ContactSearch(self.contacts, self.dofs, self.decomposition)
         with stage("assembly", self.report.seconds):
             self._K, self._f = self._forms.stiffness(), self._forms.load()
-        chosen, previous = records.near, None
+        previous = None
         for _ in range(MAX_ROUNDS):
-            self._glue(records, chosen, length)
+            self._glue(search)
             try:
                 previous = self._solve_rows(previous)
-                late = self._overlapping(chosen)
-            except NoSolutionError:  # on all ranks: rows that are far may hold the body yet
-                late = ~chosen
-                if self._count(late) == 0:
+                late = self._take_in_overlapping(search)
+            except NoSolutionError:  # on all ranks: what is far may hold the body yet
+                if search.is_exhausted:
                     raise
-            if self._count(late) == 0:
-                break
-            self.report.late_contact_rows += self._count(late)
-            chosen = chosen | late
+                with stage("contact", self.report.seconds):
+                    late = search.widen()
+            else:
+                if late == 0:
+                    break
+            self.report.late_contact_rows += late
         else:
             raise ConvergenceError(f"nodes out of reach still overlap after {MAX_ROUNDS} rounds")
         if self.options.view and self.decomposition.comm.rank == 0:
@@ -140,20 +138,21 @@ class ContactProblem:
                 item.destroy()
         self._dual, self._blocks, self._constraints = None, [], None
 
-    def _records(self) -> ContactRecords:
-        """Contact conditions of all contacts."""
-        dofs, decomposition = self.dofs, self.decomposition
-        records = [c.records(dofs, decomposition, i) for i, c in enumerate(self.contacts)]
-        return concatenate(records, dofs.bs)
-
-    def _glue(self, records: ContactRecords, chosen: Array, length: float) -> None:
-        """Rows of B for the chosen conditions."""
+    def _glue(self, search: ContactSearch) -> None:
+        """Rows of B for the present conditions."""
         with stage("gluing", self.report.seconds):
             if self._constraints is not None:
                 self._constraints.destroy()
-            weights = self._weights()
-            self._gluing = glue(self.dofs, self.bcs, records, chosen, length, weights)
+            records, weights = search.records, self._weights()
+            self._gluing = glue(self.dofs, self.bcs, records, search.length, weights)
             self._constraints = self._gluing.constraints
+
+    def _take_in_overlapping(self, search: ContactSearch) -> int:
+        """Give rows to nodes that have come to overlap without one; how many."""
+        tolerance = self.report.residuals["tolerance"]
+        with stage("contact", self.report.seconds):
+            u = self.dofs.to_primal(self.u.x.array)
+            return search.take_in_overlapping(u, tolerance)
 
     def _weights(self) -> Array:
         """D for the scaling of B: the diagonal of K over its smallest entry, or ones."""
@@ -228,13 +227,3 @@ class ContactProblem:
             pc_type=pc_type,
         )
         return self._dual
-
-    def _overlapping(self, chosen: Array) -> Array:
-        """Conditions without a row that the solution violates by more than its tolerance."""
-        with stage("contact", self.report.seconds):
-            gap = self.solution.remaining_gap
-        return ~chosen & (gap < -self.report.residuals["tolerance"])
-
-    def _count(self, flags: Array) -> int:
-        """Flags that are set on all ranks."""
-        return self.decomposition.comm.allreduce(int(np.sum(flags)))

@@ -24,8 +24,9 @@ class Report:
         kernel_dim: Dimension of the kernel of K.
         free_modes: Rigid motions that nothing resists and the load does not drive.
         contact_rows: Non-penetration rows.
-        far_contact_nodes: Contact nodes that were out of reach and got no row at first.
-        late_contact_rows: Rows that such nodes got after a solve, since they overlapped.
+        contact_candidates: Nodes of the (secondary) contact surfaces.
+        far_contact_nodes: Those that were out of reach or not covered, and have no row.
+        late_contact_rows: Rows that nodes out of reach got after a solve, since they overlapped.
         dropped_contact_rows: Those that prescribed components decide alone.
         active_contacts: Rows with a positive force.
         F_multiplications: Multiplications by F, all but the power method's.
@@ -54,6 +55,7 @@ class Report:
     kernel_dim: int = 0
     free_modes: int = 0
     contact_rows: int = 0
+    contact_candidates: int = 0
     far_contact_nodes: int = 0
     late_contact_rows: int = 0
     dropped_contact_rows: int = 0

@@ -31,7 +31,9 @@ def fill_report(
     report.kernel_dim = dual.coarse.dimension
     report.free_modes = dual.coarse.free_modes.shape[1]
     report.contact_rows = dual.num_inequalities
-    report.far_contact_nodes = comm.allreduce(int(np.sum(~gluing.records.near)))
+    report.contact_candidates = comm.allreduce(gluing.records.candidates)
+    near = comm.allreduce(int(np.sum(gluing.records.near)))
+    report.far_contact_nodes = report.contact_candidates - near
     report.dropped_contact_rows = comm.allreduce(gluing.inequalities.dropped)
     active = solution.lam[gluing.constraints.inequalities] > 0.0
     report.active_contacts = comm.allreduce(int(np.sum(active)))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.contact.conditions import conditions, triplets
+from tfeti_dolfinx.contact.facets import facet_kind, local_facets
+from tfeti_dolfinx.contact.mortar import dual_multipliers, hat_areas, positions, whole_facets
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.shapes import Shape
 from tfeti_dolfinx.contact.surfaces import (
@@ -19,6 +22,8 @@ from tfeti_dolfinx.contact.surfaces import (
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
+
+QUADRATURE = 4
 
 
 @dataclass(frozen=True)
@@ -38,44 +43,96 @@ class Obstacle:
     shape: Shape
     reach: float = np.inf
 
-    def records(self, dofs: TornDofs, decomposition: Decomposition, contact: int) -> ContactRecords:
-        """One condition per node of the surface, from its present distance. Collective.
+    def first_radius(self, decomposition: Decomposition) -> float:
+        """Infinite: all nodes of the surface are looked at."""
+        return np.inf
 
-        The condition is  n·u ≤ g  with n = −∇φ/|∇φ| and g = φ/|∇φ|, φ the signed distance.
+    def displacement_bound(self, dofs: TornDofs, decomposition: Decomposition, u: Array) -> float:
+        """Nothing lies beyond the radius, however large the displacement is."""
+        return 0.0
+
+    def records(
+        self, dofs: TornDofs, decomposition: Decomposition, contact: int, radius: float = np.inf
+    ) -> ContactRecords:
+        """One condition per vertex of the surface, from its present distance. Collective.
+
+        With φ the signed distance, n = −∇φ/|∇φ| and g = φ/|∇φ|, the condition of a displacement of
+        degree 1 is n·u ≤ g at the node. For other degrees it is that of a dual multiplier,
+        ∫ψ_i n_i·u ≤ ∫ψ_i g, divided by ∫ψ_i.
 
         Raises:
-            InputError: The surface is unknown or empty, the displacement is not of degree 1,
-                the shape has no normal at a node, or no node is within reach.
+            InputError: The surface is unknown or empty, the shape has no normal at a node, or no
+                node is within reach.
         """
         facets = surface_facets(decomposition, self.surface)
-        if dofs.V.element.basix_element.degree != 1:
-            raise InputError(
-                f"contact on surface {self.surface!r}: expected displacement of degree 1"
-            )
-        groups = on_surface(dofs, decomposition, facets)
-        area = hat_integrals(dofs, decomposition, self.surface)[groups]
-        with raised_on_all_ranks(decomposition.comm):
-            gap, normal = self._gaps(group_points(dofs)[groups], dofs.bs)
-        if decomposition.comm.allreduce(int(np.sum(gap <= self.reach))) == 0:
-            nearest = decomposition.comm.allreduce(float(gap.min(initial=np.inf)), op=MPI.MIN)
+        if dofs.V.element.basix_element.degree == 1:
+            records = self._at_nodes(dofs, decomposition, contact, facets)
+        else:
+            records = self._weighted(dofs, decomposition, contact, facets)
+        near = records.gap <= self.reach
+        if decomposition.comm.allreduce(int(np.sum(near))) == 0:
+            lowest = float(records.gap.min(initial=np.inf))
+            nearest = decomposition.comm.allreduce(lowest, op=MPI.MIN)
             raise InputError(
                 f"obstacle of surface {self.surface!r}: no node within reach={self.reach}; "
                 f"the nearest is {nearest:.6g} away"
             )
+        return replace(records, near=near)
+
+    def _at_nodes(
+        self, dofs: TornDofs, decomposition: Decomposition, contact: int, facets: Array
+    ) -> ContactRecords:
+        groups = on_surface(dofs, decomposition, facets)
+        area = hat_integrals(dofs, decomposition, self.surface)[groups]
+        with raised_on_all_ranks(decomposition.comm):
+            gap, normal = self._gaps(group_points(dofs)[groups], dofs.bs)
         return ContactRecords(
             contact=np.full(len(groups), contact),
             group=groups,
             normal=normal,
             gap=gap,
             area=area,
-            near=gap <= self.reach,
+            near=np.ones(len(groups), dtype=bool),
             row=np.arange(len(groups)),
             entry_group=dofs.group_offsets[dofs.comm.rank] + groups,
             coefficients=normal,
+            candidates=len(groups),
+        )
+
+    def _weighted(
+        self, dofs: TornDofs, decomposition: Decomposition, contact: int, facets: Array
+    ) -> ContactRecords:
+        kind, surface = facet_kind(dofs), local_facets(dofs, decomposition, facets)
+        degree = QUADRATURE * kind.displacement.degree
+        facet, xi, weight = whole_facets(kind, surface, degree)
+        dual = dual_multipliers(kind, surface.area, facet, xi, weight)
+        vertices = surface.groups[:, : kind.num_vertices]
+        with raised_on_all_ranks(decomposition.comm):
+            gap, _ = self._gaps(positions(kind, surface.x[facet], xi), dofs.bs)
+            _, normals = self._gaps(group_points(dofs), dofs.bs)
+        return conditions(
+            dofs=dofs,
+            contact=contact,
+            multipliers=vertices[dual.facet],
+            covered=dual.covered,
+            gaps=dual.integrals(gap),
+            entries=(
+                triplets(
+                    vertices[dual.facet],
+                    surface.groups[dual.facet],
+                    dual.integrals(kind.displacement.values(xi)),
+                ),
+            ),
+            nodes=vertices,
+            areas=hat_areas(kind, surface),
+            normals=normals,
         )
 
     def _gaps(self, x: Array, gdim: int) -> tuple[Array, Array]:
-        gap, gradient = self.shape.distance(x.T), self.shape.gradient(x.T).T[:, :gdim]
+        """Distances and normals at points of shape ``(n, 2)`` or ``(n, 3)``."""
+        points = np.zeros((3, len(x)))
+        points[: x.shape[1]] = x.T
+        gap, gradient = self.shape.distance(points), self.shape.gradient(points).T[:, :gdim]
         length = np.linalg.norm(gradient, axis=1)
         wrong = ~(np.isfinite(gap) & np.isfinite(length) & (length > 0.0))
         if np.any(wrong):

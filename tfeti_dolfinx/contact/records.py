@@ -25,6 +25,7 @@ class ContactRecords:
         row: Condition of each coefficient, shape ``(k,)``.
         entry_group: Global group of each coefficient, shape ``(k,)``.
         coefficients: The a_ij, shape ``(k, gdim)``.
+        candidates: Nodes of the contact surface whose groups this rank owns.
     """
 
     contact: Array
@@ -36,6 +37,7 @@ class ContactRecords:
     row: Array
     entry_group: Array
     coefficients: Array
+    candidates: int = 0
 
     def __len__(self) -> int:
         return len(self.gap)
@@ -60,6 +62,7 @@ def concatenate(records: list[ContactRecords], gdim: int) -> ContactRecords:
         row=np.concatenate([no_index, *rows]),
         entry_group=join("entry_group", no_index),
         coefficients=join("coefficients", no_vector),
+        candidates=sum(r.candidates for r in records),
     )
 
 

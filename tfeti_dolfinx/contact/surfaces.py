@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import ufl
 from dolfinx import fem
+from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
@@ -59,11 +60,16 @@ def on_surface(dofs: TornDofs, decomposition: Decomposition, facets: Array) -> A
     A copy that touches the surface only at a vertex or an edge has no facet there, so
     membership is found on the copies that do and spread to the group.
     """
+    member = np.zeros(dofs.num_nodes, dtype=bool)
+    member[surface_nodes(dofs, decomposition, facets)] = True
+    return np.flatnonzero(dofs.reduce(member, np.logical_or, False))
+
+
+def surface_nodes(dofs: TornDofs, decomposition: Decomposition, facets: Array) -> Array:
+    """Primal nodes of local facets."""
     fdim = decomposition.mesh.topology.dim - 1
     nodes = fem.locate_dofs_topological(dofs.V, fdim, facets.astype(np.int32), remote=False)
-    member = np.zeros(dofs.num_nodes, dtype=bool)
-    member[dofs.primal_nodes(nodes)] = True
-    return np.flatnonzero(dofs.reduce(member, np.logical_or, False))
+    return dofs.primal_nodes(nodes)
 
 
 def group_points(dofs: TornDofs) -> Array:
@@ -72,10 +78,30 @@ def group_points(dofs: TornDofs) -> Array:
     return dofs.reduce(x, np.minimum, np.inf)
 
 
+def extent(decomposition: Decomposition, facets: Array) -> float:
+    """Length of the diagonal of a surface's box. Collective.
+
+    Args:
+        decomposition: The torn mesh.
+        facets: Local facets of the surface.
+    """
+    mesh = decomposition.mesh
+    fdim = mesh.topology.dim - 1
+    mesh.topology.create_connectivity(fdim, mesh.topology.dim)
+    x = np.empty((0, 3))
+    if len(facets):  # DOLFINx divides by their number
+        nodes = dmesh.entities_to_geometry(mesh, fdim, facets.astype(np.int32))
+        x = mesh.geometry.x[np.unique(nodes)]
+    return _diagonal(x, decomposition.comm)
+
+
 def diameter(decomposition: Decomposition) -> float:
     """Length of the diagonal of the mesh's box. Collective."""
-    x = decomposition.mesh.geometry.x
+    return _diagonal(decomposition.mesh.geometry.x, decomposition.comm)
+
+
+def _diagonal(x: Array, comm: MPI.Intracomm) -> float:
     low, high = x.min(axis=0, initial=np.inf), x.max(axis=0, initial=-np.inf)
-    decomposition.comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
-    decomposition.comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
+    comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
+    comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
     return float(np.linalg.norm(high - low))

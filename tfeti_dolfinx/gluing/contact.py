@@ -38,7 +38,6 @@ def inequality_rows(
     prescribed: Prescribed,
     weights: Array,
     records: ContactRecords,
-    chosen: Array,
     length: float,
 ) -> InequalityRows:
     """B_N and its right side from contact conditions. Collective.
@@ -52,8 +51,7 @@ def inequality_rows(
         dofs: Dof maps.
         prescribed: Dirichlet values.
         weights: D for each copy of the owned groups, shape ``(c, bs)``.
-        records: Conditions of this rank.
-        chosen: Which of them get a row, shape ``(n,)``.
+        records: Conditions of this rank; those that are near get rows.
         length: A length of the scene; gaps below 1e-10 of it count as zero.
 
     Raises:
@@ -70,8 +68,8 @@ def inequality_rows(
     rhs = records.gap - np.bincount(records.row, weights=held, minlength=len(records))
     free = np.where(flag, 0.0, records.coefficients)
     before, after = squared_norms(records.coefficients), squared_norms(free)
-    kept = chosen & (after > NOTHING_LEFT**2 * before)
-    decided = chosen & ~kept
+    kept = records.near & (after > NOTHING_LEFT**2 * before)
+    decided = records.near & ~kept
     with raised_on_all_ranks(dofs.comm):
         _check_dropped(rhs[decided], length)
     condition = np.flatnonzero(kept)

@@ -27,25 +27,32 @@ class Gluing:
     constraints: Constraints
 
     def multipliers(self, earlier: Gluing, lam: Array) -> Array:
-        """Multipliers of earlier rows on these, which hold all of those conditions; else zero.
+        """Multipliers of earlier rows of the same scene on these; zero on rows that are new.
 
         Args:
-            earlier: Rows of the same scene for fewer conditions.
+            earlier: The earlier rows.
             lam: Their multipliers on this rank.
         """
         start = np.zeros(self.constraints.num_rows)
         equalities = self.constraints.num_equalities
         start[:equalities] = lam[:equalities]
-        place = np.searchsorted(self.inequalities.condition, earlier.inequalities.condition)
-        start[equalities + place] = lam[equalities:]
+        _, new, old = np.intersect1d(
+            self._condition_keys(), earlier._condition_keys(), return_indices=True
+        )
+        force = lam[equalities + old] * earlier.inequalities.scale[old]
+        start[equalities + new] = force / self.inequalities.scale[new]
         return start
+
+    def _condition_keys(self) -> Array:
+        """A number for the contact and the node of each inequality row."""
+        rows, records = self.inequalities.condition, self.records
+        return records.contact[rows] * 2**40 + records.group[rows]
 
 
 def glue(
     dofs: TornDofs,
     bcs: Sequence[fem.DirichletBC],
     records: ContactRecords,
-    chosen: Array,
     length: float,
     weights: Array,
 ) -> Gluing:
@@ -54,8 +61,7 @@ def glue(
     Args:
         dofs: Dof maps.
         bcs: Dirichlet conditions.
-        records: Contact conditions of this rank.
-        chosen: Which of them get a row.
+        records: Contact conditions of this rank; those that are near get rows.
         length: A length of the scene.
         weights: D, positive, one per local primal unknown: the stiffness there, or ones. Rows
             are orthonormal in the inner product of D⁻¹ as far as they can be.
@@ -66,7 +72,7 @@ def glue(
     """
     prescribed = prescribe(dofs, bcs)
     D = dofs.gather_copies(weights.reshape(-1, dofs.bs))
-    inequalities = inequality_rows(dofs, prescribed, D, records, chosen, length)
+    inequalities = inequality_rows(dofs, prescribed, D, records, length)
     equalities = equality_rows(dofs, prescribed, D)
     constraints = assemble_constraints(dofs, equalities, inequalities.rows, weights)
     return Gluing(prescribed, records, inequalities, constraints)

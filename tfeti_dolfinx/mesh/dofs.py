@@ -121,6 +121,22 @@ class TornDofs:
         asked = exchange.send(groups) - self.group_offsets[self.comm.rank]
         return tuple(exchange.answer(table[asked]) for table in tables)
 
+    def add_over_ranks(self, groups: Array, values: Array) -> Array:
+        """Sum of the values that all ranks give for a group, back to each of them. Collective.
+
+        Args:
+            groups: Global groups, none twice on a rank, shape ``(k,)``.
+            values: One value (or row) for each, shape ``(k, ...)``.
+
+        Returns:
+            The sums, shape ``(k, ...)``.
+        """
+        exchange = Exchange(self.comm, owner_of(self.group_offsets, groups))
+        slot = exchange.send(groups) - self.group_offsets[self.comm.rank]
+        sums = np.zeros((self.num_groups, *values.shape[1:]), dtype=values.dtype)
+        np.add.at(sums, slot, exchange.send(values))
+        return exchange.answer(sums[slot])
+
     def gather_copies(self, values: Array) -> Array:
         """Values of the local primal nodes in the order of the owned ``copies``. Collective.
 

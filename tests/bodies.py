@@ -1,0 +1,142 @@
+"""Scenes of several boxes, meshed independently."""
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from dolfinx import mesh as dmesh
+from mpi4py import MPI
+from scenes import hooke, strain
+
+import tfeti_dolfinx as tfeti
+
+
+def boxes(cell, parts, comm=MPI.COMM_WORLD):
+    """One mesh of several boxes that share no node.
+
+    Args:
+        cell: Name of the cell type.
+        parts: For each box its name, lowest corner, highest corner, cells along the axes.
+        comm: Communicator.
+
+    Returns:
+        Mesh, facet tags and names: "<box> left", "right", "bottom", "top" (3D: "front", "back").
+    """
+    cell_type = dmesh.to_type(cell)
+    gdim = len(parts[0][1])
+    cells, points, start = [], [], 0
+    for _, low, high, n in parts:
+        if gdim == 2:
+            box = dmesh.create_rectangle(MPI.COMM_SELF, [low, high], list(n), cell_type)
+        else:
+            box = dmesh.create_box(MPI.COMM_SELF, [low, high], list(n), cell_type)
+        geometry = box.geometry
+        dofmap = geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap
+        cells.append(start + np.asarray(dofmap))
+        points.append(geometry.x[:, :gdim])
+        start += len(geometry.x)
+        element = box.ufl_domain().ufl_coordinate_element()
+    cells, points = np.concatenate(cells).astype(np.int64), np.concatenate(points)
+    if comm.rank:
+        cells, points = cells[:0], points[:0]
+    partitioner = dmesh.create_cell_partitioner(dmesh.GhostMode.none)
+    mesh = dmesh.create_mesh(comm, cells=cells, x=points, e=element, partitioner=partitioner)
+    return mesh, *_tags(mesh, parts, gdim)
+
+
+def _tags(mesh, parts, gdim):
+    sides = [("left", 0, 0), ("right", 0, 1), ("bottom", gdim - 1, 0), ("top", gdim - 1, 1)]
+    if gdim == 3:
+        sides += [("front", 1, 0), ("back", 1, 1)]
+    names, facets, values = {}, [], []
+    for name, low, high, _ in parts:
+        for side, axis, end in sides:
+            tag = names[f"{name} {side}"] = len(names) + 1
+            at = (low, high)[end][axis]
+
+            def on_side(x, axis=axis, at=at, low=low, high=high):
+                inside = np.isclose(x[axis], at, atol=1e-9)
+                for k in range(gdim):
+                    inside &= (x[k] > low[k] - 1e-9) & (x[k] < high[k] + 1e-9)
+                return inside
+
+            found = dmesh.locate_entities_boundary(mesh, gdim - 1, on_side)
+            # a coincident side of another box is told apart by the cell's midpoint
+            found = found[_belongs(mesh, found, low, high, gdim)]
+            facets.append(found)
+            values.append(np.full(len(found), tag, dtype=np.int32))
+    facets, values = np.concatenate(facets), np.concatenate(values)
+    order = np.argsort(facets)
+    return dmesh.meshtags(mesh, gdim - 1, facets[order], values[order]), names
+
+
+def _belongs(mesh, facets, low, high, gdim):
+    mesh.topology.create_connectivity(gdim - 1, gdim)
+    links = mesh.topology.connectivity(gdim - 1, gdim)
+    cells = np.array([links.links(f)[0] for f in facets], dtype=np.int32)
+    middle = dmesh.compute_midpoints(mesh, gdim, cells)[:, :gdim]
+    return np.all((middle > np.array(low)) & (middle < np.array(high)), axis=1)
+
+
+def stacked(cell, n_lower=3, n_upper=4, subdomains=4, upper=(0.0, 1.0), gap=0.0):
+    """A box on a box: lower [0, 1]^d−1 × [−1, 0], upper from ``upper`` in x (and y), above it."""
+    gdim = 2 if cell in ("triangle", "quadrilateral") else 3
+    a, b = upper
+    parts = [
+        ("lower", (0.0,) * (gdim - 1) + (-1.0,), (1.0,) * (gdim - 1) + (0.0,), (n_lower,) * gdim),
+        ("upper", (a,) * (gdim - 1) + (gap,), (b,) * (gdim - 1) + (1.0 + gap,), (n_upper,) * gdim),
+    ]
+    mesh, tags, names = boxes(cell, parts)
+    return tfeti.decompose(mesh, subdomains, facet_tags=tags, surfaces=names)
+
+
+def jagged(x):
+    """Four subdomains whose interfaces zigzag through the contact zone."""
+    zigzag = 0.5 + 0.12 * np.sign(np.sin(23 * x[1] + 17 * x[2] + 9 * x[0]))
+    return (
+        (x[0] > zigzag) + 2 * (x[len(x) - 1] > 0)
+        if np.ptp(x[2])
+        else (x[0] > zigzag) + 2 * (x[1] > 0)
+    )
+
+
+def two_body_problem(d, load, bcs, contacts, degree=1, stress=None, **options):
+    """Elasticity with a load given as a linear form of the test function."""
+    gdim = d.mesh.geometry.dim
+    V = fem.functionspace(d.mesh, ("Lagrange", degree, (gdim,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    stress = stress or hooke()
+    dx = ufl.Measure("dx", domain=d.mesh, metadata={"quadrature_degree": 2 * degree})
+    ds = ufl.Measure(
+        "ds", domain=d.mesh, subdomain_data=d.facet_tags, metadata={"quadrature_degree": 2 * degree}
+    )
+    a = ufl.inner(stress(u), strain(v)) * dx
+    return tfeti.ContactProblem(
+        a, load(v, ds), bcs(V), contacts, d, stress=stress, petsc_options=options
+    )
+
+
+def pressed(d, pressure=0.1, on="upper top"):
+    """Load: a uniform pressure from above."""
+
+    def load(v, ds):
+        up = np.zeros(d.mesh.geometry.dim)
+        up[-1] = -pressure
+        return ufl.dot(fem.Constant(d.mesh, up), v) * ds(d.surface(on))
+
+    return load
+
+
+def held(d, *sides):
+    """Conditions: no normal displacement on the sides named."""
+    gdim = d.mesh.geometry.dim
+    axis_of = {"left": 0, "right": 0, "bottom": gdim - 1, "top": gdim - 1, "front": 1, "back": 1}
+
+    def bcs(V):
+        made = []
+        for side in sides:
+            axis = axis_of[side.split()[-1]]
+            dofs = fem.locate_dofs_topological(V.sub(axis), gdim - 1, d.facets(side))
+            made.append(fem.dirichletbc(0.0, dofs, V.sub(axis)))
+        return made
+
+    return bcs

@@ -1,0 +1,104 @@
+"""From integrals over facets to conditions of the nodes' owners."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.contact.facets import Facets
+from tfeti_dolfinx.contact.records import ContactRecords
+from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.parallel import Exchange, owner_of
+
+HARDLY_COVERED = 1e-6
+NEGLIGIBLE = 1e-13
+
+Triplets = tuple[Array, Array, Array]
+
+
+def conditions(
+    dofs: TornDofs,
+    contact: int,
+    multipliers: Array,
+    covered: Array,
+    gaps: Array,
+    entries: tuple[Triplets, ...],
+    nodes: Array,
+    areas: Array,
+    normals: Array,
+) -> ContactRecords:
+    """Add up what facets contribute to a node, and divide by ∫ψ_i. Collective.
+
+    A node whose covered share of ∫φ_i is below 1e-6 gets no condition.
+
+    Args:
+        dofs: Dof maps.
+        contact: Index of the contact.
+        multipliers: Global groups of the multipliers' nodes, shape ``(f, v)``.
+        covered: ∫φ_i over the covered part of each facet, shape ``(f, v)``.
+        gaps: ∫ψ_i g over the facets, g the gap along the node's normal, shape ``(f, v)``.
+        entries: Triplets (multiplier's group, displacement's group, ∫ψ_i φ_k with its sign).
+        nodes: Groups of all nodes of the secondary surface, shape ``(n, v)``.
+        areas: ∫φ_i over the whole facets, shape ``(n, v)``.
+        normals: Averaged normal of each owned group, shape ``(g, gdim)``.
+    """
+    area = _sum_on_owners(dofs, multipliers.ravel(), covered.ravel())
+    whole = _sum_on_owners(dofs, nodes.ravel(), areas.ravel())
+    gap = _sum_on_owners(dofs, multipliers.ravel(), gaps.ravel())
+    chosen = np.flatnonzero(area > HARDLY_COVERED * whole)
+    place = np.full(dofs.num_groups, -1)
+    place[chosen] = np.arange(len(chosen))
+    slot, column, value = _merged(dofs, entries)
+    kept = (place[slot] >= 0) & (np.abs(value) > NEGLIGIBLE * np.maximum(area[slot], 1e-300))
+    slot, column, value = slot[kept], column[kept], value[kept]
+    return ContactRecords(
+        contact=np.full(len(chosen), contact),
+        group=chosen,
+        normal=normals[chosen],
+        gap=gap[chosen] / area[chosen],
+        area=area[chosen],
+        near=np.ones(len(chosen), dtype=bool),
+        row=place[slot],
+        entry_group=column,
+        coefficients=normals[slot] * (value / area[slot])[:, None],
+        candidates=int(np.sum(whole > 0.0)),
+    )
+
+
+def triplets(rows: Array, columns: Array, values: Array) -> Triplets:
+    """Row groups, column groups and values of many small matrices."""
+    i, j = np.broadcast_arrays(rows[:, :, None], columns[:, None, :])
+    return i.ravel(), j.ravel(), values.ravel()
+
+
+def averaged_normals(dofs: TornDofs, secondary: Facets, num_vertices: int) -> Array:
+    """Averaged normal of each owned group that is a vertex of these facets, else 0. Collective."""
+    groups = secondary.groups[:, :num_vertices].ravel()
+    gdim = secondary.vertex_normals.shape[2]
+    total = _sum_on_owners(dofs, groups, secondary.vertex_normals.reshape(-1, gdim))
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return total / np.where(length > 0.0, length, 1.0)
+
+
+def _sum_on_owners(dofs: TornDofs, groups: Array, values: Array) -> Array:
+    """Sum of the values given on any rank for each owned group. Collective."""
+    exchange = Exchange(dofs.comm, owner_of(dofs.group_offsets, groups))
+    slot = exchange.send(groups) - dofs.group_offsets[dofs.comm.rank]
+    sums = np.zeros((dofs.num_groups, *values.shape[1:]))
+    np.add.at(sums, slot, exchange.send(values))
+    return sums
+
+
+def _merged(dofs: TornDofs, entries: tuple[Triplets, ...]) -> Triplets:
+    """Triplets on the ranks that own their rows (as local slots), equal ones added up."""
+    row, column, value = (np.concatenate(parts) for parts in zip(*entries, strict=True))
+    exchange = Exchange(dofs.comm, owner_of(dofs.group_offsets, row))
+    row = exchange.send(row) - dofs.group_offsets[dofs.comm.rank]
+    column, value = exchange.send(column), exchange.send(value)
+    order = np.lexsort((column, row))
+    row, column, value = row[order], column[order], value[order]
+    first = np.ones(len(row), dtype=bool)
+    first[1:] = (row[1:] != row[:-1]) | (column[1:] != column[:-1])
+    starts = np.flatnonzero(first)
+    sums = np.add.reduceat(value, starts) if len(value) else value
+    return row[first], column[first], sums

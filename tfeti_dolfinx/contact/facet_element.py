@@ -1,0 +1,104 @@
+"""Lagrange elements on facets, and which unknowns of a cell are those of its facets."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import basix
+import numpy as np
+
+from tfeti_dolfinx.arrays import Array
+
+# vertices of a facet in the order of its polygon; DOLFINx numbers quadrilaterals as tensors
+POLYGON = {"interval": [0, 1], "triangle": [0, 1, 2], "quadrilateral": [0, 1, 3, 2]}
+FACET_OF = {
+    "triangle": "interval",
+    "quadrilateral": "interval",
+    "tetrahedron": "triangle",
+    "hexahedron": "quadrilateral",
+}
+
+
+class FacetElement:
+    """Lagrange element of a degree on a facet, vertices first.
+
+    Args:
+        facet: interval, triangle or quadrilateral.
+        degree: Polynomial degree.
+        variant: basix' Lagrange variant.
+    """
+
+    def __init__(self, facet: str, degree: int, variant: Any) -> None:
+        self.facet, self.degree = facet, degree
+        self._cell = getattr(basix.CellType, facet)
+        self._element = basix.create_element(basix.ElementFamily.P, self._cell, degree, variant)
+        self.points = self._element.points
+        self.size = self._element.dim
+
+    def values(self, xi: Array) -> Array:
+        """Basis functions at reference points: shape ``(n, tdim)`` to ``(n, size)``."""
+        if len(xi) == 0:
+            return np.zeros((0, self.size))
+        return self._element.tabulate(0, np.ascontiguousarray(xi))[0, :, :, 0]
+
+    def slopes(self, xi: Array) -> Array:
+        """Derivatives at reference points: shape ``(n, tdim)`` to ``(tdim, n, size)``."""
+        return self._element.tabulate(1, np.ascontiguousarray(xi))[1:, :, :, 0]
+
+
+@cache
+def facet_dofs(cell: str, degree: int, variant: Any) -> Array:
+    """Cell unknowns of each facet, in the order of the facet's own element.
+
+    Args:
+        cell: Name of the cell type.
+        degree: Degree of the Lagrange element.
+        variant: Its variant.
+
+    Returns:
+        Shape ``(facets, unknowns per facet)``.
+    """
+    cell_type = getattr(basix.CellType, cell)
+    points = basix.create_element(basix.ElementFamily.P, cell_type, degree, variant).points
+    corners, topology = basix.geometry(cell_type), basix.topology(cell_type)
+    element = FacetElement(FACET_OF[cell], degree, variant)
+    hats = FacetElement(FACET_OF[cell], 1, variant)
+    table = []
+    for vertices in topology[points.shape[1] - 1]:
+        on_facet = hats.values(element.points) @ corners[vertices]
+        distance = np.linalg.norm(on_facet[:, None] - points[None], axis=2)
+        table.append(np.argmin(distance, axis=1))
+    return np.array(table)
+
+
+def reference_points(facet: str, corners: Array, y: Array) -> Array:
+    """Reference coordinates of points in plane facets.
+
+    Args:
+        facet: interval, triangle or quadrilateral.
+        corners: Vertices of the facet of each point, shape ``(n, vertices, tdim)``.
+        y: The points, shape ``(n, tdim)``.
+
+    Returns:
+        Shape ``(n, tdim)``. For quadrilaterals by Newton's method, exact in one step for
+        parallelograms.
+    """
+    origin = corners[:, 0]
+    if facet == "interval":
+        return (y - origin) / (corners[:, 1] - origin)
+    jacobian = np.stack((corners[:, 1] - origin, corners[:, 2] - origin), axis=2)
+    xi = _solve(jacobian, y - origin)
+    if facet == "triangle":
+        return xi
+    twist = corners[:, 3] - corners[:, 2] - corners[:, 1] + origin
+    for _ in range(8):
+        image = origin + np.einsum("nij,nj->ni", jacobian, xi) + twist * xi[:, :1] * xi[:, 1:]
+        slope = jacobian + np.stack((twist * xi[:, 1:], twist * xi[:, :1]), axis=2)
+        xi = xi + _solve(slope, y - image)
+    return xi
+
+
+def _solve(A: Array, b: Array) -> Array:
+    """Solutions of many small systems."""
+    return np.linalg.solve(A, b[:, :, None])[:, :, 0]

@@ -1,0 +1,165 @@
+"""Contact between surfaces of two bodies, by dual mortar multipliers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.contact.candidates import candidate_pairs, rendezvous
+from tfeti_dolfinx.contact.conditions import averaged_normals, conditions, triplets
+from tfeti_dolfinx.contact.facets import Facets, facet_kind, local_facets, with_averaged_normals
+from tfeti_dolfinx.contact.mortar import Segments, find_segments, hat_areas, integrate
+from tfeti_dolfinx.contact.records import ContactRecords
+from tfeti_dolfinx.contact.surfaces import extent, surface_facets, surface_nodes
+from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
+
+REACH = 0.05
+DEGENERATE = 1e-14
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Two surfaces may not enter each other.
+
+    Args:
+        secondary: Name or tag of the surface that carries the multipliers; better the one with
+            the finer mesh.
+        primary: Name or tag of the other surface.
+        search_radius: Surfaces farther apart than this make no rows at first; after the solve it
+            is checked that none of them has come to overlap. Default: 5 % of the smaller
+            surface's extent.
+    """
+
+    secondary: str | int
+    primary: str | int
+    search_radius: float | None = None
+
+    @property
+    def name(self) -> str:
+        """Name for messages."""
+        return f"contact of {self.secondary!r} with {self.primary!r}"
+
+    def first_radius(self, decomposition: Decomposition) -> float:
+        """The search radius to begin with. Collective.
+
+        Raises:
+            InputError: A surface is unknown or empty, both are the same, or the radius is not
+                positive.
+        """
+        if decomposition.surface(self.secondary) == decomposition.surface(self.primary):
+            raise InputError(
+                f"{self.name}: both are the same surface; contact of a surface with itself is "
+                "not supported, give its two sides different names"
+            )
+        facets = [surface_facets(decomposition, name) for name in (self.secondary, self.primary)]
+        if self.search_radius is None:
+            return REACH * min(extent(decomposition, surface) for surface in facets)
+        if not self.search_radius > 0.0:
+            raise InputError(
+                f"{self.name}: search_radius={self.search_radius}, expected a positive length"
+            )
+        return float(self.search_radius)
+
+    def displacement_bound(self, dofs: TornDofs, decomposition: Decomposition, u: Array) -> float:
+        """How far the surfaces may have moved towards each other. Collective.
+
+        Args:
+            dofs: Dof maps.
+            decomposition: The torn mesh.
+            u: Displacement in primal order, shape ``(num_nodes, gdim)``.
+
+        Returns:
+            Largest displacements of both surfaces, against their common mean, added up.
+        """
+        comm = decomposition.comm
+        moved = [
+            u[surface_nodes(dofs, decomposition, decomposition.facets(name))]
+            for name in (self.secondary, self.primary)
+        ]
+        total = comm.allreduce(np.sum([part.sum(axis=0) for part in moved], axis=0))
+        mean = total / comm.allreduce(sum(len(part) for part in moved))
+        largest = [np.linalg.norm(part - mean, axis=1).max(initial=0.0) for part in moved]
+        return sum(comm.allreduce(float(size), op=MPI.MAX) for size in largest)
+
+    def records(
+        self, dofs: TornDofs, decomposition: Decomposition, contact: int, radius: float
+    ) -> ContactRecords:
+        """One condition per secondary node that faces the primary surface. Collective.
+
+        With D_i = ∫ψ_i over the covered part and n_i the averaged normal the condition is
+        n_i · (Σ_k D_ik u_k − Σ_j M_ij u_j)/D_i ≤ g_i, g_i the mean gap weighted with ψ_i.
+
+        Args:
+            dofs: Dof maps.
+            decomposition: The torn mesh.
+            contact: Index of the contact.
+            radius: Surfaces farther apart than this make no conditions.
+
+        Raises:
+            InputError: The surfaces overlap by more than the radius, face away from each other,
+                or have facets without area.
+        """
+        kind, comm = facet_kind(dofs), decomposition.comm
+        v = kind.num_vertices
+        secondary, primary = self._sides(dofs, decomposition, v)
+        near_s, near_p = rendezvous(secondary, primary, v, radius, comm)
+        # three times as far, so that too deep an overlap is seen
+        pairs = candidate_pairs(near_s, near_p, v, 3.0 * radius)
+        degree = (1 if kind.facet != "quadrilateral" else 2) * (1 + kind.displacement.degree)
+        segments = find_segments(kind, near_s, near_p, pairs, radius, degree)
+        self._check_segments(segments, radius, comm)
+        integrals = integrate(kind, near_s, near_p, segments)
+        entries = (
+            triplets(
+                near_s.groups[integrals.facet, :v], near_s.groups[integrals.facet], integrals.own
+            ),
+            triplets(
+                near_s.groups[integrals.pair_secondary, :v],
+                near_p.groups[integrals.pair_primary],
+                -integrals.other,
+            ),
+        )
+        return conditions(
+            dofs=dofs,
+            contact=contact,
+            multipliers=near_s.groups[integrals.facet, :v],
+            covered=integrals.covered,
+            gaps=integrals.gap,
+            entries=entries,
+            nodes=secondary.groups[:, :v],
+            areas=hat_areas(kind, secondary),
+            normals=averaged_normals(dofs, secondary, v),
+        )
+
+    def _sides(
+        self, dofs: TornDofs, decomposition: Decomposition, num_vertices: int
+    ) -> tuple[Facets, Facets]:
+        """Facets of both surfaces, the secondary ones with averaged normals. Collective."""
+        sides = []
+        for name in (self.secondary, self.primary):
+            facets = local_facets(dofs, decomposition, surface_facets(decomposition, name))
+            size = extent(decomposition, decomposition.facets(name)) ** (facets.x.shape[2] - 1)
+            flat = int(np.sum(facets.area <= DEGENERATE * size))
+            if count := decomposition.comm.allreduce(flat):
+                raise InputError(f"{self.name}: {count} facets of {name!r} have no area")
+            sides.append(facets)
+        return with_averaged_normals(sides[0], dofs, num_vertices), sides[1]
+
+    def _check_segments(self, segments: Segments, radius: float, comm: MPI.Intracomm) -> None:
+        deepest = comm.allreduce(segments.deepest, op=MPI.MAX)
+        if deepest > radius:
+            raise InputError(
+                f"{self.name}: the surfaces overlap by up to {deepest:.6g}, more than the search "
+                f"radius {radius:.6g}; expected bodies that are apart, or a larger search_radius"
+            )
+        averted = comm.allreduce(int(segments.averted))
+        if averted and comm.allreduce(len(segments.weight)) == 0:
+            raise InputError(
+                f"{self.name}: the surfaces are near but face away from each other; expected "
+                "outward normals that oppose each other"
+            )
