@@ -38,8 +38,7 @@ def boxes(cell, parts, comm=MPI.COMM_WORLD):
     cells, points = np.concatenate(cells).astype(np.int64), np.concatenate(points)
     if comm.rank:
         cells, points = cells[:0], points[:0]
-    partitioner = dmesh.create_cell_partitioner(dmesh.GhostMode.none)
-    mesh = dmesh.create_mesh(comm, cells=cells, x=points, e=element, partitioner=partitioner)
+    mesh = dmesh.create_mesh(comm, cells=cells, x=points, e=element)
     return mesh, *_tags(mesh, parts, gdim)
 
 

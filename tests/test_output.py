@@ -29,7 +29,7 @@ def solution(request):
 
 def test_nodal_fields_share_the_displacement_s_element(solution):
     names = [f.name for f in nodal_fields(solution)]
-    assert names == ["displacement", "pressure", "gap", "status", "stress", "von_mises"]
+    assert names == ["displacement", "pressure", "gap", "status", "traction", "stress", "von_mises"]
     for f in nodal_fields(solution):
         assert f.function_space.element.basix_element.degree == 1
         assert np.all(np.isfinite(f.x.array))

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from bodies import held, jagged, pressed, stacked, two_body_problem
+from bodies import boxes, held, jagged, pressed, stacked, two_body_problem
+from dolfinx import fem
 from mpi4py import MPI
 
 import tfeti_dolfinx as tfeti
@@ -59,3 +60,86 @@ def test_uniform_pressure_and_linear_displacement(cell, subdomains, order, degre
     problem.solve()
     assert np.allclose(pressures(problem), PRESSURE, rtol=0, atol=1e-9)
     assert error_of_displacement(problem) < 1e-9
+
+
+def uncovered(d, pressure):
+    """Traction on the cut facets of the upper bottom with the moments of what is not covered.
+
+    Facets beyond x = 1 or left of x = 0 bear it whole. On a facet cut at s it is linear with
+    ∫q φ_i = ∫ over the uncovered part of p φ_i, which is all that the load knows of it.
+    """
+    W = fem.functionspace(d.mesh, ("DG", 1))
+    q = fem.Function(W)
+    x = W.tabulate_dof_coordinates()
+    cells = np.asarray(W.dofmap.list)
+    at = x[cells][:, :, 0]
+    low, high = at.min(axis=1, keepdims=True), at.max(axis=1, keepdims=True)
+    t = (at - low) / (high - low)
+    a, b = np.clip((0 - low) / (high - low), 0, 1), np.clip((1 - low) / (high - low), 0, 1)
+    # moments of 1 over [0, a] and [b, 1] with 1 − t and t, then the inverse of their mass matrix
+    right = 0.5 * (a**2 + 1 - b**2)
+    left = a + 1 - b - right
+    at_0, at_1 = 4 * left - 2 * right, 4 * right - 2 * left
+    q.x.array[cells.ravel()] = (pressure * (at_0 * (1 - t) + at_1 * t)).ravel()
+    return q
+
+
+@pytest.mark.parametrize("share", [0.5, 0.03])
+@pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
+@pytest.mark.parametrize("subdomains", [4, jagged], ids=["bisected", "jagged"])
+def test_overhanging_secondary_side(cell, subdomains, share):
+    """The uncovered remainder carries the same traction: uniform pressure again."""
+    n = 5
+    # facets of length h with the last one covered by this share of it, to the right of x = 1
+    h = 1.0 / (n - 1 + share)
+    gdim = 2 if cell == "quadrilateral" else 3
+    flat = (1.0,) * (gdim - 2)
+    parts = [
+        ("lower", (0.0,) * (gdim - 1) + (-1.0,), (1.0, *flat, 0.0), (3,) * gdim),
+        ("upper", (0.0,) * gdim, (n * h, *flat, 1.0), (n,) * gdim),
+    ]
+    mesh, tags, names = boxes(cell, parts)
+    d = tfeti.decompose(mesh, subdomains, facet_tags=tags, surfaces=names)
+    q = uncovered(d, PRESSURE)
+
+    def load(v, ds):
+        ends = pressed(d, PRESSURE)(v, ds)
+        return ends + q * v[gdim - 1] * ds(d.surface("upper bottom"))
+
+    sides = sides_of(cell)
+    problem = two_body_problem(
+        d, load, held(d, *sides), [tfeti.Contact("upper bottom", "lower top")], rtol=1e-12
+    )
+    problem.solve()
+    assert np.allclose(pressures(problem), PRESSURE, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.parametrize("order", [("upper bottom", "lower top"), ("lower top", "upper bottom")])
+def test_force_and_moment_balance(cell, order):
+    """Both sides overhang, nothing is uniform: still action equals reaction."""
+    d = stacked(cell, 3, 4, jagged, upper=(0.3, 1.4))
+    sides = ["lower bottom", "lower left", "upper left", "upper top"]
+    problem = two_body_problem(
+        d, pressed(d, 0.1, "upper right"), held(d, *sides), [tfeti.Contact(*order)], rtol=1e-12
+    )
+    problem.solve()
+    forces = problem.solution.body_forces
+    assert np.abs(forces.force).max() > 1e-3
+    assert np.allclose(forces.force.sum(axis=0), 0.0, rtol=0, atol=1e-12)
+    assert np.allclose(forces.moment.sum(axis=0), 0.0, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_hardly_covered_facets_cost_nothing(cell):
+    """Multiplications do not grow as the covered share of the last facets goes to nothing."""
+    taken = []
+    for share in (0.5, 1e-3, 1e-5, 1e-8):
+        d = stacked(cell, 3, 4, 4, upper=(0.0, 4 / (3 + share)))
+        sides = [*sides_of(cell), "upper right"]
+        problem = two_body_problem(
+            d, pressed(d), held(d, *sides), [tfeti.Contact("upper bottom", "lower top")]
+        )
+        problem.solve()
+        taken.append(problem.report.F_multiplications)
+    assert max(taken) <= 1.5 * taken[0]

@@ -1,5 +1,11 @@
-"""The type of all numpy arrays here; their shapes and units stand in the docstrings."""
+"""The type of all numpy arrays here, and sums that numpy's own functions lack.
 
+Shapes and units stand in the docstrings.
+"""
+
+from __future__ import annotations
+
+import math
 from typing import Any
 
 import numpy as np
@@ -8,4 +14,24 @@ import numpy.typing as npt
 Array = np.ndarray[Any, np.dtype[Any]]
 ArrayLike = npt.ArrayLike
 
-__all__ = ["Array", "ArrayLike"]
+__all__ = ["Array", "ArrayLike", "sum_rows"]
+
+
+def sum_rows(row: Array, values: Array, size: int) -> Array:
+    """Sums of the values with the same row.
+
+    Args:
+        row: Row of each value, shape ``(k,)``.
+        values: Shape ``(k, ...)``.
+        size: Number of rows.
+
+    Returns:
+        Shape ``(size, ...)``, of real numbers also where nothing is added up; there
+        ``numpy.bincount`` returns integers, which must not travel between ranks as real numbers.
+    """
+    shape = values.shape[1:]
+    flat = values.reshape(len(values), math.prod(shape))
+    sums = np.empty((size, flat.shape[1]))
+    for column, total in zip(flat.T, sums.T, strict=True):
+        total[:] = np.bincount(row, column, minlength=size)
+    return sums.reshape(size, *shape)

@@ -9,12 +9,9 @@ import ufl
 from dolfinx import fem
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.compat import assemble_csr
+from tfeti_dolfinx.compat import JIT_OPTIONS, assemble_csr
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
-
-# a compile by another rank or run may take longer than DOLFINx's 10 seconds
-JIT_OPTIONS = {"timeout": 300}
 
 
 def check_measures(form: ufl.Form, decomposition: Decomposition) -> None:

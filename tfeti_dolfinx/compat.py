@@ -23,6 +23,8 @@ except ImportError:
 
 
 DOLFINX_VERSION = version("fenics-dolfinx")
+# a compile by another rank or run may take longer than DOLFINx's 10 seconds
+JIT_OPTIONS = {"timeout": 300}
 
 
 def petsc_scalar_type() -> Any:

@@ -10,8 +10,7 @@ import ufl
 from dolfinx import fem
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.assembly import JIT_OPTIONS
-from tfeti_dolfinx.compat import interpolation_points
+from tfeti_dolfinx.compat import JIT_OPTIONS, interpolation_points
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
@@ -74,6 +73,32 @@ def nodal(expression: Any, dofs: TornDofs, name: str) -> fem.Function:
     averages[dofs.dolfinx_node] = sums[:, :-1] / sums[:, -1:]
     function = fem.Function(W, name=name)
     function.x.array[:] = averages.ravel()
+    return function
+
+
+def from_vertices(dofs: TornDofs, values: Array, vertices: Array) -> fem.Function:
+    """Scalar function from values at vertices. Collective.
+
+    Nodes between vertices take the value of the linear interpolant where all those vertices have
+    one, else 0: a field of a surface stays on the surface.
+
+    Args:
+        dofs: Dof maps.
+        values: One value per owned group, shape ``(g,)``.
+        vertices: Which groups are vertices with a value, shape ``(g,)``.
+    """
+    S, dof = dofs.scalar
+    function = fem.Function(S)
+    if S.element.basix_element.degree == 1:
+        function.x.array[dof] = dofs.spread(np.where(vertices, values, 0.0))
+        return function
+    W, node = dofs.hats
+    linear, share, inside = fem.Function(W), fem.Function(W), fem.Function(S)
+    linear.x.array[:] = dofs.spread(np.where(vertices, values, 0.0))[node]
+    share.x.array[:] = dofs.spread(vertices.astype(float))[node]
+    function.interpolate(linear)
+    inside.interpolate(share)
+    function.x.array[inside.x.array < 1.0 - 1e-8] = 0.0
     return function
 
 

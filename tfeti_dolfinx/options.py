@@ -71,6 +71,11 @@ class Options:
     error_if_not_converged: bool = _option(
         True, "all", "raise ConvergenceError where a solver stops before its tolerance"
     )
+    bbt: bool = _option(
+        False,
+        "all",
+        "put the extreme eigenvalues of B Bᵀ and B D⁻¹ Bᵀ into the report; needs slepc4py",
+    )
     monitor: bool = _option(False, "all", "print a line per step")
     converged_reason: bool = _option(False, "all", "print why the solver stopped")
     view: bool = _option(False, "all", "print the options, the sizes and the report")

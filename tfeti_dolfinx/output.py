@@ -83,6 +83,8 @@ def write_xdmf(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
 def nodal_fields(solution: Solution) -> list[fem.Function]:
     """All nodal fields, on the displacement's element. Collective."""
     fields = [solution.displacement, solution.pressure, solution.gap, solution.status]
+    if solution.has_contact:
+        fields.append(solution.traction)
     if solution.has_stress:
         fields += [solution.nodal_stress, solution.nodal_von_mises]
     return fields

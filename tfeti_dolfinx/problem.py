@@ -19,6 +19,7 @@ from tfeti_dolfinx.errors import ConvergenceError, NoSolutionError
 from tfeti_dolfinx.fields import Stress
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.gluing.glue import glue
+from tfeti_dolfinx.gluing.spectrum import extreme_eigenvalues, require_slepc
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import parse_options
@@ -80,6 +81,8 @@ class ContactProblem:
     ) -> None:
         require_real_petsc()
         self.options = parse_options(petsc_options, petsc_options_prefix)
+        if self.options.bbt:
+            require_slepc(decomposition.comm)
         self.decomposition, self.bcs, self.contacts = decomposition, list(bcs), list(contacts)
         V = displacement_space(a)
         self.u = fem.Function(V, name="displacement") if u is None else u
@@ -146,6 +149,9 @@ class ContactProblem:
             records, weights = search.records, self._weights()
             self._gluing = glue(self.dofs, self.bcs, records, search.length, weights)
             self._constraints = self._gluing.constraints
+        if self.options.bbt:
+            with stage("spectrum", self.report.seconds):
+                self.report.spectrum = extreme_eigenvalues(self._constraints)
 
     def _take_in_overlapping(self, search: ContactSearch) -> int:
         """Give rows to nodes that have come to overlap without one; how many."""
@@ -188,6 +194,7 @@ class ContactProblem:
                 lam=np.array(result.lam.array_r),
                 mu=result.mu,
                 stress=self._stress,
+                surfaces=[name for contact in self.contacts for name in contact.surfaces],
             )
         fill_report(report, self.solution, dual, result, self._counters, self.options.rtol)
         result.destroy()

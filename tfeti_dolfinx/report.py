@@ -45,6 +45,9 @@ class Report:
             (lengths), ``tension`` (most negative pressure), ``complementarity`` (largest
             force times gap), ``balance`` (largest force left on a kernel mode).
         errors: Relative errors against closed forms, filled by demos.
+        spectrum: With ``-tfeti_bbt``: the extreme eigenvalues ``BBt_min`` and ``BBt_max`` of
+            B Bᵀ, ``BDBt_min`` and ``BDBt_max`` of B D⁻¹ Bᵀ. Their roots are the extreme
+            singular values of B and of B D^-½.
     """
 
     primal_dofs: int = 0
@@ -73,6 +76,7 @@ class Report:
     seconds: dict[str, float] = field(default_factory=dict)
     residuals: dict[str, float] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
+    spectrum: dict[str, float] = field(default_factory=dict)
 
     def reset_counters(self) -> None:
         """Set everything that adds up over rounds to zero."""
@@ -91,10 +95,10 @@ class Report:
     def __str__(self) -> str:
         lines = []
         for name, value in asdict(self).items():
-            if isinstance(value, dict):
+            if isinstance(value, dict) and value:
                 lines += [f"{name}.{key:<22} {item:.6g}" for key, item in value.items()]
             else:
-                lines.append(f"{name:<31} {value}")
+                lines.append(f"{name:<31} {'-' if value == {} else value}")
         return "\n".join(lines)
 
     def to_json(self) -> str:

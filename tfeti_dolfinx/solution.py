@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
@@ -12,11 +13,11 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.compat import first_component
+from tfeti_dolfinx.contact.forces import BodyForces, body_forces, nodal_forces, vertex_tractions
 from tfeti_dolfinx.contact.records import remaining_gaps
 from tfeti_dolfinx.contact.surfaces import group_points
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.fields import Stress, cellwise, checked_stress, nodal, von_mises
+from tfeti_dolfinx.fields import Stress, cellwise, checked_stress, from_vertices, nodal, von_mises
 from tfeti_dolfinx.gluing.glue import Gluing
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -64,6 +65,7 @@ class Solution:
         lam: Multipliers of this rank's rows.
         mu: Multipliers of Gλ = e.
         stress: UFL stress of a displacement, or None.
+        surfaces: All contact surfaces.
     """
 
     def __init__(
@@ -75,15 +77,21 @@ class Solution:
         lam: Array,
         mu: Array,
         stress: Stress | None,
+        surfaces: Sequence[str | int] = (),
     ) -> None:
         self.displacement, self.dofs, self.decomposition = u, dofs, decomposition
         self.gluing, self.lam, self.mu = gluing, lam, mu
-        self._stress = stress
+        self._stress, self._surfaces = stress, list(surfaces)
 
     @property
     def has_stress(self) -> bool:
         """Whether the problem was given a stress."""
         return self._stress is not None
+
+    @property
+    def has_contact(self) -> bool:
+        """Whether the problem has contacts."""
+        return bool(self._surfaces)
 
     @cached_property
     def stress(self) -> fem.Function:
@@ -107,17 +115,17 @@ class Solution:
 
     @cached_property
     def pressure(self) -> fem.Function:
-        """Contact pressure, 0 off the contact surfaces."""
+        """Contact pressure on the secondary sides and at obstacles, 0 elsewhere."""
         values = np.zeros(self.dofs.num_groups)
         np.add.at(values, self.gluing.records.group, self.contact_pressure)
-        return self._scalar(values, "pressure")
+        return self._field(values, self._vertices, "pressure")
 
     @cached_property
     def gap(self) -> fem.Function:
-        """Remaining gap after deformation, 0 off the contact surfaces."""
+        """Remaining gap after deformation, 0 where there is no contact condition."""
         values = np.full(self.dofs.num_groups, np.inf)
         np.minimum.at(values, self.gluing.records.group, self.remaining_gap)
-        return self._scalar(np.where(np.isfinite(values), values, 0.0), "gap")
+        return self._field(np.where(self._vertices, values, 0.0), self._vertices, "gap")
 
     @cached_property
     def status(self) -> fem.Function:
@@ -125,7 +133,32 @@ class Solution:
         values = np.full(self.dofs.num_groups, float(ContactStatus.NONE))
         touching = np.where(self.force > 0.0, ContactStatus.TOUCHING, ContactStatus.OPEN)
         np.maximum.at(values, self.gluing.records.group, touching.astype(float))
-        return self._scalar(values, "status")
+        function = self._field(values, self._vertices, "status")
+        function.x.array[:] = np.floor(function.x.array)  # between nodes: the lesser of the two
+        return function
+
+    @cached_property
+    def traction(self) -> fem.Function:
+        """Contact traction on the surfaces of both sides, a vector; 0 elsewhere.
+
+        Its moments with the hats of degree 1 are those of the nodal contact forces, so action
+        and reaction of two sides have the same resultant.
+        """
+        dofs = self.dofs
+        values, area = vertex_tractions(
+            self._nodal_forces, dofs, self.decomposition, self._surfaces
+        )
+        function = fem.Function(dofs.V, name="traction")
+        components = function.x.array.reshape(-1, dofs.bs)
+        for i in range(dofs.bs):
+            component = from_vertices(dofs, values[:, i], area > 0.0)
+            components[dofs.dolfinx_node, i] = component.x.array[dofs.scalar[1]]
+        return function
+
+    @cached_property
+    def body_forces(self) -> BodyForces:
+        """Resultants of the contact forces on each body. Collective at first use."""
+        return body_forces(self._nodal_forces, self.dofs, self.decomposition)
 
     def contact(self, index: int = 0) -> ContactData:
         """State of the nodes of a contact, those that this rank owns. Collective.
@@ -177,20 +210,20 @@ class Solution:
             raise InputError("no stress: give ContactProblem(..., stress=sigma)")
         return checked_stress(self._stress, self.displacement)
 
-    @cached_property
-    def _scalar_space(self) -> tuple[fem.FunctionSpace, Array]:
-        """Scalar space of the displacement's element, and its dof of each DOLFINx node."""
-        V = self.dofs.V
-        if self.dofs.bs == 1:
-            return V, np.arange(V.dofmap.index_map.size_local)
-        S, parent = first_component(V)
-        dof = np.empty(len(parent), dtype=np.int64)
-        dof[parent // self.dofs.bs] = np.arange(len(parent))
-        return S, dof
+    @property
+    def _vertices(self) -> Array:
+        """Owned groups with a contact condition."""
+        found = np.zeros(self.dofs.num_groups, dtype=bool)
+        found[self.gluing.records.group] = True
+        return found
 
-    def _scalar(self, values: Array, name: str) -> fem.Function:
-        """Function from one value per owned group."""
-        S, dof = self._scalar_space
-        function = fem.Function(S, name=name)
-        function.x.array[dof[self.dofs.dolfinx_node]] = self.dofs.spread(values)
+    @cached_property
+    def _nodal_forces(self) -> Array:
+        """Contact forces on the owned groups, shape ``(g, gdim)``. Collective at first use."""
+        return nodal_forces(self.gluing.records, self.force, self.dofs)
+
+    def _field(self, values: Array, vertices: Array, name: str) -> fem.Function:
+        """Scalar function from values of the owned groups at these vertices, 0 elsewhere."""
+        function = from_vertices(self.dofs, values, vertices)
+        function.name = name
         return function

@@ -47,38 +47,90 @@ def rendezvous(
 
 
 def candidate_pairs(
-    secondary: Facets, primary: Facets, num_vertices: int, radius: float
+    secondary: Facets, primary: Facets, num_vertices: int, reach: float
 ) -> tuple[Array, Array]:
-    """Pairs of facets whose enclosing balls are no farther apart than a radius.
+    """Pairs of facets that may meet when one looks along the secondary facets' normals.
 
+    A primary facet is found if it comes within a secondary facet's radius of the line through
+    that facet's centre along its averaged normal, no farther than ``reach`` from the centre.
     Primary facets are sorted into classes of equal size up to a factor of 2, each with a tree of
-    its own, so that a graded mesh does not make large balls meet small ones in vain.
+    its own, so that a graded mesh does not make large facets meet small ones in vain.
 
     Args:
-        secondary: Secondary facets.
+        secondary: Secondary facets, with averaged normals.
         primary: Primary facets.
         num_vertices: Vertices of a facet.
-        radius: Largest distance of the balls.
+        reach: How far to look, to both sides.
 
     Returns:
         Secondary and primary facet of each pair.
     """
     s_centre, s_size = _balls(secondary, num_vertices)
     p_centre, p_size = _balls(primary, num_vertices)
-    found_s: list[Array] = [np.empty(0, dtype=np.int64)]
-    found_p: list[Array] = [np.empty(0, dtype=np.int64)]
+    direction = centre_normals(secondary)
+    pairs: list[Array] = [np.empty((2, 0), dtype=np.int64)]
     classes = np.floor(np.log2(np.maximum(p_size, 1e-300))).astype(np.int64)
     for size_class in np.unique(classes) if len(secondary) else ():
         members = np.flatnonzero(classes == size_class)
-        reach = s_size + p_size[members].max() + radius
-        lists = cKDTree(p_centre[members]).query_ball_point(s_centre, reach, return_sorted=False)
-        count = np.fromiter((len(hits) for hits in lists), dtype=np.int64, count=len(lists))
-        found_s.append(np.repeat(np.arange(len(s_centre)), count))
-        hits = np.concatenate([np.asarray(h, dtype=np.int64) for h in lists if h] or [members[:0]])
-        found_p.append(members[hits])
-    s, p = np.concatenate(found_s), np.concatenate(found_p)
-    near = np.linalg.norm(s_centre[s] - p_centre[p], axis=1) <= s_size[s] + p_size[p] + radius
-    return s[near], p[near]
+        tree, radius = cKDTree(p_centre[members]), s_size + p_size[members].max()
+        s, hit = _march(tree, s_centre, direction, radius, reach)
+        pairs.append(np.stack((s, members[hit])))
+    return tuple(np.unique(np.concatenate(pairs, axis=1), axis=1))
+
+
+def centre_normals(facets: Facets) -> Array:
+    """Mean of each facet's averaged vertex normals, of unit length, shape ``(n, gdim)``."""
+    total = facets.vertex_normals.sum(axis=1)
+    return total / np.linalg.norm(total, axis=1, keepdims=True)
+
+
+def _march(
+    tree: cKDTree, origin: Array, direction: Array, radius: Array, reach: float
+) -> tuple[Array, Array]:
+    """Points of a tree within a radius of line segments: steps as long as nothing is near.
+
+    Args:
+        tree: The points.
+        origin: Middle of each segment, shape ``(n, gdim)``.
+        direction: Unit vectors, shape ``(n, gdim)``.
+        radius: One per segment, shape ``(n,)``.
+        reach: Half the length of the segments.
+
+    Returns:
+        Segment and point of each pair, some more than once.
+    """
+    found_s: list[Array] = [np.empty(0, dtype=np.int64)]
+    found_p: list[Array] = [np.empty(0, dtype=np.int64)]
+    front = np.full(len(origin), -reach)  # all before it has been seen
+    active = np.arange(len(origin))
+    while len(active):
+        t = front[active] + radius[active]
+        x = origin[active] + t[:, None] * direction[active]
+        nearest, _ = tree.query(x)
+        close = nearest <= 2.0 * radius[active]
+        rows, points = _within(tree, x[close], 2.0 * radius[active[close]])
+        found_s.append(active[close][rows])
+        found_p.append(points)
+        front[active] = t + np.where(close, radius[active], nearest - radius[active])
+        active = active[front[active] < reach]
+    return np.concatenate(found_s), np.concatenate(found_p)
+
+
+def _within(tree: cKDTree, x: Array, radius: Array) -> tuple[Array, Array]:
+    """Points of a tree within a radius of each x: row and point of each pair."""
+    found: list[tuple[Array, Array]] = [(np.empty(0, dtype=np.int64),) * 2]
+    rows, k = np.arange(len(x)), min(16, tree.n)
+    while len(rows):
+        distance, point = tree.query(
+            x[rows], k=np.arange(1, k + 1), distance_upper_bound=np.nextafter(radius.max(), np.inf)
+        )
+        inside = distance <= radius[rows, None]
+        row, column = np.nonzero(inside)
+        full = inside[:, -1] & (k < tree.n)
+        settled = ~full[row]
+        found.append((rows[row[settled]], point[row[settled], column[settled]]))
+        rows, k = rows[full], min(2 * k, tree.n)
+    return tuple(np.concatenate(part) for part in zip(*found, strict=True))
 
 
 def _balls(facets: Facets, num_vertices: int) -> tuple[Array, Array]:

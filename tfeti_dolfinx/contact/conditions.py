@@ -42,9 +42,9 @@ def conditions(
         areas: ∫φ_i over the whole facets, shape ``(n, v)``.
         normals: Averaged normal of each owned group, shape ``(g, gdim)``.
     """
-    area = _sum_on_owners(dofs, multipliers.ravel(), covered.ravel())
-    whole = _sum_on_owners(dofs, nodes.ravel(), areas.ravel())
-    gap = _sum_on_owners(dofs, multipliers.ravel(), gaps.ravel())
+    area = dofs.add_on_owners(multipliers.ravel(), covered.ravel())
+    whole = dofs.add_on_owners(nodes.ravel(), areas.ravel())
+    gap = dofs.add_on_owners(multipliers.ravel(), gaps.ravel())
     chosen = np.flatnonzero(area > HARDLY_COVERED * whole)
     place = np.full(dofs.num_groups, -1)
     place[chosen] = np.arange(len(chosen))
@@ -75,18 +75,9 @@ def averaged_normals(dofs: TornDofs, secondary: Facets, num_vertices: int) -> Ar
     """Averaged normal of each owned group that is a vertex of these facets, else 0. Collective."""
     groups = secondary.groups[:, :num_vertices].ravel()
     gdim = secondary.vertex_normals.shape[2]
-    total = _sum_on_owners(dofs, groups, secondary.vertex_normals.reshape(-1, gdim))
+    total = dofs.add_on_owners(groups, secondary.vertex_normals.reshape(-1, gdim))
     length = np.linalg.norm(total, axis=1, keepdims=True)
     return total / np.where(length > 0.0, length, 1.0)
-
-
-def _sum_on_owners(dofs: TornDofs, groups: Array, values: Array) -> Array:
-    """Sum of the values given on any rank for each owned group. Collective."""
-    exchange = Exchange(dofs.comm, owner_of(dofs.group_offsets, groups))
-    slot = exchange.send(groups) - dofs.group_offsets[dofs.comm.rank]
-    sums = np.zeros((dofs.num_groups, *values.shape[1:]))
-    np.add.at(sums, slot, exchange.send(values))
-    return sums
 
 
 def _merged(dofs: TornDofs, entries: tuple[Triplets, ...]) -> Triplets:

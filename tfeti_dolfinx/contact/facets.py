@@ -120,11 +120,9 @@ def with_averaged_normals(facets: Facets, dofs: TornDofs, num_vertices: int) -> 
     """The same facets with normals averaged at the vertices, weighted by area. Collective."""
     groups = facets.groups[:, :num_vertices]
     weighted = np.repeat((facets.normal * facets.area[:, None])[:, None], num_vertices, axis=1)
-    used, place = np.unique(groups, return_inverse=True)
-    sums = np.zeros((len(used), weighted.shape[2]))
-    np.add.at(sums, place.ravel(), weighted.reshape(-1, sums.shape[1]))
-    total = dofs.add_over_ranks(used, sums)
-    normals = total[place.reshape(groups.shape)]
+    total = dofs.add_on_owners(groups.ravel(), weighted.reshape(-1, weighted.shape[2]))
+    (normals,) = dofs.lookup(groups.ravel(), total)
+    normals = normals.reshape(weighted.shape)
     length = np.linalg.norm(normals, axis=2, keepdims=True)
     return Facets(
         x=facets.x,

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import basix
 import numpy as np
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.arrays import Array, sum_rows
+from tfeti_dolfinx.contact.candidates import centre_normals
 from tfeti_dolfinx.contact.clipping import (
     clip_intervals,
     clip_polygons,
@@ -98,6 +98,7 @@ def find_segments(
     primary: Facets,
     pairs: tuple[Array, Array],
     radius: float,
+    reach: float,
     degree: int,
 ) -> Segments:
     """Clip pairs of facets on the secondary facets' averaged normal planes.
@@ -107,7 +108,8 @@ def find_segments(
         secondary: Secondary facets with averaged normals.
         primary: Primary facets.
         pairs: Secondary and primary facet of each pair.
-        radius: Facets farther apart than this along the normal do not meet.
+        radius: Facets that overlap by more than this along the normal do not meet.
+        reach: Nor do facets farther apart than this.
         degree: Degree of the quadrature.
     """
     s, p = pairs
@@ -132,8 +134,8 @@ def find_segments(
     distance[met] = _distance(
         kind, secondary, primary, s[met], p[met], middle[met], corners_s, corners_p[met], normal
     )
-    near = met & (np.abs(distance) <= radius)
-    deep = met & facing & (distance < -radius) & (distance >= -3.0 * radius)
+    near = met & (distance >= -radius) & (distance <= reach)
+    deep = met & facing & (distance < -radius) & (distance >= -reach)
     kept = np.flatnonzero(near & facing)
     if tdim == 1:
         owner, y, weight = quadrature_on_intervals(ends[kept], degree)
@@ -229,8 +231,7 @@ def hat_areas(kind: FacetKind, facets: Facets) -> Array:
 
 def _planes(facets: Facets, num_vertices: int) -> tuple[Array, Array, Array]:
     """Centre, averaged normal and tangents of each facet's plane."""
-    normal = facets.vertex_normals.sum(axis=1)
-    normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+    normal = centre_normals(facets)
     if normal.shape[1] == 2:
         tangents = np.stack((-normal[:, 1], normal[:, 0]), axis=1)[:, None]
     else:
@@ -266,11 +267,3 @@ def _distance(
 def positions(kind: FacetKind, x: Array, xi: Array) -> Array:
     """Points at reference coordinates of facets with geometry nodes x."""
     return np.einsum("mg,mgd->md", kind.geometry.values(xi), x)
-
-
-def sum_rows(row: Array, values: Array, size: int) -> Array:
-    """Sums of rows of values with the same ``row``."""
-    shape = values.shape[1:]
-    flat = values.reshape(len(values), math.prod(shape))
-    columns = [np.bincount(row, column, minlength=size) for column in flat.T]
-    return np.stack(columns, axis=1).reshape(size, *shape)

@@ -43,6 +43,11 @@ class Obstacle:
     shape: Shape
     reach: float = np.inf
 
+    @property
+    def surfaces(self) -> tuple[str | int, ...]:
+        """The surface."""
+        return (self.surface,)
+
     def first_radius(self, decomposition: Decomposition) -> float:
         """Infinite: all nodes of the surface are looked at."""
         return np.inf
@@ -83,7 +88,7 @@ class Obstacle:
         self, dofs: TornDofs, decomposition: Decomposition, contact: int, facets: Array
     ) -> ContactRecords:
         groups = on_surface(dofs, decomposition, facets)
-        area = hat_integrals(dofs, decomposition, self.surface)[groups]
+        area = hat_integrals(dofs, decomposition, [self.surface])[groups]
         with raised_on_all_ranks(decomposition.comm):
             gap, normal = self._gaps(group_points(dofs)[groups], dofs.bs)
         return ContactRecords(

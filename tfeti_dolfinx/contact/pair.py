@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
@@ -19,6 +19,9 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 REACH = 0.05
+# One looks farther than the search radius: else facets at its edge would be covered partly,
+# and an overlap that is too deep would not be seen.
+SEEN = 3.0
 DEGENERATE = 1e-14
 
 
@@ -44,6 +47,11 @@ class Contact:
         """Name for messages."""
         return f"contact of {self.secondary!r} with {self.primary!r}"
 
+    @property
+    def surfaces(self) -> tuple[str | int, ...]:
+        """Both surfaces."""
+        return self.secondary, self.primary
+
     def first_radius(self, decomposition: Decomposition) -> float:
         """The search radius to begin with. Collective.
 
@@ -51,12 +59,17 @@ class Contact:
             InputError: A surface is unknown or empty, both are the same, or the radius is not
                 positive.
         """
+        try:
+            facets = [
+                surface_facets(decomposition, name) for name in (self.secondary, self.primary)
+            ]
+        except InputError as error:  # on all ranks
+            raise InputError(f"{self.name}: {error}") from error
         if decomposition.surface(self.secondary) == decomposition.surface(self.primary):
             raise InputError(
                 f"{self.name}: both are the same surface; contact of a surface with itself is "
                 "not supported, give its two sides different names"
             )
-        facets = [surface_facets(decomposition, name) for name in (self.secondary, self.primary)]
         if self.search_radius is None:
             return REACH * min(extent(decomposition, surface) for surface in facets)
         if not self.search_radius > 0.0:
@@ -98,7 +111,8 @@ class Contact:
             dofs: Dof maps.
             decomposition: The torn mesh.
             contact: Index of the contact.
-            radius: Surfaces farther apart than this make no conditions.
+            radius: Conditions with a larger gap are not near; those with a gap three times as
+                large are not made.
 
         Raises:
             InputError: The surfaces overlap by more than the radius, face away from each other,
@@ -107,11 +121,11 @@ class Contact:
         kind, comm = facet_kind(dofs), decomposition.comm
         v = kind.num_vertices
         secondary, primary = self._sides(dofs, decomposition, v)
-        near_s, near_p = rendezvous(secondary, primary, v, radius, comm)
-        # three times as far, so that too deep an overlap is seen
-        pairs = candidate_pairs(near_s, near_p, v, 3.0 * radius)
+        reach = SEEN * radius
+        near_s, near_p = rendezvous(secondary, primary, v, reach, comm)
+        pairs = candidate_pairs(near_s, near_p, v, reach)
         degree = (1 if kind.facet != "quadrilateral" else 2) * (1 + kind.displacement.degree)
-        segments = find_segments(kind, near_s, near_p, pairs, radius, degree)
+        segments = find_segments(kind, near_s, near_p, pairs, radius, reach, degree)
         self._check_segments(segments, radius, comm)
         integrals = integrate(kind, near_s, near_p, segments)
         entries = (
@@ -124,7 +138,7 @@ class Contact:
                 -integrals.other,
             ),
         )
-        return conditions(
+        found = conditions(
             dofs=dofs,
             contact=contact,
             multipliers=near_s.groups[integrals.facet, :v],
@@ -135,6 +149,7 @@ class Contact:
             areas=hat_areas(kind, secondary),
             normals=averaged_normals(dofs, secondary, v),
         )
+        return replace(found, near=found.gap <= radius)
 
     def _sides(
         self, dofs: TornDofs, decomposition: Decomposition, num_vertices: int

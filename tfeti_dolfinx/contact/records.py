@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.arrays import Array, sum_rows
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 
@@ -82,4 +82,4 @@ def remaining_gaps(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
     total = dofs.reduce(u.reshape(-1, dofs.bs), np.add, 0.0)
     (values,) = dofs.lookup(records.entry_group, total / dofs.multiplicity[:, None])
     moved = np.sum(records.coefficients * values, axis=1)
-    return records.gap - np.bincount(records.row, weights=moved, minlength=len(records))
+    return records.gap - sum_rows(records.row, moved, len(records))

@@ -20,6 +20,11 @@ WIDER = 4.0
 class ContactPartner(Protocol):
     """An obstacle, or a pair of surfaces. All methods are collective."""
 
+    @property
+    def surfaces(self) -> tuple[str | int, ...]:
+        """Names or tags of the surfaces."""
+        ...
+
     def first_radius(self, decomposition: Decomposition) -> float:
         """Distance up to which conditions are made at first."""
         ...

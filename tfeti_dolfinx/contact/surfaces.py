@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import ufl
 from dolfinx import fem
@@ -9,6 +11,7 @@ from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.compat import JIT_OPTIONS
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -33,24 +36,26 @@ def surface_facets(decomposition: Decomposition, name: str | int) -> Array:
     return facets
 
 
-def hat_integrals(dofs: TornDofs, decomposition: Decomposition, name: str | int) -> Array:
-    """Integrals ∫φ_i of the nodes' basis functions over a surface. Collective.
+def hat_integrals(
+    dofs: TornDofs, decomposition: Decomposition, names: Sequence[str | int]
+) -> Array:
+    """Integrals ∫φ_i of the hats of degree 1 over the union of surfaces. Collective.
 
     Args:
-        dofs: Dof maps of the displacement space, of degree 1.
+        dofs: Dof maps of the displacement space, of any degree.
         decomposition: The torn mesh.
-        name: Name or tag of the surface.
+        names: Names or tags of the surfaces.
 
     Returns:
-        One integral per owned group, zero off the surface, shape ``(g,)``.
+        One integral per owned group, zero off the surfaces and off the vertices, shape ``(g,)``.
     """
-    V = dofs.V
-    ds = ufl.Measure("ds", domain=V.mesh, subdomain_data=decomposition.facet_tags)
-    v = ufl.TestFunction(V)
-    hat = v[0] if dofs.bs > 1 else v
-    one = fem.Constant(V.mesh, 1.0)
-    integrals = fem.assemble_vector(fem.form(one * hat * ds(decomposition.surface(name)))).array
-    per_node = integrals.reshape(-1, dofs.bs)[dofs.dolfinx_node, 0]
+    W, node = dofs.hats
+    tags = tuple(sorted({decomposition.surface(name) for name in names}))
+    ds = ufl.Measure("ds", domain=W.mesh, subdomain_data=decomposition.facet_tags)
+    one = fem.Constant(W.mesh, 1.0)
+    form = fem.form(one * ufl.TestFunction(W) * ds(tags), jit_options=JIT_OPTIONS)
+    per_node = np.zeros(dofs.num_nodes)
+    per_node[node] = fem.assemble_vector(form).array
     return dofs.reduce(per_node, np.add, 0.0)
 
 

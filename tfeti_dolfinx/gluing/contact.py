@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.arrays import Array, sum_rows
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.errors import NoSolutionError, raised_on_all_ranks
 from tfeti_dolfinx.gluing.prescribed import Prescribed
@@ -62,10 +62,10 @@ def inequality_rows(
 
     def squared_norms(coefficients: Array) -> Array:
         squares = np.sum(coefficients**2 / total, axis=1)
-        return np.bincount(records.row, weights=squares, minlength=len(records))
+        return sum_rows(records.row, squares, len(records))
 
     held = np.sum(np.where(flag, records.coefficients * value, 0.0), axis=1)
-    rhs = records.gap - np.bincount(records.row, weights=held, minlength=len(records))
+    rhs = records.gap - sum_rows(records.row, held, len(records))
     free = np.where(flag, 0.0, records.coefficients)
     before, after = squared_norms(records.coefficients), squared_norms(free)
     kept = records.near & (after > NOTHING_LEFT**2 * before)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import basix
@@ -10,7 +11,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.compat import geometry_dofmap
+from tfeti_dolfinx.compat import first_component, geometry_dofmap
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.entities import cell_entities, mix, set_key
@@ -121,21 +122,40 @@ class TornDofs:
         asked = exchange.send(groups) - self.group_offsets[self.comm.rank]
         return tuple(exchange.answer(table[asked]) for table in tables)
 
-    def add_over_ranks(self, groups: Array, values: Array) -> Array:
-        """Sum of the values that all ranks give for a group, back to each of them. Collective.
+    def add_on_owners(self, groups: Array, values: Array) -> Array:
+        """Sum of the values that all ranks give for each owned group. Collective.
 
         Args:
-            groups: Global groups, none twice on a rank, shape ``(k,)``.
+            groups: Global groups, any of them, shape ``(k,)``.
             values: One value (or row) for each, shape ``(k, ...)``.
 
         Returns:
-            The sums, shape ``(k, ...)``.
+            The sums, shape ``(g, ...)``.
         """
         exchange = Exchange(self.comm, owner_of(self.group_offsets, groups))
         slot = exchange.send(groups) - self.group_offsets[self.comm.rank]
         sums = np.zeros((self.num_groups, *values.shape[1:]), dtype=values.dtype)
         np.add.at(sums, slot, exchange.send(values))
-        return exchange.answer(sums[slot])
+        return sums
+
+    @cached_property
+    def scalar(self) -> tuple[fem.FunctionSpace, Array]:
+        """Scalar space of V's element, its dof for each primal node. Collective at first use."""
+        if self.bs == 1:
+            return self.V, self.dolfinx_node
+        S, parent = first_component(self.V)
+        dof = np.empty(len(parent), dtype=np.int64)
+        dof[parent // self.bs] = np.arange(len(parent))
+        return S, dof[self.dolfinx_node]
+
+    @cached_property
+    def hats(self) -> tuple[fem.FunctionSpace, Array]:
+        """Scalar space of degree 1, primal node of each of its dofs. Collective at first use."""
+        W = fem.functionspace(self.V.mesh, ("Lagrange", 1))
+        cells = np.asarray(W.dofmap.list)
+        node = np.empty(W.dofmap.index_map.size_local, dtype=np.int64)
+        node[cells] = np.asarray(self.V.dofmap.list)[:, : cells.shape[1]]
+        return W, self.primal_nodes(node)
 
     def gather_copies(self, values: Array) -> Array:
         """Values of the local primal nodes in the order of the owned ``copies``. Collective.

@@ -1,0 +1,418 @@
+"""gmsh's split files, one per partition: the same as the partitioned mesh in one file."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from dolfinx import mesh as dmesh
+from mpi4py import MPI
+from scenes import displacement, problem, relative
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.errors import InputError, TfetiError
+from tfeti_dolfinx.mesh.gmsh_split import SplitFiles
+
+gmsh = pytest.importorskip("gmsh")
+ROOT = MPI.COMM_WORLD.rank == 0
+CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
+
+
+@pytest.fixture(autouse=True)
+def gmsh_session():
+    if ROOT:
+        gmsh.initialize(interruptible=False)
+        gmsh.option.setNumber("General.Terminal", 0)
+    yield
+    if ROOT:
+        gmsh.finalize()
+
+
+def two_bodies(cell="triangle", order=1, far=True):
+    """A bar of two materials, "left" and "right", and above it a block, "far" (or no group).
+
+    Surfaces: "held" (left ends), 4 (right ends), "middle" between the materials.
+    """
+    gmsh.model.add("two bodies")
+    occ = gmsh.model.occ
+    dim = 2 if cell in ("triangle", "quadrilateral") else 3
+    corners = [(0, 0), (1, 0), (0, 2)]
+    if dim == 2:
+        made = [(2, occ.addRectangle(x, y, 0, 1, 1)) for x, y in corners]
+    else:
+        made = [(3, occ.addBox(x, y, 0, 1, 1, 1)) for x, y in corners]
+    occ.fragment(made[:1], made[1:2])
+    occ.synchronize()
+
+    def at(*places):
+        return [
+            tag
+            for _, tag in gmsh.model.getEntities(dim - 1)
+            if any(np.allclose(occ.getCenterOfMass(dim - 1, tag)[:2], p) for p in places)
+        ]
+
+    for (_, tag), group, name in zip(made, (7, 9, 11), ("left", "right", "far"), strict=True):
+        if far or name != "far":
+            gmsh.model.addPhysicalGroup(dim, [tag], group, name)
+    gmsh.model.addPhysicalGroup(dim - 1, at((0, 0.5), (0, 2.5)), 3, "held")
+    gmsh.model.addPhysicalGroup(dim - 1, at((2, 0.5), (1, 2.5)), 4)
+    gmsh.model.addPhysicalGroup(dim - 1, at((1, 0.5)), 5, "middle")
+    gmsh.option.setNumber("Mesh.MeshSizeMax", 0.25 if dim == 2 else 0.4)
+    if cell in ("quadrilateral", "hexahedron"):
+        gmsh.model.mesh.setTransfiniteAutomatic()
+    gmsh.model.mesh.generate(dim)
+    gmsh.model.mesh.setOrder(order)
+
+
+def write(folder, version=4.1, ghosts=False, partition=5):
+    """The model in one file ``whole.msh`` and in split files ``split_1.msh``, ..."""
+    gmsh.option.setNumber("Mesh.PartitionCreateGhostCells", int(ghosts))
+    if partition:
+        gmsh.model.mesh.partition(partition)
+    gmsh.option.setNumber("Mesh.MshFileVersion", version)
+    gmsh.write(str(folder / "whole.msh"))
+    gmsh.option.setNumber("Mesh.PartitionSplitMeshFiles", 1)
+    gmsh.write(str(folder / "split.msh"))
+
+
+def both(folder, comm, subdomains=None):
+    comm.barrier()
+    whole = tfeti.read_gmsh(folder / "whole.msh", comm, subdomains)
+    return whole, tfeti.read_gmsh(folder / "split.msh", comm, subdomains)
+
+
+def table(d, entities, dim, *columns):
+    """Midpoints of entities and columns beside them, of all ranks, sorted by midpoint."""
+    d.mesh.topology.create_connectivity(dim, d.mesh.topology.dim)
+    middle = dmesh.compute_midpoints(d.mesh, dim, np.asarray(entities, dtype=np.int32))
+    rows = np.column_stack((middle.reshape(-1, 3), *columns))
+    rows = np.concatenate(d.comm.allgather(rows))
+    return rows[np.lexsort(np.rint(rows.T * 1e7))]
+
+
+def cells_of(d, ids=True):
+    assert len(d.cell_tags.values) == len(d.cell_subdomain)
+    columns = [d.cell_subdomain, d.cell_tags.values]
+    columns += [d.original_cells] if ids else []
+    return table(d, np.arange(len(d.cell_subdomain)), d.mesh.topology.dim, *columns)
+
+
+def facets_of(d):
+    return table(d, d.facet_tags.indices, d.mesh.topology.dim - 1, d.facet_tags.values)
+
+
+def nodes_of(d, ids=True):
+    rows = np.column_stack((d.mesh.geometry.x, d.original_nodes * ids))
+    rows = np.concatenate(d.comm.allgather(rows))
+    return rows[np.lexsort(np.rint(rows.T * 1e7))]
+
+
+def check_same(whole, split, ids=True):
+    assert split.num_subdomains == whole.num_subdomains
+    assert np.array_equal(split.body_of_subdomain, whole.body_of_subdomain)
+    assert split.names == whole.names
+    assert split.body_names == whole.body_names
+    assert split.split == whole.split
+    assert np.allclose(cells_of(split, ids), cells_of(whole, ids), atol=1e-14)
+    assert np.allclose(facets_of(split), facets_of(whole), atol=1e-14)
+    assert np.array_equal(nodes_of(split, ids), nodes_of(whole, ids))
+    for name in ("tears", "boundary"):
+        sizes = [d.comm.allreduce(len(getattr(d, name))) for d in (split, whole)]
+        assert sizes[0] == sizes[1]
+
+
+def solved(d):
+    p = problem(d, clamped=("held",), loaded=4, tfeti_rtol=1e-12)
+    p.solve()
+    return displacement(p)
+
+
+@pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.parametrize("ghosts", [False, True])
+def test_the_same_as_one_file(comm, shared_tmp, cell, ghosts):
+    if ROOT:
+        two_bodies(cell)
+        write(shared_tmp, ghosts=ghosts)
+    whole, split = both(shared_tmp, comm)
+    check_same(whole, split)
+    assert split.num_subdomains >= 5
+    assert split.num_bodies == 2
+    assert split.names.volumes == {"left": 7, "right": 9, "far": 11}
+    assert split.names.surfaces == {"held": 3, "4": 4, "middle": 5}
+    assert split.mesh.topology.cell_type.name == cell
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_the_same_displacement(comm, shared_tmp, cell):
+    if ROOT:
+        two_bodies(cell)
+        write(shared_tmp)
+    whole, split = both(shared_tmp, comm)
+    (points, u), (split_points, split_u) = solved(whole), solved(split)
+    assert np.allclose(split_points, points, atol=1e-14)
+    assert relative(split_u, u) <= 1e-10
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_cells_of_second_order(comm, shared_tmp, cell):
+    if ROOT:
+        two_bodies(cell, order=2)
+        write(shared_tmp, partition=3)
+    whole, split = both(shared_tmp, comm)
+    check_same(whole, split)
+    assert split.mesh.ufl_domain().ufl_coordinate_element().degree == 2
+
+
+@pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
+def test_version_2_where_a_file_names_only_its_own_groups(comm, shared_tmp, cell):
+    if ROOT:
+        two_bodies(cell)
+        write(shared_tmp, version=2.2)
+    # gmsh numbers nodes and cells anew when it writes one file of version 2
+    check_same(*both(shared_tmp, comm), ids=False)
+
+
+def test_partition_groups_of_gmsh(comm, shared_tmp):
+    if ROOT:
+        two_bodies()
+        gmsh.model.mesh.partition(3)
+        rename_as_partition_groups()
+        write(shared_tmp, partition=0)
+    check_same(*both(shared_tmp, comm))
+
+
+def rename_as_partition_groups():
+    """One new group per partition and physical group, as ``gmsh -part_physicals`` makes them."""
+    model = gmsh.model
+    names = {group: model.getPhysicalName(*group) for group in model.getPhysicalGroups()}
+    groups_of = {
+        (dim, entity): [int(tag) for tag in model.getPhysicalGroupsForEntity(dim, entity)]
+        for dim, entity in model.getEntities()
+        if len(model.getPartitions(dim, entity)) == 1
+    }
+    whole = {group: model.getEntitiesForPhysicalGroup(*group) for group in names}
+    model.removePhysicalGroups()
+    for (dim, tag), name in names.items():
+        original = [entity for entity in whole[dim, tag] if (dim, entity) not in groups_of]
+        model.addPhysicalGroup(dim, original, tag, name)
+    for (dim, entity), tags in groups_of.items():
+        for tag in tags:
+            part = model.getPartitions(dim, entity)[0]
+            name = f"_part{{{part}}}_physical{{{tag}}}_dim{{{dim}}}"
+            model.addPhysicalGroup(dim, [entity], 100 + 10 * entity, name)
+
+
+def partition_by(partition):
+    """Partition all elements of the model by their midpoints."""
+    mesh = gmsh.model.mesh
+    kinds, ids, _ = mesh.getElements()
+    middle = np.concatenate([mesh.getBarycenters(kind, -1, False, True) for kind in kinds])
+    parts = partition(*middle.reshape(-1, 3).T[:2])
+    mesh.partition(int(parts.max()), np.concatenate(ids), parts)
+
+
+def test_a_surface_between_partitions_is_tagged_on_both_sides(comm, shared_tmp):
+    if ROOT:
+        two_bodies()
+        partition_by(lambda x, y: np.where(y > 1.5, 3, 1 + (x > 1.0)))
+        write(shared_tmp, partition=0)
+    whole, split = both(shared_tmp, comm)
+    check_same(whole, split)
+    assert comm.allreduce(len(split.facets("middle"))) == 2 * 4
+    assert np.all(np.isin(split.facets("middle"), split.tears))
+
+
+def test_a_partition_without_cells_in_groups(comm, shared_tmp):
+    if ROOT:
+        two_bodies(far=False)
+        partition_by(lambda x, y: np.where(y > 1.5, 1, 2 + (x > 0.9)))
+        write(shared_tmp, partition=0)
+    whole, split = both(shared_tmp, comm)
+    check_same(whole, split)
+    assert set(split.names.volumes) == {"left", "right"}
+
+
+def test_a_file_without_nodes(comm, shared_tmp):
+    """What gmsh writes in version 2 for a partition without cells in groups."""
+    write_squares(shared_tmp, {}, {}, {})
+    if ROOT:
+        empty = "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n0\n$EndNodes\n"
+        (shared_tmp / "squares_2.msh").write_text(empty)
+    comm.barrier()
+    d = tfeti.read_gmsh(shared_tmp / "squares.msh", comm)
+    assert (d.num_subdomains, d.num_bodies) == (2, 2)
+
+
+def test_more_ranks_than_files(comm, shared_tmp):
+    if ROOT:
+        two_bodies("tetrahedron")
+        gmsh.write(str(shared_tmp / "alone_1.msh"))
+        gmsh.write(str(shared_tmp / "whole.msh"))
+    comm.barrier()
+    alone = tfeti.read_gmsh(shared_tmp / "alone.msh", comm)
+    check_same(tfeti.read_gmsh(shared_tmp / "whole.msh", comm, lambda x: 0 * x[0]), alone)
+    assert tfeti.read_gmsh(str(shared_tmp / "alone.msh"), comm, 4).num_subdomains == 4
+
+
+@pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
+def test_partitions_can_be_overruled(comm, shared_tmp, cell):
+    if ROOT:
+        two_bodies(cell)
+        write(shared_tmp)
+    check_same(*both(shared_tmp, comm, lambda x: np.floor(2 * x[0]) + 4 * (x[1] > 1.5)))
+    split = tfeti.read_gmsh(shared_tmp / "split.msh", comm, 6)
+    assert split.num_subdomains >= 6
+    u = solved(split)[1]
+    assert relative(u, solved(tfeti.read_gmsh(shared_tmp / "whole.msh", comm))[1]) <= 1e-9
+
+
+def test_ids_of_cells_in_the_order_of_the_files(comm, shared_tmp):
+    numbers = SplitFiles(shared_tmp / "squares.msh", 3).of_rank(comm)
+    write_squares(shared_tmp, {}, {}, {})
+    ids = np.array([[2 * p, 2 * p + 1] for p in numbers], dtype=int).ravel()
+    d = tfeti.read_gmsh(shared_tmp / "squares.msh", comm, ids)
+    assert d.num_subdomains == 6
+    assert np.array_equal(d.original_cells, 10 * (d.cell_subdomain // 2 + 1) + d.cell_subdomain % 2)
+    with pytest.raises(InputError, match="array subdomains: expected one id for each of the"):
+        tfeti.read_gmsh(shared_tmp / "squares.msh", comm, np.zeros(7))
+
+
+@pytest.mark.parametrize(("size", "count"), [(1, 4), (2, 5), (3, 3), (3, 2), (4, 11)])
+def test_files_are_dealt_in_even_chunks(tmp_path, size, count):
+    files = SplitFiles(tmp_path / "any.msh", count)
+    dealt = [files.of_rank(SimpleNamespace(rank=rank, size=size)) for rank in range(size)]
+    assert [number for own in dealt for number in own] == list(range(1, count + 1))
+    assert max(map(len, dealt)) - min(map(len, dealt)) <= 1
+
+
+def test_one_file_goes_before_split_files(comm, shared_tmp):
+    write_squares(shared_tmp, {}, {}, {})
+    if ROOT:
+        (shared_tmp / "squares.msh").write_text(square(1))
+    comm.barrier()
+    assert (
+        comm.allreduce(len(tfeti.read_gmsh(shared_tmp / "squares.msh", comm).cell_subdomain)) == 2
+    )
+
+
+def square(number, tag=1, name="body", curve=None, shift=0.0, quads=False, column=None):
+    """MSH 2.2 of the square [number − 1, number] × [0, 1], maybe with a named curve below it."""
+    column = number if column is None else column
+    a, b, c, d = 2 * column - 1, 2 * column + 1, 2 * column + 2, 2 * column
+    x = column - 1 + shift
+    nodes = [(a, x, 0), (b, column, 0), (c, column, 1), (d, x, 1)]
+    cells = [(3, (a, b, c, d))] if quads else [(2, (a, b, c)), (2, (a, c, d))]
+    groups = [f'2 {tag} "{name}"']
+    lines = [
+        f"{10 * number + i} {kind} 2 {tag} {tag} {' '.join(map(str, own))}"
+        for i, (kind, own) in enumerate(cells)
+    ]
+    if curve:
+        groups.append(f'1 8 "{curve}"')
+        lines.append(f"{10 * number + 5} 1 2 8 8 {a} {b}")
+    sections = {
+        "MeshFormat": ["2.2 0 8"],
+        "PhysicalNames": [str(len(groups)), *groups],
+        "Nodes": ["4", *(f"{i} {x} {y} 0" for i, x, y in nodes)],
+        "Elements": [str(len(lines)), *lines],
+    }
+    written = ["\n".join((f"${name}", *own, f"$End{name}\n")) for name, own in sections.items()]
+    return "".join(written)
+
+
+def write_squares(folder, *changes):
+    """Files ``squares_1.msh``, ... on rank 0, seen by all ranks."""
+    if ROOT:
+        for number, change in enumerate(changes, start=1):
+            (folder / f"squares_{number}.msh").write_text(square(number, **change))
+    MPI.COMM_WORLD.barrier()
+
+
+STEEL = {"name": "steel"}
+GROUP = "dimension {} and tag {}"
+WRONG = [
+    (
+        "'Triangle 3' in squares_1.msh and 'Quadrilateral 4' in squares_3.msh; expected one type",
+        ({}, {}, {"quads": True}),
+    ),
+    (
+        f"'body' stands for the physical groups of {GROUP.format(2, 1)} and {GROUP.format(2, 2)}",
+        ({}, {}, {"tag": 2}),
+    ),
+    (
+        f"'steel' stands for the physical groups of {GROUP.format(1, 8)} and {GROUP.format(2, 1)}",
+        (STEEL, STEEL, {"tag": 3, "curve": "steel"}),
+    ),
+    (
+        f"{GROUP.format(2, 1)} is named 'body' in one file and 'steel' in another",
+        ({}, {}, STEEL),
+    ),
+    (
+        r"node [56] lies at \[2.0, .* in one file and at \[2.25, .* in another; expected files",
+        ({}, {}, {"shift": 0.25}),
+    ),
+    (
+        "cells 1[01] and 3[01] have the same nodes; expected files",
+        ({}, {}, {"column": 1}),
+    ),
+]
+
+
+@pytest.mark.parametrize(("message", "changes"), WRONG, ids=range(len(WRONG)))
+def test_files_that_do_not_fit_together(comm, shared_tmp, message, changes):
+    write_squares(shared_tmp, *changes)
+    with pytest.raises(InputError, match=message):
+        tfeti.read_gmsh(shared_tmp / "squares.msh", comm)
+
+
+def test_a_name_that_one_file_gives_to_a_surface_and_a_body(comm, shared_tmp):
+    both_groups = {"name": "steel", "curve": "steel"}
+    write_squares(shared_tmp, {"name": "steel"}, both_groups)
+    d = tfeti.read_gmsh(shared_tmp / "squares.msh", comm)
+    assert (d.surface("steel"), d.volume("steel")) == (8, 1)
+
+
+def test_a_group_that_only_one_file_names(comm, shared_tmp):
+    write_squares(shared_tmp, {}, {})
+    if ROOT:
+        second = shared_tmp / "squares_2.msh"
+        second.write_text(second.read_text().replace('2 1 "body"', '2 99 "other"'))
+    comm.barrier()
+    assert tfeti.read_gmsh(shared_tmp / "squares.msh", comm).names.volumes == {"body": 1}
+
+
+def test_missing_files(comm, shared_tmp):
+    write_squares(shared_tmp, {}, {}, {})
+    if ROOT:
+        (shared_tmp / "squares_2.msh").unlink()
+    comm.barrier()
+    with pytest.raises(InputError, match=r"squares_2.msh: no such file, but squares_3.msh is the"):
+        tfeti.read_gmsh(shared_tmp / "squares.msh", comm)
+
+
+def test_a_missing_last_file(comm, shared_tmp):
+    if ROOT:
+        two_bodies()
+        write(shared_tmp)
+        (shared_tmp / "split_5.msh").unlink()
+    comm.barrier()
+    with pytest.raises(InputError, match=r"split_5.msh: no such file; expected one .* 5 partition"):
+        tfeti.read_gmsh(shared_tmp / "split.msh", comm)
+
+
+def test_a_file_that_cannot_be_read(comm, shared_tmp):
+    write_squares(shared_tmp, {}, {}, {})
+    if ROOT:
+        (shared_tmp / "squares_3.msh").write_text("this is not a mesh\n")
+    comm.barrier()
+    with pytest.raises(TfetiError, match=r"squares_3.msh: gmsh cannot read it as a mesh"):
+        tfeti.read_gmsh(shared_tmp / "squares.msh", comm)
+
+
+def test_files_without_physical_groups(comm, shared_tmp):
+    if ROOT:
+        two_bodies()
+        gmsh.model.removePhysicalGroups()
+        write(shared_tmp, partition=2)
+    comm.barrier()
+    with pytest.raises(InputError, match="the mesh has no physical groups of cells"):
+        tfeti.read_gmsh(shared_tmp / "split.msh", comm)

@@ -1,0 +1,96 @@
+"""Contact forces on nodes, surfaces and bodies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from dolfinx.fem.petsc import interpolation_matrix
+from mpi4py import MPI
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.contact.records import ContactRecords
+from tfeti_dolfinx.contact.surfaces import group_points, hat_integrals
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
+
+
+@dataclass(frozen=True)
+class BodyForces:
+    """Resultants of the contact forces on each body, the same on all ranks.
+
+    Attributes:
+        force: Shape ``(bodies, gdim)``.
+        moment: About the origin; shape ``(bodies, 3)``, in 2D only its last component is not 0.
+    """
+
+    force: Array
+    moment: Array
+
+
+def nodal_forces(records: ContactRecords, force: Array, dofs: TornDofs) -> Array:
+    """Forces that contact exerts on the nodes of both sides. Collective.
+
+    Args:
+        records: Conditions of this rank.
+        force: Normal force of each, shape ``(n,)``.
+        dofs: Dof maps.
+
+    Returns:
+        −Σ_i a_ij s_i λ_i for each owned group, shape ``(g, gdim)``.
+    """
+    shares = -records.coefficients * force[records.row][:, None]
+    return dofs.add_on_owners(records.entry_group, shares)
+
+
+def body_forces(forces: Array, dofs: TornDofs, decomposition: Decomposition) -> BodyForces:
+    """Resultants of nodal forces, shape ``(g, gdim)``, on each body. Collective."""
+    lowest = dofs.copy_subdomains[dofs.copy_offsets[:-1]]
+    body = decomposition.body_of_subdomain[lowest]
+    spatial = np.zeros((len(forces), 3))
+    spatial[:, : forces.shape[1]] = forces
+    terms = np.column_stack((forces, np.cross(group_points(dofs), spatial)))
+    sums = np.zeros((decomposition.num_bodies, terms.shape[1]))
+    np.add.at(sums, body, terms)
+    dofs.comm.Allreduce(MPI.IN_PLACE, sums)
+    return BodyForces(sums[:, : forces.shape[1]], sums[:, forces.shape[1] :])
+
+
+def vertex_tractions(
+    forces: Array, dofs: TornDofs, decomposition: Decomposition, names: list[str | int]
+) -> tuple[Array, Array]:
+    """Tractions whose moments with the hats of degree 1 are those of nodal forces. Collective.
+
+    Args:
+        forces: Nodal forces on the owned groups, shape ``(g, gdim)``.
+        dofs: Dof maps.
+        decomposition: The torn mesh.
+        names: All contact surfaces.
+
+    Returns:
+        Force / ∫φ_i for each owned group that is a vertex of the surfaces, else 0, shape
+        ``(g, gdim)``; and ∫φ_i, shape ``(g,)``.
+    """
+    area = hat_integrals(dofs, decomposition, names)
+    if dofs.V.element.basix_element.degree > 1:
+        forces = _on_hats(forces, dofs)
+    on_surface = (area > 0.0)[:, None]
+    return np.divide(forces, area[:, None], out=np.zeros_like(forces), where=on_surface), area
+
+
+def _on_hats(forces: Array, dofs: TornDofs) -> Array:
+    """Moments with the hats of degree 1: Πᵀf, Π the interpolation from degree 1."""
+    W, node = dofs.hats
+    S, dof = dofs.scalar
+    interpolation = interpolation_matrix(W, S)
+    interpolation.assemble()
+    source, target = interpolation.createVecLeft(), interpolation.createVecRight()
+    share = dofs.spread(forces / dofs.multiplicity[:, None])
+    result = np.zeros_like(share)
+    for component in range(forces.shape[1]):
+        source.array[dof] = share[:, component]
+        interpolation.multTranspose(source, target)
+        result[node, component] = target.array_r
+    for item in (source, target, interpolation):
+        item.destroy()
+    return dofs.reduce(result, np.add, 0.0)
