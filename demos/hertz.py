@@ -28,6 +28,12 @@ class LineContact:
         load = np.pi * modulus * a**2 / (4 * radius)
         return cls(a, load, 2 * load / (np.pi * a))
 
+    @classmethod
+    def from_load(cls, load, radius, modulus):
+        """The contact under a force per length; ``modulus`` is E*."""
+        a = np.sqrt(4 * load * radius / (np.pi * modulus))
+        return cls(a, load, 2 * load / (np.pi * a))
+
     def pressure(self, x):
         """p₀√(1 − x²/a²), 0 outside."""
         return self.peak * np.sqrt(np.maximum(1 - (x / self.half_width) ** 2, 0.0))

@@ -22,12 +22,35 @@ def graded_size(
     centre: tuple[float, float, float], fine: float, fine_radius: float, growth: float
 ) -> None:
     """Let the element size be ``fine`` near a point and grow linearly beyond ``fine_radius``."""
+    use_sizes(graded_field(centre, fine, fine_radius, growth))
+
+
+def graded_field(
+    centre: tuple[float, float, float],
+    fine: float,
+    fine_radius: float,
+    growth: float,
+    body: tuple[int, list[int]] | None = None,
+) -> int:
+    """A gmsh field of that element size, in some entities (dimension, tags) only if given."""
     x, y, z = centre
     distance = f"sqrt((x-({x}))^2+(y-({y}))^2+(z-({z}))^2)"
-    field = gmsh.model.mesh.field.add("MathEval")
+    size = gmsh.model.mesh.field.add("MathEval")
     excess = f"0.5*({distance}-{fine_radius}+fabs({distance}-{fine_radius}))"
-    gmsh.model.mesh.field.setString(field, "F", f"{fine}+{growth}*{excess}")
-    gmsh.model.mesh.field.setAsBackgroundMesh(field)
+    gmsh.model.mesh.field.setString(size, "F", f"{fine}+{growth}*{excess}")
+    if body is None:
+        return int(size)
+    part = gmsh.model.mesh.field.add("Restrict")
+    gmsh.model.mesh.field.setNumber(part, "InField", size)
+    gmsh.model.mesh.field.setNumbers(part, {2: "SurfacesList", 3: "VolumesList"}[body[0]], body[1])
+    return int(part)
+
+
+def use_sizes(*fields: int) -> None:
+    """Let the least of some fields, and nothing else, decide the element size."""
+    least = gmsh.model.mesh.field.add("Min")
+    gmsh.model.mesh.field.setNumbers(least, "FieldsList", list(fields))
+    gmsh.model.mesh.field.setAsBackgroundMesh(least)
     for name in ("FromPoints", "FromCurvature", "ExtendFromBoundary"):
         gmsh.option.setNumber(f"Mesh.MeshSize{name}", 0)
 

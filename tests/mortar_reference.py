@@ -1,5 +1,7 @@
 """Two boxes of rectangles by an untorn mesh, mortar integrals in closed form, active set."""
 
+from itertools import pairwise
+
 import numpy as np
 import ufl
 from bodies import boxes
@@ -15,7 +17,7 @@ def mortar_1d(secondary, primary):
     D, M = np.zeros(len(secondary)), np.zeros((len(secondary), len(primary)))
     cuts = np.unique(np.concatenate((secondary, primary)).round(12))
     gauss, weight = np.polynomial.legendre.leggauss(3)
-    for a, b in zip(cuts[:-1], cuts[1:], strict=True):
+    for a, b in pairwise(cuts):
         for y, w in zip((a + b) / 2 + (b - a) / 2 * gauss, (b - a) / 2 * weight, strict=True):
             i = np.searchsorted(secondary, y) - 1
             j = np.searchsorted(primary, y) - 1

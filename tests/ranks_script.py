@@ -3,17 +3,43 @@
 import sys
 
 import numpy as np
+import ufl
+from bodies import held, stacked, two_body_problem
 from mpi4py import MPI
 from scenes import curved_obstacle, decomposed, displacement, problem
 
 import tfeti_dolfinx as tfeti
 
-cell, subdomains, path = sys.argv[1], int(sys.argv[2]), sys.argv[3]
-gdim = 2 if cell in ("triangle", "quadrilateral") else 3
-d = decomposed(cell, 12 if gdim == 2 else 6, subdomains)
-obstacle = tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=0.05)
-p = problem(d, (0.0,) * (gdim - 1) + (-0.05,), [obstacle], tfeti_rtol=float(sys.argv[4]))
-p.solve()
-x, u = displacement(p)
-if MPI.COMM_WORLD.rank == 0:
-    np.savez(path, x=x, u=u, active=p.report.active_contacts)
+
+def obstacle_scene(cell, subdomains, **options):
+    """A clamped box on a curved obstacle."""
+    gdim = 2 if cell in ("triangle", "quadrilateral") else 3
+    d = decomposed(cell, 12 if gdim == 2 else 6, subdomains)
+    obstacle = tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=0.05)
+    return problem(d, (0.0,) * (gdim - 1) + (-0.05,), [obstacle], **options)
+
+
+def pair_scene(cell, subdomains, **options):
+    """A box with its left and front held on another one, pressed where x is large."""
+    gdim = 2 if cell in ("triangle", "quadrilateral") else 3
+    n = (9, 12) if gdim == 2 else (4, 5)
+    d = stacked(cell, *n, subdomains)
+
+    def load(v, ds):
+        x = ufl.SpatialCoordinate(d.mesh)
+        return (0.05 - 0.2 * x[0]) * v[gdim - 1] * ds(d.surface("upper top"))
+
+    sides = ["lower bottom", "lower left", "upper left", "upper right"]
+    sides += ["lower front", "upper front"] if gdim == 3 else []
+    pair = tfeti.Contact("upper bottom", "lower top")
+    return two_body_problem(d, load, held(d, *sides), [pair], **options)
+
+
+if __name__ == "__main__":
+    scene, cell, subdomains, path, rtol = sys.argv[1:]
+    scenes = {"obstacle": obstacle_scene, "pair": pair_scene}
+    p = scenes[scene](cell, int(subdomains), tfeti_rtol=float(rtol))
+    p.solve()
+    x, u = displacement(p)
+    if MPI.COMM_WORLD.rank == 0:
+        np.savez(path, x=x, u=u, active=p.report.active_contacts)

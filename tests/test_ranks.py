@@ -20,31 +20,40 @@ def run(ranks, *arguments, **keywords):
     )
 
 
-def solve(tmp_path, ranks, cell, subdomains, rtol):
+SCENES = ["obstacle", "pair"]
+
+
+def solve(tmp_path, ranks, scene, cell, subdomains, rtol):
     path = tmp_path / f"{ranks}_{subdomains}.npz"
-    result = run(ranks, "ranks_script.py", cell, subdomains, path, rtol)
+    result = run(ranks, "ranks_script.py", scene, cell, subdomains, path, rtol)
     assert result.returncode == 0, result.stderr
     return np.load(path)
 
 
+@pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_ranks_do_not_matter(serial_only, tmp_path, cell):
-    one, two, four = (solve(tmp_path, ranks, cell, 6, 1e-10) for ranks in (1, 2, 4))
+def test_ranks_do_not_matter(serial_only, tmp_path, scene, cell):
+    one, two, four = (solve(tmp_path, ranks, scene, cell, 6, 1e-10) for ranks in (1, 2, 4))
+    assert one["active"] > 0
     for other in (two, four):
         assert np.allclose(one["x"], other["x"])
         assert relative(other["u"], one["u"]) <= 1e-8
         assert one["active"] == other["active"]
 
 
+@pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
-def test_numbers_of_subdomains_do_not_matter(serial_only, tmp_path, cell):
-    few, some, many = (solve(tmp_path, 2, cell, n, 1e-10) for n in (4, 16, 64))
+def test_numbers_of_subdomains_do_not_matter(serial_only, tmp_path, scene, cell):
+    few, some, many = (solve(tmp_path, 2, scene, cell, n, 1e-10) for n in (4, 16, 64))
     for other in (some, many):
         assert relative(other["u"], few["u"]) <= 1e-6
 
 
 def test_more_ranks_than_subdomains(serial_only, tmp_path):
-    one, four = solve(tmp_path, 1, "triangle", 2, 1e-10), solve(tmp_path, 4, "triangle", 2, 1e-10)
+    one, four = (
+        solve(tmp_path, 1, "obstacle", "triangle", 2, 1e-10),
+        solve(tmp_path, 4, "obstacle", "triangle", 2, 1e-10),
+    )
     assert relative(four["u"], one["u"]) <= 1e-8
 
 

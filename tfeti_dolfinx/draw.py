@@ -43,7 +43,7 @@ def draw(data: Mapping[str, Any], target: str) -> None:
     Args:
         data: Arrays ``cells``, ``types``, ``points``, ``moved``, ``values``, and scalars ``name``,
             ``factor`` (nan: the largest displacement becomes 5 % of the scene), ``zoom``,
-            ``focus`` (nan: the centre), ``edges``.
+            ``focus`` (nan: the centre), ``edges``, ``view`` (nan: pyvista's), ``cut`` (nan: none).
         target: The ``.png`` to write.
     """
     import pyvista
@@ -54,6 +54,9 @@ def draw(data: Mapping[str, Any], target: str) -> None:
     if np.isnan(factor):
         size = np.linalg.norm(np.ptp(grid.points, axis=0))
         factor = float(0.05 * size / max(np.abs(grid["u"]).max(), 1e-300))
+    point, normal = data["cut"]
+    if np.all(np.isfinite(normal)):
+        grid = grid.clip(normal=normal, origin=point, crinkle=True)
     flat = bool(np.ptp(grid.points[:, 2]) == 0.0)
     plotter = pyvista.Plotter(off_screen=True, window_size=[1200, 900])
     plotter.add_mesh(
@@ -66,6 +69,8 @@ def draw(data: Mapping[str, Any], target: str) -> None:
     plotter.add_text(f"displacement x {factor:.3g}", font_size=10)
     if flat:
         plotter.view_xy()
+    if np.all(np.isfinite(data["view"])):
+        plotter.view_vector(data["view"], viewup=(0.0, 0.0, 1.0))
     if np.all(np.isfinite(data["focus"])):
         plotter.set_focus(data["focus"])
         if flat:

@@ -29,6 +29,8 @@ def plot_deformed(
     zoom: float = 1.0,
     focus: tuple[float, float, float] | None = None,
     show_edges: bool = True,
+    view: tuple[float, float, float] | None = None,
+    cut: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None,
 ) -> Path:
     """Picture of the deformed bodies, coloured by von Mises stress. Collective.
 
@@ -42,6 +44,8 @@ def plot_deformed(
         zoom: Camera zoom.
         focus: Point that the camera looks at.
         show_edges: Whether to draw cell edges.
+        view: Direction from the scene to the camera, z upwards; default pyvista's.
+        cut: A point and a normal: what lies beyond that plane, before it moved, is cut away.
 
     Returns:
         The file written.
@@ -60,8 +64,10 @@ def plot_deformed(
                 "name": "von Mises",
                 "factor": np.nan if factor is None else factor,
                 "zoom": zoom,
-                "focus": np.full(3, np.nan) if focus is None else np.array(focus, dtype=float),
+                "focus": _vector(focus),
                 "edges": show_edges,
+                "view": _vector(view),
+                "cut": np.stack([_vector(v) for v in cut or (None, None)]),
             }
             _draw(target, {**_joined(parts), **scene})
     return target
@@ -112,6 +118,11 @@ def check_screen() -> None:
         raise InputError(
             "pictures need an X server: set DISPLAY, or install Xvfb (Debian: apt-get install xvfb)"
         )
+
+
+def _vector(values: tuple[float, float, float] | None) -> Array:
+    """Three numbers, nan if they are not given."""
+    return np.full(3, np.nan) if values is None else np.array(values, dtype=float)
 
 
 def _grid(solution: Solution, values: Array) -> tuple[Array, Array, Array, Array, Array]:

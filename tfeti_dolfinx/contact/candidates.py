@@ -68,14 +68,19 @@ def candidate_pairs(
     s_centre, s_size = _balls(secondary, num_vertices)
     p_centre, p_size = _balls(primary, num_vertices)
     direction = centre_normals(secondary)
-    pairs: list[Array] = [np.empty((2, 0), dtype=np.int64)]
+    keys: list[Array] = [np.empty(0, dtype=np.int64)]
     classes = np.floor(np.log2(np.maximum(p_size, 1e-300))).astype(np.int64)
     for size_class in np.unique(classes) if len(secondary) else ():
         members = np.flatnonzero(classes == size_class)
         tree, radius = cKDTree(p_centre[members]), s_size + p_size[members].max()
         s, hit = _march(tree, s_centre, direction, radius, reach)
-        pairs.append(np.stack((s, members[hit])))
-    return tuple(np.unique(np.concatenate(pairs, axis=1), axis=1))
+        p = members[hit]
+        offset = p_centre[p] - s_centre[s]
+        along = np.sum(offset * direction[s], axis=1)
+        aside = np.linalg.norm(offset - along[:, None] * direction[s], axis=1)
+        close = (aside <= s_size[s] + p_size[p]) & (np.abs(along) <= reach + p_size[p])
+        keys.append(s[close] * len(primary) + p[close])
+    return np.divmod(np.unique(np.concatenate(keys)), max(len(primary), 1))
 
 
 def centre_normals(facets: Facets) -> Array:

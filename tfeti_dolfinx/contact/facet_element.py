@@ -100,5 +100,8 @@ def reference_points(facet: str, corners: Array, y: Array) -> Array:
 
 
 def _solve(A: Array, b: Array) -> Array:
-    """Solutions of many small systems."""
-    return np.linalg.solve(A, b[:, :, None])[:, :, 0]
+    """Solutions of many systems of two equations."""
+    (p, q), (r, t) = A.transpose(1, 2, 0)
+    x = t * b[:, 0] - q * b[:, 1]
+    y = p * b[:, 1] - r * b[:, 0]
+    return np.stack((x, y), axis=1) / (p * t - q * r)[:, None]

@@ -117,6 +117,12 @@ def find_segments(
     centre, normal, tangents = _planes(secondary, v)
     corners_s = _on_planes(secondary.corners(v), centre, tangents)
     corners_p = _on_planes(primary.corners(v)[p], centre[s], tangents[s])
+    boxes_meet = np.all(
+        (corners_p.min(axis=1) <= corners_s.max(axis=1)[s])
+        & (corners_p.max(axis=1) >= corners_s.min(axis=1)[s]),
+        axis=1,
+    )
+    s, p, corners_p = s[boxes_meet], p[boxes_meet], corners_p[boxes_meet]
     cosine = np.sum(primary.normal[p] * normal[s], axis=1)
     facing = cosine < FACING
     order = POLYGON[kind.facet]

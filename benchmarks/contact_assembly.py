@@ -1,0 +1,169 @@
+"""Contact search and mortar assembly beside the assembly of K, over a factor of 16 in facets.
+
+    ./run mpirun -n 2 python3 benchmarks/contact_assembly.py [--cells 12]
+
+Two unit cubes lie one on the other, of n³ and (5n/4)³ hexahedra or six times as many tetrahedra,
+so that their facets do not match; n is doubled twice. Nothing is solved. Results go to
+results/contact_assembly.md and .json.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+import petsc4py
+
+if __name__ == "__main__":
+    petsc4py.init(sys.argv[:1])
+
+import basix.ufl
+import numpy as np
+import ufl
+from dolfinx import fem
+from dolfinx import mesh as dmesh
+from mpi4py import MPI
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import tfeti_dolfinx as tfeti
+from benchmarks.tables import markdown, slope, write_tables
+from tfeti_dolfinx.assembly import Forms
+from tfeti_dolfinx.compat import create_mesh_in_place
+from tfeti_dolfinx.contact.search import ContactSearch
+from tfeti_dolfinx.mesh.dofs import TornDofs
+
+SURFACES = {"lower top": 1, "upper bottom": 2}
+CELLS = ("hexahedron", "tetrahedron")
+# six tetrahedra around a cube's diagonal; its corners are numbered x + 2y + 4z
+TETRAHEDRA = [
+    [0, 1, 3, 7],
+    [0, 1, 5, 7],
+    [0, 2, 3, 7],
+    [0, 2, 6, 7],
+    [0, 4, 5, 7],
+    [0, 4, 6, 7],
+]
+
+
+def two_cubes(comm, cell, counts):
+    """Unit cubes above z = 0 and z = 2 with counts cells per edge; each rank makes a share."""
+    counts = np.array(counts)
+    nodes = counts + 1
+    body, index = share(comm, counts**3)
+    n, m = counts[body], nodes[body]
+    first = body * nodes[0] ** 3 + index % n + m * (index // n % n + m * (index // n**2))
+    x, y, z = np.unravel_index(np.arange(8), (2, 2, 2), order="F")
+    cells = first[:, None] + x + m[:, None] * (y + m[:, None] * z)
+    if cell == "tetrahedron":
+        cells = cells[:, TETRAHEDRA].reshape(-1, 4)
+    body, index = share(comm, nodes**3)
+    m = nodes[body]
+    points = np.stack((index % m, index // m % m, index // m**2), axis=1) / (m - 1.0)[:, None]
+    points[:, 2] += 2 * body
+    element = basix.ufl.element("Lagrange", cell, 1, shape=(3,))
+    return create_mesh_in_place(comm, cells, points, element)
+
+
+def share(comm, sizes):
+    """Body and index of this rank's share of the entries of both bodies."""
+    ends = np.cumsum(sizes)
+    chosen = ends[-1] * comm.rank // comm.size, ends[-1] * (comm.rank + 1) // comm.size
+    entry = np.arange(*chosen)
+    body = np.searchsorted(ends, entry, side="right")
+    return body, entry - (ends - sizes)[body]
+
+
+def scene(cell, counts):
+    """The torn cubes, one on the other."""
+    mesh = two_cubes(MPI.COMM_WORLD, cell, counts)
+    facets = [
+        dmesh.locate_entities_boundary(mesh, 2, lambda x, z=z: np.isclose(x[2], z)) for z in (1, 2)
+    ]
+    values = np.repeat(np.array([1, 2], dtype=np.int32), [len(f) for f in facets])
+    order = np.argsort(np.concatenate(facets))
+    tags = dmesh.meshtags(mesh, 2, np.concatenate(facets)[order], values[order])
+    mesh.geometry.x[mesh.geometry.x[:, 2] > 1.5, 2] -= 1
+    N = max(1, counts[0] // 12)
+
+    def subdomain(x):
+        i, j, k = (x * N).astype(int)
+        return i + N * j + N * N * k
+
+    return tfeti.decompose(mesh, subdomain, facet_tags=tags, surfaces=SURFACES)
+
+
+def elasticity(decomposition):
+    """Compiled forms, and the maps of their unknowns."""
+    mesh = decomposition.mesh
+    V = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    degree = 2 if mesh.topology.cell_type.name == "hexahedron" else 0
+    dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": degree})
+    strain = ufl.sym(ufl.grad(u))
+    stress = strain + ufl.tr(strain) * ufl.Identity(3)
+    down = ufl.dot(fem.Constant(mesh, (0.0, 0.0, -1.0)), v)
+    forms = Forms(ufl.inner(stress, ufl.sym(ufl.grad(v))) * dx, down * dx, decomposition, {}, {})
+    return forms, TornDofs(V, decomposition)
+
+
+def best_time(work):
+    """Least wall seconds of three runs, of the slowest rank, and the last run's result."""
+    comm, least = MPI.COMM_WORLD, np.inf
+    for _ in range(3):
+        comm.barrier()
+        start = time.perf_counter()
+        result = work()
+        least = min(least, comm.allreduce(time.perf_counter() - start, op=MPI.MAX))
+    return least, result
+
+
+def measure(cell, counts):
+    """A row: facets of both surfaces, seconds of the contact stage and of the assembly of K."""
+    comm = MPI.COMM_WORLD
+    decomposition = scene(cell, counts)
+    forms, dofs = elasticity(decomposition)
+    contacts = [tfeti.Contact("upper bottom", "lower top")]
+    contact, search = best_time(lambda: ContactSearch(contacts, dofs, decomposition))
+    assembly, _ = best_time(forms.stiffness)
+    return {
+        "facets": sum(comm.allreduce(len(decomposition.facets(name))) for name in SURFACES),
+        "conditions": comm.allreduce(len(search.records)),
+        "unknowns": comm.allreduce(dofs.num_nodes) * dofs.bs,
+        "contact": contact,
+        "assembly": assembly,
+        "contact/assembly": contact / assembly,
+    }
+
+
+def study(cell, cells):
+    """Rows for n = cells, 2 cells, 4 cells, and the slopes of time over facets."""
+    measure(cell, (2, 3))  # compiles the forms
+    rows = [measure(cell, (n, 5 * n // 4)) for n in (cells, 2 * cells, 4 * cells)]
+    facets = [row["facets"] for row in rows]
+    slopes = {name: slope(facets, [row[name] for row in rows]) for name in ("contact", "assembly")}
+    return rows, slopes
+
+
+def main(argv):
+    """Run the tables and write them; returns them."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--cells", type=int, default=12, help="n of the smallest scene")
+    parser.add_argument("--output", type=Path, default=Path("results"))
+    arguments = parser.parse_args(argv)
+    tables = {}
+    for cell in CELLS:
+        rows, slopes = study(cell, arguments.cells)
+        tables[f"Contact and assembly, {cell}"] = rows
+        tables[f"Slopes over facets, {cell}"] = [slopes]
+    if MPI.COMM_WORLD.rank == 0:
+        write_tables(arguments.output, "contact_assembly", tables)
+        for title, rows in tables.items():
+            print(f"{title}\n\n{markdown(rows)}\n")
+    return tables
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
