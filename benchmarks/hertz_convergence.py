@@ -23,7 +23,7 @@ from scipy.interpolate import LinearNDInterpolator
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.tables import markdown, slope, write_tables
-from demos import hertz_2d, hertz_3d
+from demos import cylinder_on_block_2d, hertz_2d, hertz_3d, sphere_on_block_3d
 
 OPTIONS = ["-tfeti_rtol", "1e-8"]
 
@@ -78,12 +78,33 @@ def study_3d(unknowns=(8_000, 30_000, 120_000, 480_000)):
     return study(hertz_3d, "--unknowns", unknowns, sizes, 0.05)
 
 
+def study_pair(elements=(8, 16, 32, 128)):
+    """A cylinder on a block: elements along the half width, the last for reference."""
+    a = cylinder_on_block_2d.closed_form().half_width
+    sizes = [1 / n for n in elements]
+    return study(cylinder_on_block_2d, "--elements", elements, sizes, a)
+
+
+def study_pair_3d(unknowns=(8_000, 30_000, 120_000, 480_000)):
+    """A ball on a block: sizes, the last for reference."""
+    sizes = [0.2 * (2400 / n) ** (1 / 3) for n in unknowns]
+    return study(sphere_on_block_3d, "--unknowns", unknowns, sizes, 0.05)
+
+
+STUDIES = {
+    "Half cylinder on a plane": study_2d,
+    "Half ball on a plane": study_3d,
+    "Cylinder on a block": study_pair,
+    "Ball on a block": study_pair_3d,
+}
+
+
 def main(argv):
     tables = {}
-    for name, run in (("2D", study_2d), ("3D", study_3d)):
+    for name, run in STUDIES.items():
         rows, slopes = run()
-        tables[f"Hertz {name}"] = rows
-        tables[f"Hertz {name}, slopes"] = [slopes]
+        tables[name] = rows
+        tables[f"{name}, slopes"] = [slopes]
     if MPI.COMM_WORLD.rank == 0:
         write_tables(Path("results"), "hertz_convergence", tables)
         for title, rows in tables.items():

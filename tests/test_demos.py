@@ -7,7 +7,18 @@ import pytest
 
 import tfeti_dolfinx as tfeti
 
-DEMOS = ["hertz_2d", "hertz_3d", "cube_3d", "linear_3d", "semicoercive_2d"]
+DEMOS = [
+    "hertz_2d",
+    "hertz_3d",
+    "cube_3d",
+    "linear_3d",
+    "semicoercive_2d",
+    "cylinder_on_block_2d",
+    "sphere_on_block_3d",
+    "stacked_blocks_3d",
+    "ball_bearing_3d",
+    "talk_hertz_2d",
+]
 
 
 @pytest.mark.parametrize("name", DEMOS)
@@ -65,3 +76,11 @@ def test_a_free_motion_of_the_block_is_found():
     _, report = importlib.import_module("demos.semicoercive_2d").run(["--quick", "--no-wall"])
     assert report.free_modes == 1
     assert abs(report.errors["force_floor"]) <= 1e-5
+
+
+def test_stacked_blocks_are_held_by_contact_alone():
+    """Each of the three upper blocks slides and turns freely on its flat sides: 3 modes each."""
+    _, report = importlib.import_module("demos.stacked_blocks_3d").run(["--quick"])
+    assert report.bodies == 4
+    assert report.free_modes == 9
+    assert abs(report.errors["force_base"]) <= 1e-5

@@ -4,8 +4,8 @@ from itertools import pairwise
 
 import pytest
 
-from benchmarks.hertz_convergence import study_2d, study_3d
-from demos import hertz_2d, hertz_3d
+from benchmarks.hertz_convergence import study_2d, study_3d, study_pair, study_pair_3d
+from demos import cylinder_on_block_2d, hertz_2d, hertz_3d, sphere_on_block_3d
 
 
 @pytest.mark.parametrize(("demo", "tolerance"), [(hertz_2d, 0.02), (hertz_3d, 0.05)])
@@ -42,5 +42,48 @@ def test_pressure_converges_in_2d():
 def test_pressure_converges_in_3d():
     rows, slopes = study_3d((8_000, 24_000, 72_000, 250_000))
     assert falls(rows, "pressure_l2")
+    assert falls(rows, "pressure_l2_finer")
+    assert slopes["pressure_l2_finer"] >= 0.5
+
+
+def test_a_cylinder_on_a_block_is_near_the_closed_form():
+    """NAFEMS CB1: a = 6.21 mm, p₀ = 3585.37 MPa."""
+    hertz = cylinder_on_block_2d.closed_form()
+    assert abs(hertz.half_width - 6.21) < 0.01
+    assert abs(hertz.peak - 3585.37) < 1
+    runs = {
+        name: cylinder_on_block_2d.run([*options, "-tfeti_rtol", "1e-10"])[1].errors
+        for name, options in {
+            "default": [],
+            "finer": ["--elements", "60"],
+            "exchanged": ["--exchange"],
+        }.items()
+    }
+    for errors in runs.values():
+        assert abs(errors["force"]) <= 1e-8
+    for name in ("half_width", "peak_pressure"):
+        default, finer, exchanged = (errors[name] for errors in runs.values())
+        assert abs(default) <= 0.03
+        assert abs(default - finer) <= 0.01
+        assert abs(exchanged - default) <= 0.01
+
+
+def test_pressure_of_a_pair_converges():
+    rows, slopes = study_pair((8, 16, 32, 128))
+    assert falls(rows, "pressure_l2_finer")
+    assert slopes["pressure_l2_finer"] >= 0.9
+
+
+@pytest.mark.parametrize("exchange", [[], ["--exchange"]])
+def test_a_ball_on_a_block_is_near_the_closed_form(exchange):
+    _, report = sphere_on_block_3d.run(["--quick", "-tfeti_rtol", "1e-10", *exchange])
+    assert abs(report.errors["force"]) <= 1e-8
+    assert abs(report.errors["half_width"]) <= 0.05
+    assert abs(report.errors["peak_pressure"]) <= 0.05
+
+
+@pytest.mark.slow
+def test_pressure_of_a_pair_converges_in_3d():
+    rows, slopes = study_pair_3d((8_000, 24_000, 72_000, 250_000))
     assert falls(rows, "pressure_l2_finer")
     assert slopes["pressure_l2_finer"] >= 0.5

@@ -281,3 +281,30 @@ def test_facets_without_area():
     corner = np.isclose(x[:, 0], 0.25) & np.isclose(x[:, 1], 0.0)
     x[corner, 0] = 0.0
     check_message(d, PAIR, "contact of .*: 1 facets of 'upper bottom' have no area")
+
+
+@pytest.mark.parametrize(
+    ("load", "message"),
+    [
+        ((0.0, 0.1), r"body \d.*translation in y"),
+        ((0.1, -0.1), r"body \d.*translation in x"),
+    ],
+)
+def test_a_body_that_contact_cannot_hold(load, message):
+    d = stacked("quadrilateral", 3, 4, 4)
+
+    def push(v, ds):
+        return ufl.dot(fem.Constant(d.mesh, load), v) * ds(d.surface("upper top"))
+
+    problem = two_body_problem(d, push, clamped(d, "lower bottom"), [PAIR])
+    with pytest.raises(tfeti.NoSolutionError, match=message):
+        problem.solve()
+
+
+def test_a_body_that_only_contact_holds():
+    """It slides freely, which no load drives: one free mode, and a uniform pressure."""
+    d = stacked("quadrilateral", 3, 4, 4)
+    problem = two_body_problem(d, pressed(d), held(d, "lower bottom", "lower left"), [PAIR])
+    problem.solve()
+    assert problem.report.free_modes == 1
+    assert np.allclose(gathered(problem.solution.contact().pressure), 0.1, atol=1e-6)

@@ -15,6 +15,18 @@ from typing import Any
 
 import numpy as np
 
+# readable on any background, beside the scene
+SCALAR_BAR = {
+    "vertical": True,
+    "position_x": 0.88,
+    "position_y": 0.2,
+    "height": 0.6,
+    "width": 0.1,
+    "color": "black",
+    "background_color": "white",
+    "fill": True,
+}
+
 
 def start_screen() -> subprocess.Popen[bytes] | None:
     """Xvfb, unless there is an X server already."""
@@ -43,7 +55,8 @@ def draw(data: Mapping[str, Any], target: str) -> None:
     Args:
         data: Arrays ``cells``, ``types``, ``points``, ``moved``, ``values``, and scalars ``name``,
             ``factor`` (nan: the largest displacement becomes 5 % of the scene), ``zoom``,
-            ``focus`` (nan: the centre), ``edges``, ``view`` (nan: pyvista's), ``cut`` (nan: none).
+            ``focus`` (nan: the centre), ``edges``, ``highest`` (nan: the largest), ``view`` (nan:
+            pyvista's), ``cut`` (nan: none).
         target: The ``.png`` to write.
     """
     import pyvista
@@ -64,7 +77,9 @@ def draw(data: Mapping[str, Any], target: str) -> None:
         scalars=name,
         show_edges=bool(data["edges"]),
         cmap="viridis",
+        clim=None if np.isnan(data["highest"]) else [0.0, float(data["highest"])],
         lighting=not flat,
+        scalar_bar_args=SCALAR_BAR,
     )
     plotter.add_text(f"displacement x {factor:.3g}", font_size=10)
     if flat:

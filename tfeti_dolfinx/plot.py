@@ -29,6 +29,7 @@ def plot_deformed(
     zoom: float = 1.0,
     focus: tuple[float, float, float] | None = None,
     show_edges: bool = True,
+    highest: float | None = None,
     view: tuple[float, float, float] | None = None,
     cut: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None,
 ) -> Path:
@@ -44,6 +45,7 @@ def plot_deformed(
         zoom: Camera zoom.
         focus: Point that the camera looks at.
         show_edges: Whether to draw cell edges.
+        highest: Stress of the brightest colour; default the largest in the scene.
         view: Direction from the scene to the camera, z upwards; default pyvista's.
         cut: A point and a normal: what lies beyond that plane, before it moved, is cut away.
 
@@ -66,6 +68,7 @@ def plot_deformed(
                 "zoom": zoom,
                 "focus": _vector(focus),
                 "edges": show_edges,
+                "highest": np.nan if highest is None else highest,
                 "view": _vector(view),
                 "cut": np.stack([_vector(v) for v in cut or (None, None)]),
             }

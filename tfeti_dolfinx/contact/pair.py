@@ -30,8 +30,8 @@ class Contact:
     """Two surfaces may not enter each other.
 
     Args:
-        secondary: Name or tag of the surface that carries the multipliers; better the one with
-            the finer mesh.
+        secondary: Name or tag of the surface that carries the multipliers and the pressure;
+            better that of the softer body.
         primary: Name or tag of the other surface.
         search_radius: Surfaces farther apart than this make no rows at first; after the solve it
             is checked that none of them has come to overlap. Default: 5 % of the smaller
