@@ -61,7 +61,6 @@ def row(report, talk, subdomains, rtol):
         "seconds": report.seconds["total"],
         "of them qp": report.seconds["qp"],
         "seconds, talk": seconds,
-        "MB": report.peak_memory_mb,
     }
 
 

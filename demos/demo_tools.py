@@ -83,6 +83,8 @@ def petsc_options(arguments: list[str]) -> dict[str, str | None]:
     options: dict[str, str | None] = {}
     name = None
     for word in arguments:
+        if word.startswith("--"):
+            raise ValueError(f"unrecognized argument: {word}")
         if word.startswith("-") and not _is_number(word):
             name = word.removeprefix("-")
             options[name] = None

@@ -1,5 +1,6 @@
 """Documents: every program and every command in them runs, and nothing they name is missing."""
 
+import dataclasses
 import os
 import re
 import shlex
@@ -9,6 +10,8 @@ import sys
 from pathlib import Path
 
 import pytest
+
+import tfeti_dolfinx as tfeti
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -52,13 +55,17 @@ def test_the_main_job_leaves_pictures(serial_only, tmp_path):
     assert names == {"hertz_2d.png", "hertz_2d_contact.png", "hertz_2d_pressure.png"}
 
 
-@pytest.mark.parametrize("document", ["README.md", "docs/tutorial.md"])
+@pytest.mark.parametrize("document", ["README.md", "docs/tutorial.md", "docs/two_bodies.md"])
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_programs_of_documents(serial_only, document, ranks, tmp_path):
     program = tmp_path / "program.py"
     program.write_text("\n".join(blocks(ROOT / document, "python")))
-    (tmp_path / "meshes").mkdir()
-    mesh = [sys.executable, ROOT / "meshes/half_cylinder.py", tmp_path / "meshes/half_cylinder.msh"]
+    (tmp_path / "results").mkdir()
+    mesh = [
+        sys.executable,
+        ROOT / "meshes/half_cylinder.py",
+        tmp_path / "results/half_cylinder.msh",
+    ]
     subprocess.run(mesh, capture_output=True, timeout=100, check=True)
     command = ["mpirun", "-n", str(ranks), sys.executable, str(program)]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
@@ -119,3 +126,9 @@ def test_the_package_installs(serial_only, tmp_path):
     assert str(site) in result.stdout
     installed = {p.relative_to(site) for p in site.rglob("tfeti_dolfinx/**/*.py")}
     assert installed == {p.relative_to(ROOT) for p in ROOT.rglob("tfeti_dolfinx/**/*.py")}
+
+
+def test_the_report_s_fields_are_documented():
+    text = (ROOT / "docs/report.md").read_text()
+    for field in dataclasses.fields(tfeti.Report):
+        assert f"`{field.name}`" in text, field.name

@@ -77,7 +77,7 @@ def test_monitor_and_view_and_reason_print(capsys):
         assert out == ""
         return
     assert "|gP|" in out
-    assert "|Gλ-e|" in out
+    assert "|Qx|" in out
     assert "multiplications" in out
     assert "TFETI solve CONVERGED_RTOL after" in out
     assert "-tfeti_rtol 1e-06" in out

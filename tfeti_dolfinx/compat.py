@@ -105,6 +105,12 @@ def assemble_csr(form: fem.Form) -> Any:
     return A.to_scipy()
 
 
+def is_on_mesh(bc: fem.DirichletBC, mesh: dmesh.Mesh) -> bool:
+    """Whether a Dirichlet condition's space is on a mesh."""
+    space = bc.function_space
+    return getattr(space, "_cpp_object", space).mesh is mesh._cpp_object
+
+
 def prescribed_values(bcs: Sequence[fem.DirichletBC], size: int) -> Array:
     """Values that the boundary conditions prescribe, NaN elsewhere; one row per condition.
 

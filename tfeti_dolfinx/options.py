@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from dataclasses import Field, dataclass, field, fields
 from typing import Any
@@ -105,10 +106,12 @@ def parse_options(given: Mapping[str, Any] | None, prefix: str) -> Options:
         prefix: Prefix of all options, e.g. ``"tfeti_"``.
 
     Raises:
-        InputError: An option is unknown, or its value does not fit.
+        InputError: An option is unknown, its value does not fit, or the command line has options
+            that PETSc was not given.
     """
     named = {name.removeprefix("-").removeprefix(prefix): v for name, v in (given or {}).items()}
     database = PETSc.Options(prefix)
+    _check_reached(named, database, prefix)
     named |= {name: database.getString(name, "") for name in database.getAll()}
     known = {f.name: f for f in fields(Options)}
     for name in named:
@@ -120,6 +123,17 @@ def parse_options(given: Mapping[str, Any] | None, prefix: str) -> Options:
     options = Options(**{n: _converted(known[n], v, prefix) for n, v in named.items()})
     _check_ranges(options, prefix)
     return options
+
+
+def _check_reached(named: Mapping[str, Any], database: PETSc.Options, prefix: str) -> None:
+    """Raise if the command line has options that PETSc was not given."""
+    known = set(named) | set(database.getAll())
+    for word in sys.argv[1:]:
+        if word.startswith(f"-{prefix}") and word.removeprefix(f"-{prefix}") not in known:
+            raise InputError(
+                f"{word} on the command line did not reach PETSc; call petsc4py.init(sys.argv) "
+                "before dolfinx is imported"
+            )
 
 
 def _converted(f: Field[Any], value: Any, prefix: str) -> Any:

@@ -20,8 +20,8 @@ from tfeti_dolfinx.solution import Solution
 def write_vtx(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
     """Write all fields of a solution for ParaView. Collective.
 
-    Nodal fields (displacement, pressure, gap, status and, if the problem has a stress, stress
-    and von Mises stress averaged at the nodes) go to ``path``; cell fields (subdomain, body,
+    Nodal fields (displacement, pressure, gap, status, with contacts traction, with a stress
+    stress and von Mises stress averaged at the nodes) go to ``path``; cell fields (subdomain, body,
     material) to a second file beside it, ``<stem>_cells.bp``.
 
     Args:

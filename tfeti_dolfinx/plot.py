@@ -40,8 +40,8 @@ def plot_deformed(
     Args:
         path: The ``.png`` to write.
         solution: A solution of a problem with a stress.
-        factor: Displacements are drawn times this; default such that the largest is 5 % of the
-            scene.
+        factor: Displacements are drawn times this; default 1 where there are contacts (bodies
+            would seem to enter each other), else such that the largest is 5 % of the scene.
         zoom: Camera zoom.
         focus: Point that the camera looks at.
         show_edges: Whether to draw cell edges.
@@ -57,6 +57,8 @@ def plot_deformed(
         TfetiError: The picture could not be drawn.
     """
     comm = solution.decomposition.comm
+    if factor is None and solution.has_contact:
+        factor = 1.0
     parts = comm.gather(_grid(solution, solution.nodal_von_mises.x.array), root=0)
     target = Path(path)
     with raised_on_all_ranks(comm):

@@ -13,7 +13,7 @@ from mpi4py import MPI
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.assembly import Forms, displacement_space
 from tfeti_dolfinx.compat import require_real_petsc
-from tfeti_dolfinx.contact.search import ContactPartner, ContactSearch
+from tfeti_dolfinx.contact.search import ContactPartner, ContactSearch, checked_contacts
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.errors import ConvergenceError, NoSolutionError
 from tfeti_dolfinx.fields import Stress
@@ -83,7 +83,8 @@ class ContactProblem:
         self.options = parse_options(petsc_options, petsc_options_prefix)
         if self.options.bbt:
             require_slepc(decomposition.comm)
-        self.decomposition, self.bcs, self.contacts = decomposition, list(bcs), list(contacts)
+        self.decomposition, self.bcs = decomposition, list(bcs)
+        self.contacts = checked_contacts(contacts)
         V = displacement_space(a)
         self.u = fem.Function(V, name="displacement") if u is None else u
         self.report = Report(seconds=dict(decomposition.seconds))
@@ -194,9 +195,9 @@ class ContactProblem:
                 lam=np.array(result.lam.array_r),
                 mu=result.mu,
                 stress=self._stress,
-                surfaces=[name for contact in self.contacts for name in contact.surfaces],
+                contacts=self.contacts,
             )
-        fill_report(report, self.solution, dual, result, self._counters, self.options.rtol)
+        fill_report(report, self.solution, dual, result, self._counters)
         result.destroy()
         return self.solution
 

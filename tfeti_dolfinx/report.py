@@ -41,9 +41,9 @@ class Report:
         peak_memory_mb: Peak resident memory, summed over ranks.
         seconds: Wall seconds of each stage (largest over ranks), and ``total``.
         residuals: ``projected_gradient`` and ``equilibrium`` relative to b₀, with ``tolerance``
-            = rtol·b₀ as a length; in physical units ``gluing_jump`` and ``penetration``
-            (lengths), ``tension`` (most negative pressure), ``complementarity`` (largest
-            force times gap), ``balance`` (largest force left on a kernel mode).
+            as a length: rtol·b₀, or what rounding allows; in physical units ``gluing_jump`` and
+            ``penetration`` (lengths), ``tension`` (most negative pressure), ``complementarity``
+            (largest force times gap), ``balance`` (largest force left on a kernel mode).
         errors: Relative errors against closed forms, filled by demos.
         spectrum: With ``-tfeti_bbt``: the extreme eigenvalues ``BBt_min`` and ``BBt_max`` of
             B Bᵀ, ``BDBt_min`` and ``BDBt_max`` of B D⁻¹ Bᵀ. Their roots are the extreme

@@ -19,7 +19,6 @@ def fill_report(
     dual: Dual,
     result: QPResult,
     counters: Counters,
-    rtol: float,
 ) -> None:
     """Fill in everything but closed-form errors; counters add up over rounds. Collective."""
     comm, decomposition, gluing = dual.coarse.comm, solution.decomposition, solution.gluing
@@ -47,14 +46,14 @@ def fill_report(
     report.proportioning_steps += result.steps.proportioning
     report.factorizations = comm.allreduce(counters.factorizations)
     report.converged_reason = result.reason.name
-    report.residuals = _residuals(solution, dual, result, rtol)
+    report.residuals = _residuals(solution, dual, result)
     report.peak_memory_mb = peak_memory_mb(comm)
     for name, value in report.seconds.items():
         report.seconds[name] = comm.allreduce(value, op=MPI.MAX)
     report.seconds["total"] = sum(v for k, v in report.seconds.items() if k != "total")
 
 
-def _residuals(solution: Solution, dual: Dual, result: QPResult, rtol: float) -> dict[str, float]:
+def _residuals(solution: Solution, dual: Dual, result: QPResult) -> dict[str, float]:
     comm, coarse = dual.coarse.comm, dual.coarse
     reference = result.reference or 1.0
     balance = coarse.G(solution.lam) - coarse.e
@@ -66,7 +65,7 @@ def _residuals(solution: Solution, dual: Dual, result: QPResult, rtol: float) ->
     return {
         "projected_gradient": result.projected_gradient / reference,
         "equilibrium": result.norm * result.equality / reference,
-        "tolerance": rtol * result.reference,
+        "tolerance": result.tolerance,
         "gluing_jump": largest(_jumps(solution)),
         "penetration": largest(-gap),
         "tension": largest(0.0 - solution.contact_pressure),

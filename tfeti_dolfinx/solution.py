@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 from dolfinx import fem
-from mpi4py import MPI
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.arrays import Array, sum_rows
 from tfeti_dolfinx.contact.forces import BodyForces, body_forces, nodal_forces, vertex_tractions
 from tfeti_dolfinx.contact.records import remaining_gaps
-from tfeti_dolfinx.contact.surfaces import group_points
+from tfeti_dolfinx.contact.search import ContactPartner
+from tfeti_dolfinx.contact.surfaces import group_points, hat_integrals
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.fields import Stress, cellwise, checked_stress, from_vertices, nodal, von_mises
 from tfeti_dolfinx.gluing.glue import Gluing
@@ -35,8 +35,10 @@ class ContactStatus(IntEnum):
 class ContactData:
     """State of the conditions of one contact on this rank, one row per node.
 
+    A node is on one rank only: sums over all ranks are those of the contact.
+
     Attributes:
-        points: Nodes, shape ``(n, 3)``.
+        points: Nodes where they were before the deformation, shape ``(n, 3)``.
         normal: Direction in which a node may not go further, shape ``(n, gdim)``.
         force: Normal force on the node, 0 or more, shape ``(n,)``.
         pressure: Force / ∫φ_i, shape ``(n,)``.
@@ -65,7 +67,7 @@ class Solution:
         lam: Multipliers of this rank's rows.
         mu: Multipliers of Gλ = e.
         stress: UFL stress of a displacement, or None.
-        surfaces: All contact surfaces.
+        contacts: Obstacles and pairs.
     """
 
     def __init__(
@@ -77,11 +79,11 @@ class Solution:
         lam: Array,
         mu: Array,
         stress: Stress | None,
-        surfaces: Sequence[str | int] = (),
+        contacts: Sequence[ContactPartner] = (),
     ) -> None:
         self.displacement, self.dofs, self.decomposition = u, dofs, decomposition
         self.gluing, self.lam, self.mu = gluing, lam, mu
-        self._stress, self._surfaces = stress, list(surfaces)
+        self._stress, self._contacts = stress, list(contacts)
 
     @property
     def has_stress(self) -> bool:
@@ -91,7 +93,7 @@ class Solution:
     @property
     def has_contact(self) -> bool:
         """Whether the problem has contacts."""
-        return bool(self._surfaces)
+        return bool(self._contacts)
 
     @cached_property
     def stress(self) -> fem.Function:
@@ -115,14 +117,22 @@ class Solution:
 
     @cached_property
     def pressure(self) -> fem.Function:
-        """Contact pressure on the secondary sides and at obstacles, 0 elsewhere."""
-        values = np.zeros(self.dofs.num_groups)
-        np.add.at(values, self.gluing.records.group, self.contact_pressure)
+        """Contact pressure on the secondary sides and at obstacles, 0 elsewhere.
+
+        A node of several contacts has the sum of their forces over their areas, each part of a
+        surface counted once.
+        """
+        records, dofs = self.gluing.records, self.dofs
+        force = sum_rows(records.group, self.force, dofs.num_groups)
+        area = sum_rows(records.group, records.area, dofs.num_groups)
+        surfaces = [contact.surfaces[0] for contact in self._contacts]
+        whole = hat_integrals(dofs, self.decomposition, surfaces) if surfaces else area
+        values = np.divide(force, np.minimum(area, whole), out=0.0 * force, where=area > 0.0)
         return self._field(values, self._vertices, "pressure")
 
     @cached_property
     def gap(self) -> fem.Function:
-        """Remaining gap after deformation, 0 where there is no contact condition."""
+        """Remaining gap after deformation; 0 where there is no contact condition (see status)."""
         values = np.full(self.dofs.num_groups, np.inf)
         np.minimum.at(values, self.gluing.records.group, self.remaining_gap)
         return self._field(np.where(self._vertices, values, 0.0), self._vertices, "gap")
@@ -145,9 +155,8 @@ class Solution:
         and reaction of two sides have the same resultant.
         """
         dofs = self.dofs
-        values, area = vertex_tractions(
-            self._nodal_forces, dofs, self.decomposition, self._surfaces
-        )
+        surfaces = [name for contact in self._contacts for name in contact.surfaces]
+        values, area = vertex_tractions(self._nodal_forces, dofs, self.decomposition, surfaces)
         function = fem.Function(dofs.V, name="traction")
         components = function.x.array.reshape(-1, dofs.bs)
         for i in range(dofs.bs):
@@ -170,9 +179,8 @@ class Solution:
             InputError: There is no such contact.
         """
         records = self.gluing.records
-        last = self.dofs.comm.allreduce(int(records.contact.max(initial=-1)), op=MPI.MAX)
-        if not 0 <= index <= last:
-            raise InputError(f"contact {index}: there are {last + 1}, counted from 0")
+        if not 0 <= index < len(self._contacts):
+            raise InputError(f"contact {index}: there are {len(self._contacts)}, counted from 0")
         points = group_points(self.dofs)
         own = records.contact == index
         return ContactData(

@@ -116,7 +116,7 @@ def _conclude(result: QPResult, options: Options, comm: MPI.Intracomm) -> None:
     text = (
         f"{name} after {result.steps.outer} outer and {result.steps.inner} inner iterations: "
         f"‖g^P‖ = {result.projected_gradient:.3e}, ‖F‖‖Qx‖ = "
-        f"{result.norm * result.equality:.3e}, tolerance {options.rtol * result.reference:.3e}"
+        f"{result.norm * result.equality:.3e}, tolerance {result.tolerance:.3e}"
     )
     if options.converged_reason and comm.rank == 0:
         print(f"TFETI solve {text}", flush=True)

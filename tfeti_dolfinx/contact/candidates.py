@@ -13,7 +13,7 @@ from tfeti_dolfinx.parallel import Exchange
 
 
 def rendezvous(
-    secondary: Facets, primary: Facets, num_vertices: int, radius: float, comm: MPI.Intracomm
+    secondary: Facets, primary: Facets, reach: float, comm: MPI.Intracomm
 ) -> tuple[Facets, Facets]:
     """Bring facets that may meet to the same rank. Collective.
 
@@ -23,62 +23,61 @@ def rendezvous(
     Args:
         secondary: Secondary facets of this rank.
         primary: Primary facets of this rank.
-        num_vertices: Vertices of a facet.
-        radius: How far apart facets may be.
+        reach: How far apart facets may be, their own sizes not counted.
         comm: Communicator.
 
     Returns:
         The secondary and the primary facets that have come to this rank.
     """
-    centres = secondary.corners(num_vertices).mean(axis=1)
-    here = secondary.sent(Exchange(comm, bisect_points(centres, comm.size, comm)))
-    low, high = here.box(num_vertices)
+    here = secondary.sent(Exchange(comm, bisect_points(secondary.centre, comm.size, comm)))
+    size = here.radius.max(initial=0.0)
+    low, high = here.box()
     gdim = low.shape[1]
     box = np.stack((low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)))
     boxes = np.empty((comm.size, 2, gdim))
-    comm.Allgather(box, boxes)
-    low, high = primary.box(num_vertices)
+    comm.Allgather(box + np.array([[-size], [size]]), boxes)
+    low, high = primary.box()
+    margin = reach + primary.radius[:, None]
     near = np.ones((len(primary), comm.size), dtype=bool)
     for axis in range(gdim):
-        near &= low[:, axis, None] - radius <= boxes[None, :, 1, axis]
-        near &= high[:, axis, None] + radius >= boxes[None, :, 0, axis]
+        near &= low[:, axis, None] - margin <= boxes[None, :, 1, axis]
+        near &= high[:, axis, None] + margin >= boxes[None, :, 0, axis]
     facet, rank = np.nonzero(near)
     return here, primary.sent(Exchange(comm, rank), facet)
 
 
-def candidate_pairs(
-    secondary: Facets, primary: Facets, num_vertices: int, reach: float
-) -> tuple[Array, Array]:
+def candidate_pairs(secondary: Facets, primary: Facets, reach: float) -> tuple[Array, Array]:
     """Pairs of facets that may meet when one looks along the secondary facets' normals.
 
     A primary facet is found if it comes within a secondary facet's radius of the line through
-    that facet's centre along its averaged normal, no farther than ``reach`` from the centre.
-    Primary facets are sorted into classes of equal size up to a factor of 2, each with a tree of
-    its own, so that a graded mesh does not make large facets meet small ones in vain.
+    that facet's centre along its averaged normal, no farther than ``reach`` and the facets' sizes
+    from the centre. Primary facets are sorted into classes of equal size up to a factor of 2,
+    each with a tree of its own, so that a graded mesh does not make large facets meet small ones
+    in vain.
 
     Args:
         secondary: Secondary facets, with averaged normals.
         primary: Primary facets.
-        num_vertices: Vertices of a facet.
         reach: How far to look, to both sides.
 
     Returns:
         Secondary and primary facet of each pair.
     """
-    s_centre, s_size = _balls(secondary, num_vertices)
-    p_centre, p_size = _balls(primary, num_vertices)
+    s_centre, s_size = secondary.centre, secondary.radius
+    p_centre, p_size = primary.centre, primary.radius
     direction = centre_normals(secondary)
     keys: list[Array] = [np.empty(0, dtype=np.int64)]
     classes = np.floor(np.log2(np.maximum(p_size, 1e-300))).astype(np.int64)
     for size_class in np.unique(classes) if len(secondary) else ():
         members = np.flatnonzero(classes == size_class)
-        tree, radius = cKDTree(p_centre[members]), s_size + p_size[members].max()
-        s, hit = _march(tree, s_centre, direction, radius, reach)
+        radius = s_size + p_size[members].max()
+        s, hit = _march(cKDTree(p_centre[members]), s_centre, direction, radius, reach + radius)
         p = members[hit]
         offset = p_centre[p] - s_centre[s]
         along = np.sum(offset * direction[s], axis=1)
         aside = np.linalg.norm(offset - along[:, None] * direction[s], axis=1)
-        close = (aside <= s_size[s] + p_size[p]) & (np.abs(along) <= reach + p_size[p])
+        sizes = s_size[s] + p_size[p]
+        close = (aside <= sizes) & (np.abs(along) <= reach + sizes + p_size[p])
         keys.append(s[close] * len(primary) + p[close])
     return np.divmod(np.unique(np.concatenate(keys)), max(len(primary), 1))
 
@@ -90,7 +89,7 @@ def centre_normals(facets: Facets) -> Array:
 
 
 def _march(
-    tree: cKDTree, origin: Array, direction: Array, radius: Array, reach: float
+    tree: cKDTree, origin: Array, direction: Array, radius: Array, reach: Array
 ) -> tuple[Array, Array]:
     """Points of a tree within a radius of line segments: steps as long as nothing is near.
 
@@ -99,14 +98,14 @@ def _march(
         origin: Middle of each segment, shape ``(n, gdim)``.
         direction: Unit vectors, shape ``(n, gdim)``.
         radius: One per segment, shape ``(n,)``.
-        reach: Half the length of the segments.
+        reach: Half the length of each segment, shape ``(n,)``.
 
     Returns:
         Segment and point of each pair, some more than once.
     """
     found_s: list[Array] = [np.empty(0, dtype=np.int64)]
     found_p: list[Array] = [np.empty(0, dtype=np.int64)]
-    front = np.full(len(origin), -reach)  # all before it has been seen
+    front = -reach  # all before it has been seen
     active = np.arange(len(origin))
     while len(active):
         t = front[active] + radius[active]
@@ -117,7 +116,7 @@ def _march(
         found_s.append(active[close][rows])
         found_p.append(points)
         front[active] = t + np.where(close, radius[active], nearest - radius[active])
-        active = active[front[active] < reach]
+        active = active[front[active] < reach[active]]
     return np.concatenate(found_s), np.concatenate(found_p)
 
 
@@ -136,10 +135,3 @@ def _within(tree: cKDTree, x: Array, radius: Array) -> tuple[Array, Array]:
         found.append((rows[row[settled]], point[row[settled], column[settled]]))
         rows, k = rows[full], min(2 * k, tree.n)
     return tuple(np.concatenate(part) for part in zip(*found, strict=True))
-
-
-def _balls(facets: Facets, num_vertices: int) -> tuple[Array, Array]:
-    """Centre and radius of a ball around each facet."""
-    corners = facets.corners(num_vertices)
-    centre = corners.mean(axis=1)
-    return centre, np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1, initial=0.0)

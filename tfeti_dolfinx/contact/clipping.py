@@ -2,12 +2,75 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import basix
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array
 
 SLIVER = 1e-12
+
+
+@dataclass(frozen=True)
+class Parts:
+    """Convex parts of lines or planes, one for each pair of facets.
+
+    Attributes:
+        vertices: In order, shape ``(n, k, tdim)``.
+        count: How many of them are used, 0 where there is no part, shape ``(n,)``.
+        size: Length or area, shape ``(n,)``.
+    """
+
+    vertices: Array
+    count: Array
+    size: Array
+
+    def __getitem__(self, rows: Array) -> Parts:
+        return Parts(self.vertices[rows], self.count[rows], self.size[rows])
+
+    @property
+    def middle(self) -> Array:
+        """Mean of the vertices, shape ``(n, tdim)``."""
+        used = np.arange(self.vertices.shape[1]) < self.count[:, None]
+        total = np.sum(np.where(used[:, :, None], self.vertices, 0.0), axis=1)
+        return total / np.maximum(self.count, 1)[:, None]
+
+    def quadrature(self, degree: int) -> tuple[Array, Array, Array]:
+        """Part of each point, points of shape ``(m, tdim)``, weights, exact up to a degree."""
+        if self.vertices.shape[2] == 1:
+            return quadrature_on_intervals(self.vertices[:, :, 0], degree)
+        return quadrature_on_polygons(self.vertices, self.count, degree)
+
+
+def common_parts(subject: Array, clip: Array) -> Parts:
+    """What pairs of intervals, or of convex polygons, have in common.
+
+    Args:
+        subject: Vertices in order, shape ``(n, k, tdim)``.
+        clip: Vertices in order, shape ``(n, l, tdim)``.
+    """
+    if subject.shape[2] == 1:
+        ends, met = clip_intervals(subject[:, :, 0], clip[:, :, 0])
+        size = np.where(met, ends[:, 1] - ends[:, 0], 0.0)
+        return Parts(ends[:, :, None], np.where(met, 2, 0), size)
+    polygon, count = clip_polygons(subject, clip)
+    return Parts(polygon, count, np.abs(_signed_area(polygon, count)))
+
+
+def contains(polygon: Array, y: Array) -> Array:
+    """Whether intervals or convex polygons contain a point each.
+
+    Args:
+        polygon: Vertices in order, shape ``(n, k, tdim)``.
+        y: Points, shape ``(n, tdim)``.
+    """
+    if polygon.shape[2] == 1:
+        return np.all((polygon.min(axis=1) < y) & (y < polygon.max(axis=1)), axis=1)
+    edge = np.roll(polygon, -1, axis=1) - polygon
+    offset = y[:, None] - polygon
+    side = edge[:, :, 0] * offset[:, :, 1] - edge[:, :, 1] * offset[:, :, 0]
+    return np.all(side > 0.0, axis=1) | np.all(side < 0.0, axis=1)
 
 
 def clip_intervals(subject: Array, clip: Array) -> tuple[Array, Array]:

@@ -67,10 +67,19 @@ class Facets:
         """Vertices, shape ``(n, v, gdim)``."""
         return self.x[:, :num_vertices]
 
-    def box(self, num_vertices: int) -> tuple[Array, Array]:
+    def box(self) -> tuple[Array, Array]:
         """Lowest and highest coordinates of each facet, shapes ``(n, gdim)``."""
-        corners = self.corners(num_vertices)
-        return corners.min(axis=1), corners.max(axis=1)
+        return self.x.min(axis=1), self.x.max(axis=1)
+
+    @property
+    def centre(self) -> Array:
+        """Mean of the geometry nodes, shape ``(n, gdim)``."""
+        return self.x.mean(axis=1)
+
+    @property
+    def radius(self) -> Array:
+        """Radius of a ball around the centre that holds the geometry nodes, shape ``(n,)``."""
+        return np.linalg.norm(self.x - self.centre[:, None], axis=2).max(axis=1, initial=0.0)
 
 
 def facet_kind(dofs: TornDofs) -> FacetKind:

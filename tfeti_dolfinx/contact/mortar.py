@@ -9,18 +9,16 @@ import numpy as np
 
 from tfeti_dolfinx.arrays import Array, sum_rows
 from tfeti_dolfinx.contact.candidates import centre_normals
-from tfeti_dolfinx.contact.clipping import (
-    clip_intervals,
-    clip_polygons,
-    quadrature_on_intervals,
-    quadrature_on_polygons,
-)
+from tfeti_dolfinx.contact.clipping import common_parts, contains
 from tfeti_dolfinx.contact.facet_element import POLYGON, reference_points
 from tfeti_dolfinx.contact.facets import FacetKind, Facets
+from tfeti_dolfinx.contact.layers import Look, nearest, reachable
 
 # facets whose normals make a larger angle than about 88 degrees with each other do not face
 FACING = -0.03
 HARDLY_COVERED = 1e-6
+# hats of quadrilaterals that are no parallelograms are rational on the plane
+PARALLEL, TWISTED = 1e-10, 12
 
 
 @dataclass(frozen=True)
@@ -33,7 +31,6 @@ class Segments:
         xi: Reference coordinates on the secondary facet, shape ``(m, tdim)``.
         eta: Reference coordinates on the primary facet, shape ``(m, tdim)``.
         weight: Weights, areas on the secondary facet, shape ``(m,)``.
-        deepest: Largest overlap of facing facets that were passed over as too deep, or 0.
         averted: Whether facets within reach were passed over because they do not face.
     """
 
@@ -42,7 +39,6 @@ class Segments:
     xi: Array
     eta: Array
     weight: Array
-    deepest: float
     averted: bool
 
 
@@ -97,65 +93,63 @@ def find_segments(
     secondary: Facets,
     primary: Facets,
     pairs: tuple[Array, Array],
-    radius: float,
+    depth: float,
     reach: float,
-    degree: int,
 ) -> Segments:
     """Clip pairs of facets on the secondary facets' averaged normal planes.
+
+    Of several primary facets over the same place the first one is met; facets that face each
+    other through thin bodies do not meet (``layers``). Lengths are exceeded by the facets' own
+    sizes, so that no facet within them is covered in part only.
 
     Args:
         kind: Elements on the facets.
         secondary: Secondary facets with averaged normals.
         primary: Primary facets.
         pairs: Secondary and primary facet of each pair.
-        radius: Facets that overlap by more than this along the normal do not meet.
+        depth: Facets that overlap by more than this along the normal do not meet.
         reach: Nor do facets farther apart than this.
-        degree: Degree of the quadrature.
     """
-    s, p = pairs
-    v, tdim = kind.num_vertices, secondary.x.shape[2] - 1
-    centre, normal, tangents = _planes(secondary, v)
-    corners_s = _on_planes(secondary.corners(v), centre, tangents)
-    corners_p = _on_planes(primary.corners(v)[p], centre[s], tangents[s])
-    boxes_meet = np.all(
-        (corners_p.min(axis=1) <= corners_s.max(axis=1)[s])
-        & (corners_p.max(axis=1) >= corners_s.min(axis=1)[s]),
-        axis=1,
-    )
-    s, p, corners_p = s[boxes_meet], p[boxes_meet], corners_p[boxes_meet]
-    cosine = np.sum(primary.normal[p] * normal[s], axis=1)
-    facing = cosine < FACING
+    planes = _Planes(kind, secondary, primary)
+    s, p = planes.with_meeting_boxes(*pairs)
+    corners = planes.primary_corners(s, p)
     order = POLYGON[kind.facet]
-    if tdim == 1:
-        ends, met = clip_intervals(corners_p[:, :, 0], corners_s[s, :, 0])
-        middle = ends.mean(axis=1, keepdims=True)
-    else:
-        polygon, count = clip_polygons(corners_p[:, order], corners_s[s][:, order])
-        met = count > 0
-        used = np.arange(polygon.shape[1]) < count[:, None]
-        total = np.sum(np.where(used[:, :, None], polygon, 0.0), axis=1)
-        middle = total / np.maximum(count, 1)[:, None]
-    met &= np.abs(cosine) > -FACING
-    distance = np.full(len(s), np.inf)
-    distance[met] = _distance(
-        kind, secondary, primary, s[met], p[met], middle[met], corners_s, corners_p[met], normal
-    )
-    near = met & (distance >= -radius) & (distance <= reach)
-    deep = met & facing & (distance < -radius) & (distance >= -reach)
-    kept = np.flatnonzero(near & facing)
-    if tdim == 1:
-        owner, y, weight = quadrature_on_intervals(ends[kept], degree)
-    else:
-        owner, y, weight = quadrature_on_polygons(polygon[kept], count[kept], degree)
+    parts = common_parts(corners[:, order], planes.corners[s][:, order])
+    met = np.flatnonzero(parts.count > 0)
+    s, p, corners, parts = s[met], p[met], corners[met], parts[met]
+    cosine = np.sum(primary.normal[p] * planes.normal[s], axis=1)
+    distance = planes.distance(s, p, parts.middle)
+    length = secondary.radius[s]
+    slack = length + primary.radius[p]
+    near = (np.abs(cosine) > -FACING) & (distance >= -depth - slack) & (distance <= reach + slack)
+    facing = near & (cosine < FACING)
+
+    def look(chosen: Array) -> Look:
+        place, facet = s[chosen], p[chosen]
+        middle, outline = parts.middle[chosen], corners[chosen][:, order]
+
+        def at(a: Array, b: Array) -> tuple[Array, Array]:
+            over = contains(outline[b], middle[a])
+            there = np.full(len(a), np.inf)
+            a, b = a[over], b[over]
+            there[over] = planes.distance(place[a], facet[b], middle[a])
+            return over, there
+
+        return at
+
+    seen = np.flatnonzero(near)
+    met = seen[reachable(s[seen], distance[seen], facing[seen], length[seen], look(seen))]
+    first = nearest(s[met], distance[met], length[met], parts.size[met], planes.size, look(met))
+    kept = met[first]
+    owner, y, weight = parts[kept].quadrature(_degree(kind, secondary, primary))
     pair = kept[owner]
-    slope = np.abs(np.sum(normal * secondary.normal, axis=1))
+    slope = np.abs(np.sum(planes.normal * secondary.normal, axis=1))
     return Segments(
         secondary=s[pair],
         primary=p[pair],
-        xi=reference_points(kind.facet, corners_s[s[pair]], y),
-        eta=reference_points(kind.facet, corners_p[pair], y),
+        xi=reference_points(kind.facet, planes.corners[s[pair]], y),
+        eta=reference_points(kind.facet, corners[pair], y),
         weight=weight / slope[s[pair]],
-        deepest=float(-distance[deep].min(initial=0.0)),
         averted=bool(np.any(near & ~facing)),
     )
 
@@ -194,9 +188,9 @@ def integrate(
     """Integrals of the dual multipliers over segments."""
     s, p = segments.secondary, segments.primary
     dual = dual_multipliers(kind, secondary.area, s, segments.xi, segments.weight)
-    apart = positions(kind, primary.x[p], segments.eta) - positions(
-        kind, secondary.x[s], segments.xi
-    )
+    # from the vertices: a multiplier is negative somewhere, so the mean of a curved gap with it
+    # would be below 0 where facets of second order touch
+    apart = at_hats(kind, primary.x[p], segments.eta) - at_hats(kind, secondary.x[s], segments.xi)
     gap = dual.integrals(apart)
     key = s.astype(np.int64) * max(len(primary), 1) + p
     pair, pair_row = np.unique(key, return_inverse=True)
@@ -235,41 +229,65 @@ def hat_areas(kind: FacetKind, facets: Facets) -> Array:
     return sum_rows(facet, weight[:, None] * kind.hats.values(xi), len(facets))
 
 
-def _planes(facets: Facets, num_vertices: int) -> tuple[Array, Array, Array]:
-    """Centre, averaged normal and tangents of each facet's plane."""
-    normal = centre_normals(facets)
+class _Planes:
+    """The planes of secondary facets: through their centres, along their averaged normals."""
+
+    def __init__(self, kind: FacetKind, secondary: Facets, primary: Facets) -> None:
+        self._kind, self._secondary, self._primary = kind, secondary, primary
+        corners = secondary.corners(kind.num_vertices)
+        self.normal = centre_normals(secondary)
+        self._centre, self._tangents = corners.mean(axis=1), _tangents(self.normal)
+        self.corners = self._on_planes(corners, np.arange(len(secondary)))
+        outline = self.corners[:, POLYGON[kind.facet]]
+        self.size = common_parts(outline, outline).size
+
+    def _on_planes(self, x: Array, s: Array) -> Array:
+        """Coordinates on planes s: shape ``(n, v, gdim)`` to ``(n, v, gdim - 1)``."""
+        return np.einsum("nvg,ntg->nvt", x - self._centre[s][:, None], self._tangents[s])
+
+    def primary_corners(self, s: Array, p: Array) -> Array:
+        """Vertices of primary facets p on planes s, shape ``(n, v, tdim)``."""
+        return self._on_planes(self._primary.corners(self._kind.num_vertices)[p], s)
+
+    def with_meeting_boxes(self, s: Array, p: Array) -> tuple[Array, Array]:
+        """Pairs whose boxes on the plane meet."""
+        corners = self.primary_corners(s, p)
+        low, high = self.corners.min(axis=1)[s], self.corners.max(axis=1)[s]
+        met = (corners.min(axis=1) <= high) & (corners.max(axis=1) >= low)
+        met_all = np.all(met, axis=1)
+        return s[met_all], p[met_all]
+
+    def distance(self, s: Array, p: Array, y: Array) -> Array:
+        """Distance of facets along the normal, at points y of the planes s."""
+        kind = self._kind
+        xi = reference_points(kind.facet, self.corners[s], y)
+        eta = reference_points(kind.facet, self.primary_corners(s, p), y)
+        apart = at_hats(kind, self._primary.x[p], eta) - at_hats(kind, self._secondary.x[s], xi)
+        return np.sum(apart * self.normal[s], axis=1)
+
+
+def _tangents(normal: Array) -> Array:
+    """Orthonormal tangents of unit normals, shape ``(n, gdim - 1, gdim)``."""
     if normal.shape[1] == 2:
-        tangents = np.stack((-normal[:, 1], normal[:, 0]), axis=1)[:, None]
-    else:
-        axis = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
-        first = np.cross(normal, axis)
-        first /= np.linalg.norm(first, axis=1, keepdims=True)
-        tangents = np.stack((first, np.cross(normal, first)), axis=1)
-    return facets.corners(num_vertices).mean(axis=1), normal, tangents
+        return np.stack((-normal[:, 1], normal[:, 0]), axis=1)[:, None]
+    axis = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
+    first = np.cross(normal, axis)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack((first, np.cross(normal, first)), axis=1)
 
 
-def _on_planes(x: Array, centre: Array, tangents: Array) -> Array:
-    """Coordinates on planes: shape ``(n, v, gdim)`` to ``(n, v, gdim - 1)``."""
-    return np.einsum("nvg,ntg->nvt", x - centre[:, None], tangents)
+def _degree(kind: FacetKind, secondary: Facets, primary: Facets) -> int:
+    """Degree of the quadrature: exact on intervals, triangles and parallelograms."""
+    exact = 1 + kind.displacement.degree
+    if kind.facet != "quadrilateral":
+        return exact
+    for facets in (secondary, primary):
+        a, b, c, d = facets.corners(4).transpose(1, 0, 2)
+        if np.any(np.linalg.norm(a - b - c + d, axis=1) > PARALLEL * facets.radius):
+            return TWISTED
+    return 2 * exact
 
 
-def _distance(
-    kind: FacetKind,
-    secondary: Facets,
-    primary: Facets,
-    s: Array,
-    p: Array,
-    y: Array,
-    corners_s: Array,
-    corners_p: Array,
-    normal: Array,
-) -> Array:
-    """Distance of the facets along the normal, at a point of each pair's plane."""
-    x_s = positions(kind, secondary.x[s], reference_points(kind.facet, corners_s[s], y))
-    x_p = positions(kind, primary.x[p], reference_points(kind.facet, corners_p, y))
-    return np.sum((x_p - x_s) * normal[s], axis=1)
-
-
-def positions(kind: FacetKind, x: Array, xi: Array) -> Array:
-    """Points at reference coordinates of facets with geometry nodes x."""
-    return np.einsum("mg,mgd->md", kind.geometry.values(xi), x)
+def at_hats(kind: FacetKind, x: Array, xi: Array) -> Array:
+    """Points at reference coordinates of the plane facets with geometry nodes x."""
+    return np.einsum("mv,mvd->md", kind.hats.values(xi), x[:, : kind.num_vertices])

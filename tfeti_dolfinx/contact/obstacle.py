@@ -10,7 +10,7 @@ from mpi4py import MPI
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.contact.conditions import conditions, triplets
 from tfeti_dolfinx.contact.facets import facet_kind, local_facets
-from tfeti_dolfinx.contact.mortar import dual_multipliers, hat_areas, positions, whole_facets
+from tfeti_dolfinx.contact.mortar import dual_multipliers, hat_areas, whole_facets
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.shapes import Shape
 from tfeti_dolfinx.contact.surfaces import (
@@ -57,23 +57,29 @@ class Obstacle:
         return 0.0
 
     def records(
-        self, dofs: TornDofs, decomposition: Decomposition, contact: int, radius: float = np.inf
+        self,
+        dofs: TornDofs,
+        decomposition: Decomposition,
+        contact: int,
+        radius: float = np.inf,
+        depth: float = np.inf,
     ) -> ContactRecords:
         """One condition per vertex of the surface, from its present distance. Collective.
 
         With φ the signed distance, n = −∇φ/|∇φ| and g = φ/|∇φ|, the condition of a displacement of
         degree 1 is n·u ≤ g at the node. For other degrees it is that of a dual multiplier,
-        ∫ψ_i n_i·u ≤ ∫ψ_i g, divided by ∫ψ_i.
+        ∫ψ_i n_i·u ≤ g_i ∫ψ_i, divided by ∫ψ_i, with the gap at the vertex.
 
         Raises:
-            InputError: The surface is unknown or empty, the shape has no normal at a node, or no
-                node is within reach.
+            InputError: The surface is unknown or empty or faces away, the shape has no normal at
+                a node, or no node is within reach.
         """
         facets = surface_facets(decomposition, self.surface)
         if dofs.V.element.basix_element.degree == 1:
             records = self._at_nodes(dofs, decomposition, contact, facets)
         else:
             records = self._weighted(dofs, decomposition, contact, facets)
+        self._check_side(dofs, decomposition, facets)
         near = records.gap <= self.reach
         if decomposition.comm.allreduce(int(np.sum(near))) == 0:
             lowest = float(records.gap.min(initial=np.inf))
@@ -113,14 +119,14 @@ class Obstacle:
         dual = dual_multipliers(kind, surface.area, facet, xi, weight)
         vertices = surface.groups[:, : kind.num_vertices]
         with raised_on_all_ranks(decomposition.comm):
-            gap, _ = self._gaps(positions(kind, surface.x[facet], xi), dofs.bs)
-            _, normals = self._gaps(group_points(dofs), dofs.bs)
+            gap, normals = self._gaps(group_points(dofs), dofs.bs)
+        (at_vertices,) = dofs.lookup(vertices[dual.facet].ravel(), gap)
         return conditions(
             dofs=dofs,
             contact=contact,
             multipliers=vertices[dual.facet],
             covered=dual.covered,
-            gaps=dual.integrals(gap),
+            gaps=at_vertices.reshape(dual.covered.shape) * dual.covered,
             entries=(
                 triplets(
                     vertices[dual.facet],
@@ -132,6 +138,19 @@ class Obstacle:
             areas=hat_areas(kind, surface),
             normals=normals,
         )
+
+    def _check_side(self, dofs: TornDofs, decomposition: Decomposition, facets: Array) -> None:
+        """Raise if no facet faces the obstacle. Collective."""
+        surface = local_facets(dofs, decomposition, facets)
+        centres = surface.corners(facet_kind(dofs).num_vertices).mean(axis=1)
+        with raised_on_all_ranks(decomposition.comm):
+            _, towards = self._gaps(centres, dofs.bs)
+        facing = int(np.sum(np.sum(towards * surface.normal, axis=1) > 0.0))
+        if dofs.bs > 1 and decomposition.comm.allreduce(facing) == 0:
+            raise InputError(
+                f"obstacle of surface {self.surface!r}: the surface faces away from it; expected "
+                "a shape whose distance falls along the outward normal (is its normal turned?)"
+            )
 
     def _gaps(self, x: Array, gdim: int) -> tuple[Array, Array]:
         """Distances and normals at points of shape ``(n, 2)`` or ``(n, 3)``."""

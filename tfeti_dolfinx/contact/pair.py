@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +15,7 @@ from tfeti_dolfinx.contact.facets import Facets, facet_kind, local_facets, with_
 from tfeti_dolfinx.contact.mortar import Segments, find_segments, hat_areas, integrate
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.surfaces import extent, surface_facets, surface_nodes
-from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
@@ -23,11 +24,16 @@ REACH = 0.05
 # and an overlap that is too deep would not be seen.
 SEEN = 3.0
 DEGENERATE = 1e-14
+CREASE = 0.75  # facets that make more than about 40 degrees with the averaged normal
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Contact:
     """Two surfaces may not enter each other.
+
+    Surfaces should be smooth: the sides of an edge are surfaces, and pairs, of their own.
 
     Args:
         secondary: Name or tag of the surface that carries the multipliers and the pressure;
@@ -72,7 +78,7 @@ class Contact:
             )
         if self.search_radius is None:
             return REACH * min(extent(decomposition, surface) for surface in facets)
-        if not self.search_radius > 0.0:
+        if not 0.0 < self.search_radius < np.inf:
             raise InputError(
                 f"{self.name}: search_radius={self.search_radius}, expected a positive length"
             )
@@ -100,7 +106,12 @@ class Contact:
         return sum(comm.allreduce(float(size), op=MPI.MAX) for size in largest)
 
     def records(
-        self, dofs: TornDofs, decomposition: Decomposition, contact: int, radius: float
+        self,
+        dofs: TornDofs,
+        decomposition: Decomposition,
+        contact: int,
+        radius: float,
+        depth: float,
     ) -> ContactRecords:
         """One condition per secondary node that faces the primary surface. Collective.
 
@@ -113,21 +124,24 @@ class Contact:
             contact: Index of the contact.
             radius: Conditions with a larger gap are not near; those with a gap three times as
                 large are not made.
+            depth: Largest initial overlap.
 
         Raises:
-            InputError: The surfaces overlap by more than the radius, face away from each other,
-                or have facets without area.
+            InputError: The surfaces overlap by more than ``depth`` (they are looked at up to three
+                times as deep), face away from each other, or have facets without area.
         """
         kind, comm = facet_kind(dofs), decomposition.comm
         v = kind.num_vertices
         secondary, primary = self._sides(dofs, decomposition, v)
-        reach = SEEN * radius
-        near_s, near_p = rendezvous(secondary, primary, v, reach, comm)
-        pairs = candidate_pairs(near_s, near_p, v, reach)
-        degree = (1 if kind.facet != "quadrilateral" else 2) * (1 + kind.displacement.degree)
-        segments = find_segments(kind, near_s, near_p, pairs, radius, reach, degree)
-        self._check_segments(segments, radius, comm)
-        integrals = integrate(kind, near_s, near_p, segments)
+        reach = SEEN * max(radius, depth)
+        near_s, near_p = rendezvous(secondary, primary, reach, comm)
+        with raised_on_all_ranks(comm):
+            pairs = candidate_pairs(near_s, near_p, reach)
+            segments = find_segments(
+                kind, near_s, near_p, pairs, depth=SEEN * depth, reach=SEEN * radius
+            )
+            integrals = integrate(kind, near_s, near_p, segments)
+        self._check_facing(segments, comm)
         entries = (
             triplets(
                 near_s.groups[integrals.facet, :v], near_s.groups[integrals.facet], integrals.own
@@ -149,6 +163,7 @@ class Contact:
             areas=hat_areas(kind, secondary),
             normals=averaged_normals(dofs, secondary, v),
         )
+        self._check_depth(found, depth, comm)
         return replace(found, near=found.gap <= radius)
 
     def _sides(
@@ -163,18 +178,29 @@ class Contact:
             if count := decomposition.comm.allreduce(flat):
                 raise InputError(f"{self.name}: {count} facets of {name!r} have no area")
             sides.append(facets)
-        return with_averaged_normals(sides[0], dofs, num_vertices), sides[1]
-
-    def _check_segments(self, segments: Segments, radius: float, comm: MPI.Intracomm) -> None:
-        deepest = comm.allreduce(segments.deepest, op=MPI.MAX)
-        if deepest > radius:
-            raise InputError(
-                f"{self.name}: the surfaces overlap by up to {deepest:.6g}, more than the search "
-                f"radius {radius:.6g}; expected bodies that are apart, or a larger search_radius"
+        secondary = with_averaged_normals(sides[0], dofs, num_vertices)
+        cosine = np.einsum("nvg,ng->nv", secondary.vertex_normals, secondary.normal)
+        if decomposition.comm.allreduce(int(np.sum(cosine < CREASE))) and not dofs.comm.rank:
+            log.warning(
+                "%s: %r has edges; normals are averaged there. Give the sides of an edge names of "
+                "their own, and a pair each",
+                self.name,
+                self.secondary,
             )
+        return secondary, sides[1]
+
+    def _check_facing(self, segments: Segments, comm: MPI.Intracomm) -> None:
         averted = comm.allreduce(int(segments.averted))
         if averted and comm.allreduce(len(segments.weight)) == 0:
             raise InputError(
                 f"{self.name}: the surfaces are near but face away from each other; expected "
                 "outward normals that oppose each other"
+            )
+
+    def _check_depth(self, found: ContactRecords, depth: float, comm: MPI.Intracomm) -> None:
+        deepest = -comm.allreduce(float(found.gap.min(initial=0.0)), op=MPI.MIN)
+        if deepest > depth:
+            raise InputError(
+                f"{self.name}: the surfaces overlap by up to {deepest:.6g}, more than the search "
+                f"radius {depth:.6g}; expected bodies that are apart, or a larger search_radius"
             )

@@ -19,7 +19,8 @@ class ContactRecords:
         group: Owned group of the contact node, shape ``(n,)``.
         normal: Direction in which the node may not go further, unit length, shape ``(n, gdim)``.
         gap: Distance g_i, a length, shape ``(n,)``.
-        area: Integral ∫φ_i of the node's hat over the contact surface, shape ``(n,)``.
+        area: Integral ∫φ_i of the node's hat over the contact surface, of a pair over what the
+            other side covers of it, shape ``(n,)``.
         near: Whether a row is made at once; a far condition gets one only if the solution
             violates it, shape ``(n,)``.
         row: Condition of each coefficient, shape ``(k,)``.

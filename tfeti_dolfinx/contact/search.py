@@ -11,10 +11,12 @@ import numpy as np
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.contact.records import ContactRecords, concatenate, remaining_gaps
 from tfeti_dolfinx.contact.surfaces import diameter
+from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
-WIDER = 4.0
+# how much farther one looks for what may hold a body; of the scene's length at least
+WIDER, LEAST = 4.0, 0.01
 
 
 class ContactPartner(Protocol):
@@ -34,10 +36,29 @@ class ContactPartner(Protocol):
         ...
 
     def records(
-        self, dofs: TornDofs, decomposition: Decomposition, contact: int, radius: float
+        self,
+        dofs: TornDofs,
+        decomposition: Decomposition,
+        contact: int,
+        radius: float,
+        depth: float,
     ) -> ContactRecords:
-        """Conditions up to a distance."""
+        """Conditions up to a distance, and down to a depth of initial overlap."""
         ...
+
+
+def checked_contacts(contacts: Sequence[ContactPartner]) -> list[ContactPartner]:
+    """The contacts as a list.
+
+    Raises:
+        InputError: They are not a sequence of obstacles and pairs.
+    """
+    if not isinstance(contacts, Sequence):
+        raise InputError(f"contacts: expected a list, got {contacts!r}")
+    for contact in contacts:
+        if not all(hasattr(contact, name) for name in ("records", "surfaces", "first_radius")):
+            raise InputError(f"contacts: expected obstacles and pairs, got {contact!r}")
+    return list(contacts)
 
 
 class ContactSearch:
@@ -51,6 +72,9 @@ class ContactSearch:
     Attributes:
         length: Length of the scene.
         records: All conditions of this rank; those that are ``near`` have rows.
+
+    Raises:
+        InputError: A pair is there twice, or a contact raises it.
     """
 
     def __init__(
@@ -58,7 +82,9 @@ class ContactSearch:
     ) -> None:
         self._contacts, self._dofs, self._decomposition = contacts, dofs, decomposition
         self.length = diameter(decomposition)
-        self._radii = [contact.first_radius(decomposition) for contact in contacts]
+        self._depths = [contact.first_radius(decomposition) for contact in contacts]
+        self._radii = list(self._depths)
+        self._check_pairs()
         self._parts = [self._search(i, radius) for i, radius in enumerate(self._radii)]
 
     @property
@@ -87,13 +113,20 @@ class ContactSearch:
             found = known
             if moved > self._radii[i]:
                 found = self._with_rows_of(self._search(i, moved), known)
-            overlaps = remaining_gaps(found, self._dofs, u) < -tolerance
-            new = self._count(overlaps & ~found.near)
+            overlaps, new = self._overlapping(found, u, tolerance)
+            if new == 0 and found is not known:
+                found = known
+                overlaps, new = self._overlapping(found, u, tolerance)
             if new:
                 self._parts[i] = replace(found, near=found.near | overlaps)
                 self._radii[i] = max(self._radii[i], moved)
                 late += new
         return late
+
+    def _overlapping(self, found: ContactRecords, u: Array, tolerance: float) -> tuple[Array, int]:
+        """Conditions that a displacement violates, and how many of them have no row."""
+        overlaps = remaining_gaps(found, self._dofs, u) < -tolerance
+        return overlaps, self._count(overlaps & ~found.near)
 
     def widen(self) -> int:
         """Give rows to all conditions, and search farther: what is far may hold a body yet.
@@ -105,7 +138,7 @@ class ContactSearch:
         for i, radius in enumerate(self._radii):
             known = self._parts[i]
             if radius < self.length:
-                self._radii[i] = min(WIDER * radius, self.length)
+                self._radii[i] = min(max(WIDER * radius, LEAST * self.length), self.length)
                 known = self._search(i, self._radii[i])
             late += self._count(~known.near) + self._count(known.near)
             late -= self._count(self._parts[i].near)
@@ -118,9 +151,18 @@ class ContactSearch:
         far = any(radius < self.length for radius in self._radii)
         return not far and sum(self._count(~part.near) for part in self._parts) == 0
 
+    def _check_pairs(self) -> None:
+        """Raise if a pair is there twice: its force would be shared between the two."""
+        pairs = set()
+        for contact in self._contacts:
+            tags = frozenset(self._decomposition.surface(name) for name in contact.surfaces)
+            if len(tags) == 2 and tags in pairs:
+                raise InputError(f"contacts: the pair of {contact.surfaces} is there twice")
+            pairs.add(tags)
+
     def _search(self, index: int, radius: float) -> ContactRecords:
         contact = self._contacts[index]
-        return contact.records(self._dofs, self._decomposition, index, radius)
+        return contact.records(self._dofs, self._decomposition, index, radius, self._depths[index])
 
     def _with_rows_of(self, found: ContactRecords, known: ContactRecords) -> ContactRecords:
         """Conditions of a wider search, near where they had rows before."""

@@ -14,6 +14,8 @@ from tfeti_dolfinx.errors import NoSolutionError
 
 BALANCE = 1e-9
 TINY = 1e-14
+# of the largest coefficient: what takes part in a motion, what it is named after; bodies named
+PART, DOMINANT, NAMED = 1e-3, 0.3, 4
 
 
 def check_solvable(
@@ -41,21 +43,28 @@ def check_solvable(
     if np.linalg.norm(push) > BALANCE * load_norm:
         motion = coarse.free_motions @ (coarse.free_motions.T @ (coarse.body_modes.T @ coarse.e))
         raise NoSolutionError(
-            f"{_name(motion, body_names, mode_names)}: nothing holds it and the load pushes it; "
-            "hold it by a Dirichlet condition, a contact or a spring, or balance its load"
+            f"{_name(motion, body_names, mode_names)}: nothing resists that and the load drives "
+            "it; add a Dirichlet condition, a contact or a spring, or balance the load"
         )
     motion = escape(coarse, bounded)
     if motion is not None:
         raise NoSolutionError(
-            f"{_name(motion, body_names, mode_names)}: only contact could hold it, and the load "
-            "moves it out of contact"
+            f"{_name(motion, body_names, mode_names)}: only contact could resist that, and the "
+            "load drives out of contact"
         )
 
 
 def _name(motion: Array, body_names: Sequence[str], mode_names: Sequence[str]) -> str:
-    """Body and mode that dominate a motion."""
-    body, mode = divmod(int(np.argmax(np.abs(motion))), len(mode_names))
-    return f"{body_names[body]} is free to move ({mode_names[mode]})"
+    """The bodies that take part in a motion, and what it is mostly."""
+    parts = np.abs(motion.reshape(len(body_names), len(mode_names)))
+    moving = np.flatnonzero(parts.max(axis=1) > PART * parts.max())
+    share = parts[moving].max(axis=0)
+    modes = " and ".join(mode_names[m] for m in np.flatnonzero(share > DOMINANT * share.max()))
+    if len(moving) == 1:
+        return f"{body_names[moving[0]]} is free to move ({modes})"
+    names = ", ".join(body_names[b] for b in moving[:NAMED])
+    more = f" and {len(moving) - NAMED} more" if len(moving) > NAMED else ""
+    return f"{names}{more} are free to move together ({modes})"
 
 
 def escape(coarse: CoarseSpace, bounded: slice) -> Array | None:

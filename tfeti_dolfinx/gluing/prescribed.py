@@ -9,7 +9,7 @@ import numpy as np
 from dolfinx import fem
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.compat import prescribed_values
+from tfeti_dolfinx.compat import is_on_mesh, prescribed_values
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
@@ -33,8 +33,10 @@ def prescribe(dofs: TornDofs, bcs: Sequence[fem.DirichletBC]) -> Prescribed:
     """Collect Dirichlet values and spread them to all copies of their nodes. Collective.
 
     Raises:
-        InputError: Conditions contradict each other at a node, or a value is not finite.
+        InputError: A condition is on another mesh, conditions contradict each other at a node, or
+            a value is not finite.
     """
+    _check_mesh(dofs, bcs)
     size = dofs.V.dofmap.index_map.size_local * dofs.bs
     values = prescribed_values(bcs, size)
     low = np.fmin.reduce(values, axis=0, initial=np.inf)
@@ -46,6 +48,15 @@ def prescribe(dofs: TornDofs, bcs: Sequence[fem.DirichletBC]) -> Prescribed:
         _check_finite(bcs)
         _check_agreement(low, high, flag)
     return Prescribed(flag=flag, value=np.where(flag, low, 0.0))
+
+
+def _check_mesh(dofs: TornDofs, bcs: Sequence[fem.DirichletBC]) -> None:
+    for number, bc in enumerate(bcs):
+        if not is_on_mesh(bc, dofs.V.mesh):
+            raise InputError(
+                f"Dirichlet condition {number} is on another mesh; expected a space on "
+                "decomposition.mesh, the torn mesh"
+            )
 
 
 def _check_finite(bcs: Sequence[fem.DirichletBC]) -> None:

@@ -9,6 +9,8 @@ from petsc4py import PETSc
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.problem import QP, project
 
+ROUNDING = 1e-14
+
 
 @dataclass(frozen=True)
 class Homogenised:
@@ -19,12 +21,18 @@ class Homogenised:
         b: P(d − F λ̄).
         feasible: Ω − λ̄.
         reference: b₀ = ‖P(d − F λ̄₀)‖ with λ̄₀ = Gᵀ(GGᵀ)⁻¹e, whatever λ̄ is.
+        noise: What rounding leaves of b₀ where it should be 0.
     """
 
     lam_bar: PETSc.Vec
     b: PETSc.Vec
     feasible: FeasibleSet
     reference: float
+    noise: float
+
+    def tolerance(self, rtol: float, atol: float) -> float:
+        """Norm at which a residual is small enough: rtol·b₀, atol, or that of rounding."""
+        return max(rtol * self.reference, atol, self.noise)
 
     def destroy(self) -> None:
         """Destroy the vectors. Collective."""
@@ -41,23 +49,23 @@ def homogenise(qp: QP, lam_bar: PETSc.Vec | None = None) -> Homogenised:
     """
     natural = qp.d.duplicate()
     qp.coarse.particular(natural)
-    b = _right_side(qp, natural)
-    reference = b.norm()
+    b, size = _right_side(qp, natural)
+    reference, noise = b.norm(), ROUNDING * size
     if lam_bar is None:
-        return Homogenised(natural, b, qp.feasible.shifted(natural), reference)
+        return Homogenised(natural, b, qp.feasible.shifted(natural), reference, noise)
     natural.destroy()
     b.destroy()
-    return Homogenised(
-        lam_bar.copy(), _right_side(qp, lam_bar), qp.feasible.shifted(lam_bar), reference
-    )
+    b, _ = _right_side(qp, lam_bar)
+    return Homogenised(lam_bar.copy(), b, qp.feasible.shifted(lam_bar), reference, noise)
 
 
-def _right_side(qp: QP, lam_bar: PETSc.Vec) -> PETSc.Vec:
-    """P(d − F λ̄)."""
-    b, work = qp.d.copy(), qp.d.duplicate()
+def _right_side(qp: QP, lam_bar: PETSc.Vec) -> tuple[PETSc.Vec, float]:
+    """P(d − F λ̄), and the size of what it is the difference of."""
+    b, work, size = qp.d.copy(), qp.d.duplicate(), qp.d.norm()
     if lam_bar.norm() > 0.0:
         qp.F.mult(lam_bar, work)
+        size += work.norm()
         b.axpy(-1.0, work)
     project(qp.coarse, b, work)
     work.destroy()
-    return b
+    return b, size

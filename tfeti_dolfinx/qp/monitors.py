@@ -50,12 +50,17 @@ class PrintMonitor:
     def __call__(
         self, steps: Steps, step: str, x: PETSc.Vec, projected_gradient: float, equality: float
     ) -> None:
-        """Print outer iteration, step, ‖g^P‖, ‖Gλ − e‖, touching rows, multiplications."""
+        """Print outer iteration, step, ‖g^P‖, ‖Qx‖ if known, touching rows, multiplications."""
         touching = self.touching(x)
         if x.getComm().getRank() == 0:
             print(
                 f"{steps.outer:4d} {step:<13s} |gP| {projected_gradient:.4e}  "
-                f"|Gλ-e| {equality:.4e}  touching {touching:6d}  "
+                f"|Qx| {_known(equality)}  touching {touching:6d}  "
                 f"multiplications {self.multiplications():5d}",
                 flush=True,
             )
+
+
+def _known(value: float) -> str:
+    """A norm, blank where it was not computed."""
+    return f"{value:.4e}" if value >= 0.0 else " " * 10

@@ -34,7 +34,7 @@ def pcpg(
     Returns:
         The multipliers, the gradient Fλ − d up to the range of Gᵀ, the reason, the residuals.
     """
-    tol = max(rtol * homogenised.reference, atol)
+    tol = homogenised.tolerance(rtol, atol)
     x, r = homogenised.b.duplicate(), homogenised.b.copy()
     p, Fp, z, work = (r.duplicate() for _ in range(4))
     steps, rz, norm = Steps(), 1.0, r.norm()
@@ -72,6 +72,7 @@ def pcpg(
         projected_gradient=norm,
         equality=qp.coarse.norm_Q(x),
         reference=homogenised.reference,
+        tolerance=tol,
         norm=0.0,
         steps=steps,
     )

@@ -132,6 +132,7 @@ class QPResult:
         projected_gradient: ‖g^P‖ at the end.
         equality: ‖Q x‖ at the end, x the homogenised unknown.
         reference: b₀ = ‖P(d − F λ̄₀)‖ that both are compared with.
+        tolerance: What both had to come down to.
         norm: Estimate of ‖F‖ that ‖Q x‖ is weighted with.
         steps: Steps taken.
     """
@@ -143,6 +144,7 @@ class QPResult:
     projected_gradient: float
     equality: float
     reference: float
+    tolerance: float
     norm: float
     steps: Steps = field(default_factory=Steps)
 

@@ -100,7 +100,7 @@ def smalse(
         The multipliers, their gradient, the reason and the residuals.
     """
     b, feasible, coarse = homogenised.b, homogenised.feasible, qp.coarse
-    tol = max(rtol * homogenised.reference, atol)
+    tol = homogenised.tolerance(rtol, atol)
     rho, M, eta = parameters.rho * norm, parameters.M * norm, parameters.eta * b.norm()
     A = PenalisedOperator(qp.F, coarse, rho, b)
     x, y, Qx = _start(start, homogenised), b.duplicate(), b.duplicate()
@@ -151,6 +151,7 @@ def smalse(
         projected_gradient=state.projected_gradient,
         equality=Qx.norm(),
         reference=homogenised.reference,
+        tolerance=tol,
         norm=norm,
         steps=steps,
     )

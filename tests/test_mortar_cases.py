@@ -1,0 +1,270 @@
+"""Mortar conditions in awkward scenes: layers, thin bodies, coarse and curved facets, bad input."""
+
+import sys
+from itertools import pairwise
+
+import gmsh
+import numpy as np
+import pytest
+import ufl
+from bodies import boxes, held, pressed, stacked, two_body_problem
+from dolfinx import fem
+from dolfinx import mesh as dmesh
+from mpi4py import MPI
+from scenes import box, clamp, decomposed, problem
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.contact.search import ContactSearch
+from tfeti_dolfinx.mesh.dofs import TornDofs
+
+PAIR = tfeti.Contact("upper bottom", "lower top")
+
+
+def gathered(values):
+    return np.concatenate(MPI.COMM_WORLD.allgather(values))
+
+
+def decomposed_boxes(parts, subdomains=4, groups=(), cell="quadrilateral"):
+    """Boxes; ``groups`` are names of surfaces made of several sides."""
+    mesh, tags, names = boxes(cell, parts)
+    surfaces = dict(names)
+    values = tags.values.copy()
+    for name, sides in groups:
+        tag = surfaces[name] = len(surfaces) + 1
+        values[np.isin(values, [names[side] for side in sides])] = tag
+    tags = dmesh.meshtags(mesh, tags.dim, tags.indices, values)
+    return tfeti.decompose(mesh, subdomains, facet_tags=tags, surfaces=surfaces)
+
+
+def flat(name, low, high, n, width=1.0):
+    return (name, (0.0, low), (width, high), (n, 2))
+
+
+@pytest.mark.parametrize("apart", [0.1, 0.5])
+@pytest.mark.parametrize("radius", [None, 1.0])
+def test_only_the_first_of_two_layers_is_met(apart, radius):
+    """The primary surface has the lower box's top and, below it, another one's."""
+    parts = [
+        flat("base", -apart - 0.7, -apart - 0.2, 3),
+        flat("lower", -apart, 0.0, 3),
+        flat("upper", 0.0, 1.0, 4),
+    ]
+    d = decomposed_boxes(parts, 6, [("tops", ["base top", "lower top"])])
+    sides = ["base bottom", "base left", "lower left", "lower bottom", "upper left"]
+    contact = tfeti.Contact("upper bottom", "tops", radius)
+    p = two_body_problem(d, pressed(d), held(d, *sides), [contact], rtol=1e-12)
+    p.solve()
+    assert np.allclose(gathered(p.solution.contact().pressure), 0.1, rtol=0, atol=1e-9)
+    assert np.isclose(gathered(p.solution.contact().area).sum(), 1.0)
+
+
+@pytest.mark.parametrize("thickness", [0.2, 0.06, 0.02])
+@pytest.mark.parametrize("radius", [None, 1e-3, 1.0])
+def test_thin_plates_are_not_met_from_behind(thickness, radius):
+    """Both faces of both plates are in the surfaces: the outer ones face through the plates."""
+    parts = [flat("lower", -thickness, 0.0, 6), flat("upper", 0.0, thickness, 8)]
+    groups = [
+        ("lower faces", ["lower bottom", "lower top"]),
+        ("upper faces", ["upper bottom", "upper top"]),
+    ]
+    d = decomposed_boxes(parts, 4, groups)
+    dofs = TornDofs(fem.functionspace(d.mesh, ("Lagrange", 1, (2,))), d)
+    search = ContactSearch([tfeti.Contact("upper faces", "lower faces", radius)], dofs, d)
+    records = search.records
+    assert MPI.COMM_WORLD.allreduce(len(records)) == 9
+    assert np.allclose(records.gap, 0.0, atol=1e-14)
+    assert np.isclose(MPI.COMM_WORLD.allreduce(records.area.sum()), 1.0)
+
+
+def disc_on_block(comm, cells, order, pushed=0.02):
+    """A disc of radius 1 that touches a block with a vertex, moved down by its centre's top."""
+    if comm.rank == 0:
+        if not gmsh.isInitialized():
+            gmsh.initialize(interruptible=False)
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.model.add("disc on block")
+        geo = gmsh.model.geo
+        centre = geo.addPoint(0, 1, 0)
+        ends = [geo.addPoint(*x, 0) for x in ((-1, 1), (0, 0), (1, 1))]
+        arcs = [geo.addCircleArc(a, centre, b) for a, b in pairwise(ends)]
+        top = [geo.addLine(ends[2], centre), geo.addLine(centre, ends[0])]
+        disc = geo.addPlaneSurface([geo.addCurveLoop([*arcs, *top])])
+        corners = [geo.addPoint(*x, 0) for x in ((-1, -1), (1, -1), (1, 0), (-1, 0))]
+        lines = [geo.addLine(corners[i], corners[(i + 1) % 4]) for i in range(4)]
+        block = geo.addPlaneSurface([geo.addCurveLoop(lines)])
+        for arc in arcs:
+            geo.mesh.setTransfiniteCurve(arc, cells // 4 + 1)
+        for line in (*top, *lines):
+            geo.mesh.setTransfiniteCurve(line, cells // 4 + 2)
+        geo.synchronize()
+        gmsh.model.addPhysicalGroup(2, [disc], name="disc")
+        gmsh.model.addPhysicalGroup(2, [block], name="block")
+        gmsh.model.addPhysicalGroup(1, arcs, name="arc")
+        gmsh.model.addPhysicalGroup(1, top, name="flat")
+        gmsh.model.addPhysicalGroup(1, [lines[2]], name="top")
+        gmsh.model.addPhysicalGroup(1, [lines[0]], name="bottom")
+        gmsh.option.setNumber("Mesh.MeshSizeMax", 8.0 / cells)
+        gmsh.option.setNumber("Mesh.ElementOrder", order)
+        gmsh.model.mesh.generate(2)
+    d = tfeti.read_gmsh(gmsh.model if comm.rank == 0 else None, comm, 4)
+    if comm.rank == 0:
+        gmsh.option.setNumber("Mesh.ElementOrder", 1)
+
+    def bcs(V):
+        flat_dofs = fem.locate_dofs_topological(V, 1, d.facets("flat"))
+        bottom = fem.locate_dofs_topological(V, 1, d.facets("bottom"))
+        down = fem.dirichletbc(np.array([0.0, -pushed]), flat_dofs, V)
+        return [down, fem.dirichletbc(np.zeros(2), bottom, V)]
+
+    return d, bcs
+
+
+def no_load(v, ds):
+    mesh = ufl.domain.extract_unique_domain(v)
+    return ufl.dot(fem.Constant(mesh, (0.0, 0.0)), v) * ufl.dx(domain=mesh)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("sides", [("arc", "top"), ("top", "arc")])
+def test_the_search_radius_does_not_change_the_answer(comm, order, sides):
+    """Facets as large as the contact zone, and a load by displacement alone."""
+    forces = []
+    for radius in (None, 0.1, 0.01, 1e-3):
+        d, bcs = disc_on_block(comm, 24, order)
+        contact = tfeti.Contact(*sides, radius)
+        p = two_body_problem(d, no_load, bcs, [contact], rtol=1e-10)
+        p.solve()
+        assert p.report.residuals["penetration"] <= p.report.residuals["tolerance"]
+        forces.append(np.abs(p.solution.body_forces.force[:, 1]).max())
+    assert min(forces) > 1e-3
+    assert np.allclose(forces, forces[0], rtol=1e-6)
+
+
+def test_facets_of_second_order_touch_without_overlap(comm):
+    """The chord and the arc touch the block at the same vertex: no initial overlap, same force."""
+    forces = []
+    for order in (1, 2):
+        d, bcs = disc_on_block(comm, 24, order)
+        p = two_body_problem(d, no_load, bcs, [tfeti.Contact("arc", "top")], rtol=1e-10)
+        p.solve()
+        dofs = p.dofs
+        records = ContactSearch(p.contacts, dofs, d).records
+        assert records.gap.min(initial=0.0) > -1e-12
+        forces.append(np.abs(p.solution.body_forces.force[:, 1]).max())
+    assert np.isclose(*forces, rtol=0.02)
+
+
+@pytest.mark.parametrize("contacts", [[], [PAIR]])
+def test_a_rigid_motion_is_found(contacts):
+    """Prescribed values that move bodies as they are: b₀ is what rounding leaves."""
+    d = stacked("quadrilateral", 3, 4, 4, gap=0.1)
+
+    def bcs(V):
+        top = fem.locate_dofs_topological(V, 1, d.facets("upper top"))
+        bottom = fem.locate_dofs_topological(V, 1, d.facets("lower bottom"))
+        down = fem.dirichletbc(np.array([0.0, -0.15 if contacts else -0.05]), top, V)
+        return [down, fem.dirichletbc(np.zeros(2), bottom, V)]
+
+    p = two_body_problem(d, no_load, bcs, contacts)
+    p.solve()
+    assert p.report.converged_reason.startswith("CONVERGED")
+    if contacts:
+        assert p.report.late_contact_rows == p.report.contact_rows == 5
+        assert np.all(gathered(p.solution.contact().force) > 0.0)
+    else:
+        assert p.report.residuals["gluing_jump"] < 1e-12
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_patch_of_quadrilaterals_that_are_no_parallelograms(degree):
+    d = stacked("hexahedron", 3, 4, 4)
+    x = d.mesh.geometry.x
+    inside = np.all((x[:, :2] > 1e-9) & (x[:, :2] < 1 - 1e-9), axis=1)
+    wave = 0.06 * np.sin(7 * x[:, 0] + 5 * x[:, 1] + (x[:, 2] > -1e-9))
+    x[inside, 0] += wave[inside]
+    x[inside, 1] -= 0.7 * wave[inside]
+    sides = ["lower bottom", "lower left", "upper left", "lower front", "upper front"]
+    p = two_body_problem(d, pressed(d), held(d, *sides), [PAIR], degree, rtol=1e-12)
+    p.solve()
+    assert np.allclose(gathered(p.solution.contact().pressure), 0.1, rtol=0, atol=1e-8)
+
+
+def test_pressure_at_a_node_of_two_pairs():
+    parts = [
+        ("one", (0.0, -1.0), (1.0, 0.0), (3, 3)),
+        ("two", (1.0, -1.0), (2.0, 0.0), (3, 3)),
+        ("upper", (0.0, 0.0), (2.0, 1.0), (5, 3)),
+    ]
+    d = decomposed_boxes(parts, 6)
+    sides = ["one bottom", "one left", "two bottom", "two right", "upper left"]
+    pairs = [tfeti.Contact("upper bottom", f"{name} top") for name in ("one", "two")]
+    p = two_body_problem(d, pressed(d), held(d, *sides), pairs, rtol=1e-12)
+    p.solve()
+    _, dof = p.dofs.scalar
+    values = p.solution.pressure.x.array[dof]
+    assert np.allclose(values[values > 0], 0.1, rtol=0, atol=1e-9)
+
+
+def test_edges_are_warned_of(caplog):
+    parts = [("lower", (0.0, -1.0), (1.0, 0.0), (3, 3)), ("upper", (0.0, 0.0), (1.0, 1.0), (4, 4))]
+    d = decomposed_boxes(parts, 4, [("corner", ["upper bottom", "upper right"])])
+    bcs = held(d, "lower bottom", "lower left", "upper left")
+    p = two_body_problem(d, pressed(d), bcs, [tfeti.Contact("corner", "lower top")])
+    p.solve()
+    assert ("'corner' has edges" in caplog.text) == (d.comm.rank == 0)
+
+
+def test_a_pair_without_conditions_has_empty_data():
+    d = stacked("quadrilateral", 3, 4, 4, gap=0.5)
+    bcs = held(d, "lower bottom", "lower left", "upper top", "upper left")
+    p = two_body_problem(d, pressed(d), bcs, [PAIR])
+    p.solve()
+    assert len(p.solution.contact(0).force) == 0
+    with pytest.raises(tfeti.InputError, match="contact 1: there are 1, counted from 0"):
+        p.solution.contact(1)
+
+
+def test_contacts_that_are_none():
+    d = stacked("quadrilateral", 3, 4, 4)
+    with pytest.raises(tfeti.InputError, match="contacts: expected a list, got Contact"):
+        tfeti.ContactProblem(*forms_of(d), PAIR, d)
+    with pytest.raises(tfeti.InputError, match="expected obstacles and pairs, got 'lower top'"):
+        tfeti.ContactProblem(*forms_of(d), ["lower top"], d)
+    twice = tfeti.ContactProblem(
+        *forms_of(d), [PAIR, tfeti.Contact("lower top", "upper bottom")], d
+    )
+    with pytest.raises(tfeti.InputError, match="the pair of .* is there twice"):
+        twice.solve()
+
+
+def forms_of(d):
+    p = two_body_problem(d, pressed(d), held(d, "lower bottom"), [])
+    V = p.u.function_space
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    zero = fem.Constant(d.mesh, (0.0, 0.0))
+    return ufl.inner(ufl.sym(ufl.grad(u)), ufl.grad(v)) * ufl.dx, ufl.dot(zero, v) * ufl.dx, []
+
+
+def test_conditions_on_the_untorn_mesh_are_refused():
+    mesh, tags, names = box("quadrilateral", 4)
+    d = tfeti.decompose(mesh, 4, facet_tags=tags, surfaces=names)
+    p = problem(d, clamped=())
+    V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
+    p.bcs.append(clamp(V, tags.find(names["left"])))
+    with pytest.raises(tfeti.InputError, match="Dirichlet condition 0 is on another mesh"):
+        p.solve()
+
+
+def test_an_obstacle_with_its_normal_turned():
+    d = decomposed("quadrilateral", 4)
+    plane = tfeti.Plane((0, -0.01), (0, -1))
+    with pytest.raises(tfeti.InputError, match="'bottom': the surface faces away from it"):
+        problem(d, contacts=[tfeti.Obstacle("bottom", plane)]).solve()
+
+
+def test_options_that_did_not_reach_petsc(monkeypatch):
+    monkeypatch.setattr(sys, "argv", ["program", "-tfeti_max_it", "3"])
+    d = decomposed("quadrilateral", 2, 2)
+    with pytest.raises(tfeti.InputError, match="-tfeti_max_it on the command line did not reach"):
+        problem(d)
+    problem(d, tfeti_max_it=3)  # the program has read it itself
