@@ -115,7 +115,7 @@ def run(argv):
     #
     # A ball's whole sphere faces both grooves; only what is near gets conditions.
     contacts = [
-        tfeti.Contact(f"ball {i + 1}", groove, search_radius=0.02 * bearing.ball)
+        tfeti.Contact(f"ball {i + 1}", groove, search_radius=0.006 * bearing.ball)
         for i in range(bearing.balls)
         for groove in ("inner groove", "outer groove")
     ]

@@ -64,7 +64,8 @@ def run(argv):
     # ## Load, conditions, contact
     #
     # A uniform pressure on the ball's flat top carries a quarter of the force F that belongs to
-    # the radius a. The cuts are planes of symmetry; contact alone holds the ball in z.
+    # the radius a. The cuts are planes of symmetry; contact alone holds the ball in z. The block,
+    # whose mesh is the coarser one, carries the multipliers.
     hertz = PointContact.from_half_width(a, R, E / (1 - nu**2) / 2)
     load = ds(decomposition.surface("load"))
     area = comm.allreduce(fem.assemble_scalar(fem.form(fem.Constant(mesh, 1.0) * load)))
@@ -74,7 +75,7 @@ def run(argv):
     for axis, cut in enumerate(("x=0", "y=0")):
         dofs = fem.locate_dofs_topological(V.sub(axis), 2, decomposition.facets(cut))
         bcs.append(fem.dirichletbc(0.0, dofs, V.sub(axis)))
-    sides = ("top", "cap") if arguments.exchange else ("cap", "top")
+    sides = ("cap", "top") if arguments.exchange else ("top", "cap")
     contacts = [tfeti.Contact(*sides, search_radius=a**2 / R)]
     problem = tfeti.ContactProblem(
         ufl.inner(stress(u), strain(v)) * dx,
@@ -130,7 +131,7 @@ def main(argv):
 def configure(parser):
     parser.add_argument("--unknowns", type=int, help="about so many unknowns")
     parser.add_argument("--subdomains", type=int, help="METIS parts")
-    parser.add_argument("--exchange", action="store_true", help="multipliers on the block")
+    parser.add_argument("--exchange", action="store_true", help="multipliers on the ball")
 
 
 if __name__ == "__main__":

@@ -15,16 +15,16 @@ from typing import Any
 
 import numpy as np
 
-# readable on any background, beside the scene
+# in a field of its own, right of the scene
 SCALAR_BAR = {
     "vertical": True,
-    "position_x": 0.88,
+    "position_x": 0.1,
     "position_y": 0.2,
     "height": 0.6,
-    "width": 0.1,
+    "width": 0.5,
     "color": "black",
-    "background_color": "white",
-    "fill": True,
+    "title_font_size": 18,
+    "label_font_size": 16,
 }
 
 
@@ -71,15 +71,22 @@ def draw(data: Mapping[str, Any], target: str) -> None:
     if np.all(np.isfinite(normal)):
         grid = grid.clip(normal=normal, origin=point, crinkle=True)
     flat = bool(np.ptp(grid.points[:, 2]) == 0.0)
-    plotter = pyvista.Plotter(off_screen=True, window_size=[1200, 900])
-    plotter.add_mesh(
+    plotter = pyvista.Plotter(
+        off_screen=True,
+        window_size=[1200, 900],
+        shape=(1, 2),
+        col_weights=[0.86, 0.14],
+        border=False,
+    )
+    plotter.subplot(0, 0)
+    actor = plotter.add_mesh(
         grid.warp_by_vector("u", factor=factor),
         scalars=name,
         show_edges=bool(data["edges"]),
         cmap="viridis",
         clim=None if np.isnan(data["highest"]) else [0.0, float(data["highest"])],
         lighting=not flat,
-        scalar_bar_args=SCALAR_BAR,
+        show_scalar_bar=False,
     )
     plotter.add_text(f"displacement x {factor:.3g}", font_size=10)
     if flat:
@@ -92,6 +99,8 @@ def draw(data: Mapping[str, Any], target: str) -> None:
             x, y, _ = data["focus"]
             plotter.camera.position = (x, y, plotter.camera.position[2])
     plotter.camera.zoom(float(data["zoom"]))
+    plotter.subplot(0, 1)
+    plotter.add_scalar_bar(title=name, mapper=actor.mapper, **SCALAR_BAR)
     plotter.screenshot(target)
 
 

@@ -111,8 +111,7 @@ def find_segments(
         reach: Nor do facets farther apart than this.
     """
     planes = _Planes(kind, secondary, primary)
-    s, p = planes.with_meeting_boxes(*pairs)
-    corners = planes.primary_corners(s, p)
+    s, p, corners = planes.with_meeting_boxes(*pairs)
     order = POLYGON[kind.facet]
     parts = common_parts(corners[:, order], planes.corners[s][:, order])
     met = np.flatnonzero(parts.count > 0)
@@ -249,13 +248,13 @@ class _Planes:
         """Vertices of primary facets p on planes s, shape ``(n, v, tdim)``."""
         return self._on_planes(self._primary.corners(self._kind.num_vertices)[p], s)
 
-    def with_meeting_boxes(self, s: Array, p: Array) -> tuple[Array, Array]:
-        """Pairs whose boxes on the plane meet."""
+    def with_meeting_boxes(self, s: Array, p: Array) -> tuple[Array, Array, Array]:
+        """Pairs whose boxes on the plane meet, with the primary facets' vertices there."""
         corners = self.primary_corners(s, p)
         low, high = self.corners.min(axis=1)[s], self.corners.max(axis=1)[s]
         met = (corners.min(axis=1) <= high) & (corners.max(axis=1) >= low)
         met_all = np.all(met, axis=1)
-        return s[met_all], p[met_all]
+        return s[met_all], p[met_all], corners[met_all]
 
     def distance(self, s: Array, p: Array, y: Array) -> Array:
         """Distance of facets along the normal, at points y of the planes s."""

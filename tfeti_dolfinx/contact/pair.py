@@ -37,7 +37,7 @@ class Contact:
 
     Args:
         secondary: Name or tag of the surface that carries the multipliers and the pressure;
-            better that of the softer body.
+            better that of the softer body, or of the coarser mesh.
         primary: Name or tag of the other surface.
         search_radius: Surfaces farther apart than this make no rows at first; after the solve it
             is checked that none of them has come to overlap. Default: 5 % of the smaller
