@@ -9,8 +9,8 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 from tfeti_dolfinx.contact.clipping import (
     clip_intervals,
     clip_polygons,
+    contains,
     quadrature_on_intervals,
-    quadrature_on_polygons,
 )
 
 
@@ -48,31 +48,32 @@ def exact_area(p, q):
 def test_areas_of_common_parts(k, m, seed):
     rng = np.random.default_rng(seed)
     p, q = random_convex(rng, k, 4), random_convex(rng, m, 4)
-    polygon, count = clip_polygons(p, q)
-    owner, _, weight = quadrature_on_polygons(polygon, count, 1)
+    parts = clip_polygons(p, q)
+    owner, _, weight = parts.quadrature(1)
     area = np.bincount(owner, weight, minlength=4)
+    assert np.allclose(parts.size, area, atol=1e-12)
     assert np.allclose(area, [exact_area(a, b) for a, b in zip(p, q, strict=True)], atol=1e-9)
-    back, back_count = clip_polygons(q, p)
-    owner, _, weight = quadrature_on_polygons(back, back_count, 1)
+    owner, _, weight = clip_polygons(q, p).quadrature(1)
     assert np.allclose(np.bincount(owner, weight, minlength=4), area, atol=1e-12)
 
 
 def test_a_polygon_in_itself_and_apart():
     square = np.array([[[0, 0], [1, 0], [1, 1], [0, 1]]], dtype=float)
-    polygon, count = clip_polygons(square, square)
-    assert count.tolist() == [4]
-    assert np.array_equal(np.sort(polygon[0, :4], axis=0), np.sort(square[0], axis=0))
+    parts = clip_polygons(square, square)
+    assert parts.count.tolist() == [4]
+    assert np.array_equal(np.sort(parts.vertices[0, :4], axis=0), np.sort(square[0], axis=0))
     for shift in ((1, 0), (0, -1), (3, 3)):  # side by side counts as apart
-        _, count = clip_polygons(square + np.array(shift), square)
-        assert count.tolist() == [0]
+        apart = clip_polygons(square + np.array(shift), square)
+        assert apart.count.tolist() == [0]
+        assert apart.size.tolist() == [0.0]
 
 
 def test_quadrature_is_exact_on_polygons():
     rng = np.random.default_rng(0)
-    polygon, count = clip_polygons(random_convex(rng, 4, 50), random_convex(rng, 3, 50))
-    fine = quadrature_on_polygons(polygon, count, 8)
+    parts = clip_polygons(random_convex(rng, 4, 50), random_convex(rng, 3, 50))
+    fine = parts.quadrature(8)
     for degree in (1, 2, 4):
-        owner, x, w = quadrature_on_polygons(polygon, count, degree)
+        owner, x, w = parts.quadrature(degree)
         value = np.bincount(owner, w * (1 + x[:, 0]) ** degree, minlength=50)
         exact = np.bincount(fine[0], fine[2] * (1 + fine[1][:, 0]) ** degree, minlength=50)
         assert np.allclose(value, exact, atol=1e-12)
@@ -88,3 +89,15 @@ def test_intervals():
     assert np.allclose(
         np.bincount(owner, w * x[:, 0] ** 3), (ends[:2, 1] ** 4 - ends[:2, 0] ** 4) / 4
     )
+
+
+def test_what_contains_a_point():
+    square = np.array([[[0, 0], [1, 0], [1, 1], [0, 1]]], dtype=float)
+    inside, outside, edge = ([[0.3, 0.9]], [[1.2, 0.5]], [[1.0, 0.5]])
+    for polygon in (square, square[:, ::-1]):
+        assert contains(polygon, np.array(inside)).all()
+        assert not contains(polygon, np.array(outside)).any()
+        assert not contains(polygon, np.array(edge)).any()
+    interval = np.array([[[2.0], [1.0]]])
+    assert contains(interval, np.array([[1.5]])).all()
+    assert not contains(interval, np.array([[2.5]])).any()

@@ -123,7 +123,7 @@ def _march(
 def _within(tree: cKDTree, x: Array, radius: Array) -> tuple[Array, Array]:
     """Points of a tree within a radius of each x: row and point of each pair."""
     found: list[tuple[Array, Array]] = [(np.empty(0, dtype=np.int64),) * 2]
-    rows, k = np.arange(len(x)), min(16, tree.n)
+    rows, k = np.arange(len(x)), min(64, tree.n)
     while len(rows):
         distance, point = tree.query(
             x[rows], k=np.arange(1, k + 1), distance_upper_bound=np.nextafter(radius.max(), np.inf)

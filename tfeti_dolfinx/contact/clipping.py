@@ -54,8 +54,14 @@ def common_parts(subject: Array, clip: Array) -> Parts:
         ends, met = clip_intervals(subject[:, :, 0], clip[:, :, 0])
         size = np.where(met, ends[:, 1] - ends[:, 0], 0.0)
         return Parts(ends[:, :, None], np.where(met, 2, 0), size)
-    polygon, count = clip_polygons(subject, clip)
-    return Parts(polygon, count, np.abs(_signed_area(polygon, count)))
+    return clip_polygons(subject, clip)
+
+
+def sizes(polygon: Array) -> Array:
+    """Length of intervals or area of polygons with vertices in order, shape ``(n, k, tdim)``."""
+    if polygon.shape[2] == 1:
+        return np.ptp(polygon[:, :, 0], axis=1)
+    return np.abs(_signed_area(polygon, np.full(len(polygon), polygon.shape[1])))
 
 
 def contains(polygon: Array, y: Array) -> Array:
@@ -88,7 +94,7 @@ def clip_intervals(subject: Array, clip: Array) -> tuple[Array, Array]:
     return np.stack((low, high), axis=1), high - low > SLIVER * np.ptp(clip, axis=1)
 
 
-def clip_polygons(subject: Array, clip: Array) -> tuple[Array, Array]:
+def clip_polygons(subject: Array, clip: Array) -> Parts:
     """Common parts of pairs of convex polygons (Sutherland, Hodgman 1974).
 
     Args:
@@ -96,20 +102,19 @@ def clip_polygons(subject: Array, clip: Array) -> tuple[Array, Array]:
         clip: Vertices in order, shape ``(n, l, 2)``.
 
     Returns:
-        Vertices, shape ``(n, k + l, 2)``, and how many of them are used, 0 where polygons are
-        apart or meet in a sliver only.
+        Parts of up to k + l vertices; none where polygons are apart or meet in a sliver only.
     """
-    clip = _counterclockwise(clip)
+    clip, whole = _counterclockwise(clip)
     n, sides = len(subject), clip.shape[1]
     polygon = np.zeros((n, subject.shape[1] + sides, 2))
-    polygon[:, : subject.shape[1]] = _counterclockwise(subject)
+    polygon[:, : subject.shape[1]], _ = _counterclockwise(subject)
     count = np.full(n, subject.shape[1])
     for side in range(sides):
         start, end = clip[:, side], clip[:, (side + 1) % sides]
         polygon, count = _cut(polygon, count, start, end - start)
-    size = np.abs(_signed_area(clip, np.full(n, sides)))
-    count[np.abs(_signed_area(polygon, count)) <= SLIVER * size] = 0
-    return polygon, count
+    area = np.abs(_signed_area(polygon, count))
+    count[area <= SLIVER * whole] = 0
+    return Parts(polygon, count, np.where(count > 0, area, 0.0))
 
 
 def _cut(polygon: Array, count: Array, point: Array, direction: Array) -> tuple[Array, Array]:
@@ -144,9 +149,11 @@ def _signed_area(polygon: Array, count: Array) -> Array:
     return 0.5 * np.sum(np.where(k < count[:, None], cross, 0.0), axis=1)
 
 
-def _counterclockwise(polygon: Array) -> Array:
-    turned = _signed_area(polygon, np.full(len(polygon), polygon.shape[1])) < 0.0
-    return np.where(turned[:, None, None], polygon[:, ::-1], polygon)
+def _counterclockwise(polygon: Array) -> tuple[Array, Array]:
+    """The polygons, counterclockwise, and their areas."""
+    area = _signed_area(polygon, np.full(len(polygon), polygon.shape[1]))
+    turned = (area < 0.0)[:, None, None]
+    return np.where(turned, polygon[:, ::-1], polygon), np.abs(area)
 
 
 def quadrature_on_intervals(ends: Array, degree: int) -> tuple[Array, Array, Array]:

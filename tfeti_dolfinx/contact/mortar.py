@@ -9,7 +9,7 @@ import numpy as np
 
 from tfeti_dolfinx.arrays import Array, sum_rows
 from tfeti_dolfinx.contact.candidates import centre_normals
-from tfeti_dolfinx.contact.clipping import common_parts, contains
+from tfeti_dolfinx.contact.clipping import common_parts, contains, sizes
 from tfeti_dolfinx.contact.facet_element import POLYGON, reference_points
 from tfeti_dolfinx.contact.facets import FacetKind, Facets
 from tfeti_dolfinx.contact.layers import Look, nearest, reachable
@@ -237,8 +237,7 @@ class _Planes:
         self.normal = centre_normals(secondary)
         self._centre, self._tangents = corners.mean(axis=1), _tangents(self.normal)
         self.corners = self._on_planes(corners, np.arange(len(secondary)))
-        outline = self.corners[:, POLYGON[kind.facet]]
-        self.size = common_parts(outline, outline).size
+        self.size = sizes(self.corners[:, POLYGON[kind.facet]])
 
     def _on_planes(self, x: Array, s: Array) -> Array:
         """Coordinates on planes s: shape ``(n, v, gdim)`` to ``(n, v, gdim - 1)``."""

@@ -23,7 +23,7 @@ REACH = 0.05
 # One looks farther than the search radius: else facets at its edge would be covered partly,
 # and an overlap that is too deep would not be seen.
 SEEN = 3.0
-DEGENERATE = 1e-14
+DEGENERATE = 1e-12  # of the square (in 2D: of the length) of a facet's radius
 CREASE = 0.75  # facets that make more than about 40 degrees with the averaged normal
 
 log = logging.getLogger(__name__)
@@ -173,8 +173,8 @@ class Contact:
         sides = []
         for name in (self.secondary, self.primary):
             facets = local_facets(dofs, decomposition, surface_facets(decomposition, name))
-            size = extent(decomposition, decomposition.facets(name)) ** (facets.x.shape[2] - 1)
-            flat = int(np.sum(facets.area <= DEGENERATE * size))
+            whole = facets.radius ** (facets.x.shape[2] - 1)
+            flat = int(np.sum(facets.area <= DEGENERATE * whole))
             if count := decomposition.comm.allreduce(flat):
                 raise InputError(f"{self.name}: {count} facets of {name!r} have no area")
             sides.append(facets)
