@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import tfeti_dolfinx as tfeti
 from demos.demo_tools import Demo
-from demos.hertz import LineContact, fit, pressure_error
+from demos.hertz import LineContact, compare
 from meshes.cylinder_on_block import build
 
 # ## Data and closed form
@@ -109,13 +109,7 @@ def run(argv):
     # reference.
     contact = problem.solution.contact(0)
     x = contact.points[:, 0]
-    half_width, peak = fit(comm, x, contact.pressure, hertz.peak)
-    problem.report.errors.update(
-        half_width=half_width / a - 1,
-        peak_pressure=peak / hertz.peak - 1,
-        force=abs(comm.allreduce(contact.force @ contact.normal[:, 1])) / P - 1,
-        pressure_l2=pressure_error(comm, contact, x, hertz, 0.9 * a),
-    )
+    problem.report.errors.update(compare(comm, contact, x, hertz))
     if arguments.plot:
         from tfeti_dolfinx.plot import plot_deformed, plot_pressure
 

@@ -85,3 +85,15 @@ def pressure_error(comm, contact, r, hertz, radius):
     error = np.sum((contact.area * (contact.pressure - exact) ** 2)[inside])
     size = np.sum((contact.area * exact**2)[inside])
     return float(np.sqrt(comm.allreduce(error) / comm.allreduce(size)))
+
+
+def compare(comm, contact, r, hertz, part=1.0):
+    """Relative errors of half width, peak, force (of a part of the load), pressure. Collective."""
+    half_width, peak = fit(comm, r, contact.pressure, hertz.peak)
+    force = comm.allreduce(contact.force @ contact.normal)[-1]  # normals of arcs are not vertical
+    return {
+        "half_width": half_width / hertz.half_width - 1,
+        "peak_pressure": peak / hertz.peak - 1,
+        "force": abs(force) / (part * hertz.load) - 1,
+        "pressure_l2": pressure_error(comm, contact, r, hertz, 0.9 * hertz.half_width),
+    }

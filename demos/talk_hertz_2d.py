@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import tfeti_dolfinx as tfeti
 from demos.demo_tools import Demo
-from demos.hertz import LineContact, fit
+from demos.hertz import LineContact, compare
 from tfeti_dolfinx.compat import create_mesh_in_place
 
 SIDES = {"lower bottom": 1, "lower top": 2, "upper bottom": 3, "upper top": 4}
@@ -135,12 +135,7 @@ def run(argv):
 
     # ## Comparison with the closed form
     contact = problem.solution.contact(0)
-    half_width, peak = fit(comm, contact.points[:, 0], contact.pressure, hertz.peak)
-    problem.report.errors.update(
-        half_width=half_width / a - 1,
-        peak_pressure=peak / hertz.peak - 1,
-        force=comm.allreduce(-contact.force @ contact.normal[:, 1]) / hertz.load - 1,
-    )
+    problem.report.errors.update(compare(comm, contact, contact.points[:, 0], hertz))
     if arguments.plot:
         from tfeti_dolfinx.plot import plot_deformed
 

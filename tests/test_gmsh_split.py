@@ -7,6 +7,7 @@ import pytest
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
 from scenes import displacement, problem, relative
+from test_gmsh import rename_as_partition_groups
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.errors import InputError, TfetiError
@@ -178,27 +179,6 @@ def test_partition_groups_of_gmsh(comm, shared_tmp):
         rename_as_partition_groups()
         write(shared_tmp, partition=0)
     check_same(*both(shared_tmp, comm))
-
-
-def rename_as_partition_groups():
-    """One new group per partition and physical group, as ``gmsh -part_physicals`` makes them."""
-    model = gmsh.model
-    names = {group: model.getPhysicalName(*group) for group in model.getPhysicalGroups()}
-    groups_of = {
-        (dim, entity): [int(tag) for tag in model.getPhysicalGroupsForEntity(dim, entity)]
-        for dim, entity in model.getEntities()
-        if len(model.getPartitions(dim, entity)) == 1
-    }
-    whole = {group: model.getEntitiesForPhysicalGroup(*group) for group in names}
-    model.removePhysicalGroups()
-    for (dim, tag), name in names.items():
-        original = [entity for entity in whole[dim, tag] if (dim, entity) not in groups_of]
-        model.addPhysicalGroup(dim, original, tag, name)
-    for (dim, entity), tags in groups_of.items():
-        for tag in tags:
-            part = model.getPartitions(dim, entity)[0]
-            name = f"_part{{{part}}}_physical{{{tag}}}_dim{{{dim}}}"
-            model.addPhysicalGroup(dim, [entity], 100 + 10 * entity, name)
 
 
 def partition_by(partition):

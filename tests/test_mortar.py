@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import ufl
-from bodies import boxes, held, jagged, pressed, stacked, two_body_problem
+from bodies import boxes, gathered, held, jagged, pressed, stacked, two_body_problem
 from dolfinx import fem
 from mortar_reference import TwoBoxes
 from mpi4py import MPI
@@ -19,10 +19,6 @@ PAIR = tfeti.Contact("upper bottom", "lower top")
 
 def total(values):
     return MPI.COMM_WORLD.allreduce(np.sum(values, axis=0))
-
-
-def gathered(values):
-    return np.concatenate(MPI.COMM_WORLD.allgather(values))
 
 
 def clamped(d, *sides):

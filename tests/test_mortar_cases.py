@@ -7,7 +7,7 @@ import gmsh
 import numpy as np
 import pytest
 import ufl
-from bodies import boxes, held, pressed, stacked, two_body_problem
+from bodies import boxes, gathered, held, pressed, stacked, two_body_problem
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
@@ -18,10 +18,6 @@ from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 PAIR = tfeti.Contact("upper bottom", "lower top")
-
-
-def gathered(values):
-    return np.concatenate(MPI.COMM_WORLD.allgather(values))
 
 
 def decomposed_boxes(parts, subdomains=4, groups=(), cell="quadrilateral"):
@@ -238,8 +234,7 @@ def test_contacts_that_are_none():
 
 
 def forms_of(d):
-    p = two_body_problem(d, pressed(d), held(d, "lower bottom"), [])
-    V = p.u.function_space
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
     zero = fem.Constant(d.mesh, (0.0, 0.0))
     return ufl.inner(ufl.sym(ufl.grad(u)), ufl.grad(v)) * ufl.dx, ufl.dot(zero, v) * ufl.dx, []
@@ -268,3 +263,14 @@ def test_options_that_did_not_reach_petsc(monkeypatch):
     with pytest.raises(tfeti.InputError, match="-tfeti_max_it on the command line did not reach"):
         problem(d)
     problem(d, tfeti_max_it=3)  # the program has read it itself
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_an_obstacle_is_asked_about_its_surface_only(degree):
+    """A block in a hollow sphere, with a node at its centre, where the sphere has no normal."""
+    d = decomposed("hexahedron", 2, 4)
+    hollow = tfeti.Sphere((0.5, 0.5, 0.5), 2.0, inside=True)
+    p = problem(d, contacts=[tfeti.Obstacle("bottom", hollow)], degree=degree)
+    p.solve()
+    assert p.report.contact_candidates == 9
+    assert p.report.converged_reason == "CONVERGED_RTOL"

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from bodies import boxes, held, jagged, pressed, stacked, two_body_problem
+from bodies import boxes, gathered, held, jagged, pressed, stacked, two_body_problem
 from dolfinx import fem
 from mpi4py import MPI
 
@@ -40,7 +40,7 @@ def error_of_displacement(problem):
 
 def pressures(problem):
     data = problem.solution.contact()
-    return np.concatenate(MPI.COMM_WORLD.allgather(data.pressure))
+    return gathered(data.pressure)
 
 
 @pytest.mark.parametrize("degree", [1, 2])

@@ -63,3 +63,11 @@ def owner_of(offsets: Array, index: Array) -> Array:
 def chunk_offsets(comm: MPI.Intracomm, size: int) -> Array:
     """Offsets of all ranks' chunks, shape ``(comm.size + 1,)``. Collective."""
     return np.concatenate(([0], np.cumsum(comm.allgather(size)))).astype(np.int64)
+
+
+def box_over_ranks(comm: MPI.Intracomm, x: Array) -> tuple[Array, Array]:
+    """Lowest and highest coordinates of all ranks' points, shapes ``(gdim,)``. Collective."""
+    low, high = x.min(axis=0, initial=np.inf), x.max(axis=0, initial=-np.inf)
+    comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
+    comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
+    return low, high

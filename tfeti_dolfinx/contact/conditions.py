@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.contact.facets import Facets
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.parallel import Exchange, owner_of
@@ -69,15 +68,6 @@ def triplets(rows: Array, columns: Array, values: Array) -> Triplets:
     """Row groups, column groups and values of many small matrices."""
     i, j = np.broadcast_arrays(rows[:, :, None], columns[:, None, :])
     return i.ravel(), j.ravel(), values.ravel()
-
-
-def averaged_normals(dofs: TornDofs, secondary: Facets, num_vertices: int) -> Array:
-    """Averaged normal of each owned group that is a vertex of these facets, else 0. Collective."""
-    groups = secondary.groups[:, :num_vertices].ravel()
-    gdim = secondary.vertex_normals.shape[2]
-    total = dofs.add_on_owners(groups, secondary.vertex_normals.reshape(-1, gdim))
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    return total / np.where(length > 0.0, length, 1.0)
 
 
 def _merged(dofs: TornDofs, entries: tuple[Triplets, ...]) -> Triplets:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -125,21 +125,21 @@ def local_facets(dofs: TornDofs, decomposition: Decomposition, facets: Array) ->
     )
 
 
-def with_averaged_normals(facets: Facets, dofs: TornDofs, num_vertices: int) -> Facets:
-    """The same facets with normals averaged at the vertices, weighted by area. Collective."""
+def with_averaged_normals(
+    facets: Facets, dofs: TornDofs, num_vertices: int
+) -> tuple[Facets, Array]:
+    """The same facets with normals averaged at the vertices, weighted by area. Collective.
+
+    Returns:
+        The facets, and the averaged normal of each owned group, 0 off them, shape ``(g, gdim)``.
+    """
     groups = facets.groups[:, :num_vertices]
     weighted = np.repeat((facets.normal * facets.area[:, None])[:, None], num_vertices, axis=1)
     total = dofs.add_on_owners(groups.ravel(), weighted.reshape(-1, weighted.shape[2]))
-    (normals,) = dofs.lookup(groups.ravel(), total)
-    normals = normals.reshape(weighted.shape)
-    length = np.linalg.norm(normals, axis=2, keepdims=True)
-    return Facets(
-        x=facets.x,
-        groups=facets.groups,
-        normal=facets.normal,
-        vertex_normals=normals / np.where(length > 0.0, length, 1.0),
-        area=facets.area,
-    )
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    averaged = total / np.where(length > 0.0, length, 1.0)
+    (at_vertices,) = dofs.lookup(groups.ravel(), averaged)
+    return replace(facets, vertex_normals=at_vertices.reshape(weighted.shape)), averaged
 
 
 def _cells_of(decomposition: Decomposition, facets: Array) -> tuple[Array, Array]:

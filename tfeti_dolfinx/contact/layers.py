@@ -27,17 +27,17 @@ def reachable(s: Array, distance: Array, facing: Array, length: Array, look: Loo
         s: Secondary facet of each pair, shape ``(n,)``.
         distance: Distance along the secondary facet's normal.
         facing: Whether the facets face each other.
-        length: Size of the secondary facet.
+        length: Size of every secondary facet.
         look: The way to look at one pair's place along another.
 
     Returns:
         Flags, shape ``(n,)``.
     """
-    found = facing.copy()
-    behind = distance < -SAME * length
+    found, same = facing.copy(), SAME * length[s]
+    behind = distance < -same
     a, b = couples(s, np.flatnonzero(facing & behind), np.flatnonzero(~facing & behind))
     over, there = look(a, b)
-    found[a[over & (distance[a] < there) & (there < -SAME * length[a])]] = False
+    found[a[over & (distance[a] < there) & (there < -same[a])]] = False
     return found
 
 
@@ -49,7 +49,7 @@ def nearest(
     Args:
         s: Secondary facet of each pair, shape ``(n,)``.
         distance: Distance along the secondary facet's normal.
-        length: Size of the secondary facet.
+        length: Size of every secondary facet.
         size: Length or area of the common part.
         whole: Length or area of every secondary facet.
         look: The way to look at one pair's place along another.
@@ -62,7 +62,7 @@ def nearest(
     several = np.flatnonzero((covered > (1.0 + COVERED_TWICE) * whole)[s])
     a, b = couples(s, several, several)
     over, there = look(a, b)
-    found[a[(a != b) & over & (there < distance[a] - SAME * length[a])]] = False
+    found[a[(a != b) & over & (there < distance[a] - SAME * length[s[a]])]] = False
     return found
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import basix
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array, sum_rows
 from tfeti_dolfinx.contact.candidates import centre_normals
-from tfeti_dolfinx.contact.clipping import common_parts, contains, sizes
+from tfeti_dolfinx.contact.clipping import Parts, common_parts, contains, sizes
 from tfeti_dolfinx.contact.facet_element import POLYGON, reference_points
 from tfeti_dolfinx.contact.facets import FacetKind, Facets
 from tfeti_dolfinx.contact.layers import Look, nearest, reachable
@@ -111,45 +111,25 @@ def find_segments(
         reach: Nor do facets farther apart than this.
     """
     planes = _Planes(kind, secondary, primary)
-    s, p, corners = planes.with_meeting_boxes(*pairs)
-    order = POLYGON[kind.facet]
-    parts = common_parts(corners[:, order], planes.corners[s][:, order])
-    met = np.flatnonzero(parts.count > 0)
-    s, p, corners, parts = s[met], p[met], corners[met], parts[met]
-    cosine = np.sum(primary.normal[p] * planes.normal[s], axis=1)
-    distance = planes.distance(s, p, parts.middle)
-    length = secondary.radius[s]
-    slack = length + primary.radius[p]
-    near = (np.abs(cosine) > -FACING) & (distance >= -depth - slack) & (distance <= reach + slack)
-    facing = near & (cosine < FACING)
-
-    def look(chosen: Array) -> Look:
-        place, facet = s[chosen], p[chosen]
-        middle, outline = parts.middle[chosen], corners[chosen][:, order]
-
-        def at(a: Array, b: Array) -> tuple[Array, Array]:
-            over = contains(outline[b], middle[a])
-            there = np.full(len(a), np.inf)
-            a, b = a[over], b[over]
-            there[over] = planes.distance(place[a], facet[b], middle[a])
-            return over, there
-
-        return at
-
-    seen = np.flatnonzero(near)
-    met = seen[reachable(s[seen], distance[seen], facing[seen], length[seen], look(seen))]
-    first = nearest(s[met], distance[met], length[met], parts.size[met], planes.size, look(met))
-    kept = met[first]
-    owner, y, weight = parts[kept].quadrature(_degree(kind, secondary, primary))
-    pair = kept[owner]
+    found = planes.meetings(*pairs)
+    slack = secondary.radius[found.s] + primary.radius[found.p]
+    within = (found.distance >= -depth - slack) & (found.distance <= reach + slack)
+    found = found[within & (np.abs(found.cosine) > -FACING)]
+    facing, length = found.cosine < FACING, secondary.radius
+    averted = bool(np.any(~facing))
+    found = found[reachable(found.s, found.distance, facing, length, planes.look(found))]
+    size = found.parts.size, planes.size
+    found = found[nearest(found.s, found.distance, length, *size, planes.look(found))]
+    pair, y, weight = found.parts.quadrature(_degree(kind, secondary, primary))
+    s, p = found.s[pair], found.p[pair]
     slope = np.abs(np.sum(planes.normal * secondary.normal, axis=1))
     return Segments(
-        secondary=s[pair],
-        primary=p[pair],
-        xi=reference_points(kind.facet, planes.corners[s[pair]], y),
-        eta=reference_points(kind.facet, corners[pair], y),
-        weight=weight / slope[s[pair]],
-        averted=bool(np.any(near & ~facing)),
+        secondary=s,
+        primary=p,
+        xi=reference_points(kind.facet, planes.corners[s], y),
+        eta=reference_points(kind.facet, found.corners[pair], y),
+        weight=weight / slope[s],
+        averted=averted,
     )
 
 
@@ -191,16 +171,16 @@ def integrate(
     # would be below 0 where facets of second order touch
     apart = at_hats(kind, primary.x[p], segments.eta) - at_hats(kind, secondary.x[s], segments.xi)
     gap = dual.integrals(apart)
-    key = s.astype(np.int64) * max(len(primary), 1) + p
-    pair, pair_row = np.unique(key, return_inverse=True)
+    stride = max(len(primary), 1)
+    pair, pair_row = np.unique(s * stride + p, return_inverse=True)
     theirs = kind.displacement.values(segments.eta)
     return MortarIntegrals(
         facet=dual.facet,
         own=dual.integrals(kind.displacement.values(segments.xi)),
         gap=np.sum(gap * secondary.vertex_normals[dual.facet], axis=2),
         covered=dual.covered,
-        pair_secondary=pair // max(len(primary), 1),
-        pair_primary=pair % max(len(primary), 1),
+        pair_secondary=pair // stride,
+        pair_primary=pair % stride,
         other=sum_rows(pair_row, dual.weighted[:, :, None] * theirs[:, None], len(pair)),
     )
 
@@ -228,38 +208,82 @@ def hat_areas(kind: FacetKind, facets: Facets) -> Array:
     return sum_rows(facet, weight[:, None] * kind.hats.values(xi), len(facets))
 
 
+@dataclass(frozen=True)
+class _Meetings:
+    """Pairs of facets with a common part on the secondary facet's plane.
+
+    Attributes:
+        s: Secondary facet of each pair, shape ``(n,)``.
+        p: Primary facet.
+        corners: The primary facet's vertices on the plane, shape ``(n, v, tdim)``.
+        parts: The common parts.
+        cosine: Of the facets' normals.
+        distance: Along the normal, at the middle of the common part.
+    """
+
+    s: Array
+    p: Array
+    corners: Array
+    parts: Parts
+    cosine: Array
+    distance: Array
+
+    def __getitem__(self, rows: Array) -> _Meetings:
+        return _Meetings(*(getattr(self, f.name)[rows] for f in fields(self)))
+
+
 class _Planes:
     """The planes of secondary facets: through their centres, along their averaged normals."""
 
     def __init__(self, kind: FacetKind, secondary: Facets, primary: Facets) -> None:
         self._kind, self._secondary, self._primary = kind, secondary, primary
+        self._order = POLYGON[kind.facet]
         corners = secondary.corners(kind.num_vertices)
         self.normal = centre_normals(secondary)
         self._centre, self._tangents = corners.mean(axis=1), _tangents(self.normal)
         self.corners = self._on_planes(corners, np.arange(len(secondary)))
-        self.size = sizes(self.corners[:, POLYGON[kind.facet]])
+        self.size = sizes(self.corners[:, self._order])
+
+    def meetings(self, s: Array, p: Array) -> _Meetings:
+        """Those of the pairs that have a common part."""
+        corners = self._on_planes(self._primary.corners(self._kind.num_vertices)[p], s)
+        low, high = self.corners.min(axis=1)[s], self.corners.max(axis=1)[s]
+        boxes_meet = np.all((corners.min(axis=1) <= high) & (corners.max(axis=1) >= low), axis=1)
+        s, p, corners = s[boxes_meet], p[boxes_meet], corners[boxes_meet]
+        parts = common_parts(corners[:, self._order], self.corners[s][:, self._order])
+        met = parts.count > 0
+        s, p, corners, parts = s[met], p[met], corners[met], parts[met]
+        return _Meetings(
+            s=s,
+            p=p,
+            corners=corners,
+            parts=parts,
+            cosine=np.sum(self._primary.normal[p] * self.normal[s], axis=1),
+            distance=self._distance(s, p, corners, parts.middle),
+        )
+
+    def look(self, found: _Meetings) -> Look:
+        """Whether the primary facet of pair b lies over pair a's middle, and how far."""
+        middle = found.parts.middle
+
+        def at(a: Array, b: Array) -> tuple[Array, Array]:
+            over = contains(found.corners[b][:, self._order], middle[a])
+            there = np.full(len(a), np.inf)
+            a, b = a[over], b[over]
+            there[over] = self._distance(found.s[a], found.p[b], found.corners[b], middle[a])
+            return over, there
+
+        return at
 
     def _on_planes(self, x: Array, s: Array) -> Array:
         """Coordinates on planes s: shape ``(n, v, gdim)`` to ``(n, v, gdim - 1)``."""
         return np.einsum("nvg,ntg->nvt", x - self._centre[s][:, None], self._tangents[s])
 
-    def primary_corners(self, s: Array, p: Array) -> Array:
-        """Vertices of primary facets p on planes s, shape ``(n, v, tdim)``."""
-        return self._on_planes(self._primary.corners(self._kind.num_vertices)[p], s)
-
-    def with_meeting_boxes(self, s: Array, p: Array) -> tuple[Array, Array, Array]:
-        """Pairs whose boxes on the plane meet, with the primary facets' vertices there."""
-        corners = self.primary_corners(s, p)
-        low, high = self.corners.min(axis=1)[s], self.corners.max(axis=1)[s]
-        met = (corners.min(axis=1) <= high) & (corners.max(axis=1) >= low)
-        met_all = np.all(met, axis=1)
-        return s[met_all], p[met_all], corners[met_all]
-
-    def distance(self, s: Array, p: Array, y: Array) -> Array:
-        """Distance of facets along the normal, at points y of the planes s."""
+    def _distance(self, s: Array, p: Array, corners: Array, y: Array) -> Array:
+        """Distance along the normal at points y of the planes, p's vertices there given."""
         kind = self._kind
         xi = reference_points(kind.facet, self.corners[s], y)
-        eta = reference_points(kind.facet, self.primary_corners(s, p), y)
+        eta = reference_points(kind.facet, corners, y)
         apart = at_hats(kind, self._primary.x[p], eta) - at_hats(kind, self._secondary.x[s], xi)
         return np.sum(apart * self.normal[s], axis=1)
 

@@ -9,16 +9,11 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.contact.conditions import conditions, triplets
-from tfeti_dolfinx.contact.facets import facet_kind, local_facets
+from tfeti_dolfinx.contact.facets import Facets, facet_kind, local_facets
 from tfeti_dolfinx.contact.mortar import dual_multipliers, hat_areas, whole_facets
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.shapes import Shape
-from tfeti_dolfinx.contact.surfaces import (
-    group_points,
-    hat_integrals,
-    on_surface,
-    surface_facets,
-)
+from tfeti_dolfinx.contact.surfaces import group_points, on_surface, surface_facets
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -66,20 +61,34 @@ class Obstacle:
     ) -> ContactRecords:
         """One condition per vertex of the surface, from its present distance. Collective.
 
-        With φ the signed distance, n = −∇φ/|∇φ| and g = φ/|∇φ|, the condition of a displacement of
-        degree 1 is n·u ≤ g at the node. For other degrees it is that of a dual multiplier,
-        ∫ψ_i n_i·u ≤ g_i ∫ψ_i, divided by ∫ψ_i, with the gap at the vertex.
+        With φ the signed distance, n = −∇φ/|∇φ| and g = φ/|∇φ| at the vertex, the condition is
+        that of a dual multiplier, ∫ψ_i n_i·u ≤ g_i ∫ψ_i, divided by ∫ψ_i. Of a displacement of
+        degree 1 it is n·u ≤ g at the node, since ψ_i is biorthogonal to its hats.
 
         Raises:
             InputError: The surface is unknown or empty or faces away, the shape has no normal at
                 a node, or no node is within reach.
         """
         facets = surface_facets(decomposition, self.surface)
-        if dofs.V.element.basix_element.degree == 1:
-            records = self._at_nodes(dofs, decomposition, contact, facets)
-        else:
-            records = self._weighted(dofs, decomposition, contact, facets)
-        self._check_side(dofs, decomposition, facets)
+        kind, surface = facet_kind(dofs), local_facets(dofs, decomposition, facets)
+        self._check_side(surface, kind.num_vertices, dofs)
+        facet, xi, weight = whole_facets(kind, surface, QUADRATURE * kind.displacement.degree)
+        dual = dual_multipliers(kind, surface.area, facet, xi, weight)
+        vertices = surface.groups[:, : kind.num_vertices]
+        gap, normals = self._at_groups(dofs, on_surface(dofs, decomposition, facets))
+        (at_vertices,) = dofs.lookup(vertices[dual.facet].ravel(), gap)
+        own = dual.integrals(kind.displacement.values(xi))
+        records = conditions(
+            dofs=dofs,
+            contact=contact,
+            multipliers=vertices[dual.facet],
+            covered=dual.covered,
+            gaps=at_vertices.reshape(dual.covered.shape) * dual.covered,
+            entries=(triplets(vertices[dual.facet], surface.groups[dual.facet], own),),
+            nodes=vertices,
+            areas=hat_areas(kind, surface),
+            normals=normals,
+        )
         near = records.gap <= self.reach
         if decomposition.comm.allreduce(int(np.sum(near))) == 0:
             lowest = float(records.gap.min(initial=np.inf))
@@ -90,63 +99,20 @@ class Obstacle:
             )
         return replace(records, near=near)
 
-    def _at_nodes(
-        self, dofs: TornDofs, decomposition: Decomposition, contact: int, facets: Array
-    ) -> ContactRecords:
-        groups = on_surface(dofs, decomposition, facets)
-        area = hat_integrals(dofs, decomposition, [self.surface])[groups]
-        with raised_on_all_ranks(decomposition.comm):
-            gap, normal = self._gaps(group_points(dofs)[groups], dofs.bs)
-        return ContactRecords(
-            contact=np.full(len(groups), contact),
-            group=groups,
-            normal=normal,
-            gap=gap,
-            area=area,
-            near=np.ones(len(groups), dtype=bool),
-            row=np.arange(len(groups)),
-            entry_group=dofs.group_offsets[dofs.comm.rank] + groups,
-            coefficients=normal,
-            candidates=len(groups),
-        )
+    def _at_groups(self, dofs: TornDofs, groups: Array) -> tuple[Array, Array]:
+        """Gap and normal of these owned groups, 0 for the others. Collective."""
+        gap, normals = np.zeros(dofs.num_groups), np.zeros((dofs.num_groups, dofs.bs))
+        x = group_points(dofs)[groups]
+        with raised_on_all_ranks(dofs.comm):
+            gap[groups], normals[groups] = self._gaps(x, dofs.bs)
+        return gap, normals
 
-    def _weighted(
-        self, dofs: TornDofs, decomposition: Decomposition, contact: int, facets: Array
-    ) -> ContactRecords:
-        kind, surface = facet_kind(dofs), local_facets(dofs, decomposition, facets)
-        degree = QUADRATURE * kind.displacement.degree
-        facet, xi, weight = whole_facets(kind, surface, degree)
-        dual = dual_multipliers(kind, surface.area, facet, xi, weight)
-        vertices = surface.groups[:, : kind.num_vertices]
-        with raised_on_all_ranks(decomposition.comm):
-            gap, normals = self._gaps(group_points(dofs), dofs.bs)
-        (at_vertices,) = dofs.lookup(vertices[dual.facet].ravel(), gap)
-        return conditions(
-            dofs=dofs,
-            contact=contact,
-            multipliers=vertices[dual.facet],
-            covered=dual.covered,
-            gaps=at_vertices.reshape(dual.covered.shape) * dual.covered,
-            entries=(
-                triplets(
-                    vertices[dual.facet],
-                    surface.groups[dual.facet],
-                    dual.integrals(kind.displacement.values(xi)),
-                ),
-            ),
-            nodes=vertices,
-            areas=hat_areas(kind, surface),
-            normals=normals,
-        )
-
-    def _check_side(self, dofs: TornDofs, decomposition: Decomposition, facets: Array) -> None:
+    def _check_side(self, surface: Facets, num_vertices: int, dofs: TornDofs) -> None:
         """Raise if no facet faces the obstacle. Collective."""
-        surface = local_facets(dofs, decomposition, facets)
-        centres = surface.corners(facet_kind(dofs).num_vertices).mean(axis=1)
-        with raised_on_all_ranks(decomposition.comm):
-            _, towards = self._gaps(centres, dofs.bs)
+        with raised_on_all_ranks(dofs.comm):
+            _, towards = self._gaps(surface.corners(num_vertices).mean(axis=1), dofs.bs)
         facing = int(np.sum(np.sum(towards * surface.normal, axis=1) > 0.0))
-        if dofs.bs > 1 and decomposition.comm.allreduce(facing) == 0:
+        if dofs.bs > 1 and dofs.comm.allreduce(facing) == 0:
             raise InputError(
                 f"obstacle of surface {self.surface!r}: the surface faces away from it; expected "
                 "a shape whose distance falls along the outward normal (is its normal turned?)"

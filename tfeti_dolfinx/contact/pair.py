@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.contact.candidates import candidate_pairs, rendezvous
-from tfeti_dolfinx.contact.conditions import averaged_normals, conditions, triplets
+from tfeti_dolfinx.contact.conditions import conditions, triplets
 from tfeti_dolfinx.contact.facets import Facets, facet_kind, local_facets, with_averaged_normals
 from tfeti_dolfinx.contact.mortar import Segments, find_segments, hat_areas, integrate
 from tfeti_dolfinx.contact.records import ContactRecords
@@ -132,7 +132,7 @@ class Contact:
         """
         kind, comm = facet_kind(dofs), decomposition.comm
         v = kind.num_vertices
-        secondary, primary = self._sides(dofs, decomposition, v)
+        secondary, normals, primary = self._sides(dofs, decomposition, v)
         reach = SEEN * max(radius, depth)
         near_s, near_p = rendezvous(secondary, primary, reach, comm)
         with raised_on_all_ranks(comm):
@@ -161,15 +161,15 @@ class Contact:
             entries=entries,
             nodes=secondary.groups[:, :v],
             areas=hat_areas(kind, secondary),
-            normals=averaged_normals(dofs, secondary, v),
+            normals=normals,
         )
         self._check_depth(found, depth, comm)
         return replace(found, near=found.gap <= radius)
 
     def _sides(
         self, dofs: TornDofs, decomposition: Decomposition, num_vertices: int
-    ) -> tuple[Facets, Facets]:
-        """Facets of both surfaces, the secondary ones with averaged normals. Collective."""
+    ) -> tuple[Facets, Array, Facets]:
+        """Secondary facets, averaged normals of the owned groups, primary facets. Collective."""
         sides = []
         for name in (self.secondary, self.primary):
             facets = local_facets(dofs, decomposition, surface_facets(decomposition, name))
@@ -178,7 +178,7 @@ class Contact:
             if count := decomposition.comm.allreduce(flat):
                 raise InputError(f"{self.name}: {count} facets of {name!r} have no area")
             sides.append(facets)
-        secondary = with_averaged_normals(sides[0], dofs, num_vertices)
+        secondary, normals = with_averaged_normals(sides[0], dofs, num_vertices)
         cosine = np.einsum("nvg,ng->nv", secondary.vertex_normals, secondary.normal)
         if decomposition.comm.allreduce(int(np.sum(cosine < CREASE))) and not dofs.comm.rank:
             log.warning(
@@ -187,7 +187,7 @@ class Contact:
                 self.name,
                 self.secondary,
             )
-        return secondary, sides[1]
+        return secondary, normals, sides[1]
 
     def _check_facing(self, segments: Segments, comm: MPI.Intracomm) -> None:
         averted = comm.allreduce(int(segments.averted))

@@ -119,7 +119,8 @@ class ContactSearch:
                 overlaps, new = self._overlapping(found, u, tolerance)
             if new:
                 self._parts[i] = replace(found, near=found.near | overlaps)
-                self._radii[i] = max(self._radii[i], moved)
+                if found is not known:
+                    self._radii[i] = moved
                 late += new
         return late
 

@@ -15,6 +15,7 @@ from tfeti_dolfinx.compat import JIT_OPTIONS
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.parallel import box_over_ranks
 
 
 def surface_facets(decomposition: Decomposition, name: str | int) -> Array:
@@ -106,7 +107,5 @@ def diameter(decomposition: Decomposition) -> float:
 
 
 def _diagonal(x: Array, comm: MPI.Intracomm) -> float:
-    low, high = x.min(axis=0, initial=np.inf), x.max(axis=0, initial=-np.inf)
-    comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
-    comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
+    low, high = box_over_ranks(comm, x)
     return float(np.linalg.norm(high - low))

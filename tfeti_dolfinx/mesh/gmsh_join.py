@@ -16,7 +16,7 @@ from tfeti_dolfinx.mesh.gmsh_model import Elements, Part, concatenated
 from tfeti_dolfinx.mesh.gmsh_names import group_names
 from tfeti_dolfinx.mesh.gmsh_split import check_shared
 from tfeti_dolfinx.mesh.untorn import UntornMesh
-from tfeti_dolfinx.parallel import Exchange
+from tfeti_dolfinx.parallel import Exchange, box_over_ranks
 
 # gmsh's element types: DOLFINx's cell type and degree
 CELLS = {
@@ -116,9 +116,7 @@ def _no_elements(kind: int, kind_name: str, num_nodes: int) -> Elements:
 
 def _checked_extent(x: Array, gdim: int, comm: MPI.Intracomm) -> float:
     """Longest side of the box of all points; raises if plane cells do not lie in a plane."""
-    low, high = x.min(axis=0, initial=np.inf), x.max(axis=0, initial=-np.inf)
-    comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
-    comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
+    low, high = box_over_ranks(comm, x)
     sides = high - low
     if gdim == 2 and sides[2] > 1e-12 * sides.max():
         raise InputError("plane cells that do not lie in a plane z = constant: shells are not")

@@ -13,6 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from tfeti_dolfinx.arrays import Array, ArrayLike
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.untorn import UntornMesh
+from tfeti_dolfinx.parallel import box_over_ranks
 
 Subdomains = int | ArrayLike | Callable[[Array], ArrayLike]
 
@@ -169,9 +170,7 @@ def bisect_points(x: Array, num_parts: int, comm: MPI.Intracomm) -> Array:
 def _on_grid(x: Array, comm: MPI.Intracomm) -> Array:
     """Coordinates as integers on a grid over the box of all points."""
     gdim = x.shape[1]
-    low, high = x.min(axis=0, initial=np.inf), x.max(axis=0, initial=-np.inf)
-    comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
-    comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
+    low, high = box_over_ranks(comm, x)
     bits = 62 // gdim
     return np.rint((x - low) / max(np.max(high - low), 1e-300) * (2.0**bits - 1)).astype(np.int64)
 
