@@ -2,10 +2,24 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
+
+
+T = TypeVar("T")
+
+
+def agreed(comm: MPI.Intracomm, value: T) -> T:
+    """Rank 0's value on every rank. Collective.
+
+    For what steers collective calls: processors of different kinds may round differently, and
+    ranks that decide by their own floats may part ways.
+    """
+    return comm.bcast(value, root=0)
 
 
 class Exchange:
