@@ -28,7 +28,7 @@ def fill_report(
     report.subdomains, report.bodies = decomposition.num_subdomains, decomposition.num_bodies
     report.split_subdomains = len(decomposition.split)
     report.kernel_dim = dual.coarse.dimension
-    report.free_modes = dual.coarse.free_modes.shape[1]
+    report.free_modes = dual.coarse.free_modes
     report.contact_rows = dual.num_inequalities
     report.contact_candidates = comm.allreduce(gluing.records.candidates)
     near = comm.allreduce(int(np.sum(gluing.records.near)))

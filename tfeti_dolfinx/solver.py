@@ -7,7 +7,7 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.dual import Dual
-from tfeti_dolfinx.dual.solvability import feasible_particular
+from tfeti_dolfinx.dual.particular import feasible_particular
 from tfeti_dolfinx.errors import ConvergenceError, InputError
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.homogenised import Homogenised, homogenise

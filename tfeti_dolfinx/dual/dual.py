@@ -61,11 +61,10 @@ class Dual:
         if pc_type != "none":
             self._scaled = ScaledGluing(B, constraints.weights)
             self.preconditioner = PRECONDITIONERS[pc_type](self._scaled, blocks)
-        self.coarse = CoarseSpace(B, blocks, body_of_block, len(body_names), comm)
         bounded = constraints.inequalities
+        self.coarse = CoarseSpace(B, blocks, body_of_block, len(body_names), bounded, comm)
         self.num_inequalities = comm.allreduce(bounded.stop - bounded.start)
-        load_norm = np.sqrt(comm.allreduce(sum(block.load_norm**2 for block in blocks)))
-        check_solvable(self.coarse, bounded, float(load_norm), body_names, mode_names)
+        check_solvable(self.coarse, body_names, mode_names)
         self.d = linear_term(B, constraints.c, blocks)
 
     def qp(self) -> QP:
@@ -83,9 +82,8 @@ class Dual:
         closed = lam[bounded] <= 0.0
         nu[bounded] = np.where(closed, result.gradient.array_r[bounded], 0.0)
         constraints = self.constraints
-        return recover(
-            constraints.B, constraints.c, self.blocks, self.coarse, result.lam, bounded, nu
-        )
+        u, _ = recover(constraints.B, constraints.c, self.blocks, self.coarse, result.lam, nu)
+        return u
 
     def destroy(self) -> None:
         """Destroy the PETSc objects."""

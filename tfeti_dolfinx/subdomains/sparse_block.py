@@ -37,6 +37,7 @@ class SparseBlock:
         body_frame: Centre and length of the whole body, for its candidate modes.
         counters: Counts factorisations.
         kplus_type: Kind of the generalised inverse.
+        shares: 1 / number of torn copies of each node, shape ``(n / bs,)``; default 1.
 
     Raises:
         InputError: K is not symmetric, not finite or not positive semidefinite, or the load is
@@ -53,8 +54,10 @@ class SparseBlock:
         body_frame: tuple[Array, float],
         counters: Counters,
         kplus_type: str = "regularized",
+        shares: Array | None = None,
     ) -> None:
         self._name, self._x, self._frame = name, x, body_frame
+        self._shares = np.ones(len(x)) if shares is None else shares
         self._counters, self._kplus_type = counters, kplus_type
         self.trace_dofs = trace_dofs
         self.update(K=K, f=f)
@@ -115,6 +118,16 @@ class SparseBlock:
         inside = self._R.T @ modes
         rest = modes - self._R @ inside
         return inside, rest.T @ rest
+
+    @property
+    def body_metric(self) -> Array:
+        """Cᵀ W C, shape ``(k, k)``, W the share in each node."""
+        modes = self._modes(*self._frame)
+        return modes.T @ (np.repeat(self._shares, self._bs)[:, None] * modes)
+
+    def body_moments(self, u: Array) -> Array:
+        """Cᵀ W u of a displacement on all unknowns, shape ``(k,)``."""
+        return self._modes(*self._frame).T @ (np.repeat(self._shares, self._bs) * u)
 
     @property
     def condensed_load(self) -> Array:
