@@ -194,10 +194,9 @@ class SemidefiniteFactor:
 
 
 def _without_rounding(J: Any) -> csr_array:
-    """The same rows, those that are only rounding emptied."""
+    """The same rows without entries that are only rounding."""
     J = csr_array(J)
-    length = np.sqrt(np.asarray(J.multiply(J).sum(axis=1)).ravel())
-    J = csr_array(diags_array((length > NO_GRIP).astype(float)) @ J)
+    J.data[np.abs(J.data) <= NO_GRIP] = 0.0
     J.eliminate_zeros()
     return J
 

@@ -12,6 +12,9 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.parallel import agreed
 
+# Random directions in which the outermost rows are taken at first: enough for the corners of
+# patches; what they miss comes by and by.
+DIRECTIONS = 12
 
 class Rows:
     """This rank's inequalities A y ≤ b, each between few bodies.
@@ -35,28 +38,28 @@ class Rows:
         # rows between the same bodies form a patch
         _, self.patch = np.unique(np.stack((first, last), axis=1), axis=0, return_inverse=True)
         self.patch = self.patch.ravel()
-        self._entry = row, column, entries.data
+        self._entry = row, column
         self.sent = np.zeros(A.shape[0], dtype=bool)
 
     def links(self, bodies: int) -> csr_array:
         """Which bodies meet in a row, shape ``(bodies, bodies)``."""
-        row, column, _ = self._entry
+        row, column = self._entry
         meets = (np.ones(len(row)), (row, self._body[column]))
         incidence = csr_array(meets, shape=(self.A.shape[0], bodies))
         return csr_array(incidence.T @ incidence)
 
     def extremes(self) -> Array:
-        """Of each patch the rows with the largest and the smallest entry in each column.
+        """Of each patch the rows that are outermost in some directions.
 
-        Of a flat patch these are its outermost rows, which imply most others.
+        Of a flat patch they are most of its corners, which imply all other rows.
         """
-        row, column, value = self._entry
-        patch = self.patch[row]
-        order = np.lexsort((value, patch, column))
-        key = np.stack((column[order], patch[order]), axis=1)
-        change = np.flatnonzero(np.any(np.diff(key, axis=0) != 0, axis=1))
-        ends = np.concatenate((change, change + 1, [0, len(order) - 1] if len(order) else []))
-        return np.unique(row[order[ends.astype(np.int64)]])
+        found = [np.empty(0, dtype=np.int64)]
+        for direction in np.random.default_rng(0).standard_normal((DIRECTIONS, self.A.shape[1])):
+            order = np.lexsort((self.A @ direction, self.patch))
+            change = np.flatnonzero(np.diff(self.patch[order]))
+            ends = np.concatenate(([0], change, change + 1, [-1])) if len(order) else order
+            found.append(order[ends])
+        return np.unique(np.concatenate(found))
 
     def violated(self, y: Array, tolerance: float, most: int) -> Array:
         """Of each patch the rows, at most so many, that y violates most."""

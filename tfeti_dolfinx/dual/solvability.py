@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy.optimize import linprog
@@ -108,10 +109,9 @@ def escape(coarse: CoarseSpace) -> Array | None:
     largest[largest == 0.0] = 1.0
     load, size = load / largest[part], size / largest[part]
     y = minimise(rows, lambda A, _: _most_work(A, load, size), SLOPE, coarse.comm)
-    if y is None:
-        return None
-    least = minimise(rows, lambda A, _: _least_motion(A, load), SLOPE, coarse.comm)
-    return np.asarray(Z @ (y if least is None else least))
+    if y is not None:
+        y = minimise(rows, lambda A, _: _least_motion(A, load), SLOPE, coarse.comm)
+    return None if y is None else np.asarray(Z @ y)
 
 
 def _parts(coarse: CoarseSpace, rows: Rows, body: Array) -> Array:
@@ -121,44 +121,50 @@ def _parts(coarse: CoarseSpace, rows: Rows, body: Array) -> Array:
 
 
 def _most_work(A: csr_array, load: Array, size: Array) -> Array | None:
-    """The motion of the most work, if that is more than rounding; A y ≤ 0, −1 ≤ y ≤ 1."""
+    """A motion of much work, if that is more than rounding; A y ≤ 0, −1 ≤ y ≤ 1."""
+    y = _minimiser(-load, A, bounds=(-1.0, 1.0))
+    if load @ y <= BALANCE * size.max():
+        return None
+    # Motions that cost nothing are in y, too: of heavily loaded bodies they would hide that of a
+    # light one. Work less what counts as none has no such motions.
     noise = BALANCE * size
-    cost = np.concatenate((noise - load, noise + load))
-    y = _halves(cost, A, bounds=(0.0, 1.0))
-    if y is None:
-        raise TfetiError("the linear program that tells whether contact can hold the bodies failed")
+    y = _halves(_minimiser(np.concatenate((noise - load, noise + load)), _both(A), bounds=(0, 1)))
     # a cone: a motion that gains something gains more until a bound stops it
-    return y if np.abs(y).max(initial=0.0) > 0.5 and load @ y > noise @ np.abs(y) else None
+    return y if np.abs(y).max() > 0.5 and load @ y > noise @ np.abs(y) else None
 
 
-def _least_motion(A: csr_array, load: Array) -> Array | None:
+def _least_motion(A: csr_array, load: Array) -> Array:
     """The least motion (sum of moduli) of unit work, scaled to 1; A y ≤ 0."""
-    y = _halves(
-        np.ones(2 * len(load)),
-        A,
-        bounds=(0.0, None),
-        A_eq=np.concatenate((load, -load))[None, :],
-        b_eq=np.ones(1),
-    )
-    return None if y is None else y / np.abs(y).max()
+    work = np.concatenate((load, -load))[None, :]
+    y = _halves(_minimiser(np.ones(work.size), _both(A), A_eq=work, b_eq=np.ones(1)))
+    return y / np.abs(y).max()
 
 
-def _halves(cost: Array, A: csr_array, **rest: object) -> Array | None:
-    """The minimiser p − q of a program in p, q ≥ 0 with A(p − q) ≤ 0, or None."""
-    n = len(cost) // 2
-    methods = ("highs-ipm", "highs-ds") if 2 * n > LARGE else ("highs-ds", "highs-ipm")
-    for method in methods:
+def _both(A: csr_array) -> csr_array:
+    """A for y = p − q."""
+    return csr_array(hstack([A, -A]))
+
+
+def _halves(pq: Array) -> Array:
+    """y = p − q."""
+    p, q = np.split(pq, 2)
+    return np.asarray(p - q)
+
+
+def _minimiser(cost: Array, A: csr_array, **rest: Any) -> Array:
+    """The minimiser of a linear program over A y ≤ 0.
+
+    Raises:
+        TfetiError: Neither the simplex nor the interior point method found it.
+    """
+    options = {
+        "primal_feasibility_tolerance": LP_TOLERANCE,
+        "dual_feasibility_tolerance": LP_TOLERANCE,
+    }
+    for method in ("highs-ipm", "highs-ds") if len(cost) > LARGE else ("highs-ds", "highs-ipm"):
         found = linprog(
-            cost,
-            A_ub=hstack([A, -A]) if A.shape[0] else None,
-            b_ub=np.zeros(A.shape[0]) if A.shape[0] else None,
-            method=method,
-            options={
-                "primal_feasibility_tolerance": LP_TOLERANCE,
-                "dual_feasibility_tolerance": LP_TOLERANCE,
-            },
-            **rest,
+            cost, A_ub=A, b_ub=np.zeros(A.shape[0]), method=method, options=options, **rest
         )
         if found.status == 0:
-            return np.asarray(found.x[:n] - found.x[n:])
-    return None
+            return np.asarray(found.x)
+    raise TfetiError(f"a linear program of the solvability test failed: {found.message}")
