@@ -17,6 +17,9 @@ from tfeti_dolfinx.subdomains.block import Block
 # Share of a motion's square that lies outside a subdomain's kernel, and so moves a spring:
 # kernels beside weak springs are inexact, and a share is the square of an angle.
 SPRUNG = 1e-8
+# Work of a body's load that counts as none, as a share of the largest that loads of this size
+# could do (what users balance by hand is seldom exact), and of that of any body (rounding).
+BALANCE, ROUNDING = 1e-9, 1e-14
 DEPENDENT = 1e-12  # of the largest eigenvalue of the modes' Gram matrix: no motion of its own
 
 
@@ -40,8 +43,8 @@ class Bodies:
         modes: Kernel coordinates of the motions, scipy CSR, shape ``(r, bodies * k)``.
         size: Their Gram matrices, shape ``(bodies, k, k)``.
         springs: Projectors onto motions that springs resist, shape ``(bodies, k, k)``.
-        load_size: Largest work that a body's load can do on a motion of mean square 1, whatever
-            its direction, shape ``(bodies,)``.
+        negligible: Work of each body's load, on a motion of mean square 1, that counts as none,
+            shape ``(bodies,)``.
     """
 
     def __init__(
@@ -75,7 +78,8 @@ class Bodies:
         for block, body in zip(blocks, self._body_of_block, strict=True):
             squares[body] += block.load_norm**2
         self._comm.Allreduce(MPI.IN_PLACE, squares, op=MPI.SUM)
-        self.load_size = np.sqrt(squares * self.nodes)
+        largest = np.sqrt(squares * self.nodes)
+        self.negligible = np.maximum(BALANCE * largest, ROUNDING * largest.max(initial=0.0))
 
     def part_of(self, u: Sequence[Array], blocks: Sequence[Block]) -> Array:
         """The bodies' motion in a displacement, by least squares over the nodes. Collective.

@@ -18,9 +18,6 @@ from tfeti_dolfinx.dual.motions import Motions
 from tfeti_dolfinx.errors import NoSolutionError, TfetiError
 from tfeti_dolfinx.parallel import agreed
 
-# Work of a load that counts as none, as a share of the largest that loads of this size could do:
-# loads are summed from many entries, and what users balance by hand is seldom exact.
-BALANCE = 1e-9
 # Least slope against a contact, of a motion of mean square 1, that counts as an overlap; the
 # tolerances of the linear programs are finer.
 SLOPE, LP_TOLERANCE = 1e-9, 1e-10
@@ -77,13 +74,13 @@ def _name(amounts: Array, body_names: Sequence[str], mode_names: Sequence[str]) 
 def _driven(free: Motions, load: Array, bodies: Bodies) -> Array | None:
     """The part of the load on free motions, if it is more than rounding."""
     alone = (free.alone @ (free.alone.T @ load)).reshape(bodies.count, bodies.k)
-    alone[np.linalg.norm(alone, axis=1) <= BALANCE * bodies.load_size] = 0.0
+    alone[np.linalg.norm(alone, axis=1) <= bodies.negligible] = 0.0
     if np.any(alone):
         return np.asarray(alone.ravel())
     Q = np.linalg.qr(free.joint)[0]
     joint = Q @ (Q.T @ load)
     each = np.linalg.norm(joint.reshape(bodies.count, bodies.k), axis=1)
-    return joint if joint @ load > BALANCE * (bodies.load_size @ each) else None
+    return joint if joint @ load > bodies.negligible @ each else None
 
 
 def escape(coarse: CoarseSpace) -> Array | None:
@@ -99,16 +96,16 @@ def escape(coarse: CoarseSpace) -> Array | None:
     body = np.repeat(np.arange(bodies.count), coarse.unheld.free.sum(axis=1))
     J_N = csr_array(coarse.J[coarse.bounded] @ Z)
     rows = Rows(J_N, np.zeros(J_N.shape[0]), body)
-    load, size = Z.T @ (bodies.modes.T @ coarse.e), bodies.load_size[body]
-    if agreed(coarse.comm, bool(np.all(np.abs(load) <= BALANCE * size))):
+    load, noise = Z.T @ (bodies.modes.T @ coarse.e), bodies.negligible[body]
+    if agreed(coarse.comm, bool(np.all(np.abs(load) <= noise))):
         return None
     # parts of the scene that do not meet may be loaded by very different forces
     part = _parts(coarse, rows, body)
     largest = np.zeros(part.max() + 1)
     np.maximum.at(largest, part, np.abs(load))
     largest[largest == 0.0] = 1.0
-    load, size = load / largest[part], size / largest[part]
-    y = minimise(rows, lambda A, _: _most_work(A, load, size), SLOPE, coarse.comm)
+    load, noise = load / largest[part], noise / largest[part]
+    y = minimise(rows, lambda A, _: _most_work(A, load, noise), SLOPE, coarse.comm)
     if y is not None:
         y = minimise(rows, lambda A, _: _least_motion(A, load), SLOPE, coarse.comm)
     return None if y is None else np.asarray(Z @ y)
@@ -120,14 +117,13 @@ def _parts(coarse: CoarseSpace, rows: Rows, body: Array) -> Array:
     return connected_components(csr_array(sum(links)), directed=False)[1][body]
 
 
-def _most_work(A: csr_array, load: Array, size: Array) -> Array | None:
+def _most_work(A: csr_array, load: Array, noise: Array) -> Array | None:
     """A motion of much work, if that is more than rounding; A y ≤ 0, −1 ≤ y ≤ 1."""
     y = _minimiser(-load, A, bounds=(-1.0, 1.0))
-    if load @ y <= BALANCE * size.max():
+    if load @ y <= noise.max():
         return None
     # Motions that cost nothing are in y, too: of heavily loaded bodies they would hide that of a
     # light one. Work less what counts as none has no such motions.
-    noise = BALANCE * size
     y = _halves(_minimiser(np.concatenate((noise - load, noise + load)), _both(A), bounds=(0, 1)))
     # a cone: a motion that gains something gains more until a bound stops it
     return y if np.abs(y).max() > 0.5 and load @ y > noise @ np.abs(y) else None
