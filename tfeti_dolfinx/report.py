@@ -7,8 +7,12 @@ import os
 import resource
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 from mpi4py import MPI
+
+
+PRINTED = 10  # of a list; all of it is in the file
 
 
 @dataclass
@@ -23,6 +27,9 @@ class Report:
         split_subdomains: Subdomains that were not connected and were split.
         kernel_dim: Dimension of the kernel of K.
         free_modes: Rigid motions that nothing resists and the load does not drive.
+        nearly_free: Rigid motions that contacts with a force hold hardly (``stiffness``: as a
+            share of what the same contacts hold at most) or not at all (0): dicts of ``bodies``,
+            ``mode`` and ``stiffness``. The smallest motion was taken.
         contact_rows: Non-penetration rows.
         contact_candidates: Nodes of the (secondary) contact surfaces.
         far_contact_nodes: Those that were out of reach or not covered, and have no row.
@@ -57,6 +64,7 @@ class Report:
     split_subdomains: int = 0
     kernel_dim: int = 0
     free_modes: int = 0
+    nearly_free: list[dict[str, object]] = field(default_factory=list)
     contact_rows: int = 0
     contact_candidates: int = 0
     far_contact_nodes: int = 0
@@ -97,8 +105,11 @@ class Report:
         for name, value in asdict(self).items():
             if isinstance(value, dict) and value:
                 lines += [f"{name}.{key:<22} {item:.6g}" for key, item in value.items()]
+            elif isinstance(value, list) and value:
+                lines += [f"{name:<31} {_motion(item)}" for item in value[:PRINTED]]
+                lines += [f"{name:<31} {len(value)} in all"]
             else:
-                lines.append(f"{name:<31} {'-' if value == {} else value}")
+                lines.append(f"{name:<31} {'-' if value in ({}, []) else value}")
         return "\n".join(lines)
 
     def to_json(self) -> str:
@@ -114,6 +125,11 @@ class Report:
             partial.write_text(self.to_json() + "\n")
             os.replace(partial, target)
         comm.barrier()
+
+
+def _motion(item: dict[str, Any]) -> str:
+    """One of ``nearly_free`` as text."""
+    return f"{', '.join(item['bodies'])}: {item['mode']}, stiffness {item['stiffness']:.2g}"
 
 
 def peak_memory_mb(comm: MPI.Intracomm) -> float:

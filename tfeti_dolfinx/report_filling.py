@@ -29,6 +29,7 @@ def fill_report(
     report.split_subdomains = len(decomposition.split)
     report.kernel_dim = dual.coarse.dimension
     report.free_modes = dual.coarse.free_modes
+    report.nearly_free = dual.nearly_free
     report.contact_rows = dual.num_inequalities
     report.contact_candidates = comm.allreduce(gluing.records.candidates)
     near = comm.allreduce(int(np.sum(gluing.records.near)))

@@ -43,6 +43,7 @@ class Bodies:
         modes: Kernel coordinates of the motions, scipy CSR, shape ``(r, bodies * k)``.
         size: Their Gram matrices, shape ``(bodies, k, k)``.
         springs: Projectors onto motions that springs resist, shape ``(bodies, k, k)``.
+        loads: ‖f‖ of each body, shape ``(bodies,)``.
         negligible: Work of each body's load, on a motion of mean square 1, that counts as none,
             shape ``(bodies,)``.
     """
@@ -78,7 +79,8 @@ class Bodies:
         for block, body in zip(blocks, self._body_of_block, strict=True):
             squares[body] += block.load_norm**2
         self._comm.Allreduce(MPI.IN_PLACE, squares, op=MPI.SUM)
-        largest = np.sqrt(squares * self.nodes)
+        self.loads = np.sqrt(squares)
+        largest = self.loads * np.sqrt(self.nodes)
         self.negligible = np.maximum(BALANCE * largest, ROUNDING * largest.max(initial=0.0))
 
     def part_of(self, u: Sequence[Array], blocks: Sequence[Block]) -> Array:

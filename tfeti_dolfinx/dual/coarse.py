@@ -20,7 +20,7 @@ from tfeti_dolfinx.parallel import agreed, chunk_offsets
 from tfeti_dolfinx.subdomains.block import Block
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor
 
-# Of the largest entry of a row: what of it acts on motions of bodies and is only rounding.
+# Of the size of a row: what of it acts on motions of bodies and is only rounding.
 NO_GRIP = 1e-12
 
 
@@ -40,8 +40,8 @@ class CoarseSpace:
         e: Rᵀ f, shape ``(r,)``.
         Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
         bounded: Local rows with λ ≥ 0.
-        row_size: Largest entry of each local row of B: a row over it is a length, shape
-            ``(m_local,)``.
+        row_size: Sum of the moduli of each local row of B, the same however the mesh is torn. A
+            row over it gives lengths. Shape ``(m_local,)``.
         bodies: Motions of the bodies.
         J: This rank's rows of Gᵀ over their size, on motions of bodies, scipy CSR, shape
             ``(m_local, bodies * k)``; empty for gluing rows.
@@ -67,7 +67,7 @@ class CoarseSpace:
         starts = offsets[comm.rank] + np.concatenate(([0], np.cumsum(sizes)))
         self._starts, self._sizes = starts, sizes
         self.Gt = _transposed_G(B, blocks, starts, self.dimension)
-        self.row_size = _largest_entries(B)
+        self.row_size = _sizes(B)
         self.bodies = Bodies(blocks, starts, self.dimension, body_of_block, num_bodies, comm)
         self.J = _without_rounding(diags_array(1.0 / self.row_size) @ self.Gt @ self.bodies.modes)
         self._read_load(blocks)
@@ -201,13 +201,12 @@ def _without_rounding(J: Any) -> csr_array:
     return J
 
 
-def _largest_entries(B: PETSc.Mat) -> Array:
-    """Largest entry of each local row, 1 where there is none."""
+def _sizes(B: PETSc.Mat) -> Array:
+    """Sum of the moduli of each local row, 1 where that is 0."""
     indptr, _, data = B.getValuesCSR()
     rows = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
-    largest = np.zeros(len(indptr) - 1)
-    np.maximum.at(largest, rows, np.abs(data))
-    return np.where(largest > 0.0, largest, 1.0)
+    sizes = np.bincount(rows, np.abs(data), minlength=len(indptr) - 1).astype(float)
+    return np.where(sizes > 0.0, sizes, 1.0)
 
 
 def _transposed_G(

@@ -76,23 +76,25 @@ def minimise(
     solve: Callable[[csr_array, Array], Array | None],
     tolerance: float,
     comm: MPI.Intracomm,
+    first: Array,
 ) -> Array | None:
     """Solve a program whose rows are spread over the ranks. Collective.
 
-    One rank solves it with some of the rows, begins with the extremes of each patch and is sent
-    what the others find violated: each time up to twice as many of a patch, so that it ends.
+    One rank solves it with some of the rows and is sent what the others find violated: each time
+    up to twice as many of a patch, so that it ends.
 
     Args:
         rows: This rank's rows.
         solve: Minimises over A y ≤ b, some of the rows, on rank 0; None ends the search.
         tolerance: Excess of a row that is let be.
         comm: Communicator.
+        first: Rows of this rank to begin with.
 
     Returns:
         The minimiser, or None where ``solve`` returned it.
     """
     A, b = csr_array((0, rows.A.shape[1])), np.zeros(0)
-    chosen, most = rows.extremes(), 1
+    chosen, most = first, 1
     rows.sent[:] = False
     while True:
         rows.sent[chosen] = True

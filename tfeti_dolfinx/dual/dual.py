@@ -15,7 +15,9 @@ from tfeti_dolfinx.dual.operator import (
     dual_operator,
     linear_term,
 )
-from tfeti_dolfinx.dual.recovery import recover
+from tfeti_dolfinx.dual.naming import listed
+from tfeti_dolfinx.dual.recovery import moved, recover
+from tfeti_dolfinx.dual.smallest import nearly_free, smallest_motion
 from tfeti_dolfinx.dual.solvability import check_solvable
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Unbounded
@@ -39,6 +41,7 @@ class Dual:
         preconditioner: The preconditioner, or None.
         coarse: The coarse space.
         num_inequalities: Inequality rows of all ranks.
+        nearly_free: After ``recover``: motions that contacts with a force hold hardly or not.
 
     Raises:
         NoSolutionError: The load moves a body that nothing holds.
@@ -54,6 +57,7 @@ class Dual:
         pc_type: str,
     ) -> None:
         self.constraints, self.blocks = constraints, blocks
+        self._names, self.nearly_free = (body_names, mode_names), list[dict[str, object]]()
         B, comm = constraints.B, constraints.B.getComm().tompi4py()
         self.F = dual_operator(B, blocks)
         self.preconditioner: BlockOperator | None = None
@@ -82,8 +86,14 @@ class Dual:
         closed = lam[bounded] <= 0.0
         nu[bounded] = np.where(closed, result.gradient.array_r[bounded], 0.0)
         constraints = self.constraints
-        u, _ = recover(constraints.B, constraints.c, self.blocks, self.coarse, result.lam, nu)
-        return u
+        u, gap = recover(constraints.B, constraints.c, self.blocks, self.coarse, result.lam, nu)
+        error = max(result.projected_gradient / (result.norm or 1.0), result.equality)
+        motions, force = nearly_free(self.coarse, lam, error)
+        self.nearly_free = listed(motions, self.coarse.bodies, *self._names)
+        if motions.count == 0:
+            return u
+        alpha = smallest_motion(self.coarse, self.blocks, u, gap, motions, force)
+        return moved(self.blocks, u, self.coarse, alpha)
 
     def destroy(self) -> None:
         """Destroy the PETSc objects."""

@@ -15,6 +15,7 @@ from tfeti_dolfinx.dual.bodies import Bodies
 from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.dual.cuts import Rows, minimise
 from tfeti_dolfinx.dual.motions import Motions
+from tfeti_dolfinx.dual.naming import free_to_move
 from tfeti_dolfinx.errors import NoSolutionError, TfetiError
 from tfeti_dolfinx.parallel import agreed
 
@@ -23,8 +24,6 @@ from tfeti_dolfinx.parallel import agreed
 SLOPE, LP_TOLERANCE = 1e-9, 1e-10
 # Columns from which the interior point method with its crossover beats the simplex method.
 LARGE = 2000
-# of the largest coefficient: what takes part in a motion, what it is named after; bodies named
-PART, DOMINANT, NAMED = 1e-3, 0.3, 4
 
 
 def check_solvable(
@@ -44,31 +43,16 @@ def check_solvable(
         return
     load = coarse.bodies.modes.T @ coarse.e
     motion = agreed(coarse.comm, _driven(coarse.free_motions, load, coarse.bodies))
+    reason = (
+        "nothing resists that and the load drives it; add a Dirichlet condition, a contact or a "
+        "spring, or balance the load"
+    )
+    if motion is None:
+        motion = escape(coarse)
+        reason = "only contact could resist that, and the load drives out of contact"
     if motion is not None:
-        raise NoSolutionError(
-            f"{_name(coarse.bodies.amounts(motion), body_names, mode_names)}: nothing resists "
-            "that and the load drives it; add a Dirichlet condition, a contact or a spring, or "
-            "balance the load"
-        )
-    motion = escape(coarse)
-    if motion is not None:
-        raise NoSolutionError(
-            f"{_name(coarse.bodies.amounts(motion), body_names, mode_names)}: only contact could "
-            "resist that, and the load drives out of contact"
-        )
-
-
-def _name(amounts: Array, body_names: Sequence[str], mode_names: Sequence[str]) -> str:
-    """The bodies that take part in a motion, and what it is mostly."""
-    parts = np.abs(amounts)
-    moving = np.flatnonzero(parts.max(axis=1) > PART * parts.max())
-    share = parts[moving].max(axis=0)
-    modes = " and ".join(mode_names[m] for m in np.flatnonzero(share > DOMINANT * share.max()))
-    if len(moving) == 1:
-        return f"{body_names[moving[0]]} is free to move ({modes})"
-    names = ", ".join(body_names[b] for b in moving[:NAMED])
-    more = f" and {len(moving) - NAMED} more" if len(moving) > NAMED else ""
-    return f"{names}{more} are free to move together ({modes})"
+        words = free_to_move(coarse.bodies.amounts(motion), body_names, mode_names)
+        raise NoSolutionError(f"{words}: {reason}")
 
 
 def _driven(free: Motions, load: Array, bodies: Bodies) -> Array | None:
@@ -105,9 +89,10 @@ def escape(coarse: CoarseSpace) -> Array | None:
     np.maximum.at(largest, part, np.abs(load))
     largest[largest == 0.0] = 1.0
     load, noise = load / largest[part], noise / largest[part]
-    y = minimise(rows, lambda A, _: _most_work(A, load, noise), SLOPE, coarse.comm)
+    comm, first = coarse.comm, rows.extremes()
+    y = minimise(rows, lambda A, _: _most_work(A, load, noise), SLOPE, comm, first)
     if y is not None:
-        y = minimise(rows, lambda A, _: _least_motion(A, load), SLOPE, coarse.comm)
+        y = minimise(rows, lambda A, _: _least_motion(A, load), SLOPE, comm, first)
     return None if y is None else np.asarray(Z @ y)
 
 
