@@ -11,7 +11,6 @@ from typing import Any
 
 from mpi4py import MPI
 
-
 PRINTED = 10  # of a list; all of it is in the file
 
 

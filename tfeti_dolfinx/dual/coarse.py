@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from mpi4py import MPI
@@ -152,11 +152,12 @@ class CoarseSpace:
 
     def _unresisted(self, rows: Array, within: Motions, below: float) -> Motions:
         """Found on one rank: processors that round differently might count differently."""
-        grams, found = self.comm.gather(self.J[rows].T @ self.J[rows], root=0), None
+        grams = self.comm.gather(self.J[rows].T @ self.J[rows], root=0)
+        found: Any = None
         with raised_on_all_ranks(self.comm):
             if grams is not None:
                 found = unresisted(csr_array(sum(grams)), within, below)
-        return agreed(self.comm, found)
+        return cast(Motions, agreed(self.comm, found))
 
     def destroy(self) -> None:
         """Free the factor."""

@@ -16,6 +16,7 @@ from tfeti_dolfinx.parallel import agreed
 # patches; what they miss comes by and by.
 DIRECTIONS = 12
 
+
 class Rows:
     """This rank's inequalities A y ≤ b, each between few bodies.
 
@@ -69,6 +70,13 @@ class Rows:
         starts = np.flatnonzero(np.diff(self.patch[row], prepend=-1))
         place = np.arange(len(row)) - np.repeat(starts, np.diff(starts, append=len(row)))
         return row[place < most]
+
+    def allowed(self, y: Array, tolerance: float, comm: MPI.Intracomm) -> float:
+        """Largest share of y, up to 1, that meets all rows; 0 does. Collective."""
+        value = self.A @ y
+        beyond = value > self.b + tolerance
+        shares = np.maximum(self.b[beyond], 0.0) / value[beyond]
+        return float(comm.allreduce(float(shares.min(initial=1.0)), op=MPI.MIN))
 
 
 def minimise(

@@ -8,6 +8,7 @@ import numpy as np
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
+from tfeti_dolfinx.dual.naming import listed
 from tfeti_dolfinx.dual.operator import (
     PRECONDITIONERS,
     BlockOperator,
@@ -15,11 +16,11 @@ from tfeti_dolfinx.dual.operator import (
     dual_operator,
     linear_term,
 )
-from tfeti_dolfinx.dual.naming import listed
 from tfeti_dolfinx.dual.recovery import moved, recover
 from tfeti_dolfinx.dual.smallest import nearly_free, smallest_motion
 from tfeti_dolfinx.dual.solvability import check_solvable
 from tfeti_dolfinx.gluing.constraints import Constraints
+from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Unbounded
 from tfeti_dolfinx.qp.problem import QP, Coarse, NoCoarse, QPResult
 from tfeti_dolfinx.subdomains.block import Block
@@ -89,7 +90,8 @@ class Dual:
         u, gap = recover(constraints.B, constraints.c, self.blocks, self.coarse, result.lam, nu)
         error = max(result.projected_gradient / (result.norm or 1.0), result.equality)
         motions, force = nearly_free(self.coarse, lam, error)
-        self.nearly_free = listed(motions, self.coarse.bodies, *self._names)
+        words = listed(motions, self.coarse.bodies, *self._names)
+        self.nearly_free = agreed(self.coarse.comm, words)
         if motions.count == 0:
             return u
         alpha = smallest_motion(self.coarse, self.blocks, u, gap, motions, force)

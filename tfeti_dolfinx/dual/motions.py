@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import block_array, bsr_array, csr_array, diags_array, eye_array
+from scipy.sparse import bsr_array, csr_array, diags_array, eye_array
 from scipy.sparse.csgraph import connected_components
 
 from tfeti_dolfinx.arrays import Array
@@ -43,13 +43,6 @@ class Motions:
     def alone(self) -> csr_array:
         """The motions of single bodies as columns, shape ``(bodies * k, a)``."""
         return csr_array(block_diagonal(self.single)[:, np.flatnonzero(self.free.ravel())])
-
-    @cached_property
-    def basis(self) -> csr_array:
-        """All of them as columns, shape ``(bodies * k, a + c)``."""
-        if self.joint.shape[1] == 0:
-            return self.alone
-        return csr_array(block_array([[self.alone, csr_array(self.joint)]]))
 
     @property
     def count(self) -> int:
@@ -97,9 +90,9 @@ def unresisted(gram: csr_array, within: Motions, below: float = NULL) -> Motions
         gram: JᵀJ of the rows, shape ``(bodies * k,) * 2``.
         within: The space to look in; its joint motions are not looked at.
         below: Motions of a single body held by less than this share of its stiffest motion are
-            taken in too; those of several bodies must be free.
+            taken in too; those of several bodies must be free (and may have parts in those).
     """
-    n, k = within.free.shape
+    k = within.free.shape[1]
     V = block_diagonal(within.single)
     kept = diags_array(within.free.ravel().astype(float))
     A = csr_array(kept @ (V.T @ gram @ V) @ kept)
@@ -110,14 +103,13 @@ def unresisted(gram: csr_array, within: Motions, below: float = NULL) -> Motions
     # what is not in the space is held; twice the stiffest motion keeps it apart in the order
     blocks[:, np.arange(k), np.arange(k)] += np.where(within.free, 0.0, 2.0)
     stiffness, vectors = np.linalg.eigh(blocks)
-    free = stiffness <= below
-    held = ~free & (stiffness < 1.5)
+    held = (stiffness > NULL) & (stiffness < 1.5)
     # coordinates in which every body alone resists all its motions alike
     U = block_diagonal(vectors * (np.where(held, stiffness, 1.0) ** -0.5)[:, None, :])
     U = csr_array(U[:, np.flatnonzero(held.ravel())])
     joint = scale @ (U @ _null_space(csr_array(U.T @ A @ U), np.nonzero(held)[0]))
     single = within.single @ vectors
-    return Motions(single, free, np.maximum(stiffness, 0.0), np.asarray(V @ joint))
+    return Motions(single, stiffness <= below, np.maximum(stiffness, 0.0), np.asarray(V @ joint))
 
 
 def _null_space(A: csr_array, body: Array) -> Array:

@@ -59,11 +59,19 @@ def listed(
             _, mode = _parts(vectors[:, j][None, :], mode_names)
             held = float(stiffness[j])
             found.append({"bodies": [body_names[body]], "mode": mode, "stiffness": held})
-    for motion in motions.joint.T:
+    for motion in _plain(motions.joint).T:
         moving, mode = _parts(bodies.amounts(motion), mode_names)
         names = [body_names[b] for b in moving]
         found.append({"bodies": names, "mode": mode, "stiffness": 0.0})
     return found
+
+
+def _plain(joint: Array) -> Array:
+    """Motions that span the same, each with a coordinate that the others leave alone."""
+    if joint.shape[1] == 0:
+        return joint
+    rows = qr(joint.T, pivoting=True, mode="r")[1][: joint.shape[1]]
+    return np.asarray(joint @ np.linalg.inv(joint[np.sort(rows)]))
 
 
 def _spanning(vectors: Array, mode_names: Sequence[str]) -> list[str]:

@@ -14,6 +14,7 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.dual.cuts import Rows, minimise
 from tfeti_dolfinx.dual.motions import Motions
+from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.subdomains.block import Block
 
 # Motions held by less than this share of what the same contacts hold at most are nearly free:
@@ -22,6 +23,8 @@ NEARLY = 1e-2
 # Contact force that counts as none: as a share of the largest on the same bodies; or in multiples
 # of the solver's own error, unless it is a larger share of the bodies' loads.
 NO_FORCE, NO_EFFECT = 1e-6, 10.0
+# Size of what is left of a joint motion that motions of single bodies span already.
+DEPENDENT = 1e-8
 # Excess of a row, as a share of the motion, that is let be; slope of a row that is rounding.
 EXCESS, SLOPE = 1e-9, 1e-12
 
@@ -77,7 +80,7 @@ def smallest_motion(
     Returns:
         Shape ``(r,)``.
     """
-    N, body = _orthonormal(motions, coarse.bodies.k)
+    N, body = agreed(coarse.comm, _orthonormal(motions, coarse.bodies.k))
     wanted = -(N.T @ coarse.bodies.part_of(u, blocks))
     size = float(np.abs(wanted).max(initial=0.0))
     rows = _rows(coarse, csr_array(coarse.J @ N), gap / coarse.row_size, force, body)
@@ -88,7 +91,9 @@ def smallest_motion(
         coarse.comm,
         np.empty(0, dtype=np.int64),
     )
-    return np.asarray(coarse.bodies.modes @ (N @ y))
+    if y is None:
+        return np.zeros(coarse.dimension)
+    return np.asarray(coarse.bodies.modes @ (N @ (rows.allowed(y, EXCESS * size, coarse.comm) * y)))
 
 
 def _orthonormal(motions: Motions, k: int) -> tuple[csr_array, Array]:
@@ -97,7 +102,9 @@ def _orthonormal(motions: Motions, k: int) -> tuple[csr_array, Array]:
     body = np.repeat(np.arange(len(motions.free)), motions.free.sum(axis=1))
     if joint.shape[1] == 0:
         return alone, body
-    joint = np.linalg.qr(joint - alone @ (alone.T @ joint))[0]
+    joint = joint / np.linalg.norm(joint, axis=0)
+    U, size, _ = np.linalg.svd(joint - alone @ (alone.T @ joint), full_matrices=False)
+    joint = U[:, size > DEPENDENT]
     first = np.argmax(np.abs(joint) > SLOPE, axis=0) // k
     return csr_array(block_array([[alone, csr_array(joint)]])), np.concatenate((body, first))
 
@@ -120,7 +127,7 @@ def _nearest(A: csr_array, b: Array, wanted: Array) -> Array:
     if A.shape[0] == 0:
         return y
     links = csr_array(abs(A).T @ abs(A))
-    count, part = connected_components(links, directed=False)
+    part = connected_components(links, directed=False)[1]
     part_of_row = part[A.indices[A.indptr[:-1]]]
     for p in np.unique(part_of_row):
         columns, rows = np.flatnonzero(part == p), np.flatnonzero(part_of_row == p)
