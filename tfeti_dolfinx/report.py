@@ -27,6 +27,7 @@ class Report:
         contact_candidates: Nodes of the (secondary) contact surfaces.
         far_contact_nodes: Those that were out of reach or not covered, and have no row.
         late_contact_rows: Rows that nodes out of reach got after a solve, since they overlapped.
+        unmet_contacts: Contacts none of whose nodes has a row: position in the list, and name.
         dropped_contact_rows: Those that prescribed components decide alone.
         active_contacts: Rows with a positive force.
         F_multiplications: Multiplications by F, all but the power method's.
@@ -61,6 +62,7 @@ class Report:
     contact_candidates: int = 0
     far_contact_nodes: int = 0
     late_contact_rows: int = 0
+    unmet_contacts: list[str] = field(default_factory=list)
     dropped_contact_rows: int = 0
     active_contacts: int = 0
     F_multiplications: int = 0
@@ -98,7 +100,7 @@ class Report:
             if isinstance(value, dict) and value:
                 lines += [f"{name}.{key:<22} {item:.6g}" for key, item in value.items()]
             else:
-                lines.append(f"{name:<31} {'-' if value == {} else value}")
+                lines.append(f"{name:<31} {'-' if value in ({}, []) else value}")
         return "\n".join(lines)
 
     def to_json(self) -> str:

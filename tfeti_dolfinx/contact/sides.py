@@ -1,0 +1,56 @@
+"""Which side of a pair is the stiffer one, where they meet."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.contact.facet_maps import hat_areas
+from tfeti_dolfinx.contact.facets import facet_kind, local_facets
+from tfeti_dolfinx.contact.records import ContactRecords
+from tfeti_dolfinx.contact.surfaces import surface_facets
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.parallel import agreed
+
+
+def stiffness_ratio(
+    records: ContactRecords,
+    surfaces: tuple[str | int, str | int],
+    dofs: TornDofs,
+    decomposition: Decomposition,
+    stiffness: Array,
+) -> float:
+    """Stiffness per area of the first surface over that of the second. Collective.
+
+    Stiffness per area is E/h of the elements at a surface: Σ K_ii / Σ ∫φ_i over its vertices,
+    before anything is glued. Those that rows near name are taken, so that a mesh that is fine
+    only where the bodies touch is judged there; where there is no such row, all of them.
+
+    Args:
+        records: Conditions between the surfaces.
+        surfaces: Their names or tags.
+        dofs: Dof maps.
+        decomposition: The torn mesh.
+        stiffness: Diagonal of K in primal order, shape ``(num_nodes * bs,)``.
+    """
+    diagonal = dofs.reduce(stiffness.reshape(-1, dofs.bs), np.add, 0.0).sum(axis=1)
+    named = records.entry_group[records.near[records.row]]
+    meets = dofs.add_on_owners(named, np.ones(len(named))) > 0.0
+    if dofs.comm.allreduce(int(np.sum(meets))) == 0:
+        meets[:] = True
+    per_area = []
+    for name in surfaces:
+        area = _vertex_areas(name, dofs, decomposition)
+        at = meets & (area > 0.0)
+        sums = dofs.comm.allreduce(np.array([diagonal[at].sum(), area[at].sum()]))
+        per_area.append(sums[0] / sums[1])
+    return agreed(dofs.comm, float(per_area[0] / per_area[1]))
+
+
+def _vertex_areas(name: str | int, dofs: TornDofs, decomposition: Decomposition) -> Array:
+    """∫φ_i over a surface for each owned group, 0 off its vertices. Collective."""
+    kind = facet_kind(dofs)
+    facets = local_facets(dofs, decomposition, surface_facets(decomposition, name))
+    vertices = facets.groups[:, : kind.num_vertices]
+    return dofs.add_on_owners(vertices.ravel(), hat_areas(kind, facets).ravel())
