@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array, sum_rows
+from tfeti_dolfinx.contact.facet_maps import points
 from tfeti_dolfinx.contact.facets import FacetKind, Facets
-from tfeti_dolfinx.contact.segments import Segments
+from tfeti_dolfinx.contact.segments import FacingPoints, Segments
 
 HARDLY_COVERED = 1e-6
 
@@ -98,12 +99,12 @@ def integrate(
     at = segments.points
     dual = dual_multipliers(kind, secondary.area, at.secondary, at.xi, segments.weight)
     normals = secondary.vertex_normals[dual.facet]
-    apart = at.apart(kind, secondary, primary)
+    apart = _apart(kind, secondary, primary, at)
     lowest, highest = _range(
         dual,
         normals,
         np.concatenate((at.secondary, segments.corners.secondary)),
-        np.concatenate((apart, segments.corners.apart(kind, secondary, primary))),
+        np.concatenate((apart, _apart(kind, secondary, primary, segments.corners))),
         segments.whole,
     )
     stride = max(len(primary), 1)
@@ -120,6 +121,19 @@ def integrate(
         pair_primary=pair % stride,
         other=sum_rows(pair_row, dual.weighted[:, :, None] * theirs[:, None], len(pair)),
     )
+
+
+def _apart(kind: FacetKind, secondary: Facets, primary: Facets, at: FacingPoints) -> Array:
+    """Vectors along the surface's normal that close the gap, shape ``(m, gdim)``.
+
+    From one facet to the other one looks along the normal of a whole facet; what closes the gap
+    of curved bodies is the part along the normal at the point, interpolated from the vertices.
+    """
+    there = points(kind.geometry, primary.x[at.primary], at.eta)
+    here = points(kind.geometry, secondary.x[at.secondary], at.xi)
+    normal = points(kind.hats, secondary.vertex_normals[at.secondary], at.xi)
+    distance = np.sum((there - here) * normal, axis=1) / np.sum(normal**2, axis=1)
+    return distance[:, None] * normal
 
 
 def _range(

@@ -39,11 +39,6 @@ class FacingPoints:
     xi: Array
     eta: Array
 
-    def apart(self, kind: FacetKind, secondary: Facets, primary: Facets) -> Array:
-        """Vectors from the secondary to the primary facets, shape ``(m, gdim)``."""
-        there = points(kind.geometry, primary.x[self.primary], self.eta)
-        return there - points(kind.geometry, secondary.x[self.secondary], self.xi)
-
 
 @dataclass(frozen=True)
 class Segments:

@@ -6,7 +6,7 @@ import numpy as np
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.contact.facet_maps import hat_areas
-from tfeti_dolfinx.contact.facets import facet_kind, local_facets
+from tfeti_dolfinx.contact.facets import facet_kind, local_facets, with_averaged_normals
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.surfaces import surface_facets
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -23,9 +23,10 @@ def stiffness_ratio(
 ) -> float:
     """Stiffness per area of the first surface over that of the second. Collective.
 
-    Stiffness per area is E/h of the elements at a surface: Σ K_ii / Σ ∫φ_i over its vertices,
-    before anything is glued. Those that rows near name are taken, so that a mesh that is fine
-    only where the bodies touch is judged there; where there is no such row, all of them.
+    Stiffness per area is E/h of the elements at a surface: Σ n_i·K_ii n_i / Σ ∫φ_i over its
+    vertices, K_ii the diagonal before anything is glued, n_i the normal. The vertices that rows
+    name are taken, so that a mesh that is fine only where the bodies touch is judged there; where
+    there is no such row, all of them.
 
     Args:
         records: Conditions between the surfaces.
@@ -34,23 +35,29 @@ def stiffness_ratio(
         decomposition: The torn mesh.
         stiffness: Diagonal of K in primal order, shape ``(num_nodes * bs,)``.
     """
-    diagonal = dofs.reduce(stiffness.reshape(-1, dofs.bs), np.add, 0.0).sum(axis=1)
+    diagonal = dofs.reduce(stiffness.reshape(-1, dofs.bs), np.add, 0.0)
     named = records.entry_group[records.near[records.row]]
     meets = dofs.add_on_owners(named, np.ones(len(named))) > 0.0
     if dofs.comm.allreduce(int(np.sum(meets))) == 0:
         meets[:] = True
     per_area = []
     for name in surfaces:
-        area = _vertex_areas(name, dofs, decomposition)
+        area, normal = _vertices(name, dofs, decomposition)
         at = meets & (area > 0.0)
-        sums = dofs.comm.allreduce(np.array([diagonal[at].sum(), area[at].sum()]))
+        along = np.sum(normal[at] ** 2 * diagonal[at])
+        sums = dofs.comm.allreduce(np.array([along, area[at].sum()]))
         per_area.append(sums[0] / sums[1])
     return agreed(dofs.comm, float(per_area[0] / per_area[1]))
 
 
-def _vertex_areas(name: str | int, dofs: TornDofs, decomposition: Decomposition) -> Array:
-    """∫φ_i over a surface for each owned group, 0 off its vertices. Collective."""
+def _vertices(name: str | int, dofs: TornDofs, decomposition: Decomposition) -> tuple[Array, Array]:
+    """∫φ_i and the normal for each owned group that is a vertex of a surface, else 0. Collective.
+
+    Returns:
+        Shapes ``(g,)`` and ``(g, gdim)``.
+    """
     kind = facet_kind(dofs)
     facets = local_facets(dofs, decomposition, surface_facets(decomposition, name))
     vertices = facets.groups[:, : kind.num_vertices]
-    return dofs.add_on_owners(vertices.ravel(), hat_areas(kind, facets).ravel())
+    area = dofs.add_on_owners(vertices.ravel(), hat_areas(kind, facets).ravel())
+    return area, with_averaged_normals(facets, dofs, kind.num_vertices)[1]
