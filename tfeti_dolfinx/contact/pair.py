@@ -13,11 +13,11 @@ from tfeti_dolfinx.contact.arguments import Gap, checked_gap, checked_reach, giv
 from tfeti_dolfinx.contact.candidates import candidate_pairs, rendezvous
 from tfeti_dolfinx.contact.conditions import conditions, triplets
 from tfeti_dolfinx.contact.facet_maps import hat_areas
-from tfeti_dolfinx.contact.facets import Facets, facet_kind, local_facets, with_averaged_normals
+from tfeti_dolfinx.contact.facets import facet_kind, with_averaged_normals
 from tfeti_dolfinx.contact.mortar import integrate
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.segments import Segments, find_segments
-from tfeti_dolfinx.contact.sides import stiffness_ratio
+from tfeti_dolfinx.contact.sides import has_edges, side_facets, stiffness_ratio
 from tfeti_dolfinx.contact.surfaces import (
     diameter,
     extent,
@@ -32,8 +32,6 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 # One looks farther than the reach: else facets at its edge would be covered partly, and an overlap
 # that is too deep would not be seen.
 SEEN = 3.0
-DEGENERATE = 1e-12  # of the square (in 2D: of the length) of a facet's radius
-CREASE = 0.75  # facets that make more than about 40 degrees with the averaged normal
 # ratios of stiffness per area: up to the first, rounding must not decide; from the second on, the
 # choice of the secondary side shows in the pressure
 EQUAL, MUCH_WORSE = 1.01, 2.0
@@ -193,7 +191,8 @@ class Contact:
         """
         kind, comm = facet_kind(dofs), decomposition.comm
         v = kind.num_vertices
-        secondary, normals, primary = self._sides(dofs, decomposition, v)
+        sides = [side_facets(self.name, side, dofs, decomposition) for side in self.surfaces]
+        (secondary, normals), primary = with_averaged_normals(sides[0], dofs, v), sides[1]
         seen = SEEN * max(reach, depth)
         near_s, near_p = rendezvous(secondary, primary, seen, comm)
         with raised_on_all_ranks(comm):
@@ -250,25 +249,9 @@ class Contact:
     def _exchanged(self) -> Contact:
         return replace(self, a=self.b, b=self.a)
 
-    def _sides(
-        self, dofs: TornDofs, decomposition: Decomposition, num_vertices: int
-    ) -> tuple[Facets, Array, Facets]:
-        """Secondary facets, averaged normals of the owned groups, primary facets. Collective."""
-        sides = []
-        for name in self.surfaces:
-            facets = local_facets(dofs, decomposition, surface_facets(decomposition, name))
-            whole = facets.radius ** (facets.x.shape[2] - 1)
-            flat = int(np.sum(facets.area <= DEGENERATE * whole))
-            if count := decomposition.comm.allreduce(flat):
-                raise InputError(f"{self.name}: {count} facets of {name!r} have no area")
-            sides.append(facets)
-        return *with_averaged_normals(sides[0], dofs, num_vertices), sides[1]
-
     def _warn_of_edges(self, dofs: TornDofs, decomposition: Decomposition) -> None:
         """Log on rank 0 that the secondary surface has edges. Collective."""
-        secondary, _, _ = self._sides(dofs, decomposition, facet_kind(dofs).num_vertices)
-        cosine = np.einsum("nvg,ng->nv", secondary.vertex_normals, secondary.normal)
-        if decomposition.comm.allreduce(int(np.sum(cosine < CREASE))) and not dofs.comm.rank:
+        if has_edges(self.a, dofs, decomposition) and dofs.comm.rank == 0:
             log.warning(
                 "%s: %r has edges; normals are averaged there. Give the sides of an edge names of "
                 "their own, and a pair each",

@@ -1,4 +1,4 @@
-"""Which side of a pair is the stiffer one, where they meet."""
+"""The two sides of a pair: their facets, and which is the stiffer one where they meet."""
 
 from __future__ import annotations
 
@@ -6,12 +6,46 @@ import numpy as np
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.contact.facet_maps import hat_areas
-from tfeti_dolfinx.contact.facets import facet_kind, local_facets, with_averaged_normals
+from tfeti_dolfinx.contact.facets import Facets, facet_kind, local_facets, with_averaged_normals
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.surfaces import surface_facets
+from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.parallel import agreed
+
+DEGENERATE = 1e-12  # of the square (in 2D: of the length) of a facet's radius
+CREASE = 0.75  # facets that make more than about 40 degrees with the averaged normal
+
+
+def side_facets(
+    contact: str, surface: str | int, dofs: TornDofs, decomposition: Decomposition
+) -> Facets:
+    """Facets of a surface on this rank. Collective.
+
+    Args:
+        contact: Name of the contact, for messages.
+        surface: Name or tag of the surface.
+        dofs: Dof maps.
+        decomposition: The torn mesh.
+
+    Raises:
+        InputError: The surface is unknown or empty, or has facets without area.
+    """
+    facets = local_facets(dofs, decomposition, surface_facets(decomposition, surface))
+    whole = facets.radius ** (facets.x.shape[2] - 1)
+    flat = int(np.sum(facets.area <= DEGENERATE * whole))
+    if count := decomposition.comm.allreduce(flat):
+        raise InputError(f"{contact}: {count} facets of {surface!r} have no area")
+    return facets
+
+
+def has_edges(surface: str | int, dofs: TornDofs, decomposition: Decomposition) -> bool:
+    """Whether a facet stands far off the averaged normal at one of its vertices. Collective."""
+    facets = local_facets(dofs, decomposition, surface_facets(decomposition, surface))
+    facets, _ = with_averaged_normals(facets, dofs, facet_kind(dofs).num_vertices)
+    cosine = np.einsum("nvg,ng->nv", facets.vertex_normals, facets.normal)
+    return decomposition.comm.allreduce(int(np.sum(cosine < CREASE))) > 0
 
 
 def stiffness_ratio(
