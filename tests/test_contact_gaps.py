@@ -162,3 +162,15 @@ def test_the_gap_of_a_pair_is_what_is_given():
     x = group_points(dofs)[records.group]
     assert np.allclose(records.gap, x[:, 0] - 0.5)
     assert MPI.COMM_WORLD.allreduce(len(records)) == 5
+
+
+def test_a_given_gap_ends_where_the_reach_does():
+    d = bent("triangle", 3, 16, 0.0, 0.4)
+    dofs = dofs_of(d)
+    geometry, given = (
+        searched([sided(*ORDERS[0], reach=0.05, gap=gap)], dofs, d) for gap in ("geometry", -0.01)
+    )
+    within = geometry.gap <= 0.05
+    assert np.allclose(given.gap, np.where(within, -0.01, geometry.gap))
+    assert np.array_equal(given.near, within)
+    assert 0 < MPI.COMM_WORLD.allreduce(np.sum(within)) < MPI.COMM_WORLD.allreduce(len(within))

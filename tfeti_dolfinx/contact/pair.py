@@ -12,12 +12,11 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.contact.arguments import Gap, checked_gap, checked_reach, given_gaps
 from tfeti_dolfinx.contact.candidates import candidate_pairs, rendezvous
 from tfeti_dolfinx.contact.conditions import conditions, triplets
-from tfeti_dolfinx.contact.facet_maps import hat_areas
-from tfeti_dolfinx.contact.facets import facet_kind, with_averaged_normals
+from tfeti_dolfinx.contact.facets import facet_kind
 from tfeti_dolfinx.contact.mortar import integrate
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.segments import Segments, find_segments
-from tfeti_dolfinx.contact.sides import has_edges, side_facets, stiffness_ratio
+from tfeti_dolfinx.contact.sides import Side, side_of, stiffness_ratio
 from tfeti_dolfinx.contact.surfaces import (
     diameter,
     extent,
@@ -36,6 +35,15 @@ SEEN = 3.0
 # choice of the secondary side shows in the pressure
 EQUAL, MUCH_WORSE = 1.01, 2.0
 
+WORSE = (
+    "%s: the secondary side %r is %.3g times as stiff per area as %r, where they meet; the "
+    "pressure would be better with secondary=%r"
+)
+EDGES = (
+    "%s: %r has edges; normals are averaged there. Give the sides of an edge names of their own, "
+    "and a pair each"
+)
+
 log = logging.getLogger(__name__)
 
 
@@ -51,8 +59,8 @@ class Contact:
         secondary: The surface that carries the multipliers and the pressure, ``a`` or ``b``.
             "auto": the softer one, by the stiffness per area of its elements, E/h.
         gap: "geometry" for the distance between the surfaces, or what replaces it wherever they
-            face each other within reach (negative: interference): a number, or a function of the
-            secondary surface's vertices, shape ``(3, n)``.
+            are not farther apart than the reach (negative: interference): a number, or a function
+            of the secondary surface's vertices, shape ``(3, n)``.
         reach: Surfaces farther apart than this make no rows at first; after the solve it is
             checked that none of them has come to overlap. Default: 5 % of the smaller surface's
             extent.
@@ -121,24 +129,17 @@ class Contact:
             InputError: As ``records``.
         """
         settled = self._named_first(decomposition)
-        found = settled.records(dofs, decomposition, contact, reach, reach)
-        sides = settled.a, settled.b
-        ratio = stiffness_ratio(found, sides, dofs, decomposition, stiffness)
-        if self.secondary != "auto":
-            if ratio > MUCH_WORSE and dofs.comm.rank == 0:
-                log.warning(
-                    "%s: the secondary side %r is %.3g times as stiff per area as %r, where they "
-                    "meet; the pressure would be better with secondary=%r",
-                    self.name,
-                    settled.a,
-                    ratio,
-                    settled.b,
-                    settled.b,
-                )
-        elif ratio > EQUAL:
-            settled = settled._exchanged()
-            found = settled.records(dofs, decomposition, contact, reach, reach)
-        settled._warn_of_edges(dofs, decomposition)
+        sides = settled._sides(dofs, decomposition)
+        found = settled._meet(sides, dofs, contact, reach, reach)
+        ratio = stiffness_ratio(found, sides, dofs, stiffness)
+        if self.secondary == "auto" and ratio > EQUAL:
+            settled, sides, ratio = settled._exchanged(), (sides[1], sides[0]), 1.0 / ratio
+            found = settled._meet(sides, dofs, contact, reach, reach)
+        edges = sides[0].has_edges(dofs.comm)
+        if ratio > MUCH_WORSE and dofs.comm.rank == 0:
+            log.warning(WORSE, self.name, settled.a, ratio, settled.b, settled.b)
+        if edges and dofs.comm.rank == 0:
+            log.warning(EDGES, self.name, settled.a)
         return settled, found
 
     def displacement_bound(self, dofs: TornDofs, decomposition: Decomposition, u: Array) -> float:
@@ -182,17 +183,26 @@ class Contact:
             contact: Index of the contact.
             reach: Conditions with a larger gap are not near; those of surfaces three times as
                 far apart are not made.
-            depth: Largest initial overlap of the geometry, unless a gap is given.
+            depth: Largest initial overlap of the geometry, and how far a given gap replaces it.
 
         Raises:
             InputError: The surfaces overlap by more than ``depth`` (they are looked at up to three
                 times as deep), face away from each other, or have facets without area; or a given
                 gap is no number somewhere.
         """
-        kind, comm = facet_kind(dofs), decomposition.comm
-        v = kind.num_vertices
-        sides = [side_facets(self.name, side, dofs, decomposition) for side in self.surfaces]
-        (secondary, normals), primary = with_averaged_normals(sides[0], dofs, v), sides[1]
+        sides = self._sides(dofs, decomposition)
+        return self._meet(sides, dofs, contact, reach, depth)
+
+    def _sides(self, dofs: TornDofs, decomposition: Decomposition) -> tuple[Side, Side]:
+        a, b = (side_of(self.name, side, dofs, decomposition) for side in self.surfaces)
+        return a, b
+
+    def _meet(
+        self, sides: tuple[Side, Side], dofs: TornDofs, contact: int, reach: float, depth: float
+    ) -> ContactRecords:
+        """The conditions; arguments as of ``records``. Collective."""
+        kind, comm = facet_kind(dofs), dofs.comm
+        v, secondary, primary = kind.num_vertices, sides[0].facets, sides[1].facets
         seen = SEEN * max(reach, depth)
         near_s, near_p = rendezvous(secondary, primary, seen, comm)
         with raised_on_all_ranks(comm):
@@ -219,18 +229,18 @@ class Contact:
             covered=integrals.covered,
             gaps=integrals.gap,
             entries=entries,
-            nodes=secondary.groups[:, :v],
-            areas=hat_areas(kind, secondary),
-            normals=normals,
+            nodes=sides[0].vertices,
+            areas=sides[0].areas,
+            normals=sides[0].normals,
             bounds=(integrals.lowest, integrals.highest),
         )
-        x = group_points(dofs)[found.group]
+        x, within = group_points(dofs)[found.group], found.gap <= depth
         with raised_on_all_ranks(comm):
             given = given_gaps(self.name, self.gap, x)
         if given is None:
             self._check_depth(found, depth, comm)
         else:
-            found = replace(found, gap=given)
+            found = replace(found, gap=np.where(within, given, found.gap))
         return replace(found, near=found.gap <= reach)
 
     def _named_first(self, decomposition: Decomposition) -> Contact:
@@ -248,16 +258,6 @@ class Contact:
 
     def _exchanged(self) -> Contact:
         return replace(self, a=self.b, b=self.a)
-
-    def _warn_of_edges(self, dofs: TornDofs, decomposition: Decomposition) -> None:
-        """Log on rank 0 that the secondary surface has edges. Collective."""
-        if has_edges(self.a, dofs, decomposition) and dofs.comm.rank == 0:
-            log.warning(
-                "%s: %r has edges; normals are averaged there. Give the sides of an edge names of "
-                "their own, and a pair each",
-                self.name,
-                self.a,
-            )
 
     def _check_facing(self, segments: Segments, comm: MPI.Intracomm) -> None:
         averted = comm.allreduce(int(segments.averted))
