@@ -145,7 +145,8 @@ def test_the_gap_of_an_obstacle_is_what_is_given():
     d = decomposed("quadrilateral", 4)
     plane = tfeti.Plane((0, -0.3), (0, 1))
     for gap, expected in ((0.01, 0.01), (-0.02, -0.02), (lambda x: 0.1 * x[0], None)):
-        p = problem(d, clamped=("top",), contacts=[tfeti.Obstacle("bottom", plane, gap=gap)])
+        contacts = [tfeti.Obstacle("bottom", plane, gap=gap)]
+        p = problem(d, contacts=contacts, clamped=("top",), loaded="right")
         p.solve()
         records, x = p.solution.gluing.records, p.solution.contact().points
         assert np.allclose(records.gap, 0.1 * x[:, 0] if expected is None else expected)
