@@ -114,8 +114,9 @@ class ContactSearch:
         stiffness: Array,
     ) -> None:
         self._dofs, self._decomposition = dofs, decomposition
-        self.length = diameter(decomposition)
-        self._depths = [contact.first_reach(decomposition) for contact in contacts]
+        self.length = agreed(dofs.comm, diameter(decomposition))
+        reach = [contact.first_reach(decomposition) for contact in contacts]
+        self._depths = agreed(dofs.comm, reach)
         self._reach = list(self._depths)
         _check_pairs(contacts, decomposition)
         settled = [
