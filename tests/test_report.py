@@ -13,7 +13,7 @@ from tfeti_dolfinx import Report
 @pytest.fixture(scope="module")
 def report():
     d = decomposed("hexahedron", 6, 8)
-    p = problem(d, contacts=[tfeti.Obstacle("bottom", curved_obstacle(3))])
+    p = problem(d, contacts=[tfeti.Obstacle("bottom", curved_obstacle(3), reach=0.1)])
     p.solve()
     return p.report
 

@@ -110,10 +110,12 @@ class ContactProblem:
         """
         self.destroy()
         self.report.reset()
-        with stage("contact", self.report.seconds):
-            search = ContactSearch(self.contacts, self.dofs, self.decomposition)
         with stage("assembly", self.report.seconds):
             self._K, self._f = self._forms.stiffness(), self._forms.load()
+        with stage("contact", self.report.seconds):
+            diagonal = self.dofs.to_primal(self._K.diagonal())
+            search = ContactSearch(self.contacts, self.dofs, self.decomposition, diagonal)
+            self._settled = search.contacts
         previous = None
         for _ in range(MAX_ROUNDS):
             self._glue(search)
@@ -132,6 +134,7 @@ class ContactProblem:
             self.report.late_contact_rows += late
         else:
             raise ConvergenceError(f"nodes out of reach still overlap after {MAX_ROUNDS} rounds")
+        search.warn_of_unmet()
         if self.options.view and self.decomposition.comm.rank == 0:
             print(self.options.view_text(self._prefix), self.report, sep="\n", flush=True)
         return self.u
@@ -148,6 +151,7 @@ class ContactProblem:
         with stage("gluing", self.report.seconds):
             if self._constraints is not None:
                 self._constraints.destroy()
+            self.report.unmet_contacts = search.unmet()
             records, weights = search.records, self._weights()
             self._gluing = glue(self.dofs, self.bcs, records, search.length, weights)
             self._constraints = self._gluing.constraints
@@ -197,7 +201,7 @@ class ContactProblem:
                 lam=np.array(result.lam.array_r),
                 mu=result.mu,
                 stress=self._stress,
-                contacts=self.contacts,
+                contacts=self._settled,
             )
         fill_result(report, self.solution, dual, result, accuracy, self._counters)
         result.destroy()
