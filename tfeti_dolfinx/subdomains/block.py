@@ -68,6 +68,17 @@ class Block(Protocol):
         """S w, S the Schur complement of K on the trace, shapes ``(t,)``."""
         ...
 
+    def prepare(self, operator: str) -> None:
+        """Make what an operator needs, so that no error can come up in a collective call.
+
+        Args:
+            operator: ``"pinv"``, ``"stiffness"`` or ``"schur"``.
+
+        Raises:
+            FactorError: A factor that it needs could not be made.
+        """
+        ...
+
     def recover(self, w: Array) -> Array:
         """K⁺(f − w) on all unknowns, shape ``(n,)``; w on the trace."""
         ...
