@@ -26,6 +26,16 @@ class ConvergenceError(TfetiError, RuntimeError):
     """A solver stopped before it reached its tolerance."""
 
 
+class ConformanceError(TfetiError, AssertionError):
+    """An implementation does not do what its interface promises; the message says what."""
+
+
+def require(holds: object, promise: str) -> None:
+    """Raise a ConformanceError unless a promise holds; ``assert`` would go with ``python -O``."""
+    if not holds:
+        raise ConformanceError(f"this does not hold: {promise}")
+
+
 @contextmanager
 def raised_on_all_ranks(comm: MPI.Intracomm) -> Iterator[None]:
     """Let an exception of any rank inside the block be raised on all ranks at its end.

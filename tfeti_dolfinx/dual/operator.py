@@ -12,7 +12,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.errors import raised_on_all_ranks
+from tfeti_dolfinx.errors import raised_on_all_ranks, require
 from tfeti_dolfinx.subdomains.block import Block
 
 
@@ -156,7 +156,11 @@ def linear_term(B: PETSc.Mat, c: PETSc.Vec, blocks: Sequence[Block]) -> PETSc.Ve
 
 
 def check_operator(F: Any, like: PETSc.Vec, tol: float = 1e-10) -> None:
-    """Assert that an operator is symmetric and positive semidefinite on random vectors."""
+    """Check that an operator is symmetric and positive semidefinite on random vectors. Collective.
+
+    Raises:
+        ConformanceError: It is not; the message says which.
+    """
     rng = np.random.default_rng(like.getComm().getRank())
     x, y, Fx, Fy = (like.duplicate() for _ in range(4))
     for _ in range(3):
@@ -164,7 +168,7 @@ def check_operator(F: Any, like: PETSc.Vec, tol: float = 1e-10) -> None:
             vec.array[:] = rng.standard_normal(vec.getLocalSize())
         F.mult(x, Fx)
         F.mult(y, Fy)
-        assert x.dot(Fx) >= 0.0
-        assert abs(y.dot(Fx) - x.dot(Fy)) <= tol * Fx.norm() * y.norm()
+        require(x.dot(Fx) >= 0.0, "xᵀFx ≥ 0")
+        require(abs(y.dot(Fx) - x.dot(Fy)) <= tol * Fx.norm() * y.norm(), "yᵀFx = xᵀFy")
     for vec in (x, y, Fx, Fy):
         vec.destroy()
