@@ -41,7 +41,10 @@ def test_residuals_are_named(report):
     assert set(report.residuals) == {
         "projected_gradient",
         "equilibrium",
-        "tolerance",
+        *report.tolerances,
+    }
+    assert set(report.tolerances) == {
+        "displacement_error",
         "gluing_jump",
         "penetration",
         "tension",

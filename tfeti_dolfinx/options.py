@@ -37,9 +37,11 @@ class Options:
         "solver of the dual problem; auto takes pcpg without inequalities, else smalse",
         ("auto", "pcpg", "smalse"),
     )
-    rtol: float = _option(1e-6, "all", "stop when ‖g^P‖ and ‖F‖‖Qx‖ are below rtol·‖P(d − F λ̄₀)‖")
-    atol: float = _option(0.0, "all", "or when both are below this length")
-    max_it: int = _option(10_000, "all", "most inner steps")
+    rtol: float = _option(
+        1e-6, "all", "stop when the displacement of each body is right to this, in the maximum norm"
+    )
+    atol: float = _option(0.0, "all", "or when jumps and overlaps are below this length")
+    max_it: int = _option(10_000, "all", "most inner steps, and most outer ones")
     pc_type: str = _option(
         "auto",
         "pcpg",
@@ -62,7 +64,7 @@ class Options:
         "λ̄ with Gλ̄ = e: natural is Gᵀ(GGᵀ)⁻¹e, feasible the smallest one with λ̄_N ≥ 0",
         ("natural", "feasible"),
     )
-    norm_steps: int = _option(15, "smalse", "power steps that estimate ‖PFP‖")
+    norm_steps: int = _option(15, "smalse", "Lanczos steps that estimate ‖PFP‖")
     smalse_rho: float = _option(_SMALSE.rho, "smalse", "penalty ρ in units of ‖PFP‖")
     smalse_M: float = _option(_SMALSE.M, "smalse", "M₀ in units of ‖PFP‖")
     smalse_beta: float = _option(_SMALSE.beta, "smalse", "factor β on M, in (0, 1)")

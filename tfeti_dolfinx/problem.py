@@ -26,7 +26,7 @@ from tfeti_dolfinx.options import factor_options, parse_options
 from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.report_filling import fill_report
 from tfeti_dolfinx.solution import Solution
-from tfeti_dolfinx.solver import resolve_types, solve_dual
+from tfeti_dolfinx.solver import conclude, resolve_types, solve_dual
 from tfeti_dolfinx.subdomains.build import sparse_blocks, trace_parts
 from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.kernel import mode_names
@@ -159,7 +159,7 @@ class ContactProblem:
 
     def _take_in_overlapping(self, search: ContactSearch) -> int:
         """Give rows to nodes that have come to overlap without one; how many."""
-        tolerance = self.report.residuals["tolerance"]
+        tolerance = self.report.tolerances["penetration"]
         with stage("contact", self.report.seconds):
             u = self.dofs.to_primal(self.u.x.array)
             return search.take_in_overlapping(u, tolerance)
@@ -187,9 +187,9 @@ class ContactProblem:
             start = None
             if previous is not None:
                 start = (gluing.multipliers(previous.gluing, previous.lam), previous.mu)
-            result = solve_dual(dual, self.options, qp_type, start)
+            result, accuracy = solve_dual(dual, self.options, qp_type, start)
         with stage("recovery", report.seconds):
-            u = np.concatenate([np.empty(0), *dual.recover(result)])
+            u = np.concatenate([np.empty(0), *accuracy.u])
             self.u.x.array[:] = self.dofs.to_dolfinx(u)
             self.solution = Solution(
                 u=self.u,
@@ -201,8 +201,9 @@ class ContactProblem:
                 stress=self._stress,
                 contacts=self.contacts,
             )
-        fill_report(report, self.solution, dual, result, self._counters)
+        fill_report(report, self.solution, dual, result, accuracy, self._counters)
         result.destroy()
+        conclude(result, accuracy, self.options, comm)
         return self.solution
 
     def _build_blocks(self) -> list[SparseBlock]:

@@ -34,6 +34,8 @@ class Report:
         F_multiplications: Multiplications by F, all but the power method's.
         preconditioner_multiplications: Multiplications by the preconditioner.
         power_method_multiplications: Multiplications that estimated ‖PFP‖.
+        recoveries: Displacements recovered to see how right they are, each for one more solve
+            in every subdomain.
         outer_iterations: Outer iterations.
         cg_steps: Conjugate gradient steps.
         expansion_steps: Expansion steps.
@@ -42,10 +44,12 @@ class Report:
         converged_reason: Name of the ConvergedReason.
         peak_memory_mb: Peak resident memory, summed over ranks.
         seconds: Wall seconds of each stage (largest over ranks), and ``total``.
-        residuals: ``projected_gradient`` and ``equilibrium`` relative to b₀, with ``tolerance``
-            as a length: rtol·b₀, or what rounding allows; in physical units ``gluing_jump`` and
+        residuals: ``projected_gradient`` and ``equilibrium`` relative to b₀;
+            ``displacement_error``, the estimated error of u in the maximum norm relative to the
+            displacement of the body where it is worst; in physical units ``gluing_jump`` and
             ``penetration`` (lengths), ``tension`` (most negative pressure), ``complementarity``
             (largest force times gap), ``balance`` (largest force left on a kernel mode).
+        tolerances: What they were at most allowed to be, all but the first two.
         errors: Relative errors against closed forms, filled by demos.
         spectrum: With ``-tfeti_bbt``: the extreme eigenvalues ``BBt_min`` and ``BBt_max`` of
             B Bᵀ, ``BDBt_min`` and ``BDBt_max`` of B D⁻¹ Bᵀ. Their roots are the extreme
@@ -68,6 +72,7 @@ class Report:
     F_multiplications: int = 0
     preconditioner_multiplications: int = 0
     power_method_multiplications: int = 0
+    recoveries: int = 0
     outer_iterations: int = 0
     cg_steps: int = 0
     expansion_steps: int = 0
@@ -77,6 +82,7 @@ class Report:
     peak_memory_mb: float = 0.0
     seconds: dict[str, float] = field(default_factory=dict)
     residuals: dict[str, float] = field(default_factory=dict)
+    tolerances: dict[str, float] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
     spectrum: dict[str, float] = field(default_factory=dict)
 
@@ -87,6 +93,7 @@ class Report:
             "F_multiplications",
             "preconditioner_multiplications",
             "power_method_multiplications",
+            "recoveries",
             "outer_iterations",
             "cg_steps",
             "expansion_steps",

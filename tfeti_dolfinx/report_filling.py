@@ -6,6 +6,7 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.dual.accuracy import Accuracy
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.qp.problem import QPResult
 from tfeti_dolfinx.report import Report, peak_memory_mb
@@ -18,6 +19,7 @@ def fill_report(
     solution: Solution,
     dual: Dual,
     result: QPResult,
+    accuracy: Accuracy,
     counters: Counters,
 ) -> None:
     """Fill in everything but closed-form errors; counters add up over rounds. Collective."""
@@ -46,32 +48,46 @@ def fill_report(
     report.proportioning_steps += result.steps.proportioning
     report.factorizations = comm.allreduce(counters.factorizations)
     report.converged_reason = result.reason.name
-    report.residuals = _residuals(solution, dual, result)
+    report.recoveries += accuracy.looks
+    report.residuals = _residuals(solution, dual, result, accuracy)
+    report.tolerances = _tolerances(solution, dual, accuracy)
     report.peak_memory_mb = peak_memory_mb(comm)
     for name, value in report.seconds.items():
         report.seconds[name] = comm.allreduce(value, op=MPI.MAX)
     report.seconds["total"] = sum(v for k, v in report.seconds.items() if k != "total")
 
 
-def _residuals(solution: Solution, dual: Dual, result: QPResult) -> dict[str, float]:
-    comm, coarse = dual.coarse.comm, dual.coarse
+def _residuals(
+    solution: Solution, dual: Dual, result: QPResult, accuracy: Accuracy
+) -> dict[str, float]:
     reference = result.reference or 1.0
-    balance = coarse.G(solution.lam) - coarse.e
-
-    def largest(values: Array) -> float:
-        return float(comm.allreduce(float(np.max(values, initial=0.0)), op=MPI.MAX))
-
     gap = solution.remaining_gap
     return {
         "projected_gradient": result.projected_gradient / reference,
         "equilibrium": result.norm * result.equality / reference,
-        "tolerance": result.tolerance,
-        "gluing_jump": largest(_jumps(solution)),
-        "penetration": largest(-gap),
-        "tension": largest(0.0 - solution.contact_pressure),
-        "complementarity": largest(np.abs(solution.force * gap)),
-        "balance": largest(np.abs(balance)),
+        "displacement_error": accuracy.relative_error(),
+        "gluing_jump": _largest(dual, _jumps(solution)),
+        "penetration": _largest(dual, -gap),
+        "tension": _largest(dual, 0.0 - solution.contact_pressure),
+        "complementarity": _largest(dual, np.abs(solution.force * gap)),
+        "balance": accuracy.balance,
     }
+
+
+def _tolerances(solution: Solution, dual: Dual, accuracy: Accuracy) -> dict[str, float]:
+    allowed = accuracy.tolerances()
+    return {
+        "displacement_error": accuracy.rtol,
+        "gluing_jump": allowed.jump,
+        "penetration": allowed.penetration,
+        "tension": 0.0,
+        "complementarity": _largest(dual, solution.force) * allowed.penetration,
+        "balance": allowed.balance,
+    }
+
+
+def _largest(dual: Dual, values: Array) -> float:
+    return float(dual.coarse.comm.allreduce(float(np.max(values, initial=0.0)), op=MPI.MAX))
 
 
 def _jumps(solution: Solution) -> Array:

@@ -53,6 +53,20 @@ class Block(Protocol):
         ...
 
     @property
+    def modes(self) -> Array:
+        """C, the candidate modes of the whole body on all unknowns, shape ``(n, k)``."""
+        ...
+
+    @property
+    def diagonal(self) -> Array:
+        """Diagonal of K on the trace, shape ``(t,)``."""
+        ...
+
+    def energy(self, u: Array) -> float:
+        """uᵀKu."""
+        ...
+
+    @property
     def condensed_load(self) -> Array:
         """K⁺ f on the trace, shape ``(t,)``."""
         ...
@@ -131,6 +145,11 @@ def check_block(block: Block, K: Any, tol: float = 1e-9) -> None:
     require(np.abs(K @ R).max(initial=0.0) <= tol * size, "K R = 0")
     values = np.linalg.eigvalsh(K)
     require(np.sum(values > ZERO * values[-1]) == block.size - r, "the kernel is complete")
+
+    require(np.allclose(block.diagonal, K.diagonal()[trace], rtol=tol), "diagonal is that of K")
+    whole = np.random.default_rng(1).standard_normal(block.size)
+    require(np.isclose(block.energy(whole), whole @ K @ whole, rtol=tol), "energy is uᵀKu")
+    require(np.allclose(R.T @ block.modes, block.body_modes[0], atol=tol), "body_modes is Rᵀ C")
 
     inverse_tol = max(tol, 100 * np.finfo(float).eps * values[-1] / values[r])
     w, v = np.random.default_rng(0).standard_normal((2, len(trace)))
