@@ -29,18 +29,21 @@ def some_rank_is_idle(d):
     return fewest == 0
 
 
-def everything_asked_for(p, folder):
+def everything_asked_for(p, folder, pictures=False):
     """All that a user may ask a solution for, on every rank."""
     s = p.solution
     for name in FIELDS:
         assert np.all(np.isfinite(getattr(s, name).x.array)), name
     assert np.all(np.isfinite(s.body_forces.force))
     files = [*write_vtx(folder / "out.bp", s), *write_xdmf(folder / "out.xdmf", s)]
-    files.append(plot_deformed(folder / "deformed.png", s))
+    if pictures:
+        files.append(plot_deformed(folder / "deformed.png", s))
     for index in range(len(p.contacts)):
         data = s.contact(index)
         assert len(data.points) == len(data.force) == len(data.gap)
-        files.append(plot_pressure(folder / f"{index}.png", s, lambda x: x[:, 0], contact=index))
+        if pictures:
+            file = folder / f"{index}.png"
+            files.append(plot_pressure(file, s, lambda x: x[:, 0], contact=index))
     p.report.write(folder / "report.json", p.decomposition.comm)
     assert p.report.converged_reason.startswith("CONVERGED")
     p.decomposition.comm.barrier()
@@ -52,17 +55,23 @@ def box_on_obstacle(comm, cell="quadrilateral", degree=1, subdomains=2, clamped=
     """Some nodes get their rows late: they are out of reach at first, and come to overlap."""
     gdim = 2 if cell in ("triangle", "quadrilateral") else 3
     d = decomposed(cell, 6 if gdim == 2 else 3, subdomains, comm=comm)
-    contacts = [tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=0.022)]
+    reach = 0.022 if gdim == 2 else 0.024
+    contacts = [tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=reach)]
     if not clamped:
         contacts += [tfeti.Obstacle("left", tfeti.Plane((-0.01, 0, 0), (1, 0, 0)))]
     load = (-0.01 if not clamped else 0.0,) + (0.0,) * (gdim - 2) + (-0.05,)
     return problem(d, load, contacts, clamped=clamped, degree=degree, tfeti_rtol=1e-10)
 
 
-@pytest.mark.parametrize("subdomains", [1, 2])
 @pytest.mark.parametrize(
-    ("cell", "degree"),
-    [("quadrilateral", 1), ("triangle", 2), ("hexahedron", 1), ("tetrahedron", 2)],
+    ("cell", "degree", "subdomains"),
+    [
+        ("quadrilateral", 1, 1),
+        ("quadrilateral", 1, 2),
+        ("triangle", 2, 1),
+        ("hexahedron", 1, 2),
+        ("tetrahedron", 2, 1),
+    ],
 )
 def test_obstacle_with_late_rows(comm, shared_tmp, cell, degree, subdomains):
     p, alone = (box_on_obstacle(c, cell, degree, subdomains) for c in (comm, MPI.COMM_SELF))
@@ -72,7 +81,7 @@ def test_obstacle_with_late_rows(comm, shared_tmp, cell, degree, subdomains):
     assert p.report.late_contact_rows > 0
     assert p.report.factorizations == subdomains
     assert relative(displacement(p)[1], displacement(alone)[1]) <= 1e-7
-    everything_asked_for(p, shared_tmp)
+    everything_asked_for(p, shared_tmp, pictures=subdomains == 2)
     p.solve()  # anew, from no Blocks on
     assert relative(displacement(p)[1], displacement(alone)[1]) <= 1e-7
 
@@ -84,8 +93,9 @@ def test_a_body_that_contact_alone_holds(comm, shared_tmp):
     everything_asked_for(p, shared_tmp)
 
 
-@pytest.mark.parametrize("pc_type", ["none", "lumped", "dirichlet"])
-@pytest.mark.parametrize("subdomains", [1, 2])
+@pytest.mark.parametrize(
+    ("pc_type", "subdomains"), [("none", 1), ("lumped", 2), ("dirichlet", 1), ("dirichlet", 2)]
+)
 def test_no_contact(comm, shared_tmp, pc_type, subdomains):
     options = {"tfeti_pc_type": pc_type, "tfeti_bbt": True, "tfeti_view": True}
     p = problem(decomposed("quadrilateral", 4, subdomains), (0.0, -0.05), **options)
@@ -93,8 +103,10 @@ def test_no_contact(comm, shared_tmp, pc_type, subdomains):
     everything_asked_for(p, shared_tmp)
 
 
-@pytest.mark.parametrize("homogenization", ["natural", "feasible"])
-@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+@pytest.mark.parametrize(
+    ("cell", "homogenization"),
+    [("quadrilateral", "natural"), ("quadrilateral", "feasible"), ("tetrahedron", "natural")],
+)
 def test_a_pair(comm, shared_tmp, cell, homogenization):
     d = stacked(cell, 3, 4, 2)
     sides = ["lower bottom", "lower left", "upper left"]
