@@ -13,9 +13,10 @@ from scipy.sparse import coo_array, csr_array, diags_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.operator import trace_slices
+from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.parallel import chunk_offsets
 from tfeti_dolfinx.subdomains.block import Block
-from tfeti_dolfinx.subdomains.factor import CholeskyFactor
+from tfeti_dolfinx.subdomains.factor import CholeskyFactor, FactorError
 
 NULL = 1e-14
 
@@ -63,7 +64,12 @@ class CoarseSpace:
         )
         self.free_motions = self.null_motions()
         self.free_modes = self.modes_of(self.free_motions)
-        self._factor = SemidefiniteFactor(self.gram(), self.free_modes, prefix)
+        gram = self.gram()
+        with raised_on_all_ranks(comm):
+            try:
+                self._factor = SemidefiniteFactor(gram, self.free_modes, prefix)
+            except FactorError as error:
+                raise type(error)(f"GGᵀ of the coarse problem: {error}") from error
 
     def update_load(self, blocks: Sequence[Block]) -> None:
         """Replace e = Rᵀ f by that of the Blocks' present loads."""
