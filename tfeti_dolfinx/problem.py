@@ -24,7 +24,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import factor_options, parse_options
 from tfeti_dolfinx.report import Report
-from tfeti_dolfinx.report_filling import fill_report
+from tfeti_dolfinx.report_filling import fill_result, fill_sizes
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solver import conclude, resolve_types, solve_dual
 from tfeti_dolfinx.subdomains.build import sparse_blocks, trace_parts
@@ -112,7 +112,7 @@ class ContactProblem:
             FactorError: A matrix could not be factored.
         """
         self.destroy()
-        self.report.reset_counters()
+        self.report.reset()
         with stage("contact", self.report.seconds):
             search = ContactSearch(self.contacts, self.dofs, self.decomposition)
         with stage("assembly", self.report.seconds):
@@ -125,6 +125,7 @@ class ContactProblem:
                 late = self._take_in_overlapping(search)
             except NoSolutionError:  # on all ranks: what is far may hold the body yet
                 if search.is_exhausted:
+                    self.report.converged_reason = "NO_SOLUTION"
                     raise
                 with stage("contact", self.report.seconds):
                     late = search.widen()
@@ -153,6 +154,7 @@ class ContactProblem:
             records, weights = search.records, self._weights()
             self._gluing = glue(self.dofs, self.bcs, records, search.length, weights)
             self._constraints = self._gluing.constraints
+        fill_sizes(self.report, self.dofs, self.decomposition, self._gluing)
         if self.options.bbt:
             with stage("spectrum", self.report.seconds):
                 self.report.spectrum = extreme_eigenvalues(self._constraints)
@@ -201,7 +203,7 @@ class ContactProblem:
                 stress=self._stress,
                 contacts=self.contacts,
             )
-        fill_report(report, self.solution, dual, result, accuracy, self._counters)
+        fill_result(report, self.solution, dual, result, accuracy, self._counters)
         result.destroy()
         conclude(result, accuracy, self.options, comm)
         return self.solution

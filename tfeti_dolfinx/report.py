@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import resource
-from dataclasses import asdict, dataclass, field
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
 
 from mpi4py import MPI
@@ -41,7 +41,8 @@ class Report:
         expansion_steps: Expansion steps.
         proportioning_steps: Proportioning steps.
         factorizations: Factorisations of subdomain matrices.
-        converged_reason: Name of the ConvergedReason.
+        converged_reason: Name of the ConvergedReason; NO_SOLUTION where there is none,
+            NOT_SOLVED before a solve and where one ended in another error.
         peak_memory_mb: Peak resident memory, summed over ranks.
         seconds: Wall seconds of each stage (largest over ranks), and ``total``.
         residuals: ``projected_gradient`` and ``equilibrium`` relative to b₀;
@@ -78,7 +79,7 @@ class Report:
     expansion_steps: int = 0
     proportioning_steps: int = 0
     factorizations: int = 0
-    converged_reason: str = "ITERATING"
+    converged_reason: str = "NOT_SOLVED"
     peak_memory_mb: float = 0.0
     seconds: dict[str, float] = field(default_factory=dict)
     residuals: dict[str, float] = field(default_factory=dict)
@@ -86,20 +87,11 @@ class Report:
     errors: dict[str, float] = field(default_factory=dict)
     spectrum: dict[str, float] = field(default_factory=dict)
 
-    def reset_counters(self) -> None:
-        """Set everything that adds up over rounds to zero."""
-        for name in (
-            "late_contact_rows",
-            "F_multiplications",
-            "preconditioner_multiplications",
-            "power_method_multiplications",
-            "recoveries",
-            "outer_iterations",
-            "cg_steps",
-            "expansion_steps",
-            "proportioning_steps",
-        ):
-            setattr(self, name, 0)
+    def reset(self) -> None:
+        """Forget the solve before; seconds add up. After an error nothing old is left."""
+        for f in fields(self):
+            if f.name != "seconds":
+                setattr(self, f.name, f.default if f.default is not MISSING else {})
 
     def __str__(self) -> str:
         lines = []

@@ -8,13 +8,33 @@ from mpi4py import MPI
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.accuracy import Accuracy
 from tfeti_dolfinx.dual.dual import Dual
+from tfeti_dolfinx.gluing.glue import Gluing
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.qp.problem import QPResult
 from tfeti_dolfinx.report import Report, peak_memory_mb
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.subdomains.sparse_block import Counters
 
 
-def fill_report(
+def fill_sizes(
+    report: Report, dofs: TornDofs, decomposition: Decomposition, gluing: Gluing
+) -> None:
+    """Fill in what is known before the dual problem is. Collective."""
+    comm, constraints = dofs.comm, gluing.constraints
+    bounded = constraints.inequalities
+    report.primal_dofs = int(dofs.offsets[-1]) * dofs.bs
+    report.dual_dofs = comm.allreduce(constraints.num_rows)
+    report.subdomains, report.bodies = decomposition.num_subdomains, decomposition.num_bodies
+    report.split_subdomains = len(decomposition.split)
+    report.contact_rows = comm.allreduce(bounded.stop - bounded.start)
+    report.contact_candidates = comm.allreduce(gluing.records.candidates)
+    near = comm.allreduce(int(np.sum(gluing.records.near)))
+    report.far_contact_nodes = report.contact_candidates - near
+    report.dropped_contact_rows = comm.allreduce(gluing.inequalities.dropped)
+
+
+def fill_result(
     report: Report,
     solution: Solution,
     dual: Dual,
@@ -22,21 +42,11 @@ def fill_report(
     accuracy: Accuracy,
     counters: Counters,
 ) -> None:
-    """Fill in everything but closed-form errors; counters add up over rounds. Collective."""
-    comm, decomposition, gluing = dual.coarse.comm, solution.decomposition, solution.gluing
-    dofs = solution.dofs
-    report.primal_dofs = int(dofs.offsets[-1]) * dofs.bs
-    report.dual_dofs = comm.allreduce(gluing.constraints.num_rows)
-    report.subdomains, report.bodies = decomposition.num_subdomains, decomposition.num_bodies
-    report.split_subdomains = len(decomposition.split)
+    """Fill in what a solve has found; counters add up over rounds. Collective."""
+    comm = dual.coarse.comm
     report.kernel_dim = dual.coarse.dimension
     report.free_modes = dual.coarse.free_modes.shape[1]
-    report.contact_rows = dual.num_inequalities
-    report.contact_candidates = comm.allreduce(gluing.records.candidates)
-    near = comm.allreduce(int(np.sum(gluing.records.near)))
-    report.far_contact_nodes = report.contact_candidates - near
-    report.dropped_contact_rows = comm.allreduce(gluing.inequalities.dropped)
-    active = solution.lam[gluing.constraints.inequalities] > 0.0
+    active = solution.lam[solution.gluing.constraints.inequalities] > 0.0
     report.active_contacts = comm.allreduce(int(np.sum(active)))
     report.F_multiplications += dual.F.count["solver"]
     report.power_method_multiplications += dual.F.count["power method"]
