@@ -11,14 +11,10 @@ from scipy.sparse import csr_array, diags_array
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.compat import assemble_csr
-from tfeti_dolfinx.errors import ConformanceError, InputError
+from tfeti_dolfinx.errors import ConformanceError, FactorError, InputError
 from tfeti_dolfinx.subdomains import factor, sparse_block
 from tfeti_dolfinx.subdomains.block import check_block
-from tfeti_dolfinx.subdomains.factor import (
-    CholeskyFactor,
-    FactorError,
-    NotPositiveDefiniteError,
-)
+from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 from tfeti_dolfinx.subdomains.kernel import candidate_modes, fixing_nodes, kernel_of
 from tfeti_dolfinx.subdomains.sparse_block import Counters, SparseBlock
 

@@ -26,6 +26,10 @@ class ConvergenceError(TfetiError, RuntimeError):
     """A solver stopped before it reached its tolerance."""
 
 
+class FactorError(TfetiError, RuntimeError):
+    """A matrix could not be factored; the message says why."""
+
+
 class ConformanceError(TfetiError, AssertionError):
     """An implementation does not do what its interface promises; the message says what."""
 

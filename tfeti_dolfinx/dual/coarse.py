@@ -13,10 +13,10 @@ from scipy.sparse import coo_array, csr_array, diags_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.operator import trace_slices
-from tfeti_dolfinx.errors import raised_on_all_ranks
+from tfeti_dolfinx.errors import FactorError, raised_on_all_ranks
 from tfeti_dolfinx.parallel import chunk_offsets
 from tfeti_dolfinx.subdomains.block import Block
-from tfeti_dolfinx.subdomains.factor import CholeskyFactor, FactorError
+from tfeti_dolfinx.subdomains.factor import CholeskyFactor
 
 NULL = 1e-14
 

@@ -13,7 +13,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.errors import TfetiError
+from tfeti_dolfinx.errors import FactorError
 
 log = logging.getLogger(__name__)
 
@@ -30,10 +30,6 @@ DEFINITE = {
 OUT_OF_MEMORY, NO_SUPPORT, MISSING_SOLVER = 55, 56, 92
 ZERO_PIVOTS = (71, 81)
 CHOLMOD_OUT_OF_MEMORY = "CHOLMOD factorization failed with status -2"
-
-
-class FactorError(TfetiError, RuntimeError):
-    """A matrix could not be factored; the message says why."""
 
 
 class NotPositiveDefiniteError(FactorError, ArithmeticError):

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.linalg import null_space
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.subdomains.factor import FactorError, NotPositiveDefiniteError
+from tfeti_dolfinx.errors import FactorError, InputError
+from tfeti_dolfinx.subdomains.factor import NotPositiveDefiniteError
 from tfeti_dolfinx.subdomains.kernel import candidate_modes, fixing_nodes, kernel_of
 from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, GeneralisedInverse, regularised
 
