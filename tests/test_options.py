@@ -10,7 +10,7 @@ from petsc4py import PETSc
 from scenes import decomposed, problem
 
 from tfeti_dolfinx import InputError, Options
-from tfeti_dolfinx.options import options_table, parse_options
+from tfeti_dolfinx.options import factor_options, options_table, parse_options
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -66,6 +66,16 @@ def test_view_lists_every_option():
 
 def test_the_document_has_the_table():
     assert options_table() in (ROOT / "docs/options.md").read_text()
+
+
+def test_options_of_factors_are_let_through_and_no_others():
+    name, value = "coarse_mat_mumps_icntl_14", 40
+    given = {f"tfeti_{name}": value, "rtol": 1e-3}
+    assert parse_options(given, "tfeti_").rtol == 1e-3
+    assert factor_options(given, "tfeti_") == {name: value}
+    for wrong in ("sub_pc_type", "coarse_ksp_type", "sub_pc_factor_", "mat_type"):
+        with pytest.raises(InputError, match=f"unknown option -tfeti_{wrong};"):
+            parse_options({f"tfeti_{wrong}": "lu"}, "tfeti_")
 
 
 def test_monitor_and_view_and_reason_print(capsys):
