@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Mapping
 from dataclasses import Field, dataclass, field, fields
@@ -16,6 +17,8 @@ from tfeti_dolfinx.qp.smalse import SmalseParameters
 from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES
 
 _SMALSE = SmalseParameters()
+# what the factors of the subdomains and of the coarse problem read from PETSc's options
+FACTOR_OPTION = re.compile(r"(sub|coarse)_(pc_factor|mat)_\w+")
 
 
 def _option(default: Any, algorithm: str, text: str, choices: tuple[str, ...] = ()) -> Any:
@@ -111,20 +114,32 @@ def parse_options(given: Mapping[str, Any] | None, prefix: str) -> Options:
         InputError: An option is unknown, its value does not fit, or the command line has options
             that PETSc was not given.
     """
-    named = {name.removeprefix("-").removeprefix(prefix): v for name, v in (given or {}).items()}
+    named = _without_prefix(given, prefix)
     database = PETSc.Options(prefix)
     _check_reached(named, database, prefix)
     named |= {name: database.getString(name, "") for name in database.getAll()}
     known = {f.name: f for f in fields(Options)}
     for name in named:
-        if name not in known:
+        if name not in known and not FACTOR_OPTION.fullmatch(name):
             raise InputError(
                 f"unknown option -{prefix}{name}; expected one of "
                 + ", ".join(f"-{prefix}{n}" for n in known)
             )
-    options = Options(**{n: _converted(known[n], v, prefix) for n, v in named.items()})
+    options = Options(
+        **{n: _converted(known[n], v, prefix) for n, v in named.items() if n in known}
+    )
     _check_ranges(options, prefix)
     return options
+
+
+def factor_options(given: Mapping[str, Any] | None, prefix: str) -> dict[str, Any]:
+    """Those options of a dictionary that PETSc itself reads, without the prefix."""
+    named = _without_prefix(given, prefix)
+    return {name: value for name, value in named.items() if FACTOR_OPTION.fullmatch(name)}
+
+
+def _without_prefix(given: Mapping[str, Any] | None, prefix: str) -> dict[str, Any]:
+    return {name.removeprefix("-").removeprefix(prefix): v for name, v in (given or {}).items()}
 
 
 def _check_reached(named: Mapping[str, Any], database: PETSc.Options, prefix: str) -> None:

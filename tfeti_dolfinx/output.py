@@ -11,7 +11,7 @@ import numpy as np
 from dolfinx import fem, io
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.errors import InputError, naming, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.entities import NO_TAG
 from tfeti_dolfinx.solution import Solution
@@ -33,7 +33,7 @@ def write_vtx(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
         The files written.
 
     Raises:
-        InputError: The name does not end with ``.bp``.
+        InputError: The name does not end with ``.bp``, or the files cannot be written.
     """
     target = Path(path)
     if target.suffix != ".bp":
@@ -58,16 +58,17 @@ def write_xdmf(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
         The files written.
 
     Raises:
-        InputError: The name does not end with ``.xdmf``.
+        InputError: The name does not end with ``.xdmf``, or the files cannot be written.
     """
     target = Path(path)
     if target.suffix != ".xdmf":
         raise InputError(f"{target}: expected a name that ends with .xdmf")
     decomposition = solution.decomposition
     folder = _begin(target.with_name(f"{target.stem}.folder"), solution)
-    if decomposition.comm.rank == 0:
-        folder.mkdir(parents=True)
-    decomposition.comm.barrier()
+    with raised_on_all_ranks(decomposition.comm):
+        if decomposition.comm.rank == 0:
+            with naming(target):
+                folder.mkdir(parents=True)
     with io.XDMFFile(decomposition.comm, folder / target.name, "w") as xdmf:
         xdmf.write_mesh(decomposition.mesh)
         for function in (*nodal_fields(solution), *cell_fields(solution)):
@@ -75,8 +76,9 @@ def write_xdmf(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
     companion = target.with_suffix(".h5")
     for name in (companion, target):
         _replace(folder / name.name, name, solution)
-    if decomposition.comm.rank == 0:
-        folder.rmdir()
+    with raised_on_all_ranks(decomposition.comm):
+        if decomposition.comm.rank == 0:
+            folder.rmdir()
     return [target, companion]
 
 
@@ -129,8 +131,9 @@ def _begin(name: Path, solution: Solution) -> Path:
     comm = solution.decomposition.comm
     with raised_on_all_ranks(comm):
         if comm.rank == 0:
-            name.parent.mkdir(parents=True, exist_ok=True)
-            _remove(partial)
+            with naming(name):
+                name.parent.mkdir(parents=True, exist_ok=True)
+                _remove(partial)
     return partial
 
 
@@ -139,8 +142,9 @@ def _replace(partial: Path, name: Path, solution: Solution) -> None:
     comm.barrier()
     with raised_on_all_ranks(comm):
         if comm.rank == 0:
-            _remove(name)
-            os.replace(partial, name)
+            with naming(name):
+                _remove(name)
+                os.replace(partial, name)
 
 
 def _remove(path: Path) -> None:

@@ -15,7 +15,7 @@ from dolfinx import plot as dplot
 
 from tfeti_dolfinx import draw
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.errors import InputError, TfetiError, raised_on_all_ranks
+from tfeti_dolfinx.errors import InputError, TfetiError, naming, raised_on_all_ranks
 from tfeti_dolfinx.solution import Solution
 
 SECONDS = 600
@@ -74,7 +74,8 @@ def plot_deformed(
                 "view": _vector(view),
                 "cut": np.stack([_vector(v) for v in cut or (None, None)]),
             }
-            _draw(target, {**_joined(parts), **scene})
+            with naming(target):
+                _draw(target, {**_joined(parts), **scene})
     return target
 
 
@@ -104,12 +105,15 @@ def plot_pressure(
     """
     comm = solution.decomposition.comm
     data = solution.contact(contact)
-    parts = comm.gather((coordinate(data.points), data.pressure), root=0)
+    with raised_on_all_ranks(comm):
+        x = coordinate(data.points)
+    parts = comm.gather((x, data.pressure), root=0)
     target = Path(path)
     with raised_on_all_ranks(comm):
         if comm.rank == 0 and parts is not None:
             x, p = (np.concatenate(rows) for rows in zip(*parts, strict=True))
-            _draw_curve(target, x, p, closed_form, limit, label)
+            with naming(target):
+                _draw_curve(target, x, p, closed_form, limit, label)
     return target
 
 

@@ -10,6 +10,8 @@ from pathlib import Path
 
 from mpi4py import MPI
 
+from tfeti_dolfinx.errors import naming, raised_on_all_ranks
+
 
 @dataclass
 class Report:
@@ -107,14 +109,27 @@ class Report:
         return json.dumps(asdict(self), indent=2)
 
     def write(self, path: str | Path, comm: MPI.Intracomm) -> None:
-        """Write the report as a JSON file; it appears whole. Collective."""
-        if comm.rank == 0:
-            target = Path(path)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            partial = target.with_name(f".{target.name}.partial")
-            partial.write_text(self.to_json() + "\n")
-            os.replace(partial, target)
-        comm.barrier()
+        """Write the report as a JSON file; it appears whole. Collective.
+
+        Raises:
+            InputError: The file cannot be written.
+        """
+        with raised_on_all_ranks(comm):
+            if comm.rank == 0:
+                with naming(path):
+                    _write_whole(Path(path), self.to_json() + "\n")
+
+
+def _write_whole(target: Path, text: str) -> None:
+    """Write a file aside and give it its name when it is whole."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_name(f".{target.name}.partial")
+    partial.write_text(text)
+    try:
+        os.replace(partial, target)
+    except OSError:
+        partial.unlink()
+        raise
 
 
 def peak_memory_mb(comm: MPI.Intracomm) -> float:

@@ -131,7 +131,7 @@ class Solution:
         force = sum_rows(records.group, self.force, dofs.num_groups)
         area = sum_rows(records.group, records.area, dofs.num_groups)
         surfaces = [contact.surfaces[0] for contact in self.contacts]
-        whole = hat_integrals(dofs, self.decomposition, surfaces) if surfaces else area
+        whole = hat_integrals(dofs, self.decomposition, surfaces)
         values = np.divide(force, np.minimum(area, whole), out=0.0 * force, where=area > 0.0)
         return self._field(values, self._vertices, "pressure")
 

@@ -13,6 +13,7 @@ from scipy.sparse import coo_array, csr_array, diags_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.operator import trace_slices
+from tfeti_dolfinx.errors import FactorError, raised_on_all_ranks
 from tfeti_dolfinx.parallel import chunk_offsets
 from tfeti_dolfinx.subdomains.block import Block
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor
@@ -29,6 +30,7 @@ class CoarseSpace:
         body_of_block: Body of each of them.
         num_bodies: Number of bodies on all ranks.
         comm: Communicator. The constructor and all methods are collective.
+        prefix: Prefix of the factor's PETSc options.
 
     Attributes:
         dimension: r, the dimension of the kernel of K.
@@ -47,6 +49,7 @@ class CoarseSpace:
         body_of_block: Array,
         num_bodies: int,
         comm: MPI.Intracomm,
+        prefix: str = "tfeti_coarse_",
     ) -> None:
         self.comm = comm
         sizes = np.array([block.kernel.shape[1] for block in blocks], dtype=np.int64)
@@ -61,7 +64,12 @@ class CoarseSpace:
         )
         self.free_motions = self.null_motions()
         self.free_modes = self.modes_of(self.free_motions)
-        self._factor = SemidefiniteFactor(self.gram(), self.free_modes)
+        gram = self.gram()
+        with raised_on_all_ranks(comm):
+            try:
+                self._factor = SemidefiniteFactor(gram, self.free_modes, prefix)
+            except FactorError as error:
+                raise type(error)(f"GGᵀ of the coarse problem: {error}") from error
 
     def update_load(self, blocks: Sequence[Block]) -> None:
         """Replace e = Rᵀ f by that of the Blocks' present loads."""
@@ -160,13 +168,15 @@ class SemidefiniteFactor:
     Args:
         A: scipy CSR, shape ``(r, r)``.
         null: Orthonormal basis of its null space, shape ``(r, k)``.
+        prefix: Prefix of the factor's PETSc options.
     """
 
-    def __init__(self, A: csr_array, null: Array) -> None:
+    def __init__(self, A: csr_array, null: Array, prefix: str = "tfeti_coarse_") -> None:
         self._null = null
         pinned = np.zeros(A.shape[0])
         pinned[_independent_rows(null)] = A.diagonal().max(initial=1.0)
-        self._factor = CholeskyFactor(csr_array(A + diags_array(pinned))) if A.shape[0] else None
+        regular = csr_array(A + diags_array(pinned))
+        self._factor = CholeskyFactor(regular, prefix) if A.shape[0] else None
 
     def solve(self, y: Array) -> Array:
         """A⁺ y up to null modes that are removed, y orthogonal to them."""

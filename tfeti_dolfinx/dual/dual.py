@@ -34,6 +34,7 @@ class Dual:
         body_names: Names of all bodies.
         mode_names: Names of their candidate modes.
         pc_type: Preconditioner: none, lumped or dirichlet.
+        options_prefix: Prefix of all PETSc options.
 
     Attributes:
         F: B K⁺ Bᵀ.
@@ -44,6 +45,7 @@ class Dual:
 
     Raises:
         NoSolutionError: The load moves a body that nothing holds.
+        FactorError: A matrix could not be factored.
     """
 
     def __init__(
@@ -54,6 +56,7 @@ class Dual:
         body_names: Sequence[str],
         mode_names: Sequence[str],
         pc_type: str,
+        options_prefix: str = "tfeti_",
     ) -> None:
         self.constraints, self.blocks = constraints, blocks
         self.body_of_block, self.num_bodies = body_of_block, len(body_names)
@@ -64,7 +67,9 @@ class Dual:
         if pc_type != "none":
             self._scaled = ScaledGluing(B, constraints.weights)
             self.preconditioner = PRECONDITIONERS[pc_type](self._scaled, blocks)
-        self.coarse = CoarseSpace(B, blocks, body_of_block, len(body_names), comm)
+        self.coarse = CoarseSpace(
+            B, blocks, body_of_block, len(body_names), comm, f"{options_prefix}coarse_"
+        )
         bounded = constraints.inequalities
         self.num_inequalities = comm.allreduce(bounded.stop - bounded.start)
         load_norm = np.sqrt(comm.allreduce(sum(block.load_norm**2 for block in blocks)))
