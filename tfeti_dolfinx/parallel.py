@@ -9,7 +9,6 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
 
-
 T = TypeVar("T")
 
 
