@@ -31,6 +31,8 @@ POSITIVE = Range("a positive number", lambda value: value > 0.0)
 
 def shown(value: Any) -> str:
     """A value for a message: short, and of objects their type only."""
+    if isinstance(value, np.generic):
+        value = value.item()
     if value is None or isinstance(value, (bool, str, Real, list, tuple, dict)):
         return reprlib.repr(value)
     if isinstance(value, np.ndarray):

@@ -30,7 +30,10 @@ def checked_stress(stress: Stress, u: fem.Function) -> Any:
     Raises:
         InputError: It cannot be called, fails, or does not return a 3×3 tensor.
     """
-    checked_callable(stress, "stress", "a callable from a displacement to its stress in UFL")
+    expected = "a callable from a displacement to its stress in UFL"
+    if isinstance(stress, ufl.core.expr.Expr):  # which can be called, but for something else
+        raise InputError(f"stress is an expression; expected {expected}")
+    checked_callable(stress, "stress", expected)
     with named("stress(u)"):
         sigma = stress(u)
     if not isinstance(sigma, ufl.core.expr.Expr):

@@ -8,6 +8,8 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from dolfinx import mesh as dmesh
+from ufl.algorithms import compute_form_data, extract_arguments
+from ufl.algorithms.check_arities import ArityMismatch
 from ufl.constantvalue import Zero
 from ufl.corealg.traversal import unique_pre_traversal
 from ufl.domain import extract_domains
@@ -21,6 +23,7 @@ from tfeti_dolfinx.mesh.spaces import check_space, described, is_same_space
 from tfeti_dolfinx.mesh.tags import check_tags
 
 ARITY = {1: "linear", 2: "bilinear"}
+FUNCTIONS = ("test", "trial")
 KINDS = {"cell": "dx", "exterior_facet": "ds", "interior_facet": "dS"}
 
 
@@ -123,7 +126,22 @@ def _argument_spaces(form: Any, name: str, arity: int) -> list[Any]:
         arguments = form.arguments()
     if len(arguments) != arity:
         raise InputError(f"{name} has {len(arguments)} arguments; expected {expected}")
+    for integral in form.integrals():
+        parts = {argument.number() for argument in extract_arguments(integral.integrand())}
+        if missing := set(range(arity)) - parts:
+            kind = FUNCTIONS[missing.pop()]
+            raise InputError(f"{name}: an integral has no {kind} function; expected {expected}")
+    _check_linearity(form, f"{name} is not {expected}")
     return [argument.ufl_function_space() for argument in arguments]
+
+
+def _check_linearity(form: ufl.Form, what: str) -> None:
+    """Raise if a form is not linear in its arguments: DOLFINx would say so on one rank only."""
+    with named(what):
+        try:
+            compute_form_data(form)
+        except ArityMismatch as error:  # a BaseException, which nobody else catches
+            raise ValueError(error) from error
 
 
 def _check_measures(form: ufl.Form, name: str, decomposition: Decomposition) -> None:
@@ -166,9 +184,8 @@ def _check_tags(integral: Any, name: str, decomposition: Decomposition) -> None:
 
 def _check_entities(entities: Array, kind: str, what: str, decomposition: Decomposition) -> None:
     """Raise if a tag has no entities, or facets inside a body. Collective."""
-    inside = np.empty(0)
-    if kind == "exterior_facet":
-        inside = np.setdiff1d(entities, decomposition.boundary)
+    outside = decomposition.boundary if kind == "exterior_facet" else entities
+    inside = np.setdiff1d(entities, outside)
     count, wrong = decomposition.comm.allreduce(np.array([len(entities), len(inside)]))
     if count == 0:
         groups = decomposition.names.volumes if kind == "cell" else decomposition.names.surfaces
@@ -200,7 +217,8 @@ def _listed(data: Any, kind: str, decomposition: Decomposition, what: str) -> tu
     """The same of DOLFINx's lists of a tag and cells, or pairs of a cell and a local facet."""
     mesh = decomposition.mesh
     facets = cell_facets(mesh)
-    entities, values = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    entities: list[Array] = [np.empty(0, np.int64)]
+    values: list[Array] = [np.empty(0, np.int64)]
     for item in data:
         if not (isinstance(item, tuple) and len(item) == 2 and is_whole(item[0])):
             raise InputError(
@@ -217,7 +235,6 @@ def _listed(data: Any, kind: str, decomposition: Decomposition, what: str) -> tu
                 f"{what}: subdomain_data of tag {item[0]} has entities that this rank has not; "
                 "expected local cells, for ds each followed by its local facet"
             )
-        found = found if kind == "cell" else facets[cell, local]
-        entities.append(found)
-        values.append(np.full(len(found), item[0]))
+        entities.append(found if kind == "cell" else facets[cell, local])
+        values.append(np.full(len(entities[-1]), item[0]))
     return np.concatenate(entities), np.concatenate(values)

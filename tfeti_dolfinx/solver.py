@@ -28,8 +28,8 @@ def resolve_types(options: Options, num_inequalities: int, prefix: str) -> tuple
         qp_type = "smalse" if num_inequalities else "pcpg"
     if qp_type == "pcpg" and num_inequalities:
         raise InputError(
-            f"-{prefix}qp_type pcpg: the scene has {num_inequalities} contact rows, which PCPG cannot "
-            "keep; expected auto or smalse"
+            f"-{prefix}qp_type pcpg: the scene has {num_inequalities} contact rows, which PCPG "
+            "cannot keep; expected auto or smalse"
         )
     if qp_type == "smalse":
         check_preconditioner(options, prefix)

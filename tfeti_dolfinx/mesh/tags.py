@@ -45,7 +45,7 @@ def checked_names(names: Any, what: str, tags: Any, tags_name: str) -> dict[str,
     for name, tag in names.items():
         if not isinstance(name, str) or not is_whole(tag):
             raise InputError(
-                f"{what}: {shown(name)}: {shown(tag)}; expected a name and its tag, such as 'top': 1"
+                f"{what} has {shown(name)}: {shown(tag)}; expected a name and its tag, 'top': 1"
             )
     if names and tags is None:
         raise InputError(f"{what}={shown(names)} without {tags_name}; expected the tags they name")
