@@ -41,7 +41,10 @@ def test_residuals_are_named(report):
     assert set(report.residuals) == {
         "projected_gradient",
         "equilibrium",
-        "tolerance",
+        *report.tolerances,
+    }
+    assert set(report.tolerances) == {
+        "displacement_error",
         "gluing_jump",
         "penetration",
         "tension",
@@ -65,3 +68,24 @@ def test_text_has_every_field(report):
     for f in fields(Report):
         if f.name != "errors":
             assert f.name in text
+
+
+def test_after_an_error_the_report_says_what_is_known():
+    d = decomposed("hexahedron", 2, 3)
+    floor = tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -0.01), (0, 0, 1)))
+    p = problem(d, (0, 0, 0.05), [floor], clamped=())
+    assert p.report.converged_reason == "NOT_SOLVED"
+    with pytest.raises(tfeti.NoSolutionError):
+        p.solve()
+    assert p.report.converged_reason == "NO_SOLUTION"
+    assert p.report.contact_candidates == 9
+    assert p.report.primal_dofs > 81
+    assert p.report.active_contacts == 0
+
+
+def test_a_solve_that_stopped_early_says_how_wrong_it_is():
+    p = problem(decomposed("hexahedron", 3, 4), tfeti_max_it=3)
+    with pytest.raises(tfeti.ConvergenceError, match="times what rtol 1e-06 allows"):
+        p.solve()
+    assert p.report.converged_reason == "DIVERGED_ITS"
+    assert p.report.residuals["displacement_error"] > 1e-6

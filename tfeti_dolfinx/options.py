@@ -51,11 +51,13 @@ class Options:
     rtol: float = _option(
         1e-6,
         "all",
-        "stop when ‖g^P‖ and ‖F‖‖Qx‖ are below rtol·‖P(d − F λ̄₀)‖",
+        "stop when the displacement of each body is right to this, in the maximum norm",
         fits=Range("0 or more, less than 1", lambda value: 0.0 <= value < 1.0),
     )
-    atol: float = _option(0.0, "all", "or when both are below this length", fits=FROM_0)
-    max_it: int = _option(10_000, "all", "most inner steps", fits=FROM_0)
+    atol: float = _option(
+        0.0, "all", "or when jumps and overlaps are below this length", fits=FROM_0
+    )
+    max_it: int = _option(10_000, "all", "most inner steps, and most outer ones", fits=FROM_0)
     pc_type: str = _option(
         "auto",
         "pcpg",
@@ -78,7 +80,7 @@ class Options:
         "λ̄ with Gλ̄ = e: natural is Gᵀ(GGᵀ)⁻¹e, feasible the smallest one with λ̄_N ≥ 0",
         ("natural", "feasible"),
     )
-    norm_steps: int = _option(15, "smalse", "power steps that estimate ‖PFP‖", fits=FROM_1)
+    norm_steps: int = _option(15, "smalse", "Lanczos steps that estimate ‖PFP‖", fits=FROM_1)
     smalse_rho: float = _option(_SMALSE.rho, "smalse", "penalty ρ in units of ‖PFP‖", fits=ABOVE_0)
     smalse_M: float = _option(_SMALSE.M, "smalse", "M₀ in units of ‖PFP‖", fits=ABOVE_0)
     smalse_beta: float = _option(

@@ -27,9 +27,9 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import parse_options
 from tfeti_dolfinx.report import Report
-from tfeti_dolfinx.report_filling import fill_report
+from tfeti_dolfinx.report_filling import fill_result, fill_sizes
 from tfeti_dolfinx.solution import Solution
-from tfeti_dolfinx.solver import resolve_types, solve_dual
+from tfeti_dolfinx.solver import conclude, resolve_types, solve_dual
 from tfeti_dolfinx.subdomains.build import sparse_blocks, trace_parts
 from tfeti_dolfinx.subdomains.kernel import mode_names
 from tfeti_dolfinx.subdomains.sparse_block import Counters, SparseBlock
@@ -126,7 +126,7 @@ class ContactProblem:
             ConvergenceError: The solver stopped before its tolerance.
         """
         self.destroy()
-        self.report.reset_counters()
+        self.report.reset()
         with stage("contact", self.report.seconds):
             search = ContactSearch(self.contacts, self.dofs, self.decomposition)
         with stage("assembly", self.report.seconds):
@@ -139,6 +139,7 @@ class ContactProblem:
                 late = self._take_in_overlapping(search)
             except NoSolutionError:  # on all ranks: what is far may hold the body yet
                 if search.is_exhausted:
+                    self.report.converged_reason = "NO_SOLUTION"
                     raise
                 with stage("contact", self.report.seconds):
                     late = search.widen()
@@ -177,13 +178,14 @@ class ContactProblem:
             records, weights = search.records, self._weights()
             self._gluing = glue(self.dofs, self.bcs, records, search.length, weights)
             self._constraints = self._gluing.constraints
+        fill_sizes(self.report, self.dofs, self.decomposition, self._gluing)
         if self.options.bbt:
             with stage("spectrum", self.report.seconds):
                 self.report.spectrum = extreme_eigenvalues(self._constraints)
 
     def _take_in_overlapping(self, search: ContactSearch) -> int:
         """Give rows to nodes that have come to overlap without one; how many."""
-        tolerance = self.report.residuals["tolerance"]
+        tolerance = self.report.tolerances["penetration"]
         with stage("contact", self.report.seconds):
             u = self.dofs.to_primal(self.u.x.array)
             return search.take_in_overlapping(u, tolerance)
@@ -210,9 +212,9 @@ class ContactProblem:
             start = None
             if previous is not None:
                 start = (gluing.multipliers(previous.gluing, previous.lam), previous.mu)
-            result = solve_dual(dual, self.options, qp_type, start)
+            result, accuracy = solve_dual(dual, self.options, qp_type, start)
         with stage("recovery", report.seconds):
-            u = np.concatenate([np.empty(0), *dual.recover(result)])
+            u = np.concatenate([np.empty(0), *accuracy.u])
             self.u.x.array[:] = self.dofs.to_dolfinx(u)
             self._solution = Solution(
                 u=self.u,
@@ -224,8 +226,9 @@ class ContactProblem:
                 stress=self._stress,
                 contacts=self.contacts,
             )
-        fill_report(report, self.solution, dual, result, self._counters)
+        fill_result(report, self.solution, dual, result, accuracy, self._counters)
         result.destroy()
+        conclude(result, accuracy, self.options, comm)
         return self.solution
 
     def _build_blocks(self) -> None:

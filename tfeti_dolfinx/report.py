@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import resource
-from dataclasses import asdict, dataclass, field
+from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
 
 from mpi4py import MPI
@@ -32,18 +32,23 @@ class Report:
         F_multiplications: Multiplications by F, all but the power method's.
         preconditioner_multiplications: Multiplications by the preconditioner.
         power_method_multiplications: Multiplications that estimated ‖PFP‖.
+        recoveries: Displacements recovered to see how right they are, each for one more solve
+            in every subdomain.
         outer_iterations: Outer iterations.
         cg_steps: Conjugate gradient steps.
         expansion_steps: Expansion steps.
         proportioning_steps: Proportioning steps.
         factorizations: Factorisations of subdomain matrices.
-        converged_reason: Name of the ConvergedReason.
+        converged_reason: Name of the ConvergedReason; NO_SOLUTION where there is none,
+            NOT_SOLVED before a solve and where one ended in another error.
         peak_memory_mb: Peak resident memory, summed over ranks.
         seconds: Wall seconds of each stage (largest over ranks), and ``total``.
-        residuals: ``projected_gradient`` and ``equilibrium`` relative to b₀, with ``tolerance``
-            as a length: rtol·b₀, or what rounding allows; in physical units ``gluing_jump`` and
+        residuals: ``projected_gradient`` and ``equilibrium`` relative to b₀;
+            ``displacement_error``, the estimated error of u in the maximum norm relative to the
+            displacement of the body where it is worst; in physical units ``gluing_jump`` and
             ``penetration`` (lengths), ``tension`` (most negative pressure), ``complementarity``
             (largest force times gap), ``balance`` (largest force left on a kernel mode).
+        tolerances: What they were at most allowed to be, all but the first two.
         errors: Relative errors against closed forms, filled by demos.
         spectrum: With ``-tfeti_bbt``: the extreme eigenvalues ``BBt_min`` and ``BBt_max`` of
             B Bᵀ, ``BDBt_min`` and ``BDBt_max`` of B D⁻¹ Bᵀ. Their roots are the extreme
@@ -66,31 +71,25 @@ class Report:
     F_multiplications: int = 0
     preconditioner_multiplications: int = 0
     power_method_multiplications: int = 0
+    recoveries: int = 0
     outer_iterations: int = 0
     cg_steps: int = 0
     expansion_steps: int = 0
     proportioning_steps: int = 0
     factorizations: int = 0
-    converged_reason: str = "ITERATING"
+    converged_reason: str = "NOT_SOLVED"
     peak_memory_mb: float = 0.0
     seconds: dict[str, float] = field(default_factory=dict)
     residuals: dict[str, float] = field(default_factory=dict)
+    tolerances: dict[str, float] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
     spectrum: dict[str, float] = field(default_factory=dict)
 
-    def reset_counters(self) -> None:
-        """Set everything that adds up over rounds to zero."""
-        for name in (
-            "late_contact_rows",
-            "F_multiplications",
-            "preconditioner_multiplications",
-            "power_method_multiplications",
-            "outer_iterations",
-            "cg_steps",
-            "expansion_steps",
-            "proportioning_steps",
-        ):
-            setattr(self, name, 0)
+    def reset(self) -> None:
+        """Forget the solve before; seconds add up. After an error nothing old is left."""
+        for f in fields(self):
+            if f.name != "seconds":
+                setattr(self, f.name, f.default if f.default is not MISSING else {})
 
     def __str__(self) -> str:
         lines = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
@@ -19,7 +20,7 @@ from tfeti_dolfinx.dual.recovery import recover
 from tfeti_dolfinx.dual.solvability import check_solvable
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Unbounded
-from tfeti_dolfinx.qp.problem import QP, Coarse, NoCoarse, QPResult
+from tfeti_dolfinx.qp.problem import QP, Coarse, NoCoarse
 from tfeti_dolfinx.subdomains.block import Block
 
 
@@ -36,6 +37,7 @@ class Dual:
 
     Attributes:
         F: B K⁺ Bᵀ.
+        num_bodies: Number of bodies on all ranks.
         preconditioner: The preconditioner, or None.
         coarse: The coarse space.
         num_inequalities: Inequality rows of all ranks.
@@ -54,6 +56,7 @@ class Dual:
         pc_type: str,
     ) -> None:
         self.constraints, self.blocks = constraints, blocks
+        self.body_of_block, self.num_bodies = body_of_block, len(body_names)
         B, comm = constraints.B, constraints.B.getComm().tompi4py()
         self.F = dual_operator(B, blocks)
         self.preconditioner: BlockOperator | None = None
@@ -75,17 +78,18 @@ class Dual:
         feasible: FeasibleSet = bounds if self.num_inequalities else Unbounded()
         return QP(self.F, self.d, coarse, feasible, self.preconditioner)
 
-    def recover(self, result: QPResult) -> list[Array]:
-        """Displacements that belong to the multipliers of a result."""
-        bounded = self.constraints.inequalities
-        lam = result.lam.array_r
-        nu = np.zeros(len(lam))
-        closed = lam[bounded] <= 0.0
-        nu[bounded] = np.where(closed, result.gradient.array_r[bounded], 0.0)
-        constraints = self.constraints
-        return recover(
-            constraints.B, constraints.c, self.blocks, self.coarse, result.lam, bounded, nu
-        )
+    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec) -> list[Array]:
+        """Displacements that belong to multipliers.
+
+        Args:
+            lam: The multipliers λ.
+            gradient: Fλ − d up to the range of Gᵀ; on bound components the multiplier ν.
+        """
+        constraints, bounded = self.constraints, self.constraints.inequalities
+        nu = np.zeros(constraints.num_rows)
+        closed = lam.array_r[bounded] <= 0.0
+        nu[bounded] = np.where(closed, gradient.array_r[bounded], 0.0)
+        return recover(constraints.B, constraints.c, self.blocks, self.coarse, lam, bounded, nu)
 
     def destroy(self) -> None:
         """Destroy the PETSc objects."""

@@ -53,6 +53,12 @@ class Iterate:
         self.A.mult(target, self.Ap)
         self.move(-1.0, target, self.Ap)
 
+    def refresh(self, linear: PETSc.Vec) -> None:
+        """g = A x + c anew, for what rounding has added up in it; multiplies by A once."""
+        self.A.mult(self.x, self.g)
+        self.g.axpy(1.0, linear)
+        self.split()
+
     def destroy(self) -> None:
         """Destroy the work vectors, not x and g. Collective."""
         for vec in (self.phi, self.beta, self.p, self.Ap):

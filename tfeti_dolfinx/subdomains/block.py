@@ -52,6 +52,20 @@ class Block(Protocol):
         ...
 
     @property
+    def modes(self) -> Array:
+        """C, the candidate modes of the whole body on all unknowns, shape ``(n, k)``."""
+        ...
+
+    @property
+    def diagonal(self) -> Array:
+        """Diagonal of K on the trace, shape ``(t,)``."""
+        ...
+
+    def energy(self, u: Array) -> float:
+        """uᵀKu."""
+        ...
+
+    @property
     def condensed_load(self) -> Array:
         """K⁺ f on the trace, shape ``(t,)``."""
         ...
@@ -112,6 +126,11 @@ def check_block(block: Block, K: Any, tol: float = 1e-9) -> None:
     assert np.allclose(R[trace], block.kernel, atol=tol)
     assert np.abs(K @ R).max(initial=0.0) <= tol * np.abs(K).max()
     assert np.linalg.matrix_rank(K, tol=1e-8 * np.abs(K).max()) == block.size - r
+
+    assert np.allclose(block.diagonal, K.diagonal()[trace], rtol=tol)
+    whole = np.random.default_rng(1).standard_normal(block.size)
+    assert np.isclose(block.energy(whole), whole @ K @ whole, rtol=tol)
+    assert np.allclose(R.T @ block.modes, block.body_modes[0], atol=tol)
 
     pinv_w, pinv_v = block.apply_pinv(w), block.apply_pinv(v)
     assert np.isclose(v @ pinv_w, w @ pinv_v, rtol=tol, atol=tol * np.abs(pinv_w).max())

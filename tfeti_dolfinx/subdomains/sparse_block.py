@@ -75,11 +75,11 @@ class SparseBlock:
         """Replace the trace; the factor of K_ii goes with it, that of K stays."""
         if not np.array_equal(trace_dofs, self.trace_dofs):
             self.trace_dofs = trace_dofs
-            self._forget("_inner", "_blocks", "kernel")
+            self._forget("_inner", "_blocks", "kernel", "diagonal")
 
     def destroy(self) -> None:
         """Free the factors."""
-        self._forget("_pinv", "_inner", "_blocks", "_R", "kernel")
+        self._forget("_pinv", "_inner", "_blocks", "_R", "kernel", "diagonal")
 
     def _forget(self, *names: str) -> None:
         """Drop cached values, and free those that are factors."""
@@ -111,10 +111,24 @@ class SparseBlock:
     @property
     def body_modes(self) -> tuple[Array, Array]:
         """Rᵀ C and Cᵀ(I − R Rᵀ)C for the candidate modes C of the body."""
-        modes = self._modes(*self._frame)
+        modes = self.modes
         inside = self._R.T @ modes
         rest = modes - self._R @ inside
         return inside, rest.T @ rest
+
+    @property
+    def modes(self) -> Array:
+        """C, the candidate modes of the whole body on all unknowns, shape ``(n, k)``."""
+        return self._modes(*self._frame)
+
+    @cached_property
+    def diagonal(self) -> Array:
+        """Diagonal of K on the trace, shape ``(t,)``."""
+        return self._K.diagonal()[self.trace_dofs]
+
+    def energy(self, u: Array) -> float:
+        """uᵀKu."""
+        return float(u @ (self._K @ u))
 
     @property
     def condensed_load(self) -> Array:
