@@ -237,4 +237,10 @@ def _listed(data: Any, kind: str, decomposition: Decomposition, what: str) -> tu
             )
         entities.append(found if kind == "cell" else facets[cell, local])
         values.append(np.full(len(entities[-1]), item[0]))
+    tags = [tag for tag, _ in data]
+    if tags != sorted(set(tags)):  # DOLFINx would integrate over some of them only
+        raise InputError(
+            f"{what}: subdomain_data has the tags {shown(tags)}; expected each once, in ascending "
+            "order"
+        )
     return np.concatenate(entities), np.concatenate(values)

@@ -140,7 +140,7 @@ def parse_options(given: Mapping[str, Any] | None, prefix: str) -> Options:
         InputError: An option is unknown, its value does not fit, or the command line has options
             that PETSc was not given.
     """
-    named = _named(given, prefix)
+    named = _without_prefix(given, prefix)
     database = PETSc.Options(prefix)
     _check_reached(named, database, prefix)
     named |= {name: database.getString(name, "") for name in database.getAll()}
@@ -171,7 +171,7 @@ def check_preconditioner(options: Options, prefix: str) -> None:
         )
 
 
-def _named(given: Any, prefix: str) -> dict[str, Any]:
+def _without_prefix(given: Any, prefix: str) -> dict[str, Any]:
     """The options given, without the prefix."""
     if not isinstance(prefix, str) or not re.fullmatch(r"\w+", prefix):
         raise InputError(

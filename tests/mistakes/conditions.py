@@ -207,4 +207,4 @@ OTHERS = {
     ),
 }
 
-MISTAKES = BCS | U | STRESS | OTHERS
+TABLES = ("BCS", "U", "STRESS", "OTHERS")

@@ -5,6 +5,8 @@ import ufl
 from basix.ufl import element, mixed_element
 from dolfinx import fem
 
+NO_ENTITIES = np.empty(0, dtype=np.int32)
+
 
 def mixed(s):
     cell = s.d.mesh.basix_cell()
@@ -306,6 +308,14 @@ MEASURES = {
         lambda s: s.problem(**load(s, s.ds([(4, np.array([0], dtype=np.int32))]), 4)),
         r"L: ds\(4\): subdomain_data of tag 4 has entities that this rank has not",
     ),
+    "ds with a list that is not in order": (
+        lambda s: s.problem(**load(s, s.ds([(4, NO_ENTITIES), (2, NO_ENTITIES)]), 4)),
+        r"L: ds\(4\): subdomain_data has the tags \[4, 2\]; expected each once, in ascending order",
+    ),
+    "ds with a list that has a tag twice": (
+        lambda s: s.problem(**load(s, s.ds([(4, NO_ENTITIES), (4, NO_ENTITIES)]), 4)),
+        r"L: ds\(4\): subdomain_data has the tags \[4, 4\]; expected each once",
+    ),
     "ds with two kinds of tags in a form": (
         lambda s: s.problem(L=s.v[0] * s.ds()(4) + s.v[1] * other_ds(s)(3)),
         r"L: ds with different subdomain_data; expected one measure ds in a form",
@@ -322,4 +332,4 @@ def load_of(s):
     return g * s.v[0] * s.dx
 
 
-MISTAKES = ARGUMENTS | SPACES | COEFFICIENTS | MEASURES
+TABLES = ("ARGUMENTS", "SPACES", "COEFFICIENTS", "MEASURES")

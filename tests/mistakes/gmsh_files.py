@@ -136,4 +136,4 @@ SOURCES = {
     ),
 }
 
-MISTAKES = SOURCES
+TABLES = ("SOURCES",)

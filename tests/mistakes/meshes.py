@@ -216,4 +216,4 @@ NAMES = {
     "a surface that is a fraction": (lambda s: s.d.surface(1.0), r"surface 1.0: expected the na"),
 }
 
-MISTAKES = MESHES | SUBDOMAINS | TAGS | NAMES
+TABLES = ("MESHES", "SUBDOMAINS", "TAGS", "NAMES")

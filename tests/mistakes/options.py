@@ -120,4 +120,4 @@ OPTIONS = {
     ),
 }
 
-MISTAKES = OPTIONS
+TABLES = ("OPTIONS",)

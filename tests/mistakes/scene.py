@@ -80,6 +80,15 @@ class Scene:
     def untorn_space(self, *element):
         return fem.functionspace(self.mesh, element)
 
+    @cached_property
+    def twin(self):
+        """A space that is equal to V, but another one."""
+        return self.space(*self.vector)
+
+    @cached_property
+    def twin_u(self):
+        return fem.Function(self.twin)
+
     @property
     def u(self):
         return ufl.TrialFunction(self.V)
