@@ -177,7 +177,7 @@ def _check_tags(integral: Any, name: str, decomposition: Decomposition) -> None:
         return
     for t in tags:
         what = f"{name}: {KINDS[kind]}({t})"
-        with raised_on_all_ranks(decomposition.comm):
+        with raised_on_all_ranks(decomposition.comm), named(what):
             entities, values = _tagged(data, kind, decomposition, what)
         _check_entities(entities[values == t], kind, what, decomposition)
 

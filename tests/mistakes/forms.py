@@ -304,6 +304,10 @@ MEASURES = {
         lambda s: s.problem(**load(s, s.ds([(4, np.array([1000, 0], dtype=np.int32))]), 4)),
         r"L: ds\(4\): subdomain_data of tag 4 has entities that this rank has not",
     ),
+    "ds with a list of names": (
+        lambda s: s.problem(**load(s, s.ds([(4, ["top"])]), 4)),
+        r"L: ds\(4\): ValueError: ",
+    ),
     "ds with a list of half pairs": (
         lambda s: s.problem(**load(s, s.ds([(4, np.array([0], dtype=np.int32))]), 4)),
         r"L: ds\(4\): subdomain_data of tag 4 has entities that this rank has not",
