@@ -10,7 +10,8 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-from tfeti_dolfinx.errors import naming, raised_on_all_ranks
+from tfeti_dolfinx.checks import named
+from tfeti_dolfinx.errors import raised_on_all_ranks
 
 
 @dataclass
@@ -114,10 +115,9 @@ class Report:
         Raises:
             InputError: The file cannot be written.
         """
-        with raised_on_all_ranks(comm):
+        with raised_on_all_ranks(comm), named(f"cannot write {path}", OSError):
             if comm.rank == 0:
-                with naming(path):
-                    _write_whole(Path(path), self.to_json() + "\n")
+                _write_whole(Path(path), self.to_json() + "\n")
 
 
 def _write_whole(target: Path, text: str) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 from dolfinx import fem
 
 from tfeti_dolfinx.arrays import Array, sum_rows
+from tfeti_dolfinx.checks import is_whole, shown
 from tfeti_dolfinx.contact.forces import BodyForces, body_forces, nodal_forces, vertex_tractions
 from tfeti_dolfinx.contact.records import remaining_gaps
 from tfeti_dolfinx.contact.search import ContactPartner
@@ -184,8 +185,12 @@ class Solution:
             InputError: There is no such contact.
         """
         records = self.gluing.records
-        if not 0 <= index < len(self.contacts):
-            raise InputError(f"contact {index}: there are {len(self.contacts)}, counted from 0")
+        if not is_whole(index) or not 0 <= index < len(self.contacts):
+            known = [f"{i}: {contact.surfaces}" for i, contact in enumerate(self.contacts)]
+            raise InputError(
+                f"contact {shown(index)}: there are {len(known)}, counted from 0; their positions "
+                f"and surfaces are {', '.join(known) or 'none'}"
+            )
         points = group_points(self.dofs)
         own = records.contact == index
         return ContactData(
