@@ -13,7 +13,7 @@ from tfeti_dolfinx import Report
 @pytest.fixture(scope="module")
 def report():
     d = decomposed("hexahedron", 6, 8)
-    p = problem(d, contacts=[tfeti.Obstacle("bottom", curved_obstacle(3))])
+    p = problem(d, contacts=[tfeti.Obstacle("bottom", curved_obstacle(3), reach=0.1)])
     p.solve()
     return p.report
 
@@ -41,7 +41,10 @@ def test_residuals_are_named(report):
     assert set(report.residuals) == {
         "projected_gradient",
         "equilibrium",
-        "tolerance",
+        *report.tolerances,
+    }
+    assert set(report.tolerances) == {
+        "displacement_error",
         "gluing_jump",
         "penetration",
         "tension",
@@ -60,8 +63,41 @@ def test_json_has_every_field(report, comm, shared_tmp):
     assert [p.name for p in path.parent.iterdir()] == ["report.json"]
 
 
+def test_a_report_that_cannot_be_written_is_named_on_all_ranks(report, comm, shared_tmp):
+    if comm.rank == 0:
+        (shared_tmp / "file").write_text("")
+        (shared_tmp / "folder").mkdir()
+    comm.barrier()
+    for path in (shared_tmp / "file" / "report.json", shared_tmp / "folder"):
+        with pytest.raises(tfeti.InputError, match=f"cannot write {path}"):
+            report.write(path, comm)
+    comm.barrier()
+    assert not list(shared_tmp.glob(".*"))
+
+
 def test_text_has_every_field(report):
     text = str(report)
     for f in fields(Report):
         if f.name != "errors":
             assert f.name in text
+
+
+def test_after_an_error_the_report_says_what_is_known():
+    d = decomposed("hexahedron", 2, 3)
+    floor = tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -0.01), (0, 0, 1)))
+    p = problem(d, (0, 0, 0.05), [floor], clamped=())
+    assert p.report.converged_reason == "NOT_SOLVED"
+    with pytest.raises(tfeti.NoSolutionError):
+        p.solve()
+    assert p.report.converged_reason == "NO_SOLUTION"
+    assert p.report.contact_candidates == 9
+    assert p.report.primal_dofs > 81
+    assert p.report.active_contacts == 0
+
+
+def test_a_solve_that_stopped_early_says_how_wrong_it_is():
+    p = problem(decomposed("hexahedron", 3, 4), tfeti_max_it=3)
+    with pytest.raises(tfeti.ConvergenceError, match="times what rtol 1e-06 allows"):
+        p.solve()
+    assert p.report.converged_reason == "DIVERGED_ITS"
+    assert p.report.residuals["displacement_error"] > 1e-6

@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 import os
 import resource
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 from mpi4py import MPI
+
+from tfeti_dolfinx.checks import named
+from tfeti_dolfinx.errors import raised_on_all_ranks
 
 PRINTED = 10  # of a list; all of it is in the file
 
@@ -33,23 +36,29 @@ class Report:
         contact_candidates: Nodes of the (secondary) contact surfaces.
         far_contact_nodes: Those that were out of reach or not covered, and have no row.
         late_contact_rows: Rows that nodes out of reach got after a solve, since they overlapped.
+        unmet_contacts: Contacts none of whose nodes has a row: position in the list, and name.
         dropped_contact_rows: Those that prescribed components decide alone.
         active_contacts: Rows with a positive force.
         F_multiplications: Multiplications by F, all but the power method's.
         preconditioner_multiplications: Multiplications by the preconditioner.
         power_method_multiplications: Multiplications that estimated ‖PFP‖.
+        recoveries: Displacements recovered to see how right they are, each for one more solve
+            in every subdomain.
         outer_iterations: Outer iterations.
         cg_steps: Conjugate gradient steps.
         expansion_steps: Expansion steps.
         proportioning_steps: Proportioning steps.
         factorizations: Factorisations of subdomain matrices.
-        converged_reason: Name of the ConvergedReason.
+        converged_reason: Name of the ConvergedReason; NO_SOLUTION where there is none,
+            NOT_SOLVED before a solve and where one ended in another error.
         peak_memory_mb: Peak resident memory, summed over ranks.
         seconds: Wall seconds of each stage (largest over ranks), and ``total``.
-        residuals: ``projected_gradient`` and ``equilibrium`` relative to b₀, with ``tolerance``
-            as a length: rtol·b₀, or what rounding allows; in physical units ``gluing_jump`` and
+        residuals: ``projected_gradient`` and ``equilibrium`` relative to b₀;
+            ``displacement_error``, the estimated error of u in the maximum norm relative to the
+            displacement of the body where it is worst; in physical units ``gluing_jump`` and
             ``penetration`` (lengths), ``tension`` (most negative pressure), ``complementarity``
             (largest force times gap), ``balance`` (largest force left on a kernel mode).
+        tolerances: What they were at most allowed to be, all but the first two.
         errors: Relative errors against closed forms, filled by demos.
         spectrum: With ``-tfeti_bbt``: the extreme eigenvalues ``BBt_min`` and ``BBt_max`` of
             B Bᵀ, ``BDBt_min`` and ``BDBt_max`` of B D⁻¹ Bᵀ. Their roots are the extreme
@@ -68,36 +77,31 @@ class Report:
     contact_candidates: int = 0
     far_contact_nodes: int = 0
     late_contact_rows: int = 0
+    unmet_contacts: list[str] = field(default_factory=list)
     dropped_contact_rows: int = 0
     active_contacts: int = 0
     F_multiplications: int = 0
     preconditioner_multiplications: int = 0
     power_method_multiplications: int = 0
+    recoveries: int = 0
     outer_iterations: int = 0
     cg_steps: int = 0
     expansion_steps: int = 0
     proportioning_steps: int = 0
     factorizations: int = 0
-    converged_reason: str = "ITERATING"
+    converged_reason: str = "NOT_SOLVED"
     peak_memory_mb: float = 0.0
     seconds: dict[str, float] = field(default_factory=dict)
     residuals: dict[str, float] = field(default_factory=dict)
+    tolerances: dict[str, float] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
     spectrum: dict[str, float] = field(default_factory=dict)
 
-    def reset_counters(self) -> None:
-        """Set everything that adds up over rounds to zero."""
-        for name in (
-            "late_contact_rows",
-            "F_multiplications",
-            "preconditioner_multiplications",
-            "power_method_multiplications",
-            "outer_iterations",
-            "cg_steps",
-            "expansion_steps",
-            "proportioning_steps",
-        ):
-            setattr(self, name, 0)
+    def reset(self) -> None:
+        """Forget the solve before; seconds add up. After an error nothing old is left."""
+        fresh = Report(seconds=self.seconds)
+        for f in fields(self):
+            setattr(self, f.name, getattr(fresh, f.name))
 
     def __str__(self) -> str:
         lines = []
@@ -105,7 +109,7 @@ class Report:
             if isinstance(value, dict) and value:
                 lines += [f"{name}.{key:<22} {item:.6g}" for key, item in value.items()]
             elif isinstance(value, list) and value:
-                lines += [f"{name:<31} {_motion(item)}" for item in value[:PRINTED]]
+                lines += [f"{name:<31} {_item(item)}" for item in value[:PRINTED]]
                 lines += [f"{name:<31} {len(value)} in all"]
             else:
                 lines.append(f"{name:<31} {'-' if value in ({}, []) else value}")
@@ -116,18 +120,32 @@ class Report:
         return json.dumps(asdict(self), indent=2)
 
     def write(self, path: str | Path, comm: MPI.Intracomm) -> None:
-        """Write the report as a JSON file; it appears whole. Collective."""
-        if comm.rank == 0:
-            target = Path(path)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            partial = target.with_name(f".{target.name}.partial")
-            partial.write_text(self.to_json() + "\n")
-            os.replace(partial, target)
-        comm.barrier()
+        """Write the report as a JSON file; it appears whole. Collective.
+
+        Raises:
+            InputError: The file cannot be written.
+        """
+        with raised_on_all_ranks(comm), named(f"cannot write {path}", OSError):
+            if comm.rank == 0:
+                _write_whole(Path(path), self.to_json() + "\n")
 
 
-def _motion(item: dict[str, Any]) -> str:
-    """One of ``nearly_free`` as text."""
+def _write_whole(target: Path, text: str) -> None:
+    """Write a file aside and give it its name when it is whole."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_name(f".{target.name}.partial")
+    partial.write_text(text)
+    try:
+        os.replace(partial, target)
+    except OSError:
+        partial.unlink()
+        raise
+
+
+def _item(item: str | dict[str, Any]) -> str:
+    """An unmet contact, or a motion that is nearly free, as text."""
+    if isinstance(item, str):
+        return item
     return f"{', '.join(item['bodies'])}: {item['mode']}, stiffness {item['stiffness']:.2g}"
 
 

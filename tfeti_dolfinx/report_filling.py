@@ -6,36 +6,48 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.dual.accuracy import Accuracy
 from tfeti_dolfinx.dual.dual import Dual
+from tfeti_dolfinx.gluing.glue import Gluing
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.qp.problem import QPResult
 from tfeti_dolfinx.report import Report, peak_memory_mb
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.subdomains.sparse_block import Counters
 
 
-def fill_report(
-    report: Report,
-    solution: Solution,
-    dual: Dual,
-    result: QPResult,
-    counters: Counters,
+def fill_sizes(
+    report: Report, dofs: TornDofs, decomposition: Decomposition, gluing: Gluing
 ) -> None:
-    """Fill in everything but closed-form errors; counters add up over rounds. Collective."""
-    comm, decomposition, gluing = dual.coarse.comm, solution.decomposition, solution.gluing
-    dofs = solution.dofs
+    """Fill in what is known before the dual problem is. Collective."""
+    comm, constraints = dofs.comm, gluing.constraints
+    bounded = constraints.inequalities
     report.primal_dofs = int(dofs.offsets[-1]) * dofs.bs
-    report.dual_dofs = comm.allreduce(gluing.constraints.num_rows)
+    report.dual_dofs = comm.allreduce(constraints.num_rows)
     report.subdomains, report.bodies = decomposition.num_subdomains, decomposition.num_bodies
     report.split_subdomains = len(decomposition.split)
-    report.kernel_dim = dual.coarse.dimension
-    report.free_modes = dual.coarse.free_modes
-    report.nearly_free = dual.nearly_free
-    report.contact_rows = dual.num_inequalities
+    report.contact_rows = comm.allreduce(bounded.stop - bounded.start)
     report.contact_candidates = comm.allreduce(gluing.records.candidates)
     near = comm.allreduce(int(np.sum(gluing.records.near)))
     report.far_contact_nodes = report.contact_candidates - near
     report.dropped_contact_rows = comm.allreduce(gluing.inequalities.dropped)
-    active = solution.lam[gluing.constraints.inequalities] > 0.0
+
+
+def fill_result(
+    report: Report,
+    solution: Solution,
+    dual: Dual,
+    result: QPResult,
+    accuracy: Accuracy,
+    counters: Counters,
+) -> None:
+    """Fill in what a solve has found; counters add up over rounds. Collective."""
+    comm = dual.coarse.comm
+    report.kernel_dim = dual.coarse.dimension
+    report.free_modes = dual.coarse.free_modes
+    report.nearly_free = dual.nearly_free
+    active = solution.lam[solution.gluing.constraints.inequalities] > 0.0
     report.active_contacts = comm.allreduce(int(np.sum(active)))
     report.F_multiplications += dual.F.count["solver"]
     report.power_method_multiplications += dual.F.count["power method"]
@@ -47,32 +59,46 @@ def fill_report(
     report.proportioning_steps += result.steps.proportioning
     report.factorizations = comm.allreduce(counters.factorizations)
     report.converged_reason = result.reason.name
-    report.residuals = _residuals(solution, dual, result)
+    report.recoveries += accuracy.looks
+    report.residuals = _residuals(solution, dual, result, accuracy)
+    report.tolerances = _tolerances(solution, dual, accuracy)
     report.peak_memory_mb = peak_memory_mb(comm)
     for name, value in report.seconds.items():
         report.seconds[name] = comm.allreduce(value, op=MPI.MAX)
     report.seconds["total"] = sum(v for k, v in report.seconds.items() if k != "total")
 
 
-def _residuals(solution: Solution, dual: Dual, result: QPResult) -> dict[str, float]:
-    comm, coarse = dual.coarse.comm, dual.coarse
+def _residuals(
+    solution: Solution, dual: Dual, result: QPResult, accuracy: Accuracy
+) -> dict[str, float]:
     reference = result.reference or 1.0
-    balance = coarse.G(solution.lam) - coarse.e
-
-    def largest(values: Array) -> float:
-        return float(comm.allreduce(float(np.max(values, initial=0.0)), op=MPI.MAX))
-
     gap = solution.remaining_gap
     return {
         "projected_gradient": result.projected_gradient / reference,
         "equilibrium": result.norm * result.equality / reference,
-        "tolerance": result.tolerance,
-        "gluing_jump": largest(_jumps(solution)),
-        "penetration": largest(-gap),
-        "tension": largest(0.0 - solution.contact_pressure),
-        "complementarity": largest(np.abs(solution.force * gap)),
-        "balance": largest(np.abs(balance)),
+        "displacement_error": accuracy.relative_error(),
+        "gluing_jump": _largest(dual, _jumps(solution)),
+        "penetration": _largest(dual, -gap),
+        "tension": _largest(dual, 0.0 - solution.contact_pressure),
+        "complementarity": _largest(dual, np.abs(solution.force * gap)),
+        "balance": accuracy.balance,
     }
+
+
+def _tolerances(solution: Solution, dual: Dual, accuracy: Accuracy) -> dict[str, float]:
+    allowed = accuracy.tolerances()
+    return {
+        "displacement_error": accuracy.rtol,
+        "gluing_jump": allowed.jump,
+        "penetration": allowed.penetration,
+        "tension": 0.0,
+        "complementarity": _largest(dual, solution.force) * allowed.penetration,
+        "balance": allowed.balance,
+    }
+
+
+def _largest(dual: Dual, values: Array) -> float:
+    return float(dual.coarse.comm.allreduce(float(np.max(values, initial=0.0)), op=MPI.MAX))
 
 
 def _jumps(solution: Solution) -> Array:

@@ -6,31 +6,41 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.dual.accuracy import Accuracy
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.dual.particular import feasible_particular
 from tfeti_dolfinx.errors import ConvergenceError, InputError
-from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.options import Options, check_preconditioner
 from tfeti_dolfinx.qp.homogenised import Homogenised, homogenise
 from tfeti_dolfinx.qp.monitors import Monitor, PrintMonitor, no_monitor
+from tfeti_dolfinx.qp.norm import estimate_norm
 from tfeti_dolfinx.qp.pcpg import pcpg
-from tfeti_dolfinx.qp.problem import QP, QPResult, Start, estimate_norm
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, QPResult, Start
 from tfeti_dolfinx.qp.smalse import smalse
 
+EXPLANATIONS = {
+    ConvergedReason.DIVERGED_ROUNDING: "; rounding does not let it come lower: expected a "
+    "larger rtol, or a scene with smaller ratios of stiffness or size",
+    ConvergedReason.DIVERGED_STALLED: "; the forces come no nearer to balancing the load",
+}
 
-def resolve_types(options: Options, num_inequalities: int) -> tuple[str, str]:
+
+def resolve_types(options: Options, num_inequalities: int, prefix: str) -> tuple[str, str]:
     """The solver and the preconditioner that ``auto`` stands for.
 
     Raises:
-        InputError: pcpg is asked for, but the scene has inequalities.
+        InputError: The scene has inequalities, but pcpg or a preconditioner is asked for.
     """
     qp_type = options.qp_type
     if qp_type == "auto":
         qp_type = "smalse" if num_inequalities else "pcpg"
     if qp_type == "pcpg" and num_inequalities:
         raise InputError(
-            f"qp_type pcpg: the scene has {num_inequalities} contact rows, which PCPG cannot "
-            "keep; expected auto or smalse"
+            f"-{prefix}qp_type pcpg: the scene has {num_inequalities} contact rows, which PCPG "
+            "cannot keep; expected auto or smalse"
         )
+    if qp_type == "smalse":
+        check_preconditioner(options, prefix)
     pc_type = options.pc_type
     if pc_type == "auto":
         pc_type = "dirichlet" if qp_type == "pcpg" else "none"
@@ -39,8 +49,8 @@ def resolve_types(options: Options, num_inequalities: int) -> tuple[str, str]:
 
 def solve_dual(
     dual: Dual, options: Options, qp_type: str, start: tuple[Array, Array] | None = None
-) -> QPResult:
-    """Solve the dual problem. Collective.
+) -> tuple[QPResult, Accuracy]:
+    """Solve the dual problem, and look at the answer. Collective.
 
     Args:
         dual: The dual problem.
@@ -48,38 +58,35 @@ def solve_dual(
         qp_type: pcpg or smalse.
         start: λ on this rank's rows, and the multipliers of Gλ = e, to start from.
 
-    Raises:
-        ConvergenceError: The solver stopped before its tolerance, unless options turn it off.
+    Returns:
+        Multipliers, and their displacement with its measured accuracy.
     """
     qp = dual.qp()
     homogenised = _homogenise(dual, qp, options)
-    monitor = _monitor(dual, homogenised, options)
-    if qp_type == "pcpg":
-        result = pcpg(
-            qp,
-            homogenised,
-            rtol=options.rtol,
-            atol=options.atol,
-            max_it=options.max_it,
-            monitor=monitor,
-        )
-    else:
+    monitor, norm = _monitor(dual, homogenised, options), 1.0
+    if qp_type == "smalse":
         with dual.F.charged_to("power method"):
             norm = estimate_norm(qp.F, qp.coarse, qp.d, options.norm_steps)
+    reference, rounding = homogenised.reference, homogenised.rounding
+    rule = Accuracy(dual, options.rtol, options.atol, reference, rounding, norm)
+    if qp_type == "pcpg":
+        result = pcpg(qp, homogenised, rule, max_it=options.max_it, monitor=monitor)
+    else:
         result = smalse(
             qp,
             homogenised,
             norm,
+            rule,
             options.smalse(),
-            rtol=options.rtol,
-            atol=options.atol,
             max_it=options.max_it,
             start=_start(start, qp.d),
             monitor=monitor,
         )
     homogenised.destroy()
-    _conclude(result, options, dual.constraints.c.getComm().tompi4py())
-    return result
+    if result.reason <= 0:
+        residual = max(result.projected_gradient, norm * result.equality)
+        rule.look(result.lam, result.gradient, residual)
+    return result, rule
 
 
 def _start(values: tuple[Array, Array] | None, like: PETSc.Vec) -> Start | None:
@@ -110,13 +117,16 @@ def _monitor(dual: Dual, homogenised: Homogenised, options: Options) -> Monitor:
     )
 
 
-def _conclude(result: QPResult, options: Options, comm: MPI.Intracomm) -> None:
-    """Say why the solver stopped, and raise where it should have gone on."""
-    name = result.reason.name
+def conclude(result: QPResult, rule: Accuracy, options: Options, comm: MPI.Intracomm) -> None:
+    """Say why the solver stopped, and raise where it should have gone on.
+
+    Raises:
+        ConvergenceError: It stopped before its tolerance, unless options turn that off.
+    """
     text = (
-        f"{name} after {result.steps.outer} outer and {result.steps.inner} inner iterations: "
-        f"‖g^P‖ = {result.projected_gradient:.3e}, ‖F‖‖Qx‖ = "
-        f"{result.norm * result.equality:.3e}, tolerance {result.tolerance:.3e}"
+        f"{result.reason.name} after {result.steps.outer} outer and {result.steps.inner} inner "
+        f"iterations: the worst of its errors is {rule.ratio():.3g} times what rtol "
+        f"{options.rtol:g} allows{EXPLANATIONS.get(result.reason, '')}"
     )
     if options.converged_reason and comm.rank == 0:
         print(f"TFETI solve {text}", flush=True)

@@ -15,7 +15,7 @@ from tfeti_dolfinx.dual.bodies import Bodies, joined
 from tfeti_dolfinx.dual.motions import NULL, Motions, unresisted, unsprung
 from tfeti_dolfinx.dual.null_basis import NullBasis, null_basis
 from tfeti_dolfinx.dual.operator import trace_slices
-from tfeti_dolfinx.errors import raised_on_all_ranks
+from tfeti_dolfinx.errors import FactorError, raised_on_all_ranks
 from tfeti_dolfinx.parallel import agreed, chunk_offsets
 from tfeti_dolfinx.subdomains.block import Block
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor
@@ -34,6 +34,7 @@ class CoarseSpace:
         num_bodies: Number of bodies on all ranks.
         bounded: Local rows with λ ≥ 0.
         comm: Communicator. The constructor and all methods are collective.
+        prefix: Prefix of the factor's PETSc options.
 
     Attributes:
         dimension: r, the dimension of the kernel of K.
@@ -59,6 +60,7 @@ class CoarseSpace:
         num_bodies: int,
         bounded: slice,
         comm: MPI.Intracomm,
+        prefix: str = "tfeti_coarse_",
     ) -> None:
         self.comm, self.bounded = comm, bounded
         sizes = np.array([block.kernel.shape[1] for block in blocks], dtype=np.int64)
@@ -76,7 +78,12 @@ class CoarseSpace:
         self.unheld = self._unresisted(equalities, unsprung(self.bodies.springs), NULL)
         self.free_motions = self.unresisted(~equalities)
         self.null = null_basis(self.bodies, self.free_motions)
-        self._factor = SemidefiniteFactor(self.gram(), self.null)
+        gram = self.gram()
+        with raised_on_all_ranks(comm):
+            try:
+                self._factor = SemidefiniteFactor(gram, self.null, prefix)
+            except FactorError as error:
+                raise type(error)(f"GGᵀ of the coarse problem: {error}") from error
 
     def update_load(self, blocks: Sequence[Block]) -> None:
         """Replace e = Rᵀ f by that of the Blocks' present loads."""
@@ -173,14 +180,16 @@ class SemidefiniteFactor:
     Args:
         A: scipy CSR, shape ``(r, r)``.
         null: Its null space.
+        prefix: Prefix of the factor's PETSc options.
     """
 
-    def __init__(self, A: csr_array, null: NullBasis) -> None:
+    def __init__(self, A: csr_array, null: NullBasis, prefix: str = "tfeti_coarse_") -> None:
         self._null, diagonal, pinned = null, A.diagonal(), np.zeros(A.shape[0])
         largest = diagonal.max(initial=0.0) or 1.0
         # an entry's own size: bodies may differ by many orders of magnitude
         pinned[null.pins] = np.where(diagonal[null.pins] > 0.0, diagonal[null.pins], largest)
-        self._factor = CholeskyFactor(csr_array(A + diags_array(pinned))) if A.shape[0] else None
+        regular = csr_array(A + diags_array(pinned))
+        self._factor = CholeskyFactor(regular, prefix) if A.shape[0] else None
 
     def solve(self, y: Array) -> Array:
         """A⁺ y up to null modes that are removed, y orthogonal to them."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
@@ -22,7 +23,7 @@ from tfeti_dolfinx.dual.solvability import check_solvable
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Unbounded
-from tfeti_dolfinx.qp.problem import QP, Coarse, NoCoarse, QPResult
+from tfeti_dolfinx.qp.problem import QP, Coarse, NoCoarse
 from tfeti_dolfinx.subdomains.block import Block
 
 
@@ -36,9 +37,11 @@ class Dual:
         body_names: Names of all bodies.
         mode_names: Names of their candidate modes.
         pc_type: Preconditioner: none, lumped or dirichlet.
+        options_prefix: Prefix of all PETSc options.
 
     Attributes:
         F: B K⁺ Bᵀ.
+        num_bodies: Number of bodies on all ranks.
         preconditioner: The preconditioner, or None.
         coarse: The coarse space.
         num_inequalities: Inequality rows of all ranks.
@@ -46,6 +49,7 @@ class Dual:
 
     Raises:
         NoSolutionError: The load moves a body that nothing holds.
+        FactorError: A matrix could not be factored.
     """
 
     def __init__(
@@ -56,8 +60,10 @@ class Dual:
         body_names: Sequence[str],
         mode_names: Sequence[str],
         pc_type: str,
+        options_prefix: str = "tfeti_",
     ) -> None:
         self.constraints, self.blocks = constraints, blocks
+        self.body_of_block, self.num_bodies = body_of_block, len(body_names)
         self._names, self.nearly_free = (body_names, mode_names), list[dict[str, object]]()
         B, comm = constraints.B, constraints.B.getComm().tompi4py()
         self.F = dual_operator(B, blocks)
@@ -67,7 +73,9 @@ class Dual:
             self._scaled = ScaledGluing(B, constraints.weights)
             self.preconditioner = PRECONDITIONERS[pc_type](self._scaled, blocks)
         bounded = constraints.inequalities
-        self.coarse = CoarseSpace(B, blocks, body_of_block, len(body_names), bounded, comm)
+        self.coarse = CoarseSpace(
+            B, blocks, body_of_block, len(body_names), bounded, comm, f"{options_prefix}coarse_"
+        )
         self.num_inequalities = comm.allreduce(bounded.stop - bounded.start)
         check_solvable(self.coarse, body_names, mode_names)
         self.d = linear_term(B, constraints.c, blocks)
@@ -79,17 +87,20 @@ class Dual:
         feasible: FeasibleSet = bounds if self.num_inequalities else Unbounded()
         return QP(self.F, self.d, coarse, feasible, self.preconditioner)
 
-    def recover(self, result: QPResult) -> list[Array]:
-        """Displacements that belong to the multipliers of a result."""
-        bounded = self.constraints.inequalities
-        lam = result.lam.array_r
-        nu = np.zeros(len(lam))
-        closed = lam[bounded] <= 0.0
-        nu[bounded] = np.where(closed, result.gradient.array_r[bounded], 0.0)
-        constraints = self.constraints
-        u, gap = recover(constraints.B, constraints.c, self.blocks, self.coarse, result.lam, nu)
-        error = max(result.projected_gradient / (result.norm or 1.0), result.equality)
-        motions, force = nearly_free(self.coarse, lam, error)
+    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, error: float) -> list[Array]:
+        """Displacements that belong to multipliers: of equal ones the smallest.
+
+        Args:
+            lam: The multipliers λ.
+            gradient: Fλ − d up to the range of Gᵀ; on bound components the multiplier ν.
+            error: How large multipliers may be by the solver's error alone.
+        """
+        constraints, bounded = self.constraints, self.constraints.inequalities
+        nu = np.zeros(constraints.num_rows)
+        closed = lam.array_r[bounded] <= 0.0
+        nu[bounded] = np.where(closed, gradient.array_r[bounded], 0.0)
+        u, gap = recover(constraints.B, constraints.c, self.blocks, self.coarse, lam, nu)
+        motions, force = nearly_free(self.coarse, lam.array_r, error)
         words = listed(motions, self.coarse.bodies, *self._names)
         self.nearly_free = agreed(self.coarse.comm, words)
         if motions.count == 0:

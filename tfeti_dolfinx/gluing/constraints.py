@@ -27,6 +27,7 @@ class Constraints:
         num_rows: All local rows.
         trace: Local primal unknown of each local trace unknown, ascending.
         weights: D on the local trace unknowns: the rows are scaled with it.
+        scale: The s_i of the local inequality rows: over it what a row misses is a length.
     """
 
     B: PETSc.Mat
@@ -35,6 +36,7 @@ class Constraints:
     num_rows: int
     trace: Array
     weights: Array
+    scale: Array
 
     @property
     def inequalities(self) -> slice:
@@ -48,7 +50,7 @@ class Constraints:
 
 
 def assemble_constraints(
-    dofs: TornDofs, equalities: Rows, inequalities: Rows, weights: Array
+    dofs: TornDofs, equalities: Rows, inequalities: Rows, weights: Array, scale: Array
 ) -> Constraints:
     """Assemble B and c. Collective.
 
@@ -57,6 +59,7 @@ def assemble_constraints(
         equalities: Gluing and Dirichlet rows of this rank.
         inequalities: Contact rows of this rank.
         weights: D on the local primal unknowns.
+        scale: What each contact row was multiplied by.
     """
     rows = stack([equalities, inequalities])
     trace, column = _trace_columns(dofs, rows.column)
@@ -71,7 +74,7 @@ def assemble_constraints(
     )
     c = B.createVecLeft()
     c.array[:] = rows.rhs
-    return Constraints(B, c, len(equalities), num_rows, trace, weights[trace])
+    return Constraints(B, c, len(equalities), num_rows, trace, weights[trace], scale)
 
 
 def _trace_columns(dofs: TornDofs, column: Array) -> tuple[Array, Array]:

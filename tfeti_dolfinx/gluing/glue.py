@@ -74,5 +74,7 @@ def glue(
     D = dofs.gather_copies(weights.reshape(-1, dofs.bs))
     inequalities = inequality_rows(dofs, prescribed, D, records, length)
     equalities = equality_rows(dofs, prescribed, D)
-    constraints = assemble_constraints(dofs, equalities, inequalities.rows, weights)
+    constraints = assemble_constraints(
+        dofs, equalities, inequalities.rows, weights, inequalities.scale
+    )
     return Gluing(prescribed, records, inequalities, constraints)

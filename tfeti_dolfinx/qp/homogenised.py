@@ -9,7 +9,9 @@ from petsc4py import PETSc
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.problem import QP, project
 
-ROUNDING = 1e-14
+# of the terms that a residual is the difference of: what rounding leaves of it at least, and
+# below how many times that rounding may be the reason of anything strange
+ROUNDING, STRANGE = 1e-14, 1e8
 
 
 @dataclass(frozen=True)
@@ -21,18 +23,18 @@ class Homogenised:
         b: P(d − F λ̄).
         feasible: Ω − λ̄.
         reference: b₀ = ‖P(d − F λ̄₀)‖ with λ̄₀ = Gᵀ(GGᵀ)⁻¹e, whatever λ̄ is.
-        noise: What rounding leaves of b₀ where it should be 0.
+        rounding: What rounding leaves of b₀ where it should be 0.
     """
 
     lam_bar: PETSc.Vec
     b: PETSc.Vec
     feasible: FeasibleSet
     reference: float
-    noise: float
+    rounding: float
 
-    def tolerance(self, rtol: float, atol: float) -> float:
-        """Norm at which a residual is small enough: rtol·b₀, atol, or that of rounding."""
-        return max(rtol * self.reference, atol, self.noise)
+    def is_rounding(self, residual: float) -> bool:
+        """Whether a residual is so small that rounding explains what is strange about it."""
+        return residual <= STRANGE * self.rounding
 
     def destroy(self) -> None:
         """Destroy the vectors. Collective."""
@@ -50,13 +52,13 @@ def homogenise(qp: QP, lam_bar: PETSc.Vec | None = None) -> Homogenised:
     natural = qp.d.duplicate()
     qp.coarse.particular(natural)
     b, size = _right_side(qp, natural)
-    reference, noise = b.norm(), ROUNDING * size
+    reference, rounding = b.norm(), ROUNDING * size
     if lam_bar is None:
-        return Homogenised(natural, b, qp.feasible.shifted(natural), reference, noise)
+        return Homogenised(natural, b, qp.feasible.shifted(natural), reference, rounding)
     natural.destroy()
     b.destroy()
     b, _ = _right_side(qp, lam_bar)
-    return Homogenised(lam_bar.copy(), b, qp.feasible.shifted(lam_bar), reference, noise)
+    return Homogenised(lam_bar.copy(), b, qp.feasible.shifted(lam_bar), reference, rounding)
 
 
 def _right_side(qp: QP, lam_bar: PETSc.Vec) -> tuple[PETSc.Vec, float]:

@@ -95,14 +95,19 @@ class QP:
 
 
 class ConvergedReason(IntEnum):
-    """Why a solver stopped; positive: converged. Values as in KSPConvergedReason."""
+    """Why a solver stopped; positive: converged. Values as in KSPConvergedReason, where it has one.
+
+    DIVERGED_ROUNDING: residuals cannot be brought down any further in floating point.
+    DIVERGED_STALLED: Gλ = e comes no nearer, as if nothing in Ω fulfilled it.
+    """
 
     CONVERGED_RTOL = 2
     CONVERGED_ATOL = 3
     ITERATING = 0
     DIVERGED_ITS = -3
-    DIVERGED_BREAKDOWN = -5
     DIVERGED_INDEFINITE_MAT = -10
+    DIVERGED_ROUNDING = -20
+    DIVERGED_STALLED = -21
 
 
 @dataclass
@@ -131,8 +136,7 @@ class QPResult:
         reason: Why the solver stopped.
         projected_gradient: ‖g^P‖ at the end.
         equality: ‖Q x‖ at the end, x the homogenised unknown.
-        reference: b₀ = ‖P(d − F λ̄₀)‖ that both are compared with.
-        tolerance: What both had to come down to.
+        reference: b₀ = ‖P(d − F λ̄₀)‖.
         norm: Estimate of ‖F‖ that ‖Q x‖ is weighted with.
         steps: Steps taken.
     """
@@ -144,7 +148,6 @@ class QPResult:
     projected_gradient: float
     equality: float
     reference: float
-    tolerance: float
     norm: float
     steps: Steps = field(default_factory=Steps)
 
@@ -165,36 +168,3 @@ class Start:
 
     lam: PETSc.Vec
     mu: Array
-
-
-def estimate_norm(
-    F: Operator, coarse: Coarse, like: PETSc.Vec, steps: int = 15, safety: float = 1.05
-) -> float:
-    """‖PFP‖ by the power method, times a safety factor. Collective.
-
-    The start is random, but the same in every run on the same number of ranks.
-
-    Args:
-        F: Symmetric positive semidefinite operator.
-        coarse: Gives the projector P.
-        like: A vector of the right layout.
-        steps: Multiplications by F.
-        safety: Factor on the result, since the method gives a lower bound.
-    """
-    x, y, work = like.duplicate(), like.duplicate(), like.duplicate()
-    rng = np.random.default_rng(like.getComm().getRank())
-    x.array[:] = rng.standard_normal(x.getLocalSize())
-    project(coarse, x, work)
-    norm = 0.0
-    for _ in range(steps):
-        length = x.norm()
-        if length == 0.0:
-            break
-        x.scale(1.0 / length)
-        F.mult(x, y)
-        project(coarse, y, work)
-        norm = y.norm()
-        x, y = y, x
-    for vec in (x, y, work):
-        vec.destroy()
-    return safety * norm

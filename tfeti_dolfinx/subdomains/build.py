@@ -13,6 +13,7 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.subdomains.factor import say_if_not_cholmod
 from tfeti_dolfinx.subdomains.sparse_block import Counters, SparseBlock
 
 
@@ -24,6 +25,7 @@ def sparse_blocks(
     trace: Array,
     counters: Counters,
     kplus_type: str,
+    prefix: str = "tfeti_sub_",
 ) -> list[SparseBlock]:
     """One SparseBlock for each subdomain of this rank. Collective.
 
@@ -35,7 +37,9 @@ def sparse_blocks(
         trace: Local primal unknowns that rows of B touch, ascending.
         counters: Counts factorisations.
         kplus_type: Kind of the generalised inverse.
+        prefix: Prefix of the factors' PETSc options.
     """
+    say_if_not_cholmod(dofs.comm)
     gdim = decomposition.mesh.geometry.dim
     x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node, :gdim]
     shares = 1.0 / dofs.spread(dofs.multiplicity)
@@ -60,6 +64,7 @@ def sparse_blocks(
                     body_frame=frames[decomposition.body_of_subdomain[subdomain]],
                     counters=counters,
                     kplus_type=kplus_type,
+                    prefix=prefix,
                     shares=shares[nodes],
                 )
             )

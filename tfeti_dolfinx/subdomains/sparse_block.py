@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import null_space
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.errors import FactorError, InputError
 from tfeti_dolfinx.subdomains.factor import NotPositiveDefiniteError
 from tfeti_dolfinx.subdomains.kernel import candidate_modes, fixing_nodes, kernel_of
 from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, GeneralisedInverse, regularised
@@ -37,11 +37,13 @@ class SparseBlock:
         body_frame: Centre and length of the whole body, for its candidate modes.
         counters: Counts factorisations.
         kplus_type: Kind of the generalised inverse.
+        prefix: Prefix of the factors' PETSc options.
         shares: 1 / number of torn copies of each node, shape ``(n / bs,)``; default 1.
 
     Raises:
         InputError: K is not symmetric, not finite or not positive semidefinite, or the load is
             not finite.
+        FactorError: A factor could not be made.
     """
 
     def __init__(
@@ -54,11 +56,12 @@ class SparseBlock:
         body_frame: tuple[Array, float],
         counters: Counters,
         kplus_type: str = "regularized",
+        prefix: str = "tfeti_sub_",
         shares: Array | None = None,
     ) -> None:
         self._name, self._x, self._frame = name, x, body_frame
         self._shares = np.ones(len(x)) if shares is None else shares
-        self._counters, self._kplus_type = counters, kplus_type
+        self._counters, self._kplus_type, self._prefix = counters, kplus_type, prefix
         self.trace_dofs = trace_dofs
         self.update(K=K, f=f)
 
@@ -78,11 +81,11 @@ class SparseBlock:
         """Replace the trace; the factor of K_ii goes with it, that of K stays."""
         if not np.array_equal(trace_dofs, self.trace_dofs):
             self.trace_dofs = trace_dofs
-            self._forget("_inner", "_blocks", "kernel")
+            self._forget("_inner", "_blocks", "kernel", "diagonal")
 
     def destroy(self) -> None:
         """Free the factors."""
-        self._forget("_pinv", "_inner", "_blocks", "_R", "kernel")
+        self._forget("_pinv", "_inner", "_blocks", "_R", "kernel", "diagonal")
 
     def _forget(self, *names: str) -> None:
         """Drop cached values, and free those that are factors."""
@@ -114,20 +117,33 @@ class SparseBlock:
     @property
     def body_modes(self) -> tuple[Array, Array]:
         """Rᵀ C and Cᵀ(I − R Rᵀ)C for the candidate modes C of the body."""
-        modes = self._modes(*self._frame)
+        modes = self.modes
         inside = self._R.T @ modes
         rest = modes - self._R @ inside
         return inside, rest.T @ rest
 
     @property
+    def modes(self) -> Array:
+        """C, the candidate modes of the whole body on all unknowns, shape ``(n, k)``."""
+        return self._modes(*self._frame)
+
+    @cached_property
+    def diagonal(self) -> Array:
+        """Diagonal of K on the trace, shape ``(t,)``."""
+        return self._K.diagonal()[self.trace_dofs]
+
+    def energy(self, u: Array) -> float:
+        """uᵀKu."""
+        return float(u @ (self._K @ u))
+
+    @property
     def body_metric(self) -> Array:
         """Cᵀ W C, shape ``(k, k)``, W the share in each node."""
-        modes = self._modes(*self._frame)
-        return modes.T @ (np.repeat(self._shares, self._bs)[:, None] * modes)
+        return self.modes.T @ (np.repeat(self._shares, self._bs)[:, None] * self.modes)
 
     def body_moments(self, u: Array) -> Array:
         """Cᵀ W u of a displacement on all unknowns, shape ``(k,)``."""
-        return self._modes(*self._frame).T @ (np.repeat(self._shares, self._bs) * u)
+        return self.modes.T @ (np.repeat(self._shares, self._bs) * u)
 
     @property
     def condensed_load(self) -> Array:
@@ -149,6 +165,11 @@ class SparseBlock:
             return K_bb @ w
         return K_bb @ w - K_ib.T @ self._inner.solve(K_ib @ w)
 
+    def prepare(self, operator: str) -> None:
+        """Factor K_ii for ``"schur"``; what the other operators need is there."""
+        if operator == "schur" and len(self._inner_dofs):
+            self._inner  # noqa: B018
+
     def recover(self, w: Array) -> Array:
         """K⁺(f − w), shape ``(n,)``."""
         return self._pinv_load - self._pinv.solve(self._extend(w))
@@ -168,12 +189,14 @@ class SparseBlock:
         dofs = self._fixing(np.arange(self.size) // self._bs)
         self._counters.factorizations += 1
         try:
-            return KPLUS_TYPES[self._kplus_type](self._K, self._R, dofs)
+            return KPLUS_TYPES[self._kplus_type](self._K, self._R, dofs, self._prefix)
         except NotPositiveDefiniteError as error:
             raise InputError(
                 f"{self._name}: the stiffness is not positive semidefinite; "
                 "expected a linear elastic form"
             ) from error
+        except FactorError as error:
+            raise FactorError(f"{self._name}: {error}") from error
 
     @cached_property
     def _inner(self) -> GeneralisedInverse:
@@ -181,7 +204,14 @@ class SparseBlock:
         inner = self._inner_dofs
         R_inner = self._R[inner] @ null_space(self.kernel, rcond=1e-10)
         self._counters.factorizations += 1
-        return regularised(self._blocks[2], R_inner, self._fixing(inner // self._bs))
+        fixing = self._fixing(inner // self._bs)
+        try:
+            return regularised(self._blocks[2], R_inner, fixing, self._prefix)
+        except FactorError as error:
+            raise FactorError(
+                f"{self._name}: the stiffness of the unknowns that no row touches, for the "
+                f"dirichlet preconditioner: {error}"
+            ) from error
 
     @property
     def _inner_dofs(self) -> Array:

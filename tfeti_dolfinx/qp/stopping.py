@@ -1,0 +1,53 @@
+"""When a solver may stop: a cheap test in every step, and an examination where that holds."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from petsc4py import PETSc
+
+from tfeti_dolfinx.qp.problem import ConvergedReason
+
+
+class StoppingRule(Protocol):
+    """What the residuals of an iterate must come down to.
+
+    A solver compares max(‖g^P‖, ‖F‖‖Qx‖) with ``tolerance`` in every step. Where it is small
+    enough, the iterate is examined; an examination that is not content lowers the tolerance.
+
+    Attributes:
+        tolerance: Norm of the residuals from which on an examination is worth its price.
+        drifted: Set where an examination finds that the solver's gradient is no longer true;
+            the solver makes it anew and takes the flag back.
+    """
+
+    tolerance: float
+    drifted: bool
+
+    def examine(self, lam: PETSc.Vec, gradient: PETSc.Vec, residual: float) -> ConvergedReason:
+        """Examine an iterate whose residuals are small. Collective.
+
+        Args:
+            lam: The multipliers λ.
+            gradient: Fλ − d up to the range of Gᵀ.
+            residual: max(‖g^P‖, ‖F‖‖Qx‖).
+
+        Returns:
+            Why to stop, or ITERATING; then ``tolerance`` is below ``residual``.
+        """
+        ...
+
+
+class ResidualRule:
+    """Small residuals are good enough: for a program that stands for itself.
+
+    Args:
+        tolerance: What residuals must come down to.
+    """
+
+    def __init__(self, tolerance: float) -> None:
+        self.tolerance, self.drifted = tolerance, False
+
+    def examine(self, lam: PETSc.Vec, gradient: PETSc.Vec, residual: float) -> ConvergedReason:
+        """Content."""
+        return ConvergedReason.CONVERGED_RTOL
