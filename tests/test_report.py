@@ -63,6 +63,18 @@ def test_json_has_every_field(report, comm, shared_tmp):
     assert [p.name for p in path.parent.iterdir()] == ["report.json"]
 
 
+def test_a_report_that_cannot_be_written_is_named_on_all_ranks(report, comm, shared_tmp):
+    if comm.rank == 0:
+        (shared_tmp / "file").write_text("")
+        (shared_tmp / "folder").mkdir()
+    comm.barrier()
+    for path in (shared_tmp / "file" / "report.json", shared_tmp / "folder"):
+        with pytest.raises(tfeti.InputError, match=f"cannot write {path}"):
+            report.write(path, comm)
+    comm.barrier()
+    assert not list(shared_tmp.glob(".*"))
+
+
 def test_text_has_every_field(report):
     text = str(report)
     for f in fields(Report):

@@ -11,23 +11,27 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.assembly import Forms, displacement_space
+from tfeti_dolfinx.assembly import Forms
+from tfeti_dolfinx.checks import checked_type
 from tfeti_dolfinx.compat import require_real_petsc
 from tfeti_dolfinx.contact.search import ContactPartner, ContactSearch, checked_contacts
 from tfeti_dolfinx.dual.dual import Dual
-from tfeti_dolfinx.errors import ConvergenceError, NoSolutionError
-from tfeti_dolfinx.fields import Stress
+from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError
+from tfeti_dolfinx.fields import Stress, checked_stress
+from tfeti_dolfinx.form_checks import check_mesh, check_same_space, displacement_space
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.gluing.glue import glue
+from tfeti_dolfinx.gluing.prescribed import checked_conditions
 from tfeti_dolfinx.gluing.spectrum import extreme_eigenvalues, require_slepc
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.options import parse_options
+from tfeti_dolfinx.options import factor_options, parse_options
 from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.report_filling import fill_result, fill_sizes
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solver import conclude, resolve_types, solve_dual
 from tfeti_dolfinx.subdomains.build import sparse_blocks, trace_parts
+from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.kernel import mode_names
 from tfeti_dolfinx.subdomains.sparse_block import Counters, SparseBlock
 from tfeti_dolfinx.timing import stage
@@ -42,7 +46,7 @@ class ContactProblem:
 
     Args:
         a: Bilinear form on a Lagrange space of the torn mesh.
-        L: Linear form.
+        L: Linear form; for no load ``ufl.ZeroBaseForm((v,))``.
         bcs: Dirichlet conditions; their values hold on all torn copies of a node.
         contacts: Obstacles and pairs of surfaces; none for a linear problem.
         decomposition: The torn mesh.
@@ -55,14 +59,11 @@ class ContactProblem:
 
     Attributes:
         u: The displacement.
-        solution: Fields and contact states, after ``solve``.
         report: Sizes, counters, residuals and times.
 
     Raises:
         InputError: Something given does not fit; the message names it.
     """
-
-    solution: Solution
 
     def __init__(
         self,
@@ -81,21 +82,39 @@ class ContactProblem:
     ) -> None:
         require_real_petsc()
         self.options = parse_options(petsc_options, petsc_options_prefix)
+        checked_type(
+            decomposition, Decomposition, "decomposition", "what decompose or read_gmsh return"
+        )
         if self.options.bbt:
             require_slepc(decomposition.comm)
-        self.decomposition, self.bcs = decomposition, list(bcs)
+        self.decomposition = decomposition
         self.contacts = checked_contacts(contacts)
-        V = displacement_space(a)
-        self.u = fem.Function(V, name="displacement") if u is None else u
+        V = displacement_space(a, decomposition)
+        self.bcs = checked_conditions(bcs, V)
+        self.u = fem.Function(V, name="displacement") if u is None else self._checked_u(u, V)
+        self._stress = self._checked_stress(stress)
         self.report = Report(seconds=dict(decomposition.seconds))
-        self._stress, self._prefix = stress, petsc_options_prefix
+        self._prefix = petsc_options_prefix
+        self._factor_options = factor_options(petsc_options, petsc_options_prefix)
+        self._solution: Solution | None = None
         self._constraints: Constraints | None = None
-        self._blocks: list[SparseBlock] = []
+        self._blocks: list[SparseBlock] | None = None  # a rank may have none of them
         self._dual: Dual | None = None
         with stage("assembly", self.report.seconds):
-            self._forms = Forms(a, L, decomposition, form_compiler_options, jit_options)
+            self._forms = Forms(a, L, V, decomposition, form_compiler_options, jit_options)
         with stage("gluing", self.report.seconds):
             self.dofs = TornDofs(V, decomposition)
+
+    @property
+    def solution(self) -> Solution:
+        """Fields and contact states.
+
+        Raises:
+            InputError: There is none before ``solve``.
+        """
+        if self._solution is None:
+            raise InputError("there is no solution yet; expected a call of solve() before")
+        return self._solution
 
     def solve(self) -> fem.Function:
         """Solve the problem.
@@ -107,6 +126,7 @@ class ContactProblem:
             InputError: Dirichlet values, contacts, stiffness or load do not fit.
             NoSolutionError: The problem has no solution.
             ConvergenceError: The solver stopped before its tolerance.
+            FactorError: A matrix could not be factored.
         """
         self.destroy()
         self.report.reset()
@@ -139,12 +159,22 @@ class ContactProblem:
             print(self.options.view_text(self._prefix), self.report, sep="\n", flush=True)
         return self.u
 
+    def _checked_u(self, u: fem.Function, V: fem.FunctionSpace) -> fem.Function:
+        checked_type(u, fem.Function, "u", "a dolfinx.fem.Function on the space of a")
+        check_same_space(u.function_space, V, "u", "the space of a")
+        return u
+
+    def _checked_stress(self, stress: Stress | None) -> Stress | None:
+        if stress is not None:
+            check_mesh(checked_stress(stress, self.u), "stress", self.decomposition)
+        return stress
+
     def destroy(self) -> None:
         """Destroy the PETSc objects; solution and report stay. ``solve`` makes them anew."""
-        for item in (self._dual, *self._blocks, self._constraints):
+        for item in (self._dual, *(self._blocks or ()), self._constraints):
             if item is not None:
                 item.destroy()
-        self._dual, self._blocks, self._constraints = None, [], None
+        self._dual, self._blocks, self._constraints = None, None, None
 
     def _glue(self, search: ContactSearch) -> None:
         """Rows of B for the present conditions."""
@@ -181,10 +211,11 @@ class ContactProblem:
         """Solve with the present rows, from an earlier solution on."""
         gluing, report, comm = self._gluing, self.report, self.decomposition.comm
         rows = comm.allreduce(len(gluing.inequalities.rows))
-        qp_type, pc_type = resolve_types(self.options, rows)
-        self._build_blocks()
-        with stage("dual", report.seconds):
-            dual = self._build_dual(pc_type)
+        qp_type, pc_type = resolve_types(self.options, rows, self._prefix)
+        with added_options(self._prefix, self._factor_options):
+            blocks = self._build_blocks()
+            with stage("dual", report.seconds):
+                dual = self._build_dual(blocks, pc_type)
         with stage("qp", report.seconds):
             start = None
             if previous is not None:
@@ -193,7 +224,7 @@ class ContactProblem:
         with stage("recovery", report.seconds):
             u = np.concatenate([np.empty(0), *accuracy.u])
             self.u.x.array[:] = self.dofs.to_dolfinx(u)
-            self.solution = Solution(
+            self._solution = Solution(
                 u=self.u,
                 dofs=self.dofs,
                 decomposition=self.decomposition,
@@ -208,14 +239,14 @@ class ContactProblem:
         conclude(result, accuracy, self.options, comm)
         return self.solution
 
-    def _build_blocks(self) -> None:
+    def _build_blocks(self) -> list[SparseBlock]:
         """Blocks for the present trace; factors are made once."""
         trace = self._gluing.constraints.trace
-        if self._blocks:
+        if self._blocks is not None:
             with stage("subdomains", self.report.seconds):
                 for block, part in zip(self._blocks, trace_parts(self.dofs, trace), strict=True):
                     block.retrace(part)
-            return
+            return self._blocks
         self._counters = Counters()
         with stage("subdomains", self.report.seconds):
             self._blocks = sparse_blocks(
@@ -226,19 +257,22 @@ class ContactProblem:
                 trace,
                 self._counters,
                 self.options.kplus_type,
+                f"{self._prefix}sub_",
             )
+        return self._blocks
 
-    def _build_dual(self, pc_type: str) -> Dual:
+    def _build_dual(self, blocks: list[SparseBlock], pc_type: str) -> Dual:
         """The dual problem of the present rows."""
         if self._dual is not None:
             self._dual.destroy()
         decomposition = self.decomposition
         self._dual = Dual(
             constraints=self._gluing.constraints,
-            blocks=self._blocks,
+            blocks=blocks,
             body_of_block=decomposition.body_of_subdomain[decomposition.subdomains],
             body_names=decomposition.body_names,
             mode_names=mode_names(decomposition.mesh.geometry.dim, self.dofs.bs),
             pc_type=pc_type,
+            options_prefix=self._prefix,
         )
         return self._dual

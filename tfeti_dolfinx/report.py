@@ -7,8 +7,14 @@ import os
 import resource
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 from mpi4py import MPI
+
+from tfeti_dolfinx.checks import named
+from tfeti_dolfinx.errors import raised_on_all_ranks
+
+PRINTED = 10  # of a list; all of it is in the file
 
 
 @dataclass
@@ -23,6 +29,9 @@ class Report:
         split_subdomains: Subdomains that were not connected and were split.
         kernel_dim: Dimension of the kernel of K.
         free_modes: Rigid motions that nothing resists and the load does not drive.
+        nearly_free: Rigid motions that contacts with a force hold hardly (``stiffness``: as a
+            share of what the same contacts hold at most) or not at all (0): dicts of ``bodies``,
+            ``mode`` and ``stiffness``. The smallest motion was taken.
         contact_rows: Non-penetration rows.
         contact_candidates: Nodes of the (secondary) contact surfaces.
         far_contact_nodes: Those that were out of reach or not covered, and have no row.
@@ -63,6 +72,7 @@ class Report:
     split_subdomains: int = 0
     kernel_dim: int = 0
     free_modes: int = 0
+    nearly_free: list[dict[str, object]] = field(default_factory=list)
     contact_rows: int = 0
     contact_candidates: int = 0
     far_contact_nodes: int = 0
@@ -98,6 +108,9 @@ class Report:
         for name, value in asdict(self).items():
             if isinstance(value, dict) and value:
                 lines += [f"{name}.{key:<22} {item:.6g}" for key, item in value.items()]
+            elif isinstance(value, list) and value:
+                lines += [f"{name:<31} {_item(item)}" for item in value[:PRINTED]]
+                lines += [f"{name:<31} {len(value)} in all"]
             else:
                 lines.append(f"{name:<31} {'-' if value in ({}, []) else value}")
         return "\n".join(lines)
@@ -107,14 +120,33 @@ class Report:
         return json.dumps(asdict(self), indent=2)
 
     def write(self, path: str | Path, comm: MPI.Intracomm) -> None:
-        """Write the report as a JSON file; it appears whole. Collective."""
-        if comm.rank == 0:
-            target = Path(path)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            partial = target.with_name(f".{target.name}.partial")
-            partial.write_text(self.to_json() + "\n")
-            os.replace(partial, target)
-        comm.barrier()
+        """Write the report as a JSON file; it appears whole. Collective.
+
+        Raises:
+            InputError: The file cannot be written.
+        """
+        with raised_on_all_ranks(comm), named(f"cannot write {path}", OSError):
+            if comm.rank == 0:
+                _write_whole(Path(path), self.to_json() + "\n")
+
+
+def _write_whole(target: Path, text: str) -> None:
+    """Write a file aside and give it its name when it is whole."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_name(f".{target.name}.partial")
+    partial.write_text(text)
+    try:
+        os.replace(partial, target)
+    except OSError:
+        partial.unlink()
+        raise
+
+
+def _item(item: str | dict[str, Any]) -> str:
+    """An unmet contact, or a motion that is nearly free, as text."""
+    if isinstance(item, str):
+        return item
+    return f"{', '.join(item['bodies'])}: {item['mode']}, stiffness {item['stiffness']:.2g}"
 
 
 def peak_memory_mb(comm: MPI.Intracomm) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 from dolfinx import fem
 
 from tfeti_dolfinx.arrays import Array, sum_rows
+from tfeti_dolfinx.checks import is_whole, shown
 from tfeti_dolfinx.contact.forces import BodyForces, body_forces, nodal_forces, vertex_tractions
 from tfeti_dolfinx.contact.records import remaining_gaps
 from tfeti_dolfinx.contact.search import ContactPartner
@@ -131,7 +132,7 @@ class Solution:
         force = sum_rows(records.group, self.force, dofs.num_groups)
         area = sum_rows(records.group, records.area, dofs.num_groups)
         surfaces = [contact.surfaces[0] for contact in self.contacts]
-        whole = hat_integrals(dofs, self.decomposition, surfaces) if surfaces else area
+        whole = hat_integrals(dofs, self.decomposition, surfaces)
         values = np.divide(force, np.minimum(area, whole), out=0.0 * force, where=area > 0.0)
         return self._field(values, self._vertices, "pressure")
 
@@ -184,8 +185,12 @@ class Solution:
             InputError: There is no such contact.
         """
         records = self.gluing.records
-        if not 0 <= index < len(self.contacts):
-            raise InputError(f"contact {index}: there are {len(self.contacts)}, counted from 0")
+        if not is_whole(index) or not 0 <= index < len(self.contacts):
+            known = [f"{i}: {contact.surfaces}" for i, contact in enumerate(self.contacts)]
+            raise InputError(
+                f"contact {shown(index)}: there are {len(known)}, counted from 0; their positions "
+                f"and surfaces are {', '.join(known) or 'none'}"
+            )
         points = group_points(self.dofs)
         own = records.contact == index
         return ContactData(

@@ -8,9 +8,9 @@ from petsc4py import PETSc
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.accuracy import Accuracy
 from tfeti_dolfinx.dual.dual import Dual
-from tfeti_dolfinx.dual.solvability import feasible_particular
+from tfeti_dolfinx.dual.particular import feasible_particular
 from tfeti_dolfinx.errors import ConvergenceError, InputError
-from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.options import Options, check_preconditioner
 from tfeti_dolfinx.qp.homogenised import Homogenised, homogenise
 from tfeti_dolfinx.qp.monitors import Monitor, PrintMonitor, no_monitor
 from tfeti_dolfinx.qp.norm import estimate_norm
@@ -25,20 +25,22 @@ EXPLANATIONS = {
 }
 
 
-def resolve_types(options: Options, num_inequalities: int) -> tuple[str, str]:
+def resolve_types(options: Options, num_inequalities: int, prefix: str) -> tuple[str, str]:
     """The solver and the preconditioner that ``auto`` stands for.
 
     Raises:
-        InputError: pcpg is asked for, but the scene has inequalities.
+        InputError: The scene has inequalities, but pcpg or a preconditioner is asked for.
     """
     qp_type = options.qp_type
     if qp_type == "auto":
         qp_type = "smalse" if num_inequalities else "pcpg"
     if qp_type == "pcpg" and num_inequalities:
         raise InputError(
-            f"qp_type pcpg: the scene has {num_inequalities} contact rows, which PCPG cannot "
-            "keep; expected auto or smalse"
+            f"-{prefix}qp_type pcpg: the scene has {num_inequalities} contact rows, which PCPG "
+            "cannot keep; expected auto or smalse"
         )
+    if qp_type == "smalse":
+        check_preconditioner(options, prefix)
     pc_type = options.pc_type
     if pc_type == "auto":
         pc_type = "dirichlet" if qp_type == "pcpg" else "none"
@@ -61,13 +63,15 @@ def solve_dual(
     """
     qp = dual.qp()
     homogenised = _homogenise(dual, qp, options)
-    rule = Accuracy(dual, options.rtol, options.atol, homogenised.reference, homogenised.rounding)
-    monitor = _monitor(dual, homogenised, options)
+    monitor, norm = _monitor(dual, homogenised, options), 1.0
+    if qp_type == "smalse":
+        with dual.F.charged_to("power method"):
+            norm = estimate_norm(qp.F, qp.coarse, qp.d, options.norm_steps)
+    reference, rounding = homogenised.reference, homogenised.rounding
+    rule = Accuracy(dual, options.rtol, options.atol, reference, rounding, norm)
     if qp_type == "pcpg":
         result = pcpg(qp, homogenised, rule, max_it=options.max_it, monitor=monitor)
     else:
-        with dual.F.charged_to("power method"):
-            norm = estimate_norm(qp.F, qp.coarse, qp.d, options.norm_steps)
         result = smalse(
             qp,
             homogenised,
@@ -80,7 +84,8 @@ def solve_dual(
         )
     homogenised.destroy()
     if result.reason <= 0:
-        rule.look(result.lam, result.gradient)
+        residual = max(result.projected_gradient, norm * result.equality)
+        rule.look(result.lam, result.gradient, residual)
     return result, rule
 
 

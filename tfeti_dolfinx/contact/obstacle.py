@@ -13,8 +13,15 @@ from tfeti_dolfinx.contact.facet_maps import hat_areas, whole_facets
 from tfeti_dolfinx.contact.facets import Facets, facet_kind, local_facets
 from tfeti_dolfinx.contact.mortar import dual_multipliers
 from tfeti_dolfinx.contact.records import ContactRecords
+from tfeti_dolfinx.contact.shape_checks import check_placement, check_shape, distance_and_gradient
 from tfeti_dolfinx.contact.shapes import Shape
-from tfeti_dolfinx.contact.surfaces import extent, group_points, on_surface, surface_facets
+from tfeti_dolfinx.contact.surfaces import (
+    diameter,
+    extent,
+    group_points,
+    on_surface,
+    surface_facets,
+)
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -42,6 +49,9 @@ class Obstacle:
     _: KW_ONLY
     gap: Gap = "geometry"
     reach: float | None = None
+
+    def __post_init__(self) -> None:
+        check_shape(self.shape, self.name)
 
     @property
     def name(self) -> str:
@@ -110,6 +120,7 @@ class Obstacle:
         """
         facets = surface_facets(decomposition, self.surface)
         kind, surface = facet_kind(dofs), local_facets(dofs, decomposition, facets)
+        self._check_placement(surface, kind.num_vertices, dofs, decomposition)
         self._check_side(surface, kind.num_vertices, dofs)
         facet, xi, weight = whole_facets(kind, surface, QUADRATURE * kind.displacement.degree)
         dual = dual_multipliers(kind, surface.area, facet, xi, weight)
@@ -141,6 +152,14 @@ class Obstacle:
             gap[groups] = given
         return gap, normals
 
+    def _check_placement(
+        self, surface: Facets, num_vertices: int, dofs: TornDofs, decomposition: Decomposition
+    ) -> None:
+        if dofs.bs > 1:  # of a scalar space the gradient's first component counts
+            x = surface.corners(num_vertices).mean(axis=1)
+            size = diameter(decomposition)
+            check_placement(self.shape, x, dofs.bs, self.name, size, decomposition.comm)
+
     def _check_side(self, surface: Facets, num_vertices: int, dofs: TornDofs) -> None:
         """Raise if no facet faces the obstacle. Collective."""
         with raised_on_all_ranks(dofs.comm):
@@ -154,9 +173,10 @@ class Obstacle:
 
     def _gaps(self, x: Array, gdim: int) -> tuple[Array, Array]:
         """Distances and normals at points of shape ``(n, 2)`` or ``(n, 3)``."""
-        points = np.zeros((3, len(x)))
-        points[: x.shape[1]] = x.T
-        gap, gradient = self.shape.distance(points), self.shape.gradient(points).T[:, :gdim]
+        gap, gradient = distance_and_gradient(
+            self.shape, x, f"obstacle of surface {self.surface!r}"
+        )
+        gradient = gradient[:, :gdim]
         length = np.linalg.norm(gradient, axis=1)
         wrong = ~(np.isfinite(gap) & np.isfinite(length) & (length > 0.0))
         if np.any(wrong):

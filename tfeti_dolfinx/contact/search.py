@@ -10,6 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.checks import shown
 from tfeti_dolfinx.contact.records import ContactRecords, concatenate, remaining_gaps
 from tfeti_dolfinx.contact.surfaces import diameter
 from tfeti_dolfinx.errors import InputError
@@ -78,10 +79,11 @@ def checked_contacts(contacts: Sequence[ContactPartner]) -> list[ContactPartner]
         InputError: They are not a sequence of obstacles and pairs.
     """
     if not isinstance(contacts, Sequence):
-        raise InputError(f"contacts: expected a list, got {contacts!r}")
+        raise InputError(f"contacts: expected a list, got {shown(contacts)}")
     for contact in contacts:
-        if not all(hasattr(contact, name) for name in ("records", "surfaces", "first_reach")):
-            raise InputError(f"contacts: expected obstacles and pairs, got {contact!r}")
+        known = all(hasattr(contact, name) for name in ("records", "surfaces", "first_reach"))
+        if isinstance(contact, type) or not known:
+            raise InputError(f"contacts: expected obstacles and pairs, got {shown(contact)}")
     return list(contacts)
 
 
