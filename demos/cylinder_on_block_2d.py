@@ -91,7 +91,7 @@ def run(argv):
     bottom = fem.locate_dofs_topological(V, 1, decomposition.facets("bottom"))
     bcs = [fem.dirichletbc(0.0, axis, V.sub(0)), fem.dirichletbc(np.zeros(2), bottom, V)]
     sides = ("top", "arc") if arguments.exchange else ("arc", "top")
-    contacts = [tfeti.Contact(*sides, search_radius=0.75 * a**2 / R)]
+    contacts = [tfeti.Contact(*sides, secondary=sides[0], reach=0.75 * a**2 / R)]
     problem = tfeti.ContactProblem(
         ufl.inner(stress(u), strain(v)) * dx,
         ufl.dot(traction, v) * ds(decomposition.surface("load")),

@@ -10,14 +10,15 @@ PACKAGE = Path(__file__).resolve().parents[1] / "tfeti_dolfinx"
 # the rooms in their order; those of one line may not import from each other
 ROOMS = [
     ["errors", "arrays", "version"],
-    ["compat", "parallel", "timing"],
+    ["checks", "compat", "parallel", "timing"],
     ["mesh"],
     ["contact"],
     ["gluing"],
     ["qp"],
     ["subdomains"],
     ["dual"],
-    ["assembly", "options", "report"],
+    ["form_checks", "options", "report"],
+    ["assembly"],
     ["fields"],
     ["solution"],
     ["report_filling", "solver"],

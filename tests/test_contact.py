@@ -165,12 +165,6 @@ def test_late_rows_go_on_from_where_the_solve_stood(monkeypatch):
     assert warm[1] < 0.9 * cold[1]
 
 
-def test_no_node_within_reach_is_an_error():
-    p = contact_problem(reach=0.001)
-    with pytest.raises(tfeti.InputError, match=r"'bottom': no node within reach=0.001; .* 0.02"):
-        p.solve()
-
-
 @pytest.mark.parametrize("inside", [False, True])
 def test_spheres_and_cylinders(inside):
     """A rigid ball below, or a hollow around, touches where the analysis says."""

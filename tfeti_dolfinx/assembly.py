@@ -1,7 +1,8 @@
-"""Forms on the torn mesh: what they may integrate over, and their matrices."""
+"""Compiled forms on the torn mesh, and their matrices."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -9,60 +10,11 @@ import ufl
 from dolfinx import fem
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.checks import checked_type, named
 from tfeti_dolfinx.compat import JIT_OPTIONS, assemble_csr
-from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.errors import raised_on_all_ranks
+from tfeti_dolfinx.form_checks import check_form, is_zero
 from tfeti_dolfinx.mesh.decomposition import Decomposition
-
-
-def check_measures(form: ufl.Form, decomposition: Decomposition) -> None:
-    """Raise if a form integrates over the tears. Collective.
-
-    Raises:
-        InputError: The form has an interior facet integral, an untagged ``ds``, or a tagged one
-            whose facets lie inside a body.
-    """
-    if not decomposition.is_torn:
-        return
-    for integral in form.integrals():
-        kind = integral.integral_type()
-        if kind.startswith("interior_facet"):
-            raise InputError("dS has no meaning across the tears of the mesh; use dx and ds(tag)")
-        if kind.startswith("exterior_facet"):
-            _check_exterior(integral, decomposition)
-
-
-def _check_exterior(integral: Any, decomposition: Decomposition) -> None:
-    tag, data = integral.subdomain_id(), integral.subdomain_data()
-    if tag in ("everywhere", "otherwise"):
-        raise InputError(
-            "an untagged ds would integrate over the tears of the mesh; use "
-            "ds(decomposition.surface(name)) with subdomain_data=decomposition.facet_tags"
-        )
-    if not hasattr(data, "find"):
-        return
-    tags = tag if isinstance(tag, tuple) else (tag,)
-    facets = np.concatenate([data.find(t) for t in tags])
-    torn = np.intersect1d(facets, decomposition.tears)
-    if count := decomposition.comm.allreduce(len(torn)):
-        raise InputError(
-            f"ds({tag}): {count} of its facets lie inside a body, on the tears of the mesh; "
-            "expected facets of the boundary only"
-        )
-
-
-def displacement_space(a: ufl.Form) -> fem.FunctionSpace:
-    """The space of a bilinear form's trial and test functions.
-
-    Raises:
-        InputError: The form is not bilinear on one space.
-    """
-    arguments = a.arguments()
-    if len(arguments) != 2:
-        raise InputError(f"a has {len(arguments)} arguments; expected a bilinear form")
-    test, trial = (argument.ufl_function_space() for argument in arguments)
-    if test != trial:
-        raise InputError("trial and test functions of a are from different spaces")
-    return test
 
 
 class Forms:
@@ -71,26 +23,33 @@ class Forms:
     Args:
         a: Bilinear form.
         L: Linear form.
+        V: The space of a.
         decomposition: The torn mesh.
         form_compiler_options: As in DOLFINx.
         jit_options: As in DOLFINx.
+
+    Raises:
+        InputError: A form cannot be integrated on the torn mesh, or not be compiled.
     """
 
     def __init__(
         self,
         a: ufl.Form,
-        L: ufl.Form,
+        L: ufl.Form | ufl.ZeroBaseForm,
+        V: fem.FunctionSpace,
         decomposition: Decomposition,
-        form_compiler_options: dict[str, Any] | None,
-        jit_options: dict[str, Any] | None,
+        form_compiler_options: Mapping[str, Any] | None,
+        jit_options: Mapping[str, Any] | None,
     ) -> None:
-        for form in (a, L):
-            check_measures(form, decomposition)
         keywords = {
-            "form_compiler_options": form_compiler_options,
-            "jit_options": {**JIT_OPTIONS, **(jit_options or {})},
+            "form_compiler_options": _options(form_compiler_options, "form_compiler_options"),
+            "jit_options": {**JIT_OPTIONS, **_options(jit_options, "jit_options")},
         }
-        self.a, self.L = fem.form(a, **keywords), fem.form(L, **keywords)
+        for form, name in ((a, "a"), (L, "L")):
+            check_form(form, name, V, decomposition)
+        self._size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
+        self.a = _compiled(a, "a", decomposition, keywords)
+        self.L = None if is_zero(L) else _compiled(L, "L", decomposition, keywords)
 
     def stiffness(self) -> Any:
         """This rank's K in DOLFINx's numbering, scipy CSR."""
@@ -98,4 +57,21 @@ class Forms:
 
     def load(self) -> Array:
         """This rank's f in DOLFINx's numbering."""
+        if self.L is None:
+            return np.zeros(self._size)
         return np.array(fem.assemble_vector(self.L).array)
+
+
+def _options(given: Mapping[str, Any] | None, what: str) -> dict[str, Any]:
+    if given is None:
+        return {}
+    checked_type(given, Mapping, what, "a dictionary")
+    return dict(given)
+
+
+def _compiled(
+    form: ufl.Form, name: str, decomposition: Decomposition, keywords: dict[str, Any]
+) -> fem.Form:
+    """The form compiled by DOLFINx, which fails on all ranks or on none. Collective."""
+    with raised_on_all_ranks(decomposition.comm), named(f"{name} cannot be compiled"):
+        return fem.form(form, **keywords)

@@ -83,6 +83,17 @@ def geometry_dofmap(mesh: dmesh.Mesh) -> Array:
     return np.asarray(geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap)
 
 
+def original_cells(mesh: dmesh.Mesh) -> Array:
+    """Ids of the local cells before DOLFINx moved them; of a submesh their global indices."""
+    topology = mesh.topology
+    try:
+        return np.asarray(topology.original_cell_index, dtype=np.int64)
+    except RuntimeError:  # a submesh has none
+        cells = topology.index_map(topology.dim)
+        here = np.arange(cells.size_local + cells.num_ghosts, dtype=np.int32)
+        return np.asarray(cells.local_to_global(here), dtype=np.int64)
+
+
 def interpolation_points(V: fem.FunctionSpace) -> Array:
     """Points of the reference cell at which the element of ``V`` is interpolated."""
     points = V.element.interpolation_points
@@ -106,10 +117,10 @@ def assemble_csr(form: fem.Form) -> Any:
     return A.to_scipy()
 
 
-def is_on_mesh(bc: fem.DirichletBC, mesh: dmesh.Mesh) -> bool:
-    """Whether a Dirichlet condition's space is on a mesh."""
+def space_of(bc: fem.DirichletBC) -> Any:
+    """C++ space of a Dirichlet condition."""
     space = bc.function_space
-    return getattr(space, "_cpp_object", space).mesh is mesh._cpp_object
+    return getattr(space, "_cpp_object", space)
 
 
 def prescribed_values(bcs: Sequence[fem.DirichletBC], size: int) -> Array:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import pickle
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -76,12 +75,3 @@ def _portable(error: Exception) -> Exception:
     if type(rebuilt) is type(error) and str(rebuilt) == str(error):
         return error
     return TfetiError(f"{type(error).__name__}: {error}")
-
-
-@contextmanager
-def naming(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Raise what the system says against writing a file as an InputError that names it."""
-    try:
-        yield
-    except OSError as error:
-        raise InputError(f"{os.fspath(path)} cannot be written: {error}") from error

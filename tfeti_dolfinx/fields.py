@@ -10,6 +10,7 @@ import ufl
 from dolfinx import fem
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.checks import checked_callable, named, shown
 from tfeti_dolfinx.compat import JIT_OPTIONS, interpolation_points
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -27,9 +28,16 @@ def checked_stress(stress: Stress, u: fem.Function) -> Any:
     """The stress of u as a UFL expression.
 
     Raises:
-        InputError: It is not a 3×3 tensor.
+        InputError: It cannot be called, fails, or does not return a 3×3 tensor.
     """
-    sigma = stress(u)
+    expected = "a callable from a displacement to its stress in UFL"
+    if isinstance(stress, ufl.core.expr.Expr):  # which can be called, but for something else
+        raise InputError(f"stress is an expression; expected {expected}")
+    checked_callable(stress, "stress", expected)
+    with named("stress(u)"):
+        sigma = stress(u)
+    if not isinstance(sigma, ufl.core.expr.Expr):
+        raise InputError(f"stress(u) is {shown(sigma)}; expected a UFL tensor of shape (3, 3)")
     if sigma.ufl_shape != (3, 3):
         raise InputError(
             f"stress(u) has shape {sigma.ufl_shape}; expected (3, 3), in plane strain with σ_zz"

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import Field, dataclass, field, fields
 from typing import Any
 
+import numpy as np
 from petsc4py import PETSc
 
+from tfeti_dolfinx.checks import FINITE, Range, checked_type, shown
 from tfeti_dolfinx.dual.operator import PRECONDITIONERS
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.qp.mprgp import EXPANSIONS
@@ -21,10 +24,20 @@ _SMALSE = SmalseParameters()
 FACTOR_OPTION = re.compile(r"(sub|coarse)_(pc_factor|mat)_\w+")
 
 
-def _option(default: Any, algorithm: str, text: str, choices: tuple[str, ...] = ()) -> Any:
-    return field(
-        default=default, metadata={"algorithm": algorithm, "text": text, "choices": choices}
-    )
+FROM_0 = Range("0 or more", lambda value: value >= 0.0)
+FROM_1 = Range("1 or more", lambda value: value >= 1.0)
+ABOVE_0 = Range("more than 0", lambda value: value > 0.0)
+
+
+def _option(
+    default: Any,
+    algorithm: str,
+    text: str,
+    choices: tuple[str, ...] = (),
+    fits: Range = FINITE,
+) -> Any:
+    metadata = {"algorithm": algorithm, "text": text, "choices": choices, "fits": fits}
+    return field(default=default, metadata=metadata)
 
 
 @dataclass(frozen=True)
@@ -38,10 +51,15 @@ class Options:
         ("auto", "pcpg", "smalse"),
     )
     rtol: float = _option(
-        1e-6, "all", "stop when the displacement of each body is right to this, in the maximum norm"
+        1e-6,
+        "all",
+        "stop when the displacement of each body is right to this, in the maximum norm",
+        fits=Range("0 or more, less than 1", lambda value: 0.0 <= value < 1.0),
     )
-    atol: float = _option(0.0, "all", "or when jumps and overlaps are below this length")
-    max_it: int = _option(10_000, "all", "most inner steps, and most outer ones")
+    atol: float = _option(
+        0.0, "all", "or when jumps and overlaps are below this length", fits=FROM_0
+    )
+    max_it: int = _option(10_000, "all", "most inner steps, and most outer ones", fits=FROM_0)
     pc_type: str = _option(
         "auto",
         "pcpg",
@@ -64,13 +82,23 @@ class Options:
         "λ̄ with Gλ̄ = e: natural is Gᵀ(GGᵀ)⁻¹e, feasible the smallest one with λ̄_N ≥ 0",
         ("natural", "feasible"),
     )
-    norm_steps: int = _option(15, "smalse", "Lanczos steps that estimate ‖PFP‖")
-    smalse_rho: float = _option(_SMALSE.rho, "smalse", "penalty ρ in units of ‖PFP‖")
-    smalse_M: float = _option(_SMALSE.M, "smalse", "M₀ in units of ‖PFP‖")
-    smalse_beta: float = _option(_SMALSE.beta, "smalse", "factor β on M, in (0, 1)")
-    smalse_eta: float = _option(_SMALSE.eta, "smalse", "η in units of ‖b‖")
-    mpgp_gamma: float = _option(_SMALSE.gamma, "mprgp", "Γ of the proportioning test")
-    mpgp_alpha: float = _option(_SMALSE.alpha_bar, "mprgp", "step length ᾱ in units of 1/‖A‖")
+    norm_steps: int = _option(15, "smalse", "Lanczos steps that estimate ‖PFP‖", fits=FROM_1)
+    smalse_rho: float = _option(_SMALSE.rho, "smalse", "penalty ρ in units of ‖PFP‖", fits=ABOVE_0)
+    smalse_M: float = _option(_SMALSE.M, "smalse", "M₀ in units of ‖PFP‖", fits=ABOVE_0)
+    smalse_beta: float = _option(
+        _SMALSE.beta,
+        "smalse",
+        "factor β on M, in (0, 1)",
+        fits=Range("between 0 and 1", lambda value: 0.0 < value < 1.0),
+    )
+    smalse_eta: float = _option(_SMALSE.eta, "smalse", "η in units of ‖b‖", fits=ABOVE_0)
+    mpgp_gamma: float = _option(_SMALSE.gamma, "mprgp", "Γ of the proportioning test", fits=ABOVE_0)
+    mpgp_alpha: float = _option(
+        _SMALSE.alpha_bar,
+        "mprgp",
+        "step length ᾱ in units of 1/‖A‖",
+        fits=Range("more than 0, at most 2", lambda value: 0.0 < value <= 2.0),
+    )
     mpgp_expansion: str = _option(
         _SMALSE.expansion, "mprgp", "expansion step: fixed, or projcg", tuple(EXPANSIONS)
     )
@@ -128,7 +156,8 @@ def parse_options(given: Mapping[str, Any] | None, prefix: str) -> Options:
     options = Options(
         **{n: _converted(known[n], v, prefix) for n, v in named.items() if n in known}
     )
-    _check_ranges(options, prefix)
+    if options.qp_type == "smalse":
+        check_preconditioner(options, prefix)
     return options
 
 
@@ -138,8 +167,38 @@ def factor_options(given: Mapping[str, Any] | None, prefix: str) -> dict[str, An
     return {name: value for name, value in named.items() if FACTOR_OPTION.fullmatch(name)}
 
 
-def _without_prefix(given: Mapping[str, Any] | None, prefix: str) -> dict[str, Any]:
-    return {name.removeprefix("-").removeprefix(prefix): v for name, v in (given or {}).items()}
+def check_preconditioner(options: Options, prefix: str) -> None:
+    """Raise if a preconditioner is asked for that SMALSE-M would ignore.
+
+    Raises:
+        InputError: ``pc_type`` is neither auto nor none.
+    """
+    if options.pc_type not in ("auto", "none"):
+        raise InputError(
+            f"-{prefix}pc_type {options.pc_type} with smalse, which solves scenes with contact: "
+            "SMALSE-M takes no preconditioner, since it would not preserve the bounds; expected "
+            "auto or none"
+        )
+
+
+def _without_prefix(given: Any, prefix: str) -> dict[str, Any]:
+    """The options given, without the prefix."""
+    if not isinstance(prefix, str) or not re.fullmatch(r"\w+", prefix):
+        raise InputError(
+            f"petsc_options_prefix is {shown(prefix)}; expected letters, digits and underscores, "
+            "such as 'tfeti_'"
+        )
+    if given is None:
+        return {}
+    checked_type(given, Mapping, "petsc_options", "a dictionary such as {'tfeti_rtol': 1e-8}")
+    named: dict[str, Any] = {}
+    for name, value in given.items():
+        checked_type(name, str, f"petsc_options: the key {shown(name)}", "the name of an option")
+        short = name.removeprefix("-").removeprefix(prefix)
+        if short in named:
+            raise InputError(f"petsc_options: -{prefix}{short} is there twice; expected it once")
+        named[short] = value
+    return named
 
 
 def _check_reached(named: Mapping[str, Any], database: PETSc.Options, prefix: str) -> None:
@@ -154,20 +213,19 @@ def _check_reached(named: Mapping[str, Any], database: PETSc.Options, prefix: st
 
 
 def _converted(f: Field[Any], value: Any, prefix: str) -> Any:
-    """The value as the type of the option."""
-    choices = f.metadata["choices"]
-    kind: Any = type(f.default)
+    """The value as the type of the option, in its range."""
+    what, kind = f"-{prefix}{f.name}", type(f.default)
     try:
-        if kind is bool:
-            result: Any = _as_bool(value)
-        else:
-            result = kind(value)
-    except (TypeError, ValueError):
+        result = CONVERSIONS[kind](value)
+    except (TypeError, ValueError, OverflowError):
         raise InputError(
-            f"-{prefix}{f.name} {value!r}: expected a value of type {kind.__name__}"
+            f"{what} {shown(value)}: expected a value of type {kind.__name__}"
         ) from None
+    choices, fits = f.metadata["choices"], f.metadata["fits"]
     if choices and result not in choices:
-        raise InputError(f"-{prefix}{f.name} {value}: expected one of {', '.join(choices)}")
+        raise InputError(f"{what} {result}: expected one of {', '.join(choices)}")
+    if kind in (int, float) and not (math.isfinite(result) and fits.holds(result)):
+        raise InputError(f"{what} {result}: expected {fits.text}")
     return result
 
 
@@ -178,30 +236,37 @@ def _as_bool(value: Any) -> bool:
         if value.lower() not in table:
             raise ValueError(value)
         return table[value.lower()]
+    if value is not None and value not in (0, 1):
+        raise ValueError(value)
     return True if value is None else bool(value)
 
 
-def _check_ranges(options: Options, prefix: str) -> None:
-    ranges = {
-        "rtol": (options.rtol >= 0.0, "0 or more"),
-        "atol": (options.atol >= 0.0, "0 or more"),
-        "max_it": (options.max_it >= 0, "0 or more"),
-        "norm_steps": (options.norm_steps >= 1, "1 or more"),
-        "smalse_rho": (options.smalse_rho > 0.0, "more than 0"),
-        "smalse_M": (options.smalse_M > 0.0, "more than 0"),
-        "smalse_beta": (0.0 < options.smalse_beta < 1.0, "between 0 and 1"),
-        "smalse_eta": (options.smalse_eta > 0.0, "more than 0"),
-        "mpgp_gamma": (options.mpgp_gamma > 0.0, "more than 0"),
-        "mpgp_alpha": (0.0 < options.mpgp_alpha <= 2.0, "more than 0, at most 2"),
-    }
-    for name, (fits, expected) in ranges.items():
-        if not fits:
-            raise InputError(f"-{prefix}{name} {getattr(options, name)}: expected {expected}")
-    if options.qp_type == "smalse" and options.pc_type not in ("auto", "none"):
-        raise InputError(
-            f"-{prefix}pc_type {options.pc_type} with -{prefix}qp_type smalse: SMALSE-M takes no "
-            "preconditioner, since it would not preserve the bounds; expected none"
-        )
+def _as_float(value: Any) -> float:
+    if isinstance(value, (bool, np.bool_)):
+        raise TypeError(value)
+    return float(value)
+
+
+def _as_int(value: Any) -> int:
+    if isinstance(value, str):
+        return int(value)
+    if _as_float(value) != int(value):
+        raise ValueError(value)
+    return int(value)
+
+
+def _as_text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(value)
+    return value
+
+
+CONVERSIONS: dict[type, Callable[[Any], Any]] = {
+    bool: _as_bool,
+    float: _as_float,
+    int: _as_int,
+    str: _as_text,
+}
 
 
 def options_table() -> str:

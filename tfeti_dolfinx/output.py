@@ -11,7 +11,8 @@ import numpy as np
 from dolfinx import fem, io
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.errors import InputError, naming, raised_on_all_ranks
+from tfeti_dolfinx.checks import checked_path, checked_type, named
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.entities import NO_TAG
 from tfeti_dolfinx.solution import Solution
@@ -33,11 +34,9 @@ def write_vtx(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
         The files written.
 
     Raises:
-        InputError: The name does not end with ``.bp``, or the files cannot be written.
+        InputError: The name does not end with ``.bp``, or nothing can be written there.
     """
-    target = Path(path)
-    if target.suffix != ".bp":
-        raise InputError(f"{target}: expected a name that ends with .bp")
+    target = _checked_target(path, ".bp", solution)
     if not dolfinx.has_adios2:
         return write_xdmf(target.with_suffix(".xdmf"), solution)
     cells = target.with_name(f"{target.stem}_cells.bp")
@@ -58,17 +57,14 @@ def write_xdmf(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
         The files written.
 
     Raises:
-        InputError: The name does not end with ``.xdmf``, or the files cannot be written.
+        InputError: The name does not end with ``.xdmf``, or nothing can be written there.
     """
-    target = Path(path)
-    if target.suffix != ".xdmf":
-        raise InputError(f"{target}: expected a name that ends with .xdmf")
+    target = _checked_target(path, ".xdmf", solution)
     decomposition = solution.decomposition
     folder = _begin(target.with_name(f"{target.stem}.folder"), solution)
-    with raised_on_all_ranks(decomposition.comm):
+    with raised_on_all_ranks(decomposition.comm), named(f"cannot write {target}", OSError):
         if decomposition.comm.rank == 0:
-            with naming(target):
-                folder.mkdir(parents=True)
+            folder.mkdir(parents=True)
     with io.XDMFFile(decomposition.comm, folder / target.name, "w") as xdmf:
         xdmf.write_mesh(decomposition.mesh)
         for function in (*nodal_fields(solution), *cell_fields(solution)):
@@ -125,26 +121,35 @@ def _as_geometry(function: fem.Function, decomposition: Decomposition) -> fem.Fu
     return copy
 
 
+def _checked_target(path: str | os.PathLike[str], suffix: str, solution: Solution) -> Path:
+    """The name to write to. Collective."""
+    target = checked_path(path, suffix)
+    checked_type(solution, Solution, "solution", "the solution of a ContactProblem")
+    with raised_on_all_ranks(solution.decomposition.comm):
+        foreign = target.is_dir() and any(target.iterdir()) and not (target / "md.idx").exists()
+        if foreign:
+            raise InputError(f"{target} is a directory that VTX has not written; expected a file")
+    return target
+
+
 def _begin(name: Path, solution: Solution) -> Path:
     """Name to write to until the file is whole; what an earlier run left there is removed."""
     partial = name.with_name(f".{name.name}.partial")
     comm = solution.decomposition.comm
-    with raised_on_all_ranks(comm):
+    with raised_on_all_ranks(comm), named(f"cannot write {name}", OSError):
         if comm.rank == 0:
-            with naming(name):
-                name.parent.mkdir(parents=True, exist_ok=True)
-                _remove(partial)
+            name.parent.mkdir(parents=True, exist_ok=True)
+            _remove(partial)
     return partial
 
 
 def _replace(partial: Path, name: Path, solution: Solution) -> None:
     comm = solution.decomposition.comm
     comm.barrier()
-    with raised_on_all_ranks(comm):
+    with raised_on_all_ranks(comm), named(f"cannot write {name}", OSError):
         if comm.rank == 0:
-            with naming(name):
-                _remove(name)
-                os.replace(partial, name)
+            _remove(name)
+            os.replace(partial, name)
 
 
 def _remove(path: Path) -> None:

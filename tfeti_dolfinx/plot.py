@@ -9,13 +9,26 @@ import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from dolfinx import plot as dplot
 
 from tfeti_dolfinx import draw
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.errors import InputError, TfetiError, naming, raised_on_all_ranks
+from tfeti_dolfinx.checks import (
+    FINITE,
+    POSITIVE,
+    Range,
+    checked_callable,
+    checked_flag,
+    checked_number,
+    checked_path,
+    checked_type,
+    named,
+    shown,
+)
+from tfeti_dolfinx.errors import InputError, TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.solution import Solution
 
 SECONDS = 600
@@ -53,29 +66,29 @@ def plot_deformed(
         The file written.
 
     Raises:
-        InputError: There is no X server and no Xvfb to start one, or the problem has no stress.
+        InputError: There is no X server and no Xvfb to start one, the problem has no stress, or
+            an argument does not fit.
         TfetiError: The picture could not be drawn.
     """
+    target = checked_path(path, ".png")
+    checked_type(solution, Solution, "solution", "the solution of a ContactProblem")
+    scene = {
+        "factor": _number(factor, "factor", FINITE),
+        "zoom": checked_number(zoom, "zoom", POSITIVE),
+        "focus": _vector(focus, "focus"),
+        "edges": checked_flag(show_edges, "show_edges"),
+        "highest": _number(highest, "highest", POSITIVE),
+        "view": _vector(view, "view"),
+        "cut": np.stack([_vector(v, "cut") for v in _pair(cut)]),
+    }
     comm = solution.decomposition.comm
     if factor is None and solution.has_contact:
-        factor = 1.0
+        scene["factor"] = 1.0
     parts = comm.gather(_grid(solution, solution.nodal_von_mises.x.array), root=0)
-    target = Path(path)
-    with raised_on_all_ranks(comm):
+    with raised_on_all_ranks(comm), named(f"cannot write {target}", OSError):
         if comm.rank == 0 and parts is not None:
             check_screen()
-            scene = {
-                "name": "von Mises",
-                "factor": np.nan if factor is None else factor,
-                "zoom": zoom,
-                "focus": _vector(focus),
-                "edges": show_edges,
-                "highest": np.nan if highest is None else highest,
-                "view": _vector(view),
-                "cut": np.stack([_vector(v) for v in cut or (None, None)]),
-            }
-            with naming(target):
-                _draw(target, {**_joined(parts), **scene})
+            _draw(target, {**_joined(parts), **scene, "name": "von Mises"})
     return target
 
 
@@ -102,18 +115,26 @@ def plot_pressure(
 
     Returns:
         The file written.
+
+    Raises:
+        InputError: An argument does not fit, or a callable fails.
     """
+    target = checked_path(path, ".png")
+    checked_type(solution, Solution, "solution", "the solution of a ContactProblem")
+    checked_callable(coordinate, "coordinate", "a callable of points of shape (n, 3)")
+    if closed_form is not None:
+        checked_callable(closed_form, "closed_form", "a callable of coordinates of shape (n,)")
+    if limit is not None:
+        checked_number(limit, "limit", POSITIVE)
     comm = solution.decomposition.comm
     data = solution.contact(contact)
     with raised_on_all_ranks(comm):
-        x = coordinate(data.points)
+        x = _coordinates(coordinate, data.points)
     parts = comm.gather((x, data.pressure), root=0)
-    target = Path(path)
-    with raised_on_all_ranks(comm):
+    with raised_on_all_ranks(comm), named(f"cannot write {target}"):
         if comm.rank == 0 and parts is not None:
             x, p = (np.concatenate(rows) for rows in zip(*parts, strict=True))
-            with naming(target):
-                _draw_curve(target, x, p, closed_form, limit, label)
+            _draw_curve(target, x, p, closed_form, limit, label)
     return target
 
 
@@ -129,9 +150,41 @@ def check_screen() -> None:
         )
 
 
-def _vector(values: tuple[float, float, float] | None) -> Array:
+def _coordinates(coordinate: Callable[[Array], Array], points: Array) -> Array:
+    """The coordinate of each point."""
+    with named(f"coordinate of points of shape {points.shape}"):
+        x = np.asarray(coordinate(points), dtype=float)
+    if x.shape != (len(points),):
+        raise InputError(
+            f"coordinate of points of shape {points.shape} has the shape {x.shape}; expected "
+            f"({len(points)},)"
+        )
+    return x
+
+
+def _number(value: float | None, what: str, expected: Range) -> float:
+    """A number, nan if it is not given."""
+    return np.nan if value is None else checked_number(value, what, expected)
+
+
+def _vector(values: tuple[float, float, float] | None, what: str) -> Array:
     """Three numbers, nan if they are not given."""
-    return np.full(3, np.nan) if values is None else np.array(values, dtype=float)
+    if values is None:
+        return np.full(3, np.nan)
+    with named(f"{what}={shown(values)}, expected three finite numbers"):
+        vector = np.array(values, dtype=float)
+    if vector.shape != (3,) or not np.all(np.isfinite(vector)):
+        raise InputError(f"{what}={shown(values)}: expected three finite numbers")
+    return vector
+
+
+def _pair(cut: Any) -> tuple[Any, Any]:
+    """A point and a normal, or neither."""
+    if cut is None:
+        return None, None
+    if not isinstance(cut, (tuple, list, np.ndarray)) or len(cut) != 2:
+        raise InputError(f"cut={shown(cut)}: expected a point and a normal")
+    return cut[0], cut[1]
 
 
 def _grid(solution: Solution, values: Array) -> tuple[Array, Array, Array, Array, Array]:

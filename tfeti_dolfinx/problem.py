@@ -11,14 +11,17 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.assembly import Forms, displacement_space
+from tfeti_dolfinx.assembly import Forms
+from tfeti_dolfinx.checks import checked_type
 from tfeti_dolfinx.compat import require_real_petsc
 from tfeti_dolfinx.contact.search import ContactPartner, ContactSearch, checked_contacts
 from tfeti_dolfinx.dual.dual import Dual
-from tfeti_dolfinx.errors import ConvergenceError, NoSolutionError
-from tfeti_dolfinx.fields import Stress
+from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError
+from tfeti_dolfinx.fields import Stress, checked_stress
+from tfeti_dolfinx.form_checks import check_mesh, check_same_space, displacement_space
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.gluing.glue import glue
+from tfeti_dolfinx.gluing.prescribed import checked_conditions
 from tfeti_dolfinx.gluing.spectrum import extreme_eigenvalues, require_slepc
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -43,7 +46,7 @@ class ContactProblem:
 
     Args:
         a: Bilinear form on a Lagrange space of the torn mesh.
-        L: Linear form.
+        L: Linear form; for no load ``ufl.ZeroBaseForm((v,))``.
         bcs: Dirichlet conditions; their values hold on all torn copies of a node.
         contacts: Obstacles and pairs of surfaces; none for a linear problem.
         decomposition: The torn mesh.
@@ -56,14 +59,11 @@ class ContactProblem:
 
     Attributes:
         u: The displacement.
-        solution: Fields and contact states, after ``solve``.
         report: Sizes, counters, residuals and times.
 
     Raises:
         InputError: Something given does not fit; the message names it.
     """
-
-    solution: Solution
 
     def __init__(
         self,
@@ -82,22 +82,39 @@ class ContactProblem:
     ) -> None:
         require_real_petsc()
         self.options = parse_options(petsc_options, petsc_options_prefix)
+        checked_type(
+            decomposition, Decomposition, "decomposition", "what decompose or read_gmsh return"
+        )
         if self.options.bbt:
             require_slepc(decomposition.comm)
-        self.decomposition, self.bcs = decomposition, list(bcs)
+        self.decomposition = decomposition
         self.contacts = checked_contacts(contacts)
-        V = displacement_space(a)
-        self.u = fem.Function(V, name="displacement") if u is None else u
+        V = displacement_space(a, decomposition)
+        self.bcs = checked_conditions(bcs, V)
+        self.u = fem.Function(V, name="displacement") if u is None else self._checked_u(u, V)
+        self._stress = self._checked_stress(stress)
         self.report = Report(seconds=dict(decomposition.seconds))
-        self._stress, self._prefix = stress, petsc_options_prefix
+        self._prefix = petsc_options_prefix
         self._factor_options = factor_options(petsc_options, petsc_options_prefix)
+        self._solution: Solution | None = None
         self._constraints: Constraints | None = None
         self._blocks: list[SparseBlock] | None = None  # a rank may have none of them
         self._dual: Dual | None = None
         with stage("assembly", self.report.seconds):
-            self._forms = Forms(a, L, decomposition, form_compiler_options, jit_options)
+            self._forms = Forms(a, L, V, decomposition, form_compiler_options, jit_options)
         with stage("gluing", self.report.seconds):
             self.dofs = TornDofs(V, decomposition)
+
+    @property
+    def solution(self) -> Solution:
+        """Fields and contact states.
+
+        Raises:
+            InputError: There is none before ``solve``.
+        """
+        if self._solution is None:
+            raise InputError("there is no solution yet; expected a call of solve() before")
+        return self._solution
 
     def solve(self) -> fem.Function:
         """Solve the problem.
@@ -113,10 +130,12 @@ class ContactProblem:
         """
         self.destroy()
         self.report.reset()
-        with stage("contact", self.report.seconds):
-            search = ContactSearch(self.contacts, self.dofs, self.decomposition)
         with stage("assembly", self.report.seconds):
             self._K, self._f = self._forms.stiffness(), self._forms.load()
+        with stage("contact", self.report.seconds):
+            diagonal = self.dofs.to_primal(self._K.diagonal())
+            search = ContactSearch(self.contacts, self.dofs, self.decomposition, diagonal)
+            self._settled = search.contacts
         previous = None
         for _ in range(MAX_ROUNDS):
             self._glue(search)
@@ -135,9 +154,20 @@ class ContactProblem:
             self.report.late_contact_rows += late
         else:
             raise ConvergenceError(f"nodes out of reach still overlap after {MAX_ROUNDS} rounds")
+        search.warn_of_unmet()
         if self.options.view and self.decomposition.comm.rank == 0:
             print(self.options.view_text(self._prefix), self.report, sep="\n", flush=True)
         return self.u
+
+    def _checked_u(self, u: fem.Function, V: fem.FunctionSpace) -> fem.Function:
+        checked_type(u, fem.Function, "u", "a dolfinx.fem.Function on the space of a")
+        check_same_space(u.function_space, V, "u", "the space of a")
+        return u
+
+    def _checked_stress(self, stress: Stress | None) -> Stress | None:
+        if stress is not None:
+            check_mesh(checked_stress(stress, self.u), "stress", self.decomposition)
+        return stress
 
     def destroy(self) -> None:
         """Destroy the PETSc objects; solution and report stay. ``solve`` makes them anew."""
@@ -151,6 +181,7 @@ class ContactProblem:
         with stage("gluing", self.report.seconds):
             if self._constraints is not None:
                 self._constraints.destroy()
+            self.report.unmet_contacts = search.unmet()
             records, weights = search.records, self._weights()
             self._gluing = glue(self.dofs, self.bcs, records, search.length, weights)
             self._constraints = self._gluing.constraints
@@ -180,7 +211,7 @@ class ContactProblem:
         """Solve with the present rows, from an earlier solution on."""
         gluing, report, comm = self._gluing, self.report, self.decomposition.comm
         rows = comm.allreduce(len(gluing.inequalities.rows))
-        qp_type, pc_type = resolve_types(self.options, rows)
+        qp_type, pc_type = resolve_types(self.options, rows, self._prefix)
         with added_options(self._prefix, self._factor_options):
             blocks = self._build_blocks()
             with stage("dual", report.seconds):
@@ -193,7 +224,7 @@ class ContactProblem:
         with stage("recovery", report.seconds):
             u = np.concatenate([np.empty(0), *accuracy.u])
             self.u.x.array[:] = self.dofs.to_dolfinx(u)
-            self.solution = Solution(
+            self._solution = Solution(
                 u=self.u,
                 dofs=self.dofs,
                 decomposition=self.decomposition,
@@ -201,7 +232,7 @@ class ContactProblem:
                 lam=np.array(result.lam.array_r),
                 mu=result.mu,
                 stress=self._stress,
-                contacts=self.contacts,
+                contacts=self._settled,
             )
         fill_result(report, self.solution, dual, result, accuracy, self._counters)
         result.destroy()

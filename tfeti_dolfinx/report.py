@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import os
 import resource
-from dataclasses import MISSING, asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 
 from mpi4py import MPI
 
-from tfeti_dolfinx.errors import naming, raised_on_all_ranks
+from tfeti_dolfinx.checks import named
+from tfeti_dolfinx.errors import raised_on_all_ranks
 
 
 @dataclass
@@ -29,6 +30,7 @@ class Report:
         contact_candidates: Nodes of the (secondary) contact surfaces.
         far_contact_nodes: Those that were out of reach or not covered, and have no row.
         late_contact_rows: Rows that nodes out of reach got after a solve, since they overlapped.
+        unmet_contacts: Contacts none of whose nodes has a row: position in the list, and name.
         dropped_contact_rows: Those that prescribed components decide alone.
         active_contacts: Rows with a positive force.
         F_multiplications: Multiplications by F, all but the power method's.
@@ -68,6 +70,7 @@ class Report:
     contact_candidates: int = 0
     far_contact_nodes: int = 0
     late_contact_rows: int = 0
+    unmet_contacts: list[str] = field(default_factory=list)
     dropped_contact_rows: int = 0
     active_contacts: int = 0
     F_multiplications: int = 0
@@ -89,9 +92,9 @@ class Report:
 
     def reset(self) -> None:
         """Forget the solve before; seconds add up. After an error nothing old is left."""
+        fresh = Report(seconds=self.seconds)
         for f in fields(self):
-            if f.name != "seconds":
-                setattr(self, f.name, f.default if f.default is not MISSING else {})
+            setattr(self, f.name, getattr(fresh, f.name))
 
     def __str__(self) -> str:
         lines = []
@@ -99,7 +102,7 @@ class Report:
             if isinstance(value, dict) and value:
                 lines += [f"{name}.{key:<22} {item:.6g}" for key, item in value.items()]
             else:
-                lines.append(f"{name:<31} {'-' if value == {} else value}")
+                lines.append(f"{name:<31} {'-' if value in ({}, []) else value}")
         return "\n".join(lines)
 
     def to_json(self) -> str:
@@ -112,10 +115,9 @@ class Report:
         Raises:
             InputError: The file cannot be written.
         """
-        with raised_on_all_ranks(comm):
+        with raised_on_all_ranks(comm), named(f"cannot write {path}", OSError):
             if comm.rank == 0:
-                with naming(path):
-                    _write_whole(Path(path), self.to_json() + "\n")
+                _write_whole(Path(path), self.to_json() + "\n")
 
 
 def _write_whole(target: Path, text: str) -> None:

@@ -10,7 +10,7 @@ from tfeti_dolfinx.dual.accuracy import Accuracy
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.dual.solvability import feasible_particular
 from tfeti_dolfinx.errors import ConvergenceError, InputError
-from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.options import Options, check_preconditioner
 from tfeti_dolfinx.qp.homogenised import Homogenised, homogenise
 from tfeti_dolfinx.qp.monitors import Monitor, PrintMonitor, no_monitor
 from tfeti_dolfinx.qp.norm import estimate_norm
@@ -25,20 +25,22 @@ EXPLANATIONS = {
 }
 
 
-def resolve_types(options: Options, num_inequalities: int) -> tuple[str, str]:
+def resolve_types(options: Options, num_inequalities: int, prefix: str) -> tuple[str, str]:
     """The solver and the preconditioner that ``auto`` stands for.
 
     Raises:
-        InputError: pcpg is asked for, but the scene has inequalities.
+        InputError: The scene has inequalities, but pcpg or a preconditioner is asked for.
     """
     qp_type = options.qp_type
     if qp_type == "auto":
         qp_type = "smalse" if num_inequalities else "pcpg"
     if qp_type == "pcpg" and num_inequalities:
         raise InputError(
-            f"qp_type pcpg: the scene has {num_inequalities} contact rows, which PCPG cannot "
-            "keep; expected auto or smalse"
+            f"-{prefix}qp_type pcpg: the scene has {num_inequalities} contact rows, which PCPG "
+            "cannot keep; expected auto or smalse"
         )
+    if qp_type == "smalse":
+        check_preconditioner(options, prefix)
     pc_type = options.pc_type
     if pc_type == "auto":
         pc_type = "dirichlet" if qp_type == "pcpg" else "none"

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.checks import POSITIVE, checked_callable, checked_flag, checked_number, named
 from tfeti_dolfinx.errors import InputError
 
 Point = tuple[float, ...] | list[float] | Array
@@ -28,7 +29,8 @@ class Shape(Protocol):
 
 def _vector(values: Point, what: str) -> Array:
     """A vector of three components from two or three."""
-    array = np.asarray(values, dtype=float)
+    with named(f"{what}={values!r}, expected two or three finite numbers", TypeError, ValueError):
+        array = np.asarray(values, dtype=float)
     if array.shape not in ((2,), (3,)) or not np.all(np.isfinite(array)):
         raise InputError(f"{what}={values}: expected two or three finite numbers")
     return np.pad(array, (0, 3 - len(array)))
@@ -42,13 +44,26 @@ def _direction(values: Point, what: str) -> Array:
     return vector / length
 
 
-def _radius(radius: float) -> float:
-    if not radius > 0.0:
-        raise InputError(f"radius={radius}: expected a positive number")
-    return float(radius)
+class Placed:
+    """A shape that is placed by vectors of two or three components."""
+
+    def __init__(self, **vectors: Point) -> None:
+        self._vectors = vectors
+
+    def check_dimension(self, gdim: int, whose: str) -> None:
+        """Raise if the shape is not placed in a space of this dimension.
+
+        Raises:
+            InputError: In 3D a vector has two components, or in 2D one points out of the plane.
+        """
+        for what, values in self._vectors.items():
+            if len(values) == 2 and gdim == 3:
+                raise InputError(f"{whose}: {what}={values}, expected three components in 3D")
+            if len(values) == 3 and gdim == 2 and values[2] != 0.0 and what != "axis":
+                raise InputError(f"{whose}: {what}={values}, expected two components in 2D")
 
 
-class Plane:
+class Plane(Placed):
     """A half space behind a plane.
 
     Args:
@@ -59,6 +74,7 @@ class Plane:
     def __init__(self, point: Point, normal: Point) -> None:
         self.point = _vector(point, "point")
         self.normal = _direction(normal, "normal")
+        super().__init__(point=point, normal=normal)
 
     def distance(self, x: Array) -> Array:
         """Signed distance, shape ``(n,)``."""
@@ -69,7 +85,7 @@ class Plane:
         return np.repeat(self.normal[:, None], x.shape[1], axis=1)
 
 
-class Sphere:
+class Sphere(Placed):
     """A ball (in 2D: a disc), or with ``inside`` a spherical cavity.
 
     Args:
@@ -80,8 +96,9 @@ class Sphere:
 
     def __init__(self, centre: Point, radius: float, inside: bool = False) -> None:
         self.centre = _vector(centre, "centre")
-        self.radius = _radius(radius)
-        self.sign = -1.0 if inside else 1.0
+        self.radius = checked_number(radius, "radius", POSITIVE)
+        self.sign = -1.0 if checked_flag(inside, "inside") else 1.0
+        super().__init__(centre=centre)
 
     def _offset(self, x: Array) -> Array:
         return x - self.centre[:, None]
@@ -108,8 +125,9 @@ class Cylinder(Sphere):
     """
 
     def __init__(self, point: Point, axis: Point, radius: float, inside: bool = False) -> None:
-        super().__init__(point, radius, inside)
+        super().__init__(_vector(point, "point"), radius, inside)
         self.axis = _direction(axis, "axis")
+        self._vectors = {"point": point, "axis": axis}
 
     def _offset(self, x: Array) -> Array:
         offset = super()._offset(x)
@@ -128,6 +146,11 @@ class SignedDistance:
     distance_of: Callable[[Array], Array]
     gradient_of: Callable[[Array], Array]
 
+    def __post_init__(self) -> None:
+        expected = "a callable of points of shape (3, n)"
+        checked_callable(self.distance_of, "distance_of", expected)
+        checked_callable(self.gradient_of, "gradient_of", expected)
+
     def distance(self, x: Array) -> Array:
         """Signed distance, shape ``(n,)``."""
         return np.asarray(self.distance_of(x), dtype=float)
@@ -135,4 +158,6 @@ class SignedDistance:
     def gradient(self, x: Array) -> Array:
         """Gradient of the signed distance, shape ``(3, n)``."""
         gradient = np.asarray(self.gradient_of(x), dtype=float)
-        return np.pad(gradient, ((0, 3 - len(gradient)), (0, 0)))
+        if gradient.ndim == 2 and len(gradient) == 2:
+            return np.pad(gradient, ((0, 1), (0, 0)))
+        return gradient

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from dolfinx import fem
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.compat import is_on_mesh, prescribed_values
+from tfeti_dolfinx.checks import checked_type, shown
+from tfeti_dolfinx.compat import prescribed_values, space_of
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.mesh.spaces import component_of, described, is_same_space
 
 AGREEMENT = 1e-10
 
@@ -33,10 +35,8 @@ def prescribe(dofs: TornDofs, bcs: Sequence[fem.DirichletBC]) -> Prescribed:
     """Collect Dirichlet values and spread them to all copies of their nodes. Collective.
 
     Raises:
-        InputError: A condition is on another mesh, conditions contradict each other at a node, or
-            a value is not finite.
+        InputError: Conditions contradict each other at a node, or a value is not finite.
     """
-    _check_mesh(dofs, bcs)
     size = dofs.V.dofmap.index_map.size_local * dofs.bs
     values = prescribed_values(bcs, size)
     low = np.fmin.reduce(values, axis=0, initial=np.inf)
@@ -50,13 +50,55 @@ def prescribe(dofs: TornDofs, bcs: Sequence[fem.DirichletBC]) -> Prescribed:
     return Prescribed(flag=flag, value=np.where(flag, low, 0.0))
 
 
-def _check_mesh(dofs: TornDofs, bcs: Sequence[fem.DirichletBC]) -> None:
-    for number, bc in enumerate(bcs):
-        if not is_on_mesh(bc, dofs.V.mesh):
-            raise InputError(
-                f"Dirichlet condition {number} is on another mesh; expected a space on "
-                "decomposition.mesh, the torn mesh"
-            )
+def checked_conditions(
+    bcs: Iterable[fem.DirichletBC], V: fem.FunctionSpace
+) -> list[fem.DirichletBC]:
+    """The conditions as a list. Collective.
+
+    Raises:
+        InputError: They are no Dirichlet conditions on V or a component of V, or one of them has
+            no unknowns, or some that V has not.
+    """
+    if isinstance(bcs, fem.DirichletBC) or not isinstance(bcs, Iterable):
+        raise InputError(
+            f"bcs is {shown(bcs)}; expected a list of Dirichlet conditions, [] for none"
+        )
+    conditions = list(bcs)
+    count = np.zeros(len(conditions), dtype=np.int64)
+    with raised_on_all_ranks(V.mesh.comm):
+        for number, bc in enumerate(conditions):
+            what = f"Dirichlet condition {number}"
+            checked_type(bc, fem.DirichletBC, what, "a dolfinx.fem.DirichletBC")
+            _check_space(what, bc, V)
+            count[number] = len(bc.dof_indices()[0])
+    total = V.mesh.comm.allreduce(count)
+    if not np.all(total):
+        raise InputError(
+            f"Dirichlet condition {int(np.argmin(total))} holds nowhere: it has no unknowns on any "
+            "rank; expected at least one"
+        )
+    return conditions
+
+
+def _check_space(what: str, bc: fem.DirichletBC, V: fem.FunctionSpace) -> None:
+    space = space_of(bc)
+    if space.mesh is not V.mesh._cpp_object:
+        raise InputError(
+            f"{what} is on another mesh; expected a space on decomposition.mesh, the torn mesh"
+        )
+    own = component_of(V, list(space.component()))
+    if own is None or not is_same_space(space, own):
+        raise InputError(
+            f"{what} is on {described(space)}; expected the space of a, "
+            f"{described(V._cpp_object)}, or V.sub(i) of it"
+        )
+    size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
+    highest = int(bc.dof_indices()[0].max(initial=-1))
+    if highest >= size:
+        raise InputError(
+            f"{what} prescribes the unknown {highest}, but this rank has {size}; expected "
+            "unknowns that were located in the space of a"
+        )
 
 
 def _check_finite(bcs: Sequence[fem.DirichletBC]) -> None:

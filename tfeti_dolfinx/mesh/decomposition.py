@@ -10,6 +10,7 @@ from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.checks import is_whole, shown
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.untorn import GroupNames
 
@@ -108,10 +109,15 @@ class Decomposition:
 
 
 def _tag(name: str | int, names: dict[str, int], kind: str) -> int:
-    if isinstance(name, (int, np.integer)):
-        if int(name) in names.values():
-            return int(name)
-    elif name in names:
+    if is_whole(name) and int(name) in names.values():
+        return int(name)
+    if isinstance(name, str) and name in names:
         return names[name]
-    known = ", ".join(f"{n!r} ({t})" for n, t in names.items()) or "none"
-    raise InputError(f"no {kind} {name!r} in the mesh; its {kind}s are: {known}")
+    if not is_whole(name) and not isinstance(name, str):
+        raise InputError(f"{kind} {shown(name)}: expected the name or the tag of one {kind}")
+    raise InputError(f"no {kind} {name!r} in the mesh; its {kind}s are: {known_tags(names)}")
+
+
+def known_tags(names: dict[str, int]) -> str:
+    """Names and tags for messages."""
+    return ", ".join(f"{n!r} ({t})" for n, t in names.items()) or "none"

@@ -5,16 +5,15 @@ from __future__ import annotations
 from functools import cached_property
 from typing import Any
 
-import basix
 import numpy as np
 from dolfinx import fem
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.compat import first_component, geometry_dofmap
-from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.entities import cell_entities, mix, set_key
+from tfeti_dolfinx.mesh.spaces import check_space
 from tfeti_dolfinx.parallel import Exchange, chunk_offsets, owner_of
 
 
@@ -42,11 +41,11 @@ class TornDofs:
         copy_subdomains: Their subdomains, shape ``(c,)``.
 
     Raises:
-        InputError: ``V`` is not a continuous Lagrange space on the torn mesh.
+        InputError: ``V`` is not a space for displacements on the torn mesh.
     """
 
     def __init__(self, V: fem.FunctionSpace, decomposition: Decomposition) -> None:
-        _check_space(V, decomposition)
+        check_space(V, decomposition)
         self.V = V
         self.comm = decomposition.comm
         self.bs = V.dofmap.index_map_bs
@@ -132,11 +131,25 @@ class TornDofs:
         Returns:
             The sums, shape ``(g, ...)``.
         """
+        return self.reduce_on_owners(groups, values, np.add, 0)
+
+    def reduce_on_owners(self, groups: Array, values: Array, op: np.ufunc, initial: Any) -> Array:
+        """Combine the values that all ranks give for each owned group. Collective.
+
+        Args:
+            groups: Global groups, any of them, shape ``(k,)``.
+            values: One value (or row) for each, shape ``(k, ...)``.
+            op: ``np.add``, ``np.maximum`` or ``np.minimum``.
+            initial: Neutral element of ``op``.
+
+        Returns:
+            Shape ``(g, ...)``.
+        """
         exchange = Exchange(self.comm, owner_of(self.group_offsets, groups))
         slot = exchange.send(groups) - self.group_offsets[self.comm.rank]
-        sums = np.zeros((self.num_groups, *values.shape[1:]), dtype=values.dtype)
-        np.add.at(sums, slot, exchange.send(values))
-        return sums
+        out = np.full((self.num_groups, *values.shape[1:]), initial, dtype=values.dtype)
+        op.at(out, slot, exchange.send(values))
+        return out
 
     @cached_property
     def scalar(self) -> tuple[fem.FunctionSpace, Array]:
@@ -232,19 +245,6 @@ class TornDofs:
         facets = np.union1d(decomposition.tears, decomposition.boundary).astype(np.int32)
         fdim = decomposition.mesh.topology.dim - 1
         return self.primal_nodes(fem.locate_dofs_topological(self.V, fdim, facets, remote=False))
-
-
-def _check_space(V: fem.FunctionSpace, decomposition: Decomposition) -> None:
-    if V.mesh is not decomposition.mesh:
-        raise InputError("the space is not on decomposition.mesh, the torn mesh")
-    try:
-        element = V.element.basix_element
-    except RuntimeError as error:
-        raise InputError("mixed spaces are not supported, expected a Lagrange space") from error
-    if element.family != basix.ElementFamily.P or element.discontinuous or element.degree < 1:
-        raise InputError(
-            f"space {V.ufl_element()}: expected a continuous Lagrange space of degree 1 or more"
-        )
 
 
 def _owners(comm: MPI.Intracomm, key: Array, subdomain: Array) -> Array:

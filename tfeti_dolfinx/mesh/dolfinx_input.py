@@ -8,8 +8,9 @@ import numpy as np
 from dolfinx import mesh as dmesh
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.compat import geometry_dofmap
-from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.checks import checked_type
+from tfeti_dolfinx.compat import geometry_dofmap, original_cells
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.entities import NO_TAG, cell_facets
 from tfeti_dolfinx.mesh.partition import (
@@ -18,6 +19,7 @@ from tfeti_dolfinx.mesh.partition import (
     coordinate_bisection,
     default_count,
 )
+from tfeti_dolfinx.mesh.tags import check_tags, checked_names
 from tfeti_dolfinx.mesh.tearing import tear
 from tfeti_dolfinx.mesh.untorn import GroupNames, UntornMesh
 from tfeti_dolfinx.timing import stage
@@ -51,11 +53,17 @@ def decompose(
 
     Raises:
         InputError: The cells are not triangles, quadrilaterals, tetrahedra or hexahedra, or
-            the subdomains do not fit.
+            tags, names or subdomains do not fit.
     """
+    _check_mesh(mesh)
+    for tags, of_cells, what in ((cell_tags, True, "cell_tags"), (facet_tags, False, "facet_tags")):
+        if tags is not None:
+            check_tags(tags, mesh, of_cells, what, f"expected the {what} of the mesh given")
+    surfaces = checked_names(surfaces, "surfaces", facet_tags, "facet_tags")
+    volumes = checked_names(volumes, "volumes", cell_tags, "cell_tags")
     seconds: dict[str, float] = {}
     with stage("mesh", seconds):
-        untorn = _untorn(mesh, cell_tags, facet_tags, surfaces or {}, volumes or {})
+        untorn = _untorn(mesh, cell_tags, facet_tags, surfaces, volumes)
         if subdomains is None:
             subdomains = default_count(untorn, mesh.comm)
         subdomain = assign_subdomains(untorn, subdomains, mesh.comm, coordinate_bisection)
@@ -72,11 +80,6 @@ def _untorn(
     volumes: dict[str, int],
 ) -> UntornMesh:
     topology, gdim = mesh.topology, mesh.geometry.dim
-    if topology.cell_type.name not in CELL_TYPES or topology.dim != gdim:
-        raise InputError(
-            f"mesh of {topology.cell_type.name}s in {gdim}D: expected one of "
-            f"{', '.join(CELL_TYPES)} in its own dimension"
-        )
     owned = topology.index_map(topology.dim).size_local
     nodes = geometry_dofmap(mesh)[:owned]
     ids = np.asarray(mesh.geometry.input_global_indices)
@@ -87,7 +90,7 @@ def _untorn(
         cell_type=topology.cell_type,
         element=mesh.ufl_domain().ufl_coordinate_element(),
         cells=ids[nodes],
-        cell_ids=np.asarray(topology.original_cell_index[:owned], dtype=np.int64),
+        cell_ids=original_cells(mesh)[:owned],
         cell_tags=_values(cell_tags, np.arange(owned)),
         facet_tags=_values(facet_tags, cell_facets(mesh)),
         node_ids=used,
@@ -97,6 +100,24 @@ def _untorn(
             volumes=_names(mesh, cell_tags, volumes),
         ),
     )
+
+
+def _check_mesh(mesh: dmesh.Mesh) -> None:
+    checked_type(mesh, dmesh.Mesh, "mesh", "a dolfinx.mesh.Mesh")
+    topology, gdim = mesh.topology, mesh.geometry.dim
+    if topology.cell_type.name not in CELL_TYPES or topology.dim != gdim:
+        raise InputError(
+            f"mesh of {topology.cell_type.name}s in {gdim}D: expected one of "
+            f"{', '.join(CELL_TYPES)} in its own dimension"
+        )
+    if topology.index_map(topology.dim).size_global == 0:
+        raise InputError("the mesh has no cells")
+    with raised_on_all_ranks(mesh.comm):
+        x = mesh.geometry.x
+        if x.dtype != np.float64:
+            raise InputError(f"mesh with coordinates of type {x.dtype}; expected float64")
+        if not np.all(np.isfinite(x)):
+            raise InputError(f"mesh with {np.sum(~np.isfinite(x))} coordinates that are not finite")
 
 
 def _values(tags: dmesh.MeshTags | None, entities: Array) -> Array:

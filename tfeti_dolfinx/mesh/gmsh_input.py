@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from tfeti_dolfinx.checks import checked_type
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.gmsh_join import untorn_mesh
@@ -58,6 +59,7 @@ def read_gmsh(
             is missing, a name or a tag means different groups, a node has different
             coordinates, or a cell lies in two files.
     """
+    checked_type(comm, MPI.Intracomm, "comm", "a communicator such as MPI.COMM_WORLD")
     seconds: dict[str, float] = {}
     with stage("mesh", seconds):
         decomposition = _read_and_tear(source, comm, subdomains)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.checks import named, shown
 from tfeti_dolfinx.errors import InputError
 
 # what gmsh calls the physical groups that it makes for partitions
@@ -71,6 +72,10 @@ def opened(source: str | PathLike[str] | Any, may_be_empty: bool = False) -> Ite
     import gmsh
 
     if not isinstance(source, (str, PathLike)):
+        if not hasattr(source, "getPhysicalGroups"):
+            raise InputError(
+                f"source is {shown(source)}; expected a .msh file, or a gmsh model: gmsh.model"
+            )
         yield source
         return
     path = Path(source)
@@ -113,7 +118,8 @@ def read_part(model: Any, where: str) -> Part:
         InputError: An element lies in several physical groups, or the elements of a dimension
             are of several types.
     """
-    top = max((dim for dim, _ in model.getPhysicalGroups()), default=0)
+    with named("gmsh.model (is gmsh initialised, with a model in it?)"):
+        top = max((dim for dim, _ in model.getPhysicalGroups()), default=0)
     elements = {}
     for dim in range(max(top - 1, 1), top + 1):
         found = _elements(model, dim)

@@ -11,6 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from tfeti_dolfinx.arrays import Array, ArrayLike
+from tfeti_dolfinx.checks import is_whole, named, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.untorn import UntornMesh
 from tfeti_dolfinx.parallel import box_over_ranks
@@ -48,7 +49,7 @@ def assign_subdomains(
             whole number per cell, or an id is negative.
     """
     total = comm.allreduce(len(mesh.cells))
-    if isinstance(subdomains, (int, np.integer)):
+    if is_whole(subdomains):
         if not 1 <= subdomains <= total:
             raise InputError(
                 f"subdomains={subdomains}: expected between 1 and {total}, the number of cells"
@@ -58,20 +59,28 @@ def assign_subdomains(
         if callable(subdomains):
             midpoints = np.zeros((3, len(mesh.cells)))
             midpoints[: mesh.gdim] = mesh.midpoints().T
-            ids = _checked_ids(subdomains(midpoints), len(mesh.cells), "callable subdomains")
+            with named("callable subdomains"):
+                found = subdomains(midpoints)
+            ids = _checked_ids(found, len(mesh.cells), "callable subdomains")
         else:
             ids = _checked_ids(subdomains, len(mesh.cells), "array subdomains")
     return _without_holes(ids, comm)
 
 
 def _checked_ids(ids: ArrayLike, num_cells: int, what: str) -> Array:
-    array = np.asarray(ids)
+    with named(what):
+        array = np.asarray(ids)
+    if array.ndim == 0 or array.dtype.kind not in "biuf":
+        raise InputError(
+            f"{what}: expected a number of subdomains, one whole number for each cell or a "
+            f"callable that returns them, got {shown(ids)}"
+        )
     if array.shape != (num_cells,):
         raise InputError(
             f"{what}: expected one id for each of the {num_cells} cells of this rank, "
             f"got an array of shape {array.shape}"
         )
-    whole = array.astype(np.int64)
+    whole = np.where(np.isfinite(array), array, -1).astype(np.int64)
     if np.any(whole != array) or np.any(whole < 0):
         wrong = array[(whole != array) | (whole < 0)][0]
         raise InputError(f"{what}: expected whole numbers from 0 up, got {wrong}")

@@ -1,0 +1,1 @@
+"""Mistakes that users make, and the words that the message must have."""

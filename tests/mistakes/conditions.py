@@ -1,0 +1,210 @@
+"""Mistakes in conditions, in u, the stress, the decomposition, and options of the compiler."""
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from scenes import hooke
+
+import tfeti_dolfinx as tfeti
+from mistakes.scene import raising
+
+
+def in_space(s, V, at=None):
+    """The problem with a condition on another space."""
+    dofs = s.on(V=V if at is None else at)
+    size = V.dofmap.index_map_bs if not V._cpp_object.component() else 1
+    value = np.zeros(size) if size > 1 else 0.0
+    return s.problem(bcs=[fem.dirichletbc(value, dofs, V)])
+
+
+def untorn(s):
+    V = s.untorn_space(*s.vector)
+    facets = s.facet_tags.find(1)
+    return fem.dirichletbc(np.zeros(2), fem.locate_dofs_topological(V, 1, facets), V)
+
+
+def of_function(s, value):
+    g = fem.Function(s.V)
+    g.x.array[:] = value
+    return fem.dirichletbc(g, s.on())
+
+
+def modulus_before(s):
+    E = fem.Function(s.untorn_space("DG", 0), name="E")
+    return lambda u: E * hooke()(u)
+
+
+BCS = {
+    "bcs is None": (lambda s: s.problem(bcs=None), r"bcs is None; expected a list"),
+    "bcs is one condition": (
+        lambda s: s.problem(bcs=s.clamp()),
+        r"bcs is a DirichletBC; expected a list",
+    ),
+    "bcs has None": (
+        lambda s: s.problem(bcs=[s.clamp(), None]),
+        r"Dirichlet condition 1 is None; expected a dolfinx.fem.DirichletBC",
+    ),
+    "bcs is a surface": (
+        lambda s: s.problem(bcs="left"),
+        r"Dirichlet condition 0 is 'l'; expected a dolfinx.fem.DirichletBC",
+    ),
+    "bcs has unknowns and a value": (
+        lambda s: s.problem(bcs=[(0.0, s.on())]),
+        r"Dirichlet condition 0 is \(0.0, .*; expected a dolfinx.fem.DirichletBC",
+    ),
+    "bcs is a dictionary": (
+        lambda s: s.problem(bcs={"left": 0.0}),
+        r"Dirichlet condition 0 is 'left'; expected",
+    ),
+    "bcs has lists of conditions": (
+        lambda s: s.problem(bcs=[[s.clamp()]]),
+        r"Dirichlet condition 0 is \[.*; expected a dolfinx.fem.DirichletBC",
+    ),
+    "bcs is a number": (lambda s: s.problem(bcs=0), r"bcs is 0; expected a list"),
+    "a condition of degree 2": (
+        lambda s: in_space(s, s.space("Lagrange", 2, (2,))),
+        r"Dirichlet condition 0 is on a space of degree 2 with 2 unknowns per node; expected the "
+        r"space of a, a space of degree 1 with 2",
+    ),
+    "a condition on a scalar space": (
+        lambda s: in_space(s, s.space("Lagrange", 1)),
+        r"Dirichlet condition 0 is on a space of degree 1 with 1 unknowns per node; expected the",
+    ),
+    "a condition on a collapsed space": (
+        lambda s: in_space(s, s.V.sub(0).collapse()[0]),
+        r"Dirichlet condition 0 is on a space of degree 1 with 1 .* or V.sub\(i\) of it",
+    ),
+    "a condition on a component of degree 2": (
+        lambda s: in_space(s, s.space("Lagrange", 2, (2,)).sub(1)),
+        r"Dirichlet condition 0 is on a component of a space of degree 2",
+    ),
+    "a condition on a third component in 2D": (
+        lambda s: in_space(s, s.space("Lagrange", 1, (3,)).sub(2)),
+        r"Dirichlet condition 0 is on a component of a space of degree 1 with 3 unknowns",
+    ),
+    "a condition on a discontinuous space": (
+        lambda s: in_space(s, s.space("DG", 1, (2,))),
+        r"Dirichlet condition 0 is on a space of degree 1 .*expected the space of a",
+    ),
+    "a condition on the mesh before it is torn": (
+        lambda s: s.problem(bcs=[untorn(s)]),
+        r"Dirichlet condition 0 is on another mesh; expected .*the torn mesh",
+    ),
+    "the second condition on the mesh before it is torn": (
+        lambda s: s.problem(bcs=[s.clamp(), untorn(s)]),
+        r"Dirichlet condition 1 is on another mesh",
+    ),
+    "unknowns that were located in another space": (
+        lambda s: in_space(s, s.V, at=s.space("Lagrange", 3, (2,))),
+        r"Dirichlet condition 0 prescribes the unknown \d+, but this rank has \d+; expected",
+    ),
+    "a condition that holds nowhere": (
+        lambda s: s.problem(bcs=[s.clamp(), s.clamp(side="nothing")]),
+        r"Dirichlet condition 1 holds nowhere",
+    ),
+    "a value that is nan": (
+        lambda s: s.problem(bcs=[s.clamp(np.nan)]).solve(),
+        r"Dirichlet condition 0 has a value that is not finite",
+    ),
+    "a value that is infinite": (
+        lambda s: s.problem(bcs=[s.clamp(), s.clamp(np.inf, "right")]).solve(),
+        r"Dirichlet condition 1 has a value that is not finite",
+    ),
+    "a function that is nan": (
+        lambda s: s.problem(bcs=[of_function(s, np.nan)]).solve(),
+        r"Dirichlet condition 0 has a value that is not finite",
+    ),
+    "conditions that contradict each other": (
+        lambda s: s.problem(bcs=[s.clamp(0.0), s.clamp(0.1, "bottom")]).solve(),
+        r"Dirichlet conditions contradict each other: component \d of a node is prescribed as 0",
+    ),
+}
+
+U = {
+    "u is on the mesh before it is torn": (
+        lambda s: s.problem(u=fem.Function(s.untorn_space(*s.vector))),
+        r"u is from a space of degree 1 with 2 .* on another mesh; expected the space of a",
+    ),
+    "u is of degree 2": (
+        lambda s: s.problem(u=fem.Function(s.space("Lagrange", 2, (2,)))),
+        r"u is from a space of degree 2",
+    ),
+    "u is scalar": (
+        lambda s: s.problem(u=fem.Function(s.space("Lagrange", 1))),
+        r"u is from a space of degree 1 with 1 unknowns",
+    ),
+    "u is a trial function": (lambda s: s.problem(u=s.u), r"u is a Argument; expected a dolfinx"),
+    "u is an array": (lambda s: s.problem(u=np.zeros(3)), r"u is an array of shape \(3,\)"),
+    "u is a name": (lambda s: s.problem(u="displacement"), r"u is 'displacement'; expected"),
+    "u is a space": (lambda s: s.problem(u=s.V), r"u is a FunctionSpace; expected"),
+}
+
+STRESS = {
+    "the stress is an expression": (
+        lambda s: s.problem(stress=hooke()(fem.Function(s.V))),
+        r"stress is an expression; expected a callable",
+    ),
+    "the stress is a number": (lambda s: s.problem(stress=1.0), r"stress is 1.0; expected a call"),
+    "the stress is a text": (lambda s: s.problem(stress="hooke"), r"stress is 'hooke'; expected"),
+    "the stress has two rows": (
+        lambda s: s.problem(stress=lambda u: ufl.sym(ufl.grad(u))),
+        r"stress\(u\) has shape \(2, 2\); expected \(3, 3\)",
+    ),
+    "the stress is scalar": (
+        lambda s: s.problem(stress=lambda u: ufl.tr(ufl.grad(u))),
+        r"stress\(u\) has shape \(\); expected \(3, 3\)",
+    ),
+    "the stress returns None": (
+        lambda s: s.problem(stress=lambda u: None),
+        r"stress\(u\) is None; expected a UFL tensor of shape \(3, 3\)",
+    ),
+    "the stress returns an array": (
+        lambda s: s.problem(stress=lambda u: np.zeros((3, 3))),
+        r"stress\(u\) is an array of shape \(3, 3\); expected a UFL tensor",
+    ),
+    "the stress takes no argument": (
+        lambda s: s.problem(stress=lambda: None),
+        r"stress\(u\): TypeError: .*takes 0 positional arguments",
+    ),
+    "the stress fails": (
+        lambda s: s.problem(stress=raising),
+        r"stress\(u\): ZeroDivisionError: no such place",
+    ),
+    "the stress has E on the mesh before it is torn": (
+        lambda s: s.problem(stress=modulus_before(s)),
+        r"stress: the function 'E' is on another mesh",
+    ),
+}
+
+OTHERS = {
+    "the decomposition is None": (
+        lambda s: s.problem(decomposition=None),
+        r"decomposition is None; expected what decompose or read_gmsh return",
+    ),
+    "the decomposition is the mesh": (
+        lambda s: s.problem(decomposition=s.d.mesh),
+        r"decomposition is a Mesh; expected",
+    ),
+    "the decomposition is a number of subdomains": (
+        lambda s: s.problem(decomposition=4),
+        r"decomposition is 4; expected",
+    ),
+    "the decomposition is a class": (
+        lambda s: s.problem(decomposition=tfeti.Decomposition),
+        r"decomposition is the class Decomposition; expected",
+    ),
+    "the decomposition is another one": (
+        lambda s: s.problem(decomposition=tfeti.decompose(s.mesh, 2)),
+        r"the space is on another mesh",
+    ),
+    "form_compiler_options is a list": (
+        lambda s: s.problem(form_compiler_options=["-O2"]),
+        r"form_compiler_options is \['-O2'\]; expected a dictionary",
+    ),
+    "jit_options is a text": (
+        lambda s: s.problem(jit_options="-O2"),
+        r"jit_options is '-O2'; expected a dictionary",
+    ),
+}
+
+TABLES = ("BCS", "U", "STRESS", "OTHERS")

@@ -1,0 +1,219 @@
+"""Mistakes in meshes, tags, names and subdomains that DOLFINx's mesh comes with."""
+
+import numpy as np
+from dolfinx import mesh as dmesh
+
+import tfeti_dolfinx as tfeti
+from mistakes.scene import raising
+
+
+def submesh(s, dim, number):
+    s.mesh.topology.create_connectivity(dim, s.mesh.topology.dim)
+    count = min(number, s.mesh.topology.index_map(dim).size_local)
+    return dmesh.create_submesh(s.mesh, dim, np.arange(count, dtype=np.int32))[0]
+
+
+def single(s):
+    return dmesh.create_unit_square(s.comm, 2, 2, dtype=np.float32)
+
+
+def with_nodes_at(s, value):
+    mesh = dmesh.create_unit_square(s.comm, 2, 2)
+    mesh.geometry.x[:1] = value
+    return mesh
+
+
+def torn(s, *arguments, **names):
+    return tfeti.decompose(s.mesh, *arguments, **names)
+
+
+def parts(says, subdomains):
+    """Decomposition into what is given, for a number of cells."""
+    return lambda s: torn(s, subdomains), says
+
+
+def cells(s):
+    return s.mesh.topology.index_map(2).size_local
+
+
+MESHES = {
+    "no mesh": (lambda s: tfeti.decompose(None, 2), r"mesh is None; expected a dolfinx.mesh.Mesh"),
+    "mesh and tags as DOLFINx reads them": (
+        lambda s: tfeti.decompose((s.mesh, s.cell_tags, s.facet_tags), 2),
+        r"mesh is \(.*; expected a dolfinx.mesh.Mesh",
+    ),
+    "a mesh of UFL": (lambda s: tfeti.decompose(s.mesh.ufl_domain(), 2), r"mesh is a Mesh; expec"),
+    "a file's name": (lambda s: tfeti.decompose("ring.msh", 2), r"mesh is 'ring.msh'; expected"),
+    "a decomposition": (lambda s: tfeti.decompose(s.d, 2), r"mesh is a Decomposition; expected"),
+    "intervals": (
+        lambda s: tfeti.decompose(dmesh.create_unit_interval(s.comm, 4), 2),
+        r"mesh of intervals in 1D: expected one of triangle",
+    ),
+    "prisms": (
+        lambda s: tfeti.decompose(
+            dmesh.create_unit_cube(s.comm, 1, 1, 1, cell_type=dmesh.CellType.prism), 1
+        ),
+        r"mesh of prisms in 3D: expected one of triangle",
+    ),
+    "a surface in 3D": (
+        lambda s: tfeti.decompose(submesh(s.cube, 2, 8), 2),
+        r"mesh of quadrilaterals in 3D: expected one of .* in its own dimension",
+    ),
+    "a mesh without cells": (
+        lambda s: tfeti.decompose(submesh(s, 2, 0)),
+        r"the mesh has no cells",
+    ),
+    "a mesh of single precision": (
+        lambda s: tfeti.decompose(single(s), 2),
+        r"mesh with coordinates of type float32; expected float64",
+    ),
+    "nodes that are nan": (
+        lambda s: tfeti.decompose(with_nodes_at(s, np.nan), 2),
+        r"mesh with 3 coordinates that are not finite",
+    ),
+    "nodes at infinity": (
+        lambda s: tfeti.decompose(with_nodes_at(s, np.inf), 2),
+        r"mesh with 3 coordinates that are not finite",
+    ),
+}
+
+SUBDOMAINS = {
+    "True subdomains": parts(r"array subdomains: expected a number.*got True", True),
+    "no subdomains": parts(r"subdomains=0: expected between 1 and 4, the number of cells", 0),
+    "fewer than no subdomains": parts(r"subdomains=-1: expected between 1 and 4", -1),
+    "more subdomains than cells": parts(r"subdomains=5: expected between 1 and 4", 5),
+    "two and a half subdomains": parts(r"array subdomains: expected a number.*got 2.5", 2.5),
+    "subdomains as text": parts(r"array subdomains: expected a number.*got '2'", "2"),
+    "subdomains as a dictionary": parts(r"array subdomains: expected a number.*got {'n", {"n": 2}),
+    "an id for too few cells": parts(
+        r"array subdomains: expected one id for each of the \d cells .*\(9,\)", np.zeros(9)
+    ),
+    "an id for each cell and more": parts(
+        r"array subdomains: expected one id for each .*\(2, 2\)", np.zeros((2, 2))
+    ),
+    "ids below 0": (
+        lambda s: torn(s, np.full(cells(s), -1)),
+        r"array subdomains: expected whole numbers from 0 up, got -1",
+    ),
+    "ids of fractions": (
+        lambda s: torn(s, np.full(cells(s), 0.5)),
+        r"array subdomains: expected whole numbers from 0 up, got 0.5",
+    ),
+    "ids that are nan": (
+        lambda s: torn(s, np.full(cells(s), np.nan)),
+        r"array subdomains: expected whole numbers from 0 up, got nan",
+    ),
+    "ids that are names": (
+        lambda s: torn(s, ["inner"] * cells(s)),
+        r"array subdomains: expected a number of subdomains, one whole number for each cell",
+    ),
+    "ids that are ragged": (
+        lambda s: torn(s, [[0], [1, 2]]),
+        r"array subdomains: ValueError",
+    ),
+    "a callable that returns None": parts(r"callable subdomains: .*got None", lambda x: None),
+    "a callable that returns one number": parts(
+        r"callable subdomains: expected a number of.*got 0", lambda x: 0
+    ),
+    "a callable that returns a number per coordinate": parts(
+        r"callable subdomains: expected one id for each .*got an array of shape \(3, \d\)",
+        lambda x: (x > 0.5).astype(int),
+    ),
+    "a callable of three coordinates": parts(
+        r"callable subdomains: TypeError: .*missing 2 required positional arguments",
+        lambda x, y, z: x > 0.5,
+    ),
+    "a callable that fails": parts(
+        r"callable subdomains: ZeroDivisionError: no such place", raising
+    ),
+    "a callable that returns nan": parts(
+        r"callable subdomains: expected whole numbers from 0 up, got nan",
+        lambda x: np.full(x.shape[1], np.nan),
+    ),
+}
+
+TAGS = {
+    "cell and facet tags exchanged": (
+        lambda s: torn(s, 2, s.facet_tags, s.cell_tags),
+        r"cell_tags are tags of entities of dimension 1, not 2",
+    ),
+    "facet tags for cell tags": (
+        lambda s: torn(s, 2, cell_tags=s.facet_tags),
+        r"cell_tags are tags of entities of dimension 1, not 2",
+    ),
+    "cell tags for facet tags": (
+        lambda s: torn(s, 2, facet_tags=s.cell_tags),
+        r"facet_tags are tags of entities of dimension 2, not 1",
+    ),
+    "facet tags of another mesh": (
+        lambda s: torn(s, 2, facet_tags=s.d.facet_tags),
+        r"facet_tags are tags of another mesh; expected the facet_tags of the mesh given",
+    ),
+    "cell tags of another mesh": (
+        lambda s: torn(s, 2, cell_tags=s.d.cell_tags),
+        r"cell_tags are tags of another mesh; expected the cell_tags of the mesh given",
+    ),
+    "cell tags that are an array": (
+        lambda s: torn(s, 2, cell_tags=np.zeros(4, dtype=int)),
+        r"cell_tags is an array of shape \(4,\); expected dolfinx.mesh.MeshTags",
+    ),
+    "facet tags that are names": (
+        lambda s: torn(s, 2, facet_tags={"top": 1}),
+        r"facet_tags is {'top': 1}; expected dolfinx.mesh.MeshTags",
+    ),
+    "surfaces from tags to names": (
+        lambda s: torn(s, 2, facet_tags=s.facet_tags, surfaces={1: "top"}),
+        r"surfaces has 1: 'top'; expected a name and its tag",
+    ),
+    "surfaces in a list": (
+        lambda s: torn(s, 2, facet_tags=s.facet_tags, surfaces=["top"]),
+        r"surfaces is \['top'\]; expected a dictionary of names and tags",
+    ),
+    "a surface whose tag is text": (
+        lambda s: torn(s, 2, facet_tags=s.facet_tags, surfaces={"top": "1"}),
+        r"surfaces has 'top': '1'; expected a name and its tag",
+    ),
+    "a surface whose tag is a fraction": (
+        lambda s: torn(s, 2, facet_tags=s.facet_tags, surfaces={"top": 1.5}),
+        r"surfaces has 'top': 1.5; expected a name and its tag",
+    ),
+    "a volume of two tags": (
+        lambda s: torn(s, 2, cell_tags=s.cell_tags, volumes={"steel": [5, 6]}),
+        r"volumes has 'steel': \[5, 6\]; expected a name and its tag",
+    ),
+    "surfaces without facet tags": (
+        lambda s: torn(s, 2, surfaces={"top": 1}),
+        r"surfaces={'top': 1} without facet_tags",
+    ),
+    "volumes without cell tags": (
+        lambda s: torn(s, 2, facet_tags=s.facet_tags, volumes={"steel": 5}),
+        r"volumes={'steel': 5} without cell_tags",
+    ),
+}
+
+NAMES = {
+    "an unknown surface": (
+        lambda s: s.d.surface("lid"),
+        r"no surface 'lid' in the mesh; its surfaces are: 'left' \(1\)",
+    ),
+    "a surface with a capital": (lambda s: s.d.facets("Top"), r"no surface 'Top' in the mesh"),
+    "an unknown tag of a surface": (lambda s: s.d.surface(77), r"no surface 77 in the mesh"),
+    "a tag as text": (lambda s: s.d.surface("4"), r"no surface '4' in the mesh; .*'top' \(4\)"),
+    "the volume's name for a surface": (lambda s: s.d.facets("steel"), r"no surface 'steel'"),
+    "the surface's name for a volume": (
+        lambda s: s.d.volume("top"),
+        r"no volume 'top' in the mesh; its volumes are: 'steel' \(5\)",
+    ),
+    "a surface that is None": (
+        lambda s: s.d.surface(None),
+        r"surface None: expected the name or the tag of one surface",
+    ),
+    "surfaces in a list for one": (
+        lambda s: s.d.facets(["left", "right"]),
+        r"surface \['left', 'right'\]: expected the name or the tag of one surface",
+    ),
+    "a surface that is True": (lambda s: s.d.surface(True), r"surface True: expected the name"),
+    "a surface that is a fraction": (lambda s: s.d.surface(1.0), r"surface 1.0: expected the na"),
+}
+
+TABLES = ("MESHES", "SUBDOMAINS", "TAGS", "NAMES")

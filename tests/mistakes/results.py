@@ -1,0 +1,187 @@
+"""Mistakes with what a solve has found: fields, contacts, files and pictures."""
+
+import numpy as np
+
+from mistakes.scene import raising
+from tfeti_dolfinx.output import write_vtx, write_xdmf
+from tfeti_dolfinx.plot import plot_deformed, plot_pressure
+
+SOLUTION = r"solution is .*; expected the solution of a ContactProblem"
+
+
+def occupied(s):
+    """A folder with something of the user's in it, and a file where one expects a folder."""
+    folder = s.folder
+    if s.comm.rank == 0:
+        (folder / "file").write_text("mine")
+        for name in ("mine.bp", "mine.xdmf", "mine.png"):
+            (folder / name).mkdir(exist_ok=True)
+            (folder / name / "notes.txt").write_text("mine")
+    s.comm.barrier()
+    return folder
+
+
+def contact(says, index):
+    """Ask for a contact of the solution."""
+    return lambda s: s.solved.contact(index), says
+
+
+def picture(says, **arguments):
+    """A picture of the deformed body."""
+    return lambda s: plot_deformed(s.folder / "a.png", s.solved, **arguments), says
+
+
+def curve(says, coordinate, *others, **arguments):
+    """A picture of the pressure."""
+    return (
+        lambda s: plot_pressure(s.folder / "a.png", s.solved, coordinate, *others, **arguments),
+        says,
+    )
+
+
+FIELDS = {
+    "the solution before there is one": (
+        lambda s: s.problem().solution,
+        r"there is no solution yet; expected a call of solve\(\) before",
+    ),
+    "a contact of the solution before there is one": (
+        lambda s: s.problem(contacts=[s.floor]).solution.contact(0),
+        r"there is no solution yet",
+    ),
+    "a contact by name": contact(
+        r"contact 'bottom': there are 1, counted from 0; .*0: \('bottom',\)", "bottom"
+    ),
+    "a contact counted from 1": contact(r"contact 1: there are 1, counted from 0", 1),
+    "the last contact": contact(r"contact -1: there are 1, counted from 0", -1),
+    "a contact that is None": contact(r"contact None: there are 1, counted from 0", None),
+    "a contact that is a fraction": contact(r"contact 0.0: there are 1, counted", 0.0),
+    "a contact that is True": contact(r"contact True: there are 1, counted from 0", True),
+    "contacts in a list": contact(r"contact \[0\]: there are 1, counted from 0", [0]),
+    "a contact where there is none": (
+        lambda s: s.bare.contact(),
+        r"contact 0: there are 0, counted from 0; .* are none",
+    ),
+    "stress where none was given": (
+        lambda s: s.bare.stress,
+        r"no stress: give ContactProblem\(..., stress=sigma\)",
+    ),
+    "von Mises stress where none was given": (lambda s: s.bare.von_mises, r"no stress: give"),
+    "nodal stress where none was given": (lambda s: s.bare.nodal_stress, r"no stress: give"),
+    "nodal von Mises stress where none was given": (
+        lambda s: s.bare.nodal_von_mises,
+        r"no stress: give",
+    ),
+}
+
+FILES = {
+    "VTX with another ending": (
+        lambda s: write_vtx(s.folder / "x.vtu", s.solved),
+        r"x.vtu: expected a name that ends with .bp",
+    ),
+    "VTX without an ending": (
+        lambda s: write_vtx("result", s.solved),
+        r"result: expected a name that ends with .bp",
+    ),
+    "VTX to None": (
+        lambda s: write_vtx(None, s.solved),
+        r"path is None; expected a name that ends with .bp",
+    ),
+    "VTX with its arguments exchanged": (
+        lambda s: write_vtx(s.solved, "x.bp"),
+        r"path is a Solution; expected a name that ends with .bp",
+    ),
+    "VTX of the displacement": (
+        lambda s: write_vtx(s.folder / "x.bp", s.solved.displacement),
+        SOLUTION,
+    ),
+    "VTX of the problem": (lambda s: write_vtx(s.folder / "x.bp", s.problem()), SOLUTION),
+    "VTX below a file": (
+        lambda s: write_vtx(occupied(s) / "file" / "x.bp", s.solved),
+        r"cannot write .*x.bp: ",
+    ),
+    "VTX over somebody's folder": (
+        lambda s: write_vtx(occupied(s) / "mine.bp", s.solved),
+        r"mine.bp is a directory that VTX has not written",
+    ),
+    "XDMF with another ending": (
+        lambda s: write_xdmf(s.folder / "x.h5", s.solved),
+        r"x.h5: expected a name that ends with .xdmf",
+    ),
+    "XDMF to a number": (
+        lambda s: write_xdmf(7, s.solved),
+        r"path is 7; expected a name that ends with .xdmf",
+    ),
+    "XDMF of None": (lambda s: write_xdmf(s.folder / "x.xdmf", None), SOLUTION),
+    "XDMF below a file": (
+        lambda s: write_xdmf(occupied(s) / "file" / "x.xdmf", s.solved),
+        r"cannot write .*file.*: ",
+    ),
+    "XDMF over somebody's folder": (
+        lambda s: write_xdmf(occupied(s) / "mine.xdmf", s.solved),
+        r"mine.xdmf is a directory that VTX has not written",
+    ),
+}
+
+PICTURES = {
+    "a picture with another ending": (
+        lambda s: plot_deformed(s.folder / "a.svg", s.solved),
+        r"a.svg: expected a name that ends with .png",
+    ),
+    "a picture of the problem": (
+        lambda s: plot_deformed(s.folder / "a.png", s.problem()),
+        SOLUTION,
+    ),
+    "a picture without a stress": (
+        lambda s: plot_deformed(s.folder / "a.png", s.bare),
+        r"no stress: give ContactProblem",
+    ),
+    "a picture magnified by 0": picture(r"zoom=0: expected a positive number", zoom=0),
+    "a picture with a zoom of text": picture(r"zoom='2': expected a positive number", zoom="2"),
+    "a picture with a factor that is nan": picture(
+        r"factor=nan: expected a finite number", factor=np.nan
+    ),
+    "a picture with a focus in 2D": picture(
+        r"focus=\(0, 0\): expected three finite numbers", focus=(0, 0)
+    ),
+    "a picture with a view that is a name": picture(
+        r"view='xy', expected three finite numbers", view="xy"
+    ),
+    "a picture with a cut of one point": picture(
+        r"cut=\(0, 0, 0\): expected a point and a normal", cut=(0, 0, 0)
+    ),
+    "a picture with a highest stress below 0": picture(
+        r"highest=-1: expected a positive number", highest=-1
+    ),
+    "a picture with edges of text": picture(
+        r"show_edges='no': expected True or False", show_edges="no"
+    ),
+    "a curve over an axis": curve(r"coordinate is 0; expected a callable of points", 0),
+    "a curve over points": curve(
+        r"coordinate of points of shape \(\d, 3\) has the shape \(\d, 3\); expected \(\d,\)",
+        lambda x: x,
+    ),
+    "a curve over something that fails": curve(
+        r"coordinate of points of shape \(\d, 3\): ZeroDivisionError: no such place", raising
+    ),
+    "a curve with a closed form that is an array": curve(
+        r"closed_form is an array of shape \(3,\); expected a callable",
+        lambda x: x[:, 0],
+        np.zeros(3),
+    ),
+    "a curve of a contact that is not there": curve(
+        r"contact 3: there are 1, counted from 0", lambda x: x[:, 0], contact=3
+    ),
+    "a curve up to nowhere": curve(
+        r"limit=0.0: expected a positive number", lambda x: x[:, 0], limit=0.0
+    ),
+    "a curve with another ending": (
+        lambda s: plot_pressure("a.pdf", s.solved, lambda x: x[:, 0]),
+        r"a.pdf: expected a name that ends with .png",
+    ),
+    "a curve below a file": (
+        lambda s: plot_pressure(occupied(s) / "file" / "a.png", s.solved, lambda x: x[:, 0]),
+        r"cannot write .*a.png: ",
+    ),
+}
+
+TABLES = ("FIELDS", "FILES", "PICTURES")

@@ -1,0 +1,50 @@
+"""Mistakes that users make get a message that names the thing, on every rank."""
+
+import re
+
+import pytest
+from mistakes import accepted, conditions, contacts, forms, gmsh_files, meshes, options, results
+from mistakes.scene import Scene
+
+TABLES = {
+    f"{module.__name__.split('.')[1]} {name.lower()}": getattr(module, name)
+    for module in (forms, conditions, options, meshes, contacts, results, gmsh_files)
+    for name in module.TABLES
+}
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return Scene()
+
+
+def answer(do, scene, comm):
+    """Types and messages of the errors of all ranks; every rank has one, or the test hangs."""
+    error = None
+    try:
+        do(scene)
+    except Exception as caught:
+        error = caught
+    return comm.allgather((type(error).__name__, str(error)))
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_mistakes_are_named(table, scene, shared_tmp, comm):
+    scene.folder = shared_tmp
+    wrong = {}
+    for name, (do, says) in TABLES[table].items():
+        answers = answer(do, scene, comm)
+        if not all(kind == "InputError" and re.search(says, text) for kind, text in answers):
+            wrong[name] = (says, answers)
+    assert not wrong
+
+
+def test_no_mistake_is_there_twice():
+    names = [name for table in TABLES.values() for name in table]
+    assert len(set(names)) == len(names) >= 155
+
+
+@pytest.mark.parametrize("use", accepted.ACCEPTED)
+def test_what_is_right_is_accepted(use, scene, shared_tmp):
+    scene.folder = shared_tmp
+    assert accepted.ACCEPTED[use](scene)
