@@ -6,7 +6,7 @@ from scenes import curved_obstacle, decomposed, problem
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.dual.operator import check_operator
-from tfeti_dolfinx.dual.solvability import feasible_particular
+from tfeti_dolfinx.dual.particular import feasible_particular
 from tfeti_dolfinx.qp.problem import project
 
 

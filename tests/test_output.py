@@ -119,7 +119,7 @@ def test_files_that_cannot_be_written_are_named_on_all_ranks(solution, comm, sha
         "deformed.png": lambda path: plot_deformed(path, solution),
         "pressure.png": lambda path: plot_pressure(path, solution, lambda x: x[:, 0]),
     }.items():
-        with pytest.raises(InputError, match=f"cannot write {folder / name}"):
+        with pytest.raises(InputError, match=f"cannot write {folder}"):
             write(folder / name)
 
 

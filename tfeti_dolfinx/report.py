@@ -7,11 +7,14 @@ import os
 import resource
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 from mpi4py import MPI
 
 from tfeti_dolfinx.checks import named
 from tfeti_dolfinx.errors import raised_on_all_ranks
+
+PRINTED = 10  # of a list; all of it is in the file
 
 
 @dataclass
@@ -26,6 +29,9 @@ class Report:
         split_subdomains: Subdomains that were not connected and were split.
         kernel_dim: Dimension of the kernel of K.
         free_modes: Rigid motions that nothing resists and the load does not drive.
+        nearly_free: Rigid motions that contacts with a force hold hardly (``stiffness``: as a
+            share of what the same contacts hold at most) or not at all (0): dicts of ``bodies``,
+            ``mode`` and ``stiffness``. The smallest motion was taken.
         contact_rows: Non-penetration rows.
         contact_candidates: Nodes of the (secondary) contact surfaces.
         far_contact_nodes: Those that were out of reach or not covered, and have no row.
@@ -66,6 +72,7 @@ class Report:
     split_subdomains: int = 0
     kernel_dim: int = 0
     free_modes: int = 0
+    nearly_free: list[dict[str, object]] = field(default_factory=list)
     contact_rows: int = 0
     contact_candidates: int = 0
     far_contact_nodes: int = 0
@@ -101,6 +108,9 @@ class Report:
         for name, value in asdict(self).items():
             if isinstance(value, dict) and value:
                 lines += [f"{name}.{key:<22} {item:.6g}" for key, item in value.items()]
+            elif isinstance(value, list) and value:
+                lines += [f"{name:<31} {_item(item)}" for item in value[:PRINTED]]
+                lines += [f"{name:<31} {len(value)} in all"]
             else:
                 lines.append(f"{name:<31} {'-' if value in ({}, []) else value}")
         return "\n".join(lines)
@@ -130,6 +140,13 @@ def _write_whole(target: Path, text: str) -> None:
     except OSError:
         partial.unlink()
         raise
+
+
+def _item(item: str | dict[str, Any]) -> str:
+    """An unmet contact, or a motion that is nearly free, as text."""
+    if isinstance(item, str):
+        return item
+    return f"{', '.join(item['bodies'])}: {item['mode']}, stiffness {item['stiffness']:.2g}"
 
 
 def peak_memory_mb(comm: MPI.Intracomm) -> float:

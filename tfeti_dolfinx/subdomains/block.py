@@ -67,6 +67,15 @@ class Block(Protocol):
         ...
 
     @property
+    def body_metric(self) -> Array:
+        """Cᵀ W C, shape ``(k, k)``, W the share of this block in each of its nodes."""
+        ...
+
+    def body_moments(self, u: Array) -> Array:
+        """Cᵀ W u of a displacement on all unknowns, shape ``(k,)``."""
+        ...
+
+    @property
     def condensed_load(self) -> Array:
         """K⁺ f on the trace, shape ``(t,)``."""
         ...

@@ -42,7 +42,8 @@ def sparse_blocks(
     say_if_not_cholmod(dofs.comm)
     gdim = decomposition.mesh.geometry.dim
     x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node, :gdim]
-    frames = _body_frames(dofs, decomposition, x)
+    shares = 1.0 / dofs.spread(dofs.multiplicity)
+    frames = _body_frames(dofs, decomposition, x, shares)
     loads = dofs.to_primal(f)
     dolfinx = dofs.dolfinx_dofs()
     primal = np.empty(len(dolfinx), dtype=np.int32)
@@ -64,6 +65,7 @@ def sparse_blocks(
                     counters=counters,
                     kplus_type=kplus_type,
                     prefix=prefix,
+                    shares=shares[nodes],
                 )
             )
     return blocks
@@ -86,12 +88,12 @@ def _submatrix(K: Any, rows: Array, primal: Array, first: int) -> csr_array:
 
 
 def _body_frames(
-    dofs: TornDofs, decomposition: Decomposition, x: Array
+    dofs: TornDofs, decomposition: Decomposition, x: Array, shares: Array
 ) -> list[tuple[Array, float]]:
-    """Centre and size of each body, the same on all ranks."""
+    """Centre and size of each body, the same on all ranks and for all subdomains."""
     body = decomposition.body_of_subdomain[dofs.node_subdomain]
     sums = np.zeros((decomposition.num_bodies, 1 + x.shape[1]))
-    np.add.at(sums, body, np.column_stack((np.ones(len(x)), x)))
+    np.add.at(sums, body, shares[:, None] * np.column_stack((np.ones(len(x)), x)))
     dofs.comm.Allreduce(MPI.IN_PLACE, sums, op=MPI.SUM)
     centre = sums[:, 1:] / sums[:, :1]
     length = np.zeros(decomposition.num_bodies)

@@ -38,6 +38,7 @@ class SparseBlock:
         counters: Counts factorisations.
         kplus_type: Kind of the generalised inverse.
         prefix: Prefix of the factors' PETSc options.
+        shares: 1 / number of torn copies of each node, shape ``(n / bs,)``; default 1.
 
     Raises:
         InputError: K is not symmetric, not finite or not positive semidefinite, or the load is
@@ -56,8 +57,10 @@ class SparseBlock:
         counters: Counters,
         kplus_type: str = "regularized",
         prefix: str = "tfeti_sub_",
+        shares: Array | None = None,
     ) -> None:
         self._name, self._x, self._frame = name, x, body_frame
+        self._shares = np.ones(len(x)) if shares is None else shares
         self._counters, self._kplus_type, self._prefix = counters, kplus_type, prefix
         self.trace_dofs = trace_dofs
         self.update(K=K, f=f)
@@ -132,6 +135,15 @@ class SparseBlock:
     def energy(self, u: Array) -> float:
         """uᵀKu."""
         return float(u @ (self._K @ u))
+
+    @property
+    def body_metric(self) -> Array:
+        """Cᵀ W C, shape ``(k, k)``, W the share in each node."""
+        return self.modes.T @ (np.repeat(self._shares, self._bs)[:, None] * self.modes)
+
+    def body_moments(self, u: Array) -> Array:
+        """Cᵀ W u of a displacement on all unknowns, shape ``(k,)``."""
+        return self.modes.T @ (np.repeat(self._shares, self._bs) * u)
 
     @property
     def condensed_load(self) -> Array:
