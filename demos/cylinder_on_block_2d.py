@@ -86,6 +86,8 @@ def run(argv):
     #
     # The axis stays on x = 0 and the block's bottom where it is. Contact alone holds the
     # cylinder in y. The surfaces are 1.5 a²/2R apart at x = 1.2 a: farther ones need no rows.
+    # Here the cylinder has the multipliers; a warning says that the softer block, whose mesh is
+    # the coarser one, would be the better side (--exchange).
     traction = fem.Constant(mesh, (0.0, -P / (2 * R)))
     axis = fem.locate_dofs_topological(V.sub(0), 1, decomposition.facets("axis"))
     bottom = fem.locate_dofs_topological(V, 1, decomposition.facets("bottom"))

@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -22,7 +23,7 @@ import tempfile
 import time
 from collections import Counter
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 BATCH = 100
 START = 60.0  # seconds that a process may take to import and to compile
@@ -48,7 +49,7 @@ def run_batch(names: list[str], ranks: int, limit: float) -> list[dict[str, Any]
 
 def _watch(path: Path, names: list[str], ranks: int, limit: float) -> tuple[str, str] | None:
     """Run a worker; how it ended if before its time."""
-    command = [sys.executable, "-m", "benchmarks.stress.worker", str(path), *names]
+    command = [sys.executable, "-m", "benchmarks.stress.worker", str(path), str(limit), *names]
     if ranks > 1:
         command = ["mpirun", "-n", str(ranks), *command]
     with tempfile.TemporaryFile("w+") as log:
@@ -63,13 +64,21 @@ def _watch(path: Path, names: list[str], ranks: int, limit: float) -> tuple[str,
                     size, since = path.stat().st_size, time.monotonic()
                     allowed = limit if size > 200 else START + limit
                 if time.monotonic() - since > allowed:
-                    return "HANG", f"no answer after {allowed:.0f} s"
+                    _end(process)
+                    return "HANG", f"no answer after {allowed:.0f} s{_standing(log)}"
         finally:
             _end(process)
         if process.returncode == 0:
             return None
         log.seek(0)
         return "DEATH", f"exit status {process.returncode}: {log.read()[-1500:]}"
+
+
+def _standing(log: TextIO) -> str:
+    """The package's own lines, innermost first, of the ranks' last tracebacks."""
+    log.seek(0)
+    places = re.findall(r"tfeti_dolfinx/(\S+\.py)\", line (\d+) in (\w+)", log.read())
+    return "".join(f", {file}:{line} {name}" for file, line, name in places[:8])
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:

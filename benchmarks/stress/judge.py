@@ -31,11 +31,11 @@ def run_scene(scene: Scene, comm: MPI.Intracomm) -> dict[str, Any]:
         if outcome.disagree:
             row |= {"class": "RANKS DISAGREE", "error": outcome.disagree}
         else:
-            row |= _judged(scene, g, outcome)
+            row |= judged(scene, g, outcome)
     return row
 
 
-def _judged(scene: Scene, g: meshes.Grid, outcome: Outcome) -> dict[str, Any]:
+def judged(scene: Scene, g: meshes.Grid, outcome: Outcome) -> dict[str, Any]:
     kind = outcome.error.split(":")[0]
     if outcome.error and kind not in NAMED:
         return {"class": "CRASH"}

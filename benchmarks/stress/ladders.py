@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 from benchmarks.stress.scene import GDIM, Body, Held, Load, Pair, Scene, Wall
 
@@ -39,6 +40,7 @@ def _rungs() -> Iterator[tuple[str, Scene]]:
         ("nu", nearly_incompressible, NU),
         ("nu, loose", nearly_incompressible_loose, NU),
         ("units", in_units, (1e-9, 1e-6, 1e-3, 1e3, 1e6)),
+        ("cradle", cradle, (2.0, 10.0, 100.0, 1000.0)),
         ("beam over far plane", beam_over_far_plane, (1.0, 2.0, 8.0)),
     ]
     for name, rung, values in table:
@@ -163,8 +165,7 @@ def subdomain_jumps(cell: str, jump: float) -> Scene:
 
 
 def subdomain_jumps_pair(cell: str, jump: float) -> Scene:
-    scene = two_bodies(cell, 1.0, 1.0)
-    return Scene(**{**vars(scene), "subdomains": 8, "subdomain_jump": jump})
+    return replace(two_bodies(cell, 1.0, 1.0), subdomains=8, subdomain_jump=jump)
 
 
 def two_bodies(cell: str, lower: float, upper: float) -> Scene:
@@ -249,9 +250,8 @@ def nearly_incompressible(cell: str, nu: float) -> Scene:
 
 
 def nearly_incompressible_loose(cell: str, nu: float) -> Scene:
-    scene = loose_stack(cell, 1.0)
     bodies = tuple(block(cell, float(k), E=1.0, nu=nu) for k in range(3))
-    return Scene(**{**vars(scene), "bodies": bodies})
+    return replace(loose_stack(cell, 1.0), bodies=bodies)
 
 
 def in_units(cell: str, length: float) -> Scene:
@@ -264,10 +264,24 @@ def in_units(cell: str, length: float) -> Scene:
         return Body(low, high, b.cells, b.E * pascal, b.nu)
 
     loads = tuple(Load(p.side, tuple(pascal * v for v in p.value)) for p in scene.loads)
-    return Scene(**{**vars(scene), "bodies": tuple(map(scaled, scene.bodies)), "loads": loads})
+    return replace(scene, bodies=tuple(map(scaled, scene.bodies)), loads=loads)
 
 
 def beam_over_far_plane(cell: str, n: float) -> Scene:
     """A far obstacle below a slender cantilever of n subdomains: nothing touches."""
-    scene = beam(cell, 20.0)
-    return Scene(**{**vars(scene), "walls": (floor(cell, -1.0),), "subdomains": int(n)})
+    return replace(beam(cell, 20.0), walls=(floor(cell, -1.0),), subdomains=int(n))
+
+
+def cradle(cell: str, radius: float) -> Scene:
+    """A block pressed into a shallow bowl that alone holds it against a push from the side."""
+    last = GDIM[cell] - 1
+    depth = (radius**2 - 0.25 * last) ** 0.5
+    centre = (0.5,) * last + (depth,)
+    push = (1e-4 / radius,) + (0.0,) * last
+    return Scene(
+        cell,
+        (block(cell, E=1.0),),
+        held=(Held((0, last, 1), (last,), -1e-3),),
+        loads=(Load((0, -1, 0), push),),
+        walls=(Wall((0, last, 0), "bowl", (centre, (radius,))),),
+    )

@@ -78,7 +78,8 @@ def tag_sides(scene: Scene, mesh: dmesh.Mesh, body_of_cell: np.ndarray) -> dmesh
     mesh.topology.create_connectivity(tdim - 1, tdim)
     facets = dmesh.exterior_facet_indices(mesh.topology)
     links = mesh.topology.connectivity(tdim - 1, tdim)
-    body = body_of_cell[[links.links(f)[0] for f in facets]].astype(int)
+    first = np.array([links.links(f)[0] for f in facets], dtype=int)
+    body = body_of_cell[first]
     middle = dmesh.compute_midpoints(mesh, tdim - 1, facets)[:, :tdim]
     low = np.array([b.low for b in scene.bodies])[body].reshape(-1, tdim)
     high = np.array([b.high for b in scene.bodies])[body].reshape(-1, tdim)
@@ -110,9 +111,8 @@ def cellwise(mesh: dmesh.Mesh, values: np.ndarray) -> fem.Function:
     """Values of the cells as a function."""
     function = fem.Function(fem.functionspace(mesh, ("DG", 0, values.shape[1:])))
     cell_dof = function.function_space.dofmap.list[: len(values), 0]
-    function.x.array.reshape(-1, int(np.prod(values.shape[1:])))[cell_dof] = values.reshape(
-        len(values), -1
-    )
+    width = int(np.prod(values.shape[1:]))
+    function.x.array.reshape(-1, width)[cell_dof] = values.reshape(len(values), width)
     return function
 
 

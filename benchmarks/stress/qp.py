@@ -103,7 +103,8 @@ def settle(
         noise = ROUNDING * max(np.abs(lam).max(initial=0.0), 1e-12 * size)
         wrong = (active & (lam < -noise)) | (~active & (s < -noise))
         if not wrong.any():
-            if r and balance > 1e-8 * max(np.abs(e).max(initial=0.0), np.abs(lam).max(initial=0.0)):
+            largest = max(np.abs(e).max(initial=0.0), np.abs(lam).max(initial=0.0))
+            if balance > 1e-8 * max(largest, 1e-12 * size):
                 raise UnsettledError(f"Gλ = e is off by {balance:.1e}")
             return lam, alpha
         if active.tobytes() in seen:  # a cycle: one at a time

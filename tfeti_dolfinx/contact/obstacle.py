@@ -97,8 +97,8 @@ class Obstacle:
         dofs: TornDofs,
         decomposition: Decomposition,
         contact: int,
-        reach: float,
-        depth: float,
+        reach: float = np.inf,
+        depth: float = np.inf,
     ) -> ContactRecords:
         """One condition per vertex of the surface, from its present distance. Collective.
 
