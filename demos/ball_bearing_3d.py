@@ -115,8 +115,8 @@ def run(argv):
     #
     # A ball's whole sphere faces both grooves; only what is near gets conditions.
     contacts = [
-        tfeti.Contact(f"ball {i + 1}", groove, search_radius=0.006 * bearing.ball)
-        for i in range(bearing.balls)
+        tfeti.Contact(ball, groove, secondary=ball, reach=0.006 * bearing.ball)
+        for ball in (f"ball {i + 1}" for i in range(bearing.balls))
         for groove in ("inner groove", "outer groove")
     ]
     problem = tfeti.ContactProblem(

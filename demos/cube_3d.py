@@ -75,7 +75,7 @@ def run(argv):
 
     # ## Load, conditions, obstacle
     #
-    # The obstacle lies below z = 0, by 0.02 and more.
+    # The obstacle lies below z = 0, by 0.02 and more. Every node of the side gets its row.
     traction = fem.Constant(mesh, (0.0, 0.0, -0.05))
     fixed = fem.locate_dofs_topological(V, 2, decomposition.facets("fixed"))
     obstacle = tfeti.SignedDistance(
@@ -86,7 +86,7 @@ def run(argv):
         ufl.inner(stress(u), strain(v)) * dx,
         ufl.dot(traction, v) * ds(decomposition.surface("top")),
         [fem.dirichletbc(np.zeros(3), fixed, V)],
-        [tfeti.Obstacle("bottom", obstacle)],
+        [tfeti.Obstacle("bottom", obstacle, reach=np.inf)],
         decomposition,
         stress=stress,
         petsc_options=demo.petsc_options,

@@ -76,7 +76,7 @@ def run(argv):
         dofs = fem.locate_dofs_topological(V.sub(axis), 2, decomposition.facets(cut))
         bcs.append(fem.dirichletbc(0.0, dofs, V.sub(axis)))
     sides = ("cap", "top") if arguments.exchange else ("top", "cap")
-    contacts = [tfeti.Contact(*sides, search_radius=a**2 / R)]
+    contacts = [tfeti.Contact(*sides, secondary=sides[0], reach=a**2 / R)]
     problem = tfeti.ContactProblem(
         ufl.inner(stress(u), strain(v)) * dx,
         ufl.dot(traction, v) * load,

@@ -71,7 +71,7 @@ def run(argv):
     pressure = 0.02 * x[0] * (2 - x[0])
     base = fem.locate_dofs_topological(V, 2, decomposition.facets("base bottom"))
     top = ds(decomposition.surface("beam top"))
-    contacts = [tfeti.Contact(*pair, search_radius=0.05) for pair in PAIRS]
+    contacts = [tfeti.Contact(*pair, secondary=pair[0], reach=0.05) for pair in PAIRS]
     problem = tfeti.ContactProblem(
         ufl.inner(stress(u), strain(v)) * dx,
         ufl.dot(weight, v) * dx - pressure * v[2] * top,

@@ -126,7 +126,7 @@ def run(argv):
         ufl.inner(stress(u), strain(v)) * dx,
         ufl.dot(traction, v) * ds(decomposition.surface("upper top")),
         [fem.dirichletbc(np.zeros(2), fixed, V), fem.dirichletbc(0.0, guided, V.sub(0))],
-        [tfeti.Contact("upper bottom", "lower top", search_radius=a / 3)],
+        [tfeti.Contact("upper bottom", "lower top", secondary="upper bottom", reach=a / 3)],
         decomposition,
         stress=stress,
         petsc_options=demo.petsc_options,

@@ -8,6 +8,7 @@ from mpi4py import MPI
 from scenes import hooke, strain
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.contact.search import ContactSearch
 
 
 def boxes(cell, parts, comm=MPI.COMM_WORLD):
@@ -123,6 +124,17 @@ def pressed(d, pressure=0.1, on="upper top"):
         return ufl.dot(fem.Constant(d.mesh, up), v) * ds(d.surface(on))
 
     return load
+
+
+def sided(secondary, primary, **changes):
+    """A pair whose secondary side is the first."""
+    return tfeti.Contact(secondary, primary, secondary=secondary, **changes)
+
+
+def searched(contacts, dofs, d):
+    """The conditions of contacts, as if all elements were equally stiff."""
+    stiffness = np.ones(dofs.num_nodes * dofs.bs)
+    return ContactSearch(contacts, dofs, d, stiffness).records
 
 
 def held(d, *sides):

@@ -1,5 +1,6 @@
 """Tests run serially and under mpirun; every test runs on all ranks."""
 
+import faulthandler
 import gc
 import os
 
@@ -12,6 +13,29 @@ from mpi4py import MPI
 
 settings.register_profile("ranks", derandomize=True, deadline=None, database=None)
 settings.load_profile("ranks")
+
+LATER = 1.1  # pytest-timeout, which names the test, comes first where it can
+STDERR = pytest.StashKey[int]()
+
+
+def pytest_configure(config):
+    config.stash[STDERR] = os.dup(2)  # pytest captures it later
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_protocol(item):
+    """End a test that hangs on all ranks: mpirun ends them when one of them exits.
+
+    A rank that waits for others inside DOLFINx or PETSc holds Python's lock, and pytest-timeout's
+    timer is a thread that needs it. This timer is written in C.
+    """
+    config = item.config
+    seconds = float(config.getoption("timeout") or config.getini("timeout"))
+    faulthandler.dump_traceback_later(LATER * seconds, exit=True, file=config.stash[STDERR])
+    try:
+        return (yield)
+    finally:
+        faulthandler.cancel_dump_traceback_later()
 
 
 @pytest.fixture(scope="session")

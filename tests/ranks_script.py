@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import ufl
-from bodies import held, stacked, two_body_problem
+from bodies import held, sided, stacked, two_body_problem
 from mpi4py import MPI
 from scenes import curved_obstacle, decomposed, displacement, problem
 
@@ -31,7 +31,7 @@ def pair_scene(cell, subdomains, **options):
 
     sides = ["lower bottom", "lower left", "upper left", "upper right"]
     sides += ["lower front", "upper front"] if gdim == 3 else []
-    pair = tfeti.Contact("upper bottom", "lower top")
+    pair = sided("upper bottom", "lower top")
     return two_body_problem(d, load, held(d, *sides), [pair], **options)
 
 

@@ -57,13 +57,15 @@ class UntornElasticity:
 def primal_active_set(K, f, N, gap):
     """min ½uᵀKu − fᵀu, N u ≤ gap: primal-dual active set with direct solves of the KKT system."""
     active = np.zeros(len(gap), dtype=bool)
+    # a row that touches without a force is left out, else rounding would flip it for ever
+    touching = 1e-12 * np.abs(f).sum()
     for _ in range(100):
         A = N[active]
         KKT = bmat([[K, A.T], [A, None]], format="csc") if active.any() else K.tocsc()
         solution = spsolve(KKT, np.concatenate((f, gap[active])))
         u, lam = solution[: len(f)], np.zeros(len(gap))
         lam[active] = solution[len(f) :]
-        new = lam + (N @ u - gap) * K.diagonal().max() > 0.0
+        new = lam + (N @ u - gap) * K.diagonal().max() > touching
         if np.array_equal(new, active):
             return u, lam
         active = new

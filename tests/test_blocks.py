@@ -5,11 +5,14 @@ import pytest
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
-from scenes import decomposed, hooke, strain
+from petsc4py import PETSc
+from scenes import clamp, decomposed, forms, hooke, problem, strain
 from scipy.sparse import csr_array, diags_array
 
+import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.compat import assemble_csr
-from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.errors import ConformanceError, FactorError, InputError
+from tfeti_dolfinx.subdomains import factor, sparse_block
 from tfeti_dolfinx.subdomains.block import check_block
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 from tfeti_dolfinx.subdomains.kernel import candidate_modes, fixing_nodes, kernel_of
@@ -171,9 +174,111 @@ def test_a_negative_stiffness_is_named():
         block(csr_array(-K), x)
 
 
-def test_cholesky_says_when_there_is_no_factor():
-    A = csr_array(np.array([[1.0, 0.0], [0.0, 0.0]]))
-    with pytest.raises(NotPositiveDefiniteError):
-        CholeskyFactor(A)
-    factor = CholeskyFactor(csr_array(np.diag([2.0, 4.0])))
-    assert np.allclose(factor.solve(np.ones(2)), [0.5, 0.25])
+@pytest.fixture(params=factor.SOLVERS)
+def solver(request, monkeypatch):
+    """PETSc as if it had this solver and those that come after it, but not those before."""
+    missing = factor.SOLVERS[: factor.SOLVERS.index(request.param)]
+    has_solver = factor.has_solver
+    monkeypatch.setattr(factor, "has_solver", lambda s: s not in missing and has_solver(s))
+    for cached in (factor.default_solver, factor._say):
+        cached.cache_clear()
+    if not factor.has_solver(request.param):
+        pytest.skip(f"this PETSc has no {request.param}")
+    yield request.param
+    for cached in (factor.default_solver, factor._say):
+        cached.cache_clear()
+
+
+NO_FACTOR = {
+    "singular": [[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+    "indefinite": [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+    "negative": [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]],
+}
+
+
+@pytest.mark.parametrize("kind", list(NO_FACTOR))
+def test_cholesky_says_when_there_is_no_factor(solver, kind):
+    """Also where the solver would make one: LDLᵀ takes pivots of any sign."""
+    with pytest.raises(NotPositiveDefiniteError, match=f"not positive definite.*{solver}"):
+        CholeskyFactor(csr_array(np.array(NO_FACTOR[kind])))
+
+
+def test_every_solver_factors(solver):
+    K, _ = stiffness("tetrahedron", 2, mass=1.0)
+    found = CholeskyFactor(K)
+    b = np.random.default_rng(0).standard_normal(K.shape[0])
+    assert np.allclose(K @ found.solve(b), b, atol=1e-9)
+    found.destroy()
+
+
+def test_what_stands_in_for_cholmod_is_said_once(solver, caplog):
+    d = decomposed("quadrilateral", 3, 2)
+    for _ in range(2):
+        problem(d, (0.0, -0.05)).solve()
+    said = [r.getMessage() for r in caplog.records if "built without CHOLMOD" in r.getMessage()]
+    assert len(said) == (solver != "cholmod" and d.comm.rank == 0)
+
+
+def test_a_solver_that_is_missing_is_named(comm):
+    name = "tfeti_sub_pc_factor_mat_solver_type"
+    p = problem(decomposed("quadrilateral", 3, 2), (0.0, -0.05), **{name: "nosuch"})
+    with pytest.raises(FactorError, match=r"subdomain 0: .* factors by nosuch; expected one of"):
+        p.solve()
+    assert not PETSc.Options().hasName(name)
+
+
+def test_factors_heed_options_with_their_prefix(monkeypatch):
+    made = []
+    cholesky = factor._factored
+
+    def factored(pc, matrix, prefix):
+        found = cholesky(pc, matrix, prefix)
+        made.append((prefix, pc.getFactorSolverType()))
+        return found
+
+    monkeypatch.setattr(factor, "_factored", factored)
+    options = {"my_sub_pc_factor_mat_solver_type": "petsc"}
+    d = decomposed("quadrilateral", 3, 1, comm=MPI.COMM_SELF)
+    V, a, L = forms(d.mesh, d.facet_tags, (0.0, -0.05), d.surface("top"))
+    bcs = [clamp(V, d.facets("left"))]
+    arguments = dict(petsc_options=options, petsc_options_prefix="my_")
+    tfeti.ContactProblem(a, L, bcs, [], d, **arguments).solve()
+    assert set(made) == {("my_sub_", "petsc"), ("my_coarse_", factor.default_solver())}
+
+
+def test_a_factor_without_memory_is_named():
+    class NoMemory(PETSc.Error):
+        ierr = factor.OUT_OF_MEMORY
+
+    A = csr_array(np.eye(3))
+    cause = factor._cause(NoMemory(factor.OUT_OF_MEMORY), "cholmod", A)
+    assert "out of memory: cholmod had none for the factor of 3 unknowns with 3" in str(cause)
+
+
+def test_a_factor_that_only_the_preconditioner_needs_fails_on_all_ranks(monkeypatch):
+    """K_ii is made where all ranks can raise together, not within a multiplication."""
+    d = decomposed("quadrilateral", 4, 4)
+    unlucky = d.comm.allreduce(int(d.subdomains.min(initial=99)), op=MPI.MAX)
+    regularised = sparse_block.regularised
+
+    def fails(K, R, fixing_dofs, prefix):
+        if unlucky in d.subdomains:
+            raise FactorError("out of memory")
+        return regularised(K, R, fixing_dofs, prefix)
+
+    monkeypatch.setattr(sparse_block, "regularised", fails)
+    p = problem(d, (0.0, -0.05), tfeti_pc_type="dirichlet")
+    with pytest.raises(FactorError, match=r"subdomain \d: .*dirichlet preconditioner: out of mem"):
+        p.solve()
+
+
+def test_an_implementation_that_breaks_its_promises_is_named():
+    K, x = stiffness("quadrilateral", 2)
+    b = block(K, x)
+    with pytest.raises(ConformanceError, match="this does not hold: apply_stiffness is K_bb"):
+        b.apply_stiffness = lambda w: 2 * w
+        check_block(b, K)
+    del b.apply_stiffness
+    with pytest.raises(ConformanceError, match="this does not hold: K⁺ is symmetric"):
+        b.apply_pinv = lambda w: np.roll(w, 1)
+        check_block(b, K)

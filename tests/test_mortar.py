@@ -3,18 +3,27 @@
 import numpy as np
 import pytest
 import ufl
-from bodies import boxes, gathered, held, jagged, pressed, stacked, two_body_problem
+from bodies import (
+    boxes,
+    gathered,
+    held,
+    jagged,
+    pressed,
+    searched,
+    sided,
+    stacked,
+    two_body_problem,
+)
 from dolfinx import fem
 from mortar_reference import TwoBoxes
 from mpi4py import MPI
 from scenes import clamp, displacement, relative
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
-PAIR = tfeti.Contact("upper bottom", "lower top")
+PAIR = sided("upper bottom", "lower top")
 
 
 def total(values):
@@ -47,7 +56,7 @@ def test_matching_meshes_give_node_to_node_rows(cell):
     d = stacked(cell, 3, 3, 4)
     V = fem.functionspace(d.mesh, ("Lagrange", 1, (d.mesh.geometry.dim,)))
     dofs = TornDofs(V, d)
-    records = ContactSearch([PAIR], dofs, d).records
+    records = searched([PAIR], dofs, d)
     order = np.argsort(records.row, kind="stable")
     assert np.array_equal(records.row[order], np.repeat(np.arange(len(records)), 2))
     pairs = records.coefficients[order].reshape(-1, 2, d.mesh.geometry.dim)
@@ -124,10 +133,10 @@ def test_independent_active_set(cell, n):
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_pairs_out_of_reach_join_when_they_overlap(cell):
     near = lever(
-        cell, gap=0.001, rtol=1e-10, pc_type="none", contact=tfeti.Contact(*PAIR.surfaces, 0.01)
+        cell, gap=0.001, rtol=1e-10, pc_type="none", contact=sided(*PAIR.surfaces, reach=0.01)
     )
     late = lever(
-        cell, gap=0.001, rtol=1e-10, pc_type="none", contact=tfeti.Contact(*PAIR.surfaces, 1e-4)
+        cell, gap=0.001, rtol=1e-10, pc_type="none", contact=sided(*PAIR.surfaces, reach=1e-4)
     )
     near.solve()
     late.solve()
@@ -175,7 +184,7 @@ def three(cell="quadrilateral"):
 def test_a_surface_in_two_pairs(cell, upper_is_secondary):
     d = three(cell)
     pairs = [("upper bottom", "left top"), ("upper bottom", "right top")]
-    contacts = [tfeti.Contact(*(p if upper_is_secondary else p[::-1])) for p in pairs]
+    contacts = [sided(*(p if upper_is_secondary else p[::-1])) for p in pairs]
     bcs = held(d, "left bottom", "left left", "right bottom", "right left", "upper left")
     problem = two_body_problem(d, pressed(d), bcs, contacts, rtol=1e-11)
     problem.solve()
@@ -224,23 +233,36 @@ def dense(matrix):
 
 
 @pytest.mark.parametrize(
-    ("contact", "message"),
+    ("sides", "changes", "message"),
     [
-        (("upper bottom", "upper bottom"), "both are the same surface"),
-        (("upper bottom", "lid"), r"contact of 'upper bottom' with 'lid': no surface 'lid'"),
+        (("upper bottom", "upper bottom"), {}, "both are the same surface"),
+        (("upper bottom", "lid"), {}, r"contact of 'upper bottom' with 'lid': no surface 'lid'"),
         (
             ("upper bottom", "nothing"),
+            {},
             "contact of 'upper bottom' with 'nothing': surface 'nothing' has no facets",
         ),
-        (("upper bottom", "lower top", -1.0), "search_radius=-1.0, expected a positive length"),
-        (("upper bottom", "lower top", float("nan")), "search_radius=nan, expected a positive"),
-        (("upper bottom", "lower bottom", 2.0), "face away from each other"),
+        (("upper bottom", "lower top"), {"reach": -1.0}, "reach=-1.0, expected a positive length"),
+        (("upper bottom", "lower top"), {"reach": float("nan")}, "reach=nan, expected a positive"),
+        (("upper bottom", "lower top"), {"reach": "far"}, "reach='far', expected a positive"),
+        (("upper bottom", "lower bottom"), {"reach": 2.0}, "face away from each other"),
+        (
+            ("upper bottom", "lower top"),
+            {"secondary": "lower bottom"},
+            "contact of .* with .*: secondary='lower bottom', expected one of its surfaces",
+        ),
+        (("upper bottom", "lower top"), {"secondary": "lid"}, "secondary='lid', expected one of"),
+        (("upper bottom", "lower top"), {"secondary": None}, "secondary=None, expected one of"),
+        (("upper bottom", "lower top"), {"gap": "none"}, "of 'upper bottom' .*: gap='none', exp"),
+        (("upper bottom", "lower top"), {"gap": np.inf}, "gap=inf, expected"),
+        (("upper bottom", "lower top"), {"gap": lambda x: x[:1]}, "gap, a function, did not give"),
+        (("upper bottom", "lower top"), {"gap": lambda x: x[0] * np.nan}, "gap is .* at the point"),
     ],
 )
-def test_bad_pairs(contact, message):
+def test_bad_pairs(sides, changes, message):
     mesh, tags, names = boxes("quadrilateral", BOXES)
     d = tfeti.decompose(mesh, 4, facet_tags=tags, surfaces={**names, "nothing": 99})
-    check_message(d, tfeti.Contact(*contact), message)
+    check_message(d, tfeti.Contact(*sides, **changes), message)
 
 
 BOXES = [
@@ -258,7 +280,7 @@ def check_message(d, contact, message):
 
 def test_surfaces_that_overlap_too_deep():
     d = stacked("quadrilateral", 3, 4, 4, gap=-0.1)
-    message = r"contact of .* with .*: the surfaces overlap by up to 0\.1, more than the search"
+    message = r"contact of .* with .*: the surfaces overlap by up to 0\.1, more than the reach"
     check_message(d, PAIR, message)
 
 

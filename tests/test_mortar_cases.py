@@ -7,17 +7,25 @@ import gmsh
 import numpy as np
 import pytest
 import ufl
-from bodies import boxes, gathered, held, pressed, stacked, two_body_problem
+from bodies import (
+    boxes,
+    gathered,
+    held,
+    pressed,
+    searched,
+    sided,
+    stacked,
+    two_body_problem,
+)
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
 from scenes import box, clamp, decomposed, problem
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
-PAIR = tfeti.Contact("upper bottom", "lower top")
+PAIR = sided("upper bottom", "lower top")
 
 
 def decomposed_boxes(parts, subdomains=4, groups=(), cell="quadrilateral"):
@@ -47,7 +55,7 @@ def test_only_the_first_of_two_layers_is_met(apart, radius):
     ]
     d = decomposed_boxes(parts, 6, [("tops", ["base top", "lower top"])])
     sides = ["base bottom", "base left", "lower left", "lower bottom", "upper left"]
-    contact = tfeti.Contact("upper bottom", "tops", radius)
+    contact = sided("upper bottom", "tops", reach=radius)
     p = two_body_problem(d, pressed(d), held(d, *sides), [contact], rtol=1e-12)
     p.solve()
     assert np.allclose(gathered(p.solution.contact().pressure), 0.1, rtol=0, atol=1e-9)
@@ -65,8 +73,7 @@ def test_thin_plates_are_not_met_from_behind(thickness, radius):
     ]
     d = decomposed_boxes(parts, 4, groups)
     dofs = TornDofs(fem.functionspace(d.mesh, ("Lagrange", 1, (2,))), d)
-    search = ContactSearch([tfeti.Contact("upper faces", "lower faces", radius)], dofs, d)
-    records = search.records
+    records = searched([sided("upper faces", "lower faces", reach=radius)], dofs, d)
     assert MPI.COMM_WORLD.allreduce(len(records)) == 9
     assert np.allclose(records.gap, 0.0, atol=1e-14)
     assert np.isclose(MPI.COMM_WORLD.allreduce(records.area.sum()), 1.0)
@@ -122,12 +129,12 @@ def no_load(v, ds):
 
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("sides", [("arc", "top"), ("top", "arc")])
-def test_the_search_radius_does_not_change_the_answer(comm, order, sides):
+def test_the_reach_does_not_change_the_answer(comm, order, sides):
     """Facets as large as the contact zone, and a load by displacement alone."""
     forces = []
     for radius in (None, 0.1, 0.01, 1e-3):
         d, bcs = disc_on_block(comm, 24, order)
-        contact = tfeti.Contact(*sides, radius)
+        contact = sided(*sides, reach=radius)
         p = two_body_problem(d, no_load, bcs, [contact], rtol=1e-10)
         p.solve()
         assert p.report.residuals["penetration"] <= p.report.tolerances["penetration"]
@@ -137,17 +144,20 @@ def test_the_search_radius_does_not_change_the_answer(comm, order, sides):
 
 
 def test_facets_of_second_order_touch_without_overlap(comm):
-    """The chord and the arc touch the block at the same vertex: no initial overlap, same force."""
+    """The chord and the arc touch the block at the same vertex: no initial overlap.
+
+    The arc lies outside of the chord: a little more force.
+    """
     forces = []
     for order in (1, 2):
         d, bcs = disc_on_block(comm, 24, order)
-        p = two_body_problem(d, no_load, bcs, [tfeti.Contact("arc", "top")], rtol=1e-10)
+        p = two_body_problem(d, no_load, bcs, [sided("arc", "top")], rtol=1e-10)
         p.solve()
         dofs = p.dofs
-        records = ContactSearch(p.contacts, dofs, d).records
+        records = searched(p.contacts, dofs, d)
         assert records.gap.min(initial=0.0) > -1e-12
         forces.append(np.abs(p.solution.body_forces.force[:, 1]).max())
-    assert np.isclose(*forces, rtol=0.02)
+    assert np.isclose(*forces, rtol=0.03)
 
 
 @pytest.mark.parametrize("contacts", [[], [PAIR]])
@@ -193,7 +203,7 @@ def test_pressure_at_a_node_of_two_pairs():
     ]
     d = decomposed_boxes(parts, 6)
     sides = ["one bottom", "one left", "two bottom", "two right", "upper left"]
-    pairs = [tfeti.Contact("upper bottom", f"{name} top") for name in ("one", "two")]
+    pairs = [sided("upper bottom", f"{name} top") for name in ("one", "two")]
     p = two_body_problem(d, pressed(d), held(d, *sides), pairs, rtol=1e-12)
     p.solve()
     _, dof = p.dofs.scalar
@@ -205,7 +215,7 @@ def test_edges_are_warned_of(caplog):
     parts = [("lower", (0.0, -1.0), (1.0, 0.0), (3, 3)), ("upper", (0.0, 0.0), (1.0, 1.0), (4, 4))]
     d = decomposed_boxes(parts, 4, [("corner", ["upper bottom", "upper right"])])
     bcs = held(d, "lower bottom", "lower left", "upper left")
-    p = two_body_problem(d, pressed(d), bcs, [tfeti.Contact("corner", "lower top")])
+    p = two_body_problem(d, pressed(d), bcs, [sided("corner", "lower top")])
     p.solve()
     assert ("'corner' has edges" in caplog.text) == (d.comm.rank == 0)
 
@@ -226,9 +236,7 @@ def test_contacts_that_are_none():
         tfeti.ContactProblem(*forms_of(d), PAIR, d)
     with pytest.raises(tfeti.InputError, match="expected obstacles and pairs, got 'lower top'"):
         tfeti.ContactProblem(*forms_of(d), ["lower top"], d)
-    twice = tfeti.ContactProblem(
-        *forms_of(d), [PAIR, tfeti.Contact("lower top", "upper bottom")], d
-    )
+    twice = tfeti.ContactProblem(*forms_of(d), [PAIR, sided("lower top", "upper bottom")], d)
     with pytest.raises(tfeti.InputError, match="the pair of .* is there twice"):
         twice.solve()
 

@@ -10,7 +10,7 @@ from petsc4py import PETSc
 from scenes import decomposed, problem
 
 from tfeti_dolfinx import InputError, Options
-from tfeti_dolfinx.options import options_table, parse_options
+from tfeti_dolfinx.options import factor_options, options_table, parse_options
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -68,20 +68,25 @@ def test_the_document_has_the_table():
     assert options_table() in (ROOT / "docs/options.md").read_text()
 
 
+def test_options_of_factors_are_let_through_and_no_others():
+    name, value = "coarse_mat_mumps_icntl_14", 40
+    given = {f"tfeti_{name}": value, "rtol": 1e-3}
+    assert parse_options(given, "tfeti_").rtol == 1e-3
+    assert factor_options(given, "tfeti_") == {name: value}
+    for wrong in ("sub_pc_type", "coarse_ksp_type", "sub_pc_factor_", "mat_type"):
+        with pytest.raises(InputError, match=f"unknown option -tfeti_{wrong};"):
+            parse_options({f"tfeti_{wrong}": "lu"}, "tfeti_")
+
+
 def test_monitor_and_view_and_reason_print(capsys):
     d = decomposed("hexahedron", 2, 2)
     p = problem(d, tfeti_monitor=True, tfeti_converged_reason=True, tfeti_view=True)
     p.solve()
     out = capsys.readouterr().out
-    if d.comm.rank:
-        assert out == ""
-        return
-    assert "|gP|" in out
-    assert "|Qx|" in out
-    assert "multiplications" in out
-    assert "TFETI solve CONVERGED_RTOL after" in out
-    assert "-tfeti_rtol 1e-06" in out
-    assert "primal_dofs" in out
+    words = ["|gP|", "|Qx|", "multiplications", "TFETI solve CONVERGED_RTOL after"]
+    words += ["-tfeti_rtol 1e-06", "primal_dofs"]
+    assert [word in out for word in words] == [d.comm.rank == 0] * len(words)
+    assert (out == "") == (d.comm.rank != 0)
 
 
 def test_the_command_line_of_a_program(serial_only):

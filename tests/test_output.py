@@ -108,6 +108,31 @@ def test_names_that_do_not_fit(solution):
         write_xdmf("x.bp", solution)
 
 
+def test_files_that_cannot_be_written_are_named_on_all_ranks(solution, comm, shared_tmp):
+    if comm.rank == 0:
+        (shared_tmp / "file").write_text("")
+    comm.barrier()
+    folder = shared_tmp / "file"
+    for name, write in {
+        "out.bp": lambda path: write_vtx(path, solution),
+        "out.xdmf": lambda path: write_xdmf(path, solution),
+        "deformed.png": lambda path: plot_deformed(path, solution),
+        "pressure.png": lambda path: plot_pressure(path, solution, lambda x: x[:, 0]),
+    }.items():
+        with pytest.raises(InputError, match=f"cannot write {folder}"):
+            write(folder / name)
+
+
+def test_a_coordinate_that_one_rank_cannot_compute(solution, comm, shared_tmp):
+    def coordinate(x):
+        if comm.rank == comm.size - 1:
+            raise LookupError("no such coordinate")
+        return x[:, 0]
+
+    with pytest.raises(LookupError, match="no such coordinate"):
+        plot_pressure(shared_tmp / "pressure.png", solution, coordinate)
+
+
 def test_pictures(solution, comm, shared_tmp):
     name = f"{solution.dofs.bs}.png"
     files = [

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from bodies import boxes, gathered, held, jagged, pressed, stacked, two_body_problem
+from bodies import boxes, gathered, held, jagged, pressed, sided, stacked, two_body_problem
 from dolfinx import fem
 from mpi4py import MPI
 
@@ -53,7 +53,7 @@ def test_uniform_pressure_and_linear_displacement(cell, subdomains, order, degre
         d,
         pressed(d, PRESSURE),
         held(d, *sides_of(cell)),
-        [tfeti.Contact(*order)],
+        [sided(*order)],
         degree,
         rtol=1e-12,
     )
@@ -108,7 +108,7 @@ def test_overhanging_secondary_side(cell, subdomains, share):
 
     sides = sides_of(cell)
     problem = two_body_problem(
-        d, load, held(d, *sides), [tfeti.Contact("upper bottom", "lower top")], rtol=1e-12
+        d, load, held(d, *sides), [sided("upper bottom", "lower top")], rtol=1e-12
     )
     problem.solve()
     assert np.allclose(pressures(problem), PRESSURE, rtol=0, atol=1e-9)
@@ -121,7 +121,7 @@ def test_force_and_moment_balance(cell, order):
     d = stacked(cell, 3, 4, jagged, upper=(0.3, 1.4))
     sides = ["lower bottom", "lower left", "upper left", "upper top"]
     problem = two_body_problem(
-        d, pressed(d, 0.1, "upper right"), held(d, *sides), [tfeti.Contact(*order)], rtol=1e-12
+        d, pressed(d, 0.1, "upper right"), held(d, *sides), [sided(*order)], rtol=1e-12
     )
     problem.solve()
     forces = problem.solution.body_forces
@@ -138,7 +138,7 @@ def test_hardly_covered_facets_cost_nothing(cell):
         d = stacked(cell, 3, 4, 4, upper=(0.0, 4 / (3 + share)))
         sides = [*sides_of(cell), "upper right"]
         problem = two_body_problem(
-            d, pressed(d), held(d, *sides), [tfeti.Contact("upper bottom", "lower top")]
+            d, pressed(d), held(d, *sides), [sided("upper bottom", "lower top")]
         )
         problem.solve()
         taken.append(problem.report.F_multiplications)

@@ -13,7 +13,7 @@ from tfeti_dolfinx import Report
 @pytest.fixture(scope="module")
 def report():
     d = decomposed("hexahedron", 6, 8)
-    p = problem(d, contacts=[tfeti.Obstacle("bottom", curved_obstacle(3))])
+    p = problem(d, contacts=[tfeti.Obstacle("bottom", curved_obstacle(3), reach=0.1)])
     p.solve()
     return p.report
 
@@ -61,6 +61,18 @@ def test_json_has_every_field(report, comm, shared_tmp):
     assert data["contact_rows"] == report.contact_rows
     comm.barrier()
     assert [p.name for p in path.parent.iterdir()] == ["report.json"]
+
+
+def test_a_report_that_cannot_be_written_is_named_on_all_ranks(report, comm, shared_tmp):
+    if comm.rank == 0:
+        (shared_tmp / "file").write_text("")
+        (shared_tmp / "folder").mkdir()
+    comm.barrier()
+    for path in (shared_tmp / "file" / "report.json", shared_tmp / "folder"):
+        with pytest.raises(tfeti.InputError, match=f"cannot write {path}"):
+            report.write(path, comm)
+    comm.barrier()
+    assert not list(shared_tmp.glob(".*"))
 
 
 def test_text_has_every_field(report):

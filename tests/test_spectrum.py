@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 import ufl
-from bodies import held, pressed, stacked, two_body_problem
+from bodies import held, pressed, sided, stacked, two_body_problem
 from dolfinx import fem
 from mpi4py import MPI
 from scenes import decomposed, hooke, problem
@@ -35,7 +35,7 @@ def stacked_problem(cell, n, subdomains, scaling, pair=UP, stiffness=1.0, **opti
         d,
         pressed(d),
         held(d, *sides),
-        [tfeti.Contact(*pair)],
+        [sided(*pair)],
         stress=hooke(ufl.conditional(ufl.gt(height, 0.0), stiffness, 1.0)),
         scaling=scaling,
         **options,

@@ -3,7 +3,13 @@
 from tfeti_dolfinx.contact.obstacle import Obstacle
 from tfeti_dolfinx.contact.pair import Contact
 from tfeti_dolfinx.contact.shapes import Cylinder, Plane, SignedDistance, Sphere
-from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
+from tfeti_dolfinx.errors import (
+    ConvergenceError,
+    FactorError,
+    InputError,
+    NoSolutionError,
+    TfetiError,
+)
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dolfinx_input import decompose
 from tfeti_dolfinx.mesh.gmsh_input import read_gmsh
@@ -20,6 +26,7 @@ __all__ = [
     "ConvergenceError",
     "Cylinder",
     "Decomposition",
+    "FactorError",
     "InputError",
     "NoSolutionError",
     "Obstacle",

@@ -103,7 +103,8 @@ def interpolation_points(V: fem.FunctionSpace) -> Array:
 def first_component(V: fem.FunctionSpace) -> tuple[fem.FunctionSpace, Array]:
     """Space of the first component of a blocked space, and the dof of ``V`` of each of its dofs."""
     S, parent = V.sub(0).collapse()
-    return S, np.ravel(parent)  # 0.11 wraps the map in a list
+    # 0.11 wraps the map in a list; without cells it is empty, and numpy's type would be float
+    return S, np.ravel(parent).astype(np.int64)
 
 
 def assemble_csr(form: fem.Form) -> Any:

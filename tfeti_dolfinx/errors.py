@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -24,12 +25,27 @@ class ConvergenceError(TfetiError, RuntimeError):
     """A solver stopped before it reached its tolerance."""
 
 
+class FactorError(TfetiError, RuntimeError):
+    """A matrix could not be factored; the message says why."""
+
+
+class ConformanceError(TfetiError, AssertionError):
+    """An implementation does not do what its interface promises; the message says what."""
+
+
+def require(holds: object, promise: str) -> None:
+    """Raise a ConformanceError unless a promise holds; ``assert`` would go with ``python -O``."""
+    if not holds:
+        raise ConformanceError(f"this does not hold: {promise}")
+
+
 @contextmanager
 def raised_on_all_ranks(comm: MPI.Intracomm) -> Iterator[None]:
     """Let an exception of any rank inside the block be raised on all ranks at its end.
 
     Collective. The block itself must not communicate after a point where a rank may raise.
-    The exception of the lowest rank that has one is raised everywhere.
+    The exception of the lowest rank that has one is raised everywhere, of the same type: one that
+    cannot travel is a TfetiError that names it, on its own rank too.
 
     Args:
         comm: The communicator whose ranks all enter the block.
@@ -42,14 +58,20 @@ def raised_on_all_ranks(comm: MPI.Intracomm) -> Iterator[None]:
     raiser = comm.allreduce(comm.size if error is None else comm.rank, op=MPI.MIN)
     if raiser == comm.size:
         return
-    shared = comm.bcast(_portable(error) if comm.rank == raiser else None, root=raiser)
-    if comm.rank == raiser and error is not None:
+    if comm.rank != raiser or error is None:
+        raise comm.bcast(None, root=raiser)
+    portable = comm.bcast(_portable(error), root=raiser)
+    if type(portable) is type(error):
         raise error
-    raise shared
+    raise portable from error
 
 
-def _portable(error: Exception | None) -> Exception:
-    """The error itself if other ranks can rebuild it from its message, else a TfetiError."""
-    if isinstance(error, TfetiError):
-        return type(error)(str(error))
+def _portable(error: Exception) -> Exception:
+    """The error itself if other ranks can rebuild it, else a TfetiError that names it."""
+    try:
+        rebuilt = pickle.loads(pickle.dumps(error))
+    except Exception:  # whatever the error's own methods raise
+        rebuilt = None
+    if type(rebuilt) is type(error) and str(rebuilt) == str(error):
+        return error
     return TfetiError(f"{type(error).__name__}: {error}")

@@ -20,6 +20,8 @@ from tfeti_dolfinx.qp.smalse import SmalseParameters
 from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES
 
 _SMALSE = SmalseParameters()
+# what the factors of the subdomains and of the coarse problem read from PETSc's options
+FACTOR_OPTION = re.compile(r"(sub|coarse)_(pc_factor|mat)_\w+")
 
 
 FROM_0 = Range("0 or more", lambda value: value >= 0.0)
@@ -146,15 +148,23 @@ def parse_options(given: Mapping[str, Any] | None, prefix: str) -> Options:
     named |= {name: database.getString(name, "") for name in database.getAll()}
     known = {f.name: f for f in fields(Options)}
     for name in named:
-        if name not in known:
+        if name not in known and not FACTOR_OPTION.fullmatch(name):
             raise InputError(
                 f"unknown option -{prefix}{name}; expected one of "
                 + ", ".join(f"-{prefix}{n}" for n in known)
             )
-    options = Options(**{n: _converted(known[n], v, prefix) for n, v in named.items()})
+    options = Options(
+        **{n: _converted(known[n], v, prefix) for n, v in named.items() if n in known}
+    )
     if options.qp_type == "smalse":
         check_preconditioner(options, prefix)
     return options
+
+
+def factor_options(given: Mapping[str, Any] | None, prefix: str) -> dict[str, Any]:
+    """Those options of a dictionary that PETSc itself reads, without the prefix."""
+    named = _without_prefix(given, prefix)
+    return {name: value for name, value in named.items() if FACTOR_OPTION.fullmatch(name)}
 
 
 def check_preconditioner(options: Options, prefix: str) -> None:

@@ -62,9 +62,9 @@ def write_xdmf(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
     target = _checked_target(path, ".xdmf", solution)
     decomposition = solution.decomposition
     folder = _begin(target.with_name(f"{target.stem}.folder"), solution)
-    if decomposition.comm.rank == 0:
-        folder.mkdir(parents=True)
-    decomposition.comm.barrier()
+    with raised_on_all_ranks(decomposition.comm), named(f"cannot write {target}", OSError):
+        if decomposition.comm.rank == 0:
+            folder.mkdir(parents=True)
     with io.XDMFFile(decomposition.comm, folder / target.name, "w") as xdmf:
         xdmf.write_mesh(decomposition.mesh)
         for function in (*nodal_fields(solution), *cell_fields(solution)):
@@ -72,8 +72,9 @@ def write_xdmf(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
     companion = target.with_suffix(".h5")
     for name in (companion, target):
         _replace(folder / name.name, name, solution)
-    if decomposition.comm.rank == 0:
-        folder.rmdir()
+    with raised_on_all_ranks(decomposition.comm):
+        if decomposition.comm.rank == 0:
+            folder.rmdir()
     return [target, companion]
 
 

@@ -25,12 +25,13 @@ from tfeti_dolfinx.gluing.prescribed import checked_conditions
 from tfeti_dolfinx.gluing.spectrum import extreme_eigenvalues, require_slepc
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.options import parse_options
+from tfeti_dolfinx.options import factor_options, parse_options
 from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.report_filling import fill_result, fill_sizes
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solver import conclude, resolve_types, solve_dual
 from tfeti_dolfinx.subdomains.build import sparse_blocks, trace_parts
+from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.kernel import mode_names
 from tfeti_dolfinx.subdomains.sparse_block import Counters, SparseBlock
 from tfeti_dolfinx.timing import stage
@@ -94,9 +95,10 @@ class ContactProblem:
         self._stress = self._checked_stress(stress)
         self.report = Report(seconds=dict(decomposition.seconds))
         self._prefix = petsc_options_prefix
+        self._factor_options = factor_options(petsc_options, petsc_options_prefix)
         self._solution: Solution | None = None
         self._constraints: Constraints | None = None
-        self._blocks: list[SparseBlock] = []
+        self._blocks: list[SparseBlock] | None = None  # a rank may have none of them
         self._dual: Dual | None = None
         with stage("assembly", self.report.seconds):
             self._forms = Forms(a, L, V, decomposition, form_compiler_options, jit_options)
@@ -124,13 +126,16 @@ class ContactProblem:
             InputError: Dirichlet values, contacts, stiffness or load do not fit.
             NoSolutionError: The problem has no solution.
             ConvergenceError: The solver stopped before its tolerance.
+            FactorError: A matrix could not be factored.
         """
         self.destroy()
         self.report.reset()
-        with stage("contact", self.report.seconds):
-            search = ContactSearch(self.contacts, self.dofs, self.decomposition)
         with stage("assembly", self.report.seconds):
             self._K, self._f = self._forms.stiffness(), self._forms.load()
+        with stage("contact", self.report.seconds):
+            diagonal = self.dofs.to_primal(self._K.diagonal())
+            search = ContactSearch(self.contacts, self.dofs, self.decomposition, diagonal)
+            self._settled = search.contacts
         previous = None
         for _ in range(MAX_ROUNDS):
             self._glue(search)
@@ -149,6 +154,7 @@ class ContactProblem:
             self.report.late_contact_rows += late
         else:
             raise ConvergenceError(f"nodes out of reach still overlap after {MAX_ROUNDS} rounds")
+        search.warn_of_unmet()
         if self.options.view and self.decomposition.comm.rank == 0:
             print(self.options.view_text(self._prefix), self.report, sep="\n", flush=True)
         return self.u
@@ -165,16 +171,17 @@ class ContactProblem:
 
     def destroy(self) -> None:
         """Destroy the PETSc objects; solution and report stay. ``solve`` makes them anew."""
-        for item in (self._dual, *self._blocks, self._constraints):
+        for item in (self._dual, *(self._blocks or ()), self._constraints):
             if item is not None:
                 item.destroy()
-        self._dual, self._blocks, self._constraints = None, [], None
+        self._dual, self._blocks, self._constraints = None, None, None
 
     def _glue(self, search: ContactSearch) -> None:
         """Rows of B for the present conditions."""
         with stage("gluing", self.report.seconds):
             if self._constraints is not None:
                 self._constraints.destroy()
+            self.report.unmet_contacts = search.unmet()
             records, weights = search.records, self._weights()
             self._gluing = glue(self.dofs, self.bcs, records, search.length, weights)
             self._constraints = self._gluing.constraints
@@ -205,9 +212,10 @@ class ContactProblem:
         gluing, report, comm = self._gluing, self.report, self.decomposition.comm
         rows = comm.allreduce(len(gluing.inequalities.rows))
         qp_type, pc_type = resolve_types(self.options, rows, self._prefix)
-        self._build_blocks()
-        with stage("dual", report.seconds):
-            dual = self._build_dual(pc_type)
+        with added_options(self._prefix, self._factor_options):
+            blocks = self._build_blocks()
+            with stage("dual", report.seconds):
+                dual = self._build_dual(blocks, pc_type)
         with stage("qp", report.seconds):
             start = None
             if previous is not None:
@@ -224,21 +232,21 @@ class ContactProblem:
                 lam=np.array(result.lam.array_r),
                 mu=result.mu,
                 stress=self._stress,
-                contacts=self.contacts,
+                contacts=self._settled,
             )
         fill_result(report, self.solution, dual, result, accuracy, self._counters)
         result.destroy()
         conclude(result, accuracy, self.options, comm)
         return self.solution
 
-    def _build_blocks(self) -> None:
+    def _build_blocks(self) -> list[SparseBlock]:
         """Blocks for the present trace; factors are made once."""
         trace = self._gluing.constraints.trace
-        if self._blocks:
+        if self._blocks is not None:
             with stage("subdomains", self.report.seconds):
                 for block, part in zip(self._blocks, trace_parts(self.dofs, trace), strict=True):
                     block.retrace(part)
-            return
+            return self._blocks
         self._counters = Counters()
         with stage("subdomains", self.report.seconds):
             self._blocks = sparse_blocks(
@@ -249,19 +257,22 @@ class ContactProblem:
                 trace,
                 self._counters,
                 self.options.kplus_type,
+                f"{self._prefix}sub_",
             )
+        return self._blocks
 
-    def _build_dual(self, pc_type: str) -> Dual:
+    def _build_dual(self, blocks: list[SparseBlock], pc_type: str) -> Dual:
         """The dual problem of the present rows."""
         if self._dual is not None:
             self._dual.destroy()
         decomposition = self.decomposition
         self._dual = Dual(
             constraints=self._gluing.constraints,
-            blocks=self._blocks,
+            blocks=blocks,
             body_of_block=decomposition.body_of_subdomain[decomposition.subdomains],
             body_names=decomposition.body_names,
             mode_names=mode_names(decomposition.mesh.geometry.dim, self.dofs.bs),
             pc_type=pc_type,
+            options_prefix=self._prefix,
         )
         return self._dual

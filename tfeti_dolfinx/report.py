@@ -5,10 +5,16 @@ from __future__ import annotations
 import json
 import os
 import resource
-from dataclasses import MISSING, asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 from mpi4py import MPI
+
+from tfeti_dolfinx.checks import named
+from tfeti_dolfinx.errors import raised_on_all_ranks
+
+PRINTED = 10  # of a list; all of it is in the file
 
 
 @dataclass
@@ -23,10 +29,14 @@ class Report:
         split_subdomains: Subdomains that were not connected and were split.
         kernel_dim: Dimension of the kernel of K.
         free_modes: Rigid motions that nothing resists and the load does not drive.
+        nearly_free: Rigid motions that contacts with a force hold hardly (``stiffness``: as a
+            share of what the same contacts hold at most) or not at all (0): dicts of ``bodies``,
+            ``mode`` and ``stiffness``. The smallest motion was taken.
         contact_rows: Non-penetration rows.
         contact_candidates: Nodes of the (secondary) contact surfaces.
         far_contact_nodes: Those that were out of reach or not covered, and have no row.
         late_contact_rows: Rows that nodes out of reach got after a solve, since they overlapped.
+        unmet_contacts: Contacts none of whose nodes has a row: position in the list, and name.
         dropped_contact_rows: Those that prescribed components decide alone.
         active_contacts: Rows with a positive force.
         F_multiplications: Multiplications by F, all but the power method's.
@@ -62,10 +72,12 @@ class Report:
     split_subdomains: int = 0
     kernel_dim: int = 0
     free_modes: int = 0
+    nearly_free: list[dict[str, object]] = field(default_factory=list)
     contact_rows: int = 0
     contact_candidates: int = 0
     far_contact_nodes: int = 0
     late_contact_rows: int = 0
+    unmet_contacts: list[str] = field(default_factory=list)
     dropped_contact_rows: int = 0
     active_contacts: int = 0
     F_multiplications: int = 0
@@ -87,17 +99,20 @@ class Report:
 
     def reset(self) -> None:
         """Forget the solve before; seconds add up. After an error nothing old is left."""
+        fresh = Report(seconds=self.seconds)
         for f in fields(self):
-            if f.name != "seconds":
-                setattr(self, f.name, f.default if f.default is not MISSING else {})
+            setattr(self, f.name, getattr(fresh, f.name))
 
     def __str__(self) -> str:
         lines = []
         for name, value in asdict(self).items():
             if isinstance(value, dict) and value:
                 lines += [f"{name}.{key:<22} {item:.6g}" for key, item in value.items()]
+            elif isinstance(value, list) and value:
+                lines += [f"{name:<31} {_item(item)}" for item in value[:PRINTED]]
+                lines += [f"{name:<31} {len(value)} in all"]
             else:
-                lines.append(f"{name:<31} {'-' if value == {} else value}")
+                lines.append(f"{name:<31} {'-' if value in ({}, []) else value}")
         return "\n".join(lines)
 
     def to_json(self) -> str:
@@ -105,14 +120,33 @@ class Report:
         return json.dumps(asdict(self), indent=2)
 
     def write(self, path: str | Path, comm: MPI.Intracomm) -> None:
-        """Write the report as a JSON file; it appears whole. Collective."""
-        if comm.rank == 0:
-            target = Path(path)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            partial = target.with_name(f".{target.name}.partial")
-            partial.write_text(self.to_json() + "\n")
-            os.replace(partial, target)
-        comm.barrier()
+        """Write the report as a JSON file; it appears whole. Collective.
+
+        Raises:
+            InputError: The file cannot be written.
+        """
+        with raised_on_all_ranks(comm), named(f"cannot write {path}", OSError):
+            if comm.rank == 0:
+                _write_whole(Path(path), self.to_json() + "\n")
+
+
+def _write_whole(target: Path, text: str) -> None:
+    """Write a file aside and give it its name when it is whole."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_name(f".{target.name}.partial")
+    partial.write_text(text)
+    try:
+        os.replace(partial, target)
+    except OSError:
+        partial.unlink()
+        raise
+
+
+def _item(item: str | dict[str, Any]) -> str:
+    """An unmet contact, or a motion that is nearly free, as text."""
+    if isinstance(item, str):
+        return item
+    return f"{', '.join(item['bodies'])}: {item['mode']}, stiffness {item['stiffness']:.2g}"
 
 
 def peak_memory_mb(comm: MPI.Intracomm) -> float:

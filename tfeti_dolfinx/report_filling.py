@@ -45,7 +45,8 @@ def fill_result(
     """Fill in what a solve has found; counters add up over rounds. Collective."""
     comm = dual.coarse.comm
     report.kernel_dim = dual.coarse.dimension
-    report.free_modes = dual.coarse.free_modes.shape[1]
+    report.free_modes = dual.coarse.free_modes
+    report.nearly_free = dual.nearly_free
     active = solution.lam[solution.gluing.constraints.inequalities] > 0.0
     report.active_contacts = comm.allreduce(int(np.sum(active)))
     report.F_multiplications += dual.F.count["solver"]

@@ -68,7 +68,12 @@ class Solution:
         lam: Multipliers of this rank's rows.
         mu: Multipliers of Gλ = e.
         stress: UFL stress of a displacement, or None.
-        contacts: Obstacles and pairs.
+        contacts: Obstacles and pairs, the secondary surface of a pair first.
+
+    Attributes:
+        displacement: Displacement on the torn mesh.
+        contacts: The contacts with their sides decided: ``contacts[i].surfaces[0]`` has the
+            multipliers and the pressure.
     """
 
     def __init__(
@@ -84,7 +89,7 @@ class Solution:
     ) -> None:
         self.displacement, self.dofs, self.decomposition = u, dofs, decomposition
         self.gluing, self.lam, self.mu = gluing, lam, mu
-        self._stress, self._contacts = stress, list(contacts)
+        self._stress, self.contacts = stress, list(contacts)
 
     @property
     def has_stress(self) -> bool:
@@ -94,7 +99,7 @@ class Solution:
     @property
     def has_contact(self) -> bool:
         """Whether the problem has contacts."""
-        return bool(self._contacts)
+        return bool(self.contacts)
 
     @cached_property
     def stress(self) -> fem.Function:
@@ -126,8 +131,8 @@ class Solution:
         records, dofs = self.gluing.records, self.dofs
         force = sum_rows(records.group, self.force, dofs.num_groups)
         area = sum_rows(records.group, records.area, dofs.num_groups)
-        surfaces = [contact.surfaces[0] for contact in self._contacts]
-        whole = hat_integrals(dofs, self.decomposition, surfaces) if surfaces else area
+        surfaces = [contact.surfaces[0] for contact in self.contacts]
+        whole = hat_integrals(dofs, self.decomposition, surfaces)
         values = np.divide(force, np.minimum(area, whole), out=0.0 * force, where=area > 0.0)
         return self._field(values, self._vertices, "pressure")
 
@@ -156,7 +161,7 @@ class Solution:
         and reaction of two sides have the same resultant.
         """
         dofs = self.dofs
-        surfaces = [name for contact in self._contacts for name in contact.surfaces]
+        surfaces = [name for contact in self.contacts for name in contact.surfaces]
         values, area = vertex_tractions(self._nodal_forces, dofs, self.decomposition, surfaces)
         function = fem.Function(dofs.V, name="traction")
         components = function.x.array.reshape(-1, dofs.bs)
@@ -180,8 +185,8 @@ class Solution:
             InputError: There is no such contact.
         """
         records = self.gluing.records
-        if not is_whole(index) or not 0 <= index < len(self._contacts):
-            known = [f"{i}: {contact.surfaces}" for i, contact in enumerate(self._contacts)]
+        if not is_whole(index) or not 0 <= index < len(self.contacts):
+            known = [f"{i}: {contact.surfaces}" for i, contact in enumerate(self.contacts)]
             raise InputError(
                 f"contact {shown(index)}: there are {len(known)}, counted from 0; their positions "
                 f"and surfaces are {', '.join(known) or 'none'}"

@@ -8,7 +8,7 @@ from petsc4py import PETSc
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.accuracy import Accuracy
 from tfeti_dolfinx.dual.dual import Dual
-from tfeti_dolfinx.dual.solvability import feasible_particular
+from tfeti_dolfinx.dual.particular import feasible_particular
 from tfeti_dolfinx.errors import ConvergenceError, InputError
 from tfeti_dolfinx.options import Options, check_preconditioner
 from tfeti_dolfinx.qp.homogenised import Homogenised, homogenise
@@ -63,13 +63,15 @@ def solve_dual(
     """
     qp = dual.qp()
     homogenised = _homogenise(dual, qp, options)
-    rule = Accuracy(dual, options.rtol, options.atol, homogenised.reference, homogenised.rounding)
-    monitor = _monitor(dual, homogenised, options)
+    monitor, norm = _monitor(dual, homogenised, options), 1.0
+    if qp_type == "smalse":
+        with dual.F.charged_to("power method"):
+            norm = estimate_norm(qp.F, qp.coarse, qp.d, options.norm_steps)
+    reference, rounding = homogenised.reference, homogenised.rounding
+    rule = Accuracy(dual, options.rtol, options.atol, reference, rounding, norm)
     if qp_type == "pcpg":
         result = pcpg(qp, homogenised, rule, max_it=options.max_it, monitor=monitor)
     else:
-        with dual.F.charged_to("power method"):
-            norm = estimate_norm(qp.F, qp.coarse, qp.d, options.norm_steps)
         result = smalse(
             qp,
             homogenised,
@@ -82,7 +84,8 @@ def solve_dual(
         )
     homogenised.destroy()
     if result.reason <= 0:
-        rule.look(result.lam, result.gradient)
+        residual = max(result.projected_gradient, norm * result.equality)
+        rule.look(result.lam, result.gradient, residual)
     return result, rule
 
 

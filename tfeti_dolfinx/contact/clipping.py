@@ -36,6 +36,11 @@ class Parts:
         total = np.sum(np.where(used[:, :, None], self.vertices, 0.0), axis=1)
         return total / np.maximum(self.count, 1)[:, None]
 
+    def corners(self) -> tuple[Array, Array]:
+        """Part of each vertex that is used, and the vertices, shape ``(m, tdim)``."""
+        part, place = np.nonzero(np.arange(self.vertices.shape[1]) < self.count[:, None])
+        return part, self.vertices[part, place]
+
     def quadrature(self, degree: int) -> tuple[Array, Array, Array]:
         """Part of each point, points of shape ``(m, tdim)``, weights, exact up to a degree."""
         if self.vertices.shape[2] == 1:

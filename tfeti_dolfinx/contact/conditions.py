@@ -25,6 +25,7 @@ def conditions(
     nodes: Array,
     areas: Array,
     normals: Array,
+    bounds: tuple[Array, Array] | None = None,
 ) -> ContactRecords:
     """Add up what facets contribute to a node, and divide by ∫ψ_i. Collective.
 
@@ -40,11 +41,18 @@ def conditions(
         nodes: Groups of all nodes of the secondary surface, shape ``(n, v)``.
         areas: ∫φ_i over the whole facets, shape ``(n, v)``.
         normals: Averaged normal of each owned group, shape ``(g, gdim)``.
+        bounds: Smallest and largest g on each facet, shapes ``(f, v)``. ψ_i is negative somewhere,
+            and a mean with it would else fall below the smallest gap.
     """
     area = dofs.add_on_owners(multipliers.ravel(), covered.ravel())
     whole = dofs.add_on_owners(nodes.ravel(), areas.ravel())
     gap = dofs.add_on_owners(multipliers.ravel(), gaps.ravel())
     chosen = np.flatnonzero(area > HARDLY_COVERED * whole)
+    mean = gap[chosen] / area[chosen]
+    if bounds is not None:
+        low = dofs.reduce_on_owners(multipliers.ravel(), bounds[0].ravel(), np.minimum, np.inf)
+        high = dofs.reduce_on_owners(multipliers.ravel(), bounds[1].ravel(), np.maximum, -np.inf)
+        mean = np.clip(mean, low[chosen], high[chosen])
     place = np.full(dofs.num_groups, -1)
     place[chosen] = np.arange(len(chosen))
     slot, column, value = _merged(dofs, entries)
@@ -54,7 +62,7 @@ def conditions(
         contact=np.full(len(chosen), contact),
         group=chosen,
         normal=normals[chosen],
-        gap=gap[chosen] / area[chosen],
+        gap=mean,
         area=area[chosen],
         near=np.ones(len(chosen), dtype=bool),
         row=place[slot],

@@ -36,6 +36,11 @@ class FacetElement:
         self.points = self._element.points
         self.size = self._element.dim
 
+    @property
+    def is_affine(self) -> bool:
+        """Whether all maps with these basis functions are affine."""
+        return self.degree == 1 and self.facet != "quadrilateral"
+
     def values(self, xi: Array) -> Array:
         """Basis functions at reference points: shape ``(n, tdim)`` to ``(n, size)``."""
         if len(xi) == 0:
@@ -44,6 +49,8 @@ class FacetElement:
 
     def slopes(self, xi: Array) -> Array:
         """Derivatives at reference points: shape ``(n, tdim)`` to ``(tdim, n, size)``."""
+        if len(xi) == 0:
+            return np.zeros((self.points.shape[1], 0, self.size))
         return self._element.tabulate(1, np.ascontiguousarray(xi))[1:, :, :, 0]
 
 
@@ -70,38 +77,3 @@ def facet_dofs(cell: str, degree: int, variant: Any) -> Array:
         distance = np.linalg.norm(on_facet[:, None] - points[None], axis=2)
         table.append(np.argmin(distance, axis=1))
     return np.array(table)
-
-
-def reference_points(facet: str, corners: Array, y: Array) -> Array:
-    """Reference coordinates of points in plane facets.
-
-    Args:
-        facet: interval, triangle or quadrilateral.
-        corners: Vertices of the facet of each point, shape ``(n, vertices, tdim)``.
-        y: The points, shape ``(n, tdim)``.
-
-    Returns:
-        Shape ``(n, tdim)``. For quadrilaterals by Newton's method, exact in one step for
-        parallelograms.
-    """
-    origin = corners[:, 0]
-    if facet == "interval":
-        return (y - origin) / (corners[:, 1] - origin)
-    jacobian = np.stack((corners[:, 1] - origin, corners[:, 2] - origin), axis=2)
-    xi = _solve(jacobian, y - origin)
-    if facet == "triangle":
-        return xi
-    twist = corners[:, 3] - corners[:, 2] - corners[:, 1] + origin
-    for _ in range(8):
-        image = origin + np.einsum("nij,nj->ni", jacobian, xi) + twist * xi[:, :1] * xi[:, 1:]
-        slope = jacobian + np.stack((twist * xi[:, 1:], twist * xi[:, :1]), axis=2)
-        xi = xi + _solve(slope, y - image)
-    return xi
-
-
-def _solve(A: Array, b: Array) -> Array:
-    """Solutions of many systems of two equations."""
-    (p, q), (r, t) = A.transpose(1, 2, 0)
-    x = t * b[:, 0] - q * b[:, 1]
-    y = p * b[:, 1] - r * b[:, 0]
-    return np.stack((x, y), axis=1) / (p * t - q * r)[:, None]

@@ -11,7 +11,7 @@ from tfeti_dolfinx.compat import geometry_dofmap
 from tfeti_dolfinx.contact.facet_element import FACET_OF, FacetElement, facet_dofs
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mesh.entities import cell_facets, facet_vertices
+from tfeti_dolfinx.mesh.entities import cell_facets
 from tfeti_dolfinx.parallel import Exchange
 
 
@@ -45,7 +45,8 @@ class Facets:
         x: Geometry nodes, vertices first, shape ``(n, g, gdim)``.
         groups: Global groups of the displacement's nodes, vertices first, shape ``(n, t)``.
         normal: Outward unit normal at the centre, shape ``(n, gdim)``.
-        vertex_normals: Averaged normals at the vertices, shape ``(n, v, gdim)``.
+        vertex_normals: Unit normals at the vertices, at first the facet's own, then averaged ones,
+            shape ``(n, v, gdim)``.
         area: Area (length in 2D), shape ``(n,)``.
     """
 
@@ -113,14 +114,15 @@ def local_facets(dofs: TornDofs, decomposition: Decomposition, facets: Array) ->
     x = mesh.geometry.x[np.take_along_axis(nodes, on_facet, axis=1)][:, :, :gdim]
     trace = facet_dofs(cell_type.name, element.degree, element.lagrange_variant)[place]
     displacement = np.take_along_axis(np.asarray(dofs.V.dofmap.list)[cell], trace, axis=1)
-    num_vertices = facet_vertices(cell_type).shape[1]
+    kind = facet_kind(dofs)
+    num_vertices = kind.num_vertices
     inside = mesh.geometry.x[nodes[:, : coordinate.dim // gdim]].mean(axis=1)[:, :gdim]
     normal, area = _normals(x[:, :num_vertices], inside)
     return Facets(
         x=np.ascontiguousarray(x),
         groups=dofs.group[dofs.primal_nodes(displacement)],
         normal=normal,
-        vertex_normals=np.zeros((len(facets), num_vertices, gdim)),
+        vertex_normals=_vertex_normals(kind, x, normal),
         area=area,
     )
 
@@ -134,7 +136,7 @@ def with_averaged_normals(
         The facets, and the averaged normal of each owned group, 0 off them, shape ``(g, gdim)``.
     """
     groups = facets.groups[:, :num_vertices]
-    weighted = np.repeat((facets.normal * facets.area[:, None])[:, None], num_vertices, axis=1)
+    weighted = facets.vertex_normals * facets.area[:, None, None]
     total = dofs.add_on_owners(groups.ravel(), weighted.reshape(-1, weighted.shape[2]))
     length = np.linalg.norm(total, axis=1, keepdims=True)
     averaged = total / np.where(length > 0.0, length, 1.0)
@@ -150,6 +152,17 @@ def _cells_of(decomposition: Decomposition, facets: Array) -> tuple[Array, Array
     cell = cells.array[cells.offsets[facets]]
     place = np.argmax(cell_facets(decomposition.mesh)[cell] == facets[:, None], axis=1)
     return cell, place
+
+
+def _vertex_normals(kind: FacetKind, x: Array, normal: Array) -> Array:
+    """Unit normals of curved facets at their vertices, on the side of plane facets' normals."""
+    tangents = np.einsum("tvg,ngd->tnvd", kind.geometry.slopes(kind.hats.points), x)
+    if len(tangents) == 1:
+        found = np.stack((tangents[0, :, :, 1], -tangents[0, :, :, 0]), axis=2)
+    else:
+        found = np.cross(*tangents)
+    length = np.linalg.norm(found, axis=2) * np.sign(np.einsum("nvd,nd->nv", found, normal))
+    return found / np.where(length != 0.0, length, np.inf)[:, :, None]
 
 
 def _normals(corners: Array, inside: Array) -> tuple[Array, Array]:

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
-from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.contact.arguments import Gap, checked_gap, checked_reach, given_gaps
 from tfeti_dolfinx.contact.conditions import conditions, triplets
+from tfeti_dolfinx.contact.facet_maps import hat_areas, whole_facets
 from tfeti_dolfinx.contact.facets import Facets, facet_kind, local_facets
-from tfeti_dolfinx.contact.mortar import dual_multipliers, hat_areas, whole_facets
+from tfeti_dolfinx.contact.mortar import dual_multipliers
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.shape_checks import check_placement, check_shape, distance_and_gradient
 from tfeti_dolfinx.contact.shapes import Shape
-from tfeti_dolfinx.contact.surfaces import diameter, group_points, on_surface, surface_facets
+from tfeti_dolfinx.contact.surfaces import (
+    diameter,
+    extent,
+    group_points,
+    on_surface,
+    surface_facets,
+)
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -30,29 +37,59 @@ class Obstacle:
         surface: Name or tag of the surface.
         shape: A ``Plane``, ``Sphere``, ``Cylinder``, ``SignedDistance``, or anything with their
             two methods.
+        gap: "geometry" for the shape's distance, or what replaces it (negative: interference):
+            a number, or a function of the surface's vertices, shape ``(3, n)``.
         reach: Nodes farther than this from the obstacle get no row at first. After the solve
-            all are checked, and those that came to overlap get theirs. A reach that leaves few
-            rows without contact makes the solve faster, mostly where contact alone holds a body.
+            all are checked, and those that came to overlap get theirs. Default: 5 % of the
+            surface's extent.
     """
 
     surface: str | int
     shape: Shape
-    reach: float = np.inf
+    _: KW_ONLY
+    gap: Gap = "geometry"
+    reach: float | None = None
 
     def __post_init__(self) -> None:
-        check_shape(self.shape, f"obstacle of surface {self.surface!r}")
+        check_shape(self.shape, self.name)
+
+    @property
+    def name(self) -> str:
+        """Name for messages."""
+        return f"obstacle of surface {self.surface!r}"
 
     @property
     def surfaces(self) -> tuple[str | int, ...]:
         """The surface."""
         return (self.surface,)
 
-    def first_radius(self, decomposition: Decomposition) -> float:
-        """Infinite: all nodes of the surface are looked at."""
-        return np.inf
+    def first_reach(self, decomposition: Decomposition) -> float:
+        """The reach to begin with. Collective.
+
+        Raises:
+            InputError: The surface is unknown or empty, or gap or reach do not fit.
+        """
+        checked_gap(self.name, self.gap)
+        size = extent(decomposition, surface_facets(decomposition, self.surface))
+        return checked_reach(self.name, self.reach, size)
+
+    def horizon(self, length: float) -> float:
+        """None: all nodes of the surface are looked at, whatever the reach is."""
+        return 0.0
+
+    def settled(
+        self,
+        dofs: TornDofs,
+        decomposition: Decomposition,
+        contact: int,
+        reach: float,
+        stiffness: Array,
+    ) -> tuple[Obstacle, ContactRecords]:
+        """The obstacle itself, which has one side, and its conditions. Collective."""
+        return self, self.records(dofs, decomposition, contact, reach, reach)
 
     def displacement_bound(self, dofs: TornDofs, decomposition: Decomposition, u: Array) -> float:
-        """Nothing lies beyond the radius, however large the displacement is."""
+        """Nothing comes from beyond the reach, however large the displacement is."""
         return 0.0
 
     def records(
@@ -60,18 +97,26 @@ class Obstacle:
         dofs: TornDofs,
         decomposition: Decomposition,
         contact: int,
-        radius: float = np.inf,
+        reach: float = np.inf,
         depth: float = np.inf,
     ) -> ContactRecords:
         """One condition per vertex of the surface, from its present distance. Collective.
 
-        With φ the signed distance, n = −∇φ/|∇φ| and g = φ/|∇φ| at the vertex, the condition is
-        that of a dual multiplier, ∫ψ_i n_i·u ≤ g_i ∫ψ_i, divided by ∫ψ_i. Of a displacement of
-        degree 1 it is n·u ≤ g at the node, since ψ_i is biorthogonal to its hats.
+        With φ the signed distance, n = −∇φ/|∇φ| and g = φ/|∇φ| at the vertex (or the gap that is
+        given), the condition is that of a dual multiplier, ∫ψ_i n_i·u ≤ g_i ∫ψ_i, divided by ∫ψ_i.
+        Of a displacement of degree 1 it is n·u ≤ g at the node, since ψ_i is biorthogonal to its
+        hats.
+
+        Args:
+            dofs: Dof maps.
+            decomposition: The torn mesh.
+            contact: Index of the contact.
+            reach: Conditions with a larger gap are not near.
+            depth: Not used: a body may lie in an obstacle as deep as it likes.
 
         Raises:
-            InputError: The surface is unknown or empty or faces away, the shape has no normal at
-                a node, or no node is within reach.
+            InputError: The surface faces away, the shape has no normal at a node, or a given gap
+                is no number there.
         """
         facets = surface_facets(decomposition, self.surface)
         kind, surface = facet_kind(dofs), local_facets(dofs, decomposition, facets)
@@ -94,15 +139,7 @@ class Obstacle:
             areas=hat_areas(kind, surface),
             normals=normals,
         )
-        near = records.gap <= self.reach
-        if decomposition.comm.allreduce(int(np.sum(near))) == 0:
-            lowest = float(records.gap.min(initial=np.inf))
-            nearest = decomposition.comm.allreduce(lowest, op=MPI.MIN)
-            raise InputError(
-                f"obstacle of surface {self.surface!r}: no node within reach={self.reach}; "
-                f"the nearest is {nearest:.6g} away"
-            )
-        return replace(records, near=near)
+        return replace(records, near=records.gap <= reach)
 
     def _at_groups(self, dofs: TornDofs, groups: Array) -> tuple[Array, Array]:
         """Gap and normal of these owned groups, 0 for the others. Collective."""
@@ -110,6 +147,9 @@ class Obstacle:
         x = group_points(dofs)[groups]
         with raised_on_all_ranks(dofs.comm):
             gap[groups], normals[groups] = self._gaps(x, dofs.bs)
+            given = given_gaps(self.name, self.gap, x)
+        if given is not None:
+            gap[groups] = given
         return gap, normals
 
     def _check_placement(
@@ -117,9 +157,8 @@ class Obstacle:
     ) -> None:
         if dofs.bs > 1:  # of a scalar space the gradient's first component counts
             x = surface.corners(num_vertices).mean(axis=1)
-            what = f"obstacle of surface {self.surface!r}"
             size = diameter(decomposition)
-            check_placement(self.shape, x, dofs.bs, what, size, decomposition.comm)
+            check_placement(self.shape, x, dofs.bs, self.name, size, decomposition.comm)
 
     def _check_side(self, surface: Facets, num_vertices: int, dofs: TornDofs) -> None:
         """Raise if no facet faces the obstacle. Collective."""
@@ -128,7 +167,7 @@ class Obstacle:
         facing = int(np.sum(np.sum(towards * surface.normal, axis=1) > 0.0))
         if dofs.bs > 1 and dofs.comm.allreduce(facing) == 0:
             raise InputError(
-                f"obstacle of surface {self.surface!r}: the surface faces away from it; expected "
+                f"{self.name}: the surface faces away from it; expected "
                 "a shape whose distance falls along the outward normal (is its normal turned?)"
             )
 
@@ -142,7 +181,7 @@ class Obstacle:
         wrong = ~(np.isfinite(gap) & np.isfinite(length) & (length > 0.0))
         if np.any(wrong):
             raise InputError(
-                f"obstacle of surface {self.surface!r} has no distance and normal at the node "
+                f"{self.name} has no distance and normal at the node "
                 f"{x[wrong][0].tolist()}: distance {gap[wrong][0]}, gradient {gradient[wrong][0]}"
             )
         return gap / length, -gradient / length[:, None]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Protocol
@@ -15,25 +16,48 @@ from tfeti_dolfinx.contact.surfaces import diameter
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.parallel import agreed
 
 # how much farther one looks for what may hold a body; of the scene's length at least
 WIDER, LEAST = 4.0, 0.01
+
+log = logging.getLogger(__name__)
 
 
 class ContactPartner(Protocol):
     """An obstacle, or a pair of surfaces. All methods are collective."""
 
     @property
-    def surfaces(self) -> tuple[str | int, ...]:
-        """Names or tags of the surfaces."""
+    def name(self) -> str:
+        """Name for messages."""
         ...
 
-    def first_radius(self, decomposition: Decomposition) -> float:
-        """Distance up to which conditions are made at first."""
+    @property
+    def surfaces(self) -> tuple[str | int, ...]:
+        """Names or tags of the surfaces, that with the multipliers first."""
+        ...
+
+    def first_reach(self, decomposition: Decomposition) -> float:
+        """Distance up to which conditions have rows at first."""
+        ...
+
+    def horizon(self, length: float) -> float:
+        """Reach beyond which no search finds more conditions, in a scene of a length."""
+        ...
+
+    def settled(
+        self,
+        dofs: TornDofs,
+        decomposition: Decomposition,
+        contact: int,
+        reach: float,
+        stiffness: Array,
+    ) -> tuple[ContactPartner, ContactRecords]:
+        """The contact with its sides decided from the diagonal of K, and its conditions."""
         ...
 
     def displacement_bound(self, dofs: TornDofs, decomposition: Decomposition, u: Array) -> float:
-        """How far what lay beyond the radius may have come nearer, u of shape (nodes, bs)."""
+        """How far what lay beyond the reach may have come nearer, u of shape (nodes, bs)."""
         ...
 
     def records(
@@ -41,10 +65,10 @@ class ContactPartner(Protocol):
         dofs: TornDofs,
         decomposition: Decomposition,
         contact: int,
-        radius: float,
+        reach: float,
         depth: float,
     ) -> ContactRecords:
-        """Conditions up to a distance, and down to a depth of initial overlap."""
+        """Conditions up to a distance and beyond, and down to a depth of initial overlap."""
         ...
 
 
@@ -57,7 +81,7 @@ def checked_contacts(contacts: Sequence[ContactPartner]) -> list[ContactPartner]
     if not isinstance(contacts, Sequence):
         raise InputError(f"contacts: expected a list, got {shown(contacts)}")
     for contact in contacts:
-        known = all(hasattr(contact, name) for name in ("records", "surfaces", "first_radius"))
+        known = all(hasattr(contact, name) for name in ("records", "surfaces", "first_reach"))
         if isinstance(contact, type) or not known:
             raise InputError(f"contacts: expected obstacles and pairs, got {shown(contact)}")
     return list(contacts)
@@ -66,12 +90,17 @@ def checked_contacts(contacts: Sequence[ContactPartner]) -> list[ContactPartner]
 class ContactSearch:
     """Conditions of all contacts. Creation and all methods are collective.
 
+    Conditions farther than a contact's reach have no rows at first; ``take_in_overlapping`` gives
+    them to those that a displacement violates, ``widen`` to those that may hold a body yet.
+
     Args:
         contacts: Obstacles and pairs.
         dofs: Dof maps.
         decomposition: The torn mesh.
+        stiffness: Diagonal of K in primal order, shape ``(num_nodes * bs,)``.
 
     Attributes:
+        contacts: The contacts with their sides decided: of a pair the secondary one comes first.
         length: Length of the scene.
         records: All conditions of this rank; those that are ``near`` have rows.
 
@@ -80,14 +109,24 @@ class ContactSearch:
     """
 
     def __init__(
-        self, contacts: Sequence[ContactPartner], dofs: TornDofs, decomposition: Decomposition
+        self,
+        contacts: Sequence[ContactPartner],
+        dofs: TornDofs,
+        decomposition: Decomposition,
+        stiffness: Array,
     ) -> None:
-        self._contacts, self._dofs, self._decomposition = contacts, dofs, decomposition
-        self.length = diameter(decomposition)
-        self._depths = [contact.first_radius(decomposition) for contact in contacts]
-        self._radii = list(self._depths)
-        self._check_pairs()
-        self._parts = [self._search(i, radius) for i, radius in enumerate(self._radii)]
+        self._dofs, self._decomposition = dofs, decomposition
+        self.length = agreed(dofs.comm, diameter(decomposition))
+        reach = [contact.first_reach(decomposition) for contact in contacts]
+        self._depths = agreed(dofs.comm, reach)
+        self._reach = list(self._depths)
+        _check_pairs(contacts, decomposition)
+        settled = [
+            contact.settled(dofs, decomposition, i, self._reach[i], stiffness)
+            for i, contact in enumerate(contacts)
+        ]
+        self.contacts = [contact for contact, _ in settled]
+        self._parts = [records for _, records in settled]
 
     @property
     def records(self) -> ContactRecords:
@@ -107,13 +146,14 @@ class ContactSearch:
             How many rows are new, on all ranks.
         """
         late = 0
-        for i, contact in enumerate(self._contacts):
+        for i, contact in enumerate(self.contacts):
             known = self._parts[i]
-            moved = contact.displacement_bound(
+            bound = contact.displacement_bound(
                 self._dofs, self._decomposition, u.reshape(-1, self._dofs.bs)
             )
+            moved = agreed(self._dofs.comm, bound)
             found = known
-            if moved > self._radii[i]:
+            if moved > self._reach[i]:
                 found = self._with_rows_of(self._search(i, moved), known)
             overlaps, new = self._overlapping(found, u, tolerance)
             if new == 0 and found is not known:
@@ -122,7 +162,7 @@ class ContactSearch:
             if new:
                 self._parts[i] = replace(found, near=found.near | overlaps)
                 if found is not known:
-                    self._radii[i] = moved
+                    self._reach[i] = moved
                 late += new
         return late
 
@@ -132,40 +172,52 @@ class ContactSearch:
         return overlaps, self._count(overlaps & ~found.near)
 
     def widen(self) -> int:
-        """Give rows to all conditions, and search farther: what is far may hold a body yet.
+        """Reach farther, until a condition gets a row: what is far may hold a body yet.
 
         Returns:
-            How many rows are new, on all ranks; 0 where nothing is left to search.
+            How many rows are new, on all ranks; 0 where nothing is left to find.
         """
-        late = 0
-        for i, radius in enumerate(self._radii):
-            known = self._parts[i]
-            if radius < self.length:
-                self._radii[i] = min(max(WIDER * radius, LEAST * self.length), self.length)
-                known = self._search(i, self._radii[i])
-            late += self._count(~known.near) + self._count(known.near)
-            late -= self._count(self._parts[i].near)
-            self._parts[i] = replace(known, near=np.ones(len(known), dtype=bool))
-        return late
+        while not self.is_exhausted:
+            if late := sum(self._widen(i) for i in range(len(self.contacts))):
+                return late
+        return 0
 
     @property
     def is_exhausted(self) -> bool:
         """Whether every node has been looked at, however far it is, and has its row."""
-        far = any(radius < self.length for radius in self._radii)
-        return not far and sum(self._count(~part.near) for part in self._parts) == 0
+        return all(self._is_exhausted(i) for i in range(len(self.contacts)))
 
-    def _check_pairs(self) -> None:
-        """Raise if a pair is there twice: its force would be shared between the two."""
-        pairs = set()
-        for contact in self._contacts:
-            tags = frozenset(self._decomposition.surface(name) for name in contact.surfaces)
-            if len(tags) == 2 and tags in pairs:
-                raise InputError(f"contacts: the pair of {contact.surfaces} is there twice")
-            pairs.add(tags)
+    def unmet(self) -> list[str]:
+        """Contacts none of whose nodes has a row: position in the list, and name."""
+        rows = np.array([np.sum(part.near) for part in self._parts], dtype=np.int64)
+        rows = self._dofs.comm.allreduce(rows)
+        return [f"{i}: {self.contacts[i].name}" for i in np.flatnonzero(rows == 0)]
 
-    def _search(self, index: int, radius: float) -> ContactRecords:
-        contact = self._contacts[index]
-        return contact.records(self._dofs, self._decomposition, index, radius, self._depths[index])
+    def warn_of_unmet(self) -> None:
+        """Log on rank 0 which contacts have met nobody."""
+        for contact in self.unmet():
+            if self._dofs.comm.rank == 0:
+                log.warning("contact %s has met nobody, and has no rows", contact)
+
+    def _is_exhausted(self, i: int) -> bool:
+        complete = self._reach[i] >= self.contacts[i].horizon(self.length)
+        return self._count(~self._parts[i].near) == 0 and complete
+
+    def _widen(self, i: int) -> int:
+        """Reach farther in one contact; how many rows are new."""
+        if self._is_exhausted(i):
+            return 0
+        before, found = self._count(self._parts[i].near), self._parts[i]
+        reach = max(WIDER * self._reach[i], LEAST * self.length)
+        if self._reach[i] < self.contacts[i].horizon(self.length):
+            found = self._with_rows_of(self._search(i, reach), found)
+        self._reach[i] = reach
+        self._parts[i] = replace(found, near=found.near | (found.gap <= reach))
+        return self._count(self._parts[i].near) - before
+
+    def _search(self, index: int, reach: float) -> ContactRecords:
+        contact = self.contacts[index]
+        return contact.records(self._dofs, self._decomposition, index, reach, self._depths[index])
 
     def _with_rows_of(self, found: ContactRecords, known: ContactRecords) -> ContactRecords:
         """Conditions of a wider search, near where they had rows before."""
@@ -173,3 +225,13 @@ class ContactSearch:
 
     def _count(self, flags: Array) -> int:
         return int(self._dofs.comm.allreduce(int(np.sum(flags))))
+
+
+def _check_pairs(contacts: Sequence[ContactPartner], decomposition: Decomposition) -> None:
+    """Raise if a pair is there twice: its force would be shared between the two."""
+    pairs = set()
+    for contact in contacts:
+        tags = frozenset(decomposition.surface(name) for name in contact.surfaces)
+        if len(tags) == 2 and tags in pairs:
+            raise InputError(f"contacts: the pair of {contact.surfaces} is there twice")
+        pairs.add(tags)

@@ -42,13 +42,13 @@ class Scene(Protocol):
     body_of_block: Array
     num_bodies: int
 
-    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec) -> list[Array]:
-        """Displacements of this rank's Blocks. Collective."""
+    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, error: float) -> list[Array]:
+        """Displacements of this rank's Blocks, given the solver's error. Collective."""
         ...
 
 
 @dataclass(frozen=True)
-class Bodies:
+class BodyMeasures:
     """What is known of each body at an iterate, arrays of shape ``(bodies,)``; on all ranks.
 
     Attributes:
@@ -82,7 +82,7 @@ class Measures:
     """
 
     u: list[Array]
-    bodies: Bodies
+    bodies: BodyMeasures
     penetration: float
     balance: float
     forces: float
@@ -95,7 +95,11 @@ class Measures:
 
 
 def measure(
-    scene: Scene, lam: PETSc.Vec, gradient: PETSc.Vec, before: Sequence[Array] | None = None
+    scene: Scene,
+    lam: PETSc.Vec,
+    gradient: PETSc.Vec,
+    error: float,
+    before: Sequence[Array] | None = None,
 ) -> Measures:
     """Recover the displacement of an iterate and see how well it fulfils the rows. Collective.
 
@@ -107,9 +111,10 @@ def measure(
         scene: The dual problem.
         lam: The multipliers λ.
         gradient: Fλ − d up to the range of Gᵀ.
+        error: How large multipliers may be by the solver's error alone.
         before: Displacements of an earlier iterate.
     """
-    u = scene.recover(lam, gradient)
+    u = scene.recover(lam, gradient, error)
     w, penetration = _missed(scene, u, lam)
     v = scene.constraints.B.createVecRight()
     scene.constraints.B.multTranspose(w, v)
@@ -139,10 +144,11 @@ def _missed(scene: Scene, u: list[Array], lam: PETSc.Vec) -> tuple[PETSc.Vec, fl
     return w, float(w.getComm().tompi4py().allreduce(deepest, op=MPI.MAX))
 
 
-def _bodies(scene: Scene, u: list[Array], v: Array, before: Sequence[Array] | None) -> Bodies:
+def _bodies(scene: Scene, u: list[Array], v: Array, before: Sequence[Array] | None) -> BodyMeasures:
     """What is known of each body. Collective."""
     comm, count = scene.coarse.comm, scene.num_bodies
-    rigid = _rigid_parts(scene, u)
+    motions = scene.coarse.bodies
+    rigid = motions.amounts(motions.part_of(u, scene.blocks))
     sums, largest = np.zeros((2, count)), np.zeros((4, count))
     slices = trace_slices(scene.blocks)
     for s, (block, part, body) in enumerate(
@@ -156,20 +162,7 @@ def _bodies(scene: Scene, u: list[Array], v: Array, before: Sequence[Array] | No
     comm.Allreduce(MPI.IN_PLACE, sums, op=MPI.SUM)
     comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
     size, elastic, correction, change = largest
-    return Bodies(size, elastic, sums[0], correction, sums[1], change)
-
-
-def _rigid_parts(scene: Scene, u: list[Array]) -> Array:
-    """Coefficients of each body's modes nearest to its displacement, shape ``(bodies, k)``."""
-    comm = scene.coarse.comm
-    k = comm.allreduce(max((b.modes.shape[1] for b in scene.blocks), default=0), op=MPI.MAX)
-    normal = np.zeros((scene.num_bodies, k, k + 1))
-    for block, body, u_s in zip(scene.blocks, scene.body_of_block, u, strict=True):
-        C = block.modes
-        normal[body] += np.column_stack((C.T @ C, C.T @ u_s))
-    comm.Allreduce(MPI.IN_PLACE, normal, op=MPI.SUM)
-    inverse = np.linalg.pinv(normal[:, :, :k], hermitian=True)
-    return np.asarray(np.einsum("bij,bj->bi", inverse, normal[:, :, k]))
+    return BodyMeasures(size, elastic, sums[0], correction, sums[1], change)
 
 
 def _balance(coarse: CoarseSpace, lam: PETSc.Vec) -> tuple[float, float]:
@@ -215,6 +208,7 @@ class Accuracy:
         atol: A length that errors may have whatever moves.
         reference: b₀, the norm of the residual at the start.
         rounding: What rounding leaves of a residual at least.
+        norm: ‖F‖, or an estimate; residuals over it are errors of multipliers.
 
     Attributes:
         rtol: Relative tolerance.
@@ -225,26 +219,32 @@ class Accuracy:
     """
 
     def __init__(
-        self, scene: Scene, rtol: float, atol: float, reference: float, rounding: float
+        self,
+        scene: Scene,
+        rtol: float,
+        atol: float,
+        reference: float,
+        rounding: float,
+        norm: float = 1.0,
     ) -> None:
         self._scene, self.rtol, self._atol = scene, rtol, atol
-        self._rounding = rounding
+        self._rounding, self._norm = rounding, norm or 1.0
         self._before: Measures | None = None
         self.tolerance = max(rtol**FIRST_LOOK * reference, atol, rounding)
         self.drifted, self.looks, self._stalls, self._claimed = False, 0, 0, 1.0
         self.measures: Measures | None = None
 
-    def look(self, lam: PETSc.Vec, gradient: PETSc.Vec) -> Measures:
+    def look(self, lam: PETSc.Vec, gradient: PETSc.Vec, residual: float) -> Measures:
         """Measure an iterate. Collective."""
-        before = self.measures
-        self.measures = measure(self._scene, lam, gradient, before.u if before else None)
+        before, error = self.measures, residual / self._norm
+        self.measures = measure(self._scene, lam, gradient, error, before.u if before else None)
         self.looks += 1
         self._before = before
         return self.measures
 
     def examine(self, lam: PETSc.Vec, gradient: PETSc.Vec, residual: float) -> ConvergedReason:
         """Whether an iterate is right. Collective."""
-        now = self.look(lam, gradient)
+        now = self.look(lam, gradient, residual)
         comm = self._scene.coarse.comm
         ratio, longest = agreed(comm, (self.ratio(), self._longest(now)))
         if ratio <= 1.0:

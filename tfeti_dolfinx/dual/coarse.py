@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from mpi4py import MPI
@@ -12,12 +11,17 @@ from petsc4py import PETSc
 from scipy.sparse import coo_array, csr_array, diags_array
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.dual.bodies import Bodies, joined
+from tfeti_dolfinx.dual.motions import NULL, Motions, unresisted, unsprung
+from tfeti_dolfinx.dual.null_basis import NullBasis, null_basis
 from tfeti_dolfinx.dual.operator import trace_slices
-from tfeti_dolfinx.parallel import chunk_offsets
+from tfeti_dolfinx.errors import FactorError, raised_on_all_ranks
+from tfeti_dolfinx.parallel import agreed, chunk_offsets
 from tfeti_dolfinx.subdomains.block import Block
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor
 
-NULL = 1e-14
+# Of the size of a row: what of it acts on motions of bodies and is only rounding.
+NO_GRIP = 1e-12
 
 
 class CoarseSpace:
@@ -28,16 +32,24 @@ class CoarseSpace:
         blocks: This rank's Blocks.
         body_of_block: Body of each of them.
         num_bodies: Number of bodies on all ranks.
+        bounded: Local rows with λ ≥ 0.
         comm: Communicator. The constructor and all methods are collective.
+        prefix: Prefix of the factor's PETSc options.
 
     Attributes:
         dimension: r, the dimension of the kernel of K.
         e: Rᵀ f, shape ``(r,)``.
         Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
-        body_modes: Kernel coordinates of the bodies' candidate modes, scipy CSR, shape
-            ``(r, bodies * k)``.
-        free_motions: Motions of the bodies that no row resists, as ``null_motions`` gives them.
-        free_modes: Orthonormal basis of null(Gᵀ), shape ``(r, number of free modes)``.
+        bounded: Local rows with λ ≥ 0.
+        row_size: Sum of the moduli of each local row of B, the same however the mesh is torn. A
+            row over it gives lengths. Shape ``(m_local,)``.
+        bodies: Motions of the bodies.
+        J: This rank's rows of Gᵀ over their size, on motions of bodies, scipy CSR, shape
+            ``(m_local, bodies * k)``; empty for gluing rows.
+        unheld: Motions that neither springs nor equality rows resist; each of these rows acts
+            on one body.
+        free_motions: Motions that no row resists at all.
+        null: Orthonormal basis of null(Gᵀ).
     """
 
     def __init__(
@@ -46,27 +58,46 @@ class CoarseSpace:
         blocks: Sequence[Block],
         body_of_block: Array,
         num_bodies: int,
+        bounded: slice,
         comm: MPI.Intracomm,
+        prefix: str = "tfeti_coarse_",
     ) -> None:
-        self.comm = comm
+        self.comm, self.bounded = comm, bounded
         sizes = np.array([block.kernel.shape[1] for block in blocks], dtype=np.int64)
         offsets = chunk_offsets(comm, int(sizes.sum()))
         self.dimension = int(offsets[-1])
         starts = offsets[comm.rank] + np.concatenate(([0], np.cumsum(sizes)))
         self._starts, self._sizes = starts, sizes
         self.Gt = _transposed_G(B, blocks, starts, self.dimension)
-        self.update_load(blocks)
-        self.body_modes, self._defect = _body_modes(
-            blocks, starts, self.dimension, body_of_block, num_bodies, comm
-        )
-        self.free_motions = self.null_motions()
-        self.free_modes = self.modes_of(self.free_motions)
-        self._factor = SemidefiniteFactor(self.gram(), self.free_modes)
+        self.row_size = _sizes(B)
+        self.bodies = Bodies(blocks, starts, self.dimension, body_of_block, num_bodies, comm)
+        self.J = _without_rounding(diags_array(1.0 / self.row_size) @ self.Gt @ self.bodies.modes)
+        self._read_load(blocks)
+        equalities = np.ones(len(self.row_size), dtype=bool)
+        equalities[bounded] = False
+        self.unheld = self._unresisted(equalities, unsprung(self.bodies.springs), NULL)
+        self.free_motions = self.unresisted(~equalities)
+        self.null = null_basis(self.bodies, self.free_motions)
+        gram = self.gram()
+        with raised_on_all_ranks(comm):
+            try:
+                self._factor = SemidefiniteFactor(gram, self.null, prefix)
+            except FactorError as error:
+                raise type(error)(f"GGᵀ of the coarse problem: {error}") from error
 
     def update_load(self, blocks: Sequence[Block]) -> None:
         """Replace e = Rᵀ f by that of the Blocks' present loads."""
+        self._read_load(blocks)
+        self.bodies.update_load(blocks)
+
+    def _read_load(self, blocks: Sequence[Block]) -> None:
         local = [block.kernel_load for block in blocks]
         self.e = np.concatenate(self.comm.allgather(np.concatenate([np.empty(0), *local])))
+
+    @property
+    def free_modes(self) -> int:
+        """Number of motions that no row resists."""
+        return self.free_motions.count
 
     def alpha_of(self, alpha: Array) -> list[Array]:
         """The parts of an r-vector that belong to this rank's Blocks."""
@@ -111,40 +142,29 @@ class CoarseSpace:
         value = np.concatenate(self.comm.allgather(local.data))
         return coo_array((value, (row, column)), shape=(self.dimension,) * 2).tocsr()
 
-    def body_gram(self, rows: Array | None = None) -> Array:
-        """How rows and springs resist the bodies' modes, shape ``(bodies * k,) * 2``; replicated.
+    def unresisted(self, rows: Array, below: float = NULL) -> Motions:
+        """Motions that neither springs, nor equality rows, nor contact rows flagged resist.
 
-        Gram matrix of B R Z on the rows flagged, Z the modes, plus what of Z no kernel holds.
+        The null space of Gᵀ lives on the bodies' motions: one that no gluing row resists is the
+        same in all subdomains of a body.
+
+        Args:
+            rows: Flags of local rows, those of equalities without effect.
+            below: Motions of a single body that are held by less than this share of what the
+                same rows hold at most are taken in, too.
         """
-        J = (self.Gt if rows is None else self.Gt[rows]) @ self.body_modes
-        gram = (J.T @ J).toarray()
-        self.comm.Allreduce(MPI.IN_PLACE, gram, op=MPI.SUM)
-        return gram + self._defect
+        flags = np.zeros(len(self.row_size), dtype=bool)
+        flags[self.bounded] = rows[self.bounded]
+        return self._unresisted(flags, self.unheld, below)
 
-    @cached_property
-    def motion_basis(self) -> Array:
-        """Basis of the bodies' motions, of unit size each, shape ``(bodies * k, count)``."""
-        size = (self.body_modes.T @ self.body_modes).toarray() + self._defect
-        return _metric_basis(size)
-
-    def null_motions(self, rows: Array | None = None) -> Array:
-        """Motions of the bodies that Gᵀ (or the rows flagged of it) does not resist.
-
-        The null space of Gᵀ lives on the bodies' modes: a motion that no gluing row resists is
-        the same in all subdomains of a body.
-
-        Returns:
-            Coefficients of the bodies' modes as columns, shape ``(bodies * k, count)``.
-        """
-        basis = self.motion_basis
-        values, vectors = np.linalg.eigh(basis.T @ self.body_gram(rows) @ basis)
-        free = values <= NULL * max(values.max(initial=0.0), 1.0)
-        return basis @ vectors[:, free]
-
-    def modes_of(self, motions: Array) -> Array:
-        """Orthonormal basis of motions in kernel coordinates, shape ``(r, count)``."""
-        modes = self.body_modes @ motions
-        return np.linalg.qr(modes)[0] if modes.shape[1] else modes
+    def _unresisted(self, rows: Array, within: Motions, below: float) -> Motions:
+        """Found on one rank: processors that round differently might count differently."""
+        grams = self.comm.gather(self.J[rows].T @ self.J[rows], root=0)
+        found: Any = None
+        with raised_on_all_ranks(self.comm):
+            if grams is not None:
+                found = unresisted(csr_array(sum(grams)), within, below)
+        return cast(Motions, agreed(self.comm, found))
 
     def destroy(self) -> None:
         """Free the factor."""
@@ -159,23 +179,23 @@ class SemidefiniteFactor:
 
     Args:
         A: scipy CSR, shape ``(r, r)``.
-        null: Orthonormal basis of its null space, shape ``(r, k)``.
+        null: Its null space.
+        prefix: Prefix of the factor's PETSc options.
     """
 
-    def __init__(self, A: csr_array, null: Array) -> None:
-        self._null = null
-        pinned = np.zeros(A.shape[0])
-        pinned[_independent_rows(null)] = A.diagonal().max(initial=1.0)
-        self._factor = CholeskyFactor(csr_array(A + diags_array(pinned))) if A.shape[0] else None
+    def __init__(self, A: csr_array, null: NullBasis, prefix: str = "tfeti_coarse_") -> None:
+        self._null, diagonal, pinned = null, A.diagonal(), np.zeros(A.shape[0])
+        largest = diagonal.max(initial=0.0) or 1.0
+        # an entry's own size: bodies may differ by many orders of magnitude
+        pinned[null.pins] = np.where(diagonal[null.pins] > 0.0, diagonal[null.pins], largest)
+        regular = csr_array(A + diags_array(pinned))
+        self._factor = CholeskyFactor(regular, prefix) if A.shape[0] else None
 
     def solve(self, y: Array) -> Array:
         """A⁺ y up to null modes that are removed, y orthogonal to them."""
         if self._factor is None:
             return y
-        if self._null.shape[1] == 0:
-            return self._factor.solve(y)
-        x = self._factor.solve(y - self._null @ (self._null.T @ y))
-        return np.asarray(x - self._null @ (self._null.T @ x))
+        return self._null.removed(self._factor.solve(self._null.removed(y)))
 
     def destroy(self) -> None:
         """Free the factor."""
@@ -183,20 +203,20 @@ class SemidefiniteFactor:
             self._factor.destroy()
 
 
-def _independent_rows(null: Array) -> Array:
-    """As many rows as columns, chosen by pivoting, on which the columns are independent."""
-    from scipy.linalg import qr
+def _without_rounding(J: Any) -> csr_array:
+    """The same rows without entries that are only rounding."""
+    J = csr_array(J)
+    J.data[np.abs(J.data) <= NO_GRIP] = 0.0
+    J.eliminate_zeros()
+    return J
 
-    if null.shape[1] == 0:
-        return np.empty(0, dtype=np.int64)
-    return np.asarray(qr(null.T, pivoting=True, mode="r")[1][: null.shape[1]])
 
-
-def _metric_basis(size: Array) -> Array:
-    """Basis that is orthonormal in a positive semidefinite metric, null directions left out."""
-    values, vectors = np.linalg.eigh(size)
-    kept = values > 1e-12 * max(values.max(initial=0.0), 1e-300)
-    return vectors[:, kept] / np.sqrt(values[kept])
+def _sizes(B: PETSc.Mat) -> Array:
+    """Sum of the moduli of each local row, 1 where that is 0."""
+    indptr, _, data = B.getValuesCSR()
+    rows = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
+    sizes = np.bincount(rows, np.abs(data), minlength=len(indptr) - 1).astype(float)
+    return np.where(sizes > 0.0, sizes, 1.0)
 
 
 def _transposed_G(
@@ -211,8 +231,8 @@ def _transposed_G(
         rows.append((part.start + i).ravel())
         columns.append((start + j).ravel())
         values.append(kernel.ravel())
-    coordinates = (_join(rows, np.int64), _join(columns, np.int64))
-    local = coo_array((_join(values, np.float64), coordinates), shape=(num_trace, dimension))
+    coordinates = (joined(rows, np.int64), joined(columns, np.int64))
+    local = coo_array((joined(values, np.float64), coordinates), shape=(num_trace, dimension))
     local = local.tocsr()
     index = PETSc.IntType
     R = PETSc.Mat().createAIJ(
@@ -226,35 +246,3 @@ def _transposed_G(
     R.destroy()
     BR.destroy()
     return Gt
-
-
-def _body_modes(
-    blocks: Sequence[Block],
-    starts: Array,
-    dimension: int,
-    body_of_block: Array,
-    num_bodies: int,
-    comm: MPI.Intracomm,
-) -> tuple[csr_array, Array]:
-    """Kernel coordinates of the bodies' modes, and the Gram matrix of what no kernel holds."""
-    parts = [block.body_modes for block in blocks]
-    k = comm.allreduce(max((inside.shape[1] for inside, _ in parts), default=0), op=MPI.MAX)
-    defect = np.zeros((num_bodies * k, num_bodies * k))
-    rows, columns, values = [], [], []
-    for (inside, rest), start, body in zip(parts, starts, body_of_block, strict=False):
-        i, j = np.indices(inside.shape)
-        rows.append((start + i).ravel())
-        columns.append((body * k + j).ravel())
-        values.append(inside.ravel())
-        own = slice(body * k, body * k + k)
-        defect[own, own] += rest
-    comm.Allreduce(MPI.IN_PLACE, defect, op=MPI.SUM)
-    row, column, value = (
-        np.concatenate(comm.allgather(_join(parts_, kind)))
-        for parts_, kind in ((rows, np.int64), (columns, np.int64), (values, np.float64))
-    )
-    return coo_array((value, (row, column)), shape=(dimension, num_bodies * k)).tocsr(), defect
-
-
-def _join(parts: list[Array], dtype: Any) -> Array:
-    return np.concatenate([np.empty(0, dtype=dtype), *parts])

@@ -9,6 +9,7 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
+from tfeti_dolfinx.dual.naming import listed
 from tfeti_dolfinx.dual.operator import (
     PRECONDITIONERS,
     BlockOperator,
@@ -16,9 +17,11 @@ from tfeti_dolfinx.dual.operator import (
     dual_operator,
     linear_term,
 )
-from tfeti_dolfinx.dual.recovery import recover
+from tfeti_dolfinx.dual.recovery import moved, recover
+from tfeti_dolfinx.dual.smallest import nearly_free, smallest_motion
 from tfeti_dolfinx.dual.solvability import check_solvable
 from tfeti_dolfinx.gluing.constraints import Constraints
+from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Unbounded
 from tfeti_dolfinx.qp.problem import QP, Coarse, NoCoarse
 from tfeti_dolfinx.subdomains.block import Block
@@ -34,6 +37,7 @@ class Dual:
         body_names: Names of all bodies.
         mode_names: Names of their candidate modes.
         pc_type: Preconditioner: none, lumped or dirichlet.
+        options_prefix: Prefix of all PETSc options.
 
     Attributes:
         F: B K⁺ Bᵀ.
@@ -41,9 +45,11 @@ class Dual:
         preconditioner: The preconditioner, or None.
         coarse: The coarse space.
         num_inequalities: Inequality rows of all ranks.
+        nearly_free: After ``recover``: motions that contacts with a force hold hardly or not.
 
     Raises:
         NoSolutionError: The load moves a body that nothing holds.
+        FactorError: A matrix could not be factored.
     """
 
     def __init__(
@@ -54,9 +60,11 @@ class Dual:
         body_names: Sequence[str],
         mode_names: Sequence[str],
         pc_type: str,
+        options_prefix: str = "tfeti_",
     ) -> None:
         self.constraints, self.blocks = constraints, blocks
         self.body_of_block, self.num_bodies = body_of_block, len(body_names)
+        self._names, self.nearly_free = (body_names, mode_names), list[dict[str, object]]()
         B, comm = constraints.B, constraints.B.getComm().tompi4py()
         self.F = dual_operator(B, blocks)
         self.preconditioner: BlockOperator | None = None
@@ -64,11 +72,12 @@ class Dual:
         if pc_type != "none":
             self._scaled = ScaledGluing(B, constraints.weights)
             self.preconditioner = PRECONDITIONERS[pc_type](self._scaled, blocks)
-        self.coarse = CoarseSpace(B, blocks, body_of_block, len(body_names), comm)
         bounded = constraints.inequalities
+        self.coarse = CoarseSpace(
+            B, blocks, body_of_block, len(body_names), bounded, comm, f"{options_prefix}coarse_"
+        )
         self.num_inequalities = comm.allreduce(bounded.stop - bounded.start)
-        load_norm = np.sqrt(comm.allreduce(sum(block.load_norm**2 for block in blocks)))
-        check_solvable(self.coarse, bounded, float(load_norm), body_names, mode_names)
+        check_solvable(self.coarse, body_names, mode_names)
         self.d = linear_term(B, constraints.c, blocks)
 
     def qp(self) -> QP:
@@ -78,18 +87,26 @@ class Dual:
         feasible: FeasibleSet = bounds if self.num_inequalities else Unbounded()
         return QP(self.F, self.d, coarse, feasible, self.preconditioner)
 
-    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec) -> list[Array]:
-        """Displacements that belong to multipliers.
+    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, error: float) -> list[Array]:
+        """Displacements that belong to multipliers: of equal ones the smallest.
 
         Args:
             lam: The multipliers λ.
             gradient: Fλ − d up to the range of Gᵀ; on bound components the multiplier ν.
+            error: How large multipliers may be by the solver's error alone.
         """
         constraints, bounded = self.constraints, self.constraints.inequalities
         nu = np.zeros(constraints.num_rows)
         closed = lam.array_r[bounded] <= 0.0
         nu[bounded] = np.where(closed, gradient.array_r[bounded], 0.0)
-        return recover(constraints.B, constraints.c, self.blocks, self.coarse, lam, bounded, nu)
+        u, gap = recover(constraints.B, constraints.c, self.blocks, self.coarse, lam, nu)
+        motions, force = nearly_free(self.coarse, lam.array_r, error)
+        words = listed(motions, self.coarse.bodies, *self._names)
+        self.nearly_free = agreed(self.coarse.comm, words)
+        if motions.count == 0:
+            return u
+        alpha = smallest_motion(self.coarse, self.blocks, u, gap, motions, force)
+        return moved(self.blocks, u, self.coarse, alpha)
 
     def destroy(self) -> None:
         """Destroy the PETSc objects."""

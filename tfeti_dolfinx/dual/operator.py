@@ -12,6 +12,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.errors import raised_on_all_ranks, require
 from tfeti_dolfinx.subdomains.block import Block
 
 
@@ -38,19 +39,27 @@ class BlockOperator:
         B: Dual rows × trace unknowns, MPIAIJ (or scaled).
         blocks: This rank's Blocks, in the order of B's local columns.
         apply: The local operator: from a Block and a trace vector to a trace vector.
+        name: Its name for ``Block.prepare``; all ranks raise what it raises.
 
     Attributes:
         count: Multiplications so far, by who they are charged to (``"solver"`` by default).
     """
 
     def __init__(
-        self, B: Gluing, blocks: Sequence[Block], apply: Callable[[Block, Array], Array]
+        self,
+        B: Gluing,
+        blocks: Sequence[Block],
+        apply: Callable[[Block, Array], Array],
+        name: str,
     ) -> None:
         self.B, self.blocks, self.apply = B, blocks, apply
         self.slices = trace_slices(blocks)
         self.count: Counter[str] = Counter()
         self._payer = "solver"
         self._w, self._v = B.createVecRight(), B.createVecRight()
+        with raised_on_all_ranks(self._w.getComm().tompi4py()):
+            for block in blocks:
+                block.prepare(name)
 
     @contextmanager
     def charged_to(self, payer: str) -> Iterator[None]:
@@ -84,7 +93,7 @@ def trace_slices(blocks: Sequence[Block]) -> list[slice]:
 
 def dual_operator(B: PETSc.Mat, blocks: Sequence[Block]) -> BlockOperator:
     """F = B K⁺ Bᵀ."""
-    return BlockOperator(B, blocks, lambda block, w: block.apply_pinv(w))
+    return BlockOperator(B, blocks, lambda block, w: block.apply_pinv(w), "pinv")
 
 
 class ScaledGluing:
@@ -124,12 +133,12 @@ class ScaledGluing:
 
 def lumped_preconditioner(B: Gluing, blocks: Sequence[Block]) -> BlockOperator:
     """B K_bb Bᵀ (Farhat, Roux 1991), B or rather B_D."""
-    return BlockOperator(B, blocks, lambda block, w: block.apply_stiffness(w))
+    return BlockOperator(B, blocks, lambda block, w: block.apply_stiffness(w), "stiffness")
 
 
 def dirichlet_preconditioner(B: Gluing, blocks: Sequence[Block]) -> BlockOperator:
     """B S Bᵀ (Farhat, Mandel, Roux 1994), B or rather B_D."""
-    return BlockOperator(B, blocks, lambda block, w: block.apply_schur(w))
+    return BlockOperator(B, blocks, lambda block, w: block.apply_schur(w), "schur")
 
 
 PRECONDITIONERS = {"lumped": lumped_preconditioner, "dirichlet": dirichlet_preconditioner}
@@ -147,7 +156,11 @@ def linear_term(B: PETSc.Mat, c: PETSc.Vec, blocks: Sequence[Block]) -> PETSc.Ve
 
 
 def check_operator(F: Any, like: PETSc.Vec, tol: float = 1e-10) -> None:
-    """Assert that an operator is symmetric and positive semidefinite on random vectors."""
+    """Check that an operator is symmetric and positive semidefinite on random vectors. Collective.
+
+    Raises:
+        ConformanceError: It is not; the message says which.
+    """
     rng = np.random.default_rng(like.getComm().getRank())
     x, y, Fx, Fy = (like.duplicate() for _ in range(4))
     for _ in range(3):
@@ -155,7 +168,7 @@ def check_operator(F: Any, like: PETSc.Vec, tol: float = 1e-10) -> None:
             vec.array[:] = rng.standard_normal(vec.getLocalSize())
         F.mult(x, Fx)
         F.mult(y, Fy)
-        assert x.dot(Fx) >= 0.0
-        assert abs(y.dot(Fx) - x.dot(Fy)) <= tol * Fx.norm() * y.norm()
+        require(x.dot(Fx) >= 0.0, "xᵀFx ≥ 0")
+        require(abs(y.dot(Fx) - x.dot(Fy)) <= tol * Fx.norm() * y.norm(), "yᵀFx = xᵀFy")
     for vec in (x, y, Fx, Fy):
         vec.destroy()

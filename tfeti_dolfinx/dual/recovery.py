@@ -6,11 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 from petsc4py import PETSc
+from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace, SemidefiniteFactor
 from tfeti_dolfinx.dual.operator import trace_slices
 from tfeti_dolfinx.subdomains.block import Block
+
+# of GGᵀ, added to G_f G_fᵀ: rows with a force that hold a motion by less are not asked about it
+DAMPING = 1e-8
 
 
 def recover(
@@ -19,13 +23,13 @@ def recover(
     blocks: Sequence[Block],
     coarse: CoarseSpace,
     lam: PETSc.Vec,
-    bounded: slice,
     nu: Array,
-) -> list[Array]:
+) -> tuple[list[Array], Array]:
     """u = K⁺(f − Bᵀλ) + Rα. Collective.
 
-    α = (G_f G_fᵀ)⁻¹G_f(Fλ − d) on the free rows f, those of equalities and of λ_N > 0. Where the
-    free rows let a body move that all rows together hold, α = (GGᵀ)⁻¹G(Fλ − d − ν).
+    α = (GGᵀ)⁻¹G(Fλ − d − ν) makes the rows' residuals vanish, but for the gaps of open rows, ν
+    as the solver left it. A step of the damped normal equations on the rows f of equalities and
+    of λ_N > 0 makes theirs as small as α can.
 
     Args:
         B: Dual rows × trace unknowns.
@@ -33,11 +37,10 @@ def recover(
         blocks: This rank's Blocks.
         coarse: The coarse space.
         lam: The multipliers.
-        bounded: Local rows with λ ≥ 0.
         nu: Multipliers of λ_N ≥ 0 on all local rows, zero on free ones, shape ``(m,)``.
 
     Returns:
-        Displacements of each Block, each of shape ``(n_s,)``.
+        Displacements of each Block, each of shape ``(n_s,)``, and c − B u, shape ``(m,)``.
     """
     w, v, residual = B.createVecRight(), B.createVecRight(), c.duplicate()
     B.multTranspose(lam, w)
@@ -47,27 +50,38 @@ def recover(
         v.array[part] = u_s[block.trace_dofs]
     B.mult(v, residual)
     residual.aypx(-1.0, c)  # c − B K⁺(f − Bᵀλ) = Fλ − d
-    alpha = _alpha(coarse, residual.array_r, lam.array_r, bounded, nu)
+    gap = np.array(residual.array_r)
     for vec in (w, v, residual):
         vec.destroy()
-    return [
-        u_s + block.kernel_motion(a)
-        for u_s, block, a in zip(u, blocks, coarse.alpha_of(alpha), strict=True)
-    ]
+    alpha = _alpha(coarse, gap, carrying(lam.array_r, coarse.bounded), nu)
+    return moved(blocks, u, coarse, alpha), gap - coarse.Gt @ alpha
 
 
-def _alpha(coarse: CoarseSpace, gradient: Array, lam: Array, bounded: slice, nu: Array) -> Array:
+def carrying(lam: Array, bounded: slice) -> Array:
+    """Rows of equalities, and those of λ_N > 0."""
+    flags = np.ones(len(lam), dtype=bool)
+    flags[bounded] = lam[bounded] > 0.0
+    return flags
+
+
+def moved(
+    blocks: Sequence[Block], u: Sequence[Array], coarse: CoarseSpace, alpha: Array
+) -> list[Array]:
+    """u + Rα."""
+    parts = coarse.alpha_of(alpha)
+    return [v + block.kernel_motion(a) for v, block, a in zip(u, blocks, parts, strict=True)]
+
+
+def _alpha(coarse: CoarseSpace, gradient: Array, free: Array, nu: Array) -> Array:
     """Kernel coordinates that make the rows' residuals vanish as far as they can."""
     if coarse.dimension == 0:
         return np.zeros(0)
-    free = np.ones(len(lam), dtype=bool)
-    free[bounded] = lam[bounded] > 0.0
+    alpha = coarse.solve(coarse.G(gradient - nu))
     if coarse.comm.allreduce(int(np.sum(~free))) == 0:
-        return coarse.solve(coarse.G(gradient))
-    motions = coarse.null_motions(free)
-    if motions.shape[1] > coarse.free_motions.shape[1]:
-        return coarse.solve(coarse.G(gradient - nu))
-    factor = SemidefiniteFactor(coarse.gram(free), coarse.modes_of(motions))
-    alpha = factor.solve(coarse.G(np.where(free, gradient, 0.0)))
+        return alpha
+    damped = csr_array(coarse.gram(free) + DAMPING * coarse.gram())
+    factor = SemidefiniteFactor(damped, coarse.null)
+    left = np.where(free, gradient - coarse.Gt @ alpha, 0.0)
+    step = factor.solve(coarse.G(left))
     factor.destroy()
-    return alpha
+    return alpha + step

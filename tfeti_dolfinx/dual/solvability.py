@@ -3,34 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
-from mpi4py import MPI
-from scipy.sparse import csr_array
+from scipy.optimize import linprog
+from scipy.sparse import csr_array, hstack
+from scipy.sparse.csgraph import connected_components
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.dual.coarse import NULL, CoarseSpace, SemidefiniteFactor
-from tfeti_dolfinx.errors import NoSolutionError
+from tfeti_dolfinx.dual.bodies import Bodies
+from tfeti_dolfinx.dual.coarse import CoarseSpace
+from tfeti_dolfinx.dual.cuts import Rows, minimise
+from tfeti_dolfinx.dual.motions import Motions
+from tfeti_dolfinx.dual.naming import free_to_move
+from tfeti_dolfinx.errors import NoSolutionError, TfetiError
+from tfeti_dolfinx.parallel import agreed
 
-BALANCE = 1e-9
-TINY = 1e-14
-# of the largest coefficient: what takes part in a motion, what it is named after; bodies named
-PART, DOMINANT, NAMED = 1e-3, 0.3, 4
+# Least slope against a contact, of a motion of mean square 1, that counts as an overlap; the
+# tolerances of the linear programs are finer.
+SLOPE, LP_TOLERANCE = 1e-9, 1e-10
+# Columns from which the interior point method with its crossover beats the simplex method.
+LARGE = 2000
 
 
 def check_solvable(
-    coarse: CoarseSpace,
-    bounded: slice,
-    load_norm: float,
-    body_names: Sequence[str],
-    mode_names: Sequence[str],
+    coarse: CoarseSpace, body_names: Sequence[str], mode_names: Sequence[str]
 ) -> None:
     """Raise if the load moves a body that nothing holds. Collective.
 
     Args:
         coarse: The coarse space.
-        bounded: Local rows with λ ≥ 0.
-        load_norm: ‖f‖ over all subdomains.
         body_names: Names of the bodies.
         mode_names: Names of their modes.
 
@@ -39,127 +41,111 @@ def check_solvable(
     """
     if coarse.dimension == 0:
         return
-    push = coarse.free_modes.T @ coarse.e
-    if np.linalg.norm(push) > BALANCE * load_norm:
-        motion = coarse.free_motions @ (coarse.free_motions.T @ (coarse.body_modes.T @ coarse.e))
-        raise NoSolutionError(
-            f"{_name(motion, body_names, mode_names)}: nothing resists that and the load drives "
-            "it; add a Dirichlet condition, a contact or a spring, or balance the load"
-        )
-    motion = escape(coarse, bounded)
+    load = coarse.bodies.modes.T @ coarse.e
+    motion = agreed(coarse.comm, _driven(coarse.free_motions, load, coarse.bodies))
+    reason = (
+        "nothing resists that and the load drives it; add a Dirichlet condition, a contact or a "
+        "spring, or balance the load"
+    )
+    if motion is None:
+        motion = escape(coarse)
+        reason = "only contact could resist that, and the load drives out of contact"
     if motion is not None:
-        raise NoSolutionError(
-            f"{_name(motion, body_names, mode_names)}: only contact could resist that, and the "
-            "load drives out of contact"
-        )
+        words = free_to_move(coarse.bodies.amounts(motion), body_names, mode_names)
+        raise NoSolutionError(f"{words}: {reason}")
 
 
-def _name(motion: Array, body_names: Sequence[str], mode_names: Sequence[str]) -> str:
-    """The bodies that take part in a motion, and what it is mostly."""
-    parts = np.abs(motion.reshape(len(body_names), len(mode_names)))
-    moving = np.flatnonzero(parts.max(axis=1) > PART * parts.max())
-    share = parts[moving].max(axis=0)
-    modes = " and ".join(mode_names[m] for m in np.flatnonzero(share > DOMINANT * share.max()))
-    if len(moving) == 1:
-        return f"{body_names[moving[0]]} is free to move ({modes})"
-    names = ", ".join(body_names[b] for b in moving[:NAMED])
-    more = f" and {len(moving) - NAMED} more" if len(moving) > NAMED else ""
-    return f"{names}{more} are free to move together ({modes})"
+def _driven(free: Motions, load: Array, bodies: Bodies) -> Array | None:
+    """The part of the load on free motions, if it is more than rounding."""
+    alone = (free.alone @ (free.alone.T @ load)).reshape(bodies.count, bodies.k)
+    alone[np.linalg.norm(alone, axis=1) <= bodies.negligible] = 0.0
+    if np.any(alone):
+        return np.asarray(alone.ravel())
+    Q = np.linalg.qr(free.joint)[0]
+    joint = Q @ (Q.T @ load)
+    each = np.linalg.norm(joint.reshape(bodies.count, bodies.k), axis=1)
+    return joint if joint @ load > bodies.negligible @ each else None
 
 
-def escape(coarse: CoarseSpace, bounded: slice) -> Array | None:
+def escape(coarse: CoarseSpace) -> Array | None:
     """A motion of the bodies that opens contacts and on which the load does work. Collective.
 
-    By Farkas' lemma Gλ = e has a solution with λ_N ≥ 0 just if there is none. With J = B R Z, Z
-    the bodies' modes, it is sought by Newton's method for
-    min ½‖J_E z‖² + ½‖(J_N z)₊‖² + ½ε‖z‖² − zᵀZᵀe, whose minimiser tends to a multiple of it.
+    By Farkas' lemma Gλ = e has a solution with λ_N ≥ 0 just if there is none. With Z the motions
+    that equality rows and springs leave, max zᵀe over J_N z ≤ 0, −1 ≤ z ≤ 1 is a linear program.
 
     Returns:
-        Coefficients of the bodies' modes, or None.
+        Coordinates of the bodies' motion, or None.
     """
-    basis = coarse.motion_basis
-    held = np.ones(coarse.Gt.shape[0], dtype=bool)
-    held[bounded] = False
-    H_E = basis.T @ coarse.body_gram(held) @ basis
-    if np.linalg.eigvalsh(H_E).min(initial=1.0) > NULL:
+    bodies, Z = coarse.bodies, coarse.unheld.alone
+    body = np.repeat(np.arange(bodies.count), coarse.unheld.free.sum(axis=1))
+    J_N = csr_array(coarse.J[coarse.bounded] @ Z)
+    rows = Rows(J_N, np.zeros(J_N.shape[0]), body)
+    load, noise = Z.T @ (bodies.modes.T @ coarse.e), bodies.negligible[body]
+    if agreed(coarse.comm, bool(np.all(np.abs(load) <= noise))):
         return None
-    J_N = np.asarray((coarse.Gt[bounded] @ coarse.body_modes) @ basis)
-    load = basis.T @ (coarse.body_modes.T @ coarse.e)
-    if np.linalg.norm(load) <= TINY:
+    # parts of the scene that do not meet may be loaded by very different forces
+    part = _parts(coarse, rows, body)
+    largest = np.zeros(part.max() + 1)
+    np.maximum.at(largest, part, np.abs(load))
+    largest[largest == 0.0] = 1.0
+    load, noise = load / largest[part], noise / largest[part]
+    comm, first = coarse.comm, rows.extremes()
+    y = minimise(rows, lambda A, _: _most_work(A, load, noise), SLOPE, comm, first)
+    if y is not None:
+        y = minimise(rows, lambda A, _: _least_motion(A, load), SLOPE, comm, first)
+    return None if y is None else np.asarray(Z @ y)
+
+
+def _parts(coarse: CoarseSpace, rows: Rows, body: Array) -> Array:
+    """For each column the part of the scene, connected through contact rows, that it is in."""
+    links = coarse.comm.allgather(rows.links(coarse.bodies.count))
+    return connected_components(csr_array(sum(links)), directed=False)[1][body]
+
+
+def _most_work(A: csr_array, load: Array, noise: Array) -> Array | None:
+    """A motion of much work, if that is more than rounding; A y ≤ 0, −1 ≤ y ≤ 1."""
+    y = _minimiser(-load, A, bounds=(-1.0, 1.0))
+    if load @ y <= noise.max():
         return None
-    z = _one_sided_newton(H_E, J_N, load, coarse.comm)
-    z /= max(float(np.linalg.norm(z)), 1e-300)
-    resistance = z @ H_E @ z + coarse.comm.allreduce(float(np.sum(np.maximum(J_N @ z, 0.0) ** 2)))
-    escapes = resistance <= NULL and z @ load > BALANCE * np.linalg.norm(load)
-    return basis @ z if escapes else None
+    # Motions that cost nothing are in y, too: of heavily loaded bodies they would hide that of a
+    # light one. Work less what counts as none has no such motions.
+    y = _halves(_minimiser(np.concatenate((noise - load, noise + load)), _both(A), bounds=(0, 1)))
+    # a cone: a motion that gains something gains more until a bound stops it
+    return y if np.abs(y).max() > 0.5 and load @ y > noise @ np.abs(y) else None
 
 
-def _one_sided_newton(H_E: Array, J_N: Array, load: Array, comm: MPI.Intracomm) -> Array:
-    """Minimise the piecewise quadratic of ``escape`` by damped Newton steps."""
-    epsilon = TINY * max(1.0, np.abs(H_E).max())
-    z: Array = np.zeros(len(load))
-
-    def evaluate(z: Array) -> tuple[float, Array, Array]:
-        push = np.maximum(J_N @ z, 0.0)
-        active = J_N[push > 0.0]
-        parts = np.concatenate(([push @ push], J_N.T @ push, (active.T @ active).ravel()))
-        comm.Allreduce(MPI.IN_PLACE, parts, op=MPI.SUM)
-        n = len(z)
-        gradient = H_E @ z + parts[1 : n + 1] + epsilon * z - load
-        hessian = H_E + parts[n + 1 :].reshape(n, n) + epsilon * np.eye(n)
-        cost = 0.5 * (z @ H_E @ z + parts[0] + epsilon * z @ z) - load @ z
-        return float(cost), gradient, hessian
-
-    for _ in range(100):
-        value, gradient, hessian = evaluate(z)
-        if np.linalg.norm(gradient) <= 1e-10 * np.linalg.norm(load):
-            break
-        step = -np.linalg.lstsq(hessian, gradient, rcond=None)[0]
-        damping = 1.0
-        while damping > 1e-8 and evaluate(z + damping * step)[0] > value:
-            damping *= 0.5
-        z = z + damping * step
-    return z
+def _least_motion(A: csr_array, load: Array) -> Array:
+    """The least motion (sum of moduli) of unit work, scaled to 1; A y ≤ 0."""
+    work = np.concatenate((load, -load))[None, :]
+    y = _halves(_minimiser(np.ones(work.size), _both(A), A_eq=work, b_eq=np.ones(1)))
+    return y / np.abs(y).max()
 
 
-def feasible_particular(coarse: CoarseSpace, bounded: slice) -> Array:
-    """λ̄ of min ½‖λ‖² subject to Gλ = e, λ_N ≥ 0. Collective.
+def _both(A: csr_array) -> csr_array:
+    """A for y = p − q."""
+    return csr_array(hstack([A, -A]))
 
-    λ̄ = Gᵀα on free rows and (Gᵀα)₊ on bounded ones; α by a semismooth Newton method, each
-    step of which factors G_f G_fᵀ, f the rows that carry a force (Dostál's talk, item (ii)).
 
-    Args:
-        coarse: The coarse space; the problem has been found solvable.
-        bounded: Local rows with λ ≥ 0.
+def _halves(pq: Array) -> Array:
+    """y = p − q."""
+    p, q = np.split(pq, 2)
+    return np.asarray(p - q)
 
-    Returns:
-        This rank's part of λ̄.
+
+def _minimiser(cost: Array, A: csr_array, **rest: Any) -> Array:
+    """The minimiser of a linear program over A y ≤ 0.
+
+    Raises:
+        TfetiError: Neither the simplex nor the interior point method found it.
     """
-    carrying = np.ones(coarse.Gt.shape[0], dtype=bool)
-    gram, alpha = coarse.gram(), coarse.solve(coarse.e)
-    for _ in range(100):
-        force = coarse.Gt @ alpha
-        carrying[bounded] = force[bounded] > 0.0
-        residual = coarse.e - coarse.G(np.where(carrying, force, 0.0))
-        if np.linalg.norm(residual) <= 1e-13 * np.linalg.norm(coarse.e):
-            break
-        damped = csr_array(coarse.gram(carrying) + 1e-8 * gram)
-        factor = SemidefiniteFactor(damped, coarse.free_modes)
-        step = factor.solve(residual)
-        factor.destroy()
-        alpha = alpha + _damping(coarse, bounded, alpha, step) * step
-    return np.where(carrying, coarse.Gt @ alpha, 0.0)
-
-
-def _damping(coarse: CoarseSpace, bounded: slice, alpha: Array, step: Array) -> float:
-    """Step length that does not raise ½‖λ(α)‖² − αᵀe."""
-
-    def cost(alpha: Array) -> float:
-        force = coarse.Gt @ alpha
-        force[bounded] = np.maximum(force[bounded], 0.0)
-        return 0.5 * float(coarse.comm.allreduce(float(force @ force))) - float(alpha @ coarse.e)
-
-    start, length = cost(alpha), 1.0
-    while length > 1e-8 and cost(alpha + length * step) > start:
-        length *= 0.5
-    return length
+    options = {
+        "primal_feasibility_tolerance": LP_TOLERANCE,
+        "dual_feasibility_tolerance": LP_TOLERANCE,
+    }
+    for method in ("highs-ipm", "highs-ds") if len(cost) > LARGE else ("highs-ds", "highs-ipm"):
+        found = linprog(
+            cost, A_ub=A, b_ub=np.zeros(A.shape[0]), method=method, options=options, **rest
+        )
+        if found.status == 0:
+            return np.asarray(found.x)
+    raise TfetiError(f"a linear program of the solvability test failed: {found.message}")

@@ -8,7 +8,9 @@ import numpy as np
 
 from tfeti_dolfinx.arrays import Array, sum_rows
 from tfeti_dolfinx.contact.records import ContactRecords
+from tfeti_dolfinx.contact.surfaces import group_points
 from tfeti_dolfinx.errors import NoSolutionError, raised_on_all_ranks
+from tfeti_dolfinx.gluing.consistency import check_consistent
 from tfeti_dolfinx.gluing.prescribed import Prescribed
 from tfeti_dolfinx.gluing.rows import Rows
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -55,7 +57,8 @@ def inequality_rows(
         length: A length of the scene; gaps below 1e-10 of it count as zero.
 
     Raises:
-        NoSolutionError: Prescribed components alone violate a condition.
+        NoSolutionError: Prescribed components alone violate a condition, or the conditions of a
+            node contradict each other.
     """
     sums = np.add.reduceat(weights, dofs.copy_offsets[:-1]) if len(weights) else weights
     flag, value, total = dofs.lookup(records.entry_group, prescribed.flag, prescribed.value, sums)
@@ -70,8 +73,10 @@ def inequality_rows(
     before, after = squared_norms(records.coefficients), squared_norms(free)
     kept = records.near & (after > NOTHING_LEFT**2 * before)
     decided = records.near & ~kept
+    points = group_points(dofs)
     with raised_on_all_ranks(dofs.comm):
         _check_dropped(rhs[decided], length)
+        check_consistent(records, free, rhs, kept, points, length)
     condition = np.flatnonzero(kept)
     scale = 1.0 / np.sqrt(after[kept])
     return InequalityRows(

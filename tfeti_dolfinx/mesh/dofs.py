@@ -131,11 +131,25 @@ class TornDofs:
         Returns:
             The sums, shape ``(g, ...)``.
         """
+        return self.reduce_on_owners(groups, values, np.add, 0)
+
+    def reduce_on_owners(self, groups: Array, values: Array, op: np.ufunc, initial: Any) -> Array:
+        """Combine the values that all ranks give for each owned group. Collective.
+
+        Args:
+            groups: Global groups, any of them, shape ``(k,)``.
+            values: One value (or row) for each, shape ``(k, ...)``.
+            op: ``np.add``, ``np.maximum`` or ``np.minimum``.
+            initial: Neutral element of ``op``.
+
+        Returns:
+            Shape ``(g, ...)``.
+        """
         exchange = Exchange(self.comm, owner_of(self.group_offsets, groups))
         slot = exchange.send(groups) - self.group_offsets[self.comm.rank]
-        sums = np.zeros((self.num_groups, *values.shape[1:]), dtype=values.dtype)
-        np.add.at(sums, slot, exchange.send(values))
-        return sums
+        out = np.full((self.num_groups, *values.shape[1:]), initial, dtype=values.dtype)
+        op.at(out, slot, exchange.send(values))
+        return out
 
     @cached_property
     def scalar(self) -> tuple[fem.FunctionSpace, Array]:

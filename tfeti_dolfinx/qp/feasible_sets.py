@@ -9,6 +9,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.errors import require
 
 
 class FeasibleSet(Protocol):
@@ -118,11 +119,14 @@ class Unbounded:
 
 
 def check_feasible_set(feasible: FeasibleSet, like: PETSc.Vec, seed: int = 0) -> None:
-    """Assert what MPRGP relies on, at random points of any feasible set. Collective.
+    """Check what MPRGP relies on, at random points of any feasible set. Collective.
 
     The projection is idempotent and the nearest point; a maximal step stays in the set; the
     projected gradient vanishes exactly where a projected step does not move; the reduced free
     gradient is not longer than the free one.
+
+    Raises:
+        ConformanceError: Something of that does not hold; the message says what.
     """
     rng = np.random.default_rng(seed + like.getComm().getRank())
     x, y, g, phi, beta, z = (like.duplicate() for _ in range(6))
@@ -134,26 +138,28 @@ def check_feasible_set(feasible: FeasibleSet, like: PETSc.Vec, seed: int = 0) ->
         feasible.project(y)
         z.axpy(-1.0, x)  # z = x₀ − P(x₀) makes an obtuse angle with every y − P(x₀)
         y.axpy(-1.0, x)
-        assert z.dot(y) <= 1e-12 * (1.0 + z.norm() * y.norm())
+        require(z.dot(y) <= 1e-12 * (1.0 + z.norm() * y.norm()), "P(x) is the nearest point of Ω")
         x.copy(z)
         feasible.project(z)
         z.axpy(-1.0, x)
-        assert z.norm() <= 1e-14 * (1.0 + x.norm())
+        require(z.norm() <= 1e-14 * (1.0 + x.norm()), "P(P(x)) = P(x)")
 
         feasible.split(x, g, phi, beta)
-        assert -1e-12 <= feasible.reduced(x, phi, 0.5) <= phi.dot(phi) * (1.0 + 1e-12)
+        reduced = feasible.reduced(x, phi, 0.5)
+        require(-1e-12 <= reduced <= phi.dot(phi) * (1.0 + 1e-12), "0 ≤ φ̃ᵀφ ≤ φᵀφ")
         step = feasible.max_step(x, phi)
         x.copy(z)
         z.axpy(-min(step, 1e3), phi)
         z.copy(y)
         feasible.project(y)
         y.axpy(-1.0, z)
-        assert y.norm() <= 1e-10 * (1.0 + z.norm())
+        require(y.norm() <= 1e-10 * (1.0 + z.norm()), "x − αφ ∈ Ω for the largest step α")
         x.copy(z)
         z.axpy(-1e-6, g)
         feasible.project(z)
         z.axpy(-1.0, x)
         phi.axpy(1.0, beta)
-        assert abs(z.norm() - 1e-6 * phi.norm()) <= 1e-4 * 1e-6 * (1.0 + phi.norm())
+        apart = abs(z.norm() - 1e-6 * phi.norm())
+        require(apart <= 1e-4 * 1e-6 * (1.0 + phi.norm()), "φ + β is the projected gradient")
     for vec in (x, y, g, phi, beta, z):
         vec.destroy()

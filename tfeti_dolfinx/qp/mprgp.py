@@ -48,10 +48,12 @@ class Iterate:
         self.g.axpy(-alpha, Ap)
 
     def move_to(self, target: PETSc.Vec) -> None:
-        """x ← target; multiplies by A once. The target is overwritten."""
-        target.axpy(-1.0, self.x)
-        self.A.mult(target, self.Ap)
-        self.move(-1.0, target, self.Ap)
+        """x ← target; multiplies by A once, and overwrites the direction p."""
+        target.copy(self.p)
+        self.p.axpy(-1.0, self.x)
+        self.A.mult(self.p, self.Ap)
+        self.g.axpy(1.0, self.Ap)
+        target.copy(self.x)  # not x + (target − x), which rounds: what is on its bound stays there
 
     def refresh(self, linear: PETSc.Vec) -> None:
         """g = A x + c anew, for what rounding has added up in it; multiplies by A once."""

@@ -16,7 +16,7 @@ from tfeti_dolfinx.qp.stopping import StoppingRule
 ROUNDING = 1e-14
 # where nothing fulfils Bx = 0, ‖Bx‖ tends to a limit: that it has changed by less than this share,
 # and M not at all, for so many outer steps is a stall; the slowest scenes change by 1e-3 a step
-CHANGE, PATIENCE = 1e-3, 100
+CHANGE, PATIENCE = 1e-3, 1000
 # of the tolerance: inner problems are not solved more exactly than that
 ENOUGH = 0.1
 

@@ -13,6 +13,7 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.subdomains.factor import say_if_not_cholmod
 from tfeti_dolfinx.subdomains.sparse_block import Counters, SparseBlock
 
 
@@ -24,6 +25,7 @@ def sparse_blocks(
     trace: Array,
     counters: Counters,
     kplus_type: str,
+    prefix: str = "tfeti_sub_",
 ) -> list[SparseBlock]:
     """One SparseBlock for each subdomain of this rank. Collective.
 
@@ -35,10 +37,13 @@ def sparse_blocks(
         trace: Local primal unknowns that rows of B touch, ascending.
         counters: Counts factorisations.
         kplus_type: Kind of the generalised inverse.
+        prefix: Prefix of the factors' PETSc options.
     """
+    say_if_not_cholmod(dofs.comm)
     gdim = decomposition.mesh.geometry.dim
     x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node, :gdim]
-    frames = _body_frames(dofs, decomposition, x)
+    shares = 1.0 / dofs.spread(dofs.multiplicity)
+    frames = _body_frames(dofs, decomposition, x, shares)
     loads = dofs.to_primal(f)
     dolfinx = dofs.dolfinx_dofs()
     primal = np.empty(len(dolfinx), dtype=np.int32)
@@ -59,6 +64,8 @@ def sparse_blocks(
                     body_frame=frames[decomposition.body_of_subdomain[subdomain]],
                     counters=counters,
                     kplus_type=kplus_type,
+                    prefix=prefix,
+                    shares=shares[nodes],
                 )
             )
     return blocks
@@ -81,12 +88,12 @@ def _submatrix(K: Any, rows: Array, primal: Array, first: int) -> csr_array:
 
 
 def _body_frames(
-    dofs: TornDofs, decomposition: Decomposition, x: Array
+    dofs: TornDofs, decomposition: Decomposition, x: Array, shares: Array
 ) -> list[tuple[Array, float]]:
-    """Centre and size of each body, the same on all ranks."""
+    """Centre and size of each body, the same on all ranks and for all subdomains."""
     body = decomposition.body_of_subdomain[dofs.node_subdomain]
     sums = np.zeros((decomposition.num_bodies, 1 + x.shape[1]))
-    np.add.at(sums, body, np.column_stack((np.ones(len(x)), x)))
+    np.add.at(sums, body, shares[:, None] * np.column_stack((np.ones(len(x)), x)))
     dofs.comm.Allreduce(MPI.IN_PLACE, sums, op=MPI.SUM)
     centre = sums[:, 1:] / sums[:, :1]
     length = np.zeros(decomposition.num_bodies)

@@ -1,16 +1,38 @@
-"""Sparse Cholesky factors by CHOLMOD, through PETSc."""
+"""Sparse Cholesky factors through PETSc: CHOLMOD, or what this PETSc has in its place."""
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.errors import FactorError
+
+log = logging.getLogger(__name__)
+
+# in the order of preference
+SOLVERS = ("cholmod", "mumps", "petsc")
+# without these an indefinite matrix would pass: CHOLMOD's simplicial LDLᵀ takes pivots of any
+# sign, and MUMPS tells their signs only if it also looks for pivots that are zero
+DEFINITE = {
+    "mat_cholmod_factor": "SUPERNODAL",
+    "mat_mumps_icntl_13": "1",
+    "mat_mumps_icntl_24": "1",
+}
+# PETSc's error codes, which petsc4py does not name
+OUT_OF_MEMORY, NO_SUPPORT, MISSING_SOLVER = 55, 56, 92
+ZERO_PIVOTS = (71, 81)
+CHOLMOD_OUT_OF_MEMORY = "CHOLMOD factorization failed with status -2"
 
 
-class NotPositiveDefiniteError(ArithmeticError):
+class NotPositiveDefiniteError(FactorError, ArithmeticError):
     """A matrix that should have a Cholesky factor has none."""
 
 
@@ -19,37 +41,30 @@ class CholeskyFactor:
 
     Args:
         A: scipy sparse matrix, both triangles, shape ``(n, n)``.
+        prefix: Prefix of the PETSc options ``pc_factor_...`` and ``mat_...`` that it heeds.
 
     Raises:
         NotPositiveDefiniteError: A is not positive definite.
+        FactorError: There is no memory for the factor, PETSc has no such solver, or it fails.
     """
 
-    def __init__(self, A: Any) -> None:
-        A = A.tocsr()
-        A.sort_indices()
-        index = PETSc.IntType
-        matrix = PETSc.Mat().createAIJWithArrays(
-            A.shape,
-            (A.indptr.astype(index), A.indices.astype(index), A.data),
-            comm=PETSc.COMM_SELF,
-        )
-        matrix.setOption(PETSc.Mat.Option.SPD, True)
-        pc = PETSc.PC().create(PETSc.COMM_SELF)
-        pc.setType(PETSc.PC.Type.CHOLESKY)
-        pc.setFactorSolverType(PETSc.Mat.SolverType.CHOLMOD)
-        pc.setOperators(matrix)
+    def __init__(self, A: Any, prefix: str = "tfeti_sub_") -> None:
+        matrix = _petsc_matrix(A)
         self._b, self._x = matrix.createVecs()
+        pc = PETSc.PC().create(PETSc.COMM_SELF)
+        self._factor: Any = None
         try:
-            pc.setUp()
-            self._factor = pc.getFactorMatrix()
-            regular = bool(np.all(np.isfinite(self.solve(np.ones(A.shape[0])))))
-        except PETSc.Error:
-            regular = False
+            self._factor = _factored(pc, matrix, prefix)
+            _check_definite(self._factor)
+            if not np.all(np.isfinite(self.solve(np.ones(A.shape[0])))):
+                raise NotPositiveDefiniteError("a pivot is zero")
+        except (PETSc.Error, FactorError) as error:
+            cause = _cause(error, pc.getFactorSolverType(), A)
+            self.destroy()
+            raise cause from error
         finally:
             pc.destroy()
             matrix.destroy()
-        if not regular:
-            raise NotPositiveDefiniteError("CHOLMOD found no Cholesky factor")
 
     def solve(self, b: Array) -> Array:
         """A⁻¹ b, shape ``(n,)``."""
@@ -60,4 +75,123 @@ class CholeskyFactor:
     def destroy(self) -> None:
         """Free the factor."""
         for item in (self._b, self._x, self._factor):
-            item.destroy()
+            if item is not None:
+                item.destroy()
+
+
+@contextmanager
+def added_options(prefix: str, given: Mapping[str, Any]) -> Iterator[None]:
+    """PETSc's options with some more in the block; those that it has already win."""
+    database = PETSc.Options(prefix)
+    added = [name for name in given if not database.hasName(name)]
+    for name in added:
+        database[name] = given[name]
+    try:
+        yield
+    finally:
+        for name in added:
+            database.delValue(name)
+
+
+@cache
+def default_solver() -> str:
+    """The first of ``SOLVERS`` that this PETSc has."""
+    return next(solver for solver in SOLVERS if has_solver(solver))
+
+
+def has_solver(solver: str) -> bool:
+    """Whether this PETSc makes Cholesky factors by a solver."""
+    one = PETSc.Mat().createAIJ((1, 1), nnz=1, comm=PETSc.COMM_SELF)
+    one.setValue(0, 0, 1.0)
+    one.assemble()
+    one.setOption(PETSc.Mat.Option.SPD, True)
+    pc = PETSc.PC().create(PETSc.COMM_SELF)
+    try:
+        pc.setType(PETSc.PC.Type.CHOLESKY)
+        pc.setFactorSolverType(solver)
+        pc.setOperators(one)
+        pc.setUp()
+    except PETSc.Error:
+        return False
+    finally:
+        pc.destroy()
+        one.destroy()
+    return True
+
+
+def say_if_not_cholmod(comm: MPI.Intracomm) -> None:
+    """Log, on rank 0 and once, what factors the matrices where PETSc has no CHOLMOD."""
+    solver = default_solver()
+    if solver != SOLVERS[0] and comm.rank == 0:
+        _say(solver)
+
+
+@cache
+def _say(solver: str) -> None:
+    log.warning(
+        "this PETSc is built without CHOLMOD (SuiteSparse): matrices are factored by %s, which "
+        "may be slower",
+        {"mumps": "MUMPS", "petsc": "PETSc's own Cholesky"}[solver],
+    )
+
+
+def _petsc_matrix(A: Any) -> PETSc.Mat:
+    A = A.tocsr()
+    A.sort_indices()
+    index = PETSc.IntType
+    matrix = PETSc.Mat().createAIJWithArrays(
+        A.shape,
+        (A.indptr.astype(index), A.indices.astype(index), A.data),
+        comm=PETSc.COMM_SELF,
+    )
+    # not SPD, which is what the factor is to find out; MUMPS would not look at signs then
+    matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+    return matrix
+
+
+def _factored(pc: PETSc.PC, matrix: PETSc.Mat, prefix: str) -> PETSc.Mat:
+    """The factor of a matrix, by PETSc's options with a prefix."""
+    pc.setOptionsPrefix(prefix)
+    pc.setType(PETSc.PC.Type.CHOLESKY)
+    pc.setOperators(matrix)
+    with added_options(prefix, {"pc_factor_mat_solver_type": default_solver(), **DEFINITE}):
+        pc.setFromOptions()
+        pc.setUp()
+    reason = pc.getFailedReason()
+    if reason == PETSc.PC.FailedReason.FACTOR_OUTMEMORY:
+        raise PETSc.Error(OUT_OF_MEMORY)
+    if reason:
+        raise NotPositiveDefiniteError("a pivot is zero")
+    return pc.getFactorMatrix()
+
+
+def _check_definite(factor: PETSc.Mat) -> None:
+    """Raise if an eigenvalue is not positive; CHOLMOD does not tell, but has stopped by itself."""
+    try:
+        negative, zero, _ = factor.getInertia()
+    except PETSc.Error as error:
+        if error.ierr == NO_SUPPORT:
+            return
+        raise
+    if negative or zero:
+        raise NotPositiveDefiniteError(f"{negative} eigenvalues are negative, {zero} zero")
+
+
+def _cause(error: Exception, solver: str | None, A: Any) -> FactorError:
+    """What made a factor fail."""
+    if isinstance(error, FactorError):
+        return type(error)(f"not positive definite ({solver}: {error})")
+    code = getattr(error, "ierr", None)
+    if code in ZERO_PIVOTS:
+        return NotPositiveDefiniteError(f"not positive definite (found by {solver})")
+    if code == OUT_OF_MEMORY or CHOLMOD_OUT_OF_MEMORY in str(error):
+        return FactorError(
+            f"out of memory: {solver} had none for the factor of {A.shape[0]} unknowns with "
+            f"{A.nnz} entries; expected smaller subdomains, or more memory"
+        )
+    if code == MISSING_SOLVER:
+        known = ", ".join(name for name in SOLVERS if has_solver(name))
+        return FactorError(
+            f"this PETSc makes no Cholesky factors by {solver}; expected one of {known}"
+        )
+    return FactorError(f"{solver} failed: {str(error).strip().splitlines()[-1]}")

@@ -23,7 +23,9 @@ class GeneralisedInverse(Protocol):
         ...
 
 
-def regularised(K: Any, R: Array, fixing_dofs: Array) -> GeneralisedInverse:
+def regularised(
+    K: Any, R: Array, fixing_dofs: Array, prefix: str = "tfeti_sub_"
+) -> GeneralisedInverse:
     """K_ρ⁻¹ with K_ρ = K + ρ Nᵀ(NNᵀ)⁻¹N, N the kernel on a few fixing unknowns, ρ = max diag K.
 
     An exact generalised inverse, because N R is regular
@@ -33,17 +35,19 @@ def regularised(K: Any, R: Array, fixing_dofs: Array) -> GeneralisedInverse:
         K: Stiffness, shape ``(n, n)``.
         R: Kernel, shape ``(n, r)``; without columns K itself is inverted.
         fixing_dofs: Unknowns of the fixing nodes.
+        prefix: Prefix of the factor's PETSc options.
 
     Raises:
         NotPositiveDefiniteError: K_ρ has no Cholesky factor.
+        FactorError: It could not be made for another reason.
     """
     if R.shape[1] == 0:
-        return CholeskyFactor(K)
+        return CholeskyFactor(K, prefix)
     Q, _ = np.linalg.qr(R[fixing_dofs])
     rho = K.diagonal().max()
     row, column = np.meshgrid(fixing_dofs, fixing_dofs, indexing="ij")
     projector = coo_array((rho * (Q @ Q.T).ravel(), (row.ravel(), column.ravel())), shape=K.shape)
-    return CholeskyFactor((K + projector).tocsr())
+    return CholeskyFactor((K + projector).tocsr(), prefix)
 
 
 KPLUS_TYPES = {"regularized": regularised}

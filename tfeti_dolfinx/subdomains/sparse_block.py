@@ -10,7 +10,7 @@ import numpy as np
 from scipy.linalg import null_space
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.errors import FactorError, InputError
 from tfeti_dolfinx.subdomains.factor import NotPositiveDefiniteError
 from tfeti_dolfinx.subdomains.kernel import candidate_modes, fixing_nodes, kernel_of
 from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, GeneralisedInverse, regularised
@@ -37,10 +37,13 @@ class SparseBlock:
         body_frame: Centre and length of the whole body, for its candidate modes.
         counters: Counts factorisations.
         kplus_type: Kind of the generalised inverse.
+        prefix: Prefix of the factors' PETSc options.
+        shares: 1 / number of torn copies of each node, shape ``(n / bs,)``; default 1.
 
     Raises:
         InputError: K is not symmetric, not finite or not positive semidefinite, or the load is
             not finite.
+        FactorError: A factor could not be made.
     """
 
     def __init__(
@@ -53,9 +56,12 @@ class SparseBlock:
         body_frame: tuple[Array, float],
         counters: Counters,
         kplus_type: str = "regularized",
+        prefix: str = "tfeti_sub_",
+        shares: Array | None = None,
     ) -> None:
         self._name, self._x, self._frame = name, x, body_frame
-        self._counters, self._kplus_type = counters, kplus_type
+        self._shares = np.ones(len(x)) if shares is None else shares
+        self._counters, self._kplus_type, self._prefix = counters, kplus_type, prefix
         self.trace_dofs = trace_dofs
         self.update(K=K, f=f)
 
@@ -131,6 +137,15 @@ class SparseBlock:
         return float(u @ (self._K @ u))
 
     @property
+    def body_metric(self) -> Array:
+        """Cᵀ W C, shape ``(k, k)``, W the share in each node."""
+        return self.modes.T @ (np.repeat(self._shares, self._bs)[:, None] * self.modes)
+
+    def body_moments(self, u: Array) -> Array:
+        """Cᵀ W u of a displacement on all unknowns, shape ``(k,)``."""
+        return self.modes.T @ (np.repeat(self._shares, self._bs) * u)
+
+    @property
     def condensed_load(self) -> Array:
         """K⁺ f on the trace, shape ``(t,)``."""
         return self._pinv_load[self.trace_dofs]
@@ -149,6 +164,11 @@ class SparseBlock:
         if K_ib.shape[0] == 0:
             return K_bb @ w
         return K_bb @ w - K_ib.T @ self._inner.solve(K_ib @ w)
+
+    def prepare(self, operator: str) -> None:
+        """Factor K_ii for ``"schur"``; what the other operators need is there."""
+        if operator == "schur" and len(self._inner_dofs):
+            self._inner  # noqa: B018
 
     def recover(self, w: Array) -> Array:
         """K⁺(f − w), shape ``(n,)``."""
@@ -169,12 +189,14 @@ class SparseBlock:
         dofs = self._fixing(np.arange(self.size) // self._bs)
         self._counters.factorizations += 1
         try:
-            return KPLUS_TYPES[self._kplus_type](self._K, self._R, dofs)
+            return KPLUS_TYPES[self._kplus_type](self._K, self._R, dofs, self._prefix)
         except NotPositiveDefiniteError as error:
             raise InputError(
                 f"{self._name}: the stiffness is not positive semidefinite; "
                 "expected a linear elastic form"
             ) from error
+        except FactorError as error:
+            raise FactorError(f"{self._name}: {error}") from error
 
     @cached_property
     def _inner(self) -> GeneralisedInverse:
@@ -182,7 +204,14 @@ class SparseBlock:
         inner = self._inner_dofs
         R_inner = self._R[inner] @ null_space(self.kernel, rcond=1e-10)
         self._counters.factorizations += 1
-        return regularised(self._blocks[2], R_inner, self._fixing(inner // self._bs))
+        fixing = self._fixing(inner // self._bs)
+        try:
+            return regularised(self._blocks[2], R_inner, fixing, self._prefix)
+        except FactorError as error:
+            raise FactorError(
+                f"{self._name}: the stiffness of the unknowns that no row touches, for the "
+                f"dirichlet preconditioner: {error}"
+            ) from error
 
     @property
     def _inner_dofs(self) -> Array:

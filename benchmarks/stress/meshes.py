@@ -1,0 +1,157 @@
+"""Meshes of a scene, their sides, and elasticity on them with coefficients in the cells."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import basix.ufl
+import numpy as np
+import ufl
+from dolfinx import fem
+from dolfinx import mesh as dmesh
+from mpi4py import MPI
+
+from benchmarks.stress.scene import Scene
+
+# simplices around the diagonal of a box whose corners are numbered x + 2y + 4z
+SPLIT = {
+    "triangle": [[0, 1, 3], [0, 2, 3]],
+    "tetrahedron": [
+        [0, 1, 3, 7],
+        [0, 1, 5, 7],
+        [0, 2, 3, 7],
+        [0, 2, 6, 7],
+        [0, 4, 5, 7],
+        [0, 4, 6, 7],
+    ],
+}
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Cells and points of all bodies.
+
+    Attributes:
+        points: Shape ``(n, gdim)``.
+        cells: Points of each cell.
+        body: Body of each cell.
+        colour: Colour of each cell on a checkerboard, 0 or 1.
+    """
+
+    points: np.ndarray
+    cells: np.ndarray
+    body: np.ndarray
+    colour: np.ndarray
+
+
+def grid(scene: Scene) -> Grid:
+    points, cells, body, colour, start = [], [], [], [], 0
+    for b, box in enumerate(scene.bodies):
+        n = np.array(box.cells)
+        axes = [np.linspace(lo, hi, k + 1) for lo, hi, k in zip(box.low, box.high, n, strict=True)]
+        x = np.stack([c.ravel(order="F") for c in np.meshgrid(*axes, indexing="ij")], axis=1)
+        index = np.stack(np.unravel_index(np.arange(n.prod()), n, order="F"))
+        stride = np.cumprod(np.r_[1, n[:-1] + 1])
+        corner = np.stack(np.unravel_index(np.arange(2 ** len(n)), (2,) * len(n), order="F"))
+        boxes = start + (stride @ index)[:, None] + stride @ corner
+        split = SPLIT.get(scene.cell)
+        parts = 1 if split is None else len(split)
+        cells.append(boxes if split is None else boxes[:, split].reshape(-1, len(split[0])))
+        colour.append(np.repeat(index.sum(axis=0) % 2, parts))
+        body.append(np.full(len(cells[-1]), b))
+        points.append(x)
+        start += len(x)
+    return Grid(*(np.concatenate(part) for part in (points, cells, body, colour)))
+
+
+def make_mesh(scene: Scene, g: Grid, comm: MPI.Intracomm) -> dmesh.Mesh:
+    """The mesh, from the cells that rank 0 has."""
+    own = slice(None) if comm.rank == 0 else slice(0, 0)
+    element = basix.ufl.element("Lagrange", scene.cell, 1, shape=(scene.gdim,))
+    return dmesh.create_mesh(comm, cells=g.cells[own], x=g.points[own], e=element)
+
+
+def tag_sides(scene: Scene, mesh: dmesh.Mesh, body_of_cell: np.ndarray) -> dmesh.MeshTags:
+    """Sides of all bodies; ``body_of_cell`` is that of the cells of this rank."""
+    tdim = mesh.topology.dim
+    mesh.topology.create_connectivity(tdim - 1, tdim)
+    facets = dmesh.exterior_facet_indices(mesh.topology)
+    links = mesh.topology.connectivity(tdim - 1, tdim)
+    first = np.array([links.links(f)[0] for f in facets], dtype=int)
+    body = body_of_cell[first]
+    middle = dmesh.compute_midpoints(mesh, tdim - 1, facets)[:, :tdim]
+    low = np.array([b.low for b in scene.bodies])[body].reshape(-1, tdim)
+    high = np.array([b.high for b in scene.bodies])[body].reshape(-1, tdim)
+    # a facet's midpoint is on its own side, and half a cell away from all others
+    away = np.stack((middle - low, high - middle), axis=2) / (high - low)[:, :, None]
+    side = np.abs(away).reshape(len(facets), -1).argmin(axis=1) if len(facets) else body
+    tags = (body * 2 * tdim + side + 1).astype(np.int32)
+    return dmesh.meshtags(mesh, tdim - 1, facets, tags)
+
+
+def loads_of(scene: Scene) -> np.ndarray:
+    """Tractions on the sides of each body and its force per volume: (bodies, sides + 1, gdim)."""
+    values = np.zeros((len(scene.bodies), 2 * scene.gdim + 1, scene.gdim))
+    for load in scene.loads:
+        body, axis, end = load.side
+        values[body, 2 * axis + end if axis >= 0 else -1] += load.value
+    return values
+
+
+def materials(scene: Scene, g: Grid, subdomain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lamé's μ and λ of each cell, given the subdomain of each cell."""
+    E, nu, jump = np.array([(b.E, b.nu, b.jump) for b in scene.bodies])[g.body].T
+    E = E * np.where(g.colour == 1, jump, 1.0)
+    E = E * np.where(subdomain % 2 == 1, scene.subdomain_jump, 1.0)
+    return E / 2 / (1 + nu), E * nu / (1 + nu) / (1 - 2 * nu)
+
+
+def cellwise(mesh: dmesh.Mesh, values: np.ndarray) -> fem.Function:
+    """Values of the cells as a function."""
+    function = fem.Function(fem.functionspace(mesh, ("DG", 0, values.shape[1:])))
+    cell_dof = function.function_space.dofmap.list[: len(values), 0]
+    width = int(np.prod(values.shape[1:]))
+    function.x.array.reshape(-1, width)[cell_dof] = values.reshape(len(values), width)
+    return function
+
+
+def elasticity(
+    scene: Scene,
+    mesh: dmesh.Mesh,
+    facet_tags: dmesh.MeshTags,
+    mu: np.ndarray,
+    lmbda: np.ndarray,
+    loads: np.ndarray,
+) -> tuple[Any, Any, Any]:
+    """V, a, L; the coefficients are those of this rank's cells.
+
+    One compiled form serves all scenes of a cell type: tractions depend on the facet's normal.
+    """
+    gdim = scene.gdim
+    V = fem.functionspace(mesh, ("Lagrange", 1, (gdim,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    mu, lmbda, t = (cellwise(mesh, values) for values in (mu, lmbda, loads))
+    quadrature = {"quadrature_degree": 2 if len(SPLIT.get(scene.cell, [])) == 0 else 1}
+    dx = ufl.Measure("dx", domain=mesh, metadata=quadrature)
+    ds = ufl.Measure("ds", domain=mesh, subdomain_data=facet_tags, metadata=quadrature)
+    e, n = ufl.sym(ufl.grad(u)), ufl.FacetNormal(mesh)
+    stress = 2 * mu * e + lmbda * ufl.tr(e) * ufl.Identity(gdim)
+    traction = sum(
+        ufl.max_value(sign * n[k], 0.0) * t[2 * k + end, :]
+        for k in range(gdim)
+        for end, sign in ((0, -1.0), (1, 1.0))
+    )
+    tags = tuple(scene.surfaces.values())
+    L = ufl.dot(t[2 * gdim, :], v) * dx + ufl.dot(traction, v) * ds(tags)
+    return V, ufl.inner(stress, ufl.sym(ufl.grad(v))) * dx, L
+
+
+def prescribed(scene: Scene, V: Any, facets_of: Any) -> list[fem.DirichletBC]:
+    """Dirichlet conditions; ``facets_of`` gives the local facets of a side."""
+    made = []
+    for held in scene.held:
+        for c in held.components:
+            dofs = fem.locate_dofs_topological(V.sub(c), scene.gdim - 1, facets_of(held.side))
+            made.append(fem.dirichletbc(held.value, dofs, V.sub(c)))
+    return made

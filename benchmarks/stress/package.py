@@ -1,0 +1,160 @@
+"""A scene given to tfeti_dolfinx, and what comes back."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+import tfeti_dolfinx as tfeti
+from benchmarks.stress import meshes
+from benchmarks.stress.scene import Scene, Wall, side_name, wall_distance
+
+
+@dataclass
+class Outcome:
+    """What the package did with a scene, on rank 0.
+
+    Attributes:
+        error: Type and message of what was raised, the same on all ranks, or "".
+        disagree: What ranks raised where they differ, else "".
+        mu: Lamé's μ of the grid's cells, if the mesh could be torn.
+        lmbda: Lamé's λ of them.
+        x: Nodes of all torn copies.
+        body: Their bodies.
+        u: Their displacements.
+        forces: Resultants of the contact forces on the bodies.
+        report: Some of the report.
+        seconds: Wall time.
+    """
+
+    error: str = ""
+    disagree: str = ""
+    mu: np.ndarray | None = None
+    lmbda: np.ndarray | None = None
+    x: np.ndarray | None = None
+    body: np.ndarray | None = None
+    u: np.ndarray | None = None
+    forces: np.ndarray | None = None
+    report: dict[str, Any] = field(default_factory=dict)
+    seconds: float = 0.0
+
+
+class WallShape:
+    """A wall as a shape of the package."""
+
+    def __init__(self, wall: Wall) -> None:
+        self.wall = wall
+
+    def distance(self, x: np.ndarray) -> np.ndarray:
+        """Signed distance, shape ``(n,)``."""
+        return wall_distance(self.wall, x)[0]
+
+    def gradient(self, x: np.ndarray) -> np.ndarray:
+        """Gradient, shape ``(3, n)``."""
+        return wall_distance(self.wall, x)[1]
+
+
+def pair(secondary: str, primary: str) -> tfeti.Contact:
+    """A pair whose first surface carries the multipliers, in the package's words."""
+    try:
+        return tfeti.Contact(secondary, primary, secondary=secondary)
+    except TypeError:  # before the surfaces of a pair were a and b
+        return tfeti.Contact(secondary, primary)
+
+
+def contacts_of(scene: Scene) -> list[Any]:
+    walls = [tfeti.Obstacle(side_name(w.side), WallShape(w)) for w in scene.walls]
+    pairs = [pair(side_name(p.secondary), side_name(p.primary)) for p in scene.pairs]
+    return walls + pairs
+
+
+def partition(scene: Scene) -> Any:
+    """What ``decompose`` is given: a number, or a random one by nearest points of each body."""
+    if scene.scattered is None:
+        return scene.subdomains
+    rng = np.random.default_rng(scene.scattered)
+    low = np.array([b.low for b in scene.bodies])
+    high = np.array([b.high for b in scene.bodies])
+    share = -(-scene.subdomains // len(scene.bodies))
+    seeds = rng.uniform(size=(len(scene.bodies), share, scene.gdim))
+
+    def subdomain(x: np.ndarray) -> np.ndarray:
+        x = x[: scene.gdim].T
+        t = (x[:, None] - low) / (high - low)
+        body = np.abs(t - 0.5).max(axis=2).argmin(axis=1)
+        own = t[np.arange(len(x)), body]
+        nearest = np.linalg.norm(own[:, None] - seeds[body], axis=2)
+        return body * share + nearest.argmin(axis=1)
+
+    return subdomain
+
+
+def solve_scene(scene: Scene, g: meshes.Grid, comm: MPI.Intracomm) -> Outcome:
+    """Solve by the package. Collective; the outcome is complete on rank 0."""
+    outcome, start, error = Outcome(), time.perf_counter(), ""
+    try:
+        problem = _problem(scene, g, comm, outcome)
+        problem.solve()
+        _collect(scene, g, problem, outcome)
+    except Exception as caught:
+        error = f"{type(caught).__name__}: {caught}"
+    outcome.seconds = time.perf_counter() - start
+    errors = comm.allgather(error)
+    outcome.error = next((e for e in errors if e), "")
+    if len(set(errors)) > 1:
+        outcome.disagree = " | ".join(errors)
+    return outcome
+
+
+def _problem(
+    scene: Scene, g: meshes.Grid, comm: MPI.Intracomm, outcome: Outcome
+) -> tfeti.ContactProblem:
+    mesh = meshes.make_mesh(scene, g, comm)
+    original = np.asarray(mesh.topology.original_cell_index)
+    tags = meshes.tag_sides(scene, mesh, g.body[original])
+    d = tfeti.decompose(mesh, partition(scene), facet_tags=tags, surfaces=scene.surfaces)
+    subdomain = np.zeros(len(g.cells), dtype=np.int64)
+    subdomain[d.original_cells] = d.cell_subdomain
+    subdomain = comm.allreduce(subdomain)
+    outcome.mu, outcome.lmbda = mu, lmbda = meshes.materials(scene, g, subdomain)
+    cell = d.original_cells
+    loads = meshes.loads_of(scene)[g.body[cell]]
+    V, a, L = meshes.elasticity(scene, d.mesh, d.facet_tags, mu[cell], lmbda[cell], loads)
+    bcs = meshes.prescribed(scene, V, lambda side: d.facets(side_name(side)))
+    options = dict(scene.options)
+    return tfeti.ContactProblem(a, L, bcs, contacts_of(scene), d, petsc_options=options)
+
+
+def _collect(scene: Scene, g: meshes.Grid, problem: tfeti.ContactProblem, outcome: Outcome) -> None:
+    d, V, gdim = problem.decomposition, problem.u.function_space, scene.gdim
+    comm = d.comm
+    x = V.tabulate_dof_coordinates()
+    body = np.zeros(len(x), dtype=int)
+    body[V.dofmap.list[: len(d.original_cells)]] = g.body[d.original_cells][:, None]
+    forces = np.zeros((len(scene.bodies), gdim))
+    partners = [(w.side[0], None) for w in scene.walls]
+    partners += [(p.secondary[0], p.primary[0]) for p in scene.pairs]
+    for k, (own, other) in enumerate(partners):
+        data = problem.solution.contact(k)
+        total = data.force @ data.normal.reshape(len(data.force), gdim)
+        forces[own] -= total
+        if other is not None:
+            forces[other] += total
+    outcome.forces = comm.allreduce(forces)
+    gathered = [comm.gather(part) for part in (x, body, problem.u.x.array.reshape(-1, gdim))]
+    if comm.rank == 0:
+        outcome.x, outcome.body, outcome.u = (np.concatenate(part) for part in gathered)
+    report = problem.report
+    outcome.report = {
+        "reason": report.converged_reason,
+        "F": report.F_multiplications,
+        "free_modes": report.free_modes,
+        "rows": report.contact_rows,
+        "active": report.active_contacts,
+        "penetration": report.residuals.get("penetration", 0.0),
+        "tolerance": report.residuals.get("tolerance", 0.0),
+    }

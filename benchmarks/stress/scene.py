@@ -1,0 +1,146 @@
+"""A scene of boxes as plain data: nothing here knows the package or DOLFINx."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+Vector = tuple[float, ...]
+Side = tuple[int, int, int]  # body, axis, end (0 low, 1 high)
+
+GDIM = {"triangle": 2, "quadrilateral": 2, "tetrahedron": 3, "hexahedron": 3}
+
+
+@dataclass(frozen=True)
+class Body:
+    """A box of cells, with Young's modulus E on one colour of a checkerboard, E·jump on the other.
+
+    Attributes:
+        low: Lowest corner.
+        high: Highest corner.
+        cells: Cells along the axes.
+        E: Young's modulus.
+        nu: Poisson's ratio.
+        jump: Ratio of moduli between the colours.
+    """
+
+    low: Vector
+    high: Vector
+    cells: tuple[int, ...]
+    E: float = 1.0
+    nu: float = 0.3
+    jump: float = 1.0
+
+
+@dataclass(frozen=True)
+class Held:
+    """Prescribed displacement of some components on a side."""
+
+    side: Side
+    components: tuple[int, ...]
+    value: float = 0.0
+
+
+@dataclass(frozen=True)
+class Load:
+    """A traction on a side of a body, or with ``axis`` −1 a force per volume."""
+
+    side: Side
+    value: Vector
+
+
+@dataclass(frozen=True)
+class Wall:
+    """A rigid obstacle of a side.
+
+    Attributes:
+        side: The side.
+        kind: plane (point, normal); ball or bowl (centre, radius); bump, the graph of a
+            paraboloid (point, normal, curvature).
+        data: What the kind needs.
+    """
+
+    side: Side
+    kind: str
+    data: tuple[Vector, ...]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two parallel sides that may not enter each other; the first carries the multipliers."""
+
+    secondary: Side
+    primary: Side
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Boxes, what holds them, what drives them, what they meet.
+
+    Attributes:
+        cell: Name of the cell type.
+        bodies: The boxes.
+        held: Dirichlet conditions.
+        loads: Loads.
+        walls: Obstacles.
+        pairs: Pairs of sides.
+        subdomains: Their number, by coordinate bisection.
+        scattered: Seed of a random partition into as many; None for the bisection.
+        subdomain_jump: Ratio of moduli between odd and even subdomains.
+        options: Options of the package.
+        note: What the scene is about.
+    """
+
+    cell: str
+    bodies: tuple[Body, ...]
+    held: tuple[Held, ...] = ()
+    loads: tuple[Load, ...] = ()
+    walls: tuple[Wall, ...] = ()
+    pairs: tuple[Pair, ...] = ()
+    subdomains: int = 4
+    scattered: int | None = None
+    subdomain_jump: float = 1.0
+    options: dict[str, float] = field(default_factory=lambda: {"tfeti_rtol": 1e-6})
+    note: str = ""
+
+    @property
+    def gdim(self) -> int:
+        """2 or 3."""
+        return GDIM[self.cell]
+
+    @property
+    def surfaces(self) -> dict[str, int]:
+        """Names of all sides of all bodies, with their tags."""
+        sides = [
+            (b, axis, end)
+            for b in range(len(self.bodies))
+            for axis in range(self.gdim)
+            for end in (0, 1)
+        ]
+        return {side_name(side): tag for tag, side in enumerate(sides, start=1)}
+
+
+def side_name(side: Side) -> str:
+    """Name of a side, such as ``0+z``: at the high end of z of the first body."""
+    body, axis, end = side
+    return f"{body}{'-+'[end]}{'xyz'[axis]}"
+
+
+def wall_distance(wall: Wall, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Signed distance (or a level function) and its gradient at points of shape (3, n)."""
+    vectors = [np.pad(np.array(v, dtype=float), (0, 3 - min(3, len(v)))) for v in wall.data]
+    offset = x - vectors[0][:, None]
+    if wall.kind == "plane":
+        normal = vectors[1] / np.linalg.norm(vectors[1])
+        return normal @ offset, np.repeat(normal[:, None], x.shape[1], axis=1)
+    if wall.kind in ("ball", "bowl"):
+        sign = 1.0 if wall.kind == "ball" else -1.0
+        length = np.linalg.norm(offset, axis=0)
+        return sign * (length - wall.data[1][0]), sign * offset / length
+    normal = vectors[1] / np.linalg.norm(vectors[1])
+    height = normal @ offset
+    along = offset - np.outer(normal, height)
+    curvature = wall.data[2][0]
+    gradient = normal[:, None] + curvature * along  # the bump falls off on all sides
+    return height + 0.5 * curvature * np.sum(along**2, axis=0), gradient

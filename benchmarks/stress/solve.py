@@ -1,0 +1,183 @@
+"""Bodies under conditions N u ≤ gap: an LP's verdict, a dense dual problem, a last primal step."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import qr
+from scipy.optimize import linprog
+from scipy.sparse import csr_array, diags_array
+from scipy.sparse.linalg import splu
+
+from benchmarks.stress.qp import UnsettledError, solve_qp
+
+DEPENDENT = 1e-10
+ESCAPES, SURELY_HELD = 1e-6, 1e-9  # work of a motion, of that of all loads
+FARTHER = 10.0
+PENALTY = 1e4  # of a row's stiffness
+ROUNDING = 1e-9
+WRONG = 1e-7  # relative residual of the reference
+EPSILON = 2.2e-16
+
+
+def null_space(A: np.ndarray) -> np.ndarray:
+    """Orthonormal basis of the null space, columns of A being of one size."""
+    if A.shape[0] == 0 or A.shape[1] == 0:
+        return np.eye(A.shape[1])
+    _, sigma, Vt = np.linalg.svd(A, full_matrices=True)
+    return Vt[int(np.sum(sigma > DEPENDENT * max(sigma.max(initial=0.0), 1e-300))) :].T
+
+
+def verdict(
+    N: csr_array,
+    gap: np.ndarray,
+    R: np.ndarray,
+    f: np.ndarray,
+    weight: np.ndarray,
+    length: float,
+) -> str:
+    """Whether a displacement keeps all conditions, and no motion escapes to infinity."""
+    size = max(np.abs(gap).max(initial=0.0), length)
+    if np.any(gap[weight <= DEPENDENT] < -1e-9 * size):
+        return "contradiction"
+    if np.any(gap < -1e-12 * size):  # else u = 0 does
+        m = len(gap)
+        A = np.hstack((N.toarray(), -np.ones((m, 1))))
+        cost = np.r_[np.zeros(A.shape[1] - 1), 1.0]
+        bounds = [(None, None)] * (A.shape[1] - 1) + [(0, None)]
+        best = linprog(cost, A, gap / size, bounds=bounds, method="highs")
+        if best.fun > 1e-7:
+            return "contradiction"
+    load = R.T @ f  # prescribed values do no work on what they leave
+    total = np.abs(f).sum()
+    if R.shape[1] == 0 or np.abs(load).max() <= 1e-12 * total:
+        return "solvable"
+    A = N @ R
+    options = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+    best = linprog(
+        -load / total, A, np.zeros(len(gap)), bounds=(-1, 1), method="highs", options=options
+    )
+    if -best.fun > ESCAPES:
+        return "no_solution"
+    return "solvable" if -best.fun < SURELY_HELD else "borderline"
+
+
+def solve(
+    K: csr_array,
+    f: np.ndarray,
+    N: csr_array,
+    gap: np.ndarray,
+    R: np.ndarray,
+    e: np.ndarray,
+    active: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """λ and u of min ½uᵀKu − fᵀu, N u ≤ gap; R spans the kernel of K, e = Rᵀf."""
+    Q = np.linalg.qr(R)[0] if R.shape[1] else R
+    pinned = qr(R.T, pivoting=True, mode="r")[1][: R.shape[1]]
+    rest = np.setdiff1d(np.arange(len(f)), pinned)
+    scale = 1.0 / np.sqrt(K.diagonal()[rest])
+    scaled = csr_array(K[rest][:, rest].multiply(scale[:, None]).multiply(scale))
+    factor = splu(scaled.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+
+    def compliance(b: np.ndarray) -> np.ndarray:
+        b = b - Q @ (Q.T @ b)
+        right = b[rest] * scale[(...,) + (None,) * (b.ndim - 1)]
+        x = factor.solve(right)
+        x += factor.solve(right - scaled @ x)
+        out = np.zeros_like(b)
+        out[rest] = x * scale[(...,) + (None,) * (b.ndim - 1)]
+        return out - Q @ (Q.T @ out)
+
+    free = compliance(f)
+    if N.shape[0] == 0:
+        return np.zeros(0), free
+    W = compliance(np.asarray(N.T.todense()))
+    F, G = N @ W, np.asarray((N @ R).T)
+    F = 0.5 * (F + F.T)
+    lam, alpha = solve_near(F, N @ free - gap, G, e, gap, active)
+    rigid = R @ alpha
+    lam, bent = refine(K, f, N, gap - N @ rigid, R, lam)
+    return lam, bent + rigid
+
+
+def refine(
+    K: csr_array, f: np.ndarray, N: csr_array, gap: np.ndarray, R: np.ndarray, lam: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """A primal active set from a λ that is nearly right.
+
+    The compliance of what bends easily drowns what contact holds: there the dual loses digits
+    that the primal problem has.
+    """
+    active, seen = lam > 0.0, set()
+    for _ in range(40):
+        u, lam = touching(K, f, N, gap, R, active)
+        s = gap - N @ u
+        noise = ROUNDING * np.abs(lam).max(initial=0.0)
+        depth = ROUNDING * max(np.abs(u).max(), 1e-6 * np.abs(gap).max())
+        wrong = (active & (lam < -noise)) | (~active & (s < -depth))
+        if not wrong.any():
+            break
+        if active.tobytes() in seen:
+            size = np.where(active, -lam / (noise or 1.0), -s / (depth or 1.0))
+            wrong = np.arange(len(lam)) == np.argmax(np.where(wrong, size, -np.inf))
+        seen.add(active.tobytes())
+        active = active ^ wrong
+    else:
+        raise UnsettledError("the primal active set did not settle")
+    push = f - N.T @ lam
+    rounding = 1e3 * EPSILON * (abs(K) @ np.abs(u)).max()
+    off = max(np.abs(K @ u - push).max() - rounding, 0.0)
+    size = np.abs(f).max() + np.abs(N.T @ lam).max()
+    if off > WRONG * size:
+        raise UnsettledError(f"the residual is {off / size:.1e}")
+    return np.where(active, lam, 0.0), u
+
+
+def touching(
+    K: csr_array, f: np.ndarray, N: csr_array, gap: np.ndarray, R: np.ndarray, active: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """u and λ where the active rows are equations: multipliers with a large penalty."""
+    A, lam = N[active], np.zeros(len(gap))
+    row = 1.0 / np.asarray((A.multiply(A) / K.diagonal()).sum(axis=1)).ravel()
+    penalty = PENALTY * row
+    M = csr_array(K + A.T @ (diags_array(penalty) @ A)) if len(row) else K
+    motions = R @ null_space(A @ R)
+    pinned = qr(motions.T, pivoting=True, mode="r")[1][: motions.shape[1]]
+    rest = np.setdiff1d(np.arange(len(f)), pinned)
+    scale = 1.0 / np.sqrt(M.diagonal()[rest])
+    scaled = csr_array(M[rest][:, rest].multiply(scale[:, None]).multiply(scale))
+    factor = splu(scaled.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+    u, force = np.zeros(len(f)), np.zeros(len(row))
+    for _ in range(8):
+        residual = f - K @ u - A.T @ (force + penalty * (A @ u - gap[active]))
+        u[rest] += scale * factor.solve(scale * residual[rest])
+        force = force + penalty * (A @ u - gap[active])
+    lam[active] = force
+    return u, lam
+
+
+def solve_near(
+    F: np.ndarray,
+    d: np.ndarray,
+    G: np.ndarray,
+    e: np.ndarray,
+    gap: np.ndarray,
+    active: np.ndarray | None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """``solve_qp``, without gaps that are far at first: they would spoil its scale."""
+    reach = np.quantile(np.abs(gap), [0.25, 0.5, 0.75])
+    for near in (*(gap <= FARTHER * r for r in reach), np.ones(len(gap), dtype=bool)):
+        for _ in range(20):
+            lam = np.zeros(len(gap))
+            guess = None if active is None else active[near]
+            try:
+                lam[near], alpha = solve_qp(F[np.ix_(near, near)], d[near], G[:, near], e, guess)
+            except UnsettledError:
+                if near.all():
+                    raise
+                break
+            s = F @ lam - d - G.T @ alpha
+            entered = ~near & (s < 0.0)
+            if not entered.any():
+                return lam, alpha
+            near = near | entered
+    raise UnsettledError("rows that were far came in again and again")

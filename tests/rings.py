@@ -1,0 +1,73 @@
+"""A ring shrunk on another one, meshed independently, and its closed form."""
+
+import gmsh
+import numpy as np
+
+import tfeti_dolfinx as tfeti
+
+INNER, MIDDLE, OUTER = 0.5, 1.0, 1.6
+
+
+def rings(comm, cells, order=1, overlap=0.0, turn=0.1, subdomains=4):
+    """Two rings with their contact at the radius 1.
+
+    Args:
+        comm: Communicator.
+        cells: Facets around the shaft (outside of the inner ring) and the hub.
+        order: Degree of the geometry.
+        overlap: How much larger the shaft's radius is than the hub's.
+        turn: Angle between the meshes.
+        subdomains: Their number.
+
+    Returns:
+        The torn mesh, with surfaces "bore", "shaft", "hub", "rim".
+    """
+    if comm.rank == 0:
+        if not gmsh.isInitialized():
+            gmsh.initialize(interruptible=False)
+        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.model.add("rings")
+        shaft, hub = MIDDLE + overlap / 2, MIDDLE - overlap / 2
+        _ring("inner", {"bore": INNER, "shaft": shaft}, cells[0], 0.0)
+        _ring("outer", {"hub": hub, "rim": OUTER}, cells[1], turn)
+        gmsh.option.setNumber("Mesh.ElementOrder", order)
+        gmsh.model.mesh.generate(2)
+    d = tfeti.read_gmsh(gmsh.model if comm.rank == 0 else None, comm, subdomains)
+    if comm.rank == 0:
+        gmsh.option.setNumber("Mesh.ElementOrder", 1)
+        gmsh.model.remove()
+    return d
+
+
+def _ring(name, radii, cells, turn):
+    """Quarters of structured quadrilaterals, as square as they can be."""
+    geo = gmsh.model.geo
+    centre = geo.addPoint(0, 0, 0)
+    angles = turn + np.arange(4) * np.pi / 2
+    points = [
+        [geo.addPoint(r * np.cos(t), r * np.sin(t), 0) for t in angles] for r in radii.values()
+    ]
+    arcs = [[geo.addCircleArc(p[k], centre, p[(k + 1) % 4]) for k in range(4)] for p in points]
+    spokes = [geo.addLine(points[0][k], points[1][k]) for k in range(4)]
+    layers = max(1, round(cells / (2 * np.pi) * (max(radii.values()) - min(radii.values()))))
+    quarters = []
+    for k in range(4):
+        loop = geo.addCurveLoop([arcs[0][k], spokes[(k + 1) % 4], -arcs[1][k], -spokes[k]])
+        quarters.append(geo.addPlaneSurface([loop]))
+        geo.mesh.setTransfiniteCurve(spokes[k], layers + 1)
+        for arc in arcs:
+            geo.mesh.setTransfiniteCurve(arc[k], cells // 4 + 1)
+        geo.mesh.setTransfiniteSurface(quarters[k])
+        geo.mesh.setRecombine(2, quarters[k])
+    geo.synchronize()
+    gmsh.model.addPhysicalGroup(2, quarters, name=name)
+    for surface, arc in zip(radii, arcs, strict=True):
+        gmsh.model.addPhysicalGroup(1, arc, name=surface)
+
+
+def lame_pressure(overlap, E=1.0, nu=0.3):
+    """Pressure between the rings, in plane strain (Lamé)."""
+    a, b, c = INNER**2, MIDDLE**2, OUTER**2
+    modulus, ratio = E / (1 - nu**2), nu / (1 - nu)
+    inwards, outwards = (b + a) / (b - a) - ratio, (c + b) / (c - b) + ratio
+    return overlap * modulus / (MIDDLE * (inwards + outwards))

@@ -1,0 +1,177 @@
+"""Gaps: never outside the pointwise ones, of curved facets, given by the user; shrink fits."""
+
+import numpy as np
+import pytest
+import ufl
+from bodies import boxes, gathered, held, searched, sided, stacked, two_body_problem
+from dolfinx import fem
+from mpi4py import MPI
+from rings import MIDDLE, lame_pressure, rings
+from scenes import decomposed, hooke, problem, strain
+from test_mortar_cases import disc_on_block, no_load
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.contact.surfaces import group_points
+from tfeti_dolfinx.mesh.dofs import TornDofs
+
+CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
+ORDERS = [("upper bottom", "lower top"), ("lower top", "upper bottom")]
+
+
+def dofs_of(d):
+    return TornDofs(fem.functionspace(d.mesh, ("Lagrange", 1, (d.mesh.geometry.dim,))), d)
+
+
+def shaped(cell, n_lower, n_upper, lower, upper, across=(0.0, 1.0)):
+    """Boxes whose facing sides are bent to the heights lower(x) and upper(x), x from −½ to ½."""
+    last = 1 if cell in CELLS[:2] else 2
+    low, high = ((end,) * last for end in across)
+    parts = [
+        ("lower", (0.0,) * last + (-1.0,), (1.0,) * last + (0.0,), (n_lower,) * last + (2,)),
+        ("upper", (*low, 0.5), (*high, 1.5), (n_upper,) * last + (2,)),
+    ]
+    mesh, tags, names = boxes(cell, parts)
+    d = tfeti.decompose(mesh, 4, facet_tags=tags, surfaces=names)
+    x = d.mesh.geometry.x
+    at, z = x[:, :last] - 0.5, x[:, last]
+    above = z > 0.25
+    z[:] = np.where(above, z - 0.5 + (1.5 - z) * upper(at), z + (1.0 + z) * lower(at))
+    return d
+
+
+def bent(cell, n_lower, n_upper, lower, upper):
+    """Sides bent to c|x|², which touch at x = 0."""
+
+    def side(c):
+        return lambda x: c * np.sum(x**2, axis=1)
+
+    return shaped(cell, n_lower, n_upper, side(lower), side(upper))
+
+
+@pytest.mark.parametrize("sides", ORDERS)
+@pytest.mark.parametrize("n", [(2, 16), (16, 2), (3, 8)])
+@pytest.mark.parametrize("curvatures", [(0.0, 0.4), (-0.3, 0.3), (-0.4, 0.0), (0.025, 0.4)])
+@pytest.mark.parametrize("cell", CELLS)
+def test_bodies_that_only_touch_have_no_overlap(cell, curvatures, n, sides):
+    """Flat, convex and concave sides; a mean with ψ_i, negative somewhere, must not say more."""
+    if curvatures[0] > 0.0 and n[0] % 2:
+        pytest.skip("a chord of the concave side would cut into the other body")
+    d = bent(cell, *n, *curvatures)
+    gaps = gathered(searched([sided(*sides, reach=0.5)], dofs_of(d), d).gap)
+    assert len(gaps) > 0
+    assert gaps.min() > -1e-12
+
+
+def test_bodies_that_only_touch_do_not_push_each_other():
+    d = bent("triangle", 2, 16, 0.0, 0.4)
+    sides = ["lower bottom", "lower left", "upper left"]
+    p = two_body_problem(d, no_load, held(d, *sides), [sided(*ORDERS[1])])
+    p.solve()
+    assert np.all(gathered(p.solution.contact().pressure) < 1e-9)
+    assert np.abs(p.u.x.array).max(initial=0.0) < 1e-9
+
+
+@pytest.mark.parametrize("sides", [("arc", "top"), ("top", "arc")])
+def test_curved_facets_that_only_touch_have_no_overlap(comm, sides):
+    d, _ = disc_on_block(comm, 24, 2)
+    gaps = gathered(searched([sided(*sides, reach=0.3)], dofs_of(d), d).gap)
+    assert -1e-12 < gaps.min() < 0.01
+
+
+@pytest.mark.parametrize("slope", [-0.02, 0.02])
+@pytest.mark.parametrize("cell", CELLS)
+def test_an_overhanging_wedge(cell, slope):
+    """The last facets hang over an edge, where the wedge closes to nothing or opens.
+
+    Beside the edge the gap goes on as it was if it opens; if it closes it would become an overlap
+    with nothing.
+    """
+    n, gdim = 4, 2 if cell in CELLS[:2] else 3
+    start = 0.5 if slope < 0.0 else -0.5
+    d = shaped(
+        cell,
+        3,
+        n,
+        lambda x: 0.0 * x[:, 0],
+        lambda x: slope * (x[:, 0] - start),
+        across=(0.0, 1.15),
+    )
+    dofs = dofs_of(d)
+    records = searched([sided(*ORDERS[0], reach=0.5)], dofs, d)
+    x = gathered(group_points(dofs)[records.group])[:, 0] - 0.5
+    gaps, expected = gathered(records.gap), slope * (x - start)
+    assert np.sum(x > 0.5) == n ** (gdim - 2) + (gdim - 2)
+    assert np.allclose(gaps, np.maximum(expected, 0.0), rtol=1e-3, atol=1e-12)
+
+
+def ring_problem(cells, overlap, order=1, degree=1, **contact):
+    """The rings; weak springs hold them against motions that contact leaves free."""
+    d = rings(MPI.COMM_WORLD, cells, order, overlap)
+    V = fem.functionspace(d.mesh, ("Lagrange", degree, (2,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    dx = ufl.Measure("dx", domain=d.mesh, metadata={"quadrature_degree": 2 * (degree + order) - 2})
+    a = ufl.inner(hooke()(u), strain(v)) * dx + 1e-6 * ufl.dot(u, v) * dx
+    L = ufl.dot(fem.Constant(d.mesh, (0.0, 0.0)), v) * dx
+    pair = tfeti.Contact("shaft", "hub", **contact)
+    return tfeti.ContactProblem(a, L, [], [pair], d, petsc_options={"rtol": 1e-9})
+
+
+OVERLAP = MIDDLE / 1500
+
+
+@pytest.mark.parametrize("secondary", ["auto", "shaft", "hub"])
+@pytest.mark.parametrize(
+    ("cells", "order", "contact"),
+    [
+        ((48, 64), 1, {"gap": -OVERLAP}),
+        ((48, 64), 1, {"gap": lambda x: -OVERLAP * np.hypot(x[0], x[1])}),
+        ((40, 48), 2, {}),
+    ],
+    ids=["number", "function", "geometry"],
+)
+def test_a_ring_shrunk_on_another(cells, order, contact, secondary):
+    overlap = 0.0 if contact else OVERLAP
+    p = ring_problem(cells, overlap, order, order, secondary=secondary, **contact)
+    p.solve()
+    data, exact = p.solution.contact(), lame_pressure(OVERLAP)
+    area, pressure = gathered(data.area), gathered(data.pressure)
+    mean = np.average(pressure, weights=area)
+    error = np.sqrt(np.average((pressure - exact) ** 2, weights=area))
+    assert abs(mean / exact - 1) <= (0.005 if contact else 0.01)
+    assert error / exact <= (0.03 if contact else 0.05)
+
+
+def test_the_gap_of_an_obstacle_is_what_is_given():
+    d = decomposed("quadrilateral", 4)
+    plane = tfeti.Plane((0, -0.3), (0, 1))
+    for gap, expected in ((0.01, 0.01), (-0.02, -0.02), (lambda x: 0.1 * x[0], None)):
+        contacts = [tfeti.Obstacle("bottom", plane, gap=gap)]
+        p = problem(d, contacts=contacts, clamped=("top",), loaded="right")
+        p.solve()
+        records, x = p.solution.gluing.records, p.solution.contact().points
+        assert np.allclose(records.gap, 0.1 * x[:, 0] if expected is None else expected)
+        assert p.report.contact_rows > 0
+    with pytest.raises(tfeti.InputError, match="obstacle of surface 'bottom': gap=nan, expected"):
+        problem(d, contacts=[tfeti.Obstacle("bottom", plane, gap=np.nan)]).solve()
+
+
+def test_the_gap_of_a_pair_is_what_is_given():
+    """Also where the meshes overlap by more than the reach."""
+    d = stacked("triangle", 3, 4, 4, gap=-0.1)
+    dofs = dofs_of(d)
+    records = searched([sided(*ORDERS[0], gap=lambda x: x[0] - 0.5)], dofs, d)
+    x = group_points(dofs)[records.group]
+    assert np.allclose(records.gap, x[:, 0] - 0.5)
+    assert MPI.COMM_WORLD.allreduce(len(records)) == 5
+
+
+def test_a_given_gap_ends_where_the_reach_does():
+    d = bent("triangle", 3, 16, 0.0, 0.4)
+    dofs = dofs_of(d)
+    geometry, given = (
+        searched([sided(*ORDERS[0], reach=0.05, gap=gap)], dofs, d) for gap in ("geometry", -0.01)
+    )
+    within = geometry.gap <= 0.05
+    assert np.allclose(given.gap, np.where(within, -0.01, geometry.gap))
+    assert np.array_equal(given.near, within)
+    assert 0 < MPI.COMM_WORLD.allreduce(np.sum(within)) < MPI.COMM_WORLD.allreduce(len(within))

@@ -1,0 +1,88 @@
+"""The side that carries the multipliers: chosen by stiffness per area, or named."""
+
+import numpy as np
+import pytest
+import ufl
+from bodies import gathered, held, pressed, sided, stacked, two_body_problem
+from mpi4py import MPI
+from scenes import hooke
+
+import tfeti_dolfinx as tfeti
+
+UPPER, LOWER = "upper bottom", "lower top"
+
+
+def scene(
+    contact, n=(4, 4), stiffness=1.0, cell="quadrilateral", degree=1, subdomains=4, **options
+):
+    """A box on a box, n = (cells of the lower, of the upper); the upper one is stiffer."""
+    d = stacked(cell, *n, subdomains)
+    gdim = d.mesh.geometry.dim
+    height = ufl.SpatialCoordinate(d.mesh)[gdim - 1]
+    stress = hooke(ufl.conditional(ufl.gt(height, 0.0), stiffness, 1.0))
+    sides = ["lower bottom", "lower left", "upper left"]
+    sides += ["lower front", "upper front"] if gdim == 3 else []
+    bcs = held(d, *sides)
+    p = two_body_problem(d, pressed(d), bcs, [contact], degree, stress=stress, **options)
+    p.solve()
+    return p
+
+
+@pytest.mark.parametrize("sides", [(UPPER, LOWER), (LOWER, UPPER)])
+@pytest.mark.parametrize(
+    ("n", "stiffness", "secondary"),
+    [
+        ((3, 6), 1.0, LOWER),
+        ((6, 3), 1.0, UPPER),
+        ((4, 4), 5.0, LOWER),
+        ((4, 4), 0.2, UPPER),
+        ((6, 3), 5.0, LOWER),
+        ((4, 4), 1.0, None),
+    ],
+)
+def test_the_softer_and_coarser_side_is_taken(n, stiffness, secondary, sides):
+    p = scene(tfeti.Contact(*sides), n, stiffness)
+    expected = secondary or sides[0]  # of two equal ones the first
+    assert p.solution.contacts[0].surfaces[0] == expected
+    _, dof = p.dofs.scalar
+    height = p.u.function_space.tabulate_dof_coordinates()[p.dofs.dolfinx_node, 1]
+    pressure = p.solution.pressure.x.array[dof]
+    assert np.allclose(gathered(pressure[pressure > 0.0]), 0.1, atol=1e-5)
+    assert np.allclose(height[pressure > 0.0], 0.0)
+
+
+@pytest.mark.parametrize(
+    ("cell", "degree"), [("triangle", 2), ("tetrahedron", 1), ("hexahedron", 2)]
+)
+def test_the_side_is_the_same_for_all_elements_and_subdomains(cell, degree):
+    for subdomains in (2, 5):
+        p = scene(tfeti.Contact(UPPER, LOWER), (2, 3), 1.0, cell, degree, subdomains)
+        assert p.solution.contacts[0].surfaces == (LOWER, UPPER)
+
+
+def test_a_mesh_that_is_fine_only_where_bodies_meet_is_judged_there():
+    """The lower surface is coarse on the whole, and finer than the upper one where that stands."""
+    d = stacked("quadrilateral", 16, 2, 4, upper=(0.0, 0.25))
+    x = d.mesh.geometry.x
+    lower = x[:, 1] < 1e-9
+    x[lower, 0] = np.where(x[lower, 0] > 0.25, 0.25 + 40 * (x[lower, 0] - 0.25), x[lower, 0])
+    bcs = held(d, "lower bottom", "lower left", "upper left")
+    p = two_body_problem(d, pressed(d), bcs, [tfeti.Contact(LOWER, UPPER)])
+    p.solve()
+    assert p.solution.contacts[0].surfaces == (UPPER, LOWER)
+
+
+@pytest.mark.parametrize("by_tag", [False, True])
+@pytest.mark.parametrize("sides", [(UPPER, LOWER), (LOWER, UPPER)])
+def test_a_side_can_be_named(sides, by_tag, caplog):
+    d = stacked("quadrilateral", 4, 4, 4)
+    named = d.surface(UPPER) if by_tag else UPPER
+    p = scene(tfeti.Contact(*sides, secondary=named), (4, 6))
+    assert p.solution.contacts[0].surfaces == (UPPER, LOWER)
+    assert "times as stiff" not in caplog.text
+
+
+def test_a_choice_that_is_much_the_worse_one_is_warned_of(caplog):
+    scene(sided(UPPER, LOWER), (4, 5), 3.0)
+    warned = "'upper bottom' is 3.75 times as stiff per area as 'lower top'" in caplog.text
+    assert warned == (MPI.COMM_WORLD.rank == 0)

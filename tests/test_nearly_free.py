@@ -1,0 +1,168 @@
+"""Motions that contact holds hardly or not at all: named, and the smallest is taken."""
+
+import basix.ufl
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx import mesh as dmesh
+from mpi4py import MPI
+from scenes import decomposed, hooke, problem, strain
+
+import tfeti_dolfinx as tfeti
+
+
+def ring(centre, inner, outer, layers, around, jitter, seed):
+    """Nodes and quadrilaterals of a ring whose nodes are not quite evenly spaced."""
+    rng = np.random.default_rng(seed)
+    angle = 2 * np.pi * (np.arange(around) + jitter * rng.uniform(-1, 1, around)) / around
+    r = np.linspace(inner, outer, layers + 1)
+    points = np.stack((np.outer(r, np.cos(angle)), np.outer(r, np.sin(angle))), axis=2)
+    i, j = (index.ravel() for index in np.indices((layers, around)))
+    a, b = i * around + j, i * around + (j + 1) % around
+    return centre + points.reshape(-1, 2), np.stack((a, a + around, b, b + around), axis=1)
+
+
+def rings(parts, subdomains):
+    """Rings in one mesh, each with its sides: ``in0``, ``out0``, ``in1``, ..."""
+    cells, points, start = [], [], 0
+    for part in parts:
+        x, c = ring(*part)
+        cells.append(start + c)
+        points.append(x)
+        start += len(x)
+    cells, points = np.concatenate(cells).astype(np.int64), np.concatenate(points)
+    comm = MPI.COMM_WORLD
+    if comm.rank:
+        cells, points = cells[:0], points[:0]
+    element = basix.ufl.element("Lagrange", "quadrilateral", 1, shape=(2,))
+    mesh = dmesh.create_mesh(comm, cells=cells, x=points, e=element)
+    mesh.topology.create_connectivity(1, 2)
+    facets = dmesh.exterior_facet_indices(mesh.topology)
+    links = mesh.topology.connectivity(1, 2)
+    cell = np.array([links.links(f)[0] for f in facets], dtype=np.int32)
+    at, beside = (dmesh.compute_midpoints(mesh, d, e) for d, e in ((1, facets), (2, cell)))
+    values, names = np.zeros(len(facets), dtype=np.int32), {}
+    for i, (centre, inner, outer, *_) in enumerate(parts):
+        own = np.linalg.norm(beside[:, :2] - centre, axis=1)
+        own = (own > inner * 0.9) & (own < outer)
+        outside = np.linalg.norm(at[:, :2] - centre, axis=1) > 0.5 * (inner + outer)
+        values[own] = 2 * i + 1 + outside[own]
+        names |= {f"in{i}": 2 * i + 1, f"out{i}": 2 * i + 2}
+    tags = dmesh.meshtags(mesh, 1, facets, values)
+    return tfeti.decompose(mesh, subdomains, facet_tags=tags, surfaces=names)
+
+
+def elastic(d, load, bcs, contacts, **options):
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+    a = ufl.inner(hooke()(u), strain(v)) * ufl.dx
+    return tfeti.ContactProblem(a, load(v, ds), bcs(V), contacts, d, petsc_options=options)
+
+
+def ring_in_ring(subdomains, jitter, rtol):
+    """Pressure inside the inner ring; the outer one is held outside."""
+    parts = [((0, 0), 0.5, 1.0, 2, 24, jitter, 1), ((0, 0), 1.0, 1.5, 2, 36, jitter, 2)]
+    d = rings(parts, subdomains)
+
+    def load(v, ds):
+        return -0.01 * ufl.dot(ufl.FacetNormal(d.mesh), v) * ds(d.surface("in0"))
+
+    def bcs(V):
+        dofs = fem.locate_dofs_topological(V, 1, d.facets("out1"))
+        return [fem.dirichletbc(np.zeros(2), dofs, V)]
+
+    contact = tfeti.Contact("out0", "in1", search_radius=0.2)
+    return elastic(d, load, bcs, [contact], rtol=rtol)
+
+
+def three_discs(subdomains, rtol):
+    """Discs in a row between walls that press them a little, no other load."""
+    parts = [((2.0 * i, 0.0), 0.3, 1.0, 2, 18, 0.2, i) for i in range(3)]
+    d = rings(parts, subdomains)
+
+    def load(v, ds):
+        return ufl.dot(fem.Constant(d.mesh, np.zeros(2)), v) * ds(d.surface("in0"))
+
+    contacts = [tfeti.Contact(f"out{i}", f"out{i + 1}", search_radius=0.2) for i in range(2)]
+    contacts += [
+        tfeti.Obstacle("out0", tfeti.Plane((-0.93, 0), (1, 0))),
+        tfeti.Obstacle("out2", tfeti.Plane((4.93, 0), (-1, 0))),
+    ]
+    return elastic(d, load, lambda V: [], contacts, rtol=rtol)
+
+
+def motions(p):
+    """Mean displacement and turn of each body, on nodes counted once."""
+    d, dofs = p.decomposition, p.dofs
+    u = dofs.to_primal(p.u.x.array).reshape(-1, 2)
+    x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node, :2]
+    share = 1.0 / dofs.spread(dofs.multiplicity)
+    body, found = d.body_of_subdomain[dofs.node_subdomain], []
+    for b in range(d.num_bodies):
+        w, y, v = share[body == b], x[body == b], u[body == b]
+        sums = d.comm.allreduce(np.concatenate(([w.sum()], w @ y, w @ v)))
+        centre, mean = sums[1:3] / sums[0], sums[3:] / sums[0]
+        y = y - centre
+        turn = np.sum(w * (y[:, 0] * v[:, 1] - y[:, 1] * v[:, 0]))
+        size = np.sum(w * np.sum(y**2, axis=1))
+        found.append((*mean, d.comm.allreduce(turn) / d.comm.allreduce(size)))
+    return np.array(found)
+
+
+def test_a_ring_in_an_even_ring_does_not_turn():
+    """Nothing holds its turn, and of all turns none is the smallest."""
+    for subdomains in (2, 5):
+        p = ring_in_ring(subdomains, 0.0, 1e-6)
+        p.solve()
+        found = motions(p)
+        assert np.abs(found[:, 2]).max() <= 1e-8
+        assert p.report.free_modes == 1
+        (only,) = p.report.nearly_free
+        assert only["mode"] == "rotation in the plane"
+        assert only["stiffness"] == 0.0
+
+
+def test_a_ring_that_polygons_hold_by_a_little():
+    """Its turn follows from the meshes: small normals' errors hold it, which is said."""
+    turns, held = [], []
+    for subdomains in (2, 5):
+        p = ring_in_ring(subdomains, 0.05, 1e-8)
+        p.solve()
+        turns.append(motions(p)[:, 2])
+        (only,) = p.report.nearly_free
+        assert only["mode"] == "rotation in the plane"
+        held.append(only["stiffness"])
+        assert p.report.free_modes == 0
+    assert 1e-6 < held[0] < 1e-2
+    assert held[0] == pytest.approx(held[1], rel=1e-6)
+    assert np.allclose(turns[0], turns[1], atol=1e-5 * np.abs(turns[0]).max() + 1e-9)
+
+
+def test_three_discs_between_walls_move_alike_on_all_layouts():
+    """They slide and roll together without a force changing: the least of it is taken."""
+    results, joint = [], []
+    for subdomains in (3, 7):
+        p = three_discs(subdomains, 1e-9)
+        p.solve()
+        results.append(motions(p))
+        assert p.report.residuals["penetration"] <= 1e-8
+        assert p.report.residuals["gluing_jump"] <= 1e-8
+        together = [m for m in p.report.nearly_free if len(m["bodies"]) == 3]
+        joint.append(len(together))
+        assert all(m["stiffness"] == 0.0 and "translation in y" in m["mode"] for m in together)
+    assert joint == [2, 2]
+    assert np.allclose(results[0], results[1], atol=1e-4 * np.abs(results[0]).max())
+
+
+def test_a_block_that_slides_freely_stays_where_it_is():
+    """No force along the floor, so no way along it, whatever the subdomains."""
+    for subdomains in (1, 4):
+        d = decomposed("quadrilateral", 4, subdomains)
+        floor = [tfeti.Obstacle("bottom", tfeti.Plane((0, -0.01), (0, 1)))]
+        p = problem(d, (0.0, -0.05), floor, clamped=(), tfeti_rtol=1e-9)
+        p.solve()
+        assert abs(motions(p)[0, 0]) <= 1e-9
+        (only,) = p.report.nearly_free
+        assert only == {"bodies": ["body 0"], "mode": "translation in x", "stiffness": 0.0}

@@ -1,0 +1,79 @@
+"""The estimate of ‖PFP‖: the fixed step of MPRGP diverges where it is too small."""
+
+import numpy as np
+import pytest
+from scenes import curved_obstacle, decomposed, problem
+from test_qp import DenseCoarse, matrix, vector
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.qp.norm import estimate_norm
+from tfeti_dolfinx.qp.problem import NoCoarse, project
+
+# with the step ᾱ = 1.95/‖·‖ of the default options ‖A‖ᾱ ≤ 2 needs 0.975 of the norm
+LEAST, MOST = 0.975, 1.1
+SIZE = 60
+
+SPECTRA = {
+    "one eigenvalue apart": np.append(np.linspace(0.1, 1.0, SIZE - 1), 5.0),
+    "evenly spread": np.linspace(0.01, 1.0, SIZE),
+    "two close at the top": np.append(np.linspace(0.0, 0.5, SIZE - 2), [0.99, 1.0]),
+    "crowded at the top": 1.0 - np.linspace(0.0, 1.0, SIZE) ** 2,
+    "all the same": np.ones(SIZE),
+    "a single one": np.append(np.zeros(SIZE - 1), 3.0),
+    "fourteen orders": np.logspace(-14, 0, SIZE),
+    "tiny": 1e-12 * np.linspace(0.01, 1.0, SIZE),
+}
+
+
+def operator(values, seed):
+    """A symmetric matrix of these eigenvalues in a random basis."""
+    basis, _ = np.linalg.qr(np.random.default_rng(seed).standard_normal((SIZE, SIZE)))
+    return (basis * values) @ basis.T
+
+
+def holds(estimate, exact):
+    assert LEAST * exact <= estimate <= MOST * exact, estimate / exact
+
+
+@pytest.mark.parametrize("kind", list(SPECTRA))
+@pytest.mark.parametrize("seed", range(5))
+def test_norm_of_any_spectrum(kind, seed):
+    F = operator(SPECTRA[kind], seed)
+    estimate = estimate_norm(matrix(F), NoCoarse(), vector(np.zeros(SIZE)), Options().norm_steps)
+    holds(estimate, np.linalg.norm(F, 2))
+
+
+@pytest.mark.parametrize("kind", list(SPECTRA))
+def test_norm_on_the_kernel_of_a_coarse_space(kind):
+    F = operator(SPECTRA[kind], 7)
+    G = np.random.default_rng(8).standard_normal((6, SIZE))
+    P = np.eye(SIZE) - G.T @ np.linalg.solve(G @ G.T, G)
+    coarse = DenseCoarse(G, np.zeros(6))
+    estimate = estimate_norm(matrix(F), coarse, vector(np.zeros(SIZE)), Options().norm_steps)
+    holds(estimate, np.linalg.norm(P @ F @ P, 2))
+
+
+@pytest.mark.parametrize("scaling", ["stiffness", "multiplicity"])
+@pytest.mark.parametrize(("cell", "n"), [("quadrilateral", 12), ("tetrahedron", 4)])
+def test_norm_of_a_scene(cell, n, scaling):
+    gdim = 2 if cell == "quadrilateral" else 3
+    d = decomposed(cell, n, 6)
+    floor = tfeti.Obstacle("bottom", curved_obstacle(gdim))
+    load = (0.0,) * (gdim - 1) + (-0.05,)
+    p = problem(d, load, [floor], tfeti_scaling=scaling)
+    p.solve()
+    dual = p._dual
+    estimate = estimate_norm(dual.F, dual.coarse, dual.d, Options().norm_steps)
+    x, y, size = dual.d.duplicate(), dual.d.duplicate(), 0.0
+    rng = np.random.default_rng(dual.coarse.comm.rank)
+    x.array[:] = rng.standard_normal(x.getLocalSize())
+    for _ in range(1000):  # plain power steps, far more than an estimate may take
+        project(dual.coarse, x, y)
+        x.normalize()
+        dual.F.mult(x, y)
+        project(dual.coarse, y, x)
+        size = y.norm()
+        y.copy(x)
+    holds(estimate, size)
+    p.destroy()

@@ -1,0 +1,216 @@
+"""Verdicts on solvability against plain linear programs, and where scales differ much."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import ufl
+from bodies import boxes, two_body_problem
+from dolfinx import fem
+from dolfinx.mesh import meshtags
+from mpi4py import MPI
+from scenes import box, hooke, strain
+from scipy.optimize import linprog
+from scipy.sparse import csr_array, eye_array
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx import NoSolutionError
+from tfeti_dolfinx.contact.search import ContactSearch
+from tfeti_dolfinx.dual.cuts import Rows
+from tfeti_dolfinx.dual.motions import unresisted, unsprung
+from tfeti_dolfinx.dual.solvability import check_solvable
+
+
+def rigid_scene(rng):
+    """Rows of equalities and contacts between rigid bodies, and a load."""
+    count, k = int(rng.integers(1, 6)), int(rng.choice([3, 6]))
+
+    def row(*bodies):
+        values = np.zeros((count, k))
+        force = rng.integers(-1, 2, k) if rng.random() < 0.5 else rng.standard_normal(k)
+        for sign, body in zip((1, -1), bodies, strict=False):
+            values[body] = sign * force + (sign < 0) * 0.3 * rng.standard_normal(k)
+        return values.ravel()
+
+    E = [row(rng.integers(count)) for _ in range(rng.integers(0, 4))]
+    N = [row(*rng.permutation(count)[: rng.integers(1, 3)]) for _ in range(rng.integers(1, 30))]
+    E, N = np.array(E).reshape(-1, count * k), np.array(N)
+    load = N.T @ np.maximum(rng.standard_normal(len(N)), 0.0) + E.T @ rng.standard_normal(len(E))
+    disturbed = rng.choice([0.0, 1e-3, 1.0], p=[0.4, 0.3, 0.3])
+    return count, k, E, N, load + disturbed * rng.standard_normal(count * k)
+
+
+def as_coarse(count, k, E, N, load):
+    """What the test of solvability looks at of a coarse space."""
+    size = np.linalg.norm(load.reshape(count, k), axis=1)
+    unheld = unresisted(csr_array(E.T @ E), unsprung(np.zeros((count, k, k))))
+    bodies = SimpleNamespace(
+        count=count,
+        k=k,
+        modes=eye_array(count * k, format="csr"),
+        negligible=np.maximum(1e-9 * size, 1e-14 * size.max()),
+        amounts=lambda motion: motion.reshape(count, k),
+    )
+    return SimpleNamespace(
+        dimension=count * k,
+        comm=MPI.COMM_SELF,
+        bodies=bodies,
+        e=load,
+        J=csr_array(N),
+        bounded=slice(0, len(N)),
+        unheld=unheld,
+        free_motions=unresisted(csr_array(N.T @ N), unheld),
+    )
+
+
+def test_random_rigid_scenes_against_a_plain_program():
+    """Gλ = e, λ_N ≥ 0 is feasible or not; loads of 1e-9 to 1e9 in whatever units."""
+    verdicts = []
+    for seed in range(150):
+        rng = np.random.default_rng(seed)
+        count, k, E, N, load = rigid_scene(rng)
+        A = np.concatenate((N.T, E.T, -E.T), axis=1)
+        plain = linprog(np.zeros(A.shape[1]), A_eq=A, b_eq=load, bounds=(0, None)).status == 0
+        coarse = as_coarse(count, k, E, N, load * 10.0 ** rng.uniform(-9, 9))
+        names = [f"body {b}" for b in range(count)], [f"mode {m}" for m in range(k)]
+        try:
+            check_solvable(coarse, *names)
+            solvable = True
+        except NoSolutionError:
+            solvable = False
+        assert solvable == plain, f"seed {seed}"
+        verdicts.append(solvable)
+    assert 0.2 < np.mean(verdicts) < 0.8
+
+
+def block_on_floor(scale, E, load, subdomains=2):
+    """A block of edge ``scale`` over a plane, pressed or pushed by a traction on its top."""
+    mesh, tags, names = box("quadrilateral", 3)
+    mesh.geometry.x[:] *= scale
+    d = tfeti.decompose(mesh, subdomains, facet_tags=tags, surfaces=names)
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+    L = ufl.dot(fem.Constant(d.mesh, E * np.array(load)), v) * ds(d.surface("top"))
+    floor = tfeti.Obstacle("bottom", tfeti.Plane((0, -0.01 * scale), (0, 1)))
+    return tfeti.ContactProblem(ufl.inner(hooke(E)(u), strain(v)) * ufl.dx, L, [], [floor], d)
+
+
+@pytest.mark.parametrize(("scale", "E"), [(1e-9, 2e11), (1e6, 2e-1), (1.0, 1e9)])
+def test_units_do_not_matter(scale, E):
+    pressed = block_on_floor(scale, E, (0.0, -1e-3))
+    pressed.solve()
+    assert pressed.report.free_modes == 1
+    with pytest.raises(NoSolutionError, match=r"translation in y\): only contact"):
+        block_on_floor(scale, E, (0.0, 1e-3)).solve()
+    with pytest.raises(NoSolutionError, match=r"translation in x\): nothing resists"):
+        block_on_floor(scale, E, (1e-9, -1e-3)).solve()
+
+
+@pytest.mark.parametrize("subdomains", [1, 4])
+def test_a_spring_of_1e_10_holds_a_body(subdomains):
+    mesh, tags, names = box("quadrilateral", 12)
+    d = tfeti.decompose(mesh, subdomains, facet_tags=tags, surfaces=names)
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+    spring = fem.Constant(d.mesh, 1e-10)
+    a = ufl.inner(hooke()(u), strain(v)) * ufl.dx + spring * ufl.inner(u, v) * ds(
+        d.surface("bottom")
+    )
+    L = ufl.dot(fem.Constant(d.mesh, np.array([0.0, -1e-12])), v) * ds(d.surface("top"))
+    p = tfeti.ContactProblem(a, L, [], [], d)
+    down = p.solve().x.array.reshape(-1, 2)[:, 1]
+    assert p.report.free_modes == 0
+    assert np.allclose(down, -0.01, rtol=0.02)  # what rounding leaves of the stiffness
+
+
+def test_a_body_pinned_at_neighbouring_nodes_beside_a_stiff_one():
+    """The pins are a mesh size apart, and the other body is 1e8 times as stiff."""
+    parts = [
+        ("soft", (0.0, 0.0), (1.0, 1.0), (16, 16)),
+        ("stiff", (0.2, 1.0), (0.8, 2.0), (4, 4)),
+    ]
+    mesh, tags, names = boxes("quadrilateral", parts)
+    d = tfeti.decompose(mesh, 3, facet_tags=tags, surfaces=names)
+
+    def pins(V):
+        at = {(0.0, 0.0): (0, 1), (1 / 16, 0.0): (1,)}
+        made = []
+        for point, axes in at.items():
+            for axis in axes:
+                W, _ = V.sub(axis).collapse()
+
+                def near(x, point=point):
+                    return np.isclose(x[0], point[0]) & np.isclose(x[1], point[1])
+
+                dofs = fem.locate_dofs_geometrical((V.sub(axis), W), near)
+                made.append(fem.dirichletbc(fem.Function(W), dofs, V.sub(axis)))
+        return made
+
+    def load(v, ds):
+        return ufl.dot(fem.Constant(d.mesh, (0.0, -1e-6)), v) * ds(d.surface("stiff top"))
+
+    def stress(u):
+        x = ufl.SpatialCoordinate(d.mesh)
+        E = ufl.conditional(ufl.gt(x[1], 1.0), 1e8, 1.0)
+        return E * hooke()(u)
+
+    contact = tfeti.Contact("soft top", "stiff bottom", search_radius=0.1)
+    p = two_body_problem(d, load, pins, [contact], stress=stress)
+    dual = dual_of(p)
+    assert dual.coarse.free_modes == 1  # the stiff one slides
+    p.destroy()
+
+
+def dual_of(p):
+    """The dual problem of a scene, not solved."""
+    search = ContactSearch(p.contacts, p.dofs, p.decomposition)
+    p._K, p._f = p._forms.stiffness(), p._forms.load()
+    p._glue(search)
+    p._build_blocks()
+    return p._build_dual("none")
+
+
+def in_a_slot(width):
+    """A block all of whose skin must stay between two walls, ``width`` apart."""
+    mesh, tags, _ = box("quadrilateral", 3)
+    skin = meshtags(mesh, 1, tags.indices, np.full_like(tags.values, 1))
+    d = tfeti.decompose(mesh, 2, facet_tags=skin, surfaces={"skin": 1})
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    left = tfeti.Obstacle("skin", tfeti.Plane((0.5 - width / 2, 0), (1, 0)))
+    right = tfeti.Obstacle("skin", tfeti.Plane((0.5 + width / 2, 0), (-1, 0)))
+    L = ufl.dot(fem.Constant(d.mesh, np.zeros(2)), v) * ufl.dx
+    a = ufl.inner(hooke()(u), strain(v)) * ufl.dx
+    return tfeti.ContactProblem(a, L, [], [left, right], d)
+
+
+def test_contradicting_obstacles_are_named():
+    """A narrow slot compresses the block; walls that have passed each other leave no place."""
+    in_a_slot(0.9).solve()
+    with pytest.raises(NoSolutionError, match=r"contacts 0 and 1 .* contradict each other"):
+        in_a_slot(-0.1).solve()
+
+
+def test_many_loose_bodies_need_no_large_dense_array():
+    """Free motions of single bodies are sparse, whatever the number of bodies; rows are few."""
+    count, k = 300, 6
+    rng = np.random.default_rng(0)
+    levers = rng.uniform(-1, 1, (count, 40, 2))
+    below = np.zeros((count * 40, count * k))
+    rows, body = np.arange(count * 40), np.repeat(np.arange(count), 40)
+    for sign, other in ((1.0, body), (-1.0, body - 1)):
+        used = other >= 0
+        for mode, value in ((2, 1.0), (4, levers[..., 0].ravel()), (5, levers[..., 1].ravel())):
+            values = np.broadcast_to(sign * value, rows.shape)[used]
+            below[rows[used], other[used] * k + mode] = values
+    J = csr_array(below)
+    free = unresisted(csr_array(J.T @ J), unsprung(np.zeros((count, k, k))))
+    assert free.count == 3 * count
+    assert free.joint.shape[1] == 0
+    assert free.alone.nnz <= count * k * k
+    table = Rows(J, np.zeros(len(rows)), np.repeat(np.arange(count), k))
+    first = table.extremes()
+    assert count <= len(first) <= 24 * count
+    assert len(table.violated(rng.standard_normal(count * k), 1e-9, 1)) <= count

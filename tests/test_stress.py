@@ -1,0 +1,101 @@
+"""The stress harness judges rightly, and a few of its scenes are right (``benchmarks.stress``)."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.stress import judge, meshes
+from benchmarks.stress.__main__ import main
+from benchmarks.stress.ladders import floor, ladder_scenes, two_bodies
+from benchmarks.stress.package import solve_scene
+from benchmarks.stress.random_scenes import random_scene
+from benchmarks.stress.reference import Untorn
+from benchmarks.stress.scene import Body, Load, Scene
+
+
+@pytest.mark.parametrize("seed", [1, 3, 4, 6, 8, 10])
+def test_random_scenes_are_right(seed, comm):
+    row = judge.run_scene(random_scene(seed), comm)
+    if comm.rank == 0:
+        assert row["class"] in ("right", "right: no solution"), row
+
+
+@pytest.mark.parametrize("subdomains", [1, 6])
+def test_a_rung_is_right_on_ranks_without_subdomains(subdomains, comm):
+    scene = two_bodies("triangle", 1.0, 1e4)
+    row = judge.run_scene(replace(scene, subdomains=subdomains), comm)
+    if comm.rank == 0:
+        assert row["class"] == "right", row
+        assert row["noise"] < 1e-9
+
+
+def answer(scene):
+    g = meshes.grid(scene)
+    return Untorn(scene, g, *meshes.materials(scene, g, np.zeros(len(g.cells), dtype=int))).answer()
+
+
+def on_the_floor(cell, traction):
+    """A unit box on a floor, its top drawn by a traction."""
+    gdim = len(traction)
+    box = Body((0.0,) * gdim, (1.0,) * gdim, (2,) * gdim, E=2.0, nu=0.0)
+    return Scene(cell, (box,), loads=(Load((0, gdim - 1, 1), traction),), walls=(floor(cell),))
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_the_reference_knows_a_uniform_pressure(cell):
+    gdim = 2 if cell == "quadrilateral" else 3
+    found = answer(on_the_floor(cell, (0.0,) * (gdim - 1) + (-0.1,)))
+    assert found.verdict == "solvable"
+    exact = -0.05 * found.x[:, gdim - 1]
+    assert np.allclose(found.u[:, gdim - 1], exact, rtol=0, atol=1e-12)
+    assert found.free.shape[1] == (1 if gdim == 2 else 3)
+    assert found.forces.sum(axis=0)[-1] == pytest.approx(0.1, rel=1e-10)
+
+
+@pytest.mark.parametrize("traction", [(0.0, 0.1), (1e-6, -0.1), (0.0, 0.0, 0.1)])
+def test_the_reference_knows_what_has_no_solution(traction):
+    cell = "triangle" if len(traction) == 2 else "hexahedron"
+    assert answer(on_the_floor(cell, traction)).verdict == "no_solution"
+
+
+def test_the_two_references_of_the_tests_agree():
+    """The lever of ``test_mortar``'s reference, by the harness's own mortar and solver."""
+    from mortar_reference import TwoBoxes
+
+    from benchmarks.stress.scene import Held, Pair
+
+    lower = Body((0.0, -1.0), (1.0, 0.0), (3, 3))
+    upper = Body((0.0, 0.0), (1.0, 1.0), (4, 4))
+    held = (Held((0, 1, 0), (0, 1)), Held((1, 0, 0), (0, 1)))
+    loads = (Load((1, 1, 1), (0.0, -0.1)),)
+    scene = Scene("quadrilateral", (lower, upper), held, loads, (), (Pair((1, 1, 0), (0, 1, 1)),))
+    found = answer(scene)
+    x, u, _, force = TwoBoxes("quadrilateral", 3, 4, push=0.1, pull=-0.1).solve()
+    order = np.lexsort(np.rint(found.x.T * 1e7))
+    for k in (0, 1):  # nodes that coincide may be in another order
+        assert np.sort(found.u[order, k]) == pytest.approx(np.sort(u[:, k]), abs=1e-12)
+    on_upper = found.forces[found.body == 1].sum(axis=0)[1]
+    assert on_upper == pytest.approx(force.sum(), rel=1e-9)
+
+
+def test_a_wrong_answer_is_called_wrong(comm):
+    scene = two_bodies("quadrilateral", 1.0, 1.0)
+    g = meshes.grid(scene)
+    outcome = solve_scene(scene, g, comm)
+    if comm.rank == 0:
+        outcome.u = outcome.u * (1 + 3e-4)
+        assert judge.judged(scene, g, outcome)["class"] == "WRONG"
+
+
+def test_ladders_have_names_of_their_own_and_scenes_of_a_seed_are_the_same():
+    assert len(ladder_scenes()) > 300
+    assert random_scene(5) == random_scene(5)
+
+
+def test_a_process_that_dies_is_a_row(serial_only, tmp_path):
+    rows = main(["--only", "0", "no such scene", "1", "--output", str(tmp_path), "--limit", "100"])
+    assert [row["scene"] for row in rows] == ["0", "no such scene", "1"]
+    assert rows[1]["class"] == "DEATH"
+    assert "ValueError" in rows[1]["error"]
+    assert (tmp_path / "stress.md").read_text().startswith("| class | scenes |")

@@ -1,0 +1,78 @@
+"""What a user says of a contact besides its surfaces: how far it looks, and its gap."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from numbers import Real
+
+import numpy as np
+
+from tfeti_dolfinx.arrays import Array, ArrayLike
+from tfeti_dolfinx.errors import InputError
+
+REACH = 0.05  # of the extent of the smaller surface
+
+Gap = str | float | Callable[[Array], ArrayLike]
+
+
+def checked_reach(name: str, reach: float | None, extent: float) -> float:
+    """The reach, or its default.
+
+    Args:
+        name: Name of the contact, for messages.
+        reach: A length, infinite for all that there is; None for 5 % of the extent.
+        extent: Extent of the smaller surface.
+
+    Raises:
+        InputError: It is not a positive number.
+    """
+    if reach is None:
+        return REACH * extent
+    if not isinstance(reach, Real) or isinstance(reach, bool) or not reach > 0.0:
+        raise InputError(f"{name}: reach={reach!r}, expected a positive length or None")
+    return float(reach)
+
+
+def checked_gap(name: str, gap: Gap) -> None:
+    """Raise if a gap is none of "geometry", a finite number, a callable.
+
+    Raises:
+        InputError: It is not.
+    """
+    number = isinstance(gap, Real) and not isinstance(gap, bool) and np.isfinite(float(gap))
+    if not (number or callable(gap) or (isinstance(gap, str) and gap == "geometry")):
+        raise InputError(
+            f'{name}: gap={gap!r}, expected "geometry", a finite length (negative: interference), '
+            "or a function of points of shape (3, n)"
+        )
+
+
+def given_gaps(name: str, gap: Gap, x: Array) -> Array | None:
+    """Gaps that a user gives at points, None where the geometry has them.
+
+    Args:
+        name: Name of the contact, for messages.
+        gap: Checked by ``checked_gap``.
+        x: Points, shape ``(n, 3)``.
+
+    Returns:
+        Lengths, shape ``(n,)``.
+
+    Raises:
+        InputError: A function gave something else than one finite number for each point.
+    """
+    if isinstance(gap, str):
+        return None
+    if not callable(gap):
+        return np.full(len(x), float(gap))
+    try:
+        values = np.asarray(gap(x.T), dtype=float)
+        values = np.array(np.broadcast_to(values, (len(x),)))
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"{name}: gap, a function, did not give one number for each of {len(x)} points of "
+            f"shape (3, {len(x)}): {error}"
+        ) from error
+    if np.any(wrong := ~np.isfinite(values)):
+        raise InputError(f"{name}: gap is {values[wrong][0]} at the point {x[wrong][0].tolist()}")
+    return values

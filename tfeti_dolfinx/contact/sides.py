@@ -1,0 +1,97 @@
+"""The two sides of a pair: their facets, and which is the stiffer one where they meet."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.contact.facet_maps import hat_areas
+from tfeti_dolfinx.contact.facets import Facets, facet_kind, local_facets, with_averaged_normals
+from tfeti_dolfinx.contact.records import ContactRecords
+from tfeti_dolfinx.contact.surfaces import surface_facets
+from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.parallel import agreed
+
+DEGENERATE = 1e-12  # of the square (in 2D: of the length) of a facet's radius
+CREASE = 0.75  # facets that make more than about 40 degrees with the averaged normal
+
+
+@dataclass(frozen=True)
+class Side:
+    """A surface of a pair.
+
+    Attributes:
+        facets: Its facets on this rank, with averaged normals.
+        vertices: Global groups of their vertices, shape ``(n, v)``.
+        areas: ∫φ_i over each facet, shape ``(n, v)``.
+        normals: Averaged normal of each owned group, 0 off the surface, shape ``(g, gdim)``.
+    """
+
+    facets: Facets
+    vertices: Array
+    areas: Array
+    normals: Array
+
+    def has_edges(self, comm: MPI.Intracomm) -> bool:
+        """Whether a facet stands far off the averaged normal at a vertex of its. Collective."""
+        cosine = np.einsum("nvg,ng->nv", self.facets.vertex_normals, self.facets.normal)
+        return comm.allreduce(int(np.sum(cosine < CREASE))) > 0
+
+
+def side_of(contact: str, surface: str | int, dofs: TornDofs, decomposition: Decomposition) -> Side:
+    """A surface of a pair. Collective.
+
+    Args:
+        contact: Name of the contact, for messages.
+        surface: Name or tag of the surface.
+        dofs: Dof maps.
+        decomposition: The torn mesh.
+
+    Raises:
+        InputError: The surface is unknown or empty, or has facets without area.
+    """
+    kind = facet_kind(dofs)
+    facets = local_facets(dofs, decomposition, surface_facets(decomposition, surface))
+    whole = facets.radius ** (facets.x.shape[2] - 1)
+    flat = int(np.sum(facets.area <= DEGENERATE * whole))
+    if count := dofs.comm.allreduce(flat):
+        raise InputError(f"{contact}: {count} facets of {surface!r} have no area")
+    facets, normals = with_averaged_normals(facets, dofs, kind.num_vertices)
+    vertices = facets.groups[:, : kind.num_vertices]
+    return Side(facets, vertices, hat_areas(kind, facets), normals)
+
+
+def stiffness_ratio(
+    records: ContactRecords, sides: tuple[Side, Side], dofs: TornDofs, stiffness: Array
+) -> float:
+    """Stiffness per area of the first side over that of the second. Collective.
+
+    Stiffness per area is E/h of the elements at a surface: Σ n_i·K_ii n_i / Σ ∫φ_i over its
+    vertices, K_ii the diagonal before anything is glued, n_i the normal. The vertices that rows
+    name are taken, so that a mesh that is fine only where the bodies touch is judged there; where
+    there is no such row, all of them.
+
+    Args:
+        records: Conditions between the sides.
+        sides: Both sides.
+        dofs: Dof maps.
+        stiffness: Diagonal of K in primal order, shape ``(num_nodes * bs,)``.
+    """
+    diagonal = dofs.reduce(stiffness.reshape(-1, dofs.bs), np.add, 0.0)
+    named = records.entry_group[records.near[records.row]]
+    meets = dofs.add_on_owners(named, np.ones(len(named))) > 0.0
+    if dofs.comm.allreduce(int(np.sum(meets))) == 0:
+        meets[:] = True
+    per_area = []
+    for side in sides:
+        area = dofs.add_on_owners(side.vertices.ravel(), side.areas.ravel())
+        at = meets & (area > 0.0)
+        along = np.sum(side.normals[at] ** 2 * diagonal[at])
+        sums = dofs.comm.allreduce(np.array([along, area[at].sum()]))
+        per_area.append(sums[0] / sums[1])
+    return agreed(dofs.comm, float(per_area[0] / per_area[1]))

@@ -1,0 +1,84 @@
+"""Words for motions of bodies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.linalg import qr
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.dual.bodies import Bodies
+from tfeti_dolfinx.dual.motions import NULL, Motions
+
+# of the largest coefficient: what takes part in a motion, what it is named after; bodies named
+PART, DOMINANT, NAMED = 1e-3, 0.3, 4
+
+
+def free_to_move(amounts: Array, body_names: Sequence[str], mode_names: Sequence[str]) -> str:
+    """A sentence about a motion.
+
+    Args:
+        amounts: How much of each mode is in it, shape ``(bodies, k)``.
+        body_names: Names of the bodies.
+        mode_names: Names of their modes.
+    """
+    moving, modes = _parts(amounts, mode_names)
+    if len(moving) == 1:
+        return f"{body_names[moving[0]]} is free to move ({modes})"
+    names = ", ".join(body_names[b] for b in moving[:NAMED])
+    more = f" and {len(moving) - NAMED} more" if len(moving) > NAMED else ""
+    return f"{names}{more} are free to move together ({modes})"
+
+
+def _parts(amounts: Array, mode_names: Sequence[str]) -> tuple[Array, str]:
+    """The bodies that take part in a motion, and what it is mostly."""
+    parts = np.abs(amounts)
+    moving = np.flatnonzero(parts.max(axis=1) > PART * parts.max())
+    share = parts[moving].max(axis=0)
+    modes = " and ".join(mode_names[m] for m in np.flatnonzero(share > DOMINANT * share.max()))
+    return moving, modes
+
+
+def listed(
+    motions: Motions, bodies: Bodies, body_names: Sequence[str], mode_names: Sequence[str]
+) -> list[dict[str, object]]:
+    """A list of motions: ``bodies``, ``mode`` and the ``stiffness`` that holds them, 0 for none.
+
+    Of several free motions of one body any combination is one, too; they are named after the
+    modes that span them best.
+    """
+    found: list[dict[str, object]] = []
+    for body in np.flatnonzero(motions.free.any(axis=1)):
+        vectors = bodies.frames[body] @ motions.single[body]
+        own, stiffness = motions.free[body], motions.stiffness[body]
+        loose = own & (stiffness <= NULL)
+        for mode in _spanning(vectors[:, loose], mode_names):
+            found.append({"bodies": [body_names[body]], "mode": mode, "stiffness": 0.0})
+        for j in np.flatnonzero(own & ~loose):
+            _, mode = _parts(vectors[:, j][None, :], mode_names)
+            held = float(stiffness[j])
+            found.append({"bodies": [body_names[body]], "mode": mode, "stiffness": held})
+    for motion in _plain(motions.joint).T:
+        moving, mode = _parts(bodies.amounts(motion), mode_names)
+        names = [body_names[b] for b in moving]
+        found.append({"bodies": names, "mode": mode, "stiffness": 0.0})
+    return found
+
+
+def _plain(joint: Array) -> Array:
+    """Motions that span the same, each with a coordinate that the others leave alone."""
+    if joint.shape[1] == 0:
+        return joint
+    rows = qr(joint.T, pivoting=True, mode="r")[1][: joint.shape[1]]
+    return np.asarray(joint @ np.linalg.inv(joint[np.sort(rows)]))
+
+
+def _spanning(vectors: Array, mode_names: Sequence[str]) -> list[str]:
+    """Names of as many motions as there are columns."""
+    count = vectors.shape[1]
+    if count == 1:
+        return [_parts(vectors.T, mode_names)[1]]
+    if count == 0:
+        return []
+    return [mode_names[m] for m in sorted(qr(vectors.T, pivoting=True, mode="r")[1][:count])]

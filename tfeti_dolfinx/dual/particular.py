@@ -1,0 +1,77 @@
+"""The smallest multipliers that balance the load."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.dual.coarse import CoarseSpace, SemidefiniteFactor
+from tfeti_dolfinx.parallel import agreed
+
+MAX_STEPS = 100
+# of ‖e‖: what the coarse problem's factors leave at best, and what is let pass
+BALANCED, LET_PASS = 1e-13, 1e-9
+# of GGᵀ: keeps the steps' matrices regular where few rows carry a force
+DAMPING = 1e-8
+SHORTEST = 1e-8
+
+log = logging.getLogger(__name__)
+
+
+def feasible_particular(coarse: CoarseSpace, bounded: slice) -> Array:
+    """λ̄ of min ½‖λ‖² subject to Gλ = e, λ_N ≥ 0. Collective.
+
+    λ̄ = Gᵀα on free rows and (Gᵀα)₊ on bounded ones; α by a semismooth Newton method, each
+    step of which factors G_f G_fᵀ, f the rows that carry a force (Dostál's talk, item (ii)).
+    Where that does not end, λ̄ = Gᵀ(GGᵀ)⁻¹e is taken, and a warning says so.
+
+    Args:
+        coarse: The coarse space; the problem has been found solvable.
+        bounded: Local rows with λ ≥ 0.
+
+    Returns:
+        This rank's part of λ̄.
+    """
+    carrying = np.ones(coarse.Gt.shape[0], dtype=bool)
+    gram, start = coarse.gram(), coarse.solve(coarse.e)
+    alpha = start
+    for _ in range(MAX_STEPS):
+        force = coarse.Gt @ alpha
+        carrying[bounded] = force[bounded] > 0.0
+        residual = coarse.e - coarse.G(np.where(carrying, force, 0.0))
+        left = float(np.linalg.norm(residual))
+        if agreed(coarse.comm, left <= BALANCED * float(np.linalg.norm(coarse.e))):
+            return np.where(carrying, force, 0.0)
+        factor = SemidefiniteFactor(csr_array(coarse.gram(carrying) + DAMPING * gram), coarse.null)
+        step = factor.solve(residual)
+        factor.destroy()
+        length = _damping(coarse, bounded, alpha, step)
+        if length <= SHORTEST:
+            break
+        alpha = alpha + length * step
+    if agreed(coarse.comm, left <= LET_PASS * float(np.linalg.norm(coarse.e))):
+        return np.where(carrying, force, 0.0)
+    if coarse.comm.rank == 0:
+        log.warning(
+            "homogenization feasible: the smallest feasible multipliers were not found (Gλ − e "
+            "is %.1e of e); natural is taken instead",
+            left / float(np.linalg.norm(coarse.e)),
+        )
+    return np.asarray(coarse.Gt @ start)
+
+
+def _damping(coarse: CoarseSpace, bounded: slice, alpha: Array, step: Array) -> float:
+    """Step length that does not raise ½‖λ(α)‖² − αᵀe."""
+
+    def cost(alpha: Array) -> float:
+        force = coarse.Gt @ alpha
+        force[bounded] = np.maximum(force[bounded], 0.0)
+        return 0.5 * float(coarse.comm.allreduce(float(force @ force))) - float(alpha @ coarse.e)
+
+    start, length = cost(alpha), 1.0
+    while length > SHORTEST and agreed(coarse.comm, cost(alpha + length * step) > start):
+        length *= 0.5
+    return length

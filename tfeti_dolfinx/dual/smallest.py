@@ -1,0 +1,151 @@
+"""The smallest of the displacements that solve a problem equally well."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from mpi4py import MPI
+from scipy.optimize import lsq_linear
+from scipy.sparse import block_array, csr_array
+from scipy.sparse.csgraph import connected_components
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.dual.coarse import CoarseSpace
+from tfeti_dolfinx.dual.cuts import Rows, minimise
+from tfeti_dolfinx.dual.motions import Motions
+from tfeti_dolfinx.parallel import agreed
+from tfeti_dolfinx.subdomains.block import Block
+
+# Motions held by less than this share of what the same contacts hold at most are nearly free:
+# their contacts' normals are off by less than 6 degrees from a right angle.
+NEARLY = 1e-2
+# Contact force that counts as none: as a share of the largest on the same bodies; or in multiples
+# of the solver's own error, unless it is a larger share of the bodies' loads.
+NO_FORCE, NO_EFFECT = 1e-6, 10.0
+# Size of what is left of a joint motion that motions of single bodies span already.
+DEPENDENT = 1e-8
+# Excess of a row, as a share of the motion, that is let be; slope of a row that is rounding.
+EXCESS, SLOPE = 1e-9, 1e-12
+
+
+def nearly_free(coarse: CoarseSpace, lam: Array, error: float) -> tuple[Motions, Array]:
+    """Motions that the contact rows with a force do not hold, or hardly. Collective.
+
+    Args:
+        coarse: The coarse space.
+        lam: The multipliers.
+        error: How large multipliers may be by the solver's error alone.
+
+    Returns:
+        The motions, and flags of the local rows with a force.
+    """
+    force = np.zeros(len(lam))
+    force[coarse.bounded] = (lam * coarse.row_size)[coarse.bounded]
+    row, column = coarse.J.tocoo().coords
+    body = column // coarse.bodies.k
+    largest = np.zeros(coarse.bodies.count)
+    np.maximum.at(largest, body, force[row])
+    coarse.comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
+    loads = np.where(coarse.bodies.loads > 0.0, coarse.bodies.loads, np.inf)
+    against_forces, against_loads = np.full((2, len(lam)), np.inf)
+    np.minimum.at(against_forces, row, largest[body])
+    np.minimum.at(against_loads, row, loads[body])
+    error_alone = (lam <= NO_EFFECT * error) & (force <= NO_FORCE * against_loads)
+    real = (force > 0.0) & (force > NO_FORCE * against_forces) & ~error_alone
+    return coarse.unresisted(real, below=NEARLY), real
+
+
+def smallest_motion(
+    coarse: CoarseSpace,
+    blocks: Sequence[Block],
+    u: Sequence[Array],
+    gap: Array,
+    motions: Motions,
+    force: Array,
+) -> Array:
+    """Kernel coordinates of the motion that makes u the smallest solution. Collective.
+
+    Of the displacements that differ by these motions, that keep open contacts open and leave the
+    rows with a force as near to contact as they are, it has the least mean squares on the bodies.
+
+    Args:
+        coarse: The coarse space.
+        blocks: This rank's Blocks.
+        u: Displacement of each Block.
+        gap: c − B u, shape ``(m,)``.
+        motions: Motions that hardly any force resists.
+        force: Flags of local contact rows with a force.
+
+    Returns:
+        Shape ``(r,)``.
+    """
+    N, body = agreed(coarse.comm, _orthonormal(motions, coarse.bodies.k))
+    wanted = -(N.T @ coarse.bodies.part_of(u, blocks))
+    size = float(np.abs(wanted).max(initial=0.0))
+    rows = _rows(coarse, csr_array(coarse.J @ N), gap / coarse.row_size, force, body)
+    y = minimise(
+        rows,
+        lambda A, b: _nearest(A, b, wanted),
+        EXCESS * size,
+        coarse.comm,
+        np.empty(0, dtype=np.int64),
+    )
+    if y is None:
+        return np.zeros(coarse.dimension)
+    return np.asarray(coarse.bodies.modes @ (N @ (rows.allowed(y, EXCESS * size, coarse.comm) * y)))
+
+
+def _orthonormal(motions: Motions, k: int) -> tuple[csr_array, Array]:
+    """Orthonormal basis of the motions, and a body of each."""
+    alone, joint = motions.alone, motions.joint
+    body = np.repeat(np.arange(len(motions.free)), motions.free.sum(axis=1))
+    if joint.shape[1] == 0:
+        return alone, body
+    joint = joint / np.linalg.norm(joint, axis=0)
+    U, size, _ = np.linalg.svd(joint - alone @ (alone.T @ joint), full_matrices=False)
+    joint = U[:, size > DEPENDENT]
+    first = np.argmax(np.abs(joint) > SLOPE, axis=0) // k
+    return csr_array(block_array([[alone, csr_array(joint)]])), np.concatenate((body, first))
+
+
+def _rows(coarse: CoarseSpace, A: csr_array, gap: Array, force: Array, body: Array) -> Rows:
+    """A y ≤ gap on open rows; |gap − A y| no larger on others than it is anywhere."""
+    bounded = np.zeros(len(gap), dtype=bool)
+    bounded[coarse.bounded] = True
+    closed = ~bounded | force
+    largest = float(np.abs(gap[closed]).max(initial=0.0))
+    error = coarse.comm.allreduce(largest, op=MPI.MAX)
+    upper = np.where(force, gap + error, np.maximum(gap, 0.0))
+    matrix = csr_array(block_array([[A[bounded]], [-A[force]]]))
+    return Rows(matrix, np.concatenate((upper[bounded], error - gap[force])), body)
+
+
+def _nearest(A: csr_array, b: Array, wanted: Array) -> Array:
+    """The point of A y ≤ b that is nearest to the one wanted, by parts that do not meet."""
+    y = wanted.copy()
+    if A.shape[0] == 0:
+        return y
+    links = csr_array(abs(A).T @ abs(A))
+    part = connected_components(links, directed=False)[1]
+    part_of_row = part[A.indices[A.indptr[:-1]]]
+    for p in np.unique(part_of_row):
+        columns, rows = np.flatnonzero(part == p), np.flatnonzero(part_of_row == p)
+        y[columns] += _least_distance(A[rows][:, columns].toarray(), b[rows], wanted[columns])
+    return y
+
+
+def _least_distance(A: Array, b: Array, wanted: Array) -> Array:
+    """min ½‖x‖² over A(x + wanted) ≤ b by least squares with bounds.
+
+    Lawson, Hanson, Solving Least Squares Problems, 1974, chapter 23, problem LDP.
+    """
+    excess = A @ wanted - b
+    scale = np.abs(excess).max()
+    if np.all(excess <= 0.0):
+        return np.zeros_like(wanted)
+    E = np.concatenate((-A.T, excess[None, :] / scale))
+    f = np.zeros(len(E))
+    f[-1] = 1.0
+    r = E @ lsq_linear(E, f, bounds=(0.0, np.inf), method="bvls", tol=1e-14).x - f
+    return np.asarray(-scale * r[:-1] / r[-1])
