@@ -105,7 +105,7 @@ def elasticity(decomposition):
     strain = ufl.sym(ufl.grad(u))
     stress = strain + ufl.tr(strain) * ufl.Identity(3)
     down = ufl.dot(fem.Constant(mesh, (0.0, 0.0, -1.0)), v)
-    forms = Forms(ufl.inner(stress, ufl.sym(ufl.grad(v))) * dx, down * dx, decomposition, {}, {})
+    forms = Forms(ufl.inner(stress, ufl.sym(ufl.grad(v))) * dx, down * dx, V, decomposition, {}, {})
     return forms, TornDofs(V, decomposition)
 
 
