@@ -1,22 +1,16 @@
-"""How right the displacement of an iterate is, and when a solver may stop for it."""
+"""The stopping rule: the displacement of each body is right."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.dual.coarse import CoarseSpace
-from tfeti_dolfinx.dual.operator import trace_slices
-from tfeti_dolfinx.gluing.constraints import Constraints
+from tfeti_dolfinx.dual.measures import Measures, Scene, measure
 from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.qp.problem import ConvergedReason
-from tfeti_dolfinx.subdomains.block import Block
 
 # Differences that are rounding, in a body that hardly moves as well: of the largest displacement
 # of all bodies; of what its load does to its subdomains alone, if that is held where it acts.
@@ -31,152 +25,6 @@ AIM, LEAP = 0.5, 1e-6
 STALL = 0.5
 # of what rounding leaves of a residual: nothing comes down to that
 OUT_OF_REACH = 1e-4
-
-
-class Scene(Protocol):
-    """What a measurement needs to know of the dual problem."""
-
-    constraints: Constraints
-    blocks: Sequence[Block]
-    coarse: CoarseSpace
-    body_of_block: Array
-    num_bodies: int
-
-    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, error: float) -> list[Array]:
-        """Displacements of this rank's Blocks, given the solver's error. Collective."""
-        ...
-
-
-@dataclass(frozen=True)
-class BodyMeasures:
-    """What is known of each body at an iterate, arrays of shape ``(bodies,)``; on all ranks.
-
-    Attributes:
-        size: Largest displacement.
-        elastic: Largest displacement but for a rigid motion.
-        energy: uᵀKu.
-        correction: Largest displacement v that closes jumps and overlaps.
-        correction_energy: vᵀ diag(K) v.
-        change: Largest change since the iterate before, or 0.
-        alone: Largest displacement K⁺f of the trace.
-    """
-
-    size: Array
-    elastic: Array
-    energy: Array
-    correction: Array
-    correction_energy: Array
-    change: Array
-    alone: Array
-
-
-@dataclass(frozen=True)
-class Measures:
-    """An iterate in physical terms; the same on all ranks but for the displacements.
-
-    Attributes:
-        u: Displacements of this rank's Blocks.
-        bodies: What is known of each body.
-        penetration: Deepest overlap, or distance of a row that carries a force.
-        balance: Largest force left on a kernel mode.
-        forces: Size of the forces that act on a kernel mode.
-        residual: Norm of what rows miss.
-    """
-
-    u: list[Array]
-    bodies: BodyMeasures
-    penetration: float
-    balance: float
-    forces: float
-    residual: float
-
-    @property
-    def error(self) -> float:
-        """Norm of the correction in energy, over all bodies."""
-        return float(np.sqrt(self.bodies.correction_energy.sum()))
-
-
-def measure(
-    scene: Scene,
-    lam: PETSc.Vec,
-    gradient: PETSc.Vec,
-    error: float,
-    before: Sequence[Array] | None = None,
-) -> Measures:
-    """Recover the displacement of an iterate and see how well it fulfils the rows. Collective.
-
-    Rows miss w = Bu − c: rows of equalities and those that carry a force both ways, others
-    where they overlap. v = D⁻¹Bᵀw closes that (rows are orthonormal in D⁻¹), and u + v is
-    admissible; so ‖v‖_K bounds the error of u in energy, as far as λ balances the load.
-
-    Args:
-        scene: The dual problem.
-        lam: The multipliers λ.
-        gradient: Fλ − d up to the range of Gᵀ.
-        error: How large multipliers may be by the solver's error alone.
-        before: Displacements of an earlier iterate.
-    """
-    u = scene.recover(lam, gradient, error)
-    w, penetration = _missed(scene, u, lam)
-    v = scene.constraints.B.createVecRight()
-    scene.constraints.B.multTranspose(w, v)
-    residual = w.norm()
-    bodies = _bodies(scene, u, v.array_r / scene.constraints.weights, before)
-    balance, forces = _balance(scene.coarse, lam)
-    for vec in (w, v):
-        vec.destroy()
-    return Measures(u, bodies, penetration, balance, forces, residual)
-
-
-def _missed(scene: Scene, u: list[Array], lam: PETSc.Vec) -> tuple[PETSc.Vec, float]:
-    """w, and the largest of its inequality rows as a length."""
-    constraints = scene.constraints
-    trace, w = constraints.B.createVecRight(), constraints.c.duplicate()
-    for block, part, u_s in zip(scene.blocks, trace_slices(scene.blocks), u, strict=True):
-        trace.array[part] = u_s[block.trace_dofs]
-    constraints.B.mult(trace, w)
-    w.axpy(-1.0, constraints.c)
-    bounded = constraints.inequalities
-    rows = w.array[bounded]
-    carrying = lam.array_r[bounded] > 0.0
-    rows[:] = np.where(carrying, rows, np.maximum(rows, 0.0))
-    lengths = np.abs(rows) / constraints.scale
-    trace.destroy()
-    deepest = float(np.max(lengths, initial=0.0))
-    return w, float(w.getComm().tompi4py().allreduce(deepest, op=MPI.MAX))
-
-
-def _bodies(scene: Scene, u: list[Array], v: Array, before: Sequence[Array] | None) -> BodyMeasures:
-    """What is known of each body. Collective."""
-    comm, count = scene.coarse.comm, scene.num_bodies
-    motions = scene.coarse.bodies
-    rigid = motions.amounts(motions.part_of(u, scene.blocks))
-    sums, largest = np.zeros((2, count)), np.zeros((5, count))
-    slices = trace_slices(scene.blocks)
-    for s, (block, part, body) in enumerate(
-        zip(scene.blocks, slices, scene.body_of_block, strict=True)
-    ):
-        sums[:, body] += block.energy(u[s]), block.diagonal @ v[part] ** 2
-        change = u[s] - before[s] if before is not None else np.zeros(0)
-        elastic = u[s] - block.modes @ rigid[body]
-        fields = (u[s], elastic, v[part], change, block.condensed_load)
-        sizes = [np.max(np.abs(field), initial=0.0) for field in fields]
-        largest[:, body] = np.maximum(largest[:, body], sizes)
-    comm.Allreduce(MPI.IN_PLACE, sums, op=MPI.SUM)
-    comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
-    size, elastic, correction, change, alone = largest
-    return BodyMeasures(size, elastic, sums[0], correction, sums[1], change, alone)
-
-
-def _balance(coarse: CoarseSpace, lam: PETSc.Vec) -> tuple[float, float]:
-    """Largest entry of Gλ − e, and what it is compared with. Collective."""
-    if coarse.dimension == 0:
-        return 0.0, 0.0
-    squares = (coarse.Gt.multiply(coarse.Gt)).sum(axis=0)
-    squares = np.ascontiguousarray(squares, dtype=float).ravel()
-    coarse.comm.Allreduce(MPI.IN_PLACE, squares, op=MPI.SUM)
-    left = np.abs(coarse.G(lam.array_r) - coarse.e).max()
-    return float(left), float(np.sqrt(squares.max()) * lam.norm())
 
 
 @dataclass(frozen=True)

@@ -118,9 +118,9 @@ class CoarseSpace:
         self.combine(self.coordinates(x), y)
 
     def norm_Q(self, x: PETSc.Vec) -> float:
-        """‖Q x‖."""
+        """‖Q x‖; the same on all ranks, since loops end by it."""
         Gx = self.G(x.array_r)
-        return float(np.sqrt(max(float(Gx @ self.solve(Gx)), 0.0)))
+        return agreed(self.comm, float(np.sqrt(max(float(Gx @ self.solve(Gx)), 0.0))))
 
     def particular(self, x: PETSc.Vec) -> None:
         """x = Gᵀ(GGᵀ)⁻¹e."""
