@@ -125,7 +125,7 @@ def test_a_pair(comm, shared_tmp, cell, homogenization):
 
 
 def test_a_pair_that_meets_late(comm, shared_tmp):
-    """The search radius is smaller than the gap: rows come when the bodies overlap."""
+    """The reach is smaller than the gap: rows come when the bodies overlap."""
     d = stacked("quadrilateral", 3, 4, 2, gap=0.02)
 
     def clamped_on_top(V):
@@ -136,7 +136,7 @@ def test_a_pair_that_meets_late(comm, shared_tmp):
             fem.dirichletbc(-0.04, down, V.sub(1)),
         ]
 
-    pair = tfeti.Contact("upper bottom", "lower top", search_radius=0.01)
+    pair = tfeti.Contact("upper bottom", "lower top", reach=0.01)
     p = two_body_problem(d, pressed(d, 0.0), clamped_on_top, [pair])
     p.solve()
     assert p.report.late_contact_rows > 0

@@ -18,9 +18,9 @@ from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.qp.problem import ConvergedReason
 from tfeti_dolfinx.subdomains.block import Block
 
-# of the largest displacement of all bodies: differences that small are rounding, in a body that
-# hardly moves as well
-NOISE = 1e-13
+# Differences that are rounding, in a body that hardly moves as well: of the largest displacement
+# of all bodies; of what its load does to its subdomains alone, if that is held where it acts.
+NOISE, LOAD_NOISE = 1e-13, 1e-14
 # the first look is taken at this power of rtol, to learn how far things move
 FIRST_LOOK = 0.5
 # a new tolerance aims a little below what was asked for; it never falls by more than LEAP at
@@ -58,6 +58,7 @@ class BodyMeasures:
         correction: Largest displacement v that closes jumps and overlaps.
         correction_energy: vᵀ diag(K) v.
         change: Largest change since the iterate before, or 0.
+        alone: Largest displacement K⁺f of the trace.
     """
 
     size: Array
@@ -66,6 +67,7 @@ class BodyMeasures:
     correction: Array
     correction_energy: Array
     change: Array
+    alone: Array
 
 
 @dataclass(frozen=True)
@@ -149,7 +151,7 @@ def _bodies(scene: Scene, u: list[Array], v: Array, before: Sequence[Array] | No
     comm, count = scene.coarse.comm, scene.num_bodies
     motions = scene.coarse.bodies
     rigid = motions.amounts(motions.part_of(u, scene.blocks))
-    sums, largest = np.zeros((2, count)), np.zeros((4, count))
+    sums, largest = np.zeros((2, count)), np.zeros((5, count))
     slices = trace_slices(scene.blocks)
     for s, (block, part, body) in enumerate(
         zip(scene.blocks, slices, scene.body_of_block, strict=True)
@@ -157,12 +159,13 @@ def _bodies(scene: Scene, u: list[Array], v: Array, before: Sequence[Array] | No
         sums[:, body] += block.energy(u[s]), block.diagonal @ v[part] ** 2
         change = u[s] - before[s] if before is not None else np.zeros(0)
         elastic = u[s] - block.modes @ rigid[body]
-        values = [np.max(np.abs(a), initial=0.0) for a in (u[s], elastic, v[part], change)]
-        largest[:, body] = np.maximum(largest[:, body], values)
+        fields = (u[s], elastic, v[part], change, block.condensed_load)
+        sizes = [np.max(np.abs(field), initial=0.0) for field in fields]
+        largest[:, body] = np.maximum(largest[:, body], sizes)
     comm.Allreduce(MPI.IN_PLACE, sums, op=MPI.SUM)
     comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
-    size, elastic, correction, change = largest
-    return BodyMeasures(size, elastic, sums[0], correction, sums[1], change)
+    size, elastic, correction, change, alone = largest
+    return BodyMeasures(size, elastic, sums[0], correction, sums[1], change, alone)
 
 
 def _balance(coarse: CoarseSpace, lam: PETSc.Vec) -> tuple[float, float]:
@@ -290,7 +293,7 @@ class Accuracy:
     def tolerances(self) -> Tolerances:
         """What the last look is compared with."""
         now = self._looked()
-        noise = NOISE * now.bodies.size.max(initial=0.0)
+        noise = NOISE * now.bodies.size.max(initial=0.0) + LOAD_NOISE * now.bodies.alone
         displacement = self.rtol * now.bodies.size + noise
         largest = float(displacement.max(initial=0.0))
         balance = max(self.rtol, NOISE) * now.forces

@@ -124,8 +124,9 @@ class Block(Protocol):
         ...
 
 
-# eigenvalues of a stiffness, relative to the largest one, that are 0 but for rounding
-ZERO = 1e-12
+# eigenvalues of a stiffness and singular values, relative to the largest one, that are 0 but for
+# rounding
+ZERO, RANK = 1e-12, 1e-10
 
 
 def check_block(block: Block, K: Any, tol: float = 1e-9) -> None:
@@ -166,7 +167,7 @@ def check_block(block: Block, K: Any, tol: float = 1e-9) -> None:
 
     inner = np.setdiff1d(np.arange(block.size), trace)
     K_bb, K_bi, K_ii = K[np.ix_(trace, trace)], K[np.ix_(trace, inner)], K[np.ix_(inner, inner)]
-    S = K_bb - K_bi @ np.linalg.lstsq(K_ii, K_bi.T, rcond=1e-10)[0]
+    S = K_bb - K_bi @ np.linalg.lstsq(K_ii, K_bi.T, rcond=RANK)[0]
     largest = np.abs(K_bb @ w).max()
     block.prepare("stiffness")
     applied = block.apply_stiffness(w)
@@ -183,7 +184,8 @@ def _check_inverse(block: Block, K: Array, R: Array, w: Array, v: Array, tol: fl
     product, transposed = v @ block.apply_pinv(w), w @ block.apply_pinv(v)
     atol = tol * largest * np.linalg.norm(v)
     require(np.isclose(product, transposed, rtol=tol, atol=atol), "K⁺ is symmetric")
-    balanced = w - R[trace] @ np.linalg.lstsq(R[trace], w, rcond=None)[0]
+    # a mode that is 0 on the trace but for rounding must not be scaled up
+    balanced = w - R[trace] @ np.linalg.lstsq(R[trace], w, rcond=RANK)[0]
     base = block.recover(np.zeros(len(trace)))
     u = base - block.recover(balanced)
     force = np.zeros(block.size)
