@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import ufl
+from bodies import held, pressed, stacked, two_body_problem
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -272,6 +273,17 @@ def test_pcpg_with_contact():
     floor = tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -0.01), (0, 0, 1)))
     p = problem(d, contacts=[floor], tfeti_qp_type="pcpg")
     with pytest.raises(InputError, match="qp_type pcpg: the scene has 6 contact rows"):
+        p.solve()
+
+
+@pytest.mark.parametrize(
+    "pair",
+    [("lower left", "upper right"), ("lower bottom", "upper top"), ("lower right", "upper right")],
+)
+def test_a_body_is_free_since_its_pair_does_not_face(pair):
+    d = stacked("quadrilateral", 2, 2, 2)
+    p = two_body_problem(d, pressed(d), held(d, "lower bottom"), [tfeti.Contact(*pair)])
+    with pytest.raises(tfeti.NoSolutionError, match="body 1 .*of the contacts meet nobody: 0: con"):
         p.solve()
 
 

@@ -232,7 +232,7 @@ def test_a_pair_without_conditions_has_empty_data():
 
 def test_contacts_that_are_none():
     d = stacked("quadrilateral", 3, 4, 4)
-    with pytest.raises(tfeti.InputError, match="contacts: expected a list, got Contact"):
+    with pytest.raises(tfeti.InputError, match="contacts: expected a list, got a Contact"):
         tfeti.ContactProblem(*forms_of(d), PAIR, d)
     with pytest.raises(tfeti.InputError, match="expected obstacles and pairs, got 'lower top'"):
         tfeti.ContactProblem(*forms_of(d), ["lower top"], d)

@@ -142,9 +142,12 @@ class ContactProblem:
             try:
                 previous = self._solve_rows(previous)
                 late = self._take_in_overlapping(search)
-            except NoSolutionError:  # on all ranks: what is far may hold the body yet
+            except NoSolutionError as error:  # on all ranks: what is far may hold the body yet
                 if search.is_exhausted:
                     self.report.converged_reason = "NO_SOLUTION"
+                    if unmet := search.unmet():
+                        text = f"{error}; of the contacts meet nobody: {', '.join(unmet)}"
+                        raise NoSolutionError(text) from error
                     raise
                 with stage("contact", self.report.seconds):
                     late = search.widen()

@@ -173,9 +173,7 @@ class Obstacle:
 
     def _gaps(self, x: Array, gdim: int) -> tuple[Array, Array]:
         """Distances and normals at points of shape ``(n, 2)`` or ``(n, 3)``."""
-        gap, gradient = distance_and_gradient(
-            self.shape, x, f"obstacle of surface {self.surface!r}"
-        )
+        gap, gradient = distance_and_gradient(self.shape, x, self.name)
         gradient = gradient[:, :gdim]
         length = np.linalg.norm(gradient, axis=1)
         wrong = ~(np.isfinite(gap) & np.isfinite(length) & (length > 0.0))

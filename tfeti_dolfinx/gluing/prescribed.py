@@ -35,8 +35,9 @@ def prescribe(dofs: TornDofs, bcs: Sequence[fem.DirichletBC]) -> Prescribed:
     """Collect Dirichlet values and spread them to all copies of their nodes. Collective.
 
     Raises:
-        InputError: Conditions contradict each other at a node, or a value is not finite.
+        InputError: Conditions do not fit V, contradict each other at a node, or are not finite.
     """
+    bcs = checked_conditions(bcs, dofs.V)
     size = dofs.V.dofmap.index_map.size_local * dofs.bs
     values = prescribed_values(bcs, size)
     low = np.fmin.reduce(values, axis=0, initial=np.inf)
