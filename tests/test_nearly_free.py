@@ -73,24 +73,25 @@ def ring_in_ring(subdomains, jitter, rtol):
         dofs = fem.locate_dofs_topological(V, 1, d.facets("out1"))
         return [fem.dirichletbc(np.zeros(2), dofs, V)]
 
-    contact = tfeti.Contact("out0", "in1", search_radius=0.2)
+    contact = tfeti.Contact("out0", "in1", reach=0.2)
     return elastic(d, load, bcs, [contact], rtol=rtol)
 
 
-def three_discs(subdomains, rtol):
-    """Discs in a row between walls that press them a little, no other load."""
-    parts = [((2.0 * i, 0.0), 0.3, 1.0, 2, 18, 0.2, i) for i in range(3)]
+def three_discs(subdomains, jitter):
+    """Heavy discs in a row on a floor, a little apart from the walls beside them."""
+    parts = [((2.0 * i, 0.0), 0.3, 1.0, 2, 20, jitter, i) for i in range(3)]
     d = rings(parts, subdomains)
 
     def load(v, ds):
-        return ufl.dot(fem.Constant(d.mesh, np.zeros(2)), v) * ds(d.surface("in0"))
+        return ufl.dot(fem.Constant(d.mesh, np.array([0.0, -1e-3])), v) * ufl.dx
 
-    contacts = [tfeti.Contact(f"out{i}", f"out{i + 1}", search_radius=0.2) for i in range(2)]
+    contacts = [tfeti.Contact(f"out{i}", f"out{i + 1}", reach=0.2) for i in range(2)]
+    contacts += [tfeti.Obstacle(f"out{i}", tfeti.Plane((0, -1), (0, 1))) for i in range(3)]
     contacts += [
-        tfeti.Obstacle("out0", tfeti.Plane((-0.93, 0), (1, 0))),
-        tfeti.Obstacle("out2", tfeti.Plane((4.93, 0), (-1, 0))),
+        tfeti.Obstacle("out0", tfeti.Plane((-1.01, 0), (1, 0))),
+        tfeti.Obstacle("out2", tfeti.Plane((5.01, 0), (-1, 0))),
     ]
-    return elastic(d, load, lambda V: [], contacts, rtol=rtol)
+    return elastic(d, load, lambda V: [], contacts)
 
 
 def motions(p):
@@ -140,20 +141,21 @@ def test_a_ring_that_polygons_hold_by_a_little():
     assert np.allclose(turns[0], turns[1], atol=1e-5 * np.abs(turns[0]).max() + 1e-9)
 
 
-def test_three_discs_between_walls_move_alike_on_all_layouts():
-    """They slide and roll together without a force changing: the least of it is taken."""
-    results, joint = [], []
+@pytest.mark.parametrize("jitter", [0.0, 0.2])
+def test_three_discs_between_walls_move_alike_on_all_layouts(jitter):
+    """They may slide until they meet, and evenly spaced nodes roll: the least of it is taken."""
+    results = []
     for subdomains in (3, 7):
-        p = three_discs(subdomains, 1e-9)
+        p = three_discs(subdomains, jitter)
         p.solve()
         results.append(motions(p))
-        assert p.report.residuals["penetration"] <= 1e-8
-        assert p.report.residuals["gluing_jump"] <= 1e-8
-        together = [m for m in p.report.nearly_free if len(m["bodies"]) == 3]
-        joint.append(len(together))
-        assert all(m["stiffness"] == 0.0 and "translation in y" in m["mode"] for m in together)
-    assert joint == [2, 2]
-    assert np.allclose(results[0], results[1], atol=1e-4 * np.abs(results[0]).max())
+        assert p.report.residuals["penetration"] <= p.report.tolerances["penetration"]
+        assert p.report.residuals["gluing_jump"] <= p.report.tolerances["gluing_jump"]
+        named = {(m["bodies"][0], m["mode"]) for m in p.report.nearly_free}
+        assert {(f"body {b}", "translation in x") for b in range(3)} <= named
+    assert np.allclose(results[0], results[1], atol=1e-5 * np.abs(results[0]).max())
+    if jitter == 0.0:
+        assert np.abs(results[0][:, 2]).max() <= 1e-8
 
 
 def test_a_block_that_slides_freely_stays_where_it_is():

@@ -156,7 +156,7 @@ def test_a_body_pinned_at_neighbouring_nodes_beside_a_stiff_one():
         E = ufl.conditional(ufl.gt(x[1], 1.0), 1e8, 1.0)
         return E * hooke()(u)
 
-    contact = tfeti.Contact("soft top", "stiff bottom", search_radius=0.1)
+    contact = tfeti.Contact("soft top", "stiff bottom", reach=0.1)
     p = two_body_problem(d, load, pins, [contact], stress=stress)
     dual = dual_of(p)
     assert dual.coarse.free_modes == 1  # the stiff one slides
@@ -165,11 +165,11 @@ def test_a_body_pinned_at_neighbouring_nodes_beside_a_stiff_one():
 
 def dual_of(p):
     """The dual problem of a scene, not solved."""
-    search = ContactSearch(p.contacts, p.dofs, p.decomposition)
     p._K, p._f = p._forms.stiffness(), p._forms.load()
+    diagonal = p.dofs.to_primal(p._K.diagonal())
+    search = ContactSearch(p.contacts, p.dofs, p.decomposition, diagonal)
     p._glue(search)
-    p._build_blocks()
-    return p._build_dual("none")
+    return p._build_dual(p._build_blocks(), "none")
 
 
 def in_a_slot(width):

@@ -45,6 +45,7 @@ class Dual:
         preconditioner: The preconditioner, or None.
         coarse: The coarse space.
         num_inequalities: Inequality rows of all ranks.
+        carrying: After ``recover``: contact rows whose force is more than the solver's error.
         nearly_free: After ``recover``: motions that contacts with a force hold hardly or not.
 
     Raises:
@@ -63,6 +64,7 @@ class Dual:
         options_prefix: str = "tfeti_",
     ) -> None:
         self.constraints, self.blocks = constraints, blocks
+        self.carrying = np.zeros(constraints.num_rows, dtype=bool)
         self.body_of_block, self.num_bodies = body_of_block, len(body_names)
         self._names, self.nearly_free = (body_names, mode_names), list[dict[str, object]]()
         B, comm = constraints.B, constraints.B.getComm().tompi4py()
@@ -101,6 +103,7 @@ class Dual:
         nu[bounded] = np.where(closed, gradient.array_r[bounded], 0.0)
         u, gap = recover(constraints.B, constraints.c, self.blocks, self.coarse, lam, nu)
         motions, force = nearly_free(self.coarse, lam.array_r, error)
+        self.carrying = force
         words = listed(motions, self.coarse.bodies, *self._names)
         self.nearly_free = agreed(self.coarse.comm, words)
         if motions.count == 0:

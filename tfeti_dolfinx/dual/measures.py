@@ -25,6 +25,7 @@ class Scene(Protocol):
     coarse: CoarseSpace
     body_of_block: Array
     num_bodies: int
+    carrying: Array
 
     def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, error: float) -> list[Array]:
         """Displacements of this rank's Blocks, given the solver's error. Collective."""
@@ -101,7 +102,7 @@ def measure(
         before: Displacements of an earlier iterate.
     """
     u = scene.recover(lam, gradient, error)
-    w, penetration = _missed(scene, u, lam)
+    w, penetration = _missed(scene, u)
     v = scene.constraints.B.createVecRight()
     scene.constraints.B.multTranspose(w, v)
     residual = w.norm()
@@ -112,7 +113,7 @@ def measure(
     return Measures(u, bodies, penetration, balance, forces, residual)
 
 
-def _missed(scene: Scene, u: list[Array], lam: PETSc.Vec) -> tuple[PETSc.Vec, float]:
+def _missed(scene: Scene, u: list[Array]) -> tuple[PETSc.Vec, float]:
     """w, and the largest of its inequality rows as a length."""
     constraints = scene.constraints
     trace, w = constraints.B.createVecRight(), constraints.c.duplicate()
@@ -122,8 +123,7 @@ def _missed(scene: Scene, u: list[Array], lam: PETSc.Vec) -> tuple[PETSc.Vec, fl
     w.axpy(-1.0, constraints.c)
     bounded = constraints.inequalities
     rows = w.array[bounded]
-    carrying = lam.array_r[bounded] > 0.0
-    rows[:] = np.where(carrying, rows, np.maximum(rows, 0.0))
+    rows[:] = np.where(scene.carrying[bounded], rows, np.maximum(rows, 0.0))
     lengths = np.abs(rows) / constraints.scale
     trace.destroy()
     deepest = float(np.max(lengths, initial=0.0))
