@@ -84,9 +84,16 @@ def solve_dual(
         )
     homogenised.destroy()
     if result.reason <= 0:
-        residual = max(result.projected_gradient, norm * result.equality)
-        rule.look(result.lam, result.gradient, residual)
+        _last_look(result, rule)
     return result, rule
+
+
+def _last_look(result: QPResult, rule: Accuracy) -> None:
+    """Measure where a solver has stopped before its tolerance: it may be good enough."""
+    residual = max(result.projected_gradient, result.norm * result.equality)
+    reason = rule.examine(result.lam, result.gradient, residual)
+    if reason > 0:
+        result.reason = reason
 
 
 def _start(values: tuple[Array, Array] | None, like: PETSc.Vec) -> Start | None:

@@ -20,6 +20,7 @@ from benchmarks.stress.mortar import Facet, mortar
 from benchmarks.stress.scene import Pair, Scene, Side, wall_distance
 from benchmarks.stress.solve import DEPENDENT, EPSILON, null_space, solve, verdict
 
+SMALLEST = 1e-10  # of the largest displacement of all bodies: what a body has at least
 NO_WORK = 1e-13  # of all loads: rounding
 CARRIES = 1e-7  # of the largest force
 
@@ -206,13 +207,19 @@ class Untorn:
         return full.reshape(-1, self.gdim)
 
 
-def body_errors(answer: Answer, u: np.ndarray) -> np.ndarray:
-    """max |u − answer.u| over max |answer.u| of each body, modulo its free motions."""
-    bodies = range(answer.body.max() + 1)
-    difference = u - answer.u
-    size = np.array([np.abs(answer.u[answer.body == b]).max() for b in bodies])
-    size = np.maximum(size, 1e-10 * size.max())
+def body_sizes(answer: Answer, u: np.ndarray) -> np.ndarray:
+    """Displacement of each body: where it moves freely, what it was taken to be counts too."""
+    both = np.maximum(np.abs(answer.u), np.abs(u)).max(axis=1)
+    size = np.array([both[answer.body == b].max() for b in range(answer.body.max() + 1)])
+    size = np.maximum(size, SMALLEST * size.max())
     size[size == 0.0] = 1.0
+    return size
+
+
+def body_errors(answer: Answer, u: np.ndarray) -> np.ndarray:
+    """max |u − answer.u| over the displacement of each body, modulo its free motions."""
+    bodies = range(answer.body.max() + 1)
+    difference, size = u - answer.u, body_sizes(answer, u)
     weight = np.repeat(1.0 / size[answer.body], u.shape[1])
     if answer.free.shape[1]:
         z = np.linalg.lstsq(answer.free * weight[:, None], difference.ravel() * weight)[0]

@@ -14,7 +14,10 @@ from tfeti_dolfinx.qp.problem import ConvergedReason
 
 # Differences that are rounding, in a body that hardly moves as well: of the largest displacement
 # of all bodies; of what its load does to its subdomains alone, if that is held where it acts.
-NOISE, LOAD_NOISE = 1e-13, 1e-14
+NOISE, LOAD_NOISE = 5e-14, 1e-14
+# a body that moves by less than this share of another is stiff beside it, and has the error of the
+# other's forces on top of its own: its own must be as much smaller
+STIFF, STRICTER = 1e-3, 0.1
 # the first look is taken at this power of rtol, to learn how far things move
 FIRST_LOOK = 0.5
 # a new tolerance aims a little below what was asked for; it never falls by more than LEAP at
@@ -141,8 +144,9 @@ class Accuracy:
     def tolerances(self) -> Tolerances:
         """What the last look is compared with."""
         now = self._looked()
-        noise = NOISE * now.bodies.size.max(initial=0.0) + LOAD_NOISE * now.bodies.alone
-        displacement = self.rtol * now.bodies.size + noise
+        size, most = now.bodies.size, now.bodies.size.max(initial=0.0)
+        share = np.where(size < STIFF * most, STRICTER, 1.0)
+        displacement = self.rtol * share * size + NOISE * most + LOAD_NOISE * now.bodies.alone
         largest = float(displacement.max(initial=0.0))
         balance = max(self.rtol, NOISE) * now.forces
         return Tolerances(displacement, 2.0 * largest, 2.0 * largest, balance)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from petsc4py import PETSc
-from scipy.linalg import eigh_tridiagonal
 
 from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.qp.problem import Coarse, Operator, project
@@ -49,7 +48,8 @@ def estimate_norm(F: Operator, coarse: Coarse, like: PETSc.Vec, steps: int = 15)
         vec.destroy()
     if not diagonal:
         return 0.0
-    values, vectors = eigh_tridiagonal(np.array(diagonal), np.array(beside[1:-1]))
+    off = np.array(beside[1:-1])
+    values, vectors = np.linalg.eigh(np.diag(diagonal) + np.diag(off, 1) + np.diag(off, -1))
     return agreed(comm, float(values[-1] + beside[-1] * abs(vectors[-1, -1])))
 
 
