@@ -3,6 +3,7 @@
 import faulthandler
 import gc
 import os
+import sys
 
 # a compiled form must not be taken from, or leave a lock in, a cache that another run shares
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -56,7 +57,11 @@ def shared_tmp(tmp_path, comm):
 
 
 @pytest.fixture(autouse=True)
-def collect_garbage_together():
+def clean_up_together():
+    """Options and models of gmsh must not reach the next test: they would decide its mesh sizes."""
     yield
+    gmsh = sys.modules.get("gmsh")
+    if gmsh is not None and gmsh.isInitialized():
+        gmsh.finalize()
     gc.collect()
     MPI.COMM_WORLD.barrier()
