@@ -44,6 +44,7 @@ class BodyMeasures:
         correction_energy: vᵀ diag(K) v.
         change: Largest change since the iterate before, or 0.
         alone: Largest displacement K⁺f of the trace.
+        stiffness: Trace of K on the trace unknowns.
     """
 
     size: Array
@@ -53,6 +54,7 @@ class BodyMeasures:
     correction_energy: Array
     change: Array
     alone: Array
+    stiffness: Array
 
 
 @dataclass(frozen=True)
@@ -135,12 +137,13 @@ def _bodies(scene: Scene, u: list[Array], v: Array, before: Sequence[Array] | No
     comm, count = scene.coarse.comm, scene.num_bodies
     motions = scene.coarse.bodies
     rigid = motions.amounts(motions.part_of(u, scene.blocks))
-    sums, largest = np.zeros((2, count)), np.zeros((5, count))
+    sums, largest = np.zeros((3, count)), np.zeros((5, count))
     slices = trace_slices(scene.blocks)
     for s, (block, part, body) in enumerate(
         zip(scene.blocks, slices, scene.body_of_block, strict=True)
     ):
-        sums[:, body] += block.energy(u[s]), block.diagonal @ v[part] ** 2
+        diagonal = block.diagonal
+        sums[:, body] += block.energy(u[s]), diagonal @ v[part] ** 2, diagonal.sum()
         change = u[s] - before[s] if before is not None else np.zeros(0)
         elastic = u[s] - block.modes @ rigid[body]
         fields = (u[s], elastic, v[part], change, block.condensed_load)
@@ -149,7 +152,7 @@ def _bodies(scene: Scene, u: list[Array], v: Array, before: Sequence[Array] | No
     comm.Allreduce(MPI.IN_PLACE, sums, op=MPI.SUM)
     comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
     size, elastic, correction, change, alone = largest
-    return BodyMeasures(size, elastic, sums[0], correction, sums[1], change, alone)
+    return BodyMeasures(size, elastic, sums[0], correction, sums[1], change, alone, sums[2])
 
 
 def _balance(coarse: CoarseSpace, lam: PETSc.Vec) -> tuple[float, float]:
