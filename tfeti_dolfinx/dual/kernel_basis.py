@@ -68,9 +68,9 @@ class KernelBasis:
             J: The same rows on motions of bodies.
             equalities: Flags of the rows.
         """
-        GtM = J @ self.combined.multiply(~self.free)
-        nothing = J @ self.combined.multiply(self.unheld & ~self.free)
-        GtM = GtM - diags_array(equalities.astype(float)) @ nothing
+        of_equalities = diags_array(equalities.astype(float)) @ J
+        GtM = of_equalities @ self.combined.multiply(~self.unheld)
+        GtM = GtM + (J - of_equalities) @ self.combined.multiply(~self.free)
         return csr_array(hstack([GtM, csc_array(Gt)[:, self.rest]]))
 
 
@@ -89,9 +89,8 @@ def kernel_basis(bodies: Bodies, unheld: Motions, free: Motions) -> KernelBasis:
     body = np.repeat(np.arange(bodies.count), kept.sum(axis=1))
     pins, inverse = _pins(csc_array(motions), body)
     rest = np.setdiff1d(np.arange(motions.shape[0]), pins)
-    return KernelBasis(
-        combined, motions, pins, rest, inverse, held_by[kept] < EQUALITIES, held_by[kept] < CONTACT
-    )
+    unheld_of, free_of = held_by[kept] < EQUALITIES, held_by[kept] < CONTACT
+    return KernelBasis(combined, motions, pins, rest, inverse, unheld_of, free_of)
 
 
 def _directions(bodies: Bodies, unheld: Motions, free: Motions) -> tuple[Array, Array]:
