@@ -82,9 +82,9 @@ class CoarseSpace:
         self.unheld = self._unresisted(equalities, unsprung(self.bodies.springs), NULL)
         self.free_motions = self.unresisted(~equalities)
         # made on one rank: processors that round differently might choose differently
-        self._basis = agreed(comm, kernel_basis(self.bodies, self.free_motions))
+        self._basis = agreed(comm, kernel_basis(self.bodies, self.unheld, self.free_motions))
         self.modes = self._basis.coordinates(self.bodies.modes)
-        self.Gt = self._basis.rows(Gt, self.J, diags_array(self.row_size))
+        self.Gt = self._basis.rows(Gt, diags_array(self.row_size) @ self.J, equalities)
         self._read_load(blocks)
         joint = self.modes @ self.free_motions.joint
         self.null = agreed(comm, null_basis(np.flatnonzero(self._basis.free), joint))

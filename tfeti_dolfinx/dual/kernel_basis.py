@@ -6,11 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import qr
-from scipy.sparse import block_diag, csc_array, csr_array, hstack, vstack
+from scipy.sparse import block_diag, csc_array, csr_array, diags_array, hstack, vstack
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.bodies import Bodies
 from tfeti_dolfinx.dual.motions import Motions, block_diagonal
+
+# what holds a direction, in the order of the coordinates
+CONTACT, EQUALITIES, SPRINGS = 1, 2, 5
 
 
 @dataclass(frozen=True)
@@ -18,8 +21,10 @@ class KernelBasis:
     """T = [M, E]: motions M of bodies, and unit vectors E of the subdomains' other coordinates.
 
     Gluing rows of a stiff body are larger than the contact rows that hold it by the root of the
-    ratio of stiffnesses. In the subdomains' own coordinates GGᵀ would be a sum of both, and
-    rounding of the one could exceed the other. Columns GᵀM know nothing of gluing.
+    ratio of stiffnesses, and so may be rows of conditions on it. In the subdomains' own
+    coordinates GGᵀ would be a sum of both, and rounding of the one could exceed the other.
+    Columns GᵀM know nothing of gluing, and those of motions that only contact holds nothing of
+    conditions.
 
     Attributes:
         combined: Directions of each body as columns, so that M = modes @ combined, shape
@@ -28,6 +33,7 @@ class KernelBasis:
         pins: Coordinates that M takes the place of.
         rest: The others.
         inverse: Inverse of M's rows at the pins.
+        unheld: Flags of the motions that no equality row resists, shape ``(a,)``.
         free: Flags of the motions that no row resists, shape ``(a,)``.
     """
 
@@ -36,6 +42,7 @@ class KernelBasis:
     pins: Array
     rest: Array
     inverse: csr_array
+    unheld: Array
     free: Array
 
     def products(self, x: Array) -> Array:
@@ -53,46 +60,58 @@ class KernelBasis:
         first = self.inverse @ X[self.pins]
         return csr_array(vstack([first, X[self.rest] - self.motions[self.rest] @ first]))
 
-    def rows(self, Gt: csr_array, J: csr_array, row_size: csr_array) -> csr_array:
+    def rows(self, Gt: csr_array, J: csr_array, equalities: Array) -> csr_array:
         """Gᵀ T, what is known to be zero left out.
 
         Args:
             Gt: Gᵀ in the subdomains' coordinates.
-            J: Rows on motions of bodies, over their size.
-            row_size: Diagonal matrix of their sizes.
+            J: The same rows on motions of bodies.
+            equalities: Flags of the rows.
         """
-        kept = self.combined.multiply(~self.free)
-        return csr_array(hstack([row_size @ J @ kept, csc_array(Gt)[:, self.rest]]))
+        of_equalities = diags_array(equalities.astype(float)) @ J
+        GtM = of_equalities @ self.combined.multiply(~self.unheld)
+        GtM = GtM + (J - of_equalities) @ self.combined.multiply(~self.free)
+        return csr_array(hstack([GtM, csc_array(Gt)[:, self.rest]]))
 
 
-def kernel_basis(bodies: Bodies, free: Motions) -> KernelBasis:
+def kernel_basis(bodies: Bodies, unheld: Motions, free: Motions) -> KernelBasis:
     """The basis with all motions of bodies that no springs resist, the free ones apart.
 
     Args:
         bodies: The bodies.
+        unheld: Motions that neither springs nor equality rows resist.
         free: Motions that nothing resists.
     """
-    directions, kept, alone = _directions(bodies, free)
+    directions, held_by = _directions(bodies, unheld, free)
+    kept = held_by < SPRINGS
     combined = csr_array(block_diagonal(directions)[:, np.flatnonzero(kept.ravel())])
     motions = csr_array(bodies.modes @ combined)
     body = np.repeat(np.arange(bodies.count), kept.sum(axis=1))
     pins, inverse = _pins(csc_array(motions), body)
     rest = np.setdiff1d(np.arange(motions.shape[0]), pins)
-    return KernelBasis(combined, motions, pins, rest, inverse, alone[kept])
+    unheld_of, free_of = held_by[kept] < EQUALITIES, held_by[kept] < CONTACT
+    return KernelBasis(combined, motions, pins, rest, inverse, unheld_of, free_of)
 
 
-def _directions(bodies: Bodies, free: Motions) -> tuple[Array, Array, Array]:
-    """Directions of each body that are orthonormal in the kernel, flags: unsprung ones, free ones.
+def _directions(bodies: Bodies, unheld: Motions, free: Motions) -> tuple[Array, Array]:
+    """Directions of each body that are orthonormal in the kernel, and what holds each.
 
-    Each is a combination of those before it, and the free ones come first.
+    Each is a combination of those before it: free ones, those that contact holds, those that
+    equality rows hold, those that springs resist.
     """
-    F = free.single * free.free[:, None, :]
-    order = 2.0 * bodies.springs - F @ np.swapaxes(F, 1, 2)
-    values, V = np.linalg.eigh(order)  # -1: free, 0: held by rows, 2: by springs
-    kept, alone = values < 1.0, values < -0.5
+    order = 3.0 * bodies.springs - _projector(unheld) - _projector(free)
+    values, V = np.linalg.eigh(order)
+    held_by = np.rint(values) + EQUALITIES
+    kept = held_by < SPRINGS
     gram = np.swapaxes(V, 1, 2) @ bodies.size @ V
     gram = np.where(kept[:, :, None] & kept[:, None, :], gram, np.eye(bodies.k))
-    return V @ np.linalg.inv(np.swapaxes(np.linalg.cholesky(gram), 1, 2)), kept, alone
+    return V @ np.linalg.inv(np.swapaxes(np.linalg.cholesky(gram), 1, 2)), held_by
+
+
+def _projector(motions: Motions) -> Array:
+    """Projectors onto the motions of single bodies, shape ``(bodies, k, k)``."""
+    F = motions.single * motions.free[:, None, :]
+    return np.asarray(F @ np.swapaxes(F, 1, 2))
 
 
 def _pins(motions: csc_array, body: Array) -> tuple[Array, csr_array]:
