@@ -16,6 +16,10 @@ from tfeti_dolfinx.dual.operator import trace_slices
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.subdomains.block import Block
 
+# of the largest forces on a kernel mode: those on a light one beside it count as so large at least,
+# since the rounding of the largest reaches them
+LIGHT = 1e-4
+
 
 class Scene(Protocol):
     """What a measurement needs to know of the dual problem."""
@@ -65,8 +69,8 @@ class Measures:
         u: Displacements of this rank's Blocks.
         bodies: What is known of each body.
         penetration: Deepest overlap, or distance of a row that carries a force.
-        balance: Largest force left on a kernel mode.
-        forces: Size of the forces that act on a kernel mode.
+        balance: Force left on a kernel mode, where it is largest beside the forces there.
+        forces: Size of these forces.
         residual: Norm of what rows miss.
     """
 
@@ -156,11 +160,12 @@ def _bodies(scene: Scene, u: list[Array], v: Array, before: Sequence[Array] | No
 
 
 def _balance(coarse: CoarseSpace, lam: PETSc.Vec) -> tuple[float, float]:
-    """Largest entry of Gλ − e, and what it is compared with. Collective."""
+    """Entry of Gλ − e that is largest beside the forces on its mode, and those. Collective."""
     if coarse.dimension == 0:
         return 0.0, 0.0
-    squares = (coarse.Gt.multiply(coarse.Gt)).sum(axis=0)
-    squares = np.ascontiguousarray(squares, dtype=float).ravel()
-    coarse.comm.Allreduce(MPI.IN_PLACE, squares, op=MPI.SUM)
-    left = np.abs(coarse.G(lam.array_r) - coarse.e).max()
-    return float(left), float(np.sqrt(squares.max()) * lam.norm())
+    forces = np.asarray(abs(coarse.Gt).T @ np.abs(lam.array_r))
+    coarse.comm.Allreduce(MPI.IN_PLACE, forces, op=MPI.SUM)
+    forces = np.maximum(forces, LIGHT * forces.max())
+    left = np.abs(coarse.G(lam.array_r) - coarse.e)
+    worst = int(np.argmax(left / np.maximum(forces, 1e-300)))
+    return float(left[worst]), float(forces[worst])
