@@ -31,13 +31,14 @@ def commands():
 
 @pytest.mark.parametrize("command", list(commands()))
 def test_commands_of_the_readme(serial_only, command, tmp_path):
-    """In a copy of the tree, so that nothing is written into it."""
+    """In a copy of the tree, so that nothing is written into it; benchmarks at their quick size."""
+    quick = ["--quick"] if "benchmarks/" in command else []
     for name in ("demos", "meshes", "benchmarks", "tfeti_dolfinx"):
         (tmp_path / name).symlink_to(ROOT / name)
     (tmp_path / "results").mkdir()
     environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
     result = subprocess.run(
-        shlex.split(command),
+        [*shlex.split(command), *quick],
         cwd=tmp_path,
         capture_output=True,
         text=True,
