@@ -174,6 +174,20 @@ def test_a_negative_stiffness_is_named():
         block(csr_array(-K), x)
 
 
+@pytest.mark.parametrize(
+    ("share", "message"),
+    [(1e-3, "not positive semidefinite; expected a linear"), (1e-14, "indefinite by rounding")],
+)
+def test_a_negative_energy_is_told_from_rounding(share, message):
+    """The softest deformation has a negative energy, as a share of the stiffest one's."""
+    K, x = stiffness("hexahedron", 2)
+    values, vectors = np.linalg.eigh(K.toarray())
+    softest = vectors[:, RIGID["hexahedron"]]
+    change = (values[RIGID["hexahedron"]] + share * values[-1]) * np.outer(softest, softest)
+    with pytest.raises(InputError, match=f"subdomain 5: the stiffness is {message}"):
+        block(csr_array(K - change), x)
+
+
 @pytest.fixture(params=factor.SOLVERS)
 def solver(request, monkeypatch):
     """PETSc as if it had this solver and those that come after it, but not those before."""

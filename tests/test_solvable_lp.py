@@ -47,7 +47,6 @@ def as_coarse(count, k, E, N, load):
     bodies = SimpleNamespace(
         count=count,
         k=k,
-        modes=eye_array(count * k, format="csr"),
         negligible=np.maximum(1e-9 * size, 1e-14 * size.max()),
         amounts=lambda motion: motion.reshape(count, k),
     )
@@ -55,6 +54,7 @@ def as_coarse(count, k, E, N, load):
         dimension=count * k,
         comm=MPI.COMM_SELF,
         bodies=bodies,
+        modes=eye_array(count * k, format="csr"),
         e=load,
         J=csr_array(N),
         bounded=slice(0, len(N)),

@@ -57,7 +57,8 @@ class Report:
             ``displacement_error``, the estimated error of u in the maximum norm relative to the
             displacement of the body where it is worst; in physical units ``gluing_jump`` and
             ``penetration`` (lengths), ``tension`` (most negative pressure), ``complementarity``
-            (largest force times gap), ``balance`` (largest force left on a kernel mode).
+            (largest force times gap), ``balance`` (force left on a kernel mode where
+            it is largest beside the forces there).
         tolerances: What they were at most allowed to be, all but the first two.
         errors: Relative errors against closed forms, filled by demos.
         spectrum: With ``-tfeti_bbt``: the extreme eigenvalues ``BBt_min`` and ``BBt_max`` of

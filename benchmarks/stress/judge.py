@@ -96,10 +96,14 @@ def _compared(scene: Scene, answer: Answer, outcome: Outcome) -> dict[str, Any]:
     worst = np.maximum(np.maximum(error, copies), penetration)
     if np.any(worst > allowed) or not np.all(np.isfinite(worst)):
         of_one = row["u of all"] <= RIGHT and force <= RIGHT
-        return {**row, "class": "WRONG OF A BODY" if of_one else "WRONG"}
-    if force > allowed.max():
-        return {**row, "class": "WRONG FORCE"}
-    return {**row, "class": "right" if worst.max() <= RIGHT else "right but for rounding"}
+        found = "WRONG OF A BODY" if of_one else "WRONG"
+    elif force > allowed.max():
+        found = "WRONG FORCE"
+    else:
+        found = "right" if worst.max() <= RIGHT else "right but for rounding"
+    if found.isupper() and np.any(own > RIGHT * scale):
+        found = "not judged"  # the reference has not kept the conditions itself
+    return {**row, "class": found}
 
 
 def _nodes(scene: Scene, answer: Answer, outcome: Outcome) -> np.ndarray:

@@ -20,7 +20,7 @@ from benchmarks.stress.mortar import Facet, mortar
 from benchmarks.stress.scene import Pair, Scene, Side, wall_distance
 from benchmarks.stress.solve import DEPENDENT, EPSILON, null_space, solve, verdict
 
-SMALLEST = 1e-10  # of the largest displacement of all bodies: what a body has at least
+SMALLEST = 1e-9  # of the largest displacement of all bodies: what a body has at least
 NO_WORK = 1e-13  # of all loads: rounding
 CARRIES = 1e-7  # of the largest force
 

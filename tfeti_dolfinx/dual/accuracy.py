@@ -18,6 +18,9 @@ NOISE, LOAD_NOISE = 5e-14, 1e-14
 # a body that moves by less than this share of another is stiff beside it, and has the error of the
 # other's forces on top of its own: its own must be as much smaller
 STIFF, STRICTER = 1e-3, 0.1
+# of rtol: error of u in energy over all bodies, so that forces are right where bodies move much
+# and deform little
+FORCES = 10.0
 # the first look is taken at this power of rtol, to learn how far things move
 FIRST_LOOK = 0.5
 # a new tolerance aims a little below what was asked for; it never falls by more than LEAP at
@@ -39,12 +42,14 @@ class Tolerances:
         jump: Jumps at tears, and distances from Dirichlet values.
         penetration: Overlaps, and distances where a force acts.
         balance: Force left on a kernel mode.
+        energy: Norm of the correction in energy, over all bodies.
     """
 
     displacement: Array
     jump: float
     penetration: float
     balance: float
+    energy: float
 
 
 class Accuracy:
@@ -149,7 +154,9 @@ class Accuracy:
         displacement = self.rtol * share * size + NOISE * most + LOAD_NOISE * now.bodies.alone
         largest = float(displacement.max(initial=0.0))
         balance = max(self.rtol, NOISE) * now.forces
-        return Tolerances(displacement, 2.0 * largest, 2.0 * largest, balance)
+        energy = FORCES * self.rtol * np.sqrt(max(now.bodies.energy.sum(), 0.0))
+        energy += NOISE * most * np.sqrt(now.bodies.stiffness.sum())
+        return Tolerances(displacement, 2.0 * largest, 2.0 * largest, balance, float(energy))
 
     def ratio(self) -> float:
         """What must be at most 1: the largest of all errors over their tolerances."""
@@ -158,6 +165,7 @@ class Accuracy:
             *zip(self.errors(), allowed.displacement, strict=True),
             (now.penetration, allowed.penetration),
             (now.balance, allowed.balance),
+            (now.error, allowed.energy),
         ]
         return max(float(error) / max(float(limit), 1e-300) for error, limit in pairs)
 

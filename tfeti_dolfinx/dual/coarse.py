@@ -12,20 +12,25 @@ from scipy.sparse import coo_array, csr_array, diags_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.bodies import Bodies, joined
+from tfeti_dolfinx.dual.kernel_basis import kernel_basis
 from tfeti_dolfinx.dual.motions import NULL, Motions, unresisted, unsprung
-from tfeti_dolfinx.dual.null_basis import NullBasis, null_basis
+from tfeti_dolfinx.dual.null_basis import null_basis
 from tfeti_dolfinx.dual.operator import trace_slices
-from tfeti_dolfinx.errors import FactorError, raised_on_all_ranks
+from tfeti_dolfinx.dual.semidefinite import SemidefiniteFactor
+from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.parallel import agreed, chunk_offsets
 from tfeti_dolfinx.subdomains.block import Block
-from tfeti_dolfinx.subdomains.factor import CholeskyFactor
 
-# Of the size of a row: what of it acts on motions of bodies and is only rounding.
-NO_GRIP = 1e-12
+# Of the size of a row: what of it acts on motions of bodies and is only rounding; and how it acts
+# as a whole if it only glues. Rounding of points far from the origin is more than that of motions,
+# but all other rows act on translations with about their size.
+NO_GRIP, GLUING = 1e-12, 1e-6
 
 
 class CoarseSpace:
     """G, GGᵀ and what follows from them; the r-vectors are replicated on all ranks.
+
+    G = (R T)ᵀ Bᵀ, with T a basis of the kernel that has the bodies' motions as coordinates.
 
     Args:
         B: Dual rows × trace unknowns.
@@ -38,13 +43,14 @@ class CoarseSpace:
 
     Attributes:
         dimension: r, the dimension of the kernel of K.
-        e: Rᵀ f, shape ``(r,)``.
+        e: (R T)ᵀ f, shape ``(r,)``.
+        modes: The bodies' motions in the basis T, scipy CSR, shape ``(r, bodies * k)``.
         Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
         bounded: Local rows with λ ≥ 0.
         row_size: Sum of the moduli of each local row of B, the same however the mesh is torn. A
             row over it gives lengths. Shape ``(m_local,)``.
         bodies: Motions of the bodies.
-        J: This rank's rows of Gᵀ over their size, on motions of bodies, scipy CSR, shape
+        J: This rank's rows of B R over their size, on motions of bodies, scipy CSR, shape
             ``(m_local, bodies * k)``; empty for gluing rows.
         unheld: Motions that neither springs nor equality rows resist; each of these rows acts
             on one body.
@@ -68,22 +74,23 @@ class CoarseSpace:
         self.dimension = int(offsets[-1])
         starts = offsets[comm.rank] + np.concatenate(([0], np.cumsum(sizes)))
         self._starts, self._sizes = starts, sizes
-        self.Gt = _transposed_G(B, blocks, starts, self.dimension)
-        self.row_size = _sizes(B)
+        Gt, self.row_size = _transposed_G(B, blocks, starts, self.dimension), _sizes(B)
         self.bodies = Bodies(blocks, starts, self.dimension, body_of_block, num_bodies, comm)
-        self.J = _without_rounding(diags_array(1.0 / self.row_size) @ self.Gt @ self.bodies.modes)
-        self._read_load(blocks)
+        self.J = _without_rounding(diags_array(1.0 / self.row_size) @ Gt @ self.bodies.modes)
         equalities = np.ones(len(self.row_size), dtype=bool)
         equalities[bounded] = False
         self.unheld = self._unresisted(equalities, unsprung(self.bodies.springs), NULL)
         self.free_motions = self.unresisted(~equalities)
-        self.null = null_basis(self.bodies, self.free_motions)
-        gram = self.gram()
-        with raised_on_all_ranks(comm):
-            try:
-                self._factor = SemidefiniteFactor(gram, self.null, prefix)
-            except FactorError as error:
-                raise type(error)(f"GGᵀ of the coarse problem: {error}") from error
+        # made on one rank: processors that round differently might choose differently
+        self._basis = agreed(comm, kernel_basis(self.bodies, self.unheld, self.free_motions))
+        self.modes = self._basis.coordinates(self.bodies.modes)
+        self.Gt = self._basis.rows(Gt, diags_array(self.row_size) @ self.J, equalities)
+        self._read_load(blocks)
+        joint = self.modes @ self.free_motions.joint
+        self.null = agreed(comm, null_basis(np.flatnonzero(self._basis.free), joint))
+        self._factor = SemidefiniteFactor(
+            self.gram(), self.null, comm, "GGᵀ of the coarse problem", prefix
+        )
 
     def update_load(self, blocks: Sequence[Block]) -> None:
         """Replace e = Rᵀ f by that of the Blocks' present loads."""
@@ -92,7 +99,8 @@ class CoarseSpace:
 
     def _read_load(self, blocks: Sequence[Block]) -> None:
         local = [block.kernel_load for block in blocks]
-        self.e = np.concatenate(self.comm.allgather(np.concatenate([np.empty(0), *local])))
+        e = np.concatenate(self.comm.allgather(np.concatenate([np.empty(0), *local])))
+        self.e = self._basis.products(e)
 
     @property
     def free_modes(self) -> int:
@@ -100,7 +108,8 @@ class CoarseSpace:
         return self.free_motions.count
 
     def alpha_of(self, alpha: Array) -> list[Array]:
-        """The parts of an r-vector that belong to this rank's Blocks."""
+        """Kernel coordinates of this rank's Blocks that belong to an r-vector."""
+        alpha = self._basis.kernel(alpha)
         return [alpha[a : a + n] for a, n in zip(self._starts, self._sizes, strict=False)]
 
     def G(self, x: Array) -> Array:
@@ -171,42 +180,12 @@ class CoarseSpace:
         self._factor.destroy()
 
 
-class SemidefiniteFactor:
-    """A⁺ of a sparse positive semidefinite A with a known null space, on each rank.
-
-    A + σ E Eᵀ, E unit vectors of entries that determine the null modes: an exact generalised
-    inverse for right sides orthogonal to them.
-
-    Args:
-        A: scipy CSR, shape ``(r, r)``.
-        null: Its null space.
-        prefix: Prefix of the factor's PETSc options.
-    """
-
-    def __init__(self, A: csr_array, null: NullBasis, prefix: str = "tfeti_coarse_") -> None:
-        self._null, diagonal, pinned = null, A.diagonal(), np.zeros(A.shape[0])
-        largest = diagonal.max(initial=0.0) or 1.0
-        # an entry's own size: bodies may differ by many orders of magnitude
-        pinned[null.pins] = np.where(diagonal[null.pins] > 0.0, diagonal[null.pins], largest)
-        regular = csr_array(A + diags_array(pinned))
-        self._factor = CholeskyFactor(regular, prefix) if A.shape[0] else None
-
-    def solve(self, y: Array) -> Array:
-        """A⁺ y up to null modes that are removed, y orthogonal to them."""
-        if self._factor is None:
-            return y
-        return self._null.removed(self._factor.solve(self._null.removed(y)))
-
-    def destroy(self) -> None:
-        """Free the factor."""
-        if self._factor is not None:
-            self._factor.destroy()
-
-
 def _without_rounding(J: Any) -> csr_array:
     """The same rows without entries that are only rounding."""
     J = csr_array(J)
-    J.data[np.abs(J.data) <= NO_GRIP] = 0.0
+    largest = abs(J).max(axis=1).toarray().ravel()
+    noise = np.where(largest <= GLUING, GLUING, NO_GRIP)
+    J.data[np.abs(J.data) <= np.repeat(noise, np.diff(J.indptr))] = 0.0
     J.eliminate_zeros()
     return J
 
@@ -222,7 +201,7 @@ def _sizes(B: PETSc.Mat) -> Array:
 def _transposed_G(
     B: PETSc.Mat, blocks: Sequence[Block], starts: Array, dimension: int
 ) -> csr_array:
-    """This rank's rows of Gᵀ = B R, with global columns."""
+    """This rank's rows of B R, with global columns."""
     num_trace = B.getLocalSize()[1]
     kernels = [block.kernel for block in blocks]
     rows, columns, values = [], [], []

@@ -16,6 +16,10 @@ from tfeti_dolfinx.dual.operator import trace_slices
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.subdomains.block import Block
 
+# of the largest forces on a kernel mode: those on a light one beside it count as so large at least,
+# since the rounding of the largest reaches them
+LIGHT = 1e-4
+
 
 class Scene(Protocol):
     """What a measurement needs to know of the dual problem."""
@@ -44,6 +48,7 @@ class BodyMeasures:
         correction_energy: vᵀ diag(K) v.
         change: Largest change since the iterate before, or 0.
         alone: Largest displacement K⁺f of the trace.
+        stiffness: Trace of K on the trace unknowns.
     """
 
     size: Array
@@ -53,6 +58,7 @@ class BodyMeasures:
     correction_energy: Array
     change: Array
     alone: Array
+    stiffness: Array
 
 
 @dataclass(frozen=True)
@@ -63,8 +69,8 @@ class Measures:
         u: Displacements of this rank's Blocks.
         bodies: What is known of each body.
         penetration: Deepest overlap, or distance of a row that carries a force.
-        balance: Largest force left on a kernel mode.
-        forces: Size of the forces that act on a kernel mode.
+        balance: Force left on a kernel mode, where it is largest beside the forces there.
+        forces: Size of these forces.
         residual: Norm of what rows miss.
     """
 
@@ -135,12 +141,13 @@ def _bodies(scene: Scene, u: list[Array], v: Array, before: Sequence[Array] | No
     comm, count = scene.coarse.comm, scene.num_bodies
     motions = scene.coarse.bodies
     rigid = motions.amounts(motions.part_of(u, scene.blocks))
-    sums, largest = np.zeros((2, count)), np.zeros((5, count))
+    sums, largest = np.zeros((3, count)), np.zeros((5, count))
     slices = trace_slices(scene.blocks)
     for s, (block, part, body) in enumerate(
         zip(scene.blocks, slices, scene.body_of_block, strict=True)
     ):
-        sums[:, body] += block.energy(u[s]), block.diagonal @ v[part] ** 2
+        diagonal = block.diagonal
+        sums[:, body] += block.energy(u[s]), diagonal @ v[part] ** 2, diagonal.sum()
         change = u[s] - before[s] if before is not None else np.zeros(0)
         elastic = u[s] - block.modes @ rigid[body]
         fields = (u[s], elastic, v[part], change, block.condensed_load)
@@ -149,15 +156,16 @@ def _bodies(scene: Scene, u: list[Array], v: Array, before: Sequence[Array] | No
     comm.Allreduce(MPI.IN_PLACE, sums, op=MPI.SUM)
     comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
     size, elastic, correction, change, alone = largest
-    return BodyMeasures(size, elastic, sums[0], correction, sums[1], change, alone)
+    return BodyMeasures(size, elastic, sums[0], correction, sums[1], change, alone, sums[2])
 
 
 def _balance(coarse: CoarseSpace, lam: PETSc.Vec) -> tuple[float, float]:
-    """Largest entry of Gλ − e, and what it is compared with. Collective."""
+    """Entry of Gλ − e that is largest beside the forces on its mode, and those. Collective."""
     if coarse.dimension == 0:
         return 0.0, 0.0
-    squares = (coarse.Gt.multiply(coarse.Gt)).sum(axis=0)
-    squares = np.ascontiguousarray(squares, dtype=float).ravel()
-    coarse.comm.Allreduce(MPI.IN_PLACE, squares, op=MPI.SUM)
-    left = np.abs(coarse.G(lam.array_r) - coarse.e).max()
-    return float(left), float(np.sqrt(squares.max()) * lam.norm())
+    forces = np.asarray(abs(coarse.Gt).T @ np.abs(lam.array_r))
+    coarse.comm.Allreduce(MPI.IN_PLACE, forces, op=MPI.SUM)
+    forces = np.maximum(forces, LIGHT * forces.max())
+    left = np.abs(coarse.G(lam.array_r) - coarse.e)
+    worst = int(np.argmax(left / np.maximum(forces, 1e-300)))
+    return float(left[worst]), float(forces[worst])

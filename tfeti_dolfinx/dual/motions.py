@@ -95,9 +95,12 @@ def unresisted(gram: csr_array, within: Motions, below: float = NULL) -> Motions
     k = within.free.shape[1]
     V = block_diagonal(within.single)
     kept = diags_array(within.free.ravel().astype(float))
-    A = csr_array(kept @ (V.T @ gram @ V) @ kept)
-    largest = np.linalg.eigvalsh(diagonal_blocks(A, k)).max(axis=1, initial=0.0)
-    scale = diags_array(np.repeat(np.where(largest > 0.0, largest, 1.0) ** -0.5, k))
+    whole = csr_array(V.T @ gram @ V)
+    A = csr_array(kept @ whole @ kept)
+    largest, at_all = (_largest(matrix, k) for matrix in (A, whole))
+    # rows that hold only what is not in the space leave their rounding here
+    grip = largest > NULL * at_all
+    scale = diags_array(np.repeat(np.where(grip, np.where(grip, largest, 1.0) ** -0.5, 0.0), k))
     A = csr_array(scale @ A @ scale)
     blocks = diagonal_blocks(A, k)
     # what is not in the space is held; twice the stiffest motion keeps it apart in the order
@@ -110,6 +113,11 @@ def unresisted(gram: csr_array, within: Motions, below: float = NULL) -> Motions
     joint = scale @ (U @ _null_space(csr_array(U.T @ A @ U), np.nonzero(held)[0]))
     single = within.single @ vectors
     return Motions(single, stiffness <= below, np.maximum(stiffness, 0.0), np.asarray(V @ joint))
+
+
+def _largest(A: csr_array, k: int) -> Array:
+    """Largest eigenvalue of each diagonal block."""
+    return np.asarray(np.linalg.eigvalsh(diagonal_blocks(A, k)).max(axis=1, initial=0.0))
 
 
 def _null_space(A: csr_array, body: Array) -> Array:

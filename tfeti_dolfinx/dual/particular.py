@@ -8,7 +8,8 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.dual.coarse import CoarseSpace, SemidefiniteFactor
+from tfeti_dolfinx.dual.coarse import CoarseSpace
+from tfeti_dolfinx.dual.semidefinite import SemidefiniteFactor
 from tfeti_dolfinx.parallel import agreed
 
 MAX_STEPS = 100
@@ -45,7 +46,9 @@ def feasible_particular(coarse: CoarseSpace, bounded: slice) -> Array:
         left = float(np.linalg.norm(residual))
         if agreed(coarse.comm, left <= BALANCED * float(np.linalg.norm(coarse.e))):
             return np.where(carrying, force, 0.0)
-        factor = SemidefiniteFactor(csr_array(coarse.gram(carrying) + DAMPING * gram), coarse.null)
+        damped = csr_array(coarse.gram(carrying) + DAMPING * gram)
+        what = "GGᵀ of the rows that carry a force"
+        factor = SemidefiniteFactor(damped, coarse.null, coarse.comm, what)
         step = factor.solve(residual)
         factor.destroy()
         length = _damping(coarse, bounded, alpha, step)

@@ -9,8 +9,9 @@ from petsc4py import PETSc
 from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.dual.coarse import CoarseSpace, SemidefiniteFactor
+from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.dual.operator import trace_slices
+from tfeti_dolfinx.dual.semidefinite import SemidefiniteFactor
 from tfeti_dolfinx.subdomains.block import Block
 
 # of GGᵀ, added to G_f G_fᵀ: rows with a force that hold a motion by less are not asked about it
@@ -80,7 +81,9 @@ def _alpha(coarse: CoarseSpace, gradient: Array, free: Array, nu: Array) -> Arra
     if coarse.comm.allreduce(int(np.sum(~free))) == 0:
         return alpha
     damped = csr_array(coarse.gram(free) + DAMPING * coarse.gram())
-    factor = SemidefiniteFactor(damped, coarse.null)
+    factor = SemidefiniteFactor(
+        damped, coarse.null, coarse.comm, "GGᵀ of the rows that carry a force"
+    )
     left = np.where(free, gradient - coarse.Gt @ alpha, 0.0)
     step = factor.solve(coarse.G(left))
     factor.destroy()

@@ -93,7 +93,7 @@ def smallest_motion(
     )
     if y is None:
         return np.zeros(coarse.dimension)
-    return np.asarray(coarse.bodies.modes @ (N @ (rows.allowed(y, EXCESS * size, coarse.comm) * y)))
+    return np.asarray(coarse.modes @ (N @ (rows.allowed(y, EXCESS * size, coarse.comm) * y)))
 
 
 def _orthonormal(motions: Motions, k: int) -> tuple[csr_array, Array]:

@@ -41,13 +41,18 @@ def regularised(
         NotPositiveDefiniteError: K_ρ has no Cholesky factor.
         FactorError: It could not be made for another reason.
     """
+    return CholeskyFactor(regular_matrix(K, R, fixing_dofs), prefix)
+
+
+def regular_matrix(K: Any, R: Array, fixing_dofs: Array) -> Any:
+    """K_ρ, scipy CSR; K itself where R has no columns."""
     if R.shape[1] == 0:
-        return CholeskyFactor(K, prefix)
+        return K
     Q, _ = np.linalg.qr(R[fixing_dofs])
     rho = K.diagonal().max()
     row, column = np.meshgrid(fixing_dofs, fixing_dofs, indexing="ij")
     projector = coo_array((rho * (Q @ Q.T).ravel(), (row.ravel(), column.ravel())), shape=K.shape)
-    return CholeskyFactor((K + projector).tocsr(), prefix)
+    return (K + projector).tocsr()
 
 
 KPLUS_TYPES = {"regularized": regularised}

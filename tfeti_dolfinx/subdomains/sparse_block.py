@@ -12,6 +12,7 @@ from scipy.linalg import null_space
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.errors import FactorError, InputError
 from tfeti_dolfinx.subdomains.factor import NotPositiveDefiniteError
+from tfeti_dolfinx.subdomains.indefinite import why_indefinite
 from tfeti_dolfinx.subdomains.kernel import candidate_modes, fixing_nodes, kernel_of
 from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, GeneralisedInverse, regularised
 
@@ -191,10 +192,8 @@ class SparseBlock:
         try:
             return KPLUS_TYPES[self._kplus_type](self._K, self._R, dofs, self._prefix)
         except NotPositiveDefiniteError as error:
-            raise InputError(
-                f"{self._name}: the stiffness is not positive semidefinite; "
-                "expected a linear elastic form"
-            ) from error
+            why = why_indefinite(self._K, self._R, dofs, self._x, self._prefix)
+            raise InputError(f"{self._name}: {why}") from error
         except FactorError as error:
             raise FactorError(f"{self._name}: {error}") from error
 
