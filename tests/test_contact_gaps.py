@@ -113,7 +113,7 @@ def ring_problem(cells, overlap, order=1, degree=1, **contact):
     a = ufl.inner(hooke()(u), strain(v)) * dx + 1e-6 * ufl.dot(u, v) * dx
     L = ufl.dot(fem.Constant(d.mesh, (0.0, 0.0)), v) * dx
     pair = tfeti.Contact("shaft", "hub", **contact)
-    return tfeti.ContactProblem(a, L, [], [pair], d, petsc_options={"rtol": 1e-9})
+    return tfeti.ContactProblem(a, L, [], [pair], d, petsc_options={"rtol": 1e-8})
 
 
 OVERLAP = MIDDLE / 1500

@@ -18,7 +18,7 @@ ROUNDING = 1e-14
 # and M not at all, for so many outer steps is a stall; the slowest scenes change by 1e-3 a step
 CHANGE, PATIENCE = 1e-3, 1000
 # of the tolerance: inner problems are not solved more exactly than that
-ENOUGH = 0.1
+ENOUGH = 1e-3
 
 
 class PenalisedOperator:
