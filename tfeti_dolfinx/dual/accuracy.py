@@ -19,8 +19,8 @@ NOISE, LOAD_NOISE = 5e-14, 1e-14
 # other's forces on top of its own: its own must be as much smaller
 STIFF, STRICTER = 1e-3, 0.1
 # of rtol: error of u in energy over all bodies, so that forces are right where bodies move much
-# and deform little
-FORCES = 10.0
+# and deform little; what rounding leaves of bodies that do not deform at all, as a displacement
+FORCES, RIGID = 10.0, 1e-12
 # the first look is taken at this power of rtol, to learn how far things move
 FIRST_LOOK = 0.5
 # a new tolerance aims a little below what was asked for; it never falls by more than LEAP at
@@ -151,11 +151,12 @@ class Accuracy:
         now = self._looked()
         size, most = now.bodies.size, now.bodies.size.max(initial=0.0)
         share = np.where(size < STIFF * most, STRICTER, 1.0)
-        displacement = self.rtol * share * size + NOISE * most + LOAD_NOISE * now.bodies.alone
+        alone = LOAD_NOISE * now.bodies.alone
+        displacement = self.rtol * share * size + NOISE * most + alone
         largest = float(displacement.max(initial=0.0))
         balance = max(self.rtol, NOISE) * now.forces
         energy = FORCES * self.rtol * np.sqrt(max(now.bodies.energy.sum(), 0.0))
-        energy += NOISE * most * np.sqrt(now.bodies.stiffness.sum())
+        energy += np.sqrt(now.bodies.stiffness @ (RIGID * most + alone) ** 2)
         return Tolerances(displacement, 2.0 * largest, 2.0 * largest, balance, float(energy))
 
     def ratio(self) -> float:
