@@ -24,7 +24,7 @@ def contact_problem(cell="hexahedron", n=6, subdomains=6, grading=1.0, reach=np.
     gdim = gdim_of(cell)
     d = decomposed(cell, n, subdomains, grading=grading)
     obstacle = tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=reach)
-    options = {"tfeti_rtol": 1e-11, **options}
+    options = {"tfeti_rtol": 1e-10, **options}
     return problem(d, (0.0,) * (gdim - 1) + (-0.05,), [obstacle], **options)
 
 

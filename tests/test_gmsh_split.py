@@ -122,7 +122,7 @@ def check_same(whole, split, ids=True):
 
 
 def solved(d):
-    p = problem(d, clamped=("held",), loaded=4, tfeti_rtol=1e-12)
+    p = problem(d, clamped=("held",), loaded=4, tfeti_rtol=1e-10)
     p.solve()
     return displacement(p)
 

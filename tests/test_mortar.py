@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import ufl
 from bodies import (
+    TO_ROUNDING,
     boxes,
     gathered,
     held,
@@ -78,7 +79,7 @@ def test_both_sides_bear_the_same_traction(cell, degree):
     gdim = d.mesh.geometry.dim
     sides = ["lower bottom", "lower left", "upper left"]
     sides += ["lower front", "upper front"] if gdim == 3 else []
-    problem = two_body_problem(d, pressed(d, 0.1), held(d, *sides), [PAIR], degree, rtol=1e-12)
+    problem = two_body_problem(d, pressed(d, 0.1), held(d, *sides), [PAIR], degree, **TO_ROUNDING)
     problem.solve()
     solution = problem.solution
     forces = solution.body_forces
@@ -114,7 +115,7 @@ def total_height(d, body):
 @pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
 @pytest.mark.parametrize("n", [(3, 4), (5, 3)])
 def test_independent_active_set(cell, n):
-    problem = lever(cell, jagged, n, rtol=1e-12)
+    problem = lever(cell, jagged, n, **TO_ROUNDING)
     problem.solve()
     x, u = displacement(problem)
     reference = TwoBoxes(cell, *n, push=0.07, pull=0.12)
@@ -186,7 +187,7 @@ def test_a_surface_in_two_pairs(cell, upper_is_secondary):
     pairs = [("upper bottom", "left top"), ("upper bottom", "right top")]
     contacts = [sided(*(p if upper_is_secondary else p[::-1])) for p in pairs]
     bcs = held(d, "left bottom", "left left", "right bottom", "right left", "upper left")
-    problem = two_body_problem(d, pressed(d), bcs, contacts, rtol=1e-11)
+    problem = two_body_problem(d, pressed(d), bcs, contacts, **TO_ROUNDING)
     problem.solve()
     loads = np.sort(problem.solution.body_forces.force[:, 1])
     assert np.isclose(loads[-1], 0.25, atol=1e-9)
@@ -205,7 +206,7 @@ def test_obstacle_under_a_uniform_pressure(cell, degree):
     if gdim == 3:
         sides += ["lower front", "upper front"]
     plane = tfeti.Obstacle("upper bottom", tfeti.Plane(tuple(0.4 * up), tuple(up)))
-    problem = two_body_problem(d, pressed(d), held(d, *sides), [plane], degree, rtol=1e-12)
+    problem = two_body_problem(d, pressed(d), held(d, *sides), [plane], degree, **TO_ROUNDING)
     problem.solve()
     assert np.allclose(gathered(problem.solution.contact().pressure), 0.1, rtol=0, atol=1e-9)
     assert problem.report.contact_rows == 4 ** (gdim - 1)

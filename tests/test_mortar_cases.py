@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import ufl
 from bodies import (
+    TO_ROUNDING,
     boxes,
     gathered,
     held,
@@ -56,7 +57,7 @@ def test_only_the_first_of_two_layers_is_met(apart, radius):
     d = decomposed_boxes(parts, 6, [("tops", ["base top", "lower top"])])
     sides = ["base bottom", "base left", "lower left", "lower bottom", "upper left"]
     contact = sided("upper bottom", "tops", reach=radius)
-    p = two_body_problem(d, pressed(d), held(d, *sides), [contact], rtol=1e-12)
+    p = two_body_problem(d, pressed(d), held(d, *sides), [contact], **TO_ROUNDING)
     p.solve()
     assert np.allclose(gathered(p.solution.contact().pressure), 0.1, rtol=0, atol=1e-9)
     assert np.isclose(gathered(p.solution.contact().area).sum(), 1.0)
@@ -190,7 +191,7 @@ def test_patch_of_quadrilaterals_that_are_no_parallelograms(degree):
     x[inside, 0] += wave[inside]
     x[inside, 1] -= 0.7 * wave[inside]
     sides = ["lower bottom", "lower left", "upper left", "lower front", "upper front"]
-    p = two_body_problem(d, pressed(d), held(d, *sides), [PAIR], degree, rtol=1e-12)
+    p = two_body_problem(d, pressed(d), held(d, *sides), [PAIR], degree, **TO_ROUNDING)
     p.solve()
     assert np.allclose(gathered(p.solution.contact().pressure), 0.1, rtol=0, atol=1e-8)
 
@@ -204,7 +205,7 @@ def test_pressure_at_a_node_of_two_pairs():
     d = decomposed_boxes(parts, 6)
     sides = ["one bottom", "one left", "two bottom", "two right", "upper left"]
     pairs = [sided("upper bottom", f"{name} top") for name in ("one", "two")]
-    p = two_body_problem(d, pressed(d), held(d, *sides), pairs, rtol=1e-12)
+    p = two_body_problem(d, pressed(d), held(d, *sides), pairs, **TO_ROUNDING)
     p.solve()
     _, dof = p.dofs.scalar
     values = p.solution.pressure.x.array[dof]
