@@ -15,7 +15,8 @@ from scenes import curved_obstacle, decomposed, displacement, forms, problem, re
 from test_gmsh_split import two_bodies
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.mesh import dolfinx_input, gmsh_input
+from tfeti_dolfinx.mesh import dolfinx_input
+from tfeti_dolfinx.mesh.gmsh import reading
 from tfeti_dolfinx.mesh.partition import assign_subdomains
 from tfeti_dolfinx.output import write_vtx, write_xdmf
 from tfeti_dolfinx.plot import plot_deformed, plot_pressure
@@ -201,7 +202,7 @@ def test_demos(name, comm, shared_tmp, monkeypatch):
         ids = assign_subdomains(mesh, subdomains, comm, partition)
         return np.zeros_like(ids)
 
-    for module in (dolfinx_input, gmsh_input):
+    for module in (dolfinx_input, reading):
         monkeypatch.setattr(module, "assign_subdomains", few)
     demo = importlib.import_module(f"demos.{name}")
     report_file, folder = shared_tmp / "report.json", shared_tmp / "out"

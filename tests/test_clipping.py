@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
-from tfeti_dolfinx.contact.clipping import (
+from tfeti_dolfinx.mortar.clipping import (
     clip_intervals,
     clip_polygons,
     contains,

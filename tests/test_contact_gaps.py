@@ -11,8 +11,8 @@ from scenes import decomposed, hooke, problem, strain
 from test_mortar_cases import disc_on_block, no_load
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.contact.surfaces import group_points
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.mortar.surfaces import group_points
 
 CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
 ORDERS = [("upper bottom", "lower top"), ("lower top", "upper bottom")]

@@ -12,7 +12,7 @@ from tfeti_dolfinx.errors import (
 )
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dolfinx_input import decompose
-from tfeti_dolfinx.mesh.gmsh_input import read_gmsh
+from tfeti_dolfinx.mesh.gmsh.reading import read_gmsh
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.report import Report

@@ -16,12 +16,12 @@ from tfeti_dolfinx.checks import is_whole, shown
 from tfeti_dolfinx.contact.forces import BodyForces, body_forces, nodal_forces, vertex_tractions
 from tfeti_dolfinx.contact.records import remaining_gaps
 from tfeti_dolfinx.contact.search import ContactPartner
-from tfeti_dolfinx.contact.surfaces import group_points, hat_integrals
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.fields import Stress, cellwise, checked_stress, from_vertices, nodal, von_mises
 from tfeti_dolfinx.gluing.glue import Gluing
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.mortar.surfaces import group_points, hat_integrals
 
 
 class ContactStatus(IntEnum):

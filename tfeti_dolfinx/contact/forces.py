@@ -10,9 +10,9 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.contact.records import ContactRecords
-from tfeti_dolfinx.contact.surfaces import group_points, hat_integrals
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.mortar.surfaces import group_points, hat_integrals
 
 
 @dataclass(frozen=True)

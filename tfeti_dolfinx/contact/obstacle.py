@@ -9,22 +9,22 @@ import numpy as np
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.contact.arguments import Gap, checked_gap, checked_reach, given_gaps
 from tfeti_dolfinx.contact.conditions import conditions, triplets
-from tfeti_dolfinx.contact.facet_maps import hat_areas, whole_facets
-from tfeti_dolfinx.contact.facets import Facets, facet_kind, local_facets
-from tfeti_dolfinx.contact.mortar import dual_multipliers
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.shape_checks import check_placement, check_shape, distance_and_gradient
 from tfeti_dolfinx.contact.shapes import Shape
-from tfeti_dolfinx.contact.surfaces import (
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.mortar.facet_maps import hat_areas, whole_facets
+from tfeti_dolfinx.mortar.facets import Facets, facet_kind, local_facets
+from tfeti_dolfinx.mortar.integrals import dual_multipliers
+from tfeti_dolfinx.mortar.surfaces import (
     diameter,
     extent,
     group_points,
     on_surface,
     surface_facets,
 )
-from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.mesh.decomposition import Decomposition
-from tfeti_dolfinx.mesh.dofs import TornDofs
 
 QUADRATURE = 4
 

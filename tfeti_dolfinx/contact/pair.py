@@ -10,23 +10,23 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.contact.arguments import Gap, checked_gap, checked_reach, given_gaps
-from tfeti_dolfinx.contact.candidates import candidate_pairs, rendezvous
 from tfeti_dolfinx.contact.conditions import conditions, triplets
-from tfeti_dolfinx.contact.facets import facet_kind
-from tfeti_dolfinx.contact.mortar import integrate
 from tfeti_dolfinx.contact.records import ContactRecords
-from tfeti_dolfinx.contact.segments import Segments, find_segments
 from tfeti_dolfinx.contact.sides import Side, side_of, stiffness_ratio
-from tfeti_dolfinx.contact.surfaces import (
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.mortar.candidates import candidate_pairs, rendezvous
+from tfeti_dolfinx.mortar.facets import facet_kind
+from tfeti_dolfinx.mortar.integrals import integrate
+from tfeti_dolfinx.mortar.segments import Segments, find_segments
+from tfeti_dolfinx.mortar.surfaces import (
     diameter,
     extent,
     group_points,
     surface_facets,
     surface_nodes,
 )
-from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.mesh.decomposition import Decomposition
-from tfeti_dolfinx.mesh.dofs import TornDofs
 
 # One looks farther than the reach: else facets at its edge would be covered partly, and an overlap
 # that is too deep would not be seen.

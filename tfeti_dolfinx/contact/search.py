@@ -12,10 +12,10 @@ import numpy as np
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.checks import shown
 from tfeti_dolfinx.contact.records import ContactRecords, concatenate, remaining_gaps
-from tfeti_dolfinx.contact.surfaces import diameter
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.mortar.surfaces import diameter
 from tfeti_dolfinx.parallel import agreed
 
 # how much farther one looks for what may hold a body; of the scene's length at least

@@ -8,13 +8,13 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.contact.facet_maps import hat_areas
-from tfeti_dolfinx.contact.facets import Facets, facet_kind, local_facets, with_averaged_normals
 from tfeti_dolfinx.contact.records import ContactRecords
-from tfeti_dolfinx.contact.surfaces import surface_facets
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.mortar.facet_maps import hat_areas
+from tfeti_dolfinx.mortar.facets import Facets, facet_kind, local_facets, with_averaged_normals
+from tfeti_dolfinx.mortar.surfaces import surface_facets
 from tfeti_dolfinx.parallel import agreed
 
 DEGENERATE = 1e-12  # of the square (in 2D: of the length) of a facet's radius

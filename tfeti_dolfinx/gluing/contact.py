@@ -8,12 +8,12 @@ import numpy as np
 
 from tfeti_dolfinx.arrays import Array, sum_rows
 from tfeti_dolfinx.contact.records import ContactRecords
-from tfeti_dolfinx.contact.surfaces import group_points
 from tfeti_dolfinx.errors import NoSolutionError, raised_on_all_ranks
 from tfeti_dolfinx.gluing.consistency import check_consistent
 from tfeti_dolfinx.gluing.prescribed import Prescribed
 from tfeti_dolfinx.gluing.rows import Rows
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.mortar.surfaces import group_points
 
 NOTHING_LEFT = 1e-10
 

@@ -10,9 +10,10 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.compat import first_component, geometry_dofmap
+from tfeti_dolfinx.compat import first_component
 from tfeti_dolfinx.mesh.decomposition import Decomposition
-from tfeti_dolfinx.mesh.entities import cell_entities, mix, set_key
+from tfeti_dolfinx.mesh.entities import mix
+from tfeti_dolfinx.mesh.node_keys import lowest_owners, node_keys
 from tfeti_dolfinx.mesh.spaces import check_space
 from tfeti_dolfinx.parallel import Exchange, chunk_offsets, owner_of
 
@@ -51,7 +52,7 @@ class TornDofs:
         self.bs = V.dofmap.index_map_bs
         self._number_nodes(decomposition)
         self.offsets = chunk_offsets(self.comm, self.num_nodes)
-        origin, key = _node_keys(V, decomposition)
+        origin, key = node_keys(V, decomposition)
         self._find_groups(decomposition, origin[self.dolfinx_node], key[self.dolfinx_node])
 
     @property
@@ -225,7 +226,7 @@ class TornDofs:
         key = mix(key + mix(body))
         owner = np.full(self.num_nodes, self.comm.rank, dtype=np.int64)
         shared = self._boundary_nodes(decomposition)
-        owner[shared] = _owners(self.comm, key[shared], self.node_subdomain[shared])
+        owner[shared] = lowest_owners(self.comm, key[shared], self.node_subdomain[shared])
         exchange = Exchange(self.comm, owner)
         node = exchange.send(self.offsets[self.comm.rank] + np.arange(self.num_nodes))
         subdomain = exchange.send(self.node_subdomain)
@@ -245,48 +246,3 @@ class TornDofs:
         facets = np.union1d(decomposition.tears, decomposition.boundary).astype(np.int32)
         fdim = decomposition.mesh.topology.dim - 1
         return self.primal_nodes(fem.locate_dofs_topological(self.V, fdim, facets, remote=False))
-
-
-def _owners(comm: MPI.Intracomm, key: Array, subdomain: Array) -> Array:
-    """For each key the rank that sends it with the lowest subdomain. Collective."""
-    exchange = Exchange(comm, (key % np.uint64(comm.size)).astype(np.int64))
-    key, subdomain = exchange.send(key), exchange.send(subdomain)
-    order = np.lexsort((subdomain, key))
-    _, start, inverse = np.unique(key[order], return_index=True, return_inverse=True)
-    owner = np.empty(len(key), dtype=np.int64)
-    owner[order] = exchange.source[order][start][inverse]
-    return exchange.answer(owner)
-
-
-def _node_keys(V: fem.FunctionSpace, decomposition: Decomposition) -> tuple[Array, Array]:
-    """For each DOLFINx node its lowest original vertex, and a key that all copies share.
-
-    The key comes from the vertices of the mesh entity that the node belongs to; where an entity
-    has several nodes, their relative distances to its vertices tell them apart.
-    """
-    mesh = V.mesh
-    cell_type = mesh.topology.cell_type
-    geometry = geometry_dofmap(mesh)[:, : len(cell_entities(cell_type, 0))]
-    ids = decomposition.original_nodes[geometry]
-    dofs = np.asarray(V.dofmap.list)
-    origin = np.empty(V.dofmap.index_map.size_local, dtype=np.int64)
-    key = np.empty(len(origin), dtype=np.uint64)
-    for dim, entity_dofs in enumerate(V.element.basix_element.entity_dofs):
-        for vertices, entity in zip(cell_entities(cell_type, dim), entity_dofs, strict=True):
-            for j in entity:
-                nodes = dofs[:, j]
-                origin[nodes] = ids[:, vertices].min(axis=1)
-                key[nodes] = set_key(ids[:, vertices])
-                if len(entity) > 1:
-                    corners = mesh.geometry.x[geometry[:, vertices]]
-                    key[nodes] += _place(V, nodes, corners, ids[:, vertices])
-    return origin, key
-
-
-def _place(V: fem.FunctionSpace, nodes: Array, corners: Array, ids: Array) -> Array:
-    """Key of a node's place within an entity: its relative distances to the sorted vertices."""
-    x = V.tabulate_dof_coordinates()[nodes]
-    distance = np.linalg.norm(corners - x[:, None], axis=2)
-    distance = np.take_along_axis(distance, np.argsort(ids, axis=1), axis=1)
-    share = np.rint(1e6 * distance / distance.sum(axis=1, keepdims=True))
-    return mix((share * (1 + np.arange(share.shape[1]))).sum(axis=1).astype(np.uint64))

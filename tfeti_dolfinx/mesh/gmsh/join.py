@@ -12,9 +12,9 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.compat import cell_permutation, coordinate_element
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.entities import NO_TAG, cell_dim, facet_keys, facet_vertices, set_key
-from tfeti_dolfinx.mesh.gmsh_model import Elements, Part, concatenated
-from tfeti_dolfinx.mesh.gmsh_names import group_names
-from tfeti_dolfinx.mesh.gmsh_split import check_shared
+from tfeti_dolfinx.mesh.gmsh.model import Elements, Part, concatenated
+from tfeti_dolfinx.mesh.gmsh.names import group_names
+from tfeti_dolfinx.mesh.gmsh.split import check_shared
 from tfeti_dolfinx.mesh.untorn import UntornMesh
 from tfeti_dolfinx.parallel import Exchange, box_over_ranks
 

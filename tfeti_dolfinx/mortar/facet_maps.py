@@ -6,9 +6,9 @@ import basix
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array, sum_rows
-from tfeti_dolfinx.contact.facet_element import FacetElement
-from tfeti_dolfinx.contact.facets import FacetKind, Facets
 from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.mortar.facet_element import FacetElement
+from tfeti_dolfinx.mortar.facets import FacetKind, Facets
 
 # Newton's method from the affine map: facets that are not folded take 3 or 4 steps
 MAX_STEPS, CLOSE, FAR = 20, 1e-14, 1e-8

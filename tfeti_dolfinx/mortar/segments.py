@@ -7,12 +7,12 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.contact.candidates import centre_normals
-from tfeti_dolfinx.contact.clipping import Parts, common_parts, contains, sizes
-from tfeti_dolfinx.contact.facet_element import POLYGON
-from tfeti_dolfinx.contact.facet_maps import densities, points, reference_points
-from tfeti_dolfinx.contact.facets import FacetKind, Facets
-from tfeti_dolfinx.contact.layers import Look, nearest, reachable
+from tfeti_dolfinx.mortar.candidates import centre_normals
+from tfeti_dolfinx.mortar.clipping import Parts, common_parts, contains, sizes
+from tfeti_dolfinx.mortar.facet_element import POLYGON
+from tfeti_dolfinx.mortar.facet_maps import densities, points, reference_points
+from tfeti_dolfinx.mortar.facets import FacetKind, Facets
+from tfeti_dolfinx.mortar.layers import Look, nearest, reachable
 
 # facets whose normals make a larger angle than about 88 degrees with each other do not face
 FACING = -0.03

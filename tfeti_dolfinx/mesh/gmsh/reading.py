@@ -12,9 +12,9 @@ from mpi4py import MPI
 from tfeti_dolfinx.checks import checked_type
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
-from tfeti_dolfinx.mesh.gmsh_join import untorn_mesh
-from tfeti_dolfinx.mesh.gmsh_model import Part, opened, read_part
-from tfeti_dolfinx.mesh.gmsh_split import find_split_files, read_split_files
+from tfeti_dolfinx.mesh.gmsh.join import untorn_mesh
+from tfeti_dolfinx.mesh.gmsh.model import Part, opened, read_part
+from tfeti_dolfinx.mesh.gmsh.split import find_split_files, read_split_files
 from tfeti_dolfinx.mesh.partition import (
     Subdomains,
     assign_subdomains,

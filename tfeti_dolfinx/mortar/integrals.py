@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array, sum_rows
-from tfeti_dolfinx.contact.facet_maps import points
-from tfeti_dolfinx.contact.facets import FacetKind, Facets
-from tfeti_dolfinx.contact.segments import FacingPoints, Segments
+from tfeti_dolfinx.mortar.facet_maps import points
+from tfeti_dolfinx.mortar.facets import FacetKind, Facets
+from tfeti_dolfinx.mortar.segments import FacingPoints, Segments
 
 HARDLY_COVERED = 1e-6
 

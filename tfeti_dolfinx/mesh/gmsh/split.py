@@ -14,7 +14,7 @@ from mpi4py import MPI
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.entities import equal_pairs, set_key
-from tfeti_dolfinx.mesh.gmsh_model import Elements, Part, opened, read_part
+from tfeti_dolfinx.mesh.gmsh.model import Elements, Part, opened, read_part
 from tfeti_dolfinx.mesh.untorn import UntornMesh
 from tfeti_dolfinx.parallel import Exchange
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from mpi4py import MPI
 
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.mesh.gmsh_model import Part
+from tfeti_dolfinx.mesh.gmsh.model import Part
 from tfeti_dolfinx.mesh.untorn import GroupNames
 
 # dimension and tag of a physical group

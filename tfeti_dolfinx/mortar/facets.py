@@ -8,10 +8,10 @@ import numpy as np
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.compat import geometry_dofmap
-from tfeti_dolfinx.contact.facet_element import FACET_OF, FacetElement, facet_dofs
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mesh.entities import cell_facets
+from tfeti_dolfinx.mortar.facet_element import FACET_OF, FacetElement, facet_dofs
 from tfeti_dolfinx.parallel import Exchange
 
 

@@ -1,0 +1,1 @@
+"""gmsh's files: one or split, and from memory."""

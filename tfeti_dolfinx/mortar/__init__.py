@@ -1,0 +1,1 @@
+"""Geometry of contact surfaces: facets, who meets whom, clipping, layers, integrals."""
