@@ -22,7 +22,7 @@ def solved():
 
 @pytest.fixture(scope="module")
 def dual(solved):
-    return solved._dual
+    return solved.dual
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def held_by_contact():
     contacts = [tfeti.Obstacle(name, tfeti.Plane((0, 0, 0), n)) for name, n in planes.items()]
     p = problem(d, (-0.01, -0.02, -0.05), contacts, clamped=())
     p.solve()
-    yield p._dual
+    yield p.dual
     p.destroy()
 
 
@@ -125,7 +125,7 @@ def test_the_feasible_homogenisation_is_the_smallest(held_by_contact):
 
 def test_recovered_displacement_meets_the_rows(solved):
     """B_E u = c_E and B_N u ≤ c_N, with equality where there is a force."""
-    constraints, solution = solved._dual.constraints, solved.solution
+    constraints, solution = solved.dual.constraints, solved.solution
     u, Bu = constraints.B.createVecRight(), constraints.c.duplicate()
     u.array[:] = solved.dofs.to_primal(solved.u.x.array)[constraints.trace]
     constraints.B.mult(u, Bu)
@@ -141,12 +141,13 @@ def test_recovered_displacement_meets_the_rows(solved):
 
 def test_recovered_displacement_is_in_equilibrium(solved):
     """K u = f − Bᵀλ in every subdomain."""
-    constraints = solved._dual.constraints
+    constraints = solved.dual.constraints
     lam, force = constraints.c.duplicate(), constraints.B.createVecRight()
     lam.array[:] = solved.solution.lam
     constraints.B.multTranspose(lam, force)
     dofs = solved.dofs
-    left = dofs.to_primal(solved._K @ solved.u.x.array - solved._f)
+    forms = solved._system.forms
+    left = dofs.to_primal(forms.stiffness() @ solved.u.x.array - forms.load())
     left[constraints.trace] += force.array_r
     assert np.all(np.abs(left) <= 1e-9 * force.norm())
 

@@ -218,7 +218,7 @@ def test_contact_rows_are_orthogonal_to_gluing_rows(scaling):
     problem.solve()
     if MPI.COMM_WORLD.size > 1:
         return  # B is gathered on one rank only
-    constraints = problem._constraints
+    constraints = problem.dual.constraints
     B = dense(constraints.B)
     gram = (B / constraints.weights) @ B.T
     equalities = constraints.num_equalities

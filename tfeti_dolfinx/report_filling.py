@@ -14,7 +14,6 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.qp.problem import QPResult
 from tfeti_dolfinx.report import Report, peak_memory_mb
 from tfeti_dolfinx.solution import Solution
-from tfeti_dolfinx.subdomains.sparse_block import Counters
 
 
 def fill_sizes(
@@ -40,7 +39,6 @@ def fill_result(
     dual: Dual,
     result: QPResult,
     accuracy: Accuracy,
-    counters: Counters,
 ) -> None:
     """Fill in what a solve has found; counters add up over rounds. Collective."""
     comm = dual.coarse.comm
@@ -57,7 +55,6 @@ def fill_result(
     report.cg_steps += result.steps.cg
     report.expansion_steps += result.steps.expansion
     report.proportioning_steps += result.steps.proportioning
-    report.factorizations = comm.allreduce(counters.factorizations)
     report.converged_reason = result.reason.name
     report.recoveries += accuracy.looks
     report.residuals = _residuals(solution, dual, result, accuracy)
@@ -104,7 +101,7 @@ def _largest(dual: Dual, values: Array) -> float:
 def _jumps(solution: Solution) -> Array:
     """For each owned group how far its copies are apart, and from prescribed values. Collective."""
     dofs, prescribed = solution.dofs, solution.gluing.prescribed
-    u = dofs.to_primal(solution.displacement.x.array).reshape(-1, dofs.bs)
+    u = solution.u.reshape(-1, dofs.bs)
     low, high = dofs.reduce(u, np.minimum, np.inf), dofs.reduce(u, np.maximum, -np.inf)
     held_low = np.where(prescribed.flag, np.minimum(low, prescribed.value), low)
     held_high = np.where(prescribed.flag, np.maximum(high, prescribed.value), high)

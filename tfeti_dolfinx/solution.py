@@ -58,38 +58,45 @@ class ContactData:
 class Solution:
     """What a solve has found; fields are made when they are first asked for.
 
-    Creating a field is collective.
+    It owns its data: a later solve of the same problem leaves it as it is. Creating a field is
+    collective.
 
     Args:
-        u: Displacement on the torn mesh.
+        u: Displacement in primal order, shape ``(num_nodes * bs,)``.
+        lam: Multipliers of this rank's rows.
         dofs: Dof maps.
         decomposition: The torn mesh.
         gluing: Rows and contact records.
-        lam: Multipliers of this rank's rows.
-        mu: Multipliers of Gλ = e.
-        stress: UFL stress of a displacement, or None.
         contacts: Obstacles and pairs, the secondary surface of a pair first.
+        stress: UFL stress of a displacement, or None.
 
     Attributes:
-        displacement: Displacement on the torn mesh.
+        u: Displacement in primal order.
+        lam: Multipliers of this rank's rows.
         contacts: The contacts with their sides decided: ``contacts[i].surfaces[0]`` has the
             multipliers and the pressure.
     """
 
     def __init__(
         self,
-        u: fem.Function,
+        u: Array,
+        lam: Array,
         dofs: TornDofs,
         decomposition: Decomposition,
         gluing: Gluing,
-        lam: Array,
-        mu: Array,
-        stress: Stress | None,
         contacts: Sequence[ContactPartner] = (),
+        stress: Stress | None = None,
     ) -> None:
-        self.displacement, self.dofs, self.decomposition = u, dofs, decomposition
-        self.gluing, self.lam, self.mu = gluing, lam, mu
-        self._stress, self.contacts = stress, list(contacts)
+        self.u, self.lam = u, lam
+        self.dofs, self.decomposition, self.gluing = dofs, decomposition, gluing
+        self.contacts, self._stress = list(contacts), stress
+
+    @cached_property
+    def displacement(self) -> fem.Function:
+        """Displacement on the torn mesh."""
+        function = fem.Function(self.dofs.V, name="displacement")
+        function.x.array[:] = self.dofs.to_dolfinx(self.u)
+        return function
 
     @property
     def has_stress(self) -> bool:
@@ -220,8 +227,7 @@ class Solution:
     @cached_property
     def remaining_gap(self) -> Array:
         """Gap after deformation of each contact condition of this rank. Collective at first use."""
-        u = self.dofs.to_primal(self.displacement.x.array)
-        return remaining_gaps(self.gluing.records, self.dofs, u)
+        return remaining_gaps(self.gluing.records, self.dofs, self.u)
 
     def _sigma(self) -> Any:
         if self._stress is None:

@@ -82,6 +82,23 @@ class Dual:
         check_solvable(self.coarse, body_names, mode_names)
         self.d = linear_term(B, constraints.c, blocks)
 
+    def update_load(self) -> None:
+        """Take the Blocks' present loads and the present right sides.
+
+        Raises:
+            NoSolutionError: The load moves a body that nothing holds.
+        """
+        self.coarse.update_load(self.blocks)
+        check_solvable(self.coarse, *self._names)
+        self.d.destroy()
+        self.d = linear_term(self.constraints.B, self.constraints.c, self.blocks)
+
+    def forget_counts(self) -> None:
+        """Count multiplications from 0 on."""
+        for operator in (self.F, self.preconditioner):
+            if operator is not None:
+                operator.count.clear()
+
     def qp(self) -> QP:
         """The quadratic program; without kernel it has no coarse problem."""
         coarse: Coarse = self.coarse if self.coarse.dimension else NoCoarse()
