@@ -213,7 +213,7 @@ class ContactProblem:
     def _solve_rows(self, previous: Solution | None) -> Solution:
         """Solve with the present rows, from an earlier solution on."""
         gluing, report, comm = self._gluing, self.report, self.decomposition.comm
-        rows = comm.allreduce(len(gluing.inequalities.rows))
+        rows = comm.allreduce(len(gluing.constraints.sets.normals))
         qp_type, pc_type = resolve_types(self.options, rows, self._prefix)
         with added_options(self._prefix, self._factor_options):
             blocks = self._build_blocks()
