@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.mortar.clipping import Parts, common_parts, contains, sizes
+from tfeti_dolfinx.mortar.clipping import CommonParts, common_parts, contains, sizes
 from tfeti_dolfinx.mortar.facet_element import POLYGON
 from tfeti_dolfinx.mortar.facet_maps import densities, points, reference_points
 from tfeti_dolfinx.mortar.facets import FacetKind, Facets
@@ -123,7 +123,7 @@ class _Meetings:
     s: Array
     p: Array
     corners: Array
-    parts: Parts
+    parts: CommonParts
     cosine: Array
     distance: Array
 
