@@ -96,7 +96,7 @@ def test_gram_is_G_Gt(dual):
 
 def test_feasible_homogenisation(held_by_contact):
     dual = held_by_contact
-    coarse, bounded = dual.coarse, dual.constraints.inequalities
+    coarse, bounded = dual.coarse, dual.constraints.sets.normals
     lam = feasible_particular(coarse, bounded)
     assert np.allclose(coarse.G(lam), coarse.e, atol=1e-11)
     assert np.all(lam[bounded] >= 0.0)
@@ -112,7 +112,7 @@ def test_feasible_homogenisation(held_by_contact):
 def test_the_feasible_homogenisation_is_the_smallest(held_by_contact):
     """Its optimality conditions: λ̄ = Gᵀα on carrying rows, (Gᵀα) ≤ 0 on the others."""
     dual = held_by_contact
-    coarse, bounded = dual.coarse, dual.constraints.inequalities
+    coarse, bounded = dual.coarse, dual.constraints.sets.normals
     lam = feasible_particular(coarse, bounded)
     carrying = np.ones(len(lam), dtype=bool)
     carrying[bounded] = lam[bounded] > 0.0
@@ -131,8 +131,9 @@ def test_recovered_displacement_meets_the_rows(solved):
     constraints.B.mult(u, Bu)
     size = solved.u.x.petsc_vec.norm()
     residual = Bu.array_r - constraints.c.array_r
-    bounded, lam = constraints.inequalities, solution.lam
-    assert np.all(np.abs(residual[: bounded.start]) <= 1e-8 * size)
+    sets, lam = constraints.sets, solution.lam
+    bounded = sets.normals
+    assert np.all(np.abs(residual[sets.equalities]) <= 1e-8 * size)
     assert np.all(residual[bounded] <= 1e-8 * size)
     closed = lam[bounded] > 0.0
     assert solved.decomposition.comm.allreduce(int(np.sum(closed))) > 0

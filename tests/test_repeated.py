@@ -88,6 +88,15 @@ def test_another_load_makes_no_row_and_no_factor(scene):
     assert np.array_equal(first.displacement.x.array, before)
 
 
+def test_other_prescribed_values_make_no_row(scene):
+    scene.solve()
+    second = scene.solve(held=-0.01)
+    report = scene.problem.report
+    assert counters(report) == [0] * len(COUNTERS)
+    assert "right side" not in report.reused
+    assert distance(second, scene.fresh(held=-0.01)) <= 1e-8
+
+
 def test_another_stiffness_is_not_searched_again(scene):
     scene.solve()
     second = scene.solve(E=2.0)

@@ -21,16 +21,15 @@ def fill_sizes(
 ) -> None:
     """Fill in what is known before the dual problem is. Collective."""
     comm, constraints = dofs.comm, gluing.constraints
-    bounded = constraints.inequalities
     report.primal_dofs = int(dofs.offsets[-1]) * dofs.bs
     report.dual_dofs = comm.allreduce(constraints.num_rows)
     report.subdomains, report.bodies = decomposition.num_subdomains, decomposition.num_bodies
     report.split_subdomains = len(decomposition.split)
-    report.contact_rows = comm.allreduce(bounded.stop - bounded.start)
+    report.contact_rows = comm.allreduce(len(constraints.sets.normals))
     report.contact_candidates = comm.allreduce(gluing.records.candidates)
-    near = comm.allreduce(int(np.sum(gluing.records.near)))
-    report.far_contact_nodes = report.contact_candidates - near
-    report.dropped_contact_rows = comm.allreduce(gluing.inequalities.dropped)
+    within_reach = comm.allreduce(int(np.sum(gluing.records.within_reach)))
+    report.far_contact_nodes = report.contact_candidates - within_reach
+    report.dropped_contact_rows = comm.allreduce(len(gluing.contact.decided))
 
 
 def fill_result(
@@ -45,7 +44,7 @@ def fill_result(
     report.kernel_dim = dual.coarse.dimension
     report.free_modes = dual.coarse.free_modes
     report.nearly_free = dual.nearly_free
-    active = solution.lam[solution.gluing.constraints.inequalities] > 0.0
+    active = solution.lam[solution.gluing.constraints.sets.normals] > 0.0
     report.active_contacts = comm.allreduce(int(np.sum(active)))
     report.F_multiplications += dual.F.count["solver"]
     report.power_method_multiplications += dual.F.count["power method"]

@@ -212,10 +212,10 @@ class Solution:
     @cached_property
     def force(self) -> Array:
         """Normal force s_i λ_i of each contact condition of this rank, 0 without a row."""
-        inequalities = self.gluing.inequalities
+        contact = self.gluing.contact
         values = np.zeros(len(self.gluing.records))
-        lam = self.lam[self.gluing.constraints.inequalities]
-        values[inequalities.condition] = inequalities.scale * lam
+        lam = self.lam[self.gluing.constraints.sets.normals]
+        values[contact.condition] = contact.scale * lam
         return values
 
     @cached_property

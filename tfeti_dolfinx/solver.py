@@ -108,7 +108,7 @@ def _homogenise(dual: Dual, qp: QP, options: Options) -> Homogenised:
     if options.homogenization == "natural" or not dual.num_inequalities:
         return homogenise(qp)
     lam_bar = qp.d.duplicate()
-    lam_bar.array[:] = feasible_particular(dual.coarse, dual.constraints.inequalities)
+    lam_bar.array[:] = feasible_particular(dual.coarse, dual.constraints.sets.normals)
     homogenised = homogenise(qp, lam_bar)
     lam_bar.destroy()
     return homogenised

@@ -182,7 +182,8 @@ class System:
         self.spectrum = {}
 
     def _fill_right_side(self) -> None:
-        pass
+        values, gaps = _made(self._prescribed).value, self.search.records.gap
+        self._gluing = self.gluing.with_right_side(values, gaps)
 
     def _assemble_load(self) -> None:
         self._f = self.forms.load()
@@ -214,7 +215,7 @@ class System:
 
     def _make_dual(self) -> None:
         decomposition, dofs = self._decomposition, self._dofs
-        rows = dofs.comm.allreduce(len(self.gluing.inequalities.rows))
+        rows = dofs.comm.allreduce(len(self.gluing.constraints.sets.normals))
         _, pc_type = resolve_types(self._options, rows, self._prefix)
         with added_options(self._prefix, self.factor_options):
             self._dual = Dual(

@@ -64,7 +64,7 @@ class CoarseSpace:
         blocks: Sequence[Block],
         body_of_block: Array,
         num_bodies: int,
-        bounded: slice,
+        bounded: Array,
         comm: MPI.Intracomm,
         prefix: str = "tfeti_coarse_",
     ) -> None:

@@ -74,11 +74,11 @@ class Dual:
         if pc_type != "none":
             self._scaled = ScaledGluing(B, constraints.weights)
             self.preconditioner = PRECONDITIONERS[pc_type](self._scaled, blocks)
-        bounded = constraints.inequalities
+        bounded = constraints.sets.normals
         self.coarse = CoarseSpace(
             B, blocks, body_of_block, len(body_names), bounded, comm, f"{options_prefix}coarse_"
         )
-        self.num_inequalities = comm.allreduce(bounded.stop - bounded.start)
+        self.num_inequalities = comm.allreduce(len(bounded))
         check_solvable(self.coarse, body_names, mode_names)
         self.d = linear_term(B, constraints.c, blocks)
 
@@ -102,7 +102,7 @@ class Dual:
     def qp(self) -> QP:
         """The quadratic program; without kernel it has no coarse problem."""
         coarse: Coarse = self.coarse if self.coarse.dimension else NoCoarse()
-        bounds = Bounds(self.constraints.inequalities)
+        bounds = Bounds(self.constraints.sets.normals)
         feasible: FeasibleSet = bounds if self.num_inequalities else Unbounded()
         return QP(self.F, self.d, coarse, feasible, self.preconditioner)
 
@@ -114,7 +114,7 @@ class Dual:
             gradient: Fλ − d up to the range of Gᵀ; on bound components the multiplier ν.
             error: How large multipliers may be by the solver's error alone.
         """
-        constraints, bounded = self.constraints, self.constraints.inequalities
+        constraints, bounded = self.constraints, self.constraints.sets.normals
         nu = np.zeros(constraints.num_rows)
         closed = lam.array_r[bounded] <= 0.0
         nu[bounded] = np.where(closed, gradient.array_r[bounded], 0.0)

@@ -58,7 +58,7 @@ def recover(
     return moved(blocks, u, coarse, alpha), gap - coarse.Gt @ alpha
 
 
-def carrying(lam: Array, bounded: slice) -> Array:
+def carrying(lam: Array, bounded: Array) -> Array:
     """Rows of equalities, and those of λ_N > 0."""
     flags = np.ones(len(lam), dtype=bool)
     flags[bounded] = lam[bounded] > 0.0
