@@ -49,11 +49,11 @@ def test_F_is_symmetric_and_positive(dual):
 
 
 def test_preconditioners_are_symmetric_and_positive(dual):
-    from tfeti_dolfinx.dual.operator import PRECONDITIONERS, ScaledGluing
+    from tfeti_dolfinx.dual.operator import PRECONDITIONERS, ScaledRows
 
-    scaled = ScaledGluing(dual.constraints.B, dual.constraints.weights)
+    scaled = ScaledRows(dual.constraints.B, dual.constraints.weights)
     for make in PRECONDITIONERS.values():
-        check_operator(make(scaled, dual.blocks), dual.d)
+        check_operator(make(scaled, dual.subdomains.blocks), dual.d)
 
 
 def test_projectors(dual):
@@ -146,7 +146,7 @@ def test_recovered_displacement_is_in_equilibrium(solved):
     lam.array[:] = solved.solution.lam
     constraints.B.multTranspose(lam, force)
     dofs = solved.dofs
-    left = dofs.to_primal(solved._K @ solved.u.x.array - solved._f)
+    left = dofs.to_primal(solved._forms.stiffness() @ solved.u.x.array - solved._f)
     left[constraints.trace] += force.array_r
     assert np.all(np.abs(left) <= 1e-9 * force.norm())
 

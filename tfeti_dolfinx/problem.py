@@ -30,10 +30,12 @@ from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.report_filling import fill_result, fill_sizes
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solver import conclude, resolve_types, solve_dual
-from tfeti_dolfinx.subdomains.build import sparse_blocks, trace_parts
+from tfeti_dolfinx.subdomains.build import make_blocks, subdomain_data
+from tfeti_dolfinx.subdomains.data import Counters
 from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.kernel import mode_names
-from tfeti_dolfinx.subdomains.sparse_block import Counters, SparseBlock
+from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
+from tfeti_dolfinx.subdomains.subdomains import Subdomains
 from tfeti_dolfinx.timing import stage
 
 MAX_ROUNDS = 20
@@ -98,7 +100,7 @@ class ContactProblem:
         self._factor_options = factor_options(petsc_options, petsc_options_prefix)
         self._solution: Solution | None = None
         self._constraints: Constraints | None = None
-        self._blocks: list[SparseBlock] | None = None  # a rank may have none of them
+        self._subdomains: Subdomains | None = None
         self._dual: Dual | None = None
         with stage("assembly", self.report.seconds):
             self._forms = Forms(a, L, V, decomposition, form_compiler_options, jit_options)
@@ -131,10 +133,9 @@ class ContactProblem:
         self.destroy()
         self.report.reset()
         with stage("assembly", self.report.seconds):
-            self._K, self._f = self._forms.stiffness(), self._forms.load()
+            self._assemble()
         with stage("contact", self.report.seconds):
-            diagonal = self.dofs.to_primal(self._K.diagonal())
-            search = ContactSearch(self.contacts, self.dofs, self.decomposition, diagonal)
+            search = ContactSearch(self.contacts, self.dofs, self.decomposition, self._diagonal)
             self._settled = search.contacts
         previous = None
         for _ in range(MAX_ROUNDS):
@@ -174,10 +175,15 @@ class ContactProblem:
 
     def destroy(self) -> None:
         """Destroy the PETSc objects; solution and report stay. ``solve`` makes them anew."""
-        for item in (self._dual, *(self._blocks or ()), self._constraints):
+        for item in (self._dual, self._subdomains, self._constraints):
             if item is not None:
                 item.destroy()
-        self._dual, self._blocks, self._constraints = None, None, None
+        self._dual, self._subdomains, self._constraints = None, None, None
+
+    def _assemble(self) -> None:
+        """K, which is let go when the Blocks have it, its diagonal in primal order, and f."""
+        self._K, self._f = self._forms.stiffness(), self._forms.load()
+        self._diagonal = self.dofs.to_primal(self._K.diagonal())
 
     def _glue(self, search: ContactSearch) -> None:
         """Rows of B for the present conditions."""
@@ -204,7 +210,7 @@ class ContactProblem:
         """D for the scaling of B: the diagonal of K over its smallest entry, or ones."""
         if self.options.scaling == "multiplicity":
             return np.ones(self.dofs.num_nodes * self.dofs.bs)
-        diagonal = self.dofs.to_primal(self._K.diagonal())
+        diagonal = self._diagonal
         positive = diagonal > 0.0  # what is not is reported when Blocks are built
         lowest = float(np.min(diagonal[positive], initial=np.inf))
         lowest = self.decomposition.comm.allreduce(lowest, op=MPI.MIN)
@@ -216,17 +222,16 @@ class ContactProblem:
         rows = comm.allreduce(len(gluing.inequalities.rows))
         qp_type, pc_type = resolve_types(self.options, rows, self._prefix)
         with added_options(self._prefix, self._factor_options):
-            blocks = self._build_blocks()
+            subdomains = self._build_subdomains()
             with stage("dual", report.seconds):
-                dual = self._build_dual(blocks, pc_type)
+                dual = self._build_dual(subdomains, pc_type)
         with stage("qp", report.seconds):
             start = None
             if previous is not None:
                 start = (gluing.multipliers(previous.gluing, previous.lam), previous.mu)
             result, accuracy = solve_dual(dual, self.options, qp_type, start)
         with stage("recovery", report.seconds):
-            u = np.concatenate([np.empty(0), *accuracy.u])
-            self.u.x.array[:] = self.dofs.to_dolfinx(u)
+            self.u.x.array[:] = self.dofs.to_dolfinx(accuracy.u)
             self._solution = Solution(
                 u=self.u,
                 dofs=self.dofs,
@@ -242,39 +247,38 @@ class ContactProblem:
         conclude(result, accuracy, self.options, comm)
         return self.solution
 
-    def _build_blocks(self) -> list[SparseBlock]:
+    def _build_subdomains(self) -> Subdomains:
         """Blocks for the present trace; factors are made once."""
-        trace = self._gluing.constraints.trace
-        if self._blocks is not None:
-            with stage("subdomains", self.report.seconds):
-                for block, part in zip(self._blocks, trace_parts(self.dofs, trace), strict=True):
-                    block.retrace(part)
-            return self._blocks
-        self._counters = Counters()
+        trace, decomposition = self._gluing.constraints.trace, self.decomposition
         with stage("subdomains", self.report.seconds):
-            self._blocks = sparse_blocks(
-                self.dofs,
-                self.decomposition,
-                self._K,
-                self._f,
-                trace,
-                self._counters,
-                self.options.kplus_type,
-                f"{self._prefix}sub_",
+            if self._subdomains is not None:
+                self._subdomains.retrace(trace)
+                return self._subdomains
+            data = subdomain_data(self.dofs, decomposition, self._K, self._f, trace)
+            self._K = None
+            self._counters = counters = Counters()
+            kplus_type, prefix = self.options.kplus_type, f"{self._prefix}sub_"
+            blocks = make_blocks(
+                data, lambda s: SparseBlock(s, counters, kplus_type, prefix), decomposition.comm
             )
-        return self._blocks
+            self._subdomains = Subdomains(
+                blocks,
+                decomposition.body_of_subdomain[decomposition.subdomains],
+                decomposition.num_bodies,
+                decomposition.comm,
+                counters,
+            )
+        return self._subdomains
 
-    def _build_dual(self, blocks: list[SparseBlock], pc_type: str) -> Dual:
+    def _build_dual(self, subdomains: Subdomains, pc_type: str) -> Dual:
         """The dual problem of the present rows."""
         if self._dual is not None:
             self._dual.destroy()
-        decomposition = self.decomposition
         self._dual = Dual(
             constraints=self._gluing.constraints,
-            blocks=blocks,
-            body_of_block=decomposition.body_of_subdomain[decomposition.subdomains],
-            body_names=decomposition.body_names,
-            mode_names=mode_names(decomposition.mesh.geometry.dim, self.dofs.bs),
+            subdomains=subdomains,
+            body_names=self.decomposition.body_names,
+            mode_names=mode_names(self.decomposition.mesh.geometry.dim, self.dofs.bs),
             pc_type=pc_type,
             options_prefix=self._prefix,
         )

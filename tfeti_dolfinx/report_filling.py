@@ -14,7 +14,7 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.qp.problem import QPResult
 from tfeti_dolfinx.report import Report, peak_memory_mb
 from tfeti_dolfinx.solution import Solution
-from tfeti_dolfinx.subdomains.sparse_block import Counters
+from tfeti_dolfinx.subdomains.data import Counters
 
 
 def fill_sizes(
@@ -45,7 +45,7 @@ def fill_result(
     """Fill in what a solve has found; counters add up over rounds. Collective."""
     comm = dual.coarse.comm
     report.kernel_dim = dual.coarse.dimension
-    report.free_modes = dual.coarse.free_modes
+    report.free_modes = dual.coarse.num_free_motions
     report.nearly_free = dual.nearly_free
     active = solution.lam[solution.gluing.constraints.inequalities] > 0.0
     report.active_contacts = comm.allreduce(int(np.sum(active)))
