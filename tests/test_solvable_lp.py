@@ -54,7 +54,7 @@ def as_coarse(count, k, E, N, load):
         dimension=count * k,
         comm=MPI.COMM_SELF,
         bodies=bodies,
-        modes=eye_array(count * k, format="csr"),
+        motions=eye_array(count * k, format="csr"),
         e=load,
         J=csr_array(N),
         bounded=slice(0, len(N)),

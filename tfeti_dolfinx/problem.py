@@ -30,7 +30,7 @@ from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.report_filling import fill_result, fill_sizes
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solver import conclude, resolve_types, solve_dual
-from tfeti_dolfinx.subdomains.build import make_blocks, subdomain_data
+from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
 from tfeti_dolfinx.subdomains.data import Counters
 from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.kernel import mode_names
@@ -258,14 +258,10 @@ class ContactProblem:
             self._K = None
             self._counters = counters = Counters()
             kplus_type, prefix = self.options.kplus_type, f"{self._prefix}sub_"
-            blocks = make_blocks(
-                data, lambda s: SparseBlock(s, counters, kplus_type, prefix), decomposition.comm
-            )
-            self._subdomains = Subdomains(
-                blocks,
-                decomposition.body_of_subdomain[decomposition.subdomains],
-                decomposition.num_bodies,
-                decomposition.comm,
+            self._subdomains = make_subdomains(
+                data,
+                lambda s: SparseBlock(s, counters, kplus_type, prefix),
+                decomposition,
                 counters,
             )
         return self._subdomains

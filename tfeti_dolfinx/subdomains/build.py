@@ -15,8 +15,9 @@ from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.subdomains.block import Block
-from tfeti_dolfinx.subdomains.data import SubdomainData
+from tfeti_dolfinx.subdomains.data import Counters, SubdomainData
 from tfeti_dolfinx.subdomains.factor import say_if_not_cholmod
+from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 MakeBlock = Callable[[SubdomainData], Block]
 
@@ -65,22 +66,29 @@ def submatrices(dofs: TornDofs, K: Any) -> Iterator[csr_array]:
         yield _submatrix(K, dolfinx[first:last], primal, first)
 
 
-def make_blocks(
-    data: list[SubdomainData], make_block: MakeBlock, comm: MPI.Intracomm
-) -> list[Block]:
-    """A Block for each subdomain. Collective.
+def make_subdomains(
+    data: list[SubdomainData],
+    make_block: MakeBlock,
+    decomposition: Decomposition,
+    counters: Counters | None = None,
+) -> Subdomains:
+    """A Block for each subdomain of this rank. Collective.
 
     Args:
         data: The subdomains; the list is emptied, so that no K is held twice.
-        make_block: Makes one; it may refuse with an error, which all ranks raise.
-        comm: Communicator.
+        make_block: Makes one, say ``SparseBlock`` or a class of one's own; what it raises is
+            raised on all ranks.
+        decomposition: The torn mesh.
+        counters: Counts solves.
     """
+    comm = decomposition.comm
     say_if_not_cholmod(comm)
     blocks = []
     with raised_on_all_ranks(comm):
         while data:
             blocks.append(make_block(data.pop(0)))
-    return blocks
+    bodies = decomposition.body_of_subdomain[decomposition.subdomains]
+    return Subdomains(blocks, bodies, decomposition.num_bodies, comm, counters)
 
 
 def _submatrix(K: Any, rows: Array, primal: Array, first: int) -> csr_array:
