@@ -131,8 +131,8 @@ class Accuracy:
         return self._looked().balance
 
     @property
-    def u(self) -> list[Array]:
-        """Displacements of this rank's Blocks at the last look."""
+    def u(self) -> Array:
+        """This rank's part of the displacement at the last look, shape ``(n,)``."""
         return self._looked().u
 
     def errors(self) -> Array:

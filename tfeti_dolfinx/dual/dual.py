@@ -12,8 +12,8 @@ from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.dual.naming import listed
 from tfeti_dolfinx.dual.operator import (
     PRECONDITIONERS,
-    BlockOperator,
-    ScaledGluing,
+    DualOperator,
+    ScaledRows,
     dual_operator,
     linear_term,
 )
@@ -24,7 +24,7 @@ from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Unbounded
 from tfeti_dolfinx.qp.problem import QP, Coarse, NoCoarse
-from tfeti_dolfinx.subdomains.block import Block
+from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 
 class Dual:
@@ -32,8 +32,7 @@ class Dual:
 
     Args:
         constraints: B and c.
-        blocks: This rank's Blocks.
-        body_of_block: Body of each of them.
+        subdomains: This rank's Blocks.
         body_names: Names of all bodies.
         mode_names: Names of their candidate modes.
         pc_type: Preconditioner: none, lumped or dirichlet.
@@ -41,7 +40,6 @@ class Dual:
 
     Attributes:
         F: B K⁺ Bᵀ.
-        num_bodies: Number of bodies on all ranks.
         preconditioner: The preconditioner, or None.
         coarse: The coarse space.
         num_inequalities: Inequality rows of all ranks.
@@ -56,31 +54,27 @@ class Dual:
     def __init__(
         self,
         constraints: Constraints,
-        blocks: Sequence[Block],
-        body_of_block: Array,
+        subdomains: Subdomains,
         body_names: Sequence[str],
         mode_names: Sequence[str],
         pc_type: str,
         options_prefix: str = "tfeti_",
     ) -> None:
-        self.constraints, self.blocks = constraints, blocks
+        self.constraints, self.subdomains = constraints, subdomains
         self.carrying = np.zeros(constraints.num_rows, dtype=bool)
-        self.body_of_block, self.num_bodies = body_of_block, len(body_names)
         self._names, self.nearly_free = (body_names, mode_names), list[dict[str, object]]()
         B, comm = constraints.B, constraints.B.getComm().tompi4py()
-        self.F = dual_operator(B, blocks)
-        self.preconditioner: BlockOperator | None = None
-        self._scaled: ScaledGluing | None = None
+        self.F = dual_operator(B, subdomains.blocks)
+        self.preconditioner: DualOperator | None = None
+        self._scaled: ScaledRows | None = None
         if pc_type != "none":
-            self._scaled = ScaledGluing(B, constraints.weights)
-            self.preconditioner = PRECONDITIONERS[pc_type](self._scaled, blocks)
+            self._scaled = ScaledRows(B, constraints.weights)
+            self.preconditioner = PRECONDITIONERS[pc_type](self._scaled, subdomains.blocks)
         bounded = constraints.sets.normals
-        self.coarse = CoarseSpace(
-            B, blocks, body_of_block, len(body_names), bounded, comm, f"{options_prefix}coarse_"
-        )
+        self.coarse = CoarseSpace(B, subdomains, bounded, f"{options_prefix}coarse_")
         self.num_inequalities = comm.allreduce(len(bounded))
         check_solvable(self.coarse, body_names, mode_names)
-        self.d = linear_term(B, constraints.c, blocks)
+        self.d = linear_term(B, constraints.c, subdomains)
 
     def update_load(self) -> None:
         """Take the Blocks' present loads and the present right sides.
@@ -88,10 +82,10 @@ class Dual:
         Raises:
             NoSolutionError: The load moves a body that nothing holds.
         """
-        self.coarse.update_load(self.blocks)
+        self.coarse.update_load()
         check_solvable(self.coarse, *self._names)
         self.d.destroy()
-        self.d = linear_term(self.constraints.B, self.constraints.c, self.blocks)
+        self.d = linear_term(self.constraints.B, self.constraints.c, self.subdomains)
 
     def forget_counts(self) -> None:
         """Count multiplications from 0 on."""
@@ -106,27 +100,30 @@ class Dual:
         feasible: FeasibleSet = bounds if self.num_inequalities else Unbounded()
         return QP(self.F, self.d, coarse, feasible, self.preconditioner)
 
-    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, error: float) -> list[Array]:
+    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, error: float) -> Array:
         """Displacements that belong to multipliers: of equal ones the smallest.
 
         Args:
             lam: The multipliers λ.
             gradient: Fλ − d up to the range of Gᵀ; on bound components the multiplier ν.
             error: How large multipliers may be by the solver's error alone.
+
+        Returns:
+            This rank's part of u, shape ``(n,)``.
         """
         constraints, bounded = self.constraints, self.constraints.sets.normals
         nu = np.zeros(constraints.num_rows)
         closed = lam.array_r[bounded] <= 0.0
         nu[bounded] = np.where(closed, gradient.array_r[bounded], 0.0)
-        u, gap = recover(constraints.B, constraints.c, self.blocks, self.coarse, lam, nu)
+        u, gap = recover(constraints.B, constraints.c, self.coarse, lam, nu)
         motions, force = nearly_free(self.coarse, lam.array_r, error)
         self.carrying = force
         words = listed(motions, self.coarse.bodies, *self._names)
         self.nearly_free = agreed(self.coarse.comm, words)
         if motions.count == 0:
             return u
-        alpha = smallest_motion(self.coarse, self.blocks, u, gap, motions, force)
-        return moved(self.blocks, u, self.coarse, alpha)
+        alpha = smallest_motion(self.coarse, u, gap, motions, force)
+        return moved(u, self.coarse, alpha)
 
     def destroy(self) -> None:
         """Destroy the PETSc objects."""

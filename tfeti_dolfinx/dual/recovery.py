@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from petsc4py import PETSc
 from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
-from tfeti_dolfinx.dual.operator import trace_slices
 from tfeti_dolfinx.dual.semidefinite import SemidefiniteFactor
-from tfeti_dolfinx.subdomains.block import Block
 
 # of GGᵀ, added to G_f G_fᵀ: rows with a force that hold a motion by less are not asked about it
 DAMPING = 1e-8
@@ -21,11 +17,10 @@ DAMPING = 1e-8
 def recover(
     B: PETSc.Mat,
     c: PETSc.Vec,
-    blocks: Sequence[Block],
     coarse: CoarseSpace,
     lam: PETSc.Vec,
     nu: Array,
-) -> tuple[list[Array], Array]:
+) -> tuple[Array, Array]:
     """u = K⁺(f − Bᵀλ) + Rα. Collective.
 
     α = (GGᵀ)⁻¹G(Fλ − d − ν) makes the rows' residuals vanish, but for the gaps of open rows, ν
@@ -35,27 +30,25 @@ def recover(
     Args:
         B: Dual rows × trace unknowns.
         c: Right sides.
-        blocks: This rank's Blocks.
         coarse: The coarse space.
         lam: The multipliers.
         nu: Multipliers of λ_N ≥ 0 on all local rows, zero on free ones, shape ``(m,)``.
 
     Returns:
-        Displacements of each Block, each of shape ``(n_s,)``, and c − B u, shape ``(m,)``.
+        This rank's part of u, shape ``(n,)``, and c − B u, shape ``(m,)``.
     """
     w, v, residual = B.createVecRight(), B.createVecRight(), c.duplicate()
     B.multTranspose(lam, w)
-    slices = trace_slices(blocks)
-    u = [block.recover(w.array_r[part]) for block, part in zip(blocks, slices, strict=True)]
-    for block, part, u_s in zip(blocks, slices, u, strict=True):
-        v.array[part] = u_s[block.trace_dofs]
+    subdomains = coarse.subdomains
+    u = subdomains.recover(w.array_r)
+    v.array[:] = u[subdomains.trace]
     B.mult(v, residual)
     residual.aypx(-1.0, c)  # c − B K⁺(f − Bᵀλ) = Fλ − d
     gap = np.array(residual.array_r)
     for vec in (w, v, residual):
         vec.destroy()
     alpha = _alpha(coarse, gap, carrying(lam.array_r, coarse.bounded), nu)
-    return moved(blocks, u, coarse, alpha), gap - coarse.Gt @ alpha
+    return moved(u, coarse, alpha), gap - coarse.Gt @ alpha
 
 
 def carrying(lam: Array, bounded: Array) -> Array:
@@ -65,12 +58,9 @@ def carrying(lam: Array, bounded: Array) -> Array:
     return flags
 
 
-def moved(
-    blocks: Sequence[Block], u: Sequence[Array], coarse: CoarseSpace, alpha: Array
-) -> list[Array]:
+def moved(u: Array, coarse: CoarseSpace, alpha: Array) -> Array:
     """u + Rα."""
-    parts = coarse.alpha_of(alpha)
-    return [v + block.kernel_motion(a) for v, block, a in zip(u, blocks, parts, strict=True)]
+    return u + coarse.subdomains.kernel_motion(coarse.local_alpha(alpha))
 
 
 def _alpha(coarse: CoarseSpace, gradient: Array, free: Array, nu: Array) -> Array:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from mpi4py import MPI
 from scipy.optimize import lsq_linear
@@ -15,7 +13,6 @@ from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.dual.cuts import Rows, minimise
 from tfeti_dolfinx.dual.motions import Motions
 from tfeti_dolfinx.parallel import agreed
-from tfeti_dolfinx.subdomains.block import Block
 
 # Motions held by less than this share of what the same contacts hold at most are nearly free:
 # their contacts' normals are off by less than 6 degrees from a right angle.
@@ -58,8 +55,7 @@ def nearly_free(coarse: CoarseSpace, lam: Array, error: float) -> tuple[Motions,
 
 def smallest_motion(
     coarse: CoarseSpace,
-    blocks: Sequence[Block],
-    u: Sequence[Array],
+    u: Array,
     gap: Array,
     motions: Motions,
     force: Array,
@@ -71,8 +67,7 @@ def smallest_motion(
 
     Args:
         coarse: The coarse space.
-        blocks: This rank's Blocks.
-        u: Displacement of each Block.
+        u: This rank's part of the displacement, shape ``(n,)``.
         gap: c − B u, shape ``(m,)``.
         motions: Motions that hardly any force resists.
         force: Flags of local contact rows with a force.
@@ -81,7 +76,7 @@ def smallest_motion(
         Shape ``(r,)``.
     """
     N, body = agreed(coarse.comm, _orthonormal(motions, coarse.bodies.k))
-    wanted = -(N.T @ coarse.bodies.part_of(u, blocks))
+    wanted = -(N.T @ coarse.bodies.part_of(u))
     size = float(np.abs(wanted).max(initial=0.0))
     rows = _rows(coarse, csr_array(coarse.J @ N), gap / coarse.row_size, force, body)
     y = minimise(
@@ -93,7 +88,7 @@ def smallest_motion(
     )
     if y is None:
         return np.zeros(coarse.dimension)
-    return np.asarray(coarse.modes @ (N @ (rows.allowed(y, EXCESS * size, coarse.comm) * y)))
+    return np.asarray(coarse.motions @ (N @ (rows.allowed(y, EXCESS * size, coarse.comm) * y)))
 
 
 def _orthonormal(motions: Motions, k: int) -> tuple[csr_array, Array]:

@@ -41,7 +41,7 @@ def check_solvable(
     """
     if coarse.dimension == 0:
         return
-    load = coarse.modes.T @ coarse.e
+    load = coarse.motions.T @ coarse.e
     motion = agreed(coarse.comm, _driven(coarse.free_motions, load, coarse.bodies))
     reason = (
         "nothing resists that and the load drives it; add a Dirichlet condition, a contact or a "
@@ -80,7 +80,7 @@ def escape(coarse: CoarseSpace) -> Array | None:
     body = np.repeat(np.arange(bodies.count), coarse.unheld.free.sum(axis=1))
     J_N = csr_array(coarse.J[coarse.bounded] @ Z)
     rows = Rows(J_N, np.zeros(J_N.shape[0]), body)
-    load, noise = Z.T @ (coarse.modes.T @ coarse.e), bodies.negligible[body]
+    load, noise = Z.T @ (coarse.motions.T @ coarse.e), bodies.negligible[body]
     if agreed(coarse.comm, bool(np.all(np.abs(load) <= noise))):
         return None
     # parts of the scene that do not meet may be loaded by very different forces
