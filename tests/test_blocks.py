@@ -1,5 +1,7 @@
 """Blocks: generalised inverses, kernels, Schur complements."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import ufl
@@ -13,7 +15,7 @@ import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.compat import assemble_csr
 from tfeti_dolfinx.errors import ConformanceError, FactorError, InputError
 from tfeti_dolfinx.subdomains import factor, sparse_block
-from tfeti_dolfinx.subdomains.conformance import check_block
+from tfeti_dolfinx.subdomains.conformance import check_block, check_kind_of_block
 from tfeti_dolfinx.subdomains.data import Counters, SubdomainData
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 from tfeti_dolfinx.subdomains.kernel import candidate_modes, fixing_nodes, kernel_of
@@ -62,6 +64,10 @@ def test_blocks_fulfil_their_contract(cell, degree):
     check_block(b, K)
     assert b.kernel.shape[1] == RIGID[cell]
     b.destroy()
+
+
+def test_any_class_of_blocks_can_be_checked():
+    check_kind_of_block(SparseBlock)
 
 
 def test_blocks_of_a_scalar_problem_have_the_constants():
@@ -320,6 +326,8 @@ def test_an_implementation_that_breaks_its_promises_is_named():
         b.apply_stiffness = lambda w: 2 * w
         check_block(b, K)
     del b.apply_stiffness
+    with pytest.raises(ConformanceError, match=r"this does not hold: a Block has load, kernel, d"):
+        check_block(SimpleNamespace(trace_dofs=b.trace_dofs), K)
     with pytest.raises(ConformanceError, match="this does not hold: K⁺ is symmetric"):
         b.apply_pinv = lambda w: np.roll(w, 1)
         check_block(b, K)

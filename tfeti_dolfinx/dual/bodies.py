@@ -17,7 +17,9 @@ SPRUNG = 1e-8
 # Work of a body's load that counts as none, as a share of the largest that loads of this size
 # could do (what users balance by hand is seldom exact), and of that of any body (rounding).
 BALANCE, ROUNDING = 1e-9, 1e-14
-DEPENDENT = 1e-12  # of the largest eigenvalue of the modes' Gram matrix: no motion of its own
+# Eigenvalue of the modes' Gram matrix, as a share of the largest, that is none: on nodes of a line
+# or a point some mode is no motion of its own, and only rounding is left of it.
+DEPENDENT = 1e-12
 
 
 class Bodies:

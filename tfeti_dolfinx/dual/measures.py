@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.arrays import TINY, Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.subdomains.subdomains import Subdomains, sizes, sums
@@ -170,5 +170,5 @@ def _balance(coarse: CoarseSpace, lam: PETSc.Vec) -> tuple[float, float]:
     coarse.comm.Allreduce(MPI.IN_PLACE, forces, op=MPI.SUM)
     forces = np.maximum(forces, LIGHT * forces.max())
     left = np.abs(coarse.G(lam.array_r) - coarse.e)
-    worst = int(np.argmax(left / np.maximum(forces, 1e-300)))
+    worst = int(np.argmax(left / np.maximum(forces, TINY)))
     return float(left[worst]), float(forces[worst])

@@ -10,7 +10,8 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.dual.semidefinite import SemidefiniteFactor
 
-# of GGᵀ, added to G_f G_fᵀ: rows with a force that hold a motion by less are not asked about it
+# Of GGᵀ, added to G_f G_fᵀ: rows with a force that hold a motion by less are not asked about it,
+# since they would answer with their rounding over this share.
 DAMPING = 1e-8
 
 

@@ -20,10 +20,14 @@ NEARLY = 1e-2
 # Contact force that counts as none: as a share of the largest on the same bodies; or in multiples
 # of the solver's own error, unless it is a larger share of the bodies' loads.
 NO_FORCE, NO_EFFECT = 1e-6, 10.0
-# Size of what is left of a joint motion that motions of single bodies span already.
+# Size of what is left of a joint motion of size 1 that motions of single bodies span already: both
+# come from null spaces of Gram matrices, whose vectors are right to the root of rounding.
 DEPENDENT = 1e-8
-# Excess of a row, as a share of the motion, that is let be; slope of a row that is rounding.
+# Excess of a row, as a share of the motion, that is let be: below what rtol can see. Coefficient of
+# a motion of size 1 that is rounding.
 EXCESS, SLOPE = 1e-9, 1e-12
+# of lsq_linear: as far as rounding lets it come
+TIGHT = 1e-14
 
 
 def nearly_free(coarse: CoarseSpace, lam: Array, error: float) -> tuple[Motions, Array]:
@@ -142,5 +146,5 @@ def _least_distance(A: Array, b: Array, wanted: Array) -> Array:
     E = np.concatenate((-A.T, excess[None, :] / scale))
     f = np.zeros(len(E))
     f[-1] = 1.0
-    r = E @ lsq_linear(E, f, bounds=(0.0, np.inf), method="bvls", tol=1e-14).x - f
+    r = E @ lsq_linear(E, f, bounds=(0.0, np.inf), method="bvls", tol=TIGHT).x - f
     return np.asarray(-scale * r[:-1] / r[-1])

@@ -24,6 +24,8 @@ from tfeti_dolfinx.parallel import agreed
 SLOPE, LP_TOLERANCE = 1e-9, 1e-10
 # Columns from which the interior point method with its crossover beats the simplex method.
 LARGE = 2000
+# Motions of a cone within −1 ≤ y ≤ 1: the largest entry is 1, or 0 but for rounding.
+MOVES = 0.5
 
 
 def check_solvable(
@@ -111,7 +113,7 @@ def _most_work(A: csr_array, load: Array, noise: Array) -> Array | None:
     # light one. Work less what counts as none has no such motions.
     y = _halves(_minimiser(np.concatenate((noise - load, noise + load)), _both(A), bounds=(0, 1)))
     # a cone: a motion that gains something gains more until a bound stops it
-    return y if np.abs(y).max() > 0.5 and load @ y > noise @ np.abs(y) else None
+    return y if np.abs(y).max() > MOVES and load @ y > noise @ np.abs(y) else None
 
 
 def _least_motion(A: csr_array, load: Array) -> Array:

@@ -2,19 +2,73 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array, diags_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.errors import require
 from tfeti_dolfinx.subdomains.block import Block
+from tfeti_dolfinx.subdomains.data import SubdomainData
 
 # Eigenvalues of a stiffness, as a share of the largest, that are 0 but for rounding (which is
 # 1e-16 times a few powers of n); singular values are their roots, and cut off above rounding.
 ZERO, RANK = 1e-12, 1e-10
-# a solve loses this many times eps times the condition at most, by experience
+# of eps times the condition: what a solve may lose, with room for sums of many terms
 LOST = 100.0
+# what the dual asks a Block for
+PROMISED = [name for name in vars(Block) if not name.startswith("_")]
+
+
+def check_kind_of_block(make_block: Callable[[SubdomainData], Block], tol: float = 1e-9) -> None:
+    """Check a class of Blocks on small trusses: loose, held by springs, and with changes.
+
+    Args:
+        make_block: The class, or what else makes a Block.
+        tol: Relative tolerance, see ``check_block``.
+
+    Raises:
+        ConformanceError: A promise is broken; the message says which.
+    """
+    for data, changed in _trusses():
+        K, trace = data.K.copy(), data.trace_dofs
+        block = make_block(data)
+        check_block(block, K, tol)
+        block.retrace(trace[::2])
+        require(np.array_equal(block.trace_dofs, trace[::2]), "retrace replaces the trace")
+        check_block(block, K, tol)
+        block.update(K=changed.copy())
+        check_block(block, changed, tol)
+        block.destroy()
+
+
+def _trusses() -> Iterator[tuple[SubdomainData, csr_array]]:
+    """Random points, each held to each by a bar, and another stiffness for each truss."""
+    rng = np.random.default_rng(0)
+    for gdim in (2, 3):
+        x = rng.uniform(size=(9, gdim))
+        i, j = np.triu_indices(len(x), 1)
+        bars, axes = np.zeros((len(i), len(x), gdim)), x[i] - x[j]
+        bars[np.arange(len(i)), i], bars[np.arange(len(i)), j] = axes, -axes
+        rows = bars.reshape(len(i), -1)
+        loose = csr_array(rows.T @ rows)
+        n = loose.shape[0]
+        held = csr_array(loose + diags_array(np.where(np.arange(n) % gdim, 1.0, 0.0)))
+        for K, other in ((loose, held), (held, 2.0 * held)):
+            yield (
+                SubdomainData(
+                    name=f"truss of {len(x)} nodes in {gdim}D",
+                    K=K.copy(),
+                    f=rng.standard_normal(n),
+                    x=x,
+                    trace_dofs=np.arange(0, n, 2),
+                    body_frame=(x.mean(axis=0), 1.0),
+                    node_shares=np.ones(len(x)),
+                ),
+                csr_array(other),
+            )
 
 
 def check_block(block: Block, K: Any, tol: float = 1e-9) -> None:
@@ -33,6 +87,8 @@ def check_block(block: Block, K: Any, tol: float = 1e-9) -> None:
     Raises:
         ConformanceError: An identity does not hold; the message names it.
     """
+    missing = [name for name in PROMISED if not hasattr(block, name)]
+    require(not missing, f"a Block has {', '.join(missing)}")
     K = K.toarray()
     values = _check_kernel(block, K, tol)
     _check_stiffness(block, K, tol)

@@ -9,8 +9,8 @@ import numpy as np
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.errors import InputError
 
-# Largest entry of K − Kᵀ over that of K: assembly leaves 1e-15, a form that is not symmetric more
-# than this by any term that matters.
+# Largest entry of K − Kᵀ over that of K: far above what rounding of assembly leaves, far below any
+# term of a form that matters.
 SYMMETRY = 1e-8
 
 
