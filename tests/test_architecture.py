@@ -11,6 +11,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "tfeti_dolfinx"
 ROOMS = [
     ["errors", "arrays", "version"],
     ["checks", "compat", "parallel", "timing"],
+    ["described"],
     ["mesh"],
     ["mortar"],
     ["contact"],
@@ -19,7 +20,7 @@ ROOMS = [
     ["subdomains"],
     ["dual"],
     ["form_checks", "options", "report"],
-    ["assembly"],
+    ["assembly", "option_parsing"],
     ["fields"],
     ["solution"],
     ["report_filling", "solver"],

@@ -25,7 +25,7 @@ from tfeti_dolfinx.gluing.prescribed import checked_conditions
 from tfeti_dolfinx.gluing.spectrum import extreme_eigenvalues, require_slepc
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.options import factor_options, parse_options
+from tfeti_dolfinx.option_parsing import factor_options, parse_options
 from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.report_filling import fill_result, fill_sizes
 from tfeti_dolfinx.solution import Solution
@@ -234,6 +234,7 @@ class ContactProblem:
                 gluing=gluing,
                 lam=np.array(result.lam.array_r),
                 mu=result.mu,
+                carrying=dual.face(result.lam, result.gradient).carrying,
                 stress=self._stress,
                 contacts=self._settled,
             )

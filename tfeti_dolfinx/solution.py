@@ -67,6 +67,7 @@ class Solution:
         gluing: Rows and contact records.
         lam: Multipliers of this rank's rows.
         mu: Multipliers of Gλ = e.
+        carrying: Flags of this rank's rows that carry a force.
         stress: UFL stress of a displacement, or None.
         contacts: Obstacles and pairs, the secondary surface of a pair first.
 
@@ -84,11 +85,12 @@ class Solution:
         gluing: Gluing,
         lam: Array,
         mu: Array,
+        carrying: Array,
         stress: Stress | None,
         contacts: Sequence[ContactPartner] = (),
     ) -> None:
         self.displacement, self.dofs, self.decomposition = u, dofs, decomposition
-        self.gluing, self.lam, self.mu = gluing, lam, mu
+        self.gluing, self.lam, self.mu, self.carrying = gluing, lam, mu, carrying
         self._stress, self.contacts = stress, list(contacts)
 
     @property
@@ -147,7 +149,9 @@ class Solution:
     def status(self) -> fem.Function:
         """ContactStatus of each node, as a number."""
         values = np.full(self.dofs.num_groups, float(ContactStatus.NONE))
-        touching = np.where(self.force > 0.0, ContactStatus.TOUCHING, ContactStatus.OPEN)
+        touching = np.where(
+            self._of_conditions(self.carrying), ContactStatus.TOUCHING, ContactStatus.OPEN
+        )
         np.maximum.at(values, self.gluing.records.group, touching.astype(float))
         function = self._field(values, self._vertices, "status")
         function.x.array[:] = np.floor(function.x.array)  # between nodes: the lesser of the two
@@ -206,9 +210,15 @@ class Solution:
     def force(self) -> Array:
         """Normal force s_i λ_i of each contact condition of this rank, 0 without a row."""
         inequalities = self.gluing.inequalities
-        values = np.zeros(len(self.gluing.records))
-        lam = self.lam[self.gluing.constraints.inequalities]
-        values[inequalities.condition] = inequalities.scale * lam
+        scale = np.zeros(len(self.gluing.records))
+        scale[inequalities.condition] = inequalities.scale
+        return scale * self._of_conditions(self.lam)
+
+    def _of_conditions(self, of_rows: Array) -> Array:
+        """Values of the rows of each contact condition of this rank, 0 without a row."""
+        values = np.zeros(len(self.gluing.records), dtype=of_rows.dtype)
+        inequalities = self.gluing.constraints.inequalities
+        values[self.gluing.inequalities.condition] = of_rows[inequalities]
         return values
 
     @cached_property

@@ -29,7 +29,7 @@ class Scene(Protocol):
     coarse: CoarseSpace
     body_of_block: Array
     num_bodies: int
-    carrying: Array
+    pressing: Array
 
     def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, error: float) -> list[Array]:
         """Displacements of this rank's Blocks, given the solver's error. Collective."""
@@ -96,7 +96,7 @@ def measure(
 ) -> Measures:
     """Recover the displacement of an iterate and see how well it fulfils the rows. Collective.
 
-    Rows miss w = Bu − c: rows of equalities and those that carry a force both ways, others
+    Rows miss w = Bu − c: rows of equalities and those that press both ways, others
     where they overlap. v = D⁻¹Bᵀw closes that (rows are orthonormal in D⁻¹), and u + v is
     admissible; so ‖v‖_K bounds the error of u in energy, as far as λ balances the load.
 
@@ -129,7 +129,7 @@ def _missed(scene: Scene, u: list[Array]) -> tuple[PETSc.Vec, float]:
     w.axpy(-1.0, constraints.c)
     bounded = constraints.inequalities
     rows = w.array[bounded]
-    rows[:] = np.where(scene.carrying[bounded], rows, np.maximum(rows, 0.0))
+    rows[:] = np.where(scene.pressing[bounded], rows, np.maximum(rows, 0.0))
     lengths = np.abs(rows) / constraints.scale
     trace.destroy()
     deepest = float(np.max(lengths, initial=0.0))

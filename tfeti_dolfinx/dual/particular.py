@@ -1,16 +1,16 @@
-"""The smallest multipliers that balance the load."""
+"""Multipliers that balance the load: the smallest ones, with and without tension."""
 
 from __future__ import annotations
 
 import logging
 
 import numpy as np
-from scipy.sparse import csr_array
+from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
-from tfeti_dolfinx.dual.semidefinite import SemidefiniteFactor
 from tfeti_dolfinx.parallel import agreed
+from tfeti_dolfinx.qp.homogenised import natural
 
 MAX_STEPS = 100
 # of ‖e‖: what the coarse problem's factors leave at best, and what is let pass
@@ -22,7 +22,7 @@ SHORTEST = 1e-8
 log = logging.getLogger(__name__)
 
 
-def feasible_particular(coarse: CoarseSpace, bounded: slice) -> Array:
+def feasible_particular(coarse: CoarseSpace, bounded: slice | Array) -> Array:
     """λ̄ of min ½‖λ‖² subject to Gλ = e, λ_N ≥ 0. Collective.
 
     λ̄ = Gᵀα on free rows and (Gᵀα)₊ on bounded ones; α by a semismooth Newton method, each
@@ -37,8 +37,7 @@ def feasible_particular(coarse: CoarseSpace, bounded: slice) -> Array:
         This rank's part of λ̄.
     """
     carrying = np.ones(coarse.Gt.shape[0], dtype=bool)
-    gram, start = coarse.gram(), coarse.solve(coarse.e)
-    alpha = start
+    alpha = start = coarse.solve(coarse.e)
     for _ in range(MAX_STEPS):
         force = coarse.Gt @ alpha
         carrying[bounded] = force[bounded] > 0.0
@@ -46,9 +45,7 @@ def feasible_particular(coarse: CoarseSpace, bounded: slice) -> Array:
         left = float(np.linalg.norm(residual))
         if agreed(coarse.comm, left <= BALANCED * float(np.linalg.norm(coarse.e))):
             return np.where(carrying, force, 0.0)
-        damped = csr_array(coarse.gram(carrying) + DAMPING * gram)
-        what = "GGᵀ of the rows that carry a force"
-        factor = SemidefiniteFactor(damped, coarse.null, coarse.comm, what)
+        factor = coarse.damped_factor(carrying, DAMPING)
         step = factor.solve(residual)
         factor.destroy()
         length = _damping(coarse, bounded, alpha, step)
@@ -66,7 +63,7 @@ def feasible_particular(coarse: CoarseSpace, bounded: slice) -> Array:
     return np.asarray(coarse.Gt @ start)
 
 
-def _damping(coarse: CoarseSpace, bounded: slice, alpha: Array, step: Array) -> float:
+def _damping(coarse: CoarseSpace, bounded: slice | Array, alpha: Array, step: Array) -> float:
     """Step length that does not raise ½‖λ(α)‖² − αᵀe."""
 
     def cost(alpha: Array) -> float:
@@ -78,3 +75,13 @@ def _damping(coarse: CoarseSpace, bounded: slice, alpha: Array, step: Array) -> 
     while length > SHORTEST and agreed(coarse.comm, cost(alpha + length * step) > start):
         length *= 0.5
     return length
+
+
+def _feasible(coarse: CoarseSpace, like: PETSc.Vec) -> PETSc.Vec:
+    x = like.duplicate()
+    x.array[:] = feasible_particular(coarse, coarse.bounded)
+    return x
+
+
+# solutions of Gλ̄ = e
+PARTICULAR = {"natural": natural, "feasible": _feasible}
