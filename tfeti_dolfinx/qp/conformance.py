@@ -40,7 +40,7 @@ def check_feasible_set(feasible: FeasibleSet, size: int, seed: int = 0) -> None:
         require(_close(moved, x, 1e-12), "P of Ω − s is P of Ω, shifted")
         _check_face(feasible.face(x, g), size)
         t = rng.standard_normal(feasible.face(x, g).Z.shape[1])
-        _check_moves(feasible, x, g, t)
+        _check_moves(feasible, x, x - start, t)
 
 
 def _close(a: Array, b: Array, share: float) -> bool:
@@ -60,10 +60,9 @@ def _check_gradients(feasible: FeasibleSet, x: Array, g: Array) -> None:
     require(-1e-12 <= reduced <= phi @ phi * (1.0 + 1e-12), "0 ≤ φ̃ᵀφ ≤ φᵀφ")
     far = x - min(feasible.max_step(x, phi), 1e3) * phi
     require(_close(feasible.project(far), far, 1e-10), "x − αφ ∈ Ω for the largest step α")
-    moved = np.linalg.norm(feasible.project(x - 1e-6 * g) - x)
-    projected = 1e-6 * np.linalg.norm(phi + beta)
-    apart = abs(moved - projected)
-    require(apart <= 1e-4 * (1e-6 + projected), "φ + β is the projected gradient")
+    moved, projected = feasible.project(x - SHORT * g) - x, SHORT * (phi + beta)
+    apart, size = np.linalg.norm(moved + projected), np.linalg.norm(projected)
+    require(apart <= 1e-4 * (SHORT + size), "φ + β is the projected gradient")
 
 
 def _check_face(face: Face, size: int) -> None:
@@ -81,7 +80,14 @@ def _check_face(face: Face, size: int) -> None:
 
 
 def _check_moves(feasible: FeasibleSet, x: Array, g: Array, t: Array) -> None:
-    """Moves along the face stay in the set, but for what its curvature bends them."""
+    """Moves along the face stay in the set, but for what its curvature bends them.
+
+    Args:
+        feasible: The set.
+        x: A point of it.
+        g: A gradient that pushes against the set there, and does nothing else.
+        t: Coefficients of a move.
+    """
     face = feasible.face(x, g)
     step = face.Z @ t
     for sign in (SHORT, -SHORT):

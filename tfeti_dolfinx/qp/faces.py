@@ -33,9 +33,9 @@ class Face:
     Attributes:
         Z: Free directions as orthonormal columns, scipy CSR, shape ``(m, k)``; each of them
             lives on this rank.
-        curvature: What the set's boundary adds to the Hessian along each direction: moving
-            along the set by Zt changes gᵀx by gᵀZt + ½ Σ κ_j t_j²; 0 where the boundary is
-            flat. Shape ``(k,)``.
+        curvature: What the set's boundary adds to the Hessian along each direction: where the
+            gradient pushes against it, moving along the set by Zt changes gᵀx by
+            gᵀZt + ½ Σ κ_j t_j². 0 where it is flat or not pushed against. Shape ``(k,)``.
         status: Status of each row, shape ``(m,)``.
     """
 

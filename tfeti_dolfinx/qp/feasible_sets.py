@@ -90,6 +90,12 @@ class Bounds:
 class Product:
     """Sets on disjoint rows; rows of none are free. Without sets it is the whole space.
 
+    >>> half_line = Product([(np.array([0]), Bounds())])
+    >>> half_line.project(np.array([-1.0, -1.0])).tolist()
+    [0.0, -1.0]
+    >>> half_line.face(np.array([0.0, -1.0]), np.zeros(2)).carrying.tolist()
+    [False, True]
+
     Args:
         factors: Pairs of rows, a slice or an array of indices, and the set of these rows.
 

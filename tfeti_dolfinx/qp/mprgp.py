@@ -152,6 +152,24 @@ def mprgp(
 
     Multiplications by A: one per CG or proportioning step, two per expansion step.
 
+    ===========================  =====================================
+    reason                       when
+    ===========================  =====================================
+    None                         ``stop`` said so, before a step
+    ``DIVERGED_ITS``             ``max_it`` steps are not enough
+    ``DIVERGED_INDEFINITE_MAT``  a direction has no positive curvature
+    ===========================  =====================================
+
+    >>> import numpy as np
+    >>> from tfeti_dolfinx.qp.feasible_sets import Bounds
+    >>> A = PETSc.Mat().createDense((2, 2), array=np.diag([1.0, 2.0]), comm=PETSc.COMM_SELF)
+    >>> x = PETSc.Vec().createWithArray(np.zeros(2), comm=PETSc.COMM_SELF)
+    >>> g = PETSc.Vec().createWithArray(np.array([-3.0, 4.0]), comm=PETSc.COMM_SELF)  # Ax − b
+    >>> state, steps = Iterate(A, x, g, Bounds()), Steps()
+    >>> mprgp(state, MprgpParameters(0.9), lambda s: s.projected_gradient <= 1e-9, steps, 100)
+    >>> x.array.round(6).tolist(), steps.inner > 0
+    ([3.0, 0.0], True)
+
     Args:
         state: The iterate; holds the solution afterwards.
         parameters: Step length, Γ, expansion.

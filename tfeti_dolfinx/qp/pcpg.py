@@ -25,11 +25,13 @@ def pcpg(
     the projector of ``qp.coarse``: on a face λ moves in the face alone. Multiplies by F, and by
     the preconditioner, once per step, and once more where the rule finds that g has drifted.
 
-    | reason | when |
-    |---|---|
-    | the rule's | ‖P g‖ ≤ ``rule.tolerance``, and the rule is content |
-    | ``DIVERGED_ITS`` | ``max_it`` steps are not enough |
-    | ``DIVERGED_INDEFINITE_MAT`` | a direction has no positive curvature |
+    ===========================  ===================================================
+    reason                       when
+    ===========================  ===================================================
+    the rule's                   ‖P g‖ ≤ ``rule.tolerance``, and the rule is content
+    ``DIVERGED_ITS``             ``max_it`` steps are not enough
+    ``DIVERGED_INDEFINITE_MAT``  a direction has no positive curvature
+    ===========================  ===================================================
 
     Args:
         qp: F, d, P and the preconditioner; its feasible set is not looked at.
@@ -97,9 +99,11 @@ def solve_by_pcpg(
 
     Stops as ``pcpg`` does; besides with
 
-    | reason | when |
-    |---|---|
-    | ``DIVERGED_ROUNDING`` | no positive curvature, but residuals that are rounding |
+    =====================  ======================================================
+    reason                 when
+    =====================  ======================================================
+    ``DIVERGED_ROUNDING``  no positive curvature, but residuals that are rounding
+    =====================  ======================================================
 
     >>> import numpy as np
     >>> from petsc4py import PETSc

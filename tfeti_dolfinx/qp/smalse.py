@@ -29,22 +29,21 @@ def smalse(
     Dostál, Kozubek, Math. Program. 135 (2012) 195–220. Step numbers are those of the talk.
     B is an orthonormalised G, so that ‖Bx‖ = ‖Qx‖; Bᵀμ = y is kept instead of μ.
 
-    | reason | when |
-    |---|---|
-    | the rule's | max(‖g^P‖, ‖F‖‖Qx‖) ≤ ``rule.tolerance``, and the rule is content |
-    | ``DIVERGED_ITS`` | ``max_it`` inner or outer steps are not enough |
-    | ``DIVERGED_STALLED`` | ‖Qx‖ tends to a limit that is not 0 |
-    | ``DIVERGED_ROUNDING`` | no positive curvature, but residuals that are rounding |
-    | ``DIVERGED_INDEFINITE_MAT`` | a direction has no positive curvature |
+    ===========================  =================================================================
+    reason                       when
+    ===========================  =================================================================
+    the rule's                   max(‖g^P‖, ‖F‖‖Qx‖) ≤ ``rule.tolerance``, and the rule is content
+    ``DIVERGED_ITS``             ``max_it`` inner or outer steps are not enough
+    ``DIVERGED_STALLED``         ‖Qx‖ tends to a limit that is not 0
+    ``DIVERGED_ROUNDING``        no positive curvature, but residuals that are rounding
+    ``DIVERGED_INDEFINITE_MAT``  a direction has no positive curvature
+    ===========================  =================================================================
 
     >>> import numpy as np
     >>> from petsc4py import PETSc
     >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
     >>> from tfeti_dolfinx.qp.feasible_sets import Bounds
-    >>> from tfeti_dolfinx.checks import Range
-    from tfeti_dolfinx.described import ABOVE_0, described
-    from tfeti_dolfinx.qp.coarse import Coarse
-    from tfeti_dolfinx.qp.homogenised import homogenise
+    >>> from tfeti_dolfinx.qp.homogenised import homogenise
     >>> from tfeti_dolfinx.qp.stopping import ResidualRule
     >>> F = PETSc.Mat().createDense((3, 3), array=np.diag([1.0, 2.0, 4.0]), comm=PETSc.COMM_SELF)
     >>> d = PETSc.Vec().createWithArray(np.array([1.0, -1.0, 2.0]), comm=PETSc.COMM_SELF)
