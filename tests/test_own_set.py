@@ -73,7 +73,7 @@ def with_law(p, law):
     result, accuracy = solve_dual(own, Options(rtol=1e-9), "smalse")
     assert result.reason > 0
     u, lam = np.concatenate([np.empty(0), *accuracy.u]), np.array(result.lam.array_r)
-    carrying = own.face(result.lam, result.gradient).carrying
+    carrying = result.face.carrying
     trace, left = dual.constraints.B.createVecRight(), dual.d.duplicate()
     trace.array[:] = u[dual.constraints.trace]
     dual.constraints.B.mult(trace, left)

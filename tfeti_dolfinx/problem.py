@@ -234,7 +234,7 @@ class ContactProblem:
                 gluing=gluing,
                 lam=np.array(result.lam.array_r),
                 mu=result.mu,
-                carrying=dual.face(result.lam, result.gradient).carrying,
+                carrying=result.face.carrying,
                 stress=self._stress,
                 contacts=self._settled,
             )

@@ -133,20 +133,16 @@ class Dual:
             return None
         return self._images[kind][1]
 
-    def face(self, lam: PETSc.Vec, gradient: PETSc.Vec) -> Face:
-        """The face of λ ∈ Ω: which local rows carry a force. Not collective."""
-        return self.feasible.face(lam.array_r, gradient.array_r)
-
-    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, error: float) -> list[Array]:
+    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> list[Array]:
         """Displacements that belong to multipliers: of equal ones the smallest.
 
         Args:
             lam: The multipliers λ.
             gradient: Fλ − d up to the range of Gᵀ; on open rows the multiplier ν.
+            face: The face of λ: which rows carry a force.
             error: How large multipliers may be by the solver's error alone.
         """
-        constraints, face = self.constraints, self.face(lam, gradient)
-        B, c = constraints.B, constraints.c
+        B, c = self.constraints.B, self.constraints.c
         u, gap = recover(B, c, self.blocks, self.coarse, lam, gradient, face)
         motions, force = nearly_free(self.coarse, lam.array_r, face.holding, error)
         self.pressing = force

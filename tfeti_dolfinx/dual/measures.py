@@ -14,6 +14,7 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.dual.operator import trace_slices
 from tfeti_dolfinx.gluing.constraints import Constraints
+from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.subdomains.block import Block
 
 # of the largest forces on a kernel mode: those on a light one beside it count as so large at least,
@@ -31,8 +32,8 @@ class Scene(Protocol):
     num_bodies: int
     pressing: Array
 
-    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, error: float) -> list[Array]:
-        """Displacements of this rank's Blocks, given the solver's error. Collective."""
+    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> list[Array]:
+        """Displacements of this rank's Blocks, given the solver's face and error. Collective."""
         ...
 
 
@@ -91,6 +92,7 @@ def measure(
     scene: Scene,
     lam: PETSc.Vec,
     gradient: PETSc.Vec,
+    face: Face,
     error: float,
     before: Sequence[Array] | None = None,
 ) -> Measures:
@@ -104,10 +106,11 @@ def measure(
         scene: The dual problem.
         lam: The multipliers λ.
         gradient: Fλ − d up to the range of Gᵀ.
+        face: The face of λ.
         error: How large multipliers may be by the solver's error alone.
         before: Displacements of an earlier iterate.
     """
-    u = scene.recover(lam, gradient, error)
+    u = scene.recover(lam, gradient, face, error)
     w, penetration = _missed(scene, u)
     v = scene.constraints.B.createVecRight()
     scene.constraints.B.multTranspose(w, v)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.monitors import Monitor, no_monitor
 from tfeti_dolfinx.qp.problem import ConvergedReason, Operator, Steps
@@ -58,6 +59,10 @@ class Iterate:
         """Largest α with x − α p ∈ Ω."""
         own = self.feasible.max_step(self.x.array_r, p.array_r)
         return float(self._comm.allreduce(own, op=MPI.MIN))
+
+    def face(self) -> Face:
+        """The face of x."""
+        return self.feasible.face(self.x.array_r, self.g.array_r)
 
     def move(self, alpha: float, p: PETSc.Vec, Ap: PETSc.Vec) -> None:
         """x ← x − α p and the gradient with it."""

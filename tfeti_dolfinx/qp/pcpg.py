@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from petsc4py import PETSc
 
+from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.monitors import Monitor, no_monitor
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, QPResult, Steps
@@ -34,7 +35,7 @@ def pcpg(
     ===========================  ===================================================
 
     Args:
-        qp: F, d, P and the preconditioner; its feasible set is not looked at.
+        qp: F, d, P and the preconditioner; its feasible set is kept by nobody.
         lam: λ; updated.
         g: F λ − d; updated, on all rows.
         rule: Says when ‖P g‖ is small enough.
@@ -52,7 +53,7 @@ def pcpg(
     while True:
         # test
         if norm <= rule.tolerance:
-            reason = rule.examine(lam, g, norm)
+            reason = rule.examine(lam, g, _face(qp, lam, g), norm)
         if rule.drifted:
             qp.F.mult(lam, g)
             g.axpy(-1.0, qp.d)
@@ -72,7 +73,7 @@ def pcpg(
         qp.coarse.project(z)
         pFp = p.dot(z)
         if not (pFp > 0.0 and rz > 0.0):
-            reason = rule.examine(lam, g, norm)
+            reason = rule.examine(lam, g, _face(qp, lam, g), norm)
             if reason == ConvergedReason.ITERATING:
                 reason = ConvergedReason.DIVERGED_INDEFINITE_MAT
             break
@@ -141,6 +142,7 @@ def solve_by_pcpg(
         lam=lam,
         mu=qp.coarse.coordinates(g),
         gradient=g,
+        face=_face(qp, lam, g),
         reason=reason,
         projected_gradient=norm,
         equality=qp.coarse.norm_Q(moved),
@@ -150,6 +152,11 @@ def solve_by_pcpg(
     )
     moved.destroy()
     return result
+
+
+def _face(qp: QP, lam: PETSc.Vec, g: PETSc.Vec) -> Face:
+    """The face of λ."""
+    return qp.feasible.face(lam.array_r, g.array_r)
 
 
 def _residual(qp: QP, g: PETSc.Vec, r: PETSc.Vec | None = None) -> PETSc.Vec:

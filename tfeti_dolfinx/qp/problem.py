@@ -10,6 +10,7 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.qp.coarse import Coarse
+from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 
 
@@ -82,6 +83,7 @@ class QPResult:
         lam: The multipliers λ.
         mu: Multipliers μ of Gλ = e: the gradient is P(Fλ − d) + Gᵀμ.
         gradient: Fλ − d up to the range of Gᵀ; on bound components the multiplier ν.
+        face: The face of λ, in which rows that carry a force are free.
         reason: Why the solver stopped.
         projected_gradient: ‖g^P‖ at the end.
         equality: ‖Q x‖ at the end, x the homogenised unknown.
@@ -93,6 +95,7 @@ class QPResult:
     lam: PETSc.Vec
     mu: Array
     gradient: PETSc.Vec
+    face: Face
     reason: ConvergedReason
     projected_gradient: float
     equality: float

@@ -109,6 +109,7 @@ def smalse(
         lam=x,
         mu=coarse.coordinates(y),
         gradient=state.g,
+        face=state.face(),
         reason=reason,
         projected_gradient=state.projected_gradient,
         equality=Qx.norm(),

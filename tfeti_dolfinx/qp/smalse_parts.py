@@ -132,7 +132,7 @@ class InnerTest:
     def _examine(self, state: Iterate, residual: float) -> None:
         state.x.copy(self._lam)
         self._lam.axpy(1.0, self._homogenised.lam_bar)
-        self._verdict = self._rule.examine(self._lam, state.g, residual)
+        self._verdict = self._rule.examine(self._lam, state.g, state.face(), residual)
 
     def destroy(self) -> None:
         """Destroy the work vector. Collective."""
