@@ -7,7 +7,6 @@ from scenes import curved_obstacle, decomposed, problem
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.dual.operator import check_operator
 from tfeti_dolfinx.dual.particular import feasible_particular
-from tfeti_dolfinx.qp.problem import project
 
 
 @pytest.fixture(scope="module")
@@ -57,28 +56,28 @@ def test_preconditioners_are_symmetric_and_positive(dual):
 
 
 def test_projectors(dual):
-    x, Qx, work = random_vec(dual), dual.d.duplicate(), dual.d.duplicate()
+    x, Qx = random_vec(dual), dual.d.duplicate()
     coarse = dual.coarse
     coarse.apply_Q(x, Qx)
     assert coarse.norm_Q(x) == pytest.approx(Qx.norm(), rel=1e-10)
     assert np.allclose(coarse.G(x.array_r), coarse.G(Qx.array_r), atol=1e-11 * x.norm())
     Px = x.copy()
-    project(coarse, Px, work)
+    coarse.project(Px)
     assert np.abs(coarse.G(Px.array_r)).max() <= 1e-11 * x.norm()
     assert abs(Px.dot(Qx)) <= 1e-11 * x.norm() ** 2
     PPx = Px.copy()
-    project(coarse, PPx, work)
+    coarse.project(PPx)
     PPx.axpy(-1.0, Px)
     assert PPx.norm() <= 1e-11 * x.norm()
 
 
 def test_P_annihilates_the_range_of_Gt(dual):
     coarse = dual.coarse
-    y, work = dual.d.duplicate(), dual.d.duplicate()
+    y = dual.d.duplicate()
     coarse.combine(np.arange(1.0, coarse.dimension + 1), y)
     size = y.norm()
     assert np.allclose(coarse.coordinates(y), np.arange(1.0, coarse.dimension + 1), rtol=1e-8)
-    project(coarse, y, work)
+    coarse.project(y)
     assert y.norm() <= 1e-11 * size
 
 

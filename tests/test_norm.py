@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 from scenes import curved_obstacle, decomposed, problem
-from test_qp import DenseCoarse, matrix, vector
+from test_qp import matrix, vector
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
 from tfeti_dolfinx.qp.norm import estimate_norm
-from tfeti_dolfinx.qp.problem import NoCoarse, project
 
 # with the step ᾱ = 1.95/‖·‖ of the default options ‖A‖ᾱ ≤ 2 needs 0.975 of the norm
 LEAST, MOST = 0.975, 1.1
@@ -69,10 +69,10 @@ def test_norm_of_a_scene(cell, n, scaling):
     rng = np.random.default_rng(dual.coarse.comm.rank)
     x.array[:] = rng.standard_normal(x.getLocalSize())
     for _ in range(1000):  # plain power steps, far more than an estimate may take
-        project(dual.coarse, x, y)
+        dual.coarse.project(x)
         x.normalize()
         dual.F.mult(x, y)
-        project(dual.coarse, y, x)
+        dual.coarse.project(y)
         size = y.norm()
         y.copy(x)
     holds(estimate, size)

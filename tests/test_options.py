@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -10,7 +9,9 @@ from petsc4py import PETSc
 from scenes import decomposed, problem
 
 from tfeti_dolfinx import InputError, Options
-from tfeti_dolfinx.options import factor_options, options_table, parse_options
+from tfeti_dolfinx.described import parameters_of
+from tfeti_dolfinx.option_parsing import factor_options, parse_options
+from tfeti_dolfinx.options import options_table
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -60,8 +61,24 @@ def test_options_that_do_not_fit(given, message):
 
 def test_view_lists_every_option():
     text = Options().view_text("tfeti_")
-    for f in fields(Options):
-        assert f"-tfeti_{f.name} {f.default}" in text
+    for option in parameters_of(Options):
+        assert f"-tfeti_{option.name} {option.default}" in text
+    changed = parse_options({"smalse_rho": 3}, "tfeti_").view_text("tfeti_")
+    assert "-tfeti_smalse_rho 3.0" in changed
+
+
+def test_symbols_of_parameters_stand_in_the_notation():
+    """With the name of the field that they stand for, in one row."""
+    rows = (ROOT / "docs/notation.md").read_text().splitlines()
+    described = [p for p in parameters_of(Options) if p.description.symbol]
+    assert len(described) == 6
+    for parameter in described:
+        symbol, name = parameter.description.symbol, parameter.path[-1]
+        assert any(
+            symbol in row.split("|")[1] and f"`{name}`" in row
+            for row in rows[1:]
+            if row.startswith("|")
+        )
 
 
 def test_the_document_has_the_table():

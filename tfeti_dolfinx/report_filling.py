@@ -44,7 +44,7 @@ def fill_result(
     report.kernel_dim = dual.coarse.dimension
     report.free_modes = dual.coarse.num_free_motions
     report.nearly_free = dual.nearly_free
-    active = solution.lam[solution.gluing.constraints.sets.normals] > 0.0
+    active = solution.carrying[solution.gluing.constraints.sets.normals]
     report.active_contacts = comm.allreduce(int(np.sum(active)))
     report.F_multiplications += dual.F.count["solver"]
     report.power_method_multiplications += dual.F.count["power method"]

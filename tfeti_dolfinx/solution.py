@@ -20,7 +20,6 @@ from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.fields import Stress, cellwise, checked_stress, from_vertices, nodal, von_mises
 from tfeti_dolfinx.gluing.glue import Gluing
 from tfeti_dolfinx.mesh.decomposition import Decomposition
-from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import group_points, hat_integrals
 
 
@@ -64,7 +63,7 @@ class Solution:
     Args:
         u: Displacement in primal order, shape ``(num_nodes * bs,)``.
         lam: Multipliers of this rank's rows.
-        dofs: Dof maps.
+        carrying: Flags of this rank's rows that carry a force.
         decomposition: The torn mesh.
         gluing: Rows and contact records.
         contacts: Obstacles and pairs, the secondary surface of a pair first.
@@ -81,14 +80,14 @@ class Solution:
         self,
         u: Array,
         lam: Array,
-        dofs: TornDofs,
+        carrying: Array,
         decomposition: Decomposition,
         gluing: Gluing,
         contacts: Sequence[ContactPartner] = (),
         stress: Stress | None = None,
     ) -> None:
-        self.u, self.lam = u, lam
-        self.dofs, self.decomposition, self.gluing = dofs, decomposition, gluing
+        self.u, self.lam, self.carrying = u, lam, carrying
+        self.decomposition, self.gluing, self.dofs = decomposition, gluing, gluing.dofs
         self.contacts, self._stress = list(contacts), stress
 
     @cached_property
@@ -154,7 +153,9 @@ class Solution:
     def status(self) -> fem.Function:
         """ContactStatus of each node, as a number."""
         values = np.full(self.dofs.num_groups, float(ContactStatus.NONE))
-        touching = np.where(self.force > 0.0, ContactStatus.TOUCHING, ContactStatus.OPEN)
+        touching = np.where(
+            self._of_conditions(self.carrying), ContactStatus.TOUCHING, ContactStatus.OPEN
+        )
         np.maximum.at(values, self.gluing.records.group, touching.astype(float))
         function = self._field(values, self._vertices, "status")
         function.x.array[:] = np.floor(function.x.array)  # between nodes: the lesser of the two
@@ -212,10 +213,15 @@ class Solution:
     @cached_property
     def force(self) -> Array:
         """Normal force s_i λ_i of each contact condition of this rank, 0 without a row."""
-        contact = self.gluing.contact
-        values = np.zeros(len(self.gluing.records))
-        lam = self.lam[self.gluing.constraints.sets.normals]
-        values[contact.condition] = contact.scale * lam
+        scale = np.zeros(len(self.gluing.records))
+        scale[self.gluing.contact.condition] = self.gluing.contact.scale
+        return scale * self._of_conditions(self.lam)
+
+    def _of_conditions(self, of_rows: Array) -> Array:
+        """Values of the rows of each contact condition of this rank, 0 without a row."""
+        values = np.zeros(len(self.gluing.records), dtype=of_rows.dtype)
+        normals = self.gluing.constraints.sets.normals
+        values[self.gluing.contact.condition] = of_rows[normals]
         return values
 
     @cached_property

@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.accuracy import Accuracy
 from tfeti_dolfinx.dual.dual import Dual
-from tfeti_dolfinx.dual.particular import feasible_particular
 from tfeti_dolfinx.errors import ConvergenceError, InputError
-from tfeti_dolfinx.options import Options, check_preconditioner
-from tfeti_dolfinx.qp.homogenised import Homogenised, homogenise
+from tfeti_dolfinx.option_parsing import check_preconditioner
+from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.qp.homogenised import (
+    Homogenised,
+    homogenise,
+    image,
+    restored,
+    scale_at,
+    scale_near,
+)
 from tfeti_dolfinx.qp.monitors import Monitor, PrintMonitor, no_monitor
-from tfeti_dolfinx.qp.norm import estimate_norm
-from tfeti_dolfinx.qp.pcpg import pcpg
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, QPResult, Start
-from tfeti_dolfinx.qp.smalse import smalse
+from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver
 
 EXPLANATIONS = {
     ConvergedReason.DIVERGED_ROUNDING: "; rounding does not let it come lower: expected a "
@@ -29,60 +35,57 @@ def resolve_types(options: Options, num_inequalities: int, prefix: str) -> tuple
     """The solver and the preconditioner that ``auto`` stands for.
 
     Raises:
-        InputError: The scene has inequalities, but pcpg or a preconditioner is asked for.
+        InputError: The scene has inequalities, but a solver that does not keep them is asked
+            for, or a preconditioner that the solver does not take.
     """
     qp_type = options.qp_type
     if qp_type == "auto":
-        qp_type = "smalse" if num_inequalities else "pcpg"
-    if qp_type == "pcpg" and num_inequalities:
+        qp_type = AUTO[num_inequalities > 0]
+    if num_inequalities and not SOLVERS[qp_type].keeps_bounds:
+        able = [name for name, solver in SOLVERS.items() if solver.keeps_bounds]
         raise InputError(
-            f"-{prefix}qp_type pcpg: the scene has {num_inequalities} contact rows, which PCPG "
-            "cannot keep; expected auto or smalse"
+            f"-{prefix}qp_type {qp_type}: the scene has {num_inequalities} contact rows, which "
+            f"{qp_type.upper()} cannot keep; expected {' or '.join(['auto', *able])}"
         )
-    if qp_type == "smalse":
-        check_preconditioner(options, prefix)
+    check_preconditioner(options, qp_type, prefix)
     pc_type = options.pc_type
-    if pc_type == "auto":
-        pc_type = "dirichlet" if qp_type == "pcpg" else "none"
-    return qp_type, pc_type
+    return qp_type, SOLVERS[qp_type].pc_type if pc_type == "auto" else pc_type
 
 
 def solve_dual(
-    dual: Dual, options: Options, qp_type: str, start: tuple[Array, Array] | None = None
+    dual: Dual,
+    options: Options,
+    qp_type: str,
+    start: tuple[Array, Array] | None = None,
+    monitor: Monitor | None = None,
 ) -> tuple[QPResult, Accuracy]:
     """Solve the dual problem, and look at the answer. Collective.
+
+    From the solution of an earlier solve PCPG multiplies by F once, SMALSE-M at most twice: once
+    less each if F λ̄ is known, as it is where the dual problem has been solved for the same e.
 
     Args:
         dual: The dual problem.
         options: Options.
-        qp_type: pcpg or smalse.
+        qp_type: A solver of ``SOLVERS``.
         start: λ on this rank's rows, and the multipliers of Gλ = e, to start from.
+        monitor: Called after each step; default as options say.
 
     Returns:
         Multipliers, and their displacement with its measured accuracy.
     """
-    qp = dual.qp()
-    homogenised = _homogenise(dual, qp, options)
-    monitor, norm = _monitor(dual, homogenised, options), 1.0
-    if qp_type == "smalse":
-        with dual.F.charged_to("power method"):
-            norm = estimate_norm(qp.F, qp.coarse, qp.d, options.norm_steps)
-    reference, rounding = homogenised.reference, homogenised.rounding
-    rule = Accuracy(dual, options.rtol, options.atol, reference, rounding, norm)
-    if qp_type == "pcpg":
-        result = pcpg(qp, homogenised, rule, max_it=options.max_it, monitor=monitor)
-    else:
-        result = smalse(
-            qp,
-            homogenised,
-            norm,
-            rule,
-            options.smalse(),
-            max_it=options.max_it,
-            start=_start(start, qp.d),
-            monitor=monitor,
-        )
+    solver = SOLVERS[qp_type]
+    qp = dual.qp(options.norm_steps if solver.relative_to_norm else 0)
+    begin = _start(start, qp.d)
+    homogenised = _homogenise(dual, qp, solver, options, begin)
+    if monitor is None:
+        monitor = _monitor(dual, homogenised, options)
+    scale = homogenised.scale
+    rule = Accuracy(dual, options.rtol, options.atol, scale.reference, scale.rounding, qp.norm)
+    result = solver.solve(qp, homogenised, rule, options, begin, monitor)
     homogenised.destroy()
+    if begin is not None:
+        begin.lam.destroy()
     if result.reason <= 0:
         _last_look(result, rule)
     return result, rule
@@ -91,7 +94,7 @@ def solve_dual(
 def _last_look(result: QPResult, rule: Accuracy) -> None:
     """Measure where a solver has stopped before its tolerance: it may be good enough."""
     residual = max(result.projected_gradient, result.norm * result.equality)
-    reason = rule.examine(result.lam, result.gradient, residual)
+    reason = rule.examine(result.lam, result.gradient, result.face, residual)
     if reason > 0:
         result.reason = reason
 
@@ -104,24 +107,30 @@ def _start(values: tuple[Array, Array] | None, like: PETSc.Vec) -> Start | None:
     return Start(lam, values[1])
 
 
-def _homogenise(dual: Dual, qp: QP, options: Options) -> Homogenised:
-    if options.homogenization == "natural" or not dual.num_inequalities:
-        return homogenise(qp)
-    lam_bar = qp.d.duplicate()
-    lam_bar.array[:] = feasible_particular(dual.coarse, dual.constraints.sets.normals)
-    homogenised = homogenise(qp, lam_bar)
-    lam_bar.destroy()
-    return homogenised
+def _homogenise(
+    dual: Dual, qp: QP, solver: Solver, options: Options, start: Start | None
+) -> Homogenised:
+    """With λ̄ where the solver starts, or as the options say."""
+    if start is not None and solver.starts_at_lam_bar:
+        at, known = image(qp.F, restored(qp.coarse, start.lam)), dual.known_image("natural")
+        homogenised = homogenise(qp, at, scale_at(qp, known) if known else scale_near(qp, at))
+        at.destroy()
+        return homogenised
+    kind = options.homogenization if dual.num_inequalities else "natural"
+    scale = scale_at(qp, dual.image("natural"))
+    return homogenise(qp, dual.image(kind), scale)
 
 
 def _monitor(dual: Dual, homogenised: Homogenised, options: Options) -> Monitor:
     if not options.monitor:
         return no_monitor
     comm, feasible = dual.coarse.comm, homogenised.feasible
-    return PrintMonitor(
-        touching=lambda x: comm.allreduce(feasible.num_off(x)),
-        multiplications=lambda: dual.F.count["solver"],
-    )
+
+    def touching(x: PETSc.Vec) -> int:
+        face = feasible.face(x.array_r, np.zeros(x.getLocalSize()))
+        return int(comm.allreduce(int(np.sum(face.constrained & face.carrying))))
+
+    return PrintMonitor(touching=touching, multiplications=lambda: dual.F.count["solver"])
 
 
 def conclude(result: QPResult, rule: Accuracy, options: Options, comm: MPI.Intracomm) -> None:

@@ -10,6 +10,7 @@ from petsc4py import PETSc
 from tfeti_dolfinx.arrays import TINY, Array
 from tfeti_dolfinx.dual.measures import Measures, Scene, measure
 from tfeti_dolfinx.parallel import agreed
+from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.problem import ConvergedReason
 
 # Differences that are rounding, in a body that hardly moves as well: of the largest displacement
@@ -93,17 +94,21 @@ class Accuracy:
         self.drifted, self.looks, self._stalls, self._claimed = False, 0, 0, 1.0
         self.measures: Measures | None = None
 
-    def look(self, lam: PETSc.Vec, gradient: PETSc.Vec, residual: float) -> Measures:
+    def look(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float) -> Measures:
         """Measure an iterate. Collective."""
         before, error = self.measures, residual / self._norm
-        self.measures = measure(self._scene, lam, gradient, error, before.u if before else None)
+        self.measures = measure(
+            self._scene, lam, gradient, face, error, before.u if before else None
+        )
         self.looks += 1
         self._before = before
         return self.measures
 
-    def examine(self, lam: PETSc.Vec, gradient: PETSc.Vec, residual: float) -> ConvergedReason:
+    def examine(
+        self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float
+    ) -> ConvergedReason:
         """Whether an iterate is right. Collective."""
-        now = self.look(lam, gradient, residual)
+        now = self.look(lam, gradient, face, residual)
         comm = self._scene.coarse.comm
         ratio, longest = agreed(comm, (self.ratio(), self._longest(now)))
         if ratio <= 1.0:

@@ -5,18 +5,24 @@ from __future__ import annotations
 from typing import Any, cast
 
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
-from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse import csr_array, diags_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.bodies import Bodies
 from tfeti_dolfinx.dual.kernel_basis import kernel_basis
 from tfeti_dolfinx.dual.motions import NULL, Motions, unresisted, unsprung
 from tfeti_dolfinx.dual.null_basis import null_basis
+from tfeti_dolfinx.dual.projectors import (
+    FaceFactors,
+    FaceProjectors,
+    Projectors,
+    replicated_gram,
+)
 from tfeti_dolfinx.dual.semidefinite import SemidefiniteFactor
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.parallel import agreed, chunk_offsets
+from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # Of the size of a row: what of it acts on motions of bodies and is only rounding; and how it acts
@@ -25,7 +31,7 @@ from tfeti_dolfinx.subdomains.subdomains import Subdomains
 NO_GRIP, GLUING = 1e-12, 1e-6
 
 
-class CoarseSpace:
+class CoarseSpace(Projectors):
     """G, GGᵀ and what follows from them; the r-vectors are replicated on all ranks.
 
     G = (R T)ᵀ Bᵀ, with T a basis of the kernel that has the bodies' motions as coordinates.
@@ -52,6 +58,7 @@ class CoarseSpace:
             on one body.
         free_motions: Motions that no row resists at all.
         null: Orthonormal basis of null(Gᵀ).
+        factors: Makes the factors of faces, and counts them apart from that of GGᵀ.
     """
 
     def __init__(
@@ -81,9 +88,9 @@ class CoarseSpace:
         self._read_load()
         joint = self.motions @ self.free_motions.joint
         self.null = agreed(comm, null_basis(np.flatnonzero(self._basis.free), joint))
-        self._factor = SemidefiniteFactor(
-            self.gram(), self.null, comm, "GGᵀ of the coarse problem", prefix
-        )
+        self._gram = replicated_gram(self.Gt, comm)
+        self.factors = FaceFactors(comm, self.null, prefix)
+        self._factor = self.factors.factor(self._gram, "whole")
 
     def update_load(self) -> None:
         """Replace e = Rᵀ f by that of the Blocks' present loads."""
@@ -103,44 +110,17 @@ class CoarseSpace:
         """Kernel coordinates of this rank's Blocks that belong to an r-vector."""
         return self._basis.kernel(alpha)[self._own]
 
-    def G(self, x: Array) -> Array:
-        """G x, shape ``(r,)``, from this rank's part of x."""
-        y = self.Gt.T @ x
-        self.comm.Allreduce(MPI.IN_PLACE, y, op=MPI.SUM)
-        return np.asarray(y)
-
-    def solve(self, y: Array) -> Array:
-        """(GGᵀ)⁺ y for y in the range of G, orthogonal to the free motions."""
-        return self._factor.solve(y)
-
-    def apply_Q(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = Gᵀ(GGᵀ)⁻¹G x."""
-        self.combine(self.coordinates(x), y)
-
-    def norm_Q(self, x: PETSc.Vec) -> float:
-        """‖Q x‖; the same on all ranks, since loops end by it."""
-        Gx = self.G(x.array_r)
-        return agreed(self.comm, float(np.sqrt(max(float(Gx @ self.solve(Gx)), 0.0))))
-
-    def particular(self, x: PETSc.Vec) -> None:
-        """x = Gᵀ(GGᵀ)⁻¹e."""
-        self.combine(self.solve(self.e), x)
-
-    def coordinates(self, x: PETSc.Vec) -> Array:
-        """(GGᵀ)⁻¹G x, shape ``(r,)``."""
-        return self.solve(self.G(x.array_r))
-
-    def combine(self, mu: Array, x: PETSc.Vec) -> None:
-        """x = Gᵀ μ. Not collective."""
-        x.array[:] = self.Gt @ mu
-
     def gram(self, rows: Array | None = None) -> csr_array:
         """GGᵀ, or G_f G_fᵀ of the local rows flagged, shape ``(r, r)``; replicated."""
-        Gt = self.Gt if rows is None else self.Gt[rows]
-        local = (Gt.T @ Gt).tocoo()
-        row, column = (np.concatenate(self.comm.allgather(index)) for index in local.coords)
-        value = np.concatenate(self.comm.allgather(local.data))
-        return coo_array((value, (row, column)), shape=(self.dimension,) * 2).tocsr()
+        return self._gram if rows is None else replicated_gram(csr_array(self.Gt[rows]), self.comm)
+
+    def damped_factor(self, rows: Array, damping: float) -> SemidefiniteFactor:
+        """A factor of G_f G_fᵀ + damping·GGᵀ of the local rows flagged."""
+        return self.factors.factor(csr_array(self.gram(rows) + damping * self.gram()))
+
+    def on_face(self, face: Face) -> FaceProjectors:
+        """The projectors on a face of the rows."""
+        return FaceProjectors(self, face, self.factors)
 
     def unresisted(self, rows: Array, below: float = NULL) -> Motions:
         """Motions that neither springs, nor equality rows, nor contact rows flagged resist.
@@ -165,10 +145,6 @@ class CoarseSpace:
             if grams is not None:
                 found = unresisted(csr_array(sum(grams)), within, below)
         return cast(Motions, agreed(self.comm, found))
-
-    def destroy(self) -> None:
-        """Free the factor."""
-        self._factor.destroy()
 
 
 def _without_rounding(J: Any) -> csr_array:

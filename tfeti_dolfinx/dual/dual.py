@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from petsc4py import PETSc
@@ -11,20 +11,33 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.dual.naming import listed
 from tfeti_dolfinx.dual.operator import (
-    PRECONDITIONERS,
     DualOperator,
+    MakePreconditioner,
     ScaledRows,
     dual_operator,
     linear_term,
 )
+from tfeti_dolfinx.dual.particular import PARTICULAR
 from tfeti_dolfinx.dual.recovery import moved, recover
 from tfeti_dolfinx.dual.smallest import nearly_free, smallest_motion
 from tfeti_dolfinx.dual.solvability import check_solvable
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.parallel import agreed
-from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Unbounded
-from tfeti_dolfinx.qp.problem import QP, Coarse, NoCoarse
+from tfeti_dolfinx.qp.coarse import Coarse, NoCoarse
+from tfeti_dolfinx.qp.faces import Face
+from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Product
+from tfeti_dolfinx.qp.homogenised import Image, image
+from tfeti_dolfinx.qp.norm import estimate_norm
+from tfeti_dolfinx.qp.problem import QP
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
+
+# from B and c to the set of multipliers, on all local rows
+FeasibleLaw = Callable[[Constraints], FeasibleSet]
+
+
+def no_tension(constraints: Constraints) -> FeasibleSet:
+    """λ_N ≥ 0: contact without friction and adhesion."""
+    return Product([(constraints.sets.normals, Bounds())])
 
 
 class Dual:
@@ -35,15 +48,17 @@ class Dual:
         subdomains: This rank's Blocks.
         body_names: Names of all bodies.
         mode_names: Names of their candidate modes.
-        pc_type: Preconditioner: none, lumped or dirichlet.
+        preconditioner: Makes a preconditioner from B D⁻¹ and the Blocks, or None.
         options_prefix: Prefix of all PETSc options.
+        feasible: Makes the set of multipliers from B and c; default λ_N ≥ 0.
 
     Attributes:
         F: B K⁺ Bᵀ.
         preconditioner: The preconditioner, or None.
         coarse: The coarse space.
         num_inequalities: Inequality rows of all ranks.
-        carrying: After ``recover``: contact rows whose force is more than the solver's error.
+        feasible: The set Ω of multipliers.
+        pressing: After ``recover``: contact rows whose force is more than the solver's error.
         nearly_free: After ``recover``: motions that contacts with a force hold hardly or not.
 
     Raises:
@@ -57,22 +72,26 @@ class Dual:
         subdomains: Subdomains,
         body_names: Sequence[str],
         mode_names: Sequence[str],
-        pc_type: str,
+        preconditioner: MakePreconditioner | None = None,
         options_prefix: str = "tfeti_",
+        feasible: FeasibleLaw = no_tension,
     ) -> None:
         self.constraints, self.subdomains = constraints, subdomains
-        self.carrying = np.zeros(constraints.num_rows, dtype=bool)
+        self.pressing = np.zeros(constraints.num_rows, dtype=bool)
         self._names, self.nearly_free = (body_names, mode_names), list[dict[str, object]]()
         B, comm = constraints.B, constraints.B.getComm().tompi4py()
         self.F = dual_operator(B, subdomains.blocks)
         self.preconditioner: DualOperator | None = None
         self._scaled: ScaledRows | None = None
-        if pc_type != "none":
+        if preconditioner is not None:
             self._scaled = ScaledRows(B, constraints.weights)
-            self.preconditioner = PRECONDITIONERS[pc_type](self._scaled, subdomains.blocks)
+            self.preconditioner = preconditioner(self._scaled, subdomains.blocks)
         bounded = constraints.sets.normals
         self.coarse = CoarseSpace(B, subdomains, bounded, f"{options_prefix}coarse_")
         self.num_inequalities = comm.allreduce(len(bounded))
+        self.feasible = feasible(constraints)
+        self._images = dict[str, tuple[Array, Image]]()
+        self._norm: tuple[int, float] | None = None
         check_solvable(self.coarse, body_names, mode_names)
         self.d = linear_term(B, constraints.c, subdomains)
 
@@ -93,31 +112,54 @@ class Dual:
             if operator is not None:
                 operator.count.clear()
 
-    def qp(self) -> QP:
-        """The quadratic program; without kernel it has no coarse problem."""
-        coarse: Coarse = self.coarse if self.coarse.dimension else NoCoarse()
-        bounds = Bounds(self.constraints.sets.normals)
-        feasible: FeasibleSet = bounds if self.num_inequalities else Unbounded()
-        return QP(self.F, self.d, coarse, feasible, self.preconditioner)
+    def qp(self, norm_steps: int = 0) -> QP:
+        """The quadratic program; without kernel it has no coarse problem.
 
-    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, error: float) -> Array:
+        Args:
+            norm_steps: Lanczos steps that estimate ‖PFP‖, once; 0 where nobody asks for it.
+        """
+        coarse: Coarse = self.coarse if self.coarse.dimension else NoCoarse()
+        norm = self._norm_of(coarse, norm_steps) if norm_steps else 1.0
+        return QP(self.F, self.d, coarse, self.feasible, self.preconditioner, norm)
+
+    def _norm_of(self, coarse: Coarse, steps: int) -> float:
+        if self._norm is None or self._norm[0] != steps:
+            with self.F.charged_to("power method"):
+                self._norm = (steps, estimate_norm(self.F, coarse, self.d, steps))
+        return self._norm[1]
+
+    def image(self, kind: str) -> Image:
+        """λ̄ of a kind in ``PARTICULAR`` with F λ̄; multiplies once for each e."""
+        if (found := self.known_image(kind)) is not None:
+            return found
+        if kind in self._images:
+            self._images.pop(kind)[1].destroy()
+        made = image(self.F, PARTICULAR[kind](self.coarse, self.d))
+        self._images[kind] = (self.coarse.e.copy(), made)
+        return made
+
+    def known_image(self, kind: str) -> Image | None:
+        """λ̄ and F λ̄ if they are known for the present e."""
+        if kind not in self._images or not np.array_equal(self._images[kind][0], self.coarse.e):
+            return None
+        return self._images[kind][1]
+
+    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> Array:
         """Displacements that belong to multipliers: of equal ones the smallest.
 
         Args:
             lam: The multipliers λ.
-            gradient: Fλ − d up to the range of Gᵀ; on bound components the multiplier ν.
+            gradient: Fλ − d up to the range of Gᵀ; on open rows the multiplier ν.
+            face: The face of λ: which rows carry a force.
             error: How large multipliers may be by the solver's error alone.
 
         Returns:
             This rank's part of u, shape ``(n,)``.
         """
-        constraints, bounded = self.constraints, self.constraints.sets.normals
-        nu = np.zeros(constraints.num_rows)
-        closed = lam.array_r[bounded] <= 0.0
-        nu[bounded] = np.where(closed, gradient.array_r[bounded], 0.0)
-        u, gap = recover(constraints.B, constraints.c, self.coarse, lam, nu)
-        motions, force = nearly_free(self.coarse, lam.array_r, error)
-        self.carrying = force
+        B, c = self.constraints.B, self.constraints.c
+        u, gap = recover(B, c, self.coarse, lam, gradient, face)
+        motions, force = nearly_free(self.coarse, lam.array_r, face.holding, error)
+        self.pressing = force
         words = listed(motions, self.coarse.bodies, *self._names)
         self.nearly_free = agreed(self.coarse.comm, words)
         if motions.count == 0:
@@ -127,6 +169,7 @@ class Dual:
 
     def destroy(self) -> None:
         """Destroy the PETSc objects."""
-        for item in (self.F, self.preconditioner, self._scaled, self.coarse, self.d):
+        images = [found for _, found in self._images.values()]
+        for item in (self.F, self.preconditioner, self._scaled, self.coarse, self.d, *images):
             if item is not None:
                 item.destroy()

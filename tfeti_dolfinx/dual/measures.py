@@ -12,6 +12,7 @@ from petsc4py import PETSc
 from tfeti_dolfinx.arrays import TINY, Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.gluing.constraints import Constraints
+from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.subdomains.subdomains import Subdomains, sizes, sums
 
 # of the largest forces on a kernel mode: those on a light one beside it count as so large at least,
@@ -25,10 +26,10 @@ class Scene(Protocol):
     constraints: Constraints
     subdomains: Subdomains
     coarse: CoarseSpace
-    carrying: Array
+    pressing: Array
 
-    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, error: float) -> Array:
-        """This rank's part of u, given the solver's error. Collective."""
+    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> Array:
+        """This rank's part of u, given the solver's face and error. Collective."""
         ...
 
 
@@ -87,12 +88,13 @@ def measure(
     scene: Scene,
     lam: PETSc.Vec,
     gradient: PETSc.Vec,
+    face: Face,
     error: float,
     before: Array | None = None,
 ) -> Measures:
     """Recover the displacement of an iterate and see how well it fulfils the rows. Collective.
 
-    Rows miss w = Bu − c: rows of equalities and those that carry a force both ways, others
+    Rows miss w = Bu − c: rows of equalities and those that press both ways, others
     where they overlap. v = D⁻¹Bᵀw closes that (rows are orthonormal in D⁻¹), and u + v is
     admissible; so ‖v‖_K bounds the error of u in energy, as far as λ balances the load.
 
@@ -100,10 +102,11 @@ def measure(
         scene: The dual problem.
         lam: The multipliers λ.
         gradient: Fλ − d up to the range of Gᵀ.
+        face: The face of λ.
         error: How large multipliers may be by the solver's error alone.
         before: The displacement of an earlier iterate.
     """
-    u = scene.recover(lam, gradient, error)
+    u = scene.recover(lam, gradient, face, error)
     w, penetration = _missed(scene, u)
     v = scene.constraints.B.createVecRight()
     scene.constraints.B.multTranspose(w, v)
@@ -124,7 +127,7 @@ def _missed(scene: Scene, u: Array) -> tuple[PETSc.Vec, float]:
     w.axpy(-1.0, constraints.c)
     bounded = constraints.sets.normals
     rows = w.array_r[bounded]
-    rows = np.where(scene.carrying[bounded], rows, np.maximum(rows, 0.0))
+    rows = np.where(scene.pressing[bounded], rows, np.maximum(rows, 0.0))
     w.array[bounded] = rows
     lengths = np.abs(rows) / constraints.scale
     trace.destroy()

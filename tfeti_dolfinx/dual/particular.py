@@ -1,16 +1,16 @@
-"""The smallest multipliers that balance the load."""
+"""Multipliers that balance the load: the smallest ones, with and without tension."""
 
 from __future__ import annotations
 
 import logging
 
 import numpy as np
-from scipy.sparse import csr_array
+from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
-from tfeti_dolfinx.dual.semidefinite import SemidefiniteFactor
 from tfeti_dolfinx.parallel import agreed
+from tfeti_dolfinx.qp.homogenised import natural
 
 # far more than Newton takes where it converges, so that a cycle ends
 MAX_STEPS = 100
@@ -41,8 +41,7 @@ def feasible_particular(coarse: CoarseSpace, bounded: Array) -> Array:
         This rank's part of λ̄.
     """
     carrying = np.ones(coarse.Gt.shape[0], dtype=bool)
-    gram, start = coarse.gram(), coarse.solve(coarse.e)
-    alpha = start
+    alpha = start = coarse.solve(coarse.e)
     for _ in range(MAX_STEPS):
         force = coarse.Gt @ alpha
         carrying[bounded] = force[bounded] > 0.0
@@ -50,9 +49,7 @@ def feasible_particular(coarse: CoarseSpace, bounded: Array) -> Array:
         left = float(np.linalg.norm(residual))
         if agreed(coarse.comm, left <= BALANCED * float(np.linalg.norm(coarse.e))):
             return np.where(carrying, force, 0.0)
-        damped = csr_array(coarse.gram(carrying) + DAMPING * gram)
-        what = "GGᵀ of the rows that carry a force"
-        factor = SemidefiniteFactor(damped, coarse.null, coarse.comm, what)
+        factor = coarse.damped_factor(carrying, DAMPING)
         step = factor.solve(residual)
         factor.destroy()
         length = _damping(coarse, bounded, alpha, step)
@@ -82,3 +79,13 @@ def _damping(coarse: CoarseSpace, bounded: Array, alpha: Array, step: Array) -> 
     while length > SHORTEST and agreed(coarse.comm, cost(alpha + length * step) > start):
         length *= 0.5
     return length
+
+
+def _feasible(coarse: CoarseSpace, like: PETSc.Vec) -> PETSc.Vec:
+    x = like.duplicate()
+    x.array[:] = feasible_particular(coarse, coarse.bounded)
+    return x
+
+
+# solutions of Gλ̄ = e
+PARTICULAR = {"natural": natural, "feasible": _feasible}

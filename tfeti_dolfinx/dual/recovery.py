@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 from petsc4py import PETSc
-from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
-from tfeti_dolfinx.dual.semidefinite import SemidefiniteFactor
+from tfeti_dolfinx.qp.faces import Face
 
 # Of GGᵀ, added to G_f G_fᵀ: rows with a force that hold a motion by less are not asked about it,
 # since they would answer with their rounding over this share.
@@ -20,20 +19,22 @@ def recover(
     c: PETSc.Vec,
     coarse: CoarseSpace,
     lam: PETSc.Vec,
-    nu: Array,
+    gradient: PETSc.Vec,
+    face: Face,
 ) -> tuple[Array, Array]:
     """u = K⁺(f − Bᵀλ) + Rα. Collective.
 
-    α = (GGᵀ)⁻¹G(Fλ − d − ν) makes the rows' residuals vanish, but for the gaps of open rows, ν
-    as the solver left it. A step of the damped normal equations on the rows f of equalities and
-    of λ_N > 0 makes theirs as small as α can.
+    α = (GGᵀ)⁻¹G(Fλ − d − ν) makes the rows' residuals vanish, but for ν, the gaps of open rows
+    as the solver left them. A step of the damped normal equations on the rows f that the face
+    holds (equalities, λ_N > 0) makes theirs as small as α can.
 
     Args:
         B: Dual rows × trace unknowns.
         c: Right sides.
         coarse: The coarse space.
         lam: The multipliers.
-        nu: Multipliers of λ_N ≥ 0 on all local rows, zero on free ones, shape ``(m,)``.
+        gradient: Fλ − d up to the range of Gᵀ; on rows that the face does not hold it is ν.
+        face: The face of λ.
 
     Returns:
         This rank's part of u, shape ``(n,)``, and c − B u, shape ``(m,)``.
@@ -48,15 +49,9 @@ def recover(
     gap = np.array(residual.array_r)
     for vec in (w, v, residual):
         vec.destroy()
-    alpha = _alpha(coarse, gap, carrying(lam.array_r, coarse.bounded), nu)
+    nu = np.where(face.holding, 0.0, gradient.array_r)
+    alpha = _alpha(coarse, gap, face.holding, nu)
     return moved(u, coarse, alpha), gap - coarse.Gt @ alpha
-
-
-def carrying(lam: Array, bounded: Array) -> Array:
-    """Rows of equalities, and those of λ_N > 0."""
-    flags = np.ones(len(lam), dtype=bool)
-    flags[bounded] = lam[bounded] > 0.0
-    return flags
 
 
 def moved(u: Array, coarse: CoarseSpace, alpha: Array) -> Array:
@@ -71,10 +66,7 @@ def _alpha(coarse: CoarseSpace, gradient: Array, free: Array, nu: Array) -> Arra
     alpha = coarse.solve(coarse.G(gradient - nu))
     if coarse.comm.allreduce(int(np.sum(~free))) == 0:
         return alpha
-    damped = csr_array(coarse.gram(free) + DAMPING * coarse.gram())
-    factor = SemidefiniteFactor(
-        damped, coarse.null, coarse.comm, "GGᵀ of the rows that carry a force"
-    )
+    factor = coarse.damped_factor(free, DAMPING)
     left = np.where(free, gradient - coarse.Gt @ alpha, 0.0)
     step = factor.solve(coarse.G(left))
     factor.destroy()

@@ -43,7 +43,8 @@ class SemidefiniteFactor:
         what: str,
         prefix: str = "tfeti_coarse_",
     ) -> None:
-        self._null, diagonal, pinned = null, A.diagonal(), np.zeros(A.shape[0])
+        self._null, diagonal = null, A.diagonal()
+        pinned = np.where(diagonal > 0.0, 0.0, 1.0)  # what nothing holds at all stands for itself
         self._scale = np.where(diagonal > 0.0, diagonal, 1.0) ** -0.5
         pinned[null.pins(self._scale)] = 1.0
         S = diags_array(self._scale)

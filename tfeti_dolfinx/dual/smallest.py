@@ -30,18 +30,21 @@ EXCESS, SLOPE = 1e-9, 1e-12
 TIGHT = 1e-14
 
 
-def nearly_free(coarse: CoarseSpace, lam: Array, error: float) -> tuple[Motions, Array]:
+def nearly_free(
+    coarse: CoarseSpace, lam: Array, holding: Array, error: float
+) -> tuple[Motions, Array]:
     """Motions that the contact rows with a force do not hold, or hardly. Collective.
 
     Args:
         coarse: The coarse space.
         lam: The multipliers.
+        holding: Flags of the local rows that are held.
         error: How large multipliers may be by the solver's error alone.
 
     Returns:
         The motions, and flags of the local rows with a force.
     """
-    force = np.zeros(len(lam))
+    lam, force = np.where(holding, np.abs(lam), 0.0), np.zeros(len(lam))
     force[coarse.bounded] = (lam * coarse.row_size)[coarse.bounded]
     row, column = coarse.J.tocoo().coords
     body = column // coarse.bodies.k

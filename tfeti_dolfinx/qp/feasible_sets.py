@@ -1,165 +1,176 @@
-"""Closed convex sets that are products of small ones: bounds now, discs and ellipses later."""
+"""Closed convex sets that are products of small ones: bounds now, discs and ellipses later.
+
+A set knows its own rows of this rank as numpy arrays, nothing of ranks and other rows: solvers
+add up over ranks, ``Product`` puts sets on rows. Nothing here is collective.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
-from mpi4py import MPI
-from petsc4py import PETSc
+from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.errors import require
+from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.qp.faces import Face, Status, face_of
 
 
 class FeasibleSet(Protocol):
-    """A set Ω of vectors, and the parts of a gradient that belong to it."""
+    """A set Ω of vectors of n entries, and the parts of a gradient that belong to it.
 
-    def project(self, x: PETSc.Vec) -> None:
-        """x ← P_Ω(x), the nearest point of Ω."""
+    All arrays have the shape ``(n,)``; none that is passed may be written to.
+    ``check_feasible_set`` tests any implementation.
+    """
+
+    def project(self, x: Array) -> Array:
+        """P_Ω(x), the nearest point of Ω."""
         ...
 
-    def split(self, x: PETSc.Vec, g: PETSc.Vec, phi: PETSc.Vec, beta: PETSc.Vec) -> None:
+    def split(self, x: Array, g: Array) -> tuple[Array, Array]:
         """Free gradient φ and chopped gradient β at x ∈ Ω; φ + β is the projected gradient."""
         ...
 
-    def reduced(self, x: PETSc.Vec, phi: PETSc.Vec, alpha: float) -> float:
-        """φ̃ᵀφ, φ̃ = (x − P_Ω(x − α φ))/α on free components, φ elsewhere. Collective."""
+    def reduced(self, x: Array, phi: Array, alpha: float) -> Array:
+        """Reduced free gradient φ̃ = (x − P_Ω(x − α φ))/α."""
         ...
 
-    def max_step(self, x: PETSc.Vec, p: PETSc.Vec) -> float:
-        """Largest α with x − α p ∈ Ω, maybe infinite. Collective."""
+    def max_step(self, x: Array, p: Array) -> float:
+        """Largest α with x − α p ∈ Ω, maybe infinite."""
         ...
 
-    def shifted(self, shift: PETSc.Vec) -> FeasibleSet:
+    def shifted(self, shift: Array) -> FeasibleSet:
         """The set Ω − shift."""
         ...
 
-    def num_off(self, x: PETSc.Vec) -> int:
-        """Local constrained components that are off their bound."""
+    def face(self, x: Array, g: Array) -> Face:
+        """The face of x ∈ Ω, given the gradient there."""
         ...
 
 
 class Bounds:
-    """x_i ≥ l_i on some of the local components, the others free.
+    """x_i ≥ l_i.
 
     Args:
-        where: Local components that are bounded.
-        lower: Their bounds, shape as ``where`` gives; default 0.
+        lower: The bounds l, shape ``(n,)``, or one for all entries.
     """
 
-    def __init__(self, where: slice | Array, lower: Array | float = 0.0) -> None:
-        self.where = where
+    def __init__(self, lower: Array | float = 0.0) -> None:
         self.lower = lower
 
-    def project(self, x: PETSc.Vec) -> None:
-        """x ← max(x, l)."""
-        x.array[self.where] = np.maximum(x.array_r[self.where], self.lower)
+    def project(self, x: Array) -> Array:
+        """max(x, l)."""
+        return np.maximum(x, self.lower)
 
-    def split(self, x: PETSc.Vec, g: PETSc.Vec, phi: PETSc.Vec, beta: PETSc.Vec) -> None:
+    def split(self, x: Array, g: Array) -> tuple[Array, Array]:
         """φ = g off the bounds; β = min(g, 0) on them."""
-        g.copy(phi)
-        beta.set(0.0)
-        bounded = x.array_r[self.where] <= self.lower
-        part = g.array_r[self.where]
-        phi.array[self.where] = np.where(bounded, 0.0, part)
-        beta.array[self.where] = np.where(bounded, np.minimum(part, 0.0), 0.0)
+        bound = x <= self.lower
+        return np.where(bound, 0.0, g), np.where(bound, np.minimum(g, 0.0), 0.0)
 
-    def reduced(self, x: PETSc.Vec, phi: PETSc.Vec, alpha: float) -> float:
-        """φ̃ᵀφ with φ̃_i = min((x_i − l_i)/α, φ_i) on bounded components."""
-        part = phi.array_r[self.where]
-        room = (x.array_r[self.where] - self.lower) / alpha
-        excess = np.sum((part - np.minimum(room, part)) * part)
-        total = phi.dot(phi)
-        return float(total - phi.getComm().tompi4py().allreduce(excess))
+    def reduced(self, x: Array, phi: Array, alpha: float) -> Array:
+        """φ̃_i = min((x_i − l_i)/α, φ_i)."""
+        return np.minimum((x - self.lower) / alpha, phi)
 
-    def max_step(self, x: PETSc.Vec, p: PETSc.Vec) -> float:
+    def max_step(self, x: Array, p: Array) -> float:
         """min over p_i > 0 of (x_i − l_i)/p_i."""
-        part = p.array_r[self.where]
-        room = x.array_r[self.where] - self.lower
-        down = part > 0.0
-        step = np.min(room[down] / part[down], initial=np.inf)
-        return float(p.getComm().tompi4py().allreduce(float(step), op=MPI.MIN))
+        down = p > 0.0
+        return float(np.min((x - self.lower)[down] / p[down], initial=np.inf))
 
-    def shifted(self, shift: PETSc.Vec) -> Bounds:
+    def shifted(self, shift: Array) -> Bounds:
         """Bounds l − shift."""
-        return Bounds(self.where, self.lower - shift.array_r[self.where])
+        return Bounds(self.lower - shift)
 
-    def num_off(self, x: PETSc.Vec) -> int:
-        """Local components with x_i > l_i."""
-        return int(np.sum(x.array_r[self.where] > self.lower))
-
-
-class Unbounded:
-    """The whole space: a scene without inequalities."""
-
-    def project(self, x: PETSc.Vec) -> None:
-        """Nothing to do."""
-
-    def split(self, x: PETSc.Vec, g: PETSc.Vec, phi: PETSc.Vec, beta: PETSc.Vec) -> None:
-        """φ = g, β = 0."""
-        g.copy(phi)
-        beta.set(0.0)
-
-    def reduced(self, x: PETSc.Vec, phi: PETSc.Vec, alpha: float) -> float:
-        """φᵀφ."""
-        return float(phi.dot(phi))
-
-    def max_step(self, x: PETSc.Vec, p: PETSc.Vec) -> float:
-        """Infinite."""
-        return float(np.inf)
-
-    def shifted(self, shift: PETSc.Vec) -> Unbounded:
-        """The same set."""
-        return self
-
-    def num_off(self, x: PETSc.Vec) -> int:
-        """None."""
-        return 0
+    def face(self, x: Array, g: Array) -> Face:
+        """Rows off their bounds are free: they touch."""
+        off = np.asarray(x > self.lower)
+        return face_of(off, np.where(off, Status.TOUCHING, Status.OPEN))
 
 
-def check_feasible_set(feasible: FeasibleSet, like: PETSc.Vec, seed: int = 0) -> None:
-    """Check what MPRGP relies on, at random points of any feasible set. Collective.
+class Product:
+    """Sets on disjoint rows; rows of none are free. Without sets it is the whole space.
 
-    The projection is idempotent and the nearest point; a maximal step stays in the set; the
-    projected gradient vanishes exactly where a projected step does not move; the reduced free
-    gradient is not longer than the free one.
+    >>> half_line = Product([(np.array([0]), Bounds())])
+    >>> half_line.project(np.array([-1.0, -1.0])).tolist()
+    [0.0, -1.0]
+    >>> half_line.face(np.array([0.0, -1.0]), np.zeros(2)).carrying.tolist()
+    [False, True]
+
+    Args:
+        factors: Pairs of rows, a slice or an array of indices, and the set of these rows.
 
     Raises:
-        ConformanceError: Something of that does not hold; the message says what.
+        InputError: A row stands in two sets.
     """
-    rng = np.random.default_rng(seed + like.getComm().getRank())
-    x, y, g, phi, beta, z = (like.duplicate() for _ in range(6))
-    for scale in (0.1, 1.0, 10.0):
-        for vec in (x, y, g):
-            vec.array[:] = scale * rng.standard_normal(vec.getLocalSize())
-        x.copy(z)
-        feasible.project(x)
-        feasible.project(y)
-        z.axpy(-1.0, x)  # z = x₀ − P(x₀) makes an obtuse angle with every y − P(x₀)
-        y.axpy(-1.0, x)
-        require(z.dot(y) <= 1e-12 * (1.0 + z.norm() * y.norm()), "P(x) is the nearest point of Ω")
-        x.copy(z)
-        feasible.project(z)
-        z.axpy(-1.0, x)
-        require(z.norm() <= 1e-14 * (1.0 + x.norm()), "P(P(x)) = P(x)")
 
-        feasible.split(x, g, phi, beta)
-        reduced = feasible.reduced(x, phi, 0.5)
-        require(-1e-12 <= reduced <= phi.dot(phi) * (1.0 + 1e-12), "0 ≤ φ̃ᵀφ ≤ φᵀφ")
-        step = feasible.max_step(x, phi)
-        x.copy(z)
-        z.axpy(-min(step, 1e3), phi)
-        z.copy(y)
-        feasible.project(y)
-        y.axpy(-1.0, z)
-        require(y.norm() <= 1e-10 * (1.0 + z.norm()), "x − αφ ∈ Ω for the largest step α")
-        x.copy(z)
-        z.axpy(-1e-6, g)
-        feasible.project(z)
-        z.axpy(-1.0, x)
-        phi.axpy(1.0, beta)
-        apart = abs(z.norm() - 1e-6 * phi.norm())
-        require(apart <= 1e-4 * 1e-6 * (1.0 + phi.norm()), "φ + β is the projected gradient")
-    for vec in (x, y, g, phi, beta, z):
-        vec.destroy()
+    def __init__(self, factors: Sequence[tuple[slice | Array, FeasibleSet]] = ()) -> None:
+        self.factors = [(_indices(rows), factor) for rows, factor in factors]
+        rows, count = np.unique(
+            np.concatenate([np.empty(0, dtype=np.int64), *(rows for rows, _ in self.factors)]),
+            return_counts=True,
+        )
+        if np.any(count > 1):
+            raise InputError(
+                f"Product: row {rows[count > 1][0]} stands in two sets; expected one at most"
+            )
+
+    def project(self, x: Array) -> Array:
+        """P of each set on its rows."""
+        y = np.array(x)
+        for rows, factor in self.factors:
+            y[rows] = factor.project(x[rows])
+        return y
+
+    def split(self, x: Array, g: Array) -> tuple[Array, Array]:
+        """φ and β of each set; φ = g on free rows."""
+        phi, beta = np.array(g), np.zeros(len(g))
+        for rows, factor in self.factors:
+            phi[rows], beta[rows] = factor.split(x[rows], g[rows])
+        return phi, beta
+
+    def reduced(self, x: Array, phi: Array, alpha: float) -> Array:
+        """φ̃ of each set; φ on free rows."""
+        values = np.array(phi)
+        for rows, factor in self.factors:
+            values[rows] = factor.reduced(x[rows], phi[rows], alpha)
+        return values
+
+    def max_step(self, x: Array, p: Array) -> float:
+        """The least of all sets."""
+        steps = [factor.max_step(x[rows], p[rows]) for rows, factor in self.factors]
+        return min([float(np.inf), *steps])
+
+    def shifted(self, shift: Array) -> Product:
+        """Each set, shifted."""
+        return Product([(rows, factor.shifted(shift[rows])) for rows, factor in self.factors])
+
+    def face(self, x: Array, g: Array) -> Face:
+        """Free rows, then the directions of each set."""
+        status, free = np.full(len(x), Status.FREE), np.ones(len(x), dtype=bool)
+        faces = []
+        for rows, factor in self.factors:
+            face = factor.face(x[rows], g[rows])
+            status[rows], free[rows] = face.status, False
+            faces.append((rows, face))
+        return _joined([(np.arange(len(x)), face_of(free, status)), *faces], status)
+
+
+def _indices(rows: slice | Array) -> Array:
+    """Rows as indices, in their order."""
+    if isinstance(rows, slice):
+        return np.arange(rows.start or 0, rows.stop, dtype=np.int64)
+    return np.asarray(rows, dtype=np.int64)
+
+
+def _joined(faces: Sequence[tuple[Array, Face]], status: Array) -> Face:
+    """The directions of several faces on their rows, one after the other."""
+    row, column, value, start = [], [], [], 0
+    for rows, face in faces:
+        Z = face.Z.tocoo()
+        row.append(rows[Z.coords[0]])
+        column.append(start + Z.coords[1])
+        value.append(Z.data)
+        start += Z.shape[1]
+    coordinates = (np.concatenate(row), np.concatenate(column))
+    Z = csr_array((np.concatenate(value), coordinates), shape=(len(status), start))
+    return Face(Z, np.concatenate([face.curvature for _, face in faces]), status)

@@ -4,14 +4,86 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 from petsc4py import PETSc
 
+from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
-from tfeti_dolfinx.qp.problem import QP, project
+from tfeti_dolfinx.qp.problem import QP, Operator
 
 # of the terms that a residual is the difference of: what rounding leaves of it at least, and
 # below how many times that rounding may be the reason of anything strange
 ROUNDING, STRANGE = 1e-14, 1e8
+
+
+@dataclass(frozen=True)
+class Image:
+    """A vector and what F makes of it, so that F need not be asked again.
+
+    Attributes:
+        x: The vector.
+        Fx: F x.
+    """
+
+    x: PETSc.Vec
+    Fx: PETSc.Vec
+
+    def destroy(self) -> None:
+        """Destroy the vectors. Collective."""
+        self.x.destroy()
+        self.Fx.destroy()
+
+
+def image(F: Operator, x: PETSc.Vec) -> Image:
+    """x and F x; takes x over, and multiplies once if x ≠ 0. Collective."""
+    Fx = x.duplicate()
+    Fx.set(0.0)
+    if x.norm() > 0.0:
+        F.mult(x, Fx)
+    return Image(x, Fx)
+
+
+def natural(coarse: Coarse, like: PETSc.Vec) -> PETSc.Vec:
+    """λ̄₀ = Gᵀ(GGᵀ)⁻¹e. Collective."""
+    x = like.duplicate()
+    coarse.particular(x)
+    return x
+
+
+def restored(coarse: Coarse, lam: PETSc.Vec) -> PETSc.Vec:
+    """The nearest solution of Gλ̄ = e to λ: λ + Gᵀ(GGᵀ)⁻¹(e − Gλ). Collective."""
+    x, fixed = lam.copy(), natural(coarse, lam)
+    coarse.project(x)
+    x.axpy(1.0, fixed)
+    fixed.destroy()
+    return x
+
+
+@dataclass(frozen=True)
+class Scale:
+    """How large residuals are at the start, and what rounding leaves of them.
+
+    Attributes:
+        reference: b₀ = ‖P(d − F λ̄₀)‖ with λ̄₀ = Gᵀ(GGᵀ)⁻¹e.
+        rounding: What rounding leaves of b₀ where it should be 0.
+    """
+
+    reference: float
+    rounding: float
+
+
+def scale_at(qp: QP, start: Image) -> Scale:
+    """The scale of a program whose λ̄₀ is known with its image. Collective."""
+    return Scale(_projected(qp, start.Fx, qp.d), ROUNDING * (qp.d.norm() + start.Fx.norm()))
+
+
+def scale_near(qp: QP, at: Image) -> Scale:
+    """A scale from another solution of Gλ̄ = e, if F λ̄₀ is not known. Collective.
+
+    ‖P d‖ and ‖P F λ‖ are equal at the solution, and b₀ is ‖P d‖ where e = 0; the larger one.
+    """
+    sizes = (_projected(qp, qp.d), _projected(qp, at.Fx))
+    return Scale(max(sizes), ROUNDING * (qp.d.norm() + at.Fx.norm()))
 
 
 @dataclass(frozen=True)
@@ -20,54 +92,57 @@ class Homogenised:
 
     Attributes:
         lam_bar: λ̄.
+        gradient: F λ̄ − d.
         b: P(d − F λ̄).
         feasible: Ω − λ̄.
-        reference: b₀ = ‖P(d − F λ̄₀)‖ with λ̄₀ = Gᵀ(GGᵀ)⁻¹e, whatever λ̄ is.
-        rounding: What rounding leaves of b₀ where it should be 0.
+        scale: Size of the residual at λ̄₀, whatever λ̄ is.
     """
 
     lam_bar: PETSc.Vec
+    gradient: PETSc.Vec
     b: PETSc.Vec
     feasible: FeasibleSet
-    reference: float
-    rounding: float
+    scale: Scale
 
     def is_rounding(self, residual: float) -> bool:
         """Whether a residual is so small that rounding explains what is strange about it."""
-        return residual <= STRANGE * self.rounding
+        return residual <= STRANGE * self.scale.rounding
 
     def destroy(self) -> None:
         """Destroy the vectors. Collective."""
-        self.lam_bar.destroy()
-        self.b.destroy()
+        for vec in (self.lam_bar, self.gradient, self.b):
+            vec.destroy()
 
 
-def homogenise(qp: QP, lam_bar: PETSc.Vec | None = None) -> Homogenised:
-    """Homogenise a quadratic program; multiplies by F once if e ≠ 0. Collective.
+def homogenise(qp: QP, at: Image | None = None, scale: Scale | None = None) -> Homogenised:
+    """Homogenise a quadratic program. Collective.
 
     Args:
         qp: The program.
-        lam_bar: A solution of Gλ̄ = e; default λ̄₀. Another one costs a second multiplication.
+        at: A solution of Gλ̄ = e with its image, which is copied; default λ̄₀, which costs one
+            multiplication by F if e ≠ 0.
+        scale: The scale of residuals; default that at λ̄.
     """
-    natural = qp.d.duplicate()
-    qp.coarse.particular(natural)
-    b, size = _right_side(qp, natural)
-    reference, rounding = b.norm(), ROUNDING * size
-    if lam_bar is None:
-        return Homogenised(natural, b, qp.feasible.shifted(natural), reference, rounding)
-    natural.destroy()
-    b.destroy()
-    b, _ = _right_side(qp, lam_bar)
-    return Homogenised(lam_bar.copy(), b, qp.feasible.shifted(lam_bar), reference, rounding)
+    if at is None:
+        at = image(qp.F, natural(qp.coarse, qp.d))
+        homogenised = homogenise(qp, at, scale)
+        at.destroy()
+        return homogenised
+    gradient = at.Fx.copy()
+    gradient.axpy(-1.0, qp.d)
+    b = gradient.copy()
+    b.scale(-1.0)
+    qp.coarse.project(b)
+    feasible = qp.feasible.shifted(np.array(at.x.array_r))
+    return Homogenised(at.x.copy(), gradient, b, feasible, scale or scale_at(qp, at))
 
 
-def _right_side(qp: QP, lam_bar: PETSc.Vec) -> tuple[PETSc.Vec, float]:
-    """P(d − F λ̄), and the size of what it is the difference of."""
-    b, work, size = qp.d.copy(), qp.d.duplicate(), qp.d.norm()
-    if lam_bar.norm() > 0.0:
-        qp.F.mult(lam_bar, work)
-        size += work.norm()
-        b.axpy(-1.0, work)
-    project(qp.coarse, b, work)
-    work.destroy()
-    return b, size
+def _projected(qp: QP, x: PETSc.Vec, less: PETSc.Vec | None = None) -> float:
+    """‖P x‖, or ‖P(x − y)‖."""
+    part = x.copy()
+    if less is not None:
+        part.axpy(-1.0, less)
+    qp.coarse.project(part)
+    size: float = part.norm()
+    part.destroy()
+    return size

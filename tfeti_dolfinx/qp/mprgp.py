@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
+from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.monitors import Monitor, no_monitor
 from tfeti_dolfinx.qp.problem import ConvergedReason, Operator, Steps
@@ -27,13 +29,14 @@ class Iterate:
 
     def __init__(self, A: Operator, x: PETSc.Vec, g: PETSc.Vec, feasible: FeasibleSet) -> None:
         self.A, self.x, self.g, self.feasible = A, x, g, feasible
+        self._comm = x.getComm().tompi4py()
         self.phi, self.beta, self.p, self.Ap = (x.duplicate() for _ in range(4))
         self.free_squared = self.chopped_squared = 0.0
         self.split()
 
     def split(self) -> None:
         """Find φ and β at x."""
-        self.feasible.split(self.x, self.g, self.phi, self.beta)
+        self.phi.array[:], self.beta.array[:] = self.feasible.split(self.x.array_r, self.g.array_r)
         self.free_squared = self.phi.dot(self.phi)
         self.chopped_squared = self.beta.dot(self.beta)
 
@@ -41,6 +44,25 @@ class Iterate:
     def projected_gradient(self) -> float:
         """‖g^P‖ = ‖φ + β‖."""
         return float((self.free_squared + self.chopped_squared) ** 0.5)
+
+    def project(self, x: PETSc.Vec) -> None:
+        """x ← P_Ω(x)."""
+        x.array[:] = self.feasible.project(x.array_r)
+
+    def reduced_squared(self, alpha: float) -> float:
+        """φ̃ᵀφ."""
+        phi = self.phi.array_r
+        own = float(self.feasible.reduced(self.x.array_r, phi, alpha) @ phi)
+        return float(self._comm.allreduce(own))
+
+    def max_step(self, p: PETSc.Vec) -> float:
+        """Largest α with x − α p ∈ Ω."""
+        own = self.feasible.max_step(self.x.array_r, p.array_r)
+        return float(self._comm.allreduce(own, op=MPI.MIN))
+
+    def face(self) -> Face:
+        """The face of x."""
+        return self.feasible.face(self.x.array_r, self.g.array_r)
 
     def move(self, alpha: float, p: PETSc.Vec, Ap: PETSc.Vec) -> None:
         """x ← x − α p and the gradient with it."""
@@ -70,11 +92,11 @@ class Iterate:
 def fixed_step(state: Iterate, alpha_f: float, alpha_cg: float, alpha_bar: float) -> None:
     """Expansion by a step −ᾱφ from the face's edge, projected (Dostál, Schöberl 2005)."""
     state.move(alpha_f, state.p, state.Ap)
-    state.feasible.project(state.x)
+    state.project(state.x)
     state.split()
     target = state.x.copy()
     target.axpy(-alpha_bar, state.phi)
-    state.feasible.project(target)
+    state.project(target)
     state.move_to(target)
     target.destroy()
 
@@ -87,7 +109,7 @@ def projected_cg(state: Iterate, alpha_f: float, alpha_cg: float, alpha_bar: flo
     """
     target, Ad = state.x.copy(), state.x.duplicate()
     target.axpy(-alpha_cg, state.p)
-    state.feasible.project(target)
+    state.project(target)
     target.axpy(-1.0, state.x)
     state.A.mult(target, Ad)
     slope = state.g.dot(target)
@@ -95,7 +117,7 @@ def projected_cg(state: Iterate, alpha_f: float, alpha_cg: float, alpha_bar: flo
     gp, pAp = state.g.dot(state.p), state.p.dot(state.Ap)
     if decrease <= -alpha_f * gp + 0.5 * alpha_f**2 * pAp:
         state.move(-1.0, target, Ad)
-        state.feasible.project(state.x)
+        state.project(state.x)
     else:
         fixed_step(state, alpha_f, alpha_cg, alpha_bar)
     target.destroy()
@@ -127,13 +149,31 @@ def mprgp(
     steps: Steps,
     max_it: int,
     monitor: Monitor = no_monitor,
-) -> ConvergedReason:
+) -> ConvergedReason | None:
     """Minimise ½xᵀAx − bᵀx on Ω, from ``state`` on and in place. Collective.
 
     Dostál, Schöberl, Comput. Optim. Appl. 30 (2005) 23–43; Dostál, Optimal Quadratic
     Programming Algorithms, Springer 2009, section 5.8, whose steps are numbered here.
 
     Multiplications by A: one per CG or proportioning step, two per expansion step.
+
+    ===========================  =====================================
+    reason                       when
+    ===========================  =====================================
+    None                         ``stop`` said so, before a step
+    ``DIVERGED_ITS``             ``max_it`` steps are not enough
+    ``DIVERGED_INDEFINITE_MAT``  a direction has no positive curvature
+    ===========================  =====================================
+
+    >>> import numpy as np
+    >>> from tfeti_dolfinx.qp.feasible_sets import Bounds
+    >>> A = PETSc.Mat().createDense((2, 2), array=np.diag([1.0, 2.0]), comm=PETSc.COMM_SELF)
+    >>> x = PETSc.Vec().createWithArray(np.zeros(2), comm=PETSc.COMM_SELF)
+    >>> g = PETSc.Vec().createWithArray(np.array([-3.0, 4.0]), comm=PETSc.COMM_SELF)  # Ax − b
+    >>> state, steps = Iterate(A, x, g, Bounds()), Steps()
+    >>> mprgp(state, MprgpParameters(0.9), lambda s: s.projected_gradient <= 1e-9, steps, 100)
+    >>> x.array.round(6).tolist(), steps.inner > 0
+    ([3.0, 0.0], True)
 
     Args:
         state: The iterate; holds the solution afterwards.
@@ -144,22 +184,22 @@ def mprgp(
         monitor: Called after each step.
 
     Returns:
-        ITERATING if ``stop`` ended the loop, else why it could not go on.
+        None if ``stop`` ended the loop, else why it could not go on.
     """
-    A, feasible, alpha_bar = state.A, state.feasible, parameters.alpha_bar
+    A, alpha_bar = state.A, parameters.alpha_bar
     x, g, p, Ap, phi, beta = state.x, state.g, state.p, state.Ap, state.phi, state.beta
     phi.copy(p)
     while not stop(state):
         if steps.inner >= max_it:
             return ConvergedReason.DIVERGED_ITS
         # Step 1: is x strictly proportional?
-        if state.chopped_squared <= parameters.gamma**2 * feasible.reduced(x, phi, alpha_bar):
+        if state.chopped_squared <= parameters.gamma**2 * state.reduced_squared(alpha_bar):
             # Step 2: trial conjugate gradient step
             A.mult(p, Ap)
             pAp = p.dot(Ap)
             if not pAp > 0.0:
                 return ConvergedReason.DIVERGED_INDEFINITE_MAT
-            alpha_cg, alpha_f = g.dot(p) / pAp, feasible.max_step(x, p)
+            alpha_cg, alpha_f = g.dot(p) / pAp, state.max_step(p)
             if alpha_cg <= alpha_f:
                 # Step 3: conjugate gradient step
                 state.move(alpha_cg, p, Ap)
@@ -178,10 +218,10 @@ def mprgp(
             bAb = beta.dot(Ap)
             if not bAb > 0.0:
                 return ConvergedReason.DIVERGED_INDEFINITE_MAT
-            state.move(min(g.dot(beta) / bAb, feasible.max_step(x, beta)), beta, Ap)
+            state.move(min(g.dot(beta) / bAb, state.max_step(beta)), beta, Ap)
             steps.proportioning += 1
             kind = "proportioning"
         state.split()
         phi.copy(p)
         monitor(steps, kind, x, state.projected_gradient, -1.0)
-    return ConvergedReason.ITERATING
+    return None

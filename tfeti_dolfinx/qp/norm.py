@@ -6,7 +6,8 @@ import numpy as np
 from petsc4py import PETSc
 
 from tfeti_dolfinx.parallel import agreed
-from tfeti_dolfinx.qp.problem import Coarse, Operator, project
+from tfeti_dolfinx.qp.coarse import Coarse
+from tfeti_dolfinx.qp.problem import Operator
 
 # an off-diagonal entry this small in units of the norm ends the method: the space is exhausted
 EXHAUSTED = 1e-12
@@ -26,10 +27,10 @@ def estimate_norm(F: Operator, coarse: Coarse, like: PETSc.Vec, steps: int = 15)
         like: A vector of the right layout.
         steps: Most multiplications by F.
     """
-    v, previous, w, work = (like.duplicate() for _ in range(4))
+    v, previous, w = (like.duplicate() for _ in range(3))
     rng = np.random.default_rng(like.getComm().getRank())
     v.array[:] = rng.standard_normal(v.getLocalSize())
-    project(coarse, v, work)
+    coarse.project(v)
     previous.set(0.0)
     diagonal: list[float] = []
     beside: list[float] = [v.norm()]
@@ -37,14 +38,14 @@ def estimate_norm(F: Operator, coarse: Coarse, like: PETSc.Vec, steps: int = 15)
     while len(diagonal) < steps and agreed(comm, beside[-1] > EXHAUSTED * _size(diagonal, beside)):
         v.scale(1.0 / beside[-1])
         F.mult(v, w)
-        project(coarse, w, work)
+        coarse.project(w)
         diagonal.append(w.dot(v))
         w.axpy(-diagonal[-1], v)
         if len(diagonal) > 1:
             w.axpy(-beside[-1], previous)
         beside.append(w.norm())
         previous, v, w = v, w, previous
-    for vec in (v, previous, w, work):
+    for vec in (v, previous, w):
         vec.destroy()
     if not diagonal:
         return 0.0

@@ -1,16 +1,94 @@
-"""PCPG: preconditioned conjugate projected gradients, for a program without inequalities."""
+"""PCPG: preconditioned conjugate projected gradients, for programs without inequalities."""
 
 from __future__ import annotations
 
 from petsc4py import PETSc
 
+from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.monitors import Monitor, no_monitor
-from tfeti_dolfinx.qp.problem import QP, ConvergedReason, QPResult, Steps, project
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, QPResult, Steps
 from tfeti_dolfinx.qp.stopping import StoppingRule
 
 
 def pcpg(
+    qp: QP,
+    lam: PETSc.Vec,
+    g: PETSc.Vec,
+    rule: StoppingRule,
+    steps: Steps,
+    max_it: int,
+    monitor: Monitor = no_monitor,
+) -> ConvergedReason:
+    """Minimise ½λᵀFλ − λᵀd over λ + range(P), from a start on and in place. Collective.
+
+    Farhat, Mandel, Roux, Comput. Methods Appl. Mech. Engrg. 115 (1994) 365–385, section 3. P is
+    the projector of ``qp.coarse``: on a face λ moves in the face alone. Multiplies by F, and by
+    the preconditioner, once per step, and once more where the rule finds that g has drifted.
+
+    ===========================  ===================================================
+    reason                       when
+    ===========================  ===================================================
+    the rule's                   ‖P g‖ ≤ ``rule.tolerance``, and the rule is content
+    ``DIVERGED_ITS``             ``max_it`` steps are not enough
+    ``DIVERGED_INDEFINITE_MAT``  a direction has no positive curvature
+    ===========================  ===================================================
+
+    Args:
+        qp: F, d, P and the preconditioner; its feasible set is kept by nobody.
+        lam: λ; updated.
+        g: F λ − d; updated, on all rows.
+        rule: Says when ‖P g‖ is small enough.
+        steps: Counts the steps.
+        max_it: Most steps in ``steps``.
+        monitor: Called after each step.
+
+    Returns:
+        Why it stopped.
+    """
+    r = _residual(qp, g)
+    p, Fp, z = (r.duplicate() for _ in range(3))
+    rz, fresh, norm = 1.0, True, r.norm()
+    reason = ConvergedReason.ITERATING
+    while True:
+        # test
+        if norm <= rule.tolerance:
+            reason = rule.examine(lam, g, _face(qp, lam, g), norm)
+        if rule.drifted:
+            qp.F.mult(lam, g)
+            g.axpy(-1.0, qp.d)
+            r, rule.drifted, fresh = _residual(qp, g, r), False, True
+        if reason == ConvergedReason.ITERATING and steps.cg >= max_it:
+            reason = ConvergedReason.DIVERGED_ITS
+        if reason != ConvergedReason.ITERATING:
+            break
+        # precondition and project: z = P M r
+        _precondition(qp, r, z)
+        # direction
+        rz, previous = r.dot(z), rz
+        p.aypx(0.0 if fresh else rz / previous, z)
+        # step
+        qp.F.mult(p, Fp)
+        Fp.copy(z)
+        qp.coarse.project(z)
+        pFp = p.dot(z)
+        if not (pFp > 0.0 and rz > 0.0):
+            reason = rule.examine(lam, g, _face(qp, lam, g), norm)
+            if reason == ConvergedReason.ITERATING:
+                reason = ConvergedReason.DIVERGED_INDEFINITE_MAT
+            break
+        lam.axpy(rz / pFp, p)
+        g.axpy(rz / pFp, Fp)
+        r.axpy(-rz / pFp, z)
+        fresh, norm = False, r.norm()
+        steps.cg += 1
+        monitor(steps, "cg", lam, norm, 0.0)
+    for vec in (r, p, Fp, z):
+        vec.destroy()
+    return reason
+
+
+def solve_by_pcpg(
     qp: QP,
     homogenised: Homogenised,
     rule: StoppingRule,
@@ -18,14 +96,32 @@ def pcpg(
     max_it: int = 10_000,
     monitor: Monitor = no_monitor,
 ) -> QPResult:
-    """Solve min ½λᵀFλ − λᵀd, Gλ = e. Collective.
+    """Solve min ½λᵀFλ − λᵀd, Gλ = e, from λ̄ on. Collective.
 
-    Farhat, Mandel, Roux, Comput. Methods Appl. Mech. Engrg. 115 (1994) 365–385, section 3.
-    Multiplies by F, and by the preconditioner, once per step.
+    Stops as ``pcpg`` does; besides with
+
+    =====================  ======================================================
+    reason                 when
+    =====================  ======================================================
+    ``DIVERGED_ROUNDING``  no positive curvature, but residuals that are rounding
+    =====================  ======================================================
+
+    >>> import numpy as np
+    >>> from petsc4py import PETSc
+    >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
+    >>> from tfeti_dolfinx.qp.feasible_sets import Product
+    >>> from tfeti_dolfinx.qp.homogenised import homogenise
+    >>> from tfeti_dolfinx.qp.stopping import ResidualRule
+    >>> F = PETSc.Mat().createDense((3, 3), array=np.diag([1.0, 2.0, 4.0]), comm=PETSc.COMM_SELF)
+    >>> d = PETSc.Vec().createWithArray(np.array([1.0, 1.0, 2.0]), comm=PETSc.COMM_SELF)
+    >>> qp = QP(F, d, DenseCoarse(np.ones((1, 3)), np.ones(1)), Product())
+    >>> result = solve_by_pcpg(qp, homogenise(qp), ResidualRule(1e-12))
+    >>> result.reason.name, result.lam.array.round(6).tolist()
+    ('CONVERGED_RTOL', [0.428571, 0.214286, 0.357143])
 
     Args:
         qp: The program; its feasible set is not looked at.
-        homogenised: Its homogenised form.
+        homogenised: Its homogenised form, whose λ̄ is the start.
         rule: Says when ‖P(d − Fλ)‖ is small enough.
         max_it: Most steps.
         monitor: Called after each step.
@@ -33,88 +129,49 @@ def pcpg(
     Returns:
         The multipliers, the gradient Fλ − d up to the range of Gᵀ, the reason, the residuals.
     """
-    lam, r = homogenised.lam_bar.copy(), homogenised.b.copy()
-    p, Fp, z, g = (r.duplicate() for _ in range(4))
-    steps, rz, fresh, norm = Steps(), 1.0, True, r.norm()
-    reason = ConvergedReason.ITERATING
-    monitor(steps, "start", lam, norm, 0.0)
-    while True:
-        # test
-        if norm <= rule.tolerance:
-            reason = _examine(rule, lam, r, g)
-        if rule.drifted:
-            _residual(qp, lam, r, g)
-            fresh, rule.drifted = True, False
-        if reason == ConvergedReason.ITERATING and steps.cg >= max_it:
-            reason = ConvergedReason.DIVERGED_ITS
-        if reason != ConvergedReason.ITERATING:
-            break
-        # precondition and project: z = P M r
-        _precondition(qp, r, z, g)
-        # direction
-        rz, previous = r.dot(z), rz
-        p.aypx(0.0 if fresh else rz / previous, z)
-        # step
-        qp.F.mult(p, Fp)
-        project(qp.coarse, Fp, g)
-        pFp = p.dot(Fp)
-        if not (pFp > 0.0 and rz > 0.0):
-            reason = _broken(rule, lam, r, g, homogenised)
-            break
-        lam.axpy(rz / pFp, p)
-        r.axpy(-rz / pFp, Fp)
-        fresh, norm = False, r.norm()
-        steps.cg += 1
-        monitor(steps, "cg", lam, norm, 0.0)
-    r.scale(-1.0)
-    lam.copy(z)
-    z.axpy(-1.0, homogenised.lam_bar)
+    lam, g, steps = homogenised.lam_bar.copy(), homogenised.gradient.copy(), Steps()
+    monitor(steps, "start", lam, homogenised.b.norm(), 0.0)
+    reason = pcpg(qp, lam, g, rule, steps, max_it, monitor)
+    qp.coarse.project(g)
+    norm = g.norm()
+    if reason == ConvergedReason.DIVERGED_INDEFINITE_MAT and homogenised.is_rounding(norm):
+        reason = ConvergedReason.DIVERGED_ROUNDING
+    moved = lam.copy()
+    moved.axpy(-1.0, homogenised.lam_bar)
     result = QPResult(
         lam=lam,
-        mu=qp.coarse.coordinates(r),
-        gradient=r,
+        mu=qp.coarse.coordinates(g),
+        gradient=g,
+        face=_face(qp, lam, g),
         reason=reason,
         projected_gradient=norm,
-        equality=qp.coarse.norm_Q(z),
-        reference=homogenised.reference,
+        equality=qp.coarse.norm_Q(moved),
+        reference=homogenised.scale.reference,
         norm=0.0,
         steps=steps,
     )
-    for vec in (p, Fp, z, g):
-        vec.destroy()
+    moved.destroy()
     return result
 
 
-def _examine(rule: StoppingRule, lam: PETSc.Vec, r: PETSc.Vec, g: PETSc.Vec) -> ConvergedReason:
-    """Ask the rule; its gradient is g = −r."""
-    r.copy(g)
-    g.scale(-1.0)
-    return rule.examine(lam, g, r.norm())
+def _face(qp: QP, lam: PETSc.Vec, g: PETSc.Vec) -> Face:
+    """The face of λ."""
+    return qp.feasible.face(lam.array_r, g.array_r)
 
 
-def _broken(
-    rule: StoppingRule, lam: PETSc.Vec, r: PETSc.Vec, g: PETSc.Vec, homogenised: Homogenised
-) -> ConvergedReason:
-    """Why there is no direction with a positive curvature: all is done, rounding, or F."""
-    reason = _examine(rule, lam, r, g)
-    if reason != ConvergedReason.ITERATING:
-        return reason
-    if homogenised.is_rounding(r.norm()):
-        return ConvergedReason.DIVERGED_ROUNDING
-    return ConvergedReason.DIVERGED_INDEFINITE_MAT
+def _residual(qp: QP, g: PETSc.Vec, r: PETSc.Vec | None = None) -> PETSc.Vec:
+    """r = −P g."""
+    r = g.duplicate() if r is None else r
+    g.copy(r)
+    r.scale(-1.0)
+    qp.coarse.project(r)
+    return r
 
 
-def _residual(qp: QP, lam: PETSc.Vec, r: PETSc.Vec, work: PETSc.Vec) -> None:
-    """r = P(d − Fλ), anew."""
-    qp.F.mult(lam, r)
-    r.aypx(-1.0, qp.d)
-    project(qp.coarse, r, work)
-
-
-def _precondition(qp: QP, r: PETSc.Vec, z: PETSc.Vec, work: PETSc.Vec) -> None:
+def _precondition(qp: QP, r: PETSc.Vec, z: PETSc.Vec) -> None:
     """z = P M r, M the preconditioner or the identity."""
     if qp.preconditioner is None:
         r.copy(z)
     else:
         qp.preconditioner.mult(r, z)
-        project(qp.coarse, z, work)
+        qp.coarse.project(z)

@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Protocol
 
-import numpy as np
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.qp.coarse import Coarse
+from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 
 
@@ -19,60 +20,6 @@ class Operator(Protocol):
     def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = A x. Collective."""
         ...
-
-
-class Coarse(Protocol):
-    """The constraint Gλ = e through its orthogonal projectors Q = Gᵀ(GGᵀ)⁻¹G and P = I − Q."""
-
-    def apply_Q(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = Q x. Collective."""
-        ...
-
-    def norm_Q(self, x: PETSc.Vec) -> float:
-        """‖Q x‖. Collective."""
-        ...
-
-    def particular(self, x: PETSc.Vec) -> None:
-        """x = Gᵀ(GGᵀ)⁻¹e, the smallest solution of Gλ = e. Collective."""
-        ...
-
-    def coordinates(self, x: PETSc.Vec) -> Array:
-        """(GGᵀ)⁻¹G x, replicated. Collective."""
-        ...
-
-    def combine(self, mu: Array, x: PETSc.Vec) -> None:
-        """x = Gᵀ μ."""
-        ...
-
-
-class NoCoarse:
-    """No equality constraint: Q = 0, at no cost."""
-
-    def apply_Q(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = 0."""
-        y.set(0.0)
-
-    def norm_Q(self, x: PETSc.Vec) -> float:
-        """0."""
-        return 0.0
-
-    def particular(self, x: PETSc.Vec) -> None:
-        """x = 0."""
-        x.set(0.0)
-
-    def coordinates(self, x: PETSc.Vec) -> Array:
-        """None."""
-        return np.zeros(0)
-
-    def combine(self, mu: Array, x: PETSc.Vec) -> None:
-        """x = 0."""
-        x.set(0.0)
-
-
-def project(coarse: Coarse, x: PETSc.Vec, work: PETSc.Vec) -> None:
-    """x ← P x in place. Collective."""
-    coarse.apply_Q(x, work)
-    x.axpy(-1.0, work)
 
 
 @dataclass(frozen=True)
@@ -85,6 +32,7 @@ class QP:
         coarse: Projectors of G, and a particular solution of Gλ = e.
         feasible: The set Ω.
         preconditioner: Approximate inverse of F, or None.
+        norm: Estimate of ‖PFP‖, which step lengths are relative to; 1 where nobody asks.
     """
 
     F: Operator
@@ -92,11 +40,13 @@ class QP:
     coarse: Coarse
     feasible: FeasibleSet
     preconditioner: Operator | None = None
+    norm: float = 1.0
 
 
 class ConvergedReason(IntEnum):
     """Why a solver stopped; positive: converged. Values as in KSPConvergedReason, where it has one.
 
+    ITERATING: it has not stopped.
     DIVERGED_ROUNDING: residuals cannot be brought down any further in floating point.
     DIVERGED_STALLED: Gλ = e comes no nearer, as if nothing in Ω fulfilled it.
     """
@@ -131,8 +81,9 @@ class QPResult:
 
     Attributes:
         lam: The multipliers λ.
-        mu: Multipliers of Gλ = e.
+        mu: Multipliers μ of Gλ = e: the gradient is P(Fλ − d) + Gᵀμ.
         gradient: Fλ − d up to the range of Gᵀ; on bound components the multiplier ν.
+        face: The face of λ, in which rows that carry a force are free.
         reason: Why the solver stopped.
         projected_gradient: ‖g^P‖ at the end.
         equality: ‖Q x‖ at the end, x the homogenised unknown.
@@ -144,6 +95,7 @@ class QPResult:
     lam: PETSc.Vec
     mu: Array
     gradient: PETSc.Vec
+    face: Face
     reason: ConvergedReason
     projected_gradient: float
     equality: float

@@ -6,6 +6,7 @@ from typing import Protocol
 
 from petsc4py import PETSc
 
+from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.problem import ConvergedReason
 
 
@@ -24,12 +25,15 @@ class StoppingRule(Protocol):
     tolerance: float
     drifted: bool
 
-    def examine(self, lam: PETSc.Vec, gradient: PETSc.Vec, residual: float) -> ConvergedReason:
+    def examine(
+        self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float
+    ) -> ConvergedReason:
         """Examine an iterate whose residuals are small. Collective.
 
         Args:
             lam: The multipliers λ.
             gradient: Fλ − d up to the range of Gᵀ.
+            face: The face of λ: which rows carry a force.
             residual: max(‖g^P‖, ‖F‖‖Qx‖).
 
         Returns:
@@ -48,6 +52,8 @@ class ResidualRule:
     def __init__(self, tolerance: float) -> None:
         self.tolerance, self.drifted = tolerance, False
 
-    def examine(self, lam: PETSc.Vec, gradient: PETSc.Vec, residual: float) -> ConvergedReason:
+    def examine(
+        self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float
+    ) -> ConvergedReason:
         """Content."""
         return ConvergedReason.CONVERGED_RTOL

@@ -1,0 +1,215 @@
+"""The coarse problem on faces: projectors of G_f = GZ, against dense ones; PCPG on a face."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bodies import held, pressed, stacked, two_body_problem
+from scenes import decomposed, problem
+from scipy.sparse import coo_array, csr_array
+from test_qp import matrix, random_program, vector
+from test_solvable_lp import dual_of
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
+from tfeti_dolfinx.qp.faces import Face, Status, face_of
+from tfeti_dolfinx.qp.feasible_sets import Product
+from tfeti_dolfinx.qp.pcpg import pcpg
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Steps
+from tfeti_dolfinx.qp.stopping import ResidualRule
+
+
+def in_a_corner():
+    """A block that contact with three planes holds, and nothing else."""
+    d = decomposed("hexahedron", 3, subdomains=4)
+    planes = {"bottom": (0, 0, 1), "left": (1, 0, 0), "front": (0, 1, 0)}
+    contacts = [tfeti.Obstacle(name, tfeti.Plane((0, 0, 0), n)) for name, n in planes.items()]
+    return problem(d, (-0.01, -0.02, -0.05), contacts, clamped=())
+
+
+def on_a_block():
+    """A block on another one, which holds it in one direction."""
+    d = stacked("quadrilateral", 3, 4, 5)
+    sides = held(d, "lower bottom", "upper left")
+    contact = tfeti.Contact("lower top", "upper bottom")
+    return two_body_problem(d, pressed(d, 1e-2), sides, [contact])
+
+
+@pytest.fixture(scope="module", params=[in_a_corner, on_a_block])
+def dual(request):
+    p = request.param()
+    yield dual_of(p)
+    p.destroy()
+
+
+def mask(dual, kept):
+    """The face of the equality rows and of those contact rows that are kept."""
+    free = np.ones(dual.constraints.num_rows, dtype=bool)
+    bounded = np.arange(len(free))[dual.constraints.sets.normals]
+    free[bounded] = kept(bounded)
+    return face_of(free, np.where(free, Status.TOUCHING, Status.OPEN))
+
+
+def sliding(dual):
+    """A face of pairs of contact rows, one direction for two rows, as slip has it."""
+    m = dual.constraints.num_rows
+    bounded = np.arange(m)[dual.constraints.sets.normals]
+    first, rest = np.setdiff1d(np.arange(m), bounded), len(bounded) // 2
+    angle = np.arange(rest) + 0.3
+    rows = np.concatenate((first, bounded[0 : 2 * rest : 2], bounded[1 : 2 * rest : 2]))
+    around = len(first) + np.arange(rest)
+    columns = np.concatenate((np.arange(len(first)), around, around))
+    values = np.concatenate((np.ones(len(first)), np.cos(angle), np.sin(angle)))
+    Z = coo_array((values, (rows, columns)), shape=(m, len(first) + rest))
+    return Face(csr_array(Z), np.zeros(Z.shape[1]), np.full(m, Status.SLIP))
+
+
+FACES = {
+    "all": lambda dual: mask(dual, lambda rows: rows >= 0),
+    "open": lambda dual: mask(dual, lambda rows: rows < 0),
+    "every third": lambda dual: mask(dual, lambda rows: rows % 3 == 0),
+    "one row": lambda dual: mask(dual, lambda rows: rows == rows.min(initial=0)),
+    "sliding": sliding,
+}
+
+
+def random_vec(dual, seed):
+    vec = dual.d.duplicate()
+    rng = np.random.default_rng(10 * seed + dual.coarse.comm.rank)
+    vec.array[:] = rng.standard_normal(vec.getLocalSize())
+    return vec
+
+
+def gathered(dual, rows):
+    """Rows of all ranks, dense."""
+    return np.concatenate(dual.coarse.comm.allgather(np.asarray(rows)))
+
+
+@pytest.mark.parametrize("kind", list(FACES))
+def test_projectors_of_a_face(dual, kind):
+    """P is idempotent, symmetric, kills Z G_fᵀ and what is not in Z, and is the dense one."""
+    face = FACES[kind](dual)
+    coarse = dual.coarse.on_face(face)
+    x, y, Px, Py, Qx = (random_vec(dual, seed) for seed in range(5))
+    for vec, copy in ((x, Px), (y, Py)):
+        vec.copy(copy)
+        coarse.project(copy)
+    size = x.norm() * y.norm()
+    assert abs(Px.dot(y) - x.dot(Py)) <= 1e-10 * size
+    twice = Px.copy()
+    coarse.project(twice)
+    twice.axpy(-1.0, Px)
+    assert twice.norm() <= 1e-10 * x.norm()
+    assert np.allclose(face.restricted(Px.array_r), Px.array_r, atol=1e-10)
+    coarse.apply_Q(x, Qx)
+    assert coarse.norm_Q(x) == pytest.approx(Qx.norm(), rel=1e-8)
+    assert np.allclose(Px.array_r + Qx.array_r, face.restricted(x.array_r), atol=1e-9)
+    mu = np.random.default_rng(0).standard_normal(dual.coarse.dimension)
+    coarse.combine(mu, y)
+    size = y.norm()
+    coarse.project(y)
+    assert y.norm() <= 1e-9 * size
+    Gt = gathered(dual, face.restricted(dual.coarse.Gt.toarray()))
+    U, values, _ = np.linalg.svd(Gt, full_matrices=False)
+    U = U[:, values > 1e-9 * values[0]]
+    masked = gathered(dual, face.restricted(x.array_r))
+    assert np.allclose(gathered(dual, Px.array_r), masked - U @ (U.T @ masked), atol=1e-8)
+    coarse.destroy()
+
+
+def test_the_whole_face_is_no_face(dual):
+    x, y = random_vec(dual, 7), random_vec(dual, 7)
+    coarse = dual.coarse.on_face(FACES["all"](dual))
+    coarse.project(x)
+    dual.coarse.project(y)
+    assert np.allclose(x.array_r, y.array_r, atol=1e-12)
+    coarse.destroy()
+
+
+@pytest.mark.parametrize("kind", list(FACES))
+def test_the_particular_solution_of_a_face_is_its_best(dual, kind):
+    """Gλ = e where the face can, with rows of the face alone; else the residual is orthogonal."""
+    face = FACES[kind](dual)
+    coarse, lam = dual.coarse.on_face(face), dual.d.duplicate()
+    coarse.particular(lam)
+    assert np.allclose(face.restricted(lam.array_r), lam.array_r)
+    left = dual.coarse.e - dual.coarse.G(lam.array_r)
+    Gt = gathered(dual, face.restricted(dual.coarse.Gt.toarray()))
+    rank = np.linalg.matrix_rank(Gt, tol=1e-9 * np.linalg.norm(Gt, 2))
+    if rank == dual.coarse.dimension - dual.coarse.num_free_motions:
+        assert np.linalg.norm(left) <= 1e-9 * np.linalg.norm(dual.coarse.e)
+    coarse.destroy()
+
+
+def test_some_faces_lack_rank(dual):
+    """The tests above are about them, too."""
+    Gt = gathered(dual, FACES["open"](dual).restricted(dual.coarse.Gt.toarray()))
+    rank = np.linalg.matrix_rank(Gt, tol=1e-9 * np.linalg.norm(Gt, 2))
+    assert rank < dual.coarse.dimension - dual.coarse.num_free_motions
+
+
+def test_factors_of_faces_are_counted_apart(dual):
+    before = dual.coarse.factors.count["face"]
+    first = dual.coarse.on_face(FACES["open"](dual))
+    second = first.on_face(FACES["all"](dual))
+    assert dual.coarse.factors.count == {"whole": 1, "face": before + 2}
+    x, y = random_vec(dual, 3), random_vec(dual, 3)
+    second.project(x)
+    dual.coarse.project(y)
+    assert np.allclose(x.array_r, y.array_r, atol=1e-12)
+    first.destroy()
+    second.destroy()
+
+
+def test_without_a_coarse_problem_a_face_only_masks():
+    face = face_of(np.array([True, False, True]), np.zeros(3))
+    x = vector([1.0, 2.0, 3.0])
+    NoCoarse().on_face(face).project(x)
+    assert np.array_equal(x.array_r, [1.0, 0.0, 3.0])
+
+
+def pairs_and_rows():
+    """The first 20 rows, one direction in each of 5 pairs, and no rows of the last 10."""
+    angle = np.arange(5.0)
+    rows = np.concatenate((np.arange(20), np.arange(20, 30, 2), np.arange(21, 30, 2)))
+    columns = np.concatenate((np.arange(20), 20 + np.arange(5), 20 + np.arange(5)))
+    values = np.concatenate((np.ones(20), np.cos(angle), np.sin(angle)))
+    Z = csr_array(coo_array((values, (rows, columns)), shape=(40, 25)))
+    return Face(Z, np.zeros(25), np.zeros(40))
+
+
+@pytest.mark.parametrize("preconditioned", [False, True])
+@pytest.mark.parametrize("with_coarse", [False, True])
+def test_pcpg_on_a_face(preconditioned, with_coarse):
+    """It moves in the face alone, keeps Gλ, and knows the gradient on all rows."""
+    F, d, G, e, _ = random_program(4)
+    face = pairs_and_rows()
+    Z = face.Z.toarray()
+    coarse = DenseCoarse(G, e) if with_coarse else NoCoarse()
+    qp = QP(matrix(F), vector(d), coarse, Product())
+    helper = matrix(Z @ np.linalg.inv(Z.T @ F @ Z) @ Z.T) if preconditioned else None
+    on_face = replace(qp, coarse=coarse.on_face(face), preconditioner=helper)
+    start = np.random.default_rng(5).standard_normal(40)
+    lam, g, steps = vector(start), vector(F @ start - d), Steps()
+    reason = pcpg(on_face, lam, g, ResidualRule(1e-11), steps, 100)
+    assert reason == ConvergedReason.CONVERGED_RTOL
+    assert steps.cg <= (12 if preconditioned else 26)
+    assert np.allclose(g.array_r, F @ lam.array_r - d, atol=1e-9)
+    GZ = G @ Z if with_coarse else np.zeros((0, 25))
+    r = len(GZ)
+    KKT = np.block([[Z.T @ F @ Z, GZ.T], [GZ, np.zeros((r, r))]])
+    right = np.concatenate((-Z.T @ (F @ start - d), np.zeros(r)))
+    exact = start + Z @ np.linalg.solve(KKT, right)[:25]
+    assert np.allclose(lam.array_r, exact, atol=1e-9)
+
+
+def test_pcpg_from_its_solution_takes_no_step():
+    F, d, G, e, _ = random_program(6)
+    qp = QP(matrix(F), vector(d), DenseCoarse(G, e), Product())
+    lam, steps = vector(np.linalg.lstsq(G, e, rcond=None)[0]), Steps()
+    g = vector(F @ lam.array_r - d)
+    assert pcpg(qp, lam, g, ResidualRule(1e-10), steps, 100) > 0
+    taken = steps.cg
+    assert taken > 0
+    assert pcpg(qp, lam, g, ResidualRule(1e-9), steps, 100) > 0
+    assert steps.cg == taken

@@ -1,0 +1,164 @@
+"""Feasible sets keep their contract, products of them too, and what does not is named."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from discs import Discs
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tfeti_dolfinx import InputError
+from tfeti_dolfinx.errors import ConformanceError
+from tfeti_dolfinx.qp.conformance import check_feasible_set
+from tfeti_dolfinx.qp.faces import Status, face_of
+from tfeti_dolfinx.qp.feasible_sets import Bounds, Product
+
+
+@pytest.mark.parametrize(
+    "feasible",
+    [Bounds(), Product(), Product([(slice(3, 20), Bounds())]), Product([(slice(0, 0), Bounds())])],
+)
+def test_feasible_sets_fulfil_their_contract(feasible):
+    check_feasible_set(feasible, 30)
+
+
+@given(st.integers(0, 10_000), st.floats(-2, 2))
+def test_bounds_fulfil_their_contract_for_any_bound(seed, level):
+    rng = np.random.default_rng(seed)
+    where = np.flatnonzero(rng.random(12) < 0.5)
+    lower = level + rng.standard_normal(len(where))
+    check_feasible_set(Product([(where, Bounds(lower))]), 12, seed)
+
+
+@given(st.integers(0, 10_000))
+def test_discs_fulfil_the_contract(seed):
+    rng = np.random.default_rng(seed)
+    radius = rng.uniform(0.1, 3.0, 6) * (rng.random(6) < 0.8)
+    check_feasible_set(Discs(radius, rng.standard_normal((6, 2))), 12, seed)
+
+
+def friction(seed=0):
+    """Equalities, normals and discs on rows in no order, as a contact law would put them."""
+    rng = np.random.default_rng(seed)
+    order = rng.permutation(20)
+    normals, tangents = order[5:10], order[10:]
+    radius = rng.uniform(0.5, 2.0, 5)
+    return Product([(normals, Bounds()), (tangents, Discs(radius))]), normals, tangents
+
+
+@given(st.integers(0, 1000))
+def test_a_product_of_bounds_and_discs_fulfils_the_contract(seed):
+    check_feasible_set(friction(seed)[0], 20, seed)
+
+
+def test_the_face_of_a_product_says_what_each_row_does():
+    feasible, normals, tangents = friction()
+    rng = np.random.default_rng(1)
+    x, g = feasible.project(1.2 * rng.standard_normal(20)), rng.standard_normal(20)
+    face = feasible.face(x, g)
+    free = np.setdiff1d(np.arange(20), np.concatenate((normals, tangents)))
+    assert np.all(face.status[free] == Status.FREE)
+    assert np.array_equal(face.status[normals] == Status.OPEN, x[normals] == 0.0)
+    slip = face.status[tangents] == Status.SLIP
+    assert 0 < slip.sum() < 10
+    assert np.array_equal(face.carrying, face.status != Status.OPEN)
+    assert np.array_equal(face.carrying & ~face.holding, face.status == Status.SLIP)
+    assert np.array_equal(face.constrained, np.isin(np.arange(20), np.r_[normals, tangents]))
+    assert face.Z.shape[1] == face.holding.sum() + slip.sum() // 2
+    y = face.restricted(rng.standard_normal(20))
+    assert np.allclose(face.restricted(y), y)
+    assert np.all(y[face.status == Status.OPEN] == 0.0)
+    pairs = (x * y)[tangents].reshape(-1, 2).sum(axis=1)  # on circles only around the centre
+    assert np.allclose(pairs[slip[::2]], 0.0)
+
+
+def test_a_row_in_two_sets_is_named():
+    with pytest.raises(InputError, match="Product: row 4 stands in two sets; expected one at most"):
+        Product([(slice(0, 5), Bounds()), (np.array([7, 4]), Bounds())])
+
+
+class NotNearest(Bounds):
+    def project(self, x):
+        return np.abs(x)
+
+
+class NotIdempotent(Bounds):
+    def project(self, x):
+        return np.where(x > 0, x, x / 2)
+
+
+class TooLong(Bounds):
+    def max_step(self, x, p):
+        return 2.0 * super().max_step(x, p)
+
+
+class WrongSign(Bounds):
+    def split(self, x, g):
+        phi, beta = super().split(x, g)
+        return phi, -beta
+
+
+class LongReduced(Bounds):
+    def reduced(self, x, phi, alpha):
+        return 2.0 * phi
+
+
+class Unshifted(Bounds):
+    def shifted(self, shift):
+        return self
+
+
+class FaceWithOpenRows(Bounds):
+    def face(self, x, g):
+        return face_of(np.ones(len(x), dtype=bool), super().face(x, g).status)
+
+
+class AllTouching(Bounds):
+    def face(self, x, g):
+        return face_of(np.ones(len(x), dtype=bool), np.full(len(x), Status.TOUCHING))
+
+
+class Missing(Bounds):
+    def face(self, x, g):
+        return face_of(np.zeros(len(x), dtype=bool), super().face(x, g).status)
+
+
+class Scaled(Bounds):
+    def face(self, x, g):
+        face = super().face(x, g)
+        return replace(face, Z=2.0 * face.Z)
+
+
+class WithoutStatus(Bounds):
+    def face(self, x, g):
+        return replace(super().face(x, g), status=np.zeros(0))
+
+
+class Flat(Discs):
+    def face(self, x, g):
+        face = super().face(x, g)
+        return replace(face, curvature=0.0 * face.curvature)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        (NotNearest(), r"P\(x\) is the nearest point"),
+        (NotIdempotent(), r"P\(P\(x\)\) = P\(x\)|nearest point"),
+        (TooLong(), "largest step"),
+        (WrongSign(), "φ \\+ β is the projected gradient"),
+        (LongReduced(), "0 ≤ φ̃ᵀφ ≤ φᵀφ"),
+        (Unshifted(), "shifted"),
+        (FaceWithOpenRows(), "open rows are not in Z"),
+        (AllTouching(), r"x \+ Zt stays in Ω"),
+        (Missing(), "rows that are held are free in Z"),
+        (Scaled(), "columns of Z are orthonormal"),
+        (WithoutStatus(), "a status for each row"),
+        (Flat(np.full(5, 0.05)), "bends by"),
+    ],
+    ids=lambda value: type(value).__name__ if not isinstance(value, str) else "",
+)
+def test_what_does_not_conform_is_named(wrong, words):
+    with pytest.raises(ConformanceError, match=words):
+        check_feasible_set(wrong, 10)

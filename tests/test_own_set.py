@@ -1,0 +1,60 @@
+"""A feasible set of one's own, a half space per row: glue that lets go at a limit."""
+
+import numpy as np
+import pytest
+from scenes import curved_obstacle, decomposed, problem
+
+from tfeti_dolfinx import Extensions, Obstacle
+from tfeti_dolfinx.qp.conformance import check_feasible_set
+from tfeti_dolfinx.qp.faces import Status, face_of
+from tfeti_dolfinx.qp.feasible_sets import Product
+
+
+class HalfSpaces:
+    def __init__(self, a, b):
+        self.a, self.b = a, b
+
+    def project(self, x):
+        return np.where(self.a * x > self.b, self.b / self.a, x)
+
+    def _bound(self, x):
+        return self.a * x >= self.b - 1e-14 * np.abs(self.b)
+
+    def split(self, x, g):
+        bound = self._bound(x)
+        return np.where(bound, 0.0, g), np.where(bound, np.minimum(g, 0.0), 0.0)
+
+    def reduced(self, x, phi, alpha):
+        return np.minimum(phi, (x - self.b / self.a) / alpha)
+
+    def max_step(self, x, p):
+        down = self.a * p < 0.0
+        return np.min((self.a * x - self.b)[down] / (self.a * p)[down], initial=np.inf)
+
+    def shifted(self, shift):
+        return HalfSpaces(self.a, self.b - self.a * shift)
+
+    def face(self, x, g):
+        off = ~self._bound(x)
+        return face_of(off, np.where(off, Status.TOUCHING, Status.OPEN))
+
+
+def test_it_conforms():
+    check_feasible_set(HalfSpaces(-np.arange(1.0, 11.0), np.linspace(-1.0, 2.0, 10)), 10)
+
+
+@pytest.mark.parametrize("limit", [0.0, 1e-4, 1e6])
+def test_glue_that_lets_go_at_a_limit(limit):
+    def pulling(constraints):
+        half_spaces = HalfSpaces(-constraints.scale, np.full(len(constraints.scale), limit))
+        return Product([(constraints.sets.normals, half_spaces)])
+
+    obstacle, own = Obstacle("bottom", curved_obstacle(3)), Extensions(feasible_set=pulling)
+    p = problem(decomposed("hexahedron", 4, 6), contacts=[obstacle], extensions=own, rtol=1e-9)
+    noise = 1e-7 * p.solve().x.petsc_vec.norm(3)
+    rows = p.solution.gluing.contact.condition
+    force, gap = p.solution.force[rows], p.solution.remaining_gap[rows]
+    assert np.all(gap >= -noise)
+    assert np.allclose(force[gap > noise], -limit, rtol=1e-9)
+    both = p.dofs.comm.allgather((np.any(force < -1e-12), np.any(gap > noise)))
+    assert np.any(both, axis=0).tolist() == [limit > 0.0, limit < 1.0]

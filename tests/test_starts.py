@@ -1,0 +1,133 @@
+"""What a second solve costs, and what may be put into solvers from outside."""
+
+import numpy as np
+import pytest
+from scenes import curved_obstacle, decomposed, problem
+from test_qp import bounds_on, matrix, random_program, to, vector
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.qp.coarse import DenseCoarse
+from tfeti_dolfinx.qp.homogenised import homogenise, image, natural, scale_at, scale_near
+from tfeti_dolfinx.qp.mprgp import EXPANSIONS
+from tfeti_dolfinx.qp.parameters import SmalseParameters
+from tfeti_dolfinx.qp.problem import QP
+from tfeti_dolfinx.qp.smalse import smalse
+from tfeti_dolfinx.solver import solve_dual
+
+
+def scene(contacts, **options):
+    obstacle = tfeti.Obstacle("bottom", curved_obstacle(3))
+    p = problem(decomposed("hexahedron", 4, 6), contacts=[obstacle] * contacts, **options)
+    p.solve()
+    return p, p._start[1:]
+
+
+def cost(p, qp_type, start, **options):
+    """Multiplications that the solver is charged with, the power method's, and the answer."""
+    dual, counts = p.dual, p.dual.F.count
+    before = counts["solver"], counts["power method"]
+    result, accuracy = solve_dual(dual, Options(**options), qp_type, start)
+    assert result.reason > 0
+    result.destroy()
+    u = accuracy.u
+    return counts["solver"] - before[0], counts["power method"] - before[1], u
+
+
+def forget(p):
+    """As if the dual problem were new."""
+    for _, found in p.dual._images.values():
+        found.destroy()
+    p.dual._images.clear()
+
+
+@pytest.mark.parametrize("qp_type", ["pcpg", "smalse"])
+@pytest.mark.parametrize("contacts", [0, 1])
+def test_a_solve_from_its_own_solution(qp_type, contacts):
+    """PCPG multiplies once, SMALSE-M twice, once less if F λ̄ is known from before."""
+    if qp_type == "pcpg" and contacts:
+        pytest.skip("PCPG keeps no bounds")
+    p, start = scene(contacts, tfeti_qp_type=qp_type)
+    u = p.dofs.to_primal(p.u.x.array)
+    multiplied, power, again = cost(p, qp_type, start)
+    assert (multiplied, power) == (1, 0)
+    assert np.allclose(again, u, rtol=0.0, atol=1e-8 * np.abs(u).max(initial=0.0))
+    forget(p)
+    multiplied, power, again = cost(p, qp_type, start)
+    assert (multiplied, power) == (1 if qp_type == "pcpg" else 2, 0)
+    assert np.allclose(again, u, rtol=0.0, atol=1e-8 * np.abs(u).max(initial=0.0))
+    p.destroy()
+
+
+def test_pcpg_from_multipliers_that_do_not_balance_the_load():
+    """Gλ = e is restored without a multiplication."""
+    p, (lam, mu) = scene(0)
+    u = p.dofs.to_primal(p.u.x.array)
+    cold, _, _ = cost(p, "pcpg", None)
+    start = (lam * (1.0 + 1e-4 * np.cos(np.arange(len(lam)))), mu)
+    warm, _, again = cost(p, "pcpg", start)
+    assert 1 < warm < cold
+    assert np.allclose(again, u, rtol=0.0, atol=1e-5 * p.u.x.petsc_vec.norm())
+    p.destroy()
+
+
+def test_known_images_cost_nothing():
+    F, d, G, e, bounded = random_program(3)
+    counted = Counted(matrix(F))
+    qp = QP(counted, vector(d), DenseCoarse(G, e), bounds_on(bounded))
+    at = image(qp.F, natural(qp.coarse, qp.d))
+    assert counted.count == 1
+    from_image, cold = homogenise(qp, at), homogenise(qp)
+    assert counted.count == 2
+    assert np.array_equal(from_image.b.array_r, cold.b.array_r)
+    assert from_image.scale == cold.scale
+    assert np.allclose(from_image.gradient.array_r, F @ at.x.array_r - d)
+    other = image(qp.F, vector(np.linalg.lstsq(G, e, rcond=None)[0]))
+    assert homogenise(qp, other, scale_at(qp, at)).scale == cold.scale
+    near = scale_near(qp, other)
+    assert counted.count == 3
+    assert near.reference >= np.linalg.norm(homogenise(qp, other).b.array_r) / 2
+
+
+class Counted:
+    """An operator that counts."""
+
+    def __init__(self, A):
+        self.A, self.count = A, 0
+
+    def mult(self, x, y):
+        self.count += 1
+        self.A.mult(x, y)
+
+
+@pytest.mark.parametrize(("qp_type", "contacts"), [("pcpg", 0), ("smalse", 1)])
+def test_a_monitor_of_one_s_own(qp_type, contacts):
+    p, _ = scene(contacts, tfeti_qp_type=qp_type)
+    seen = []
+
+    def monitor(steps, step, x, projected_gradient, equality):
+        seen.append((step, projected_gradient))
+
+    result, _ = solve_dual(p.dual, Options(), qp_type, monitor=monitor)
+    inner = [size for step, size in seen if step not in ("start", "outer")]
+    assert len(inner) == result.steps.inner > 3
+    assert inner[-1] < 0.1 * max(inner)
+    result.destroy()
+    p.destroy()
+
+
+def test_an_expansion_of_one_s_own():
+    F, d, G, e, bounded = random_program(9)
+    qp = QP(matrix(F), vector(d), DenseCoarse(G, e), bounds_on(bounded), norm=np.linalg.norm(F, 2))
+    lengths = []
+
+    def mine(state, alpha_f, alpha_cg, alpha_bar):
+        lengths.append((alpha_f, alpha_cg))
+        EXPANSIONS["fixed"](state, alpha_f, alpha_cg, alpha_bar)
+
+    homogenised = homogenise(qp)
+    own = smalse(qp, homogenised, to(1e-9, homogenised), SmalseParameters(expansion=mine))
+    known = smalse(qp, homogenised, to(1e-9, homogenised))
+    assert len(lengths) == own.steps.expansion == known.steps.expansion > 0
+    assert all(alpha_f < alpha_cg for alpha_f, alpha_cg in lengths)
+    assert np.array_equal(own.lam.array_r, known.lam.array_r)

@@ -1,0 +1,150 @@
+"""Orthogonal projectors of Gλ = e, r-vectors replicated: on all rows, or on a face."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Protocol
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+from scipy.sparse import coo_array, csr_array
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.dual.null_basis import NullBasis
+from tfeti_dolfinx.dual.semidefinite import SemidefiniteFactor
+from tfeti_dolfinx.parallel import agreed
+from tfeti_dolfinx.qp.faces import Face
+
+
+class Factor(Protocol):
+    """A generalised inverse on r-vectors."""
+
+    def solve(self, y: Array) -> Array:
+        """A⁺ y."""
+        ...
+
+    def destroy(self) -> None:
+        """Free it."""
+        ...
+
+
+class Projectors:
+    """P and Q of the rows Gᵀ: what ``Coarse`` of ``qp/coarse.py`` promises, but for faces.
+
+    Attributes:
+        comm: Communicator; all methods but ``combine`` are collective.
+        Gt: This rank's rows of Gᵀ, or of ZZᵀGᵀ, scipy CSR, shape ``(m_local, r)``.
+        e: Right side, shape ``(r,)``.
+    """
+
+    comm: MPI.Intracomm
+    Gt: csr_array
+    e: Array
+    _factor: Factor
+
+    def G(self, x: Array) -> Array:
+        """G x, shape ``(r,)``, from this rank's part of x."""
+        y = self.Gt.T @ x
+        self.comm.Allreduce(MPI.IN_PLACE, y, op=MPI.SUM)
+        return np.asarray(y)
+
+    def solve(self, y: Array) -> Array:
+        """(GGᵀ)⁺ y for y in the range of G, orthogonal to the free modes."""
+        return self._factor.solve(y)
+
+    def restricted(self, x: Array) -> Array:
+        """The part of x in the face: all of it."""
+        return x
+
+    def project(self, x: PETSc.Vec) -> None:
+        """x ← P x."""
+        x.array[:] = self.restricted(x.array_r) - self.Gt @ self.coordinates(x)
+
+    def apply_Q(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """y = Gᵀ(GGᵀ)⁻¹G x."""
+        self.combine(self.coordinates(x), y)
+
+    def norm_Q(self, x: PETSc.Vec) -> float:
+        """‖Q x‖; the same on all ranks, since loops end by it."""
+        Gx = self.G(x.array_r)
+        return agreed(self.comm, float(np.sqrt(max(float(Gx @ self.solve(Gx)), 0.0))))
+
+    def particular(self, x: PETSc.Vec) -> None:
+        """x = Gᵀ(GGᵀ)⁻¹e."""
+        self.combine(self.solve(self.e), x)
+
+    def coordinates(self, x: PETSc.Vec) -> Array:
+        """(GGᵀ)⁻¹G x, shape ``(r,)``."""
+        return self.solve(self.G(x.array_r))
+
+    def combine(self, mu: Array, x: PETSc.Vec) -> None:
+        """x = Gᵀ μ. Not collective."""
+        x.array[:] = self.Gt @ mu
+
+    def destroy(self) -> None:
+        """Free the factor."""
+        self._factor.destroy()
+
+
+class FaceFactors:
+    """Factors of the Gram matrices of faces, counted.
+
+    Args:
+        comm: Communicator.
+        null: What no row resists.
+        prefix: Prefix of the factors' PETSc options.
+
+    Attributes:
+        count: How many factors there were so far: of the whole, and of faces.
+    """
+
+    def __init__(self, comm: MPI.Intracomm, null: NullBasis, prefix: str) -> None:
+        self.comm, self._null, self._prefix = comm, null, prefix
+        self.count: Counter[str] = Counter()
+
+    def factor(self, gram: csr_array, kind: str = "face") -> SemidefiniteFactor:
+        """A factor of a Gram matrix. Collective.
+
+        Raises:
+            FactorError: It could not be made.
+        """
+        self.count[kind] += 1
+        what = f"GGᵀ of the {'coarse problem' if kind == 'whole' else 'rows of a face'}"
+        return SemidefiniteFactor(gram, self._null, self.comm, what, self._prefix)
+
+
+class FaceProjectors(Projectors):
+    """P and Q on a face of the rows: G_f = GZ, vectors in the layout of all rows.
+
+    A face that leaves motions free that all rows hold has a G_f without full rank: harmless for
+    P and Q, since what the factor makes of such a motion G_fᵀ does not see.
+
+    Args:
+        whole: Gᵀ of all rows and e.
+        face: The face.
+        factors: Makes the factor. Collective.
+    """
+
+    def __init__(self, whole: Projectors, face: Face, factors: FaceFactors) -> None:
+        self.comm, self._whole, self._face = whole.comm, whole, face
+        GZt = csr_array(face.Z.T @ whole.Gt)
+        self.Gt, self.e = csr_array(face.Z @ GZt), whole.e
+        self._factor = factors.factor(replicated_gram(GZt, self.comm))
+        self._factors = factors
+
+    def restricted(self, x: Array) -> Array:
+        """ZZᵀ x."""
+        return self._face.restricted(x)
+
+    def on_face(self, face: Face) -> FaceProjectors:
+        """The projectors of another face of all rows."""
+        return FaceProjectors(self._whole, face, self._factors)
+
+
+def replicated_gram(Gt: csr_array, comm: MPI.Intracomm) -> csr_array:
+    """GGᵀ from all ranks' rows of Gᵀ, shape ``(r, r)``; on all ranks. Collective."""
+    local = (Gt.T @ Gt).tocoo()
+    row, column = (np.concatenate(comm.allgather(index)) for index in local.coords)
+    value = np.concatenate(comm.allgather(local.data))
+    return coo_array((value, (row, column)), shape=(Gt.shape[1],) * 2).tocsr()

@@ -1,0 +1,158 @@
+"""Options from a dictionary and the command line."""
+
+from __future__ import annotations
+
+import math
+import re
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from petsc4py import PETSc
+
+from tfeti_dolfinx.checks import checked_type, shown
+from tfeti_dolfinx.described import Parameter, made, parameters_of
+from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.qp.solvers import SOLVERS
+
+# what the factors of the subdomains and of the coarse problem read from PETSc's options
+FACTOR_OPTION = re.compile(r"(sub|coarse)_(pc_factor|mat)_\w+")
+
+
+def parse_options(given: Mapping[str, Any] | None, prefix: str) -> Options:
+    """Options from the command line, else from a dictionary, else the defaults.
+
+    Args:
+        given: Options of the program, with or without the prefix.
+        prefix: Prefix of all options, e.g. ``"tfeti_"``.
+
+    Raises:
+        InputError: An option is unknown, its value does not fit, or the command line has options
+            that PETSc was not given.
+    """
+    named = _without_prefix(given, prefix)
+    database = PETSc.Options(prefix)
+    _check_reached(named, database, prefix)
+    named |= {name: database.getString(name, "") for name in database.getAll()}
+    known = {option.name: option for option in parameters_of(Options)}
+    for name in named:
+        if name not in known and not FACTOR_OPTION.fullmatch(name):
+            raise InputError(
+                f"unknown option -{prefix}{name}; expected one of "
+                + ", ".join(f"-{prefix}{n}" for n in known)
+            )
+    values = {n: _converted(known[n], v, prefix) for n, v in named.items() if n in known}
+    options: Options = made(Options, values)
+    if options.qp_type in SOLVERS:
+        check_preconditioner(options, options.qp_type, prefix)
+    return options
+
+
+def factor_options(given: Mapping[str, Any] | None, prefix: str) -> dict[str, Any]:
+    """Those options of a dictionary that PETSc itself reads, without the prefix."""
+    named = _without_prefix(given, prefix)
+    return {name: value for name, value in named.items() if FACTOR_OPTION.fullmatch(name)}
+
+
+def check_preconditioner(options: Options, qp_type: str, prefix: str) -> None:
+    """Raise if a preconditioner is asked for that the solver would ignore.
+
+    Raises:
+        InputError: The solver takes none, but ``pc_type`` is neither auto nor none.
+    """
+    why = SOLVERS[qp_type].unpreconditioned
+    if why and options.pc_type not in ("auto", "none"):
+        raise InputError(
+            f"-{prefix}pc_type {options.pc_type} with {qp_type}, which solves scenes with "
+            f"contact: {why}; expected auto or none"
+        )
+
+
+def _without_prefix(given: Any, prefix: str) -> dict[str, Any]:
+    """The options given, without the prefix."""
+    if not isinstance(prefix, str) or not re.fullmatch(r"\w+", prefix):
+        raise InputError(
+            f"petsc_options_prefix is {shown(prefix)}; expected letters, digits and underscores, "
+            "such as 'tfeti_'"
+        )
+    if given is None:
+        return {}
+    checked_type(given, Mapping, "petsc_options", "a dictionary such as {'tfeti_rtol': 1e-8}")
+    named: dict[str, Any] = {}
+    for name, value in given.items():
+        checked_type(name, str, f"petsc_options: the key {shown(name)}", "the name of an option")
+        short = name.removeprefix("-").removeprefix(prefix)
+        if short in named:
+            raise InputError(f"petsc_options: -{prefix}{short} is there twice; expected it once")
+        named[short] = value
+    return named
+
+
+def _check_reached(named: Mapping[str, Any], database: PETSc.Options, prefix: str) -> None:
+    """Raise if the command line has options that PETSc was not given."""
+    known = set(named) | set(database.getAll())
+    for word in sys.argv[1:]:
+        if word.startswith(f"-{prefix}") and word.removeprefix(f"-{prefix}") not in known:
+            raise InputError(
+                f"{word} on the command line did not reach PETSc; call petsc4py.init(sys.argv) "
+                "before dolfinx is imported"
+            )
+
+
+def _converted(option: Parameter, value: Any, prefix: str) -> Any:
+    """The value as the type of the option, in its range."""
+    what, kind = f"-{prefix}{option.name}", type(option.default)
+    try:
+        result = CONVERSIONS[kind](value)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(
+            f"{what} {shown(value)}: expected a value of type {kind.__name__}"
+        ) from None
+    choices, fits = option.description.choices, option.description.fits
+    if choices and result not in choices:
+        raise InputError(f"{what} {result}: expected one of {', '.join(choices)}")
+    if kind in (int, float) and not (math.isfinite(result) and fits.holds(result)):
+        raise InputError(f"{what} {result}: expected {fits.text}")
+    return result
+
+
+def _as_bool(value: Any) -> bool:
+    if isinstance(value, str):
+        table = {"": True, "1": True, "true": True, "yes": True, "on": True}
+        table |= {"0": False, "false": False, "no": False, "off": False}
+        if value.lower() not in table:
+            raise ValueError(value)
+        return table[value.lower()]
+    if value is not None and value not in (0, 1):
+        raise ValueError(value)
+    return True if value is None else bool(value)
+
+
+def _as_float(value: Any) -> float:
+    if isinstance(value, (bool, np.bool_)):
+        raise TypeError(value)
+    return float(value)
+
+
+def _as_int(value: Any) -> int:
+    if isinstance(value, str):
+        return int(value)
+    if _as_float(value) != int(value):
+        raise ValueError(value)
+    return int(value)
+
+
+def _as_text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(value)
+    return value
+
+
+CONVERSIONS: dict[type, Callable[[Any], Any]] = {
+    bool: _as_bool,
+    float: _as_float,
+    int: _as_int,
+    str: _as_text,
+}

@@ -1,0 +1,141 @@
+"""The constraint Gλ = e as solvers see it: orthogonal projectors, on all rows or on a face."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from petsc4py import PETSc
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.qp.faces import Face
+
+
+class Coarse(Protocol):
+    """The constraint Gλ = e, λ in a face with the free directions Z.
+
+    With G_f = GZ the projectors are Q = Z G_fᵀ(G_f G_fᵀ)⁺G_f Zᵀ and P = ZZᵀ − Q. Vectors keep the
+    layout of all rows. Without a face Z = I, so that P = I − Q.
+    """
+
+    def project(self, x: PETSc.Vec) -> None:
+        """x ← P x. Collective."""
+        ...
+
+    def apply_Q(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """y = Q x. Collective."""
+        ...
+
+    def norm_Q(self, x: PETSc.Vec) -> float:
+        """‖Q x‖, the same on all ranks. Collective."""
+        ...
+
+    def particular(self, x: PETSc.Vec) -> None:
+        """x = Z G_fᵀ(G_f G_fᵀ)⁺e, the smallest λ in the face that fulfils Gλ = e. Collective."""
+        ...
+
+    def coordinates(self, x: PETSc.Vec) -> Array:
+        """(G_f G_fᵀ)⁺G_f Zᵀ x, replicated. Collective."""
+        ...
+
+    def combine(self, mu: Array, x: PETSc.Vec) -> None:
+        """x = ZZᵀGᵀ μ."""
+        ...
+
+    def on_face(self, face: Face) -> Coarse:
+        """The same constraint on (another) face of all rows. Collective."""
+        ...
+
+    def destroy(self) -> None:
+        """Free what a factor holds. Collective."""
+        ...
+
+
+class NoCoarse:
+    """No equality constraint: Q = 0, at no cost.
+
+    Args:
+        face: The face; default all rows.
+    """
+
+    def __init__(self, face: Face | None = None) -> None:
+        self._face = face
+
+    def project(self, x: PETSc.Vec) -> None:
+        """x ← ZZᵀx."""
+        if self._face is not None:
+            x.array[:] = self._face.restricted(x.array_r)
+
+    def apply_Q(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """y = 0."""
+        y.set(0.0)
+
+    def norm_Q(self, x: PETSc.Vec) -> float:
+        """0."""
+        return 0.0
+
+    def particular(self, x: PETSc.Vec) -> None:
+        """x = 0."""
+        x.set(0.0)
+
+    def coordinates(self, x: PETSc.Vec) -> Array:
+        """None."""
+        return np.zeros(0)
+
+    def combine(self, mu: Array, x: PETSc.Vec) -> None:
+        """x = 0."""
+        x.set(0.0)
+
+    def on_face(self, face: Face) -> NoCoarse:
+        """Only masks."""
+        return NoCoarse(face)
+
+    def destroy(self) -> None:
+        """Nothing to free."""
+
+
+class DenseCoarse:
+    """A constraint from a dense G, for a program on one rank.
+
+    Args:
+        G: Shape ``(r, m)``.
+        e: Shape ``(r,)``.
+        face: The face; default all rows.
+    """
+
+    def __init__(self, G: Array, e: Array, face: Face | None = None) -> None:
+        self._G, self._face, self._e = G, face, e
+        self._Gf = G if face is None else np.asarray((face.Z @ (face.Z.T @ G.T)).T)
+        self._inverse = np.linalg.pinv(self._Gf @ self._Gf.T, hermitian=True)
+
+    def project(self, x: PETSc.Vec) -> None:
+        """x ← P x."""
+        values = x.array_r if self._face is None else self._face.restricted(x.array_r)
+        x.array[:] = values - self._Gf.T @ self.coordinates(x)
+
+    def apply_Q(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """y = Q x."""
+        self.combine(self.coordinates(x), y)
+
+    def norm_Q(self, x: PETSc.Vec) -> float:
+        """‖Q x‖."""
+        return float(np.linalg.norm(self._Gf.T @ self.coordinates(x)))
+
+    def particular(self, x: PETSc.Vec) -> None:
+        """x = Z G_fᵀ(G_f G_fᵀ)⁺e."""
+        self.combine(self._inverse @ self._e, x)
+
+    def coordinates(self, x: PETSc.Vec) -> Array:
+        """(G_f G_fᵀ)⁺G_f Zᵀ x."""
+        return np.asarray(self._inverse @ (self._Gf @ x.array_r))
+
+    def combine(self, mu: Array, x: PETSc.Vec) -> None:
+        """x = ZZᵀGᵀ μ."""
+        x.array[:] = self._Gf.T @ mu
+
+    def on_face(self, face: Face) -> DenseCoarse:
+        """The same G on a face."""
+        return DenseCoarse(self._G, self._e, face)
+
+    def destroy(self) -> None:
+        """Nothing to free."""

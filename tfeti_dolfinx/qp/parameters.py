@@ -1,0 +1,63 @@
+"""Parameters of the solvers; options and documents follow from what stands here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from tfeti_dolfinx.checks import Range
+from tfeti_dolfinx.described import ABOVE_0, described
+from tfeti_dolfinx.qp.mprgp import EXPANSIONS, Expansion, MprgpParameters
+
+
+@dataclass(frozen=True)
+class SmalseParameters:
+    """Parameters of SMALSE-M and of its inner MPRGP, for F scaled to ‖PFP‖ = 1.
+
+    Each says itself what it is; ``expansion`` may be a function of one's own, too.
+    """
+
+    rho: float = described(
+        1.0,
+        "smalse",
+        "penalty ρ in units of ‖PFP‖",
+        name="smalse_rho",
+        symbol="ρ",
+        fits=ABOVE_0,
+    )
+    M: float = described(
+        1.0, "smalse", "M₀ in units of ‖PFP‖", name="smalse_M", symbol="M", fits=ABOVE_0
+    )
+    beta: float = described(
+        0.9,
+        "smalse",
+        "factor β on M, in (0, 1)",
+        name="smalse_beta",
+        symbol="β",
+        fits=Range("between 0 and 1", lambda value: 0.0 < value < 1.0),
+    )
+    eta: float = described(
+        0.1, "smalse", "η in units of ‖b‖", name="smalse_eta", symbol="η", fits=ABOVE_0
+    )
+    gamma: float = described(
+        1.0, "mprgp", "Γ of the proportioning test", name="mpgp_gamma", symbol="Γ", fits=ABOVE_0
+    )
+    alpha_bar: float = described(
+        1.95,
+        "mprgp",
+        "step length ᾱ in units of 1/‖A‖",
+        name="mpgp_alpha",
+        symbol="ᾱ",
+        fits=Range("more than 0, at most 2", lambda value: 0.0 < value <= 2.0),
+    )
+    expansion: str | Expansion = described(
+        "fixed",
+        "mprgp",
+        "expansion step: fixed, or projcg",
+        name="mpgp_expansion",
+        choices=tuple(EXPANSIONS),
+    )
+
+    def inner(self, norm: float) -> MprgpParameters:
+        """Parameters of MPRGP for an operator A of this norm."""
+        expand = EXPANSIONS[self.expansion] if isinstance(self.expansion, str) else self.expansion
+        return MprgpParameters(self.alpha_bar / norm, self.gamma, expand)

@@ -1,0 +1,98 @@
+"""All solvers of the dual problem in one table."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+from tfeti_dolfinx.qp.homogenised import Homogenised
+from tfeti_dolfinx.qp.monitors import Monitor
+from tfeti_dolfinx.qp.parameters import SmalseParameters
+from tfeti_dolfinx.qp.pcpg import solve_by_pcpg
+from tfeti_dolfinx.qp.problem import QP, QPResult, Start
+from tfeti_dolfinx.qp.smalse import smalse
+from tfeti_dolfinx.qp.stopping import StoppingRule
+
+
+class Parameters(Protocol):
+    """What solvers are told: each takes its own."""
+
+    @property
+    def max_it(self) -> int:
+        """Most inner steps, and most outer ones."""
+        ...
+
+    @property
+    def smalse(self) -> SmalseParameters:
+        """Parameters of SMALSE-M."""
+        ...
+
+
+Solve = Callable[[QP, Homogenised, StoppingRule, Parameters, Start | None, Monitor], QPResult]
+
+
+@dataclass(frozen=True)
+class Solver:
+    """A solver, and what to know before it is called.
+
+    Attributes:
+        solve: Solves a program with its homogenised form, from a start if there is one.
+        keeps_bounds: Whether it keeps inequalities.
+        pc_type: Preconditioner that ``auto`` stands for.
+        unpreconditioned: Why it takes no preconditioner; empty if it does.
+        relative_to_norm: Whether its steps are relative to ‖PFP‖.
+        starts_at_lam_bar: Whether λ̄ is where it starts; else λ̄ is as options say.
+    """
+
+    solve: Solve
+    keeps_bounds: bool
+    pc_type: str
+    unpreconditioned: str
+    relative_to_norm: bool
+    starts_at_lam_bar: bool
+
+
+def _pcpg(
+    qp: QP,
+    homogenised: Homogenised,
+    rule: StoppingRule,
+    parameters: Parameters,
+    start: Start | None,
+    monitor: Monitor,
+) -> QPResult:
+    return solve_by_pcpg(qp, homogenised, rule, max_it=parameters.max_it, monitor=monitor)
+
+
+def _smalse(
+    qp: QP,
+    homogenised: Homogenised,
+    rule: StoppingRule,
+    parameters: Parameters,
+    start: Start | None,
+    monitor: Monitor,
+) -> QPResult:
+    own, max_it = parameters.smalse, parameters.max_it
+    return smalse(qp, homogenised, rule, own, max_it=max_it, start=start, monitor=monitor)
+
+
+SOLVERS = {
+    "pcpg": Solver(
+        _pcpg,
+        keeps_bounds=False,
+        pc_type="dirichlet",
+        unpreconditioned="",
+        relative_to_norm=False,
+        starts_at_lam_bar=True,
+    ),
+    "smalse": Solver(
+        _smalse,
+        keeps_bounds=True,
+        pc_type="none",
+        unpreconditioned="SMALSE-M takes no preconditioner, since it would not preserve the bounds",
+        relative_to_norm=True,
+        starts_at_lam_bar=False,
+    ),
+}
+# what auto stands for, without and with inequalities
+AUTO = {False: "pcpg", True: "smalse"}
