@@ -1,6 +1,8 @@
 """One direction of flow: a module imports only from rooms that come before its own."""
 
 import ast
+import statistics
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -9,7 +11,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "tfeti_dolfinx"
 
 # the rooms in their order; those of one line may not import from each other
 ROOMS = [
-    ["errors", "arrays", "version"],
+    ["errors", "arrays", "stages", "version"],
     ["checks", "compat", "parallel", "timing"],
     ["described"],
     ["mesh"],
@@ -24,6 +26,7 @@ ROOMS = [
     ["fields"],
     ["solution"],
     ["report_filling", "solver"],
+    ["system"],
     ["problem"],
     ["draw"],
     ["output", "plot"],
@@ -73,3 +76,59 @@ def test_only_plot_knows_pyvista():
     for path in modules():
         if path.stem not in ("plot", "draw"):
             assert "pyvista" not in path.read_text()
+
+
+def functions(path):
+    """Functions with a body of their own: name, lines of the body, arguments but for self."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if not isinstance(node, ast.FunctionDef):
+            continue
+        body = node.body[1:] if ast.get_docstring(node) is not None else node.body
+        if not body or isinstance(getattr(body[0], "value", None), ast.Constant):
+            continue  # a protocol's
+        arguments = [
+            a.arg for a in [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+        ]
+        lines = body[-1].end_lineno - body[0].lineno + 1
+        yield node.name, lines, len([a for a in arguments if a not in ("self", "cls")])
+
+
+# what a user calls may have as many arguments as the user needs
+DOORS = {"problem.py", "plot.py", "conditions.py", "smalse.py", "build.py", "sparse_block.py"}
+
+
+@pytest.mark.parametrize("path", modules(), ids=lambda p: str(p.relative_to(PACKAGE)))
+def test_functions_stay_small(path):
+    for name, lines, arguments in functions(path):
+        assert lines <= 60, name
+        assert arguments <= 7 or path.name in DOORS, name
+
+
+def test_most_functions_are_very_small():
+    lines = [lines for path in modules() for _, lines, _ in functions(path)]
+    assert statistics.median(lines) <= 7
+
+
+def test_nothing_stands_twice():
+    """No ten lines of code that follow each other, imports apart."""
+    seen = {}
+    for path in modules():
+        lines = [line.strip() for line in path.read_text().splitlines()]
+        code = [s for s in lines if s and not s.startswith(("import ", "from ", "#"))]
+        for k in range(len(code) - 9):
+            block = tuple(code[k : k + 10])
+            assert block not in seen, f"{path.name} and {seen[block]}: {block[0]}"
+            seen[block] = path.name
+
+
+def test_imports_have_no_circle():
+    names = {".".join(p.relative_to(PACKAGE.parent).with_suffix("").parts): p for p in modules()}
+    imports = {
+        name: {
+            node.module
+            for node in ast.walk(ast.parse(path.read_text()))
+            if isinstance(node, ast.ImportFrom) and node.module in names
+        }
+        for name, path in names.items()
+    }
+    assert list(TopologicalSorter(imports).static_order())

@@ -173,5 +173,5 @@ def test_a_given_gap_ends_where_the_reach_does():
     )
     within = geometry.gap <= 0.05
     assert np.allclose(given.gap, np.where(within, -0.01, geometry.gap))
-    assert np.array_equal(given.near, within)
+    assert np.array_equal(given.within_reach, within)
     assert 0 < MPI.COMM_WORLD.allreduce(np.sum(within)) < MPI.COMM_WORLD.allreduce(len(within))

@@ -21,7 +21,7 @@ def solved():
 
 @pytest.fixture(scope="module")
 def dual(solved):
-    return solved._dual
+    return solved.dual
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +32,7 @@ def held_by_contact():
     contacts = [tfeti.Obstacle(name, tfeti.Plane((0, 0, 0), n)) for name, n in planes.items()]
     p = problem(d, (-0.01, -0.02, -0.05), contacts, clamped=())
     p.solve()
-    yield p._dual
+    yield p.dual
     p.destroy()
 
 
@@ -95,7 +95,7 @@ def test_gram_is_G_Gt(dual):
 
 def test_feasible_homogenisation(held_by_contact):
     dual = held_by_contact
-    coarse, bounded = dual.coarse, dual.constraints.inequalities
+    coarse, bounded = dual.coarse, dual.constraints.sets.normals
     lam = feasible_particular(coarse, bounded)
     assert np.allclose(coarse.G(lam), coarse.e, atol=1e-11)
     assert np.all(lam[bounded] >= 0.0)
@@ -111,7 +111,7 @@ def test_feasible_homogenisation(held_by_contact):
 def test_the_feasible_homogenisation_is_the_smallest(held_by_contact):
     """Its optimality conditions: λ̄ = Gᵀα on carrying rows, (Gᵀα) ≤ 0 on the others."""
     dual = held_by_contact
-    coarse, bounded = dual.coarse, dual.constraints.inequalities
+    coarse, bounded = dual.coarse, dual.constraints.sets.normals
     lam = feasible_particular(coarse, bounded)
     carrying = np.ones(len(lam), dtype=bool)
     carrying[bounded] = lam[bounded] > 0.0
@@ -124,14 +124,15 @@ def test_the_feasible_homogenisation_is_the_smallest(held_by_contact):
 
 def test_recovered_displacement_meets_the_rows(solved):
     """B_E u = c_E and B_N u ≤ c_N, with equality where there is a force."""
-    constraints, solution = solved._dual.constraints, solved.solution
+    constraints, solution = solved.dual.constraints, solved.solution
     u, Bu = constraints.B.createVecRight(), constraints.c.duplicate()
     u.array[:] = solved.dofs.to_primal(solved.u.x.array)[constraints.trace]
     constraints.B.mult(u, Bu)
     size = solved.u.x.petsc_vec.norm()
     residual = Bu.array_r - constraints.c.array_r
-    bounded, lam = constraints.inequalities, solution.lam
-    assert np.all(np.abs(residual[: bounded.start]) <= 1e-8 * size)
+    sets, lam = constraints.sets, solution.lam
+    bounded = sets.normals
+    assert np.all(np.abs(residual[sets.equalities]) <= 1e-8 * size)
     assert np.all(residual[bounded] <= 1e-8 * size)
     closed = lam[bounded] > 0.0
     assert solved.decomposition.comm.allreduce(int(np.sum(closed))) > 0
@@ -140,12 +141,13 @@ def test_recovered_displacement_meets_the_rows(solved):
 
 def test_recovered_displacement_is_in_equilibrium(solved):
     """K u = f − Bᵀλ in every subdomain."""
-    constraints = solved._dual.constraints
+    constraints = solved.dual.constraints
     lam, force = constraints.c.duplicate(), constraints.B.createVecRight()
     lam.array[:] = solved.solution.lam
     constraints.B.multTranspose(lam, force)
     dofs = solved.dofs
-    left = dofs.to_primal(solved._K @ solved.u.x.array - solved._f)
+    forms = solved._system.forms
+    left = dofs.to_primal(forms.stiffness() @ solved.u.x.array - forms.load())
     left[constraints.trace] += force.array_r
     assert np.all(np.abs(left) <= 1e-9 * force.norm())
 

@@ -45,7 +45,7 @@ def dual(request):
 def mask(dual, kept):
     """The face of the equality rows and of those contact rows that are kept."""
     free = np.ones(dual.constraints.num_rows, dtype=bool)
-    bounded = np.arange(len(free))[dual.constraints.inequalities]
+    bounded = dual.constraints.sets.normals
     free[bounded] = kept(bounded)
     return face_of(free, np.where(free, Status.TOUCHING, Status.OPEN))
 
@@ -53,7 +53,7 @@ def mask(dual, kept):
 def sliding(dual):
     """A face of pairs of contact rows, one direction for two rows, as slip has it."""
     m = dual.constraints.num_rows
-    bounded = np.arange(m)[dual.constraints.inequalities]
+    bounded = dual.constraints.sets.normals
     first, rest = np.setdiff1d(np.arange(m), bounded), len(bounded) // 2
     angle = np.arange(rest) + 0.3
     rows = np.concatenate((first, bounded[0 : 2 * rest : 2], bounded[1 : 2 * rest : 2]))

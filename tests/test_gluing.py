@@ -45,11 +45,12 @@ class Scene:
         """Trace values of all ranks from primal values."""
         return np.concatenate(self.d.comm.allgather(values[self.constraints.trace]))
 
-    def rows(self, equalities):
-        """Flags of equality or inequality rows among all ranks' rows."""
-        c = self.constraints
-        flags = np.arange(c.num_rows) < c.num_equalities
-        return np.concatenate(self.d.comm.allgather(flags)) == equalities
+    def rows(self, name):
+        """Flags of a named set among all ranks' rows."""
+        sets = self.constraints.sets
+        flags = np.zeros(sets.num_rows, dtype=bool)
+        flags[getattr(sets, name)] = True
+        return np.concatenate(self.d.comm.allgather(flags))
 
     def nodal(self, function):
         """Primal values of a function of points of shape (n, 3)."""
@@ -139,7 +140,7 @@ def test_equal_weights_give_the_known_pattern():
 
 def test_contact_rows_are_unit_and_orthogonal_to_the_gluing():
     scene = Scene(contacts=[tfeti.Obstacle("bottom", curved_obstacle(3))])
-    B, N = scene.B[scene.rows(True)], scene.B[scene.rows(False)]
+    B, N = scene.B[scene.rows("equalities")], scene.B[scene.rows("normals")]
     assert np.allclose(np.linalg.norm(N, axis=1), 1.0)
     assert np.abs(N @ B.T).max() <= 1e-14
     assert np.allclose(N @ N.T, np.eye(len(N)), atol=1e-14)
@@ -148,9 +149,9 @@ def test_contact_rows_are_unit_and_orthogonal_to_the_gluing():
 def test_contact_rows_measure_the_approach_in_scaled_lengths():
     plane = tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -0.1), (0, 0, 2)))
     scene = Scene(contacts=[plane], clamped=False)
-    rows = scene.rows(False)
+    rows = scene.rows("normals")
     u = scene.trace(scene.nodal(lambda x: np.column_stack((x[:, 0], x[:, 1], -0.3 - x[:, 0]))))
-    scale = np.concatenate(scene.d.comm.allgather(scene.gluing.inequalities.scale))
+    scale = np.concatenate(scene.d.comm.allgather(scene.gluing.contact.scale))
     approach = (scene.B @ u)[rows] / scale
     assert np.allclose(scene.rhs[rows] / scale, 0.1)
     assert approach.min() == pytest.approx(0.3)
@@ -159,7 +160,7 @@ def test_contact_rows_measure_the_approach_in_scaled_lengths():
 
 def test_one_condition_per_contact_node_however_it_is_torn():
     scene = Scene(contacts=[tfeti.Obstacle("bottom", curved_obstacle(3))], clamped=False)
-    assert scene.rows(False).sum() == 5 * 5
+    assert scene.rows("normals").sum() == 5 * 5
 
 
 def test_areas_of_contact_nodes_add_up_to_the_surface():
@@ -171,8 +172,8 @@ def test_areas_of_contact_nodes_add_up_to_the_surface():
 def test_conditions_that_dirichlet_values_decide_are_dropped_and_counted():
     plane = tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -5), (0, 0, 1)))
     scene = Scene(contacts=[plane])
-    assert scene.d.comm.allreduce(scene.gluing.inequalities.dropped) == 5
-    assert scene.rows(False).sum() == 20
+    assert scene.d.comm.allreduce(len(scene.gluing.contact.decided)) == 5
+    assert scene.rows("normals").sum() == 20
 
 
 def test_prescribed_components_move_into_the_gap():
@@ -184,9 +185,9 @@ def test_prescribed_components_move_into_the_gap():
     records = concatenate([slanted.records(dofs, d, 0)], 3)
     bcs = [fem.dirichletbc(1.0, bottom, V.sub(0))]
     gluing = glue(dofs, bcs, records, 1.0, np.ones(dofs.num_nodes * 3))
-    rows = gluing.constraints.inequalities
-    gap = gluing.constraints.c.array_r[rows] / gluing.inequalities.scale
-    assert np.allclose(gap, records.gap[gluing.inequalities.condition] + 0.6 * 1.0)
+    rows = gluing.constraints.sets.normals
+    gap = gluing.constraints.c.array_r[rows] / gluing.contact.scale
+    assert np.allclose(gap, records.gap[gluing.contact.condition] + 0.6 * 1.0)
 
 
 def test_an_obstacle_pushed_through_a_fixed_face_is_an_error():

@@ -58,9 +58,9 @@ def test_matching_meshes_give_node_to_node_rows(cell):
     V = fem.functionspace(d.mesh, ("Lagrange", 1, (d.mesh.geometry.dim,)))
     dofs = TornDofs(V, d)
     records = searched([PAIR], dofs, d)
-    order = np.argsort(records.row, kind="stable")
-    assert np.array_equal(records.row[order], np.repeat(np.arange(len(records)), 2))
-    pairs = records.coefficients[order].reshape(-1, 2, d.mesh.geometry.dim)
+    order = np.argsort(records.condition, kind="stable")
+    assert np.array_equal(records.condition[order], np.repeat(np.arange(len(records)), 2))
+    pairs = records.coefficients(0)[order].reshape(-1, 2, d.mesh.geometry.dim)
     own = records.entry_group[order].reshape(-1, 2) == (
         records.group[:, None] + dofs.group_offsets[d.comm.rank]
     )
@@ -218,11 +218,11 @@ def test_contact_rows_are_orthogonal_to_gluing_rows(scaling):
     problem.solve()
     if MPI.COMM_WORLD.size > 1:
         return  # B is gathered on one rank only
-    constraints = problem._constraints
+    constraints = problem.dual.constraints
     B = dense(constraints.B)
     gram = (B / constraints.weights) @ B.T
-    equalities = constraints.num_equalities
-    assert np.allclose(gram[:equalities, equalities:], 0.0, atol=1e-13)
+    sets = constraints.sets
+    assert np.allclose(gram[np.ix_(sets.equalities, sets.normals)], 0.0, atol=1e-13)
     assert np.allclose(np.diag(gram), 1.0)
 
 

@@ -63,7 +63,7 @@ def test_norm_of_a_scene(cell, n, scaling):
     load = (0.0,) * (gdim - 1) + (-0.05,)
     p = problem(d, load, [floor], tfeti_scaling=scaling)
     p.solve()
-    dual = p._dual
+    dual = p.dual
     estimate = estimate_norm(dual.F, dual.coarse, dual.d, Options().norm_steps)
     x, y, size = dual.d.duplicate(), dual.d.duplicate(), 0.0
     rng = np.random.default_rng(dual.coarse.comm.rank)

@@ -54,7 +54,7 @@ def test_stress_of_a_linear_displacement_is_exact():
     d = decomposed("tetrahedron", 3, 4)
     p = problem(d, (0, 0, -0.05), tfeti_rtol=1e-4)
     p.solve()
-    p.u.interpolate(lambda x: np.stack((0 * x[0], 0 * x[0], 1e-3 * x[2])))
+    p.solution.displacement.interpolate(lambda x: np.stack((0 * x[0], 0 * x[0], 1e-3 * x[2])))
     s = p.solution.stress.x.array.reshape(-1, 9)
     lmbda, mu = 0.3 / (1.3 * 0.4), 0.5 / 1.3
     exact = 1e-3 * np.diag([lmbda, lmbda, lmbda + 2 * mu]).ravel()

@@ -6,6 +6,7 @@ from scenes import curved_obstacle, decomposed, problem
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.dual.dual import Dual
+from tfeti_dolfinx.dual.naming import NamedBodies
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.conformance import check_feasible_set
 from tfeti_dolfinx.qp.faces import Status, face_of
@@ -50,7 +51,7 @@ def pulling(limit):
     def law(constraints):
         scale = constraints.scale
         half_spaces = HalfSpaces(-scale, np.full(len(scale), float(limit)))
-        return Product([(constraints.inequalities, half_spaces)])
+        return Product([(constraints.sets.normals, half_spaces)])
 
     return law
 
@@ -66,10 +67,9 @@ def solved():
 
 def with_law(p, law):
     """λ, u, flags of the rows that carry a force, and c − B u."""
-    d, dual = p.decomposition, p._dual
-    bodies = d.body_of_subdomain[d.subdomains]
-    own = Dual(dual.constraints, dual.blocks, bodies, d.body_names, list("abcdef"), "none",
-               feasible=law)  # fmt: skip
+    d, dual = p.decomposition, p._system.dual
+    bodies = NamedBodies(d.body_of_subdomain[d.subdomains], d.body_names, list("abcdef"))
+    own = Dual(dual.constraints, dual.blocks, bodies, "none", feasible=law)
     result, accuracy = solve_dual(own, Options(rtol=1e-9), "smalse")
     assert result.reason > 0
     u, lam = np.concatenate([np.empty(0), *accuracy.u]), np.array(result.lam.array_r)
@@ -99,8 +99,8 @@ def test_without_pulling_it_is_contact(solved):
 def test_glue_that_lets_go_at_a_limit(solved, limit):
     """Nodes are on the obstacle, or pull with the limit and are off it."""
     lam, u, carrying, left = with_law(solved, pulling(min(limit, 1e6)))
-    constraints, comm = solved._dual.constraints, solved.decomposition.comm
-    rows = constraints.inequalities
+    constraints, comm = solved._system.dual.constraints, solved.decomposition.comm
+    rows = constraints.sets.normals
     force, gap = constraints.scale * lam[rows], left[rows] / constraints.scale
     size = comm.allreduce(float(np.abs(u).max(initial=0.0)), op=max)
     assert comm.allreduce(int(np.sum(force < 0.0))) > 0

@@ -15,7 +15,6 @@ from scipy.sparse import csr_array, eye_array
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx import NoSolutionError
-from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.dual.cuts import Rows
 from tfeti_dolfinx.dual.motions import unresisted, unsprung
 from tfeti_dolfinx.dual.solvability import check_solvable
@@ -165,11 +164,8 @@ def test_a_body_pinned_at_neighbouring_nodes_beside_a_stiff_one():
 
 def dual_of(p):
     """The dual problem of a scene, not solved."""
-    p._K, p._f = p._forms.stiffness(), p._forms.load()
-    diagonal = p.dofs.to_primal(p._K.diagonal())
-    search = ContactSearch(p.contacts, p.dofs, p.decomposition, diagonal)
-    p._glue(search)
-    return p._build_dual(p._build_blocks(), "none")
+    p._system.look_for_changes()
+    return p._system.make(p.report)
 
 
 def in_a_slot(width):

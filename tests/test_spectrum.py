@@ -74,7 +74,7 @@ def test_values_are_those_of_the_dense_matrix(cell, stiffness, scaling):
     p = stacked_problem(cell, n, 8, scaling, stiffness=stiffness, bbt=True, **ROWS_ONLY)
     p.solve()
     assert list(p.report.spectrum) == ["BBt_min", "BBt_max", "BDBt_min", "BDBt_max"]
-    assert np.allclose(list(p.report.spectrum.values()), dense(p._constraints), rtol=1e-8)
+    assert np.allclose(list(p.report.spectrum.values()), dense(p.dual.constraints), rtol=1e-8)
 
 
 def test_values_do_not_depend_on_the_number_of_ranks():

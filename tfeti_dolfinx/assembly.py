@@ -1,8 +1,9 @@
-"""Compiled forms on the torn mesh, and their matrices."""
+"""Compiled forms on the torn mesh, their matrices, and whether their data has changed."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from hashlib import blake2b
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,39 @@ from tfeti_dolfinx.compat import JIT_OPTIONS, assemble_csr
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.form_checks import check_form, is_zero
 from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.parallel import any_rank
+
+
+class Data:
+    """The constants, coefficients and points that forms refer to, and what they were last.
+
+    Args:
+        form: The form.
+        V: The space of its arguments.
+    """
+
+    def __init__(self, form: ufl.Form | ufl.ZeroBaseForm, V: fem.FunctionSpace) -> None:
+        self._mesh, self._seen = V.mesh, b""
+        zero = is_zero(form)
+        self._constants = [] if zero else list(form.constants())
+        self._coefficients = [] if zero else list(form.coefficients())
+
+    def has_changed(self) -> bool:
+        """Whether anything is other than at the last call, or this is the first. Collective."""
+        before, self._seen = self._seen, self._digest()
+        return any_rank(self._mesh.comm, before != self._seen)
+
+    def _digest(self) -> bytes:
+        digest = blake2b(np.ascontiguousarray(self._mesh.geometry.x))
+        for constant in self._constants:
+            digest.update(np.ascontiguousarray(constant.value))
+        for function in self._coefficients:
+            digest.update(np.ascontiguousarray(function.x.array))
+        return digest.digest()
 
 
 class Forms:
-    """The compiled forms of a problem. Creation is collective.
+    """The compiled forms of a problem. Creation and all methods are collective.
 
     Args:
         a: Bilinear form.
@@ -41,25 +71,48 @@ class Forms:
         form_compiler_options: Mapping[str, Any] | None,
         jit_options: Mapping[str, Any] | None,
     ) -> None:
-        keywords = {
+        self._V, self._decomposition = V, decomposition
+        self._keywords = {
             "form_compiler_options": _options(form_compiler_options, "form_compiler_options"),
             "jit_options": {**JIT_OPTIONS, **_options(jit_options, "jit_options")},
         }
-        for form, name in ((a, "a"), (L, "L")):
-            check_form(form, name, V, decomposition)
-        self._size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
-        self.a = _compiled(a, "a", decomposition, keywords)
-        self.L = None if is_zero(L) else _compiled(L, "L", decomposition, keywords)
+        self.replace_stiffness(a)
+        self.replace_load(L)
+
+    def replace_stiffness(self, a: ufl.Form) -> None:
+        """Take another bilinear form on the same space."""
+        check_form(a, "a", self._V, self._decomposition)
+        self._a, self._of_a = self._compiled(a, "a"), Data(a, self._V)
+
+    def replace_load(self, L: ufl.Form | ufl.ZeroBaseForm) -> None:
+        """Take another linear form on the same space."""
+        check_form(L, "L", self._V, self._decomposition)
+        self._L = None if is_zero(L) else self._compiled(L, "L")
+        self._of_L = Data(L, self._V)
+
+    def has_new_stiffness(self) -> bool:
+        """Whether a, or what it refers to, has changed since the last call."""
+        return self._of_a.has_changed()
+
+    def has_new_load(self) -> bool:
+        """Whether L, or what it refers to, has changed since the last call."""
+        return self._of_L.has_changed()
 
     def stiffness(self) -> Any:
         """This rank's K in DOLFINx's numbering, scipy CSR."""
-        return assemble_csr(self.a)
+        return assemble_csr(self._a)
 
     def load(self) -> Array:
         """This rank's f in DOLFINx's numbering."""
-        if self.L is None:
-            return np.zeros(self._size)
-        return np.array(fem.assemble_vector(self.L).array)
+        if self._L is None:
+            return np.zeros(self._V.dofmap.index_map.size_local * self._V.dofmap.index_map_bs)
+        return np.array(fem.assemble_vector(self._L).array)
+
+    def _compiled(self, form: ufl.Form, name: str) -> fem.Form:
+        """The form compiled by DOLFINx, which fails on all ranks or on none."""
+        comm = self._decomposition.comm
+        with raised_on_all_ranks(comm), named(f"{name} cannot be compiled"):
+            return fem.form(form, **self._keywords)
 
 
 def _options(given: Mapping[str, Any] | None, what: str) -> dict[str, Any]:
@@ -67,11 +120,3 @@ def _options(given: Mapping[str, Any] | None, what: str) -> dict[str, Any]:
         return {}
     checked_type(given, Mapping, what, "a dictionary")
     return dict(given)
-
-
-def _compiled(
-    form: ufl.Form, name: str, decomposition: Decomposition, keywords: dict[str, Any]
-) -> fem.Form:
-    """The form compiled by DOLFINx, which fails on all ranks or on none. Collective."""
-    with raised_on_all_ranks(decomposition.comm), named(f"{name} cannot be compiled"):
-        return fem.form(form, **keywords)

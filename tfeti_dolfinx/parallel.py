@@ -21,6 +21,11 @@ def agreed(comm: MPI.Intracomm, value: T) -> T:
     return comm.bcast(value, root=0)
 
 
+def any_rank(comm: MPI.Intracomm, flag: bool) -> bool:
+    """Whether a flag is set on some rank. Collective."""
+    return bool(comm.allreduce(bool(flag), op=MPI.LOR))
+
+
 class Exchange:
     """Rows that travel to other ranks, and answers that travel back.
 

@@ -8,32 +8,27 @@ from typing import Any
 import numpy as np
 import ufl
 from dolfinx import fem
-from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.assembly import Forms
 from tfeti_dolfinx.checks import checked_type
 from tfeti_dolfinx.compat import require_real_petsc
-from tfeti_dolfinx.contact.search import ContactPartner, ContactSearch, checked_contacts
+from tfeti_dolfinx.contact.search import ContactPartner, checked_contacts
 from tfeti_dolfinx.dual.dual import Dual
-from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError
+from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
 from tfeti_dolfinx.fields import Stress, checked_stress
 from tfeti_dolfinx.form_checks import check_mesh, check_same_space, displacement_space
-from tfeti_dolfinx.gluing.constraints import Constraints
-from tfeti_dolfinx.gluing.glue import glue
+from tfeti_dolfinx.gluing.glue import Gluing
 from tfeti_dolfinx.gluing.prescribed import checked_conditions
 from tfeti_dolfinx.gluing.spectrum import extreme_eigenvalues, require_slepc
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.option_parsing import factor_options, parse_options
 from tfeti_dolfinx.report import Report
-from tfeti_dolfinx.report_filling import fill_result, fill_sizes
-from tfeti_dolfinx.solution import Solution
+from tfeti_dolfinx.report_filling import fill_result
+from tfeti_dolfinx.solution import Multipliers, Solution
 from tfeti_dolfinx.solver import conclude, resolve_types, solve_dual
-from tfeti_dolfinx.subdomains.build import sparse_blocks, trace_parts
-from tfeti_dolfinx.subdomains.factor import added_options
-from tfeti_dolfinx.subdomains.kernel import mode_names
-from tfeti_dolfinx.subdomains.sparse_block import Counters, SparseBlock
+from tfeti_dolfinx.system import System
 from tfeti_dolfinx.timing import stage
 
 MAX_ROUNDS = 20
@@ -58,7 +53,7 @@ class ContactProblem:
         jit_options: As in DOLFINx.
 
     Attributes:
-        u: The displacement.
+        u: The displacement of the last solve.
         report: Sizes, counters, residuals and times.
 
     Raises:
@@ -95,15 +90,22 @@ class ContactProblem:
         self._stress = self._checked_stress(stress)
         self.report = Report(seconds=dict(decomposition.seconds))
         self._prefix = petsc_options_prefix
-        self._factor_options = factor_options(petsc_options, petsc_options_prefix)
         self._solution: Solution | None = None
-        self._constraints: Constraints | None = None
-        self._blocks: list[SparseBlock] | None = None  # a rank may have none of them
-        self._dual: Dual | None = None
+        self._start: tuple[Gluing, Array, Array] | None = None
         with stage("assembly", self.report.seconds):
-            self._forms = Forms(a, L, V, decomposition, form_compiler_options, jit_options)
+            forms = Forms(a, L, V, decomposition, form_compiler_options, jit_options)
         with stage("gluing", self.report.seconds):
             self.dofs = TornDofs(V, decomposition)
+        self._system = System(
+            forms,
+            self.bcs,
+            self.contacts,
+            self.dofs,
+            decomposition,
+            self.options,
+            petsc_options_prefix,
+        )
+        self._system.factor_options = factor_options(petsc_options, petsc_options_prefix)
 
     @property
     def solution(self) -> Solution:
@@ -116,8 +118,21 @@ class ContactProblem:
             raise InputError("there is no solution yet; expected a call of solve() before")
         return self._solution
 
+    @property
+    def dual(self) -> Dual:
+        """The dual problem of the last solve, for experts.
+
+        Raises:
+            InputError: There is none before ``solve``, and after ``destroy``.
+        """
+        return self._system.dual
+
     def solve(self) -> fem.Function:
         """Solve the problem.
+
+        What a solve has made is kept. Constants and functions in the forms and Dirichlet values
+        may change between two solves: only what depends on them is made again, and the solver
+        starts from the last solution. For new forms, conditions or gaps see ``update``.
 
         Returns:
             The displacement, on the torn mesh.
@@ -128,39 +143,81 @@ class ContactProblem:
             ConvergenceError: The solver stopped before its tolerance.
             FactorError: A matrix could not be factored.
         """
-        self.destroy()
-        self.report.reset()
-        with stage("assembly", self.report.seconds):
-            self._K, self._f = self._forms.stiffness(), self._forms.load()
-        with stage("contact", self.report.seconds):
-            diagonal = self.dofs.to_primal(self._K.diagonal())
-            search = ContactSearch(self.contacts, self.dofs, self.decomposition, diagonal)
-            self._settled = search.contacts
-        previous = None
-        for _ in range(MAX_ROUNDS):
-            self._glue(search)
-            try:
-                previous = self._solve_rows(previous)
-                late = self._take_in_overlapping(search)
-            except NoSolutionError as error:  # on all ranks: what is far may hold the body yet
-                if search.is_exhausted:
-                    self.report.converged_reason = "NO_SOLUTION"
-                    if unmet := search.unmet():
-                        text = f"{error}; of the contacts meet nobody: {', '.join(unmet)}"
-                        raise NoSolutionError(text) from error
-                    raise
-                with stage("contact", self.report.seconds):
-                    late = search.widen()
-            else:
-                if late == 0:
-                    break
-            self.report.late_contact_rows += late
-        else:
-            raise ConvergenceError(f"nodes out of reach still overlap after {MAX_ROUNDS} rounds")
-        search.warn_of_unmet()
+        self.report.begin()
+        try:
+            self._system.look_for_changes()
+            self._solve_rounds()
+        except TfetiError:  # on all ranks
+            self._count()
+            raise
+        self._count()
+        self._system.search.warn_of_unmet()
         if self.options.view and self.decomposition.comm.rank == 0:
             print(self.options.view_text(self._prefix), self.report, sep="\n", flush=True)
         return self.u
+
+    def update(
+        self,
+        *,
+        load: ufl.Form | None = None,
+        values: Sequence[fem.DirichletBC] | None = None,
+        stiffness: ufl.Form | None = None,
+    ) -> None:
+        """Take other forms or conditions; the next ``solve`` makes again what depends on them.
+
+        Not needed where constants, functions or Dirichlet values have only got other values:
+        ``solve`` sees that itself. Of conditions on the same unknowns only the values count; a
+        new load or new values need no row and no factor, a new stiffness no search.
+
+        Args:
+            load: A linear form instead of ``L``.
+            values: Dirichlet conditions instead of ``bcs``.
+            stiffness: A bilinear form on the same space instead of ``a``.
+
+        Raises:
+            InputError: Something given does not fit; the message names it.
+        """
+        V = self.dofs.V
+        if values is not None:
+            self.bcs[:] = checked_conditions(values, V)
+        if stiffness is not None:
+            check_same_space(displacement_space(stiffness, self.decomposition), V, "stiffness", "a")
+            self._system.forms.replace_stiffness(stiffness)
+        if load is not None:
+            self._system.forms.replace_load(load)
+
+    def _count(self) -> None:
+        """What the solve has made and taken."""
+        self._system.count(self.report)
+        self.report.end()
+
+    def _solve_rounds(self) -> None:
+        """Solve until no node without a row overlaps."""
+        system, report = self._system, self.report
+        for _ in range(MAX_ROUNDS):
+            try:
+                solution = self._solve_rows()
+            except NoSolutionError as error:  # on all ranks: what is far may hold the body yet
+                late = self._widen(error)
+            else:
+                with stage("contact", report.seconds):
+                    late = system.take_in_overlapping(solution.u, report.tolerances["penetration"])
+                if late == 0:
+                    return
+            report.late_contact_rows += late
+        raise ConvergenceError(f"nodes out of reach still overlap after {MAX_ROUNDS} rounds")
+
+    def _widen(self, error: NoSolutionError) -> int:
+        """Look farther for what may hold a body; how many rows are new."""
+        search = self._system.search
+        if not search.is_exhausted:
+            with stage("contact", self.report.seconds):
+                return self._system.widen()
+        self.report.converged_reason = "NO_SOLUTION"
+        if unmet := search.unmet():
+            text = f"{error}; of the contacts meet nobody: {', '.join(unmet)}"
+            raise NoSolutionError(text) from error
+        raise error
 
     def _checked_u(self, u: fem.Function, V: fem.FunctionSpace) -> fem.Function:
         checked_type(u, fem.Function, "u", "a dolfinx.fem.Function on the space of a")
@@ -174,109 +231,37 @@ class ContactProblem:
 
     def destroy(self) -> None:
         """Destroy the PETSc objects; solution and report stay. ``solve`` makes them anew."""
-        for item in (self._dual, *(self._blocks or ()), self._constraints):
-            if item is not None:
-                item.destroy()
-        self._dual, self._blocks, self._constraints = None, None, None
+        self._system.destroy()
 
-    def _glue(self, search: ContactSearch) -> None:
-        """Rows of B for the present conditions."""
-        with stage("gluing", self.report.seconds):
-            if self._constraints is not None:
-                self._constraints.destroy()
-            self.report.unmet_contacts = search.unmet()
-            records, weights = search.records, self._weights()
-            self._gluing = glue(self.dofs, self.bcs, records, search.length, weights)
-            self._constraints = self._gluing.constraints
-        fill_sizes(self.report, self.dofs, self.decomposition, self._gluing)
-        if self.options.bbt:
-            with stage("spectrum", self.report.seconds):
-                self.report.spectrum = extreme_eigenvalues(self._constraints)
-
-    def _take_in_overlapping(self, search: ContactSearch) -> int:
-        """Give rows to nodes that have come to overlap without one; how many."""
-        tolerance = self.report.tolerances["penetration"]
-        with stage("contact", self.report.seconds):
-            u = self.dofs.to_primal(self.u.x.array)
-            return search.take_in_overlapping(u, tolerance)
-
-    def _weights(self) -> Array:
-        """D for the scaling of B: the diagonal of K over its smallest entry, or ones."""
-        if self.options.scaling == "multiplicity":
-            return np.ones(self.dofs.num_nodes * self.dofs.bs)
-        diagonal = self.dofs.to_primal(self._K.diagonal())
-        positive = diagonal > 0.0  # what is not is reported when Blocks are built
-        lowest = float(np.min(diagonal[positive], initial=np.inf))
-        lowest = self.decomposition.comm.allreduce(lowest, op=MPI.MIN)
-        return np.where(positive, diagonal / lowest, 1.0)
-
-    def _solve_rows(self, previous: Solution | None) -> Solution:
-        """Solve with the present rows, from an earlier solution on."""
-        gluing, report, comm = self._gluing, self.report, self.decomposition.comm
-        rows = comm.allreduce(len(gluing.inequalities.rows))
-        qp_type, pc_type = resolve_types(self.options, rows, self._prefix)
-        with added_options(self._prefix, self._factor_options):
-            blocks = self._build_blocks()
-            with stage("dual", report.seconds):
-                dual = self._build_dual(blocks, pc_type)
+    def _solve_rows(self) -> Solution:
+        """Solve with the present rows, from the last solution on."""
+        system, report = self._system, self.report
+        dual, gluing = system.make(report), system.gluing
+        if self.options.bbt and not system.spectrum:
+            with stage("spectrum", report.seconds):
+                system.spectrum = extreme_eigenvalues(gluing.constraints)
+        report.spectrum = system.spectrum
+        dual.forget_counts()
+        qp_type, _ = resolve_types(self.options, dual.num_inequalities, self._prefix)
         with stage("qp", report.seconds):
             start = None
-            if previous is not None:
-                start = (gluing.multipliers(previous.gluing, previous.lam), previous.mu)
+            if self._start is not None:
+                earlier, lam, mu = self._start
+                start = (gluing.multipliers(earlier, lam), mu)
             result, accuracy = solve_dual(dual, self.options, qp_type, start)
         with stage("recovery", report.seconds):
-            u = np.concatenate([np.empty(0), *accuracy.u])
-            self.u.x.array[:] = self.dofs.to_dolfinx(u)
-            self._solution = Solution(
-                u=self.u,
+            solution = self._solution = Solution(
+                u=np.concatenate([np.empty(0), *accuracy.u]),
+                multipliers=Multipliers(np.array(result.lam.array_r), result.face.carrying),
                 dofs=self.dofs,
                 decomposition=self.decomposition,
                 gluing=gluing,
-                lam=np.array(result.lam.array_r),
-                mu=result.mu,
-                carrying=result.face.carrying,
+                contacts=system.search.contacts,
                 stress=self._stress,
-                contacts=self._settled,
             )
-        fill_result(report, self.solution, dual, result, accuracy, self._counters)
+            self.u.x.array[:] = self.dofs.to_dolfinx(solution.u)
+        self._start = (gluing, solution.lam, result.mu) if result.reason > 0 else None
+        fill_result(report, solution, dual, result, accuracy)
         result.destroy()
-        conclude(result, accuracy, self.options, comm)
-        return self.solution
-
-    def _build_blocks(self) -> list[SparseBlock]:
-        """Blocks for the present trace; factors are made once."""
-        trace = self._gluing.constraints.trace
-        if self._blocks is not None:
-            with stage("subdomains", self.report.seconds):
-                for block, part in zip(self._blocks, trace_parts(self.dofs, trace), strict=True):
-                    block.retrace(part)
-            return self._blocks
-        self._counters = Counters()
-        with stage("subdomains", self.report.seconds):
-            self._blocks = sparse_blocks(
-                self.dofs,
-                self.decomposition,
-                self._K,
-                self._f,
-                trace,
-                self._counters,
-                self.options.kplus_type,
-                f"{self._prefix}sub_",
-            )
-        return self._blocks
-
-    def _build_dual(self, blocks: list[SparseBlock], pc_type: str) -> Dual:
-        """The dual problem of the present rows."""
-        if self._dual is not None:
-            self._dual.destroy()
-        decomposition = self.decomposition
-        self._dual = Dual(
-            constraints=self._gluing.constraints,
-            blocks=blocks,
-            body_of_block=decomposition.body_of_subdomain[decomposition.subdomains],
-            body_names=decomposition.body_names,
-            mode_names=mode_names(decomposition.mesh.geometry.dim, self.dofs.bs),
-            pc_type=pc_type,
-            options_prefix=self._prefix,
-        )
-        return self._dual
+        conclude(result, accuracy, self.options, self.decomposition.comm)
+        return solution

@@ -17,9 +17,16 @@ from tfeti_dolfinx.errors import raised_on_all_ranks
 PRINTED = 10  # of a list; all of it is in the file
 
 
+def _counter() -> Any:
+    """A counter, which adds up over solves in ``in_all``."""
+    return field(default=0, metadata={"adds": True})
+
+
 @dataclass
 class Report:
     """Sizes, counters, residuals and times of a solve; the same on all ranks.
+
+    Counters and seconds are those of the last solve; the first has what was before it, too.
 
     Attributes:
         primal_dofs: Unknowns of the torn mesh.
@@ -49,6 +56,11 @@ class Report:
         expansion_steps: Expansion steps.
         proportioning_steps: Proportioning steps.
         factorizations: Factorisations of subdomain matrices.
+        coarse_factorizations: Factorisations of GGᵀ.
+        assemblies: Times that the stiffness was assembled.
+        searches: Times that it was searched who meets whom.
+        gluings: Times that rows of B were made.
+        reused: Stages that this solve took over from the one before, see ``stages``.
         converged_reason: Name of the ConvergedReason; NO_SOLUTION where there is none,
             NOT_SOLVED before a solve and where one ended in another error.
         peak_memory_mb: Peak resident memory, summed over ranks.
@@ -60,6 +72,7 @@ class Report:
             (largest force times gap), ``balance`` (force left on a kernel mode where
             it is largest beside the forces there).
         tolerances: What they were at most allowed to be, all but the first two.
+        in_all: Solves, counters and ``seconds`` of all solves together.
         errors: Relative errors against closed forms, filled by demos.
         spectrum: With ``-tfeti_bbt``: the extreme eigenvalues ``BBt_min`` and ``BBt_max`` of
             B Bᵀ, ``BDBt_min`` and ``BDBt_max`` of B D⁻¹ Bᵀ. Their roots are the extreme
@@ -77,19 +90,24 @@ class Report:
     contact_rows: int = 0
     contact_candidates: int = 0
     far_contact_nodes: int = 0
-    late_contact_rows: int = 0
+    late_contact_rows: int = _counter()
     unmet_contacts: list[str] = field(default_factory=list)
     dropped_contact_rows: int = 0
     active_contacts: int = 0
-    F_multiplications: int = 0
-    preconditioner_multiplications: int = 0
-    power_method_multiplications: int = 0
-    recoveries: int = 0
-    outer_iterations: int = 0
-    cg_steps: int = 0
-    expansion_steps: int = 0
-    proportioning_steps: int = 0
-    factorizations: int = 0
+    F_multiplications: int = _counter()
+    preconditioner_multiplications: int = _counter()
+    power_method_multiplications: int = _counter()
+    recoveries: int = _counter()
+    outer_iterations: int = _counter()
+    cg_steps: int = _counter()
+    expansion_steps: int = _counter()
+    proportioning_steps: int = _counter()
+    factorizations: int = _counter()
+    coarse_factorizations: int = _counter()
+    assemblies: int = _counter()
+    searches: int = _counter()
+    gluings: int = _counter()
+    reused: list[str] = field(default_factory=list)
     converged_reason: str = "NOT_SOLVED"
     peak_memory_mb: float = 0.0
     seconds: dict[str, float] = field(default_factory=dict)
@@ -97,12 +115,21 @@ class Report:
     tolerances: dict[str, float] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
     spectrum: dict[str, float] = field(default_factory=dict)
+    in_all: dict[str, float] = field(default_factory=dict)
 
-    def reset(self) -> None:
-        """Forget the solve before; seconds add up. After an error nothing old is left."""
-        fresh = Report(seconds=self.seconds)
+    def begin(self) -> None:
+        """Forget the solve before, but for what it adds up to. After an error nothing is left."""
+        seconds = {} if self.in_all else self.seconds
+        fresh = Report(seconds=seconds, in_all=self.in_all)
         for f in fields(self):
             setattr(self, f.name, getattr(fresh, f.name))
+
+    def end(self) -> None:
+        """Add the counters and seconds of a solve, whatever its end was, to ``in_all``."""
+        self.seconds["total"] = sum(v for k, v in self.seconds.items() if k != "total")
+        added = {f.name: getattr(self, f.name) for f in fields(self) if f.metadata.get("adds")}
+        for name, value in {"solves": 1, **added, "seconds": self.seconds["total"]}.items():
+            self.in_all[name] = self.in_all.get(name, 0) + value
 
     def __str__(self) -> str:
         lines = []

@@ -14,7 +14,6 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.qp.problem import QPResult
 from tfeti_dolfinx.report import Report, peak_memory_mb
 from tfeti_dolfinx.solution import Solution
-from tfeti_dolfinx.subdomains.sparse_block import Counters
 
 
 def fill_sizes(
@@ -22,16 +21,15 @@ def fill_sizes(
 ) -> None:
     """Fill in what is known before the dual problem is. Collective."""
     comm, constraints = dofs.comm, gluing.constraints
-    bounded = constraints.inequalities
     report.primal_dofs = int(dofs.offsets[-1]) * dofs.bs
     report.dual_dofs = comm.allreduce(constraints.num_rows)
     report.subdomains, report.bodies = decomposition.num_subdomains, decomposition.num_bodies
     report.split_subdomains = len(decomposition.split)
-    report.contact_rows = comm.allreduce(bounded.stop - bounded.start)
+    report.contact_rows = comm.allreduce(len(constraints.sets.normals))
     report.contact_candidates = comm.allreduce(gluing.records.candidates)
-    near = comm.allreduce(int(np.sum(gluing.records.near)))
-    report.far_contact_nodes = report.contact_candidates - near
-    report.dropped_contact_rows = comm.allreduce(gluing.inequalities.dropped)
+    within_reach = comm.allreduce(int(np.sum(gluing.records.within_reach)))
+    report.far_contact_nodes = report.contact_candidates - within_reach
+    report.dropped_contact_rows = comm.allreduce(len(gluing.contact.decided))
 
 
 def fill_result(
@@ -40,14 +38,13 @@ def fill_result(
     dual: Dual,
     result: QPResult,
     accuracy: Accuracy,
-    counters: Counters,
 ) -> None:
     """Fill in what a solve has found; counters add up over rounds. Collective."""
     comm = dual.coarse.comm
     report.kernel_dim = dual.coarse.dimension
     report.free_modes = dual.coarse.free_modes
     report.nearly_free = dual.nearly_free
-    active = solution.carrying[solution.gluing.constraints.inequalities]
+    active = solution.carrying[solution.gluing.constraints.sets.normals]
     report.active_contacts = comm.allreduce(int(np.sum(active)))
     report.F_multiplications += dual.F.count["solver"]
     report.power_method_multiplications += dual.F.count["power method"]
@@ -57,7 +54,6 @@ def fill_result(
     report.cg_steps += result.steps.cg
     report.expansion_steps += result.steps.expansion
     report.proportioning_steps += result.steps.proportioning
-    report.factorizations = comm.allreduce(counters.factorizations)
     report.converged_reason = result.reason.name
     report.recoveries += accuracy.looks
     report.residuals = _residuals(solution, dual, result, accuracy)
@@ -104,7 +100,7 @@ def _largest(dual: Dual, values: Array) -> float:
 def _jumps(solution: Solution) -> Array:
     """For each owned group how far its copies are apart, and from prescribed values. Collective."""
     dofs, prescribed = solution.dofs, solution.gluing.prescribed
-    u = dofs.to_primal(solution.displacement.x.array).reshape(-1, dofs.bs)
+    u = solution.u.reshape(-1, dofs.bs)
     low, high = dofs.reduce(u, np.minimum, np.inf), dofs.reduce(u, np.maximum, -np.inf)
     held_low = np.where(prescribed.flag, np.minimum(low, prescribed.value), low)
     held_high = np.where(prescribed.flag, np.maximum(high, prescribed.value), high)

@@ -55,43 +55,62 @@ class ContactData:
     area: Array
 
 
+@dataclass(frozen=True)
+class Multipliers:
+    """Multipliers of this rank's rows.
+
+    Attributes:
+        lam: λ, shape ``(m,)``.
+        carrying: Flags of the rows that carry a force, shape ``(m,)``.
+    """
+
+    lam: Array
+    carrying: Array
+
+
 class Solution:
     """What a solve has found; fields are made when they are first asked for.
 
-    Creating a field is collective.
+    It owns its data: a later solve of the same problem leaves it as it is. Creating a field is
+    collective.
 
     Args:
-        u: Displacement on the torn mesh.
+        u: Displacement in primal order, shape ``(num_nodes * bs,)``.
+        multipliers: Multipliers of this rank's rows.
         dofs: Dof maps.
         decomposition: The torn mesh.
         gluing: Rows and contact records.
-        lam: Multipliers of this rank's rows.
-        mu: Multipliers of Gλ = e.
-        carrying: Flags of this rank's rows that carry a force.
-        stress: UFL stress of a displacement, or None.
         contacts: Obstacles and pairs, the secondary surface of a pair first.
+        stress: UFL stress of a displacement, or None.
 
     Attributes:
-        displacement: Displacement on the torn mesh.
+        u: Displacement in primal order.
+        lam: Multipliers of this rank's rows.
+        carrying: Flags of the rows that carry a force.
         contacts: The contacts with their sides decided: ``contacts[i].surfaces[0]`` has the
             multipliers and the pressure.
     """
 
     def __init__(
         self,
-        u: fem.Function,
+        u: Array,
+        multipliers: Multipliers,
         dofs: TornDofs,
         decomposition: Decomposition,
         gluing: Gluing,
-        lam: Array,
-        mu: Array,
-        carrying: Array,
-        stress: Stress | None,
         contacts: Sequence[ContactPartner] = (),
+        stress: Stress | None = None,
     ) -> None:
-        self.displacement, self.dofs, self.decomposition = u, dofs, decomposition
-        self.gluing, self.lam, self.mu, self.carrying = gluing, lam, mu, carrying
-        self._stress, self.contacts = stress, list(contacts)
+        self.u, self.lam, self.carrying = u, multipliers.lam, multipliers.carrying
+        self.dofs, self.decomposition, self.gluing = dofs, decomposition, gluing
+        self.contacts, self._stress = list(contacts), stress
+
+    @cached_property
+    def displacement(self) -> fem.Function:
+        """Displacement on the torn mesh."""
+        function = fem.Function(self.dofs.V, name="displacement")
+        function.x.array[:] = self.dofs.to_dolfinx(self.u)
+        return function
 
     @property
     def has_stress(self) -> bool:
@@ -209,16 +228,15 @@ class Solution:
     @cached_property
     def force(self) -> Array:
         """Normal force s_i λ_i of each contact condition of this rank, 0 without a row."""
-        inequalities = self.gluing.inequalities
+        contact = self.gluing.contact
         scale = np.zeros(len(self.gluing.records))
-        scale[inequalities.condition] = inequalities.scale
+        scale[contact.condition] = contact.scale
         return scale * self._of_conditions(self.lam)
 
     def _of_conditions(self, of_rows: Array) -> Array:
         """Values of the rows of each contact condition of this rank, 0 without a row."""
         values = np.zeros(len(self.gluing.records), dtype=of_rows.dtype)
-        inequalities = self.gluing.constraints.inequalities
-        values[self.gluing.inequalities.condition] = of_rows[inequalities]
+        values[self.gluing.contact.condition] = of_rows[self.gluing.constraints.sets.normals]
         return values
 
     @cached_property
@@ -230,8 +248,7 @@ class Solution:
     @cached_property
     def remaining_gap(self) -> Array:
         """Gap after deformation of each contact condition of this rank. Collective at first use."""
-        u = self.dofs.to_primal(self.displacement.x.array)
-        return remaining_gaps(self.gluing.records, self.dofs, u)
+        return remaining_gaps(self.gluing.records, self.dofs, self.u)
 
     def _sigma(self) -> Any:
         if self._stress is None:

@@ -2,72 +2,78 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.contact.records import ContactRecords
+from tfeti_dolfinx.contact.sides import Side
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.mortar.frames import frames
 from tfeti_dolfinx.parallel import Exchange, owner_of
 
+# of ∫φ_i: a node whose hat is covered by less has slivers of facets only, and divides by them
 HARDLY_COVERED = 1e-6
+# of ∫φ_i: a weight below it is what rounding leaves of one that biorthogonality makes 0; as an
+# entry of B it would make an unknown of the trace of every node of a facet
 NEGLIGIBLE = 1e-13
 
 Triplets = tuple[Array, Array, Array]
 
 
-def conditions(
-    dofs: TornDofs,
-    contact: int,
-    multipliers: Array,
-    covered: Array,
-    gaps: Array,
-    entries: tuple[Triplets, ...],
-    nodes: Array,
-    areas: Array,
-    normals: Array,
-    bounds: tuple[Array, Array] | None = None,
-) -> ContactRecords:
+@dataclass(frozen=True)
+class Shares:
+    """What facets of a surface contribute to the conditions of their vertices.
+
+    Attributes:
+        vertices: Global groups of the facets' vertices, shape ``(f, v)``.
+        covered: ∫φ_i over the covered part of each facet, shape ``(f, v)``.
+        gap: ∫ψ_i g over the facets, g the gap along the node's normal, shape ``(f, v)``.
+        entries: Triplets (multiplier's group, displacement's group, ∫ψ_i φ_k with its sign).
+        bounds: Smallest and largest g on each facet, shapes ``(f, v)``. ψ_i is negative somewhere,
+            and a mean with it would else fall below the smallest gap.
+    """
+
+    vertices: Array
+    covered: Array
+    gap: Array
+    entries: tuple[Triplets, ...]
+    bounds: tuple[Array, Array] | None = None
+
+
+def conditions(dofs: TornDofs, contact: int, side: Side, shares: Shares) -> ContactRecords:
     """Add up what facets contribute to a node, and divide by ∫ψ_i. Collective.
 
-    A node whose covered share of ∫φ_i is below 1e-6 gets no condition.
+    A node whose covered share of ∫φ_i is below 1e-6 gets no condition. The gaps are those of the
+    geometry, and all conditions are taken to be within reach.
 
     Args:
         dofs: Dof maps.
         contact: Index of the contact.
-        multipliers: Global groups of the multipliers' nodes, shape ``(f, v)``.
-        covered: ∫φ_i over the covered part of each facet, shape ``(f, v)``.
-        gaps: ∫ψ_i g over the facets, g the gap along the node's normal, shape ``(f, v)``.
-        entries: Triplets (multiplier's group, displacement's group, ∫ψ_i φ_k with its sign).
-        nodes: Groups of all nodes of the secondary surface, shape ``(n, v)``.
-        areas: ∫φ_i over the whole facets, shape ``(n, v)``.
-        normals: Averaged normal of each owned group, shape ``(g, gdim)``.
-        bounds: Smallest and largest g on each facet, shapes ``(f, v)``. ψ_i is negative somewhere,
-            and a mean with it would else fall below the smallest gap.
+        side: The surface whose vertices get conditions, along its normals.
+        shares: What facets on any rank contribute.
     """
-    area = dofs.add_on_owners(multipliers.ravel(), covered.ravel())
-    whole = dofs.add_on_owners(nodes.ravel(), areas.ravel())
-    gap = dofs.add_on_owners(multipliers.ravel(), gaps.ravel())
+    area = dofs.add_on_owners(shares.vertices.ravel(), shares.covered.ravel())
+    whole = dofs.add_on_owners(side.vertices.ravel(), side.areas.ravel())
+    gap = _mean_gaps(dofs, shares, area)
     chosen = np.flatnonzero(area > HARDLY_COVERED * whole)
-    mean = gap[chosen] / area[chosen]
-    if bounds is not None:
-        low = dofs.reduce_on_owners(multipliers.ravel(), bounds[0].ravel(), np.minimum, np.inf)
-        high = dofs.reduce_on_owners(multipliers.ravel(), bounds[1].ravel(), np.maximum, -np.inf)
-        mean = np.clip(mean, low[chosen], high[chosen])
     place = np.full(dofs.num_groups, -1)
     place[chosen] = np.arange(len(chosen))
-    slot, column, value = _merged(dofs, entries)
+    slot, column, value = _merged(dofs, shares.entries)
     kept = (place[slot] >= 0) & (np.abs(value) > NEGLIGIBLE * np.maximum(area[slot], 1e-300))
     slot, column, value = slot[kept], column[kept], value[kept]
     return ContactRecords(
         contact=np.full(len(chosen), contact),
         group=chosen,
-        normal=normals[chosen],
-        gap=mean,
+        frame=frames(side.normals[chosen]),
+        gap=gap[chosen],
+        geometric_gap=gap[chosen],
         area=area[chosen],
-        near=np.ones(len(chosen), dtype=bool),
-        row=place[slot],
+        within_reach=np.ones(len(chosen), dtype=bool),
+        condition=place[slot],
         entry_group=column,
-        coefficients=normals[slot] * (value / area[slot])[:, None],
+        weight=value / area[slot],
         candidates=int(np.sum(whole > 0.0)),
     )
 
@@ -76,6 +82,18 @@ def triplets(rows: Array, columns: Array, values: Array) -> Triplets:
     """Row groups, column groups and values of many small matrices."""
     i, j = np.broadcast_arrays(rows[:, :, None], columns[:, None, :])
     return i.ravel(), j.ravel(), values.ravel()
+
+
+def _mean_gaps(dofs: TornDofs, shares: Shares, area: Array) -> Array:
+    """∫ψ_i g / ∫ψ_i of the owned groups, between the bounds on g; 0 off the surface. Collective."""
+    vertices = shares.vertices.ravel()
+    total = dofs.add_on_owners(vertices, shares.gap.ravel())
+    mean = np.divide(total, area, out=np.zeros_like(area), where=area > 0.0)
+    if shares.bounds is None:
+        return mean
+    low = dofs.reduce_on_owners(vertices, shares.bounds[0].ravel(), np.minimum, np.inf)
+    high = dofs.reduce_on_owners(vertices, shares.bounds[1].ravel(), np.maximum, -np.inf)
+    return np.clip(mean, low, high)
 
 
 def _merged(dofs: TornDofs, entries: tuple[Triplets, ...]) -> Triplets:

@@ -39,7 +39,7 @@ def nodal_forces(records: ContactRecords, force: Array, dofs: TornDofs) -> Array
     Returns:
         −Σ_i a_ij s_i λ_i for each owned group, shape ``(g, gdim)``.
     """
-    shares = -records.coefficients * force[records.row][:, None]
+    shares = -records.coefficients(0) * force[records.condition][:, None]
     return dofs.add_on_owners(records.entry_group, shares)
 
 

@@ -7,11 +7,13 @@ from dataclasses import KW_ONLY, dataclass, replace
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.contact.arguments import Gap, checked_gap, checked_reach, given_gaps
-from tfeti_dolfinx.contact.conditions import conditions, triplets
+from tfeti_dolfinx.contact.arguments import Gap, checked_gap, checked_reach
+from tfeti_dolfinx.contact.conditions import Shares, conditions, triplets
+from tfeti_dolfinx.contact.gaps import gaps_of
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.shape_checks import check_placement, check_shape, distance_and_gradient
 from tfeti_dolfinx.contact.shapes import Shape
+from tfeti_dolfinx.contact.sides import Side
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -26,6 +28,7 @@ from tfeti_dolfinx.mortar.surfaces import (
     surface_facets,
 )
 
+# times the displacement's degree: exact for ψ_i φ_k on plane facets, and enough on curved ones
 QUADRATURE = 4
 
 
@@ -111,7 +114,7 @@ class Obstacle:
             dofs: Dof maps.
             decomposition: The torn mesh.
             contact: Index of the contact.
-            reach: Conditions with a larger gap are not near.
+            reach: Conditions with a larger gap are out of reach.
             depth: Not used: a body may lie in an obstacle as deep as it likes.
 
         Raises:
@@ -124,32 +127,45 @@ class Obstacle:
         self._check_side(surface, kind.num_vertices, dofs)
         facet, xi, weight = whole_facets(kind, surface, QUADRATURE * kind.displacement.degree)
         dual = dual_multipliers(kind, surface.area, facet, xi, weight)
+        distance, normals = self._at_groups(dofs, on_surface(dofs, decomposition, facets))
         vertices = surface.groups[:, : kind.num_vertices]
-        gap, normals = self._at_groups(dofs, on_surface(dofs, decomposition, facets))
-        (at_vertices,) = dofs.lookup(vertices[dual.facet].ravel(), gap)
+        side = Side(surface, vertices, hat_areas(kind, surface), normals)
+        (at_vertices,) = dofs.lookup(vertices[dual.facet].ravel(), distance)
         own = dual.integrals(kind.displacement.values(xi))
-        records = conditions(
-            dofs=dofs,
-            contact=contact,
-            multipliers=vertices[dual.facet],
+        shares = Shares(
+            vertices=vertices[dual.facet],
             covered=dual.covered,
-            gaps=at_vertices.reshape(dual.covered.shape) * dual.covered,
+            gap=at_vertices.reshape(dual.covered.shape) * dual.covered,
             entries=(triplets(vertices[dual.facet], surface.groups[dual.facet], own),),
-            nodes=vertices,
-            areas=hat_areas(kind, surface),
-            normals=normals,
         )
-        return replace(records, near=records.gap <= reach)
+        found = conditions(dofs, contact, side, shares)
+        gap = self.gaps(dofs, found)
+        return replace(found, gap=gap, within_reach=gap <= reach)
+
+    def with_gap(self, gap: Gap) -> Obstacle:
+        """The same obstacle with another ``gap=``."""
+        checked_gap(self.name, gap)
+        return replace(self, gap=gap)
+
+    def gaps(self, dofs: TornDofs, records: ContactRecords, depth: float = np.inf) -> Array:
+        """Gaps of its conditions, as ``gap=`` or the shape has them. Collective.
+
+        Args:
+            dofs: Dof maps.
+            records: The conditions, of any ``gap=``.
+            depth: Not used: a given gap holds however deep a body lies in an obstacle.
+
+        Raises:
+            InputError: A given gap is no number at a node.
+        """
+        return gaps_of(self.name, self.gap, records, dofs)
 
     def _at_groups(self, dofs: TornDofs, groups: Array) -> tuple[Array, Array]:
-        """Gap and normal of these owned groups, 0 for the others. Collective."""
+        """Distance and normal of these owned groups, 0 for the others. Collective."""
         gap, normals = np.zeros(dofs.num_groups), np.zeros((dofs.num_groups, dofs.bs))
         x = group_points(dofs)[groups]
         with raised_on_all_ranks(dofs.comm):
-            gap[groups], normals[groups] = self._gaps(x, dofs.bs)
-            given = given_gaps(self.name, self.gap, x)
-        if given is not None:
-            gap[groups] = given
+            gap[groups], normals[groups] = self._distances(x, dofs.bs)
         return gap, normals
 
     def _check_placement(
@@ -163,7 +179,7 @@ class Obstacle:
     def _check_side(self, surface: Facets, num_vertices: int, dofs: TornDofs) -> None:
         """Raise if no facet faces the obstacle. Collective."""
         with raised_on_all_ranks(dofs.comm):
-            _, towards = self._gaps(surface.corners(num_vertices).mean(axis=1), dofs.bs)
+            _, towards = self._distances(surface.corners(num_vertices).mean(axis=1), dofs.bs)
         facing = int(np.sum(np.sum(towards * surface.normal, axis=1) > 0.0))
         if dofs.bs > 1 and dofs.comm.allreduce(facing) == 0:
             raise InputError(
@@ -171,7 +187,7 @@ class Obstacle:
                 "a shape whose distance falls along the outward normal (is its normal turned?)"
             )
 
-    def _gaps(self, x: Array, gdim: int) -> tuple[Array, Array]:
+    def _distances(self, x: Array, gdim: int) -> tuple[Array, Array]:
         """Distances and normals at points of shape ``(n, 2)`` or ``(n, 3)``."""
         gap, gradient = distance_and_gradient(self.shape, x, self.name)
         gradient = gradient[:, :gdim]

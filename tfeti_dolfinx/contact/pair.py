@@ -9,28 +9,22 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.contact.arguments import Gap, checked_gap, checked_reach, given_gaps
-from tfeti_dolfinx.contact.conditions import conditions, triplets
+from tfeti_dolfinx.contact.arguments import Gap, checked_gap, checked_reach
+from tfeti_dolfinx.contact.conditions import conditions
+from tfeti_dolfinx.contact.gaps import gaps_of
+from tfeti_dolfinx.contact.meeting import meeting
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.sides import Side, side_of, stiffness_ratio
-from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.candidates import candidate_pairs, rendezvous
-from tfeti_dolfinx.mortar.facets import facet_kind
-from tfeti_dolfinx.mortar.integrals import integrate
-from tfeti_dolfinx.mortar.segments import Segments, find_segments
 from tfeti_dolfinx.mortar.surfaces import (
     diameter,
     extent,
-    group_points,
     surface_facets,
     surface_nodes,
 )
 
-# One looks farther than the reach: else facets at its edge would be covered partly, and an overlap
-# that is too deep would not be seen.
-SEEN = 3.0
 # ratios of stiffness per area: up to the first, rounding must not decide; from the second on, the
 # choice of the secondary side shows in the pressure
 EQUAL, MUCH_WORSE = 1.01, 2.0
@@ -122,7 +116,7 @@ class Contact:
             dofs: Dof maps.
             decomposition: The torn mesh.
             contact: Index of the contact.
-            reach: Conditions with a larger gap are not near.
+            reach: Conditions with a larger gap are out of reach.
             stiffness: Diagonal of K in primal order, shape ``(num_nodes * bs,)``.
 
         Raises:
@@ -174,14 +168,13 @@ class Contact:
         """One condition per node of ``a`` that faces ``b``. Collective.
 
         With D_i = ∫ψ_i over the covered part and n_i the averaged normal the condition is
-        n_i · (Σ_k D_ik u_k − Σ_j M_ij u_j)/D_i ≤ g_i, g_i the mean gap weighted with ψ_i. A given
-        gap is taken at the nodes: that is the mean of its linear interpolant.
+        n_i · (Σ_k D_ik u_k − Σ_j M_ij u_j)/D_i ≤ g_i, g_i the mean gap weighted with ψ_i.
 
         Args:
             dofs: Dof maps.
             decomposition: The torn mesh.
             contact: Index of the contact.
-            reach: Conditions with a larger gap are not near; those of surfaces three times as
+            reach: Conditions with a larger gap are out of reach; those of surfaces three times as
                 far apart are not made.
             depth: Largest initial overlap of the geometry, and how far a given gap replaces it.
 
@@ -193,7 +186,33 @@ class Contact:
         sides = self._sides(dofs, decomposition)
         return self._meet(sides, dofs, contact, reach, depth)
 
+    def with_gap(self, gap: Gap) -> Contact:
+        """The same contact with another ``gap=``."""
+        checked_gap(self.name, gap)
+        return replace(self, gap=gap)
+
+    def gaps(self, dofs: TornDofs, records: ContactRecords, depth: float) -> Array:
+        """Gaps of its conditions, as ``gap=`` and the geometry have them. Collective.
+
+        Args:
+            dofs: Dof maps.
+            records: The conditions, of any ``gap=``.
+            depth: Largest initial overlap of the geometry, and how far a given gap replaces it.
+
+        Raises:
+            InputError: The surfaces overlap by more than ``depth`` and no gap is given, or it is
+                no number somewhere.
+        """
+        if isinstance(self.gap, str):
+            self._check_depth(records, depth, dofs.comm)
+        return gaps_of(self.name, self.gap, records, dofs, depth)
+
     def _sides(self, dofs: TornDofs, decomposition: Decomposition) -> tuple[Side, Side]:
+        if dofs.bs != decomposition.mesh.geometry.dim:
+            raise InputError(
+                f"{self.name}: the space is scalar; expected displacements of "
+                f"{decomposition.mesh.geometry.dim} components, since surfaces meet along normals"
+            )
         a, b = (side_of(self.name, side, dofs, decomposition) for side in self.surfaces)
         return a, b
 
@@ -201,47 +220,10 @@ class Contact:
         self, sides: tuple[Side, Side], dofs: TornDofs, contact: int, reach: float, depth: float
     ) -> ContactRecords:
         """The conditions; arguments as of ``records``. Collective."""
-        kind, comm = facet_kind(dofs), dofs.comm
-        v, secondary, primary = kind.num_vertices, sides[0].facets, sides[1].facets
-        seen = SEEN * max(reach, depth)
-        near_s, near_p = rendezvous(secondary, primary, seen, comm)
-        with raised_on_all_ranks(comm):
-            pairs = candidate_pairs(near_s, near_p, seen)
-            segments = find_segments(
-                kind, near_s, near_p, pairs, depth=SEEN * depth, reach=SEEN * reach
-            )
-            integrals = integrate(kind, near_s, near_p, segments)
-        self._check_facing(segments, comm)
-        entries = (
-            triplets(
-                near_s.groups[integrals.facet, :v], near_s.groups[integrals.facet], integrals.own
-            ),
-            triplets(
-                near_s.groups[integrals.pair_secondary, :v],
-                near_p.groups[integrals.pair_primary],
-                -integrals.other,
-            ),
-        )
-        found = conditions(
-            dofs=dofs,
-            contact=contact,
-            multipliers=near_s.groups[integrals.facet, :v],
-            covered=integrals.covered,
-            gaps=integrals.gap,
-            entries=entries,
-            nodes=sides[0].vertices,
-            areas=sides[0].areas,
-            normals=sides[0].normals,
-            bounds=(integrals.lowest, integrals.highest),
-        )
-        x, within = group_points(dofs)[found.group], found.gap <= depth
-        with raised_on_all_ranks(comm):
-            given = given_gaps(self.name, self.gap, x)
-        if given is None:
-            self._check_depth(found, depth, comm)
-        else:
-            found = replace(found, gap=np.where(within, given, found.gap))
-        return replace(found, near=found.gap <= reach)
+        shares = meeting(self.name, sides, dofs, reach, depth)
+        found = conditions(dofs, contact, sides[0], shares)
+        gap = self.gaps(dofs, found, depth)
+        return replace(found, gap=gap, within_reach=gap <= reach)
 
     def _named_first(self, decomposition: Decomposition) -> Contact:
         """The contact with the side that is named as secondary as ``a``."""
@@ -259,16 +241,9 @@ class Contact:
     def _exchanged(self) -> Contact:
         return replace(self, a=self.b, b=self.a)
 
-    def _check_facing(self, segments: Segments, comm: MPI.Intracomm) -> None:
-        averted = comm.allreduce(int(segments.averted))
-        if averted and comm.allreduce(len(segments.weight)) == 0:
-            raise InputError(
-                f"{self.name}: the surfaces are near but face away from each other; expected "
-                "outward normals that oppose each other"
-            )
-
     def _check_depth(self, found: ContactRecords, depth: float, comm: MPI.Intracomm) -> None:
-        deepest = -comm.allreduce(float(found.gap.min(initial=0.0)), op=MPI.MIN)
+        lowest = comm.allreduce(float(found.geometric_gap.min(initial=0.0)), op=MPI.MIN)
+        deepest = -lowest
         if deepest > depth:
             raise InputError(
                 f"{self.name}: the surfaces overlap by up to {deepest:.6g}, more than the reach "

@@ -1,4 +1,4 @@
-"""Non-penetration conditions before they become rows of B."""
+"""Contact conditions before they become rows of B: a frame and scalar weights each."""
 
 from __future__ import annotations
 
@@ -12,36 +12,57 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 
 @dataclass(frozen=True)
 class ContactRecords:
-    """Conditions  Σ_j a_ij · u_j ≤ g_i,  one for each contact node whose group this rank owns.
+    """Conditions of contact nodes, one for each contact and node whose group this rank owns.
+
+    With the *relative displacement* v_i = Σ_j w_ij u_j of a node against what it meets, the
+    condition is n_i · v_i ≤ g_i, and its slip is the tangential part of v_i. A scalar space has
+    frames of shape ``(n, 1, 1)``.
 
     Attributes:
         contact: Index of the contact (in the list that the user gave), shape ``(n,)``.
         group: Owned group of the contact node, shape ``(n,)``.
-        normal: Direction in which the node may not go further, unit length, shape ``(n, gdim)``.
+        frame: Right-handed orthonormal axes, shape ``(n, gdim, gdim)``: axis 0 is the normal n_i,
+            in which the node may not go further, the others are tangents.
         gap: Distance g_i, a length, shape ``(n,)``.
+        geometric_gap: The distance that the geometry has, whatever a user gives, shape ``(n,)``.
         area: Integral ∫φ_i of the node's hat over the contact surface, of a pair over what the
             other side covers of it, shape ``(n,)``.
-        near: Whether a row is made at once; a far condition gets one only if the solution
-            violates it, shape ``(n,)``.
-        row: Condition of each coefficient, shape ``(k,)``.
-        entry_group: Global group of each coefficient, shape ``(k,)``.
-        coefficients: The a_ij, shape ``(k, gdim)``.
+        within_reach: Whether a row is made at once; a condition out of reach gets one only if
+            the solution violates it, shape ``(n,)``.
+        condition: Condition of each weight, shape ``(k,)``.
+        entry_group: Global group of each weight, shape ``(k,)``.
+        weight: The w_ij, without a unit, shape ``(k,)``.
         candidates: Nodes of the contact surface whose groups this rank owns.
     """
 
     contact: Array
     group: Array
-    normal: Array
+    frame: Array
     gap: Array
+    geometric_gap: Array
     area: Array
-    near: Array
-    row: Array
+    within_reach: Array
+    condition: Array
     entry_group: Array
-    coefficients: Array
+    weight: Array
     candidates: int = 0
 
     def __len__(self) -> int:
         return len(self.gap)
+
+    @property
+    def normal(self) -> Array:
+        """Direction in which each node may not go further, shape ``(n, gdim)``."""
+        return self.frame[:, 0]
+
+    @property
+    def tangents(self) -> Array:
+        """The other axes of the frames, shape ``(n, gdim - 1, gdim)``."""
+        return self.frame[:, 1:]
+
+    def coefficients(self, axis: int) -> Array:
+        """The a_ij of Σ_j a_ij · u_j, v_i along an axis of the frame, shape ``(k, gdim)``."""
+        return self.frame[self.condition, axis] * self.weight[:, None]
 
 
 def concatenate(records: list[ContactRecords], gdim: int) -> ContactRecords:
@@ -51,36 +72,60 @@ def concatenate(records: list[ContactRecords], gdim: int) -> ContactRecords:
     def join(name: str, empty: Array) -> Array:
         return np.concatenate([empty, *(getattr(r, name) for r in records)])
 
-    no_index, no_vector = np.empty(0, dtype=np.int64), np.empty((0, gdim))
-    rows = [r.row + start for r, start in zip(records, starts[:-1], strict=True)]
+    no_index, no_number = np.empty(0, dtype=np.int64), np.empty(0)
+    conditions = [r.condition + start for r, start in zip(records, starts[:-1], strict=True)]
     return ContactRecords(
         contact=join("contact", no_index),
         group=join("group", no_index),
-        normal=join("normal", no_vector),
-        gap=join("gap", np.empty(0)),
-        area=join("area", np.empty(0)),
-        near=join("near", np.empty(0, dtype=bool)),
-        row=np.concatenate([no_index, *rows]),
+        frame=join("frame", np.empty((0, gdim, gdim))),
+        gap=join("gap", no_number),
+        geometric_gap=join("geometric_gap", no_number),
+        area=join("area", no_number),
+        within_reach=join("within_reach", np.empty(0, dtype=bool)),
+        condition=np.concatenate([no_index, *conditions]),
         entry_group=join("entry_group", no_index),
-        coefficients=join("coefficients", no_vector),
+        weight=join("weight", no_number),
         candidates=sum(r.candidates for r in records),
     )
 
 
-def remaining_gaps(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
-    """g_i − Σ_j a_ij · u_j for all conditions of this rank, negative where bodies overlap.
+def relative_displacement(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
+    """v_i = Σ_j w_ij u_j of all conditions of this rank: the node's, less what it meets.
 
     Collective.
 
     Args:
         records: The conditions.
         dofs: Dof maps.
-        u: Displacement in primal order, shape ``(num_nodes * bs,)``.
+        u: Displacement in primal order, shape ``(num_nodes * bs,)``; of torn copies the mean.
 
     Returns:
-        Lengths, shape ``(n,)``.
+        Lengths, shape ``(n, gdim)``.
     """
     total = dofs.reduce(u.reshape(-1, dofs.bs), np.add, 0.0)
     (values,) = dofs.lookup(records.entry_group, total / dofs.multiplicity[:, None])
-    moved = np.sum(records.coefficients * values, axis=1)
-    return records.gap - sum_rows(records.row, moved, len(records))
+    return sum_rows(records.condition, records.weight[:, None] * values, len(records))
+
+
+def remaining_gaps(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
+    """g_i − n_i · v_i, negative where bodies overlap, shape ``(n,)``. Collective.
+
+    Args:
+        records: The conditions.
+        dofs: Dof maps.
+        u: Displacement in primal order, shape ``(num_nodes * bs,)``.
+    """
+    v = relative_displacement(records, dofs, u)
+    return records.gap - np.sum(records.normal * v, axis=1)
+
+
+def slips(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
+    """v_i along the tangents of its frame, shape ``(n, gdim - 1)``. Collective.
+
+    Args:
+        records: The conditions.
+        dofs: Dof maps.
+        u: Displacement in primal order, shape ``(num_nodes * bs,)``.
+    """
+    v = relative_displacement(records, dofs, u)
+    return np.einsum("ntg,ng->nt", records.tangents, v)

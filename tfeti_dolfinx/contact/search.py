@@ -11,6 +11,7 @@ import numpy as np
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.checks import shown
+from tfeti_dolfinx.contact.arguments import Gap
 from tfeti_dolfinx.contact.records import ContactRecords, concatenate, remaining_gaps
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -18,7 +19,8 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import diameter
 from tfeti_dolfinx.parallel import agreed
 
-# how much farther one looks for what may hold a body; of the scene's length at least
+# How much farther one looks for what may hold a body: few rounds, each a search and a solve, up to
+# the length of the scene; of that at least, since a small surface's reach may be as good as none.
 WIDER, LEAST = 4.0, 0.01
 
 log = logging.getLogger(__name__)
@@ -71,6 +73,14 @@ class ContactPartner(Protocol):
         """Conditions up to a distance and beyond, and down to a depth of initial overlap."""
         ...
 
+    def with_gap(self, gap: Gap) -> ContactPartner:
+        """The same contact with another gap."""
+        ...
+
+    def gaps(self, dofs: TornDofs, records: ContactRecords, depth: float) -> Array:
+        """Gaps of conditions that were made with another gap: no search, no integral."""
+        ...
+
 
 def checked_contacts(contacts: Sequence[ContactPartner]) -> list[ContactPartner]:
     """The contacts as a list.
@@ -90,8 +100,8 @@ def checked_contacts(contacts: Sequence[ContactPartner]) -> list[ContactPartner]
 class ContactSearch:
     """Conditions of all contacts. Creation and all methods are collective.
 
-    Conditions farther than a contact's reach have no rows at first; ``take_in_overlapping`` gives
-    them to those that a displacement violates, ``widen`` to those that may hold a body yet.
+    Conditions out of a contact's reach have no rows at first; ``take_in_overlapping`` gives them
+    to those that a displacement violates, ``widen`` to those that may hold a body yet.
 
     Args:
         contacts: Obstacles and pairs.
@@ -102,7 +112,7 @@ class ContactSearch:
     Attributes:
         contacts: The contacts with their sides decided: of a pair the secondary one comes first.
         length: Length of the scene.
-        records: All conditions of this rank; those that are ``near`` have rows.
+        records: All conditions of this rank; those ``within_reach`` get rows.
 
     Raises:
         InputError: A pair is there twice, or a contact raises it.
@@ -126,12 +136,30 @@ class ContactSearch:
             for i, contact in enumerate(contacts)
         ]
         self.contacts = [contact for contact, _ in settled]
-        self._parts = [records for _, records in settled]
+        self._records = [records for _, records in settled]
 
     @property
     def records(self) -> ContactRecords:
         """All conditions of this rank."""
-        return concatenate(self._parts, self._dofs.bs)
+        return concatenate(self._records, self._dofs.bs)
+
+    def set_gap(self, index: int, gap: Gap) -> None:
+        """Give a contact another ``gap=``; its conditions stay, but for their gaps.
+
+        Conditions within reach stay those, so that rows of B stay; others are looked at by
+        ``take_in_overlapping``, as ever.
+
+        Args:
+            index: Position of the contact in the list.
+            gap: "geometry", a number, or a function of points.
+
+        Raises:
+            InputError: The gap does not fit, or "geometry" overlaps too deep. Nothing has changed.
+        """
+        contact = self.contacts[index].with_gap(gap)
+        known = self._records[index]
+        gaps = contact.gaps(self._dofs, known, self._depths[index])
+        self.contacts[index], self._records[index] = contact, replace(known, gap=gaps)
 
     def take_in_overlapping(self, u: Array, tolerance: float) -> int:
         """Give rows to conditions without one that a displacement violates.
@@ -145,31 +173,30 @@ class ContactSearch:
         Returns:
             How many rows are new, on all ranks.
         """
-        late = 0
-        for i, contact in enumerate(self.contacts):
-            known = self._parts[i]
-            bound = contact.displacement_bound(
-                self._dofs, self._decomposition, u.reshape(-1, self._dofs.bs)
-            )
-            moved = agreed(self._dofs.comm, bound)
+        return sum(self._take_in(i, u, tolerance) for i in range(len(self.contacts)))
+
+    def _take_in(self, i: int, u: Array, tolerance: float) -> int:
+        """Give rows to violated conditions of one contact; how many rows are new."""
+        known = found = self._records[i]
+        nodal = u.reshape(-1, self._dofs.bs)
+        bound = self.contacts[i].displacement_bound(self._dofs, self._decomposition, nodal)
+        moved = agreed(self._dofs.comm, bound)
+        if moved > self._reach[i]:
+            found = self._with_rows_of(self._search(i, moved), known)
+        overlaps, new = self._overlapping(found, u, tolerance)
+        if new == 0 and found is not known:
             found = known
-            if moved > self._reach[i]:
-                found = self._with_rows_of(self._search(i, moved), known)
             overlaps, new = self._overlapping(found, u, tolerance)
-            if new == 0 and found is not known:
-                found = known
-                overlaps, new = self._overlapping(found, u, tolerance)
-            if new:
-                self._parts[i] = replace(found, near=found.near | overlaps)
-                if found is not known:
-                    self._reach[i] = moved
-                late += new
-        return late
+        if new:
+            self._records[i] = replace(found, within_reach=found.within_reach | overlaps)
+            if found is not known:
+                self._reach[i] = moved
+        return new
 
     def _overlapping(self, found: ContactRecords, u: Array, tolerance: float) -> tuple[Array, int]:
         """Conditions that a displacement violates, and how many of them have no row."""
         overlaps = remaining_gaps(found, self._dofs, u) < -tolerance
-        return overlaps, self._count(overlaps & ~found.near)
+        return overlaps, self._count(overlaps & ~found.within_reach)
 
     def widen(self) -> int:
         """Reach farther, until a condition gets a row: what is far may hold a body yet.
@@ -178,8 +205,8 @@ class ContactSearch:
             How many rows are new, on all ranks; 0 where nothing is left to find.
         """
         while not self.is_exhausted:
-            if late := sum(self._widen(i) for i in range(len(self.contacts))):
-                return late
+            if new := sum(self._widen(i) for i in range(len(self.contacts))):
+                return new
         return 0
 
     @property
@@ -189,7 +216,7 @@ class ContactSearch:
 
     def unmet(self) -> list[str]:
         """Contacts none of whose nodes has a row: position in the list, and name."""
-        rows = np.array([np.sum(part.near) for part in self._parts], dtype=np.int64)
+        rows = np.array([np.sum(known.within_reach) for known in self._records], dtype=np.int64)
         rows = self._dofs.comm.allreduce(rows)
         return [f"{i}: {self.contacts[i].name}" for i in np.flatnonzero(rows == 0)]
 
@@ -201,27 +228,27 @@ class ContactSearch:
 
     def _is_exhausted(self, i: int) -> bool:
         complete = self._reach[i] >= self.contacts[i].horizon(self.length)
-        return self._count(~self._parts[i].near) == 0 and complete
+        return self._count(~self._records[i].within_reach) == 0 and complete
 
     def _widen(self, i: int) -> int:
         """Reach farther in one contact; how many rows are new."""
         if self._is_exhausted(i):
             return 0
-        before, found = self._count(self._parts[i].near), self._parts[i]
+        before, found = self._count(self._records[i].within_reach), self._records[i]
         reach = max(WIDER * self._reach[i], LEAST * self.length)
         if self._reach[i] < self.contacts[i].horizon(self.length):
             found = self._with_rows_of(self._search(i, reach), found)
         self._reach[i] = reach
-        self._parts[i] = replace(found, near=found.near | (found.gap <= reach))
-        return self._count(self._parts[i].near) - before
+        self._records[i] = replace(found, within_reach=found.within_reach | (found.gap <= reach))
+        return self._count(self._records[i].within_reach) - before
 
     def _search(self, index: int, reach: float) -> ContactRecords:
         contact = self.contacts[index]
         return contact.records(self._dofs, self._decomposition, index, reach, self._depths[index])
 
     def _with_rows_of(self, found: ContactRecords, known: ContactRecords) -> ContactRecords:
-        """Conditions of a wider search, near where they had rows before."""
-        return replace(found, near=np.isin(found.group, known.group[known.near]))
+        """Conditions of a wider search, within reach where they had rows before."""
+        return replace(found, within_reach=np.isin(found.group, known.group[known.within_reach]))
 
     def _count(self, flags: Array) -> int:
         return int(self._dofs.comm.allreduce(int(np.sum(flags))))

@@ -14,7 +14,8 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 
 # Differences over 1e-5 of the scene: curvature and rounding are both far below what is looked for
 STEP = 1e-5
-SAMPLE = 16  # points of each rank, those next to the shape
+# points of each rank, those next to the shape: a wrong gradient is wrong nearly everywhere
+SAMPLE = 16
 # More than 60 degrees, or a factor of 100: a gradient may be rounded off or of any length
 COSINE, FACTOR = 0.5, 100.0
 

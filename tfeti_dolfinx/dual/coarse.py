@@ -72,7 +72,7 @@ class CoarseSpace(Projectors):
         blocks: Sequence[Block],
         body_of_block: Array,
         num_bodies: int,
-        bounded: slice | Array,
+        bounded: Array,
         comm: MPI.Intracomm,
         prefix: str = "tfeti_coarse_",
     ) -> None:

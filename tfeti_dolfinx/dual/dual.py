@@ -9,7 +9,7 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
-from tfeti_dolfinx.dual.naming import listed
+from tfeti_dolfinx.dual.naming import NamedBodies, listed
 from tfeti_dolfinx.dual.operator import (
     PRECONDITIONERS,
     BlockOperator,
@@ -37,7 +37,7 @@ FeasibleLaw = Callable[[Constraints], FeasibleSet]
 
 def no_tension(constraints: Constraints) -> FeasibleSet:
     """λ_N ≥ 0: contact without friction and adhesion."""
-    return Product([(constraints.inequalities, Bounds())])
+    return Product([(constraints.sets.normals, Bounds())])
 
 
 class Dual:
@@ -46,9 +46,7 @@ class Dual:
     Args:
         constraints: B and c.
         blocks: This rank's Blocks.
-        body_of_block: Body of each of them.
-        body_names: Names of all bodies.
-        mode_names: Names of their candidate modes.
+        bodies: The bodies that they are parts of.
         pc_type: Preconditioner: none, lumped or dirichlet.
         options_prefix: Prefix of all PETSc options.
         feasible: Makes the set of multipliers from B and c; default λ_N ≥ 0.
@@ -72,17 +70,15 @@ class Dual:
         self,
         constraints: Constraints,
         blocks: Sequence[Block],
-        body_of_block: Array,
-        body_names: Sequence[str],
-        mode_names: Sequence[str],
+        bodies: NamedBodies,
         pc_type: str,
         options_prefix: str = "tfeti_",
         feasible: FeasibleLaw = no_tension,
     ) -> None:
         self.constraints, self.blocks = constraints, blocks
         self.pressing = np.zeros(constraints.num_rows, dtype=bool)
-        self.body_of_block, self.num_bodies = body_of_block, len(body_names)
-        self._names, self.nearly_free = (body_names, mode_names), list[dict[str, object]]()
+        self.body_of_block, self.num_bodies = bodies.of_block, len(bodies.names)
+        self._names, self.nearly_free = (bodies.names, bodies.modes), list[dict[str, object]]()
         B, comm = constraints.B, constraints.B.getComm().tompi4py()
         self.F = dual_operator(B, blocks)
         self.preconditioner: BlockOperator | None = None
@@ -90,16 +86,33 @@ class Dual:
         if pc_type != "none":
             self._scaled = ScaledGluing(B, constraints.weights)
             self.preconditioner = PRECONDITIONERS[pc_type](self._scaled, blocks)
-        bounded = constraints.inequalities
+        bounded = constraints.sets.normals
         self.coarse = CoarseSpace(
-            B, blocks, body_of_block, len(body_names), bounded, comm, f"{options_prefix}coarse_"
+            B, blocks, bodies.of_block, self.num_bodies, bounded, comm, f"{options_prefix}coarse_"
         )
-        self.num_inequalities = comm.allreduce(len(np.arange(constraints.num_rows)[bounded]))
+        self.num_inequalities = comm.allreduce(len(bounded))
         self.feasible = feasible(constraints)
         self._images = dict[str, tuple[Array, Image]]()
         self._norm: tuple[int, float] | None = None
-        check_solvable(self.coarse, body_names, mode_names)
+        check_solvable(self.coarse, *self._names)
         self.d = linear_term(B, constraints.c, blocks)
+
+    def update_load(self) -> None:
+        """Take the Blocks' present loads and the present right sides.
+
+        Raises:
+            NoSolutionError: The load moves a body that nothing holds.
+        """
+        self.coarse.update_load(self.blocks)
+        check_solvable(self.coarse, *self._names)
+        self.d.destroy()
+        self.d = linear_term(self.constraints.B, self.constraints.c, self.blocks)
+
+    def forget_counts(self) -> None:
+        """Count multiplications from 0 on."""
+        for operator in (self.F, self.preconditioner):
+            if operator is not None:
+                operator.count.clear()
 
     def qp(self, norm_steps: int = 0) -> QP:
         """The quadratic program; without kernel it has no coarse problem.

@@ -130,9 +130,10 @@ def _missed(scene: Scene, u: list[Array]) -> tuple[PETSc.Vec, float]:
         trace.array[part] = u_s[block.trace_dofs]
     constraints.B.mult(trace, w)
     w.axpy(-1.0, constraints.c)
-    bounded = constraints.inequalities
-    rows = w.array[bounded]
-    rows[:] = np.where(scene.pressing[bounded], rows, np.maximum(rows, 0.0))
+    bounded = constraints.sets.normals
+    rows = w.array_r[bounded]
+    rows = np.where(scene.pressing[bounded], rows, np.maximum(rows, 0.0))
+    w.array[bounded] = rows
     lengths = np.abs(rows) / constraints.scale
     trace.destroy()
     deepest = float(np.max(lengths, initial=0.0))

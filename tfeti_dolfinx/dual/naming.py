@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import qr
@@ -13,6 +14,21 @@ from tfeti_dolfinx.dual.motions import NULL, Motions
 
 # of the largest coefficient: what takes part in a motion, what it is named after; bodies named
 PART, DOMINANT, NAMED = 1e-3, 0.3, 4
+
+
+@dataclass(frozen=True)
+class NamedBodies:
+    """All bodies, and this rank's part of them.
+
+    Attributes:
+        of_block: Body of each of this rank's Blocks.
+        names: Names of all bodies.
+        modes: Names of their candidate modes.
+    """
+
+    of_block: Array
+    names: Sequence[str]
+    modes: Sequence[str]
 
 
 def free_to_move(amounts: Array, body_names: Sequence[str], mode_names: Sequence[str]) -> str:

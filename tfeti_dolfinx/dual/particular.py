@@ -22,7 +22,7 @@ SHORTEST = 1e-8
 log = logging.getLogger(__name__)
 
 
-def feasible_particular(coarse: CoarseSpace, bounded: slice | Array) -> Array:
+def feasible_particular(coarse: CoarseSpace, bounded: Array) -> Array:
     """λ̄ of min ½‖λ‖² subject to Gλ = e, λ_N ≥ 0. Collective.
 
     λ̄ = Gᵀα on free rows and (Gᵀα)₊ on bounded ones; α by a semismooth Newton method, each
@@ -63,7 +63,7 @@ def feasible_particular(coarse: CoarseSpace, bounded: slice | Array) -> Array:
     return np.asarray(coarse.Gt @ start)
 
 
-def _damping(coarse: CoarseSpace, bounded: slice | Array, alpha: Array, step: Array) -> float:
+def _damping(coarse: CoarseSpace, bounded: Array, alpha: Array, step: Array) -> float:
     """Step length that does not raise ½‖λ(α)‖² − αᵀe."""
 
     def cost(alpha: Array) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.gluing.row_sets import RowSets, row_sets
 from tfeti_dolfinx.gluing.rows import Rows, stack
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.parallel import Exchange, chunk_offsets, owner_of
@@ -15,33 +16,36 @@ from tfeti_dolfinx.parallel import Exchange, chunk_offsets, owner_of
 
 @dataclass(frozen=True)
 class Constraints:
-    """B u = c on equality rows, B u ≤ c on inequality rows.
+    """B u = c on equality rows, B u ≤ c on rows of contact normals.
 
-    A rank's rows stand in the order [E; N]. B acts on *trace* unknowns only: primal unknowns
-    that some row touches, sorted as the primal ones.
+    B acts on *trace* unknowns only: primal unknowns that some row touches, sorted as the primal
+    ones. It depends neither on prescribed values nor on gaps; c does, and can be filled again.
 
     Attributes:
         B: Dual rows × trace unknowns, MPIAIJ.
-        c: Right sides, distributed as the rows.
-        num_equalities: Local equality rows.
-        num_rows: All local rows.
+        c: Right sides, distributed as the rows; 0 until they are set.
+        sets: Which local rows are what.
         trace: Local primal unknown of each local trace unknown, ascending.
         weights: D on the local trace unknowns: the rows are scaled with it.
-        scale: The s_i of the local inequality rows: over it what a row misses is a length.
+        scale: The s_i of the conditions with rows, one for each of ``sets.normals`` (and for the
+            tangents of the same condition): over it what a row misses is a length.
     """
 
     B: PETSc.Mat
     c: PETSc.Vec
-    num_equalities: int
-    num_rows: int
+    sets: RowSets
     trace: Array
     weights: Array
     scale: Array
 
     @property
-    def inequalities(self) -> slice:
-        """Local rows that are inequalities."""
-        return slice(self.num_equalities, self.num_rows)
+    def num_rows(self) -> int:
+        """All local rows."""
+        return self.sets.num_rows
+
+    def set_right_side(self, c: Array) -> None:
+        """Fill c anew, with this rank's part of it, shape ``(num_rows,)``. B stays."""
+        self.c.array[:] = c
 
     def destroy(self) -> None:
         """Destroy the PETSc objects. Collective."""
@@ -50,18 +54,19 @@ class Constraints:
 
 
 def assemble_constraints(
-    dofs: TornDofs, equalities: Rows, inequalities: Rows, weights: Array, scale: Array
+    dofs: TornDofs, equalities: Rows, normals: Rows, weights: Array, scale: Array
 ) -> Constraints:
-    """Assemble B and c. Collective.
+    """Assemble B, with c = 0. Collective.
 
     Args:
         dofs: Dof maps.
         equalities: Gluing and Dirichlet rows of this rank.
-        inequalities: Contact rows of this rank.
+        normals: Contact rows of this rank.
         weights: D on the local primal unknowns.
         scale: What each contact row was multiplied by.
     """
-    rows = stack([equalities, inequalities])
+    rows = stack([equalities, normals])
+    sets = row_sets(len(equalities), len(normals), dofs.bs)
     trace, column = _trace_columns(dofs, rows.column)
     num_rows, num_columns = len(rows), len(trace)
     order = np.lexsort((column, rows.row))
@@ -73,8 +78,8 @@ def assemble_constraints(
         comm=dofs.comm,
     )
     c = B.createVecLeft()
-    c.array[:] = rows.rhs
-    return Constraints(B, c, len(equalities), num_rows, trace, weights[trace], scale)
+    c.set(0.0)
+    return Constraints(B, c, sets, trace, weights[trace], scale)
 
 
 def _trace_columns(dofs: TornDofs, column: Array) -> tuple[Array, Array]:

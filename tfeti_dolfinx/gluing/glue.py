@@ -3,50 +3,117 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from dolfinx import fem
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.contact.records import ContactRecords
+from tfeti_dolfinx.errors import TfetiError
 from tfeti_dolfinx.gluing.constraints import Constraints, assemble_constraints
-from tfeti_dolfinx.gluing.contact import InequalityRows, inequality_rows
-from tfeti_dolfinx.gluing.interface import equality_rows
+from tfeti_dolfinx.gluing.contact import ContactRows, contact_rows
+from tfeti_dolfinx.gluing.interface import HeldRows, equality_rows
 from tfeti_dolfinx.gluing.prescribed import Prescribed, prescribe
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.parallel import any_rank
+
+# more than any mesh has nodes, and times any number of contacts within 64 bits
+MANY_GROUPS = 2**40
 
 
 @dataclass(frozen=True)
 class Gluing:
-    """Rows of a scene, and the Dirichlet values and contact records that they come from."""
+    """Rows of a scene, and the Dirichlet values and contact records that they come from.
 
+    B depends on which components are prescribed, on the records' normals and weights, on which
+    of them are within reach, and on D. Prescribed values and gaps are in c alone.
+
+    Attributes:
+        dofs: Dof maps.
+        prescribed: Dirichlet values.
+        records: Contact conditions of this rank.
+        held: The rows that hold prescribed components.
+        contact: What belongs to the contact rows.
+        constraints: B, c and the sets of rows.
+        length: A length of the scene.
+    """
+
+    dofs: TornDofs
     prescribed: Prescribed
     records: ContactRecords
-    inequalities: InequalityRows
+    held: HeldRows
+    contact: ContactRows
     constraints: Constraints
+    length: float
+
+    def right_side(self, values: Array, gaps: Array) -> Array:
+        """This rank's part of c for any prescribed values and gaps; B stays. Collective.
+
+        Args:
+            values: Prescribed values of the owned groups, shape ``(g, bs)``; what stands at
+                components that are not prescribed has no effect.
+            gaps: Gap of each condition of the records, a length, shape ``(n,)``.
+
+        Returns:
+            Shape ``(num_rows,)``, for ``Constraints.set_right_side``.
+
+        Raises:
+            NoSolutionError: Prescribed components alone violate a condition, or the conditions
+                of a node contradict each other.
+        """
+        sets = self.constraints.sets
+        c = np.zeros(sets.num_rows)
+        c[sets.equalities[self.held.row]] = self.held.right_side(values)
+        c[sets.normals] = self.contact.right_side(self.dofs, values, gaps, self.length)
+        return c
+
+    def with_right_side(self, values: Array, gaps: Array) -> Gluing:
+        """The same rows with other prescribed values and gaps; c is filled anew. Collective.
+
+        The constraints are shared with these rows: their c is the new one too. What raises
+        leaves it as it was.
+
+        Args:
+            values: Prescribed values of the owned groups, shape ``(g, bs)``.
+            gaps: Gap of each condition of the records, shape ``(n,)``.
+
+        Raises:
+            NoSolutionError: As ``right_side``.
+        """
+        self.constraints.set_right_side(self.right_side(values, gaps))
+        flag = self.prescribed.flag
+        return replace(
+            self,
+            prescribed=Prescribed(flag, np.where(flag, values, 0.0)),
+            records=replace(self.records, gap=gaps),
+        )
 
     def multipliers(self, earlier: Gluing, lam: Array) -> Array:
         """Multipliers of earlier rows of the same scene on these; zero on rows that are new.
+
+        Where other components are prescribed all rows of equalities are. Collective.
 
         Args:
             earlier: The earlier rows.
             lam: Their multipliers on this rank.
         """
-        start = np.zeros(self.constraints.num_rows)
-        equalities = self.constraints.num_equalities
-        start[:equalities] = lam[:equalities]
+        sets, before = self.constraints.sets, earlier.constraints.sets
+        start = np.zeros(sets.num_rows)
+        flags, flags_before = self.prescribed.flag, earlier.prescribed.flag
+        if not any_rank(self.dofs.comm, not np.array_equal(flags, flags_before)):
+            start[sets.equalities] = lam[before.equalities]
         _, new, old = np.intersect1d(
             self._condition_keys(), earlier._condition_keys(), return_indices=True
         )
-        force = lam[equalities + old] * earlier.inequalities.scale[old]
-        start[equalities + new] = force / self.inequalities.scale[new]
+        force = lam[before.normals[old]] * earlier.contact.scale[old]
+        start[sets.normals[new]] = force / self.contact.scale[new]
         return start
 
     def _condition_keys(self) -> Array:
-        """A number for the contact and the node of each inequality row."""
-        rows, records = self.inequalities.condition, self.records
-        return records.contact[rows] * 2**40 + records.group[rows]
+        """A number for the contact and the node of each contact row."""
+        kept, records = self.contact.condition, self.records
+        return records.contact[kept] * MANY_GROUPS + records.group[kept]
 
 
 def glue(
@@ -56,12 +123,12 @@ def glue(
     length: float,
     weights: Array,
 ) -> Gluing:
-    """Rows of interfaces, Dirichlet conditions and contacts. Collective.
+    """Rows of interfaces, Dirichlet conditions and contacts, and their right sides. Collective.
 
     Args:
         dofs: Dof maps.
         bcs: Dirichlet conditions.
-        records: Contact conditions of this rank; those that are near get rows.
+        records: Contact conditions of this rank; those within reach get rows.
         length: A length of the scene.
         weights: D, positive, one per local primal unknown: the stiffness there, or ones. Rows
             are orthonormal in the inner product of D⁻¹ as far as they can be.
@@ -72,9 +139,13 @@ def glue(
     """
     prescribed = prescribe(dofs, bcs)
     D = dofs.gather_copies(weights.reshape(-1, dofs.bs))
-    inequalities = inequality_rows(dofs, prescribed, D, records, length)
-    equalities = equality_rows(dofs, prescribed, D)
-    constraints = assemble_constraints(
-        dofs, equalities, inequalities.rows, weights, inequalities.scale
-    )
-    return Gluing(prescribed, records, inequalities, constraints)
+    normals, contact = contact_rows(dofs, prescribed.flag, D, records)
+    equalities, held = equality_rows(dofs, prescribed.flag, D)
+    constraints = assemble_constraints(dofs, equalities, normals, weights, contact.scale)
+    gluing = Gluing(dofs, prescribed, records, held, contact, constraints, length)
+    try:
+        constraints.set_right_side(gluing.right_side(prescribed.value, records.gap))
+    except TfetiError:  # on all ranks
+        constraints.destroy()
+        raise
+    return gluing

@@ -12,7 +12,7 @@ from mpi4py import MPI
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.checks import is_whole, shown
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.mesh.untorn import GroupNames
+from tfeti_dolfinx.mesh.untorn import PhysicalNames
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Decomposition:
     mesh: dmesh.Mesh
     cell_tags: dmesh.MeshTags
     facet_tags: dmesh.MeshTags
-    names: GroupNames
+    names: PhysicalNames
     cell_subdomain: Array
     original_cells: Array
     original_nodes: Array

@@ -21,7 +21,7 @@ from tfeti_dolfinx.mesh.partition import (
 )
 from tfeti_dolfinx.mesh.tags import check_tags, checked_names
 from tfeti_dolfinx.mesh.tearing import tear
-from tfeti_dolfinx.mesh.untorn import GroupNames, UntornMesh
+from tfeti_dolfinx.mesh.untorn import PhysicalNames, UntornMesh
 from tfeti_dolfinx.timing import stage
 
 CELL_TYPES = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
@@ -95,7 +95,7 @@ def _untorn(
         facet_tags=_values(facet_tags, cell_facets(mesh)),
         node_ids=used,
         x=mesh.geometry.x[position, :gdim],
-        names=GroupNames(
+        names=PhysicalNames(
             surfaces=_names(mesh, facet_tags, surfaces),
             volumes=_names(mesh, cell_tags, volumes),
         ),

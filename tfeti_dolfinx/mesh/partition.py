@@ -18,6 +18,7 @@ from tfeti_dolfinx.parallel import box_over_ranks
 
 Subdomains = int | ArrayLike | Callable[[Array], ArrayLike]
 
+# displacement unknowns: a factor of that size is cheap, and kernels and interfaces are still few
 UNKNOWNS_PER_SUBDOMAIN = 4000
 
 

@@ -13,7 +13,7 @@ from tfeti_dolfinx.mesh.entities import cell_entities, equal_pairs, facet_keys
 
 
 @dataclass(frozen=True)
-class GroupNames:
+class PhysicalNames:
     """Names of the physical groups: ``surfaces[name]`` and ``volumes[name]`` are tags."""
 
     surfaces: dict[str, int] = field(default_factory=dict)
@@ -44,7 +44,7 @@ class UntornMesh:
     facet_tags: Array
     node_ids: Array
     x: Array
-    names: GroupNames
+    names: PhysicalNames
 
     @property
     def gdim(self) -> int:

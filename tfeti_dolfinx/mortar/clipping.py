@@ -9,11 +9,12 @@ import numpy as np
 
 from tfeti_dolfinx.arrays import Array
 
+# of the clipping facet's size: common parts below it are what rounding leaves where facets touch
 SLIVER = 1e-12
 
 
 @dataclass(frozen=True)
-class Parts:
+class CommonParts:
     """Convex parts of lines or planes, one for each pair of facets.
 
     Attributes:
@@ -26,8 +27,8 @@ class Parts:
     count: Array
     size: Array
 
-    def __getitem__(self, rows: Array) -> Parts:
-        return Parts(self.vertices[rows], self.count[rows], self.size[rows])
+    def __getitem__(self, rows: Array) -> CommonParts:
+        return CommonParts(self.vertices[rows], self.count[rows], self.size[rows])
 
     @property
     def middle(self) -> Array:
@@ -48,7 +49,7 @@ class Parts:
         return quadrature_on_polygons(self.vertices, self.count, degree)
 
 
-def common_parts(subject: Array, clip: Array) -> Parts:
+def common_parts(subject: Array, clip: Array) -> CommonParts:
     """What pairs of intervals, or of convex polygons, have in common.
 
     Args:
@@ -58,7 +59,7 @@ def common_parts(subject: Array, clip: Array) -> Parts:
     if subject.shape[2] == 1:
         ends, met = clip_intervals(subject[:, :, 0], clip[:, :, 0])
         size = np.where(met, ends[:, 1] - ends[:, 0], 0.0)
-        return Parts(ends[:, :, None], np.where(met, 2, 0), size)
+        return CommonParts(ends[:, :, None], np.where(met, 2, 0), size)
     return clip_polygons(subject, clip)
 
 
@@ -99,7 +100,7 @@ def clip_intervals(subject: Array, clip: Array) -> tuple[Array, Array]:
     return np.stack((low, high), axis=1), high - low > SLIVER * np.ptp(clip, axis=1)
 
 
-def clip_polygons(subject: Array, clip: Array) -> Parts:
+def clip_polygons(subject: Array, clip: Array) -> CommonParts:
     """Common parts of pairs of convex polygons (Sutherland, Hodgman 1974).
 
     Args:
@@ -107,7 +108,7 @@ def clip_polygons(subject: Array, clip: Array) -> Parts:
         clip: Vertices in order, shape ``(n, l, 2)``.
 
     Returns:
-        Parts of up to k + l vertices; none where polygons are apart or meet in a sliver only.
+        CommonParts of up to k + l vertices; none where polygons are apart or meet in a sliver only.
     """
     clip, whole = _counterclockwise(clip)
     n, sides = len(subject), clip.shape[1]
@@ -119,7 +120,7 @@ def clip_polygons(subject: Array, clip: Array) -> Parts:
         polygon, count = _cut(polygon, count, start, end - start)
     area = np.abs(_signed_area(polygon, count))
     count[area <= SLIVER * whole] = 0
-    return Parts(polygon, count, np.where(count > 0, area, 0.0))
+    return CommonParts(polygon, count, np.where(count > 0, area, 0.0))
 
 
 def _cut(polygon: Array, count: Array, point: Array, direction: Array) -> tuple[Array, Array]:

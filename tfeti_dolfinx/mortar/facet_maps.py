@@ -10,7 +10,8 @@ from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mortar.facet_element import FacetElement
 from tfeti_dolfinx.mortar.facets import FacetKind, Facets
 
-# Newton's method from the affine map: facets that are not folded take 3 or 4 steps
+# Newton's method from the affine map: facets that are not folded take 3 or 4 steps. It ends at
+# rounding (of the facet's size); where it stalls above that, a point may still be as good as FAR.
 MAX_STEPS, CLOSE, FAR = 20, 1e-14, 1e-8
 
 

@@ -11,6 +11,7 @@ from tfeti_dolfinx.mortar.facet_maps import points
 from tfeti_dolfinx.mortar.facets import FacetKind, Facets
 from tfeti_dolfinx.mortar.segments import FacingPoints, Segments
 
+# of a facet's area: on a sliver the hats are nearly dependent, and M_e cannot be inverted
 HARDLY_COVERED = 1e-6
 
 
@@ -19,13 +20,13 @@ class MortarIntegrals:
     """Integrals with the dual multipliers ψ_i of the secondary facets' vertices.
 
     Attributes:
-        facet: Secondary facet of each row of ``own``, ``gap``, ``covered``, shape ``(f,)``.
+        facet: Secondary facet that ``own``, ``gap``, ``covered`` are of, shape ``(f,)``.
         own: ∫ψ_i φ_k of the facet's own displacement nodes, shape ``(f, v, t)``.
         gap: ∫ψ_i n_i·(x_primary − x_secondary), shape ``(f, v)``.
         lowest: Smallest n_i·(x_primary − x_secondary) on the covered part, shape ``(f, v)``.
         highest: The largest one, infinite where a facet is covered in part, shape ``(f, v)``.
         covered: ∫φ_i over the covered part, shape ``(f, v)``.
-        pair_secondary: Secondary facet of each row of ``other``, shape ``(q,)``.
+        pair_secondary: Secondary facet that ``other`` is of, shape ``(q,)``.
         pair_primary: Primary facet of each, shape ``(q,)``.
         other: ∫ψ_i φ_j of the primary facet's displacement nodes, shape ``(q, v, t)``.
     """
@@ -47,13 +48,13 @@ class DualMultipliers:
 
     Attributes:
         facet: Facets that have points, shape ``(f,)``.
-        row: Place in ``facet`` of each point's facet, shape ``(m,)``.
+        place: Place in ``facet`` of each point's facet, shape ``(m,)``.
         weighted: Weight times ψ_i at each point, shape ``(m, v)``.
         covered: ∫φ_i over the part that the points cover, shape ``(f, v)``.
     """
 
     facet: Array
-    row: Array
+    place: Array
     weighted: Array
     covered: Array
 
@@ -61,7 +62,7 @@ class DualMultipliers:
         """∫ψ_i f on each facet, from values of f at the points: ``(m, …)`` to ``(f, v, …)``."""
         extra = (1,) * (values.ndim - 1)
         weighted = self.weighted.reshape(*self.weighted.shape, *extra)
-        return sum_rows(self.row, weighted * values[:, None], len(self.facet))
+        return sum_rows(self.place, weighted * values[:, None], len(self.facet))
 
 
 def dual_multipliers(
@@ -80,16 +81,16 @@ def dual_multipliers(
         xi: Reference coordinates of the points, shape ``(m, tdim)``.
         weight: Weights, shape ``(m,)``.
     """
-    facets, row = np.unique(facet, return_inverse=True)
+    facets, place = np.unique(facet, return_inverse=True)
     hats = kind.hats.values(xi)
-    covered = sum_rows(row, weight[:, None] * hats, len(facets))
-    mass = sum_rows(row, weight[:, None, None] * hats[:, :, None] * hats[:, None], len(facets))
+    covered = sum_rows(place, weight[:, None] * hats, len(facets))
+    mass = sum_rows(place, weight[:, None, None] * hats[:, :, None] * hats[:, None], len(facets))
     hardly = covered.sum(axis=1) <= HARDLY_COVERED * area[facets]
     mass[hardly] = np.eye(kind.num_vertices)
     covered[hardly] = 0.0
     dual = covered[:, :, None] * np.linalg.inv(mass)
-    psi = np.einsum("mij,mj->mi", dual[row], hats)
-    return DualMultipliers(facets, row, weight[:, None] * psi, covered)
+    psi = np.einsum("mij,mj->mi", dual[place], hats)
+    return DualMultipliers(facets, place, weight[:, None] * psi, covered)
 
 
 def integrate(
@@ -108,7 +109,7 @@ def integrate(
         segments.whole,
     )
     stride = max(len(primary), 1)
-    pair, pair_row = np.unique(at.secondary * stride + at.primary, return_inverse=True)
+    pair, pair_place = np.unique(at.secondary * stride + at.primary, return_inverse=True)
     theirs = kind.displacement.values(at.eta)
     return MortarIntegrals(
         facet=dual.facet,
@@ -119,7 +120,7 @@ def integrate(
         covered=dual.covered,
         pair_secondary=pair // stride,
         pair_primary=pair % stride,
-        other=sum_rows(pair_row, dual.weighted[:, :, None] * theirs[:, None], len(pair)),
+        other=sum_rows(pair_place, dual.weighted[:, :, None] * theirs[:, None], len(pair)),
     )
 
 
@@ -144,11 +145,11 @@ def _range(
     On a facet that is covered in part, a vertex may lie beside the part, and its multiplier
     extrapolates there: upwards that is right, downwards it could be an overlap that is none.
     """
-    row = np.searchsorted(dual.facet, facet)
-    gap = np.einsum("md,mvd->mv", apart, normals[row])
+    place = np.searchsorted(dual.facet, facet)
+    gap = np.einsum("md,mvd->mv", apart, normals[place])
     lowest, highest = np.full(dual.covered.shape, np.inf), np.full(dual.covered.shape, -np.inf)
-    np.minimum.at(lowest, row, gap)
-    np.maximum.at(highest, row, gap)
+    np.minimum.at(lowest, place, gap)
+    np.maximum.at(highest, place, gap)
     highest[~whole[dual.facet]] = np.inf
     counts = dual.covered.sum(axis=1) > 0.0  # what is hardly covered has no multipliers
     lowest[~counts], highest[~counts] = np.inf, -np.inf

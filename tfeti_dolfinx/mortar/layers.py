@@ -8,7 +8,9 @@ import numpy as np
 
 from tfeti_dolfinx.arrays import Array
 
+# of a facet's size: distances closer than this are those of facets of one layer, apart by rounding
 SAME = 1e-9
+# of a facet: common parts that exceed it by less are one layer, whose clipping has rounded
 COVERED_TWICE = 1e-6
 
 # for pairs a and b of the same secondary facet: whether b's primary facet lies over the middle of
@@ -16,7 +18,7 @@ COVERED_TWICE = 1e-6
 Look = Callable[[Array, Array], tuple[Array, Array]]
 
 
-def reachable(s: Array, distance: Array, facing: Array, length: Array, look: Look) -> Array:
+def truly_overlapping(s: Array, distance: Array, facing: Array, length: Array, look: Look) -> Array:
     """Facing pairs whose overlap is real: no way out of the primary body lies before them.
 
     An overlap means that the primary body reaches from its facet, behind the secondary one, up to
@@ -35,7 +37,8 @@ def reachable(s: Array, distance: Array, facing: Array, length: Array, look: Loo
     """
     found, same = facing.copy(), SAME * length[s]
     behind = distance < -same
-    a, b = couples(s, np.flatnonzero(facing & behind), np.flatnonzero(~facing & behind))
+    within, out = np.flatnonzero(facing & behind), np.flatnonzero(~facing & behind)
+    a, b = pairs_over_one_facet(s, within, out)
     over, there = look(a, b)
     found[a[over & (distance[a] < there) & (there < -same[a])]] = False
     return found
@@ -60,14 +63,14 @@ def nearest(
     found = np.ones(len(s), dtype=bool)
     covered = np.bincount(s, size, minlength=len(whole))
     several = np.flatnonzero((covered > (1.0 + COVERED_TWICE) * whole)[s])
-    a, b = couples(s, several, several)
+    a, b = pairs_over_one_facet(s, several, several)
     over, there = look(a, b)
     found[a[(a != b) & over & (there < distance[a] - SAME * length[s[a]])]] = False
     return found
 
 
-def couples(s: Array, first: Array, second: Array) -> tuple[Array, Array]:
-    """All couples of a pair of ``first`` and one of ``second`` with the same secondary facet."""
+def pairs_over_one_facet(s: Array, first: Array, second: Array) -> tuple[Array, Array]:
+    """All (a, b), a of ``first`` and b of ``second``, with the same secondary facet."""
     ordered = second[np.argsort(s[second], kind="stable")]
     start = np.searchsorted(s[ordered], s[first], side="left")
     count = np.searchsorted(s[ordered], s[first], side="right") - start

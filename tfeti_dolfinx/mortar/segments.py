@@ -7,20 +7,24 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.mortar.candidates import centre_normals
-from tfeti_dolfinx.mortar.clipping import Parts, common_parts, contains, sizes
+from tfeti_dolfinx.mortar.clipping import CommonParts, common_parts, contains, sizes
 from tfeti_dolfinx.mortar.facet_element import POLYGON
 from tfeti_dolfinx.mortar.facet_maps import densities, points, reference_points
 from tfeti_dolfinx.mortar.facets import FacetKind, Facets
-from tfeti_dolfinx.mortar.layers import Look, nearest, reachable
+from tfeti_dolfinx.mortar.frames import tangents
+from tfeti_dolfinx.mortar.layers import Look, nearest, truly_overlapping
+from tfeti_dolfinx.mortar.pairing import centre_normals
 
-# facets whose normals make a larger angle than about 88 degrees with each other do not face
+# Facets whose normals make a larger angle than about 88 degrees with each other do not face: seen
+# from the side they have no common part but slivers, and rounding must not decide.
 FACING = -0.03
-# hats of quadrilaterals that are no parallelograms are rational on the plane
+# hats of quadrilaterals that are no parallelograms (by more than rounding, of their radius) are
+# rational on the plane: no degree is exact, this one leaves less than the mesh does
 PARALLEL, TWISTED = 1e-10, 12
 # on curved facets areas are no polynomials: so many degrees more than on plane ones
 CURVED = 2
-WHOLE = 1e-6  # share of a facet that may be uncovered by rounding
+# share of a facet that rounding of the common parts may leave uncovered
+WHOLE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -49,7 +53,7 @@ class Segments:
         weight: Their weights, areas on the secondary facet, shape ``(m,)``.
         corners: The corners of the parts.
         whole: Whether each secondary facet is covered wholly, shape ``(n,)``.
-        averted: Whether facets within reach were passed over because they do not face.
+        averted: Whether facets near enough were passed over because they do not face.
     """
 
     points: FacingPoints
@@ -65,7 +69,7 @@ def find_segments(
     primary: Facets,
     pairs: tuple[Array, Array],
     depth: float,
-    reach: float,
+    height: float,
 ) -> Segments:
     """Clip pairs of facets on the secondary facets' averaged normal planes.
 
@@ -79,16 +83,16 @@ def find_segments(
         primary: Primary facets.
         pairs: Secondary and primary facet of each pair.
         depth: Facets that overlap by more than this along the normal do not meet.
-        reach: Nor do facets farther apart than this.
+        height: Nor do facets farther apart than this.
     """
     planes = _Planes(kind, secondary, primary)
     found = planes.meetings(*pairs)
     slack = secondary.radius[found.s] + primary.radius[found.p]
-    within = (found.distance >= -depth - slack) & (found.distance <= reach + slack)
+    within = (found.distance >= -depth - slack) & (found.distance <= height + slack)
     found = found[within & (np.abs(found.cosine) > -FACING)]
     facing, length = found.cosine < FACING, secondary.radius
     averted = bool(np.any(~facing))
-    found = found[reachable(found.s, found.distance, facing, length, planes.look(found))]
+    found = found[truly_overlapping(found.s, found.distance, facing, length, planes.look(found))]
     size = found.parts.size, planes.size
     found = found[nearest(found.s, found.distance, length, *size, planes.look(found))]
     pair, y, weight = found.parts.quadrature(_degree(kind, secondary, primary))
@@ -119,7 +123,7 @@ class _Meetings:
     s: Array
     p: Array
     corners: Array
-    parts: Parts
+    parts: CommonParts
     cosine: Array
     distance: Array
 
@@ -135,7 +139,7 @@ class _Planes:
         self._order = POLYGON[kind.facet]
         corners = secondary.corners(kind.num_vertices)
         self.normal = centre_normals(secondary)
-        self._centre, self._tangents = corners.mean(axis=1), _tangents(self.normal)
+        self._centre, self._tangents = corners.mean(axis=1), tangents(self.normal)
         self._nodes = self._on_planes(secondary.x, np.arange(len(secondary)))
         self.corners = self._nodes[:, : kind.num_vertices]
         self.size = sizes(self.corners[:, self._order])
@@ -202,16 +206,6 @@ class _Planes:
         eta = reference_points(hats, corners, y)
         apart = points(hats, self._primary.x[p], eta) - points(hats, self._secondary.x[s], xi)
         return np.sum(apart * self.normal[s], axis=1)
-
-
-def _tangents(normal: Array) -> Array:
-    """Orthonormal tangents of unit normals, shape ``(n, gdim - 1, gdim)``."""
-    if normal.shape[1] == 2:
-        return np.stack((-normal[:, 1], normal[:, 0]), axis=1)[:, None]
-    axis = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
-    first = np.cross(normal, axis)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack((first, np.cross(normal, first)), axis=1)
 
 
 def _degree(kind: FacetKind, secondary: Facets, primary: Facets) -> int:

@@ -12,12 +12,14 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.compat import cell_permutation, coordinate_element
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.entities import NO_TAG, cell_dim, facet_keys, facet_vertices, set_key
-from tfeti_dolfinx.mesh.gmsh.model import Elements, Part, concatenated
-from tfeti_dolfinx.mesh.gmsh.names import group_names
+from tfeti_dolfinx.mesh.gmsh.model import Elements, ModelContent, concatenated
+from tfeti_dolfinx.mesh.gmsh.names import physical_names
 from tfeti_dolfinx.mesh.gmsh.split import check_shared
 from tfeti_dolfinx.mesh.untorn import UntornMesh
 from tfeti_dolfinx.parallel import Exchange, box_over_ranks
 
+# of the mesh's size: what rounding of coordinates leaves of a plane mesh's height
+FLAT = 1e-12
 # gmsh's element types: DOLFINx's cell type and degree
 CELLS = {
     2: ("triangle", 1),
@@ -32,33 +34,33 @@ CELLS = {
 
 
 def untorn_mesh(
-    parts: Sequence[Part], comm: MPI.Intracomm, shared: bool
+    contents: Sequence[ModelContent], comm: MPI.Intracomm, shared: bool
 ) -> tuple[UntornMesh, Array | None]:
     """The untorn mesh, and the partition of each cell if all cells have one. Collective.
 
     Args:
-        parts: What this rank has read, maybe nothing.
+        contents: What this rank has read, maybe nothing.
         comm: Communicator.
-        shared: Whether parts of different ranks may have nodes and facets in common.
+        shared: Whether models of different ranks may have nodes and facets in common.
 
     Raises:
         InputError: There are no physical groups of cells, the cells are of several types or
             of one that is not supported, plane cells do not lie in a plane, names contradict
-            each other, or the parts do not fit together.
+            each other, or the models do not fit together.
     """
-    top = comm.allreduce(max((part.top for part in parts), default=0), op=MPI.MAX)
-    with_cells = [part for part in parts if top in part.elements]
+    top = comm.allreduce(max((content.top for content in contents), default=0), op=MPI.MAX)
+    with_cells = [content for content in contents if top in content.elements]
     kind, kind_name = _one_kind(with_cells, top, comm)
     shape, degree = CELLS[kind]
     cell_type = dmesh.to_type(shape)
     gdim = cell_dim(cell_type)
     element = coordinate_element(cell_type, degree, gdim)
     empty = _no_elements(kind, kind_name, element.dim // gdim)
-    found = concatenated([empty, *(part.elements[top] for part in with_cells)])
+    found = concatenated([empty, *(content.elements[top] for content in with_cells)])
     cells = found.nodes[:, cell_permutation(cell_type, found.nodes.shape[1])]
-    facets = [part.elements[top - 1] for part in parts if top - 1 in part.elements]
-    all_ids = np.concatenate([empty.ids, *(part.node_ids for part in with_cells)])
-    all_x = np.concatenate([np.empty((0, 3)), *(part.x for part in with_cells)])
+    facets = [content.elements[top - 1] for content in contents if top - 1 in content.elements]
+    all_ids = np.concatenate([empty.ids, *(content.node_ids for content in with_cells)])
+    all_x = np.concatenate([np.empty((0, 3)), *(content.x for content in with_cells)])
     node_ids, first = np.unique(all_ids, return_index=True)
     mesh = UntornMesh(
         cell_type=cell_type,
@@ -69,7 +71,7 @@ def untorn_mesh(
         facet_tags=_facet_tags(cells, cell_type, facets, comm if shared else MPI.COMM_SELF),
         node_ids=node_ids,
         x=np.ascontiguousarray(all_x[first, :gdim]),
-        names=group_names(parts, top, comm),
+        names=physical_names(contents, top, comm),
     )
     extent = _checked_extent(all_x, gdim, comm)
     if shared:
@@ -78,9 +80,10 @@ def untorn_mesh(
     return mesh, found.partitions if partitioned else None
 
 
-def _one_kind(parts: Sequence[Part], top: int, comm: MPI.Intracomm) -> tuple[int, str]:
+def _one_kind(contents: Sequence[ModelContent], top: int, comm: MPI.Intracomm) -> tuple[int, str]:
     """Number and name of gmsh's type of all cells of all ranks."""
-    own = [(part.elements[top].kind, part.elements[top].kind_name, part.where) for part in parts]
+    cells = [(content.elements[top], content.where) for content in contents]
+    own = [(found.kind, found.kind_name, where) for found, where in cells]
     first_of_kind = {kind: (name, where) for kind, name, where in reversed(own)}
     kinds: dict[int, tuple[str, str]] = {}
     for of_rank in comm.allgather(first_of_kind):
@@ -118,7 +121,7 @@ def _checked_extent(x: Array, gdim: int, comm: MPI.Intracomm) -> float:
     """Longest side of the box of all points; raises if plane cells do not lie in a plane."""
     low, high = box_over_ranks(comm, x)
     sides = high - low
-    if gdim == 2 and sides[2] > 1e-12 * sides.max():
+    if gdim == 2 and sides[2] > FLAT * sides.max():
         raise InputError("plane cells that do not lie in a plane z = constant: shells are not")
     return float(sides.max())
 

@@ -36,7 +36,7 @@ class Elements:
 
 
 @dataclass(frozen=True)
-class Part:
+class ModelContent:
     """What one model holds of the mesh.
 
     Attributes:
@@ -59,7 +59,7 @@ class Part:
 
 
 @contextmanager
-def opened(source: str | PathLike[str] | Any, may_be_empty: bool = False) -> Iterator[Any]:
+def open_model(source: str | PathLike[str] | Any, may_be_empty: bool = False) -> Iterator[Any]:
     """The gmsh model of a file, closed afterwards; or the model itself.
 
     Args:
@@ -107,7 +107,7 @@ def opened(source: str | PathLike[str] | Any, may_be_empty: bool = False) -> Ite
             gmsh.model.setCurrent(previous)
 
 
-def read_part(model: Any, where: str) -> Part:
+def read_content(model: Any, where: str) -> ModelContent:
     """What a model holds.
 
     Args:
@@ -127,7 +127,7 @@ def read_part(model: Any, where: str) -> Part:
             elements[dim] = found
     cells = elements.get(top)
     used = np.unique(cells.nodes if cells else np.empty(0, dtype=np.int64))
-    return Part(
+    return ModelContent(
         where=where,
         top=top,
         elements=elements,
@@ -154,25 +154,25 @@ def _names(model: Any, dim: int) -> dict[str, int]:
         name = model.getPhysicalName(dim, tag)
         if not PARTITION_GROUP.fullmatch(name):
             names[name or str(tag)] = int(tag)
-        elif tag_of := _original_group(model, dim, tag):
+        elif tag_of := _original_physical_group(model, dim, tag):
             names.setdefault(model.getPhysicalName(dim, tag_of) or str(tag_of), tag_of)
     return names
 
 
-def _original_group(model: Any, dim: int, tag: int) -> int:
+def _original_physical_group(model: Any, dim: int, tag: int) -> int:
     """The group that a partition's group stands for, or the group itself."""
     match = PARTITION_GROUP.fullmatch(model.getPhysicalName(dim, tag))
     return int(match[1]) if match else int(tag)
 
 
-def _groups(model: Any, dim: int, entity: int) -> set[int]:
+def _physical_groups(model: Any, dim: int, entity: int) -> set[int]:
     """Physical groups of an entity, or of the entity that gmsh partitioned it from."""
     groups = model.getPhysicalGroupsForEntity(dim, entity)
     if len(groups) == 0:
         parent_dim, parent = model.getParent(dim, entity)
         if parent_dim == dim:
             groups = model.getPhysicalGroupsForEntity(dim, parent)
-    return {_original_group(model, dim, tag) for tag in groups}
+    return {_original_physical_group(model, dim, tag) for tag in groups}
 
 
 def _elements(model: Any, dim: int) -> Elements | None:
@@ -182,7 +182,7 @@ def _elements(model: Any, dim: int) -> Elements | None:
     """
     found: list[Elements] = []
     for _, entity in model.getEntities(dim):
-        groups = _groups(model, dim, entity)
+        groups = _physical_groups(model, dim, entity)
         kinds, ids, nodes = model.mesh.getElements(dim, entity)
         if not groups or len(kinds) == 0:
             continue

@@ -13,7 +13,7 @@ from tfeti_dolfinx.checks import checked_type
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.gmsh.join import untorn_mesh
-from tfeti_dolfinx.mesh.gmsh.model import Part, opened, read_part
+from tfeti_dolfinx.mesh.gmsh.model import ModelContent, open_model, read_content
 from tfeti_dolfinx.mesh.gmsh.split import find_split_files, read_split_files
 from tfeti_dolfinx.mesh.partition import (
     Subdomains,
@@ -70,8 +70,8 @@ def _read_and_tear(
     source: Any, comm: MPI.Intracomm, subdomains: Subdomains | None
 ) -> Decomposition:
     files = find_split_files(source, comm)
-    parts = read_split_files(files, comm) if files else _read_on_rank_0(source, comm)
-    untorn, partitions = untorn_mesh(parts, comm, shared=files is not None)
+    contents = read_split_files(files, comm) if files else _read_on_rank_0(source, comm)
+    untorn, partitions = untorn_mesh(contents, comm, shared=files is not None)
     if subdomains is None:
         subdomains = default_count(untorn, comm) if partitions is None else partitions
     # METIS needs the mesh on one rank
@@ -81,10 +81,10 @@ def _read_and_tear(
     return tear(untorn, subdomain, comm, absorb=bisected)
 
 
-def _read_on_rank_0(source: Any, comm: MPI.Intracomm) -> list[Part]:
-    parts = []
+def _read_on_rank_0(source: Any, comm: MPI.Intracomm) -> list[ModelContent]:
+    contents = []
     with raised_on_all_ranks(comm):
         if comm.rank == 0:
-            with opened(source) as model:
-                parts.append(read_part(model, "the mesh"))
-    return parts
+            with open_model(source) as model:
+                contents.append(read_content(model, "the mesh"))
+    return contents

@@ -14,12 +14,13 @@ from mpi4py import MPI
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.entities import equal_pairs, set_key
-from tfeti_dolfinx.mesh.gmsh.model import Elements, Part, opened, read_part
+from tfeti_dolfinx.mesh.gmsh.model import Elements, ModelContent, open_model, read_content
 from tfeti_dolfinx.mesh.untorn import UntornMesh
 from tfeti_dolfinx.parallel import Exchange
 
 ONE_MODEL = "expected files that gmsh has written from one model with Mesh.PartitionSplitMeshFiles"
-# distance, relative to the size of the mesh, up to which a node's places are the same
+# distance, relative to the size of the mesh, up to which a node's places are the same: files in
+# text keep fewer digits than gmsh has
 SAME_PLACE = 1e-9
 
 
@@ -71,27 +72,29 @@ def _found(path: Path) -> SplitFiles | None:
     return files if numbers else None
 
 
-def read_split_files(files: SplitFiles, comm: MPI.Intracomm) -> list[Part]:
+def read_split_files(files: SplitFiles, comm: MPI.Intracomm) -> list[ModelContent]:
     """What this rank's files hold, the number of its file as the partition of a cell. Collective.
 
     Raises:
         InputError: A file cannot be read, or partitions are missing.
     """
-    parts = []
+    contents = []
     with raised_on_all_ranks(comm):
         for number in files.of_rank(comm):
             # a partition may hold no element in a physical group: gmsh then writes no nodes
-            with opened(files.file(number), may_be_empty=True) as model:
-                part = read_part(model, files.file(number).name)
-            of_file = {d: _in_partition(e, number) for d, e in part.elements.items()}
-            parts.append(replace(part, elements=of_file))
-    known = comm.allreduce(max((part.num_partitions for part in parts), default=0), op=MPI.MAX)
+            with open_model(files.file(number), may_be_empty=True) as model:
+                content = read_content(model, files.file(number).name)
+            of_file = {d: _in_partition(e, number) for d, e in content.elements.items()}
+            contents.append(replace(content, elements=of_file))
+    known = comm.allreduce(
+        max((content.num_partitions for content in contents), default=0), op=MPI.MAX
+    )
     if known > files.count:
         raise InputError(
             f"{files.file(files.count + 1)}: no such file; expected one file for each of the "
             f"{known} partitions"
         )
-    return parts
+    return contents
 
 
 def _in_partition(elements: Elements, number: int) -> Elements:

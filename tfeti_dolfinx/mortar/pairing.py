@@ -11,9 +11,13 @@ from tfeti_dolfinx.mesh.partition import bisect_points
 from tfeti_dolfinx.mortar.facets import Facets
 from tfeti_dolfinx.parallel import Exchange
 
+# asked of a tree at first, and twice as many where that was not all: facets of one size class have
+# about 20 neighbours within their radii
+NEIGHBOURS = 64
+
 
 def rendezvous(
-    secondary: Facets, primary: Facets, reach: float, comm: MPI.Intracomm
+    secondary: Facets, primary: Facets, distance: float, comm: MPI.Intracomm
 ) -> tuple[Facets, Facets]:
     """Bring facets that may meet to the same rank. Collective.
 
@@ -23,7 +27,7 @@ def rendezvous(
     Args:
         secondary: Secondary facets of this rank.
         primary: Primary facets of this rank.
-        reach: How far apart facets may be, their own sizes not counted.
+        distance: How far apart facets may be, their own sizes not counted.
         comm: Communicator.
 
     Returns:
@@ -37,28 +41,28 @@ def rendezvous(
     boxes = np.empty((comm.size, 2, gdim))
     comm.Allgather(box + np.array([[-size], [size]]), boxes)
     low, high = primary.box()
-    margin = reach + primary.radius[:, None]
-    near = np.ones((len(primary), comm.size), dtype=bool)
+    margin = distance + primary.radius[:, None]
+    meets = np.ones((len(primary), comm.size), dtype=bool)
     for axis in range(gdim):
-        near &= low[:, axis, None] - margin <= boxes[None, :, 1, axis]
-        near &= high[:, axis, None] + margin >= boxes[None, :, 0, axis]
-    facet, rank = np.nonzero(near)
+        meets &= low[:, axis, None] - margin <= boxes[None, :, 1, axis]
+        meets &= high[:, axis, None] + margin >= boxes[None, :, 0, axis]
+    facet, rank = np.nonzero(meets)
     return here, primary.sent(Exchange(comm, rank), facet)
 
 
-def candidate_pairs(secondary: Facets, primary: Facets, reach: float) -> tuple[Array, Array]:
+def possible_pairs(secondary: Facets, primary: Facets, distance: float) -> tuple[Array, Array]:
     """Pairs of facets that may meet when one looks along the secondary facets' normals.
 
     A primary facet is found if it comes within a secondary facet's radius of the line through
-    that facet's centre along its averaged normal, no farther than ``reach`` and the facets' sizes
-    from the centre. Primary facets are sorted into classes of equal size up to a factor of 2,
+    that facet's centre along its averaged normal, no farther than ``distance`` and the facets'
+    sizes from the centre. Primary facets are sorted into classes of equal size up to a factor of 2,
     each with a tree of its own, so that a graded mesh does not make large facets meet small ones
     in vain.
 
     Args:
         secondary: Secondary facets, with averaged normals.
         primary: Primary facets.
-        reach: How far to look, to both sides.
+        distance: How far to look, to both sides.
 
     Returns:
         Secondary and primary facet of each pair.
@@ -71,13 +75,13 @@ def candidate_pairs(secondary: Facets, primary: Facets, reach: float) -> tuple[A
     for size_class in np.unique(classes) if len(secondary) else ():
         members = np.flatnonzero(classes == size_class)
         radius = s_size + p_size[members].max()
-        s, hit = _march(cKDTree(p_centre[members]), s_centre, direction, radius, reach + radius)
+        s, hit = _march(cKDTree(p_centre[members]), s_centre, direction, radius, distance + radius)
         p = members[hit]
         offset = p_centre[p] - s_centre[s]
         along = np.sum(offset * direction[s], axis=1)
         aside = np.linalg.norm(offset - along[:, None] * direction[s], axis=1)
         sizes = s_size[s] + p_size[p]
-        close = (aside <= sizes) & (np.abs(along) <= reach + sizes + p_size[p])
+        close = (aside <= sizes) & (np.abs(along) <= distance + sizes + p_size[p])
         keys.append(s[close] * len(primary) + p[close])
     return np.divmod(np.unique(np.concatenate(keys)), max(len(primary), 1))
 
@@ -89,7 +93,7 @@ def centre_normals(facets: Facets) -> Array:
 
 
 def _march(
-    tree: cKDTree, origin: Array, direction: Array, radius: Array, reach: Array
+    tree: cKDTree, origin: Array, direction: Array, radius: Array, half_length: Array
 ) -> tuple[Array, Array]:
     """Points of a tree within a radius of line segments: steps as long as nothing is near.
 
@@ -98,14 +102,14 @@ def _march(
         origin: Middle of each segment, shape ``(n, gdim)``.
         direction: Unit vectors, shape ``(n, gdim)``.
         radius: One per segment, shape ``(n,)``.
-        reach: Half the length of each segment, shape ``(n,)``.
+        half_length: Half the length of each segment, shape ``(n,)``.
 
     Returns:
         Segment and point of each pair, some more than once.
     """
     found_s: list[Array] = [np.empty(0, dtype=np.int64)]
     found_p: list[Array] = [np.empty(0, dtype=np.int64)]
-    front = -reach  # all before it has been seen
+    front = -half_length  # all before it has been seen
     active = np.arange(len(origin))
     while len(active):
         t = front[active] + radius[active]
@@ -116,14 +120,14 @@ def _march(
         found_s.append(active[close][rows])
         found_p.append(points)
         front[active] = t + np.where(close, radius[active], nearest - radius[active])
-        active = active[front[active] < reach[active]]
+        active = active[front[active] < half_length[active]]
     return np.concatenate(found_s), np.concatenate(found_p)
 
 
 def _within(tree: cKDTree, x: Array, radius: Array) -> tuple[Array, Array]:
     """Points of a tree within a radius of each x: row and point of each pair."""
     found: list[tuple[Array, Array]] = [(np.empty(0, dtype=np.int64),) * 2]
-    rows, k = np.arange(len(x)), min(64, tree.n)
+    rows, k = np.arange(len(x)), min(NEIGHBOURS, tree.n)
     while len(rows):
         distance, point = tree.query(
             x[rows], k=np.arange(1, k + 1), distance_upper_bound=np.nextafter(radius.max(), np.inf)

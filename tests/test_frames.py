@@ -1,0 +1,214 @@
+"""Frames of contact conditions, and what follows from them: coefficients, gaps, slips, rows."""
+
+import numpy as np
+import pytest
+import ufl
+from bodies import gathered, searched, sided, stacked
+from dolfinx import fem
+from hypothesis import given
+from hypothesis import strategies as st
+from mpi4py import MPI
+from scenes import curved_obstacle, decomposed
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.arrays import sum_rows
+from tfeti_dolfinx.contact.records import relative_displacement, remaining_gaps, slips
+from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.gluing.glue import glue
+from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.mortar.frames import SWITCH, frames
+from tfeti_dolfinx.mortar.surfaces import group_points
+
+CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
+ORDERS = [("upper bottom", "lower top"), ("lower top", "upper bottom")]
+
+
+def unit(vectors):
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def simple_normals(gdim):
+    """Normals of plane faces as engineers draw them: axes, diagonals, simple slopes."""
+    steps = np.arange(-4, 5)
+    grid = np.stack(np.meshgrid(*[steps] * gdim), axis=-1).reshape(-1, gdim)
+    return unit(grid[np.any(grid != 0, axis=1)])
+
+
+def dofs_on(d, degree=1):
+    gdim = d.mesh.geometry.dim
+    return TornDofs(fem.functionspace(d.mesh, ("Lagrange", degree, (gdim,))), d)
+
+
+def nodal(dofs, function):
+    """Values at the nodes of a function from (n, gdim) to (n, gdim), in primal order."""
+    x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node]
+    return function(x[:, : dofs.bs]).ravel()
+
+
+@given(st.integers(1, 3), st.integers(0, 1000))
+def test_frames_are_orthonormal_and_right_handed(gdim, seed):
+    normal = unit(np.random.default_rng(seed).standard_normal((20, gdim)))
+    frame = frames(normal)
+    assert frame.shape == (20, gdim, gdim)
+    assert np.array_equal(frame[:, 0], normal)
+    assert np.allclose(frame @ frame.transpose(0, 2, 1), np.eye(gdim), rtol=0, atol=1e-14)
+    if gdim > 1:
+        assert np.allclose(np.linalg.det(frame), 1.0)
+
+
+@pytest.mark.parametrize("gdim", [2, 3])
+def test_faces_along_coordinate_planes_have_tangents_along_axes(gdim):
+    frame = frames(np.concatenate((np.eye(gdim), -np.eye(gdim))))
+    assert np.array_equal(np.sort(np.abs(frame), axis=2)[:, :, :-1], np.zeros_like(frame[:, :, 1:]))
+
+
+@pytest.mark.parametrize("gdim", [2, 3])
+def test_rounding_of_a_normal_does_not_turn_its_tangents(gdim):
+    normal = simple_normals(gdim)
+    assert np.all(np.abs(np.abs(normal[:, 0]) - SWITCH) > 1e-3)
+    rng = np.random.default_rng(0)
+    for size in (1e-15, 1e-9):
+        moved = unit(normal + size * rng.standard_normal(normal.shape))
+        assert np.allclose(frames(moved), frames(normal), rtol=0, atol=20 * size)
+
+
+@given(st.integers(0, 1000))
+def test_frames_are_continuous_but_for_the_switch(seed):
+    rng = np.random.default_rng(seed)
+    normal = unit(rng.standard_normal((50, 3)))
+    moved = unit(normal + 1e-4 * rng.standard_normal((50, 3)))
+    same_side = (np.abs(normal[:, 0]) < SWITCH) == (np.abs(moved[:, 0]) < SWITCH)
+    change = np.linalg.norm(moved - normal, axis=1)
+    turned = np.abs(frames(moved) - frames(normal)).max(axis=(1, 2))
+    # the first tangent is e − (e·n)n over its length, which is √(1 − 0.9²) at least
+    assert np.all(turned[same_side] <= 3.0 / np.sqrt(1 - SWITCH**2) * change[same_side])
+
+
+def test_frames_are_the_same_on_any_number_of_ranks():
+    found = []
+    for comm in (MPI.COMM_WORLD, MPI.COMM_SELF):
+        d = decomposed("tetrahedron", 4, 5, comm=comm)
+        dofs = dofs_on(d)
+        records = tfeti.Obstacle("bottom", curved_obstacle(3)).records(dofs, d, 0)
+        parts = comm.allgather((group_points(dofs)[records.group], records.frame))
+        x, frame = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+        found.append(frame[np.lexsort(np.round(x, 9).T)])
+    assert np.allclose(*found, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("gap", [0.0, 0.1])
+@pytest.mark.parametrize("sides", ORDERS)
+@pytest.mark.parametrize("cell", CELLS)
+def test_slip_and_gap_of_moved_bodies(cell, sides, gap, degree):
+    """One body moves by t + Ax, or both rotate: linear fields are met exactly."""
+    d = stacked(cell, 3, 4, 4, gap=gap)
+    dofs = dofs_on(d, degree)
+    records, gdim = searched([sided(*sides, reach=0.5)], dofs, d), dofs.bs
+    assert MPI.COMM_WORLD.allreduce(len(records)) > 0
+    x = group_points(dofs)[records.group][:, :gdim]
+    rng = np.random.default_rng(3)
+    t, A = rng.standard_normal(gdim), rng.standard_normal((gdim, gdim))
+    of_upper = 1.0 if sides[0] == "upper bottom" else -1.0
+
+    def upper_moves(x):
+        return np.where(x[:, gdim - 1 :] > 0.5 * gap - 1e-9, t + x @ A.T, 0.0)
+
+    def rotation(x):
+        return t + x @ (A - A.T)
+
+    if gap > 0.0:  # else nodes of both bodies have the same points
+        at = x if of_upper > 0.0 else x + gap * records.normal
+        check_motion(records, dofs, upper_moves, of_upper * (t + at @ A.T))
+    away = -gap * records.normal  # from what a node meets to the node
+    check_motion(records, dofs, rotation, away @ (A - A.T))
+
+
+def check_motion(records, dofs, motion, v):
+    """The relative displacement is v, and gap and slip are its parts."""
+    u = nodal(dofs, motion)
+    assert np.allclose(relative_displacement(records, dofs, u), v, rtol=0, atol=1e-12)
+    left = records.gap - np.sum(records.normal * v, axis=1)
+    assert np.allclose(remaining_gaps(records, dofs, u), left, rtol=0, atol=1e-12)
+    along = slips(records, dofs, u)
+    assert along.shape == (len(records), dofs.bs - 1)
+    tangential = v - np.sum(records.normal * v, axis=1)[:, None] * records.normal
+    found = np.einsum("nt,ntg->ng", along, records.tangents)
+    assert np.allclose(found, tangential, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_coefficients_give_the_motion_along_each_axis(cell):
+    d = stacked(cell, 3, 4, 4)
+    dofs = dofs_on(d)
+    records = searched([sided(*ORDERS[0])], dofs, d)
+    u = nodal(dofs, lambda x: np.sin(3.0 * x) + x[:, ::-1])
+    (values,) = dofs.lookup(
+        records.entry_group,
+        dofs.reduce(u.reshape(-1, dofs.bs), np.minimum, np.inf),
+    )
+    v = relative_displacement(records, dofs, u)
+    for axis in range(dofs.bs):
+        moved = np.sum(records.coefficients(axis) * values, axis=1)
+        found = sum_rows(records.condition, moved, len(records))
+        assert np.allclose(found, np.sum(records.frame[:, axis] * v, axis=1), rtol=0, atol=1e-13)
+
+
+def test_rows_of_normals_measure_what_records_do():
+    """On displacements without jumps B_N u = s_i n_i·v_i, v_i from the records."""
+    d = stacked("tetrahedron", 3, 4, 6)
+    dofs = dofs_on(d)
+    records = searched([sided(*ORDERS[1])], dofs, d)
+    weights = 1.0 + np.arange(dofs.num_nodes * 3) % 7
+    gluing = glue(dofs, [], records, 1.0, weights)
+    u = nodal(dofs, lambda x: np.cos(2.0 * x) - x[:, [1, 2, 0]])
+    constraints = gluing.constraints
+    trace, Bu = constraints.B.createVecs()
+    trace.array[:] = u[constraints.trace]
+    constraints.B.mult(trace, Bu)
+    v = relative_displacement(records, dofs, u)
+    expected = np.sum(records.normal * v, axis=1)[gluing.contact.condition]
+    rows = Bu.array_r[constraints.sets.normals] / constraints.scale
+    assert MPI.COMM_WORLD.allreduce(len(rows)) > 0
+    assert np.allclose(rows, expected, rtol=0, atol=1e-12)
+    for vec in (trace, Bu):
+        vec.destroy()
+    constraints.destroy()
+
+
+def scalar_problem(d, contacts, flux=0.3):
+    """A membrane over the unit square, held at the top, pulled down at the bottom."""
+    V = fem.functionspace(d.mesh, ("Lagrange", 1))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+    top = fem.locate_dofs_topological(V, 1, d.facets("top"))
+    a = ufl.inner(ufl.grad(u), ufl.grad(v)) * ufl.dx
+    L = fem.Constant(d.mesh, -flux) * v * ds(d.surface("bottom"))
+    options = {"tfeti_rtol": 1e-10}
+    return tfeti.ContactProblem(
+        a, L, [fem.dirichletbc(0.0, top, V)], contacts, d, petsc_options=options
+    )
+
+
+def test_a_membrane_over_an_obstacle():
+    """Height u = −g(1 − y), and the obstacle bears what the membrane does not: q − g."""
+    g, q = 0.1, 0.3
+    d = decomposed("quadrilateral", 6, 4)
+    below = tfeti.SignedDistance(
+        lambda x: 0.0 * x[0] + g, lambda x: np.stack((0.0 * x[0] + 1.0, 0.0 * x[0], 0.0 * x[0]))
+    )
+    p = scalar_problem(d, [tfeti.Obstacle("bottom", below)], q)
+    uh = p.solve()
+    y = uh.function_space.tabulate_dof_coordinates()[:, 1]
+    assert np.allclose(uh.x.array, -g * (1.0 - y), rtol=0, atol=1e-8)
+    records = p.solution.gluing.records
+    assert records.frame.shape == (len(records), 1, 1)
+    assert np.allclose(gathered(p.solution.contact().pressure), q - g, rtol=0, atol=1e-7)
+    assert slips(records, p.dofs, p.dofs.to_primal(uh.x.array)).shape == (len(records), 0)
+
+
+def test_two_surfaces_of_a_scalar_space_are_an_error():
+    d = stacked("quadrilateral", 3, 4, 4)
+    V = fem.functionspace(d.mesh, ("Lagrange", 1))
+    with pytest.raises(InputError, match="contact of .*: the space is scalar; expected displ"):
+        searched([tfeti.Contact("upper bottom", "lower top")], TornDofs(V, d), d)

@@ -1,0 +1,134 @@
+"""Solves that repeat: only what depends on a change is made again."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from scenes import curved_obstacle, decomposed, hooke, strain
+
+import tfeti_dolfinx as tfeti
+
+COUNTERS = ("assemblies", "searches", "gluings", "factorizations", "coarse_factorizations")
+MADE_ONCE = {"stiffness", "search", "rows", "factors", "trace", "coarse problem"}
+
+
+class Repeated:
+    """A box on a curved obstacle, clamped on the left, that takes other data."""
+
+    def __init__(self, cell="hexahedron", contact=True, **options):
+        d = decomposed(cell, 4, 6)
+        gdim = d.mesh.geometry.dim
+        V = fem.functionspace(d.mesh, ("Lagrange", 1, (gdim,)))
+        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+        dx = ufl.Measure("dx", domain=d.mesh)
+        ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+        self.E = fem.Constant(d.mesh, 1.0)
+        self.load = fem.Constant(d.mesh, np.array([0.0] * (gdim - 1) + [-0.05]))
+        self.held = fem.Constant(d.mesh, np.zeros(gdim))
+        left = fem.locate_dofs_topological(V, gdim - 1, d.facets("left"))
+        self.problem = tfeti.ContactProblem(
+            self.E * ufl.inner(hooke()(u), strain(v)) * dx,
+            ufl.dot(self.load, v) * ds(d.surface("top")),
+            [fem.dirichletbc(self.held, left, V)],
+            [tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=0.2)] if contact else [],
+            d,
+            petsc_options={"rtol": 1e-10, **options},
+        )
+        self.cell, self.contact, self.options = cell, contact, options
+
+    def change(self, E=1.0, load=-0.05, held=0.0):
+        self.E.value, self.load.value[-1], self.held.value[-1] = E, load, held
+
+    def solve(self, **changes):
+        self.change(**changes)
+        self.problem.solve()
+        return self.problem.solution
+
+    def fresh(self, **changes):
+        """The solution of a problem that was never solved with other data."""
+        other = Repeated(self.cell, self.contact, **self.options)
+        solution = other.solve(**changes)
+        other.problem.destroy()
+        return solution
+
+
+def counters(report):
+    return [getattr(report, name) for name in COUNTERS]
+
+
+def distance(solution, other):
+    """Largest difference of two displacements over the largest displacement."""
+    comm = solution.dofs.comm
+    apart = comm.allreduce(np.abs(solution.u - other.u).max(initial=0.0), op=tfeti_max)
+    return apart / comm.allreduce(np.abs(other.u).max(initial=0.0), op=tfeti_max)
+
+
+def tfeti_max(a, b):
+    return max(a, b)
+
+
+@pytest.fixture(params=[("hexahedron", True), ("triangle", True), ("tetrahedron", False)])
+def scene(request):
+    cell, contact = request.param
+    made = Repeated(cell, contact)
+    yield made
+    made.problem.destroy()
+
+
+def test_another_load_makes_no_row_and_no_factor(scene):
+    first = scene.solve()
+    before = first.displacement.x.array.copy()
+    second = scene.solve(load=-0.08)
+    report = scene.problem.report
+    assert counters(report) == [0] * len(COUNTERS)
+    assert set(report.reused) >= MADE_ONCE
+    assert "load" not in report.reused
+    assert distance(second, scene.fresh(load=-0.08)) <= 1e-8
+    assert distance(second, first) > 1e-2
+    assert np.array_equal(first.displacement.x.array, before)
+
+
+def test_other_prescribed_values_make_no_row(scene):
+    scene.solve()
+    second = scene.solve(held=-0.01)
+    report = scene.problem.report
+    assert counters(report) == [0] * len(COUNTERS)
+    assert "right side" not in report.reused
+    assert distance(second, scene.fresh(held=-0.01)) <= 1e-8
+
+
+def test_another_stiffness_is_not_searched_again(scene):
+    scene.solve()
+    second = scene.solve(E=2.0)
+    report = scene.problem.report
+    assert report.searches == 0
+    assert report.assemblies == report.gluings == report.coarse_factorizations == 1
+    assert report.factorizations > 0
+    assert distance(second, scene.fresh(E=2.0)) <= 1e-8
+
+
+def test_the_start_is_no_worse_than_none(scene):
+    """Back and forth between two loads, the answers are those of fresh problems."""
+    for load in (-0.05, 0.03, -0.05):
+        assert distance(scene.solve(load=load), scene.fresh(load=load)) <= 1e-8
+
+
+def test_counters_and_seconds_add_up_apart(scene):
+    multiplications, seconds = 0, 0.0
+    for load in (-0.05, -0.08, -0.02):
+        scene.solve(load=load)
+        report = scene.problem.report
+        multiplications += report.F_multiplications
+        seconds += report.seconds["total"]
+    assert report.in_all["solves"] == 3
+    assert report.in_all["F_multiplications"] == multiplications
+    assert report.in_all["seconds"] == pytest.approx(seconds)
+    assert report.in_all["searches"] == 1
+
+
+def test_a_problem_that_was_destroyed_is_solved_anew(scene):
+    first = scene.solve()
+    scene.problem.destroy()
+    second = scene.solve()
+    assert min(counters(scene.problem.report)) == 1 or scene.problem.report.factorizations > 1
+    assert distance(second, first) <= 1e-9

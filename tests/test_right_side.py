@@ -1,0 +1,175 @@
+"""Other prescribed values and gaps: c alone changes, to what assembling anew would give."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bodies import searched, sided, stacked
+from dolfinx import fem
+from mpi4py import MPI
+from scenes import clamp, decomposed
+from test_solvable_lp import in_a_slot
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.contact.search import ContactSearch
+from tfeti_dolfinx.errors import InputError, NoSolutionError
+from tfeti_dolfinx.gluing.glue import glue
+from tfeti_dolfinx.gluing.prescribed import prescribe
+from tfeti_dolfinx.mesh.dofs import TornDofs
+
+PAIR = sided("upper bottom", "lower top", reach=0.5)
+
+
+class Scene:
+    """A box on a box, on an obstacle; some nodes in contact are held in one direction."""
+
+    def __init__(self, cell="tetrahedron", degree=1):
+        self.d = d = stacked(cell, 3, 4, 6)
+        gdim = d.mesh.geometry.dim
+        self.V = V = fem.functionspace(d.mesh, ("Lagrange", degree, (gdim,)))
+        self.dofs = TornDofs(V, d)
+        up = np.eye(gdim)[-1] + 0.3 * np.eye(gdim)[0]
+        plane = tfeti.Plane(tuple(-1.1 * np.eye(gdim)[-1]), tuple(up))
+        contacts = [PAIR, tfeti.Obstacle("lower bottom", plane, reach=np.inf)]
+        self.search = ContactSearch(contacts, self.dofs, d, np.ones(self.dofs.num_nodes * gdim))
+        self.weights = 1.0 + np.arange(self.dofs.num_nodes * gdim) % 5
+
+    def bcs(self, side, across, top):
+        """Values: of the x component at a side, of the last at the lower box's right, on top."""
+        V, d, last = self.V, self.d, self.V.mesh.geometry.dim - 1
+        fdim = d.mesh.topology.dim - 1
+        made = []
+        for name, axis, value in (("lower left", 0, side), ("lower right", last, across)):
+            at = fem.locate_dofs_topological(V.sub(axis), fdim, d.facets(name))
+            made.append(fem.dirichletbc(value, at, V.sub(axis)))
+        return [*made, clamp(V, d.facets("upper top"), top)]
+
+    def glued(self, bcs, records=None):
+        records = self.search.records if records is None else records
+        return glue(self.dofs, bcs, records, 1.0, self.weights)
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_other_values_and_gaps_cost_a_vector(cell, degree):
+    scene = Scene(cell, degree)
+    old, new = scene.bcs(0.01, 0.02, -0.03), scene.bcs(-0.04, 0.1, 0.2)
+    gluing = scene.glued(old)
+    B, c = gluing.constraints.B, gluing.constraints.c
+    entries, state = [np.array(part) for part in B.getValuesCSR()], B.stateGet()
+    first = np.array(c.array_r)
+    scene.search.set_gap(0, lambda x: 0.1 + 0.01 * x[0])
+    anew = scene.glued(new)
+    values, gaps = prescribe(scene.dofs, new).value, scene.search.records.gap
+    expected = np.array(anew.constraints.c.array_r)
+    assert np.allclose(gluing.right_side(values, gaps), expected, rtol=1e-14, atol=1e-15)
+    assert np.array_equal(c.array_r, first)
+
+    updated = gluing.with_right_side(values, gaps)
+    assert updated.constraints is gluing.constraints
+    assert np.allclose(c.array_r, expected, rtol=1e-14, atol=1e-15)
+    assert MPI.COMM_WORLD.allreduce(int(np.sum(expected != first))) > 0
+    assert B.stateGet() == state
+    for before, now, other in zip(
+        entries, B.getValuesCSR(), anew.constraints.B.getValuesCSR(), strict=True
+    ):
+        assert np.array_equal(before, now)
+        assert np.array_equal(before, other)
+    assert np.array_equal(updated.records.gap, gaps)
+    assert np.allclose(updated.prescribed.value, anew.prescribed.value)
+    assert not np.array_equal(gluing.records.gap, gaps) or len(gaps) == 0
+    for item in (gluing, anew):
+        item.constraints.destroy()
+
+
+def test_rows_stand_in_named_sets_once():
+    sets = Scene().glued([]).constraints.sets
+    rows = np.concatenate((sets.equalities, sets.normals, sets.tangents.ravel()))
+    assert np.array_equal(np.sort(rows), np.arange(sets.num_rows))
+    assert sets.tangents.shape == (0, 2)
+
+
+def test_values_that_push_a_held_face_into_an_obstacle_leave_c_as_it_was():
+    d = decomposed("hexahedron", 3, 4)
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (3,)))
+    dofs = TornDofs(V, d)
+    wall = tfeti.Obstacle("left", tfeti.Plane((-0.5, 0, 0), (1, 0, 0)))
+    records = searched([wall], dofs, d)
+    gluing = glue(dofs, [clamp(V, d.facets("left"))], records, 1.0, np.ones(dofs.num_nodes * 3))
+    assert d.comm.allreduce(len(gluing.contact.decided)) == 0
+    near = glue(
+        dofs,
+        [clamp(V, d.facets("left"))],
+        searched([tfeti.Obstacle("left", wall.shape, reach=np.inf)], dofs, d),
+        1.0,
+        np.ones(dofs.num_nodes * 3),
+    )
+    assert d.comm.allreduce(len(near.contact.decided)) == 16
+    c = np.array(near.constraints.c.array_r)
+    values = np.array(near.prescribed.value)
+    values[:, 0] -= 0.75
+    with pytest.raises(NoSolutionError, match=r"prescribed: .* nodes penetrate by up to 0\.25 "):
+        near.with_right_side(values, near.records.gap)
+    assert np.array_equal(near.constraints.c.array_r, c)
+    values[:, 0] += 0.5
+    near.with_right_side(values, near.records.gap)
+    with pytest.raises(NoSolutionError, match=r"prescribed: .* nodes penetrate by up to 1\.75 "):
+        near.with_right_side(values, near.records.gap - 2.0)
+
+
+def test_gaps_that_contradict_each_other_are_found_without_new_rows():
+    """A block all of whose skin stays between two walls, which then pass each other."""
+    p = in_a_slot(0.9)
+    dofs, d = p.dofs, p.decomposition
+    records = searched([replace(wall, reach=np.inf) for wall in p.contacts], dofs, d)
+    gluing = glue(dofs, [], records, 1.0, np.ones(dofs.num_nodes * 2))
+    values = np.zeros_like(gluing.prescribed.value)
+    gluing.right_side(values, records.gap)
+    with pytest.raises(NoSolutionError, match=r"contacts 0 and 1 .* contradict each other"):
+        gluing.right_side(values, records.gap - 0.5)
+    gluing.constraints.destroy()
+
+
+class Counted:
+    """Fails the test where conditions are made anew."""
+
+    def __init__(self, monkeypatch):
+        monkeypatch.setattr(tfeti.Contact, "records", self.never)
+        monkeypatch.setattr(tfeti.Contact, "_meet", self.never)
+
+    def never(self, *args):
+        raise AssertionError("a search")
+
+
+def test_another_gap_needs_no_search(monkeypatch):
+    scene = Scene("triangle")
+    search = scene.search
+    geometry = search.records
+    ramp = searched([sided("upper bottom", "lower top", reach=0.5, gap=0.01)], scene.dofs, scene.d)
+    Counted(monkeypatch)
+    search.set_gap(0, 0.01)
+    own = search.records.contact == 0
+    assert np.allclose(search.records.gap[own], ramp.gap, rtol=0, atol=1e-15)
+    assert np.array_equal(search.records.gap[~own], geometry.gap[~own])
+    assert np.array_equal(search.records.geometric_gap, geometry.geometric_gap)
+    assert np.array_equal(search.records.within_reach, geometry.within_reach)
+    assert search.contacts[0].gap == 0.01
+    for gap in (np.nan, "geometric", lambda x: np.nan + x[0]):
+        with pytest.raises(InputError, match="gap"):
+            search.set_gap(0, gap)
+        assert search.contacts[0].gap == 0.01
+    search.set_gap(1, lambda x: x[0])
+    search.set_gap(0, "geometry")
+    assert np.array_equal(search.records.gap[own], geometry.gap[own])
+    search.set_gap(1, "geometry")
+    assert np.array_equal(search.records.gap, geometry.gap)
+
+
+def test_a_geometry_that_overlaps_too_deep_is_not_gone_back_to():
+    d = stacked("triangle", 3, 4, 4, gap=-0.1)
+    dofs = TornDofs(fem.functionspace(d.mesh, ("Lagrange", 1, (2,))), d)
+    pair = sided("upper bottom", "lower top", gap=0.0)
+    search = ContactSearch([pair], dofs, d, np.ones(dofs.num_nodes * 2))
+    with pytest.raises(InputError, match=r"the surfaces overlap by up to 0\.1, more than"):
+        search.set_gap(0, "geometry")
+    assert np.array_equal(search.records.gap, np.zeros(len(search.records)))

@@ -1,0 +1,274 @@
+"""From forms to the dual problem, in stages that are kept until their input changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Any, TypeVar
+
+import numpy as np
+from dolfinx import fem
+from mpi4py import MPI
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.assembly import Forms
+from tfeti_dolfinx.contact.search import ContactPartner, ContactSearch
+from tfeti_dolfinx.dual.dual import Dual
+from tfeti_dolfinx.dual.naming import NamedBodies
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.gluing.glue import Gluing, glue
+from tfeti_dolfinx.gluing.prescribed import Prescribed, prescribe
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.parallel import any_rank
+from tfeti_dolfinx.report import Report
+from tfeti_dolfinx.report_filling import fill_sizes
+from tfeti_dolfinx.solver import resolve_types
+from tfeti_dolfinx.stages import STAGES, Stages
+from tfeti_dolfinx.subdomains.build import sparse_blocks, trace_parts
+from tfeti_dolfinx.subdomains.factor import added_options
+from tfeti_dolfinx.subdomains.kernel import mode_names
+from tfeti_dolfinx.subdomains.sparse_block import Counters, SparseBlock
+from tfeti_dolfinx.timing import stage
+
+T = TypeVar("T")
+
+
+class System:
+    """What the dual problem of a scene is made from. Creation and all methods are collective.
+
+    Args:
+        forms: The compiled forms.
+        bcs: Dirichlet conditions.
+        contacts: Obstacles and pairs.
+        dofs: Dof maps.
+        decomposition: The torn mesh.
+        options: Options.
+        prefix: Prefix of all options.
+
+    Attributes:
+        forms: The compiled forms.
+        bcs: Dirichlet conditions.
+        factor_options: Options that PETSc's factors read, without prefix.
+        spectrum: Extreme eigenvalues of B Bᵀ, if somebody has put them here.
+    """
+
+    def __init__(
+        self,
+        forms: Forms,
+        bcs: Sequence[fem.DirichletBC],
+        contacts: Sequence[ContactPartner],
+        dofs: TornDofs,
+        decomposition: Decomposition,
+        options: Options,
+        prefix: str,
+    ) -> None:
+        self.forms, self.bcs, self._contacts = forms, bcs, contacts
+        self._dofs, self._decomposition = dofs, decomposition
+        self._options, self._prefix = options, prefix
+        self.factor_options: dict[str, Any] = {}
+        self.spectrum: dict[str, float] = {}
+        self._stages, self._counters, self._counted = Stages(), Counters(), 0
+        self._search: ContactSearch | None = None
+        self._prescribed: Prescribed | None = None
+        self._gluing: Gluing | None = None
+        self._blocks: list[SparseBlock] | None = None  # a rank may have none of them
+        self._dual: Dual | None = None
+
+    @property
+    def search(self) -> ContactSearch:
+        """The contacts' conditions."""
+        return _made(self._search)
+
+    @property
+    def gluing(self) -> Gluing:
+        """Rows, and the records that they come from."""
+        return _made(self._gluing)
+
+    @property
+    def dual(self) -> Dual:
+        """The dual problem."""
+        return _made(self._dual)
+
+    def look_for_changes(self) -> None:
+        """See whether what forms and Dirichlet conditions refer to has changed.
+
+        Raises:
+            InputError: Dirichlet conditions contradict each other.
+        """
+        if self.forms.has_new_stiffness():
+            self.change("stiffness")
+        if self.forms.has_new_load():
+            self.change("load")
+        new, old = prescribe(self._dofs, self.bcs), self._prescribed
+        self._prescribed = new
+        if old is None or any_rank(self._dofs.comm, not np.array_equal(new.flag, old.flag)):
+            self.change("rows")
+        elif any_rank(self._dofs.comm, not np.array_equal(new.value, old.value)):
+            self.change("right side")
+
+    def change(self, what: str) -> None:
+        """Say that something has changed, a key of ``CHANGES``; what is out of date is freed."""
+        self._stages.change(what)
+        if self._stages.is_stale("coarse problem"):
+            self._destroy_dual()
+        if self._stages.is_stale("factors"):
+            self._destroy_blocks()
+
+    def make(self, report: Report) -> Dual:
+        """Make what is out of date; the dual problem.
+
+        Args:
+            report: Takes seconds and sizes.
+
+        Raises:
+            InputError: Dirichlet values, contacts, stiffness or load do not fit.
+            NoSolutionError: The problem has no solution.
+            FactorError: A matrix could not be factored.
+        """
+        for name in self._stages.stale():
+            with stage(STAGES[name], report.seconds):
+                MAKERS[name](self)
+        return self.dual
+
+    def count(self, report: Report) -> None:
+        """Put sizes into a report, and what was made since it was last counted."""
+        if self._gluing is not None:
+            fill_sizes(report, self._dofs, self._decomposition, self._gluing)
+            report.unmet_contacts = self.search.unmet()
+        made, report.reused = self._stages.take_counts()
+        report.assemblies, report.searches = made["stiffness"], made["search"]
+        report.gluings, report.coarse_factorizations = made["rows"], made["coarse problem"]
+        factored = self._counters.factorizations
+        report.factorizations = self._dofs.comm.allreduce(factored - self._counted)
+        self._counted = factored
+
+    def take_in_overlapping(self, u: Array, tolerance: float) -> int:
+        """Give rows to nodes that a displacement makes overlap without one; how many."""
+        late = self.search.take_in_overlapping(u, tolerance)
+        if late:
+            self.change("rows")
+        return late
+
+    def widen(self) -> int:
+        """Reach farther in all contacts; how many rows are new."""
+        late = self.search.widen()
+        if late:
+            self.change("rows")
+        return late
+
+    def destroy(self) -> None:
+        """Destroy the PETSc objects; all stages are out of date."""
+        self._destroy_dual()
+        self._destroy_blocks()
+        if self._gluing is not None:
+            self._gluing.constraints.destroy()
+        self._gluing = None
+        self._stages.forget()
+
+    def _assemble_stiffness(self) -> None:
+        self._K = self.forms.stiffness()
+        self._diagonal = self._dofs.to_primal(self._K.diagonal())
+
+    def _find_contacts(self) -> None:
+        dofs, decomposition = self._dofs, self._decomposition
+        self._search = ContactSearch(self._contacts, dofs, decomposition, self._diagonal)
+
+    def _make_rows(self) -> None:
+        if self._gluing is not None:
+            self._gluing.constraints.destroy()
+        search, weights = self.search, self._weights()
+        self._gluing = glue(self._dofs, self.bcs, search.records, search.length, weights)
+        self.spectrum = {}
+
+    def _fill_right_side(self) -> None:
+        values, gaps = _made(self._prescribed).value, self.search.records.gap
+        self._gluing = self.gluing.with_right_side(values, gaps)
+
+    def _assemble_load(self) -> None:
+        self._f = self.forms.load()
+        if self._blocks is not None:
+            loads = self._dofs.to_primal(self._f)
+            starts = self._dofs.node_offsets * self._dofs.bs
+            with raised_on_all_ranks(self._dofs.comm):
+                for block, (a, b) in zip(self._blocks, pairwise(starts), strict=True):
+                    block.update(f=loads[a:b])
+
+    def _factor(self) -> None:
+        with added_options(self._prefix, self.factor_options):
+            self._blocks = sparse_blocks(
+                self._dofs,
+                self._decomposition,
+                self._K,
+                self._f,
+                self.gluing.constraints.trace,
+                self._counters,
+                self._options.kplus_type,
+                f"{self._prefix}sub_",
+            )
+        del self._K  # the Blocks have it
+
+    def _retrace(self) -> None:
+        parts = trace_parts(self._dofs, self.gluing.constraints.trace)
+        for block, part in zip(_made(self._blocks), parts, strict=True):
+            block.retrace(part)
+
+    def _make_dual(self) -> None:
+        decomposition, dofs = self._decomposition, self._dofs
+        rows = dofs.comm.allreduce(len(self.gluing.constraints.sets.normals))
+        _, pc_type = resolve_types(self._options, rows, self._prefix)
+        with added_options(self._prefix, self.factor_options):
+            self._dual = Dual(
+                constraints=self.gluing.constraints,
+                blocks=_made(self._blocks),
+                bodies=NamedBodies(
+                    decomposition.body_of_subdomain[decomposition.subdomains],
+                    decomposition.body_names,
+                    mode_names(decomposition.mesh.geometry.dim, dofs.bs),
+                ),
+                pc_type=pc_type,
+                options_prefix=self._prefix,
+            )
+
+    def _make_linear_term(self) -> None:
+        self.dual.update_load()
+
+    def _weights(self) -> Array:
+        """D for the scaling of B: the diagonal of K over its smallest entry, or ones."""
+        if self._options.scaling == "multiplicity":
+            return np.ones(len(self._diagonal))
+        positive = self._diagonal > 0.0  # what is not is reported when Blocks are built
+        lowest = float(np.min(self._diagonal[positive], initial=np.inf))
+        lowest = self._dofs.comm.allreduce(lowest, op=MPI.MIN)
+        return np.where(positive, self._diagonal / lowest, 1.0)
+
+    def _destroy_dual(self) -> None:
+        if self._dual is not None:
+            self._dual.destroy()
+        self._dual = None
+
+    def _destroy_blocks(self) -> None:
+        for block in self._blocks or ():
+            block.destroy()
+        self._blocks = None
+
+
+MAKERS: dict[str, Callable[[System], None]] = {
+    "stiffness": System._assemble_stiffness,
+    "search": System._find_contacts,
+    "rows": System._make_rows,
+    "right side": System._fill_right_side,
+    "load": System._assemble_load,
+    "factors": System._factor,
+    "trace": System._retrace,
+    "coarse problem": System._make_dual,
+    "linear term": System._make_linear_term,
+}
+
+
+def _made(item: T | None) -> T:
+    """What a stage has made."""
+    if item is None:
+        raise InputError("nothing has been made yet; expected a call of solve() before")
+    return item
