@@ -1,5 +1,7 @@
 """Blocks: generalised inverses, kernels, Schur complements."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import ufl
@@ -13,10 +15,11 @@ import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.compat import assemble_csr
 from tfeti_dolfinx.errors import ConformanceError, FactorError, InputError
 from tfeti_dolfinx.subdomains import factor, sparse_block
-from tfeti_dolfinx.subdomains.block import check_block
+from tfeti_dolfinx.subdomains.conformance import check_block, check_kind_of_block
+from tfeti_dolfinx.subdomains.data import Counters, SubdomainData
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 from tfeti_dolfinx.subdomains.kernel import candidate_modes, fixing_nodes, kernel_of
-from tfeti_dolfinx.subdomains.sparse_block import Counters, SparseBlock
+from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
 
 RIGID = {"triangle": 3, "quadrilateral": 3, "tetrahedron": 6, "hexahedron": 6}
 
@@ -36,19 +39,21 @@ def stiffness(cell, n=2, degree=1, mass=0.0, scalar=False):
     return csr_array(assemble_csr(fem.form(a))), V.tabulate_dof_coordinates()[:, :gdim]
 
 
-def block(K, x, every=3, **changes):
-    trace = np.arange(0, K.shape[0], every)
-    f = np.random.default_rng(1).standard_normal(K.shape[0])
+def data(K, x, every=3, **changes):
     arguments = dict(
         name="subdomain 5",
         K=K,
-        f=f,
+        f=np.random.default_rng(1).standard_normal(K.shape[0]),
         x=x,
-        trace_dofs=trace,
+        trace_dofs=np.arange(0, K.shape[0], every),
         body_frame=(x.mean(axis=0), 1.0),
-        counters=Counters(),
+        node_shares=np.ones(len(x)),
     )
-    return SparseBlock(**{**arguments, **changes})
+    return SubdomainData(**{**arguments, **changes})
+
+
+def block(K, x, every=3, counters=None, **changes):
+    return SparseBlock(data(K, x, every, **changes), counters)
 
 
 @pytest.mark.parametrize("cell", list(RIGID))
@@ -59,6 +64,10 @@ def test_blocks_fulfil_their_contract(cell, degree):
     check_block(b, K)
     assert b.kernel.shape[1] == RIGID[cell]
     b.destroy()
+
+
+def test_any_class_of_blocks_can_be_checked():
+    check_kind_of_block(SparseBlock)
 
 
 def test_blocks_of_a_scalar_problem_have_the_constants():
@@ -106,14 +115,38 @@ def test_a_new_load_leaves_the_factor_alone():
     K, x = stiffness("hexahedron", 2)
     counters = Counters()
     b = block(K, x, counters=counters)
-    b.apply_pinv(np.ones(len(b.trace_dofs)))
-    first = b.condensed_load.copy()
-    b.update(f=2 * np.random.default_rng(1).standard_normal(K.shape[0]))
-    assert np.allclose(b.condensed_load, 2 * first)
+    load = 2 * b.load
+    b.update(f=load)
+    assert np.array_equal(b.load, load)
     assert counters.factorizations == 1
-    b.update(K=csr_array(2 * K))
-    assert np.allclose(b.condensed_load, first)
-    assert counters.factorizations == 2
+    check_block(b, K)
+
+
+def test_new_values_in_the_same_pattern_are_factored_without_an_analysis():
+    """Also where the kernel shrinks or comes back: the pattern holds what the fixing nodes add."""
+    K, x = stiffness("hexahedron", 2)
+    springs = K.copy()
+    springs.setdiag(K.diagonal() + 1e-3)
+    counters = Counters()
+    b = block(K.copy(), x, counters=counters)
+    for matrix, kernel in [(2 * K, 6), (springs, 0), (K, 6)]:
+        before = counters.factorizations, counters.analyses
+        b.update(K=matrix.copy())
+        assert (counters.factorizations, counters.analyses) == (before[0] + 1, before[1])
+        assert b.kernel.shape[1] == kernel
+        check_block(b, matrix)
+
+
+def test_another_pattern_is_analysed_again():
+    K, x = stiffness("hexahedron", 2)
+    counters = Counters()
+    b = block(K.copy(), x, counters=counters)
+    spring = np.zeros(K.shape[0])
+    spring[[0, -1]] = 1.0
+    coupled = csr_array(K + diags_array(np.ones(K.shape[0])) + 1e-3 * np.outer(spring, spring))
+    b.update(K=coupled)
+    check_block(b, coupled)
+    assert counters.factorizations == counters.analyses == 3  # and that of K_ii
 
 
 def test_a_new_trace_leaves_the_factor_alone():
@@ -265,7 +298,7 @@ def test_a_factor_without_memory_is_named():
         ierr = factor.OUT_OF_MEMORY
 
     A = csr_array(np.eye(3))
-    cause = factor._cause(NoMemory(factor.OUT_OF_MEMORY), "cholmod", A)
+    cause = factor._cause(NoMemory(factor.OUT_OF_MEMORY), "cholmod", factor._petsc_matrix(A))
     assert "out of memory: cholmod had none for the factor of 3 unknowns with 3" in str(cause)
 
 
@@ -293,6 +326,8 @@ def test_an_implementation_that_breaks_its_promises_is_named():
         b.apply_stiffness = lambda w: 2 * w
         check_block(b, K)
     del b.apply_stiffness
+    with pytest.raises(ConformanceError, match=r"this does not hold: a Block has load, kernel, d"):
+        check_block(SimpleNamespace(trace_dofs=b.trace_dofs), K)
     with pytest.raises(ConformanceError, match="this does not hold: K⁺ is symmetric"):
         b.apply_pinv = lambda w: np.roll(w, 1)
         check_block(b, K)

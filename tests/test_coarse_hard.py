@@ -67,8 +67,8 @@ def test_the_basis_spans_the_kernel(stiff_on_soft):
     """T T⁻¹ = I, and Tᵀ is what products takes."""
     coarse = stiff_on_soft.coarse
     basis, bodies = coarse._basis, coarse.bodies
-    back = [basis.kernel(column) for column in coarse.modes.toarray().T]
-    assert np.allclose(np.transpose(back), bodies.modes.toarray(), atol=1e-12)
+    back = [basis.kernel(column) for column in coarse.motions.toarray().T]
+    assert np.allclose(np.transpose(back), bodies.motions.toarray(), atol=1e-12)
     rng = np.random.default_rng(0)
     x, y = rng.standard_normal((2, coarse.dimension))
     assert basis.products(x) @ y == pytest.approx(x @ basis.kernel(y))
@@ -102,7 +102,7 @@ def test_a_body_that_slides_along_all_that_it_meets():
         return ufl.dot(push, v) * ds(d.surface("block left"))
 
     p = two_body_problem(d, load, held(d, "block left", "block front"), [wall])
-    assert dual_of(p).coarse.free_modes == 1
+    assert dual_of(p).coarse.num_free_motions == 1
     p.destroy()
 
 
@@ -114,7 +114,7 @@ def test_gluing_far_from_the_origin_holds_nothing():
     mesh.geometry.x[:, :2] = (mesh.geometry.x[:, :2] + far) / 3.0
     d = tfeti.decompose(mesh, 4, facet_tags=tags, surfaces=names)
     p = two_body_problem(d, pressed(d, 0.0, "block top"), lambda V: [], [])
-    assert dual_of(p).coarse.free_modes == 3
+    assert dual_of(p).coarse.num_free_motions == 3
     p.destroy()
 
 

@@ -48,11 +48,11 @@ def test_F_is_symmetric_and_positive(dual):
 
 
 def test_preconditioners_are_symmetric_and_positive(dual):
-    from tfeti_dolfinx.dual.operator import PRECONDITIONERS, ScaledGluing
+    from tfeti_dolfinx.dual.operator import PRECONDITIONERS, ScaledRows
 
-    scaled = ScaledGluing(dual.constraints.B, dual.constraints.weights)
+    scaled = ScaledRows(dual.constraints.B, dual.constraints.weights)
     for make in PRECONDITIONERS.values():
-        check_operator(make(scaled, dual.blocks), dual.d)
+        check_operator(make(scaled, dual.subdomains.blocks), dual.d)
 
 
 def test_projectors(dual):

@@ -6,7 +6,6 @@ from scenes import curved_obstacle, decomposed, problem
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.dual.dual import Dual
-from tfeti_dolfinx.dual.naming import NamedBodies
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.conformance import check_feasible_set
 from tfeti_dolfinx.qp.faces import Status, face_of
@@ -68,11 +67,11 @@ def solved():
 def with_law(p, law):
     """λ, u, flags of the rows that carry a force, and c − B u."""
     d, dual = p.decomposition, p._system.dual
-    bodies = NamedBodies(d.body_of_subdomain[d.subdomains], d.body_names, list("abcdef"))
-    own = Dual(dual.constraints, dual.blocks, bodies, "none", feasible=law)
+    names = d.body_names, list("abcdef")
+    own = Dual(dual.constraints, dual.subdomains, *names, "none", feasible=law)
     result, accuracy = solve_dual(own, Options(rtol=1e-9), "smalse")
     assert result.reason > 0
-    u, lam = np.concatenate([np.empty(0), *accuracy.u]), np.array(result.lam.array_r)
+    u, lam = accuracy.u, np.array(result.lam.array_r)
     carrying = result.face.carrying
     trace, left = dual.constraints.B.createVecRight(), dual.d.duplicate()
     trace.array[:] = u[dual.constraints.trace]

@@ -53,7 +53,7 @@ def as_coarse(count, k, E, N, load):
         dimension=count * k,
         comm=MPI.COMM_SELF,
         bodies=bodies,
-        modes=eye_array(count * k, format="csr"),
+        motions=eye_array(count * k, format="csr"),
         e=load,
         J=csr_array(N),
         bounded=slice(0, len(N)),
@@ -158,7 +158,7 @@ def test_a_body_pinned_at_neighbouring_nodes_beside_a_stiff_one():
     contact = tfeti.Contact("soft top", "stiff bottom", reach=0.1)
     p = two_body_problem(d, load, pins, [contact], stress=stress)
     dual = dual_of(p)
-    assert dual.coarse.free_modes == 1  # the stiff one slides
+    assert dual.coarse.num_free_motions == 1  # the stiff one slides
     p.destroy()
 
 

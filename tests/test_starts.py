@@ -30,7 +30,7 @@ def cost(p, qp_type, start, **options):
     result, accuracy = solve_dual(dual, Options(**options), qp_type, start)
     assert result.reason > 0
     result.destroy()
-    u = np.concatenate([np.empty(0), *accuracy.u])
+    u = accuracy.u
     return counts["solver"] - before[0], counts["power method"] - before[1], u
 
 

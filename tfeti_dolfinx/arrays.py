@@ -13,8 +13,10 @@ import numpy.typing as npt
 
 Array = np.ndarray[Any, np.dtype[Any]]
 ArrayLike = npt.ArrayLike
+# stands for 0 in a denominator: smaller than any quantity, and its inverse is still finite
+TINY = 1e-300
 
-__all__ = ["Array", "ArrayLike", "sum_rows"]
+__all__ = ["TINY", "Array", "ArrayLike", "sum_rows"]
 
 
 def sum_rows(row: Array, values: Array, size: int) -> Array:

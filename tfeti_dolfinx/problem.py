@@ -251,7 +251,7 @@ class ContactProblem:
             result, accuracy = solve_dual(dual, self.options, qp_type, start)
         with stage("recovery", report.seconds):
             solution = self._solution = Solution(
-                u=np.concatenate([np.empty(0), *accuracy.u]),
+                u=accuracy.u,
                 multipliers=Multipliers(np.array(result.lam.array_r), result.face.carrying),
                 dofs=self.dofs,
                 decomposition=self.decomposition,

@@ -42,7 +42,7 @@ def fill_result(
     """Fill in what a solve has found; counters add up over rounds. Collective."""
     comm = dual.coarse.comm
     report.kernel_dim = dual.coarse.dimension
-    report.free_modes = dual.coarse.free_modes
+    report.free_modes = dual.coarse.num_free_motions
     report.nearly_free = dual.nearly_free
     active = solution.carrying[solution.gluing.constraints.sets.normals]
     report.active_contacts = comm.allreduce(int(np.sum(active)))

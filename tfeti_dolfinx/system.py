@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,8 +13,7 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.assembly import Forms
 from tfeti_dolfinx.contact.search import ContactPartner, ContactSearch
 from tfeti_dolfinx.dual.dual import Dual
-from tfeti_dolfinx.dual.naming import NamedBodies
-from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.gluing.glue import Gluing, glue
 from tfeti_dolfinx.gluing.prescribed import Prescribed, prescribe
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -26,10 +24,12 @@ from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.report_filling import fill_sizes
 from tfeti_dolfinx.solver import resolve_types
 from tfeti_dolfinx.stages import STAGES, Stages
-from tfeti_dolfinx.subdomains.build import sparse_blocks, trace_parts
+from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
+from tfeti_dolfinx.subdomains.data import Counters
 from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.kernel import mode_names
-from tfeti_dolfinx.subdomains.sparse_block import Counters, SparseBlock
+from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
+from tfeti_dolfinx.subdomains.subdomains import Subdomains
 from tfeti_dolfinx.timing import stage
 
 T = TypeVar("T")
@@ -73,7 +73,7 @@ class System:
         self._search: ContactSearch | None = None
         self._prescribed: Prescribed | None = None
         self._gluing: Gluing | None = None
-        self._blocks: list[SparseBlock] | None = None  # a rank may have none of them
+        self._subdomains: Subdomains | None = None
         self._dual: Dual | None = None
 
     @property
@@ -114,7 +114,7 @@ class System:
         if self._stages.is_stale("coarse problem"):
             self._destroy_dual()
         if self._stages.is_stale("factors"):
-            self._destroy_blocks()
+            self._destroy_subdomains()
 
     def make(self, report: Report) -> Dual:
         """Make what is out of date; the dual problem.
@@ -161,7 +161,7 @@ class System:
     def destroy(self) -> None:
         """Destroy the PETSc objects; all stages are out of date."""
         self._destroy_dual()
-        self._destroy_blocks()
+        self._destroy_subdomains()
         if self._gluing is not None:
             self._gluing.constraints.destroy()
         self._gluing = None
@@ -188,31 +188,24 @@ class System:
 
     def _assemble_load(self) -> None:
         self._f = self.forms.load()
-        if self._blocks is not None:
-            loads = self._dofs.to_primal(self._f)
-            starts = self._dofs.node_offsets * self._dofs.bs
-            with raised_on_all_ranks(self._dofs.comm):
-                for block, (a, b) in zip(self._blocks, pairwise(starts), strict=True):
-                    block.update(f=loads[a:b])
+        if self._subdomains is not None:
+            self._subdomains.update(f=self._dofs.to_primal(self._f))
 
     def _factor(self) -> None:
-        with added_options(self._prefix, self.factor_options):
-            self._blocks = sparse_blocks(
-                self._dofs,
-                self._decomposition,
-                self._K,
-                self._f,
-                self.gluing.constraints.trace,
-                self._counters,
-                self._options.kplus_type,
-                f"{self._prefix}sub_",
-            )
+        trace, counters = self.gluing.constraints.trace, self._counters
+        kplus_type, prefix = self._options.kplus_type, f"{self._prefix}sub_"
+        data = subdomain_data(self._dofs, self._decomposition, self._K, self._f, trace)
         del self._K  # the Blocks have it
+        with added_options(self._prefix, self.factor_options):
+            self._subdomains = make_subdomains(
+                data,
+                lambda s: SparseBlock(s, counters, kplus_type, prefix),
+                self._decomposition,
+                counters,
+            )
 
     def _retrace(self) -> None:
-        parts = trace_parts(self._dofs, self.gluing.constraints.trace)
-        for block, part in zip(_made(self._blocks), parts, strict=True):
-            block.retrace(part)
+        _made(self._subdomains).retrace(self.gluing.constraints.trace)
 
     def _make_dual(self) -> None:
         decomposition, dofs = self._decomposition, self._dofs
@@ -221,12 +214,9 @@ class System:
         with added_options(self._prefix, self.factor_options):
             self._dual = Dual(
                 constraints=self.gluing.constraints,
-                blocks=_made(self._blocks),
-                bodies=NamedBodies(
-                    decomposition.body_of_subdomain[decomposition.subdomains],
-                    decomposition.body_names,
-                    mode_names(decomposition.mesh.geometry.dim, dofs.bs),
-                ),
+                subdomains=_made(self._subdomains),
+                body_names=decomposition.body_names,
+                mode_names=mode_names(decomposition.mesh.geometry.dim, dofs.bs),
                 pc_type=pc_type,
                 options_prefix=self._prefix,
             )
@@ -248,10 +238,10 @@ class System:
             self._dual.destroy()
         self._dual = None
 
-    def _destroy_blocks(self) -> None:
-        for block in self._blocks or ():
-            block.destroy()
-        self._blocks = None
+    def _destroy_subdomains(self) -> None:
+        if self._subdomains is not None:
+            self._subdomains.destroy()
+        self._subdomains = None
 
 
 MAKERS: dict[str, Callable[[System], None]] = {

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from petsc4py import PETSc
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.arrays import TINY, Array
 from tfeti_dolfinx.dual.measures import Measures, Scene, measure
 from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.qp.faces import Face
@@ -136,8 +136,8 @@ class Accuracy:
         return self._looked().balance
 
     @property
-    def u(self) -> list[Array]:
-        """Displacements of this rank's Blocks at the last look."""
+    def u(self) -> Array:
+        """This rank's part of the displacement at the last look, shape ``(n,)``."""
         return self._looked().u
 
     def errors(self) -> Array:
@@ -173,13 +173,13 @@ class Accuracy:
             (now.balance, allowed.balance),
             (now.error, allowed.energy),
         ]
-        return max(float(error) / max(float(limit), 1e-300) for error, limit in pairs)
+        return max(float(error) / max(float(limit), TINY) for error, limit in pairs)
 
     def relative_error(self) -> float:
         """Largest estimated error of a body over its largest displacement."""
         noise = self.tolerances().displacement / max(self.rtol, NOISE)
         errors = self.errors()
-        return float(np.max(errors / np.maximum(noise, 1e-300), initial=0.0))
+        return float(np.max(errors / np.maximum(noise, TINY), initial=0.0))
 
     def _longest(self, now: Measures) -> float:
         return max(float(now.bodies.correction.max(initial=0.0)), now.penetration)

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
-from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse import csr_array, diags_array
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.dual.bodies import Bodies, joined
+from tfeti_dolfinx.dual.bodies import Bodies
 from tfeti_dolfinx.dual.kernel_basis import kernel_basis
 from tfeti_dolfinx.dual.motions import NULL, Motions, unresisted, unsprung
 from tfeti_dolfinx.dual.null_basis import null_basis
-from tfeti_dolfinx.dual.operator import trace_slices
 from tfeti_dolfinx.dual.projectors import (
     FaceFactors,
     FaceProjectors,
@@ -26,7 +23,7 @@ from tfeti_dolfinx.dual.semidefinite import SemidefiniteFactor
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.parallel import agreed, chunk_offsets
 from tfeti_dolfinx.qp.faces import Face
-from tfeti_dolfinx.subdomains.block import Block
+from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # Of the size of a row: what of it acts on motions of bodies and is only rounding; and how it acts
 # as a whole if it only glues. Rounding of points far from the origin is more than that of motions,
@@ -41,17 +38,15 @@ class CoarseSpace(Projectors):
 
     Args:
         B: Dual rows × trace unknowns.
-        blocks: This rank's Blocks.
-        body_of_block: Body of each of them.
-        num_bodies: Number of bodies on all ranks.
+        subdomains: This rank's Blocks. The constructor and all methods are collective.
         bounded: Local rows with λ ≥ 0.
-        comm: Communicator. The constructor and all methods are collective.
         prefix: Prefix of the factor's PETSc options.
 
     Attributes:
+        subdomains: This rank's Blocks.
         dimension: r, the dimension of the kernel of K.
         e: (R T)ᵀ f, shape ``(r,)``.
-        modes: The bodies' motions in the basis T, scipy CSR, shape ``(r, bodies * k)``.
+        motions: The bodies' motions in the basis T, scipy CSR, shape ``(r, bodies * k)``.
         Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
         bounded: Local rows with λ ≥ 0.
         row_size: Sum of the moduli of each local row of B, the same however the mesh is torn. A
@@ -69,56 +64,51 @@ class CoarseSpace(Projectors):
     def __init__(
         self,
         B: PETSc.Mat,
-        blocks: Sequence[Block],
-        body_of_block: Array,
-        num_bodies: int,
+        subdomains: Subdomains,
         bounded: Array,
-        comm: MPI.Intracomm,
         prefix: str = "tfeti_coarse_",
     ) -> None:
-        self.comm, self.bounded = comm, bounded
-        sizes = np.array([block.kernel.shape[1] for block in blocks], dtype=np.int64)
-        offsets = chunk_offsets(comm, int(sizes.sum()))
+        self.subdomains, self.bounded = subdomains, bounded
+        self.comm = comm = subdomains.comm
+        offsets = chunk_offsets(comm, subdomains.kernel_size)
         self.dimension = int(offsets[-1])
-        starts = offsets[comm.rank] + np.concatenate(([0], np.cumsum(sizes)))
-        self._starts, self._sizes = starts, sizes
-        Gt, self.row_size = _transposed_G(B, blocks, starts, self.dimension), _sizes(B)
-        self.bodies = Bodies(blocks, starts, self.dimension, body_of_block, num_bodies, comm)
-        self.J = _without_rounding(diags_array(1.0 / self.row_size) @ Gt @ self.bodies.modes)
+        self._own = slice(int(offsets[comm.rank]), int(offsets[comm.rank + 1]))
+        Gt = _transposed_G(B, subdomains.kernel_rows, self._own.start, self.dimension)
+        self.row_size = _sizes(B)
+        self.bodies = Bodies(subdomains, self._own.start, self.dimension)
+        self.J = _without_rounding(diags_array(1.0 / self.row_size) @ Gt @ self.bodies.motions)
         equalities = np.ones(len(self.row_size), dtype=bool)
         equalities[bounded] = False
         self.unheld = self._unresisted(equalities, unsprung(self.bodies.springs), NULL)
         self.free_motions = self.unresisted(~equalities)
         # made on one rank: processors that round differently might choose differently
         self._basis = agreed(comm, kernel_basis(self.bodies, self.unheld, self.free_motions))
-        self.modes = self._basis.coordinates(self.bodies.modes)
+        self.motions = self._basis.coordinates(self.bodies.motions)
         self.Gt = self._basis.rows(Gt, diags_array(self.row_size) @ self.J, equalities)
-        self._read_load(blocks)
-        joint = self.modes @ self.free_motions.joint
+        self._read_load()
+        joint = self.motions @ self.free_motions.joint
         self.null = agreed(comm, null_basis(np.flatnonzero(self._basis.free), joint))
         self._gram = replicated_gram(self.Gt, comm)
         self.factors = FaceFactors(comm, self.null, prefix)
         self._factor = self.factors.factor(self._gram, "whole")
 
-    def update_load(self, blocks: Sequence[Block]) -> None:
+    def update_load(self) -> None:
         """Replace e = Rᵀ f by that of the Blocks' present loads."""
-        self._read_load(blocks)
-        self.bodies.update_load(blocks)
+        self._read_load()
+        self.bodies.update_load()
 
-    def _read_load(self, blocks: Sequence[Block]) -> None:
-        local = [block.kernel_load for block in blocks]
-        e = np.concatenate(self.comm.allgather(np.concatenate([np.empty(0), *local])))
+    def _read_load(self) -> None:
+        e = np.concatenate(self.comm.allgather(self.subdomains.kernel_load))
         self.e = self._basis.products(e)
 
     @property
-    def free_modes(self) -> int:
+    def num_free_motions(self) -> int:
         """Number of motions that no row resists."""
         return self.free_motions.count
 
-    def alpha_of(self, alpha: Array) -> list[Array]:
+    def local_alpha(self, alpha: Array) -> Array:
         """Kernel coordinates of this rank's Blocks that belong to an r-vector."""
-        alpha = self._basis.kernel(alpha)
-        return [alpha[a : a + n] for a, n in zip(self._starts, self._sizes, strict=False)]
+        return self._basis.kernel(alpha)[self._own]
 
     def gram(self, rows: Array | None = None) -> csr_array:
         """GGᵀ, or G_f G_fᵀ of the local rows flagged, shape ``(r, r)``; replicated."""
@@ -175,25 +165,13 @@ def _sizes(B: PETSc.Mat) -> Array:
     return np.where(sizes > 0.0, sizes, 1.0)
 
 
-def _transposed_G(
-    B: PETSc.Mat, blocks: Sequence[Block], starts: Array, dimension: int
-) -> csr_array:
-    """This rank's rows of B R, with global columns."""
-    num_trace = B.getLocalSize()[1]
-    kernels = [block.kernel for block in blocks]
-    rows, columns, values = [], [], []
-    for kernel, part, start in zip(kernels, trace_slices(blocks), starts, strict=False):
-        i, j = np.indices(kernel.shape)
-        rows.append((part.start + i).ravel())
-        columns.append((start + j).ravel())
-        values.append(kernel.ravel())
-    coordinates = (joined(rows, np.int64), joined(columns, np.int64))
-    local = coo_array((joined(values, np.float64), coordinates), shape=(num_trace, dimension))
-    local = local.tocsr()
+def _transposed_G(B: PETSc.Mat, kernel: csr_array, first: int, dimension: int) -> csr_array:
+    """This rank's rows of B R, with global columns; its own kernel coordinates begin at first."""
     index = PETSc.IntType
+    columns = (kernel.indices + first).astype(index)
     R = PETSc.Mat().createAIJ(
-        size=((num_trace, None), (int(sum(k.shape[1] for k in kernels)), None)),
-        csr=(local.indptr.astype(index), local.indices.astype(index), local.data),
+        size=((kernel.shape[0], None), (kernel.shape[1], None)),
+        csr=(kernel.indptr.astype(index), columns, kernel.data),
         comm=B.getComm(),
     )
     BR = B.matMult(R)

@@ -9,11 +9,11 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
-from tfeti_dolfinx.dual.naming import NamedBodies, listed
+from tfeti_dolfinx.dual.naming import listed
 from tfeti_dolfinx.dual.operator import (
     PRECONDITIONERS,
-    BlockOperator,
-    ScaledGluing,
+    DualOperator,
+    ScaledRows,
     dual_operator,
     linear_term,
 )
@@ -29,7 +29,7 @@ from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Product
 from tfeti_dolfinx.qp.homogenised import Image, image
 from tfeti_dolfinx.qp.norm import estimate_norm
 from tfeti_dolfinx.qp.problem import QP
-from tfeti_dolfinx.subdomains.block import Block
+from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # from B and c to the set of multipliers, on all local rows
 FeasibleLaw = Callable[[Constraints], FeasibleSet]
@@ -45,15 +45,15 @@ class Dual:
 
     Args:
         constraints: B and c.
-        blocks: This rank's Blocks.
-        bodies: The bodies that they are parts of.
+        subdomains: This rank's Blocks.
+        body_names: Names of all bodies.
+        mode_names: Names of their candidate modes.
         pc_type: Preconditioner: none, lumped or dirichlet.
         options_prefix: Prefix of all PETSc options.
         feasible: Makes the set of multipliers from B and c; default λ_N ≥ 0.
 
     Attributes:
         F: B K⁺ Bᵀ.
-        num_bodies: Number of bodies on all ranks.
         preconditioner: The preconditioner, or None.
         coarse: The coarse space.
         num_inequalities: Inequality rows of all ranks.
@@ -69,33 +69,31 @@ class Dual:
     def __init__(
         self,
         constraints: Constraints,
-        blocks: Sequence[Block],
-        bodies: NamedBodies,
+        subdomains: Subdomains,
+        body_names: Sequence[str],
+        mode_names: Sequence[str],
         pc_type: str,
         options_prefix: str = "tfeti_",
         feasible: FeasibleLaw = no_tension,
     ) -> None:
-        self.constraints, self.blocks = constraints, blocks
+        self.constraints, self.subdomains = constraints, subdomains
         self.pressing = np.zeros(constraints.num_rows, dtype=bool)
-        self.body_of_block, self.num_bodies = bodies.of_block, len(bodies.names)
-        self._names, self.nearly_free = (bodies.names, bodies.modes), list[dict[str, object]]()
+        self._names, self.nearly_free = (body_names, mode_names), list[dict[str, object]]()
         B, comm = constraints.B, constraints.B.getComm().tompi4py()
-        self.F = dual_operator(B, blocks)
-        self.preconditioner: BlockOperator | None = None
-        self._scaled: ScaledGluing | None = None
+        self.F = dual_operator(B, subdomains.blocks)
+        self.preconditioner: DualOperator | None = None
+        self._scaled: ScaledRows | None = None
         if pc_type != "none":
-            self._scaled = ScaledGluing(B, constraints.weights)
-            self.preconditioner = PRECONDITIONERS[pc_type](self._scaled, blocks)
+            self._scaled = ScaledRows(B, constraints.weights)
+            self.preconditioner = PRECONDITIONERS[pc_type](self._scaled, subdomains.blocks)
         bounded = constraints.sets.normals
-        self.coarse = CoarseSpace(
-            B, blocks, bodies.of_block, self.num_bodies, bounded, comm, f"{options_prefix}coarse_"
-        )
+        self.coarse = CoarseSpace(B, subdomains, bounded, f"{options_prefix}coarse_")
         self.num_inequalities = comm.allreduce(len(bounded))
         self.feasible = feasible(constraints)
         self._images = dict[str, tuple[Array, Image]]()
         self._norm: tuple[int, float] | None = None
-        check_solvable(self.coarse, *self._names)
-        self.d = linear_term(B, constraints.c, blocks)
+        check_solvable(self.coarse, body_names, mode_names)
+        self.d = linear_term(B, constraints.c, subdomains)
 
     def update_load(self) -> None:
         """Take the Blocks' present loads and the present right sides.
@@ -103,10 +101,10 @@ class Dual:
         Raises:
             NoSolutionError: The load moves a body that nothing holds.
         """
-        self.coarse.update_load(self.blocks)
+        self.coarse.update_load()
         check_solvable(self.coarse, *self._names)
         self.d.destroy()
-        self.d = linear_term(self.constraints.B, self.constraints.c, self.blocks)
+        self.d = linear_term(self.constraints.B, self.constraints.c, self.subdomains)
 
     def forget_counts(self) -> None:
         """Count multiplications from 0 on."""
@@ -146,7 +144,7 @@ class Dual:
             return None
         return self._images[kind][1]
 
-    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> list[Array]:
+    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> Array:
         """Displacements that belong to multipliers: of equal ones the smallest.
 
         Args:
@@ -154,17 +152,20 @@ class Dual:
             gradient: Fλ − d up to the range of Gᵀ; on open rows the multiplier ν.
             face: The face of λ: which rows carry a force.
             error: How large multipliers may be by the solver's error alone.
+
+        Returns:
+            This rank's part of u, shape ``(n,)``.
         """
         B, c = self.constraints.B, self.constraints.c
-        u, gap = recover(B, c, self.blocks, self.coarse, lam, gradient, face)
+        u, gap = recover(B, c, self.coarse, lam, gradient, face)
         motions, force = nearly_free(self.coarse, lam.array_r, face.holding, error)
         self.pressing = force
         words = listed(motions, self.coarse.bodies, *self._names)
         self.nearly_free = agreed(self.coarse.comm, words)
         if motions.count == 0:
             return u
-        alpha = smallest_motion(self.coarse, self.blocks, u, gap, motions, force)
-        return moved(self.blocks, u, self.coarse, alpha)
+        alpha = smallest_motion(self.coarse, u, gap, motions, force)
+        return moved(u, self.coarse, alpha)
 
     def destroy(self) -> None:
         """Destroy the PETSc objects."""

@@ -27,7 +27,7 @@ class KernelBasis:
     conditions.
 
     Attributes:
-        combined: Directions of each body as columns, so that M = modes @ combined, shape
+        combined: Directions of each body as columns, so that M = bodies.motions @ combined, shape
             ``(bodies * k, a)``.
         motions: M, orthonormal, shape ``(r, a)``.
         pins: Coordinates that M takes the place of.
@@ -85,7 +85,7 @@ def kernel_basis(bodies: Bodies, unheld: Motions, free: Motions) -> KernelBasis:
     directions, held_by = _directions(bodies, unheld, free)
     kept = held_by < SPRINGS
     combined = csr_array(block_diagonal(directions)[:, np.flatnonzero(kept.ravel())])
-    motions = csr_array(bodies.modes @ combined)
+    motions = csr_array(bodies.motions @ combined)
     body = np.repeat(np.arange(bodies.count), kept.sum(axis=1))
     pins, inverse = _pins(csc_array(motions), body)
     rest = np.setdiff1d(np.arange(motions.shape[0]), pins)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -10,12 +9,11 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.arrays import TINY, Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
-from tfeti_dolfinx.dual.operator import trace_slices
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.qp.faces import Face
-from tfeti_dolfinx.subdomains.block import Block
+from tfeti_dolfinx.subdomains.subdomains import Subdomains, sizes, sums
 
 # of the largest forces on a kernel mode: those on a light one beside it count as so large at least,
 # since the rounding of the largest reaches them
@@ -26,14 +24,12 @@ class Scene(Protocol):
     """What a measurement needs to know of the dual problem."""
 
     constraints: Constraints
-    blocks: Sequence[Block]
+    subdomains: Subdomains
     coarse: CoarseSpace
-    body_of_block: Array
-    num_bodies: int
     pressing: Array
 
-    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> list[Array]:
-        """Displacements of this rank's Blocks, given the solver's face and error. Collective."""
+    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> Array:
+        """This rank's part of u, given the solver's face and error. Collective."""
         ...
 
 
@@ -67,7 +63,7 @@ class Measures:
     """An iterate in physical terms; the same on all ranks but for the displacements.
 
     Attributes:
-        u: Displacements of this rank's Blocks.
+        u: This rank's part of the displacement, shape ``(n,)``.
         bodies: What is known of each body.
         penetration: Deepest overlap, or distance of a row that carries a force.
         balance: Force left on a kernel mode, where it is largest beside the forces there.
@@ -75,7 +71,7 @@ class Measures:
         residual: Norm of what rows miss.
     """
 
-    u: list[Array]
+    u: Array
     bodies: BodyMeasures
     penetration: float
     balance: float
@@ -94,7 +90,7 @@ def measure(
     gradient: PETSc.Vec,
     face: Face,
     error: float,
-    before: Sequence[Array] | None = None,
+    before: Array | None = None,
 ) -> Measures:
     """Recover the displacement of an iterate and see how well it fulfils the rows. Collective.
 
@@ -108,7 +104,7 @@ def measure(
         gradient: Fλ − d up to the range of Gᵀ.
         face: The face of λ.
         error: How large multipliers may be by the solver's error alone.
-        before: Displacements of an earlier iterate.
+        before: The displacement of an earlier iterate.
     """
     u = scene.recover(lam, gradient, face, error)
     w, penetration = _missed(scene, u)
@@ -122,12 +118,11 @@ def measure(
     return Measures(u, bodies, penetration, balance, forces, residual)
 
 
-def _missed(scene: Scene, u: list[Array]) -> tuple[PETSc.Vec, float]:
+def _missed(scene: Scene, u: Array) -> tuple[PETSc.Vec, float]:
     """w, and the largest of its inequality rows as a length."""
     constraints = scene.constraints
     trace, w = constraints.B.createVecRight(), constraints.c.duplicate()
-    for block, part, u_s in zip(scene.blocks, trace_slices(scene.blocks), u, strict=True):
-        trace.array[part] = u_s[block.trace_dofs]
+    trace.array[:] = u[scene.subdomains.trace]
     constraints.B.mult(trace, w)
     w.axpy(-1.0, constraints.c)
     bounded = constraints.sets.normals
@@ -140,27 +135,34 @@ def _missed(scene: Scene, u: list[Array]) -> tuple[PETSc.Vec, float]:
     return w, float(w.getComm().tompi4py().allreduce(deepest, op=MPI.MAX))
 
 
-def _bodies(scene: Scene, u: list[Array], v: Array, before: Sequence[Array] | None) -> BodyMeasures:
+def _bodies(scene: Scene, u: Array, v: Array, before: Array | None) -> BodyMeasures:
     """What is known of each body. Collective."""
-    comm, count = scene.coarse.comm, scene.num_bodies
-    motions = scene.coarse.bodies
-    rigid = motions.amounts(motions.part_of(u, scene.blocks))
-    sums, largest = np.zeros((3, count)), np.zeros((5, count))
-    slices = trace_slices(scene.blocks)
-    for s, (block, part, body) in enumerate(
-        zip(scene.blocks, slices, scene.body_of_block, strict=True)
-    ):
-        diagonal = block.diagonal
-        sums[:, body] += block.energy(u[s]), diagonal @ v[part] ** 2, diagonal.sum()
-        change = u[s] - before[s] if before is not None else np.zeros(0)
-        elastic = u[s] - block.modes @ rigid[body]
-        fields = (u[s], elastic, v[part], change, block.condensed_load)
-        sizes = [np.max(np.abs(field), initial=0.0) for field in fields]
-        largest[:, body] = np.maximum(largest[:, body], sizes)
-    comm.Allreduce(MPI.IN_PLACE, sums, op=MPI.SUM)
-    comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
-    size, elastic, correction, change, alone = largest
-    return BodyMeasures(size, elastic, sums[0], correction, sums[1], change, alone, sums[2])
+    subdomains, motions = scene.subdomains, scene.coarse.bodies
+    rigid = subdomains.modes_motion(motions.amounts(motions.part_of(u)))
+    change = u - before if before is not None else np.zeros_like(u)
+    dofs, trace, diagonal = subdomains.dof_parts, subdomains.trace_parts, subdomains.diagonal
+    energy, correction_energy, stiffness = subdomains.body_sums(
+        [subdomains.energies(u), sums(diagonal * v**2, trace), sums(diagonal, trace)]
+    )
+    size, elastic, correction, changed, alone = subdomains.body_maxima(
+        [
+            sizes(u, dofs),
+            sizes(u - rigid, dofs),
+            sizes(v, trace),
+            sizes(change, dofs),
+            sizes(subdomains.pinv_load[subdomains.trace], trace),
+        ]
+    )
+    return BodyMeasures(
+        size=size,
+        elastic=elastic,
+        energy=energy,
+        correction=correction,
+        correction_energy=correction_energy,
+        change=changed,
+        alone=alone,
+        stiffness=stiffness,
+    )
 
 
 def _balance(coarse: CoarseSpace, lam: PETSc.Vec) -> tuple[float, float]:
@@ -171,5 +173,5 @@ def _balance(coarse: CoarseSpace, lam: PETSc.Vec) -> tuple[float, float]:
     coarse.comm.Allreduce(MPI.IN_PLACE, forces, op=MPI.SUM)
     forces = np.maximum(forces, LIGHT * forces.max())
     left = np.abs(coarse.G(lam.array_r) - coarse.e)
-    worst = int(np.argmax(left / np.maximum(forces, 1e-300)))
+    worst = int(np.argmax(left / np.maximum(forces, TINY)))
     return float(left[worst]), float(forces[worst])

@@ -15,11 +15,18 @@ from tfeti_dolfinx.subdomains.factor import CholeskyFactor
 # Stiffness, as a share of the stiffest motion of the same body, that counts as none: rounding
 # makes 1e-15 of it, and pins on neighbouring nodes of a fine mesh hold a turn by 1e-9.
 NULL = 1e-13
-# Components of more coordinates than this are looked at by a sparse factor.
+# Components of more coordinates than this are looked at by a sparse factor: the time of a dense
+# eigenproblem grows with the cube of its size.
 DENSE = 500
 # Shift of that factor: above rounding, below the softest chain of a thousand bodies.
 SHIFT = 1e-12
+# Inverse iterations, each of which damps what is not null by SHIFT over its stiffness, so that
+# even the softest chain is gone after a few; and vectors at first, doubled if all are null.
 SWEEPS, BLOCK = 4, 32
+# Eigenvalue of a projector, 0 or 1 but for rounding, from which on it is 1.
+HALF = 0.5
+# Stiffness given to directions outside the space, and where those inside, at most 1, end.
+OUTSIDE, INSIDE = 2.0, 1.5
 
 
 @dataclass(frozen=True)
@@ -77,7 +84,7 @@ def unsprung(springs: Array) -> Motions:
     """
     values, vectors = np.linalg.eigh(springs)
     none = np.zeros((springs.shape[0] * springs.shape[1], 0))
-    return Motions(vectors, values < 0.5, values, none)
+    return Motions(vectors, values < HALF, values, none)
 
 
 def unresisted(gram: csr_array, within: Motions, below: float = NULL) -> Motions:
@@ -104,9 +111,9 @@ def unresisted(gram: csr_array, within: Motions, below: float = NULL) -> Motions
     A = csr_array(scale @ A @ scale)
     blocks = diagonal_blocks(A, k)
     # what is not in the space is held; twice the stiffest motion keeps it apart in the order
-    blocks[:, np.arange(k), np.arange(k)] += np.where(within.free, 0.0, 2.0)
+    blocks[:, np.arange(k), np.arange(k)] += np.where(within.free, 0.0, OUTSIDE)
     stiffness, vectors = np.linalg.eigh(blocks)
-    held = (stiffness > NULL) & (stiffness < 1.5)
+    held = (stiffness > NULL) & (stiffness < INSIDE)
     # coordinates in which every body alone resists all its motions alike
     U = block_diagonal(vectors * (np.where(held, stiffness, 1.0) ** -0.5)[:, None, :])
     U = csr_array(U[:, np.flatnonzero(held.ravel())])

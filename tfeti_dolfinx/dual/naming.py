@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import qr
@@ -12,23 +11,12 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.bodies import Bodies
 from tfeti_dolfinx.dual.motions import NULL, Motions
 
-# of the largest coefficient: what takes part in a motion, what it is named after; bodies named
-PART, DOMINANT, NAMED = 1e-3, 0.3, 4
-
-
-@dataclass(frozen=True)
-class NamedBodies:
-    """All bodies, and this rank's part of them.
-
-    Attributes:
-        of_block: Body of each of this rank's Blocks.
-        names: Names of all bodies.
-        modes: Names of their candidate modes.
-    """
-
-    of_block: Array
-    names: Sequence[str]
-    modes: Sequence[str]
+# Of the largest coefficient: a body that moves by less than this takes no part in a motion, which
+# is known to rounding only; and a motion is named after modes of this share or more, which leaves
+# out what a rotation about another centre mixes in.
+TAKES_PART, DOMINANT = 1e-3, 0.3
+# bodies that a sentence names; of more it tells how many
+NAMED = 4
 
 
 def free_to_move(amounts: Array, body_names: Sequence[str], mode_names: Sequence[str]) -> str:
@@ -50,7 +38,7 @@ def free_to_move(amounts: Array, body_names: Sequence[str], mode_names: Sequence
 def _parts(amounts: Array, mode_names: Sequence[str]) -> tuple[Array, str]:
     """The bodies that take part in a motion, and what it is mostly."""
     parts = np.abs(amounts)
-    moving = np.flatnonzero(parts.max(axis=1) > PART * parts.max())
+    moving = np.flatnonzero(parts.max(axis=1) > TAKES_PART * parts.max())
     share = parts[moving].max(axis=0)
     modes = " and ".join(mode_names[m] for m in np.flatnonzero(share > DOMINANT * share.max()))
     return moving, modes

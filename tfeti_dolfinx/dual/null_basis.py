@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.arrays import TINY, Array
 from tfeti_dolfinx.dual.kernel_basis import independent
 
 
@@ -35,7 +35,7 @@ class NullBasis:
             scale: Coordinates are to be counted in these units.
         """
         joint = self.joint / scale[:, None]
-        size = np.maximum(np.linalg.norm(joint, axis=0), 1e-300)
+        size = np.maximum(np.linalg.norm(joint, axis=0), TINY)
         return np.concatenate((self.alone, independent(joint / size)))
 
 

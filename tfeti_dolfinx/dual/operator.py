@@ -1,11 +1,10 @@
-"""F = B K⁺ Bᵀ, and its preconditioners: B does all the communication, Blocks are local."""
+"""F = B K⁺ Bᵀ, and its preconditioners: B does all the communication, the rest is local."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from itertools import pairwise
 from typing import Any, Protocol
 
 import numpy as np
@@ -14,9 +13,11 @@ from petsc4py import PETSc
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.errors import raised_on_all_ranks, require
 from tfeti_dolfinx.subdomains.block import Block
+from tfeti_dolfinx.subdomains.local import LocalOperator, local_operator
+from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 
-class Gluing(Protocol):
+class RowMatrix(Protocol):
     """B, or something that stands for it between dual and trace vectors."""
 
     def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
@@ -32,34 +33,24 @@ class Gluing(Protocol):
         ...
 
 
-class BlockOperator:
-    """B diag(A_s) Bᵀ, A_s a local operator of each Block, with a count of multiplications.
+class DualOperator:
+    """B diag(A_s) Bᵀ, diag(A_s) local to the ranks, with a count of multiplications.
 
     Args:
         B: Dual rows × trace unknowns, MPIAIJ (or scaled).
-        blocks: This rank's Blocks, in the order of B's local columns.
-        apply: The local operator: from a Block and a trace vector to a trace vector.
-        name: Its name for ``Block.prepare``; all ranks raise what it raises.
+        local: diag(A_s) on this rank; what its ``prepare`` raises is raised on all ranks.
 
     Attributes:
         count: Multiplications so far, by who they are charged to (``"solver"`` by default).
     """
 
-    def __init__(
-        self,
-        B: Gluing,
-        blocks: Sequence[Block],
-        apply: Callable[[Block, Array], Array],
-        name: str,
-    ) -> None:
-        self.B, self.blocks, self.apply = B, blocks, apply
-        self.slices = trace_slices(blocks)
+    def __init__(self, B: RowMatrix, local: LocalOperator) -> None:
+        self.B, self.local = B, local
         self.count: Counter[str] = Counter()
         self._payer = "solver"
         self._w, self._v = B.createVecRight(), B.createVecRight()
         with raised_on_all_ranks(self._w.getComm().tompi4py()):
-            for block in blocks:
-                block.prepare(name)
+            local.prepare()
 
     @contextmanager
     def charged_to(self, payer: str) -> Iterator[None]:
@@ -74,29 +65,22 @@ class BlockOperator:
         """y = B diag(A_s) Bᵀ x. Collective."""
         self.count[self._payer] += 1
         self.B.multTranspose(x, self._w)
-        w, v = self._w.array_r, self._v.array
-        for block, part in zip(self.blocks, self.slices, strict=True):
-            v[part] = self.apply(block, w[part])
+        self.local.mult(self._w.array_r, self._v.array)
         self.B.mult(self._v, y)
 
     def destroy(self) -> None:
-        """Destroy the work vectors. Collective."""
+        """Destroy the work vectors and the local operator, not B. Collective."""
+        self.local.destroy()
         self._w.destroy()
         self._v.destroy()
 
 
-def trace_slices(blocks: Sequence[Block]) -> list[slice]:
-    """Local trace unknowns of each Block."""
-    ends = np.cumsum([0, *(len(block.trace_dofs) for block in blocks)])
-    return [slice(int(a), int(b)) for a, b in pairwise(ends)]
+def dual_operator(B: PETSc.Mat, blocks: Sequence[Block]) -> DualOperator:
+    """F = B K⁺ Bᵀ. Collective."""
+    return DualOperator(B, local_operator(blocks, "pinv"))
 
 
-def dual_operator(B: PETSc.Mat, blocks: Sequence[Block]) -> BlockOperator:
-    """F = B K⁺ Bᵀ."""
-    return BlockOperator(B, blocks, lambda block, w: block.apply_pinv(w), "pinv")
-
-
-class ScaledGluing:
+class ScaledRows:
     """B_D = B D⁻¹, which is (B D⁻¹ Bᵀ)⁻¹ B D⁻¹ for rows that are orthonormal in D⁻¹.
 
     With D the stiffness, preconditioners built on B_D bear jumps of stiffness between subdomains
@@ -131,24 +115,23 @@ class ScaledGluing:
         self._inverse.destroy()
 
 
-def lumped_preconditioner(B: Gluing, blocks: Sequence[Block]) -> BlockOperator:
-    """B K_bb Bᵀ (Farhat, Roux 1991), B or rather B_D."""
-    return BlockOperator(B, blocks, lambda block, w: block.apply_stiffness(w), "stiffness")
+def lumped_preconditioner(B: RowMatrix, blocks: Sequence[Block]) -> DualOperator:
+    """B K_bb Bᵀ (Farhat, Roux 1991), B or rather B_D. Collective."""
+    return DualOperator(B, local_operator(blocks, "stiffness"))
 
 
-def dirichlet_preconditioner(B: Gluing, blocks: Sequence[Block]) -> BlockOperator:
-    """B S Bᵀ (Farhat, Mandel, Roux 1994), B or rather B_D."""
-    return BlockOperator(B, blocks, lambda block, w: block.apply_schur(w), "schur")
+def dirichlet_preconditioner(B: RowMatrix, blocks: Sequence[Block]) -> DualOperator:
+    """B S Bᵀ (Farhat, Mandel, Roux 1994), B or rather B_D. Collective."""
+    return DualOperator(B, local_operator(blocks, "schur"))
 
 
 PRECONDITIONERS = {"lumped": lumped_preconditioner, "dirichlet": dirichlet_preconditioner}
 
 
-def linear_term(B: PETSc.Mat, c: PETSc.Vec, blocks: Sequence[Block]) -> PETSc.Vec:
+def linear_term(B: PETSc.Mat, c: PETSc.Vec, subdomains: Subdomains) -> PETSc.Vec:
     """d = B K⁺ f − c. Collective."""
     v, d = B.createVecRight(), c.duplicate()
-    for block, part in zip(blocks, trace_slices(blocks), strict=True):
-        v.array[part] = block.condensed_load
+    v.array[:] = subdomains.pinv_load[subdomains.trace]
     B.mult(v, d)
     d.axpy(-1.0, c)
     v.destroy()

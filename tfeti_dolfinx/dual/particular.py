@@ -13,11 +13,15 @@ from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Product
 from tfeti_dolfinx.qp.homogenised import natural
 
+# far more than Newton takes where it converges, so that a cycle ends
 MAX_STEPS = 100
-# of ‖e‖: what the coarse problem's factors leave at best, and what is let pass
+# Of ‖e‖: what the coarse problem's factors leave at best, and what is let pass: below any rtol,
+# and the solver makes Gλ = e good afterwards.
 BALANCED, LET_PASS = 1e-13, 1e-9
-# of GGᵀ: keeps the steps' matrices regular where few rows carry a force
+# of GGᵀ: keeps the steps' matrices regular where few rows carry a force; above rounding, and small
+# beside 1, so that steps stay Newton's
 DAMPING = 1e-8
+# a step of this share of Newton's changes nothing that is left above rounding
 SHORTEST = 1e-8
 
 log = logging.getLogger(__name__)

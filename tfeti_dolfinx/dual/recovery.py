@@ -2,30 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
-from tfeti_dolfinx.dual.operator import trace_slices
 from tfeti_dolfinx.qp.faces import Face
-from tfeti_dolfinx.subdomains.block import Block
 
-# of GGᵀ, added to G_f G_fᵀ: rows with a force that hold a motion by less are not asked about it
+# Of GGᵀ, added to G_f G_fᵀ: rows with a force that hold a motion by less are not asked about it,
+# since they would answer with their rounding over this share.
 DAMPING = 1e-8
 
 
 def recover(
     B: PETSc.Mat,
     c: PETSc.Vec,
-    blocks: Sequence[Block],
     coarse: CoarseSpace,
     lam: PETSc.Vec,
     gradient: PETSc.Vec,
     face: Face,
-) -> tuple[list[Array], Array]:
+) -> tuple[Array, Array]:
     """u = K⁺(f − Bᵀλ) + Rα. Collective.
 
     α = (GGᵀ)⁻¹G(Fλ − d − ν) makes the rows' residuals vanish, but for ν, the gaps of open rows
@@ -35,21 +31,19 @@ def recover(
     Args:
         B: Dual rows × trace unknowns.
         c: Right sides.
-        blocks: This rank's Blocks.
         coarse: The coarse space.
         lam: The multipliers.
         gradient: Fλ − d up to the range of Gᵀ; on rows that the face does not hold it is ν.
         face: The face of λ.
 
     Returns:
-        Displacements of each Block, each of shape ``(n_s,)``, and c − B u, shape ``(m,)``.
+        This rank's part of u, shape ``(n,)``, and c − B u, shape ``(m,)``.
     """
     w, v, residual = B.createVecRight(), B.createVecRight(), c.duplicate()
     B.multTranspose(lam, w)
-    slices = trace_slices(blocks)
-    u = [block.recover(w.array_r[part]) for block, part in zip(blocks, slices, strict=True)]
-    for block, part, u_s in zip(blocks, slices, u, strict=True):
-        v.array[part] = u_s[block.trace_dofs]
+    subdomains = coarse.subdomains
+    u = subdomains.recover(w.array_r)
+    v.array[:] = u[subdomains.trace]
     B.mult(v, residual)
     residual.aypx(-1.0, c)  # c − B K⁺(f − Bᵀλ) = Fλ − d
     gap = np.array(residual.array_r)
@@ -57,15 +51,12 @@ def recover(
         vec.destroy()
     nu = np.where(face.holding, 0.0, gradient.array_r)
     alpha = _alpha(coarse, gap, face.holding, nu)
-    return moved(blocks, u, coarse, alpha), gap - coarse.Gt @ alpha
+    return moved(u, coarse, alpha), gap - coarse.Gt @ alpha
 
 
-def moved(
-    blocks: Sequence[Block], u: Sequence[Array], coarse: CoarseSpace, alpha: Array
-) -> list[Array]:
+def moved(u: Array, coarse: CoarseSpace, alpha: Array) -> Array:
     """u + Rα."""
-    parts = coarse.alpha_of(alpha)
-    return [v + block.kernel_motion(a) for v, block, a in zip(u, blocks, parts, strict=True)]
+    return u + coarse.subdomains.kernel_motion(coarse.local_alpha(alpha))
 
 
 def _alpha(coarse: CoarseSpace, gradient: Array, free: Array, nu: Array) -> Array:

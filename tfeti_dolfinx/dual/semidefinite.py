@@ -14,6 +14,7 @@ from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteE
 # Added to a unit diagonal, where pivots are lost to rounding; so small a shift is made good by
 # refinement in all directions that stand out from rounding.
 SHIFTS = (0.0, 1e-14, 1e-13, 1e-12)
+# each divides the error in a direction of eigenvalue σ by σ / shift: three do for σ from 1e-8 on
 REFINEMENTS = 3
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 from mpi4py import MPI
 from scipy.optimize import lsq_linear
@@ -15,7 +13,6 @@ from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.dual.cuts import Rows, minimise
 from tfeti_dolfinx.dual.motions import Motions
 from tfeti_dolfinx.parallel import agreed
-from tfeti_dolfinx.subdomains.block import Block
 
 # Motions held by less than this share of what the same contacts hold at most are nearly free:
 # their contacts' normals are off by less than 6 degrees from a right angle.
@@ -23,10 +20,14 @@ NEARLY = 1e-2
 # Contact force that counts as none: as a share of the largest on the same bodies; or in multiples
 # of the solver's own error, unless it is a larger share of the bodies' loads.
 NO_FORCE, NO_EFFECT = 1e-6, 10.0
-# Size of what is left of a joint motion that motions of single bodies span already.
+# Size of what is left of a joint motion of size 1 that motions of single bodies span already: both
+# come from null spaces of Gram matrices, whose vectors are right to the root of rounding.
 DEPENDENT = 1e-8
-# Excess of a row, as a share of the motion, that is let be; slope of a row that is rounding.
+# Excess of a row, as a share of the motion, that is let be: below what rtol can see. Coefficient of
+# a motion of size 1 that is rounding.
 EXCESS, SLOPE = 1e-9, 1e-12
+# of lsq_linear: as far as rounding lets it come
+TIGHT = 1e-14
 
 
 def nearly_free(
@@ -61,8 +62,7 @@ def nearly_free(
 
 def smallest_motion(
     coarse: CoarseSpace,
-    blocks: Sequence[Block],
-    u: Sequence[Array],
+    u: Array,
     gap: Array,
     motions: Motions,
     force: Array,
@@ -74,8 +74,7 @@ def smallest_motion(
 
     Args:
         coarse: The coarse space.
-        blocks: This rank's Blocks.
-        u: Displacement of each Block.
+        u: This rank's part of the displacement, shape ``(n,)``.
         gap: c − B u, shape ``(m,)``.
         motions: Motions that hardly any force resists.
         force: Flags of local contact rows with a force.
@@ -84,7 +83,7 @@ def smallest_motion(
         Shape ``(r,)``.
     """
     N, body = agreed(coarse.comm, _orthonormal(motions, coarse.bodies.k))
-    wanted = -(N.T @ coarse.bodies.part_of(u, blocks))
+    wanted = -(N.T @ coarse.bodies.part_of(u))
     size = float(np.abs(wanted).max(initial=0.0))
     rows = _rows(coarse, csr_array(coarse.J @ N), gap / coarse.row_size, force, body)
     y = minimise(
@@ -96,7 +95,7 @@ def smallest_motion(
     )
     if y is None:
         return np.zeros(coarse.dimension)
-    return np.asarray(coarse.modes @ (N @ (rows.allowed(y, EXCESS * size, coarse.comm) * y)))
+    return np.asarray(coarse.motions @ (N @ (rows.allowed(y, EXCESS * size, coarse.comm) * y)))
 
 
 def _orthonormal(motions: Motions, k: int) -> tuple[csr_array, Array]:
@@ -150,5 +149,5 @@ def _least_distance(A: Array, b: Array, wanted: Array) -> Array:
     E = np.concatenate((-A.T, excess[None, :] / scale))
     f = np.zeros(len(E))
     f[-1] = 1.0
-    r = E @ lsq_linear(E, f, bounds=(0.0, np.inf), method="bvls", tol=1e-14).x - f
+    r = E @ lsq_linear(E, f, bounds=(0.0, np.inf), method="bvls", tol=TIGHT).x - f
     return np.asarray(-scale * r[:-1] / r[-1])

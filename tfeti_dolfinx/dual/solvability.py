@@ -24,6 +24,8 @@ from tfeti_dolfinx.parallel import agreed
 SLOPE, LP_TOLERANCE = 1e-9, 1e-10
 # Columns from which the interior point method with its crossover beats the simplex method.
 LARGE = 2000
+# Motions of a cone within −1 ≤ y ≤ 1: the largest entry is 1, or 0 but for rounding.
+MOVES = 0.5
 
 
 def check_solvable(
@@ -41,7 +43,7 @@ def check_solvable(
     """
     if coarse.dimension == 0:
         return
-    load = coarse.modes.T @ coarse.e
+    load = coarse.motions.T @ coarse.e
     motion = agreed(coarse.comm, _driven(coarse.free_motions, load, coarse.bodies))
     reason = (
         "nothing resists that and the load drives it; add a Dirichlet condition, a contact or a "
@@ -80,7 +82,7 @@ def escape(coarse: CoarseSpace) -> Array | None:
     body = np.repeat(np.arange(bodies.count), coarse.unheld.free.sum(axis=1))
     J_N = csr_array(coarse.J[coarse.bounded] @ Z)
     rows = Rows(J_N, np.zeros(J_N.shape[0]), body)
-    load, noise = Z.T @ (coarse.modes.T @ coarse.e), bodies.negligible[body]
+    load, noise = Z.T @ (coarse.motions.T @ coarse.e), bodies.negligible[body]
     if agreed(coarse.comm, bool(np.all(np.abs(load) <= noise))):
         return None
     # parts of the scene that do not meet may be loaded by very different forces
@@ -111,7 +113,7 @@ def _most_work(A: csr_array, load: Array, noise: Array) -> Array | None:
     # light one. Work less what counts as none has no such motions.
     y = _halves(_minimiser(np.concatenate((noise - load, noise + load)), _both(A), bounds=(0, 1)))
     # a cone: a motion that gains something gains more until a bound stops it
-    return y if np.abs(y).max() > 0.5 and load @ y > noise @ np.abs(y) else None
+    return y if np.abs(y).max() > MOVES and load @ y > noise @ np.abs(y) else None
 
 
 def _least_motion(A: csr_array, load: Array) -> Array:

@@ -1,26 +1,25 @@
-"""The Block: all that the dual knows of a subdomain, and the identities that any Block fulfils."""
+"""The Block: all that the dual knows of a subdomain."""
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.errors import require
+from tfeti_dolfinx.subdomains.data import SubdomainData
+from tfeti_dolfinx.subdomains.input_checks import check_load
+from tfeti_dolfinx.subdomains.kernel import candidate_modes
+
+OperatorKind = Literal["pinv", "stiffness", "schur"]
 
 
 class Block(Protocol):
     """One subdomain, seen through the unknowns that rows of B touch (the *trace*).
 
     n is the number of its unknowns, t of its trace unknowns, r the dimension of its kernel.
-    Nothing here is collective.
+    Nothing here is collective. ``BlockDefaults`` has most of it; ``check_block`` tests it.
     """
-
-    @property
-    def size(self) -> int:
-        """n."""
-        ...
 
     @property
     def trace_dofs(self) -> Array:
@@ -28,56 +27,36 @@ class Block(Protocol):
         ...
 
     @property
+    def load(self) -> Array:
+        """f, shape ``(n,)``."""
+        ...
+
+    @property
     def kernel(self) -> Array:
-        """R, an orthonormal basis of the kernel, its trace rows, shape ``(t, r)``."""
-        ...
-
-    @property
-    def kernel_load(self) -> Array:
-        """e = Rᵀ f, shape ``(r,)``."""
-        ...
-
-    @property
-    def load_norm(self) -> float:
-        """‖f‖."""
-        ...
-
-    @property
-    def body_modes(self) -> tuple[Array, Array]:
-        """How the modes of the whole body lie in this kernel.
-
-        Returns:
-            Rᵀ C, shape ``(r, k)``, C the candidate modes of the body on this block, and the
-            Gram matrix of what is left of them, Cᵀ(I − R Rᵀ)C, shape ``(k, k)``.
-        """
-        ...
-
-    @property
-    def modes(self) -> Array:
-        """C, the candidate modes of the whole body on all unknowns, shape ``(n, k)``."""
+        """R, an orthonormal basis of the kernel of K, shape ``(n, r)``."""
         ...
 
     @property
     def diagonal(self) -> Array:
-        """Diagonal of K on the trace, shape ``(t,)``."""
-        ...
-
-    def energy(self, u: Array) -> float:
-        """uᵀKu."""
+        """Diagonal of K, shape ``(n,)``."""
         ...
 
     @property
-    def body_metric(self) -> Array:
-        """Cᵀ W C, shape ``(k, k)``, W the share of this block in each of its nodes."""
-        ...
-
-    def body_moments(self, u: Array) -> Array:
-        """Cᵀ W u of a displacement on all unknowns, shape ``(k,)``."""
+    def modes(self) -> Array:
+        """C, the candidate modes of the whole body, shape ``(n, k)``."""
         ...
 
     @property
-    def condensed_load(self) -> Array:
-        """K⁺ f on the trace, shape ``(t,)``."""
+    def shares(self) -> Array:
+        """1 / number of torn copies of each unknown, shape ``(n,)``."""
+        ...
+
+    def multiply(self, u: Array) -> Array:
+        """K u on all unknowns, shapes ``(n,)``."""
+        ...
+
+    def solve(self, b: Array) -> Array:
+        """K⁺ b on all unknowns, shapes ``(n,)``."""
         ...
 
     def apply_pinv(self, w: Array) -> Array:
@@ -92,27 +71,23 @@ class Block(Protocol):
         """S w, S the Schur complement of K on the trace, shapes ``(t,)``."""
         ...
 
-    def prepare(self, operator: str) -> None:
+    def prepare(self, kind: OperatorKind) -> None:
         """Make what an operator needs, so that no error can come up in a collective call.
-
-        Args:
-            operator: ``"pinv"``, ``"stiffness"`` or ``"schur"``.
 
         Raises:
             FactorError: A factor that it needs could not be made.
         """
         ...
 
-    def recover(self, w: Array) -> Array:
-        """K⁺(f − w) on all unknowns, shape ``(n,)``; w on the trace."""
-        ...
-
-    def kernel_motion(self, alpha: Array) -> Array:
-        """R α on all unknowns, shape ``(n,)``."""
-        ...
-
     def update(self, K: Any = None, f: Array | None = None) -> None:
-        """Replace the stiffness or the load; only what depends on it is computed again."""
+        """Replace the stiffness or the load; only what depends on it is computed again.
+
+        K becomes the Block's own, as the one that it was made from.
+
+        Raises:
+            InputError: They do not fit.
+            FactorError: A factor could not be made.
+        """
         ...
 
     def retrace(self, trace_dofs: Array) -> None:
@@ -124,74 +99,91 @@ class Block(Protocol):
         ...
 
 
-# eigenvalues of a stiffness and singular values, relative to the largest one, that are 0 but for
-# rounding
-ZERO, RANK = 1e-12, 1e-10
+class BlockDefaults:
+    """A Block but for its stiffness: base of one's own kind.
 
-
-def check_block(block: Block, K: Any, tol: float = 1e-9) -> None:
-    """Check the identities that the dual relies on, for a Block of stiffness ``K``.
-
-    The kernel is orthonormal, annihilated by K and complete; K⁺ is a symmetric generalised
-    inverse: K K⁺ w = w for every trace force w that is orthogonal to the kernel; K_bb and S are
-    what they say.
+    A kind gives ``set_stiffness``, which sets ``kernel`` and ``diagonal``, and ``multiply``,
+    ``solve`` and ``apply_schur``; it overrides what it can do at less cost.
 
     Args:
-        block: The Block.
-        K: Its stiffness, a scipy sparse matrix of shape ``(n, n)``.
-        tol: Relative tolerance; what goes through an inverse may be off by what rounding makes
-            of the condition of K if that is more.
+        data: The subdomain. Its K is handed to ``set_stiffness`` and not kept.
 
-    Raises:
-        ConformanceError: An identity does not hold; the message names it.
+    Attributes:
+        name: Name for messages.
+        trace_dofs: Trace unknowns.
+        load: f.
+        kernel: R.
+        diagonal: Diagonal of K.
     """
-    K, trace, r = K.toarray(), block.trace_dofs, block.kernel.shape[1]
-    size = np.abs(K).max()
-    R = np.zeros((block.size, r))
-    for j in range(r):
-        R[:, j] = block.kernel_motion(np.eye(r)[j])
-    require(np.allclose(R.T @ R, np.eye(r), atol=tol), "Rᵀ R = I")
-    require(np.allclose(R[trace], block.kernel, atol=tol), "kernel is R on the trace")
-    require(np.abs(K @ R).max(initial=0.0) <= tol * size, "K R = 0")
-    values = np.linalg.eigvalsh(K)
-    require(np.sum(values > ZERO * values[-1]) == block.size - r, "the kernel is complete")
 
-    require(np.allclose(block.diagonal, K.diagonal()[trace], rtol=tol), "diagonal is that of K")
-    whole = np.random.default_rng(1).standard_normal(block.size)
-    require(np.isclose(block.energy(whole), whole @ K @ whole, rtol=tol), "energy is uᵀKu")
-    require(np.allclose(R.T @ block.modes, block.body_modes[0], atol=tol), "body_modes is Rᵀ C")
+    kernel: Array
+    diagonal: Array
 
-    inverse_tol = max(tol, 100 * np.finfo(float).eps * values[-1] / values[r])
-    w, v = np.random.default_rng(0).standard_normal((2, len(trace)))
-    _check_inverse(block, K, R, w, v, inverse_tol)
+    def __init__(self, data: SubdomainData) -> None:
+        self.name, self.x, self.bs = data.name, data.x, data.bs
+        self._body_frame, self._node_shares = data.body_frame, data.node_shares
+        self.trace_dofs = data.trace_dofs
+        self.update(K=data.K, f=data.f)
 
-    inner = np.setdiff1d(np.arange(block.size), trace)
-    K_bb, K_bi, K_ii = K[np.ix_(trace, trace)], K[np.ix_(trace, inner)], K[np.ix_(inner, inner)]
-    S = K_bb - K_bi @ np.linalg.lstsq(K_ii, K_bi.T, rcond=RANK)[0]
-    largest = np.abs(K_bb @ w).max()
-    block.prepare("stiffness")
-    applied = block.apply_stiffness(w)
-    require(np.allclose(applied, K_bb @ w, atol=tol * largest), "apply_stiffness is K_bb")
-    block.prepare("schur")
-    applied = block.apply_schur(w)
-    require(np.allclose(applied, S @ w, atol=inverse_tol * largest), "apply_schur is S")
+    def set_stiffness(self, K: Any) -> None:
+        """Take a stiffness, scipy CSR, and make what is needed of it.
 
+        Raises:
+            InputError: It does not fit.
+            FactorError: A factor could not be made.
+        """
+        raise NotImplementedError
 
-def _check_inverse(block: Block, K: Array, R: Array, w: Array, v: Array, tol: float) -> None:
-    """K⁺ is symmetric, and K K⁺ w = w for a balanced w."""
-    block.prepare("pinv")
-    trace, largest = block.trace_dofs, np.abs(block.apply_pinv(w)).max()
-    product, transposed = v @ block.apply_pinv(w), w @ block.apply_pinv(v)
-    atol = tol * largest * np.linalg.norm(v)
-    require(np.isclose(product, transposed, rtol=tol, atol=atol), "K⁺ is symmetric")
-    # a mode that is 0 on the trace but for rounding must not be scaled up
-    balanced = w - R[trace] @ np.linalg.lstsq(R[trace], w, rcond=RANK)[0]
-    base = block.recover(np.zeros(len(trace)))
-    u = base - block.recover(balanced)
-    force = np.zeros(block.size)
-    force[trace] = balanced
-    largest = np.abs(force).max()
-    require(np.abs(K @ u - force).max() <= tol * largest, "K K⁺ w = w for Rᵀ w = 0")
-    atol = tol * max(np.abs(u).max(), np.abs(base).max())
-    on_trace = block.apply_pinv(balanced)
-    require(np.allclose(u[trace], on_trace, atol=atol), "recover and apply_pinv agree")
+    def multiply(self, u: Array) -> Array:
+        """K u on all unknowns, shapes ``(n,)``."""
+        raise NotImplementedError
+
+    def solve(self, b: Array) -> Array:
+        """K⁺ b on all unknowns, shapes ``(n,)``."""
+        raise NotImplementedError
+
+    def apply_schur(self, w: Array) -> Array:
+        """S w, shapes ``(t,)``."""
+        raise NotImplementedError
+
+    @property
+    def modes(self) -> Array:
+        """C, the candidate modes of the whole body, shape ``(n, k)``."""
+        return candidate_modes(self.x, self.bs, *self._body_frame)
+
+    @property
+    def shares(self) -> Array:
+        """1 / number of torn copies of each unknown, shape ``(n,)``."""
+        return np.repeat(self._node_shares, self.bs)
+
+    def apply_pinv(self, w: Array) -> Array:
+        """K⁺ w on the trace, shapes ``(t,)``."""
+        return self.solve(self._extended(w))[self.trace_dofs]
+
+    def apply_stiffness(self, w: Array) -> Array:
+        """K_bb w, shapes ``(t,)``."""
+        return self.multiply(self._extended(w))[self.trace_dofs]
+
+    def prepare(self, kind: OperatorKind) -> None:
+        """All is there."""
+
+    def update(self, K: Any = None, f: Array | None = None) -> None:
+        """Replace the stiffness or the load."""
+        if f is not None:
+            check_load(self.name, f)
+            self.load = f
+        if K is not None:
+            self.set_stiffness(K)
+
+    def retrace(self, trace_dofs: Array) -> None:
+        """Replace the trace."""
+        self.trace_dofs = trace_dofs
+
+    def destroy(self) -> None:
+        """Nothing is to be freed."""
+
+    def _extended(self, w: Array) -> Array:
+        """A trace vector on all unknowns, 0 elsewhere."""
+        full = np.zeros(len(self.load))
+        full[self.trace_dofs] = w
+        return full

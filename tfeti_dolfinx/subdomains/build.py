@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from typing import Any
 
@@ -13,69 +14,81 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.subdomains.block import Block
+from tfeti_dolfinx.subdomains.data import Counters, SubdomainData
 from tfeti_dolfinx.subdomains.factor import say_if_not_cholmod
-from tfeti_dolfinx.subdomains.sparse_block import Counters, SparseBlock
+from tfeti_dolfinx.subdomains.subdomains import Subdomains
+
+MakeBlock = Callable[[SubdomainData], Block]
 
 
-def sparse_blocks(
-    dofs: TornDofs,
-    decomposition: Decomposition,
-    K: Any,
-    f: Array,
-    trace: Array,
-    counters: Counters,
-    kplus_type: str,
-    prefix: str = "tfeti_sub_",
-) -> list[SparseBlock]:
-    """One SparseBlock for each subdomain of this rank. Collective.
+def subdomain_data(
+    dofs: TornDofs, decomposition: Decomposition, K: Any, f: Array, trace: Array
+) -> list[SubdomainData]:
+    """What the Block of each subdomain of this rank is made from. Collective.
 
     Args:
         dofs: Dof maps.
         decomposition: The torn mesh.
-        K: This rank's stiffness in DOLFINx's numbering, scipy CSR.
+        K: This rank's stiffness in DOLFINx's numbering, scipy CSR; not needed any more after it.
         f: Its load in DOLFINx's numbering.
         trace: Local primal unknowns that rows of B touch, ascending.
-        counters: Counts factorisations.
-        kplus_type: Kind of the generalised inverse.
-        prefix: Prefix of the factors' PETSc options.
     """
-    say_if_not_cholmod(dofs.comm)
     gdim = decomposition.mesh.geometry.dim
     x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node, :gdim]
     shares = 1.0 / dofs.spread(dofs.multiplicity)
     frames = _body_frames(dofs, decomposition, x, shares)
-    loads = dofs.to_primal(f)
+    loads, starts = dofs.to_primal(f), dofs.node_offsets * dofs.bs
+    cuts = np.searchsorted(trace, starts)
+    data = []
+    for s, (K_s, subdomain) in enumerate(zip(submatrices(dofs, K), dofs.subdomains, strict=True)):
+        nodes = slice(dofs.node_offsets[s], dofs.node_offsets[s + 1])
+        data.append(
+            SubdomainData(
+                name=f"subdomain {subdomain}",
+                K=K_s,
+                f=loads[starts[s] : starts[s + 1]],
+                x=x[nodes],
+                trace_dofs=trace[cuts[s] : cuts[s + 1]] - starts[s],
+                body_frame=frames[decomposition.body_of_subdomain[subdomain]],
+                node_shares=shares[nodes],
+            )
+        )
+    return data
+
+
+def submatrices(dofs: TornDofs, K: Any) -> Iterator[csr_array]:
+    """Stiffness of each subdomain of this rank in primal order, from that of all of them."""
     dolfinx = dofs.dolfinx_dofs()
     primal = np.empty(len(dolfinx), dtype=np.int32)
     primal[dolfinx] = np.arange(len(dolfinx))
-    parts = trace_parts(dofs, trace)
+    for first, last in pairwise((dofs.node_offsets * dofs.bs).tolist()):
+        yield _submatrix(K, dolfinx[first:last], primal, first)
+
+
+def make_subdomains(
+    data: list[SubdomainData],
+    make_block: MakeBlock,
+    decomposition: Decomposition,
+    counters: Counters | None = None,
+) -> Subdomains:
+    """A Block for each subdomain of this rank. Collective.
+
+    Args:
+        data: The subdomains; the list is emptied, so that no K is held twice.
+        make_block: Makes one, say ``SparseBlock`` or a class of one's own; what it raises is
+            raised on all ranks.
+        decomposition: The torn mesh.
+        counters: Counts solves.
+    """
+    comm = decomposition.comm
+    say_if_not_cholmod(comm)
     blocks = []
-    with raised_on_all_ranks(dofs.comm):
-        for s, subdomain in enumerate(dofs.subdomains):
-            nodes = slice(dofs.node_offsets[s], dofs.node_offsets[s + 1])
-            first, last = nodes.start * dofs.bs, nodes.stop * dofs.bs
-            blocks.append(
-                SparseBlock(
-                    name=f"subdomain {subdomain}",
-                    K=_submatrix(K, dolfinx[first:last], primal, first),
-                    f=loads[first:last],
-                    x=x[nodes],
-                    trace_dofs=parts[s],
-                    body_frame=frames[decomposition.body_of_subdomain[subdomain]],
-                    counters=counters,
-                    kplus_type=kplus_type,
-                    prefix=prefix,
-                    shares=shares[nodes],
-                )
-            )
-    return blocks
-
-
-def trace_parts(dofs: TornDofs, trace: Array) -> list[Array]:
-    """Trace unknowns of each subdomain of this rank, counted from its own first unknown."""
-    starts = dofs.node_offsets * dofs.bs
-    cuts = np.searchsorted(trace, starts)
-    return [trace[a:b] - start for (a, b), start in zip(pairwise(cuts), starts, strict=False)]
+    with raised_on_all_ranks(comm):
+        while data:
+            blocks.append(make_block(data.pop(0)))
+    bodies = decomposition.body_of_subdomain[decomposition.subdomains]
+    return Subdomains(blocks, bodies, decomposition.num_bodies, comm, counters)
 
 
 def _submatrix(K: Any, rows: Array, primal: Array, first: int) -> csr_array:

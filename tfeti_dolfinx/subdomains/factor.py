@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from typing import Any
@@ -42,29 +42,45 @@ class CholeskyFactor:
     Args:
         A: scipy sparse matrix, both triangles, shape ``(n, n)``.
         prefix: Prefix of the PETSc options ``pc_factor_...`` and ``mat_...`` that it heeds.
+        keep: Whether ``refactor`` will be asked for: the arrays of A, CSR with sorted indices,
+            are then shared, not copied, and its owner may change the values. Else A is let go.
 
     Raises:
         NotPositiveDefiniteError: A is not positive definite.
         FactorError: There is no memory for the factor, PETSc has no such solver, or it fails.
     """
 
-    def __init__(self, A: Any, prefix: str = "tfeti_sub_") -> None:
-        matrix = _petsc_matrix(A)
-        self._b, self._x = matrix.createVecs()
-        pc = PETSc.PC().create(PETSc.COMM_SELF)
+    def __init__(self, A: Any, prefix: str = "tfeti_sub_", keep: bool = False) -> None:
+        self._prefix, self._keep = prefix, keep
+        self._matrix: Any = _petsc_matrix(A)
+        self._b, self._x = self._matrix.createVecs()
+        self._pc: Any = PETSc.PC().create(PETSc.COMM_SELF)
         self._factor: Any = None
+        self._make(lambda: _factored(self._pc, self._matrix, prefix))
+
+    def refactor(self) -> None:
+        """Factor the present values of A: no ordering, no symbolic factorisation.
+
+        Raises:
+            NotPositiveDefiniteError: A is not positive definite.
+            FactorError: The factor could not be made.
+        """
+        self._matrix.stateIncrease()  # PETSc does not see that the shared values have changed
+        self._make(lambda: _factored_again(self._pc, self._prefix))
+
+    def _make(self, factored: Callable[[], PETSc.Mat]) -> None:
+        """Make the factor and see that it is one; on an error nothing stays."""
         try:
-            self._factor = _factored(pc, matrix, prefix)
+            self._factor = factored()
             _check_definite(self._factor)
-            if not np.all(np.isfinite(self.solve(np.ones(A.shape[0])))):
+            if not np.all(np.isfinite(self.solve(np.ones(self._b.getLocalSize())))):
                 raise NotPositiveDefiniteError("a pivot is zero")
         except (PETSc.Error, FactorError) as error:
-            cause = _cause(error, pc.getFactorSolverType(), A)
+            cause = _cause(error, self._pc.getFactorSolverType(), self._matrix)
             self.destroy()
             raise cause from error
-        finally:
-            pc.destroy()
-            matrix.destroy()
+        if not self._keep:
+            self._release()
 
     def solve(self, b: Array) -> Array:
         """A⁻¹ b, shape ``(n,)``."""
@@ -74,9 +90,17 @@ class CholeskyFactor:
 
     def destroy(self) -> None:
         """Free the factor."""
+        self._release()
         for item in (self._b, self._x, self._factor):
             if item is not None:
                 item.destroy()
+
+    def _release(self) -> None:
+        """Let go of what only the next factorisation would need."""
+        for item in (self._pc, self._matrix):
+            if item is not None:
+                item.destroy()
+        self._pc = self._matrix = None
 
 
 @contextmanager
@@ -136,13 +160,12 @@ def _say(solver: str) -> None:
 
 
 def _petsc_matrix(A: Any) -> PETSc.Mat:
+    """A as a matrix of PETSc, on the same arrays if they are sorted CSR of PETSc's integers."""
     A = A.tocsr()
     A.sort_indices()
-    index = PETSc.IntType
+    indptr, indices = (array.astype(PETSc.IntType, copy=False) for array in (A.indptr, A.indices))
     matrix = PETSc.Mat().createAIJWithArrays(
-        A.shape,
-        (A.indptr.astype(index), A.indices.astype(index), A.data),
-        comm=PETSc.COMM_SELF,
+        A.shape, (indptr, indices, A.data), comm=PETSc.COMM_SELF
     )
     # not SPD, which is what the factor is to find out; MUMPS would not look at signs then
     matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -154,6 +177,11 @@ def _factored(pc: PETSc.PC, matrix: PETSc.Mat, prefix: str) -> PETSc.Mat:
     pc.setOptionsPrefix(prefix)
     pc.setType(PETSc.PC.Type.CHOLESKY)
     pc.setOperators(matrix)
+    return _factored_again(pc, prefix)
+
+
+def _factored_again(pc: PETSc.PC, prefix: str) -> PETSc.Mat:
+    """The factor of the present values, numeric only if there has been one."""
     with added_options(prefix, {"pc_factor_mat_solver_type": default_solver(), **DEFINITE}):
         pc.setFromOptions()
         pc.setUp()
@@ -177,8 +205,8 @@ def _check_definite(factor: PETSc.Mat) -> None:
         raise NotPositiveDefiniteError(f"{negative} eigenvalues are negative, {zero} zero")
 
 
-def _cause(error: Exception, solver: str | None, A: Any) -> FactorError:
-    """What made a factor fail."""
+def _cause(error: Exception, solver: str | None, A: PETSc.Mat) -> FactorError:
+    """What made the factor of a matrix fail."""
     if isinstance(error, FactorError):
         return type(error)(f"not positive definite ({solver}: {error})")
     code = getattr(error, "ierr", None)
@@ -186,8 +214,8 @@ def _cause(error: Exception, solver: str | None, A: Any) -> FactorError:
         return NotPositiveDefiniteError(f"not positive definite (found by {solver})")
     if code == OUT_OF_MEMORY or CHOLMOD_OUT_OF_MEMORY in str(error):
         return FactorError(
-            f"out of memory: {solver} had none for the factor of {A.shape[0]} unknowns with "
-            f"{A.nnz} entries; expected smaller subdomains, or more memory"
+            f"out of memory: {solver} had none for the factor of {A.getSize()[0]} unknowns with "
+            f"{A.getInfo()['nz_used']:.0f} entries; expected smaller subdomains, or more memory"
         )
     if code == MISSING_SOLVER:
         known = ", ".join(name for name in SOLVERS if has_solver(name))

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import diags_array
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.arrays import TINY, Array
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 from tfeti_dolfinx.subdomains.kplus import regular_matrix
 
@@ -36,7 +36,7 @@ def why_indefinite(K: Any, R: Array, fixing_dofs: Array, x: Array, prefix: str) 
     except NotPositiveDefiniteError:
         return "the stiffness is not positive semidefinite; expected a linear elastic form"
     extents = np.linalg.svd(x - x.mean(axis=0), compute_uv=False)
-    flat = extents[0] / max(extents[-1], 1e-300)
+    flat = extents[0] / max(extents[-1], TINY)
     return (
         "the stiffness is indefinite by rounding: its softest deformations are lost beside its "
         f"stiffest (its length is {flat:.0e} of its thickness, its diagonal spans a factor of "

@@ -11,6 +11,9 @@ from tfeti_dolfinx.arrays import Array
 # Energy of a mode, as a share of what its terms would sum up to without their signs, that counts
 # as none: rounding makes 2e-16 of it, a spring of 1e-10 of the stiffness 1e-14 and more.
 NULL = 2e-15
+# Of the largest singular value of the modes, whose entries are of the size 1: what a mode has on
+# its own beside the others. Nodes on a line or in one point make it 0 but for rounding.
+DEPENDENT = 1e-10
 
 
 def candidate_modes(x: Array, bs: int, centre: Array, length: float) -> Array:
@@ -20,7 +23,7 @@ def candidate_modes(x: Array, bs: int, centre: Array, length: float) -> Array:
         x: Points of the nodes, shape ``(n, gdim)``.
         bs: Unknowns per node.
         centre: Point that the rotations turn about, shape ``(gdim,)``.
-        length: Length that makes rotations comparable to translations.
+        length: Length that makes rotations comparable to translations; 0 for a body of one node.
 
     Returns:
         Modes as columns, shape ``(n * bs, k)``; k = 3 in 2D, 6 in 3D, bs for other fields.
@@ -28,7 +31,7 @@ def candidate_modes(x: Array, bs: int, centre: Array, length: float) -> Array:
     gdim = x.shape[1]
     modes = [np.tile(np.eye(bs)[i], len(x)) for i in range(bs)]
     if bs == gdim and gdim > 1:
-        y = (x - centre) / length
+        y = (x - centre) / (length or 1.0)
         for i in range(gdim):
             for j in range(i):
                 turn = np.zeros((len(x), bs))
@@ -79,7 +82,7 @@ def kernel_of(K: Any, modes: Array) -> Array:
 def orthonormal(modes: Array) -> Array:
     """Orthonormal basis of the span of the columns (few of them, maybe dependent)."""
     U, s, _ = np.linalg.svd(modes, full_matrices=False)
-    return U[:, s > 1e-10 * s.max(initial=0.0)]
+    return U[:, s > DEPENDENT * s.max(initial=0.0)]
 
 
 def fixing_nodes(x: Array, count: int) -> Array:

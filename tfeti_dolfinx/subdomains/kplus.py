@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, Protocol
 
 import numpy as np
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor
@@ -18,24 +20,64 @@ class GeneralisedInverse(Protocol):
         """K⁺ b, shape ``(n,)``."""
         ...
 
+    def refactor(self, R: Array) -> None:
+        """Follow new values of K in the same pattern; R is their kernel.
+
+        Raises:
+            FactorError: The factor could not be made.
+        """
+        ...
+
     def destroy(self) -> None:
         """Free the factor."""
         ...
 
 
-def regularised(
-    K: Any, R: Array, fixing_dofs: Array, prefix: str = "tfeti_sub_"
-) -> GeneralisedInverse:
+class Regularised:
     """K_ρ⁻¹ with K_ρ = K + ρ Nᵀ(NNᵀ)⁻¹N, N the kernel on a few fixing unknowns, ρ = max diag K.
 
     An exact generalised inverse, because N R is regular
-    (Brzobohatý, Dostál, Kozubek, Kovář, Markopoulos, IJNME 88, 2011, section 4).
+    (Brzobohatý, Dostál, Kozubek, Kovář, Markopoulos, IJNME 88, 2011, section 4). K_ρ is never
+    stored: K lends its own entries for as long as the factor is made.
 
     Args:
-        K: Stiffness, shape ``(n, n)``.
+        K: Stiffness, CSR with sorted indices and an entry, maybe 0, for each pair of fixing
+            unknowns (see ``with_entries``), shape ``(n, n)``. Its arrays are held.
         R: Kernel, shape ``(n, r)``; without columns K itself is inverted.
         fixing_dofs: Unknowns of the fixing nodes.
         prefix: Prefix of the factor's PETSc options.
+
+    Raises:
+        NotPositiveDefiniteError: K_ρ has no Cholesky factor.
+        FactorError: It could not be made for another reason.
+    """
+
+    def __init__(self, K: Any, R: Array, fixing_dofs: Array, prefix: str = "tfeti_sub_") -> None:
+        self._K, self._fixing_dofs = K, fixing_dofs
+        with _regular_values(K, R, fixing_dofs):
+            self._factor = CholeskyFactor(K, prefix, keep=True)
+
+    def solve(self, b: Array) -> Array:
+        """K⁺ b, shape ``(n,)``."""
+        return self._factor.solve(b)
+
+    def refactor(self, R: Array) -> None:
+        """Follow new values of K in the same pattern; R is their kernel.
+
+        Raises:
+            NotPositiveDefiniteError: K_ρ has no Cholesky factor.
+            FactorError: It could not be made for another reason.
+        """
+        with _regular_values(self._K, R, self._fixing_dofs):
+            self._factor.refactor()
+
+    def destroy(self) -> None:
+        """Free the factor."""
+        self._factor.destroy()
+
+
+def regularised(K: Any, R: Array, fixing_dofs: Array, prefix: str = "tfeti_sub_") -> CholeskyFactor:
+    """K_ρ⁻¹ (see ``Regularised``) of a K that is not needed any more.
 
     Raises:
         NotPositiveDefiniteError: K_ρ has no Cholesky factor.
@@ -48,11 +90,54 @@ def regular_matrix(K: Any, R: Array, fixing_dofs: Array) -> Any:
     """K_ρ, scipy CSR; K itself where R has no columns."""
     if R.shape[1] == 0:
         return K
-    Q, _ = np.linalg.qr(R[fixing_dofs])
-    rho = K.diagonal().max()
+    added = _projector(K, R, fixing_dofs).ravel()
     row, column = np.meshgrid(fixing_dofs, fixing_dofs, indexing="ij")
-    projector = coo_array((rho * (Q @ Q.T).ravel(), (row.ravel(), column.ravel())), shape=K.shape)
-    return (K + projector).tocsr()
+    return (K + coo_array((added, (row.ravel(), column.ravel())), shape=K.shape)).tocsr()
 
 
-KPLUS_TYPES = {"regularized": regularised}
+def with_entries(K: Any, dofs: Array) -> Any:
+    """The same matrix in CSR with sorted indices and an entry, maybe 0, for each pair of dofs."""
+    K.sort_indices()
+    if np.all(_places(K, dofs) >= 0):
+        return K
+    entries = K.tocoo()
+    row, column = (index.ravel() for index in np.meshgrid(dofs, dofs, indexing="ij"))
+    rows, columns = (
+        np.concatenate((old, new.astype(old.dtype)))
+        for old, new in zip(entries.coords, (row, column), strict=True)
+    )
+    values = np.concatenate((entries.data, np.zeros(len(row))))
+    return csr_array(coo_array((values, (rows, columns)), shape=K.shape))
+
+
+def same_pattern(K: Any, other: Any) -> bool:
+    """Whether two CSR matrices store the same entries."""
+    return np.array_equal(K.indptr, other.indptr) and np.array_equal(K.indices, other.indices)
+
+
+def _projector(K: Any, R: Array, fixing_dofs: Array) -> Array:
+    """ρ Nᵀ(NNᵀ)⁻¹N on the fixing unknowns."""
+    Q, _ = np.linalg.qr(R[fixing_dofs])
+    return np.asarray(K.diagonal().max() * (Q @ Q.T))
+
+
+def _places(K: Any, dofs: Array) -> Array:
+    """Where the entries of each pair of dofs are stored, −1 where they are not."""
+    number = csr_array((np.arange(1, K.nnz + 1), K.indices, K.indptr), shape=K.shape)
+    return np.asarray(number[dofs][:, dofs].toarray()) - 1
+
+
+@contextmanager
+def _regular_values(K: Any, R: Array, fixing_dofs: Array) -> Iterator[None]:
+    """The values of K_ρ in the place of those of K, which come back to the last bit."""
+    places = _places(K, fixing_dofs)
+    kept = K.data[places]
+    if R.shape[1]:
+        K.data[places] += _projector(K, R, fixing_dofs)
+    try:
+        yield
+    finally:
+        K.data[places] = kept
+
+
+KPLUS_TYPES = {"regularized": Regularised}

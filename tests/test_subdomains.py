@@ -1,0 +1,139 @@
+"""The Blocks of a rank as one: identities against the assembled matrices, and what is made anew."""
+
+import numpy as np
+import pytest
+from bodies import held, pressed, sided, stacked, two_body_problem
+from mpi4py import MPI
+from test_solvable_lp import dual_of
+
+from tfeti_dolfinx.subdomains.build import submatrices
+from tfeti_dolfinx.subdomains.local import local_operator
+from tfeti_dolfinx.subdomains.subdomains import sizes, sums
+
+
+@pytest.fixture(scope="module")
+def scene():
+    d = stacked("quadrilateral", subdomains=3)
+    bcs = held(d, "lower bottom", "lower left")
+    p = two_body_problem(d, pressed(d), bcs, [sided("upper bottom", "lower top")])
+    dual = dual_of(p)
+    yield p, dual.subdomains
+    p.destroy()
+
+
+def random(n, seed=0):
+    return np.random.default_rng(seed + MPI.COMM_WORLD.rank).standard_normal(n)
+
+
+def applied(p, u):
+    """K u in primal order, with the K that DOLFINx has assembled."""
+    return p.dofs.to_primal(p._system.forms.stiffness() @ p.dofs.to_dolfinx(u))
+
+
+def num_dofs(p):
+    return p.dofs.num_nodes * p.dofs.bs
+
+
+def test_energies(scene):
+    p, subdomains = scene
+    u = random(num_dofs(p))
+    assert np.sum(subdomains.energies(u)) == pytest.approx(u @ applied(p, u), rel=1e-12)
+
+
+def test_kernel_motions_cost_nothing(scene):
+    p, subdomains = scene
+    alpha = random(subdomains.kernel_size)
+    motion = subdomains.kernel_motion(alpha)
+    assert np.abs(applied(p, motion)).max(initial=0.0) <= 1e-12
+    assert np.allclose(subdomains.kernel_rows @ alpha, motion[subdomains.trace], atol=1e-14)
+    f = p.dofs.to_primal(p._system.forms.load())
+    assert subdomains.kernel_load @ alpha == pytest.approx(f @ motion, abs=1e-13)
+
+
+def test_the_local_operator_and_recovery_are_one_generalised_inverse(scene):
+    _, subdomains = scene
+    w = random(len(subdomains.trace))
+    out = np.full_like(w, np.nan)
+    operator = local_operator(subdomains.blocks, "pinv")
+    operator.prepare()
+    operator.mult(w, out)
+    u = subdomains.pinv_load - subdomains.recover(w)
+    assert np.allclose(u[subdomains.trace], out, atol=1e-12 * np.abs(out).max(initial=0.0))
+
+
+@pytest.mark.parametrize("kind", ["stiffness", "schur"])
+def test_local_operators_measure_the_energy_of_trace_vectors(scene, kind):
+    """wᵀK_bb w is that of w without the inside, wᵀSw the least of all insides."""
+    p, subdomains = scene
+    w, u = random(len(subdomains.trace)), np.zeros(num_dofs(p))
+    out, operator = np.empty_like(w), local_operator(subdomains.blocks, kind)
+    operator.prepare()
+    operator.mult(w, out)
+    u[subdomains.trace] = w
+    energy = u @ applied(p, u)
+    if kind == "stiffness":
+        assert w @ out == pytest.approx(energy, rel=1e-12)
+    else:
+        assert -1e-12 * energy <= w @ out <= energy * (1 + 1e-12)
+
+
+def test_motions_of_bodies(scene):
+    """Moments of C a are the metric times a; a kernel that holds C has all of it inside."""
+    _, subdomains = scene
+    amounts = np.random.default_rng(3).standard_normal((2, subdomains.num_modes))
+    motion = subdomains.modes_motion(amounts)
+    expected = np.einsum("bij,bj->bi", subdomains.modes_metric(), amounts)
+    assert np.allclose(subdomains.moments(motion), expected, rtol=1e-12)
+    alpha = subdomains.modes_in_kernel @ amounts.ravel()
+    assert np.allclose(subdomains.kernel_motion(alpha), motion, atol=1e-12)
+    assert np.abs(subdomains.modes_outside()).max() <= 1e-12
+
+
+def test_sums_and_maxima_by_bodies(scene):
+    p, subdomains = scene
+    u, parts = random(num_dofs(p)), subdomains.dof_parts
+    body = p.decomposition.body_of_subdomain[p.dofs.node_subdomain].repeat(p.dofs.bs)
+    comm = p.decomposition.comm
+    for b in range(2):
+        own = u[body == b]
+        largest = comm.allreduce(np.abs(own).max(initial=0.0), op=MPI.MAX)
+        assert subdomains.body_maxima([sizes(u, parts)])[0, b] == largest
+        total = comm.allreduce(own.sum())
+        assert subdomains.body_sums([sums(u, parts)])[0, b] == pytest.approx(total, abs=1e-12)
+    f = p.dofs.to_primal(p._system.forms.load())
+    norms = [np.sqrt(comm.allreduce(f[body == b] @ f[body == b])) for b in range(2)]
+    assert np.allclose(subdomains.load_norms(), norms, rtol=1e-12)
+
+
+def test_a_new_load_costs_a_solve_and_a_new_stiffness_a_factor(scene):
+    p, subdomains = scene
+    counters, count, f = (
+        subdomains.counters,
+        len(subdomains.blocks),
+        p.dofs.to_primal(p._system.forms.load()),
+    )
+    before = subdomains.pinv_load.copy()
+    start = counters.factorizations, counters.analyses, counters.load_solves
+    subdomains.update(f=2 * f)
+    assert np.allclose(subdomains.pinv_load, 2 * before)
+    subdomains.pinv_load  # noqa: B018  made once
+    now = counters.factorizations, counters.analyses, counters.load_solves
+    assert now == (start[0], start[1], start[2] + count)
+    K = p._system.forms.stiffness()
+    subdomains.update(K=list(submatrices(p.dofs, 2 * K)))
+    assert np.allclose(subdomains.pinv_load, before)
+    now = counters.factorizations, counters.analyses, counters.load_solves
+    assert now == (start[0] + count, start[1], start[2] + 2 * count)
+    subdomains.update(K=list(submatrices(p.dofs, K)), f=f)
+    assert np.allclose(subdomains.pinv_load, before)
+
+
+def test_a_new_trace_leaves_the_factors_alone(scene):
+    p, subdomains = scene
+    old, made = subdomains.trace, subdomains.counters.factorizations
+    subdomains.retrace(old[::2])
+    assert np.array_equal(subdomains.trace, old[::2])
+    diagonal = p.dofs.to_primal(p._system.forms.stiffness().diagonal())
+    assert np.allclose(subdomains.diagonal, diagonal[old[::2]], rtol=1e-14)
+    subdomains.retrace(old)
+    assert subdomains.counters.factorizations == made

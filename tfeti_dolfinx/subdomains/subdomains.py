@@ -1,0 +1,242 @@
+"""All subdomains of a rank as one: what the dual asks of Blocks, on arrays of the rank."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+from scipy.sparse import coo_array, csr_array
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.errors import raised_on_all_ranks
+from tfeti_dolfinx.subdomains.block import Block
+from tfeti_dolfinx.subdomains.data import Counters
+from tfeti_dolfinx.subdomains.local import joined, parts_of
+
+
+class Subdomains:
+    """The Blocks of a rank, one after the other.
+
+    n, t and r are sums over this rank's Blocks: of their unknowns, of their trace unknowns and of
+    the dimensions of their kernels; b is the number of bodies of all ranks and k that of
+    candidate modes of each. A rank may have no Block.
+
+    Args:
+        blocks: This rank's Blocks.
+        body_of_block: Body of each.
+        num_bodies: Number of bodies of all ranks.
+        comm: Communicator. The constructor is collective, and what its docstring calls so.
+        counters: Counts solves.
+
+    Attributes:
+        num_modes: k.
+        trace: Trace unknowns among this rank's, ascending, shape ``(t,)``.
+        trace_parts: Where the trace unknowns of each Block lie among the t.
+        dof_parts: Where the unknowns of each Block lie among the n.
+    """
+
+    def __init__(
+        self,
+        blocks: Sequence[Block],
+        body_of_block: Array,
+        num_bodies: int,
+        comm: MPI.Intracomm,
+        counters: Counters | None = None,
+    ) -> None:
+        self.blocks, self.body_of_block = list(blocks), body_of_block
+        self.num_bodies, self.comm = num_bodies, comm
+        self.counters = Counters() if counters is None else counters
+        own = max((block.modes.shape[1] for block in self.blocks), default=0)
+        self.num_modes = int(comm.allreduce(own, op=MPI.MAX))
+        self.dof_parts = parts_of([len(block.load) for block in self.blocks])
+        self._read_trace()
+        self._pinv_load: Array | None = None
+
+    def _read_trace(self) -> None:
+        traces = [block.trace_dofs for block in self.blocks]
+        self.trace_parts = parts_of([len(dofs) for dofs in traces])
+        shifted = [part.start + dofs for part, dofs in zip(self.dof_parts, traces, strict=True)]
+        self.trace = joined(shifted).astype(np.int64)
+        self.diagonal = joined([block.diagonal[block.trace_dofs] for block in self.blocks])
+
+    def retrace(self, trace: Array) -> None:
+        """Other rows act on the subdomains, on these trace unknowns of the rank, ascending."""
+        for block, part in zip(self.blocks, self.dof_parts, strict=True):
+            first, last = np.searchsorted(trace, (part.start, part.stop))
+            block.retrace(trace[first:last] - part.start)
+        self._read_trace()
+
+    def update(self, K: Sequence[Any] | None = None, f: Array | None = None) -> None:
+        """Replace the stiffness of each Block, or the load, shape ``(n,)``. Collective.
+
+        Raises:
+            InputError: They do not fit.
+            FactorError: A factor could not be made.
+        """
+        self._pinv_load = None
+        with raised_on_all_ranks(self.comm):
+            for i, (block, part) in enumerate(zip(self.blocks, self.dof_parts, strict=True)):
+                block.update(None if K is None else K[i], None if f is None else f[part])
+        self._read_trace()
+
+    def destroy(self) -> None:
+        """Free the factors of the Blocks."""
+        for block in self.blocks:
+            block.destroy()
+
+    # ------------------------------------------------------------------ kernels
+
+    @property
+    def kernel_parts(self) -> list[slice]:
+        """Where the kernel coordinates of each Block lie among the r."""
+        return parts_of([block.kernel.shape[1] for block in self.blocks])
+
+    @property
+    def kernel_size(self) -> int:
+        """r."""
+        return sum(block.kernel.shape[1] for block in self.blocks)
+
+    @property
+    def kernel_rows(self) -> csr_array:
+        """R on the trace, shape ``(t, r)``."""
+        parts = [block.kernel[block.trace_dofs] for block in self.blocks]
+        rows = [part.start for part in self.trace_parts]
+        columns = [part.start for part in self.kernel_parts]
+        return _assembled(parts, rows, columns, (len(self.trace), self.kernel_size))
+
+    @property
+    def kernel_load(self) -> Array:
+        """Rᵀ f, shape ``(r,)``."""
+        return joined([block.kernel.T @ block.load for block in self.blocks])
+
+    def kernel_motion(self, alpha: Array) -> Array:
+        """R α on all unknowns, shape ``(n,)``, for α of shape ``(r,)``."""
+        pairs = zip(self.blocks, self.kernel_parts, strict=True)
+        return joined([block.kernel @ alpha[part] for block, part in pairs])
+
+    # ------------------------------------------------------------------- bodies
+
+    @property
+    def modes_in_kernel(self) -> csr_array:
+        """Rᵀ C, C the candidate modes of all bodies, shape ``(r, b * k)``."""
+        parts = [block.kernel.T @ block.modes for block in self.blocks]
+        rows = [part.start for part in self.kernel_parts]
+        columns = [self.num_modes * int(body) for body in self.body_of_block]
+        shape = (self.kernel_size, self.num_bodies * self.num_modes)
+        return _assembled(parts, rows, columns, shape)
+
+    def modes_outside(self) -> Array:
+        """Σ Cᵀ(I − R Rᵀ)C / tr CᵀC over the Blocks of a body, shape ``(b, k, k)``. Collective.
+
+        What springs hold of the modes lies outside the kernels.
+        """
+        return self._summed(_outside)
+
+    def modes_metric(self) -> Array:
+        """Cᵀ W C of each body, W the shares, shape ``(b, k, k)``. Collective."""
+
+        def metric(block: Block) -> Array:
+            modes = block.modes
+            return np.asarray(modes.T @ (block.shares[:, None] * modes))
+
+        return self._summed(metric)
+
+    def moments(self, u: Array) -> Array:
+        """Cᵀ W u of each body, shape ``(b, k)``, u on all unknowns. Collective."""
+        total = np.zeros((self.num_bodies, self.num_modes))
+        for block, part, body in zip(self.blocks, self.dof_parts, self.body_of_block, strict=True):
+            total[body] += block.modes.T @ (block.shares * u[part])
+        self.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
+        return total
+
+    def modes_motion(self, amounts: Array) -> Array:
+        """C times amounts of each body's modes, of shape ``(b, k)``, shape ``(n,)``."""
+        pairs = zip(self.blocks, self.body_of_block, strict=True)
+        return joined([block.modes @ amounts[body] for block, body in pairs])
+
+    def load_norms(self) -> Array:
+        """‖f‖ of each body, shape ``(b,)``. Collective."""
+        squares = [float(np.linalg.norm(block.load)) ** 2 for block in self.blocks]
+        return np.sqrt(self.body_sums([squares])[0])
+
+    def body_sums(self, values: Sequence[Sequence[float]]) -> Array:
+        """Sums over the Blocks of each body, shape ``(q, b)``, of q values each. Collective."""
+        total = np.zeros((len(values), self.num_bodies))
+        np.add.at(total.T, self.body_of_block, np.array(values, dtype=float).T)
+        self.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
+        return total
+
+    def body_maxima(self, values: Sequence[Sequence[float]]) -> Array:
+        """Largest over the Blocks of each body, at least 0, as in ``body_sums``. Collective."""
+        largest = np.zeros((len(values), self.num_bodies))
+        np.maximum.at(largest.T, self.body_of_block, np.array(values, dtype=float).T)
+        self.comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
+        return largest
+
+    # ------------------------------------------------------------ displacements
+
+    def recover(self, w: Array) -> Array:
+        """K⁺(f − w) on all unknowns, shape ``(n,)``; w on the trace, shape ``(t,)``."""
+        force = np.zeros(self.dof_parts[-1].stop if self.dof_parts else 0)
+        force[self.trace] = w
+        return self.pinv_load - self._solved(force)
+
+    @property
+    def pinv_load(self) -> Array:
+        """K⁺ f on all unknowns, shape ``(n,)``; solved for once."""
+        if self._pinv_load is None:
+            self.counters.load_solves += len(self.blocks)
+            self._pinv_load = self._solved(joined([block.load for block in self.blocks]))
+        return self._pinv_load
+
+    def energies(self, u: Array) -> list[float]:
+        """uᵀKu of each Block."""
+        pairs = zip(self.blocks, self.dof_parts, strict=True)
+        return [float(u[part] @ block.multiply(u[part])) for block, part in pairs]
+
+    def _solved(self, b: Array) -> Array:
+        pairs = zip(self.blocks, self.dof_parts, strict=True)
+        return joined([block.solve(b[part]) for block, part in pairs])
+
+    def _summed(self, matrix: Callable[[Block], Array]) -> Array:
+        """k × k matrices of the Blocks, summed by bodies. Collective."""
+        total = np.zeros((self.num_bodies, self.num_modes, self.num_modes))
+        for block, body in zip(self.blocks, self.body_of_block, strict=True):
+            total[body] += matrix(block)
+        self.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
+        return total
+
+
+def sums(x: Array, parts: Sequence[slice]) -> list[float]:
+    """Sum over each part of an array."""
+    return [float(x[part].sum()) for part in parts]
+
+
+def sizes(x: Array, parts: Sequence[slice]) -> list[float]:
+    """Largest modulus in each part of an array, 0 where that is empty."""
+    return [float(np.max(np.abs(x[part]), initial=0.0)) for part in parts]
+
+
+def _outside(block: Block) -> Array:
+    """Cᵀ(I − R Rᵀ)C over the trace of CᵀC."""
+    modes, R = block.modes, block.kernel
+    inside = R.T @ modes
+    rest = modes - R @ inside
+    gram = rest.T @ rest
+    whole = float(np.trace(inside.T @ inside + gram))
+    return np.asarray(gram / (whole or 1.0))
+
+
+def _assembled(
+    parts: Sequence[Array], rows: Sequence[int], columns: Sequence[int], shape: tuple[int, int]
+) -> csr_array:
+    """Dense parts at these first rows and columns of a sparse matrix."""
+    places, values = [np.empty((2, 0), dtype=np.int64)], []
+    for part, row, column in zip(parts, rows, columns, strict=True):
+        i, j = np.indices(part.shape)
+        places.append(np.stack(((row + i).ravel(), (column + j).ravel())))
+        values.append(part.ravel())
+    row_of, column_of = np.concatenate(places, axis=1)
+    return csr_array(coo_array((joined(values), (row_of, column_of)), shape=shape))
