@@ -127,8 +127,8 @@ def test_the_whole_face_is_no_face(dual):
 
 
 @pytest.mark.parametrize("kind", list(FACES))
-def test_the_particular_solution_of_a_face_is_its_best(dual, kind):
-    """Gλ = e where the face can, with rows of the face alone; else the residual is orthogonal."""
+def test_the_particular_solution_of_a_face(dual, kind):
+    """It has rows of the face alone, and Gλ = e where the face holds all bodies."""
     face = FACES[kind](dual)
     coarse, lam = dual.coarse.on_face(face), dual.d.duplicate()
     coarse.particular(lam)
@@ -136,7 +136,7 @@ def test_the_particular_solution_of_a_face_is_its_best(dual, kind):
     left = dual.coarse.e - dual.coarse.G(lam.array_r)
     Gt = gathered(dual, face.restricted(dual.coarse.Gt.toarray()))
     rank = np.linalg.matrix_rank(Gt, tol=1e-9 * np.linalg.norm(Gt, 2))
-    if rank == dual.coarse.dimension - dual.coarse.free_modes:
+    if rank == dual.coarse.dimension - dual.coarse.free_motions.count:
         assert np.linalg.norm(left) <= 1e-9 * np.linalg.norm(dual.coarse.e)
     coarse.destroy()
 
@@ -145,7 +145,7 @@ def test_some_faces_lack_rank(dual):
     """The tests above are about them, too."""
     Gt = gathered(dual, FACES["open"](dual).restricted(dual.coarse.Gt.toarray()))
     rank = np.linalg.matrix_rank(Gt, tol=1e-9 * np.linalg.norm(Gt, 2))
-    assert rank < dual.coarse.dimension - dual.coarse.free_modes
+    assert rank < dual.coarse.dimension - dual.coarse.free_motions.count
 
 
 def test_factors_of_faces_are_counted_apart(dual):
