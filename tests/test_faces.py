@@ -127,8 +127,8 @@ def test_the_whole_face_is_no_face(dual):
 
 
 @pytest.mark.parametrize("kind", list(FACES))
-def test_the_particular_solution_of_a_face_is_its_best(dual, kind):
-    """Gλ = e where the face can, with rows of the face alone; else the residual is orthogonal."""
+def test_the_particular_solution_of_a_face(dual, kind):
+    """It has rows of the face alone, and Gλ = e where the face holds all bodies."""
     face = FACES[kind](dual)
     coarse, lam = dual.coarse.on_face(face), dual.d.duplicate()
     coarse.particular(lam)

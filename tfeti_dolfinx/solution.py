@@ -72,6 +72,7 @@ class Solution:
     Attributes:
         u: Displacement in primal order.
         lam: Multipliers of this rank's rows.
+        carrying: Flags of the rows that carry a force.
         contacts: The contacts with their sides decided: ``contacts[i].surfaces[0]`` has the
             multipliers and the pressure.
     """

@@ -10,6 +10,7 @@ from petsc4py import PETSc
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.parallel import agreed
+from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Product
 from tfeti_dolfinx.qp.homogenised import natural
 
 # far more than Newton takes where it converges, so that a cycle ends
@@ -40,24 +41,23 @@ def feasible_particular(coarse: CoarseSpace, bounded: Array) -> Array:
     Returns:
         This rank's part of λ̄.
     """
-    carrying = np.ones(coarse.Gt.shape[0], dtype=bool)
+    feasible = Product([(bounded, Bounds())])
     alpha = start = coarse.solve(coarse.e)
     for _ in range(MAX_STEPS):
-        force = coarse.Gt @ alpha
-        carrying[bounded] = force[bounded] > 0.0
-        residual = coarse.e - coarse.G(np.where(carrying, force, 0.0))
+        force = feasible.project(coarse.Gt @ alpha)
+        residual = coarse.e - coarse.G(force)
         left = float(np.linalg.norm(residual))
         if agreed(coarse.comm, left <= BALANCED * float(np.linalg.norm(coarse.e))):
-            return np.where(carrying, force, 0.0)
-        factor = coarse.damped_factor(carrying, DAMPING)
+            return force
+        factor = coarse.damped_factor(feasible.face(force, force).carrying, DAMPING)
         step = factor.solve(residual)
         factor.destroy()
-        length = _damping(coarse, bounded, alpha, step)
+        length = _damping(coarse, feasible, alpha, step)
         if length <= SHORTEST:
             break
         alpha = alpha + length * step
     if agreed(coarse.comm, left <= LET_PASS * float(np.linalg.norm(coarse.e))):
-        return np.where(carrying, force, 0.0)
+        return force
     if coarse.comm.rank == 0:
         log.warning(
             "homogenization feasible: the smallest feasible multipliers were not found (Gλ − e "
@@ -67,12 +67,11 @@ def feasible_particular(coarse: CoarseSpace, bounded: Array) -> Array:
     return np.asarray(coarse.Gt @ start)
 
 
-def _damping(coarse: CoarseSpace, bounded: Array, alpha: Array, step: Array) -> float:
+def _damping(coarse: CoarseSpace, feasible: FeasibleSet, alpha: Array, step: Array) -> float:
     """Step length that does not raise ½‖λ(α)‖² − αᵀe."""
 
     def cost(alpha: Array) -> float:
-        force = coarse.Gt @ alpha
-        force[bounded] = np.maximum(force[bounded], 0.0)
+        force = feasible.project(coarse.Gt @ alpha)
         return 0.5 * float(coarse.comm.allreduce(float(force @ force))) - float(alpha @ coarse.e)
 
     start, length = cost(alpha), 1.0

@@ -50,7 +50,7 @@ class Projectors:
         return np.asarray(y)
 
     def solve(self, y: Array) -> Array:
-        """(GGᵀ)⁺ y for y in the range of G, orthogonal to the free modes."""
+        """(GGᵀ)⁺ y for y in the range of G, orthogonal to the free motions."""
         return self._factor.solve(y)
 
     def restricted(self, x: Array) -> Array:

@@ -31,7 +31,7 @@ class Coarse(Protocol):
         ...
 
     def particular(self, x: PETSc.Vec) -> None:
-        """x = Z G_fᵀ(G_f G_fᵀ)⁺e, the smallest λ in the face that fulfils Gλ = e. Collective."""
+        """x = Z G_fᵀ(G_f G_fᵀ)⁺e, the smallest Gλ = e of the face, if it has one. Collective."""
         ...
 
     def coordinates(self, x: PETSc.Vec) -> Array:
