@@ -18,7 +18,7 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facet_maps import hat_areas, whole_facets
-from tfeti_dolfinx.mortar.facets import Facets, facet_kind, local_facets
+from tfeti_dolfinx.mortar.facets import FacetKind, Facets, facet_kind, local_facets
 from tfeti_dolfinx.mortar.integrals import dual_multipliers
 from tfeti_dolfinx.mortar.surfaces import (
     diameter,
@@ -125,20 +125,10 @@ class Obstacle:
         kind, surface = facet_kind(dofs), local_facets(dofs, decomposition, facets)
         self._check_placement(surface, kind.num_vertices, dofs, decomposition)
         self._check_side(surface, kind.num_vertices, dofs)
-        facet, xi, weight = whole_facets(kind, surface, QUADRATURE * kind.displacement.degree)
-        dual = dual_multipliers(kind, surface.area, facet, xi, weight)
         distance, normals = self._at_groups(dofs, on_surface(dofs, decomposition, facets))
         vertices = surface.groups[:, : kind.num_vertices]
         side = Side(surface, vertices, hat_areas(kind, surface), normals)
-        (at_vertices,) = dofs.lookup(vertices[dual.facet].ravel(), distance)
-        own = dual.integrals(kind.displacement.values(xi))
-        shares = Shares(
-            vertices=vertices[dual.facet],
-            covered=dual.covered,
-            gap=at_vertices.reshape(dual.covered.shape) * dual.covered,
-            entries=(triplets(vertices[dual.facet], surface.groups[dual.facet], own),),
-        )
-        found = conditions(dofs, contact, side, shares)
+        found = conditions(dofs, contact, side, _shares(dofs, kind, side, distance))
         gap = self.gaps(dofs, found)
         return replace(found, gap=gap, within_reach=gap <= reach)
 
@@ -199,3 +189,19 @@ class Obstacle:
                 f"{x[wrong][0].tolist()}: distance {gap[wrong][0]}, gradient {gradient[wrong][0]}"
             )
         return gap / length, -gradient / length[:, None]
+
+
+def _shares(dofs: TornDofs, kind: FacetKind, side: Side, distance: Array) -> Shares:
+    """What whole facets contribute, from the distances of the owned groups. Collective."""
+    surface = side.facets
+    facet, xi, weight = whole_facets(kind, surface, QUADRATURE * kind.displacement.degree)
+    dual = dual_multipliers(kind, surface.area, facet, xi, weight)
+    vertices = side.vertices[dual.facet]
+    (at_vertices,) = dofs.lookup(vertices.ravel(), distance)
+    own = dual.integrals(kind.displacement.values(xi))
+    return Shares(
+        vertices=vertices,
+        covered=dual.covered,
+        gap=at_vertices.reshape(dual.covered.shape) * dual.covered,
+        entries=(triplets(vertices, surface.groups[dual.facet], own),),
+    )
