@@ -11,6 +11,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.dual.closing import closing
 from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.dual.operator import trace_slices
 from tfeti_dolfinx.gluing.constraints import Constraints
@@ -97,8 +98,8 @@ def measure(
     """Recover the displacement of an iterate and see how well it fulfils the rows. Collective.
 
     Rows miss w = Bu − c: rows of equalities and those that carry a force both ways, others
-    where they overlap. v = D⁻¹Bᵀw closes that (rows are orthonormal in D⁻¹), and u + v is
-    admissible; so ‖v‖_K bounds the error of u in energy, as far as λ balances the load.
+    where they overlap. v, the least displacement in D that closes that, makes u + v admissible;
+    so ‖v‖_K bounds the error of u in energy, as far as λ balances the load.
 
     Args:
         scene: The dual problem.
@@ -109,13 +110,11 @@ def measure(
     """
     u = scene.recover(lam, gradient, error)
     w, penetration = _missed(scene, u)
-    v = scene.constraints.B.createVecRight()
-    scene.constraints.B.multTranspose(w, v)
-    residual = w.norm()
-    bodies = _bodies(scene, u, v.array_r / scene.constraints.weights, before)
+    residual, bounded = w.norm(), scene.constraints.inequalities
+    closed = scene.carrying[bounded] | (w.array_r[bounded] > 0.0)
+    bodies = _bodies(scene, u, closing(scene.constraints, w, closed), before)
     balance, forces = _balance(scene.coarse, lam)
-    for vec in (w, v):
-        vec.destroy()
+    w.destroy()
     return Measures(u, bodies, penetration, balance, forces, residual)
 
 

@@ -16,6 +16,8 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import group_points
 
 NOTHING_LEFT = 1e-10
+# of what rounding makes of a condition's coefficients, and of lengths: errors of several add up
+SEVERAL, EPSILON = 10.0, 2.2e-16
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,8 @@ def inequality_rows(
     A coefficient a becomes a·w/Σw on each torn copy, w its weight in D (a/k on k copies of equal
     weight): so the rows are orthogonal to the gluing rows in the inner product of D⁻¹.
     Prescribed components move to the right side. Then the whole row is scaled to unit norm by
-    one number s_i. If less than 1e-10 of it remains, it is dropped.
+    one number s_i. If less than 1e-10 of it remains, or than what rounding makes of it, it is
+    dropped.
 
     Args:
         dofs: Dof maps.
@@ -71,9 +74,9 @@ def inequality_rows(
     rhs = records.gap - sum_rows(records.row, held, len(records))
     free = np.where(flag, 0.0, records.coefficients)
     before, after = squared_norms(records.coefficients), squared_norms(free)
-    kept = records.near & (after > NOTHING_LEFT**2 * before)
-    decided = records.near & ~kept
     points = group_points(dofs)
+    kept = records.near & (after > _nothing_left(records, points) ** 2 * before)
+    decided = records.near & ~kept
     with raised_on_all_ranks(dofs.comm):
         _check_dropped(rhs[decided], length)
         check_consistent(records, free, rhs, kept, points, length)
@@ -85,6 +88,19 @@ def inequality_rows(
         scale=scale,
         dropped=int(np.sum(decided)),
     )
+
+
+def _nothing_left(records: ContactRecords, points: Array) -> Array:
+    """Share of a condition that is rounding, shape ``(n,)``.
+
+    The normal of a facet of size h at x is exact to ε|x|/h, and so is a place on it. At a distance
+    g the normal points that much times g beside the place that it should point to.
+    """
+    x = np.abs(points[records.group]).max(axis=1, initial=0.0)
+    h = records.area ** (1.0 / max(records.normal.shape[1] - 1, 1))
+    g = np.abs(records.gap)
+    error = EPSILON * (x * (1.0 + g / h) + g) / h
+    return np.maximum(NOTHING_LEFT, SEVERAL * error)
 
 
 def _check_dropped(rhs: Array, length: float) -> None:
