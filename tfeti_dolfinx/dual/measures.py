@@ -73,6 +73,7 @@ class Measures:
         balance: Force left on a kernel mode, where it is largest beside the forces there.
         forces: Size of these forces.
         residual: Norm of what rows miss.
+        gap: Largest gap of a contact row, or overlap.
     """
 
     u: list[Array]
@@ -81,6 +82,7 @@ class Measures:
     balance: float
     forces: float
     residual: float
+    gap: float
 
     @property
     def error(self) -> float:
@@ -109,17 +111,17 @@ def measure(
         before: Displacements of an earlier iterate.
     """
     u = scene.recover(lam, gradient, error)
-    w, penetration = _missed(scene, u)
+    w, penetration, gap = _missed(scene, u)
     residual, bounded = w.norm(), scene.constraints.inequalities
     closed = scene.carrying[bounded] | (w.array_r[bounded] > 0.0)
     bodies = _bodies(scene, u, closing(scene.constraints, w, closed), before)
     balance, forces = _balance(scene.coarse, lam)
     w.destroy()
-    return Measures(u, bodies, penetration, balance, forces, residual)
+    return Measures(u, bodies, penetration, balance, forces, residual, gap)
 
 
-def _missed(scene: Scene, u: list[Array]) -> tuple[PETSc.Vec, float]:
-    """w, and the largest of its inequality rows as a length."""
+def _missed(scene: Scene, u: list[Array]) -> tuple[PETSc.Vec, float, float]:
+    """w, and as lengths the largest of its inequality rows and the largest of their gaps."""
     constraints = scene.constraints
     trace, w = constraints.B.createVecRight(), constraints.c.duplicate()
     for block, part, u_s in zip(scene.blocks, trace_slices(scene.blocks), u, strict=True):
@@ -129,10 +131,11 @@ def _missed(scene: Scene, u: list[Array]) -> tuple[PETSc.Vec, float]:
     bounded = constraints.inequalities
     rows = w.array[bounded]
     rows[:] = np.where(scene.carrying[bounded], rows, np.maximum(rows, 0.0))
-    lengths = np.abs(rows) / constraints.scale
+    lengths = np.abs((rows, constraints.c.array_r[bounded])) / constraints.scale
     trace.destroy()
-    deepest = float(np.max(lengths, initial=0.0))
-    return w, float(w.getComm().tompi4py().allreduce(deepest, op=MPI.MAX))
+    largest = np.max(lengths, axis=1, initial=0.0)
+    w.getComm().tompi4py().Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
+    return w, float(largest[0]), float(largest[1])
 
 
 def _bodies(scene: Scene, u: list[Array], v: Array, before: Sequence[Array] | None) -> BodyMeasures:
