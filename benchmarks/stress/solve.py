@@ -20,6 +20,7 @@ ROUNDING = 1e-9
 WRONG = 1e-7  # relative residual of the reference
 EPSILON = 2.2e-16
 STEPS = 20  # of conjugate gradients on the forces
+HELD = 1e-14  # of a row's terms: what it is missed by
 
 
 def null_space(A: np.ndarray) -> np.ndarray:
@@ -155,10 +156,10 @@ def touching(
         return x
 
     u, force = np.zeros(len(f)), np.zeros(len(row))
-    for _ in range(8):
+    for k in range(8):
         u += inverse(f - K @ u - A.T @ (force + penalty * (A @ u - gap[active])))
         force = force + penalty * (A @ u - gap[active])
-        if _ < 6:
+        if k < 4:  # the last steps leave what rounding has made of the forces behind
             force, u = close(A, gap[active], inverse, np.sqrt(penalty), force, u)
     lam[active] = force
     return u, lam
@@ -178,8 +179,9 @@ def close(
     """
     r = root * (A @ u - gap)
     p, left = r, r @ r
+    rounding = HELD * np.linalg.norm(root * (abs(A) @ np.abs(u)))
     for _ in range(STEPS):
-        if left == 0.0:
+        if left <= rounding**2:
             break
         v = inverse(A.T @ (root * p))
         q = root * (A @ v)
