@@ -150,6 +150,7 @@ def touching(
     scale = 1.0 / np.sqrt(M.diagonal()[rest])
     scaled = csr_array(M[rest][:, rest].multiply(scale[:, None]).multiply(scale))
     factor = splu(scaled.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+
     def inverse(b: np.ndarray) -> np.ndarray:
         x = np.zeros(len(b))
         x[rest] = scale * factor.solve(scale * b[rest])
