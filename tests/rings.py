@@ -8,7 +8,7 @@ import tfeti_dolfinx as tfeti
 INNER, MIDDLE, OUTER = 0.5, 1.0, 1.6
 
 
-def rings(comm, cells, order=1, overlap=0.0, turn=0.1, subdomains=4):
+def rings(comm, cells, order=1, overlap=0.0, turn=0.1, subdomains=4, triangles=False):
     """Two rings with their contact at the radius 1.
 
     Args:
@@ -18,6 +18,7 @@ def rings(comm, cells, order=1, overlap=0.0, turn=0.1, subdomains=4):
         overlap: How much larger the shaft's radius is than the hub's.
         turn: Angle between the meshes.
         subdomains: Their number.
+        triangles: Halves of the quadrilaterals instead of them.
 
     Returns:
         The torn mesh, with surfaces "bore", "shaft", "hub", "rim".
@@ -28,8 +29,8 @@ def rings(comm, cells, order=1, overlap=0.0, turn=0.1, subdomains=4):
         gmsh.option.setNumber("General.Terminal", 0)
         gmsh.model.add("rings")
         shaft, hub = MIDDLE + overlap / 2, MIDDLE - overlap / 2
-        _ring("inner", {"bore": INNER, "shaft": shaft}, cells[0], 0.0)
-        _ring("outer", {"hub": hub, "rim": OUTER}, cells[1], turn)
+        _ring("inner", {"bore": INNER, "shaft": shaft}, cells[0], 0.0, triangles)
+        _ring("outer", {"hub": hub, "rim": OUTER}, cells[1], turn, triangles)
         gmsh.option.setNumber("Mesh.ElementOrder", order)
         gmsh.model.mesh.generate(2)
     d = tfeti.read_gmsh(gmsh.model if comm.rank == 0 else None, comm, subdomains)
@@ -39,8 +40,8 @@ def rings(comm, cells, order=1, overlap=0.0, turn=0.1, subdomains=4):
     return d
 
 
-def _ring(name, radii, cells, turn):
-    """Quarters of structured quadrilaterals, as square as they can be."""
+def _ring(name, radii, cells, turn, triangles):
+    """Quarters of a structured mesh, as square as it can be."""
     geo = gmsh.model.geo
     centre = geo.addPoint(0, 0, 0)
     angles = turn + np.arange(4) * np.pi / 2
@@ -58,7 +59,8 @@ def _ring(name, radii, cells, turn):
         for arc in arcs:
             geo.mesh.setTransfiniteCurve(arc[k], cells // 4 + 1)
         geo.mesh.setTransfiniteSurface(quarters[k])
-        geo.mesh.setRecombine(2, quarters[k])
+        if not triangles:
+            geo.mesh.setRecombine(2, quarters[k])
     geo.synchronize()
     gmsh.model.addPhysicalGroup(2, quarters, name=name)
     for surface, arc in zip(radii, arcs, strict=True):

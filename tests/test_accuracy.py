@@ -3,14 +3,17 @@
 import numpy as np
 import pytest
 import ufl
+from bodies import held, sided, stacked, two_body_problem
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import clamp, gathered, strain
+from scenes import clamp, gathered, hooke, strain
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import spsolve
+from test_mortar_cases import no_load
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.dual.closing import closing
 
 
 def rectangle(cells, size, comm):
@@ -149,3 +152,37 @@ def test_rounding_is_called_so():
     with pytest.raises(tfeti.ConvergenceError, match="DIVERGED_ROUNDING.*rounding does not let"):
         p.solve()
     assert p.report.converged_reason == "DIVERGED_ROUNDING"
+
+
+@pytest.mark.parametrize("stiffness", [1.0, 1e7])
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_what_rows_miss_is_closed_by_the_least_displacement(cell, stiffness):
+    """Also where the fine side is stiff: its rows act on the other side's few soft nodes."""
+    d = stacked(cell, 2, 5)
+    height = ufl.SpatialCoordinate(d.mesh)[d.mesh.geometry.dim - 1]
+    stress = hooke(ufl.conditional(ufl.gt(height, 0.0), stiffness, 1.0))
+    bcs = held(d, "lower bottom", "upper top")
+    p = two_body_problem(d, no_load, bcs, [sided("upper bottom", "lower top")], stress=stress)
+    p.solve()
+    rows = p.solution.gluing.constraints
+    w, missed, v = rows.c.duplicate(), rows.c.duplicate(), rows.B.createVecRight()
+    rng = np.random.default_rng(MPI.COMM_WORLD.rank)
+    w.array[:] = rng.standard_normal(rows.num_rows)
+    closed = rng.random(len(rows.sets.normals)) < 0.8
+    w.array[rows.sets.normals] *= closed
+    v.array[:] = closing(rows, w, closed)
+    rows.B.mult(v, missed)
+    asked = np.ones(rows.num_rows, dtype=bool)
+    asked[rows.sets.normals] = closed
+    assert np.allclose(missed.array_r[asked], w.array_r[asked], atol=1e-4)
+    # least in D: D v is in the range of B_fᵀ, so D-orthogonal to what closes nothing
+    other = v.duplicate()
+    other.array[:] = rng.standard_normal(len(other.array_r))
+    rows.B.mult(other, missed)
+    missed.array[~asked] = 0.0
+    nothing = other.array_r - closing(rows, missed, closed)
+    product = MPI.COMM_WORLD.allreduce(nothing @ (rows.weights * v.array_r))
+    size = MPI.COMM_WORLD.allreduce(np.abs(nothing) @ np.abs(rows.weights * v.array_r))
+    assert abs(product) <= 1e-4 * size
+    for vec in (w, missed, v, other):
+        vec.destroy()

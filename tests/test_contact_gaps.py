@@ -62,13 +62,69 @@ def test_bodies_that_only_touch_have_no_overlap(cell, curvatures, n, sides):
     assert gaps.min() > -1e-12
 
 
-def test_bodies_that_only_touch_do_not_push_each_other():
-    d = bent("triangle", 2, 16, 0.0, 0.4)
-    sides = ["lower bottom", "lower left", "upper left"]
-    p = two_body_problem(d, no_load, held(d, *sides), [sided(*ORDERS[1])])
+# what keeps both bodies where they are: sides without normal displacement, springs everywhere
+HOLDS = {
+    "loose": (("lower bottom",), 0.0),
+    "held": (("lower bottom", "upper top"), 0.0),
+    "springs": ((), 1e-3),
+}
+NO_PRESSURE = 1e-6  # of E, which is 1
+
+
+def unloaded(d, hold, contact, degree=1):
+    """Two bodies without load, the upper one free to fall, held, or both on springs."""
+    names, springs = HOLDS[hold]
+    across = ("left", "front")[: d.mesh.geometry.dim - 1]
+    names += tuple(f"{body} {side}" for body in ("lower", "upper") for side in across)
+    V = fem.functionspace(d.mesh, ("Lagrange", degree, (d.mesh.geometry.dim,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    dx = ufl.Measure("dx", domain=d.mesh, metadata={"quadrature_degree": 2 * degree})
+    spring = fem.Constant(d.mesh, springs)
+    a = ufl.inner(hooke()(u), strain(v)) * dx + spring * ufl.dot(u, v) * dx
+    return tfeti.ContactProblem(a, no_load(v, None), held(d, *names)(V), [contact], d)
+
+
+def check_at_rest(p):
     p.solve()
-    assert np.all(gathered(p.solution.contact().pressure) < 1e-9)
-    assert np.abs(p.u.x.array).max(initial=0.0) < 1e-9
+    assert p.report.contact_rows > 0
+    assert np.all(gathered(p.solution.contact().pressure) < NO_PRESSURE)
+    assert np.abs(gathered(p.u.x.array)).max() < NO_PRESSURE
+
+
+@pytest.mark.parametrize("hold", HOLDS)
+@pytest.mark.parametrize("sides", ORDERS)
+@pytest.mark.parametrize(
+    ("cell", "n", "curvatures"),
+    [
+        ("triangle", (2, 16), (0.025, 0.4)),
+        ("triangle", (16, 2), (-0.4, 0.0)),
+        ("quadrilateral", (3, 8), (-0.3, 0.3)),
+        ("tetrahedron", (1, 8), (0.0, 0.4)),
+        ("hexahedron", (8, 1), (-0.4, 0.0)),
+    ],
+)
+def test_bodies_that_only_touch_do_not_push_each_other(cell, n, curvatures, sides, hold):
+    """Mesh ratios 1/8 to 8, flat, convex and concave sides, either one secondary."""
+    check_at_rest(unloaded(bent(cell, *n, *curvatures), hold, sided(*sides, reach=0.5)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("hold", HOLDS)
+@pytest.mark.parametrize("sides", ORDERS)
+@pytest.mark.parametrize("n", [(2, 16), (16, 2), (3, 8)])
+@pytest.mark.parametrize("curvatures", [(0.0, 0.4), (-0.3, 0.3), (-0.4, 0.0), (0.025, 0.4)])
+@pytest.mark.parametrize("cell", CELLS)
+def test_no_bodies_that_only_touch_push_each_other(cell, curvatures, n, sides, hold):
+    if curvatures[0] > 0.0 and n[0] % 2:
+        pytest.skip("a chord of the concave side would cut into the other body")
+    check_at_rest(unloaded(bent(cell, *n, *curvatures), hold, sided(*sides, reach=0.5)))
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("sides", [("arc", "top"), ("top", "arc")])
+def test_a_disc_on_a_block_does_not_push_it(comm, sides, order):
+    d, bcs = disc_on_block(comm, 24, order, pushed=0.0)
+    check_at_rest(two_body_problem(d, no_load, bcs, [sided(*sides, reach=0.3)], degree=order))
 
 
 @pytest.mark.parametrize("sides", [("arc", "top"), ("top", "arc")])
@@ -104,9 +160,9 @@ def test_an_overhanging_wedge(cell, slope):
     assert np.allclose(gaps, np.maximum(expected, 0.0), rtol=1e-3, atol=1e-12)
 
 
-def ring_problem(cells, overlap, order=1, degree=1, **contact):
+def ring_problem(cells, overlap, order=1, degree=1, mesh=None, **contact):
     """The rings; weak springs hold them against motions that contact leaves free."""
-    d = rings(MPI.COMM_WORLD, cells, order, overlap)
+    d = rings(MPI.COMM_WORLD, cells, order, overlap, **(mesh or {}))
     V = fem.functionspace(d.mesh, ("Lagrange", degree, (2,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
     dx = ufl.Measure("dx", domain=d.mesh, metadata={"quadrature_degree": 2 * (degree + order) - 2})
@@ -119,26 +175,47 @@ def ring_problem(cells, overlap, order=1, degree=1, **contact):
 OVERLAP = MIDDLE / 1500
 
 
-@pytest.mark.parametrize("secondary", ["auto", "shaft", "hub"])
-@pytest.mark.parametrize(
-    ("cells", "order", "contact"),
-    [
-        ((48, 64), 1, {"gap": -OVERLAP}),
-        ((48, 64), 1, {"gap": lambda x: -OVERLAP * np.hypot(x[0], x[1])}),
-        ((40, 48), 2, {}),
-    ],
-    ids=["number", "function", "geometry"],
-)
-def test_a_ring_shrunk_on_another(cells, order, contact, secondary):
-    overlap = 0.0 if contact else OVERLAP
-    p = ring_problem(cells, overlap, order, order, secondary=secondary, **contact)
+def against_lame(p):
+    """Solve; relative error of the mean pressure, and of the pressure in L²."""
     p.solve()
     data, exact = p.solution.contact(), lame_pressure(OVERLAP)
     area, pressure = gathered(data.area), gathered(data.pressure)
-    mean = np.average(pressure, weights=area)
     error = np.sqrt(np.average((pressure - exact) ** 2, weights=area))
-    assert abs(mean / exact - 1) <= (0.005 if contact else 0.01)
-    assert error / exact <= (0.03 if contact else 0.05)
+    return np.average(pressure, weights=area) / exact - 1.0, error / exact
+
+
+@pytest.mark.parametrize("secondary", ["auto", "shaft", "hub"])
+@pytest.mark.parametrize(
+    ("cells", "order", "mesh", "contact"),
+    [
+        ((48, 64), 1, {}, {"gap": -OVERLAP}),
+        ((48, 64), 1, {}, {"gap": lambda x: -OVERLAP * np.hypot(x[0], x[1])}),
+        ((96, 128), 1, {"triangles": True}, {"gap": -OVERLAP}),
+        ((40, 48), 2, {}, {}),
+        ((40, 48), 2, {"triangles": True}, {}),
+    ],
+    ids=["number", "function", "triangles", "geometry", "geometry, triangles"],
+)
+def test_a_ring_shrunk_on_another(cells, order, mesh, contact, secondary):
+    overlap = 0.0 if contact else OVERLAP
+    p = ring_problem(cells, overlap, order, order, mesh, secondary=secondary, **contact)
+    mean, error = against_lame(p)
+    assert abs(mean) <= (0.005 if contact else 0.01)
+    assert error <= (0.03 if contact else 0.05)
+
+
+def test_coarse_triangles_are_too_stiff_whether_they_match_or_not():
+    """0.7 to 0.8 % on 48 and 64 facets; 1.0 % and 0.7 % on meshes that match."""
+
+    def mean(cells, turn, secondary):
+        mesh = {"triangles": True, "turn": turn}
+        p = ring_problem(cells, 0.0, mesh=mesh, gap=-OVERLAP, secondary=secondary)
+        return against_lame(p)[0]
+
+    fine, coarse = mean((64, 64), 0.0, "shaft"), mean((48, 48), 0.0, "shaft")
+    assert 0.005 < fine < coarse < 0.011
+    for secondary in ("shaft", "hub"):
+        assert fine < mean((48, 64), 0.1, secondary) < coarse
 
 
 def test_the_gap_of_an_obstacle_is_what_is_given():

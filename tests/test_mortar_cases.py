@@ -125,7 +125,7 @@ def disc_on_block(comm, cells, order, pushed=0.02):
 
 def no_load(v, ds):
     mesh = ufl.domain.extract_unique_domain(v)
-    return ufl.dot(fem.Constant(mesh, (0.0, 0.0)), v) * ufl.dx(domain=mesh)
+    return ufl.dot(fem.Constant(mesh, (0.0,) * v.ufl_shape[0]), v) * ufl.dx(domain=mesh)
 
 
 @pytest.mark.parametrize("order", [1, 2])

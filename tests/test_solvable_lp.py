@@ -82,6 +82,20 @@ def test_random_rigid_scenes_against_a_plain_program():
     assert 0.2 < np.mean(verdicts) < 0.8
 
 
+def test_a_load_that_is_rounding_hides_no_escape():
+    """A body falls away from its contact; on another one a load that is held leaves 1e-21."""
+    count, k = 2, 3
+    E, N, load = np.zeros((2, 6)), np.zeros((2, 6)), np.zeros(6)
+    E[[0, 1], [3, 4]] = 1.0  # of the second body only the last mode is free
+    N[0, 0], N[1, 0], N[1, 2] = 1.0, 1.0, 0.5
+    load[[0, 3, 5]] = -1e-3, 1.0, 1e-21
+    names = ["falling", "held"], ["x", "y", "turn"]
+    with pytest.raises(NoSolutionError, match="falling.*drives out of contact"):
+        check_solvable(as_coarse(count, k, E, N, load), *names)
+    load[0] = 1e-3
+    check_solvable(as_coarse(count, k, E, N, load), *names)
+
+
 def block_on_floor(scale, E, load, subdomains=2):
     """A block of edge ``scale`` over a plane, pressed or pushed by a traction on its top."""
     mesh, tags, names = box("quadrilateral", 3)

@@ -39,6 +39,7 @@ class Answer:
         free: Rigid motions that the solution is unique up to, shape ``(n * gdim, k)``.
         load: Sum of the absolute values of the load.
         noise: Relative change of u, per body, when K and the gaps change by rounding.
+        force_noise: Change of the resultants of the contact forces on the bodies by that.
         rows: Conditions N u ≤ gap.
         gap: Their right sides.
     """
@@ -53,6 +54,7 @@ class Answer:
     forces: np.ndarray | None = None
     free: np.ndarray | None = None
     noise: np.ndarray | None = None
+    force_noise: float = 0.0
 
 
 class Untorn:
@@ -186,17 +188,23 @@ class Untorn:
         known.free = np.zeros((len(self.f), kept.shape[1]))
         known.free[free] = kept
         known.u = self._smallest(u, known.free)
-        known.forces = -(self.rows[used].T @ lam).reshape(-1, self.gdim)
+        known.forces = self._forces(used, lam)
         rng = np.random.default_rng(0)
         shaken = K.copy()
         shaken.data = K.data * (1 + EPSILON * rng.uniform(-1, 1, len(K.data)))
-        # points are rounded, and so is N u where bodies move far
-        size = np.abs(known.u.ravel()) + np.abs(self.x[:, : self.gdim].ravel())
-        gap = gap + EPSILON * (abs(self.rows[used]) @ size) * rng.uniform(-1, 1, len(gap))
-        _, other = solve(0.5 * (shaken + shaken.T), f, N, gap, R, e, lam > 0.0)
+        # points are rounded, as far as the largest of their coordinates, and so is N u where bodies
+        # move far
+        size = np.abs(known.u) + np.abs(self.x).max(axis=1, keepdims=True)
+        gap = gap + EPSILON * (abs(self.rows[used]) @ size.ravel()) * rng.uniform(-1, 1, len(gap))
+        pressed, other = solve(0.5 * (shaken + shaken.T), f, N, gap, R, e, lam > 0.0)
         second = self._smallest(other, known.free)
         known.noise = body_errors(known, second)
+        change = resultants(known, self._forces(used, pressed)) - resultants(known, known.forces)
+        known.force_noise = float(np.abs(change).max())
         return known
+
+    def _forces(self, used: np.ndarray, lam: np.ndarray) -> np.ndarray:
+        return -(self.rows[used].T @ lam).reshape(-1, self.gdim)
 
     def _smallest(self, u: np.ndarray, motions: np.ndarray) -> np.ndarray:
         """All displacements, from the free ones, less what is free."""
@@ -205,6 +213,12 @@ class Untorn:
         if motions.shape[1]:
             full -= motions @ np.linalg.lstsq(motions, full)[0]
         return full.reshape(-1, self.gdim)
+
+
+def resultants(answer: Answer, forces: np.ndarray) -> np.ndarray:
+    """Sums of nodal forces over each body, shape ``(bodies, gdim)``."""
+    bodies = range(answer.body.max() + 1)
+    return np.array([forces[answer.body == b].sum(axis=0) for b in bodies])
 
 
 def body_sizes(answer: Answer, u: np.ndarray) -> np.ndarray:

@@ -22,6 +22,9 @@ STIFF, STRICTER = 1e-3, 0.1
 # of rtol: error of u in energy over all bodies, so that forces are right where bodies move much
 # and deform little; what rounding leaves of bodies that do not deform at all, as a displacement
 FORCES, RIGID = 10.0, 1e-12
+# of the largest gap of a contact row: without load all displacements may be that small and are
+# what rounding leaves of 0 (seen: 3e-15)
+AT_REST = 1e-14
 # the first look is taken at this power of rtol, to learn how far things move
 FIRST_LOOK = 0.5
 # a new tolerance aims a little below what was asked for; it never falls by more than LEAP at
@@ -157,11 +160,13 @@ class Accuracy:
         size, most = now.bodies.size, now.bodies.size.max(initial=0.0)
         share = np.where(size < STIFF * most, STRICTER, 1.0)
         alone = LOAD_NOISE * now.bodies.alone
-        displacement = self.rtol * share * size + NOISE * most + alone
+        at_rest = 0.0 if alone.any() or most > AT_REST * now.gap else AT_REST * now.gap
+        displacement = self.rtol * share * size + NOISE * most + alone + at_rest
         largest = float(displacement.max(initial=0.0))
         balance = max(self.rtol, NOISE) * now.forces
+        balance += at_rest * now.bodies.stiffness.max(initial=0.0)
         energy = FORCES * self.rtol * np.sqrt(max(now.bodies.energy.sum(), 0.0))
-        energy += np.sqrt(now.bodies.stiffness @ (RIGID * most + alone) ** 2)
+        energy += np.sqrt(now.bodies.stiffness @ (RIGID * most + alone + at_rest) ** 2)
         return Tolerances(displacement, 2.0 * largest, 2.0 * largest, balance, float(energy))
 
     def ratio(self) -> float:

@@ -10,6 +10,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import TINY, Array
+from tfeti_dolfinx.dual.closing import closing
 from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.qp.faces import Face
@@ -69,6 +70,7 @@ class Measures:
         balance: Force left on a kernel mode, where it is largest beside the forces there.
         forces: Size of these forces.
         residual: Norm of what rows miss.
+        gap: Largest gap of a contact row, or overlap.
     """
 
     u: Array
@@ -77,6 +79,7 @@ class Measures:
     balance: float
     forces: float
     residual: float
+    gap: float
 
     @property
     def error(self) -> float:
@@ -94,9 +97,9 @@ def measure(
 ) -> Measures:
     """Recover the displacement of an iterate and see how well it fulfils the rows. Collective.
 
-    Rows miss w = Bu − c: rows of equalities and those that press both ways, others
-    where they overlap. v = D⁻¹Bᵀw closes that (rows are orthonormal in D⁻¹), and u + v is
-    admissible; so ‖v‖_K bounds the error of u in energy, as far as λ balances the load.
+    Rows miss w = Bu − c: rows of equalities and those that press both ways, others where they
+    overlap. v, the least displacement in D that closes that, makes u + v admissible; so ‖v‖_K
+    bounds the error of u in energy, as far as λ balances the load.
 
     Args:
         scene: The dual problem.
@@ -107,32 +110,31 @@ def measure(
         before: The displacement of an earlier iterate.
     """
     u = scene.recover(lam, gradient, face, error)
-    w, penetration = _missed(scene, u)
-    v = scene.constraints.B.createVecRight()
-    scene.constraints.B.multTranspose(w, v)
-    residual = w.norm()
-    bodies = _bodies(scene, u, v.array_r / scene.constraints.weights, before)
+    w, penetration, gap = _missed(scene, u)
+    residual, normals = w.norm(), scene.constraints.sets.normals
+    closed = scene.pressing[normals] | (w.array_r[normals] > 0.0)
+    bodies = _bodies(scene, u, closing(scene.constraints, w, closed), before)
     balance, forces = _balance(scene.coarse, lam)
-    for vec in (w, v):
-        vec.destroy()
-    return Measures(u, bodies, penetration, balance, forces, residual)
+    w.destroy()
+    return Measures(u, bodies, penetration, balance, forces, residual, gap)
 
 
-def _missed(scene: Scene, u: Array) -> tuple[PETSc.Vec, float]:
-    """w, and the largest of its inequality rows as a length."""
+def _missed(scene: Scene, u: Array) -> tuple[PETSc.Vec, float, float]:
+    """w, and as lengths the largest of its contact rows and the largest of their gaps."""
     constraints = scene.constraints
     trace, w = constraints.B.createVecRight(), constraints.c.duplicate()
     trace.array[:] = u[scene.subdomains.trace]
     constraints.B.mult(trace, w)
     w.axpy(-1.0, constraints.c)
-    bounded = constraints.sets.normals
-    rows = w.array_r[bounded]
-    rows = np.where(scene.pressing[bounded], rows, np.maximum(rows, 0.0))
-    w.array[bounded] = rows
-    lengths = np.abs(rows) / constraints.scale
+    normals = constraints.sets.normals
+    rows = w.array_r[normals]
+    rows = np.where(scene.pressing[normals], rows, np.maximum(rows, 0.0))
+    w.array[normals] = rows
+    lengths = np.abs((rows, constraints.c.array_r[normals])) / constraints.scale
     trace.destroy()
-    deepest = float(np.max(lengths, initial=0.0))
-    return w, float(w.getComm().tompi4py().allreduce(deepest, op=MPI.MAX))
+    largest = np.max(lengths, axis=1, initial=0.0)
+    w.getComm().tompi4py().Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
+    return w, float(largest[0]), float(largest[1])
 
 
 def _bodies(scene: Scene, u: Array, v: Array, before: Array | None) -> BodyMeasures:

@@ -11,7 +11,7 @@ from scipy.sparse import csr_array, hstack
 from scipy.sparse.csgraph import connected_components
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.dual.bodies import Bodies
+from tfeti_dolfinx.dual.bodies import BALANCE, Bodies
 from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.dual.cuts import Rows, minimise
 from tfeti_dolfinx.dual.motions import Motions
@@ -87,15 +87,26 @@ def escape(coarse: CoarseSpace) -> Array | None:
         return None
     # parts of the scene that do not meet may be loaded by very different forces
     part = _parts(coarse, rows, body)
-    largest = np.zeros(part.max() + 1)
-    np.maximum.at(largest, part, np.abs(load))
-    largest[largest == 0.0] = 1.0
+    largest = _sizes(load, noise, part)
     load, noise = load / largest[part], noise / largest[part]
     comm, first = coarse.comm, rows.extremes()
     y = minimise(rows, lambda A, _: _most_work(A, load, noise), SLOPE, comm, first)
     if y is not None:
         y = minimise(rows, lambda A, _: _least_motion(A, load), SLOPE, comm, first)
     return None if y is None else np.asarray(Z @ y)
+
+
+def _sizes(load: Array, noise: Array, part: Array) -> Array:
+    """Size of the load on each part of the scene, 1 where there is none.
+
+    A load that is no more than rounding is not the size of anything: else its noise would hide
+    what drives the other parts.
+    """
+    driving, possible = np.zeros((2, part.max() + 1))
+    np.maximum.at(driving, part, np.where(np.abs(load) > noise, np.abs(load), 0.0))
+    np.maximum.at(possible, part, noise / BALANCE)
+    sizes = np.where(driving > 0.0, driving, possible)
+    return np.where(sizes > 0.0, sizes, 1.0)
 
 
 def _parts(coarse: CoarseSpace, rows: Rows, body: Array) -> Array:

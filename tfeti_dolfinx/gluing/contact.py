@@ -17,6 +17,8 @@ from tfeti_dolfinx.mortar.surfaces import group_points
 # Of a row's norm: what is left of less is rounding, scaled up to unit norm. Of the scene's length:
 # overlaps below it are rounding of gaps and prescribed values.
 NOTHING_LEFT = 1e-10
+# of what rounding makes of a condition's coefficients, and of lengths: errors of several add up
+SEVERAL, EPSILON = 10.0, 2.2e-16
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,8 @@ def contact_rows(
     A coefficient a becomes a·w/Σw on each torn copy, w its weight in D (a/k on k copies of equal
     weight): so the rows are orthogonal to the gluing rows in the inner product of D⁻¹.
     Prescribed components are left to the right side. Then the whole row is scaled to unit norm
-    by one number s_i. If less than 1e-10 of it remains, it is dropped.
+    by one number s_i. If less than 1e-10 of it remains, or than what rounding makes of it, it is
+    dropped.
 
     Args:
         dofs: Dof maps.
@@ -96,7 +99,8 @@ def contact_rows(
     coefficients = records.coefficients(0)
     free = np.where(prescribed, 0.0, coefficients)
     before, after = squared_norms(coefficients), squared_norms(free)
-    kept = records.within_reach & (after > NOTHING_LEFT**2 * before)
+    points = group_points(dofs)
+    kept = records.within_reach & (after > _nothing_left(records, points) ** 2 * before)
     condition = np.flatnonzero(kept)
     scale = 1.0 / np.sqrt(after[kept])
     holds = np.flatnonzero(np.any(prescribed, axis=1))
@@ -107,9 +111,22 @@ def contact_rows(
         held_condition=records.condition[holds],
         held_group=records.entry_group[holds],
         held=coefficients[holds] - free[holds],
-        shared=shared_nodes(records, free, kept, group_points(dofs)),
+        shared=shared_nodes(records, free, kept, points),
     )
     return _spread(dofs, weights, records, free / total, found), found
+
+
+def _nothing_left(records: ContactRecords, points: Array) -> Array:
+    """Share of a condition that is rounding, shape ``(n,)``.
+
+    The normal of a facet of size h at x is exact to ε|x|/h, and so is a place on it. At a distance
+    g the normal points that much times g beside the place that it should point to.
+    """
+    x = np.abs(points[records.group]).max(axis=1, initial=0.0)
+    h = records.area ** (1.0 / max(records.normal.shape[1] - 1, 1))
+    g = np.abs(records.geometric_gap)
+    error = EPSILON * (x * (1.0 + g / h) + g) / h
+    return np.maximum(NOTHING_LEFT, SEVERAL * error)
 
 
 def _check_decided(gaps: Array, length: float) -> None:
