@@ -19,7 +19,7 @@ ROOMS = [
     ["subdomains"],
     ["dual"],
     ["form_checks", "options", "report"],
-    ["assembly"],
+    ["assembly", "elasticity"],
     ["fields"],
     ["solution"],
     ["report_filling", "solver"],

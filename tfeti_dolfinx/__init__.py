@@ -3,6 +3,7 @@
 from tfeti_dolfinx.contact.obstacle import Obstacle
 from tfeti_dolfinx.contact.pair import Contact
 from tfeti_dolfinx.contact.shapes import Cylinder, Plane, SignedDistance, Sphere
+from tfeti_dolfinx.elasticity import Elasticity
 from tfeti_dolfinx.errors import (
     ConvergenceError,
     FactorError,
@@ -16,16 +17,18 @@ from tfeti_dolfinx.mesh.gmsh.reading import read_gmsh
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.report import Report
-from tfeti_dolfinx.solution import ContactStatus, Solution
+from tfeti_dolfinx.solution import ContactData, ContactStatus, Solution
 from tfeti_dolfinx.version import __version__
 
 __all__ = [
     "Contact",
+    "ContactData",
     "ContactProblem",
     "ContactStatus",
     "ConvergenceError",
     "Cylinder",
     "Decomposition",
+    "Elasticity",
     "FactorError",
     "InputError",
     "NoSolutionError",

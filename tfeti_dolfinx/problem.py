@@ -17,8 +17,8 @@ from tfeti_dolfinx.compat import require_real_petsc
 from tfeti_dolfinx.contact.search import ContactPartner, ContactSearch, checked_contacts
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError
-from tfeti_dolfinx.fields import Stress, checked_stress
-from tfeti_dolfinx.form_checks import check_mesh, check_same_space, displacement_space
+from tfeti_dolfinx.fields import Stress, check_stress, checked_thickness
+from tfeti_dolfinx.form_checks import check_same_space, displacement_space
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.gluing.glue import glue
 from tfeti_dolfinx.gluing.prescribed import checked_conditions
@@ -51,6 +51,8 @@ class ContactProblem:
         contacts: Obstacles and pairs of surfaces; none for a linear problem.
         decomposition: The torn mesh.
         stress: From a displacement to its 3×3 stress in UFL, for stress fields.
+        thickness: What the forms were multiplied with, a number or a scalar in UFL: a thickness
+            in 2D, 2πr if axisymmetric. Contact pressures are forces over areas times it.
         u: Function that takes the solution; default a new one.
         petsc_options: Options, with or without the prefix; the command line beats them.
         petsc_options_prefix: Prefix of the options.
@@ -74,6 +76,7 @@ class ContactProblem:
         decomposition: Decomposition,
         *,
         stress: Stress | None = None,
+        thickness: Any = 1.0,
         u: fem.Function | None = None,
         petsc_options: Mapping[str, Any] | None = None,
         petsc_options_prefix: str = "tfeti_",
@@ -92,7 +95,8 @@ class ContactProblem:
         V = displacement_space(a, decomposition)
         self.bcs = checked_conditions(bcs, V)
         self.u = fem.Function(V, name="displacement") if u is None else self._checked_u(u, V)
-        self._stress = self._checked_stress(stress)
+        self._stress = check_stress(stress, self.u, decomposition)
+        self._thickness = checked_thickness(thickness, decomposition)
         self.report = Report(seconds=dict(decomposition.seconds))
         self._prefix = petsc_options_prefix
         self._factor_options = factor_options(petsc_options, petsc_options_prefix)
@@ -167,11 +171,6 @@ class ContactProblem:
         check_same_space(u.function_space, V, "u", "the space of a")
         return u
 
-    def _checked_stress(self, stress: Stress | None) -> Stress | None:
-        if stress is not None:
-            check_mesh(checked_stress(stress, self.u), "stress", self.decomposition)
-        return stress
-
     def destroy(self) -> None:
         """Destroy the PETSc objects; solution and report stay. ``solve`` makes them anew."""
         for item in (self._dual, *(self._blocks or ()), self._constraints):
@@ -236,6 +235,7 @@ class ContactProblem:
                 mu=result.mu,
                 stress=self._stress,
                 contacts=self._settled,
+                thickness=self._thickness,
             )
         fill_result(report, self.solution, dual, result, accuracy, self._counters)
         result.destroy()

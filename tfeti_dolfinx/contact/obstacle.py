@@ -7,7 +7,7 @@ from dataclasses import KW_ONLY, dataclass, replace
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.contact.arguments import Gap, checked_gap, checked_reach, given_gaps
+from tfeti_dolfinx.contact.arguments import Gap, checked_gap, checked_reach, give_name, given_gaps
 from tfeti_dolfinx.contact.conditions import conditions, triplets
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.shape_checks import check_placement, check_shape, distance_and_gradient
@@ -42,6 +42,7 @@ class Obstacle:
         reach: Nodes farther than this from the obstacle get no row at first. After the solve
             all are checked, and those that came to overlap get theirs. Default: 5 % of the
             surface's extent.
+        name: For messages and ``solution.contact(name)``. Default: "obstacle of surface 'a'".
     """
 
     surface: str | int
@@ -49,14 +50,11 @@ class Obstacle:
     _: KW_ONLY
     gap: Gap = "geometry"
     reach: float | None = None
+    name: str = ""
 
     def __post_init__(self) -> None:
+        give_name(self, f"obstacle of surface {self.surface!r}")
         check_shape(self.shape, self.name)
-
-    @property
-    def name(self) -> str:
-        """Name for messages."""
-        return f"obstacle of surface {self.surface!r}"
 
     @property
     def surfaces(self) -> tuple[str | int, ...]:

@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.contact.arguments import Gap, checked_gap, checked_reach, given_gaps
+from tfeti_dolfinx.contact.arguments import Gap, checked_gap, checked_reach, give_name, given_gaps
 from tfeti_dolfinx.contact.conditions import conditions, triplets
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.sides import Side, side_of, stiffness_ratio
@@ -64,6 +64,7 @@ class Contact:
         reach: Surfaces farther apart than this make no rows at first; after the solve it is
             checked that none of them has come to overlap. Default: 5 % of the smaller surface's
             extent.
+        name: For messages and ``solution.contact(name)``. Default: "contact of 'a' with 'b'".
     """
 
     a: str | int
@@ -72,11 +73,10 @@ class Contact:
     secondary: str | int = "auto"
     gap: Gap = "geometry"
     reach: float | None = None
+    name: str = ""
 
-    @property
-    def name(self) -> str:
-        """Name for messages."""
-        return f"contact of {self.a!r} with {self.b!r}"
+    def __post_init__(self) -> None:
+        give_name(self, f"contact of {self.a!r} with {self.b!r}")
 
     @property
     def surfaces(self) -> tuple[str | int, ...]:
