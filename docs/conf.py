@@ -1,4 +1,4 @@
-"""Settings of Sphinx. The pages are the repository's own documents: ``.ci/run`` builds them with
+"""Settings of Sphinx; the pages are the repository's own documents.
 
 python3 -m sphinx -W --keep-going -b html -c docs . OUT
 """

@@ -9,7 +9,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "tfeti_dolfinx"
 
 # the rooms in their order; those of one line may not import from each other
 ROOMS = [
-    ["errors", "arrays", "version"],
+    ["errors", "arrays", "citations", "version"],
     ["checks", "compat", "parallel", "timing"],
     ["mesh"],
     ["mortar"],

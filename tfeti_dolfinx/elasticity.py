@@ -61,6 +61,15 @@ class Elasticity:
 
     Raises:
         InputError: A modulus, a name, the model, the mesh or the thickness does not fit.
+
+    Example:
+        >>> bar = dmesh.create_unit_square(MPI.COMM_WORLD, 2, 2)
+        >>> elastic = tfeti.Elasticity(bar, E=10.0, nu=0.25, model="plane_stress")
+        >>> u = fem.Function(fem.functionspace(bar, ("Lagrange", 1, (2,))))
+        >>> u.interpolate(lambda x: (x[0], -0.25 * x[1]))
+        >>> local = fem.assemble_scalar(fem.form(elastic.stress(u)[0, 0] * ufl.dx))
+        >>> print(f"{bar.comm.allreduce(local):.6f}")
+        10.000000
     """
 
     def __init__(

@@ -42,7 +42,8 @@ MAX_ROUNDS = 20
 class ContactProblem:
     """Linear elasticity with contact on a torn mesh, solved by Total FETI.
 
-    Mirrors ``dolfinx.fem.petsc.LinearProblem``. Creation and all methods are collective.
+    Mirrors ``dolfinx.fem.petsc.LinearProblem``. Creation and all methods are collective. A whole
+    example stands at the top of the package.
 
     Args:
         a: Bilinear form on a Lagrange space of the torn mesh.

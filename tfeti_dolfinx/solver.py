@@ -6,6 +6,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.citations import cite
 from tfeti_dolfinx.dual.accuracy import Accuracy
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.dual.particular import feasible_particular
@@ -61,6 +62,7 @@ def solve_dual(
     Returns:
         Multipliers, and their displacement with its measured accuracy.
     """
+    cite("tfeti", qp_type)
     qp = dual.qp()
     homogenised = _homogenise(dual, qp, options)
     monitor, norm = _monitor(dual, homogenised, options), 1.0

@@ -43,6 +43,11 @@ class Obstacle:
             all are checked, and those that came to overlap get theirs. Default: 5 % of the
             surface's extent.
         name: For messages and ``solution.contact(name)``. Default: "obstacle of surface 'a'".
+
+    Example:
+        >>> table = tfeti.Plane((0, 0, -0.01), normal=(0, 0, 1))
+        >>> tfeti.Obstacle("bottom", table, gap=0.0, name="table").name
+        'table'
     """
 
     surface: str | int

@@ -9,6 +9,7 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.citations import cite
 from tfeti_dolfinx.contact.arguments import Gap, checked_gap, checked_reach, give_name, given_gaps
 from tfeti_dolfinx.contact.conditions import conditions, triplets
 from tfeti_dolfinx.contact.records import ContactRecords
@@ -65,6 +66,10 @@ class Contact:
             checked that none of them has come to overlap. Default: 5 % of the smaller surface's
             extent.
         name: For messages and ``solution.contact(name)``. Default: "contact of 'a' with 'b'".
+
+    Example:
+        >>> tfeti.Contact("shaft", "hub", gap=-1e-3, secondary="hub").name
+        "contact of 'shaft' with 'hub'"
     """
 
     a: str | int
@@ -128,6 +133,7 @@ class Contact:
         Raises:
             InputError: As ``records``.
         """
+        cite("mortar")
         settled = self._named_first(decomposition)
         sides = settled._sides(dofs, decomposition)
         found = settled._meet(sides, dofs, contact, reach, reach)
