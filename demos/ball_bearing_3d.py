@@ -52,13 +52,7 @@ def run(argv):
 
     # ## Elasticity
     E, nu = 2.1e5, 0.3
-    mu, lmbda = E / 2 / (1 + nu), E * nu / (1 + nu) / (1 - 2 * nu)
-
-    def strain(u):
-        return ufl.sym(ufl.grad(u))
-
-    def stress(u):
-        return 2 * mu * strain(u) + lmbda * ufl.tr(strain(u)) * ufl.Identity(3)
+    elastic = tfeti.Elasticity(decomposition, E=E, nu=nu)
 
     V = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
@@ -97,7 +91,7 @@ def run(argv):
     # the inner ring from moving across the load, and so from spinning; along the load it is free.
     around = ufl.as_vector((-outward[2], 0, outward[0]))
     cage = E / bearing.ball**2
-    a = ufl.inner(stress(u), strain(v)) * dx
+    a = elastic.a(u, v)
     a += cage * ufl.dot(u, around) * ufl.dot(v, around) * dx
     L = ufl.dot(traction, v) * bore + ufl.dot(push, v) * dx
     outside = fem.locate_dofs_topological(V, 2, decomposition.facets("outside"))
@@ -125,7 +119,7 @@ def run(argv):
         bcs,
         contacts,
         decomposition,
-        stress=stress,
+        stress=elastic.stress,
         petsc_options={"tfeti_mpgp_expansion": "projcg", **demo.petsc_options},
     )
     uh = problem.solve()

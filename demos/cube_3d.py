@@ -58,19 +58,11 @@ def run(argv):
     # ## Elasticity
     #
     # Trilinear hexahedra need quadrature of degree 2; UFL's estimate would be three times dearer.
-    E, nu = 1.0, 0.3
-    mu, lmbda = E / 2 / (1 + nu), E * nu / (1 + nu) / (1 - 2 * nu)
-
-    def strain(u):
-        return ufl.sym(ufl.grad(u))
-
-    def stress(u):
-        return 2 * mu * strain(u) + lmbda * ufl.tr(strain(u)) * ufl.Identity(3)
+    elastic = tfeti.Elasticity(decomposition, E=1.0, nu=0.3)
 
     V = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
     degree = {"quadrature_degree": 2}
-    dx = ufl.Measure("dx", domain=mesh, metadata=degree)
     ds = ufl.Measure("ds", domain=mesh, subdomain_data=decomposition.facet_tags, metadata=degree)
 
     # ## Load, conditions, obstacle
@@ -83,12 +75,12 @@ def run(argv):
         lambda x: np.stack((np.zeros_like(x[0]), np.zeros_like(x[0]), np.ones_like(x[0]))),
     )
     problem = tfeti.ContactProblem(
-        ufl.inner(stress(u), strain(v)) * dx,
+        elastic.a(u, v),
         ufl.dot(traction, v) * ds(decomposition.surface("top")),
         [fem.dirichletbc(np.zeros(3), fixed, V)],
         [tfeti.Obstacle("bottom", obstacle, reach=np.inf)],
         decomposition,
-        stress=stress,
+        stress=elastic.stress,
         petsc_options=demo.petsc_options,
     )
     problem.solve()

@@ -63,23 +63,11 @@ def run(argv):
 
     # ## Elasticity in plane strain
     #
-    # Young's modulus is constant in each body: a function of degree 0 from the cell tags.
-    E = fem.Function(fem.functionspace(mesh, ("DG", 0)), name="young")
-    cell_dof = np.asarray(E.function_space.dofmap.list)[:, 0]
-    for name, value in young.items():
-        E.x.array[cell_dof[decomposition.cell_tags.find(decomposition.volume(name))]] = value
-    mu, lmbda = E / 2 / (1 + nu), E * nu / (1 + nu) / (1 - 2 * nu)
-
-    def strain(u):
-        g = ufl.sym(ufl.grad(u))
-        return ufl.as_tensor([[g[0, 0], g[0, 1], 0], [g[1, 0], g[1, 1], 0], [0, 0, 0]])
-
-    def stress(u):
-        return 2 * mu * strain(u) + lmbda * ufl.tr(strain(u)) * ufl.Identity(3)
+    # Young's modulus by the names of the bodies.
+    elastic = tfeti.Elasticity(decomposition, E=young, nu=nu, model="plane_strain")
 
     V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 0})
     ds = ufl.Measure("ds", domain=mesh, subdomain_data=decomposition.facet_tags)
 
     # ## Load, conditions, contact
@@ -95,12 +83,12 @@ def run(argv):
     sides = ("top", "arc") if arguments.exchange else ("arc", "top")
     contacts = [tfeti.Contact(*sides, secondary=sides[0], reach=0.75 * a**2 / R)]
     problem = tfeti.ContactProblem(
-        ufl.inner(stress(u), strain(v)) * dx,
+        elastic.a(u, v),
         ufl.dot(traction, v) * ds(decomposition.surface("load")),
         bcs,
         contacts,
         decomposition,
-        stress=stress,
+        stress=elastic.stress,
         petsc_options=demo.petsc_options,
     )
     problem.solve()

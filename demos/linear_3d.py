@@ -38,8 +38,9 @@ def run(argv):
     # bisection.
     n = arguments.cells or (4 if arguments.quick else 12)
     box = dmesh.create_box(comm, [(0, 0, 0), (4, 1, 1)], [4 * n, n, n])
-    upper = dmesh.locate_entities(box, 3, lambda x: x[2] >= 0.5 - 1e-9)
-    cell_tags = dmesh.meshtags(box, 3, upper, np.full(len(upper), 2, dtype=np.int32))
+    cells = np.arange(box.topology.index_map(3).size_local, dtype=np.int32)
+    upper = dmesh.compute_midpoints(box, 3, cells)[:, 2] > 0.5
+    cell_tags = dmesh.meshtags(box, 3, cells, np.where(upper, 2, 1).astype(np.int32))
     ends = [
         dmesh.locate_entities_boundary(box, 2, lambda x: np.isclose(x[0], 0)),
         dmesh.locate_entities_boundary(box, 2, lambda x: np.isclose(x[0], 4)),
@@ -52,37 +53,27 @@ def run(argv):
         cell_tags,
         dmesh.meshtags(box, 2, np.concatenate(ends)[order], values[order]),
         surfaces={"clamped": 1, "loaded": 2},
-        volumes={"upper": 2},
+        volumes={"lower": 1, "upper": 2},
     )
     mesh = decomposition.mesh
 
     # ## Elasticity
     #
-    # The modulus is a function on the cells of the torn mesh, from its cell tags.
-    nu, load = 0.3, -1e-3
-    E = fem.Function(fem.functionspace(mesh, ("DG", 0)))
-    E.x.array[:] = 1.0
-    E.x.array[decomposition.cell_tags.find(decomposition.volume("upper"))] = arguments.ratio
-
-    def strain(u):
-        return ufl.sym(ufl.grad(u))
-
-    def stress(u):
-        mu, lmbda = E / 2 / (1 + nu), E * nu / (1 + nu) / (1 - 2 * nu)
-        return 2 * mu * strain(u) + lmbda * ufl.tr(strain(u)) * ufl.Identity(3)
+    # Young's modulus by the names of the volumes.
+    young = {"lower": 1.0, "upper": arguments.ratio}
+    elastic = tfeti.Elasticity(decomposition, E=young, nu=0.3)
 
     V = fem.functionspace(mesh, ("Lagrange", arguments.degree, (3,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    dx = ufl.Measure("dx", domain=mesh)
     ds = ufl.Measure("ds", domain=mesh, subdomain_data=decomposition.facet_tags)
     clamped = fem.locate_dofs_topological(V, 2, decomposition.facets("clamped"))
     problem = tfeti.ContactProblem(
-        ufl.inner(stress(u), strain(v)) * dx,
-        ufl.dot(fem.Constant(mesh, (0.0, 0.0, load)), v) * ds(decomposition.surface("loaded")),
+        elastic.a(u, v),
+        ufl.dot(fem.Constant(mesh, (0.0, 0.0, -1e-3)), v) * ds(decomposition.surface("loaded")),
         [fem.dirichletbc(np.zeros(3), clamped, V)],
         [],
         decomposition,
-        stress=stress,
+        stress=elastic.stress,
         petsc_options=demo.petsc_options,
     )
     problem.solve()

@@ -51,15 +51,7 @@ def run(argv):
     mesh = decomposition.mesh
 
     # ## Elasticity in plane strain
-    E, nu = 1.0, 0.3
-    mu, lmbda = E / 2 / (1 + nu), E * nu / (1 + nu) / (1 - 2 * nu)
-
-    def strain(u):
-        g = ufl.sym(ufl.grad(u))
-        return ufl.as_tensor([[g[0, 0], g[0, 1], 0], [g[1, 0], g[1, 1], 0], [0, 0, 0]])
-
-    def stress(u):
-        return 2 * mu * strain(u) + lmbda * ufl.tr(strain(u)) * ufl.Identity(3)
+    elastic = tfeti.Elasticity(decomposition, E=1.0, nu=0.3, model="plane_strain")
 
     V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
@@ -80,16 +72,17 @@ def run(argv):
     x = ufl.SpatialCoordinate(mesh)
     gravity = fem.Constant(mesh, (0.0, -0.003))
     traction = ufl.as_vector((push, -0.045 * ufl.max_value(1 - 3 * x[0], 0)))
-    contacts = [tfeti.Obstacle("floor", tfeti.Plane((0, -0.01), normal=(0, 1)))]
+    contacts = [tfeti.Obstacle("floor", tfeti.Plane((0, -0.01), normal=(0, 1)), name="floor")]
     if not arguments.no_wall:
-        contacts.append(tfeti.Obstacle("wall", tfeti.Plane((-0.01, 0), normal=(1, 0))))
+        wall = tfeti.Plane((-0.01, 0), normal=(1, 0))
+        contacts.append(tfeti.Obstacle("wall", wall, name="wall"))
     problem = tfeti.ContactProblem(
-        ufl.inner(stress(u), strain(v)) * dx,
+        elastic.a(u, v),
         ufl.dot(gravity, v) * dx + ufl.dot(traction, v) * ds(decomposition.surface("top")),
         [],
         contacts,
         decomposition,
-        stress=stress,
+        stress=elastic.stress,
         petsc_options=demo.petsc_options,
     )
     problem.solve()
@@ -98,10 +91,10 @@ def run(argv):
     #
     # Each contact carries the load that points at it.
     load = fem.assemble_scalar(fem.form(traction[1] * ds(decomposition.surface("top"))))
-    loads = (0.003 - comm.allreduce(load), -push)
-    for name, index, load in zip(("floor", "wall"), range(len(contacts)), loads, strict=False):
-        force = comm.allreduce(problem.solution.contact(index).force.sum())
-        problem.report.errors[f"force_{name}"] = force / load - 1
+    loads = {"floor": 0.003 - comm.allreduce(load), "wall": -push}
+    for name in (contact.name for contact in contacts):
+        force = comm.allreduce(problem.solution.contact(name).force.sum())
+        problem.report.errors[f"force_{name}"] = force / loads[name] - 1
     if arguments.plot:
         from tfeti_dolfinx.plot import plot_deformed
 

@@ -48,17 +48,10 @@ def run(argv):
     mesh = decomposition.mesh
 
     # ## Elasticity
-    mu, lmbda = E / 2 / (1 + nu), E * nu / (1 + nu) / (1 - 2 * nu)
-
-    def strain(u):
-        return ufl.sym(ufl.grad(u))
-
-    def stress(u):
-        return 2 * mu * strain(u) + lmbda * ufl.tr(strain(u)) * ufl.Identity(3)
+    elastic = tfeti.Elasticity(decomposition, E=E, nu=nu)
 
     V = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 0})
     ds = ufl.Measure("ds", domain=mesh, subdomain_data=decomposition.facet_tags)
 
     # ## Load, conditions, contact
@@ -78,12 +71,12 @@ def run(argv):
     sides = ("cap", "top") if arguments.exchange else ("top", "cap")
     contacts = [tfeti.Contact(*sides, secondary=sides[0], reach=a**2 / R)]
     problem = tfeti.ContactProblem(
-        ufl.inner(stress(u), strain(v)) * dx,
+        elastic.a(u, v),
         ufl.dot(traction, v) * load,
         bcs,
         contacts,
         decomposition,
-        stress=stress,
+        stress=elastic.stress,
         petsc_options=demo.petsc_options,
     )
     problem.solve()

@@ -48,14 +48,7 @@ def run(argv):
     # ## Elasticity
     #
     # Trilinear hexahedra need quadrature of degree 2.
-    E, nu = 1.0, 0.3
-    mu, lmbda = E / 2 / (1 + nu), E * nu / (1 + nu) / (1 - 2 * nu)
-
-    def strain(u):
-        return ufl.sym(ufl.grad(u))
-
-    def stress(u):
-        return 2 * mu * strain(u) + lmbda * ufl.tr(strain(u)) * ufl.Identity(3)
+    elastic = tfeti.Elasticity(decomposition, E=1.0, nu=0.3)
 
     V = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
@@ -73,12 +66,12 @@ def run(argv):
     top = ds(decomposition.surface("beam top"))
     contacts = [tfeti.Contact(*pair, secondary=pair[0], reach=0.05) for pair in PAIRS]
     problem = tfeti.ContactProblem(
-        ufl.inner(stress(u), strain(v)) * dx,
+        elastic.a(u, v),
         ufl.dot(weight, v) * dx - pressure * v[2] * top,
         [fem.dirichletbc(np.zeros(3), base, V)],
         contacts,
         decomposition,
-        stress=stress,
+        stress=elastic.stress,
         petsc_options=demo.petsc_options,
     )
     problem.solve()

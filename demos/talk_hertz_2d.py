@@ -96,21 +96,12 @@ def run(argv):
 
     # ## Elasticity in plane strain
     #
-    # `stress` returns a 3×3 tensor, so that σ_zz is in von Mises' stress. Bilinear
-    # quadrilaterals need quadrature of degree 2; UFL's estimate would be dearer.
-    mu, lmbda = E / 2 / (1 + nu), E * nu / (1 + nu) / (1 - 2 * nu)
-
-    def strain(u):
-        g = ufl.sym(ufl.grad(u))
-        return ufl.as_tensor([[g[0, 0], g[0, 1], 0], [g[1, 0], g[1, 1], 0], [0, 0, 0]])
-
-    def stress(u):
-        return 2 * mu * strain(u) + lmbda * ufl.tr(strain(u)) * ufl.Identity(3)
+    # Its stress is a 3×3 tensor, so that σ_zz is in von Mises' stress.
+    elastic = tfeti.Elasticity(decomposition, E=E, nu=nu, model="plane_strain")
 
     V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
     degree = {"quadrature_degree": 2}
-    dx = ufl.Measure("dx", domain=mesh, metadata=degree)
     ds = ufl.Measure("ds", domain=mesh, subdomain_data=decomposition.facet_tags, metadata=degree)
 
     # ## Load, conditions, contact
@@ -123,12 +114,12 @@ def run(argv):
     fixed = fem.locate_dofs_topological(V, 1, decomposition.facets("lower bottom"))
     guided = fem.locate_dofs_topological(V.sub(0), 1, decomposition.facets("upper top"))
     problem = tfeti.ContactProblem(
-        ufl.inner(stress(u), strain(v)) * dx,
+        elastic.a(u, v),
         ufl.dot(traction, v) * ds(decomposition.surface("upper top")),
         [fem.dirichletbc(np.zeros(2), fixed, V), fem.dirichletbc(0.0, guided, V.sub(0))],
         [tfeti.Contact("upper bottom", "lower top", secondary="upper bottom", reach=a / 3)],
         decomposition,
-        stress=stress,
+        stress=elastic.stress,
         petsc_options=demo.petsc_options,
     )
     problem.solve()

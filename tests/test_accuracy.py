@@ -43,10 +43,8 @@ def elasticity(mesh, tags, modulus, nu, traction):
     E.interpolate(lambda x: modulus(x) + 0.0 * x[0])
     V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    mu, lmbda = E / 2 / (1 + nu), E * nu / (1 + nu) / (1 - 2 * nu)
-    sigma = 2 * mu * strain(u) + lmbda * ufl.tr(strain(u)) * ufl.Identity(3)
     ds = ufl.Measure("ds", domain=mesh, subdomain_data=tags)
-    a = ufl.inner(sigma, strain(v)) * ufl.dx
+    a = ufl.inner(hooke(E, nu)(u), strain(v)) * ufl.dx
     return V, a, ufl.dot(fem.Constant(mesh, np.array(traction, dtype=float)), v) * ds(4)
 
 

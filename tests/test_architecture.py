@@ -11,7 +11,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "tfeti_dolfinx"
 
 # the rooms in their order; those of one line may not import from each other
 ROOMS = [
-    ["errors", "arrays", "stages", "version"],
+    ["errors", "arrays", "citations", "stages", "version"],
     ["checks", "compat", "parallel", "timing"],
     ["described"],
     ["mesh"],
@@ -22,7 +22,7 @@ ROOMS = [
     ["subdomains"],
     ["dual"],
     ["form_checks", "options", "report"],
-    ["assembly", "option_parsing"],
+    ["assembly", "elasticity", "option_parsing"],
     ["fields"],
     ["solution"],
     ["report_filling", "solver"],

@@ -109,7 +109,7 @@ def test_the_package_installs(serial_only, tmp_path):
     source = tmp_path / "source"
     source.mkdir()
     shutil.copytree(ROOT / "tfeti_dolfinx", source / "tfeti_dolfinx")
-    for name in ("pyproject.toml", "README.md"):
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, source)
     site = tmp_path / "site"
     command = [sys.executable, "-m", "pip", "install", "--no-deps", "--no-build-isolation"]
@@ -126,8 +126,38 @@ def test_the_package_installs(serial_only, tmp_path):
         check=True,
     )
     assert str(site) in result.stdout
-    installed = {p.relative_to(site) for p in site.rglob("tfeti_dolfinx/**/*.py")}
-    assert installed == {p.relative_to(ROOT) for p in ROOT.rglob("tfeti_dolfinx/**/*.py")}
+    for kind in ("*.py", "py.typed"):
+        installed = {p.relative_to(site) for p in site.rglob(f"tfeti_dolfinx/**/{kind}")}
+        assert installed == {p.relative_to(ROOT) for p in ROOT.glob(f"tfeti_dolfinx/**/{kind}")}
+    (metadata,) = site.glob("tfeti_dolfinx-*.dist-info/METADATA")
+    assert "License-Expression: MIT\n" in metadata.read_text()
+    assert f"Version: {tfeti.__version__}\n" in metadata.read_text()
+
+
+def test_one_version():
+    citation = re.search(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
+    changes = re.search(r"^## \[(.*?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert citation[1] == changes[1] == tfeti.__version__
+
+
+def test_demos_run_from_an_installed_package(serial_only, tmp_path):
+    """Somewhere else, without the repository on the path; the demos' helpers lie beside them."""
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    site = tmp_path / "site"
+    site.mkdir()
+    (site / "tfeti_dolfinx").symlink_to(ROOT / "tfeti_dolfinx")
+    for name in ("demos", "meshes"):
+        shutil.copytree(ROOT / name, tmp_path / "elsewhere" / name)
+    result = subprocess.run(
+        [sys.executable, tmp_path / "elsewhere/demos/hertz_2d.py", "--quick"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env={**environment, "PYTHONPATH": str(site)},
+    )
+    assert result.returncode == 0, result.stderr
+    assert "CONVERGED_RTOL" in result.stdout
 
 
 def test_the_report_s_fields_are_documented():

@@ -3,12 +3,22 @@
 import re
 
 import pytest
-from mistakes import accepted, conditions, contacts, forms, gmsh_files, meshes, options, results
+from mistakes import (
+    accepted,
+    conditions,
+    contacts,
+    elasticity,
+    forms,
+    gmsh_files,
+    meshes,
+    options,
+    results,
+)
 from mistakes.scene import Scene
 
 TABLES = {
     f"{module.__name__.split('.')[1]} {name.lower()}": getattr(module, name)
-    for module in (forms, conditions, options, meshes, contacts, results, gmsh_files)
+    for module in (forms, elasticity, conditions, options, meshes, contacts, results, gmsh_files)
     for name in module.TABLES
 }
 
@@ -41,7 +51,7 @@ def test_mistakes_are_named(table, scene, shared_tmp, comm):
 
 def test_no_mistake_is_there_twice():
     names = [name for table in TABLES.values() for name in table]
-    assert len(set(names)) == len(names) >= 155
+    assert len(set(names)) == len(names) >= 195
 
 
 @pytest.mark.parametrize("use", accepted.ACCEPTED)

@@ -1,8 +1,37 @@
-"""Multi-body elastic contact by Total FETI, as a FEniCSx application."""
+"""Multi-body elastic contact by Total FETI, as a FEniCSx application.
+
+Example:
+    An elastic square falls on a floor, which bears its weight.
+
+    >>> import numpy as np
+    >>> import ufl
+    >>> from dolfinx import fem
+    >>> from dolfinx import mesh as dmesh
+    >>> from mpi4py import MPI
+    >>> import tfeti_dolfinx as tfeti
+    >>> comm = MPI.COMM_WORLD
+    >>> square = dmesh.create_unit_square(comm, 8, 8)
+    >>> facets = dmesh.locate_entities_boundary(square, 1, lambda x: np.isclose(x[1], 0))
+    >>> tags = dmesh.meshtags(square, 1, facets, np.full_like(facets, 1))
+    >>> decomposition = tfeti.decompose(square, 4, facet_tags=tags, surfaces={"bottom": 1})
+    >>> elastic = tfeti.Elasticity(decomposition, E=1.0, nu=0.3, model="plane_strain")
+    >>> V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+    >>> u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    >>> weight = fem.Constant(decomposition.mesh, (0.0, -0.1))
+    >>> floor = tfeti.Obstacle("bottom", tfeti.Plane((0, -0.1), normal=(0, 1)), name="floor")
+    >>> problem = tfeti.ContactProblem(
+    ...     elastic.a(u, v), ufl.dot(weight, v) * ufl.dx, [], [floor], decomposition
+    ... )
+    >>> uh = problem.solve()
+    >>> force = comm.allreduce(problem.solution.contact("floor").force.sum())
+    >>> print(f"{force:.6f}")
+    0.100000
+"""
 
 from tfeti_dolfinx.contact.obstacle import Obstacle
 from tfeti_dolfinx.contact.pair import Contact
 from tfeti_dolfinx.contact.shapes import Cylinder, Plane, SignedDistance, Sphere
+from tfeti_dolfinx.elasticity import Elasticity
 from tfeti_dolfinx.errors import (
     ConvergenceError,
     FactorError,
@@ -17,16 +46,18 @@ from tfeti_dolfinx.mesh.gmsh.reading import read_gmsh
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.report import Report
-from tfeti_dolfinx.solution import ContactStatus, Solution
+from tfeti_dolfinx.solution import ContactData, ContactStatus, Solution
 from tfeti_dolfinx.version import __version__
 
 __all__ = [
     "Contact",
+    "ContactData",
     "ContactProblem",
     "ContactStatus",
     "ConvergenceError",
     "Cylinder",
     "Decomposition",
+    "Elasticity",
     "Extensions",
     "FactorError",
     "InputError",

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib.metadata import version
 from typing import Any
 
 import basix.ufl
+import dolfinx
 import numpy as np
 from dolfinx import fem, graph, la
 from dolfinx import mesh as dmesh
@@ -22,7 +22,7 @@ except ImportError:
     from dolfinx.io import gmshio as _gmshio
 
 
-DOLFINX_VERSION = version("fenics-dolfinx")
+DOLFINX_VERSION = dolfinx.__version__  # a wheel may have another name than fenics-dolfinx
 # a compile by another rank or run may take longer than DOLFINx's 10 seconds
 JIT_OPTIONS = {"timeout": 300}
 

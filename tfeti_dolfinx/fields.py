@@ -10,9 +10,11 @@ import ufl
 from dolfinx import fem
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.checks import checked_callable, named, shown
+from tfeti_dolfinx.checks import POSITIVE, checked_callable, checked_number, named, shown
 from tfeti_dolfinx.compat import JIT_OPTIONS, interpolation_points
 from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.form_checks import check_mesh
+from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 Stress = Callable[[Any], Any]
@@ -43,6 +45,33 @@ def checked_stress(stress: Stress, u: fem.Function) -> Any:
             f"stress(u) has shape {sigma.ufl_shape}; expected (3, 3), in plane strain with σ_zz"
         )
     return sigma
+
+
+def check_stress(
+    stress: Stress | None, u: fem.Function, decomposition: Decomposition
+) -> Stress | None:
+    """The stress as it is, where there is one.
+
+    Raises:
+        InputError: As ``checked_stress``, or it is on another mesh.
+    """
+    if stress is not None:
+        check_mesh(checked_stress(stress, u), "stress", decomposition)
+    return stress
+
+
+def checked_thickness(thickness: Any, decomposition: Decomposition) -> Any:
+    """What areas of the mesh are multiplied with, a number or a scalar in UFL.
+
+    Raises:
+        InputError: It is neither, not positive, or on another mesh.
+    """
+    if not isinstance(thickness, ufl.core.expr.Expr):
+        return checked_number(thickness, "thickness", POSITIVE)
+    if thickness.ufl_shape != ():
+        raise InputError(f"thickness is of shape {thickness.ufl_shape}; expected a scalar")
+    check_mesh(thickness, "thickness", decomposition)
+    return thickness
 
 
 def cellwise(expression: Any, dofs: TornDofs, name: str) -> fem.Function:

@@ -17,8 +17,8 @@ from tfeti_dolfinx.contact.search import ContactPartner, checked_contacts
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
 from tfeti_dolfinx.extensions import Extensions
-from tfeti_dolfinx.fields import Stress, checked_stress
-from tfeti_dolfinx.form_checks import check_mesh, check_same_space, displacement_space
+from tfeti_dolfinx.fields import Stress, check_stress, checked_thickness
+from tfeti_dolfinx.form_checks import check_same_space, displacement_space
 from tfeti_dolfinx.gluing.glue import Gluing
 from tfeti_dolfinx.gluing.prescribed import checked_conditions
 from tfeti_dolfinx.gluing.spectrum import extreme_eigenvalues, require_slepc
@@ -27,7 +27,7 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.option_parsing import factor_options, parse_options
 from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.report_filling import fill_result
-from tfeti_dolfinx.solution import Solution
+from tfeti_dolfinx.solution import Multipliers, Solution
 from tfeti_dolfinx.solver import conclude, resolve_types, solve_dual
 from tfeti_dolfinx.system import System
 from tfeti_dolfinx.timing import stage
@@ -38,7 +38,8 @@ MAX_ROUNDS = 20
 class ContactProblem:
     """Linear elasticity with contact on a torn mesh, solved by Total FETI.
 
-    Mirrors ``dolfinx.fem.petsc.LinearProblem``. Creation and all methods are collective.
+    Mirrors ``dolfinx.fem.petsc.LinearProblem``. Creation and all methods are collective. A whole
+    example stands at the top of the package.
 
     Args:
         a: Bilinear form on a Lagrange space of the torn mesh.
@@ -47,6 +48,8 @@ class ContactProblem:
         contacts: Obstacles and pairs of surfaces; none for a linear problem.
         decomposition: The torn mesh.
         stress: From a displacement to its 3×3 stress in UFL, for stress fields.
+        thickness: What the forms were multiplied with, a number or a scalar in UFL: a thickness
+            in 2D, 2πr if axisymmetric. Contact pressures are forces over areas times it.
         u: Function that takes the solution; default a new one.
         petsc_options: Options, with or without the prefix; the command line beats them.
         petsc_options_prefix: Prefix of the options.
@@ -71,6 +74,7 @@ class ContactProblem:
         decomposition: Decomposition,
         *,
         stress: Stress | None = None,
+        thickness: Any = 1.0,
         u: fem.Function | None = None,
         petsc_options: Mapping[str, Any] | None = None,
         petsc_options_prefix: str = "tfeti_",
@@ -90,7 +94,8 @@ class ContactProblem:
         V = displacement_space(a, decomposition)
         self.bcs = checked_conditions(bcs, V)
         self.u = fem.Function(V, name="displacement") if u is None else self._checked_u(u, V)
-        self._stress = self._checked_stress(stress)
+        self._stress = check_stress(stress, self.u, decomposition)
+        self._thickness = checked_thickness(thickness, decomposition)
         self.report = Report(seconds=dict(decomposition.seconds))
         self._prefix = petsc_options_prefix
         self._solution: Solution | None = None
@@ -230,11 +235,6 @@ class ContactProblem:
         check_same_space(u.function_space, V, "u", "the space of a")
         return u
 
-    def _checked_stress(self, stress: Stress | None) -> Stress | None:
-        if stress is not None:
-            check_mesh(checked_stress(stress, self.u), "stress", self.decomposition)
-        return stress
-
     def destroy(self) -> None:
         """Destroy the PETSc objects; solution and report stay. ``solve`` makes them anew."""
         self._system.destroy()
@@ -259,12 +259,12 @@ class ContactProblem:
         with stage("recovery", report.seconds):
             solution = self._solution = Solution(
                 u=accuracy.u,
-                lam=np.array(result.lam.array_r),
-                carrying=result.face.carrying,
+                multipliers=Multipliers(np.array(result.lam.array_r), result.face.carrying),
                 decomposition=self.decomposition,
                 gluing=gluing,
                 contacts=system.search.contacts,
                 stress=self._stress,
+                thickness=self._thickness,
             )
             self.u.x.array[:] = self.dofs.to_dolfinx(solution.u)
         self._start = (gluing, solution.lam, result.mu) if result.reason > 0 else None

@@ -39,19 +39,36 @@ class ContactData:
 
     Attributes:
         points: Nodes where they were before the deformation, shape ``(n, 3)``.
-        normal: Direction in which a node may not go further, shape ``(n, gdim)``.
+        normal: Direction in which a node may not go further, of unit length, out of its body:
+            the contact pushes it with −force·normal, shape ``(n, gdim)``.
         force: Normal force on the node, 0 or more, shape ``(n,)``.
-        pressure: Force / ∫φ_i, shape ``(n,)``.
+        pressure: Force over area, shape ``(n,)``.
+        area: ∫φ_i of the node's hat over the surface, of a pair over what the other side covers,
+            times the thickness, shape ``(n,)``.
         gap: Remaining distance, shape ``(n,)``.
-        area: ∫φ_i, shape ``(n,)``.
+        status: ContactStatus: TOUCHING where there is a force, else OPEN, shape ``(n,)``.
     """
 
     points: Array
     normal: Array
     force: Array
     pressure: Array
-    gap: Array
     area: Array
+    gap: Array
+    status: Array
+
+
+@dataclass(frozen=True)
+class Multipliers:
+    """Multipliers of this rank's rows.
+
+    Attributes:
+        lam: λ, shape ``(m,)``.
+        carrying: Flags of the rows that carry a force, shape ``(m,)``.
+    """
+
+    lam: Array
+    carrying: Array
 
 
 class Solution:
@@ -62,12 +79,12 @@ class Solution:
 
     Args:
         u: Displacement in primal order, shape ``(num_nodes * bs,)``.
-        lam: Multipliers of this rank's rows.
-        carrying: Flags of this rank's rows that carry a force.
+        multipliers: Multipliers of this rank's rows.
         decomposition: The torn mesh.
         gluing: Rows and contact records.
         contacts: Obstacles and pairs, the secondary surface of a pair first.
         stress: UFL stress of a displacement, or None.
+        thickness: What areas of the mesh are multiplied with, a number or a scalar in UFL.
 
     Attributes:
         u: Displacement in primal order.
@@ -80,16 +97,16 @@ class Solution:
     def __init__(
         self,
         u: Array,
-        lam: Array,
-        carrying: Array,
+        multipliers: Multipliers,
         decomposition: Decomposition,
         gluing: Gluing,
         contacts: Sequence[ContactPartner] = (),
         stress: Stress | None = None,
+        thickness: Any = 1.0,
     ) -> None:
-        self.u, self.lam, self.carrying = u, lam, carrying
+        self.u, self.lam, self.carrying = u, multipliers.lam, multipliers.carrying
         self.decomposition, self.gluing, self.dofs = decomposition, gluing, gluing.dofs
-        self.contacts, self._stress = list(contacts), stress
+        self.contacts, self._stress, self._thickness = list(contacts), stress, thickness
 
     @cached_property
     def displacement(self) -> fem.Function:
@@ -137,9 +154,8 @@ class Solution:
         """
         records, dofs = self.gluing.records, self.dofs
         force = sum_rows(records.group, self.force, dofs.num_groups)
-        area = sum_rows(records.group, records.area, dofs.num_groups)
-        surfaces = [contact.surfaces[0] for contact in self.contacts]
-        whole = hat_integrals(dofs, self.decomposition, surfaces)
+        area = sum_rows(records.group, self.area, dofs.num_groups)
+        whole = hat_integrals(dofs, self.decomposition, self._secondary_surfaces, self._thickness)
         values = np.divide(force, np.minimum(area, whole), out=0.0 * force, where=area > 0.0)
         return self._field(values, self._vertices, "pressure")
 
@@ -171,7 +187,9 @@ class Solution:
         """
         dofs = self.dofs
         surfaces = [name for contact in self.contacts for name in contact.surfaces]
-        values, area = vertex_tractions(self._nodal_forces, dofs, self.decomposition, surfaces)
+        values, area = vertex_tractions(
+            self._nodal_forces, dofs, self.decomposition, surfaces, self._thickness
+        )
         function = fem.Function(dofs.V, name="traction")
         components = function.x.array.reshape(-1, dofs.bs)
         for i in range(dofs.bs):
@@ -184,31 +202,37 @@ class Solution:
         """Resultants of the contact forces on each body. Collective at first use."""
         return body_forces(self._nodal_forces, self.dofs, self.decomposition)
 
-    def contact(self, index: int = 0) -> ContactData:
+    def contact(self, which: int | str = 0) -> ContactData:
         """State of the nodes of a contact, those that this rank owns. Collective.
 
         Args:
-            index: Position in the list of contacts.
+            which: Position in the list of contacts, or name.
 
         Raises:
-            InputError: There is no such contact.
+            InputError: There is no such contact, or several have the name.
         """
         records = self.gluing.records
-        if not is_whole(index) or not 0 <= index < len(self.contacts):
-            known = [f"{i}: {contact.surfaces}" for i, contact in enumerate(self.contacts)]
-            raise InputError(
-                f"contact {shown(index)}: there are {len(known)}, counted from 0; their positions "
-                f"and surfaces are {', '.join(known) or 'none'}"
-            )
-        points = group_points(self.dofs)
-        own = records.contact == index
+        own = records.contact == self._position(which)
         return ContactData(
-            points=points[records.group[own]],
+            points=group_points(self.dofs)[records.group[own]],
             normal=records.normal[own],
             force=self.force[own],
             pressure=self.contact_pressure[own],
+            area=self.area[own],
             gap=self.remaining_gap[own],
-            area=records.area[own],
+            status=np.where(self.force[own] > 0.0, ContactStatus.TOUCHING, ContactStatus.OPEN),
+        )
+
+    def _position(self, which: int | str) -> int:
+        names = [contact.name for contact in self.contacts]
+        if is_whole(which) and 0 <= which < len(names):
+            return int(which)
+        if isinstance(which, str) and names.count(which) == 1:
+            return names.index(which)
+        known = ", ".join(f"{i}: {name}" for i, name in enumerate(names)) or "none"
+        raise InputError(
+            f"contact {shown(which)}: there are {len(names)}, counted from 0; their positions and "
+            f"names, of which one was expected, are {known}"
         )
 
     @cached_property
@@ -227,9 +251,21 @@ class Solution:
 
     @cached_property
     def contact_pressure(self) -> Array:
-        """Force / ∫φ_i of each contact condition of this rank, 0 where ∫φ_i = 0."""
-        area = self.gluing.records.area
-        return np.divide(self.force, area, out=np.zeros_like(area), where=area > 0.0)
+        """Force over area of each contact condition of this rank. Collective at first use."""
+        return np.divide(self.force, self.area, out=0.0 * self.force, where=self.area > 0.0)
+
+    @cached_property
+    def area(self) -> Array:
+        """∫φ_i times the thickness of each contact condition of this rank. Collective at first use.
+
+        Where a pair covers a part of the node's surface, the thickness is its mean over the whole.
+        """
+        records = self.gluing.records
+        if isinstance(self._thickness, float):
+            return self._thickness * records.area
+        of, surfaces = self.decomposition, self._secondary_surfaces
+        volume = hat_integrals(self.dofs, of, surfaces, self._thickness)[records.group]
+        return records.area * volume / hat_integrals(self.dofs, of, surfaces)[records.group]
 
     @cached_property
     def remaining_gap(self) -> Array:
@@ -240,6 +276,10 @@ class Solution:
         if self._stress is None:
             raise InputError("no stress: give ContactProblem(..., stress=sigma)")
         return checked_stress(self._stress, self.displacement)
+
+    @property
+    def _secondary_surfaces(self) -> list[str | int]:
+        return [contact.surfaces[0] for contact in self.contacts]
 
     @property
     def _vertices(self) -> Array:

@@ -7,6 +7,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.citations import cite
 from tfeti_dolfinx.dual.accuracy import Accuracy
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.errors import ConvergenceError, InputError
@@ -74,6 +75,7 @@ def solve_dual(
     Returns:
         Multipliers, and their displacement with its measured accuracy.
     """
+    cite("tfeti", qp_type)
     solver = SOLVERS[qp_type]
     qp = dual.qp(options.norm_steps if solver.relative_to_norm else 0)
     begin = _start(start, qp.d)

@@ -59,6 +59,12 @@ def with_modulus(s, E):
     return solved(s, a=E * ufl.inner(ufl.grad(s.u), ufl.grad(s.v)) * s.dx)
 
 
+def with_elasticity(s, dx=None, **arguments):
+    elastic = tfeti.Elasticity(s.d, **{"E": 1.0, **arguments})
+    a = elastic.a(s.u, s.v, dx)
+    return solved(s, a=a, stress=elastic.stress, thickness=elastic.thickness)
+
+
 def function(s, *element):
     E = fem.Function(s.space(*element))
     E.x.array[:] = 1.0
@@ -222,6 +228,23 @@ ACCEPTED = {
     ),
     "an obstacle by the tag": lambda s: solved(
         s, contacts=[tfeti.Obstacle(np.int32(3), s.floor.shape)]
+    ),
+    "a contact of the solution by its name": lambda s: (
+        s.comm.allreduce(len(s.solved.contact("obstacle of surface 'bottom'").force)) == 3
+    ),
+    "a contact of the solution by a number of numpy's": lambda s: (
+        s.comm.allreduce(len(s.solved.contact(np.int64(0)).force)) == 3
+    ),
+    "a sheet that keeps its volume": lambda s: with_elasticity(s, nu=0.5, model="plane_stress"),
+    "a material that grows thicker": lambda s: with_elasticity(s, nu=-0.5, model="plane_strain"),
+    "moduli by tags that numpy made": lambda s: with_elasticity(
+        s, E={np.int32(5): np.float32(1.0)}, nu=np.float64(0.3), model="plane_strain"
+    ),
+    "a thickness that is a function": lambda s: with_elasticity(
+        s, nu=0.3, model="plane_stress", thickness=function(s, "Lagrange", 1)
+    ),
+    "elasticity on cells of a tag": lambda s: with_elasticity(
+        s, dx=s.dx(subdomain_data=s.d.cell_tags)(5), nu=0.3, model="plane_stress"
     ),
     "options of other types": lambda s: (
         options(

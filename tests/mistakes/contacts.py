@@ -54,6 +54,18 @@ CONTACTS = {
     "contacts is a dictionary": list_of(r"contacts: expected a list, got {'bot", {"bottom": 0}),
     "contacts is a text": list_of(r"contacts: expected obstacles and pairs, got 'b'", "bottom"),
     "contacts has None": list_of(r"expected obstacles and pairs, got None", [None]),
+    "a contact whose name is a number": (
+        lambda s: tfeti.Contact("left", "right", name=1),
+        r"contact of 'left' with 'right': name is 1; expected a text",
+    ),
+    "an obstacle whose name is None": (
+        lambda s: tfeti.Obstacle("bottom", s.floor.shape, name=None),
+        rf"{BOTTOM}: name is None; expected a text",
+    ),
+    "the depth of a contact that has a name": (
+        lambda s: s.with_contacts(tfeti.Contact("left", "left", name="joint")),
+        r"^joint: both are the same surface",
+    ),
     "contacts has names": list_of(r"expected obstacles and pairs, got \('a', 'b'\)", [("a", "b")]),
     "contacts has a shape": list_of(
         r"expected obstacles and pairs, got a Plane", [tfeti.Plane((0, 0), (0, 1))]

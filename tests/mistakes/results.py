@@ -48,8 +48,14 @@ FIELDS = {
         lambda s: s.problem(contacts=[s.floor]).solution.contact(0),
         r"there is no solution yet",
     ),
-    "a contact by name": contact(
-        r"contact 'bottom': there are 1, counted from 0; .*0: \('bottom',\)", "bottom"
+    "a contact by its surface": contact(
+        r"contact 'bottom': there are 1, counted from 0; their positions and names, of which one "
+        r"was expected, are 0: obstacle of surface 'bottom'",
+        "bottom",
+    ),
+    "a contact by a name that two have": (
+        lambda s: s.twice.contact("obstacle of surface 'bottom'"),
+        r"contact .*bottom.*: there are 2, .* are 0: obstacle .*, 1: obstacle",
     ),
     "a contact counted from 1": contact(r"contact 1: there are 1, counted from 0", 1),
     "the last contact": contact(r"contact -1: there are 1, counted from 0", -1),

@@ -173,6 +173,13 @@ class Scene:
         return problem.solution
 
     @cached_property
+    def twice(self):
+        """A solution with two contacts of one name."""
+        problem = self.problem(contacts=[self.floor, self.floor])
+        problem.solve()
+        return problem.solution
+
+    @cached_property
     def bare(self):
         """A solution without contacts and stress."""
         problem = self.problem()

@@ -1,13 +1,15 @@
-"""What a user says of a contact besides its surfaces: how far it looks, and its gap."""
+"""What a user says of a contact besides its surfaces: its name, how far it looks, its gap."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from numbers import Real
+from typing import Any
 
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array, ArrayLike
+from tfeti_dolfinx.checks import checked_type
 from tfeti_dolfinx.errors import InputError
 
 # of the extent of the smaller surface: few nodes farther off ever touch in small strains, and those
@@ -15,6 +17,16 @@ from tfeti_dolfinx.errors import InputError
 REACH = 0.05
 
 Gap = str | float | Callable[[Array], ArrayLike]
+
+
+def give_name(contact: Any, default: str) -> None:
+    """Give a contact that has none its default name.
+
+    Raises:
+        InputError: Its name is not a text.
+    """
+    checked_type(contact.name, str, f"{default}: name", "a text")
+    object.__setattr__(contact, "name", contact.name or default)  # it is frozen
 
 
 def checked_reach(name: str, reach: float | None, extent: float) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from dolfinx.fem.petsc import interpolation_matrix
@@ -57,7 +58,11 @@ def body_forces(forces: Array, dofs: TornDofs, decomposition: Decomposition) -> 
 
 
 def vertex_tractions(
-    forces: Array, dofs: TornDofs, decomposition: Decomposition, names: list[str | int]
+    forces: Array,
+    dofs: TornDofs,
+    decomposition: Decomposition,
+    names: list[str | int],
+    thickness: Any = 1.0,
 ) -> tuple[Array, Array]:
     """Tractions whose moments with the hats of degree 1 are those of nodal forces. Collective.
 
@@ -66,12 +71,13 @@ def vertex_tractions(
         dofs: Dof maps.
         decomposition: The torn mesh.
         names: All contact surfaces.
+        thickness: What their areas are multiplied with, as in ``hat_integrals``.
 
     Returns:
         Force / ∫φ_i for each owned group that is a vertex of the surfaces, else 0, shape
         ``(g, gdim)``; and ∫φ_i, shape ``(g,)``.
     """
-    area = hat_integrals(dofs, decomposition, names)
+    area = hat_integrals(dofs, decomposition, names, thickness)
     if dofs.V.element.basix_element.degree > 1:
         forces = _on_hats(forces, dofs)
     on_surface = (area > 0.0)[:, None]

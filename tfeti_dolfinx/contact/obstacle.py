@@ -7,7 +7,7 @@ from dataclasses import KW_ONLY, dataclass, replace
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.contact.arguments import Gap, checked_gap, checked_reach
+from tfeti_dolfinx.contact.arguments import Gap, checked_gap, checked_reach, give_name
 from tfeti_dolfinx.contact.conditions import Shares, conditions, triplets
 from tfeti_dolfinx.contact.gaps import gaps_of
 from tfeti_dolfinx.contact.records import ContactRecords
@@ -45,6 +45,12 @@ class Obstacle:
         reach: Nodes farther than this from the obstacle get no row at first. After the solve
             all are checked, and those that came to overlap get theirs. Default: 5 % of the
             surface's extent.
+        name: For messages and ``solution.contact(name)``. Default: "obstacle of surface 'a'".
+
+    Example:
+        >>> table = tfeti.Plane((0, 0, -0.01), normal=(0, 0, 1))
+        >>> tfeti.Obstacle("bottom", table, gap=0.0, name="table").name
+        'table'
     """
 
     surface: str | int
@@ -52,14 +58,11 @@ class Obstacle:
     _: KW_ONLY
     gap: Gap = "geometry"
     reach: float | None = None
+    name: str = ""
 
     def __post_init__(self) -> None:
+        give_name(self, f"obstacle of surface {self.surface!r}")
         check_shape(self.shape, self.name)
-
-    @property
-    def name(self) -> str:
-        """Name for messages."""
-        return f"obstacle of surface {self.surface!r}"
 
     @property
     def surfaces(self) -> tuple[str | int, ...]:

@@ -9,7 +9,8 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.contact.arguments import Gap, checked_gap, checked_reach
+from tfeti_dolfinx.citations import cite
+from tfeti_dolfinx.contact.arguments import Gap, checked_gap, checked_reach, give_name
 from tfeti_dolfinx.contact.conditions import conditions
 from tfeti_dolfinx.contact.gaps import gaps_of
 from tfeti_dolfinx.contact.meeting import meeting
@@ -58,6 +59,11 @@ class Contact:
         reach: Surfaces farther apart than this make no rows at first; after the solve it is
             checked that none of them has come to overlap. Default: 5 % of the smaller surface's
             extent.
+        name: For messages and ``solution.contact(name)``. Default: "contact of 'a' with 'b'".
+
+    Example:
+        >>> tfeti.Contact("shaft", "hub", gap=-1e-3, secondary="hub").name
+        "contact of 'shaft' with 'hub'"
     """
 
     a: str | int
@@ -66,11 +72,10 @@ class Contact:
     secondary: str | int = "auto"
     gap: Gap = "geometry"
     reach: float | None = None
+    name: str = ""
 
-    @property
-    def name(self) -> str:
-        """Name for messages."""
-        return f"contact of {self.a!r} with {self.b!r}"
+    def __post_init__(self) -> None:
+        give_name(self, f"contact of {self.a!r} with {self.b!r}")
 
     @property
     def surfaces(self) -> tuple[str | int, ...]:
@@ -122,6 +127,7 @@ class Contact:
         Raises:
             InputError: As ``records``.
         """
+        cite("mortar")
         settled = self._named_first(decomposition)
         sides = settled._sides(dofs, decomposition)
         found = settled._meet(sides, dofs, contact, reach, reach)

@@ -69,6 +69,11 @@ class Plane(Placed):
     Args:
         point: A point of the plane.
         normal: Its normal, towards the free side; any length.
+
+    Example:
+        >>> floor = tfeti.Plane((0, -1), normal=(0, 2))
+        >>> floor.distance(np.array([[0.5], [0.25], [0.0]])).tolist()
+        [1.25]
     """
 
     def __init__(self, point: Point, normal: Point) -> None:
@@ -92,6 +97,13 @@ class Sphere(Placed):
         centre: The centre.
         radius: The radius.
         inside: Whether the bodies are inside the sphere.
+
+    Example:
+        >>> x = np.array([[3.0], [4.0], [0.0]])
+        >>> tfeti.Sphere((0, 0, 0), radius=2.0).distance(x).tolist()
+        [3.0]
+        >>> tfeti.Sphere((0, 0, 0), radius=6.0, inside=True).distance(x).tolist()
+        [1.0]
     """
 
     def __init__(self, centre: Point, radius: float, inside: bool = False) -> None:
@@ -122,6 +134,11 @@ class Cylinder(Sphere):
         axis: Direction of the axis, any length.
         radius: The radius.
         inside: Whether the bodies are inside the cylinder.
+
+    Example:
+        >>> bore = tfeti.Cylinder((0, 0, 0), axis=(0, 0, 1), radius=6.0, inside=True)
+        >>> bore.distance(np.array([[3.0], [4.0], [9.0]])).tolist()
+        [1.0]
     """
 
     def __init__(self, point: Point, axis: Point, radius: float, inside: bool = False) -> None:
@@ -141,6 +158,13 @@ class SignedDistance:
     Args:
         distance_of: Signed distance, positive on the free side, shape ``(n,)``.
         gradient_of: Its gradient, shape ``(3, n)`` (or ``(2, n)`` in 2D).
+
+    Example:
+        >>> bowl = tfeti.SignedDistance(
+        ...     lambda x: x[1] - x[0] ** 2, lambda x: np.stack((-2 * x[0], np.ones_like(x[1])))
+        ... )
+        >>> bowl.gradient(np.array([[0.5], [1.0], [0.0]])).ravel().tolist()
+        [-1.0, 1.0, 0.0]
     """
 
     distance_of: Callable[[Array], Array]

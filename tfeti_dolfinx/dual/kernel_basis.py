@@ -126,7 +126,7 @@ def _pins(motions: csc_array, body: Array) -> tuple[Array, csr_array]:
         chosen = independent(dense)
         pins.append(rows[chosen])
         inverses.append(np.linalg.inv(dense[chosen]))
-    return np.concatenate(pins), csr_array(block_diag(inverses))
+    return np.concatenate(pins), csr_array(block_diag([csr_array(X) for X in inverses]))
 
 
 def independent(columns: Array) -> Array:

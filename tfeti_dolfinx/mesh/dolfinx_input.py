@@ -54,6 +54,15 @@ def decompose(
     Raises:
         InputError: The cells are not triangles, quadrilaterals, tetrahedra or hexahedra, or
             tags, names or subdomains do not fit.
+
+    Example:
+        >>> square = dmesh.create_unit_square(MPI.COMM_WORLD, 8, 8)
+        >>> decomposition = tfeti.decompose(square, 4)
+        >>> decomposition.num_subdomains, decomposition.num_bodies
+        (4, 1)
+        >>> halves = tfeti.decompose(square, lambda x: x[0] > 0.5)
+        >>> halves.num_subdomains
+        2
     """
     _check_mesh(mesh)
     for tags, of_cells, what in ((cell_tags, True, "cell_tags"), (facet_tags, False, "facet_tags")):

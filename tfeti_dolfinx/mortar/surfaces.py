@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import ufl
@@ -38,7 +39,7 @@ def surface_facets(decomposition: Decomposition, name: str | int) -> Array:
 
 
 def hat_integrals(
-    dofs: TornDofs, decomposition: Decomposition, names: Sequence[str | int]
+    dofs: TornDofs, decomposition: Decomposition, names: Sequence[str | int], thickness: Any = 1.0
 ) -> Array:
     """Integrals ∫φ_i of the hats of degree 1 over the union of surfaces. Collective.
 
@@ -46,6 +47,7 @@ def hat_integrals(
         dofs: Dof maps of the displacement space, of any degree.
         decomposition: The torn mesh.
         names: Names or tags of the surfaces.
+        thickness: Weight of the integrals, a number or a scalar in UFL.
 
     Returns:
         One integral per owned group, zero off the surfaces and off the vertices, shape ``(g,)``.
@@ -55,8 +57,8 @@ def hat_integrals(
     W, node = dofs.hats
     tags = tuple(sorted({decomposition.surface(name) for name in names}))
     ds = ufl.Measure("ds", domain=W.mesh, subdomain_data=decomposition.facet_tags)
-    one = fem.Constant(W.mesh, 1.0)
-    form = fem.form(one * ufl.TestFunction(W) * ds(tags), jit_options=JIT_OPTIONS)
+    weight = fem.Constant(W.mesh, thickness) if isinstance(thickness, float) else thickness
+    form = fem.form(weight * ufl.TestFunction(W) * ds(tags), jit_options=JIT_OPTIONS)
     per_node = np.zeros(dofs.num_nodes)
     per_node[node] = fem.assemble_vector(form).array
     return dofs.reduce(per_node, np.add, 0.0)

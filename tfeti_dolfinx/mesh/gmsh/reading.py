@@ -58,6 +58,24 @@ def read_gmsh(
             the cells are of several types, or the subdomains do not fit. Of split files: one
             is missing, a name or a tag means different groups, a node has different
             coordinates, or a cell lies in two files.
+
+    Example:
+        gmsh meshes on rank 0; the other ranks give None.
+
+        >>> import gmsh
+        >>> comm, model = MPI.COMM_WORLD, None
+        >>> if comm.rank == 0:
+        ...     gmsh.initialize(interruptible=False)
+        ...     gmsh.option.setNumber("General.Terminal", 0)
+        ...     model = gmsh.model
+        ...     plate = model.occ.addRectangle(0, 0, 0, 2, 1)
+        ...     model.occ.synchronize()
+        ...     steel = model.addPhysicalGroup(2, [plate], name="steel")
+        ...     edges = model.addPhysicalGroup(1, [1, 2, 3, 4], name="edges")
+        ...     model.mesh.generate(2)
+        >>> decomposition = tfeti.read_gmsh(model, comm, subdomains=3)
+        >>> decomposition.num_subdomains, decomposition.body_names
+        (3, ["body 0 (volume 'steel')"])
     """
     checked_type(comm, MPI.Intracomm, "comm", "a communicator such as MPI.COMM_WORLD")
     seconds: dict[str, float] = {}

@@ -1,0 +1,57 @@
+"""``-citations`` prints the papers of the methods that a run has used, and no others."""
+
+import dataclasses
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tfeti_dolfinx.citations import PAPERS, cite
+from tfeti_dolfinx.options import Options
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def keys(text):
+    return {key for key in re.findall(r"@\w+\{([^,]+),", text) if not key.startswith("petsc")}
+
+
+def of(*methods):
+    return {key for method in methods for paper in PAPERS[method] for key in keys(paper)}
+
+
+@pytest.mark.parametrize(
+    ("demo", "methods"),
+    [
+        ("linear_3d", ("tfeti", "pcpg")),
+        ("cube_3d", ("tfeti", "smalse")),
+        ("stacked_blocks_3d", ("tfeti", "smalse", "mortar")),
+    ],
+)
+def test_citations_of_a_run(serial_only, demo, methods, tmp_path):
+    command = [sys.executable, ROOT / f"demos/{demo}.py", "--quick", "-citations"]
+    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    assert result.returncode == 0, result.stderr
+    ours = of(*PAPERS)
+    assert keys(result.stdout) & ours == of(*methods)
+    for key in of(*methods):
+        assert result.stdout.count(f"{{{key},") == 1
+
+
+def test_all_solvers_have_papers():
+    (solvers,) = (f.metadata["choices"] for f in dataclasses.fields(Options) if f.name == "qp_type")
+    assert set(solvers) - {"auto"} <= set(PAPERS)
+
+
+def test_papers_are_whole():
+    for papers in PAPERS.values():
+        for paper in papers:
+            assert paper.count("{") == paper.count("}")
+            for field in ("title", "author", "year"):
+                assert f"{field} = {{" in paper
+
+
+def test_methods_without_a_paper_are_passed_over():
+    cite("nobody's method")

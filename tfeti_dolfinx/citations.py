@@ -1,0 +1,79 @@
+"""The papers whose methods a run has used: PETSc's option ``-citations`` prints them at the end."""
+
+from __future__ import annotations
+
+from petsc4py import PETSc
+
+TOTAL_FETI = """@article{DostalHorakKucera2006,
+  title = {Total {FETI} -- an easier implementable variant of the {FETI} method
+    for numerical solution of elliptic {PDE}},
+  author = {Dost{\\'a}l, Zden{\\v{e}}k and Hor{\\'a}k, David and Ku{\\v{c}}era, Radek},
+  journal = {Communications in Numerical Methods in Engineering},
+  volume = {22}, pages = {1155--1162}, year = {2006}
+}
+"""
+FIXING_NODES = """@article{BrzobohatyEtAl2011,
+  title = {Cholesky decomposition with fixing nodes to stable computation of a generalized
+    inverse of the stiffness matrix of a floating structure},
+  author = {Brzobohat{\\'y}, Tom{\\'a}{\\v{s}} and Dost{\\'a}l, Zden{\\v{e}}k
+    and Kozubek, Tom{\\'a}{\\v{s}} and Kov{\\'a}{\\v{r}}, Petr
+    and Markopoulos, Alexandros},
+  journal = {International Journal for Numerical Methods in Engineering},
+  volume = {88}, pages = {493--509}, year = {2011}
+}
+"""
+SMALSE = """@book{Dostal2009,
+  title = {Optimal Quadratic Programming Algorithms},
+  author = {Dost{\\'a}l, Zden{\\v{e}}k},
+  publisher = {Springer}, year = {2009}
+}
+"""
+SCALABLE_CONTACT = """@article{DostalHorak2007,
+  title = {Theoretically supported scalable {FETI} for numerical solution of variational
+    inequalities},
+  author = {Dost{\\'a}l, Zden{\\v{e}}k and Hor{\\'a}k, David},
+  journal = {SIAM Journal on Numerical Analysis},
+  volume = {45}, pages = {500--513}, year = {2007}
+}
+"""
+MPRGP = """@article{DostalSchoberl2005,
+  title = {Minimizing quadratic functions subject to bound constraints with the rate of
+    convergence and finite termination},
+  author = {Dost{\\'a}l, Zden{\\v{e}}k and Sch{\\"o}berl, Joachim},
+  journal = {Computational Optimization and Applications},
+  volume = {30}, pages = {23--43}, year = {2005}
+}
+"""
+PCPG = """@article{FarhatMandelRoux1994,
+  title = {Optimal convergence properties of the {FETI} domain decomposition method},
+  author = {Farhat, Charbel and Mandel, Jan and Roux, Fran{\\c{c}}ois-Xavier},
+  journal = {Computer Methods in Applied Mechanics and Engineering},
+  volume = {115}, pages = {365--385}, year = {1994}
+}
+"""
+DUAL_MORTAR = """@article{Wohlmuth2000,
+  title = {A mortar finite element method using dual spaces for the {Lagrange} multiplier},
+  author = {Wohlmuth, Barbara I.},
+  journal = {SIAM Journal on Numerical Analysis},
+  volume = {38}, pages = {989--1012}, year = {2000}
+}
+"""
+
+# of each method, what a paper that uses it should cite
+PAPERS = {
+    "tfeti": (TOTAL_FETI, FIXING_NODES),
+    "pcpg": (PCPG,),
+    "smalse": (SCALABLE_CONTACT, SMALSE, MPRGP),
+    "mortar": (DUAL_MORTAR,),
+}
+
+
+def cite(*methods: str) -> None:
+    """Let ``-citations`` print the papers of these methods, each once.
+
+    Args:
+        methods: Names in ``PAPERS``; those of methods without a paper are passed over.
+    """
+    for method in methods:
+        for paper in PAPERS.get(method, ()):
+            PETSc.Sys.registerCitation(paper)
