@@ -88,6 +88,7 @@ def problem(
     clamped=("left",),
     degree=1,
     loaded="top",
+    extensions=None,
     **options,
 ):
     """A box, some sides clamped, a traction on another."""
@@ -109,6 +110,7 @@ def problem(
         decomposition,
         stress=hooke(),
         petsc_options=options,
+        extensions=extensions,
     )
 
 

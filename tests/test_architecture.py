@@ -26,6 +26,7 @@ ROOMS = [
     ["fields"],
     ["solution"],
     ["report_filling", "solver"],
+    ["extensions"],
     ["system"],
     ["problem"],
     ["draw"],

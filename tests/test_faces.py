@@ -45,7 +45,7 @@ def dual(request):
 def mask(dual, kept):
     """The face of the equality rows and of those contact rows that are kept."""
     free = np.ones(dual.constraints.num_rows, dtype=bool)
-    bounded = dual.constraints.sets.normals
+    bounded = np.arange(len(free))[dual.constraints.sets.normals]
     free[bounded] = kept(bounded)
     return face_of(free, np.where(free, Status.TOUCHING, Status.OPEN))
 
@@ -53,7 +53,7 @@ def mask(dual, kept):
 def sliding(dual):
     """A face of pairs of contact rows, one direction for two rows, as slip has it."""
     m = dual.constraints.num_rows
-    bounded = dual.constraints.sets.normals
+    bounded = np.arange(m)[dual.constraints.sets.normals]
     first, rest = np.setdiff1d(np.arange(m), bounded), len(bounded) // 2
     angle = np.arange(rest) + 0.3
     rows = np.concatenate((first, bounded[0 : 2 * rest : 2], bounded[1 : 2 * rest : 2]))
@@ -136,7 +136,7 @@ def test_the_particular_solution_of_a_face(dual, kind):
     left = dual.coarse.e - dual.coarse.G(lam.array_r)
     Gt = gathered(dual, face.restricted(dual.coarse.Gt.toarray()))
     rank = np.linalg.matrix_rank(Gt, tol=1e-9 * np.linalg.norm(Gt, 2))
-    if rank == dual.coarse.dimension - dual.coarse.free_motions.count:
+    if rank == dual.coarse.dimension - dual.coarse.num_free_motions:
         assert np.linalg.norm(left) <= 1e-9 * np.linalg.norm(dual.coarse.e)
     coarse.destroy()
 
@@ -145,7 +145,7 @@ def test_some_faces_lack_rank(dual):
     """The tests above are about them, too."""
     Gt = gathered(dual, FACES["open"](dual).restricted(dual.coarse.Gt.toarray()))
     rank = np.linalg.matrix_rank(Gt, tol=1e-9 * np.linalg.norm(Gt, 2))
-    assert rank < dual.coarse.dimension - dual.coarse.free_motions.count
+    assert rank < dual.coarse.dimension - dual.coarse.num_free_motions
 
 
 def test_factors_of_faces_are_counted_apart(dual):

@@ -75,6 +75,20 @@ def scene(request):
     made.problem.destroy()
 
 
+def test_the_same_load_again_costs_next_to_nothing(scene):
+    first = scene.solve()
+    before, lam = first.u.copy(), first.lam.copy()
+    second = scene.solve()
+    report = scene.problem.report
+    assert report.F_multiplications + report.power_method_multiplications <= 2
+    assert counters(report) == [0] * len(COUNTERS)
+    assert set(report.reused) >= MADE_ONCE | {"right side", "load", "linear term"}
+    assert distance(second, first) <= 1e-9
+    assert second is not first
+    assert np.array_equal(first.u, before)
+    assert np.array_equal(first.lam, lam)
+
+
 def test_another_load_makes_no_row_and_no_factor(scene):
     first = scene.solve()
     before = first.displacement.x.array.copy()

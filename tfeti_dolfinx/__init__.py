@@ -10,6 +10,7 @@ from tfeti_dolfinx.errors import (
     NoSolutionError,
     TfetiError,
 )
+from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dolfinx_input import decompose
 from tfeti_dolfinx.mesh.gmsh.reading import read_gmsh
@@ -26,6 +27,7 @@ __all__ = [
     "ConvergenceError",
     "Cylinder",
     "Decomposition",
+    "Extensions",
     "FactorError",
     "InputError",
     "NoSolutionError",

@@ -16,6 +16,7 @@ from tfeti_dolfinx.compat import require_real_petsc
 from tfeti_dolfinx.contact.search import ContactPartner, checked_contacts
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
+from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.fields import Stress, checked_stress
 from tfeti_dolfinx.form_checks import check_mesh, check_same_space, displacement_space
 from tfeti_dolfinx.gluing.glue import Gluing
@@ -26,7 +27,7 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.option_parsing import factor_options, parse_options
 from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.report_filling import fill_result
-from tfeti_dolfinx.solution import Multipliers, Solution
+from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solver import conclude, resolve_types, solve_dual
 from tfeti_dolfinx.system import System
 from tfeti_dolfinx.timing import stage
@@ -51,6 +52,7 @@ class ContactProblem:
         petsc_options_prefix: Prefix of the options.
         form_compiler_options: As in DOLFINx.
         jit_options: As in DOLFINx.
+        extensions: Parts of one's own: a Block, a feasible set, a preconditioner, a K⁺, a monitor.
 
     Attributes:
         u: The displacement of the last solve.
@@ -74,6 +76,7 @@ class ContactProblem:
         petsc_options_prefix: str = "tfeti_",
         form_compiler_options: dict[str, Any] | None = None,
         jit_options: dict[str, Any] | None = None,
+        extensions: Extensions | None = None,
     ) -> None:
         require_real_petsc()
         self.options = parse_options(petsc_options, petsc_options_prefix)
@@ -105,6 +108,9 @@ class ContactProblem:
             self.options,
             petsc_options_prefix,
         )
+        if extensions is not None:
+            checked_type(extensions, Extensions, "extensions", "tfeti_dolfinx.Extensions")
+            self._system.extensions = extensions
         self._system.factor_options = factor_options(petsc_options, petsc_options_prefix)
 
     @property
@@ -248,12 +254,13 @@ class ContactProblem:
             if self._start is not None:
                 earlier, lam, mu = self._start
                 start = (gluing.multipliers(earlier, lam), mu)
-            result, accuracy = solve_dual(dual, self.options, qp_type, start)
+            monitor = system.extensions.monitor
+            result, accuracy = solve_dual(dual, self.options, qp_type, start, monitor)
         with stage("recovery", report.seconds):
             solution = self._solution = Solution(
                 u=accuracy.u,
-                multipliers=Multipliers(np.array(result.lam.array_r), result.face.carrying),
-                dofs=self.dofs,
+                lam=np.array(result.lam.array_r),
+                carrying=result.face.carrying,
                 decomposition=self.decomposition,
                 gluing=gluing,
                 contacts=system.search.contacts,

@@ -20,7 +20,6 @@ from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.fields import Stress, cellwise, checked_stress, from_vertices, nodal, von_mises
 from tfeti_dolfinx.gluing.glue import Gluing
 from tfeti_dolfinx.mesh.decomposition import Decomposition
-from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import group_points, hat_integrals
 
 
@@ -55,19 +54,6 @@ class ContactData:
     area: Array
 
 
-@dataclass(frozen=True)
-class Multipliers:
-    """Multipliers of this rank's rows.
-
-    Attributes:
-        lam: λ, shape ``(m,)``.
-        carrying: Flags of the rows that carry a force, shape ``(m,)``.
-    """
-
-    lam: Array
-    carrying: Array
-
-
 class Solution:
     """What a solve has found; fields are made when they are first asked for.
 
@@ -76,8 +62,8 @@ class Solution:
 
     Args:
         u: Displacement in primal order, shape ``(num_nodes * bs,)``.
-        multipliers: Multipliers of this rank's rows.
-        dofs: Dof maps.
+        lam: Multipliers of this rank's rows.
+        carrying: Flags of this rank's rows that carry a force.
         decomposition: The torn mesh.
         gluing: Rows and contact records.
         contacts: Obstacles and pairs, the secondary surface of a pair first.
@@ -86,7 +72,6 @@ class Solution:
     Attributes:
         u: Displacement in primal order.
         lam: Multipliers of this rank's rows.
-        carrying: Flags of the rows that carry a force.
         contacts: The contacts with their sides decided: ``contacts[i].surfaces[0]`` has the
             multipliers and the pressure.
     """
@@ -94,15 +79,15 @@ class Solution:
     def __init__(
         self,
         u: Array,
-        multipliers: Multipliers,
-        dofs: TornDofs,
+        lam: Array,
+        carrying: Array,
         decomposition: Decomposition,
         gluing: Gluing,
         contacts: Sequence[ContactPartner] = (),
         stress: Stress | None = None,
     ) -> None:
-        self.u, self.lam, self.carrying = u, multipliers.lam, multipliers.carrying
-        self.dofs, self.decomposition, self.gluing = dofs, decomposition, gluing
+        self.u, self.lam, self.carrying = u, lam, carrying
+        self.decomposition, self.gluing, self.dofs = decomposition, gluing, gluing.dofs
         self.contacts, self._stress = list(contacts), stress
 
     @cached_property
@@ -228,15 +213,15 @@ class Solution:
     @cached_property
     def force(self) -> Array:
         """Normal force s_i λ_i of each contact condition of this rank, 0 without a row."""
-        contact = self.gluing.contact
         scale = np.zeros(len(self.gluing.records))
-        scale[contact.condition] = contact.scale
+        scale[self.gluing.contact.condition] = self.gluing.contact.scale
         return scale * self._of_conditions(self.lam)
 
     def _of_conditions(self, of_rows: Array) -> Array:
         """Values of the rows of each contact condition of this rank, 0 without a row."""
         values = np.zeros(len(self.gluing.records), dtype=of_rows.dtype)
-        values[self.gluing.contact.condition] = of_rows[self.gluing.constraints.sets.normals]
+        normals = self.gluing.constraints.sets.normals
+        values[self.gluing.contact.condition] = of_rows[normals]
         return values
 
     @cached_property

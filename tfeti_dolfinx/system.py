@@ -13,7 +13,9 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.assembly import Forms
 from tfeti_dolfinx.contact.search import ContactPartner, ContactSearch
 from tfeti_dolfinx.dual.dual import Dual
+from tfeti_dolfinx.dual.operator import PRECONDITIONERS
 from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.gluing.glue import Gluing, glue
 from tfeti_dolfinx.gluing.prescribed import Prescribed, prescribe
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -28,6 +30,7 @@ from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
 from tfeti_dolfinx.subdomains.data import Counters
 from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.kernel import mode_names
+from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 from tfeti_dolfinx.timing import stage
@@ -51,6 +54,7 @@ class System:
         forms: The compiled forms.
         bcs: Dirichlet conditions.
         factor_options: Options that PETSc's factors read, without prefix.
+        extensions: Parts that the program brings.
         spectrum: Extreme eigenvalues of B Bᵀ, if somebody has put them here.
     """
 
@@ -68,6 +72,7 @@ class System:
         self._dofs, self._decomposition = dofs, decomposition
         self._options, self._prefix = options, prefix
         self.factor_options: dict[str, Any] = {}
+        self.extensions = Extensions()
         self.spectrum: dict[str, float] = {}
         self._stages, self._counters, self._counted = Stages(), Counters(), 0
         self._search: ContactSearch | None = None
@@ -193,13 +198,14 @@ class System:
 
     def _factor(self) -> None:
         trace, counters = self.gluing.constraints.trace, self._counters
-        kplus_type, prefix = self._options.kplus_type, f"{self._prefix}sub_"
+        kplus = self.extensions.kplus or KPLUS_TYPES[self._options.kplus_type]
+        prefix = f"{self._prefix}sub_"
         data = subdomain_data(self._dofs, self._decomposition, self._K, self._f, trace)
         del self._K  # the Blocks have it
         with added_options(self._prefix, self.factor_options):
             self._subdomains = make_subdomains(
                 data,
-                lambda s: SparseBlock(s, counters, kplus_type, prefix),
+                self.extensions.block or (lambda s: SparseBlock(s, counters, kplus, prefix)),
                 self._decomposition,
                 counters,
             )
@@ -211,14 +217,21 @@ class System:
         decomposition, dofs = self._decomposition, self._dofs
         rows = dofs.comm.allreduce(len(self.gluing.constraints.sets.normals))
         _, pc_type = resolve_types(self._options, rows, self._prefix)
+        own = self.extensions.preconditioner
+        if own is not None and pc_type == "none":
+            raise InputError(
+                "extensions: a preconditioner is given, but the solver takes none, or "
+                f"-{self._prefix}pc_type is none; expected a solver that takes one, say pcpg"
+            )
         with added_options(self._prefix, self.factor_options):
             self._dual = Dual(
                 constraints=self.gluing.constraints,
                 subdomains=_made(self._subdomains),
                 body_names=decomposition.body_names,
                 mode_names=mode_names(decomposition.mesh.geometry.dim, dofs.bs),
-                pc_type=pc_type,
+                preconditioner=own or PRECONDITIONERS.get(pc_type),
                 options_prefix=self._prefix,
+                feasible=self.extensions.feasible_set,
             )
 
     def _make_linear_term(self) -> None:

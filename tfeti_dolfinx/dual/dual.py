@@ -11,8 +11,8 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.dual.naming import listed
 from tfeti_dolfinx.dual.operator import (
-    PRECONDITIONERS,
     DualOperator,
+    MakePreconditioner,
     ScaledRows,
     dual_operator,
     linear_term,
@@ -48,7 +48,7 @@ class Dual:
         subdomains: This rank's Blocks.
         body_names: Names of all bodies.
         mode_names: Names of their candidate modes.
-        pc_type: Preconditioner: none, lumped or dirichlet.
+        preconditioner: Makes a preconditioner from B D⁻¹ and the Blocks, or None.
         options_prefix: Prefix of all PETSc options.
         feasible: Makes the set of multipliers from B and c; default λ_N ≥ 0.
 
@@ -72,7 +72,7 @@ class Dual:
         subdomains: Subdomains,
         body_names: Sequence[str],
         mode_names: Sequence[str],
-        pc_type: str,
+        preconditioner: MakePreconditioner | None = None,
         options_prefix: str = "tfeti_",
         feasible: FeasibleLaw = no_tension,
     ) -> None:
@@ -83,9 +83,9 @@ class Dual:
         self.F = dual_operator(B, subdomains.blocks)
         self.preconditioner: DualOperator | None = None
         self._scaled: ScaledRows | None = None
-        if pc_type != "none":
+        if preconditioner is not None:
             self._scaled = ScaledRows(B, constraints.weights)
-            self.preconditioner = PRECONDITIONERS[pc_type](self._scaled, subdomains.blocks)
+            self.preconditioner = preconditioner(self._scaled, subdomains.blocks)
         bounded = constraints.sets.normals
         self.coarse = CoarseSpace(B, subdomains, bounded, f"{options_prefix}coarse_")
         self.num_inequalities = comm.allreduce(len(bounded))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
 
@@ -125,7 +125,11 @@ def dirichlet_preconditioner(B: RowMatrix, blocks: Sequence[Block]) -> DualOpera
     return DualOperator(B, local_operator(blocks, "schur"))
 
 
-PRECONDITIONERS = {"lumped": lumped_preconditioner, "dirichlet": dirichlet_preconditioner}
+MakePreconditioner = Callable[[RowMatrix, Sequence[Block]], DualOperator]
+PRECONDITIONERS: dict[str, MakePreconditioner] = {
+    "lumped": lumped_preconditioner,
+    "dirichlet": dirichlet_preconditioner,
+}
 
 
 def linear_term(B: PETSc.Mat, c: PETSc.Vec, subdomains: Subdomains) -> PETSc.Vec:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Protocol
 
@@ -140,4 +140,6 @@ def _regular_values(K: Any, R: Array, fixing_dofs: Array) -> Iterator[None]:
         K.data[places] = kept
 
 
-KPLUS_TYPES = {"regularized": Regularised}
+# from K, its kernel, the unknowns of fixing nodes and a prefix of options to K⁺
+MakeInverse = Callable[[Any, Array, Array, str], GeneralisedInverse]
+KPLUS_TYPES: dict[str, MakeInverse] = {"regularized": Regularised}

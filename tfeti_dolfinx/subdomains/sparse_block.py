@@ -17,8 +17,9 @@ from tfeti_dolfinx.subdomains.indefinite import why_indefinite
 from tfeti_dolfinx.subdomains.input_checks import check_stiffness
 from tfeti_dolfinx.subdomains.kernel import candidate_modes, fixing_nodes, kernel_of
 from tfeti_dolfinx.subdomains.kplus import (
-    KPLUS_TYPES,
     GeneralisedInverse,
+    MakeInverse,
+    Regularised,
     regularised,
     same_pattern,
     with_entries,
@@ -38,7 +39,7 @@ class SparseBlock(BlockDefaults):
     Args:
         data: The subdomain.
         counters: Counts factorisations.
-        kplus_type: Kind of the generalised inverse.
+        kplus: Makes the generalised inverse.
         prefix: Prefix of the factors' PETSc options.
 
     Raises:
@@ -51,11 +52,11 @@ class SparseBlock(BlockDefaults):
         self,
         data: SubdomainData,
         counters: Counters | None = None,
-        kplus_type: str = "regularized",
+        kplus: MakeInverse = Regularised,
         prefix: str = "tfeti_sub_",
     ) -> None:
         self._counters = Counters() if counters is None else counters
-        self._kplus_type, self._prefix = kplus_type, prefix
+        self._kplus, self._prefix = kplus, prefix
         self._K: Any = None
         self._pinv: GeneralisedInverse | None = None
         super().__init__(data)
@@ -133,9 +134,8 @@ class SparseBlock(BlockDefaults):
             if self._pinv is not None:
                 self._pinv.refactor(self.kernel)
                 return
-            kplus = KPLUS_TYPES[self._kplus_type]
             self._counters.analyses += 1
-            self._pinv = kplus(self._K, self.kernel, self._fixing_dofs, self._prefix)
+            self._pinv = self._kplus(self._K, self.kernel, self._fixing_dofs, self._prefix)
         except NotPositiveDefiniteError as error:
             self._pinv = None
             why = why_indefinite(self._K, self.kernel, self._fixing_dofs, self.x, self._prefix)
