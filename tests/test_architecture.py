@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "tfeti_dolfinx"
 # the rooms in their order; those of one line may not import from each other
 ROOMS = [
     ["errors", "arrays", "citations", "stages", "version"],
-    ["checks", "compat", "parallel", "timing"],
+    ["checks", "compat", "parallel", "states", "timing"],
     ["described"],
     ["mesh"],
     ["mortar"],
@@ -62,7 +62,7 @@ def test_imports_go_one_way(path):
 
 @pytest.mark.parametrize("path", modules(), ids=lambda p: str(p.relative_to(PACKAGE)))
 def test_files_stay_small(path):
-    assert len(path.read_text().splitlines()) <= 283
+    assert len(path.read_text().splitlines()) <= 280
 
 
 def test_only_compat_knows_versions():
@@ -95,7 +95,7 @@ def functions(path):
 
 
 # what a user calls may have as many arguments as the user needs
-DOORS = {"problem.py", "plot.py", "conditions.py", "smalse.py", "build.py", "sparse_block.py"}
+DOORS = {"problem.py", "plot.py"}
 
 
 @pytest.mark.parametrize("path", modules(), ids=lambda p: str(p.relative_to(PACKAGE)))

@@ -146,3 +146,64 @@ def test_a_problem_that_was_destroyed_is_solved_anew(scene):
     second = scene.solve()
     assert min(counters(scene.problem.report)) == 1 or scene.problem.report.factorizations > 1
     assert distance(second, first) <= 1e-9
+
+
+def test_another_gap_makes_no_row():
+    scene = Repeated("hexahedron", contact=True)
+    first = scene.solve()
+    before = first.remaining_gap.copy()
+    name = scene.problem.contacts[0].name
+    scene.problem.update(gap={name: 0.01})
+    second = scene.solve()
+    assert counters(scene.problem.report) == [0] * len(COUNTERS)
+    assert distance(second, first) > 1e-3
+    other = Repeated("hexahedron", contact=True)
+    other.problem.update(gap={0: 0.01})
+    assert distance(second, other.solve()) <= 1e-8
+    assert np.array_equal(first.remaining_gap, before)
+    for item in (scene, other):
+        item.problem.destroy()
+
+
+def test_other_forms_and_conditions():
+    scene, other = Repeated("triangle"), Repeated("triangle")
+    first = scene.solve()
+    d, V = scene.problem.decomposition, scene.problem.dofs.V
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+    scene.problem.update(load=ufl.dot(2.0 * scene.load, v) * ds(d.surface("top")))
+    twice = scene.solve()
+    assert counters(scene.problem.report) == [0] * len(COUNTERS)
+    assert distance(twice, other.solve(load=-0.1)) <= 1e-8
+    scene.problem.update(stiffness=2.0 * ufl.inner(hooke()(u), strain(v)) * ufl.dx)
+    assert distance(scene.solve(), other.solve(load=-0.1, E=2.0)) <= 1e-8
+    right = fem.locate_dofs_topological(V, 1, d.facets("right"))
+    scene.problem.update(values=[fem.dirichletbc(scene.held, right, V)])
+    mirrored = scene.solve()
+    assert scene.problem.report.gluings == 1
+    assert scene.problem.report.factorizations == 0
+    assert scene.problem.report.searches == 0
+    assert distance(mirrored, first) > 1e-2
+    for item in (scene, other):
+        item.problem.destroy()
+
+
+def test_what_an_update_cannot_take_is_named():
+    scene = Repeated("triangle")
+    V = scene.problem.dofs.V
+    with pytest.raises(tfeti.InputError, match="contact 'nobody': there are 1"):
+        scene.problem.update(gap={"nobody": 0.1})
+    with pytest.raises(tfeti.InputError, match="expected a dictionary from contacts"):
+        scene.problem.update(gap=0.1)
+    with pytest.raises(tfeti.InputError, match="expected a list of Dirichlet conditions"):
+        scene.problem.update(values=5)
+    other = Repeated("triangle")
+    v = ufl.TestFunction(other.problem.dofs.V)
+    with pytest.raises(tfeti.InputError):
+        scene.problem.update(load=ufl.dot(other.load, v) * ufl.dx)
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    with pytest.raises(tfeti.InputError):
+        scene.problem.update(load=ufl.inner(hooke()(u), strain(v)) * ufl.dx)
+    assert distance(scene.solve(), other.solve()) <= 1e-8
+    for item in (scene, other):
+        item.problem.destroy()

@@ -46,7 +46,8 @@ from tfeti_dolfinx.mesh.gmsh.reading import read_gmsh
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.report import Report
-from tfeti_dolfinx.solution import ContactData, ContactStatus, Solution
+from tfeti_dolfinx.solution import Solution
+from tfeti_dolfinx.states import ContactData, ContactStatus
 from tfeti_dolfinx.version import __version__
 
 __all__ = [

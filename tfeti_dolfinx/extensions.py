@@ -1,12 +1,14 @@
-"""Parts of a solve that a program may bring itself."""
+"""How to solve: options, and parts that a program may bring itself."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from tfeti_dolfinx.dual.dual import FeasibleLaw, no_tension
 from tfeti_dolfinx.dual.operator import MakePreconditioner
+from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.monitors import Monitor
 from tfeti_dolfinx.subdomains.block import Block
 from tfeti_dolfinx.subdomains.data import SubdomainData
@@ -32,3 +34,20 @@ class Extensions:
     preconditioner: MakePreconditioner | None = None
     feasible_set: FeasibleLaw = no_tension
     monitor: Monitor | None = None
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How to solve.
+
+    Attributes:
+        options: Options.
+        prefix: Prefix of all options.
+        factor_options: Options that PETSc's factors read, without prefix.
+        extensions: Parts that the program brings.
+    """
+
+    options: Options
+    prefix: str
+    factor_options: Mapping[str, Any]
+    extensions: Extensions

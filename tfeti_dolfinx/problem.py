@@ -13,10 +13,11 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.assembly import Forms
 from tfeti_dolfinx.checks import checked_type
 from tfeti_dolfinx.compat import require_real_petsc
+from tfeti_dolfinx.contact.arguments import Gap, position_of
 from tfeti_dolfinx.contact.search import ContactPartner, checked_contacts
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
-from tfeti_dolfinx.extensions import Extensions
+from tfeti_dolfinx.extensions import Extensions, Settings
 from tfeti_dolfinx.fields import Stress, check_stress, checked_thickness
 from tfeti_dolfinx.form_checks import check_same_space, displacement_space
 from tfeti_dolfinx.gluing.glue import Gluing
@@ -27,8 +28,9 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.option_parsing import factor_options, parse_options
 from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.report_filling import fill_result
-from tfeti_dolfinx.solution import Multipliers, Solution
+from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solver import conclude, resolve_types, solve_dual
+from tfeti_dolfinx.states import Multipliers
 from tfeti_dolfinx.system import System
 from tfeti_dolfinx.timing import stage
 
@@ -84,6 +86,10 @@ class ContactProblem:
     ) -> None:
         require_real_petsc()
         self.options = parse_options(petsc_options, petsc_options_prefix)
+        extensions = Extensions() if extensions is None else extensions
+        checked_type(extensions, Extensions, "extensions", "tfeti_dolfinx.Extensions")
+        for_factors = factor_options(petsc_options, petsc_options_prefix)
+        self._settings = Settings(self.options, petsc_options_prefix, for_factors, extensions)
         checked_type(
             decomposition, Decomposition, "decomposition", "what decompose or read_gmsh return"
         )
@@ -97,7 +103,6 @@ class ContactProblem:
         self._stress = check_stress(stress, self.u, decomposition)
         self._thickness = checked_thickness(thickness, decomposition)
         self.report = Report(seconds=dict(decomposition.seconds))
-        self._prefix = petsc_options_prefix
         self._solution: Solution | None = None
         self._start: tuple[Gluing, Array, Array] | None = None
         with stage("assembly", self.report.seconds):
@@ -105,18 +110,8 @@ class ContactProblem:
         with stage("gluing", self.report.seconds):
             self.dofs = TornDofs(V, decomposition)
         self._system = System(
-            forms,
-            self.bcs,
-            self.contacts,
-            self.dofs,
-            decomposition,
-            self.options,
-            petsc_options_prefix,
+            forms, self.bcs, self.contacts, self.dofs, decomposition, self._settings
         )
-        if extensions is not None:
-            checked_type(extensions, Extensions, "extensions", "tfeti_dolfinx.Extensions")
-            self._system.extensions = extensions
-        self._system.factor_options = factor_options(petsc_options, petsc_options_prefix)
 
     @property
     def solution(self) -> Solution:
@@ -164,7 +159,7 @@ class ContactProblem:
         self._count()
         self._system.search.warn_of_unmet()
         if self.options.view and self.decomposition.comm.rank == 0:
-            print(self.options.view_text(self._prefix), self.report, sep="\n", flush=True)
+            print(self.options.view_text(self._settings.prefix), self.report, sep="\n", flush=True)
         return self.u
 
     def update(
@@ -173,17 +168,20 @@ class ContactProblem:
         load: ufl.Form | None = None,
         values: Sequence[fem.DirichletBC] | None = None,
         stiffness: ufl.Form | None = None,
+        gap: Mapping[int | str, Gap] | None = None,
     ) -> None:
         """Take other forms or conditions; the next ``solve`` makes again what depends on them.
 
         Not needed where constants, functions or Dirichlet values have only got other values:
         ``solve`` sees that itself. Of conditions on the same unknowns only the values count; a
-        new load or new values need no row and no factor, a new stiffness no search.
+        new load, new values or new gaps need no row and no factor, a new stiffness no search.
 
         Args:
             load: A linear form instead of ``L``.
             values: Dirichlet conditions instead of ``bcs``.
             stiffness: A bilinear form on the same space instead of ``a``.
+            gap: For contacts, by position or name, what their ``gap=`` is from now on. Rows stay;
+                nodes that have none and come to overlap get theirs, as ever.
 
         Raises:
             InputError: Something given does not fit; the message names it.
@@ -196,6 +194,10 @@ class ContactProblem:
             self._system.forms.replace_stiffness(stiffness)
         if load is not None:
             self._system.forms.replace_load(load)
+        if gap is not None:
+            checked_type(gap, Mapping, "gap", "a dictionary from contacts to gaps")
+            for which, value in gap.items():
+                self._system.set_gap(position_of(self.contacts, which), value)
 
     def _count(self) -> None:
         """What the solve has made and taken."""
@@ -248,13 +250,13 @@ class ContactProblem:
                 system.spectrum = extreme_eigenvalues(gluing.constraints)
         report.spectrum = system.spectrum
         dual.forget_counts()
-        qp_type, _ = resolve_types(self.options, dual.num_inequalities, self._prefix)
+        qp_type, _ = resolve_types(self.options, dual.num_inequalities, self._settings.prefix)
         with stage("qp", report.seconds):
             start = None
             if self._start is not None:
                 earlier, lam, mu = self._start
                 start = (gluing.multipliers(earlier, lam), mu)
-            monitor = system.extensions.monitor
+            monitor = self._settings.extensions.monitor
             result, accuracy = solve_dual(dual, self.options, qp_type, start, monitor)
         with stage("recovery", report.seconds):
             solution = self._solution = Solution(
@@ -262,7 +264,7 @@ class ContactProblem:
                 multipliers=Multipliers(np.array(result.lam.array_r), result.face.carrying),
                 decomposition=self.decomposition,
                 gluing=gluing,
-                contacts=system.search.contacts,
+                contacts=list(system.search.contacts),
                 stress=self._stress,
                 thickness=self._thickness,
             )

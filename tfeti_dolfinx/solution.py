@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from enum import IntEnum
 from functools import cached_property
 from typing import Any
 
@@ -12,7 +10,7 @@ import numpy as np
 from dolfinx import fem
 
 from tfeti_dolfinx.arrays import Array, sum_rows
-from tfeti_dolfinx.checks import is_whole, shown
+from tfeti_dolfinx.contact.arguments import position_of
 from tfeti_dolfinx.contact.forces import BodyForces, body_forces, nodal_forces, vertex_tractions
 from tfeti_dolfinx.contact.records import remaining_gaps
 from tfeti_dolfinx.contact.search import ContactPartner
@@ -21,54 +19,7 @@ from tfeti_dolfinx.fields import Stress, cellwise, checked_stress, from_vertices
 from tfeti_dolfinx.gluing.glue import Gluing
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mortar.surfaces import group_points, hat_integrals
-
-
-class ContactStatus(IntEnum):
-    """Status of a node."""
-
-    NONE = 0
-    OPEN = 1
-    TOUCHING = 2
-
-
-@dataclass(frozen=True)
-class ContactData:
-    """State of the conditions of one contact on this rank, one row per node.
-
-    A node is on one rank only: sums over all ranks are those of the contact.
-
-    Attributes:
-        points: Nodes where they were before the deformation, shape ``(n, 3)``.
-        normal: Direction in which a node may not go further, of unit length, out of its body:
-            the contact pushes it with −force·normal, shape ``(n, gdim)``.
-        force: Normal force on the node, 0 or more, shape ``(n,)``.
-        pressure: Force over area, shape ``(n,)``.
-        area: ∫φ_i of the node's hat over the surface, of a pair over what the other side covers,
-            times the thickness, shape ``(n,)``.
-        gap: Remaining distance, shape ``(n,)``.
-        status: ContactStatus: TOUCHING where there is a force, else OPEN, shape ``(n,)``.
-    """
-
-    points: Array
-    normal: Array
-    force: Array
-    pressure: Array
-    area: Array
-    gap: Array
-    status: Array
-
-
-@dataclass(frozen=True)
-class Multipliers:
-    """Multipliers of this rank's rows.
-
-    Attributes:
-        lam: λ, shape ``(m,)``.
-        carrying: Flags of the rows that carry a force, shape ``(m,)``.
-    """
-
-    lam: Array
-    carrying: Array
+from tfeti_dolfinx.states import ContactData, ContactStatus, Multipliers
 
 
 class Solution:
@@ -89,7 +40,6 @@ class Solution:
     Attributes:
         u: Displacement in primal order.
         lam: Multipliers of this rank's rows.
-        carrying: Flags of the rows that carry a force.
         contacts: The contacts with their sides decided: ``contacts[i].surfaces[0]`` has the
             multipliers and the pressure.
     """
@@ -166,14 +116,18 @@ class Solution:
         np.minimum.at(values, self.gluing.records.group, self.remaining_gap)
         return self._field(np.where(self._vertices, values, 0.0), self._vertices, "gap")
 
+    @property
+    def _status_of_conditions(self) -> Array:
+        """ContactStatus of each contact condition of this rank."""
+        carrying = self._of_conditions(self.carrying)
+        return np.where(carrying, ContactStatus.TOUCHING, ContactStatus.OPEN)
+
     @cached_property
     def status(self) -> fem.Function:
         """ContactStatus of each node, as a number."""
         values = np.full(self.dofs.num_groups, float(ContactStatus.NONE))
-        touching = np.where(
-            self._of_conditions(self.carrying), ContactStatus.TOUCHING, ContactStatus.OPEN
-        )
-        np.maximum.at(values, self.gluing.records.group, touching.astype(float))
+        known = self._status_of_conditions.astype(float)
+        np.maximum.at(values, self.gluing.records.group, known)
         function = self._field(values, self._vertices, "status")
         function.x.array[:] = np.floor(function.x.array)  # between nodes: the lesser of the two
         return function
@@ -212,7 +166,7 @@ class Solution:
             InputError: There is no such contact, or several have the name.
         """
         records = self.gluing.records
-        own = records.contact == self._position(which)
+        own = records.contact == position_of(self.contacts, which)
         return ContactData(
             points=group_points(self.dofs)[records.group[own]],
             normal=records.normal[own],
@@ -220,19 +174,7 @@ class Solution:
             pressure=self.contact_pressure[own],
             area=self.area[own],
             gap=self.remaining_gap[own],
-            status=np.where(self.force[own] > 0.0, ContactStatus.TOUCHING, ContactStatus.OPEN),
-        )
-
-    def _position(self, which: int | str) -> int:
-        names = [contact.name for contact in self.contacts]
-        if is_whole(which) and 0 <= which < len(names):
-            return int(which)
-        if isinstance(which, str) and names.count(which) == 1:
-            return names.index(which)
-        known = ", ".join(f"{i}: {name}" for i, name in enumerate(names)) or "none"
-        raise InputError(
-            f"contact {shown(which)}: there are {len(names)}, counted from 0; their positions and "
-            f"names, of which one was expected, are {known}"
+            status=self._status_of_conditions[own],
         )
 
     @cached_property

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from dolfinx import fem
-from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.assembly import Forms
+from tfeti_dolfinx.contact.arguments import Gap
 from tfeti_dolfinx.contact.search import ContactPartner, ContactSearch
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.dual.operator import PRECONDITIONERS
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.extensions import Extensions
+from tfeti_dolfinx.extensions import Settings
 from tfeti_dolfinx.gluing.glue import Gluing, glue
 from tfeti_dolfinx.gluing.prescribed import Prescribed, prescribe
+from tfeti_dolfinx.gluing.weights import row_weights
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.parallel import any_rank
 from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.report_filling import fill_sizes
@@ -47,14 +47,11 @@ class System:
         contacts: Obstacles and pairs.
         dofs: Dof maps.
         decomposition: The torn mesh.
-        options: Options.
-        prefix: Prefix of all options.
+        settings: How to solve.
 
     Attributes:
         forms: The compiled forms.
         bcs: Dirichlet conditions.
-        factor_options: Options that PETSc's factors read, without prefix.
-        extensions: Parts that the program brings.
         spectrum: Extreme eigenvalues of B Bᵀ, if somebody has put them here.
     """
 
@@ -62,17 +59,14 @@ class System:
         self,
         forms: Forms,
         bcs: Sequence[fem.DirichletBC],
-        contacts: Sequence[ContactPartner],
+        contacts: list[ContactPartner],
         dofs: TornDofs,
         decomposition: Decomposition,
-        options: Options,
-        prefix: str,
+        settings: Settings,
     ) -> None:
         self.forms, self.bcs, self._contacts = forms, bcs, contacts
         self._dofs, self._decomposition = dofs, decomposition
-        self._options, self._prefix = options, prefix
-        self.factor_options: dict[str, Any] = {}
-        self.extensions = Extensions()
+        self._settings = settings
         self.spectrum: dict[str, float] = {}
         self._stages, self._counters, self._counted = Stages(), Counters(), 0
         self._search: ContactSearch | None = None
@@ -120,6 +114,18 @@ class System:
             self._destroy_dual()
         if self._stages.is_stale("factors"):
             self._destroy_subdomains()
+
+    def set_gap(self, index: int, gap: Gap) -> None:
+        """Give a contact another ``gap=``; its conditions stay, but for their gaps.
+
+        Raises:
+            InputError: The gap does not fit, or overlaps too deep. Nothing has changed.
+        """
+        contact = self._contacts[index].with_gap(gap)
+        if self._search is not None:
+            self._search.set_gap(index, gap)
+        self._contacts[index] = contact
+        self.change("right side")
 
     def make(self, report: Report) -> Dual:
         """Make what is out of date; the dual problem.
@@ -183,7 +189,8 @@ class System:
     def _make_rows(self) -> None:
         if self._gluing is not None:
             self._gluing.constraints.destroy()
-        search, weights = self.search, self._weights()
+        search = self.search
+        weights = row_weights(self._diagonal, self._settings.options.scaling, self._dofs.comm)
         self._gluing = glue(self._dofs, self.bcs, search.records, search.length, weights)
         self.spectrum = {}
 
@@ -198,14 +205,15 @@ class System:
 
     def _factor(self) -> None:
         trace, counters = self.gluing.constraints.trace, self._counters
-        kplus = self.extensions.kplus or KPLUS_TYPES[self._options.kplus_type]
-        prefix = f"{self._prefix}sub_"
+        kplus = self._settings.extensions.kplus or KPLUS_TYPES[self._settings.options.kplus_type]
+        prefix = f"{self._settings.prefix}sub_"
         data = subdomain_data(self._dofs, self._decomposition, self._K, self._f, trace)
         del self._K  # the Blocks have it
-        with added_options(self._prefix, self.factor_options):
+        with added_options(self._settings.prefix, self._settings.factor_options):
             self._subdomains = make_subdomains(
                 data,
-                self.extensions.block or (lambda s: SparseBlock(s, counters, kplus, prefix)),
+                self._settings.extensions.block
+                or (lambda s: SparseBlock(s, counters, kplus, prefix)),
                 self._decomposition,
                 counters,
             )
@@ -216,35 +224,26 @@ class System:
     def _make_dual(self) -> None:
         decomposition, dofs = self._decomposition, self._dofs
         rows = dofs.comm.allreduce(len(self.gluing.constraints.sets.normals))
-        _, pc_type = resolve_types(self._options, rows, self._prefix)
-        own = self.extensions.preconditioner
+        _, pc_type = resolve_types(self._settings.options, rows, self._settings.prefix)
+        own = self._settings.extensions.preconditioner
         if own is not None and pc_type == "none":
             raise InputError(
                 "extensions: a preconditioner is given, but the solver takes none, or "
-                f"-{self._prefix}pc_type is none; expected a solver that takes one, say pcpg"
+                f"-{self._settings.prefix}pc_type is none; expected one that takes it, say pcpg"
             )
-        with added_options(self._prefix, self.factor_options):
+        with added_options(self._settings.prefix, self._settings.factor_options):
             self._dual = Dual(
                 constraints=self.gluing.constraints,
                 subdomains=_made(self._subdomains),
                 body_names=decomposition.body_names,
                 mode_names=mode_names(decomposition.mesh.geometry.dim, dofs.bs),
                 preconditioner=own or PRECONDITIONERS.get(pc_type),
-                options_prefix=self._prefix,
-                feasible=self.extensions.feasible_set,
+                options_prefix=self._settings.prefix,
+                feasible=self._settings.extensions.feasible_set,
             )
 
     def _make_linear_term(self) -> None:
         self.dual.update_load()
-
-    def _weights(self) -> Array:
-        """D for the scaling of B: the diagonal of K over its smallest entry, or ones."""
-        if self._options.scaling == "multiplicity":
-            return np.ones(len(self._diagonal))
-        positive = self._diagonal > 0.0  # what is not is reported when Blocks are built
-        lowest = float(np.min(self._diagonal[positive], initial=np.inf))
-        lowest = self._dofs.comm.allreduce(lowest, op=MPI.MIN)
-        return np.where(positive, self._diagonal / lowest, 1.0)
 
     def _destroy_dual(self) -> None:
         if self._dual is not None:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from numbers import Real
 from typing import Any
 
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array, ArrayLike
-from tfeti_dolfinx.checks import checked_type
+from tfeti_dolfinx.checks import checked_type, is_whole, shown
 from tfeti_dolfinx.errors import InputError
 
 # of the extent of the smaller surface: few nodes farther off ever touch in small strains, and those
@@ -27,6 +27,24 @@ def give_name(contact: Any, default: str) -> None:
     """
     checked_type(contact.name, str, f"{default}: name", "a text")
     object.__setattr__(contact, "name", contact.name or default)  # it is frozen
+
+
+def position_of(contacts: Sequence[Any], which: int | str) -> int:
+    """Position of a contact that is given by its position or its name.
+
+    Raises:
+        InputError: There is no such contact, or several have the name.
+    """
+    names = [contact.name for contact in contacts]
+    if is_whole(which) and 0 <= which < len(names):
+        return int(which)
+    if isinstance(which, str) and names.count(which) == 1:
+        return names.index(which)
+    known = ", ".join(f"{i}: {name}" for i, name in enumerate(names)) or "none"
+    raise InputError(
+        f"contact {shown(which)}: there are {len(names)}, counted from 0; their positions and "
+        f"names, of which one was expected, are {known}"
+    )
 
 
 def checked_reach(name: str, reach: float | None, extent: float) -> float:
