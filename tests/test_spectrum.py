@@ -43,7 +43,7 @@ def stacked_problem(cell, n, subdomains, scaling, pair=UP, stiffness=1.0, **opti
 
 
 def spectrum(*args, **kwargs):
-    p = stacked_problem(*args, **kwargs, bbt=True, **ROWS_ONLY)
+    p = stacked_problem(*args, **kwargs, spectrum=True, **ROWS_ONLY)
     p.solve()
     p.destroy()
     return p.report.spectrum
@@ -71,7 +71,7 @@ def assert_within(found, low, high, of):
 @pytest.mark.parametrize("cell", ["quadrilateral", "triangle", "hexahedron", "tetrahedron"])
 def test_values_are_those_of_the_dense_matrix(cell, stiffness, scaling):
     n = (6, 8) if cell in ("quadrilateral", "triangle") else (2, 3)
-    p = stacked_problem(cell, n, 8, scaling, stiffness=stiffness, bbt=True, **ROWS_ONLY)
+    p = stacked_problem(cell, n, 8, scaling, stiffness=stiffness, spectrum=True, **ROWS_ONLY)
     p.solve()
     assert list(p.report.spectrum) == ["BBt_min", "BBt_max", "BDBt_min", "BDBt_max"]
     assert np.allclose(list(p.report.spectrum.values()), dense(p.dual.constraints), rtol=1e-8)
@@ -157,7 +157,7 @@ def test_bounds_need_meshes_of_comparable_size(scaling):
 def test_two_equal_conditions_are_seen():
     """Two obstacles at the same plane: the smallest eigenvalue is 0, and is found."""
     twice = [tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -0.01), (0, 0, 1)))] * 2
-    p = problem(decomposed("hexahedron", 3, 4), contacts=twice, bbt=True, **ROWS_ONLY)
+    p = problem(decomposed("hexahedron", 3, 4), contacts=twice, spectrum=True, **ROWS_ONLY)
     p.solve()
     assert 0.0 <= p.report.spectrum["BDBt_min"] < 1e-9
     assert p.report.spectrum["BDBt_max"] == pytest.approx(2.0)
@@ -173,7 +173,7 @@ def test_no_rows_no_values():
 
 
 def test_the_report_has_them_when_asked():
-    p = problem(decomposed("triangle", 3, 2), tfeti_bbt=True)
+    p = problem(decomposed("triangle", 3, 2), tfeti_spectrum=True)
     p.solve()
     assert p.report.converged_reason == "CONVERGED_RTOL"
     assert json.loads(p.report.to_json())["spectrum"] == p.report.spectrum
@@ -199,8 +199,8 @@ def test_without_the_option_it_costs_nothing(monkeypatch):
 
 def test_slepc_is_missed_at_once(monkeypatch):
     monkeypatch.setattr(module, "_slepc", no_slepc)
-    with pytest.raises(InputError, match=r"option bbt needs slepc4py, .*No module named"):
-        problem(decomposed("triangle", 2, 2), bbt=True)
+    with pytest.raises(InputError, match=r"option spectrum needs slepc4py, .*No module named"):
+        problem(decomposed("triangle", 2, 2), spectrum=True)
 
 
 def test_no_convergence_is_an_error(monkeypatch):

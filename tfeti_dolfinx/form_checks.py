@@ -94,7 +94,7 @@ def check_mesh(expression: Any, name: str, decomposition: Decomposition) -> None
         _check_kind(term, name)
         if not isinstance(term, ufl.Constant) and any(d != domain for d in extract_domains(term)):
             raise InputError(
-                f"{name}: {_said(term)} is on another mesh (the one before decompose?); expected "
+                f"{name}: {_term_name(term)} is on another mesh (the one before decompose?); expected "
                 "decomposition.mesh, the torn mesh"
             )
 
@@ -109,7 +109,7 @@ def _check_kind(term: Any, name: str) -> None:
             )
 
 
-def _said(term: Any) -> str:
+def _term_name(term: Any) -> str:
     if isinstance(term, fem.Function):
         return f"the function {term.name!r}"
     return f"the {type(term).__name__} {term}"

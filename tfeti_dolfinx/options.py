@@ -63,7 +63,7 @@ class Options:
     error_if_not_converged: bool = described(
         True, "all", "raise ConvergenceError where a solver stops before its tolerance"
     )
-    bbt: bool = described(
+    spectrum: bool = described(
         False,
         "all",
         "put the extreme eigenvalues of B Bᵀ and B D⁻¹ Bᵀ into the report; needs slepc4py",

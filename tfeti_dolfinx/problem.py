@@ -93,7 +93,7 @@ class ContactProblem:
         checked_type(
             decomposition, Decomposition, "decomposition", "what decompose or read_gmsh return"
         )
-        if self.options.bbt:
+        if self.options.spectrum:
             require_slepc(decomposition.comm)
         self.decomposition = decomposition
         self.contacts = checked_contacts(contacts)
@@ -211,13 +211,13 @@ class ContactProblem:
             try:
                 solution = self._solve_rows()
             except NoSolutionError as error:  # on all ranks: what is far may hold the body yet
-                late = self._widen(error)
+                added = self._widen(error)
             else:
                 with stage("contact", report.seconds):
-                    late = system.take_in_overlapping(solution.u, report.tolerances["penetration"])
-                if late == 0:
+                    added = system.take_in_overlapping(solution.u, report.tolerances["penetration"])
+                if added == 0:
                     return
-            report.late_contact_rows += late
+            report.late_contact_rows += added
         raise ConvergenceError(f"nodes out of reach still overlap after {MAX_ROUNDS} rounds")
 
     def _widen(self, error: NoSolutionError) -> int:
@@ -245,7 +245,7 @@ class ContactProblem:
         """Solve with the present rows, from the last solution on."""
         system, report = self._system, self.report
         dual, gluing = system.make(report), system.gluing
-        if self.options.bbt and not system.spectrum:
+        if self.options.spectrum and not system.spectrum:
             with stage("spectrum", report.seconds):
                 system.spectrum = extreme_eigenvalues(gluing.constraints)
         report.spectrum = system.spectrum

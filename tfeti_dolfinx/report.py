@@ -74,7 +74,7 @@ class Report:
         tolerances: What they were at most allowed to be, all but the first two.
         in_all: Solves, counters and ``seconds`` of all solves together.
         errors: Relative errors against closed forms, filled by demos.
-        spectrum: With ``-tfeti_bbt``: the extreme eigenvalues ``BBt_min`` and ``BBt_max`` of
+        spectrum: With ``-tfeti_spectrum``: the extreme eigenvalues ``BBt_min`` and ``BBt_max`` of
             B Bᵀ, ``BDBt_min`` and ``BDBt_max`` of B D⁻¹ Bᵀ. Their roots are the extreme
             singular values of B and of B D^-½.
     """

@@ -157,17 +157,17 @@ class System:
 
     def take_in_overlapping(self, u: Array, tolerance: float) -> int:
         """Give rows to nodes that a displacement makes overlap without one; how many."""
-        late = self.search.take_in_overlapping(u, tolerance)
-        if late:
+        added = self.search.take_in_overlapping(u, tolerance)
+        if added:
             self.change("rows")
-        return late
+        return added
 
     def widen(self) -> int:
         """Reach farther in all contacts; how many rows are new."""
-        late = self.search.widen()
-        if late:
+        added = self.search.widen()
+        if added:
             self.change("rows")
-        return late
+        return added
 
     def destroy(self) -> None:
         """Destroy the PETSc objects; all stages are out of date."""

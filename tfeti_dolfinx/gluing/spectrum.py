@@ -28,8 +28,8 @@ def require_slepc(comm: MPI.Intracomm) -> None:
             _slepc()
         except ImportError as error:
             raise InputError(
-                f"option bbt needs slepc4py, which cannot be imported ({error}); expected "
-                "Debian's python3-slepc4py-real, conda's slepc4py, or no bbt"
+                f"option spectrum needs slepc4py, which cannot be imported ({error}); expected "
+                "Debian's python3-slepc4py-real, conda's slepc4py, or no spectrum"
             ) from None
 
 
