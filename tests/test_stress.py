@@ -14,8 +14,8 @@ from benchmarks.stress.reference import Untorn
 from benchmarks.stress.scene import Body, Load, Scene
 
 
-# 237: no load; 608: rows of a stiff side on a few soft nodes; 798: u is rounding of points; 913: rows
-# that are rounding of normals of tiny facets; 981: rounding of a motion along rows, which is no hold;
+# 237: no load; 608: rows of a stiff side on a few soft nodes; 798: u is rounding of points; 913:
+# rows that are rounding of normals of tiny facets; 981: rounding of a motion along rows is no hold;
 # 1110: a part of the scene whose load is rounding
 @pytest.mark.parametrize("seed", [*range(1, 20), 237, 608, 798, 913, 981, 1110])
 def test_random_scenes_are_right_or_named(seed, comm):
