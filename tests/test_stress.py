@@ -14,9 +14,10 @@ from benchmarks.stress.reference import Untorn
 from benchmarks.stress.scene import Body, Load, Scene
 
 
-# 608: rows of a stiff side on a few soft nodes; 798: u is rounding of points; 913: rows that are
-# rounding of normals of tiny facets; 1110: a part of the scene whose load is rounding
-@pytest.mark.parametrize("seed", [*range(1, 20), 608, 798, 913, 1110])
+# 237: no load; 314: a far row is kept, however uncertain its normal; 608: rows of a stiff side on a
+# few soft nodes; 798: u is rounding of points; 913: rows that are rounding of normals of tiny
+# facets; 981: rounding of a motion along rows is no hold; 1110: a part whose load is rounding
+@pytest.mark.parametrize("seed", [*range(1, 20), 237, 314, 608, 798, 913, 981, 1110])
 def test_random_scenes_are_right_or_named(seed, comm):
     """Classes in capitals: wrong answers and verdicts, errors that are not the package's."""
     row = judge.run_scene(random_scene(seed), comm)

@@ -94,8 +94,8 @@ def check_mesh(expression: Any, name: str, decomposition: Decomposition) -> None
         _check_kind(term, name)
         if not isinstance(term, ufl.Constant) and any(d != domain for d in extract_domains(term)):
             raise InputError(
-                f"{name}: {_term_name(term)} is on another mesh (the one before decompose?); expected "
-                "decomposition.mesh, the torn mesh"
+                f"{name}: {_term_name(term)} is on another mesh (the one before decompose?); "
+                "expected decomposition.mesh, the torn mesh"
             )
 
 

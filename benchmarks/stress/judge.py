@@ -78,7 +78,8 @@ def _compared(scene: Scene, answer: Answer, outcome: Outcome) -> dict[str, Any]:
     size = max(np.abs(answer.forces).max(), np.abs(resultant).max(), OF_LOAD * answer.load)
     force = np.abs(outcome.forces - resultant).max() / (size or 1.0)
     inside = answer.rows @ u.ravel() - answer.gap
-    penetration = inside.max(initial=0.0) / max(np.abs(answer.u).max(), 1e-300)
+    most = max(np.abs(answer.u).max(), answer.point_noise.max())
+    penetration = inside.max(initial=0.0) / most
     row = {
         "u": float(error.max()),
         "u of all": float((error * scale).max() / scale.max()),
@@ -88,7 +89,8 @@ def _compared(scene: Scene, answer: Answer, outcome: Outcome) -> dict[str, Any]:
         "overlap": float(penetration),
     }
     own = np.maximum(answer.rows @ answer.u.ravel() - answer.gap, 0.0).max(initial=0.0)
-    noise = np.maximum(answer.noise, own / scale)  # what the reference itself overlaps by
+    # what the reference itself overlaps by, and what is no motion
+    noise = np.maximum(answer.noise, np.maximum(own, answer.point_noise) / scale)
     allowed = np.maximum(RIGHT, OF_NOISE * noise)
     copies = np.array([jump[outcome.body == b].max() for b in range(len(scene.bodies))])
     worst = np.maximum(np.maximum(error, copies), penetration)

@@ -22,6 +22,7 @@ from benchmarks.stress.solve import DEPENDENT, EPSILON, null_space, solve, verdi
 
 SMALLEST = 1e-9  # of the largest displacement of all bodies: what a body has at least
 NO_WORK = 1e-13  # of all loads: rounding
+ALONG = 1e-12  # of a motion: rounding, which must not hold anything
 CARRIES = 1e-7  # of the largest force
 
 
@@ -55,6 +56,13 @@ class Answer:
     free: np.ndarray | None = None
     noise: np.ndarray | None = None
     force_noise: float = 0.0
+
+    @property
+    def point_noise(self) -> np.ndarray:
+        """Lengths that rounding of the points of each body makes: less than that is no motion."""
+        bodies = range(self.body.max() + 1)
+        extents = [np.ptp(self.x[self.body == b], axis=0).max() for b in bodies]
+        return EPSILON * np.array(extents)
 
 
 class Untorn:
@@ -161,7 +169,8 @@ class Untorn:
             dofs = (nodes[:, None] * gdim + np.arange(gdim)).ravel()
             kept = null_space(R[self.fixed[dofs]])
             motions = np.zeros((n, kept.shape[1]))
-            motions[dofs] = R @ kept
+            moved = R @ kept
+            motions[dofs] = np.where(np.abs(moved) > ALONG * np.abs(moved).max(axis=0), moved, 0.0)
             out.append(motions)
         return np.concatenate(out, axis=1)
 

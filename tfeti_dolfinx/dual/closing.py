@@ -8,8 +8,8 @@ from petsc4py import PETSc
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.gluing.constraints import Constraints
 
-# Conjugate gradients for B_f D⁻¹ B_fᵀ: with its usual eigenvalues, 0.6 to 2, about 10 steps lead
-# to this residual; what is left of w then has at most 1e-2 of its energy where one is 1e-8.
+# Conjugate gradients for B_f D⁻¹ B_fᵀ: with its usual eigenvalues, 0.6 to 2, about 10 steps to this
+# residual; what is left of w then has at most 1e-2 of its energy where one is 1e-8.
 EXACT, MOST_STEPS = 1e-6, 100
 # curvature of a direction, usually about 1: rows that are dependent but for rounding, whose
 # differences nothing can close

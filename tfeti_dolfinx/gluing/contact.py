@@ -19,6 +19,8 @@ from tfeti_dolfinx.mortar.surfaces import group_points
 NOTHING_LEFT = 1e-10
 # of what rounding makes of a condition's coefficients, and of lengths: errors of several add up
 SEVERAL, EPSILON = 10.0, 2.2e-16
+# a condition of which more than this remains is one, however uncertain its normal is
+HARDLY_LEFT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -126,7 +128,7 @@ def _nothing_left(records: ContactRecords, points: Array) -> Array:
     h = records.area ** (1.0 / max(records.normal.shape[1] - 1, 1))
     g = np.abs(records.geometric_gap)
     error = EPSILON * (x * (1.0 + g / h) + g) / h
-    return np.maximum(NOTHING_LEFT, SEVERAL * error)
+    return np.clip(SEVERAL * error, NOTHING_LEFT, HARDLY_LEFT)
 
 
 def _check_decided(gaps: Array, length: float) -> None:
