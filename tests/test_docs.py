@@ -164,3 +164,12 @@ def test_the_report_s_fields_are_documented():
     text = (ROOT / "docs/report.md").read_text()
     for field in dataclasses.fields(tfeti.Report):
         assert f"`{field.name}`" in text, field.name
+
+
+def test_every_page_and_every_public_name_is_in_the_documents():
+    index, api = ((ROOT / f"docs/{page}.md").read_text() for page in ("index", "api"))
+    pages = {p.stem for p in (ROOT / "docs").glob("*.md")} - {"index"}
+    pages |= {"../README", "../CONTRIBUTING", "../CHANGELOG", "../environment/README"}
+    assert pages <= set(index.splitlines())
+    described = set(re.findall(r"^\.\. auto\w+:: (?:\w+\.)*(\w+)$", api, re.MULTILINE))
+    assert set(tfeti.__all__) - {"__version__"} <= described

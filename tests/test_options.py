@@ -120,4 +120,4 @@ def test_the_command_line_of_a_program(serial_only):
     assert "TFETI solve CONVERGED_RTOL" in result.stdout
     for name in ("mesh", "contact", "gluing", "assembly", "subdomains", "dual", "qp", "recovery"):
         assert f"tfeti: {name}" in result.stdout
-    assert "unused" not in result.stdout + result.stderr
+    assert "unused database" not in result.stdout + result.stderr

@@ -172,7 +172,8 @@ class Elasticity:
         return beside * u[0] / ufl.max_value(r, near) + (1 - beside) * e[0, 0]
 
     def _quadrature_degree(self, v: Any) -> int:
-        element, geometry = v.ufl_function_space().ufl_element(), self.mesh.geometry.cmap.degree
+        element = v.ufl_function_space().ufl_element()
+        geometry = self.mesh.ufl_domain().ufl_coordinate_element().degree
         simplex = self.mesh.topology.cell_type.name in ("triangle", "tetrahedron")
         slope = element.degree - 1 if simplex else element.degree
         moduli = sum(estimate_total_polynomial_degree(c) for c in (self.E, self.nu))

@@ -19,6 +19,7 @@ from benchmarks.stress import meshes
 from benchmarks.stress.mortar import Facet, mortar
 from benchmarks.stress.scene import Pair, Scene, Side, wall_distance
 from benchmarks.stress.solve import DEPENDENT, EPSILON, null_space, solve, verdict
+from tfeti_dolfinx.compat import geometry_dofmap
 
 SMALLEST = 1e-9  # of the largest displacement of all bodies: what a body has at least
 NO_WORK = 1e-13  # of all loads: rounding
@@ -90,7 +91,7 @@ class Untorn:
         self.body[cells] = g.body[cell][:, None]
         self._mesh, self._tags, self._V = mesh, tags, V
         self._dof = np.zeros(len(mesh.geometry.x), dtype=int)
-        self._dof[mesh.geometry.dofmap] = cells
+        self._dof[geometry_dofmap(mesh)] = cells
         self.fixed, self.values = np.zeros(len(self.f), dtype=bool), np.zeros(len(self.f))
         for bc in meshes.prescribed(scene, V, self._facets):
             dofs, own = bc.dof_indices()
