@@ -1,0 +1,99 @@
+"""Parts of one's own through ContactProblem: an inverse, a preconditioner, a monitor."""
+
+import numpy as np
+import pytest
+from scenes import curved_obstacle, decomposed, problem
+from scipy.linalg import pinvh
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.dual.operator import DualOperator
+from tfeti_dolfinx.subdomains.local import BlockwiseOperator
+
+
+class DensePinv:
+    """K⁺ of Moore and Penrose."""
+
+    def __init__(self, K, R, fixing_dofs, prefix):
+        self.K = K
+        self.refactor(R)
+
+    def refactor(self, R):
+        self.inverse = pinvh(self.K.toarray(), rtol=1e-12)
+
+    def solve(self, b):
+        return self.inverse @ b
+
+    def destroy(self):
+        pass
+
+
+class Doubled:
+    """Twice the stiffness of the trace: scales a preconditioner, which changes nothing."""
+
+    def __init__(self, blocks):
+        self.half = BlockwiseOperator(blocks, "stiffness")
+
+    def prepare(self):
+        self.half.prepare()
+
+    def mult(self, w, out):
+        self.half.mult(w, out)
+        out *= 2.0
+
+    def destroy(self):
+        self.half.destroy()
+
+
+def solved(contacts=(), extensions=None, **options):
+    d = decomposed("hexahedron", 3, 4)
+    p = problem(d, contacts=contacts, extensions=extensions, tfeti_rtol=1e-9, **options)
+    u = p.solve().x.array.copy()
+    p.destroy()
+    return u, p
+
+
+@pytest.mark.parametrize("contacts", [0, 1])
+def test_an_inverse_of_one_s_own(contacts):
+    obstacles = [tfeti.Obstacle("bottom", curved_obstacle(3))] * contacts
+    known, p = solved(obstacles)
+    own, _ = solved(obstacles, tfeti.Extensions(kplus=DensePinv))
+    largest = p.dofs.comm.allreduce(np.abs(known).max(initial=0.0), op=max)
+    assert np.abs(own - known).max(initial=0.0) <= 1e-7 * largest
+
+
+def test_a_preconditioner_of_one_s_own():
+    def doubled(B, blocks):
+        return DualOperator(B, Doubled(blocks))
+
+    known, p = solved(tfeti_pc_type="lumped")
+    own, q = solved(extensions=tfeti.Extensions(preconditioner=doubled))
+    largest = p.dofs.comm.allreduce(np.abs(known).max(initial=0.0), op=max)
+    assert np.abs(own - known).max(initial=0.0) <= 1e-7 * largest
+    assert q.report.preconditioner_multiplications > 0
+    assert abs(q.report.cg_steps - p.report.cg_steps) <= 1
+
+
+def test_a_preconditioner_that_nobody_takes_is_refused():
+    obstacle = tfeti.Obstacle("bottom", curved_obstacle(3))
+    own = tfeti.Extensions(preconditioner=lambda B, blocks: DualOperator(B, Doubled(blocks)))
+    with pytest.raises(tfeti.InputError, match="a preconditioner is given, but"):
+        solved([obstacle], own, tfeti_qp_type="smalse")
+
+
+def test_a_monitor_of_one_s_own():
+    seen = []
+
+    def monitor(steps, step, x, projected_gradient, equality):
+        seen.append((step, projected_gradient))
+
+    _, p = solved(extensions=tfeti.Extensions(monitor=monitor))
+    inner = [size for step, size in seen if step == "cg"]
+    assert len(inner) == p.report.cg_steps > 3
+    assert inner[-1] < 1e-3 * max(inner)
+
+
+def test_something_else_is_named():
+    with pytest.raises(
+        tfeti.InputError, match=r"extensions is .*expected tfeti_dolfinx\.Extensions"
+    ):
+        solved(extensions={"monitor": print})
