@@ -136,9 +136,10 @@ class ContactProblem:
     def solve(self) -> fem.Function:
         """Solve the problem.
 
-        What a solve has made is kept. Constants and functions in the forms and Dirichlet values
-        may change between two solves: only what depends on them is made again, and the solver
-        starts from the last solution. For new forms, conditions or gaps see ``update``.
+        What a solve has made is kept. Constants and functions in the forms, Dirichlet values and
+        the points of the mesh may change between two solves: only what depends on them is made
+        again, and the solver starts from the last solution. For new forms, conditions or gaps
+        see ``update``.
 
         Returns:
             The displacement, on the torn mesh.

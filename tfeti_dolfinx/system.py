@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from dolfinx import fem
@@ -69,6 +69,7 @@ class System:
         self._settings = settings
         self.spectrum: dict[str, float] = {}
         self._stages, self._counters, self._counted = Stages(), Counters(), 0
+        self._K: Any = None
         self._search: ContactSearch | None = None
         self._prescribed: Prescribed | None = None
         self._gluing: Gluing | None = None
@@ -91,11 +92,13 @@ class System:
         return _made(self._dual)
 
     def look_for_changes(self) -> None:
-        """See whether what forms and Dirichlet conditions refer to has changed.
+        """See whether the mesh, or what forms and Dirichlet conditions refer to, has changed.
 
         Raises:
             InputError: Dirichlet conditions contradict each other.
         """
+        if self.forms.has_new_points():
+            self.change("points")
         if self.forms.has_new_stiffness():
             self.change("stiffness")
         if self.forms.has_new_load():
@@ -205,18 +208,16 @@ class System:
 
     def _factor(self) -> None:
         trace, counters = self.gluing.constraints.trace, self._counters
-        kplus = self._settings.extensions.kplus or KPLUS_TYPES[self._settings.options.kplus_type]
-        prefix = f"{self._settings.prefix}sub_"
+        own, prefix = self._settings.extensions, f"{self._settings.prefix}sub_"
+        kplus = own.kplus or KPLUS_TYPES[self._settings.options.kplus_type]
+        make_block = own.block or (lambda s: SparseBlock(s, counters, kplus, prefix))
+        if self._K is None:  # it went into Blocks that could not be made
+            self._assemble_stiffness()
+            self._stages.made["stiffness"] += 1
         data = subdomain_data(self._dofs, self._decomposition, self._K, self._f, trace)
-        del self._K  # the Blocks have it
+        self._K = None  # the Blocks have it
         with added_options(self._settings.prefix, self._settings.factor_options):
-            self._subdomains = make_subdomains(
-                data,
-                self._settings.extensions.block
-                or (lambda s: SparseBlock(s, counters, kplus, prefix)),
-                self._decomposition,
-                counters,
-            )
+            self._subdomains = make_subdomains(data, make_block, self._decomposition, counters)
 
     def _retrace(self) -> None:
         _made(self._subdomains).retrace(self.gluing.constraints.trace)
