@@ -274,3 +274,24 @@ def test_the_stress_of_an_earlier_solution_is_that_of_its_modulus():
         V.mesh.comm.allgather(not np.allclose(fields(problem.solution)[0], expected[0], rtol=1e-2))
     )
     problem.destroy()
+
+
+def test_an_update_that_raises_has_changed_nothing():
+    scene, other = Repeated("triangle"), Repeated("triangle")
+    first = scene.solve()
+    V = scene.problem.dofs.V
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    good = {
+        "stiffness": 2.0 * ufl.inner(hooke()(u), strain(v)) * ufl.dx,
+        "load": ufl.ZeroBaseForm((v,)),
+        "values": [],
+        "gap": {0: 0.1},
+    }
+    bad = {"load": 1, "values": [None], "gap": {0: np.nan}}
+    for name, value in bad.items():
+        with pytest.raises(tfeti.InputError):
+            scene.problem.update(**{**good, name: value})
+        assert distance(scene.solve(), first) <= 1e-8
+        assert counters(scene.problem.report) == [0] * len(COUNTERS)
+    for item in (scene, other):
+        item.problem.destroy()

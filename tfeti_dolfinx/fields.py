@@ -8,7 +8,11 @@ from typing import Any
 import numpy as np
 import ufl
 from dolfinx import fem
-from ufl.algorithms.analysis import extract_coefficients, extract_constants
+from ufl.algorithms.analysis import (
+    extract_arguments,
+    extract_coefficients,
+    extract_constants,
+)
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.checks import POSITIVE, checked_callable, checked_number, named, shown
@@ -72,6 +76,10 @@ def checked_thickness(thickness: Any, decomposition: Decomposition) -> Any:
     if thickness.ufl_shape != ():
         raise InputError(f"thickness is of shape {thickness.ufl_shape}; expected a scalar")
     check_mesh(thickness, "thickness", decomposition)
+    if extract_arguments(thickness):
+        raise InputError("thickness has a test or trial function; expected a scalar with values")
+    if isinstance(thickness, fem.Constant):
+        checked_number(thickness.value, "thickness", POSITIVE)
     return thickness
 
 

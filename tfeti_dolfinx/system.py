@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -118,16 +118,17 @@ class System:
         if self._stages.is_stale("factors"):
             self._destroy_subdomains()
 
-    def set_gap(self, index: int, gap: Gap) -> None:
-        """Give a contact another ``gap=``; its conditions stay, but for their gaps.
+    def set_gaps(self, gaps: Mapping[int, Gap]) -> None:
+        """Give contacts, by position, another ``gap=``; their conditions stay, but for their gaps.
 
         Raises:
-            InputError: The gap does not fit, or overlaps too deep. Nothing has changed.
+            InputError: A gap does not fit, or overlaps too deep. Nothing has changed.
         """
-        contact = self._contacts[index].with_gap(gap)
+        contacts = {i: self._contacts[i].with_gap(gap) for i, gap in gaps.items()}
         if self._search is not None:
-            self._search.set_gap(index, gap)
-        self._contacts[index] = contact
+            self._search.set_gaps(gaps)
+        for i, contact in contacts.items():
+            self._contacts[i] = contact
         self.change("right side")
 
     def make(self, report: Report) -> Dual:
