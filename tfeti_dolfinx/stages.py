@@ -19,6 +19,7 @@ STAGES = {
 }
 # what has to be made anew where something has changed
 CHANGES = {
+    "points": tuple(STAGES),
     "stiffness": ("stiffness", "rows", "factors", "trace", "coarse problem"),
     "rows": ("rows", "trace", "coarse problem"),
     "right side": ("right side", "linear term"),

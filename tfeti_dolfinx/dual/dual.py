@@ -89,7 +89,7 @@ class Dual:
         bounded = constraints.sets.normals
         self.coarse = CoarseSpace(B, subdomains, bounded, f"{options_prefix}coarse_")
         self.num_inequalities = comm.allreduce(len(bounded))
-        self.feasible = feasible(constraints)
+        self._law, self.feasible = feasible, feasible(constraints)
         self._images = dict[str, tuple[Array, Image]]()
         self._norm: tuple[int, float] | None = None
         check_solvable(self.coarse, body_names, mode_names)
@@ -119,6 +119,7 @@ class Dual:
             norm_steps: Lanczos steps that estimate ‖PFP‖, once; 0 where nobody asks for it.
         """
         coarse: Coarse = self.coarse if self.coarse.dimension else NoCoarse()
+        self.feasible = self._law(self.constraints)  # c may be another, and what the law refers to
         norm = self._norm_of(coarse, norm_steps) if norm_steps else 1.0
         return QP(self.F, self.d, coarse, self.feasible, self.preconditioner, norm)
 
