@@ -15,7 +15,7 @@ from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
 from tfeti_dolfinx.qp.faces import Face, Status, face_of
 from tfeti_dolfinx.qp.feasible_sets import Product
 from tfeti_dolfinx.qp.pcpg import pcpg
-from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Steps
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, Steps
 from tfeti_dolfinx.qp.stopping import ResidualRule
 
 
@@ -191,7 +191,7 @@ def test_pcpg_on_a_face(preconditioned, with_coarse):
     on_face = replace(qp, coarse=coarse.on_face(face), preconditioner=helper)
     start = np.random.default_rng(5).standard_normal(40)
     lam, g, steps = vector(start), vector(F @ start - d), Steps()
-    reason = pcpg(on_face, lam, g, ResidualRule(1e-11), steps, 100)
+    reason = pcpg(on_face, Point(lam, g), ResidualRule(1e-11), steps, 100)
     assert reason == ConvergedReason.CONVERGED_RTOL
     assert steps.cg <= (12 if preconditioned else 26)
     assert np.allclose(g.array_r, F @ lam.array_r - d, atol=1e-9)
@@ -208,8 +208,8 @@ def test_pcpg_from_its_solution_takes_no_step():
     qp = QP(matrix(F), vector(d), DenseCoarse(G, e), Product())
     lam, steps = vector(np.linalg.lstsq(G, e, rcond=None)[0]), Steps()
     g = vector(F @ lam.array_r - d)
-    assert pcpg(qp, lam, g, ResidualRule(1e-10), steps, 100) > 0
+    assert pcpg(qp, Point(lam, g), ResidualRule(1e-10), steps, 100) > 0
     taken = steps.cg
     assert taken > 0
-    assert pcpg(qp, lam, g, ResidualRule(1e-9), steps, 100) > 0
+    assert pcpg(qp, Point(lam, g), ResidualRule(1e-9), steps, 100) > 0
     assert steps.cg == taken

@@ -77,6 +77,7 @@ class Accuracy:
         rtol: Relative tolerance.
         tolerance: Norm of the residuals from which on one looks (again).
         drifted: Whether the solver's gradient has to be made anew.
+        norm: ‖F‖, or an estimate.
         measures: What the last look has seen.
         looks: How many looks there were.
     """
@@ -91,7 +92,7 @@ class Accuracy:
         norm: float = 1.0,
     ) -> None:
         self._scene, self.rtol, self._atol = scene, rtol, atol
-        self._rounding, self._norm = rounding, norm or 1.0
+        self._rounding, self.norm = rounding, norm or 1.0
         self._before: Measures | None = None
         self.tolerance = max(rtol**FIRST_LOOK * reference, atol, rounding)
         self.drifted, self.looks, self._stalls, self._claimed = False, 0, 0, 1.0
@@ -99,7 +100,7 @@ class Accuracy:
 
     def look(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float) -> Measures:
         """Measure an iterate. Collective."""
-        before, error = self.measures, residual / self._norm
+        before, error = self.measures, residual / self.norm
         self.measures = measure(
             self._scene, lam, gradient, face, error, before.u if before else None
         )

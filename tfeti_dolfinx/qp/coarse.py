@@ -7,8 +7,15 @@ from typing import Protocol
 import numpy as np
 from petsc4py import PETSc
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.arrays import TINY, Array
 from tfeti_dolfinx.qp.faces import Face
+
+# of GGᵀ, added to G_f G_fᵀ: keeps steps regular where few rows carry a force; above rounding, and
+# small beside 1, so that they stay Newton's
+DAMPING = 1e-8
+# of the largest forces on an equation: those on a light one beside it count as so large at least,
+# since the rounding of the largest reaches them
+LIGHT = 1e-4
 
 
 class Coarse(Protocol):
@@ -16,7 +23,33 @@ class Coarse(Protocol):
 
     With G_f = GZ the projectors are Q = Z G_fᵀ(G_f G_fᵀ)⁺G_f Zᵀ and P = ZZᵀ − Q. Vectors keep the
     layout of all rows. Without a face Z = I, so that P = I − Q.
+
+    Attributes:
+        dimension: Number r of equations.
+        e: Right side, replicated, shape ``(r,)``.
     """
+
+    @property
+    def dimension(self) -> int:
+        """Number r of equations."""
+        ...
+
+    @property
+    def e(self) -> Array:
+        """Right side, replicated, shape ``(r,)``."""
+        ...
+
+    def residual(self, x: PETSc.Vec, share: float = 1.0) -> Array:
+        """share·e − G_f Zᵀx, replicated, shape ``(r,)``. Collective."""
+        ...
+
+    def imbalance(self, x: PETSc.Vec) -> float:
+        """How far G_f Zᵀx is from e: the worst equation, beside its terms; 1 is far. Collective."""
+        ...
+
+    def damped_solve(self, face: Face, y: Array) -> Array:
+        """(G_f G_fᵀ + δGGᵀ)⁻¹y with a small δ, f a face of all rows. Collective."""
+        ...
 
     def project(self, x: PETSc.Vec) -> None:
         """x ← P x. Collective."""
@@ -51,6 +84,12 @@ class Coarse(Protocol):
         ...
 
 
+def worst(residual: Array, forces: Array) -> float:
+    """Largest entry of a residual beside the moduli of its terms."""
+    floor = max(LIGHT * float(forces.max(initial=0.0)), TINY)
+    return float(np.max(np.abs(residual) / np.maximum(forces, floor), initial=0.0))
+
+
 class NoCoarse:
     """No equality constraint: Q = 0, at no cost.
 
@@ -58,8 +97,22 @@ class NoCoarse:
         face: The face; default all rows.
     """
 
+    dimension = 0
+
     def __init__(self, face: Face | None = None) -> None:
-        self._face = face
+        self._face, self.e = face, np.zeros(0)
+
+    def residual(self, x: PETSc.Vec, share: float = 1.0) -> Array:
+        """None."""
+        return np.zeros(0)
+
+    def imbalance(self, x: PETSc.Vec) -> float:
+        """0."""
+        return 0.0
+
+    def damped_solve(self, face: Face, y: Array) -> Array:
+        """None."""
+        return y
 
     def project(self, x: PETSc.Vec) -> None:
         """x ← ZZᵀx."""
@@ -104,9 +157,24 @@ class DenseCoarse:
     """
 
     def __init__(self, G: Array, e: Array, face: Face | None = None) -> None:
-        self._G, self._face, self._e = G, face, e
+        self._G, self._face, self.e, self.dimension = G, face, e, len(e)
         self._Gf = G if face is None else np.asarray((face.Z @ (face.Z.T @ G.T)).T)
         self._inverse = np.linalg.pinv(self._Gf @ self._Gf.T, hermitian=True)
+
+    def residual(self, x: PETSc.Vec, share: float = 1.0) -> Array:
+        """share·e − G_f Zᵀx."""
+        return np.asarray(share * self.e - self._Gf @ x.array_r)
+
+    def imbalance(self, x: PETSc.Vec) -> float:
+        """The worst equation, beside its terms."""
+        forces = np.abs(self._Gf) @ np.abs(x.array_r) + np.abs(self.e)
+        return worst(self.residual(x), forces)
+
+    def damped_solve(self, face: Face, y: Array) -> Array:
+        """(G_f G_fᵀ + δGGᵀ)⁺y."""
+        GZ = (face.Z.T @ self._G.T).T
+        gram = GZ @ GZ.T + DAMPING * self._G @ self._G.T
+        return np.asarray(np.linalg.pinv(gram, hermitian=True) @ y)
 
     def project(self, x: PETSc.Vec) -> None:
         """x ← P x."""
@@ -123,7 +191,7 @@ class DenseCoarse:
 
     def particular(self, x: PETSc.Vec) -> None:
         """x = Z G_fᵀ(G_f G_fᵀ)⁺e."""
-        self.combine(self._inverse @ self._e, x)
+        self.combine(self._inverse @ self.e, x)
 
     def coordinates(self, x: PETSc.Vec) -> Array:
         """(G_f G_fᵀ)⁺G_f Zᵀ x."""
@@ -135,7 +203,7 @@ class DenseCoarse:
 
     def on_face(self, face: Face) -> DenseCoarse:
         """The same G on a face."""
-        return DenseCoarse(self._G, self._e, face)
+        return DenseCoarse(self._G, self.e, face)
 
     def destroy(self) -> None:
         """Nothing to free."""
