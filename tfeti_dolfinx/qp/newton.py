@@ -117,7 +117,7 @@ def newton(
         if reason != ConvergedReason.ITERATING:
             break
         # Step 2: the face
-        face = state.wanted_face(parameters.gamma) if looked else state.face()
+        face = state.wanted_face(parameters.gamma, faces) if looked else state.face()
         # Step 3: solve on the face, drop what leaves Ω, restore Gλ = e
         trial = faces.solve(state.point, face, state.residual)
         # Step 4: accept where q falls enough

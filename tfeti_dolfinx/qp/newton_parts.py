@@ -33,7 +33,9 @@ HELD = 1e-9
 # rows leave a face in so many rounds at most: each round drops one row at least, but most at once
 MOST_ROUNDS = 60
 # of the rule's tolerance, for the last solve on a face: ‖g^P‖ is measured otherwise than ‖P_f g‖
-FINAL = 0.5
+FINAL = float(__import__("os").environ.get("FINAL", 0.9))
+# a solve on a face that stays is looked at from time to time: PCPG goes on where it stopped
+STAGE = float(__import__("os").environ.get("STAGE", 0.1))
 
 
 class Iterate:
@@ -94,12 +96,17 @@ class Iterate:
         self._qp.coarse.combine(self.mu, self.s)
         self.s.aypx(-1.0, self.point.g)
 
-    def wanted_face(self, gamma: float) -> Face:
-        """What carries force, and what wants to, if that is most of what is wrong."""
+    def wanted_face(self, gamma: float, faces: FaceSolver) -> Face:
+        """What carries force, and what wants to, if that is most of what is wrong.
+
+        The rest is what PCPG has left on the face, if it has stopped at λ.
+        """
         lam, s, feasible = self.point.lam.array_r, self.s.array_r, self._qp.feasible
         phi, beta = feasible.split(lam, s)
-        squares = self._comm.allreduce(np.array([phi @ phi, beta @ beta]), op=MPI.SUM)
-        if agreed(self._comm, squares[1] > gamma**2 * squares[0]):
+        free, chopped = self._comm.allreduce(np.array([phi @ phi, beta @ beta]), op=MPI.SUM)
+        if faces.settled:
+            free = faces.left**2
+        if agreed(self._comm, chopped > gamma**2 * free):
             moved = feasible.project(lam - beta / self.norm)
             return feasible.face(0.5 * (lam + moved), s)
         return self.face()
@@ -227,7 +234,8 @@ class FaceSolver:
         monitor: Called after each.
 
     Attributes:
-        norm: Largest Rayleigh quotient of F seen; at most ‖F‖.
+        settled: Whether λ is where PCPG has stopped on the face entered.
+        left: The residual there.
     """
 
     def __init__(
@@ -244,7 +252,7 @@ class FaceSolver:
         self._comm = qp.d.getComm().tompi4py()
         self._directions = Directions(qp.d)
         self._face: Face | None = None
-        self._settled = False
+        self.settled, self.left = False, float("inf")
         self._on_face = qp
         self._preconditioner: FaceOperator | None = None
 
@@ -284,11 +292,11 @@ class FaceSolver:
 
     def settle(self) -> None:
         """The last solve's end was accepted; if its face stays, PCPG goes on from there."""
-        self._settled = True
+        self.settled = True
 
     def forget(self) -> None:
         """The next direction is a first one: the point is not where PCPG has stopped."""
-        self._directions.fresh, self._settled = True, False
+        self._directions.fresh, self.settled = True, False
 
     def solve(self, start: Point, face: Face, optimality: float) -> Trial:
         """Solve on a face; drop what leaves Ω, restore Gλ = e, solve again.
@@ -299,7 +307,7 @@ class FaceSolver:
             optimality: ‖g^P‖ there.
         """
         z, first, feasible = start.copy(), None, self._qp.feasible
-        stays = self.enter(face) and self._settled
+        stays = self.enter(face) and self.settled
         for _ in range(MOST_ROUNDS):
             self._pcpg(z, optimality, stays)
             stays = False
@@ -342,7 +350,7 @@ class FaceSolver:
         z.g.copy(self._directions.r)
         self.coarse.project(self._directions.r)
         start, final = float(self._directions.r.norm()), FINAL * self._rule.tolerance
-        share = 0.0 if stays else self._parameters.reduction
+        share = STAGE if stays else self._parameters.reduction
         target = max(final, share * min(start, optimality))
         pcpg(
             self._on_face,
@@ -353,6 +361,7 @@ class FaceSolver:
             self._monitor,
             self._directions,
         )
+        self.left = float(self._directions.r.norm())
 
     def _leave(self) -> None:
         """Free what belongs to the face."""
