@@ -121,7 +121,7 @@ def newton(
         # Step 3: solve on the face, drop what leaves Ω, restore Gλ = e
         trial = faces.solve(state.point, face, state.residual)
         # Step 4: accept where q falls enough
-        if not state.accept(trial, faces):
+        if not state.accept(trial, faces) or state.stalled:
             reason = ConvergedReason.DIVERGED_ROUNDING
         trial.destroy()
         steps.outer, looked = steps.outer + 1, True

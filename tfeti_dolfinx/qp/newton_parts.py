@@ -33,9 +33,18 @@ HELD = 1e-9
 # rows leave a face in so many rounds at most: each round drops one row at least, but most at once
 MOST_ROUNDS = 60
 # of the rule's tolerance, for the last solve on a face: ‖g^P‖ is measured otherwise than ‖P_f g‖
-FINAL = float(__import__("os").environ.get("FINAL", 0.9))
-# a solve on a face that stays is looked at from time to time: PCPG goes on where it stopped
-STAGE = float(__import__("os").environ.get("STAGE", 0.1))
+FINAL = 0.9
+# a solve on a face that stays is looked at whenever it has come down by this: PCPG goes on where it
+# has stopped, and rows that want to carry are found before the wrong face is solved to the end
+STAGE = 0.1
+# of Gλ = e: what is left after a first try to restore it is worth a second one
+EXACT = 1e-13
+# of ‖F‖: curvature of the way that a solve has gone; less is nearly none, and the way far
+LOOSE = 1e-8
+# a little more than the way to a bound, so that rounding leaves nobody before it
+BEYOND = 1.0 + 1e-12
+# so many steps in a row that neither lower q by what stands out from its rounding, nor halve ‖g^P‖
+PATIENCE, ROUNDING = 10, 1e-15
 
 
 class Iterate:
@@ -62,6 +71,7 @@ class Iterate:
         self.back: PETSc.Vec | None = None
         self.mu = np.zeros(qp.coarse.dimension)
         self.residual, self.norm = float("inf"), _rayleigh(qp, self.point)
+        self._best, self._idle = float("inf"), 0
 
     def face(self) -> Face:
         """The face of λ."""
@@ -91,6 +101,9 @@ class Iterate:
         target.axpy(-1.0, self.back)
         self.residual = self.norm * target.norm()
         target.destroy()
+        self._idle += 1
+        if self.residual <= 0.5 * self._best:
+            self._best, self._idle = self.residual, 0
 
     def _set_multipliers(self) -> None:
         self._qp.coarse.combine(self.mu, self.s)
@@ -119,8 +132,9 @@ class Iterate:
         """
         known = np.isfinite(self.residual)
         enough = ENOUGH * 0.5 / self.norm * self.residual**2 if known else 0.0
-        if trial.feasible and agreed(self._comm, self.gain(trial.last) >= enough):
-            self.point.take(trial.last)
+        gain = self.gain(trial.last)
+        if trial.feasible and agreed(self._comm, gain >= enough):
+            self._take(trial.last, gain)
             faces.settle()
             return True
         faces.forget()
@@ -129,11 +143,24 @@ class Iterate:
         for kept, end in ((shorter.lam, trial.first.lam), (shorter.g, trial.first.g)):
             kept.aypx(1.0 - length, self._scaled(length, end))
         shorter.lam.array[:] = self._qp.feasible.project(shorter.lam.array_r)
-        taken = agreed(self._comm, length > 0.0 and self.gain(shorter) >= enough)
+        gain = self.gain(shorter)
+        taken = agreed(self._comm, length > 0.0 and gain >= enough)
         if taken:
-            self.point.take(shorter)
+            self._take(shorter, gain)
         shorter.destroy()
         return taken or self._descend(known, faces)
+
+    @property
+    def stalled(self) -> bool:
+        """Whether q and ‖g^P‖ have not come down any more for long."""
+        return agreed(self._comm, self._idle >= PATIENCE)
+
+    def _take(self, to: Point, gain: float) -> None:
+        """Go there; a gain that stands out from the rounding of q is worth more steps."""
+        sizes = abs(self.point.lam.dot(self.point.g)) + abs(self.point.lam.dot(self._qp.d))
+        if gain > ROUNDING * sizes:
+            self._idle = 0
+        self.point.take(to)
 
     def gain(self, to: Point) -> float:
         """q(λ) − q(to), by differences, and without what Gλ = e makes constant. Collective."""
@@ -159,6 +186,8 @@ class Iterate:
         length = min(1.0, slope / curvature) if curvature > 0.0 else 1.0
         moved = agreed(self._comm, size > 0.0 and slope > 0.0)
         if moved:
+            if length * slope > ROUNDING * abs(self.point.lam.dot(self.point.g)):
+                self._idle = 0
             self.point.move(length, p, Fp)
             self.point.lam.array[:] = self._qp.feasible.project(self.point.lam.array_r)
         p.destroy()
@@ -309,18 +338,53 @@ class FaceSolver:
         z, first, feasible = start.copy(), None, self._qp.feasible
         stays = self.enter(face) and self.settled
         for _ in range(MOST_ROUNDS):
-            self._pcpg(z, optimality, stays)
+            before = z.copy()
+            broken = self._pcpg(z, optimality, stays) == ConvergedReason.DIVERGED_INDEFINITE_MAT
             stays = False
+            self._shorten(before, z)
+            before.destroy()
             if first is None:
                 first = z.copy()
             inside = feasible.project(z.lam.array_r)
             out = any_rank(self._comm, not np.array_equal(inside, z.lam.array_r))
-            if not out or self._steps.cg >= self._max_it:
+            if self._steps.cg >= self._max_it or not (out or (broken and self._slide(z))):
                 break
-            z.lam.array[:] = inside
+            z.lam.array[:] = feasible.project(z.lam.array_r)
             self._drop(z)
         assert first is not None
         return Trial(first, z, not out)
+
+    def _shorten(self, before: Point, z: Point) -> None:
+        """Where a solve has gone far because nothing held it, go to the first bound only.
+
+        Rows depend on each other there, or nearly so; numbers of that size would drown the others.
+        """
+        p, Fp = z.lam.copy(), z.g.copy()
+        p.axpy(-1.0, before.lam)
+        Fp.axpy(-1.0, before.g)
+        own = self._qp.feasible.max_step(before.lam.array_r, -p.array_r)
+        length = float(self._comm.allreduce(own, op=MPI.MIN))
+        if agreed(self._comm, length < 1.0 and p.dot(Fp) <= LOOSE * self.norm * p.dot(p)):
+            z.take(before)
+            z.move(max(length, 0.0) * BEYOND, p, Fp)
+        p.destroy()
+        Fp.destroy()
+
+    def _slide(self, z: Point) -> bool:
+        """Along a residual that meets no curvature, where rows depend on each other, to a bound.
+
+        Returns:
+            Whether there is one.
+        """
+        r, Fr = self._directions.r, self._directions.Fp
+        self._qp.F.mult(r, Fr)
+        if self._directions.seen(r.dot(Fr), r.dot(r)):
+            return False
+        own = self._qp.feasible.max_step(z.lam.array_r, -r.array_r)
+        length = float(self._comm.allreduce(own, op=MPI.MIN))
+        if np.isfinite(length):
+            z.move(length * BEYOND, r, Fr)
+        return bool(np.isfinite(length))
 
     def _drop(self, z: Point) -> None:
         """Enter the face of z, and bring z back to Gλ = e in it; multiplies by F once."""
@@ -328,7 +392,7 @@ class FaceSolver:
         assert previous is not None
         face = feasible.face(z.lam.array_r, z.g.array_r)
         self.enter(face)
-        near = restored(self.coarse, z.lam)
+        near = self._restored(z.lam)
         if self.coarse.imbalance(near) > HELD:
             # it no longer holds a body: what is nearest names rows that do, near by if it can
             near.destroy()
@@ -345,14 +409,22 @@ class FaceSolver:
         z.refresh(self._qp)
         self.forget()
 
-    def _pcpg(self, z: Point, optimality: float, stays: bool) -> None:
+    def _restored(self, lam: PETSc.Vec) -> PETSc.Vec:
+        """The nearest point of Gλ = e on the face entered, if it has one."""
+        near = restored(self.coarse, lam)
+        if self.coarse.imbalance(near) > EXACT:  # what its factor leaves where rows hardly hold
+            once, near = near, restored(self.coarse, near)
+            once.destroy()
+        return near
+
+    def _pcpg(self, z: Point, optimality: float, stays: bool) -> ConvergedReason:
         """PCPG to a part of what there is to do; to the end where the face stays."""
         z.g.copy(self._directions.r)
         self.coarse.project(self._directions.r)
         start, final = float(self._directions.r.norm()), FINAL * self._rule.tolerance
         share = STAGE if stays else self._parameters.reduction
         target = max(final, share * min(start, optimality))
-        pcpg(
+        reason = pcpg(
             self._on_face,
             z,
             TargetRule(target),
@@ -362,6 +434,7 @@ class FaceSolver:
             self._directions,
         )
         self.left = float(self._directions.r.norm())
+        return reason
 
     def _leave(self) -> None:
         """Free what belongs to the face."""

@@ -22,7 +22,7 @@ class NewtonParameters:
         fits=ABOVE_0,
     )
     reduction: float = described(
-        0.3,
+        0.5,
         "newton",
         "what a solve on a face that may change reduces its residual to, in (0, 1)",
         name="newton_reduction",

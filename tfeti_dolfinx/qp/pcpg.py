@@ -12,7 +12,7 @@ from tfeti_dolfinx.qp.stopping import StoppingRule
 
 # of the largest curvature of a direction, and of what the preconditioner makes of a residual: less
 # is rounding, as where rows depend on each other
-FLAT = 1e-14
+FLAT = 1e-13
 
 
 class Directions:
