@@ -19,20 +19,20 @@ from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, Steps
 from tfeti_dolfinx.qp.stopping import ResidualRule
 
 
-def in_a_corner():
+def in_a_corner(**options):
     """A block that contact with three planes holds, and nothing else."""
     d = decomposed("hexahedron", 3, subdomains=4)
     planes = {"bottom": (0, 0, 1), "left": (1, 0, 0), "front": (0, 1, 0)}
     contacts = [tfeti.Obstacle(name, tfeti.Plane((0, 0, 0), n)) for name, n in planes.items()]
-    return problem(d, (-0.01, -0.02, -0.05), contacts, clamped=())
+    return problem(d, (-0.01, -0.02, -0.05), contacts, clamped=(), **options)
 
 
-def on_a_block():
+def on_a_block(**options):
     """A block on another one, which holds it in one direction."""
     d = stacked("quadrilateral", 3, 4, 5)
     sides = held(d, "lower bottom", "upper left")
     contact = tfeti.Contact("lower top", "upper bottom")
-    return two_body_problem(d, pressed(d, 1e-2), sides, [contact])
+    return two_body_problem(d, pressed(d, 1e-2), sides, [contact], **options)
 
 
 @pytest.fixture(scope="module", params=[in_a_corner, on_a_block])

@@ -41,8 +41,8 @@ STAGE = 0.1
 EXACT = 1e-13
 # of ‖F‖: curvature of the way that a solve has gone; less is nearly none, and the way far
 LOOSE = 1e-8
-# a little more than the way to a bound, so that rounding leaves nobody before it
-BEYOND = 1.0 + 1e-12
+# of the way to the first bound, where nothing else ends it: more rows than one are to leave
+BEYOND = 10.0
 # so many steps in a row that neither lower q by what stands out from its rounding, nor halve ‖g^P‖
 PATIENCE, ROUNDING = 10, 1e-15
 
