@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import ufl
-from bodies import boxes, held, pressed, stacked, two_body_problem
+from bodies import held, pressed, stacked, two_body_problem
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI

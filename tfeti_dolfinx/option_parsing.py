@@ -17,7 +17,7 @@ from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.solvers import SOLVERS
 
-# what the factors of the subdomains, of the coarse problem and of contact rows read from PETSc's options
+# what the factors of subdomains, of the coarse problem and of contact rows read from PETSc's options
 FACTOR_OPTION = re.compile(r"(sub|coarse|face)_(pc_factor|mat)_\w+")
 
 

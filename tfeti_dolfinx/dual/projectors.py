@@ -14,7 +14,6 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.null_basis import NullBasis
 from tfeti_dolfinx.dual.semidefinite import SemidefiniteFactor
 from tfeti_dolfinx.parallel import agreed
-from tfeti_dolfinx.qp.coarse import worst
 from tfeti_dolfinx.qp.faces import Face
 
 
@@ -55,15 +54,15 @@ class Projectors:
         """Number r of equations."""
         return self.Gt.shape[1]
 
-    def residual(self, x: PETSc.Vec, share: float = 1.0) -> Array:
-        """share·e − Gx, shape ``(r,)``."""
-        return np.asarray(share * self.e - self.G(x.array_r))
+    def residual(self, x: PETSc.Vec) -> Array:
+        """e − Gx, shape ``(r,)``."""
+        return np.asarray(self.e - self.G(x.array_r))
 
-    def imbalance(self, x: PETSc.Vec) -> float:
-        """How far Gx is from e: the worst equation, beside its terms."""
+    def forces(self, x: PETSc.Vec) -> Array:
+        """Σ|G||x| + |e|, shape ``(r,)``."""
         forces = np.asarray(abs(self.Gt).T @ np.abs(x.array_r))
         self.comm.Allreduce(MPI.IN_PLACE, forces, op=MPI.SUM)
-        return agreed(self.comm, worst(self.residual(x), forces + np.abs(self.e)))
+        return forces + np.abs(self.e)
 
     def solve(self, y: Array) -> Array:
         """(GGᵀ)⁺ y for y in the range of G, orthogonal to the free motions."""

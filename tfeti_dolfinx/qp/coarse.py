@@ -8,6 +8,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import TINY, Array
+from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.qp.faces import Face
 
 # of GGᵀ, added to G_f G_fᵀ: keeps steps regular where few rows carry a force; above rounding, and
@@ -39,12 +40,12 @@ class Coarse(Protocol):
         """Right side, replicated, shape ``(r,)``."""
         ...
 
-    def residual(self, x: PETSc.Vec, share: float = 1.0) -> Array:
-        """share·e − G_f Zᵀx, replicated, shape ``(r,)``. Collective."""
+    def residual(self, x: PETSc.Vec) -> Array:
+        """e − G_f Zᵀx, replicated, shape ``(r,)``. Collective."""
         ...
 
-    def imbalance(self, x: PETSc.Vec) -> float:
-        """How far G_f Zᵀx is from e: the worst equation, beside its terms; 1 is far. Collective."""
+    def forces(self, x: PETSc.Vec) -> Array:
+        """Sum of the moduli of the terms of each entry of the residual. Collective."""
         ...
 
     def damped_solve(self, face: Face, y: Array) -> Array:
@@ -84,10 +85,12 @@ class Coarse(Protocol):
         ...
 
 
-def worst(residual: Array, forces: Array) -> float:
-    """Largest entry of a residual beside the moduli of its terms."""
+def imbalance(coarse: Coarse, x: PETSc.Vec) -> float:
+    """How far Gx is from e: the worst entry beside its terms, 1 at most. Collective."""
+    forces = coarse.forces(x)
     floor = max(LIGHT * float(forces.max(initial=0.0)), TINY)
-    return float(np.max(np.abs(residual) / np.maximum(forces, floor), initial=0.0))
+    own = np.max(np.abs(coarse.residual(x)) / np.maximum(forces, floor), initial=0.0)
+    return agreed(x.getComm().tompi4py(), float(own))
 
 
 class NoCoarse:
@@ -102,13 +105,13 @@ class NoCoarse:
     def __init__(self, face: Face | None = None) -> None:
         self._face, self.e = face, np.zeros(0)
 
-    def residual(self, x: PETSc.Vec, share: float = 1.0) -> Array:
+    def residual(self, x: PETSc.Vec) -> Array:
         """None."""
         return np.zeros(0)
 
-    def imbalance(self, x: PETSc.Vec) -> float:
-        """0."""
-        return 0.0
+    def forces(self, x: PETSc.Vec) -> Array:
+        """None."""
+        return np.zeros(0)
 
     def damped_solve(self, face: Face, y: Array) -> Array:
         """None."""
@@ -161,14 +164,13 @@ class DenseCoarse:
         self._Gf = G if face is None else np.asarray((face.Z @ (face.Z.T @ G.T)).T)
         self._inverse = np.linalg.pinv(self._Gf @ self._Gf.T, hermitian=True)
 
-    def residual(self, x: PETSc.Vec, share: float = 1.0) -> Array:
-        """share·e − G_f Zᵀx."""
-        return np.asarray(share * self.e - self._Gf @ x.array_r)
+    def residual(self, x: PETSc.Vec) -> Array:
+        """e − G_f Zᵀx."""
+        return np.asarray(self.e - self._Gf @ x.array_r)
 
-    def imbalance(self, x: PETSc.Vec) -> float:
-        """The worst equation, beside its terms."""
-        forces = np.abs(self._Gf) @ np.abs(x.array_r) + np.abs(self.e)
-        return worst(self.residual(x), forces)
+    def forces(self, x: PETSc.Vec) -> Array:
+        """Σ|G_f Zᵀ||x| + |e|."""
+        return np.asarray(np.abs(self._Gf) @ np.abs(x.array_r) + np.abs(self.e))
 
     def damped_solve(self, face: Face, y: Array) -> Array:
         """(G_f G_fᵀ + δGGᵀ)⁺y."""

@@ -11,12 +11,12 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.parallel import agreed
-from tfeti_dolfinx.qp.coarse import Coarse
+from tfeti_dolfinx.qp.coarse import Coarse, imbalance
 from tfeti_dolfinx.qp.faces import Face, Status, face_of
 
 # far more than Newton takes where it converges, so that a cycle ends
 MAX_STEPS = 100
-# of ‖e‖, or of ‖Gy‖ if that is more: what the coarse problem's factors leave at best
+# of the terms of Gλ − e: what the coarse problem's factors leave at best
 BALANCED = 1e-13
 # of the same: below that, a step that does not halve what is left has met rounding
 NEARLY = 1e-9
@@ -45,7 +45,7 @@ class Nearest:
     Attributes:
         lam: The point, the caller's own.
         alpha: λ = P_Ω(y + Gᵀα), replicated.
-        missing: ‖e − Gλ‖ over the larger one of ‖e‖ and ‖Gy‖.
+        missing: How far Gλ is from e: the worst entry beside its terms, 1 at most.
     """
 
     lam: PETSc.Vec
@@ -81,9 +81,8 @@ def nearest(
     """
     comm = y.getComm().tompi4py()
     trial = _trial(coarse, feasible, y, np.zeros(coarse.dimension) if alpha is None else alpha)
-    scale = max(float(np.linalg.norm(coarse.e)), float(np.linalg.norm(coarse.residual(y, 0.0))))
     for _ in range(MAX_STEPS):
-        left = trial.left
+        left, scale = trial.left, float(np.linalg.norm(coarse.forces(trial.lam)))
         if agreed(comm, left <= BALANCED * scale):
             break
         step = coarse.damped_solve(feasible.face(trial.lam.array_r, y.array_r), trial.residual)
@@ -91,7 +90,7 @@ def nearest(
         met_rounding = trial.left > 0.5 * left and trial.left <= NEARLY * scale
         if agreed(comm, length <= SHORTEST or met_rounding):
             break
-    return Nearest(trial.lam, trial.alpha, agreed(comm, trial.left / (scale or 1.0)))
+    return Nearest(trial.lam, trial.alpha, imbalance(coarse, trial.lam))
 
 
 class WithinFace:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from petsc4py import PETSc
 
-
+from tfeti_dolfinx.qp.coarse import imbalance
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.monitors import Monitor, no_monitor
 from tfeti_dolfinx.qp.nearest import nearest
-from tfeti_dolfinx.qp.newton_parts import FaceSolver, Iterate
+from tfeti_dolfinx.qp.newton_faces import FaceSolver
+from tfeti_dolfinx.qp.newton_iterate import Iterate
 from tfeti_dolfinx.qp.parameters import NewtonParameters
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, QPResult, Start, Steps
 from tfeti_dolfinx.qp.stopping import StoppingRule
@@ -28,7 +29,7 @@ def first_point(qp: QP) -> PETSc.Vec:
     coarse = qp.coarse.on_face(qp.feasible.face(zero.array_r, zero.array_r))
     lam = zero.duplicate()
     coarse.particular(lam)
-    held = coarse.imbalance(lam) <= HELD
+    held = imbalance(coarse, lam) <= HELD
     coarse.destroy()
     if not held:
         lam.destroy()
@@ -102,7 +103,7 @@ def newton(
     while reason == ConvergedReason.ITERATING:
         if looked:
             # Step 1: optimality
-            state.look(max(faces.norm, state.norm))
+            state.look(faces)
             monitor(steps, "outer", state.point.lam, state.residual, 0.0)
             if state.residual <= rule.tolerance:
                 rule.norm = state.norm
@@ -129,5 +130,3 @@ def newton(
     faces.destroy()
     state.destroy()
     return result
-
-

@@ -129,4 +129,4 @@ SOLVERS = {
     ),
 }
 # what auto stands for, without and with inequalities
-AUTO = {False: "pcpg", True: "newton"}
+AUTO = {False: "pcpg", True: "smalse"}
