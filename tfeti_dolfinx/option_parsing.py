@@ -17,7 +17,7 @@ from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.solvers import SOLVERS
 
-# what the factors of subdomains, of the coarse problem and of contact rows read from PETSc's options
+# what factors of subdomains, the coarse problem and contact rows read from PETSc.s options
 FACTOR_OPTION = re.compile(r"(sub|coarse|face)_(pc_factor|mat)_\w+")
 
 

@@ -35,8 +35,8 @@ class Options:
     max_it: int = described(10_000, "all", "most inner steps, and most outer ones", fits=FROM_0)
     pc_type: str = described(
         "auto",
-        "pcpg",
-        "preconditioner; auto takes dirichlet with pcpg and none with smalse, which takes no other",
+        "pcpg, newton",
+        "preconditioner; auto takes dirichlet, and none with smalse, which takes no other",
         choices=("auto", "none", *PRECONDITIONERS),
     )
     scaling: str = described(

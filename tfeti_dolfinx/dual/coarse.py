@@ -22,7 +22,6 @@ from tfeti_dolfinx.dual.projectors import (
 from tfeti_dolfinx.dual.semidefinite import SemidefiniteFactor
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.parallel import agreed, chunk_offsets
-from tfeti_dolfinx.qp.coarse import DAMPING
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
@@ -119,10 +118,10 @@ class CoarseSpace(Projectors):
         """A factor of G_f G_fᵀ + damping·GGᵀ of the local rows flagged."""
         return self.factors.factor(csr_array(self.gram(rows) + damping * self.gram()))
 
-    def damped_solve(self, face: Face, y: Array) -> Array:
-        """(G_f G_fᵀ + δGGᵀ)⁻¹y, f a face of the rows."""
+    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
+        """(G_f G_fᵀ + damping·GGᵀ)⁻¹y, f a face of the rows."""
         gram = replicated_gram(csr_array(face.Z.T @ self.Gt), self.comm)
-        factor = self.factors.factor(csr_array(gram + DAMPING * self.gram()))
+        factor = self.factors.factor(csr_array(gram + damping * self.gram()))
         x = factor.solve(y)
         factor.destroy()
         return x

@@ -136,8 +136,8 @@ class Whole(Protocol):
     Gt: csr_array
     e: Array
 
-    def damped_solve(self, face: Face, y: Array) -> Array:
-        """(G_f G_fᵀ + δGGᵀ)⁻¹y."""
+    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
+        """(G_f G_fᵀ + damping·GGᵀ)⁻¹y."""
         ...
 
 
@@ -164,9 +164,9 @@ class FaceProjectors(Projectors):
         """ZZᵀ x."""
         return self._face.restricted(x)
 
-    def damped_solve(self, face: Face, y: Array) -> Array:
+    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
         """As on all rows."""
-        return self._whole.damped_solve(face, y)
+        return self._whole.damped_solve(face, y, damping)
 
     def on_face(self, face: Face) -> FaceProjectors:
         """The projectors of another face of all rows."""

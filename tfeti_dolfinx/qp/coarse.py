@@ -11,9 +11,6 @@ from tfeti_dolfinx.arrays import TINY, Array
 from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.qp.faces import Face
 
-# of GGᵀ, added to G_f G_fᵀ: keeps steps regular where few rows carry a force; above rounding, and
-# small beside 1, so that they stay Newton's
-DAMPING = 1e-8
 # of the largest forces on an equation: those on a light one beside it count as so large at least,
 # since the rounding of the largest reaches them
 LIGHT = 1e-4
@@ -48,8 +45,8 @@ class Coarse(Protocol):
         """Sum of the moduli of the terms of each entry of the residual. Collective."""
         ...
 
-    def damped_solve(self, face: Face, y: Array) -> Array:
-        """(G_f G_fᵀ + δGGᵀ)⁻¹y with a small δ, f a face of all rows. Collective."""
+    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
+        """(G_f G_fᵀ + damping·GGᵀ)⁻¹y, f a face of all rows. Collective."""
         ...
 
     def project(self, x: PETSc.Vec) -> None:
@@ -113,7 +110,7 @@ class NoCoarse:
         """None."""
         return np.zeros(0)
 
-    def damped_solve(self, face: Face, y: Array) -> Array:
+    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
         """None."""
         return y
 
@@ -172,10 +169,10 @@ class DenseCoarse:
         """Σ|G_f Zᵀ||x| + |e|."""
         return np.asarray(np.abs(self._Gf) @ np.abs(x.array_r) + np.abs(self.e))
 
-    def damped_solve(self, face: Face, y: Array) -> Array:
-        """(G_f G_fᵀ + δGGᵀ)⁺y."""
+    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
+        """(G_f G_fᵀ + damping·GGᵀ)⁺y."""
         GZ = (face.Z.T @ self._G.T).T
-        gram = GZ @ GZ.T + DAMPING * self._G @ self._G.T
+        gram = GZ @ GZ.T + damping * self._G @ self._G.T
         return np.asarray(np.linalg.pinv(gram, hermitian=True) @ y)
 
     def project(self, x: PETSc.Vec) -> None:

@@ -18,8 +18,12 @@ from tfeti_dolfinx.qp.faces import Face, Status, face_of
 MAX_STEPS = 100
 # of the terms of Gλ − e: what the coarse problem's factors leave at best
 BALANCED = 1e-13
-# of the same: below that, a step that does not halve what is left has met rounding
-NEARLY = 1e-9
+# of the same: below that, a step that leaves more than this share has met the damping, or rounding
+NEARLY, SLOW = 1e-6, 0.1
+# of GGᵀ, added to G_f G_fᵀ: keeps steps regular where few rows carry a force, and is small beside 1,
+# so that they stay Newton's; where bodies are hardly held it slows the end down, and the smallest
+# that a factor bears takes its place
+DAMPING, LEAST_DAMPING = 1e-8, 1e-14
 # a step of this share of Newton's changes nothing that is left above rounding
 SHORTEST = 1e-8
 # of the cost: what rounding may add to it
@@ -81,15 +85,19 @@ def nearest(
     """
     comm = y.getComm().tompi4py()
     trial = _trial(coarse, feasible, y, np.zeros(coarse.dimension) if alpha is None else alpha)
+    damping = DAMPING
     for _ in range(MAX_STEPS):
         left, scale = trial.left, float(np.linalg.norm(coarse.forces(trial.lam)))
         if agreed(comm, left <= BALANCED * scale):
             break
-        step = coarse.damped_solve(feasible.face(trial.lam.array_r, y.array_r), trial.residual)
+        face = feasible.face(trial.lam.array_r, y.array_r)
+        step = coarse.damped_solve(face, trial.residual, damping)
         trial, length = _searched(coarse, feasible, y, trial, step)
-        met_rounding = trial.left > 0.5 * left and trial.left <= NEARLY * scale
-        if agreed(comm, length <= SHORTEST or met_rounding):
+        slow = agreed(comm, trial.left > SLOW * left and trial.left <= NEARLY * scale)
+        if agreed(comm, length <= SHORTEST) or (slow and damping <= LEAST_DAMPING):
             break
+        if slow:
+            damping = LEAST_DAMPING
     return Nearest(trial.lam, trial.alpha, imbalance(coarse, trial.lam))
 
 

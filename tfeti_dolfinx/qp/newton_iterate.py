@@ -16,6 +16,8 @@ from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, QPResult, Steps
 
 # of what the gradient step promises at least, (ᾱ/2)‖g^P‖²: a step must lower q by that share
 ENOUGH = 0.1
+# of λ: what a way must be, so that F on it is not F on rounding of Gλ = e
+SHORT = 1e-6
 # so many steps in a row that neither lower q by what stands out from its rounding, nor halve ‖g^P‖
 PATIENCE, ROUNDING = 10, 1e-15
 # so many in a row that do not halve ‖g^P‖, whatever q does
@@ -46,7 +48,7 @@ class Iterate:
         self.back: PETSc.Vec | None = None
         self.mu: Array = np.zeros(qp.coarse.dimension)
         self._set_multipliers()
-        self.residual, self.norm = float("inf"), _rayleigh(qp, self.point)
+        self.residual, self.norm = float("inf"), 1.0
         self._best, self._idle, self._slow = float("inf"), 0, 0
 
     def face(self) -> Face:
@@ -60,9 +62,10 @@ class Iterate:
 
     def look(self, faces: FaceSolver) -> None:
         """Optimality: how far a gradient step, brought back to the feasible set, moves."""
-        self.norm = max(self.norm, faces.norm) or 1.0
+        self.norm = faces.norm or _rayleigh(self._qp, self.point) or 1.0
         if faces.settled:
-            self.multipliers_on(faces)
+            self.mu = faces.coarse.coordinates(self.point.g)
+        self._set_multipliers()
         target = self.point.lam.copy()
         target.axpy(-1.0 / self.norm, self.s)  # not Fλ − d: what Gᵀμ takes from it may be large
         found = nearest(self._qp.coarse, self._qp.feasible, target)
@@ -156,7 +159,8 @@ class Iterate:
         p.axpy(-1.0, self.point.lam)
         self._qp.F.mult(p, Fp)
         slope, curvature, size = -self.s.dot(p), p.dot(Fp), p.dot(p)
-        faces.saw(curvature, size)
+        if size > SHORT**2 * self.point.lam.dot(self.point.lam):
+            faces.saw(curvature, size)
         length = min(1.0, slope / curvature) if curvature > 0.0 else 1.0
         moved = agreed(self._comm, size > 0.0 and slope > 0.0)
         if moved:
