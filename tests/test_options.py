@@ -74,7 +74,7 @@ def test_symbols_of_parameters_stand_in_the_notation():
     """With the name of the field that they stand for, in one row."""
     rows = (ROOT / "docs/notation.md").read_text().splitlines()
     described = [p for p in parameters_of(Options) if p.description.symbol]
-    assert len(described) == 6
+    assert len(described) == 7
     for parameter in described:
         symbol, name = parameter.description.symbol, parameter.path[-1]
         assert any(

@@ -149,7 +149,9 @@ class Accuracy:
         now, before = self._looked(), self._before
         bodies, energy = now.bodies, np.sqrt(np.maximum(now.bodies.energy, 0.0))
         own = np.sqrt(bodies.correction_energy)
-        shown = np.divide(bodies.elastic, energy, out=np.zeros_like(energy), where=energy > 0.0)
+        # at rest all is rounding, and energy does not say how far anything moves
+        known = (energy > 0.0) & (self._at_rest(now) == 0.0)
+        shown = np.divide(bodies.elastic, energy, out=np.zeros_like(energy), where=known)
         estimate = shown * own
         if before is not None and before.error > 0.0:
             estimate = np.maximum(estimate, bodies.change * (now.error / before.error))
@@ -161,7 +163,7 @@ class Accuracy:
         size, most = now.bodies.size, now.bodies.size.max(initial=0.0)
         share = np.where(size < STIFF * most, STRICTER, 1.0)
         alone = LOAD_NOISE * now.bodies.alone
-        at_rest = 0.0 if alone.any() or most > AT_REST * now.gap else AT_REST * now.gap
+        at_rest = self._at_rest(now)
         displacement = self.rtol * share * size + NOISE * most + alone + at_rest
         largest = float(displacement.max(initial=0.0))
         balance = max(self.rtol, NOISE) * now.forces
@@ -169,6 +171,12 @@ class Accuracy:
         energy = FORCES * self.rtol * np.sqrt(max(now.bodies.energy.sum(), 0.0))
         energy += np.sqrt(now.bodies.stiffness @ (RIGID * most + alone + at_rest) ** 2)
         return Tolerances(displacement, 2.0 * largest, 2.0 * largest, balance, float(energy))
+
+    def _at_rest(self, now: Measures) -> float:
+        """The size of displacements that are rounding of 0 where nothing is loaded, else 0."""
+        small = AT_REST * now.gap
+        loaded = bool(now.bodies.alone.any())
+        return 0.0 if loaded or now.bodies.size.max(initial=0.0) > small else small
 
     def ratio(self) -> float:
         """What must be at most 1: the largest of all errors over their tolerances."""
