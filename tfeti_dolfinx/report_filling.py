@@ -51,6 +51,8 @@ def fill_result(
     if dual.preconditioner is not None:
         report.preconditioner_multiplications += dual.preconditioner.count["solver"]
     report.outer_iterations += result.steps.outer
+    report.newton_faces += result.steps.faces
+    report.face_factorizations += dual.coarse.factors.count["face"]
     report.cg_steps += result.steps.cg
     report.expansion_steps += result.steps.expansion
     report.proportioning_steps += result.steps.proportioning
