@@ -21,8 +21,8 @@ BALANCED = 1e-13
 # of the same: below that, a step that leaves more than this share has met the damping, or rounding
 NEARLY, SLOW = 1e-6, 0.1
 # of GGᵀ, added to G_f G_fᵀ: keeps steps regular where few rows carry a force, and is small beside
-# 1, so that they stay Newton's; where bodies are hardly held it slows the end down, and the smallest
-# that a factor bears takes its place
+# 1, so that they stay Newton's; where bodies are hardly held it slows the end down, and the
+# smallest that a factor bears takes its place
 DAMPING, LEAST_DAMPING = 1e-8, 1e-14
 # a step of this share of Newton's changes nothing that is left above rounding
 SHORTEST = 1e-8
