@@ -216,6 +216,7 @@ def test_factors_that_failed_are_made_again():
         with pytest.raises(tfeti.InputError, match="the stiffness has a diagonal entry"):
             scene.solve(E=-1.0)
     assert scene.problem.report.assemblies == 1
+    assert not {"factors", "coarse problem"} & set(scene.problem.report.reused)
     assert distance(scene.solve(), scene.fresh()) <= 1e-8
     scene.problem.destroy()
 

@@ -177,7 +177,8 @@ class ContactProblem:
 
         Not needed where constants, functions or Dirichlet values have only got other values:
         ``solve`` sees that itself. Of conditions on the same unknowns only the values count; a
-        new load, new values or new gaps need no row and no factor, a new stiffness no search.
+        new load, new values or new gaps need no row and no factor, a new stiffness no search:
+        with ``secondary="auto"`` the sides of a pair stay those of the first stiffness.
 
         Args:
             load: A linear form instead of ``L``.
