@@ -216,6 +216,7 @@ def test_factors_that_failed_are_made_again():
         with pytest.raises(tfeti.InputError, match="the stiffness has a diagonal entry"):
             scene.solve(E=-1.0)
     assert scene.problem.report.assemblies == 1
+    assert not {"factors", "coarse problem"} & set(scene.problem.report.reused)
     assert distance(scene.solve(), scene.fresh()) <= 1e-8
     scene.problem.destroy()
 
@@ -295,3 +296,16 @@ def test_an_update_that_raises_has_changed_nothing():
         assert counters(scene.problem.report) == [0] * len(COUNTERS)
     for item in (scene, other):
         item.problem.destroy()
+
+
+def test_the_report_is_the_same_on_all_ranks():
+    scene = Repeated("triangle")
+    for load in (-0.05, np.nan, -0.08):
+        try:
+            scene.solve(load=load)
+        except tfeti.InputError:
+            assert np.isnan(load)
+        report, comm = scene.problem.report, scene.problem.decomposition.comm
+        assert len(set(comm.allgather(report.to_json()))) == 1
+    assert report.in_all["solves"] == 3
+    scene.problem.destroy()

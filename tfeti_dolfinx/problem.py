@@ -28,7 +28,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.option_parsing import factor_options, parse_options
 from tfeti_dolfinx.report import Report
-from tfeti_dolfinx.report_filling import fill_result
+from tfeti_dolfinx.report_filling import fill_result, settle_seconds
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solver import conclude, resolve_types, solve_dual
 from tfeti_dolfinx.states import Multipliers
@@ -177,7 +177,8 @@ class ContactProblem:
 
         Not needed where constants, functions or Dirichlet values have only got other values:
         ``solve`` sees that itself. Of conditions on the same unknowns only the values count; a
-        new load, new values or new gaps need no row and no factor, a new stiffness no search.
+        new load, new values or new gaps need no row and no factor, a new stiffness no search:
+        with ``secondary="auto"`` the sides of a pair stay those of the first stiffness.
 
         Args:
             load: A linear form instead of ``L``.
@@ -203,6 +204,7 @@ class ContactProblem:
     def _count(self) -> None:
         """What the solve has made and taken."""
         self._system.count(self.report)
+        settle_seconds(self.report, self.decomposition.comm)
         self.report.end()
 
     def _solve_rounds(self) -> None:
