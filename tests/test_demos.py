@@ -62,7 +62,12 @@ def test_unknown_arguments_are_refused():
         demo.main(["--quick", "-tfeti_rtoll", "1e-3"])
 
 
-CUBES = [("newton", 8, 30), ("newton", 64, 32), ("smalse", 8, 100), ("smalse", 64, 130)]
+CUBES = [
+    ("newton", 8, 30),
+    pytest.param("newton", 64, 32, marks=pytest.mark.slow),
+    ("smalse", 8, 100),
+    ("smalse", 64, 130),
+]
 
 
 @pytest.mark.parametrize(("qp_type", "subdomains", "most"), CUBES)
