@@ -15,6 +15,7 @@ from tfeti_dolfinx.arrays import sum_rows
 from tfeti_dolfinx.contact.records import relative_displacement, remaining_gaps, slips
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.gluing.glue import glue
+from tfeti_dolfinx.gluing.prescribed import prescribe
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.frames import SWITCH, frames
 from tfeti_dolfinx.mortar.surfaces import group_points
@@ -160,7 +161,7 @@ def test_rows_of_normals_measure_what_records_do():
     dofs = dofs_on(d)
     records = searched([sided(*ORDERS[1])], dofs, d)
     weights = 1.0 + np.arange(dofs.num_nodes * 3) % 7
-    gluing = glue(dofs, [], records, 1.0, weights)
+    gluing = glue(dofs, prescribe(dofs, []), records, 1.0, weights)
     u = nodal(dofs, lambda x: np.cos(2.0 * x) - x[:, [1, 2, 0]])
     constraints = gluing.constraints
     trace, Bu = constraints.B.createVecs()

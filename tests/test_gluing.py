@@ -13,6 +13,7 @@ from tfeti_dolfinx.contact.records import concatenate
 from tfeti_dolfinx.errors import InputError, NoSolutionError
 from tfeti_dolfinx.gluing.glue import glue
 from tfeti_dolfinx.gluing.interface import _orthonormal
+from tfeti_dolfinx.gluing.prescribed import prescribe
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 
@@ -31,7 +32,7 @@ class Scene:
         records = concatenate([c.records(dofs, d, i) for i, c in enumerate(contacts)], gdim)
         n_local = dofs.num_nodes * dofs.bs
         self.weights = np.ones(n_local) if weights is None else weights(dofs)
-        self.gluing = glue(dofs, self.bcs, records, 1.0, self.weights)
+        self.gluing = glue(dofs, prescribe(dofs, self.bcs), records, 1.0, self.weights)
         self.constraints = self.gluing.constraints
 
     @property
@@ -115,7 +116,7 @@ def test_a_dirichlet_value_reaches_copies_that_have_no_facet_on_the_surface():
     records = concatenate([], 2)
     ones = np.ones(dofs.num_nodes * 2)
     bcs = [fem.dirichletbc(0.5, left, V.sub(1))]
-    gluing = glue(dofs, bcs, records, 1.0, ones)
+    gluing = glue(dofs, prescribe(dofs, bcs), records, 1.0, ones)
     found = d.comm.allreduce(int(np.sum(np.isclose(gluing.constraints.c.array_r, 0.5))))
     x = V.tabulate_dof_coordinates()
     assert found == d.comm.allreduce(int(np.sum(np.isclose(x[:, 0], 0))))
@@ -184,7 +185,7 @@ def test_prescribed_components_move_into_the_gap():
     bottom = fem.locate_dofs_topological(V.sub(0), 2, d.facets("bottom"))
     records = concatenate([slanted.records(dofs, d, 0)], 3)
     bcs = [fem.dirichletbc(1.0, bottom, V.sub(0))]
-    gluing = glue(dofs, bcs, records, 1.0, np.ones(dofs.num_nodes * 3))
+    gluing = glue(dofs, prescribe(dofs, bcs), records, 1.0, np.ones(dofs.num_nodes * 3))
     rows = gluing.constraints.sets.normals
     gap = gluing.constraints.c.array_r[rows] / gluing.contact.scale
     assert np.allclose(gap, records.gap[gluing.contact.condition] + 0.6 * 1.0)
@@ -205,9 +206,9 @@ def test_contradictory_dirichlet_values_are_an_error():
     ]
     dofs, records = TornDofs(V, d), concatenate([], 3)
     with pytest.raises(InputError, match=r"contradict each other: component \d .* 0.0 and as 1.0"):
-        glue(dofs, bcs, records, 1.0, np.ones(dofs.num_nodes * 3))
+        glue(dofs, prescribe(dofs, bcs), records, 1.0, np.ones(dofs.num_nodes * 3))
     same = [bcs[0], fem.dirichletbc(np.zeros(3), bcs[1].dof_indices()[0][::3] // 3, V)]
-    glue(dofs, same, records, 1.0, np.ones(dofs.num_nodes * 3))
+    glue(dofs, prescribe(dofs, same), records, 1.0, np.ones(dofs.num_nodes * 3))
 
 
 def test_dirichlet_values_that_are_not_finite_are_an_error():
@@ -217,4 +218,4 @@ def test_dirichlet_values_that_are_not_finite_are_an_error():
     dofs, records = TornDofs(V, d), concatenate([], 3)
     with pytest.raises(InputError, match="Dirichlet condition 0 has a value that is not finite"):
         bc = fem.dirichletbc(np.full(3, np.nan), left, V)
-        glue(dofs, [bc], records, 1.0, np.ones(dofs.num_nodes * 3))
+        glue(dofs, prescribe(dofs, [bc]), records, 1.0, np.ones(dofs.num_nodes * 3))

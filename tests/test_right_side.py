@@ -46,7 +46,7 @@ class Scene:
 
     def glued(self, bcs, records=None):
         records = self.search.records if records is None else records
-        return glue(self.dofs, bcs, records, 1.0, self.weights)
+        return glue(self.dofs, prescribe(self.dofs, bcs), records, 1.0, self.weights)
 
 
 @pytest.mark.parametrize("degree", [1, 2])
@@ -95,14 +95,15 @@ def test_values_that_push_a_held_face_into_an_obstacle_leave_c_as_it_was():
     dofs = TornDofs(V, d)
     wall = tfeti.Obstacle("left", tfeti.Plane((-0.5, 0, 0), (1, 0, 0)))
     records = searched([wall], dofs, d)
-    gluing = glue(dofs, [clamp(V, d.facets("left"))], records, 1.0, np.ones(dofs.num_nodes * 3))
+    held, ones = prescribe(dofs, [clamp(V, d.facets("left"))]), np.ones(dofs.num_nodes * 3)
+    gluing = glue(dofs, held, records, 1.0, ones)
     assert d.comm.allreduce(len(gluing.contact.decided)) == 0
     near = glue(
         dofs,
-        [clamp(V, d.facets("left"))],
+        held,
         searched([tfeti.Obstacle("left", wall.shape, reach=np.inf)], dofs, d),
         1.0,
-        np.ones(dofs.num_nodes * 3),
+        ones,
     )
     assert d.comm.allreduce(len(near.contact.decided)) == 16
     c = np.array(near.constraints.c.array_r)
@@ -122,7 +123,7 @@ def test_gaps_that_contradict_each_other_are_found_without_new_rows():
     p = in_a_slot(0.9)
     dofs, d = p.dofs, p.decomposition
     records = searched([replace(wall, reach=np.inf) for wall in p.contacts], dofs, d)
-    gluing = glue(dofs, [], records, 1.0, np.ones(dofs.num_nodes * 2))
+    gluing = glue(dofs, prescribe(dofs, []), records, 1.0, np.ones(dofs.num_nodes * 2))
     values = np.zeros_like(gluing.prescribed.value)
     gluing.right_side(values, records.gap)
     with pytest.raises(NoSolutionError, match=r"contacts 0 and 1 .* contradict each other"):

@@ -16,6 +16,7 @@ from tfeti_dolfinx.contact.records import concatenate
 from tfeti_dolfinx.errors import ConvergenceError, InputError
 from tfeti_dolfinx.gluing import spectrum as module
 from tfeti_dolfinx.gluing.glue import glue
+from tfeti_dolfinx.gluing.prescribed import prescribe
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 # the rows alone matter: no step of the solver is made
@@ -167,7 +168,7 @@ def test_no_rows_no_values():
     d = decomposed("triangle", 2, 1)
     dofs = TornDofs(fem.functionspace(d.mesh, ("Lagrange", 1, (2,))), d)
     ones = np.ones(dofs.num_nodes * dofs.bs)
-    constraints = glue(dofs, [], concatenate([], 2), 1.0, ones).constraints
+    constraints = glue(dofs, prescribe(dofs, []), concatenate([], 2), 1.0, ones).constraints
     assert module.extreme_eigenvalues(constraints) == {}
     constraints.destroy()
 

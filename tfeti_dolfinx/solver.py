@@ -22,7 +22,7 @@ from tfeti_dolfinx.qp.homogenised import (
 )
 from tfeti_dolfinx.qp.monitors import Monitor, PrintMonitor, no_monitor
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, QPResult, Start
-from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver
+from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver, Task
 
 EXPLANATIONS = {
     ConvergedReason.DIVERGED_ROUNDING: "; rounding does not let it come lower: expected a "
@@ -83,7 +83,7 @@ def solve_dual(
         monitor = _monitor(dual, homogenised, options)
     scale = homogenised.scale
     rule = Accuracy(dual, options.rtol, options.atol, scale.reference, scale.rounding, qp.norm)
-    result = solver.solve(qp, homogenised, rule, options, begin, monitor)
+    result = solver.solve(Task(qp, homogenised, rule, options, begin, monitor))
     homogenised.destroy()
     if begin is not None:
         begin.lam.destroy()

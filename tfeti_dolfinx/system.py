@@ -195,7 +195,8 @@ class System:
             self._gluing.constraints.destroy()
         search = self.search
         weights = row_weights(self._diagonal, self._settings.options.scaling, self._dofs.comm)
-        self._gluing = glue(self._dofs, self.bcs, search.records, search.length, weights)
+        prescribed = _made(self._prescribed)
+        self._gluing = glue(self._dofs, prescribed, search.records, search.length, weights)
         self.spectrum = {}
 
     def _fill_right_side(self) -> None:

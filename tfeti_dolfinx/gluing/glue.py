@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from dolfinx import fem
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.contact.records import ContactRecords
@@ -14,7 +12,7 @@ from tfeti_dolfinx.errors import TfetiError
 from tfeti_dolfinx.gluing.constraints import Constraints, assemble_constraints
 from tfeti_dolfinx.gluing.contact import ContactRows, contact_rows
 from tfeti_dolfinx.gluing.interface import HeldRows, equality_rows
-from tfeti_dolfinx.gluing.prescribed import Prescribed, prescribe
+from tfeti_dolfinx.gluing.prescribed import Prescribed
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.parallel import any_rank
 
@@ -118,7 +116,7 @@ class Gluing:
 
 def glue(
     dofs: TornDofs,
-    bcs: Sequence[fem.DirichletBC],
+    prescribed: Prescribed,
     records: ContactRecords,
     length: float,
     weights: Array,
@@ -127,17 +125,15 @@ def glue(
 
     Args:
         dofs: Dof maps.
-        bcs: Dirichlet conditions.
+        prescribed: Dirichlet values.
         records: Contact conditions of this rank; those within reach get rows.
         length: A length of the scene.
         weights: D, positive, one per local primal unknown: the stiffness there, or ones. Rows
             are orthonormal in the inner product of D⁻¹ as far as they can be.
 
     Raises:
-        InputError: Dirichlet conditions contradict each other.
         NoSolutionError: Dirichlet conditions and contacts contradict each other.
     """
-    prescribed = prescribe(dofs, bcs)
     D = dofs.gather_copies(weights.reshape(-1, dofs.bs))
     normals, contact = contact_rows(dofs, prescribed.flag, D, records)
     equalities, held = equality_rows(dofs, prescribed.flag, D)

@@ -37,7 +37,25 @@ class Parameters(Protocol):
         ...
 
 
-Solve = Callable[[QP, Homogenised, StoppingRule, Parameters, Start | None, Monitor], QPResult]
+@dataclass(frozen=True)
+class Task:
+    """What a solver is called with.
+
+    Attributes:
+        qp: The program.
+        homogenised: Its homogenised form.
+        rule: Says when to stop.
+        parameters: Parameters of all solvers.
+        start: Where to start, or None.
+        monitor: Called after each step.
+    """
+
+    qp: QP
+    homogenised: Homogenised
+    rule: StoppingRule
+    parameters: Parameters
+    start: Start | None
+    monitor: Monitor
 
 
 @dataclass(frozen=True)
@@ -45,7 +63,7 @@ class Solver:
     """A solver, and what to know before it is called.
 
     Attributes:
-        solve: Solves a program with its homogenised form, from a start if there is one.
+        solve: Solves a task.
         keeps_bounds: Whether it keeps inequalities.
         pc_type: Preconditioner that ``auto`` stands for.
         unpreconditioned: Why it takes no preconditioner; empty if it does.
@@ -54,7 +72,7 @@ class Solver:
         warm: From a start to its λ̄; None: λ̄ is as without one.
     """
 
-    solve: Solve
+    solve: Callable[[Task], QPResult]
     keeps_bounds: bool
     pc_type: str
     unpreconditioned: str
@@ -63,39 +81,33 @@ class Solver:
     warm: Callable[[QP, Start], PETSc.Vec] | None = None
 
 
-def _pcpg(
-    qp: QP,
-    homogenised: Homogenised,
-    rule: StoppingRule,
-    parameters: Parameters,
-    start: Start | None,
-    monitor: Monitor,
-) -> QPResult:
-    return solve_by_pcpg(qp, homogenised, rule, max_it=parameters.max_it, monitor=monitor)
+def _pcpg(task: Task) -> QPResult:
+    max_it = task.parameters.max_it
+    return solve_by_pcpg(task.qp, task.homogenised, task.rule, max_it=max_it, monitor=task.monitor)
 
 
-def _smalse(
-    qp: QP,
-    homogenised: Homogenised,
-    rule: StoppingRule,
-    parameters: Parameters,
-    start: Start | None,
-    monitor: Monitor,
-) -> QPResult:
-    own, max_it = parameters.smalse, parameters.max_it
-    return smalse(qp, homogenised, rule, own, max_it=max_it, start=start, monitor=monitor)
+def _smalse(task: Task) -> QPResult:
+    return smalse(
+        task.qp,
+        task.homogenised,
+        task.rule,
+        task.parameters.smalse,
+        max_it=task.parameters.max_it,
+        start=task.start,
+        monitor=task.monitor,
+    )
 
 
-def _newton(
-    qp: QP,
-    homogenised: Homogenised,
-    rule: StoppingRule,
-    parameters: Parameters,
-    start: Start | None,
-    monitor: Monitor,
-) -> QPResult:
-    own, max_it, warm = parameters.newton, parameters.max_it, start is not None
-    return newton(qp, homogenised, rule, own, max_it=max_it, warm=warm, monitor=monitor)
+def _newton(task: Task) -> QPResult:
+    return newton(
+        task.qp,
+        task.homogenised,
+        task.rule,
+        task.parameters.newton,
+        max_it=task.parameters.max_it,
+        warm=task.start is not None,
+        monitor=task.monitor,
+    )
 
 
 def _restored(qp: QP, start: Start) -> PETSc.Vec:
