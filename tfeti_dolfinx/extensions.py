@@ -23,8 +23,8 @@ class Extensions:
         block: Makes the Block of a subdomain, say a class; ``BlockDefaults`` leaves four methods
             to write, ``check_kind_of_block`` tests it.
         kplus: Makes the generalised inverse of a subdomain, for ``SparseBlock``.
-        preconditioner: Makes a preconditioner from B D⁻¹ and the Blocks, for solvers that take
-            one.
+        preconditioner: Makes a preconditioner from B D⁻¹ and the subdomains, for solvers that
+            take one.
         feasible_set: From B and c to the set of multipliers; ``check_feasible_set`` tests it.
         monitor: Called after each step of the solver.
     """

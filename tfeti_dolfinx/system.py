@@ -26,12 +26,12 @@ from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.report_filling import fill_sizes
 from tfeti_dolfinx.solver import resolve_types
 from tfeti_dolfinx.stages import STAGES, Stages
-from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
+from tfeti_dolfinx.subdomains.build import make_subdomains, sparse_blocks, subdomain_data
 from tfeti_dolfinx.subdomains.data import Counters
 from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.kernel import mode_names
-from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES
-from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
+from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, Making
+from tfeti_dolfinx.subdomains.local import LocalChoice
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 from tfeti_dolfinx.timing import stage
 
@@ -205,17 +205,19 @@ class System:
 
     def _factor(self) -> None:
         trace, counters = self.gluing.constraints.trace, self._counters
-        kplus = self._settings.extensions.kplus or KPLUS_TYPES[self._settings.options.kplus_type]
-        prefix = f"{self._settings.prefix}sub_"
+        extensions, options = self._settings.extensions, self._settings.options
+        kplus = extensions.kplus or KPLUS_TYPES[options.kplus_type]
+        choice = LocalChoice(options.local_type, options.local_multiplications)
+        how = Making(counters, kplus, f"{self._settings.prefix}sub_")
         data = subdomain_data(self._dofs, self._decomposition, self._K, self._f, trace)
         del self._K  # the Blocks have it
         with added_options(self._settings.prefix, self._settings.factor_options):
             self._subdomains = make_subdomains(
                 data,
-                self._settings.extensions.block
-                or (lambda s: SparseBlock(s, counters, kplus, prefix)),
+                extensions.block or sparse_blocks(how, choice),
                 self._decomposition,
                 counters,
+                choice,
             )
 
     def _retrace(self) -> None:
