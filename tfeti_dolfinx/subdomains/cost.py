@@ -9,7 +9,7 @@ from tfeti_dolfinx.subdomains.factor import REAL, FactorSize
 # What one core of a few years ago does; of a faster one all times are shorter alike, and only their
 # ratios choose. Bytes read from memory, and operations of sweeps over a factor and of dense
 # products of matrices, each per second; seconds of a call that comes through Python and PETSc.
-BANDWIDTH, SWEEPS, PRODUCTS, CALL = 1.2e10, 9e9, 2e10, 2e-5
+BANDWIDTH, SWEEPS, PRODUCTS, CALL = 1.2e10, 9e9, 1.6e10, 2e-5
 # Seconds of one entry of a sparse matrix times one number.
 SPARSE_ENTRY = 1.2e-9
 # Right sides that go through a factor at once: enough that it is not read for each, and few enough
