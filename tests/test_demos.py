@@ -4,6 +4,7 @@ import importlib
 import json
 
 import pytest
+from mpi4py import MPI
 
 import tfeti_dolfinx as tfeti
 
@@ -69,7 +70,7 @@ def test_multiplications_of_the_cube(subdomains, most):
     assert report.F_multiplications <= most
     assert report.primal_dofs == 3993 * subdomains
     assert report.kernel_dim == 6 * subdomains
-    assert report.factorizations == subdomains
+    assert 1 <= report.factorizations <= MPI.COMM_WORLD.size  # the subdomains are equal
 
 
 def test_a_free_motion_of_the_block_is_found():

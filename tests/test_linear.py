@@ -155,7 +155,12 @@ def test_no_contact_no_price():
 
 
 def test_without_a_preconditioner_K_ii_is_not_factored():
-    p = problem(decomposed("hexahedron", 4, 8), (0, 0, -0.05), tfeti_pc_type="lumped")
+    p = problem(
+        decomposed("hexahedron", 4, 8),
+        (0, 0, -0.05),
+        tfeti_pc_type="lumped",
+        tfeti_local_type="implicit",
+    )
     p.solve()
     assert p.report.factorizations == 8
 
