@@ -107,7 +107,7 @@ class CholeskyFactor:
     def solve(self, b: Array) -> Array:
         """A⁻¹ b, shapes ``(n,)`` or ``(n, q)``."""
         if b.ndim == 2:
-            return self._solve_many(b)
+            return self._solve_many(b) if b.shape[1] > 1 else self.solve(b[:, 0])[:, None]
         self._b.array[:] = b
         self._factor.solve(self._b, self._x)
         return np.array(self._x.array_r)
