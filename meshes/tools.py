@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import gmsh
@@ -68,5 +69,6 @@ def script(description: str | None, build: Callable[..., Any]) -> None:
     parser.add_argument("--partitions", type=int, default=0)
     arguments = parser.parse_args()
     build(partitions=arguments.partitions)
+    Path(arguments.output).parent.mkdir(parents=True, exist_ok=True)
     gmsh.write(arguments.output)
     gmsh.finalize()

@@ -96,7 +96,7 @@ def test_gram_is_G_Gt(dual):
 def test_feasible_homogenisation(held_by_contact):
     dual = held_by_contact
     coarse, bounded = dual.coarse, dual.constraints.sets.normals
-    lam = feasible_particular(coarse, bounded)
+    lam = feasible_particular(coarse, dual.d).array_r
     assert np.allclose(coarse.G(lam), coarse.e, atol=1e-11)
     assert np.all(lam[bounded] >= 0.0)
     natural = dual.d.duplicate()
@@ -112,7 +112,7 @@ def test_the_feasible_homogenisation_is_the_smallest(held_by_contact):
     """Its optimality conditions: λ̄ = Gᵀα on carrying rows, (Gᵀα) ≤ 0 on the others."""
     dual = held_by_contact
     coarse, bounded = dual.coarse, dual.constraints.sets.normals
-    lam = feasible_particular(coarse, bounded)
+    lam = feasible_particular(coarse, dual.d).array_r
     carrying = np.ones(len(lam), dtype=bool)
     carrying[bounded] = lam[bounded] > 0.0
     gram = coarse.gram(carrying).toarray()

@@ -15,24 +15,24 @@ from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
 from tfeti_dolfinx.qp.faces import Face, Status, face_of
 from tfeti_dolfinx.qp.feasible_sets import Product
 from tfeti_dolfinx.qp.pcpg import pcpg
-from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Steps
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, Steps
 from tfeti_dolfinx.qp.stopping import ResidualRule
 
 
-def in_a_corner():
+def in_a_corner(**options):
     """A block that contact with three planes holds, and nothing else."""
     d = decomposed("hexahedron", 3, subdomains=4)
     planes = {"bottom": (0, 0, 1), "left": (1, 0, 0), "front": (0, 1, 0)}
     contacts = [tfeti.Obstacle(name, tfeti.Plane((0, 0, 0), n)) for name, n in planes.items()]
-    return problem(d, (-0.01, -0.02, -0.05), contacts, clamped=())
+    return problem(d, (-0.01, -0.02, -0.05), contacts, clamped=(), **options)
 
 
-def on_a_block():
+def on_a_block(**options):
     """A block on another one, which holds it in one direction."""
     d = stacked("quadrilateral", 3, 4, 5)
     sides = held(d, "lower bottom", "upper left")
     contact = tfeti.Contact("lower top", "upper bottom")
-    return two_body_problem(d, pressed(d, 1e-2), sides, [contact])
+    return two_body_problem(d, pressed(d, 1e-2), sides, [contact], **options)
 
 
 @pytest.fixture(scope="module", params=[in_a_corner, on_a_block])
@@ -191,7 +191,7 @@ def test_pcpg_on_a_face(preconditioned, with_coarse):
     on_face = replace(qp, coarse=coarse.on_face(face), preconditioner=helper)
     start = np.random.default_rng(5).standard_normal(40)
     lam, g, steps = vector(start), vector(F @ start - d), Steps()
-    reason = pcpg(on_face, lam, g, ResidualRule(1e-11), steps, 100)
+    reason = pcpg(on_face, Point(lam, g), ResidualRule(1e-11), steps, 100)
     assert reason == ConvergedReason.CONVERGED_RTOL
     assert steps.cg <= (12 if preconditioned else 26)
     assert np.allclose(g.array_r, F @ lam.array_r - d, atol=1e-9)
@@ -208,8 +208,8 @@ def test_pcpg_from_its_solution_takes_no_step():
     qp = QP(matrix(F), vector(d), DenseCoarse(G, e), Product())
     lam, steps = vector(np.linalg.lstsq(G, e, rcond=None)[0]), Steps()
     g = vector(F @ lam.array_r - d)
-    assert pcpg(qp, lam, g, ResidualRule(1e-10), steps, 100) > 0
+    assert pcpg(qp, Point(lam, g), ResidualRule(1e-10), steps, 100) > 0
     taken = steps.cg
     assert taken > 0
-    assert pcpg(qp, lam, g, ResidualRule(1e-9), steps, 100) > 0
+    assert pcpg(qp, Point(lam, g), ResidualRule(1e-9), steps, 100) > 0
     assert steps.cg == taken

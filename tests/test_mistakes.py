@@ -5,9 +5,11 @@ import re
 import pytest
 from mistakes import (
     accepted,
+    again,
     conditions,
     contacts,
     elasticity,
+    extensions,
     forms,
     gmsh_files,
     meshes,
@@ -16,9 +18,11 @@ from mistakes import (
 )
 from mistakes.scene import Scene
 
+MODULES = (forms, elasticity, conditions, options, meshes, contacts, results, gmsh_files)
+MODULES += (again, extensions)
 TABLES = {
     f"{module.__name__.split('.')[1]} {name.lower()}": getattr(module, name)
-    for module in (forms, elasticity, conditions, options, meshes, contacts, results, gmsh_files)
+    for module in MODULES
     for name in module.TABLES
 }
 

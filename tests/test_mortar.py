@@ -115,13 +115,16 @@ def total_height(d, body):
 @pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
 @pytest.mark.parametrize("n", [(3, 4), (5, 3)])
 def test_independent_active_set(cell, n):
-    problem = lever(cell, jagged, n, **TO_ROUNDING)
-    problem.solve()
-    x, u = displacement(problem)
     reference = TwoBoxes(cell, *n, push=0.07, pull=0.12)
     x_ref, u_ref, points, lam = reference.solve()
-    assert np.allclose(x, x_ref)
-    assert relative(u, u_ref) <= 1e-8
+    for qp_type in ("newton", "smalse"):
+        problem = lever(cell, jagged, n, qp_type=qp_type, **TO_ROUNDING)
+        problem.solve()
+        x, u = displacement(problem)
+        assert np.allclose(x, x_ref)
+        assert relative(u, u_ref) <= 1e-8
+    # rows on prescribed vertices meet few others and may depend on each other: forces are not
+    # unique then, and SMALSE-M, which starts at 0, happens to find those of the reference
     data = problem.solution.contact()
     place, force = gathered(data.points), gathered(data.force)
     order = np.lexsort(np.rint(place.T * 1e7))

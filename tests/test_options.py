@@ -43,7 +43,10 @@ def test_the_command_line_beats_the_dictionary():
         ({"tfeti_rtol": "tight"}, r"-tfeti_rtol 'tight': expected a value of type float"),
         ({"tfeti_rtol": -1}, r"-tfeti_rtol -1.0: expected 0 or more"),
         ({"tfeti_max_it": "1.5"}, r"-tfeti_max_it '1.5': expected a value of type int"),
-        ({"tfeti_qp_type": "newt"}, r"-tfeti_qp_type newt: expected one of auto, pcpg, smalse"),
+        (
+            {"tfeti_qp_type": "newt"},
+            r"-tfeti_qp_type newt: expected one of auto, pcpg, smalse, newton",
+        ),
         ({"tfeti_monitor": "maybe"}, r"-tfeti_monitor 'maybe': expected a value of type bool"),
         ({"tfeti_smalse_beta": 1.0}, r"-tfeti_smalse_beta 1.0: expected between 0 and 1"),
         ({"tfeti_smalse_rho": 0}, r"-tfeti_smalse_rho 0.0: expected more than 0"),
@@ -71,7 +74,7 @@ def test_symbols_of_parameters_stand_in_the_notation():
     """With the name of the field that they stand for, in one row."""
     rows = (ROOT / "docs/notation.md").read_text().splitlines()
     described = [p for p in parameters_of(Options) if p.description.symbol]
-    assert len(described) == 6
+    assert len(described) == 7
     for parameter in described:
         symbol, name = parameter.description.symbol, parameter.path[-1]
         assert any(

@@ -58,3 +58,20 @@ def test_glue_that_lets_go_at_a_limit(limit):
     assert np.allclose(force[gap > noise], -limit, rtol=1e-9)
     both = p.dofs.comm.allgather((np.any(force < -1e-12), np.any(gap > noise)))
     assert np.any(both, axis=0).tolist() == [limit > 0.0, limit < 1.0]
+
+
+def test_a_set_that_changes_is_asked_for_before_each_solve():
+    limit, found = [1e6], []
+
+    def pulling(constraints):
+        half_spaces = HalfSpaces(-constraints.scale, np.full(len(constraints.scale), limit[0]))
+        return Product([(constraints.sets.normals, half_spaces)])
+
+    obstacle, own = Obstacle("bottom", curved_obstacle(2)), Extensions(feasible_set=pulling)
+    p = problem(decomposed("triangle", 3, 3), contacts=[obstacle], extensions=own, rtol=1e-9)
+    for limit[0] in (1e6, 0.0):
+        p.solve()
+        found.append(p.dofs.comm.allreduce(p.solution.force.min(initial=0.0), op=min))
+    assert found[0] < -1e-3
+    assert found[1] >= -1e-12
+    p.destroy()

@@ -207,3 +207,105 @@ def test_what_an_update_cannot_take_is_named():
     assert distance(scene.solve(), other.solve()) <= 1e-8
     for item in (scene, other):
         item.problem.destroy()
+
+
+def test_factors_that_failed_are_made_again():
+    """The stiffness is held by nobody in between."""
+    scene = Repeated("triangle")
+    for _ in range(2):
+        with pytest.raises(tfeti.InputError, match="the stiffness has a diagonal entry"):
+            scene.solve(E=-1.0)
+    assert scene.problem.report.assemblies == 1
+    assert not {"factors", "coarse problem"} & set(scene.problem.report.reused)
+    assert distance(scene.solve(), scene.fresh()) <= 1e-8
+    scene.problem.destroy()
+
+
+def test_a_mesh_that_has_moved_is_searched_again():
+    scene, other = Repeated("triangle"), Repeated("triangle")
+    first = scene.solve()
+    for item in (scene, other):
+        item.problem.decomposition.mesh.geometry.x[:, 1] -= 0.015
+    second = scene.solve()
+    assert scene.problem.report.searches == 1
+    assert distance(second, other.solve()) <= 1e-8
+    assert distance(second, first) > 1e-2
+    for item in (scene, other):
+        item.problem.destroy()
+
+
+def test_the_stress_of_an_earlier_solution_is_that_of_its_modulus():
+    d = decomposed("triangle", 3, 3)
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+    nu = fem.Function(fem.functionspace(d.mesh, ("DG", 0)))
+    nu.x.array[:] = 0.3
+    thickness = fem.Constant(d.mesh, 1.0)
+    elastic = tfeti.Elasticity(d, E=1.0, nu=nu, model="plane_strain", thickness=thickness)
+    load = fem.Constant(d.mesh, (0.0, -0.05))
+    left = fem.locate_dofs_topological(V, 1, d.facets("left"))
+    problem = tfeti.ContactProblem(
+        elastic.a(u, v),
+        ufl.dot(load, v) * ds(d.surface("top")),
+        [fem.dirichletbc(np.zeros(2), left, V)],
+        [tfeti.Obstacle("bottom", curved_obstacle(2))],
+        d,
+        stress=elastic.stress,
+        thickness=elastic.thickness,
+        petsc_options={"rtol": 1e-10},
+    )
+
+    def fields(solution):
+        return [
+            solution.stress.x.array,
+            solution.nodal_von_mises.x.array,
+            solution.pressure.x.array,
+        ]
+
+    problem.solve()
+    first = problem.solution
+    problem.solve()
+    expected = [values.copy() for values in fields(problem.solution)]
+    elastic.E.value, thickness.value, nu.x.array[:] = 7.0, 2.0, 0.1
+    problem.solve()
+    for now, then in zip(fields(first), expected, strict=True):
+        assert np.allclose(now, then, rtol=1e-6, atol=1e-9)
+    assert any(
+        V.mesh.comm.allgather(not np.allclose(fields(problem.solution)[0], expected[0], rtol=1e-2))
+    )
+    problem.destroy()
+
+
+def test_an_update_that_raises_has_changed_nothing():
+    scene, other = Repeated("triangle"), Repeated("triangle")
+    first = scene.solve()
+    V = scene.problem.dofs.V
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    good = {
+        "stiffness": 2.0 * ufl.inner(hooke()(u), strain(v)) * ufl.dx,
+        "load": ufl.ZeroBaseForm((v,)),
+        "values": [],
+        "gap": {0: 0.1},
+    }
+    bad = {"load": 1, "values": [None], "gap": {0: np.nan}}
+    for name, value in bad.items():
+        with pytest.raises(tfeti.InputError):
+            scene.problem.update(**{**good, name: value})
+        assert distance(scene.solve(), first) <= 1e-8
+        assert counters(scene.problem.report) == [0] * len(COUNTERS)
+    for item in (scene, other):
+        item.problem.destroy()
+
+
+def test_the_report_is_the_same_on_all_ranks():
+    scene = Repeated("triangle")
+    for load in (-0.05, np.nan, -0.08):
+        try:
+            scene.solve(load=load)
+        except tfeti.InputError:
+            assert np.isnan(load)
+        report, comm = scene.problem.report, scene.problem.decomposition.comm
+        assert len(set(comm.allgather(report.to_json()))) == 1
+    assert report.in_all["solves"] == 3
+    scene.problem.destroy()

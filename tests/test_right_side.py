@@ -58,7 +58,7 @@ def test_other_values_and_gaps_cost_a_vector(cell, degree):
     B, c = gluing.constraints.B, gluing.constraints.c
     entries, state = [np.array(part) for part in B.getValuesCSR()], B.stateGet()
     first = np.array(c.array_r)
-    scene.search.set_gap(0, lambda x: 0.1 + 0.01 * x[0])
+    scene.search.set_gaps({0: lambda x: 0.1 + 0.01 * x[0]})
     anew = scene.glued(new)
     values, gaps = prescribe(scene.dofs, new).value, scene.search.records.gap
     expected = np.array(anew.constraints.c.array_r)
@@ -147,7 +147,7 @@ def test_another_gap_needs_no_search(monkeypatch):
     geometry = search.records
     ramp = searched([sided("upper bottom", "lower top", reach=0.5, gap=0.01)], scene.dofs, scene.d)
     Counted(monkeypatch)
-    search.set_gap(0, 0.01)
+    search.set_gaps({0: 0.01})
     own = search.records.contact == 0
     assert np.allclose(search.records.gap[own], ramp.gap, rtol=0, atol=1e-15)
     assert np.array_equal(search.records.gap[~own], geometry.gap[~own])
@@ -156,12 +156,12 @@ def test_another_gap_needs_no_search(monkeypatch):
     assert search.contacts[0].gap == 0.01
     for gap in (np.nan, "geometric", lambda x: np.nan + x[0]):
         with pytest.raises(InputError, match="gap"):
-            search.set_gap(0, gap)
+            search.set_gaps({0: gap})
         assert search.contacts[0].gap == 0.01
-    search.set_gap(1, lambda x: x[0])
-    search.set_gap(0, "geometry")
+    search.set_gaps({1: lambda x: x[0]})
+    search.set_gaps({0: "geometry"})
     assert np.array_equal(search.records.gap[own], geometry.gap[own])
-    search.set_gap(1, "geometry")
+    search.set_gaps({1: "geometry"})
     assert np.array_equal(search.records.gap, geometry.gap)
 
 
@@ -171,5 +171,5 @@ def test_a_geometry_that_overlaps_too_deep_is_not_gone_back_to():
     pair = sided("upper bottom", "lower top", gap=0.0)
     search = ContactSearch([pair], dofs, d, np.ones(dofs.num_nodes * 2))
     with pytest.raises(InputError, match=r"the surfaces overlap by up to 0\.1, more than"):
-        search.set_gap(0, "geometry")
+        search.set_gaps({0: "geometry"})
     assert np.array_equal(search.records.gap, np.zeros(len(search.records)))

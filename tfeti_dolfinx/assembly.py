@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from hashlib import blake2b
 from typing import Any
 
 import numpy as np
 import ufl
 from dolfinx import fem
+from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.checks import checked_type, named
@@ -20,31 +21,36 @@ from tfeti_dolfinx.parallel import any_rank
 
 
 class Data:
-    """The constants, coefficients and points that forms refer to, and what they were last.
+    """Numbers that somebody may change, and what they were last.
 
     Args:
-        form: The form.
-        V: The space of its arguments.
+        arrays: Gives the numbers as they are now.
+        comm: Communicator.
     """
 
-    def __init__(self, form: ufl.Form | ufl.ZeroBaseForm, V: fem.FunctionSpace) -> None:
-        self._mesh, self._seen = V.mesh, b""
-        zero = is_zero(form)
-        self._constants = [] if zero else list(form.constants())
-        self._coefficients = [] if zero else list(form.coefficients())
+    def __init__(self, arrays: Callable[[], list[Array]], comm: MPI.Intracomm) -> None:
+        self._arrays, self._comm, self._seen = arrays, comm, b""
 
     def has_changed(self) -> bool:
         """Whether anything is other than at the last call, or this is the first. Collective."""
         before, self._seen = self._seen, self._digest()
-        return any_rank(self._mesh.comm, before != self._seen)
+        return any_rank(self._comm, before != self._seen)
 
     def _digest(self) -> bytes:
-        digest = blake2b(np.ascontiguousarray(self._mesh.geometry.x))
-        for constant in self._constants:
-            digest.update(np.ascontiguousarray(constant.value))
-        for function in self._coefficients:
-            digest.update(np.ascontiguousarray(function.x.array))
+        digest = blake2b()
+        for array in self._arrays():
+            digest.update(np.ascontiguousarray(array))
         return digest.digest()
+
+
+def data_of(form: ufl.Form | ufl.ZeroBaseForm, V: fem.FunctionSpace) -> Data:
+    """The constants and coefficients of a form whose arguments are on V."""
+    zero = is_zero(form)
+    constants = [] if zero else list(form.constants())
+    coefficients = [] if zero else list(form.coefficients())
+    return Data(
+        lambda: [*(c.value for c in constants), *(f.x.array for f in coefficients)], V.mesh.comm
+    )
 
 
 class Forms:
@@ -76,19 +82,24 @@ class Forms:
             "form_compiler_options": _options(form_compiler_options, "form_compiler_options"),
             "jit_options": {**JIT_OPTIONS, **_options(jit_options, "jit_options")},
         }
+        self._points = Data(lambda: [V.mesh.geometry.x], decomposition.comm)
         self.replace_stiffness(a)
         self.replace_load(L)
 
     def replace_stiffness(self, a: ufl.Form) -> None:
         """Take another bilinear form on the same space."""
         check_form(a, "a", self._V, self._decomposition)
-        self._a, self._of_a = self._compiled(a, "a"), Data(a, self._V)
+        self._a, self._of_a = self._compiled(a, "a"), data_of(a, self._V)
 
     def replace_load(self, L: ufl.Form | ufl.ZeroBaseForm) -> None:
         """Take another linear form on the same space."""
         check_form(L, "L", self._V, self._decomposition)
         self._L = None if is_zero(L) else self._compiled(L, "L")
-        self._of_L = Data(L, self._V)
+        self._of_L = data_of(L, self._V)
+
+    def has_new_points(self) -> bool:
+        """Whether the mesh has moved since the last call."""
+        return self._points.has_changed()
 
     def has_new_stiffness(self) -> bool:
         """Whether a, or what it refers to, has changed since the last call."""

@@ -51,6 +51,13 @@ PCPG = """@article{FarhatMandelRoux1994,
   volume = {115}, pages = {365--385}, year = {1994}
 }
 """
+SEMISMOOTH = """@article{HintermullerItoKunisch2002,
+  title = {The primal-dual active set strategy as a semismooth {Newton} method},
+  author = {Hinterm{\\"u}ller, Michael and Ito, Kazufumi and Kunisch, Karl},
+  journal = {SIAM Journal on Optimization},
+  volume = {13}, pages = {865--888}, year = {2002}
+}
+"""
 DUAL_MORTAR = """@article{Wohlmuth2000,
   title = {A mortar finite element method using dual spaces for the {Lagrange} multiplier},
   author = {Wohlmuth, Barbara I.},
@@ -63,6 +70,7 @@ DUAL_MORTAR = """@article{Wohlmuth2000,
 PAPERS = {
     "tfeti": (TOTAL_FETI, FIXING_NODES),
     "pcpg": (PCPG,),
+    "newton": (SEMISMOOTH, PCPG),
     "smalse": (SCALABLE_CONTACT, SMALSE, MPRGP),
     "mortar": (DUAL_MORTAR,),
 }

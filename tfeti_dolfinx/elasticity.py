@@ -157,6 +157,7 @@ class Elasticity:
         if dx is None:
             degree = {"quadrature_degree": self._quadrature_degree(v)}
             dx = ufl.Measure("dx", domain=self.mesh, metadata=degree)
+        checked_type(dx, ufl.Measure, "dx", "a measure of UFL, or None")
         is_one = isinstance(self.thickness, float)
         return work * dx if is_one else self.thickness * work * dx
 

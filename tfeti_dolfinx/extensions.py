@@ -3,16 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
+import numpy as np
+from mpi4py import MPI
+
+from tfeti_dolfinx.checks import checked_callable, named, shown
 from tfeti_dolfinx.dual.dual import FeasibleLaw, no_tension
 from tfeti_dolfinx.dual.operator import MakePreconditioner
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.monitors import Monitor
 from tfeti_dolfinx.subdomains.block import Block
-from tfeti_dolfinx.subdomains.data import SubdomainData
-from tfeti_dolfinx.subdomains.kplus import MakeInverse
+from tfeti_dolfinx.subdomains.build import MakeBlock, sparse_blocks
+from tfeti_dolfinx.subdomains.data import Counters, SubdomainData
+from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, GeneralisedInverse, MakeInverse, Making
+from tfeti_dolfinx.subdomains.local import LocalChoice
 
 
 @dataclass(frozen=True)
@@ -25,8 +34,12 @@ class Extensions:
         kplus: Makes the generalised inverse of a subdomain, for ``SparseBlock``.
         preconditioner: Makes a preconditioner from B D⁻¹ and the subdomains, for solvers that
             take one.
-        feasible_set: From B and c to the set of multipliers; ``check_feasible_set`` tests it.
+        feasible_set: From B and c to the set of multipliers, asked before each run of the solver;
+            ``check_feasible_set`` tests it.
         monitor: Called after each step of the solver.
+
+    Raises:
+        InputError: One of them cannot be called, or a K⁺ is given that the Block would not use.
     """
 
     block: Callable[[SubdomainData], Block] | None = None
@@ -34,6 +47,84 @@ class Extensions:
     preconditioner: MakePreconditioner | None = None
     feasible_set: FeasibleLaw = no_tension
     monitor: Monitor | None = None
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            if (given := getattr(self, field.name)) is not field.default:
+                checked_callable(given, f"extensions: {field.name}", "a callable")
+        if self.block is not None and self.kplus is not None:
+            raise InputError(
+                "extensions: kplus is given, but only the package's own Block takes it; expected "
+                "block or kplus"
+            )
+
+
+def guarded(own: Extensions, comm: MPI.Intracomm) -> Extensions:
+    """The same parts, of which what fails is named, on all ranks where they run on all.
+
+    Blocks and K⁺ are made where ranks raise together.
+    """
+    return Extensions(
+        block=_giving(own.block, "block", Block),
+        kplus=_giving(own.kplus, "kplus", GeneralisedInverse),
+        preconditioner=_together(own.preconditioner, "preconditioner", comm),
+        feasible_set=own.feasible_set
+        if own.feasible_set is no_tension
+        else _together(_checked_set(own.feasible_set), "feasible_set", comm),
+        monitor=_together(own.monitor, "monitor", comm),
+    )
+
+
+def _together(part: Any, name: str, comm: MPI.Intracomm) -> Any:
+    """A part whose errors become an InputError of all ranks."""
+    if part is None:
+        return None
+
+    def call(*given: Any) -> Any:
+        with raised_on_all_ranks(comm), named(f"extensions: {name}"):
+            return part(*given)
+
+    return call
+
+
+def _giving(part: Any, name: str, protocol: type) -> Any:
+    """A part whose errors become an InputError, and which must give an implementation."""
+    if part is None:
+        return None
+
+    def call(*given: Any) -> Any:
+        with named(f"extensions: {name}"):
+            made = part(*given)
+            _check_members(made, name, protocol)
+        return made
+
+    return call
+
+
+def _check_members(made: Any, name: str, protocol: type) -> None:
+    members = [member for member in dir(protocol) if not member.startswith("_")]
+    if missing := [member for member in members if not hasattr(made, member)]:
+        raise InputError(
+            f"extensions: {name} gave {shown(made)} without {', '.join(missing)}; expected a "
+            f"{protocol.__name__}"
+        )
+
+
+def _checked_set(law: FeasibleLaw) -> FeasibleLaw:
+    """A law whose sets are of multipliers on all rows."""
+
+    def checked(constraints: Constraints) -> FeasibleSet:
+        made, zero = law(constraints), np.zeros(constraints.num_rows)
+        _check_members(made, "feasible_set", FeasibleSet)
+        if np.shape(made.project(zero)) != zero.shape:
+            raise InputError(
+                f"extensions: feasible_set projects vectors of shape {zero.shape} to "
+                f"{np.shape(made.project(zero))}; expected a set on all rows of this rank, say a "
+                "Product of sets on constraints.sets.normals"
+            )
+        return made
+
+    return checked
 
 
 @dataclass(frozen=True)
@@ -51,3 +142,18 @@ class Settings:
     prefix: str
     factor_options: Mapping[str, Any]
     extensions: Extensions
+
+    @property
+    def local_choice(self) -> LocalChoice:
+        """Which form local operators take."""
+        return LocalChoice(self.options.local_type, self.options.local_multiplications)
+
+    def make_block(self, counters: Counters) -> MakeBlock:
+        """What makes the Blocks of a rank.
+
+        Args:
+            counters: Counts factorisations.
+        """
+        kplus = self.extensions.kplus or KPLUS_TYPES[self.options.kplus_type]
+        how = Making(counters, kplus, f"{self.prefix}sub_")
+        return self.extensions.block or sparse_blocks(how, self.local_choice)

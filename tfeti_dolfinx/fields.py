@@ -8,6 +8,11 @@ from typing import Any
 import numpy as np
 import ufl
 from dolfinx import fem
+from ufl.algorithms.analysis import (
+    extract_arguments,
+    extract_coefficients,
+    extract_constants,
+)
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.checks import POSITIVE, checked_callable, checked_number, named, shown
@@ -71,7 +76,23 @@ def checked_thickness(thickness: Any, decomposition: Decomposition) -> Any:
     if thickness.ufl_shape != ():
         raise InputError(f"thickness is of shape {thickness.ufl_shape}; expected a scalar")
     check_mesh(thickness, "thickness", decomposition)
+    if extract_arguments(thickness):
+        raise InputError("thickness has a test or trial function; expected a scalar with values")
+    if isinstance(thickness, fem.Constant):
+        checked_number(thickness.value, "thickness", POSITIVE)
     return thickness
+
+
+def frozen(expression: Any, but: fem.Function | None = None) -> Any:
+    """An expression with its constants and functions as they are now, all but one.
+
+    The mesh is no function: where it is moved, the expression moves along.
+    """
+    if not isinstance(expression, ufl.core.expr.Expr):
+        return expression
+    copies = {c: fem.Constant(c.ufl_domain(), c.value) for c in extract_constants(expression)}
+    functions = [f for f in extract_coefficients(expression) if f is not but]
+    return ufl.replace(expression, copies | {f: f.copy() for f in functions})
 
 
 def cellwise(expression: Any, dofs: TornDofs, name: str) -> fem.Function:

@@ -17,8 +17,8 @@ from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.solvers import SOLVERS
 
-# what the factors of the subdomains and of the coarse problem read from PETSc's options
-FACTOR_OPTION = re.compile(r"(sub|coarse)_(pc_factor|mat)_\w+")
+# what factors of subdomains, the coarse problem and contact rows read from PETSc.s options
+FACTOR_OPTION = re.compile(r"(sub|coarse|face)_(pc_factor|mat)_\w+")
 
 
 def parse_options(given: Mapping[str, Any] | None, prefix: str) -> Options:

@@ -8,7 +8,7 @@ from tfeti_dolfinx.checks import Range
 from tfeti_dolfinx.described import FROM_0, FROM_1, described, parameters_of
 from tfeti_dolfinx.dual.operator import PRECONDITIONERS
 from tfeti_dolfinx.dual.particular import PARTICULAR
-from tfeti_dolfinx.qp.parameters import SmalseParameters
+from tfeti_dolfinx.qp.parameters import NewtonParameters, SmalseParameters
 from tfeti_dolfinx.qp.solvers import SOLVERS
 from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES
 from tfeti_dolfinx.subdomains.local import LOCAL_TYPES
@@ -36,8 +36,8 @@ class Options:
     max_it: int = described(10_000, "all", "most inner steps, and most outer ones", fits=FROM_0)
     pc_type: str = described(
         "auto",
-        "pcpg",
-        "preconditioner; auto takes dirichlet with pcpg and none with smalse, which takes no other",
+        "pcpg, newton",
+        "preconditioner; auto takes dirichlet, and none with smalse, which takes no other",
         choices=("auto", "none", *PRECONDITIONERS),
     )
     scaling: str = described(
@@ -71,6 +71,7 @@ class Options:
         choices=tuple(PARTICULAR),
     )
     norm_steps: int = described(15, "smalse", "Lanczos steps that estimate ‖PFP‖", fits=FROM_1)
+    newton: NewtonParameters = NewtonParameters()
     smalse: SmalseParameters = SmalseParameters()
     error_if_not_converged: bool = described(
         True, "all", "raise ConvergenceError where a solver stops before its tolerance"

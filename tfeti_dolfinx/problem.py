@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,11 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.assembly import Forms
 from tfeti_dolfinx.checks import checked_type
 from tfeti_dolfinx.compat import require_real_petsc
-from tfeti_dolfinx.contact.arguments import Gap, position_of
+from tfeti_dolfinx.contact.arguments import Gap, gaps_by_position
 from tfeti_dolfinx.contact.search import ContactPartner, checked_contacts
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
-from tfeti_dolfinx.extensions import Extensions, Settings
+from tfeti_dolfinx.extensions import Extensions, Settings, guarded
 from tfeti_dolfinx.fields import Stress, check_stress, checked_thickness
 from tfeti_dolfinx.form_checks import check_same_space, displacement_space
 from tfeti_dolfinx.gluing.glue import Gluing
@@ -27,7 +28,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.option_parsing import factor_options, parse_options
 from tfeti_dolfinx.report import Report
-from tfeti_dolfinx.report_filling import fill_result
+from tfeti_dolfinx.report_filling import fill_result, settle_seconds
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solver import conclude, resolve_types, solve_dual
 from tfeti_dolfinx.states import Multipliers
@@ -88,11 +89,12 @@ class ContactProblem:
         self.options = parse_options(petsc_options, petsc_options_prefix)
         extensions = Extensions() if extensions is None else extensions
         checked_type(extensions, Extensions, "extensions", "tfeti_dolfinx.Extensions")
-        for_factors = factor_options(petsc_options, petsc_options_prefix)
-        self._settings = Settings(self.options, petsc_options_prefix, for_factors, extensions)
         checked_type(
             decomposition, Decomposition, "decomposition", "what decompose or read_gmsh return"
         )
+        own = guarded(extensions, decomposition.comm)
+        for_factors = factor_options(petsc_options, petsc_options_prefix)
+        self._settings = Settings(self.options, petsc_options_prefix, for_factors, own)
         if self.options.spectrum:
             require_slepc(decomposition.comm)
         self.decomposition = decomposition
@@ -136,9 +138,10 @@ class ContactProblem:
     def solve(self) -> fem.Function:
         """Solve the problem.
 
-        What a solve has made is kept. Constants and functions in the forms and Dirichlet values
-        may change between two solves: only what depends on them is made again, and the solver
-        starts from the last solution. For new forms, conditions or gaps see ``update``.
+        What a solve has made is kept. Constants and functions in the forms, Dirichlet values and
+        the points of the mesh may change between two solves: only what depends on them is made
+        again, and the solver starts from the last solution. For new forms, conditions or gaps
+        see ``update``.
 
         Returns:
             The displacement, on the torn mesh.
@@ -174,7 +177,8 @@ class ContactProblem:
 
         Not needed where constants, functions or Dirichlet values have only got other values:
         ``solve`` sees that itself. Of conditions on the same unknowns only the values count; a
-        new load, new values or new gaps need no row and no factor, a new stiffness no search.
+        new load, new values or new gaps need no row and no factor, a new stiffness no search:
+        with ``secondary="auto"`` the sides of a pair stay those of the first stiffness.
 
         Args:
             load: A linear form instead of ``L``.
@@ -184,24 +188,23 @@ class ContactProblem:
                 nodes that have none and come to overlap get theirs, as ever.
 
         Raises:
-            InputError: Something given does not fit; the message names it.
+            InputError: Something given does not fit; the message names it. Nothing has changed.
         """
-        V = self.dofs.V
-        if values is not None:
-            self.bcs[:] = checked_conditions(values, V)
+        V, forms = self.dofs.V, copy(self._system.forms)
+        conditions = self.bcs if values is None else checked_conditions(values, V)
         if stiffness is not None:
             check_same_space(displacement_space(stiffness, self.decomposition), V, "stiffness", "a")
-            self._system.forms.replace_stiffness(stiffness)
+            forms.replace_stiffness(stiffness)
         if load is not None:
-            self._system.forms.replace_load(load)
+            forms.replace_load(load)
         if gap is not None:
-            checked_type(gap, Mapping, "gap", "a dictionary from contacts to gaps")
-            for which, value in gap.items():
-                self._system.set_gap(position_of(self.contacts, which), value)
+            self._system.set_gaps(gaps_by_position(self.contacts, gap))
+        self._system.forms, self.bcs[:] = forms, conditions
 
     def _count(self) -> None:
         """What the solve has made and taken."""
         self._system.count(self.report)
+        settle_seconds(self.report, self.decomposition.comm)
         self.report.end()
 
     def _solve_rounds(self) -> None:

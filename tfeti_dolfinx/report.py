@@ -52,6 +52,7 @@ class Report:
         recoveries: Displacements recovered to see how right they are, each for one more solve
             in every subdomain.
         outer_iterations: Outer iterations.
+        newton_faces: Faces that block Newton has solved on.
         cg_steps: Conjugate gradient steps.
         expansion_steps: Expansion steps.
         proportioning_steps: Proportioning steps.
@@ -60,6 +61,7 @@ class Report:
             form, and seconds of one multiplication, ``predicted`` by the model and ``measured``
             (largest over ranks).
         coarse_factorizations: Factorisations of GGᵀ.
+        face_factorizations: Factorisations of G_f G_fᵀ, f a face of the rows.
         assemblies: Times that the stiffness was assembled.
         searches: Times that it was searched who meets whom.
         gluings: Times that rows of B were made.
@@ -102,12 +104,14 @@ class Report:
     power_method_multiplications: int = _counter()
     recoveries: int = _counter()
     outer_iterations: int = _counter()
+    newton_faces: int = _counter()
     cg_steps: int = _counter()
     expansion_steps: int = _counter()
     proportioning_steps: int = _counter()
     factorizations: int = _counter()
     local_operators: dict[str, float] = field(default_factory=dict)
     coarse_factorizations: int = _counter()
+    face_factorizations: int = _counter()
     assemblies: int = _counter()
     searches: int = _counter()
     gluings: int = _counter()

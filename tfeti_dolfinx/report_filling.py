@@ -52,6 +52,8 @@ def fill_result(
     if dual.preconditioner is not None:
         report.preconditioner_multiplications += dual.preconditioner.count["solver"]
     report.outer_iterations += result.steps.outer
+    report.newton_faces += result.steps.faces
+    report.face_factorizations += dual.coarse.factors.count["face"]
     report.cg_steps += result.steps.cg
     report.expansion_steps += result.steps.expansion
     report.proportioning_steps += result.steps.proportioning
@@ -61,9 +63,13 @@ def fill_result(
     report.residuals = _residuals(solution, dual, result, accuracy)
     report.tolerances = _tolerances(solution, dual, accuracy)
     report.peak_memory_mb = peak_memory_mb(comm)
-    for name, value in report.seconds.items():
-        report.seconds[name] = comm.allreduce(value, op=MPI.MAX)
-    report.seconds["total"] = sum(v for k, v in report.seconds.items() if k != "total")
+
+
+def settle_seconds(report: Report, comm: MPI.Intracomm) -> None:
+    """Make the seconds of each stage those of the slowest rank. Collective."""
+    of_ranks = comm.allgather(report.seconds)
+    names = dict.fromkeys(name for seconds in of_ranks for name in seconds)
+    report.seconds.update({name: max(s.get(name, 0.0) for s in of_ranks) for name in names})
 
 
 def _local_operators(dual: Dual) -> dict[str, float]:

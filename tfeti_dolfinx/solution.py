@@ -15,7 +15,15 @@ from tfeti_dolfinx.contact.forces import BodyForces, body_forces, nodal_forces, 
 from tfeti_dolfinx.contact.records import remaining_gaps
 from tfeti_dolfinx.contact.search import ContactPartner
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.fields import Stress, cellwise, checked_stress, from_vertices, nodal, von_mises
+from tfeti_dolfinx.fields import (
+    Stress,
+    cellwise,
+    checked_stress,
+    from_vertices,
+    frozen,
+    nodal,
+    von_mises,
+)
 from tfeti_dolfinx.gluing.glue import Gluing
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mortar.surfaces import group_points, hat_integrals
@@ -25,8 +33,9 @@ from tfeti_dolfinx.states import ContactData, ContactStatus, Multipliers
 class Solution:
     """What a solve has found; fields are made when they are first asked for.
 
-    It owns its data: a later solve of the same problem leaves it as it is. Creating a field is
-    collective.
+    It owns its data, the constants and functions in the stress too: a later solve of the same
+    problem leaves it as it is. Only a mesh whose points are moved takes along the fields that are
+    made later. Creating a field is collective.
 
     Args:
         u: Displacement in primal order, shape ``(num_nodes * bs,)``.
@@ -56,7 +65,11 @@ class Solution:
     ) -> None:
         self.u, self.lam, self.carrying = u, multipliers.lam, multipliers.carrying
         self.decomposition, self.gluing, self.dofs = decomposition, gluing, gluing.dofs
-        self.contacts, self._stress, self._thickness = list(contacts), stress, thickness
+        self.contacts, self._thickness = list(contacts), frozen(thickness)
+        self._stress = None
+        if stress is not None:
+            u_h = self.displacement
+            self._stress = frozen(checked_stress(stress, u_h), but=u_h)
 
     @cached_property
     def displacement(self) -> fem.Function:
@@ -217,7 +230,7 @@ class Solution:
     def _sigma(self) -> Any:
         if self._stress is None:
             raise InputError("no stress: give ContactProblem(..., stress=sigma)")
-        return checked_stress(self._stress, self.displacement)
+        return self._stress
 
     @property
     def _secondary_surfaces(self) -> list[str | int]:

@@ -17,7 +17,6 @@ from tfeti_dolfinx.qp.homogenised import (
     Homogenised,
     homogenise,
     image,
-    restored,
     scale_at,
     scale_near,
 )
@@ -113,11 +112,21 @@ def _homogenise(
     dual: Dual, qp: QP, solver: Solver, options: Options, start: Start | None
 ) -> Homogenised:
     """With λ̄ where the solver starts, or as the options say."""
-    if start is not None and solver.starts_at_lam_bar:
-        at, known = image(qp.F, restored(qp.coarse, start.lam)), dual.known_image("natural")
-        homogenised = homogenise(qp, at, scale_at(qp, known) if known else scale_near(qp, at))
-        at.destroy()
-        return homogenised
+    if start is not None and solver.warm is not None:
+        at, known = image(qp.F, solver.warm(qp, start)), dual.known_image("natural")
+        scale = scale_at(qp, known) if known else scale_near(qp, at)
+    elif solver.cold is not None:
+        at = image(qp.F, solver.cold(qp))
+        scale = scale_at(qp, at)
+    else:
+        return _homogenise_as_told(dual, qp, options)
+    homogenised = homogenise(qp, at, scale)
+    at.destroy()
+    return homogenised
+
+
+def _homogenise_as_told(dual: Dual, qp: QP, options: Options) -> Homogenised:
+    """With λ̄ as the options say; its image is kept."""
     kind = options.homogenization if dual.num_inequalities else "natural"
     scale = scale_at(qp, dual.image("natural"))
     return homogenise(qp, dual.image(kind), scale)

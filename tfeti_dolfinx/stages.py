@@ -19,6 +19,7 @@ STAGES = {
 }
 # what has to be made anew where something has changed
 CHANGES = {
+    "points": tuple(STAGES),
     "stiffness": ("stiffness", "rows", "factors", "trace", "coarse problem"),
     "rows": ("rows", "trace", "coarse problem"),
     "right side": ("right side", "linear term"),
@@ -63,7 +64,7 @@ class Stages:
         self._stale = set(STAGES)
 
     def take_counts(self) -> tuple[Counter[str], list[str]]:
-        """How often each stage was made since the last call, and which were not."""
+        """How often each stage was made since the last call, and which were up to date."""
         made, self.made = self.made, Counter()
-        brought = {BRINGS.get(name) for name in made}
-        return made, [name for name in STAGES if name not in made and name not in brought]
+        new = {*made, *(BRINGS.get(name) for name in made), *self._stale}
+        return made, [name for name in STAGES if name not in new]

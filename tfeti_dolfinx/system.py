@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 from dolfinx import fem
@@ -26,12 +26,10 @@ from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.report_filling import fill_sizes
 from tfeti_dolfinx.solver import resolve_types
 from tfeti_dolfinx.stages import STAGES, Stages
-from tfeti_dolfinx.subdomains.build import make_subdomains, sparse_blocks, subdomain_data
+from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
 from tfeti_dolfinx.subdomains.data import Counters
 from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.kernel import mode_names
-from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, Making
-from tfeti_dolfinx.subdomains.local import LocalChoice
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 from tfeti_dolfinx.timing import stage
 
@@ -69,6 +67,7 @@ class System:
         self._settings = settings
         self.spectrum: dict[str, float] = {}
         self._stages, self._counters, self._counted = Stages(), Counters(), 0
+        self._K: Any = None
         self._search: ContactSearch | None = None
         self._prescribed: Prescribed | None = None
         self._gluing: Gluing | None = None
@@ -91,11 +90,13 @@ class System:
         return _made(self._dual)
 
     def look_for_changes(self) -> None:
-        """See whether what forms and Dirichlet conditions refer to has changed.
+        """See whether the mesh, or what forms and Dirichlet conditions refer to, has changed.
 
         Raises:
             InputError: Dirichlet conditions contradict each other.
         """
+        if self.forms.has_new_points():
+            self.change("points")
         if self.forms.has_new_stiffness():
             self.change("stiffness")
         if self.forms.has_new_load():
@@ -115,16 +116,17 @@ class System:
         if self._stages.is_stale("factors"):
             self._destroy_subdomains()
 
-    def set_gap(self, index: int, gap: Gap) -> None:
-        """Give a contact another ``gap=``; its conditions stay, but for their gaps.
+    def set_gaps(self, gaps: Mapping[int, Gap]) -> None:
+        """Give contacts, by position, another ``gap=``; their conditions stay, but for their gaps.
 
         Raises:
-            InputError: The gap does not fit, or overlaps too deep. Nothing has changed.
+            InputError: A gap does not fit, or overlaps too deep. Nothing has changed.
         """
-        contact = self._contacts[index].with_gap(gap)
+        contacts = {i: self._contacts[i].with_gap(gap) for i, gap in gaps.items()}
         if self._search is not None:
-            self._search.set_gap(index, gap)
-        self._contacts[index] = contact
+            self._search.set_gaps(gaps)
+        for i, contact in contacts.items():
+            self._contacts[i] = contact
         self.change("right side")
 
     def make(self, report: Report) -> Dual:
@@ -205,19 +207,15 @@ class System:
 
     def _factor(self) -> None:
         trace, counters = self.gluing.constraints.trace, self._counters
-        extensions, options = self._settings.extensions, self._settings.options
-        kplus = extensions.kplus or KPLUS_TYPES[options.kplus_type]
-        choice = LocalChoice(options.local_type, options.local_multiplications)
-        how = Making(counters, kplus, f"{self._settings.prefix}sub_")
+        make_block, choice = self._settings.make_block(counters), self._settings.local_choice
+        if self._K is None:  # it went into Blocks that could not be made
+            self._assemble_stiffness()
+            self._stages.made["stiffness"] += 1
         data = subdomain_data(self._dofs, self._decomposition, self._K, self._f, trace)
-        del self._K  # the Blocks have it
+        self._K = None  # the Blocks have it
         with added_options(self._settings.prefix, self._settings.factor_options):
             self._subdomains = make_subdomains(
-                data,
-                extensions.block or sparse_blocks(how, choice),
-                self._decomposition,
-                counters,
-                choice,
+                data, make_block, self._decomposition, counters, choice
             )
 
     def _retrace(self) -> None:

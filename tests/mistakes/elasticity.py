@@ -131,6 +131,10 @@ MODELS = {
         lambda s: elastic(s).strain(fem.Function(s.space("Lagrange", 1))),
         r"u is a Function of shape \(\); expected a displacement of 2 components",
     ),
+    "a measure that is a number": (
+        lambda s: elastic(s).a(s.u, s.v, 2),
+        r"dx is 2; expected a measure of UFL, or None",
+    ),
     "the stress of an array": (
         lambda s: elastic(s).stress(np.zeros(2)),
         r"u is an array of shape \(2,\).*; expected a displacement of 2 components",
@@ -147,6 +151,14 @@ def beside_its_axis(s):
 
 THICKNESS = {
     "a thickness of 0": given(r"thickness=0: expected a positive number", thickness=0),
+    "a problem's constant thickness of 0": (
+        lambda s: s.problem(thickness=fem.Constant(s.d.mesh, 0.0)),
+        r"thickness=0.0: expected a positive number",
+    ),
+    "a problem's thickness with a test function": (
+        lambda s: s.problem(thickness=s.v[0]),
+        r"thickness has a test or trial function; expected a scalar with values",
+    ),
     "a thickness of a ring": given(
         r"thickness=0.5: expected none with model='axisymmetric'",
         thickness=0.5,

@@ -53,7 +53,7 @@ OPTIONS = {
         r"-tfeti_mpgp_alpha 3.0: expected more than 0, at most 2", tfeti_mpgp_alpha=3
     ),
     "an unknown solver": given(
-        r"-tfeti_qp_type newton: expected one of auto, pcpg, smalse", tfeti_qp_type="newton"
+        r"-tfeti_qp_type newt: expected one of auto, pcpg, smalse, newton", tfeti_qp_type="newt"
     ),
     "a solver in capitals": given(r"-tfeti_qp_type SMALSE: expected one", tfeti_qp_type="SMALSE"),
     "a solver that is None": given(r"-tfeti_qp_type None: expected a value", tfeti_qp_type=None),
@@ -75,7 +75,7 @@ OPTIONS = {
         tfeti_pc_type="dirichlet",
     ),
     "a preconditioner where there is contact": (
-        lambda s: s.with_contacts(s.floor, tfeti_pc_type="lumped"),
+        lambda s: s.with_contacts(s.floor, tfeti_pc_type="lumped", tfeti_qp_type="smalse"),
         r"-tfeti_pc_type lumped with smalse.* takes no preconditioner",
     ),
     "pcpg where there is contact": (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from numbers import Real
 from typing import Any
 
@@ -45,6 +45,22 @@ def position_of(contacts: Sequence[Any], which: int | str) -> int:
         f"contact {shown(which)}: there are {len(names)}, counted from 0; their positions and "
         f"names, of which one was expected, are {known}"
     )
+
+
+def gaps_by_position(contacts: Sequence[Any], gaps: Mapping[int | str, Gap]) -> dict[int, Gap]:
+    """Gaps of contacts that are given by their positions or names, by position.
+
+    Raises:
+        InputError: There is no such contact, or one is there twice.
+    """
+    checked_type(gaps, Mapping, "gap", "a dictionary from contacts to gaps")
+    found: dict[int, Gap] = {}
+    for which, gap in gaps.items():
+        position = position_of(contacts, which)
+        if position in found:
+            raise InputError(f"gap: contact {position} is there twice, by position and by name")
+        found[position] = gap
+    return found
 
 
 def checked_reach(name: str, reach: float | None, extent: float) -> float:
@@ -100,10 +116,10 @@ def given_gaps(name: str, gap: Gap, x: Array) -> Array | None:
     try:
         values = np.asarray(gap(x.T), dtype=float)
         values = np.array(np.broadcast_to(values, (len(x),)))
-    except (TypeError, ValueError) as error:
+    except Exception as error:  # a user's function may raise anything
         raise InputError(
             f"{name}: gap, a function, did not give one number for each of {len(x)} points of "
-            f"shape (3, {len(x)}): {error}"
+            f"shape (3, {len(x)}): {type(error).__name__}: {error}"
         ) from error
     if np.any(wrong := ~np.isfinite(values)):
         raise InputError(f"{name}: gap is {values[wrong][0]} at the point {x[wrong][0].tolist()}")

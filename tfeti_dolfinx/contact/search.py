@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Protocol
 
@@ -143,23 +143,24 @@ class ContactSearch:
         """All conditions of this rank."""
         return concatenate(self._records, self._dofs.bs)
 
-    def set_gap(self, index: int, gap: Gap) -> None:
-        """Give a contact another ``gap=``; its conditions stay, but for their gaps.
+    def set_gaps(self, gaps: Mapping[int, Gap]) -> None:
+        """Give contacts another ``gap=``; their conditions stay, but for their gaps.
 
         Conditions within reach stay those, so that rows of B stay; others are looked at by
         ``take_in_overlapping``, as ever.
 
         Args:
-            index: Position of the contact in the list.
-            gap: "geometry", a number, or a function of points.
+            gaps: By position in the list: "geometry", a number, or a function of points.
 
         Raises:
-            InputError: The gap does not fit, or "geometry" overlaps too deep. Nothing has changed.
+            InputError: A gap does not fit, or "geometry" overlaps too deep. Nothing has changed.
         """
-        contact = self.contacts[index].with_gap(gap)
-        known = self._records[index]
-        gaps = contact.gaps(self._dofs, known, self._depths[index])
-        self.contacts[index], self._records[index] = contact, replace(known, gap=gaps)
+        contacts, records = list(self.contacts), list(self._records)
+        for i, gap in gaps.items():
+            contacts[i] = contacts[i].with_gap(gap)
+            values = contacts[i].gaps(self._dofs, records[i], self._depths[i])
+            records[i] = replace(records[i], gap=values)
+        self.contacts, self._records = contacts, records
 
     def take_in_overlapping(self, u: Array, tolerance: float) -> int:
         """Give rows to conditions without one that a displacement violates.

@@ -77,6 +77,7 @@ class Accuracy:
         rtol: Relative tolerance.
         tolerance: Norm of the residuals from which on one looks (again).
         drifted: Whether the solver's gradient has to be made anew.
+        norm: ‖F‖, or an estimate.
         measures: What the last look has seen.
         looks: How many looks there were.
     """
@@ -91,7 +92,7 @@ class Accuracy:
         norm: float = 1.0,
     ) -> None:
         self._scene, self.rtol, self._atol = scene, rtol, atol
-        self._rounding, self._norm = rounding, norm or 1.0
+        self._rounding, self.norm = rounding, norm or 1.0
         self._before: Measures | None = None
         self.tolerance = max(rtol**FIRST_LOOK * reference, atol, rounding)
         self.drifted, self.looks, self._stalls, self._claimed = False, 0, 0, 1.0
@@ -99,7 +100,7 @@ class Accuracy:
 
     def look(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float) -> Measures:
         """Measure an iterate. Collective."""
-        before, error = self.measures, residual / self._norm
+        before, error = self.measures, residual / self.norm
         self.measures = measure(
             self._scene, lam, gradient, face, error, before.u if before else None
         )
@@ -148,7 +149,9 @@ class Accuracy:
         now, before = self._looked(), self._before
         bodies, energy = now.bodies, np.sqrt(np.maximum(now.bodies.energy, 0.0))
         own = np.sqrt(bodies.correction_energy)
-        shown = np.divide(bodies.elastic, energy, out=np.zeros_like(energy), where=energy > 0.0)
+        # at rest all is rounding, and energy does not say how far anything moves
+        known = (energy > 0.0) & (self._at_rest(now) == 0.0)
+        shown = np.divide(bodies.elastic, energy, out=np.zeros_like(energy), where=known)
         estimate = shown * own
         if before is not None and before.error > 0.0:
             estimate = np.maximum(estimate, bodies.change * (now.error / before.error))
@@ -160,7 +163,7 @@ class Accuracy:
         size, most = now.bodies.size, now.bodies.size.max(initial=0.0)
         share = np.where(size < STIFF * most, STRICTER, 1.0)
         alone = LOAD_NOISE * now.bodies.alone
-        at_rest = 0.0 if alone.any() or most > AT_REST * now.gap else AT_REST * now.gap
+        at_rest = self._at_rest(now)
         displacement = self.rtol * share * size + NOISE * most + alone + at_rest
         largest = float(displacement.max(initial=0.0))
         balance = max(self.rtol, NOISE) * now.forces
@@ -168,6 +171,12 @@ class Accuracy:
         energy = FORCES * self.rtol * np.sqrt(max(now.bodies.energy.sum(), 0.0))
         energy += np.sqrt(now.bodies.stiffness @ (RIGID * most + alone + at_rest) ** 2)
         return Tolerances(displacement, 2.0 * largest, 2.0 * largest, balance, float(energy))
+
+    def _at_rest(self, now: Measures) -> float:
+        """The size of displacements that are rounding of 0 where nothing is loaded, else 0."""
+        small = AT_REST * now.gap
+        loaded = bool(now.bodies.alone.any())
+        return 0.0 if loaded or now.bodies.size.max(initial=0.0) > small else small
 
     def ratio(self) -> float:
         """What must be at most 1: the largest of all errors over their tolerances."""

@@ -71,11 +71,11 @@ class CoarseSpace(Projectors):
         self.subdomains, self.bounded = subdomains, bounded
         self.comm = comm = subdomains.comm
         offsets = chunk_offsets(comm, subdomains.kernel_size)
-        self.dimension = int(offsets[-1])
+        dimension = int(offsets[-1])
         self._own = slice(int(offsets[comm.rank]), int(offsets[comm.rank + 1]))
-        Gt = _transposed_G(B, subdomains.kernel_rows, self._own.start, self.dimension)
+        Gt = _transposed_G(B, subdomains.kernel_rows, self._own.start, dimension)
         self.row_size = _sizes(B)
-        self.bodies = Bodies(subdomains, self._own.start, self.dimension)
+        self.bodies = Bodies(subdomains, self._own.start, dimension)
         self.J = _without_rounding(diags_array(1.0 / self.row_size) @ Gt @ self.bodies.motions)
         equalities = np.ones(len(self.row_size), dtype=bool)
         equalities[bounded] = False
@@ -117,6 +117,14 @@ class CoarseSpace(Projectors):
     def damped_factor(self, rows: Array, damping: float) -> SemidefiniteFactor:
         """A factor of G_f G_fᵀ + damping·GGᵀ of the local rows flagged."""
         return self.factors.factor(csr_array(self.gram(rows) + damping * self.gram()))
+
+    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
+        """(G_f G_fᵀ + damping·GGᵀ)⁻¹y, f a face of the rows."""
+        gram = replicated_gram(csr_array(face.Z.T @ self.Gt), self.comm)
+        factor = self.factors.factor(csr_array(gram + damping * self.gram()))
+        x = factor.solve(y)
+        factor.destroy()
+        return x
 
     def on_face(self, face: Face) -> FaceProjectors:
         """The projectors on a face of the rows."""

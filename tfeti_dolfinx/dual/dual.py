@@ -9,6 +9,7 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
+from tfeti_dolfinx.dual.face_preconditioner import FacePreconditioner
 from tfeti_dolfinx.dual.naming import listed
 from tfeti_dolfinx.dual.operator import (
     DualOperator,
@@ -28,7 +29,7 @@ from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Product
 from tfeti_dolfinx.qp.homogenised import Image, image
 from tfeti_dolfinx.qp.norm import estimate_norm
-from tfeti_dolfinx.qp.problem import QP
+from tfeti_dolfinx.qp.problem import QP, FaceOperator
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # from B and c to the set of multipliers, on all local rows
@@ -78,6 +79,7 @@ class Dual:
     ) -> None:
         self.constraints, self.subdomains = constraints, subdomains
         self.pressing = np.zeros(constraints.num_rows, dtype=bool)
+        self._prefix = f"{options_prefix}face_"
         self._names, self.nearly_free = (body_names, mode_names), list[dict[str, object]]()
         B, comm = constraints.B, constraints.B.getComm().tompi4py()
         self.F = dual_operator(B, subdomains)
@@ -86,10 +88,11 @@ class Dual:
         if preconditioner is not None:
             self._scaled = ScaledRows(B, constraints.weights)
             self.preconditioner = preconditioner(self._scaled, subdomains)
+        self._on_faces: FacePreconditioner | None = None
         bounded = constraints.sets.normals
         self.coarse = CoarseSpace(B, subdomains, bounded, f"{options_prefix}coarse_")
         self.num_inequalities = comm.allreduce(len(bounded))
-        self.feasible = feasible(constraints)
+        self._law, self.feasible = feasible, feasible(constraints)
         self._images = dict[str, tuple[Array, Image]]()
         self._norm: tuple[int, float] | None = None
         check_solvable(self.coarse, body_names, mode_names)
@@ -111,6 +114,7 @@ class Dual:
         for operator in (self.F, self.preconditioner):
             if operator is not None:
                 operator.count.clear()
+        self.coarse.factors.count["face"] = 0
 
     def qp(self, norm_steps: int = 0) -> QP:
         """The quadratic program; without kernel it has no coarse problem.
@@ -119,8 +123,17 @@ class Dual:
             norm_steps: Lanczos steps that estimate ‖PFP‖, once; 0 where nobody asks for it.
         """
         coarse: Coarse = self.coarse if self.coarse.dimension else NoCoarse()
+        self.feasible = self._law(self.constraints)  # c may be another, and what the law refers to
         norm = self._norm_of(coarse, norm_steps) if norm_steps else 1.0
-        return QP(self.F, self.d, coarse, self.feasible, self.preconditioner, norm)
+        on = self._preconditioner_on if self.preconditioner is not None else None
+        return QP(self.F, self.d, coarse, self.feasible, self.preconditioner, norm, on)
+
+    def _preconditioner_on(self, face: Face) -> FaceOperator:
+        """The preconditioner on a face of the rows; what all faces share is made once."""
+        assert self.preconditioner is not None
+        if self._on_faces is None:
+            self._on_faces = FacePreconditioner(self.preconditioner, self.constraints, self._prefix)
+        return self._on_faces.on_face(face)
 
     def _norm_of(self, coarse: Coarse, steps: int) -> float:
         if self._norm is None or self._norm[0] != steps:
@@ -170,6 +183,7 @@ class Dual:
     def destroy(self) -> None:
         """Destroy the PETSc objects."""
         images = [found for _, found in self._images.values()]
-        for item in (self.F, self.preconditioner, self._scaled, self.coarse, self.d, *images):
+        own = (self._on_faces, self.preconditioner, self._scaled)
+        for item in (self.F, *own, self.coarse, self.d, *images):
             if item is not None:
                 item.destroy()

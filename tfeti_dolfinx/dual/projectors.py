@@ -49,6 +49,21 @@ class Projectors:
         self.comm.Allreduce(MPI.IN_PLACE, y, op=MPI.SUM)
         return np.asarray(y)
 
+    @property
+    def dimension(self) -> int:
+        """Number r of equations."""
+        return self.Gt.shape[1]
+
+    def residual(self, x: PETSc.Vec) -> Array:
+        """e − Gx, shape ``(r,)``."""
+        return np.asarray(self.e - self.G(x.array_r))
+
+    def forces(self, x: PETSc.Vec) -> Array:
+        """Σ|G||x| + |e|, shape ``(r,)``."""
+        forces = np.asarray(abs(self.Gt).T @ np.abs(x.array_r))
+        self.comm.Allreduce(MPI.IN_PLACE, forces, op=MPI.SUM)
+        return forces + np.abs(self.e)
+
     def solve(self, y: Array) -> Array:
         """(GGᵀ)⁺ y for y in the range of G, orthogonal to the free motions."""
         return self._factor.solve(y)
@@ -114,6 +129,18 @@ class FaceFactors:
         return SemidefiniteFactor(gram, self._null, self.comm, what, self._prefix)
 
 
+class Whole(Protocol):
+    """What projectors of a face know of all rows."""
+
+    comm: MPI.Intracomm
+    Gt: csr_array
+    e: Array
+
+    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
+        """(G_f G_fᵀ + damping·GGᵀ)⁻¹y."""
+        ...
+
+
 class FaceProjectors(Projectors):
     """P and Q on a face of the rows: G_f = GZ, vectors in the layout of all rows.
 
@@ -121,12 +148,12 @@ class FaceProjectors(Projectors):
     P and Q, since what the factor makes of such a motion G_fᵀ does not see.
 
     Args:
-        whole: Gᵀ of all rows and e.
+        whole: Gᵀ of all rows, e, and the factors of other faces.
         face: The face.
         factors: Makes the factor. Collective.
     """
 
-    def __init__(self, whole: Projectors, face: Face, factors: FaceFactors) -> None:
+    def __init__(self, whole: Whole, face: Face, factors: FaceFactors) -> None:
         self.comm, self._whole, self._face = whole.comm, whole, face
         GZt = csr_array(face.Z.T @ whole.Gt)
         self.Gt, self.e = csr_array(face.Z @ GZt), whole.e
@@ -136,6 +163,10 @@ class FaceProjectors(Projectors):
     def restricted(self, x: Array) -> Array:
         """ZZᵀ x."""
         return self._face.restricted(x)
+
+    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
+        """As on all rows."""
+        return self._whole.damped_solve(face, y, damping)
 
     def on_face(self, face: Face) -> FaceProjectors:
         """The projectors of another face of all rows."""

@@ -7,8 +7,13 @@ from typing import Protocol
 import numpy as np
 from petsc4py import PETSc
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.arrays import TINY, Array
+from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.qp.faces import Face
+
+# of the largest forces on an equation: those on a light one beside it count as so large at least,
+# since the rounding of the largest reaches them
+LIGHT = 1e-4
 
 
 class Coarse(Protocol):
@@ -16,7 +21,33 @@ class Coarse(Protocol):
 
     With G_f = GZ the projectors are Q = Z G_fᵀ(G_f G_fᵀ)⁺G_f Zᵀ and P = ZZᵀ − Q. Vectors keep the
     layout of all rows. Without a face Z = I, so that P = I − Q.
+
+    Attributes:
+        dimension: Number r of equations.
+        e: Right side, replicated, shape ``(r,)``.
     """
+
+    @property
+    def dimension(self) -> int:
+        """Number r of equations."""
+        ...
+
+    @property
+    def e(self) -> Array:
+        """Right side, replicated, shape ``(r,)``."""
+        ...
+
+    def residual(self, x: PETSc.Vec) -> Array:
+        """e − G_f Zᵀx, replicated, shape ``(r,)``. Collective."""
+        ...
+
+    def forces(self, x: PETSc.Vec) -> Array:
+        """Sum of the moduli of the terms of each entry of the residual. Collective."""
+        ...
+
+    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
+        """(G_f G_fᵀ + damping·GGᵀ)⁻¹y, f a face of all rows. Collective."""
+        ...
 
     def project(self, x: PETSc.Vec) -> None:
         """x ← P x. Collective."""
@@ -51,6 +82,14 @@ class Coarse(Protocol):
         ...
 
 
+def imbalance(coarse: Coarse, x: PETSc.Vec) -> float:
+    """How far Gx is from e: the worst entry beside its terms, 1 at most. Collective."""
+    forces = coarse.forces(x)
+    floor = max(LIGHT * float(forces.max(initial=0.0)), TINY)
+    own = np.max(np.abs(coarse.residual(x)) / np.maximum(forces, floor), initial=0.0)
+    return agreed(x.getComm().tompi4py(), float(own))
+
+
 class NoCoarse:
     """No equality constraint: Q = 0, at no cost.
 
@@ -58,8 +97,22 @@ class NoCoarse:
         face: The face; default all rows.
     """
 
+    dimension = 0
+
     def __init__(self, face: Face | None = None) -> None:
-        self._face = face
+        self._face, self.e = face, np.zeros(0)
+
+    def residual(self, x: PETSc.Vec) -> Array:
+        """None."""
+        return np.zeros(0)
+
+    def forces(self, x: PETSc.Vec) -> Array:
+        """None."""
+        return np.zeros(0)
+
+    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
+        """None."""
+        return y
 
     def project(self, x: PETSc.Vec) -> None:
         """x ← ZZᵀx."""
@@ -104,9 +157,23 @@ class DenseCoarse:
     """
 
     def __init__(self, G: Array, e: Array, face: Face | None = None) -> None:
-        self._G, self._face, self._e = G, face, e
+        self._G, self._face, self.e, self.dimension = G, face, e, len(e)
         self._Gf = G if face is None else np.asarray((face.Z @ (face.Z.T @ G.T)).T)
         self._inverse = np.linalg.pinv(self._Gf @ self._Gf.T, hermitian=True)
+
+    def residual(self, x: PETSc.Vec) -> Array:
+        """e − G_f Zᵀx."""
+        return np.asarray(self.e - self._Gf @ x.array_r)
+
+    def forces(self, x: PETSc.Vec) -> Array:
+        """Σ|G_f Zᵀ||x| + |e|."""
+        return np.asarray(np.abs(self._Gf) @ np.abs(x.array_r) + np.abs(self.e))
+
+    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
+        """(G_f G_fᵀ + damping·GGᵀ)⁺y."""
+        GZ = (face.Z.T @ self._G.T).T
+        gram = GZ @ GZ.T + damping * self._G @ self._G.T
+        return np.asarray(np.linalg.pinv(gram, hermitian=True) @ y)
 
     def project(self, x: PETSc.Vec) -> None:
         """x ← P x."""
@@ -123,7 +190,7 @@ class DenseCoarse:
 
     def particular(self, x: PETSc.Vec) -> None:
         """x = Z G_fᵀ(G_f G_fᵀ)⁺e."""
-        self.combine(self._inverse @ self._e, x)
+        self.combine(self._inverse @ self.e, x)
 
     def coordinates(self, x: PETSc.Vec) -> Array:
         """(G_f G_fᵀ)⁺G_f Zᵀ x."""
@@ -135,7 +202,7 @@ class DenseCoarse:
 
     def on_face(self, face: Face) -> DenseCoarse:
         """The same G on a face."""
-        return DenseCoarse(self._G, self._e, face)
+        return DenseCoarse(self._G, self.e, face)
 
     def destroy(self) -> None:
         """Nothing to free."""

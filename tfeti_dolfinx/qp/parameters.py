@@ -10,6 +10,27 @@ from tfeti_dolfinx.qp.mprgp import EXPANSIONS, Expansion, MprgpParameters
 
 
 @dataclass(frozen=True)
+class NewtonParameters:
+    """Parameters of block Newton; each says itself what it is."""
+
+    gamma: float = described(
+        1.0,
+        "newton",
+        "Γ of the proportioning test between two faces",
+        name="newton_gamma",
+        symbol="Γ",
+        fits=ABOVE_0,
+    )
+    reduction: float = described(
+        0.5,
+        "newton",
+        "what a solve on a face that may change reduces its residual to, in (0, 1)",
+        name="newton_reduction",
+        fits=Range("between 0 and 1", lambda value: 0.0 < value < 1.0),
+    )
+
+
+@dataclass(frozen=True)
 class SmalseParameters:
     """Parameters of SMALSE-M and of its inner MPRGP, for F scaled to ‖PFP‖ = 1.
 

@@ -7,20 +7,59 @@ from petsc4py import PETSc
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.monitors import Monitor, no_monitor
-from tfeti_dolfinx.qp.problem import QP, ConvergedReason, QPResult, Steps
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, QPResult, Steps
 from tfeti_dolfinx.qp.stopping import StoppingRule
+
+# of the largest curvature of a direction, and of what the preconditioner makes of a residual: less
+# is rounding, as where rows depend on each other
+FLAT = 1e-13
+
+
+class Directions:
+    """What PCPG remembers, so that it can go on where it has stopped.
+
+    Args:
+        like: A vector of the right layout.
+
+    Attributes:
+        r: Residual −P g.
+        p: The last direction.
+        fresh: Whether the next direction is the first.
+        rz: rᵀz of the last step.
+        norm: Largest Rayleigh quotient of F that a direction has shown; at most ‖PFP‖.
+        helped: Largest rᵀz/rᵀr so far.
+    """
+
+    def __init__(self, like: PETSc.Vec) -> None:
+        self.r, self.p, self.Fp, self.z = (like.duplicate() for _ in range(4))
+        self.fresh, self.rz, self.norm, self.helped = True, 1.0, 0.0, 0.0
+
+    def seen(self, pFp: float, pp: float) -> bool:
+        """Whether a direction has a curvature that stands out from rounding."""
+        self.norm = max(self.norm, pFp / pp if pp > 0.0 else 0.0)
+        return pFp > FLAT * self.norm * pp
+
+    def stands_out(self, rz: float, rr: float) -> bool:
+        """Whether the preconditioner leaves something of a residual."""
+        self.helped = max(self.helped, rz / rr if rr > 0.0 else 0.0)
+        return rz > FLAT * self.helped * rr
+
+    def destroy(self) -> None:
+        """Destroy the vectors. Collective."""
+        for vec in (self.r, self.p, self.Fp, self.z):
+            vec.destroy()
 
 
 def pcpg(
     qp: QP,
-    lam: PETSc.Vec,
-    g: PETSc.Vec,
+    point: Point,
     rule: StoppingRule,
     steps: Steps,
     max_it: int,
     monitor: Monitor = no_monitor,
+    directions: Directions | None = None,
 ) -> ConvergedReason:
-    """Minimise ½λᵀFλ − λᵀd over λ + range(P), from a start on and in place. Collective.
+    """Minimise ½λᵀFλ − λᵀd over λ + range(P), from a point on and in place. Collective.
 
     Farhat, Mandel, Roux, Comput. Methods Appl. Mech. Engrg. 115 (1994) 365–385, section 3. P is
     the projector of ``qp.coarse``: on a face λ moves in the face alone. Multiplies by F, and by
@@ -36,28 +75,26 @@ def pcpg(
 
     Args:
         qp: F, d, P and the preconditioner; its feasible set is kept by nobody.
-        lam: λ; updated.
-        g: F λ − d; updated, on all rows.
+        point: λ and F λ − d on all rows; updated.
         rule: Says when ‖P g‖ is small enough.
         steps: Counts the steps.
         max_it: Most steps in ``steps``.
         monitor: Called after each step.
+        directions: What an earlier call at this point, with this ``qp``, has left; updated.
 
     Returns:
         Why it stopped.
     """
-    r = _residual(qp, g)
-    p, Fp, z = (r.duplicate() for _ in range(3))
-    rz, fresh, norm = 1.0, True, r.norm()
-    reason = ConvergedReason.ITERATING
+    own = Directions(point.lam) if directions is None else directions
+    r, p, Fp, z = own.r, own.p, own.Fp, own.z
+    norm, reason = _residual(qp, point.g, r), ConvergedReason.ITERATING
     while True:
         # test
         if norm <= rule.tolerance:
-            reason = rule.examine(lam, g, _face(qp, lam, g), norm)
+            reason = _examined(qp, point, rule, norm)
         if rule.drifted:
-            qp.F.mult(lam, g)
-            g.axpy(-1.0, qp.d)
-            r, rule.drifted, fresh = _residual(qp, g, r), False, True
+            point.refresh(qp)
+            norm, rule.drifted, own.fresh = _residual(qp, point.g, r), False, True
         if reason == ConvergedReason.ITERATING and steps.cg >= max_it:
             reason = ConvergedReason.DIVERGED_ITS
         if reason != ConvergedReason.ITERATING:
@@ -65,26 +102,25 @@ def pcpg(
         # precondition and project: z = P M r
         _precondition(qp, r, z)
         # direction
-        rz, previous = r.dot(z), rz
-        p.aypx(0.0 if fresh else rz / previous, z)
+        own.rz, previous = r.dot(z), own.rz
+        p.aypx(0.0 if own.fresh else own.rz / previous, z)
         # step
         qp.F.mult(p, Fp)
         Fp.copy(z)
         qp.coarse.project(z)
-        pFp = p.dot(z)
-        if not (pFp > 0.0 and rz > 0.0):
-            reason = rule.examine(lam, g, _face(qp, lam, g), norm)
+        pFp, pp = p.mDot([z, p])
+        if not (own.seen(pFp, pp) and own.stands_out(own.rz, norm**2)):
+            own.fresh, reason = True, _examined(qp, point, rule, norm)
             if reason == ConvergedReason.ITERATING:
                 reason = ConvergedReason.DIVERGED_INDEFINITE_MAT
             break
-        lam.axpy(rz / pFp, p)
-        g.axpy(rz / pFp, Fp)
-        r.axpy(-rz / pFp, z)
-        fresh, norm = False, r.norm()
+        point.move(own.rz / pFp, p, Fp)
+        r.axpy(-own.rz / pFp, z)
+        own.fresh, norm = False, r.norm()
         steps.cg += 1
-        monitor(steps, "cg", lam, norm, 0.0)
-    for vec in (r, p, Fp, z):
-        vec.destroy()
+        monitor(steps, "cg", point.lam, norm, 0.0)
+    if directions is None:
+        own.destroy()
     return reason
 
 
@@ -131,7 +167,7 @@ def solve_by_pcpg(
     """
     lam, g, steps = homogenised.lam_bar.copy(), homogenised.gradient.copy(), Steps()
     monitor(steps, "start", lam, homogenised.b.norm(), 0.0)
-    reason = pcpg(qp, lam, g, rule, steps, max_it, monitor)
+    reason = pcpg(qp, Point(lam, g), rule, steps, max_it, monitor)
     qp.coarse.project(g)
     norm = g.norm()
     if reason == ConvergedReason.DIVERGED_INDEFINITE_MAT and homogenised.is_rounding(norm):
@@ -159,13 +195,17 @@ def _face(qp: QP, lam: PETSc.Vec, g: PETSc.Vec) -> Face:
     return qp.feasible.face(lam.array_r, g.array_r)
 
 
-def _residual(qp: QP, g: PETSc.Vec, r: PETSc.Vec | None = None) -> PETSc.Vec:
-    """r = −P g."""
-    r = g.duplicate() if r is None else r
+def _examined(qp: QP, point: Point, rule: StoppingRule, norm: float) -> ConvergedReason:
+    """What the rule says of the point."""
+    return rule.examine(point.lam, point.g, _face(qp, point.lam, point.g), norm)
+
+
+def _residual(qp: QP, g: PETSc.Vec, r: PETSc.Vec) -> float:
+    """r = −P g, and its norm."""
     g.copy(r)
     r.scale(-1.0)
     qp.coarse.project(r)
-    return r
+    return float(r.norm())
 
 
 def _precondition(qp: QP, r: PETSc.Vec, z: PETSc.Vec) -> None:

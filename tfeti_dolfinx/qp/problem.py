@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Protocol
@@ -22,6 +23,14 @@ class Operator(Protocol):
         ...
 
 
+class FaceOperator(Operator, Protocol):
+    """An operator that belongs to a face."""
+
+    def destroy(self) -> None:
+        """Free what it holds. Collective."""
+        ...
+
+
 @dataclass(frozen=True)
 class QP:
     """min ½λᵀFλ − λᵀd subject to Gλ = e, λ ∈ Ω.
@@ -33,6 +42,8 @@ class QP:
         feasible: The set Ω.
         preconditioner: Approximate inverse of F, or None.
         norm: Estimate of ‖PFP‖, which step lengths are relative to; 1 where nobody asks.
+        preconditioner_on: Makes an approximate inverse of ZᵀFZ for a face Z, between vectors of
+            the face in the layout of all rows; or None.
     """
 
     F: Operator
@@ -41,6 +52,44 @@ class QP:
     feasible: FeasibleSet
     preconditioner: Operator | None = None
     norm: float = 1.0
+    preconditioner_on: Callable[[Face], FaceOperator] | None = None
+
+
+@dataclass(frozen=True)
+class Point:
+    """Multipliers and their gradient.
+
+    Attributes:
+        lam: λ.
+        g: F λ − d, on all rows.
+    """
+
+    lam: PETSc.Vec
+    g: PETSc.Vec
+
+    def copy(self) -> Point:
+        """A point of its own."""
+        return Point(self.lam.copy(), self.g.copy())
+
+    def take(self, other: Point) -> None:
+        """Become another point."""
+        other.lam.copy(self.lam)
+        other.g.copy(self.g)
+
+    def refresh(self, qp: QP) -> None:
+        """Make the gradient anew; multiplies by F once. Collective."""
+        qp.F.mult(self.lam, self.g)
+        self.g.axpy(-1.0, qp.d)
+
+    def move(self, length: float, p: PETSc.Vec, Fp: PETSc.Vec) -> None:
+        """λ ← λ + length·p, and the gradient with it."""
+        self.lam.axpy(length, p)
+        self.g.axpy(length, Fp)
+
+    def destroy(self) -> None:
+        """Destroy the vectors. Collective."""
+        self.lam.destroy()
+        self.g.destroy()
 
 
 class ConvergedReason(IntEnum):
@@ -62,9 +111,10 @@ class ConvergedReason(IntEnum):
 
 @dataclass
 class Steps:
-    """Steps that a solver has taken, by their kind."""
+    """Steps that a solver has taken, by their kind, and faces that it has solved on."""
 
     outer: int = 0
+    faces: int = 0
     cg: int = 0
     expansion: int = 0
     proportioning: int = 0

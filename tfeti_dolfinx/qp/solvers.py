@@ -6,9 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from tfeti_dolfinx.qp.homogenised import Homogenised
+from petsc4py import PETSc
+
+from tfeti_dolfinx.qp.homogenised import Homogenised, restored
 from tfeti_dolfinx.qp.monitors import Monitor
-from tfeti_dolfinx.qp.parameters import SmalseParameters
+from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
+from tfeti_dolfinx.qp.parameters import NewtonParameters, SmalseParameters
 from tfeti_dolfinx.qp.pcpg import solve_by_pcpg
 from tfeti_dolfinx.qp.problem import QP, QPResult, Start
 from tfeti_dolfinx.qp.smalse import smalse
@@ -21,6 +24,11 @@ class Parameters(Protocol):
     @property
     def max_it(self) -> int:
         """Most inner steps, and most outer ones."""
+        ...
+
+    @property
+    def newton(self) -> NewtonParameters:
+        """Parameters of block Newton."""
         ...
 
     @property
@@ -42,7 +50,8 @@ class Solver:
         pc_type: Preconditioner that ``auto`` stands for.
         unpreconditioned: Why it takes no preconditioner; empty if it does.
         relative_to_norm: Whether its steps are relative to ‖PFP‖.
-        starts_at_lam_bar: Whether λ̄ is where it starts; else λ̄ is as options say.
+        cold: Where it starts, which is its λ̄; None: λ̄ is as options say.
+        warm: From a start to its λ̄; None: λ̄ is as without one.
     """
 
     solve: Solve
@@ -50,7 +59,8 @@ class Solver:
     pc_type: str
     unpreconditioned: str
     relative_to_norm: bool
-    starts_at_lam_bar: bool
+    cold: Callable[[QP], PETSc.Vec] | None = None
+    warm: Callable[[QP, Start], PETSc.Vec] | None = None
 
 
 def _pcpg(
@@ -76,6 +86,22 @@ def _smalse(
     return smalse(qp, homogenised, rule, own, max_it=max_it, start=start, monitor=monitor)
 
 
+def _newton(
+    qp: QP,
+    homogenised: Homogenised,
+    rule: StoppingRule,
+    parameters: Parameters,
+    start: Start | None,
+    monitor: Monitor,
+) -> QPResult:
+    own, max_it, warm = parameters.newton, parameters.max_it, start is not None
+    return newton(qp, homogenised, rule, own, max_it=max_it, warm=warm, monitor=monitor)
+
+
+def _restored(qp: QP, start: Start) -> PETSc.Vec:
+    return restored(qp.coarse, start.lam)
+
+
 SOLVERS = {
     "pcpg": Solver(
         _pcpg,
@@ -83,7 +109,7 @@ SOLVERS = {
         pc_type="dirichlet",
         unpreconditioned="",
         relative_to_norm=False,
-        starts_at_lam_bar=True,
+        warm=_restored,
     ),
     "smalse": Solver(
         _smalse,
@@ -91,7 +117,15 @@ SOLVERS = {
         pc_type="none",
         unpreconditioned="SMALSE-M takes no preconditioner, since it would not preserve the bounds",
         relative_to_norm=True,
-        starts_at_lam_bar=False,
+    ),
+    "newton": Solver(
+        _newton,
+        keeps_bounds=True,
+        pc_type="dirichlet",
+        unpreconditioned="",
+        relative_to_norm=False,
+        cold=first_point,
+        warm=feasible_start,
     ),
 }
 # what auto stands for, without and with inequalities

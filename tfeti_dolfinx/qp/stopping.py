@@ -20,10 +20,13 @@ class StoppingRule(Protocol):
         tolerance: Norm of the residuals from which on an examination is worth its price.
         drifted: Set where an examination finds that the solver's gradient is no longer true;
             the solver makes it anew and takes the flag back.
+        norm: ‖F‖, or an estimate: residuals over it are errors of multipliers. A solver that
+            learns it on its way says so here.
     """
 
     tolerance: float
     drifted: bool
+    norm: float
 
     def examine(
         self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float
@@ -50,10 +53,21 @@ class ResidualRule:
     """
 
     def __init__(self, tolerance: float) -> None:
-        self.tolerance, self.drifted = tolerance, False
+        self.tolerance, self.drifted, self.norm = tolerance, False, 1.0
 
     def examine(
         self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float
     ) -> ConvergedReason:
         """Content."""
         return ConvergedReason.CONVERGED_RTOL
+
+
+class TargetRule(ResidualRule):
+    """Content where the residual is what was asked for, and not before: for a part of a solve."""
+
+    def examine(
+        self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float
+    ) -> ConvergedReason:
+        """Content, if the residual has come down to the tolerance."""
+        small = residual <= self.tolerance
+        return ConvergedReason.CONVERGED_RTOL if small else ConvergedReason.ITERATING

@@ -132,19 +132,19 @@ class BlockDefaults:
             InputError: It does not fit.
             FactorError: A factor could not be made.
         """
-        raise NotImplementedError
+        raise NotImplementedError("set_stiffness")
 
     def multiply(self, u: Array) -> Array:
         """K u on all unknowns, shapes ``(n,)``."""
-        raise NotImplementedError
+        raise NotImplementedError("multiply")
 
     def solve(self, b: Array) -> Array:
         """K⁺ b on all unknowns, shapes ``(n,)``."""
-        raise NotImplementedError
+        raise NotImplementedError("solve")
 
     def apply_schur(self, w: Array) -> Array:
         """S w, shapes ``(t,)``."""
-        raise NotImplementedError
+        raise NotImplementedError("apply_schur")
 
     @property
     def modes(self) -> Array:

@@ -1,0 +1,118 @@
+"""Mistakes in parts of one's own."""
+
+import numpy as np
+
+from mistakes.scene import raising
+from tfeti_dolfinx import Extensions
+from tfeti_dolfinx.qp.feasible_sets import Bounds
+from tfeti_dolfinx.subdomains.block import BlockDefaults
+
+
+def own(says, contact=True, **parts):
+    """Solve with parts of one's own."""
+
+    def do(s):
+        contacts = [s.floor] if contact else []
+        s.problem(contacts=contacts, extensions=Extensions(**parts)).solve()
+
+    return do, says
+
+
+def on_the_last_rank(s, part):
+    """Solve with a part that fails on the last rank only."""
+
+    def fails(*_):
+        if s.comm.rank == s.comm.size - 1:
+            raising()
+
+    s.problem(contacts=[s.floor], extensions=Extensions(**{part: fails})).solve()
+
+
+class OfThree:
+    """A set of vectors of three entries, whatever the rows are."""
+
+    def __getattr__(self, name):
+        return getattr(Bounds(), name)
+
+    def project(self, x):
+        return np.zeros(len(x) + 1)
+
+
+GIVEN = {
+    "extensions that are a class": (
+        lambda s: s.problem(extensions=Extensions),
+        r"extensions is the class Extensions; expected tfeti_dolfinx.Extensions",
+    ),
+    "extensions that are a dictionary": (
+        lambda s: s.problem(extensions={"monitor": print}),
+        r"extensions is {'monitor': .*}; expected tfeti_dolfinx.Extensions",
+    ),
+    "a block that is a text": own(
+        r"extensions: block is 'dense'; expected a callable", block="dense"
+    ),
+    "a K⁺ that is a number": own(r"extensions: kplus is 5; expected a callable", kplus=5),
+    "a preconditioner that is a text": own(
+        r"extensions: preconditioner is 'lumped'; expected a callable", preconditioner="lumped"
+    ),
+    "a feasible set that is None": own(
+        r"extensions: feasible_set is None; expected a callable", feasible_set=None
+    ),
+    "a feasible set that is no law": own(
+        r"extensions: feasible_set is a Bounds; expected a callable", feasible_set=Bounds()
+    ),
+    "a monitor that is True": own(r"extensions: monitor is True; expected a call", monitor=True),
+    "a K⁺ that the block does not use": own(
+        r"extensions: kplus is given, but only the package's own Block takes it",
+        block=BlockDefaults,
+        kplus=raising,
+    ),
+    "a preconditioner that nobody takes": own(
+        r"extensions: a preconditioner is given, but the solver takes none", preconditioner=raising
+    ),
+}
+
+RUN = {
+    "a block that is None": own(
+        r"extensions: block gave None without apply_pinv, .*; expected a Block",
+        block=lambda data: None,
+    ),
+    "a block without methods": own(
+        r"extensions: block: NotImplementedError: set_stiffness", block=BlockDefaults
+    ),
+    "a block that fails": own(r"extensions: block: ZeroDivisionError: no such", block=raising),
+    "a block that fails on one rank": (
+        lambda s: on_the_last_rank(s, "block"),
+        r"extensions: block(: ZeroDivisionError: no such| gave None without)",
+    ),
+    "a K⁺ that is None": own(
+        r"extensions: kplus gave None without destroy, refactor, solve", kplus=lambda *_: None
+    ),
+    "a preconditioner that fails": own(
+        r"extensions: preconditioner: ZeroDivisionError: no such place",
+        contact=False,
+        preconditioner=raising,
+    ),
+    "a law that gives nothing": own(
+        r"extensions: feasible_set gave None without face, max_step, project",
+        feasible_set=lambda constraints: None,
+    ),
+    "a law of other rows": own(
+        r"extensions: feasible_set projects vectors of shape \(\d+,\) to \(\d+,\); expected a set "
+        r"on all rows of this rank",
+        feasible_set=lambda constraints: OfThree(),
+    ),
+    "a law that fails on one rank": (
+        lambda s: on_the_last_rank(s, "feasible_set"),
+        r"extensions: feasible_set(: ZeroDivisionError: no such| gave None without)",
+    ),
+    "a monitor that takes too few": own(
+        r"extensions: monitor: TypeError: .*takes 1 positional argument but 5",
+        monitor=lambda step: None,
+    ),
+    "a monitor that fails on one rank": (
+        lambda s: on_the_last_rank(s, "monitor"),
+        r"extensions: monitor: ZeroDivisionError: no such place",
+    ),
+}
+
+TABLES = ("GIVEN", "RUN")

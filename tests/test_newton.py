@@ -1,0 +1,156 @@
+"""Block Newton against independent solutions and SMALSE-M, and what it costs."""
+
+import numpy as np
+import pytest
+from reference import dense_qp
+from test_qp import bounds_on, matrix, vector
+
+from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
+from tfeti_dolfinx.qp.homogenised import homogenise, image
+from tfeti_dolfinx.qp.nearest import nearest
+from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
+from tfeti_dolfinx.qp.problem import QP, Start
+from tfeti_dolfinx.qp.stopping import ResidualRule
+
+
+def program(seed, kind="regular"):
+    """A random program with a feasible point; r and the share of bounds vary with the seed."""
+    rng = np.random.default_rng(seed)
+    m, r = int(rng.integers(10, 50)), int(rng.integers(1, 6))
+    bounded = np.sort(rng.permutation(m)[: rng.integers(1, m - r)])
+    A = rng.standard_normal((m, m)) * 10.0 ** rng.uniform(-1, 1, m)
+    F = A @ A.T / m + 0.01 * np.eye(m)
+    G = rng.standard_normal((r, m))
+    if kind == "held by bounds":  # without rows that carry, G has no rank
+        G[:, np.setdiff1d(np.arange(m), bounded)] = 0.0
+    if kind == "dependent":  # two rows that are the same, but for what they demand
+        one, two = bounded[0], bounded[-1]
+        F[two], F[:, two], G[:, two] = F[one], F[:, one], G[:, one]
+        F[two, two] = F[one, one]
+        F[one, two] = F[two, one] = F[one, one]
+    feasible = rng.standard_normal(m)
+    feasible[bounded] = np.maximum(feasible[bounded], 0.0)
+    return F, 3.0 * rng.standard_normal(m), G, G @ feasible, bounded
+
+
+class Counted:
+    """An operator that counts."""
+
+    def __init__(self, A):
+        self.A, self.count = matrix(A), 0
+
+    def mult(self, x, y):
+        self.count += 1
+        self.A.mult(x, y)
+
+
+def qp_of(F, d, G, e, bounded):
+    return QP(Counted(F), vector(d), DenseCoarse(G, e), bounds_on(bounded))
+
+
+def solved(qp, tolerance, start=None):
+    at = image(qp.F, feasible_start(qp, start) if start else first_point(qp))
+    found = newton(qp, homogenise(qp, at), ResidualRule(tolerance), max_it=3000, warm=bool(start))
+    assert found.reason > 0
+    return found
+
+
+def check_optimal(F, d, G, e, bounded, result, share):
+    """The conditions of Karush, Kuhn and Tucker, with the solver's own μ."""
+    lam, size = result.lam.array_r, np.linalg.norm(d)
+    s = F @ lam - d - G.T @ result.mu
+    free = np.setdiff1d(np.arange(len(lam)), bounded)
+    assert np.all(lam[bounded] >= 0.0)
+    assert np.linalg.norm(G @ lam - e) <= 1e-10 * (1.0 + np.linalg.norm(e))
+    assert np.abs(s[free]).max(initial=0.0) <= share * size
+    assert np.abs(np.minimum(lam, s)[bounded]).max() <= share * size
+
+
+KINDS = ["regular", "held by bounds", "dependent"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("seed", range(15))
+def test_random_programs(kind, seed):
+    F, d, G, e, bounded = program(seed, kind)
+    result = solved(qp_of(F, d, G, e, bounded), 1e-9)
+    check_optimal(F, d, G, e, bounded, result, 1e-8)
+
+
+@pytest.mark.parametrize("kind", KINDS[:2])
+@pytest.mark.parametrize("seed", range(5))
+def test_an_independent_active_set_finds_the_same(kind, seed):
+    F, d, G, e, bounded = program(100 + seed, kind)
+    lam = solved(qp_of(F, d, G, e, bounded), 1e-10).lam.array_r
+    reference = dense_qp(F, d, G, e, bounded)
+    assert np.allclose(lam, reference, rtol=0.0, atol=1e-6 * np.abs(reference).max())
+
+
+def test_the_cost_falls_and_iterates_are_feasible():
+    F, d, G, e, bounded = program(7)
+    qp, seen = qp_of(F, d, G, e, bounded), []
+
+    def monitor(steps, step, x, projected_gradient, equality):
+        if step in ("start", "outer"):
+            lam = np.array(x.array_r)
+            assert np.all(lam[bounded] >= 0.0)
+            assert np.allclose(G @ lam, e, atol=1e-9)
+            seen.append(0.5 * lam @ F @ lam - d @ lam)
+
+    start = homogenise(qp, image(qp.F, first_point(qp)))
+    newton(qp, start, ResidualRule(1e-9), max_it=3000, monitor=monitor)
+    assert len(seen) > 3
+    assert np.all(np.diff(seen) <= 1e-12 * np.abs(seen[-1]))
+
+
+def test_from_its_own_solution_it_multiplies_once():
+    F, d, G, e, bounded = program(3)
+    qp = qp_of(F, d, G, e, bounded)
+    found = solved(qp, 1e-9)
+    before = qp.F.count
+    again = solved(qp, 1e-8, Start(found.lam, found.mu))
+    assert qp.F.count == before + 1
+    assert np.allclose(again.lam.array_r, found.lam.array_r, atol=1e-8)
+
+
+def test_without_a_kernel():
+    F, d, _, _, bounded = program(4)
+    qp = QP(matrix(F), vector(d), NoCoarse(), bounds_on(bounded))
+    lam = solved(qp, 1e-10).lam.array_r
+    reference = dense_qp(F, d, np.zeros((0, len(d))), np.zeros(0), bounded)
+    assert np.allclose(lam, reference, atol=1e-7 * np.abs(reference).max())
+
+
+def test_nothing_to_do_costs_nothing():
+    """d = 0, e = 0: the start is the solution."""
+    F, d, G, e, bounded = program(5)
+    qp = qp_of(F, 0.0 * d, G, 0.0 * e, bounded)
+    result = solved(qp, 1e-12)
+    assert qp.F.count == 0
+    assert not result.lam.array_r.any()
+
+
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("kind", KINDS[:2])
+def test_the_nearest_feasible_point(kind, seed):
+    """Gλ = e, λ ∈ Ω, and λ − y = Gᵀα on free rows, at least that on the others."""
+    _, d, G, e, bounded = program(seed, kind)
+    y = 10.0 * d
+    found = nearest(DenseCoarse(G, e), bounds_on(bounded), vector(y))
+    lam = found.lam.array_r
+    assert found.missing <= 1e-12
+    assert np.allclose(G @ lam, e, atol=1e-9 * np.linalg.norm(y))
+    assert np.all(lam[bounded] >= 0.0)
+    apart = lam - y - G.T @ found.alpha
+    free = np.ones(len(y), dtype=bool)
+    free[bounded] = lam[bounded] > 0.0
+    assert np.allclose(apart[free], 0.0, atol=1e-9 * np.linalg.norm(y))
+    assert np.all(apart >= -1e-9 * np.linalg.norm(y))
+
+
+def test_the_nearest_point_says_what_nothing_fulfils():
+    """λ₁ + λ₂ = −1 with λ ≥ 0."""
+    coarse = DenseCoarse(np.ones((1, 2)), np.array([-1.0]))
+    found = nearest(coarse, bounds_on(np.arange(2)), vector([1.0, 2.0]))
+    assert found.missing >= 0.1
+    assert np.all(found.lam.array_r >= 0.0)

@@ -1,0 +1,169 @@
+"""The nearest point of {λ ∈ Ω, Gλ = e}: coarse factors, and no multiplication by F."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.parallel import agreed
+from tfeti_dolfinx.qp.coarse import Coarse, imbalance
+from tfeti_dolfinx.qp.faces import Face, Status, face_of
+
+# far more than Newton takes where it converges, so that a cycle ends
+MAX_STEPS = 100
+# of the terms of Gλ − e: what the coarse problem's factors leave at best
+BALANCED = 1e-13
+# of the same: below that, a step that leaves more than this share has met the damping, or rounding
+NEARLY, SLOW = 1e-6, 0.1
+# of GGᵀ, added to G_f G_fᵀ: keeps steps regular where few rows carry a force, and is small beside
+# 1, so that they stay Newton's; where bodies are hardly held it slows the end down, and the
+# smallest that a factor bears takes its place
+DAMPING, LEAST_DAMPING = 1e-8, 1e-14
+# a step of this share of Newton's changes nothing that is left above rounding
+SHORTEST = 1e-8
+# of the cost: what rounding may add to it
+ROUNDING = 1e-14
+
+
+class ConvexSet(Protocol):
+    """What is asked of Ω here; any ``FeasibleSet`` has it."""
+
+    def project(self, x: Array) -> Array:
+        """P_Ω(x)."""
+        ...
+
+    def face(self, x: Array, g: Array) -> Face:
+        """The face of x ∈ Ω."""
+        ...
+
+
+@dataclass(frozen=True)
+class Nearest:
+    """A point of Ω, and how far it is from Gλ = e.
+
+    Attributes:
+        lam: The point, the caller's own.
+        alpha: λ = P_Ω(y + Gᵀα), replicated.
+        missing: How far Gλ is from e: the worst entry beside its terms, 1 at most.
+    """
+
+    lam: PETSc.Vec
+    alpha: Array
+    missing: float
+
+
+def nearest(
+    coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec, alpha: Array | None = None
+) -> Nearest:
+    """The nearest point to y of {λ ∈ Ω, Gλ = e}, or what comes closest to it. Collective.
+
+    It is λ(α) = P_Ω(y + Gᵀα) with Gλ(α) = e. That is where the convex function
+    ½‖z‖² − ½‖z − P_Ω(z)‖² − αᵀe of z = y + Gᵀα is least, which a semismooth Newton method with a
+    line search finds: each step factors G_f G_fᵀ, f the face of λ(α).
+
+    >>> import numpy as np
+    >>> from petsc4py import PETSc
+    >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
+    >>> from tfeti_dolfinx.qp.feasible_sets import Bounds
+    >>> y = PETSc.Vec().createWithArray(np.array([1.0, -1.0]), comm=PETSc.COMM_SELF)
+    >>> nearest(DenseCoarse(np.ones((1, 2)), np.ones(1)), Bounds(), y).lam.array.tolist()
+    [1.0, 0.0]
+
+    Args:
+        coarse: Gλ = e on all rows.
+        feasible: The set Ω.
+        y: Any point.
+        alpha: Where to start.
+
+    Returns:
+        The point; where nothing in Ω fulfils Gλ = e, or α does not converge, it misses some of e.
+    """
+    comm = y.getComm().tompi4py()
+    trial = _trial(coarse, feasible, y, np.zeros(coarse.dimension) if alpha is None else alpha)
+    damping = DAMPING
+    for _ in range(MAX_STEPS):
+        left, scale = trial.left, float(np.linalg.norm(coarse.forces(trial.lam)))
+        if agreed(comm, left <= BALANCED * scale):
+            break
+        face = feasible.face(trial.lam.array_r, y.array_r)
+        step = coarse.damped_solve(face, trial.residual, damping)
+        trial, length = _searched(coarse, feasible, y, trial, step)
+        slow = agreed(comm, trial.left > SLOW * left and trial.left <= NEARLY * scale)
+        if agreed(comm, length <= SHORTEST) or (slow and damping <= LEAST_DAMPING):
+            break
+        if slow:
+            damping = LEAST_DAMPING
+    return Nearest(trial.lam, trial.alpha, imbalance(coarse, trial.lam))
+
+
+class WithinFace:
+    """Those points of Ω whose open rows are those of a face, at least.
+
+    Args:
+        feasible: The set Ω.
+        face: The face; its open rows stay where ``at`` has them.
+        at: A point of the face, shape ``(m,)``.
+    """
+
+    def __init__(self, feasible: ConvexSet, face: Face, at: Array) -> None:
+        self._feasible, self._open, self._at = feasible, ~face.carrying, at
+
+    def project(self, x: Array) -> Array:
+        """P_Ω(x), but for the rows that stay."""
+        return np.where(self._open, self._at, self._feasible.project(x))
+
+    def face(self, x: Array, g: Array) -> Face:
+        """The face of x, without the rows that stay."""
+        face = self._feasible.face(x, g)
+        status = np.where(self._open, Status.OPEN, face.status)
+        return face_of(face.carrying & ~self._open, status)
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """λ(α), e − Gλ(α) and the cost there."""
+
+    alpha: Array
+    lam: PETSc.Vec
+    residual: Array
+    cost: float
+
+    @property
+    def left(self) -> float:
+        """‖e − Gλ‖."""
+        return float(np.linalg.norm(self.residual))
+
+
+def _trial(coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec, alpha: Array) -> _Trial:
+    lam = y.duplicate()
+    coarse.combine(alpha, lam)
+    z = lam.array_r + y.array_r
+    projected = feasible.project(z)
+    lam.array[:] = projected
+    own = float(z @ projected) - 0.5 * float(projected @ projected)
+    cost = y.getComm().tompi4py().allreduce(own, op=MPI.SUM) - float(alpha @ coarse.e)
+    return _Trial(alpha, lam, coarse.residual(lam), cost)
+
+
+def _searched(
+    coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec, start: _Trial, step: Array
+) -> tuple[_Trial, float]:
+    """The longest of steps 1, ½, ¼, … that does not raise the cost; destroys the start.
+
+    Where the cost still falls at the end of a step, it fell along all of it: it is convex. That
+    holds where rounding hides the cost's difference.
+    """
+    comm, length = y.getComm().tompi4py(), 1.0
+    while True:
+        trial = _trial(coarse, feasible, y, start.alpha + length * step)
+        fell = trial.cost <= start.cost + ROUNDING * abs(start.cost)
+        if agreed(comm, fell or float(trial.residual @ step) >= 0.0 or length <= SHORTEST):
+            start.lam.destroy()
+            return trial, length
+        trial.lam.destroy()
+        length *= 0.5

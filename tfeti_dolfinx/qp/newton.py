@@ -1,0 +1,132 @@
+"""Block Newton: faces of Ω one after the other, each by PCPG, with a cost that falls."""
+
+from __future__ import annotations
+
+from petsc4py import PETSc
+
+from tfeti_dolfinx.qp.coarse import imbalance
+from tfeti_dolfinx.qp.homogenised import Homogenised
+from tfeti_dolfinx.qp.monitors import Monitor, no_monitor
+from tfeti_dolfinx.qp.nearest import nearest
+from tfeti_dolfinx.qp.newton_faces import FaceSolver
+from tfeti_dolfinx.qp.newton_iterate import Iterate
+from tfeti_dolfinx.qp.parameters import NewtonParameters
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, QPResult, Start, Steps
+from tfeti_dolfinx.qp.stopping import StoppingRule
+
+# Gλ = e holds on the face of 0 as well as factors can tell
+HELD = 1e-9
+
+
+def first_point(qp: QP) -> PETSc.Vec:
+    """Step 0: the least λ with open contact if that balances the load, else the least of Ω.
+
+    Collective; multiplies by nothing.
+    """
+    zero = qp.d.duplicate()
+    zero.set(0.0)
+    zero.array[:] = qp.feasible.project(zero.array_r)
+    coarse = qp.coarse.on_face(qp.feasible.face(zero.array_r, zero.array_r))
+    lam = zero.duplicate()
+    coarse.particular(lam)
+    held = imbalance(coarse, lam) <= HELD
+    coarse.destroy()
+    if not held:
+        lam.destroy()
+        lam = nearest(qp.coarse, qp.feasible, zero).lam
+    zero.destroy()
+    return lam
+
+
+def feasible_start(qp: QP, start: Start) -> PETSc.Vec:
+    """Step 0: the nearest feasible point to earlier multipliers. Collective."""
+    return nearest(qp.coarse, qp.feasible, start.lam).lam
+
+
+def newton(
+    qp: QP,
+    homogenised: Homogenised,
+    rule: StoppingRule,
+    parameters: NewtonParameters = NewtonParameters(),
+    *,
+    max_it: int = 10_000,
+    warm: bool = False,
+    monitor: Monitor = no_monitor,
+) -> QPResult:
+    """Minimise q(λ) = ½λᵀFλ − λᵀd subject to Gλ = e, λ ∈ Ω. Collective.
+
+    Iterates are feasible, and q falls in each step. A step solves on a face of Ω by PCPG, drops
+    what leaves Ω, all at once, and solves again on the smaller face. The numbers of the steps are
+    those of docs/theory.md.
+
+    ===========================  =================================================================
+    reason                       when
+    ===========================  =================================================================
+    the rule's                   ‖g^P‖ ≤ ``rule.tolerance``, and the rule is content
+    ``DIVERGED_ITS``             ``max_it`` faces or conjugate gradient steps are not enough
+    ``DIVERGED_ROUNDING``        no step lowers q any more by what stands out from rounding
+    ===========================  =================================================================
+
+    >>> import numpy as np
+    >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
+    >>> from tfeti_dolfinx.qp.feasible_sets import Bounds
+    >>> from tfeti_dolfinx.qp.homogenised import homogenise, image
+    >>> from tfeti_dolfinx.qp.stopping import ResidualRule
+    >>> F = PETSc.Mat().createDense((3, 3), array=np.diag([1.0, 2.0, 4.0]), comm=PETSc.COMM_SELF)
+    >>> d = PETSc.Vec().createWithArray(np.array([1.0, -1.0, 2.0]), comm=PETSc.COMM_SELF)
+    >>> qp = QP(F, d, DenseCoarse(np.ones((1, 3)), np.ones(1)), Bounds())
+    >>> start = homogenise(qp, image(F, first_point(qp)))
+    >>> result = newton(qp, start, ResidualRule(1e-10))
+    >>> result.reason.name, result.lam.array.round(6).tolist()
+    ('CONVERGED_RTOL', [0.6, 0.0, 0.4])
+
+    Args:
+        qp: The program; ``preconditioner_on`` makes preconditioners of faces.
+        homogenised: Its homogenised form, whose λ̄ is feasible: the start.
+        rule: Says when ‖g^P‖ is small enough.
+        parameters: Γ and what inner solves reduce.
+        max_it: Most conjugate gradient steps, and most faces.
+        warm: Whether the start may be optimal, so that this is looked at first.
+        monitor: Called after each step.
+
+    Returns:
+        The multipliers, their gradient s, the reason and the residuals.
+    """
+    steps = Steps()
+    state = Iterate(qp, homogenised)
+    faces = FaceSolver(qp, rule, parameters, steps, max_it, monitor)
+    reason, looked = ConvergedReason.ITERATING, warm
+    monitor(steps, "start", state.point.lam, homogenised.b.norm(), 0.0)
+    if not warm:
+        faces.enter(state.face())
+        state.multipliers_on(faces)
+    while reason == ConvergedReason.ITERATING:
+        if looked:
+            # Step 1: optimality
+            state.look(faces)
+            monitor(steps, "outer", state.point.lam, state.residual, 0.0)
+            if state.residual <= rule.tolerance:
+                rule.norm = state.norm
+                reason = rule.examine(state.point.lam, state.s, state.face(), state.residual)
+            if rule.drifted:
+                state.point.refresh(qp)
+                faces.forget()
+                rule.drifted = False
+                continue
+        if reason == ConvergedReason.ITERATING and max(steps.outer, steps.cg) >= max_it:
+            reason = ConvergedReason.DIVERGED_ITS
+        if reason != ConvergedReason.ITERATING:
+            break
+        # Step 2: the face
+        face = state.wanted_face(parameters.gamma, faces) if looked else state.face()
+        # Step 3: solve on the face, drop what leaves Ω, restore Gλ = e
+        trial = faces.solve(state.point, face, state.residual)
+        # Step 4: accept where q falls enough
+        if not state.accept(trial, faces) or state.stalled:
+            reason = ConvergedReason.DIVERGED_ROUNDING
+        trial.destroy()
+        steps.outer, looked = steps.outer + 1, True
+    result = state.result(reason, steps)
+    faces.destroy()
+    state.destroy()
+    return result

@@ -1,0 +1,256 @@
+"""Solves on faces by PCPG, one after the other: the inner part of block Newton."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from tfeti_dolfinx.parallel import agreed, any_rank
+from tfeti_dolfinx.qp.coarse import Coarse, imbalance
+from tfeti_dolfinx.qp.faces import Face
+from tfeti_dolfinx.qp.homogenised import restored
+from tfeti_dolfinx.qp.monitors import Monitor
+from tfeti_dolfinx.qp.nearest import WithinFace, nearest
+from tfeti_dolfinx.qp.parameters import NewtonParameters
+from tfeti_dolfinx.qp.pcpg import Directions, pcpg
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, FaceOperator, Point, Steps
+from tfeti_dolfinx.qp.stopping import StoppingRule, TargetRule
+
+# Gλ = e on a smaller face holds as well as its factor can tell
+HELD = 1e-9
+# rows leave a face in so many rounds at most: each round drops one row at least, but most at once
+MOST_ROUNDS = 60
+# of the rule's tolerance, for the last solve on a face: ‖g^P‖ is measured otherwise than ‖P_f g‖
+FINAL = 0.9
+# a solve on a face that stays is looked at whenever it has come down by this: PCPG goes on where it
+# has stopped, and rows that want to carry are found before the wrong face is solved to the end
+STAGE = 0.1
+# of Gλ = e: what is left after a first try to restore it is worth a second one
+EXACT = 1e-13
+# of ‖F‖: curvature of the way that a solve has gone; less is nearly none, and the way far
+LOOSE = 1e-8
+# of the way to the first bound, where nothing else ends it: more rows than one are to leave
+BEYOND = 10.0
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What solves on faces have come to.
+
+    Attributes:
+        first: Where the first one ended, maybe outside of Ω.
+        last: Where the last one ended.
+        feasible: Whether that is in Ω.
+    """
+
+    first: Point
+    last: Point
+    feasible: bool
+
+    def destroy(self) -> None:
+        """Destroy the points. Collective."""
+        self.first.destroy()
+        self.last.destroy()
+
+
+class FaceSolver:
+    """Solves on faces by PCPG; keeps factor and directions while the face stays.
+
+    Args:
+        qp: The program on all rows.
+        rule: Its tolerance is what the last solve aims at.
+        parameters: What other solves reduce.
+        steps: Counts.
+        max_it: Most conjugate gradient steps.
+        monitor: Called after each.
+
+    Attributes:
+        settled: Whether λ is where PCPG has stopped on the face entered.
+        left: The residual there.
+    """
+
+    def __init__(
+        self,
+        qp: QP,
+        rule: StoppingRule,
+        parameters: NewtonParameters,
+        steps: Steps,
+        max_it: int,
+        monitor: Monitor,
+    ) -> None:
+        self._qp, self._rule, self._parameters = qp, rule, parameters
+        self._steps, self._max_it, self._monitor = steps, max_it, monitor
+        self._comm = qp.d.getComm().tompi4py()
+        self._directions = Directions(qp.d)
+        self._face: Face | None = None
+        self.settled, self.left = False, float("inf")
+        self._on_face = qp
+        self._preconditioner: FaceOperator | None = None
+
+    @property
+    def norm(self) -> float:
+        """Largest Rayleigh quotient of F seen; at most ‖F‖."""
+        return self._directions.norm
+
+    def saw(self, curvature: float, size: float) -> None:
+        """Another Rayleigh quotient."""
+        self._directions.seen(curvature, size)
+
+    @property
+    def coarse(self) -> Coarse:
+        """Projectors of the face entered."""
+        return self._on_face.coarse
+
+    def enter(self, face: Face) -> bool:
+        """Make the projectors and the preconditioner of a face, unless it is the last one.
+
+        Returns:
+            Whether it is the last one.
+        """
+        if self._face is not None and not any_rank(
+            self._comm, not np.array_equal(face.status, self._face.status)
+        ):
+            return True
+        self._leave()
+        self._steps.faces += 1
+        coarse = self._qp.coarse.on_face(face)
+        if self._qp.preconditioner_on is not None:
+            self._preconditioner = self._qp.preconditioner_on(face)
+        self._on_face = replace(self._qp, coarse=coarse, preconditioner=self._preconditioner)
+        self._face = face
+        self.forget()
+        return False
+
+    def settle(self) -> None:
+        """The last solve's end was accepted; if its face stays, PCPG goes on from there."""
+        self.settled = True
+
+    def forget(self) -> None:
+        """The next direction is a first one: the point is not where PCPG has stopped."""
+        self._directions.fresh, self.settled = True, False
+
+    def solve(self, start: Point, face: Face, optimality: float) -> Trial:
+        """Solve on a face; drop what leaves Ω, restore Gλ = e, solve again.
+
+        Args:
+            start: A feasible point, in the face.
+            face: The face.
+            optimality: ‖g^P‖ there.
+        """
+        z, first, feasible = start.copy(), None, self._qp.feasible
+        stays = self.enter(face) and self.settled
+        for _ in range(MOST_ROUNDS):
+            before = z.copy()
+            broken = self._pcpg(z, optimality, stays) == ConvergedReason.DIVERGED_INDEFINITE_MAT
+            stays = False
+            self._shorten(before, z)
+            before.destroy()
+            if first is None:
+                first = z.copy()
+            inside = feasible.project(z.lam.array_r)
+            out = any_rank(self._comm, not np.array_equal(inside, z.lam.array_r))
+            if self._steps.cg >= self._max_it or not (out or (broken and self._slide(z))):
+                break
+            z.lam.array[:] = feasible.project(z.lam.array_r)
+            self._drop(z)
+        assert first is not None
+        return Trial(first, z, not out)
+
+    def _shorten(self, before: Point, z: Point) -> None:
+        """Where a solve has gone far because nothing held it, go to the first bound only.
+
+        Rows depend on each other there, or nearly so; numbers of that size would drown the others.
+        """
+        p, Fp = z.lam.copy(), z.g.copy()
+        p.axpy(-1.0, before.lam)
+        Fp.axpy(-1.0, before.g)
+        own = self._qp.feasible.max_step(before.lam.array_r, -p.array_r)
+        length = float(self._comm.allreduce(own, op=MPI.MIN))
+        if agreed(self._comm, length < 1.0 and p.dot(Fp) <= LOOSE * self.norm * p.dot(p)):
+            z.take(before)
+            z.move(max(length, 0.0) * BEYOND, p, Fp)
+        p.destroy()
+        Fp.destroy()
+
+    def _slide(self, z: Point) -> bool:
+        """Along a residual that meets no curvature, where rows depend on each other, to a bound.
+
+        Returns:
+            Whether there is one.
+        """
+        r, Fr = self._directions.r, self._directions.Fp
+        self._qp.F.mult(r, Fr)
+        if self._directions.seen(r.dot(Fr), r.dot(r)):
+            return False
+        own = self._qp.feasible.max_step(z.lam.array_r, -r.array_r)
+        length = float(self._comm.allreduce(own, op=MPI.MIN))
+        if np.isfinite(length):
+            z.move(length * BEYOND, r, Fr)
+        return bool(np.isfinite(length))
+
+    def _drop(self, z: Point) -> None:
+        """Enter the face of z, and bring z back to Gλ = e in it; multiplies by F once."""
+        previous, feasible = self._face, self._qp.feasible
+        assert previous is not None
+        face = feasible.face(z.lam.array_r, z.g.array_r)
+        self.enter(face)
+        near = self._restored(z.lam)
+        if imbalance(self.coarse, near) > HELD:
+            # it no longer holds a body: what is nearest names rows that do, near by if it can
+            near.destroy()
+            within = WithinFace(feasible, previous, z.lam.array_r)
+            found = nearest(self._qp.coarse, within, z.lam)
+            if imbalance(self._qp.coarse, found.lam) > HELD:
+                found.lam.destroy()
+                found = nearest(self._qp.coarse, feasible, z.lam)
+            near = found.lam
+            middle = 0.5 * (z.lam.array_r + near.array_r)
+            self.enter(feasible.face(middle, z.g.array_r))
+        near.copy(z.lam)
+        near.destroy()
+        z.refresh(self._qp)
+        self.forget()
+
+    def _restored(self, lam: PETSc.Vec) -> PETSc.Vec:
+        """The nearest point of Gλ = e on the face entered, if it has one."""
+        near = restored(self.coarse, lam)
+        if imbalance(self.coarse, near) > EXACT:  # what its factor leaves where rows hardly hold
+            once, near = near, restored(self.coarse, near)
+            once.destroy()
+        return near
+
+    def _pcpg(self, z: Point, optimality: float, stays: bool) -> ConvergedReason:
+        """PCPG to a part of what there is to do; to the end where the face stays."""
+        z.g.copy(self._directions.r)
+        self.coarse.project(self._directions.r)
+        start, final = float(self._directions.r.norm()), FINAL * self._rule.tolerance
+        share = STAGE if stays else self._parameters.reduction
+        target = max(final, share * min(start, optimality))
+        reason = pcpg(
+            self._on_face,
+            z,
+            TargetRule(target),
+            self._steps,
+            self._max_it,
+            self._monitor,
+            self._directions,
+        )
+        self.left = float(self._directions.r.norm())
+        return reason
+
+    def _leave(self) -> None:
+        """Free what belongs to the face."""
+        if self._face is not None:
+            self._on_face.coarse.destroy()
+        if self._preconditioner is not None:
+            self._preconditioner.destroy()
+            self._preconditioner = None
+        self._face = None
+
+    def destroy(self) -> None:
+        """Free what it holds. Collective."""
+        self._leave()
+        self._directions.destroy()

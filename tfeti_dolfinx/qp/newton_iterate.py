@@ -1,0 +1,215 @@
+"""The iterate of block Newton: what it lacks to be optimal, and where q falls."""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.parallel import agreed
+from tfeti_dolfinx.qp.faces import Face
+from tfeti_dolfinx.qp.homogenised import Homogenised
+from tfeti_dolfinx.qp.nearest import nearest
+from tfeti_dolfinx.qp.newton_faces import FaceSolver, Trial
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, QPResult, Steps
+
+# of what the gradient step promises at least, (ᾱ/2)‖g^P‖²: a step must lower q by that share
+ENOUGH = 0.1
+# of λ: what a way must be, so that F on it is not F on rounding of Gλ = e
+SHORT = 1e-6
+# so many steps in a row that neither lower q by what stands out from its rounding, nor halve ‖g^P‖
+PATIENCE, ROUNDING = 10, 1e-15
+# so many in a row that do not halve ‖g^P‖, whatever q does
+LONG = 100
+
+
+class Iterate:
+    """A feasible point, with what it lacks to be optimal.
+
+    Args:
+        qp: The program.
+        homogenised: Holds the start.
+
+    Attributes:
+        point: λ and Fλ − d.
+        s: Multipliers of Ω: Fλ − d − Gᵀμ; 0 where λ is free, if it is optimal.
+        mu: Multipliers μ of Gλ = e.
+        back: The nearest feasible point to λ − ᾱ(Fλ − d).
+        residual: ‖g^P‖, g^P = (λ − back)/ᾱ.
+        norm: Estimate of ‖F‖; ᾱ is its inverse.
+    """
+
+    def __init__(self, qp: QP, homogenised: Homogenised) -> None:
+        self._qp, self._homogenised = qp, homogenised
+        self._comm = qp.d.getComm().tompi4py()
+        self.point = Point(homogenised.lam_bar.copy(), homogenised.gradient.copy())
+        self.s, self._work = qp.d.duplicate(), qp.d.duplicate()
+        self.back: PETSc.Vec | None = None
+        self.mu: Array = np.zeros(qp.coarse.dimension)
+        self._set_multipliers()
+        self.residual, self.norm = float("inf"), 1.0
+        self._best, self._idle, self._slow = float("inf"), 0, 0
+
+    def face(self) -> Face:
+        """The face of λ."""
+        return self._qp.feasible.face(self.point.lam.array_r, self.s.array_r)
+
+    def multipliers_on(self, faces: FaceSolver) -> None:
+        """μ and s that belong to the face entered, while nothing is known of ‖F‖."""
+        self.mu = faces.coarse.coordinates(self.point.g)
+        self._set_multipliers()
+
+    def look(self, faces: FaceSolver) -> None:
+        """Optimality: how far a gradient step, brought back to the feasible set, moves."""
+        self.norm = faces.norm or _rayleigh(self._qp, self.point) or 1.0
+        if faces.settled:
+            self.mu = faces.coarse.coordinates(self.point.g)
+        self._set_multipliers()
+        target = self.point.lam.copy()
+        target.axpy(-1.0 / self.norm, self.s)  # not Fλ − d: what Gᵀμ takes from it may be large
+        found = nearest(self._qp.coarse, self._qp.feasible, target)
+        self.mu = self.mu + self.norm * found.alpha
+        self._set_multipliers()
+        if self.back is not None:
+            self.back.destroy()
+        self.back = found.lam
+        self.point.lam.copy(target)
+        target.axpy(-1.0, self.back)
+        self.residual = self.norm * target.norm()
+        target.destroy()
+        self._idle, self._slow = self._idle + 1, self._slow + 1
+        if self.residual <= 0.5 * self._best:
+            self._best, self._idle, self._slow = self.residual, 0, 0
+
+    def _set_multipliers(self) -> None:
+        self._qp.coarse.combine(self.mu, self.s)
+        self.s.aypx(-1.0, self.point.g)
+
+    def wanted_face(self, gamma: float, faces: FaceSolver) -> Face:
+        """What carries force, and what wants to, if that is most of what is wrong.
+
+        The rest is what PCPG has left on the face, if it has stopped at λ.
+        """
+        lam, s, feasible = self.point.lam.array_r, self.s.array_r, self._qp.feasible
+        phi, beta = feasible.split(lam, s)
+        free, chopped = self._comm.allreduce(np.array([phi @ phi, beta @ beta]), op=MPI.SUM)
+        if faces.settled:
+            free = faces.left**2
+        if agreed(self._comm, chopped > gamma**2 * free):
+            moved = feasible.project(lam - beta / self.norm)
+            return feasible.face(0.5 * (lam + moved), s)
+        return self.face()
+
+    def accept(self, trial: Trial, faces: FaceSolver) -> bool:
+        """Go where q falls enough: trial, the feasible part of its first step, or downhill.
+
+        Returns:
+            Whether q could be lowered.
+        """
+        known = np.isfinite(self.residual)
+        enough = ENOUGH * 0.5 / self.norm * self.residual**2 if known else 0.0
+        gain = self.gain(trial.last)
+        if trial.feasible and agreed(self._comm, gain >= enough):
+            self._take(trial.last, gain)
+            faces.settle()
+            return True
+        faces.forget()
+        length = self._feasible_part(trial.first)
+        shorter = self.point.copy()
+        for kept, end in ((shorter.lam, trial.first.lam), (shorter.g, trial.first.g)):
+            kept.aypx(1.0 - length, self._scaled(length, end))
+        shorter.lam.array[:] = self._qp.feasible.project(shorter.lam.array_r)
+        gain = self.gain(shorter)
+        taken = agreed(self._comm, length > 0.0 and gain >= enough)
+        if taken:
+            self._take(shorter, gain)
+        shorter.destroy()
+        return taken or self._descend(known, faces)
+
+    @property
+    def stalled(self) -> bool:
+        """Whether q and ‖g^P‖ have not come down any more for long."""
+        return agreed(self._comm, self._idle >= PATIENCE or self._slow >= LONG)
+
+    def _take(self, to: Point, gain: float) -> None:
+        """Go there; a gain that stands out from the rounding of q is worth more steps."""
+        sizes = abs(self.point.lam.dot(self.point.g)) + abs(self.point.lam.dot(self._qp.d))
+        if gain > ROUNDING * sizes:
+            self._idle = 0
+        self.point.take(to)
+
+    def gain(self, to: Point) -> float:
+        """q(λ) − q(to), by differences, and without what Gλ = e makes constant. Collective."""
+        apart, gradient = to.lam.copy(), to.g.copy()
+        apart.axpy(-1.0, self.point.lam)
+        gradient.axpy(-1.0, self.point.g)
+        gradient.axpy(2.0, self.s)
+        value = -0.5 * float(apart.dot(gradient))
+        apart.destroy()
+        gradient.destroy()
+        return value
+
+    def _descend(self, known: bool, faces: FaceSolver) -> bool:
+        """The projected gradient step, or the part of it where q is least."""
+        if not known:
+            self.look(faces)
+        assert self.back is not None
+        p, Fp = self.back.copy(), self._work
+        p.axpy(-1.0, self.point.lam)
+        self._qp.F.mult(p, Fp)
+        slope, curvature, size = -self.s.dot(p), p.dot(Fp), p.dot(p)
+        if size > SHORT**2 * self.point.lam.dot(self.point.lam):
+            faces.saw(curvature, size)
+        length = min(1.0, slope / curvature) if curvature > 0.0 else 1.0
+        moved = agreed(self._comm, size > 0.0 and slope > 0.0)
+        if moved:
+            if length * slope > ROUNDING * abs(self.point.lam.dot(self.point.g)):
+                self._idle = 0
+            self.point.move(length, p, Fp)
+            self.point.lam.array[:] = self._qp.feasible.project(self.point.lam.array_r)
+        p.destroy()
+        return moved
+
+    def _feasible_part(self, end: Point) -> float:
+        """Largest t up to 1 with λ + t(end − λ) ∈ Ω. Collective."""
+        down = self.point.lam.array_r - end.lam.array_r
+        own = self._qp.feasible.max_step(self.point.lam.array_r, down)
+        return min(1.0, float(self._comm.allreduce(own, op=MPI.MIN)))
+
+    def _scaled(self, share: float, x: PETSc.Vec) -> PETSc.Vec:
+        x.copy(self._work)
+        self._work.scale(share)
+        return self._work
+
+    def result(self, reason: ConvergedReason, steps: Steps) -> QPResult:
+        """The answer; takes λ and s over."""
+        moved = self.point.lam.copy()
+        moved.axpy(-1.0, self._homogenised.lam_bar)
+        equality = self._qp.coarse.norm_Q(moved)
+        moved.destroy()
+        return QPResult(
+            lam=self.point.lam.copy(),
+            mu=self.mu,
+            gradient=self.s.copy(),
+            face=self.face(),
+            reason=reason,
+            projected_gradient=self.residual,
+            equality=equality,
+            reference=self._homogenised.scale.reference,
+            norm=self.norm,
+            steps=steps,
+        )
+
+    def destroy(self) -> None:
+        """Destroy the vectors. Collective."""
+        self.point.destroy()
+        for vec in (self.s, self._work, self.back):
+            if vec is not None:
+                vec.destroy()
+
+
+def _rayleigh(qp: QP, point: Point) -> float:
+    """λᵀFλ/λᵀλ, 0 where λ = 0."""
+    size = point.lam.dot(point.lam)
+    return float(point.lam.dot(point.g) + point.lam.dot(qp.d)) / size if size > 0.0 else 0.0
