@@ -14,11 +14,12 @@ from scipy.sparse import csr_array, diags_array
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.compat import assemble_csr
 from tfeti_dolfinx.errors import ConformanceError, FactorError, InputError
-from tfeti_dolfinx.subdomains import factor, sparse_block
+from tfeti_dolfinx.subdomains import factor, traced
 from tfeti_dolfinx.subdomains.conformance import check_block, check_kind_of_block
 from tfeti_dolfinx.subdomains.data import Counters, SubdomainData
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 from tfeti_dolfinx.subdomains.kernel import candidate_modes, fixing_nodes, kernel_of
+from tfeti_dolfinx.subdomains.kplus import Making
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
 
 RIGID = {"triangle": 3, "quadrilateral": 3, "tetrahedron": 6, "hexahedron": 6}
@@ -53,7 +54,7 @@ def data(K, x, every=3, **changes):
 
 
 def block(K, x, every=3, counters=None, **changes):
-    return SparseBlock(data(K, x, every, **changes), counters)
+    return SparseBlock(data(K, x, every, **changes), Making(counters or Counters()))
 
 
 @pytest.mark.parametrize("cell", list(RIGID))
@@ -306,14 +307,14 @@ def test_a_factor_that_only_the_preconditioner_needs_fails_on_all_ranks(monkeypa
     """K_ii is made where all ranks can raise together, not within a multiplication."""
     d = decomposed("quadrilateral", 4, 4)
     unlucky = d.comm.allreduce(int(d.subdomains.min(initial=99)), op=MPI.MAX)
-    regularised = sparse_block.regularised
+    regularised = traced.regularised
 
     def fails(K, R, fixing_dofs, prefix):
         if unlucky in d.subdomains:
             raise FactorError("out of memory")
         return regularised(K, R, fixing_dofs, prefix)
 
-    monkeypatch.setattr(sparse_block, "regularised", fails)
+    monkeypatch.setattr(traced, "regularised", fails)
     p = problem(d, (0.0, -0.05), tfeti_pc_type="dirichlet")
     with pytest.raises(FactorError, match=r"subdomain \d: .*dirichlet preconditioner: out of mem"):
         p.solve()

@@ -52,7 +52,7 @@ def test_preconditioners_are_symmetric_and_positive(dual):
 
     scaled = ScaledRows(dual.constraints.B, dual.constraints.weights)
     for make in PRECONDITIONERS.values():
-        check_operator(make(scaled, dual.subdomains.blocks), dual.d)
+        check_operator(make(scaled, dual.subdomains), dual.d)
 
 
 def test_projectors(dual):

@@ -44,6 +44,10 @@ class Doubled:
         self.half.destroy()
 
 
+def doubled(B, subdomains):
+    return DualOperator(B, Doubled(subdomains.blocks))
+
+
 def solved(contacts=(), extensions=None, **options):
     d = decomposed("hexahedron", 3, 4)
     p = problem(d, contacts=contacts, extensions=extensions, tfeti_rtol=1e-9, **options)
@@ -62,9 +66,6 @@ def test_an_inverse_of_one_s_own(contacts):
 
 
 def test_a_preconditioner_of_one_s_own():
-    def doubled(B, blocks):
-        return DualOperator(B, Doubled(blocks))
-
     known, p = solved(tfeti_pc_type="lumped")
     own, q = solved(extensions=tfeti.Extensions(preconditioner=doubled))
     largest = p.dofs.comm.allreduce(np.abs(known).max(initial=0.0), op=max)
@@ -75,7 +76,7 @@ def test_a_preconditioner_of_one_s_own():
 
 def test_a_preconditioner_that_nobody_takes_is_refused():
     obstacle = tfeti.Obstacle("bottom", curved_obstacle(3))
-    own = tfeti.Extensions(preconditioner=lambda B, blocks: DualOperator(B, Doubled(blocks)))
+    own = tfeti.Extensions(preconditioner=doubled)
     with pytest.raises(tfeti.InputError, match="a preconditioner is given, but"):
         solved([obstacle], own, tfeti_qp_type="smalse")
 

@@ -144,7 +144,7 @@ def test_jumps_of_stiffness_cost_little():
 
 
 def test_no_contact_no_price():
-    p = problem(decomposed("hexahedron", 4, 8), (0, 0, -0.05))
+    p = problem(decomposed("hexahedron", 4, 8), (0, 0, -0.05), tfeti_local_type="implicit")
     p.solve()
     r = p.report
     assert r.contact_rows == r.expansion_steps == r.proportioning_steps == r.outer_iterations == 0
@@ -155,7 +155,12 @@ def test_no_contact_no_price():
 
 
 def test_without_a_preconditioner_K_ii_is_not_factored():
-    p = problem(decomposed("hexahedron", 4, 8), (0, 0, -0.05), tfeti_pc_type="lumped")
+    p = problem(
+        decomposed("hexahedron", 4, 8),
+        (0, 0, -0.05),
+        tfeti_pc_type="lumped",
+        tfeti_local_type="implicit",
+    )
     p.solve()
     assert p.report.factorizations == 8
 

@@ -7,7 +7,6 @@ from mpi4py import MPI
 from test_solvable_lp import dual_of
 
 from tfeti_dolfinx.subdomains.build import submatrices
-from tfeti_dolfinx.subdomains.local import local_operator
 from tfeti_dolfinx.subdomains.subdomains import sizes, sums
 
 
@@ -54,7 +53,7 @@ def test_the_local_operator_and_recovery_are_one_generalised_inverse(scene):
     _, subdomains = scene
     w = random(len(subdomains.trace))
     out = np.full_like(w, np.nan)
-    operator = local_operator(subdomains.blocks, "pinv")
+    operator = subdomains.local_operator("pinv")
     operator.prepare()
     operator.mult(w, out)
     u = subdomains.pinv_load - subdomains.recover(w)
@@ -66,7 +65,7 @@ def test_local_operators_measure_the_energy_of_trace_vectors(scene, kind):
     """wᵀK_bb w is that of w without the inside, wᵀSw the least of all insides."""
     p, subdomains = scene
     w, u = random(len(subdomains.trace)), np.zeros(num_dofs(p))
-    out, operator = np.empty_like(w), local_operator(subdomains.blocks, kind)
+    out, operator = np.empty_like(w), subdomains.local_operator(kind)
     operator.prepare()
     operator.mult(w, out)
     u[subdomains.trace] = w

@@ -6,6 +6,8 @@ Shapes and units stand in the docstrings.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -16,7 +18,7 @@ ArrayLike = npt.ArrayLike
 # stands for 0 in a denominator: smaller than any quantity, and its inverse is still finite
 TINY = 1e-300
 
-__all__ = ["TINY", "Array", "ArrayLike", "sum_rows"]
+__all__ = ["TINY", "Array", "ArrayLike", "joined", "parts_of", "sum_rows"]
 
 
 def sum_rows(row: Array, values: Array, size: int) -> Array:
@@ -37,3 +39,14 @@ def sum_rows(row: Array, values: Array, size: int) -> Array:
     for column, total in zip(flat.T, sums.T, strict=True):
         total[:] = np.bincount(row, column, minlength=size)
     return sums.reshape(size, *shape)
+
+
+def parts_of(sizes: Sequence[int]) -> list[slice]:
+    """Where arrays of these lengths lie, one after the other."""
+    ends = np.cumsum([0, *sizes])
+    return [slice(int(a), int(b)) for a, b in pairwise(ends)]
+
+
+def joined(parts: Sequence[Array]) -> Array:
+    """One float array of several, maybe none."""
+    return np.concatenate([np.empty(0), *parts])

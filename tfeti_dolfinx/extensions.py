@@ -18,8 +18,10 @@ from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.monitors import Monitor
 from tfeti_dolfinx.subdomains.block import Block
-from tfeti_dolfinx.subdomains.data import SubdomainData
-from tfeti_dolfinx.subdomains.kplus import GeneralisedInverse, MakeInverse
+from tfeti_dolfinx.subdomains.build import MakeBlock, sparse_blocks
+from tfeti_dolfinx.subdomains.data import Counters, SubdomainData
+from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, GeneralisedInverse, MakeInverse, Making
+from tfeti_dolfinx.subdomains.local import LocalChoice
 
 
 @dataclass(frozen=True)
@@ -30,8 +32,8 @@ class Extensions:
         block: Makes the Block of a subdomain, say a class; ``BlockDefaults`` leaves four methods
             to write, ``check_kind_of_block`` tests it.
         kplus: Makes the generalised inverse of a subdomain, for ``SparseBlock``.
-        preconditioner: Makes a preconditioner from B D⁻¹ and the Blocks, for solvers that take
-            one.
+        preconditioner: Makes a preconditioner from B D⁻¹ and the subdomains, for solvers that
+            take one.
         feasible_set: From B and c to the set of multipliers, asked before each run of the solver;
             ``check_feasible_set`` tests it.
         monitor: Called after each step of the solver.
@@ -140,3 +142,18 @@ class Settings:
     prefix: str
     factor_options: Mapping[str, Any]
     extensions: Extensions
+
+    @property
+    def local_choice(self) -> LocalChoice:
+        """Which form local operators take."""
+        return LocalChoice(self.options.local_type, self.options.local_multiplications)
+
+    def make_block(self, counters: Counters) -> MakeBlock:
+        """What makes the Blocks of a rank.
+
+        Args:
+            counters: Counts factorisations.
+        """
+        kplus = self.extensions.kplus or KPLUS_TYPES[self.options.kplus_type]
+        how = Making(counters, kplus, f"{self.prefix}sub_")
+        return self.extensions.block or sparse_blocks(how, self.local_choice)

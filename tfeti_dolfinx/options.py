@@ -11,6 +11,7 @@ from tfeti_dolfinx.dual.particular import PARTICULAR
 from tfeti_dolfinx.qp.parameters import NewtonParameters, SmalseParameters
 from tfeti_dolfinx.qp.solvers import SOLVERS
 from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES
+from tfeti_dolfinx.subdomains.local import LOCAL_TYPES
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,17 @@ class Options:
         "subdomains",
         "generalised inverse of a subdomain",
         choices=tuple(KPLUS_TYPES),
+    )
+    local_type: str = described(
+        "auto",
+        "subdomains",
+        "how K⁺ and S of the subdomains are applied: through sparse factors, by a dense matrix for "
+        "each, or by one factor or matrix for all that are equal; auto takes what a model of "
+        "the costs says",
+        choices=LOCAL_TYPES,
+    )
+    local_multiplications: int = described(
+        50, "subdomains", "multiplications that this model expects", fits=FROM_0
     )
     homogenization: str = described(
         "natural",

@@ -57,6 +57,9 @@ class Report:
         expansion_steps: Expansion steps.
         proportioning_steps: Proportioning steps.
         factorizations: Factorisations of subdomain matrices.
+        local_operators: Of ``F`` and ``preconditioner``: how many subdomains apply theirs in each
+            form, and seconds of one multiplication, ``predicted`` by the model and ``measured``
+            (largest over ranks).
         coarse_factorizations: Factorisations of GGᵀ.
         face_factorizations: Factorisations of G_f G_fᵀ, f a face of the rows.
         assemblies: Times that the stiffness was assembled.
@@ -106,6 +109,7 @@ class Report:
     expansion_steps: int = _counter()
     proportioning_steps: int = _counter()
     factorizations: int = _counter()
+    local_operators: dict[str, float] = field(default_factory=dict)
     coarse_factorizations: int = _counter()
     face_factorizations: int = _counter()
     assemblies: int = _counter()

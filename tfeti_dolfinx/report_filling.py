@@ -14,6 +14,7 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.qp.problem import QPResult
 from tfeti_dolfinx.report import Report, peak_memory_mb
 from tfeti_dolfinx.solution import Solution
+from tfeti_dolfinx.subdomains.local import GroupedOperator
 
 
 def fill_sizes(
@@ -57,6 +58,7 @@ def fill_result(
     report.expansion_steps += result.steps.expansion
     report.proportioning_steps += result.steps.proportioning
     report.converged_reason = result.reason.name
+    report.local_operators = _local_operators(dual)
     report.recoveries += accuracy.looks
     report.residuals = _residuals(solution, dual, result, accuracy)
     report.tolerances = _tolerances(solution, dual, accuracy)
@@ -68,6 +70,22 @@ def settle_seconds(report: Report, comm: MPI.Intracomm) -> None:
     of_ranks = comm.allgather(report.seconds)
     names = dict.fromkeys(name for seconds in of_ranks for name in seconds)
     report.seconds.update({name: max(s.get(name, 0.0) for s in of_ranks) for name in names})
+
+
+def _local_operators(dual: Dual) -> dict[str, float]:
+    """Forms of the local operators, and what they cost."""
+    found: dict[str, float] = {}
+    for name, operator in (("F", dual.F), ("preconditioner", dual.preconditioner)):
+        if operator is None or not isinstance(operator.local, GroupedOperator):
+            continue
+        forms = dual.coarse.comm.allreduce(operator.local.forms)
+        found |= {f"{name}_{form}": float(forms[form]) for form in sorted(forms)}
+        for word, value in (
+            ("predicted", operator.local.predicted),
+            ("measured", operator.local_seconds),
+        ):
+            found[f"{name}_{word}"] = dual.coarse.comm.allreduce(value, op=MPI.MAX)
+    return found
 
 
 def _residuals(

@@ -30,8 +30,6 @@ from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
 from tfeti_dolfinx.subdomains.data import Counters
 from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.kernel import mode_names
-from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES
-from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 from tfeti_dolfinx.timing import stage
 
@@ -210,16 +208,16 @@ class System:
 
     def _factor(self) -> None:
         trace, counters = self.gluing.constraints.trace, self._counters
-        own, prefix = self._settings.extensions, f"{self._settings.prefix}sub_"
-        kplus = own.kplus or KPLUS_TYPES[self._settings.options.kplus_type]
-        make_block = own.block or (lambda s: SparseBlock(s, counters, kplus, prefix))
+        make_block, choice = self._settings.make_block(counters), self._settings.local_choice
         if self._K is None:  # it went into Blocks that could not be made
             self._assemble_stiffness()
             self._stages.made["stiffness"] += 1
         data = subdomain_data(self._dofs, self._decomposition, self._K, self._f, trace)
         self._K = None  # the Blocks have it
         with added_options(self._settings.prefix, self._settings.factor_options):
-            self._subdomains = make_subdomains(data, make_block, self._decomposition, counters)
+            self._subdomains = make_subdomains(
+                data, make_block, self._decomposition, counters, choice
+            )
 
     def _retrace(self) -> None:
         _made(self._subdomains).retrace(self.gluing.constraints.trace)

@@ -49,7 +49,7 @@ class Dual:
         subdomains: This rank's Blocks.
         body_names: Names of all bodies.
         mode_names: Names of their candidate modes.
-        preconditioner: Makes a preconditioner from B D⁻¹ and the Blocks, or None.
+        preconditioner: Makes a preconditioner from B D⁻¹ and the subdomains, or None.
         options_prefix: Prefix of all PETSc options.
         feasible: Makes the set of multipliers from B and c; default λ_N ≥ 0.
 
@@ -82,12 +82,12 @@ class Dual:
         self._prefix = f"{options_prefix}face_"
         self._names, self.nearly_free = (body_names, mode_names), list[dict[str, object]]()
         B, comm = constraints.B, constraints.B.getComm().tompi4py()
-        self.F = dual_operator(B, subdomains.blocks)
+        self.F = dual_operator(B, subdomains)
         self.preconditioner: DualOperator | None = None
         self._scaled: ScaledRows | None = None
         if preconditioner is not None:
             self._scaled = ScaledRows(B, constraints.weights)
-            self.preconditioner = preconditioner(self._scaled, subdomains.blocks)
+            self.preconditioner = preconditioner(self._scaled, subdomains)
         self._on_faces: FacePreconditioner | None = None
         bounded = constraints.sets.normals
         self.coarse = CoarseSpace(B, subdomains, bounded, f"{options_prefix}coarse_")

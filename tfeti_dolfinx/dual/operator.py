@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from time import perf_counter
 from typing import Any, Protocol
 
 import numpy as np
@@ -12,8 +13,7 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.errors import raised_on_all_ranks, require
-from tfeti_dolfinx.subdomains.block import Block
-from tfeti_dolfinx.subdomains.local import LocalOperator, local_operator
+from tfeti_dolfinx.subdomains.local import LocalOperator
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 
@@ -47,7 +47,7 @@ class DualOperator:
     def __init__(self, B: RowMatrix, local: LocalOperator) -> None:
         self.B, self.local = B, local
         self.count: Counter[str] = Counter()
-        self._payer = "solver"
+        self._payer, self._seconds, self._times = "solver", 0.0, 0
         self._w, self._v = B.createVecRight(), B.createVecRight()
         with raised_on_all_ranks(self._w.getComm().tompi4py()):
             local.prepare()
@@ -65,8 +65,15 @@ class DualOperator:
         """y = B diag(A_s) Bᵀ x. Collective."""
         self.count[self._payer] += 1
         self.B.multTranspose(x, self._w)
+        start = perf_counter()
         self.local.mult(self._w.array_r, self._v.array)
+        self._seconds, self._times = self._seconds + perf_counter() - start, self._times + 1
         self.B.mult(self._v, y)
+
+    @property
+    def local_seconds(self) -> float:
+        """Seconds that diag(A_s) has taken on this rank, on average of all multiplications."""
+        return self._seconds / max(self._times, 1)
 
     def destroy(self) -> None:
         """Destroy the work vectors and the local operator, not B. Collective."""
@@ -75,9 +82,9 @@ class DualOperator:
         self._v.destroy()
 
 
-def dual_operator(B: PETSc.Mat, blocks: Sequence[Block]) -> DualOperator:
+def dual_operator(B: PETSc.Mat, subdomains: Subdomains) -> DualOperator:
     """F = B K⁺ Bᵀ. Collective."""
-    return DualOperator(B, local_operator(blocks, "pinv"))
+    return DualOperator(B, subdomains.local_operator("pinv"))
 
 
 class ScaledRows:
@@ -115,17 +122,17 @@ class ScaledRows:
         self._inverse.destroy()
 
 
-def lumped_preconditioner(B: RowMatrix, blocks: Sequence[Block]) -> DualOperator:
+def lumped_preconditioner(B: RowMatrix, subdomains: Subdomains) -> DualOperator:
     """B K_bb Bᵀ (Farhat, Roux 1991), B or rather B_D. Collective."""
-    return DualOperator(B, local_operator(blocks, "stiffness"))
+    return DualOperator(B, subdomains.local_operator("stiffness"))
 
 
-def dirichlet_preconditioner(B: RowMatrix, blocks: Sequence[Block]) -> DualOperator:
+def dirichlet_preconditioner(B: RowMatrix, subdomains: Subdomains) -> DualOperator:
     """B S Bᵀ (Farhat, Mandel, Roux 1994), B or rather B_D. Collective."""
-    return DualOperator(B, local_operator(blocks, "schur"))
+    return DualOperator(B, subdomains.local_operator("schur"))
 
 
-MakePreconditioner = Callable[[RowMatrix, Sequence[Block]], DualOperator]
+MakePreconditioner = Callable[[RowMatrix, Subdomains], DualOperator]
 PRECONDITIONERS: dict[str, MakePreconditioner] = {
     "lumped": lumped_preconditioner,
     "dirichlet": dirichlet_preconditioner,

@@ -16,7 +16,11 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.subdomains.block import Block
 from tfeti_dolfinx.subdomains.data import Counters, SubdomainData
+from tfeti_dolfinx.subdomains.equal import EqualSubdomains
 from tfeti_dolfinx.subdomains.factor import say_if_not_cholmod
+from tfeti_dolfinx.subdomains.kplus import Making
+from tfeti_dolfinx.subdomains.local import LocalChoice
+from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 MakeBlock = Callable[[SubdomainData], Block]
@@ -66,11 +70,18 @@ def submatrices(dofs: TornDofs, K: Any) -> Iterator[csr_array]:
         yield _submatrix(K, dolfinx[first:last], primal, first)
 
 
+def sparse_blocks(how: Making, choice: LocalChoice) -> MakeBlock:
+    """What makes the Blocks of a rank, which share a stiffness where a choice says so."""
+    equals = EqualSubdomains(how) if choice.shares else None
+    return lambda data: SparseBlock(data, how, equals)
+
+
 def make_subdomains(
     data: list[SubdomainData],
     make_block: MakeBlock,
     decomposition: Decomposition,
     counters: Counters | None = None,
+    choice: LocalChoice | None = None,
 ) -> Subdomains:
     """A Block for each subdomain of this rank. Collective.
 
@@ -80,6 +91,7 @@ def make_subdomains(
             raised on all ranks.
         decomposition: The torn mesh.
         counters: Counts solves.
+        choice: Which form local operators take.
     """
     comm = decomposition.comm
     say_if_not_cholmod(comm)
@@ -88,7 +100,7 @@ def make_subdomains(
         while data:
             blocks.append(make_block(data.pop(0)))
     bodies = decomposition.body_of_subdomain[decomposition.subdomains]
-    return Subdomains(blocks, bodies, decomposition.num_bodies, comm, counters)
+    return Subdomains(blocks, bodies, decomposition.num_bodies, comm, counters, choice)
 
 
 def _submatrix(K: Any, rows: Array, primal: Array, first: int) -> csr_array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -29,11 +30,25 @@ DEFINITE = {
 # PETSc's error codes, which petsc4py does not name
 OUT_OF_MEMORY, NO_SUPPORT, MISSING_SOLVER = 55, 56, 92
 ZERO_PIVOTS = (71, 81)
+REAL = 8  # bytes of a number
 CHOLMOD_OUT_OF_MEMORY = "CHOLMOD factorization failed with status -2"
 
 
 class NotPositiveDefiniteError(FactorError, ArithmeticError):
     """A matrix that should have a Cholesky factor has none."""
+
+
+@dataclass(frozen=True)
+class FactorSize:
+    """What a factor stores.
+
+    Attributes:
+        entries: Entries of L.
+        memory: Bytes that a sweep over it reads.
+    """
+
+    entries: float
+    memory: float
 
 
 class CholeskyFactor:
@@ -82,11 +97,33 @@ class CholeskyFactor:
         if not self._keep:
             self._release()
 
+    @property
+    def size(self) -> FactorSize:
+        """What the factor stores, as far as its package tells."""
+        info = self._factor.getInfo()
+        entries = max(info["nz_used"], float(self._b.getLocalSize()))
+        return FactorSize(entries, max(info["memory"], REAL * entries))
+
     def solve(self, b: Array) -> Array:
-        """A⁻¹ b, shape ``(n,)``."""
+        """A⁻¹ b, shapes ``(n,)`` or ``(n, q)``."""
+        if b.ndim == 2:
+            return self._solve_many(b) if b.shape[1] > 1 else self.solve(b[:, 0])[:, None]
         self._b.array[:] = b
         self._factor.solve(self._b, self._x)
         return np.array(self._x.array_r)
+
+    def _solve_many(self, b: Array) -> Array:
+        """A⁻¹ b, shape ``(n, q)``, in one sweep over the factor."""
+        x = np.empty(b.shape, order="F")
+        given, found = (
+            PETSc.Mat().createDense(b.shape, array=array, comm=PETSc.COMM_SELF)
+            for array in (np.asfortranarray(b), x)
+        )
+        self._factor.matSolve(given, found)
+        x = np.array(found.getDenseArray(readonly=True), order="F")
+        given.destroy()
+        found.destroy()
+        return x
 
     def destroy(self) -> None:
         """Free the factor."""

@@ -102,3 +102,10 @@ def fixing_nodes(x: Array, count: int) -> Array:
         chosen.append(int(np.argmax(distance)))
         distance = np.minimum(distance, np.linalg.norm(x - x[chosen[-1]], axis=1))
     return np.unique(chosen)
+
+
+def fixing_dofs(x: Array, node_of_dof: Array) -> Array:
+    """Positions of the unknowns at well-spread nodes, given the node of each unknown."""
+    nodes = np.unique(node_of_dof)
+    chosen = nodes[fixing_nodes(x[nodes], 2 ** x.shape[1])]
+    return np.flatnonzero(np.isin(node_of_dof, chosen))

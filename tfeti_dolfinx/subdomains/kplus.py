@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.subdomains.factor import CholeskyFactor
+from tfeti_dolfinx.subdomains.data import Counters
+from tfeti_dolfinx.subdomains.factor import CholeskyFactor, FactorSize
 
 
 class GeneralisedInverse(Protocol):
@@ -58,8 +60,13 @@ class Regularised:
             self._factor = CholeskyFactor(K, prefix, keep=True)
 
     def solve(self, b: Array) -> Array:
-        """K⁺ b, shape ``(n,)``."""
+        """K⁺ b, shapes ``(n,)`` or ``(n, q)``."""
         return self._factor.solve(b)
+
+    @property
+    def size(self) -> FactorSize:
+        """What the factor stores."""
+        return self._factor.size
 
     def refactor(self, R: Array) -> None:
         """Follow new values of K in the same pattern; R is their kernel.
@@ -84,6 +91,13 @@ def regularised(K: Any, R: Array, fixing_dofs: Array, prefix: str = "tfeti_sub_"
         FactorError: It could not be made for another reason.
     """
     return CholeskyFactor(regular_matrix(K, R, fixing_dofs), prefix)
+
+
+def solved(inverse: GeneralisedInverse, b: Array) -> Array:
+    """K⁺ b, shapes ``(n,)`` or ``(n, q)``, by an inverse that may know single vectors only."""
+    if b.ndim == 1 or isinstance(inverse, Regularised):
+        return inverse.solve(b)
+    return np.stack([inverse.solve(column) for column in b.T], axis=1)
 
 
 def regular_matrix(K: Any, R: Array, fixing_dofs: Array) -> Any:
@@ -143,3 +157,18 @@ def _regular_values(K: Any, R: Array, fixing_dofs: Array) -> Iterator[None]:
 # from K, its kernel, the unknowns of fixing nodes and a prefix of options to K⁺
 MakeInverse = Callable[[Any, Array, Array, str], GeneralisedInverse]
 KPLUS_TYPES: dict[str, MakeInverse] = {"regularized": Regularised}
+
+
+@dataclass(frozen=True)
+class Making:
+    """How inverses are made.
+
+    Attributes:
+        counters: Counts factorisations.
+        kplus: Makes the generalised inverse.
+        prefix: Prefix of the factors' PETSc options.
+    """
+
+    counters: Counters = field(default_factory=Counters)
+    kplus: MakeInverse = Regularised
+    prefix: str = "tfeti_sub_"

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
-from itertools import pairwise
+from dataclasses import dataclass
 from typing import Protocol
 
-import numpy as np
-
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.arrays import Array, parts_of
 from tfeti_dolfinx.subdomains.block import Block, OperatorKind
+from tfeti_dolfinx.subdomains.groups import Form, chosen, groups_of
+
+LOCAL_TYPES = ("auto", "implicit", "explicit", "shared")
 
 
 class LocalOperator(Protocol):
@@ -34,6 +36,24 @@ class LocalOperator(Protocol):
     def destroy(self) -> None:
         """Free what ``prepare`` has made, but not the Blocks."""
         ...
+
+
+@dataclass(frozen=True)
+class LocalChoice:
+    """Which form local operators take.
+
+    Attributes:
+        type: One of ``LOCAL_TYPES``.
+        multiplications: How many to expect.
+    """
+
+    type: str = "auto"
+    multiplications: int = 50
+
+    @property
+    def shares(self) -> bool:
+        """Whether equal subdomains share their stiffness."""
+        return self.type in ("auto", "shared")
 
 
 class BlockwiseOperator:
@@ -64,17 +84,47 @@ class BlockwiseOperator:
         """The factors are the Blocks'."""
 
 
-def local_operator(blocks: Sequence[Block], kind: OperatorKind) -> LocalOperator:
+class GroupedOperator:
+    """Equal subdomains apply theirs at once, each group in the form that suits it.
+
+    Args:
+        blocks: This rank's Blocks.
+        kind: ``"pinv"``, ``"stiffness"`` or ``"schur"``.
+        choice: Which form groups take.
+
+    Attributes:
+        predicted: After ``prepare``: seconds of one multiplication by the model.
+        forms: Number of subdomains in each form.
+    """
+
+    def __init__(self, blocks: Sequence[Block], kind: OperatorKind, choice: LocalChoice) -> None:
+        self._blocks, self._kind, self._choice = blocks, kind, choice
+        self._forms: list[Form] = []
+        self.predicted, self.forms = 0.0, Counter[str]()
+
+    def prepare(self) -> None:
+        """Let Blocks make what they need, and make dense matrices where they are chosen."""
+        for block in self._blocks:
+            block.prepare(self._kind)
+        for group in groups_of(self._blocks, self._kind):
+            form = chosen(group, self._choice.type, self._choice.multiplications)
+            form.prepare()
+            self._forms.append(form)
+            self.predicted += form.cost.multiplication
+            self.forms[form.name] += group.count
+
+    def mult(self, w: Array, out: Array) -> None:
+        """out = diag(A_s) w, shapes ``(t,)``."""
+        for form in self._forms:
+            form.mult(w, out)
+
+    def destroy(self) -> None:
+        """Let dense matrices go; the factors are the Blocks'."""
+        self._forms.clear()
+
+
+def local_operator(
+    blocks: Sequence[Block], kind: OperatorKind, choice: LocalChoice
+) -> GroupedOperator:
     """The local operator of a rank: the one place that chooses its form."""
-    return BlockwiseOperator(blocks, kind)
-
-
-def parts_of(sizes: Sequence[int]) -> list[slice]:
-    """Where arrays of these lengths lie, one after the other."""
-    ends = np.cumsum([0, *sizes])
-    return [slice(int(a), int(b)) for a, b in pairwise(ends)]
-
-
-def joined(parts: Sequence[Array]) -> Array:
-    """One float array of several, maybe none."""
-    return np.concatenate([np.empty(0), *parts])
+    return GroupedOperator(blocks, kind, choice)

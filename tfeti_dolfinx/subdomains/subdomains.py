@@ -9,11 +9,11 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import coo_array, csr_array
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.arrays import Array, joined, parts_of
 from tfeti_dolfinx.errors import raised_on_all_ranks
-from tfeti_dolfinx.subdomains.block import Block
+from tfeti_dolfinx.subdomains.block import Block, OperatorKind
 from tfeti_dolfinx.subdomains.data import Counters
-from tfeti_dolfinx.subdomains.local import joined, parts_of
+from tfeti_dolfinx.subdomains.local import GroupedOperator, LocalChoice, local_operator
 
 
 class Subdomains:
@@ -29,6 +29,7 @@ class Subdomains:
         num_bodies: Number of bodies of all ranks.
         comm: Communicator. The constructor is collective, and what its docstring calls so.
         counters: Counts solves.
+        choice: Which form local operators take.
 
     Attributes:
         num_modes: k.
@@ -44,7 +45,9 @@ class Subdomains:
         num_bodies: int,
         comm: MPI.Intracomm,
         counters: Counters | None = None,
+        choice: LocalChoice | None = None,
     ) -> None:
+        self._choice = choice or LocalChoice()
         self.blocks, self.body_of_block = list(blocks), body_of_block
         self.num_bodies, self.comm = num_bodies, comm
         self.counters = Counters() if counters is None else counters
@@ -80,6 +83,10 @@ class Subdomains:
             for i, (block, part) in enumerate(zip(self.blocks, self.dof_parts, strict=True)):
                 block.update(None if K is None else K[i], None if f is None else f[part])
         self._read_trace()
+
+    def local_operator(self, kind: OperatorKind) -> GroupedOperator:
+        """K⁺, K_bb or S of all Blocks on the trace; to be made again after ``retrace``."""
+        return local_operator(self.blocks, kind, self._choice)
 
     def destroy(self) -> None:
         """Free the factors of the Blocks."""

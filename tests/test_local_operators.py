@@ -1,0 +1,322 @@
+"""Local operators: all forms apply the same, equal subdomains are factored once."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx import mesh as dmesh
+from mpi4py import MPI
+from scenes import box, curved_obstacle, decomposed, hooke, problem, strain
+from scipy.sparse import csr_array
+from test_blocks import data, stiffness
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.dual.operator import check_operator
+from tfeti_dolfinx.subdomains.block import BlockDefaults
+from tfeti_dolfinx.subdomains.conformance import check_block, check_kind_of_block
+from tfeti_dolfinx.subdomains.cost import Cost, dense_product, sweeps
+from tfeti_dolfinx.subdomains.data import Counters
+from tfeti_dolfinx.subdomains.equal import EqualSubdomains
+from tfeti_dolfinx.subdomains.factor import FactorSize
+from tfeti_dolfinx.subdomains.groups import Explicit, Implicit, chosen, groups_of
+from tfeti_dolfinx.subdomains.kplus import Making
+from tfeti_dolfinx.subdomains.local import BlockwiseOperator, LocalChoice, local_operator
+from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
+
+CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
+KINDS = ("pinv", "stiffness", "schur")
+
+
+def cubes(cell, parts=2, cells=2):
+    """A box whose subdomains are equal boxes, in rows of so many."""
+    mesh, facet_tags, names = box(cell, parts * cells)
+    gdim = mesh.geometry.dim
+
+    def subdomain(x):
+        index = np.minimum((x[:gdim] * parts).astype(int), parts - 1)
+        return parts ** np.arange(gdim) @ index
+
+    return tfeti.decompose(mesh, subdomain, facet_tags=facet_tags, surfaces=names)
+
+
+def made(d, local_type="auto", contact=True, **options):
+    """A problem and its subdomains, the dual made but not solved."""
+    gdim = d.mesh.geometry.dim
+    contacts = [tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=np.inf)] if contact else []
+    p = problem(d, contacts=contacts, tfeti_local_type=local_type, **options)
+    p._system.look_for_changes()
+    return p, p._system.make(p.report).subdomains
+
+
+def random(n):
+    return np.random.default_rng(MPI.COMM_WORLD.rank).standard_normal(n)
+
+
+def applied(operator, w):
+    out = np.full_like(w, np.nan)
+    operator.prepare()
+    operator.mult(w, out)
+    operator.destroy()
+    return out
+
+
+def close(x, y, comm):
+    """Whether arrays agree to 1e-10 of the largest entry of all ranks."""
+    largest = comm.allreduce(np.abs(y).max(initial=0.0), op=MPI.MAX)
+    return comm.allreduce(bool(np.abs(x - y).max(initial=0.0) <= 1e-10 * largest), op=MPI.LAND)
+
+
+def in_form(form):
+    """A local operator whose groups all have a form."""
+
+    class Formed:
+        def __init__(self, blocks, kind):
+            self.forms = [form(group) for group in groups_of(blocks, kind)]
+
+        def prepare(self):
+            for item in self.forms:
+                item.prepare()
+
+        def mult(self, w, out):
+            for item in self.forms:
+                item.mult(w, out)
+
+        def destroy(self):
+            pass
+
+    return Formed
+
+
+@pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.parametrize("equal", [True, False])
+def test_all_forms_apply_the_same(cell, equal):
+    """Also on subdomains with contact rows, with prescribed values, and of several shapes.
+
+    K⁺ is compared on forces that are in balance: generalised inverses of a place of its own each
+    differ by rigid motions.
+    """
+    d = cubes(cell) if equal else decomposed(cell, 4, 5)
+    p, subdomains = made(d)
+    alone, single = made(d, "implicit")
+    w = random(len(subdomains.trace))
+    for kind in KINDS:
+        for s in (subdomains, single):
+            reference = BlockwiseOperator(s.blocks, kind)
+            expected = applied(reference, w)
+            for form in (Implicit, Explicit):
+                for _ in range(2):  # what is kept from the first time is right as well
+                    assert close(applied(in_form(form)(s.blocks, kind), w), expected, d.comm)
+        if kind != "pinv":
+            assert close(applied(reference, w), applied(subdomains.local_operator(kind), w), d.comm)
+    R = subdomains.kernel_rows.toarray()
+    balanced = w - R @ np.linalg.lstsq(R, w, rcond=None)[0]
+    u, v = (applied(s.local_operator("pinv"), balanced) for s in (subdomains, single))
+    assert close(balanced @ u, balanced @ v, d.comm)
+    check_operator(subdomains_dual(p).F, subdomains_dual(p).d)
+    for item in (p, alone):
+        item.destroy()
+
+
+def subdomains_dual(p):
+    return p._system.dual
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_equal_subdomains_are_factored_once(cell):
+    d = cubes(cell)
+    p, subdomains = made(d, "shared")
+    counters = subdomains.counters
+    ranks_with_any = d.comm.allreduce(int(len(d.subdomains) > 0))
+    assert d.comm.allreduce(counters.factorizations) == ranks_with_any
+    assert len({id(block.stiffness) for block in subdomains.blocks}) <= 1
+    forms = subdomains.local_operator("pinv")
+    forms.prepare()
+    assert sum(forms.forms.values()) == len(subdomains.blocks)
+    p.destroy()
+    p, subdomains = made(d, "implicit")
+    assert subdomains.counters.factorizations == len(subdomains.blocks)
+    assert len({id(block.stiffness) for block in subdomains.blocks}) == len(subdomains.blocks)
+    p.destroy()
+
+
+@pytest.mark.parametrize("local_type", ["shared", "explicit", "auto"])
+@pytest.mark.parametrize("contact", [True, False])
+def test_the_answer_does_not_depend_on_the_form(local_type, contact):
+    u, reports = [], []
+    for name in ("implicit", local_type):
+        d = cubes("hexahedron")
+        contacts = [tfeti.Obstacle("bottom", curved_obstacle(3))] if contact else []
+        p = problem(d, contacts=contacts, tfeti_local_type=name, tfeti_rtol=1e-9)
+        u.append(p.solve().x.array.copy())
+        reports.append(p.report)
+        p.destroy()
+    largest = d.comm.allreduce(np.abs(u[0]).max(initial=0.0), op=MPI.MAX)
+    assert np.abs(u[1] - u[0]).max(initial=0.0) <= 1e-8 * largest
+    first, second = (r.F_multiplications for r in reports)
+    assert abs(first - second) <= 2
+    for name, report in zip(("implicit", local_type), reports, strict=True):
+        found = report.local_operators
+        counts = [v for k, v in found.items() if k.startswith("F_") and k[2:] in FORMS]
+        assert sum(counts) == report.subdomains == 8
+        assert found["F_predicted"] > 0.0
+        assert found["F_measured"] > 0.0
+        assert ("preconditioner_predicted" in found) != contact
+        if name in ("implicit", "explicit"):
+            assert found[f"F_{name}"] == 8
+
+
+FORMS = ("implicit", "explicit", "shared_implicit", "shared_explicit")
+
+
+def shared(K, x, equals, shift=0.0, order=None, **changes):
+    """A Block of a stiffness somewhere else, its nodes in another order."""
+    bs = K.shape[0] // len(x)
+    order = np.arange(len(x)) if order is None else order
+    dofs = (order[:, None] * bs + np.arange(bs)).ravel()
+    K = csr_array(K.tocsr()[dofs][:, dofs])
+    K.sort_indices()
+    given = data(K, x[order] + shift, **changes)
+    return SparseBlock(given, equals=equals), K
+
+
+@pytest.fixture
+def equals():
+    return EqualSubdomains(Making())
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_friends_in_another_place_and_order(cell, equals):
+    K, x = stiffness(cell, 3)
+    first, _ = shared(K, x, equals)
+    order = np.random.default_rng(0).permutation(len(x))
+    second, moved = shared(K, x, equals, shift=7.3, order=order)
+    assert second.stiffness is first.stiffness
+    check_block(second, moved)
+    first.destroy()
+    check_block(second, moved)  # who stays keeps the factor
+    second.destroy()
+
+
+@pytest.mark.parametrize("cell", CELLS)
+def test_false_friends_are_told_apart(cell, equals):
+    """Of the same shape: another modulus, also a hair's breadth, one soft cell, another size."""
+    K, x = stiffness(cell, 3)
+    first, _ = shared(K, x, equals)
+    for other, points in ((2 * K, x), ((1 + 1e-9) * K, x), (K, 2 * x)):
+        block, _ = shared(other, points, equals)
+        same = points is not x and np.array_equal(other.data, K.data)
+        # a shape of another size has rotations of another length, but the same kernel
+        assert (block.stiffness is first.stiffness) == same
+        check_block(block, other)
+    dense = K.toarray()
+    dense[0, 0] += 1e-6
+    block, changed = shared(csr_array(dense), x, equals)
+    assert block.stiffness is not first.stiffness
+    check_block(block, changed)
+
+
+def test_another_orientation_is_another_subdomain(equals):
+    """A box turned by a right angle has the same nodes, but x and y change places."""
+    mesh = dmesh.create_rectangle(MPI.COMM_SELF, [(0, 0), (1, 1)], [3, 3], dmesh.CellType.triangle)
+    V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    a = fem.form(ufl.inner(hooke()(u), strain(v)) * ufl.dx)
+    matrices, points = [], []
+    for _ in range(2):
+        A = fem.assemble_matrix(a)
+        A.scatter_reverse()
+        matrices.append(csr_array(A.to_scipy()))
+        points.append(V.tabulate_dof_coordinates()[:, :2].copy())
+        mesh.geometry.x[:, 0] = 1.0 - mesh.geometry.x[:, 0]  # diagonals run the other way
+    blocks = [shared(K, x, equals)[0] for K, x in zip(matrices, points, strict=True)]
+    assert blocks[0].stiffness is not blocks[1].stiffness
+    for block, K in zip(blocks, matrices, strict=True):
+        check_block(block, K)
+
+
+def test_shared_blocks_keep_the_promises_of_a_block(equals):
+    check_kind_of_block(lambda data: SparseBlock(data, equals=equals))
+
+
+def test_another_stiffness_leaves_the_others_alone():
+    counters = Counters()
+    equals = EqualSubdomains(Making(counters))
+    K, x = stiffness("hexahedron", 2)
+    blocks = [shared(K, x, equals, shift=s)[0] for s in range(3)]
+    assert counters.factorizations == 1
+    blocks[1].update(f=2 * blocks[1].load)
+    assert counters.factorizations == 1
+    blocks[0].update(K=2 * K)
+    assert counters.factorizations == 2
+    check_block(blocks[0], 2 * K)
+    check_block(blocks[2], K)
+    made_before = counters.factorizations
+    for block in blocks[1:]:
+        block.update(K=2 * K)
+        assert block.stiffness is blocks[0].stiffness
+    assert counters.factorizations == made_before
+    check_block(blocks[2], 2 * K)
+
+
+def test_a_new_trace_of_one_leaves_the_others_theirs(equals):
+    K, x = stiffness("hexahedron", 2)
+    blocks = [shared(K, x, equals, shift=s)[0] for s in range(2)]
+    for block in blocks:
+        block.prepare("schur")
+    blocks[0].retrace(np.arange(0, K.shape[0], 2))
+    for block in blocks:
+        check_block(block, K)
+    w = random(sum(len(block.trace_dofs) for block in blocks))
+    for kind in KINDS:
+        expected = applied(BlockwiseOperator(blocks, kind), w)
+        for local_type in ("implicit", "explicit"):
+            operator = local_operator(blocks, kind, LocalChoice(local_type))
+            assert close(applied(operator, w), expected, MPI.COMM_SELF)
+
+
+class OwnBlock(BlockDefaults):
+    """K = I."""
+
+    def set_stiffness(self, K):
+        self.kernel, self.diagonal = np.zeros((K.shape[0], 0)), np.ones(K.shape[0])
+
+    def multiply(self, u):
+        return u
+
+    solve = apply_schur = multiply
+
+
+@pytest.mark.parametrize("local_type", ["auto", "implicit", "explicit", "shared"])
+def test_blocks_of_one_s_own_apply_what_they_have(local_type):
+    K, x = stiffness("triangle", 2)
+    blocks = [OwnBlock(data(K, x)) for _ in range(2)]
+    w = random(sum(len(block.trace_dofs) for block in blocks))
+    for kind in KINDS:
+        assert np.allclose(applied(local_operator(blocks, kind, LocalChoice(local_type)), w), w)
+
+
+@pytest.mark.parametrize("local_type", ["auto", "implicit", "explicit", "shared"])
+def test_ranks_without_subdomains(local_type):
+    operator = local_operator([], "pinv", LocalChoice(local_type))
+    assert applied(operator, np.empty(0)).shape == (0,)
+    assert operator.predicted == 0.0
+    d = decomposed("quadrilateral", 4, 1)  # one rank has it
+    p = problem(d, tfeti_local_type=local_type)
+    p.solve()
+    assert sum(v for k, v in p.report.local_operators.items() if k[2:] in FORMS) == 1
+    p.destroy()
+
+
+def test_the_model_prefers_what_is_cheaper():
+    """Dense matrices pay off where many multiplications are to come."""
+    K, x = stiffness("quadrilateral", 12)
+    block = SparseBlock(data(K, x, trace_dofs=np.arange(20)))
+    (group,) = groups_of([block], "pinv")
+    assert isinstance(chosen(group, "auto", 0), Implicit)
+    assert isinstance(chosen(group, "auto", 10**9), Explicit)
+    assert isinstance(chosen(group, "shared", 10**9), Implicit)  # it shares nothing
+    assert Cost(2.0, 3.0).of(4) == 14.0
+    small, large = FactorSize(1e3, 8e3), FactorSize(1e6, 8e6)
+    assert sweeps(small, 100, 1) < sweeps(large, 100, 1) < sweeps(large, 100, 64)
+    assert sweeps(large, 100, 64) < 64 * sweeps(large, 100, 1)
+    assert dense_product(100, 64) < 64 * dense_product(100, 1)

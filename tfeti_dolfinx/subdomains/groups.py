@@ -1,0 +1,147 @@
+"""Groups of Blocks that apply one matrix, each to its own part of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from typing import Protocol
+
+import numpy as np
+
+from tfeti_dolfinx.arrays import Array, parts_of
+from tfeti_dolfinx.subdomains.block import Block, OperatorKind
+from tfeti_dolfinx.subdomains.cost import Cost, dense_product
+from tfeti_dolfinx.subdomains.matrices import (
+    OwnMatrix,
+    PinvMatrix,
+    SchurMatrix,
+    StiffnessMatrix,
+    TraceMatrix,
+)
+from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
+
+
+class Group:
+    """Blocks of equal subdomains, or one alone.
+
+    Args:
+        matrix: The matrix that all apply.
+        rows: Its row for each trace unknown, for each Block.
+        parts: Where the trace unknowns of each Block lie among those of the rank.
+
+    Attributes:
+        matrix: The matrix.
+        count: Number of Blocks.
+    """
+
+    def __init__(self, matrix: TraceMatrix, rows: Sequence[Array], parts: Sequence[slice]) -> None:
+        self.matrix, self.count = matrix, len(rows)
+        # of an array of one column for each Block, columns first
+        self._place = np.concatenate([k * matrix.size + row for k, row in enumerate(rows)])
+        self._where = np.concatenate([np.arange(part.start, part.stop) for part in parts])
+
+    def mult(self, apply: Callable[[Array], Array], w: Array, out: Array) -> None:
+        """out = A w on the parts of all Blocks, A W being ``apply``."""
+        columns = np.zeros(self.count * self.matrix.size)
+        columns[self._place] = w[self._where]
+        product = apply(columns.reshape((self.matrix.size, self.count), order="F"))
+        out[self._where] = product.ravel(order="F")[self._place]
+
+
+class Form(Protocol):
+    """How a group applies its matrix.
+
+    Attributes:
+        name: Name in reports.
+        group: The group.
+        cost: What it costs by the model.
+    """
+
+    name: str
+    group: Group
+    cost: Cost
+
+    def prepare(self) -> None:
+        """Make what ``mult`` needs."""
+        ...
+
+    def mult(self, w: Array, out: Array) -> None:
+        """out = A w on the group's parts of trace vectors of the rank."""
+        ...
+
+
+class Implicit:
+    """Through factors, with several right sides where there are several Blocks."""
+
+    def __init__(self, group: Group) -> None:
+        self.group, self.name = group, "implicit" if group.count == 1 else "shared_implicit"
+        self.cost = Cost(0.0, group.matrix.seconds(group.count))
+
+    def prepare(self) -> None:
+        """The factors are there."""
+
+    def mult(self, w: Array, out: Array) -> None:
+        """out = A w on the group's parts of trace vectors of the rank."""
+        self.group.mult(self.group.matrix.apply, w, out)
+
+
+class Explicit:
+    """By a dense matrix: one product for all Blocks."""
+
+    def __init__(self, group: Group) -> None:
+        self.group, self.name = group, "explicit" if group.count == 1 else "shared_explicit"
+        size = group.matrix.size
+        self.cost = Cost(group.matrix.seconds(size), dense_product(size, group.count))
+
+    def prepare(self) -> None:
+        """Make the matrix."""
+        self._matrix = self.group.matrix.dense(packed=self.group.count == 1)
+
+    def mult(self, w: Array, out: Array) -> None:
+        """out = A w on the group's parts of trace vectors of the rank."""
+        self.group.mult(self._matrix.apply, w, out)
+
+
+def chosen(group: Group, local_type: str, multiplications: int) -> Form:
+    """The form of a group, one of a type or what the model says is cheapest."""
+    implicit, explicit = Implicit(group), Explicit(group)
+    if local_type == "implicit" or not group.matrix.has_dense:
+        return implicit
+    if local_type == "explicit":
+        return explicit
+    if local_type == "shared" and group.count == 1:
+        return implicit
+    forms: list[Form] = [implicit, explicit]
+    return min(forms, key=lambda form: form.cost.of(multiplications))
+
+
+def groups_of(blocks: Sequence[Block], kind: OperatorKind) -> Iterator[Group]:
+    """Groups that are as large as possible."""
+    members: dict[Hashable, list[int]] = {}
+    for i, block in enumerate(blocks):
+        members.setdefault(_key(block, kind), []).append(i)
+    parts = parts_of([len(block.trace_dofs) for block in blocks])
+    for chosen_blocks in members.values():
+        yield _group([blocks[i] for i in chosen_blocks], kind, [parts[i] for i in chosen_blocks])
+
+
+def _key(block: Block, kind: OperatorKind) -> Hashable:
+    """Equal for Blocks that apply the same matrix."""
+    if not isinstance(block, SparseBlock):
+        return id(block)
+    return id(block.stiffness) if kind == "pinv" else id(block.traced)
+
+
+def _group(blocks: Sequence[Block], kind: OperatorKind, parts: Sequence[slice]) -> Group:
+    sparse = [block for block in blocks if isinstance(block, SparseBlock)]
+    if not sparse:
+        own = OwnMatrix(getattr(blocks[0], f"apply_{kind}"), len(blocks[0].trace_dofs))
+        return Group(own, [np.arange(own.size)], parts)
+    places, first = [block.trace_place for block in sparse], sparse[0]
+    if kind == "pinv":
+        # K⁺ on a part of a trace is a part of K⁺ on the trace, so that all traces may be joined
+        trace = np.unique(np.concatenate(places))
+        matrix: TraceMatrix = PinvMatrix(first.stiffness, trace)
+    else:
+        trace = first.traced.trace
+        matrix = (SchurMatrix if kind == "schur" else StiffnessMatrix)(first.traced)
+    return Group(matrix, [np.searchsorted(trace, place) for place in places], parts)

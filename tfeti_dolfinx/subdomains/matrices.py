@@ -1,0 +1,161 @@
+"""K⁺, K_bb and S on a trace as matrices that are applied through factors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.subdomains.cost import TOGETHER, sparse_products, sweeps
+from tfeti_dolfinx.subdomains.dense import Packed, Whole, made_dense
+from tfeti_dolfinx.subdomains.stiffness import Stiffness
+from tfeti_dolfinx.subdomains.traced import Traced
+
+
+class TraceMatrix(Protocol):
+    """A symmetric matrix on a trace, applied as cheaply as factors allow.
+
+    Attributes:
+        size: Number of its rows, t.
+        has_dense: Whether there is use in a dense one.
+    """
+
+    size: int
+    has_dense: bool
+
+    def apply(self, W: Array) -> Array:
+        """A W, shapes ``(t, q)``."""
+        ...
+
+    def seconds(self, count: int) -> float:
+        """Of ``apply`` to so many vectors, by the model."""
+        ...
+
+    def dense(self, packed: bool) -> Packed | Whole:
+        """The same, dense."""
+        ...
+
+
+class PinvMatrix:
+    """K⁺ on a trace.
+
+    Args:
+        stiffness: The stiffness.
+        trace: Trace unknowns of it, ascending.
+    """
+
+    has_dense = True
+
+    def __init__(self, stiffness: Stiffness, trace: Array) -> None:
+        self._stiffness, self._trace, self.size = stiffness, trace, len(trace)
+
+    def apply(self, W: Array) -> Array:
+        """K⁺ W, through the factor, as many right sides at once as are good for the cache."""
+        out = np.empty(W.shape, order="F")
+        for first in range(0, W.shape[1], TOGETHER):
+            some = slice(first, first + TOGETHER)
+            B = np.zeros((self._stiffness.size, W[:, some].shape[1]), order="F")
+            B[self._trace] = W[:, some]
+            out[:, some] = self._stiffness.solve(B)[self._trace]
+        return out
+
+    def seconds(self, count: int) -> float:
+        """Of ``apply`` to so many vectors, by the model."""
+        return sweeps(self._stiffness.factor_size, self._stiffness.size, count)
+
+    def dense(self, packed: bool) -> Packed | Whole:
+        """The same, dense; kept for the next operator on this trace."""
+        key = packed, self._trace.tobytes()
+        kept = self._stiffness.dense_pinv
+        if kept is None or kept[0] != key:
+            self._stiffness.dense_pinv = None  # two of them might be too large
+            kept = self._stiffness.dense_pinv = (key, _made(self, packed))
+        return kept[1]
+
+
+class SchurMatrix:
+    """S on a trace.
+
+    Args:
+        traced: The stiffness on the trace.
+    """
+
+    has_dense = True
+
+    def __init__(self, traced: Traced) -> None:
+        self._traced, self.size = traced, len(traced.trace)
+
+    def apply(self, W: Array) -> Array:
+        """S W, through the factor of K_ii."""
+        return self._traced.apply_schur(W)
+
+    def seconds(self, count: int) -> float:
+        """Of ``apply`` to so many vectors, by the model."""
+        inner = self._traced.inner
+        products = sparse_products(self._traced.K_bb.nnz, count)
+        if inner is None:
+            return products
+        products += 2.0 * sparse_products(self._traced.K_ib.nnz, count)
+        return products + sweeps(inner.size, self._traced.K_ib.shape[0], count)
+
+    def dense(self, packed: bool) -> Packed | Whole:
+        """The same, dense."""
+        return _made(self, packed)
+
+
+class StiffnessMatrix:
+    """K_bb on a trace: sparse as it is.
+
+    Args:
+        traced: The stiffness on the trace.
+    """
+
+    has_dense = False
+
+    def __init__(self, traced: Traced) -> None:
+        self._traced, self.size = traced, len(traced.trace)
+
+    def apply(self, W: Array) -> Array:
+        """K_bb W."""
+        return self._traced.apply_stiffness(W)
+
+    def seconds(self, count: int) -> float:
+        """Of ``apply`` to so many vectors, by the model."""
+        return sparse_products(self._traced.K_bb.nnz, count)
+
+    def dense(self, packed: bool) -> Packed | Whole:
+        """The same, dense."""
+        return _made(self, packed)
+
+
+class OwnMatrix:
+    """What a Block of another class applies, one vector after the other.
+
+    Args:
+        apply: A w, shapes ``(t,)``.
+        size: t.
+    """
+
+    has_dense = True
+
+    def __init__(self, apply: Callable[[Array], Array], size: int) -> None:
+        self._apply, self.size = apply, size
+
+    def apply(self, W: Array) -> Array:
+        """A W."""
+        return np.stack([self._apply(np.ascontiguousarray(w)) for w in W.T], axis=1)
+
+    def seconds(self, count: int) -> float:
+        """Nothing is known of it: 0, so that it stays as it is."""
+        return 0.0
+
+    def dense(self, packed: bool) -> Packed | Whole:
+        """The same, dense."""
+        return _made(self, packed)
+
+
+def _made(matrix: TraceMatrix, packed: bool) -> Packed | Whole:
+    A = made_dense(matrix.apply, matrix.size, TOGETHER)
+    return Packed(A) if packed else Whole(A)
