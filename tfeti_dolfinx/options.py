@@ -50,7 +50,8 @@ class Options:
     kplus_type: str = described(
         "regularized",
         "subdomains",
-        "generalised inverse of a subdomain",
+        "generalised inverse of a subdomain: K made regular on fixing nodes, by the Schur "
+        "complement on these, or by that on the last unknowns of an elimination",
         choices=tuple(KPLUS_TYPES),
     )
     local_type: str = described(
