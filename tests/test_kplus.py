@@ -137,7 +137,7 @@ def test_the_last_unknowns_of_an_elimination_hold_the_kernel():
     """As few as do: fewer than the kernel's dimension never do, and S has their number of rows."""
     K, x, left = subdomain("tetrahedron", n=3)
     b = made("lu_svd", K, x)
-    s = b.stiffness._pinv._s
+    s = b.stiffness._pinv.unknowns
     assert left <= len(s) < K.shape[0] // 4
     assert null_space(b.kernel[s], rcond=1e-8).shape[1] == 0
     b.destroy()

@@ -31,7 +31,7 @@ class SchurPseudoinverse(FactoredInverse):
     s are the unknowns of the fixing nodes, r the others; K_rr has a Cholesky factor, since no
     motion of the kernel is 0 on s, and S⁺ is the pseudo-inverse of a small matrix whose kernel,
     that of K on s, is known. E S⁺ Eᵀ is kept as H Hᵀ. Of the rank of K, so K⁺ K K⁺ = K⁺
-    (Brzobohatý, Dostál, Kozubek, Kovář, Markopoulos, IJNME 88, 2011, section 3).
+    (Brzobohatý, Dostál, Kozubek, Kovář, Markopoulos, IJNME 88, 2011).
     K_rr is not stored: K lends its own entries for as long as the factor is made.
 
     Args:
@@ -40,6 +40,9 @@ class SchurPseudoinverse(FactoredInverse):
         fixing_dofs: Unknowns of the fixing nodes.
         prefix: Prefix of the factor's PETSc options.
 
+    Attributes:
+        unknowns: s.
+
     Raises:
         NotPositiveDefiniteError: K_rr has no Cholesky factor, or S is not semidefinite.
         FactorError: It could not be made for another reason.
@@ -47,15 +50,15 @@ class SchurPseudoinverse(FactoredInverse):
 
     def __init__(self, K: Any, R: Array, fixing_dofs: Array, prefix: str = "tfeti_sub_") -> None:
         self._K, self._fixing_dofs = K, fixing_dofs
-        self._s = self._chosen(R)
-        with _apart(K, self._s):
+        self.unknowns = self._chosen(R)
+        with _apart(K, self.unknowns):
             self._factor = CholeskyFactor(K, prefix, keep=True)
         self._complete(R)
 
     def solve(self, b: Array) -> Array:
         """K⁺ b, shapes ``(n,)`` or ``(n, q)``."""
         b_r = np.array(b)
-        b_r[self._s] = 0.0
+        b_r[self.unknowns] = 0.0
         return self._factor.solve(b_r) + self._H @ (self._H.T @ b)
 
     @property
@@ -71,8 +74,8 @@ class SchurPseudoinverse(FactoredInverse):
             NotPositiveDefiniteError: K_rr has no Cholesky factor, or S is not semidefinite.
             FactorError: It could not be made for another reason.
         """
-        self._s = self._chosen(R)
-        with _apart(self._K, self._s):
+        self.unknowns = self._chosen(R)
+        with _apart(self._K, self.unknowns):
             self._factor.refactor()
         self._complete(R)
 
@@ -82,14 +85,14 @@ class SchurPseudoinverse(FactoredInverse):
 
     def _complete(self, R: Array) -> None:
         """H with H Hᵀ = E S⁺ Eᵀ."""
-        K_s = self._K[:, self._s].toarray()
+        K_s = self._K[:, self.unknowns].toarray()
         K_rs = np.array(K_s)
-        K_rs[self._s] = 0.0
+        K_rs[self.unknowns] = 0.0
         E = -self._factor.solve(K_rs)
-        S = K_s[self._s] + K_rs.T @ E
-        E[self._s] += np.eye(len(self._s))
+        S = K_s[self.unknowns] + K_rs.T @ E
+        E[self.unknowns] += np.eye(len(self.unknowns))
         try:
-            self._H = np.asarray(E @ _root_of_pseudoinverse(S, R[self._s]))
+            self._H = np.asarray(E @ _root_of_pseudoinverse(S, R[self.unknowns]))
         except NotPositiveDefiniteError:
             self.destroy()
             raise
