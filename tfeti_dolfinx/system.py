@@ -152,7 +152,9 @@ class System:
             report.unmet_contacts = self.search.unmet()
         made, report.reused = self._stages.take_counts()
         report.assemblies, report.searches = made["stiffness"], made["search"]
-        report.gluings, report.coarse_factorizations = made["rows"], made["coarse problem"]
+        report.gluings = made["rows"]
+        has_kernel = self._dual is None or self._dual.coarse.dimension > 0
+        report.coarse_factorizations = made["coarse problem"] if has_kernel else 0
         factored = self._counters.factorizations
         report.factorizations = self._dofs.comm.allreduce(factored - self._counted)
         self._counted = factored
