@@ -231,8 +231,8 @@ class System:
         own = self._settings.extensions.preconditioner
         if own is not None and pc_type == "none":
             raise InputError(
-                "extensions: a preconditioner is given, but the solver takes none, or "
-                f"-{self._settings.prefix}pc_type is none; expected one that takes it, say pcpg"
+                f"extensions: a preconditioner is given, but -{self._settings.prefix}pc_type is "
+                "none, as auto is with smalse; expected lumped or dirichlet, whose place it takes"
             )
         with added_options(self._settings.prefix, self._settings.factor_options):
             self._dual = Dual(
