@@ -110,8 +110,9 @@ def chosen(group: Group, local_type: str, multiplications: int) -> Form:
         return explicit
     if local_type == "shared" and group.count == 1:
         return implicit
-    forms: list[Form] = [implicit, explicit]
-    return min(forms, key=lambda form: form.cost.of(multiplications))
+    if implicit.cost.of(multiplications) <= explicit.cost.of(multiplications):
+        return implicit
+    return explicit if group.matrix.is_sound else implicit
 
 
 def groups_of(blocks: Sequence[Block], kind: OperatorKind) -> Iterator[Group]:

@@ -13,6 +13,11 @@ from tfeti_dolfinx.subdomains.dense import Packed, Whole, made_dense
 from tfeti_dolfinx.subdomains.stiffness import Stiffness
 from tfeti_dolfinx.subdomains.traced import Traced
 
+# Of the stiffness of a node: what K⁺ makes of forces of size 1 on a sound subdomain stays far below
+# it. Above it, where springs or soft parts hardly hold a subdomain, the parts of K⁺ w that cancel
+# are so large that a dense product loses two or three times as much to rounding as a factor does.
+HARDLY_HELD = 1e5
+
 
 class TraceMatrix(Protocol):
     """A symmetric matrix on a trace, applied as cheaply as factors allow.
@@ -24,6 +29,11 @@ class TraceMatrix(Protocol):
 
     size: int
     has_dense: bool
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether a dense one rounds no worse than the factors; may cost a solve."""
+        ...
 
     def apply(self, W: Array) -> Array:
         """A W, shapes ``(t, q)``."""
@@ -50,6 +60,15 @@ class PinvMatrix:
 
     def __init__(self, stiffness: Stiffness, trace: Array) -> None:
         self._stiffness, self._trace, self.size = stiffness, trace, len(trace)
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether random forces of size 1 move the trace by no more than a sound subdomain."""
+        if self.size == 0:
+            return True
+        forces = np.random.default_rng(0).standard_normal((self.size, 1))
+        largest = self._stiffness.diagonal[self._trace].max()
+        return bool(np.abs(self.apply(forces)).max() * largest <= HARDLY_HELD)
 
     def apply(self, W: Array) -> Array:
         """K⁺ W, through the factor, as many right sides at once as are good for the cache."""
@@ -87,6 +106,11 @@ class SchurMatrix:
     def __init__(self, traced: Traced) -> None:
         self._traced, self.size = traced, len(traced.trace)
 
+    @property
+    def is_sound(self) -> bool:
+        """Yes: S is of the size of K."""
+        return True
+
     def apply(self, W: Array) -> Array:
         """S W, through the factor of K_ii."""
         return self._traced.apply_schur(W)
@@ -117,6 +141,11 @@ class StiffnessMatrix:
     def __init__(self, traced: Traced) -> None:
         self._traced, self.size = traced, len(traced.trace)
 
+    @property
+    def is_sound(self) -> bool:
+        """There is no dense one."""
+        return True
+
     def apply(self, W: Array) -> Array:
         """K_bb W."""
         return self._traced.apply_stiffness(W)
@@ -142,6 +171,11 @@ class OwnMatrix:
 
     def __init__(self, apply: Callable[[Array], Array], size: int) -> None:
         self._apply, self.size = apply, size
+
+    @property
+    def is_sound(self) -> bool:
+        """Nothing is known against it."""
+        return True
 
     def apply(self, W: Array) -> Array:
         """A W."""
