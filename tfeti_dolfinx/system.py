@@ -212,8 +212,8 @@ class System:
         if self._K is None:  # it went into Blocks that could not be made
             self._assemble_stiffness()
             self._stages.made["stiffness"] += 1
-        data = subdomain_data(self._dofs, self._decomposition, self._K, self._f, trace)
-        self._K = None  # the Blocks have it
+        K, self._K = self._K, None  # it goes into the Blocks
+        data = subdomain_data(self._dofs, self._decomposition, K, self._f, trace)
         with added_options(self._settings.prefix, self._settings.factor_options):
             self._subdomains = make_subdomains(
                 data, make_block, self._decomposition, counters, choice
