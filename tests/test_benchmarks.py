@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 
-from benchmarks import contact_assembly, talk_tables
+from benchmarks import contact_assembly, kplus_forms, talk_tables
 
 
 def written(folder, name, comm):
@@ -32,3 +32,19 @@ def test_contact_assembly(shared_tmp, comm):
         assert [row["facets"] for row in rows] == (per_square * squares).tolist()
         assert [row["conditions"] for row in rows] == [6**2, 11**2, 21**2]
     assert written(shared_tmp, "contact_assembly", comm).keys() == tables.keys()
+
+
+def test_kplus_forms(shared_tmp, comm):
+    """A bad choice of fixing nodes makes what is factored worse, and no choice makes K⁺ wrong."""
+    tables = kplus_forms.main(["--quick", "--output", str(shared_tmp)])
+    for rows in tables.values():
+        condition = {
+            (row["K⁺"], row["fixing nodes"]): row["condition of the factor"] for row in rows
+        }
+        for kind in ("regularized", "schur"):
+            assert condition[kind, "a cell in a corner"] >= 5 * condition[kind, "spread"]
+        for row in rows:
+            assert row["error of a deformation"] <= 1e-10
+            assert row["error of K K⁺ K"] <= 1e-10
+    assert written(shared_tmp, "kplus_forms", comm).keys() == tables.keys()
+    assert (shared_tmp / "kplus_forms.png").is_file()

@@ -11,7 +11,6 @@ from tfeti_dolfinx.citations import cite
 from tfeti_dolfinx.dual.accuracy import Accuracy
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.errors import ConvergenceError, InputError
-from tfeti_dolfinx.option_parsing import check_preconditioner
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.homogenised import (
     Homogenised,
@@ -36,7 +35,7 @@ def resolve_types(options: Options, num_inequalities: int, prefix: str) -> tuple
 
     Raises:
         InputError: The scene has inequalities, but a solver that does not keep them is asked
-            for, or a preconditioner that the solver does not take.
+            for.
     """
     qp_type = options.qp_type
     if qp_type == "auto":
@@ -47,7 +46,6 @@ def resolve_types(options: Options, num_inequalities: int, prefix: str) -> tuple
             f"-{prefix}qp_type {qp_type}: the scene has {num_inequalities} contact rows, which "
             f"{qp_type.upper()} cannot keep; expected {' or '.join(['auto', *able])}"
         )
-    check_preconditioner(options, qp_type, prefix)
     pc_type = options.pc_type
     return qp_type, SOLVERS[qp_type].pc_type if pc_type == "auto" else pc_type
 

@@ -152,7 +152,9 @@ class System:
             report.unmet_contacts = self.search.unmet()
         made, report.reused = self._stages.take_counts()
         report.assemblies, report.searches = made["stiffness"], made["search"]
-        report.gluings, report.coarse_factorizations = made["rows"], made["coarse problem"]
+        report.gluings = made["rows"]
+        has_kernel = self._dual is None or self._dual.coarse.dimension > 0
+        report.coarse_factorizations = made["coarse problem"] if has_kernel else 0
         factored = self._counters.factorizations
         report.factorizations = self._dofs.comm.allreduce(factored - self._counted)
         self._counted = factored
@@ -229,8 +231,8 @@ class System:
         own = self._settings.extensions.preconditioner
         if own is not None and pc_type == "none":
             raise InputError(
-                "extensions: a preconditioner is given, but the solver takes none, or "
-                f"-{self._settings.prefix}pc_type is none; expected one that takes it, say pcpg"
+                f"extensions: a preconditioner is given, but -{self._settings.prefix}pc_type is "
+                "none, as auto is with smalse; expected lumped or dirichlet, whose place it takes"
             )
         with added_options(self._settings.prefix, self._settings.factor_options):
             self._dual = Dual(

@@ -66,7 +66,6 @@ class Solver:
         solve: Solves a task.
         keeps_bounds: Whether it keeps inequalities.
         pc_type: Preconditioner that ``auto`` stands for.
-        unpreconditioned: Why it takes no preconditioner; empty if it does.
         relative_to_norm: Whether its steps are relative to ‖PFP‖.
         cold: Where it starts, which is its λ̄; None: λ̄ is as options say.
         warm: From a start to its λ̄; None: λ̄ is as without one.
@@ -75,7 +74,6 @@ class Solver:
     solve: Callable[[Task], QPResult]
     keeps_bounds: bool
     pc_type: str
-    unpreconditioned: str
     relative_to_norm: bool
     cold: Callable[[QP], PETSc.Vec] | None = None
     warm: Callable[[QP, Start], PETSc.Vec] | None = None
@@ -119,7 +117,6 @@ SOLVERS = {
         _pcpg,
         keeps_bounds=False,
         pc_type="dirichlet",
-        unpreconditioned="",
         relative_to_norm=False,
         warm=_restored,
     ),
@@ -127,14 +124,12 @@ SOLVERS = {
         _smalse,
         keeps_bounds=True,
         pc_type="none",
-        unpreconditioned="SMALSE-M takes no preconditioner, since it would not preserve the bounds",
         relative_to_norm=True,
     ),
     "newton": Solver(
         _newton,
         keeps_bounds=True,
         pc_type="dirichlet",
-        unpreconditioned="",
         relative_to_norm=False,
         cold=first_point,
         warm=feasible_start,

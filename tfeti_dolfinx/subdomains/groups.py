@@ -116,10 +116,11 @@ def chosen(group: Group, local_type: str, multiplications: int) -> Form:
 
 
 def groups_of(blocks: Sequence[Block], kind: OperatorKind) -> Iterator[Group]:
-    """Groups that are as large as possible."""
+    """Groups that are as large as possible; Blocks without a trace have nothing to apply."""
     members: dict[Hashable, list[int]] = {}
     for i, block in enumerate(blocks):
-        members.setdefault(_key(block, kind), []).append(i)
+        if len(block.trace_dofs):
+            members.setdefault(_key(block, kind), []).append(i)
     parts = parts_of([len(block.trace_dofs) for block in blocks])
     for chosen_blocks in members.values():
         yield _group([blocks[i] for i in chosen_blocks], kind, [parts[i] for i in chosen_blocks])
