@@ -72,7 +72,7 @@ def contact(scene, qp_type, options):
     problem.solve()
     report = problem.report
     seconds = report.seconds
-    return problem, {
+    row = {
         "solver": f"contact, {qp_type}",
         "setting": f"rtol {problem.options.rtol:.0e}",
         "steps": f"{report.F_multiplications} F + {report.preconditioner_multiplications} S",
@@ -81,12 +81,14 @@ def contact(scene, qp_type, options):
         "all": solve_seconds({"seconds": seconds}),
         "error": report.residuals["displacement_error"],
     }
+    say(row)
+    return problem, row
 
 
 def linear_row(linear, kind, setting, rtol):
     """Solve the linear problem; a row."""
     found = solve(linear, SETTINGS[kind][setting], rtol)
-    return {
+    row = {
         "solver": kind,
         "setting": f"{setting}, rtol {rtol:.0e}",
         "steps": found["iterations"],
@@ -95,6 +97,15 @@ def linear_row(linear, kind, setting, rtol):
         "all": linear.seconds + found["set-up"] + found["solve"],
         "error": found["error"],
     }
+    say(row)
+    return row
+
+
+def say(row):
+    """Print a row at once: large scenes take their time."""
+    if MPI.COMM_WORLD.rank == 0:
+        print(*(f"{value:.4g}" if isinstance(value, float) else value for value in row.values()))
+        sys.stdout.flush()
 
 
 def study(demo, size, options, repeats, arguments):

@@ -33,7 +33,8 @@ def stacked(axes: Any, title: str, rows: Sequence[Mapping[str, Any]], parts: Seq
     axes.invert_yaxis()
     axes.set_xlabel("seconds")
     axes.set_title(title, fontsize="medium")
-    axes.legend(fontsize="small")
+    if len(parts) > 1:
+        axes.legend(fontsize="small")
 
 
 def curves(
@@ -48,8 +49,10 @@ def curves(
         axes.plot(x, y, marker="o", label=name)
     if "x" in log:
         axes.set_xscale("log")
+        plain(axes.xaxis, sorted({value for x, _ in lines.values() for value in x}))
     if "y" in log:
         axes.set_yscale("log")
+        plain(axes.yaxis)
     else:
         axes.set_ylim(bottom=0.0)
     axes.set_xlabel(labels[0])
@@ -57,6 +60,17 @@ def curves(
     axes.set_title(title, fontsize="medium")
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small")
+
+
+def plain(axis: Any, ticks: Sequence[float] | None = None) -> None:
+    """Numbers as they are on a logarithmic axis: those given, or 1, 2, 5, 10, ..."""
+    from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
+
+    axis.set_major_locator(
+        LogLocator(subs=(1.0, 2.0, 5.0)) if ticks is None else FixedLocator(ticks)
+    )
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
 def column(rows: Sequence[Mapping[str, Any]], name: str) -> list[float]:

@@ -2,7 +2,8 @@
 
     ./run mpirun -n 2 python3 benchmarks/stages.py [--quick | --large]
 
-Memory is what all ranks hold when a stage ends, and the most that they held in it. A multiplication
+Memory is what all ranks have in use when a stage ends, and what their processes hold then: what is
+freed may stay theirs (Open MPI wants it so), and is used for what comes later. A multiplication
 by F reads each subdomain's factor twice, or its dense matrix once: if the machine's memory is what
 limits it, its bytes per second come near those of a copy of an array larger than the cache, by all
 ranks at once (reading and writing both count). Results go to results/stages.md, .json and .png.
@@ -11,9 +12,11 @@ ranks at once (reading and writing both count). Results go to results/stages.md,
 from __future__ import annotations
 
 import argparse
+import ctypes
 import sys
 import time
 from pathlib import Path
+from typing import ClassVar
 
 import petsc4py
 
@@ -48,58 +51,59 @@ SIZES = {
 }
 # numbers of an array that is copied; the caches of today's processors hold less
 COPIED = {True: 2**20, False: 2**25}
-STATUS, REFERENCES = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+STATUS = Path("/proc/self/status")
 
 
 class Watched(dict):
-    """Seconds of stages that also notes what memory this rank holds when a stage ends.
+    """Seconds of stages that also notes what memory this rank has when a stage ends.
 
     Args:
         seconds: Of the mesh, and of what else is known.
-        before: ``memory()`` when the mesh was made.
+        mesh: ``memory()`` when the mesh was made.
 
     Attributes:
-        held: Megabytes at the end of each stage.
-        most: The most in it; since the run began, where the system does not say of a stage.
+        memory: Megabytes in use, and held, at the end of each stage.
     """
 
-    def __init__(self, seconds, before):
-        held, most = before
-        self.held, self.most = {"mesh": held}, {"mesh": most}
+    def __init__(self, seconds, mesh):
+        self.memory = {"mesh": mesh}
         super().__init__(seconds)
 
     def __setitem__(self, name, value):
         super().__setitem__(name, value)
-        self.held[name], most = memory()
-        self.most[name] = max(self.most.get(name, 0.0), most)
-        forget_peak()
+        self.memory.setdefault(name, memory())  # at its first end: contact comes back at the last
 
     def __reduce__(self):
         """What travels between ranks is the seconds."""
         return dict, (dict(self),)
 
 
+class Mallinfo(ctypes.Structure):
+    """What mallinfo2 of glibc returns."""
+
+    NAMES = "arena ordblks smblks hblks hblkhd usmblks fsmblks uordblks fordblks keepcost"
+    _fields_: ClassVar = [(name, ctypes.c_size_t) for name in NAMES.split()]
+
+
 def memory():
-    """Megabytes that this process holds, and the most since ``forget_peak``."""
-    lines = dict(line.split(":", 1) for line in STATUS.read_text().splitlines())
-    return tuple(float(lines[name].split()[0]) / 1024 for name in ("VmRSS", "VmHWM"))
-
-
-def forget_peak():
-    """Let the system count the most memory anew, if it does that."""
+    """Megabytes that this process has in use, and those that it holds. Without glibc the same."""
+    (line,) = (line for line in STATUS.read_text().splitlines() if line.startswith("VmRSS"))
+    held = float(line.split()[1]) / 1024
     try:
-        REFERENCES.write_text("5")
-    except OSError:
-        return
+        mallinfo = ctypes.CDLL(None).mallinfo2
+    except AttributeError:
+        return held, held
+    mallinfo.restype = Mallinfo
+    info = mallinfo()
+    return (info.uordblks + info.hblkhd) / 2**20, held
 
 
 def solved(demo, size, options):
     """The report of a scene, its seconds watched."""
     scene = demo.scene(demo.torn_mesh(argparse.Namespace(quick=False, **size)))
-    before = memory()
-    forget_peak()
+    mesh = memory()
     problem = tfeti.ContactProblem(**scene, petsc_options={"tfeti_qp_type": "newton", **options})
-    seconds = problem.report.seconds = Watched(problem.report.seconds, before)
+    seconds = problem.report.seconds = Watched(problem.report.seconds, mesh)
     problem.solve()
     problem.destroy()
     return problem.report, seconds
@@ -114,18 +118,19 @@ def stage_rows(seconds):
             "stage": name,
             "seconds": seconds[name],
             "share": seconds[name] / whole,
-            "MB at its end": comm.allreduce(seconds.held.get(name, 0.0)),
-            "MB at most": comm.allreduce(seconds.most.get(name, 0.0)),
+            "MB in use": comm.allreduce(seconds.memory[name][0]),
+            "MB held": comm.allreduce(seconds.memory[name][1]),
         }
         for name in STAGES
         if name in seconds
     ]
 
 
-def bandwidth_row(operator, local, copy):
+def bandwidth_row(scene, operator, local, copy):
     """Bytes, seconds and bandwidth of a multiplication by F or the preconditioner."""
     rate = local[f"{operator}_bytes"] / local[f"{operator}_measured"]
     return {
+        "scene": scene,
         "operator": operator,
         "MB": local[f"{operator}_bytes"] / 1e6,
         "seconds": local[f"{operator}_measured"],
@@ -164,18 +169,18 @@ def main(argv):
     """Run the scenes and write their tables; returns them."""
     arguments, rest = command_line(__doc__, argv, configure)
     size = "quick" if arguments.quick else "large" if arguments.large else "default"
-    comm, tables = MPI.COMM_WORLD, {}
-    copy = copy_bandwidth(COPIED[arguments.quick])
+    comm, tables, local = MPI.COMM_WORLD, {}, {}
     for name, demo in DEMOS.items():
         report, seconds = solved(demo, SIZES[size][name], petsc_options(rest))
-        local = report.local_operators
+        local[name] = report.local_operators
         title = f"{name}, {report.primal_dofs} unknowns, {comm.size} ranks"
         tables[title] = stage_rows(seconds)
-        tables[f"{name}, local operators"] = [
-            bandwidth_row(operator, local, copy)
-            for operator in ("F", "preconditioner")
-            if f"{operator}_bytes" in local
-        ]
+    copy = copy_bandwidth(COPIED[arguments.quick])
+    tables["Local operators"] = [
+        bandwidth_row(name, operator, found, copy)
+        for name, found in local.items()
+        for operator in ("F", "preconditioner")
+    ]
     return finish(arguments.output, "stages", tables, draw, comm.rank)
 
 

@@ -94,6 +94,10 @@ def best_runs(
     for _ in range(1 if arguments.quick else arguments.repeats):
         for run, found in zip(runs, reports, strict=True):
             found.append(run_demo(*run))
+            name, words, ranks = run
+            print(
+                f"{name}, {ranks} ranks:", *words, f"{solve_seconds(found[-1]):.3g} s", flush=True
+            )
     return [min(found, key=solve_seconds) for found in reports]
 
 

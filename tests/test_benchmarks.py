@@ -67,12 +67,12 @@ def test_the_linear_problem_has_the_solution_of_the_contact(shared_tmp, comm, na
 def test_stages(shared_tmp, comm):
     tables = quick(stages, shared_tmp, comm)
     for title, rows in tables.items():
-        if "local operators" in title:
-            assert {row["operator"] for row in rows} == {"F", "preconditioner"}
+        if title == "Local operators":
+            assert len(rows) == 2 * len(stages.DEMOS)
             assert all(row["MB"] > 0.0 for row in rows)
         else:
             assert sum(row["share"] for row in rows) == pytest.approx(1.0)
-            assert all(row["MB at its end"] > 0.0 for row in rows)
+            assert all(0.0 < row["MB in use"] <= row["MB held"] for row in rows)
 
 
 def test_weak_scaling(serial_only, shared_tmp, comm):
