@@ -159,6 +159,7 @@ def test_the_answer_does_not_depend_on_the_form(local_type, contact):
         counts = [v for k, v in found.items() if k.startswith("F_") and k[2:] in FORMS]
         assert sum(counts) == report.subdomains == 8
         assert found["F_predicted"] > 0.0
+        assert found["F_bytes"] > 0.0
         assert found["F_measured"] > 0.0
         assert ("preconditioner_predicted" in found) != contact
         if name in ("implicit", "explicit"):

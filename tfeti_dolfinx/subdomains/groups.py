@@ -9,7 +9,7 @@ import numpy as np
 
 from tfeti_dolfinx.arrays import Array, parts_of
 from tfeti_dolfinx.subdomains.block import Block, OperatorKind
-from tfeti_dolfinx.subdomains.cost import TOGETHER, Cost, dense_product
+from tfeti_dolfinx.subdomains.cost import TOGETHER, Cost, dense_product, dense_traffic
 from tfeti_dolfinx.subdomains.matrices import (
     OwnMatrix,
     PinvMatrix,
@@ -74,7 +74,8 @@ class Implicit:
 
     def __init__(self, group: Group) -> None:
         self.group, self.name = group, "implicit" if group.count == 1 else "shared_implicit"
-        self.cost = Cost(0.0, group.matrix.seconds(group.count))
+        matrix, count = group.matrix, group.count
+        self.cost = Cost(0.0, matrix.seconds(count), matrix.traffic(count))
 
     def prepare(self) -> None:
         """The factors are there."""
@@ -89,8 +90,8 @@ class Explicit:
 
     def __init__(self, group: Group) -> None:
         self.group, self.name = group, "explicit" if group.count == 1 else "shared_explicit"
-        size = group.matrix.size
-        self.cost = Cost(group.matrix.seconds(size), dense_product(size, group.count))
+        t, count = group.matrix.size, group.count
+        self.cost = Cost(group.matrix.seconds(t), dense_product(t, count), dense_traffic(t, count))
 
     def prepare(self) -> None:
         """Make the matrix."""

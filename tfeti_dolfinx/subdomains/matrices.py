@@ -8,7 +8,13 @@ from typing import Protocol
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.subdomains.cost import TOGETHER, sparse_products, sweeps
+from tfeti_dolfinx.subdomains.cost import (
+    TOGETHER,
+    sparse_products,
+    sparse_traffic,
+    sweeps,
+    sweeps_traffic,
+)
 from tfeti_dolfinx.subdomains.dense import Packed, Whole, made_dense
 from tfeti_dolfinx.subdomains.stiffness import Stiffness
 from tfeti_dolfinx.subdomains.traced import Traced
@@ -41,6 +47,10 @@ class TraceMatrix(Protocol):
 
     def seconds(self, count: int) -> float:
         """Of ``apply`` to so many vectors, by the model."""
+        ...
+
+    def traffic(self, count: int) -> float:
+        """Bytes that ``apply`` to so many vectors moves, by the model."""
         ...
 
     def dense(self, packed: bool) -> Packed | Whole:
@@ -84,6 +94,10 @@ class PinvMatrix:
         """Of ``apply`` to so many vectors, by the model."""
         return sweeps(self._stiffness.factor_size, self._stiffness.size, count)
 
+    def traffic(self, count: int) -> float:
+        """Bytes that ``apply`` to so many vectors moves, by the model."""
+        return sweeps_traffic(self._stiffness.factor_size, self._stiffness.size, count)
+
     def dense(self, packed: bool) -> Packed | Whole:
         """The same, dense; kept for the next operator on this trace."""
         key = packed, self._trace.tobytes()
@@ -124,6 +138,15 @@ class SchurMatrix:
         products += 2.0 * sparse_products(self._traced.K_ib.nnz, count)
         return products + sweeps(inner.size, self._traced.K_ib.shape[0], count)
 
+    def traffic(self, count: int) -> float:
+        """Bytes that ``apply`` to so many vectors moves, by the model."""
+        inner, K_ib = self._traced.inner, self._traced.K_ib
+        products = sparse_traffic(self._traced.K_bb.nnz, count)
+        if inner is None:
+            return products
+        products += 2.0 * sparse_traffic(K_ib.nnz, count)
+        return products + sweeps_traffic(inner.size, K_ib.shape[0], count)
+
     def dense(self, packed: bool) -> Packed | Whole:
         """The same, dense."""
         return _made(self, packed)
@@ -154,6 +177,10 @@ class StiffnessMatrix:
         """Of ``apply`` to so many vectors, by the model."""
         return sparse_products(self._traced.K_bb.nnz, count)
 
+    def traffic(self, count: int) -> float:
+        """Bytes that ``apply`` to so many vectors moves, by the model."""
+        return sparse_traffic(self._traced.K_bb.nnz, count)
+
     def dense(self, packed: bool) -> Packed | Whole:
         """The same, dense."""
         return _made(self, packed)
@@ -183,6 +210,10 @@ class OwnMatrix:
 
     def seconds(self, count: int) -> float:
         """Nothing is known of it: 0, so that it stays as it is."""
+        return 0.0
+
+    def traffic(self, count: int) -> float:
+        """Bytes that ``apply`` to so many vectors moves, by the model."""
         return 0.0
 
     def dense(self, packed: bool) -> Packed | Whole:
