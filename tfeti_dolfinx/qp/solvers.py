@@ -65,6 +65,7 @@ class Solver:
     Attributes:
         solve: Solves a task.
         keeps_bounds: Whether it keeps inequalities.
+        keeps_discs: Whether it keeps discs and ellipses.
         pc_type: Preconditioner that ``auto`` stands for.
         unpreconditioned: Why it takes no preconditioner; empty if it does.
         relative_to_norm: Whether its steps are relative to ‖PFP‖.
@@ -74,6 +75,7 @@ class Solver:
 
     solve: Callable[[Task], QPResult]
     keeps_bounds: bool
+    keeps_discs: bool
     pc_type: str
     unpreconditioned: str
     relative_to_norm: bool
@@ -118,6 +120,7 @@ SOLVERS = {
     "pcpg": Solver(
         _pcpg,
         keeps_bounds=False,
+        keeps_discs=False,
         pc_type="dirichlet",
         unpreconditioned="",
         relative_to_norm=False,
@@ -126,6 +129,7 @@ SOLVERS = {
     "smalse": Solver(
         _smalse,
         keeps_bounds=True,
+        keeps_discs=True,
         pc_type="none",
         unpreconditioned="SMALSE-M takes no preconditioner, since it would not preserve the bounds",
         relative_to_norm=True,
@@ -133,6 +137,7 @@ SOLVERS = {
     "newton": Solver(
         _newton,
         keeps_bounds=True,
+        keeps_discs=False,
         pc_type="dirichlet",
         unpreconditioned="",
         relative_to_norm=False,
@@ -140,5 +145,6 @@ SOLVERS = {
         warm=feasible_start,
     ),
 }
-# what auto stands for, without and with inequalities
+# what auto stands for, without and with inequalities, and with discs
 AUTO = {False: "pcpg", True: "smalse"}
+AUTO_WITH_DISCS = "smalse"
