@@ -24,6 +24,7 @@ ROOMS = [
     ["form_checks", "options", "report"],
     ["assembly", "elasticity", "option_parsing"],
     ["fields"],
+    ["contact_state", "friction_bounds"],
     ["solution"],
     ["report_filling", "solver"],
     ["extensions"],

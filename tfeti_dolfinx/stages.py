@@ -11,6 +11,7 @@ STAGES = {
     "search": "contact",
     "rows": "gluing",
     "right side": "gluing",
+    "friction": "gluing",
     "load": "assembly",
     "factors": "subdomains",
     "trace": "subdomains",
@@ -20,9 +21,10 @@ STAGES = {
 # what has to be made anew where something has changed
 CHANGES = {
     "points": tuple(STAGES),
-    "stiffness": ("stiffness", "rows", "factors", "trace", "coarse problem"),
-    "rows": ("rows", "trace", "coarse problem"),
+    "stiffness": ("stiffness", "rows", "friction", "factors", "trace", "coarse problem"),
+    "rows": ("rows", "friction", "trace", "coarse problem"),
     "right side": ("right side", "linear term"),
+    "friction": ("friction",),
     "load": ("load", "linear term"),
 }
 # what comes with a stage

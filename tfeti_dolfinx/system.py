@@ -11,11 +11,13 @@ from dolfinx import fem
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.assembly import Forms
 from tfeti_dolfinx.contact.arguments import Gap
-from tfeti_dolfinx.contact.search import ContactPartner, ContactSearch
+from tfeti_dolfinx.contact.partners import ContactPartner
+from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.dual.operator import PRECONDITIONERS
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import Settings
+from tfeti_dolfinx.friction_bounds import FrictionBounds
 from tfeti_dolfinx.gluing.glue import Gluing, glue
 from tfeti_dolfinx.gluing.prescribed import Prescribed, prescribe
 from tfeti_dolfinx.gluing.weights import row_weights
@@ -65,6 +67,7 @@ class System:
         self.forms, self.bcs, self._contacts = forms, bcs, contacts
         self._dofs, self._decomposition = dofs, decomposition
         self._settings = settings
+        self._friction = FrictionBounds(contacts, dofs, decomposition, forms.thickness)
         self.spectrum: dict[str, float] = {}
         self._stages, self._counters, self._counted = Stages(), Counters(), 0
         self._K: Any = None
@@ -107,6 +110,8 @@ class System:
             self.change("rows")
         elif any_rank(self._dofs.comm, not np.array_equal(new.value, old.value)):
             self.change("right side")
+        if self._search is not None and self._friction.has_changed(self._search):
+            self.change("friction")
 
     def change(self, what: str) -> None:
         """Say that something has changed, a key of ``CHANGES``; what is out of date is freed."""
@@ -226,7 +231,7 @@ class System:
 
     def _make_dual(self) -> None:
         decomposition, dofs = self._decomposition, self._dofs
-        rows = dofs.comm.allreduce(len(self.gluing.constraints.sets.normals))
+        rows = self.gluing.constraints.sets.contact_rows(dofs.comm)
         _, pc_type = resolve_types(self._settings.options, rows, self._settings.prefix)
         own = self._settings.extensions.preconditioner
         if own is not None and pc_type == "none":
@@ -245,9 +250,6 @@ class System:
                 feasible=self._settings.extensions.feasible_set,
             )
 
-    def _make_linear_term(self) -> None:
-        self.dual.update_load()
-
     def _destroy_dual(self) -> None:
         if self._dual is not None:
             self._dual.destroy()
@@ -264,11 +266,12 @@ MAKERS: dict[str, Callable[[System], None]] = {
     "search": System._find_contacts,
     "rows": System._make_rows,
     "right side": System._fill_right_side,
+    "friction": lambda system: system._friction.set_limits(system.gluing, system.search),
     "load": System._assemble_load,
     "factors": System._factor,
     "trace": System._retrace,
     "coarse problem": System._make_dual,
-    "linear term": System._make_linear_term,
+    "linear term": lambda system: system.dual.update_load(),
 }
 
 
