@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from dolfinx import fem
@@ -27,15 +27,13 @@ from tfeti_dolfinx.parallel import any_rank
 from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.report_filling import fill_sizes
 from tfeti_dolfinx.solver import resolve_types
-from tfeti_dolfinx.stages import STAGES, Stages
+from tfeti_dolfinx.stages import STAGES, Stages, made
 from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
 from tfeti_dolfinx.subdomains.data import Counters
 from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.kernel import mode_names
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 from tfeti_dolfinx.timing import stage
-
-T = TypeVar("T")
 
 
 class System:
@@ -80,17 +78,17 @@ class System:
     @property
     def search(self) -> ContactSearch:
         """The contacts' conditions."""
-        return _made(self._search)
+        return made(self._search)
 
     @property
     def gluing(self) -> Gluing:
         """Rows, and the records that they come from."""
-        return _made(self._gluing)
+        return made(self._gluing)
 
     @property
     def dual(self) -> Dual:
         """The dual problem."""
-        return _made(self._dual)
+        return made(self._dual)
 
     def look_for_changes(self) -> None:
         """See whether the mesh, or what forms and Dirichlet conditions refer to, has changed.
@@ -200,12 +198,12 @@ class System:
             self._gluing.constraints.destroy()
         search = self.search
         weights = row_weights(self._diagonal, self._settings.options.scaling, self._dofs.comm)
-        prescribed = _made(self._prescribed)
+        prescribed = made(self._prescribed)
         self._gluing = glue(self._dofs, prescribed, search.records, search.length, weights)
         self.spectrum = {}
 
     def _fill_right_side(self) -> None:
-        values, gaps = _made(self._prescribed).value, self.search.records.gap
+        values, gaps = made(self._prescribed).value, self.search.records.gap
         self._gluing = self.gluing.with_right_side(values, gaps)
 
     def _assemble_load(self) -> None:
@@ -227,7 +225,7 @@ class System:
             )
 
     def _retrace(self) -> None:
-        _made(self._subdomains).retrace(self.gluing.constraints.trace)
+        made(self._subdomains).retrace(self.gluing.constraints.trace)
 
     def _make_dual(self) -> None:
         decomposition, dofs = self._decomposition, self._dofs
@@ -242,7 +240,7 @@ class System:
         with added_options(self._settings.prefix, self._settings.factor_options):
             self._dual = Dual(
                 constraints=self.gluing.constraints,
-                subdomains=_made(self._subdomains),
+                subdomains=made(self._subdomains),
                 body_names=decomposition.body_names,
                 mode_names=mode_names(decomposition.mesh.geometry.dim, dofs.bs),
                 preconditioner=own or PRECONDITIONERS.get(pc_type),
@@ -273,10 +271,3 @@ MAKERS: dict[str, Callable[[System], None]] = {
     "coarse problem": System._make_dual,
     "linear term": lambda system: system.dual.update_load(),
 }
-
-
-def _made(item: T | None) -> T:
-    """What a stage has made."""
-    if item is None:
-        raise InputError("nothing has been made yet; expected a call of solve() before")
-    return item
