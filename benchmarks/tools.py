@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -51,6 +52,24 @@ def configure_runs(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--large", action="store_true", help="the largest sizes, too")
     parser.add_argument("--ranks", type=int, default=2, help="ranks of each run")
     parser.add_argument("--repeats", type=int, default=3, help="runs, of which the best counts")
+
+
+def configure_clock(parser: argparse.ArgumentParser) -> None:
+    """An argument of benchmarks that may share their machine."""
+    parser.add_argument(
+        "--processor", action="store_true", help="seconds of the processor, not of the wall"
+    )
+
+
+def choose_clock(arguments: argparse.Namespace) -> str:
+    """What seconds are; from now on all clocks count those of the processor, if asked for.
+
+    On a machine that others use, too, they say more than those of the wall.
+    """
+    if not arguments.processor:
+        return "seconds"
+    time.perf_counter = time.process_time
+    return "seconds of the processor"
 
 
 def finish(
