@@ -141,4 +141,4 @@ SOLVERS = {
     ),
 }
 # what auto stands for, without and with inequalities
-AUTO = {False: "pcpg", True: "smalse"}
+AUTO = {False: "pcpg", True: "newton"}
