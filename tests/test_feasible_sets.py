@@ -4,13 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from discs import Discs
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tfeti_dolfinx import InputError
 from tfeti_dolfinx.errors import ConformanceError
 from tfeti_dolfinx.qp.conformance import check_feasible_set
+from tfeti_dolfinx.qp.discs import Discs
 from tfeti_dolfinx.qp.faces import Status, face_of
 from tfeti_dolfinx.qp.feasible_sets import Bounds, Product
 
@@ -29,13 +29,6 @@ def test_bounds_fulfil_their_contract_for_any_bound(seed, level):
     where = np.flatnonzero(rng.random(12) < 0.5)
     lower = level + rng.standard_normal(len(where))
     check_feasible_set(Product([(where, Bounds(lower))]), 12, seed)
-
-
-@given(st.integers(0, 10_000))
-def test_discs_fulfil_the_contract(seed):
-    rng = np.random.default_rng(seed)
-    radius = rng.uniform(0.1, 3.0, 6) * (rng.random(6) < 0.8)
-    check_feasible_set(Discs(radius, rng.standard_normal((6, 2))), 12, seed)
 
 
 def friction(seed=0):

@@ -28,6 +28,7 @@ Example:
     0.100000
 """
 
+from tfeti_dolfinx.contact.friction import Coulomb, Tresca
 from tfeti_dolfinx.contact.obstacle import Obstacle
 from tfeti_dolfinx.contact.pair import Contact
 from tfeti_dolfinx.contact.shapes import Cylinder, Plane, SignedDistance, Sphere
@@ -56,6 +57,7 @@ __all__ = [
     "ContactProblem",
     "ContactStatus",
     "ConvergenceError",
+    "Coulomb",
     "Cylinder",
     "Decomposition",
     "Elasticity",
@@ -71,6 +73,7 @@ __all__ = [
     "Solution",
     "Sphere",
     "TfetiError",
+    "Tresca",
     "__version__",
     "decompose",
     "read_gmsh",

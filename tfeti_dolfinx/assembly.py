@@ -64,6 +64,10 @@ class Forms:
         form_compiler_options: As in DOLFINx.
         jit_options: As in DOLFINx.
 
+    Attributes:
+        thickness: What the forms were multiplied with, a number or a scalar in UFL; 1 until it is
+            set.
+
     Raises:
         InputError: A form cannot be integrated on the torn mesh, or not be compiled.
     """
@@ -78,6 +82,7 @@ class Forms:
         jit_options: Mapping[str, Any] | None,
     ) -> None:
         self._V, self._decomposition = V, decomposition
+        self.thickness: Any = 1.0
         self._keywords = {
             "form_compiler_options": _options(form_compiler_options, "form_compiler_options"),
             "jit_options": {**JIT_OPTIONS, **_options(jit_options, "jit_options")},

@@ -10,7 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.checks import checked_callable, named, shown
-from tfeti_dolfinx.dual.dual import FeasibleLaw, no_tension
+from tfeti_dolfinx.dual.dual import FeasibleLaw, contact_set
 from tfeti_dolfinx.dual.operator import MakePreconditioner
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.gluing.constraints import Constraints
@@ -46,7 +46,7 @@ class Extensions:
     block: Callable[[SubdomainData], Block] | None = None
     kplus: MakeInverse | None = None
     preconditioner: MakePreconditioner | None = None
-    feasible_set: FeasibleLaw = no_tension
+    feasible_set: FeasibleLaw = contact_set
     monitor: Monitor | None = None
 
     def __post_init__(self) -> None:
@@ -70,7 +70,7 @@ def guarded(own: Extensions, comm: MPI.Intracomm) -> Extensions:
         kplus=_giving(own.kplus, "kplus", GeneralisedInverse),
         preconditioner=_together(own.preconditioner, "preconditioner", comm),
         feasible_set=own.feasible_set
-        if own.feasible_set is no_tension
+        if own.feasible_set is contact_set
         else _together(_checked_set(own.feasible_set), "feasible_set", comm),
         monitor=_together(own.monitor, "monitor", comm),
     )

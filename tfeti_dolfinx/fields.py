@@ -160,6 +160,19 @@ def from_vertices(dofs: TornDofs, values: Array, vertices: Array) -> fem.Functio
     return function
 
 
+def vector_from_vertices(dofs: TornDofs, values: Array, vertices: Array, name: str) -> fem.Function:
+    """Vector function from values at vertices, shape ``(g, bs)``, as ``from_vertices``.
+
+    Collective.
+    """
+    function = fem.Function(dofs.V, name=name)
+    components = function.x.array.reshape(-1, dofs.bs)
+    for i in range(dofs.bs):
+        component = from_vertices(dofs, values[:, i], vertices)
+        components[dofs.dolfinx_node, i] = component.x.array[dofs.scalar[1]]
+    return function
+
+
 def _volumes(dofs: TornDofs) -> Array:
     """Volume of each local cell."""
     W = fem.functionspace(dofs.V.mesh, ("DG", 0))

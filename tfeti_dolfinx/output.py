@@ -21,7 +21,8 @@ from tfeti_dolfinx.solution import Solution
 def write_vtx(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
     """Write all fields of a solution for ParaView. Collective.
 
-    Nodal fields (displacement, pressure, gap, status, with contacts traction, with a stress
+    Nodal fields (displacement, pressure, gap, status, with contacts traction, with friction
+    tangential traction and slip, with a stress
     stress and von Mises stress averaged at the nodes) go to ``path``; cell fields (subdomain, body,
     material) to a second file beside it, ``<stem>_cells.bp``.
 
@@ -83,6 +84,8 @@ def nodal_fields(solution: Solution) -> list[fem.Function]:
     fields = [solution.displacement, solution.pressure, solution.gap, solution.status]
     if solution.has_contact:
         fields.append(solution.traction)
+    if solution.has_friction:
+        fields += [solution.tangential_traction, solution.slip]
     if solution.has_stress:
         fields += [solution.nodal_stress, solution.nodal_von_mises]
     return fields

@@ -15,7 +15,8 @@ from tfeti_dolfinx.assembly import Forms
 from tfeti_dolfinx.checks import checked_type
 from tfeti_dolfinx.compat import require_real_petsc
 from tfeti_dolfinx.contact.arguments import Gap, gaps_by_position
-from tfeti_dolfinx.contact.search import ContactPartner, checked_contacts
+from tfeti_dolfinx.contact.partners import ContactPartner, checked_contacts
+from tfeti_dolfinx.contact_state import Multipliers
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
 from tfeti_dolfinx.extensions import Extensions, Settings, guarded
@@ -31,7 +32,6 @@ from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.report_filling import fill_result, settle_seconds
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solver import conclude, resolve_types, solve_dual
-from tfeti_dolfinx.states import Multipliers
 from tfeti_dolfinx.system import System
 from tfeti_dolfinx.timing import stage
 
@@ -111,6 +111,7 @@ class ContactProblem:
             forms = Forms(a, L, V, decomposition, form_compiler_options, jit_options)
         with stage("gluing", self.report.seconds):
             self.dofs = TornDofs(V, decomposition)
+        forms.thickness = self._thickness
         self._system = System(
             forms, self.bcs, self.contacts, self.dofs, decomposition, self._settings
         )
@@ -253,7 +254,7 @@ class ContactProblem:
                 system.spectrum = extreme_eigenvalues(gluing.constraints)
         report.spectrum = system.spectrum
         dual.forget_counts()
-        qp_type, _ = resolve_types(self.options, dual.num_inequalities, self._settings.prefix)
+        qp_type, _ = resolve_types(self.options, dual.contact_rows, self._settings.prefix)
         with stage("qp", report.seconds):
             start = None
             if self._start is not None:
@@ -264,7 +265,7 @@ class ContactProblem:
         with stage("recovery", report.seconds):
             solution = self._solution = Solution(
                 u=accuracy.u,
-                multipliers=Multipliers(np.array(result.lam.array_r), result.face.carrying),
+                multipliers=Multipliers(np.array(result.lam.array_r), result.face),
                 decomposition=self.decomposition,
                 gluing=gluing,
                 contacts=list(system.search.contacts),

@@ -46,6 +46,9 @@ class Report:
         unmet_contacts: Contacts none of whose nodes has a row: position in the list, and name.
         dropped_contact_rows: Those that prescribed components decide alone.
         active_contacts: Rows with a positive force.
+        tangential_rows: Rows along tangents, of contacts that have friction.
+        sticking: Nodes with friction that touch and stick.
+        sliding: Those that slip.
         F_multiplications: Multiplications by F, all but the power method's.
         preconditioner_multiplications: Multiplications by the preconditioner.
         power_method_multiplications: Multiplications that estimated ‖PFP‖.
@@ -58,8 +61,8 @@ class Report:
         proportioning_steps: Proportioning steps.
         factorizations: Factorisations of subdomain matrices.
         local_operators: Of ``F`` and ``preconditioner``: how many subdomains apply theirs in each
-            form, and seconds of one multiplication, ``predicted`` by the model and ``measured``
-            (largest over ranks).
+            form, ``bytes`` that one multiplication moves on all ranks by the model, and its
+            seconds, ``predicted`` by the model and ``measured`` (largest over ranks).
         coarse_factorizations: Factorisations of GGᵀ.
         face_factorizations: Factorisations of G_f G_fᵀ, f a face of the rows.
         assemblies: Times that the stiffness was assembled.
@@ -99,6 +102,9 @@ class Report:
     unmet_contacts: list[str] = field(default_factory=list)
     dropped_contact_rows: int = 0
     active_contacts: int = 0
+    tangential_rows: int = 0
+    sticking: int = 0
+    sliding: int = 0
     F_multiplications: int = _counter()
     preconditioner_multiplications: int = _counter()
     power_method_multiplications: int = _counter()

@@ -14,6 +14,7 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.qp.problem import QPResult
 from tfeti_dolfinx.report import Report, peak_memory_mb
 from tfeti_dolfinx.solution import Solution
+from tfeti_dolfinx.states import ContactStatus
 from tfeti_dolfinx.subdomains.local import GroupedOperator
 
 
@@ -27,6 +28,7 @@ def fill_sizes(
     report.subdomains, report.bodies = decomposition.num_subdomains, decomposition.num_bodies
     report.split_subdomains = len(decomposition.split)
     report.contact_rows = comm.allreduce(len(constraints.sets.normals))
+    report.tangential_rows = comm.allreduce(constraints.sets.tangents.size)
     report.contact_candidates = comm.allreduce(gluing.records.candidates)
     within_reach = comm.allreduce(int(np.sum(gluing.records.within_reach)))
     report.far_contact_nodes = report.contact_candidates - within_reach
@@ -47,6 +49,9 @@ def fill_result(
     report.nearly_free = dual.nearly_free
     active = solution.carrying[solution.gluing.constraints.sets.normals]
     report.active_contacts = comm.allreduce(int(np.sum(active)))
+    status = solution.status_of_conditions
+    report.sticking = comm.allreduce(int(np.sum(status == ContactStatus.STICK)))
+    report.sliding = comm.allreduce(int(np.sum(status == ContactStatus.SLIP)))
     report.F_multiplications += dual.F.count["solver"]
     report.power_method_multiplications += dual.F.count["power method"]
     if dual.preconditioner is not None:
@@ -80,6 +85,7 @@ def _local_operators(dual: Dual) -> dict[str, float]:
             continue
         forms = dual.coarse.comm.allreduce(operator.local.forms)
         found |= {f"{name}_{form}": float(forms[form]) for form in sorted(forms)}
+        found[f"{name}_bytes"] = dual.coarse.comm.allreduce(operator.local.traffic)
         for word, value in (
             ("predicted", operator.local.predicted),
             ("measured", operator.local_seconds),

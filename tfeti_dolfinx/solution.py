@@ -10,10 +10,9 @@ import numpy as np
 from dolfinx import fem
 
 from tfeti_dolfinx.arrays import Array, sum_rows
-from tfeti_dolfinx.contact.arguments import position_of
-from tfeti_dolfinx.contact.forces import BodyForces, body_forces, nodal_forces, vertex_tractions
-from tfeti_dolfinx.contact.records import remaining_gaps
-from tfeti_dolfinx.contact.search import ContactPartner
+from tfeti_dolfinx.contact.forces import BodyForces, body_forces, vertex_tractions
+from tfeti_dolfinx.contact.partners import ContactPartner
+from tfeti_dolfinx.contact_state import ContactState, Multipliers
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.fields import (
     Stress,
@@ -22,15 +21,16 @@ from tfeti_dolfinx.fields import (
     from_vertices,
     frozen,
     nodal,
+    vector_from_vertices,
     von_mises,
 )
 from tfeti_dolfinx.gluing.glue import Gluing
 from tfeti_dolfinx.mesh.decomposition import Decomposition
-from tfeti_dolfinx.mortar.surfaces import group_points, hat_integrals
-from tfeti_dolfinx.states import ContactData, ContactStatus, Multipliers
+from tfeti_dolfinx.mortar.surfaces import hat_integrals
+from tfeti_dolfinx.states import ContactStatus
 
 
-class Solution:
+class Solution(ContactState):
     """What a solve has found; fields are made when they are first asked for.
 
     It owns its data, the constants and functions in the stress too: a later solve of the same
@@ -63,9 +63,7 @@ class Solution:
         stress: Stress | None = None,
         thickness: Any = 1.0,
     ) -> None:
-        self.u, self.lam, self.carrying = u, multipliers.lam, multipliers.carrying
-        self.decomposition, self.gluing, self.dofs = decomposition, gluing, gluing.dofs
-        self.contacts, self._thickness = list(contacts), frozen(thickness)
+        super().__init__(u, multipliers, decomposition, gluing, contacts, frozen(thickness))
         self._stress = None
         if stress is not None:
             u_h = self.displacement
@@ -87,6 +85,11 @@ class Solution:
     def has_contact(self) -> bool:
         """Whether the problem has contacts."""
         return bool(self.contacts)
+
+    @property
+    def has_friction(self) -> bool:
+        """Whether a contact of the problem has friction."""
+        return any(contact.friction is not None for contact in self.contacts)
 
     @cached_property
     def stress(self) -> fem.Function:
@@ -115,11 +118,7 @@ class Solution:
         A node of several contacts has the sum of their forces over their areas, each part of a
         surface counted once.
         """
-        records, dofs = self.gluing.records, self.dofs
-        force = sum_rows(records.group, self.force, dofs.num_groups)
-        area = sum_rows(records.group, self.area, dofs.num_groups)
-        whole = hat_integrals(dofs, self.decomposition, self._secondary_surfaces, self._thickness)
-        values = np.divide(force, np.minimum(area, whole), out=0.0 * force, where=area > 0.0)
+        values = self._over_areas(self.force[:, None])[:, 0]
         return self._field(values, self._vertices, "pressure")
 
     @cached_property
@@ -129,17 +128,11 @@ class Solution:
         np.minimum.at(values, self.gluing.records.group, self.remaining_gap)
         return self._field(np.where(self._vertices, values, 0.0), self._vertices, "gap")
 
-    @property
-    def _status_of_conditions(self) -> Array:
-        """ContactStatus of each contact condition of this rank."""
-        carrying = self._of_conditions(self.carrying)
-        return np.where(carrying, ContactStatus.TOUCHING, ContactStatus.OPEN)
-
     @cached_property
     def status(self) -> fem.Function:
         """ContactStatus of each node, as a number."""
         values = np.full(self.dofs.num_groups, float(ContactStatus.NONE))
-        known = self._status_of_conditions.astype(float)
+        known = self.status_of_conditions.astype(float)
         np.maximum.at(values, self.gluing.records.group, known)
         function = self._field(values, self._vertices, "status")
         function.x.array[:] = np.floor(function.x.array)  # between nodes: the lesser of the two
@@ -152,89 +145,40 @@ class Solution:
         Its moments with the hats of degree 1 are those of the nodal contact forces, so action
         and reaction of two sides have the same resultant.
         """
-        dofs = self.dofs
         surfaces = [name for contact in self.contacts for name in contact.surfaces]
         values, area = vertex_tractions(
-            self._nodal_forces, dofs, self.decomposition, surfaces, self._thickness
+            self.nodal_forces, self.dofs, self.decomposition, surfaces, self.thickness
         )
-        function = fem.Function(dofs.V, name="traction")
-        components = function.x.array.reshape(-1, dofs.bs)
-        for i in range(dofs.bs):
-            component = from_vertices(dofs, values[:, i], area > 0.0)
-            components[dofs.dolfinx_node, i] = component.x.array[dofs.scalar[1]]
-        return function
+        return vector_from_vertices(self.dofs, values, area > 0.0, "traction")
+
+    @cached_property
+    def tangential_traction(self) -> fem.Function:
+        """Friction on the secondary sides and at obstacles over the area, a vector; 0 elsewhere."""
+        values = self._over_areas(self.tangential_force)
+        return vector_from_vertices(self.dofs, values, self._vertices, "tangential_traction")
+
+    @cached_property
+    def slip(self) -> fem.Function:
+        """How far nodes that slip have slid on what they meet, a vector; 0 elsewhere.
+
+        Of a node that slips on several contacts it is the mean.
+        """
+        records, size = self.gluing.records, self.dofs.num_groups
+        slips = (self.status_of_conditions == ContactStatus.SLIP).astype(float)
+        count = sum_rows(records.group, slips, size)
+        total = sum_rows(records.group, slips[:, None] * self.slip_of_conditions, size)
+        values = total / np.maximum(count, 1.0)[:, None]
+        return vector_from_vertices(self.dofs, values, self._vertices, "slip")
 
     @cached_property
     def body_forces(self) -> BodyForces:
         """Resultants of the contact forces on each body. Collective at first use."""
-        return body_forces(self._nodal_forces, self.dofs, self.decomposition)
-
-    def contact(self, which: int | str = 0) -> ContactData:
-        """State of the nodes of a contact, those that this rank owns. Collective.
-
-        Args:
-            which: Position in the list of contacts, or name.
-
-        Raises:
-            InputError: There is no such contact, or several have the name.
-        """
-        records = self.gluing.records
-        own = records.contact == position_of(self.contacts, which)
-        return ContactData(
-            points=group_points(self.dofs)[records.group[own]],
-            normal=records.normal[own],
-            force=self.force[own],
-            pressure=self.contact_pressure[own],
-            area=self.area[own],
-            gap=self.remaining_gap[own],
-            status=self._status_of_conditions[own],
-        )
-
-    @cached_property
-    def force(self) -> Array:
-        """Normal force s_i λ_i of each contact condition of this rank, 0 without a row."""
-        scale = np.zeros(len(self.gluing.records))
-        scale[self.gluing.contact.condition] = self.gluing.contact.scale
-        return scale * self._of_conditions(self.lam)
-
-    def _of_conditions(self, of_rows: Array) -> Array:
-        """Values of the rows of each contact condition of this rank, 0 without a row."""
-        values = np.zeros(len(self.gluing.records), dtype=of_rows.dtype)
-        normals = self.gluing.constraints.sets.normals
-        values[self.gluing.contact.condition] = of_rows[normals]
-        return values
-
-    @cached_property
-    def contact_pressure(self) -> Array:
-        """Force over area of each contact condition of this rank. Collective at first use."""
-        return np.divide(self.force, self.area, out=0.0 * self.force, where=self.area > 0.0)
-
-    @cached_property
-    def area(self) -> Array:
-        """∫φ_i times the thickness of each contact condition of this rank. Collective at first use.
-
-        Where a pair covers a part of the node's surface, the thickness is its mean over the whole.
-        """
-        records = self.gluing.records
-        if isinstance(self._thickness, float):
-            return self._thickness * records.area
-        of, surfaces = self.decomposition, self._secondary_surfaces
-        volume = hat_integrals(self.dofs, of, surfaces, self._thickness)[records.group]
-        return records.area * volume / hat_integrals(self.dofs, of, surfaces)[records.group]
-
-    @cached_property
-    def remaining_gap(self) -> Array:
-        """Gap after deformation of each contact condition of this rank. Collective at first use."""
-        return remaining_gaps(self.gluing.records, self.dofs, self.u)
+        return body_forces(self.nodal_forces, self.dofs, self.decomposition)
 
     def _sigma(self) -> Any:
         if self._stress is None:
             raise InputError("no stress: give ContactProblem(..., stress=sigma)")
         return self._stress
-
-    @property
-    def _secondary_surfaces(self) -> list[str | int]:
-        return [contact.surfaces[0] for contact in self.contacts]
 
     @property
     def _vertices(self) -> Array:
@@ -243,10 +187,14 @@ class Solution:
         found[self.gluing.records.group] = True
         return found
 
-    @cached_property
-    def _nodal_forces(self) -> Array:
-        """Contact forces on the owned groups, shape ``(g, gdim)``. Collective at first use."""
-        return nodal_forces(self.gluing.records, self.force, self.dofs)
+    def _over_areas(self, force: Array) -> Array:
+        """Forces of conditions, shape ``(n, k)``, over the area of their nodes: of groups."""
+        records, dofs = self.gluing.records, self.dofs
+        total = sum_rows(records.group, force, dofs.num_groups)
+        area = sum_rows(records.group, self.area, dofs.num_groups)
+        whole = hat_integrals(dofs, self.decomposition, self.secondary_surfaces, self.thickness)
+        area = np.minimum(area, whole)[:, None]
+        return np.divide(total, area, out=np.zeros_like(total), where=area > 0.0)
 
     def _field(self, values: Array, vertices: Array, name: str) -> fem.Function:
         """Scalar function from values of the owned groups at these vertices, 0 elsewhere."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -21,7 +23,7 @@ from tfeti_dolfinx.qp.homogenised import (
 )
 from tfeti_dolfinx.qp.monitors import Monitor, PrintMonitor, no_monitor
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, QPResult, Start
-from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver, Task
+from tfeti_dolfinx.qp.solvers import AUTO, AUTO_WITH_DISCS, SOLVERS, Solver, Task
 
 EXPLANATIONS = {
     ConvergedReason.DIVERGED_ROUNDING: "; rounding does not let it come lower: expected a "
@@ -30,16 +32,27 @@ EXPLANATIONS = {
 }
 
 
-def resolve_types(options: Options, num_inequalities: int, prefix: str) -> tuple[str, str]:
+def resolve_types(options: Options, rows: Sequence[int], prefix: str) -> tuple[str, str]:
     """The solver and the preconditioner that ``auto`` stands for.
 
+    Args:
+        options: Options.
+        rows: Number of normal and of tangential rows of contacts, on all ranks.
+        prefix: Prefix of all options.
+
     Raises:
-        InputError: The scene has inequalities, but a solver that does not keep them is asked
-            for.
+        InputError: The scene has inequalities or friction, but a solver that does not keep them
+            is asked for.
     """
-    qp_type = options.qp_type
+    qp_type, (num_inequalities, num_tangents) = options.qp_type, rows
     if qp_type == "auto":
-        qp_type = AUTO[num_inequalities > 0]
+        qp_type = AUTO_WITH_DISCS if num_tangents else AUTO[num_inequalities > 0]
+    if num_tangents and not SOLVERS[qp_type].keeps_discs:
+        able = [name for name, solver in SOLVERS.items() if solver.keeps_discs]
+        raise InputError(
+            f"-{prefix}qp_type {qp_type}: the scene has friction, {num_tangents} tangential rows, "
+            f"which {qp_type.upper()} cannot keep yet; expected {' or '.join(['auto', *able])}"
+        )
     if num_inequalities and not SOLVERS[qp_type].keeps_bounds:
         able = [name for name, solver in SOLVERS.items() if solver.keeps_bounds]
         raise InputError(
@@ -93,6 +106,7 @@ def solve_dual(
 def _last_look(result: QPResult, rule: Accuracy) -> None:
     """Measure where a solver has stopped before its tolerance: it may be good enough."""
     residual = max(result.projected_gradient, result.norm * result.equality)
+    rule.accept_rounding()
     reason = rule.examine(result.lam, result.gradient, result.face, residual)
     if reason > 0:
         result.reason = reason
@@ -125,7 +139,7 @@ def _homogenise(
 
 def _homogenise_as_told(dual: Dual, qp: QP, options: Options) -> Homogenised:
     """With λ̄ as the options say; its image is kept."""
-    kind = options.homogenization if dual.num_inequalities else "natural"
+    kind = options.homogenization if any(dual.contact_rows) else "natural"
     scale = scale_at(qp, dual.image("natural"))
     return homogenise(qp, dual.image(kind), scale)
 

@@ -9,11 +9,17 @@ from tfeti_dolfinx.arrays import Array
 
 
 class ContactStatus(IntEnum):
-    """Status of a node."""
+    """Status of a node.
+
+    OPEN: no normal force. TOUCHING: one, and no friction there. SLIP, STICK: one, with friction at
+    its bound, and below it. A node whose normal displacement is prescribed slips or sticks.
+    """
 
     NONE = 0
     OPEN = 1
     TOUCHING = 2
+    SLIP = 3
+    STICK = 4
 
 
 @dataclass(frozen=True)
@@ -31,7 +37,11 @@ class ContactData:
         area: ∫φ_i of the node's hat over the surface, of a pair over what the other side covers,
             times the thickness, shape ``(n,)``.
         gap: Remaining distance, shape ``(n,)``.
-        status: ContactStatus: TOUCHING where there is a force, else OPEN, shape ``(n,)``.
+        status: ContactStatus: OPEN without a normal force, else TOUCHING; with friction SLIP or
+            STICK, shape ``(n,)``.
+        tangential_traction: Friction on the node over the area, a vector, shape ``(n, gdim)``.
+        slip: Displacement along the surface, against what the node meets, a vector, shape
+            ``(n, gdim)``.
     """
 
     points: Array
@@ -41,16 +51,5 @@ class ContactData:
     area: Array
     gap: Array
     status: Array
-
-
-@dataclass(frozen=True)
-class Multipliers:
-    """Multipliers of this rank's rows.
-
-    Attributes:
-        lam: λ, shape ``(m,)``.
-        carrying: Flags of the rows that carry a force, shape ``(m,)``.
-    """
-
-    lam: Array
-    carrying: Array
+    tangential_traction: Array
+    slip: Array

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from dolfinx import fem
@@ -11,11 +11,13 @@ from dolfinx import fem
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.assembly import Forms
 from tfeti_dolfinx.contact.arguments import Gap
-from tfeti_dolfinx.contact.search import ContactPartner, ContactSearch
+from tfeti_dolfinx.contact.partners import ContactPartner
+from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.dual.operator import PRECONDITIONERS
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import Settings
+from tfeti_dolfinx.friction_bounds import FrictionBounds
 from tfeti_dolfinx.gluing.glue import Gluing, glue
 from tfeti_dolfinx.gluing.prescribed import Prescribed, prescribe
 from tfeti_dolfinx.gluing.weights import row_weights
@@ -25,15 +27,13 @@ from tfeti_dolfinx.parallel import any_rank
 from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.report_filling import fill_sizes
 from tfeti_dolfinx.solver import resolve_types
-from tfeti_dolfinx.stages import STAGES, Stages
+from tfeti_dolfinx.stages import STAGES, Stages, made
 from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
 from tfeti_dolfinx.subdomains.data import Counters
 from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.kernel import mode_names
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 from tfeti_dolfinx.timing import stage
-
-T = TypeVar("T")
 
 
 class System:
@@ -65,6 +65,7 @@ class System:
         self.forms, self.bcs, self._contacts = forms, bcs, contacts
         self._dofs, self._decomposition = dofs, decomposition
         self._settings = settings
+        self._friction = FrictionBounds(contacts, dofs, decomposition, forms.thickness)
         self.spectrum: dict[str, float] = {}
         self._stages, self._counters, self._counted = Stages(), Counters(), 0
         self._K: Any = None
@@ -77,17 +78,17 @@ class System:
     @property
     def search(self) -> ContactSearch:
         """The contacts' conditions."""
-        return _made(self._search)
+        return made(self._search)
 
     @property
     def gluing(self) -> Gluing:
         """Rows, and the records that they come from."""
-        return _made(self._gluing)
+        return made(self._gluing)
 
     @property
     def dual(self) -> Dual:
         """The dual problem."""
-        return _made(self._dual)
+        return made(self._dual)
 
     def look_for_changes(self) -> None:
         """See whether the mesh, or what forms and Dirichlet conditions refer to, has changed.
@@ -107,6 +108,8 @@ class System:
             self.change("rows")
         elif any_rank(self._dofs.comm, not np.array_equal(new.value, old.value)):
             self.change("right side")
+        if self._search is not None and self._friction.has_changed(self._search):
+            self.change("friction")
 
     def change(self, what: str) -> None:
         """Say that something has changed, a key of ``CHANGES``; what is out of date is freed."""
@@ -195,12 +198,12 @@ class System:
             self._gluing.constraints.destroy()
         search = self.search
         weights = row_weights(self._diagonal, self._settings.options.scaling, self._dofs.comm)
-        prescribed = _made(self._prescribed)
+        prescribed = made(self._prescribed)
         self._gluing = glue(self._dofs, prescribed, search.records, search.length, weights)
         self.spectrum = {}
 
     def _fill_right_side(self) -> None:
-        values, gaps = _made(self._prescribed).value, self.search.records.gap
+        values, gaps = made(self._prescribed).value, self.search.records.gap
         self._gluing = self.gluing.with_right_side(values, gaps)
 
     def _assemble_load(self) -> None:
@@ -214,19 +217,19 @@ class System:
         if self._K is None:  # it went into Blocks that could not be made
             self._assemble_stiffness()
             self._stages.made["stiffness"] += 1
-        data = subdomain_data(self._dofs, self._decomposition, self._K, self._f, trace)
-        self._K = None  # the Blocks have it
+        K, self._K = self._K, None  # it goes into the Blocks
+        data = subdomain_data(self._dofs, self._decomposition, K, self._f, trace)
         with added_options(self._settings.prefix, self._settings.factor_options):
             self._subdomains = make_subdomains(
                 data, make_block, self._decomposition, counters, choice
             )
 
     def _retrace(self) -> None:
-        _made(self._subdomains).retrace(self.gluing.constraints.trace)
+        made(self._subdomains).retrace(self.gluing.constraints.trace)
 
     def _make_dual(self) -> None:
         decomposition, dofs = self._decomposition, self._dofs
-        rows = dofs.comm.allreduce(len(self.gluing.constraints.sets.normals))
+        rows = self.gluing.constraints.sets.contact_rows(dofs.comm)
         _, pc_type = resolve_types(self._settings.options, rows, self._settings.prefix)
         own = self._settings.extensions.preconditioner
         if own is not None and pc_type == "none":
@@ -237,16 +240,13 @@ class System:
         with added_options(self._settings.prefix, self._settings.factor_options):
             self._dual = Dual(
                 constraints=self.gluing.constraints,
-                subdomains=_made(self._subdomains),
+                subdomains=made(self._subdomains),
                 body_names=decomposition.body_names,
                 mode_names=mode_names(decomposition.mesh.geometry.dim, dofs.bs),
                 preconditioner=own or PRECONDITIONERS.get(pc_type),
                 options_prefix=self._settings.prefix,
                 feasible=self._settings.extensions.feasible_set,
             )
-
-    def _make_linear_term(self) -> None:
-        self.dual.update_load()
 
     def _destroy_dual(self) -> None:
         if self._dual is not None:
@@ -264,16 +264,10 @@ MAKERS: dict[str, Callable[[System], None]] = {
     "search": System._find_contacts,
     "rows": System._make_rows,
     "right side": System._fill_right_side,
+    "friction": lambda system: system._friction.set_limits(system.gluing, system.search),
     "load": System._assemble_load,
     "factors": System._factor,
     "trace": System._retrace,
     "coarse problem": System._make_dual,
-    "linear term": System._make_linear_term,
+    "linear term": lambda system: system.dual.update_load(),
 }
-
-
-def _made(item: T | None) -> T:
-    """What a stage has made."""
-    if item is None:
-        raise InputError("nothing has been made yet; expected a call of solve() before")
-    return item

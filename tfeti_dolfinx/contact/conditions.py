@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.contact.records import ContactRecords
+from tfeti_dolfinx.contact.records import ContactRecords, Friction
 from tfeti_dolfinx.contact.sides import Side
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.frames import frames
@@ -46,7 +46,7 @@ def conditions(dofs: TornDofs, contact: int, side: Side, shares: Shares) -> Cont
     """Add up what facets contribute to a node, and divide by ∫ψ_i. Collective.
 
     A node whose covered share of ∫φ_i is below 1e-6 gets no condition. The gaps are those of the
-    geometry, and all conditions are taken to be within reach.
+    geometry, all conditions are taken to be within reach, and none has friction.
 
     Args:
         dofs: Dof maps.
@@ -74,6 +74,7 @@ def conditions(dofs: TornDofs, contact: int, side: Side, shares: Shares) -> Cont
         condition=place[slot],
         entry_group=column,
         weight=value / area[slot],
+        friction=np.full(len(chosen), Friction.NONE),
         candidates=int(np.sum(whole > 0.0)),
     )
 

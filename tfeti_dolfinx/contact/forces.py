@@ -34,14 +34,38 @@ def nodal_forces(records: ContactRecords, force: Array, dofs: TornDofs) -> Array
 
     Args:
         records: Conditions of this rank.
-        force: Normal force of each, shape ``(n,)``.
+        force: Force of each on its own node, shape ``(n, gdim)``.
         dofs: Dof maps.
 
     Returns:
-        −Σ_i a_ij s_i λ_i for each owned group, shape ``(g, gdim)``.
+        Σ_i w_ij F_i for each owned group, shape ``(g, gdim)``.
     """
-    shares = -records.coefficients(0) * force[records.condition][:, None]
+    shares = records.weight[:, None] * force[records.condition]
     return dofs.add_on_owners(records.entry_group, shares)
+
+
+def condition_areas(
+    records: ContactRecords,
+    dofs: TornDofs,
+    decomposition: Decomposition,
+    surfaces: list[str | int],
+    thickness: Any = 1.0,
+) -> Array:
+    """∫φ_i times the thickness of each condition of this rank, shape ``(n,)``. Collective.
+
+    Where a pair covers a part of the node's surface, the thickness is its mean over the whole.
+
+    Args:
+        records: Conditions of this rank.
+        dofs: Dof maps.
+        decomposition: The torn mesh.
+        surfaces: The secondary surfaces.
+        thickness: A number, or a scalar in UFL.
+    """
+    if isinstance(thickness, float):
+        return thickness * records.area
+    volume = hat_integrals(dofs, decomposition, surfaces, thickness)[records.group]
+    return records.area * volume / hat_integrals(dofs, decomposition, surfaces)[records.group]
 
 
 def body_forces(forces: Array, dofs: TornDofs, decomposition: Decomposition) -> BodyForces:

@@ -9,6 +9,7 @@ import numpy as np
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.contact.arguments import Gap, checked_gap, checked_reach, give_name
 from tfeti_dolfinx.contact.conditions import Shares, conditions, triplets
+from tfeti_dolfinx.contact.friction import Law, checked_friction, with_friction
 from tfeti_dolfinx.contact.gaps import gaps_of
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.shape_checks import check_placement, check_shape, distance_and_gradient
@@ -42,6 +43,7 @@ class Obstacle:
             two methods.
         gap: "geometry" for the shape's distance, or what replaces it (negative: interference):
             a number, or a function of the surface's vertices, shape ``(3, n)``.
+        friction: ``Tresca``, ``Coulomb``, or None.
         reach: Nodes farther than this from the obstacle get no row at first. After the solve
             all are checked, and those that came to overlap get theirs. Default: 5 % of the
             surface's extent.
@@ -57,12 +59,14 @@ class Obstacle:
     shape: Shape
     _: KW_ONLY
     gap: Gap = "geometry"
+    friction: Law | None = None
     reach: float | None = None
     name: str = ""
 
     def __post_init__(self) -> None:
         give_name(self, f"obstacle of surface {self.surface!r}")
         check_shape(self.shape, self.name)
+        checked_friction(self.name, self.friction)
 
     @property
     def surfaces(self) -> tuple[str | int, ...]:
@@ -121,8 +125,8 @@ class Obstacle:
             depth: Not used: a body may lie in an obstacle as deep as it likes.
 
         Raises:
-            InputError: The surface faces away, the shape has no normal at a node, or a given gap
-                is no number there.
+            InputError: The surface faces away, the shape has no normal at a node, a given gap is
+                no number there, or the friction does not fit.
         """
         facets = surface_facets(decomposition, self.surface)
         kind, surface = facet_kind(dofs), local_facets(dofs, decomposition, facets)
@@ -132,6 +136,7 @@ class Obstacle:
         vertices = surface.groups[:, : kind.num_vertices]
         side = Side(surface, vertices, hat_areas(kind, surface), normals)
         found = conditions(dofs, contact, side, _shares(dofs, kind, side, distance))
+        found = with_friction(self.name, self.friction, found, dofs)
         gap = self.gaps(dofs, found)
         return replace(found, gap=gap, within_reach=gap <= reach)
 

@@ -12,6 +12,7 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.citations import cite
 from tfeti_dolfinx.contact.arguments import Gap, checked_gap, checked_reach, give_name
 from tfeti_dolfinx.contact.conditions import conditions
+from tfeti_dolfinx.contact.friction import Law, checked_friction, with_friction
 from tfeti_dolfinx.contact.gaps import gaps_of
 from tfeti_dolfinx.contact.meeting import meeting
 from tfeti_dolfinx.contact.records import ContactRecords
@@ -56,6 +57,7 @@ class Contact:
         gap: "geometry" for the distance between the surfaces, or what replaces it wherever they
             are not farther apart than the reach (negative: interference): a number, or a function
             of the secondary surface's vertices, shape ``(3, n)``.
+        friction: ``Tresca``, ``Coulomb``, or None.
         reach: Surfaces farther apart than this make no rows at first; after the solve it is
             checked that none of them has come to overlap. Default: 5 % of the smaller surface's
             extent.
@@ -71,11 +73,13 @@ class Contact:
     _: KW_ONLY
     secondary: str | int = "auto"
     gap: Gap = "geometry"
+    friction: Law | None = None
     reach: float | None = None
     name: str = ""
 
     def __post_init__(self) -> None:
         give_name(self, f"contact of {self.a!r} with {self.b!r}")
+        checked_friction(self.name, self.friction)
 
     @property
     def surfaces(self) -> tuple[str | int, ...]:
@@ -186,8 +190,8 @@ class Contact:
 
         Raises:
             InputError: The surfaces overlap by more than ``depth`` (they are looked at up to three
-                times as deep), face away from each other, or have facets without area; or a given
-                gap is no number somewhere.
+                times as deep), face away from each other, or have facets without area; a given
+                gap is no number somewhere; or the friction does not fit.
         """
         sides = self._sides(dofs, decomposition)
         return self._meet(sides, dofs, contact, reach, depth)
@@ -228,6 +232,7 @@ class Contact:
         """The conditions; arguments as of ``records``. Collective."""
         shares = meeting(self.name, sides, dofs, reach, depth)
         found = conditions(dofs, contact, sides[0], shares)
+        found = with_friction(self.name, self.friction, found, dofs)
         gap = self.gaps(dofs, found, depth)
         return replace(found, gap=gap, within_reach=gap <= reach)
 

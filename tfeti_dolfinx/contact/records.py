@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array, sum_rows
 from tfeti_dolfinx.mesh.dofs import TornDofs
+
+
+class Friction(IntEnum):
+    """What bounds the tangential force of a condition: nothing to hold, a given force, pressure."""
+
+    NONE = 0
+    GIVEN = 1
+    COULOMB = 2
 
 
 @dataclass(frozen=True)
@@ -32,6 +41,7 @@ class ContactRecords:
         condition: Condition of each weight, shape ``(k,)``.
         entry_group: Global group of each weight, shape ``(k,)``.
         weight: The w_ij, without a unit, shape ``(k,)``.
+        friction: ``Friction`` of each condition, shape ``(n,)``.
         candidates: Nodes of the contact surface whose groups this rank owns.
     """
 
@@ -45,6 +55,7 @@ class ContactRecords:
     condition: Array
     entry_group: Array
     weight: Array
+    friction: Array
     candidates: int = 0
 
     def __len__(self) -> int:
@@ -85,6 +96,7 @@ def concatenate(records: list[ContactRecords], gdim: int) -> ContactRecords:
         condition=np.concatenate([no_index, *conditions]),
         entry_group=join("entry_group", no_index),
         weight=join("weight", no_number),
+        friction=join("friction", no_index),
         candidates=sum(r.candidates for r in records),
     )
 

@@ -5,15 +5,14 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.checks import shown
 from tfeti_dolfinx.contact.arguments import Gap
+from tfeti_dolfinx.contact.friction import friction_values
+from tfeti_dolfinx.contact.partners import ContactPartner, check_laws, check_pairs
 from tfeti_dolfinx.contact.records import ContactRecords, concatenate, remaining_gaps
-from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import diameter
@@ -24,77 +23,6 @@ from tfeti_dolfinx.parallel import agreed
 WIDER, LEAST = 4.0, 0.01
 
 log = logging.getLogger(__name__)
-
-
-class ContactPartner(Protocol):
-    """An obstacle, or a pair of surfaces. All methods are collective."""
-
-    @property
-    def name(self) -> str:
-        """Name for messages."""
-        ...
-
-    @property
-    def surfaces(self) -> tuple[str | int, ...]:
-        """Names or tags of the surfaces, that with the multipliers first."""
-        ...
-
-    def first_reach(self, decomposition: Decomposition) -> float:
-        """Distance up to which conditions have rows at first."""
-        ...
-
-    def horizon(self, length: float) -> float:
-        """Reach beyond which no search finds more conditions, in a scene of a length."""
-        ...
-
-    def settled(
-        self,
-        dofs: TornDofs,
-        decomposition: Decomposition,
-        contact: int,
-        reach: float,
-        stiffness: Array,
-    ) -> tuple[ContactPartner, ContactRecords]:
-        """The contact with its sides decided from the diagonal of K, and its conditions."""
-        ...
-
-    def displacement_bound(self, dofs: TornDofs, decomposition: Decomposition, u: Array) -> float:
-        """How far what lay beyond the reach may have come nearer, u of shape (nodes, bs)."""
-        ...
-
-    def records(
-        self,
-        dofs: TornDofs,
-        decomposition: Decomposition,
-        contact: int,
-        reach: float,
-        depth: float,
-    ) -> ContactRecords:
-        """Conditions up to a distance and beyond, and down to a depth of initial overlap."""
-        ...
-
-    def with_gap(self, gap: Gap) -> ContactPartner:
-        """The same contact with another gap."""
-        ...
-
-    def gaps(self, dofs: TornDofs, records: ContactRecords, depth: float) -> Array:
-        """Gaps of conditions that were made with another gap: no search, no integral."""
-        ...
-
-
-def checked_contacts(contacts: Sequence[ContactPartner]) -> list[ContactPartner]:
-    """The contacts as a list.
-
-    Raises:
-        InputError: They are not a sequence of obstacles and pairs.
-    """
-    if not isinstance(contacts, Sequence):
-        raise InputError(f"contacts: expected a list, got {shown(contacts)}")
-    for contact in contacts:
-        known = all(hasattr(contact, name) for name in ("records", "surfaces", "first_reach"))
-        if isinstance(contact, type) or not known:
-            raise InputError(f"contacts: expected obstacles and pairs, got {shown(contact)}")
-    return list(contacts)
 
 
 class ContactSearch:
@@ -130,7 +58,8 @@ class ContactSearch:
         reach = [contact.first_reach(decomposition) for contact in contacts]
         self._depths = agreed(dofs.comm, reach)
         self._reach = list(self._depths)
-        _check_pairs(contacts, decomposition)
+        check_pairs(contacts, decomposition)
+        check_laws(contacts, decomposition)
         settled = [
             contact.settled(dofs, decomposition, i, self._reach[i], stiffness)
             for i, contact in enumerate(contacts)
@@ -142,6 +71,24 @@ class ContactSearch:
     def records(self) -> ContactRecords:
         """All conditions of this rank."""
         return concatenate(self._records, self._dofs.bs)
+
+    def friction(self) -> Array:
+        """Bounds or coefficients of all conditions of this rank along their tangents.
+
+        Returns:
+            Shape ``(n, gdim - 1)``; 0 where there is no friction.
+
+        Raises:
+            InputError: A value is negative or no number somewhere.
+        """
+        parts = [np.zeros((0, max(self._dofs.bs - 1, 0)))]
+        for contact, records in zip(self.contacts, self._records, strict=True):
+            if contact.friction is None:
+                parts.append(np.zeros((len(records), parts[0].shape[1])))
+            else:
+                found = friction_values(contact.name, contact.friction, records, self._dofs)
+                parts.append(found)
+        return np.concatenate(parts)
 
     def set_gaps(self, gaps: Mapping[int, Gap]) -> None:
         """Give contacts another ``gap=``; their conditions stay, but for their gaps.
@@ -253,13 +200,3 @@ class ContactSearch:
 
     def _count(self, flags: Array) -> int:
         return int(self._dofs.comm.allreduce(int(np.sum(flags))))
-
-
-def _check_pairs(contacts: Sequence[ContactPartner], decomposition: Decomposition) -> None:
-    """Raise if a pair is there twice: its force would be shared between the two."""
-    pairs = set()
-    for contact in contacts:
-        tags = frozenset(decomposition.surface(name) for name in contact.surfaces)
-        if len(tags) == 2 and tags in pairs:
-            raise InputError(f"contacts: the pair of {contact.surfaces} is there twice")
-        pairs.add(tags)

@@ -26,14 +26,15 @@ def closing(constraints: Constraints, w: PETSc.Vec, closed: Array) -> Array:
     Args:
         constraints: B and D.
         w: What rows miss, zero on rows that are not asked about.
-        closed: Flags of the local contact rows that are.
+        closed: Flags of the local contact rows that are, in the order of ``sets.contact``.
 
     Returns:
         On this rank's trace unknowns, shape ``(Σ t_s,)``.
     """
     gram = _Gram(constraints, closed)
     z, found = w.duplicate(), np.array(w.array_r)
-    found[constraints.sets.normals] = gram.solve(found[constraints.sets.normals])
+    contact = constraints.sets.contact
+    found[contact] = gram.solve(found[contact])
     z.array[:] = found
     v = gram.spread(z)
     z.destroy()
@@ -46,6 +47,7 @@ class _Gram:
 
     def __init__(self, constraints: Constraints, rows: Array) -> None:
         self._constraints, self._rows = constraints, rows
+        self._contact = constraints.sets.contact
         self._comm = constraints.B.getComm().tompi4py()
         self._x, self._y = constraints.c.duplicate(), constraints.c.duplicate()
         self._v = constraints.B.createVecRight()
@@ -74,11 +76,10 @@ class _Gram:
         return x
 
     def _mult(self, p: Array) -> Array:
-        normals = self._constraints.sets.normals
-        self._x.array[normals] = p
+        self._x.array[self._contact] = p
         self.spread(self._x)
         self._constraints.B.mult(self._v, self._y)
-        return np.where(self._rows, self._y.array_r[normals], 0.0)
+        return np.where(self._rows, self._y.array_r[self._contact], 0.0)
 
     def _dot(self, a: Array, b: Array) -> float:
         return float(self._comm.allreduce(a @ b))

@@ -25,6 +25,7 @@ from tfeti_dolfinx.dual.solvability import check_solvable
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.qp.coarse import Coarse, NoCoarse
+from tfeti_dolfinx.qp.discs import Discs, Ellipses
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Product
 from tfeti_dolfinx.qp.homogenised import Image, image
@@ -36,9 +37,21 @@ from tfeti_dolfinx.subdomains.subdomains import Subdomains
 FeasibleLaw = Callable[[Constraints], FeasibleSet]
 
 
-def no_tension(constraints: Constraints) -> FeasibleSet:
-    """λ_N ≥ 0: contact without friction and adhesion."""
-    return Product([(constraints.sets.normals, Bounds())])
+def contact_set(constraints: Constraints) -> FeasibleSet:
+    """λ_N ≥ 0, and λ_T of each condition with friction in its disc or ellipse: no adhesion."""
+    sets, limits = constraints.sets, constraints.limits
+    normal = (sets.normals, Bounds())
+    if limits.size == 0:
+        return Product([normal])
+    round_ones = np.all(limits == limits[:, :1], axis=1)
+    discs, ellipses = sets.tangents[round_ones], sets.tangents[~round_ones]
+    return Product(
+        [
+            normal,
+            (discs.ravel(), Discs(limits[round_ones].max(axis=1, initial=0.0), limits.shape[1])),
+            (ellipses.ravel(), Ellipses(limits[~round_ones])),
+        ]
+    )
 
 
 class Dual:
@@ -51,13 +64,13 @@ class Dual:
         mode_names: Names of their candidate modes.
         preconditioner: Makes a preconditioner from B D⁻¹ and the subdomains, or None.
         options_prefix: Prefix of all PETSc options.
-        feasible: Makes the set of multipliers from B and c; default λ_N ≥ 0.
+        feasible: Makes the set of multipliers from B and c; default ``contact_set``.
 
     Attributes:
         F: B K⁺ Bᵀ.
         preconditioner: The preconditioner, or None.
         coarse: The coarse space.
-        num_inequalities: Inequality rows of all ranks.
+        contact_rows: Number of normal and of tangential rows on all ranks.
         feasible: The set Ω of multipliers.
         pressing: After ``recover``: contact rows whose force is more than the solver's error.
         nearly_free: After ``recover``: motions that contacts with a force hold hardly or not.
@@ -75,7 +88,7 @@ class Dual:
         mode_names: Sequence[str],
         preconditioner: MakePreconditioner | None = None,
         options_prefix: str = "tfeti_",
-        feasible: FeasibleLaw = no_tension,
+        feasible: FeasibleLaw = contact_set,
     ) -> None:
         self.constraints, self.subdomains = constraints, subdomains
         self.pressing = np.zeros(constraints.num_rows, dtype=bool)
@@ -91,7 +104,7 @@ class Dual:
         self._on_faces: FacePreconditioner | None = None
         bounded = constraints.sets.normals
         self.coarse = CoarseSpace(B, subdomains, bounded, f"{options_prefix}coarse_")
-        self.num_inequalities = comm.allreduce(len(bounded))
+        self.contact_rows = constraints.sets.contact_rows(comm)
         self._law, self.feasible = feasible, feasible(constraints)
         self._images = dict[str, tuple[Array, Image]]()
         self._norm: tuple[int, float] | None = None
@@ -177,6 +190,7 @@ class Dual:
         self.nearly_free = agreed(self.coarse.comm, words)
         if motions.count == 0:
             return u
+        gap[self.constraints.sets.tangents] = 0.0  # a slip says nothing of how exact rows are
         alpha = smallest_motion(self.coarse, u, gap, motions, force)
         return moved(u, self.coarse, alpha)
 

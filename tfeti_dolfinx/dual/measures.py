@@ -14,6 +14,7 @@ from tfeti_dolfinx.dual.closing import closing
 from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.qp.faces import Face
+from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.subdomains.subdomains import Subdomains, sizes, sums
 
 # of the largest forces on a kernel mode: those on a light one beside it count as so large at least,
@@ -28,6 +29,7 @@ class Scene(Protocol):
     subdomains: Subdomains
     coarse: CoarseSpace
     pressing: Array
+    feasible: FeasibleSet
 
     def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> Array:
         """This rank's part of u, given the solver's face and error. Collective."""
@@ -66,7 +68,8 @@ class Measures:
     Attributes:
         u: This rank's part of the displacement, shape ``(n,)``.
         bodies: What is known of each body.
-        penetration: Deepest overlap, or distance of a row that carries a force.
+        penetration: Deepest overlap, distance of a row that carries a force, or slip that friction
+            does not allow.
         balance: Force left on a kernel mode, where it is largest beside the forces there.
         forces: Size of these forces.
         residual: Norm of what rows miss.
@@ -98,8 +101,9 @@ def measure(
     """Recover the displacement of an iterate and see how well it fulfils the rows. Collective.
 
     Rows miss w = Bu − c: rows of equalities and those that press both ways, others where they
-    overlap. v, the least displacement in D that closes that, makes u + v admissible; so ‖v‖_K
-    bounds the error of u in energy, as far as λ balances the load.
+    overlap, tangential ones what of the slip their force does not allow. v, the least displacement
+    in D that closes that, makes u + v admissible; so ‖v‖_K bounds the error of u in energy, as far
+    as λ balances the load.
 
     Args:
         scene: The dual problem.
@@ -110,16 +114,18 @@ def measure(
         before: The displacement of an earlier iterate.
     """
     u = scene.recover(lam, gradient, face, error)
-    w, penetration, gap = _missed(scene, u)
-    residual, normals = w.norm(), scene.constraints.sets.normals
+    w, penetration, gap = _missed(scene, u, lam, error)
+    constraints = scene.constraints
+    residual, normals = w.norm(), constraints.sets.normals
     closed = scene.pressing[normals] | (w.array_r[normals] > 0.0)
-    bodies = _bodies(scene, u, closing(scene.constraints, w, closed), before)
+    closed = np.concatenate((closed, constraints.limits.ravel() > 0.0))
+    bodies = _bodies(scene, u, closing(constraints, w, closed), before)
     balance, forces = _balance(scene.coarse, lam)
     w.destroy()
     return Measures(u, bodies, penetration, balance, forces, residual, gap)
 
 
-def _missed(scene: Scene, u: Array) -> tuple[PETSc.Vec, float, float]:
+def _missed(scene: Scene, u: Array, lam: PETSc.Vec, error: float) -> tuple[PETSc.Vec, float, float]:
     """w, and as lengths the largest of its contact rows and the largest of their gaps."""
     constraints = scene.constraints
     trace, w = constraints.B.createVecRight(), constraints.c.duplicate()
@@ -133,8 +139,33 @@ def _missed(scene: Scene, u: Array) -> tuple[PETSc.Vec, float, float]:
     lengths = np.abs((rows, constraints.c.array_r[normals])) / constraints.scale
     trace.destroy()
     largest = np.max(lengths, axis=1, initial=0.0)
+    tangents = constraints.sets.tangents
+    if tangents.size:
+        w.array[tangents] = _slip_missed(scene, lam.array_r, w.array_r[tangents], error)
+        length = np.linalg.norm(w.array_r[tangents], axis=1) / constraints.tangent_scale
+        largest[0] = max(largest[0], length.max())
     w.getComm().tompi4py().Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
     return w, float(largest[0]), float(largest[1])
+
+
+def _slip_missed(scene: Scene, lam: Array, slip: Array, error: float) -> Array:
+    """What of slips is not normal to the set of tangential forces where the force is.
+
+    A force inside its disc allows no slip, one on the circle only a slip that it opposes: for that
+    ψ‖q‖ − τᵀq = 0. What remains is the projected gradient of −q. The force is taken as far outwards
+    as the solver's error may have left it inside.
+
+    Args:
+        scene: The dual problem.
+        lam: The multipliers.
+        slip: The q, scaled, shape ``(t, gdim - 1)``.
+        error: How large multipliers may be by the solver's error alone.
+    """
+    tangents, q, out = scene.constraints.sets.tangents, np.zeros_like(lam), np.array(lam)
+    q[tangents] = slip
+    out[tangents] += error * slip / np.maximum(np.linalg.norm(slip, axis=1, keepdims=True), TINY)
+    phi, beta = scene.feasible.split(scene.feasible.project(out), -q)
+    return np.asarray(-(phi + beta)[tangents])
 
 
 def _bodies(scene: Scene, u: Array, v: Array, before: Array | None) -> BodyMeasures:
@@ -171,8 +202,7 @@ def _balance(coarse: CoarseSpace, lam: PETSc.Vec) -> tuple[float, float]:
     """Entry of Gλ − e that is largest beside the forces on its mode, and those. Collective."""
     if coarse.dimension == 0:
         return 0.0, 0.0
-    forces = np.asarray(abs(coarse.Gt).T @ np.abs(lam.array_r))
-    coarse.comm.Allreduce(MPI.IN_PLACE, forces, op=MPI.SUM)
+    forces = coarse.terms(lam)
     forces = np.maximum(forces, LIGHT * forces.max())
     left = np.abs(coarse.G(lam.array_r) - coarse.e)
     worst = int(np.argmax(left / np.maximum(forces, TINY)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +17,7 @@ from tfeti_dolfinx.parallel import Exchange, chunk_offsets, owner_of
 
 @dataclass(frozen=True)
 class Constraints:
-    """B u = c on equality rows, B u ≤ c on rows of contact normals.
+    """B u = c on equality rows, B u ≤ c on rows of contact normals; tangents have friction.
 
     B acts on *trace* unknowns only: primal unknowns that some row touches, sorted as the primal
     ones. It depends neither on prescribed values nor on gaps; c does, and can be filled again.
@@ -27,8 +28,11 @@ class Constraints:
         sets: Which local rows are what.
         trace: Local primal unknown of each local trace unknown, ascending.
         weights: D on the local trace unknowns: the rows are scaled with it.
-        scale: The s_i of the conditions with rows, one for each of ``sets.normals`` (and for the
-            tangents of the same condition): over it what a row misses is a length.
+        scale: The s_i of the conditions with rows, one for each of ``sets.normals``: over it what
+            a row misses is a length.
+        tangent_scale: The same for each point of ``sets.tangents``, shape ``(t,)``.
+        limits: The ψ_i, semi-axes of the sets of the tangential multipliers, shape
+            ``(t, gdim - 1)``; 0 until they are set.
     """
 
     B: PETSc.Mat
@@ -37,6 +41,8 @@ class Constraints:
     trace: Array
     weights: Array
     scale: Array
+    tangent_scale: Array
+    limits: Array
 
     @property
     def num_rows(self) -> int:
@@ -47,6 +53,10 @@ class Constraints:
         """Fill c anew, with this rank's part of it, shape ``(num_rows,)``. B stays."""
         self.c.array[:] = c
 
+    def set_limits(self, limits: Array) -> None:
+        """Fill the ψ_i anew, shape ``(t, gdim - 1)``. B stays."""
+        self.limits[:] = limits
+
     def destroy(self) -> None:
         """Destroy the PETSc objects. Collective."""
         self.B.destroy()
@@ -54,19 +64,20 @@ class Constraints:
 
 
 def assemble_constraints(
-    dofs: TornDofs, equalities: Rows, normals: Rows, weights: Array, scale: Array
+    dofs: TornDofs, tables: Sequence[Rows], weights: Array, scale: Array, tangent_scale: Array
 ) -> Constraints:
-    """Assemble B, with c = 0. Collective.
+    """Assemble B, with c = 0 and ψ = 0. Collective.
 
     Args:
         dofs: Dof maps.
-        equalities: Gluing and Dirichlet rows of this rank.
-        normals: Contact rows of this rank.
+        tables: This rank's rows: equalities, contact normals, tangents.
         weights: D on the local primal unknowns.
-        scale: What each contact row was multiplied by.
+        scale: What each normal row was multiplied by.
+        tangent_scale: What the tangential rows of each condition were multiplied by.
     """
-    rows = stack([equalities, normals])
-    sets = row_sets(len(equalities), len(normals), dofs.bs)
+    rows = stack(list(tables))
+    equalities, normals, tangents = (len(table) for table in tables)
+    sets = row_sets(equalities, normals, tangents, dofs.bs)
     trace, column = _trace_columns(dofs, rows.column)
     num_rows, num_columns = len(rows), len(trace)
     order = np.lexsort((column, rows.row))
@@ -79,7 +90,8 @@ def assemble_constraints(
     )
     c = B.createVecLeft()
     c.set(0.0)
-    return Constraints(B, c, sets, trace, weights[trace], scale)
+    limits = np.zeros(sets.tangents.shape)
+    return Constraints(B, c, sets, trace, weights[trace], scale, tangent_scale, limits)
 
 
 def _trace_columns(dofs: TornDofs, column: Array) -> tuple[Array, Array]:

@@ -13,6 +13,8 @@ from tfeti_dolfinx.gluing.constraints import Constraints, assemble_constraints
 from tfeti_dolfinx.gluing.contact import ContactRows, contact_rows
 from tfeti_dolfinx.gluing.interface import HeldRows, equality_rows
 from tfeti_dolfinx.gluing.prescribed import Prescribed
+from tfeti_dolfinx.gluing.spread import Spread
+from tfeti_dolfinx.gluing.tangents import TangentRows, tangent_rows
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.parallel import any_rank
 
@@ -32,7 +34,8 @@ class Gluing:
         prescribed: Dirichlet values.
         records: Contact conditions of this rank.
         held: The rows that hold prescribed components.
-        contact: What belongs to the contact rows.
+        contact: What belongs to the normal rows.
+        tangents: What belongs to the tangential rows.
         constraints: B, c and the sets of rows.
         length: A length of the scene.
     """
@@ -42,6 +45,7 @@ class Gluing:
     records: ContactRecords
     held: HeldRows
     contact: ContactRows
+    tangents: TangentRows
     constraints: Constraints
     length: float
 
@@ -64,6 +68,7 @@ class Gluing:
         c = np.zeros(sets.num_rows)
         c[sets.equalities[self.held.row]] = self.held.right_side(values)
         c[sets.normals] = self.contact.right_side(self.dofs, values, gaps, self.length)
+        c[sets.tangents] = self.tangents.right_side(self.dofs, values, len(gaps))
         return c
 
     def with_right_side(self, values: Array, gaps: Array) -> Gluing:
@@ -101,17 +106,24 @@ class Gluing:
         flags, flags_before = self.prescribed.flag, earlier.prescribed.flag
         if not any_rank(self.dofs.comm, not np.array_equal(flags, flags_before)):
             start[sets.equalities] = lam[before.equalities]
-        _, new, old = np.intersect1d(
-            self._condition_keys(), earlier._condition_keys(), return_indices=True
-        )
+        new, old = _common(self._keys(self.contact), earlier._keys(earlier.contact))
         force = lam[before.normals[old]] * earlier.contact.scale[old]
         start[sets.normals[new]] = force / self.contact.scale[new]
+        new, old = _common(self._keys(self.tangents), earlier._keys(earlier.tangents))
+        forces = lam[before.tangents[old]] * earlier.tangents.scale[old][:, None]
+        start[sets.tangents[new]] = forces / self.tangents.scale[new][:, None]
         return start
 
-    def _condition_keys(self) -> Array:
-        """A number for the contact and the node of each contact row."""
-        kept, records = self.contact.condition, self.records
+    def _keys(self, rows: ContactRows | TangentRows) -> Array:
+        """A number for the contact and the node of each condition with such rows."""
+        kept, records = rows.condition, self.records
         return records.contact[kept] * MANY_GROUPS + records.group[kept]
+
+
+def _common(keys: Array, earlier: Array) -> tuple[Array, Array]:
+    """Where the numbers stand that are in both arrays."""
+    _, new, old = np.intersect1d(keys, earlier, return_indices=True)
+    return new, old
 
 
 def glue(
@@ -135,10 +147,13 @@ def glue(
         NoSolutionError: Dirichlet conditions and contacts contradict each other.
     """
     D = dofs.gather_copies(weights.reshape(-1, dofs.bs))
-    normals, contact = contact_rows(dofs, prescribed.flag, D, records)
+    spread = Spread(dofs, prescribed.flag, D, records)
+    normal_rows, contact = contact_rows(spread)
+    sliding_rows, tangents = tangent_rows(dofs, spread, contact)
     equalities, held = equality_rows(dofs, prescribed.flag, D)
-    constraints = assemble_constraints(dofs, equalities, normals, weights, contact.scale)
-    gluing = Gluing(dofs, prescribed, records, held, contact, constraints, length)
+    tables = (equalities, normal_rows, sliding_rows)
+    constraints = assemble_constraints(dofs, tables, weights, contact.scale, tangents.scale)
+    gluing = Gluing(dofs, prescribed, records, held, contact, tangents, constraints, length)
     try:
         constraints.set_right_side(gluing.right_side(prescribed.value, records.gap))
     except TfetiError:  # on all ranks

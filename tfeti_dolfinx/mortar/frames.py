@@ -27,6 +27,28 @@ def frames(normal: Array) -> Array:
     return np.concatenate((normal[:, None], tangents(normal)), axis=1)
 
 
+def aligned(frame: Array, direction: Array) -> tuple[Array, Array]:
+    """Frames of space whose first tangent is along a direction, as far as it is tangential.
+
+    Args:
+        frame: Shape ``(n, 3, 3)``.
+        direction: Unit vector, shape ``(3,)``.
+
+    Returns:
+        The frames, and how long the direction's tangential part is, shape ``(n,)``; where it is
+        0 the frame is as it was.
+    """
+    normal = frame[:, 0]
+    first = direction - np.sum(direction * normal, axis=1, keepdims=True) * normal
+    length = np.linalg.norm(first, axis=1)
+    known = (length > 0.0)[:, None]
+    first = np.where(known, first / np.where(known, length[:, None], 1.0), frame[:, 1])
+    # what rounding has left of the normal in a short tangent
+    first -= np.sum(first * normal, axis=1, keepdims=True) * normal
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack((normal, first, np.cross(normal, first)), axis=1), length
+
+
 def tangents(normal: Array) -> Array:
     """Orthonormal tangents of unit normals, as close to coordinate axes as they can be.
 

@@ -9,9 +9,12 @@ from tfeti_dolfinx.errors import require
 from tfeti_dolfinx.qp.faces import Face, Status
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 
-# Steps along a face: one so short that what is linear in it stands out from what is quadratic;
-# one that is longer, so that what is quadratic stands out from rounding.
+# Steps along a face, relative to the radius of its curvature: one so short that what is linear in
+# it stands out from what is quadratic; one that is longer, so that what is quadratic stands out
+# from rounding.
 SHORT, LONG = 1e-8, 1e-5
+# Steps along a gradient: small sets are curved so much that only the last ones are short
+SHORTER = (1e-8, 1e-10, 1e-12, 1e-14)
 
 
 def check_feasible_set(feasible: FeasibleSet, size: int, seed: int = 0) -> None:
@@ -60,9 +63,16 @@ def _check_gradients(feasible: FeasibleSet, x: Array, g: Array) -> None:
     require(-1e-12 <= reduced <= phi @ phi * (1.0 + 1e-12), "0 ≤ φ̃ᵀφ ≤ φᵀφ")
     far = x - min(feasible.max_step(x, phi), 1e3) * phi
     require(_close(feasible.project(far), far, 1e-10), "x − αφ ∈ Ω for the largest step α")
-    moved, projected = feasible.project(x - SHORT * g) - x, SHORT * (phi + beta)
-    apart, size = np.linalg.norm(moved + projected), np.linalg.norm(projected)
-    require(apart <= 1e-4 * (SHORT + size), "φ + β is the projected gradient")
+    right = [_is_derivative(feasible, x, g, phi + beta, step) for step in SHORTER]
+    require(any(right), "φ + β is the projected gradient")
+
+
+def _is_derivative(
+    feasible: FeasibleSet, x: Array, g: Array, projected: Array, step: float
+) -> bool:
+    """Whether a step along −g that is projected goes along −g^P."""
+    apart = np.linalg.norm(feasible.project(x - step * g) - x + step * projected)
+    return bool(apart <= 1e-4 * step * (1.0 + np.linalg.norm(projected)))
 
 
 def _check_face(face: Face, size: int) -> None:
@@ -89,6 +99,7 @@ def _check_moves(feasible: FeasibleSet, x: Array, g: Array, t: Array) -> None:
         t: Coefficients of a move.
     """
     face = feasible.face(x, g)
+    t = t * np.minimum(1.0, _radii(face, g))
     step = face.Z @ t
     for sign in (SHORT, -SHORT):
         out = np.linalg.norm(feasible.project(x + sign * step) - x - sign * step)
@@ -101,3 +112,10 @@ def _check_moves(feasible: FeasibleSet, x: Array, g: Array, t: Array) -> None:
         rounding = 1e-14 * np.linalg.norm(g) * np.linalg.norm(x)
         right = abs(bent - expected) <= 0.01 * abs(expected) + rounding
         require(right, "gᵀx along Ω bends by ½ tᵀ diag(κ) t")
+
+
+def _radii(face: Face, g: Array) -> Array:
+    """Radius of curvature along each direction of a face, infinite where it is flat."""
+    pushing = np.sqrt(abs(face.Z.sign()).T @ g**2)
+    flat = face.curvature == 0.0
+    return np.where(flat, np.inf, pushing / np.where(flat, 1.0, face.curvature))

@@ -1,4 +1,4 @@
-"""MPRGP: modified proportioning with reduced gradient projections."""
+"""MPRGP, modified proportioning with reduced gradient projections; MPGP on curved sets."""
 
 from __future__ import annotations
 
@@ -120,6 +120,15 @@ def fixed_step(state: Iterate, alpha_f: float, alpha_cg: float, alpha_bar: float
     target.destroy()
 
 
+def projected_step(state: Iterate, alpha_bar: float) -> None:
+    """x ← P_Ω(x − ᾱg): the boundary of a curved set leaves a step along −β no room."""
+    target = state.x.copy()
+    target.axpy(-alpha_bar, state.g)
+    state.project(target)
+    state.move_to(target)
+    target.destroy()
+
+
 def projected_cg(state: Iterate, alpha_f: float, alpha_cg: float, alpha_bar: float) -> None:
     """Expansion by the whole conjugate gradient step, projected.
 
@@ -173,7 +182,9 @@ def mprgp(
 
     Dostál, Schöberl, Comput. Optim. Appl. 30 (2005) 23–43; Dostál, Optimal Quadratic
     Programming Algorithms, Springer 2009, section 5.8, whose steps are numbered here, and 5.10
-    for preconditioning in face.
+    for preconditioning in face. Where Ω has curved sets it is MPGP (Dostál, Kozubek, Math.
+    Program. 135 (2012) 195–220): a proportioning step of less than ᾱ along −β would do nothing,
+    and P_Ω(x − ᾱg) takes its place.
 
     Multiplications by A: one per CG or proportioning step, two per expansion step; by M_f: one
     per CG or expansion step.
@@ -240,11 +251,15 @@ def mprgp(
             kind = "expansion"
         else:
             # Step 5: proportioning step
-            A.mult(beta, Ap)
-            bAb = beta.dot(Ap)
-            if not bAb > 0.0:
-                return ConvergedReason.DIVERGED_INDEFINITE_MAT
-            state.move(min(g.dot(beta) / bAb, state.max_step(beta)), beta, Ap)
+            room = state.max_step(beta)
+            if room < alpha_bar:
+                projected_step(state, alpha_bar)
+            else:
+                A.mult(beta, Ap)
+                bAb = beta.dot(Ap)
+                if not bAb > 0.0:
+                    return ConvergedReason.DIVERGED_INDEFINITE_MAT
+                state.move(min(g.dot(beta) / bAb, room), beta, Ap)
             steps.proportioning += 1
             kind = "proportioning"
         state.split()

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 from petsc4py import PETSc
 
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.parallel import summed
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.monitors import Monitor, no_monitor
@@ -63,7 +66,8 @@ def pcpg(
 
     Farhat, Mandel, Roux, Comput. Methods Appl. Mech. Engrg. 115 (1994) 365–385, section 3. P is
     the projector of ``qp.coarse``: on a face λ moves in the face alone. Multiplies by F, and by
-    the preconditioner, once per step, and once more where the rule finds that g has drifted.
+    the preconditioner, once per step, and once more where the rule finds that g has drifted. A step
+    makes three global reductions: one with each projection, one for the norm of the residual.
 
     ===========================  ===================================================
     reason                       when
@@ -100,23 +104,23 @@ def pcpg(
         if reason != ConvergedReason.ITERATING:
             break
         # precondition and project: z = P M r
-        _precondition(qp, r, z)
+        own.rz, previous = _precondition(qp, r, z, norm), own.rz
         # direction
-        own.rz, previous = r.dot(z), own.rz
         p.aypx(0.0 if own.fresh else own.rz / previous, z)
         # step
         qp.F.mult(p, Fp)
         Fp.copy(z)
-        qp.coarse.project(z)
-        pFp, pp = p.mDot([z, p])
+        pFp, pp = qp.coarse.project_against(z, p)
+        z.aypx(-own.rz / pFp if pFp else 0.0, r)
+        squared, own.rz, pFp = _square(z, own.rz, pFp)
         if not (own.seen(pFp, pp) and own.stands_out(own.rz, norm**2)):
             own.fresh, reason = True, _examined(qp, point, rule, norm)
             if reason == ConvergedReason.ITERATING:
                 reason = ConvergedReason.DIVERGED_INDEFINITE_MAT
             break
         point.move(own.rz / pFp, p, Fp)
-        r.axpy(-own.rz / pFp, z)
-        own.fresh, norm = False, r.norm()
+        z.copy(r)
+        own.fresh, norm = False, float(np.sqrt(squared))
         steps.cg += 1
         monitor(steps, "cg", point.lam, norm, 0.0)
     if directions is None:
@@ -208,10 +212,17 @@ def _residual(qp: QP, g: PETSc.Vec, r: PETSc.Vec) -> float:
     return float(r.norm())
 
 
-def _precondition(qp: QP, r: PETSc.Vec, z: PETSc.Vec) -> None:
-    """z = P M r, M the preconditioner or the identity."""
+def _square(x: PETSc.Vec, *known: float) -> Array:
+    """‖x‖², and rank 0's numbers, since loops end by them. Collective, one reduction."""
+    comm = x.getComm().tompi4py()
+    sums = np.array([x.array_r @ x.array_r, *(known if comm.rank == 0 else np.zeros(len(known)))])
+    return summed(comm, sums)
+
+
+def _precondition(qp: QP, r: PETSc.Vec, z: PETSc.Vec, norm: float) -> float:
+    """z = P M r, M the preconditioner or the identity; rᵀz, given ‖r‖."""
     if qp.preconditioner is None:
         r.copy(z)
-    else:
-        qp.preconditioner.mult(r, z)
-        qp.coarse.project(z)
+        return norm**2
+    qp.preconditioner.mult(r, z)
+    return qp.coarse.project_against(z, r)[0]

@@ -65,6 +65,7 @@ class Solver:
     Attributes:
         solve: Solves a task.
         keeps_bounds: Whether it keeps inequalities.
+        keeps_discs: Whether it keeps discs and ellipses.
         pc_type: Preconditioner that ``auto`` stands for.
         relative_to_norm: Whether its steps are relative to ‖PFP‖.
         cold: Where it starts, which is its λ̄; None: λ̄ is as options say.
@@ -73,6 +74,7 @@ class Solver:
 
     solve: Callable[[Task], QPResult]
     keeps_bounds: bool
+    keeps_discs: bool
     pc_type: str
     relative_to_norm: bool
     cold: Callable[[QP], PETSc.Vec] | None = None
@@ -116,6 +118,7 @@ SOLVERS = {
     "pcpg": Solver(
         _pcpg,
         keeps_bounds=False,
+        keeps_discs=False,
         pc_type="dirichlet",
         relative_to_norm=False,
         warm=_restored,
@@ -123,17 +126,20 @@ SOLVERS = {
     "smalse": Solver(
         _smalse,
         keeps_bounds=True,
+        keeps_discs=True,
         pc_type="none",
         relative_to_norm=True,
     ),
     "newton": Solver(
         _newton,
         keeps_bounds=True,
+        keeps_discs=False,
         pc_type="dirichlet",
         relative_to_norm=False,
         cold=first_point,
         warm=feasible_start,
     ),
 }
-# what auto stands for, without and with inequalities
-AUTO = {False: "pcpg", True: "smalse"}
+# what auto stands for, without and with inequalities, and with discs
+AUTO = {False: "pcpg", True: "newton"}
+AUTO_WITH_DISCS = "smalse"

@@ -1,0 +1,119 @@
+"""Tresca's friction on an untorn mesh: condensed on the contact nodes, by an interior point method.
+
+Nothing of the package is used but the meshes of the scenes.
+"""
+
+import numpy as np
+import ufl
+from bodies import boxes
+from conic import constrained_qp
+from dolfinx import fem
+from mpi4py import MPI
+from scenes import box, clamp, hooke, strain
+from scipy.sparse import csc_matrix
+from scipy.sparse.linalg import splu
+
+
+class Untorn:
+    """Elastic boxes on one rank, some sides clamped; conditions between nodes and what they meet.
+
+    Args:
+        mesh, tags, names: The boxes.
+        traction: On each of these sides, by name.
+        clamped: Clamped sides.
+        load: A force per volume.
+    """
+
+    def __init__(self, mesh, tags, names, traction, clamped, load=None):
+        gdim = self.gdim = mesh.geometry.dim
+        V = self.V = fem.functionspace(mesh, ("Lagrange", 1, (gdim,)))
+        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+        dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 2})
+        ds = ufl.Measure("ds", domain=mesh, subdomain_data=tags, metadata={"quadrature_degree": 2})
+        a = ufl.inner(hooke()(u), strain(v)) * dx
+        L = ufl.dot(fem.Constant(mesh, np.array(load or np.zeros(gdim))), v) * dx
+        for name, q in traction.items():
+            L += ufl.dot(fem.Constant(mesh, np.array(q, dtype=float)), v) * ds(names[name])
+        self.K = fem.assemble_matrix(fem.form(a), block_mode=None).to_scipy().tocsc()
+        self.f = fem.assemble_vector(fem.form(L)).array.copy()
+        held = [clamp(V, tags.find(names[name])).dof_indices()[0] for name in clamped]
+        self.free = np.setdiff1d(np.arange(len(self.f)), np.concatenate(held))
+        self.x = V.tabulate_dof_coordinates()
+        self.order = np.lexsort(np.rint(self.x.T * 1e7))
+        self.tags, self.names, self.ds = tags, names, ds
+
+    def side(self, name):
+        """Nodes of a side in the order of their points, and the integrals of their hats."""
+        W = fem.functionspace(self.V.mesh, ("Lagrange", 1))
+        hats = fem.assemble_vector(fem.form(ufl.TestFunction(W) * self.ds(self.names[name]))).array
+        at = W.tabulate_dof_coordinates()
+        fdim = self.gdim - 1
+        nodes = fem.locate_dofs_topological(self.V, fdim, self.tags.find(self.names[name]))
+        nodes = nodes[np.lexsort(np.rint(self.x[nodes].T * 1e7))]
+        area = [hats[np.argmin(np.linalg.norm(at - self.x[n], axis=1))] for n in nodes]
+        return nodes, np.array(area)
+
+    def solve(self, entries, gap, semi_axes, frame):
+        """Displacement, sorted by point, and forces of the conditions along their frame.
+
+        Args:
+            entries: For each condition its nodes with their weights.
+            gap: Of each condition.
+            semi_axes: Largest tangential forces of each, shape (n, gdim - 1).
+            frame: Axes, normal first, of all conditions, shape (gdim, gdim).
+        """
+        n, gdim = len(entries), self.gdim
+        B = np.zeros((n * gdim, len(self.f)))
+        for i, nodes in enumerate(entries):
+            for node, weight in nodes.items():
+                for k in range(gdim):
+                    B[n * k + i, node * gdim : (node + 1) * gdim] = weight * frame[k]
+        B, f = B[:, self.free], self.f[self.free]
+        used = np.linalg.norm(B, axis=1) > 0.0
+        solve = splu(csc_matrix(self.K[self.free][:, self.free])).solve
+        KB = solve(B.T.copy())
+        c = np.concatenate((gap, np.zeros(n * (gdim - 1))))
+        kept = np.flatnonzero(used[:n])
+        pairs = np.stack([kept + n * k for k in range(1, gdim)], axis=1)
+        rows = np.concatenate((kept, pairs.T.ravel()))
+        m = len(kept)
+        F, d = B[rows] @ KB[:, rows], (B @ solve(f) - c)[rows]
+        places = np.arange(m, m * gdim).reshape(gdim - 1, m).T
+        lam = constrained_qp(
+            F, d, np.zeros((0, len(d))), np.zeros(0), np.arange(m), places, semi_axes[kept]
+        )
+        u, force = np.zeros(len(self.f)), np.zeros((n, gdim))
+        u[self.free] = solve(f - B[rows].T @ lam)
+        force[kept] = lam.reshape(gdim, m).T
+        return u.reshape(-1, gdim)[self.order], force
+
+
+def on_plane(cell, n, traction, bounds, frame, gap=0.0, clamped=("left",)):
+    """The box of ``scenes`` over a plane: u, contact points, forces."""
+    scene = Untorn(*box(cell, n, MPI.COMM_SELF), {"top": traction}, clamped)
+    nodes, area = scene.side("bottom")
+    entries = [{int(node): 1.0} for node in nodes]
+    axes = area[:, None] * np.asarray(bounds)
+    u, force = scene.solve(entries, np.full(len(nodes), gap), axes, frame)
+    return u, scene.x[nodes], force
+
+
+def parts(gdim, n, gap):
+    """Two boxes whose nodes face each other across a gap."""
+    cross = (0.0,) * (gdim - 1)
+    return [
+        ("lower", (*cross, -1.0), (1.0,) * (gdim - 1) + (0.0,), (n,) * gdim),
+        ("upper", (*cross, gap), (1.0,) * (gdim - 1) + (1.0 + gap,), (n,) * gdim),
+    ]
+
+
+def on_each_other(cell, n, traction, bounds, frame, apart, clamped):
+    """Two boxes, gaps taken as 0: u, contact points of the lower box, forces on it."""
+    gdim = 2 if cell in ("triangle", "quadrilateral") else 3
+    mesh, tags, names = boxes(cell, parts(gdim, n, apart), MPI.COMM_SELF)
+    scene = Untorn(mesh, tags, names, {"upper top": traction}, clamped)
+    (below, area), (above, _) = scene.side("lower top"), scene.side("upper bottom")
+    entries = [{int(a): 1.0, int(b): -1.0} for a, b in zip(below, above, strict=True)]
+    axes = area[:, None] * np.asarray(bounds)
+    u, force = scene.solve(entries, np.zeros(len(below)), axes, frame)
+    return u, scene.x[below], force

@@ -1,0 +1,166 @@
+"""Discs and ellipses: nearest points, gradients, steps and faces, against what they must fulfil."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tfeti_dolfinx.qp.conformance import check_feasible_set
+from tfeti_dolfinx.qp.discs import Discs, Ellipses
+from tfeti_dolfinx.qp.faces import Status
+from tfeti_dolfinx.qp.feasible_sets import Bounds, Product
+
+SEEDS = st.integers(0, 10_000)
+
+
+def semi_axes(seed, n=8, k=2, smallest=1e-3):
+    """Of all sizes, some of them 0."""
+    rng = np.random.default_rng(seed)
+    return smallest ** rng.random((n, k)) * 3.0 * (rng.random((n, k)) < 0.85)
+
+
+def level(a, x):
+    """Σ(x_j/a_j)² of points; entries that are fixed must be 0."""
+    x = x.reshape(a.shape)
+    assert np.all(x[a == 0.0] == 0.0)
+    return np.sum(np.divide(x, a, out=np.zeros_like(x), where=a > 0.0) ** 2, axis=1)
+
+
+@given(SEEDS, st.sampled_from([1, 2]), st.sampled_from([1.0, 1e-3, 1e-6]))
+def test_discs_fulfil_the_contract(seed, k, size):
+    rng = np.random.default_rng(seed)
+    radius = size * rng.uniform(0.1, 3.0, 6) * (rng.random(6) < 0.8)
+    check_feasible_set(Discs(radius, k, size * rng.standard_normal((6, k))), 6 * k, seed)
+
+
+@given(SEEDS, st.sampled_from([1, 2]))
+def test_ellipses_fulfil_the_contract(seed, k):
+    rng = np.random.default_rng(seed)
+    a = semi_axes(seed, 6, k, 0.03)
+    check_feasible_set(Ellipses(a, rng.standard_normal((6, k))), 6 * k, seed)
+
+
+@given(SEEDS)
+def test_a_product_of_all_of_them_fulfils_the_contract(seed):
+    order = np.random.default_rng(seed).permutation(26)
+    sets = [
+        (order[:5], Bounds()),
+        (order[5:11], Discs(semi_axes(seed, 3)[:, 0])),
+        (order[11:19], Ellipses(semi_axes(seed, 4, 2, 0.05))),
+        (order[19:23], Discs(np.full(4, 0.3), 1)),
+    ]
+    check_feasible_set(Product(sets), 26, seed)
+
+
+@given(SEEDS, st.floats(-6, 6))
+def test_projections_fulfil_the_variational_inequality(seed, exponent):
+    """(z − P z)·(y − P z) ≤ 0 for all y of the set, and P z is in it."""
+    rng = np.random.default_rng(seed)
+    a = semi_axes(seed, smallest=1e-6)
+    z = 10.0**exponent * rng.standard_normal(a.size)
+    ellipses = Ellipses(a)
+    x = ellipses.project(z)
+    assert np.all(level(a, x) <= 1.0 + 1e-12)
+    angle = rng.uniform(0.0, 2.0 * np.pi, (50, len(a)))
+    y = a * np.stack((np.cos(angle), np.sin(angle)), axis=-1)
+    away, inside = (z - x).reshape(a.shape), y - x.reshape(a.shape)
+    products = np.sum(away * inside, axis=-1)
+    sizes = np.linalg.norm(away, axis=-1) * np.maximum(np.linalg.norm(inside, axis=-1), 1e-300)
+    assert np.all(products <= 1e-9 * sizes)
+    assert np.allclose(ellipses.project(x), x, rtol=1e-12, atol=1e-15)
+
+
+@given(SEEDS)
+def test_nearest_points_of_ellipses_lie_along_their_normals(seed):
+    """z − Pz = μ H Pz with H = diag(a)⁻², μ ≥ 0: the secular equation, and its exact solution."""
+    rng = np.random.default_rng(seed)
+    a = rng.uniform(0.01, 2.0, (20, 2))
+    angle, mu = rng.uniform(0.0, 2.0 * np.pi, 20), rng.uniform(0.0, 5.0, (20, 1))
+    on = a * np.stack((np.cos(angle), np.sin(angle)), axis=1)
+    z = on + mu * on / a**2
+    assert np.allclose(Ellipses(a).project(z.ravel()).reshape(-1, 2), on, rtol=0, atol=1e-12)
+
+
+@given(SEEDS)
+def test_discs_are_ellipses_with_equal_axes(seed):
+    rng = np.random.default_rng(seed)
+    radius = rng.uniform(0.0, 2.0, 10) * (rng.random(10) < 0.9)
+    discs, ellipses = Discs(radius), Ellipses(np.repeat(radius[:, None], 2, axis=1))
+    z, g = 2.0 * rng.standard_normal((2, 20))
+    x = discs.project(z)
+    assert np.allclose(x, ellipses.project(z), rtol=0, atol=1e-14)
+    for one, other in zip(discs.split(x, g), ellipses.split(x, g), strict=True):
+        assert np.array_equal(one, other)
+    faces = discs.face(x, x - z), ellipses.face(x, x - z)
+    assert np.array_equal(faces[0].status, faces[1].status)
+    slides = np.linalg.norm(z.reshape(-1, 2), axis=1) > radius
+    slides &= radius > 0.0
+    outward = np.linalg.norm((z - x).reshape(-1, 2), axis=1)[slides]
+    kappa = faces[0].curvature[len(faces[0].curvature) - slides.sum() :]
+    assert np.allclose(kappa, outward / radius[slides])
+    assert np.allclose(faces[0].curvature, faces[1].curvature)
+
+
+def test_intervals_are_bounds_from_both_sides():
+    x = np.array([-3.0, -0.5, 0.5, 3.0, 1.0])
+    intervals = Discs(np.array([1.0, 1.0, 1.0, 1.0, 0.0]), 1)
+    assert np.array_equal(intervals.project(x), [-1.0, -0.5, 0.5, 1.0, 0.0])
+    y, g = intervals.project(x), np.array([1.0, 1.0, 1.0, 1.0, 1.0])
+    phi, beta = intervals.split(y, g)
+    assert np.array_equal(phi, [0.0, 1.0, 1.0, 0.0, 0.0])
+    assert np.array_equal(beta, [0.0, 0.0, 0.0, 1.0, 0.0])  # at −1 it pushes outwards
+    face = intervals.face(y, g)
+    slip, stick, fixed = Status.SLIP, Status.STICK, Status.OPEN
+    assert face.status.tolist() == [slip, stick, stick, slip, fixed]
+    assert face.Z.toarray().tolist() == [[0, 0], [1, 0], [0, 1], [0, 0], [0, 0]]
+    assert intervals.max_step(
+        np.array([0.0, 0.5, -0.5, 0.0, 0.0]), np.array([0, -2.0, 2, 0, 0])
+    ) == (pytest.approx(0.25))
+
+
+@given(SEEDS)
+def test_what_is_projected_is_on_the_boundary_wherever_the_centre_is(seed):
+    """λ = x + λ̄: rounding of x − centre decides nothing."""
+    rng = np.random.default_rng(seed)
+    a = rng.uniform(0.1, 2.0, (10, 2))
+    moved = Ellipses(a).shifted(1e3 * rng.standard_normal(20))
+    z = moved.centre + 5.0 * a * rng.standard_normal((10, 2))
+    outside = level(a, z - moved.centre) > 1.0
+    x = moved.project(z.ravel())
+    status = moved.face(x, np.zeros(20)).status.reshape(-1, 2)
+    assert np.all((status == Status.SLIP) == outside[:, None])
+    phi, _ = moved.split(x, np.ones(20))
+    assert np.array_equal(phi.reshape(-1, 2) == 0.0, np.repeat(outside[:, None], 2, axis=1))
+
+
+@given(SEEDS)
+def test_the_longest_step_ends_on_the_boundary(seed):
+    rng = np.random.default_rng(seed)
+    a = rng.uniform(0.01, 2.0, (1, 2))
+    x, p = Ellipses(a).project(rng.standard_normal(2)), rng.standard_normal(2)
+    step = Ellipses(a).max_step(x, p)
+    assert level(a, x - step * p)[0] == pytest.approx(1.0, abs=1e-9)
+
+
+def test_a_point_that_cannot_move_has_no_step():
+    fixed = Ellipses(np.array([[1.0, 0.0]]))
+    assert fixed.max_step(np.zeros(2), np.array([1.0, 1.0])) == 0.0
+    assert fixed.max_step(np.zeros(2), np.array([1.0, 0.0])) == 1.0
+    assert fixed.max_step(np.zeros(2), np.zeros(2)) == np.inf
+
+
+@given(SEEDS)
+def test_the_parts_of_a_gradient_sum_up_to_the_projected_one(seed):
+    """φ + β is the projection of g on the tangent cone's negative: what is left pushes out."""
+    rng = np.random.default_rng(seed)
+    a = semi_axes(seed)
+    x, g = Ellipses(a).project(3.0 * rng.standard_normal(a.size)), rng.standard_normal(a.size)
+    phi, beta = Ellipses(a).split(x, g)
+    assert np.all(phi * beta == 0.0)
+    left = (g - phi - beta).reshape(a.shape)
+    assert abs(np.sum(left * (phi + beta).reshape(a.shape))) <= 1e-12  # Moreau's decomposition
+    x = x.reshape(a.shape)
+    both = (a > 0.0).all(axis=1)
+    assert np.all(np.sum(left * x, axis=1)[both] <= 1e-12)
+    inside = both & (level(a, x) < 1.0 - 1e-9)
+    assert np.all(left[inside] == 0.0)

@@ -1,0 +1,101 @@
+"""MPGP and SMALSE-M with discs, ellipses and intervals, against an interior point method."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from conic import constrained_qp
+from hypothesis import given
+from hypothesis import strategies as st
+from test_qp import matrix, to, vector
+
+from tfeti_dolfinx.qp.coarse import DenseCoarse
+from tfeti_dolfinx.qp.discs import Discs, Ellipses
+from tfeti_dolfinx.qp.faces import Status
+from tfeti_dolfinx.qp.feasible_sets import Bounds, Product
+from tfeti_dolfinx.qp.homogenised import homogenise
+from tfeti_dolfinx.qp.mprgp import EXPANSIONS, Iterate, MprgpParameters, mprgp
+from tfeti_dolfinx.qp.norm import estimate_norm
+from tfeti_dolfinx.qp.parameters import SmalseParameters
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Steps
+from tfeti_dolfinx.qp.smalse import smalse
+
+
+def program(seed, k, isotropic, m=40, r=4):
+    """F, d, G, e, rows λ ≥ 0, rows of ellipses and their semi-axes; a point fulfils it all."""
+    rng = np.random.default_rng(seed)
+    X = rng.standard_normal((m, m))
+    F = X @ X.T / m + 0.05 * np.eye(m)
+    order = rng.permutation(m)
+    bounded, pairs = order[:10], order[10 : 10 + 10 * k].reshape(10, k)
+    a = 0.3 * rng.uniform(0.2, 2.0, (10, k)) * (rng.random((10, k)) < 0.9)
+    if isotropic:
+        a = np.repeat(a[:, :1], k, axis=1)
+    inside = rng.standard_normal(m)
+    inside[bounded] = np.abs(inside[bounded])
+    inside[pairs] = 0.5 * a * rng.uniform(-1.0, 1.0, (10, k))
+    G = rng.standard_normal((r, m))
+    return F, rng.standard_normal(m), G, G @ inside, bounded, pairs, a
+
+
+def as_set(bounded, pairs, a, isotropic):
+    discs = Discs(a[:, 0], a.shape[1]) if isotropic else Ellipses(a)
+    return Product([(bounded, Bounds()), (pairs.ravel(), discs)])
+
+
+@given(
+    st.integers(0, 1000), st.sampled_from([1, 2]), st.booleans(), st.sampled_from(list(EXPANSIONS))
+)
+def test_smalse_agrees_with_an_interior_point_method(seed, k, isotropic, expansion):
+    F, d, G, e, bounded, pairs, a = program(seed, k, isotropic)
+    coarse, feasible = DenseCoarse(G, e), as_set(bounded, pairs, a, isotropic)
+    qp = QP(matrix(F), vector(d), coarse, feasible)
+    qp = replace(qp, norm=estimate_norm(qp.F, coarse, qp.d, 60))
+    homogenised = homogenise(qp)
+    parameters = SmalseParameters(expansion=expansion)
+    result = smalse(qp, homogenised, to(1e-10, homogenised), parameters, max_it=20_000)
+    assert result.reason == ConvergedReason.CONVERGED_RTOL
+    lam = result.lam.array
+    exact = constrained_qp(F, d, G, e, bounded, pairs, a)
+    assert np.linalg.norm(lam - exact) <= 1e-7 * np.linalg.norm(exact)
+    assert np.allclose(feasible.project(lam), lam, rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("expansion", list(EXPANSIONS))
+def test_mpgp_slides_sticks_and_falls_off(expansion):
+    """min ½‖Ax − b‖²-like with a disc pushed outwards, one that is not, and one of radius 0."""
+    A = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
+    A[0, 1] = A[1, 0] = 0.5
+    b = np.array([3.0, 1.0, 0.3, 0.4, 1.0, 1.0])
+    discs = Discs(np.array([1.0, 1.0, 0.0]))
+    x, g, steps = vector(np.zeros(6)), vector(-b), Steps()
+    state = Iterate(matrix(A), x, g, discs)
+    parameters = MprgpParameters(1.0 / 6.5, 1.0, EXPANSIONS[expansion])
+    assert mprgp(state, parameters, lambda s: s.projected_gradient <= 1e-9, steps, 500) is None
+    exact = constrained_qp(
+        A,
+        b,
+        np.zeros((0, 6)),
+        np.zeros(0),
+        [],
+        np.arange(6).reshape(3, 2),
+        np.array([[1.0] * 2] * 2 + [[0.0] * 2]),
+    )
+    assert np.allclose(x.array, exact, atol=1e-9)
+    slip, stick, fixed = Status.SLIP, Status.STICK, Status.OPEN
+    assert state.face().status.tolist() == [slip, slip, stick, stick, fixed, fixed]
+    assert np.allclose(g.array, A @ x.array - b, atol=1e-12)
+    assert steps.proportioning > 0
+
+
+def test_the_cost_falls_in_each_step():
+    F, d, _, _, bounded, pairs, a = program(3, 2, True)
+    x, costs = vector(np.zeros(40)), []
+    state = Iterate(matrix(F), x, vector(-d), as_set(bounded, pairs, a, True))
+
+    def stop(s):
+        costs.append(0.5 * float(s.x.array @ (s.g.array - d)))
+        return s.projected_gradient <= 1e-10
+
+    assert mprgp(state, MprgpParameters(1.0 / np.linalg.norm(F, 2)), stop, Steps(), 2000) is None
+    assert np.all(np.diff(costs) <= 1e-13 * np.abs(costs).max())

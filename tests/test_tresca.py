@@ -1,0 +1,151 @@
+"""Given friction from the user's door to u and λ, against an independent solver, without tears."""
+
+import numpy as np
+from bodies import boxes
+from friction_reference import on_each_other, on_plane, parts
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import clamp, decomposed, displacement, forms, hooke, problem
+
+import tfeti_dolfinx as tfeti
+
+EXACT = {"rtol": 1e-10}
+AT_REST = 1e-6
+
+
+def frame_of(gdim, angle, normal):
+    """Axes of all conditions: normal ±e_last, then the tangents; in 3D turned by an angle."""
+    last = normal * np.eye(gdim)[-1]
+    if gdim == 2:
+        return np.array([last, [1.0, 0.0]])
+    first = np.array([np.cos(angle), np.sin(angle), 0.0])
+    return np.array([last, first, np.cross(last, first)])
+
+
+def law_of(bounds, angle):
+    """Tresca's law whose frame ``frame_of`` has."""
+    if len(bounds) == 1:
+        return tfeti.Tresca(bounds[0])
+    return tfeti.Tresca(tuple(bounds), direction=(np.cos(angle), np.sin(angle), 0.0))
+
+
+def nodal_data(solution, comm, contact=0):
+    """Points of all conditions with their forces as vectors, sorted by point, on every rank."""
+    data = solution.contact(contact)
+    force = data.area[:, None] * data.tangential_traction - data.force[:, None] * data.normal
+    found = comm.allgather((data.points, force, data.status, data.slip))
+    points, *rest = (np.concatenate(part) for part in zip(*found, strict=True))
+    order = np.lexsort(np.rint(points.T * 1e7))
+    return points[order], *(part[order] for part in rest)
+
+
+def compare(p, u, x, force, frame):
+    """u and forces agree to 1e-7; frictional forces oppose slips."""
+    comm = p.dofs.comm
+    scale = max(np.abs(u).max(), AT_REST)
+    assert np.allclose(displacement(p)[1], u, rtol=0, atol=1e-7 * scale)
+    points, found, status, slip = nodal_data(p.solution, comm)
+    assert np.allclose(points[:, : u.shape[1]], x[:, : u.shape[1]])
+    expected = -force @ frame
+    assert np.allclose(found, expected, rtol=0, atol=1e-7 * max(np.abs(expected).max(), AT_REST))
+    return status, slip
+
+
+def on_the_plane(cell, n, subdomains, traction, bounds, angle=0.0, gap=0.0):
+    d = decomposed(cell, n, subdomains)
+    gdim = d.mesh.geometry.dim
+    up = np.eye(gdim)[-1]
+    law = law_of(bounds, angle)
+    plane = tfeti.Obstacle("bottom", tfeti.Plane(-gap * up, up), friction=law, reach=np.inf)
+    p = problem(d, traction, [plane], **EXACT)
+    p.solve()
+    frame = frame_of(gdim, angle, -1.0)
+    both = np.resize(bounds, gdim - 1)
+    status, _ = compare(p, *on_plane(cell, n, traction, both, frame, gap), frame)
+    return p, status
+
+
+def stresses(low, high):
+    """Numbers of a sensible size, or 0."""
+    return st.integers(round(1e3 * low), round(1e3 * high)).map(lambda number: 1e-3 * number)
+
+
+SCENES_2D = st.tuples(
+    st.sampled_from(["triangle", "quadrilateral"]),
+    st.integers(2, 6),
+    st.integers(1, 4),
+    st.tuples(stresses(-0.06, 0.06), stresses(-0.08, 0.01)),
+    stresses(0.0, 0.05).map(lambda bound: (bound,)),
+)
+SCENES_3D = st.tuples(
+    st.sampled_from(["tetrahedron", "hexahedron"]),
+    st.integers(2, 3),
+    st.integers(1, 4),
+    st.tuples(stresses(-0.05, 0.05), stresses(-0.05, 0.05), stresses(-0.08, 0.01)),
+    st.one_of(
+        stresses(0.0, 0.05).map(lambda bound: (bound,)),
+        st.tuples(stresses(0.0, 0.05), stresses(0.0, 0.05)),
+    ),
+    st.floats(0.0, 3.0),
+)
+
+
+@settings(max_examples=20)
+@given(SCENES_2D, st.sampled_from([0.0, 0.01]))
+def test_a_square_on_a_plane(scene, gap):
+    on_the_plane(*scene, gap=gap)
+
+
+@settings(max_examples=12)
+@given(SCENES_3D)
+def test_a_cube_on_a_plane(scene):
+    on_the_plane(*scene)
+
+
+def test_some_nodes_stick_and_some_slip():
+    p, status = on_the_plane("hexahedron", 4, 4, (0.0, -0.035, -0.05), (0.015,))
+    assert p.report.sticking == np.sum(status == tfeti.ContactStatus.STICK) > 0
+    assert p.report.sliding == np.sum(status == tfeti.ContactStatus.SLIP) > 0
+    assert p.report.tangential_rows == 2 * p.report.contact_rows
+
+
+def two_boxes(cell, n, subdomains, traction, bounds, angle, secondary):
+    gdim, apart = (2 if cell in ("triangle", "quadrilateral") else 3), 0.05
+    mesh, tags, names = boxes(cell, parts(gdim, n, apart))
+    d = tfeti.decompose(mesh, max(subdomains, 2), facet_tags=tags, surfaces=names)
+    V, a, L = forms(d.mesh, d.facet_tags, traction, d.surface("upper top"))
+    clamped = ("lower bottom", "upper left")
+    pair = tfeti.Contact(
+        "lower top",
+        "upper bottom",
+        secondary=secondary,
+        gap=0.0,
+        friction=law_of(bounds, angle),
+        reach=0.3,
+    )
+    bcs = [clamp(V, d.facets(name)) for name in clamped]
+    p = tfeti.ContactProblem(a, L, bcs, [pair], d, stress=hooke(), petsc_options=EXACT)
+    p.solve()
+    frame, both = frame_of(gdim, angle, 1.0), np.resize(bounds, gdim - 1)
+    u, x, force = on_each_other(cell, n, traction, both, frame, apart, clamped)
+    if secondary == "upper bottom":
+        x, force = x + apart * np.eye(3)[gdim - 1], -force
+    compare(p, u, x, force, frame)
+    # what acts on one box reacts on the other
+    total = p.solution.body_forces.force
+    assert np.allclose(total.sum(axis=0), 0.0, rtol=0, atol=1e-12)
+
+
+SIDES = st.sampled_from(["lower top", "upper bottom"])
+
+
+@settings(max_examples=12)
+@given(SCENES_2D, SIDES)
+def test_a_square_on_a_square(scene, secondary):
+    two_boxes(*scene, 0.0, secondary)
+
+
+@settings(max_examples=8)
+@given(SCENES_3D, SIDES)
+def test_a_cube_on_a_cube(scene, secondary):
+    two_boxes(*scene, secondary)

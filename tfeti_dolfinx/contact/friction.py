@@ -1,0 +1,243 @@
+"""Laws of friction: what a user says of them, and what they say at the contact nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, dataclass, replace
+from typing import Any, TypeAlias
+
+import numpy as np
+from dolfinx import fem
+
+from tfeti_dolfinx.arrays import Array, ArrayLike
+from tfeti_dolfinx.checks import Range, checked_number, checked_type, shown
+from tfeti_dolfinx.contact.records import ContactRecords, Friction
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.mortar.frames import aligned
+from tfeti_dolfinx.mortar.surfaces import group_points
+
+Value: TypeAlias = "float | Callable[[Array], ArrayLike] | fem.Function"
+
+NOT_NEGATIVE = Range("a number, 0 or more", lambda value: value >= 0.0)
+# of a direction: what is left in the tangent plane of less says nothing of where it points
+ALONG = 1e-3
+
+
+@dataclass(frozen=True)
+class Tresca:
+    """The tangential traction is at most a given bound, whatever the pressure is.
+
+    It acts on all nodes with a contact condition, open ones as well, and on those whose normal
+    displacement is prescribed.
+
+    Args:
+        bound: A stress, 0 or more: a number, a function of points of shape ``(3, n)``, or a
+            scalar DOLFINx function on the torn mesh. Two of them: orthotropic, along the direction
+            and across it; the traction is in the ellipse with these semi-axes.
+        direction: Vector along which the first of two bounds holds, projected on the surface.
+
+    Example:
+        >>> tfeti.Tresca((0.02, 0.01), direction=(1, 0, 0)).values
+        (0.02, 0.01)
+    """
+
+    bound: Value | tuple[Value, Value]
+    _: KW_ONLY
+    direction: Sequence[float] | None = None
+
+    what = "bound"
+    kind = Friction.GIVEN
+
+    @property
+    def values(self) -> tuple[Value, ...]:
+        """One bound, or two."""
+        given = self.bound
+        return tuple(given) if isinstance(given, (tuple, list)) else (given,)
+
+
+@dataclass(frozen=True)
+class Coulomb:
+    """The tangential traction is at most a coefficient times the pressure.
+
+    Nodes whose normal displacement is prescribed have no friction: their contact force is hidden
+    in what holds them.
+
+    Args:
+        coefficient: 0 or more: a number, a function of points of shape ``(3, n)``, or a scalar
+            DOLFINx function on the torn mesh. Two of them: orthotropic, along the direction and
+            across it; the traction over the pressure is in the ellipse with these semi-axes.
+        direction: Vector along which the first of two coefficients holds, projected on the
+            surface.
+
+    Example:
+        >>> tfeti.Coulomb(0.3).values
+        (0.3,)
+    """
+
+    coefficient: Value | tuple[Value, Value]
+    _: KW_ONLY
+    direction: Sequence[float] | None = None
+
+    what = "coefficient"
+    kind = Friction.COULOMB
+
+    @property
+    def values(self) -> tuple[Value, ...]:
+        """One coefficient, or two."""
+        given = self.coefficient
+        return tuple(given) if isinstance(given, (tuple, list)) else (given,)
+
+
+Law = Tresca | Coulomb
+
+
+def checked_friction(name: str, friction: Law | None) -> None:
+    """Raise if a law is none, or has values that cannot be right anywhere. Not collective.
+
+    Args:
+        name: Name of the contact, for messages.
+        friction: What a user gave.
+
+    Raises:
+        InputError: It is not a law, or a value of it negative or of a wrong type.
+    """
+    if friction is None:
+        return
+    expected = "Tresca(bound), Coulomb(coefficient) or None"
+    checked_type(friction, (Tresca, Coulomb), f"{name}: friction", expected)
+    what, count = f"{name}: {friction.what}", len(friction.values)
+    if count > 2 or (count == 2) != (friction.direction is not None):
+        raise InputError(
+            f"{what} has {count} value{'s' * (count != 1)} and direction={friction.direction!r}; "
+            "expected one value, or two and the direction of the first"
+        )
+    for value in friction.values:
+        if not (isinstance(value, fem.Function) or callable(value)):
+            checked_number(value, what, NOT_NEGATIVE)
+        elif isinstance(value, fem.Function) and value.ufl_shape != ():
+            raise InputError(f"{what} has the shape {value.ufl_shape}; expected a scalar function")
+
+
+def same_law(one: Law, other: Law) -> bool:
+    """Whether two laws say the same, as far as one can tell without asking functions."""
+    values = [*zip(one.values, other.values, strict=False)]
+    return (
+        type(one) is type(other)
+        and len(one.values) == len(other.values)
+        and all(a is b or (not callable(a) and a == b) for a, b in values)
+        and repr(one.direction) == repr(other.direction)
+    )
+
+
+def with_friction(
+    name: str, friction: Law | None, records: ContactRecords, dofs: TornDofs
+) -> ContactRecords:
+    """The conditions of a contact with its friction, their tangents along its direction.
+
+    Collective.
+
+    Raises:
+        InputError: The space is scalar, or the direction does not fit or is along a normal.
+    """
+    if friction is None:
+        return records
+    gdim = dofs.bs
+    if gdim == 1:
+        raise InputError(
+            f"{name}: friction on a scalar space; expected displacements, since what slides needs "
+            "tangents"
+        )
+    if friction.direction is not None:
+        if gdim == 2:
+            raise InputError(
+                f"{name}: {friction.what} has two values; expected one in the plane, where there "
+                "is one tangent"
+            )
+        direction = _checked_direction(name, friction.direction)
+        with raised_on_all_ranks(dofs.comm):
+            frame, left = aligned(records.frame, direction)
+            if np.any(left < ALONG):
+                x = group_points(dofs)[records.group[np.argmin(left)]]
+                raise InputError(
+                    f"{name}: direction {friction.direction} is along the normal at the node "
+                    f"{x.tolist()}; expected one that is along the surface everywhere"
+                )
+        records = replace(records, frame=frame)
+    return replace(records, friction=np.full(len(records), friction.kind))
+
+
+def friction_values(name: str, friction: Law, records: ContactRecords, dofs: TornDofs) -> Array:
+    """Bounds or coefficients of all conditions along their tangents. Collective.
+
+    Args:
+        name: Name of the contact, for messages.
+        friction: Its law.
+        records: Its conditions.
+        dofs: Dof maps.
+
+    Returns:
+        Shape ``(n, gdim - 1)``.
+
+    Raises:
+        InputError: A value is negative or no number somewhere, or a function on another mesh.
+    """
+    x, what = group_points(dofs)[records.group], f"{name}: {friction.what}"
+    columns = []
+    for value in friction.values:
+        if isinstance(value, fem.Function):
+            column = _at_groups(what, value, dofs)[records.group]
+        else:
+            column = None
+        with raised_on_all_ranks(dofs.comm):
+            columns.append(_checked_values(what, value if column is None else column, x))
+    if len(columns) < dofs.bs - 1:
+        columns = columns * (dofs.bs - 1)
+    return np.stack(columns, axis=1)
+
+
+def _checked_direction(name: str, direction: Any) -> Array:
+    try:
+        vector = np.array(direction, dtype=float)
+    except (TypeError, ValueError):
+        vector = np.empty(0)
+    if vector.shape != (3,) or not np.all(np.isfinite(vector)) or not np.any(vector):
+        raise InputError(
+            f"{name}: direction={shown(direction)}; expected three numbers, not all of them 0"
+        )
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def _at_groups(what: str, function: fem.Function, dofs: TornDofs) -> Array:
+    """Values of a function at the owned groups, the mean over the torn copies. Collective."""
+    S, dof = dofs.scalar
+    if function.function_space.mesh is not S.mesh and (
+        function.function_space.mesh._cpp_object is not S.mesh._cpp_object
+    ):
+        raise InputError(
+            f"{what} is on another mesh; expected a function on decomposition.mesh, the torn mesh"
+        )
+    on_nodes = fem.Function(S)
+    on_nodes.interpolate(function)
+    total = dofs.reduce(on_nodes.x.array[dof], np.add, 0.0)
+    return np.asarray(total / dofs.multiplicity)
+
+
+def _checked_values(what: str, value: Any, x: Array) -> Array:
+    """A number, a function of points, or values at them: one for each point."""
+    if callable(value):
+        try:
+            value = np.asarray(value(x.T), dtype=float)
+            value = np.broadcast_to(value, (len(x),))
+        except Exception as error:  # a user's function may raise anything
+            raise InputError(
+                f"{what}, a function, did not give one number for each of {len(x)} points of "
+                f"shape (3, {len(x)}): {type(error).__name__}: {error}"
+            ) from error
+    values = np.array(np.broadcast_to(value, (len(x),)), dtype=float)
+    if np.any(wrong := ~(np.isfinite(values) & (values >= 0.0))):
+        raise InputError(
+            f"{what} is {values[wrong][0]} at the point {x[wrong][0].tolist()}; expected "
+            f"{NOT_NEGATIVE.text}"
+        )
+    return values

@@ -1,0 +1,193 @@
+"""Discs and ellipses of multipliers: intervals in the plane, sets of friction on surfaces."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from tfeti_dolfinx.arrays import TINY, Array
+from tfeti_dolfinx.qp.faces import Face, Status
+
+# Of the boundary's distance from the centre: what is so near to the boundary is on it. Projections
+# come within a few roundings of it; those of λ − λ̄ within as many of the centre, −λ̄.
+ON, SEVERAL, EPSILON = 1e-10, 8.0, 2.2e-16
+# of the centre's distance from 0: a semi-axis below it is 0, since rounding decides what is inside
+NEGLIGIBLE = 1e-11
+# Newton's method for the secular equation: far more steps than it takes, and where it ends
+MOST_STEPS, SOLVED = 60, 4.0 * EPSILON
+
+
+class Ellipses:
+    """Σ_j ((x_ij − c_ij)/a_ij)² ≤ 1: points x_i of one or two neighbouring entries each.
+
+    A semi-axis of 0 fixes its entry; with both of them 0 the set is its centre.
+
+    >>> slab = Ellipses(np.array([[2.0, 1.0]]))
+    >>> slab.project(np.array([0.0, 3.0])).tolist(), slab.project(np.array([0.5, 0.5])).tolist()
+    ([0.0, 1.0], [0.5, 0.5])
+
+    Args:
+        semi_axes: The a_ij, 0 or more, shape ``(n, k)``, k = 1 or 2.
+        centre: The c_ij, of the same shape, or 0.
+    """
+
+    def __init__(self, semi_axes: Array, centre: Array | float = 0.0) -> None:
+        self.semi_axes = np.asarray(semi_axes, dtype=float)
+        self.centre = np.broadcast_to(centre, self.semi_axes.shape)
+        self._moves = self.semi_axes > NEGLIGIBLE * np.abs(self.centre)
+        self._inverse = np.divide(
+            1.0, self.semi_axes, out=np.zeros(self.semi_axes.shape), where=self._moves
+        )
+
+    def project(self, x: Array) -> Array:
+        """The nearest points of the ellipses."""
+        t = self._from_centre(x)
+        outside = self._level(t) > 1.0
+        nearest = np.where(self._moves, t, 0.0)
+        nearest[outside] = self._nearest(t[outside], outside)
+        # what stays where it was is not rounded
+        return np.where(nearest == t, self._points(x), self.centre + nearest).ravel()
+
+    def split(self, x: Array, g: Array) -> tuple[Array, Array]:
+        """φ = g inside; on the boundary β = g − min(nᵀg, 0)n, n its outward normal."""
+        t = self._from_centre(x)
+        on, normal = self._boundary(t)
+        g = np.where(self._moves, self._points(g), 0.0)
+        pushing = np.minimum(np.sum(normal * g, axis=1), 0.0)
+        phi = np.where(on[:, None], 0.0, g)
+        beta = np.where(on[:, None], g - pushing[:, None] * normal, 0.0)
+        return phi.ravel(), beta.ravel()
+
+    def reduced(self, x: Array, phi: Array, alpha: float) -> Array:
+        """φ̃ = (x − P(x − αφ))/α, φ itself where the step stays inside."""
+        trial = x - alpha * phi
+        projected = self.project(trial)
+        return np.where(projected == trial, phi, (x - projected) / alpha)
+
+    def max_step(self, x: Array, p: Array) -> float:
+        """Largest α with x − αp inside: the smallest root of a quadratic equation for each."""
+        p = self._points(p)
+        if np.any(p[~self._moves]):
+            return 0.0
+        t, p = self._from_centre(x) * self._inverse, p * self._inverse
+        a, b = np.sum(p * p, axis=1), np.sum(p * t, axis=1)
+        moves = a > 0.0
+        a, b = a[moves], b[moves]
+        room = np.maximum(1.0 - np.sum(t[moves] ** 2, axis=1), 0.0)
+        root = np.sqrt(b * b + a * room)
+        # of the two forms of the larger root of aα² − 2bα = room the one that cancels nothing
+        steps = np.where(b > 0.0, (b + root) / a, room / np.maximum(root - b, TINY))
+        return float(np.min(steps, initial=np.inf))
+
+    def shifted(self, shift: Array) -> Ellipses:
+        """Ellipses around c − shift."""
+        return Ellipses(self.semi_axes, self.centre - self._points(shift))
+
+    def face(self, x: Array, g: Array) -> Face:
+        """Inside all directions are free: it sticks. On the boundary the tangent: it slips."""
+        t = self._from_centre(x)
+        on, normal = self._boundary(t)
+        status = np.where(on[:, None], Status.SLIP, Status.STICK)
+        status = np.where(self._moves, status, Status.OPEN)
+        inside = np.flatnonzero(self._moves & ~on[:, None])
+        along = np.flatnonzero(on & self._moves.all(axis=1) & (self.semi_axes.shape[1] == 2))
+        Z = _directions(inside, along, normal, x.size)
+        curvature = self._curvature(t, np.where(self._moves, self._points(g), 0.0), normal)
+        kappa = np.concatenate((np.zeros(len(inside)), curvature[along]))
+        return Face(Z, kappa, status.ravel())
+
+    def _points(self, x: Array) -> Array:
+        return np.asarray(x).reshape(self.semi_axes.shape)
+
+    def _from_centre(self, x: Array) -> Array:
+        return np.asarray(self._points(x) - self.centre)
+
+    def _level(self, t: Array) -> Array:
+        """‖t/a‖, 1 on the boundary; entries that are fixed do not count."""
+        return np.asarray(np.linalg.norm(t * self._inverse, axis=1))
+
+    def _boundary(self, t: Array) -> tuple[Array, Array]:
+        """Flags of what is on the boundary, and its outward normals; 0 where nothing moves."""
+        rounding = SEVERAL * EPSILON * np.max(np.abs(self.centre) * self._inverse, axis=1)
+        on = self._level(t) >= 1.0 - ON - rounding
+        steep = t * self._inverse**2
+        size = np.linalg.norm(steep, axis=1, keepdims=True)
+        normal = np.divide(steep, size, out=np.zeros_like(t), where=size > 0.0)
+        return on | ~self._moves.any(axis=1), normal
+
+    def _curvature(self, t: Array, g: Array, normal: Array) -> Array:
+        """κ = (−nᵀg)⁺ τᵀHτ/‖Ht‖ with H = diag(a)⁻² and τ the tangent, shape ``(n,)``."""
+        pushing = np.maximum(-np.sum(g * normal, axis=1), 0.0)
+        inverse = self._inverse**2
+        slope = np.linalg.norm(inverse * t, axis=1)
+        bent = np.sum(inverse * normal[:, ::-1] ** 2, axis=1)
+        return np.asarray(pushing * np.divide(bent, slope, out=0.0 * slope, where=slope > 0.0))
+
+    def _nearest(self, z: Array, which: Array) -> Array:
+        """The nearest points of the boundary to points outside: a_j²z_j/(a_j² + μ)."""
+        a = self.semi_axes[which]
+        scale = np.maximum(a.max(axis=1, initial=TINY), TINY)[:, None]
+        a, z = a / scale, z / scale
+        y = a * a * z / np.maximum(a * a + _secular(a, z)[:, None], TINY)
+        # the last rounding of μ must not leave y off the boundary
+        level = np.linalg.norm(np.divide(y, a, out=np.zeros_like(y), where=a > 0.0), axis=1)
+        return np.asarray(scale * y / np.maximum(level, TINY)[:, None])
+
+
+class Discs(Ellipses):
+    """‖x_i − c_i‖ ≤ r_i; of one entry each: intervals.
+
+    >>> Discs(np.array([1.0])).project(np.array([3.0, 4.0])).tolist()
+    [0.6, 0.8]
+
+    Args:
+        radius: The r_i, 0 or more, shape ``(n,)``.
+        dimension: Entries of a point, 1 or 2.
+        centre: The c_i, shape ``(n, dimension)``, or 0.
+    """
+
+    def __init__(self, radius: Array, dimension: int = 2, centre: Array | float = 0.0) -> None:
+        radius = np.asarray(radius, dtype=float)
+        super().__init__(np.repeat(radius[:, None], dimension, axis=1), centre)
+
+    def shifted(self, shift: Array) -> Discs:
+        """Discs around c − shift."""
+        radius, dimension = self.semi_axes[:, 0], self.semi_axes.shape[1]
+        return Discs(radius, dimension, self.centre - self._points(shift))
+
+    def _nearest(self, z: Array, which: Array) -> Array:
+        """r z/‖z‖."""
+        size = np.linalg.norm(z, axis=1, keepdims=True)
+        return np.asarray(self.semi_axes[which] * (z / np.maximum(size, TINY)))
+
+
+def _secular(a: Array, z: Array) -> Array:
+    """μ ≥ 0 with Σ_j (a_j z_j/(a_j² + μ))² = 1, for points outside, shape ``(n,)``.
+
+    Newton's method for 1 − 1/√Σ, which is nearly linear in μ: from a start on the left of the root
+    it comes nearer in each step (Moré, Sorensen, SIAM J. Sci. Stat. Comput. 4, 1983).
+    """
+    c = a * np.abs(z)
+    mu = np.maximum(np.max(c - a * a, axis=1, initial=0.0), 0.0)  # one term alone is 1 there
+    for _ in range(MOST_STEPS):
+        below = a * a + mu[:, None]
+        terms = np.divide(c, below, out=np.zeros_like(c), where=below > 0.0) ** 2
+        total = terms.sum(axis=1)
+        slope = np.divide(terms, below, out=np.zeros_like(c), where=below > 0.0).sum(axis=1)
+        wanted = total > 1.0
+        step = np.divide(total * (np.sqrt(total) - 1.0), slope, out=np.zeros_like(mu), where=wanted)
+        mu = mu + step
+        if not np.any(step > SOLVED * mu):
+            break
+    return mu
+
+
+def _directions(inside: Array, along: Array, normal: Array, size: int) -> csr_array:
+    """Z: coordinates of what is inside, then the tangents of what is on the boundary."""
+    n, k = len(inside), len(along)
+    around = n + np.arange(k)
+    rows = np.concatenate((inside, 2 * along, 2 * along + 1))
+    columns = np.concatenate((np.arange(n), around, around))
+    n_x, n_y = normal[along, 0], normal[along, -1]
+    values = np.concatenate((np.ones(n), -n_y, n_x))
+    return csr_array((values, (rows, columns)), shape=(size, n + k))
