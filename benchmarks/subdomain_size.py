@@ -60,6 +60,7 @@ def row(name, size, local_type, report):
         "K⁺": seconds["subdomains"],
         **{stage: seconds[stage] for stage in ("dual", "qp")},
         "without mesh": solve_seconds(report),
+        "processor": report["processor"],
         "MB": report["peak_memory_mb"],
         "F predicted": local["F_predicted"],
         "F measured": local["F_measured"],

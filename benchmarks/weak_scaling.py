@@ -41,6 +41,7 @@ def row(report):
         **stage_seconds(report),
         "without mesh": seconds,
         "per million unknowns": seconds / report["primal_dofs"] * 1e6,
+        "processor": report["processor"],
         "MB": report["peak_memory_mb"],
         "kB per unknown": report["peak_memory_mb"] / report["primal_dofs"] * 1e3,
     }
