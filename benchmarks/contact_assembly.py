@@ -1,15 +1,14 @@
 """Contact search and mortar assembly beside the assembly of K, over a factor of 16 in facets.
 
-    ./run mpirun -n 2 python3 benchmarks/contact_assembly.py [--cells 12]
+    ./run mpirun -n 2 python3 benchmarks/contact_assembly.py [--quick] [--cells 12]
 
 Two unit cubes lie one on the other, of n³ and (5n/4)³ hexahedra or six times as many tetrahedra,
 so that their facets do not match; n is doubled twice. Nothing is solved. Results go to
-results/contact_assembly.md and .json.
+results/contact_assembly.md, .json and .png.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from pathlib import Path
@@ -29,7 +28,9 @@ from mpi4py import MPI
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import tfeti_dolfinx as tfeti
-from benchmarks.tables import markdown, slope, write_tables
+from benchmarks.pictures import column, curves, picture
+from benchmarks.tables import slope
+from benchmarks.tools import command_line, finish
 from tfeti_dolfinx.assembly import Forms
 from tfeti_dolfinx.compat import create_mesh_in_place
 from tfeti_dolfinx.contact.search import ContactSearch
@@ -145,22 +146,32 @@ def study(cell, cells):
     return rows, slopes
 
 
+def configure(parser):
+    parser.add_argument("--cells", type=int, help="n of the smallest scene: 12, --quick 4")
+
+
+def draw(path, tables):
+    """Seconds over facets."""
+    with picture(path, len(CELLS)) as axes:
+        for panel, cell in zip(axes, CELLS, strict=True):
+            rows = tables[f"Contact and assembly, {cell}"]
+            lines = {
+                name: (column(rows, "facets"), column(rows, name))
+                for name in ("contact", "assembly")
+            }
+            curves(panel, cell, ("facets", "seconds"), lines)
+
+
 def main(argv):
     """Run the tables and write them; returns them."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--cells", type=int, default=12, help="n of the smallest scene")
-    parser.add_argument("--output", type=Path, default=Path("results"))
-    arguments = parser.parse_args(argv)
+    arguments, _ = command_line(__doc__, argv, configure)
+    cells = arguments.cells or (4 if arguments.quick else 12)
     tables = {}
     for cell in CELLS:
-        rows, slopes = study(cell, arguments.cells)
+        rows, slopes = study(cell, cells)
         tables[f"Contact and assembly, {cell}"] = rows
         tables[f"Slopes over facets, {cell}"] = [slopes]
-    if MPI.COMM_WORLD.rank == 0:
-        write_tables(arguments.output, "contact_assembly", tables)
-        for title, rows in tables.items():
-            print(f"{title}\n\n{markdown(rows)}\n")
-    return tables
+    return finish(arguments.output, "contact_assembly", tables, draw, MPI.COMM_WORLD.rank)
 
 
 if __name__ == "__main__":

@@ -1,14 +1,15 @@
-"""The tables of Dostál's talk, beside the talk's own figures.
+"""The tables of Dostál's talk by both solvers, beside the talk's own figures.
 
     ./run mpirun -n 2 python3 benchmarks/talk_tables.py [--quick | --large] [--rtol 1e-4 1e-6]
 
-Multiplications are by F = B K⁺ Bᵀ, all but the power method's. The talk gives neither tolerance
-nor geometry in full. Results go to results/talk_tables.md and .json.
+Multiplications are by F = B K⁺ Bᵀ, all but the power method's, which only SMALSE-M needs, and by
+the preconditioner S, which only block Newton has. The talk gives neither tolerance nor geometry in
+full; its solver is SMALSE-M. Seconds are those of all but the mesh. Results go to
+results/talk_tables.md, .json and .png.
 """
 
 from __future__ import annotations
 
-import argparse
 import sys
 from pathlib import Path
 
@@ -21,7 +22,8 @@ from mpi4py import MPI
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.tables import markdown, write_tables
+from benchmarks.pictures import column, curves, picture
+from benchmarks.tools import command_line, finish, solve_seconds
 from demos import cube_3d, talk_hertz_2d
 
 # subdomains: the talk's primal, dual, kernel dimension, multiplications, seconds
@@ -39,61 +41,83 @@ TABLES = {
     "Hertz 2D": (talk_hertz_2d, HERTZ_2D),
     "Frictionless 3D": (cube_3d, FRICTIONLESS_3D),
 }
-SOLVER = ["-tfeti_qp_type", "smalse", "-tfeti_pc_type", "none"]
+SOLVERS = {
+    "Newton": ["-tfeti_qp_type", "newton"],
+    "SMALSE": ["-tfeti_qp_type", "smalse", "-tfeti_pc_type", "none"],
+}
 
 
-def row(report, talk, subdomains, rtol):
+def row(reports, talk, subdomains, rtol):
     """A row of a table: ours beside the talk's."""
     primal, dual, kernel, multiplications, seconds = talk
+    newton, smalse = reports["Newton"], reports["SMALSE"]
     return {
         "subdomains": subdomains,
         "rtol": f"{rtol:.0e}",
-        "primal": report.primal_dofs,
+        "primal": newton.primal_dofs,
         "primal, talk": primal,
-        "dual": report.dual_dofs,
+        "dual": newton.dual_dofs,
         "dual, talk": dual,
-        "kernel": report.kernel_dim,
+        "kernel": newton.kernel_dim,
         "kernel, talk": kernel,
-        "multiplications": report.F_multiplications,
-        "multiplications, talk": multiplications,
-        "power method": report.power_method_multiplications,
-        "outer": report.outer_iterations,
-        "seconds": report.seconds["total"],
-        "of them qp": report.seconds["qp"],
+        "F, Newton": newton.F_multiplications,
+        "S, Newton": newton.preconditioner_multiplications,
+        "F, SMALSE": smalse.F_multiplications,
+        "F, talk": multiplications,
+        "outer, Newton": newton.outer_iterations,
+        "outer, SMALSE": smalse.outer_iterations,
+        "power method": smalse.power_method_multiplications,
+        **{f"seconds, {name}": seconds_of(report) for name, report in reports.items()},
         "seconds, talk": seconds,
+        "MB": newton.peak_memory_mb,
     }
 
 
-def table(demo, talk, sizes, tolerances, quick=False):
+def seconds_of(report):
+    """Seconds of all but the mesh."""
+    return solve_seconds({"seconds": report.seconds})
+
+
+def table(demo, talk, sizes, arguments, options):
     """A row for each size and tolerance."""
     rows = []
     for subdomains in sizes:
-        for rtol in tolerances:
-            options = ["--subdomains", str(subdomains), *(["--quick"] if quick else [])]
-            _, report = demo.run([*options, *SOLVER, "-tfeti_rtol", str(rtol)])
-            rows.append(row(report, talk[subdomains], subdomains, rtol))
+        for rtol in arguments.rtol:
+            words = ["--subdomains", str(subdomains), *(["--quick"] if arguments.quick else [])]
+            words += ["-tfeti_rtol", str(rtol), *options]
+            reports = {name: demo.run([*words, *solver])[1] for name, solver in SOLVERS.items()}
+            rows.append(row(reports, talk[subdomains], subdomains, rtol))
     return rows
+
+
+def draw(path, tables):
+    """Multiplications by F over subdomains, at the last tolerance."""
+    with picture(path, len(tables)) as axes:
+        for panel, (title, rows) in zip(axes, tables.items(), strict=True):
+            last = [row for row in rows if row["rtol"] == rows[-1]["rtol"]]
+            names = {"F, Newton": "Newton", "F, SMALSE": "SMALSE-M", "F, talk": "talk"}
+            lines = {
+                label: (column(last, "subdomains"), column(last, name))
+                for name, label in names.items()
+            }
+            labels = ("subdomains", "multiplications by F")
+            curves(panel, f"{title}, rtol {rows[-1]['rtol']}", labels, lines, log="x")
+
+
+def configure(parser):
+    parser.add_argument("--large", action="store_true", help="the largest rows too")
+    parser.add_argument("--rtol", type=float, nargs="+", default=[1e-4, 1e-6])
 
 
 def main(argv):
     """Run the tables and write them; returns them."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    size = parser.add_mutually_exclusive_group()
-    size.add_argument("--quick", action="store_true", help="the smallest rows, on coarse meshes")
-    size.add_argument("--large", action="store_true", help="the largest rows too")
-    parser.add_argument("--rtol", type=float, nargs="+", default=[1e-4, 1e-6])
-    parser.add_argument("--output", type=Path, default=Path("results"))
-    arguments = parser.parse_args(argv)
+    arguments, options = command_line(__doc__, argv, configure)
     count = 3 if arguments.large else 1 if arguments.quick else 2
     tables = {
-        title: table(demo, talk, list(talk)[:count], arguments.rtol, arguments.quick)
+        title: table(demo, talk, list(talk)[:count], arguments, options)
         for title, (demo, talk) in TABLES.items()
     }
-    if MPI.COMM_WORLD.rank == 0:
-        write_tables(arguments.output, "talk_tables", tables)
-        for title, rows in tables.items():
-            print(f"{title}\n\n{markdown(rows)}\n")
-    return tables
+    return finish(arguments.output, "talk_tables", tables, draw, MPI.COMM_WORLD.rank)
 
 
 if __name__ == "__main__":

@@ -27,14 +27,12 @@ import tfeti_dolfinx as tfeti
 from demos.demo_tools import Demo
 
 
-def run(argv):
-    demo = Demo(__doc__, argv, configure)
-    arguments, comm = demo.arguments, MPI.COMM_WORLD
-
+def torn_mesh(arguments):
     # ## Mesh
     #
     # A box made in DOLFINx. The subdomains are cubes, given by a function of the cells'
     # midpoints.
+    comm = MPI.COMM_WORLD
     N = round(arguments.subdomains ** (1 / 3))
     cells = arguments.cells or (5 if arguments.quick else 10)
     box = dmesh.create_box(comm, [(0, 0, 0), (1, 1, 1)], [N * cells] * 3, dmesh.CellType.hexahedron)
@@ -52,7 +50,10 @@ def run(argv):
         i, j, k = np.minimum((x * N).astype(int), N - 1)
         return i + N * j + N * N * k
 
-    decomposition = tfeti.decompose(box, subdomain, facet_tags=facet_tags, surfaces=names)
+    return tfeti.decompose(box, subdomain, facet_tags=facet_tags, surfaces=names)
+
+
+def scene(decomposition):
     mesh = decomposition.mesh
 
     # ## Elasticity
@@ -74,17 +75,23 @@ def run(argv):
         lambda x: x[2] + 0.02 + 0.1 * ((x[0] - 0.8) ** 2 + (x[1] - 0.5) ** 2),
         lambda x: np.stack((np.zeros_like(x[0]), np.zeros_like(x[0]), np.ones_like(x[0]))),
     )
+    return {
+        "a": elastic.a(u, v),
+        "L": ufl.dot(traction, v) * ds(decomposition.surface("top")),
+        "bcs": [fem.dirichletbc(np.zeros(3), fixed, V)],
+        "contacts": [tfeti.Obstacle("bottom", obstacle, reach=np.inf)],
+        "decomposition": decomposition,
+        "stress": elastic.stress,
+    }
+
+
+def run(argv):
+    demo = Demo(__doc__, argv, configure)
     problem = tfeti.ContactProblem(
-        elastic.a(u, v),
-        ufl.dot(traction, v) * ds(decomposition.surface("top")),
-        [fem.dirichletbc(np.zeros(3), fixed, V)],
-        [tfeti.Obstacle("bottom", obstacle, reach=np.inf)],
-        decomposition,
-        stress=elastic.stress,
-        petsc_options=demo.petsc_options,
+        **scene(torn_mesh(demo.arguments)), petsc_options=demo.petsc_options
     )
     problem.solve()
-    if arguments.plot:
+    if demo.arguments.plot:
         from tfeti_dolfinx.plot import plot_deformed
 
         plot_deformed(demo.folder / "cube_3d.png", problem.solution, factor=1.0)

@@ -28,24 +28,27 @@ from demos.demo_tools import Demo
 from demos.hertz import PointContact, compare
 from meshes.half_ball import build
 
+R, E, nu = 1.0, 1.0, 0.3
+a = 0.05 * R
+HERTZ = PointContact.from_half_width(a, R, E / (1 - nu**2))
 
-def run(argv):
-    demo = Demo(__doc__, argv, configure)
-    arguments, comm = demo.arguments, MPI.COMM_WORLD
 
+def torn_mesh(arguments):
     # ## Mesh
     #
     # gmsh meshes on rank 0, `read_gmsh` partitions with METIS. All element sizes are scaled by
     # one factor to come near the number of unknowns that is asked for.
-    R, E, nu = 1.0, 1.0, 0.3
-    a = 0.05 * R
+    comm = MPI.COMM_WORLD
     unknowns = arguments.unknowns or (6_000 if arguments.quick else 60_000)
     subdomains = arguments.subdomains or max(2, round(unknowns / 4000))
     scale = (4500 / unknowns) ** (1 / 3)
     model = None
     if comm.rank == 0:
         model = build(R, fine=0.2 * a * scale, fine_radius=1.3 * a, growth=0.3 * scale)
-    decomposition = tfeti.read_gmsh(model, comm, subdomains)
+    return tfeti.read_gmsh(model, comm, subdomains)
+
+
+def scene(decomposition):
     mesh = decomposition.mesh
 
     # ## Elasticity
@@ -59,30 +62,34 @@ def run(argv):
     #
     # A uniform pressure on the top carries the force F that belongs to the radius a. The top is
     # a polygon: its own area makes the total force exact.
-    hertz = PointContact.from_half_width(a, R, E / (1 - nu**2))
     top = ds(decomposition.surface("top"))
-    area = comm.allreduce(fem.assemble_scalar(fem.form(fem.Constant(mesh, 1.0) * top)))
-    traction = fem.Constant(mesh, (0.0, 0.0, -hertz.load / area))
+    area = mesh.comm.allreduce(fem.assemble_scalar(fem.form(fem.Constant(mesh, 1.0) * top)))
+    traction = fem.Constant(mesh, (0.0, 0.0, -HERTZ.load / area))
     contacts = [
         tfeti.Obstacle("contact", tfeti.Plane((0, 0, 0), normal=(0, 0, 1)), reach=2 * a**2 / R)
     ]
+    return {
+        "a": elastic.a(u, v),
+        "L": ufl.dot(traction, v) * top,
+        "bcs": [],
+        "contacts": contacts,
+        "decomposition": decomposition,
+        "stress": elastic.stress,
+    }
 
+
+def run(argv):
+    demo = Demo(__doc__, argv, configure)
     problem = tfeti.ContactProblem(
-        elastic.a(u, v),
-        ufl.dot(traction, v) * top,
-        [],
-        contacts,
-        decomposition,
-        stress=elastic.stress,
-        petsc_options=demo.petsc_options,
+        **scene(torn_mesh(demo.arguments)), petsc_options=demo.petsc_options
     )
     problem.solve()
 
     # ## Comparison with the closed form
     contact = problem.solution.contact(0)
     r = np.hypot(contact.points[:, 0], contact.points[:, 1])
-    problem.report.errors.update(compare(comm, contact, r, hertz))
-    if arguments.plot:
+    problem.report.errors.update(compare(MPI.COMM_WORLD, contact, r, HERTZ))
+    if demo.arguments.plot:
         from tfeti_dolfinx.plot import plot_deformed, plot_pressure
 
         folder, solution = demo.folder, problem.solution
@@ -91,7 +98,7 @@ def run(argv):
             folder / "hertz_3d_pressure.png",
             solution,
             lambda points: np.hypot(points[:, 0], points[:, 1]),
-            hertz.pressure,
+            HERTZ.pressure,
             limit=2 * a,
             label="r",
         )

@@ -299,7 +299,7 @@ def test_a_factor_without_memory_is_named():
         ierr = factor.OUT_OF_MEMORY
 
     A = csr_array(np.eye(3))
-    cause = factor._cause(NoMemory(factor.OUT_OF_MEMORY), "cholmod", factor._petsc_matrix(A))
+    cause = factor._cause(NoMemory(factor.OUT_OF_MEMORY), "cholmod", factor.as_petsc_matrix(A))
     assert "out of memory: cholmod had none for the factor of 3 unknowns with 3" in str(cause)
 
 

@@ -45,7 +45,7 @@ def test_a_stiff_body_that_contact_with_a_soft_one_holds(stiff_on_soft):
     """Gluing rows of the stiff body are 1e8 times as large as the rows that hold it."""
     coarse = stiff_on_soft.coarse
     mu = np.random.default_rng(0).standard_normal(coarse.dimension)
-    size = np.sqrt(coarse.gram().diagonal())
+    size = np.sqrt(coarse.grams.whole.diagonal())
     mu = coarse.null.removed(mu / np.where(size > 0.0, size, 1.0))
     x = stiff_on_soft.d.duplicate()
     coarse.combine(mu, x)

@@ -59,6 +59,13 @@ def test_agrees_with_an_active_set_on_the_untorn_mesh(cell):
         SMALSE | {"tfeti_mpgp_gamma": 10.0, "tfeti_mpgp_alpha": 1.0},
         {"tfeti_qp_type": "newton", "tfeti_newton_reduction": 0.1, "tfeti_newton_gamma": 0.3},
         {"tfeti_qp_type": "newton", "tfeti_pc_type": "lumped"},
+        {"tfeti_qp_type": "smalse", "tfeti_pc_type": "lumped"},
+        {"tfeti_qp_type": "smalse", "tfeti_pc_type": "dirichlet"},
+        {
+            "tfeti_qp_type": "smalse",
+            "tfeti_pc_type": "dirichlet",
+            "tfeti_mpgp_expansion": "projcg",
+        },
     ],
 )
 def test_variants_find_the_same(options):

@@ -90,7 +90,7 @@ def test_the_particular_solution_solves_G_lam_e(dual):
 def test_gram_is_G_Gt(dual):
     coarse = dual.coarse
     y = np.random.default_rng(0).standard_normal(coarse.dimension)
-    assert np.allclose(coarse.gram() @ y, coarse.G(coarse.Gt @ y), atol=1e-11)
+    assert np.allclose(coarse.grams.whole @ y, coarse.G(coarse.Gt @ y), atol=1e-11)
 
 
 def test_feasible_homogenisation(held_by_contact):
@@ -115,7 +115,7 @@ def test_the_feasible_homogenisation_is_the_smallest(held_by_contact):
     lam = feasible_particular(coarse, dual.d).array_r
     carrying = np.ones(len(lam), dtype=bool)
     carrying[bounded] = lam[bounded] > 0.0
-    gram = coarse.gram(carrying).toarray()
+    gram = coarse.grams.of_rows(carrying).toarray()
     alpha = np.linalg.lstsq(gram, coarse.e, rcond=1e-12)[0]
     force = coarse.Gt @ alpha
     assert np.allclose(force[carrying], lam[carrying], atol=1e-10)

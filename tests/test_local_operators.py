@@ -159,6 +159,7 @@ def test_the_answer_does_not_depend_on_the_form(local_type, contact):
         counts = [v for k, v in found.items() if k.startswith("F_") and k[2:] in FORMS]
         assert sum(counts) == report.subdomains == 8
         assert found["F_predicted"] > 0.0
+        assert found["F_bytes"] > 0.0
         assert found["F_measured"] > 0.0
         assert ("preconditioner_predicted" in found) != contact
         if name in ("implicit", "explicit"):
@@ -320,3 +321,11 @@ def test_the_model_prefers_what_is_cheaper():
     assert sweeps(small, 100, 1) < sweeps(large, 100, 1) < sweeps(large, 100, 64)
     assert sweeps(large, 100, 64) < 64 * sweeps(large, 100, 1)
     assert dense_product(100, 64) < 64 * dense_product(100, 1)
+
+
+@pytest.mark.parametrize(("mass", "form"), [(1.0, Explicit), (1e-8, Implicit)])
+def test_a_subdomain_that_is_hardly_held_keeps_its_factors(mass, form):
+    block = SparseBlock(data(*stiffness("quadrilateral", 12, mass=mass), trace_dofs=np.arange(20)))
+    (group,) = groups_of([block], "pinv")
+    assert isinstance(chosen(group, "auto", 10**9), form)
+    assert isinstance(chosen(group, "explicit", 10**9), Explicit)

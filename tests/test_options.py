@@ -51,10 +51,6 @@ def test_the_command_line_beats_the_dictionary():
         ({"tfeti_smalse_beta": 1.0}, r"-tfeti_smalse_beta 1.0: expected between 0 and 1"),
         ({"tfeti_smalse_rho": 0}, r"-tfeti_smalse_rho 0.0: expected more than 0"),
         ({"tfeti_mpgp_alpha": 3}, r"-tfeti_mpgp_alpha 3.0: expected more than 0, at most 2"),
-        (
-            {"tfeti_qp_type": "smalse", "tfeti_pc_type": "dirichlet"},
-            r"SMALSE-M takes no preconditioner",
-        ),
     ],
 )
 def test_options_that_do_not_fit(given, message):

@@ -20,7 +20,8 @@ from tfeti_dolfinx.qp.monitors import Monitor
 from tfeti_dolfinx.subdomains.block import Block
 from tfeti_dolfinx.subdomains.build import MakeBlock, sparse_blocks
 from tfeti_dolfinx.subdomains.data import Counters, SubdomainData
-from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, GeneralisedInverse, MakeInverse, Making
+from tfeti_dolfinx.subdomains.inverse import GeneralisedInverse
+from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, MakeInverse, Making
 from tfeti_dolfinx.subdomains.local import LocalChoice
 
 

@@ -15,7 +15,6 @@ from tfeti_dolfinx.checks import checked_type, shown
 from tfeti_dolfinx.described import Parameter, made, parameters_of
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.options import Options
-from tfeti_dolfinx.qp.solvers import SOLVERS
 
 # what factors of subdomains, the coarse problem and contact rows read from PETSc.s options
 FACTOR_OPTION = re.compile(r"(sub|coarse|face)_(pc_factor|mat)_\w+")
@@ -45,8 +44,6 @@ def parse_options(given: Mapping[str, Any] | None, prefix: str) -> Options:
             )
     values = {n: _converted(known[n], v, prefix) for n, v in named.items() if n in known}
     options: Options = made(Options, values)
-    if options.qp_type in SOLVERS:
-        check_preconditioner(options, options.qp_type, prefix)
     return options
 
 
@@ -54,20 +51,6 @@ def factor_options(given: Mapping[str, Any] | None, prefix: str) -> dict[str, An
     """Those options of a dictionary that PETSc itself reads, without the prefix."""
     named = _without_prefix(given, prefix)
     return {name: value for name, value in named.items() if FACTOR_OPTION.fullmatch(name)}
-
-
-def check_preconditioner(options: Options, qp_type: str, prefix: str) -> None:
-    """Raise if a preconditioner is asked for that the solver would ignore.
-
-    Raises:
-        InputError: The solver takes none, but ``pc_type`` is neither auto nor none.
-    """
-    why = SOLVERS[qp_type].unpreconditioned
-    if why and options.pc_type not in ("auto", "none"):
-        raise InputError(
-            f"-{prefix}pc_type {options.pc_type} with {qp_type}, which solves scenes with "
-            f"contact: {why}; expected auto or none"
-        )
 
 
 def _without_prefix(given: Any, prefix: str) -> dict[str, Any]:

@@ -36,8 +36,9 @@ class Options:
     max_it: int = described(10_000, "all", "most inner steps, and most outer ones", fits=FROM_0)
     pc_type: str = described(
         "auto",
-        "pcpg, newton",
-        "preconditioner; auto takes dirichlet, and none with smalse, which takes no other",
+        "all",
+        "preconditioner, with contact on the free rows alone; auto takes dirichlet, and none with "
+        "smalse",
         choices=("auto", "none", *PRECONDITIONERS),
     )
     scaling: str = described(
@@ -50,7 +51,8 @@ class Options:
     kplus_type: str = described(
         "regularized",
         "subdomains",
-        "generalised inverse of a subdomain",
+        "generalised inverse of a subdomain: K made regular on fixing nodes, by the Schur "
+        "complement on these, or by that on the last unknowns of an elimination",
         choices=tuple(KPLUS_TYPES),
     )
     local_type: str = described(

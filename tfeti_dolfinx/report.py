@@ -61,8 +61,8 @@ class Report:
         proportioning_steps: Proportioning steps.
         factorizations: Factorisations of subdomain matrices.
         local_operators: Of ``F`` and ``preconditioner``: how many subdomains apply theirs in each
-            form, and seconds of one multiplication, ``predicted`` by the model and ``measured``
-            (largest over ranks).
+            form, ``bytes`` that one multiplication moves on all ranks by the model, and its
+            seconds, ``predicted`` by the model and ``measured`` (largest over ranks).
         coarse_factorizations: Factorisations of GGᵀ.
         face_factorizations: Factorisations of G_f G_fᵀ, f a face of the rows.
         assemblies: Times that the stiffness was assembled.

@@ -85,6 +85,7 @@ def _local_operators(dual: Dual) -> dict[str, float]:
             continue
         forms = dual.coarse.comm.allreduce(operator.local.forms)
         found |= {f"{name}_{form}": float(forms[form]) for form in sorted(forms)}
+        found[f"{name}_bytes"] = dual.coarse.comm.allreduce(operator.local.traffic)
         for word, value in (
             ("predicted", operator.local.predicted),
             ("measured", operator.local_seconds),

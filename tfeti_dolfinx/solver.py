@@ -13,7 +13,6 @@ from tfeti_dolfinx.citations import cite
 from tfeti_dolfinx.dual.accuracy import Accuracy
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.errors import ConvergenceError, InputError
-from tfeti_dolfinx.option_parsing import check_preconditioner
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.homogenised import (
     Homogenised,
@@ -43,7 +42,7 @@ def resolve_types(options: Options, rows: Sequence[int], prefix: str) -> tuple[s
 
     Raises:
         InputError: The scene has inequalities or friction, but a solver that does not keep them
-            is asked for, or a preconditioner that the solver does not take.
+            is asked for.
     """
     qp_type, (num_inequalities, num_tangents) = options.qp_type, rows
     if qp_type == "auto":
@@ -60,7 +59,6 @@ def resolve_types(options: Options, rows: Sequence[int], prefix: str) -> tuple[s
             f"-{prefix}qp_type {qp_type}: the scene has {num_inequalities} contact rows, which "
             f"{qp_type.upper()} cannot keep; expected {' or '.join(['auto', *able])}"
         )
-    check_preconditioner(options, qp_type, prefix)
     pc_type = options.pc_type
     return qp_type, SOLVERS[qp_type].pc_type if pc_type == "auto" else pc_type
 

@@ -4,6 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from typing import TypeVar
+
+from tfeti_dolfinx.errors import InputError
+
+T = TypeVar("T")
 
 # in the order in which they are made, with the name that their seconds have in the report
 STAGES = {
@@ -70,3 +75,10 @@ class Stages:
         made, self.made = self.made, Counter()
         new = {*made, *(BRINGS.get(name) for name in made), *self._stale}
         return made, [name for name in STAGES if name not in new]
+
+
+def made(item: T | None) -> T:
+    """What a stage has made."""
+    if item is None:
+        raise InputError("nothing has been made yet; expected a call of solve() before")
+    return item

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from dolfinx import fem
@@ -27,15 +27,13 @@ from tfeti_dolfinx.parallel import any_rank
 from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.report_filling import fill_sizes
 from tfeti_dolfinx.solver import resolve_types
-from tfeti_dolfinx.stages import STAGES, Stages
+from tfeti_dolfinx.stages import STAGES, Stages, made
 from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
 from tfeti_dolfinx.subdomains.data import Counters
 from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.kernel import mode_names
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 from tfeti_dolfinx.timing import stage
-
-T = TypeVar("T")
 
 
 class System:
@@ -80,17 +78,17 @@ class System:
     @property
     def search(self) -> ContactSearch:
         """The contacts' conditions."""
-        return _made(self._search)
+        return made(self._search)
 
     @property
     def gluing(self) -> Gluing:
         """Rows, and the records that they come from."""
-        return _made(self._gluing)
+        return made(self._gluing)
 
     @property
     def dual(self) -> Dual:
         """The dual problem."""
-        return _made(self._dual)
+        return made(self._dual)
 
     def look_for_changes(self) -> None:
         """See whether the mesh, or what forms and Dirichlet conditions refer to, has changed.
@@ -157,7 +155,9 @@ class System:
             report.unmet_contacts = self.search.unmet()
         made, report.reused = self._stages.take_counts()
         report.assemblies, report.searches = made["stiffness"], made["search"]
-        report.gluings, report.coarse_factorizations = made["rows"], made["coarse problem"]
+        report.gluings = made["rows"]
+        has_kernel = self._dual is None or self._dual.coarse.dimension > 0
+        report.coarse_factorizations = made["coarse problem"] if has_kernel else 0
         factored = self._counters.factorizations
         report.factorizations = self._dofs.comm.allreduce(factored - self._counted)
         self._counted = factored
@@ -198,12 +198,12 @@ class System:
             self._gluing.constraints.destroy()
         search = self.search
         weights = row_weights(self._diagonal, self._settings.options.scaling, self._dofs.comm)
-        prescribed = _made(self._prescribed)
+        prescribed = made(self._prescribed)
         self._gluing = glue(self._dofs, prescribed, search.records, search.length, weights)
         self.spectrum = {}
 
     def _fill_right_side(self) -> None:
-        values, gaps = _made(self._prescribed).value, self.search.records.gap
+        values, gaps = made(self._prescribed).value, self.search.records.gap
         self._gluing = self.gluing.with_right_side(values, gaps)
 
     def _assemble_load(self) -> None:
@@ -217,15 +217,15 @@ class System:
         if self._K is None:  # it went into Blocks that could not be made
             self._assemble_stiffness()
             self._stages.made["stiffness"] += 1
-        data = subdomain_data(self._dofs, self._decomposition, self._K, self._f, trace)
-        self._K = None  # the Blocks have it
+        K, self._K = self._K, None  # it goes into the Blocks
+        data = subdomain_data(self._dofs, self._decomposition, K, self._f, trace)
         with added_options(self._settings.prefix, self._settings.factor_options):
             self._subdomains = make_subdomains(
                 data, make_block, self._decomposition, counters, choice
             )
 
     def _retrace(self) -> None:
-        _made(self._subdomains).retrace(self.gluing.constraints.trace)
+        made(self._subdomains).retrace(self.gluing.constraints.trace)
 
     def _make_dual(self) -> None:
         decomposition, dofs = self._decomposition, self._dofs
@@ -234,13 +234,13 @@ class System:
         own = self._settings.extensions.preconditioner
         if own is not None and pc_type == "none":
             raise InputError(
-                "extensions: a preconditioner is given, but the solver takes none, or "
-                f"-{self._settings.prefix}pc_type is none; expected one that takes it, say pcpg"
+                f"extensions: a preconditioner is given, but -{self._settings.prefix}pc_type is "
+                "none, as auto is with smalse; expected lumped or dirichlet, whose place it takes"
             )
         with added_options(self._settings.prefix, self._settings.factor_options):
             self._dual = Dual(
                 constraints=self.gluing.constraints,
-                subdomains=_made(self._subdomains),
+                subdomains=made(self._subdomains),
                 body_names=decomposition.body_names,
                 mode_names=mode_names(decomposition.mesh.geometry.dim, dofs.bs),
                 preconditioner=own or PRECONDITIONERS.get(pc_type),
@@ -271,10 +271,3 @@ MAKERS: dict[str, Callable[[System], None]] = {
     "coarse problem": System._make_dual,
     "linear term": lambda system: system.dual.update_load(),
 }
-
-
-def _made(item: T | None) -> T:
-    """What a stage has made."""
-    if item is None:
-        raise InputError("nothing has been made yet; expected a call of solve() before")
-    return item

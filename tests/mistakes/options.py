@@ -69,15 +69,6 @@ OPTIONS = {
     ),
     "a switch of 2": given(r"-tfeti_monitor 2: expected a value of type bool", monitor=2),
     "a switch of nan": given(r"-tfeti_view nan: expected a value of type bool", view=NAN),
-    "a preconditioner for smalse": given(
-        r"-tfeti_pc_type dirichlet with smalse.* takes no preconditioner",
-        tfeti_qp_type="smalse",
-        tfeti_pc_type="dirichlet",
-    ),
-    "a preconditioner where there is contact": (
-        lambda s: s.with_contacts(s.floor, tfeti_pc_type="lumped", tfeti_qp_type="smalse"),
-        r"-tfeti_pc_type lumped with smalse.* takes no preconditioner",
-    ),
     "pcpg where there is contact": (
         lambda s: s.with_contacts(s.floor, tfeti_qp_type="pcpg"),
         r"-tfeti_qp_type pcpg: the scene has \d+ contact rows, which PCPG cannot keep",

@@ -10,15 +10,11 @@ from scipy.sparse import csr_array, diags_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.bodies import Bodies
+from tfeti_dolfinx.dual.grams import Grams
 from tfeti_dolfinx.dual.kernel_basis import kernel_basis
 from tfeti_dolfinx.dual.motions import NULL, Motions, unresisted, unsprung
 from tfeti_dolfinx.dual.null_basis import null_basis
-from tfeti_dolfinx.dual.projectors import (
-    FaceFactors,
-    FaceProjectors,
-    Projectors,
-    replicated_gram,
-)
+from tfeti_dolfinx.dual.projectors import FaceFactors, FaceProjectors, Projectors
 from tfeti_dolfinx.dual.semidefinite import SemidefiniteFactor
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.parallel import agreed, chunk_offsets
@@ -58,6 +54,7 @@ class CoarseSpace(Projectors):
             on one body.
         free_motions: Motions that no row resists at all.
         null: Orthonormal basis of null(Gᵀ).
+        grams: GGᵀ, and those of faces.
         factors: Makes the factors of faces, and counts them apart from that of GGᵀ.
     """
 
@@ -88,9 +85,9 @@ class CoarseSpace(Projectors):
         self._read_load()
         joint = self.motions @ self.free_motions.joint
         self.null = agreed(comm, null_basis(np.flatnonzero(self._basis.free), joint))
-        self._gram = replicated_gram(self.Gt, comm)
+        self.grams = Grams(self.Gt, bounded, comm)
         self.factors = FaceFactors(comm, self.null, prefix)
-        self._factor = self.factors.factor(self._gram, "whole")
+        self._factor = self.factors.factor(self.grams.whole, "whole")
 
     def update_load(self) -> None:
         """Replace e = Rᵀ f by that of the Blocks' present loads."""
@@ -110,21 +107,19 @@ class CoarseSpace(Projectors):
         """Kernel coordinates of this rank's Blocks that belong to an r-vector."""
         return self._basis.kernel(alpha)[self._own]
 
-    def gram(self, rows: Array | None = None) -> csr_array:
-        """GGᵀ, or G_f G_fᵀ of the local rows flagged, shape ``(r, r)``; replicated."""
-        return self._gram if rows is None else replicated_gram(csr_array(self.Gt[rows]), self.comm)
-
     def damped_factor(self, rows: Array, damping: float) -> SemidefiniteFactor:
         """A factor of G_f G_fᵀ + damping·GGᵀ of the local rows flagged."""
-        return self.factors.factor(csr_array(self.gram(rows) + damping * self.gram()))
+        return self._damped(self.grams.of_rows(rows), damping)
 
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
         """(G_f G_fᵀ + damping·GGᵀ)⁻¹y, f a face of the rows."""
-        gram = replicated_gram(csr_array(face.Z.T @ self.Gt), self.comm)
-        factor = self.factors.factor(csr_array(gram + damping * self.gram()))
+        factor = self._damped(self.grams.of_face(face), damping)
         x = factor.solve(y)
         factor.destroy()
         return x
+
+    def _damped(self, gram: csr_array, damping: float) -> SemidefiniteFactor:
+        return self.factors.factor(csr_array(gram + damping * self.grams.whole))
 
     def on_face(self, face: Face) -> FaceProjectors:
         """The projectors on a face of the rows."""

@@ -202,8 +202,7 @@ def _balance(coarse: CoarseSpace, lam: PETSc.Vec) -> tuple[float, float]:
     """Entry of Gλ − e that is largest beside the forces on its mode, and those. Collective."""
     if coarse.dimension == 0:
         return 0.0, 0.0
-    forces = np.asarray(abs(coarse.Gt).T @ np.abs(lam.array_r))
-    coarse.comm.Allreduce(MPI.IN_PLACE, forces, op=MPI.SUM)
+    forces = coarse.terms(lam)
     forces = np.maximum(forces, LIGHT * forces.max())
     left = np.abs(coarse.G(lam.array_r) - coarse.e)
     worst = int(np.argmax(left / np.maximum(forces, TINY)))

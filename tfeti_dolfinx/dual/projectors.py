@@ -8,9 +8,10 @@ from typing import Protocol
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.dual.grams import Grams
 from tfeti_dolfinx.dual.null_basis import NullBasis
 from tfeti_dolfinx.dual.semidefinite import SemidefiniteFactor
 from tfeti_dolfinx.parallel import agreed
@@ -34,7 +35,7 @@ class Projectors:
 
     Attributes:
         comm: Communicator; all methods but ``combine`` are collective.
-        Gt: This rank's rows of Gᵀ, or of ZZᵀGᵀ, scipy CSR, shape ``(m_local, r)``.
+        Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
         e: Right side, shape ``(r,)``.
     """
 
@@ -45,7 +46,7 @@ class Projectors:
 
     def G(self, x: Array) -> Array:
         """G x, shape ``(r,)``, from this rank's part of x."""
-        y = self.Gt.T @ x
+        y = self.Gt.T @ self.restricted(x)
         self.comm.Allreduce(MPI.IN_PLACE, y, op=MPI.SUM)
         return np.asarray(y)
 
@@ -60,9 +61,15 @@ class Projectors:
 
     def forces(self, x: PETSc.Vec) -> Array:
         """Σ|G||x| + |e|, shape ``(r,)``."""
-        forces = np.asarray(abs(self.Gt).T @ np.abs(x.array_r))
-        self.comm.Allreduce(MPI.IN_PLACE, forces, op=MPI.SUM)
-        return forces + np.abs(self.e)
+        return self.terms(x) + np.abs(self.e)
+
+    def terms(self, x: PETSc.Vec) -> Array:
+        """Σ|G||x|, shape ``(r,)``."""
+        Gt = self.Gt
+        moduli = csr_array((np.abs(Gt.data), Gt.indices, Gt.indptr), shape=Gt.shape)
+        terms = np.asarray(moduli.T @ np.abs(self.restricted(x.array_r)))
+        self.comm.Allreduce(MPI.IN_PLACE, terms, op=MPI.SUM)
+        return terms
 
     def solve(self, y: Array) -> Array:
         """(GGᵀ)⁺ y for y in the range of G, orthogonal to the free motions."""
@@ -74,7 +81,18 @@ class Projectors:
 
     def project(self, x: PETSc.Vec) -> None:
         """x ← P x."""
-        x.array[:] = self.restricted(x.array_r) - self.Gt @ self.coordinates(x)
+        self._take_away(x, self.coordinates(x))
+
+    def project_against(self, x: PETSc.Vec, y: PETSc.Vec) -> tuple[float, float]:
+        """x ← P x; yᵀx and yᵀy, for y in the range of P. One reduction."""
+        own = self.restricted(x.array_r)
+        sums = np.append(self.Gt.T @ own, (own @ y.array_r, y.array_r @ y.array_r))
+        self.comm.Allreduce(MPI.IN_PLACE, sums, op=MPI.SUM)
+        self._take_away(x, self.solve(sums[:-2]))
+        return float(sums[-2]), float(sums[-1])
+
+    def _take_away(self, x: PETSc.Vec, mu: Array) -> None:
+        x.array[:] = self.restricted(x.array_r - self.Gt @ mu)
 
     def apply_Q(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = Gᵀ(GGᵀ)⁻¹G x."""
@@ -95,7 +113,7 @@ class Projectors:
 
     def combine(self, mu: Array, x: PETSc.Vec) -> None:
         """x = Gᵀ μ. Not collective."""
-        x.array[:] = self.Gt @ mu
+        x.array[:] = self.restricted(self.Gt @ mu)
 
     def destroy(self) -> None:
         """Free the factor."""
@@ -135,6 +153,7 @@ class Whole(Protocol):
     comm: MPI.Intracomm
     Gt: csr_array
     e: Array
+    grams: Grams
 
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
         """(G_f G_fᵀ + damping·GGᵀ)⁻¹y."""
@@ -155,9 +174,8 @@ class FaceProjectors(Projectors):
 
     def __init__(self, whole: Whole, face: Face, factors: FaceFactors) -> None:
         self.comm, self._whole, self._face = whole.comm, whole, face
-        GZt = csr_array(face.Z.T @ whole.Gt)
-        self.Gt, self.e = csr_array(face.Z @ GZt), whole.e
-        self._factor = factors.factor(replicated_gram(GZt, self.comm))
+        self.Gt, self.e = whole.Gt, whole.e
+        self._factor = factors.factor(whole.grams.of_face(face))
         self._factors = factors
 
     def restricted(self, x: Array) -> Array:
@@ -171,11 +189,3 @@ class FaceProjectors(Projectors):
     def on_face(self, face: Face) -> FaceProjectors:
         """The projectors of another face of all rows."""
         return FaceProjectors(self._whole, face, self._factors)
-
-
-def replicated_gram(Gt: csr_array, comm: MPI.Intracomm) -> csr_array:
-    """GGᵀ from all ranks' rows of Gᵀ, shape ``(r, r)``; on all ranks. Collective."""
-    local = (Gt.T @ Gt).tocoo()
-    row, column = (np.concatenate(comm.allgather(index)) for index in local.coords)
-    value = np.concatenate(comm.allgather(local.data))
-    return coo_array((value, (row, column)), shape=(Gt.shape[1],) * 2).tocsr()

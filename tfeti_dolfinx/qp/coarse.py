@@ -53,6 +53,10 @@ class Coarse(Protocol):
         """x ← P x. Collective."""
         ...
 
+    def project_against(self, x: PETSc.Vec, y: PETSc.Vec) -> tuple[float, float]:
+        """x ← P x; yᵀPx and yᵀy, for y in the range of P. Collective, one reduction."""
+        ...
+
     def apply_Q(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = Q x. Collective."""
         ...
@@ -119,6 +123,12 @@ class NoCoarse:
         if self._face is not None:
             x.array[:] = self._face.restricted(x.array_r)
 
+    def project_against(self, x: PETSc.Vec, y: PETSc.Vec) -> tuple[float, float]:
+        """x ← ZZᵀx; yᵀx and yᵀy."""
+        self.project(x)
+        yx, yy = y.mDot([x, y])
+        return float(yx), float(yy)
+
     def apply_Q(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = 0."""
         y.set(0.0)
@@ -179,6 +189,12 @@ class DenseCoarse:
         """x ← P x."""
         values = x.array_r if self._face is None else self._face.restricted(x.array_r)
         x.array[:] = values - self._Gf.T @ self.coordinates(x)
+
+    def project_against(self, x: PETSc.Vec, y: PETSc.Vec) -> tuple[float, float]:
+        """x ← P x; yᵀPx and yᵀy."""
+        self.project(x)
+        yx, yy = y.mDot([x, y])
+        return float(yx), float(yy)
 
     def apply_Q(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = Q x."""

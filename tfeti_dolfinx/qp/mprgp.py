@@ -10,6 +10,7 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
+from tfeti_dolfinx.qp.masked import MaskedPreconditioner
 from tfeti_dolfinx.qp.monitors import Monitor, no_monitor
 from tfeti_dolfinx.qp.problem import ConvergedReason, Operator, Steps
 
@@ -25,12 +26,22 @@ class Iterate:
         x: Starting point in Ω; updated in place.
         g: Its gradient; updated in place.
         feasible: The set Ω.
+        preconditioner: Preconditions in face; taken over.
     """
 
-    def __init__(self, A: Operator, x: PETSc.Vec, g: PETSc.Vec, feasible: FeasibleSet) -> None:
+    def __init__(
+        self,
+        A: Operator,
+        x: PETSc.Vec,
+        g: PETSc.Vec,
+        feasible: FeasibleSet,
+        preconditioner: MaskedPreconditioner | None = None,
+    ) -> None:
         self.A, self.x, self.g, self.feasible = A, x, g, feasible
         self._comm = x.getComm().tompi4py()
         self.phi, self.beta, self.p, self.Ap = (x.duplicate() for _ in range(4))
+        self._preconditioner = preconditioner
+        self.z = self.phi if preconditioner is None else x.duplicate()
         self.free_squared = self.chopped_squared = 0.0
         self.split()
 
@@ -39,6 +50,11 @@ class Iterate:
         self.phi.array[:], self.beta.array[:] = self.feasible.split(self.x.array_r, self.g.array_r)
         self.free_squared = self.phi.dot(self.phi)
         self.chopped_squared = self.beta.dot(self.beta)
+
+    def precondition(self) -> None:
+        """z = M_f φ on the face of x; without a preconditioner z is φ."""
+        if self._preconditioner is not None:
+            self._preconditioner.apply(self.face(), self.phi, self.z)
 
     @property
     def projected_gradient(self) -> float:
@@ -87,6 +103,9 @@ class Iterate:
         """Destroy the work vectors, not x and g. Collective."""
         for vec in (self.phi, self.beta, self.p, self.Ap):
             vec.destroy()
+        if self._preconditioner is not None:
+            self._preconditioner.destroy()
+            self.z.destroy()
 
 
 def fixed_step(state: Iterate, alpha_f: float, alpha_cg: float, alpha_bar: float) -> None:
@@ -162,11 +181,13 @@ def mprgp(
     """Minimise ½xᵀAx − bᵀx on Ω, from ``state`` on and in place. Collective.
 
     Dostál, Schöberl, Comput. Optim. Appl. 30 (2005) 23–43; Dostál, Optimal Quadratic
-    Programming Algorithms, Springer 2009, section 5.8, whose steps are numbered here. Where Ω has
-    curved sets it is MPGP (Dostál, Kozubek, Math. Program. 135 (2012) 195–220): a proportioning
-    step of less than ᾱ along −β would do nothing, and P_Ω(x − ᾱg) takes its place.
+    Programming Algorithms, Springer 2009, section 5.8, whose steps are numbered here, and 5.10
+    for preconditioning in face. Where Ω has curved sets it is MPGP (Dostál, Kozubek, Math.
+    Program. 135 (2012) 195–220): a proportioning step of less than ᾱ along −β would do nothing,
+    and P_Ω(x − ᾱg) takes its place.
 
-    Multiplications by A: one per CG or proportioning step, two per expansion step.
+    Multiplications by A: one per CG or proportioning step, two per expansion step; by M_f: one
+    per CG or expansion step.
 
     ===========================  =====================================
     reason                       when
@@ -198,14 +219,19 @@ def mprgp(
         None if ``stop`` ended the loop, else why it could not go on.
     """
     A, alpha_bar = state.A, parameters.alpha_bar
-    x, g, p, Ap, phi, beta = state.x, state.g, state.p, state.Ap, state.phi, state.beta
-    phi.copy(p)
+    x, g, p, Ap, z, beta = state.x, state.g, state.p, state.Ap, state.z, state.beta
+    conjugate, pAp = False, 1.0
     while not stop(state):
         if steps.inner >= max_it:
             return ConvergedReason.DIVERGED_ITS
         # Step 1: is x strictly proportional?
         if state.chopped_squared <= parameters.gamma**2 * state.reduced_squared(alpha_bar):
-            # Step 2: trial conjugate gradient step
+            # Step 2: trial conjugate gradient step, z = M_f φ
+            state.precondition()
+            if conjugate:
+                p.aypx(-z.dot(Ap) / pAp, z)
+            else:
+                z.copy(p)
             A.mult(p, Ap)
             pAp = p.dot(Ap)
             if not pAp > 0.0:
@@ -215,7 +241,7 @@ def mprgp(
                 # Step 3: conjugate gradient step
                 state.move(alpha_cg, p, Ap)
                 state.split()
-                p.aypx(-phi.dot(Ap) / pAp, phi)
+                conjugate = True
                 steps.cg += 1
                 monitor(steps, "cg", x, state.projected_gradient, -1.0)
                 continue
@@ -237,6 +263,6 @@ def mprgp(
             steps.proportioning += 1
             kind = "proportioning"
         state.split()
-        phi.copy(p)
+        conjugate = False
         monitor(steps, kind, x, state.projected_gradient, -1.0)
     return None

@@ -63,7 +63,8 @@ def pcpg(
 
     Farhat, Mandel, Roux, Comput. Methods Appl. Mech. Engrg. 115 (1994) 365–385, section 3. P is
     the projector of ``qp.coarse``: on a face λ moves in the face alone. Multiplies by F, and by
-    the preconditioner, once per step, and once more where the rule finds that g has drifted.
+    the preconditioner, once per step, and once more where the rule finds that g has drifted. A step
+    makes three global reductions: one with each projection, one for the norm of the residual.
 
     ===========================  ===================================================
     reason                       when
@@ -100,15 +101,13 @@ def pcpg(
         if reason != ConvergedReason.ITERATING:
             break
         # precondition and project: z = P M r
-        _precondition(qp, r, z)
+        own.rz, previous = _precondition(qp, r, z, norm), own.rz
         # direction
-        own.rz, previous = r.dot(z), own.rz
         p.aypx(0.0 if own.fresh else own.rz / previous, z)
         # step
         qp.F.mult(p, Fp)
         Fp.copy(z)
-        qp.coarse.project(z)
-        pFp, pp = p.mDot([z, p])
+        pFp, pp = qp.coarse.project_against(z, p)
         if not (own.seen(pFp, pp) and own.stands_out(own.rz, norm**2)):
             own.fresh, reason = True, _examined(qp, point, rule, norm)
             if reason == ConvergedReason.ITERATING:
@@ -208,10 +207,10 @@ def _residual(qp: QP, g: PETSc.Vec, r: PETSc.Vec) -> float:
     return float(r.norm())
 
 
-def _precondition(qp: QP, r: PETSc.Vec, z: PETSc.Vec) -> None:
-    """z = P M r, M the preconditioner or the identity."""
+def _precondition(qp: QP, r: PETSc.Vec, z: PETSc.Vec, norm: float) -> float:
+    """z = P M r, M the preconditioner or the identity; rᵀz, given ‖r‖."""
     if qp.preconditioner is None:
         r.copy(z)
-    else:
-        qp.preconditioner.mult(r, z)
-        qp.coarse.project(z)
+        return norm**2
+    qp.preconditioner.mult(r, z)
+    return qp.coarse.project_against(z, r)[0]

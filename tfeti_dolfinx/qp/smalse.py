@@ -5,6 +5,7 @@ from __future__ import annotations
 from petsc4py import PETSc
 
 from tfeti_dolfinx.qp.homogenised import Homogenised
+from tfeti_dolfinx.qp.masked import masked
 from tfeti_dolfinx.qp.monitors import Monitor, no_monitor
 from tfeti_dolfinx.qp.mprgp import Iterate, mprgp
 from tfeti_dolfinx.qp.parameters import SmalseParameters
@@ -53,7 +54,8 @@ def smalse(
     ('CONVERGED_RTOL', [0.6, 0.0, 0.4])
 
     Args:
-        qp: The program; parameters are relative to its norm.
+        qp: The program; parameters are relative to its norm. ``preconditioner_on`` preconditions
+            the conjugate gradient steps.
         homogenised: Its homogenised form.
         rule: Says when ‖g^P‖ and ‖F‖‖Qx‖ are small enough; asked in the inner loop too.
         parameters: ρ, M, β, η, Γ, ᾱ, expansion.
@@ -71,7 +73,7 @@ def smalse(
     x, y, Qx = _start(start, homogenised), b.duplicate(), b.duplicate()
     if start is not None:
         coarse.combine(start.mu, y)
-    state = Iterate(A, x, _gradient(A, x, b, y), feasible)
+    state = Iterate(A, x, _gradient(A, x, b, y), feasible, masked(qp, rho))
     inner = parameters.inner(max(norm, rho) or 1.0)
     steps, test = Steps(), InnerTest(homogenised, coarse, rule, precision, norm, eta)
     reason = ConvergedReason.ITERATING

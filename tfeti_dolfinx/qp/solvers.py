@@ -67,7 +67,6 @@ class Solver:
         keeps_bounds: Whether it keeps inequalities.
         keeps_discs: Whether it keeps discs and ellipses.
         pc_type: Preconditioner that ``auto`` stands for.
-        unpreconditioned: Why it takes no preconditioner; empty if it does.
         relative_to_norm: Whether its steps are relative to ‖PFP‖.
         cold: Where it starts, which is its λ̄; None: λ̄ is as options say.
         warm: From a start to its λ̄; None: λ̄ is as without one.
@@ -77,7 +76,6 @@ class Solver:
     keeps_bounds: bool
     keeps_discs: bool
     pc_type: str
-    unpreconditioned: str
     relative_to_norm: bool
     cold: Callable[[QP], PETSc.Vec] | None = None
     warm: Callable[[QP, Start], PETSc.Vec] | None = None
@@ -122,7 +120,6 @@ SOLVERS = {
         keeps_bounds=False,
         keeps_discs=False,
         pc_type="dirichlet",
-        unpreconditioned="",
         relative_to_norm=False,
         warm=_restored,
     ),
@@ -131,7 +128,6 @@ SOLVERS = {
         keeps_bounds=True,
         keeps_discs=True,
         pc_type="none",
-        unpreconditioned="SMALSE-M takes no preconditioner, since it would not preserve the bounds",
         relative_to_norm=True,
     ),
     "newton": Solver(
@@ -139,7 +135,6 @@ SOLVERS = {
         keeps_bounds=True,
         keeps_discs=False,
         pc_type="dirichlet",
-        unpreconditioned="",
         relative_to_norm=False,
         cold=first_point,
         warm=feasible_start,

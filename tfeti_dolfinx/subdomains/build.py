@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import pairwise
 from typing import Any
 
@@ -28,8 +28,8 @@ MakeBlock = Callable[[SubdomainData], Block]
 
 def subdomain_data(
     dofs: TornDofs, decomposition: Decomposition, K: Any, f: Array, trace: Array
-) -> list[SubdomainData]:
-    """What the Block of each subdomain of this rank is made from. Collective.
+) -> Iterator[SubdomainData]:
+    """What the Block of each subdomain of this rank is made from, one at a time. Collective.
 
     Args:
         dofs: Dof maps.
@@ -44,11 +44,12 @@ def subdomain_data(
     frames = _body_frames(dofs, decomposition, x, shares)
     loads, starts = dofs.to_primal(f), dofs.node_offsets * dofs.bs
     cuts = np.searchsorted(trace, starts)
-    data = []
-    for s, (K_s, subdomain) in enumerate(zip(submatrices(dofs, K), dofs.subdomains, strict=True)):
-        nodes = slice(dofs.node_offsets[s], dofs.node_offsets[s + 1])
-        data.append(
-            SubdomainData(
+
+    def data() -> Iterator[SubdomainData]:
+        pairs = zip(submatrices(dofs, K), dofs.subdomains, strict=True)
+        for s, (K_s, subdomain) in enumerate(pairs):
+            nodes = slice(dofs.node_offsets[s], dofs.node_offsets[s + 1])
+            yield SubdomainData(
                 name=f"subdomain {subdomain}",
                 K=K_s,
                 f=loads[starts[s] : starts[s + 1]],
@@ -57,17 +58,35 @@ def subdomain_data(
                 body_frame=frames[decomposition.body_of_subdomain[subdomain]],
                 node_shares=shares[nodes],
             )
-        )
-    return data
+
+    return data()
 
 
 def submatrices(dofs: TornDofs, K: Any) -> Iterator[csr_array]:
-    """Stiffness of each subdomain of this rank in primal order, from that of all of them."""
+    """Stiffness of each subdomain of this rank in primal order, from that of all of them.
+
+    Its entries are a part of K's own, in their place, where DOLFINx numbers the subdomain without
+    holes and no other one might be equal to it; else a copy. K is not to be used afterwards.
+    """
     dolfinx = dofs.dolfinx_dofs()
     primal = np.empty(len(dolfinx), dtype=np.int32)
     primal[dolfinx] = np.arange(len(dolfinx))
-    for first, last in pairwise((dofs.node_offsets * dofs.bs).tolist()):
-        yield _submatrix(K, dolfinx[first:last], primal, first)
+    starts = dofs.node_offsets * dofs.bs
+    lone = _lone(starts, np.diff(K.indptr)[dolfinx])
+    for s, (first, last) in enumerate(pairwise(starts.tolist())):
+        rows = dolfinx[first:last]
+        if np.all(np.diff(rows) == 1):
+            yield _part(K, slice(rows[0], rows[-1] + 1), copied=not lone[s])
+        else:
+            yield _submatrix(K, rows, primal, first)
+
+
+def _lone(starts: Array, entries_of_row: Array) -> Array:
+    """Flags of the subdomains that none other is equal to, by sizes and numbers of entries."""
+    entries = np.diff(np.append(0, np.cumsum(entries_of_row))[starts])
+    sizes = np.stack((np.diff(starts), entries), axis=1)
+    _, which, count = np.unique(sizes, axis=0, return_inverse=True, return_counts=True)
+    return np.asarray(count[which.ravel()] == 1)
 
 
 def sparse_blocks(how: Making, choice: LocalChoice) -> MakeBlock:
@@ -77,7 +96,7 @@ def sparse_blocks(how: Making, choice: LocalChoice) -> MakeBlock:
 
 
 def make_subdomains(
-    data: list[SubdomainData],
+    data: Iterable[SubdomainData],
     make_block: MakeBlock,
     decomposition: Decomposition,
     counters: Counters | None = None,
@@ -86,7 +105,7 @@ def make_subdomains(
     """A Block for each subdomain of this rank. Collective.
 
     Args:
-        data: The subdomains; the list is emptied, so that no K is held twice.
+        data: The subdomains; each is let go when its Block is made.
         make_block: Makes one, say ``SparseBlock`` or a class of one's own; what it raises is
             raised on all ranks.
         decomposition: The torn mesh.
@@ -95,12 +114,22 @@ def make_subdomains(
     """
     comm = decomposition.comm
     say_if_not_cholmod(comm)
-    blocks = []
     with raised_on_all_ranks(comm):
-        while data:
-            blocks.append(make_block(data.pop(0)))
+        blocks = [make_block(item) for item in data]
     bodies = decomposition.body_of_subdomain[decomposition.subdomains]
     return Subdomains(blocks, bodies, decomposition.num_bodies, comm, counters, choice)
+
+
+def _part(K: Any, rows: slice, copied: bool) -> csr_array:
+    """Stiffness of one subdomain whose unknowns are consecutive, in the same order."""
+    indptr = K.indptr[rows.start : rows.stop + 1]
+    entries, n = slice(indptr[0], indptr[-1]), rows.stop - rows.start
+    data, indices = K.data[entries], K.indices[entries] - rows.start
+    if copied:
+        data = data.copy()
+    A = csr_array((data, indices, (indptr - indptr[0]).astype(indices.dtype)), shape=(n, n))
+    A.sort_indices()
+    return A
 
 
 def _submatrix(K: Any, rows: Array, primal: Array, first: int) -> csr_array:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.subdomains.kplus import Making
+from tfeti_dolfinx.subdomains.kplus import Making, same_pattern
 from tfeti_dolfinx.subdomains.stiffness import Stiffness
 
 # Of the size of a subdomain: nodes nearer than that have the same place. Which nodes are meant
@@ -52,7 +52,7 @@ class EqualSubdomains:
         for stiffness, its_order in known:
             here = np.empty_like(order)
             here[order] = its_order
-            if stiffness is not own and _equal(K, stiffness.K, here):
+            if stiffness is not own and _equal(K, stiffness, here):
                 return stiffness, here
         if own is not None:
             own.replace(K)
@@ -73,13 +73,16 @@ def _shape_and_order(x: Array, bs: int) -> tuple[bytes, Array]:
     return bytes([bs]) + places[nodes].tobytes(), order
 
 
-def _equal(K: Any, other: Any, here: Array) -> bool:
+def _equal(K: Any, other: Stiffness, here: Array) -> bool:
     """Whether K is the other stiffness, its unknown i being the other's ``here[i]``."""
-    allowed = SAME * np.abs(other.data).max(initial=0.0)
+    allowed = SAME * np.abs(other.K.data).max(initial=0.0)
+    in_order = np.array_equal(here, np.arange(len(here)))
+    if in_order and same_pattern(K, other.K):
+        return bool(np.abs(K.data - other.K.data).max(initial=0.0) <= allowed)
     # the diagonals tell most of those apart that are not
-    if not np.abs(K.diagonal() - other.diagonal()[here]).max(initial=0.0) <= allowed:
+    if not np.abs(K.diagonal() - other.diagonal[here]).max(initial=0.0) <= allowed:
         return False
     there = np.argsort(here).astype(here.dtype)
     moved = K[there]
     moved = csr_array((moved.data, here[moved.indices], moved.indptr), shape=K.shape)
-    return bool(np.abs((moved - other).data).max(initial=0.0) <= allowed)
+    return bool(np.abs((moved - other.K).data).max(initial=0.0) <= allowed)

@@ -67,7 +67,7 @@ class CholeskyFactor:
 
     def __init__(self, A: Any, prefix: str = "tfeti_sub_", keep: bool = False) -> None:
         self._prefix, self._keep = prefix, keep
-        self._matrix: Any = _petsc_matrix(A)
+        self._matrix: Any = as_petsc_matrix(A)
         self._b, self._x = self._matrix.createVecs()
         self._pc: Any = PETSc.PC().create(PETSc.COMM_SELF)
         self._factor: Any = None
@@ -106,8 +106,10 @@ class CholeskyFactor:
 
     def solve(self, b: Array) -> Array:
         """A⁻¹ b, shapes ``(n,)`` or ``(n, q)``."""
+        if b.ndim == 2 and b.shape[1] == 1:
+            return self.solve(b[:, 0])[:, None]
         if b.ndim == 2:
-            return self._solve_many(b) if b.shape[1] > 1 else self.solve(b[:, 0])[:, None]
+            return self._solve_many(b) if b.shape[1] else np.array(b)
         self._b.array[:] = b
         self._factor.solve(self._b, self._x)
         return np.array(self._x.array_r)
@@ -196,7 +198,7 @@ def _say(solver: str) -> None:
     )
 
 
-def _petsc_matrix(A: Any) -> PETSc.Mat:
+def as_petsc_matrix(A: Any) -> PETSc.Mat:
     """A as a matrix of PETSc, on the same arrays if they are sorted CSR of PETSc's integers."""
     A = A.tocsr()
     A.sort_indices()

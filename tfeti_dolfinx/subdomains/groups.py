@@ -9,7 +9,7 @@ import numpy as np
 
 from tfeti_dolfinx.arrays import Array, parts_of
 from tfeti_dolfinx.subdomains.block import Block, OperatorKind
-from tfeti_dolfinx.subdomains.cost import Cost, dense_product
+from tfeti_dolfinx.subdomains.cost import TOGETHER, Cost, dense_product, dense_traffic
 from tfeti_dolfinx.subdomains.matrices import (
     OwnMatrix,
     PinvMatrix,
@@ -74,7 +74,8 @@ class Implicit:
 
     def __init__(self, group: Group) -> None:
         self.group, self.name = group, "implicit" if group.count == 1 else "shared_implicit"
-        self.cost = Cost(0.0, group.matrix.seconds(group.count))
+        matrix, count = group.matrix, group.count
+        self.cost = Cost(0.0, matrix.seconds(count), matrix.traffic(count))
 
     def prepare(self) -> None:
         """The factors are there."""
@@ -89,8 +90,8 @@ class Explicit:
 
     def __init__(self, group: Group) -> None:
         self.group, self.name = group, "explicit" if group.count == 1 else "shared_explicit"
-        size = group.matrix.size
-        self.cost = Cost(group.matrix.seconds(size), dense_product(size, group.count))
+        t, count = group.matrix.size, group.count
+        self.cost = Cost(group.matrix.seconds(t), dense_product(t, count), dense_traffic(t, count))
 
     def prepare(self) -> None:
         """Make the matrix."""
@@ -110,18 +111,52 @@ def chosen(group: Group, local_type: str, multiplications: int) -> Form:
         return explicit
     if local_type == "shared" and group.count == 1:
         return implicit
-    forms: list[Form] = [implicit, explicit]
-    return min(forms, key=lambda form: form.cost.of(multiplications))
+    if implicit.cost.of(multiplications) <= explicit.cost.of(multiplications):
+        return implicit
+    return explicit if group.matrix.is_sound else implicit
 
 
 def groups_of(blocks: Sequence[Block], kind: OperatorKind) -> Iterator[Group]:
-    """Groups that are as large as possible."""
+    """Groups that are as large as possible; Blocks without a trace have nothing to apply."""
     members: dict[Hashable, list[int]] = {}
     for i, block in enumerate(blocks):
-        members.setdefault(_key(block, kind), []).append(i)
+        if len(block.trace_dofs):
+            members.setdefault(_key(block, kind), []).append(i)
     parts = parts_of([len(block.trace_dofs) for block in blocks])
     for chosen_blocks in members.values():
         yield _group([blocks[i] for i in chosen_blocks], kind, [parts[i] for i in chosen_blocks])
+
+
+def solved_together(blocks: Sequence[Block], parts: Sequence[slice], b: Array) -> Array:
+    """K⁺ b of all Blocks, shape ``(n,)``; of equal ones with several right sides at once.
+
+    Args:
+        blocks: The Blocks.
+        parts: Where the unknowns of each lie among the n.
+        b: Right sides.
+    """
+    x = np.empty(len(b))
+    members: dict[int, list[tuple[SparseBlock, slice]]] = {}
+    for block, part in zip(blocks, parts, strict=True):
+        if isinstance(block, SparseBlock):
+            members.setdefault(id(block.stiffness), []).append((block, part))
+        else:
+            x[part] = block.solve(b[part])
+    for equal in members.values():
+        for first in range(0, len(equal), TOGETHER):
+            _solve_some(equal[first : first + TOGETHER], b, x)
+    return x
+
+
+def _solve_some(equal: Sequence[tuple[SparseBlock, slice]], b: Array, x: Array) -> None:
+    """x = K⁺ b on the parts of some Blocks with one stiffness."""
+    stiffness = equal[0][0].stiffness
+    columns = np.empty((stiffness.size, len(equal)), order="F")
+    for j, (block, part) in enumerate(equal):
+        columns[block.place, j] = b[part]
+    solved = stiffness.solve(columns)
+    for j, (block, part) in enumerate(equal):
+        x[part] = solved[block.place, j]
 
 
 def _key(block: Block, kind: OperatorKind) -> Hashable:

@@ -5,37 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.subdomains.data import Counters
-from tfeti_dolfinx.subdomains.factor import CholeskyFactor, FactorSize
+from tfeti_dolfinx.subdomains.factor import CholeskyFactor
+from tfeti_dolfinx.subdomains.inverse import FactoredInverse, GeneralisedInverse
+from tfeti_dolfinx.subdomains.pseudoinverse import SchurPseudoinverse, TrailingPseudoinverse
 
 
-class GeneralisedInverse(Protocol):
-    """K⁺ with K K⁺ K = K."""
-
-    def solve(self, b: Array) -> Array:
-        """K⁺ b, shape ``(n,)``."""
-        ...
-
-    def refactor(self, R: Array) -> None:
-        """Follow new values of K in the same pattern; R is their kernel.
-
-        Raises:
-            FactorError: The factor could not be made.
-        """
-        ...
-
-    def destroy(self) -> None:
-        """Free the factor."""
-        ...
-
-
-class Regularised:
+class Regularised(FactoredInverse):
     """K_ρ⁻¹ with K_ρ = K + ρ Nᵀ(NNᵀ)⁻¹N, N the kernel on a few fixing unknowns, ρ = max diag K.
 
     An exact generalised inverse, because N R is regular
@@ -59,15 +41,6 @@ class Regularised:
         with _regular_values(K, R, fixing_dofs):
             self._factor = CholeskyFactor(K, prefix, keep=True)
 
-    def solve(self, b: Array) -> Array:
-        """K⁺ b, shapes ``(n,)`` or ``(n, q)``."""
-        return self._factor.solve(b)
-
-    @property
-    def size(self) -> FactorSize:
-        """What the factor stores."""
-        return self._factor.size
-
     def refactor(self, R: Array) -> None:
         """Follow new values of K in the same pattern; R is their kernel.
 
@@ -78,10 +51,6 @@ class Regularised:
         with _regular_values(self._K, R, self._fixing_dofs):
             self._factor.refactor()
 
-    def destroy(self) -> None:
-        """Free the factor."""
-        self._factor.destroy()
-
 
 def regularised(K: Any, R: Array, fixing_dofs: Array, prefix: str = "tfeti_sub_") -> CholeskyFactor:
     """K_ρ⁻¹ (see ``Regularised``) of a K that is not needed any more.
@@ -91,13 +60,6 @@ def regularised(K: Any, R: Array, fixing_dofs: Array, prefix: str = "tfeti_sub_"
         FactorError: It could not be made for another reason.
     """
     return CholeskyFactor(regular_matrix(K, R, fixing_dofs), prefix)
-
-
-def solved(inverse: GeneralisedInverse, b: Array) -> Array:
-    """K⁺ b, shapes ``(n,)`` or ``(n, q)``, by an inverse that may know single vectors only."""
-    if b.ndim == 1 or isinstance(inverse, Regularised):
-        return inverse.solve(b)
-    return np.stack([inverse.solve(column) for column in b.T], axis=1)
 
 
 def regular_matrix(K: Any, R: Array, fixing_dofs: Array) -> Any:
@@ -156,7 +118,11 @@ def _regular_values(K: Any, R: Array, fixing_dofs: Array) -> Iterator[None]:
 
 # from K, its kernel, the unknowns of fixing nodes and a prefix of options to K⁺
 MakeInverse = Callable[[Any, Array, Array, str], GeneralisedInverse]
-KPLUS_TYPES: dict[str, MakeInverse] = {"regularized": Regularised}
+KPLUS_TYPES: dict[str, MakeInverse] = {
+    "regularized": Regularised,
+    "schur": SchurPseudoinverse,
+    "lu_svd": TrailingPseudoinverse,
+}
 
 
 @dataclass(frozen=True)

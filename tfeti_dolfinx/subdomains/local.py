@@ -94,13 +94,14 @@ class GroupedOperator:
 
     Attributes:
         predicted: After ``prepare``: seconds of one multiplication by the model.
+        traffic: Bytes that it moves by the model.
         forms: Number of subdomains in each form.
     """
 
     def __init__(self, blocks: Sequence[Block], kind: OperatorKind, choice: LocalChoice) -> None:
         self._blocks, self._kind, self._choice = blocks, kind, choice
         self._forms: list[Form] = []
-        self.predicted, self.forms = 0.0, Counter[str]()
+        self.predicted, self.traffic, self.forms = 0.0, 0.0, Counter[str]()
 
     def prepare(self) -> None:
         """Let Blocks make what they need, and make dense matrices where they are chosen."""
@@ -111,6 +112,7 @@ class GroupedOperator:
             form.prepare()
             self._forms.append(form)
             self.predicted += form.cost.multiplication
+            self.traffic += form.cost.traffic
             self.forms[form.name] += group.count
 
     def mult(self, w: Array, out: Array) -> None:

@@ -8,10 +8,21 @@ from typing import Protocol
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.subdomains.cost import TOGETHER, sparse_products, sweeps
+from tfeti_dolfinx.subdomains.cost import (
+    TOGETHER,
+    sparse_products,
+    sparse_traffic,
+    sweeps,
+    sweeps_traffic,
+)
 from tfeti_dolfinx.subdomains.dense import Packed, Whole, made_dense
 from tfeti_dolfinx.subdomains.stiffness import Stiffness
 from tfeti_dolfinx.subdomains.traced import Traced
+
+# Of the stiffness of a node: what K⁺ makes of forces of size 1 on a sound subdomain stays far below
+# it. Above it, where springs or soft parts hardly hold a subdomain, the parts of K⁺ w that cancel
+# are so large that a dense product loses two or three times as much to rounding as a factor does.
+HARDLY_HELD = 1e5
 
 
 class TraceMatrix(Protocol):
@@ -25,12 +36,21 @@ class TraceMatrix(Protocol):
     size: int
     has_dense: bool
 
+    @property
+    def is_sound(self) -> bool:
+        """Whether a dense one rounds no worse than the factors; may cost a solve."""
+        ...
+
     def apply(self, W: Array) -> Array:
         """A W, shapes ``(t, q)``."""
         ...
 
     def seconds(self, count: int) -> float:
         """Of ``apply`` to so many vectors, by the model."""
+        ...
+
+    def traffic(self, count: int) -> float:
+        """Bytes that ``apply`` to so many vectors moves, by the model."""
         ...
 
     def dense(self, packed: bool) -> Packed | Whole:
@@ -51,6 +71,15 @@ class PinvMatrix:
     def __init__(self, stiffness: Stiffness, trace: Array) -> None:
         self._stiffness, self._trace, self.size = stiffness, trace, len(trace)
 
+    @property
+    def is_sound(self) -> bool:
+        """Whether random forces of size 1 move the trace by no more than a sound subdomain."""
+        if self.size == 0:
+            return True
+        forces = np.random.default_rng(0).standard_normal((self.size, 1))
+        largest = self._stiffness.diagonal[self._trace].max()
+        return bool(np.abs(self.apply(forces)).max() * largest <= HARDLY_HELD)
+
     def apply(self, W: Array) -> Array:
         """K⁺ W, through the factor, as many right sides at once as are good for the cache."""
         out = np.empty(W.shape, order="F")
@@ -64,6 +93,10 @@ class PinvMatrix:
     def seconds(self, count: int) -> float:
         """Of ``apply`` to so many vectors, by the model."""
         return sweeps(self._stiffness.factor_size, self._stiffness.size, count)
+
+    def traffic(self, count: int) -> float:
+        """Bytes that ``apply`` to so many vectors moves, by the model."""
+        return sweeps_traffic(self._stiffness.factor_size, self._stiffness.size, count)
 
     def dense(self, packed: bool) -> Packed | Whole:
         """The same, dense; kept for the next operator on this trace."""
@@ -87,6 +120,11 @@ class SchurMatrix:
     def __init__(self, traced: Traced) -> None:
         self._traced, self.size = traced, len(traced.trace)
 
+    @property
+    def is_sound(self) -> bool:
+        """Yes: S is of the size of K."""
+        return True
+
     def apply(self, W: Array) -> Array:
         """S W, through the factor of K_ii."""
         return self._traced.apply_schur(W)
@@ -99,6 +137,15 @@ class SchurMatrix:
             return products
         products += 2.0 * sparse_products(self._traced.K_ib.nnz, count)
         return products + sweeps(inner.size, self._traced.K_ib.shape[0], count)
+
+    def traffic(self, count: int) -> float:
+        """Bytes that ``apply`` to so many vectors moves, by the model."""
+        inner, K_ib = self._traced.inner, self._traced.K_ib
+        products = sparse_traffic(self._traced.K_bb.nnz, count)
+        if inner is None:
+            return products
+        products += 2.0 * sparse_traffic(K_ib.nnz, count)
+        return products + sweeps_traffic(inner.size, K_ib.shape[0], count)
 
     def dense(self, packed: bool) -> Packed | Whole:
         """The same, dense."""
@@ -117,6 +164,11 @@ class StiffnessMatrix:
     def __init__(self, traced: Traced) -> None:
         self._traced, self.size = traced, len(traced.trace)
 
+    @property
+    def is_sound(self) -> bool:
+        """There is no dense one."""
+        return True
+
     def apply(self, W: Array) -> Array:
         """K_bb W."""
         return self._traced.apply_stiffness(W)
@@ -124,6 +176,10 @@ class StiffnessMatrix:
     def seconds(self, count: int) -> float:
         """Of ``apply`` to so many vectors, by the model."""
         return sparse_products(self._traced.K_bb.nnz, count)
+
+    def traffic(self, count: int) -> float:
+        """Bytes that ``apply`` to so many vectors moves, by the model."""
+        return sparse_traffic(self._traced.K_bb.nnz, count)
 
     def dense(self, packed: bool) -> Packed | Whole:
         """The same, dense."""
@@ -143,12 +199,21 @@ class OwnMatrix:
     def __init__(self, apply: Callable[[Array], Array], size: int) -> None:
         self._apply, self.size = apply, size
 
+    @property
+    def is_sound(self) -> bool:
+        """Nothing is known against it."""
+        return True
+
     def apply(self, W: Array) -> Array:
         """A W."""
         return np.stack([self._apply(np.ascontiguousarray(w)) for w in W.T], axis=1)
 
     def seconds(self, count: int) -> float:
         """Nothing is known of it: 0, so that it stays as it is."""
+        return 0.0
+
+    def traffic(self, count: int) -> float:
+        """Bytes that ``apply`` to so many vectors moves, by the model."""
         return 0.0
 
     def dense(self, packed: bool) -> Packed | Whole:

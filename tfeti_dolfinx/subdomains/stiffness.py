@@ -12,15 +12,9 @@ from tfeti_dolfinx.subdomains.dense import Packed, Whole
 from tfeti_dolfinx.subdomains.factor import REAL, FactorSize, NotPositiveDefiniteError
 from tfeti_dolfinx.subdomains.indefinite import why_indefinite
 from tfeti_dolfinx.subdomains.input_checks import check_stiffness
+from tfeti_dolfinx.subdomains.inverse import FactoredInverse, GeneralisedInverse, solved
 from tfeti_dolfinx.subdomains.kernel import candidate_modes, fixing_dofs, kernel_of
-from tfeti_dolfinx.subdomains.kplus import (
-    GeneralisedInverse,
-    Making,
-    Regularised,
-    same_pattern,
-    solved,
-    with_entries,
-)
+from tfeti_dolfinx.subdomains.kplus import Making, same_pattern, with_entries
 from tfeti_dolfinx.subdomains.traced import Traced
 
 
@@ -89,7 +83,7 @@ class Stiffness:
     @property
     def factor_size(self) -> FactorSize:
         """What the factor stores; of an inverse of one's own, as if it were dense."""
-        if isinstance(self._pinv, Regularised):
+        if isinstance(self._pinv, FactoredInverse):
             return self._pinv.size
         n = float(self.size)
         return FactorSize(n * n / 2.0, REAL * n * n / 2.0)

@@ -13,6 +13,7 @@ from tfeti_dolfinx.arrays import Array, joined, parts_of
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.subdomains.block import Block, OperatorKind
 from tfeti_dolfinx.subdomains.data import Counters
+from tfeti_dolfinx.subdomains.groups import solved_together
 from tfeti_dolfinx.subdomains.local import GroupedOperator, LocalChoice, local_operator
 
 
@@ -188,24 +189,21 @@ class Subdomains:
         """K⁺(f − w) on all unknowns, shape ``(n,)``; w on the trace, shape ``(t,)``."""
         force = np.zeros(self.dof_parts[-1].stop if self.dof_parts else 0)
         force[self.trace] = w
-        return self.pinv_load - self._solved(force)
+        return self.pinv_load - solved_together(self.blocks, self.dof_parts, force)
 
     @property
     def pinv_load(self) -> Array:
         """K⁺ f on all unknowns, shape ``(n,)``; solved for once."""
         if self._pinv_load is None:
             self.counters.load_solves += len(self.blocks)
-            self._pinv_load = self._solved(joined([block.load for block in self.blocks]))
+            load = joined([block.load for block in self.blocks])
+            self._pinv_load = solved_together(self.blocks, self.dof_parts, load)
         return self._pinv_load
 
     def energies(self, u: Array) -> list[float]:
         """uᵀKu of each Block."""
         pairs = zip(self.blocks, self.dof_parts, strict=True)
         return [float(u[part] @ block.multiply(u[part])) for block, part in pairs]
-
-    def _solved(self, b: Array) -> Array:
-        pairs = zip(self.blocks, self.dof_parts, strict=True)
-        return joined([block.solve(b[part]) for block, part in pairs])
 
     def _summed(self, matrix: Callable[[Block], Array]) -> Array:
         """k × k matrices of the Blocks, summed by bodies. Collective."""

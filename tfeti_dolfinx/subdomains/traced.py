@@ -63,9 +63,12 @@ class Traced:
 
     @cached_property
     def inner(self) -> CholeskyFactor | None:
-        """K_ii⁺; K_ii is singular where the trace leaves a motion free, say normal rows only."""
+        """K_ii⁺; K_ii is singular where the trace leaves a motion free, say normal rows only.
+
+        None where there is no inside, or no trace that would ask for it.
+        """
         inner = self._inner_dofs
-        if len(inner) == 0:
+        if len(inner) == 0 or len(self.trace) == 0:
             return None
         R_inner = self._kernel[inner] @ null_space(self._kernel[self.trace], rcond=NOT_ON_TRACE)
         self._how.counters.factorizations += 1

@@ -1,0 +1,195 @@
+"""The forms of K⁺ on a floating subdomain, its fixing nodes well and badly chosen.
+
+    ./run python3 benchmarks/kplus_forms.py
+
+A beam without any support, 4 : 1 in 2D and 4 : 1 : 1 in 3D: condition numbers of what is factored
+and of the Schur complement on the fixing unknowns, and errors of K⁺. Nothing is parallel. Results
+go to results/kplus_forms.md, .json and .png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+import petsc4py
+
+if __name__ == "__main__":
+    petsc4py.init(sys.argv[:1])
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from dolfinx import mesh as dmesh
+from mpi4py import MPI
+from scipy.linalg import eigh
+from scipy.sparse import csr_array
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.tables import markdown, write_tables
+from tfeti_dolfinx.compat import assemble_csr
+from tfeti_dolfinx.subdomains.kernel import candidate_modes, fixing_nodes, kernel_of
+from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, regular_matrix, with_entries
+
+ASPECT, NU = 4, 0.3
+SOFTEST = 8  # deformations that K⁺ is to find
+
+
+class Beam:
+    """K of a floating beam of n cells across, with what is exact about it.
+
+    Attributes:
+        K: Stiffness.
+        x: Nodes.
+        R: Kernel.
+        softest: The softest deformations, orthonormal.
+        condition: Of K beside its kernel.
+    """
+
+    def __init__(self, gdim, n):
+        corners = [(0.0,) * gdim, (ASPECT,) + (1.0,) * (gdim - 1)]
+        cells = [ASPECT * n] + [n] * (gdim - 1)
+        create = dmesh.create_rectangle if gdim == 2 else dmesh.create_box
+        cell = dmesh.CellType.quadrilateral if gdim == 2 else dmesh.CellType.hexahedron
+        V = fem.functionspace(create(MPI.COMM_SELF, corners, cells, cell), ("Lagrange", 1, (gdim,)))
+        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+        strain = ufl.sym(ufl.grad(u))
+        mu, lmbda = 0.5 / (1 + NU), NU / (1 + NU) / (1 - 2 * NU)
+        stress = 2 * mu * strain + lmbda * ufl.tr(strain) * ufl.Identity(gdim)
+        form = fem.form(ufl.inner(stress, ufl.sym(ufl.grad(v))) * ufl.dx)
+        self.K = csr_array(assemble_csr(form))
+        self.K.sort_indices()
+        self.x, self.n, self.gdim = V.tabulate_dof_coordinates()[:, :gdim], n, gdim
+        self.R = kernel_of(self.K, candidate_modes(self.x, gdim, self.x.mean(axis=0), 1.0))
+        values, vectors = eigh(self.K.toarray())
+        r = self.R.shape[1]
+        self.condition = float(values[-1] / values[r])
+        self.softest = vectors[:, r : r + SOFTEST]
+
+    def choices(self):
+        """Names of choices of fixing nodes, with the nodes."""
+        count, middle, h = 2**self.gdim, self.x.mean(axis=0), 1.0 / self.n
+        end = np.flatnonzero(self.x[:, 0] < h / 2)
+        places = {
+            "spread": fixing_nodes(self.x, count),
+            "spread over one end": end[fixing_nodes(self.x[end], count)],
+            "a cell in the middle": self.cell(np.floor(middle / h) * h),
+            "a cell in a corner": self.cell(np.zeros(self.gdim)),
+        }
+        return {name: np.sort(nodes) for name, nodes in places.items()}
+
+    def cell(self, corner):
+        """Nodes of the cell that begins at a corner."""
+        h = 1.0 / self.n
+        return np.flatnonzero(np.all(np.abs(self.x - corner - h / 2) < 0.6 * h, axis=1))
+
+    def dofs(self, nodes):
+        """Unknowns of some nodes."""
+        return (nodes[:, None] * self.gdim + np.arange(self.gdim)).ravel()
+
+
+def condition(A, kernel=0):
+    """Largest over least eigenvalue, but for a kernel."""
+    values = np.linalg.eigvalsh(A)
+    return float(values[-1] / values[kernel]) if len(values) > kernel else 1.0
+
+
+def schur_complement(K, s):
+    """K_ss − K_sr K_rr⁻¹ K_rs, and K_rr, dense."""
+    r = np.setdiff1d(np.arange(K.shape[0]), s)
+    K_rs, K_rr = K[np.ix_(r, s)], K[np.ix_(r, r)]
+    return K[np.ix_(s, s)] - K_rs.T @ np.linalg.solve(K_rr, K_rs), K_rr
+
+
+def errors_of(pinv, beam):
+    """Relative errors of K⁺: in soft deformations, from their forces, and of K K⁺ K = K."""
+    K, R, u = beam.K, beam.R, beam.softest
+    found = pinv.solve(extended_product(K, u))
+    found -= R @ (R.T @ found)
+    deformation = np.linalg.norm(found - u, axis=0).max()
+    f = K @ np.random.default_rng(0).standard_normal((K.shape[0], SOFTEST))
+    identity = np.linalg.norm(K @ pinv.solve(f) - f) / np.linalg.norm(f)
+    return {"error of a deformation": float(deformation), "error of K K⁺ K": float(identity)}
+
+
+def extended_product(K, u):
+    """K u, each entry rounded once."""
+    terms = K.data.astype(np.longdouble)[:, None] * u[K.indices]
+    return np.add.reduceat(terms, K.indptr[:-1], axis=0).astype(float)
+
+
+def row(kind, choice, beam, nodes):
+    """One form with one choice of fixing nodes."""
+    dofs, K, R = beam.dofs(nodes), beam.K, beam.R
+    entry = {"K⁺": kind, "fixing nodes": choice}
+    pinv = KPLUS_TYPES[kind](with_entries(K.copy(), dofs), R, dofs, "tfeti_sub_")
+    if kind == "regularized":
+        entry |= {"unknowns": len(dofs)}
+        entry |= {"condition of the factor": condition(regular_matrix(K, R, dofs).toarray())}
+        entry |= {"condition of S": "-"}
+    else:
+        S, K_rr = schur_complement(K.toarray(), pinv.unknowns)
+        entry |= {"unknowns": len(S), "condition of the factor": condition(K_rr)}
+        entry |= {"condition of S": condition(S, R.shape[1])}
+    entry |= errors_of(pinv, beam)
+    pinv.destroy()
+    return entry
+
+
+def study(gdim, n):
+    """All forms and choices; LU-SVD has no choice."""
+    beam = Beam(gdim, n)
+    rows = [
+        row(kind, choice, beam, nodes)
+        for choice, nodes in beam.choices().items()
+        for kind in ("regularized", "schur")
+    ]
+    rows.append(row("lu_svd", "the last of the elimination", beam, beam.choices()["spread"]))
+    title = f"{gdim}D, {beam.K.shape[0]} unknowns, condition of K {beam.condition:.3g}"
+    return title, rows
+
+
+def draw(target, tables):
+    """Error over condition, a panel for each beam."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10, 4.5), layout="constrained")
+    panels = figure.subplots(1, len(tables), squeeze=False)[0]
+    for axes, (title, rows) in zip(panels, tables.items(), strict=True):
+        for kind, colour in zip(KPLUS_TYPES, ("C0", "C1", "C2"), strict=True):
+            of = [row for row in rows if row["K⁺"] == kind]
+            across = [row["condition of the factor"] for row in of]
+            for name, fill in (("a deformation", colour), ("K K⁺ K", "none")):
+                errors = [row[f"error of {name}"] for row in of]
+                axes.loglog(across, errors, "o", color=colour, mfc=fill, label=f"{kind}, {name}")
+        axes.set_title(title, fontsize=9)
+        axes.set_xlabel("condition of what is factored")
+        axes.set_ylabel("relative error")
+        axes.legend(fontsize=7)
+    partial = target.with_name(f".partial-{target.name}")
+    FigureCanvasAgg(figure).print_png(str(partial))
+    os.replace(partial, target)
+
+
+def main(argv):
+    """Run the tables and write them; returns them."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="small beams, for the tests")
+    parser.add_argument("--output", type=Path, default=Path("results"))
+    arguments = parser.parse_args(argv)
+    sizes = ((2, 2), (3, 2)) if arguments.quick else ((2, 16), (3, 4))
+    tables = dict(study(gdim, n) for gdim, n in sizes)
+    if MPI.COMM_WORLD.rank == 0:
+        write_tables(arguments.output, "kplus_forms", tables)
+        draw(arguments.output / "kplus_forms.png", tables)
+        for title, rows in tables.items():
+            print(f"{title}\n\n{markdown(rows)}\n")
+    return tables
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,188 @@
+"""Seconds and memory of each stage of a solve, and bandwidth of F beside that of a copy.
+
+    ./run mpirun -n 2 python3 benchmarks/stages.py [--quick | --large]
+
+Memory is what all ranks have in use when a stage ends, and what their processes hold then: what is
+freed may stay theirs (Open MPI wants it so), and is used for what comes later. A multiplication
+by F reads each subdomain's factor twice, or its dense matrix once: if the machine's memory is what
+limits it, its bytes per second come near those of a copy of an array larger than the cache, by all
+ranks at once (reading and writing both count). Results go to results/stages.md, .json and .png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ctypes
+import sys
+import time
+from pathlib import Path
+from typing import ClassVar
+
+import petsc4py
+
+if __name__ == "__main__":
+    petsc4py.init(sys.argv[:1])
+
+import numpy as np
+from mpi4py import MPI
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import tfeti_dolfinx as tfeti
+from benchmarks.pictures import picture, stacked
+from benchmarks.tools import STAGES, command_line, finish
+from demos import cube_3d, hertz_3d
+from demos.demo_tools import petsc_options
+
+DEMOS = {"cube_3d": cube_3d, "hertz_3d": hertz_3d}
+SIZES = {
+    "quick": {
+        "cube_3d": {"subdomains": 8, "cells": 4},
+        "hertz_3d": {"unknowns": 4_000, "subdomains": 4},
+    },
+    "default": {
+        "cube_3d": {"subdomains": 64, "cells": 10},
+        "hertz_3d": {"unknowns": 60_000, "subdomains": 16},
+    },
+    "large": {
+        "cube_3d": {"subdomains": 512, "cells": 10},
+        "hertz_3d": {"unknowns": 235_000, "subdomains": 64},
+    },
+}
+# numbers of an array that is copied; the caches of today's processors hold less
+COPIED = {True: 2**20, False: 2**25}
+STATUS = Path("/proc/self/status")
+
+
+class Watched(dict):
+    """Seconds of stages that also notes what memory this rank has when a stage ends.
+
+    Args:
+        seconds: Of the mesh, and of what else is known.
+        mesh: ``memory()`` when the mesh was made.
+
+    Attributes:
+        memory: Megabytes in use, and held, at the end of each stage.
+    """
+
+    def __init__(self, seconds, mesh):
+        self.memory = {"mesh": mesh}
+        super().__init__(seconds)
+
+    def __setitem__(self, name, value):
+        super().__setitem__(name, value)
+        self.memory.setdefault(name, memory())  # at its first end: contact comes back at the last
+
+    def __reduce__(self):
+        """What travels between ranks is the seconds."""
+        return dict, (dict(self),)
+
+
+class Mallinfo(ctypes.Structure):
+    """What mallinfo2 of glibc returns."""
+
+    NAMES = "arena ordblks smblks hblks hblkhd usmblks fsmblks uordblks fordblks keepcost"
+    _fields_: ClassVar = [(name, ctypes.c_size_t) for name in NAMES.split()]
+
+
+def memory():
+    """Megabytes that this process has in use, and those that it holds. Without glibc the same."""
+    (line,) = (line for line in STATUS.read_text().splitlines() if line.startswith("VmRSS"))
+    held = float(line.split()[1]) / 1024
+    try:
+        mallinfo = ctypes.CDLL(None).mallinfo2
+    except AttributeError:
+        return held, held
+    mallinfo.restype = Mallinfo
+    info = mallinfo()
+    return (info.uordblks + info.hblkhd) / 2**20, held
+
+
+def solved(demo, size, options):
+    """The report of a scene, its seconds watched."""
+    scene = demo.scene(demo.torn_mesh(argparse.Namespace(quick=False, **size)))
+    mesh = memory()
+    problem = tfeti.ContactProblem(**scene, petsc_options={"tfeti_qp_type": "newton", **options})
+    seconds = problem.report.seconds = Watched(problem.report.seconds, mesh)
+    problem.solve()
+    problem.destroy()
+    return problem.report, seconds
+
+
+def stage_rows(seconds):
+    """A row for each stage. Collective."""
+    comm = MPI.COMM_WORLD
+    whole = sum(seconds.get(name, 0.0) for name in STAGES)
+    return [
+        {
+            "stage": name,
+            "seconds": seconds[name],
+            "share": seconds[name] / whole,
+            "MB in use": comm.allreduce(seconds.memory[name][0]),
+            "MB held": comm.allreduce(seconds.memory[name][1]),
+        }
+        for name in STAGES
+        if name in seconds
+    ]
+
+
+def bandwidth_row(scene, operator, local, copy):
+    """Bytes, seconds and bandwidth of a multiplication by F or the preconditioner."""
+    rate = local[f"{operator}_bytes"] / local[f"{operator}_measured"]
+    return {
+        "scene": scene,
+        "operator": operator,
+        "MB": local[f"{operator}_bytes"] / 1e6,
+        "seconds": local[f"{operator}_measured"],
+        "predicted": local[f"{operator}_predicted"],
+        "GB/s": rate / 1e9,
+        "copy, GB/s": copy / 1e9,
+        "of copy": rate / copy,
+    }
+
+
+def copy_bandwidth(count):
+    """Bytes per second that all ranks read and write together in a copy. Collective."""
+    comm, least = MPI.COMM_WORLD, np.inf
+    source, target = np.ones(count), np.empty(count)
+    for _ in range(5):
+        comm.barrier()
+        start = time.perf_counter()
+        np.copyto(target, source)
+        least = min(least, comm.allreduce(time.perf_counter() - start, op=MPI.MAX))
+    return comm.size * 2 * source.nbytes / least
+
+
+def configure(parser):
+    parser.add_argument("--large", action="store_true", help="larger scenes")
+
+
+def draw(path, tables):
+    """Seconds of stages."""
+    stages = {title: rows for title, rows in tables.items() if "stage" in rows[0]}
+    with picture(path, len(stages)) as axes:
+        for panel, (title, rows) in zip(axes, stages.items(), strict=True):
+            stacked(panel, title, rows, ["seconds"])
+
+
+def main(argv):
+    """Run the scenes and write their tables; returns them."""
+    arguments, rest = command_line(__doc__, argv, configure)
+    size = "quick" if arguments.quick else "large" if arguments.large else "default"
+    comm, tables, local = MPI.COMM_WORLD, {}, {}
+    for name, demo in DEMOS.items():
+        report, seconds = solved(demo, SIZES[size][name], petsc_options(rest))
+        local[name] = report.local_operators
+        title = f"{name}, {report.primal_dofs} unknowns, {comm.size} ranks"
+        tables[title] = stage_rows(seconds)
+    copy = copy_bandwidth(COPIED[arguments.quick])
+    tables["Local operators"] = [
+        bandwidth_row(name, operator, found, copy)
+        for name, found in local.items()
+        for operator in ("F", "preconditioner")
+    ]
+    return finish(arguments.output, "stages", tables, draw, comm.rank)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

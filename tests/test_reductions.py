@@ -1,0 +1,89 @@
+"""Global reductions of a step of conjugate gradients, counted."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from petsc4py import PETSc
+from scenes import curved_obstacle, decomposed, problem
+from test_solvable_lp import dual_of
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.qp.faces import Status, face_of
+from tfeti_dolfinx.qp.homogenised import homogenise
+from tfeti_dolfinx.qp.pcpg import pcpg
+from tfeti_dolfinx.qp.problem import ConvergedReason, Point, Steps
+from tfeti_dolfinx.qp.stopping import ResidualRule
+
+# what PETSc logs of vectors; each is a reduction on more ranks than one
+EVENTS = ("VecDot", "VecTDot", "VecMDot", "VecMTDot", "VecNorm", "VecDotNorm2")
+COLLECTIVE = ("allreduce", "Allreduce", "reduce", "Reduce", "bcast", "Bcast", "allgather", "gather")
+
+
+class Counted:
+    """A communicator that counts its global calls."""
+
+    def __init__(self, comm):
+        self._comm, self.calls = comm, 0
+
+    def __getattr__(self, name):
+        self.calls += name in COLLECTIVE
+        return getattr(self._comm, name)
+
+
+@pytest.fixture(scope="module")
+def dual():
+    d = decomposed("hexahedron", 4, subdomains=6)
+    obstacle = tfeti.Obstacle("bottom", curved_obstacle(3))
+    p = problem(d, contacts=[obstacle], tfeti_pc_type="dirichlet", tfeti_qp_type="newton")
+    made = dual_of(p)
+    made.coarse.comm = Counted(made.coarse.comm)
+    PETSc.Log.begin()
+    yield made
+    made.coarse.comm = made.coarse.comm._comm
+    p.destroy()
+
+
+def face_with_half_of_the_contacts(dual):
+    free = np.ones(dual.constraints.num_rows, dtype=bool)
+    free[dual.constraints.sets.normals[::2]] = False
+    return face_of(free, np.where(free, Status.TOUCHING, Status.OPEN))
+
+
+def count(dual, qp, num_steps):
+    """Global calls of so many steps, with what comes before and after them."""
+    start = homogenise(qp)
+    point, steps = Point(start.lam_bar.copy(), start.gradient.copy()), Steps()
+    logged = [PETSc.Log.Event(name) for name in EVENTS]
+    before = dual.coarse.comm.calls + sum(event.getPerfInfo()["count"] for event in logged)
+    reason = pcpg(qp, point, ResidualRule(0.0), steps, num_steps)
+    after = dual.coarse.comm.calls + sum(event.getPerfInfo()["count"] for event in logged)
+    assert reason == ConvergedReason.DIVERGED_ITS and steps.cg == num_steps
+    point.destroy()
+    start.destroy()
+    return after - before
+
+
+@pytest.mark.parametrize("on_face", [False, True])
+@pytest.mark.parametrize(("preconditioned", "most"), [(True, 3), (False, 2)])
+def test_a_step_of_pcpg_makes_three_reductions(dual, on_face, preconditioned, most):
+    qp = dual.qp()
+    face = face_with_half_of_the_contacts(dual)
+    preconditioner = qp.preconditioner_on(face) if on_face else qp.preconditioner
+    if on_face:
+        qp = replace(qp, coarse=qp.coarse.on_face(face))
+    qp = replace(qp, preconditioner=preconditioner if preconditioned else None)
+    assert count(dual, qp, 7) - count(dual, qp, 2) == 5 * most
+
+
+def test_reductions_are_seen(dual):
+    """The test above would count what PCPG called twice."""
+    x, coarse = dual.d.copy(), dual.coarse
+    before = coarse.comm.calls
+    coarse.project(x)
+    assert coarse.comm.calls == before + 1
+    norm = PETSc.Log.Event("VecNorm")
+    before = norm.getPerfInfo()["count"]
+    x.norm()
+    assert norm.getPerfInfo()["count"] == before + 1
+    x.destroy()
