@@ -11,8 +11,8 @@ PACKAGE = Path(__file__).resolve().parents[1] / "tfeti_dolfinx"
 
 # the rooms in their order; those of one line may not import from each other
 ROOMS = [
-    ["errors", "arrays", "citations", "stages", "version"],
-    ["checks", "compat", "parallel", "states", "timing"],
+    ["errors", "arrays", "citations", "version"],
+    ["checks", "compat", "parallel", "stages", "states", "timing"],
     ["described"],
     ["mesh"],
     ["mortar"],

@@ -58,7 +58,8 @@ def count(dual, qp, num_steps):
     before = dual.coarse.comm.calls + sum(event.getPerfInfo()["count"] for event in logged)
     reason = pcpg(qp, point, ResidualRule(0.0), steps, num_steps)
     after = dual.coarse.comm.calls + sum(event.getPerfInfo()["count"] for event in logged)
-    assert reason == ConvergedReason.DIVERGED_ITS and steps.cg == num_steps
+    assert reason == ConvergedReason.DIVERGED_ITS
+    assert steps.cg == num_steps
     point.destroy()
     start.destroy()
     return after - before
