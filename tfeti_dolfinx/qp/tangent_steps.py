@@ -18,8 +18,8 @@ from tfeti_dolfinx.qp.problem import Operator
 # multiplication then brings the point back to the boundary. Measured on the cube of tresca_3d.py,
 # 8 subdomains, reductions of 0.3, 0.1, 0.03: 125, 144, 158 multiplications.
 REDUCTION, MOST_STEPS = 0.3, 30
-# of the slope: what the cost must fall by for a step to be taken; of ‖g‖ times the step: what is
-# lost to rounding, since g does not vanish where the boundary is pushed against
+# of the slope: what the cost must fall by for a step to be taken; of ‖g‖‖x‖: what is lost
+# to rounding, since g does not vanish where the boundary is pushed against
 ENOUGH, ROUNDING = 0.1, 1e-15
 # of ‖β‖²: so much must be tangential for the face to be where work is left
 TANGENTIAL = 0.5
@@ -79,7 +79,7 @@ def step_on_face(state: Point, alpha_bar: float) -> int:
     image.axpy(1.0, cg.Ad)
     bend.axpy(1.0, cg.d)  # all of the step
     change = state.g.dot(bend) + 0.5 * bend.dot(image)
-    allowed = ENOUGH * state.g.dot(cg.d) + ROUNDING * state.g.norm() * bend.norm()
+    allowed = ENOUGH * state.g.dot(cg.d) + ROUNDING * state.g.norm() * state.x.norm()
     falls = agreed(comm, bool(change <= allowed))
     if falls:
         state.g.axpy(1.0, image)
