@@ -1,6 +1,6 @@
 """The price of contact beside that of one linear elasticity solve of the same untorn mesh.
 
-    ./run mpirun -n 2 python3 benchmarks/linear_price.py [--quick | --large] [--scenes hertz_3d]
+    ./run mpirun -n 2 python3 benchmarks/linear_price.py [--quick | --large] [--processor]
 
 The linear problem (``benchmarks/linear.py``) has the contact's solution: nodes that carry a contact
 force are held where the contact's solution puts them. PETSc's CG gets it to the same error as the
@@ -37,10 +37,11 @@ from benchmarks.linear import (
     solve,
 )
 from benchmarks.pictures import picture, stacked
-from benchmarks.tools import command_line, finish, solve_seconds
+from benchmarks.tools import choose_clock, command_line, configure_clock, finish, solve_seconds
 from demos import cube_3d, hertz_3d
 from demos.demo_tools import petsc_options
 
+OTHERS = [kind for kind in SETTINGS if kind != "GAMG"]
 DEMOS = {"cube_3d": cube_3d, "hertz_3d": hertz_3d}
 SIZES = {
     "quick": {
@@ -62,6 +63,8 @@ def configure(parser):
     parser.add_argument("--large", action="store_true", help="2 million unknowns, no direct solver")
     parser.add_argument("--scenes", nargs="+", choices=list(DEMOS), default=list(DEMOS))
     parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--others", nargs="*", choices=OTHERS, default=OTHERS, help="than GAMG")
+    configure_clock(parser)
     parser.add_argument("--no-smalse", action="store_true", help="block Newton alone")
 
 
@@ -116,7 +119,7 @@ def study(demo, size, options, repeats, arguments):
     linear = linear_problem(scene, problem.solution)
     problem.destroy()
     rows = [[row]]
-    work = tried(linear, rtol, arguments.large)
+    work = tried(linear, rtol, arguments)
     for repeat in range(repeats):
         for i, (kind, setting, tolerance) in enumerate(work):
             if repeat == 0:
@@ -134,14 +137,14 @@ def study(demo, size, options, repeats, arguments):
     return [min(found, key=price) for found in rows], problem.report
 
 
-def tried(linear, rtol, large):
+def tried(linear, rtol, arguments):
     """Kind, setting and tolerance of the linear solvers that PETSc has."""
     comm = linear.A.getComm().tompi4py()
     return [
         (kind, setting, first_tolerance(linear, text, rtol))
-        for kind, settings in SETTINGS.items()
-        for setting, text in settings.items()
-        if available(kind, setting, comm) and not (large and kind == "direct")
+        for kind in ("GAMG", *arguments.others)
+        for setting, text in SETTINGS[kind].items()
+        if available(kind, setting, comm) and not (arguments.large and kind == "direct")
     ]
 
 
@@ -175,12 +178,12 @@ def main(argv):
     arguments, rest = command_line(__doc__, argv, configure)
     size = "quick" if arguments.quick else "large" if arguments.large else "default"
     repeats = 1 if arguments.quick else arguments.repeats
-    options, comm = petsc_options(rest), MPI.COMM_WORLD
+    options, comm, unit = petsc_options(rest), MPI.COMM_WORLD, choose_clock(arguments)
     tables = {}
     for name in arguments.scenes:
         rows, report = study(DEMOS[name], SIZES[size][name], options, repeats, arguments)
         sizes = f"{report.primal_dofs} unknowns, {report.subdomains} subdomains"
-        tables[f"{name}: {sizes}, {comm.size} ranks"] = with_ratios(rows)
+        tables[f"{name}: {sizes}, {comm.size} ranks, {unit}"] = with_ratios(rows)
     return finish(arguments.output, "linear_price", tables, draw, comm.rank)
 
 

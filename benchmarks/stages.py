@@ -1,12 +1,13 @@
 """Seconds and memory of each stage of a solve, and bandwidth of F beside that of a copy.
 
-    ./run mpirun -n 2 python3 benchmarks/stages.py [--quick | --large]
+    ./run mpirun -n 2 python3 benchmarks/stages.py [--quick | --large] [--processor]
 
 Memory is what all ranks have in use when a stage ends, and what their processes hold then: what is
 freed may stay theirs (Open MPI wants it so), and is used for what comes later. A multiplication
 by F reads each subdomain's factor twice, or its dense matrix once: if the machine's memory is what
 limits it, its bytes per second come near those of a copy of an array larger than the cache, by all
-ranks at once (reading and writing both count). Results go to results/stages.md, .json and .png.
+ranks at once (reading and writing both count); its seconds are always those of the wall. Results go
+to results/stages.md, .json and .png.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import tfeti_dolfinx as tfeti
 from benchmarks.pictures import picture, stacked
-from benchmarks.tools import STAGES, command_line, finish
+from benchmarks.tools import STAGES, choose_clock, command_line, configure_clock, finish
 from demos import cube_3d, hertz_3d
 from demos.demo_tools import petsc_options
 
@@ -155,6 +156,7 @@ def copy_bandwidth(count):
 
 def configure(parser):
     parser.add_argument("--large", action="store_true", help="larger scenes")
+    configure_clock(parser)
 
 
 def draw(path, tables):
@@ -162,18 +164,18 @@ def draw(path, tables):
     stages = {title: rows for title, rows in tables.items() if "stage" in rows[0]}
     with picture(path, len(stages)) as axes:
         for panel, (title, rows) in zip(axes, stages.items(), strict=True):
-            stacked(panel, title, rows, ["seconds"])
+            stacked(panel, title.rpartition(",")[0], rows, ["seconds"])
 
 
 def main(argv):
     """Run the scenes and write their tables; returns them."""
     arguments, rest = command_line(__doc__, argv, configure)
     size = "quick" if arguments.quick else "large" if arguments.large else "default"
-    comm, tables, local = MPI.COMM_WORLD, {}, {}
+    comm, tables, local, unit = MPI.COMM_WORLD, {}, {}, choose_clock(arguments)
     for name, demo in DEMOS.items():
         report, seconds = solved(demo, SIZES[size][name], petsc_options(rest))
         local[name] = report.local_operators
-        title = f"{name}, {report.primal_dofs} unknowns, {comm.size} ranks"
+        title = f"{name}, {report.primal_dofs} unknowns, {comm.size} ranks, {unit}"
         tables[title] = stage_rows(seconds)
     copy = copy_bandwidth(COPIED[arguments.quick])
     tables["Local operators"] = [

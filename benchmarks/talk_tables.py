@@ -69,7 +69,6 @@ def row(reports, talk, subdomains, rtol):
         "power method": smalse.power_method_multiplications,
         **{f"seconds, {name}": seconds_of(report) for name, report in reports.items()},
         "seconds, talk": seconds,
-        "MB": newton.peak_memory_mb,
     }
 
 

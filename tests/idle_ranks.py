@@ -105,10 +105,15 @@ def test_no_contact(comm, shared_tmp, pc_type, subdomains):
 
 
 @pytest.mark.parametrize(
-    ("cell", "homogenization"),
-    [("quadrilateral", "natural"), ("quadrilateral", "feasible"), ("tetrahedron", "natural")],
+    ("cell", "options"),
+    [
+        ("quadrilateral", {}),
+        ("quadrilateral", {"homogenization": "feasible"}),
+        ("quadrilateral", {"qp_type": "smalse", "pc_type": "dirichlet"}),
+        ("tetrahedron", {"kplus_type": "schur"}),
+    ],
 )
-def test_a_pair(comm, shared_tmp, cell, homogenization):
+def test_a_pair(comm, shared_tmp, cell, options):
     d = stacked(cell, 3, 4, 2)
     sides = ["lower bottom", "lower left", "upper left"]
     sides += ["lower front", "upper front"] if cell == "tetrahedron" else []
@@ -117,7 +122,7 @@ def test_a_pair(comm, shared_tmp, cell, homogenization):
         pressed(d),
         held(d, *sides),
         [tfeti.Contact("upper bottom", "lower top")],
-        tfeti_homogenization=homogenization,
+        **options,
     )
     assert some_rank_is_idle(d)
     p.solve()

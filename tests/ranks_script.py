@@ -4,7 +4,7 @@ import sys
 
 import numpy as np
 import ufl
-from bodies import held, sided, stacked, two_body_problem
+from bodies import gathered, held, sided, stacked, two_body_problem
 from mpi4py import MPI
 from scenes import curved_obstacle, decomposed, displacement, problem
 
@@ -41,5 +41,9 @@ if __name__ == "__main__":
     p = scenes[scene](cell, int(subdomains), tfeti_rtol=float(rtol))
     p.solve()
     x, u = displacement(p)
+    data = p.solution.contact(0)
+    points, force, gap = (gathered(part) for part in (data.points, data.force, data.gap))
+    order = np.lexsort(np.rint(1e7 * points).T)
+    contact = {"force": force[order], "gap": gap[order]}
     if MPI.COMM_WORLD.rank == 0:
-        np.savez(path, x=x, u=u, active=p.report.active_contacts)
+        np.savez(path, x=x, u=u, active=p.report.active_contacts, **contact)

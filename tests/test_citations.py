@@ -22,15 +22,16 @@ def of(*methods):
 
 
 @pytest.mark.parametrize(
-    ("demo", "methods"),
+    ("demo", "options", "methods"),
     [
-        ("linear_3d", ("tfeti", "pcpg")),
-        ("cube_3d", ("tfeti", "smalse")),
-        ("stacked_blocks_3d", ("tfeti", "smalse", "mortar")),
+        ("linear_3d", [], ("tfeti", "pcpg")),
+        ("cube_3d", [], ("tfeti", "newton")),
+        ("cube_3d", ["-tfeti_qp_type", "smalse"], ("tfeti", "smalse")),
+        ("stacked_blocks_3d", [], ("tfeti", "newton", "mortar")),
     ],
 )
-def test_citations_of_a_run(serial_only, demo, methods, tmp_path):
-    command = [sys.executable, ROOT / f"demos/{demo}.py", "--quick", "-citations"]
+def test_citations_of_a_run(serial_only, demo, options, methods, tmp_path):
+    command = [sys.executable, ROOT / f"demos/{demo}.py", "--quick", "-citations", *options]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert result.returncode == 0, result.stderr
     ours = of(*PAPERS)

@@ -1,14 +1,22 @@
 """The forms of K⁺: each a generalised inverse, on any kernel, with the same answers."""
 
+import re
+
 import numpy as np
 import pytest
 from scenes import curved_obstacle, decomposed, displacement, problem
 from scipy.linalg import null_space, pinvh
 from scipy.sparse import csr_array, diags_array
 from test_blocks import RIGID, data, stiffness
+from test_extensions import DensePinv
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.subdomains.conformance import check_block, check_kind_of_block
+from tfeti_dolfinx.errors import ConformanceError
+from tfeti_dolfinx.subdomains.conformance import (
+    check_block,
+    check_kind_of_block,
+    check_kind_of_inverse,
+)
 from tfeti_dolfinx.subdomains.data import Counters
 from tfeti_dolfinx.subdomains.factor import NotPositiveDefiniteError
 from tfeti_dolfinx.subdomains.kernel import candidate_modes, fixing_dofs, kernel_of
@@ -70,6 +78,28 @@ def test_a_generalised_inverse(kind, cell, degree, kernel):
 @pytest.mark.parametrize("kind", TYPES)
 def test_blocks_with_it_keep_their_promises(kind):
     check_kind_of_block(lambda data: SparseBlock(data, Making(kplus=KPLUS_TYPES[kind])))
+
+
+@pytest.mark.parametrize("kind", TYPES)
+def test_inverses_keep_their_promises(kind):
+    check_kind_of_inverse(KPLUS_TYPES[kind])
+
+
+def test_an_inverse_of_one_s_own_can_be_checked():
+    check_kind_of_inverse(DensePinv)
+
+    class Stale(DensePinv):
+        def refactor(self, R):
+            if not hasattr(self, "inverse"):
+                super().refactor(R)
+
+    class Crooked(DensePinv):
+        def solve(self, b):
+            return np.roll(super().solve(b), 1)
+
+    for kind, promise in ((Stale, "K K⁺ K = K"), (Crooked, "K K⁺ K = K")):
+        with pytest.raises(ConformanceError, match=f"does not hold: {re.escape(promise)}"):
+            check_kind_of_inverse(kind)
 
 
 @pytest.mark.parametrize("kind", TYPES)

@@ -121,6 +121,27 @@ def test_without_a_kernel():
     assert np.allclose(lam, reference, atol=1e-7 * np.abs(reference).max())
 
 
+def test_what_equations_take_from_d_does_not_drown_the_rest():
+    """d + Gᵀμ adds a constant to q; all numbers are exact, but Fλ − d has 16 digits only."""
+    F, d, _, e, bounded = program(6)
+    d, G = np.rint(2**20 * d) / 2**20, np.zeros((1, len(d)))
+    G[:, : len(d) // 2] = 1.0
+    qp, moved = (qp_of(F, d + mu * G[0], G, np.ones(1), bounded) for mu in (0.0, 2.0**32))
+    expected, found = (solved(each, 1e-9) for each in (qp, moved))
+    assert np.allclose(found.lam.array_r, expected.lam.array_r, rtol=0.0, atol=1e-6)
+    assert np.allclose(found.gradient.array_r, expected.gradient.array_r, rtol=0.0, atol=1e-7)
+    assert np.allclose(found.mu, expected.mu - 2.0**32, rtol=1e-15, atol=0.0)
+
+
+def test_forces_that_are_rounding_do_not_say_what_touches():
+    """min ½λ₁² − λ₁ + λ₂, λ ≥ 0, from λ₂ = 1e-25: nothing rests on the second row."""
+    qp = QP(matrix(np.eye(2)), vector([1.0, -1.0]), NoCoarse(), bounds_on(np.arange(2)))
+    start = homogenise(qp, image(qp.F, vector([1.0, 1e-25])))
+    found = newton(qp, start, ResidualRule(1e-10), warm=True)
+    assert found.lam.array_r[1] > 0.0
+    assert found.face.carrying.tolist() == [True, False]
+
+
 def test_nothing_to_do_costs_nothing():
     """d = 0, e = 0: the start is the solution."""
     F, d, G, e, bounded = program(5)

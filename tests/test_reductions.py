@@ -9,6 +9,7 @@ from scenes import curved_obstacle, decomposed, problem
 from test_solvable_lp import dual_of
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.parallel import summed
 from tfeti_dolfinx.qp.faces import Status, face_of
 from tfeti_dolfinx.qp.homogenised import homogenise
 from tfeti_dolfinx.qp.pcpg import pcpg
@@ -50,14 +51,31 @@ def face_with_half_of_the_contacts(dual):
     return face_of(free, np.where(free, Status.TOUCHING, Status.OPEN))
 
 
-def count(dual, qp, num_steps):
+def logged_calls():
+    return sum(PETSc.Log.Event(name).getPerfInfo()["count"] for name in EVENTS)
+
+
+@pytest.fixture
+def sums(monkeypatch):
+    """Calls of the one function that adds arrays up over ranks."""
+    calls = []
+
+    def counted(comm, values):
+        calls.append(len(values))
+        return summed(getattr(comm, "_comm", comm), values)
+
+    for module in ("tfeti_dolfinx.qp.pcpg", "tfeti_dolfinx.dual.projectors"):
+        monkeypatch.setattr(f"{module}.summed", counted)
+    return calls
+
+
+def count(dual, qp, sums, num_steps):
     """Global calls of so many steps, with what comes before and after them."""
     start = homogenise(qp)
     point, steps = Point(start.lam_bar.copy(), start.gradient.copy()), Steps()
-    logged = [PETSc.Log.Event(name) for name in EVENTS]
-    before = dual.coarse.comm.calls + sum(event.getPerfInfo()["count"] for event in logged)
+    before = len(sums) + dual.coarse.comm.calls + logged_calls()
     reason = pcpg(qp, point, ResidualRule(0.0), steps, num_steps)
-    after = dual.coarse.comm.calls + sum(event.getPerfInfo()["count"] for event in logged)
+    after = len(sums) + dual.coarse.comm.calls + logged_calls()
     assert reason == ConvergedReason.DIVERGED_ITS
     assert steps.cg == num_steps
     point.destroy()
@@ -67,24 +85,44 @@ def count(dual, qp, num_steps):
 
 @pytest.mark.parametrize("on_face", [False, True])
 @pytest.mark.parametrize(("preconditioned", "most"), [(True, 3), (False, 2)])
-def test_a_step_of_pcpg_makes_three_reductions(dual, on_face, preconditioned, most):
+def test_a_step_of_pcpg_makes_three_reductions(dual, sums, on_face, preconditioned, most):
     qp = dual.qp()
     face = face_with_half_of_the_contacts(dual)
     preconditioner = qp.preconditioner_on(face) if on_face else qp.preconditioner
     if on_face:
         qp = replace(qp, coarse=qp.coarse.on_face(face))
     qp = replace(qp, preconditioner=preconditioner if preconditioned else None)
-    assert count(dual, qp, 7) - count(dual, qp, 2) == 5 * most
+    assert count(dual, qp, sums, 7) - count(dual, qp, sums, 2) == 5 * most
 
 
-def test_reductions_are_seen(dual):
-    """The test above would count what PCPG called twice."""
+def test_calls_are_seen(dual, sums):
+    """What PCPG did once more than it should would be counted."""
     x, coarse = dual.d.copy(), dual.coarse
-    before = coarse.comm.calls
     coarse.project(x)
+    assert len(sums) == 1
+    before = coarse.comm.calls
+    coarse.norm_Q(x)
     assert coarse.comm.calls == before + 1
-    norm = PETSc.Log.Event("VecNorm")
-    before = norm.getPerfInfo()["count"]
+    before = logged_calls()
     x.norm()
-    assert norm.getPerfInfo()["count"] == before + 1
+    assert logged_calls() == before + 1
     x.destroy()
+
+
+@pytest.mark.parametrize("on_face", [False, True])
+def test_a_projection_against_a_vector_that_has_drifted(dual, on_face):
+    """yᵀPx, whatever part of y lies outside of the range of P."""
+    face = face_with_half_of_the_contacts(dual)
+    coarse = dual.coarse.on_face(face) if on_face else dual.coarse
+    x, y, Px = (dual.d.duplicate() for _ in range(3))
+    rng = np.random.default_rng(dual.coarse.comm.rank)
+    for vec in (x, y):
+        values = rng.standard_normal(vec.getLocalSize())
+        vec.array[:] = face.restricted(values) if on_face else values
+    x.copy(Px)
+    coarse.project(Px)
+    found = coarse.project_against(x, y)
+    assert np.allclose(x.array_r, Px.array_r, atol=1e-14)
+    assert found == pytest.approx((y.dot(Px), y.dot(y)))
+    for vec in (x, y, Px):
+        vec.destroy()

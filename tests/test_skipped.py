@@ -45,6 +45,27 @@ def test_only_the_dirichlet_preconditioner_factors_K_ii(contact, qp_type, pc_typ
     p.destroy()
 
 
+@pytest.mark.parametrize(
+    ("contact", "options"),
+    [
+        (False, {"pc_type": "none"}),
+        (False, {"pc_type": "dirichlet"}),
+        (True, {"qp_type": "smalse"}),
+        (True, {"qp_type": "smalse", "pc_type": "dirichlet"}),
+        (True, {"qp_type": "newton", "pc_type": "lumped"}),
+        (True, {"qp_type": "newton", "kplus_type": "schur"}),
+    ],
+)
+def test_the_same_load_again_makes_no_factor(contact, options):
+    p = cube(contact, **options)
+    p.solve()
+    p.solve()
+    assert p.report.F_multiplications + p.report.power_method_multiplications <= 2
+    assert p.report.preconditioner_multiplications == 0
+    assert p.report.factorizations == p.report.coarse_factorizations == 0
+    p.destroy()
+
+
 @pytest.mark.parametrize("contact", [False, True])
 def test_a_subdomain_without_interface_has_no_inside(contact):
     """Beside a box of several subdomains, one that springs hold, and that no row touches."""

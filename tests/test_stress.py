@@ -25,6 +25,17 @@ def test_random_scenes_are_right_or_named(seed, comm):
         assert row["class"].islower(), row
 
 
+# 68, 2106: forces that are rounding of 0; 163: gaps 1e12 times as large as the error allowed
+@pytest.mark.parametrize("qp_type", ["newton", "smalse"])
+@pytest.mark.parametrize("seed", [68, 163, 2106])
+def test_scenes_near_to_rounding_are_right_with_both_solvers(seed, qp_type, comm):
+    scene = random_scene(seed)
+    scene = replace(scene, options={**scene.options, "tfeti_qp_type": qp_type})
+    row = judge.run_scene(scene, comm)
+    if comm.rank == 0:
+        assert row["class"] == "right", row
+
+
 @pytest.mark.parametrize(
     "rung",
     [

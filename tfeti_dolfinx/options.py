@@ -21,7 +21,7 @@ class Options:
     qp_type: str = described(
         "auto",
         "all",
-        "solver of the dual problem; auto takes pcpg without inequalities, else smalse",
+        "solver of the dual problem; auto takes pcpg without inequalities, else newton",
         choices=("auto", *SOLVERS),
     )
     rtol: float = described(

@@ -26,6 +26,12 @@ def any_rank(comm: MPI.Intracomm, flag: bool) -> bool:
     return bool(comm.allreduce(bool(flag), op=MPI.LOR))
 
 
+def summed(comm: MPI.Intracomm, values: Array) -> Array:
+    """Sums of all ranks' values, entry by entry, in their place: one reduction. Collective."""
+    comm.Allreduce(MPI.IN_PLACE, values, op=MPI.SUM)
+    return values
+
+
 class Exchange:
     """Rows that travel to other ranks, and answers that travel back.
 

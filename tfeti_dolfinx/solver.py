@@ -106,6 +106,7 @@ def solve_dual(
 def _last_look(result: QPResult, rule: Accuracy) -> None:
     """Measure where a solver has stopped before its tolerance: it may be good enough."""
     residual = max(result.projected_gradient, result.norm * result.equality)
+    rule.accept_rounding()
     reason = rule.examine(result.lam, result.gradient, result.face, residual)
     if reason > 0:
         result.reason = reason

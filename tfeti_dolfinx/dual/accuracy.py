@@ -25,6 +25,9 @@ FORCES, RIGID = 10.0, 1e-12
 # of the largest gap of a contact row: without load all displacements may be that small and are
 # what rounding leaves of 0 (seen: 3e-15)
 AT_REST = 1e-14
+# of rtol b₀, and of what rounding leaves of a residual where numbers of all sizes meet: a residual
+# that is good enough where rounding may explain an error in energy
+SMALL, LITTLE = 1e-2, 0.1
 # the first look is taken at this power of rtol, to learn how far things move
 FIRST_LOOK = 0.5
 # a new tolerance aims a little below what was asked for; it never falls by more than LEAP at
@@ -95,6 +98,7 @@ class Accuracy:
         self._rounding, self.norm = rounding, norm or 1.0
         self._before: Measures | None = None
         self.tolerance = max(rtol**FIRST_LOOK * reference, atol, rounding)
+        self._small = max(SMALL * rtol * reference, LITTLE * rounding)
         self.drifted, self.looks, self._stalls, self._claimed = False, 0, 0, 1.0
         self.measures: Measures | None = None
 
@@ -114,18 +118,33 @@ class Accuracy:
         """Whether an iterate is right. Collective."""
         now = self.look(lam, gradient, face, residual)
         comm = self._scene.coarse.comm
-        ratio, longest = agreed(comm, (self.ratio(), self._longest(now)))
-        if ratio <= 1.0:
+        values = (self.ratio(), self._longest(now), self._energy_ratio(now))
+        ratio, longest, in_energy = agreed(comm, values)
+        if ratio <= 1.0 and (in_energy <= 1.0 or residual <= self._small):
             return ConvergedReason.CONVERGED_RTOL
         if longest <= self._atol:
             return ConvergedReason.CONVERGED_ATOL
-        tolerance = residual * max(AIM / ratio, LEAP)
+        tolerance = residual * max(AIM / (ratio if ratio > 1.0 else in_energy), LEAP)
+        if ratio <= 1.0:
+            tolerance = max(tolerance, self._small)
         self._stalls = self._stalls + 1 if agreed(comm, self._stalled(now, residual)) else 0
         if self._stalls > 1 or agreed(comm, tolerance < OUT_OF_REACH * self._rounding):
             return ConvergedReason.DIVERGED_ROUNDING
         self.drifted = self._stalls > 0
         self.tolerance, self._claimed = tolerance, residual
         return ConvergedReason.ITERATING
+
+    def accept_rounding(self) -> None:
+        """Where no solver comes any farther, what rounding may explain is good enough."""
+        self._small = float("inf")
+
+    def _energy_ratio(self, now: Measures) -> float:
+        """Error in energy over its tolerance without what that allows for rounding.
+
+        A body that falls far deforms by less than rounding of its fall, but forces may be known.
+        """
+        energy = np.sqrt(max(now.bodies.energy.sum(), 0.0))
+        return now.error / max(FORCES * self.rtol * float(energy), TINY)
 
     def _stalled(self, now: Measures, residual: float) -> bool:
         """Whether the true residual lags behind the one that the solver claims."""
@@ -149,8 +168,9 @@ class Accuracy:
         now, before = self._looked(), self._before
         bodies, energy = now.bodies, np.sqrt(np.maximum(now.bodies.energy, 0.0))
         own = np.sqrt(bodies.correction_energy)
-        # at rest all is rounding, and energy does not say how far anything moves
-        known = (energy > 0.0) & (self._at_rest(now) == 0.0)
+        # where all is rounding, energy does not say how far anything moves
+        moves = bodies.size > NOISE * bodies.size.max(initial=0.0)
+        known = (energy > 0.0) & moves & (self._at_rest(now) == 0.0)
         shown = np.divide(bodies.elastic, energy, out=np.zeros_like(energy), where=known)
         estimate = shown * own
         if before is not None and before.error > 0.0:

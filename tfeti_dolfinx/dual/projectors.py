@@ -14,7 +14,7 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.grams import Grams
 from tfeti_dolfinx.dual.null_basis import NullBasis
 from tfeti_dolfinx.dual.semidefinite import SemidefiniteFactor
-from tfeti_dolfinx.parallel import agreed
+from tfeti_dolfinx.parallel import agreed, summed
 from tfeti_dolfinx.qp.faces import Face
 
 
@@ -46,9 +46,7 @@ class Projectors:
 
     def G(self, x: Array) -> Array:
         """G x, shape ``(r,)``, from this rank's part of x."""
-        y = self.Gt.T @ self.restricted(x)
-        self.comm.Allreduce(MPI.IN_PLACE, y, op=MPI.SUM)
-        return np.asarray(y)
+        return summed(self.comm, self.Gt.T @ self.restricted(x))
 
     @property
     def dimension(self) -> int:
@@ -67,9 +65,7 @@ class Projectors:
         """Σ|G||x|, shape ``(r,)``."""
         Gt = self.Gt
         moduli = csr_array((np.abs(Gt.data), Gt.indices, Gt.indptr), shape=Gt.shape)
-        terms = np.asarray(moduli.T @ np.abs(self.restricted(x.array_r)))
-        self.comm.Allreduce(MPI.IN_PLACE, terms, op=MPI.SUM)
-        return terms
+        return summed(self.comm, moduli.T @ np.abs(self.restricted(x.array_r)))
 
     def solve(self, y: Array) -> Array:
         """(GGᵀ)⁺ y for y in the range of G, orthogonal to the free motions."""
@@ -84,12 +80,17 @@ class Projectors:
         self._take_away(x, self.coordinates(x))
 
     def project_against(self, x: PETSc.Vec, y: PETSc.Vec) -> tuple[float, float]:
-        """x ← P x; yᵀx and yᵀy, for y in the range of P. One reduction."""
-        own = self.restricted(x.array_r)
-        sums = np.append(self.Gt.T @ own, (own @ y.array_r, y.array_r @ y.array_r))
-        self.comm.Allreduce(MPI.IN_PLACE, sums, op=MPI.SUM)
-        self._take_away(x, self.solve(sums[:-2]))
-        return float(sums[-2]), float(sums[-1])
+        """x ← P x; yᵀPx and yᵀy, y in the face. One reduction.
+
+        What rounding has left of y outside of the range of P is not taken for a part of yᵀPx.
+        """
+        own, r = self.restricted(x.array_r), self.dimension
+        products = self.Gt.T @ np.stack((own, y.array_r), axis=1)
+        terms = np.append(products.T, (own @ y.array_r, y.array_r @ y.array_r))
+        sums = summed(self.comm, terms)
+        mu = self.solve(sums[:r])
+        self._take_away(x, mu)
+        return float(sums[-2] - sums[r : 2 * r] @ mu), float(sums[-1])
 
     def _take_away(self, x: PETSc.Vec, mu: Array) -> None:
         x.array[:] = self.restricted(x.array_r - self.Gt @ mu)

@@ -54,7 +54,10 @@ class Coarse(Protocol):
         ...
 
     def project_against(self, x: PETSc.Vec, y: PETSc.Vec) -> tuple[float, float]:
-        """x ← P x; yᵀPx and yᵀy, for y in the range of P. Collective, one reduction."""
+        """x ← P x; yᵀPx and yᵀy, for y in the face. Collective, one reduction.
+
+        Ranks may round yᵀPx differently.
+        """
         ...
 
     def apply_Q(self, x: PETSc.Vec, y: PETSc.Vec) -> None:

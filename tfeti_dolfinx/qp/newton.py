@@ -94,7 +94,7 @@ def newton(
     """
     steps = Steps()
     state = Iterate(qp, homogenised)
-    faces = FaceSolver(qp, rule, parameters, steps, max_it, monitor)
+    faces = FaceSolver(state.qp, rule, parameters, steps, max_it, monitor)
     reason, looked = ConvergedReason.ITERATING, warm
     monitor(steps, "start", state.point.lam, homogenised.b.norm(), 0.0)
     if not warm:
@@ -107,9 +107,10 @@ def newton(
             monitor(steps, "outer", state.point.lam, state.residual, 0.0)
             if state.residual <= rule.tolerance:
                 rule.norm = state.norm
-                reason = rule.examine(state.point.lam, state.s, state.face(), state.residual)
+                face = state.pressed_face()
+                reason = rule.examine(state.point.lam, state.s, face, state.residual)
             if rule.drifted:
-                state.point.refresh(qp)
+                state.point.refresh(state.qp)
                 faces.forget()
                 rule.drifted = False
                 continue

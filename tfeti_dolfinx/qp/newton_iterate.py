@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -16,6 +18,11 @@ from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, QPResult, Steps
 
 # of what the gradient step promises at least, (ᾱ/2)‖g^P‖²: a step must lower q by that share
 ENOUGH = 0.1
+# of Fλ − d: where Gᵀμ is nearly all of it, it is taken out of d, since its rounding, as where gaps
+# are far larger than displacements, would drown what is left
+MOST = 0.1
+# times Fλ − d: multipliers that are larger are rounding, for Gᵀμ is to be as large as that
+WILD = 1e3
 # of λ: what a way must be, so that F on it is not F on rounding of Gλ = e
 SHORT = 1e-6
 # so many steps in a row that neither lower q by what stands out from its rounding, nor halve ‖g^P‖
@@ -32,21 +39,24 @@ class Iterate:
         homogenised: Holds the start.
 
     Attributes:
-        point: λ and Fλ − d.
-        s: Multipliers of Ω: Fλ − d − Gᵀμ; 0 where λ is free, if it is optimal.
-        mu: Multipliers μ of Gλ = e.
+        qp: The same program, but for a d' = d + Gᵀμ', which adds a constant to q.
+        point: λ and Fλ − d'.
+        s: Multipliers of Ω: Fλ − d' − Gᵀμ; 0 where λ is free, if it is optimal.
+        mu: Multipliers μ of Gλ = e in the program with d'.
         back: The nearest feasible point to λ − ᾱ(Fλ − d).
         residual: ‖g^P‖, g^P = (λ − back)/ᾱ.
         norm: Estimate of ‖F‖; ᾱ is its inverse.
     """
 
     def __init__(self, qp: QP, homogenised: Homogenised) -> None:
-        self._qp, self._homogenised = qp, homogenised
+        self._given, self._homogenised = qp, homogenised
+        self.qp = self._qp = replace(qp, d=qp.d.copy())
         self._comm = qp.d.getComm().tompi4py()
         self.point = Point(homogenised.lam_bar.copy(), homogenised.gradient.copy())
         self.s, self._work = qp.d.duplicate(), qp.d.duplicate()
         self.back: PETSc.Vec | None = None
         self.mu: Array = np.zeros(qp.coarse.dimension)
+        self._taken: Array = np.zeros(qp.coarse.dimension)
         self._set_multipliers()
         self.residual, self.norm = float("inf"), 1.0
         self._best, self._idle, self._slow = float("inf"), 0, 0
@@ -55,22 +65,38 @@ class Iterate:
         """The face of λ."""
         return self._qp.feasible.face(self.point.lam.array_r, self.s.array_r)
 
+    def pressed_face(self) -> Face:
+        """The face of ``back``: a row that carries less than it is open by, λ_i < ᾱs_i, is open.
+
+        Where forces are rounding of 0 they do not say which rows touch.
+        """
+        if self.back is None:
+            return self.face()
+        return self._qp.feasible.face(self.back.array_r, self.s.array_r)
+
     def multipliers_on(self, faces: FaceSolver) -> None:
-        """μ and s that belong to the face entered, while nothing is known of ‖F‖."""
-        self.mu = faces.coarse.coordinates(self.point.g)
+        """μ and s that belong to the face entered.
+
+        A face that lacks rank says nothing of motions that it leaves free, but its factor may.
+        """
+        last, self.mu = self.mu, faces.coarse.coordinates(self.point.g)
         self._set_multipliers()
+        if agreed(self._comm, self.s.norm() > WILD * self.point.g.norm()):
+            self.mu = last
+            self._set_multipliers()
 
     def look(self, faces: FaceSolver) -> None:
         """Optimality: how far a gradient step, brought back to the feasible set, moves."""
         self.norm = faces.norm or _rayleigh(self._qp, self.point) or 1.0
-        if faces.settled:
-            self.mu = faces.coarse.coordinates(self.point.g)
         self._set_multipliers()
+        if faces.settled:
+            self.multipliers_on(faces)
         target = self.point.lam.copy()
         target.axpy(-1.0 / self.norm, self.s)  # not Fλ − d: what Gᵀμ takes from it may be large
         found = nearest(self._qp.coarse, self._qp.feasible, target)
         self.mu = self.mu + self.norm * found.alpha
         self._set_multipliers()
+        self._take_out()
         if self.back is not None:
             self.back.destroy()
         self.back = found.lam
@@ -86,6 +112,15 @@ class Iterate:
         self._qp.coarse.combine(self.mu, self.s)
         self.s.aypx(-1.0, self.point.g)
 
+    def _take_out(self) -> None:
+        """Put Gᵀμ into d', where it is most of Fλ − d'. q changes by a constant."""
+        if agreed(self._comm, self.s.norm() > MOST * self.point.g.norm()):
+            return
+        self._taken, self.mu = self._taken + self.mu, np.zeros_like(self.mu)
+        self._qp.coarse.combine(self._taken, self._qp.d)
+        self._qp.d.axpy(1.0, self._given.d)
+        self.s.copy(self.point.g)
+
     def wanted_face(self, gamma: float, faces: FaceSolver) -> Face:
         """What carries force, and what wants to, if that is most of what is wrong.
 
@@ -93,6 +128,7 @@ class Iterate:
         """
         lam, s, feasible = self.point.lam.array_r, self.s.array_r, self._qp.feasible
         phi, beta = feasible.split(lam, s)
+        phi = feasible.reduced(lam, phi, 1.0 / self.norm)  # what soon stops at a bound is little
         free, chopped = self._comm.allreduce(np.array([phi @ phi, beta @ beta]), op=MPI.SUM)
         if faces.settled:
             free = faces.left**2
@@ -190,9 +226,9 @@ class Iterate:
         moved.destroy()
         return QPResult(
             lam=self.point.lam.copy(),
-            mu=self.mu,
+            mu=self._taken + self.mu,
             gradient=self.s.copy(),
-            face=self.face(),
+            face=self.pressed_face(),
             reason=reason,
             projected_gradient=self.residual,
             equality=equality,
@@ -204,7 +240,7 @@ class Iterate:
     def destroy(self) -> None:
         """Destroy the vectors. Collective."""
         self.point.destroy()
-        for vec in (self.s, self._work, self.back):
+        for vec in (self.s, self._work, self._qp.d, self.back):
             if vec is not None:
                 vec.destroy()
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 from petsc4py import PETSc
 
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.parallel import summed
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.monitors import Monitor, no_monitor
@@ -108,14 +111,16 @@ def pcpg(
         qp.F.mult(p, Fp)
         Fp.copy(z)
         pFp, pp = qp.coarse.project_against(z, p)
+        z.aypx(-own.rz / pFp if pFp else 0.0, r)
+        squared, own.rz, pFp = _square(z, own.rz, pFp)
         if not (own.seen(pFp, pp) and own.stands_out(own.rz, norm**2)):
             own.fresh, reason = True, _examined(qp, point, rule, norm)
             if reason == ConvergedReason.ITERATING:
                 reason = ConvergedReason.DIVERGED_INDEFINITE_MAT
             break
         point.move(own.rz / pFp, p, Fp)
-        r.axpy(-own.rz / pFp, z)
-        own.fresh, norm = False, r.norm()
+        z.copy(r)
+        own.fresh, norm = False, float(np.sqrt(squared))
         steps.cg += 1
         monitor(steps, "cg", point.lam, norm, 0.0)
     if directions is None:
@@ -205,6 +210,13 @@ def _residual(qp: QP, g: PETSc.Vec, r: PETSc.Vec) -> float:
     r.scale(-1.0)
     qp.coarse.project(r)
     return float(r.norm())
+
+
+def _square(x: PETSc.Vec, *known: float) -> Array:
+    """‖x‖², and rank 0's numbers, since loops end by them. Collective, one reduction."""
+    comm = x.getComm().tompi4py()
+    sums = np.array([x.array_r @ x.array_r, *(known if comm.rank == 0 else np.zeros(len(known)))])
+    return summed(comm, sums)
 
 
 def _precondition(qp: QP, r: PETSc.Vec, z: PETSc.Vec, norm: float) -> float:

@@ -141,5 +141,5 @@ SOLVERS = {
     ),
 }
 # what auto stands for, without and with inequalities, and with discs
-AUTO = {False: "pcpg", True: "smalse"}
+AUTO = {False: "pcpg", True: "newton"}
 AUTO_WITH_DISCS = "smalse"

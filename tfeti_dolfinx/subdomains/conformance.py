@@ -12,6 +12,9 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.errors import require
 from tfeti_dolfinx.subdomains.block import Block
 from tfeti_dolfinx.subdomains.data import SubdomainData
+from tfeti_dolfinx.subdomains.inverse import GeneralisedInverse, solved
+from tfeti_dolfinx.subdomains.kernel import candidate_modes, fixing_dofs, kernel_of
+from tfeti_dolfinx.subdomains.kplus import MakeInverse, with_entries
 
 # Eigenvalues of a stiffness, as a share of the largest, that are 0 but for rounding (which is
 # 1e-16 times a few powers of n); singular values are their roots, and cut off above rounding.
@@ -42,6 +45,45 @@ def check_kind_of_block(make_block: Callable[[SubdomainData], Block], tol: float
         block.update(K=changed.copy())
         check_block(block, changed, tol)
         block.destroy()
+
+
+def check_kind_of_inverse(make_inverse: MakeInverse, tol: float = 1e-9) -> None:
+    """Check a generalised inverse on small trusses: loose, held by springs, and with changes.
+
+    K K⁺ K = K; K⁺ is symmetric positive semidefinite; ``refactor`` follows new values, also where
+    the kernel comes or goes; K is as it was.
+
+    Args:
+        make_inverse: Its class, or what else makes one, as for ``Extensions(kplus=...)``.
+        tol: Relative tolerance.
+
+    Raises:
+        ConformanceError: A promise is broken; the message says which.
+    """
+    for data, changed in _trusses():
+        nodes = np.arange(data.K.shape[0]) // data.bs
+        fixing = fixing_dofs(data.x, nodes)
+        modes = candidate_modes(data.x, data.bs, *data.body_frame)
+        K = with_entries(data.K, fixing)
+        inverse = make_inverse(K, kernel_of(K, modes), fixing, "tfeti_sub_")
+        _check_pinv(inverse, K.toarray(), tol)
+        rows = np.repeat(np.arange(K.shape[0]), np.diff(K.indptr))
+        K.data[:] = changed.toarray()[rows, K.indices]
+        inverse.refactor(kernel_of(K, modes))
+        require(np.array_equal(K.toarray(), changed.toarray()), "K is as it was")
+        _check_pinv(inverse, changed.toarray(), tol)
+        inverse.destroy()
+
+
+def _check_pinv(inverse: GeneralisedInverse, K: Array, tol: float) -> None:
+    """K K⁺ K = K, K⁺ symmetric positive semidefinite."""
+    pinv = solved(inverse, np.eye(len(K)))
+    alone = np.stack([inverse.solve(e) for e in np.eye(len(K))], axis=1)
+    largest = np.abs(pinv).max()
+    require(np.allclose(alone, pinv, atol=tol * largest), "one right side is as several")
+    require(np.allclose(K @ pinv @ K, K, atol=tol * np.abs(K).max()), "K K⁺ K = K")
+    require(np.allclose(pinv, pinv.T, atol=tol * largest), "K⁺ is symmetric")
+    require(np.linalg.eigvalsh(pinv)[0] >= -tol * largest, "K⁺ is positive semidefinite")
 
 
 def _trusses() -> Iterator[tuple[SubdomainData, csr_array]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Protocol
 
 import numpy as np
@@ -62,3 +64,14 @@ def solved(inverse: GeneralisedInverse, b: Array) -> Array:
     if b.ndim == 1 or isinstance(inverse, FactoredInverse):
         return inverse.solve(b)
     return np.stack([inverse.solve(column) for column in b.T], axis=1)
+
+
+@contextmanager
+def lent(entries: Array, places: Array, values: Array | float) -> Iterator[None]:
+    """Other values at some places, in the block; the old ones come back to the last bit."""
+    kept = entries[places]
+    entries[places] = values
+    try:
+        yield
+    finally:
+        entries[places] = kept

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,7 +13,7 @@ from scipy.sparse import coo_array, csr_array
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.subdomains.data import Counters
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor
-from tfeti_dolfinx.subdomains.inverse import FactoredInverse, GeneralisedInverse
+from tfeti_dolfinx.subdomains.inverse import FactoredInverse, GeneralisedInverse, lent
 from tfeti_dolfinx.subdomains.pseudoinverse import SchurPseudoinverse, TrailingPseudoinverse
 
 
@@ -38,7 +38,7 @@ class Regularised(FactoredInverse):
 
     def __init__(self, K: Any, R: Array, fixing_dofs: Array, prefix: str = "tfeti_sub_") -> None:
         self._K, self._fixing_dofs = K, fixing_dofs
-        with _regular_values(K, R, fixing_dofs):
+        with _regular(K, R, fixing_dofs):
             self._factor = CholeskyFactor(K, prefix, keep=True)
 
     def refactor(self, R: Array) -> None:
@@ -48,7 +48,7 @@ class Regularised(FactoredInverse):
             NotPositiveDefiniteError: K_ρ has no Cholesky factor.
             FactorError: It could not be made for another reason.
         """
-        with _regular_values(self._K, R, self._fixing_dofs):
+        with _regular(self._K, R, self._fixing_dofs):
             self._factor.refactor()
 
 
@@ -103,17 +103,11 @@ def _places(K: Any, dofs: Array) -> Array:
     return np.asarray(number[dofs][:, dofs].toarray()) - 1
 
 
-@contextmanager
-def _regular_values(K: Any, R: Array, fixing_dofs: Array) -> Iterator[None]:
-    """The values of K_ρ in the place of those of K, which come back to the last bit."""
+def _regular(K: Any, R: Array, fixing_dofs: Array) -> AbstractContextManager[None]:
+    """The values of K_ρ in the place of those of K, for a while."""
     places = _places(K, fixing_dofs)
-    kept = K.data[places]
-    if R.shape[1]:
-        K.data[places] += _projector(K, R, fixing_dofs)
-    try:
-        yield
-    finally:
-        K.data[places] = kept
+    added = _projector(K, R, fixing_dofs) if R.shape[1] else 0.0
+    return lent(K.data, places, K.data[places] + added)
 
 
 # from K, its kernel, the unknowns of fixing nodes and a prefix of options to K⁺

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from tfeti_dolfinx.subdomains.factor import (
     NotPositiveDefiniteError,
     as_petsc_matrix,
 )
-from tfeti_dolfinx.subdomains.inverse import FactoredInverse
+from tfeti_dolfinx.subdomains.inverse import FactoredInverse, lent
 
 # Of the mean size of a motion: one that is less on the last unknowns leaves a pivot of 1e-8 before
 # them, which counts as none.
@@ -139,16 +138,10 @@ def _root_of_pseudoinverse(S: Array, R: Array) -> Array:
     return np.asarray(V @ (vectors / np.sqrt(values)))
 
 
-@contextmanager
-def _apart(K: Any, s: Array) -> Iterator[None]:
-    """diag(K_rr, diag K_ss) in the place of K, whose values come back to the last bit."""
+def _apart(K: Any, s: Array) -> AbstractContextManager[None]:
+    """diag(K_rr, diag K_ss) in the place of K, for a while."""
     in_s = np.zeros(K.shape[0], dtype=bool)
     in_s[s] = True
     row_of = np.repeat(np.arange(len(in_s), dtype=K.indices.dtype), np.diff(K.indptr))
-    coupled = np.flatnonzero((in_s[row_of] | in_s[K.indices]) & (row_of != K.indices))
-    kept = K.data[coupled]
-    K.data[coupled] = 0.0
-    try:
-        yield
-    finally:
-        K.data[coupled] = kept
+    coupled = (in_s[row_of] | in_s[K.indices]) & (row_of != K.indices)
+    return lent(K.data, np.flatnonzero(coupled), 0.0)
