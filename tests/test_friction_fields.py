@@ -167,3 +167,23 @@ def test_the_error_of_u_is_what_the_report_says():
         error = np.abs(displacement(p)[1] - exact).max() / np.abs(exact).max()
         assert error <= 2.0 * rtol
         assert p.report.residuals["displacement_error"] <= rtol
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
+def test_friction_alone_holds_a_body(cell, comm):
+    """Nothing else holds the block along the plane; beyond the capacity the solver stalls."""
+    d = decomposed(cell, 3, 3)
+    gdim, bound = d.mesh.geometry.dim, 0.02
+    for push in (0.5 * bound, 0.9 * bound):
+        traction = (push, *np.zeros(gdim - 2), -0.1)
+        p = problem(d, traction, [floor(gdim, tfeti.Tresca(bound))], clamped=(), rtol=1e-8)
+        p.solve()
+        data = p.solution.contact()
+        friction = (data.area[:, None] * data.tangential_traction).sum(axis=0)
+        expected = np.r_[-push, np.zeros(gdim - 1)]
+        assert np.allclose(comm.allreduce(friction), expected, rtol=0, atol=1e-7)
+        assert p.report.free_modes == 0
+    traction = (1.5 * bound, *np.zeros(gdim - 2), -0.1)
+    p = problem(d, traction, [floor(gdim, tfeti.Tresca(bound))], clamped=(), rtol=1e-6)
+    with pytest.raises(tfeti.ConvergenceError, match="DIVERGED_STALLED"):
+        p.solve()
