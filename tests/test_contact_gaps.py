@@ -169,8 +169,7 @@ def ring_problem(cells, overlap, order=1, degree=1, mesh=None, **contact):
     a = ufl.inner(hooke()(u), strain(v)) * dx + 1e-6 * ufl.dot(u, v) * dx
     L = ufl.dot(fem.Constant(d.mesh, (0.0, 0.0)), v) * dx
     pair = tfeti.Contact("shaft", "hub", **contact)
-    # the springs leave a condition of 1e7: at 1e-8 rounding would have a say
-    return tfeti.ContactProblem(a, L, [], [pair], d, petsc_options={"rtol": 1e-7})
+    return tfeti.ContactProblem(a, L, [], [pair], d, petsc_options={"rtol": 1e-8})
 
 
 OVERLAP = MIDDLE / 1500
