@@ -1,4 +1,6 @@
-"""Tresca's friction on an untorn mesh: condensed on the contact nodes, by an interior point method.
+"""Friction on an untorn mesh, condensed on the contact nodes.
+
+Tresca's by an interior point method, Coulomb's by iterating its own natural map.
 
 Nothing of the package is used but the meshes of the scenes.
 """
@@ -53,14 +55,16 @@ class Untorn:
         area = [hats[np.argmin(np.linalg.norm(at - self.x[n], axis=1))] for n in nodes]
         return nodes, np.array(area)
 
-    def solve(self, entries, gap, semi_axes, frame):
+    def solve(self, entries, gap, semi_axes, frame, coulomb=False):
         """Displacement, sorted by point, and forces of the conditions along their frame.
 
         Args:
             entries: For each condition its nodes with their weights.
             gap: Of each condition.
-            semi_axes: Largest tangential forces of each, shape (n, gdim - 1).
+            semi_axes: Largest tangential forces of each, shape (n, gdim - 1); under Coulomb's law
+                coefficients of friction.
             frame: Axes, normal first, of all conditions, shape (gdim, gdim).
+            coulomb: Whether that is the law.
         """
         n, gdim = len(entries), self.gdim
         B = np.zeros((n * gdim, len(self.f)))
@@ -79,22 +83,57 @@ class Untorn:
         m = len(kept)
         F, d = B[rows] @ KB[:, rows], (B @ solve(f) - c)[rows]
         places = np.arange(m, m * gdim).reshape(gdim - 1, m).T
-        lam = constrained_qp(
-            F, d, np.zeros((0, len(d))), np.zeros(0), np.arange(m), places, semi_axes[kept]
-        )
+        if coulomb:
+            lam = natural_map(F, d, places, semi_axes[kept])
+        else:
+            none = np.zeros((0, len(d))), np.zeros(0)
+            lam = constrained_qp(F, d, *none, np.arange(m), places, semi_axes[kept])
         u, force = np.zeros(len(self.f)), np.zeros((n, gdim))
         u[self.free] = solve(f - B[rows].T @ lam)
         force[kept] = lam.reshape(gdim, m).T
         return u.reshape(-1, gdim)[self.order], force
 
 
-def on_plane(cell, n, traction, bounds, frame, gap=0.0, clamped=("left",)):
+def natural_map(F, d, places, mu):
+    """λ_N = max(λ_N − r(Fλ − d)_N, 0), τ = P(τ − r(Fλ − d)_T) on the ellipse of μλ_N.
+
+    Args:
+        F, d: The condensed program, normals first.
+        places: Rows of each condition's tangents, shape (n, gdim - 1).
+        mu: Coefficients, of the same shape.
+    """
+    lam, r, n = np.zeros(len(d)), 1.0 / np.linalg.norm(F, 2), len(places)
+    for _ in range(400_000):
+        step = lam - r * (F @ lam - d)
+        new = np.concatenate((np.maximum(step[:n], 0.0), np.zeros(len(d) - n)))
+        new[places] = in_ellipses(step[places], mu * new[:n, None])
+        change, lam = np.linalg.norm(new - lam), new
+        if change <= 1e-13 * np.linalg.norm(lam):
+            return lam
+    raise AssertionError("the reference did not settle")
+
+
+def in_ellipses(z, a):
+    """The nearest points of ellipses, by halving the interval of their multiplier."""
+    low, high = np.zeros(len(z)), np.linalg.norm(a * z, axis=1)
+    high = high + 1e-300
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        y = np.divide(a * z, a**2 + middle[:, None], out=np.zeros_like(z), where=a > 0.0)
+        outside = np.linalg.norm(y, axis=1) > 1.0
+        low, high = np.where(outside, middle, low), np.where(outside, high, middle)
+    y = a**2 * z / np.maximum(a**2 + high[:, None], 1e-300)
+    inside = np.linalg.norm(np.divide(z, a, out=np.full_like(z, 2.0), where=a > 0.0), axis=1) <= 1
+    return np.where(inside[:, None], z, y)
+
+
+def on_plane(cell, n, traction, bounds, frame, gap=0.0, clamped=("left",), coulomb=False):
     """The box of ``scenes`` over a plane: u, contact points, forces."""
     scene = Untorn(*box(cell, n, MPI.COMM_SELF), {"top": traction}, clamped)
     nodes, area = scene.side("bottom")
     entries = [{int(node): 1.0} for node in nodes]
-    axes = area[:, None] * np.asarray(bounds)
-    u, force = scene.solve(entries, np.full(len(nodes), gap), axes, frame)
+    axes = (np.ones_like(area) if coulomb else area)[:, None] * np.asarray(bounds)
+    u, force = scene.solve(entries, np.full(len(nodes), gap), axes, frame, coulomb)
     return u, scene.x[nodes], force
 
 
@@ -107,13 +146,13 @@ def parts(gdim, n, gap):
     ]
 
 
-def on_each_other(cell, n, traction, bounds, frame, apart, clamped):
+def on_each_other(cell, n, traction, bounds, frame, apart, clamped, coulomb=False):
     """Two boxes, gaps taken as 0: u, contact points of the lower box, forces on it."""
     gdim = 2 if cell in ("triangle", "quadrilateral") else 3
     mesh, tags, names = boxes(cell, parts(gdim, n, apart), MPI.COMM_SELF)
     scene = Untorn(mesh, tags, names, {"upper top": traction}, clamped)
     (below, area), (above, _) = scene.side("lower top"), scene.side("upper bottom")
     entries = [{int(a): 1.0, int(b): -1.0} for a, b in zip(below, above, strict=True)]
-    axes = area[:, None] * np.asarray(bounds)
-    u, force = scene.solve(entries, np.zeros(len(below)), axes, frame)
+    axes = (np.ones_like(area) if coulomb else area)[:, None] * np.asarray(bounds)
+    u, force = scene.solve(entries, np.zeros(len(below)), axes, frame, coulomb)
     return u, scene.x[below], force

@@ -50,6 +50,7 @@ def test_residuals_are_named(report):
         "tension",
         "complementarity",
         "balance",
+        "friction",
     }
 
 

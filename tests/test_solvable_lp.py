@@ -57,6 +57,7 @@ def as_coarse(count, k, E, N, load):
         e=load,
         J=csr_array(N),
         bounded=slice(0, len(N)),
+        rubbing=np.zeros(0, dtype=int),
         unheld=unheld,
         free_motions=unresisted(csr_array(N.T @ N), unheld),
     )

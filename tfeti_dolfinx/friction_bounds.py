@@ -9,10 +9,8 @@ import numpy as np
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.contact.forces import condition_areas
-from tfeti_dolfinx.contact.friction import Coulomb
 from tfeti_dolfinx.contact.partners import ContactPartner
 from tfeti_dolfinx.contact.search import ContactSearch
-from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.gluing.glue import Gluing
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -51,18 +49,17 @@ class FrictionBounds:
         return any_rank(self._dofs.comm, not np.array_equal(search.friction(), self._known))
 
     def set_limits(self, gluing: Gluing, search: ContactSearch) -> None:
-        """Fill the ψ_i of the rows.
+        """Fill the ψ_i of the rows, and the μ_i under Coulomb's law.
 
         Raises:
-            InputError: A value is negative or no number somewhere, or a law is Coulomb's.
+            InputError: A value is negative or no number somewhere.
         """
         if not self._has_friction:
             return
         contacts = search.contacts
-        if unable := [c.name for c in contacts if isinstance(c.friction, Coulomb)]:
-            raise InputError(f"{unable[0]}: Coulomb friction is not solved yet; expected Tresca")
         surfaces = [contact.surfaces[0] for contact in contacts]
         of, thickness = self._decomposition, self._thickness
         area = condition_areas(gluing.records, self._dofs, of, surfaces, thickness)
         self._known = search.friction()
         gluing.constraints.set_limits(gluing.tangents.limits(self._known, area))
+        gluing.constraints.coefficients[:] = gluing.tangents.coefficients(self._known)

@@ -74,6 +74,16 @@ class Options:
         choices=tuple(PARTICULAR),
     )
     norm_steps: int = described(15, "smalse", "Lanczos steps that estimate ‖PFP‖", fits=FROM_1)
+    friction_rtol: float = described(
+        1e-4,
+        "coulomb",
+        "change of the bounds of Coulomb's friction, over their size, at which they are at rest; "
+        "or 100 rtol, if that is less",
+        fits=Range("0 or more, less than 1", lambda value: 0.0 <= value < 1.0),
+    )
+    friction_max_it: int = described(
+        50, "coulomb", "most problems with given bounds that are solved for them", fits=FROM_1
+    )
     newton: NewtonParameters = NewtonParameters()
     smalse: SmalseParameters = SmalseParameters()
     error_if_not_converged: bool = described(

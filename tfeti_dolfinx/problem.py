@@ -17,6 +17,7 @@ from tfeti_dolfinx.compat import require_real_petsc
 from tfeti_dolfinx.contact.arguments import Gap, gaps_by_position
 from tfeti_dolfinx.contact.partners import ContactPartner, checked_contacts
 from tfeti_dolfinx.contact_state import Multipliers
+from tfeti_dolfinx.coulomb import solve_with_friction
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
 from tfeti_dolfinx.extensions import Extensions, Settings, guarded
@@ -31,7 +32,7 @@ from tfeti_dolfinx.option_parsing import factor_options, parse_options
 from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.report_filling import fill_result, settle_seconds
 from tfeti_dolfinx.solution import Solution
-from tfeti_dolfinx.solver import conclude, resolve_types, solve_dual
+from tfeti_dolfinx.solver import conclude, resolve_types
 from tfeti_dolfinx.system import System
 from tfeti_dolfinx.timing import stage
 
@@ -41,8 +42,7 @@ MAX_ROUNDS = 20
 class ContactProblem:
     """Linear elasticity with contact on a torn mesh, solved by Total FETI.
 
-    Mirrors ``dolfinx.fem.petsc.LinearProblem``. Creation and all methods are collective. A whole
-    example stands at the top of the package.
+    Mirrors ``dolfinx.fem.petsc.LinearProblem``; all is collective. The package has an example.
 
     Args:
         a: Bilinear form on a Lagrange space of the torn mesh.
@@ -141,8 +141,7 @@ class ContactProblem:
 
         What a solve has made is kept. Constants and functions in the forms, Dirichlet values and
         the points of the mesh may change between two solves: only what depends on them is made
-        again, and the solver starts from the last solution. For new forms, conditions or gaps
-        see ``update``.
+        again, and the solver starts from the last solution. See ``update`` for new forms.
 
         Returns:
             The displacement, on the torn mesh.
@@ -260,8 +259,9 @@ class ContactProblem:
             if self._start is not None:
                 earlier, lam, mu = self._start
                 start = (gluing.multipliers(earlier, lam), mu)
-            monitor = self._settings.extensions.monitor
-            result, accuracy = solve_dual(dual, self.options, qp_type, start, monitor)
+            own = self._settings.extensions.monitor
+            solved = solve_with_friction(dual, self.options, qp_type, start, own)
+        result, accuracy, _ = solved
         with stage("recovery", report.seconds):
             solution = self._solution = Solution(
                 u=accuracy.u,
@@ -274,7 +274,7 @@ class ContactProblem:
             )
             self.u.x.array[:] = self.dofs.to_dolfinx(solution.u)
         self._start = (gluing, solution.lam, result.mu) if result.reason > 0 else None
-        fill_result(report, solution, dual, result, accuracy)
+        fill_result(report, solution, dual, *solved)
         result.destroy()
         conclude(result, accuracy, self.options, self.decomposition.comm)
         return solution

@@ -54,6 +54,7 @@ class Report:
         power_method_multiplications: Multiplications that estimated ‖PFP‖.
         recoveries: Displacements recovered to see how right they are, each for one more solve
             in every subdomain.
+        friction_iterations: Problems with given bounds that were solved for Coulomb's friction.
         outer_iterations: Outer iterations.
         newton_faces: Faces that block Newton has solved on.
         cg_steps: Conjugate gradient steps.
@@ -78,7 +79,8 @@ class Report:
             displacement of the body where it is worst; in physical units ``gluing_jump`` and
             ``penetration`` (lengths), ``tension`` (most negative pressure), ``complementarity``
             (largest force times gap), ``balance`` (force left on a kernel mode where
-            it is largest beside the forces there).
+            it is largest beside the forces there); ``friction``, the last change of the bounds of
+            Coulomb's friction over their size.
         tolerances: What they were at most allowed to be, all but the first two.
         in_all: Solves, counters and ``seconds`` of all solves together.
         errors: Relative errors against closed forms, filled by demos.
@@ -109,6 +111,7 @@ class Report:
     preconditioner_multiplications: int = _counter()
     power_method_multiplications: int = _counter()
     recoveries: int = _counter()
+    friction_iterations: int = _counter()
     outer_iterations: int = _counter()
     newton_faces: int = _counter()
     cg_steps: int = _counter()

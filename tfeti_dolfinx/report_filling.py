@@ -6,6 +6,7 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.coulomb import Settling
 from tfeti_dolfinx.dual.accuracy import Accuracy
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.gluing.glue import Gluing
@@ -41,6 +42,7 @@ def fill_result(
     dual: Dual,
     result: QPResult,
     accuracy: Accuracy,
+    settling: Settling,
 ) -> None:
     """Fill in what a solve has found; counters add up over rounds. Collective."""
     comm = dual.coarse.comm
@@ -56,6 +58,7 @@ def fill_result(
     report.power_method_multiplications += dual.F.count["power method"]
     if dual.preconditioner is not None:
         report.preconditioner_multiplications += dual.preconditioner.count["solver"]
+    report.friction_iterations += settling.iterations
     report.outer_iterations += result.steps.outer
     report.newton_faces += result.steps.faces
     report.face_factorizations += dual.coarse.factors.count["face"]
@@ -66,7 +69,9 @@ def fill_result(
     report.local_operators = _local_operators(dual)
     report.recoveries += accuracy.looks
     report.residuals = _residuals(solution, dual, result, accuracy)
+    report.residuals["friction"] = settling.change
     report.tolerances = _tolerances(solution, dual, accuracy)
+    report.tolerances["friction"] = settling.tolerance
     report.peak_memory_mb = peak_memory_mb(comm)
 
 

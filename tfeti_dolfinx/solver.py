@@ -29,6 +29,8 @@ EXPLANATIONS = {
     ConvergedReason.DIVERGED_ROUNDING: "; rounding does not let it come lower: expected a "
     "larger rtol, or a scene with smaller ratios of stiffness or size",
     ConvergedReason.DIVERGED_STALLED: "; the forces come no nearer to balancing the load",
+    ConvergedReason.DIVERGED_FRICTION: "; the bounds of Coulomb's friction do not come to rest: "
+    "expected a smaller coefficient, smaller load steps, or a larger friction_max_it",
 }
 
 

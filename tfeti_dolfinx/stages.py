@@ -29,7 +29,7 @@ CHANGES = {
     "stiffness": ("stiffness", "rows", "friction", "factors", "trace", "coarse problem"),
     "rows": ("rows", "friction", "trace", "coarse problem"),
     "right side": ("right side", "linear term"),
-    "friction": ("friction",),
+    "friction": ("friction", "linear term"),
     "load": ("load", "linear term"),
 }
 # what comes with a stage

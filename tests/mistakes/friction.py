@@ -157,10 +157,6 @@ AT_NODES = {
         lambda s: two_laws(s, tfeti.Tresca(1.0), tfeti.Coulomb(1.0)),
         r"^sand: the same surface has another law of friction in ice; expected one law",
     ),
-    "a law that is not solved yet": on_floor(
-        rf"{FLOOR}: Coulomb friction is not solved yet; expected Tresca",
-        lambda s: tfeti.Coulomb(0.3),
-    ),
     "newton with friction": (
         lambda s: solved_with(s, "newton"),
         r"-tfeti_qp_type newton: the scene has friction, \d+ tangential rows, which NEWTON cannot "

@@ -36,6 +36,7 @@ class CoarseSpace(Projectors):
         B: Dual rows × trace unknowns.
         subdomains: This rank's Blocks. The constructor and all methods are collective.
         bounded: Local rows with λ ≥ 0.
+        rubbing: Local rows of friction.
         prefix: Prefix of the factor's PETSc options.
 
     Attributes:
@@ -45,13 +46,14 @@ class CoarseSpace(Projectors):
         motions: The bodies' motions in the basis T, scipy CSR, shape ``(r, bodies * k)``.
         Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
         bounded: Local rows with λ ≥ 0.
+        rubbing: Local rows of friction.
         row_size: Sum of the moduli of each local row of B, the same however the mesh is torn. A
             row over it gives lengths. Shape ``(m_local,)``.
         bodies: Motions of the bodies.
         J: This rank's rows of B R over their size, on motions of bodies, scipy CSR, shape
             ``(m_local, bodies * k)``; empty for gluing rows.
-        unheld: Motions that neither springs nor equality rows resist; each of these rows acts
-            on one body.
+        unheld: Motions that neither springs nor equality rows resist, friction apart; each of
+            these rows acts on one body.
         free_motions: Motions that no row resists at all.
         null: Orthonormal basis of null(Gᵀ).
         grams: GGᵀ, and those of faces.
@@ -63,9 +65,10 @@ class CoarseSpace(Projectors):
         B: PETSc.Mat,
         subdomains: Subdomains,
         bounded: Array,
+        rubbing: Array,
         prefix: str = "tfeti_coarse_",
     ) -> None:
-        self.subdomains, self.bounded = subdomains, bounded
+        self.subdomains, self.bounded, self.rubbing = subdomains, bounded, rubbing
         self.comm = comm = subdomains.comm
         offsets = chunk_offsets(comm, subdomains.kernel_size)
         dimension = int(offsets[-1])
@@ -75,7 +78,7 @@ class CoarseSpace(Projectors):
         self.bodies = Bodies(subdomains, self._own.start, dimension)
         self.J = _without_rounding(diags_array(1.0 / self.row_size) @ Gt @ self.bodies.motions)
         equalities = np.ones(len(self.row_size), dtype=bool)
-        equalities[bounded] = False
+        equalities[np.concatenate((bounded, rubbing))] = False
         self.unheld = self._unresisted(equalities, unsprung(self.bodies.springs), NULL)
         self.free_motions = self.unresisted(~equalities)
         # made on one rank: processors that round differently might choose differently
@@ -85,7 +88,7 @@ class CoarseSpace(Projectors):
         self._read_load()
         joint = csr_array(self.motions @ self.free_motions.joint)
         self.null = agreed(comm, null_basis(np.flatnonzero(self._basis.free), joint))
-        self.grams = Grams(self.Gt, bounded, comm)
+        self.grams = Grams(self.Gt, np.flatnonzero(~equalities), comm)
         self.factors = FaceFactors(comm, self.null, prefix)
         self._factor = self.factors.factor(self.grams.whole, "whole")
 
@@ -137,7 +140,8 @@ class CoarseSpace(Projectors):
                 same rows hold at most are taken in, too.
         """
         flags = np.zeros(len(self.row_size), dtype=bool)
-        flags[self.bounded] = rows[self.bounded]
+        for own in (self.bounded, self.rubbing):
+            flags[own] = rows[own]
         return self._unresisted(flags, self.unheld, below)
 
     def _unresisted(self, rows: Array, within: Motions, below: float) -> Motions:

@@ -26,6 +26,8 @@ class Rows:
         body: Body of each column, shape ``(n,)``.
 
     Attributes:
+        ends: First and last body of each row, shape ``(m,)``; of an empty row beyond all bodies,
+            and −1.
         sent: Which of them the rank that solves knows, shape ``(m,)``.
     """
 
@@ -37,6 +39,7 @@ class Rows:
         np.minimum.at(first, row, body[column])
         np.maximum.at(last, row, body[column])
         # rows between the same bodies form a patch
+        self.ends = first, last
         _, self.patch = np.unique(np.stack((first, last), axis=1), axis=0, return_inverse=True)
         self.patch = self.patch.ravel()
         self._entry = row, column

@@ -8,6 +8,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.dual.capacity import check_capacity, holds
 from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.dual.face_preconditioner import FacePreconditioner
 from tfeti_dolfinx.dual.naming import listed
@@ -102,13 +103,14 @@ class Dual:
             self._scaled = ScaledRows(B, constraints.weights)
             self.preconditioner = preconditioner(self._scaled, subdomains)
         self._on_faces: FacePreconditioner | None = None
-        bounded = constraints.sets.normals
-        self.coarse = CoarseSpace(B, subdomains, bounded, f"{options_prefix}coarse_")
+        normals, tangents = constraints.sets.normals, constraints.sets.tangents.ravel()
+        prefix = f"{options_prefix}coarse_"
+        self.coarse = CoarseSpace(B, subdomains, normals, tangents, prefix)
         self.contact_rows = constraints.sets.contact_rows(comm)
         self._law, self.feasible = feasible, feasible(constraints)
         self._images = dict[str, tuple[Array, Image]]()
         self._norm: tuple[int, float] | None = None
-        check_solvable(self.coarse, body_names, mode_names)
+        self._check()
         self.d = linear_term(B, constraints.c, subdomains)
 
     def update_load(self) -> None:
@@ -118,9 +120,18 @@ class Dual:
             NoSolutionError: The load moves a body that nothing holds.
         """
         self.coarse.update_load()
-        check_solvable(self.coarse, *self._names)
+        self._check()
         self.d.destroy()
         self.d = linear_term(self.constraints.B, self.constraints.c, self.subdomains)
+
+    def _check(self) -> None:
+        check_solvable(self.coarse, *self._names)
+        check_capacity(self.coarse, self.constraints, *self._names)
+
+    @property
+    def holds(self) -> bool:
+        """Whether forces within the present limits of friction can balance the load."""
+        return holds(self.coarse, self.constraints)
 
     def forget_counts(self) -> None:
         """Count multiplications from 0 on."""
@@ -184,7 +195,7 @@ class Dual:
         """
         B, c = self.constraints.B, self.constraints.c
         u, gap = recover(B, c, self.coarse, lam, gradient, face)
-        motions, force = nearly_free(self.coarse, lam.array_r, face.holding, error)
+        motions, force = nearly_free(self.coarse, lam.array_r, face.carrying, error)
         self.pressing = force
         words = listed(motions, self.coarse.bodies, *self._names)
         self.nearly_free = agreed(self.coarse.comm, words)

@@ -33,20 +33,20 @@ TIGHT = 1e-14
 
 
 def nearly_free(
-    coarse: CoarseSpace, lam: Array, holding: Array, error: float
+    coarse: CoarseSpace, lam: Array, carrying: Array, error: float
 ) -> tuple[Motions, Array]:
     """Motions that the contact rows with a force do not hold, or hardly. Collective.
 
     Args:
         coarse: The coarse space.
         lam: The multipliers.
-        holding: Flags of the local rows that are held.
+        carrying: Flags of the local rows that carry a force.
         error: How large multipliers may be by the solver's error alone.
 
     Returns:
-        The motions, and flags of the local rows with a force.
+        The motions, and flags of the local rows with a force, or with friction.
     """
-    lam, force = np.where(holding, np.abs(lam), 0.0), np.zeros(len(lam))
+    lam, force = np.where(carrying, np.abs(lam), 0.0), np.zeros(len(lam))
     force[coarse.bounded] = (lam * coarse.row_size)[coarse.bounded]
     row, column = coarse.J.tocoo().coords
     body = column // coarse.bodies.k
@@ -59,6 +59,8 @@ def nearly_free(
     np.minimum.at(against_loads, row, loads[body])
     error_alone = (lam <= NO_EFFECT * error) & (force <= NO_FORCE * against_loads)
     real = (force > 0.0) & (force > NO_FORCE * against_forces) & ~error_alone
+    # what sticks holds, pushed or not; and what slips cannot do so farther or less as it likes
+    real[coarse.rubbing] = carrying[coarse.rubbing]
     return coarse.unresisted(real, below=NEARLY), real
 
 

@@ -18,7 +18,7 @@ from tfeti_dolfinx.dual.motions import Motions
 from tfeti_dolfinx.dual.naming import free_to_move
 from tfeti_dolfinx.dual.sparse_columns import orthonormal_columns
 from tfeti_dolfinx.errors import NoSolutionError, TfetiError
-from tfeti_dolfinx.parallel import agreed
+from tfeti_dolfinx.parallel import agreed, any_rank
 
 # Least slope against a contact, of a motion of mean square 1, that counts as an overlap; the
 # tolerances of the linear programs are finer.
@@ -33,6 +33,8 @@ def check_solvable(
     coarse: CoarseSpace, body_names: Sequence[str], mode_names: Sequence[str]
 ) -> None:
     """Raise if the load moves a body that nothing holds. Collective.
+
+    What friction holds is a question of its own, see ``dual/capacity.py``.
 
     Args:
         coarse: The coarse space.
@@ -50,7 +52,7 @@ def check_solvable(
         "nothing resists that and the load drives it; add a Dirichlet condition, a contact or a "
         "spring, or balance the load"
     )
-    if motion is None:
+    if motion is None and not any_rank(coarse.comm, coarse.rubbing.size > 0):
         motion = escape(coarse)
         reason = "only contact could resist that, and the load drives out of contact"
     if motion is not None:
@@ -87,8 +89,8 @@ def escape(coarse: CoarseSpace) -> Array | None:
     if agreed(coarse.comm, bool(np.all(np.abs(load) <= noise))):
         return None
     # parts of the scene that do not meet may be loaded by very different forces
-    part = _parts(coarse, rows, body)
-    largest = _sizes(load, noise, part)
+    part = parts_of(coarse, rows, body)
+    largest = load_sizes(load, noise, part)
     load, noise = load / largest[part], noise / largest[part]
     comm, first = coarse.comm, rows.extremes()
     y = minimise(rows, lambda A, _: _most_work(A, load, noise), SLOPE, comm, first)
@@ -97,7 +99,7 @@ def escape(coarse: CoarseSpace) -> Array | None:
     return None if y is None else np.asarray(Z @ y)
 
 
-def _sizes(load: Array, noise: Array, part: Array) -> Array:
+def load_sizes(load: Array, noise: Array, part: Array) -> Array:
     """Size of the load on each part of the scene, 1 where there is none.
 
     A load that is no more than rounding is not the size of anything: else its noise would hide
@@ -110,7 +112,7 @@ def _sizes(load: Array, noise: Array, part: Array) -> Array:
     return np.where(sizes > 0.0, sizes, 1.0)
 
 
-def _parts(coarse: CoarseSpace, rows: Rows, body: Array) -> Array:
+def parts_of(coarse: CoarseSpace, rows: Rows, body: Array) -> Array:
     """For each column the part of the scene, connected through contact rows, that it is in."""
     links = coarse.comm.allgather(rows.links(coarse.bodies.count))
     return connected_components(csr_array(sum(links)), directed=False)[1][body]
@@ -118,12 +120,12 @@ def _parts(coarse: CoarseSpace, rows: Rows, body: Array) -> Array:
 
 def _most_work(A: csr_array, load: Array, noise: Array) -> Array | None:
     """A motion of much work, if that is more than rounding; A y ≤ 0, −1 ≤ y ≤ 1."""
-    y = _minimiser(-load, A, bounds=(-1.0, 1.0))
+    y = minimiser(-load, A, bounds=(-1.0, 1.0))
     if load @ y <= noise.max():
         return None
     # Motions that cost nothing are in y, too: of heavily loaded bodies they would hide that of a
     # light one. Work less what counts as none has no such motions.
-    y = _halves(_minimiser(np.concatenate((noise - load, noise + load)), _both(A), bounds=(0, 1)))
+    y = _halves(minimiser(np.concatenate((noise - load, noise + load)), _both(A), bounds=(0, 1)))
     # a cone: a motion that gains something gains more until a bound stops it
     return y if np.abs(y).max() > MOVES and load @ y > noise @ np.abs(y) else None
 
@@ -131,7 +133,7 @@ def _most_work(A: csr_array, load: Array, noise: Array) -> Array | None:
 def _least_motion(A: csr_array, load: Array) -> Array:
     """The least motion (sum of moduli) of unit work, scaled to 1; A y ≤ 0."""
     work = np.concatenate((load, -load))[None, :]
-    y = _halves(_minimiser(np.ones(work.size), _both(A), A_eq=work, b_eq=np.ones(1)))
+    y = _halves(minimiser(np.ones(work.size), _both(A), A_eq=work, b_eq=np.ones(1)))
     return y / np.abs(y).max()
 
 
@@ -146,7 +148,7 @@ def _halves(pq: Array) -> Array:
     return np.asarray(p - q)
 
 
-def _minimiser(cost: Array, A: csr_array, **rest: Any) -> Array:
+def minimiser(cost: Array, A: csr_array, **rest: Any) -> Array:
     """The minimiser of a linear program over A y ≤ 0.
 
     Raises:

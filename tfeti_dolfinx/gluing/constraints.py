@@ -33,6 +33,11 @@ class Constraints:
         tangent_scale: The same for each point of ``sets.tangents``, shape ``(t,)``.
         limits: The ψ_i, semi-axes of the sets of the tangential multipliers, shape
             ``(t, gdim - 1)``; 0 until they are set.
+        pressed_by: Under Coulomb's law the local row of the condition's normal, else −1, shape
+            ``(t,)``.
+        coefficients: The μ_i of Coulomb's law, else 0, shape ``(t, gdim - 1)``.
+        pressures: The λ_N whose friction the limits are, under Coulomb's law; nan until they
+            are set, shape ``(t,)``.
     """
 
     B: PETSc.Mat
@@ -43,6 +48,9 @@ class Constraints:
     scale: Array
     tangent_scale: Array
     limits: Array
+    pressed_by: Array
+    coefficients: Array
+    pressures: Array
 
     @property
     def num_rows(self) -> int:
@@ -57,6 +65,18 @@ class Constraints:
         """Fill the ψ_i anew, shape ``(t, gdim - 1)``. B stays."""
         self.limits[:] = limits
 
+    @property
+    def pressed(self) -> Array:
+        """Positions of the points of ``sets.tangents`` with a coefficient of Coulomb's law."""
+        return np.flatnonzero(np.any(self.coefficients > 0.0, axis=1))
+
+    def set_pressures(self, pressures: Array) -> None:
+        """Fill the ψ_i under Coulomb's law, μ_i times a λ_N of each of ``pressed``; ∞ sticks."""
+        at = self.pressed
+        self.pressures[at] = pressures
+        mu = self.coefficients[at]
+        self.limits[at] = np.multiply(mu, pressures[:, None], out=np.zeros_like(mu), where=mu > 0.0)
+
     def destroy(self) -> None:
         """Destroy the PETSc objects. Collective."""
         self.B.destroy()
@@ -64,7 +84,12 @@ class Constraints:
 
 
 def assemble_constraints(
-    dofs: TornDofs, tables: Sequence[Rows], weights: Array, scale: Array, tangent_scale: Array
+    dofs: TornDofs,
+    tables: Sequence[Rows],
+    weights: Array,
+    scale: Array,
+    tangent_scale: Array,
+    pressed_by: Array,
 ) -> Constraints:
     """Assemble B, with c = 0 and ψ = 0. Collective.
 
@@ -74,6 +99,7 @@ def assemble_constraints(
         weights: D on the local primal unknowns.
         scale: What each normal row was multiplied by.
         tangent_scale: What the tangential rows of each condition were multiplied by.
+        pressed_by: For each of them the position of its normal row under Coulomb's law, else −1.
     """
     rows = stack(list(tables))
     equalities, normals, tangents = (len(table) for table in tables)
@@ -90,8 +116,21 @@ def assemble_constraints(
     )
     c = B.createVecLeft()
     c.set(0.0)
-    limits = np.zeros(sets.tangents.shape)
-    return Constraints(B, c, sets, trace, weights[trace], scale, tangent_scale, limits)
+    shape, row = sets.tangents.shape, pressed_by.copy()
+    row[row >= 0] = sets.normals[row[row >= 0]]
+    return Constraints(
+        B=B,
+        c=c,
+        sets=sets,
+        trace=trace,
+        weights=weights[trace],
+        scale=scale,
+        tangent_scale=tangent_scale,
+        limits=np.zeros(shape),
+        pressed_by=row,
+        coefficients=np.zeros(shape),
+        pressures=np.full(len(row), np.nan),
+    )
 
 
 def _trace_columns(dofs: TornDofs, column: Array) -> tuple[Array, Array]:

@@ -152,7 +152,9 @@ def glue(
     sliding_rows, tangents = tangent_rows(dofs, spread, contact)
     equalities, held = equality_rows(dofs, prescribed.flag, D)
     tables = (equalities, normal_rows, sliding_rows)
-    constraints = assemble_constraints(dofs, tables, weights, contact.scale, tangents.scale)
+    constraints = assemble_constraints(
+        dofs, tables, weights, contact.scale, tangents.scale, tangents.normal
+    )
     gluing = Gluing(dofs, prescribed, records, held, contact, tangents, constraints, length)
     try:
         constraints.set_right_side(gluing.right_side(prescribed.value, records.gap))

@@ -30,6 +30,8 @@ class TangentRows:
             stay, so that a disc stays a disc, shape ``(t, gdim - 1)``.
         tangents: Axes of the rows, shape ``(t, gdim - 1, gdim)``.
         held: What prescribed components contribute to relative displacements.
+        normal: Under Coulomb's law the normal row of the same condition, as a position in
+            ``RowSets.normals``, else −1, shape ``(t,)``.
     """
 
     condition: Array
@@ -37,6 +39,7 @@ class TangentRows:
     moves: Array
     tangents: Array
     held: HeldPart
+    normal: Array
 
     def right_side(self, dofs: TornDofs, values: Array, size: int) -> Array:
         """What makes T u − c the scaled slip, that of prescribed values taken in. Collective.
@@ -62,10 +65,23 @@ class TangentRows:
             area: ∫φ_i of all conditions, shape ``(n,)``.
 
         Returns:
-            traction · ∫φ_i / s_i, shape ``(t, gdim - 1)``.
+            traction · ∫φ_i / s_i, shape ``(t, gdim - 1)``; 0 under Coulomb's law.
         """
         over = (area[self.condition] / self.scale)[:, None]
-        return np.where(self.moves, traction[self.condition] * over, 0.0)
+        given = self.moves & (self.normal < 0)[:, None]
+        return np.where(given, traction[self.condition] * over, 0.0)
+
+    def coefficients(self, values: Array) -> Array:
+        """The μ_i: semi-axes over λ_N, 0 on rows without entries and under a given bound.
+
+        Args:
+            values: Coefficients of all conditions along their tangents, shape ``(n, gdim - 1)``.
+
+        Returns:
+            Shape ``(t, gdim - 1)``.
+        """
+        pressed = self.moves & (self.normal >= 0)[:, None]
+        return np.where(pressed, values[self.condition], 0.0)
 
 
 def tangent_rows(dofs: TornDofs, spread: Spread, normals: ContactRows) -> tuple[Rows, TangentRows]:
@@ -81,7 +97,8 @@ def tangent_rows(dofs: TornDofs, spread: Spread, normals: ContactRows) -> tuple[
     """
     records, count = spread.records, dofs.bs - 1
     if not any_rank(dofs.comm, bool(np.any(records.friction != Friction.NONE))):
-        return NO_ROWS, _tangents_of(spread, NOTHING, np.zeros(0), np.ones((0, count), dtype=bool))
+        none = np.ones((0, count), dtype=bool)
+        return NO_ROWS, _tangents_of(spread, NOTHING, np.zeros(0), none, NOTHING)
     squares, moves = np.zeros((len(records), count)), np.zeros((len(records), count), dtype=bool)
     for k in range(count):
         squares[:, k], moves[:, k] = spread.left(1 + k)
@@ -93,14 +110,19 @@ def tangent_rows(dofs: TornDofs, spread: Spread, normals: ContactRows) -> tuple[
     longest = np.sqrt(squares[condition].max(axis=1, initial=0.0))
     scale = normal_scale[condition]
     scale = np.where(scale > 0.0, scale, 1.0 / np.maximum(longest, TINY))
-    found = _tangents_of(spread, condition, scale, moves[condition])
+    row = np.full(len(records), -1)
+    row[normals.condition] = np.arange(len(normals.condition))
+    row[records.friction != Friction.COULOMB] = -1
+    found = _tangents_of(spread, condition, scale, moves[condition], row[condition])
     tables = [spread.rows(1 + k, condition, scale * found.moves[:, k]) for k in range(count)]
     return _by_condition(tables), found
 
 
-def _tangents_of(spread: Spread, condition: Array, scale: Array, moves: Array) -> TangentRows:
+def _tangents_of(
+    spread: Spread, condition: Array, scale: Array, moves: Array, normal: Array
+) -> TangentRows:
     tangents = spread.records.tangents[condition]
-    return TangentRows(condition, scale, moves, tangents, spread.held)
+    return TangentRows(condition, scale, moves, tangents, spread.held, normal)
 
 
 def _by_condition(tables: list[Rows]) -> Rows:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from enum import IntEnum
 from typing import Protocol
 
@@ -105,6 +105,7 @@ class ConvergedReason(IntEnum):
     ITERATING: it has not stopped.
     DIVERGED_ROUNDING: residuals cannot be brought down any further in floating point.
     DIVERGED_STALLED: Gλ = e comes no nearer, as if nothing in Ω fulfilled it.
+    DIVERGED_FRICTION: the bounds of friction do not come to rest.
     """
 
     CONVERGED_RTOL = 2
@@ -114,6 +115,7 @@ class ConvergedReason(IntEnum):
     DIVERGED_INDEFINITE_MAT = -10
     DIVERGED_ROUNDING = -20
     DIVERGED_STALLED = -21
+    DIVERGED_FRICTION = -22
 
 
 @dataclass
@@ -130,6 +132,10 @@ class Steps:
     def inner(self) -> int:
         """All inner steps."""
         return self.cg + self.expansion + self.proportioning
+
+    def plus(self, other: Steps) -> Steps:
+        """The steps of both."""
+        return Steps(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
 
 
 @dataclass

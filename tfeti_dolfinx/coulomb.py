@@ -1,0 +1,205 @@
+"""Coulomb's law: a fixed point iteration on the bounds of friction, each a problem of Tresca's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import cast
+
+import numpy as np
+from petsc4py import PETSc
+
+from tfeti_dolfinx.arrays import TINY, Array
+from tfeti_dolfinx.dual.accuracy import Accuracy
+from tfeti_dolfinx.dual.dual import Dual
+from tfeti_dolfinx.errors import ConvergenceError
+from tfeti_dolfinx.gluing.constraints import Constraints
+from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.parallel import agreed, any_rank, summed
+from tfeti_dolfinx.qp.acceleration import Anderson
+from tfeti_dolfinx.qp.cones import Cones
+from tfeti_dolfinx.qp.discs import Ellipses
+from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Product
+from tfeti_dolfinx.qp.monitors import Monitor
+from tfeti_dolfinx.qp.nearest import nearest
+from tfeti_dolfinx.qp.problem import ConvergedReason, QPResult, Steps
+from tfeti_dolfinx.solver import solve_dual
+
+# Inner tolerance: rtol of the first step, and share of the last change of the bounds
+FIRST, SHARE = 1e-2, 0.1
+# Change of the bounds beside rtol, where that is smaller than what options ask for: the law holds
+# to the change, and each step makes it smaller by a factor of this order
+BESIDE_RTOL = 100.0
+# of what is wanted: a change from which on the next one may be small enough
+NEAR = 10.0
+# of all multipliers: forces of normals that rounding makes of none
+NO_FORCE = 1e-13
+# factors on the forces of normals of the nearest balanced point: it is found to some digits only
+LARGER = (1.0, 1.001, 1.1, 2.0)
+
+
+@dataclass(frozen=True)
+class Settling:
+    """How the bounds of friction have come to rest.
+
+    Attributes:
+        iterations: Problems with given bounds that were solved; 0 without Coulomb's law.
+        change: Last change of the bounds, over their size.
+        tolerance: What that had to come down to.
+    """
+
+    iterations: int = 0
+    change: float = 0.0
+    tolerance: float = 0.0
+
+
+def solve_with_friction(
+    dual: Dual,
+    options: Options,
+    qp_type: str,
+    start: tuple[Array, Array] | None = None,
+    monitor: Monitor | None = None,
+) -> tuple[QPResult, Accuracy, Settling]:
+    """Solve the dual problem with bounds of friction that fit the forces of normals. Collective.
+
+    Args:
+        dual: The dual problem.
+        options: Options.
+        qp_type: A solver of ``SOLVERS``.
+        start: λ on this rank's rows, and the multipliers of Gλ = e, to start from.
+        monitor: Called after each step; default as options say.
+
+    Returns:
+        Multipliers, their displacement with its accuracy (of the last step; steps and looks are
+        those of all), and how the bounds have come to rest.
+    """
+    if not any_rank(dual.coarse.comm, dual.constraints.pressed.size > 0):
+        return *solve_dual(dual, options, qp_type, start, monitor), Settling()
+    bounds, steps, looks = _Pressures(dual, start), Steps(), 0
+    tolerance = min(options.friction_rtol, BESIDE_RTOL * options.rtol)
+    change, iterations = np.inf, 0
+    while True:
+        bounds.set_feasible(start)
+        near = change <= NEAR * tolerance
+        rtol = options.rtol if near else max(options.rtol, min(FIRST, SHARE * change))
+        result, rule = solve_dual(dual, replace(options, rtol=rtol), qp_type, start, monitor)
+        iterations, looks = iterations + 1, looks + rule.looks
+        steps = steps.plus(result.steps)
+        if result.reason <= 0:
+            break
+        change = bounds.change(result.lam)
+        if change <= tolerance and rtol <= options.rtol:
+            break
+        if iterations >= options.friction_max_it:
+            result.reason = ConvergedReason.DIVERGED_FRICTION
+            break
+        if change > tolerance:
+            bounds.advance()
+        start = (np.array(result.lam.array_r), result.mu)
+        result.destroy()
+    result.steps, rule.looks = steps, looks
+    return result, rule, Settling(iterations, float(change), tolerance)
+
+
+class _Pressures:
+    """λ_N of the rows under Coulomb's law, that the limits belong to. All methods are collective.
+
+    Without a start what touches sticks at first: that has a solution wherever any bounds have one.
+
+    Args:
+        dual: The dual problem.
+        start: Multipliers to start from.
+    """
+
+    def __init__(self, dual: Dual, start: tuple[Array, Array] | None) -> None:
+        self._dual, self._constraints = dual, dual.constraints
+        self._comm = dual.coarse.comm
+        at = dual.constraints.pressed
+        self._rows = dual.constraints.pressed_by[at]
+        # differences of bounds are measured as forces
+        mu = np.linalg.norm(dual.constraints.coefficients[at], axis=1)
+        self._weight = mu * dual.constraints.tangent_scale[at]
+        self._now, self._found = self._first(start), np.zeros(len(at))
+        self._anderson = Anderson(self._products)
+
+    def _first(self, start: tuple[Array, Array] | None) -> Array:
+        known = self._constraints.pressures[self._constraints.pressed]
+        if start is None:
+            return np.full(len(self._rows), np.inf)
+        if any_rank(self._comm, not np.all(np.isfinite(known))):
+            return np.maximum(start[0][self._rows], 0.0)
+        return known
+
+    def set_feasible(self, start: tuple[Array, Array] | None) -> None:
+        """Set the limits, first those of a point that balances the load if these cannot.
+
+        Raises:
+            ConvergenceError: None was found.
+        """
+        self._constraints.set_pressures(self._now)
+        if self._sticks or self._dual.holds:
+            return
+        lam = self._dual.d.duplicate()
+        lam.set(0.0)
+        if start is not None:
+            lam.array[:] = start[0]
+        found = nearest(self._dual.coarse, _cone_set(self._constraints), lam)
+        pressures = np.array(found.lam.array_r[self._rows])
+        found.lam.destroy()
+        lam.destroy()
+        self._anderson = Anderson(self._products)
+        for factor in LARGER:
+            self._now = factor * pressures
+            self._constraints.set_pressures(self._now)
+            if self._dual.holds:
+                return
+        raise ConvergenceError(
+            "Coulomb's friction: no bounds were found that can hold the load (forces within its "
+            f"law miss {found.missing:.1e} of it); expected a load farther from what friction holds"
+        )
+
+    def change(self, lam: PETSc.Vec) -> float:
+        """Take what a solve has found; how far that is from the bounds, over its size."""
+        values = lam.array_r
+        self._found = np.maximum(values[self._rows], 0.0)
+        if self._sticks:
+            return float("inf")
+        miss, size = self._norm(self._found - self._now), self._norm(self._found)
+        largest = summed(self._comm, np.array([values @ values])) ** 0.5
+        heaviest = summed(self._comm, np.array([self._weight @ self._weight])) ** 0.5
+        size = max(size, NO_FORCE * float(largest[0] * heaviest[0]), TINY)
+        return agreed(self._comm, miss / size)
+
+    def advance(self) -> None:
+        """Take the next bounds."""
+        sticks = self._sticks
+        self._now = self._found if sticks else self._anderson.next(self._now, self._found)
+
+    @property
+    def _sticks(self) -> bool:
+        """Whether no bound is set yet."""
+        return any_rank(self._comm, bool(np.any(np.isinf(self._now))))
+
+    def _norm(self, pressures: Array) -> float:
+        column = pressures[:, None]
+        return float(np.sqrt(self._products(column, column)[0, 0]))
+
+    def _products(self, A: Array, B: Array) -> Array:
+        weighted = (self._weight[:, None] ** 2) * B
+        return agreed(self._comm, summed(self._comm, A.T @ weighted))
+
+
+def _cone_set(constraints: Constraints) -> Product:
+    """λ_N ≥ 0, given bounds, and Coulomb's law for normal and tangents together."""
+    sets, pressed = constraints.sets, constraints.pressed
+    above = constraints.pressed_by[pressed]
+    given = np.setdiff1d(np.arange(len(sets.tangents)), pressed)
+    rows = np.column_stack((above, sets.tangents[pressed]))
+    # the nearest point asks for no more than projections and faces
+    cone = cast(FeasibleSet, Cones(constraints.coefficients[pressed]))
+    return Product(
+        [
+            (np.setdiff1d(sets.normals, above), Bounds()),
+            (sets.tangents[given].ravel(), Ellipses(constraints.limits[given])),
+            (rows.ravel(), cone),
+        ]
+    )
