@@ -8,9 +8,9 @@ import numpy as np
 
 from tfeti_dolfinx.arrays import Array
 
-# Steps that are remembered: maps of contact have few slow directions, and older steps belong to
-# other faces.
-DEPTH = 5
+# Steps that are remembered: one, which makes it the crossed secant method. More of them mix
+# values of Φ on several faces, each inexact, and took up to twice as many steps.
+DEPTH = 1
 # ‖Φ(x) − x‖ that has grown by more than this since its least: what is remembered misleads
 GROWTH = 2.0
 # of the largest singular value: directions of the memory that inexact values of Φ decide
