@@ -169,6 +169,23 @@ def test_the_nearest_feasible_point(kind, seed):
     assert np.all(apart >= -1e-9 * np.linalg.norm(y))
 
 
+def test_steps_that_no_row_stops_end():
+    """λ ≥ 0 and λ₁ + λ₂ = −1: the cost falls for ever along α < 0."""
+
+    class Counting(DenseCoarse):
+        steps = 0
+
+        def damped_solve(self, face, y, damping):
+            self.steps += 1
+            return super().damped_solve(face, y, damping)
+
+    coarse = Counting(np.ones((1, 2)), -np.ones(1))
+    found = nearest(coarse, bounds_on(np.arange(2)), vector([1.0, 2.0]))
+    assert found.missing == pytest.approx(1.0)
+    assert np.array_equal(found.lam.array_r, [0.0, 0.0])
+    assert coarse.steps <= 15
+
+
 def test_the_nearest_point_says_what_nothing_fulfils():
     """λ₁ + λ₂ = −1 with λ ≥ 0."""
     coarse = DenseCoarse(np.ones((1, 2)), np.array([-1.0]))
