@@ -31,6 +31,7 @@ def stacked(axes: Any, title: str, rows: Sequence[Mapping[str, Any]], parts: Seq
         left = [a + b for a, b in zip(left, widths, strict=True)]
     axes.set_yticks(range(len(rows)), labels)
     axes.invert_yaxis()
+    axes.set_xlim(0.0, 1.3 * max(left))  # room for the legend
     axes.set_xlabel("seconds")
     axes.set_title(title, fontsize="medium")
     if len(parts) > 1:
@@ -63,12 +64,11 @@ def curves(
 
 
 def plain(axis: Any, ticks: Sequence[float] | None = None) -> None:
-    """Numbers as they are on a logarithmic axis: those given, or 1, 2, 5, 10, ..."""
+    """Numbers as they are on a logarithmic axis: those given if short, or 1, 2, 5, 10, ..."""
     from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
 
-    axis.set_major_locator(
-        LogLocator(subs=(1.0, 2.0, 5.0)) if ticks is None else FixedLocator(ticks)
-    )
+    short = ticks is not None and max(ticks) < 1000
+    axis.set_major_locator(FixedLocator(ticks) if short else LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 

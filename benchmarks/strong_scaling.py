@@ -58,6 +58,7 @@ def table(name, words, arguments, options):
             **stage_seconds(report),
             "without mesh": solve_seconds(report),
             "faster": serial / solve_seconds(report),
+            "processor": report["processor"],
             "MB": report["peak_memory_mb"],
         }
         for (_, _, ranks), report in zip(runs, reports, strict=True)

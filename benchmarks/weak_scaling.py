@@ -41,6 +41,7 @@ def row(report):
         **stage_seconds(report),
         "without mesh": seconds,
         "per million unknowns": seconds / report["primal_dofs"] * 1e6,
+        "processor": report["processor"],
         "MB": report["peak_memory_mb"],
         "kB per unknown": report["peak_memory_mb"] / report["primal_dofs"] * 1e3,
     }
@@ -54,15 +55,17 @@ def table(name, counts, cells, arguments, options):
 
 
 def draw(path, tables):
-    """Multiplications and seconds per unknown over subdomains."""
-    panels = {"F": "multiplications by F", "per million unknowns": "seconds per million unknowns"}
-    with picture(path, len(panels)) as axes:
-        for panel, (name, label) in zip(axes, panels.items(), strict=True):
+    """Multiplications over subdomains, and seconds of the processor over unknowns."""
+    with picture(path, 2) as (counts, seconds):
+        for panel, x, y, label, log in (
+            (counts, "subdomains", "F", "multiplications by F", "x"),
+            (seconds, "unknowns", "processor", "seconds of the processor", "xy"),
+        ):
             lines = {
-                title.split(":")[0]: (column(rows, "subdomains"), column(rows, name))
+                title.split(":")[0]: (column(rows, x), column(rows, y))
                 for title, rows in tables.items()
             }
-            curves(panel, label, ("subdomains", label), lines, log="x")
+            curves(panel, label, (x, label), lines, log)
 
 
 def main(argv):

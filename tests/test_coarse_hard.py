@@ -118,7 +118,7 @@ def test_gluing_far_from_the_origin_holds_nothing():
     p.destroy()
 
 
-NO_NULL = null_basis(np.empty(0, dtype=np.int64), np.zeros((4, 0)))
+NO_NULL = null_basis(np.empty(0, dtype=np.int64), csr_array((4, 0)))
 LAPLACIAN = np.diag([1.0, 2.0, 2.0, 1.0]) - np.diag(np.ones(3), 1) - np.diag(np.ones(3), -1)
 
 
@@ -144,7 +144,7 @@ def test_pins_are_chosen_in_the_units_of_the_matrix():
     sizes = np.array([1e-4, 1.0, 1.0, 1.0])
     A = csr_array(np.diag(sizes) @ (np.eye(4) - np.full((4, 4), 0.25)) @ np.diag(sizes))
     vector = 1.0 / sizes
-    null = null_basis(np.empty(0, dtype=np.int64), vector[:, None])
+    null = null_basis(np.empty(0, dtype=np.int64), csr_array(vector[:, None]))
     factor = SemidefiniteFactor(A, null, MPI.COMM_WORLD, "A")
     b = A @ np.array([1.0, 2.0, 3.0, 4.0])
     x = factor.solve(b)

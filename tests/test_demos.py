@@ -19,6 +19,8 @@ DEMOS = [
     "stacked_blocks_3d",
     "ball_bearing_3d",
     "talk_hertz_2d",
+    "tresca_2d",
+    "tresca_3d",
 ]
 
 

@@ -11,6 +11,7 @@ from mistakes import (
     elasticity,
     extensions,
     forms,
+    friction,
     gmsh_files,
     meshes,
     options,
@@ -19,7 +20,7 @@ from mistakes import (
 from mistakes.scene import Scene
 
 MODULES = (forms, elasticity, conditions, options, meshes, contacts, results, gmsh_files)
-MODULES += (again, extensions)
+MODULES += (again, extensions, friction)
 TABLES = {
     f"{module.__name__.split('.')[1]} {name.lower()}": getattr(module, name)
     for module in MODULES

@@ -19,6 +19,7 @@ from tfeti_dolfinx.qp.norm import estimate_norm
 from tfeti_dolfinx.qp.parameters import SmalseParameters
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Steps
 from tfeti_dolfinx.qp.smalse import smalse
+from tfeti_dolfinx.qp.tangent_steps import projected_step, step_on_face
 
 
 def program(seed, k, isotropic, m=40, r=4):
@@ -99,3 +100,47 @@ def test_the_cost_falls_in_each_step():
 
     assert mprgp(state, MprgpParameters(1.0 / np.linalg.norm(F, 2)), stop, Steps(), 2000) is None
     assert np.all(np.diff(costs) <= 1e-13 * np.abs(costs).max())
+
+
+def around_circles(seed, n=12):
+    """F and d that push all of n discs outwards, in different directions."""
+    rng = np.random.default_rng(seed)
+    X = rng.standard_normal((2 * n, 2 * n))
+    F = X @ X.T / (2 * n) + 0.05 * np.eye(2 * n)
+    return F, 30.0 * rng.standard_normal(2 * n), rng.uniform(0.1, 1.0, n)
+
+
+@given(st.integers(0, 1000))
+def test_steps_on_faces_find_the_minimum(seed):
+    """All points slide: tangents and the boundary's curvature are all that there is."""
+    F, d, radius = around_circles(seed)
+    discs, pairs = Discs(radius), np.arange(24).reshape(12, 2)
+    a = np.repeat(radius[:, None], 2, axis=1)
+    exact = constrained_qp(F, d, np.zeros((0, 24)), np.zeros(0), [], pairs, a)
+    x = vector(discs.project(exact + 1e-3 * np.sin(np.arange(24.0))))
+    start = np.linalg.norm(x.array - exact)
+    state = Iterate(matrix(F), x, vector(F @ x.array - d), discs)
+    for _ in range(60):
+        if step_on_face(state, 1.0 / np.linalg.norm(F, 2)) == 0:
+            break
+        state.split()
+    assert np.linalg.norm(x.array - exact) <= 1e-5 * start
+    assert np.allclose(state.g.array, F @ x.array - d, atol=1e-9)
+
+
+@given(st.integers(0, 1000))
+def test_each_step_on_a_curved_set_lowers_the_cost(seed):
+    F, d, _, _, bounded, pairs, a = program(seed, 2, True)
+    feasible, norm = as_set(bounded, pairs, a, True), np.linalg.norm(F, 2)
+    rng = np.random.default_rng(seed)
+    x = vector(feasible.project(3.0 * rng.standard_normal(40)))
+    state = Iterate(matrix(F), x, vector(F @ x.array - d), feasible)
+    costs = [0.5 * float(x.array @ (state.g.array - d))]
+    for step in (step_on_face, projected_step) * 4:
+        step(state, 1.0 / norm)
+        state.split()
+        costs.append(0.5 * float(x.array @ (state.g.array - d)))
+        assert np.allclose(state.g.array, F @ x.array - d, atol=1e-10)
+        assert np.allclose(feasible.project(x.array), x.array, rtol=0, atol=1e-12)
+    assert np.all(np.diff(costs) <= 1e-13 * np.abs(costs).max())
+    assert costs[-1] < costs[0]

@@ -106,6 +106,13 @@ def test_preconditioners_do_not_change_the_answer(pc_type):
     q.destroy()
 
 
+@pytest.mark.parametrize("gap", [0.0, 1e-9, 1e-3])
+def test_equal_rows_with_other_gaps_cost_little(gap):
+    """Of two parallel planes the nearer one carries; the other one is found to lose."""
+    alone = multiplications(between_parallel_planes(1.0))
+    assert multiplications(between_parallel_planes(gap)) <= 2 * alone
+
+
 def multiplications(scene):
     p = solved(scene)
     counted = p.report.F_multiplications

@@ -21,7 +21,8 @@ class Options:
     qp_type: str = described(
         "auto",
         "all",
-        "solver of the dual problem; auto takes pcpg without inequalities, else newton",
+        "solver of the dual problem; auto takes pcpg without contact, smalse with friction, "
+        "else newton",
         choices=("auto", *SOLVERS),
     )
     rtol: float = described(

@@ -71,6 +71,10 @@ def function(s, *element):
     return E
 
 
+def with_friction(s, law):
+    return solved(s, contacts=(tfeti.Obstacle("bottom", s.floor.shape, friction=law),))
+
+
 def with_shape(s, shape):
     return solved(s, contacts=(tfeti.Obstacle("bottom", shape),))
 
@@ -225,6 +229,20 @@ ACCEPTED = {
             lambda x: np.minimum(x[1] + 0.1, x[1] - x[0] + 0.7),
             lambda x: np.where(x[0] < 0.6, [[0.0], [1.0], [0.0]], [[-1.0], [1.0], [0.0]]),
         ),
+    ),
+    "friction that is a function of DOLFINx on cells": lambda s: with_friction(
+        s, tfeti.Tresca(function(s, "DG", 0))
+    ),
+    "friction that is a function of points": lambda s: with_friction(
+        s, tfeti.Tresca(lambda x: 0.1 * x[0])
+    ),
+    "friction that is a number of numpy's": lambda s: with_friction(s, tfeti.Tresca(np.float32(1))),
+    "friction of 0": lambda s: with_friction(s, tfeti.Tresca(0)),
+    "the same law twice on a surface": lambda s: solved(
+        s,
+        contacts=[
+            tfeti.Obstacle("bottom", s.floor.shape, friction=tfeti.Tresca(0.1)) for _ in range(2)
+        ],
     ),
     "an obstacle by the tag": lambda s: solved(
         s, contacts=[tfeti.Obstacle(np.int32(3), s.floor.shape)]

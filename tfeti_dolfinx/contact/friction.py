@@ -28,8 +28,8 @@ ALONG = 1e-3
 class Tresca:
     """The tangential traction is at most a given bound, whatever the pressure is.
 
-    It acts on all nodes with a contact condition, open ones as well, and on those whose normal
-    displacement is prescribed.
+    It acts on all nodes with a contact condition within reach, open ones as well, and on those
+    whose normal displacement is prescribed.
 
     Args:
         bound: A stress, 0 or more: a number, a function of points of shape ``(3, n)``, or a

@@ -83,7 +83,7 @@ class CoarseSpace(Projectors):
         self.motions = self._basis.coordinates(self.bodies.motions)
         self.Gt = self._basis.rows(Gt, diags_array(self.row_size) @ self.J, equalities)
         self._read_load()
-        joint = self.motions @ self.free_motions.joint
+        joint = csr_array(self.motions @ self.free_motions.joint)
         self.null = agreed(comm, null_basis(np.flatnonzero(self._basis.free), joint))
         self.grams = Grams(self.Gt, bounded, comm)
         self.factors = FaceFactors(comm, self.null, prefix)

@@ -144,6 +144,19 @@ class _OnFace:
         scaled.destroy()
         y.array[:] = self._scaled(y.array_r)
 
+    def dependent(self, x: Array) -> Array | None:
+        """The part of x in the null space of W, and so of B_fᵀ. Collective.
+
+        (1 + W/ε)⁻², ε the shift, leaves (ε/σ)² of what has the eigenvalue σ.
+        """
+        if self._factor is None:
+            return None
+        part, values = np.zeros_like(x), x[self._rows]
+        for _ in range(2):
+            values = SHIFT * self._factor.solve(values)
+        part[self._rows] = values
+        return part
+
     def _scaled(self, x: Array) -> Array:
         """W⁻¹x on the rows of the face."""
         values = self._face.restricted(x)

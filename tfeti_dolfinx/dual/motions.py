@@ -10,6 +10,7 @@ from scipy.sparse import bsr_array, csr_array, diags_array, eye_array
 from scipy.sparse.csgraph import connected_components
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.dual.sparse_columns import side_by_side, spread
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor
 
 # Stiffness, as a share of the stiffest motion of the same body, that counts as none: rounding
@@ -38,13 +39,13 @@ class Motions:
         free: Which of them the body can take alone, shape ``(bodies, k)``.
         stiffness: What holds each of them, as a share of the body's stiffest motion, its
             neighbours at rest, shape ``(bodies, k)``.
-        joint: Motions of several bodies together, shape ``(bodies * k, c)``.
+        joint: Motions of several bodies together, scipy CSR, shape ``(bodies * k, c)``.
     """
 
     single: Array
     free: Array
     stiffness: Array
-    joint: Array
+    joint: csr_array
 
     @cached_property
     def alone(self) -> csr_array:
@@ -83,7 +84,7 @@ def unsprung(springs: Array) -> Motions:
         springs: Projector onto what they resist, shape ``(bodies, k, k)``.
     """
     values, vectors = np.linalg.eigh(springs)
-    none = np.zeros((springs.shape[0] * springs.shape[1], 0))
+    none = csr_array((springs.shape[0] * springs.shape[1], 0))
     return Motions(vectors, values < HALF, values, none)
 
 
@@ -119,7 +120,7 @@ def unresisted(gram: csr_array, within: Motions, below: float = NULL) -> Motions
     U = csr_array(U[:, np.flatnonzero(held.ravel())])
     joint = scale @ (U @ _null_space(csr_array(U.T @ A @ U), np.nonzero(held)[0]))
     single = within.single @ vectors
-    return Motions(single, stiffness <= below, np.maximum(stiffness, 0.0), np.asarray(V @ joint))
+    return Motions(single, stiffness <= below, np.maximum(stiffness, 0.0), csr_array(V @ joint))
 
 
 def _largest(A: csr_array, k: int) -> Array:
@@ -127,10 +128,10 @@ def _largest(A: csr_array, k: int) -> Array:
     return np.asarray(np.linalg.eigvalsh(diagonal_blocks(A, k)).max(axis=1, initial=0.0))
 
 
-def _null_space(A: csr_array, body: Array) -> Array:
+def _null_space(A: csr_array, body: Array) -> csr_array:
     """Null space of a Gram matrix with unit blocks, by components of bodies."""
     if A.shape[0] == 0:
-        return np.zeros((0, 0))
+        return csr_array((0, 0))
     members = csr_array(
         (np.ones(len(body)), (body, np.arange(len(body)))), shape=(body.max() + 1, len(body))
     )
@@ -144,10 +145,8 @@ def _null_space(A: csr_array, body: Array) -> Array:
         if body[own[0]] == body[own[-1]]:
             continue  # a body alone: nothing is left free of it
         null = _component_null(csr_array(A[own][:, own]))
-        spread = np.zeros((A.shape[0], null.shape[1]))
-        spread[own] = null
-        columns.append(spread)
-    return np.concatenate([np.zeros((A.shape[0], 0)), *columns], axis=1)
+        columns.append(spread(own, null, A.shape[0]))
+    return side_by_side(columns, A.shape[0])
 
 
 def _component_null(A: csr_array) -> Array:

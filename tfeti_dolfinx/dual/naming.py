@@ -10,6 +10,7 @@ from scipy.linalg import qr
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.bodies import Bodies
 from tfeti_dolfinx.dual.motions import NULL, Motions
+from tfeti_dolfinx.dual.sparse_columns import parts_of_columns
 
 # Of the largest coefficient: a body that moves by less than this takes no part in a motion, which
 # is known to rounding only; and a motion is named after modes of this share or more, which leaves
@@ -63,17 +64,20 @@ def listed(
             _, mode = _parts(vectors[:, j][None, :], mode_names)
             held = float(stiffness[j])
             found.append({"bodies": [body_names[body]], "mode": mode, "stiffness": held})
-    for motion in _plain(motions.joint).T:
-        moving, mode = _parts(bodies.amounts(motion), mode_names)
-        names = [body_names[b] for b in moving]
-        found.append({"bodies": names, "mode": mode, "stiffness": 0.0})
+    for _, rows, joint in parts_of_columns(motions.joint):
+        moving, place = np.unique(rows // bodies.k, return_inverse=True)
+        for motion in _plain(joint).T:
+            coefficients = np.zeros((len(moving), bodies.k))
+            coefficients[place, rows % bodies.k] = motion
+            amounts = np.einsum("bij,bj->bi", bodies.frames[moving], coefficients)
+            parts, mode = _parts(amounts, mode_names)
+            names = [body_names[b] for b in moving[parts]]
+            found.append({"bodies": names, "mode": mode, "stiffness": 0.0})
     return found
 
 
 def _plain(joint: Array) -> Array:
     """Motions that span the same, each with a coordinate that the others leave alone."""
-    if joint.shape[1] == 0:
-        return joint
     rows = qr(joint.T, pivoting=True, mode="r")[1][: joint.shape[1]]
     return np.asarray(joint @ np.linalg.inv(joint[np.sort(rows)]))
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import csr_array, diags_array
 
 from tfeti_dolfinx.arrays import TINY, Array
 from tfeti_dolfinx.dual.kernel_basis import independent
+from tfeti_dolfinx.dual.sparse_columns import orthonormal_columns, parts_of_columns
 
 
 @dataclass(frozen=True)
@@ -16,11 +18,11 @@ class NullBasis:
 
     Attributes:
         alone: Coordinates of the unit vectors.
-        joint: Orthonormal, zero at those coordinates, as columns, shape ``(r, c)``.
+        joint: Orthonormal, zero at those coordinates, as columns, scipy CSR, shape ``(r, c)``.
     """
 
     alone: Array
-    joint: Array
+    joint: csr_array
 
     def removed(self, x: Array) -> Array:
         """x less its part in the space."""
@@ -34,18 +36,23 @@ class NullBasis:
         Args:
             scale: Coordinates are to be counted in these units.
         """
-        joint = self.joint / scale[:, None]
-        size = np.maximum(np.linalg.norm(joint, axis=0), TINY)
-        return np.concatenate((self.alone, independent(joint / size)))
+        pins = [self.alone]
+        for _, rows, dense in parts_of_columns(self.joint):
+            joint = dense / scale[rows, None]
+            size = np.maximum(np.linalg.norm(joint, axis=0), TINY)
+            pins.append(rows[independent(joint / size)])
+        return np.concatenate(pins)
 
 
-def null_basis(alone: Array, joint: Array) -> NullBasis:
+def null_basis(alone: Array, joint: csr_array) -> NullBasis:
     """Basis of unit vectors and others.
 
     Args:
         alone: Coordinates of the unit vectors.
         joint: Other vectors as columns, independent of them.
     """
-    joint = joint.copy()
-    joint[alone] = 0.0
-    return NullBasis(alone, np.linalg.qr(joint)[0])
+    others = np.ones(joint.shape[0])
+    others[alone] = 0.0
+    kept = csr_array(diags_array(others) @ joint)
+    kept.eliminate_zeros()
+    return NullBasis(alone, orthonormal_columns(kept))

@@ -5,13 +5,15 @@ from __future__ import annotations
 import numpy as np
 from mpi4py import MPI
 from scipy.optimize import lsq_linear
-from scipy.sparse import block_array, csr_array
+from scipy.sparse import block_array, csc_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import norm
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.dual.cuts import Rows, minimise
 from tfeti_dolfinx.dual.motions import Motions
+from tfeti_dolfinx.dual.sparse_columns import by_parts
 from tfeti_dolfinx.parallel import agreed
 
 # Motions held by less than this share of what the same contacts hold at most are nearly free:
@@ -104,11 +106,20 @@ def _orthonormal(motions: Motions, k: int) -> tuple[csr_array, Array]:
     body = np.repeat(np.arange(len(motions.free)), motions.free.sum(axis=1))
     if joint.shape[1] == 0:
         return alone, body
-    joint = joint / np.linalg.norm(joint, axis=0)
-    U, size, _ = np.linalg.svd(joint - alone @ (alone.T @ joint), full_matrices=False)
-    joint = U[:, size > DEPENDENT]
-    first = np.argmax(np.abs(joint) > SLOPE, axis=0) // k
-    return csr_array(block_array([[alone, csr_array(joint)]])), np.concatenate((body, first))
+    joint = csr_array(joint @ diags_array(1.0 / norm(joint, axis=0)))
+    joint = by_parts(csr_array(joint - alone @ (alone.T @ joint)), _span)
+    entries = csc_array(joint)
+    entries.data[np.abs(entries.data) <= SLOPE] = 0.0
+    entries.eliminate_zeros()
+    entries.sort_indices()
+    first = entries.indices[entries.indptr[:-1]] // k
+    return csr_array(block_array([[alone, joint]])), np.concatenate((body, first))
+
+
+def _span(columns: Array) -> Array:
+    """Orthonormal basis of the span of columns of size 1, or less if they are dependent."""
+    U, size, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(U[:, size > DEPENDENT])
 
 
 def _rows(coarse: CoarseSpace, A: csr_array, gap: Array, force: Array, body: Array) -> Rows:

@@ -16,6 +16,7 @@ from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.dual.cuts import Rows, minimise
 from tfeti_dolfinx.dual.motions import Motions
 from tfeti_dolfinx.dual.naming import free_to_move
+from tfeti_dolfinx.dual.sparse_columns import orthonormal_columns
 from tfeti_dolfinx.errors import NoSolutionError, TfetiError
 from tfeti_dolfinx.parallel import agreed
 
@@ -63,8 +64,8 @@ def _driven(free: Motions, load: Array, bodies: Bodies) -> Array | None:
     alone[np.linalg.norm(alone, axis=1) <= bodies.negligible] = 0.0
     if np.any(alone):
         return np.asarray(alone.ravel())
-    Q = np.linalg.qr(free.joint)[0]
-    joint = Q @ (Q.T @ load)
+    Q = orthonormal_columns(free.joint)
+    joint = np.asarray(Q @ (Q.T @ load))
     each = np.linalg.norm(joint.reshape(bodies.count, bodies.k), axis=1)
     return joint if joint @ load > bodies.negligible @ each else None
 

@@ -42,12 +42,16 @@ def rendezvous(
     comm.Allgather(box + np.array([[-size], [size]]), boxes)
     low, high = primary.box()
     margin = distance + primary.radius[:, None]
-    meets = np.ones((len(primary), comm.size), dtype=bool)
+    low, high = low - margin, high + margin
+    # ranks that some facet may meet first: they are few, of however many
+    reach = low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)
+    near = np.flatnonzero(np.all((reach[0] <= boxes[:, 1]) & (reach[1] >= boxes[:, 0]), axis=1))
+    meets = np.ones((len(primary), len(near)), dtype=bool)
     for axis in range(gdim):
-        meets &= low[:, axis, None] - margin <= boxes[None, :, 1, axis]
-        meets &= high[:, axis, None] + margin >= boxes[None, :, 0, axis]
-    facet, rank = np.nonzero(meets)
-    return here, primary.sent(Exchange(comm, rank), facet)
+        meets &= low[:, axis, None] <= boxes[None, near, 1, axis]
+        meets &= high[:, axis, None] >= boxes[None, near, 0, axis]
+    facet, place = np.nonzero(meets)
+    return here, primary.sent(Exchange(comm, near[place]), facet)
 
 
 def possible_pairs(secondary: Facets, primary: Facets, distance: float) -> tuple[Array, Array]:

@@ -13,6 +13,7 @@ from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.masked import MaskedPreconditioner
 from tfeti_dolfinx.qp.monitors import Monitor, no_monitor
 from tfeti_dolfinx.qp.problem import ConvergedReason, Operator, Steps
+from tfeti_dolfinx.qp.tangent_steps import projected_step, step_on_face
 
 StoppingTest = Callable[["Iterate"], bool]
 Expansion = Callable[["Iterate", float, float, float], None]
@@ -120,15 +121,6 @@ def fixed_step(state: Iterate, alpha_f: float, alpha_cg: float, alpha_bar: float
     target.destroy()
 
 
-def projected_step(state: Iterate, alpha_bar: float) -> None:
-    """x ← P_Ω(x − ᾱg): the boundary of a curved set leaves a step along −β no room."""
-    target = state.x.copy()
-    target.axpy(-alpha_bar, state.g)
-    state.project(target)
-    state.move_to(target)
-    target.destroy()
-
-
 def projected_cg(state: Iterate, alpha_f: float, alpha_cg: float, alpha_bar: float) -> None:
     """Expansion by the whole conjugate gradient step, projected.
 
@@ -183,8 +175,8 @@ def mprgp(
     Dostál, Schöberl, Comput. Optim. Appl. 30 (2005) 23–43; Dostál, Optimal Quadratic
     Programming Algorithms, Springer 2009, section 5.8, whose steps are numbered here, and 5.10
     for preconditioning in face. Where Ω has curved sets it is MPGP (Dostál, Kozubek, Math.
-    Program. 135 (2012) 195–220): a proportioning step of less than ᾱ along −β would do nothing,
-    and P_Ω(x − ᾱg) takes its place.
+    Program. 135 (2012) 195–220): a proportioning step of less than ᾱ along −β would do nothing.
+    A step on the face takes its place, tangents of the boundary included, or P_Ω(x − ᾱg).
 
     Multiplications by A: one per CG or proportioning step, two per expansion step; by M_f: one
     per CG or expansion step.
@@ -253,7 +245,10 @@ def mprgp(
             # Step 5: proportioning step
             room = state.max_step(beta)
             if room < alpha_bar:
-                projected_step(state, alpha_bar)
+                cg = step_on_face(state, alpha_bar)
+                steps.cg += cg
+                if cg == 0:
+                    projected_step(state, alpha_bar)
             else:
                 A.mult(beta, Ap)
                 bAb = beta.dot(Ap)

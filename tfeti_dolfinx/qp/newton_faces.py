@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
 
-from tfeti_dolfinx.parallel import agreed, any_rank
+from tfeti_dolfinx.parallel import any_rank
 from tfeti_dolfinx.qp.coarse import Coarse, imbalance
+from tfeti_dolfinx.qp.dependent import DependentRows
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.homogenised import restored
 from tfeti_dolfinx.qp.monitors import Monitor
@@ -30,10 +30,6 @@ FINAL = 0.9
 STAGE = 0.1
 # of Gλ = e: what is left after a first try to restore it is worth a second one
 EXACT = 1e-13
-# of ‖F‖: curvature of the way that a solve has gone; less is nearly none, and the way far
-LOOSE = 1e-8
-# of the way to the first bound, where nothing else ends it: more rows than one are to leave
-BEYOND = 10.0
 
 
 @dataclass(frozen=True)
@@ -85,6 +81,7 @@ class FaceSolver:
         self._steps, self._max_it, self._monitor = steps, max_it, monitor
         self._comm = qp.d.getComm().tompi4py()
         self._directions = Directions(qp.d)
+        self._dependent = DependentRows(qp, self._directions)
         self._face: Face | None = None
         self.settled, self.left = False, float("inf")
         self._on_face = qp
@@ -119,6 +116,7 @@ class FaceSolver:
         coarse = self._qp.coarse.on_face(face)
         if self._qp.preconditioner_on is not None:
             self._preconditioner = self._qp.preconditioner_on(face)
+        self._dependent.preconditioner = self._preconditioner
         self._on_face = replace(self._qp, coarse=coarse, preconditioner=self._preconditioner)
         self._face = face
         self.forget()
@@ -143,53 +141,27 @@ class FaceSolver:
         z, first, feasible = start.copy(), None, self._qp.feasible
         stays = self.enter(face) and self.settled
         for _ in range(MOST_ROUNDS):
+            target = self._target(z, optimality, stays)
+            bound = self._dependent.slack(z, target)
+            if bound is not None:
+                first = first or bound
+                self._drop(z)
+                continue
             before = z.copy()
-            broken = self._pcpg(z, optimality, stays) == ConvergedReason.DIVERGED_INDEFINITE_MAT
+            broken = self._pcpg(z, target) == ConvergedReason.DIVERGED_INDEFINITE_MAT
             stays = False
-            self._shorten(before, z)
+            self._dependent.shorten(before, z)
             before.destroy()
             if first is None:
                 first = z.copy()
             inside = feasible.project(z.lam.array_r)
             out = any_rank(self._comm, not np.array_equal(inside, z.lam.array_r))
-            if self._steps.cg >= self._max_it or not (out or (broken and self._slide(z))):
+            if self._steps.cg >= self._max_it or not (out or (broken and self._dependent.slide(z))):
                 break
             z.lam.array[:] = feasible.project(z.lam.array_r)
             self._drop(z)
         assert first is not None
         return Trial(first, z, not out)
-
-    def _shorten(self, before: Point, z: Point) -> None:
-        """Where a solve has gone far because nothing held it, go to the first bound only.
-
-        Rows depend on each other there, or nearly so; numbers of that size would drown the others.
-        """
-        p, Fp = z.lam.copy(), z.g.copy()
-        p.axpy(-1.0, before.lam)
-        Fp.axpy(-1.0, before.g)
-        own = self._qp.feasible.max_step(before.lam.array_r, -p.array_r)
-        length = float(self._comm.allreduce(own, op=MPI.MIN))
-        if agreed(self._comm, length < 1.0 and p.dot(Fp) <= LOOSE * self.norm * p.dot(p)):
-            z.take(before)
-            z.move(max(length, 0.0) * BEYOND, p, Fp)
-        p.destroy()
-        Fp.destroy()
-
-    def _slide(self, z: Point) -> bool:
-        """Along a residual that meets no curvature, where rows depend on each other, to a bound.
-
-        Returns:
-            Whether there is one.
-        """
-        r, Fr = self._directions.r, self._directions.Fp
-        self._qp.F.mult(r, Fr)
-        if self._directions.seen(r.dot(Fr), r.dot(r)):
-            return False
-        own = self._qp.feasible.max_step(z.lam.array_r, -r.array_r)
-        length = float(self._comm.allreduce(own, op=MPI.MIN))
-        if np.isfinite(length):
-            z.move(length * BEYOND, r, Fr)
-        return bool(np.isfinite(length))
 
     def _drop(self, z: Point) -> None:
         """Enter the face of z, and bring z back to Gλ = e in it; multiplies by F once."""
@@ -222,13 +194,16 @@ class FaceSolver:
             once.destroy()
         return near
 
-    def _pcpg(self, z: Point, optimality: float, stays: bool) -> ConvergedReason:
-        """PCPG to a part of what there is to do; to the end where the face stays."""
+    def _target(self, z: Point, optimality: float, stays: bool) -> float:
+        """What PCPG aims at: a part of what there is to do; more where the face stays."""
         z.g.copy(self._directions.r)
         self.coarse.project(self._directions.r)
         start, final = float(self._directions.r.norm()), FINAL * self._rule.tolerance
         share = STAGE if stays else self._parameters.reduction
-        target = max(final, share * min(start, optimality))
+        return max(final, share * min(start, optimality))
+
+    def _pcpg(self, z: Point, target: float) -> ConvergedReason:
+        """PCPG on the face entered."""
         reason = pcpg(
             self._on_face,
             z,
@@ -247,7 +222,7 @@ class FaceSolver:
             self._on_face.coarse.destroy()
         if self._preconditioner is not None:
             self._preconditioner.destroy()
-            self._preconditioner = None
+            self._preconditioner = self._dependent.preconditioner = None
         self._face = None
 
     def destroy(self) -> None:

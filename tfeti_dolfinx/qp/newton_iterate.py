@@ -21,6 +21,8 @@ ENOUGH = 0.1
 # of Fλ − d: where Gᵀμ is nearly all of it, it is taken out of d, since its rounding, as where gaps
 # are far larger than displacements, would drown what is left
 MOST = 0.1
+# times Fλ − d: multipliers that are larger are rounding, for Gᵀμ is to be as large as that
+WILD = 1e3
 # of λ: what a way must be, so that F on it is not F on rounding of Gλ = e
 SHORT = 1e-6
 # so many steps in a row that neither lower q by what stands out from its rounding, nor halve ‖g^P‖
@@ -73,16 +75,22 @@ class Iterate:
         return self._qp.feasible.face(self.back.array_r, self.s.array_r)
 
     def multipliers_on(self, faces: FaceSolver) -> None:
-        """μ and s that belong to the face entered, while nothing is known of ‖F‖."""
-        self.mu = faces.coarse.coordinates(self.point.g)
+        """μ and s that belong to the face entered.
+
+        A face that lacks rank says nothing of motions that it leaves free, but its factor may.
+        """
+        last, self.mu = self.mu, faces.coarse.coordinates(self.point.g)
         self._set_multipliers()
+        if agreed(self._comm, self.s.norm() > WILD * self.point.g.norm()):
+            self.mu = last
+            self._set_multipliers()
 
     def look(self, faces: FaceSolver) -> None:
         """Optimality: how far a gradient step, brought back to the feasible set, moves."""
         self.norm = faces.norm or _rayleigh(self._qp, self.point) or 1.0
-        if faces.settled:
-            self.mu = faces.coarse.coordinates(self.point.g)
         self._set_multipliers()
+        if faces.settled:
+            self.multipliers_on(faces)
         target = self.point.lam.copy()
         target.axpy(-1.0 / self.norm, self.s)  # not Fλ − d: what Gᵀμ takes from it may be large
         found = nearest(self._qp.coarse, self._qp.feasible, target)

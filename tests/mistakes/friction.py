@@ -1,0 +1,175 @@
+"""Mistakes in laws of friction."""
+
+import numpy as np
+import ufl
+from dolfinx import fem
+
+import tfeti_dolfinx as tfeti
+from mistakes.scene import raising
+
+NAN, INF = float("nan"), float("inf")
+FLOOR = "obstacle of surface 'bottom'"
+
+
+def law(says, make):
+    """Make an obstacle with a law."""
+    return lambda s: tfeti.Obstacle("bottom", s.floor.shape, friction=make(s)), says
+
+
+def on_floor(says, make, scene=lambda s: s):
+    """Solve with an obstacle that has a law."""
+
+    def do(s):
+        s = scene(s)
+        friction = make(s)
+        s.with_contacts(tfeti.Obstacle("bottom", s.floor.shape, friction=friction))
+
+    return do, says
+
+
+def untorn_function(s):
+    return fem.Function(s.untorn_space("Lagrange", 1))
+
+
+def with_values(s, value):
+    function = fem.Function(s.space("Lagrange", 1))
+    function.x.array[:] = value
+    return function
+
+
+def membrane(s):
+    V = s.space("Lagrange", 1)
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    away = tfeti.SignedDistance(
+        lambda x: 0.0 * x[0] + 1.0,
+        lambda x: np.stack((0.0 * x[0] + 1.0, 0.0 * x[0], 0.0 * x[0])),
+    )
+    s.problem(
+        a=ufl.inner(ufl.grad(u), ufl.grad(v)) * s.dx,
+        L=fem.Constant(s.d.mesh, 1.0) * v * s.dx,
+        bcs=[fem.dirichletbc(0.0, s.on(V=V), V)],
+        contacts=[tfeti.Obstacle("bottom", away, friction=tfeti.Tresca(1.0), name="lid")],
+    ).solve()
+
+
+def two_laws(s, first, second):
+    shape = s.floor.shape
+    one = tfeti.Obstacle("bottom", shape, friction=first, name="ice")
+    s.with_contacts(one, tfeti.Obstacle("bottom", shape, friction=second, name="sand"))
+
+
+def solved_with(s, qp_type):
+    floor = tfeti.Obstacle("bottom", s.floor.shape, friction=tfeti.Tresca(1.0))
+    s.with_contacts(floor, qp_type=qp_type)
+
+
+LAWS = {
+    "friction is a number": law(
+        rf"{FLOOR}: friction is 0.3; expected Tresca\(bound\), Coulomb", lambda s: 0.3
+    ),
+    "friction is a class": law(
+        rf"{FLOOR}: friction is the class Tresca; expected", lambda s: tfeti.Tresca
+    ),
+    "a negative coefficient": law(
+        rf"{FLOOR}: coefficient=-0.3: expected a number, 0 or more", lambda s: tfeti.Coulomb(-0.3)
+    ),
+    "a bound that is nan": law(
+        rf"{FLOOR}: bound=nan: expected a number, 0 or more", lambda s: tfeti.Tresca(NAN)
+    ),
+    "a bound that is infinite": law(rf"{FLOOR}: bound=inf: expected", lambda s: tfeti.Tresca(INF)),
+    "a bound that is a text": law(rf"{FLOOR}: bound='much': exp", lambda s: tfeti.Tresca("much")),
+    "a bound that is True": law(rf"{FLOOR}: bound=True: expected", lambda s: tfeti.Tresca(True)),
+    "two bounds without a direction": law(
+        rf"{FLOOR}: bound has 2 values and direction=None; expected one value, or two and the dir",
+        lambda s: tfeti.Tresca((1.0, 2.0)),
+    ),
+    "one coefficient with a direction": law(
+        rf"{FLOOR}: coefficient has 1 value and direction=\(1, 0, 0\); expected one value",
+        lambda s: tfeti.Coulomb(0.3, direction=(1, 0, 0)),
+    ),
+    "three bounds": law(
+        rf"{FLOOR}: bound has 3 values",
+        lambda s: tfeti.Tresca((1.0, 2.0, 3.0), direction=(1, 0, 0)),
+    ),
+    "the second of two bounds is negative": law(
+        rf"{FLOOR}: bound=-2.0: expected",
+        lambda s: tfeti.Tresca((1.0, -2.0), direction=(1, 0, 0)),
+    ),
+    "a bound that is a vector function": law(
+        rf"{FLOOR}: bound has the shape \(2,\); expected a scalar function",
+        lambda s: tfeti.Tresca(fem.Function(s.V)),
+    ),
+    "friction of a pair that has a name": (
+        lambda s: tfeti.Contact("left", "right", friction=tfeti.Coulomb(-1), name="joint"),
+        r"^joint: coefficient=-1: expected a number, 0 or more",
+    ),
+}
+
+AT_NODES = {
+    "a bound that gives nan": on_floor(
+        rf"{FLOOR}: bound is nan at the point \[.*; expected a number, 0 or more",
+        lambda s: tfeti.Tresca(lambda x: NAN * x[0]),
+    ),
+    "a bound that is negative somewhere": on_floor(
+        rf"{FLOOR}: bound is -0.5 at the point \[",
+        lambda s: tfeti.Tresca(lambda x: x[0] - 0.5),
+    ),
+    "a bound that fails": on_floor(
+        rf"{FLOOR}: bound, a function, did not give one number .*ZeroDivisionError: no such place",
+        lambda s: tfeti.Tresca(raising),
+    ),
+    "a bound of vectors": on_floor(
+        rf"{FLOOR}: bound, a function, did not give one number for each of \d points",
+        lambda s: tfeti.Tresca(lambda x: x),
+    ),
+    "a coefficient on the mesh before it was torn": on_floor(
+        rf"{FLOOR}: bound is on another mesh; expected a function on decomposition.mesh",
+        lambda s: tfeti.Tresca(untorn_function(s)),
+    ),
+    "a dolfinx function that is negative": on_floor(
+        rf"{FLOOR}: bound is -1.0 at the point", lambda s: tfeti.Tresca(with_values(s, -1.0))
+    ),
+    "a direction along the normal": on_floor(
+        rf"{FLOOR}: direction \(0, 0, 1\) is along the normal at the node \[",
+        lambda s: tfeti.Tresca((1.0, 2.0), direction=(0, 0, 1)),
+        lambda s: s.cube,
+    ),
+    "a direction of two components": on_floor(
+        rf"{FLOOR}: direction=\(1, 0\); expected three numbers, not all of them 0",
+        lambda s: tfeti.Tresca((1.0, 2.0), direction=(1, 0)),
+        lambda s: s.cube,
+    ),
+    "a direction of zeros": on_floor(
+        rf"{FLOOR}: direction=\(0, 0, 0\); expected three numbers",
+        lambda s: tfeti.Tresca((1.0, 2.0), direction=(0, 0, 0)),
+        lambda s: s.cube,
+    ),
+    "two bounds in the plane": on_floor(
+        rf"{FLOOR}: bound has two values; expected one in the plane",
+        lambda s: tfeti.Tresca((1.0, 2.0), direction=(1, 0, 0)),
+    ),
+    "friction on a scalar space": (membrane, r"^lid: friction on a scalar space; expected disp"),
+    "two laws on one surface": (
+        lambda s: two_laws(s, tfeti.Tresca(1.0), tfeti.Tresca(2.0)),
+        r"^sand: the same surface has another law of friction in ice; expected one law",
+    ),
+    "two kinds of laws on one surface": (
+        lambda s: two_laws(s, tfeti.Tresca(1.0), tfeti.Coulomb(1.0)),
+        r"^sand: the same surface has another law of friction in ice; expected one law",
+    ),
+    "a law that is not solved yet": on_floor(
+        rf"{FLOOR}: Coulomb friction is not solved yet; expected Tresca",
+        lambda s: tfeti.Coulomb(0.3),
+    ),
+    "newton with friction": (
+        lambda s: solved_with(s, "newton"),
+        r"-tfeti_qp_type newton: the scene has friction, \d+ tangential rows, which NEWTON cannot "
+        r"keep yet; expected auto or smalse",
+    ),
+    "pcpg with friction": (
+        lambda s: solved_with(s, "pcpg"),
+        r"-tfeti_qp_type pcpg: the scene has friction",
+    ),
+}
+
+TABLES = ("LAWS", "AT_NODES")

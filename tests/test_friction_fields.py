@@ -1,0 +1,189 @@
+"""What a solution says of friction, and what does not change it: closed forms and limits."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from scenes import box, decomposed, displacement, hooke, problem, strain
+from test_tresca import nodal_data
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.output import nodal_fields
+
+EXACT = {"rtol": 1e-10}
+
+
+def floor(gdim, law, reach=np.inf):
+    up = np.eye(gdim)[-1]
+    return tfeti.Obstacle("bottom", tfeti.Plane(0.0 * up, up), friction=law, reach=reach)
+
+
+def solved(cell, law, traction, n=4, subdomains=4, **options):
+    d = decomposed(cell, n, subdomains)
+    gdim = d.mesh.geometry.dim
+    p = problem(d, traction, [floor(gdim, law)], **{**EXACT, **options})
+    p.solve()
+    return p
+
+
+SCENES = [("quadrilateral", (0.05, -0.05)), ("tetrahedron", (0.01, -0.035, -0.05))]
+
+
+@pytest.mark.parametrize(("cell", "traction"), SCENES)
+def test_a_bound_of_0_is_no_friction(cell, traction):
+    without = solved(cell, None, traction)
+    with_none = solved(cell, tfeti.Tresca(0.0), traction)
+    assert np.allclose(displacement(with_none)[1], displacement(without)[1], rtol=0, atol=1e-9)
+    assert with_none.report.sticking == 0
+    assert with_none.report.sliding == with_none.report.active_contacts > 0
+    assert without.report.tangential_rows == without.report.sliding == 0
+    assert without.report.dual_dofs + with_none.report.tangential_rows == with_none.report.dual_dofs
+
+
+@pytest.mark.parametrize(("cell", "traction"), SCENES)
+def test_a_large_bound_sticks(cell, traction, comm):
+    p = solved(cell, tfeti.Tresca(1e3), traction)
+    assert p.report.sliding == 0
+    assert p.report.sticking == p.report.active_contacts > 0
+    u = np.abs(displacement(p)[1]).max()
+    _, _, _, slip = nodal_data(p.solution, comm)
+    assert np.abs(slip).max() <= 1e-9 * u
+
+
+@pytest.mark.parametrize(("cell", "traction"), SCENES)
+def test_where_all_slides_friction_is_its_bound_times_the_area(cell, traction, comm):
+    bound = 1e-4
+    p = solved(cell, tfeti.Tresca(bound), traction)
+    data = p.solution.contact()
+    size = np.linalg.norm(data.tangential_traction, axis=1)
+    assert np.all(size <= bound * (1 + 1e-9))
+    slides = data.status == tfeti.ContactStatus.SLIP
+    assert comm.allreduce(int(slides.sum())) == p.report.sliding > 0
+    assert np.allclose(size[slides], bound)
+    opposed = np.sum(data.tangential_traction * data.slip, axis=1)[slides]
+    along = bound * np.linalg.norm(data.slip, axis=1)[slides]
+    assert np.allclose(opposed, -along, rtol=1e-6, atol=1e-12)
+    # what bodies feel is what nodes do
+    total = comm.allreduce((data.area[:, None] * data.tangential_traction).sum(axis=0))
+    total -= comm.allreduce((data.force[:, None] * data.normal).sum(axis=0))
+    assert np.allclose(p.solution.body_forces.force.sum(axis=0), total, rtol=0, atol=1e-13)
+
+
+def test_fields_of_friction_are_written():
+    rough = solved("quadrilateral", tfeti.Tresca(0.01), (0.05, -0.05))
+    names = [field.name for field in nodal_fields(rough.solution)]
+    assert {"tangential_traction", "slip", "status"} <= set(names)
+    traction = rough.solution.tangential_traction.x.array.reshape(-1, 2)
+    largest = rough.dofs.comm.allreduce(float(np.abs(traction).max(initial=0.0)), op=MPI.MAX)
+    assert largest == pytest.approx(0.01)
+    smooth = solved("quadrilateral", None, (0.05, -0.05))
+    names = [field.name for field in nodal_fields(smooth.solution)]
+    assert not {"tangential_traction", "slip"} & set(names)
+
+
+def test_a_bound_may_change_between_solves():
+    """A DOLFINx function with other values: no factor, no row, and the answer of a fresh solve."""
+    d = decomposed("quadrilateral", 5, 4)
+    bound = fem.Function(fem.functionspace(d.mesh, ("Lagrange", 1)))
+    bound.x.array[:] = 0.01
+    p = problem(d, (0.05, -0.05), [floor(2, tfeti.Tresca(bound))], **EXACT)
+    p.solve()
+    first = displacement(p)[1]
+    bound.x.array[:] = 0.004
+    p.solve()
+    assert p.report.factorizations == p.report.gluings == p.report.coarse_factorizations == 0
+    assert "friction" not in p.report.reused
+    fresh = problem(d, (0.05, -0.05), [floor(2, tfeti.Tresca(0.004))], **EXACT)
+    fresh.solve()
+    assert np.allclose(displacement(p)[1], displacement(fresh)[1], rtol=0, atol=1e-8)
+    assert np.abs(displacement(p)[1] - first).max() > 1e-4
+    p.solve()
+    assert "friction" in p.report.reused
+    assert p.report.F_multiplications <= 2
+
+
+def test_a_bound_is_a_stress_whatever_the_thickness_is():
+    d, found = decomposed("quadrilateral", 4, 3), []
+    for thickness in (1.0, 2.5):
+        V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
+        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+        dx = ufl.Measure("dx", domain=d.mesh, metadata={"quadrature_degree": 2})
+        ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+        t = fem.Constant(d.mesh, (0.05, -0.05))
+        left = fem.locate_dofs_topological(V, 1, d.facets("left"))
+        p = tfeti.ContactProblem(
+            thickness * ufl.inner(hooke()(u), strain(v)) * dx,
+            thickness * ufl.dot(t, v) * ds(d.surface("top")),
+            [fem.dirichletbc(np.zeros(2), left, V)],
+            [floor(2, tfeti.Tresca(0.01))],
+            d,
+            thickness=thickness,
+            petsc_options=EXACT,
+        )
+        p.solve()
+        found.append(displacement(p)[1])
+        largest = np.linalg.norm(p.solution.contact().tangential_traction, axis=1).max(initial=0.0)
+        assert d.comm.allreduce(float(largest), op=MPI.MAX) == pytest.approx(0.01)
+    assert np.allclose(*found, rtol=0, atol=1e-8)
+
+
+def turned(axis, angle):
+    """The rotation about an axis."""
+    k = np.array(axis) / np.linalg.norm(axis)
+    K = np.array([[0, -k[2], k[1]], [k[2], 0, -k[0]], [-k[1], k[0], 0]])
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+
+
+@pytest.mark.parametrize("orthotropic", [False, True])
+def test_a_rotated_scene_has_the_rotated_answer(orthotropic):
+    R, answers, multiplications = turned((1.0, 2.0, 3.0), 0.7), [], []
+    for Q in (np.eye(3), R):
+        mesh, tags, names = box("hexahedron", 4)
+        mesh.geometry.x[:] = mesh.geometry.x @ Q.T
+        d = tfeti.decompose(mesh, 1, facet_tags=tags, surfaces=names)
+        law = tfeti.Tresca(0.015)
+        if orthotropic:
+            law = tfeti.Tresca((0.02, 0.008), direction=tuple(Q @ [1.0, 1.0, 0.0]))
+        plane = tfeti.Plane((0, 0, 0), tuple(Q @ [0.0, 0.0, 1.0]))
+        contact = tfeti.Obstacle("bottom", plane, friction=law, reach=np.inf)
+        p = problem(d, tuple(Q @ [0.0, -0.035, -0.05]), [contact], **EXACT)
+        p.solve()
+        x, u = displacement(p)
+        x = x @ Q
+        answers.append((u @ Q)[np.lexsort(np.rint(x.T * 1e6))])
+        multiplications.append(p.report.F_multiplications)
+        assert p.report.sticking > 0
+        assert p.report.sliding > 0
+    assert np.allclose(*answers, rtol=0, atol=1e-8)
+    assert abs(multiplications[0] - multiplications[1]) <= max(3, 0.15 * max(multiplications))
+
+
+def test_the_error_of_u_is_what_the_report_says():
+    """Against a solve that is far more exact, at several tolerances."""
+    exact = displacement(solved("hexahedron", tfeti.Tresca(0.015), (0.0, -0.035, -0.05)))[1]
+    for rtol in (1e-2, 1e-3, 1e-4, 1e-6):
+        p = solved("hexahedron", tfeti.Tresca(0.015), (0.0, -0.035, -0.05), rtol=rtol)
+        error = np.abs(displacement(p)[1] - exact).max() / np.abs(exact).max()
+        assert error <= 2.0 * rtol
+        assert p.report.residuals["displacement_error"] <= rtol
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
+def test_friction_alone_holds_a_body(cell, comm):
+    """Nothing else holds the block along the plane; beyond the capacity the solver stalls."""
+    d = decomposed(cell, 3, 3)
+    gdim, bound = d.mesh.geometry.dim, 0.02
+    for push in (0.5 * bound, 0.9 * bound):
+        traction = (push, *np.zeros(gdim - 2), -0.1)
+        p = problem(d, traction, [floor(gdim, tfeti.Tresca(bound))], clamped=(), rtol=1e-8)
+        p.solve()
+        data = p.solution.contact()
+        friction = (data.area[:, None] * data.tangential_traction).sum(axis=0)
+        expected = np.r_[-push, np.zeros(gdim - 1)]
+        assert np.allclose(comm.allreduce(friction), expected, rtol=0, atol=1e-7)
+        assert p.report.free_modes == 0
+    traction = (1.5 * bound, *np.zeros(gdim - 2), -0.1)
+    p = problem(d, traction, [floor(gdim, tfeti.Tresca(bound))], clamped=(), rtol=1e-6)
+    with pytest.raises(tfeti.ConvergenceError, match="DIVERGED_STALLED"):
+        p.solve()

@@ -1,0 +1,47 @@
+"""Algebra on parts of columns that do not meet, against dense algebra on all of them."""
+
+import numpy as np
+from scipy.linalg import block_diag
+from scipy.sparse import csr_array
+
+from tfeti_dolfinx.dual.null_basis import null_basis
+from tfeti_dolfinx.dual.sparse_columns import orthonormal_columns, parts_of_columns
+
+
+def scattered(rng):
+    """Two groups of columns on rows of their own, and a row of none, in any order."""
+    dense = block_diag(rng.standard_normal((4, 2)), rng.standard_normal((5, 3)), np.zeros((1, 0)))
+    return dense[rng.permutation(10)][:, rng.permutation(5)]
+
+
+def test_parts_do_not_meet_and_are_all():
+    dense = scattered(np.random.default_rng(0))
+    again = np.zeros_like(dense)
+    sizes = []
+    for columns, rows, part in parts_of_columns(csr_array(dense)):
+        again[np.ix_(rows, columns)] = part
+        sizes.append(part.shape)
+    assert np.array_equal(again, dense)
+    assert sorted(sizes) == [(4, 2), (5, 3)]
+
+
+def test_orthonormal_columns_span_the_same():
+    dense = scattered(np.random.default_rng(1))
+    Q = orthonormal_columns(csr_array(dense))
+    assert Q.nnz <= 4 * 2 + 5 * 3
+    assert np.allclose((Q.T @ Q).toarray(), np.eye(5), atol=1e-14)
+    assert np.allclose(Q @ (Q.T @ dense), dense, atol=1e-14)
+
+
+def test_a_null_basis_of_unit_vectors_and_others():
+    rng = np.random.default_rng(2)
+    dense = scattered(rng)
+    alone = np.flatnonzero(~dense.any(axis=1))
+    basis = null_basis(alone, csr_array(dense))
+    x = basis.removed(rng.standard_normal(10))
+    assert np.allclose(dense.T @ x, 0.0, atol=1e-14)
+    assert np.array_equal(x[alone], np.zeros(len(alone)))
+    pins = basis.pins(np.ones(10))
+    whole = np.column_stack((np.eye(10)[:, alone], basis.joint.toarray()))
+    assert len(pins) == whole.shape[1]
+    assert np.linalg.matrix_rank(whole[pins]) == len(pins)

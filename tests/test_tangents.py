@@ -1,0 +1,249 @@
+"""Tangential rows: they measure slip, on any ranks, and where the normal is prescribed too."""
+
+import numpy as np
+import pytest
+from bodies import gathered, searched, sided, stacked
+from dolfinx import fem
+from mpi4py import MPI
+from scenes import curved_obstacle, decomposed
+from test_frames import dofs_on, nodal
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.contact.friction import friction_values
+from tfeti_dolfinx.contact.records import relative_displacement, slips
+from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.gluing.glue import glue
+from tfeti_dolfinx.gluing.prescribed import prescribe
+from tfeti_dolfinx.mortar.surfaces import group_points
+
+TRESCA, COULOMB = tfeti.Tresca(0.1), tfeti.Coulomb(0.3)
+
+
+def times_rows(gluing, u):
+    """B u − c of this rank's rows."""
+    constraints = gluing.constraints
+    trace, Bu = constraints.B.createVecs()
+    trace.array[:] = u[constraints.trace]
+    constraints.B.mult(trace, Bu)
+    found = np.array(Bu.array_r) - constraints.c.array_r
+    for vec in (trace, Bu):
+        vec.destroy()
+    return found
+
+
+def weights_of(dofs):
+    return 1.0 + np.arange(dofs.num_nodes * dofs.bs) % 7
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])
+def test_rows_measure_slips(cell, degree):
+    """On displacements without jumps T u = s_i times the slip, also between meshes that differ."""
+    d = stacked(cell, 3, 4, 6)
+    dofs = dofs_on(d, degree)
+    records = searched([sided("upper bottom", "lower top", friction=TRESCA)], dofs, d)
+    gluing = glue(dofs, prescribe(dofs, []), records, 1.0, weights_of(dofs))
+    rows, sets = gluing.tangents, gluing.constraints.sets
+    assert sets.tangents.shape == (len(sets.normals), dofs.bs - 1)
+    assert np.array_equal(rows.condition, gluing.contact.condition)
+    assert np.array_equal(rows.scale, gluing.contact.scale)
+    u = nodal(dofs, lambda x: np.cos(2.0 * x) - np.roll(x, 1, axis=1))
+    found = times_rows(gluing, u)[sets.tangents] / rows.scale[:, None]
+    expected = slips(records, dofs, u)[rows.condition]
+    assert MPI.COMM_WORLD.allreduce(expected.size) > 0
+    assert np.allclose(found, expected, rtol=0, atol=1e-12)
+    gluing.constraints.destroy()
+
+
+def test_scenes_without_friction_have_no_tangential_row():
+    d = stacked("hexahedron", 3, 4, 4)
+    dofs = dofs_on(d)
+    records = searched([sided("upper bottom", "lower top")], dofs, d)
+    gluing = glue(dofs, prescribe(dofs, []), records, 1.0, weights_of(dofs))
+    assert gluing.constraints.sets.tangents.shape == (0, 2)
+    assert gluing.constraints.limits.shape == (0, 2)
+    gluing.constraints.destroy()
+
+
+def test_only_the_contact_with_friction_has_tangential_rows():
+    d = stacked("quadrilateral", 3, 4, 4)
+    dofs = dofs_on(d)
+    rough = tfeti.Obstacle(
+        "lower bottom", tfeti.Plane((0, -1.01), (0, 1)), friction=TRESCA, reach=np.inf
+    )
+    records = searched([sided("upper bottom", "lower top"), rough], dofs, d)
+    gluing = glue(dofs, prescribe(dofs, []), records, 1.0, weights_of(dofs))
+    assert np.all(records.contact[gluing.tangents.condition] == 1)
+    assert d.comm.allreduce(len(gluing.tangents.condition)) == 4
+    gluing.constraints.destroy()
+
+
+class Held:
+    """A cube on a plane, its left side and its bottom held in some directions."""
+
+    def __init__(self, law, **prescribed):
+        self.d = decomposed("hexahedron", 2, 3)
+        self.dofs = dofs = dofs_on(self.d)
+        plane = tfeti.Plane((0, 0, -0.01), (0, 0, 1))
+        contact = tfeti.Obstacle("bottom", plane, friction=law, reach=np.inf)
+        self.records = searched([contact], dofs, self.d)
+        bcs = []
+        for name, (axis, value) in prescribed.items():
+            V = dofs.V.sub(axis)
+            at = fem.locate_dofs_topological(V, 2, self.d.facets(name))
+            bcs.append(fem.dirichletbc(value, at, V))
+        prescribed = prescribe(dofs, bcs)
+        self.gluing = glue(dofs, prescribed, self.records, 1.0, weights_of(dofs))
+
+    def count(self, flags):
+        return self.d.comm.allreduce(int(np.sum(flags)))
+
+
+def test_a_prescribed_tangent_leaves_a_row_without_entries():
+    """On the left side x is held: the disc becomes an interval, and its other row stays."""
+    held = Held(TRESCA, left=(0, 0.125))
+    rows, sets = held.gluing.tangents, held.gluing.constraints.sets
+    on_left = group_points(held.dofs)[held.records.group[rows.condition], 0] < 1e-9
+    assert held.count(on_left) == 3
+    assert held.count(~rows.moves) == 3
+    along_x = np.abs(rows.tangents[:, :, 0]) > 0.5
+    assert np.array_equal(~rows.moves, along_x & on_left[:, None])
+    bound = rows.limits(np.full((len(held.records), 2), 0.5), held.records.area)
+    assert np.all((bound > 0.0) == rows.moves)
+    expected = 0.5 * held.records.area[rows.condition] / rows.scale
+    assert np.allclose(bound.max(axis=1, initial=0.0), expected)
+    assert np.all(held.gluing.constraints.c.array_r[sets.tangents] == 0.0)
+
+
+def test_prescribed_values_slip():
+    """Where rows see other nodes too, the slip of what is prescribed goes to their right sides."""
+    d = stacked("hexahedron", 2, 3, 4)
+    dofs = dofs_on(d)
+    records = searched([sided("upper bottom", "lower top", friction=TRESCA)], dofs, d)
+    V = dofs.V.sub(0)
+    at = fem.locate_dofs_topological(V, 2, d.facets("lower top"))
+    bcs = [fem.dirichletbc(0.125, at, V)]
+    gluing = glue(dofs, prescribe(dofs, bcs), records, 1.0, weights_of(dofs))
+
+    def motion(x):
+        u = np.sin(3.0 * x)
+        lower = d_lower(x)
+        u[lower, 0] = 0.125
+        return u
+
+    def d_lower(x):  # nodes of both boxes lie on z = 0: the lower box has other x there
+        grid = np.abs(x[:, 0] * 2 - np.rint(x[:, 0] * 2)) < 1e-9
+        return (np.abs(x[:, 2]) < 1e-9) & grid
+
+    u = nodal(dofs, motion)
+    # corners are on both grids: the upper box moves there as the lower one does
+    rows = gluing.tangents
+    found = times_rows(gluing, u)[gluing.constraints.sets.tangents] / rows.scale[:, None]
+    assert np.allclose(found, slips(records, dofs, u)[rows.condition], rtol=0, atol=1e-12)
+    gluing.constraints.destroy()
+
+
+@pytest.mark.parametrize(("law", "rows"), [(TRESCA, 9), (COULOMB, 0)])
+def test_a_node_whose_normal_motion_is_prescribed(law, rows):
+    """A given bound holds there; a pressure that hides in what holds the node bounds nothing."""
+    held = Held(law, bottom=(2, 0.0))
+    assert held.count(np.ones(len(held.gluing.contact.condition))) == 0
+    assert held.count(np.ones(len(held.gluing.tangents.condition))) == rows
+    norms = np.linalg.norm(tangential_matrix(held), axis=1)
+    assert np.all(norms <= 1.0 + 1e-12)
+    assert held.count(norms > 1.0 - 1e-12) >= rows
+
+
+def tangential_matrix(held):
+    """This rank's tangential rows over √D, dense."""
+    B, weights = held.gluing.constraints.B, held.gluing.constraints.weights
+    scaled = B.copy()
+    root = B.createVecRight()
+    root.array[:] = weights**-0.5
+    scaled.diagonalScale(None, root)
+    indptr, columns, values = scaled.getValuesCSR()
+    rows = held.gluing.constraints.sets.tangents.ravel()
+    dense = np.zeros((len(rows), B.getSize()[1]))
+    for i, row in enumerate(rows):
+        dense[i, columns[indptr[row] : indptr[row + 1]]] = values[indptr[row] : indptr[row + 1]]
+    for item in (scaled, root):
+        item.destroy()
+    return dense
+
+
+def test_clamped_nodes_have_no_tangential_row():
+    V_axes = {"left": (0, 0.0), "front": (1, 0.0)}
+    held = Held(TRESCA, **V_axes, bottom=(2, 0.0))
+    # 9 nodes, of which one is held in x and y
+    assert held.count(np.ones(len(held.gluing.tangents.condition))) == 8
+
+
+def test_the_first_tangent_follows_the_direction():
+    d = decomposed("tetrahedron", 3, 4)
+    dofs, direction = dofs_on(d), np.array([1.0, 2.0, 0.5])
+    law = tfeti.Tresca((0.1, 0.2), direction=tuple(direction))
+    contact = tfeti.Obstacle("bottom", curved_obstacle(3), friction=law, reach=np.inf)
+    records = searched([contact], dofs, d)
+    first, second = records.tangents[:, 0], records.tangents[:, 1]
+    identity = np.eye(3)
+    assert np.allclose(records.frame @ records.frame.transpose(0, 2, 1), identity, atol=1e-14)
+    assert np.allclose(np.linalg.det(records.frame), 1.0)
+    assert np.allclose(second @ direction, 0.0, rtol=0, atol=1e-14)
+    assert np.all(first @ direction > 0.0)
+    values = friction_values("floor", law, records, dofs)
+    assert np.allclose(values, [0.1, 0.2])
+
+
+def test_frames_along_a_direction_are_the_same_on_any_number_of_ranks():
+    law, found = tfeti.Tresca((0.1, 0.2), direction=(1, 2, 0)), []
+    for comm in (MPI.COMM_WORLD, MPI.COMM_SELF):
+        d = decomposed("tetrahedron", 4, 5, comm=comm)
+        dofs = dofs_on(d)
+        contact = tfeti.Obstacle("bottom", curved_obstacle(3), friction=law, reach=np.inf)
+        records = searched([contact], dofs, d)
+        parts = comm.allgather((group_points(dofs)[records.group], records.frame))
+        x, frame = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+        found.append(frame[np.lexsort(np.round(x, 9).T)])
+    assert np.allclose(*found, rtol=0, atol=1e-13)
+
+
+def test_bounds_of_functions_are_those_at_the_nodes():
+    d = decomposed("quadrilateral", 4, 3)
+    dofs = dofs_on(d, 2)
+    plane = tfeti.Plane((0, 0), (0, 1))
+    function = fem.Function(fem.functionspace(d.mesh, ("Lagrange", 1)))
+    function.interpolate(lambda x: 1.0 + 2.0 * x[0])
+    for law in (tfeti.Tresca(lambda x: 1.0 + 2.0 * x[0]), tfeti.Tresca(function)):
+        records = searched([tfeti.Obstacle("bottom", plane, friction=law)], dofs, d)
+        values = friction_values("floor", law, records, dofs)
+        x = group_points(dofs)[records.group]
+        assert values.shape == (len(records), 1)
+        assert np.allclose(values[:, 0], 1.0 + 2.0 * x[:, 0])
+        assert len(gathered(values)) == 5
+
+
+def test_relative_displacements_do_not_depend_on_the_direction():
+    d = stacked("hexahedron", 3, 4, 4)
+    dofs = dofs_on(d)
+    u, found = nodal(dofs, np.sin), []
+    for law in (None, tfeti.Tresca((0.1, 0.2), direction=(1, 1, 0))):
+        records = searched([sided("upper bottom", "lower top", friction=law)], dofs, d)
+        assert np.allclose(
+            relative_displacement(records, dofs, u),
+            np.einsum(
+                "n,ng->ng",
+                np.sum(records.normal * relative_displacement(records, dofs, u), axis=1),
+                records.normal,
+            )
+            + np.einsum("nt,ntg->ng", slips(records, dofs, u), records.tangents),
+        )
+        found.append(relative_displacement(records, dofs, u))
+    assert np.array_equal(*found)
+
+
+def test_a_direction_along_a_normal_is_named_on_all_ranks():
+    d = decomposed("hexahedron", 2, 3)
+    law = tfeti.Tresca((0.1, 0.2), direction=(0, 0, 2))
+    plane = tfeti.Plane((0, 0, 0), (0, 0, 1))
+    with pytest.raises(InputError, match="floor: direction .* is along the normal at the node"):
+        searched([tfeti.Obstacle("bottom", plane, friction=law, name="floor")], dofs_on(d), d)

@@ -1,0 +1,112 @@
+"""Rows of a face that depend on each other: ways along which F sees nothing."""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.parallel import agreed
+from tfeti_dolfinx.qp.pcpg import Directions
+from tfeti_dolfinx.qp.problem import QP, FaceOperator, Point
+
+# of ‖F‖: curvature of the way that a solve has gone; less is nearly none, and the way far
+LOOSE = 1e-8
+# of the way to the first bound, where nothing else ends it: more rows than one are to leave
+BEYOND = 10.0
+# projections to find forces in Ω on such a way: between two rows each halves what is missing
+ALTERNATIONS = 10
+
+
+class DependentRows:
+    """What to do on a face where F is singular, or nearly so.
+
+    Args:
+        qp: The program on all rows.
+        directions: Those of PCPG on the face.
+
+    Attributes:
+        preconditioner: That of the face, which knows how rows depend on each other, or None.
+    """
+
+    def __init__(self, qp: QP, directions: Directions) -> None:
+        self._qp, self._directions = qp, directions
+        self._comm = qp.d.getComm().tompi4py()
+        self.preconditioner: FaceOperator | None = None
+
+    def part(self, x: Array) -> PETSc.Vec | None:
+        """The part of x that F and Gᵀ do not see; None where there is none. Collective."""
+        part = self.preconditioner.dependent(x) if self.preconditioner is not None else None
+        if part is None:
+            return None
+        found = self._qp.d.duplicate()
+        found.array[:] = part
+        return found
+
+    def slack(self, z: Point, target: float) -> Point | None:
+        """Where rows that depend on each other want different gaps, let those go that lose.
+
+        Between them forces may move that F does not see, and q falls all the way to a bound.
+
+        Args:
+            z: The point; moved into Ω, to a smaller face, if there is such a way.
+            target: What PCPG aims at; it would not get below what the way leads along.
+
+        Returns:
+            The point at the first bound, or None where z stays.
+        """
+        way = self.part(-z.g.array_r)
+        if way is None:
+            return None
+        length = self._to_a_bound(z, way.array_r)
+        if not (np.isfinite(length) and agreed(self._comm, way.norm() > target)):
+            way.destroy()
+            return None
+        bound, start = z.copy(), np.array(z.lam.array_r)
+        bound.lam.axpy(length, way)
+        z.lam.axpy(BEYOND * length, way)
+        for _ in range(ALTERNATIONS):
+            inside = self.part(self._qp.feasible.project(z.lam.array_r) - start)
+            assert inside is not None
+            z.lam.array[:] = start + inside.array_r
+            inside.destroy()
+        z.lam.array[:] = self._qp.feasible.project(z.lam.array_r)
+        way.destroy()
+        return bound
+
+    def shorten(self, before: Point, z: Point) -> None:
+        """Where a solve has gone far because nothing held it, go to the first bound only.
+
+        Rows depend on each other there, or nearly so; numbers of that size would drown the others.
+        """
+        p, Fp = z.lam.copy(), z.g.copy()
+        p.axpy(-1.0, before.lam)
+        Fp.axpy(-1.0, before.g)
+        length = self._to_a_bound(before, p.array_r)
+        loose = p.dot(Fp) <= LOOSE * self._directions.norm * p.dot(p)
+        if agreed(self._comm, length < 1.0 and loose):
+            z.take(before)
+            z.move(max(length, 0.0) * BEYOND, p, Fp)
+        p.destroy()
+        Fp.destroy()
+
+    def slide(self, z: Point) -> bool:
+        """Along a residual that meets no curvature, where rows depend on each other, to a bound.
+
+        Returns:
+            Whether there is one.
+        """
+        r, Fr = self._directions.r, self._directions.Fp
+        self._qp.F.mult(r, Fr)
+        if self._directions.seen(r.dot(Fr), r.dot(r)):
+            return False
+        length = self._to_a_bound(z, r.array_r)
+        if np.isfinite(length):
+            z.move(length * BEYOND, r, Fr)
+        return bool(np.isfinite(length))
+
+    def _to_a_bound(self, z: Point, way: Array) -> float:
+        """Largest t with λ + t·way ∈ Ω, maybe infinite. Collective."""
+        own = self._qp.feasible.max_step(z.lam.array_r, -way)
+        return float(self._comm.allreduce(own, op=MPI.MIN))
