@@ -20,6 +20,9 @@ ORTHONORMAL = 1e-12
 # added to the unit diagonal: rows that depend on each other leave no pivot, and B_fᵀ takes away
 # what the shift makes of them, down to rounding over it
 SHIFT = 1e-8
+# rows up to which each rank has a factor of the whole: to tell each other of so few costs less than
+# to share their elimination, and MUMPS 5.7 has been seen to hang in a solve with 13 rows of one rank
+FEW_ROWS = 1000
 
 
 class FacePreconditioner:
@@ -91,7 +94,7 @@ def contact_factor(A: PETSc.Mat, prefix: str) -> Factor:
 
 
 class DistributedFactor:
-    """A = L Lᵀ over all ranks by MUMPS; without it, on each rank a factor of the whole.
+    """A = L Lᵀ over all ranks by MUMPS; for few rows or without it, on each rank of the whole.
 
     Args:
         A: Symmetric positive definite, MPIAIJ; taken over. The constructor is collective.
@@ -107,7 +110,7 @@ class DistributedFactor:
         self._pc: Any = PETSc.PC().create(A.getComm())
         self._pc.setOptionsPrefix(prefix)
         self._pc.setOperators(A)
-        parallel = has_solver("mumps")
+        parallel = A.getSize()[0] > FEW_ROWS and has_solver("mumps")
         self._pc.setType(PETSc.PC.Type.CHOLESKY if parallel else PETSc.PC.Type.REDUNDANT)
         given = {"pc_factor_mat_solver_type": "mumps"} if parallel else {}
         with raised_on_all_ranks(A.getComm().tompi4py()), added_options(prefix, given):
