@@ -25,9 +25,10 @@ def test_random_scenes_are_right_or_named(seed, comm):
         assert row["class"].islower(), row
 
 
-# 68, 2106: forces that are rounding of 0; 163: gaps 1e12 times as large as the error allowed
+# 68, 2106: forces that are rounding of 0; 163: gaps 1e12 times as large as the error allowed; 2186:
+# bodies 220 and 600 times as long as thick
 @pytest.mark.parametrize("qp_type", ["newton", "smalse"])
-@pytest.mark.parametrize("seed", [68, 163, 2106])
+@pytest.mark.parametrize("seed", [68, 163, 2106, 2186])
 def test_scenes_near_to_rounding_are_right_with_both_solvers(seed, qp_type, comm):
     scene = random_scene(seed)
     scene = replace(scene, options={**scene.options, "tfeti_qp_type": qp_type})

@@ -66,6 +66,7 @@ class FaceSolver:
     Attributes:
         settled: Whether λ is where PCPG has stopped on the face entered.
         left: The residual there.
+        rounded: So many solves in a row ended at rounding, before their target.
     """
 
     def __init__(
@@ -83,7 +84,7 @@ class FaceSolver:
         self._directions = Directions(qp.d)
         self._dependent = DependentRows(qp, self._directions)
         self._face: Face | None = None
-        self.settled, self.left = False, float("inf")
+        self.settled, self.left, self.rounded = False, float("inf"), 0
         self._on_face = qp
         self._preconditioner: FaceOperator | None = None
 
@@ -214,6 +215,8 @@ class FaceSolver:
             self._directions,
         )
         self.left = float(self._directions.r.norm())
+        ended = reason == ConvergedReason.DIVERGED_ROUNDING
+        self.rounded = self.rounded + 1 if ended else 0
         return reason
 
     def _leave(self) -> None:
