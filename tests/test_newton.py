@@ -203,6 +203,39 @@ def test_what_nearly_dependent_rows_of_G_leave_is_no_residual(seed):
     assert np.linalg.norm(P @ (F @ result.lam.array_r - qp.d.array_r)) <= 2e-8
 
 
+class Dependent:
+    """A preconditioner that knows what rows +b and −b have in common."""
+
+    def __init__(self, face):
+        self.face = face
+
+    def mult(self, x, y):
+        y.array[:] = self.face.restricted(x.array_r)
+
+    def dependent(self, x):
+        both = self.face.carrying[:2].all()
+        return np.array([1.0, 1.0, 0.0]) * (x[0] + x[1]) / 2.0 if both else np.zeros(3)
+
+    def destroy(self):
+        """Nothing to free."""
+
+
+@pytest.mark.parametrize("knows", [None, Dependent])
+@pytest.mark.parametrize(("room", "solvable"), [(-0.5, False), (0.5, True)])
+def test_rows_that_exclude_each_other_are_named(knows, room, solvable):
+    """u ≤ −1 and −u ≤ 1 + room; with less than none q falls forever along (1, 1)."""
+    F = np.array([[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    d = vector([1.0, -1.0 - room, 1.0])
+    qp = QP(matrix(F), d, NoCoarse(), bounds_on(np.arange(3)), preconditioner_on=knows)
+    start = vector([1.0, 1.0, 0.0])  # both touch
+    result = newton(qp, homogenise(qp, image(qp.F, start)), ResidualRule(1e-10), max_it=100)
+    if not solvable:
+        assert result.reason.name == "DIVERGED_CONTRADICTION"
+    else:
+        assert result.reason > 0
+        assert result.lam.array == pytest.approx([1.0, 0.0, 1.0], abs=1e-9)
+
+
 def string_beside(force, n=1500):
     """A string whose ‖r‖ is not below that at the start for 1000 steps, and a known force."""
     A = diags_array([-np.ones(n - 1), 2 * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1])

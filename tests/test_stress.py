@@ -37,6 +37,15 @@ def test_scenes_near_to_rounding_are_right_with_both_solvers(seed, qp_type, comm
         assert row["class"] == "right", row
 
 
+def test_forces_after_a_far_fall_are_known(comm):
+    """124: u is the fall, 2e5 lengths, and right to rounding long before the forces are."""
+    row = judge.run_scene(random_scene(124), comm)
+    if comm.rank == 0:
+        assert row["error"] == "", row
+        assert row["u"] <= 1e-9
+        assert row["force"] <= 1e-3
+
+
 @pytest.mark.parametrize(
     "rung",
     [

@@ -93,6 +93,11 @@ class FaceSolver:
         """Largest Rayleigh quotient of F seen; at most ‖F‖."""
         return self._directions.norm
 
+    @property
+    def contradicts(self) -> bool:
+        """Whether rows of the face exclude each other."""
+        return self._dependent.contradicts
+
     def saw(self, curvature: float, size: float) -> None:
         """Another Rayleigh quotient."""
         self._directions.seen(curvature, size)
@@ -139,11 +144,13 @@ class FaceSolver:
             face: The face.
             optimality: ‖g^P‖ there.
         """
-        z, first, feasible = start.copy(), None, self._qp.feasible
+        z, first, feasible, out = start.copy(), None, self._qp.feasible, False
         stays = self.enter(face) and self.settled
         for _ in range(MOST_ROUNDS):
             target = self._target(z, optimality, stays)
             bound = self._dependent.slack(z, target)
+            if self.contradicts:
+                break
             if bound is not None:
                 first = first or bound
                 self._drop(z)
@@ -161,8 +168,7 @@ class FaceSolver:
                 break
             z.lam.array[:] = feasible.project(z.lam.array_r)
             self._drop(z)
-        assert first is not None
-        return Trial(first, z, not out)
+        return Trial(first or z.copy(), z, not out)
 
     def _drop(self, z: Point) -> None:
         """Enter the face of z, and bring z back to Gλ = e in it; multiplies by F once."""
