@@ -29,6 +29,8 @@ EXPLANATIONS = {
     ConvergedReason.DIVERGED_ROUNDING: "; rounding does not let it come lower: expected a "
     "larger rtol, or a scene with smaller ratios of stiffness or size",
     ConvergedReason.DIVERGED_STALLED: "; the forces come no nearer to balancing the load",
+    ConvergedReason.DIVERGED_CONTRADICTION: "; contact rows that depend on each other exclude each "
+    "other: expected gaps that some displacement keeps",
 }
 
 

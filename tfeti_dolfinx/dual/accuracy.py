@@ -27,7 +27,7 @@ FORCES, RIGID = 10.0, 1e-12
 AT_REST = 1e-14
 # of rtol b₀, and of what rounding leaves of a residual where numbers of all sizes meet: a residual
 # that is good enough where rounding may explain an error in energy
-SMALL, LITTLE = 1e-2, 0.1
+SMALL, LITTLE = 1e-2, 0.01
 # the first look is taken at this power of rtol, to learn how far things move
 FIRST_LOOK = 0.5
 # a new tolerance aims a little below what was asked for; it never falls by more than LEAP at
