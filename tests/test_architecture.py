@@ -26,14 +26,18 @@ ROOMS = [
     ["fields"],
     ["contact_state", "friction_bounds"],
     ["solution"],
+    ["saved_state"],
     ["solver"],
     ["coulomb"],
     ["report_filling"],
     ["extensions"],
     ["system"],
+    ["rounds", "stepping"],
     ["problem"],
     ["draw"],
     ["output", "plot"],
+    ["checkpoint", "halving", "progress", "series"],
+    ["load_steps"],
 ]
 PLACE = {room: place for place, rooms in enumerate(ROOMS) for room in rooms}
 # the QP solvers know nothing of meshes and rows, the Blocks nothing of rows
@@ -98,7 +102,7 @@ def functions(path):
 
 
 # what a user calls may have as many arguments as the user needs
-DOORS = {"problem.py", "plot.py"}
+DOORS = {"load_steps.py", "plot.py", "problem.py"}
 
 
 @pytest.mark.parametrize("path", modules(), ids=lambda p: str(p.relative_to(PACKAGE)))

@@ -2,10 +2,12 @@
 
 from types import SimpleNamespace
 
+import basix.ufl
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from dolfinx import mesh as dmesh
 from mpi4py import MPI
 from petsc4py import PETSc
 from scenes import clamp, decomposed, forms, hooke, problem, strain
@@ -101,6 +103,23 @@ def test_kernel_where_the_stiffness_varies_by_nine_orders():
     K = csr_array(1e9 * K)
     modes = candidate_modes(x, 3, x.mean(axis=0), 1.0)
     assert kernel_of(K, modes).shape == (n, 6)
+
+
+@pytest.mark.parametrize("thickness", [1.0, 0.1, 0.01, 1e-3])
+def test_kernel_of_flat_triangles(thickness):
+    """The ends have no entry across but that of a shear, a difference of far larger numbers."""
+    h = 0.093541 * thickness
+    for k in range(6):
+        low = np.array([0.381886 + 0.7407867 * k, 1.784418 - 0.0935 * k])
+        x = low + [[0, 0], [0.7407867, 0], [0.7407867, h], [2 * 0.7407867, h]]
+        element = basix.ufl.element("Lagrange", "triangle", 1, shape=(2,))
+        cells = np.array([[0, 1, 2], [1, 2, 3]])
+        mesh = dmesh.create_mesh(MPI.COMM_SELF, cells=cells, x=x, e=element)
+        V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
+        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+        K = csr_array(assemble_csr(fem.form(ufl.inner(hooke()(u), strain(v)) * ufl.dx)))
+        modes = candidate_modes(V.tabulate_dof_coordinates()[:, :2], 2, low, 1.0)
+        assert kernel_of(K, modes).shape == (8, 3)
 
 
 def test_generalised_inverse_of_the_whole_matrix():

@@ -171,7 +171,7 @@ def test_a_block_that_is_drawn_along_slides_at_its_capacity(angle, comm):
     value = np.array([5.0 * np.cos(angle), 5.0 * np.sin(angle), -press])
     dofs = fem.locate_dofs_topological(V, 2, d.facets("top"))
     bcs = [fem.dirichletbc(value, dofs, V)]
-    p = tfeti.ContactProblem(a, L, bcs, [floor(3, law)], d, petsc_options=EXACT)
+    p = tfeti.ContactProblem(a, L, bcs, [floor(3, law)], d, petsc_options={"rtol": 1e-7})
     p.solve()
     assert p.report.sticking == 0
     data = p.solution.contact()

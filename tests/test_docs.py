@@ -55,7 +55,10 @@ def test_the_main_job_leaves_pictures(serial_only, tmp_path):
     assert names == {"hertz_2d.png", "hertz_2d_contact.png", "hertz_2d_pressure.png"}
 
 
-@pytest.mark.parametrize("document", ["README.md", "docs/tutorial.md", "docs/two_bodies.md"])
+PROGRAMS = ["README.md", *(f"docs/{name}.md" for name in ("tutorial", "two_bodies", "load_steps"))]
+
+
+@pytest.mark.parametrize("document", PROGRAMS)
 @pytest.mark.parametrize("ranks", [1, 2])
 def test_programs_of_documents(serial_only, document, ranks, tmp_path):
     program = tmp_path / "program.py"

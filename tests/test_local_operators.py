@@ -124,7 +124,7 @@ def subdomains_dual(p):
 @pytest.mark.parametrize("cell", CELLS)
 def test_equal_subdomains_are_factored_once(cell):
     d = cubes(cell)
-    p, subdomains = made(d, "shared")
+    p, subdomains = made(d, "shared", tfeti_pc_type="lumped")
     counters = subdomains.counters
     ranks_with_any = d.comm.allreduce(int(len(d.subdomains) > 0))
     assert d.comm.allreduce(counters.factorizations) == ranks_with_any
@@ -133,7 +133,7 @@ def test_equal_subdomains_are_factored_once(cell):
     forms.prepare()
     assert sum(forms.forms.values()) == len(subdomains.blocks)
     p.destroy()
-    p, subdomains = made(d, "implicit")
+    p, subdomains = made(d, "implicit", tfeti_pc_type="lumped")
     assert subdomains.counters.factorizations == len(subdomains.blocks)
     assert len({id(block.stiffness) for block in subdomains.blocks}) == len(subdomains.blocks)
     p.destroy()
@@ -161,7 +161,7 @@ def test_the_answer_does_not_depend_on_the_form(local_type, contact):
         assert found["F_predicted"] > 0.0
         assert found["F_bytes"] > 0.0
         assert found["F_measured"] > 0.0
-        assert ("preconditioner_predicted" in found) != contact
+        assert found["preconditioner_predicted"] > 0.0
         if name in ("implicit", "explicit"):
             assert found[f"F_{name}"] == 8
 

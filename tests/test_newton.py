@@ -3,12 +3,15 @@
 import numpy as np
 import pytest
 from reference import dense_qp
+from scipy.sparse import diags_array
 from test_qp import bounds_on, matrix, vector
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
+from tfeti_dolfinx.qp.feasible_sets import Product
 from tfeti_dolfinx.qp.homogenised import homogenise, image
 from tfeti_dolfinx.qp.nearest import nearest
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
+from tfeti_dolfinx.qp.pcpg import solve_by_pcpg
 from tfeti_dolfinx.qp.problem import QP, Start
 from tfeti_dolfinx.qp.stopping import ResidualRule
 
@@ -169,9 +172,104 @@ def test_the_nearest_feasible_point(kind, seed):
     assert np.all(apart >= -1e-9 * np.linalg.norm(y))
 
 
+def test_steps_that_no_row_stops_end():
+    """λ ≥ 0 and λ₁ + λ₂ = −1: the cost falls for ever along α < 0."""
+
+    class Counting(DenseCoarse):
+        steps = 0
+
+        def damped_solve(self, face, y, damping):
+            self.steps += 1
+            return super().damped_solve(face, y, damping)
+
+    coarse = Counting(np.ones((1, 2)), -np.ones(1))
+    found = nearest(coarse, bounds_on(np.arange(2)), vector([1.0, 2.0]))
+    assert found.missing == pytest.approx(1.0)
+    assert np.array_equal(found.lam.array_r, [0.0, 0.0])
+    assert coarse.steps <= 15
+
+
 def test_the_nearest_point_says_what_nothing_fulfils():
     """λ₁ + λ₂ = −1 with λ ≥ 0."""
     coarse = DenseCoarse(np.ones((1, 2)), np.array([-1.0]))
     found = nearest(coarse, bounds_on(np.arange(2)), vector([1.0, 2.0]))
     assert found.missing >= 0.1
     assert np.all(found.lam.array_r >= 0.0)
+
+
+def nearly_dependent(seed, near=1e-6, m=60):
+    """Two rows of G that are nearly the same, d nearly all in Gᵀμ, and an M that has Gᵀ for 0."""
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((m, m)) * 10.0 ** rng.uniform(-0.5, 0.5, m)
+    F = A @ A.T / m + 0.1 * np.eye(m)
+    G = rng.standard_normal((4, m))
+    G[1] = G[0] + near * G[1]
+    Q = np.linalg.qr(G.T)[0]
+    P = np.eye(m) - Q @ Q.T
+    d = rng.standard_normal(m) + 1e3 * G.T @ rng.standard_normal(4)
+    M = P @ np.diag(1.0 / np.diag(F)) @ P
+    return QP(matrix(F), vector(d), DenseCoarse(G, G @ np.ones(m)), Product(), matrix(M)), F, P
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_nearly_dependent_rows_of_G_leave_is_no_residual(seed):
+    """κ(GGᵀ) = 1e12: a projection leaves 1e-7 of d, which M does not see."""
+    qp, F, P = nearly_dependent(seed)
+    result = solve_by_pcpg(qp, homogenise(qp), ResidualRule(1e-9), max_it=3000)
+    assert result.reason > 0
+    assert np.linalg.norm(P @ (F @ result.lam.array_r - qp.d.array_r)) <= 2e-8
+
+
+class Dependent:
+    """A preconditioner that knows what rows +b and −b have in common."""
+
+    def __init__(self, face):
+        self.face = face
+
+    def mult(self, x, y):
+        y.array[:] = self.face.restricted(x.array_r)
+
+    def dependent(self, x):
+        both = self.face.carrying[:2].all()
+        return np.array([1.0, 1.0, 0.0]) * (x[0] + x[1]) / 2.0 if both else np.zeros(3)
+
+    def destroy(self):
+        """Nothing to free."""
+
+
+@pytest.mark.parametrize("knows", [None, Dependent])
+@pytest.mark.parametrize(("room", "solvable"), [(-0.5, False), (0.5, True)])
+def test_rows_that_exclude_each_other_are_named(knows, room, solvable):
+    """u ≤ −1 and −u ≤ 1 + room; with less than none q falls forever along (1, 1)."""
+    F = np.array([[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    d = vector([1.0, -1.0 - room, 1.0])
+    qp = QP(matrix(F), d, NoCoarse(), bounds_on(np.arange(3)), preconditioner_on=knows)
+    start = vector([1.0, 1.0, 0.0])  # both touch
+    result = newton(qp, homogenise(qp, image(qp.F, start)), ResidualRule(1e-10), max_it=100)
+    if not solvable:
+        assert result.reason.name == "DIVERGED_CONTRADICTION"
+    else:
+        assert result.reason > 0
+        assert result.lam.array == pytest.approx([1.0, 0.0, 1.0], abs=1e-9)
+
+
+def string_beside(force, n=1500):
+    """A string whose ‖r‖ is not below that at the start for 1000 steps, and a known force."""
+    A = diags_array([-np.ones(n - 1), 2 * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1])
+    F = np.zeros((n + 1, n + 1))
+    F[:n, :n] = A.toarray()
+    G, d = np.zeros((1, n + 1)), np.zeros(n + 1)
+    G[0, n] = F[n, n] = 1.0
+    d[:n], d[n] = np.arange(n) / n, force
+    return QP(matrix(F), vector(d), DenseCoarse(G, np.array([force])), Product())
+
+
+@pytest.mark.parametrize(
+    ("force", "reason"), [(1.0, "CONVERGED_RTOL"), (1e15, "DIVERGED_ROUNDING")]
+)
+def test_a_plateau_is_left_where_q_does_not_fall_either(force, reason):
+    """500 steps, and 500 with a new gradient; beside 1e30, what they gain is rounding of q."""
+    qp = string_beside(force)
+    result = solve_by_pcpg(qp, homogenise(qp), ResidualRule(1e-9))
+    assert result.reason.name == reason
+    assert (result.steps.cg <= 1001) == (force > 1.0)

@@ -17,7 +17,7 @@ import tfeti_dolfinx as tfeti
 from tfeti_dolfinx import NoSolutionError
 from tfeti_dolfinx.dual.cuts import Rows
 from tfeti_dolfinx.dual.motions import unresisted, unsprung
-from tfeti_dolfinx.dual.solvability import check_solvable
+from tfeti_dolfinx.dual.solvability import _minimiser, check_solvable
 
 
 def rigid_scene(rng):
@@ -81,6 +81,22 @@ def test_random_rigid_scenes_against_a_plain_program():
         assert solvable == plain, f"seed {seed}"
         verdicts.append(solvable)
     assert 0.2 < np.mean(verdicts) < 0.8
+
+
+def test_a_program_that_presolving_spoils():
+    """HiGHS 1.11 does not know the status of what it makes of this one's presolved optimum."""
+    A = np.zeros((9, 8))
+    A[:3, :3] = [[0.028, -0.97, 0.81], [0, -1, 0], [-0.028, -0.97, -0.81]]
+    A[3:5, 1:5] = [[0.49, -0.39, -0.49, 0.33], [0.5, 0.4, -0.5, -0.45]]
+    A[5:7, 3:6] = [[0.5, -0.45, -0.5], [0.5, -0.28, -0.5]]
+    A[7:, 5:] = [[0.4, -0.4, 0.34], [0.33, -0.33, 0]]
+    load = np.array([0, 0, 0, -1, 0.905070269816, -0.458141638602, -0.725973378359, 0])
+    noise = np.array([1.8e-14, 1.8e-14, 1.8e-14, 1.8e-9, 1.8e-9, 8.4e-10, 1.3e-9, 1.3e-9])
+    cost, A = np.concatenate((noise - load, noise + load)), csr_array(np.hstack([A, -A]))
+    y = _minimiser(cost, A, bounds=(0, 1))
+    expected = linprog(cost, A_ub=A, b_ub=np.zeros(9), bounds=(0, 1)).fun
+    assert np.all(A @ y <= 1e-9)
+    assert cost @ y == pytest.approx(expected, rel=1e-6)
 
 
 def test_a_load_that_is_rounding_hides_no_escape():

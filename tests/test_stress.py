@@ -16,8 +16,9 @@ from benchmarks.stress.scene import Body, Load, Scene
 
 # 237: no load; 314: a far row is kept, however uncertain its normal; 608: rows of a stiff side on a
 # few soft nodes; 798: u is rounding of points; 913: rows that are rounding of normals of tiny
-# facets; 981: rounding of a motion along rows is no hold; 1110: a part whose load is rounding
-@pytest.mark.parametrize("seed", [*range(1, 20), 237, 314, 608, 798, 913, 981, 1110])
+# facets; 981: rounding of a motion along rows is no hold; 1110: a part whose load is rounding;
+# 6054: a linear program that HiGHS' presolving spoils
+@pytest.mark.parametrize("seed", [*range(1, 20), 237, 314, 608, 798, 913, 981, 1110, 6054])
 def test_random_scenes_are_right_or_named(seed, comm):
     """Classes in capitals: wrong answers and verdicts, errors that are not the package's."""
     row = judge.run_scene(random_scene(seed), comm)
@@ -25,13 +26,22 @@ def test_random_scenes_are_right_or_named(seed, comm):
         assert row["class"].islower(), row
 
 
-# 68, 2106: forces that are rounding of 0; 163: gaps 1e12 times as large as the error allowed
+# 68, 2106: forces that are rounding of 0; 163: gaps 1e12 times as large as the error allowed; 2186:
+# bodies 220 and 600 times as long as thick; 5033: normals of a side at 2e5 of its length; 6044: a
+# kernel of flat triangles; 6114: u is 1e-4 of that of the first look
 @pytest.mark.parametrize("qp_type", ["newton", "smalse"])
-@pytest.mark.parametrize("seed", [68, 163, 2106])
+@pytest.mark.parametrize("seed", [68, 163, 2106, 2186, 5033, 6044, 6114])
 def test_scenes_near_to_rounding_are_right_with_both_solvers(seed, qp_type, comm):
     scene = random_scene(seed)
     scene = replace(scene, options={**scene.options, "tfeti_qp_type": qp_type})
     row = judge.run_scene(scene, comm)
+    if comm.rank == 0:
+        assert row["class"] == "right", row
+
+
+def test_forces_after_a_far_fall_are_known(comm):
+    """124: u is the fall, 2e5 lengths, and right to rounding long before the forces are."""
+    row = judge.run_scene(random_scene(124), comm)
     if comm.rank == 0:
         assert row["class"] == "right", row
 

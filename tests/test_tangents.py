@@ -139,7 +139,15 @@ def test_prescribed_values_slip():
     # corners are on both grids: the upper box moves there as the lower one does
     rows = gluing.tangents
     found = times_rows(gluing, u)[gluing.constraints.sets.tangents] / rows.scale[:, None]
-    assert np.allclose(found, slips(records, dofs, u)[rows.condition], rtol=0, atol=1e-12)
+    whole = slips(records, dofs, u)
+    assert np.allclose(found, whole[rows.condition], rtol=0, atol=1e-12)
+    # a load step that begins elsewhere
+    begin, before = np.cos(1.0 + whole), gluing.constraints.c.array_r.copy()
+    later = gluing.with_right_side(gluing.prescribed.value, records.gap, begin)
+    found = times_rows(later, u)[gluing.constraints.sets.tangents] / rows.scale[:, None]
+    assert np.allclose(found, (whole - begin)[rows.condition], rtol=0, atol=1e-12)
+    gain = gluing.constraints.c.array_r - before
+    assert np.allclose(gluing.gain(begin), gain, rtol=0, atol=1e-12)
     gluing.constraints.destroy()
 
 

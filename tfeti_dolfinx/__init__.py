@@ -41,6 +41,7 @@ from tfeti_dolfinx.errors import (
     TfetiError,
 )
 from tfeti_dolfinx.extensions import Extensions
+from tfeti_dolfinx.load_steps import LoadSteps, StepRecord
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dolfinx_input import decompose
 from tfeti_dolfinx.mesh.gmsh.reading import read_gmsh
@@ -64,6 +65,7 @@ __all__ = [
     "Extensions",
     "FactorError",
     "InputError",
+    "LoadSteps",
     "NoSolutionError",
     "Obstacle",
     "Options",
@@ -72,6 +74,7 @@ __all__ = [
     "SignedDistance",
     "Solution",
     "Sphere",
+    "StepRecord",
     "TfetiError",
     "Tresca",
     "__version__",

@@ -126,9 +126,21 @@ class ContactState:
 
     @cached_property
     def slip_of_conditions(self) -> Array:
-        """Tangential v_i of each condition, shape ``(n, gdim)``. Collective at first use."""
+        """How far the tangential v_i of each condition has come in this step, a vector.
+
+        Shape ``(n, gdim)``. Collective at first use.
+        """
         records = self.gluing.records
-        return np.einsum("nt,ntg->ng", slips(records, self.dofs, self.u), records.tangents)
+        slip = slips(records, self.dofs, self.u) - self.gluing.slip
+        return np.einsum("nt,ntg->ng", slip, records.tangents)
+
+    @cached_property
+    def dissipation(self) -> Array:
+        """What friction dissipates at each condition in this step, shape ``(n,)``.
+
+        −F·s, F the friction on the node and s its slip. Collective at first use.
+        """
+        return -np.sum(self.tangential_force * self.slip_of_conditions, axis=1)
 
     @cached_property
     def status_of_conditions(self) -> Array:

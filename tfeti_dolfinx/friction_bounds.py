@@ -1,4 +1,4 @@
-"""What bounds the tangential forces of a scene, and whether that has changed."""
+"""What bounds the tangential forces of a scene, and where its slips count from."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ import numpy as np
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.contact.forces import condition_areas
 from tfeti_dolfinx.contact.partners import ContactPartner
+from tfeti_dolfinx.contact.records import slips
 from tfeti_dolfinx.contact.search import ContactSearch
+from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.gluing.glue import Gluing
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -25,6 +27,10 @@ class FrictionBounds:
         dofs: Dof maps.
         decomposition: The torn mesh.
         thickness: What areas of the mesh are multiplied with, a number or a scalar in UFL.
+
+    Attributes:
+        exists: Whether a contact has friction.
+        rest: Displacement at which the load step begins, in primal order; None: no displacement.
     """
 
     def __init__(
@@ -36,7 +42,30 @@ class FrictionBounds:
     ) -> None:
         self._dofs, self._decomposition, self._thickness = dofs, decomposition, thickness
         self._known: Array | None = None
-        self._has_friction = any(contact.friction is not None for contact in contacts)
+        self.exists = any(contact.friction is not None for contact in contacts)
+        self.rest: Array | None = None
+
+    def slip(self, search: ContactSearch) -> Array:
+        """Tangential v_i of all conditions where the load step begins, shape ``(n, gdim - 1)``."""
+        records = search.records
+        if self.rest is None:
+            return np.zeros(records.tangents.shape[:2])
+        return slips(records, self._dofs, self.rest)
+
+    def gain(self, dual: Dual, gluing: Gluing, search: ContactSearch) -> Array:
+        """What μ gains where a load step begins that these rows do not know of yet.
+
+        The bodies are where they were, so Gᵀμ gains what c gains in the range of Gᵀ.
+
+        Args:
+            dual: The dual problem of the rows.
+            gluing: The rows, with the slips of the step before.
+            search: The contacts' conditions.
+        """
+        coarse = dual.coarse
+        if coarse.dimension == 0:
+            return np.zeros(0)
+        return coarse.solve(coarse.G(gluing.gain(self.slip(search))))
 
     def has_changed(self, search: ContactSearch) -> bool:
         """Whether laws say something else than when the limits were last set.
@@ -44,7 +73,7 @@ class FrictionBounds:
         Raises:
             InputError: A value is negative or no number somewhere.
         """
-        if not self._has_friction or self._known is None:
+        if not self.exists or self._known is None:
             return False
         return any_rank(self._dofs.comm, not np.array_equal(search.friction(), self._known))
 
@@ -54,7 +83,7 @@ class FrictionBounds:
         Raises:
             InputError: A value is negative or no number somewhere.
         """
-        if not self._has_friction:
+        if not self.exists:
             return
         contacts = search.contacts
         surfaces = [contact.surfaces[0] for contact in contacts]

@@ -37,15 +37,15 @@ def write_vtx(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
     Raises:
         InputError: The name does not end with ``.bp``, or nothing can be written there.
     """
-    target = _checked_target(path, ".bp", solution)
+    target = checked_target(path, ".bp", solution)
     if not dolfinx.has_adios2:
         return write_xdmf(target.with_suffix(".xdmf"), solution)
     cells = target.with_name(f"{target.stem}_cells.bp")
     for name, functions in ((target, nodal_fields(solution)), (cells, cell_fields(solution))):
-        partial = _begin(name, solution)
+        partial = begin_file(name, solution)
         with io.VTXWriter(solution.decomposition.comm, partial, functions, engine="BP4") as vtx:
             vtx.write(0.0)
-        _replace(partial, name, solution)
+        end_file(partial, name, solution)
     return [target, cells]
 
 
@@ -60,9 +60,9 @@ def write_xdmf(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
     Raises:
         InputError: The name does not end with ``.xdmf``, or nothing can be written there.
     """
-    target = _checked_target(path, ".xdmf", solution)
+    target = checked_target(path, ".xdmf", solution)
     decomposition = solution.decomposition
-    folder = _begin(target.with_name(f"{target.stem}.folder"), solution)
+    folder = begin_file(target.with_name(f"{target.stem}.folder"), solution)
     with raised_on_all_ranks(decomposition.comm), named(f"cannot write {target}", OSError):
         if decomposition.comm.rank == 0:
             folder.mkdir(parents=True)
@@ -72,7 +72,7 @@ def write_xdmf(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
             xdmf.write_function(_as_geometry(function, decomposition))
     companion = target.with_suffix(".h5")
     for name in (companion, target):
-        _replace(folder / name.name, name, solution)
+        end_file(folder / name.name, name, solution)
     with raised_on_all_ranks(decomposition.comm):
         if decomposition.comm.rank == 0:
             folder.rmdir()
@@ -124,7 +124,7 @@ def _as_geometry(function: fem.Function, decomposition: Decomposition) -> fem.Fu
     return copy
 
 
-def _checked_target(path: str | os.PathLike[str], suffix: str, solution: Solution) -> Path:
+def checked_target(path: str | os.PathLike[str], suffix: str, solution: Solution) -> Path:
     """The name to write to. Collective."""
     target = checked_path(path, suffix)
     checked_type(solution, Solution, "solution", "the solution of a ContactProblem")
@@ -135,7 +135,7 @@ def _checked_target(path: str | os.PathLike[str], suffix: str, solution: Solutio
     return target
 
 
-def _begin(name: Path, solution: Solution) -> Path:
+def begin_file(name: Path, solution: Solution) -> Path:
     """Name to write to until the file is whole; what an earlier run left there is removed."""
     partial = name.with_name(f".{name.name}.partial")
     comm = solution.decomposition.comm
@@ -146,7 +146,8 @@ def _begin(name: Path, solution: Solution) -> Path:
     return partial
 
 
-def _replace(partial: Path, name: Path, solution: Solution) -> None:
+def end_file(partial: Path, name: Path, solution: Solution) -> None:
+    """Give a whole file its name. Collective."""
     comm = solution.decomposition.comm
     comm.barrier()
     with raised_on_all_ranks(comm), named(f"cannot write {name}", OSError):

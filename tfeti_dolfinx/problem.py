@@ -10,7 +10,6 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.assembly import Forms
 from tfeti_dolfinx.checks import checked_type
 from tfeti_dolfinx.compat import require_real_petsc
@@ -19,11 +18,10 @@ from tfeti_dolfinx.contact.partners import ContactPartner, checked_contacts
 from tfeti_dolfinx.contact_state import Multipliers
 from tfeti_dolfinx.coulomb import solve_with_friction
 from tfeti_dolfinx.dual.dual import Dual
-from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
+from tfeti_dolfinx.errors import TfetiError
 from tfeti_dolfinx.extensions import Extensions, Settings, guarded
 from tfeti_dolfinx.fields import Stress, check_stress, checked_thickness
 from tfeti_dolfinx.form_checks import check_same_space, displacement_space
-from tfeti_dolfinx.gluing.glue import Gluing
 from tfeti_dolfinx.gluing.prescribed import checked_conditions
 from tfeti_dolfinx.gluing.spectrum import extreme_eigenvalues, require_slepc
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -31,15 +29,15 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.option_parsing import factor_options, parse_options
 from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.report_filling import fill_result, settle_seconds
+from tfeti_dolfinx.rounds import solve_in_rounds
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solver import conclude, resolve_types
+from tfeti_dolfinx.stepping import Stepping
 from tfeti_dolfinx.system import System
 from tfeti_dolfinx.timing import stage
 
-MAX_ROUNDS = 20
 
-
-class ContactProblem:
+class ContactProblem(Stepping):
     """Linear elasticity with contact on a torn mesh, solved by Total FETI.
 
     Mirrors ``dolfinx.fem.petsc.LinearProblem``; all is collective. The package has an example.
@@ -105,8 +103,6 @@ class ContactProblem:
         self._stress = check_stress(stress, self.u, decomposition)
         self._thickness = checked_thickness(thickness, decomposition)
         self.report = Report(seconds=dict(decomposition.seconds))
-        self._solution: Solution | None = None
-        self._start: tuple[Gluing, Array, Array] | None = None
         with stage("assembly", self.report.seconds):
             forms = Forms(a, L, V, decomposition, form_compiler_options, jit_options)
         with stage("gluing", self.report.seconds):
@@ -115,17 +111,6 @@ class ContactProblem:
         self._system = System(
             forms, self.bcs, self.contacts, self.dofs, decomposition, self._settings
         )
-
-    @property
-    def solution(self) -> Solution:
-        """Fields and contact states.
-
-        Raises:
-            InputError: There is none before ``solve``.
-        """
-        if self._solution is None:
-            raise InputError("there is no solution yet; expected a call of solve() before")
-        return self._solution
 
     @property
     def dual(self) -> Dual:
@@ -155,7 +140,7 @@ class ContactProblem:
         self.report.begin()
         try:
             self._system.look_for_changes()
-            self._solve_rounds()
+            solve_in_rounds(self._solve_rows, self._system, self.report)
         except TfetiError:  # on all ranks
             self._count()
             raise
@@ -207,34 +192,6 @@ class ContactProblem:
         settle_seconds(self.report, self.decomposition.comm)
         self.report.end()
 
-    def _solve_rounds(self) -> None:
-        """Solve until no node without a row overlaps."""
-        system, report = self._system, self.report
-        for _ in range(MAX_ROUNDS):
-            try:
-                solution = self._solve_rows()
-            except NoSolutionError as error:  # on all ranks: what is far may hold the body yet
-                added = self._widen(error)
-            else:
-                with stage("contact", report.seconds):
-                    added = system.take_in_overlapping(solution.u, report.tolerances["penetration"])
-                if added == 0:
-                    return
-            report.late_contact_rows += added
-        raise ConvergenceError(f"nodes out of reach still overlap after {MAX_ROUNDS} rounds")
-
-    def _widen(self, error: NoSolutionError) -> int:
-        """Look farther for what may hold a body; how many rows are new."""
-        search = self._system.search
-        if not search.is_exhausted:
-            with stage("contact", self.report.seconds):
-                return self._system.widen()
-        self.report.converged_reason = "NO_SOLUTION"
-        if unmet := search.unmet():
-            text = f"{error}; of the contacts meet nobody: {', '.join(unmet)}"
-            raise NoSolutionError(text) from error
-        raise error
-
     def _checked_u(self, u: fem.Function, V: fem.FunctionSpace) -> fem.Function:
         checked_type(u, fem.Function, "u", "a dolfinx.fem.Function on the space of a")
         check_same_space(u.function_space, V, "u", "the space of a")
@@ -263,15 +220,8 @@ class ContactProblem:
             solved = solve_with_friction(dual, self.options, qp_type, start, own)
         result, accuracy, _ = solved
         with stage("recovery", report.seconds):
-            solution = self._solution = Solution(
-                u=accuracy.u,
-                multipliers=Multipliers(np.array(result.lam.array_r), result.face),
-                decomposition=self.decomposition,
-                gluing=gluing,
-                contacts=list(system.search.contacts),
-                stress=self._stress,
-                thickness=self._thickness,
-            )
+            multipliers = Multipliers(np.array(result.lam.array_r), result.face)
+            solution = self._solution = self._make_solution(accuracy.u, multipliers, gluing)
             self.u.x.array[:] = self.dofs.to_dolfinx(solution.u)
         self._start = (gluing, solution.lam, result.mu) if result.reason > 0 else None
         fill_result(report, solution, dual, *solved)

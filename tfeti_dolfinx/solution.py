@@ -159,7 +159,7 @@ class Solution(ContactState):
 
     @cached_property
     def slip(self) -> fem.Function:
-        """How far nodes that slip have slid on what they meet, a vector; 0 elsewhere.
+        """How far nodes that slip have slid in this load step, a vector; 0 elsewhere.
 
         Of a node that slips on several contacts it is the mean.
         """

@@ -31,6 +31,8 @@ EXPLANATIONS = {
     ConvergedReason.DIVERGED_STALLED: "; the forces come no nearer to balancing the load",
     ConvergedReason.DIVERGED_FRICTION: "; the bounds of Coulomb's friction do not come to rest: "
     "expected a smaller coefficient, smaller load steps, or a larger friction_max_it",
+    ConvergedReason.DIVERGED_CONTRADICTION: "; contact rows that depend on each other exclude each "
+    "other: expected gaps that some displacement keeps",
 }
 
 

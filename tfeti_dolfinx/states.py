@@ -40,8 +40,8 @@ class ContactData:
         status: ContactStatus: OPEN without a normal force, else TOUCHING; with friction SLIP or
             STICK, shape ``(n,)``.
         tangential_traction: Friction on the node over the area, a vector, shape ``(n, gdim)``.
-        slip: Displacement along the surface, against what the node meets, a vector, shape
-            ``(n, gdim)``.
+        slip: Displacement along the surface, against what the node meets, since the load step
+            began (``ContactProblem.accept``), a vector, shape ``(n, gdim)``.
     """
 
     points: Array

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,7 @@ class System:
     Attributes:
         forms: The compiled forms.
         bcs: Dirichlet conditions.
+        friction: What bounds tangential forces.
         spectrum: Extreme eigenvalues of B Bᵀ, if somebody has put them here.
     """
 
@@ -65,11 +67,12 @@ class System:
         self.forms, self.bcs, self._contacts = forms, bcs, contacts
         self._dofs, self._decomposition = dofs, decomposition
         self._settings = settings
-        self._friction = FrictionBounds(contacts, dofs, decomposition, forms.thickness)
+        self.friction = FrictionBounds(contacts, dofs, decomposition, forms.thickness)
         self.spectrum: dict[str, float] = {}
         self._stages, self._counters, self._counted = Stages(), Counters(), 0
         self._K: Any = None
         self._search: ContactSearch | None = None
+        self._known_rows: tuple[Sequence[float], Sequence[Array]] | None = None
         self._prescribed: Prescribed | None = None
         self._gluing: Gluing | None = None
         self._subdomains: Subdomains | None = None
@@ -108,7 +111,7 @@ class System:
             self.change("rows")
         elif any_rank(self._dofs.comm, not np.array_equal(new.value, old.value)):
             self.change("right side")
-        if self._search is not None and self._friction.has_changed(self._search):
+        if self._search is not None and self.friction.has_changed(self._search):
             self.change("friction")
 
     def change(self, what: str) -> None:
@@ -162,19 +165,18 @@ class System:
         report.factorizations = self._dofs.comm.allreduce(factored - self._counted)
         self._counted = factored
 
-    def take_in_overlapping(self, u: Array, tolerance: float) -> int:
-        """Give rows to nodes that a displacement makes overlap without one; how many."""
-        added = self.search.take_in_overlapping(u, tolerance)
-        if added:
-            self.change("rows")
-        return added
+    def count_slips_from(self, u: Array) -> None:
+        """Let slips count from a displacement in primal order."""
+        self.friction.rest = u
+        if self.friction.exists:
+            self.change("right side")
+        elif self._gluing is not None:
+            self._gluing = replace(self._gluing, slip=self.friction.slip(self.search))
 
-    def widen(self) -> int:
-        """Reach farther in all contacts; how many rows are new."""
-        added = self.search.widen()
-        if added:
-            self.change("rows")
-        return added
+    def know_rows(self, reach: Sequence[float], groups: Sequence[Array]) -> None:
+        """Let the next search end with the rows that an earlier one of the scene had."""
+        self._known_rows = (reach, groups)
+        self.change("points")
 
     def destroy(self) -> None:
         """Destroy the PETSc objects; all stages are out of date."""
@@ -192,19 +194,23 @@ class System:
     def _find_contacts(self) -> None:
         dofs, decomposition = self._dofs, self._decomposition
         self._search = ContactSearch(self._contacts, dofs, decomposition, self._diagonal)
+        if self._known_rows is not None:
+            self._search.take_rows(*self._known_rows)
+            self._known_rows = None
 
     def _make_rows(self) -> None:
         if self._gluing is not None:
             self._gluing.constraints.destroy()
         search = self.search
         weights = row_weights(self._diagonal, self._settings.options.scaling, self._dofs.comm)
-        prescribed = made(self._prescribed)
-        self._gluing = glue(self._dofs, prescribed, search.records, search.length, weights)
+        prescribed, slip = made(self._prescribed), self.friction.slip(search)
+        self._gluing = glue(self._dofs, prescribed, search.records, search.length, weights, slip)
         self.spectrum = {}
 
     def _fill_right_side(self) -> None:
         values, gaps = made(self._prescribed).value, self.search.records.gap
-        self._gluing = self.gluing.with_right_side(values, gaps)
+        slip = self.friction.slip(self.search)
+        self._gluing = self.gluing.with_right_side(values, gaps, slip)
 
     def _assemble_load(self) -> None:
         self._f = self.forms.load()
@@ -264,7 +270,7 @@ MAKERS: dict[str, Callable[[System], None]] = {
     "search": System._find_contacts,
     "rows": System._make_rows,
     "right side": System._fill_right_side,
-    "friction": lambda system: system._friction.set_limits(system.gluing, system.search),
+    "friction": lambda system: system.friction.set_limits(system.gluing, system.search),
     "load": System._assemble_load,
     "factors": System._factor,
     "trace": System._retrace,

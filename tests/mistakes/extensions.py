@@ -8,12 +8,12 @@ from tfeti_dolfinx.qp.feasible_sets import Bounds
 from tfeti_dolfinx.subdomains.block import BlockDefaults
 
 
-def own(says, contact=True, **parts):
+def own(says, contact=True, options=None, **parts):
     """Solve with parts of one's own."""
 
     def do(s):
-        contacts = [s.floor] if contact else []
-        s.problem(contacts=contacts, extensions=Extensions(**parts)).solve()
+        contacts, extensions = [s.floor] if contact else [], Extensions(**parts)
+        s.problem(contacts=contacts, extensions=extensions, petsc_options=options).solve()
 
     return do, says
 
@@ -68,6 +68,7 @@ GIVEN = {
     ),
     "a preconditioner that nobody takes": own(
         r"extensions: a preconditioner is given, but -tfeti_pc_type is none, .* expected lumped",
+        options={"qp_type": "smalse"},
         preconditioner=raising,
     ),
 }

@@ -109,6 +109,17 @@ class ContactSearch:
             records[i] = replace(records[i], gap=values)
         self.contacts, self._records = contacts, records
 
+    def rows(self) -> tuple[list[float], list[Array]]:
+        """How far one has looked in each contact, and the owned groups whose nodes have rows."""
+        return list(self._reach), [r.group[r.within_reach] for r in self._records]
+
+    def take_rows(self, reach: Sequence[float], groups: Sequence[Array]) -> None:
+        """Have the rows that an earlier search of the same scene had, as ``rows`` said."""
+        for i, known in enumerate(self._records):
+            found = known if reach[i] <= self._reach[i] else self._search(i, reach[i])
+            self._records[i] = replace(found, within_reach=np.isin(found.group, groups[i]))
+            self._reach[i] = max(reach[i], self._reach[i])
+
     def take_in_overlapping(self, u: Array, tolerance: float) -> int:
         """Give rows to conditions without one that a displacement violates.
 

@@ -27,7 +27,7 @@ FORCES, RIGID = 10.0, 1e-12
 AT_REST = 1e-14
 # of rtol b₀, and of what rounding leaves of a residual where numbers of all sizes meet: a residual
 # that is good enough where rounding may explain an error in energy
-SMALL, LITTLE = 1e-2, 0.1
+SMALL, LITTLE = 1e-2, 0.01
 # the first look is taken at this power of rtol, to learn how far things move
 FIRST_LOOK = 0.5
 # a new tolerance aims a little below what was asked for; it never falls by more than LEAP at
@@ -118,8 +118,13 @@ class Accuracy:
         """Whether an iterate is right. Collective."""
         now = self.look(lam, gradient, face, residual)
         comm = self._scene.coarse.comm
-        values = (self.ratio(), self._longest(now), self._energy_ratio(now))
-        ratio, longest, in_energy = agreed(comm, values)
+        values = (
+            self.ratio(),
+            self.ratio(changes=False),
+            self._longest(now),
+            self._energy_ratio(now),
+        )
+        ratio, own, longest, in_energy = agreed(comm, values)
         if ratio <= 1.0 and (in_energy <= 1.0 or residual <= self._small):
             return ConvergedReason.CONVERGED_RTOL
         if longest <= self._atol:
@@ -127,6 +132,9 @@ class Accuracy:
         tolerance = residual * max(AIM / (ratio if ratio > 1.0 else in_energy), LEAP)
         if ratio <= 1.0:
             tolerance = max(tolerance, self._small)
+        elif tolerance < OUT_OF_REACH * self._rounding:
+            # the change since a poor iterate says little: another look before one gives up
+            tolerance = residual * max(AIM / max(own, 1.0), LEAP)
         self._stalls = self._stalls + 1 if agreed(comm, self._stalled(now, residual)) else 0
         if self._stalls > 1 or agreed(comm, tolerance < OUT_OF_REACH * self._rounding):
             return ConvergedReason.DIVERGED_ROUNDING
@@ -163,9 +171,13 @@ class Accuracy:
         """This rank's part of the displacement at the last look, shape ``(n,)``."""
         return self._looked().u
 
-    def errors(self) -> Array:
-        """Estimated errors of u at the last look, a length for each body, shape ``(bodies,)``."""
-        now, before = self._looked(), self._before
+    def errors(self, changes: bool = True) -> Array:
+        """Estimated errors of u at the last look, a length for each body, shape ``(bodies,)``.
+
+        Args:
+            changes: Whether what has changed since the look before it counts.
+        """
+        now, before = self._looked(), self._before if changes else None
         bodies, energy = now.bodies, np.sqrt(np.maximum(now.bodies.energy, 0.0))
         own = np.sqrt(bodies.correction_energy)
         # where all is rounding, energy does not say how far anything moves
@@ -198,11 +210,11 @@ class Accuracy:
         loaded = bool(now.bodies.alone.any())
         return 0.0 if loaded or now.bodies.size.max(initial=0.0) > small else small
 
-    def ratio(self) -> float:
-        """What must be at most 1: the largest of all errors over their tolerances."""
+    def ratio(self, changes: bool = True) -> float:
+        """What must be at most 1: the largest of all errors (``errors``) over their tolerances."""
         now, allowed = self._looked(), self.tolerances()
         pairs = [
-            *zip(self.errors(), allowed.displacement, strict=True),
+            *zip(self.errors(changes), allowed.displacement, strict=True),
             (now.penetration, allowed.penetration),
             (now.balance, allowed.balance),
             (now.error, allowed.energy),

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
-
 import numpy as np
 from petsc4py import PETSc
-from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.errors import FactorError, raised_on_all_ranks
+from tfeti_dolfinx.dual.contact_factor import Factor, contact_factor
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.problem import FaceOperator, Operator
-from tfeti_dolfinx.subdomains.factor import CholeskyFactor, added_options, has_solver
 
 # an entry of B_N D⁻¹ B_Nᵀ − I, whose diagonal is 1, that is rounding
 ORTHONORMAL = 1e-12
@@ -62,72 +58,6 @@ class FacePreconditioner:
         """Destroy W_N, not the operator on all rows. Collective."""
         if self._gram is not None:
             self._gram.destroy()
-
-
-class Factor(Protocol):
-    """The inverse of a matrix."""
-
-    def solve(self, b: Array) -> Array:
-        """A⁻¹b, of this rank's parts. Collective."""
-        ...
-
-    def destroy(self) -> None:
-        """Free it. Collective."""
-        ...
-
-
-def contact_factor(A: PETSc.Mat, prefix: str) -> Factor:
-    """A factor of a distributed matrix, which is taken over. Collective.
-
-    Raises:
-        FactorError: It could not be made.
-    """
-    if A.getComm().getSize() > 1:
-        return DistributedFactor(A, prefix)
-    indptr, indices, data = A.getValuesCSR()
-    matrix = csr_array((data, indices, indptr), shape=A.getSize())
-    A.destroy()
-    return CholeskyFactor(matrix, prefix)
-
-
-class DistributedFactor:
-    """A = L Lᵀ over all ranks by MUMPS; without it, on each rank a factor of the whole.
-
-    Args:
-        A: Symmetric positive definite, MPIAIJ; taken over. The constructor is collective.
-        prefix: Prefix of the PETSc options.
-
-    Raises:
-        FactorError: It could not be made.
-    """
-
-    def __init__(self, A: PETSc.Mat, prefix: str) -> None:
-        A.setOption(PETSc.Mat.Option.SPD, True)
-        self._b, self._x = A.createVecs()
-        self._pc: Any = PETSc.PC().create(A.getComm())
-        self._pc.setOptionsPrefix(prefix)
-        self._pc.setOperators(A)
-        parallel = has_solver("mumps")
-        self._pc.setType(PETSc.PC.Type.CHOLESKY if parallel else PETSc.PC.Type.REDUNDANT)
-        given = {"pc_factor_mat_solver_type": "mumps"} if parallel else {}
-        with raised_on_all_ranks(A.getComm().tompi4py()), added_options(prefix, given):
-            try:
-                self._pc.setFromOptions()
-                self._pc.setUp()
-            except PETSc.Error as error:
-                raise FactorError(f"the contact rows of a face: {error}") from error
-        A.destroy()
-
-    def solve(self, b: Array) -> Array:
-        """A⁻¹b, of this rank's parts."""
-        self._b.array[:] = b
-        self._pc.apply(self._b, self._x)
-        return np.array(self._x.array_r)
-
-    def destroy(self) -> None:
-        """Free the factor."""
-        for item in (self._pc, self._b, self._x):
-            item.destroy()
 
 
 class _OnFace:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -154,11 +155,14 @@ def minimiser(cost: Array, A: csr_array, **rest: Any) -> Array:
     Raises:
         TfetiError: Neither the simplex nor the interior point method found it.
     """
-    options = {
-        "primal_feasibility_tolerance": LP_TOLERANCE,
-        "dual_feasibility_tolerance": LP_TOLERANCE,
-    }
-    for method in ("highs-ipm", "highs-ds") if len(cost) > LARGE else ("highs-ds", "highs-ipm"):
+    methods = ("highs-ipm", "highs-ds") if len(cost) > LARGE else ("highs-ds", "highs-ipm")
+    # what is undone after presolving may miss the tolerance; without it nothing is undone
+    for presolve, method in product((True, False), methods):
+        options = {
+            "primal_feasibility_tolerance": LP_TOLERANCE,
+            "dual_feasibility_tolerance": LP_TOLERANCE,
+            "presolve": presolve,
+        }
         found = linprog(
             cost, A_ub=A, b_ub=np.zeros(A.shape[0]), method=method, options=options, **rest
         )

@@ -38,6 +38,8 @@ class Gluing:
         tangents: What belongs to the tangential rows.
         constraints: B, c and the sets of rows.
         length: A length of the scene.
+        slip: Where the load step begins: the tangential v_i of all conditions then, shape
+            ``(n, gdim - 1)``. Friction acts on what comes to it.
     """
 
     dofs: TornDofs
@@ -48,14 +50,16 @@ class Gluing:
     tangents: TangentRows
     constraints: Constraints
     length: float
+    slip: Array
 
-    def right_side(self, values: Array, gaps: Array) -> Array:
-        """This rank's part of c for any prescribed values and gaps; B stays. Collective.
+    def right_side(self, values: Array, gaps: Array, slip: Array | None = None) -> Array:
+        """This rank's part of c for any prescribed values, gaps and slips; B stays. Collective.
 
         Args:
             values: Prescribed values of the owned groups, shape ``(g, bs)``; what stands at
                 components that are not prescribed has no effect.
             gaps: Gap of each condition of the records, a length, shape ``(n,)``.
+            slip: Where the load step begins, as the attribute; default that.
 
         Returns:
             Shape ``(num_rows,)``, for ``Constraints.set_right_side``.
@@ -68,11 +72,12 @@ class Gluing:
         c = np.zeros(sets.num_rows)
         c[sets.equalities[self.held.row]] = self.held.right_side(values)
         c[sets.normals] = self.contact.right_side(self.dofs, values, gaps, self.length)
-        c[sets.tangents] = self.tangents.right_side(self.dofs, values, len(gaps))
+        slip = self.slip if slip is None else slip
+        c[sets.tangents] = self.tangents.right_side(self.dofs, values, slip)
         return c
 
-    def with_right_side(self, values: Array, gaps: Array) -> Gluing:
-        """The same rows with other prescribed values and gaps; c is filled anew. Collective.
+    def with_right_side(self, values: Array, gaps: Array, slip: Array | None = None) -> Gluing:
+        """The same rows with other prescribed values, gaps, slips; c is filled anew. Collective.
 
         The constraints are shared with these rows: their c is the new one too. What raises
         leaves it as it was.
@@ -80,17 +85,26 @@ class Gluing:
         Args:
             values: Prescribed values of the owned groups, shape ``(g, bs)``.
             gaps: Gap of each condition of the records, shape ``(n,)``.
+            slip: Where the load step begins, as the attribute; default that.
 
         Raises:
             NoSolutionError: As ``right_side``.
         """
-        self.constraints.set_right_side(self.right_side(values, gaps))
+        self.constraints.set_right_side(self.right_side(values, gaps, slip))
         flag = self.prescribed.flag
         return replace(
             self,
             prescribed=Prescribed(flag, np.where(flag, values, 0.0)),
             records=replace(self.records, gap=gaps),
+            slip=self.slip if slip is None else slip,
         )
+
+    def gain(self, slip: Array) -> Array:
+        """What c gains where a step begins at other slips, shape ``(num_rows,)``."""
+        rows, gain = self.tangents, np.zeros(self.constraints.num_rows)
+        more = (slip - self.slip)[rows.condition] * rows.scale[:, None]
+        gain[self.constraints.sets.tangents] = np.where(rows.moves, more, 0.0)
+        return gain
 
     def multipliers(self, earlier: Gluing, lam: Array) -> Array:
         """Multipliers of earlier rows of the same scene on these; zero on rows that are new.
@@ -132,6 +146,7 @@ def glue(
     records: ContactRecords,
     length: float,
     weights: Array,
+    slip: Array | None = None,
 ) -> Gluing:
     """Rows of interfaces, Dirichlet conditions and contacts, and their right sides. Collective.
 
@@ -142,6 +157,8 @@ def glue(
         length: A length of the scene.
         weights: D, positive, one per local primal unknown: the stiffness there, or ones. Rows
             are orthonormal in the inner product of D⁻¹ as far as they can be.
+        slip: Where the load step begins: the tangential v_i of all conditions then, shape
+            ``(n, gdim - 1)``; default 0.
 
     Raises:
         NoSolutionError: Dirichlet conditions and contacts contradict each other.
@@ -155,7 +172,8 @@ def glue(
     constraints = assemble_constraints(
         dofs, tables, weights, contact.scale, tangents.scale, tangents.normal
     )
-    gluing = Gluing(dofs, prescribed, records, held, contact, tangents, constraints, length)
+    slip = np.zeros(records.tangents.shape[:2]) if slip is None else slip
+    gluing = Gluing(dofs, prescribed, records, held, contact, tangents, constraints, length, slip)
     try:
         constraints.set_right_side(gluing.right_side(prescribed.value, records.gap))
     except TfetiError:  # on all ranks

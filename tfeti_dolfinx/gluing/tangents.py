@@ -41,20 +41,22 @@ class TangentRows:
     held: HeldPart
     normal: Array
 
-    def right_side(self, dofs: TornDofs, values: Array, size: int) -> Array:
-        """What makes T u − c the scaled slip, that of prescribed values taken in. Collective.
+    def right_side(self, dofs: TornDofs, values: Array, slip: Array) -> Array:
+        """What makes T u − c the scaled slip of a step, prescribed values taken in. Collective.
 
         Args:
             dofs: Dof maps.
             values: Prescribed values of the owned groups, shape ``(g, bs)``.
-            size: Number of conditions.
+            slip: Where the step begins: the tangential v_i of all conditions then, shape
+                ``(n, gdim - 1)``.
 
         Returns:
             Shape ``(t, gdim - 1)``.
         """
-        v = self.held.displacement(dofs, values, size)[self.condition]
+        v = self.held.displacement(dofs, values, len(slip))[self.condition]
         along = np.einsum("tkg,tg->tk", self.tangents, v)
-        return np.where(self.moves, -along * self.scale[:, None], 0.0)
+        left = slip[self.condition] - along
+        return np.where(self.moves, left * self.scale[:, None], 0.0)
 
     def limits(self, traction: Array, area: Array) -> Array:
         """The ψ_i: semi-axes of what λ_T may be, 0 on rows without entries.

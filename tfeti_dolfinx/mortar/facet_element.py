@@ -54,6 +54,15 @@ class FacetElement:
         return self._element.tabulate(1, np.ascontiguousarray(xi))[1:, :, :, 0]
 
 
+def from_first(x: Array) -> Array:
+    """Nodes of facets from the first one on, shape ``(n, nodes, d)``.
+
+    Tangents are sums of these times slopes: slopes add up to 0 but for rounding, which would turn
+    a facet that is far from the origin.
+    """
+    return np.asarray(x - x[:, :1])
+
+
 @cache
 def facet_dofs(cell: str, degree: int, variant: Any) -> Array:
     """Cell unknowns of each facet, in the order of the facet's own element.

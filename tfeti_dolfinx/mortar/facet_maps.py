@@ -7,7 +7,7 @@ import numpy as np
 
 from tfeti_dolfinx.arrays import Array, sum_rows
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.mortar.facet_element import FacetElement
+from tfeti_dolfinx.mortar.facet_element import FacetElement, from_first
 from tfeti_dolfinx.mortar.facets import FacetKind, Facets
 
 # Newton's method from the affine map: facets that are not folded take 3 or 4 steps. It ends at
@@ -22,7 +22,8 @@ def points(element: FacetElement, x: Array, xi: Array) -> Array:
 
 def densities(element: FacetElement, x: Array, xi: Array) -> Array:
     """Area per area of the reference facet, shape ``(m,)``; arguments as of ``points``."""
-    return _areas(np.einsum("tmv,mvd->mtd", element.slopes(xi), x[:, : element.size]))
+    nodes = from_first(x[:, : element.size])
+    return _areas(np.einsum("tmv,mvd->mtd", element.slopes(xi), nodes))
 
 
 def reference_points(element: FacetElement, nodes: Array, y: Array) -> Array:
@@ -64,7 +65,7 @@ def whole_facets(kind: FacetKind, facets: Facets, degree: int) -> tuple[Array, A
     """
     xi, w = basix.make_quadrature(getattr(basix.CellType, kind.facet), degree)
     n, q = len(facets), len(w)
-    slopes = np.einsum("tqv,nvd->nqtd", kind.geometry.slopes(xi), facets.x)
+    slopes = np.einsum("tqv,nvd->nqtd", kind.geometry.slopes(xi), from_first(facets.x))
     weight = _areas(slopes.reshape(n * q, *slopes.shape[2:])) * np.tile(w, n)
     return np.repeat(np.arange(n), q), np.tile(xi, (n, 1)), weight
 

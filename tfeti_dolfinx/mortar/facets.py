@@ -11,7 +11,7 @@ from tfeti_dolfinx.compat import geometry_dofmap
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mesh.entities import cell_facets
-from tfeti_dolfinx.mortar.facet_element import FACET_OF, FacetElement, facet_dofs
+from tfeti_dolfinx.mortar.facet_element import FACET_OF, FacetElement, facet_dofs, from_first
 from tfeti_dolfinx.parallel import Exchange
 
 
@@ -156,7 +156,8 @@ def _cells_of(decomposition: Decomposition, facets: Array) -> tuple[Array, Array
 
 def _vertex_normals(kind: FacetKind, x: Array, normal: Array) -> Array:
     """Unit normals of curved facets at their vertices, on the side of plane facets' normals."""
-    tangents = np.einsum("tvg,ngd->tnvd", kind.geometry.slopes(kind.hats.points), x)
+    slopes = kind.geometry.slopes(kind.hats.points)
+    tangents = np.einsum("tvg,ngd->tnvd", slopes, from_first(x))
     if len(tangents) == 1:
         found = np.stack((tangents[0, :, :, 1], -tangents[0, :, :, 0]), axis=2)
     else:

@@ -17,6 +17,8 @@ LOOSE = 1e-8
 BEYOND = 10.0
 # projections to find forces in Ω on such a way: between two rows each halves what is missing
 ALTERNATIONS = 10
+# of d: rows that want gaps so far apart exclude each other, less may be rounding
+APART = 1e-8
 
 
 class DependentRows:
@@ -28,12 +30,14 @@ class DependentRows:
 
     Attributes:
         preconditioner: That of the face, which knows how rows depend on each other, or None.
+        contradicts: Whether q falls along a way that F and Gᵀ do not see, and that nothing ends.
     """
 
     def __init__(self, qp: QP, directions: Directions) -> None:
         self._qp, self._directions = qp, directions
         self._comm = qp.d.getComm().tompi4py()
         self.preconditioner: FaceOperator | None = None
+        self.contradicts = False
 
     def part(self, x: Array) -> PETSc.Vec | None:
         """The part of x that F and Gᵀ do not see; None where there is none. Collective."""
@@ -54,12 +58,14 @@ class DependentRows:
             target: What PCPG aims at; it would not get below what the way leads along.
 
         Returns:
-            The point at the first bound, or None where z stays.
+            The point at the first bound, or None where z stays; then ``contradicts`` says whether
+            there is a way without a bound.
         """
         way = self.part(-z.g.array_r)
         if way is None:
             return None
         length = self._to_a_bound(z, way.array_r)
+        self._endless(length, way.norm())
         if not (np.isfinite(length) and agreed(self._comm, way.norm() > target)):
             way.destroy()
             return None
@@ -92,19 +98,27 @@ class DependentRows:
         Fp.destroy()
 
     def slide(self, z: Point) -> bool:
-        """Along a residual that meets no curvature, where rows depend on each other, to a bound.
+        """To a bound along a direction or residual without curvature, as of dependent rows.
 
         Returns:
             Whether there is one.
         """
-        r, Fr = self._directions.r, self._directions.Fp
-        self._qp.F.mult(r, Fr)
-        if self._directions.seen(r.dot(Fr), r.dot(r)):
-            return False
-        length = self._to_a_bound(z, r.array_r)
-        if np.isfinite(length):
-            z.move(length * BEYOND, r, Fr)
-        return bool(np.isfinite(length))
+        own = self._directions
+        for way in (own.p, own.r):
+            self._qp.F.mult(way, own.Fp)
+            if way.norm() == 0.0 or own.seen(way.dot(own.Fp), way.dot(way)):
+                continue
+            length = self._to_a_bound(z, way.array_r)
+            self._endless(length, own.r.dot(way) / way.norm())
+            if np.isfinite(length):
+                z.move(length * BEYOND, way, own.Fp)
+            return bool(np.isfinite(length))
+        return False
+
+    def _endless(self, length: float, slope: float) -> None:
+        """Whether a way down that costs nothing is none that rounding has made, and has no end."""
+        far = agreed(self._comm, slope > APART * self._qp.d.norm())
+        self.contradicts = bool(far and not np.isfinite(length))
 
     def _to_a_bound(self, z: Point, way: Array) -> float:
         """Largest t with λ + t·way ∈ Ω, maybe infinite. Collective."""

@@ -14,8 +14,8 @@ from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.qp.coarse import Coarse, imbalance
 from tfeti_dolfinx.qp.faces import Face, Status, face_of
 
-# far more than Newton takes where it converges, so that a cycle ends
-MAX_STEPS = 100
+# points looked at: far more than Newton takes where it converges, so that a cycle ends
+MAX_TRIALS = 300
 # of the terms of Gλ − e: what the coarse problem's factors leave at best
 BALANCED = 1e-13
 # of the same: below that, a step that leaves more than this share has met the damping, or rounding
@@ -26,6 +26,9 @@ NEARLY, SLOW = 1e-6, 0.1
 DAMPING, LEAST_DAMPING = 1e-8, 1e-14
 # a step of this share of Newton's changes nothing that is left above rounding
 SHORTEST = 1e-8
+# of the slope at its start: a whole step that leaves as much has met no row but the damping; after
+# so many in a row it is far beyond y, and nothing in Ω fulfils Gλ = e but for rounding
+LEFT, PATIENCE = 0.5, 10
 # of the cost: what rounding may add to it
 ROUNDING = 1e-14
 
@@ -64,7 +67,8 @@ def nearest(
 
     It is λ(α) = P_Ω(y + Gᵀα) with Gλ(α) = e. That is where the convex function
     ½‖z‖² − ½‖z − P_Ω(z)‖² − αᵀe of z = y + Gᵀα is least, which a semismooth Newton method with a
-    line search finds: each step factors G_f G_fᵀ, f the face of λ(α).
+    line search finds: each step factors G_f G_fᵀ, f the face of λ(α). Where nothing in Ω fulfils
+    Gλ = e, the cost falls without end along steps that no row stops; a few of them end it.
 
     >>> import numpy as np
     >>> from petsc4py import PETSc
@@ -81,18 +85,23 @@ def nearest(
         alpha: Where to start.
 
     Returns:
-        The point; where nothing in Ω fulfils Gλ = e, or α does not converge, it misses some of e.
+        The point; where nothing in Ω fulfils Gλ = e, or α does not converge, it misses some of e:
+        ``missing`` says so.
     """
     comm = y.getComm().tompi4py()
     trial = _trial(coarse, feasible, y, np.zeros(coarse.dimension) if alpha is None else alpha)
-    damping = DAMPING
-    for _ in range(MAX_STEPS):
+    damping, trials, unmet = DAMPING, 1, 0
+    while trials < MAX_TRIALS and unmet < PATIENCE:
         left, scale = trial.left, float(np.linalg.norm(coarse.forces(trial.lam)))
         if agreed(comm, left <= BALANCED * scale):
             break
         face = feasible.face(trial.lam.array_r, y.array_r)
         step = coarse.damped_solve(face, trial.residual, damping)
-        trial, length = _searched(coarse, feasible, y, trial, step)
+        slope = float(trial.residual @ step)
+        trial, length, tried = _searched(coarse, feasible, y, trial, step)
+        trials += tried
+        whole = agreed(comm, length == 1.0 and float(trial.residual @ step) > LEFT * slope)
+        unmet = unmet + 1 if whole else 0
         slow = agreed(comm, trial.left > SLOW * left and trial.left <= NEARLY * scale)
         if agreed(comm, length <= SHORTEST) or (slow and damping <= LEAST_DAMPING):
             break
@@ -152,18 +161,21 @@ def _trial(coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec, alpha: Array) -> _
 
 def _searched(
     coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec, start: _Trial, step: Array
-) -> tuple[_Trial, float]:
+) -> tuple[_Trial, float, int]:
     """The longest of steps 1, ½, ¼, … that does not raise the cost; destroys the start.
 
     Where the cost still falls at the end of a step, it fell along all of it: it is convex. That
     holds where rounding hides the cost's difference.
+
+    Returns:
+        The point, the step's length and how many were tried.
     """
-    comm, length = y.getComm().tompi4py(), 1.0
+    comm, length, tried = y.getComm().tompi4py(), 1.0, 0
     while True:
-        trial = _trial(coarse, feasible, y, start.alpha + length * step)
+        trial, tried = _trial(coarse, feasible, y, start.alpha + length * step), tried + 1
         fell = trial.cost <= start.cost + ROUNDING * abs(start.cost)
         if agreed(comm, fell or float(trial.residual @ step) >= 0.0 or length <= SHORTEST):
             start.lam.destroy()
-            return trial, length
+            return trial, length, tried
         trial.lam.destroy()
         length *= 0.5

@@ -64,7 +64,9 @@ def newton(
     ===========================  =================================================================
     the rule's                   ‖g^P‖ ≤ ``rule.tolerance``, and the rule is content
     ``DIVERGED_ITS``             ``max_it`` faces or conjugate gradient steps are not enough
-    ``DIVERGED_ROUNDING``        no step lowers q any more by what stands out from rounding
+    ``DIVERGED_ROUNDING``        no step lowers q any more by what stands out from rounding, or
+                                 PCPG ends so twice in a row
+    ``DIVERGED_CONTRADICTION``   rows that depend on each other exclude each other: q has no end
     ===========================  =================================================================
 
     >>> import numpy as np
@@ -123,7 +125,9 @@ def newton(
         # Step 3: solve on the face, drop what leaves Ω, restore Gλ = e
         trial = faces.solve(state.point, face, state.residual)
         # Step 4: accept where q falls enough
-        if not state.accept(trial, faces) or state.stalled:
+        if faces.contradicts:
+            reason = ConvergedReason.DIVERGED_CONTRADICTION
+        elif not state.accept(trial, faces) or state.stalled or faces.rounded > 1:
             reason = ConvergedReason.DIVERGED_ROUNDING
         trial.destroy()
         steps.outer, looked = steps.outer + 1, True

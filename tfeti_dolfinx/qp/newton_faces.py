@@ -66,6 +66,7 @@ class FaceSolver:
     Attributes:
         settled: Whether λ is where PCPG has stopped on the face entered.
         left: The residual there.
+        rounded: So many solves in a row ended at rounding, before their target.
     """
 
     def __init__(
@@ -83,7 +84,7 @@ class FaceSolver:
         self._directions = Directions(qp.d)
         self._dependent = DependentRows(qp, self._directions)
         self._face: Face | None = None
-        self.settled, self.left = False, float("inf")
+        self.settled, self.left, self.rounded = False, float("inf"), 0
         self._on_face = qp
         self._preconditioner: FaceOperator | None = None
 
@@ -91,6 +92,11 @@ class FaceSolver:
     def norm(self) -> float:
         """Largest Rayleigh quotient of F seen; at most ‖F‖."""
         return self._directions.norm
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether rows of the face exclude each other."""
+        return self._dependent.contradicts
 
     def saw(self, curvature: float, size: float) -> None:
         """Another Rayleigh quotient."""
@@ -138,11 +144,13 @@ class FaceSolver:
             face: The face.
             optimality: ‖g^P‖ there.
         """
-        z, first, feasible = start.copy(), None, self._qp.feasible
+        z, first, feasible, out = start.copy(), None, self._qp.feasible, False
         stays = self.enter(face) and self.settled
         for _ in range(MOST_ROUNDS):
             target = self._target(z, optimality, stays)
             bound = self._dependent.slack(z, target)
+            if self.contradicts:
+                break
             if bound is not None:
                 first = first or bound
                 self._drop(z)
@@ -160,8 +168,7 @@ class FaceSolver:
                 break
             z.lam.array[:] = feasible.project(z.lam.array_r)
             self._drop(z)
-        assert first is not None
-        return Trial(first, z, not out)
+        return Trial(first or z.copy(), z, not out)
 
     def _drop(self, z: Point) -> None:
         """Enter the face of z, and bring z back to Gλ = e in it; multiplies by F once."""
@@ -214,6 +221,8 @@ class FaceSolver:
             self._directions,
         )
         self.left = float(self._directions.r.norm())
+        ended = reason == ConvergedReason.DIVERGED_ROUNDING
+        self.rounded = self.rounded + 1 if ended else 0
         return reason
 
     def _leave(self) -> None:

@@ -81,6 +81,8 @@ class Iterate:
         """
         last, self.mu = self.mu, faces.coarse.coordinates(self.point.g)
         self._set_multipliers()
+        self.mu = self.mu + faces.coarse.coordinates(self.s)  # rounding of Fλ − d, not of s
+        self._set_multipliers()
         if agreed(self._comm, self.s.norm() > WILD * self.point.g.norm()):
             self.mu = last
             self._set_multipliers()

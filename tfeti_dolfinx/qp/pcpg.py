@@ -6,7 +6,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.parallel import summed
+from tfeti_dolfinx.parallel import agreed, summed
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.monitors import Monitor, no_monitor
@@ -16,6 +16,9 @@ from tfeti_dolfinx.qp.stopping import StoppingRule
 # of the largest curvature of a direction, and of what the preconditioner makes of a residual: less
 # is rounding, as where rows depend on each other
 FLAT = 1e-13
+# so many steps in which neither ‖r‖ comes down to a half nor q by what stands out from its rounding
+# have met rounding: at that pace 10 000 steps would bring 6 digits at best
+PLATEAU, ROUNDING = 500, 1e-15
 
 
 class Directions:
@@ -53,6 +56,34 @@ class Directions:
             vec.destroy()
 
 
+class _Progress:
+    """Whether residuals and q still come down."""
+
+    def __init__(self, norm: float) -> None:
+        self._best, self._steps, self._gain, self._restarted = norm, 0, 0.0, False
+
+    def step(self, norm: float, gain: float) -> None:
+        """A step has lowered q by so much, and ends with that ‖r‖."""
+        self._steps, self._gain = self._steps + 1, self._gain + gain
+        if norm <= 0.5 * self._best:
+            self._best, self._steps, self._gain, self._restarted = norm, 0, 0.0, False
+
+    def ended(self, qp: QP, point: Point) -> bool:
+        """Whether there was none for long. Collective where there were many steps."""
+        if self._steps < PLATEAU:
+            return False
+        sizes = abs(point.lam.dot(point.g)) + abs(point.lam.dot(qp.d))
+        comm = point.lam.getComm().tompi4py()
+        ended = agreed(comm, self._gain <= ROUNDING * sizes)
+        self._steps, self._gain = 0, 0.0
+        return ended
+
+    def once_more(self) -> bool:
+        """Whether this is the first time since ‖r‖ came down."""
+        first, self._restarted = not self._restarted, True
+        return first
+
+
 def pcpg(
     qp: QP,
     point: Point,
@@ -66,8 +97,9 @@ def pcpg(
 
     Farhat, Mandel, Roux, Comput. Methods Appl. Mech. Engrg. 115 (1994) 365–385, section 3. P is
     the projector of ``qp.coarse``: on a face λ moves in the face alone. Multiplies by F, and by
-    the preconditioner, once per step, and once more where the rule finds that g has drifted. A step
-    makes three global reductions: one with each projection, one for the norm of the residual.
+    the preconditioner, once per step, and once more where the rule finds that g has drifted, or
+    where neither ‖P g‖ nor q has come down for long. A step makes three global reductions: one
+    with each projection, one for the norm of the residual.
 
     ===========================  ===================================================
     reason                       when
@@ -75,6 +107,7 @@ def pcpg(
     the rule's                   ‖P g‖ ≤ ``rule.tolerance``, and the rule is content
     ``DIVERGED_ITS``             ``max_it`` steps are not enough
     ``DIVERGED_INDEFINITE_MAT``  a direction has no positive curvature
+    ``DIVERGED_ROUNDING``        neither ‖P g‖ nor q comes down, with a new g neither
     ===========================  ===================================================
 
     Args:
@@ -92,11 +125,16 @@ def pcpg(
     own = Directions(point.lam) if directions is None else directions
     r, p, Fp, z = own.r, own.p, own.Fp, own.z
     norm, reason = _residual(qp, point.g, r), ConvergedReason.ITERATING
+    progress = _Progress(norm)
     while True:
         # test
         if norm <= rule.tolerance:
             reason = _examined(qp, point, rule, norm)
-        if rule.drifted:
+        ended = reason == ConvergedReason.ITERATING and progress.ended(qp, point)
+        anew = ended and progress.once_more()
+        if ended and not anew:
+            reason = ConvergedReason.DIVERGED_ROUNDING
+        if rule.drifted or anew:
             point.refresh(qp)
             norm, rule.drifted, own.fresh = _residual(qp, point.g, r), False, True
         if reason == ConvergedReason.ITERATING and steps.cg >= max_it:
@@ -122,6 +160,7 @@ def pcpg(
         z.copy(r)
         own.fresh, norm = False, float(np.sqrt(squared))
         steps.cg += 1
+        progress.step(norm, 0.5 * own.rz**2 / pFp)
         monitor(steps, "cg", point.lam, norm, 0.0)
     if directions is None:
         own.destroy()
@@ -205,9 +244,14 @@ def _examined(qp: QP, point: Point, rule: StoppingRule, norm: float) -> Converge
 
 
 def _residual(qp: QP, g: PETSc.Vec, r: PETSc.Vec) -> float:
-    """r = −P g, and its norm."""
+    """r = −P g, and its norm.
+
+    Twice: what G's factor leaves of Gᵀμ the first time is rounding of Fλ − d, not of r, and the
+    preconditioner does not see it, so no step would take it away.
+    """
     g.copy(r)
     r.scale(-1.0)
+    qp.coarse.project(r)
     qp.coarse.project(r)
     return float(r.norm())
 

@@ -106,6 +106,8 @@ class ConvergedReason(IntEnum):
     DIVERGED_ROUNDING: residuals cannot be brought down any further in floating point.
     DIVERGED_STALLED: Gλ = e comes no nearer, as if nothing in Ω fulfilled it.
     DIVERGED_FRICTION: the bounds of friction do not come to rest.
+    DIVERGED_CONTRADICTION: q falls forever along forces that F and G do not see: rows that depend
+        on each other exclude each other.
     """
 
     CONVERGED_RTOL = 2
@@ -115,7 +117,8 @@ class ConvergedReason(IntEnum):
     DIVERGED_INDEFINITE_MAT = -10
     DIVERGED_ROUNDING = -20
     DIVERGED_STALLED = -21
-    DIVERGED_FRICTION = -22
+    DIVERGED_CONTRADICTION = -22
+    DIVERGED_FRICTION = -23
 
 
 @dataclass

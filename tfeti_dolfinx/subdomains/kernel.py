@@ -5,11 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import Array
 
-# Energy of a mode, as a share of what its terms would sum up to without their signs, that counts
-# as none: rounding makes 2e-16 of it, a spring of 1e-10 of the stiffness 1e-14 and more.
+# Energy of a mode, as a share of what its terms may be without their signs, that counts as none:
+# rounding makes 2e-16 of it, a spring of 1e-10 of the stiffness 1e-14 and more.
 NULL = 2e-15
 # Of the largest singular value of the modes, whose entries are of the size 1: what a mode has on
 # its own beside the others. Nodes on a line or in one point make it 0 but for rounding.
@@ -75,8 +76,20 @@ def kernel_of(K: Any, modes: Array) -> Array:
     R0 = orthonormal(modes)
     R = R0 @ np.linalg.eigh(R0.T @ (K @ R0))[1]
     energy = np.sum(R * (K @ R), axis=0)
-    terms = np.sum(np.abs(R) * (abs(K) @ np.abs(R)), axis=0)
-    return R[:, energy <= NULL * terms]
+    return R[:, energy <= NULL * _terms(csr_array(K), R)]
+
+
+def _terms(K: csr_array, R: Array) -> Array:
+    """What the terms of RᵀKR may be, without their signs, for each mode.
+
+    In flat cells entries are differences of far larger numbers, which are as large as those that
+    other unknowns of the cell have: the largest diagonal entry that a row meets bounds them.
+    """
+    meets = K.diagonal()[K.indices]
+    largest = np.maximum.reduceat(meets, K.indptr[:-1])
+    pattern = csr_array((np.ones_like(K.data), K.indices, K.indptr), shape=K.shape)
+    sizes = np.sqrt(largest)[:, None] * np.abs(R)
+    return np.asarray(np.sum(sizes * (pattern @ sizes), axis=0))
 
 
 def orthonormal(modes: Array) -> Array:

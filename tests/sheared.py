@@ -1,0 +1,89 @@
+"""A block that is pressed on a rough plane and sheared: uniform stress, one slip."""
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from scenes import curved_obstacle, decomposed, hooke, strain
+
+import tfeti_dolfinx as tfeti
+
+# of E = 1, ν = 0: σ_xx does not follow from σ_yy, and simple shear leaves the sides where they are
+MU, BOUND, PRESSED = 0.5, 0.02, 0.01
+
+
+def tops(path):
+    """Shear and slip, step by step, of a block whose top goes along a path, in closed form."""
+    shear, slip, found = 0.0, 0.0, []
+    for before, after in zip([0.0, *path[:-1]], path, strict=True):
+        wanted = shear + MU * (after - before)
+        new = np.clip(wanted, -BOUND, BOUND)
+        step = (wanted - new) / MU
+        shear, slip = new, slip + step
+        found.append((shear, step, slip))
+    return found
+
+
+class Sheared:
+    """The block; ``top`` is where its upper side is held."""
+
+    def __init__(self, cell="quadrilateral", n=4, subdomains=3, **options):
+        d = decomposed(cell, n, subdomains)
+        gdim = d.mesh.geometry.dim
+        last, fdim = gdim - 1, gdim - 1
+        V = fem.functionspace(d.mesh, ("Lagrange", 1, (gdim,)))
+        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+        self.top = fem.Constant(d.mesh, 0.0)
+        W, _ = V.sub(last).collapse()
+        down = fem.Function(W)
+        down.interpolate(lambda x: -PRESSED * x[last])
+        sides = np.unique(np.concatenate([d.facets(name) for name in ("left", "right", "top")]))
+        bcs = [
+            fem.dirichletbc(
+                down, fem.locate_dofs_topological((V.sub(last), W), fdim, sides), V.sub(last)
+            )
+        ]
+        for k in range(last):
+            dofs = fem.locate_dofs_topological(V.sub(k), fdim, d.facets("top"))
+            value = self.top if k == 0 else fem.Constant(d.mesh, 0.0)
+            bcs.append(fem.dirichletbc(value, dofs, V.sub(k)))
+        plane = tfeti.Plane(np.zeros(gdim), np.eye(gdim)[last])
+        self.problem = tfeti.ContactProblem(
+            ufl.inner(hooke(nu=0.0)(u), strain(v)) * ufl.dx(domain=d.mesh),
+            ufl.ZeroBaseForm((v,)),
+            bcs,
+            [tfeti.Obstacle("bottom", plane, friction=tfeti.Tresca(BOUND))],
+            d,
+            petsc_options={"rtol": 1e-10, **options},
+        )
+
+
+class Driven:
+    """A box on a curved obstacle or a rough plane, clamped on the left, under a traction."""
+
+    def __init__(self, cell="quadrilateral", n=8, subdomains=5, rough=True, **options):
+        d = decomposed(cell, n, subdomains)
+        gdim = d.mesh.geometry.dim
+        V = fem.functionspace(d.mesh, ("Lagrange", 1, (gdim,)))
+        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+        ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+        self.load = fem.Constant(d.mesh, np.zeros(gdim))
+        left = fem.locate_dofs_topological(V, gdim - 1, d.facets("left"))
+        if rough:
+            plane = tfeti.Plane(np.zeros(gdim), np.eye(gdim)[-1])
+            contact = tfeti.Obstacle("bottom", plane, friction=tfeti.Tresca(0.01))
+        else:  # rows come later
+            contact = tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=0.022)
+        self.problem = tfeti.ContactProblem(
+            ufl.inner(hooke()(u), strain(v)) * ufl.dx(domain=d.mesh),
+            ufl.dot(self.load, v) * ds(d.surface("top")),
+            [fem.dirichletbc(np.zeros(gdim), left, V)],
+            [contact],
+            d,
+            stress=hooke(),
+            petsc_options=options,
+        )
+
+    def apply(self, problem, t):
+        """To and fro, pressed more and more."""
+        self.load.value[0] = 0.06 * np.sin(0.5 * np.pi * t)
+        self.load.value[-1] = -0.03 - 0.01 * t

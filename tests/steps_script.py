@@ -1,0 +1,82 @@
+"""Run a series of load steps, and die on the way if told to: see test_load_steps."""
+
+import itertools
+import os
+import signal
+import sys
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+from scenes import displacement
+from sheared import Driven
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx import checkpoint
+from tfeti_dolfinx.series import fields_of
+
+TIMES = [0.5, 1.0, 1.75, 2.5, 3.25]
+LAST = MPI.COMM_WORLD.size - 1
+
+
+def die():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def die_at(name, count, before):
+    """End the process when a file gets this name for the count-th time, before or after it has.
+
+    What it would rename is cut where it is before.
+    """
+    rename, times = os.replace, itertools.count(1)
+
+    def replace(source, target):
+        now = Path(target).name == name and next(times) == count
+        if now and before:
+            os.truncate(source, os.path.getsize(source) // 2)
+            die()
+        rename(source, target)
+        if now:
+            die()
+
+    os.replace = replace
+
+
+# file, and whether the process dies before it has its name
+DEATHS = {
+    "writing": (f"state_3_{LAST}.npz", 1, True),
+    "committing": (checkpoint.INDEX, 3, True),
+    "committed": (checkpoint.INDEX, 3, False),
+}
+
+
+if __name__ == "__main__":
+    scene, folder, how = sys.argv[1], Path(sys.argv[2]), sys.argv[3]
+    driven = Driven(rough=scene == "rough")
+
+    def apply(problem, t):
+        if how == "between" and t == TIMES[3]:
+            die()
+        driven.apply(problem, t)
+
+    if how in DEATHS:
+        die_at(*DEATHS[how])
+    steps = tfeti.LoadSteps(
+        driven.problem,
+        apply,
+        TIMES,
+        path=folder / "series.bp",
+        checkpoint=folder / "checkpoint",
+    )
+    records = steps.run(resume=how == "resume")
+    x, u = displacement(driven.problem)
+    fields = {
+        f"{MPI.COMM_WORLD.rank} {name}": values
+        for name, values in fields_of(driven.problem.solution).items()
+    }
+    everywhere = {k: v for part in MPI.COMM_WORLD.allgather(fields) for k, v in part.items()}
+    if MPI.COMM_WORLD.rank == 0:
+        figures = np.array([[r.time, r.size, r.dissipation] for r in records])
+        F = np.array([r.figures["F_multiplications"] for r in records])
+        late = np.array([r.figures["late_contact_rows"] for r in records])
+        np.savez(folder / "found.npz", u=u, figures=figures, F=F, late=late, **everywhere)

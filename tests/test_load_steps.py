@@ -1,0 +1,334 @@
+"""Series of load steps: slips count from step to step, steps are halved, killed series go on."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sheared import BOUND, Driven, Sheared, tops
+from steps_script import TIMES
+from test_repeated import COUNTERS, Repeated
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.halving import Place, checked_times
+
+HERE = Path(__file__).resolve().parent
+PATH = [0.02, 0.06, 0.06, 0.02, -0.06, -0.08, 0.06, -0.01]
+
+
+def collected(data, comm, *names):
+    return [np.concatenate(comm.allgather(getattr(data, name))) for name in names]
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "triangle", "hexahedron"])
+def test_a_block_pushed_and_pulled_back_slips_as_in_closed_form(cell):
+    """Shear, slip and dissipation of each step; u is linear, so that the mesh does not matter."""
+    scene = Sheared(cell, 3)
+    comm = scene.problem.decomposition.comm
+
+    for n, top in enumerate(PATH):
+        scene.top.value = top
+        scene.problem.solve()
+        data = scene.problem.solution.contact(0)
+        lost = comm.allreduce(float(np.sum(scene.problem.solution.dissipation)))
+        shear, step, _ = tops(PATH)[n]
+        traction, slip = collected(data, comm, "tangential_traction", "slip")
+        assert np.allclose(traction[:, 0], -shear, rtol=0, atol=1e-7)
+        assert np.allclose(slip[:, 0], step, rtol=0, atol=1e-7)
+        assert np.allclose(traction[:, 1:], 0.0, rtol=0, atol=1e-7)
+        assert lost == pytest.approx(BOUND * abs(step), abs=1e-8)
+        scene.problem.accept()
+    assert np.ptp([shear for shear, _, _ in tops(PATH)]) == pytest.approx(2 * BOUND)
+    scene.problem.destroy()
+
+
+def test_without_accept_friction_acts_on_the_whole_slip():
+    scene, fresh = Sheared(), Sheared()
+    scene.top.value = 0.08
+    scene.problem.solve()
+    for item in (scene, fresh):
+        item.top.value = 0.02
+        item.problem.solve()
+    assert np.allclose(scene.problem.u.x.array, fresh.problem.u.x.array, rtol=0, atol=1e-9)
+
+
+def test_a_series_and_what_it_dissipates():
+    """Pushed to and fro: no step dissipates less than nothing, and what was slipped stays."""
+    scene = Driven(rtol=1e-10)
+    comm = scene.problem.decomposition.comm
+    path = np.array([0.0, 1.0, 0.0, -1.0])
+
+    def apply(problem, t):
+        scene.load.value[:] = (0.06 * path[round(t) % 4], -0.03)
+
+    steps = tfeti.LoadSteps(scene.problem, apply, range(9), begin=-1.0)
+    records = steps.run()
+    assert [r.time for r in records] == list(range(9))
+    lost = np.array([r.dissipation for r in records])
+    assert np.all(lost >= -1e-10)
+    assert np.sum(lost > 1e-7) >= 5
+    assert all(r.figures["factorizations"] == 0 for r in records[1:])
+    fresh = Driven(rtol=1e-10)
+    fresh.load.value[:] = (0.0, -0.03)
+    fresh.problem.solve()
+    apart = np.abs(fresh.problem.u.x.array - scene.problem.u.x.array).max(initial=0.0)
+    assert comm.allreduce(apart, op=max) > 1e-4
+
+
+@pytest.mark.parametrize("scene", ["smooth", "rough"])
+def test_a_step_that_repeats_the_load_costs_next_to_nothing(scene):
+    driven = Driven(rough=scene == "rough", rtol=1e-8)
+    steps = tfeti.LoadSteps(
+        driven.problem, lambda problem, t: driven.apply(problem, min(t, 1.0)), [0.5, 1.0, 2.0, 3.0]
+    )
+    records = steps.run()
+    for record in records[2:]:
+        figures = record.figures
+        assert figures["F_multiplications"] + figures["power_method_multiplications"] <= 2
+        assert [figures[name] for name in COUNTERS] == [0] * len(COUNTERS)
+        assert abs(record.dissipation) <= 1e-9
+
+
+def test_halved_steps_begin_at_the_last_accepted_one():
+    """As if the times had been the halved ones from the beginning."""
+    halved, plain = Driven(rtol=1e-10), Driven(rtol=1e-10)
+    solve, reached, asked = halved.problem.solve, [0.0], []
+
+    def apply(problem, t):
+        asked.append(t)
+        halved.apply(problem, t)
+
+    def fails_on_long_steps():
+        solve()
+        if asked[-1] - reached[-1] > 0.3:
+            raise tfeti.ConvergenceError("too long")
+        reached.append(asked[-1])
+        return halved.problem.u
+
+    halved.problem.solve = fails_on_long_steps
+    records = tfeti.LoadSteps(halved.problem, apply, [1.0, 1.25]).run()
+    assert asked == [1.0, 0.5, 0.25, 0.5, 1.0, 0.75, 1.0, 1.25]
+    assert [r.time for r in records] == [0.25, 0.5, 0.75, 1.0, 1.25]
+    assert [r.number for r in records] == [0, 0, 0, 0, 1]
+    others = tfeti.LoadSteps(plain.problem, plain.apply, [r.time for r in records]).run()
+    assert np.allclose(halved.problem.u.x.array, plain.problem.u.x.array, rtol=0, atol=1e-9)
+    for one, other in zip(records, others, strict=True):
+        assert one.dissipation == pytest.approx(other.dissipation, rel=1e-5, abs=1e-9)
+
+
+@pytest.mark.parametrize("raises", [True, False])
+def test_what_does_not_converge_is_named_with_its_time(raises):
+    driven = Driven(max_it=1, error_if_not_converged=raises)
+    steps = tfeti.LoadSteps(driven.problem, driven.apply, [1.0, 2.0], max_halvings=2)
+    says = r"load step 0, from t = 0 to 0.25, does not converge, halved 2 times \(max_halvings=2\)"
+    with pytest.raises(tfeti.ConvergenceError, match=says):
+        steps.run()
+    assert steps.records == []
+
+
+def test_other_errors_have_a_note():
+    driven = Driven()
+    steps = tfeti.LoadSteps(driven.problem, lambda problem, t: problem.update(gap=t), [1.0])
+    with pytest.raises(tfeti.InputError) as caught:
+        steps.run()
+    assert caught.value.__notes__ == ["load step 0, t = 1"]
+
+
+def test_going_back():
+    scene = Repeated("triangle")
+    with pytest.raises(tfeti.InputError, match="there is no solution yet"):
+        scene.problem.accept()
+    with pytest.raises(tfeti.InputError, match="there is no state yet"):
+        scene.problem.state()
+    first = scene.solve()
+    scene.problem.accept()
+    scene.solve(load=-0.08)
+    scene.problem.go_back()
+    assert scene.problem.solution is first
+    assert np.array_equal(scene.problem.u.x.array, first.displacement.x.array)
+    scene.solve()
+    assert scene.problem.report.F_multiplications <= 2
+    scene.problem.destroy()
+
+
+def test_places():
+    times = checked_times(0.0, [1.0, 3.0])
+    place = Place()
+    assert (place.begin(times), place.end(times)) == (0.0, 1.0)
+    quarter = Place(0, 0, 2)
+    seen = [quarter.end(times)]
+    place = quarter.ahead()
+    while place.number < 2:
+        seen.append(place.end(times))
+        place = place.ahead()
+    assert seen == [0.25, 0.5, 1.0, 3.0]
+
+
+def number_of_steps(file):
+    """BP4's index has 64 bytes, and 64 for each step."""
+    return (file / "md.idx").stat().st_size // 64 - 1
+
+
+def test_files_of_a_series(shared_tmp):
+    driven = Driven()
+    path, folder = shared_tmp / "a" / "series.bp", shared_tmp / "checkpoint"
+    steps = tfeti.LoadSteps(driven.problem, driven.apply, TIMES[:3], path=path, checkpoint=folder)
+    steps.run()
+    assert number_of_steps(path) == 3
+    assert {f.name for f in path.parent.iterdir()} == {"series.bp", "series_cells.bp"}
+    size = driven.problem.decomposition.comm.size
+    expected = {"checkpoint.json", *(f"state_3_{rank}.npz" for rank in range(size))}
+    expected |= {f"fields_{n}_{rank}.npz" for n in (1, 2, 3) for rank in range(size)}
+    assert {f.name for f in folder.iterdir()} == expected
+    index = json.loads((folder / "checkpoint.json").read_text())
+    assert [r["time"] for r in index["records"]] == TIMES[:3]
+    # the series goes on to times that it did not have, in the same process too
+    more = Driven()
+    steps = tfeti.LoadSteps(more.problem, more.apply, TIMES[:4], path=path, checkpoint=folder)
+    records = steps.run(resume=True)
+    assert [r.time for r in records] == TIMES[:4]
+    assert number_of_steps(path) == 4
+
+
+def run(ranks, scene, folder, how):
+    folder.mkdir(exist_ok=True)
+    command = ["mpirun", "-n", str(ranks), sys.executable, "steps_script.py", scene, folder, how]
+    return subprocess.run(
+        list(map(str, command)), cwd=HERE, capture_output=True, text=True, timeout=300
+    )
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """What a series finds that nobody kills."""
+    known = {}
+
+    def of(ranks, scene):
+        if (ranks, scene) not in known:
+            folder = tmp_path_factory.mktemp("whole")
+            result = run(ranks, scene, folder, "whole")
+            assert result.returncode == 0, result.stderr
+            known[ranks, scene] = np.load(folder / "found.npz")
+        return known[ranks, scene]
+
+    return of
+
+
+@pytest.mark.parametrize(
+    ("ranks", "scene", "how"),
+    [
+        (1, "rough", "between"),
+        (1, "smooth", "between"),
+        (1, "rough", "writing"),
+        (1, "rough", "committing"),
+        (1, "rough", "committed"),
+        (2, "rough", "between"),
+        (2, "rough", "writing"),
+        (2, "smooth", "between"),
+    ],
+)
+def test_a_killed_series_goes_on_to_the_same_answer(
+    serial_only, tmp_path, whole, ranks, scene, how
+):
+    result = run(ranks, scene, tmp_path, how)
+    assert result.returncode != 0
+    assert not (tmp_path / "found.npz").exists()
+    assert not (tmp_path / "series.bp").exists()
+    done = {"between": 3, "writing": 2, "committing": 2, "committed": 3}[how]
+    index = json.loads((tmp_path / "checkpoint" / "checkpoint.json").read_text())
+    assert index["number"] == done
+    result = run(ranks, scene, tmp_path, "resume")
+    assert result.returncode == 0, result.stderr
+    found, expected = np.load(tmp_path / "found.npz"), whole(ranks, scene)
+    assert set(found) == set(expected)
+    for name in expected:
+        scale = np.abs(expected[name]).max(initial=0.0)
+        assert np.allclose(found[name], expected[name], rtol=0, atol=1e-12 * scale), name
+    assert number_of_steps(tmp_path / "series.bp") == len(TIMES)
+    left = {f.name for f in tmp_path.iterdir()}
+    assert left == {"checkpoint", "found.npz", "series.bp", "series_cells.bp"}
+    if scene == "smooth":
+        assert expected["late"].sum() > 0
+
+
+def test_a_checkpoint_of_other_ranks(serial_only, tmp_path):
+    assert run(2, "rough", tmp_path, "between").returncode != 0
+    result = run(1, "rough", tmp_path, "resume")
+    assert result.returncode != 0
+    assert "was written on 2 ranks, this run has 1; expected the same number" in result.stderr
+
+
+def test_mistakes(shared_tmp):
+    driven = Driven()
+    problem, apply = driven.problem, driven.apply
+    wrong = {
+        "problem is None; expected a tfeti_dolfinx.ContactProblem": (None, apply, [1.0]),
+        "apply is 5; expected a function of the problem and a time": (problem, 5, [1.0]),
+        "times is 1.0; expected a list of increasing numbers": (problem, apply, 1.0),
+        "times is empty; expected at least one time": (problem, apply, []),
+        r"times\[1\]=1 is not after 2; expected increasing": (problem, apply, [2.0, 1.0]),
+        r"times\[0\]=0 is not after 0": (problem, apply, [0.0]),
+        r"times\[0\]=nan: expected a finite number": (problem, apply, [np.nan]),
+    }
+    for says, arguments in wrong.items():
+        with pytest.raises(tfeti.InputError, match=says):
+            tfeti.LoadSteps(*arguments)
+    foreign = shared_tmp / "foreign"
+    foreign.mkdir(exist_ok=True)
+    (foreign / "thesis.tex").touch()
+    options = {
+        "max_halvings=-1: expected an integer, 0 to 30": {"max_halvings": -1},
+        r"series.vtk: expected a name that ends with .bp": {"path": "series.vtk"},
+        "is a folder with other files, 'thesis.tex'": {"checkpoint": foreign},
+        "is a file; expected the name of a folder": {"checkpoint": foreign / "thesis.tex"},
+    }
+    for says, keywords in options.items():
+        with pytest.raises(tfeti.InputError, match=says):
+            tfeti.LoadSteps(problem, apply, [1.0], **keywords)
+    with pytest.raises(tfeti.InputError, match="resume=True: expected LoadSteps"):
+        tfeti.LoadSteps(problem, apply, [1.0]).run(resume=True)
+
+
+def test_a_checkpoint_of_something_else(shared_tmp):
+    driven = Driven()
+    steps = tfeti.LoadSteps(driven.problem, driven.apply, [0.5, 1.0], checkpoint=shared_tmp / "c")
+    steps.run()
+
+    def again(other, times):
+        series = tfeti.LoadSteps(other.problem, other.apply, times, checkpoint=shared_tmp / "c")
+        series.run(resume=True)
+
+    with pytest.raises(tfeti.InputError, match="a series with the times"):
+        again(Driven(), [0.5, 1.5])
+    with pytest.raises(tfeti.InputError, match="the state is of another mesh"):
+        again(Driven(n=6), [0.5, 1.0])
+    with pytest.raises(tfeti.InputError, match="other contact rows"):
+        again(Driven(rough=False), [0.5, 1.0])
+    comm = driven.problem.decomposition.comm
+    if comm.rank == 0:
+        (shared_tmp / "c" / f"state_2_{comm.size - 1}.npz").write_bytes(b"half")
+    comm.barrier()
+    with pytest.raises(tfeti.InputError, match="cannot read .*state_2_"):
+        again(Driven(), [0.5, 1.0])
+
+
+def test_an_apply_that_fails_on_one_rank():
+    driven = Driven()
+    comm = driven.problem.decomposition.comm
+
+    def apply(problem, t):
+        if comm.rank == comm.size - 1:
+            raise ZeroDivisionError("mine")
+
+    with pytest.raises(ZeroDivisionError, match="mine"):
+        tfeti.LoadSteps(driven.problem, apply, [1.0]).run()
+
+
+def test_progress_is_shown_where_wanted(capfd, comm):
+    driven = Driven(n=3)
+    for wanted in (None, False, True):
+        tfeti.LoadSteps(driven.problem, driven.apply, [1.0], progress=wanted).run()
+        said = "".join(capfd.readouterr())
+        assert ("load steps" in said) == (wanted is True and comm.rank == 0)

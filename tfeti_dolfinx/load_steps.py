@@ -1,0 +1,244 @@
+"""A series of load steps: solved, shown, written, kept, and halved where one does not converge."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import dolfinx
+import numpy as np
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.checkpoint import Checkpoint
+from tfeti_dolfinx.checks import (
+    checked_callable,
+    checked_path,
+    checked_type,
+    is_whole,
+    shown,
+)
+from tfeti_dolfinx.errors import ConvergenceError, InputError, TfetiError, raised_on_all_ranks
+from tfeti_dolfinx.halving import MOST_HALVINGS, Place, checked_times
+from tfeti_dolfinx.problem import ContactProblem
+from tfeti_dolfinx.progress import Show, shown_progress
+from tfeti_dolfinx.series import Series, fields_of
+
+Apply = Callable[[ContactProblem, float], None]
+
+
+@dataclass(frozen=True)
+class StepRecord:
+    """What is known of a converged step; the same on all ranks.
+
+    Attributes:
+        number: Position in the times of the step that this is, or is a part of.
+        time: Its end.
+        size: Its length.
+        dissipation: What friction has dissipated in it, all contacts together.
+        figures: Sizes, counters and the reason from the report.
+        residuals: Those of the report.
+        seconds: Wall seconds.
+    """
+
+    number: int
+    time: float
+    size: float
+    dissipation: float
+    figures: dict[str, Any]
+    residuals: dict[str, float]
+    seconds: float
+
+
+class LoadSteps:
+    """A series of load steps of one problem. Creation and ``run`` are collective.
+
+    Each step starts from the one before, makes again only what depends on its changes, and is
+    accepted when it has converged: friction acts on the slip since then. One that does not
+    converge is halved: it begins again at the last accepted step with half the way.
+
+    Args:
+        problem: The problem.
+        apply: Called as ``apply(problem, t)`` before each solve, on all ranks: sets constants,
+            functions, values, points, or calls ``problem.update``. What it sets may depend on t
+            alone, not on what was set before: steps are halved, and a series goes on in a new run.
+        times: Ends of the steps, increasing.
+        begin: Where the first step begins.
+        path: File for ParaView with all steps, ``.bp``; None: none. It has its name when the
+            series has ended, also by an error of this package; before that it is
+            ``.<name>.partial`` beside it.
+        checkpoint: Folder for the last converged step; None: none.
+        max_halvings: How often a step may be halved.
+        progress: Whether rank 0 shows a bar; default where its standard error is a terminal.
+
+    Attributes:
+        records: A ``StepRecord`` for each converged step so far.
+
+    Raises:
+        InputError: Something given does not fit; the message names it.
+    """
+
+    def __init__(
+        self,
+        problem: ContactProblem,
+        apply: Apply,
+        times: Sequence[float],
+        *,
+        begin: float = 0.0,
+        path: str | os.PathLike[str] | None = None,
+        checkpoint: str | os.PathLike[str] | None = None,
+        max_halvings: int = 5,
+        progress: bool | None = None,
+    ) -> None:
+        checked_type(problem, ContactProblem, "problem", "a tfeti_dolfinx.ContactProblem")
+        checked_callable(apply, "apply", "a function of the problem and a time")
+        if not is_whole(max_halvings) or not 0 <= max_halvings <= MOST_HALVINGS:
+            raise InputError(
+                f"max_halvings={shown(max_halvings)}: expected an integer, 0 to {MOST_HALVINGS}"
+            )
+        self._times = checked_times(begin, times)
+        self._path = None if path is None else checked_path(path, ".bp")
+        if path is not None and not dolfinx.has_adios2:
+            raise InputError(f"{path}: this DOLFINx has no ADIOS2, which writes steps")
+        self._comm = problem.decomposition.comm
+        self._checkpoint = None if checkpoint is None else Checkpoint(checkpoint, self._comm)
+        self._problem, self._apply = problem, apply
+        self._max_halvings, self._progress = int(max_halvings), progress
+        self._series: Series | None = None
+        self.records: list[StepRecord] = []
+
+    def run(self, resume: bool = False) -> list[StepRecord]:
+        """Solve all steps.
+
+        Args:
+            resume: Go on after the last step of the checkpoint, if there is one: in a new run of
+                the same program, on as many ranks. Times that were not reached yet may be others.
+
+        Returns:
+            The records, with those of earlier runs.
+
+        Raises:
+            InputError: As ``ContactProblem.solve``, or the checkpoint is of another series.
+            NoSolutionError: A step has no solution; a note of the error has its time.
+            ConvergenceError: A step did not converge, halved as often as allowed.
+        """
+        place = self._begin(resume)
+        try:
+            with shown_progress(self._comm, self._progress) as show:
+                self._steps(place, show)
+        except TfetiError:  # on all ranks; the steps before it are whole
+            self._close()
+            raise
+        self._close()
+        return self.records
+
+    def _steps(self, place: Place, show: Show) -> None:
+        while place.number < len(self._times) - 1:
+            t = place.end(self._times)
+            show(place.number / (len(self._times) - 1), f"t = {t:.6g}")
+            try:
+                self._solve(t, place.number)
+            except ConvergenceError as error:
+                place = self._halved(place, t, error)
+            else:
+                self._problem.accept()
+                size = t - place.begin(self._times)
+                self.records.append(self._record(place.number, t, size))
+                place = place.ahead()
+                self._keep(place, t)
+        show(1.0, "done")
+
+    def _solve(self, t: float, number: int) -> None:
+        problem = self._problem
+        try:
+            self._set(t)
+            problem.solve()
+        except TfetiError as error:
+            error.add_note(f"load step {number}, t = {t:.6g}")
+            raise
+        reason = problem.report.converged_reason
+        if not reason.startswith("CONVERGED"):  # options let it be
+            raise ConvergenceError(f"the dual solver stopped: {reason}")
+
+    def _set(self, t: float) -> None:
+        with raised_on_all_ranks(self._comm):
+            self._apply(self._problem, t)
+
+    def _halved(self, place: Place, t: float, error: ConvergenceError) -> Place:
+        """Half the way, from the last accepted step."""
+        self._problem.go_back()
+        if place.level >= self._max_halvings:
+            begin = place.begin(self._times)
+            raise ConvergenceError(
+                f"load step {place.number}, from t = {begin:.9g} to {t:.9g}, does not converge, "
+                f"halved {place.level} times (max_halvings={self._max_halvings}): {error}"
+            ) from error
+        return replace(place, level=place.level + 1)
+
+    def _record(self, number: int, t: float, size: float) -> StepRecord:
+        report = self._problem.report
+        figures = {
+            name: value for name, value in asdict(report).items() if isinstance(value, (int, str))
+        }
+        lost = float(np.sum(self._problem.solution.dissipation))
+        total = self._comm.allreduce(lost)
+        residuals, seconds = dict(report.residuals), report.seconds["total"]
+        return StepRecord(number, t, size, total, figures, residuals, seconds)
+
+    def _keep(self, place: Place, t: float) -> None:
+        """Write a step that has converged, and the place of the next."""
+        fields: dict[str, Array] = {}
+        if self._path is not None:
+            solution = self._problem.solution
+            fields = fields_of(solution)
+            if self._series is None:
+                self._series = Series(self._path, solution)
+            self._series.write_fields(t, fields)
+        if self._checkpoint is not None:
+            about = {
+                "times": self._times[: place.number + 2],
+                "place": asdict(place),
+                "records": [asdict(record) for record in self.records],
+            }
+            self._checkpoint.write(len(self.records), about, self._problem.state(), fields)
+
+    def _begin(self, resume: bool) -> Place:
+        """Where to begin, with the state of that place."""
+        self.records = []
+        if self._checkpoint is None:
+            if resume:
+                raise InputError("resume=True: expected LoadSteps(..., checkpoint=) too")
+            return Place()
+        index = self._checkpoint.read_index() if resume else None
+        if index is None:
+            self._checkpoint.forget()
+            return Place()
+        place = Place(**index["place"])
+        self._check_times(index["times"], place)
+        self.records = [StepRecord(**record) for record in index["records"]]
+        self._set(self.records[-1].time)
+        self._problem.restore(self._checkpoint.read_state(index["number"]))
+        self._replay(self._checkpoint)
+        return place
+
+    def _check_times(self, times: list[float], place: Place) -> None:
+        reached = place.number + (2 if place.done else 1)
+        if times[:reached] != self._times[:reached]:
+            raise InputError(
+                f"the checkpoint is of a series with the times {shown(times[:reached])}, begin "
+                f"first; expected those, got {shown(self._times[:reached])}"
+            )
+
+    def _replay(self, checkpoint: Checkpoint) -> None:
+        """Write the steps of earlier runs again: a file of ADIOS2 cannot be continued."""
+        if self._path is None:
+            return
+        self._series = Series(self._path, self._problem.solution)
+        for number, record in enumerate(self.records, start=1):
+            self._series.write_fields(record.time, checkpoint.read_fields(number))
+
+    def _close(self) -> None:
+        if self._series is not None:
+            self._series.close()
+        self._series = None

@@ -1,0 +1,120 @@
+"""A solution as plain arrays, from which another run of the same program goes on."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.checks import checked_type
+from tfeti_dolfinx.contact_state import Multipliers
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.gluing.glue import Gluing
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.qp.faces import Status, face_of
+from tfeti_dolfinx.solution import Solution
+
+
+@dataclass(frozen=True)
+class SavedState:
+    """An accepted solution on this rank, and what the next solve starts from.
+
+    Attributes:
+        layout: Checksums of this rank's part of the mesh and its unknowns, shape ``(4,)``.
+        u: Displacement in primal order.
+        lam: Multipliers λ of this rank's rows.
+        mu: Multipliers of Gλ = e.
+        status: Status of each row, see ``qp.faces``.
+        slip: Where the load step began: tangential v_i of the conditions, ``(n, gdim - 1)``.
+        reach: How far was searched in each contact.
+        contact: Contact of each condition with a row.
+        group: Owned group of each condition with a row.
+    """
+
+    layout: Array
+    u: Array
+    lam: Array
+    mu: Array
+    status: Array
+    slip: Array
+    reach: Array
+    contact: Array
+    group: Array
+
+    @classmethod
+    def of(cls, solution: Solution, mu: Array, reach: list[float]) -> SavedState:
+        """The state of a solution."""
+        records, holding = solution.gluing.records, solution.holding
+        held = np.where(holding, Status.STICK, Status.SLIP)
+        return cls(
+            layout=layout_of(solution.dofs, solution.decomposition),
+            u=solution.u,
+            lam=solution.lam,
+            mu=mu,
+            status=np.where(solution.carrying, held, Status.OPEN),
+            slip=solution.gluing.slip,
+            reach=np.array(reach, dtype=float),
+            contact=records.contact[records.within_reach],
+            group=records.group[records.within_reach],
+        )
+
+    def groups(self) -> list[Array]:
+        """The groups whose nodes have rows, of each contact."""
+        return [self.group[self.contact == i] for i in range(len(self.reach))]
+
+    def multipliers(self) -> Multipliers:
+        """The multipliers, with a face that only knows what rows do."""
+        return Multipliers(self.lam, face_of(np.zeros(len(self.lam), dtype=bool), self.status))
+
+    def check_rows(self, gluing: Gluing) -> None:
+        """Raise unless rows are those of the state. Collective.
+
+        Raises:
+            InputError: They are others.
+        """
+        records = gluing.records
+        sizes = (len(self.lam), len(self.slip), self.contact.tolist(), self.group.tolist())
+        kept = records.within_reach
+        found = (records.contact[kept].tolist(), records.group[kept].tolist())
+        with raised_on_all_ranks(gluing.dofs.comm):
+            if sizes != (gluing.constraints.num_rows, len(records), *found):
+                raise InputError(
+                    "the state has other contact rows than the problem: expected the contacts, "
+                    "conditions and data that it was found with"
+                )
+
+
+def layout_of(dofs: TornDofs, decomposition: Decomposition) -> Array:
+    """Checksums of this rank's part of the mesh and its unknowns."""
+    numbers = (
+        decomposition.cell_subdomain,
+        decomposition.original_cells,
+        dofs.dolfinx_node,
+        dofs.group * dofs.bs,
+    )
+    return np.array([zlib.crc32(np.asarray(n, dtype=np.int64).tobytes()) for n in numbers])
+
+
+def checked_state(
+    state: SavedState, dofs: TornDofs, decomposition: Decomposition, contacts: int
+) -> None:
+    """Raise unless a state is of this mesh, on these ranks, with so many contacts. Collective.
+
+    Raises:
+        InputError: It is not.
+    """
+    with raised_on_all_ranks(dofs.comm):
+        checked_type(state, SavedState, "state", "what ContactProblem.state returned")
+        if not np.array_equal(state.layout, layout_of(dofs, decomposition)):
+            raise InputError(
+                "the state is of another mesh, or of one that was distributed in another way; "
+                "expected the same mesh on as many ranks"
+            )
+        if len(state.reach) != contacts:
+            raise InputError(
+                f"the state is of {len(state.reach)} contacts; expected those of the problem, "
+                f"{contacts}"
+            )

@@ -1,0 +1,126 @@
+"""The solutions of a problem: the last one, and the one that a load step has ended with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+from dolfinx import fem
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.contact.partners import ContactPartner
+from tfeti_dolfinx.contact_state import Multipliers
+from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.fields import Stress
+from tfeti_dolfinx.gluing.glue import Gluing
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.report import Report
+from tfeti_dolfinx.saved_state import SavedState, checked_state
+from tfeti_dolfinx.solution import Solution
+from tfeti_dolfinx.system import System
+
+# rows, their λ, and the multipliers of Gλ = e
+Start = tuple[Gluing, Array, Array]
+
+
+class Stepping:
+    """What of ``ContactProblem`` concerns load steps: what it has found, and where to go on."""
+
+    u: fem.Function
+    dofs: TornDofs
+    decomposition: Decomposition
+    contacts: list[ContactPartner]
+    report: Report
+    _system: System
+    _stress: Stress | None
+    _thickness: Any
+    _solution: Solution | None = None
+    _start: Start | None = None
+    _accepted: tuple[Solution | None, Start | None] = (None, None)
+
+    @property
+    def solution(self) -> Solution:
+        """Fields and contact states.
+
+        Raises:
+            InputError: There is none before ``solve``.
+        """
+        if self._solution is None:
+            raise InputError("there is no solution yet; expected a call of solve() before")
+        return self._solution
+
+    def accept(self) -> None:
+        """Take the last solution as the end of a load step. Collective.
+
+        Friction acts on slips from there on (quasi-static), and ``go_back`` returns there.
+
+        Raises:
+            InputError: There is no solution, or the solver stopped before its tolerance.
+        """
+        solution = self.solution
+        if self._start is None:
+            raise InputError("the last solve has not converged; expected one that has")
+        if solution is self._accepted[0]:
+            return
+        system, (gluing, lam, mu) = self._system, self._start
+        system.count_slips_from(solution.u)
+        if system.friction.exists:
+            mu = mu + system.friction.gain(system.dual, gluing, system.search)
+        self._start = (gluing, lam, mu)
+        self._accepted = (solution, self._start)
+
+    def go_back(self) -> None:
+        """Return to the last accepted solution, or to none. Collective.
+
+        The next ``solve`` starts from there. Loads, values and gaps stay as they are.
+        """
+        self._solution, self._start = self._accepted
+        last = self._solution
+        self.u.x.array[:] = 0.0 if last is None else self.dofs.to_dolfinx(last.u)
+
+    def state(self) -> SavedState:
+        """The last accepted solution as arrays of this rank, for ``restore``. Collective.
+
+        Raises:
+            InputError: No solution was accepted.
+        """
+        solution, start = self._accepted
+        if solution is None or start is None:
+            raise InputError("there is no state yet; expected a call of accept() before")
+        reach, _ = self._system.search.rows()
+        return SavedState.of(solution, start[2], reach)
+
+    def restore(self, state: SavedState) -> None:
+        """Go on where another run of the same program, on as many ranks, has been. Collective.
+
+        Constants, functions, values, gaps and points must be those that the state was found with.
+
+        Args:
+            state: What ``state`` returned on this rank.
+
+        Raises:
+            InputError: The state is of another mesh, other contacts or other ranks.
+        """
+        checked_state(state, self.dofs, self.decomposition, len(self.contacts))
+        system = self._system
+        system.know_rows(list(state.reach), state.groups())
+        system.look_for_changes()
+        system.make(self.report)
+        gluing = replace(system.gluing, slip=state.slip)
+        state.check_rows(gluing)
+        solution = self._make_solution(state.u, state.multipliers(), gluing)
+        self._accepted = (solution, (gluing, state.lam, state.mu))
+        self.go_back()
+        system.count_slips_from(solution.u)
+
+    def _make_solution(self, u: Array, multipliers: Multipliers, gluing: Gluing) -> Solution:
+        return Solution(
+            u=u,
+            multipliers=multipliers,
+            decomposition=self.decomposition,
+            gluing=gluing,
+            contacts=list(self._system.search.contacts),
+            stress=self._stress,
+            thickness=self._thickness,
+        )
