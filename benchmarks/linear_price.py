@@ -37,26 +37,12 @@ from benchmarks.linear import (
     solve,
 )
 from benchmarks.pictures import picture, stacked
+from benchmarks.scenes import DEMOS, LARGE, MIDDLE, sizes
 from benchmarks.tools import choose_clock, command_line, configure_clock, finish, solve_seconds
-from demos import cube_3d, hertz_3d
 from demos.demo_tools import petsc_options
 
 OTHERS = [kind for kind in SETTINGS if kind != "GAMG"]
-DEMOS = {"cube_3d": cube_3d, "hertz_3d": hertz_3d}
-SIZES = {
-    "quick": {
-        "cube_3d": {"subdomains": 8, "cells": 4},
-        "hertz_3d": {"unknowns": 4_000, "subdomains": 4},
-    },
-    "default": {
-        "cube_3d": {"subdomains": 64, "cells": 10},
-        "hertz_3d": {"unknowns": 235_000, "subdomains": 64},
-    },
-    "large": {
-        "cube_3d": {"subdomains": 512, "cells": 10},
-        "hertz_3d": {"unknowns": 2_090_000, "subdomains": 256},
-    },
-}
+SIZES = sizes(MIDDLE, LARGE)
 
 
 def configure(parser):

@@ -31,25 +31,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import tfeti_dolfinx as tfeti
 from benchmarks.pictures import picture, stacked
+from benchmarks.scenes import DEMOS, MIDDLE, SMALL, sizes
 from benchmarks.tools import STAGES, choose_clock, command_line, configure_clock, finish
-from demos import cube_3d, hertz_3d
 from demos.demo_tools import petsc_options
 
-DEMOS = {"cube_3d": cube_3d, "hertz_3d": hertz_3d}
-SIZES = {
-    "quick": {
-        "cube_3d": {"subdomains": 8, "cells": 4},
-        "hertz_3d": {"unknowns": 4_000, "subdomains": 4},
-    },
-    "default": {
-        "cube_3d": {"subdomains": 64, "cells": 10},
-        "hertz_3d": {"unknowns": 60_000, "subdomains": 16},
-    },
-    "large": {
-        "cube_3d": {"subdomains": 512, "cells": 10},
-        "hertz_3d": {"unknowns": 235_000, "subdomains": 64},
-    },
-}
+SIZES = sizes(SMALL, MIDDLE)
 # numbers of an array that is copied; the caches of today's processors hold less
 COPIED = {True: 2**20, False: 2**25}
 STATUS = Path("/proc/self/status")

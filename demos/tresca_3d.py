@@ -102,9 +102,9 @@ def run(argv):
     )
     problem.solve()
 
-    # ## Balance
+    # ## Its bound is kept
     #
-    # Friction is opposite to slip, and its bound is kept.
+    # The report has the share by which the largest tangential traction is above it.
     comm, data = decomposition.comm, problem.solution.contact("floor")
     largest = np.linalg.norm(data.tangential_traction, axis=1).max(initial=0.0)
     excess = comm.allreduce(float(largest), op=MPI.MAX) / bound - 1.0

@@ -194,7 +194,7 @@ class LoadSteps:
             fields = fields_of(solution)
             if self._series is None:
                 self._series = Series(self._path, solution)
-            self._series.write_fields(t, fields)
+            self._series.write(t, fields)
         if self._checkpoint is not None:
             about = {
                 "times": self._times[: place.number + 2],
@@ -236,7 +236,7 @@ class LoadSteps:
             return
         self._series = Series(self._path, self._problem.solution)
         for number, record in enumerate(self.records, start=1):
-            self._series.write_fields(record.time, checkpoint.read_fields(number))
+            self._series.write(record.time, checkpoint.read_fields(number))
 
     def _close(self) -> None:
         if self._series is not None:

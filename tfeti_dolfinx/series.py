@@ -6,12 +6,10 @@ import os
 from pathlib import Path
 from typing import Any
 
-import dolfinx
 import numpy as np
 from dolfinx import fem, io
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.output import begin_file, cell_fields, checked_target, end_file, nodal_fields
 from tfeti_dolfinx.solution import Solution
 
@@ -28,22 +26,18 @@ class Series:
         solution: A solution of the problem: its mesh and which fields there are.
 
     Raises:
-        InputError: The name does not fit, nothing can be written there, or DOLFINx has no ADIOS2.
+        InputError: The name does not fit, or nothing can be written there.
     """
 
     def __init__(self, path: str | os.PathLike[str], solution: Solution) -> None:
-        self._target = checked_series(path, solution)
+        self._target = checked_target(path, ".bp", solution)
         self._mesh = solution.decomposition.mesh
         self._fields = [_copy(f) for f in nodal_fields(solution)]
         self._solution = solution
         self._partial = begin_file(self._target, solution)
         self._vtx: Any = io.VTXWriter(self._mesh.comm, self._partial, self._fields, engine="BP4")
 
-    def write(self, time: float, solution: Solution) -> None:
-        """Add a step."""
-        self.write_fields(time, fields_of(solution))
-
-    def write_fields(self, time: float, values: dict[str, Array]) -> None:
+    def write(self, time: float, values: dict[str, Array]) -> None:
         """Add a step from what ``fields_of`` returned for it, in this run or an earlier one."""
         points = self._mesh.geometry.x.copy()
         self._mesh.geometry.x[:] = values[POINTS]
@@ -54,7 +48,7 @@ class Series:
 
     def close(self) -> list[Path]:
         """Give the files their names; which they are."""
-        self.abandon()
+        self._vtx.close()
         end_file(self._partial, self._target, self._solution)
         cells = self._target.with_name(f"{self._target.stem}_cells.bp")
         partial = begin_file(cells, self._solution)
@@ -63,22 +57,6 @@ class Series:
             vtx.write(0.0)
         end_file(partial, cells, self._solution)
         return [self._target, cells]
-
-    def abandon(self) -> None:
-        """Stop writing; what is there keeps its temporary name."""
-        self._vtx.close()
-
-
-def checked_series(path: str | os.PathLike[str], solution: Solution) -> Path:
-    """The file to write to. Collective.
-
-    Raises:
-        InputError: As ``Series``.
-    """
-    target = checked_target(path, ".bp", solution)
-    if not dolfinx.has_adios2:
-        raise InputError(f"{target}: this DOLFINx has no ADIOS2, which writes steps; expected None")
-    return target
 
 
 def fields_of(solution: Solution) -> dict[str, Array]:

@@ -69,7 +69,7 @@ class NoRows:
 
 
 class DistributedFactor:
-    """A = L Lᵀ over all ranks by MUMPS; for few rows or without it, on each rank of the whole.
+    """A = L Lᵀ shared by ranks with rows, by MUMPS; of few rows, or without it, whole on each.
 
     Args:
         A: Symmetric positive definite, MPIAIJ; taken over. The constructor is collective.
