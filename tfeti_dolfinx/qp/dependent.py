@@ -8,6 +8,7 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.parallel import agreed
+from tfeti_dolfinx.qp.faces import Face, without_slip
 from tfeti_dolfinx.qp.pcpg import Directions
 from tfeti_dolfinx.qp.problem import QP, FaceOperator, Point
 
@@ -28,12 +29,14 @@ class DependentRows:
 
     Attributes:
         preconditioner: That of the face, which knows how rows depend on each other, or None.
+        face: The face; its rows that slip follow their boundary, no bound ends their ways.
     """
 
     def __init__(self, qp: QP, directions: Directions) -> None:
         self._qp, self._directions = qp, directions
         self._comm = qp.d.getComm().tompi4py()
         self.preconditioner: FaceOperator | None = None
+        self.face: Face | None = None
 
     def part(self, x: Array) -> PETSc.Vec | None:
         """The part of x that F and Gᵀ do not see; None where there is none. Collective."""
@@ -108,5 +111,6 @@ class DependentRows:
 
     def _to_a_bound(self, z: Point, way: Array) -> float:
         """Largest t with λ + t·way ∈ Ω, maybe infinite. Collective."""
-        own = self._qp.feasible.max_step(z.lam.array_r, -way)
+        held = way if self.face is None else without_slip(self.face, way)
+        own = self._qp.feasible.max_step(z.lam.array_r, -held)
         return float(self._comm.allreduce(own, op=MPI.MIN))

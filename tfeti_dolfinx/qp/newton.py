@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 from petsc4py import PETSc
 
 from tfeti_dolfinx.qp.coarse import imbalance
+from tfeti_dolfinx.qp.faces import Status, face_of
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.monitors import Monitor, no_monitor
 from tfeti_dolfinx.qp.nearest import nearest
@@ -26,7 +28,9 @@ def first_point(qp: QP) -> PETSc.Vec:
     zero = qp.d.duplicate()
     zero.set(0.0)
     zero.array[:] = qp.feasible.project(zero.array_r)
-    coarse = qp.coarse.on_face(qp.feasible.face(zero.array_r, zero.array_r))
+    bounded = qp.feasible.face(zero.array_r, zero.array_r).constrained
+    status = np.where(bounded, Status.OPEN, Status.FREE)
+    coarse = qp.coarse.on_face(face_of(~bounded, status))
     lam = zero.duplicate()
     coarse.particular(lam)
     held = imbalance(coarse, lam) <= HELD

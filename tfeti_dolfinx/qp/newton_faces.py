@@ -14,6 +14,7 @@ from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.homogenised import restored
 from tfeti_dolfinx.qp.monitors import Monitor
 from tfeti_dolfinx.qp.nearest import WithinFace, nearest
+from tfeti_dolfinx.qp.newton_curved import Bent, bent_at, brought_back, has_left, is_curved, restored_along
 from tfeti_dolfinx.qp.parameters import NewtonParameters
 from tfeti_dolfinx.qp.pcpg import Directions, pcpg
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, FaceOperator, Point, Steps
@@ -40,11 +41,15 @@ class Trial:
         first: Where the first one ended, maybe outside of Ω.
         last: Where the last one ended.
         feasible: Whether that is in Ω.
+        face: The face of the first one.
+        rounds: How many there were.
     """
 
     first: Point
     last: Point
     feasible: bool
+    face: Face
+    rounds: int
 
     def destroy(self) -> None:
         """Destroy the points. Collective."""
@@ -65,6 +70,7 @@ class FaceSolver:
 
     Attributes:
         settled: Whether λ is where PCPG has stopped on the face entered.
+        curved: Whether that face is curved.
         left: The residual there.
     """
 
@@ -84,8 +90,11 @@ class FaceSolver:
         self._dependent = DependentRows(qp, self._directions)
         self._face: Face | None = None
         self.settled, self.left = False, float("inf")
+        self.curved, self._accepted = False, False
         self._on_face = qp
+        self._bent: Bent | None = None
         self._preconditioner: FaceOperator | None = None
+        self._prepared = False
 
     @property
     def norm(self) -> float:
@@ -102,33 +111,45 @@ class FaceSolver:
         return self._on_face.coarse
 
     def enter(self, face: Face) -> bool:
-        """Make the projectors and the preconditioner of a face, unless it is the last one.
+        """Make the projectors of a face, unless it is the last one; anew where it is curved.
 
         Returns:
-            Whether it is the last one.
+            Whether each row does what it did on the last one.
         """
-        if self._face is not None and not any_rank(
+        same = self._face is not None and not any_rank(
             self._comm, not np.array_equal(face.status, self._face.status)
-        ):
+        )
+        if same and not self.curved:
             return True
         self._leave()
-        self._steps.faces += 1
-        coarse = self._qp.coarse.on_face(face)
-        if self._qp.preconditioner_on is not None:
-            self._preconditioner = self._qp.preconditioner_on(face)
-        self._dependent.preconditioner = self._preconditioner
-        self._on_face = replace(self._qp, coarse=coarse, preconditioner=self._preconditioner)
-        self._face = face
+        self._steps.faces += not same
+        self._on_face = replace(self._qp, coarse=self._qp.coarse.on_face(face), preconditioner=None)
+        self._face, self.curved = face, is_curved(self._qp, face)
         self.forget()
-        return False
+        return same
+
+    def _ready(self) -> None:
+        """Make the preconditioner of the face entered, and what its curvature adds to F."""
+        if self._face is None or self._prepared:
+            return
+        if self._qp.preconditioner_on is not None:
+            self._preconditioner = self._qp.preconditioner_on(self._face)
+        self._dependent.preconditioner, self._dependent.face = self._preconditioner, self._face
+        self._bent = Bent(self._qp.F, self._face) if self.curved else None
+        F = self._bent or self._qp.F
+        self._on_face = replace(self._on_face, F=F, preconditioner=self._preconditioner)
+        self._prepared = True
 
     def settle(self) -> None:
-        """The last solve's end was accepted; if its face stays, PCPG goes on from there."""
-        self.settled = True
+        """The last solve's end was accepted; if its face stays, PCPG goes on from there.
+
+        Not where it is curved: the end was brought back to it.
+        """
+        self.settled, self._accepted = not self.curved, True
 
     def forget(self) -> None:
         """The next direction is a first one: the point is not where PCPG has stopped."""
-        self._directions.fresh, self.settled = True, False
+        self._directions.fresh, self.settled, self._accepted = True, False, False
 
     def solve(self, start: Point, face: Face, optimality: float) -> Trial:
         """Solve on a face; drop what leaves Ω, restore Gλ = e, solve again.
@@ -138,9 +159,11 @@ class FaceSolver:
             face: The face.
             optimality: ‖g^P‖ there.
         """
-        z, first, feasible = start.copy(), None, self._qp.feasible
-        stays = self.enter(face) and self.settled
-        for _ in range(MOST_ROUNDS):
+        z, first, out, accepted = start.copy(), None, True, self._accepted
+        stays = self.enter(face) and accepted
+        for rounds in range(1, MOST_ROUNDS + 1):
+            self._ready()
+            assert self._face is not None
             target = self._target(z, optimality, stays)
             bound = self._dependent.slack(z, target)
             if bound is not None:
@@ -153,46 +176,55 @@ class FaceSolver:
             self._dependent.shorten(before, z)
             before.destroy()
             if first is None:
-                first = z.copy()
-            inside = feasible.project(z.lam.array_r)
-            out = any_rank(self._comm, not np.array_equal(inside, z.lam.array_r))
+                first, face = z.copy(), self._face
+            out = has_left(self._qp, self._face, z.lam.array_r)
             if self._steps.cg >= self._max_it or not (out or (broken and self._dependent.slide(z))):
                 break
-            z.lam.array[:] = feasible.project(z.lam.array_r)
+            z.lam.array[:] = self._qp.feasible.project(z.lam.array_r)
             self._drop(z)
-        assert first is not None
-        return Trial(first, z, not out)
+        assert first is not None and self._face is not None
+        back = not out and (not self.curved or brought_back(self._qp, self._face, z))
+        return Trial(first, z, back, face, rounds)
 
     def _drop(self, z: Point) -> None:
         """Enter the face of z, and bring z back to Gλ = e in it; multiplies by F once."""
         previous, feasible = self._face, self._qp.feasible
         assert previous is not None
-        face = feasible.face(z.lam.array_r, z.g.array_r)
-        self.enter(face)
+        on = np.array(z.lam.array_r)
+        self.enter(feasible.face(on, z.g.array_r))
         near = self._restored(z.lam)
-        if imbalance(self.coarse, near) > HELD:
+        if self._imbalance(near) > HELD:
             # it no longer holds a body: what is nearest names rows that do, near by if it can
             near.destroy()
-            within = WithinFace(feasible, previous, z.lam.array_r)
-            found = nearest(self._qp.coarse, within, z.lam)
+            found = nearest(self._qp.coarse, WithinFace(feasible, previous), z.lam)
             if imbalance(self._qp.coarse, found.lam) > HELD:
                 found.lam.destroy()
                 found = nearest(self._qp.coarse, feasible, z.lam)
             near = found.lam
-            middle = 0.5 * (z.lam.array_r + near.array_r)
-            self.enter(feasible.face(middle, z.g.array_r))
+            on = 0.5 * (z.lam.array_r + near.array_r)
+            self.enter(feasible.face(on, z.g.array_r))
         near.copy(z.lam)
         near.destroy()
         z.refresh(self._qp)
+        if self.curved and self._face is not None:
+            self._face = bent_at(self._qp, self.coarse, self._face, on, z.g)
         self.forget()
 
     def _restored(self, lam: PETSc.Vec) -> PETSc.Vec:
         """The nearest point of Gλ = e on the face entered, if it has one."""
-        near = restored(self.coarse, lam)
-        if imbalance(self.coarse, near) > EXACT:  # what its factor leaves where rows hardly hold
-            once, near = near, restored(self.coarse, near)
+        near = self._nearer(lam)
+        if self._imbalance(near) > EXACT:  # what its factor leaves where rows hardly hold
+            once, near = near, self._nearer(near)
             once.destroy()
         return near
+
+    def _nearer(self, lam: PETSc.Vec) -> PETSc.Vec:
+        if self.curved:
+            return restored_along(self._qp, self.coarse, lam)
+        return restored(self.coarse, lam)
+
+    def _imbalance(self, lam: PETSc.Vec) -> float:
+        return imbalance(self._qp.coarse if self.curved else self.coarse, lam)
 
     def _target(self, z: Point, optimality: float, stays: bool) -> float:
         """What PCPG aims at: a part of what there is to do; more where the face stays."""
@@ -203,7 +235,8 @@ class FaceSolver:
         return max(final, share * min(start, optimality))
 
     def _pcpg(self, z: Point, target: float) -> ConvergedReason:
-        """PCPG on the face entered."""
+        """PCPG on the face entered; what a curvature adds is taken from the gradient again."""
+        before = np.array(z.lam.array_r)
         reason = pcpg(
             self._on_face,
             z,
@@ -214,6 +247,8 @@ class FaceSolver:
             self._directions,
         )
         self.left = float(self._directions.r.norm())
+        if self._bent is not None:
+            z.g.array[:] -= self._bent.bend(z.lam.array_r - before)
         return reason
 
     def _leave(self) -> None:
@@ -223,7 +258,7 @@ class FaceSolver:
         if self._preconditioner is not None:
             self._preconditioner.destroy()
             self._preconditioner = self._dependent.preconditioner = None
-        self._face = None
+        self._face, self._prepared = None, False
 
     def destroy(self) -> None:
         """Free what it holds. Collective."""

@@ -133,7 +133,7 @@ SOLVERS = {
     "newton": Solver(
         _newton,
         keeps_bounds=True,
-        keeps_discs=False,
+        keeps_discs=True,
         pc_type="dirichlet",
         relative_to_norm=False,
         cold=first_point,
