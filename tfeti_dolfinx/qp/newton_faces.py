@@ -20,6 +20,8 @@ from tfeti_dolfinx.qp.pcpg import Directions, pcpg
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, FaceOperator, Point, Steps
 from tfeti_dolfinx.qp.stopping import StoppingRule, TargetRule
 
+import os
+DEBUG = "NDEBUG" in os.environ
 # Gλ = e on a smaller face holds as well as its factor can tell
 HELD = 1e-9
 # rows leave a face in so many rounds at most: each round drops one row at least, but most at once
@@ -160,7 +162,10 @@ class FaceSolver:
             optimality: ‖g^P‖ there.
         """
         z, first, out, accepted = start.copy(), None, True, self._accepted
+        old = self._face
         stays = self.enter(face) and accepted
+        if old is not None and DEBUG:
+            print("   solve", stays, [int(np.sum(face.status==k)) for k in range(5)], [int(np.sum(old.status==k)) for k in range(5)], int(np.sum(old.status!=face.status)), flush=True)
         for rounds in range(1, MOST_ROUNDS + 1):
             self._ready()
             assert self._face is not None
@@ -181,7 +186,10 @@ class FaceSolver:
             if self._steps.cg >= self._max_it or not (out or (broken and self._dependent.slide(z))):
                 break
             z.lam.array[:] = self._qp.feasible.project(z.lam.array_r)
+            before=self._face
             self._drop(z)
+            if DEBUG:
+                print("     drop", target, rounds, [int(np.sum(self._face.status==k)) for k in range(5)], int(np.sum(before.status!=self._face.status)), flush=True)
         assert first is not None and self._face is not None
         back = not out and (not self.curved or brought_back(self._qp, self._face, z))
         return Trial(first, z, back, face, rounds)
@@ -219,12 +227,18 @@ class FaceSolver:
         return near
 
     def _nearer(self, lam: PETSc.Vec) -> PETSc.Vec:
-        if self.curved:
+        if self._outside(lam):
             return restored_along(self._qp, self.coarse, lam)
         return restored(self.coarse, lam)
 
+    def _outside(self, lam: PETSc.Vec) -> bool:
+        """Whether λ is not 0 in directions that are not the face's, as where rows slip."""
+        assert self._face is not None
+        fixed = lam.array_r - self._face.restricted(lam.array_r)
+        return any_rank(self._comm, bool(np.any(fixed)))
+
     def _imbalance(self, lam: PETSc.Vec) -> float:
-        return imbalance(self._qp.coarse if self.curved else self.coarse, lam)
+        return imbalance(self._qp.coarse if self._outside(lam) else self.coarse, lam)
 
     def _target(self, z: Point, optimality: float, stays: bool) -> float:
         """What PCPG aims at: a part of what there is to do; more where the face stays."""
