@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
 from petsc4py import PETSc
 
 from tfeti_dolfinx.qp.coarse import imbalance
-from tfeti_dolfinx.qp.faces import Status, face_of
+from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.monitors import Monitor, no_monitor
 from tfeti_dolfinx.qp.nearest import nearest
+from tfeti_dolfinx.qp.newton_curved import is_rubbing
 from tfeti_dolfinx.qp.newton_faces import FaceSolver
 from tfeti_dolfinx.qp.newton_iterate import Iterate
 from tfeti_dolfinx.qp.parameters import NewtonParameters
@@ -23,23 +23,28 @@ HELD = 1e-9
 def first_point(qp: QP) -> PETSc.Vec:
     """Step 0: the least λ with open contact if that balances the load, else the least of Ω.
 
-    Collective; multiplies by nothing.
+    With friction the latter: what is open would slip far first. Collective; multiplies by nothing.
     """
     zero = qp.d.duplicate()
     zero.set(0.0)
     zero.array[:] = qp.feasible.project(zero.array_r)
-    bounded = qp.feasible.face(zero.array_r, zero.array_r).constrained
-    status = np.where(bounded, Status.OPEN, Status.FREE)
-    coarse = qp.coarse.on_face(face_of(~bounded, status))
-    lam = zero.duplicate()
+    face = qp.feasible.face(zero.array_r, zero.array_r)
+    lam = None if is_rubbing(qp, face) else _open(qp, face)
+    if lam is None:
+        lam = nearest(qp.coarse, qp.feasible, zero).lam
+    zero.destroy()
+    return lam
+
+
+def _open(qp: QP, face: Face) -> PETSc.Vec | None:
+    """The least λ on a face, None where it does not balance the load."""
+    coarse, lam = qp.coarse.on_face(face), qp.d.duplicate()
     coarse.particular(lam)
     held = imbalance(coarse, lam) <= HELD
     coarse.destroy()
     if not held:
         lam.destroy()
-        lam = nearest(qp.coarse, qp.feasible, zero).lam
-    zero.destroy()
-    return lam
+    return lam if held else None
 
 
 def feasible_start(qp: QP, start: Start) -> PETSc.Vec:

@@ -8,7 +8,7 @@ from petsc4py import PETSc
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.parallel import any_rank
 from tfeti_dolfinx.qp.coarse import Coarse, imbalance
-from tfeti_dolfinx.qp.faces import Face, without_slip
+from tfeti_dolfinx.qp.faces import Face, Status, without_slip
 from tfeti_dolfinx.qp.nearest import WithinFace, nearest
 from tfeti_dolfinx.qp.problem import QP, Operator, Point
 
@@ -40,6 +40,12 @@ class Bent:
 def is_curved(qp: QP, face: Face) -> bool:
     """Whether a row of some rank slips along a boundary. Collective."""
     return any_rank(qp.d.getComm().tompi4py(), face.curved)
+
+
+def is_rubbing(qp: QP, face: Face) -> bool:
+    """Whether a row of some rank sticks or slips. Collective."""
+    rubbing = np.isin(face.status, (Status.STICK, Status.SLIP))
+    return any_rank(qp.d.getComm().tompi4py(), bool(np.any(rubbing)))
 
 
 def has_left(qp: QP, face: Face, x: Array) -> bool:

@@ -14,14 +14,19 @@ from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.homogenised import restored
 from tfeti_dolfinx.qp.monitors import Monitor
 from tfeti_dolfinx.qp.nearest import WithinFace, nearest
-from tfeti_dolfinx.qp.newton_curved import Bent, bent_at, brought_back, has_left, is_curved, restored_along
+from tfeti_dolfinx.qp.newton_curved import (
+    Bent,
+    bent_at,
+    brought_back,
+    has_left,
+    is_curved,
+    restored_along,
+)
 from tfeti_dolfinx.qp.parameters import NewtonParameters
 from tfeti_dolfinx.qp.pcpg import Directions, pcpg
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, FaceOperator, Point, Steps
 from tfeti_dolfinx.qp.stopping import StoppingRule, TargetRule
 
-import os
-DEBUG = "NDEBUG" in os.environ
 # Gλ = e on a smaller face holds as well as its factor can tell
 HELD = 1e-9
 # rows leave a face in so many rounds at most: each round drops one row at least, but most at once
@@ -31,6 +36,9 @@ FINAL = 0.9
 # a solve on a face that stays is looked at whenever it has come down by this: PCPG goes on where it
 # has stopped, and rows that want to carry are found before the wrong face is solved to the end
 STAGE = 0.1
+# of the residual of PCPG: ‖g^P‖ that is at most so large shows that the face hardly bends on the
+# way; the next solve is to be so much better that the end is superlinear
+FOLLOWED = 2.0
 # of Gλ = e: what is left after a first try to restore it is worth a second one
 EXACT = 1e-13
 
@@ -96,7 +104,7 @@ class FaceSolver:
         self._on_face = qp
         self._bent: Bent | None = None
         self._preconditioner: FaceOperator | None = None
-        self._prepared = False
+        self._prepared, self._stayed, self._stage = False, False, STAGE
 
     @property
     def norm(self) -> float:
@@ -162,11 +170,9 @@ class FaceSolver:
             optimality: ‖g^P‖ there.
         """
         z, first, out, accepted = start.copy(), None, True, self._accepted
-        old = self._face
         stays = self.enter(face) and accepted
-        if old is not None and DEBUG:
-            print("   solve", stays, [int(np.sum(face.status==k)) for k in range(5)], [int(np.sum(old.status==k)) for k in range(5)], int(np.sum(old.status!=face.status)), flush=True)
-        for rounds in range(1, MOST_ROUNDS + 1):
+        rounds = 0
+        for _ in range(MOST_ROUNDS):
             self._ready()
             assert self._face is not None
             target = self._target(z, optimality, stays)
@@ -177,7 +183,7 @@ class FaceSolver:
                 continue
             before = z.copy()
             broken = self._pcpg(z, target) == ConvergedReason.DIVERGED_INDEFINITE_MAT
-            stays = False
+            stays, rounds = False, rounds + 1
             self._dependent.shorten(before, z)
             before.destroy()
             if first is None:
@@ -186,11 +192,9 @@ class FaceSolver:
             if self._steps.cg >= self._max_it or not (out or (broken and self._dependent.slide(z))):
                 break
             z.lam.array[:] = self._qp.feasible.project(z.lam.array_r)
-            before=self._face
             self._drop(z)
-            if DEBUG:
-                print("     drop", target, rounds, [int(np.sum(self._face.status==k)) for k in range(5)], int(np.sum(before.status!=self._face.status)), flush=True)
-        assert first is not None and self._face is not None
+        assert first is not None
+        assert self._face is not None
         back = not out and (not self.curved or brought_back(self._qp, self._face, z))
         return Trial(first, z, back, face, rounds)
 
@@ -245,7 +249,10 @@ class FaceSolver:
         z.g.copy(self._directions.r)
         self.coarse.project(self._directions.r)
         start, final = float(self._directions.r.norm()), FINAL * self._rule.tolerance
-        share = STAGE if stays else self._parameters.reduction
+        followed = self._stayed and self.curved and optimality <= FOLLOWED * self.left
+        self._stage = STAGE if not stays else self._stage**2 if followed else self._stage
+        self._stayed = stays
+        share = self._stage if stays else self._parameters.reduction
         return max(final, share * min(start, optimality))
 
     def _pcpg(self, z: Point, target: float) -> ConvergedReason:

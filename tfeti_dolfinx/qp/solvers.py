@@ -140,6 +140,5 @@ SOLVERS = {
         warm=feasible_start,
     ),
 }
-# what auto stands for, without and with inequalities, and with discs
+# what auto stands for, without and with inequalities
 AUTO = {False: "pcpg", True: "newton"}
-AUTO_WITH_DISCS = "smalse"
