@@ -16,6 +16,9 @@ from tfeti_dolfinx.qp.parameters import NewtonParameters
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, QPResult, Start, Steps
 from tfeti_dolfinx.qp.stopping import StoppingRule
 
+# far more than what factors leave of Gλ = e: the nearest point of Ω does not balance the load;
+# without friction that is known before
+UNBALANCED = 1e-3
 # Gλ = e holds on the face of 0 as well as factors can tell
 HELD = 1e-9
 
@@ -72,6 +75,7 @@ def newton(
     reason                       when
     ===========================  =================================================================
     the rule's                   ‖g^P‖ ≤ ``rule.tolerance``, and the rule is content
+    ``DIVERGED_STALLED``         friction does not suffice for Gλ = e, as the start shows
     ``DIVERGED_ITS``             ``max_it`` faces or conjugate gradient steps are not enough
     ``DIVERGED_ROUNDING``        no step lowers q any more by what stands out from rounding
     ===========================  =================================================================
@@ -106,7 +110,9 @@ def newton(
     faces = FaceSolver(state.qp, rule, parameters, steps, max_it, monitor)
     reason, looked = ConvergedReason.ITERATING, warm
     monitor(steps, "start", state.point.lam, homogenised.b.norm(), 0.0)
-    if not warm:
+    if is_rubbing(qp, state.face()) and imbalance(qp.coarse, state.point.lam) > UNBALANCED:
+        reason = ConvergedReason.DIVERGED_STALLED
+    elif not warm:
         faces.enter(state.face())
         state.multipliers_on(faces)
     while reason == ConvergedReason.ITERATING:

@@ -9,6 +9,7 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.parallel import any_rank
 from tfeti_dolfinx.qp.coarse import Coarse, imbalance
 from tfeti_dolfinx.qp.faces import Face, Status, without_slip
+from tfeti_dolfinx.qp.homogenised import restored
 from tfeti_dolfinx.qp.nearest import WithinFace, nearest
 from tfeti_dolfinx.qp.problem import QP, Operator, Point
 
@@ -54,18 +55,32 @@ def has_left(qp: QP, face: Face, x: Array) -> bool:
     return any_rank(qp.d.getComm().tompi4py(), bool(np.any(left != 0.0)))
 
 
-def restored_along(qp: QP, coarse: Coarse, lam: PETSc.Vec) -> PETSc.Vec:
-    """λ + ZG_fᵀ(G_fG_fᵀ)⁺(e − Gλ), λ on a face and maybe not in its directions. Collective.
+def restored_on(qp: QP, coarse: Coarse, face: Face, lam: PETSc.Vec) -> PETSc.Vec:
+    """λ + ZG_fᵀ(G_fG_fᵀ)⁺(e − Gλ). Collective.
 
     Args:
         qp: The program.
         coarse: Projectors of the face.
-        lam: The point.
+        face: The face.
+        lam: A point of the face.
     """
+    if not _is_beside(face, lam):
+        return restored(coarse, lam)
     near = lam.duplicate()
     coarse.combine(coarse.solve(qp.coarse.residual(lam)), near)
     near.axpy(1.0, lam)
     return near
+
+
+def imbalance_on(qp: QP, coarse: Coarse, face: Face, lam: PETSc.Vec) -> float:
+    """How far Gλ is from e: the worst entry beside its terms, 1 at most. Collective."""
+    return imbalance(qp.coarse if _is_beside(face, lam) else coarse, lam)
+
+
+def _is_beside(face: Face, lam: PETSc.Vec) -> bool:
+    """Whether λ is not 0 in directions that are not the face's, as where rows slip."""
+    fixed = lam.array_r - face.restricted(lam.array_r)
+    return any_rank(lam.getComm().tompi4py(), bool(np.any(fixed)))
 
 
 def bent_at(qp: QP, coarse: Coarse, face: Face, on: Array, g: PETSc.Vec) -> Face:

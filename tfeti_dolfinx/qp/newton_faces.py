@@ -11,7 +11,6 @@ from tfeti_dolfinx.parallel import any_rank
 from tfeti_dolfinx.qp.coarse import Coarse, imbalance
 from tfeti_dolfinx.qp.dependent import DependentRows
 from tfeti_dolfinx.qp.faces import Face
-from tfeti_dolfinx.qp.homogenised import restored
 from tfeti_dolfinx.qp.monitors import Monitor
 from tfeti_dolfinx.qp.nearest import WithinFace, nearest
 from tfeti_dolfinx.qp.newton_curved import (
@@ -19,8 +18,9 @@ from tfeti_dolfinx.qp.newton_curved import (
     bent_at,
     brought_back,
     has_left,
+    imbalance_on,
     is_curved,
-    restored_along,
+    restored_on,
 )
 from tfeti_dolfinx.qp.parameters import NewtonParameters
 from tfeti_dolfinx.qp.pcpg import Directions, pcpg
@@ -224,25 +224,16 @@ class FaceSolver:
 
     def _restored(self, lam: PETSc.Vec) -> PETSc.Vec:
         """The nearest point of Gλ = e on the face entered, if it has one."""
-        near = self._nearer(lam)
+        assert self._face is not None
+        near = restored_on(self._qp, self.coarse, self._face, lam)
         if self._imbalance(near) > EXACT:  # what its factor leaves where rows hardly hold
-            once, near = near, self._nearer(near)
+            once, near = near, restored_on(self._qp, self.coarse, self._face, near)
             once.destroy()
         return near
 
-    def _nearer(self, lam: PETSc.Vec) -> PETSc.Vec:
-        if self._outside(lam):
-            return restored_along(self._qp, self.coarse, lam)
-        return restored(self.coarse, lam)
-
-    def _outside(self, lam: PETSc.Vec) -> bool:
-        """Whether λ is not 0 in directions that are not the face's, as where rows slip."""
-        assert self._face is not None
-        fixed = lam.array_r - self._face.restricted(lam.array_r)
-        return any_rank(self._comm, bool(np.any(fixed)))
-
     def _imbalance(self, lam: PETSc.Vec) -> float:
-        return imbalance(self._qp.coarse if self._outside(lam) else self.coarse, lam)
+        assert self._face is not None
+        return imbalance_on(self._qp, self.coarse, self._face, lam)
 
     def _target(self, z: Point, optimality: float, stays: bool) -> float:
         """What PCPG aims at: a part of what there is to do; more where the face stays."""
