@@ -112,6 +112,7 @@ def newton(
     monitor(steps, "start", state.point.lam, homogenised.b.norm(), 0.0)
     if is_rubbing(qp, state.face()) and imbalance(qp.coarse, state.point.lam) > UNBALANCED:
         reason = ConvergedReason.DIVERGED_STALLED
+        state.look(faces)
     elif not warm:
         faces.enter(state.face())
         state.multipliers_on(faces)
