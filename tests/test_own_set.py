@@ -38,6 +38,9 @@ class HalfSpaces:
         off = ~self._bound(x)
         return face_of(off, np.where(off, Status.TOUCHING, Status.OPEN))
 
+    def onto(self, x, status):
+        return np.where(status == Status.OPEN, self.b / self.a, self.project(x))
+
 
 def test_it_conforms():
     check_feasible_set(HalfSpaces(-np.arange(1.0, 11.0), np.linspace(-1.0, 2.0, 10)), 10)

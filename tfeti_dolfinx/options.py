@@ -21,8 +21,7 @@ class Options:
     qp_type: str = described(
         "auto",
         "all",
-        "solver of the dual problem; auto takes pcpg without contact, smalse with friction, "
-        "else newton",
+        "solver of the dual problem; auto takes pcpg without contact, else newton",
         choices=("auto", *SOLVERS),
     )
     rtol: float = described(

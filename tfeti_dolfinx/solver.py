@@ -23,7 +23,7 @@ from tfeti_dolfinx.qp.homogenised import (
 )
 from tfeti_dolfinx.qp.monitors import Monitor, PrintMonitor, no_monitor
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, QPResult, Start
-from tfeti_dolfinx.qp.solvers import AUTO, AUTO_WITH_DISCS, SOLVERS, Solver, Task
+from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver, Task
 
 EXPLANATIONS = {
     ConvergedReason.DIVERGED_ROUNDING: "; rounding does not let it come lower: expected a "
@@ -50,12 +50,12 @@ def resolve_types(options: Options, rows: Sequence[int], prefix: str) -> tuple[s
     """
     qp_type, (num_inequalities, num_tangents) = options.qp_type, rows
     if qp_type == "auto":
-        qp_type = AUTO_WITH_DISCS if num_tangents else AUTO[num_inequalities > 0]
+        qp_type = AUTO[num_inequalities + num_tangents > 0]
     if num_tangents and not SOLVERS[qp_type].keeps_discs:
         able = [name for name, solver in SOLVERS.items() if solver.keeps_discs]
         raise InputError(
             f"-{prefix}qp_type {qp_type}: the scene has friction, {num_tangents} tangential rows, "
-            f"which {qp_type.upper()} cannot keep yet; expected {' or '.join(['auto', *able])}"
+            f"which {qp_type.upper()} cannot keep; expected {' or '.join(['auto', *able])}"
         )
     if num_inequalities and not SOLVERS[qp_type].keeps_bounds:
         able = [name for name, solver in SOLVERS.items() if solver.keeps_bounds]

@@ -156,7 +156,10 @@ class Dual:
         """The preconditioner on a face of the rows; what all faces share is made once."""
         assert self.preconditioner is not None
         if self._on_faces is None:
-            self._on_faces = FacePreconditioner(self.preconditioner, self.constraints, self._prefix)
+            diagonal = self.subdomains.diagonal
+            self._on_faces = FacePreconditioner(
+                self.preconditioner, self.constraints, diagonal, self._prefix
+            )
         return self._on_faces.on_face(face)
 
     def _norm_of(self, coarse: Coarse, steps: int) -> float:

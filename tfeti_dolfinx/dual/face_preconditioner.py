@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from petsc4py import PETSc
+from scipy.sparse import csr_array, diags_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.contact_factor import Factor, contact_factor
@@ -22,40 +23,54 @@ class FacePreconditioner:
     """M_f = W⁻¹B_f D⁻¹ A D⁻¹B_fᵀ W⁻¹, W = B_f D⁻¹B_fᵀ, f the rows of a face.
 
     Gluing and Dirichlet rows are orthonormal in D⁻¹ and orthogonal to contact rows, so W is the
-    identity but for its block of contact rows, W_N. That is the identity too where no two of them
-    meet, as at an obstacle.
+    identity but for its block of contact rows, W_C, normals and tangents. That is the identity too
+    where no two of them meet, as at an obstacle, and D is the same in all directions. Where
+    a face is curved M_f stands for (ZᵀFZ + κ)⁻¹: it is scaled with (1 + κσ)^{-1/2} from both sides,
+    σ the diagonal of B D⁻¹ diag(K) D⁻¹Bᵀ.
 
     Args:
         whole: B D⁻¹ A D⁻¹Bᵀ on all rows, A the Schur complements, or the stiffness on the trace.
         constraints: B and D. The constructor is collective.
+        diagonal: That of K on the local trace unknowns.
         prefix: Prefix of the factor's PETSc options.
     """
 
-    def __init__(self, whole: Operator, constraints: Constraints, prefix: str) -> None:
-        self._whole, self._prefix = whole, prefix
-        self._normals = constraints.sets.normals
-        self._gram = _contact_gram(constraints)
+    def __init__(
+        self, whole: Operator, constraints: Constraints, diagonal: Array, prefix: str
+    ) -> None:
+        self._whole, self._prefix, sets = whole, prefix, constraints.sets
+        self._contact = np.concatenate((sets.normals, sets.tangents.ravel()))
+        self._gram = _contact_gram(constraints, self._contact)
+        self._size = _diagonal(constraints, diagonal)
 
     def on_face(self, face: Face) -> FaceOperator:
         """M_f on a face. Collective.
 
         Raises:
-            FactorError: W_N has no factor.
+            FactorError: W_C has no factor.
         """
-        carrying = face.carrying[self._normals]
-        if self._gram is None:
-            return _OnFace(self._whole, face, self._normals[carrying], None)
-        first = self._gram.getOwnershipRange()[0]
-        kept = (first + np.flatnonzero(carrying)).astype(PETSc.IntType)
-        rows = PETSc.IS().createGeneral(kept, comm=self._gram.getComm())
-        part = self._gram.createSubMatrix(rows, rows)
-        rows.destroy()
-        part.shift(SHIFT)
-        factor = contact_factor(part, self._prefix) if part.getSize()[0] else None
-        return _OnFace(self._whole, face, self._normals[carrying], factor)
+        on_contact = csr_array(face.Z[self._contact])
+        kept = np.unique(on_contact.indices)
+        Z_C, factor = csr_array(face.Z[:, kept]), None
+        if self._gram is not None:
+            part = _restricted(self._gram, csr_array(on_contact[:, kept]))
+            part.shift(SHIFT)
+            if part.getSize()[0]:
+                factor = contact_factor(part, self._prefix)
+            else:
+                part.destroy()
+        return _OnFace(self._whole, face, Z_C, factor, self._bending(face))
+
+    def _bending(self, face: Face) -> csr_array | None:
+        """Z((1 + κσ)^{-1/2} − 1)Zᵀ, or None where it is 0."""
+        if not np.any(face.curvature):
+            return None
+        size = face.Z.multiply(face.Z).T @ self._size
+        bent = diags_array(1.0 / np.sqrt(1.0 + face.curvature * size) - 1.0)
+        return csr_array(face.Z @ bent @ face.Z.T)
 
     def destroy(self) -> None:
-        """Destroy W_N, not the operator on all rows. Collective."""
+        """Destroy W_C, not the operator on all rows. Collective."""
         if self._gram is not None:
             self._gram.destroy()
 
@@ -63,16 +78,24 @@ class FacePreconditioner:
 class _OnFace:
     """M_f between vectors of a face, which have the layout of all rows."""
 
-    def __init__(self, whole: Operator, face: Face, rows: Array, factor: Factor | None) -> None:
-        self._whole, self._face, self._rows, self._factor = whole, face, rows, factor
+    def __init__(
+        self,
+        whole: Operator,
+        face: Face,
+        Z_C: csr_array,
+        factor: Factor | None,
+        bending: csr_array | None,
+    ) -> None:
+        self._whole, self._face, self._Z_C, self._factor = whole, face, Z_C, factor
+        self._bending = bending
 
     def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = M_f x. Collective."""
         scaled = x.duplicate()
-        scaled.array[:] = self._scaled(x.array_r)
+        scaled.array[:] = self._scaled(self._bent(x.array_r))
         self._whole.mult(scaled, y)
         scaled.destroy()
-        y.array[:] = self._scaled(y.array_r)
+        y.array[:] = self._bent(self._scaled(y.array_r))
 
     def dependent(self, x: Array) -> Array | None:
         """The part of x in the null space of W, and so of B_fᵀ. Collective.
@@ -81,18 +104,22 @@ class _OnFace:
         """
         if self._factor is None:
             return None
-        part, values = np.zeros_like(x), x[self._rows]
+        values = self._Z_C.T @ x
         for _ in range(2):
             values = SHIFT * self._factor.solve(values)
-        part[self._rows] = values
-        return part
+        return np.asarray(self._Z_C @ values)
+
+    def _bent(self, x: Array) -> Array:
+        """(1 + κσ)^{-1/2}x on the face."""
+        return x if self._bending is None else x + self._bending @ x
 
     def _scaled(self, x: Array) -> Array:
         """W⁻¹x on the rows of the face."""
         values = self._face.restricted(x)
         if self._factor is not None:
-            values[self._rows] = self._factor.solve(values[self._rows])
-        return values
+            contact = self._Z_C.T @ values
+            values = values + self._Z_C @ (self._factor.solve(contact) - contact)
+        return np.asarray(values)
 
     def destroy(self) -> None:
         """Free the factor. Collective."""
@@ -100,12 +127,42 @@ class _OnFace:
             self._factor.destroy()
 
 
-def _contact_gram(constraints: Constraints) -> PETSc.Mat | None:
-    """B_N D⁻¹ B_Nᵀ, or None where it is the identity but for rounding. Collective."""
-    B, normals = constraints.B, constraints.sets.normals
+def _restricted(gram: PETSc.Mat, Z: csr_array) -> PETSc.Mat:
+    """ZᵀWZ, Z with a row for each local row of W. Collective."""
+    comm, index = gram.getComm(), PETSc.IntType
+    own = Z.shape[1]
+    start = comm.tompi4py().exscan(own) or 0
+    indices = (start + Z.indices).astype(index)
+    table = (Z.indptr.astype(index), indices, Z.data)
+    size = ((Z.shape[0], None), (own, None))
+    directions = PETSc.Mat().createAIJ(size=size, csr=table, comm=comm)
+    part = gram.PtAP(directions)
+    directions.destroy()
+    return part
+
+
+def _diagonal(constraints: Constraints, diagonal: Array) -> Array:
+    """The diagonal of B D⁻¹ diag(K) D⁻¹Bᵀ on the local rows. Collective."""
+    B = constraints.B
+    squares, size = B.copy(), B.createVecRight()
+    rows, columns, values = squares.getValuesCSR()
+    squares.setValuesCSR(rows, columns, values**2)
+    squares.assemble()
+    size.array[:] = diagonal / constraints.weights**2
+    result = B.createVecLeft()
+    squares.mult(size, result)
+    found = np.array(result.array_r)
+    for item in (squares, size, result):
+        item.destroy()
+    return found
+
+
+def _contact_gram(constraints: Constraints, contact: Array) -> PETSc.Mat | None:
+    """B_C D⁻¹ B_Cᵀ, or None where it is the identity but for rounding. Collective."""
+    B = constraints.B
     comm = B.getComm()
     first = B.getOwnershipRange()[0]
-    rows = PETSc.IS().createGeneral((first + normals).astype(PETSc.IntType), comm=comm)
+    rows = PETSc.IS().createGeneral((first + contact).astype(PETSc.IntType), comm=comm)
     B_N = B.createSubMatrix(rows)
     transposed = B_N.transpose(PETSc.Mat())
     inverse = B.createVecRight()

@@ -49,6 +49,10 @@ class Coarse(Protocol):
         """(G_f G_fᵀ + damping·GGᵀ)⁻¹y, f a face of all rows. Collective."""
         ...
 
+    def solve(self, y: Array) -> Array:
+        """(G_f G_fᵀ)⁺y, y replicated."""
+        ...
+
     def project(self, x: PETSc.Vec) -> None:
         """x ← P x. Collective."""
         ...
@@ -121,6 +125,10 @@ class NoCoarse:
         """None."""
         return y
 
+    def solve(self, y: Array) -> Array:
+        """None."""
+        return y
+
     def project(self, x: PETSc.Vec) -> None:
         """x ← ZZᵀx."""
         if self._face is not None:
@@ -187,6 +195,10 @@ class DenseCoarse:
         GZ = (face.Z.T @ self._G.T).T
         gram = GZ @ GZ.T + damping * self._G @ self._G.T
         return np.asarray(np.linalg.pinv(gram, hermitian=True) @ y)
+
+    def solve(self, y: Array) -> Array:
+        """(G_f G_fᵀ)⁺y."""
+        return np.asarray(self._inverse @ y)
 
     def project(self, x: PETSc.Vec) -> None:
         """x ← P x."""

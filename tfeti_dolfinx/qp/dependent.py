@@ -8,6 +8,7 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.parallel import agreed
+from tfeti_dolfinx.qp.faces import Face, without_slip
 from tfeti_dolfinx.qp.pcpg import Directions
 from tfeti_dolfinx.qp.problem import QP, FaceOperator, Point
 
@@ -30,6 +31,7 @@ class DependentRows:
 
     Attributes:
         preconditioner: That of the face, which knows how rows depend on each other, or None.
+        face: The face; its rows that slip follow their boundary, no bound ends their ways.
         contradicts: Whether q falls along a way that F and Gᵀ do not see, and that nothing ends.
     """
 
@@ -37,6 +39,7 @@ class DependentRows:
         self._qp, self._directions = qp, directions
         self._comm = qp.d.getComm().tompi4py()
         self.preconditioner: FaceOperator | None = None
+        self.face: Face | None = None
         self.contradicts = False
 
     def part(self, x: Array) -> PETSc.Vec | None:
@@ -122,5 +125,6 @@ class DependentRows:
 
     def _to_a_bound(self, z: Point, way: Array) -> float:
         """Largest t with λ + t·way ∈ Ω, maybe infinite. Collective."""
-        own = self._qp.feasible.max_step(z.lam.array_r, -way)
+        held = way if self.face is None else without_slip(self.face, way)
+        own = self._qp.feasible.max_step(z.lam.array_r, -held)
         return float(self._comm.allreduce(own, op=MPI.MIN))

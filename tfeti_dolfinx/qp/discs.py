@@ -96,6 +96,15 @@ class Ellipses:
         kappa = np.concatenate((np.zeros(len(inside)), curvature[along]))
         return Face(Z, kappa, status.ravel())
 
+    def onto(self, x: Array, status: Array) -> Array:
+        """The nearest points of the ellipses; of their boundary, from inside too, for slip."""
+        values = self._points(self.project(x)).copy()
+        t = np.where(self._moves, self._from_centre(x), 0.0)
+        slips = np.any(self._points(status) == Status.SLIP, axis=1)
+        inward = slips & (self._level(t) < 1.0) & np.any(t != 0.0, axis=1)
+        values[inward] = self.centre[inward] + self._nearest(t[inward], inward)
+        return np.asarray(values.ravel())
+
     def _points(self, x: Array) -> Array:
         return np.asarray(x).reshape(self.semi_axes.shape)
 
@@ -124,7 +133,7 @@ class Ellipses:
         return np.asarray(pushing * np.divide(bent, slope, out=0.0 * slope, where=slope > 0.0))
 
     def _nearest(self, z: Array, which: Array) -> Array:
-        """The nearest points of the boundary to points outside: a_j²z_j/(a_j² + μ)."""
+        """The nearest points of the boundary: a_j²z_j/(a_j² + μ)."""
         a = self.semi_axes[which]
         scale = np.maximum(a.max(axis=1, initial=TINY), TINY)[:, None]
         a, z = a / scale, z / scale
@@ -162,13 +171,15 @@ class Discs(Ellipses):
 
 
 def _secular(a: Array, z: Array) -> Array:
-    """μ ≥ 0 with Σ_j (a_j z_j/(a_j² + μ))² = 1, for points outside, shape ``(n,)``.
+    """μ with Σ_j (a_j z_j/(a_j² + μ))² = 1, at least 0 for points outside, shape ``(n,)``.
 
     Newton's method for 1 − 1/√Σ, which is nearly linear in μ: from a start on the left of the root
     it comes nearer in each step (Moré, Sorensen, SIAM J. Sci. Stat. Comput. 4, 1983).
     """
     c = a * np.abs(z)
-    mu = np.maximum(np.max(c - a * a, axis=1, initial=0.0), 0.0)  # one term alone is 1 there
+    mu = np.max(c - a * a, axis=1, initial=-np.inf)  # one term alone is 1 there
+    outside = np.sum(np.divide(c, a * a, out=np.zeros_like(c), where=a > 0.0) ** 2, axis=1) >= 1.0
+    mu = np.where(outside, np.maximum(mu, 0.0), mu)
     for _ in range(MOST_STEPS):
         below = a * a + mu[:, None]
         terms = np.divide(c, below, out=np.zeros_like(c), where=below > 0.0) ** 2
@@ -177,7 +188,7 @@ def _secular(a: Array, z: Array) -> Array:
         wanted = total > 1.0
         step = np.divide(total * (np.sqrt(total) - 1.0), slope, out=np.zeros_like(mu), where=wanted)
         mu = mu + step
-        if not np.any(step > SOLVED * mu):
+        if not np.any(step > SOLVED * np.abs(mu)):
             break
     return mu
 

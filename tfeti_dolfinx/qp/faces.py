@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, diags_array
 
 from tfeti_dolfinx.arrays import Array
 
@@ -58,9 +58,26 @@ class Face:
         """Rows that some set constrains; flags, shape ``(m,)``."""
         return np.asarray(self.status != Status.FREE)
 
+    @property
+    def curved(self) -> bool:
+        """Whether some row of this rank slips along a boundary."""
+        return bool(np.any(np.diff(self.Z.indptr)[self.status == Status.SLIP]))
+
+    def damped(self) -> Face:
+        """Z diag(1 + κ)^{-1/2}: ZZᵀ is the derivative of P_Ω at x, P_Ω(x) − x its gradient."""
+        if not np.any(self.curvature):
+            return self
+        share = diags_array(1.0 / np.sqrt(1.0 + self.curvature))
+        return Face(csr_array(self.Z @ share), self.curvature, self.status)
+
     def restricted(self, x: Array) -> Array:
         """Z Zᵀ x: the part of a vector that lies in the face."""
         return np.asarray(self.Z @ (self.Z.T @ x))
+
+
+def without_slip(face: Face, x: Array) -> Array:
+    """x, 0 where rows slip: these follow their boundary, no bound stops them."""
+    return np.where(face.status == Status.SLIP, 0.0, x)
 
 
 def face_of(free: Array, status: Array) -> Face:

@@ -48,6 +48,10 @@ class FeasibleSet(Protocol):
         """The face of x ∈ Ω, given the gradient there."""
         ...
 
+    def onto(self, x: Array, status: Array) -> Array:
+        """P_Ω(x), but on their bounds where rows are open, and on the boundary where they slip."""
+        ...
+
 
 class Bounds:
     """x_i ≥ l_i.
@@ -85,6 +89,10 @@ class Bounds:
         """Rows off their bounds are free: they touch."""
         off = np.asarray(x > self.lower)
         return face_of(off, np.where(off, Status.TOUCHING, Status.OPEN))
+
+    def onto(self, x: Array, status: Array) -> Array:
+        """max(x, l); l where rows are open."""
+        return np.where(status == Status.OPEN, self.lower, self.project(x))
 
 
 class Product:
@@ -153,6 +161,13 @@ class Product:
             status[rows], free[rows] = face.status, False
             faces.append((rows, face))
         return _joined([(np.arange(len(x)), face_of(free, status)), *faces], status)
+
+    def onto(self, x: Array, status: Array) -> Array:
+        """Each set's, x itself on free rows."""
+        values = np.array(x)
+        for rows, factor in self.factors:
+            values[rows] = factor.onto(x[rows], status[rows])
+        return values
 
 
 def _indices(rows: slice | Array) -> Array:

@@ -8,11 +8,13 @@ from typing import Protocol
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
+from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.qp.coarse import Coarse, imbalance
-from tfeti_dolfinx.qp.faces import Face, Status, face_of
+from tfeti_dolfinx.qp.faces import Face, Status
+from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 
 # points looked at: far more than Newton takes where it converges, so that a cycle ends
 MAX_TRIALS = 300
@@ -95,8 +97,8 @@ def nearest(
         left, scale = trial.left, float(np.linalg.norm(coarse.forces(trial.lam)))
         if agreed(comm, left <= BALANCED * scale):
             break
-        face = feasible.face(trial.lam.array_r, y.array_r)
-        step = coarse.damped_solve(face, trial.residual, damping)
+        face = feasible.face(trial.lam.array_r, trial.lam.array_r - trial.z)
+        step = coarse.damped_solve(face.damped(), trial.residual, damping)
         slope = float(trial.residual @ step)
         trial, length, tried = _searched(coarse, feasible, y, trial, step)
         trials += tried
@@ -115,29 +117,34 @@ class WithinFace:
 
     Args:
         feasible: The set Ω.
-        face: The face; its open rows stay where ``at`` has them.
-        at: A point of the face, shape ``(m,)``.
+        face: The face.
+        slipping: Whether its slipping rows stay on their boundary, too. They do not make a convex
+            set then, but what ``nearest`` minimises is convex with any set.
     """
 
-    def __init__(self, feasible: ConvexSet, face: Face, at: Array) -> None:
-        self._feasible, self._open, self._at = feasible, ~face.carrying, at
+    def __init__(self, feasible: FeasibleSet, face: Face, slipping: bool = False) -> None:
+        self._feasible, self._open = feasible, ~face.carrying
+        kept = face.status if slipping else np.where(self._open, Status.OPEN, Status.FREE)
+        self._status = kept
 
     def project(self, x: Array) -> Array:
         """P_Ω(x), but for the rows that stay."""
-        return np.where(self._open, self._at, self._feasible.project(x))
+        return self._feasible.onto(x, self._status)
 
     def face(self, x: Array, g: Array) -> Face:
-        """The face of x, without the rows that stay."""
+        """The face of x, without the rows that stay open."""
         face = self._feasible.face(x, g)
+        kept = np.flatnonzero(face.Z.T @ self._open.astype(float) == 0.0)
         status = np.where(self._open, Status.OPEN, face.status)
-        return face_of(face.carrying & ~self._open, status)
+        return Face(csr_array(face.Z[:, kept]), face.curvature[kept], status)
 
 
 @dataclass(frozen=True)
 class _Trial:
-    """λ(α), e − Gλ(α) and the cost there."""
+    """λ(α) = P_Ω(z), e − Gλ(α) and the cost there."""
 
     alpha: Array
+    z: Array
     lam: PETSc.Vec
     residual: Array
     cost: float
@@ -156,7 +163,7 @@ def _trial(coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec, alpha: Array) -> _
     lam.array[:] = projected
     own = float(z @ projected) - 0.5 * float(projected @ projected)
     cost = y.getComm().tompi4py().allreduce(own, op=MPI.SUM) - float(alpha @ coarse.e)
-    return _Trial(alpha, lam, coarse.residual(lam), cost)
+    return _Trial(alpha, z, lam, coarse.residual(lam), cost)
 
 
 def _searched(

@@ -5,15 +5,20 @@ from __future__ import annotations
 from petsc4py import PETSc
 
 from tfeti_dolfinx.qp.coarse import imbalance
+from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.monitors import Monitor, no_monitor
 from tfeti_dolfinx.qp.nearest import nearest
+from tfeti_dolfinx.qp.newton_curved import is_rubbing
 from tfeti_dolfinx.qp.newton_faces import FaceSolver
 from tfeti_dolfinx.qp.newton_iterate import Iterate
 from tfeti_dolfinx.qp.parameters import NewtonParameters
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, QPResult, Start, Steps
 from tfeti_dolfinx.qp.stopping import StoppingRule
 
+# far more than what factors leave of Gλ = e: the nearest point of Ω does not balance the load;
+# without friction that is known before
+UNBALANCED = 1e-3
 # Gλ = e holds on the face of 0 as well as factors can tell
 HELD = 1e-9
 
@@ -21,21 +26,28 @@ HELD = 1e-9
 def first_point(qp: QP) -> PETSc.Vec:
     """Step 0: the least λ with open contact if that balances the load, else the least of Ω.
 
-    Collective; multiplies by nothing.
+    With friction the latter: what is open would slip far first. Collective; multiplies by nothing.
     """
     zero = qp.d.duplicate()
     zero.set(0.0)
     zero.array[:] = qp.feasible.project(zero.array_r)
-    coarse = qp.coarse.on_face(qp.feasible.face(zero.array_r, zero.array_r))
-    lam = zero.duplicate()
+    face = qp.feasible.face(zero.array_r, zero.array_r)
+    lam = None if is_rubbing(qp, face) else _open(qp, face)
+    if lam is None:
+        lam = nearest(qp.coarse, qp.feasible, zero).lam
+    zero.destroy()
+    return lam
+
+
+def _open(qp: QP, face: Face) -> PETSc.Vec | None:
+    """The least λ on a face, None where it does not balance the load."""
+    coarse, lam = qp.coarse.on_face(face), qp.d.duplicate()
     coarse.particular(lam)
     held = imbalance(coarse, lam) <= HELD
     coarse.destroy()
     if not held:
         lam.destroy()
-        lam = nearest(qp.coarse, qp.feasible, zero).lam
-    zero.destroy()
-    return lam
+    return lam if held else None
 
 
 def feasible_start(qp: QP, start: Start) -> PETSc.Vec:
@@ -63,6 +75,7 @@ def newton(
     reason                       when
     ===========================  =================================================================
     the rule's                   ‖g^P‖ ≤ ``rule.tolerance``, and the rule is content
+    ``DIVERGED_STALLED``         friction does not suffice for Gλ = e, as the start shows
     ``DIVERGED_ITS``             ``max_it`` faces or conjugate gradient steps are not enough
     ``DIVERGED_ROUNDING``        no step lowers q any more by what stands out from rounding, or
                                  PCPG ends so twice in a row
@@ -99,7 +112,10 @@ def newton(
     faces = FaceSolver(state.qp, rule, parameters, steps, max_it, monitor)
     reason, looked = ConvergedReason.ITERATING, warm
     monitor(steps, "start", state.point.lam, homogenised.b.norm(), 0.0)
-    if not warm:
+    if is_rubbing(qp, state.face()) and imbalance(qp.coarse, state.point.lam) > UNBALANCED:
+        reason = ConvergedReason.DIVERGED_STALLED
+        state.look(faces)
+    elif not warm:
         faces.enter(state.face())
         state.multipliers_on(faces)
     while reason == ConvergedReason.ITERATING:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from petsc4py import PETSc
@@ -11,13 +11,22 @@ from tfeti_dolfinx.parallel import any_rank
 from tfeti_dolfinx.qp.coarse import Coarse, imbalance
 from tfeti_dolfinx.qp.dependent import DependentRows
 from tfeti_dolfinx.qp.faces import Face
-from tfeti_dolfinx.qp.homogenised import restored
 from tfeti_dolfinx.qp.monitors import Monitor
 from tfeti_dolfinx.qp.nearest import WithinFace, nearest
+from tfeti_dolfinx.qp.newton_curved import (
+    Bent,
+    bent_at,
+    brought_back,
+    has_left,
+    imbalance_on,
+    is_curved,
+    restored_on,
+)
 from tfeti_dolfinx.qp.parameters import NewtonParameters
 from tfeti_dolfinx.qp.pcpg import Directions, pcpg
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, FaceOperator, Point, Steps
 from tfeti_dolfinx.qp.stopping import StoppingRule, TargetRule
+from tfeti_dolfinx.qp.trial import Trial
 
 # Gλ = e on a smaller face holds as well as its factor can tell
 HELD = 1e-9
@@ -28,28 +37,11 @@ FINAL = 0.9
 # a solve on a face that stays is looked at whenever it has come down by this: PCPG goes on where it
 # has stopped, and rows that want to carry are found before the wrong face is solved to the end
 STAGE = 0.1
+# of the residual of PCPG: ‖g^P‖ that is at most so large shows that the face hardly bends on the
+# way; the next solve is to be so much better that the end is superlinear
+FOLLOWED = 2.0
 # of Gλ = e: what is left after a first try to restore it is worth a second one
 EXACT = 1e-13
-
-
-@dataclass(frozen=True)
-class Trial:
-    """What solves on faces have come to.
-
-    Attributes:
-        first: Where the first one ended, maybe outside of Ω.
-        last: Where the last one ended.
-        feasible: Whether that is in Ω.
-    """
-
-    first: Point
-    last: Point
-    feasible: bool
-
-    def destroy(self) -> None:
-        """Destroy the points. Collective."""
-        self.first.destroy()
-        self.last.destroy()
 
 
 class FaceSolver:
@@ -65,6 +57,7 @@ class FaceSolver:
 
     Attributes:
         settled: Whether λ is where PCPG has stopped on the face entered.
+        curved: Whether that face is curved.
         left: The residual there.
         rounded: So many solves in a row ended at rounding, before their target.
     """
@@ -85,8 +78,11 @@ class FaceSolver:
         self._dependent = DependentRows(qp, self._directions)
         self._face: Face | None = None
         self.settled, self.left, self.rounded = False, float("inf"), 0
+        self.curved, self._accepted = False, False
         self._on_face = qp
+        self._bent: Bent | None = None
         self._preconditioner: FaceOperator | None = None
+        self._prepared, self._stayed, self._stage = False, False, STAGE
 
     @property
     def norm(self) -> float:
@@ -108,33 +104,45 @@ class FaceSolver:
         return self._on_face.coarse
 
     def enter(self, face: Face) -> bool:
-        """Make the projectors and the preconditioner of a face, unless it is the last one.
+        """Make the projectors of a face, unless it is the last one; anew where it is curved.
 
         Returns:
-            Whether it is the last one.
+            Whether each row does what it did on the last one.
         """
-        if self._face is not None and not any_rank(
+        same = self._face is not None and not any_rank(
             self._comm, not np.array_equal(face.status, self._face.status)
-        ):
+        )
+        if same and not self.curved:
             return True
         self._leave()
-        self._steps.faces += 1
-        coarse = self._qp.coarse.on_face(face)
-        if self._qp.preconditioner_on is not None:
-            self._preconditioner = self._qp.preconditioner_on(face)
-        self._dependent.preconditioner = self._preconditioner
-        self._on_face = replace(self._qp, coarse=coarse, preconditioner=self._preconditioner)
-        self._face = face
+        self._steps.faces += not same
+        self._on_face = replace(self._qp, coarse=self._qp.coarse.on_face(face), preconditioner=None)
+        self._face, self.curved = face, is_curved(self._qp, face)
         self.forget()
-        return False
+        return same
+
+    def _ready(self) -> None:
+        """Make the preconditioner of the face entered, and what its curvature adds to F."""
+        if self._face is None or self._prepared:
+            return
+        if self._qp.preconditioner_on is not None:
+            self._preconditioner = self._qp.preconditioner_on(self._face)
+        self._dependent.preconditioner, self._dependent.face = self._preconditioner, self._face
+        self._bent = Bent(self._qp.F, self._face) if self.curved else None
+        F = self._bent or self._qp.F
+        self._on_face = replace(self._on_face, F=F, preconditioner=self._preconditioner)
+        self._prepared = True
 
     def settle(self) -> None:
-        """The last solve's end was accepted; if its face stays, PCPG goes on from there."""
-        self.settled = True
+        """The last solve's end was accepted; if its face stays, PCPG goes on from there.
+
+        Not where it is curved: the end was brought back to it.
+        """
+        self.settled, self._accepted = not self.curved, True
 
     def forget(self) -> None:
         """The next direction is a first one: the point is not where PCPG has stopped."""
-        self._directions.fresh, self.settled = True, False
+        self._directions.fresh, self.settled, self._accepted = True, False, False
 
     def solve(self, start: Point, face: Face, optimality: float) -> Trial:
         """Solve on a face; drop what leaves Ω, restore Gλ = e, solve again.
@@ -144,9 +152,11 @@ class FaceSolver:
             face: The face.
             optimality: ‖g^P‖ there.
         """
-        z, first, feasible, out = start.copy(), None, self._qp.feasible, False
-        stays = self.enter(face) and self.settled
+        z, first, out, accepted = start.copy(), None, True, self._accepted
+        stays, rounds = self.enter(face) and accepted, 0
         for _ in range(MOST_ROUNDS):
+            self._ready()
+            assert self._face is not None
             target = self._target(z, optimality, stays)
             bound = self._dependent.slack(z, target)
             if self.contradicts:
@@ -157,60 +167,71 @@ class FaceSolver:
                 continue
             before = z.copy()
             broken = self._pcpg(z, target) == ConvergedReason.DIVERGED_INDEFINITE_MAT
-            stays = False
+            stays, rounds = False, rounds + 1
             self._dependent.shorten(before, z)
             before.destroy()
             if first is None:
-                first = z.copy()
-            inside = feasible.project(z.lam.array_r)
-            out = any_rank(self._comm, not np.array_equal(inside, z.lam.array_r))
+                first, face = z.copy(), self._face
+            out = has_left(self._qp, self._face, z.lam.array_r)
             if self._steps.cg >= self._max_it or not (out or (broken and self._dependent.slide(z))):
                 break
-            z.lam.array[:] = feasible.project(z.lam.array_r)
+            z.lam.array[:] = self._qp.feasible.project(z.lam.array_r)
             self._drop(z)
-        return Trial(first or z.copy(), z, not out)
+        assert self._face is not None
+        back = not out and (not self.curved or brought_back(self._qp, self._face, z))
+        return Trial(first or z.copy(), z, back, face, rounds)
 
     def _drop(self, z: Point) -> None:
         """Enter the face of z, and bring z back to Gλ = e in it; multiplies by F once."""
         previous, feasible = self._face, self._qp.feasible
         assert previous is not None
-        face = feasible.face(z.lam.array_r, z.g.array_r)
-        self.enter(face)
+        on = np.array(z.lam.array_r)
+        self.enter(feasible.face(on, z.g.array_r))
         near = self._restored(z.lam)
-        if imbalance(self.coarse, near) > HELD:
+        if self._imbalance(near) > HELD:
             # it no longer holds a body: what is nearest names rows that do, near by if it can
             near.destroy()
-            within = WithinFace(feasible, previous, z.lam.array_r)
-            found = nearest(self._qp.coarse, within, z.lam)
+            found = nearest(self._qp.coarse, WithinFace(feasible, previous), z.lam)
             if imbalance(self._qp.coarse, found.lam) > HELD:
                 found.lam.destroy()
                 found = nearest(self._qp.coarse, feasible, z.lam)
             near = found.lam
-            middle = 0.5 * (z.lam.array_r + near.array_r)
-            self.enter(feasible.face(middle, z.g.array_r))
+            on = 0.5 * (z.lam.array_r + near.array_r)
+            self.enter(feasible.face(on, z.g.array_r))
         near.copy(z.lam)
         near.destroy()
         z.refresh(self._qp)
+        if self.curved and self._face is not None:
+            self._face = bent_at(self._qp, self.coarse, self._face, on, z.g)
         self.forget()
 
     def _restored(self, lam: PETSc.Vec) -> PETSc.Vec:
         """The nearest point of Gλ = e on the face entered, if it has one."""
-        near = restored(self.coarse, lam)
-        if imbalance(self.coarse, near) > EXACT:  # what its factor leaves where rows hardly hold
-            once, near = near, restored(self.coarse, near)
+        assert self._face is not None
+        near = restored_on(self._qp, self.coarse, self._face, lam)
+        if self._imbalance(near) > EXACT:  # what its factor leaves where rows hardly hold
+            once, near = near, restored_on(self._qp, self.coarse, self._face, near)
             once.destroy()
         return near
+
+    def _imbalance(self, lam: PETSc.Vec) -> float:
+        assert self._face is not None
+        return imbalance_on(self._qp, self.coarse, self._face, lam)
 
     def _target(self, z: Point, optimality: float, stays: bool) -> float:
         """What PCPG aims at: a part of what there is to do; more where the face stays."""
         z.g.copy(self._directions.r)
         self.coarse.project(self._directions.r)
         start, final = float(self._directions.r.norm()), FINAL * self._rule.tolerance
-        share = STAGE if stays else self._parameters.reduction
+        followed = self._stayed and self.curved and optimality <= FOLLOWED * self.left
+        self._stage = STAGE if not stays else self._stage**2 if followed else self._stage
+        self._stayed = stays
+        share = self._stage if stays else self._parameters.reduction
         return max(final, share * min(start, optimality))
 
     def _pcpg(self, z: Point, target: float) -> ConvergedReason:
-        """PCPG on the face entered."""
+        """PCPG on the face entered; what a curvature adds is taken from the gradient again."""
+        before = np.array(z.lam.array_r)
         reason = pcpg(
             self._on_face,
             z,
@@ -223,6 +244,8 @@ class FaceSolver:
         self.left = float(self._directions.r.norm())
         ended = reason == ConvergedReason.DIVERGED_ROUNDING
         self.rounded = self.rounded + 1 if ended else 0
+        if self._bent is not None:
+            z.g.array[:] -= self._bent.bend(z.lam.array_r - before)
         return reason
 
     def _leave(self) -> None:
@@ -232,7 +255,7 @@ class FaceSolver:
         if self._preconditioner is not None:
             self._preconditioner.destroy()
             self._preconditioner = self._dependent.preconditioner = None
-        self._face = None
+        self._face, self._prepared = None, False
 
     def destroy(self) -> None:
         """Free what it holds. Collective."""

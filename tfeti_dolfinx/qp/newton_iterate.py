@@ -10,11 +10,13 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.parallel import agreed
-from tfeti_dolfinx.qp.faces import Face
+from tfeti_dolfinx.qp.faces import Face, without_slip
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.nearest import nearest
-from tfeti_dolfinx.qp.newton_faces import FaceSolver, Trial
+from tfeti_dolfinx.qp.newton_curved import brought_back, is_curved
+from tfeti_dolfinx.qp.newton_faces import FaceSolver
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, QPResult, Steps
+from tfeti_dolfinx.qp.trial import Trial
 
 # of what the gradient step promises at least, (ᾱ/2)‖g^P‖²: a step must lower q by that share
 ENOUGH = 0.1
@@ -23,6 +25,8 @@ ENOUGH = 0.1
 MOST = 0.1
 # times Fλ − d: multipliers that are larger are rounding, for Gᵀμ is to be as large as that
 WILD = 1e3
+# of a way along a face that is curved, where q is not low enough at its end
+SHORTER = 0.5
 # of λ: what a way must be, so that F on it is not F on rounding of Gλ = e
 SHORT = 1e-6
 # so many steps in a row that neither lower q by what stands out from its rounding, nor halve ‖g^P‖
@@ -131,7 +135,10 @@ class Iterate:
         lam, s, feasible = self.point.lam.array_r, self.s.array_r, self._qp.feasible
         phi, beta = feasible.split(lam, s)
         phi = feasible.reduced(lam, phi, 1.0 / self.norm)  # what soon stops at a bound is little
-        free, chopped = self._comm.allreduce(np.array([phi @ phi, beta @ beta]), op=MPI.SUM)
+        within = self.face().restricted(beta)  # along a boundary that is curved
+        beta = beta - within
+        sums = np.array([phi @ phi + within @ within, beta @ beta])
+        free, chopped = self._comm.allreduce(sums, op=MPI.SUM)
         if faces.settled:
             free = faces.left**2
         if agreed(self._comm, chopped > gamma**2 * free):
@@ -148,22 +155,41 @@ class Iterate:
         known = np.isfinite(self.residual)
         enough = ENOUGH * 0.5 / self.norm * self.residual**2 if known else 0.0
         gain = self.gain(trial.last)
-        if trial.feasible and agreed(self._comm, gain >= enough):
+        if trial.feasible and agreed(self._comm, gain >= enough - self._hidden(trial.face)):
             self._take(trial.last, gain)
             faces.settle()
             return True
         faces.forget()
-        length = self._feasible_part(trial.first)
+        length = self._feasible_part(trial)
+        curved = is_curved(self.qp, trial.face)
+        shares = [length] if not curved else [SHORTER * length, SHORTER**2 * length]
+        if curved and trial.rounds > 1:
+            shares.insert(0, length)
+        taken = any(self._shortened(trial, share, curved, enough) for share in shares)
+        return taken or self._descend(known, faces)
+
+    def _hidden(self, face: Face) -> float:
+        """What rounding hides of q where rows slip: s and λ are both large there. Collective."""
+        lam, s = self.point.lam.array_r, self.s.array_r
+        slip = np.abs(lam * s) - without_slip(face, np.abs(lam * s))
+        return ROUNDING * float(self._comm.allreduce(float(slip.sum())))
+
+    def _shortened(self, trial: Trial, length: float, curved: bool, enough: float) -> bool:
+        """Go a part of the first solve's way, if q falls enough there."""
         shorter = self.point.copy()
         for kept, end in ((shorter.lam, trial.first.lam), (shorter.g, trial.first.g)):
             kept.aypx(1.0 - length, self._scaled(length, end))
-        shorter.lam.array[:] = self._qp.feasible.project(shorter.lam.array_r)
+        held = True
+        if curved:
+            held = brought_back(self.qp, trial.face, shorter)
+        else:
+            shorter.lam.array[:] = self._qp.feasible.project(shorter.lam.array_r)
         gain = self.gain(shorter)
-        taken = agreed(self._comm, length > 0.0 and gain >= enough)
+        taken = agreed(self._comm, held and length > 0.0 and gain >= enough)
         if taken:
             self._take(shorter, gain)
         shorter.destroy()
-        return taken or self._descend(known, faces)
+        return taken
 
     @property
     def stalled(self) -> bool:
@@ -209,9 +235,9 @@ class Iterate:
         p.destroy()
         return moved
 
-    def _feasible_part(self, end: Point) -> float:
-        """Largest t up to 1 with λ + t(end − λ) ∈ Ω. Collective."""
-        down = self.point.lam.array_r - end.lam.array_r
+    def _feasible_part(self, trial: Trial) -> float:
+        """Largest t up to 1 with λ + t(first − λ) ∈ Ω, but for rows that slip. Collective."""
+        down = without_slip(trial.face, self.point.lam.array_r - trial.first.lam.array_r)
         own = self._qp.feasible.max_step(self.point.lam.array_r, down)
         return min(1.0, float(self._comm.allreduce(own, op=MPI.MIN)))
 

@@ -133,13 +133,12 @@ SOLVERS = {
     "newton": Solver(
         _newton,
         keeps_bounds=True,
-        keeps_discs=False,
+        keeps_discs=True,
         pc_type="dirichlet",
         relative_to_norm=False,
         cold=first_point,
         warm=feasible_start,
     ),
 }
-# what auto stands for, without and with inequalities, and with discs
+# what auto stands for, without and with inequalities
 AUTO = {False: "pcpg", True: "newton"}
-AUTO_WITH_DISCS = "smalse"

@@ -1,0 +1,132 @@
+"""Block Newton with discs, ellipses and intervals, against an interior point method."""
+
+import numpy as np
+import pytest
+from conic import constrained_qp
+from hypothesis import given
+from hypothesis import strategies as st
+from test_mpgp import around_circles, as_set, program
+from test_qp import matrix, vector
+
+from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
+from tfeti_dolfinx.qp.discs import Discs, Ellipses
+from tfeti_dolfinx.qp.faces import Status
+from tfeti_dolfinx.qp.homogenised import homogenise, image
+from tfeti_dolfinx.qp.monitors import no_monitor
+from tfeti_dolfinx.qp.nearest import WithinFace, nearest
+from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Start
+from tfeti_dolfinx.qp.stopping import ResidualRule
+
+
+def solved(qp, tolerance, monitor=no_monitor, start=None):
+    at = image(qp.F, feasible_start(qp, start) if start else first_point(qp))
+    rule = ResidualRule(tolerance)
+    return newton(qp, homogenise(qp, at), rule, max_it=2000, warm=bool(start), monitor=monitor)
+
+
+@given(st.integers(0, 1000), st.sampled_from([1, 2]), st.booleans())
+def test_it_agrees_with_an_interior_point_method(seed, k, isotropic):
+    F, d, G, e, bounded, pairs, a = program(seed, k, isotropic)
+    feasible = as_set(bounded, pairs, a, isotropic)
+    qp = QP(matrix(F), vector(d), DenseCoarse(G, e), feasible)
+    result = solved(qp, 1e-10 * np.linalg.norm(d))
+    assert result.reason == ConvergedReason.CONVERGED_RTOL
+    lam = result.lam.array
+    exact = constrained_qp(F, d, G, e, bounded, pairs, a)
+    assert np.linalg.norm(lam - exact) <= 1e-7 * np.linalg.norm(exact)
+    assert np.allclose(feasible.project(lam), lam, rtol=0, atol=1e-13)
+    assert np.allclose(G @ lam, e, atol=1e-10)
+
+
+@pytest.mark.parametrize("isotropic", [True, False])
+@pytest.mark.parametrize("seed", range(5))
+def test_the_cost_falls_and_iterates_are_feasible(seed, isotropic):
+    F, d, G, e, bounded, pairs, a = program(seed, 2, isotropic)
+    feasible, costs = as_set(bounded, pairs, a, isotropic), []
+
+    def monitor(steps, step, x, projected_gradient, equality):
+        if step in ("start", "outer"):
+            lam = np.array(x.array_r)
+            assert np.allclose(feasible.project(lam), lam, rtol=0, atol=1e-12)
+            assert np.allclose(G @ lam, e, atol=1e-9)
+            costs.append(0.5 * lam @ F @ lam - d @ lam)
+
+    solved(QP(matrix(F), vector(d), DenseCoarse(G, e), feasible), 1e-9, monitor)
+    assert len(costs) > 3
+    assert np.all(np.diff(costs) <= 1e-12 * np.abs(costs[-1]))
+
+
+@given(st.integers(0, 1000))
+def test_where_all_points_slide_the_end_is_superlinear(seed):
+    F, d, radius = around_circles(seed)
+    residuals = []
+
+    def monitor(steps, step, x, projected_gradient, equality):
+        if step == "outer":
+            residuals.append(projected_gradient)
+
+    qp = QP(matrix(F), vector(d), NoCoarse(), Discs(radius))
+    result = solved(qp, 1e-11 * np.linalg.norm(d), monitor)
+    assert result.reason == ConvergedReason.CONVERGED_RTOL
+    assert np.all(result.face.status == Status.SLIP)
+    exact = constrained_qp(
+        F,
+        d,
+        np.zeros((0, 24)),
+        np.zeros(0),
+        [],
+        np.arange(24).reshape(12, 2),
+        np.repeat(radius[:, None], 2, axis=1),
+    )
+    assert np.linalg.norm(result.lam.array - exact) <= 1e-8 * np.linalg.norm(exact)
+    assert len(residuals) <= 12
+
+
+def test_from_its_own_solution_it_multiplies_once():
+    F, d, G, e, bounded, pairs, a = program(3, 2, True)
+    qp = QP(matrix(F), vector(d), DenseCoarse(G, e), as_set(bounded, pairs, a, True))
+    found = solved(qp, 1e-10)
+    again = solved(qp, 1e-8, start=Start(found.lam, found.mu))
+    assert again.steps.cg == again.steps.outer == 0
+    assert np.allclose(again.lam.array, found.lam.array, atol=1e-9)
+
+
+@given(st.integers(0, 1000), st.booleans())
+def test_the_nearest_feasible_point(seed, isotropic):
+    _, _, G, e, bounded, pairs, a = program(seed, 2, isotropic)
+    y = 2.0 * np.random.default_rng(seed).standard_normal(40)
+    feasible = as_set(bounded, pairs, a, isotropic)
+    found = nearest(DenseCoarse(G, e), feasible, vector(y))
+    assert found.missing <= 1e-12
+    exact = constrained_qp(np.eye(40), y, G, e, bounded, pairs, a)
+    assert np.linalg.norm(found.lam.array - exact) <= 1e-7 * np.linalg.norm(exact)
+
+
+@given(st.integers(0, 1000))
+def test_within_a_face_what_slips_stays_on_its_boundary(seed):
+    rng = np.random.default_rng(seed)
+    a = rng.uniform(0.2, 2.0, (30, 2))
+    angle = rng.uniform(0.0, 2.0 * np.pi, 30)
+    x = (a * np.stack((np.cos(angle), np.sin(angle)), axis=1)).ravel()
+    for feasible in (Ellipses(a), Discs(a[:, 0])):
+        on = feasible.project(10.0 * x)
+        face = feasible.face(on, np.zeros(60))
+        normal = feasible.project(2.0 * on) - 2.0 * on
+        near = on + 0.05 * np.repeat(a.min(axis=1), 2) * rng.uniform(-1.0, 1.0, 60)
+        y = WithinFace(feasible, face, slipping=True).project(near)
+        assert np.all(feasible.face(y, np.zeros(60)).status == Status.SLIP)
+        # the way to the nearest point of a boundary is normal to it
+        tangents = feasible.face(y, normal).Z
+        assert np.allclose(tangents.T @ (near - y), 0.0, atol=1e-9)
+
+
+def test_what_nothing_in_the_set_balances_is_said():
+    """Two discs of radius 1 cannot carry 3."""
+    qp = QP(
+        matrix(np.eye(4)),
+        vector(np.ones(4)),
+        DenseCoarse(np.array([[1.0, 0.0, 1.0, 0.0]]), np.array([3.0])),
+        Discs(np.ones(2)),
+    )
+    assert solved(qp, 1e-9).reason == ConvergedReason.DIVERGED_STALLED

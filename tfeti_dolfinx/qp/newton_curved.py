@@ -1,0 +1,121 @@
+"""Faces that are curved, as where nodes slip: what block Newton does there besides."""
+
+from __future__ import annotations
+
+import numpy as np
+from petsc4py import PETSc
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.parallel import any_rank
+from tfeti_dolfinx.qp.coarse import Coarse, imbalance
+from tfeti_dolfinx.qp.faces import Face, Status, without_slip
+from tfeti_dolfinx.qp.homogenised import restored
+from tfeti_dolfinx.qp.nearest import WithinFace, nearest
+from tfeti_dolfinx.qp.problem import QP, Operator, Point
+
+# Gλ = e holds as well as factors can tell
+HELD = 1e-9
+
+
+class Bent:
+    """F + Z diag(κ) Zᵀ: along a face that bends, to second order, q has this Hessian.
+
+    Args:
+        F: The operator.
+        face: The face.
+    """
+
+    def __init__(self, F: Operator, face: Face) -> None:
+        self._F, self._face = F, face
+
+    def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """y = (F + Z diag(κ) Zᵀ)x. Collective."""
+        self._F.mult(x, y)
+        y.array[:] += self.bend(x.array_r)
+
+    def bend(self, x: Array) -> Array:
+        """Z diag(κ) Zᵀx."""
+        return np.asarray(self._face.Z @ (self._face.curvature * (self._face.Z.T @ x)))
+
+
+def is_curved(qp: QP, face: Face) -> bool:
+    """Whether a row of some rank slips along a boundary. Collective."""
+    return any_rank(qp.d.getComm().tompi4py(), face.curved)
+
+
+def is_rubbing(qp: QP, face: Face) -> bool:
+    """Whether a row of some rank sticks or slips. Collective."""
+    rubbing = np.isin(face.status, (Status.STICK, Status.SLIP))
+    return any_rank(qp.d.getComm().tompi4py(), bool(np.any(rubbing)))
+
+
+def has_left(qp: QP, face: Face, x: Array) -> bool:
+    """Whether rows that do not slip are outside of Ω. Collective."""
+    left = without_slip(face, qp.feasible.project(x) - x)
+    return any_rank(qp.d.getComm().tompi4py(), bool(np.any(left != 0.0)))
+
+
+def restored_on(qp: QP, coarse: Coarse, face: Face, lam: PETSc.Vec) -> PETSc.Vec:
+    """λ + ZG_fᵀ(G_fG_fᵀ)⁺(e − Gλ). Collective.
+
+    Args:
+        qp: The program.
+        coarse: Projectors of the face.
+        face: The face.
+        lam: A point of the face.
+    """
+    if not _is_beside(face, lam):
+        return restored(coarse, lam)
+    near = lam.duplicate()
+    coarse.combine(coarse.solve(qp.coarse.residual(lam)), near)
+    near.axpy(1.0, lam)
+    return near
+
+
+def imbalance_on(qp: QP, coarse: Coarse, face: Face, lam: PETSc.Vec) -> float:
+    """How far Gλ is from e: the worst entry beside its terms, 1 at most. Collective."""
+    return imbalance(qp.coarse if _is_beside(face, lam) else coarse, lam)
+
+
+def _is_beside(face: Face, lam: PETSc.Vec) -> bool:
+    """Whether λ is not 0 in directions that are not the face's, as where rows slip."""
+    fixed = lam.array_r - face.restricted(lam.array_r)
+    return any_rank(lam.getComm().tompi4py(), bool(np.any(fixed)))
+
+
+def bent_at(qp: QP, coarse: Coarse, face: Face, on: Array, g: PETSc.Vec) -> Face:
+    """A face with the curvature that belongs to another gradient. Collective.
+
+    Args:
+        qp: The program.
+        coarse: Projectors of the face.
+        face: The face.
+        on: A point that has this face, shape ``(m,)``.
+        g: Fλ − d.
+    """
+    s = g.duplicate()
+    qp.coarse.combine(coarse.coordinates(g), s)
+    s.aypx(-1.0, g)
+    curvature = qp.feasible.face(on, s.array_r).curvature
+    s.destroy()
+    return Face(face.Z, curvature, face.status)
+
+
+def brought_back(qp: QP, face: Face, z: Point) -> bool:
+    """Bring z back to where slipping rows are on their boundary and Gz = e. Collective.
+
+    Multiplies by F once.
+
+    Returns:
+        Whether there is such a point near by.
+    """
+    found = nearest(qp.coarse, WithinFace(qp.feasible, face, slipping=True), z.lam)
+    held = imbalance(qp.coarse, found.lam) <= HELD
+    bend, image = found.lam.copy(), z.g.duplicate()
+    bend.axpy(-1.0, z.lam)
+    qp.F.mult(bend, image)
+    found.lam.copy(z.lam)
+    z.g.axpy(1.0, image)
+    for vec in (bend, image, found.lam):
+        vec.destroy()
+    return held
