@@ -44,6 +44,17 @@ def test_ranks_do_not_matter(serial_only, tmp_path, scene, cell):
         assert np.all(np.abs(one["gap"][apart]) <= 1e-8 * deepest)
 
 
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_ranks_do_not_matter_to_friction(serial_only, tmp_path, cell):
+    one, *others = (solve(tmp_path, ranks, "rough", cell, 6, 1e-10) for ranks in (1, 2, 4))
+    assert min(one["sticking"], one["sliding"]) > 0
+    largest = np.abs(one["traction"]).max()
+    for other in others:
+        assert relative(other["u"], one["u"]) <= 1e-7
+        assert np.allclose(other["traction"], one["traction"], rtol=0.0, atol=1e-6 * largest)
+        assert (other["sticking"], other["sliding"]) == (one["sticking"], one["sliding"])
+
+
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_numbers_of_subdomains_do_not_matter(serial_only, tmp_path, scene, cell):
