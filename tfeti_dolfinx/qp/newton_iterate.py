@@ -184,7 +184,8 @@ class Iterate:
         """Go a part of the first solve's way, if q falls enough there."""
         shorter = self.point.copy()
         for kept, end in ((shorter.lam, trial.first.lam), (shorter.g, trial.first.g)):
-            kept.aypx(1.0 - length, self._scaled(length, end))
+            kept.scale(1.0 - length)
+            kept.axpy(length, end)
         held = True
         if curved:
             held = brought_back(self.qp, trial.face, shorter)
@@ -246,11 +247,6 @@ class Iterate:
         down = without_slip(trial.face, self.point.lam.array_r - trial.first.lam.array_r)
         own = self._qp.feasible.max_step(self.point.lam.array_r, down)
         return min(1.0, float(self._comm.allreduce(own, op=MPI.MIN)))
-
-    def _scaled(self, share: float, x: PETSc.Vec) -> PETSc.Vec:
-        x.copy(self._work)
-        self._work.scale(share)
-        return self._work
 
     def result(self, reason: ConvergedReason, steps: Steps) -> QPResult:
         """The answer; takes λ and s over."""
