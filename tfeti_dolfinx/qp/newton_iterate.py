@@ -29,10 +29,9 @@ WILD = 1e3
 SHORTER = 0.5
 # of λ: what a way must be, so that F on it is not F on rounding of Gλ = e
 SHORT = 1e-6
-# so many steps in a row that neither lower q by what stands out from its rounding, nor halve ‖g^P‖
-PATIENCE, ROUNDING = 10, 1e-15
-# so many in a row that do not halve ‖g^P‖, whatever q does
-LONG = 100
+# so many steps in a row that neither lower q by what stands out from its rounding, nor halve
+# ‖g^P‖; so many that do not halve it, whatever q does
+PATIENCE, LONG, ROUNDING = 10, 100, 1e-15
 
 
 class Iterate:
