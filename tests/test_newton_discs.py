@@ -13,7 +13,7 @@ from tfeti_dolfinx.qp.discs import Discs, Ellipses
 from tfeti_dolfinx.qp.faces import Status
 from tfeti_dolfinx.qp.homogenised import homogenise, image
 from tfeti_dolfinx.qp.monitors import no_monitor
-from tfeti_dolfinx.qp.nearest import Pinned, WithinFace, nearest
+from tfeti_dolfinx.qp.nearest import WithinFace, nearest
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Start
 from tfeti_dolfinx.qp.stopping import ResidualRule
@@ -119,23 +119,6 @@ def test_within_a_face_what_slips_stays_on_its_boundary(seed):
         # the way to the nearest point of a boundary is normal to it
         tangents = feasible.face(y, normal).Z
         assert np.allclose(tangents.T @ (near - y), 0.0, atol=1e-9)
-
-
-@given(st.integers(0, 1000), st.sampled_from([1, 2]))
-def test_the_nearest_point_with_pinned_rows(seed, k):
-    """They keep their values; elsewhere λ = P(y + Gᵀα), with Gλ = e."""
-    _, y, G, _, bounded, pairs, a = program(seed, k, True)
-    feasible, rng = as_set(bounded, pairs, a, True), np.random.default_rng(seed)
-    values = feasible.project(3.0 * rng.standard_normal(len(y)))
-    pinned = np.zeros(len(y), dtype=bool)
-    pinned[np.asarray(pairs)[rng.random(len(pairs)) < 0.4]] = True
-    other = feasible.project(rng.standard_normal(len(y)))
-    e = G @ np.where(pinned, values, other)  # so there is such a point
-    found = nearest(DenseCoarse(G, e), Pinned(feasible, pinned, values), vector(y))
-    lam = found.lam.array
-    assert found.missing <= 1e-10
-    assert np.array_equal(lam[pinned], values[pinned])
-    assert np.allclose(feasible.project(y + G.T @ found.alpha)[~pinned], lam[~pinned], atol=1e-9)
 
 
 def test_what_nothing_in_the_set_balances_is_said():

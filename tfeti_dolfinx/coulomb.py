@@ -18,10 +18,9 @@ from tfeti_dolfinx.parallel import agreed, any_rank, summed
 from tfeti_dolfinx.qp.acceleration import Anderson
 from tfeti_dolfinx.qp.cones import Cones
 from tfeti_dolfinx.qp.discs import Ellipses
-from tfeti_dolfinx.qp.faces import Face, Status
 from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Product
 from tfeti_dolfinx.qp.monitors import Monitor
-from tfeti_dolfinx.qp.nearest import Pinned, nearest
+from tfeti_dolfinx.qp.nearest import nearest
 from tfeti_dolfinx.qp.problem import ConvergedReason, QPResult, Steps
 from tfeti_dolfinx.solver import solve_dual
 
@@ -33,8 +32,6 @@ FIRST, SHARE = 1e-2, 0.03
 BESIDE_RTOL = 100.0
 # of what is wanted: a change from which on the next one may be small enough
 NEAR = 10.0
-# Gλ = e holds as well as factors can tell
-HELD = 1e-9
 # of all multipliers: forces of normals that rounding makes of none
 NO_FORCE = 1e-13
 # factors on the forces of normals of the nearest balanced point: it is found to some digits only
@@ -81,11 +78,8 @@ def solve_with_friction(
     bounds, steps, looks = _Pressures(dual, start), Steps(), 0
     tolerance = min(options.friction_rtol, BESIDE_RTOL * options.rtol)
     change, iterations = np.inf, 0
-    face: Face | None = None
     while True:
         bounds.set_feasible(start)
-        if start is not None and face is not None:
-            start = (bounds.slipping_on(start[0], face), start[1])
         near = change <= NEAR * tolerance
         rtol = options.rtol if near else max(options.rtol, min(FIRST, SHARE * change))
         result, rule = solve_dual(dual, replace(options, rtol=rtol), qp_type, start, monitor)
@@ -101,7 +95,7 @@ def solve_with_friction(
             break
         if change > tolerance:
             bounds.advance()
-        start, face = (np.array(result.lam.array_r), result.mu), result.face
+        start = (np.array(result.lam.array_r), result.mu)
         result.destroy()
     result.steps, rule.looks = steps, looks
     return result, rule, Settling(iterations, float(change), tolerance)
@@ -180,20 +174,6 @@ class _Pressures:
         """Take the next bounds."""
         sticks = self._sticks
         self._now = self._found if sticks else self._anderson.next(self._now, self._found)
-
-    def slipping_on(self, values: Array, face: Face) -> Array:
-        """Multipliers to start from, where what has slipped on a face is at its new bound.
-
-        Inside of it, it would stick at first, and a belt on a drum is let go node by node then.
-        """
-        qp, slips, lam = self._dual.qp(), face.status == Status.SLIP, self._dual.d.duplicate()
-        lam.array[:] = values
-        at = qp.feasible.onto(values, face.status)
-        found = nearest(qp.coarse, Pinned(qp.feasible, slips, at), lam)
-        lam.destroy()
-        near = np.array(found.lam.array_r)
-        found.lam.destroy()
-        return near if agreed(self._comm, found.missing <= HELD) else values
 
     @property
     def _sticks(self) -> bool:

@@ -133,36 +133,10 @@ class WithinFace:
 
     def face(self, x: Array, g: Array) -> Face:
         """The face of x, without the rows that stay open."""
-        face = _without(self._feasible.face(x, g), self._open)
+        face = self._feasible.face(x, g)
+        kept = np.flatnonzero(abs(face.Z).T @ self._open.astype(float) == 0.0)
         status = np.where(self._open, Status.OPEN, face.status)
-        return Face(face.Z, face.curvature, status)
-
-
-class Pinned:
-    """Those points of Ω that have given values in some rows.
-
-    Args:
-        feasible: The set Ω.
-        pinned: Flags of these rows: of both tangential rows of a node, or of none.
-        values: Their values, feasible ones, and any for the other rows.
-    """
-
-    def __init__(self, feasible: FeasibleSet, pinned: Array, values: Array) -> None:
-        self._feasible, self._pinned, self._values = feasible, pinned, values
-
-    def project(self, x: Array) -> Array:
-        """P_Ω(x), but for the rows that are given."""
-        return np.where(self._pinned, self._values, self._feasible.project(x))
-
-    def face(self, x: Array, g: Array) -> Face:
-        """The face of x, without the rows that are given."""
-        return _without(self._feasible.face(x, g), self._pinned)
-
-
-def _without(face: Face, rows: Array) -> Face:
-    """A face without the directions in which some rows would move."""
-    kept = np.flatnonzero(abs(face.Z).T @ rows.astype(float) == 0.0)
-    return Face(csr_array(face.Z[:, kept]), face.curvature[kept], face.status)
+        return Face(csr_array(face.Z[:, kept]), face.curvature[kept], status)
 
 
 @dataclass(frozen=True)
