@@ -33,11 +33,18 @@ def test_all_of_the_belt_slips_back(belt, comm):
 
 
 def test_few_problems_and_multiplications(belt):
-    """What has slipped starts at its new bound: else it takes five times as many."""
     _, report = belt
     assert report.friction_iterations <= 10
     assert report.in_all["friction_iterations"] <= 20
     assert report.in_all["F_multiplications"] <= 1500
+
+
+def test_forces_are_those_of_a_sharper_solve(belt):
+    """A drum that turns moves far: displacements say little of forces, bounds at rest do."""
+    _, report = belt
+    _, exact = belt_2d.run(["--quick", "-tfeti_rtol", "1e-10"])
+    for name in ("capstan", "capstan_hung"):
+        assert abs(report.errors[name] - exact.errors[name]) <= 1e-4
 
 
 def test_another_angle_and_coefficient():

@@ -99,6 +99,7 @@ def solve_dual(
     scale = homogenised.scale
     rule = Accuracy(dual, options.rtol, options.atol, scale.reference, scale.rounding, qp.norm)
     result = solver.solve(Task(qp, homogenised, rule, options, begin, monitor))
+    dual.saw(result.norm)
     homogenised.destroy()
     if begin is not None:
         begin.lam.destroy()

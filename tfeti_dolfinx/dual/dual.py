@@ -110,6 +110,7 @@ class Dual:
         self._law, self.feasible = feasible, feasible(constraints)
         self._images = dict[str, tuple[Array, Image]]()
         self._norm: tuple[int, float] | None = None
+        self._seen = 0.0
         self._check()
         self.d = linear_term(B, constraints.c, subdomains)
 
@@ -150,7 +151,14 @@ class Dual:
         self.feasible = self._law(self.constraints)  # c may be another, and what the law refers to
         norm = self._norm_of(coarse, norm_steps) if norm_steps else 1.0
         on = self._preconditioner_on if self.preconditioner is not None else None
-        return QP(self.F, self.d, coarse, self.feasible, self.preconditioner, norm, on)
+        return QP(self.F, self.d, coarse, self.feasible, self.preconditioner, norm, on, self._seen)
+
+    def saw(self, norm: float) -> None:
+        """A solve has estimated ‖F‖: what the next one begins with.
+
+        Of its start alone it might see far less, and take its multipliers for less exact.
+        """
+        self._seen = max(self._seen, norm)
 
     def _preconditioner_on(self, face: Face) -> FaceOperator:
         """The preconditioner on a face of the rows; what all faces share is made once."""

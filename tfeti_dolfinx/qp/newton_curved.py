@@ -101,6 +101,16 @@ def bent_at(qp: QP, coarse: Coarse, face: Face, on: Array, g: PETSc.Vec) -> Face
     return Face(face.Z, curvature, face.status)
 
 
+def slipping_work(lam: PETSc.Vec, s: PETSc.Vec, face: Face) -> float:
+    """Σ|s_iλ_i| over what slips, where both are large: rounding of it hides changes of q.
+
+    Collective.
+    """
+    own = np.abs(lam.array_r * s.array_r)
+    slip = float(np.sum(own - without_slip(face, own)))
+    return float(lam.getComm().tompi4py().allreduce(slip))
+
+
 def slipping_start(
     qp: QP, at: Point, face: Face, back: PETSc.Vec, pressed: Face
 ) -> tuple[Point, Face]:

@@ -75,6 +75,7 @@ class FaceSolver:
         self._steps, self._max_it, self._monitor = steps, max_it, monitor
         self._comm = qp.d.getComm().tompi4py()
         self._directions = Directions(qp.d)
+        self._directions.norm = qp.seen
         self._dependent = DependentRows(qp, self._directions)
         self._face: Face | None = None
         self.settled, self.left, self.rounded = False, float("inf"), 0

@@ -13,7 +13,7 @@ from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.qp.faces import Face, without_slip
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.nearest import nearest
-from tfeti_dolfinx.qp.newton_curved import brought_back, is_curved, slipping_start
+from tfeti_dolfinx.qp.newton_curved import brought_back, is_curved, slipping_start, slipping_work
 from tfeti_dolfinx.qp.newton_faces import FaceSolver
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, QPResult, Steps
 from tfeti_dolfinx.qp.trial import Trial
@@ -92,8 +92,10 @@ class Iterate:
 
     def look(self, faces: FaceSolver) -> None:
         """Optimality: how far a gradient step, brought back to the feasible set, moves."""
-        self.norm = faces.norm or _rayleigh(self._qp, self.point) or 1.0
         self._set_multipliers()
+        if faces.norm == 0.0:
+            self._see(faces)
+        self.norm = faces.norm or 1.0
         if faces.settled:
             self.multipliers_on(faces)
         target = self.point.lam.copy()
@@ -112,6 +114,14 @@ class Iterate:
         self._idle, self._slow = self._idle + 1, self._slow + 1
         if self.residual <= 0.5 * self._best:
             self._best, self._idle, self._slow = self.residual, 0, 0
+
+    def _see(self, faces: FaceSolver) -> None:
+        """Rayleigh quotients of F at λ, which alone may be far below ‖F‖, and at s."""
+        lam, g, s = self.point.lam, self.point.g, self.s
+        faces.saw(lam.dot(g) + lam.dot(self._qp.d), lam.dot(lam))
+        if agreed(self._comm, s.norm() > 0.0):
+            self._qp.F.mult(s, self._work)
+            faces.saw(s.dot(self._work), s.dot(s))
 
     def _set_multipliers(self) -> None:
         self._qp.coarse.combine(self.mu, self.s)
@@ -160,7 +170,8 @@ class Iterate:
         known = np.isfinite(self.residual)
         enough = ENOUGH * 0.5 / self.norm * self.residual**2 if known else 0.0
         gain = self.gain(trial.last)
-        if trial.feasible and agreed(self._comm, gain >= enough - self._hidden(trial.face)):
+        hidden = ROUNDING * slipping_work(self.point.lam, self.s, trial.face)
+        if trial.feasible and agreed(self._comm, gain >= enough - hidden):
             self._take(trial.last, gain)
             faces.settle()
             return True
@@ -172,12 +183,6 @@ class Iterate:
             shares.insert(0, length)
         taken = any(self._shortened(trial, share, curved, enough) for share in shares)
         return taken or self._descend(known, faces)
-
-    def _hidden(self, face: Face) -> float:
-        """What rounding hides of q where rows slip: s and λ are both large there. Collective."""
-        lam, s = self.point.lam.array_r, self.s.array_r
-        slip = np.abs(lam * s) - without_slip(face, np.abs(lam * s))
-        return ROUNDING * float(self._comm.allreduce(float(slip.sum())))
 
     def _shortened(self, trial: Trial, length: float, curved: bool, enough: float) -> bool:
         """Go a part of the first solve's way, if q falls enough there."""
@@ -272,9 +277,3 @@ class Iterate:
         for vec in (self.s, self._work, self._qp.d, self.back):
             if vec is not None:
                 vec.destroy()
-
-
-def _rayleigh(qp: QP, point: Point) -> float:
-    """λᵀFλ/λᵀλ, 0 where λ = 0."""
-    size = point.lam.dot(point.lam)
-    return float(point.lam.dot(point.g) + point.lam.dot(qp.d)) / size if size > 0.0 else 0.0

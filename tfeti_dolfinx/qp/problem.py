@@ -51,6 +51,7 @@ class QP:
         norm: Estimate of ‖PFP‖, which step lengths are relative to; 1 where nobody asks.
         preconditioner_on: Makes an approximate inverse of ZᵀFZ for a face Z, between vectors of
             the face in the layout of all rows; or None.
+        seen: Largest Rayleigh quotient of F that earlier solves have seen; 0 if there were none.
     """
 
     F: Operator
@@ -60,6 +61,7 @@ class QP:
     preconditioner: Operator | None = None
     norm: float = 1.0
     preconditioner_on: Callable[[Face], FaceOperator] | None = None
+    seen: float = 0.0
 
 
 @dataclass(frozen=True)
