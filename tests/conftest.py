@@ -56,6 +56,13 @@ def shared_tmp(tmp_path, comm):
     return comm.bcast(tmp_path, root=0)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def keep_what_stays():
+    """Modules live as long as the process: to look through them after each test takes longest."""
+    gc.collect()
+    gc.freeze()
+
+
 @pytest.fixture(autouse=True)
 def clean_up_together():
     """Options and models of gmsh must not reach the next test: they would decide its mesh sizes."""
