@@ -1,6 +1,7 @@
-"""Solve a small contact scene and let rank 0 write points and displacements: see test_ranks."""
+"""Solve small contact scenes and let rank 0 write points and displacements: see test_ranks."""
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import ufl
@@ -11,12 +12,17 @@ from scenes import curved_obstacle, decomposed, displacement, problem
 import tfeti_dolfinx as tfeti
 
 
-def obstacle_scene(cell, subdomains, **options):
+def obstacle_scene(cell, subdomains, friction=None, **options):
     """A clamped box on a curved obstacle."""
     gdim = 2 if cell in ("triangle", "quadrilateral") else 3
     d = decomposed(cell, 12 if gdim == 2 else 6, subdomains)
-    obstacle = tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=0.05)
+    obstacle = tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=0.05, friction=friction)
     return problem(d, (0.0,) * (gdim - 1) + (-0.05,), [obstacle], **options)
+
+
+def rough_scene(cell, subdomains, **options):
+    """The same, rough: where the box touches it sticks, or slips."""
+    return obstacle_scene(cell, subdomains, tfeti.Coulomb(0.3), **options)
 
 
 def pair_scene(cell, subdomains, **options):
@@ -35,15 +41,26 @@ def pair_scene(cell, subdomains, **options):
     return two_body_problem(d, load, held(d, *sides), [pair], **options)
 
 
-if __name__ == "__main__":
-    scene, cell, subdomains, path, rtol = sys.argv[1:]
-    scenes = {"obstacle": obstacle_scene, "pair": pair_scene}
-    p = scenes[scene](cell, int(subdomains), tfeti_rtol=float(rtol))
-    p.solve()
+SCENES = {"obstacle": obstacle_scene, "pair": pair_scene, "rough": rough_scene}
+
+
+def write(path, p):
+    """What test_ranks compares, in an order that no rank decides."""
     x, u = displacement(p)
     data = p.solution.contact(0)
-    points, force, gap = (gathered(part) for part in (data.points, data.force, data.gap))
-    order = np.lexsort(np.rint(1e7 * points).T)
-    contact = {"force": force[order], "gap": gap[order]}
+    found = {"force": data.force, "gap": data.gap, "traction": data.tangential_traction}
+    order = np.lexsort(np.rint(1e7 * gathered(data.points)).T)
+    contact = {name: gathered(values)[order] for name, values in found.items()}
+    contact |= {"sticking": p.report.sticking, "sliding": p.report.sliding}
     if MPI.COMM_WORLD.rank == 0:
         np.savez(path, x=x, u=u, active=p.report.active_contacts, **contact)
+
+
+if __name__ == "__main__":
+    folder, rtol, *cases = sys.argv[1:]
+    for case in cases:
+        scene, cell, subdomains = case.split("-")
+        p = SCENES[scene](cell, int(subdomains), tfeti_rtol=float(rtol))
+        p.solve()
+        write(Path(folder) / f"{case}.npz", p)
+        p.destroy()
