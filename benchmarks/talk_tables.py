@@ -24,9 +24,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.pictures import column, curves, picture
 from benchmarks.tools import command_line, finish, solve_seconds
-from demos import cube_3d, talk_hertz_2d
+from demos import cube_3d, talk_hertz_2d, tresca_2d, tresca_3d
 
-# subdomains: the talk's primal, dual, kernel dimension, multiplications, seconds
+# subdomains: the talk's primal, dual, kernel dimension, multiplications, seconds (none are given
+# with friction)
 HERTZ_2D = {
     2: (40_000, 6_000, 6, 45, 10),
     32: (640_000, 11_200, 96, 88, 78),
@@ -37,9 +38,21 @@ FRICTIONLESS_3D = {
     64: (255_552, 59_051, 384, 100, 51),
     512: (2_044_416, 514_981, 3072, 154, 760),
 }
+TRESCA_2D = {
+    1: (5_202, 153, 3, 66, None),
+    16: (83_232, 3_033, 48, 130, None),
+    256: (1_331_712, 50_913, 768, 208, None),
+}
+TRESCA_3D = {
+    4: (15_972, 1_694, 24, 76, None),
+    64: (255_552, 50_634, 384, 216, None),
+    1024: (4_088_832, 942_954, 6144, 325, None),
+}
 TABLES = {
     "Hertz 2D": (talk_hertz_2d, HERTZ_2D),
     "Frictionless 3D": (cube_3d, FRICTIONLESS_3D),
+    "Tresca 2D": (tresca_2d, TRESCA_2D),
+    "Tresca 3D": (tresca_3d, TRESCA_3D),
 }
 SOLVERS = {
     "Newton": ["-tfeti_qp_type", "newton"],
@@ -67,9 +80,16 @@ def row(reports, talk, subdomains, rtol):
         "outer, Newton": newton.outer_iterations,
         "outer, SMALSE": smalse.outer_iterations,
         "power method": smalse.power_method_multiplications,
+        **(rubbing(newton) if newton.tangential_rows else {}),
         **{f"seconds, {name}": seconds_of(report) for name, report in reports.items()},
         "seconds, talk": seconds,
     }
+
+
+def rubbing(report):
+    """Shares of the contact nodes that stick and that slide."""
+    touching = report.contact_rows
+    return {"sticking": report.sticking / touching, "sliding": report.sliding / touching}
 
 
 def seconds_of(report):

@@ -32,12 +32,13 @@ def quick(benchmark, folder, comm, *arguments):
 
 def test_talk_tables(shared_tmp, comm):
     tables = quick(talk_tables, shared_tmp, comm, "--rtol", "1e-4")
-    assert set(tables) == {"Hertz 2D", "Frictionless 3D"}
-    for table in tables.values():
+    assert set(tables) == {"Hertz 2D", "Frictionless 3D", "Tresca 2D", "Tresca 3D"}
+    for title, table in tables.items():
         (row,) = table
         assert row["rtol"] == "1e-04"
         assert row["kernel"] == row["kernel, talk"]
         assert 0 < row["F, Newton"] < row["F, SMALSE"]
+        assert ("sticking" in row) == title.startswith("Tresca")
 
 
 def test_contact_assembly(shared_tmp, comm):

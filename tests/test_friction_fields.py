@@ -135,18 +135,20 @@ def turned(axis, angle):
     return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
 
 
-@pytest.mark.parametrize("orthotropic", [False, True])
-def test_a_rotated_scene_has_the_rotated_answer(orthotropic):
+@pytest.mark.parametrize("law", ["Tresca", "orthotropic", "Coulomb"])
+def test_a_rotated_scene_has_the_rotated_answer(law):
     R, answers, multiplications = turned((1.0, 2.0, 3.0), 0.7), [], []
     for Q in (np.eye(3), R):
         mesh, tags, names = box("hexahedron", 4)
         mesh.geometry.x[:] = mesh.geometry.x @ Q.T
         d = tfeti.decompose(mesh, 1, facet_tags=tags, surfaces=names)
-        law = tfeti.Tresca(0.015)
-        if orthotropic:
-            law = tfeti.Tresca((0.02, 0.008), direction=tuple(Q @ [1.0, 1.0, 0.0]))
+        friction = {
+            "Tresca": tfeti.Tresca(0.015),
+            "orthotropic": tfeti.Tresca((0.02, 0.008), direction=tuple(Q @ [1.0, 1.0, 0.0])),
+            "Coulomb": tfeti.Coulomb((0.4, 0.1), direction=tuple(Q @ [1.0, 1.0, 0.0])),
+        }[law]
         plane = tfeti.Plane((0, 0, 0), tuple(Q @ [0.0, 0.0, 1.0]))
-        contact = tfeti.Obstacle("bottom", plane, friction=law, reach=np.inf)
+        contact = tfeti.Obstacle("bottom", plane, friction=friction, reach=np.inf)
         p = problem(d, tuple(Q @ [0.0, -0.035, -0.05]), [contact], **EXACT)
         p.solve()
         x, u = displacement(p)

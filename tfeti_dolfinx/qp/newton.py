@@ -139,7 +139,9 @@ def newton(
         # Step 2: the face
         face = state.wanted_face(parameters.gamma, faces) if looked else state.face()
         # Step 3: solve on the face, drop what leaves Ω, restore Gλ = e
-        trial = faces.solve(state.point, face, state.residual)
+        start, face = state.begun(face)
+        trial = faces.solve(start, face, state.residual)
+        start.destroy()
         # Step 4: accept where q falls enough
         if faces.contradicts:
             reason = ConvergedReason.DIVERGED_CONTRADICTION

@@ -9,8 +9,8 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.parallel import agreed
-from tfeti_dolfinx.qp.faces import Face, without_slip
+from tfeti_dolfinx.parallel import agreed, any_rank
+from tfeti_dolfinx.qp.faces import Face, Status, without_slip
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.nearest import nearest
 from tfeti_dolfinx.qp.newton_curved import brought_back, is_curved
@@ -145,6 +145,24 @@ class Iterate:
             moved = feasible.project(lam - beta / self.norm)
             return feasible.face(0.5 * (lam + moved), s)
         return self.face()
+
+    def begun(self, face: Face) -> tuple[Point, Face]:
+        """Where the solve on a face starts, and on which: λ, or ``back`` where it slips first.
+
+        A row that sticks in λ near its circle, with a gradient that points outwards, would leave
+        by far and in a wrong direction.
+        """
+        slips, start = self.pressed_face(), self.point.copy()
+        early = (face.status == Status.STICK) & (slips.status == Status.SLIP)
+        if self.back is None or not any_rank(self._comm, bool(np.any(early))):
+            return start, face
+        self.back.copy(start.lam)
+        way = self.back.copy()
+        way.axpy(-1.0, self.point.lam)
+        self._qp.F.mult(way, self._work)
+        start.g.axpy(1.0, self._work)
+        way.destroy()
+        return start, slips
 
     def accept(self, trial: Trial, faces: FaceSolver) -> bool:
         """Go where q falls enough: trial, the feasible part of its first step, or downhill.
