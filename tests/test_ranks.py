@@ -113,7 +113,7 @@ def test_a_test_that_hangs_on_one_rank_ends_on_all(serial_only, tmp_path, where)
     )
     start = time.monotonic()
     arguments = ["-m", "pytest", "-c", HERE.parent / "pyproject.toml", "-p", "conftest"]
-    result = run(2, *arguments, "--timeout=5", test)
+    result = run(2, *arguments, "--timeout=2", test)
     assert result.returncode != 0
     assert time.monotonic() - start < 60
     assert "Timeout" in result.stdout + result.stderr
