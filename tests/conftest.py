@@ -9,11 +9,18 @@ import sys
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from mpi4py import MPI
 
-settings.register_profile("ranks", derandomize=True, deadline=None, database=None)
+# a failure on one rank alone must end the test: others would not take part in shrinking it
+settings.register_profile(
+    "ranks",
+    derandomize=True,
+    deadline=None,
+    database=None,
+    phases=[Phase.explicit, Phase.generate],
+)
 settings.load_profile("ranks")
 
 LATER = 1.1  # pytest-timeout, which names the test, comes first where it can

@@ -145,7 +145,7 @@ def test_a_rotated_scene_has_the_rotated_answer(law):
         friction = {
             "Tresca": tfeti.Tresca(0.015),
             "orthotropic": tfeti.Tresca((0.02, 0.008), direction=tuple(Q @ [1.0, 1.0, 0.0])),
-            "Coulomb": tfeti.Coulomb((0.4, 0.1), direction=tuple(Q @ [1.0, 1.0, 0.0])),
+            "Coulomb": tfeti.Coulomb((0.6, 0.3), direction=tuple(Q @ [1.0, 1.0, 0.0])),
         }[law]
         plane = tfeti.Plane((0, 0, 0), tuple(Q @ [0.0, 0.0, 1.0]))
         contact = tfeti.Obstacle("bottom", plane, friction=friction, reach=np.inf)

@@ -134,7 +134,7 @@ class WithinFace:
     def face(self, x: Array, g: Array) -> Face:
         """The face of x, without the rows that stay open."""
         face = self._feasible.face(x, g)
-        kept = np.flatnonzero(face.Z.T @ self._open.astype(float) == 0.0)
+        kept = np.flatnonzero(abs(face.Z).T @ self._open.astype(float) == 0.0)
         status = np.where(self._open, Status.OPEN, face.status)
         return Face(csr_array(face.Z[:, kept]), face.curvature[kept], status)
 

@@ -110,7 +110,7 @@ def newton(
     steps = Steps()
     state = Iterate(qp, homogenised)
     faces = FaceSolver(state.qp, rule, parameters, steps, max_it, monitor)
-    reason, looked = ConvergedReason.ITERATING, warm
+    reason, looked = ConvergedReason.ITERATING, warm or is_rubbing(qp, state.face())
     monitor(steps, "start", state.point.lam, homogenised.b.norm(), 0.0)
     if is_rubbing(qp, state.face()) and imbalance(qp.coarse, state.point.lam) > UNBALANCED:
         reason = ConvergedReason.DIVERGED_STALLED

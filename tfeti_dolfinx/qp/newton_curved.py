@@ -101,6 +101,28 @@ def bent_at(qp: QP, coarse: Coarse, face: Face, on: Array, g: PETSc.Vec) -> Face
     return Face(face.Z, curvature, face.status)
 
 
+def slipping_start(
+    qp: QP, at: Point, face: Face, back: PETSc.Vec, pressed: Face
+) -> tuple[Point, Face]:
+    """A copy of a point with its face, or ``back`` with its own where that slips first. Collective.
+
+    Near its circle a point that sticks, and whose gradient points outwards, would leave by far, in
+    a direction of no use. Multiplies by F once where it begins at ``back``.
+    """
+    start = at.copy()
+    early = (face.status == Status.STICK) & (pressed.status == Status.SLIP)
+    if not any_rank(qp.d.getComm().tompi4py(), bool(np.any(early))):
+        return start, face
+    way, image = back.copy(), at.g.duplicate()
+    way.axpy(-1.0, at.lam)
+    qp.F.mult(way, image)
+    start.move(1.0, way, image)
+    back.copy(start.lam)
+    way.destroy()
+    image.destroy()
+    return start, pressed
+
+
 def brought_back(qp: QP, face: Face, z: Point) -> bool:
     """Bring z back to where slipping rows are on their boundary and Gz = e. Collective.
 

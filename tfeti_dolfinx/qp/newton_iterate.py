@@ -9,11 +9,11 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.parallel import agreed, any_rank
-from tfeti_dolfinx.qp.faces import Face, Status, without_slip
+from tfeti_dolfinx.parallel import agreed
+from tfeti_dolfinx.qp.faces import Face, without_slip
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.nearest import nearest
-from tfeti_dolfinx.qp.newton_curved import brought_back, is_curved
+from tfeti_dolfinx.qp.newton_curved import brought_back, is_curved, slipping_start
 from tfeti_dolfinx.qp.newton_faces import FaceSolver
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, QPResult, Steps
 from tfeti_dolfinx.qp.trial import Trial
@@ -29,10 +29,9 @@ WILD = 1e3
 SHORTER = 0.5
 # of λ: what a way must be, so that F on it is not F on rounding of Gλ = e
 SHORT = 1e-6
-# so many steps in a row that neither lower q by what stands out from its rounding, nor halve ‖g^P‖
-PATIENCE, ROUNDING = 10, 1e-15
-# so many in a row that do not halve ‖g^P‖, whatever q does
-LONG = 100
+# so many steps in a row that neither lower q by what stands out from its rounding, nor halve
+# ‖g^P‖; so many that do not halve it, whatever q does
+PATIENCE, LONG, ROUNDING = 10, 100, 1e-15
 
 
 class Iterate:
@@ -147,22 +146,10 @@ class Iterate:
         return self.face()
 
     def begun(self, face: Face) -> tuple[Point, Face]:
-        """Where the solve on a face starts, and on which: λ, or ``back`` where it slips first.
-
-        A row that sticks in λ near its circle, with a gradient that points outwards, would leave
-        by far and in a wrong direction.
-        """
-        slips, start = self.pressed_face(), self.point.copy()
-        early = (face.status == Status.STICK) & (slips.status == Status.SLIP)
-        if self.back is None or not any_rank(self._comm, bool(np.any(early))):
-            return start, face
-        self.back.copy(start.lam)
-        way = self.back.copy()
-        way.axpy(-1.0, self.point.lam)
-        self._qp.F.mult(way, self._work)
-        start.g.axpy(1.0, self._work)
-        way.destroy()
-        return start, slips
+        """Where the solve on a face starts, and on which: λ, or ``back`` where more slips there."""
+        if self.back is None:
+            return self.point.copy(), face
+        return slipping_start(self.qp, self.point, face, self.back, self.pressed_face())
 
     def accept(self, trial: Trial, faces: FaceSolver) -> bool:
         """Go where q falls enough: trial, the feasible part of its first step, or downhill.
@@ -196,7 +183,8 @@ class Iterate:
         """Go a part of the first solve's way, if q falls enough there."""
         shorter = self.point.copy()
         for kept, end in ((shorter.lam, trial.first.lam), (shorter.g, trial.first.g)):
-            kept.aypx(1.0 - length, self._scaled(length, end))
+            kept.scale(1.0 - length)
+            kept.axpy(length, end)
         held = True
         if curved:
             held = brought_back(self.qp, trial.face, shorter)
@@ -258,11 +246,6 @@ class Iterate:
         down = without_slip(trial.face, self.point.lam.array_r - trial.first.lam.array_r)
         own = self._qp.feasible.max_step(self.point.lam.array_r, down)
         return min(1.0, float(self._comm.allreduce(own, op=MPI.MIN)))
-
-    def _scaled(self, share: float, x: PETSc.Vec) -> PETSc.Vec:
-        x.copy(self._work)
-        self._work.scale(share)
-        return self._work
 
     def result(self, reason: ConvergedReason, steps: Steps) -> QPResult:
         """The answer; takes λ and s over."""
