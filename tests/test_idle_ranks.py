@@ -3,7 +3,6 @@
 import pytest
 from test_ranks import run
 
-
 CASES = ["-k=not demos", "-k=demos", pytest.param("-m=slow", marks=pytest.mark.slow)]
 
 
