@@ -118,6 +118,13 @@ def two_body_problem(d, load, bcs, contacts, degree=1, stress=None, **options):
     )
 
 
+def stiffer_above(d, ratio, nu=0.3):
+    """Stress of bodies that are stiffer above 0 by a ratio; one form for all of them."""
+    ratio, nu = (fem.Constant(d.mesh, float(value)) for value in (ratio, nu))
+    height = ufl.SpatialCoordinate(d.mesh)[d.mesh.geometry.dim - 1]
+    return hooke(ufl.conditional(ufl.gt(height, 0.0), ratio, 1.0), nu)
+
+
 def pressed(d, pressure=0.1, on="upper top"):
     """Load: a uniform pressure from above."""
 

@@ -9,7 +9,8 @@ import sys
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
-from hypothesis import Phase, settings
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
 from mpi4py import MPI
 
 # a failure on one rank alone must end the test: others would not take part in shrinking it
@@ -61,6 +62,23 @@ def serial_only():
 def shared_tmp(tmp_path, comm):
     """A temporary folder of rank 0, the same on all ranks."""
     return comm.bcast(tmp_path, root=0)
+
+
+@given(st.none())
+def draw_nothing(nothing):
+    """Hypothesis asks once who refers to its random numbers: of what is frozen nobody knows."""
+
+
+@pytest.fixture(scope="session")
+def hypothesis_is_ready():
+    draw_nothing()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def keep_what_stays(hypothesis_is_ready):
+    """Modules live as long as the process: to look through them after each test takes longest."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)

@@ -114,17 +114,20 @@ def natural_map(F, d, places, mu):
 
 
 def in_ellipses(z, a):
-    """The nearest points of ellipses, by halving the interval of their multiplier."""
-    low, high = np.zeros(len(z)), np.linalg.norm(a * z, axis=1)
-    high = high + 1e-300
+    """The nearest points of ellipses: multipliers t ≥ 0 by Newton's method on 1/‖az/(a² + t)‖ = 1.
+
+    It is concave in t, so that t grows to the solution, and is 0 within the ellipse.
+    """
+    squares, t = np.where(a > 0.0, a**2, 1.0), np.zeros((len(z), 1))
     for _ in range(60):
-        middle = 0.5 * (low + high)
-        y = np.divide(a * z, a**2 + middle[:, None], out=np.zeros_like(z), where=a > 0.0)
-        outside = np.linalg.norm(y, axis=1) > 1.0
-        low, high = np.where(outside, middle, low), np.where(outside, high, middle)
-    y = a**2 * z / np.maximum(a**2 + high[:, None], 1e-300)
-    inside = np.linalg.norm(np.divide(z, a, out=np.full_like(z, 2.0), where=a > 0.0), axis=1) <= 1
-    return np.where(inside[:, None], z, y)
+        y = a * z / (squares + t)
+        size = np.sum(y**2, axis=1, keepdims=True)
+        slope = np.where(size > 1.0, np.sum(y**2 / (squares + t), axis=1, keepdims=True), 1.0)
+        step = np.maximum(np.sqrt(size) - 1.0, 0.0) * size / slope
+        t = t + step
+        if np.all(step <= 1e-15 * t):
+            break
+    return np.where(a > 0.0, a**2 * z / (squares + t), 0.0)
 
 
 def on_plane(cell, n, traction, bounds, frame, gap=0.0, clamped=("left",), coulomb=False):

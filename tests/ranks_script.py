@@ -1,6 +1,7 @@
-"""Solve a small contact scene and let rank 0 write points and displacements: see test_ranks."""
+"""Solve small contact scenes and let rank 0 write points and displacements: see test_ranks."""
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import ufl
@@ -40,11 +41,11 @@ def pair_scene(cell, subdomains, **options):
     return two_body_problem(d, load, held(d, *sides), [pair], **options)
 
 
-if __name__ == "__main__":
-    scene, cell, subdomains, path, rtol = sys.argv[1:]
-    scenes = {"obstacle": obstacle_scene, "pair": pair_scene, "rough": rough_scene}
-    p = scenes[scene](cell, int(subdomains), tfeti_rtol=float(rtol))
-    p.solve()
+SCENES = {"obstacle": obstacle_scene, "pair": pair_scene, "rough": rough_scene}
+
+
+def write(path, p):
+    """What test_ranks compares, in an order that no rank decides."""
     x, u = displacement(p)
     data = p.solution.contact(0)
     found = {"force": data.force, "gap": data.gap, "traction": data.tangential_traction}
@@ -53,3 +54,13 @@ if __name__ == "__main__":
     contact |= {"sticking": p.report.sticking, "sliding": p.report.sliding}
     if MPI.COMM_WORLD.rank == 0:
         np.savez(path, x=x, u=u, active=p.report.active_contacts, **contact)
+
+
+if __name__ == "__main__":
+    folder, rtol, *cases = sys.argv[1:]
+    for case in cases:
+        scene, cell, subdomains = case.split("-")
+        p = SCENES[scene](cell, int(subdomains), tfeti_rtol=float(rtol))
+        p.solve()
+        write(Path(folder) / f"{case}.npz", p)
+        p.destroy()

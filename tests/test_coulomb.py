@@ -144,7 +144,7 @@ def capacity(angle, press):
     return press / np.hypot(np.cos(angle) / MU[0], np.sin(angle) / MU[1])
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.3, 0.9, np.pi / 2])
+@pytest.mark.parametrize("angle", [0.0, 0.3, pytest.param(0.9, marks=pytest.mark.slow), np.pi / 2])
 def test_a_block_pulled_at_an_angle_slips_at_its_capacity(angle):
     """Within 0.1 %, orthotropic: a load above it has no solution, one below it may have one."""
     d, press = decomposed("hexahedron", 2, 2), 0.1
@@ -162,7 +162,7 @@ def test_a_block_pulled_at_an_angle_slips_at_its_capacity(angle):
     assert p.report.converged_reason == "CONVERGED_RTOL"
 
 
-@pytest.mark.parametrize("angle", [0.3, 1.2])
+@pytest.mark.parametrize("angle", [0.3, pytest.param(1.2, marks=pytest.mark.slow)])
 def test_a_block_that_is_drawn_along_slides_at_its_capacity(angle, comm):
     """Its top is drawn, its bottom slides: the force is on the ellipse, where that is normal."""
     d, press = decomposed("hexahedron", 3, 2), 0.1

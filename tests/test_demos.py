@@ -41,7 +41,13 @@ def test_quick_size(name, comm, shared_tmp, capsys):
     assert ("TFETI solve CONVERGED" in out) == (comm.rank == 0)
 
 
-@pytest.mark.parametrize("name", DEMOS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name in ("ball_bearing_3d",)))
+        for name in DEMOS
+    ],
+)
 def test_options_of_the_dual_solver_work_on_every_command_line(name):
     demo = importlib.import_module(f"demos.{name}")
     options = ["-tfeti_qp_type", "smalse", "-tfeti_pc_type", "none", "-tfeti_rtol", "1e-6"]
@@ -69,7 +75,8 @@ CUBES = [
     ("newton", 8, 30),
     pytest.param("newton", 64, 32, marks=pytest.mark.slow),
     ("smalse", 8, 100),
-    ("smalse", 64, 130),
+    ("smalse", 27, 130),
+    pytest.param("smalse", 64, 130, marks=pytest.mark.slow),
 ]
 
 

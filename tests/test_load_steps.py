@@ -219,14 +219,14 @@ def whole(tmp_path_factory):
 @pytest.mark.parametrize(
     ("ranks", "scene", "how"),
     [
-        (1, "rough", "between"),
         (1, "smooth", "between"),
-        (1, "rough", "writing"),
         (1, "rough", "committing"),
         (1, "rough", "committed"),
         (2, "rough", "between"),
         (2, "rough", "writing"),
-        (2, "smooth", "between"),
+        pytest.param(1, "rough", "between", marks=pytest.mark.slow),
+        pytest.param(1, "rough", "writing", marks=pytest.mark.slow),
+        pytest.param(2, "smooth", "between", marks=pytest.mark.slow),
     ],
 )
 def test_a_killed_series_goes_on_to_the_same_answer(

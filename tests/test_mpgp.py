@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conic import constrained_qp
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_qp import matrix, to, vector
 
@@ -44,10 +44,8 @@ def as_set(bounded, pairs, a, isotropic):
     return Product([(bounded, Bounds()), (pairs.ravel(), discs)])
 
 
-@given(
-    st.integers(0, 1000), st.sampled_from([1, 2]), st.booleans(), st.sampled_from(list(EXPANSIONS))
-)
-def test_smalse_agrees_with_an_interior_point_method(seed, k, isotropic, expansion):
+def smalse_agrees(seed, k, isotropic, expansion):
+    """With an interior point method."""
     F, d, G, e, bounded, pairs, a = program(seed, k, isotropic)
     coarse, feasible = DenseCoarse(G, e), as_set(bounded, pairs, a, isotropic)
     qp = QP(matrix(F), vector(d), coarse, feasible)
@@ -60,6 +58,23 @@ def test_smalse_agrees_with_an_interior_point_method(seed, k, isotropic, expansi
     exact = constrained_qp(F, d, G, e, bounded, pairs, a)
     assert np.linalg.norm(lam - exact) <= 1e-7 * np.linalg.norm(exact)
     assert np.allclose(feasible.project(lam), lam, rtol=0, atol=1e-13)
+
+
+PROGRAMS = given(
+    st.integers(0, 1000), st.sampled_from([1, 2]), st.booleans(), st.sampled_from(list(EXPANSIONS))
+)
+
+
+@settings(max_examples=25)
+@PROGRAMS
+def test_smalse_agrees_with_an_interior_point_method(seed, k, isotropic, expansion):
+    smalse_agrees(seed, k, isotropic, expansion)
+
+
+@pytest.mark.slow
+@PROGRAMS
+def test_smalse_agrees_for_many_programs(seed, k, isotropic, expansion):
+    smalse_agrees(seed, k, isotropic, expansion)
 
 
 @pytest.mark.parametrize("expansion", list(EXPANSIONS))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from conic import constrained_qp
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_mpgp import around_circles, as_set, program
 from test_qp import matrix, vector
@@ -25,8 +25,7 @@ def solved(qp, tolerance, monitor=no_monitor, start=None):
     return newton(qp, homogenise(qp, at), rule, max_it=2000, warm=bool(start), monitor=monitor)
 
 
-@given(st.integers(0, 1000), st.sampled_from([1, 2]), st.booleans())
-def test_it_agrees_with_an_interior_point_method(seed, k, isotropic):
+def agrees_with_an_interior_point_method(seed, k, isotropic):
     F, d, G, e, bounded, pairs, a = program(seed, k, isotropic)
     feasible = as_set(bounded, pairs, a, isotropic)
     qp = QP(matrix(F), vector(d), DenseCoarse(G, e), feasible)
@@ -37,6 +36,21 @@ def test_it_agrees_with_an_interior_point_method(seed, k, isotropic):
     assert np.linalg.norm(lam - exact) <= 1e-7 * np.linalg.norm(exact)
     assert np.allclose(feasible.project(lam), lam, rtol=0, atol=1e-13)
     assert np.allclose(G @ lam, e, atol=1e-10)
+
+
+PROGRAMS = given(st.integers(0, 1000), st.sampled_from([1, 2]), st.booleans())
+
+
+@settings(max_examples=25)
+@PROGRAMS
+def test_it_agrees_with_an_interior_point_method(seed, k, isotropic):
+    agrees_with_an_interior_point_method(seed, k, isotropic)
+
+
+@pytest.mark.slow
+@PROGRAMS
+def test_it_agrees_for_many_programs(seed, k, isotropic):
+    agrees_with_an_interior_point_method(seed, k, isotropic)
 
 
 @pytest.mark.parametrize("isotropic", [True, False])

@@ -85,7 +85,8 @@ def test_solvable_just_if_the_resultant_is_over_the_support(centre, width):
     x = ufl.SpatialCoordinate(d.mesh)
     # a linear pressure on the top of resultant 1 at x = c; its first moment about 0 is c
     c = centre * width + 0.5 * (1 - width)
-    pressure = (4 - 6 * c) + (12 * c - 6) * x[0]
+    at = fem.Constant(d.mesh, c)  # one form for all examples
+    pressure = (4 - 6 * at) + (12 * at - 6) * x[0]
     L = -pressure * v[1] * ds(d.surface("top"), metadata={"quadrature_degree": 3})
     contacts = [tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)))]
     p = tfeti.ContactProblem(ufl.inner(hooke()(u), strain(v)) * ufl.dx, L, [], contacts, d)

@@ -95,7 +95,7 @@ RUN = {
         preconditioner=raising,
     ),
     "a law that gives nothing": own(
-        r"extensions: feasible_set gave None without face, max_step, project",
+        r"extensions: feasible_set gave None without face, max_step, onto, project",
         feasible_set=lambda constraints: None,
     ),
     "a law of other rows": own(
