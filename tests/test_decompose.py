@@ -11,7 +11,8 @@ from mpi4py import MPI
 from scenes import SIDES, box, decomposed
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.mesh.partition import bisect_points, deal
+from tfeti_dolfinx.mesh.dealing import deal
+from tfeti_dolfinx.mesh.partition import bisect_points
 
 CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
 
