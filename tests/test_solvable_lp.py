@@ -17,7 +17,8 @@ import tfeti_dolfinx as tfeti
 from tfeti_dolfinx import NoSolutionError
 from tfeti_dolfinx.dual.cuts import Rows
 from tfeti_dolfinx.dual.motions import unresisted, unsprung
-from tfeti_dolfinx.dual.solvability import _minimiser, check_solvable
+from tfeti_dolfinx.dual.solvability import check_solvable, minimiser
+from tfeti_dolfinx.gluing.consistency import SharedNodes
 
 
 def rigid_scene(rng):
@@ -93,7 +94,7 @@ def test_a_program_that_presolving_spoils():
     load = np.array([0, 0, 0, -1, 0.905070269816, -0.458141638602, -0.725973378359, 0])
     noise = np.array([1.8e-14, 1.8e-14, 1.8e-14, 1.8e-9, 1.8e-9, 8.4e-10, 1.3e-9, 1.3e-9])
     cost, A = np.concatenate((noise - load, noise + load)), csr_array(np.hstack([A, -A]))
-    y = _minimiser(cost, A, bounds=(0, 1))
+    y = minimiser(cost, A, bounds=(0, 1))
     expected = linprog(cost, A_ub=A, b_ub=np.zeros(9), bounds=(0, 1)).fun
     assert np.all(A @ y <= 1e-9)
     assert cost @ y == pytest.approx(expected, rel=1e-6)
@@ -218,6 +219,17 @@ def test_contradicting_obstacles_are_named():
     in_a_slot(0.9).solve()
     with pytest.raises(NoSolutionError, match=r"contacts 0 and 1 .* contradict each other"):
         in_a_slot(-0.1).solve()
+
+
+def test_the_solver_names_contacts_that_exclude_each_other(monkeypatch):
+    """What conditions of one node do is found before; a chain of conditions the solver finds."""
+    monkeypatch.setattr(SharedNodes, "check", lambda *args: None)
+    p = in_a_slot(-0.1)
+    with pytest.raises(tfeti.ConvergenceError, match="those of 0: obstacle .* and 1: obstacle"):
+        p.solve()
+    assert p.report.converged_reason == "DIVERGED_CONTRADICTION"
+    assert [text[:12] for text in p.report.excluding_contacts] == ["0: obstacle ", "1: obstacle "]
+    p.destroy()
 
 
 def test_many_loose_bodies_need_no_large_dense_array():

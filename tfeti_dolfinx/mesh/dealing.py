@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from mpi4py import MPI
 
-from tfeti_dolfinx.arrays import TINY, Array
+from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.mesh.partition import bisect_points
 from tfeti_dolfinx.mesh.untorn import UntornMesh
 from tfeti_dolfinx.parallel import agreed, summed
@@ -34,12 +34,30 @@ def dealt(mesh: UntornMesh, subdomain: Array, comm: MPI.Intracomm) -> Array:
         Ranks, shape ``(N,)``, the same on all ranks.
     """
     num = comm.allreduce(int(subdomain.max(initial=-1)), op=MPI.MAX) + 1
-    x = mesh.midpoints()
+    cells, centres, shapes = measured(mesh.midpoints(), mesh.cell_tags, subdomain, num, comm)
+    return agreed(comm, deal(costs(cells, shapes), centres, comm.size))
+
+
+def measured(
+    x: Array, tags: Array, subdomain: Array, num: int, comm: MPI.Intracomm
+) -> tuple[Array, Array, Array]:
+    """Number of cells of each subdomain, centre and shape. Collective.
+
+    Args:
+        x: Midpoints of this rank's cells, shape ``(n, gdim)``.
+        tags: Their material tags.
+        subdomain: Their subdomains.
+        num: Number of subdomains, N.
+        comm: Communicator.
+
+    Returns:
+        Shapes ``(N,)``, ``(N, gdim)`` and ``(N, q)``; what is in the last depends neither on the
+        place nor on the order of the cells.
+    """
     sums = _sums(np.column_stack((np.ones(len(x)), x)), subdomain, num, comm)
     cells, centres = sums[:, 0], sums[:, 1:] / sums[:, :1]
-    moments = _sums(_moments(x - centres[subdomain], mesh.cell_tags), subdomain, num, comm)
-    weights = costs(cells, _scaled(moments / sums[:, :1], mesh.gdim))
-    return agreed(comm, deal(weights, centres, comm.size))
+    moments = _sums(_moments(x - centres[subdomain], tags), subdomain, num, comm)
+    return cells, centres, _scaled(moments / sums[:, :1], x.shape[1])
 
 
 def costs(cells: Array, shapes: Array) -> Array:
@@ -71,7 +89,7 @@ def _scaled(moments: Array, gdim: int) -> Array:
     """Mean moments without their units; lengths are those of the largest subdomain."""
     pairs = gdim * (gdim + 1) // 2
     degree = np.array([2] * pairs + [3] * gdim + [4, 0, 2])
-    length = np.sqrt(np.max(np.abs(moments[:, :pairs]), initial=TINY))
+    length = np.sqrt(np.max(np.abs(moments[:, :pairs]), initial=0.0)) or 1.0  # of single cells 0
     return np.asarray(moments / length**degree)
 
 
