@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
@@ -72,7 +73,14 @@ class Face:
 
     def restricted(self, x: Array) -> Array:
         """Z Zᵀ x: the part of a vector that lies in the face."""
+        if self._of_coordinates:
+            return np.where(np.diff(self.Z.indptr) > 0, x, 0.0)
         return np.asarray(self.Z @ (self.Z.T @ x))
+
+    @cached_property
+    def _of_coordinates(self) -> bool:
+        """Whether the directions are coordinates: unit columns with one entry each."""
+        return bool(self.Z.nnz == self.Z.shape[1] and np.all(np.abs(self.Z.data) == 1.0))
 
 
 def without_slip(face: Face, x: Array) -> Array:
