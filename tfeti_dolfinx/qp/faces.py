@@ -72,9 +72,9 @@ class Face:
         return Face(csr_array(self.Z @ share), self.curvature, self.status)
 
     def restricted(self, x: Array) -> Array:
-        """Z Zᵀ x: the part of a vector that lies in the face."""
+        """Z Zᵀ x: the part of vectors, shapes ``(m,)`` or ``(m, q)``, that lies in the face."""
         if self._of_coordinates:
-            return np.where(np.diff(self.Z.indptr) > 0, x, 0.0)
+            return np.where(np.diff(self.Z.indptr) > 0, x.T, 0.0).T
         return np.asarray(self.Z @ (self.Z.T @ x))
 
     @cached_property
