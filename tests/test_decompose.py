@@ -11,7 +11,8 @@ from mpi4py import MPI
 from scenes import SIDES, box, decomposed
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.mesh.partition import bisect_points, deal
+from tfeti_dolfinx.mesh.dealing import SHARED, costs, deal, measured
+from tfeti_dolfinx.mesh.partition import bisect_points
 
 CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
 
@@ -144,6 +145,41 @@ def test_dealing_is_balanced_and_leaves_no_rank_idle(num_subdomains, num_ranks, 
     assert len(np.unique(ranks)) == min(num_subdomains, num_ranks)
     loads = np.bincount(ranks, weights, minlength=num_ranks)
     assert loads.max() <= weights.sum() / num_ranks + 2 * weights.max()
+
+
+@pytest.mark.parametrize("gdim", [2, 3])
+@pytest.mark.parametrize("shift", [0.0, 1e3])
+def test_only_subdomains_that_are_moved_look_equal(gdim, shift):
+    """A cloud of cells, and others: moved, in another order; mirrored, larger, of other tags."""
+    rng = np.random.default_rng(0)
+    x, tags = rng.random((50, gdim)), rng.integers(0, 3, 50)
+    order, mirror = rng.permutation(50), np.ones(gdim)
+    mirror[0] = -1.0
+    clouds = [x, x[order] + shift, mirror * x, 1.01 * x, x[:, ::-1], x]
+    materials = [tags, tags[order], tags, tags, tags, (tags + 1) % 3]
+    cells, _, shapes = measured(
+        np.concatenate(clouds),
+        np.concatenate(materials),
+        np.repeat(np.arange(6), 50),
+        6,
+        MPI.COMM_SELF,
+    )
+    weights = costs(cells, shapes)
+    assert weights[0] == weights[1] == pytest.approx(50 * (SHARED + (1 - SHARED) / 2))
+    assert weights[2:].tolist() == [50.0] * 4
+
+
+@pytest.mark.parametrize(("bend", "counts"), [(0.0, [4, 4]), (0.1, [5, 3])])
+def test_who_gets_equal_subdomains_gets_more_of_them(bend, counts):
+    """Eight strips; the right half is bent, so that no two of its strips are equal."""
+    mesh = dmesh.create_unit_square(MPI.COMM_WORLD, 32, 4)
+    x, y, _ = mesh.geometry.x.T  # views
+    y += bend * np.maximum(x - 0.5, 0.0) ** 2
+    d = tfeti.decompose(mesh, lambda x: (8 * x[0]).astype(int))
+    found = d.comm.allgather(len(d.subdomains))
+    assert sum(found) == 8
+    if d.comm.size == 2:
+        assert found == counts
 
 
 @settings(max_examples=25)

@@ -250,9 +250,11 @@ def test_rows_that_exclude_each_other_are_named(knows, room, solvable):
     result = newton(qp, homogenise(qp, image(qp.F, start)), ResidualRule(1e-10), max_it=100)
     if not solvable:
         assert result.reason.name == "DIVERGED_CONTRADICTION"
+        assert result.excluding.tolist() == [0, 1]
     else:
         assert result.reason > 0
         assert result.lam.array == pytest.approx([1.0, 0.0, 1.0], abs=1e-9)
+        assert result.excluding.size == 0
 
 
 def string_beside(force, n=1500):

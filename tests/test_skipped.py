@@ -115,6 +115,37 @@ def test_without_a_kernel_there_is_no_coarse_problem(qp_type):
     p.destroy()
 
 
+LOADS = {
+    "none": lambda v: ufl.ZeroBaseForm((v,)),
+    "stress": lambda v: 0.02 * ufl.div(v) * ufl.dx,
+    "weight": lambda v: -0.05 * v[2] * ufl.dx,
+}
+
+
+@pytest.mark.parametrize("load", list(LOADS))
+@pytest.mark.parametrize("qp_type", ["pcpg", "newton"])
+def test_without_a_force_on_a_subdomain_F_is_not_applied_at_the_start(load, qp_type):
+    """e = 0 also where a given stress balances itself."""
+    d = decomposed("hexahedron", 4, 8)
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (3,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    dofs = fem.locate_dofs_topological(V, 2, d.facets("left"))
+    down = np.array((0.0, 0.0, -0.01 if load == "none" else 0.0))
+    top = fem.locate_dofs_topological(V, 2, d.facets("right"))
+    bcs = [fem.dirichletbc(np.zeros(3), dofs, V), fem.dirichletbc(down, top, V)]
+    far = [tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -1), (0, 0, 1)), reach=2.0)]
+    contacts = far if qp_type == "newton" else []
+    a = ufl.inner(hooke()(u), strain(v)) * ufl.dx
+    options = {"qp_type": qp_type}
+    p = tfeti.ContactProblem(a, LOADS[load](v), bcs, contacts, d, petsc_options=options)
+    p.solve()
+    moves = load == "weight"
+    assert np.any(p.dual.coarse.e) == moves
+    assert p.report.cg_steps > 0
+    assert p.report.F_multiplications == p.report.cg_steps + moves
+    p.destroy()
+
+
 HEAVY = """
 import sys
 from pathlib import Path

@@ -18,6 +18,7 @@ from tfeti_dolfinx import NoSolutionError
 from tfeti_dolfinx.dual.cuts import Rows
 from tfeti_dolfinx.dual.motions import unresisted, unsprung
 from tfeti_dolfinx.dual.solvability import check_solvable, minimiser
+from tfeti_dolfinx.gluing.consistency import SharedNodes
 
 
 def rigid_scene(rng):
@@ -218,6 +219,17 @@ def test_contradicting_obstacles_are_named():
     in_a_slot(0.9).solve()
     with pytest.raises(NoSolutionError, match=r"contacts 0 and 1 .* contradict each other"):
         in_a_slot(-0.1).solve()
+
+
+def test_the_solver_names_contacts_that_exclude_each_other(monkeypatch):
+    """What conditions of one node do is found before; a chain of conditions the solver finds."""
+    monkeypatch.setattr(SharedNodes, "check", lambda *args: None)
+    p = in_a_slot(-0.1)
+    with pytest.raises(tfeti.ConvergenceError, match="those of 0: obstacle .* and 1: obstacle"):
+        p.solve()
+    assert p.report.converged_reason == "DIVERGED_CONTRADICTION"
+    assert [text[:12] for text in p.report.excluding_contacts] == ["0: obstacle ", "1: obstacle "]
+    p.destroy()
 
 
 def test_many_loose_bodies_need_no_large_dense_array():

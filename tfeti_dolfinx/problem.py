@@ -225,6 +225,8 @@ class ContactProblem(Stepping):
             self.u.x.array[:] = self.dofs.to_dolfinx(solution.u)
         self._start = (gluing, solution.lam, result.mu) if result.reason > 0 else None
         fill_result(report, solution, dual, *solved)
+        report.excluding_contacts = system.search.named(gluing.contacts_of(result.excluding))
         result.destroy()
-        conclude(result, accuracy, self.options, self.decomposition.comm)
+        comm, excluding = self.decomposition.comm, report.excluding_contacts
+        conclude(result, accuracy, self.options, comm, excluding)
         return solution

@@ -44,6 +44,8 @@ class Report:
         far_contact_nodes: Those that were out of reach or not covered, and have no row.
         late_contact_rows: Rows that nodes out of reach got after a solve, since they overlapped.
         unmet_contacts: Contacts none of whose nodes has a row: position in the list, and name.
+        excluding_contacts: Contacts whose rows exclude each other, likewise, if the solver has
+            stopped since they do.
         dropped_contact_rows: Those that prescribed components decide alone.
         active_contacts: Rows with a positive force.
         tangential_rows: Rows along tangents, of contacts that have friction.
@@ -102,6 +104,7 @@ class Report:
     far_contact_nodes: int = 0
     late_contact_rows: int = _counter()
     unmet_contacts: list[str] = field(default_factory=list)
+    excluding_contacts: list[str] = field(default_factory=list)
     dropped_contact_rows: int = 0
     active_contacts: int = 0
     tangential_rows: int = 0
@@ -188,7 +191,7 @@ def _write_whole(target: Path, text: str) -> None:
 
 
 def _item(item: str | dict[str, Any]) -> str:
-    """An unmet contact, or a motion that is nearly free, as text."""
+    """A contact, or a motion that is nearly free, as text."""
     if isinstance(item, str):
         return item
     return f"{', '.join(item['bodies'])}: {item['mode']}, stiffness {item['stiffness']:.2g}"

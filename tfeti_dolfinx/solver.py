@@ -32,7 +32,7 @@ EXPLANATIONS = {
     ConvergedReason.DIVERGED_FRICTION: "; the bounds of Coulomb's friction do not come to rest: "
     "expected a smaller coefficient, smaller load steps, or a larger friction_max_it",
     ConvergedReason.DIVERGED_CONTRADICTION: "; contact rows that depend on each other exclude each "
-    "other: expected gaps that some displacement keeps",
+    "other{contacts}: expected gaps that some displacement keeps",
 }
 
 
@@ -161,16 +161,31 @@ def _monitor(dual: Dual, homogenised: Homogenised, options: Options) -> Monitor:
     return PrintMonitor(touching=touching, multiplications=lambda: dual.F.count["solver"])
 
 
-def conclude(result: QPResult, rule: Accuracy, options: Options, comm: MPI.Intracomm) -> None:
+def conclude(
+    result: QPResult,
+    rule: Accuracy,
+    options: Options,
+    comm: MPI.Intracomm,
+    excluding: Sequence[str] = (),
+) -> None:
     """Say why the solver stopped, and raise where it should have gone on.
+
+    Args:
+        result: What it returned.
+        rule: Its accuracy.
+        options: Options.
+        comm: Communicator.
+        excluding: Names of the contacts whose rows exclude each other.
 
     Raises:
         ConvergenceError: It stopped before its tolerance, unless options turn that off.
     """
+    contacts = f", those of {' and '.join(excluding)}" if excluding else ""
+    explanation = EXPLANATIONS.get(result.reason, "").format(contacts=contacts)
     text = (
         f"{result.reason.name} after {result.steps.outer} outer and {result.steps.inner} inner "
         f"iterations: the worst of its errors is {rule.ratio():.3g} times what rtol "
-        f"{options.rtol:g} allows{EXPLANATIONS.get(result.reason, '')}"
+        f"{options.rtol:g} allows{explanation}"
     )
     if options.converged_reason and comm.rank == 0:
         print(f"TFETI solve {text}", flush=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -177,7 +177,11 @@ class ContactSearch:
         """Contacts none of whose nodes has a row: position in the list, and name."""
         rows = np.array([np.sum(known.within_reach) for known in self._records], dtype=np.int64)
         rows = self._dofs.comm.allreduce(rows)
-        return [f"{i}: {self.contacts[i].name}" for i in np.flatnonzero(rows == 0)]
+        return self.named(np.flatnonzero(rows == 0))
+
+    def named(self, positions: Iterable[int] | Array) -> list[str]:
+        """Contacts as reports name them: position in the list, and name."""
+        return [f"{i}: {self.contacts[i].name}" for i in positions]
 
     def warn_of_unmet(self) -> None:
         """Log on rank 0 which contacts have met nobody."""

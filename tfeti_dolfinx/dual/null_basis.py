@@ -26,7 +26,7 @@ class NullBasis:
 
     def removed(self, x: Array) -> Array:
         """x less its part in the space."""
-        x = x - self.joint @ (self.joint.T @ x)
+        x = x - self.joint @ (self.joint.T @ x) if self.joint.shape[1] else np.array(x)
         x[self.alone] = 0.0
         return np.asarray(x)
 

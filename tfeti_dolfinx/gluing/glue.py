@@ -128,6 +128,18 @@ class Gluing:
         start[sets.tangents[new]] = forces / self.tangents.scale[new][:, None]
         return start
 
+    def contacts_of(self, rows: Array) -> list[int]:
+        """Positions, in the user's list, of the contacts that some local rows are of. Collective.
+
+        Args:
+            rows: Local rows; equalities among them belong to no contact.
+        """
+        sets = self.constraints.sets
+        normals = self.contact.condition[np.isin(sets.normals, rows)]
+        tangents = self.tangents.condition[np.isin(sets.tangents, rows).any(axis=1)]
+        own = np.unique(self.records.contact[np.concatenate((normals, tangents))])
+        return sorted(set().union(*self.dofs.comm.allgather(own.tolist())))
+
     def _keys(self, rows: ContactRows | TangentRows) -> Array:
         """A number for the contact and the node of each condition with such rows."""
         kept, records = rows.condition, self.records

@@ -1,4 +1,4 @@
-"""Which subdomain a cell belongs to, and which rank a subdomain belongs to."""
+"""Which subdomain a cell belongs to."""
 
 from __future__ import annotations
 
@@ -218,27 +218,3 @@ def _kth_smallest(key: Array, part: Array, k: Array, comm: MPI.Intracomm) -> Arr
         high = np.where(enough, middle, high)
         low = np.where(enough, low, np.minimum(middle + 1, high))
     return low
-
-
-def deal(weights: Array, centres: Array, num_ranks: int) -> Array:
-    """Rank of each subdomain: neighbouring subdomains in chunks of about equal weight.
-
-    Args:
-        weights: Cells of each subdomain, shape ``(N,)``.
-        centres: Centres of the subdomains, shape ``(N, gdim)``.
-        num_ranks: Number of ranks.
-
-    Returns:
-        Ranks, shape ``(N,)``; each rank has a subdomain if there are enough of them.
-    """
-    n = len(weights)
-    order = np.argsort(bisect_points(centres, n, MPI.COMM_SELF), kind="stable")
-    sorted_weights = weights[order]
-    middle = np.cumsum(sorted_weights) - 0.5 * sorted_weights
-    position = np.arange(n)
-    rank = np.floor(middle / sorted_weights.sum() * num_ranks).astype(np.int64)
-    rank = np.clip(rank, num_ranks - n + position, position)
-    rank = np.minimum.accumulate(rank - position) + position
-    ranks = np.empty(n, dtype=np.int32)
-    ranks[order] = np.clip(rank, 0, num_ranks - 1)
-    return ranks

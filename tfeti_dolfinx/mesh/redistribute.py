@@ -6,7 +6,7 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.mesh.partition import deal
+from tfeti_dolfinx.mesh.dealing import dealt
 from tfeti_dolfinx.mesh.untorn import UntornMesh
 from tfeti_dolfinx.parallel import Exchange
 
@@ -25,7 +25,7 @@ def redistribute(
         The share after the move, cells sorted by subdomain and then original id, and their
         subdomains.
     """
-    destination = _deal_cells(mesh, subdomain, comm)[subdomain]
+    destination = dealt(mesh, subdomain, comm)[subdomain]
     exchange = Exchange(comm, destination)
     moved = mesh.with_cells(
         **{
@@ -47,15 +47,6 @@ def redistribute(
         ),
         subdomain[order],
     )
-
-
-def _deal_cells(mesh: UntornMesh, subdomain: Array, comm: MPI.Intracomm) -> Array:
-    """Rank of each subdomain."""
-    num = comm.allreduce(int(subdomain.max(initial=-1)), op=MPI.MAX) + 1
-    sums = np.zeros((num, 1 + mesh.gdim))
-    np.add.at(sums, subdomain, np.column_stack((np.ones(len(subdomain)), mesh.midpoints())))
-    comm.Allreduce(MPI.IN_PLACE, sums, op=MPI.SUM)
-    return deal(sums[:, 0], sums[:, 1:] / sums[:, :1], comm.size)
 
 
 def _send_nodes(mesh: UntornMesh, destination: Array, comm: MPI.Intracomm) -> tuple[Array, Array]:

@@ -20,6 +20,8 @@ BEYOND = 10.0
 ALTERNATIONS = 10
 # of d: rows that want gaps so far apart exclude each other, less may be rounding
 APART = 1e-8
+# of the largest force of a way that nothing ends: rows with less have no part in it
+TAKES_PART = 1e-3
 
 
 class DependentRows:
@@ -33,6 +35,7 @@ class DependentRows:
         preconditioner: That of the face, which knows how rows depend on each other, or None.
         face: The face; its rows that slip follow their boundary, no bound ends their ways.
         contradicts: Whether q falls along a way that F and Gᵀ do not see, and that nothing ends.
+        excluding: The local rows that exclude each other: those of that way.
     """
 
     def __init__(self, qp: QP, directions: Directions) -> None:
@@ -41,6 +44,7 @@ class DependentRows:
         self.preconditioner: FaceOperator | None = None
         self.face: Face | None = None
         self.contradicts = False
+        self.excluding: Array = np.empty(0, dtype=np.int64)
 
     def part(self, x: Array) -> PETSc.Vec | None:
         """The part of x that F and Gᵀ do not see; None where there is none. Collective."""
@@ -68,7 +72,7 @@ class DependentRows:
         if way is None:
             return None
         length = self._to_a_bound(z, way.array_r)
-        self._endless(length, way.norm())
+        self._endless(length, way.norm(), way)
         if not (np.isfinite(length) and agreed(self._comm, way.norm() > target)):
             way.destroy()
             return None
@@ -112,16 +116,19 @@ class DependentRows:
             if way.norm() == 0.0 or own.seen(way.dot(own.Fp), way.dot(way)):
                 continue
             length = self._to_a_bound(z, way.array_r)
-            self._endless(length, own.r.dot(way) / way.norm())
+            self._endless(length, own.r.dot(way) / way.norm(), way)
             if np.isfinite(length):
                 z.move(length * BEYOND, way, own.Fp)
             return bool(np.isfinite(length))
         return False
 
-    def _endless(self, length: float, slope: float) -> None:
+    def _endless(self, length: float, slope: float, way: PETSc.Vec) -> None:
         """Whether a way down that costs nothing is none that rounding has made, and has no end."""
         far = agreed(self._comm, slope > APART * self._qp.d.norm())
         self.contradicts = bool(far and not np.isfinite(length))
+        if self.contradicts:
+            largest = way.norm(PETSc.NormType.INFINITY)
+            self.excluding = np.flatnonzero(np.abs(way.array_r) > TAKES_PART * largest)
 
     def _to_a_bound(self, z: Point, way: Array) -> float:
         """Largest t with λ + t·way ∈ Ω, maybe infinite. Collective."""

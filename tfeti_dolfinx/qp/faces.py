@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array
@@ -71,8 +72,15 @@ class Face:
         return Face(csr_array(self.Z @ share), self.curvature, self.status)
 
     def restricted(self, x: Array) -> Array:
-        """Z Zᵀ x: the part of a vector that lies in the face."""
+        """Z Zᵀ x: the part of vectors, shapes ``(m,)`` or ``(m, q)``, that lies in the face."""
+        if self._of_coordinates:
+            return np.where(np.diff(self.Z.indptr) > 0, x.T, 0.0).T
         return np.asarray(self.Z @ (self.Z.T @ x))
+
+    @cached_property
+    def _of_coordinates(self) -> bool:
+        """Whether the directions are coordinates: unit columns with one entry each."""
+        return bool(self.Z.nnz == self.Z.shape[1] and np.all(np.abs(self.Z.data) == 1.0))
 
 
 def without_slip(face: Face, x: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 from petsc4py import PETSc
 
 from tfeti_dolfinx.qp.coarse import imbalance
@@ -26,11 +27,14 @@ HELD = 1e-9
 def first_point(qp: QP) -> PETSc.Vec:
     """Step 0: the least λ with open contact if that balances the load, else the least of Ω.
 
-    With friction the latter: what is open would slip far first. Collective; multiplies by nothing.
+    With friction the latter: what is open would slip far first. Where e = 0 it is 0. Collective;
+    multiplies by nothing.
     """
     zero = qp.d.duplicate()
     zero.set(0.0)
     zero.array[:] = qp.feasible.project(zero.array_r)
+    if not np.any(qp.coarse.e) and zero.norm() == 0.0:
+        return zero
     face = qp.feasible.face(zero.array_r, zero.array_r)
     lam = None if is_rubbing(qp, face) else _open(qp, face)
     if lam is None:
@@ -150,6 +154,7 @@ def newton(
         trial.destroy()
         steps.outer, looked = steps.outer + 1, True
     result = state.result(reason, steps)
+    result.excluding = faces.excluding
     faces.destroy()
     state.destroy()
     return result

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from petsc4py import PETSc
 
+from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.parallel import any_rank
 from tfeti_dolfinx.qp.coarse import Coarse, imbalance
 from tfeti_dolfinx.qp.dependent import DependentRows
@@ -94,6 +95,11 @@ class FaceSolver:
     def contradicts(self) -> bool:
         """Whether rows of the face exclude each other."""
         return self._dependent.contradicts
+
+    @property
+    def excluding(self) -> Array:
+        """The local rows that do."""
+        return self._dependent.excluding
 
     def saw(self, curvature: float, size: float) -> None:
         """Another Rayleigh quotient."""

@@ -7,6 +7,7 @@ from dataclasses import astuple, dataclass, field
 from enum import IntEnum
 from typing import Protocol
 
+import numpy as np
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
@@ -158,6 +159,7 @@ class QPResult:
         reference: b₀ = ‖P(d − F λ̄₀)‖.
         norm: Estimate of ‖F‖ that ‖Q x‖ is weighted with.
         steps: Steps taken.
+        excluding: Local rows that exclude each other, if that is why the solver stopped.
     """
 
     lam: PETSc.Vec
@@ -170,6 +172,7 @@ class QPResult:
     reference: float
     norm: float
     steps: Steps = field(default_factory=Steps)
+    excluding: Array = field(default_factory=lambda: np.empty(0, dtype=np.int64))
 
     def destroy(self) -> None:
         """Destroy the vectors. Collective."""

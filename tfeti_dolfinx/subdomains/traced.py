@@ -49,7 +49,7 @@ class Traced:
         """S w = K_bb w − K_bi K_ii⁻¹ K_ib w, shapes ``(t,)`` or ``(t, q)``; K_ii factored once."""
         if self.inner is None:
             return self.apply_stiffness(w)
-        return self.apply_stiffness(w) - self.K_ib.T @ self.inner.solve(self.K_ib @ w)
+        return self.apply_stiffness(w) - self._K_bi @ self.inner.solve(self.K_ib @ w)
 
     @cached_property
     def K_bb(self) -> Any:
@@ -62,6 +62,11 @@ class Traced:
         return self._K[:, self.trace][self._inner_dofs]
 
     @cached_property
+    def _K_bi(self) -> Any:
+        """Its transpose, on the same arrays; scipy would make it anew for each product."""
+        return self.K_ib.T
+
+    @cached_property
     def inner(self) -> CholeskyFactor | None:
         """K_ii⁺; K_ii is singular where the trace leaves a motion free, say normal rows only.
 
@@ -70,7 +75,7 @@ class Traced:
         inner = self._inner_dofs
         if len(inner) == 0 or len(self.trace) == 0:
             return None
-        R_inner = self._kernel[inner] @ null_space(self._kernel[self.trace], rcond=NOT_ON_TRACE)
+        R_inner = self._kernel[inner] @ self._motions_not_on_trace()
         self._how.counters.factorizations += 1
         self._how.counters.analyses += 1
         K_ii = self._K[inner][:, inner]
@@ -88,6 +93,12 @@ class Traced:
         inner = self.__dict__.pop("inner", None)
         if inner is not None:
             inner.destroy()
+
+    def _motions_not_on_trace(self) -> Array:
+        """Coefficients of the motions of the kernel that are 0 on the trace."""
+        # the triangle has the null space of the rows, and few rows itself
+        triangle = np.linalg.qr(self._kernel[self.trace], mode="r")
+        return np.asarray(null_space(triangle, rcond=NOT_ON_TRACE))
 
     @property
     def _inner_dofs(self) -> Array:
