@@ -23,6 +23,7 @@ DEMOS = [
     "tresca_3d",
     "belt_2d",
     "four_bodies_2d",
+    "clamped_connection_3d",
 ]
 
 
