@@ -34,6 +34,7 @@ def strip(
     across: int,
     centre: Point | None = None,
     straight: Sequence[int] = (),
+    level: float = 0.0,
 ) -> Strip:
     """Make a strip of pieces with quadrilaterals on grids, between stations.
 
@@ -46,9 +47,10 @@ def strip(
         across: Quadrilaterals across the strip.
         centre: The sides of pieces are arcs about this point; default straight lines.
         straight: Indices of pieces that are straight all the same.
+        level: The strip's z.
     """
-    points = [[geo.addPoint(x, y, 0.0) for x, y in side] for side in (low, high)]
-    middle = None if centre is None else geo.addPoint(*centre, 0.0)
+    points = [[geo.addPoint(x, y, level) for x, y in side] for side in (low, high)]
+    middle = None if centre is None else geo.addPoint(*centre, level)
     cross = [geo.addLine(a, b) for a, b in zip(*points, strict=True)]
     sides: list[list[int]] = [[], []]
     surfaces = []

@@ -21,6 +21,9 @@ DEMOS = [
     "talk_hertz_2d",
     "tresca_2d",
     "tresca_3d",
+    "belt_2d",
+    "four_bodies_2d",
+    "clamped_connection_3d",
 ]
 
 
@@ -44,8 +47,9 @@ def test_quick_size(name, comm, shared_tmp, capsys):
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[pytest.mark.slow] * (name in ("ball_bearing_3d",)))
+        pytest.param(name, marks=[pytest.mark.slow] * (name == "ball_bearing_3d"))
         for name in DEMOS
+        if name != "belt_2d"  # takes long
     ],
 )
 def test_options_of_the_dual_solver_work_on_every_command_line(name):

@@ -46,11 +46,13 @@ class Settling:
         iterations: Problems with given bounds that were solved; 0 without Coulomb's law.
         change: Last change of the bounds, over their size.
         tolerance: What that had to come down to.
+        last: Multiplications by F of the last problem.
     """
 
     iterations: int = 0
     change: float = 0.0
     tolerance: float = 0.0
+    last: int = 0
 
 
 def solve_with_friction(
@@ -82,6 +84,7 @@ def solve_with_friction(
         bounds.set_feasible(start)
         near = change <= NEAR * tolerance
         rtol = options.rtol if near else max(options.rtol, min(FIRST, SHARE * change))
+        before = dual.F.count["solver"]
         result, rule = solve_dual(dual, replace(options, rtol=rtol), qp_type, start, monitor)
         iterations, looks = iterations + 1, looks + rule.looks
         steps = steps.plus(result.steps)
@@ -98,7 +101,8 @@ def solve_with_friction(
         start = (np.array(result.lam.array_r), result.mu)
         result.destroy()
     result.steps, rule.looks = steps, looks
-    return result, rule, Settling(iterations, float(change), tolerance)
+    last = dual.F.count["solver"] - before
+    return result, rule, Settling(iterations, float(change), tolerance, last)
 
 
 class _Pressures:

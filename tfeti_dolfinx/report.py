@@ -57,6 +57,7 @@ class Report:
         recoveries: Displacements recovered to see how right they are, each for one more solve
             in every subdomain.
         friction_iterations: Problems with given bounds that were solved for Coulomb's friction.
+        friction_last: Multiplications by F of the last of them.
         outer_iterations: Outer iterations.
         newton_faces: Faces that block Newton has solved on.
         cg_steps: Conjugate gradient steps.
@@ -115,6 +116,7 @@ class Report:
     power_method_multiplications: int = _counter()
     recoveries: int = _counter()
     friction_iterations: int = _counter()
+    friction_last: int = 0
     outer_iterations: int = _counter()
     newton_faces: int = _counter()
     cg_steps: int = _counter()
