@@ -56,6 +56,39 @@ def use_sizes(*fields: int) -> None:
         gmsh.option.setNumber(f"Mesh.MeshSize{name}", 0)
 
 
+def add_mirror_image(model: Any, axis: int) -> dict[tuple[int, int], int]:
+    """Add the mirror image of a mesh across the plane where a coordinate is 0, to the last node.
+
+    Nodes on that plane become two: the image is a body of its own.
+
+    Args:
+        model: gmsh's model, meshed.
+        axis: The coordinate that changes its sign.
+
+    Returns:
+        The image's tag of each entity, by dimension and tag.
+    """
+    mesh, images = model.mesh, {}
+    last_node, last_element = mesh.getMaxNodeTag(), mesh.getMaxElementTag()
+    meshed = [
+        (entity, mesh.getNodes(*entity)[:2], mesh.getElements(*entity))
+        for entity in model.getEntities()
+    ]
+    for (dim, tag), (nodes, coordinates), _ in meshed:
+        images[dim, tag] = image = model.addDiscreteEntity(dim)
+        x = coordinates.reshape(-1, 3) * [-1.0 if k == axis else 1.0 for k in range(3)]
+        mesh.addNodes(dim, image, nodes + last_node, x.ravel())
+    for entity, _, (kinds, elements, corners) in meshed:
+        for kind, tags, nodes in zip(kinds, elements, corners, strict=True):
+            table = nodes.reshape(len(tags), -1) + last_node
+            # the first two change places, so that cells stay right-handed
+            order = [1, 0, *range(2, table.shape[1])] if entity[0] > 1 else slice(None)
+            mesh.addElementsByType(
+                images[entity], kind, tags + last_element, table[:, order].ravel()
+            )
+    return images
+
+
 def partition(partitions: int) -> None:
     """Let gmsh partition the mesh with METIS, if a number is given."""
     if partitions > 1:

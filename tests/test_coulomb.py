@@ -13,6 +13,10 @@ from test_friction_fields import EXACT, SCENES, floor, solved
 from test_tresca import SIDES, nodal_data, on_the_plane, stresses, two_boxes
 
 import tfeti_dolfinx as tfeti
+from demos import mindlin_3d
+from demos.partial_slip import pushed
+from meshes import half_spaces
+from tfeti_dolfinx.coulomb import _Pressures
 from tfeti_dolfinx.qp.acceleration import Anderson
 from tfeti_dolfinx.qp.cones import Cones
 
@@ -109,6 +113,33 @@ def test_few_problems_with_given_bounds(cell, traction):
     p.solve()  # the same load again
     assert p.report.F_multiplications <= 2
     assert p.report.factorizations == 0
+
+
+@pytest.mark.parametrize("subdomains", [2, 6])
+def test_what_is_open_has_no_bound(subdomains, comm):
+    """Forces that rounding leaves on open nodes were discs that block Newton could not follow."""
+    a = mindlin_3d.a
+    model = half_spaces.build(1.0, a / 4, 1.2 * a, growth=0.4) if comm.rank == 0 else None
+    loads, parts = mindlin_3d.scene(tfeti.read_gmsh(model, comm, subdomains))
+    p = tfeti.ContactProblem(**parts)
+    for share in (0.0, 0.3):
+        pushed(p, loads, mindlin_3d.CLOSED, share * mindlin_3d.CLOSED.capacity)
+        assert p.report.friction_iterations <= 10
+    p.destroy()
+
+
+def test_forces_that_rounding_makes_are_none():
+    p = solved("quadrilateral", tfeti.Coulomb(0.3), (0.05, -0.05))
+    bounds, lam = _Pressures(p.dual, None), p.dual.d.duplicate()
+    rows = p.dual.constraints.sets.normals
+    lam.set(0.0)
+    lam.array[rows] = np.where(np.arange(len(rows)) % 2 == 0, 1e-16, 1.0)
+    bounds.change(lam)
+    bounds.advance()
+    bounds.set_feasible(None)
+    found = p.dual.constraints.pressures[p.dual.constraints.pressed]
+    assert np.all((found == 0.0) | (found == 1.0))
+    lam.destroy()
 
 
 def test_bounds_that_do_not_come_to_rest_are_an_error():

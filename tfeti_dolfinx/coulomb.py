@@ -32,7 +32,8 @@ FIRST, SHARE = 1e-2, 0.03
 BESIDE_RTOL = 100.0
 # of what is wanted: a change from which on the next one may be small enough
 NEAR = 10.0
-# of all multipliers: forces of normals that rounding makes of none
+# of all multipliers: forces of normals that rounding makes of none; as bounds they would be discs
+# whose boundaries bend so much that nothing else is seen beside them
 NO_FORCE = 1e-13
 # factors on the forces of normals of the nearest balanced point: it is found to some digits only
 LARGER = (1.0, 1.001, 1.1, 2.0)
@@ -123,7 +124,7 @@ class _Pressures:
         # differences of bounds are measured as forces
         mu = np.linalg.norm(dual.constraints.coefficients[at], axis=1)
         self._weight = mu * dual.constraints.tangent_scale[at]
-        self._now, self._found = self._first(start), np.zeros(len(at))
+        self._now, self._found, self._none = self._first(start), np.zeros(len(at)), 0.0
         self._anderson = Anderson(self._products)
 
     def _first(self, start: tuple[Array, Array] | None) -> Array:
@@ -165,19 +166,26 @@ class _Pressures:
     def change(self, lam: PETSc.Vec) -> float:
         """Take what a solve has found; how far that is from the bounds, over its size."""
         values = lam.array_r
-        self._found = np.maximum(values[self._rows], 0.0)
+        squares = np.array([values @ values, self._weight @ self._weight])
+        largest, heaviest = np.sqrt(summed(self._comm, squares))
+        self._none = NO_FORCE * float(largest)
+        self._found = self._forces(values[self._rows])
         if self._sticks:
             return float("inf")
         miss, size = self._norm(self._found - self._now), self._norm(self._found)
-        largest = summed(self._comm, np.array([values @ values])) ** 0.5
-        heaviest = summed(self._comm, np.array([self._weight @ self._weight])) ** 0.5
-        size = max(size, NO_FORCE * float(largest[0] * heaviest[0]), TINY)
+        size = max(size, self._none * float(heaviest), TINY)
         return agreed(self._comm, miss / size)
 
     def advance(self) -> None:
         """Take the next bounds."""
         sticks = self._sticks
-        self._now = self._found if sticks else self._anderson.next(self._now, self._found)
+        self._now = (
+            self._found if sticks else self._forces(self._anderson.next(self._now, self._found))
+        )
+
+    def _forces(self, values: Array) -> Array:
+        """Forces of normals, without what is none but for rounding."""
+        return np.where(values > self._none, values, 0.0)
 
     @property
     def _sticks(self) -> bool:
