@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenes import clamp, decomposed, displacement, forms, hooke, problem
 from test_friction_fields import EXACT, SCENES, floor, solved
-from test_tresca import SIDES, nodal_data, on_the_plane, stresses, two_boxes
+from test_tresca import SIDES, SOLVERS, nodal_data, on_the_plane, stresses, two_boxes
 
 import tfeti_dolfinx as tfeti
 from demos import mindlin_3d
@@ -42,28 +42,32 @@ SCENES_3D = st.tuples(
 )
 
 
+@SOLVERS
 @settings(max_examples=12)
 @given(SCENES_2D, st.sampled_from([0.0, 0.01]))
-def test_a_square_on_a_plane(scene, gap):
-    on_the_plane(*scene, gap=gap, kind=tfeti.Coulomb, share=SHARE)
+def test_a_square_on_a_plane(qp_type, scene, gap):
+    on_the_plane(*scene, gap=gap, kind=tfeti.Coulomb, share=SHARE, qp_type=qp_type)
 
 
+@SOLVERS
 @settings(max_examples=6)
 @given(SCENES_3D)
-def test_a_cube_on_a_plane(scene):
-    on_the_plane(*scene, kind=tfeti.Coulomb, share=SHARE)
+def test_a_cube_on_a_plane(qp_type, scene):
+    on_the_plane(*scene, kind=tfeti.Coulomb, share=SHARE, qp_type=qp_type)
 
 
+@SOLVERS
 @settings(max_examples=8)
 @given(SCENES_2D, SIDES)
-def test_a_square_on_a_square(scene, secondary):
-    two_boxes(*scene, 0.0, secondary, kind=tfeti.Coulomb, share=SHARE)
+def test_a_square_on_a_square(qp_type, scene, secondary):
+    two_boxes(*scene, 0.0, secondary, kind=tfeti.Coulomb, share=SHARE, qp_type=qp_type)
 
 
+@SOLVERS
 @settings(max_examples=4)
 @given(SCENES_3D, SIDES)
-def test_a_cube_on_a_cube(scene, secondary):
-    two_boxes(*scene, secondary, kind=tfeti.Coulomb, share=SHARE)
+def test_a_cube_on_a_cube(qp_type, scene, secondary):
+    two_boxes(*scene, secondary, kind=tfeti.Coulomb, share=SHARE, qp_type=qp_type)
 
 
 @pytest.mark.parametrize(("cell", "traction"), SCENES)

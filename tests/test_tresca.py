@@ -1,6 +1,7 @@
 """Given friction from the user's door to u and λ, against an independent solver, without tears."""
 
 import numpy as np
+import pytest
 from bodies import boxes
 from friction_reference import on_each_other, on_plane, parts
 from hypothesis import given, settings
@@ -11,6 +12,9 @@ import tfeti_dolfinx as tfeti
 
 EXACT = {"rtol": 1e-10}
 AT_REST = 1e-6
+SOLVERS = pytest.mark.parametrize(
+    "qp_type", ["newton", pytest.param("smalse", marks=pytest.mark.slow)]
+)
 
 
 def frame_of(gdim, angle, normal):
@@ -52,14 +56,14 @@ def compare(p, u, x, force, frame, share=1e-7):
 
 
 def on_the_plane(
-    cell, n, subdomains, traction, bounds, angle=0.0, gap=0.0, kind=tfeti.Tresca, share=1e-7
+    cell, n, subdomains, traction, bounds, angle=0.0, gap=0.0, kind=tfeti.Tresca, share=1e-7, **more
 ):
     d = decomposed(cell, n, subdomains)
     gdim = d.mesh.geometry.dim
     up = np.eye(gdim)[-1]
     law = law_of(kind, bounds, angle)
     plane = tfeti.Obstacle("bottom", tfeti.Plane(-gap * up, up), friction=law, reach=np.inf)
-    p = problem(d, traction, [plane], **EXACT)
+    p = problem(d, traction, [plane], **EXACT, **more)
     p.solve()
     frame = frame_of(gdim, angle, -1.0)
     both = np.resize(bounds, gdim - 1)
@@ -94,16 +98,18 @@ SCENES_3D = st.tuples(
 )
 
 
+@SOLVERS
 @settings(max_examples=20)
 @given(SCENES_2D, st.sampled_from([0.0, 0.01]))
-def test_a_square_on_a_plane(scene, gap):
-    on_the_plane(*scene, gap=gap)
+def test_a_square_on_a_plane(qp_type, scene, gap):
+    on_the_plane(*scene, gap=gap, qp_type=qp_type)
 
 
+@SOLVERS
 @settings(max_examples=12)
 @given(SCENES_3D)
-def test_a_cube_on_a_plane(scene):
-    on_the_plane(*scene)
+def test_a_cube_on_a_plane(qp_type, scene):
+    on_the_plane(*scene, qp_type=qp_type)
 
 
 def test_some_nodes_stick_and_some_slip():
@@ -114,7 +120,7 @@ def test_some_nodes_stick_and_some_slip():
 
 
 def two_boxes(
-    cell, n, subdomains, traction, bounds, angle, secondary, kind=tfeti.Tresca, share=1e-7
+    cell, n, subdomains, traction, bounds, angle, secondary, kind=tfeti.Tresca, share=1e-7, **more
 ):
     gdim, apart = (2 if cell in ("triangle", "quadrilateral") else 3), 0.05
     mesh, tags, names = boxes(cell, parts(gdim, n, apart))
@@ -130,7 +136,8 @@ def two_boxes(
         reach=0.3,
     )
     bcs = [clamp(V, d.facets(name)) for name in clamped]
-    p = tfeti.ContactProblem(a, L, bcs, [pair], d, stress=hooke(), petsc_options=EXACT)
+    options = {**EXACT, **more}
+    p = tfeti.ContactProblem(a, L, bcs, [pair], d, stress=hooke(), petsc_options=options)
     p.solve()
     frame, both = frame_of(gdim, angle, 1.0), np.resize(bounds, gdim - 1)
     coulomb = kind is tfeti.Coulomb
@@ -147,13 +154,15 @@ def two_boxes(
 SIDES = st.sampled_from(["lower top", "upper bottom"])
 
 
+@SOLVERS
 @settings(max_examples=12)
 @given(SCENES_2D, SIDES)
-def test_a_square_on_a_square(scene, secondary):
-    two_boxes(*scene, 0.0, secondary)
+def test_a_square_on_a_square(qp_type, scene, secondary):
+    two_boxes(*scene, 0.0, secondary, qp_type=qp_type)
 
 
+@SOLVERS
 @settings(max_examples=8)
 @given(SCENES_3D, SIDES)
-def test_a_cube_on_a_cube(scene, secondary):
-    two_boxes(*scene, secondary)
+def test_a_cube_on_a_cube(qp_type, scene, secondary):
+    two_boxes(*scene, secondary, qp_type=qp_type)
