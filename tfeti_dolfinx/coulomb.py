@@ -188,8 +188,11 @@ class _Pressures:
     def slipping_on(self, values: Array, face: Face) -> Array:
         """Multipliers to start from, where what has slipped on a face is at its new bound.
 
-        Inside of it, it would stick at first, and a belt on a drum is let go node by node then.
+        Inside of it, it would stick at first, and a belt on a drum is let go node by node then. In
+        3D directions change with the bounds: to pin them took twice as many multiplications.
         """
+        if self._constraints.sets.tangents.shape[1] != 1:
+            return values
         qp, slips, lam = self._dual.qp(), face.status == Status.SLIP, self._dual.d.duplicate()
         lam.array[:] = values
         at = qp.feasible.onto(values, face.status)
