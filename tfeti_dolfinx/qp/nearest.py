@@ -63,7 +63,11 @@ class Nearest:
 
 
 def nearest(
-    coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec, alpha: Array | None = None
+    coarse: Coarse,
+    feasible: ConvexSet,
+    y: PETSc.Vec,
+    alpha: Array | None = None,
+    max_trials: int = MAX_TRIALS,
 ) -> Nearest:
     """The nearest point to y of {λ ∈ Ω, Gλ = e}, or what comes closest to it. Collective.
 
@@ -85,6 +89,7 @@ def nearest(
         feasible: The set Ω.
         y: Any point.
         alpha: Where to start.
+        max_trials: Points looked at, at most.
 
     Returns:
         The point; where nothing in Ω fulfils Gλ = e, or α does not converge, it misses some of e:
@@ -93,7 +98,7 @@ def nearest(
     comm = y.getComm().tompi4py()
     trial = _trial(coarse, feasible, y, np.zeros(coarse.dimension) if alpha is None else alpha)
     damping, trials, unmet = DAMPING, 1, 0
-    while trials < MAX_TRIALS and unmet < PATIENCE:
+    while trials < max_trials and unmet < PATIENCE:
         left, scale = trial.left, float(np.linalg.norm(coarse.forces(trial.lam)))
         if agreed(comm, left <= BALANCED * scale):
             break

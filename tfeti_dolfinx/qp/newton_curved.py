@@ -15,6 +15,8 @@ from tfeti_dolfinx.qp.problem import QP, Operator, Point
 
 # Gλ = e holds as well as factors can tell
 HELD = 1e-9
+# points looked at on the way back to circles: it is short, or there is no such way
+BACK = 30
 
 
 class Bent:
@@ -141,7 +143,7 @@ def brought_back(qp: QP, face: Face, z: Point) -> bool:
     Returns:
         Whether there is such a point near by.
     """
-    found = nearest(qp.coarse, WithinFace(qp.feasible, face, slipping=True), z.lam)
+    found = nearest(qp.coarse, WithinFace(qp.feasible, face, slipping=True), z.lam, max_trials=BACK)
     held = imbalance(qp.coarse, found.lam) <= HELD
     bend, image = found.lam.copy(), z.g.duplicate()
     bend.axpy(-1.0, z.lam)
