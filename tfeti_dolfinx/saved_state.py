@@ -27,6 +27,7 @@ class SavedState:
         u: Displacement in primal order.
         lam: Multipliers λ of this rank's rows.
         mu: Multipliers of Gλ = e.
+        norm: Estimate of ‖F‖ that solves have come to, shape ``()``.
         status: Status of each row, see ``qp.faces``.
         slip: Where the load step began: tangential v_i of the conditions, ``(n, gdim - 1)``.
         reach: How far was searched in each contact.
@@ -38,6 +39,7 @@ class SavedState:
     u: Array
     lam: Array
     mu: Array
+    norm: Array
     status: Array
     slip: Array
     reach: Array
@@ -45,7 +47,7 @@ class SavedState:
     group: Array
 
     @classmethod
-    def of(cls, solution: Solution, mu: Array, reach: list[float]) -> SavedState:
+    def of(cls, solution: Solution, mu: Array, norm: float, reach: list[float]) -> SavedState:
         """The state of a solution."""
         records, holding = solution.gluing.records, solution.holding
         held = np.where(holding, Status.STICK, Status.SLIP)
@@ -54,6 +56,7 @@ class SavedState:
             u=solution.u,
             lam=solution.lam,
             mu=mu,
+            norm=np.array(norm),
             status=np.where(solution.carrying, held, Status.OPEN),
             slip=solution.gluing.slip,
             reach=np.array(reach, dtype=float),

@@ -89,7 +89,7 @@ class Stepping:
         if solution is None or start is None:
             raise InputError("there is no state yet; expected a call of accept() before")
         reach, _ = self._system.search.rows()
-        return SavedState.of(solution, start[2], reach)
+        return SavedState.of(solution, start[2], self._system.dual.seen, reach)
 
     def restore(self, state: SavedState) -> None:
         """Go on where another run of the same program, on as many ranks, has been. Collective.
@@ -106,7 +106,7 @@ class Stepping:
         system = self._system
         system.know_rows(list(state.reach), state.groups())
         system.look_for_changes()
-        system.make(self.report)
+        system.make(self.report).saw(float(state.norm))
         gluing = replace(system.gluing, slip=state.slip)
         state.check_rows(gluing)
         solution = self._make_solution(state.u, state.multipliers(), gluing)

@@ -65,11 +65,11 @@ class System:
         settings: Settings,
     ) -> None:
         self.forms, self.bcs, self._contacts = forms, bcs, contacts
-        self._dofs, self._decomposition = dofs, decomposition
-        self._settings = settings
+        self._dofs, self._decomposition, self._settings = dofs, decomposition, settings
         self.friction = FrictionBounds(contacts, dofs, decomposition, forms.thickness)
         self.spectrum: dict[str, float] = {}
         self._stages, self._counters, self._counted = Stages(), Counters(), 0
+        self._seen = 0.0  # of ‖F‖, which more rows hardly change
         self._K: Any = None
         self._search: ContactSearch | None = None
         self._known_rows: tuple[Sequence[float], Sequence[Array]] | None = None
@@ -237,8 +237,7 @@ class System:
         decomposition, dofs = self._decomposition, self._dofs
         rows = self.gluing.constraints.sets.contact_rows(dofs.comm)
         _, pc_type = resolve_types(self._settings.options, rows, self._settings.prefix)
-        own = self._settings.extensions.preconditioner
-        if own is not None and pc_type == "none":
+        if (own := self._settings.extensions.preconditioner) is not None and pc_type == "none":
             raise InputError(
                 f"extensions: a preconditioner is given, but -{self._settings.prefix}pc_type is "
                 "none, as auto is with smalse; expected lumped or dirichlet, whose place it takes"
@@ -253,16 +252,18 @@ class System:
                 options_prefix=self._settings.prefix,
                 feasible=self._settings.extensions.feasible_set,
             )
+        self._dual.saw(self._seen)
 
     def _destroy_dual(self) -> None:
         if self._dual is not None:
+            self._seen = self._dual.seen
             self._dual.destroy()
         self._dual = None
 
     def _destroy_subdomains(self) -> None:
         if self._subdomains is not None:
             self._subdomains.destroy()
-        self._subdomains = None
+        self._subdomains, self._seen = None, 0.0
 
 
 MAKERS: dict[str, Callable[[System], None]] = {

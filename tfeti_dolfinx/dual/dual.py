@@ -72,6 +72,7 @@ class Dual:
         preconditioner: The preconditioner, or None.
         coarse: The coarse space.
         contact_rows: Number of normal and of tangential rows on all ranks.
+        seen: Largest estimate of ‖F‖ that solves have come to, 0 before.
         feasible: The set Ω of multipliers.
         pressing: After ``recover``: contact rows whose force is more than the solver's error.
         nearly_free: After ``recover``: motions that contacts with a force hold hardly or not.
@@ -110,7 +111,7 @@ class Dual:
         self._law, self.feasible = feasible, feasible(constraints)
         self._images = dict[str, tuple[Array, Image]]()
         self._norm: tuple[int, float] | None = None
-        self._seen = 0.0
+        self.seen = 0.0
         self._check()
         self.d = linear_term(B, constraints.c, subdomains)
 
@@ -151,14 +152,14 @@ class Dual:
         self.feasible = self._law(self.constraints)  # c may be another, and what the law refers to
         norm = self._norm_of(coarse, norm_steps) if norm_steps else 1.0
         on = self._preconditioner_on if self.preconditioner is not None else None
-        return QP(self.F, self.d, coarse, self.feasible, self.preconditioner, norm, on, self._seen)
+        return QP(self.F, self.d, coarse, self.feasible, self.preconditioner, norm, on, self.seen)
 
     def saw(self, norm: float) -> None:
         """A solve has estimated ‖F‖: what the next one begins with.
 
         Of its start alone it might see far less, and take its multipliers for less exact.
         """
-        self._seen = max(self._seen, norm)
+        self.seen = max(self.seen, norm)
 
     def _preconditioner_on(self, face: Face) -> FaceOperator:
         """The preconditioner on a face of the rows; what all faces share is made once."""
