@@ -125,14 +125,36 @@ def slipping_start(
     early = (face.status == Status.STICK) & (pressed.status == Status.SLIP)
     if not any_rank(qp.d.getComm().tompi4py(), bool(np.any(early))):
         return start, face
-    way, image = back.copy(), at.g.duplicate()
-    way.axpy(-1.0, at.lam)
-    qp.F.mult(way, image)
-    start.move(1.0, way, image)
-    back.copy(start.lam)
-    way.destroy()
-    image.destroy()
+    moved_to(qp, start, back.copy())
     return start, pressed
+
+
+def part_of_way(at: Point, end: Point, share: float) -> Point:
+    """The point so far from ``at`` to ``end``, the caller's own. Collective."""
+    part = at.copy()
+    for kept, last in ((part.lam, end.lam), (part.g, end.g)):
+        kept.scale(1.0 - share)
+        kept.axpy(share, last)
+    return part
+
+
+def projected_part(qp: QP, at: Point, end: Point, share: float) -> Point:
+    """The nearest feasible point to a part of a way. Collective; multiplies by F once."""
+    part = part_of_way(at, end, share)
+    found = nearest(qp.coarse, qp.feasible, part.lam)
+    moved_to(qp, part, found.lam)
+    return part
+
+
+def moved_to(qp: QP, z: Point, lam: PETSc.Vec) -> None:
+    """Take z to λ, which is destroyed, and its gradient with it; multiplies by F once."""
+    way, image = lam.copy(), z.g.duplicate()
+    way.axpy(-1.0, z.lam)
+    qp.F.mult(way, image)
+    lam.copy(z.lam)
+    z.g.axpy(1.0, image)
+    for vec in (way, image, lam):
+        vec.destroy()
 
 
 def brought_back(qp: QP, face: Face, z: Point) -> bool:
@@ -145,11 +167,5 @@ def brought_back(qp: QP, face: Face, z: Point) -> bool:
     """
     found = nearest(qp.coarse, WithinFace(qp.feasible, face, slipping=True), z.lam, max_trials=BACK)
     held = imbalance(qp.coarse, found.lam) <= HELD
-    bend, image = found.lam.copy(), z.g.duplicate()
-    bend.axpy(-1.0, z.lam)
-    qp.F.mult(bend, image)
-    found.lam.copy(z.lam)
-    z.g.axpy(1.0, image)
-    for vec in (bend, image, found.lam):
-        vec.destroy()
+    moved_to(qp, z, found.lam)
     return held

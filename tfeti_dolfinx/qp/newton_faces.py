@@ -8,7 +8,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.parallel import any_rank
+from tfeti_dolfinx.parallel import agreed, any_rank
 from tfeti_dolfinx.qp.coarse import Coarse, imbalance
 from tfeti_dolfinx.qp.dependent import DependentRows
 from tfeti_dolfinx.qp.faces import Face
@@ -104,6 +104,15 @@ class FaceSolver:
     def saw(self, curvature: float, size: float) -> None:
         """Another Rayleigh quotient."""
         self._directions.seen(curvature, size)
+
+    def see(self, point: Point, s: PETSc.Vec) -> None:
+        """Rayleigh quotients at λ, which alone may be far below ‖F‖, and at s. Collective."""
+        lam, image = point.lam, s.duplicate()
+        self.saw(lam.dot(point.g) + lam.dot(self._qp.d), lam.dot(lam))
+        if agreed(self._comm, s.norm() > 0.0):
+            self._qp.F.mult(s, image)
+            self.saw(s.dot(image), s.dot(s))
+        image.destroy()
 
     @property
     def coarse(self) -> Coarse:

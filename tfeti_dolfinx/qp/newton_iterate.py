@@ -13,7 +13,14 @@ from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.qp.faces import Face, without_slip
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.nearest import nearest
-from tfeti_dolfinx.qp.newton_curved import brought_back, is_curved, slipping_start, slipping_work
+from tfeti_dolfinx.qp.newton_curved import (
+    brought_back,
+    is_curved,
+    part_of_way,
+    projected_part,
+    slipping_start,
+    slipping_work,
+)
 from tfeti_dolfinx.qp.newton_faces import FaceSolver
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, QPResult, Steps
 from tfeti_dolfinx.qp.trial import Trial
@@ -27,6 +34,8 @@ MOST = 0.1
 WILD = 1e3
 # of a way along a face that is curved, where q is not low enough at its end
 SHORTER = 0.5
+# of such a way with all that leaves Ω brought back, which lets go many nodes at once
+PARTS = (0.5, 0.125)
 # of λ: what a way must be, so that F on it is not F on rounding of Gλ = e
 SHORT = 1e-6
 # so many steps in a row that neither lower q by what stands out from its rounding, nor halve
@@ -58,8 +67,7 @@ class Iterate:
         self.point = Point(homogenised.lam_bar.copy(), homogenised.gradient.copy())
         self.s, self._work = qp.d.duplicate(), qp.d.duplicate()
         self.back: PETSc.Vec | None = None
-        self.mu: Array = np.zeros(qp.coarse.dimension)
-        self._taken: Array = np.zeros(qp.coarse.dimension)
+        self.mu, self._taken = np.zeros(qp.coarse.dimension), np.zeros(qp.coarse.dimension)
         self._set_multipliers()
         self.residual, self.norm = float("inf"), 1.0
         self._best, self._idle, self._slow = float("inf"), 0, 0
@@ -94,7 +102,7 @@ class Iterate:
         """Optimality: how far a gradient step, brought back to the feasible set, moves."""
         self._set_multipliers()
         if faces.norm == 0.0:
-            self._see(faces)
+            faces.see(self.point, self.s)
         self.norm = faces.norm or 1.0
         if faces.settled:
             self.multipliers_on(faces)
@@ -114,14 +122,6 @@ class Iterate:
         self._idle, self._slow = self._idle + 1, self._slow + 1
         if self.residual <= 0.5 * self._best:
             self._best, self._idle, self._slow = self.residual, 0, 0
-
-    def _see(self, faces: FaceSolver) -> None:
-        """Rayleigh quotients of F at λ, which alone may be far below ‖F‖, and at s."""
-        lam, g, s = self.point.lam, self.point.g, self.s
-        faces.saw(lam.dot(g) + lam.dot(self._qp.d), lam.dot(lam))
-        if agreed(self._comm, s.norm() > 0.0):
-            self._qp.F.mult(s, self._work)
-            faces.saw(s.dot(self._work), s.dot(s))
 
     def _set_multipliers(self) -> None:
         self._qp.coarse.combine(self.mu, self.s)
@@ -157,9 +157,8 @@ class Iterate:
 
     def begun(self, face: Face) -> tuple[Point, Face]:
         """Where the solve on a face starts, and on which: λ, or ``back`` where more slips there."""
-        if self.back is None:
-            return self.point.copy(), face
-        return slipping_start(self.qp, self.point, face, self.back, self.pressed_face())
+        back = self.point.lam if self.back is None else self.back
+        return slipping_start(self.qp, self.point, face, back, self.pressed_face())
 
     def accept(self, trial: Trial, faces: FaceSolver) -> bool:
         """Go where q falls enough: trial, the feasible part of its first step, or downhill.
@@ -178,28 +177,30 @@ class Iterate:
         faces.forget()
         length = self._feasible_part(trial)
         curved = is_curved(self.qp, trial.face)
-        shares = [length] if not curved else [SHORTER * length, SHORTER**2 * length]
-        if curved and trial.rounds > 1:
-            shares.insert(0, length)
+        shares = [length] if not curved or trial.rounds > 1 else []
+        shares += [SHORTER * length, SHORTER**2 * length] if curved else []
+        for share in PARTS if curved else ():
+            if self._went_to(projected_part(self.qp, self.point, trial.first, share), enough):
+                return True
         taken = any(self._shortened(trial, share, curved, enough) for share in shares)
         return taken or self._descend(known, faces)
 
     def _shortened(self, trial: Trial, length: float, curved: bool, enough: float) -> bool:
         """Go a part of the first solve's way, if q falls enough there."""
-        shorter = self.point.copy()
-        for kept, end in ((shorter.lam, trial.first.lam), (shorter.g, trial.first.g)):
-            kept.scale(1.0 - length)
-            kept.axpy(length, end)
-        held = True
+        shorter, held = part_of_way(self.point, trial.first, length), length > 0.0
         if curved:
-            held = brought_back(self.qp, trial.face, shorter)
+            held = brought_back(self.qp, trial.face, shorter) and held
         else:
             shorter.lam.array[:] = self._qp.feasible.project(shorter.lam.array_r)
-        gain = self.gain(shorter)
-        taken = agreed(self._comm, held and length > 0.0 and gain >= enough)
+        return self._went_to(shorter, enough, held)
+
+    def _went_to(self, to: Point, enough: float, may: bool = True) -> bool:
+        """Go there if q falls enough; the point is taken over."""
+        gain = self.gain(to)
+        taken = agreed(self._comm, may and gain >= enough)
         if taken:
-            self._take(shorter, gain)
-        shorter.destroy()
+            self._take(to, gain)
+        to.destroy()
         return taken
 
     @property
