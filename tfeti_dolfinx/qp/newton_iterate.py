@@ -67,10 +67,10 @@ class Iterate:
         self.point = Point(homogenised.lam_bar.copy(), homogenised.gradient.copy())
         self.s, self._work = qp.d.duplicate(), qp.d.duplicate()
         self.back: PETSc.Vec | None = None
-        self.mu, self._taken = np.zeros(qp.coarse.dimension), np.zeros(qp.coarse.dimension)
+        self.mu: Array = np.zeros(qp.coarse.dimension)
+        self._taken: Array = np.zeros(qp.coarse.dimension)
         self._set_multipliers()
-        self.residual, self.norm = float("inf"), 1.0
-        self._best, self._idle, self._slow = float("inf"), 0, 0
+        self.residual, self._best, self.norm, self._idle, self._slow = np.inf, np.inf, 1.0, 0, 0
 
     def face(self) -> Face:
         """The face of λ."""
