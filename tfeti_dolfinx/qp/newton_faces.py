@@ -24,7 +24,7 @@ from tfeti_dolfinx.qp.newton_curved import (
     restored_on,
 )
 from tfeti_dolfinx.qp.parameters import NewtonParameters
-from tfeti_dolfinx.qp.pcpg import Directions, pcpg
+from tfeti_dolfinx.qp.pcpg import SHORT, Directions, pcpg
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, FaceOperator, Point, Steps
 from tfeti_dolfinx.qp.stopping import StoppingRule, TargetRule
 from tfeti_dolfinx.qp.trial import Trial
@@ -79,9 +79,8 @@ class FaceSolver:
         self._directions.norm = qp.seen
         self._dependent = DependentRows(qp, self._directions)
         self._face: Face | None = None
-        self.settled, self.left, self.rounded = False, float("inf"), 0
-        self.curved, self._accepted = False, False
-        self._on_face = qp
+        self.settled, self.curved, self._accepted, self.left = False, False, False, np.inf
+        self._on_face, self.rounded = qp, 0
         self._bent: Bent | None = None
         self._preconditioner: FaceOperator | None = None
         self._prepared, self._stayed, self._stage = False, False, STAGE
@@ -106,12 +105,14 @@ class FaceSolver:
         self._directions.seen(curvature, size)
 
     def see(self, point: Point, s: PETSc.Vec) -> None:
-        """Rayleigh quotients at λ, which alone may be far below ‖F‖, and at s. Collective."""
-        lam, image = point.lam, s.duplicate()
+        """Rayleigh quotients at λ, which alone may be far below ‖F‖, and at Ps. Collective."""
+        lam, way, image = point.lam, s.copy(), s.duplicate()
         self.saw(lam.dot(point.g) + lam.dot(self._qp.d), lam.dot(lam))
-        if agreed(self._comm, s.norm() > 0.0):
-            self._qp.F.mult(s, image)
-            self.saw(s.dot(image), s.dot(s))
+        self._qp.coarse.project(way)
+        if agreed(self._comm, way.norm() > SHORT * s.norm()):
+            self._qp.F.mult(way, image)
+            self.saw(way.dot(image), way.dot(way))
+        way.destroy()
         image.destroy()
 
     @property

@@ -22,6 +22,7 @@ from tfeti_dolfinx.qp.newton_curved import (
     slipping_work,
 )
 from tfeti_dolfinx.qp.newton_faces import FaceSolver
+from tfeti_dolfinx.qp.pcpg import SHORT
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, QPResult, Steps
 from tfeti_dolfinx.qp.trial import Trial
 
@@ -36,8 +37,6 @@ WILD = 1e3
 SHORTER = 0.5
 # of such a way with all that leaves Ω brought back, which lets go many nodes at once
 PARTS = (0.5, 0.125)
-# of λ: what a way must be, so that F on it is not F on rounding of Gλ = e
-SHORT = 1e-6
 # so many steps in a row that neither lower q by what stands out from its rounding, nor halve
 # ‖g^P‖; so many that do not halve it, whatever q does
 PATIENCE, LONG, ROUNDING = 10, 100, 1e-15

@@ -16,6 +16,8 @@ from tfeti_dolfinx.qp.stopping import StoppingRule
 # of the largest curvature of a direction, and of what the preconditioner makes of a residual: less
 # is rounding, as where rows depend on each other
 FLAT = 1e-13
+# of λ: a way that is shorter may be rounding of Gλ = e
+SHORT = 1e-6
 # so many steps in which neither ‖r‖ comes down to a half nor q by what stands out from its rounding
 # have met rounding: at that pace 10 000 steps would bring 6 digits at best
 PLATEAU, ROUNDING = 500, 1e-15
@@ -40,9 +42,13 @@ class Directions:
         self.r, self.p, self.Fp, self.z = (like.duplicate() for _ in range(4))
         self.fresh, self.rz, self.norm, self.helped = True, 1.0, 0.0, 0.0
 
-    def seen(self, pFp: float, pp: float) -> bool:
-        """Whether a direction has a curvature that stands out from rounding."""
-        self.norm = max(self.norm, pFp / pp if pp > 0.0 else 0.0)
+    def seen(self, pFp: float, pp: float, short: bool = False) -> bool:
+        """Whether a direction has a curvature that stands out from rounding.
+
+        Of a short step, which may be rounding of Gλ = e, F makes far too much to learn ‖F‖ from.
+        """
+        if not short:
+            self.norm = max(self.norm, pFp / pp if pp > 0.0 else 0.0)
         return pFp > FLAT * self.norm * pp
 
     def stands_out(self, rz: float, rr: float) -> bool:
@@ -125,6 +131,7 @@ def pcpg(
     own = Directions(point.lam) if directions is None else directions
     r, p, Fp, z = own.r, own.p, own.Fp, own.z
     norm, reason = _residual(qp, point.g, r), ConvergedReason.ITERATING
+    least = agreed(qp.d.getComm().tompi4py(), SHORT**2 * point.lam.dot(point.lam))
     progress = _Progress(norm)
     while True:
         # test
@@ -151,7 +158,8 @@ def pcpg(
         pFp, pp = qp.coarse.project_against(z, p)
         z.aypx(-own.rz / pFp if pFp else 0.0, r)
         squared, own.rz, pFp = _square(z, own.rz, pFp)
-        if not (own.seen(pFp, pp) and own.stands_out(own.rz, norm**2)):
+        short = bool(pFp) and (own.rz / pFp) ** 2 * pp < least
+        if not (own.seen(pFp, pp, short) and own.stands_out(own.rz, norm**2)):
             own.fresh, reason = True, _examined(qp, point, rule, norm)
             if reason == ConvergedReason.ITERATING:
                 reason = ConvergedReason.DIVERGED_INDEFINITE_MAT
