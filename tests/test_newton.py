@@ -13,7 +13,7 @@ from tfeti_dolfinx.qp.feasible_sets import Product
 from tfeti_dolfinx.qp.homogenised import homogenise, image
 from tfeti_dolfinx.qp.nearest import nearest
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
-from tfeti_dolfinx.qp.pcpg import solve_by_pcpg
+from tfeti_dolfinx.qp.pcpg import Directions, solve_by_pcpg
 from tfeti_dolfinx.qp.problem import QP, Start
 from tfeti_dolfinx.qp.stopping import ResidualRule
 
@@ -116,6 +116,17 @@ def test_from_its_own_solution_it_multiplies_once():
     again = solved(replace(qp, seen=found.norm), 1e-8, Start(found.lam, found.mu))
     assert qp.F.count == before + 1
     assert np.allclose(again.lam.array_r, found.lam.array_r, atol=1e-8)
+
+
+def test_the_size_of_the_operator_is_not_learnt_from_short_steps():
+    """They may be rounding of Gλ = e, of which F makes far too much."""
+    own = Directions(vector(np.ones(2)))
+    assert own.seen(3.0, 1.0)
+    assert own.seen(1e-3, 1e-12, short=True)
+    assert own.norm == 3.0
+    assert own.seen(8.0, 2.0)
+    assert own.norm == 4.0
+    own.destroy()
 
 
 def test_without_a_kernel():

@@ -15,6 +15,9 @@ from tfeti_dolfinx.qp.faces import Face
 # since the rounding of the largest reaches them
 LIGHT = 1e-4
 
+# what ``imbalance`` says where Gλ = e holds as well as factors can tell
+HELD = 1e-9
+
 
 class Coarse(Protocol):
     """The constraint Gλ = e, λ in a face with the free directions Z.

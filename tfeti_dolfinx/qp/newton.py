@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from petsc4py import PETSc
 
-from tfeti_dolfinx.qp.coarse import imbalance
+from tfeti_dolfinx.qp.coarse import HELD, imbalance
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.monitors import Monitor, no_monitor
@@ -20,8 +20,6 @@ from tfeti_dolfinx.qp.stopping import StoppingRule
 # far more than what factors leave of Gλ = e: the nearest point of Ω does not balance the load;
 # without friction that is known before
 UNBALANCED = 1e-3
-# Gλ = e holds on the face of 0 as well as factors can tell
-HELD = 1e-9
 
 
 def first_point(qp: QP) -> PETSc.Vec:

@@ -7,14 +7,12 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.parallel import any_rank
-from tfeti_dolfinx.qp.coarse import Coarse, imbalance
+from tfeti_dolfinx.qp.coarse import HELD, Coarse, imbalance
 from tfeti_dolfinx.qp.faces import Face, Status, without_slip
 from tfeti_dolfinx.qp.homogenised import restored
 from tfeti_dolfinx.qp.nearest import WithinFace, nearest
 from tfeti_dolfinx.qp.problem import QP, Operator, Point
 
-# Gλ = e holds as well as factors can tell
-HELD = 1e-9
 # points looked at on the way back to circles: it is short, or there is no such way
 BACK = 30
 

@@ -9,7 +9,7 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.parallel import agreed, any_rank
-from tfeti_dolfinx.qp.coarse import Coarse, imbalance
+from tfeti_dolfinx.qp.coarse import HELD, Coarse, imbalance
 from tfeti_dolfinx.qp.dependent import DependentRows
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.monitors import Monitor
@@ -29,8 +29,6 @@ from tfeti_dolfinx.qp.problem import QP, ConvergedReason, FaceOperator, Point, S
 from tfeti_dolfinx.qp.stopping import StoppingRule, TargetRule
 from tfeti_dolfinx.qp.trial import Trial
 
-# Gλ = e on a smaller face holds as well as its factor can tell
-HELD = 1e-9
 # rows leave a face in so many rounds at most: each round drops one row at least, but most at once
 MOST_ROUNDS = 60
 # of the rule's tolerance, for the last solve on a face: ‖g^P‖ is measured otherwise than ‖P_f g‖
