@@ -35,6 +35,8 @@ class Report:
         bodies: Number of bodies.
         split_subdomains: Subdomains that were not connected and were split.
         kernel_dim: Dimension of the kernel of K.
+        soft_modes: Rigid motions of subdomains that springs hold softly: part of the
+            preconditioner.
         free_modes: Rigid motions that nothing resists and the load does not drive.
         nearly_free: Rigid motions that contacts with a force hold hardly (``stiffness``: as a
             share of what the same contacts hold at most) or not at all (0): dicts of ``bodies``,
@@ -69,6 +71,7 @@ class Report:
             seconds, ``predicted`` by the model and ``measured`` (largest over ranks).
         coarse_factorizations: Factorisations of GGᵀ.
         face_factorizations: Factorisations of G_f G_fᵀ, f a face of the rows.
+        soft_factorizations: Factorisations of the coarse problem of soft motions, one for a face.
         assemblies: Times that the stiffness was assembled.
         searches: Times that it was searched who meets whom.
         gluings: Times that rows of B were made.
@@ -98,6 +101,7 @@ class Report:
     bodies: int = 0
     split_subdomains: int = 0
     kernel_dim: int = 0
+    soft_modes: int = 0
     free_modes: int = 0
     nearly_free: list[dict[str, object]] = field(default_factory=list)
     contact_rows: int = 0
@@ -126,6 +130,7 @@ class Report:
     local_operators: dict[str, float] = field(default_factory=dict)
     coarse_factorizations: int = _counter()
     face_factorizations: int = _counter()
+    soft_factorizations: int = _counter()
     assemblies: int = _counter()
     searches: int = _counter()
     gluings: int = _counter()

@@ -63,6 +63,9 @@ def fill_result(
     report.outer_iterations += result.steps.outer
     report.newton_faces += result.steps.faces
     report.face_factorizations += dual.coarse.factors.count["face"]
+    if dual.soft is not None:
+        report.soft_factorizations += dual.soft.factors.count["face"]
+        report.soft_modes = dual.soft.count
     report.cg_steps += result.steps.cg
     report.expansion_steps += result.steps.expansion
     report.proportioning_steps += result.steps.proportioning

@@ -73,7 +73,7 @@ class CoarseSpace(Projectors):
         offsets = chunk_offsets(comm, subdomains.kernel_size)
         dimension = int(offsets[-1])
         self._own = slice(int(offsets[comm.rank]), int(offsets[comm.rank + 1]))
-        Gt = _transposed_G(B, subdomains.kernel_rows, self._own.start, dimension)
+        Gt = transposed_G(B, subdomains.kernel_rows, self._own.start, dimension)
         self.row_size = _sizes(B)
         self.bodies = Bodies(subdomains, self._own.start, dimension)
         self.J = _without_rounding(diags_array(1.0 / self.row_size) @ Gt @ self.bodies.motions)
@@ -172,7 +172,7 @@ def _sizes(B: PETSc.Mat) -> Array:
     return np.where(sizes > 0.0, sizes, 1.0)
 
 
-def _transposed_G(B: PETSc.Mat, kernel: csr_array, first: int, dimension: int) -> csr_array:
+def transposed_G(B: PETSc.Mat, kernel: csr_array, first: int, dimension: int) -> csr_array:
     """This rank's rows of B R, with global columns; its own kernel coordinates begin at first."""
     index = PETSc.IntType
     columns = (kernel.indices + first).astype(index)

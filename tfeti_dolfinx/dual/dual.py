@@ -22,16 +22,17 @@ from tfeti_dolfinx.dual.operator import (
 from tfeti_dolfinx.dual.particular import PARTICULAR
 from tfeti_dolfinx.dual.recovery import moved, recover
 from tfeti_dolfinx.dual.smallest import nearly_free, smallest_motion
+from tfeti_dolfinx.dual.soft_modes import SoftModes
 from tfeti_dolfinx.dual.solvability import check_solvable
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.qp.coarse import Coarse, NoCoarse
 from tfeti_dolfinx.qp.discs import Discs, Ellipses
-from tfeti_dolfinx.qp.faces import Face
+from tfeti_dolfinx.qp.faces import Face, Status, face_of
 from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Product
 from tfeti_dolfinx.qp.homogenised import Image, image
 from tfeti_dolfinx.qp.norm import estimate_norm
-from tfeti_dolfinx.qp.problem import QP, FaceOperator
+from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # from B and c to the set of multipliers, on all local rows
@@ -71,6 +72,7 @@ class Dual:
         F: B K⁺ Bᵀ.
         preconditioner: The preconditioner, or None.
         coarse: The coarse space.
+        soft: Motions that springs hold softly, for the preconditioner; None without one.
         contact_rows: Number of normal and of tangential rows on all ranks.
         seen: Largest estimate of ‖F‖ that solves have come to, 0 before.
         feasible: The set Ω of multipliers.
@@ -104,9 +106,13 @@ class Dual:
             self._scaled = ScaledRows(B, constraints.weights)
             self.preconditioner = preconditioner(self._scaled, subdomains)
         self._on_faces: FacePreconditioner | None = None
+        self._on_all: FaceOperator | None = None
         normals, tangents = constraints.sets.normals, constraints.sets.tangents.ravel()
         prefix = f"{options_prefix}coarse_"
         self.coarse = CoarseSpace(B, subdomains, normals, tangents, prefix)
+        self.soft: SoftModes | None = None
+        if self.preconditioner is not None:
+            self.soft = SoftModes(B, self.coarse, constraints.weights, prefix)
         self.contact_rows = constraints.sets.contact_rows(comm)
         self._law, self.feasible = feasible, feasible(constraints)
         self._images = dict[str, tuple[Array, Image]]()
@@ -141,6 +147,8 @@ class Dual:
             if operator is not None:
                 operator.count.clear()
         self.coarse.factors.count["face"] = 0
+        if self.soft is not None:
+            self.soft.factors.count["face"] = 0
 
     def qp(self, norm_steps: int = 0) -> QP:
         """The quadratic program; without kernel it has no coarse problem.
@@ -152,7 +160,7 @@ class Dual:
         self.feasible = self._law(self.constraints)  # c may be another, and what the law refers to
         norm = self._norm_of(coarse, norm_steps) if norm_steps else 1.0
         on = self._preconditioner_on if self.preconditioner is not None else None
-        return QP(self.F, self.d, coarse, self.feasible, self.preconditioner, norm, on, self.seen)
+        return QP(self.F, self.d, coarse, self.feasible, self._on_all_rows, norm, on, self.seen)
 
     def saw(self, norm: float) -> None:
         """A solve has estimated ‖F‖: what the next one begins with.
@@ -161,15 +169,27 @@ class Dual:
         """
         self.seen = max(self.seen, norm)
 
+    @property
+    def _on_all_rows(self) -> Operator | None:
+        """The preconditioner where nothing is constrained; soft motions are factored once."""
+        if self.soft is None or not self.soft.count:
+            return self.preconditioner
+        if self._on_all is None:
+            rows = self.constraints.num_rows
+            face = face_of(np.ones(rows, dtype=bool), np.full(rows, Status.FREE))
+            self._on_all = self._preconditioner_on(face)
+        return self._on_all
+
     def _preconditioner_on(self, face: Face) -> FaceOperator:
         """The preconditioner on a face of the rows; what all faces share is made once."""
         assert self.preconditioner is not None
+        assert self.soft is not None
         if self._on_faces is None:
             diagonal = self.subdomains.diagonal
             self._on_faces = FacePreconditioner(
                 self.preconditioner, self.constraints, diagonal, self._prefix
             )
-        return self._on_faces.on_face(face)
+        return self.soft.balanced(face, self._on_faces.on_face(face))
 
     def _norm_of(self, coarse: Coarse, steps: int) -> float:
         if self._norm is None or self._norm[0] != steps:
@@ -220,7 +240,7 @@ class Dual:
     def destroy(self) -> None:
         """Destroy the PETSc objects."""
         images = [found for _, found in self._images.values()]
-        own = (self._on_faces, self.preconditioner, self._scaled)
+        own = (self._on_all, self._on_faces, self.preconditioner, self._scaled)
         for item in (self.F, *own, self.coarse, self.d, *images):
             if item is not None:
                 item.destroy()

@@ -43,6 +43,12 @@ class NullBasis:
             pins.append(rows[independent(joint / size)])
         return np.concatenate(pins)
 
+    def extended(self, count: int) -> NullBasis:
+        """The same space, 0 on so many more coordinates."""
+        rows = self.joint.shape[0] + count
+        table = (self.joint.data, self.joint.indices, np.pad(self.joint.indptr, (0, count), "edge"))
+        return NullBasis(self.alone, csr_array(table, shape=(rows, self.joint.shape[1])))
+
 
 def null_basis(alone: Array, joint: csr_array) -> NullBasis:
     """Basis of unit vectors and others.

@@ -31,6 +31,9 @@ class SemidefiniteFactor:
         what: Name of A for messages.
         prefix: Prefix of the factor's PETSc options.
 
+    Attributes:
+        comm: Communicator.
+
     Raises:
         FactorError: The factor could not be made.
     """
@@ -43,7 +46,7 @@ class SemidefiniteFactor:
         what: str,
         prefix: str = "tfeti_coarse_",
     ) -> None:
-        self._null, diagonal = null, A.diagonal()
+        self.comm, self._null, diagonal = comm, null, A.diagonal()
         pinned = np.where(diagonal > 0.0, 0.0, 1.0)  # what nothing holds at all stands for itself
         self._scale = np.where(diagonal > 0.0, diagonal, 1.0) ** -0.5
         pinned[null.pins(self._scale)] = 1.0

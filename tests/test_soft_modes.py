@@ -1,0 +1,127 @@
+"""Springs in the stiffness: the preconditioner knows what they hold softly."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from scenes import clamp, curved_obstacle, decomposed, displacement, forms
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.dual.projectors import FaceFactors
+from tfeti_dolfinx.dual.soft_modes import SoftModes
+from tfeti_dolfinx.qp.faces import Status, face_of
+from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
+
+SUBDOMAINS = 8
+
+
+def cubes(x):
+    """Eight subdomains."""
+    i, j, k = np.minimum((2 * x).astype(int), 1)
+    return i + 2 * j + 4 * k
+
+
+def foundation(stiffness, contact=True, along=(1.0, 1.0, 1.0), **options):
+    """A block of 8 cubes, clamped on the left, with springs in each of its points."""
+    d = decomposed("hexahedron", 6, cubes)
+    V, a, L = forms(d.mesh, d.facet_tags, (0.0, 0.0, -0.1), d.surface("top"))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    spring = fem.Constant(d.mesh, stiffness * np.array(along))
+    dx = ufl.Measure("dx", domain=d.mesh, metadata={"quadrature_degree": 2})
+    a += sum(spring[i] * u[i] * v[i] for i in range(3)) * dx
+    return tfeti.ContactProblem(
+        a,
+        L,
+        [clamp(V, d.facets("left"))],
+        [tfeti.Obstacle("bottom", curved_obstacle(3), reach=0.2)] if contact else [],
+        d,
+        petsc_options={f"tfeti_{name}": value for name, value in options.items()},
+    )
+
+
+def multiplications(stiffness, **options):
+    """Those by F, and how many motions were soft."""
+    p = foundation(stiffness, **options)
+    p.solve()
+    counted, soft = p.report.F_multiplications, p.report.soft_modes
+    p.destroy()
+    return counted, soft
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"contact": False},
+        {"qp_type": "newton"},
+        pytest.param({"qp_type": "smalse", "pc_type": "dirichlet"}, marks=pytest.mark.slow),
+    ],
+)
+def test_springs_cost_little(options):
+    """From next to nothing to stiffer than the body."""
+    without, none = multiplications(0.0, **options)
+    assert none == 0
+    for stiffness in (1e-6, 1e-3, 1.0, 1e4):
+        counted, soft = multiplications(stiffness, **options)
+        assert soft == (6 * SUBDOMAINS if stiffness <= 1.0 else 0)
+        assert counted <= 2 * without
+
+
+def test_springs_along_one_axis():
+    """As a bearing's cage: a translation and two rotations of each subdomain are left."""
+    without, _ = multiplications(0.0)
+    counted, soft = multiplications(1e-3, along=(1.0, 0.0, 0.0))
+    assert soft == 3 * SUBDOMAINS
+    assert counted <= 2 * without
+
+
+def test_they_do_not_change_the_answer():
+    p, q = (foundation(1e-3, pc_type=kind, rtol=1e-10) for kind in ("dirichlet", "none"))
+    for each in (p, q):
+        each.solve()
+    assert (p.report.soft_modes, q.report.soft_modes) == (6 * SUBDOMAINS, 0)
+    u, other = displacement(p)[1], displacement(q)[1]
+    assert np.abs(u - other).max() <= 1e-8 * np.abs(other).max()
+    p.destroy()
+    q.destroy()
+
+
+@pytest.mark.parametrize("held", [True, False])
+def test_the_preconditioner_is_symmetric_and_positive(held):
+    """Also on a face without contact rows."""
+    p = foundation(1e-3)
+    p.solve()
+    dual = p.dual
+    rows = dual.constraints.sets.normals
+    free = np.ones(dual.constraints.num_rows, dtype=bool)
+    free[rows] = held
+    status = np.where(free, Status.TOUCHING, Status.OPEN)
+    M, vectors = dual.qp().preconditioner_on(face_of(free, status)), []
+    for seed in range(2):
+        x, y = dual.d.duplicate(), dual.d.duplicate()
+        x.array[:] = np.where(free, np.random.default_rng(seed).standard_normal(len(free)), 0.0)
+        M.mult(x, y)
+        vectors.append((x, y))
+    (x, Mx), (z, Mz) = vectors
+    assert np.all(Mx.array_r[~free] == 0.0)
+    assert x.dot(Mx) > 0.0
+    assert x.dot(Mz) == pytest.approx(z.dot(Mx), abs=1e-12 * np.sqrt(x.dot(Mx) * z.dot(Mz)))
+    M.destroy()
+    p.destroy()
+
+
+def test_without_springs_nothing_is_made(monkeypatch):
+    p = foundation(0.0)
+    p.solve()
+    dual = p.dual
+
+    def refuse(*arguments):
+        raise AssertionError("nothing is to be multiplied or factored")
+
+    monkeypatch.setattr(SparseBlock, "multiply", refuse)
+    monkeypatch.setattr(FaceFactors, "factor", refuse)
+    soft = SoftModes(dual.constraints.B, dual.coarse, dual.constraints.weights)
+    free = np.ones(dual.constraints.num_rows, dtype=bool)
+    face = face_of(free, np.full(len(free), Status.FREE))
+    assert soft.count == 0
+    assert soft.balanced(face, dual.preconditioner) is dual.preconditioner
+    p.destroy()

@@ -1,0 +1,146 @@
+"""Rigid motions of subdomains that springs hold, but softly: a coarse space for preconditioners.
+
+Springs or inertia in a stiffness leave fewer kernel modes than a free subdomain has, and on what is
+left of its rigid motions K⁺ is large: F ≈ F₀ + ĜᵀD⁻¹Ĝ with Ĝ = R̂ᵀBᵀ, D = R̂ᵀKR̂. The natural coarse
+space does not know of them, and M_f is an inverse of F₀ alone.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from petsc4py import PETSc
+from scipy.sparse import block_diag, csr_array, diags_array, hstack
+
+from tfeti_dolfinx.arrays import Array, joined
+from tfeti_dolfinx.dual.coarse import CoarseSpace, transposed_G
+from tfeti_dolfinx.dual.grams import Grams
+from tfeti_dolfinx.dual.projectors import FaceFactors, Projectors
+from tfeti_dolfinx.dual.semidefinite import SemidefiniteFactor
+from tfeti_dolfinx.parallel import agreed, chunk_offsets, summed
+from tfeti_dolfinx.qp.faces import Face
+from tfeti_dolfinx.qp.problem import FaceOperator
+from tfeti_dolfinx.subdomains.block import Block
+
+# of a mode of length 1: what is left of it outside of the kernel is rounding
+IN_KERNEL = 1e-6
+
+
+class SoftModes:
+    """Ĝ of the motions that springs hold more softly than rows would.
+
+    Such are those with R̂ᵀKR̂ < σ‖Ĝᵀ‖², σ the mean stiffness of a scaled row: only there does F
+    stand out. Where every subdomain has all its rigid motions in the kernel there are none, and
+    nothing is multiplied.
+
+    Args:
+        B: Dual rows × trace unknowns.
+        coarse: The natural coarse space. The constructor is collective.
+        weights: D of the rows, on this rank's trace unknowns.
+        prefix: Prefix of the factors' PETSc options.
+
+    Attributes:
+        count: Number of soft motions of all subdomains.
+        factors: Makes the factors of faces, and counts them.
+    """
+
+    def __init__(
+        self, B: PETSc.Mat, coarse: CoarseSpace, weights: Array, prefix: str = "tfeti_coarse_"
+    ) -> None:
+        self._comm, self._r = coarse.comm, coarse.dimension
+        Gt, energy = _springs(B, coarse)
+        own = np.array([np.sum(coarse.subdomains.diagonal / weights), len(weights)])
+        stiffness, unknowns = summed(self._comm, own)
+        sigma = stiffness / max(unknowns, 1.0)
+        squares = summed(self._comm, np.asarray(Gt.multiply(Gt).sum(axis=0)).ravel())
+        soft = agreed(self._comm, np.flatnonzero(energy < sigma * squares))
+        self.count = len(soft)
+        self._energy = np.concatenate((np.zeros(self._r), energy[soft]))
+        self._damping = diags_array(self._energy / (sigma or 1.0))
+        self._Gt = csr_array(hstack((coarse.Gt, Gt[:, soft]), format="csr"))
+        contact = np.concatenate((coarse.bounded, coarse.rubbing))
+        self._grams = Grams(self._Gt, contact, self._comm) if self.count else None
+        self.factors = FaceFactors(self._comm, coarse.null.extended(self.count), prefix)
+
+    def balanced(self, face: Face, on_face: FaceOperator) -> FaceOperator:
+        """An approximate inverse of F on a face; M_f itself where nothing is soft. Collective.
+
+        Args:
+            face: The face.
+            on_face: M_f, which is taken over.
+        """
+        if self._grams is None:
+            return on_face
+        gram = csr_array(self._grams.of_face(face) + self._damping)
+        return _Balanced(self._Gt, face, on_face, self.factors.factor(gram), self._energy)
+
+
+class _Balanced(Projectors):
+    """(I − Π)M_f(I − Π) + CᵀDC, Π = [G; Ĝ]ᵀC, C = ([G; Ĝ][G; Ĝ]ᵀ + [0 0; 0 D/σ])⁻¹[G; Ĝ].
+
+    Mandel, Comm. Numer. Methods Engrg. 9 (1993) 233–241, with an inexact coarse problem: CF Cᵀ is
+    taken for D⁻¹. Where springs are soft it nearly is; where they are not, C is small. On faces
+    [G; Ĝ] may lack rank: what is left free Cᵀ does not see.
+    """
+
+    def __init__(
+        self,
+        Gt: csr_array,
+        face: Face,
+        on_face: FaceOperator,
+        factor: SemidefiniteFactor,
+        energy: Array,
+    ) -> None:
+        self.comm, self.Gt, self.e = factor.comm, Gt, np.zeros(Gt.shape[1])
+        self._face, self._on_face, self._factor, self._energy = face, on_face, factor, energy
+
+    def restricted(self, x: Array) -> Array:
+        """ZZᵀx."""
+        return self._face.restricted(x)
+
+    def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """y = M x. Collective; two reductions besides those of M_f."""
+        motion, rest = self.coordinates(x), x.copy()
+        self._take_away(rest, motion)
+        self._on_face.mult(rest, y)
+        rest.destroy()
+        self._take_away(y, self.solve(self.G(y.array_r) - self._energy * motion))
+
+    def dependent(self, x: Array) -> Array | None:
+        """As M_f says."""
+        return self._on_face.dependent(x)
+
+    def destroy(self) -> None:
+        """Free the factors."""
+        super().destroy()
+        self._on_face.destroy()
+
+
+def _springs(B: PETSc.Mat, coarse: CoarseSpace) -> tuple[csr_array, Array]:
+    """This rank's rows of Ĝᵀ, with all motions outside of kernels as columns, and D. Collective."""
+    blocks = coarse.subdomains.blocks
+    modes, energies = zip(*map(_outside, blocks), strict=True) if blocks else ((), ())
+    trace = [R[block.trace_dofs] for R, block in zip(modes, blocks, strict=True)]
+    rows = block_diag(trace, format="csr") if trace else np.zeros((0, 0))
+    offsets = chunk_offsets(coarse.comm, rows.shape[1])
+    first, total = int(offsets[coarse.comm.rank]), int(offsets[-1])
+    if total == 0:
+        return csr_array((B.getLocalSize()[0], 0)), np.zeros(0)
+    energy = np.concatenate(coarse.comm.allgather(joined(energies)))
+    return transposed_G(B, csr_array(rows), first, total), energy
+
+
+def _outside(block: Block) -> tuple[Array, Array]:
+    """R̂, orthonormal, orthogonal to the kernel, shape ``(n, k)``, and the diagonal of R̂ᵀKR̂."""
+    modes, R = block.modes, block.kernel
+    count = modes.shape[1] - R.shape[1]
+    if count <= 0:
+        return np.zeros((len(modes), 0)), np.zeros(0)
+    sizes = np.linalg.norm(modes, axis=0)
+    rest = modes / np.where(sizes > 0.0, sizes, 1.0)
+    for _ in range(2):  # once leaves rounding of the kernel
+        rest = rest - R @ (R.T @ rest)
+    U, sizes, _ = np.linalg.svd(rest, full_matrices=False)
+    U = U[:, :count][:, sizes[:count] > IN_KERNEL]
+    KU = np.array([block.multiply(u) for u in U.T]).reshape(-1, len(modes)).T
+    energies, V = np.linalg.eigh(U.T @ KU)
+    return U @ V, np.maximum(energies, 0.0)
