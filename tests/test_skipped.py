@@ -110,6 +110,8 @@ def test_without_a_kernel_there_is_no_coarse_problem(qp_type):
     p.solve()
     assert p.report.kernel_dim == p.report.coarse_factorizations == 0
     assert p.report.face_factorizations == 0
+    preconditioned = p.report.preconditioner_multiplications > 0
+    assert (p.report.soft_factorizations > 0) == preconditioned == (qp_type != "smalse")
     assert p.report.F_multiplications > 0
     assert (p.report.active_contacts > 0) == (qp_type != "pcpg")
     p.destroy()
