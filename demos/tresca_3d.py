@@ -1,8 +1,9 @@
 # # A cube with given friction
 #
 # The 3D scene of the talk's table with Tresca friction: a unit cube fixed on one face, pressed on a
-# rough plane and pushed along it. The subdomains are equal boxes of 10 × 10 × 10 elements. Four of
-# them make the half next to the fixed face, which does not slide as far: its bound is lower.
+# rough plane and pushed along it. The subdomains are equal cubes of 10 × 10 × 10 elements. Four of
+# them make the half next to the fixed face, which does not slide as far: its bound is lower. 1024 of
+# them make a body of twice the length, which slides further: its bound is higher.
 #
 #     ./run mpirun -n 2 python3 demos/tresca_3d.py --subdomains 64
 
@@ -34,7 +35,7 @@ SCENES = {
     8: ((2, 2, 2), 1.0, 0.015),
     64: ((4, 4, 4), 1.0, 0.015),
     512: ((8, 8, 8), 1.0, 0.015),
-    1024: ((16, 8, 8), 1.0, 0.015),
+    1024: ((16, 8, 8), 2.0, 0.05),
 }
 
 
