@@ -20,7 +20,7 @@ from tfeti_dolfinx.qp.cones import Cones
 from tfeti_dolfinx.qp.discs import Ellipses
 from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Product
 from tfeti_dolfinx.qp.monitors import Monitor
-from tfeti_dolfinx.qp.nearest import nearest
+from tfeti_dolfinx.qp.nearest import nearest_or_least
 from tfeti_dolfinx.qp.problem import ConvergedReason, QPResult, Steps
 from tfeti_dolfinx.solver import solve_dual
 
@@ -151,7 +151,7 @@ class _Pressures:
         lam.set(0.0)
         if start is not None:
             lam.array[:] = start[0]
-        found = nearest(self._dual.coarse, _cone_set(self._constraints), lam)
+        found = nearest_or_least(self._dual.coarse, _cone_set(self._constraints), lam)
         pressures = np.array(found.lam.array_r[self._rows])
         found.lam.destroy()
         lam.destroy()
