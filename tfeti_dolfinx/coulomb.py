@@ -20,12 +20,13 @@ from tfeti_dolfinx.qp.cones import Cones
 from tfeti_dolfinx.qp.discs import Ellipses
 from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Product
 from tfeti_dolfinx.qp.monitors import Monitor
-from tfeti_dolfinx.qp.nearest import nearest
+from tfeti_dolfinx.qp.nearest import nearest_or_least
 from tfeti_dolfinx.qp.problem import ConvergedReason, QPResult, Steps
 from tfeti_dolfinx.solver import solve_dual
 
 # Inner tolerance: rtol of the first step, and share of the last change of the bounds. Forces are
-# less exact than displacements: with a tenth the acceleration meets noise.
+# less exact than displacements: with a tenth the acceleration meets noise. It never grows again,
+# and a problem that was solved without a step tells nothing of its bounds: the same share then.
 FIRST, SHARE = 1e-2, 0.03
 # Change of the bounds beside rtol, where that is smaller than what options ask for: the law holds
 # to the change, and each step makes it smaller by a factor of this order
@@ -80,11 +81,11 @@ def solve_with_friction(
         return *solve_dual(dual, options, qp_type, start, monitor), Settling()
     bounds, steps, looks = _Pressures(dual, start), Steps(), 0
     tolerance = min(options.friction_rtol, BESIDE_RTOL * options.rtol)
-    change, iterations = np.inf, 0
+    change, rtol, iterations = np.inf, FIRST, 0
     while True:
         bounds.set_feasible(start)
         near = change <= NEAR * tolerance
-        rtol = options.rtol if near else max(options.rtol, min(FIRST, SHARE * change))
+        rtol = options.rtol if near else max(options.rtol, min(rtol, SHARE * change))
         before = dual.F.count["solver"]
         result, rule = solve_dual(dual, replace(options, rtol=rtol), qp_type, start, monitor)
         iterations, looks = iterations + 1, looks + rule.looks
@@ -99,6 +100,8 @@ def solve_with_friction(
             break
         if change > tolerance:
             bounds.advance()
+        if result.steps == Steps():
+            rtol *= SHARE
         start = (np.array(result.lam.array_r), result.mu)
         result.destroy()
     result.steps, rule.looks = steps, looks
@@ -148,7 +151,7 @@ class _Pressures:
         lam.set(0.0)
         if start is not None:
             lam.array[:] = start[0]
-        found = nearest(self._dual.coarse, _cone_set(self._constraints), lam)
+        found = nearest_or_least(self._dual.coarse, _cone_set(self._constraints), lam)
         pressures = np.array(found.lam.array_r[self._rows])
         found.lam.destroy()
         lam.destroy()

@@ -13,7 +13,7 @@ from tfeti_dolfinx.qp.coarse import HELD, Coarse, imbalance
 from tfeti_dolfinx.qp.dependent import DependentRows
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.monitors import Monitor
-from tfeti_dolfinx.qp.nearest import WithinFace, nearest
+from tfeti_dolfinx.qp.nearest import WithinFace, nearest, nearest_or_least
 from tfeti_dolfinx.qp.newton_curved import (
     Bent,
     bent_at,
@@ -209,7 +209,7 @@ class FaceSolver:
             found = nearest(self._qp.coarse, WithinFace(feasible, previous), z.lam)
             if imbalance(self._qp.coarse, found.lam) > HELD:
                 found.lam.destroy()
-                found = nearest(self._qp.coarse, feasible, z.lam)
+                found = nearest_or_least(self._qp.coarse, feasible, z.lam)
             near = found.lam
             on = 0.5 * (z.lam.array_r + near.array_r)
             self.enter(feasible.face(on, z.g.array_r))
