@@ -32,7 +32,7 @@ ROOMS = [
     ["report_filling"],
     ["extensions"],
     ["system"],
-    ["rounds", "stepping"],
+    ["estimates", "rounds", "stepping"],
     ["problem"],
     ["draw"],
     ["output", "plot"],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import copy
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from tfeti_dolfinx.contact_state import Multipliers
 from tfeti_dolfinx.coulomb import solve_with_friction
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.errors import TfetiError
+from tfeti_dolfinx.estimates import Estimates, estimate
 from tfeti_dolfinx.extensions import Extensions, Settings, guarded
 from tfeti_dolfinx.fields import Stress, check_stress, checked_thickness
 from tfeti_dolfinx.form_checks import check_same_space, displacement_space
@@ -149,6 +151,20 @@ class ContactProblem(Stepping):
         if self.options.view and self.decomposition.comm.rank == 0:
             print(self.options.view_text(self._settings.prefix), self.report, sep="\n", flush=True)
         return self.u
+
+    def estimate(self) -> Estimates:
+        """How large the errors of the last solution are, in energy. It costs what it says.
+
+        Returns:
+            The estimates, which ``report.estimates`` then has, too.
+
+        Raises:
+            InputError: There is no solution, or its rows are no longer there.
+            FactorError: A matrix could not be factored.
+        """
+        found = estimate(self._system, self.solution)
+        self.report.estimates = asdict(found)
+        return found
 
     def update(
         self,

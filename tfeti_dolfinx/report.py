@@ -86,6 +86,8 @@ class Report:
             Coulomb's friction over their size.
         tolerances: What they were at most allowed to be, all but the first two.
         in_all: Solves, counters and ``seconds`` of all solves together.
+        estimates: What ``ContactProblem.estimate`` has found since, and what it took; see
+            ``Estimates``.
         errors: Relative errors against closed forms, filled by demos.
         spectrum: With ``-tfeti_spectrum``: the extreme eigenvalues ``BBt_min`` and ``BBt_max`` of
             B Bᵀ, ``BDBt_min`` and ``BDBt_max`` of B D⁻¹ Bᵀ. Their roots are the extreme
@@ -135,6 +137,7 @@ class Report:
     seconds: dict[str, float] = field(default_factory=dict)
     residuals: dict[str, float] = field(default_factory=dict)
     tolerances: dict[str, float] = field(default_factory=dict)
+    estimates: dict[str, float] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
     spectrum: dict[str, float] = field(default_factory=dict)
     in_all: dict[str, float] = field(default_factory=dict)
