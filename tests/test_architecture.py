@@ -24,7 +24,7 @@ ROOMS = [
     ["form_checks", "options", "report"],
     ["assembly", "elasticity", "option_parsing"],
     ["fields"],
-    ["contact_state", "friction_bounds"],
+    ["contact_state", "discretisation", "friction_bounds"],
     ["solution"],
     ["saved_state"],
     ["solver"],

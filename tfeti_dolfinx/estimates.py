@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from math import nan
 from time import perf_counter
 
 import numpy as np
@@ -23,6 +24,9 @@ class Estimates:
         energy: ‖u‖_K, a root of an energy.
         algebraic: Bound of ‖u − u*‖_K, u* the exact solution of the discrete problem: its rows,
             and the last bounds of friction. Infinite where no forces balance the load.
+        discretisation: Estimate of ‖u* − ū‖_K, ū the exact solution of the continuous problem;
+            None if the problem was given no stress. ``Solution.discretisation_error`` has its
+            parts.
         factorizations: Subdomain matrices factored for it.
         lifting_multiplications: Multiplications by S, the Schur complements.
         recoveries: Displacements recovered, each for one more solve in every subdomain.
@@ -33,6 +37,7 @@ class Estimates:
 
     energy: float
     algebraic: float
+    discretisation: float | None
     factorizations: int
     lifting_multiplications: int
     recoveries: int
@@ -43,6 +48,17 @@ class Estimates:
     def relative_algebraic(self) -> float:
         """The bound over ‖u‖_K."""
         return self.algebraic / max(self.energy, TINY)
+
+    @property
+    def relative_discretisation(self) -> float:
+        """The estimate over ‖u‖_K; nan if the problem was given no stress."""
+        return (nan if self.discretisation is None else self.discretisation) / max(
+            self.energy, TINY
+        )
+
+    def numbers(self) -> dict[str, float]:
+        """What is known, by name."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
 
 
 def estimate(system: System, solution: Solution) -> Estimates:
@@ -63,9 +79,11 @@ def estimate(system: System, solution: Solution) -> Estimates:
     counters, comm = system.dual.subdomains.counters, system.dual.coarse.comm
     start, factored = perf_counter(), counters.factorizations
     energy, bound = bound_of(system, solution)
+    discretisation = _discretisation(solution) if solution.has_stress else None
     return Estimates(
         energy=energy,
         algebraic=bound.error,
+        discretisation=discretisation,
         factorizations=comm.allreduce(counters.factorizations - factored),
         lifting_multiplications=1,
         recoveries=int(bound.moved > 0.0),
@@ -84,3 +102,10 @@ def bound_of(system: System, solution: Solution) -> tuple[float, EnergyBound]:
     comm = dual.coarse.comm
     square = agreed(comm, comm.allreduce(sum(dual.subdomains.energies(solution.u))))
     return float(np.sqrt(max(square, 0.0))), bound
+
+
+def _discretisation(solution: Solution) -> float:
+    """The root of the sum of squares. Collective."""
+    comm = solution.dofs.comm
+    own = float(np.sum(solution.discretisation_error.x.array**2))
+    return float(np.sqrt(agreed(comm, comm.allreduce(own))))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -163,7 +162,7 @@ class ContactProblem(Stepping):
             FactorError: A matrix could not be factored.
         """
         found = estimate(self._system, self.solution)
-        self.report.estimates = asdict(found)
+        self.report.estimates = found.numbers()
         return found
 
     def update(
