@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from math import nan
 from time import perf_counter
+from typing import Any
 
 import numpy as np
+from dolfinx import fem
 
-from tfeti_dolfinx.arrays import TINY
+from tfeti_dolfinx.arrays import TINY, Array
+from tfeti_dolfinx.discretisation import StressRecovery
 from tfeti_dolfinx.dual.duality_gap import EnergyBound, energy_bound
+from tfeti_dolfinx.dual.goals import Goal, Reached
 from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.fields import Stress, checked_stress
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.system import System
@@ -92,12 +100,46 @@ def estimate(system: System, solution: Solution) -> Estimates:
     )
 
 
+def goal_of(stress: Stress, dofs: TornDofs, decomposition: Decomposition, thickness: Any) -> Goal:
+    """From displacements in primal order to the estimate of their discretisation error. Collective.
+
+    Args:
+        stress: UFL stress of a displacement.
+        dofs: Dof maps.
+        decomposition: The torn mesh.
+        thickness: What areas of the mesh are multiplied with.
+    """
+    u = fem.Function(dofs.V)
+    recovery = StressRecovery(u, checked_stress(stress, u), dofs, decomposition, thickness)
+
+    def error(values: Array) -> float:
+        u.x.array[:] = dofs.to_dolfinx(values)
+        return recovery.error()
+
+    return error
+
+
+def of_looks(reached: Sequence[Reached]) -> dict[str, float]:
+    """What looks at a goal have found, the last one, and taken, all of them."""
+    if not reached:
+        return {}
+    last = reached[-1]
+    return {
+        "energy": last.energy,
+        "algebraic": last.bound.error,
+        "discretisation": last.goal,
+        "lifting_multiplications": len(reached),
+        "recoveries": sum(look.bound.moved > 0.0 for look in reached),
+        "closing_steps": sum(look.bound.steps for look in reached),
+    }
+
+
 def bound_of(system: System, solution: Solution) -> tuple[float, EnergyBound]:
     """‖u‖_K, and the bound of the algebraic error. Collective."""
     dual = system.dual
     lam = dual.d.duplicate()
     lam.array[:] = solution.lam
-    bound = energy_bound(dual, lam, solution.u)
+    bound = energy_bound(dual, lam, solution.u, dual.seen)
     lam.destroy()
     comm = dual.coarse.comm
     square = agreed(comm, comm.allreduce(sum(dual.subdomains.energies(solution.u))))

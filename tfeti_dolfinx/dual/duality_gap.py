@@ -37,7 +37,6 @@ class LiftedScene(Protocol):
     subdomains: Subdomains
     coarse: CoarseSpace
     feasible: FeasibleSet
-    seen: float
 
     @property
     def lifting(self) -> LocalOperator:
@@ -62,7 +61,7 @@ class EnergyBound:
     steps: int
 
 
-def energy_bound(scene: LiftedScene, lam: PETSc.Vec, u: Array) -> EnergyBound:
+def energy_bound(scene: LiftedScene, lam: PETSc.Vec, u: Array, norm: float) -> EnergyBound:
     """Bound the algebraic error of a displacement that belongs to multipliers. Collective.
 
     With K u = f − Bᵀλ, λ ∈ Ω, and any admissible v
@@ -78,8 +77,9 @@ def energy_bound(scene: LiftedScene, lam: PETSc.Vec, u: Array) -> EnergyBound:
         scene: The dual problem.
         lam: The multipliers λ ∈ Ω.
         u: The displacement K⁺(f − Bᵀλ) + Rα on this rank, shape ``(n,)``.
+        norm: ‖F‖, or an estimate; 0 where there is none. It is asked for where λ is not feasible.
     """
-    forces, balanced, apart = _balanced(scene, lam, u)
+    forces, balanced, apart = _balanced(scene, lam, u, norm)
     if not np.isfinite(apart):
         return EnergyBound(apart, apart, apart, 0)
     change, loss, steps = admissible(scene, forces, balanced)
@@ -199,19 +199,25 @@ class _Rows:
         self._w.destroy()
 
 
-def _balanced(scene: LiftedScene, lam: PETSc.Vec, u: Array) -> tuple[PETSc.Vec, Array, float]:
+def _balanced(
+    scene: LiftedScene, lam: PETSc.Vec, u: Array, norm: float
+) -> tuple[PETSc.Vec, Array, float]:
     """Forces in Ω with Gλ = e, their displacement, and its distance from u in energy.
 
     Where λ does not balance the load, the nearest feasible point to λ − (Fλ − d)/‖F‖ does: that
     to λ might take a force off its bound where something opens or slips far.
     """
     coarse = scene.coarse
-    if coarse.dimension == 0 or imbalance(coarse, lam) <= BALANCED:
+    given = lam.array_r
+    outside = float(np.sum((scene.feasible.project(given) - given) ** 2))
+    left, size = summed(coarse.comm, np.array([outside, float(given @ given)]))
+    inside = agreed(coarse.comm, bool(left <= BALANCED**2 * size))
+    if inside and (coarse.dimension == 0 or imbalance(coarse, lam) <= BALANCED):
         return lam, u, 0.0
     rows, wanted = _Rows(scene), lam.copy()
-    if scene.seen > 0.0:
-        wanted.array[:] -= rows.missed(u) / scene.seen
-    found = nearest(coarse, scene.feasible, wanted)
+    if norm > 0.0:
+        wanted.array[:] -= rows.missed(u) / norm
+    found = nearest(coarse if coarse.dimension else NoCoarse(), scene.feasible, wanted)
     for item in (rows, wanted):
         item.destroy()
     if found.missing > HELD:
@@ -232,7 +238,9 @@ def _change(scene: LiftedScene, forces: Array) -> Array:
     change = subdomains.recover(w.array_r) - subdomains.pinv_load
     w.array[:] = change[subdomains.trace]
     B.mult(w, rows)
-    alpha = -coarse.solve(coarse.G(rows.array_r))
+    alpha = np.zeros(0)
+    if coarse.dimension:
+        alpha = -coarse.solve(coarse.G(rows.array_r))
     for vec in (w, rows):
         vec.destroy()
     return moved(change, coarse, alpha)
