@@ -76,11 +76,16 @@ def exact(p):
 def test_the_bound_is_one_and_at_most_twenty_times_the_error(seed):
     p = drawn(seed)
     p.solve()
+    reported = p.report.residuals["energy_error"]
+    assert reported <= p.report.tolerances["energy_error"]
     found, error = p.estimate(), norm(p, p.solution.u - exact(p))
     size = norm(p, p.solution.u)
     assert found.energy == pytest.approx(size)
     assert found.algebraic >= error * (1 - 1e-6) - 1e-11 * size
     assert found.algebraic <= 20 * error + 1e-11 * size
+    assert reported * size >= 0.8 * error
+    if p.options.qp_type == "newton":
+        assert reported * size <= 8 * error
     p.destroy()
 
 

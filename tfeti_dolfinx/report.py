@@ -79,7 +79,8 @@ class Report:
         seconds: Wall seconds of each stage (largest over ranks), and ``total``.
         residuals: ``projected_gradient`` and ``equilibrium`` relative to b₀;
             ``displacement_error``, the estimated error of u in the maximum norm relative to the
-            displacement of the body where it is worst; in physical units ``gluing_jump`` and
+            displacement of the body where it is worst; ``energy_error``, that in energy relative
+            to ‖u‖_K; in physical units ``gluing_jump`` and
             ``penetration`` (lengths), ``tension`` (most negative pressure), ``complementarity``
             (largest force times gap), ``balance`` (force left on a kernel mode where
             it is largest beside the forces there); ``friction``, the last change of the bounds of

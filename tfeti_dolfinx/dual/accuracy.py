@@ -235,6 +235,15 @@ class Accuracy:
         errors = self.errors()
         return float(np.max(errors / np.maximum(noise, TINY), initial=0.0))
 
+    def energy_error(self) -> tuple[float, float]:
+        """Estimated error of u in energy over ‖u‖_K at the last look, and what it may be.
+
+        Where ‖u‖_K is rounding of a rigid motion, over what rounding may leave of it.
+        """
+        now, allowed = self._looked(), self.tolerances().energy
+        size = max(float(np.sqrt(max(now.bodies.energy.sum(), 0.0))), allowed, TINY)
+        return now.error / size, allowed / size
+
     def _longest(self, now: Measures) -> float:
         return max(float(now.bodies.correction.max(initial=0.0)), now.penetration)
 
