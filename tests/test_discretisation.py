@@ -8,7 +8,7 @@ from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
 from scenes import box, clamp, curved_obstacle, decomposed, hooke, problem, strain
-from true_errors import error_against, hertz, lame_error, punch, shrink_fit, stress_of_cells
+from true_errors import ball, error_against, hertz, lame_error, punch, shrink_fit, stress_of_cells
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.output import cell_fields
@@ -39,6 +39,7 @@ def test_shrink_fit(cells, degree, triangles):
         (punch, (12, 24), 72),
         pytest.param(hertz, (6, 12, 24), 60, marks=pytest.mark.slow),
         pytest.param(punch, (12, 24, 48), 144, marks=pytest.mark.slow),
+        pytest.param(ball, (3_000, 10_000, 30_000), 240_000, marks=pytest.mark.slow),
     ],
 )
 def test_against_a_finer_mesh(serial_only, scene, sizes, finest):

@@ -1,5 +1,7 @@
 """Scenes whose discretisation error is known, by a closed form or by a finer mesh of the same."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import ufl
 from dolfinx import fem, geometry
@@ -9,6 +11,7 @@ from rings import INNER, MIDDLE, OUTER, lame_pressure, rings
 from scenes import clamp, forms, hooke, strain
 
 import tfeti_dolfinx as tfeti
+from demos import hertz_3d
 from demos.hertz import LineContact
 from meshes.half_cylinder import build
 from tfeti_dolfinx.compat import interpolation_points
@@ -60,6 +63,13 @@ def punch(n, depth=0.01, flat=0.2, **options):
     obstacle = tfeti.Obstacle("top", tfeti.SignedDistance(distance, gradient), reach=0.05)
     bcs = [clamp(V, d.facets("bottom"))]
     return tfeti.ContactProblem(a, L, bcs, [obstacle], d, stress=hooke(), petsc_options=options)
+
+
+def ball(unknowns, **options):
+    """The half ball of ``demos/hertz_3d.py``."""
+    chosen = SimpleNamespace(unknowns=unknowns, subdomains=None, quick=False)
+    made = hertz_3d.scene(hertz_3d.torn_mesh(chosen))
+    return tfeti.ContactProblem(**made, petsc_options=options)
 
 
 def shrink_fit(cells, degree=1, triangles=True, **options):
@@ -116,14 +126,15 @@ def stress_of_cells(p):
 def error_against(p, fine):
     """Error in energy on one rank, and the energy, against ``stress_of_cells`` of a finer mesh."""
     mesh, (points, area, sigma) = p.decomposition.mesh, fine
+    tdim = mesh.topology.dim
     cells = np.arange(len(p.decomposition.cell_subdomain), dtype=np.int32)
-    tree = geometry.bb_tree(mesh, 2, entities=cells)
+    tree = geometry.bb_tree(mesh, tdim, entities=cells)
     found = geometry.compute_colliding_cells(
         mesh, geometry.compute_collisions_points(tree, points), points
     )
     first, inside = np.zeros(len(points), dtype=np.int32), np.diff(found.offsets) > 0
     first[inside] = found.array[found.offsets[:-1][inside]]
-    middle = geometry.create_midpoint_tree(mesh, 2, cells)
+    middle = geometry.create_midpoint_tree(mesh, tdim, cells)
     first[~inside] = geometry.compute_closest_entity(tree, middle, mesh, points[~inside])
 
     def norm(e):
