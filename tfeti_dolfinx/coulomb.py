@@ -11,6 +11,7 @@ from petsc4py import PETSc
 from tfeti_dolfinx.arrays import TINY, Array
 from tfeti_dolfinx.dual.accuracy import Accuracy
 from tfeti_dolfinx.dual.dual import Dual
+from tfeti_dolfinx.dual.goals import Goal
 from tfeti_dolfinx.errors import ConvergenceError
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.options import Options
@@ -28,6 +29,9 @@ from tfeti_dolfinx.solver import solve_dual
 # less exact than displacements: with a tenth the acceleration meets noise. It never grows again,
 # and a problem that was solved without a step tells nothing of its bounds: the same share then.
 FIRST, SHARE = 1e-2, 0.03
+# of the change of the bounds at which they are at rest: rtol where a goal takes its place, since
+# forces have to be known to that change
+SHARE_OF_BOUNDS = 0.1
 # Change of the bounds beside rtol, where that is smaller than what options ask for: the law holds
 # to the change, and each step makes it smaller by a factor of this order
 BESIDE_RTOL = 100.0
@@ -63,6 +67,7 @@ def solve_with_friction(
     qp_type: str,
     start: tuple[Array, Array] | None = None,
     monitor: Monitor | None = None,
+    goal: Goal | None = None,
 ) -> tuple[QPResult, Accuracy, Settling]:
     """Solve the dual problem with bounds of friction that fit the forces of normals. Collective.
 
@@ -72,28 +77,33 @@ def solve_with_friction(
         qp_type: A solver of ``SOLVERS``.
         start: λ on this rank's rows, and the multipliers of Gλ = e, to start from.
         monitor: Called after each step; default as options say.
+        goal: What bounds the algebraic error in energy has to come down to, too.
 
     Returns:
         Multipliers, their displacement with its accuracy (of the last step; steps and looks are
         those of all), and how the bounds have come to rest.
     """
     if not any_rank(dual.coarse.comm, dual.constraints.pressed.size > 0):
-        return *solve_dual(dual, options, qp_type, start, monitor), Settling()
+        return *solve_dual(dual, options, qp_type, start, monitor, goal), Settling()
+    if goal is not None:
+        options = replace(options, rtol=SHARE_OF_BOUNDS * options.friction_rtol)
     bounds, steps, looks = _Pressures(dual, start), Steps(), 0
-    tolerance = min(options.friction_rtol, BESIDE_RTOL * options.rtol)
+    least = options.number
+    tolerance = min(options.friction_rtol, BESIDE_RTOL * least)
     change, rtol, iterations = np.inf, FIRST, 0
     while True:
         bounds.set_feasible(start)
         near = change <= NEAR * tolerance
-        rtol = options.rtol if near else max(options.rtol, min(rtol, SHARE * change))
+        rtol = least if near else max(least, min(rtol, SHARE * change))
         before = dual.F.count["solver"]
-        result, rule = solve_dual(dual, replace(options, rtol=rtol), qp_type, start, monitor)
+        asked = replace(options, rtol=rtol)
+        result, rule = solve_dual(dual, asked, qp_type, start, monitor, goal if near else None)
         iterations, looks = iterations + 1, looks + rule.looks
         steps = steps.plus(result.steps)
         if result.reason <= 0:
             break
         change = bounds.change(result.lam)
-        if change <= tolerance and rtol <= options.rtol:
+        if change <= tolerance and rtol <= least:
             break
         if iterations >= options.friction_max_it:
             result.reason = ConvergedReason.DIVERGED_FRICTION

@@ -82,13 +82,16 @@ class Report:
         seconds: Wall seconds of each stage (largest over ranks), and ``total``.
         residuals: ``projected_gradient`` and ``equilibrium`` relative to b₀;
             ``displacement_error``, the estimated error of u in the maximum norm relative to the
-            displacement of the body where it is worst; in physical units ``gluing_jump`` and
+            displacement of the body where it is worst; ``energy_error``, that in energy relative
+            to ‖u‖_K; in physical units ``gluing_jump`` and
             ``penetration`` (lengths), ``tension`` (most negative pressure), ``complementarity``
             (largest force times gap), ``balance`` (force left on a kernel mode where
             it is largest beside the forces there); ``friction``, the last change of the bounds of
             Coulomb's friction over their size.
         tolerances: What they were at most allowed to be, all but the first two.
         in_all: Solves, counters and ``seconds`` of all solves together.
+        estimates: What ``ContactProblem.estimate`` has found since, and what it took; see
+            ``Estimates``.
         errors: Relative errors against closed forms, filled by demos.
         spectrum: With ``-tfeti_spectrum``: the extreme eigenvalues ``BBt_min`` and ``BBt_max`` of
             B Bᵀ, ``BDBt_min`` and ``BDBt_max`` of B D⁻¹ Bᵀ. Their roots are the extreme
@@ -140,6 +143,7 @@ class Report:
     seconds: dict[str, float] = field(default_factory=dict)
     residuals: dict[str, float] = field(default_factory=dict)
     tolerances: dict[str, float] = field(default_factory=dict)
+    estimates: dict[str, float] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
     spectrum: dict[str, float] = field(default_factory=dict)
     in_all: dict[str, float] = field(default_factory=dict)
