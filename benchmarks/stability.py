@@ -51,6 +51,8 @@ def configure(parser):
 
 def verdict(scene: Scene, row: dict[str, Any]) -> str:
     """What came out, in one word."""
+    if scene.joined and row["error"].startswith("NoSolutionError"):
+        return "named"  # bodies that only nodes join are not joined, docs/theory.md
     if "u" not in row:
         return {"not converged": "named", "right: no solution": "no solution"}.get(
             row["class"], row["class"]

@@ -93,14 +93,17 @@ def scattered(cell: str, seed: float) -> Scene:
 
 
 def hinge(cell: str, joined: float) -> Scene:
-    """A block that hangs by one corner, or edge, on a clamped one, and leans on a wall."""
+    """A block beside a clamped one: 0 clamped, 1 also hanging by a corner or edge, 2 by that alone.
+
+    The package takes them for two bodies that are not joined, and must say so.
+    """
     last = GDIM[cell] - 1
     low = (1.0,) + (0.0,) * (last - 1) + (1.0,)
     high = (2.0,) + (1.0,) * (last - 1) + (2.0,)
     bodies = (block(cell, E=1.0), Body(low, high, cells(cell)))
     held = (Held((0, last, 0), all_of(cell)),)
     wall = Wall((1, 0, 1), "plane", ((2.0,) + (0.0,) * last, (-1.0,) + (0.0,) * last))
-    if not joined:
+    if joined < 2.0:
         held = (*held, Held((1, last, 0), all_of(cell)))
     loads = (Load((1, last, 1), up(cell, -1e-3)),)
     return Scene(cell, bodies, held, loads, (wall,), joined=bool(joined))
@@ -209,7 +212,7 @@ def _ladders() -> list[Ladder]:
         Ladder("thin", "beam", ladders.beam, (*THIN, 1e4)),
         Ladder("parts", "hang at corners", hanging, (0.0, 1.0)),
         Ladder("parts", "random", scattered, tuple(map(float, range(6)))),
-        Ladder("parts", "hinge", hinge, (0.0, 1.0)),
+        Ladder("parts", "hinge", hinge, (0.0, 1.0, 2.0)),
         Ladder("rows", "two obstacles", redundant, (0.0, -1.0, 1e-6, 1e-3)),
         Ladder("rows", "pairs of a node", three_pairs, (1.0, 2.0, 3.0)),
         Ladder("rows", "grazing", grazing, (1.0, 1e-3, 1e-6, 1e-9, 0.0, -1e-6)),

@@ -12,6 +12,7 @@ from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mesh.quality import flatness
+from tfeti_dolfinx.mesh.sharing import shared_by_bodies
 from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.subdomains.subdomains import Subdomains, sums
@@ -53,7 +54,8 @@ class Doubts:
             rtol: The relative tolerance that was asked for.
         """
         if self._of is not dual:
-            self._lasting, self._of = [*self._cells(), *self._locking(dual.subdomains)], dual
+            lasting = (self._cells(), self._locking(dual.subdomains), self._hinges())
+            self._lasting, self._of = [text for texts in lasting for text in texts], dual
         return [
             *_loose(report),
             *self._rounding(dual, u, rtol),
@@ -69,6 +71,15 @@ class Doubts:
             yield (
                 f"cells: the flattest is about {2.0 * worst:.0e} times as long as thick; forces "
                 "and multiplications suffer from more than 10"
+            )
+
+    def _hinges(self) -> Iterator[str]:
+        """Bodies that a mesh joins in nodes alone."""
+        names = self._decomposition.body_names
+        for (a, b), count in zip(*shared_by_bodies(self._decomposition), strict=True):
+            yield (
+                f"{names[a]}, {names[b]}: the mesh joins them in nodes alone ({count}), in no "
+                "facet: they are bodies of their own, and not joined; expected a common facet"
             )
 
     def _locking(self, subdomains: Subdomains) -> Iterator[str]:

@@ -67,7 +67,7 @@ def _conditions(scene: Scene, x: np.ndarray, facets_of: FacetsOf) -> Iterator[Co
     for wall in scene.walls:
         vertices, nodes = facets_of(wall.side)
         weights = _weights(x, vertices, nodes, scene.gdim)
-        at = list(weights)
+        at = sorted(weights)
         distance, gradient = wall_distance(wall, x[at].T)
         length = np.linalg.norm(gradient, axis=0)
         for k, i in enumerate(at):
