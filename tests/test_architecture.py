@@ -29,7 +29,7 @@ ROOMS = [
     ["saved_state"],
     ["solver"],
     ["coulomb"],
-    ["report_filling"],
+    ["report_filling", "doubts"],
     ["extensions"],
     ["system"],
     ["estimates", "rounds", "stepping"],

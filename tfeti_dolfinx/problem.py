@@ -17,6 +17,7 @@ from tfeti_dolfinx.contact.arguments import Gap, gaps_by_position
 from tfeti_dolfinx.contact.partners import ContactPartner, checked_contacts
 from tfeti_dolfinx.contact_state import Multipliers
 from tfeti_dolfinx.coulomb import solve_with_friction
+from tfeti_dolfinx.doubts import Doubts
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.dual.goals import Goal
 from tfeti_dolfinx.errors import InputError, TfetiError
@@ -115,6 +116,7 @@ class ContactProblem(Stepping):
         with stage("gluing", self.report.seconds):
             self.dofs = TornDofs(V, decomposition)
         forms.thickness = self._thickness
+        self._doubts = Doubts(decomposition, self.dofs)
         self._system = System(
             forms, self.bcs, self.contacts, self.dofs, decomposition, self._settings
         )
@@ -254,6 +256,7 @@ class ContactProblem(Stepping):
         self._start = (gluing, solution.lam, result.mu) if result.reason > 0 else None
         fill_result(report, solution, dual, *solved)
         report.estimates = of_looks(accuracy.reached)
+        report.warnings = self._doubts.found(dual, solution.u, report, self.options.rtol)
         report.excluding_contacts = system.search.named(gluing.contacts_of(result.excluding))
         result.destroy()
         comm, excluding = self.decomposition.comm, report.excluding_contacts

@@ -41,6 +41,7 @@ class Report:
         nearly_free: Rigid motions that contacts with a force hold hardly (``stiffness``: as a
             share of what the same contacts hold at most) or not at all (0): dicts of ``bodies``,
             ``mode`` and ``stiffness``. The smallest motion was taken.
+        warnings: Sentences on why the answer cannot be trusted, or not as far as it seems.
         contact_rows: Non-penetration rows.
         contact_candidates: Nodes of the (secondary) contact surfaces.
         far_contact_nodes: Those that were out of reach or not covered, and have no row.
@@ -107,6 +108,7 @@ class Report:
     soft_modes: int = 0
     free_modes: int = 0
     nearly_free: list[dict[str, object]] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
     contact_rows: int = 0
     contact_candidates: int = 0
     far_contact_nodes: int = 0

@@ -58,7 +58,8 @@ class FaceSolver:
         settled: Whether λ is where PCPG has stopped on the face entered.
         curved: Whether that face is curved.
         left: The residual there.
-        rounded: So many solves in a row ended at rounding, before their target.
+        rounded: So many solves in a row ended at rounding, before their target, or where F is not
+            definite and no row ends the way.
     """
 
     def __init__(
@@ -190,6 +191,7 @@ class FaceSolver:
             out = has_left(self._qp, self._face, z.lam.array_r)
             if self._steps.cg >= self._max_it or not (out or (broken and self._dependent.slide(z))):
                 break
+            self.rounded = self.rounded if out else 0
             z.lam.array[:] = self._qp.feasible.project(z.lam.array_r)
             self._drop(z)
         assert self._face is not None
@@ -257,7 +259,7 @@ class FaceSolver:
             self._directions,
         )
         self.left = float(self._directions.r.norm())
-        ended = reason == ConvergedReason.DIVERGED_ROUNDING
+        ended = reason != ConvergedReason.CONVERGED_RTOL and self._steps.cg < self._max_it
         self.rounded = self.rounded + 1 if ended else 0
         if self._bent is not None:
             z.g.array[:] -= self._bent.bend(z.lam.array_r - before)
