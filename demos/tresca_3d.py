@@ -2,8 +2,8 @@
 #
 # The 3D scene of the talk's table with Tresca friction: a unit cube fixed on one face, pressed on a
 # rough plane and pushed along it. The subdomains are equal cubes of 10 × 10 × 10 elements. Four of
-# them make the half next to the fixed face, which does not slide as far: its bound is lower. 1024 of
-# them make a body of twice the length, which slides further: its bound is higher.
+# them make the half next to the fixed face, which does not slide as far: its bound is lower. 1024
+# make a body of twice the length, which slides further: its bound is higher.
 #
 #     ./run mpirun -n 2 python3 demos/tresca_3d.py --subdomains 64
 

@@ -256,7 +256,7 @@ class ContactProblem(Stepping):
         self._start = (gluing, solution.lam, result.mu) if result.reason > 0 else None
         fill_result(report, solution, dual, *solved)
         report.estimates = of_looks(accuracy.reached)
-        report.warnings = self._doubts.found(dual, solution.u, report, self.options.rtol)
+        report.warnings = self._doubts.found(dual, solution.u, report, self.options.number)
         report.excluding_contacts = system.search.named(gluing.contacts_of(result.excluding))
         result.destroy()
         comm, excluding = self.decomposition.comm, report.excluding_contacts
