@@ -59,6 +59,7 @@ class Doubts:
         return [
             *_loose(report),
             *self._rounding(dual, u, rtol),
+            *self._springs(dual, rtol),
             *self._turned(u, dual.subdomains),
             *self._lasting,
         ]
@@ -128,6 +129,18 @@ class Doubts:
                 f"{self._names(share > rtol)}: rounding of the stiffness may change the "
                 f"displacement by about {share.max():.0e} of its size, more than rtol {rtol:g}; "
                 "expected thicker parts, fewer cells, or a larger rtol"
+            )
+
+    def _springs(self, dual: Dual, rtol: float) -> Iterator[str]:
+        """Springs so soft that rounding of the stiffness is a part of them."""
+        if dual.soft is None:
+            return
+        share = EPSILON * dual.soft.amplification
+        if np.any(share > rtol):
+            yield (
+                f"{self._names(share > rtol)}: springs hold subdomains so softly that rounding of "
+                f"the stiffness is about {share.max():.0e} of them, more than rtol {rtol:g}; "
+                "expected stiffer ones or none, or a larger rtol"
             )
 
     def _turned(self, u: Array, subdomains: Subdomains) -> Iterator[str]:
