@@ -8,7 +8,16 @@ from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
 from scenes import box, clamp, curved_obstacle, decomposed, hooke, problem, strain
-from true_errors import ball, error_against, hertz, lame_error, punch, shrink_fit, stress_of_cells
+from true_errors import (
+    ball,
+    density,
+    error_against,
+    hertz,
+    lame_error,
+    punch,
+    shrink_fit,
+    stress_of_cells,
+)
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.output import cell_fields
@@ -143,3 +152,48 @@ def test_without_a_stress_only_the_algebraic_error_is_known():
     assert np.isnan(found.relative_discretisation)
     assert "discretisation" not in p.report.estimates
     assert MPI.COMM_WORLD.allreduce(found.algebraic) > 0.0
+
+
+def test_axisymmetric():
+    """A tube under inner pressure: Lamé's closed form, weighed with 2πr."""
+    inner, outer, q, nu = 1.0, 2.0, 1e-3, 0.3
+    sides = dict.fromkeys(("left", "right", "bottom", "top"))
+    mesh = dmesh.create_rectangle(MPI.COMM_WORLD, [(inner, 0.0), (outer, 0.5)], [12, 6])
+    ends = {"left": (0, inner), "right": (0, outer), "bottom": (1, 0.0), "top": (1, 0.5)}
+    for side, (axis, at) in ends.items():
+        sides[side] = dmesh.locate_entities_boundary(
+            mesh, 1, lambda x, axis=axis, at=at: np.isclose(x[axis], at)
+        )
+    facets = np.concatenate(list(sides.values()))
+    values = np.repeat(np.arange(1, 5, dtype=np.int32), [len(f) for f in sides.values()])
+    order = np.argsort(facets)
+    tags = dmesh.meshtags(mesh, 1, facets[order], values[order])
+    names = {side: tag for tag, side in enumerate(sides, start=1)}
+    d = tfeti.decompose(mesh, 5, facet_tags=tags, surfaces=names)
+    elastic = tfeti.Elasticity(d, E=1.0, nu=nu, model="axisymmetric")
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+    L = fem.Constant(d.mesh, q) * v[0] * elastic.thickness * ds(d.surface("left"))
+    held_facets = np.concatenate((d.facets("bottom"), d.facets("top")))
+    dofs = fem.locate_dofs_topological(V.sub(1), 1, held_facets)
+    bcs = [fem.dirichletbc(0.0, dofs, V.sub(1))]
+    p = tfeti.ContactProblem(
+        elastic.a(u, v),
+        L,
+        bcs,
+        [],
+        d,
+        stress=elastic.stress,
+        thickness=elastic.thickness,
+        petsc_options=RTOL,
+    )
+    p.solve()
+    r2 = ufl.SpatialCoordinate(d.mesh)[0] ** 2
+    mean = q * inner**2 / (outer**2 - inner**2)
+    apart = mean * outer**2 / r2
+    exact = ufl.diag(ufl.as_vector((mean - apart, 2 * nu * mean, mean + apart)))
+    e = exact - elastic.stress(p.solution.displacement)
+    dx = ufl.Measure("dx", domain=d.mesh, metadata={"quadrature_degree": 5})
+    square = fem.assemble_scalar(fem.form(elastic.thickness * density(e) * dx))
+    assert 0.7 <= index(p, np.sqrt(p.dofs.comm.allreduce(square))) <= 1.5

@@ -10,6 +10,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.dual.closing import closing
 from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.dual.recovery import moved
 from tfeti_dolfinx.gluing.constraints import Constraints
@@ -23,9 +24,9 @@ from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # worst entry of Gλ − e beside its terms: from there on the forces are balanced first
 BALANCED = 1e-12
-# Of what rows miss at first, what they may miss at the end, and rounding of gaps; usually 20 to 60
-# steps, which cost a multiplication by B and Bᵀ each. What is left counts as a loss.
-CLOSED, ROUNDING, MOST_STEPS = 1e-12, 1e-15, 1000
+# Of the first step, the last one, and rounding of gaps; a step costs a multiplication by B and Bᵀ.
+# The bound is one wherever steps end, since a last correction closes what is left.
+CLOSED, ROUNDING, MOST_STEPS = 1e-10, 1e-15, 300
 # Lanczos steps for ‖BD⁻¹Bᵀ‖
 NORM_STEPS = 10
 
@@ -100,24 +101,33 @@ def admissible(scene: LiftedScene, lam: PETSc.Vec, u: Array) -> tuple[Array, flo
     it stands for F. With δ = −D⁻¹Bᵀ(μ − λ)/κ then Bv − c is normal to Ω at μ: torn copies agree,
     prescribed values are met, nothing overlaps, and slip is along the friction of μ. So the terms
     of contact in J(v) − q(λ) are (μ − λ)ᵀ(Bv − c). Where a force is large beside what its row
-    misses, the row is closed; else it may open, whichever is cheaper.
+    misses, the row is closed; else it may open, whichever is cheaper. μ is found roughly, with a
+    vector that is normal to Ω there; a last correction gives Bv − c that value.
 
     Returns:
-        δ on this rank's trace unknowns; this rank's part of the terms of contact, with what rows
-        still miss times their forces; steps taken.
+        δ on this rank's trace unknowns; this rank's part of the terms of contact, and what rows
+        still miss, as they depend on each other, times their forces; steps taken.
     """
     rows, comm = _Rows(scene), scene.coarse.comm
     g, given = rows.missed(u), np.array(lam.array_r)
     sets, feasible = scene.constraints.sets, scene.feasible.shifted(given)
     x = np.zeros_like(given)
     x[sets.equalities] = -rows.unit * g[sets.equalities]  # orthonormal, apart from contact
-    steps, loss = 0, 0.0
-    if any_rank(comm, sets.contact.size > 0):
-        x, normal, steps = _nearest_normal(rows, feasible, x, g)
-        missed = (-(g + rows.times(x)) - normal)[sets.contact]
-        force = np.abs(given + x)[sets.contact]
-        loss = float(x[sets.contact] @ normal[sets.contact] + force @ np.abs(missed))
-    change = rows.displacement(x)
+    if not any_rank(comm, sets.contact.size > 0):
+        change = rows.displacement(x)
+        rows.destroy()
+        return change, 0.0, 0
+    x, normal, steps = _nearest_normal(rows, feasible, x, g)
+    missed = np.zeros_like(x)
+    missed[sets.contact] = -(g + rows.times(x) + normal)[sets.contact]
+    last, force = rows.closing(missed), np.abs(given + x)
+    force[sets.equalities] = 0.0  # they are met
+    left = np.abs(missed - rows.of(last))
+    before, after = rows.sums(force * np.abs(missed), force * left)
+    if after > before:  # rows that depend on each other
+        last, left = np.zeros_like(last), np.abs(missed)
+    loss = float(x[sets.contact] @ normal[sets.contact] + force @ left)
+    change = rows.displacement(x) - last
     rows.destroy()
     return change, loss, steps
 
@@ -176,9 +186,19 @@ class _Rows:
 
     def times(self, x: Array) -> Array:
         """BD⁻¹Bᵀx/κ."""
-        self._w.array[:] = -self.displacement(x)
+        return self.of(-self.displacement(x))
+
+    def of(self, v: Array) -> Array:
+        """Bv of a displacement of the trace."""
+        self._w.array[:] = v
         self._constraints.B.mult(self._w, self._x)
         return np.array(self._x.array_r)
+
+    def closing(self, missed: Array) -> Array:
+        """The least v in D with Bv = missed, 0 on equalities, as far as rows are independent."""
+        self._x.array[:] = missed
+        every = np.ones(self._constraints.sets.contact.size, dtype=bool)
+        return closing(self._constraints, self._x, every)
 
     def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = BD⁻¹Bᵀx/κ."""
