@@ -96,8 +96,8 @@ def solve_with_friction(
         near = change <= NEAR * tolerance
         rtol = least if near else max(least, min(rtol, SHARE * change))
         before = dual.F.count["solver"]
-        asked = replace(options, rtol=rtol)
-        result, rule = solve_dual(dual, asked, qp_type, start, monitor, goal if near else None)
+        asked, exact = replace(options, rtol=rtol), goal if rtol <= least else None
+        result, rule = solve_dual(dual, asked, qp_type, start, monitor, exact)
         iterations, looks = iterations + 1, looks + rule.looks
         steps = steps.plus(result.steps)
         if result.reason <= 0:
