@@ -4,13 +4,14 @@
 
 Scenes are those of ``benchmarks.stress`` (boxes in 2D and 3D: single ones, stacks, rows, bridges,
 apart; obstacles, slender, of moduli and units that differ, held by contact alone), every third with
-Coulomb's friction, blocks with Tresca's, and beams without contact. A scene takes part if the package's
-checks say that it has a solution. For each tolerance and solver: a solve that ends in an error, in
-more than ``--steps`` steps, or with an error above 100 rtol (and 100 times what rounding does)
-counts as failed. A profile ρ(τ) is the share of scenes that a solver solves for at most τ times the
-cost of the best one (Mathematical Programming 91, 2002): cost in multiplications by F and by the
-preconditioner, and in seconds of the solver. Results go to results/solver_profiles.md, .json and
-.png.
+Coulomb's friction, blocks with Tresca's, and beams without contact. A scene takes part if the
+checks of the package say that it has a solution.
+
+A solve fails that ends in an error, in more than ``--steps`` steps, or with an error above 100 rtol
+(and 100 times what rounding does) beside a direct solve. A profile ρ(τ) is the share of scenes that
+a solver solves for at most τ times the cost of the best one (Mathematical Programming 91, 2002):
+cost in multiplications by F and by the preconditioner, and in seconds of the solver. Results go to
+results/solver_profiles.md, .json and .png.
 """
 
 from __future__ import annotations
