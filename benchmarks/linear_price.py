@@ -63,7 +63,7 @@ def contact(scene, qp_type, options):
     seconds = report.seconds
     row = {
         "solver": f"contact, {qp_type}",
-        "setting": f"rtol {problem.options.rtol:.0e}",
+        "setting": f"rtol {problem.options.number:.0e}",
         "steps": f"{report.F_multiplications} F + {report.preconditioner_multiplications} S",
         "set-up": seconds["subdomains"],
         "solve": seconds["dual"] + seconds["qp"],

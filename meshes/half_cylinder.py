@@ -6,6 +6,7 @@ python3 meshes/half_cylinder.py half_cylinder.msh --partitions 8
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import gmsh
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from meshes.tools import graded_size, partition, script, started_model
+from meshes.tools import graded_size, partition, script, started_model, use_sizes
 
 
 def build(
@@ -22,6 +23,7 @@ def build(
     fine_radius: float = 0.06,
     growth: float = 0.15,
     partitions: int = 0,
+    sizes: Callable[[], int] | None = None,
 ) -> Any:
     """Mesh the half disc x² + (y − R)² ≤ R², y ≤ R on this rank and return gmsh's model.
 
@@ -34,6 +36,7 @@ def build(
         fine_radius: Size of the fine zone.
         growth: Growth of the element size with the distance from that zone.
         partitions: Number of gmsh's partitions, 0 for none.
+        sizes: Makes a gmsh field of element sizes instead.
     """
     model = started_model("half_cylinder")
     geo = model.geo
@@ -53,7 +56,10 @@ def build(
     model.addPhysicalGroup(1, arcs, name="contact")
     model.addPhysicalGroup(1, top, name="top")
     model.addPhysicalGroup(1, [axis], name="axis")
-    graded_size((0.0, 0.0, 0.0), fine, fine_radius, growth)
+    if sizes is None:
+        graded_size((0.0, 0.0, 0.0), fine, fine_radius, growth)
+    else:
+        use_sizes(sizes())
     gmsh.model.mesh.generate(2)
     partition(partitions)
     return model

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import gmsh
+import numpy as np
 
 
 def started_model(name: str) -> Any:
@@ -54,6 +55,21 @@ def use_sizes(*fields: int) -> None:
     gmsh.model.mesh.field.setAsBackgroundMesh(least)
     for name in ("FromPoints", "FromCurvature", "ExtendFromBoundary"):
         gmsh.option.setNumber(f"Mesh.MeshSize{name}", 0)
+
+
+def sizes_from_triangles(corners: Any, sizes: Any) -> int:
+    """A gmsh field of element sizes that are given on triangles, and linear in each of them.
+
+    Args:
+        corners: Shape ``(n, 3, 3)``: corners of the triangles, and their coordinates.
+        sizes: Sizes at the corners, shape ``(n, 3)``.
+    """
+    view = gmsh.view.add("sizes")
+    table = np.concatenate((np.swapaxes(corners, 1, 2).reshape(-1, 9), sizes), axis=1)
+    gmsh.view.addListData(view, "ST", len(table), table.ravel())
+    field = gmsh.model.mesh.field.add("PostView")
+    gmsh.model.mesh.field.setNumber(field, "ViewTag", view)
+    return int(field)
 
 
 def add_mirror_image(model: Any, axis: int) -> dict[tuple[int, int], int]:

@@ -1,10 +1,14 @@
 """The belt on a drum: the capstan equation, before and after the drum turns."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 import tfeti_dolfinx as tfeti
 from demos import belt_2d
+from tfeti_dolfinx import coulomb
+from tfeti_dolfinx.qp.problem import Steps
 
 
 @pytest.fixture(scope="module")
@@ -52,6 +56,27 @@ def test_another_angle_and_coefficient():
     assert report.sticking == 0
     assert abs(report.errors["capstan"]) <= 0.01
     assert abs(report.errors["capstan_hung"]) <= 0.01
+
+
+def test_inner_tolerances_never_grow(monkeypatch):
+    """The drum moves the belt far, so that a loose tolerance takes any bounds for right."""
+    solve, solves = coulomb.solve_dual, []
+
+    def noting(dual, options, qp_type, start, monitor):
+        found = solve(dual, options, qp_type, start, monitor)
+        if start is None or options.rtol > solves[-1][-1][0]:
+            solves.append([])
+        solves[-1].append((options.rtol, found[0].steps == Steps()))
+        return found
+
+    monkeypatch.setattr(coulomb, "solve_dual", noting)
+    _, report = belt_2d.run(["--quick", "--angle", "90"])
+    assert len(solves) == report.in_all["solves"] == 2
+    known = [(before, after) for steps in solves for before, after in pairwise(steps)]
+    without_steps = [(before, rtol) for (before, idle), (rtol, _) in known if idle]
+    assert without_steps
+    assert all(rtol <= max(coulomb.SHARE * before, 1e-6) for before, rtol in without_steps)
+    assert report.friction_iterations <= 10
 
 
 @pytest.mark.slow

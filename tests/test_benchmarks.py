@@ -11,6 +11,8 @@ from benchmarks import (
     hertz_convergence,
     kplus_forms,
     linear_price,
+    solver_profiles,
+    stability,
     stages,
     strong_scaling,
     subdomain_size,
@@ -92,6 +94,44 @@ def test_stages(shared_tmp, comm, monkeypatch):
         else:
             assert sum(row["share"] for row in rows) == pytest.approx(1.0)
             assert all(0.0 < row["MB in use"] <= row["MB held"] for row in rows)
+
+
+def test_stability(shared_tmp, comm):
+    """Each row has a test of its own in ``test_stability``."""
+    tables = quick(stability, shared_tmp, comm, "--groups", "moduli", "nu")
+    assert set(tables) == {"moduli", "nu", "locking"}
+    for row in tables["moduli"] + tables["nu"]:
+        assert row["verdict"] == "right"
+        assert row["error"] <= 1e-4
+    for row in tables["moduli"]:
+        assert row["of friendly"] <= 4.0
+    stiff, locked = tables["locking"]
+    assert locked["P1 over P2"] < 0.8 * stiff["P1 over P2"]
+
+
+def test_solver_profiles(shared_tmp, comm):
+    tables = quick(solver_profiles, shared_tmp, comm, "--steps", "300")
+    default = tables["contact, multiplications"][2]
+    assert default["solver"] == "newton, dirichlet"
+    for title, rows in tables.items():
+        if "τ = 1" in rows[0]:
+            assert max(row["τ = 1"] for row in rows) > 0.0, title
+            for row in rows:
+                shares = [row[f"τ = {tau:g}"] for tau in solver_profiles.TAUS]
+                assert shares == sorted(shares)
+                assert shares[-1] <= 1.0 - row["failed"] / row["solves"]
+
+
+def test_profiles_count_failures_and_ties():
+    solvers = [("newton", "none"), ("newton", "lumped"), ("newton", "dirichlet")]
+    keys = [f"{qp}, {pc}" for qp, pc in solvers]
+    costs = [(1, 2, 4), (None, 10, 10), (None, None, None), (0, 0, 0)]
+    rows = [dict(zip(keys, cost, strict=True)) for cost in costs]
+    found = solver_profiles.profiles(rows, solvers)
+    assert [row["failed"] for row in found] == [2, 1, 1]
+    assert [row["τ = 1"] for row in found] == [0.5, 0.5, 0.5]
+    assert [row["τ = 2"] for row in found] == [0.5, 0.75, 0.5]
+    assert [row["τ = 4"] for row in found] == [0.5, 0.75, 0.75]
 
 
 def test_weak_scaling(serial_only, shared_tmp, comm):

@@ -7,10 +7,12 @@ import pytest
 from mpi4py import MPI
 
 import tfeti_dolfinx as tfeti
+from demos import adaptive_2d
 
 DEMOS = [
     "hertz_2d",
     "hertz_3d",
+    "adaptive_2d",
     "cube_3d",
     "linear_3d",
     "semicoercive_2d",
@@ -112,3 +114,12 @@ def test_stacked_blocks_are_held_by_contact_alone():
     assert report.bodies == 4
     assert report.free_modes == 9
     assert abs(report.errors["force_base"]) <= 1e-5
+
+
+def test_a_mesh_that_follows_the_error_needs_a_tenth_of_a_uniform_one():
+    """7.9 % took 38 836 unknowns of equal size, and 8 856 of hand-graded ones."""
+    solution, report = adaptive_2d.run(["--error", "0.078"])
+    assert report.estimates["discretisation"] <= 0.078 * report.estimates["energy"]
+    assert report.primal_dofs <= 3900
+    assert report.errors["pressure_l2"] <= 0.02
+    assert solution.has_discretisation_error

@@ -11,9 +11,10 @@ from test_qp import matrix, vector
 from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
 from tfeti_dolfinx.qp.discs import Discs, Ellipses
 from tfeti_dolfinx.qp.faces import Status
+from tfeti_dolfinx.qp.feasible_sets import Bounds, Product
 from tfeti_dolfinx.qp.homogenised import homogenise, image
 from tfeti_dolfinx.qp.monitors import no_monitor
-from tfeti_dolfinx.qp.nearest import WithinFace, nearest
+from tfeti_dolfinx.qp.nearest import UNBALANCED, WithinFace, nearest, nearest_or_least
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Start
 from tfeti_dolfinx.qp.stopping import ResidualRule
@@ -133,6 +134,34 @@ def test_within_a_face_what_slips_stays_on_its_boundary(seed):
         # the way to the nearest point of a boundary is normal to it
         tangents = feasible.face(y, normal).Z
         assert np.allclose(tangents.T @ (near - y), 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", [91, 356, 449])
+def test_a_solve_that_begins_elsewhere_begins_anew(seed):
+    """On the face that PCPG has stopped on; with its last direction it took 146 to 2000 steps."""
+    F, d, G, e, bounded, pairs, a = program(seed, 1, True)
+    qp = QP(matrix(F), vector(d), DenseCoarse(G, e), as_set(bounded, pairs, a, True))
+    result = solved(qp, 1e-10 * np.linalg.norm(d))
+    assert result.reason == ConvergedReason.CONVERGED_RTOL
+    assert result.steps.cg <= 50
+
+
+def test_forces_far_beyond_small_discs_do_not_hide_what_balances():
+    """As from a step in which all sticks to bounds that are a millionth of its forces."""
+    missed, small, n = [], 1e-6, 6
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        G, radius = rng.normal(size=(4, 2 * n)), small * 10.0 ** rng.uniform(-2.0, 2.0, n)
+        feasible = Product(
+            [(np.arange(n), Bounds()), (np.arange(n, 2 * n), Ellipses(radius[:, None]))]
+        )
+        balanced = np.concatenate((small * rng.uniform(size=n), radius * rng.uniform(-1.0, 1.0, n)))
+        coarse, y = DenseCoarse(G, G @ balanced), vector(rng.normal(size=2 * n))
+        missed.append(nearest(coarse, feasible, y).missing)
+        found = nearest_or_least(coarse, feasible, y)
+        assert found.missing <= UNBALANCED
+        assert np.array_equal(feasible.project(found.lam.array_r), found.lam.array_r)
+    assert max(missed) > 0.1
 
 
 def test_what_nothing_in_the_set_balances_is_said():

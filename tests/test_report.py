@@ -45,6 +45,7 @@ def test_residuals_are_named(report):
     }
     assert set(report.tolerances) == {
         "displacement_error",
+        "energy_error",
         "gluing_jump",
         "penetration",
         "tension",

@@ -40,6 +40,7 @@ from tfeti_dolfinx.errors import (
     NoSolutionError,
     TfetiError,
 )
+from tfeti_dolfinx.estimates import Estimates
 from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.load_steps import LoadSteps, StepRecord
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -62,6 +63,7 @@ __all__ = [
     "Cylinder",
     "Decomposition",
     "Elasticity",
+    "Estimates",
     "Extensions",
     "FactorError",
     "InputError",

@@ -11,6 +11,7 @@ from petsc4py import PETSc
 from tfeti_dolfinx.arrays import TINY, Array
 from tfeti_dolfinx.dual.accuracy import Accuracy
 from tfeti_dolfinx.dual.dual import Dual
+from tfeti_dolfinx.dual.goals import Goal
 from tfeti_dolfinx.errors import ConvergenceError
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.options import Options
@@ -20,13 +21,17 @@ from tfeti_dolfinx.qp.cones import Cones
 from tfeti_dolfinx.qp.discs import Ellipses
 from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Product
 from tfeti_dolfinx.qp.monitors import Monitor
-from tfeti_dolfinx.qp.nearest import nearest
+from tfeti_dolfinx.qp.nearest import nearest_or_least
 from tfeti_dolfinx.qp.problem import ConvergedReason, QPResult, Steps
 from tfeti_dolfinx.solver import solve_dual
 
 # Inner tolerance: rtol of the first step, and share of the last change of the bounds. Forces are
-# less exact than displacements: with a tenth the acceleration meets noise.
+# less exact than displacements: with a tenth the acceleration meets noise. It never grows again,
+# and a problem that was solved without a step tells nothing of its bounds: the same share then.
 FIRST, SHARE = 1e-2, 0.03
+# of the change of the bounds at which they are at rest: rtol where a goal takes its place, since
+# forces have to be known to that change
+SHARE_OF_BOUNDS = 0.1
 # Change of the bounds beside rtol, where that is smaller than what options ask for: the law holds
 # to the change, and each step makes it smaller by a factor of this order
 BESIDE_RTOL = 100.0
@@ -62,6 +67,7 @@ def solve_with_friction(
     qp_type: str,
     start: tuple[Array, Array] | None = None,
     monitor: Monitor | None = None,
+    goal: Goal | None = None,
 ) -> tuple[QPResult, Accuracy, Settling]:
     """Solve the dual problem with bounds of friction that fit the forces of normals. Collective.
 
@@ -71,34 +77,41 @@ def solve_with_friction(
         qp_type: A solver of ``SOLVERS``.
         start: λ on this rank's rows, and the multipliers of Gλ = e, to start from.
         monitor: Called after each step; default as options say.
+        goal: What bounds the algebraic error in energy has to come down to, too.
 
     Returns:
         Multipliers, their displacement with its accuracy (of the last step; steps and looks are
         those of all), and how the bounds have come to rest.
     """
     if not any_rank(dual.coarse.comm, dual.constraints.pressed.size > 0):
-        return *solve_dual(dual, options, qp_type, start, monitor), Settling()
+        return *solve_dual(dual, options, qp_type, start, monitor, goal), Settling()
+    if goal is not None:
+        options = replace(options, rtol=SHARE_OF_BOUNDS * options.friction_rtol)
     bounds, steps, looks = _Pressures(dual, start), Steps(), 0
-    tolerance = min(options.friction_rtol, BESIDE_RTOL * options.rtol)
-    change, iterations = np.inf, 0
+    least = options.number
+    tolerance = min(options.friction_rtol, BESIDE_RTOL * least)
+    change, rtol, iterations = np.inf, FIRST, 0
     while True:
         bounds.set_feasible(start)
         near = change <= NEAR * tolerance
-        rtol = options.rtol if near else max(options.rtol, min(FIRST, SHARE * change))
+        rtol = least if near else max(least, min(rtol, SHARE * change))
         before = dual.F.count["solver"]
-        result, rule = solve_dual(dual, replace(options, rtol=rtol), qp_type, start, monitor)
+        asked, exact = replace(options, rtol=rtol), goal if rtol <= least else None
+        result, rule = solve_dual(dual, asked, qp_type, start, monitor, exact)
         iterations, looks = iterations + 1, looks + rule.looks
         steps = steps.plus(result.steps)
         if result.reason <= 0:
             break
         change = bounds.change(result.lam)
-        if change <= tolerance and rtol <= options.rtol:
+        if change <= tolerance and rtol <= least:
             break
         if iterations >= options.friction_max_it:
             result.reason = ConvergedReason.DIVERGED_FRICTION
             break
         if change > tolerance:
             bounds.advance()
+        if result.steps == Steps():
+            rtol *= SHARE
         start = (np.array(result.lam.array_r), result.mu)
         result.destroy()
     result.steps, rule.looks = steps, looks
@@ -148,7 +161,7 @@ class _Pressures:
         lam.set(0.0)
         if start is not None:
             lam.array[:] = start[0]
-        found = nearest(self._dual.coarse, _cone_set(self._constraints), lam)
+        found = nearest_or_least(self._dual.coarse, _cone_set(self._constraints), lam)
         pressures = np.array(found.lam.array_r[self._rows])
         found.lam.destroy()
         lam.destroy()

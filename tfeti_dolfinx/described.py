@@ -22,6 +22,7 @@ class Description:
         text: What it does.
         choices: Its values, if they are few.
         fits: Range of a number.
+        words: What may stand in the place of a number.
         name: Name on the command line, if it is not the field's.
         symbol: Letter in the literature and in docs/notation.md.
     """
@@ -30,6 +31,7 @@ class Description:
     text: str
     choices: tuple[str, ...] = ()
     fits: Range = FINITE
+    words: tuple[str, ...] = ()
     name: str = ""
     symbol: str = ""
 

@@ -87,11 +87,14 @@ def _check_reached(named: Mapping[str, Any], database: PETSc.Options, prefix: st
 def _converted(option: Parameter, value: Any, prefix: str) -> Any:
     """The value as the type of the option, in its range."""
     what, kind = f"-{prefix}{option.name}", type(option.default)
+    if isinstance(value, str) and value in option.description.words:
+        return value
     try:
         result = CONVERSIONS[kind](value)
     except (TypeError, ValueError, OverflowError):
+        words = "".join(f" or {word}" for word in option.description.words)
         raise InputError(
-            f"{what} {shown(value)}: expected a value of type {kind.__name__}"
+            f"{what} {shown(value)}: expected a value of type {kind.__name__}{words}"
         ) from None
     choices, fits = option.description.choices, option.description.fits
     if choices and result not in choices:

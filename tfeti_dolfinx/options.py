@@ -13,6 +13,9 @@ from tfeti_dolfinx.qp.solvers import SOLVERS
 from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES
 from tfeti_dolfinx.subdomains.local import LOCAL_TYPES
 
+# what ``auto`` asks of displacements, whatever the mesh is
+LOOSEST = 1e-2
+
 
 @dataclass(frozen=True)
 class Options:
@@ -24,11 +27,13 @@ class Options:
         "solver of the dual problem; auto takes pcpg without contact, else newton",
         choices=("auto", *SOLVERS),
     )
-    rtol: float = described(
+    rtol: float | str = described(
         1e-6,
         "all",
-        "stop when the displacement of each body is right to this, in the maximum norm",
+        "stop when the displacement of each body is right to this, in the maximum norm; auto: to "
+        "1e-2, and when the algebraic error in energy is a tenth of the discretisation error",
         fits=Range("0 or more, less than 1", lambda value: 0.0 <= value < 1.0),
+        words=("auto",),
     )
     atol: float = described(
         0.0, "all", "or when jumps and overlaps are below this length", fits=FROM_0
@@ -97,6 +102,11 @@ class Options:
     converged_reason: bool = described(False, "all", "print why the solver stopped")
     view: bool = described(False, "all", "print the options, the sizes and the report")
 
+    @property
+    def number(self) -> float:
+        """rtol as a number: what displacements have to be right to."""
+        return LOOSEST if isinstance(self.rtol, str) else self.rtol
+
     def view_text(self, prefix: str) -> str:
         """One line per option."""
         known = parameters_of(Options)
@@ -108,7 +118,8 @@ def options_table() -> str:
     lines = ["| option | algorithm | default | effect |", "|---|---|---|---|"]
     for option in parameters_of(Options):
         about, default = option.description, option.default
-        values = " (" + ", ".join(about.choices) + ")" if about.choices else ""
+        known = (*about.choices, *(("a number", *about.words) if about.words else ()))
+        values = " (" + ", ".join(known) + ")" if known else ""
         shown = str(default).lower() if isinstance(default, bool) else f"{default}"
         lines.append(
             f"| `-tfeti_{option.name}` | {about.algorithm} | {shown} | {about.text}{values} |"

@@ -24,7 +24,8 @@ def write_vtx(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
     Nodal fields (displacement, pressure, gap, status, with contacts traction, with friction
     tangential traction and slip, with a stress
     stress and von Mises stress averaged at the nodes) go to ``path``; cell fields (subdomain, body,
-    material) to a second file beside it, ``<stem>_cells.bp``.
+    material, and the discretisation error if it has been estimated) to a second file beside it,
+    ``<stem>_cells.bp``.
 
     Args:
         path: A name that ends with ``.bp``. Where DOLFINx has no ADIOS2, XDMF files with the
@@ -92,17 +93,25 @@ def nodal_fields(solution: Solution) -> list[fem.Function]:
 
 
 def cell_fields(solution: Solution) -> list[fem.Function]:
-    """Subdomain, body and material (-1 where a cell has no tag). Collective."""
+    """Subdomain, body, material (-1 where a cell has no tag), and maybe the estimated error.
+
+    Collective.
+    """
     decomposition = solution.decomposition
     subdomain = decomposition.cell_subdomain
     material = np.full(len(subdomain), NO_TAG)
     material[decomposition.cell_tags.indices] = decomposition.cell_tags.values
     W = fem.functionspace(decomposition.mesh, ("DG", 0))
-    return [
+    fields = [
         _cell_function(W, "subdomain", subdomain),
         _cell_function(W, "body", decomposition.body_of_subdomain[subdomain]),
         _cell_function(W, "material", np.where(material == NO_TAG, -1, material)),
     ]
+    if solution.has_discretisation_error:
+        cells = solution.discretisation_error.function_space.dofmap.list
+        error = solution.discretisation_error.x.array[np.asarray(cells)[:, 0]]
+        fields.append(_cell_function(W, "discretisation_error", error))
+    return fields
 
 
 def _cell_function(W: fem.FunctionSpace, name: str, values: Array) -> fem.Function:

@@ -17,8 +17,11 @@ from tfeti_dolfinx.contact.arguments import Gap, gaps_by_position
 from tfeti_dolfinx.contact.partners import ContactPartner, checked_contacts
 from tfeti_dolfinx.contact_state import Multipliers
 from tfeti_dolfinx.coulomb import solve_with_friction
+from tfeti_dolfinx.doubts import Doubts
 from tfeti_dolfinx.dual.dual import Dual
-from tfeti_dolfinx.errors import TfetiError
+from tfeti_dolfinx.dual.goals import Goal
+from tfeti_dolfinx.errors import InputError, TfetiError
+from tfeti_dolfinx.estimates import Estimates, estimate, goal_of, of_looks
 from tfeti_dolfinx.extensions import Extensions, Settings, guarded
 from tfeti_dolfinx.fields import Stress, check_stress, checked_thickness
 from tfeti_dolfinx.form_checks import check_same_space, displacement_space
@@ -101,6 +104,11 @@ class ContactProblem(Stepping):
         self.bcs = checked_conditions(bcs, V)
         self.u = fem.Function(V, name="displacement") if u is None else self._checked_u(u, V)
         self._stress = check_stress(stress, self.u, decomposition)
+        if self.options.rtol == "auto" and stress is None:
+            raise InputError(
+                f"-{petsc_options_prefix}rtol auto: the problem has no stress to estimate the "
+                "discretisation error from; expected ContactProblem(..., stress=sigma)"
+            )
         self._thickness = checked_thickness(thickness, decomposition)
         self.report = Report(seconds=dict(decomposition.seconds))
         with stage("assembly", self.report.seconds):
@@ -108,6 +116,7 @@ class ContactProblem(Stepping):
         with stage("gluing", self.report.seconds):
             self.dofs = TornDofs(V, decomposition)
         forms.thickness = self._thickness
+        self._doubts = Doubts(decomposition, self.dofs)
         self._system = System(
             forms, self.bcs, self.contacts, self.dofs, decomposition, self._settings
         )
@@ -149,6 +158,20 @@ class ContactProblem(Stepping):
         if self.options.view and self.decomposition.comm.rank == 0:
             print(self.options.view_text(self._settings.prefix), self.report, sep="\n", flush=True)
         return self.u
+
+    def estimate(self) -> Estimates:
+        """How large the errors of the last solution are, in energy. It costs what it says.
+
+        Returns:
+            The estimates, which ``report.estimates`` then has, too.
+
+        Raises:
+            InputError: There is no solution, or its rows are no longer there.
+            FactorError: A matrix could not be factored.
+        """
+        found = estimate(self._system, self.solution)
+        self.report.estimates = found.numbers()
+        return found
 
     def update(
         self,
@@ -201,6 +224,12 @@ class ContactProblem(Stepping):
         """Destroy the PETSc objects; solution and report stay. ``solve`` makes them anew."""
         self._system.destroy()
 
+    def _goal(self) -> Goal | None:
+        """What -rtol auto compares the algebraic error with."""
+        if self.options.rtol != "auto" or self._stress is None:
+            return None
+        return goal_of(self._stress, self.dofs, self.decomposition, self._thickness)
+
     def _solve_rows(self) -> Solution:
         """Solve with the present rows, from the last solution on."""
         system, report = self._system, self.report
@@ -217,7 +246,8 @@ class ContactProblem(Stepping):
                 earlier, lam, mu = self._start
                 start = (gluing.multipliers(earlier, lam), mu)
             own = self._settings.extensions.monitor
-            solved = solve_with_friction(dual, self.options, qp_type, start, own)
+            goal = self._goal()
+            solved = solve_with_friction(dual, self.options, qp_type, start, own, goal)
         result, accuracy, _ = solved
         with stage("recovery", report.seconds):
             multipliers = Multipliers(np.array(result.lam.array_r), result.face)
@@ -225,6 +255,8 @@ class ContactProblem(Stepping):
             self.u.x.array[:] = self.dofs.to_dolfinx(solution.u)
         self._start = (gluing, solution.lam, result.mu) if result.reason > 0 else None
         fill_result(report, solution, dual, *solved)
+        report.estimates = of_looks(accuracy.reached)
+        report.warnings = self._doubts.found(dual, solution.u, report, self.options.number)
         report.excluding_contacts = system.search.named(gluing.contacts_of(result.excluding))
         result.destroy()
         comm, excluding = self.decomposition.comm, report.excluding_contacts

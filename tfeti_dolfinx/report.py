@@ -41,6 +41,7 @@ class Report:
         nearly_free: Rigid motions that contacts with a force hold hardly (``stiffness``: as a
             share of what the same contacts hold at most) or not at all (0): dicts of ``bodies``,
             ``mode`` and ``stiffness``. The smallest motion was taken.
+        warnings: Sentences on why the answer cannot be trusted, or not as far as it seems.
         contact_rows: Non-penetration rows.
         contact_candidates: Nodes of the (secondary) contact surfaces.
         far_contact_nodes: Those that were out of reach or not covered, and have no row.
@@ -82,13 +83,16 @@ class Report:
         seconds: Wall seconds of each stage (largest over ranks), and ``total``.
         residuals: ``projected_gradient`` and ``equilibrium`` relative to b₀;
             ``displacement_error``, the estimated error of u in the maximum norm relative to the
-            displacement of the body where it is worst; in physical units ``gluing_jump`` and
+            displacement of the body where it is worst; ``energy_error``, that in energy relative
+            to ‖u‖_K; in physical units ``gluing_jump`` and
             ``penetration`` (lengths), ``tension`` (most negative pressure), ``complementarity``
             (largest force times gap), ``balance`` (force left on a kernel mode where
             it is largest beside the forces there); ``friction``, the last change of the bounds of
             Coulomb's friction over their size.
         tolerances: What they were at most allowed to be, all but the first two.
         in_all: Solves, counters and ``seconds`` of all solves together.
+        estimates: What ``ContactProblem.estimate`` has found since, and what it took; see
+            ``Estimates``.
         errors: Relative errors against closed forms, filled by demos.
         spectrum: With ``-tfeti_spectrum``: the extreme eigenvalues ``BBt_min`` and ``BBt_max`` of
             B Bᵀ, ``BDBt_min`` and ``BDBt_max`` of B D⁻¹ Bᵀ. Their roots are the extreme
@@ -104,6 +108,7 @@ class Report:
     soft_modes: int = 0
     free_modes: int = 0
     nearly_free: list[dict[str, object]] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
     contact_rows: int = 0
     contact_candidates: int = 0
     far_contact_nodes: int = 0
@@ -140,6 +145,7 @@ class Report:
     seconds: dict[str, float] = field(default_factory=dict)
     residuals: dict[str, float] = field(default_factory=dict)
     tolerances: dict[str, float] = field(default_factory=dict)
+    estimates: dict[str, float] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
     spectrum: dict[str, float] = field(default_factory=dict)
     in_all: dict[str, float] = field(default_factory=dict)

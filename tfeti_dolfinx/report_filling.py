@@ -112,6 +112,7 @@ def _residuals(
         "projected_gradient": result.projected_gradient / reference,
         "equilibrium": result.norm * result.equality / reference,
         "displacement_error": accuracy.relative_error(),
+        "energy_error": accuracy.energy_error()[0],
         "gluing_jump": _largest(dual, _jumps(solution)),
         "penetration": _largest(dual, -gap),
         "tension": _largest(dual, 0.0 - solution.contact_pressure),
@@ -124,6 +125,7 @@ def _tolerances(solution: Solution, dual: Dual, accuracy: Accuracy) -> dict[str,
     allowed = accuracy.tolerances()
     return {
         "displacement_error": accuracy.rtol,
+        "energy_error": accuracy.energy_error()[1],
         "gluing_jump": allowed.jump,
         "penetration": allowed.penetration,
         "tension": 0.0,

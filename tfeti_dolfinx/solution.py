@@ -13,6 +13,7 @@ from tfeti_dolfinx.arrays import Array, sum_rows
 from tfeti_dolfinx.contact.forces import BodyForces, body_forces, vertex_tractions
 from tfeti_dolfinx.contact.partners import ContactPartner
 from tfeti_dolfinx.contact_state import ContactState, Multipliers
+from tfeti_dolfinx.discretisation import StressRecovery
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.fields import (
     Stress,
@@ -110,6 +111,24 @@ class Solution(ContactState):
     def nodal_von_mises(self) -> fem.Function:
         """Von Mises stress of the cells, averaged at the nodes."""
         return nodal(von_mises(self._sigma()), self.dofs, "von_mises")
+
+    @cached_property
+    def discretisation_error(self) -> fem.Function:
+        """Estimated error in energy of each cell, whose squares add up; see ``StressRecovery``.
+
+        Files for ParaView have it if it has been made, as by ``ContactProblem.estimate``.
+        """
+        recovery = StressRecovery(
+            self.displacement, self._sigma(), self.dofs, self.decomposition, self.thickness
+        )
+        function = fem.Function(recovery.cells, name="discretisation_error")
+        function.x.array[recovery.cell_dof] = np.sqrt(recovery.squares())
+        return function
+
+    @property
+    def has_discretisation_error(self) -> bool:
+        """Whether ``discretisation_error`` has been made."""
+        return "discretisation_error" in self.__dict__
 
     @cached_property
     def pressure(self) -> fem.Function:

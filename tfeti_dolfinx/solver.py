@@ -12,6 +12,7 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.citations import cite
 from tfeti_dolfinx.dual.accuracy import Accuracy
 from tfeti_dolfinx.dual.dual import Dual
+from tfeti_dolfinx.dual.goals import Goal
 from tfeti_dolfinx.errors import ConvergenceError, InputError
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.homogenised import (
@@ -73,6 +74,7 @@ def solve_dual(
     qp_type: str,
     start: tuple[Array, Array] | None = None,
     monitor: Monitor | None = None,
+    goal: Goal | None = None,
 ) -> tuple[QPResult, Accuracy]:
     """Solve the dual problem, and look at the answer. Collective.
 
@@ -85,6 +87,7 @@ def solve_dual(
         qp_type: A solver of ``SOLVERS``.
         start: λ on this rank's rows, and the multipliers of Gλ = e, to start from.
         monitor: Called after each step; default as options say.
+        goal: What bounds the algebraic error in energy has to come down to, too.
 
     Returns:
         Multipliers, and their displacement with its measured accuracy.
@@ -97,7 +100,8 @@ def solve_dual(
     if monitor is None:
         monitor = _monitor(dual, homogenised, options)
     scale = homogenised.scale
-    rule = Accuracy(dual, options.rtol, options.atol, scale.reference, scale.rounding, qp.norm)
+    rule = Accuracy(dual, options.number, options.atol, (scale.reference, scale.rounding), qp.norm)
+    rule.goal = goal
     result = solver.solve(Task(qp, homogenised, rule, options, begin, monitor))
     dual.saw(result.norm)
     homogenised.destroy()
@@ -185,7 +189,7 @@ def conclude(
     text = (
         f"{result.reason.name} after {result.steps.outer} outer and {result.steps.inner} inner "
         f"iterations: the worst of its errors is {rule.ratio():.3g} times what rtol "
-        f"{options.rtol:g} allows{explanation}"
+        f"{options.rtol} allows{explanation}"
     )
     if options.converged_reason and comm.rank == 0:
         print(f"TFETI solve {text}", flush=True)

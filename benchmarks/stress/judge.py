@@ -35,14 +35,18 @@ def run_scene(scene: Scene, comm: MPI.Intracomm) -> dict[str, Any]:
     return row
 
 
-def judged(scene: Scene, g: meshes.Grid, outcome: Outcome) -> dict[str, Any]:
+def judged(
+    scene: Scene, g: meshes.Grid, outcome: Outcome, answer: Answer | None = None
+) -> dict[str, Any]:
+    """The class of an outcome, and its errors; the answer is found if it is not given."""
     kind = outcome.error.split(":")[0]
     if outcome.error and kind not in NAMED:
         return {"class": "CRASH"}
     if outcome.mu is None:
         return {"class": "refused"}
     try:
-        answer = Untorn(scene, g, outcome.mu, outcome.lmbda).answer()
+        if answer is None:
+            answer = Untorn(scene, g, outcome.mu, outcome.lmbda).answer()
     except (UnsettledError, RuntimeError, np.linalg.LinAlgError) as error:
         return {"class": "not judged", "reference": f"{type(error).__name__}: {error}"}
     row: dict[str, Any] = {"verdict": answer.verdict}
@@ -82,6 +86,7 @@ def _compared(scene: Scene, answer: Answer, outcome: Outcome) -> dict[str, Any]:
     penetration = inside.max(initial=0.0) / most
     row = {
         "u": float(error.max()),
+        "size": float(np.abs(u).max()),
         "u of all": float((error * scale).max() / scale.max()),
         "errors": [float(e) for e in error],
         "jump": float(jump.max()),
@@ -112,6 +117,8 @@ def _nodes(scene: Scene, answer: Answer, outcome: Outcome) -> np.ndarray:
     for b, box in enumerate(scene.bodies):
         size = np.array(box.high) - np.array(box.low)
         own, torn = np.flatnonzero(answer.body == b), np.flatnonzero(outcome.body == b)
+        if scene.joined:
+            own = np.arange(len(answer.x))
         tree = cKDTree(answer.x[own, : scene.gdim] / size)
         away, k = tree.query(outcome.x[torn, : scene.gdim] / size)
         assert away.max() < 1e-6

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import basix.ufl
@@ -62,7 +62,14 @@ def grid(scene: Scene) -> Grid:
         body.append(np.full(len(cells[-1]), b))
         points.append(x)
         start += len(x)
-    return Grid(*(np.concatenate(part) for part in (points, cells, body, colour)))
+    g = Grid(*(np.concatenate(part) for part in (points, cells, body, colour)))
+    return _joined(g) if scene.joined else g
+
+
+def _joined(g: Grid) -> Grid:
+    """The same with one point where bodies have one in common."""
+    points, new = np.unique(g.points.round(12), axis=0, return_inverse=True)
+    return replace(g, points=points, cells=new.ravel()[g.cells])
 
 
 def make_mesh(scene: Scene, g: Grid, comm: MPI.Intracomm) -> dmesh.Mesh:
@@ -129,10 +136,11 @@ def elasticity(
     One compiled form serves all scenes of a cell type: tractions depend on the facet's normal.
     """
     gdim = scene.gdim
-    V = fem.functionspace(mesh, ("Lagrange", 1, (gdim,)))
+    V = fem.functionspace(mesh, ("Lagrange", scene.order, (gdim,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
     mu, lmbda, t = (cellwise(mesh, values) for values in (mu, lmbda, loads))
-    quadrature = {"quadrature_degree": 2 if len(SPLIT.get(scene.cell, [])) == 0 else 1}
+    flat = len(SPLIT.get(scene.cell, [])) > 0
+    quadrature = {"quadrature_degree": (1 if flat else 2) if scene.order == 1 else 4}
     dx = ufl.Measure("dx", domain=mesh, metadata=quadrature)
     ds = ufl.Measure("ds", domain=mesh, subdomain_data=facet_tags, metadata=quadrature)
     e, n = ufl.sym(ufl.grad(u)), ufl.FacetNormal(mesh)

@@ -94,13 +94,13 @@ class Facet:
         return polygon
 
     def rule(self, polygon: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points and weights that integrate polynomials of degree 4 over a convex polygon."""
+        """Points and weights that integrate polynomials of degree 6 over a convex polygon."""
         if self.x.shape[1] == 1:
-            xi, w = basix.make_quadrature(basix.CellType.interval, 4)
+            xi, w = basix.make_quadrature(basix.CellType.interval, 6)
             return polygon[0] + xi * (polygon[1] - polygon[0]), w * abs(polygon[1] - polygon[0])
         if len(polygon) < 3:
             return np.empty((0, 2)), np.empty(0)
-        xi, w = basix.make_quadrature(basix.CellType.triangle, 4)
+        xi, w = basix.make_quadrature(basix.CellType.triangle, 6)
         a, b, c = polygon[0], polygon[1:-1], polygon[2:]
         points = a + xi[:, :1, None] * (b - a)[:, None].swapaxes(0, 1)
         points = points + xi[:, 1:, None] * (c - a)[:, None].swapaxes(0, 1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from mpi4py import MPI
 
 import tfeti_dolfinx as tfeti
 from benchmarks.stress import meshes
+from benchmarks.stress.bending import bend
 from benchmarks.stress.scene import Scene, Wall, side_name, wall_distance
 
 
@@ -58,22 +60,34 @@ class WallShape:
         return wall_distance(self.wall, x)[1]
 
 
-def pair(secondary: str, primary: str) -> tfeti.Contact:
+def pair(secondary: str, primary: str, friction: Any) -> tfeti.Contact:
     """A pair whose first surface carries the multipliers, in the package's words."""
-    try:
-        return tfeti.Contact(secondary, primary, secondary=secondary)
-    except TypeError:  # before the surfaces of a pair were a and b
-        return tfeti.Contact(secondary, primary)
+    return tfeti.Contact(secondary, primary, secondary=secondary, friction=friction)
 
 
 def contacts_of(scene: Scene) -> list[Any]:
-    walls = [tfeti.Obstacle(side_name(w.side), WallShape(w)) for w in scene.walls]
-    pairs = [pair(side_name(p.secondary), side_name(p.primary)) for p in scene.pairs]
+    walls = [
+        tfeti.Obstacle(side_name(w.side), WallShape(w), friction=law(w.friction))
+        for w in scene.walls
+    ]
+    pairs = [
+        pair(side_name(p.secondary), side_name(p.primary), law(p.friction)) for p in scene.pairs
+    ]
     return walls + pairs
+
+
+def law(friction: tuple[str, float] | None) -> tfeti.Tresca | tfeti.Coulomb | None:
+    """A law of friction in the package's words."""
+    if friction is None:
+        return None
+    kind, number = friction
+    return tfeti.Tresca(number) if kind == "tresca" else tfeti.Coulomb(number)
 
 
 def partition(scene: Scene) -> Any:
     """What ``decompose`` is given: a number, or a random one by nearest points of each body."""
+    if scene.hanging:
+        return partial(_hanging, scene)
     if scene.scattered is None:
         return scene.subdomains
     rng = np.random.default_rng(scene.scattered)
@@ -93,15 +107,28 @@ def partition(scene: Scene) -> Any:
     return subdomain
 
 
+def _hanging(scene: Scene, x: np.ndarray) -> np.ndarray:
+    """Two subdomains in each body, its quarters or eighths in turn: they meet in corners alone."""
+    low = np.array([b.low for b in scene.bodies])
+    high = np.array([b.high for b in scene.bodies])
+    t = (x[: scene.gdim].T[:, None] - low) / (high - low)
+    body = np.abs(t - 0.5).max(axis=2).argmin(axis=1)
+    part = (t[np.arange(len(t)), body] > 0.5).sum(axis=1) % 2
+    return 2 * body + part
+
+
 def solve_scene(scene: Scene, g: meshes.Grid, comm: MPI.Intracomm) -> Outcome:
     """Solve by the package. Collective; the outcome is complete on rank 0."""
-    outcome, start, error = Outcome(), time.perf_counter(), ""
+    outcome, start, error, problem = Outcome(), time.perf_counter(), "", None
     try:
         problem = _problem(scene, g, comm, outcome)
         problem.solve()
         _collect(scene, g, problem, outcome)
     except Exception as caught:
         error = f"{type(caught).__name__}: {caught}"
+    if problem is not None:
+        outcome.report = _reported(problem)
+        problem.destroy()
     outcome.seconds = time.perf_counter() - start
     errors = comm.allgather(error)
     outcome.error = next((e for e in errors if e), "")
@@ -116,6 +143,7 @@ def _problem(
     mesh = meshes.make_mesh(scene, g, comm)
     original = np.asarray(mesh.topology.original_cell_index)
     tags = meshes.tag_sides(scene, mesh, g.body[original])
+    bend(scene, mesh)
     d = tfeti.decompose(mesh, partition(scene), facet_tags=tags, surfaces=scene.surfaces)
     subdomain = np.zeros(len(g.cells), dtype=np.int64)
     subdomain[d.original_cells] = d.cell_subdomain
@@ -141,6 +169,7 @@ def _collect(scene: Scene, g: meshes.Grid, problem: tfeti.ContactProblem, outcom
     for k, (own, other) in enumerate(partners):
         data = problem.solution.contact(k)
         total = data.force @ data.normal.reshape(len(data.force), gdim)
+        total -= data.area @ data.tangential_traction.reshape(len(data.force), gdim)
         forces[own] -= total
         if other is not None:
             forces[other] += total
@@ -148,10 +177,17 @@ def _collect(scene: Scene, g: meshes.Grid, problem: tfeti.ContactProblem, outcom
     gathered = [comm.gather(part) for part in (x, body, problem.u.x.array.reshape(-1, gdim))]
     if comm.rank == 0:
         outcome.x, outcome.body, outcome.u = (np.concatenate(part) for part in gathered)
+
+
+def _reported(problem: tfeti.ContactProblem) -> dict[str, Any]:
+    """Some of the report."""
     report = problem.report
-    outcome.report = {
+    return {
         "reason": report.converged_reason,
+        "warnings": report.warnings,
         "F": report.F_multiplications,
+        "S": report.preconditioner_multiplications,
+        "qp": report.seconds.get("qp", 0.0),
         "free_modes": report.free_modes,
         "rows": report.contact_rows,
         "active": report.active_contacts,

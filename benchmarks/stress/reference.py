@@ -16,8 +16,10 @@ from mpi4py import MPI
 from scipy.sparse import csr_array
 
 from benchmarks.stress import meshes
-from benchmarks.stress.mortar import Facet, mortar
-from benchmarks.stress.scene import Pair, Scene, Side, wall_distance
+from benchmarks.stress.bending import bend
+from benchmarks.stress.conditions import conditions
+from benchmarks.stress.scene import Scene, Side
+from benchmarks.stress.sliding import solve_sliding
 from benchmarks.stress.solve import DEPENDENT, EPSILON, null_space, solve, verdict
 from tfeti_dolfinx.compat import geometry_dofmap
 
@@ -81,6 +83,7 @@ class Untorn:
         mesh = meshes.make_mesh(scene, g, MPI.COMM_SELF)
         cell = np.asarray(mesh.topology.original_cell_index)
         tags = meshes.tag_sides(scene, mesh, g.body[cell])
+        bend(scene, mesh)
         loads = meshes.loads_of(scene)[g.body[cell]]
         V, a, L = meshes.elasticity(scene, mesh, tags, mu[cell], lmbda[cell], loads)
         K = fem.assemble_matrix(fem.form(a), block_mode=None).to_scipy()
@@ -91,13 +94,16 @@ class Untorn:
         self.body[cells] = g.body[cell][:, None]
         self._mesh, self._tags, self._V = mesh, tags, V
         self._dof = np.zeros(len(mesh.geometry.x), dtype=int)
-        self._dof[geometry_dofmap(mesh)] = cells
+        corners = geometry_dofmap(mesh)
+        self._dof[corners] = cells[:, : corners.shape[1]]
+        self._nodes_of = [np.unique(cells[g.body[cell] == b]) for b in range(len(scene.bodies))]
         self.fixed, self.values = np.zeros(len(self.f), dtype=bool), np.zeros(len(self.f))
         for bc in meshes.prescribed(scene, V, self._facets):
             dofs, own = bc.dof_indices()
             self.fixed[dofs[:own]] = True
             bc.set(self.values)
-        self.rows, self.gap = self._conditions()
+        self.conditions = conditions(scene, self.x, self._facet_nodes)
+        self.rows, self.gap = self.conditions.N, self.conditions.gap
         boxes = [np.subtract(b.high, b.low) for b in scene.bodies]
         self.length = float(min(box.max() for box in boxes))
 
@@ -105,60 +111,27 @@ class Untorn:
         body, axis, end = side
         return self._tags.find(body * 2 * self.gdim + 2 * axis + end + 1)
 
-    def _conditions(self) -> tuple[csr_array, np.ndarray]:
-        rows, columns, values, gaps = [], [], [], []
-        for wall in self.scene.walls:
-            nodes = np.unique(self._dof[self._vertices(wall.side)])
-            distance, gradient = wall_distance(wall, self.x[nodes].T)
-            length = np.linalg.norm(gradient, axis=0)
-            for k, node in enumerate(nodes):
-                for c in range(self.gdim):
-                    rows.append(len(gaps))
-                    columns.append(node * self.gdim + c)
-                    values.append(-gradient[c, k] / length[k])
-                gaps.append(distance[k] / length[k])
-        for pair in self.scene.pairs:
-            D, M, sign, gap = self._mortar(pair)
-            number = {i: len(gaps) + k for k, i in enumerate(D)}
-            axis = pair.secondary[1]
-            for i in D:
-                rows.append(number[i])
-                columns.append(i * self.gdim + axis)
-                values.append(sign)
-                gaps.append(gap)
-            for (i, j), m in M.items():
-                if i in D:
-                    rows.append(number[i])
-                    columns.append(j * self.gdim + axis)
-                    values.append(-sign * m / D[i])
-        shape = (len(gaps), len(self.f))
-        return csr_array((values, (rows, columns)), shape=shape), np.array(gaps)
-
-    def _vertices(self, side: Side) -> np.ndarray:
-        return dmesh.entities_to_geometry(self._mesh, self.gdim - 1, self._facets(side))
-
-    def _mortar(
-        self, pair: Pair
-    ) -> tuple[dict[int, float], dict[tuple[int, int], float], float, float]:
-        axis, end = pair.secondary[1:]
-        across = [c for c in range(self.gdim) if c != axis]
-        sides = []
-        for side in (pair.secondary, pair.primary):
-            nodes = self._dof[self._vertices(side)]
-            sides.append([Facet(n, self.x[n][:, across]) for n in nodes])
-        sign = 1.0 if end else -1.0
-        at = [
-            (b.low, b.high)[side[2]][axis]
-            for side in (pair.secondary, pair.primary)
-            for b in [self.scene.bodies[side[0]]]
-        ]
-        return *mortar(*sides), sign, sign * (at[1] - at[0])
+    def _facet_nodes(self, side: Side) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices and all nodes of the facets of a side."""
+        mesh, fdim, facets = self._mesh, self.gdim - 1, self._facets(side)
+        vertices = self._dof[dmesh.entities_to_geometry(mesh, fdim, facets)]
+        if self.scene.order == 1:
+            return vertices, vertices
+        mesh.topology.create_connectivity(fdim, fdim + 1)
+        mesh.topology.create_connectivity(fdim + 1, fdim)
+        own, every = mesh.topology.connectivity(fdim, fdim + 1), []
+        of_cells = mesh.topology.connectivity(fdim + 1, fdim)
+        layout = self._V.dofmap.dof_layout
+        for facet in facets:
+            cell = own.links(facet)[0]
+            local = int(np.flatnonzero(of_cells.links(cell) == facet)[0])
+            every.append(self._V.dofmap.list[cell][layout.entity_closure_dofs(fdim, local)])
+        return vertices, np.array(every)
 
     def rigid_motions(self) -> np.ndarray:
-        """Motions of whole bodies that prescribed values leave, largest displacement about 1."""
-        n, gdim, out = len(self.f), self.gdim, []
-        for b in range(len(self.scene.bodies)):
-            nodes = np.flatnonzero(self.body == b)
+        """Motions of bodies that prescribed values and hinges leave, largest about 1."""
+        n, gdim, out, held = len(self.f), self.gdim, [], []
+        for nodes in self._nodes_of:
             x = self.x[nodes] - self.x[nodes].mean(axis=0)
             x /= np.abs(x).max()
             turns = [(0, 1)] if gdim == 2 else [(0, 1), (1, 2), (2, 0)]
@@ -173,7 +146,25 @@ class Untorn:
             moved = R @ kept
             motions[dofs] = np.where(np.abs(moved) > ALONG * np.abs(moved).max(axis=0), moved, 0.0)
             out.append(motions)
-        return np.concatenate(out, axis=1)
+            held.append(np.repeat(np.isin(np.arange(len(self.x)), nodes), gdim))
+        return _hinged(out, held)
+
+    def _slid(self, known: Answer, free: np.ndarray) -> None:
+        """The answer where there is friction."""
+        c = self.conditions
+        f = self.f - self.K @ self.values
+        T = c.T[:, free]
+        moves = np.asarray(abs(c.N[:, free]).sum(axis=1)).ravel() > DEPENDENT
+        along = np.repeat(moves, T.shape[0] // len(moves))
+        given = (c.N[moves][:, free], T[along], c.gap[moves] - c.N[moves] @ self.values)
+        u, lam, tau = solve_sliding(
+            self.K[free][:, free], f[free], *given, c.given[moves], c.coefficient[moves]
+        )
+        known.u = self._smallest(u, np.zeros((len(self.f), 0)))
+        known.free = np.zeros((len(self.f), 0))
+        force = c.N[moves].T @ lam + c.T[along].T @ tau.ravel()
+        known.forces = -force.reshape(-1, self.gdim)
+        known.noise = np.zeros(len(self.scene.bodies))
 
     def answer(self) -> Answer:
         """Verdict and solution."""
@@ -185,9 +176,12 @@ class Untorn:
         R = self.rigid_motions()[free]
         weight = np.sqrt(N.multiply(N).sum(axis=1)) if N.shape[0] else np.zeros(0)
         known.verdict = verdict(N, gap, R, self.f[free], weight, self.length)
-        if known.verdict != "solvable":
+        if self.conditions.has_friction:
+            known.verdict = "solvable"
+            self._slid(known, free)
+        if known.verdict != "solvable" or known.u is not None:
             return known
-        used = weight > DEPENDENT
+        used = (weight > DEPENDENT) & _first(self.rows, self.gap)
         N, gap = N[used], gap[used]
         K = self.K[free][:, free]
         e = R.T @ self.f[free]
@@ -223,6 +217,32 @@ class Untorn:
         if motions.shape[1]:
             full -= motions @ np.linalg.lstsq(motions, full)[0]
         return full.reshape(-1, self.gdim)
+
+
+def _first(N: csr_array, gap: np.ndarray) -> np.ndarray:
+    """Of conditions that are the same the first."""
+    both = np.concatenate((N.toarray(), gap[:, None]), axis=1)
+    first = np.zeros(len(gap), dtype=bool)
+    first[np.unique(both, axis=0, return_index=True)[1]] = True
+    return first
+
+
+def _hinged(motions: list[np.ndarray], of_body: list[np.ndarray]) -> np.ndarray:
+    """Of motions of bodies those that agree where bodies share nodes."""
+    shared = np.sum(of_body, axis=0) > 1
+    if not shared.any():
+        return np.concatenate(motions, axis=1)
+    differ = []
+    for i in range(len(motions)):
+        for j in range(i):
+            rows = of_body[i] & of_body[j]
+            parts = [np.zeros((rows.sum(), m.shape[1])) for m in motions]
+            parts[i], parts[j] = motions[i][rows], -motions[j][rows]
+            differ.append(np.concatenate(parts, axis=1))
+    once = np.concatenate([m / np.sum(of_body, axis=0)[:, None] for m in motions], axis=1)
+    whole = np.concatenate(motions, axis=1)
+    whole[shared] = once[shared]
+    return whole @ null_space(np.concatenate(differ))
 
 
 def resultants(answer: Answer, forces: np.ndarray) -> np.ndarray:

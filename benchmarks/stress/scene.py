@@ -59,11 +59,13 @@ class Wall:
         kind: plane (point, normal); ball or bowl (centre, radius); bump, the graph of a
             paraboloid (point, normal, curvature).
         data: What the kind needs.
+        friction: A law, tresca or coulomb, and its number; None where it slides freely.
     """
 
     side: Side
     kind: str
     data: tuple[Vector, ...]
+    friction: tuple[str, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,7 @@ class Pair:
 
     secondary: Side
     primary: Side
+    friction: tuple[str, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,11 @@ class Scene:
         pairs: Pairs of sides.
         subdomains: Their number, by coordinate bisection.
         scattered: Seed of a random partition into as many; None for the bisection.
+        hanging: Whether subdomains hang together at corners and edges alone.
         subdomain_jump: Ratio of moduli between odd and even subdomains.
+        order: Degree of the displacements, 1 or 2; 2 for walls of one plane each only.
+        joined: Whether bodies share the points that they have in common: hinges.
+        bent: What becomes of the boxes' points, a name of ``bending.BENT``, and a number.
         options: Options of the package.
         note: What the scene is about.
     """
@@ -100,7 +107,11 @@ class Scene:
     pairs: tuple[Pair, ...] = ()
     subdomains: int = 4
     scattered: int | None = None
+    hanging: bool = False
     subdomain_jump: float = 1.0
+    order: int = 1
+    joined: bool = False
+    bent: tuple[str, float] | None = None
     options: dict[str, float] = field(default_factory=lambda: {"tfeti_rtol": 1e-6})
     note: str = ""
 

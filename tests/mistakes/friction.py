@@ -91,6 +91,17 @@ LAWS = {
         rf"{FLOOR}: bound has 3 values",
         lambda s: tfeti.Tresca((1.0, 2.0, 3.0), direction=(1, 0, 0)),
     ),
+    "no bound at all": law(
+        rf"{FLOOR}: bound has 0 values and direction=None; expected one", lambda s: tfeti.Tresca(())
+    ),
+    "a bound in UFL": law(
+        rf"{FLOOR}: bound is a \w+; expected a number, a function of points",
+        lambda s: tfeti.Tresca(ufl.SpatialCoordinate(s.d.mesh)[0]),
+    ),
+    "a coefficient that is a constant of DOLFINx": law(
+        rf"{FLOOR}: coefficient is a Constant; expected a number, a function of points",
+        lambda s: tfeti.Coulomb(fem.Constant(s.d.mesh, 0.3)),
+    ),
     "the second of two bounds is negative": law(
         rf"{FLOOR}: bound=-2.0: expected",
         lambda s: tfeti.Tresca((1.0, -2.0), direction=(1, 0, 0)),
@@ -121,6 +132,10 @@ AT_NODES = {
     "a bound of vectors": on_floor(
         rf"{FLOOR}: bound, a function, did not give one number for each of \d points",
         lambda s: tfeti.Tresca(lambda x: x),
+    ),
+    "a bound of complex numbers": on_floor(
+        rf"{FLOOR}: bound, a function, did not give one number .*complex",
+        lambda s: tfeti.Tresca(lambda x: 1j * x[0]),
     ),
     "a coefficient on the mesh before it was torn": on_floor(
         rf"{FLOOR}: bound is on another mesh; expected a function on decomposition.mesh",

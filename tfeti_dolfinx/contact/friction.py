@@ -7,6 +7,7 @@ from dataclasses import KW_ONLY, dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
+import ufl
 from dolfinx import fem
 
 from tfeti_dolfinx.arrays import Array, ArrayLike
@@ -107,16 +108,24 @@ def checked_friction(name: str, friction: Law | None) -> None:
     expected = "Tresca(bound), Coulomb(coefficient) or None"
     checked_type(friction, (Tresca, Coulomb), f"{name}: friction", expected)
     what, count = f"{name}: {friction.what}", len(friction.values)
-    if count > 2 or (count == 2) != (friction.direction is not None):
+    if count not in (1, 2) or (count == 2) != (friction.direction is not None):
         raise InputError(
             f"{what} has {count} value{'s' * (count != 1)} and direction={friction.direction!r}; "
             "expected one value, or two and the direction of the first"
         )
     for value in friction.values:
-        if not (isinstance(value, fem.Function) or callable(value)):
+        if isinstance(value, fem.Function):
+            if value.ufl_shape != ():
+                raise InputError(
+                    f"{what} has the shape {value.ufl_shape}; expected a scalar function"
+                )
+        elif isinstance(value, ufl.core.expr.Expr):  # which can be called, with points
+            raise InputError(
+                f"{what} is {shown(value)}; expected a number, a function of points of shape "
+                "(3, n), or a scalar dolfinx.fem.Function, into which UFL can be interpolated"
+            )
+        elif not callable(value):
             checked_number(value, what, NOT_NEGATIVE)
-        elif isinstance(value, fem.Function) and value.ufl_shape != ():
-            raise InputError(f"{what} has the shape {value.ufl_shape}; expected a scalar function")
 
 
 def same_law(one: Law, other: Law) -> bool:
@@ -227,7 +236,7 @@ def _checked_values(what: str, value: Any, x: Array) -> Array:
     """A number, a function of points, or values at them: one for each point."""
     if callable(value):
         try:
-            value = np.asarray(value(x.T), dtype=float)
+            value = np.asarray(value(x.T)).astype(float, casting="same_kind")
             value = np.broadcast_to(value, (len(x),))
         except Exception as error:  # a user's function may raise anything
             raise InputError(

@@ -8,7 +8,8 @@ import numpy as np
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import TINY, Array
-from tfeti_dolfinx.dual.measures import Measures, Scene, measure
+from tfeti_dolfinx.dual.goals import Goal, LookedAt, Reached
+from tfeti_dolfinx.dual.measures import Measures, measure
 from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.problem import ConvergedReason
@@ -72,8 +73,7 @@ class Accuracy:
         scene: The dual problem.
         rtol: Relative tolerance of displacements and forces.
         atol: A length that errors may have whatever moves.
-        reference: b₀, the norm of the residual at the start.
-        rounding: What rounding leaves of a residual at least.
+        scale: b₀, the norm of the residual at the start, and what rounding leaves of it.
         norm: ‖F‖, or an estimate; residuals over it are errors of multipliers.
 
     Attributes:
@@ -83,24 +83,28 @@ class Accuracy:
         norm: ‖F‖, or an estimate.
         measures: What the last look has seen.
         looks: How many looks there were.
+        goal: An error beside which the algebraic one has to be small, too, or None.
+        reached: What looks have seen of that.
     """
 
     def __init__(
         self,
-        scene: Scene,
+        scene: LookedAt,
         rtol: float,
         atol: float,
-        reference: float,
-        rounding: float,
+        scale: tuple[float, float],
         norm: float = 1.0,
     ) -> None:
         self._scene, self.rtol, self._atol = scene, rtol, atol
+        reference, rounding = scale
         self._rounding, self.norm = rounding, norm or 1.0
         self._before: Measures | None = None
         self.tolerance = max(rtol**FIRST_LOOK * reference, atol, rounding)
         self._small = max(SMALL * rtol * reference, LITTLE * rounding)
         self.drifted, self.looks, self._stalls, self._claimed = False, 0, 0, 1.0
         self.measures: Measures | None = None
+        self.goal: Goal | None = None
+        self.reached: list[Reached] = []
 
     def look(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float) -> Measures:
         """Measure an iterate. Collective."""
@@ -110,6 +114,9 @@ class Accuracy:
         )
         self.looks += 1
         self._before = before
+        if self.goal is not None:
+            reached = Reached.of(self._scene, lam, self.measures, self.goal, self.norm)
+            self.reached.append(reached)
         return self.measures
 
     def examine(
@@ -218,6 +225,7 @@ class Accuracy:
             (now.penetration, allowed.penetration),
             (now.balance, allowed.balance),
             (now.error, allowed.energy),
+            *((last.bound.error, last.allowed) for last in self.reached[-1:]),
         ]
         return max(float(error) / max(float(limit), TINY) for error, limit in pairs)
 
@@ -226,6 +234,15 @@ class Accuracy:
         noise = self.tolerances().displacement / max(self.rtol, NOISE)
         errors = self.errors()
         return float(np.max(errors / np.maximum(noise, TINY), initial=0.0))
+
+    def energy_error(self) -> tuple[float, float]:
+        """Estimated error of u in energy over ‖u‖_K at the last look, and what it may be.
+
+        Where ‖u‖_K is rounding of a rigid motion, over what rounding may leave of it.
+        """
+        now, allowed = self._looked(), self.tolerances().energy
+        size = max(float(np.sqrt(max(now.bodies.energy.sum(), 0.0))), allowed, TINY)
+        return now.error / size, allowed / size
 
     def _longest(self, now: Measures) -> float:
         return max(float(now.bodies.correction.max(initial=0.0)), now.penetration)

@@ -16,6 +16,7 @@ from tfeti_dolfinx.dual.operator import (
     DualOperator,
     MakePreconditioner,
     ScaledRows,
+    dirichlet_preconditioner,
     dual_operator,
     linear_term,
 )
@@ -24,6 +25,7 @@ from tfeti_dolfinx.dual.recovery import moved, recover
 from tfeti_dolfinx.dual.smallest import nearly_free, smallest_motion
 from tfeti_dolfinx.dual.soft_modes import SoftModes
 from tfeti_dolfinx.dual.solvability import check_solvable
+from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.qp.coarse import Coarse, NoCoarse
@@ -33,6 +35,7 @@ from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Product
 from tfeti_dolfinx.qp.homogenised import Image, image
 from tfeti_dolfinx.qp.norm import estimate_norm
 from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
+from tfeti_dolfinx.subdomains.local import LocalOperator
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # from B and c to the set of multipliers, on all local rows
@@ -105,6 +108,9 @@ class Dual:
         if preconditioner is not None:
             self._scaled = ScaledRows(B, constraints.weights)
             self.preconditioner = preconditioner(self._scaled, subdomains)
+        self._lifting: LocalOperator | None = None
+        if self.preconditioner is not None and preconditioner is dirichlet_preconditioner:
+            self._lifting = self.preconditioner.local
         self._on_faces: FacePreconditioner | None = None
         self._on_all: FaceOperator | None = None
         normals, tangents = constraints.sets.normals, constraints.sets.tangents.ravel()
@@ -131,6 +137,20 @@ class Dual:
         self._check()
         self.d.destroy()
         self.d = linear_term(self.constraints.B, self.constraints.c, self.subdomains)
+
+    @property
+    def lifting(self) -> LocalOperator:
+        """S of this rank's subdomains: that of the Dirichlet preconditioner, or made for it.
+
+        Raises:
+            FactorError: The stiffness inside of a subdomain could not be factored.
+        """
+        if self._lifting is None:
+            made = self.subdomains.local_operator("schur", once=True)
+            with raised_on_all_ranks(self.coarse.comm):
+                made.prepare()
+            self._lifting = made
+        return self._lifting
 
     def _check(self) -> None:
         check_solvable(self.coarse, *self._names)

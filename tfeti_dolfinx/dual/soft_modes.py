@@ -11,7 +11,7 @@ import numpy as np
 from petsc4py import PETSc
 from scipy.sparse import block_diag, csr_array, diags_array, hstack
 
-from tfeti_dolfinx.arrays import Array, joined
+from tfeti_dolfinx.arrays import TINY, Array, joined
 from tfeti_dolfinx.dual.coarse import CoarseSpace, transposed_G
 from tfeti_dolfinx.dual.grams import Grams
 from tfeti_dolfinx.dual.projectors import FaceFactors, Projectors
@@ -40,6 +40,8 @@ class SoftModes:
 
     Attributes:
         count: Number of soft motions of all subdomains.
+        amplification: In each body the largest of max diag(K)/R̂ᵀKR̂, 0 without springs: rounding
+            of K is so much larger in what springs do. Shape ``(b,)``.
         factors: Makes the factors of faces, and counts them.
     """
 
@@ -47,7 +49,7 @@ class SoftModes:
         self, B: PETSc.Mat, coarse: CoarseSpace, weights: Array, prefix: str = "tfeti_coarse_"
     ) -> None:
         self._comm, self._r = coarse.comm, coarse.dimension
-        Gt, energy = _springs(B, coarse)
+        Gt, energy, self.amplification = _springs(B, coarse)
         own = np.array([np.sum(coarse.subdomains.diagonal / weights), len(weights)])
         stiffness, unknowns = summed(self._comm, own)
         sigma = stiffness / max(unknowns, 1.0)
@@ -115,18 +117,27 @@ class _Balanced(Projectors):
         self._on_face.destroy()
 
 
-def _springs(B: PETSc.Mat, coarse: CoarseSpace) -> tuple[csr_array, Array]:
-    """This rank's rows of Ĝᵀ, with all motions outside of kernels as columns, and D. Collective."""
-    blocks = coarse.subdomains.blocks
+def _springs(B: PETSc.Mat, coarse: CoarseSpace) -> tuple[csr_array, Array, Array]:
+    """This rank's rows of Ĝᵀ, with all motions outside of kernels as columns; D; amplification.
+
+    Collective.
+    """
+    subdomains = coarse.subdomains
+    blocks = subdomains.blocks
     modes, energies = zip(*map(_outside, blocks), strict=True) if blocks else ((), ())
     trace = [R[block.trace_dofs] for R, block in zip(modes, blocks, strict=True)]
     rows = block_diag(trace, format="csr") if trace else np.zeros((0, 0))
     offsets = chunk_offsets(coarse.comm, rows.shape[1])
     first, total = int(offsets[coarse.comm.rank]), int(offsets[-1])
     if total == 0:
-        return csr_array((B.getLocalSize()[0], 0)), np.zeros(0)
+        return csr_array((B.getLocalSize()[0], 0)), np.zeros(0), np.zeros(subdomains.num_bodies)
     energy = np.concatenate(coarse.comm.allgather(joined(energies)))
-    return transposed_G(B, csr_array(rows), first, total), energy
+    largest = [
+        float(block.diagonal.max() / max(D.min(), TINY)) if len(D) else 0.0
+        for block, D in zip(blocks, energies, strict=True)
+    ]
+    Gt = transposed_G(B, csr_array(rows), first, total)
+    return Gt, energy, subdomains.body_maxima([largest])[0]
 
 
 def _outside(block: Block) -> tuple[Array, Array]:

@@ -123,12 +123,24 @@ class DependentRows:
         return False
 
     def _endless(self, length: float, slope: float, way: PETSc.Vec) -> None:
-        """Whether a way down that costs nothing is none that rounding has made, and has no end."""
+        """Whether a way down that costs nothing is none that rounding has made, and has no end.
+
+        Where rows cannot depend on each other, rounding of an F that is hardly definite has.
+        """
         far = agreed(self._comm, slope > APART * self._qp.d.norm())
-        self.contradicts = bool(far and not np.isfinite(length))
+        self.contradicts = bool(far and not np.isfinite(length) and self._may_depend(way))
         if self.contradicts:
             largest = way.norm(PETSc.NormType.INFINITY)
             self.excluding = np.flatnonzero(np.abs(way.array_r) > TAKES_PART * largest)
+
+    def _may_depend(self, way: PETSc.Vec) -> bool:
+        """Whether rows of the face depend on each other, as far as is known. Collective."""
+        if self.preconditioner is None:
+            return True
+        part = self.part(way.array_r)
+        if part is not None:
+            part.destroy()
+        return part is not None
 
     def _to_a_bound(self, z: Point, way: Array) -> float:
         """Largest t with λ + t·way ∈ Ω, maybe infinite. Collective."""

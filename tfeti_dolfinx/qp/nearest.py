@@ -31,6 +31,8 @@ SHORTEST = 1e-8
 # of the slope at its start: a whole step that leaves as much has met no row but the damping; after
 # so many in a row it is far beyond y, and nothing in Ω fulfils Gλ = e but for rounding
 LEFT, PATIENCE = 0.5, 10
+# far more than what factors leave of Gλ = e
+UNBALANCED = 1e-3
 # of the cost: what rounding may add to it
 ROUNDING = 1e-14
 
@@ -115,6 +117,24 @@ def nearest(
         if slow:
             damping = LEAST_DAMPING
     return Nearest(trial.lam, trial.alpha, imbalance(coarse, trial.lam))
+
+
+def nearest_or_least(coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec) -> Nearest:
+    """The nearest point to y of {λ ∈ Ω, Gλ = e}; the least such λ where that is not found.
+
+    From forces far beyond small discs, as the bounds of another load step are, the way to Gλ = e
+    has so many kinks that ``nearest`` may end before. From 0 it has few. Collective.
+    """
+    found = nearest(coarse, feasible, y)
+    if agreed(y.getComm().tompi4py(), found.missing <= UNBALANCED):
+        return found
+    zero = y.duplicate()
+    zero.set(0.0)
+    least = nearest(coarse, feasible, zero)
+    zero.destroy()
+    better = agreed(y.getComm().tompi4py(), least.missing < found.missing)
+    (found if better else least).lam.destroy()
+    return least if better else found
 
 
 class WithinFace:

@@ -9,17 +9,13 @@ from tfeti_dolfinx.qp.coarse import HELD, imbalance
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.monitors import Monitor, no_monitor
-from tfeti_dolfinx.qp.nearest import nearest
+from tfeti_dolfinx.qp.nearest import UNBALANCED, nearest, nearest_or_least
 from tfeti_dolfinx.qp.newton_curved import is_rubbing
 from tfeti_dolfinx.qp.newton_faces import FaceSolver
 from tfeti_dolfinx.qp.newton_iterate import Iterate
 from tfeti_dolfinx.qp.parameters import NewtonParameters
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, QPResult, Start, Steps
 from tfeti_dolfinx.qp.stopping import StoppingRule
-
-# far more than what factors leave of Gλ = e: the nearest point of Ω does not balance the load;
-# without friction that is known before
-UNBALANCED = 1e-3
 
 
 def first_point(qp: QP) -> PETSc.Vec:
@@ -53,8 +49,8 @@ def _open(qp: QP, face: Face) -> PETSc.Vec | None:
 
 
 def feasible_start(qp: QP, start: Start) -> PETSc.Vec:
-    """Step 0: the nearest feasible point to earlier multipliers. Collective."""
-    return nearest(qp.coarse, qp.feasible, start.lam).lam
+    """Step 0: the nearest feasible point to earlier multipliers, or to 0. Collective."""
+    return nearest_or_least(qp.coarse, qp.feasible, start.lam).lam
 
 
 def newton(
@@ -115,6 +111,7 @@ def newton(
     reason, looked = ConvergedReason.ITERATING, warm or is_rubbing(qp, state.face())
     monitor(steps, "start", state.point.lam, homogenised.b.norm(), 0.0)
     if is_rubbing(qp, state.face()) and imbalance(qp.coarse, state.point.lam) > UNBALANCED:
+        # no point of Ω balances the load; without friction that is known before
         reason = ConvergedReason.DIVERGED_STALLED
         state.look(faces)
     elif not warm:
@@ -141,8 +138,10 @@ def newton(
         # Step 2: the face
         face = state.wanted_face(parameters.gamma, faces) if looked else state.face()
         # Step 3: solve on the face, drop what leaves Ω, restore Gλ = e
-        start, face = state.begun(face)
-        trial = faces.solve(start, face, state.residual)
+        start, begun = state.begun(face)
+        if begun is not face:
+            faces.forget()  # PCPG may have stopped on that face, but elsewhere
+        trial = faces.solve(start, begun, state.residual)
         start.destroy()
         # Step 4: accept where q falls enough
         if faces.contradicts:

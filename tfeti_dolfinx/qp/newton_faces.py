@@ -13,7 +13,7 @@ from tfeti_dolfinx.qp.coarse import HELD, Coarse, imbalance
 from tfeti_dolfinx.qp.dependent import DependentRows
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.monitors import Monitor
-from tfeti_dolfinx.qp.nearest import WithinFace, nearest
+from tfeti_dolfinx.qp.nearest import WithinFace, nearest, nearest_or_least
 from tfeti_dolfinx.qp.newton_curved import (
     Bent,
     bent_at,
@@ -58,7 +58,8 @@ class FaceSolver:
         settled: Whether λ is where PCPG has stopped on the face entered.
         curved: Whether that face is curved.
         left: The residual there.
-        rounded: So many solves in a row ended at rounding, before their target.
+        rounded: So many solves in a row ended at rounding, before their target, or where F is not
+            definite and no row ends the way.
     """
 
     def __init__(
@@ -190,6 +191,7 @@ class FaceSolver:
             out = has_left(self._qp, self._face, z.lam.array_r)
             if self._steps.cg >= self._max_it or not (out or (broken and self._dependent.slide(z))):
                 break
+            self.rounded = self.rounded if out else 0
             z.lam.array[:] = self._qp.feasible.project(z.lam.array_r)
             self._drop(z)
         assert self._face is not None
@@ -209,7 +211,7 @@ class FaceSolver:
             found = nearest(self._qp.coarse, WithinFace(feasible, previous), z.lam)
             if imbalance(self._qp.coarse, found.lam) > HELD:
                 found.lam.destroy()
-                found = nearest(self._qp.coarse, feasible, z.lam)
+                found = nearest_or_least(self._qp.coarse, feasible, z.lam)
             near = found.lam
             on = 0.5 * (z.lam.array_r + near.array_r)
             self.enter(feasible.face(on, z.g.array_r))
@@ -257,7 +259,7 @@ class FaceSolver:
             self._directions,
         )
         self.left = float(self._directions.r.norm())
-        ended = reason == ConvergedReason.DIVERGED_ROUNDING
+        ended = reason != ConvergedReason.CONVERGED_RTOL and self._steps.cg < self._max_it
         self.rounded = self.rounded + 1 if ended else 0
         if self._bent is not None:
             z.g.array[:] -= self._bent.bend(z.lam.array_r - before)

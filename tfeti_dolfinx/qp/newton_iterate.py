@@ -15,6 +15,7 @@ from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.nearest import nearest
 from tfeti_dolfinx.qp.newton_curved import (
     brought_back,
+    brought_parts,
     is_curved,
     part_of_way,
     projected_part,
@@ -35,8 +36,6 @@ MOST = 0.1
 WILD = 1e3
 # of a way along a face that is curved, where q is not low enough at its end
 SHORTER = 0.5
-# of such a way with all that leaves Ω brought back, which lets go many nodes at once
-PARTS = (0.5, 0.125)
 # so many steps in a row that neither lower q by what stands out from its rounding, nor halve
 # ‖g^P‖; so many that do not halve it, whatever q does
 PATIENCE, LONG, ROUNDING = 10, 100, 1e-15
@@ -178,7 +177,7 @@ class Iterate:
         curved = is_curved(self.qp, trial.face)
         shares = [length] if not curved or trial.rounds > 1 else []
         shares += [SHORTER * length, SHORTER**2 * length] if curved else []
-        for share in PARTS if curved else ():
+        for share in agreed(self._comm, brought_parts(curved, length, self._slow > 0)):
             if self._went_to(projected_part(self.qp, self.point, trial.first, share), enough):
                 return True
         taken = any(self._shortened(trial, share, curved, enough) for share in shares)

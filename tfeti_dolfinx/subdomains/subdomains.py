@@ -89,9 +89,15 @@ class Subdomains:
                 block.update(None if K is None else K[i], None if f is None else f[part])
         self._read_trace()
 
-    def local_operator(self, kind: OperatorKind) -> GroupedOperator:
-        """K⁺, K_bb or S of all Blocks on the trace; to be made again after ``retrace``."""
-        return local_operator(self.blocks, kind, self._choice)
+    def local_operator(self, kind: OperatorKind, once: bool = False) -> GroupedOperator:
+        """K⁺, K_bb or S of all Blocks on the trace; to be made again after ``retrace``.
+
+        Args:
+            kind: Which of them.
+            once: Whether it is applied a few times only, for which no dense matrix pays.
+        """
+        choice = LocalChoice("implicit") if once else self._choice
+        return local_operator(self.blocks, kind, choice)
 
     def destroy(self) -> None:
         """Free the factors of the Blocks."""

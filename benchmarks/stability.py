@@ -1,0 +1,144 @@
+"""What hard scenes cost, and whether their answers are right: ladders from friendly to hard.
+
+    ./run python3 benchmarks/stability.py [--quick] [--groups moduli nu ...] [--cells triangle ...]
+
+Each scene is solved by the package, and directly on the untorn mesh (``benchmarks.stress``: dense
+programs and active sets, with friction Alart's and Curnier's method). A row has what came out:
+
+* ``right``: converged, and the displacement of each body within 100 rtol in the maximum norm, or
+  within 100 times what rounding of the stiffness does to the direct solution;
+* ``warned``: converged, not that right, and ``report.warnings`` says so;
+* ``named``: an error with its cause; ``no solution``: the same, and there is none;
+* in capitals what must not occur: ``SILENT``, a wrong answer that nobody warns of, ``WRONG
+  VERDICT``, a solution where there is none or the other way round, ``CRASH``.
+
+``F`` are multiplications by F, ``of friendly`` those over the ones of the friendly scene, and
+``error`` the largest error of a body. Results go to results/stability.md, .json and .png.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+from pathlib import Path
+from typing import Any
+
+import petsc4py
+
+if __name__ == "__main__":
+    petsc4py.init(sys.argv[:1])
+
+from mpi4py import MPI
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks.pictures import curves, picture
+from benchmarks.stability_scenes import CELLS, LADDERS, UNITS, Ladder
+from benchmarks.stress.judge import run_scene
+from benchmarks.stress.scene import Scene
+from benchmarks.tools import command_line, finish
+
+WITHIN = 100.0  # of rtol, and of the noise of the direct solution
+QUICK = ("triangle",)
+GROUPS = tuple(dict.fromkeys(ladder.group for ladder in LADDERS))
+SHOWN = {"moduli": "hexahedron", "nu": "hexahedron", "aspect": "hexahedron"}
+
+
+def configure(parser):
+    parser.add_argument("--groups", nargs="+", choices=GROUPS, default=list(GROUPS))
+    parser.add_argument("--cells", nargs="+", choices=CELLS)
+
+
+def verdict(scene: Scene, row: dict[str, Any]) -> str:
+    """What came out, in one word."""
+    if scene.joined and row["error"].startswith("NoSolutionError"):
+        return "named"  # bodies that only nodes join are not joined, docs/theory.md
+    if "u" not in row:
+        return {"not converged": "named", "right: no solution": "no solution"}.get(
+            row["class"], row["class"]
+        )
+    allowed = max(scene.options["tfeti_rtol"], row.get("noise", 0.0))
+    if max(row["u"], row["jump"]) <= WITHIN * allowed:
+        return "right"
+    return "warned" if row["warnings"] else "SILENT"
+
+
+def label(ladder: Ladder, value: float) -> str:
+    """A value as it stands in the table."""
+    if ladder.name.endswith(("units", "frictionless")) and ladder.values == range(len(UNITS)):
+        return "{:g} m, {:g} Pa".format(*UNITS[int(value)])
+    return f"{value:g}"
+
+
+def climb(ladder: Ladder, cell: str, quick: bool) -> list[dict[str, Any]]:
+    """A row for each rung of a ladder."""
+    values = list(ladder.values)
+    rows: list[dict[str, Any]] = []
+    for value in [values[0], values[-1]] if quick else values:
+        scene = ladder.rung(cell, value)
+        found = run_scene(scene, MPI.COMM_WORLD)
+        row = {"scene": ladder.name, "cell": cell, "value": label(ladder, value)}
+        if MPI.COMM_WORLD.rank == 0:
+            row |= {"verdict": verdict(scene, found), "F": found.get("F", 0)}
+            row["of friendly"] = row["F"] / max((rows or [row])[0]["F"], 1)
+            row["error"], row["size"] = found.get("u", "-"), found.get("size", "-")
+            row["says"] = said(found)
+            print(*row.values(), sep=" | ", flush=True)
+        rows.append(row)
+    return rows
+
+
+def said(found: dict[str, Any]) -> str:
+    """The error, or the warnings."""
+    text = found["error"] or found.get("reference", "") or "; ".join(found.get("warnings", []))
+    return " ".join(text.split()).replace("|", "/")
+
+
+def locking(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The largest displacement of degree 1 over that of degree 2, on the same cells."""
+    size = {(row["scene"], row["cell"], row["value"]): row["size"] for row in rows}
+    return [
+        {"cell": cell, "nu": nu, "P1 over P2": size["P1", cell, nu] / value}
+        for (scene, cell, nu), value in size.items()
+        if scene == "P2"
+    ]
+
+
+def draw(path, tables):
+    """Multiplications over those of the friendly scene."""
+    titles = [title for title in tables if title != "locking"]
+    with picture(path, len(titles[:3])) as axes:
+        for panel, title in zip(axes, titles[:3], strict=True):
+            rows, lines = tables[title], {}
+            cell = SHOWN.get(title, rows[0]["cell"])
+            cell = cell if any(row["cell"] == cell for row in rows) else rows[0]["cell"]
+            for row in rows:
+                if row["cell"] == cell:
+                    x, y = lines.setdefault(row["scene"], ([], []))
+                    x.append(len(x))
+                    y.append(row["of friendly"])
+            curves(panel, f"{title}, {cell}", ("rung", "F, of friendly"), lines, log="")
+
+
+def main(argv):
+    """Climb the ladders and write what came out; returns the tables."""
+    arguments, _ = command_line(__doc__, argv, configure)
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    cells = arguments.cells or (QUICK if arguments.quick else CELLS)
+    tables: dict[str, list[dict[str, Any]]] = {group: [] for group in arguments.groups}
+    for ladder in LADDERS:
+        if ladder.group in tables:
+            for cell in ladder.cells:
+                if cell in cells:
+                    tables[ladder.group] += climb(ladder, cell, arguments.quick)
+    logging.disable(before)
+    if MPI.COMM_WORLD.rank == 0 and "nu" in tables:
+        tables["locking"] = locking(tables["nu"])
+    tables = MPI.COMM_WORLD.bcast({title: rows for title, rows in tables.items() if rows})
+    return finish(arguments.output, "stability", tables, draw, MPI.COMM_WORLD.rank)
+
+
+if __name__ == "__main__":
+    found = main(sys.argv[1:])
+    sys.exit(any(row.get("verdict", "").isupper() for rows in found.values() for row in rows))

@@ -1,0 +1,199 @@
+"""The discretisation error: near to the true one, 0 where there is none, the same on all ranks."""
+
+import numpy as np
+import pytest
+import ufl
+from bodies import held, pressed, sided, stacked, stiffer_above, two_body_problem
+from dolfinx import fem
+from dolfinx import mesh as dmesh
+from mpi4py import MPI
+from scenes import box, clamp, curved_obstacle, decomposed, hooke, problem, strain
+from true_errors import (
+    ball,
+    density,
+    error_against,
+    hertz,
+    lame_error,
+    punch,
+    shrink_fit,
+    stress_of_cells,
+)
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.output import cell_fields
+
+RTOL = {"rtol": 1e-7}
+
+
+def index(p, true):
+    """Estimate over true error."""
+    return p.estimate().discretisation / true
+
+
+@pytest.mark.parametrize("triangles", [True, False])
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("cells", [8, 16, pytest.param(32, marks=pytest.mark.slow)])
+def test_shrink_fit(cells, degree, triangles):
+    p = shrink_fit(cells, degree, triangles, **RTOL)
+    p.solve()
+    error, size = lame_error(p)
+    assert p.estimate().energy == pytest.approx(size, rel=0.05)
+    assert 0.4 <= index(p, error) <= 1.5
+
+
+@pytest.mark.parametrize(
+    ("scene", "sizes", "finest"),
+    [
+        (hertz, (6, 12), 30),
+        (punch, (12, 24), 72),
+        pytest.param(hertz, (6, 12, 24), 60, marks=pytest.mark.slow),
+        pytest.param(punch, (12, 24, 48), 144, marks=pytest.mark.slow),
+        pytest.param(ball, (3_000, 10_000, 30_000), 240_000, marks=pytest.mark.slow),
+    ],
+)
+def test_against_a_finer_mesh(serial_only, scene, sizes, finest):
+    finer = scene(finest, **RTOL)
+    finer.solve()
+    reference, errors = stress_of_cells(finer), []
+    for size in sizes:
+        p = scene(size, **RTOL)
+        p.solve()
+        error, energy = error_against(p, reference)
+        errors.append(error / energy)
+        assert 0.6 <= index(p, error) <= 1.5
+    assert np.all(np.diff(errors) < 0.0)
+
+
+def layers(names):
+    """A cube of two layers, with or without names for them, E = 1 below and 10 above."""
+    mesh, tags, sides = box("tetrahedron", 4)
+    cells = np.arange(mesh.topology.index_map(3).size_local, dtype=np.int32)
+    above = dmesh.compute_midpoints(mesh, 3, cells)[:, 2] > 0.5
+    cell_tags = dmesh.meshtags(mesh, 3, cells, (above + 1).astype(np.int32))
+    told = {"cell_tags": cell_tags, "volumes": {"below": 1, "above": 2}} if names else {}
+    return tfeti.decompose(mesh, 5, facet_tags=tags, surfaces=sides, **told)
+
+
+@pytest.mark.parametrize("names", [True, False])
+def test_stress_and_strain_may_jump_where_materials_meet(names):
+    """ν = 0, pulled: the strain jumps, and the solution is exact."""
+    d = layers(names)
+    stress = hooke(ufl.conditional(ufl.gt(ufl.SpatialCoordinate(d.mesh)[2], 0.5), 10.0, 1.0), 0.0)
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (3,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    dx = ufl.Measure("dx", domain=d.mesh, metadata={"quadrature_degree": 2})
+    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+    a = ufl.inner(stress(u), strain(v)) * dx
+    L = ufl.dot(fem.Constant(d.mesh, (0.0, 0.0, 1e-3)), v) * ds(d.surface("top"))
+    bcs = [clamp(V, d.facets("bottom"))]
+    p = tfeti.ContactProblem(a, L, bcs, [], d, stress=stress, petsc_options={"rtol": 1e-9})
+    p.solve()
+    found = p.estimate().relative_discretisation
+    assert (found <= 1e-6) == names
+    p.destroy()
+
+
+def test_bodies_in_contact_have_stresses_of_their_own():
+    """Blocks of different stiffness under a pressure: each has its strain, uniform."""
+    d = stacked("hexahedron", 3, 4)
+    p = two_body_problem(
+        d,
+        pressed(d, 1e-2),
+        held(d, "lower bottom", "lower left", "lower front", "upper left", "upper front"),
+        [sided("lower top", "upper bottom")],
+        stress=stiffer_above(d, 100.0),
+        rtol=1e-9,
+    )
+    p.solve()
+    assert p.estimate().relative_discretisation <= 1e-6
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_it_does_not_see_tears(cell):
+    """One subdomain or many, on any number of ranks."""
+    found = []
+    for subdomains in (1, 7):
+        d = decomposed(cell, 5, subdomains)
+        obstacle = tfeti.Obstacle("bottom", curved_obstacle(d.mesh.geometry.dim))
+        p = problem(d, contacts=[obstacle], rtol=1e-9)
+        p.solve()
+        found.append(p.estimate().discretisation)
+        field = p.solution.discretisation_error.x.array
+        assert np.all(field >= 0.0)
+        whole = p.dofs.comm.allreduce(float(field @ field))
+        assert np.sqrt(whole) == pytest.approx(found[-1])
+    assert found[0] == pytest.approx(found[1], rel=1e-6)
+
+
+def test_files_have_the_field_once_it_is_made():
+    p = problem(decomposed("quadrilateral", 6, 5))
+    p.solve()
+    names = [field.name for field in cell_fields(p.solution)]
+    p.estimate()
+    fields = cell_fields(p.solution)
+    assert [field.name for field in fields] == [*names, "discretisation_error"]
+    own = p.solution.discretisation_error
+    cells = np.asarray(own.function_space.dofmap.list)[:, 0]
+    copied = np.asarray(fields[-1].function_space.dofmap.list)[:, 0]
+    assert np.array_equal(fields[-1].x.array[copied], own.x.array[cells])
+
+
+def test_without_a_stress_only_the_algebraic_error_is_known():
+    d = decomposed("triangle", 3, 2)
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    dx = ufl.Measure("dx", domain=d.mesh, metadata={"quadrature_degree": 2})
+    a = ufl.inner(hooke()(u), strain(v)) * dx
+    L = ufl.dot(fem.Constant(d.mesh, (0.0, -1e-2)), v) * dx
+    p = tfeti.ContactProblem(a, L, [clamp(V, d.facets("left"))], [], d)
+    p.solve()
+    found = p.estimate()
+    assert found.discretisation is None
+    assert np.isnan(found.relative_discretisation)
+    assert "discretisation" not in p.report.estimates
+    assert MPI.COMM_WORLD.allreduce(found.algebraic) > 0.0
+
+
+def test_axisymmetric():
+    """A tube under inner pressure: Lamé's closed form, weighed with 2πr."""
+    inner, outer, q, nu = 1.0, 2.0, 1e-3, 0.3
+    sides = dict.fromkeys(("left", "right", "bottom", "top"))
+    mesh = dmesh.create_rectangle(MPI.COMM_WORLD, [(inner, 0.0), (outer, 0.5)], [12, 6])
+    ends = {"left": (0, inner), "right": (0, outer), "bottom": (1, 0.0), "top": (1, 0.5)}
+    for side, (axis, at) in ends.items():
+        sides[side] = dmesh.locate_entities_boundary(
+            mesh, 1, lambda x, axis=axis, at=at: np.isclose(x[axis], at)
+        )
+    facets = np.concatenate(list(sides.values()))
+    values = np.repeat(np.arange(1, 5, dtype=np.int32), [len(f) for f in sides.values()])
+    order = np.argsort(facets)
+    tags = dmesh.meshtags(mesh, 1, facets[order], values[order])
+    names = {side: tag for tag, side in enumerate(sides, start=1)}
+    d = tfeti.decompose(mesh, 5, facet_tags=tags, surfaces=names)
+    elastic = tfeti.Elasticity(d, E=1.0, nu=nu, model="axisymmetric")
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+    L = fem.Constant(d.mesh, q) * v[0] * elastic.thickness * ds(d.surface("left"))
+    held_facets = np.concatenate((d.facets("bottom"), d.facets("top")))
+    dofs = fem.locate_dofs_topological(V.sub(1), 1, held_facets)
+    bcs = [fem.dirichletbc(0.0, dofs, V.sub(1))]
+    p = tfeti.ContactProblem(
+        elastic.a(u, v),
+        L,
+        bcs,
+        [],
+        d,
+        stress=elastic.stress,
+        thickness=elastic.thickness,
+        petsc_options=RTOL,
+    )
+    p.solve()
+    r2 = ufl.SpatialCoordinate(d.mesh)[0] ** 2
+    mean = q * inner**2 / (outer**2 - inner**2)
+    apart = mean * outer**2 / r2
+    exact = ufl.diag(ufl.as_vector((mean - apart, 2 * nu * mean, mean + apart)))
+    e = exact - elastic.stress(p.solution.displacement)
+    dx = ufl.Measure("dx", domain=d.mesh, metadata={"quadrature_degree": 5})
+    square = fem.assemble_scalar(fem.form(elastic.thickness * density(e) * dx))
+    assert 0.7 <= index(p, np.sqrt(p.dofs.comm.allreduce(square))) <= 1.5

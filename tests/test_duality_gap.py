@@ -1,0 +1,196 @@
+"""The bound of the algebraic error is one, and is near."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import ufl
+from bodies import held, sided, stacked, stiffer_above, two_body_problem
+from dolfinx import fem
+from mpi4py import MPI
+from scenes import curved_obstacle, decomposed, problem
+from test_own_set import HalfSpaces
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.dual.duality_gap import admissible
+from tfeti_dolfinx.qp.feasible_sets import Product
+from tfeti_dolfinx.solver import solve_dual
+
+CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
+LAWS = (
+    None,
+    lambda rng: tfeti.Tresca(10.0 ** rng.uniform(-4, -2)),
+    lambda rng: tfeti.Coulomb(rng.uniform(0.05, 0.8)),
+)
+
+
+def drawn(seed):
+    """A block on a block that does not match it: a problem of a seed, and rtol."""
+    rng = np.random.default_rng([seed, 11])
+    cell = CELLS[seed % 4]
+    flat = seed % 4 < 2
+    n = rng.integers(2, 9 if flat else 5, size=2)
+    d = stacked(cell, *n.tolist(), int(rng.integers(1, 9)), (0.1, 0.9), gap=rng.uniform(0, 1e-3))
+    law = LAWS[seed % 3]
+    sides = ("upper bottom", "lower top") if rng.random() < 0.5 else ("lower top", "upper bottom")
+    pair = sided(*sides, friction=None if law is None else law(rng))
+    force = rng.uniform(-5e-3, 5e-3, d.mesh.geometry.dim)
+    force[-1] = -(10.0 ** rng.uniform(-3, -1.5))
+    clamped = ["lower bottom", "upper left"] + ([] if flat else ["upper front"])
+    bcs = held(d, *clamped, "lower left") if rng.random() < 0.5 else held(d, *clamped)
+    if not flat or law is None:
+        force[:-1] = 0.0
+    rtol = 10.0 ** rng.uniform(-7, -2)
+    p = two_body_problem(
+        d,
+        lambda v, ds: ufl.dot(fem.Constant(d.mesh, force), v) * ds(d.surface("upper top")),
+        bcs,
+        [pair],
+        stress=stiffer_above(d, 10.0 ** rng.uniform(-2, 3), rng.uniform(0.0, 0.45)),
+        rtol=rtol,
+        qp_type=("newton", "smalse")[int(rng.random() < 0.3)],
+        pc_type=("auto", "lumped")[int(rng.random() < 0.3)],
+        error_if_not_converged=False,
+    )
+    return p
+
+
+def norm(p, u):
+    """‖u‖_K."""
+    subdomains = p.dual.subdomains
+    return np.sqrt(max(subdomains.comm.allreduce(sum(subdomains.energies(u))), 0.0))
+
+
+def exact(p):
+    """The displacement of the same program, bounds of friction included, as exact as can be."""
+    start = (p.solution.lam, np.zeros(p.dual.coarse.dimension))
+    options = replace(p.options, rtol=1e-13, qp_type="newton", error_if_not_converged=False)
+    result, rule = solve_dual(p.dual, options, "newton", start)
+    result.destroy()
+    return rule.u
+
+
+@pytest.mark.parametrize(
+    "seed", [pytest.param(s, marks=[] if s < 24 else [pytest.mark.slow]) for s in range(50)]
+)
+def test_the_bound_is_one_and_at_most_twenty_times_the_error(seed):
+    p = drawn(seed)
+    p.solve()
+    reported = p.report.residuals["energy_error"]
+    assert reported <= p.report.tolerances["energy_error"]
+    found, error = p.estimate(), norm(p, p.solution.u - exact(p))
+    size = norm(p, p.solution.u)
+    assert found.energy == pytest.approx(size)
+    assert found.algebraic >= error * (1 - 1e-6) - 1e-11 * size
+    assert found.algebraic <= 20 * error + 1e-11 * size
+    assert reported * size >= 0.8 * error
+    if p.options.qp_type == "newton":
+        assert reported * size <= 8 * error
+    p.destroy()
+
+
+def on_rows(p, u):
+    """B u of this rank's rows."""
+    rows = p.dual.constraints
+    w, y = rows.B.createVecRight(), rows.c.duplicate()
+    w.array[:] = u[p.dual.subdomains.trace]
+    rows.B.mult(w, y)
+    found = np.array(y.array_r)
+    w.destroy()
+    y.destroy()
+    return found
+
+
+def summed(p, value):
+    return p.dofs.comm.allreduce(float(value))
+
+
+@pytest.mark.parametrize("seed", [6, 11, 13, 41, 44])
+def test_the_gap_is_that_of_an_admissible_displacement(seed):
+    """J(v) from K, f and friction, q(λ) from K and c: their difference is what the bound says."""
+    p = drawn(seed)
+    p.solve()
+    dual, rows, u = p.dual, p.dual.constraints, p.solution.u
+    found = p.estimate()
+    lam = dual.d.duplicate()
+    lam.array[:] = p.solution.lam
+    assert found.recoveries == 0
+    change, loss, _ = admissible(dual, lam, u)
+    lifted = np.empty_like(change)
+    dual.lifting.mult(change, lifted)
+    gap = summed(p, 0.5 * change @ lifted + loss)
+    assert found.algebraic == pytest.approx(np.sqrt(2 * gap), rel=1e-6)
+
+    v = np.array(u)  # extended by 0, not harmonically: another admissible one
+    v[dual.subdomains.trace] += change
+    missed, size = on_rows(p, v) - rows.c.array_r, np.abs(u).max(initial=0.0)
+    noise = 1e-8 * p.dofs.comm.allreduce(size, op=MPI.MAX) * np.abs(rows.scale).max(initial=1.0)
+    assert np.all(np.abs(missed[rows.sets.equalities]) <= noise)
+    assert np.all(missed[rows.sets.normals] <= noise)
+    slip = missed[rows.sets.tangents]
+    rubbing = np.sum(rows.limits[:, 0] * np.linalg.norm(slip, axis=1)) if slip.size else 0.0
+    blocks = list(zip(dual.subdomains.blocks, dual.subdomains.dof_parts, strict=True))
+    load = sum(block.load @ v[part] for block, part in blocks)
+    primal = summed(p, 0.5 * sum(dual.subdomains.energies(v)) - load + rubbing)
+    own = -0.5 * sum(dual.subdomains.energies(u)) - lam.array_r @ rows.c.array_r
+    zero = np.zeros_like(u)
+    zero[dual.subdomains.trace] = change
+    rest = summed(p, 0.5 * (sum(dual.subdomains.energies(zero)) - change @ lifted))
+    assert rest >= 0.0
+    assert primal - summed(p, own) - rest == pytest.approx(gap, rel=1e-5, abs=1e-13 * abs(primal))
+    lam.destroy()
+
+
+@pytest.mark.parametrize("contacts", [0, 1])
+def test_it_is_the_same_for_all_preconditioners_and_costs_what_it_says(contacts):
+    """The Dirichlet preconditioner has the factors; without it they are made once."""
+    floor = tfeti.Obstacle("bottom", curved_obstacle(2), reach=0.2)
+    bounds = []
+    for kind in ("dirichlet", "lumped"):
+        p = problem(decomposed("triangle", 6, 4), contacts=[floor] * contacts, pc_type=kind)
+        p.solve()
+        before = p.report.F_multiplications
+        bounds.append(p.estimate())
+        assert p.report.estimates["algebraic"] == bounds[-1].algebraic
+        assert p.report.F_multiplications == before == p.dual.F.count["solver"]
+        assert bounds[-1].lifting_multiplications == 1
+        assert (bounds[-1].factorizations > 0) == (kind == "lumped")
+        assert p.estimate().factorizations == 0
+    for found in bounds:
+        assert 0.0 < found.relative_algebraic < 1e-5
+
+
+@pytest.mark.parametrize("n", [4, 8, 16])
+def test_it_does_not_grow_with_the_size_of_subdomains(n):
+    """Harmonic extension; jumps extended by 0 would cost √(H/h)."""
+    p = problem(decomposed("quadrilateral", 4 * n, 16), rtol=1e-2)
+    p.solve()
+    assert 1.0 <= p.estimate().algebraic / norm(p, p.solution.u - exact(p)) <= 1.6
+
+
+def test_a_set_of_one_s_own():
+    """Glue that lets go at a limit: the gap needs the set alone."""
+
+    def pulling(constraints):
+        half_spaces = HalfSpaces(-constraints.scale, np.full(len(constraints.scale), 1e-4))
+        return Product([(constraints.sets.normals, half_spaces)])
+
+    obstacle, own = (
+        tfeti.Obstacle("bottom", curved_obstacle(3)),
+        tfeti.Extensions(feasible_set=pulling),
+    )
+    d = decomposed("hexahedron", 4, 6)
+    p = problem(d, contacts=[obstacle], extensions=own, rtol=1e-4)
+    p.solve()
+    error = norm(p, p.solution.u - exact(p))
+    assert error <= p.estimate().algebraic <= 5 * error
+
+
+def test_it_needs_a_solution():
+    p = problem(decomposed("triangle", 2, 2))
+    with pytest.raises(tfeti.InputError, match="there is no solution yet"):
+        p.estimate()
+    p.solve()
+    p.destroy()
+    with pytest.raises(tfeti.InputError, match="nothing has been made yet"):
+        p.estimate()

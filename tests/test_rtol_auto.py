@@ -1,0 +1,109 @@
+"""-tfeti_rtol auto: as exact as the mesh is worth, for less."""
+
+import pytest
+from dolfinx import fem
+from scenes import clamp, curved_obstacle, decomposed, forms, hooke, problem
+from true_errors import error_against, hertz, punch, stress_of_cells
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.dual.goals import FINEST, TENTH
+
+
+def work(p):
+    """Multiplications by F and S, and what as much is done for looks."""
+    r = p.report
+    looks = r.recoveries + r.estimates.get("lifting_multiplications", 0)
+    return r.F_multiplications + r.preconditioner_multiplications + looks
+
+
+def is_reached(p):
+    found = p.report.estimates
+    allowed = max(TENTH * found["discretisation"], FINEST * found["energy"])
+    return 0.0 < found["algebraic"] <= allowed * (1 + 1e-12)
+
+
+@pytest.mark.parametrize(
+    ("scene", "sizes", "finest"),
+    [
+        (hertz, (6, 12), 30),
+        (punch, (12, 24), 72),
+        pytest.param(hertz, (6, 12, 24), 60, marks=pytest.mark.slow),
+        pytest.param(punch, (12, 24, 48), 144, marks=pytest.mark.slow),
+    ],
+)
+def test_it_saves_a_third_and_spoils_nothing(serial_only, scene, sizes, finest):
+    finer = scene(finest, rtol=1e-7)
+    finer.solve()
+    reference = stress_of_cells(finer)
+    for size in sizes:
+        auto, exact = scene(size, rtol="auto"), scene(size, rtol=1e-8)
+        auto.solve()
+        exact.solve()
+        assert is_reached(auto)
+        assert error_against(auto, reference)[0] <= 1.01 * error_against(exact, reference)[0]
+        assert auto.report.F_multiplications <= exact.report.F_multiplications * 2 / 3
+        assert work(auto) <= work(exact) * 2 / 3
+
+
+LAWS = {
+    "no friction": None,
+    "bound": tfeti.Tresca(5e-3),
+    "Coulomb": tfeti.Coulomb(0.3),
+}
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("qp_type", ["newton", "smalse"])
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_all_solvers_reach_it(cell, qp_type, law):
+    gdim = 2 if cell == "triangle" else 3
+    d = decomposed(cell, 5, 6)
+    obstacle = tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=0.2, friction=LAWS[law])
+    force, costs = (0.01,) + (0.0,) * (gdim - 2) + (-0.05,), []
+    for rtol in ("auto", 1e-8):
+        p = problem(d, force, [obstacle], qp_type=qp_type, rtol=rtol)
+        p.solve()
+        costs.append(p.report.F_multiplications)
+        assert bool(p.report.estimates) == (rtol == "auto")
+        if rtol == "auto":
+            assert is_reached(p)
+            before = dict(p.report.estimates)
+            after = p.estimate()
+            assert after.algebraic == pytest.approx(before["algebraic"], rel=1e-3)
+            assert after.discretisation == pytest.approx(before["discretisation"], rel=1e-9)
+            assert after.energy == pytest.approx(before["energy"])
+    assert costs[0] < costs[1]
+
+
+def test_without_contact_too():
+    p = problem(decomposed("tetrahedron", 5, 8), rtol="auto")
+    p.solve()
+    assert is_reached(p)
+    assert p.report.converged_reason == "CONVERGED_RTOL"
+    exact = problem(decomposed("tetrahedron", 5, 8), rtol=1e-8)
+    exact.solve()
+    assert p.report.F_multiplications <= exact.report.F_multiplications * 2 / 3
+
+
+def test_where_the_mesh_makes_no_error_it_ends():
+    """A uniform stress: the algebraic error is compared with ‖u‖_K then."""
+    d = decomposed("quadrilateral", 4, 4)
+    V, a, L = forms(d.mesh, d.facet_tags, (0.0, -0.01), d.surface("top"), stress=hooke(1.0, 0.0))
+    floor = fem.locate_dofs_topological(V.sub(1), 1, d.facets("bottom"))
+    side = fem.locate_dofs_topological(V.sub(0), 1, d.facets("left"))
+    bcs = [fem.dirichletbc(0.0, floor, V.sub(1)), fem.dirichletbc(0.0, side, V.sub(0))]
+    p = tfeti.ContactProblem(
+        a, L, bcs, [], d, stress=hooke(1.0, 0.0), petsc_options={"rtol": "auto"}
+    )
+    p.solve()
+    found = p.report.estimates
+    assert is_reached(p)
+    assert found["discretisation"] <= 1e-5 * found["energy"]
+
+
+def test_it_needs_a_stress():
+    d = decomposed("triangle", 2, 2)
+    V, a, L = forms(d.mesh, d.facet_tags, (0.0, -0.01), d.surface("top"))
+    bcs = [clamp(V, d.facets("left"))]
+    with pytest.raises(tfeti.InputError, match=r"-tfeti_rtol auto: .*expected .*stress=sigma"):
+        tfeti.ContactProblem(a, L, bcs, [], d, petsc_options={"tfeti_rtol": "auto"})

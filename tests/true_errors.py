@@ -1,0 +1,144 @@
+"""Scenes whose discretisation error is known, by a closed form or by a finer mesh of the same."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import ufl
+from dolfinx import fem, geometry
+from dolfinx import mesh as dmesh
+from mpi4py import MPI
+from rings import INNER, MIDDLE, OUTER, lame_pressure, rings
+from scenes import clamp, forms, hooke, strain
+
+import tfeti_dolfinx as tfeti
+from demos import hertz_3d
+from demos.hertz import LineContact
+from meshes.half_cylinder import build
+from tfeti_dolfinx.compat import interpolation_points
+
+E, NU = 1.0, 0.3
+OVERLAP = MIDDLE / 1500
+HALF_WIDTH = 0.04
+
+
+def hertz(elements, **options):
+    """The half cylinder of ``demos/hertz_2d.py``, so many elements along the half width."""
+    model = None
+    if MPI.COMM_WORLD.rank == 0:
+        growth = 3.6 / elements
+        model = build(1.0, HALF_WIDTH / elements, 1.5 * HALF_WIDTH, growth, partitions=8)
+    d = tfeti.read_gmsh(model, MPI.COMM_WORLD)
+    V, a, _ = forms(d.mesh, d.facet_tags, (0.0, 0.0), d.surface("top"))
+    load = LineContact.from_half_width(HALF_WIDTH, 1.0, E / (1 - NU**2)).load
+    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+    traction = fem.Constant(d.mesh, (0.0, -load / 2))
+    L = ufl.dot(traction, ufl.TestFunction(V)) * ds(d.surface("top"))
+    axis = fem.locate_dofs_topological(V.sub(0), 1, d.facets("axis"))
+    plane = tfeti.Obstacle("contact", tfeti.Plane((0, 0), (0, 1)), reach=2 * HALF_WIDTH**2)
+    bcs = [fem.dirichletbc(0.0, axis, V.sub(0))]
+    return tfeti.ContactProblem(a, L, bcs, [plane], d, stress=hooke(), petsc_options=options)
+
+
+def punch(n, depth=0.01, flat=0.2, **options):
+    """A rigid punch, flat and then rounded, is pressed into a block of 2n × n squares."""
+    comm = MPI.COMM_WORLD
+    mesh = dmesh.create_rectangle(
+        comm, [(-1.0, -1.0), (1.0, 0.0)], [2 * n, n], diagonal=dmesh.DiagonalType.crossed
+    )
+    sides = [dmesh.locate_entities_boundary(mesh, 1, lambda x, y=y: x[1] == y) for y in (-1.0, 0.0)]
+    values = np.repeat(np.array([1, 2], dtype=np.int32), [len(side) for side in sides])
+    facets = np.concatenate(sides)
+    order = np.argsort(facets)
+    tags = dmesh.meshtags(mesh, 1, facets[order], values[order])
+    d = tfeti.decompose(mesh, 8, facet_tags=tags, surfaces={"bottom": 1, "top": 2})
+
+    def distance(x):
+        return np.maximum(np.abs(x[0]) - flat, 0.0) ** 2 / 2 - depth - x[1]
+
+    def gradient(x):
+        slope = np.sign(x[0]) * np.maximum(np.abs(x[0]) - flat, 0.0)
+        return np.stack((slope, -np.ones_like(slope), 0.0 * slope))
+
+    V, a, L = forms(d.mesh, d.facet_tags, (0.0, 0.0), 2)
+    obstacle = tfeti.Obstacle("top", tfeti.SignedDistance(distance, gradient), reach=0.05)
+    bcs = [clamp(V, d.facets("bottom"))]
+    return tfeti.ContactProblem(a, L, bcs, [obstacle], d, stress=hooke(), petsc_options=options)
+
+
+def ball(unknowns, **options):
+    """The half ball of ``demos/hertz_3d.py``."""
+    chosen = SimpleNamespace(unknowns=unknowns, subdomains=None, quick=False)
+    made = hertz_3d.scene(hertz_3d.torn_mesh(chosen))
+    return tfeti.ContactProblem(**made, petsc_options=options)
+
+
+def shrink_fit(cells, degree=1, triangles=True, **options):
+    """A ring shrunk on another one; degree 2 on curved cells."""
+    d = rings(MPI.COMM_WORLD, (3 * cells, 4 * cells), degree, triangles=triangles)
+    V = fem.functionspace(d.mesh, ("Lagrange", degree, (2,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    dx = ufl.Measure("dx", domain=d.mesh, metadata={"quadrature_degree": 4 * degree - 2})
+    a = ufl.inner(hooke()(u), strain(v)) * dx + 1e-6 * ufl.dot(u, v) * dx
+    L = ufl.dot(fem.Constant(d.mesh, (0.0, 0.0)), v) * dx
+    pair = tfeti.Contact("shaft", "hub", gap=-OVERLAP)
+    return tfeti.ContactProblem(a, L, [], [pair], d, stress=hooke(), petsc_options=options)
+
+
+def density(sigma):
+    """σ : C⁻¹σ in UFL."""
+    return ((1 + NU) * ufl.inner(sigma, sigma) - NU * ufl.tr(sigma) ** 2) / E
+
+
+def lame_error(p):
+    """Error of a shrink fit in energy, and the energy, against Lamé's stress. Collective."""
+    mesh, uh = p.decomposition.mesh, p.solution.displacement
+    x = ufl.SpatialCoordinate(mesh)
+    r2 = x[0] ** 2 + x[1] ** 2
+    body = fem.Function(fem.functionspace(mesh, ("DG", 0)))
+    at = body.function_space.tabulate_dof_coordinates()
+    body.x.array[:] = np.linalg.norm(at, axis=1) > MIDDLE
+    q = lame_pressure(OVERLAP)
+    a, b, c = INNER**2, MIDDLE**2, OUTER**2
+    outside = ufl.gt(body, 0.5)
+    mean = ufl.conditional(outside, q * b / (c - b), -q * b / (b - a))
+    apart = ufl.conditional(outside, -q * b * c / (c - b), q * a * b / (b - a)) / r2
+    s = ((x[0] ** 2 - x[1] ** 2) * apart / r2, 2 * x[0] * x[1] * apart / r2)
+    sigma = ufl.as_tensor([[mean + s[0], s[1], 0], [s[1], mean - s[0], 0], [0, 0, 2 * NU * mean]])
+    dx = ufl.Measure("dx", domain=mesh, metadata={"quadrature_degree": 6})
+    parts = [fem.assemble_scalar(fem.form(density(t) * dx)) for t in (sigma - hooke()(uh), sigma)]
+    return np.sqrt(p.dofs.comm.allreduce(np.array(parts)))
+
+
+def stress_of_cells(p):
+    """Midpoints, areas and stresses of this rank's cells, of displacements of degree 1."""
+    mesh, tdim = p.decomposition.mesh, p.decomposition.mesh.topology.dim
+    W, Q = (fem.functionspace(mesh, ("DG", 0, *shape)) for shape in (((3, 3),), ()))
+    sigma = fem.Function(W)
+    expression = hooke()(p.solution.displacement)
+    sigma.interpolate(fem.Expression(expression, interpolation_points(W)))
+    areas = fem.assemble_vector(fem.form(ufl.TestFunction(Q) * ufl.dx)).array
+    cells = np.arange(len(p.decomposition.cell_subdomain), dtype=np.int32)
+    values = sigma.x.array.reshape(-1, 3, 3)[np.asarray(W.dofmap.list)[:, 0]]
+    area = areas[np.asarray(Q.dofmap.list)[:, 0]]
+    return dmesh.compute_midpoints(mesh, tdim, cells), area, values
+
+
+def error_against(p, fine):
+    """Error in energy on one rank, and the energy, against ``stress_of_cells`` of a finer mesh."""
+    mesh, (points, area, sigma) = p.decomposition.mesh, fine
+    tdim = mesh.topology.dim
+    cells = np.arange(len(p.decomposition.cell_subdomain), dtype=np.int32)
+    tree = geometry.bb_tree(mesh, tdim, entities=cells)
+    found = geometry.compute_colliding_cells(
+        mesh, geometry.compute_collisions_points(tree, points), points
+    )
+    first, inside = np.zeros(len(points), dtype=np.int32), np.diff(found.offsets) > 0
+    first[inside] = found.array[found.offsets[:-1][inside]]
+    middle = geometry.create_midpoint_tree(mesh, tdim, cells)
+    first[~inside] = geometry.compute_closest_entity(tree, middle, mesh, points[~inside])
+
+    def norm(e):
+        squares = (1 + NU) * np.einsum("nij,nij->n", e, e) - NU * np.einsum("nii->n", e) ** 2
+        return np.sqrt(area @ squares / E)
+
+    return norm(stress_of_cells(p)[2][first] - sigma), norm(sigma)

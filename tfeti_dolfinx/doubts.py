@@ -1,0 +1,195 @@
+"""Where an answer cannot be trusted, or not as far as it seems: sentences for the report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from mpi4py import MPI
+
+from tfeti_dolfinx.arrays import TINY, Array, joined
+from tfeti_dolfinx.dual.dual import Dual
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.mesh.quality import flatness
+from tfeti_dolfinx.mesh.sharing import shared_by_bodies
+from tfeti_dolfinx.parallel import agreed
+from tfeti_dolfinx.report import Report
+from tfeti_dolfinx.subdomains.subdomains import Subdomains, sums
+
+# relative rounding of a stiffness
+EPSILON = float(np.finfo(float).eps)
+# errors of beams and strips that are 10⁴ times as long as thick, over the estimate of rounding:
+# 10 to 50 were seen
+OF_ROUNDING = 30.0
+# ‖J‖‖J⁻¹‖/gdim of a cell that is about 1000 times as long as thick
+FLAT = 500.0
+# (λ + 2μ)/μ: 51 of ν = 0.49; from here on linear displacements are too stiff
+LOCKS = 50.0
+# radians; what linear kinematics then takes for strain is half the square, 0.5 %
+TURNS = 0.1
+LISTED = 3  # bodies that a sentence names
+
+
+class Doubts:
+    """Looks at solutions for what a residual does not show; knows again what it has looked at.
+
+    Args:
+        decomposition: The torn mesh.
+        dofs: Dof maps.
+    """
+
+    def __init__(self, decomposition: Decomposition, dofs: TornDofs) -> None:
+        self._decomposition, self._dofs = decomposition, dofs
+        self._of: Dual | None = None
+        self._lasting: list[str] = []
+
+    def found(self, dual: Dual, u: Array, report: Report, rtol: float) -> list[str]:
+        """Sentences, each of which names the thing. Collective.
+
+        Args:
+            dual: The dual problem.
+            u: This rank's displacement, shape ``(n,)``.
+            report: What is known already.
+            rtol: The relative tolerance that was asked for.
+        """
+        if self._of is not dual:
+            lasting = (self._cells(), self._locking(dual.subdomains), self._hinges())
+            self._lasting, self._of = [text for texts in lasting for text in texts], dual
+        return [
+            *_loose(report),
+            *self._rounding(dual, u, rtol),
+            *self._springs(dual, rtol),
+            *self._turned(u, dual.subdomains),
+            *self._lasting,
+        ]
+
+    def _cells(self) -> Iterator[str]:
+        """Cells that are far from regular."""
+        flat = float(np.max(flatness(self._decomposition.mesh), initial=1.0))
+        worst = float(self._dofs.comm.allreduce(flat, op=MPI.MAX))
+        if worst > FLAT:
+            yield (
+                f"cells: the flattest is about {2.0 * worst:.0e} times as long as thick; forces "
+                "and multiplications suffer from more than 10"
+            )
+
+    def _hinges(self) -> Iterator[str]:
+        """Bodies that a mesh joins in nodes alone."""
+        names = self._decomposition.body_names
+        for (a, b), count in zip(*shared_by_bodies(self._decomposition), strict=True):
+            yield (
+                f"{names[a]}, {names[b]}: the mesh joins them in nodes alone ({count}), in no "
+                "facet: they are bodies of their own, and not joined; expected a common facet"
+            )
+
+    def _locking(self, subdomains: Subdomains) -> Iterator[str]:
+        """Displacements of degree 1 where a material hardly changes its volume.
+
+        On a subdomain, which is free, uᵀKu of a stretch along an axis is the volume times
+        λ + 2μ, and that of a shear along it the volume times μ.
+        """
+        bs, element = self._dofs.bs, self._dofs.V.element.basix_element
+        if element.degree > 1 or bs != self._decomposition.mesh.geometry.dim or bs == 1:
+            return
+        x, ratios = self._points(subdomains), []
+        for i in range(bs):
+            stretch, shear = np.zeros_like(x), np.zeros_like(x)
+            stretch[:, i], shear[:, i] = x[:, i], x[:, (i + 1) % bs]
+            along, across = (np.array(subdomains.energies(v.ravel())) for v in (stretch, shear))
+            ratios.append(along / np.maximum(across, TINY))
+        ratio = np.min(ratios, axis=0) if ratios else np.empty(0)
+        worst = subdomains.body_maxima([list(ratio)])[0]
+        if np.any(worst > LOCKS):
+            t = float(worst.max())
+            yield (
+                f"{self._names(worst > LOCKS)}: Poisson's ratio is about "
+                f"{(t - 2.0) / (2.0 * t - 2.0):.4g} and displacements have degree 1, which makes "
+                "it too stiff (locking); expected degree 2"
+            )
+
+    def _rounding(self, dual: Dual, u: Array, rtol: float) -> Iterator[str]:
+        """Bodies that bend so easily beside what their cells could hold that K's rounding shows.
+
+        Entries of K are right to ε, so the energy uᵀKu is to ε Σ|K_ij u_i u_j|, about ε uᵀDu, D
+        the diagonal; of u less the rigid motion of the body, which K knows to do no work.
+        """
+        subdomains, motions = dual.subdomains, dual.coarse.bodies
+        bent = u - subdomains.modes_motion(motions.amounts(motions.part_of(u)))
+        diagonal = joined([block.diagonal for block in subdomains.blocks])
+        energy, terms = subdomains.body_sums(
+            [subdomains.energies(u), sums(diagonal * bent**2, subdomains.dof_parts)]
+        )
+        known = energy > EPSILON * energy.max(initial=0.0)
+        share = (
+            OF_ROUNDING * EPSILON * np.divide(terms, energy, out=np.zeros_like(terms), where=known)
+        )
+        if np.any(share > rtol):
+            yield (
+                f"{self._names(share > rtol)}: rounding of the stiffness may change the "
+                f"displacement by about {share.max():.0e} of its size, more than rtol {rtol:g}; "
+                "expected thicker parts, fewer cells, or a larger rtol"
+            )
+
+    def _springs(self, dual: Dual, rtol: float) -> Iterator[str]:
+        """Springs so soft that rounding of the stiffness is a part of them."""
+        if dual.soft is None:
+            return
+        share = EPSILON * dual.soft.amplification
+        if np.any(share > rtol):
+            yield (
+                f"{self._names(share > rtol)}: springs hold subdomains so softly that rounding of "
+                f"the stiffness is about {share.max():.0e} of them, more than rtol {rtol:g}; "
+                "expected stiffer ones or none, or a larger rtol"
+            )
+
+    def _turned(self, u: Array, subdomains: Subdomains) -> Iterator[str]:
+        """Bodies that turn farther than linear kinematics bears."""
+        bs = self._dofs.bs
+        if bs != self._decomposition.mesh.geometry.dim or bs == 1:
+            return
+        x, angles = self._points(subdomains), []
+        for part in subdomains.dof_parts:
+            rows = slice(part.start // bs, part.stop // bs)
+            slope = np.linalg.lstsq(x[rows], u[part].reshape(-1, bs), rcond=None)[0]
+            angles.append(float(np.linalg.norm(slope - slope.T)) / 8.0**0.5)
+        worst = subdomains.body_maxima([angles])[0]
+        if np.any(worst > TURNS):
+            yield (
+                f"{self._names(worst > TURNS)}: parts turn by up to {worst.max():.2g} radians; "
+                "linear kinematics takes half the square of that for strain: expected smaller "
+                "loads, or a nonlinear model"
+            )
+
+    def _points(self, subdomains: Subdomains) -> Array:
+        """Points of this rank's primal nodes, from the middle of their subdomains on."""
+        gdim, bs = self._decomposition.mesh.geometry.dim, self._dofs.bs
+        x = self._dofs.V.tabulate_dof_coordinates()[self._dofs.dolfinx_node, :gdim]
+        for part in subdomains.dof_parts:
+            rows = slice(part.start // bs, part.stop // bs)
+            x[rows] -= x[rows].mean(axis=0)
+        return np.asarray(x)
+
+    def _names(self, which: Array) -> str:
+        """Names of bodies, the first ones if they are many; the same on all ranks."""
+        names = self._decomposition.body_names
+        some = agreed(self._dofs.comm, np.flatnonzero(which))
+        listed = ", ".join(names[body] for body in some[:LISTED])
+        rest = len(some) - LISTED
+        return f"{listed} and {rest} more" if rest > 0 else listed
+
+
+def _loose(report: Report) -> Iterator[str]:
+    """Motions that are not determined, or hardly."""
+    if report.free_modes:
+        yield (
+            f"{report.free_modes} rigid motions are free: nothing resists or drives them, the "
+            "smallest displacement was taken"
+        )
+    for motion in report.nearly_free[:LISTED]:
+        bodies, mode, held = (motion[key] for key in ("bodies", "mode", "stiffness"))
+        assert isinstance(bodies, list)
+        share = f"hold hardly ({held:.0e} of what they could)" if held else "do not hold"
+        yield f"{', '.join(bodies)}: contacts with a force {share} {mode}; the smallest was taken"
+    if (rest := len(report.nearly_free) - LISTED) > 0:
+        yield f"{rest} more motions are held hardly or not by contacts with a force"
