@@ -62,8 +62,8 @@ def test_inner_tolerances_never_grow(monkeypatch):
     """The drum moves the belt far, so that a loose tolerance takes any bounds for right."""
     solve, solves = coulomb.solve_dual, []
 
-    def noting(dual, options, qp_type, start, monitor):
-        found = solve(dual, options, qp_type, start, monitor)
+    def noting(dual, options, qp_type, start, *others):
+        found = solve(dual, options, qp_type, start, *others)
         if start is None or options.rtol > solves[-1][-1][0]:
             solves.append([])
         solves[-1].append((options.rtol, found[0].steps == Steps()))
