@@ -156,8 +156,8 @@ def multiplications_of_rounds(monkeypatch, warm):
     """Multiplications by F in each round of rows, going on from the round before or not."""
     counts = []
 
-    def counted(dual, options, qp_type, start=None, monitor=None):
-        result = solve_dual(dual, options, qp_type, start if warm else None, monitor)
+    def counted(dual, options, qp_type, start=None, *others):
+        result = solve_dual(dual, options, qp_type, start if warm else None, *others)
         counts.append(dual.F.count["solver"])
         return result
 

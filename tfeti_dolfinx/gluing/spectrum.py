@@ -15,6 +15,7 @@ from tfeti_dolfinx.gluing.constraints import Constraints
 # above rounding. The smallest eigenvalue of many rows may take thousands of restarts.
 TOLERANCE = 1e-10
 MAX_RESTARTS = 10_000
+FLOATING_POINT = 72  # PETSC_ERR_FP
 
 
 def require_slepc(comm: MPI.Intracomm) -> None:
@@ -84,10 +85,20 @@ def _extremes(B: PETSc.Mat) -> tuple[float, float]:
         svd.setType(SLEPc.SVD.Type.CROSS)  # Krylov-Schur on B Bᵀ, which is never formed
         largest = _first_eigenvalue(svd, which.LARGEST, test.REL, TOLERANCE)
         # relative to the smallest one itself the test would never hold where that is 0
-        smallest = _first_eigenvalue(svd, which.SMALLEST, test.ABS, TOLERANCE * largest)
+        smallest = _not_negative(svd, which.SMALLEST, test.ABS, TOLERANCE * largest)
     finally:
         svd.destroy()
     return smallest, largest
+
+
+def _not_negative(svd: Any, which: Any, test: Any, tolerance: float) -> float:
+    """An eigenvalue, 0 where SLEPc finds a negative one: B Bᵀ is singular but for rounding."""
+    try:
+        return _first_eigenvalue(svd, which, test, tolerance)
+    except PETSc.Error as error:
+        if error.ierr != FLOATING_POINT:
+            raise
+        return 0.0
 
 
 def _first_eigenvalue(svd: Any, which: Any, test: Any, tolerance: float) -> float:

@@ -25,7 +25,10 @@ def shared_by_bodies(decomposition: Decomposition) -> tuple[Array, Array]:
     body[geometry] = decomposition.body_of_subdomain[decomposition.cell_subdomain][:, None]
     fdim = mesh.topology.dim - 1
     mesh.topology.create_connectivity(fdim, fdim + 1)
-    node = np.unique(dmesh.entities_to_geometry(mesh, fdim, decomposition.boundary))
+    facets = decomposition.boundary
+    node = np.empty(0, dtype=np.int32)  # DOLFINx does not bear quadrilaterals without a cell
+    if len(facets):
+        node = np.unique(dmesh.entities_to_geometry(mesh, fdim, facets))
     ids = decomposition.original_nodes[node].astype(np.int64)
     exchange = Exchange(comm, ids % comm.size)
     met = np.stack((exchange.send(ids), exchange.send(body[node])), axis=1)
