@@ -9,12 +9,11 @@ from dolfinx import mesh as dmesh
 from mpi4py import MPI
 from scenes import box, clamp, curved_obstacle, decomposed, hooke, problem, strain
 from true_errors import (
+    AGAINST_FINER,
     ball,
     density,
     error_against,
-    hertz,
     lame_error,
-    punch,
     shrink_fit,
     stress_of_cells,
 )
@@ -44,10 +43,7 @@ def test_shrink_fit(cells, degree, triangles):
 @pytest.mark.parametrize(
     ("scene", "sizes", "finest"),
     [
-        (hertz, (6, 12), 30),
-        (punch, (12, 24), 72),
-        pytest.param(hertz, (6, 12, 24), 60, marks=pytest.mark.slow),
-        pytest.param(punch, (12, 24, 48), 144, marks=pytest.mark.slow),
+        *AGAINST_FINER,
         pytest.param(ball, (3_000, 10_000, 30_000), 240_000, marks=pytest.mark.slow),
     ],
 )

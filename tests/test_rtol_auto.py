@@ -3,7 +3,7 @@
 import pytest
 from dolfinx import fem
 from scenes import clamp, curved_obstacle, decomposed, forms, hooke, problem
-from true_errors import error_against, hertz, punch, stress_of_cells
+from true_errors import AGAINST_FINER, error_against, stress_of_cells
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.dual.goals import FINEST, TENTH
@@ -22,15 +22,7 @@ def is_reached(p):
     return 0.0 < found["algebraic"] <= allowed * (1 + 1e-12)
 
 
-@pytest.mark.parametrize(
-    ("scene", "sizes", "finest"),
-    [
-        (hertz, (6, 12), 30),
-        (punch, (12, 24), 72),
-        pytest.param(hertz, (6, 12, 24), 60, marks=pytest.mark.slow),
-        pytest.param(punch, (12, 24, 48), 144, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("scene", "sizes", "finest"), AGAINST_FINER)
 def test_it_saves_a_third_and_spoils_nothing(serial_only, scene, sizes, finest):
     finer = scene(finest, rtol=1e-7)
     finer.solve()

@@ -3,6 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 import ufl
 from dolfinx import fem, geometry
 from dolfinx import mesh as dmesh
@@ -70,6 +71,15 @@ def ball(unknowns, **options):
     chosen = SimpleNamespace(unknowns=unknowns, subdomains=None, quick=False)
     made = hertz_3d.scene(hertz_3d.torn_mesh(chosen))
     return tfeti.ContactProblem(**made, petsc_options=options)
+
+
+# scenes in 2D, their sizes, and that of the mesh beside which they are judged
+AGAINST_FINER = [
+    (hertz, (6, 12), 30),
+    (punch, (12, 24), 72),
+    pytest.param(hertz, (6, 12, 24), 60, marks=pytest.mark.slow),
+    pytest.param(punch, (12, 24, 48), 144, marks=pytest.mark.slow),
+]
 
 
 def shrink_fit(cells, degree=1, triangles=True, **options):

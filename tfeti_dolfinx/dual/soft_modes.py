@@ -48,7 +48,7 @@ class SoftModes:
     def __init__(
         self, B: PETSc.Mat, coarse: CoarseSpace, weights: Array, prefix: str = "tfeti_coarse_"
     ) -> None:
-        self._comm, self._r = coarse.comm, coarse.dimension
+        self._comm = coarse.comm
         Gt, energy, self.amplification = _springs(B, coarse)
         own = np.array([np.sum(coarse.subdomains.diagonal / weights), len(weights)])
         stiffness, unknowns = summed(self._comm, own)
@@ -56,12 +56,15 @@ class SoftModes:
         squares = summed(self._comm, np.asarray(Gt.multiply(Gt).sum(axis=0)).ravel())
         soft = agreed(self._comm, np.flatnonzero(energy < sigma * squares))
         self.count = len(soft)
-        self._energy = np.concatenate((np.zeros(self._r), energy[soft]))
-        self._damping = diags_array(self._energy / (sigma or 1.0))
+        self.factors = FaceFactors(self._comm, coarse.null.extended(self.count), prefix)
+        self._grams: Grams | None = None
+        if self.count == 0:
+            return
+        self._energy = np.concatenate((np.zeros(coarse.dimension), energy[soft]))
+        self._damping = diags_array(self._energy / sigma)
         self._Gt = csr_array(hstack((coarse.Gt, Gt[:, soft]), format="csr"))
         contact = np.concatenate((coarse.bounded, coarse.rubbing))
-        self._grams = Grams(self._Gt, contact, self._comm) if self.count else None
-        self.factors = FaceFactors(self._comm, coarse.null.extended(self.count), prefix)
+        self._grams = Grams(self._Gt, contact, self._comm)
 
     def balanced(self, face: Face, on_face: FaceOperator) -> FaceOperator:
         """An approximate inverse of F on a face; M_f itself where nothing is soft. Collective.

@@ -35,6 +35,9 @@ def shared_by_bodies(decomposition: Decomposition) -> tuple[Array, Array]:
     met = np.unique(met, axis=0)
     same = met[1:, 0] == met[:-1, 0]
     local = np.stack((met[:-1, 1], met[1:, 1]), axis=1)[same]
-    every = np.concatenate(comm.allgather(local))
-    pairs, counts = np.unique(every, axis=0, return_counts=True)
+    own, count = np.unique(local, axis=0, return_counts=True)  # few pairs, however many nodes
+    every = np.concatenate(comm.allgather(own))
+    pairs, place = np.unique(every, axis=0, return_inverse=True)
+    counts = np.zeros(len(pairs), dtype=np.int64)
+    np.add.at(counts, place.ravel(), np.concatenate(comm.allgather(count)))
     return pairs, counts
