@@ -12,6 +12,7 @@ from benchmarks import (
     kplus_forms,
     linear_price,
     solver_profiles,
+    spectrum,
     stability,
     stages,
     strong_scaling,
@@ -64,6 +65,18 @@ def test_kplus_forms(shared_tmp, comm):
         for row in rows:
             assert row["error of a deformation"] <= 1e-10
             assert row["error of K K⁺ K"] <= 1e-10
+
+
+def test_spectrum(shared_tmp, comm):
+    """κ ≤ C·H/h with C of some units, whatever H is."""
+    tables = quick(spectrum, shared_tmp, comm)
+    for rows in tables.values():
+        assert len(rows) == 4
+        for row in rows:
+            assert 0.0 < row["λ_min(F)"] < row["λ_max(F)"]
+            assert row["κ(F)"] == row["λ_max(F)"] / row["λ_min(F)"]
+            assert 1.0 <= row["κ(F)·h/H"] <= 3.0
+            assert 1.0 <= row["κ(S)·h/H"] <= 4.0
 
 
 def test_hertz_convergence(shared_tmp, comm):

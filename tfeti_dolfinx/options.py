@@ -71,6 +71,13 @@ class Options:
     local_multiplications: int = described(
         50, "subdomains", "multiplications that this model expects", fits=FROM_0
     )
+    clusters: int = described(
+        0,
+        "subdomains",
+        "about so many clusters, whose subdomains are glued by averages over their faces, so that "
+        "the coarse problem has the motions of clusters only; 0: none",
+        fits=FROM_0,
+    )
     homogenization: str = described(
         "natural",
         "smalse",

@@ -34,9 +34,10 @@ class Report:
         subdomains: Number of subdomains.
         bodies: Number of bodies.
         split_subdomains: Subdomains that were not connected and were split.
+        clusters: Clusters of them that averages glue, 0 without.
         kernel_dim: Dimension of the kernel of K.
-        soft_modes: Rigid motions of subdomains that springs hold softly: part of the
-            preconditioner.
+        soft_modes: Motions of subdomains that springs, or averages in clusters, hold softly: part
+            of the preconditioner.
         free_modes: Rigid motions that nothing resists and the load does not drive.
         nearly_free: Rigid motions that contacts with a force hold hardly (``stiffness``: as a
             share of what the same contacts hold at most) or not at all (0): dicts of ``bodies``,
@@ -104,6 +105,7 @@ class Report:
     subdomains: int = 0
     bodies: int = 0
     split_subdomains: int = 0
+    clusters: int = 0
     kernel_dim: int = 0
     soft_modes: int = 0
     free_modes: int = 0

@@ -46,6 +46,7 @@ def fill_result(
 ) -> None:
     """Fill in what a solve has found; counters add up over rounds. Collective."""
     comm = dual.coarse.comm
+    report.clusters = dual.subdomains.num_clusters
     report.kernel_dim = dual.coarse.dimension
     report.free_modes = dual.coarse.num_free_motions
     report.nearly_free = dual.nearly_free

@@ -29,6 +29,7 @@ from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.report_filling import fill_sizes
 from tfeti_dolfinx.solver import resolve_types
 from tfeti_dolfinx.stages import STAGES, Stages, made
+from tfeti_dolfinx.subdomains.averages import clusters_of
 from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
 from tfeti_dolfinx.subdomains.data import Counters
 from tfeti_dolfinx.subdomains.factor import added_options
@@ -218,17 +219,16 @@ class System:
             self._subdomains.update(f=self._dofs.to_primal(self._f))
 
     def _factor(self) -> None:
-        trace, counters = self.gluing.constraints.trace, self._counters
-        make_block, choice = self._settings.make_block(counters), self._settings.local_choice
+        counters, given, make = self._counters, self._settings, self._settings.make_block
         if self._K is None:  # it went into Blocks that could not be made
             self._assemble_stiffness()
             self._stages.made["stiffness"] += 1
         K, self._K = self._K, None  # it goes into the Blocks
-        data = subdomain_data(self._dofs, self._decomposition, K, self._f, trace)
-        with added_options(self._settings.prefix, self._settings.factor_options):
-            self._subdomains = make_subdomains(
-                data, make_block, self._decomposition, counters, choice
-            )
+        dofs, cut, choice = self._dofs, self._decomposition, given.local_choice
+        data = subdomain_data(dofs, cut, K, self._f, self.gluing.constraints.trace)
+        with added_options(given.prefix, given.factor_options):
+            clusters, block = clusters_of(dofs, cut, given.options.clusters), make(counters)
+            self._subdomains = make_subdomains(data, block, cut, counters, choice, clusters)
 
     def _retrace(self) -> None:
         made(self._subdomains).retrace(self.gluing.constraints.trace)

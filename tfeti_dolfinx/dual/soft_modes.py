@@ -1,4 +1,4 @@
-"""Rigid motions of subdomains that springs hold, but softly: a coarse space for preconditioners.
+"""Motions of subdomains that something holds, but softly: a coarse space for preconditioners.
 
 Springs or inertia in a stiffness leave fewer kernel modes than a free subdomain has, and on what is
 left of its rigid motions K⁺ is large: F ≈ F₀ + ĜᵀD⁻¹Ĝ with Ĝ = R̂ᵀBᵀ, D = R̂ᵀKR̂. The natural coarse
@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 from petsc4py import PETSc
-from scipy.sparse import block_diag, csr_array, diags_array, hstack
+from scipy.sparse import csr_array, diags_array, hstack
 
-from tfeti_dolfinx.arrays import TINY, Array, joined
+from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace, transposed_G
 from tfeti_dolfinx.dual.grams import Grams
 from tfeti_dolfinx.dual.projectors import FaceFactors, Projectors
@@ -19,18 +19,15 @@ from tfeti_dolfinx.dual.semidefinite import SemidefiniteFactor
 from tfeti_dolfinx.parallel import agreed, chunk_offsets, summed
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.problem import FaceOperator
-from tfeti_dolfinx.subdomains.block import Block
-
-# of a mode of length 1: what is left of it outside of the kernel is rounding
-IN_KERNEL = 1e-6
+from tfeti_dolfinx.subdomains.soft_motions import SoftMotions
 
 
 class SoftModes:
-    """Ĝ of the motions that springs hold more softly than rows would.
+    """Ĝ of the motions that springs, or averages in clusters, hold more softly than rows would.
 
     Such are those with R̂ᵀKR̂ < σ‖Ĝᵀ‖², σ the mean stiffness of a scaled row: only there does F
-    stand out. Where every subdomain has all its rigid motions in the kernel there are none, and
-    nothing is multiplied.
+    stand out; of a cluster's motions it has chosen those itself. Where every subdomain has all
+    its rigid motions in the kernel there are none, and nothing is multiplied.
 
     Args:
         B: Dual rows × trace unknowns.
@@ -49,12 +46,13 @@ class SoftModes:
         self, B: PETSc.Mat, coarse: CoarseSpace, weights: Array, prefix: str = "tfeti_coarse_"
     ) -> None:
         self._comm = coarse.comm
-        Gt, energy, self.amplification = _springs(B, coarse)
-        own = np.array([np.sum(coarse.subdomains.diagonal / weights), len(weights)])
-        stiffness, unknowns = summed(self._comm, own)
+        own = coarse.subdomains.soft_motions()
+        Gt, energy, self.amplification = _springs(B, coarse, own)
+        terms = np.array([np.sum(coarse.subdomains.diagonal / weights), len(weights)])
+        stiffness, unknowns = summed(self._comm, terms)
         sigma = stiffness / max(unknowns, 1.0)
         squares = summed(self._comm, np.asarray(Gt.multiply(Gt).sum(axis=0)).ravel())
-        soft = agreed(self._comm, np.flatnonzero(energy < sigma * squares))
+        soft = agreed(self._comm, np.flatnonzero(energy < own.share * sigma * squares))
         self.count = len(soft)
         self.factors = FaceFactors(self._comm, coarse.null.extended(self.count), prefix)
         self._grams: Grams | None = None
@@ -120,41 +118,16 @@ class _Balanced(Projectors):
         self._on_face.destroy()
 
 
-def _springs(B: PETSc.Mat, coarse: CoarseSpace) -> tuple[csr_array, Array, Array]:
+def _springs(B: PETSc.Mat, coarse: CoarseSpace, own: SoftMotions) -> tuple[csr_array, Array, Array]:
     """This rank's rows of Ĝᵀ, with all motions outside of kernels as columns; D; amplification.
 
     Collective.
     """
     subdomains = coarse.subdomains
-    blocks = subdomains.blocks
-    modes, energies = zip(*map(_outside, blocks), strict=True) if blocks else ((), ())
-    trace = [R[block.trace_dofs] for R, block in zip(modes, blocks, strict=True)]
-    rows = block_diag(trace, format="csr") if trace else np.zeros((0, 0))
-    offsets = chunk_offsets(coarse.comm, rows.shape[1])
+    offsets = chunk_offsets(coarse.comm, own.rows.shape[1])
     first, total = int(offsets[coarse.comm.rank]), int(offsets[-1])
     if total == 0:
         return csr_array((B.getLocalSize()[0], 0)), np.zeros(0), np.zeros(subdomains.num_bodies)
-    energy = np.concatenate(coarse.comm.allgather(joined(energies)))
-    largest = [
-        float(block.diagonal.max() / max(D.min(), TINY)) if len(D) else 0.0
-        for block, D in zip(blocks, energies, strict=True)
-    ]
-    Gt = transposed_G(B, csr_array(rows), first, total)
-    return Gt, energy, subdomains.body_maxima([largest])[0]
-
-
-def _outside(block: Block) -> tuple[Array, Array]:
-    """R̂, orthonormal, orthogonal to the kernel, shape ``(n, k)``, and the diagonal of R̂ᵀKR̂."""
-    modes, R = block.modes, block.kernel
-    count = modes.shape[1] - R.shape[1]
-    if count <= 0:
-        return np.zeros((len(modes), 0)), np.zeros(0)
-    sizes = np.linalg.norm(modes, axis=0)
-    rest = modes / np.where(sizes > 0.0, sizes, 1.0)
-    for _ in range(2):  # once leaves rounding of the kernel
-        rest = rest - R @ (R.T @ rest)
-    U, sizes, _ = np.linalg.svd(rest, full_matrices=False)
-    U = U[:, :count][:, sizes[:count] > IN_KERNEL]
-    KU = np.array([block.multiply(u) for u in U.T]).reshape(-1, len(modes)).T
-    energies, V = np.linalg.eigh(U.T @ KU)
-    return U @ V, np.maximum(energies, 0.0)
+    energy = np.concatenate(coarse.comm.allgather(own.energy))
+    Gt = transposed_G(B, own.rows, first, total)
+    return Gt, energy, subdomains.body_maxima([own.amplification])[0]

@@ -14,7 +14,9 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.subdomains.averages import Clusters
 from tfeti_dolfinx.subdomains.block import Block
+from tfeti_dolfinx.subdomains.clusters import ClusteredSubdomains
 from tfeti_dolfinx.subdomains.data import Counters, SubdomainData
 from tfeti_dolfinx.subdomains.equal import EqualSubdomains
 from tfeti_dolfinx.subdomains.factor import say_if_not_cholmod
@@ -101,6 +103,7 @@ def make_subdomains(
     decomposition: Decomposition,
     counters: Counters | None = None,
     choice: LocalChoice | None = None,
+    clusters: Clusters | None = None,
 ) -> Subdomains:
     """A Block for each subdomain of this rank. Collective.
 
@@ -111,13 +114,15 @@ def make_subdomains(
         decomposition: The torn mesh.
         counters: Counts solves.
         choice: Which form local operators take.
+        clusters: Clusters of them, if any.
     """
     comm = decomposition.comm
     say_if_not_cholmod(comm)
     with raised_on_all_ranks(comm):
         blocks = [make_block(item) for item in data]
     bodies = decomposition.body_of_subdomain[decomposition.subdomains]
-    return Subdomains(blocks, bodies, decomposition.num_bodies, comm, counters, choice)
+    given = (blocks, bodies, decomposition.num_bodies, comm, counters, choice)
+    return ClusteredSubdomains(clusters, *given) if clusters is not None else Subdomains(*given)
 
 
 def _part(K: Any, rows: slice, copied: bool) -> csr_array:

@@ -15,6 +15,7 @@ from tfeti_dolfinx.subdomains.block import Block, OperatorKind
 from tfeti_dolfinx.subdomains.data import Counters
 from tfeti_dolfinx.subdomains.groups import solved_together
 from tfeti_dolfinx.subdomains.local import GroupedOperator, LocalChoice, local_operator
+from tfeti_dolfinx.subdomains.soft_motions import SoftMotions, sprung
 
 # Of ‖f‖: what the load of a subdomain does to rigid motions, which have unit norm. Ten times less
 # was found where it balances itself; more is a load that moves the subdomain.
@@ -37,11 +38,13 @@ class Subdomains:
         choice: Which form local operators take.
 
     Attributes:
-        num_modes: k.
+        num_modes: k; num_clusters: clusters on all ranks, 0 without.
         trace: Trace unknowns among this rank's, ascending, shape ``(t,)``.
-        trace_parts: Where the trace unknowns of each Block lie among the t.
-        dof_parts: Where the unknowns of each Block lie among the n.
+        trace_parts: Where the trace unknowns of each Block lie among the t, and dof_parts its
+            unknowns among the n.
     """
+
+    num_clusters = 0
 
     def __init__(
         self,
@@ -114,7 +117,7 @@ class Subdomains:
     @property
     def kernel_size(self) -> int:
         """r."""
-        return sum(block.kernel.shape[1] for block in self.blocks)
+        return _end(self.kernel_parts)
 
     @property
     def kernel_rows(self) -> csr_array:
@@ -122,7 +125,7 @@ class Subdomains:
         parts = [block.kernel[block.trace_dofs] for block in self.blocks]
         rows = [part.start for part in self.trace_parts]
         columns = [part.start for part in self.kernel_parts]
-        return _assembled(parts, rows, columns, (len(self.trace), self.kernel_size))
+        return _assembled(parts, rows, columns, (len(self.trace), _end(self.kernel_parts)))
 
     @property
     def kernel_load(self) -> Array:
@@ -134,6 +137,10 @@ class Subdomains:
         pairs = zip(self.blocks, self.kernel_parts, strict=True)
         return joined([block.kernel @ alpha[part] for block, part in pairs])
 
+    def soft_motions(self) -> SoftMotions:
+        """Rigid motions that are no kernel."""
+        return sprung(self.blocks)
+
     # ------------------------------------------------------------------- bodies
 
     @property
@@ -142,7 +149,7 @@ class Subdomains:
         parts = [block.kernel.T @ block.modes for block in self.blocks]
         rows = [part.start for part in self.kernel_parts]
         columns = [self.num_modes * int(body) for body in self.body_of_block]
-        shape = (self.kernel_size, self.num_bodies * self.num_modes)
+        shape = (_end(self.kernel_parts), self.num_bodies * self.num_modes)
         return _assembled(parts, rows, columns, shape)
 
     def modes_outside(self) -> Array:
@@ -197,9 +204,13 @@ class Subdomains:
 
     def recover(self, w: Array) -> Array:
         """K⁺(f − w) on all unknowns, shape ``(n,)``; w on the trace, shape ``(t,)``."""
-        force = np.zeros(self.dof_parts[-1].stop if self.dof_parts else 0)
+        force = np.zeros(_end(self.dof_parts))
         force[self.trace] = w
-        return self.pinv_load - solved_together(self.blocks, self.dof_parts, force)
+        return self.pinv_load - self.solve(force)
+
+    def solve(self, b: Array) -> Array:
+        """K⁺ b on all unknowns, shape ``(n,)``."""
+        return solved_together(self.blocks, self.dof_parts, b)
 
     @property
     def pinv_load(self) -> Array:
@@ -207,7 +218,7 @@ class Subdomains:
         if self._pinv_load is None:
             self.counters.load_solves += len(self.blocks)
             load = joined([block.load for block in self.blocks])
-            self._pinv_load = solved_together(self.blocks, self.dof_parts, load)
+            self._pinv_load = self.solve(load)
         return self._pinv_load
 
     def energies(self, u: Array) -> list[float]:
@@ -232,6 +243,11 @@ def sums(x: Array, parts: Sequence[slice]) -> list[float]:
 def sizes(x: Array, parts: Sequence[slice]) -> list[float]:
     """Largest modulus in each part of an array, 0 where that is empty."""
     return [float(np.max(np.abs(x[part]), initial=0.0)) for part in parts]
+
+
+def _end(parts: Sequence[slice]) -> int:
+    """Length of what parts lie in."""
+    return parts[-1].stop if parts else 0
 
 
 def _moving_part(block: Block) -> Array:

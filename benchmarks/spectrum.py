@@ -1,0 +1,171 @@
+"""The spectrum of the dual operator: κ(F) ≤ C·H/h, measured.
+
+    ./run python3 benchmarks/spectrum.py [--quick]
+
+A unit square and a unit cube, clamped on one side, of (1/H)^d equal subdomains with H/h elements
+along an edge. Extreme eigenvalues of PFP on the range of P, those of Gᵀ taken away, by Lanczos
+iterations, and of S, the Schur complement of a floating subdomain on its whole boundary, beside
+its kernel. Bounded columns κ·h/H are what the theorem says (Dostál, Kozubek, Markopoulos et al.,
+Adv. Eng. Softw. 2012; Brenner, Numer. Math. 2003 for S). Nothing is parallel. Results go to
+results/spectrum.md, .json and .png.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import petsc4py
+
+if __name__ == "__main__":
+    petsc4py.init(sys.argv[:1])
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from dolfinx import mesh as dmesh
+from mpi4py import MPI
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import LinearOperator, eigsh
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+import tfeti_dolfinx as tfeti
+from benchmarks.pictures import column, curves, picture
+from benchmarks.tools import command_line, finish
+from tfeti_dolfinx.compat import assemble_csr
+
+# dimension: all H/h with all 1/H
+SIZES = {
+    "quick": {2: ((2, 4), (2, 3))},
+    "default": {2: ((4, 8, 16, 32), (2, 4, 8)), 3: ((2, 4, 8), (2, 3, 4))},
+}
+MODELS = {2: "plane_strain", 3: None}
+# of eigenvalues; the rest of a table is exact
+ACCURACY = 1e-3
+
+
+def cut_mesh(gdim, parts, cells):
+    """The torn unit square or cube of parts^d subdomains of cells^d elements, clamped at x = 0."""
+    n = [parts * cells] * gdim
+    create = dmesh.create_rectangle if gdim == 2 else dmesh.create_box
+    kind = dmesh.CellType.quadrilateral if gdim == 2 else dmesh.CellType.hexahedron
+    mesh = create(MPI.COMM_SELF, [(0.0,) * gdim, (1.0,) * gdim], n, kind)
+    left = dmesh.locate_entities_boundary(mesh, gdim - 1, lambda x: np.isclose(x[0], 0))
+    tags = dmesh.meshtags(mesh, gdim - 1, left, np.ones(len(left), dtype=np.int32))
+
+    def subdomain(x):
+        places = np.minimum((x[:gdim] * parts).astype(int), parts - 1)
+        return np.ravel_multi_index(tuple(places), (parts,) * gdim)
+
+    return tfeti.decompose(mesh, subdomain, facet_tags=tags, surfaces={"left": 1})
+
+
+def solved(gdim, parts, cells):
+    """The problem with its dual operator; without a load it is solved at once."""
+    decomposition = cut_mesh(gdim, parts, cells)
+    mesh = decomposition.mesh
+    elastic = tfeti.Elasticity(decomposition, E=1.0, nu=0.3, model=MODELS[gdim])
+    V = fem.functionspace(mesh, ("Lagrange", 1, (gdim,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    fixed = fem.locate_dofs_topological(V, gdim - 1, decomposition.facets("left"))
+    load = ufl.dot(fem.Constant(mesh, (0.0,) * gdim), v) * ufl.dx
+    problem = tfeti.ContactProblem(
+        elastic.a(u, v), load, [fem.dirichletbc(np.zeros(gdim), fixed, V)], [], decomposition
+    )
+    problem.solve()
+    return problem
+
+
+def extremes_of_F(dual):
+    """Least and largest eigenvalue of PFP on the range of P."""
+    x, y = dual.d.duplicate(), dual.d.duplicate()
+
+    def projected(values, shift):
+        """PFPx + shift·(I − P)x."""
+        x.array[:] = values.ravel()
+        dual.coarse.project(x)
+        kernel = shift * (values.ravel() - x.array_r) if shift else 0.0
+        dual.F.mult(x, y)
+        dual.coarse.project(y)
+        return y.array_r + kernel
+
+    def extreme(which, shift):
+        operator = LinearOperator((x.size, x.size), lambda v: projected(v, shift), dtype=float)
+        start = np.random.default_rng(0).standard_normal(x.size)
+        found = eigsh(operator, 1, which=which, v0=start, tol=ACCURACY, return_eigenvectors=False)
+        return float(found[0])
+
+    largest = extreme("LA", 0.0)
+    least = extreme("SA", largest)  # what P takes away is moved to the other end
+    x.destroy()
+    y.destroy()
+    return least, largest
+
+
+def extremes_of_S(gdim, cells, H):
+    """Least eigenvalue beside the kernel and largest one of S of a floating subdomain.
+
+    The trace of a TFETI subdomain is its boundary but for what is free: here all of it.
+    """
+    whole = cut_mesh(gdim, 1, cells)
+    V = fem.functionspace(whole.mesh, ("Lagrange", 1, (gdim,)))
+    elastic = tfeti.Elasticity(whole, E=1.0, nu=0.3, model=MODELS[gdim])
+    form = fem.form(elastic.a(ufl.TrialFunction(V), ufl.TestFunction(V)))
+    K = csr_array(assemble_csr(form)).toarray()
+    x = V.tabulate_dof_coordinates()[:, :gdim]
+    nodes = np.any(np.isclose(x, 0.0) | np.isclose(x, 1.0), axis=1)
+    t = np.repeat(nodes, gdim)
+    K_it = K[np.ix_(~t, t)]
+    S = K[np.ix_(t, t)] - K_it.T @ np.linalg.solve(K[np.ix_(~t, ~t)], K_it)
+    values = np.linalg.eigvalsh(S) * H ** (gdim - 2)
+    kernel = gdim * (gdim + 1) // 2
+    return float(values[kernel]), float(values[-1])
+
+
+def row(gdim, parts, cells):
+    """A row of the table."""
+    problem = solved(gdim, parts, cells)
+    F = extremes_of_F(problem.dual)
+    S = extremes_of_S(gdim, cells, 1.0 / parts)
+    found = {
+        "H/h": cells,
+        "1/H": parts,
+        "unknowns": problem.report.primal_dofs,
+        "rows": problem.report.dual_dofs,
+        "λ_min(F)": F[0],
+        "λ_max(F)": F[1],
+        "κ(F)": F[1] / F[0],
+        "κ(F)·h/H": F[1] / F[0] / cells,
+        "κ(S)": S[1] / S[0],
+        "κ(S)·h/H": S[1] / S[0] / cells,
+    }
+    problem.destroy()
+    return found
+
+
+def draw(path, tables):
+    """κ over H/h, a line for each H."""
+    with picture(path, len(tables)) as axes:
+        for panel, (title, rows) in zip(axes, tables.items(), strict=True):
+            lines = {}
+            for parts in sorted(set(column(rows, "1/H"))):
+                of_H = [row for row in rows if row["1/H"] == parts]
+                lines[f"F, 1/H = {parts}"] = column(of_H, "H/h"), column(of_H, "κ(F)")
+            lines["S"] = column(of_H, "H/h"), column(of_H, "κ(S)")
+            curves(panel, title, ("H/h", "condition number κ"), lines)
+
+
+def main(argv):
+    """Run the tables and write them on the first rank; returns them."""
+    arguments, _ = command_line(__doc__, argv)
+    sizes = SIZES["quick" if arguments.quick else "default"]
+    tables = {
+        f"{gdim}D": [row(gdim, parts, cells) for parts in counts for cells in edges]
+        for gdim, (edges, counts) in sizes.items()
+    }
+    return finish(arguments.output, "spectrum", tables, draw, MPI.COMM_WORLD.rank)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,195 @@
+"""Clusters: K̃⁺ against a dense saddle-point problem, and scenes against the same without them."""
+
+import numpy as np
+import pytest
+from bodies import held, pressed, sided, stacked, two_body_problem
+from mpi4py import MPI
+from scenes import clamp, curved_obstacle, decomposed, forms
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.subdomains.clusters import ClusteredSubdomains
+
+COMM = MPI.COMM_WORLD
+
+
+def grid(n):
+    """Subdomains of a unit square or cube, n along each axis."""
+
+    def subdomain(x):
+        i, j, k = np.minimum((n * x).astype(int), n - 1)
+        return i + n * j + n * n * k
+
+    return subdomain
+
+
+def square(cells=16, parts=4, cell="quadrilateral", **options):
+    """A square or cube of equal subdomains, clamped on the left, pressed on a curved obstacle."""
+    d = decomposed(cell, cells, grid(parts))
+    gdim = d.mesh.geometry.dim
+    traction = (0.0,) * (gdim - 1) + (-0.1,)
+    V, a, L = forms(d.mesh, d.facet_tags, traction, d.surface("top"))
+    return tfeti.ContactProblem(
+        a,
+        L,
+        [clamp(V, d.facets("left"))],
+        [tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=0.2)],
+        d,
+        petsc_options={f"tfeti_{name}": value for name, value in options.items()},
+    )
+
+
+def solved(problem):
+    problem.solve()
+    u, report = problem.solution.u, problem.report
+    problem.destroy()
+    return u, report
+
+
+def difference(u, v):
+    """Largest difference over the largest displacement, over all ranks."""
+    parts = (np.abs(u - v).max(initial=0.0), np.abs(v).max(initial=0.0))
+    most, size = (COMM.allreduce(part, op=MPI.MAX) for part in parts)
+    return most / size
+
+
+@pytest.fixture(scope="module")
+def clustered():
+    p = square(8, 4, clusters=4)
+    p.solve()
+    yield p
+    p.destroy()
+
+
+def dense(p):
+    """K, B_c, K̃⁺f by the saddle-point problem, and null(B_c) ∩ null(K), of this rank."""
+    subdomains = p.dual.subdomains
+    B, n = subdomains._clusters.averages.toarray(), p.dofs.num_nodes * p.dofs.bs
+    K = np.zeros((n, n))
+    for block, part in zip(subdomains.blocks, subdomains.dof_parts, strict=True):
+        columns = [block.multiply(e) for e in np.eye(part.stop - part.start)]
+        K[part, part] = np.array(columns).T
+    return K, B
+
+
+def test_the_inverse_is_that_of_the_saddle_point_problem(clustered):
+    subdomains, (K, B) = clustered.dual.subdomains, dense(clustered)
+    n, r = len(K), subdomains.kernel_size
+    R = np.array([subdomains.kernel_motion(alpha) for alpha in np.eye(r)]).reshape(r, n).T
+    assert np.allclose(R.T @ R, np.eye(r), atol=1e-12)
+    assert np.abs(K @ R).max(initial=0.0) <= 1e-12
+    assert np.abs(B @ R).max(initial=0.0) <= 1e-12
+    f = np.random.default_rng(COMM.rank).standard_normal(n)
+    f -= R @ (R.T @ f)
+    u = subdomains.solve(f)
+    saddle = np.block([[K, B.T], [B, np.zeros((len(B), len(B)))]])
+    expected = np.linalg.lstsq(saddle, np.append(f, np.zeros(len(B))), rcond=None)[0][:n]
+    u, expected = (v - R @ (R.T @ v) for v in (u, expected))
+    assert np.abs(B @ u).max(initial=0.0) <= 1e-11 * np.abs(u).max(initial=1.0)
+    assert np.allclose(u, expected, atol=1e-9 * np.abs(expected).max(initial=1.0))
+
+
+def test_kernels_are_those_of_whole_clusters(clustered):
+    report = clustered.report
+    assert report.clusters == 4 or COMM.size > 2
+    assert report.kernel_dim == 3 * report.clusters
+    assert isinstance(clustered.dual.subdomains, ClusteredSubdomains)
+
+
+def test_the_local_operator_is_the_inverse_on_the_trace(clustered):
+    subdomains = clustered.dual.subdomains
+    w = np.random.default_rng(COMM.rank).standard_normal(len(subdomains.trace))
+    operator, out = subdomains.local_operator("pinv"), np.empty_like(w)
+    operator.prepare()
+    operator.mult(w, out)
+    f = np.zeros(subdomains.dof_parts[-1].stop if subdomains.dof_parts else 0)
+    f[subdomains.trace] = w
+    u = subdomains.solve(f)[subdomains.trace]
+    assert np.allclose(out, u, atol=1e-11 * np.abs(u).max(initial=1.0))
+    assert operator.traffic >= 0.0
+
+
+def test_soft_motions_are_what_is_left_of_the_inverse(clustered):
+    """K̃⁺ ≥ R̂R̂ᵀ on the trace, R̂ of energy 1: what they hold is a part of the inverse."""
+    subdomains = clustered.dual.subdomains
+    motions = subdomains.soft_motions()
+    assert np.all(motions.energy == 1.0)
+    operator, t = subdomains.local_operator("pinv"), len(subdomains.trace)
+    operator.prepare()
+    columns = np.empty((t, t))
+    for e, column in zip(np.eye(t), columns, strict=True):
+        operator.mult(e, column)
+    R = subdomains.kernel_rows.toarray()
+    P = np.eye(t) - R @ np.linalg.pinv(R)
+    rest = P @ (columns - (motions.rows @ motions.rows.T).toarray()) @ P
+    values = np.linalg.eigvalsh((rest + rest.T) / 2.0)
+    assert values.min(initial=0.0) >= -1e-10 * values.max(initial=1.0)
+
+
+@pytest.mark.parametrize("options", [{}, {"qp_type": "smalse"}, {"pc_type": "lumped"}])
+def test_the_answer_is_the_same(options):
+    u, _ = solved(square(8, 4, rtol=1e-9, **options))
+    for clusters in (1, 3, 16):
+        v, report = solved(square(8, 4, rtol=1e-9, clusters=clusters, **options))
+        assert difference(v, u) <= 1e-7
+        assert report.converged_reason == "CONVERGED_RTOL"
+
+
+def test_two_bodies():
+    """A cluster is of one body."""
+
+    def problem(**options):
+        d = stacked("quadrilateral", subdomains=12)
+        bcs = held(d, "lower bottom", "lower left")
+        contact = [sided("upper bottom", "lower top")]
+        return two_body_problem(d, pressed(d), bcs, contact, rtol=1e-9, **options)
+
+    u, _ = solved(problem())
+    v, report = solved(problem(clusters=2))
+    assert 2 <= report.clusters < report.subdomains
+    assert difference(v, u) <= 1e-7
+
+
+@pytest.mark.parametrize(
+    "cell", ["quadrilateral", pytest.param("hexahedron", marks=pytest.mark.slow)]
+)
+def test_compact_clusters_cost_at_most_half_more(cell, serial_only):
+    cells = 16 if cell == "quadrilateral" else 8
+    _, plain = solved(square(cells, 4, cell))
+    _, report = solved(square(cells, 4, cell, clusters=4 if cell == "quadrilateral" else 8))
+    assert report.kernel_dim < plain.kernel_dim / 3
+    assert report.F_multiplications <= 1.5 * plain.F_multiplications
+
+
+def test_hooks_have_soft_motions(serial_only):
+    """Three clusters of 16 squares cannot be compact; the preconditioner knows where they bend."""
+    _, plain = solved(square(16, 4))
+    _, report = solved(square(16, 4, clusters=3))
+    assert report.soft_modes > 0
+    assert report.F_multiplications <= 2 * plain.F_multiplications
+
+
+def test_without_them_nothing_is_paid():
+    p = square(8, 2)
+    p.solve()
+    assert not isinstance(p.dual.subdomains, ClusteredSubdomains)
+    assert p.report.clusters == p.report.soft_modes == 0
+    p.destroy()
+
+
+def test_a_new_load_and_a_second_solve():
+    p = square(8, 4, clusters=4, rtol=1e-9)
+    p.solve()
+    first = p.solution.u.copy()
+    p.solve()
+    assert p.report.factorizations == 0
+    assert p.report.F_multiplications <= 2
+    assert difference(p.solution.u, first) <= 1e-8
+    p.destroy()
+
+
+def test_more_clusters_than_subdomains():
+    p = square(8, 2, clusters=5)
+    with pytest.raises(InputError, match="5 clusters of 4 subdomains; expected at most"):
+        p.solve()
+    p.destroy()
