@@ -124,7 +124,7 @@ def _metis_of(graph: csr_array, count: int) -> Array:
 
     if count == 1:
         return np.zeros(graph.shape[0], dtype=np.int64)
-    options = pymetis.Options(contig=True, seed=1, ufactor=UNEVEN)
+    options = pymetis.Options(contig=True, seed=1, ufactor=UNEVEN, ncuts=20)
     adjacency = pymetis.CSRAdjacency(graph.indptr, graph.indices)
     weights = graph.data.astype(np.int64)
     found = pymetis.part_graph(count, adjacency, eweights=weights, options=options, recursive=False)

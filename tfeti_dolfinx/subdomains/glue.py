@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve, inv
-from scipy.sparse import csr_array, hstack
+from scipy.sparse import coo_array, csr_array, hstack
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.subdomains.soft_motions import SoftMotions
@@ -51,7 +52,8 @@ class Glue:
         self.unit = size / (float(abs(G).max()) if G.nnz else 1.0)
         self.Z = csr_array(hstack((Y, -self.unit * R)))
         self._of_cluster: list[tuple[Array, Array]] = []
-        self._soft, outer = [csr_array((len(stiffness), 0))], np.flatnonzero(stiffness)
+        self._soft = [csr_array((len(stiffness), 0))]
+        shapes = R.tocsc(), Y.tocsc()
         for at, kernel in places:
             F_c = F[at][:, at].toarray()
             F_c, G_c = (F_c + F_c.T) / 2.0, G[kernel][:, at].toarray()
@@ -59,8 +61,8 @@ class Glue:
             W = _inverse(F_c, -self.unit * G_c, size * (N @ N.T), size)
             self._of_cluster.append((np.concatenate((at, F.shape[0] + kernel)), W))
             if len(at):
-                shapes = R[:, kernel], Y[:, at]
-                self._soft.append(_softer(F_c, G_c, shapes, outer, stiffness))
+                own = shapes[0][:, kernel], shapes[1][:, at]
+                self._soft.append(_softer(F_c, G_c, own, stiffness))
 
     def soft_motions(self, blocks: int) -> SoftMotions:
         """The softer motions of the subdomains, as many, in their clusters."""
@@ -80,23 +82,26 @@ class Glue:
         return z
 
 
-def _softer(
-    F: Array, G: Array, shapes: tuple[csr_array, csr_array], outer: Array, stiffness: Array
-) -> csr_array:
-    """Softer motions of a cluster on the trace, of energy 1.
+def _softer(F: Array, G: Array, shapes: tuple[Any, Any], stiffness: Array) -> csr_array:
+    """Softer motions of a cluster on the trace of the rank, of energy 1.
 
     They are those of the largest R̂ᵀDR̂ for their energy, D the stiffness of outer unknowns.
     """
-    R, Y = shapes
+    there = np.unique(shapes[0].indices)
+    R, Y = (csr_array(part)[there] for part in shapes)
     mu = cho_solve(cho_factor(F), G.T)
     T = G @ mu
     values, Q = np.linalg.eigh((T + T.T) / 2.0)
     held = values > NULL * values.max(initial=0.0)
     Q = Q[:, held] / np.sqrt(values[held])
+    outer = np.flatnonzero(stiffness[there])
     far = R[outer] @ Q - Y[outer] @ (mu @ Q)
-    sizes, V = np.linalg.eigh(far.T @ (stiffness[outer, None] * far))
+    sizes, V = np.linalg.eigh(far.T @ (stiffness[there[outer], None] * far))
     V = Q @ V[:, sizes * SOFT > 1.0]
-    return csr_array(R @ csr_array(V) - Y @ csr_array(mu @ V))
+    entries = R @ V - Y @ (mu @ V)
+    rows, columns = np.repeat(there, V.shape[1]), np.tile(np.arange(V.shape[1]), len(there))
+    shape = (len(stiffness), V.shape[1])
+    return csr_array(coo_array((entries.ravel(), (rows, columns)), shape=shape))
 
 
 def _inverse(F: Array, G: Array, free: Array, size: float) -> Array:
