@@ -103,6 +103,9 @@ def solve_with_friction(
         result, rule = solve_dual(dual, asked, qp_type, start, monitor, exact)
         iterations, looks = iterations + 1, looks + rule.looks
         steps = steps.plus(result.steps)
+        if bounds.slips_first(result.reason):
+            result.destroy()
+            continue
         if result.reason <= 0:
             break
         change = bounds.change(result.lam)
@@ -212,6 +215,13 @@ class _Pressures:
         self._now = (
             self._found if sticks else self._forces(self._anderson.next(self._now, self._found))
         )
+
+    def slips_first(self, reason: ConvergedReason) -> bool:
+        """Whether what sticks contradicts itself, as beside a wall that pushes; then all slips."""
+        if not self._sticks or reason != ConvergedReason.DIVERGED_CONTRADICTION:
+            return False
+        self._now = np.zeros_like(self._found)
+        return True
 
     def _forces(self, values: Array) -> Array:
         """Forces of normals, without what is none but for rounding."""
