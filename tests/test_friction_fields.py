@@ -1,15 +1,21 @@
 """What a solution says of friction, and what does not change it: closed forms and limits."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from mpi4py import MPI
 from scenes import box, decomposed, displacement, hooke, problem, strain
 from test_tresca import nodal_data
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.dual.measures import _slip_missed
 from tfeti_dolfinx.output import nodal_fields
+from tfeti_dolfinx.qp.discs import Discs
 
 EXACT = {"rtol": 1e-10}
 
@@ -193,3 +199,26 @@ def test_friction_alone_holds_a_body(cell, comm):
     p = problem(d, traction, [floor(gdim, tfeti.Tresca(0.0))], clamped=(), rtol=1e-6)
     with pytest.raises(tfeti.NoSolutionError, match=r"translation in x.* where there is no fr"):
         p.solve()
+
+
+@settings(max_examples=50)
+@given(st.integers(0, 10_000))
+def test_a_slip_is_missed_where_the_force_may_still_grow(seed):
+    """Of q the part that no force of the set opposes, however exact other multipliers are."""
+    rng = np.random.default_rng(seed)
+    n, norm = 5, 10.0 ** rng.uniform(-3, 3)
+    radius, angle = rng.uniform(0.1, 1.0, n), rng.uniform(0, 2 * np.pi, n)
+    out = np.column_stack((np.cos(angle), np.sin(angle)))
+    inside = np.array([0.0, 0.5, 1.0 - 1e-3, 1.0, 1.0])
+    sets = SimpleNamespace(tangents=np.arange(2 * n).reshape(n, 2))
+    scene = SimpleNamespace(constraints=SimpleNamespace(sets=sets), feasible=Discs(radius))
+    lam = ((radius * inside)[:, None] * out).ravel()
+    q = norm * rng.uniform(0.0, 0.4, n) * radius
+    q[2] = norm * 0.1 * radius[2]
+    missed = _slip_missed(scene, lam, q[:, None] * out, norm)
+    size = np.sum(missed * out, axis=1)
+    # well inside all of it, near the circle what is left to it, on the circle nothing
+    room = norm * radius * (1.0 - inside)
+    assert np.allclose(size, np.minimum(q, room), rtol=1e-9, atol=1e-12 * norm)
+    back = _slip_missed(scene, lam, -q[:, None] * out, norm)
+    assert np.allclose(back, -q[:, None] * out, rtol=1e-9, atol=1e-12 * norm)

@@ -24,11 +24,12 @@ from tfeti_dolfinx.qp.monitors import Monitor
 from tfeti_dolfinx.qp.nearest import nearest_or_least
 from tfeti_dolfinx.qp.problem import ConvergedReason, QPResult, Steps
 from tfeti_dolfinx.solver import solve_dual
+from tfeti_dolfinx.subdomains.subdomains import sums
 
 # Inner tolerance: rtol of the first step, and share of the last change of the bounds. Forces are
 # less exact than displacements: with a tenth the acceleration meets noise. It never grows again,
-# and a problem that was solved without a step tells nothing of its bounds: the same share then.
-FIRST, SHARE = 1e-2, 0.03
+# and a problem that was solved without a CG step tells nothing of its bounds: the same share then.
+FIRST, SHARE = 1e-2, 0.01
 # of the change of the bounds at which they are at rest: rtol where a goal takes its place, since
 # forces have to be known to that change
 SHARE_OF_BOUNDS = 0.1
@@ -40,6 +41,8 @@ NEAR = 10.0
 # of all multipliers: forces of normals that rounding makes of none; as bounds they would be discs
 # whose boundaries bend so much that nothing else is seen beside them
 NO_FORCE = 1e-13
+# of the largest forces of normals on a body: those on a lighter one count as so large at least
+LIGHT = 1e-6
 # factors on the forces of normals of the nearest balanced point: it is found to some digits only
 LARGER = (1.0, 1.001, 1.1, 2.0)
 
@@ -100,6 +103,9 @@ def solve_with_friction(
         result, rule = solve_dual(dual, asked, qp_type, start, monitor, exact)
         iterations, looks = iterations + 1, looks + rule.looks
         steps = steps.plus(result.steps)
+        if bounds.slips_first(result.reason):
+            result.destroy()
+            continue
         if result.reason <= 0:
             break
         change = bounds.change(result.lam)
@@ -110,7 +116,7 @@ def solve_with_friction(
             break
         if change > tolerance:
             bounds.advance()
-        if result.steps == Steps():
+        if result.steps.inner == 0:
             rtol *= SHARE
         start = (np.array(result.lam.array_r), result.mu)
         result.destroy()
@@ -135,8 +141,8 @@ class _Pressures:
         at = dual.constraints.pressed
         self._rows = dual.constraints.pressed_by[at]
         # differences of bounds are measured as forces
-        mu = np.linalg.norm(dual.constraints.coefficients[at], axis=1)
-        self._weight = mu * dual.constraints.tangent_scale[at]
+        self._mu = np.linalg.norm(dual.constraints.coefficients[at], axis=1)
+        self._weight = self._mu * dual.constraints.tangent_scale[at]
         self._now, self._found, self._none = self._first(start), np.zeros(len(at)), 0.0
         self._anderson = Anderson(self._products)
 
@@ -177,17 +183,31 @@ class _Pressures:
         )
 
     def change(self, lam: PETSc.Vec) -> float:
-        """Take what a solve has found; how far that is from the bounds, over its size."""
+        """Take what a solve has found; how far that is from the bounds, over its size.
+
+        Body by body: beside forces elsewhere those on a light one would not be seen.
+        """
         values = lam.array_r
-        squares = np.array([values @ values, self._weight @ self._weight])
-        largest, heaviest = np.sqrt(summed(self._comm, squares))
-        self._none = NO_FORCE * float(largest)
+        self._none = NO_FORCE * float(np.sqrt(summed(self._comm, np.array([values @ values]))[0]))
         self._found = self._forces(values[self._rows])
         if self._sticks:
             return float("inf")
-        miss, size = self._norm(self._found - self._now), self._norm(self._found)
-        size = max(size, self._none * float(heaviest), TINY)
-        return agreed(self._comm, miss / size)
+        miss, size = (self._on_bodies(x) for x in (self._found - self._now, self._found))
+        least = self._on_bodies(np.full(len(self._rows), self._none)).max(initial=TINY)
+        size = np.maximum(size, max(least, LIGHT * size.max(initial=0.0)))
+        return agreed(self._comm, float(np.max(miss / size, initial=0.0)))
+
+    def _on_bodies(self, pressures: Array) -> Array:
+        """Norms of the nodal forces μ times those of normals make on each body."""
+        B, subdomains = self._constraints.B, self._dual.subdomains
+        forces, trace = B.createVecLeft(), B.createVecRight()
+        forces.set(0.0)
+        forces.array[self._rows] = self._mu * pressures
+        B.multTranspose(forces, trace)
+        squares = subdomains.body_sums([sums(trace.array_r**2, subdomains.trace_parts)])[0]
+        forces.destroy()
+        trace.destroy()
+        return np.asarray(np.sqrt(squares))
 
     def advance(self) -> None:
         """Take the next bounds."""
@@ -195,6 +215,13 @@ class _Pressures:
         self._now = (
             self._found if sticks else self._forces(self._anderson.next(self._now, self._found))
         )
+
+    def slips_first(self, reason: ConvergedReason) -> bool:
+        """Whether what sticks contradicts itself, as beside a wall that pushes; then all slips."""
+        if not self._sticks or reason != ConvergedReason.DIVERGED_CONTRADICTION:
+            return False
+        self._now = np.zeros_like(self._found)
+        return True
 
     def _forces(self, values: Array) -> Array:
         """Forces of normals, without what is none but for rounding."""
@@ -204,10 +231,6 @@ class _Pressures:
     def _sticks(self) -> bool:
         """Whether no bound is set yet."""
         return any_rank(self._comm, bool(np.any(np.isinf(self._now))))
-
-    def _norm(self, pressures: Array) -> float:
-        column = pressures[:, None]
-        return float(np.sqrt(self._products(column, column)[0, 0]))
 
     def _products(self, A: Array, B: Array) -> Array:
         weighted = (self._weight[:, None] ** 2) * B

@@ -110,7 +110,7 @@ class Accuracy:
         """Measure an iterate. Collective."""
         before, error = self.measures, residual / self.norm
         self.measures = measure(
-            self._scene, lam, gradient, face, error, before.u if before else None
+            self._scene, lam, gradient, face, self.norm, error, before.u if before else None
         )
         self.looks += 1
         self._before = before

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from petsc4py import PETSc
-from scipy.sparse import csr_array, diags_array
+from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.contact_factor import Factor, contact_factor
@@ -24,9 +24,13 @@ class FacePreconditioner:
 
     Gluing and Dirichlet rows are orthonormal in D⁻¹ and orthogonal to contact rows, so W is the
     identity but for its block of contact rows, W_C, normals and tangents. That is the identity too
-    where no two of them meet, as at an obstacle, and D is the same in all directions. Where
-    a face is curved M_f stands for (ZᵀFZ + κ)⁻¹: it is scaled with (1 + κσ)^{-1/2} from both sides,
-    σ the diagonal of B D⁻¹ diag(K) D⁻¹Bᵀ.
+    where no two of them meet, as at an obstacle, and D is the same in all directions.
+
+    Where a face is curved M_f stands for (ZᵀFZ + κ)⁻¹. F + κ is the F of a scene in which each
+    direction with a curvature moves a spring of stiffness 1/κ besides: for that B_f gains the
+    column 1 and A the entry 1/κ. Its weight in D is 1/(κσ), σ the diagonal of B D⁻¹ diag(K) D⁻¹Bᵀ,
+    which makes M_f the inverse where F is 1/σ. So it is W_κ⁻¹(B_f D⁻¹ A D⁻¹B_fᵀ + κσ²)W_κ⁻¹ with
+    W_κ = W + κσ.
 
     Args:
         whole: B D⁻¹ A D⁻¹Bᵀ on all rows, A the Schur complements, or the stiffness on the trace.
@@ -52,22 +56,19 @@ class FacePreconditioner:
         on_contact = csr_array(face.Z[self._contact])
         kept = np.unique(on_contact.indices)
         Z_C, factor = csr_array(face.Z[:, kept]), None
+        size = Z_C.multiply(Z_C).T @ self._size
+        bent = face.curvature[kept] * size
         if self._gram is not None:
             part = _restricted(self._gram, csr_array(on_contact[:, kept]))
-            part.shift(SHIFT)
+            added = part.createVecLeft()
+            added.array[:] = SHIFT + bent
+            part.setDiagonal(added, PETSc.InsertMode.ADD_VALUES)
+            added.destroy()
             if part.getSize()[0]:
                 factor = contact_factor(part, self._prefix)
             else:
                 part.destroy()
-        return _OnFace(self._whole, face, Z_C, factor, self._bending(face))
-
-    def _bending(self, face: Face) -> csr_array | None:
-        """Z((1 + κσ)^{-1/2} − 1)Zᵀ, or None where it is 0."""
-        if not np.any(face.curvature):
-            return None
-        size = face.Z.multiply(face.Z).T @ self._size
-        bent = diags_array(1.0 / np.sqrt(1.0 + face.curvature * size) - 1.0)
-        return csr_array(face.Z @ bent @ face.Z.T)
+        return _OnFace(self._whole, face, Z_C, (bent, bent * size), factor)
 
     def destroy(self) -> None:
         """Destroy W_C, not the operator on all rows. Collective."""
@@ -83,22 +84,25 @@ class _OnFace:
         whole: Operator,
         face: Face,
         Z_C: csr_array,
+        springs: tuple[Array, Array],
         factor: Factor | None,
-        bending: csr_array | None,
     ) -> None:
         self._whole, self._face, self._Z_C, self._factor = whole, face, Z_C, factor
-        self._bending = bending
+        self._bent, self._moved = springs
+        self._bends = bool(np.any(self._bent))
 
     def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = M_f x. Collective."""
         scaled = x.duplicate()
-        scaled.array[:] = self._scaled(self._bent(x.array_r))
+        scaled.array[:] = self._scaled(x.array_r)
         self._whole.mult(scaled, y)
+        if self._bends:
+            y.array[:] += self._Z_C @ (self._moved * (self._Z_C.T @ scaled.array_r))
         scaled.destroy()
-        y.array[:] = self._bent(self._scaled(y.array_r))
+        y.array[:] = self._scaled(y.array_r)
 
     def dependent(self, x: Array) -> Array | None:
-        """The part of x in the null space of W, and so of B_fᵀ. Collective.
+        """The part of x in the null space of W_κ, and so of B_fᵀ. Collective.
 
         (1 + W/ε)⁻², ε the shift, leaves (ε/σ)² of what has the eigenvalue σ.
         """
@@ -109,17 +113,16 @@ class _OnFace:
             values = SHIFT * self._factor.solve(values)
         return np.asarray(self._Z_C @ values)
 
-    def _bent(self, x: Array) -> Array:
-        """(1 + κσ)^{-1/2}x on the face."""
-        return x if self._bending is None else x + self._bending @ x
-
     def _scaled(self, x: Array) -> Array:
-        """W⁻¹x on the rows of the face."""
+        """W_κ⁻¹x on the rows of the face."""
         values = self._face.restricted(x)
+        if self._factor is None and not self._bends:
+            return values
+        contact = self._Z_C.T @ values
+        solved = contact / (1.0 + self._bent)
         if self._factor is not None:
-            contact = self._Z_C.T @ values
-            values = values + self._Z_C @ (self._factor.solve(contact) - contact)
-        return np.asarray(values)
+            solved = self._factor.solve(contact)
+        return np.asarray(values + self._Z_C @ (solved - contact))
 
     def destroy(self) -> None:
         """Free the factor. Collective."""

@@ -95,6 +95,7 @@ def measure(
     lam: PETSc.Vec,
     gradient: PETSc.Vec,
     face: Face,
+    norm: float,
     error: float,
     before: Array | None = None,
 ) -> Measures:
@@ -110,11 +111,12 @@ def measure(
         lam: The multipliers λ.
         gradient: Fλ − d up to the range of Gᵀ.
         face: The face of λ.
+        norm: ‖F‖, or an estimate.
         error: How large multipliers may be by the solver's error alone.
         before: The displacement of an earlier iterate.
     """
     u = scene.recover(lam, gradient, face, error)
-    w, penetration, gap = _missed(scene, u, lam, error)
+    w, penetration, gap = _missed(scene, u, lam, norm)
     constraints = scene.constraints
     residual, normals = w.norm(), constraints.sets.normals
     closed = scene.pressing[normals] | (w.array_r[normals] > 0.0)
@@ -125,7 +127,7 @@ def measure(
     return Measures(u, bodies, penetration, balance, forces, residual, gap)
 
 
-def _missed(scene: Scene, u: Array, lam: PETSc.Vec, error: float) -> tuple[PETSc.Vec, float, float]:
+def _missed(scene: Scene, u: Array, lam: PETSc.Vec, norm: float) -> tuple[PETSc.Vec, float, float]:
     """w, and as lengths the largest of its contact rows and the largest of their gaps."""
     constraints = scene.constraints
     trace, w = constraints.B.createVecRight(), constraints.c.duplicate()
@@ -141,31 +143,29 @@ def _missed(scene: Scene, u: Array, lam: PETSc.Vec, error: float) -> tuple[PETSc
     largest = np.max(lengths, axis=1, initial=0.0)
     tangents = constraints.sets.tangents
     if tangents.size:
-        w.array[tangents] = _slip_missed(scene, lam.array_r, w.array_r[tangents], error)
+        w.array[tangents] = _slip_missed(scene, lam.array_r, w.array_r[tangents], norm)
         length = np.linalg.norm(w.array_r[tangents], axis=1) / constraints.tangent_scale
         largest[0] = max(largest[0], length.max())
     w.getComm().tompi4py().Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
     return w, float(largest[0]), float(largest[1])
 
 
-def _slip_missed(scene: Scene, lam: Array, slip: Array, error: float) -> Array:
+def _slip_missed(scene: Scene, lam: Array, slip: Array, norm: float) -> Array:
     """What of slips is not normal to the set of tangential forces where the force is.
 
-    A force inside its disc allows no slip, one on the circle only a slip that it opposes: for that
-    ψ‖q‖ − τᵀq = 0. What remains is the projected gradient of −q. The force is taken as far outwards
-    as the solver's error may have left it inside.
+    A force inside its disc allows no slip, one on the circle only a slip that it opposes: then τ is
+    P(τ + q/‖F‖), and ‖F‖ times the difference is the slip that is missed. Where it is less than q,
+    no force within the disc makes more of a slip than that.
 
     Args:
         scene: The dual problem.
         lam: The multipliers.
         slip: The q, scaled, shape ``(t, gdim - 1)``.
-        error: How large multipliers may be by the solver's error alone.
+        norm: ‖F‖, or an estimate.
     """
-    tangents, q, out = scene.constraints.sets.tangents, np.zeros_like(lam), np.array(lam)
-    q[tangents] = slip
-    out[tangents] += error * slip / np.maximum(np.linalg.norm(slip, axis=1, keepdims=True), TINY)
-    phi, beta = scene.feasible.split(scene.feasible.project(out), -q)
-    return np.asarray(-(phi + beta)[tangents])
+    tangents, moved = scene.constraints.sets.tangents, np.array(lam)
+    moved[tangents] += slip / norm
+    return np.asarray(norm * (scene.feasible.project(moved) - lam)[tangents])
 
 
 def _bodies(scene: Scene, u: Array, v: Array, before: Array | None) -> BodyMeasures:

@@ -20,6 +20,11 @@ BEYOND = 10.0
 ALTERNATIONS = 10
 # of d: rows that want gaps so far apart exclude each other, less may be rounding
 APART = 1e-8
+# projections at most until nothing but what F does not see is left; what one keeps of it at least
+PURE, REMAINS = 4, 0.9
+# of ‖F‖ and of a way: what F and G may make of it by rounding, where it is to prove that rows
+# exclude each other; so far all sets of forces that have an end have ended
+PROOF, FAR = 1e-10, 1e30
 # of the largest force of a way that nothing ends: rows with less have no part in it
 TAKES_PART = 1e-3
 
@@ -47,7 +52,26 @@ class DependentRows:
         self.excluding: Array = np.empty(0, dtype=np.int64)
 
     def part(self, x: Array) -> PETSc.Vec | None:
-        """The part of x that F and Gᵀ do not see; None where there is none. Collective."""
+        """The part of x that F and Gᵀ do not see; None where there is none. Collective.
+
+        What the projector only makes small, more of it takes away.
+        """
+        part = self._unseen(x)
+        for _ in range(PURE if part is not None else 0):
+            assert part is not None
+            again = self._unseen(part.array_r)
+            assert again is not None
+            kept = agreed(self._comm, again.norm() >= REMAINS * part.norm() > 0.0)
+            part.destroy()
+            part = again
+            if kept:
+                return part
+        if part is not None:
+            part.destroy()
+        return None
+
+    def _unseen(self, x: Array) -> PETSc.Vec | None:
+        """x projected once."""
         part = self.preconditioner.dependent(x) if self.preconditioner is not None else None
         if part is None:
             return None
@@ -80,10 +104,11 @@ class DependentRows:
         bound.lam.axpy(length, way)
         z.lam.axpy(BEYOND * length, way)
         for _ in range(ALTERNATIONS):
-            inside = self.part(self._qp.feasible.project(z.lam.array_r) - start)
-            assert inside is not None
-            z.lam.array[:] = start + inside.array_r
-            inside.destroy()
+            inside = self._qp.feasible.project(z.lam.array_r) - start
+            unseen = self._unseen(inside)
+            assert unseen is not None
+            z.lam.array[:] = start + unseen.array_r
+            unseen.destroy()
         z.lam.array[:] = self._qp.feasible.project(z.lam.array_r)
         way.destroy()
         return bound
@@ -123,27 +148,39 @@ class DependentRows:
         return False
 
     def _endless(self, length: float, slope: float, way: PETSc.Vec) -> None:
-        """Whether a way down that costs nothing is none that rounding has made, and has no end.
+        """Whether a way down that costs nothing proves that q falls forever. Collective.
 
-        Where rows cannot depend on each other, rounding of an F that is hardly definite has.
+        Then it does in Ω's cone of recession, and neither F nor G sees it: rows that slip, and
+        rounding of an F that is hardly definite, make ways that are none. Multiplies by F once.
         """
-        far = agreed(self._comm, slope > APART * self._qp.d.norm())
-        self.contradicts = bool(far and not np.isfinite(length) and self._may_depend(way))
+        if not agreed(self._comm, slope > APART * self._qp.d.norm() and not np.isfinite(length)):
+            return
+        p, work = self._recession(way), way.duplicate()
+        size = p.norm()
+        self._qp.F.mult(p, work)
+        unseen = work.norm() <= PROOF * self._directions.norm * size
+        p.copy(work)
+        self._qp.coarse.project(work)
+        work.axpy(-1.0, p)
+        unseen = unseen and work.norm() <= PROOF * size
+        falls = p.dot(self._qp.d) > APART * self._qp.d.norm() * size
+        self.contradicts = bool(agreed(self._comm, size > 0.0 and unseen and falls))
         if self.contradicts:
-            largest = way.norm(PETSc.NormType.INFINITY)
-            self.excluding = np.flatnonzero(np.abs(way.array_r) > TAKES_PART * largest)
+            largest = p.norm(PETSc.NormType.INFINITY)
+            self.excluding = np.flatnonzero(np.abs(p.array_r) > TAKES_PART * largest)
+        p.destroy()
+        work.destroy()
 
-    def _may_depend(self, way: PETSc.Vec) -> bool:
-        """Whether rows of the face depend on each other, as far as is known. Collective."""
-        if self.preconditioner is None:
-            return True
-        part = self.part(way.array_r)
-        if part is not None:
-            part.destroy()
-        return part is not None
+    def _recession(self, way: PETSc.Vec) -> PETSc.Vec:
+        """The nearest direction to a way in which Ω has no end: P_Ω(t·way)/t for a large t."""
+        p, far = way.copy(), FAR / way.norm(PETSc.NormType.INFINITY)
+        p.array[:] = self._qp.feasible.project(far * way.array_r) / far
+        return p
 
     def _to_a_bound(self, z: Point, way: Array) -> float:
-        """Largest t with λ + t·way ∈ Ω, maybe infinite. Collective."""
+        """Largest t with λ + t·way ∈ Ω, maybe infinite; rounding ends no way. Collective."""
         held = way if self.face is None else without_slip(self.face, way)
+        largest = self._comm.allreduce(float(np.max(np.abs(way), initial=0.0)), op=MPI.MAX)
+        held = np.where(np.abs(held) > PROOF * largest, held, 0.0)
         own = self._qp.feasible.max_step(z.lam.array_r, -held)
         return float(self._comm.allreduce(own, op=MPI.MIN))

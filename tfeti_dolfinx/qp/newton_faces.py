@@ -39,6 +39,8 @@ STAGE = 0.1
 # of the residual of PCPG: ‖g^P‖ that is at most so large shows that the face hardly bends on the
 # way; the next solve is to be so much better that the end is superlinear
 FOLLOWED = 2.0
+# times λ: what restores Gλ = e by forces so much larger does it with rows that hold nothing
+WILD = 1e6
 # of Gλ = e: what is left after a first try to restore it is worth a second one
 EXACT = 1e-13
 
@@ -82,7 +84,7 @@ class FaceSolver:
         self._on_face, self.rounded = qp, 0
         self._bent: Bent | None = None
         self._preconditioner: FaceOperator | None = None
-        self._prepared, self._stayed, self._stage = False, False, STAGE
+        self._prepared, self._stayed, self._stage, self._size = False, False, STAGE, 0.0
 
     @property
     def norm(self) -> float:
@@ -169,6 +171,7 @@ class FaceSolver:
             optimality: ‖g^P‖ there.
         """
         z, first, out, accepted = start.copy(), None, True, self._accepted
+        self._size = start.lam.norm()
         stays, rounds = self.enter(face) and accepted, 0
         for _ in range(MOST_ROUNDS):
             self._ready()
@@ -205,7 +208,8 @@ class FaceSolver:
         on = np.array(z.lam.array_r)
         self.enter(feasible.face(on, z.g.array_r))
         near = self._restored(z.lam)
-        if self._imbalance(near) > HELD:
+        wild = agreed(self._comm, near.norm() > WILD * max(z.lam.norm(), self._size))
+        if wild or self._imbalance(near) > HELD:
             # it no longer holds a body: what is nearest names rows that do, near by if it can
             near.destroy()
             found = nearest(self._qp.coarse, WithinFace(feasible, previous), z.lam)
