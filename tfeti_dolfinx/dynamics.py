@@ -49,9 +49,11 @@ class ContactDynamics(ContactProblem):
         contacts: Obstacles and pairs. Friction acts on what slips in a step.
         decomposition: The torn mesh.
         mass: Mass per volume, a number, a scalar in UFL or numbers for all volumes by names, for
-            M = ∫ρ u·v, with ``stabilised`` and degree 1 lumped. Or a bilinear form.
+            M = ∫ρ u·v. Or a bilinear form.
         velocity: Velocity at the begin, a function; default 0.
         stabilised: Whether steps are contact-stabilised.
+        lumped: Whether a density is integrated at the vertices, which makes M diagonal; of elements
+            of degree 1 only: vertices alone are too few for others.
         others: As for ``ContactProblem``. What ``u`` has is the displacement at the begin.
 
     Attributes:
@@ -75,11 +77,12 @@ class ContactDynamics(ContactProblem):
         mass: Modulus | ufl.Form,
         velocity: fem.Function | None = None,
         stabilised: bool = False,
+        lumped: bool = False,
         **others: Any,
     ) -> None:
         self._stabilised = checked_flag(stabilised, "stabilised")
-        self._mass, thickness = mass, others.get("thickness", 1.0)
-        self._with_thickness = thickness
+        self._mass, self._lumped = mass, checked_flag(lumped, "lumped")
+        self._with_thickness = others.get("thickness", 1.0)
         super().__init__(a, L, bcs, contacts, decomposition, **others)
         if self.options.rtol == "auto":
             raise InputError("rtol auto: errors of steps in time are not estimated; expected one")
@@ -101,9 +104,10 @@ class ContactDynamics(ContactProblem):
         jit_options: dict[str, Any] | None,
     ) -> Forms:
         mass = self._mass
+        if isinstance(mass, ufl.Form) and self._lumped:
+            raise InputError("lumped=True with a form of the mass; expected a density")
         if not isinstance(mass, ufl.Form):
-            lumped = self._stabilised and V.element.basix_element.degree == 1
-            mass = mass_form(mass, V, self.decomposition, self._with_thickness, lumped)
+            mass = mass_form(mass, V, self.decomposition, self._with_thickness, self._lumped)
         options = (form_compiler_options, jit_options)
         return InertialForms(a, L, V, self.decomposition, *options, mass)
 

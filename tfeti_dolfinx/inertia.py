@@ -188,10 +188,12 @@ def mass_form(
         lumped: Whether to integrate at the vertices, which makes M diagonal; of degree 1 only.
 
     Raises:
-        InputError: The density does not fit.
+        InputError: The density does not fit, or elements are not of degree 1.
     """
     rho = in_ufl(density, decomposition, "mass", POSITIVE)
     degree = V.element.basix_element.degree
+    if lumped and degree != 1:
+        raise InputError(f"lumped=True on elements of degree {degree}; expected degree 1")
     rule = {"quadrature_degree": 2 * degree}
     if lumped:
         rule = {"quadrature_rule": "vertex", "quadrature_degree": 1}
