@@ -23,18 +23,18 @@ ROOMS = [
     ["dual"],
     ["form_checks", "options", "report"],
     ["assembly", "elasticity", "option_parsing"],
-    ["fields"],
+    ["fields", "inertia"],
     ["contact_state", "discretisation", "friction_bounds"],
     ["solution"],
-    ["saved_state"],
+    ["saved_state", "work"],
     ["solver"],
     ["coulomb"],
     ["report_filling", "doubts"],
     ["extensions"],
-    ["system"],
+    ["system", "predictor"],
     ["estimates", "rounds", "stepping"],
     ["problem"],
-    ["draw"],
+    ["draw", "dynamics"],
     ["output", "plot"],
     ["checkpoint", "halving", "progress", "series"],
     ["load_steps"],
@@ -102,7 +102,7 @@ def functions(path):
 
 
 # what a user calls may have as many arguments as the user needs
-DOORS = {"load_steps.py", "plot.py", "problem.py"}
+DOORS = {"dynamics.py", "load_steps.py", "plot.py", "problem.py"}
 
 
 @pytest.mark.parametrize("path", modules(), ids=lambda p: str(p.relative_to(PACKAGE)))

@@ -29,6 +29,8 @@ DEMOS = [
     "cattaneo_mindlin_2d",
     "unloading_2d",
     "mindlin_3d",
+    "bouncing_bar",
+    "impact_of_bars",
 ]
 
 

@@ -32,6 +32,7 @@ from tfeti_dolfinx.contact.friction import Coulomb, Tresca
 from tfeti_dolfinx.contact.obstacle import Obstacle
 from tfeti_dolfinx.contact.pair import Contact
 from tfeti_dolfinx.contact.shapes import Cylinder, Plane, SignedDistance, Sphere
+from tfeti_dolfinx.dynamics import ContactDynamics
 from tfeti_dolfinx.elasticity import Elasticity
 from tfeti_dolfinx.errors import (
     ConvergenceError,
@@ -56,6 +57,7 @@ from tfeti_dolfinx.version import __version__
 __all__ = [
     "Contact",
     "ContactData",
+    "ContactDynamics",
     "ContactProblem",
     "ContactStatus",
     "ConvergenceError",

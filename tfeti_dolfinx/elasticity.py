@@ -86,8 +86,8 @@ class Elasticity:
         with raised_on_all_ranks(self.mesh.comm):
             self.model = _checked_model(model, self.mesh.geometry.dim)
             _check_no_thickness(thickness, self.model)
-        self.E = _in_ufl(E, on, "E", POSITIVE)
-        self.nu = _in_ufl(
+        self.E = in_ufl(E, on, "E", POSITIVE)
+        self.nu = in_ufl(
             nu, on, "nu", POISSON_OF_SHEETS if self.model == "plane_stress" else POISSON
         )
         self.mu = self.E / 2 / (1 + self.nu)
@@ -96,7 +96,7 @@ class Elasticity:
             self._on_axis = ON_AXIS * self._checked_radius()
             self.thickness = 2 * math.pi * ufl.SpatialCoordinate(self.mesh)[0]
         elif thickness is not None:
-            self.thickness = _in_ufl(thickness, on, "thickness", POSITIVE)
+            self.thickness = in_ufl(thickness, on, "thickness", POSITIVE)
 
     def strain(self, u: Any) -> Any:
         """Linear strain of a displacement, a UFL tensor of shape ``(3, 3)``.
@@ -213,7 +213,7 @@ def _check_no_thickness(thickness: Any, model: str) -> None:
         )
 
 
-def _in_ufl(value: Any, on: Decomposition | dmesh.Mesh, what: str, expected: Range) -> Any:
+def in_ufl(value: Any, on: Decomposition | dmesh.Mesh, what: str, expected: Range) -> Any:
     """A modulus as a scalar in UFL. Collective."""
     mesh = on.mesh if isinstance(on, Decomposition) else on
     if isinstance(value, Mapping):

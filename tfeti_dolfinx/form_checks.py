@@ -27,15 +27,17 @@ FUNCTIONS = ("test", "trial")
 KINDS = {"cell": "dx", "exterior_facet": "ds", "interior_facet": "dS"}
 
 
-def displacement_space(a: ufl.Form, decomposition: Decomposition) -> fem.FunctionSpace:
+def displacement_space(
+    a: ufl.Form, decomposition: Decomposition, name: str = "a"
+) -> fem.FunctionSpace:
     """The space of a bilinear form's trial and test functions. Collective.
 
     Raises:
         InputError: The form is not bilinear on one space for displacements on the torn mesh.
     """
-    test, trial = _argument_spaces(a, "a", 2)
+    test, trial = _argument_spaces(a, name, 2)
     check_space(test, decomposition)
-    check_same_space(trial, test, "the trial function of a", "that of its test function")
+    check_same_space(trial, test, f"the trial function of {name}", "that of its test function")
     return test
 
 

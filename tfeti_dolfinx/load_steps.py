@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import dolfinx
@@ -40,6 +40,8 @@ class StepRecord:
         figures: Sizes, counters and the reason from the report.
         residuals: Those of the report.
         seconds: Wall seconds.
+        motion: Energies and work, from the report, of bodies with mass.
+        contact_forces: Resultant of the forces on each contact's surface, likewise.
     """
 
     number: int
@@ -49,6 +51,8 @@ class StepRecord:
     figures: dict[str, Any]
     residuals: dict[str, float]
     seconds: float
+    motion: dict[str, float] = field(default_factory=dict)
+    contact_forces: list[list[float]] = field(default_factory=list)
 
 
 class LoadSteps:
@@ -138,7 +142,7 @@ class LoadSteps:
             t = place.end(self._times)
             show(place.number / (len(self._times) - 1), f"t = {t:.6g}")
             try:
-                self._solve(t, place.number)
+                self._solve(t, place)
             except ConvergenceError as error:
                 place = self._halved(place, t, error)
             else:
@@ -149,13 +153,14 @@ class LoadSteps:
                 self._keep(place, t)
         show(1.0, "done")
 
-    def _solve(self, t: float, number: int) -> None:
+    def _solve(self, t: float, place: Place) -> None:
         problem = self._problem
         try:
+            problem.take_step(t - place.begin(self._times))
             self._set(t)
             problem.solve()
         except TfetiError as error:
-            error.add_note(f"load step {number}, t = {t:.6g}")
+            error.add_note(f"load step {place.number}, t = {t:.6g}")
             raise
         reason = problem.report.converged_reason
         if not reason.startswith("CONVERGED"):  # options let it be
@@ -184,7 +189,8 @@ class LoadSteps:
         lost = float(np.sum(self._problem.solution.dissipation))
         total = self._comm.allreduce(lost)
         residuals, seconds = dict(report.residuals), report.seconds["total"]
-        return StepRecord(number, t, size, total, figures, residuals, seconds)
+        moving = dict(report.motion), list(report.contact_forces)
+        return StepRecord(number, t, size, total, figures, residuals, seconds, *moving)
 
     def _keep(self, place: Place, t: float) -> None:
         """Write a step that has converged, and the place of the next."""
@@ -217,6 +223,7 @@ class LoadSteps:
         place = Place(**index["place"])
         self._check_times(index["times"], place)
         self.records = [StepRecord(**record) for record in index["records"]]
+        self._problem.take_step(self.records[-1].size)
         self._set(self.records[-1].time)
         self._problem.restore(self._checkpoint.read_state(index["number"]))
         self._replay(self._checkpoint)

@@ -21,8 +21,8 @@ from tfeti_dolfinx.solution import Solution
 def write_vtx(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
     """Write all fields of a solution for ParaView. Collective.
 
-    Nodal fields (displacement, pressure, gap, status, with contacts traction, with friction
-    tangential traction and slip, with a stress
+    Nodal fields (displacement, pressure, gap, status, with mass velocity, with contacts traction,
+    with friction tangential traction and slip, with a stress
     stress and von Mises stress averaged at the nodes) go to ``path``; cell fields (subdomain, body,
     material, and the discretisation error if it has been estimated) to a second file beside it,
     ``<stem>_cells.bp``.
@@ -83,6 +83,8 @@ def write_xdmf(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
 def nodal_fields(solution: Solution) -> list[fem.Function]:
     """All nodal fields, on the displacement's element. Collective."""
     fields = [solution.displacement, solution.pressure, solution.gap, solution.status]
+    if solution.has_velocity:
+        fields.append(solution.velocity)
     if solution.has_contact:
         fields.append(solution.traction)
     if solution.has_friction:

@@ -112,7 +112,7 @@ class ContactProblem(Stepping):
         self._thickness = checked_thickness(thickness, decomposition)
         self.report = Report(seconds=dict(decomposition.seconds))
         with stage("assembly", self.report.seconds):
-            forms = Forms(a, L, V, decomposition, form_compiler_options, jit_options)
+            forms = self._forms(a, L, V, form_compiler_options, jit_options)
         with stage("gluing", self.report.seconds):
             self.dofs = TornDofs(V, decomposition)
         forms.thickness = self._thickness
@@ -120,6 +120,17 @@ class ContactProblem(Stepping):
         self._system = System(
             forms, self.bcs, self.contacts, self.dofs, decomposition, self._settings
         )
+
+    def _forms(
+        self,
+        a: ufl.Form,
+        L: ufl.Form,
+        V: fem.FunctionSpace,
+        form_compiler_options: dict[str, Any] | None,
+        jit_options: dict[str, Any] | None,
+    ) -> Forms:
+        """What gives the matrix and the load of a solve."""
+        return Forms(a, L, V, self.decomposition, form_compiler_options, jit_options)
 
     @property
     def dual(self) -> Dual:

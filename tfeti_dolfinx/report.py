@@ -91,6 +91,10 @@ class Report:
             it is largest beside the forces there); ``friction``, the last change of the bounds of
             Coulomb's friction over their size.
         tolerances: What they were at most allowed to be, all but the first two.
+        motion: Of bodies with mass the energies at the end of the step and what was done in it,
+            see ``ContactDynamics``.
+        contact_forces: Of bodies with mass the mean force of the step on the surface of each
+            contact, of a pair on the secondary one, a vector.
         in_all: Solves, counters and ``seconds`` of all solves together.
         estimates: What ``ContactProblem.estimate`` has found since, and what it took; see
             ``Estimates``.
@@ -150,6 +154,8 @@ class Report:
     estimates: dict[str, float] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
     spectrum: dict[str, float] = field(default_factory=dict)
+    motion: dict[str, float] = field(default_factory=dict)
+    contact_forces: list[list[float]] = field(default_factory=list)
     in_all: dict[str, float] = field(default_factory=dict)
 
     def begin(self) -> None:
@@ -205,10 +211,12 @@ def _write_whole(target: Path, text: str) -> None:
         raise
 
 
-def _item(item: str | dict[str, Any]) -> str:
-    """A contact, or a motion that is nearly free, as text."""
+def _item(item: str | list[float] | dict[str, Any]) -> str:
+    """A contact, a force, or a motion that is nearly free, as text."""
     if isinstance(item, str):
         return item
+    if isinstance(item, list):
+        return " ".join(f"{value:.6g}" for value in item)
     return f"{', '.join(item['bodies'])}: {item['mode']}, stiffness {item['stiffness']:.2g}"
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -33,6 +33,8 @@ class SavedState:
         reach: How far was searched in each contact.
         contact: Contact of each condition with a row.
         group: Owned group of each condition with a row.
+        velocity: Velocity in DOLFINx's order, empty without inertia.
+        load: Load likewise.
     """
 
     layout: Array
@@ -45,6 +47,8 @@ class SavedState:
     reach: Array
     contact: Array
     group: Array
+    velocity: Array = field(default_factory=lambda: np.zeros(0))
+    load: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def of(cls, solution: Solution, mu: Array, norm: float, reach: list[float]) -> SavedState:

@@ -52,6 +52,7 @@ class Solution(ContactState):
         lam: Multipliers of this rank's rows.
         contacts: The contacts with their sides decided: ``contacts[i].surfaces[0]`` has the
             multipliers and the pressure.
+        v: Velocity in DOLFINx's order of bodies with mass, else None.
     """
 
     def __init__(
@@ -65,6 +66,7 @@ class Solution(ContactState):
         thickness: Any = 1.0,
     ) -> None:
         super().__init__(u, multipliers, decomposition, gluing, contacts, frozen(thickness))
+        self.v: Array | None = None
         self._stress = None
         if stress is not None:
             u_h = self.displacement
@@ -76,6 +78,20 @@ class Solution(ContactState):
         function = fem.Function(self.dofs.V, name="displacement")
         function.x.array[:] = self.dofs.to_dolfinx(self.u)
         return function
+
+    @cached_property
+    def velocity(self) -> fem.Function:
+        """Velocity on the torn mesh, of a problem with mass."""
+        if self.v is None:
+            raise InputError("no velocity: expected the solution of a ContactDynamics")
+        function = fem.Function(self.dofs.V, name="velocity")
+        function.x.array[:] = self.v
+        return function
+
+    @property
+    def has_velocity(self) -> bool:
+        """Whether the bodies have mass."""
+        return self.v is not None
 
     @property
     def has_stress(self) -> bool:

@@ -50,6 +50,9 @@ class Stepping:
             raise InputError("there is no solution yet; expected a call of solve() before")
         return self._solution
 
+    def take_step(self, size: float) -> None:
+        """Say how long the next load step is: without inertia it does not matter."""
+
     def accept(self) -> None:
         """Take the last solution as the end of a load step. Collective.
 

@@ -57,7 +57,7 @@ class ContactSearch:
         self.length = agreed(dofs.comm, diameter(decomposition))
         reach = [contact.first_reach(decomposition) for contact in contacts]
         self._depths = agreed(dofs.comm, reach)
-        self._reach = list(self._depths)
+        self._reach, self._said = list(self._depths), list[str]()
         check_pairs(contacts, decomposition)
         check_laws(contacts, decomposition)
         settled = [
@@ -184,9 +184,10 @@ class ContactSearch:
         return [f"{i}: {self.contacts[i].name}" for i in positions]
 
     def warn_of_unmet(self) -> None:
-        """Log on rank 0 which contacts have met nobody."""
-        for contact in self.unmet():
-            if self._dofs.comm.rank == 0:
+        """Log on rank 0 which contacts have met nobody, once."""
+        before, self._said = self._said, self.unmet()
+        for contact in self._said:
+            if self._dofs.comm.rank == 0 and contact not in before:
                 log.warning("contact %s has met nobody, and has no rows", contact)
 
     def _is_exhausted(self, i: int) -> bool:

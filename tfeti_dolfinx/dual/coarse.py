@@ -146,6 +146,8 @@ class CoarseSpace(Projectors):
 
     def _unresisted(self, rows: Array, within: Motions, below: float) -> Motions:
         """Found on one rank: processors that round differently might count differently."""
+        if not np.any(within.free):
+            return within.none
         grams = self.comm.gather(self.J[rows].T @ self.J[rows], root=0)
         found: Any = None
         with raised_on_all_ranks(self.comm):

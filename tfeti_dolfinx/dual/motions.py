@@ -53,6 +53,12 @@ class Motions:
         return csr_array(block_diagonal(self.single)[:, np.flatnonzero(self.free.ravel())])
 
     @property
+    def none(self) -> Motions:
+        """The space without motions."""
+        nothing, held = np.zeros_like(self.free), np.full(self.free.shape, OUTSIDE)
+        return Motions(self.single, nothing, held, csr_array((self.free.size, 0)))
+
+    @property
     def count(self) -> int:
         """How many they are."""
         return int(self.free.sum()) + self.joint.shape[1]

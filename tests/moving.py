@@ -1,0 +1,82 @@
+"""A box with mass that is thrown at a plane, or at a box below it."""
+
+import numpy as np
+import ufl
+from bodies import stacked
+from dolfinx import fem
+from scenes import decomposed, hooke, strain
+
+import tfeti_dolfinx as tfeti
+
+
+def thrown_velocity(gdim, x, above, speed, along, spin):
+    """A velocity at points."""
+    v = np.zeros((gdim, x.shape[1]))
+    v[-1] = -speed * (x[gdim - 1] > above) - spin * (x[0] - 0.4)
+    v[0] += along + spin * x[gdim - 1] ** 2
+    return v
+
+
+class Thrown:
+    """A unit box, E = ρ = 1, with a velocity that is not rigid, and where it hits.
+
+    Args:
+        cell: Name of the cell type.
+        n: Cells along an edge.
+        gap: To the plane below, or to a box on the plane.
+        friction: Of the plane.
+        below: Whether there is a box below.
+        nu: Poisson's ratio.
+        weight: Force per volume, downwards.
+        thrown: Speed downwards of the upper box, along, and of a part that turns and shears.
+        keywords: Of ``ContactDynamics``; others are options.
+    """
+
+    def __init__(
+        self,
+        cell="quadrilateral",
+        n=4,
+        gap=0.02,
+        friction=None,
+        below=False,
+        nu=0.3,
+        weight=0.0,
+        thrown=(0.3, 0.1, 0.05),
+        **keywords,
+    ):
+        d = stacked(cell, 2, 3, 4, gap=gap) if below else decomposed(cell, n, 4)
+        self.gdim = gdim = d.mesh.geometry.dim
+        V = fem.functionspace(d.mesh, ("Lagrange", 1, (gdim,)))
+        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+        self.weight = fem.Constant(d.mesh, -weight * np.eye(gdim)[-1])
+        velocity = fem.Function(V)
+        velocity.interpolate(
+            lambda x: thrown_velocity(gdim, x, gap / 2 if below else -1.0, *thrown)
+        )
+        low, up = (-1.0 if below else -gap), np.eye(gdim)[-1]
+        plane = tfeti.Plane(low * up, up)
+        bottom = "lower bottom" if below else "bottom"
+        contacts = [tfeti.Obstacle(bottom, plane, friction=friction, reach=1.0, name="plane")]
+        if below:
+            contacts.append(tfeti.Contact("upper bottom", "lower top", reach=1.0))
+        own = {k: keywords.pop(k) for k in ("mass", "stabilised") if k in keywords}
+        self.problem = tfeti.ContactDynamics(
+            ufl.inner(hooke(nu=nu)(u), strain(v)) * ufl.dx(domain=d.mesh),
+            ufl.dot(self.weight, v) * ufl.dx(domain=d.mesh),
+            [],
+            contacts,
+            d,
+            velocity=velocity,
+            petsc_options={"rtol": 1e-10, **keywords},
+            **{"mass": 1.0, **own},
+        )
+
+    def step(self, size, count=1):
+        """Go on, and give the reports of the steps."""
+        found = []
+        self.problem.take_step(size)
+        for _ in range(count):
+            self.problem.solve()
+            self.problem.accept()
+            found.append((dict(self.problem.report.motion), self.problem.report.contact_forces))
+        return found
