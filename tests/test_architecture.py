@@ -20,6 +20,7 @@ ROOMS = [
     ["gluing"],
     ["qp"],
     ["subdomains"],
+    ["boundary"],
     ["dual"],
     ["form_checks", "options", "report"],
     ["assembly", "elasticity", "option_parsing"],
