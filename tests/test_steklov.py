@@ -5,6 +5,7 @@ import pytest
 from panels import HOOK, PLANE, SPACE, SQUARE, box, kelvin, kelvin_energy, moved, polygon
 from scipy.integrate import dblquad
 
+from tfeti_dolfinx.boundary.inside import Inside, contains
 from tfeti_dolfinx.boundary.integrals2d import _by_rule, _exact, layers_2d
 from tfeti_dolfinx.boundary.integrals3d import layers_3d
 from tfeti_dolfinx.boundary.panels import Panels
@@ -138,3 +139,54 @@ def test_a_surface_that_lies_on_itself_is_refused():
     twice = Panels(twice.x, np.concatenate((twice.nodes, twice.nodes)))
     with pytest.raises(FactorError, match="closed surface"):
         steklov(twice, LAW)
+
+
+INSIDE = {
+    2: np.array([(0.25, 0.25), (0.3, 0.1), (0.45, 0.45), (0.25, 0.499)]),
+    3: np.array([(0.5, 0.5, 0.5), (0.7, 0.3, 0.2), (0.9, 0.9, 0.9), (0.5, 0.5, 0.99)]),
+}
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_inside_constant_stresses_and_forces_per_volume_are_exact(dim):
+    panels, points = PLANE["square"]() if dim == 2 else SPACE["cube"](), INSIDE[dim]
+    made, b = steklov(panels, LAW), np.arange(1.0, dim + 1)
+    G, middle = GRADIENT[:dim, :dim], panels.x.mean(axis=0)
+
+    def exact(x):  # and div σ = −b
+        return x @ G.T - b * (x - middle) ** 2 / (2 * (LAW.lmbda + 2 * LAW.mu))
+
+    inside = Inside(made, exact(panels.x), b)
+    bound = 1e-13 if dim == 2 else 1e-6
+    assert np.abs(inside.displacement(points) - exact(points)).max() < bound
+    slope = np.einsum("ki,ij->kij", -b * (points - middle), np.eye(dim))
+    stress = LAW.stress(G + slope / (LAW.lmbda + 2 * LAW.mu))
+    assert np.abs(inside.stress(points) - stress).max() < (1e-9 if dim == 2 else 1e-5)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_inside_kelvin_converges_with_the_square_of_h(dim):
+    shape = PLANE["square"] if dim == 2 else SPACE["cube"]
+    source = np.array([0.6, 0.45]) if dim == 2 else np.array([1.6, 0.8, 0.6])
+    u, gradient = kelvin(INSIDE[dim], source, LAW)
+    exact = u, LAW.stress(gradient)
+    errors = []
+    for m in (8, 16, 32) if dim == 2 else (2, 4):
+        panels = shape(m)
+        surface = kelvin(panels.x, source, LAW)[0]
+        inside = Inside(steklov(panels, LAW), surface, np.zeros(dim))
+        found = inside.displacement(INSIDE[dim]), inside.stress(INSIDE[dim])
+        errors.append(
+            [np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in zip(found, exact, strict=True)]
+        )
+    assert np.all(np.log2(np.array(errors[:-1]) / errors[1:]) > 1.8), errors
+    assert errors[-1][0] < (1e-3 if dim == 2 else 2e-2)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_what_is_inside_is_found(name):
+    panels = SHAPES[name]()
+    middle, size = panels.midpoints, panels.size.min()
+    for sign in (-1.0, 1.0):
+        points = middle + sign * 1e-2 * size * panels.normal
+        assert np.all(contains(panels, points) == (sign < 0))

@@ -28,6 +28,7 @@ Example:
     0.100000
 """
 
+from tfeti_dolfinx.boundary_elements import BoundaryElements
 from tfeti_dolfinx.contact.friction import Coulomb, Tresca
 from tfeti_dolfinx.contact.obstacle import Obstacle
 from tfeti_dolfinx.contact.pair import Contact
@@ -47,6 +48,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dolfinx_input import decompose
 from tfeti_dolfinx.mesh.gmsh.reading import read_gmsh
 from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.point_values import PointValues
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.solution import Solution
@@ -54,6 +56,7 @@ from tfeti_dolfinx.states import ContactData, ContactStatus
 from tfeti_dolfinx.version import __version__
 
 __all__ = [
+    "BoundaryElements",
     "Contact",
     "ContactData",
     "ContactProblem",
@@ -72,6 +75,7 @@ __all__ = [
     "Obstacle",
     "Options",
     "Plane",
+    "PointValues",
     "Report",
     "SignedDistance",
     "Solution",

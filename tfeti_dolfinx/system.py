@@ -11,12 +11,11 @@ from dolfinx import fem
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.assembly import Forms
+from tfeti_dolfinx.boundary_elements import BoundaryElements, Replaced
 from tfeti_dolfinx.contact.arguments import Gap
 from tfeti_dolfinx.contact.partners import ContactPartner
 from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.dual.dual import Dual
-from tfeti_dolfinx.dual.operator import PRECONDITIONERS
-from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import Settings
 from tfeti_dolfinx.friction_bounds import FrictionBounds
 from tfeti_dolfinx.gluing.glue import Gluing, glue
@@ -47,11 +46,13 @@ class System:
         dofs: Dof maps.
         decomposition: The torn mesh.
         settings: How to solve.
+        boundary: Where boundary elements are.
 
     Attributes:
         forms: The compiled forms.
         bcs: Dirichlet conditions.
         friction: What bounds tangential forces.
+        replaced: What boundary elements put in the place of finite ones.
         spectrum: Extreme eigenvalues of B Bᵀ, if somebody has put them here.
     """
 
@@ -63,10 +64,12 @@ class System:
         dofs: TornDofs,
         decomposition: Decomposition,
         settings: Settings,
+        boundary: BoundaryElements | None = None,
     ) -> None:
         self.forms, self.bcs, self._contacts = forms, bcs, contacts
         self._dofs, self._decomposition, self._settings = dofs, decomposition, settings
         self.friction = FrictionBounds(contacts, dofs, decomposition, forms.thickness)
+        self.replaced = Replaced(boundary, dofs, decomposition)
         self.spectrum: dict[str, float] = {}
         self._stages, self._counters, self._counted = Stages(), Counters(), 0
         self._seen = 0.0  # of ‖F‖, which more rows hardly change
@@ -154,7 +157,8 @@ class System:
     def count(self, report: Report) -> None:
         """Put sizes into a report, and what was made since it was last counted."""
         if self._gluing is not None:
-            fill_sizes(report, self._dofs, self._decomposition, self._gluing)
+            inside = self.replaced.inside()
+            fill_sizes(report, self._dofs, self._decomposition, self._gluing, inside)
             report.unmet_contacts = self.search.unmet()
         made, report.reused = self._stages.take_counts()
         report.assemblies, report.searches = made["stiffness"], made["search"]
@@ -189,7 +193,9 @@ class System:
 
     def _assemble_stiffness(self) -> None:
         self._K = self.forms.stiffness()
-        self._diagonal = self._dofs.to_primal(self._K.diagonal())
+        self._diagonal = self.replaced.diagonal(self._K, self._settings.making(self._counters))
+        if self.replaced.exists:  # the load that a force per volume makes depends on S
+            self.change("load")
 
     def _find_contacts(self) -> None:
         dofs, decomposition = self._dofs, self._decomposition
@@ -209,17 +215,16 @@ class System:
 
     def _fill_right_side(self) -> None:
         values, gaps = made(self._prescribed).value, self.search.records.gap
-        slip = self.friction.slip(self.search)
-        self._gluing = self.gluing.with_right_side(values, gaps, slip)
+        self._gluing = self.gluing.with_right_side(values, gaps, self.friction.slip(self.search))
 
     def _assemble_load(self) -> None:
-        self._f = self.forms.load()
+        self._f = self.replaced.load(self.forms)
         if self._subdomains is not None:
             self._subdomains.update(f=self._dofs.to_primal(self._f))
 
     def _factor(self) -> None:
         trace, counters = self.gluing.constraints.trace, self._counters
-        make_block, choice = self._settings.make_block(counters), self._settings.local_choice
+        make_block = self.replaced.blocks(self._settings.make_block(counters))
         if self._K is None:  # it went into Blocks that could not be made
             self._assemble_stiffness()
             self._stages.made["stiffness"] += 1
@@ -227,7 +232,7 @@ class System:
         data = subdomain_data(self._dofs, self._decomposition, K, self._f, trace)
         with added_options(self._settings.prefix, self._settings.factor_options):
             self._subdomains = make_subdomains(
-                data, make_block, self._decomposition, counters, choice
+                data, make_block, self._decomposition, counters, self._settings.local_choice
             )
 
     def _retrace(self) -> None:
@@ -237,18 +242,13 @@ class System:
         decomposition, dofs = self._decomposition, self._dofs
         rows = self.gluing.constraints.sets.contact_rows(dofs.comm)
         _, pc_type = resolve_types(self._settings.options, rows, self._settings.prefix)
-        if (own := self._settings.extensions.preconditioner) is not None and pc_type == "none":
-            raise InputError(
-                f"extensions: a preconditioner is given, but -{self._settings.prefix}pc_type is "
-                "none, as auto is with smalse; expected lumped or dirichlet, whose place it takes"
-            )
         with added_options(self._settings.prefix, self._settings.factor_options):
             self._dual = Dual(
                 constraints=self.gluing.constraints,
                 subdomains=made(self._subdomains),
                 body_names=decomposition.body_names,
                 mode_names=mode_names(decomposition.mesh.geometry.dim, dofs.bs),
-                preconditioner=own or PRECONDITIONERS.get(pc_type),
+                preconditioner=self._settings.preconditioner(pc_type),
                 options_prefix=self._settings.prefix,
                 feasible=self._settings.extensions.feasible_set,
             )

@@ -23,7 +23,7 @@ FAR = ((20.0, 4), (3.0, 8))
 
 
 def layers_2d(panels: Panels) -> Layers:
-    """V_Δ, R and K_Δ of plane strain; ρ is twice the diameter."""
+    """V_Δ, R and K_Δ of plane strain; ρ as ``Panels`` has it."""
     layers, lengths = Layers.empty(panels), panels.measure
     first, second = np.indices((len(lengths),) * 2).reshape(2, -1)
     apart = np.linalg.norm(panels.midpoints[first] - panels.midpoints[second], axis=1)
@@ -33,7 +33,7 @@ def layers_2d(panels: Panels) -> Layers:
             i, j = first[some], second[some]
             _put(layers, i, j, _by_rule(panels, i, j, points) if points else _exact(panels, i, j))
         below = least
-    layers.single[:] += np.log(2.0 * panels.diameter) / (2 * np.pi) * np.outer(lengths, lengths)
+    layers.single[:] += np.log(panels.rho) / (2 * np.pi) * np.outer(lengths, lengths)
     return layers
 
 

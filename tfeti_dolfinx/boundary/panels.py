@@ -74,6 +74,11 @@ class Panels:
         return 2.0 * float(np.linalg.norm(self.x - self.x.mean(axis=0), axis=1).max())
 
     @property
+    def rho(self) -> float:
+        """ρ of the logarithm in 2D: large enough for a single layer that is positive."""
+        return 2.0 * self.diameter
+
+    @property
     def volume(self) -> float:
         """∫x·n / d."""
         return float(np.sum(self.midpoints * self.directed) / self.dim)
