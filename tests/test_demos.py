@@ -29,6 +29,8 @@ DEMOS = [
     "cattaneo_mindlin_2d",
     "unloading_2d",
     "mindlin_3d",
+    "tbeti_cube_3d",
+    "tbeti_hertz_2d",
 ]
 
 

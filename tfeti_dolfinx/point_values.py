@@ -101,7 +101,7 @@ def values_at(
 
 
 def _row(u: Array, stress: Array) -> Array:
-    return np.column_stack((np.ones(len(u)), u, stress.reshape(len(u), -1)))
+    return np.column_stack((np.ones(len(u)), u, stress.reshape(len(u), u.shape[1] ** 2)))
 
 
 def _number(thickness: Any) -> float:
