@@ -31,6 +31,8 @@ DEMOS = [
     "mindlin_3d",
     "bouncing_bar",
     "impact_of_bars",
+    "tbeti_cube_3d",
+    "tbeti_hertz_2d",
 ]
 
 

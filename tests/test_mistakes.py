@@ -6,6 +6,7 @@ import pytest
 from mistakes import (
     accepted,
     again,
+    boundary,
     conditions,
     contacts,
     elasticity,
@@ -20,7 +21,7 @@ from mistakes import (
 from mistakes.scene import Scene
 
 MODULES = (forms, elasticity, conditions, options, meshes, contacts, results, gmsh_files)
-MODULES += (again, extensions, friction)
+MODULES += (again, boundary, extensions, friction)
 TABLES = {
     f"{module.__name__.split('.')[1]} {name.lower()}": getattr(module, name)
     for module in MODULES

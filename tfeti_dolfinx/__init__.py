@@ -28,6 +28,7 @@ Example:
     0.100000
 """
 
+from tfeti_dolfinx.boundary_elements import BoundaryElements
 from tfeti_dolfinx.contact.friction import Coulomb, Tresca
 from tfeti_dolfinx.contact.obstacle import Obstacle
 from tfeti_dolfinx.contact.pair import Contact
@@ -48,6 +49,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dolfinx_input import decompose
 from tfeti_dolfinx.mesh.gmsh.reading import read_gmsh
 from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.point_values import PointValues
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.solution import Solution
@@ -55,6 +57,7 @@ from tfeti_dolfinx.states import ContactData, ContactStatus
 from tfeti_dolfinx.version import __version__
 
 __all__ = [
+    "BoundaryElements",
     "Contact",
     "ContactData",
     "ContactDynamics",
@@ -74,6 +77,7 @@ __all__ = [
     "Obstacle",
     "Options",
     "Plane",
+    "PointValues",
     "Report",
     "SignedDistance",
     "Solution",

@@ -100,7 +100,7 @@ class Forms:
         """Take another linear form on the same space."""
         check_form(L, "L", self._V, self._decomposition)
         self._L = None if is_zero(L) else self._compiled(L, "L")
-        self._of_L = data_of(L, self._V)
+        self._of_L, self._volume_of_L = data_of(L, self._V), cell_integrals(L)
 
     def has_new_points(self) -> bool:
         """Whether the mesh has moved since the last call."""
@@ -124,11 +124,32 @@ class Forms:
             return np.zeros(self._V.dofmap.index_map.size_local * self._V.dofmap.index_map_bs)
         return np.array(fem.assemble_vector(self._L).array)
 
+    def volume_load(self) -> Array | None:
+        """The part of the load from integrals over cells; None if there are none."""
+        if self._volume_of_L is None:
+            return None
+        return np.array(fem.assemble_vector(self._compiled(self._volume_of_L, "L")).array)
+
+    def hats(self) -> Array:
+        """Integrals of the hats over the cells, for each of DOLFINx's nodes."""
+        one = fem.Constant(self._V.mesh, (1.0,) + (0.0,) * (self._V.dofmap.bs - 1))
+        dx = ufl.Measure("dx", domain=self._V.mesh)
+        form = self._compiled(ufl.dot(one, ufl.TestFunction(self._V)) * dx, "the volume")
+        return np.array(fem.assemble_vector(form).array[:: self._V.dofmap.bs])
+
     def _compiled(self, form: ufl.Form, name: str) -> fem.Form:
         """The form compiled by DOLFINx, which fails on all ranks or on none."""
         comm = self._decomposition.comm
         with raised_on_all_ranks(comm), named(f"{name} cannot be compiled"):
             return fem.form(form, **self._keywords)
+
+
+def cell_integrals(form: Any) -> ufl.Form | None:
+    """The part of a form over cells; None if it has none."""
+    if is_zero(form):
+        return None
+    parts = [part for part in form.integrals() if part.integral_type() == "cell"]
+    return ufl.Form(parts) if parts else None
 
 
 def _options(given: Mapping[str, Any] | None, what: str) -> dict[str, Any]:

@@ -95,20 +95,12 @@ class ContactDynamics(ContactProblem):
         if self._stabilised:
             self._predictor = Predictor(self.dofs, decomposition, self._settings)
 
-    def _forms(
-        self,
-        a: ufl.Form,
-        L: ufl.Form,
-        V: fem.FunctionSpace,
-        form_compiler_options: dict[str, Any] | None,
-        jit_options: dict[str, Any] | None,
-    ) -> Forms:
+    def _forms(self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any) -> Forms:
         mass = self._mass
         if isinstance(mass, ufl.Form) and self._lumped:
             raise InputError("lumped=True with a form of the mass; expected a density")
         if not isinstance(mass, ufl.Form):
             mass = mass_form(mass, V, self.decomposition, self._with_thickness, self._lumped)
-        options = (form_compiler_options, jit_options)
         return InertialForms(a, L, V, self.decomposition, *options, mass)
 
     @property

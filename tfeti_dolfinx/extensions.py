@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.checks import checked_callable, named, shown
 from tfeti_dolfinx.dual.dual import FeasibleLaw, contact_set
-from tfeti_dolfinx.dual.operator import MakePreconditioner
+from tfeti_dolfinx.dual.operator import PRECONDITIONERS, MakePreconditioner
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.options import Options
@@ -155,6 +155,23 @@ class Settings:
         Args:
             counters: Counts factorisations.
         """
+        return self.extensions.block or sparse_blocks(self.making(counters), self.local_choice)
+
+    def making(self, counters: Counters) -> Making:
+        """How inverses of subdomains are made."""
         kplus = self.extensions.kplus or KPLUS_TYPES[self.options.kplus_type]
-        how = Making(counters, kplus, f"{self.prefix}sub_")
-        return self.extensions.block or sparse_blocks(how, self.local_choice)
+        return Making(counters, kplus, f"{self.prefix}sub_")
+
+    def preconditioner(self, pc_type: str) -> MakePreconditioner | None:
+        """The preconditioner, the program's own if it brings one.
+
+        Raises:
+            InputError: It does, and the solver takes none.
+        """
+        own = self.extensions.preconditioner
+        if own is not None and pc_type == "none":
+            raise InputError(
+                f"extensions: a preconditioner is given, but -{self.prefix}pc_type is none, as "
+                "auto is with smalse; expected lumped or dirichlet, whose place it takes"
+            )
+        return own or PRECONDITIONERS.get(pc_type)

@@ -11,6 +11,7 @@ import ufl
 from dolfinx import fem
 
 from tfeti_dolfinx.assembly import Forms
+from tfeti_dolfinx.boundary_elements import BoundaryElements, check_boundary_elements
 from tfeti_dolfinx.checks import checked_type
 from tfeti_dolfinx.compat import require_real_petsc
 from tfeti_dolfinx.contact.arguments import Gap, gaps_by_position
@@ -60,6 +61,7 @@ class ContactProblem(Stepping):
         form_compiler_options: As in DOLFINx.
         jit_options: As in DOLFINx.
         extensions: Parts of one's own: a Block, a feasible set, a preconditioner, a K⁺, a monitor.
+        boundary_elements: Which volumes get boundary elements.
 
     Attributes:
         u: The displacement of the last solve.
@@ -85,6 +87,7 @@ class ContactProblem(Stepping):
         form_compiler_options: dict[str, Any] | None = None,
         jit_options: dict[str, Any] | None = None,
         extensions: Extensions | None = None,
+        boundary_elements: BoundaryElements | None = None,
     ) -> None:
         require_real_petsc()
         self.options = parse_options(petsc_options, petsc_options_prefix)
@@ -117,20 +120,21 @@ class ContactProblem(Stepping):
             self.dofs = TornDofs(V, decomposition)
         forms.thickness = self._thickness
         self._doubts = Doubts(decomposition, self.dofs)
+        if boundary_elements is not None:
+            check_boundary_elements(boundary_elements, extensions)
         self._system = System(
-            forms, self.bcs, self.contacts, self.dofs, decomposition, self._settings
+            forms,
+            self.bcs,
+            self.contacts,
+            self.dofs,
+            decomposition,
+            self._settings,
+            boundary_elements,
         )
 
-    def _forms(
-        self,
-        a: ufl.Form,
-        L: ufl.Form,
-        V: fem.FunctionSpace,
-        form_compiler_options: dict[str, Any] | None,
-        jit_options: dict[str, Any] | None,
-    ) -> Forms:
+    def _forms(self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any) -> Forms:
         """What gives the matrix and the load of a solve."""
-        return Forms(a, L, V, self.decomposition, form_compiler_options, jit_options)
+        return Forms(a, L, V, self.decomposition, *options)
 
     @property
     def dual(self) -> Dual:

@@ -29,7 +29,7 @@ class Report:
     Counters and seconds are those of the last solve; the first has what was before it, too.
 
     Attributes:
-        primal_dofs: Unknowns of the torn mesh.
+        primal_dofs: Unknowns of the torn mesh; with boundary elements those on their surface.
         dual_dofs: Rows of B.
         subdomains: Number of subdomains.
         bodies: Number of bodies.

@@ -20,11 +20,19 @@ from tfeti_dolfinx.subdomains.local import GroupedOperator
 
 
 def fill_sizes(
-    report: Report, dofs: TornDofs, decomposition: Decomposition, gluing: Gluing
+    report: Report, dofs: TornDofs, decomposition: Decomposition, gluing: Gluing, inside: int
 ) -> None:
-    """Fill in what is known before the dual problem is. Collective."""
+    """Fill in what is known before the dual problem is. Collective.
+
+    Args:
+        report: Takes it.
+        dofs: Dof maps.
+        decomposition: The torn mesh.
+        gluing: Rows.
+        inside: Unknowns that boundary elements do without.
+    """
     comm, constraints = dofs.comm, gluing.constraints
-    report.primal_dofs = int(dofs.offsets[-1]) * dofs.bs
+    report.primal_dofs = int(dofs.offsets[-1]) * dofs.bs - inside
     report.dual_dofs = comm.allreduce(constraints.num_rows)
     report.subdomains, report.bodies = decomposition.num_subdomains, decomposition.num_bodies
     report.split_subdomains = len(decomposition.split)

@@ -28,6 +28,7 @@ from tfeti_dolfinx.fields import (
 from tfeti_dolfinx.gluing.glue import Gluing
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mortar.surfaces import hat_integrals
+from tfeti_dolfinx.point_values import BoundarySolution, PointValues, checked_points, values_at
 from tfeti_dolfinx.states import ContactStatus
 
 
@@ -50,6 +51,7 @@ class Solution(ContactState):
     Attributes:
         u: Displacement in primal order.
         lam: Multipliers of this rank's rows.
+        boundary: What boundary elements know of it, if there are any.
         contacts: The contacts with their sides decided: ``contacts[i].surfaces[0]`` has the
             multipliers and the pressure.
         v: Velocity in DOLFINx's order of bodies with mass, else None.
@@ -67,6 +69,7 @@ class Solution(ContactState):
     ) -> None:
         super().__init__(u, multipliers, decomposition, gluing, contacts, frozen(thickness))
         self.v: Array | None = None
+        self.boundary: BoundarySolution | None = None
         self._stress = None
         if stress is not None:
             u_h = self.displacement
@@ -92,6 +95,24 @@ class Solution(ContactState):
     def has_velocity(self) -> bool:
         """Whether the bodies have mass."""
         return self.v is not None
+
+    def at(self, points: Any) -> PointValues:
+        """Displacement and stress at points inside the bodies. Collective.
+
+        In finite elements these are the values of ``displacement`` and ``stress``, in boundary
+        elements those of Somigliana's identity, which are as accurate inside as on the surface;
+        where a thickness is in the forms, but not in the problem, their stress has it, too.
+
+        Args:
+            points: The same on all ranks, shape ``(k, gdim)``; on the surface of boundary
+                elements ask ``displacement``.
+
+        Raises:
+            InputError: The points are of another shape, or not finite.
+        """
+        points = checked_points(points, self.decomposition.mesh.geometry.dim)
+        stress = self.stress if self.has_stress else None
+        return values_at(points, self.boundary, self.thickness, self.displacement, stress)
 
     @property
     def has_stress(self) -> bool:

@@ -118,7 +118,7 @@ class Stepping:
         system.count_slips_from(solution.u)
 
     def _make_solution(self, u: Array, multipliers: Multipliers, gluing: Gluing) -> Solution:
-        return Solution(
+        solution = Solution(
             u=u,
             multipliers=multipliers,
             decomposition=self.decomposition,
@@ -127,3 +127,5 @@ class Stepping:
             stress=self._stress,
             thickness=self._thickness,
         )
+        solution.boundary = self._system.replaced.solved(u)
+        return solution

@@ -11,12 +11,11 @@ from dolfinx import fem
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.assembly import Forms
+from tfeti_dolfinx.boundary_elements import BoundaryElements, Replaced
 from tfeti_dolfinx.contact.arguments import Gap
 from tfeti_dolfinx.contact.partners import ContactPartner
 from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.dual.dual import Dual
-from tfeti_dolfinx.dual.operator import PRECONDITIONERS
-from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import Settings
 from tfeti_dolfinx.friction_bounds import FrictionBounds
 from tfeti_dolfinx.gluing.glue import Gluing, glue
@@ -48,11 +47,13 @@ class System:
         dofs: Dof maps.
         decomposition: The torn mesh.
         settings: How to solve.
+        boundary: Where boundary elements are.
 
     Attributes:
         forms: The compiled forms.
         bcs: Dirichlet conditions.
         friction: What bounds tangential forces.
+        replaced: What boundary elements put in the place of finite ones.
         spectrum: Extreme eigenvalues of B Bᵀ, if somebody has put them here.
     """
 
@@ -64,10 +65,12 @@ class System:
         dofs: TornDofs,
         decomposition: Decomposition,
         settings: Settings,
+        boundary: BoundaryElements | None = None,
     ) -> None:
         self.forms, self.bcs, self._contacts = forms, bcs, contacts
         self._dofs, self._decomposition, self._settings = dofs, decomposition, settings
         self.friction = FrictionBounds(contacts, dofs, decomposition, forms.thickness)
+        self.replaced = Replaced(boundary, dofs, decomposition)
         self.spectrum: dict[str, float] = {}
         self._stages, self._counters, self._counted = Stages(), Counters(), 0
         self._seen = 0.0  # of ‖F‖, which more rows hardly change
@@ -155,7 +158,8 @@ class System:
     def count(self, report: Report) -> None:
         """Put sizes into a report, and what was made since it was last counted."""
         if self._gluing is not None:
-            fill_sizes(report, self._dofs, self._decomposition, self._gluing)
+            inside = self.replaced.inside()
+            fill_sizes(report, self._dofs, self._decomposition, self._gluing, inside)
             report.unmet_contacts = self.search.unmet()
         made, report.reused = self._stages.take_counts()
         report.assemblies, report.searches = made["stiffness"], made["search"]
@@ -190,11 +194,13 @@ class System:
 
     def _assemble_stiffness(self) -> None:
         self._K = self.forms.stiffness()
-        self._diagonal = self._dofs.to_primal(self._K.diagonal())
+        self._diagonal = self.replaced.diagonal(self._K, self._settings.making(self._counters))
+        if self.replaced.exists:  # the load that a force per volume makes depends on S
+            self.change("load")
 
     def _find_contacts(self) -> None:
-        dofs, decomposition = self._dofs, self._decomposition
-        self._search = ContactSearch(self._contacts, dofs, decomposition, self._diagonal)
+        dofs, cut = self._dofs, self._decomposition
+        self._search = ContactSearch(self._contacts, dofs, cut, self._diagonal)
         if self._known_rows is not None:
             self._search.take_rows(*self._known_rows)
             self._known_rows = None
@@ -210,16 +216,15 @@ class System:
 
     def _fill_right_side(self) -> None:
         values, gaps = made(self._prescribed).value, self.search.records.gap
-        slip = self.friction.slip(self.search)
-        self._gluing = self.gluing.with_right_side(values, gaps, slip)
+        self._gluing = self.gluing.with_right_side(values, gaps, self.friction.slip(self.search))
 
     def _assemble_load(self) -> None:
-        self._f = self.forms.load()
+        self._f = self.replaced.load(self.forms)
         if self._subdomains is not None:
             self._subdomains.update(f=self._dofs.to_primal(self._f))
 
     def _factor(self) -> None:
-        counters, given, make = self._counters, self._settings, self._settings.make_block
+        counters, given = self._counters, self._settings
         if self._K is None:  # it went into Blocks that could not be made
             self._assemble_stiffness()
             self._stages.made["stiffness"] += 1
@@ -227,28 +232,21 @@ class System:
         dofs, cut, choice = self._dofs, self._decomposition, given.local_choice
         data = subdomain_data(dofs, cut, K, self._f, self.gluing.constraints.trace)
         with added_options(given.prefix, given.factor_options):
-            clusters, block = clusters_of(dofs, cut, given.options.clusters), make(counters)
-            self._subdomains = make_subdomains(data, block, cut, counters, choice, clusters)
-
-    def _retrace(self) -> None:
-        made(self._subdomains).retrace(self.gluing.constraints.trace)
+            clusters = clusters_of(dofs, cut, given.options.clusters)
+            how = self.replaced.blocks(given.make_block(counters)), cut, counters, choice
+            self._subdomains = make_subdomains(data, *how, clusters)
 
     def _make_dual(self) -> None:
-        decomposition, dofs = self._decomposition, self._dofs
+        cut, dofs = self._decomposition, self._dofs
         rows = self.gluing.constraints.sets.contact_rows(dofs.comm)
         _, pc_type = resolve_types(self._settings.options, rows, self._settings.prefix)
-        if (own := self._settings.extensions.preconditioner) is not None and pc_type == "none":
-            raise InputError(
-                f"extensions: a preconditioner is given, but -{self._settings.prefix}pc_type is "
-                "none, as auto is with smalse; expected lumped or dirichlet, whose place it takes"
-            )
         with added_options(self._settings.prefix, self._settings.factor_options):
             self._dual = Dual(
                 constraints=self.gluing.constraints,
                 subdomains=made(self._subdomains),
-                body_names=decomposition.body_names,
-                mode_names=mode_names(decomposition.mesh.geometry.dim, dofs.bs),
-                preconditioner=own or PRECONDITIONERS.get(pc_type),
+                body_names=cut.body_names,
+                mode_names=mode_names(cut.mesh.geometry.dim, dofs.bs),
+                preconditioner=self._settings.preconditioner(pc_type),
                 options_prefix=self._settings.prefix,
                 feasible=self._settings.extensions.feasible_set,
             )
@@ -274,7 +272,7 @@ MAKERS: dict[str, Callable[[System], None]] = {
     "friction": lambda system: system.friction.set_limits(system.gluing, system.search),
     "load": System._assemble_load,
     "factors": System._factor,
-    "trace": System._retrace,
+    "trace": lambda system: made(system._subdomains).retrace(system.gluing.constraints.trace),
     "coarse problem": System._make_dual,
     "linear term": lambda system: system.dual.update_load(),
 }

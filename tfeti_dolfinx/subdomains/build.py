@@ -80,7 +80,7 @@ def submatrices(dofs: TornDofs, K: Any) -> Iterator[csr_array]:
         if np.all(np.diff(rows) == 1):
             yield _part(K, slice(rows[0], rows[-1] + 1), copied=not lone[s])
         else:
-            yield _submatrix(K, rows, primal, first)
+            yield submatrix(K, rows, primal, first)
 
 
 def _lone(starts: Array, entries_of_row: Array) -> Array:
@@ -137,7 +137,7 @@ def _part(K: Any, rows: slice, copied: bool) -> csr_array:
     return A
 
 
-def _submatrix(K: Any, rows: Array, primal: Array, first: int) -> csr_array:
+def submatrix(K: Any, rows: Array, primal: Array, first: int) -> csr_array:
     """Stiffness of one subdomain, in primal order."""
     K_s = K[rows]
     n = len(rows)

@@ -62,15 +62,21 @@ class EqualSubdomains:
         return made, np.arange(len(order), dtype=order.dtype)
 
 
-def _shape_and_order(x: Array, bs: int) -> tuple[bytes, Array]:
-    """The places of the nodes beside the lowest corner, and the unknowns in their order."""
+def places_in_order(x: Array) -> tuple[bytes, Array]:
+    """The places of the nodes beside the lowest corner in their order, and this order."""
     corner = x.min(axis=0)
     size = float((x.max(axis=0) - corner).max()) or 1.0
     places = np.rint((x - corner) / (PLACE * size)).astype(np.int64)
     nodes = np.lexsort(places.T)
+    return places[nodes].tobytes(), nodes
+
+
+def _shape_and_order(x: Array, bs: int) -> tuple[bytes, Array]:
+    """The places of the nodes, and the unknowns in their order."""
+    places, nodes = places_in_order(x)
     # sizes that differ show in K; as a part of the key they would have to be rounded
     order = (nodes[:, None] * bs + np.arange(bs)).ravel().astype(np.int32)
-    return bytes([bs]) + places[nodes].tobytes(), order
+    return bytes([bs]) + places, order
 
 
 def _equal(K: Any, other: Stiffness, here: Array) -> bool:

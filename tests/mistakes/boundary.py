@@ -1,0 +1,87 @@
+"""Mistakes with boundary elements."""
+
+import numpy as np
+import ufl
+from dolfinx import fem
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
+
+ALL = tfeti.BoundaryElements()
+
+
+def solved(s, elements=ALL, **changes):
+    s.problem(boundary_elements=elements, **changes).solve()
+
+
+def varying(s):
+    """A modulus that is another one in each cell."""
+    E = fem.Function(s.space("DG", 0))
+    E.x.array[:] = 1.0 + np.arange(len(E.x.array))
+    return E * s.a.integrals()[0].integrand() * s.dx
+
+
+def of_degree_two(s):
+    V = s.space("Lagrange", 2, (2,))
+    L = ufl.inner(s.f, ufl.TestFunction(V)) * s.dx
+    bc = fem.dirichletbc(np.zeros(2), s.on(V=V), V)
+    solved(s, a=s.a_on(V), L=L, bcs=[bc])
+
+
+def prescribed_inside(s):
+    """One subdomain, whose nodes in the middle are inside."""
+    d = tfeti.decompose(s.mesh, 1, facet_tags=s.facet_tags, surfaces=s.box[2])
+    V = fem.functionspace(d.mesh, s.vector)
+    v = ufl.TestFunction(V)
+    dofs = fem.locate_dofs_geometrical(V, lambda x: np.isclose(x[0], 0.5))
+    bc = fem.dirichletbc(np.zeros(2), dofs, V)
+    a, L = s.a_on(V, ufl.dx(domain=d.mesh)), ufl.ZeroBaseForm((v,))
+    tfeti.ContactProblem(a, L, [bc], [], d, boundary_elements=ALL).solve()
+
+
+LAW = r"body 0 \(volume 'steel'\), subdomain \d: boundary elements need one homogeneous, isotropic"
+
+GIVEN = {
+    "boundary elements that are a text": (
+        lambda s: s.problem(boundary_elements="steel"),
+        r"boundary_elements is 'steel'; expected tfeti_dolfinx.BoundaryElements",
+    ),
+    "boundary elements on an unknown volume": (
+        lambda s: s.problem(boundary_elements=tfeti.BoundaryElements("brass")),
+        r"no volume 'brass' in the mesh; its volumes are: 'steel' \(5\)",
+    ),
+    "boundary elements and a block of one's own": (
+        lambda s: s.problem(boundary_elements=ALL, extensions=tfeti.Extensions(block=SparseBlock)),
+        r"boundary_elements: extensions have a block, too; expected one of them",
+    ),
+}
+SOLVED = {
+    "a modulus that varies in boundary elements": (lambda s: solved(s, a=varying(s)), LAW),
+    "springs on boundary elements": (lambda s: solved(s, a=s.a + s.mass), LAW),
+    "a law of boundary elements that is not isotropic": (
+        lambda s: solved(s, a=s.a + s.u[0].dx(0) * s.v[0].dx(0) * s.dx),
+        LAW,
+    ),
+    "displacements of degree 2 on boundary elements": (
+        of_degree_two,
+        r"boundary elements for 2 components of degree 2; expected displacements of degree 1",
+    ),
+    "a load per volume that varies in boundary elements": (
+        lambda s: solved(s, L=ufl.SpatialCoordinate(s.d.mesh)[0] * s.v[1] * s.dx),
+        r"subdomain \d: a load per volume varies there; boundary elements take a constant force",
+    ),
+    "a value prescribed inside boundary elements": (
+        prescribed_inside,
+        r"body 0, subdomain 0: a value is prescribed inside boundary elements; expected it on",
+    ),
+    "points of another dimension": (
+        lambda s: s.solved.at([(0.0, 0.0, 0.0)]),
+        r"points of shape \(1, 3\); expected finite numbers of shape \(k, 2\)",
+    ),
+    "points that are a text": (
+        lambda s: s.solved.at("middle"),
+        r"points: could not convert string to float: 'middle'; expected numbers of shape",
+    ),
+}
+
+TABLES = ("GIVEN", "SOLVED")

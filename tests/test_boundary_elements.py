@@ -1,0 +1,271 @@
+"""Subdomains with boundary elements: their matrices, loads, and scenes with finite elements."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx import mesh as dmesh
+from mpi4py import MPI
+from scenes import clamp, curved_obstacle, decomposed, displacement, forms, hooke, relative
+from scipy.linalg import eigh
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.boundary.parts import Parts
+from tfeti_dolfinx.boundary.steklov import rigid_motions
+from tfeti_dolfinx.compat import assemble_csr
+from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
+from tfeti_dolfinx.subdomains.conformance import check_block
+from tfeti_dolfinx.subdomains.kplus import Making
+
+ALL = tfeti.BoundaryElements()
+
+
+def made_parts(d, K=None):
+    """All subdomains of this rank with boundary elements."""
+    V, a, _ = forms(d.mesh, d.facet_tags, (0.0,) * d.mesh.geometry.dim, d.surface("top"))
+    dofs, how = TornDofs(V, d), Making()
+    parts = Parts(dofs, d, np.ones(len(d.subdomains), dtype=bool), how)
+    K = assemble_csr(fem.form(a)) if K is None else K
+    parts.take_stiffness(K, dofs.to_primal(K.diagonal()))
+    return parts, dofs, K, how
+
+
+def moved(d, move):
+    d.mesh.geometry.x[:] = move(d.mesh.geometry.x)
+    return d
+
+
+def sector(x):
+    r, angle = 1 + x[:, 0], 1.2 * x[:, 1]
+    return np.stack((r * np.cos(angle), r * np.sin(angle), x[:, 2]), axis=1)
+
+
+def wedge(x):
+    return np.stack((x[:, 0], x[:, 1], x[:, 2] * (1 + 0.5 * x[:, 0])), axis=1)
+
+
+def hook(x):
+    return np.where((x[0] < 0.5) | (x[1] < 0.5), 0, 1)
+
+
+def cut_out(cell, n, subdomain):
+    mesh = dmesh.create_unit_square(MPI.COMM_WORLD, n, n, dmesh.to_type(cell))
+    top = dmesh.locate_entities_boundary(mesh, 1, lambda x: np.isclose(x[1], 1))
+    tags = dmesh.meshtags(mesh, 1, np.sort(top), np.ones_like(top))
+    return tfeti.decompose(mesh, subdomain, facet_tags=tags, surfaces={"top": 1})
+
+
+SHAPES = {
+    "square": lambda: decomposed("triangle", 6, 1),
+    "squares": lambda: decomposed("quadrilateral", 8, 4),
+    "hook": lambda: cut_out("triangle", 6, hook),
+    "sector": lambda: moved(decomposed("triangle", 6, 2), sector),
+    "bar": lambda: moved(decomposed("tetrahedron", 2, 1), lambda x: x * (2.0, 1.0, 1.0)),
+    "wedge": lambda: moved(decomposed("tetrahedron", 2, 2), wedge),
+}
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_the_schur_complement_is_softer_than_that_of_finite_elements(name):
+    parts, *_ = made_parts(SHAPES[name]())
+    for part in parts.parts.values():
+        shape, d = part.shape, part.shape.x.shape[1]
+        cut = shape.outer * d
+        S, parted = shape.steklov.S, []
+        for K in (shape.K_fem.toarray(), shape.K.toarray()):
+            inner = np.linalg.solve(K[cut:, cut:], K[cut:, :cut]) if cut < len(K) else 0.0
+            parted.append(K[:cut, :cut] - K[:cut, cut:] @ inner if cut < len(K) else K)
+        largest = np.abs(S).max()
+        assert np.abs(parted[1] - S).max() < 1e-12 * largest
+        Q = np.linalg.qr(rigid_motions(shape.x[: shape.outer]), mode="complete")[0]
+        Q = Q[:, d * (d + 1) // 2 :]
+        ratios = eigh(Q.T @ S @ Q, Q.T @ parted[0] @ Q, eigvals_only=True)
+        # constant stresses have the same energy
+        assert ratios[-1] < (1 + 1e-10 if d == 2 else 1 + 1e-5)
+        assert ratios[0] > 0.05
+
+
+def test_equal_subdomains_share_a_shape():
+    def subdomain(x):
+        return np.minimum((2 * x[0]).astype(int), 1) + 2 * np.minimum((2 * x[1]).astype(int), 1)
+
+    parts, *_ = made_parts(cut_out("quadrilateral", 8, subdomain))
+    shapes = {id(part.shape) for part in parts.parts.values()}
+    assert len(shapes) == min(len(parts.parts), 1)
+
+
+@pytest.mark.parametrize(("cell", "n"), [("triangle", 6), ("hexahedron", 3)])
+def test_blocks_keep_their_promises(cell, n):
+    d = decomposed(cell, n, 2)
+    parts, dofs, K, how = made_parts(d)
+    trace = np.concatenate(
+        [np.empty(0, dtype=np.int64)]
+        + [parts._unknowns(s).start + np.flatnonzero(p.on_surface) for s, p in parts.parts.items()]
+    )
+    data = subdomain_data(dofs, d, K, np.zeros(dofs.num_nodes * dofs.bs), trace)
+    subdomains = make_subdomains(data, parts.blocks(None), d)
+    for block, part in zip(subdomains.blocks, parts.parts.values(), strict=True):
+        check_block(block, part.shape.K[part.place][:, part.place])
+    subdomains.destroy()
+
+
+def problem(d, elements=ALL, contacts=(), sides=("left",), load=None, **options):
+    gdim = d.mesh.geometry.dim
+    V, a, L = forms(d.mesh, d.facet_tags, (0.0,) * (gdim - 1) + (-0.05,), d.surface("top"))
+    if load is not None:
+        L = load(V)
+    return tfeti.ContactProblem(
+        a,
+        L,
+        [clamp(V, d.facets(side)) for side in sides],
+        list(contacts),
+        d,
+        stress=hooke(),
+        petsc_options={"tfeti_rtol": 1e-9, **options},
+        boundary_elements=elements,
+    )
+
+
+@pytest.mark.parametrize(
+    ("cell", "sizes", "qp_type"),
+    [("triangle", (6, 12), "newton"), ("quadrilateral", (6, 12), "smalse")]
+    + [("hexahedron", (3, 6), "newton")],
+)
+def test_a_scene_of_both_kinds_of_elements_has_one_limit(cell, sizes, qp_type):
+    floor = tfeti.Obstacle("bottom", curved_obstacle(3 if cell == "hexahedron" else 2))
+    difference = []
+    for n in sizes:
+        found = []
+        for elements in (None, ALL):
+            p = problem(decomposed(cell, n, 4), elements, [floor], tfeti_qp_type=qp_type)
+            p.solve()
+            found.append(displacement(p)[1])
+            p.destroy()
+        assert found[1][:, -1].min() < found[0][:, -1].min()  # softer
+        difference.append(relative(found[1], found[0]))
+    assert difference[1] < 0.65 * difference[0] < 0.65 * 0.1
+
+
+def test_subdomains_do_not_matter_much_and_unknowns_are_those_on_surfaces():
+    whole, parted = (decomposed("quadrilateral", 8, count) for count in (1, 4))
+    found = []
+    for d, count in ((whole, 2 * 32), (parted, 2 * 64)):
+        p = problem(d)
+        p.solve()
+        assert p.report.primal_dofs == count
+        found.append(displacement(p))
+    assert relative(found[1][1], found[0][1]) < 0.02
+
+
+STRETCH = np.array([0.1, -0.1 * 0.3 / 0.7])
+
+
+def tension(d, elements):
+    """Two volumes under uniaxial tension, solved."""
+    V, a, _ = forms(d.mesh, d.facet_tags, (0.0, 0.0), d.surface("top"))
+    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+    t = fem.Constant(d.mesh, (0.1 / (1 - 0.3**2), 0.0))
+    rollers = [
+        fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(i), 1, d.facets(s)), V.sub(i))
+        for i, s in enumerate(("left", "bottom"))
+    ]
+    p = tfeti.ContactProblem(
+        a,
+        ufl.dot(t, ufl.TestFunction(V)) * ds(d.surface("right")),
+        rollers,
+        [],
+        d,
+        stress=hooke(),
+        petsc_options={"tfeti_rtol": 1e-10},
+        boundary_elements=elements,
+    )
+    p.solve()
+    return p
+
+
+def test_constant_stresses_are_exact_also_with_finite_elements():
+    for elements in (tfeti.BoundaryElements("low"), ALL):
+        p = tension(two_volumes(), elements)
+        x, u = displacement(p)
+        assert np.abs(u - x[:, :2] * STRETCH).max() < 1e-9
+        p.destroy()
+
+
+def two_volumes(n=4):
+    """A square of two volumes, each two subdomains."""
+    mesh = dmesh.create_unit_square(MPI.COMM_WORLD, n, n)
+    tdim = 2
+    cells = np.arange(mesh.topology.index_map(tdim).size_local, dtype=np.int32)
+    high = (dmesh.compute_midpoints(mesh, tdim, cells)[:, 1] > 0.5).astype(np.int32)
+    cell_tags = dmesh.meshtags(mesh, tdim, cells, 1 + high)
+    names = {"left": (0, 0.0), "right": (0, 1.0), "bottom": (1, 0.0), "top": (1, 1.0)}
+    facets = [
+        dmesh.locate_entities_boundary(mesh, 1, lambda x, i=i, at=at: np.isclose(x[i], at))
+        for i, at in names.values()
+    ]
+    values = np.repeat(np.arange(1, 5, dtype=np.int32), [len(f) for f in facets])
+    facets = np.concatenate(facets)
+    order = np.argsort(facets)
+    return tfeti.decompose(
+        mesh,
+        lambda x: (x[0] > 0.5) + 2 * (x[1] > 0.5),
+        cell_tags=cell_tags,
+        facet_tags=dmesh.meshtags(mesh, 1, facets[order], values[order]),
+        volumes={"low": 1, "high": 2},
+        surfaces={name: tag for tag, name in enumerate(names, start=1)},
+    )
+
+
+def test_a_force_per_volume():
+    """A square that stands on its side: boundary elements are nearer to a fine solution."""
+
+    def weight(V):
+        return ufl.dot(fem.Constant(V.mesh, (0.02, -0.1)), ufl.TestFunction(V)) * ufl.dx
+
+    found = []
+    for n, elements in ((4, None), (4, ALL), (16, None)):
+        p = problem(decomposed("quadrilateral", n, 4), elements, sides=("bottom",), load=weight)
+        p.solve()
+        x, u = displacement(p)
+        found.append(u[np.all(np.isclose(x * 4, np.rint(x * 4)), axis=1)])
+        p.destroy()
+    assert relative(found[1], found[2]) < 0.6 * relative(found[0], found[2]) < 0.1
+
+
+def test_points_inside():
+    """A constant stress in finite elements and in boundary elements, and no body elsewhere."""
+    d = two_volumes()
+    points = np.array([(0.3, 0.2), (0.7, 0.3), (0.2, 0.9), (0.71, 0.77), (1.5, 0.5)])
+    for elements in (None, tfeti.BoundaryElements("low"), ALL):
+        p = tension(d, elements)
+        values = p.solution.at(points)
+        assert np.abs(values.displacement[:4] - points[:4] * STRETCH).max() < 1e-8
+        stress = np.broadcast_to([[0.1 / (1 - 0.3**2), 0.0], [0.0, 0.0]], (4, 2, 2))
+        assert np.abs(values.stress[:4] - stress).max() < 1e-8
+        assert np.all(np.isnan(values.displacement[4]))
+        p.destroy()
+
+
+def test_a_change_of_modulus_and_of_load():
+    """A second solve makes S anew where the form has changed, and only there."""
+    d = decomposed("triangle", 6, 4)
+    V, _, _ = forms(d.mesh, d.facet_tags, (0.0, 0.0), d.surface("top"))
+    elastic = tfeti.Elasticity(d, E=1.0, nu=0.3, model="plane_strain")
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    force = fem.Constant(d.mesh, (0.0, -0.1))
+    p = tfeti.ContactProblem(
+        elastic.a(u, v),
+        ufl.dot(force, v) * ufl.dx,
+        [clamp(V, d.facets("left"))],
+        [],
+        d,
+        petsc_options={"tfeti_rtol": 1e-10},
+        boundary_elements=ALL,
+    )
+    first = p.solve().x.array.copy()
+    elastic.E.value = 2.0
+    assert np.allclose(p.solve().x.array, first / 2, atol=1e-9)
+    force.value *= 4.0
+    assert np.allclose(p.solve().x.array, 2 * first, atol=1e-8)
+    assert p.report.factorizations == 0

@@ -1,0 +1,192 @@
+"""The Steklov–Poincaré operator of boundary elements: exact identities and Kelvin's solution."""
+
+import numpy as np
+import pytest
+from panels import HOOK, PLANE, SPACE, SQUARE, box, kelvin, kelvin_energy, moved, polygon
+from scipy.integrate import dblquad
+
+from tfeti_dolfinx.boundary.inside import Inside, contains
+from tfeti_dolfinx.boundary.integrals2d import _by_rule, _exact, layers_2d
+from tfeti_dolfinx.boundary.integrals3d import layers_3d
+from tfeti_dolfinx.boundary.panels import Panels
+from tfeti_dolfinx.boundary.rules import apart_rule, touching_rule
+from tfeti_dolfinx.boundary.steklov import Law, rigid_motions, single_layer, steklov
+from tfeti_dolfinx.errors import FactorError
+
+LAW = Law(mu=0.4, nu=0.3)
+SHAPES = {**PLANE, **SPACE}
+GRADIENT = np.array([[1.0, 0.2, 0.3], [0.1, -0.5, 0.2], [0.4, 0.1, 0.3]])
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_rigid_motions_and_constant_stresses(name):
+    panels = SHAPES[name]()
+    made = steklov(panels, LAW)
+    largest = np.abs(made.S).max()
+    assert np.abs(made.S @ rigid_motions(panels.x)).max() < 1e-13 * largest
+    assert np.array_equal(made.S, made.S.T)
+    assert made.defect < (1e-12 if panels.dim == 2 else 2e-6)
+    G = GRADIENT[: panels.dim, : panels.dim]
+    u, stress = (panels.x @ G.T).ravel(), LAW.stress(G)
+    exact = panels.normal @ stress
+    tractions = (made.tractions @ u).reshape(exact.shape)
+    bound = 1e-11 if panels.dim == 2 else 1e-4
+    assert np.abs(tractions - exact).max() < bound * np.abs(exact).max()
+    work = np.sum(stress * G) * panels.volume
+    assert abs(u @ made.S @ u / work - 1) < (1e-12 if panels.dim == 2 else 2e-5)
+    values = np.linalg.eigvalsh(made.S)
+    kernel = {2: 3, 3: 6}[panels.dim]
+    assert np.abs(values[:kernel]).max() < 1e-13 * values[-1] < 1e-9 * values[kernel]
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_size_and_place_and_direction_do_not_matter(dim):
+    panels = (PLANE["hook"] if dim == 2 else SPACE["bar"])(2)
+    Q = np.linalg.qr(GRADIENT[:dim, :dim])[0]
+    Q *= np.sign(np.linalg.det(Q)) ** np.eye(dim)[0]
+    other = moved(panels, lambda x: 7.0 * x @ Q.T + 3.0)
+    turn = np.kron(np.eye(len(panels.x)), Q)
+    S = turn @ steklov(panels, LAW).S @ turn.T
+    bound = 1e-12 * np.abs(S).max()
+    assert np.abs(steklov(other, LAW).S * 7.0 ** (2 - dim) - S).max() < bound
+    harder = steklov(panels, Law(1e5 * LAW.mu, LAW.nu)).S
+    assert np.abs(turn @ harder @ turn.T / 1e5 - S).max() < bound
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_double_layer_of_one(dim):
+    panels = (PLANE["ring"] if dim == 2 else SPACE["ball"])()
+    K = (layers_2d if dim == 2 else layers_3d)(panels).double
+    wrong = np.abs(K.sum(axis=1) + 0.5 * panels.measure) / panels.measure
+    assert wrong.max() < (1e-14 if dim == 2 else 1e-4)
+
+
+def test_closed_forms_are_the_integrals():
+    panels = polygon([(0, 0), (1, 0.2), (1.5, 1.3), (0.2, 2.0)], 3, 1.5)
+    layers = layers_2d(panels)
+    corners, rho = panels.corners, 2 * panels.diameter
+    for i, j in ((0, 1), (1, 0), (0, 5), (4, 2)):
+        a, b = corners[i], corners[j]
+        scale = panels.measure[i] * panels.measure[j]
+
+        def over(kernel, a=a, b=b, j=j, scale=scale):
+            def value(t, s):
+                r = a[0] + s * (a[1] - a[0]) - b[0] - t * (b[1] - b[0])
+                return kernel(r, np.linalg.norm(r), panels.normal[j], t)
+
+            return scale / (2 * np.pi) * dblquad(value, 0, 1, 0, 1, epsabs=1e-10)[0]
+
+        assert layers.single[i, j] == pytest.approx(over(lambda r, d, n, t: -np.log(d / rho)), 1e-7)
+        for k, m in ((0, 0), (0, 1), (1, 1)):
+            found = over(lambda r, d, n, t, k=k, m=m: r[k] * r[m] / d**2)
+            assert layers.tensor[k, m][i, j] == pytest.approx(found, abs=1e-8)
+        for k in range(2):
+            found = over(lambda r, d, n, t, k=k: r @ n / d**2 * (t if k else 1 - t))
+            assert layers.on_corners[k][i, j] == pytest.approx(found, abs=1e-8)
+
+
+def test_gauss_and_closed_form_agree_where_they_meet():
+    panels = polygon(SQUARE, 40)
+    apart = np.linalg.norm(panels.midpoints[:, None] - panels.midpoints, axis=2)
+    i, j = np.nonzero(np.abs(apart / panels.measure[0] - 6.0) < 0.5)
+    for rule, exact in zip(_by_rule(panels, i, j, 8), _exact(panels, i, j), strict=True):
+        assert np.abs(rule - exact).max() < 1e-11 * panels.measure[0] ** 2
+
+
+@pytest.mark.parametrize("shared", [0, 1, 2, 3])
+def test_rules_integrate_polynomials(shared):
+    rule = apart_rule(4) if shared == 0 else touching_rule(shared, 4)
+    assert rule.weights.sum() == pytest.approx(1.0)
+    assert np.allclose([rule.x.sum(axis=1), rule.y.sum(axis=1)], 1.0)
+    # the mean of λ_i λ_j over a triangle is 1/6 or 1/12
+    for at in (rule.x, rule.y):
+        second = (at * rule.weights[:, None]).T @ at
+        assert np.allclose(second, (1 + np.eye(3)) / 12)
+    assert np.allclose((rule.x * rule.weights[:, None]).T @ rule.y, 1 / 9)
+
+
+def test_the_potential_of_a_square_plate():
+    """∫∫1/r over a unit square with itself, in closed form."""
+    corners = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], dtype=float)
+    plate = Panels(corners, np.array([(0, 1, 2), (0, 2, 3)]))
+    exact = 4 * np.log(1 + np.sqrt(2)) + 4 / 3 * (1 - np.sqrt(2))
+    assert 4 * np.pi * layers_3d(plate).single.sum() == pytest.approx(exact, rel=1e-6)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_kelvin_converges_with_the_square_of_h(dim):
+    shape = PLANE["square"] if dim == 2 else SPACE["cube"]
+    source = np.array([0.6, 0.45]) if dim == 2 else np.array([2.0, 0.8, 0.6])
+    errors = []
+    for m in (8, 16, 32) if dim == 2 else (3, 6):
+        panels = shape(m)
+        u = kelvin(panels.x, source, LAW)[0].ravel()
+        exact = kelvin_energy(panels, source, LAW, halvings=6 if dim == 2 else 4)
+        errors.append(1 - u @ steklov(panels, LAW).S @ u / exact)
+    assert min(errors) > 0  # from below
+    slopes = np.log2(np.array(errors[:-1]) / errors[1:])
+    assert np.all(slopes > 1.8), (errors, slopes)
+
+
+def test_single_layer_is_positive_also_of_large_bodies():
+    for scale in (1e-3, 1.0, 1e3):
+        panels = moved(polygon(HOOK, 6), lambda x, scale=scale: scale * x)
+        assert np.linalg.eigvalsh(single_layer(layers_2d(panels), LAW))[0] > 0
+
+
+def test_a_surface_that_lies_on_itself_is_refused():
+    twice = box(1)
+    twice = Panels(twice.x, np.concatenate((twice.nodes, twice.nodes)))
+    with pytest.raises(FactorError, match="closed surface"):
+        steklov(twice, LAW)
+
+
+INSIDE = {
+    2: np.array([(0.25, 0.25), (0.3, 0.1), (0.45, 0.45), (0.25, 0.499)]),
+    3: np.array([(0.5, 0.5, 0.5), (0.7, 0.3, 0.2), (0.9, 0.9, 0.9), (0.5, 0.5, 0.99)]),
+}
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_inside_constant_stresses_and_forces_per_volume_are_exact(dim):
+    panels, points = PLANE["square"]() if dim == 2 else SPACE["cube"](), INSIDE[dim]
+    made, b = steklov(panels, LAW), np.arange(1.0, dim + 1)
+    G, middle = GRADIENT[:dim, :dim], panels.x.mean(axis=0)
+
+    def exact(x):  # and div σ = −b
+        return x @ G.T - b * (x - middle) ** 2 / (2 * (LAW.lmbda + 2 * LAW.mu))
+
+    inside = Inside(made, exact(panels.x), b)
+    bound = 1e-13 if dim == 2 else 1e-6
+    assert np.abs(inside.displacement(points) - exact(points)).max() < bound
+    slope = np.einsum("ki,ij->kij", -b * (points - middle), np.eye(dim))
+    stress = LAW.stress(G + slope / (LAW.lmbda + 2 * LAW.mu))
+    assert np.abs(inside.stress(points) - stress).max() < (1e-9 if dim == 2 else 1e-5)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_inside_kelvin_converges_with_the_square_of_h(dim):
+    shape = PLANE["square"] if dim == 2 else SPACE["cube"]
+    source = np.array([0.6, 0.45]) if dim == 2 else np.array([1.6, 0.8, 0.6])
+    u, gradient = kelvin(INSIDE[dim], source, LAW)
+    exact = u, LAW.stress(gradient)
+    errors = []
+    for m in (8, 16, 32) if dim == 2 else (2, 4):
+        panels = shape(m)
+        surface = kelvin(panels.x, source, LAW)[0]
+        inside = Inside(steklov(panels, LAW), surface, np.zeros(dim))
+        found = inside.displacement(INSIDE[dim]), inside.stress(INSIDE[dim])
+        errors.append(
+            [np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in zip(found, exact, strict=True)]
+        )
+    assert np.all(np.log2(np.array(errors[:-1]) / errors[1:]) > 1.8), errors
+    assert errors[-1][0] < (1e-3 if dim == 2 else 2e-2)
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_what_is_inside_is_found(name):
+    panels = SHAPES[name]()
+    middle, size = panels.midpoints, panels.size.min()
+    for sign in (-1.0, 1.0):
+        points = middle + sign * 1e-2 * size * panels.normal
+        assert np.all(contains(panels, points) == (sign < 0))

@@ -1,0 +1,123 @@
+"""Displacement and stress at points of the user's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from dolfinx import fem, geometry
+from mpi4py import MPI
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.boundary.inside import Inside
+from tfeti_dolfinx.errors import InputError
+
+# Of the size of the mesh: how far from a cell of finite elements a point may be
+PADDING = 1e-10
+
+
+@dataclass(frozen=True)
+class PointValues:
+    """Values at points; not a number where a point is in no body.
+
+    Attributes:
+        displacement: Shape ``(k, gdim)``.
+        stress: Shape ``(k, gdim, gdim)``, in 2D without σ_zz.
+    """
+
+    displacement: Array
+    stress: Array
+
+
+@dataclass(frozen=True)
+class BoundarySolution:
+    """What boundary elements know of a solution.
+
+    Attributes:
+        bodies: Gives the subdomains of this rank that have them.
+        finite: Cells of this rank that have finite elements.
+    """
+
+    bodies: Callable[[], Iterable[Inside]]
+    finite: Array
+
+
+def checked_points(points: Any, gdim: int) -> Array:
+    """Points as an array of shape ``(k, gdim)``.
+
+    Raises:
+        InputError: They are of another shape, or not finite numbers.
+    """
+    try:
+        found = np.array(points, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"points: {error}; expected numbers of shape (k, {gdim})") from error
+    if found.ndim != 2 or found.shape[1] != gdim or not np.all(np.isfinite(found)):
+        raise InputError(
+            f"points of shape {found.shape}; expected finite numbers of shape (k, {gdim})"
+        )
+    return found
+
+
+def values_at(
+    points: Array,
+    boundary: BoundarySolution | None,
+    thickness: Any,
+    u: fem.Function,
+    stress: fem.Function | None,
+) -> PointValues:
+    """Values at points, means of the subdomains that share a point. Collective.
+
+    Args:
+        points: The same on all ranks, shape ``(k, gdim)``.
+        boundary: What boundary elements know.
+        thickness: What stresses of boundary elements have to be divided by.
+        u: Displacement on the torn mesh.
+        stress: Stress in the cells, 3×3, or None.
+    """
+    k, d = points.shape
+    total = np.zeros((k, 1 + d + d * d))
+    for body in () if boundary is None else boundary.bodies():
+        inside = np.flatnonzero(body.contains(points))
+        sigma = body.stress(points[inside]) / _number(thickness)
+        total[inside] += _row(body.displacement(points[inside]), sigma)
+    place, cells = _cells(u.function_space.mesh, points)
+    if boundary is not None:
+        kept = np.isin(cells, boundary.finite)
+        place, cells = place[kept], cells[kept]
+    if len(place):
+        x = np.zeros((len(place), 3))
+        x[:, :d] = points[place]
+        sigma = np.full((len(place), d, d), np.nan)
+        if stress is not None:
+            sigma = stress.eval(x, cells).reshape(-1, 3, 3)[:, :d, :d]
+        np.add.at(total, place, _row(u.eval(x, cells).reshape(-1, d), sigma))
+    u.function_space.mesh.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
+    with np.errstate(invalid="ignore"):
+        mean = np.where(total[:, :1] > 0.0, total[:, 1:] / total[:, :1], np.nan)
+    return PointValues(mean[:, :d], mean[:, d:].reshape(k, d, d))
+
+
+def _row(u: Array, stress: Array) -> Array:
+    return np.column_stack((np.ones(len(u)), u, stress.reshape(len(u), u.shape[1] ** 2)))
+
+
+def _number(thickness: Any) -> float:
+    """A thickness as a number; where it varies there are no boundary elements."""
+    if isinstance(thickness, fem.Constant):
+        return float(thickness.value)
+    return float(thickness) if isinstance(thickness, float) else 1.0
+
+
+def _cells(mesh: Any, points: Array) -> tuple[Array, Array]:
+    """Points by position, and the cells of this rank that each of them is in."""
+    x = np.zeros((len(points), 3))
+    x[:, : points.shape[1]] = points
+    size = float(np.ptp(mesh.geometry.x, axis=0).max(initial=0.0)) if len(mesh.geometry.x) else 0.0
+    tree = geometry.bb_tree(mesh, mesh.topology.dim, padding=PADDING * size)
+    near = geometry.compute_collisions_points(tree, x)
+    found = geometry.compute_colliding_cells(mesh, near, x)
+    place = np.repeat(np.arange(len(points)), np.diff(found.offsets))
+    return place, np.asarray(found.array)
