@@ -9,15 +9,15 @@ from typing import Any
 
 
 @contextmanager
-def picture(path: Path, panels: int, height: float = 3.4) -> Iterator[list[Any]]:
-    """Axes of panels side by side, written when the block ends."""
+def picture(path: Path, panels: int, height: float = 3.4, rows: int = 1) -> Iterator[list[Any]]:
+    """Axes of panels side by side, row by row, written when the block ends."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(4.6 * panels, height), layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(1, panels, squeeze=False)[0]
-    yield list(axes)
+    axes = figure.subplots(rows, panels, squeeze=False)
+    yield list(axes.ravel())
     figure.savefig(path, dpi=120)
 
 

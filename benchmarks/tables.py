@@ -20,6 +20,8 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def _text(value: Any) -> str:
+    if value is None:
+        return "–"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 

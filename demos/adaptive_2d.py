@@ -8,6 +8,7 @@
 """Hertz contact in 2D on meshes that follow the estimated error."""
 
 import sys
+import time
 from functools import partial
 from pathlib import Path
 
@@ -38,12 +39,12 @@ hertz = LineContact.from_half_width(a, R, E / (1 - nu**2))
 SMALLER, LARGER, STEP = 4.0, 2.0, 0.5
 
 
-def scene(decomposition):
+def scene(decomposition, degree=1):
     # ## Elasticity, load and contact
     #
     # As in `hertz_2d.py`. The closed form says which load; nothing else is taken from it.
     elastic = tfeti.Elasticity(decomposition, E=E, nu=nu, model="plane_strain")
-    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", degree, (2,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
     ds = ufl.Measure("ds", domain=decomposition.mesh, subdomain_data=decomposition.facet_tags)
     traction = fem.Constant(decomposition.mesh, (0.0, -hertz.load / (2 * R)))
@@ -78,34 +79,54 @@ def new_sizes(solution, wanted):
     return None if parts is None else [np.concatenate(part) for part in zip(*parts, strict=True)]
 
 
-def run(argv):
-    demo = Demo(__doc__, argv, configure)
-    arguments, comm, sizes = demo.arguments, MPI.COMM_WORLD, None
-    goal = arguments.error or (0.2 if arguments.quick else 0.05)
-    options = {"tfeti_rtol": "auto", **demo.petsc_options}
+def solves(goal, subdomains, options):
+    """Problems that are solved, each on a better mesh, until the error is small enough. Collective.
+
+    Yields:
+        The problem, its estimate, and the seconds that gmsh has taken for the mesh. Destroying
+        the problem is up to the caller.
+    """
+    comm, sizes = MPI.COMM_WORLD, None
 
     # ## Solve, estimate, mesh anew
     #
     # gmsh meshes on rank 0, from the sizes that the last estimate asks for.
     while True:
-        model = None
+        start, model = time.perf_counter(), None
         if comm.rank == 0:
             field = None if sizes is None else partial(sizes_from_triangles, *sizes)
             model = build(R, fine=0.1 * R, fine_radius=10 * R, sizes=field)
-        decomposition = tfeti.read_gmsh(model, comm, arguments.subdomains)
+        comm.barrier()
+        meshing = time.perf_counter() - start
+        decomposition = tfeti.read_gmsh(model, comm, subdomains)
         problem = tfeti.ContactProblem(**scene(decomposition), petsc_options=options)
         problem.solve()
         found = problem.estimate()
+        wanted = max(STEP * found.discretisation, 0.95 * goal * found.energy)
+        done = found.relative_discretisation <= goal
+        if not done:
+            sizes = new_sizes(problem.solution, wanted)
+        yield problem, found, meshing
+        if done:
+            return
+
+
+def run(argv):
+    demo = Demo(__doc__, argv, configure)
+    arguments, comm = demo.arguments, MPI.COMM_WORLD
+    goal = arguments.error or (0.2 if arguments.quick else 0.05)
+    options = {"tfeti_rtol": "auto", **demo.petsc_options}
+    last = None
+    for problem, found, _ in solves(goal, arguments.subdomains, options):
         if comm.rank == 0:
             print(
                 f"{problem.report.primal_dofs} unknowns, error {found.relative_discretisation:.2%}",
                 flush=True,
             )
-        if found.relative_discretisation <= goal:
-            break
-        wanted = max(STEP * found.discretisation, 0.95 * goal * found.energy)
-        sizes = new_sizes(problem.solution, wanted)
-        problem.destroy()
+        if last is not None:
+            last.destroy()
+        last = problem
+    problem = last
 
     contact = problem.solution.contact(0)
     problem.report.errors.update(compare(comm, contact, contact.points[:, 0], hertz))

@@ -56,14 +56,14 @@ def torn_mesh(arguments):
     return tfeti.read_gmsh(model, comm, arguments.subdomains or (2 if arguments.quick else 8))
 
 
-def scene(decomposition):
+def scene(decomposition, degree=1):
     """The loads, and what ``ContactProblem`` is made of."""
     mesh = decomposition.mesh
 
     # ## Elasticity in plane strain
     elastic = tfeti.Elasticity(decomposition, E=E, nu=nu, model="plane_strain")
 
-    V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
+    V = fem.functionspace(mesh, ("Lagrange", degree, (2,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
     ds = ufl.Measure("ds", domain=mesh, subdomain_data=decomposition.facet_tags)
 

@@ -39,15 +39,11 @@ def closed_form():
     return LineContact.from_load(P, R, 1 / sum((1 - nu**2) / E for E in young.values()))
 
 
-def run(argv):
-    demo = Demo(__doc__, argv, configure)
-    arguments, comm = demo.arguments, MPI.COMM_WORLD
-    hertz = closed_form()
-    a = hertz.half_width
-
+def torn_mesh(arguments):
     # ## Mesh
     #
     # Near the contact the block's elements are 1.3 times as large as the cylinder's.
+    comm, a = MPI.COMM_WORLD, closed_form().half_width
     elements = arguments.elements or (10 if arguments.quick else 30)
     model = None
     if comm.rank == 0:
@@ -58,7 +54,10 @@ def run(argv):
             growth=0.3 if arguments.quick else 0.12,
             partitions=arguments.subdomains,
         )
-    decomposition = tfeti.read_gmsh(model, comm)
+    return tfeti.read_gmsh(model, comm)
+
+
+def scene(decomposition, degree=1, exchange=False):
     mesh = decomposition.mesh
 
     # ## Elasticity in plane strain
@@ -66,7 +65,7 @@ def run(argv):
     # Young's modulus by the names of the bodies.
     elastic = tfeti.Elasticity(decomposition, E=young, nu=nu, model="plane_strain")
 
-    V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
+    V = fem.functionspace(mesh, ("Lagrange", degree, (2,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
     ds = ufl.Measure("ds", domain=mesh, subdomain_data=decomposition.facet_tags)
 
@@ -80,15 +79,23 @@ def run(argv):
     axis = fem.locate_dofs_topological(V.sub(0), 1, decomposition.facets("axis"))
     bottom = fem.locate_dofs_topological(V, 1, decomposition.facets("bottom"))
     bcs = [fem.dirichletbc(0.0, axis, V.sub(0)), fem.dirichletbc(np.zeros(2), bottom, V)]
-    sides = ("top", "arc") if arguments.exchange else ("arc", "top")
-    contacts = [tfeti.Contact(*sides, secondary=sides[0], reach=0.75 * a**2 / R)]
+    sides = ("top", "arc") if exchange else ("arc", "top")
+    reach = 0.75 * closed_form().half_width ** 2 / R
+    return {
+        "a": elastic.a(u, v),
+        "L": ufl.dot(traction, v) * ds(decomposition.surface("load")),
+        "bcs": bcs,
+        "contacts": [tfeti.Contact(*sides, secondary=sides[0], reach=reach)],
+        "decomposition": decomposition,
+        "stress": elastic.stress,
+    }
+
+
+def run(argv):
+    demo = Demo(__doc__, argv, configure)
+    arguments, comm, hertz = demo.arguments, MPI.COMM_WORLD, closed_form()
     problem = tfeti.ContactProblem(
-        elastic.a(u, v),
-        ufl.dot(traction, v) * ds(decomposition.surface("load")),
-        bcs,
-        contacts,
-        decomposition,
-        stress=elastic.stress,
+        **scene(torn_mesh(arguments), exchange=arguments.exchange),
         petsc_options=demo.petsc_options,
     )
     problem.solve()
@@ -111,7 +118,7 @@ def run(argv):
             solution,
             lambda points: points[:, 0],
             hertz.pressure,
-            limit=2 * a,
+            limit=2 * hertz.half_width,
         )
     return demo.finish(problem, "cylinder_on_block_2d")
 

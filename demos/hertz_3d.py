@@ -48,13 +48,13 @@ def torn_mesh(arguments):
     return tfeti.read_gmsh(model, comm, subdomains)
 
 
-def scene(decomposition):
+def scene(decomposition, degree=1):
     mesh = decomposition.mesh
 
     # ## Elasticity
     elastic = tfeti.Elasticity(decomposition, E=E, nu=nu)
 
-    V = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
+    V = fem.functionspace(mesh, ("Lagrange", degree, (3,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
     ds = ufl.Measure("ds", domain=mesh, subdomain_data=decomposition.facet_tags)
 

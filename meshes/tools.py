@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,21 @@ def started_model(name: str) -> Any:
     gmsh.option.setNumber("General.Terminal", 0)
     gmsh.model.add(name)
     return gmsh.model
+
+
+@contextmanager
+def element_options(**options: float) -> Iterator[None]:
+    """Options of gmsh's meshes, as ``ElementOrder=2`` or ``RecombineAll=1``, and then as before."""
+    if not gmsh.isInitialized():
+        gmsh.initialize(interruptible=False)
+    before = {name: gmsh.option.getNumber(f"Mesh.{name}") for name in options}
+    try:
+        for name, value in options.items():
+            gmsh.option.setNumber(f"Mesh.{name}", value)
+        yield
+    finally:
+        for name, value in before.items():
+            gmsh.option.setNumber(f"Mesh.{name}", value)
 
 
 def graded_size(

@@ -11,6 +11,7 @@ from benchmarks import (
     hertz_convergence,
     kplus_forms,
     linear_price,
+    profiles,
     solver_profiles,
     spectrum,
     stability,
@@ -18,6 +19,7 @@ from benchmarks import (
     strong_scaling,
     subdomain_size,
     talk_tables,
+    time_against_error,
     weak_scaling,
 )
 
@@ -169,6 +171,41 @@ def test_subdomain_size(serial_only, shared_tmp, comm):
         assert rows[0]["forms"] == "implicit"
         assert rows[1]["forms"] == "explicit"
         assert len({row["F"] for row in rows}) == 1
+
+
+def test_time_against_error(serial_only, shared_tmp, comm):
+    """Errors fall, and degree 2 is nearer in energy on a mesh with as many unknowns."""
+    words = ["--ranks", "1", "--scenes", "half cylinder", "shrink fit"]
+    tables = quick(time_against_error, shared_tmp, comm, *words)
+    for scene in words[3:]:
+        linear, finer, quadratic, _ = tables[scene]
+        assert finer["energy"] < linear["energy"]
+        assert finer["pressure"] < linear["pressure"]
+        assert quadratic["energy"] < linear["energy"]
+        assert quadratic["unknowns"] < finer["unknowns"]
+        groups = tables[f"{scene}, slopes and seconds"]
+        assert all(row["energy, slope over unknowns"] < 0.0 for row in groups)
+
+
+def test_seconds_at_an_error_are_between_two_meshes():
+    rows = [{"e": 0.08, "seconds": 1.0}, {"e": 0.04, "seconds": 4.0}, {"e": 0.01, "seconds": 64.0}]
+    found = [time_against_error.seconds_at(rows, "e", level) for level in (0.1, 0.04, 0.02, 0.001)]
+    assert found == [1.0, pytest.approx(4.0), pytest.approx(16.0), None]
+
+
+def test_pressures_are_compared_as_functions():
+    """Linear between points in any order: Hertz's own, on points that are fine enough."""
+    rng = np.random.default_rng(0)
+    for samples, power in ((profiles.Samples.line(2.0), 1), (profiles.Samples.disc(2.0), 2)):
+        exact = samples.exact(lambda r: np.sqrt(np.maximum(1.0 - (r / 2.0) ** 2, 0.0)))
+        points = rng.uniform(-3.0, 3.0, (20_000, power))
+        p = np.sqrt(np.maximum(1.0 - (np.linalg.norm(points, axis=1) / 2.0) ** 2, 0.0))
+        found = profiles.errors(samples, samples.at(points, 1.01 * p), exact)
+        assert found["pressure"] == pytest.approx(0.01, rel=0.05)
+        assert found["p0"] == pytest.approx(0.01, rel=0.05)
+        assert abs(found["a"]) <= 1e-3
+    ring = profiles.Samples.circle(1.0)
+    assert np.allclose(ring.at(np.array([[3.0], [-3.0], [0.0]]), np.ones(3)), 1.0)
 
 
 def test_a_benchmark_that_starts_mpirun_says_so_under_mpirun(monkeypatch, tmp_path):

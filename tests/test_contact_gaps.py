@@ -6,11 +6,11 @@ import ufl
 from bodies import boxes, gathered, held, searched, sided, stacked, two_body_problem
 from dolfinx import fem
 from mpi4py import MPI
-from rings import MIDDLE, lame_pressure, rings
 from scenes import decomposed, hooke, problem, strain
 from test_mortar_cases import disc_on_block, no_load
 
 import tfeti_dolfinx as tfeti
+from meshes.rings import MIDDLE, lame_pressure, rings
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import group_points
 
@@ -162,7 +162,7 @@ def test_an_overhanging_wedge(cell, slope):
 
 def ring_problem(cells, overlap, order=1, degree=1, mesh=None, **contact):
     """The rings; weak springs hold them against motions that contact leaves free."""
-    d = rings(MPI.COMM_WORLD, cells, order, overlap, **(mesh or {}))
+    d = rings(MPI.COMM_WORLD, cells, order, overlap=overlap, **(mesh or {}))
     V = fem.functionspace(d.mesh, ("Lagrange", degree, (2,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
     dx = ufl.Measure("dx", domain=d.mesh, metadata={"quadrature_degree": 2 * (degree + order) - 2})

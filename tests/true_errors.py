@@ -8,13 +8,13 @@ import ufl
 from dolfinx import fem, geometry
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from rings import INNER, MIDDLE, OUTER, lame_pressure, rings
 from scenes import clamp, forms, hooke, strain
 
 import tfeti_dolfinx as tfeti
 from demos import hertz_3d
 from demos.hertz import LineContact
 from meshes.half_cylinder import build
+from meshes.rings import INNER, MIDDLE, OUTER, lame_pressure, rings
 from tfeti_dolfinx.compat import interpolation_points
 
 E, NU = 1.0, 0.3

@@ -1,41 +1,55 @@
 """A ring shrunk on another one, meshed independently, and its closed form."""
 
+import sys
+from pathlib import Path
+
 import gmsh
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import tfeti_dolfinx as tfeti
+from meshes.tools import element_options, started_model
 
 INNER, MIDDLE, OUTER = 0.5, 1.0, 1.6
 
 
-def rings(comm, cells, order=1, overlap=0.0, turn=0.1, subdomains=4, triangles=False):
-    """Two rings with their contact at the radius 1.
+def build(cells, overlap=0.0, turn=0.1, triangles=False):
+    """Mesh two rings on this rank and return gmsh's model.
+
+    Physical groups: the surfaces "inner" and "outer"; the curves "bore" and "shaft" of the inner
+    ring, "hub" and "rim" of the outer one.
+
+    Args:
+        cells: Facets around the shaft (outside of the inner ring) and the hub.
+        overlap: How much larger the shaft's radius is than the hub's.
+        turn: Angle between the meshes.
+        triangles: Halves of the quadrilaterals instead of them.
+    """
+    model = started_model("rings")
+    shaft, hub = MIDDLE + overlap / 2, MIDDLE - overlap / 2
+    _ring("inner", {"bore": INNER, "shaft": shaft}, cells[0], 0.0, triangles)
+    _ring("outer", {"hub": hub, "rim": OUTER}, cells[1], turn, triangles)
+    gmsh.model.mesh.generate(2)
+    return model
+
+
+def rings(comm, cells, order=1, *, subdomains=4, **options):
+    """Two rings with their contact at the radius 1, torn; ``options`` are those of ``build``.
 
     Args:
         comm: Communicator.
-        cells: Facets around the shaft (outside of the inner ring) and the hub.
+        cells: Facets around the shaft and the hub.
         order: Degree of the geometry.
-        overlap: How much larger the shaft's radius is than the hub's.
-        turn: Angle between the meshes.
         subdomains: Their number.
-        triangles: Halves of the quadrilaterals instead of them.
-
-    Returns:
-        The torn mesh, with surfaces "bore", "shaft", "hub", "rim".
+        options: Further arguments of ``build``.
     """
+    model = None
     if comm.rank == 0:
-        if not gmsh.isInitialized():
-            gmsh.initialize(interruptible=False)
-        gmsh.option.setNumber("General.Terminal", 0)
-        gmsh.model.add("rings")
-        shaft, hub = MIDDLE + overlap / 2, MIDDLE - overlap / 2
-        _ring("inner", {"bore": INNER, "shaft": shaft}, cells[0], 0.0, triangles)
-        _ring("outer", {"hub": hub, "rim": OUTER}, cells[1], turn, triangles)
-        gmsh.option.setNumber("Mesh.ElementOrder", order)
-        gmsh.model.mesh.generate(2)
-    d = tfeti.read_gmsh(gmsh.model if comm.rank == 0 else None, comm, subdomains)
+        with element_options(ElementOrder=order):
+            model = build(cells, **options)
+    d = tfeti.read_gmsh(model, comm, subdomains)
     if comm.rank == 0:
-        gmsh.option.setNumber("Mesh.ElementOrder", 1)
         gmsh.model.remove()
     return d
 
