@@ -3,10 +3,11 @@
     ./run python3 benchmarks/spectrum.py [--quick]
 
 A unit square and a unit cube, clamped on one side, of (1/H)^d equal subdomains with H/h elements
-along an edge. Extreme eigenvalues of PFP on the range of P, those of Gᵀ taken away, by Lanczos
-iterations, and of S, the Schur complement of a floating subdomain on its whole boundary, beside
-its kernel. Bounded columns κ·h/H are what the theorem says (Dostál, Kozubek, Markopoulos et al.,
-Adv. Eng. Softw. 2012; Brenner, Numer. Math. 2003 for S). Nothing is parallel. Results go to
+along an edge, of finite and of boundary elements. Extreme eigenvalues of PFP on the range of P,
+those of Gᵀ taken away, by Lanczos iterations, and of S, the Schur complement of a floating
+subdomain on its whole boundary, beside its kernel. Bounded columns κ·h/H are what the theorem says
+(Dostál, Optimal Quadratic Programming Algorithms, 2009; Brenner, Numer. Math. 83, 1999, for S).
+Nothing is parallel. Results go to
 results/spectrum.md, .json and .png.
 """
 
@@ -33,13 +34,18 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import tfeti_dolfinx as tfeti
 from benchmarks.pictures import column, curves, picture
 from benchmarks.tools import command_line, finish
+from tfeti_dolfinx.boundary.panels import Panels
+from tfeti_dolfinx.boundary.steklov import Law, steklov
+from tfeti_dolfinx.boundary.surface import surfaces
 from tfeti_dolfinx.compat import assemble_csr
+from tfeti_dolfinx.mesh.dofs import TornDofs
 
 # dimension: all H/h with all 1/H
 SIZES = {
     "quick": {2: ((2, 4), (2, 3))},
     "default": {2: ((4, 8, 16, 32), (2, 4, 8)), 3: ((2, 4, 8), (2, 3, 4))},
 }
+NU = 0.3
 MODELS = {2: "plane_strain", 3: None}
 # of eigenvalues; the rest of a table is exact
 ACCURACY = 1e-3
@@ -61,17 +67,26 @@ def cut_mesh(gdim, parts, cells):
     return tfeti.decompose(mesh, subdomain, facet_tags=tags, surfaces={"left": 1})
 
 
-def solved(gdim, parts, cells):
+def space(decomposition):
+    """Displacements, and their bilinear form."""
+    gdim = decomposition.mesh.geometry.dim
+    elastic = tfeti.Elasticity(decomposition, E=1.0, nu=NU, model=MODELS[gdim])
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (gdim,)))
+    return V, elastic.a(ufl.TrialFunction(V), ufl.TestFunction(V))
+
+
+def solved(gdim, parts, cells, boundary):
     """The problem with its dual operator; without a load it is solved at once."""
     decomposition = cut_mesh(gdim, parts, cells)
-    mesh = decomposition.mesh
-    elastic = tfeti.Elasticity(decomposition, E=1.0, nu=0.3, model=MODELS[gdim])
-    V = fem.functionspace(mesh, ("Lagrange", 1, (gdim,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    V, a = space(decomposition)
     fixed = fem.locate_dofs_topological(V, gdim - 1, decomposition.facets("left"))
-    load = ufl.dot(fem.Constant(mesh, (0.0,) * gdim), v) * ufl.dx
     problem = tfeti.ContactProblem(
-        elastic.a(u, v), load, [fem.dirichletbc(np.zeros(gdim), fixed, V)], [], decomposition
+        a,
+        ufl.ZeroBaseForm((ufl.TestFunction(V),)),
+        [fem.dirichletbc(np.zeros(gdim), fixed, V)],
+        [],
+        decomposition,
+        boundary_elements=tfeti.BoundaryElements() if boundary else None,
     )
     problem.solve()
     return problem
@@ -103,31 +118,40 @@ def extremes_of_F(dual):
     return least, largest
 
 
-def extremes_of_S(gdim, cells, H):
+def extremes_of_S(gdim, cells, boundary):
     """Least eigenvalue beside the kernel and largest one of S of a floating subdomain.
 
     The trace of a TFETI subdomain is its boundary but for what is free: here all of it.
     """
     whole = cut_mesh(gdim, 1, cells)
-    V = fem.functionspace(whole.mesh, ("Lagrange", 1, (gdim,)))
-    elastic = tfeti.Elasticity(whole, E=1.0, nu=0.3, model=MODELS[gdim])
-    form = fem.form(elastic.a(ufl.TrialFunction(V), ufl.TestFunction(V)))
-    K = csr_array(assemble_csr(form)).toarray()
-    x = V.tabulate_dof_coordinates()[:, :gdim]
-    nodes = np.any(np.isclose(x, 0.0) | np.isclose(x, 1.0), axis=1)
-    t = np.repeat(nodes, gdim)
+    V, a = space(whole)
+    S = steklov_poincare(V, whole) if boundary else schur_complement(V, a)
+    values = np.linalg.eigvalsh(S)
+    return float(values[gdim * (gdim + 1) // 2]), float(values[-1])
+
+
+def schur_complement(V, a):
+    """That of finite elements, dense."""
+    K = csr_array(assemble_csr(fem.form(a))).toarray()
+    x = V.tabulate_dof_coordinates()[:, : V.mesh.geometry.dim]
+    t = np.repeat(np.any(np.isclose(x, 0.0) | np.isclose(x, 1.0), axis=1), x.shape[1])
     K_it = K[np.ix_(~t, t)]
-    S = K[np.ix_(t, t)] - K_it.T @ np.linalg.solve(K[np.ix_(~t, ~t)], K_it)
-    values = np.linalg.eigvalsh(S) * H ** (gdim - 2)
-    kernel = gdim * (gdim + 1) // 2
-    return float(values[kernel]), float(values[-1])
+    return K[np.ix_(t, t)] - K_it.T @ np.linalg.solve(K[np.ix_(~t, ~t)], K_it)
 
 
-def row(gdim, parts, cells):
-    """A row of the table."""
-    problem = solved(gdim, parts, cells)
+def steklov_poincare(V, whole):
+    """That of boundary elements."""
+    (surface,) = surfaces(TornDofs(V, whole), whole, np.ones(1, dtype=bool)).values()
+    used, nodes = np.unique(surface.panels.nodes, return_inverse=True)
+    panels = Panels(surface.panels.x[used], nodes.reshape(surface.panels.nodes.shape))
+    return steklov(panels, Law(0.5 / (1.0 + NU), NU)).S
+
+
+def row(gdim, parts, cells, boundary):
+    """A row of a table."""
+    problem = solved(gdim, parts, cells, boundary)
     F = extremes_of_F(problem.dual)
-    S = extremes_of_S(gdim, cells, 1.0 / parts)
+    S = extremes_of_S(gdim, cells, boundary)
     found = {
         "H/h": cells,
         "1/H": parts,
@@ -161,8 +185,11 @@ def main(argv):
     arguments, _ = command_line(__doc__, argv)
     sizes = SIZES["quick" if arguments.quick else "default"]
     tables = {
-        f"{gdim}D": [row(gdim, parts, cells) for parts in counts for cells in edges]
+        f"{gdim}D, {name}": [
+            row(gdim, parts, cells, boundary) for parts in counts for cells in edges
+        ]
         for gdim, (edges, counts) in sizes.items()
+        for name, boundary in (("finite elements", False), ("boundary elements", True))
     }
     return finish(arguments.output, "spectrum", tables, draw, MPI.COMM_WORLD.rank)
 

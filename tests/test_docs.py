@@ -111,7 +111,8 @@ def test_ci_runs_the_readme_s_test_command():
         for line in block.splitlines()
         if "pytest" in line
     ]
-    limited = [line for line in ci.splitlines() if line.startswith("limit ")]  # and without input
+    lines = [line.strip() for line in ci.splitlines()]
+    limited = [line for line in lines if line.startswith("limit ")]  # and without input
     for command in (test_command, test_command.replace("./run", "./run mpirun -n 2")):
         assert any(line.endswith(f" {command}") for line in limited)
 
