@@ -123,8 +123,8 @@ class ClusteredSubdomains(Subdomains):
         x, B, glue = super().solve(b), self._clusters.averages, self._glue()
         pairs = zip(self.blocks, self.dof_parts, strict=True)
         products = joined([block.kernel.T @ b[part] for block, part in pairs])
-        z = glue.apply(np.concatenate((B @ x, -glue.unit * products)))
-        mu, alpha = z[: B.shape[0]], glue.unit * z[B.shape[0] :]
+        z = glue.apply(np.concatenate((B @ x, -products)))
+        mu, alpha = z[: B.shape[0]], z[B.shape[0] :]
         return np.asarray(x - super().solve(B.T @ mu) + super().kernel_motion(alpha))
 
     def _glue(self) -> Glue:

@@ -12,8 +12,6 @@ from scipy.sparse import coo_array, csr_array, hstack
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.subdomains.soft_motions import SoftMotions
 
-# Of the largest energy of a motion that averages hold in a cluster: less is none.
-NULL = 1e-9
 # Of what the stiffness of outer unknowns would make of a motion: one of less energy is soft.
 # Compact clusters of 2 × 2 × 2 cubes have 0.1 and more, chains and hooks 0.01.
 SOFT = 0.1
@@ -34,7 +32,6 @@ class Glue:
             elsewhere, shape ``(t,)``.
 
     Attributes:
-        unit: R is measured in it, so that G_c is of the size of F_c.
         Z: [Y, −R] on the trace, scipy CSR.
         entries: Number of entries of W.
     """
@@ -48,9 +45,7 @@ class Glue:
     ) -> None:
         B, Y, R = given
         F, G = csr_array(B @ Y), csr_array((B @ R).T)
-        size = float(abs(F).max()) if F.nnz else 1.0
-        self.unit = size / (float(abs(G).max()) if G.nnz else 1.0)
-        self.Z = csr_array(hstack((Y, -self.unit * R)))
+        self.Z = csr_array(hstack((Y, -R)))
         self._of_cluster: list[tuple[Array, Array]] = []
         self._soft = [csr_array((len(stiffness), 0))]
         shapes = R.tocsc(), Y.tocsc()
@@ -58,11 +53,12 @@ class Glue:
             F_c = F[at][:, at].toarray()
             F_c, G_c = (F_c + F_c.T) / 2.0, G[kernel][:, at].toarray()
             N = null[kernel].toarray()
-            W = _inverse(F_c, -self.unit * G_c, size * (N @ N.T), size)
+            N = N[:, np.any(N != 0.0, axis=0)]
+            W = _inverse(F_c, -G_c, N)
             self._of_cluster.append((np.concatenate((at, F.shape[0] + kernel)), W))
             if len(at):
                 own = shapes[0][:, kernel], shapes[1][:, at]
-                self._soft.append(_softer(F_c, G_c, own, stiffness))
+                self._soft.append(_softer(F_c, G_c, N.shape[1], own, stiffness))
 
     def soft_motions(self, blocks: int) -> SoftMotions:
         """The softer motions of the subdomains, as many, in their clusters."""
@@ -82,18 +78,19 @@ class Glue:
         return z
 
 
-def _softer(F: Array, G: Array, shapes: tuple[Any, Any], stiffness: Array) -> csr_array:
+def _softer(F: Array, G: Array, free: int, shapes: tuple[Any, Any], stiffness: Array) -> csr_array:
     """Softer motions of a cluster on the trace of the rank, of energy 1.
 
-    They are those of the largest R̂ᵀDR̂ for their energy, D the stiffness of outer unknowns.
+    They are those of the largest R̂ᵀDR̂ for their energy, D the stiffness of outer unknowns; as many
+    as are free have no energy.
     """
     there = np.unique(shapes[0].indices)
     R, Y = (csr_array(part)[there] for part in shapes)
     mu = cho_solve(cho_factor(F), G.T)
-    T = G @ mu
+    _, alpha = _scales(F, G)
+    T = alpha[:, None] * (G @ mu) * alpha
     values, Q = np.linalg.eigh((T + T.T) / 2.0)
-    held = values > NULL * values.max(initial=0.0)
-    Q = Q[:, held] / np.sqrt(values[held])
+    Q = alpha[:, None] * Q[:, free:] / np.sqrt(values[free:])
     outer = np.flatnonzero(stiffness[there])
     far = R[outer] @ Q - Y[outer] @ (mu @ Q)
     sizes, V = np.linalg.eigh(far.T @ (stiffness[there[outer], None] * far))
@@ -104,9 +101,24 @@ def _softer(F: Array, G: Array, shapes: tuple[Any, Any], stiffness: Array) -> cs
     return csr_array(coo_array((entries.ravel(), (rows, columns)), shape=shape))
 
 
-def _inverse(F: Array, G: Array, free: Array, size: float) -> Array:
-    """The inverse of [F Gᵀ; G 0] beside null(Gᵀ), where ``free`` is size times its projector."""
-    a = len(F)
-    W = inv(np.block([[F, G.T], [G, free]]), overwrite_a=True)
-    W[a:, a:] -= free / size**2
+def _scales(F: Array, G: Array) -> tuple[Array, Array]:
+    """Scales that make the diagonals of F and of G diag(F)⁻¹Gᵀ 1."""
+    mu = np.diag(F) ** -0.5
+    size = np.sum((G * mu) ** 2, axis=1)
+    return mu, np.where(size > 0.0, size, 1.0) ** -0.5
+
+
+def _inverse(F: Array, G: Array, N: Array) -> Array:
+    """The inverse of [F Gᵀ; G 0] beside null(Gᵀ), whose basis N is.
+
+    Unknowns are scaled, since moduli of subdomains may differ by powers of ten.
+    """
+    mu, alpha = _scales(F, G)
+    scale, G = np.concatenate((mu, alpha)), alpha[:, None] * G * mu
+    free, _ = np.linalg.qr(N / alpha[:, None])
+    free = free @ free.T
+    A = np.block([[mu[:, None] * F * mu, G.T], [G, free]])
+    W = inv(A, overwrite_a=True)
+    W[len(mu) :, len(mu) :] -= free
+    W = scale[:, None] * W * scale
     return np.asarray((W + W.T) / 2.0)
