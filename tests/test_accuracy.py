@@ -7,7 +7,7 @@ from bodies import held, sided, stacked, stiffer_above, two_body_problem
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import clamp, gathered, hooke, strain
+from scenes import clamp, decomposed, gathered, hooke, problem, strain
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import spsolve
 from test_mortar_cases import no_load
@@ -182,4 +182,26 @@ def test_what_rows_miss_is_closed_by_the_least_displacement(cell, stiffness):
     size = MPI.COMM_WORLD.allreduce(np.abs(nothing) @ np.abs(rows.weights * v.array_r))
     assert abs(product) <= 1e-4 * size
     for vec in (w, missed, v, other):
+        vec.destroy()
+
+
+def test_what_rows_of_a_node_miss_in_contradiction_is_closed_as_far_as_it_can_be():
+    """Two walls on one side, the same rows twice: v is nearest to both, and not out of all size."""
+    d = decomposed("quadrilateral", 4, 2)
+    walls = [tfeti.Obstacle("bottom", tfeti.Plane((0, -gap), (0, 1))) for gap in (0.0, 1e-3)]
+    p = problem(d, contacts=walls)
+    p.solve()
+    rows = p.solution.gluing.constraints
+    w, v, left = rows.c.duplicate(), rows.B.createVecRight(), rows.c.duplicate()
+    closed = np.ones(len(rows.sets.normals), dtype=bool)
+    rng = np.random.default_rng(MPI.COMM_WORLD.rank)
+    w.set(0.0)
+    w.array[rows.sets.normals] = rng.standard_normal(len(closed))
+    v.array[:] = closing(rows, w, closed)
+    rows.B.mult(v, left)
+    left.aypx(-1.0, w)
+    assert left.norm() > 0.1 * w.norm()
+    rows.B.multTranspose(left, v)
+    assert v.norm() <= 1e-6 * w.norm()
+    for vec in (w, v, left):
         vec.destroy()

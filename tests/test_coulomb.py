@@ -208,6 +208,21 @@ def test_friction_alone_holds_a_body(cell, comm):
         p.solve()
 
 
+def test_what_sticks_where_a_wall_pushes_slips():
+    """Sticking to the floor contradicts a wall that overlaps it by 0.01: bounds hold neither."""
+    d = decomposed("quadrilateral", 4, 3)
+    law = tfeti.Coulomb(0.3)
+    wall = tfeti.Obstacle("left", tfeti.Plane((0.01, 0), (1, 0)), friction=law)
+    p = problem(d, (0.0, -0.05), [floor(2, law), wall], clamped=(), rtol=1e-8)
+    p.solve()
+    x, u = displacement(p)
+    assert u[np.isclose(x[:, 0], 0.0), 0].min() >= 0.01 - 1e-9
+    data = [p.solution.contact(k) for k in (0, 1)]
+    for one in data:
+        size = np.linalg.norm(one.tangential_traction, axis=1)
+        assert np.all(size <= 0.3 * one.pressure + 1e-8)
+
+
 MU = (0.4, 0.15)
 
 

@@ -16,6 +16,11 @@ import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.dual.measures import _slip_missed
 from tfeti_dolfinx.output import nodal_fields
 from tfeti_dolfinx.qp.discs import Discs
+from tfeti_dolfinx.qp.faces import Face
+from tfeti_dolfinx.qp.newton_curved import Bent
+from tfeti_dolfinx.qp.pcpg import pcpg
+from tfeti_dolfinx.qp.problem import QP, Point, Steps
+from tfeti_dolfinx.qp.stopping import TargetRule
 
 EXACT = {"rtol": 1e-10}
 
@@ -222,3 +227,30 @@ def test_a_slip_is_missed_where_the_force_may_still_grow(seed):
     assert np.allclose(size, np.minimum(q, room), rtol=1e-9, atol=1e-12 * norm)
     back = _slip_missed(scene, lam, -q[:, None] * out, norm)
     assert np.allclose(back, -q[:, None] * out, rtol=1e-9, atol=1e-12 * norm)
+
+
+def test_the_preconditioner_follows_any_curvature():
+    """PCPG with F + κ takes about as many steps whatever κ is, from 0 to where it holds."""
+    p = solved("hexahedron", tfeti.Tresca(0.003), (0.0, -0.035, -0.05), 6, 8)
+    p.dual.qp()
+    feasible, lam = p.dual.feasible, p.dual.d.duplicate()
+    lam.array[:] = p.solution.lam
+    g = Point(lam, lam.duplicate())
+    g.refresh(p.dual.qp())
+    face = feasible.face(lam.array_r, g.g.array_r)
+    g.destroy()
+    steps = []
+    for kappa in (0.0, 1.0, 1e2, 1e4):
+        bent = Face(face.Z, np.where(face.curvature > 0.0, kappa, 0.0), face.status)
+        M, coarse = p.dual._preconditioner_on(bent), p.dual.coarse.on_face(bent)
+        qp = QP(Bent(p.dual.F, bent), p.dual.d, coarse, feasible, M)
+        point, count = Point(p.dual.d.duplicate(), p.dual.d.copy()), Steps()
+        point.lam.set(0.0)
+        point.g.scale(-1.0)
+        start = point.g.copy()
+        coarse.project(start)
+        assert pcpg(qp, point, TargetRule(1e-8 * start.norm()), count, 200) > 0
+        steps.append(count.cg)
+        for item in (M, coarse, point, start):
+            item.destroy()
+    assert max(steps) <= 1.5 * steps[0], steps

@@ -173,3 +173,36 @@ def test_what_nothing_in_the_set_balances_is_said():
         Discs(np.ones(2)),
     )
     assert solved(qp, 1e-9).reason == ConvergedReason.DIVERGED_STALLED
+
+
+@pytest.mark.parametrize("small", [1e-4, 1e-8, 1e-12])
+@pytest.mark.parametrize("seed", range(4))
+def test_what_slips_far_on_small_circles_costs_no_steps(seed, small):
+    """κ = |s|/ψ is all that F + κ shows then; where a force points, its slip alone decides."""
+    F, d, radius = around_circles(seed)
+    n, rng = len(d), np.random.default_rng(seed)
+    free = rng.standard_normal((6, n + 6))
+    F = np.block([[F, np.zeros((n, 6))], [np.zeros((6, n)), np.eye(6)]]) + free.T @ free / n
+    d = np.concatenate((d, rng.standard_normal(6)))
+    set_of_all = Product([(np.arange(n), Discs(small * radius))])
+    qp = QP(matrix(F), vector(d), NoCoarse(), set_of_all)
+    result = solved(qp, 1e-9 * np.linalg.norm(d))
+    assert result.reason == ConvergedReason.CONVERGED_RTOL
+    assert result.steps.cg <= 25
+    s = (F @ result.lam.array - d)[:n].reshape(-1, 2)
+    along = np.sum(result.lam.array[:n].reshape(-1, 2) * s, axis=1)
+    assert np.allclose(along, -small * radius * np.linalg.norm(s, axis=1), rtol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_slip_ends_where_its_boundary_bends_and_is_no_contradiction(seed):
+    """F does not see a way along circles of two forces that are one; Ω bounds both."""
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((2, 4))
+    A[:, 2:] = A[:, :2]
+    F, d = A.T @ A, 3.0 * rng.standard_normal(4)
+    feasible = Discs(np.array([1.0, 0.5]))
+    result = solved(QP(matrix(F), vector(d), NoCoarse(), feasible), 1e-8)
+    lam = result.lam.array
+    assert result.reason == ConvergedReason.CONVERGED_RTOL
+    assert np.allclose(feasible.project(lam - (F @ lam - d)), lam, atol=1e-6)

@@ -16,7 +16,7 @@ from tfeti_dolfinx.qp.problem import ConvergedReason
 
 # Differences that are rounding, in a body that hardly moves as well: of the largest displacement
 # of all bodies; of what its load does to its subdomains alone, if that is held where it acts.
-NOISE, LOAD_NOISE = 5e-14, 1e-14
+NOISE, LOAD_NOISE = 2.5e-13, 1e-14
 # a body that moves by less than this share of another is stiff beside it, and has the error of the
 # other's forces on top of its own: its own must be as much smaller
 STIFF, STRICTER = 1e-3, 0.1

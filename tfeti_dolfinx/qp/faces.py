@@ -71,6 +71,10 @@ class Face:
         share = diags_array(1.0 / np.sqrt(1.0 + self.curvature))
         return Face(csr_array(self.Z @ share), self.curvature, self.status)
 
+    def with_directions(self, kept: Array) -> Face:
+        """The face with some of its directions only, the others held."""
+        return Face(csr_array(self.Z[:, kept]), self.curvature[kept], self.status)
+
     def restricted(self, x: Array) -> Array:
         """Z Zᵀ x: the part of vectors, shapes ``(m,)`` or ``(m, q)``, that lies in the face."""
         if self._of_coordinates:

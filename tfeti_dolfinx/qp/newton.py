@@ -122,7 +122,7 @@ def newton(
             # Step 1: optimality
             state.look(faces)
             monitor(steps, "outer", state.point.lam, state.residual, 0.0)
-            if state.residual <= rule.tolerance:
+            if state.residual <= max(rule.tolerance, state.rounding):
                 rule.norm = state.norm
                 face = state.pressed_face()
                 reason = rule.examine(state.point.lam, state.s, face, state.residual)

@@ -13,6 +13,9 @@ from tfeti_dolfinx.qp.homogenised import restored
 from tfeti_dolfinx.qp.nearest import WithinFace, nearest
 from tfeti_dolfinx.qp.problem import QP, Operator, Point
 
+# of Gλ = e: what is left after a first try to restore it, as where rows hardly hold, is worth a
+# second one
+EXACT = 1e-13
 # points looked at on the way back to circles: it is short, or there is no such way
 BACK = 30
 # of a way along a face that is curved, with all that leaves Ω brought back, which lets go many
@@ -61,7 +64,7 @@ def has_left(qp: QP, face: Face, x: Array) -> bool:
 
 
 def restored_on(qp: QP, coarse: Coarse, face: Face, lam: PETSc.Vec) -> PETSc.Vec:
-    """λ + ZG_fᵀ(G_fG_fᵀ)⁺(e − Gλ). Collective.
+    """λ + ZG_fᵀ(G_fG_fᵀ)⁺(e − Gλ); twice where its factor leaves much. Collective.
 
     Args:
         qp: The program.
@@ -69,6 +72,14 @@ def restored_on(qp: QP, coarse: Coarse, face: Face, lam: PETSc.Vec) -> PETSc.Vec
         face: The face.
         lam: A point of the face.
     """
+    near = _restored_once(qp, coarse, face, lam)
+    if imbalance_on(qp, coarse, face, near) > EXACT:
+        once, near = near, _restored_once(qp, coarse, face, near)
+        once.destroy()
+    return near
+
+
+def _restored_once(qp: QP, coarse: Coarse, face: Face, lam: PETSc.Vec) -> PETSc.Vec:
     if not _is_beside(face, lam):
         return restored(coarse, lam)
     near = lam.duplicate()
@@ -174,15 +185,22 @@ def moved_to(qp: QP, z: Point, lam: PETSc.Vec) -> None:
         vec.destroy()
 
 
-def brought_back(qp: QP, face: Face, z: Point) -> bool:
+def brought_back(qp: QP, face: Face, z: Point, near: PETSc.Vec | None = None) -> bool:
     """Bring z back to where slipping rows are on their boundary and Gz = e. Collective.
 
     Multiplies by F once.
 
+    Args:
+        qp: The program.
+        face: The face.
+        z: The point.
+        near: What it is brought near to, itself by default.
+
     Returns:
         Whether there is such a point near by.
     """
-    found = nearest(qp.coarse, WithinFace(qp.feasible, face, slipping=True), z.lam, max_trials=BACK)
+    within = WithinFace(qp.feasible, face, slipping=True)
+    found = nearest(qp.coarse, within, z.lam if near is None else near, max_trials=BACK)
     held = imbalance(qp.coarse, found.lam) <= HELD
     moved_to(qp, z, found.lam)
     return held

@@ -11,13 +11,13 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.parallel import agreed, any_rank
 from tfeti_dolfinx.qp.coarse import HELD, Coarse, imbalance
 from tfeti_dolfinx.qp.dependent import DependentRows
+from tfeti_dolfinx.qp.eased import Eased
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.monitors import Monitor
 from tfeti_dolfinx.qp.nearest import WithinFace, nearest, nearest_or_least
 from tfeti_dolfinx.qp.newton_curved import (
     Bent,
     bent_at,
-    brought_back,
     has_left,
     imbalance_on,
     is_curved,
@@ -41,8 +41,6 @@ STAGE = 0.1
 FOLLOWED = 2.0
 # times λ: what restores Gλ = e by forces so much larger does it with rows that hold nothing
 WILD = 1e6
-# of Gλ = e: what is left after a first try to restore it is worth a second one
-EXACT = 1e-13
 
 
 class FaceSolver:
@@ -80,6 +78,7 @@ class FaceSolver:
         self._directions.norm = qp.seen
         self._dependent = DependentRows(qp, self._directions)
         self._face: Face | None = None
+        self._eased: Eased
         self.settled, self.curved, self._accepted, self.left = False, False, False, np.inf
         self._on_face, self.rounded = qp, 0
         self._bent: Bent | None = None
@@ -134,8 +133,10 @@ class FaceSolver:
             return True
         self._leave()
         self._steps.faces += not same
-        self._on_face = replace(self._qp, coarse=self._qp.coarse.on_face(face), preconditioner=None)
-        self._face, self.curved = face, is_curved(self._qp, face)
+        self.curved = is_curved(self._qp, face)
+        self._face, self._eased = face, Eased(face, self.norm)
+        coarse = self._qp.coarse.on_face(self._eased.face)
+        self._on_face = replace(self._qp, coarse=coarse, preconditioner=None)
         self.forget()
         return same
 
@@ -144,9 +145,10 @@ class FaceSolver:
         if self._face is None or self._prepared:
             return
         if self._qp.preconditioner_on is not None:
-            self._preconditioner = self._qp.preconditioner_on(self._face)
-        self._dependent.preconditioner, self._dependent.face = self._preconditioner, self._face
-        self._bent = Bent(self._qp.F, self._face) if self.curved else None
+            self._preconditioner = self._qp.preconditioner_on(self._eased.face)
+        self._dependent.preconditioner = self._preconditioner
+        self._dependent.face = self._eased.face
+        self._bent = Bent(self._qp.F, self._eased.face) if self.curved else None
         F = self._bent or self._qp.F
         self._on_face = replace(self._on_face, F=F, preconditioner=self._preconditioner)
         self._prepared = True
@@ -198,7 +200,7 @@ class FaceSolver:
             z.lam.array[:] = self._qp.feasible.project(z.lam.array_r)
             self._drop(z)
         assert self._face is not None
-        back = not out and (not self.curved or brought_back(self._qp, self._face, z))
+        back = not out and (not self.curved or self._eased.back(self._qp, self.coarse, z))
         return Trial(first or z.copy(), z, back, face, rounds)
 
     def _drop(self, z: Point) -> None:
@@ -207,9 +209,10 @@ class FaceSolver:
         assert previous is not None
         on = np.array(z.lam.array_r)
         self.enter(feasible.face(on, z.g.array_r))
-        near = self._restored(z.lam)
+        of = (self._qp, self.coarse, self._eased.face)
+        near = restored_on(*of, z.lam)
         wild = agreed(self._comm, near.norm() > WILD * max(z.lam.norm(), self._size))
-        if wild or self._imbalance(near) > HELD:
+        if wild or imbalance_on(*of, near) > HELD:
             # it no longer holds a body: what is nearest names rows that do, near by if it can
             near.destroy()
             found = nearest(self._qp.coarse, WithinFace(feasible, previous), z.lam)
@@ -224,20 +227,8 @@ class FaceSolver:
         z.refresh(self._qp)
         if self.curved and self._face is not None:
             self._face = bent_at(self._qp, self.coarse, self._face, on, z.g)
+            self._eased.bend(self._face)
         self.forget()
-
-    def _restored(self, lam: PETSc.Vec) -> PETSc.Vec:
-        """The nearest point of Gλ = e on the face entered, if it has one."""
-        assert self._face is not None
-        near = restored_on(self._qp, self.coarse, self._face, lam)
-        if self._imbalance(near) > EXACT:  # what its factor leaves where rows hardly hold
-            once, near = near, restored_on(self._qp, self.coarse, self._face, near)
-            once.destroy()
-        return near
-
-    def _imbalance(self, lam: PETSc.Vec) -> float:
-        assert self._face is not None
-        return imbalance_on(self._qp, self.coarse, self._face, lam)
 
     def _target(self, z: Point, optimality: float, stays: bool) -> float:
         """What PCPG aims at: a part of what there is to do; more where the face stays."""

@@ -10,7 +10,7 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.parallel import agreed
-from tfeti_dolfinx.qp.faces import Face, without_slip
+from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.nearest import nearest
 from tfeti_dolfinx.qp.newton_curved import (
@@ -39,6 +39,8 @@ SHORTER = 0.5
 # so many steps in a row that neither lower q by what stands out from its rounding, nor halve
 # ‖g^P‖; so many that do not halve it, whatever q does
 PATIENCE, LONG, ROUNDING = 10, 100, 1e-15
+# of ‖F‖‖λ‖: what rounding of λ − ᾱs leaves of ‖g^P‖; times that: where each step down is one
+LOST, FAR = 2e-15, 1e3
 
 
 class Iterate:
@@ -56,6 +58,7 @@ class Iterate:
         back: The nearest feasible point to λ − ᾱ(Fλ − d).
         residual: ‖g^P‖, g^P = (λ − back)/ᾱ.
         norm: Estimate of ‖F‖; ᾱ is its inverse.
+        rounding: What rounding may make of ‖g^P‖ alone.
     """
 
     def __init__(self, qp: QP, homogenised: Homogenised) -> None:
@@ -68,7 +71,8 @@ class Iterate:
         self.mu: Array = np.zeros(qp.coarse.dimension)
         self._taken: Array = np.zeros(qp.coarse.dimension)
         self._set_multipliers()
-        self.residual, self._best, self.norm, self._idle, self._slow = np.inf, np.inf, 1.0, 0, 0
+        self.residual, self._best, self.norm, self.rounding = np.inf, np.inf, 1.0, 0.0
+        self._idle, self._slow = 0, 0
 
     def face(self) -> Face:
         """The face of λ."""
@@ -117,6 +121,7 @@ class Iterate:
         target.axpy(-1.0, self.back)
         self.residual = self.norm * target.norm()
         target.destroy()
+        self.rounding = agreed(self._comm, LOST * self.norm * self.point.lam.norm())
         self._idle, self._slow = self._idle + 1, self._slow + 1
         if self.residual <= 0.5 * self._best:
             self._best, self._idle, self._slow = self.residual, 0, 0
@@ -173,7 +178,7 @@ class Iterate:
             faces.settle()
             return True
         faces.forget()
-        length = self._feasible_part(trial)
+        length = trial.feasible_part(self._qp.feasible, self.point)
         curved = is_curved(self.qp, trial.face)
         shares = [length] if not curved or trial.rounds > 1 else []
         shares += [SHORTER * length, SHORTER**2 * length] if curved else []
@@ -208,10 +213,14 @@ class Iterate:
 
     def _take(self, to: Point, gain: float) -> None:
         """Go there; a gain that stands out from the rounding of q is worth more steps."""
-        sizes = abs(self.point.lam.dot(self.point.g)) + abs(self.point.lam.dot(self._qp.d))
-        if gain > ROUNDING * sizes:
-            self._idle = 0
+        self._went_down(gain)
         self.point.take(to)
+
+    def _went_down(self, gain: float) -> None:
+        """See whether q came down by what is no rounding of it."""
+        sizes = abs(self.point.lam.dot(self.point.g)) + abs(self.point.lam.dot(self._qp.d))
+        if gain > (0.0 if self.residual > FAR * self.rounding else ROUNDING * sizes):
+            self._idle = 0
 
     def gain(self, to: Point) -> float:
         """q(λ) − q(to), by differences, and without what Gλ = e makes constant. Collective."""
@@ -238,18 +247,11 @@ class Iterate:
         length = min(1.0, slope / curvature) if curvature > 0.0 else 1.0
         moved = agreed(self._comm, size > 0.0 and slope > 0.0)
         if moved:
-            if length * slope > ROUNDING * abs(self.point.lam.dot(self.point.g)):
-                self._idle = 0
+            self._went_down(length * slope)
             self.point.move(length, p, Fp)
             self.point.lam.array[:] = self._qp.feasible.project(self.point.lam.array_r)
         p.destroy()
         return moved
-
-    def _feasible_part(self, trial: Trial) -> float:
-        """Largest t up to 1 with λ + t(first − λ) ∈ Ω, but for rows that slip. Collective."""
-        down = without_slip(trial.face, self.point.lam.array_r - trial.first.lam.array_r)
-        own = self._qp.feasible.max_step(self.point.lam.array_r, down)
-        return min(1.0, float(self._comm.allreduce(own, op=MPI.MIN)))
 
     def result(self, reason: ConvergedReason, steps: Steps) -> QPResult:
         """The answer; takes λ and s over."""

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tfeti_dolfinx.qp.faces import Face
+from mpi4py import MPI
+
+from tfeti_dolfinx.qp.faces import Face, without_slip
+from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.problem import Point
 
 
@@ -25,6 +28,12 @@ class Trial:
     feasible: bool
     face: Face
     rounds: int
+
+    def feasible_part(self, feasible: FeasibleSet, at: Point) -> float:
+        """Largest t up to 1 with λ + t(first − λ) ∈ Ω, but for rows that slip. Collective."""
+        down = without_slip(self.face, at.lam.array_r - self.first.lam.array_r)
+        own = feasible.max_step(at.lam.array_r, down)
+        return min(1.0, float(at.lam.getComm().tompi4py().allreduce(own, op=MPI.MIN)))
 
     def destroy(self) -> None:
         """Destroy the points. Collective."""
