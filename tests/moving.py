@@ -29,6 +29,7 @@ class Thrown:
         nu: Poisson's ratio.
         weight: Force per volume, downwards.
         thrown: Speed downwards of the upper box, along, and of a part that turns and shears.
+        subdomains: Of the box alone.
         keywords: Of ``ContactDynamics``; others are options.
     """
 
@@ -42,9 +43,10 @@ class Thrown:
         nu=0.3,
         weight=0.0,
         thrown=(0.3, 0.1, 0.05),
+        subdomains=4,
         **keywords,
     ):
-        d = stacked(cell, 2, 3, 4, gap=gap) if below else decomposed(cell, n, 4)
+        d = stacked(cell, 2, 3, 4, gap=gap) if below else decomposed(cell, n, subdomains)
         self.gdim = gdim = d.mesh.geometry.dim
         V = fem.functionspace(d.mesh, ("Lagrange", 1, (gdim,)))
         u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
@@ -59,7 +61,7 @@ class Thrown:
         contacts = [tfeti.Obstacle(bottom, plane, friction=friction, reach=1.0, name="plane")]
         if below:
             contacts.append(tfeti.Contact("upper bottom", "lower top", reach=1.0))
-        own = {k: keywords.pop(k) for k in ("mass", "stabilised") if k in keywords}
+        own = {k: keywords.pop(k) for k in ("mass", "stabilised", "lumped") if k in keywords}
         self.problem = tfeti.ContactDynamics(
             ufl.inner(hooke(nu=nu)(u), strain(v)) * ufl.dx(domain=d.mesh),
             ufl.dot(self.weight, v) * ufl.dx(domain=d.mesh),
@@ -70,6 +72,10 @@ class Thrown:
             petsc_options={"rtol": 1e-10, **keywords},
             **{"mass": 1.0, **own},
         )
+
+    def apply(self, problem, t):
+        """Pushed more and more."""
+        self.weight.value[0] = 0.02 * t
 
     def step(self, size, count=1):
         """Go on, and give the reports of the steps."""

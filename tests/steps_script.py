@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+from moving import Thrown
 from mpi4py import MPI
 from scenes import displacement
 from sheared import Driven
@@ -52,7 +53,11 @@ DEATHS = {
 
 if __name__ == "__main__":
     scene, folder, how = sys.argv[1], Path(sys.argv[2]), sys.argv[3]
-    driven = Driven(rough=scene == "rough")
+    moving = {"thrown": False, "stabilised": True}
+    if scene in moving:
+        driven = Thrown(weight=0.02, stabilised=moving[scene])
+    else:
+        driven = Driven(rough=scene == "rough")
 
     def apply(problem, t):
         if how == "between" and t == TIMES[3]:

@@ -33,6 +33,7 @@ DEMOS = [
     "impact_of_bars",
     "tbeti_cube_3d",
     "tbeti_hertz_2d",
+    "falling_balls_3d",
 ]
 
 
@@ -127,3 +128,33 @@ def test_a_mesh_that_follows_the_error_needs_a_tenth_of_a_uniform_one():
     assert report.primal_dofs <= 3900
     assert report.errors["pressure_l2"] <= 0.02
     assert solution.has_discretisation_error
+
+
+def test_a_bouncing_bar_is_as_in_closed_form():
+    """At a third of the cells of the default, up to the end of the first impact."""
+    _, report = importlib.import_module("demos.bouncing_bar").run(["--quick", "--cells", "32"])
+    assert abs(report.errors["first_begin"]) <= 0.01
+    assert abs(report.errors["first_end"]) <= 0.015
+    assert abs(report.errors["first_pressure"]) <= 0.002
+    assert report.in_all["assemblies"] == report.in_all["gluings"] == 1
+
+
+@pytest.mark.slow
+def test_a_bouncing_bar_comes_back_as_in_closed_form():
+    _, report = importlib.import_module("demos.bouncing_bar").run([])
+    errors = report.errors
+    assert set(errors) >= {"second_begin", "second_end", "second_pressure", "period"}
+    assert all(abs(value) <= 0.01 for value in errors.values())
+
+
+@pytest.mark.parametrize("name", ["two", pytest.param("clamped", marks=pytest.mark.slow), "wall"])
+def test_impacts_of_bars_are_as_in_closed_form(name):
+    """Pressure within 1 %, duration within a step, and no force that oscillates."""
+    cells = 40
+    run = importlib.import_module("demos.impact_of_bars").run
+    _, report = run(["--impact", name, "--cells", str(cells)])
+    step = 1 / (4 if name == "clamped" else 2) / cells
+    assert abs(report.errors[f"{name}_pressure"]) <= 0.01
+    assert abs(report.errors[f"{name}_duration"]) <= 1.01 * step
+    assert report.errors[f"{name}_oscillates"] <= 0.005
+    assert -0.02 <= report.errors[f"{name}_energy"] <= 0.0

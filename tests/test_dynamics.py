@@ -3,6 +3,9 @@
 import numpy as np
 import pytest
 from moving import Thrown
+from scenes import displacement as nodal
+
+import tfeti_dolfinx as tfeti
 
 
 def largest(comm, values):
@@ -55,3 +58,164 @@ def test_the_energy_changes_by_what_was_done(cell, below, stabilised):
         gaps = np.array(solution.remaining_gap)
         impacts += abs(forces[-1][-1]) > 0.0
     assert impacts >= 2
+
+
+@pytest.mark.parametrize("stabilised", [False, True])
+def test_an_obstacle_that_moves_does_work(stabilised):
+    """A plane comes up under the box: what contact does is −λᵀ(g⁺ − g) less what it closes."""
+    scene = Thrown("quadrilateral", 3, stabilised=stabilised, thrown=(0.0, 0.0, 0.0))
+    comm, gaps, speed = scene.problem.decomposition.comm, None, 0.2
+    work = 0.0
+    for n in range(1, 16):
+        scene.problem.update(gap={"plane": 0.02 - speed * 0.1 * n})
+        ((motion, _),) = scene.step(0.1)
+        solution = scene.problem.solution
+        assert abs(motion["defect"]) <= 1e-12
+        if gaps is not None:
+            closed = comm.allreduce(float(solution.force @ (gaps - speed * 0.1)))
+            assert motion["contact"] == pytest.approx(-closed, rel=0, abs=1e-9)
+        work += motion["contact"]
+        gaps = np.array(solution.remaining_gap)
+    v = scene.problem.solution.velocity.x.array.reshape(-1, 2)
+    momentum = mean(scene, v)
+    # an elastic body leaves with twice the speed of the plane, less what swings in it
+    assert speed < momentum[-1] <= 2 * speed
+    assert work >= 0.5 * momentum[-1] ** 2
+
+
+def mean(scene, values):
+    """Mean of a field over the box, of mass 1."""
+    forms = scene.problem._forms_in_time
+    mass = (forms.matrices[1] @ values.ravel()).reshape(values.shape)
+    return scene.problem.decomposition.comm.allreduce(mass.sum(axis=0))
+
+
+@pytest.mark.parametrize("stabilised", [False, True])
+def test_momentum_changes_by_forces_of_contact(stabilised):
+    """Forces in the report are those that turn the box round."""
+    scene = Thrown("quadrilateral", 4, stabilised=stabilised, weight=0.02)
+    before, impulse = np.zeros(2), np.zeros(2)
+    for n in range(20):
+        ((_, forces),) = scene.step(0.1)
+        now = mean(scene, scene.problem.solution.velocity.x.array.reshape(-1, 2))
+        if n:
+            assert now - before == pytest.approx(
+                0.1 * (np.array(forces[0]) - [0.0, 0.02]), abs=1e-9
+            )
+        impulse, before = impulse + 0.1 * np.array(forces[0]), now
+    assert impulse[1] > 0.3
+    assert impulse[0] == 0.0
+
+
+@pytest.mark.parametrize("stabilised", [False, True])
+def test_friction_slows_down_what_slides(stabilised):
+    """Given friction on a plane that holds the box down: it loses bound · area in each second."""
+    bound, speed = 0.01, 0.2
+    scene = Thrown(
+        "quadrilateral",
+        4,
+        gap=0.0,
+        friction=tfeti.Tresca(bound),
+        nu=0.0,
+        weight=0.05,
+        thrown=(0.0, speed, 0.0),
+        stabilised=stabilised,
+    )
+    lost, energies = 0.0, []
+    for n in range(1, 13):
+        ((motion, forces),) = scene.step(0.25)
+        assert motion["friction"] <= 1e-12
+        assert abs(motion["defect"]) <= 1e-13
+        energies.append(motion["energy"])
+        lost -= motion["friction"]
+        v = mean(scene, scene.problem.solution.velocity.x.array.reshape(-1, 2))
+        assert v[0] == pytest.approx(speed - bound * 0.25 * n, abs=1e-9)
+        assert forces[0][0] == pytest.approx(-bound, abs=1e-9)
+    assert lost > 0.0
+    comm = scene.problem.decomposition.comm
+    dissipated = comm.allreduce(float(scene.problem.solution.dissipation.sum()))
+    assert -motion["friction"] == pytest.approx(dissipated, rel=1e-6)
+
+
+def test_a_step_is_newmark_s_by_dense_matrices():
+    """An independent solution without contact: one dense matrix for the whole, not torn box."""
+    scene = Thrown("quadrilateral", 3, gap=5.0, thrown=(0.3, 0.1, 0.4))
+    scene.step(0.2, 5)
+    found = nodal(scene.problem)
+    whole = Thrown("quadrilateral", 3, gap=5.0, thrown=(0.3, 0.1, 0.4), subdomains=1)
+    whole.problem.take_step(0.2)
+    forms = whole.problem._forms_in_time
+    u, v = np.zeros_like(forms.motion.v), forms.motion.v
+    if len(u):
+        K, M = (A.toarray() for A in forms.matrices)
+        for _ in range(5):
+            now = np.linalg.solve(K + 4 * M / 0.04, 4 * M @ (u + 0.2 * v) / 0.04 - K @ u)
+            u, v = now, 2 * (now - u) / 0.2 - v
+    whole.problem.u.x.array[:] = u
+    assert np.allclose(found[1], nodal(whole.problem)[1], rtol=0, atol=1e-9)
+
+
+def test_equal_steps_share_factors_and_another_one_says_that_it_refactors(caplog):
+    scene = Thrown("quadrilateral", 4)
+    comm = scene.problem.decomposition.comm
+    first = scene.step(0.1) and scene.problem.report.factorizations
+    assert first > 0
+    scene.step(0.1 * (1 + 1e-12), 3)
+    assert scene.problem.report.factorizations == 0
+    assert scene.problem.report.assemblies == 0
+    assert "factored anew" not in caplog.text
+    scene.step(0.05)
+    assert scene.problem.report.factorizations > 0
+    says = "the step is now 0.05, it was 0.1: all is factored anew"
+    assert (says in caplog.text) == (comm.rank == 0)
+
+
+def test_going_back_to_the_begin_of_a_step():
+    scene, plain = Thrown("quadrilateral", 3), Thrown("quadrilateral", 3)
+    problem = scene.problem
+    problem.take_step(0.1)
+    problem.solve()
+    problem.go_back()
+    comm = problem.decomposition.comm
+    assert largest(comm, problem.u.x.array) == 0.0
+    scene.step(0.1, 2)
+    problem.solve()
+    problem.go_back()
+    scene.step(0.1)
+    plain.step(0.1, 3)
+    assert largest(comm, problem.u.x.array - plain.problem.u.x.array) <= 1e-9
+
+
+def test_mistakes_of_motions():
+    with pytest.raises(tfeti.InputError, match="the step has no size yet"):
+        Thrown("quadrilateral", 3).problem.solve()
+    with pytest.raises(tfeti.InputError, match="step=0"):
+        Thrown("quadrilateral", 3).problem.take_step(0)
+    for says, keywords in {
+        "mass=-1": {"mass": -1.0},
+        "mass: .*volume": {"mass": {"nobody": 1.0}},
+        "stabilised=1: expected True or False": {"stabilised": 1},
+        "rtol auto": {"rtol": "auto"},
+    }.items():
+        with pytest.raises(tfeti.InputError, match=says):
+            Thrown("quadrilateral", 3, **keywords)
+
+
+def sixteenths(x):
+    """Four by four subdomains."""
+    i, j = np.minimum((4 * x[:2]).astype(int), 3)
+    return i + 4 * j
+
+
+@pytest.mark.parametrize(("share", "soft"), [(0.1, 0), (3.0, 48), (100.0, 48)])
+def test_steps_in_which_a_wave_crosses_subdomains_cost_no_more(share, soft):
+    """Rigid motions of subdomains cost mass alone: the preconditioner takes them apart.
+
+    Without that it takes 4, 21 and 62 multiplications.
+    """
+    scene = Thrown("quadrilateral", 16, gap=0.0, weight=0.02, subdomains=sixteenths, rtol=1e-6)
+    scene.step(share / 4 / np.sqrt(0.7 / 1.3 / 0.4))
+    report = scene.problem.report
+    assert report.soft_modes == soft
+    assert report.F_multiplications <= 14
+    assert report.kernel_dim == 0

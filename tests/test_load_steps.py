@@ -224,6 +224,8 @@ def whole(tmp_path_factory):
         (1, "rough", "committed"),
         (2, "rough", "between"),
         (2, "rough", "writing"),
+        (1, "stabilised", "between"),
+        (2, "thrown", "committing"),
         pytest.param(1, "rough", "between", marks=pytest.mark.slow),
         pytest.param(1, "rough", "writing", marks=pytest.mark.slow),
         pytest.param(2, "smooth", "between", marks=pytest.mark.slow),

@@ -20,6 +20,7 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.gluing.glue import Gluing
 from tfeti_dolfinx.inertia import InertialForms, mass_form
 from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.parallel import any_rank
 from tfeti_dolfinx.predictor import Predictor
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.saved_state import SavedState, checked_state
@@ -153,7 +154,8 @@ class ContactDynamics(ContactProblem):
     def state(self) -> SavedState:
         """The last accepted solution as arrays of this rank, for ``restore``."""
         motion, state = self._forms_in_time.motion, super().state()
-        return replace(state, velocity=motion.v, load=motion.load)
+        predicted = self._predictor.start if self._predictor is not None else state.predicted
+        return replace(state, velocity=motion.v, load=motion.load, predicted=predicted)
 
     def restore(self, state: SavedState) -> None:
         """Go on where another run of the same program has been; the step must have its size.
@@ -170,6 +172,9 @@ class ContactDynamics(ContactProblem):
         forms.motion.towards = forms.motion.free
         super().restore(state)
         self.solution.v = state.velocity
+        known = any_rank(self.decomposition.comm, state.predicted.size > 0)
+        if self._predictor is not None and known:
+            self._predictor.start_from(self._system.gluing, state.predicted)
 
     def destroy(self) -> None:
         """Destroy the PETSc objects; solution and report stay."""

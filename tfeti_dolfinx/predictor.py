@@ -17,7 +17,6 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.qp.discs import Discs
 from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Product
-from tfeti_dolfinx.qp.problem import QPResult
 from tfeti_dolfinx.solver import conclude, resolve_types, solve_dual
 from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
 from tfeti_dolfinx.subdomains.data import Counters
@@ -47,8 +46,17 @@ class Predictor:
         self._M: csr_array | None = None
         self._subdomains: Subdomains | None = None
         self._dual: Dual | None = None
-        self._start: tuple[Gluing, Array, Array] | None = None
+        self._start: tuple[Gluing, Array] | None = None
         self.multiplications = 0
+
+    @property
+    def start(self) -> Array:
+        """Multipliers that the next call starts from, empty before the first."""
+        return np.zeros(0) if self._start is None else self._start[1]
+
+    def start_from(self, gluing: Gluing, lam: Array) -> None:
+        """Let the next call start from multipliers of some rows."""
+        self._start = (gluing, lam)
 
     def nearest(self, w: Array, M: csr_array, gluing: Gluing) -> Array:
         """The nearest displacement to w.
@@ -123,20 +131,15 @@ class Predictor:
         dual, options, start = self._dual, self._settings.options, None
         assert dual is not None
         dual.forget_counts()
-        if self._start is not None:
-            earlier, lam, mu = self._start
-            start = (gluing.multipliers(earlier, lam), mu)
+        if self._start is not None:  # nothing has a kernel in M
+            start = (gluing.multipliers(*self._start), np.zeros(0))
         qp_type, _ = resolve_types(options, dual.contact_rows, self._settings.prefix)
         result, accuracy = solve_dual(dual, options, qp_type, start)
-        self._start = self._kept(gluing, result)
+        self._start = (gluing, np.array(result.lam.array_r)) if result.reason > 0 else None
         self.multiplications = dual.F.count["solver"]
         result.destroy()
         conclude(result, accuracy, options, self._dofs.comm)
         return accuracy.u
-
-    def _kept(self, gluing: Gluing, result: QPResult) -> tuple[Gluing, Array, Array] | None:
-        """What the next call starts from."""
-        return (gluing, np.array(result.lam.array_r), result.mu) if result.reason > 0 else None
 
     def destroy(self) -> None:
         """Destroy the PETSc objects; the next call makes them anew."""

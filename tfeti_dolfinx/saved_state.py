@@ -35,6 +35,7 @@ class SavedState:
         group: Owned group of each condition with a row.
         velocity: Velocity in DOLFINx's order, empty without inertia.
         load: Load likewise.
+        predicted: Multipliers of this rank's rows of the predictor, empty without one.
     """
 
     layout: Array
@@ -49,6 +50,7 @@ class SavedState:
     group: Array
     velocity: Array = field(default_factory=lambda: np.zeros(0))
     load: Array = field(default_factory=lambda: np.zeros(0))
+    predicted: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def of(cls, solution: Solution, mu: Array, norm: float, reach: list[float]) -> SavedState:

@@ -79,7 +79,8 @@ def solve_dual(
     """Solve the dual problem, and look at the answer. Collective.
 
     From the solution of an earlier solve PCPG multiplies by F once, SMALSE-M at most twice: once
-    less each if F λ̄ is known, as it is where the dual problem has been solved for the same e.
+    less each if F λ̄ is known, as it is where the dual problem has been solved for the same e, or
+    where there is no kernel and it starts where the last solve has ended.
 
     Args:
         dual: The dual problem.
@@ -104,6 +105,8 @@ def solve_dual(
     rule.goal = goal
     result = solver.solve(Task(qp, homogenised, rule, options, begin, monitor))
     dual.saw(result.norm)
+    if dual.coarse.dimension == 0:
+        dual.last.keep(result.lam, result.gradient, qp.d)
     homogenised.destroy()
     if begin is not None:
         begin.lam.destroy()
@@ -134,7 +137,7 @@ def _homogenise(
 ) -> Homogenised:
     """With λ̄ where the solver starts, or as the options say."""
     if start is not None and solver.warm is not None:
-        at, known = image(qp.F, solver.warm(qp, start)), dual.known_image("natural")
+        at, known = dual.last.image(qp.F, solver.warm(qp, start)), dual.known_image("natural")
         scale = scale_at(qp, known) if known else scale_near(qp, at)
     elif solver.cold is not None:
         at = image(qp.F, solver.cold(qp))

@@ -32,7 +32,7 @@ from tfeti_dolfinx.qp.coarse import Coarse, NoCoarse
 from tfeti_dolfinx.qp.discs import Discs, Ellipses
 from tfeti_dolfinx.qp.faces import Face, Status, face_of
 from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Product
-from tfeti_dolfinx.qp.homogenised import Image, image
+from tfeti_dolfinx.qp.homogenised import Image, LastImage, image
 from tfeti_dolfinx.qp.norm import estimate_norm
 from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
 from tfeti_dolfinx.subdomains.local import LocalOperator
@@ -79,6 +79,7 @@ class Dual:
         contact_rows: Number of normal and of tangential rows on all ranks.
         seen: Largest estimate of ‖F‖ that solves have come to, 0 before.
         feasible: The set Ω of multipliers.
+        last: The last solution with its image, if there is no kernel.
         pressing: After ``recover``: contact rows whose force is more than the solver's error.
         nearly_free: After ``recover``: motions that contacts with a force hold hardly or not.
 
@@ -123,7 +124,7 @@ class Dual:
         self._law, self.feasible = feasible, feasible(constraints)
         self._images = dict[str, tuple[Array, Image]]()
         self._norm: tuple[int, float] | None = None
-        self.seen = 0.0
+        self.seen, self.last = 0.0, LastImage()
         self._check()
         self.d = linear_term(B, constraints.c, subdomains)
 

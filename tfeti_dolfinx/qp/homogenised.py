@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from petsc4py import PETSc
 
+from tfeti_dolfinx.parallel import any_rank
 from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.problem import QP, Operator
@@ -41,6 +42,26 @@ def image(F: Operator, x: PETSc.Vec) -> Image:
     if x.norm() > 0.0:
         F.mult(x, Fx)
     return Image(x, Fx)
+
+
+class LastImage:
+    """The last solution of a program, and what F makes of it."""
+
+    def __init__(self) -> None:
+        self._x, self._Fx = np.zeros(0), np.zeros(0)
+
+    def keep(self, x: PETSc.Vec, gradient: PETSc.Vec, d: PETSc.Vec) -> None:
+        """Take a solution without Gx = e, whose gradient is F x − d in all its parts."""
+        self._x, self._Fx = np.array(x.array_r), gradient.array_r + d.array_r
+
+    def image(self, F: Operator, x: PETSc.Vec) -> Image:
+        """As ``image``, but nothing is multiplied if x is the last solution. Collective."""
+        comm = x.getComm().tompi4py()
+        if any_rank(comm, not np.array_equal(self._x, x.array_r)):
+            return image(F, x)
+        Fx = x.duplicate()
+        Fx.array[:] = self._Fx
+        return Image(x, Fx)
 
 
 def natural(coarse: Coarse, like: PETSc.Vec) -> PETSc.Vec:
