@@ -247,6 +247,49 @@ def test_points_inside():
         p.destroy()
 
 
+def test_what_is_inside_does_not_matter():
+    """Triangles and quadrilaterals with the same surface."""
+    floor = tfeti.Obstacle("bottom", curved_obstacle(2))
+    found = []
+    for cell in ("triangle", "quadrilateral"):
+        p = problem(decomposed(cell, 6, 1), ALL, [floor])
+        p.solve()
+        x, u = displacement(p)
+        found.append(u[np.any((x[:, :2] < 1e-9) | (x[:, :2] > 1 - 1e-9), axis=1)])
+        p.destroy()
+    assert relative(found[1], found[0]) < 1e-7
+
+
+def test_plane_stress_with_a_thickness():
+    """A sheet under tension: the law is that of the form, and stresses are those of the body."""
+    d = decomposed("triangle", 4, 2)
+    V, _, _ = forms(d.mesh, d.facet_tags, (0.0, 0.0), d.surface("top"))
+    elastic = tfeti.Elasticity(d, E=2.0, nu=0.25, model="plane_stress", thickness=0.1)
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+    t = fem.Constant(d.mesh, (0.4, 0.0))
+    rollers = [
+        fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(i), 1, d.facets(s)), V.sub(i))
+        for i, s in enumerate(("left", "bottom"))
+    ]
+    p = tfeti.ContactProblem(
+        elastic.a(u, v),
+        elastic.thickness * ufl.dot(t, v) * ds(d.surface("right")),
+        rollers,
+        [],
+        d,
+        stress=elastic.stress,
+        thickness=elastic.thickness,
+        boundary_elements=ALL,
+        petsc_options={"tfeti_rtol": 1e-10},
+    )
+    p.solve()
+    x, found = displacement(p)
+    assert np.abs(found - x[:, :2] * (0.2, -0.05)).max() < 1e-8
+    values = p.solution.at([(0.3, 0.6), (0.8, 0.1)])
+    assert np.abs(values.stress - [[0.4, 0.0], [0.0, 0.0]]).max() < 1e-7
+
+
 def test_a_change_of_modulus_and_of_load():
     """A second solve makes S anew where the form has changed, and only there."""
     d = decomposed("triangle", 6, 4)
