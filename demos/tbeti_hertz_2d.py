@@ -107,7 +107,7 @@ def run(argv):
         from tfeti_dolfinx.plot import plot_deformed, plot_pressure
 
         folder, solution = demo.folder, problem.solution
-        zoom = {"focus": (0.0, 0.0, 0.0), "zoom": 12.0, "show_edges": True}
+        zoom = {"focus": (0.0, 0.0, 0.0), "zoom": 25.0, "show_edges": False}
         plot_deformed(folder / "tbeti_hertz_2d.png", solution, factor=1.0, **zoom)
         plot_pressure(
             folder / "tbeti_hertz_2d_pressure.png",

@@ -37,7 +37,7 @@ def quick(benchmark, folder, comm, *arguments):
 
 def test_talk_tables(shared_tmp, comm):
     tables = quick(talk_tables, shared_tmp, comm, "--rtol", "1e-4")
-    assert set(tables) == {"Hertz 2D", "Frictionless 3D", "Tresca 2D", "Tresca 3D"}
+    assert set(tables) == {"Hertz 2D", "Frictionless 3D", "Tresca 2D", "Tresca 3D", "TBETI"}
     for title, table in tables.items():
         (row,) = table
         assert row["rtol"] == "1e-04"

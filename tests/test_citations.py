@@ -27,6 +27,7 @@ def of(*methods):
         ("linear_3d", [], ("tfeti", "pcpg")),
         ("cube_3d", [], ("tfeti", "newton")),
         ("cube_3d", ["-tfeti_qp_type", "smalse"], ("tfeti", "smalse")),
+        ("tbeti_cube_3d", [], ("tfeti", "newton", "boundary elements")),
         ("stacked_blocks_3d", [], ("tfeti", "newton", "mortar")),
     ],
 )

@@ -10,6 +10,7 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.assembly import Forms
 from tfeti_dolfinx.boundary.parts import Parts
 from tfeti_dolfinx.checks import checked_type
+from tfeti_dolfinx.citations import cite
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -23,10 +24,11 @@ class BoundaryElements:
     """Volumes whose subdomains get boundary elements: Total BETI.
 
     The mesh of the surface of each of their subdomains, tears included, is the boundary elements'
-    mesh: displacements are linear on its segments or triangles (quadrilaterals are cut in two),
-    tractions constant. The forms stay those of all bodies; the law is read from the bilinear one,
-    and has to be homogeneous and isotropic in each of these volumes, in 3D, plane strain or plane
-    stress, without springs or masses. Loads on them are tractions and constant forces per volume.
+    mesh: displacements are linear on its segments or triangles (quadrilaterals are cut in two, both
+    ways), tractions constant. The forms stay those of all bodies; the law is read from the bilinear
+    one, and has to be homogeneous and isotropic in each of these volumes, in 3D, plane strain or
+    plane stress, without springs or masses. Loads on them are tractions and constant forces per
+    volume.
 
     Nothing but the surface counts: cells inside may be as coarse as they like. There the
     displacement of ``solution`` is that of finite elements under the same surface displacement.
@@ -41,6 +43,7 @@ class BoundaryElements:
 
     def __init__(self, *volumes: str | int) -> None:
         self.volumes = volumes
+        cite("boundary elements")
 
     def __repr__(self) -> str:
         return f"BoundaryElements({', '.join(repr(volume) for volume in self.volumes)})"

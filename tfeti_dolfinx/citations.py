@@ -65,6 +65,14 @@ DUAL_MORTAR = """@article{Wohlmuth2000,
   volume = {38}, pages = {989--1012}, year = {2000}
 }
 """
+TOTAL_BETI = """@article{BouchalaDostalSadowska2009,
+  title = {Scalable Total {BETI} based algorithm for {3D} coercive contact problems of linear
+    elastostatics},
+  author = {Bouchala, Ji{\\v{r}}{\\'i} and Dost{\\'a}l, Zden{\\v{e}}k and Sadowsk{\\'a}, Marie},
+  journal = {Computing},
+  volume = {85}, pages = {189--217}, year = {2009}
+}
+"""
 
 # of each method, what a paper that uses it should cite
 PAPERS = {
@@ -73,6 +81,7 @@ PAPERS = {
     "newton": (SEMISMOOTH, PCPG),
     "smalse": (SCALABLE_CONTACT, SMALSE, MPRGP),
     "mortar": (DUAL_MORTAR,),
+    "boundary elements": (TOTAL_BETI,),
 }
 
 

@@ -62,6 +62,12 @@ SOLVED = {
         lambda s: solved(s, a=s.a + s.u[0].dx(0) * s.v[0].dx(0) * s.dx),
         LAW,
     ),
+    "an axisymmetric body of boundary elements": (
+        lambda s: solved(
+            s, a=tfeti.Elasticity(s.d, E=1.0, nu=0.3, model="axisymmetric").a(s.u, s.v)
+        ),
+        LAW,
+    ),
     "displacements of degree 2 on boundary elements": (
         of_degree_two,
         r"boundary elements for 2 components of degree 2; expected displacements of degree 1",

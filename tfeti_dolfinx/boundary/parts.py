@@ -11,7 +11,6 @@ import numpy as np
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.boundary.block import BoundaryBlock, Part
 from tfeti_dolfinx.boundary.inside import Inside
-from tfeti_dolfinx.boundary.panels import Panels
 from tfeti_dolfinx.boundary.shape import Shape
 from tfeti_dolfinx.boundary.surface import Surface, surfaces
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
@@ -136,7 +135,7 @@ class Parts:
                 shape, corner = part.shape, self._surfaces[s].panels.x.min(axis=0)
                 on_surface = moved.reshape(shape.x.shape)[: shape.outer]
                 shift = corner - shape.x.min(axis=0)
-                yield Inside(shape.steklov, on_surface, forces[s], shift)
+                yield Inside(shape.bodies[0], on_surface, forces[s], shift)
 
         return inside
 
@@ -165,17 +164,18 @@ def _part(
     place = np.empty_like(unknowns)
     place[unknowns] = np.arange(len(unknowns))
     for shape in shapes[key]:
-        if _equal(shape, placed.panels, moved):
+        if _equal(shape, placed, moved):
             return Part(name, shape, place)
     shapes[key].append(Shape(name, placed, moved, how))
     return Part(name, shapes[key][-1], place)
 
 
-def _equal(shape: Shape, panels: Panels, K: Any) -> bool:
+def _equal(shape: Shape, surface: Surface, K: Any) -> bool:
     """Also of the same size, which K does not show in 2D."""
-    if not np.array_equal(shape.panels.nodes, panels.nodes):
+    pairs = zip(shape.surface.cuts, surface.cuts, strict=True)
+    if not all(np.array_equal(one.nodes, other.nodes) for one, other in pairs):
         return False
-    ours, theirs = (x - x.min(axis=0) for x in (panels.x, shape.panels.x))
+    ours, theirs = (x - x.min(axis=0) for x in (surface.panels.x, shape.x))
     if np.abs(ours - theirs).max() > PLACE * theirs.max():
         return False
     return bool(abs(K - shape.K_fem).max() <= SAME * np.abs(K.data).max())

@@ -11,7 +11,7 @@ from scipy.sparse import block_array, csr_array
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.boundary.material import law_of
 from tfeti_dolfinx.boundary.panels import Panels
-from tfeti_dolfinx.boundary.steklov import steklov
+from tfeti_dolfinx.boundary.steklov import Steklov, steklov
 from tfeti_dolfinx.boundary.surface import Surface
 from tfeti_dolfinx.errors import FactorError, TfetiError
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor
@@ -36,10 +36,11 @@ class Shape:
 
     Attributes:
         x: Points of the nodes.
-        panels: The panels.
+        surface: The surface.
         K_fem: Stiffness of finite elements.
         outer: Number of nodes on the surface.
-        steklov: S.
+        bodies: S for each way to cut the surface in panels.
+        S: Their mean.
 
     Raises:
         InputError: K is not that of a homogeneous, isotropic body.
@@ -47,15 +48,16 @@ class Shape:
     """
 
     def __init__(self, name: str, surface: Surface, K: Any, how: Making) -> None:
-        panels = surface.panels
-        self.name, self.x, self.panels, self.K_fem, self._how = name, panels.x, panels, K, how
-        self.outer = int(panels.nodes.max()) + 1
-        self._cut = self.outer * panels.dim
-        law = law_of(K, surface, name)
+        self.name, self.x, self.surface = name, surface.panels.x, surface
+        self.K_fem, self._how = K, how
+        self.outer = int(surface.panels.nodes.max()) + 1
+        self._cut = self.outer * surface.panels.dim
+        law, x = law_of(K, surface, name), self.x[: self.outer]
         try:
-            self.steklov = steklov(Panels(panels.x[: self.outer], panels.nodes), law)
+            self.bodies = [steklov(Panels(x, cut.nodes), law) for cut in surface.cuts]
         except TfetiError as error:
             raise type(error)(f"{name}: {error}") from error
+        self.S = np.mean([body.S for body in self.bodies], axis=0)
         self._stiffness: Stiffness | None = None
         self._unit_loads: Array | None = None
         self.K = self._replaced()
@@ -79,30 +81,16 @@ class Shape:
         """
         if self._unit_loads is None:
             inside = np.kron(hats[self.outer :, None], np.eye(len(b)))
-            on_surface = np.stack([self._particular_load(e) for e in np.eye(len(b))], axis=1)
+            on_surface = np.mean([_particular_loads(body) for body in self.bodies], axis=0)
             self._unit_loads = np.concatenate((on_surface + self._carried(inside), inside))
         return np.asarray(self._unit_loads @ b)
-
-    def _particular_load(self, b: Array) -> Array:
-        """S u_p − ∫t_p φ."""
-        law, panels, d = self.steklov.law, self.steklov.panels, len(b)
-        stiff, middle = law.lmbda + 2.0 * law.mu, panels.x.mean(axis=0)
-        u = -b * (panels.x - middle) ** 2 / (2.0 * stiff)
-        # the gradient of u_p is linear, so that ∫ of it times a hat is a mean over corners
-        corners = panels.corners - middle
-        mean = (corners.sum(axis=1, keepdims=True) + corners) / (d * (d + 1))
-        gradient = np.einsum("ij,j,pkj->pkij", np.eye(d), -b / stiff, mean)
-        tractions = np.einsum("pkij,pj->pki", law.stress(gradient), panels.directed)
-        f = (self.steklov.S @ u.ravel()).reshape(-1, d)
-        np.subtract.at(f, panels.nodes, tractions)
-        return f.ravel()
 
     def _replaced(self) -> csr_array:
         """K_S."""
         cut, K = self._cut, self.K_fem
-        K_io, S = K[cut:, :cut], self.steklov.S
-        corner = S + self._condensed() if K_io.shape[0] else S.copy()
-        modes = candidate_modes(self.x, self.panels.dim, self.x.mean(axis=0), 1.0)
+        K_io = K[cut:, :cut]
+        corner = self.S + self._condensed() if K_io.shape[0] else self.S.copy()
+        modes = candidate_modes(self.x, self.x.shape[1], self.x.mean(axis=0), 1.0)
         R, triangle = np.linalg.qr(modes[:cut])
         inside = modes[cut:] @ np.linalg.inv(triangle)
         # what rounding of K_ii⁻¹ leaves of rigid motions
@@ -147,3 +135,21 @@ class Shape:
     def diagonal(self) -> Array:
         """Diagonal of K_S, shape ``(n,)``."""
         return np.asarray(self.K.diagonal())
+
+
+def _particular_loads(body: Steklov) -> Array:
+    """S u_p − ∫t_p φ for unit forces per volume, shape ``(n, d)``."""
+    law, panels, d = body.law, body.panels, body.panels.dim
+    stiff, middle = law.lmbda + 2.0 * law.mu, panels.x.mean(axis=0)
+    u = np.einsum("ij,nj->nij", np.eye(d), -((panels.x - middle) ** 2) / (2.0 * stiff))
+    # the gradient of u_p is linear, so that ∫ of it times a hat is a mean over corners
+    corners = panels.corners - middle
+    mean = (corners.sum(axis=1, keepdims=True) + corners) / (d * (d + 1))
+    # for the force e_l alone ∂_l u_l is not 0
+    one = np.zeros((d, d, d))
+    one[np.arange(d), np.arange(d), np.arange(d)] = -1.0 / stiff
+    stress = law.stress(one[None, None] * mean[:, :, :, None, None])
+    tractions = np.einsum("pklij,pj->pkil", stress, panels.directed)
+    f = (body.S @ u.reshape(-1, d)).reshape(-1, d, d)
+    np.subtract.at(f, panels.nodes, tractions)
+    return f.reshape(-1, d)

@@ -25,23 +25,35 @@ class Surface:
     """The surface of a subdomain.
 
     Attributes:
-        panels: Panels; their points are those of all nodes of the subdomain.
+        cuts: Panels; their points are those of all nodes of the subdomain. Of quadrilaterals both
+            ways to cut them: one alone loads the two corners on the diagonal more than the
+            others.
         normals: Integrals of the hats of its facets times n, for each node, shape ``(n, d)``.
     """
 
-    panels: Panels
+    cuts: tuple[Panels, ...]
     normals: Array
+
+    @property
+    def panels(self) -> Panels:
+        """The first of the cuts."""
+        return self.cuts[0]
 
     def placed(self, order: Array) -> Surface:
         """The same with nodes, and therefore panels, in another order."""
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
-        nodes = rank[self.panels.nodes]
-        if nodes.shape[1] == 3:  # each from its lowest node on
-            turn = (np.argmin(nodes, axis=1)[:, None] + np.arange(3)) % 3
-            nodes = np.take_along_axis(nodes, turn, axis=1)
-        nodes = nodes[np.lexsort(nodes.T)]
-        return Surface(Panels(self.panels.x[order], nodes), self.normals[order])
+        x = self.panels.x[order]
+        cuts = tuple(Panels(x, _in_order(rank[cut.nodes])) for cut in self.cuts)
+        return Surface(cuts, self.normals[order])
+
+
+def _in_order(nodes: Array) -> Array:
+    """Panels sorted, triangles each from their lowest node on."""
+    if nodes.shape[1] == 3:
+        turn = (np.argmin(nodes, axis=1)[:, None] + np.arange(3)) % 3
+        nodes = np.take_along_axis(nodes, turn, axis=1)
+    return nodes[np.lexsort(nodes.T)]
 
 
 def surfaces(dofs: TornDofs, decomposition: Decomposition, chosen: Array) -> dict[int, Surface]:
@@ -71,15 +83,16 @@ def surfaces(dofs: TornDofs, decomposition: Decomposition, chosen: Array) -> dic
         nodes = np.take_along_axis(corners, local_corners, axis=1)
         middle, where = x[corners].mean(axis=1), position[cell]
         normals = _sum_at(nodes, _hat_normals(x, nodes, middle), x.shape)
+        cuts = [nodes]
         if nodes.shape[1] == 4:
-            nodes = _triangles(x, nodes)
+            cuts = _triangles(x, nodes)
             middle, where = np.tile(middle, (2, 1)), np.tile(where, 2)
-        nodes = _turned_outward(x, nodes, middle)
+        cuts = [_turned_outward(x, cut, middle) for cut in cuts]
         found = {}
         for s in map(int, np.flatnonzero(chosen)):
             first, last = dofs.node_offsets[s], dofs.node_offsets[s + 1]
-            panels = Panels(x[first:last], nodes[where == s] - first)
-            found[s] = Surface(panels, normals[first:last])
+            own = tuple(Panels(x[first:last], cut[where == s] - first) for cut in cuts)
+            found[s] = Surface(own, normals[first:last])
     return found
 
 
@@ -125,8 +138,8 @@ def _check_degrees(dofs: TornDofs) -> None:
         )
 
 
-def _triangles(x: Array, nodes: Array) -> Array:
-    """Quadrilaterals in DOLFINx's order, (0, 1), (2, 3) parallel, cut in two, shape ``(2k, 3)``."""
+def _triangles(x: Array, nodes: Array) -> list[Array]:
+    """Quadrilaterals cut in two along each of their diagonals, shapes ``(2k, 3)``."""
     ring = nodes[:, [0, 1, 3, 2]]
     a, b, c, d = np.moveaxis(x[ring], 1, 0)
     size = np.linalg.norm(c - a, axis=1)
@@ -138,7 +151,8 @@ def _triangles(x: Array, nodes: Array) -> Array:
         )
     first = np.argmin(x[ring] @ DIRECTION, axis=1)[:, None]
     ring = np.take_along_axis(ring, (first + np.arange(4)) % 4, axis=1)
-    return np.concatenate((ring[:, [0, 1, 2]], ring[:, [0, 2, 3]]))
+    halves = [([0, 1, 2], [0, 2, 3]), ([1, 2, 3], [1, 3, 0])]
+    return [np.concatenate([ring[:, half] for half in pair]) for pair in halves]
 
 
 def _turned_outward(x: Array, nodes: Array, middle: Array) -> Array:
