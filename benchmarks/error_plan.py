@@ -53,7 +53,7 @@ def plan(name: str, cases: list[Case], finest: float, order: int = 2) -> Plan:
     reference = case(name, (finest,), degree=2, order=order)
     quick = tuple(replace(one, sizes=one.sizes[:2]) for one in cases[:2])
     coarse = replace(reference, sizes=(quick[0].sizes[1],))
-    return Plan(tuple(cases), replace(reference, rtol=1e-8), quick, coarse)
+    return Plan(tuple(cases), replace(reference, rtol=1e-7), quick, coarse)
 
 
 def _line() -> Plan:
@@ -90,7 +90,7 @@ def _rings() -> Plan:
     cases = both(name, sizes, mesh=UNIFORM)
     cases += both(name, sizes, mesh=UNIFORM, cell=QUADRILATERAL)
     cases += both(name, sizes, mesh=UNIFORM, ranks=2)
-    return plan(name, cases, 96.0)
+    return plan(name, cases, 90.0)  # of no mesh a refinement: their midpoints are better
 
 
 def _cylinder() -> Plan:

@@ -186,7 +186,7 @@ def _rings() -> Scene:
         }
 
     return Scene(
-        build=lambda n, mesh: rings.build((3 * round(n), 4 * round(n))),
+        build=lambda n, mesh: rings.build((3 * round(n), 4 * round(n)), triangles=True),
         make=make,
         samples=samples,
         exact=np.full(len(samples.points), rings.lame_pressure(OVERLAP)),

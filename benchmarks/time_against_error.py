@@ -119,12 +119,42 @@ def summary(case: Case, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return made
 
 
+def degrees(groups: dict[str, Sequence[dict[str, Any]]]) -> list[dict[str, Any]]:
+    """Errors of degree 1 over those of degree 2 in the same time, on straight lines of logarithms.
+
+    Args:
+        groups: Rows of groups of meshes, by their names.
+    """
+    table = []
+    for name, quadratic in groups.items():
+        linear = groups.get(name.replace("P2 curved", "P1").replace("P2 straight", "P1"), quadratic)
+        if linear is quadratic:
+            continue
+        start = max(rows[0]["seconds"] for rows in (linear, quadratic))
+        end = min(rows[-1]["seconds"] for rows in (linear, quadratic))
+        for seconds in [start, np.sqrt(start * end), end] if start < end else []:
+            row = {"meshes": name, "seconds": float(seconds)}
+            for measure in MEASURES:
+                one, two = (error_at(rows, measure, seconds) for rows in (linear, quadratic))
+                row[f"{measure}, P1"], row[f"{measure}, P2"] = one, two
+                row[f"{measure}, P1 over P2"] = one / two
+            table.append(row)
+    return table
+
+
+def error_at(rows: Sequence[dict[str, Any]], name: str, seconds: float) -> float:
+    """The error that is reached in some seconds, which are within those of the rows."""
+    ordered = sorted(rows, key=lambda row: row["seconds"])
+    x, y = ([np.log(row[key]) for row in ordered] for key in ("seconds", name))
+    return float(np.exp(np.interp(np.log(seconds), x, y)))
+
+
 def study(name: str, arguments: argparse.Namespace, folder: Path) -> Tables:
     """The tables of a scene; what its reference has goes into a folder."""
     plan, scene, reference = PLANS[name], SCENES[name](), folder / "reference.npz"
     finest = plan.quick_reference if arguments.quick else plan.reference
     best = run_case(finest, reference)["rows"][-1]
-    rows, groups, once = [], [], []
+    rows, groups, once, by_name = [], [], [], {}
     for planned in plan.quick if arguments.quick else plan.cases:
         if planned.ranks not in arguments.ranks:
             continue
@@ -132,10 +162,13 @@ def study(name: str, arguments: argparse.Namespace, folder: Path) -> Tables:
         found = run_case(case, reference)
         made = [compared(scene, one, best) for one in found["rows"]]
         rows += [{"meshes": label(case), **row} for row in made]
+        by_name[label(case)] = made
         groups.append(summary(case, made))
         once.append({"meshes": label(case), **found["once"]})
         print(name, *groups[-1].values(), sep=" | ", flush=True)
-    return {name: rows, f"{name}, slopes and seconds": groups, f"{name}, paid once": once}
+    tables = {name: rows, f"{name}, slopes and seconds": groups, f"{name}, paid once": once}
+    beside = degrees(by_name)
+    return {**tables, f"{name}, degrees at equal seconds": beside} if beside else tables
 
 
 def draw(path, tables):

@@ -193,6 +193,18 @@ def test_seconds_at_an_error_are_between_two_meshes():
     assert found == [1.0, pytest.approx(4.0), pytest.approx(16.0), None]
 
 
+def test_degrees_are_compared_in_the_same_time():
+    """Errors that fall as 1/t and as 4/t², which meet at t = 4."""
+    times = (1.0, 10.0)
+    groups = {
+        "graded P1": [{"seconds": t, "energy": 1 / t, "pressure": 1 / t} for t in times],
+        "graded P2 curved": [{"seconds": t, "energy": 4 / t**2, "pressure": 1 / t} for t in times],
+    }
+    found = time_against_error.degrees(groups)
+    assert [row["energy, P1 over P2"] for row in found] == pytest.approx([0.25, 10**0.5 / 4, 2.5])
+    assert [row["pressure, P1 over P2"] for row in found] == pytest.approx([1.0] * 3)
+
+
 def test_pressures_are_compared_as_functions():
     """Linear between points in any order: Hertz's own, on points that are fine enough."""
     rng = np.random.default_rng(0)
