@@ -8,6 +8,7 @@ from scenes import clamp, curved_obstacle, decomposed, forms
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.subdomains import averages
 from tfeti_dolfinx.subdomains.clusters import ClusteredSubdomains
 
 COMM = MPI.COMM_WORLD
@@ -167,6 +168,16 @@ def test_hooks_have_soft_motions(serial_only):
     _, report = solved(square(16, 4, clusters=3))
     assert report.soft_modes > 0
     assert report.F_multiplications <= 2 * plain.F_multiplications
+
+
+def test_subdomains_of_a_body_that_hang_together_elsewhere(serial_only):
+    """Of a fork a rank may have the prongs alone."""
+    pairs, nodes = np.array([[0, 1], [2, 3], [4, 5], [6, 7]]), np.full(4, 3)
+    whole = np.array([0, 0, 1, 1, 2, 2, 3, 3])
+    part = averages._parts(pairs, nodes, whole, 0.5)
+    assert np.array_equal(part, whole)
+    finer = averages._parts(pairs, nodes, whole, 1.0)
+    assert all(len(np.unique(whole[finer == one])) == 1 for one in np.unique(finer))
 
 
 def test_without_them_nothing_is_paid():

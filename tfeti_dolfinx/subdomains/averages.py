@@ -70,8 +70,8 @@ def clusters_of(dofs: TornDofs, decomposition: Decomposition, wanted: int) -> Cl
     faces = _faces(dofs, x)
     pairs = np.array([face.pair for face in faces], dtype=np.int64).reshape(-1, 2)
     nodes = np.array([len(face.first) for face in faces], dtype=np.int64)
-    bodies = decomposition.body_of_subdomain[decomposition.subdomains]
-    part = _parts(pairs, nodes, bodies, wanted / decomposition.num_subdomains)
+    whole = _connected(pairs, len(decomposition.subdomains))[1]
+    part = _parts(pairs, nodes, whole, wanted / decomposition.num_subdomains)
     within = part[pairs[:, 0]] == part[pairs[:, 1]]
     count, cluster = _connected(pairs[within], len(part))
     chosen = np.flatnonzero(within)
@@ -102,17 +102,23 @@ def _connected(pairs: Array, n: int) -> tuple[int, Array]:
     return int(count), found
 
 
-def _parts(pairs: Array, nodes: Array, bodies: Array, share: float) -> Array:
-    """Part of each subdomain: in each body their share of its subdomains, at least one.
+def _parts(pairs: Array, nodes: Array, whole: Array, share: float) -> Array:
+    """Part of each subdomain: each whole gets its share of parts, at least one.
 
     METIS cuts few nodes of faces; it may make parts of unequal size, since what they cost is what
     their subdomains do. Slender parts would have soft motions.
+
+    Args:
+        pairs: Subdomains that share a face, shape ``(p, 2)``.
+        nodes: How many nodes the faces have, shape ``(p,)``.
+        whole: What each subdomain hangs together with, on this rank.
+        share: Wanted clusters for each subdomain.
     """
-    n, part, first = len(bodies), np.zeros(len(bodies), dtype=np.int64), 0
+    n, part, first = len(whole), np.zeros(len(whole), dtype=np.int64), 0
     graph = coo_array((nodes, tuple(pairs.T)), shape=(n, n)).tocsr()
     graph = csr_array(graph + graph.T)
-    for body in np.unique(bodies):
-        members = np.flatnonzero(bodies == body)
+    for which in np.unique(whole):
+        members = np.flatnonzero(whole == which)
         count = max(1, round(share * len(members)))
         part[members] = first + _metis_of(csr_array(graph[members][:, members]), count)
         first += count
