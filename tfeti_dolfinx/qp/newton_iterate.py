@@ -29,8 +29,7 @@ from tfeti_dolfinx.qp.trial import Trial
 
 # of what the gradient step promises at least, (ᾱ/2)‖g^P‖²: a step must lower q by that share
 ENOUGH = 0.1
-# of Fλ − d: where Gᵀμ is nearly all of it, it is taken out of d, since its rounding, as where gaps
-# are far larger than displacements, would drown what is left
+# of Fλ − d: where Gᵀμ is nearly all of it, as where gaps are large, it is taken out of d
 MOST = 0.1
 # times Fλ − d: multipliers that are larger are rounding, for Gᵀμ is to be as large as that
 WILD = 1e3
@@ -72,7 +71,7 @@ class Iterate:
         self._taken: Array = np.zeros(qp.coarse.dimension)
         self._set_multipliers()
         self.residual, self._best, self.norm, self.rounding = np.inf, np.inf, 1.0, 0.0
-        self._idle, self._slow = 0, 0
+        self._idle = self._slow = 0
 
     def face(self) -> Face:
         """The face of λ."""
@@ -173,7 +172,8 @@ class Iterate:
         enough = ENOUGH * 0.5 / self.norm * self.residual**2 if known else 0.0
         gain = self.gain(trial.last)
         hidden = ROUNDING * slipping_work(self.point.lam, self.s, trial.face)
-        if trial.feasible and agreed(self._comm, gain >= enough - hidden):
+        stays = gain <= 0.0 and self._idle > 1  # what is left is not on the face, but maybe Gλ ≠ e
+        if trial.feasible and agreed(self._comm, gain >= enough - hidden and not stays):
             self._take(trial.last, gain)
             faces.settle()
             return True
