@@ -9,8 +9,8 @@
 # are near to Hertz', whose contact is smooth and small beside the ball, as that of a stiffer one:
 #
 #     ./run mpirun -n 2 python3 demos/falling_balls_3d.py --plot
-#     ./run python3 demos/falling_balls_3d.py --balls 1 --modulus 1e7 --fine 0.02 \
-#         --gap 0.01 --end 0.013 --steps 30 --smooth
+#     ./run python3 demos/falling_balls_3d.py --balls 1 --modulus 4e7 --fine 0.015 \
+#         --gap 0.01 --end 0.01 --steps 30 --smooth
 
 """Balls that fall on a rough floor and on each other; the first impact in closed form."""
 
