@@ -6,10 +6,11 @@
 # small, since who meets whom is found where the balls begin.
 #
 # Until its first impact is over the lowest ball is alone with the floor: force and duration of that
-# are near to Hertz', whose contact is small beside the ball. It is so where the ball is stiffer:
+# are near to Hertz', whose contact is smooth and small beside the ball, as that of a stiffer one:
 #
 #     ./run mpirun -n 2 python3 demos/falling_balls_3d.py --plot
-#     ./run python3 demos/falling_balls_3d.py --balls 1 --modulus 2e6 --fine 0.02 --end 0.27
+#     ./run python3 demos/falling_balls_3d.py --balls 1 --modulus 4e7 --fine 0.015 \
+#         --gap 0.01 --end 0.01 --steps 30 --smooth
 
 """Balls that fall on a rough floor and on each other; the first impact in closed form."""
 
@@ -46,20 +47,23 @@ def hertz(E):
     return force, 2.94 * approach / SPEED, np.sqrt(approach / R)
 
 
-def scene(decomposition, E, count, **keywords):
-    """Balls with their weight, contacts with Coulomb's friction."""
-    mesh = decomposition.mesh
-    elastic = tfeti.Elasticity(decomposition, E=E, nu=NU)
+def scene(decomposition, arguments, count, **keywords):
+    """Balls with their weight and what they have fallen, contacts with Coulomb's friction."""
+    mesh, gap = decomposition.mesh, arguments.gap
+    elastic = tfeti.Elasticity(decomposition, E=arguments.modulus, nu=NU)
     V = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
     weight = fem.Constant(mesh, (0.0, 0.0, -RHO * G))
     thrown = fem.Function(V)
-    top_of_first = GAP + 2 * R + 0.5 * APART
-    thrown.interpolate(lambda x: np.outer([ALONG, 0, 0], x[2] < top_of_first))
-    rough = tfeti.Coulomb(0.3)
+    fallen = -np.sqrt(2 * G * (GAP - gap))
+    first = gap + 2 * R + 0.5 * APART
+    thrown.interpolate(
+        lambda x: np.stack((ALONG * (x[2] < first), 0 * x[0], np.full_like(x[0], fallen)))
+    )
+    rough = None if arguments.smooth else tfeti.Coulomb(0.3)
     floor = tfeti.Plane((0, 0, 0), normal=(0, 0, 1))
     contacts = [
-        tfeti.Obstacle("ball 1 lower", floor, friction=rough, reach=GAP + 0.15, name="floor")
+        tfeti.Obstacle("ball 1 lower", floor, friction=rough, reach=gap + 0.15, name="floor")
     ]
     for n in range(1, count):
         pair = (f"ball {n + 1} lower", f"ball {n} upper")
@@ -90,12 +94,12 @@ def run(argv):
     size = closed[1] / (arguments.steps or (6 if arguments.quick else 15))
 
     # ## Mesh
-    lowest = GAP + (2 * R + APART) * np.arange(count)
+    lowest = arguments.gap + (2 * R + APART) * np.arange(count)
     model = build(lowest, R, fine, max(0.3, fine)) if comm.rank == 0 else None
     decomposition = tfeti.read_gmsh(model, comm, arguments.subdomains)
 
     # ## Motion
-    problem = scene(decomposition, arguments.modulus, count, petsc_options=demo.petsc_options)
+    problem = scene(decomposition, arguments, count, petsc_options=demo.petsc_options)
     film = Film(problem, height=lowest[-1] + 2 * R) if arguments.plot else None
     records, begin = [], 0.0
     times = size * np.arange(1, round(end / size) + 1)
@@ -157,6 +161,8 @@ def main(argv):
 def configure(parser):
     parser.add_argument("--balls", type=int, help="how many")
     parser.add_argument("--modulus", type=float, default=2e4, help="Young's modulus")
+    parser.add_argument("--smooth", action="store_true", help="without friction")
+    parser.add_argument("--gap", type=float, default=GAP, help="what is left of the fall")
     parser.add_argument("--fine", type=float, help="element size where balls touch")
     parser.add_argument("--steps", type=float, help="steps in the first impact")
     parser.add_argument("--end", type=float, help="time of the end")

@@ -135,7 +135,7 @@ def test_a_bouncing_bar_is_as_in_closed_form():
     _, report = importlib.import_module("demos.bouncing_bar").run(["--quick", "--cells", "32"])
     assert abs(report.errors["first_begin"]) <= 0.01
     assert abs(report.errors["first_end"]) <= 0.015
-    assert abs(report.errors["first_pressure"]) <= 0.002
+    assert abs(report.errors["first_pressure"]) <= 0.005
     assert report.in_all["assemblies"] == report.in_all["gluings"] == 1
 
 
@@ -158,3 +158,13 @@ def test_impacts_of_bars_are_as_in_closed_form(name):
     assert abs(report.errors[f"{name}_duration"]) <= 1.01 * step
     assert report.errors[f"{name}_oscillates"] <= 0.005
     assert -0.02 <= report.errors[f"{name}_energy"] <= 0.0
+
+
+@pytest.mark.slow
+def test_a_ball_hits_the_floor_as_hertz_says():
+    """Where the contact is small beside the ball, a/R = 0.056, and smooth."""
+    values = {"balls": 1, "modulus": 4e7, "fine": 0.015, "gap": 0.01, "end": 0.01, "steps": 30}
+    arguments = [f"--{name}={value}" for name, value in values.items()]
+    _, report = importlib.import_module("demos.falling_balls_3d").run([*arguments, "--smooth"])
+    assert abs(report.errors["force"]) <= 0.05
+    assert abs(report.errors["duration"]) <= 0.05
