@@ -100,7 +100,8 @@ class Forms:
         """Take another linear form on the same space."""
         check_form(L, "L", self._V, self._decomposition)
         self._L = None if is_zero(L) else self._compiled(L, "L")
-        self._of_L, self._volume_of_L = data_of(L, self._V), cell_integrals(L)
+        self._of_L = data_of(L, self._V)
+        self._volume_of_L: ufl.Form | fem.Form | None = cell_integrals(L)
 
     def has_new_points(self) -> bool:
         """Whether the mesh has moved since the last call."""
@@ -128,7 +129,9 @@ class Forms:
         """The part of the load from integrals over cells; None if there are none."""
         if self._volume_of_L is None:
             return None
-        return np.array(fem.assemble_vector(self._compiled(self._volume_of_L, "L")).array)
+        if isinstance(self._volume_of_L, ufl.Form):  # few problems ask for it
+            self._volume_of_L = self._compiled(self._volume_of_L, "L")
+        return np.array(fem.assemble_vector(self._volume_of_L).array)
 
     def hats(self) -> Array:
         """Integrals of the hats over the cells, for each of DOLFINx's nodes."""
