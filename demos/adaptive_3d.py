@@ -66,10 +66,18 @@ def run(argv):
     r = np.hypot(contact.points[:, 0], contact.points[:, 1])
     problem.report.errors.update(compare(MPI.COMM_WORLD, contact, r, HERTZ))
     if demo.arguments.plot:
-        from tfeti_dolfinx.plot import plot_deformed
+        from tfeti_dolfinx.plot import plot_deformed, plot_pressure
 
-        view = {"focus": (0.0, 0.0, 3 * a), "zoom": 0.14 * R / a, "show_edges": True}
-        plot_deformed(demo.folder / "adaptive_3d.png", problem.solution, factor=1.0, **view)
+        folder, solution = demo.folder, problem.solution
+        plot_deformed(folder / "adaptive_3d.png", solution, factor=1.0, show_edges=True)
+        plot_pressure(
+            folder / "adaptive_3d_pressure.png",
+            solution,
+            lambda points: np.hypot(points[:, 0], points[:, 1]),
+            HERTZ.pressure,
+            limit=2 * a,
+            label="r",
+        )
     return demo.finish(problem, "adaptive_3d")
 
 
