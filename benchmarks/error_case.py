@@ -33,7 +33,7 @@ import tfeti_dolfinx as tfeti
 from benchmarks.error_scenes import ADAPTIVE, GRADED, SCENES, Scene
 from benchmarks.profiles import Array
 from benchmarks.stress_error import energy_error, write_stresses
-from demos import adaptive_2d
+from demos import adaptive_2d, adaptive_3d
 from meshes.tools import element_options
 
 TRIANGLE, QUADRILATERAL = "triangle", "quadrilateral"
@@ -43,6 +43,12 @@ CELLS = {TRIANGLE: {}, QUADRILATERAL: {"RecombineAll": 1, "RecombinationAlgorith
 SUBDOMAIN = {2: 2500, 3: 4000}
 # seconds up to which a solve is repeated, and how often
 SHORT, REPEATS = 3.0, 3
+AUTO = {"tfeti_rtol": "auto"}
+# solves on meshes that follow the error
+FOLLOWED = {
+    "half cylinder": lambda goal: adaptive_2d.steps(goal, 8, AUTO),
+    "half ball": lambda goal: adaptive_3d.steps(goal, AUTO),
+}
 
 
 @dataclass(frozen=True)
@@ -146,7 +152,7 @@ def adapted(case: Case, goal: float, comm: MPI.Intracomm) -> Solved:
     """All solves of the adaptive loop, and their estimates. Collective."""
     clear_peak()
     begin, meshing, last = time.perf_counter(), 0.0, None
-    for problem, _, seconds in adaptive_2d.solves(goal, 8, {"tfeti_rtol": "auto"}):
+    for problem, _, seconds in FOLLOWED[case.scene](goal):
         meshing += seconds
         if last is not None:
             last.destroy()

@@ -73,6 +73,7 @@ def _ball() -> Plan:
     cases[0] = case(name, sizes)
     cases += both(name, sizes[:3], order=1)[1:]
     cases.append(case(name, (0.6, 1.0, 1.5), mesh=UNIFORM))
+    cases.append(case(name, (0.35, 0.25, 0.18), mesh=ADAPTIVE))
     cases += [replace(one, ranks=2) for one in cases[:2]]
     return plan(name, cases, 10.0)
 

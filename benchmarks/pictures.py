@@ -7,6 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+FEW = 8  # values that all can stand beside an axis
+
 
 @contextmanager
 def picture(path: Path, panels: int, height: float = 3.4, rows: int = 1) -> Iterator[list[Any]]:
@@ -64,10 +66,10 @@ def curves(
 
 
 def plain(axis: Any, ticks: Sequence[float] | None = None) -> None:
-    """Numbers as they are on a logarithmic axis: those given if short, or 1, 2, 5, 10, ..."""
+    """Numbers as they are on a logarithmic axis: those given if few and short, or 1, 2, 5, ..."""
     from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
 
-    short = ticks is not None and max(ticks) < 1000
+    short = ticks is not None and max(ticks) < 1000 and len(ticks) <= FEW
     axis.set_major_locator(FixedLocator(ticks) if short else LogLocator(subs=(1.0, 2.0, 5.0)))
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

@@ -172,17 +172,22 @@ def study(name: str, arguments: argparse.Namespace, folder: Path) -> Tables:
 
 
 def draw(path, tables):
-    """Errors over seconds."""
+    """Errors over seconds, on one rank."""
     titles = [title for title in tables if title in SCENES]
-    with picture(path, len(titles), 2 * 3.6, rows=2) as axes:
+    with picture(path, len(titles), 8.6, rows=2) as axes:
         for k, title in enumerate(titles):
-            for panel, name in zip(axes[k :: len(titles)], MEASURES, strict=True):
+            panels = axes[k :: len(titles)]
+            for panel, name in zip(panels, MEASURES, strict=True):
                 lines: dict[str, tuple[list[float], list[float]]] = {}
                 for row in tables[title]:
-                    x, y = lines.setdefault(row["meshes"], ([], []))
-                    x.append(row["seconds"])
-                    y.append(row[name])
+                    if not row["meshes"].endswith("ranks"):
+                        x, y = lines.setdefault(row["meshes"], ([], []))
+                        x.append(row["seconds"])
+                        y.append(row[name])
                 curves(panel, title, ("seconds", f"relative error, {name}"), lines)
+            panels[0].get_legend().remove()
+            below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.18), "ncols": 2}
+            panels[1].legend(fontsize="small", **below)
 
 
 def main(argv):

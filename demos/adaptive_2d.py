@@ -8,8 +8,6 @@
 """Hertz contact in 2D on meshes that follow the estimated error."""
 
 import sys
-import time
-from functools import partial
 from pathlib import Path
 
 import petsc4py
@@ -17,7 +15,6 @@ import petsc4py
 if __name__ == "__main__":
     petsc4py.init(sys.argv)  # before DOLFINx, which would initialise PETSc without options
 
-import numpy as np
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
@@ -25,18 +22,13 @@ from mpi4py import MPI
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import tfeti_dolfinx as tfeti
+from demos.adaptive import last_of, solves
 from demos.demo_tools import Demo
 from demos.hertz import LineContact, compare
 from meshes.half_cylinder import build
-from meshes.tools import sizes_from_triangles
-from tfeti_dolfinx.compat import geometry_dofmap
 
 R, E, nu, a = 1.0, 1.0, 0.3, 0.04
 hertz = LineContact.from_half_width(a, R, E / (1 - nu**2))
-
-# An element becomes at most so many times smaller or larger at once, and the error of all halved:
-# a coarse mesh says little of where a fine one should be.
-SMALLER, LARGER, STEP = 4.0, 2.0, 0.5
 
 
 def scene(decomposition, degree=1):
@@ -59,56 +51,17 @@ def scene(decomposition, degree=1):
     }
 
 
-def new_sizes(solution, wanted):
-    """Triangles with their sizes in the next mesh, on rank 0. Collective.
+def steps(goal, subdomains, options):
+    """Solve, estimate, mesh anew, until the error is small enough. Collective."""
 
-    With elements of size h the square of an element's error is about C h⁴, and the fewest elements
-    have equal errors: h' = h (c/η²)^¼, and all errors add up to ``wanted``² for √c = wanted²/Ση.
-    """
-    mesh, comm = solution.decomposition.mesh, solution.decomposition.comm
-    field = solution.discretisation_error
-    cells = len(solution.decomposition.cell_subdomain)
-    error = field.x.array[np.asarray(field.function_space.dofmap.list)[:cells, 0]]
-    corners = mesh.geometry.x[geometry_dofmap(mesh)[:cells]]
-    sides = corners[:, 1:, :2] - corners[:, :1, :2]
-    h = np.sqrt(np.abs(np.linalg.det(sides)))
-    root = wanted**2 / comm.allreduce(float(error.sum()))
-    factor = np.sqrt(root / np.maximum(error, 1e-300))
-    size = h * np.clip(factor, 1 / SMALLER, LARGER)
-    parts = comm.gather((corners, np.repeat(size[:, None], 3, axis=1)), root=0)
-    return None if parts is None else [np.concatenate(part) for part in zip(*parts, strict=True)]
-
-
-def solves(goal, subdomains, options):
-    """Problems that are solved, each on a better mesh, until the error is small enough. Collective.
-
-    Yields:
-        The problem, its estimate, and the seconds that gmsh has taken for the mesh. Destroying
-        the problem is up to the caller.
-    """
-    comm, sizes = MPI.COMM_WORLD, None
-
-    # ## Solve, estimate, mesh anew
+    # ## Meshes
     #
-    # gmsh meshes on rank 0, from the sizes that the last estimate asks for.
-    while True:
-        start, model = time.perf_counter(), None
-        if comm.rank == 0:
-            field = None if sizes is None else partial(sizes_from_triangles, *sizes)
-            model = build(R, fine=0.1 * R, fine_radius=10 * R, sizes=field)
-        comm.barrier()
-        meshing = time.perf_counter() - start
-        decomposition = tfeti.read_gmsh(model, comm, subdomains)
-        problem = tfeti.ContactProblem(**scene(decomposition), petsc_options=options)
-        problem.solve()
-        found = problem.estimate()
-        wanted = max(STEP * found.discretisation, 0.95 * goal * found.energy)
-        done = found.relative_discretisation <= goal
-        if not done:
-            sizes = new_sizes(problem.solution, wanted)
-        yield problem, found, meshing
-        if done:
-            return
+    # gmsh makes them on rank 0, a coarse uniform one at first, then from the sizes that the last
+    # estimate asks for.
+    def mesh(sizes):
+        return build(R, fine=0.1 * R, fine_radius=10 * R, sizes=sizes)
+
+    return solves(mesh, scene, goal, lambda nodes: subdomains, options, MPI.COMM_WORLD)
 
 
 def run(argv):
@@ -116,17 +69,7 @@ def run(argv):
     arguments, comm = demo.arguments, MPI.COMM_WORLD
     goal = arguments.error or (0.2 if arguments.quick else 0.05)
     options = {"tfeti_rtol": "auto", **demo.petsc_options}
-    last = None
-    for problem, found, _ in solves(goal, arguments.subdomains, options):
-        if comm.rank == 0:
-            print(
-                f"{problem.report.primal_dofs} unknowns, error {found.relative_discretisation:.2%}",
-                flush=True,
-            )
-        if last is not None:
-            last.destroy()
-        last = problem
-    problem = last
+    problem = last_of(steps(goal, arguments.subdomains, options))
 
     contact = problem.solution.contact(0)
     problem.report.errors.update(compare(comm, contact, contact.points[:, 0], hertz))

@@ -6,6 +6,7 @@ python3 meshes/half_ball.py half_ball.msh --partitions 16
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from math import pi
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import gmsh
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from meshes.tools import graded_size, partition, script, started_model
+from meshes.tools import graded_size, partition, script, started_model, use_sizes
 
 HXT = 10
 
@@ -25,6 +26,7 @@ def build(
     fine_radius: float = 0.06,
     growth: float = 0.3,
     partitions: int = 0,
+    sizes: Callable[[], int] | None = None,
 ) -> Any:
     """Mesh the half ball |x − (0, 0, R)| ≤ R, z ≤ R on this rank and return gmsh's model.
 
@@ -36,6 +38,7 @@ def build(
         fine_radius: Size of the fine zone.
         growth: Growth of the element size with the distance from that zone.
         partitions: Number of gmsh's partitions, 0 for none.
+        sizes: Makes a gmsh field of element sizes instead.
     """
     model = started_model("half_ball")
     ball = model.occ.addSphere(0.0, 0.0, radius, radius, angle1=-pi / 2, angle2=0.0)
@@ -46,7 +49,10 @@ def build(
     model.addPhysicalGroup(3, [ball], name="body")
     model.addPhysicalGroup(2, [tag for tag in surfaces if tag != top], name="contact")
     model.addPhysicalGroup(2, [top], name="top")
-    graded_size((0.0, 0.0, 0.0), fine, fine_radius, growth)
+    if sizes is None:
+        graded_size((0.0, 0.0, 0.0), fine, fine_radius, growth)
+    else:
+        use_sizes(sizes())
     gmsh.option.setNumber("Mesh.Algorithm3D", HXT)
     gmsh.model.mesh.generate(3)
     partition(partitions)

@@ -73,16 +73,17 @@ def use_sizes(*fields: int) -> None:
         gmsh.option.setNumber(f"Mesh.MeshSize{name}", 0)
 
 
-def sizes_from_triangles(corners: Any, sizes: Any) -> int:
-    """A gmsh field of element sizes that are given on triangles, and linear in each of them.
+def sizes_from_simplices(corners: Any, sizes: Any) -> int:
+    """A gmsh field of element sizes that are given on simplices, and linear in each of them.
 
     Args:
-        corners: Shape ``(n, 3, 3)``: corners of the triangles, and their coordinates.
-        sizes: Sizes at the corners, shape ``(n, 3)``.
+        corners: Shape ``(n, 3, 3)`` or ``(n, 4, 3)``: corners of triangles or tetrahedra, and their
+            coordinates.
+        sizes: Sizes at the corners, shape ``(n, 3)`` or ``(n, 4)``.
     """
-    view = gmsh.view.add("sizes")
-    table = np.concatenate((np.swapaxes(corners, 1, 2).reshape(-1, 9), sizes), axis=1)
-    gmsh.view.addListData(view, "ST", len(table), table.ravel())
+    view, count = gmsh.view.add("sizes"), sizes.shape[1]
+    table = np.concatenate((np.swapaxes(corners, 1, 2).reshape(-1, 3 * count), sizes), axis=1)
+    gmsh.view.addListData(view, {3: "ST", 4: "SS"}[count], len(table), table.ravel())
     field = gmsh.model.mesh.field.add("PostView")
     gmsh.model.mesh.field.setNumber(field, "ViewTag", view)
     return int(field)

@@ -25,12 +25,15 @@ PRESSED = {2: "LineLoadCondition2D2N", 3: "SurfaceLoadCondition3D3N"}
 LAW = {2: "LinearElasticPlaneStrain2DLaw", 3: "LinearElastic3DLaw"}
 PRESSURE = {2: "LINE_LOAD", 3: "SURFACE_LOAD"}
 SOLVER = "amgcl"
-WIDE, NEAR, PIECES = 4.0, 2.5, {2: 40, 3: 24}
+UNIT = 1e9  # of stress: Kratos has absolute tolerances, 1e-9
+# half width of the block, that of the surface that may touch, both over a, and how much larger
+# than the body the block is meshed: where it is coarse, pairs are missed
+WIDE, NEAR, COARSER = 3.0, 2.5, 1.5
 
 
-def block(dim, a, up):
-    """Nodes, cells and upper facets of a block of one layer; pairs are missed if it is coarse."""
-    along = WIDE * a * np.linspace(-1, 1, PIECES[dim] + 1)
+def block(dim, a, up, size):
+    """Nodes, cells and upper facets of a block of one layer."""
+    along = WIDE * a * np.linspace(-1, 1, round(2 * WIDE * a / size) + 1)
     flat = np.stack(np.meshgrid(*[along] * (dim - 1), indexing="ij"), axis=-1).reshape(-1, dim - 1)
     n, shape = len(flat), [len(along)] * (dim - 1)
     x = np.concatenate([np.column_stack((flat, np.full(n, y))) for y in (up, up - a)])
@@ -76,7 +79,9 @@ def filled(part, data):
     """Fill Kratos's model part: bodies, contact surfaces, load."""
     points, dim = data["points"], data["points"].shape[1]
     a, R = float(data["a"]), float(data["R"])
-    extra, base, upper = block(dim, a, a**2 / (2 * R))
+    edges = points[data["contact"][:, 1]] - points[data["contact"][:, 0]]
+    size = COARSER * np.linalg.norm(edges, axis=1).min()
+    extra, base, upper = block(dim, a, a**2 / (2 * R), size)
     n, x = len(points), np.concatenate((points, extra))
     for k, p in enumerate(x):
         part.CreateNewNode(k + 1, *p, *[0.0] * (3 - dim))
@@ -130,7 +135,7 @@ def imposed(name, part, value):
 
 def parameters(data, materials):
     """What Kratos calls project parameters."""
-    dim, load = data["points"].shape[1], float(data["load"])
+    dim, load = data["points"].shape[1], UNIT * float(data["load"])
     down = {"variable_name": PRESSURE[dim], "modulus": load / area(data["points"], data["top"])}
     pressed = {
         "python_module": "assign_vector_by_direction_to_condition_process",
@@ -204,7 +209,8 @@ def solve(data, folder):
     dim = data["points"].shape[1]
     materials = folder / "materials.json"
     law = {"constitutive_law": {"name": LAW[dim]}, "Tables": {}}
-    law["Variables"] = {"YOUNG_MODULUS": float(data["E"]), "POISSON_RATIO": float(data["nu"])}
+    E, nu = UNIT * float(data["E"]), float(data["nu"])
+    law["Variables"] = {"YOUNG_MODULUS": E, "POISSON_RATIO": nu}
     whole = {"model_part_name": "Structure", "properties_id": 1, "Material": law}
     materials.write_text(json.dumps({"properties": [whole]}))
     model = Kratos.Model()
@@ -218,7 +224,7 @@ def solve(data, folder):
     nodes = np.unique(data["contact"])
     scale = part.ProcessInfo[Kratos.SCALE_FACTOR]
     name = Contact.LAGRANGE_MULTIPLIER_CONTACT_PRESSURE
-    pressure = [-scale * part.Nodes[int(k) + 1].GetSolutionStepValue(name) for k in nodes]
+    pressure = [-scale / UNIT * part.Nodes[int(k) + 1].GetSolutionStepValue(name) for k in nodes]
     steps = part.ProcessInfo[Kratos.NL_ITERATION_NUMBER]
     return data["points"][nodes], np.array(pressure), steps
 

@@ -26,7 +26,7 @@ from benchmarks.time_against_error import seconds_at
 from benchmarks.tools import Tables, finish
 
 OURS = "tfeti_dolfinx"
-LEVELS = (0.05, 0.02, 0.01, 0.005, 0.002)
+LEVELS = (0.1, 0.05, 0.02, 0.01, 0.005, 0.002)
 
 
 def found_by(file: Path, scene: Scene) -> dict[str, Any] | None:
