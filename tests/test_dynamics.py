@@ -1,8 +1,12 @@
 """Bodies with mass: identities of the step, and motions that have closed forms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import ufl
 from moving import Thrown
+from scenes import clamp, decomposed, forms
 from scenes import displacement as nodal
 
 import tfeti_dolfinx as tfeti
@@ -199,6 +203,35 @@ def test_mistakes_of_motions():
     }.items():
         with pytest.raises(tfeti.InputError, match=says):
             Thrown("quadrilateral", 3, **keywords)
+
+
+def test_mistakes_of_masses():
+    d = decomposed("quadrilateral", 2, 1)
+    for degree, lumped_form, says in (
+        (1, True, "lumped=True with a form of the mass; expected a density"),
+        (2, False, "lumped=True on elements of degree 2; expected degree 1"),
+    ):
+        V, a, L = forms(d.mesh, d.facet_tags, (0.0, 0.0), d.surface("top"), degree)
+        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+        mass = ufl.inner(u, v) * ufl.dx if lumped_form else 1.0
+        with pytest.raises(tfeti.InputError, match=says):
+            tfeti.ContactDynamics(a, L, [], [], d, mass=mass, lumped=True)
+
+
+def test_a_state_or_a_solution_without_velocity():
+    thrown = Thrown("quadrilateral", 3)
+    thrown.problem.take_step(0.1)
+    thrown.problem.solve()
+    thrown.problem.accept()
+    state = replace(thrown.problem.state(), velocity=np.zeros(0))
+    with pytest.raises(tfeti.InputError, match="the state is of a problem without mass"):
+        thrown.problem.restore(state)
+    d = decomposed("quadrilateral", 3)
+    V, a, L = forms(d.mesh, d.facet_tags, (0.0, -0.1), d.surface("top"))
+    still = tfeti.ContactProblem(a, L, [clamp(V, d.facets("left"))], [], d)
+    still.solve()
+    with pytest.raises(tfeti.InputError, match="no velocity: expected the solution of a Contact"):
+        still.solution.velocity  # noqa: B018
 
 
 def sixteenths(x):
