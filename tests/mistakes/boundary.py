@@ -3,6 +3,7 @@
 import numpy as np
 import ufl
 from dolfinx import fem
+from scenes import box, clamp, forms
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
@@ -36,6 +37,25 @@ def prescribed_inside(s):
     dofs = fem.locate_dofs_geometrical(V, lambda x: np.isclose(x[0], 0.5))
     bc = fem.dirichletbc(np.zeros(2), dofs, V)
     a, L = s.a_on(V, ufl.dx(domain=d.mesh)), ufl.ZeroBaseForm((v,))
+    tfeti.ContactProblem(a, L, [bc], [], d, boundary_elements=ALL).solve()
+
+
+def loaded_inside(s):
+    """The middle of the body is a surface of the mesh that is no tear."""
+    inner, v = s.inner, s.inner.v
+    dS = ufl.Measure("dS", domain=inner.d.mesh, subdomain_data=inner.d.facet_tags)
+    L = ufl.inner(inner.f, v("+")) * dS(1)
+    tfeti.ContactProblem(inner.a, L, [], [], inner.d, boundary_elements=ALL).solve()
+
+
+def of_bent_facets(s):
+    """A cube of hexahedra, a node of whose upper side is lifted."""
+    mesh, facet_tags, names = box("hexahedron", 2)
+    x = mesh.geometry.x
+    x[np.all(np.isclose(x, (0.5, 0.5, 1.0)), axis=1), 2] = 1.1
+    d = tfeti.decompose(mesh, 1, facet_tags=facet_tags, surfaces=names)
+    V, a, L = forms(d.mesh, d.facet_tags, (0.0, 0.0, -0.1), d.surface("top"))
+    bc = clamp(V, d.facets("left"))
     tfeti.ContactProblem(a, L, [bc], [], d, boundary_elements=ALL).solve()
 
 
@@ -75,6 +95,18 @@ SOLVED = {
     "a load per volume that varies in boundary elements": (
         lambda s: solved(s, L=ufl.SpatialCoordinate(s.d.mesh)[0] * s.v[1] * s.dx),
         r"subdomain \d: a load per volume varies there; boundary elements take a constant force",
+    ),
+    "a load on facets inside boundary elements": (
+        loaded_inside,
+        r"body 0, subdomain 0: a load acts on facets inside boundary elements; expected tractions",
+    ),
+    "boundary elements without elasticity": (
+        lambda s: solved(s, a=fem.Constant(s.d.mesh, 0.0) * s.a.integrals()[0].integrand() * s.dx),
+        r"boundary elements take the law of a body from the bilinear form, which has no elasticity",
+    ),
+    "boundary elements on bent facets": (
+        of_bent_facets,
+        r"boundary elements: \d+ facets are not flat; expected flat facets, say triangles",
     ),
     "a value prescribed inside boundary elements": (
         prescribed_inside,
