@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+import ufl
 from bodies import held, pressed, sided, stacked, two_body_problem
 from mpi4py import MPI
-from scenes import clamp, curved_obstacle, decomposed, forms
+from scenes import clamp, curved_obstacle, decomposed, forms, hooke, strain
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.errors import InputError
@@ -197,6 +198,21 @@ def test_a_new_load_and_a_second_solve():
     assert p.report.F_multiplications <= 2
     assert difference(p.solution.u, first) <= 1e-8
     p.destroy()
+
+
+def test_a_new_stiffness():
+    """Glue is made anew from the new factors."""
+    found = []
+    for clusters in (0, 4):
+        p = square(8, 4, clusters=clusters, rtol=1e-9)
+        p.solve()
+        V = p.dofs.V
+        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+        p.update(stiffness=ufl.inner(hooke(3.0)(u), strain(v)) * ufl.dx)
+        p.solve()
+        found.append(p.solution.u.copy())
+        p.destroy()
+    assert difference(*found) <= 1e-7
 
 
 def test_more_clusters_than_subdomains():
