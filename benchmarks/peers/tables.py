@@ -44,7 +44,10 @@ def found_by(file: Path, scene: Scene) -> dict[str, Any] | None:
 def rows_of(name: str, folder: Path) -> list[dict[str, Any]]:
     """A row for each mesh and program."""
     stem, scene = name.replace(" ", "_"), SCENES[name]()
-    best = np.array(found_by(folder / f"{stem}_reference.json", scene)["profile"])  # type: ignore[index]
+    reference = found_by(folder / f"{stem}_reference.json", scene)
+    if reference is None:
+        raise RuntimeError(f"{folder / stem}_reference.json: the reference of {name} failed")
+    best = np.array(reference["profile"])
     rows = []
     for file in sorted(folder.glob(f"{stem}_[12]_*_*.json")):
         order, size = file.stem.removeprefix(f"{stem}_").split("_")[:2]

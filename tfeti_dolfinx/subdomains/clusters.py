@@ -1,7 +1,7 @@
 """Subdomains of a rank in clusters: one kernel for each, K⁺ with its subdomains glued by averages.
 
-Hybrid TFETI: Klawonn, Rheinbach, Z. Angew. Math. Mech. 90 (2010) 5–32; Markopoulos, Říha et al.,
-Adv. Eng. Softw. 2017. In a cluster u minimises ½uᵀKu − bᵀu under B_c u = 0:
+Hybrid TFETI: Klawonn, Rheinbach, Z. Angew. Math. Mech. 90 (2010) 5–32. In a cluster u minimises
+½uᵀKu − bᵀu under B_c u = 0:
 
     u = K⁺(b − B_cᵀμ) + Rα,    [F_c −G_cᵀ; −G_c 0][μ; α] = [B_cK⁺b; −Rᵀb],
 

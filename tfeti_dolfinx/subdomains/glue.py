@@ -58,7 +58,7 @@ class Glue:
             self._of_cluster.append((np.concatenate((at, F.shape[0] + kernel)), W))
             if len(at):
                 own = shapes[0][:, kernel], shapes[1][:, at]
-                self._soft.append(_softer(F_c, G_c, N.shape[1], own, stiffness))
+                self._soft.append(_softer(F_c, G_c, N, own, stiffness))
 
     def soft_motions(self, blocks: int) -> SoftMotions:
         """The softer motions of the subdomains, as many, in their clusters."""
@@ -78,11 +78,11 @@ class Glue:
         return z
 
 
-def _softer(F: Array, G: Array, free: int, shapes: tuple[Any, Any], stiffness: Array) -> csr_array:
+def _softer(F: Array, G: Array, N: Array, shapes: tuple[Any, Any], stiffness: Array) -> csr_array:
     """Softer motions of a cluster on the trace of the rank, of energy 1.
 
-    They are those of the largest R̂ᵀDR̂ for their energy, D the stiffness of outer unknowns; as many
-    as are free have no energy.
+    They are those of the largest R̂ᵀDR̂ for their energy, D the stiffness of outer unknowns, without
+    their part in N, the motions of the whole cluster, which have no energy.
     """
     there = np.unique(shapes[0].indices)
     R, Y = (csr_array(part)[there] for part in shapes)
@@ -90,7 +90,9 @@ def _softer(F: Array, G: Array, free: int, shapes: tuple[Any, Any], stiffness: A
     _, alpha = _scales(F, G)
     T = alpha[:, None] * (G @ mu) * alpha
     values, Q = np.linalg.eigh((T + T.T) / 2.0)
+    free = N.shape[1]
     Q = alpha[:, None] * Q[:, free:] / np.sqrt(values[free:])
+    Q -= N @ (N.T @ Q)
     outer = np.flatnonzero(stiffness[there])
     far = R[outer] @ Q - Y[outer] @ (mu @ Q)
     sizes, V = np.linalg.eigh(far.T @ (stiffness[there[outer], None] * far))
