@@ -25,7 +25,7 @@ ROOMS = [
     ["form_checks", "options", "report"],
     ["assembly", "elasticity", "option_parsing"],
     ["fields", "inertia"],
-    ["contact_state", "discretisation", "friction_bounds", "point_values"],
+    ["contact_state", "discretisation", "friction_bounds", "interior", "point_values"],
     ["solution"],
     ["saved_state", "work"],
     ["solver"],

@@ -6,12 +6,23 @@ import ufl
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import box, clamp, curved_obstacle, decomposed, displacement, forms, hooke, relative
+from panels import kelvin
+from scenes import (
+    SIDES,
+    box,
+    clamp,
+    curved_obstacle,
+    decomposed,
+    displacement,
+    forms,
+    hooke,
+    relative,
+)
 from scipy.linalg import eigh
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.boundary.parts import Parts
-from tfeti_dolfinx.boundary.steklov import rigid_motions
+from tfeti_dolfinx.boundary.steklov import Law, rigid_motions
 from tfeti_dolfinx.compat import assemble_csr
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
@@ -274,6 +285,65 @@ def test_points_inside():
         assert np.abs(values.stress[:4] - stress).max() < 1e-8
         assert np.all(np.isnan(values.displacement[4]))
         p.destroy()
+
+
+def size(d, values):
+    return np.sqrt(d.comm.allreduce(float(np.sum(values**2))))
+
+
+def cells_and_nodes(interior, d):
+    """Midpoints of cells with stresses, nodes with displacements."""
+    gdim = d.mesh.geometry.dim
+    count = d.mesh.topology.index_map(gdim).size_local
+    middle = dmesh.compute_midpoints(d.mesh, gdim, np.arange(count, dtype=np.int32))
+    place = np.asarray(interior.stress.function_space.dofmap.list)[:, 0]
+    stress = interior.stress.x.array.reshape(-1, 3, 3)[place]
+    x = interior.displacement.function_space.tabulate_dof_coordinates()
+    u = interior.displacement.x.array.reshape(-1, gdim)
+    return (middle[:, :gdim], stress), (x[:, :gdim], u)
+
+
+def test_fields_inside_of_constant_stresses():
+    d = two_volumes()
+    t = 0.1 / (1 - 0.3**2)
+    for elements in (None, tfeti.BoundaryElements("low"), ALL):
+        p = tension(d, elements)
+        (_, stress), (x, u) = cells_and_nodes(p.solution.interior, d)
+        assert np.abs(u - x * STRETCH).max() < 1e-8
+        assert np.abs(stress - np.diag([t, 0.0, 0.3 * t])).max(initial=0.0) < 1e-8
+        mises = p.solution.interior.von_mises.x.array
+        assert np.abs(mises - t * np.sqrt(1 - 0.3 + 0.3**2)).max(initial=0.0) < 1e-8
+        p.destroy()
+
+
+@pytest.mark.parametrize(("cell", "sizes"), [("triangle", (8, 16)), ("hexahedron", (3, 6))])
+def test_fields_inside_of_a_point_force_outside(cell, sizes):
+    """Kelvin's solution: at nodes, and also in the cells that lie on the surface."""
+    law, errors = Law(0.5 / 1.3, 0.3), []
+    for n in sizes:
+        d = decomposed(cell, n, 2)
+        gdim = d.mesh.geometry.dim
+        source = np.array([1.6, 0.7, 0.6])[:gdim]
+        V, a, L = forms(d.mesh, d.facet_tags, (0.0,) * gdim, d.surface("top"))
+        given = fem.Function(V)
+        given.interpolate(lambda x, k=gdim, s=source: kelvin(x[:k].T, s, law)[0].T)
+        facets = np.concatenate([d.facets(name) for name in SIDES[gdim]])
+        bcs = [fem.dirichletbc(given, fem.locate_dofs_topological(V, gdim - 1, facets))]
+        p = tfeti.ContactProblem(a, L, bcs, [], d, stress=hooke(), boundary_elements=ALL)
+        p.solve()
+        (middle, stress), (x, u) = cells_and_nodes(p.solution.interior, d)
+        exact = law.stress(kelvin(middle, source, law)[1])
+        off = np.all((x > 1e-9) & (x < 1 - 1e-9), axis=1)  # where nothing is prescribed
+        x, u = x[off], u[off]
+        pairs = ((u, kelvin(x, source, law)[0]), (stress[:, :gdim, :gdim], exact))
+        errors.append([size(d, one - other) / size(d, other) for one, other in pairs])
+        same = p.solution.at(np.concatenate(d.comm.allgather(middle))).stress
+        found = np.concatenate(d.comm.allgather(stress))[:, :gdim, :gdim]
+        assert np.abs(found - same).max() < 1e-12 * np.abs(same).max()
+        p.destroy()
+    slopes = np.log2(np.divide(*errors))
+    assert np.all(slopes > 1.5), (errors, slopes)
+    assert np.all(errors[1] < np.array((2e-3, 5e-3) if gdim == 2 else (1e-2, 6e-2))), errors
 
 
 def test_what_is_inside_does_not_matter():

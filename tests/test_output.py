@@ -70,6 +70,22 @@ def test_fields_are_made_when_asked_for(solution):
     assert fresh.stress is fresh.stress
 
 
+def test_fields_inside_are_written_on_request(solution, comm, shared_tmp):
+    """Without boundary elements they are those of finite elements."""
+    u, (stress, mises) = solution.interior.displacement, solution.interior.fields[1]
+    assert np.array_equal(u.x.array, solution.displacement.x.array)
+    in_cells = solution.stress.x.array.reshape(len(stress.x.array) // 9, -1, 9).mean(axis=1)
+    assert np.allclose(stress.x.array, in_cells.ravel(), atol=1e-14)
+    assert mises.name == "interior_von_mises"
+    path = shared_tmp / f"inside{solution.dofs.bs}.xdmf"
+    write_xdmf(path, solution, interior=True)
+    if dolfinx.has_adios2:
+        write_vtx(path.with_suffix(".bp"), solution, interior=True)
+    text = path.read_text()
+    for name in ("interior_displacement", "interior_stress", "interior_von_mises"):
+        assert f'Name="{name}"' in text
+
+
 @pytest.mark.skipif(not dolfinx.has_adios2, reason="DOLFINx without ADIOS2")
 def test_vtx_appears_whole(solution, comm, shared_tmp):
     path = shared_tmp / f"out{solution.dofs.bs}.bp"

@@ -44,6 +44,7 @@ from tfeti_dolfinx.errors import (
 )
 from tfeti_dolfinx.estimates import Estimates
 from tfeti_dolfinx.extensions import Extensions
+from tfeti_dolfinx.interior import Interior
 from tfeti_dolfinx.load_steps import LoadSteps, StepRecord
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dolfinx_input import decompose
@@ -72,6 +73,7 @@ __all__ = [
     "Extensions",
     "FactorError",
     "InputError",
+    "Interior",
     "LoadSteps",
     "NoSolutionError",
     "Obstacle",

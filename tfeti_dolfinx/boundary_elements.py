@@ -9,13 +9,13 @@ import numpy as np
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.assembly import Forms
 from tfeti_dolfinx.boundary.parts import Parts
+from tfeti_dolfinx.boundary.solved import BoundarySolution
 from tfeti_dolfinx.checks import checked_type
 from tfeti_dolfinx.citations import cite
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.point_values import BoundarySolution
 from tfeti_dolfinx.subdomains.build import MakeBlock
 from tfeti_dolfinx.subdomains.kplus import Making
 

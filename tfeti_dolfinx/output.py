@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
 from pathlib import Path
@@ -18,7 +19,9 @@ from tfeti_dolfinx.mesh.entities import NO_TAG
 from tfeti_dolfinx.solution import Solution
 
 
-def write_vtx(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
+def write_vtx(
+    path: str | os.PathLike[str], solution: Solution, interior: bool = False
+) -> list[Path]:
     """Write all fields of a solution for ParaView. Collective.
 
     Nodal fields (displacement, pressure, gap, status, with mass velocity, with contacts traction,
@@ -31,6 +34,8 @@ def write_vtx(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
         path: A name that ends with ``.bp``. Where DOLFINx has no ADIOS2, XDMF files with the
             same stem are written instead.
         solution: The solution.
+        interior: Whether to write the fields of ``solution.interior``, too: displacement and, with
+            a stress, stress and von Mises stress of the cells.
 
     Returns:
         The files written.
@@ -40,9 +45,9 @@ def write_vtx(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
     """
     target = checked_target(path, ".bp", solution)
     if not dolfinx.has_adios2:
-        return write_xdmf(target.with_suffix(".xdmf"), solution)
+        return write_xdmf(target.with_suffix(".xdmf"), solution, interior)
     cells = target.with_name(f"{target.stem}_cells.bp")
-    for name, functions in ((target, nodal_fields(solution)), (cells, cell_fields(solution))):
+    for name, functions in zip((target, cells), _fields(solution, interior), strict=True):
         partial = begin_file(name, solution)
         with io.VTXWriter(solution.decomposition.comm, partial, functions, engine="BP4") as vtx:
             vtx.write(0.0)
@@ -50,10 +55,17 @@ def write_vtx(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
     return [target, cells]
 
 
-def write_xdmf(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
+def write_xdmf(
+    path: str | os.PathLike[str], solution: Solution, interior: bool = False
+) -> list[Path]:
     """Write all fields of a solution to one XDMF file and its HDF5 companion. Collective.
 
     Nodal fields are interpolated to the degree of the mesh geometry, which XDMF requires.
+
+    Args:
+        path: A name that ends with ``.xdmf``.
+        solution: The solution.
+        interior: As for ``write_vtx``.
 
     Returns:
         The files written.
@@ -69,7 +81,7 @@ def write_xdmf(path: str | os.PathLike[str], solution: Solution) -> list[Path]:
             folder.mkdir(parents=True)
     with io.XDMFFile(decomposition.comm, folder / target.name, "w") as xdmf:
         xdmf.write_mesh(decomposition.mesh)
-        for function in (*nodal_fields(solution), *cell_fields(solution)):
+        for function in itertools.chain(*_fields(solution, interior)):
             xdmf.write_function(_as_geometry(function, decomposition))
     companion = target.with_suffix(".h5")
     for name in (companion, target):
@@ -114,6 +126,12 @@ def cell_fields(solution: Solution) -> list[fem.Function]:
         error = solution.discretisation_error.x.array[np.asarray(cells)[:, 0]]
         fields.append(_cell_function(W, "discretisation_error", error))
     return fields
+
+
+def _fields(solution: Solution, interior: bool) -> tuple[list[fem.Function], list[fem.Function]]:
+    """Nodal fields and cell fields. Collective."""
+    of_nodes, of_cells = solution.interior.fields if interior else ([], [])
+    return nodal_fields(solution) + of_nodes, cell_fields(solution) + of_cells
 
 
 def _cell_function(W: fem.FunctionSpace, name: str, values: Array) -> fem.Function:

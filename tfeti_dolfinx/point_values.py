@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +10,7 @@ from dolfinx import fem, geometry
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.boundary.inside import Inside
+from tfeti_dolfinx.boundary.solved import BoundarySolution
 from tfeti_dolfinx.errors import InputError
 
 # Of the size of the mesh: how far from a cell of finite elements a point may be
@@ -29,19 +28,6 @@ class PointValues:
 
     displacement: Array
     stress: Array
-
-
-@dataclass(frozen=True)
-class BoundarySolution:
-    """What boundary elements know of a solution.
-
-    Attributes:
-        bodies: Gives the subdomains of this rank that have them.
-        finite: Cells of this rank that have finite elements.
-    """
-
-    bodies: Callable[[], Iterable[Inside]]
-    finite: Array
 
 
 def checked_points(points: Any, gdim: int) -> Array:
@@ -80,9 +66,9 @@ def values_at(
     k, d = points.shape
     total = np.zeros((k, 1 + d + d * d))
     for body in () if boundary is None else boundary.bodies():
-        inside = np.flatnonzero(body.contains(points))
-        sigma = body.stress(points[inside]) / _number(thickness)
-        total[inside] += _row(body.displacement(points[inside]), sigma)
+        own = np.flatnonzero(body.inside.contains(points))
+        sigma = body.inside.stress(points[own]) / _number(thickness)
+        total[own] += _row(body.inside.displacement(points[own]), sigma)
     place, cells = _cells(u.function_space.mesh, points)
     if boundary is not None:
         kept = np.isin(cells, boundary.finite)

@@ -10,6 +10,7 @@ import numpy as np
 from dolfinx import fem
 
 from tfeti_dolfinx.arrays import Array, sum_rows
+from tfeti_dolfinx.boundary.solved import BoundarySolution
 from tfeti_dolfinx.contact.forces import BodyForces, body_forces, vertex_tractions
 from tfeti_dolfinx.contact.partners import ContactPartner
 from tfeti_dolfinx.contact_state import ContactState, Multipliers
@@ -26,9 +27,10 @@ from tfeti_dolfinx.fields import (
     von_mises,
 )
 from tfeti_dolfinx.gluing.glue import Gluing
+from tfeti_dolfinx.interior import Interior
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mortar.surfaces import hat_integrals
-from tfeti_dolfinx.point_values import BoundarySolution, PointValues, checked_points, values_at
+from tfeti_dolfinx.point_values import PointValues, checked_points, values_at
 from tfeti_dolfinx.states import ContactStatus
 
 
@@ -113,6 +115,13 @@ class Solution(ContactState):
         points = checked_points(points, self.decomposition.mesh.geometry.dim)
         stress = self.stress if self.has_stress else None
         return values_at(points, self.boundary, self.thickness, self.displacement, stress)
+
+    @cached_property
+    def interior(self) -> Interior:
+        """Displacement and stress on the mesh by Somigliana's identity in boundary elements."""
+        return Interior(
+            self.boundary, self.displacement, self._stress, self.dofs, self.decomposition
+        )
 
     @property
     def has_stress(self) -> bool:

@@ -8,20 +8,17 @@ from functools import cache
 
 import basix
 import numpy as np
-from scipy.spatial import cKDTree
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.boundary.layers import in_chunks
 from tfeti_dolfinx.boundary.panels import Panels
-from tfeti_dolfinx.boundary.steklov import Steklov, gunter
+from tfeti_dolfinx.boundary.steklov import Steklov, gunter, rigid_motions
 
-# A panel is cut in parts until their middles are as far as so many of their sizes; then a rule of
-# this degree is exact to 1e-9. What is nearer to the surface than a panel's size over 2 to the
-# power of HALVINGS loses that.
-FAR, DEGREE, HALVINGS = 2.0, 14, 12
-# Steps of differences over the distance to the nearest node or midpoint: of fourth order, so that
-# they err by 1e-11, and rounding by 1e-13
-STEP = 1e-3
+# A panel is cut in parts until their middles are as far as FAR of their sizes; from so many sizes
+# on a rule of this degree is exact to 1e-9. What is nearer to the surface than a panel's size over
+# 2 to the power of HALVINGS loses that.
+FAR, HALVINGS = 2.0, 12
+DEGREES = ((32.0, 4), (12.0, 5), (6.0, 6), (3.0, 10), (0.0, 14))
 
 
 class Inside:
@@ -42,14 +39,21 @@ class Inside:
         self._shift = shift
         self._panels, self._law, self._b = panels, law, b
         self._middle = panels.x.mean(axis=0)
-        rest = u - self._particular(panels.x)
+        # a rigid motion is taken out: it has no tractions, but quadrature makes some of it
+        R = rigid_motions(panels.x)
+        self._moved, self._turn = _rigid(panels.x, (R @ (R.T @ u.ravel())).reshape(u.shape))
+        rest = u - self._known(panels.x)
         t = (steklov.tractions @ rest.ravel()).reshape(-1, panels.dim)
         turned = (gunter(panels) @ rest.T.ravel()).reshape(panels.dim, -1).T
         self._field = _Field(t - 2.0 * law.mu * turned, turned, rest[panels.nodes])
 
     def displacement(self, points: Array) -> Array:
         """Shape ``(k, d)``, at points inside, shape ``(k, d)``."""
-        return self._at(points - self._shift, np.zeros((1, self._panels.dim)))[:, 0]
+        points = points - self._shift
+        u = self._known(points)
+        for cut in _cuts(self._panels, points, self._field.on_corners):
+            np.add.at(u, cut.point, self._layers(_Seen(cut, points, self._panels), cut))
+        return u
 
     def contains(self, points: Array) -> Array:
         """Flags of points inside, shape ``(k,)``, for points of shape ``(k, d)``."""
@@ -57,56 +61,74 @@ class Inside:
 
     def stress(self, points: Array) -> Array:
         """Shape ``(k, d, d)``, without σ_zz, at points inside, shape ``(k, d)``."""
-        d, points = self._panels.dim, points - self._shift
-        size = STEP * _distance(self._panels, points)
-        ways = np.array([-2.0, -1.0, 1.0, 2.0])
-        steps = np.concatenate([way * np.eye(d) for way in ways])
-        values = self._at(points, steps, size).reshape(len(points), 4, d, d)
-        weights = np.array([1.0, -8.0, 8.0, -1.0]) / 12.0
-        gradient = np.einsum("w,kwji->kij", weights, values) / size[:, None, None]
-        return self._law.stress(gradient)
+        return self._law.stress(self.gradient(points))
 
-    def _particular(self, x: Array) -> Array:
-        stiff = self._law.lmbda + 2.0 * self._law.mu
-        return np.asarray(-self._b * (x - self._middle) ** 2 / (2.0 * stiff))
-
-    def _at(self, points: Array, steps: Array, size: Array | None = None) -> Array:
-        """Displacements at points and steps from there, shape ``(k, q, d)``, by the same rules."""
-        size = np.ones(len(points)) if size is None else size
-        moved = points[:, None] + size[:, None, None] * steps
-        u = self._particular(moved)
+    def gradient(self, points: Array) -> Array:
+        """∂_j u_i, shape ``(k, d, d)``, at points inside, shape ``(k, d)``."""
+        points, each = points - self._shift, np.arange(self._panels.dim)
+        gradient = np.tile(self._turn, (len(points), 1, 1))
+        gradient[:, each, each] -= self._b * (points - self._middle) / self._stiff
         for cut in _cuts(self._panels, points, self._field.on_corners):
-            r = moved[cut.point][:, :, None] - cut.y[:, None]
-            np.add.at(u, cut.point, self._layers(r, cut))
-        return u
+            np.add.at(gradient, cut.point, self._slopes(_Seen(cut, points, self._panels), cut))
+        return gradient
 
-    def _layers(self, r: Array, cut: _Cut) -> Array:
-        """What some panels contribute, shape ``(p, q, d)``; r = x − y, shape ``(p, q, y, d)``."""
-        panels, law, d = self._panels, self._law, self._panels.dim
-        square = np.einsum("pqyi,pqyi->pqy", r, r)
-        over = cut.weight / ((4 if d == 3 else 2) * np.pi * square ** (d / 2.0))
-        logs = 1.0 if d == 3 else -0.5 * np.log(square / panels.rho**2)
-        potential = np.sum(over * square * logs, axis=2)[:, :, None]
-        density, turned = self._field.density[cut.panel], self._field.turned[cut.panel]
-        along = over * np.einsum("pqyi,pi->pqy", r, density)
-        value = potential * (law.single * (3.0 - 4.0 * law.nu) * density + turned)[:, None]
-        value += law.single * np.einsum("pqy,pqyi->pqi", along, r)
-        through = over * np.einsum("pqyi,pi->pqy", r, panels.normal[cut.panel])
-        return np.asarray(value - np.einsum("pqy,pyi->pqi", through, cut.values))
+    @property
+    def _stiff(self) -> float:
+        return self._law.lmbda + 2.0 * self._law.mu
+
+    def _known(self, x: Array) -> Array:
+        """The rigid motion and u_p."""
+        y = x - self._middle
+        return np.asarray(self._moved + y @ self._turn.T - self._b * y**2 / (2.0 * self._stiff))
+
+    def _densities(self, cut: _Cut) -> tuple[Array, Array]:
+        """Factors of δ_ij/(4πr) and of r_i r_j/(4πr³), in 2D of −log(r/ρ)/2π and r_i r_j/(2πr²)."""
+        density, k = self._field.density[cut.panel], self._law.single
+        both = k * (3.0 - 4.0 * self._law.nu) * density + self._field.turned[cut.panel]
+        return both, k * density
+
+    def _layers(self, seen: _Seen, cut: _Cut) -> Array:
+        """What some panels contribute to u, shape ``(p, d)``."""
+        panels, (single, tensor) = self._panels, self._densities(cut)
+        logs = 1.0 if panels.dim == 3 else -0.5 * np.log(seen.square / panels.rho**2)
+        potential = np.sum(seen.over * seen.square * logs, axis=1)
+        value = potential[:, None] * single
+        value += np.einsum("py,pyi->pi", seen.over * seen.along(tensor), seen.r)
+        double = seen.over * seen.through[:, None]
+        return np.asarray(value - np.einsum("py,pyi->pi", double, cut.values))
+
+    def _slopes(self, seen: _Seen, cut: _Cut) -> Array:
+        """What some panels contribute to ∂_j u_i, shape ``(p, d, d)``."""
+        d, (single, tensor) = self._panels.dim, self._densities(cut)
+        r, over, along = seen.r, seen.over, seen.along(tensor)
+        falling = d * over / seen.square
+        mean = np.einsum("py,pyi->pi", over, r)
+        values = np.einsum("py,pyi->pi", over, cut.values)
+        gradient = mean[:, :, None] * tensor[:, None] - single[:, :, None] * mean[:, None]
+        gradient += np.sum(over * along, axis=1)[:, None, None] * np.eye(d)
+        gradient -= values[:, :, None] * self._panels.normal[cut.panel][:, None]
+        # of 1/r^d: −d r_j/r^(d+2), of both kernels that have it
+        rest = seen.through[:, None, None] * cut.values - along[:, :, None] * r
+        gradient += np.swapaxes(rest, 1, 2) @ (falling[:, :, None] * r)
+        return np.asarray(gradient)
+
+
+def _rigid(x: Array, u: Array) -> tuple[Array, Array]:
+    """Mean and gradient of a rigid motion of points."""
+    moved, y = u.mean(axis=0), x - x.mean(axis=0)
+    turn = np.linalg.lstsq(y, u - moved, rcond=None)[0].T
+    return moved, 0.5 * (turn - turn.T)
 
 
 def contains(panels: Panels, points: Array) -> Array:
     """Flags of points inside a closed surface, shape ``(k,)``, by the double layer of 1."""
-    d = panels.dim
     found = np.zeros(len(points))
-    ones = np.ones((len(panels.nodes), d, 1))
+    ones = np.ones((len(panels.nodes), panels.dim, 1))
     low, high = panels.x.min(axis=0), panels.x.max(axis=0)
     near = np.flatnonzero(np.all((points >= low) & (points <= high), axis=1))
     for cut in _cuts(panels, points[near], ones):
-        r = points[near][cut.point][:, None] - cut.y
-        scale = (4 if d == 3 else 2) * np.pi * np.linalg.norm(r, axis=2) ** d
-        through = np.einsum("pyi,pi->py", r, panels.normal[cut.panel]) / scale
-        np.subtract.at(found, near[cut.point], np.sum(through * cut.weight[:, 0], axis=1))
+        seen = _Seen(cut, points[near], panels)
+        np.subtract.at(found, near[cut.point], seen.over.sum(axis=1) * seen.through)
     return found > 0.5
 
 
@@ -127,7 +149,7 @@ class _Cut:
         point: Shape ``(p,)``.
         panel: Shape ``(p,)``.
         y: Points of the rule, shape ``(p, y, d)``.
-        weight: Weights, shape ``(p, 1, y)``.
+        weight: Weights, shape ``(p, y)``.
         values: What is linear on the panels, shape ``(p, y, ...)``.
     """
 
@@ -138,24 +160,49 @@ class _Cut:
     values: Array
 
 
+class _Seen:
+    """r = x − y from points to parts of panels, and what the kernels are made of.
+
+    Attributes:
+        r: Shape ``(p, y, d)``.
+        square: r², shape ``(p, y)``.
+        over: Weights over 4πr³, in 2D 2πr², shape ``(p, y)``.
+        through: r·n, the same at all points of a panel, shape ``(p,)``.
+    """
+
+    def __init__(self, cut: _Cut, points: Array, panels: Panels) -> None:
+        d = panels.dim
+        self.r = points[cut.point][:, None] - cut.y
+        self.square = np.einsum("pyi,pyi->py", self.r, self.r)
+        self.over = cut.weight / ((4 if d == 3 else 2) * np.pi * self.square ** (d / 2.0))
+        self.through = np.einsum("pi,pi->p", self.r[:, 0], panels.normal[cut.panel])
+
+    def along(self, density: Array) -> Array:
+        """r·q, shape ``(p, y)``, for q of shape ``(p, d)``."""
+        return np.einsum("pyi,pi->py", self.r, density)
+
+
 def _cuts(panels: Panels, points: Array, values: Array) -> Iterator[_Cut]:
     """Panels, cut as the distances to points ask for; values at their corners go along."""
-    hats, weights = _rule(panels.dim)
     for some in in_chunks(np.arange(len(points)), 4 * len(panels.nodes)):
         point, panel = np.repeat(some, len(panels.nodes)), np.tile(_all(panels), len(some))
         corners, carried, measure = panels.corners[panel], values[panel], panels.measure[panel]
         for level in range(HALVINGS + 1):
             apart = np.linalg.norm(points[point] - corners.mean(axis=1), axis=1)
-            far = apart >= FAR * panels.size[panel] / 2.0**level
-            far |= level == HALVINGS
-            for part in in_chunks(np.flatnonzero(far), 4 * len(weights)):
-                yield _Cut(
-                    point[part],
-                    panel[part],
-                    hats @ corners[part],
-                    (measure[part, None] * weights)[:, None],
-                    hats @ carried[part],
-                )
+            apart /= panels.size[panel] / 2.0**level
+            far, below = (apart >= FAR) | (level == HALVINGS), np.inf
+            for least, degree in DEGREES:
+                hats, weights = _rule(panels.dim, degree)
+                chosen = np.flatnonzero(far & (apart >= least) & (apart < below))
+                below = least
+                for part in in_chunks(chosen, len(weights)):
+                    yield _Cut(
+                        point[part],
+                        panel[part],
+                        hats @ corners[part],
+                        measure[part, None] * weights,
+                        hats @ carried[part],
+                    )
             point, panel, corners, carried, measure = (
                 item[~far] for item in (point, panel, corners, carried, measure)
             )
@@ -173,10 +220,10 @@ def _all(panels: Panels) -> Array:
 
 
 @cache
-def _rule(d: int) -> tuple[Array, Array]:
+def _rule(d: int, degree: int) -> tuple[Array, Array]:
     """Barycentric points, shape ``(y, d)``, and weights with the sum 1."""
     cell = basix.CellType.triangle if d == 3 else basix.CellType.interval
-    points, weights = basix.make_quadrature(cell, DEGREE)
+    points, weights = basix.make_quadrature(cell, degree)
     hats = np.column_stack((1.0 - points.sum(axis=1), points))
     return hats, weights / weights.sum()
 
@@ -190,9 +237,3 @@ def _parts(d: int) -> list[Array]:
     one = np.eye(3)
     inner = [np.stack((one[i], half[i], half[i - 1])) for i in range(3)]
     return [*inner, half]
-
-
-def _distance(panels: Panels, points: Array) -> Array:
-    """To the nearest node or middle of a panel, shape ``(k,)``."""
-    known = np.concatenate((panels.x, panels.midpoints))
-    return np.asarray(cKDTree(known).query(points)[0])

@@ -12,6 +12,7 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.boundary.block import BoundaryBlock, Part
 from tfeti_dolfinx.boundary.inside import Inside
 from tfeti_dolfinx.boundary.shape import Shape
+from tfeti_dolfinx.boundary.solved import SolvedBody
 from tfeti_dolfinx.boundary.surface import Surface, surfaces
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -120,7 +121,7 @@ class Parts:
 
         return make
 
-    def solved(self, u: Array) -> Callable[[], Iterator[Inside]]:
+    def solved(self, u: Array) -> Callable[[], Iterator[SolvedBody]]:
         """The solution inside each of the parts, one at a time, with the present load.
 
         Args:
@@ -128,16 +129,19 @@ class Parts:
         """
         forces = dict(self._forces)
 
-        def inside() -> Iterator[Inside]:
+        def bodies() -> Iterator[SolvedBody]:
             for s, part in self.parts.items():
                 moved = np.empty(len(part.place))
                 moved[part.place] = u[self._unknowns(s)]
                 shape, corner = part.shape, self._surfaces[s].panels.x.min(axis=0)
                 on_surface = moved.reshape(shape.x.shape)[: shape.outer]
                 shift = corner - shape.x.min(axis=0)
-                yield Inside(shape.bodies[0], on_surface, forces[s], shift)
+                inside = Inside(shape.bodies[0], on_surface, forces[s], shift)
+                hidden = np.flatnonzero(~part.on_surface[:: self._dofs.bs])
+                nodes = int(self._dofs.node_offsets[s]) + hidden
+                yield SolvedBody(int(self._dofs.subdomains[s]), inside, nodes)
 
-        return inside
+        return bodies
 
     def inside(self) -> int:
         """Number of unknowns of all ranks that boundary elements do without."""
