@@ -10,8 +10,8 @@ from tfeti_dolfinx.boundary.integrals2d import _by_rule, _exact, layers_2d
 from tfeti_dolfinx.boundary.integrals3d import layers_3d
 from tfeti_dolfinx.boundary.panels import Panels
 from tfeti_dolfinx.boundary.rules import apart_rule, touching_rule
-from tfeti_dolfinx.boundary.steklov import Law, rigid_motions, single_layer, steklov
-from tfeti_dolfinx.errors import FactorError
+from tfeti_dolfinx.boundary.steklov import Law, rigid_motions, single_layer, steklov, wrong_forces
+from tfeti_dolfinx.errors import FactorError, InputError
 
 LAW = Law(mu=0.4, nu=0.3)
 SHAPES = {**PLANE, **SPACE}
@@ -139,6 +139,17 @@ def test_a_surface_that_lies_on_itself_is_refused():
     twice = Panels(twice.x, np.concatenate((twice.nodes, twice.nodes)))
     with pytest.raises(FactorError, match="closed surface"):
         steklov(twice, LAW)
+
+
+@pytest.mark.parametrize("sizes", [(5.0, 1.0, 1.0), (10.0, 1.0, 1.0), (1.0, 1.0, 0.1)])
+def test_long_triangles_keep_the_forces_of_constant_stresses(sizes):
+    panels = box(2, sizes)
+    assert wrong_forces(panels, LAW, steklov(panels, LAW).S) < 2e-4
+
+
+def test_triangles_that_are_too_long_are_refused():
+    with pytest.raises(InputError, match=r"longest edge squared is up to 60 times their area"):
+        steklov(box(2, (1.0, 1.0, 1 / 30)), LAW)
 
 
 INSIDE = {

@@ -9,16 +9,18 @@ from tfeti_dolfinx.boundary.layers import Layers, in_chunks
 from tfeti_dolfinx.boundary.panels import Panels
 from tfeti_dolfinx.boundary.rules import PairRule, apart_rule, touching_rule
 
-# Gauss points along each of four variables for pairs that share 1, 2 or 3 corners, up to a
-# distortion of the worse of both (2 is half a square), so that constant stresses are right to 1e-4.
+# Gauss points along each variable for pairs that share 1, 2 or 3 corners, up to a distortion of
+# the worse of both (2 is half a square): tractions of constant stresses are right to 1e-4 up to 5.
 TOUCHING = (
-    (2.1, {1: 6, 2: 8, 3: 7}),
-    (3.0, {1: 8, 2: 11, 3: 9}),
-    (np.inf, {1: 10, 2: 15, 3: 12}),
+    (2.1, {1: 6, 2: 10, 3: 8}),
+    (3.0, {1: 8, 2: 12, 3: 12}),
+    (4.0, {1: 10, 2: 14, 3: 18}),
+    (6.0, {1: 14, 2: 18, 3: 24}),
+    (np.inf, {1: 20, 2: 24, 3: 40}),
 )
 # Distance of two midpoints over the longer of their longest edges, and the degree on each triangle
 # from which on it is taken
-APART = ((8.0, 2), (4.0, 4), (2.0, 6), (1.2, 10), (0.0, 16))
+APART = ((8.0, 2), (4.0, 4), (2.0, 6), (1.2, 10), (0.6, 16), (0.0, 30))
 
 
 def layers_3d(panels: Panels) -> Layers:

@@ -10,6 +10,10 @@ import numpy as np
 
 from tfeti_dolfinx.arrays import Array
 
+# Gauss points that integrate polynomials of degree 5: what the products of two hats and the
+# Jacobian are in each variable
+POLYNOMIAL = 3
+
 
 @dataclass(frozen=True)
 class PairRule:
@@ -30,14 +34,16 @@ class PairRule:
 
 @cache
 def touching_rule(shared: int, n: int) -> PairRule:
-    """For triangles that share 1, 2 or 3 corners: n Gauss points along each of four variables.
+    """For triangles that share 1, 2 or 3 corners: Gauss points along each of four variables.
 
-    Sauter, Schwab, Boundary Element Methods (2011), section 5.2.
+    Sauter, Schwab, Boundary Element Methods (2011), section 5.2. As many of the variables as there
+    are shared corners are factors of r = x − y, the first one ξ always. The kernels are homogeneous
+    in r, so that what is left of these factors is a polynomial; n points are for the others.
     """
-    points, weights = np.polynomial.legendre.leggauss(n)
-    grid = np.meshgrid(*[0.5 * (points + 1.0)] * 4, indexing="ij")
+    rules = [np.polynomial.legendre.leggauss(POLYNOMIAL if k < shared else n) for k in range(4)]
+    grid = np.meshgrid(*[0.5 * (points + 1.0) for points, _ in rules], indexing="ij")
     xi, a, b, c = (g.ravel() for g in grid)
-    tensor = np.einsum("i,j,k,l->ijkl", *[0.5 * weights] * 4).ravel()
+    tensor = np.einsum("i,j,k,l->ijkl", *[0.5 * weights for _, weights in rules]).ravel()
     maps = {1: _vertex, 2: _edge, 3: _identical}[shared](xi, a, b, c)
     first = [_barycentric(*x) for x, _, _ in maps]
     second = [_barycentric(*y) for _, y, _ in maps]

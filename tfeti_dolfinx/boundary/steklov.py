@@ -13,7 +13,11 @@ from tfeti_dolfinx.boundary.integrals2d import layers_2d
 from tfeti_dolfinx.boundary.integrals3d import layers_3d
 from tfeti_dolfinx.boundary.layers import Layers
 from tfeti_dolfinx.boundary.panels import Panels
-from tfeti_dolfinx.errors import FactorError
+from tfeti_dolfinx.errors import FactorError, InputError
+
+# Of the largest nodal force of constant stresses: how wrong quadrature on long thin triangles may
+# make them
+WRONG = 1e-2
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,7 @@ def steklov(panels: Panels, law: Law) -> Steklov:
 
     Raises:
         FactorError: V is not positive definite.
+        InputError: Triangles are too long and thin for the quadrature.
     """
     layers = layers_2d(panels) if panels.dim == 2 else layers_3d(panels)
     V = single_layer(layers, law)
@@ -96,7 +101,26 @@ def steklov(panels: Panels, law: Law) -> Steklov:
     # (I − RRᵀ) S (I − RRᵀ)
     half = SR - 0.5 * R @ (R.T @ SR)
     S = S - half @ R.T - R @ half.T
-    return Steklov(panels, law, 0.5 * (S + S.T), tractions[np.ix_(rows, by_node)], defect)
+    S = 0.5 * (S + S.T)
+    if (wrong := wrong_forces(panels, law, S)) > WRONG:
+        raise InputError(
+            f"boundary elements on triangles whose longest edge squared is up to "
+            f"{2.0 * panels.distortion.max():.0f} times their area make forces of constant "
+            f"stresses {wrong:.1%} wrong; expected shorter edges, at most 20 times, say"
+        )
+    return Steklov(panels, law, S, tractions[np.ix_(rows, by_node)], defect)
+
+
+def wrong_forces(panels: Panels, law: Law, S: Array) -> float:
+    """The largest error of nodal forces of constant stresses, over the largest of these."""
+    d, y = panels.dim, panels.x - panels.x.mean(axis=0)
+    gradients = np.eye(d * d).reshape(d * d, d, d)
+    u = np.einsum("kij,nj->nik", gradients, y).reshape(-1, d * d)
+    t = np.einsum("kij,pj->pik", law.stress(gradients), panels.directed) / d
+    exact = np.zeros((len(y), d, d * d))
+    np.add.at(exact, panels.nodes, t[:, None])
+    exact = exact.reshape(u.shape)
+    return float(np.abs(S @ u - exact).max() / np.abs(exact).max())
 
 
 def single_layer(layers: Layers, law: Law) -> Array:
