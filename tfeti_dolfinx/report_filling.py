@@ -16,7 +16,7 @@ from tfeti_dolfinx.qp.problem import QPResult
 from tfeti_dolfinx.report import Report, peak_memory_mb
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.states import ContactStatus
-from tfeti_dolfinx.subdomains.local import GroupedOperator
+from tfeti_dolfinx.subdomains.local import ModelledOperator
 
 
 def fill_sizes(
@@ -99,7 +99,7 @@ def _local_operators(dual: Dual) -> dict[str, float]:
     """Forms of the local operators, and what they cost."""
     found: dict[str, float] = {}
     for name, operator in (("F", dual.F), ("preconditioner", dual.preconditioner)):
-        if operator is None or not isinstance(operator.local, GroupedOperator):
+        if operator is None or not isinstance(operator.local, ModelledOperator):
             continue
         forms = dual.coarse.comm.allreduce(operator.local.forms)
         found |= {f"{name}_{form}": float(forms[form]) for form in sorted(forms)}

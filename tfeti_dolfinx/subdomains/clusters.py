@@ -23,7 +23,7 @@ from tfeti_dolfinx.subdomains.block import OperatorKind
 from tfeti_dolfinx.subdomains.cost import BANDWIDTH, sparse_products, sparse_traffic
 from tfeti_dolfinx.subdomains.factor import REAL
 from tfeti_dolfinx.subdomains.glue import Glue
-from tfeti_dolfinx.subdomains.local import GroupedOperator
+from tfeti_dolfinx.subdomains.local import ModelledOperator
 from tfeti_dolfinx.subdomains.soft_motions import SoftMotions
 from tfeti_dolfinx.subdomains.subdomains import BALANCED, Subdomains
 
@@ -113,7 +113,7 @@ class ClusteredSubdomains(Subdomains):
 
     # ---------------------------------------------------------------- operators
 
-    def local_operator(self, kind: OperatorKind, once: bool = False) -> GroupedOperator:
+    def local_operator(self, kind: OperatorKind, once: bool = False) -> ModelledOperator:
         """K̃⁺ of the clusters, K_bb or S of their subdomains, on the trace."""
         inner = super().local_operator(kind, once)
         return ClusterPinv(self, inner) if kind == "pinv" else inner
@@ -136,7 +136,7 @@ class ClusteredSubdomains(Subdomains):
         assert self._glued is not None
         return self._glued
 
-    def glue(self, inner: GroupedOperator) -> Glue:
+    def glue(self, inner: ModelledOperator) -> Glue:
         """Z and W, made with K⁺ of the subdomains on the trace."""
         B, R = csr_array(self._clusters.averages[:, self.trace]), super().kernel_rows
         Y = self._responses(B, inner)
@@ -144,7 +144,7 @@ class ClusteredSubdomains(Subdomains):
         self._glued = Glue((B, Y, R), self.null, self._places(), stiffness)
         return self._glued
 
-    def _responses(self, B: csr_array, inner: GroupedOperator) -> csr_array:
+    def _responses(self, B: csr_array, inner: ModelledOperator) -> csr_array:
         """K⁺B_cᵀ on the trace: the i-th average of each subdomain goes with those of all others."""
         owner = np.repeat(np.arange(len(self.blocks)), [p.stop - p.start for p in self.trace_parts])
         entries = B.tocoo()
@@ -168,7 +168,7 @@ class ClusteredSubdomains(Subdomains):
         return csr_array(found, shape=(len(owner), B.shape[0]))
 
 
-class ClusterPinv(GroupedOperator):
+class ClusterPinv:
     """K̃⁺ = K⁺ − ZWZᵀ on the trace of a rank.
 
     Args:
@@ -176,7 +176,7 @@ class ClusterPinv(GroupedOperator):
         inner: K⁺ of their subdomains.
     """
 
-    def __init__(self, subdomains: ClusteredSubdomains, inner: GroupedOperator) -> None:
+    def __init__(self, subdomains: ClusteredSubdomains, inner: ModelledOperator) -> None:
         self._subdomains, self._inner = subdomains, inner
         self.predicted, self.traffic, self.forms = 0.0, 0.0, inner.forms
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from tfeti_dolfinx.arrays import Array, parts_of
 from tfeti_dolfinx.subdomains.block import Block, OperatorKind
@@ -36,6 +36,21 @@ class LocalOperator(Protocol):
     def destroy(self) -> None:
         """Free what ``prepare`` has made, but not the Blocks."""
         ...
+
+
+@runtime_checkable
+class ModelledOperator(LocalOperator, Protocol):
+    """A local operator that knows what it costs.
+
+    Attributes:
+        predicted: After ``prepare``: seconds of one multiplication by the model.
+        traffic: Bytes that it moves by the model.
+        forms: Number of subdomains in each form.
+    """
+
+    predicted: float
+    traffic: float
+    forms: Counter[str]
 
 
 @dataclass(frozen=True)
@@ -91,17 +106,13 @@ class GroupedOperator:
         blocks: This rank's Blocks.
         kind: ``"pinv"``, ``"stiffness"`` or ``"schur"``.
         choice: Which form groups take.
-
-    Attributes:
-        predicted: After ``prepare``: seconds of one multiplication by the model.
-        traffic: Bytes that it moves by the model.
-        forms: Number of subdomains in each form.
     """
 
     def __init__(self, blocks: Sequence[Block], kind: OperatorKind, choice: LocalChoice) -> None:
         self._blocks, self._kind, self._choice = blocks, kind, choice
         self._forms: list[Form] = []
-        self.predicted, self.traffic, self.forms = 0.0, 0.0, Counter[str]()
+        self.predicted, self.traffic = 0.0, 0.0
+        self.forms: Counter[str] = Counter()
 
     def prepare(self) -> None:
         """Let Blocks make what they need, and make dense matrices where they are chosen."""
@@ -127,6 +138,6 @@ class GroupedOperator:
 
 def local_operator(
     blocks: Sequence[Block], kind: OperatorKind, choice: LocalChoice
-) -> GroupedOperator:
+) -> ModelledOperator:
     """The local operator of a rank: the one place that chooses its form."""
     return GroupedOperator(blocks, kind, choice)

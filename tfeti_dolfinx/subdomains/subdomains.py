@@ -14,7 +14,7 @@ from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.subdomains.block import Block, OperatorKind
 from tfeti_dolfinx.subdomains.data import Counters
 from tfeti_dolfinx.subdomains.groups import solved_together
-from tfeti_dolfinx.subdomains.local import GroupedOperator, LocalChoice, local_operator
+from tfeti_dolfinx.subdomains.local import LocalChoice, ModelledOperator, local_operator
 from tfeti_dolfinx.subdomains.soft_motions import SoftMotions, sprung
 
 # Of ‖f‖: what the load of a subdomain does to rigid motions, which have unit norm. Ten times less
@@ -92,7 +92,7 @@ class Subdomains:
                 block.update(None if K is None else K[i], None if f is None else f[part])
         self._read_trace()
 
-    def local_operator(self, kind: OperatorKind, once: bool = False) -> GroupedOperator:
+    def local_operator(self, kind: OperatorKind, once: bool = False) -> ModelledOperator:
         """K⁺, K_bb or S of all Blocks on the trace; to be made again after ``retrace``.
 
         Args:
