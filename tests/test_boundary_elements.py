@@ -287,6 +287,17 @@ def test_points_inside():
         p.destroy()
 
 
+@pytest.mark.parametrize("elements", [tfeti.BoundaryElements("low"), ALL])
+def test_points_on_surfaces_and_tears(elements):
+    """On a side, a corner, a tear, where tears cross, and between boundary and finite elements."""
+    p = tension(two_volumes(), elements)
+    points = np.array([(0.3, 0.0), (0, 0), (0.5, 0.3), (0.5, 0.5), (0.7, 0.5), (1, 1), (0.5, 0.25)])
+    values = p.solution.at(points)
+    assert np.abs(values.displacement - points * STRETCH).max() < 1e-8
+    assert np.abs(values.stress - np.diag([0.1 / (1 - 0.3**2), 0.0])).max() < 1e-7
+    p.destroy()
+
+
 def size(d, values):
     return np.sqrt(d.comm.allreduce(float(np.sum(values**2))))
 

@@ -5,7 +5,7 @@ import pytest
 from panels import HOOK, PLANE, SPACE, SQUARE, box, kelvin, kelvin_energy, moved, polygon
 from scipy.integrate import dblquad
 
-from tfeti_dolfinx.boundary.inside import Inside, contains
+from tfeti_dolfinx.boundary.inside import Inside, share
 from tfeti_dolfinx.boundary.integrals2d import _by_rule, _exact, layers_2d
 from tfeti_dolfinx.boundary.integrals3d import layers_3d
 from tfeti_dolfinx.boundary.panels import Panels
@@ -213,4 +213,5 @@ def test_what_is_inside_is_found(name):
     middle, size = panels.midpoints, panels.size.min()
     for sign in (-1.0, 1.0):
         points = middle + sign * 1e-2 * size * panels.normal
-        assert np.all(contains(panels, points) == (sign < 0))
+        assert np.abs(share(panels, points) - (sign < 0)).max() < 1e-6
+    assert np.abs(share(panels, middle) - 0.5).max() < 1e-6

@@ -150,7 +150,7 @@ class Replaced:
             return None
         cells = self._decomposition.cell_subdomain
         have = self._chosen[np.searchsorted(self._dofs.subdomains, cells)]
-        return BoundarySolution(self._parts.solved(u), np.flatnonzero(~have))
+        return BoundarySolution(self._parts.solved(u), np.flatnonzero(~have), cells)
 
     def inside(self) -> int:
         """Number of unknowns of all ranks that boundary elements do without."""

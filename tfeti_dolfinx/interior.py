@@ -13,7 +13,6 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.boundary.solved import BoundarySolution
 from tfeti_dolfinx.compat import JIT_OPTIONS, geometry_dofmap, interpolation_points
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 
@@ -28,7 +27,6 @@ class Interior:
         u: Displacement on the torn mesh.
         sigma: Its stress in UFL, 3×3, linear in u, or None.
         dofs: Dof maps.
-        decomposition: The torn mesh.
     """
 
     def __init__(
@@ -37,10 +35,9 @@ class Interior:
         u: fem.Function,
         sigma: Any,
         dofs: TornDofs,
-        decomposition: Decomposition,
     ) -> None:
         self._boundary, self._u, self._sigma = boundary, u, sigma
-        self._dofs, self._decomposition = dofs, decomposition
+        self._dofs = dofs
 
     @cached_property
     def displacement(self) -> fem.Function:
@@ -102,7 +99,7 @@ class Interior:
         cells = np.ones(len(values), dtype=bool)
         cells[self._boundary.finite] = False
         for body in self._boundary.bodies():
-            own = np.flatnonzero(self._decomposition.cell_subdomain == body.subdomain)
+            own = np.flatnonzero(self._boundary.cell_subdomain == body.subdomain)
             gradient[own] = body.inside.gradient(middle[own])
         zero = at_midpoints.of(np.zeros_like(self._u.x.array))
         values[cells] = zero[cells]

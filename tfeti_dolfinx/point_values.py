@@ -11,10 +11,15 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.boundary.solved import BoundarySolution
+from tfeti_dolfinx.compat import geometry_dofmap
 from tfeti_dolfinx.errors import InputError
 
 # Of the size of the mesh: how far from a cell of finite elements a point may be
 PADDING = 1e-10
+# Share of directions hidden by a body that is neither 0 nor 1: points on its surface
+SURE = 1e-3
+# Their stress is taken so far on the way to the middle of their cell
+BESIDE = 0.1
 
 
 @dataclass(frozen=True)
@@ -65,17 +70,13 @@ def values_at(
     """
     k, d = points.shape
     total = np.zeros((k, 1 + d + d * d))
-    for body in () if boundary is None else boundary.bodies():
-        own = np.flatnonzero(body.inside.contains(points))
-        sigma = body.inside.stress(points[own]) / _number(thickness)
-        total[own] += _row(body.inside.displacement(points[own]), sigma)
     place, cells = _cells(u.function_space.mesh, points)
     if boundary is not None:
+        total += _of_boundary_elements(points, (place, cells), boundary, _number(thickness), u)
         kept = np.isin(cells, boundary.finite)
         place, cells = place[kept], cells[kept]
     if len(place):
-        x = np.zeros((len(place), 3))
-        x[:, :d] = points[place]
+        x = _in_space(points[place])
         sigma = np.full((len(place), d, d), np.nan)
         if stress is not None:
             sigma = stress.eval(x, cells).reshape(-1, 3, 3)[:, :d, :d]
@@ -84,6 +85,40 @@ def values_at(
     with np.errstate(invalid="ignore"):
         mean = np.where(total[:, :1] > 0.0, total[:, 1:] / total[:, :1], np.nan)
     return PointValues(mean[:, :d], mean[:, d:].reshape(k, d, d))
+
+
+def _of_boundary_elements(
+    points: Array,
+    found: tuple[Array, Array],
+    boundary: BoundarySolution,
+    thickness: float,
+    u: fem.Function,
+) -> Array:
+    """Rows of the bodies of this rank, added for each point."""
+    (k, d), mesh = points.shape, u.function_space.mesh
+    total = np.zeros((k, 1 + d + d * d))
+    (place, cells), owner = found, boundary.cell_subdomain
+    for body in boundary.bodies():
+        share = body.inside.share(points)
+        own = np.flatnonzero(share > 1.0 - SURE)
+        sigma = body.inside.stress(points[own]) / thickness
+        total[own] += _row(body.inside.displacement(points[own]), sigma)
+        on = (share > SURE) & (share <= 1.0 - SURE)
+        there = np.flatnonzero(on[place] & (owner[cells] == body.subdomain))
+        if len(there):
+            own, first = np.unique(place[there], return_index=True)
+            cell, at = cells[there[first]], points[own]
+            middle = mesh.geometry.x[geometry_dofmap(mesh)[cell]].mean(axis=1)[:, :d]
+            sigma = body.inside.stress(at + BESIDE * (middle - at)) / thickness
+            total[own] += _row(u.eval(_in_space(at), cell).reshape(-1, d), sigma)
+    return total
+
+
+def _in_space(points: Array) -> Array:
+    """Points with three coordinates."""
+    x = np.zeros((len(points), 3))
+    x[:, : points.shape[1]] = points
+    return x
 
 
 def _row(u: Array, stress: Array) -> Array:
@@ -99,8 +134,7 @@ def _number(thickness: Any) -> float:
 
 def _cells(mesh: Any, points: Array) -> tuple[Array, Array]:
     """Points by position, and the cells of this rank that each of them is in."""
-    x = np.zeros((len(points), 3))
-    x[:, : points.shape[1]] = points
+    x = _in_space(points)
     size = float(np.ptp(mesh.geometry.x, axis=0).max(initial=0.0)) if len(mesh.geometry.x) else 0.0
     tree = geometry.bb_tree(mesh, mesh.topology.dim, padding=PADDING * size)
     near = geometry.compute_collisions_points(tree, x)

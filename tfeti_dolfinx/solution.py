@@ -106,8 +106,8 @@ class Solution(ContactState):
         where a thickness is in the forms, but not in the problem, their stress has it, too.
 
         Args:
-            points: The same on all ranks, shape ``(k, gdim)``; on the surface of boundary
-                elements ask ``displacement``.
+            points: The same on all ranks, shape ``(k, gdim)``. On the surface of boundary elements
+                the displacement is that of their nodes, and the stress that of a point beside it.
 
         Raises:
             InputError: The points are of another shape, or not finite.
@@ -119,9 +119,7 @@ class Solution(ContactState):
     @cached_property
     def interior(self) -> Interior:
         """Displacement and stress on the mesh by Somigliana's identity in boundary elements."""
-        return Interior(
-            self.boundary, self.displacement, self._stress, self.dofs, self.decomposition
-        )
+        return Interior(self.boundary, self.displacement, self._stress, self.dofs)
 
     @property
     def has_stress(self) -> bool:

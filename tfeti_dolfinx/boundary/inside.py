@@ -18,6 +18,8 @@ from tfeti_dolfinx.boundary.steklov import Steklov, gunter, rigid_motions
 # on a rule of this degree is exact to 1e-9. What is nearer to the surface than a panel's size over
 # 2 to the power of HALVINGS loses that.
 FAR, HALVINGS = 2.0, 12
+# Of the size of the body: so far from its box a point may be and on its surface, by rounding
+ON = 1e-10
 DEGREES = ((32.0, 4), (12.0, 5), (6.0, 6), (3.0, 10), (0.0, 14))
 
 
@@ -55,9 +57,9 @@ class Inside:
             np.add.at(u, cut.point, self._layers(_Seen(cut, points, self._panels), cut))
         return u
 
-    def contains(self, points: Array) -> Array:
-        """Flags of points inside, shape ``(k,)``, for points of shape ``(k, d)``."""
-        return contains(self._panels, points - self._shift)
+    def share(self, points: Array) -> Array:
+        """As the function of that name, shape ``(k,)``."""
+        return share(self._panels, points - self._shift)
 
     def stress(self, points: Array) -> Array:
         """Shape ``(k, d, d)``, without σ_zz, at points inside, shape ``(k, d)``."""
@@ -120,16 +122,27 @@ def _rigid(x: Array, u: Array) -> tuple[Array, Array]:
     return moved, 0.5 * (turn - turn.T)
 
 
-def contains(panels: Panels, points: Array) -> Array:
-    """Flags of points inside a closed surface, shape ``(k,)``, by the double layer of 1."""
+def share(panels: Panels, points: Array) -> Array:
+    """Share of all directions that a closed surface hides, by the double layer of 1.
+
+    1 inside, 0 outside, between them on the surface: there it is the angle of the body.
+
+    Args:
+        panels: The surface.
+        points: Shape ``(k, d)``.
+
+    Returns:
+        Shape ``(k,)``.
+    """
     found = np.zeros(len(points))
     ones = np.ones((len(panels.nodes), panels.dim, 1))
-    low, high = panels.x.min(axis=0), panels.x.max(axis=0)
+    margin = ON * panels.diameter
+    low, high = panels.x.min(axis=0) - margin, panels.x.max(axis=0) + margin
     near = np.flatnonzero(np.all((points >= low) & (points <= high), axis=1))
     for cut in _cuts(panels, points[near], ones):
         seen = _Seen(cut, points[near], panels)
         np.subtract.at(found, near[cut.point], seen.over.sum(axis=1) * seen.through)
-    return found > 0.5
+    return found
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,9 @@ class BoundarySolution:
     Attributes:
         bodies: Gives the subdomains of this rank that have them, one at a time.
         finite: Cells of this rank that have finite elements.
+        cell_subdomain: Subdomain of each cell of this rank.
     """
 
     bodies: Callable[[], Iterable[SolvedBody]]
     finite: Array
+    cell_subdomain: Array
