@@ -103,7 +103,8 @@ class Solution(ContactState):
 
         In finite elements these are the values of ``displacement`` and ``stress``, in boundary
         elements those of Somigliana's identity, which are as accurate inside as on the surface;
-        where a thickness is in the forms, but not in the problem, their stress has it, too.
+        where a thickness is in the forms, but not in the problem, their stress has it, too. It is
+        that of the law in the forms: an initial stress has ``interior.stress`` alone.
 
         Args:
             points: The same on all ranks, shape ``(k, gdim)``. On the surface of boundary elements

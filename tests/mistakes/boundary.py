@@ -48,6 +48,12 @@ def loaded_inside(s):
     tfeti.ContactProblem(inner.a, L, [], [], inner.d, boundary_elements=ALL).solve()
 
 
+def with_mass(s):
+    """The matrix of a step in time is stiffness and mass."""
+    problem = tfeti.ContactDynamics(s.a, s.L, [], [], s.d, mass=s.mass, boundary_elements=ALL)
+    tfeti.LoadSteps(problem, lambda problem, t: None, np.array([0.1])).run()
+
+
 def of_bent_facets(s):
     """A cube of hexahedra, a node of whose upper side is lifted."""
     mesh, facet_tags, names = box("hexahedron", 2)
@@ -76,6 +82,7 @@ GIVEN = {
     ),
 }
 SOLVED = {
+    "bodies with mass of boundary elements": (with_mass, LAW),
     "a modulus that varies in boundary elements": (lambda s: solved(s, a=varying(s)), LAW),
     "springs on boundary elements": (lambda s: solved(s, a=s.a + s.mass), LAW),
     "a law of boundary elements that is not isotropic": (

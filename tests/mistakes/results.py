@@ -77,6 +77,10 @@ FIELDS = {
         lambda s: s.bare.nodal_von_mises,
         r"no stress: give",
     ),
+    "interior stress where none was given": (
+        lambda s: s.bare.interior.von_mises,
+        r"no stress: give",
+    ),
 }
 
 FILES = {
