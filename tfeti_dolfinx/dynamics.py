@@ -102,8 +102,7 @@ class ContactDynamics(ContactProblem):
             raise InputError("lumped=True with a form of the mass; expected a density")
         if not isinstance(mass, ufl.Form):
             mass = mass_form(mass, V, self.decomposition, self._with_thickness, self._lumped)
-        compiler, jit = options
-        return InertialForms(a, L, V, self.decomposition, compiler, jit, mass)
+        return InertialForms(mass, a, L, V, self.decomposition, *options)
 
     @property
     def _forms_in_time(self) -> InertialForms:

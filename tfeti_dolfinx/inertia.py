@@ -10,7 +10,6 @@ It is half of what the literature has, so that λ are forces: their mean in the 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -66,13 +65,8 @@ class InertialForms(Forms):
     """The matrix and the load of a step. Creation and all methods are collective.
 
     Args:
-        a: Bilinear form of the stiffness K.
-        L: Linear form of the load, as it is at the end of the step.
-        V: The space of a.
-        decomposition: The torn mesh.
-        form_compiler_options: As in DOLFINx.
-        jit_options: As in DOLFINx.
         mass: Bilinear form of the mass M.
+        as_forms: Arguments of ``Forms``; L is the load as it is at the end of the step.
 
     Attributes:
         motion: Where the step begins.
@@ -81,17 +75,9 @@ class InertialForms(Forms):
         InputError: As ``Forms``.
     """
 
-    def __init__(
-        self,
-        a: ufl.Form,
-        L: ufl.Form | ufl.ZeroBaseForm,
-        V: fem.FunctionSpace,
-        decomposition: Decomposition,
-        form_compiler_options: Mapping[str, Any] | None,
-        jit_options: Mapping[str, Any] | None,
-        mass: ufl.Form,
-    ) -> None:
-        super().__init__(a, L, V, decomposition, form_compiler_options, jit_options)
+    def __init__(self, mass: ufl.Form, *as_forms: Any) -> None:
+        super().__init__(*as_forms)
+        V, decomposition = self._V, self._decomposition
         self._comm = decomposition.comm
         space = displacement_space(mass, decomposition, "mass")
         check_same_space(space, V, "the trial function of mass", "that of a")
