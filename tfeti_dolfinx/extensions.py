@@ -19,6 +19,7 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.monitors import Monitor
+from tfeti_dolfinx.qp.recycled import Recycled
 from tfeti_dolfinx.solver import resolve_types
 from tfeti_dolfinx.subdomains.block import Block
 from tfeti_dolfinx.subdomains.build import MakeBlock, sparse_blocks
@@ -199,7 +200,7 @@ class Settings:
         rows = constraints.sets.contact_rows(dofs.comm)
         _, pc_type = resolve_types(self.options, rows, self.prefix)
         with added_options(self.prefix, self.factor_options):
-            return Dual(
+            dual = Dual(
                 constraints=constraints,
                 subdomains=subdomains,
                 body_names=decomposition.body_names,
@@ -208,3 +209,6 @@ class Settings:
                 options_prefix=self.prefix,
                 feasible=feasible,
             )
+        if self.options.recycle:
+            dual.recycled = Recycled(self.options.recycle, dofs.comm)
+        return dual
