@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import ufl
+from dolfinx import fem
 from moving import Thrown
 from scenes import clamp, decomposed, forms
 from scenes import displacement as nodal
@@ -216,6 +217,32 @@ def test_mistakes_of_masses():
         mass = ufl.inner(u, v) * ufl.dx if lumped_form else 1.0
         with pytest.raises(tfeti.InputError, match=says):
             tfeti.ContactDynamics(a, L, [], [], d, mass=mass, lumped=True)
+
+
+def test_mistakes_of_forms_of_masses_and_of_velocities():
+    d = decomposed("quadrilateral", 2, 2)
+    V, a, L = forms(d.mesh, d.facet_tags, (0.0, 0.0), d.surface("top"))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    dx = ufl.dx(domain=d.mesh)
+    masses = {
+        "mass: the matrix has a diagonal entry -": -ufl.inner(u, v) * dx,
+        "mass: the matrix is not symmetric": (ufl.inner(u, v) + 0.3 * u[0] * v[1]) * dx,
+        "mass: the matrix has a diagonal entry 0": u[0] * v[0] * dx,
+        "mass: a translation along x has the mass": a,
+    }
+    for says, mass in masses.items():
+        problem = tfeti.ContactDynamics(a, L, [], [], d, mass=mass)
+        problem.take_step(0.1)
+        with pytest.raises(tfeti.InputError, match=says):
+            problem.solve()
+    problem = tfeti.ContactDynamics(a, L, [], [], d, mass=1.0)
+    for size in (-0.1, 1e-200, np.inf, np.nan):
+        with pytest.raises(tfeti.InputError, match="step="):
+            problem.take_step(size)
+    quadratic = fem.Function(fem.functionspace(d.mesh, ("Lagrange", 2, (2,))))
+    for wrong in (quadratic, (0.0, -1.0)):
+        with pytest.raises(tfeti.InputError, match="velocity is "):
+            tfeti.ContactDynamics(a, L, [], [], d, mass=1.0, velocity=wrong)
 
 
 def test_a_state_or_a_solution_without_velocity():

@@ -179,17 +179,60 @@ def test_files_of_a_series(shared_tmp):
     assert number_of_steps(path) == 3
     assert {f.name for f in path.parent.iterdir()} == {"series.bp", "series_cells.bp"}
     size = driven.problem.decomposition.comm.size
-    expected = {"checkpoint.json", *(f"state_3_{rank}.npz" for rank in range(size))}
+    expected = {
+        "checkpoint.json",
+        "records.jsonl",
+        *(f"state_3_{rank}.npz" for rank in range(size)),
+    }
     expected |= {f"fields_{n}_{rank}.npz" for n in (1, 2, 3) for rank in range(size)}
     assert {f.name for f in folder.iterdir()} == expected
-    index = json.loads((folder / "checkpoint.json").read_text())
-    assert [r["time"] for r in index["records"]] == TIMES[:3]
+    lines = (folder / "records.jsonl").read_text().splitlines()
+    assert [json.loads(line)["time"] for line in lines] == TIMES[:3]
     # the series goes on to times that it did not have, in the same process too
     more = Driven()
     steps = tfeti.LoadSteps(more.problem, more.apply, TIMES[:4], path=path, checkpoint=folder)
     records = steps.run(resume=True)
     assert [r.time for r in records] == TIMES[:4]
     assert number_of_steps(path) == 4
+
+
+def test_what_a_step_writes_does_not_grow_with_the_steps(shared_tmp):
+    scene, folder = Repeated("triangle"), shared_tmp / "many"
+    sizes, states = [], []
+
+    def apply(problem, t):
+        if (folder / "checkpoint.json").exists():
+            sizes.append((folder / "checkpoint.json").stat().st_size)
+            states.append(len(list(folder.glob("state_*"))))
+        scene.load.value[-1] = -0.05
+
+    tfeti.LoadSteps(scene.problem, apply, np.arange(1.0, 31.0), checkpoint=folder).run()
+    assert len(sizes) == 29
+    assert max(sizes) <= min(sizes) + 10
+    assert set(states) == {scene.problem.decomposition.comm.size}
+
+
+@pytest.mark.parametrize("torn", [b'{"number": 3, "ti', b"\n{}\n{}\n"])
+def test_a_record_that_is_torn_is_written_again(shared_tmp, torn):
+    first, second = Driven(n=4), Driven(n=4)
+    folder, comm = shared_tmp / f"torn{len(torn)}", first.problem.decomposition.comm
+    tfeti.LoadSteps(first.problem, first.apply, TIMES[:2], checkpoint=folder).run()
+    comm.barrier()
+    if comm.rank == 0:
+        with (folder / "records.jsonl").open("ab") as file:
+            file.write(torn)
+    comm.barrier()
+    steps = tfeti.LoadSteps(second.problem, second.apply, TIMES[:4], checkpoint=folder)
+    assert [r.time for r in steps.run(resume=True)] == TIMES[:4]
+    comm.barrier()
+    lines = (folder / "records.jsonl").read_text().splitlines()
+    assert [json.loads(line)["time"] for line in lines] == TIMES[:4]
+    comm.barrier()
+    if comm.rank == 0:
+        (folder / "records.jsonl").write_text("")
+    comm.barrier()
+    with pytest.raises(tfeti.InputError, match="records.jsonl has 0 whole records of 4"):
+        tfeti.LoadSteps(second.problem, second.apply, TIMES, checkpoint=folder).run(resume=True)
 
 
 def run(ranks, scene, folder, how):

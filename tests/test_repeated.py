@@ -79,6 +79,20 @@ def scene(request):
     made.problem.destroy()
 
 
+def test_unloading_leaves_nothing(scene):
+    """From forces that are all wrong the solver would not come to a force of 0 but for rounding."""
+    comm = scene.problem.decomposition.comm
+    largest = np.abs(scene.solve().u).max(initial=0.0)
+    largest = comm.allreduce(largest, op=max)
+    smalse = scene.options["qp_type"] == "smalse"  # begins with the forces that it was given
+    for held in (0.0,) if smalse else (0.0, 0.01):
+        u = scene.solve(load=0.0, held=held).u.reshape(-1, scene.problem.dofs.bs)
+        apart = np.abs(u - held * np.eye(u.shape[1])[-1]).max(initial=0.0)
+        assert comm.allreduce(apart, op=max) <= 1e-12 * largest
+        assert smalse or scene.problem.report.F_multiplications <= 2
+    assert distance(scene.solve(), scene.fresh()) <= 1e-9
+
+
 def test_the_same_load_again_costs_next_to_nothing(scene):
     first = scene.solve()
     before, lam = first.u.copy(), first.lam.copy()

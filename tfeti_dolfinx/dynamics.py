@@ -89,7 +89,7 @@ class ContactDynamics(ContactProblem):
             raise InputError("rtol auto: errors of steps in time are not estimated; expected one")
         v = np.zeros_like(self.u.x.array)
         if velocity is not None:
-            v = self._checked_u(velocity, self.dofs.V).x.array
+            v = self._checked_u(velocity, self.dofs.V, "velocity").x.array
         self._forms_in_time.move(np.array(self.u.x.array), np.array(v))
         self._first = np.array(self.u.x.array)
         self._predictor: Predictor | None = None
@@ -102,8 +102,7 @@ class ContactDynamics(ContactProblem):
             raise InputError("lumped=True with a form of the mass; expected a density")
         if not isinstance(mass, ufl.Form):
             mass = mass_form(mass, V, self.decomposition, self._with_thickness, self._lumped)
-        compiler, jit = options
-        return InertialForms(a, L, V, self.decomposition, compiler, jit, mass)
+        return InertialForms(mass, a, L, V, self.decomposition, *options)
 
     @property
     def _forms_in_time(self) -> InertialForms:

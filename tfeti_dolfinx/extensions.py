@@ -10,19 +10,26 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.checks import checked_callable, named, shown
-from tfeti_dolfinx.dual.dual import FeasibleLaw, contact_set
+from tfeti_dolfinx.dual.dual import Dual, FeasibleLaw, contact_set
 from tfeti_dolfinx.dual.operator import PRECONDITIONERS, MakePreconditioner
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.gluing.constraints import Constraints
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.monitors import Monitor
+from tfeti_dolfinx.qp.recycled import Recycled
+from tfeti_dolfinx.solver import resolve_types
 from tfeti_dolfinx.subdomains.block import Block
 from tfeti_dolfinx.subdomains.build import MakeBlock, sparse_blocks
 from tfeti_dolfinx.subdomains.data import Counters, SubdomainData
+from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.inverse import GeneralisedInverse
+from tfeti_dolfinx.subdomains.kernel import mode_names
 from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, MakeInverse, Making
 from tfeti_dolfinx.subdomains.local import LocalChoice
+from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 
 @dataclass(frozen=True)
@@ -175,3 +182,33 @@ class Settings:
                 "auto is with smalse; expected lumped or dirichlet, whose place it takes"
             )
         return own or PRECONDITIONERS.get(pc_type)
+
+    def make_dual(
+        self,
+        constraints: Constraints,
+        subdomains: Subdomains,
+        dofs: TornDofs,
+        decomposition: Decomposition,
+        feasible: FeasibleLaw,
+    ) -> Dual:
+        """The dual problem of rows and subdomains. Collective.
+
+        Raises:
+            NoSolutionError: The load moves a body that nothing holds.
+            FactorError: A matrix could not be factored.
+        """
+        rows = constraints.sets.contact_rows(dofs.comm)
+        _, pc_type = resolve_types(self.options, rows, self.prefix)
+        with added_options(self.prefix, self.factor_options):
+            dual = Dual(
+                constraints=constraints,
+                subdomains=subdomains,
+                body_names=decomposition.body_names,
+                mode_names=mode_names(decomposition.mesh.geometry.dim, dofs.bs),
+                preconditioner=self.preconditioner(pc_type),
+                options_prefix=self.prefix,
+                feasible=feasible,
+            )
+        if self.options.recycle:
+            dual.recycled = Recycled(self.options.recycle, dofs.comm)
+        return dual

@@ -10,7 +10,6 @@ It is half of what the literature has, so that λ are forces: their mean in the 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,15 +20,20 @@ from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.assembly import Data, Forms, data_of
-from tfeti_dolfinx.checks import POSITIVE, checked_number
+from tfeti_dolfinx.checks import POSITIVE, Range, checked_number
 from tfeti_dolfinx.compat import assemble_csr
 from tfeti_dolfinx.elasticity import Modulus, in_ufl
-from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.form_checks import check_form, check_same_space, displacement_space
 from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.subdomains.input_checks import check_stiffness
 
 # of a step: another one that differs by less is the same, since times of equal steps are rounded
 SAME_STEP = 1e-9
+
+# of the sum of the diagonal: the mass of a translation is rounding, as where M has a kernel
+NO_MASS = 1e-10
+STEP = Range("a positive number whose square is one, too", lambda value: min(value, value**2) > 0.0)
 
 log = logging.getLogger(__name__)
 
@@ -66,13 +70,8 @@ class InertialForms(Forms):
     """The matrix and the load of a step. Creation and all methods are collective.
 
     Args:
-        a: Bilinear form of the stiffness K.
-        L: Linear form of the load, as it is at the end of the step.
-        V: The space of a.
-        decomposition: The torn mesh.
-        form_compiler_options: As in DOLFINx.
-        jit_options: As in DOLFINx.
         mass: Bilinear form of the mass M.
+        as_forms: Arguments of ``Forms``; L is the load as it is at the end of the step.
 
     Attributes:
         motion: Where the step begins.
@@ -81,17 +80,9 @@ class InertialForms(Forms):
         InputError: As ``Forms``.
     """
 
-    def __init__(
-        self,
-        a: ufl.Form,
-        L: ufl.Form | ufl.ZeroBaseForm,
-        V: fem.FunctionSpace,
-        decomposition: Decomposition,
-        form_compiler_options: Mapping[str, Any] | None,
-        jit_options: Mapping[str, Any] | None,
-        mass: ufl.Form,
-    ) -> None:
-        super().__init__(a, L, V, decomposition, form_compiler_options, jit_options)
+    def __init__(self, mass: ufl.Form, *as_forms: Any) -> None:
+        super().__init__(*as_forms)
+        V, decomposition = self._V, self._decomposition
         self._comm = decomposition.comm
         space = displacement_space(mass, decomposition, "mass")
         check_same_space(space, V, "the trial function of mass", "that of a")
@@ -107,7 +98,7 @@ class InertialForms(Forms):
 
     def take_step(self, size: float) -> None:
         """Let the next step have a size, which makes the matrix anew if it is another one."""
-        size, known = checked_number(size, "step", POSITIVE), self.motion.size
+        size, known = checked_number(size, "step", STEP), self.motion.size
         if abs(size - known) <= SAME_STEP * known:
             return
         if known and self._comm.rank == 0:
@@ -136,7 +127,10 @@ class InertialForms(Forms):
     def matrices(self) -> tuple[csr_array, csr_array]:
         """This rank's K and M in DOLFINx's numbering."""
         if self._matrices is None:
-            self._matrices = (super().stiffness(), assemble_csr(self._m))
+            M = assemble_csr(self._m)
+            with raised_on_all_ranks(self._comm):
+                check_mass(M, self._V.dofmap.index_map_bs)
+            self._matrices = (super().stiffness(), M)
         return self._matrices
 
     def stiffness(self) -> Any:
@@ -169,6 +163,28 @@ class InertialForms(Forms):
         motion = self.motion
         motion.u, motion.v = u, v
         motion.load = self._ends if load is None else load
+
+
+def check_mass(M: csr_array, bs: int) -> None:
+    """Raise if a matrix is not that of a mass in every direction.
+
+    Args:
+        M: This rank's matrix.
+        bs: Unknowns per node.
+
+    Raises:
+        InputError: It is not symmetric, not positive, or a translation has no mass.
+    """
+    check_stiffness("mass", M, "the matrix", "a density, or a form such as ∫ρ u·v")
+    for k in range(bs):
+        along = np.zeros(M.shape[0])
+        along[k::bs] = 1.0
+        total, sizes = along @ (M @ along), M.diagonal() @ along
+        if total <= NO_MASS * sizes and len(along):
+            raise InputError(
+                f"mass: a translation along {'xyz'[k]} has the mass {total:.3g}; expected a "
+                "density, or a form such as ∫ρ u·v"
+            )
 
 
 def mass_form(

@@ -202,12 +202,11 @@ class LoadSteps:
                 self._series = Series(self._path, solution)
             self._series.write(t, fields)
         if self._checkpoint is not None:
-            about = {
-                "times": self._times[: place.number + 2],
-                "place": asdict(place),
-                "records": [asdict(record) for record in self.records],
-            }
-            self._checkpoint.write(len(self.records), about, self._problem.state(), fields)
+            about = {"place": asdict(place), "begin": self._times[0]}
+            if place.done:  # where its step goes
+                about["towards"] = self._times[place.number + 1]
+            record, state = asdict(self.records[-1]), self._problem.state()
+            self._checkpoint.write(len(self.records), about, record, state, fields)
 
     def _begin(self, resume: bool) -> Place:
         """Where to begin, with the state of that place."""
@@ -221,20 +220,22 @@ class LoadSteps:
             self._checkpoint.forget()
             return Place()
         place = Place(**index["place"])
-        self._check_times(index["times"], place)
         self.records = [StepRecord(**record) for record in index["records"]]
+        ends = {record.number: record.time for record in self.records}
+        reached = [index["begin"], *(ends[number] for number in range(place.number))]
+        self._check_times(reached + ([index["towards"]] if place.done else []))
         self._problem.take_step(self.records[-1].size)
         self._set(self.records[-1].time)
         self._problem.restore(self._checkpoint.read_state(index["number"]))
         self._replay(self._checkpoint)
         return place
 
-    def _check_times(self, times: list[float], place: Place) -> None:
-        reached = place.number + (2 if place.done else 1)
-        if times[:reached] != self._times[:reached]:
+    def _check_times(self, reached: list[float]) -> None:
+        given = self._times[: len(reached)]
+        if reached != given:
             raise InputError(
-                f"the checkpoint is of a series with the times {shown(times[:reached])}, begin "
-                f"first; expected those, got {shown(self._times[:reached])}"
+                f"the checkpoint is of a series with the times {shown(reached)}, begin "
+                f"first; expected those, got {shown(given)}"
             )
 
     def _replay(self, checkpoint: Checkpoint) -> None:

@@ -78,6 +78,13 @@ class Options:
         "the coarse problem has the motions of clusters only; 0: none",
         fits=FROM_0,
     )
+    recycle: int = described(
+        0,
+        "pcpg, newton",
+        "so many directions of earlier solves with the same F are kept at most, which later ones "
+        "begin with; each takes two dual vectors",
+        fits=FROM_0,
+    )
     homogenization: str = described(
         "natural",
         "smalse",

@@ -9,7 +9,6 @@ from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.dual import Dual
-from tfeti_dolfinx.dual.operator import PRECONDITIONERS
 from tfeti_dolfinx.extensions import Extensions, Settings
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.gluing.glue import Gluing
@@ -21,7 +20,6 @@ from tfeti_dolfinx.solver import conclude, resolve_types, solve_dual
 from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
 from tfeti_dolfinx.subdomains.data import Counters
 from tfeti_dolfinx.subdomains.factor import added_options
-from tfeti_dolfinx.subdomains.kernel import mode_names
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 
@@ -109,22 +107,8 @@ class Predictor:
         if self._dual is not None:
             self._dual.destroy()
             self._subdomains.retrace(constraints.trace)
-        self._dual = self._make_dual(constraints, self._subdomains)
-
-    def _make_dual(self, constraints: Constraints, subdomains: Subdomains) -> Dual:
-        decomposition, settings = self._decomposition, self._settings
-        rows = constraints.sets.contact_rows(self._dofs.comm)
-        _, pc_type = resolve_types(settings.options, rows, settings.prefix)
-        with added_options(settings.prefix, settings.factor_options):
-            return Dual(
-                constraints=constraints,
-                subdomains=subdomains,
-                body_names=decomposition.body_names,
-                mode_names=mode_names(decomposition.mesh.geometry.dim, self._dofs.bs),
-                preconditioner=PRECONDITIONERS.get(pc_type),
-                options_prefix=settings.prefix,
-                feasible=_frictionless,
-            )
+        scene = self._dofs, self._decomposition
+        self._dual = settings.make_dual(constraints, self._subdomains, *scene, _frictionless)
 
     def _solve(self, gluing: Gluing) -> Array:
         """The displacement in primal order."""

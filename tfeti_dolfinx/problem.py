@@ -230,9 +230,9 @@ class ContactProblem(Stepping):
         settle_seconds(self.report, self.decomposition.comm)
         self.report.end()
 
-    def _checked_u(self, u: fem.Function, V: fem.FunctionSpace) -> fem.Function:
-        checked_type(u, fem.Function, "u", "a dolfinx.fem.Function on the space of a")
-        check_same_space(u.function_space, V, "u", "the space of a")
+    def _checked_u(self, u: fem.Function, V: fem.FunctionSpace, name: str = "u") -> fem.Function:
+        checked_type(u, fem.Function, name, "a dolfinx.fem.Function on the space of a")
+        check_same_space(u.function_space, V, name, "the space of a")
         return u
 
     def destroy(self) -> None:

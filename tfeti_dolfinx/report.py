@@ -57,6 +57,7 @@ class Report:
         sliding: Those that slip.
         F_multiplications: Multiplications by F, all but the power method's.
         preconditioner_multiplications: Multiplications by the preconditioner.
+        recycled_directions: Directions of this and earlier solves that the next one begins with.
         power_method_multiplications: Multiplications that estimated ‖PFP‖.
         recoveries: Displacements recovered to see how right they are, each for one more solve
             in every subdomain.
@@ -128,6 +129,7 @@ class Report:
     sliding: int = 0
     F_multiplications: int = _counter()
     preconditioner_multiplications: int = _counter()
+    recycled_directions: int = 0
     power_method_multiplications: int = _counter()
     recoveries: int = _counter()
     friction_iterations: int = _counter()

@@ -65,6 +65,7 @@ def fill_result(
     report.sliding = comm.allreduce(int(np.sum(status == ContactStatus.SLIP)))
     report.F_multiplications += dual.F.count["solver"]
     report.power_method_multiplications += dual.F.count["power method"]
+    report.recycled_directions = 0 if dual.recycled is None else dual.recycled.count
     if dual.preconditioner is not None:
         report.preconditioner_multiplications += dual.preconditioner.count["solver"]
     report.friction_iterations += settling.iterations

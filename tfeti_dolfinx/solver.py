@@ -15,8 +15,10 @@ from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.dual.goals import Goal
 from tfeti_dolfinx.errors import ConvergenceError, InputError
 from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.parallel import agreed, any_rank
 from tfeti_dolfinx.qp.homogenised import (
     Homogenised,
+    Image,
     homogenise,
     image,
     scale_at,
@@ -137,7 +139,8 @@ def _homogenise(
 ) -> Homogenised:
     """With λ̄ where the solver starts, or as the options say."""
     if start is not None and solver.warm is not None:
-        at, known = dual.last.image(qp.F, solver.warm(qp, start)), dual.known_image("natural")
+        at = _no_worse_than_nothing(qp, dual.last.image(qp.F, solver.warm(qp, start)))
+        known = dual.known_image("natural")
         scale = scale_at(qp, known) if known else scale_near(qp, at)
     elif solver.cold is not None:
         at = image(qp.F, solver.cold(qp))
@@ -147,6 +150,20 @@ def _homogenise(
     homogenised = homogenise(qp, at, scale)
     at.destroy()
     return homogenised
+
+
+def _no_worse_than_nothing(qp: QP, at: Image) -> Image:
+    """0 with its image where it is admissible and q is no less at a start, as after unloading.
+
+    Of what the start has and the solution has not, conjugate gradients would leave its rounding.
+    """
+    comm, zero = at.x.getComm().tompi4py(), np.zeros(at.x.getLocalSize())
+    may = not np.any(qp.coarse.e) and not np.any(qp.feasible.project(zero))
+    worse = 0.5 * at.x.dot(at.Fx) >= at.x.dot(qp.d)
+    if not any_rank(comm, not may) and agreed(comm, worse):
+        at.x.set(0.0)
+        at.Fx.set(0.0)
+    return at
 
 
 def _homogenise_as_told(dual: Dual, qp: QP, options: Options) -> Homogenised:

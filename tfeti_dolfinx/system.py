@@ -26,13 +26,11 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.parallel import any_rank
 from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.report_filling import fill_sizes
-from tfeti_dolfinx.solver import resolve_types
 from tfeti_dolfinx.stages import STAGES, Stages, made
 from tfeti_dolfinx.subdomains.averages import clusters_of
 from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
 from tfeti_dolfinx.subdomains.data import Counters
 from tfeti_dolfinx.subdomains.factor import added_options
-from tfeti_dolfinx.subdomains.kernel import mode_names
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 from tfeti_dolfinx.timing import stage
 
@@ -237,19 +235,10 @@ class System:
             self._subdomains = make_subdomains(data, *how, clusters)
 
     def _make_dual(self) -> None:
-        cut, dofs = self._decomposition, self._dofs
-        rows = self.gluing.constraints.sets.contact_rows(dofs.comm)
-        _, pc_type = resolve_types(self._settings.options, rows, self._settings.prefix)
-        with added_options(self._settings.prefix, self._settings.factor_options):
-            self._dual = Dual(
-                constraints=self.gluing.constraints,
-                subdomains=made(self._subdomains),
-                body_names=cut.body_names,
-                mode_names=mode_names(cut.mesh.geometry.dim, dofs.bs),
-                preconditioner=self._settings.preconditioner(pc_type),
-                options_prefix=self._settings.prefix,
-                feasible=self._settings.extensions.feasible_set,
-            )
+        settings, scene = self._settings, (self._dofs, self._decomposition)
+        parts = self.gluing.constraints, made(self._subdomains)
+        law = settings.extensions.feasible_set
+        self._dual = settings.make_dual(*parts, *scene, law)
         self._dual.saw(self._seen)
 
     def _destroy_dual(self) -> None:

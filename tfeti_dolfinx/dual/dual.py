@@ -35,6 +35,7 @@ from tfeti_dolfinx.qp.feasible_sets import Bounds, FeasibleSet, Product
 from tfeti_dolfinx.qp.homogenised import Image, LastImage, image
 from tfeti_dolfinx.qp.norm import estimate_norm
 from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
+from tfeti_dolfinx.qp.recycled import Recycled, RecycledOnFace
 from tfeti_dolfinx.subdomains.local import LocalOperator
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
@@ -80,6 +81,7 @@ class Dual:
         seen: Largest estimate of ‖F‖ that solves have come to, 0 before.
         feasible: The set Ω of multipliers.
         last: The last solution with its image, if there is no kernel.
+        recycled: Directions of earlier solves; None: none are kept.
         pressing: After ``recover``: contact rows whose force is more than the solver's error.
         nearly_free: After ``recover``: motions that contacts with a force hold hardly or not.
 
@@ -125,6 +127,7 @@ class Dual:
         self._images = dict[str, tuple[Array, Image]]()
         self._norm: tuple[int, float] | None = None
         self.seen, self.last = 0.0, LastImage()
+        self.recycled: Recycled | None = None
         self._check()
         self.d = linear_term(B, constraints.c, subdomains)
 
@@ -181,7 +184,9 @@ class Dual:
         self.feasible = self._law(self.constraints)  # c may be another, and what the law refers to
         norm = self._norm_of(coarse, norm_steps) if norm_steps else 1.0
         on = self._preconditioner_on if self.preconditioner is not None else None
-        return QP(self.F, self.d, coarse, self.feasible, self._on_all_rows, norm, on, self.seen)
+        past = None if self.recycled is None else RecycledOnFace(self.recycled)
+        also = (self._on_all_rows, norm, on, self.seen, past)
+        return QP(self.F, self.d, coarse, self.feasible, *also)
 
     def saw(self, norm: float) -> None:
         """A solve has estimated ‖F‖: what the next one begins with.

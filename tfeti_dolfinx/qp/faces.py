@@ -60,6 +60,11 @@ class Face:
         return np.asarray(self.status != Status.FREE)
 
     @property
+    def held(self) -> Array:
+        """Rows that no direction moves; flags."""
+        return np.asarray(np.diff(self.Z.indptr) == 0)
+
+    @property
     def curved(self) -> bool:
         """Whether some row of this rank slips along a boundary."""
         return bool(np.any(np.diff(self.Z.indptr)[self.status == Status.SLIP]))

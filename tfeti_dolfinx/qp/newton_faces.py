@@ -150,7 +150,9 @@ class FaceSolver:
         self._dependent.face = self._eased.face
         self._bent = Bent(self._qp.F, self._eased.face) if self.curved else None
         F = self._bent or self._qp.F
-        self._on_face = replace(self._on_face, F=F, preconditioner=self._preconditioner)
+        on = replace(self._on_face, F=F, preconditioner=self._preconditioner)
+        past = None if self.curved or on.recycled is None else on.recycled.on(self._eased.face)
+        self._on_face = replace(on, recycled=past)
         self._prepared = True
 
     def settle(self) -> None:

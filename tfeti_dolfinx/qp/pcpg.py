@@ -10,6 +10,7 @@ from tfeti_dolfinx.parallel import agreed, summed
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.monitors import Monitor, no_monitor
+from tfeti_dolfinx.qp.plateau import Plateau
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, QPResult, Steps
 from tfeti_dolfinx.qp.stopping import StoppingRule
 
@@ -18,9 +19,6 @@ from tfeti_dolfinx.qp.stopping import StoppingRule
 FLAT = 1e-13
 # of λ: a way that is shorter may be rounding of Gλ = e
 SHORT = 1e-6
-# so many steps in which neither ‖r‖ comes down to a half nor q by what stands out from its rounding
-# have met rounding: at that pace 10 000 steps would bring 6 digits at best
-PLATEAU, ROUNDING = 500, 1e-15
 
 
 class Directions:
@@ -62,34 +60,6 @@ class Directions:
             vec.destroy()
 
 
-class _Progress:
-    """Whether residuals and q still come down."""
-
-    def __init__(self, norm: float) -> None:
-        self._best, self._steps, self._gain, self._restarted = norm, 0, 0.0, False
-
-    def step(self, norm: float, gain: float) -> None:
-        """A step has lowered q by so much, and ends with that ‖r‖."""
-        self._steps, self._gain = self._steps + 1, self._gain + gain
-        if norm <= 0.5 * self._best:
-            self._best, self._steps, self._gain, self._restarted = norm, 0, 0.0, False
-
-    def ended(self, qp: QP, point: Point) -> bool:
-        """Whether there was none for long. Collective where there were many steps."""
-        if self._steps < PLATEAU:
-            return False
-        sizes = abs(point.lam.dot(point.g)) + abs(point.lam.dot(qp.d))
-        comm = point.lam.getComm().tompi4py()
-        ended = agreed(comm, self._gain <= ROUNDING * sizes)
-        self._steps, self._gain = 0, 0.0
-        return ended
-
-    def once_more(self) -> bool:
-        """Whether this is the first time since ‖r‖ came down."""
-        first, self._restarted = not self._restarted, True
-        return first
-
-
 def pcpg(
     qp: QP,
     point: Point,
@@ -105,7 +75,8 @@ def pcpg(
     the projector of ``qp.coarse``: on a face λ moves in the face alone. Multiplies by F, and by
     the preconditioner, once per step, and once more where the rule finds that g has drifted, or
     where neither ‖P g‖ nor q has come down for long. A step makes three global reductions: one
-    with each projection, one for the norm of the residual.
+    with each projection, one for the norm of the residual; one more where there are directions of
+    earlier solves.
 
     ===========================  ===================================================
     reason                       when
@@ -129,10 +100,10 @@ def pcpg(
         Why it stopped.
     """
     own = Directions(point.lam) if directions is None else directions
-    r, p, Fp, z = own.r, own.p, own.Fp, own.z
-    norm, reason = _residual(qp, point.g, r), ConvergedReason.ITERATING
+    r, p, Fp, z, past = own.r, own.p, own.Fp, own.z, qp.recycled
+    norm, reason = _begun(qp, point, own), ConvergedReason.ITERATING
     least = agreed(qp.d.getComm().tompi4py(), SHORT**2 * point.lam.dot(point.lam))
-    progress = _Progress(norm)
+    progress = Plateau(norm)
     while True:
         # test
         if norm <= rule.tolerance:
@@ -143,7 +114,8 @@ def pcpg(
             reason = ConvergedReason.DIVERGED_ROUNDING
         if rule.drifted or anew:
             point.refresh(qp)
-            norm, rule.drifted, own.fresh = _residual(qp, point.g, r), False, True
+            rule.drifted, own.fresh = False, True
+            norm = _begun(qp, point, own)
         if reason == ConvergedReason.ITERATING and steps.cg >= max_it:
             reason = ConvergedReason.DIVERGED_ITS
         if reason != ConvergedReason.ITERATING:
@@ -152,6 +124,8 @@ def pcpg(
         own.rz, previous = _precondition(qp, r, z, norm), own.rz
         # direction
         p.aypx(0.0 if own.fresh else own.rz / previous, z)
+        if past is not None:
+            past.conjugate(p)
         # step
         qp.F.mult(p, Fp)
         Fp.copy(z)
@@ -165,11 +139,15 @@ def pcpg(
                 reason = ConvergedReason.DIVERGED_INDEFINITE_MAT
             break
         point.move(own.rz / pFp, p, Fp)
+        if past is not None:
+            past.remember(p, Fp, pFp)
         z.copy(r)
         own.fresh, norm = False, float(np.sqrt(squared))
         steps.cg += 1
         progress.step(norm, 0.5 * own.rz**2 / pFp)
         monitor(steps, "cg", point.lam, norm, 0.0)
+    if past is not None:
+        past.keep()
     if directions is None:
         own.destroy()
     return reason
@@ -249,6 +227,14 @@ def _face(qp: QP, lam: PETSc.Vec, g: PETSc.Vec) -> Face:
 def _examined(qp: QP, point: Point, rule: StoppingRule, norm: float) -> ConvergedReason:
     """What the rule says of the point."""
     return rule.examine(point.lam, point.g, _face(qp, point.lam, point.g), norm)
+
+
+def _begun(qp: QP, point: Point, own: Directions) -> float:
+    """Go where q is least along directions of earlier solves; make r there. Its norm."""
+    norm = _residual(qp, point.g, own.r)
+    if qp.recycled is not None and qp.recycled.go(point.lam, point.g, own.r):
+        norm, own.fresh = _residual(qp, point.g, own.r), True
+    return norm
 
 
 def _residual(qp: QP, g: PETSc.Vec, r: PETSc.Vec) -> float:

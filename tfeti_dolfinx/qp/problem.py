@@ -14,6 +14,7 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
+from tfeti_dolfinx.qp.recycled import RecycledOnFace
 
 
 class Operator(Protocol):
@@ -53,6 +54,7 @@ class QP:
         preconditioner_on: Makes an approximate inverse of ZᵀFZ for a face Z, between vectors of
             the face in the layout of all rows; or None.
         seen: Largest Rayleigh quotient of F that earlier solves have seen; 0 if there were none.
+        recycled: Directions of earlier solves, which those of PCPG are made F-orthogonal to.
     """
 
     F: Operator
@@ -63,6 +65,7 @@ class QP:
     norm: float = 1.0
     preconditioner_on: Callable[[Face], FaceOperator] | None = None
     seen: float = 0.0
+    recycled: RecycledOnFace | None = None
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,90 @@
+"""Directions of earlier solves: what they save, and that they stay right."""
+
+import numpy as np
+import pytest
+from test_repeated import Repeated, distance
+
+import tfeti_dolfinx as tfeti
+
+
+def images(problem):
+    """How far FW is from F of W, and WᵀFW from 1."""
+    dual = problem.dual
+    W, FW = (A[:, : dual.recycled.count] for A in (dual.recycled.W, dual.recycled.FW))
+    x, Fx, worst = dual.d.duplicate(), dual.d.duplicate(), 0.0
+    for w, Fw in zip(W.T, FW.T, strict=True):
+        x.array[:] = w
+        dual.F.mult(x, Fx)
+        size = Fx.norm()
+        Fx.array[:] -= Fw
+        worst = max(worst, Fx.norm() / size)
+    apart = dual.coarse.comm.allreduce(W.T @ FW) - np.eye(W.shape[1])
+    return worst, np.abs(apart).max()
+
+
+@pytest.mark.parametrize(("cell", "qp_type"), [("tetrahedron", "pcpg"), ("triangle", "newton")])
+def test_what_was_learnt_from_a_load_is_right_for_its_multiples(cell, qp_type):
+    """Without inequalities the answer is linear in the load, and forces know no rigid motion."""
+    scene = Repeated(cell, contact=False, qp_type=qp_type, recycle=60)
+    counts = []
+    for load, held in ((-0.05, 0.0), (0.03, 0.01), (-0.2, 0.02)):
+        found = scene.solve(load=load, held=held)
+        counts.append(scene.problem.report.F_multiplications)
+        assert distance(found, scene.fresh(load=load, held=held)) <= 1e-9
+    assert counts[0] >= 10
+    assert max(counts[1:]) <= 2
+    assert scene.problem.report.recycled_directions >= 10
+
+
+def test_steps_with_contact_take_fewer_multiplications():
+    with_them, without = (Repeated("triangle", recycle=n) for n in (60, 0))
+    counts = []
+    for scene in (with_them, without):
+        total = 0
+        for load in -0.05 - 0.03 * np.arange(8):
+            found = scene.solve(load=load)
+            total += scene.problem.report.F_multiplications
+        counts.append(total)
+        assert distance(found, scene.fresh(load=load)) <= 1e-9
+    assert without.problem.report.recycled_directions == 0
+    assert counts[0] <= 0.7 * counts[1]
+
+
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_images_stay_right_over_many_solves_on_many_faces(cell):
+    """Memory is what was allowed, and rounding does not grow from one direction to the next."""
+    scene, rng = Repeated(cell, recycle=15), np.random.default_rng(3)
+    for load, held in rng.uniform([-0.2, -0.02], [0.05, 0.02], (40, 2)):
+        scene.solve(load=load, held=held)
+    known = scene.problem.dual.recycled
+    assert known.count == known.W.shape[1] == 15
+    worst, apart = images(scene.problem)
+    assert worst <= 1e-11
+    assert apart <= 1e-11
+    assert distance(scene.problem.solution, scene.fresh(load=load, held=held)) <= 1e-8
+
+
+def test_another_stiffness_forgets():
+    scene = Repeated("triangle", recycle=60)
+    scene.solve()
+    assert scene.problem.report.recycled_directions > 0
+    found = scene.solve(E=3.0, load=-0.1)
+    report = scene.problem.report
+    assert report.recycled_directions <= report.cg_steps
+    assert distance(found, scene.fresh(E=3.0, load=-0.1)) <= 1e-9
+
+
+def test_wrong_images_are_found_out():
+    """Each new direction shows whether F is still symmetric with what is kept."""
+    scene = Repeated("triangle", recycle=60)
+    for load in (-0.05, -0.1):
+        scene.solve(load=load)
+    scene.problem.dual.recycled.FW *= 1.0 + 1e-6
+    scene.solve(load=-0.3, held=0.01)
+    assert max(images(scene.problem)) <= 1e-11
+    assert distance(scene.problem.solution, scene.fresh(load=-0.3, held=0.01)) <= 1e-8
+
+
+def test_a_number_of_directions_that_is_none():
+    with pytest.raises(tfeti.InputError, match="recycle"):
+        Repeated("triangle", recycle=-1)

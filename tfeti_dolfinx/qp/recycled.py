@@ -1,0 +1,157 @@
+"""Directions of earlier solves with the same F, and what F makes of them."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.parallel import agreed, summed
+from tfeti_dolfinx.qp.faces import Face
+
+# of the energy of a direction: what stands out from those that are kept; where less does, rounding
+# of their images would grow from one to the next
+NEW = 0.1
+# of wᵀFp, for w and p of energy 1: where Fw says otherwise than Fp it is no longer F of w
+WRONG = 1e-9
+# of the longest direction: less on rows that a face holds is rounding
+HELD = 1e-10
+
+
+class Recycled:
+    """F-orthonormal directions W that conjugate gradients have gone, and their images FW.
+
+    Farhat, Crivelli, Roux, Comput. Methods Appl. Mech. Engrg. 117 (1994) 195–209: solves with
+    other right sides begin with the best of what is known, and go F-orthogonally to it. Where W is
+    full, the oldest direction goes.
+
+    Args:
+        capacity: Most directions; each takes two vectors, and two more while it is new.
+        comm: Communicator.
+
+    Attributes:
+        count: Number of directions.
+    """
+
+    def __init__(self, capacity: int, comm: MPI.Intracomm) -> None:
+        self.capacity, self.comm = capacity, comm
+        self.W, self.FW = np.zeros((0, 0)), np.zeros((0, 0))
+        self._squares = np.zeros(capacity)  # of the lengths of W's columns
+        self.count = self._next = 0
+
+    def add(self, x: Array, Fx: Array) -> None:
+        """Keep a direction of energy 1, or what is new in it. Collective, three reductions.
+
+        Where images are no longer right, all that was kept is forgotten.
+        """
+        if self.W.shape[1] == 0:
+            self.W, self.FW = (np.zeros((len(x), self.capacity), order="F") for _ in range(2))
+        for passed in range(2):
+            W, FW = self.W[:, : self.count], self.FW[:, : self.count]
+            a, same = summed(self.comm, np.array([FW.T @ x, W.T @ Fx]))
+            if passed == 0 and agreed(self.comm, bool(np.any(np.abs(a - same) > WRONG))):
+                self.count = self._next = 0
+                continue
+            if self.count == self.capacity:
+                a[self._next] = 0.0  # it goes
+            x, Fx = x - W @ a, Fx - FW @ a
+        energy, square = summed(self.comm, np.array([x @ Fx, x @ x]))
+        if not agreed(self.comm, energy >= NEW):
+            return
+        self.W[:, self._next], self.FW[:, self._next] = x / np.sqrt(energy), Fx / np.sqrt(energy)
+        self._squares[self._next] = square / energy
+        self.count = max(self.count, self._next + 1)
+        self._next = (self._next + 1) % self.capacity
+
+    def within(self, held: Array | None) -> Array | None:
+        """Orthonormal N so that W N is 0 on rows, shape ``(count, k)``. Collective.
+
+        Args:
+            held: Flags of the local rows; None: no rows, and then N is None, too.
+        """
+        if held is None:
+            return None
+        R = _triangle(self.W[held, : self.count])
+        R = self.comm.allreduce(R, op=lambda one, other: _triangle(np.vstack((one, other))))
+        _, sizes, Vt = np.linalg.svd(R)
+        longest = float(np.sqrt(self._squares[: self.count].max(initial=0.0)))
+        return agreed(self.comm, Vt[int(np.sum(sizes > HELD * longest)) :].T)
+
+
+class RecycledOnFace:
+    """Directions of earlier solves that lie in a face, by default that of all rows.
+
+    Args:
+        known: All directions.
+        held: Flags of the local rows that are 0 on the face; None: no rows.
+    """
+
+    def __init__(self, known: Recycled, held: Array | None = None) -> None:
+        self._known, self._held = known, held
+        self._N: Array | None = None
+        self._active = False
+        self._new = deque[tuple[Array, Array]](maxlen=known.capacity)
+
+    def on(self, face: Face) -> RecycledOnFace:
+        """Those within another face."""
+        return RecycledOnFace(self._known, face.held)
+
+    def go(self, lam: PETSc.Vec, g: PETSc.Vec, r: PETSc.Vec) -> bool:
+        """Go where q is least along W. Collective.
+
+        Args:
+            lam: A point; updated.
+            g: Fλ − d; updated.
+            r: −P g.
+
+        Returns:
+            Whether there is any direction.
+        """
+        self.keep()
+        known = self._known
+        self._active = known.count > 0
+        if self._active:
+            self._N = known.within(self._held)
+            self._active = self._N is None or self._N.shape[1] > 0
+        if self._active:
+            b = self._part(summed(known.comm, known.W[:, : known.count].T @ r.array_r))
+            lam.array[:] += self._combined(b)
+            g.array[:] += known.FW[:, : known.count] @ b
+        return self._active
+
+    def conjugate(self, p: PETSc.Vec) -> None:
+        """Make a direction F-orthogonal to W. Collective, one reduction, or none without W."""
+        if self._active:
+            known = self._known
+            a = summed(known.comm, known.FW[:, : known.count].T @ p.array_r)
+            p.array[:] -= self._combined(self._part(a))
+
+    def remember(self, p: PETSc.Vec, Fp: PETSc.Vec, energy: float) -> None:
+        """A direction was gone; it is kept later, for W stays while a solve goes on."""
+        size = 1.0 / np.sqrt(energy)
+        self._new.append((size * p.array_r, size * Fp.array_r))
+
+    def keep(self) -> None:
+        """Keep what was gone. Collective."""
+        while self._new:
+            self._known.add(*self._new.popleft())
+        self._active = False
+
+    def _part(self, a: Array) -> Array:
+        """N Nᵀ a."""
+        return a if self._N is None else self._N @ (self._N.T @ a)
+
+    def _combined(self, b: Array) -> Array:
+        """W b, 0 where the face holds rows."""
+        x = self._known.W[:, : self._known.count] @ b
+        if self._held is not None:
+            x[self._held] = 0.0
+        return np.asarray(x)
+
+
+def _triangle(A: Array) -> Array:
+    """R of A = QR."""
+    return np.asarray(np.linalg.qr(A, mode="r"))
