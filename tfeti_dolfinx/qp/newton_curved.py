@@ -204,3 +204,22 @@ def brought_back(qp: QP, face: Face, z: Point, near: PETSc.Vec | None = None) ->
     held = imbalance(qp.coarse, found.lam) <= HELD
     moved_to(qp, z, found.lam)
     return held
+
+
+def brought_into(qp: QP, z: Point) -> bool:
+    """Bring z, which is near by, to the nearest point of Ω with Gz = e. Collective.
+
+    Where circles are small beside what Gz lacks, no point of them may balance it; of discs one
+    does. Multiplies by F once.
+
+    Args:
+        qp: The program.
+        z: The point.
+
+    Returns:
+        Whether there is such a point.
+    """
+    found = nearest(qp.coarse, qp.feasible, z.lam)
+    held = imbalance(qp.coarse, found.lam) <= HELD
+    moved_to(qp, z, found.lam)
+    return held

@@ -203,6 +203,29 @@ class FaceSolver:
         back = not out and (not self.curved or self._eased.back(self._qp, self.coarse, z))
         return Trial(first or z.copy(), z, back, face, rounds)
 
+    def go_on(self, trial: Trial) -> Trial | None:
+        """Solve on at the end of a trial, where that is on the face on which it came to its end.
+
+        Returns:
+            The longer trial; None where the face does not stay. Takes the given one over.
+        """
+        s = trial.last.g.duplicate()
+        self._qp.coarse.combine(self.coarse.coordinates(trial.last.g), s)
+        s.aypx(-1.0, trial.last.g)
+        face = self._qp.feasible.face(trial.last.lam.array_r, s.array_r)
+        s.destroy()
+        if self._face is None or any_rank(
+            self._comm, not np.array_equal(face.status, self._face.status)
+        ):
+            return None
+        self.settle()
+        longer = self.solve(trial.last, face, self.left)
+        longer.first.destroy()
+        trial.last.destroy()
+        return replace(
+            trial, last=longer.last, feasible=longer.feasible, rounds=trial.rounds + longer.rounds
+        )
+
     def _drop(self, z: Point) -> None:
         """Enter the face of z, and bring z back to Gλ = e in it; multiplies by F once."""
         previous, feasible = self._face, self._qp.feasible

@@ -171,6 +171,13 @@ class Iterate:
         known = np.isfinite(self.residual)
         enough = ENOUGH * 0.5 / self.norm * self.residual**2 if known else 0.0
         gain = self.gain(trial.last)
+        import os
+        more = int(os.environ.get("MORE", "2"))
+        while more and trial.feasible and trial.rounds > 1 and agreed(self._comm, gain < enough) and not faces.contradicts:
+            longer = faces.go_on(trial)
+            if longer is None:
+                break
+            trial, gain, more = longer, self.gain(longer.last), more - 1
         hidden = ROUNDING * slipping_work(self.point.lam, self.s, trial.face)
         stays = gain <= 0.0 and self._idle > 1  # what is left is not on the face, but maybe Gλ ≠ e
         if trial.feasible and agreed(self._comm, gain >= enough - hidden and not stays):
