@@ -120,15 +120,19 @@ class FaceSolver:
         """Projectors of the face entered."""
         return self._on_face.coarse
 
+    def stays_on(self, face: Face) -> bool:
+        """Whether each row does on a face what it does on the one entered. Collective."""
+        return self._face is not None and not any_rank(
+            self._comm, not np.array_equal(face.status, self._face.status)
+        )
+
     def enter(self, face: Face) -> bool:
         """Make the projectors of a face, unless it is the last one; anew where it is curved.
 
         Returns:
             Whether each row does what it did on the last one.
         """
-        same = self._face is not None and not any_rank(
-            self._comm, not np.array_equal(face.status, self._face.status)
-        )
+        same = self.stays_on(face)
         if same and not self.curved:
             return True
         self._leave()
@@ -202,29 +206,6 @@ class FaceSolver:
         assert self._face is not None
         back = not out and (not self.curved or self._eased.back(self._qp, self.coarse, z))
         return Trial(first or z.copy(), z, back, face, rounds)
-
-    def go_on(self, trial: Trial) -> Trial | None:
-        """Solve on at the end of a trial, where that is on the face on which it came to its end.
-
-        Returns:
-            The longer trial; None where the face does not stay. Takes the given one over.
-        """
-        s = trial.last.g.duplicate()
-        self._qp.coarse.combine(self.coarse.coordinates(trial.last.g), s)
-        s.aypx(-1.0, trial.last.g)
-        face = self._qp.feasible.face(trial.last.lam.array_r, s.array_r)
-        s.destroy()
-        if self._face is None or any_rank(
-            self._comm, not np.array_equal(face.status, self._face.status)
-        ):
-            return None
-        self.settle()
-        longer = self.solve(trial.last, face, self.left)
-        longer.first.destroy()
-        trial.last.destroy()
-        return replace(
-            trial, last=longer.last, feasible=longer.feasible, rounds=trial.rounds + longer.rounds
-        )
 
     def _drop(self, z: Point) -> None:
         """Enter the face of z, and bring z back to Gλ = e in it; multiplies by F once."""
