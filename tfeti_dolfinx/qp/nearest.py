@@ -22,7 +22,7 @@ MAX_TRIALS = 300
 BALANCED = 1e-13
 # of the same: below that, a step that leaves more than this share has met the damping, a kink or,
 # if so many in a row do so with the least damping, rounding
-NEARLY, SLOW, SLOWLY = 1e-6, 0.1, 4
+NEARLY, SLOW, SLOWLY = 1e-6, 0.1, 8
 # of GGᵀ, added to G_f G_fᵀ: keeps steps regular where few rows carry a force, and is small beside
 # 1, so that they stay Newton's; where bodies are hardly held it slows the end down, and the
 # smallest that a factor bears takes its place
