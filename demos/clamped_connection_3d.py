@@ -82,7 +82,7 @@ def run(argv):
 
     # ## Contact
     #
-    # Where nearly all nodes slip, SMALSE-M multiplies less often than block Newton on fine meshes.
+    # Where nearly all nodes slip, as here, block Newton may take very long on fine meshes.
     law = tfeti.Coulomb(arguments.friction)
     contacts = [
         tfeti.Contact(a, b, secondary=a, friction=law, reach=1.0, name=a)

@@ -16,7 +16,8 @@ from tfeti_dolfinx.qp.homogenised import homogenise, image
 from tfeti_dolfinx.qp.monitors import no_monitor
 from tfeti_dolfinx.qp.nearest import UNBALANCED, WithinFace, nearest, nearest_or_least
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
-from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Start
+from tfeti_dolfinx.qp.newton_curved import brought_back, brought_into
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, Start
 from tfeti_dolfinx.qp.stopping import ResidualRule
 
 
@@ -162,6 +163,34 @@ def test_forces_far_beyond_small_discs_do_not_hide_what_balances():
         assert found.missing <= UNBALANCED
         assert np.array_equal(feasible.project(found.lam.array_r), found.lam.array_r)
     assert max(missed) > 0.1
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e2])
+def test_small_discs_balance_beside_large_forces(scale):
+    """What steps miss near by may be kinks of small discs, and no rounding of large forces."""
+    for seed in range(20):
+        rng, n = np.random.default_rng(seed), 40
+        radius, G = 10.0 ** rng.uniform(-3.0, 0.0, n), np.zeros((3, 2 * n + 1))
+        G[:2, :-1], G[2, -1] = rng.normal(size=(2, 2 * n)), 1.0
+        within = np.repeat(radius, 2) * rng.uniform(-0.7, 0.7, 2 * n)
+        balanced = np.append(within, 1e8)
+        y = balanced + np.append(scale * np.repeat(radius, 2) * rng.normal(size=2 * n), 0.0)
+        feasible = Product([(np.arange(2 * n), Discs(radius))])
+        found = nearest(DenseCoarse(G, G @ balanced), feasible, vector(y))
+        assert np.linalg.norm(G @ (found.lam.array - balanced)) <= 1e-12 * 1e8
+
+
+def test_where_a_circle_cannot_balance_its_disc_does():
+    """A disc of radius 1 that slips, and has to carry 0.2."""
+    qp = QP(
+        matrix(np.eye(2)), vector(np.ones(2)), DenseCoarse(np.eye(2), [0.2, 0.0]), Discs(np.ones(1))
+    )
+    on = np.array([0.8, 0.6])
+    face, z = qp.feasible.face(on, -on), Point(vector(on), vector(on - 1.0))
+    assert not brought_back(qp, face, z)
+    assert brought_into(qp, face, z)
+    assert np.allclose(z.lam.array, [0.2, 0.0], atol=1e-12)
+    assert np.allclose(z.g.array, [-0.8, -1.0], atol=1e-12)
 
 
 def test_what_nothing_in_the_set_balances_is_said():

@@ -6,7 +6,7 @@ import numpy as np
 
 from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.faces import Face
-from tfeti_dolfinx.qp.newton_curved import brought_back
+from tfeti_dolfinx.qp.newton_curved import brought_back, brought_into, gradient_on
 from tfeti_dolfinx.qp.problem import QP, Point
 
 # times ‖F‖: a curvature that leaves F no say in where a force on a small circle points, as where
@@ -39,7 +39,7 @@ class Eased:
     def back(self, qp: QP, coarse: Coarse, z: Point) -> bool:
         """Bring z back to the circles, turned by −κ⁻¹Zᵀs where these bend hard. Collective.
 
-        Multiplies by F once.
+        Into the discs where circles do not bear it. Multiplies by F once, or twice.
 
         Args:
             qp: The program.
@@ -49,13 +49,11 @@ class Eased:
         Returns:
             Whether there is such a point near by.
         """
-        s, near = z.g.duplicate(), z.lam.copy()
-        qp.coarse.combine(coarse.coordinates(z.g), s)
-        s.aypx(-1.0, z.g)
+        s, near = gradient_on(qp, coarse, z.g), z.lam.copy()
         Z, kappa = self.whole.Z[:, self._hard], self.whole.curvature[self._hard]
         slope = Z.T @ s.array_r
         near.array[:] -= Z @ np.divide(slope, kappa, out=np.zeros_like(slope), where=kappa > 0.0)
-        held = brought_back(qp, self.whole, z, near)
+        held = brought_back(qp, self.whole, z, near) or brought_into(qp, self.whole, z)
         s.destroy()
         near.destroy()
         return held

@@ -20,8 +20,9 @@ from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 MAX_TRIALS = 300
 # of the terms of Gλ − e: what the coarse problem's factors leave at best
 BALANCED = 1e-13
-# of the same: below that, a step that leaves more than this share has met the damping, or rounding
-NEARLY, SLOW = 1e-6, 0.1
+# of the same: below that, a step that leaves more than this share has met the damping, a kink or,
+# if so many in a row do so with the least damping, rounding
+NEARLY, SLOW, SLOWLY = 1e-6, 0.1, 8
 # of GGᵀ, added to G_f G_fᵀ: keeps steps regular where few rows carry a force, and is small beside
 # 1, so that they stay Newton's; where bodies are hardly held it slows the end down, and the
 # smallest that a factor bears takes its place
@@ -99,7 +100,7 @@ def nearest(
     """
     comm = y.getComm().tompi4py()
     trial = _trial(coarse, feasible, y, np.zeros(coarse.dimension) if alpha is None else alpha)
-    damping, trials, unmet = DAMPING, 1, 0
+    damping, trials, unmet, slowly = DAMPING, 1, 0, 0
     while trials < max_trials and unmet < PATIENCE:
         left, scale = trial.left, float(np.linalg.norm(coarse.forces(trial.lam)))
         if agreed(comm, left <= BALANCED * scale):
@@ -112,7 +113,8 @@ def nearest(
         whole = agreed(comm, length == 1.0 and float(trial.residual @ step) > LEFT * slope)
         unmet = unmet + 1 if whole else 0
         slow = agreed(comm, trial.left > SLOW * left and trial.left <= NEARLY * scale)
-        if agreed(comm, length <= SHORTEST) or (slow and damping <= LEAST_DAMPING):
+        slowly = slowly + 1 if slow else 0
+        if agreed(comm, length <= SHORTEST) or slowly > SLOWLY:
             break
         if slow:
             damping = LEAST_DAMPING

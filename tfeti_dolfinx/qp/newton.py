@@ -10,6 +10,7 @@ from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.monitors import Monitor, no_monitor
 from tfeti_dolfinx.qp.nearest import UNBALANCED, nearest, nearest_or_least
+from tfeti_dolfinx.qp.newton_accept import accept, longer
 from tfeti_dolfinx.qp.newton_curved import is_rubbing
 from tfeti_dolfinx.qp.newton_faces import FaceSolver
 from tfeti_dolfinx.qp.newton_iterate import Iterate
@@ -143,10 +144,11 @@ def newton(
             faces.forget()  # PCPG may have stopped on that face, but elsewhere
         trial = faces.solve(start, begun, state.residual)
         start.destroy()
+        trial = longer(state, trial, faces)
         # Step 4: accept where q falls enough
         if faces.contradicts:
             reason = ConvergedReason.DIVERGED_CONTRADICTION
-        elif not state.accept(trial, faces) or state.stalled or faces.rounded > 1:
+        elif not accept(state, trial, faces) or state.stalled or faces.rounded > 1:
             reason = ConvergedReason.DIVERGED_ROUNDING
         trial.destroy()
         steps.outer, looked = steps.outer + 1, True

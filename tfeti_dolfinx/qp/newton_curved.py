@@ -109,12 +109,18 @@ def bent_at(qp: QP, coarse: Coarse, face: Face, on: Array, g: PETSc.Vec) -> Face
         on: A point that has this face, shape ``(m,)``.
         g: Fλ − d.
     """
-    s = g.duplicate()
-    qp.coarse.combine(coarse.coordinates(g), s)
-    s.aypx(-1.0, g)
+    s = gradient_on(qp, coarse, g)
     curvature = qp.feasible.face(on, s.array_r).curvature
     s.destroy()
     return Face(face.Z, curvature, face.status)
+
+
+def gradient_on(qp: QP, coarse: Coarse, g: PETSc.Vec) -> PETSc.Vec:
+    """Fλ − d − Gᵀμ with the μ of a face, the caller's own. Collective."""
+    s = g.duplicate()
+    qp.coarse.combine(coarse.coordinates(g), s)
+    s.aypx(-1.0, g)
+    return s
 
 
 def slipping_work(lam: PETSc.Vec, s: PETSc.Vec, face: Face) -> float:
@@ -201,6 +207,26 @@ def brought_back(qp: QP, face: Face, z: Point, near: PETSc.Vec | None = None) ->
     """
     within = WithinFace(qp.feasible, face, slipping=True)
     found = nearest(qp.coarse, within, z.lam if near is None else near, max_trials=BACK)
+    held = imbalance(qp.coarse, found.lam) <= HELD
+    moved_to(qp, z, found.lam)
+    return held
+
+
+def brought_into(qp: QP, face: Face, z: Point) -> bool:
+    """Bring z to the nearest point with Gz = e and open rows at 0. Collective.
+
+    Where circles are small beside what Gz lacks, no points of them may balance it; of the discs
+    some do. Multiplies by F once.
+
+    Args:
+        qp: The program.
+        face: The face.
+        z: The point.
+
+    Returns:
+        Whether there is such a point.
+    """
+    found = nearest(qp.coarse, WithinFace(qp.feasible, face), z.lam)
     held = imbalance(qp.coarse, found.lam) <= HELD
     moved_to(qp, z, found.lam)
     return held

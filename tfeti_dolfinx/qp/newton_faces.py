@@ -120,15 +120,19 @@ class FaceSolver:
         """Projectors of the face entered."""
         return self._on_face.coarse
 
+    def stays_on(self, face: Face) -> bool:
+        """Whether each row does on a face what it does on the one entered. Collective."""
+        return self._face is not None and not any_rank(
+            self._comm, not np.array_equal(face.status, self._face.status)
+        )
+
     def enter(self, face: Face) -> bool:
         """Make the projectors of a face, unless it is the last one; anew where it is curved.
 
         Returns:
             Whether each row does what it did on the last one.
         """
-        same = self._face is not None and not any_rank(
-            self._comm, not np.array_equal(face.status, self._face.status)
-        )
+        same = self.stays_on(face)
         if same and not self.curved:
             return True
         self._leave()
