@@ -221,13 +221,13 @@ def test_bisection_leaves_columns_of_flat_cells_whole(thin, parts):
 
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])
 def test_bisection_cuts_between_layers(cell):
-    """Ten layers in three parts: 3, 4 and 3 or so, each interface is a plane."""
+    """Ten layers of flat cells in three parts: 3, 4 and 3 or so, each interface is a plane."""
     flat = cell in ("triangle", "quadrilateral")
     kind = getattr(dmesh.CellType, cell)
     if flat:
-        mesh = dmesh.create_rectangle(MPI.COMM_WORLD, [(0, 0), (5, 1)], [10, 2], kind)
+        mesh = dmesh.create_rectangle(MPI.COMM_WORLD, [(0, 0), (5, 0.2)], [10, 2], kind)
     else:
-        mesh = dmesh.create_box(MPI.COMM_WORLD, [(0, 0, 0), (5, 1, 1)], [10, 2, 2], kind)
+        mesh = dmesh.create_box(MPI.COMM_WORLD, [(0, 0, 0), (5, 1, 0.2)], [10, 2, 2], kind)
     d = tfeti.decompose(mesh, 3)
     layer = np.floor(
         2.0
@@ -249,3 +249,10 @@ def test_bisection_along_layers_stays_balanced(parts, gdim, seed):
     counts = np.bincount(bisect_points(x, parts, MPI.COMM_SELF, extents), minlength=parts)
     assert counts.min() >= 0.55 * len(x) / parts - 1.0
     assert counts.max() <= 1.6 * len(x) / parts + 1.0
+
+
+def test_bisection_of_cells_that_are_not_flat_only_counts():
+    x, extents = grid_of_cells([3, 4, 5], [1.0, 0.5, 0.4])
+    for parts in (2, 4, 7):
+        found = bisect_points(x, parts, MPI.COMM_SELF, extents)
+        assert np.array_equal(found, bisect_points(x, parts, MPI.COMM_SELF))

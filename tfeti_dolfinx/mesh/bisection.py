@@ -16,8 +16,9 @@ APART = 0.4
 # of that: midpoints that are nearer to each other count as one; so many different ones a layer has
 # at most, else there are no layers
 ONE, MOST = 0.25, 6
-# of the cells of one part: a cut moves by so many at most to lie between layers, or columns
-MOVED = 0.25
+# of the cells of one part: a cut moves by so many at most to lie between layers, or columns, in a
+# part with a cell that is so many times as long as thick
+MOVED, FLAT = 0.25, 3.0
 
 
 class _Halves(NamedTuple):
@@ -28,7 +29,8 @@ class _Halves(NamedTuple):
         may: By how many points that may change.
         axes: The axes, the one that is cut across first, then those that ties are broken by, shape
             ``(p, gdim)``.
-        gap: Distance of layers along these axes, shape ``(p, gdim)``; None where there are none.
+        gap: Distance of layers along these axes, shape ``(p, gdim)``; -1 in parts without flat
+            cells; None if there are none at all.
     """
 
     wanted: Array
@@ -49,9 +51,9 @@ def bisect_points(
         x: Points of this rank, shape ``(n, gdim)``.
         num_parts: Number of parts.
         comm: Communicator.
-        extents: Of the cells whose midpoints they are, shape ``(n, gdim)``. Then cuts lie between
-            layers of cells, or at least between columns along the axis in which cells are
-            flattest, where few cells change sides by that: ragged interfaces cut what holds most.
+        extents: Of the cells whose midpoints they are, shape ``(n, gdim)``. Where some are flat
+            cuts lie between layers of cells, or at least between columns along the axis in which
+            they are flat, if few cells change sides by that: ragged interfaces cut what holds most.
 
     Returns:
         Part of each local point, shape ``(n,)``.
@@ -97,15 +99,20 @@ def _halves(
     count, gap = _count(part, num_parts, comm), None
     axes = (np.argmax(high - low, axis=1)[:, None] + np.arange(gdim)) % gdim
     if sizes is not None:
-        total = np.zeros((num_parts, gdim), dtype=np.int64)
-        np.add.at(total, part, sizes)
+        total = np.zeros((2, num_parts, gdim), dtype=np.int64)
+        np.add.at(total[0], part, sizes)
+        largest = np.maximum(sizes.max(axis=1, initial=1)[:, None], 1)
+        np.add.at(total[1], part, (sizes << 10) // largest)
         comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
-        mean = total / np.maximum(count, 1)[:, None]
-        flat = np.take_along_axis(mean, axes, axis=1)
+        flat = np.zeros(num_parts, dtype=np.int64)
+        np.maximum.at(flat, part, np.any(FLAT * sizes <= largest, axis=1))
+        comm.Allreduce(MPI.IN_PLACE, flat, op=MPI.MAX)
+        thick = np.take_along_axis(total[1], axes, axis=1)
         if gdim == 3:
-            turned = flat[:, 1] < (1.0 - ONE) * flat[:, 2]
+            turned = (flat > 0) & (thick[:, 1] < thick[:, 2])
             axes[turned] = axes[turned][:, [0, 2, 1]]
-        gap = (APART * np.take_along_axis(mean, axes, axis=1)).astype(np.int64)
+        mean = np.take_along_axis(total[0], axes, axis=1) / np.maximum(count, 1)[:, None]
+        gap = np.where(flat[:, None] > 0, (APART * mean).astype(np.int64), -1)
     return _Halves(np.rint(count * left / whole), MOVED * count / whole, axes, gap)
 
 
@@ -122,7 +129,7 @@ def _after(grid: Array, part: Array, halves: _Halves, comm: MPI.Intracomm) -> Ar
             key = (key << bits) | digits[inside, others]
         kth = _kth_smallest(key, own, halves.wanted - before, comm)
         result[inside] = key > kth[own]
-        if halves.gap is None or k == gdim - 1:
+        if halves.gap is None or k == gdim - 1 or np.all(halves.gap < 0):
             break
         at, gap = kth >> (bits * (gdim - 1 - k)), halves.gap[:, k]
         low, is_low = _end(c, own, at, gap, comm)
@@ -132,9 +139,11 @@ def _after(grid: Array, part: Array, halves: _Halves, comm: MPI.Intracomm) -> Ar
         left = np.stack([before + _count(own, num_parts, comm, c <= end[own]) for end in ends])
         off = np.where([is_low, is_high], np.abs(left - halves.wanted), np.inf)
         better, parts = np.argmin(off, axis=0), np.arange(num_parts)
-        moves = off[better, parts] <= halves.may
+        moves = (gap >= 0) & (off[better, parts] <= halves.may)
         result[inside] = np.where(moves[own], c > ends[better, parts][own], result[inside])
-        through = (is_low & is_high & ~moves)[own] & (c > ends[0][own]) & (c <= ends[1][own])
+        through = (
+            ((gap >= 0) & is_low & is_high & ~moves)[own] & (c > ends[0][own]) & (c <= ends[1][own])
+        )
         inside, before = inside[through], left[0]
     return result
 

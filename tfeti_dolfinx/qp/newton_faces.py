@@ -11,6 +11,7 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.parallel import agreed, any_rank
 from tfeti_dolfinx.qp.coarse import HELD, Coarse, imbalance
 from tfeti_dolfinx.qp.dependent import DependentRows
+from tfeti_dolfinx.qp.directions import Directions
 from tfeti_dolfinx.qp.eased import Eased
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.monitors import Monitor
@@ -24,7 +25,7 @@ from tfeti_dolfinx.qp.newton_curved import (
     restored_on,
 )
 from tfeti_dolfinx.qp.parameters import NewtonParameters
-from tfeti_dolfinx.qp.pcpg import SHORT, Directions, pcpg
+from tfeti_dolfinx.qp.pcpg import SHORT, pcpg
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, FaceOperator, Point, Steps
 from tfeti_dolfinx.qp.stopping import StoppingRule, TargetRule
 from tfeti_dolfinx.qp.trial import Trial
