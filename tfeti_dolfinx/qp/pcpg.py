@@ -19,14 +19,16 @@ DRIFTED = 0.5
 # of λ: a way that is shorter may be rounding of Gλ = e
 SHORT = 1e-6
 # so many steps in which neither ‖r‖ comes down to a half nor q by what stands out from its rounding
-# have met rounding: at that pace 10 000 steps would bring 6 digits at best
-PLATEAU, ROUNDING = 500, 1e-15
+# have met rounding: at that pace 10 000 steps would bring 6 digits at best; twice as many as there
+# are rows, and a few, have it too
+PLATEAU, FEW, ROUNDING = 500, 20, 1e-15
 
 
 class _Progress:
     """Whether residuals and q still come down."""
 
-    def __init__(self, norm: float) -> None:
+    def __init__(self, norm: float, rows: int) -> None:
+        self._most = min(PLATEAU, 2 * rows + FEW)
         self._best, self._steps, self._gain, self._restarted = norm, 0, 0.0, False
 
     def step(self, norm: float, gain: float) -> None:
@@ -37,7 +39,7 @@ class _Progress:
 
     def ended(self, qp: QP, point: Point) -> bool:
         """Whether there was none for long. Collective where there were many steps."""
-        if self._steps < PLATEAU:
+        if self._steps < self._most:
             return False
         sizes = abs(point.lam.dot(point.g)) + abs(point.lam.dot(qp.d))
         comm = point.lam.getComm().tompi4py()
@@ -93,7 +95,7 @@ def pcpg(
     r, p, Fp, z = own.r, own.p, own.Fp, own.z
     norm, reason = _residual(qp, point.g, r), ConvergedReason.ITERATING
     least = agreed(qp.d.getComm().tompi4py(), SHORT**2 * point.lam.dot(point.lam))
-    progress = _Progress(norm)
+    progress = _Progress(norm, r.getSize())
     while True:
         # test
         if norm <= rule.tolerance:
