@@ -1,27 +1,34 @@
 """Dolan's and Moré's profiles of the solvers and preconditioners over random scenes.
 
-    ./run python3 benchmarks/solver_profiles.py [--quick] [--scenes 100] [--processor]
+    ./run python3 benchmarks/solver_profiles.py [--quick] [--scenes 100] [--default] [--resume]
 
 Scenes are those of ``benchmarks.stress`` (boxes in 2D and 3D: single ones, stacks, rows, bridges,
 apart; obstacles, slender, of moduli and units that differ, held by contact alone), every third with
 Coulomb's friction, blocks with Tresca's, and beams without contact. A scene takes part if the
 checks of the package say that it has a solution.
 
-A solve fails that ends in an error, in more than ``--steps`` steps, or with an error above 100 rtol
-(and 100 times what rounding does) beside a direct solve. A profile ρ(τ) is the share of scenes that
-a solver solves for at most τ times the cost of the best one (Mathematical Programming 91, 2002):
-cost in multiplications by F and by the preconditioner, and in seconds of the solver. Results go to
+A solve fails that ends in an error, in more than ``--steps`` steps, after more than ``--limit``
+seconds (on one rank), or with an error above 100 rtol (and 100 times what rounding does) beside a
+direct solve. Where rounding of the stiffness alone changes the direct solution by more than rtol no
+solver can be right to rtol, and may say so: such solves are in a table of their own. A profile ρ(τ)
+is the share of solves that a solver ends for at most τ times the cost of the best one (Mathematical
+Programming 91, 2002): cost in multiplications by F and by the preconditioner, and in seconds of the
+solver. Each solve is written to results/solver_profiles.jsonl at once; ``--resume`` takes what is
+there, so that a run may be ended, or begin with the default solvers, ``--default``. Results go to
 results/solver_profiles.md, .json and .png.
 """
 
 from __future__ import annotations
 
+import json
 import logging
+import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import petsc4py
 
@@ -51,6 +58,8 @@ TOLERANCES = (1e-4, 1e-8)
 WITHIN = 100.0  # of rtol, and of the noise of the direct solution
 NEAR = 2.0  # of the best
 TAUS = (1.0, 1.5, 2.0, 4.0, 8.0, 16.0)
+NAMES = ("scene", "kind", "cell", "bodies", "friction", "rtol")
+T = TypeVar("T")
 BEAMS, MODULI = (2.0, 5.0, 10.0, 20.0, 50.0), (1.0, 1e2, 1e4)
 
 
@@ -60,7 +69,35 @@ def configure(parser):
     )
     parser.add_argument("--steps", type=int, default=1000, help="most steps of a solver")
     parser.add_argument("--seed", type=int, default=0, help="the first seed")
+    parser.add_argument("--limit", type=int, default=60, help="most seconds of a solve, whole")
+    parser.add_argument("--default", action="store_true", help="the default solvers only")
+    parser.add_argument("--resume", action="store_true", help="go on with an earlier run's solves")
     configure_clock(parser)
+
+
+class LateError(Exception):
+    """Something has taken too long."""
+
+
+def limited(seconds: int, run: Callable[[], T]) -> T:
+    """What a function returns within so many seconds; on several ranks they do not count.
+
+    Raises:
+        LateError: It has not returned.
+    """
+
+    def ring(*_: object) -> None:
+        raise LateError(f"beyond {seconds} s")
+
+    if MPI.COMM_WORLD.size > 1:
+        return run()
+    before = signal.signal(signal.SIGALRM, ring)
+    signal.alarm(seconds)
+    try:
+        return run()
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def scenes(count: int, seed: int, quick: bool) -> Iterator[tuple[str, Scene]]:
@@ -128,25 +165,56 @@ def takes_part(scene: Scene, g: meshes.Grid):
     return True, answer
 
 
-def study(name: str, scene: Scene, steps: int) -> list[dict[str, Any]]:
-    """A row for each tolerance."""
-    g, rows = meshes.grid(scene), []
-    part, answer = takes_part(scene, g)
-    if not part:
-        return rows
-    solvers = CONTACT if scene.walls or scene.pairs else LINEAR
-    for rtol in TOLERANCES:
-        row = {**described(name, scene), "rtol": rtol}
-        for qp_type, pc_type in solvers:
-            mults, seconds, why = cost(scene, g, answer, steps, (qp_type, pc_type, rtol))
-            key = f"{qp_type}, {pc_type}"
-            row |= {key: mults, f"{key}, s": seconds, f"{key}, failed": why}
-        rows.append(row)
-        if MPI.COMM_WORLD.rank == 0:
-            counts = [row[f"{qp}, {pc}"] for qp, pc in solvers]
-            failed = [row[f"{qp}, {pc}, failed"][:110] for qp, pc in solvers[2:3]]
-            print(name, row["kind"], row["friction"], rtol, *counts, *failed, flush=True)
-    return rows
+def study(name: str, scene: Scene, arguments: Any, known: dict[str, Any]) -> list[dict[str, Any]]:
+    """A row for each solve of a scene, and one that says if it takes part; those known as they are.
+
+    Args:
+        name: Name of the scene.
+        scene: The scene.
+        arguments: Most steps and seconds, and which solvers.
+        known: Rows of an earlier run by ``key``.
+    """
+    has_contact = bool(scene.walls or scene.pairs)
+    solvers = CONTACT if has_contact else LINEAR
+    solvers = [DEFAULT[has_contact]] if arguments.default else solvers
+    works = [(qp, pc, rtol) for rtol in TOLERANCES for qp, pc in solvers]
+    first = known.get(name, {})
+    rows = [known[f"{name}, {work}"] for work in works if f"{name}, {work}" in known]
+    if first and (not first["part"] or len(rows) == len(works)):
+        return [first, *rows]
+    g, noise, about = meshes.grid(scene), 0.0, described(name, scene)
+    try:
+        part, answer = limited(arguments.limit, lambda: takes_part(scene, g))
+    except LateError:
+        part, answer = True, None
+    if answer is not None and answer.noise is not None:
+        noise = float(answer.noise.max())
+    found = [{"key": name, **about, "part": part, "direct": answer is not None, "noise": noise}]
+    for work in works if part else []:
+        if (row := known.get(f"{name}, {work}")) is None:
+            row = {"key": f"{name}, {work}", **about, "rtol": work[2]}
+            row |= {"solver": "{}, {}".format(*work), "noise": noise}
+            try:
+                run = partial(cost, scene, g, answer, arguments.steps, work)
+                mults, seconds, why = limited(arguments.limit, run)
+            except LateError as late:
+                mults, seconds, why = None, None, str(late)
+            row |= {"cost": mults, "seconds": seconds, "failed": why}
+        found.append(row)
+    return found
+
+
+def gathered(solves: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """A row for each scene and tolerance, with the columns of all its solvers."""
+    rows: dict[tuple[str, float], dict[str, Any]] = {}
+    for solve in solves:
+        if "solver" in solve:
+            about = {name: solve[name] for name in (*NAMES, "noise")}
+            row = rows.setdefault((solve["scene"], solve["rtol"]), about)
+            key = solve["solver"]
+            row |= {key: solve["cost"], f"{key}, s": solve["seconds"]}
+            row |= {f"{key}, failed": solve["failed"]}
+    return list(rows.values())
 
 
 def profiles(rows: list[dict[str, Any]], solvers, suffix: str = "") -> list[dict[str, Any]]:
@@ -178,27 +246,36 @@ def profiles(rows: list[dict[str, Any]], solvers, suffix: str = "") -> list[dict
 def tabled(rows: list[dict[str, Any]], unit: str) -> dict[str, list[dict[str, Any]]]:
     """Profiles of multiplications and seconds, and what failed by default."""
     tables: dict[str, list[dict[str, Any]]] = {}
+    reached = [row for row in rows if row["noise"] <= row["rtol"]]
     for has_contact, solvers in ((True, CONTACT), (False, LINEAR)):
-        own = [row for row in rows if "{}, {}".format(*solvers[0]) in row]
+        default = "{}, {}".format(*DEFAULT[has_contact])
+        own = [row for row in reached if default in row]
+        # of a run that was ended, or of default solvers alone, what all rows have
+        tried = [pair for pair in solvers if all("{}, {}".format(*pair) in row for row in own)]
         if own:
             what = "contact" if has_contact else "no contact"
-            tables[f"{what}, multiplications"] = profiles(own, solvers)
-            tables[f"{what}, {unit}"] = profiles(own, solvers, ", s")
-    worst = []
-    for row in rows:
-        for default in DEFAULT.values():
-            key = "{}, {}".format(*default)
-            others = [row[k] for k in row if k + ", failed" in row and row[k] is not None]
-            if key in row and (row[key] is None or row[key] > NEAR * min(others)):
-                names = ("scene", "kind", "cell", "bodies", "friction", "rtol")
-                least = min(others, default="-")
-                worst.append(
-                    {**{n: row[n] for n in names}, "default": row[key] or "-", "best": least}
-                    | {"why": row[f"{key}, failed"].replace("|", "/")}
-                )
-    if worst:
-        tables["default failed, or needs more than twice the best"] = worst
+            tables[f"{what}, multiplications"] = profiles(own, tried)
+            tables[f"{what}, {unit}"] = profiles(own, tried, ", s")
+    failed = "default failed, or needs more than twice the best"
+    for title, some in ((failed, reached), ("below what rounding leaves", rows)):
+        worst = [_beside_best(row) for row in some if title == failed or row not in reached]
+        if worst := [row for row in worst if row and (title != failed or row.pop("bad"))]:
+            tables[title] = [{k: v for k, v in row.items() if k != "bad"} for row in worst]
     return tables
+
+
+def _beside_best(row: dict[str, Any]) -> dict[str, Any]:
+    """What the default solver and the best one need; nothing where the default was not tried."""
+    for default in DEFAULT.values():
+        key = "{}, {}".format(*default)
+        others = [row[k] for k in row if k + ", failed" in row and row[k] is not None]
+        if key in row:
+            bad = row[key] is None or row[key] > NEAR * min(others)
+            found = {"default": "-" if row[key] is None else row[key]}
+            found |= {"best": min(others, default="-"), "bad": bad}
+            why = row[f"{key}, failed"].replace("|", "/")
+            return {**{name: row[name] for name in NAMES}, **found, "why": why}
+    return {}
 
 
 def draw(path, tables):
@@ -223,11 +300,26 @@ def main(argv):
     arguments, _ = command_line(__doc__, argv, configure)
     unit, before = choose_clock(arguments), logging.root.manager.disable
     logging.disable(logging.WARNING)
-    count, rows = 4 if arguments.quick else arguments.scenes, []
+    count, rank = 4 if arguments.quick else arguments.scenes, MPI.COMM_WORLD.rank
+    journal, solves, known = arguments.output / "solver_profiles.jsonl", [], {}
+    if arguments.resume and journal.exists():
+        lines = journal.read_text().splitlines()
+        known = {row["key"]: row for row in map(json.loads, lines)}
+    if rank == 0:
+        journal.parent.mkdir(parents=True, exist_ok=True)
+        journal.write_text("".join(json.dumps(row) + "\n" for row in known.values()))
     for name, scene in scenes(count, arguments.seed, arguments.quick):
-        rows += study(name, scene, arguments.steps)
+        found = study(name, scene, arguments, known)
+        solves += found
+        if rank == 0 and (new := [row for row in found if row["key"] not in known]):
+            with journal.open("a") as file:
+                file.writelines(json.dumps(row) + "\n" for row in new)
+            said = [
+                (row["solver"], row["rtol"], row["cost"], row["failed"][:110]) for row in new[1:]
+            ]
+            print(name, found[0]["kind"], found[0]["friction"], *said, flush=True)
+    rows = gathered(solves)
     logging.disable(before)
-    rank = MPI.COMM_WORLD.rank
     tables = MPI.COMM_WORLD.bcast(tabled(rows, unit) if rank == 0 else None)
     return finish(arguments.output, "solver_profiles", tables, draw, rank)
 

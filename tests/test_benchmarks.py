@@ -125,7 +125,7 @@ def test_stability(shared_tmp, comm):
 
 
 def test_solver_profiles(shared_tmp, comm):
-    tables = quick(solver_profiles, shared_tmp, comm, "--steps", "300")
+    tables = quick(solver_profiles, shared_tmp, comm, "--steps", "300", "--seed", "4")
     default = tables["contact, multiplications"][2]
     assert default["solver"] == "newton, dirichlet"
     for title, rows in tables.items():
@@ -147,6 +147,53 @@ def test_profiles_count_failures_and_ties():
     assert [row["τ = 1"] for row in found] == [0.5, 0.5, 0.5]
     assert [row["τ = 2"] for row in found] == [0.5, 0.75, 0.5]
     assert [row["τ = 4"] for row in found] == [0.5, 0.75, 0.75]
+
+
+def solve_row(scene, rtol, solver, cost, noise=0.0):
+    about = dict.fromkeys(("kind", "cell", "bodies", "friction"), "")
+    row = {"scene": scene, **about, "rtol": rtol, "solver": solver, "noise": noise}
+    return {**row, "cost": cost, "seconds": cost, "failed": "" if cost else "named"}
+
+
+def test_profiles_leave_out_what_rounding_does():
+    solves = [{"key": "a", "part": True}]
+    for pair, costs in (
+        (("newton", "none"), (3, 5, None)),
+        (("newton", "dirichlet"), (7, 5, None)),
+    ):
+        solver = "{}, {}".format(*pair)
+        for k, (cost, noise) in enumerate(zip(costs, (0.0, 1e-9, 1e-7), strict=True)):
+            solves.append(solve_row(str(k), 1e-8, solver, cost, noise))
+    tables = solver_profiles.tabled(solver_profiles.gathered(solves), "seconds")
+    for row in tables["contact, multiplications"]:
+        assert (row["solves"], row["failed"], row["τ = 4"]) == (2, 0, 1.0)
+    (slow,) = tables["default failed, or needs more than twice the best"]
+    assert (slow["scene"], slow["default"], slow["best"]) == ("0", 7, 3)
+    (below,) = tables["below what rounding leaves"]
+    assert (below["scene"], below["default"], below["why"]) == ("2", "-", "named")
+
+
+def test_profiles_go_on_where_a_run_was_ended(shared_tmp, comm, monkeypatch):
+    arguments = (shared_tmp, comm, "--default", "--scenes", "1", "--seed", "1")
+    monkeypatch.setattr(solver_profiles, "CELLS", ())
+    scenes = solver_profiles.scenes
+    monkeypatch.setattr(solver_profiles, "scenes", lambda *_: scenes(1, 1, False))
+    tables = quick(solver_profiles, *arguments)
+
+    def refuse(*_):
+        raise AssertionError("it is known")
+
+    monkeypatch.setattr(solver_profiles, "takes_part", refuse)
+    monkeypatch.setattr(solver_profiles, "cost", refuse)
+    again = quick(solver_profiles, *arguments, "--resume")
+    assert again == tables
+    assert [row["solves"] for row in again["contact, multiplications"]] == [2]
+
+
+def test_what_takes_too_long_is_ended(serial_only):
+    with pytest.raises(solver_profiles.LateError, match="beyond 1 s"):
+        solver_profiles.limited(1, lambda: time.sleep(5))
+    assert solver_profiles.limited(1, lambda: 7) == 7
 
 
 def test_weak_scaling(serial_only, shared_tmp, comm):

@@ -11,8 +11,8 @@ from mpi4py import MPI
 from scenes import SIDES, box, decomposed
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.mesh.bisection import bisect_points
 from tfeti_dolfinx.mesh.dealing import SHARED, costs, deal, measured
-from tfeti_dolfinx.mesh.partition import bisect_points
 
 CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
 
@@ -193,3 +193,66 @@ def test_bisection_of_points_is_balanced(parts, gdim, seed):
     assert counts.max() <= 200 // parts + 6
     alone = bisect_points(x, parts, MPI.COMM_SELF)
     assert np.array_equal(part, alone[MPI.COMM_WORLD.rank :: MPI.COMM_WORLD.size])
+
+
+def grid_of_cells(counts, size):
+    """Midpoints and extents of boxes of that size, in an order that means nothing."""
+    axes = [(np.arange(n) + 0.5) * h for n, h in zip(counts, size, strict=True)]
+    x = np.stack([a.ravel() for a in np.meshgrid(*axes, indexing="ij")], axis=1)
+    x = np.random.default_rng(0).permutation(x)
+    return x, np.broadcast_to(size, x.shape)
+
+
+@pytest.mark.parametrize("thin", range(3))
+@pytest.mark.parametrize("parts", [2, 3, 4, 7, 8])
+def test_bisection_leaves_columns_of_flat_cells_whole(thin, parts):
+    """Cells 50 times as wide as thick; columns of 5 are less than a part may change by."""
+    size = np.ones(3)
+    size[thin] = 0.02
+    x, extents = grid_of_cells([7 if k != thin else 5 for k in range(3)], size)
+    own = slice(MPI.COMM_WORLD.rank, None, MPI.COMM_WORLD.size)
+    part = bisect_points(x[own], parts, MPI.COMM_WORLD, extents[own])
+    alone = bisect_points(x, parts, MPI.COMM_SELF, extents)
+    assert np.array_equal(part, alone[own])
+    columns = np.unique(np.round(np.delete(x, thin, axis=1), 6), axis=0, return_inverse=True)[1]
+    assert len(np.unique(np.stack((columns.ravel(), alone)), axis=1).T) == 49
+    assert len(np.unique(alone)) == parts
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])
+def test_bisection_cuts_between_layers(cell):
+    """Ten layers of flat cells in three parts: 3, 4 and 3 or so, each interface is a plane."""
+    flat = cell in ("triangle", "quadrilateral")
+    kind = getattr(dmesh.CellType, cell)
+    if flat:
+        mesh = dmesh.create_rectangle(MPI.COMM_WORLD, [(0, 0), (5, 0.2)], [10, 2], kind)
+    else:
+        mesh = dmesh.create_box(MPI.COMM_WORLD, [(0, 0, 0), (5, 1, 0.2)], [10, 2, 2], kind)
+    d = tfeti.decompose(mesh, 3)
+    layer = np.floor(
+        2.0
+        * dmesh.compute_midpoints(
+            d.mesh, d.mesh.topology.dim, np.arange(len(d.original_cells), dtype=np.int32)
+        )[:, 0]
+    ).astype(int)
+    found = {(int(k), int(s)) for k, s in zip(layer, d.cell_subdomain, strict=True)}
+    assert len(set().union(*d.comm.allgather(found))) == 10
+
+
+@settings(max_examples=25)
+@given(st.integers(1, 16), st.integers(2, 3), st.integers(0, 10**6))
+def test_bisection_along_layers_stays_balanced(parts, gdim, seed):
+    """A cut changes the sizes of so many parts by a quarter of one at most: 1.25 · 1.125 · …"""
+    rng = np.random.default_rng(seed)
+    x, extents = grid_of_cells(rng.integers(2, 9, gdim), rng.uniform(0.1, 1.0, gdim))
+    parts = min(parts, len(x))
+    counts = np.bincount(bisect_points(x, parts, MPI.COMM_SELF, extents), minlength=parts)
+    assert counts.min() >= 0.55 * len(x) / parts - 1.0
+    assert counts.max() <= 1.6 * len(x) / parts + 1.0
+
+
+def test_bisection_of_cells_that_are_not_flat_only_counts():
+    x, extents = grid_of_cells([3, 4, 5], [1.0, 0.5, 0.4])
+    for parts in (2, 4, 7):
+        found = bisect_points(x, parts, MPI.COMM_SELF, extents)
+        assert np.array_equal(found, bisect_points(x, parts, MPI.COMM_SELF))

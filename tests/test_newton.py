@@ -9,11 +9,12 @@ from scipy.sparse import diags_array
 from test_qp import bounds_on, matrix, vector
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
+from tfeti_dolfinx.qp.directions import Directions
 from tfeti_dolfinx.qp.feasible_sets import Product
 from tfeti_dolfinx.qp.homogenised import homogenise, image
 from tfeti_dolfinx.qp.nearest import nearest
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
-from tfeti_dolfinx.qp.pcpg import Directions, solve_by_pcpg
+from tfeti_dolfinx.qp.pcpg import solve_by_pcpg
 from tfeti_dolfinx.qp.problem import QP, Start
 from tfeti_dolfinx.qp.stopping import ResidualRule
 

@@ -84,7 +84,7 @@ def count(dual, qp, sums, num_steps):
 
 
 @pytest.mark.parametrize("on_face", [False, True])
-@pytest.mark.parametrize(("preconditioned", "most"), [(True, 3), (False, 2)])
+@pytest.mark.parametrize(("preconditioned", "most"), [(True, 3), (False, 3)])
 def test_a_step_of_pcpg_makes_three_reductions(dual, sums, on_face, preconditioned, most):
     qp = dual.qp()
     face = face_with_half_of_the_contacts(dual)
@@ -121,7 +121,7 @@ def test_a_projection_against_a_vector_that_has_drifted(dual, on_face):
         vec.array[:] = face.restricted(values) if on_face else values
     x.copy(Px)
     coarse.project(Px)
-    found = coarse.project_against(x, y)
+    *found, _ = coarse.project_against(x, y)
     assert np.allclose(x.array_r, Px.array_r, atol=1e-14)
     assert found == pytest.approx((y.dot(Px), y.dot(y)))
     for vec in (x, y, Px):

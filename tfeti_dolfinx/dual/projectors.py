@@ -15,6 +15,7 @@ from tfeti_dolfinx.dual.grams import Grams
 from tfeti_dolfinx.dual.null_basis import NullBasis
 from tfeti_dolfinx.dual.semidefinite import SemidefiniteFactor
 from tfeti_dolfinx.parallel import agreed, summed
+from tfeti_dolfinx.qp.coarse import NOTHING
 from tfeti_dolfinx.qp.faces import Face
 
 
@@ -79,18 +80,20 @@ class Projectors:
         """x ← P x."""
         self._take_away(x, self.coordinates(x))
 
-    def project_against(self, x: PETSc.Vec, y: PETSc.Vec) -> tuple[float, float]:
-        """x ← P x; yᵀPx and yᵀy, y in the face. One reduction.
+    def project_against(
+        self, x: PETSc.Vec, y: PETSc.Vec, more: Array = NOTHING
+    ) -> tuple[float, float, Array]:
+        """x ← P x; yᵀPx and yᵀy, y in the face; and more sums. One reduction.
 
         What rounding has left of y outside of the range of P is not taken for a part of yᵀPx.
         """
         own, r = self.restricted(x.array_r), self.dimension
         products = self.Gt.T @ np.stack((own, y.array_r), axis=1)
-        terms = np.append(products.T, (own @ y.array_r, y.array_r @ y.array_r))
-        sums = summed(self.comm, terms)
-        mu = self.solve(sums[:r])
+        scalars = (own @ y.array_r, y.array_r @ y.array_r)
+        sums = summed(self.comm, np.concatenate((products.T.ravel(), scalars, more)))
+        mu, rest = self.solve(sums[:r]), sums[2 * r :]
         self._take_away(x, mu)
-        return float(sums[-2] - sums[r : 2 * r] @ mu), float(sums[-1])
+        return float(rest[0] - sums[r : 2 * r] @ mu), float(rest[1]), rest[2:]
 
     def _take_away(self, x: PETSc.Vec, mu: Array) -> None:
         x.array[:] = self.restricted(x.array_r - self.Gt @ mu)

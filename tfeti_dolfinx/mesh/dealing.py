@@ -6,7 +6,7 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.mesh.partition import bisect_points
+from tfeti_dolfinx.mesh.bisection import bisect_points
 from tfeti_dolfinx.mesh.untorn import UntornMesh
 from tfeti_dolfinx.parallel import agreed, summed
 

@@ -13,8 +13,8 @@ from scipy.sparse.csgraph import connected_components
 from tfeti_dolfinx.arrays import Array, ArrayLike
 from tfeti_dolfinx.checks import is_whole, named, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.mesh.bisection import bisect_points
 from tfeti_dolfinx.mesh.untorn import UntornMesh
-from tfeti_dolfinx.parallel import box_over_ranks
 
 Subdomains = int | ArrayLike | Callable[[Array], ArrayLike]
 
@@ -138,83 +138,9 @@ def _shares(weights: Array, num_parts: int) -> Array:
 
 
 def coordinate_bisection(mesh: UntornMesh, num_parts: int, comm: MPI.Intracomm) -> Array:
-    """Recursive coordinate bisection of a distributed mesh. Collective.
+    """Recursive coordinate bisection of a distributed mesh, along its layers. Collective.
 
-    The parts depend on the cells' midpoints only, not on how ranks share the cells.
+    The parts depend on the cells' vertices only, not on how ranks share the cells.
     """
-    return _without_holes(bisect_points(mesh.midpoints(), num_parts, comm), comm)
-
-
-def bisect_points(x: Array, num_parts: int, comm: MPI.Intracomm) -> Array:
-    """Recursive coordinate bisection of distributed points (Berger, Bokhari 1987). Collective.
-
-    All parts are halved at once, across the longest side of their box; neighbouring part
-    numbers are neighbours in space.
-
-    Args:
-        x: Points of this rank, shape ``(n, gdim)``.
-        num_parts: Number of parts.
-        comm: Communicator.
-
-    Returns:
-        Part of each local point, shape ``(n,)``.
-    """
-    grid = _on_grid(x, comm)
-    part = np.zeros(len(x), dtype=np.int64)
-    targets = np.array([num_parts])
-    while np.any(targets > 1):
-        key = _split_keys(grid, part, len(targets), comm)
-        count = _count(part, len(targets), comm)
-        left = np.where(targets > 1, targets // 2, targets)
-        threshold = _kth_smallest(key, part, np.rint(count * left / targets), comm)
-        halves = np.where(targets > 1, 2, 1)
-        first = np.cumsum(halves) - halves
-        part = first[part] + ((key > threshold[part]) & (targets[part] > 1))
-        targets = np.repeat(targets, halves)
-        targets[first] = left
-        second = first[halves == 2] + 1
-        targets[second] -= left[halves == 2]
-    return part
-
-
-def _on_grid(x: Array, comm: MPI.Intracomm) -> Array:
-    """Coordinates as integers on a grid over the box of all points."""
-    gdim = x.shape[1]
-    low, high = box_over_ranks(comm, x)
-    bits = 62 // gdim
-    return np.rint((x - low) / max(np.max(high - low), 1e-300) * (2.0**bits - 1)).astype(np.int64)
-
-
-def _split_keys(grid: Array, part: Array, num_parts: int, comm: MPI.Intracomm) -> Array:
-    """Order of the points across the longest side of their part, ties by the other sides."""
-    gdim = grid.shape[1]
-    low = np.full((num_parts, gdim), np.iinfo(np.int64).max)
-    high = np.full((num_parts, gdim), -1)
-    np.minimum.at(low, part, grid)
-    np.maximum.at(high, part, grid)
-    comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
-    comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
-    axis = np.argmax(high - low, axis=1)[part]
-    key = np.zeros(len(grid), dtype=np.int64)
-    for shift in range(gdim):
-        digits = grid[np.arange(len(grid)), (axis + shift) % gdim]
-        key = (key << (62 // gdim)) | digits
-    return key
-
-
-def _count(part: Array, num_parts: int, comm: MPI.Intracomm, chosen: Array | None = None) -> Array:
-    counts = np.bincount(part if chosen is None else part[chosen], minlength=num_parts)
-    comm.Allreduce(MPI.IN_PLACE, counts, op=MPI.SUM)
-    return counts
-
-
-def _kth_smallest(key: Array, part: Array, k: Array, comm: MPI.Intracomm) -> Array:
-    """In each part the k-th smallest key, by bisection on its bits."""
-    low: Array = np.zeros(len(k), dtype=np.int64)
-    high: Array = np.full(len(k), 2**62 - 1)
-    while np.any(low < high):
-        middle = (low + high) // 2
-        enough = _count(part, len(k), comm, key <= middle[part]) >= k
-        high = np.where(enough, middle, high)
-        low = np.where(enough, low, np.minimum(middle + 1, high))
-    return low
+    part = bisect_points(mesh.midpoints(), num_parts, comm, mesh.extents())
+    return _without_holes(part, comm)

@@ -63,8 +63,15 @@ class UntornMesh:
 
     def midpoints(self) -> Array:
         """Mean of each cell's vertices, shape ``(n, gdim)``."""
+        return self._corners().mean(axis=1)
+
+    def extents(self) -> Array:
+        """Sides of the box around each cell's vertices, shape ``(n, gdim)``."""
+        return np.ptp(self._corners(), axis=1)
+
+    def _corners(self) -> Array:
         vertices = np.searchsorted(self.node_ids, self.cells[:, : self.num_vertices])
-        return self.x[vertices].mean(axis=1)
+        return self.x[vertices]
 
     def neighbours(self, colours: Array | None = None) -> tuple[Array, Array]:
         """Pairs of local cells that share a facet, and a colour if colours are given."""

@@ -7,7 +7,7 @@ from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.mesh.partition import bisect_points
+from tfeti_dolfinx.mesh.bisection import bisect_points
 from tfeti_dolfinx.mortar.facets import Facets
 from tfeti_dolfinx.parallel import Exchange
 

@@ -8,7 +8,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import TINY, Array
-from tfeti_dolfinx.parallel import agreed
+from tfeti_dolfinx.parallel import agreed, summed
 from tfeti_dolfinx.qp.faces import Face
 
 # of the largest forces on an equation: those on a light one beside it count as so large at least,
@@ -17,6 +17,8 @@ LIGHT = 1e-4
 
 # what ``imbalance`` says where Gλ = e holds as well as factors can tell
 HELD = 1e-9
+
+NOTHING: Array = np.zeros(0)
 
 
 class Coarse(Protocol):
@@ -60,10 +62,20 @@ class Coarse(Protocol):
         """x ← P x. Collective."""
         ...
 
-    def project_against(self, x: PETSc.Vec, y: PETSc.Vec) -> tuple[float, float]:
+    def project_against(
+        self, x: PETSc.Vec, y: PETSc.Vec, more: Array = NOTHING
+    ) -> tuple[float, float, Array]:
         """x ← P x; yᵀPx and yᵀy, for y in the face. Collective, one reduction.
 
         Ranks may round yᵀPx differently.
+
+        Args:
+            x: Projected in place.
+            y: In the face.
+            more: Numbers of this rank that are summed up over all ranks on the way.
+
+        Returns:
+            Both products, and the sums.
         """
         ...
 
@@ -104,6 +116,13 @@ def imbalance(coarse: Coarse, x: PETSc.Vec) -> float:
     return agreed(x.getComm().tompi4py(), float(own))
 
 
+def _products(x: PETSc.Vec, y: PETSc.Vec, more: Array) -> tuple[float, float, Array]:
+    """yᵀx, yᵀy, and more sums. Collective, one reduction."""
+    own = y.array_r
+    sums = summed(x.getComm().tompi4py(), np.append((own @ x.array_r, own @ own), more))
+    return float(sums[0]), float(sums[1]), sums[2:]
+
+
 class NoCoarse:
     """No equality constraint: Q = 0, at no cost.
 
@@ -137,11 +156,12 @@ class NoCoarse:
         if self._face is not None:
             x.array[:] = self._face.restricted(x.array_r)
 
-    def project_against(self, x: PETSc.Vec, y: PETSc.Vec) -> tuple[float, float]:
+    def project_against(
+        self, x: PETSc.Vec, y: PETSc.Vec, more: Array = NOTHING
+    ) -> tuple[float, float, Array]:
         """x ← ZZᵀx; yᵀx and yᵀy."""
         self.project(x)
-        yx, yy = y.mDot([x, y])
-        return float(yx), float(yy)
+        return _products(x, y, more)
 
     def apply_Q(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = 0."""
@@ -208,11 +228,12 @@ class DenseCoarse:
         values = x.array_r if self._face is None else self._face.restricted(x.array_r)
         x.array[:] = values - self._Gf.T @ self.coordinates(x)
 
-    def project_against(self, x: PETSc.Vec, y: PETSc.Vec) -> tuple[float, float]:
+    def project_against(
+        self, x: PETSc.Vec, y: PETSc.Vec, more: Array = NOTHING
+    ) -> tuple[float, float, Array]:
         """x ← P x; yᵀPx and yᵀy."""
         self.project(x)
-        yx, yy = y.mDot([x, y])
-        return float(yx), float(yy)
+        return _products(x, y, more)
 
     def apply_Q(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = Q x."""

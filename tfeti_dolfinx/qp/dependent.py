@@ -8,8 +8,8 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.parallel import agreed
+from tfeti_dolfinx.qp.directions import Directions
 from tfeti_dolfinx.qp.faces import Face, without_slip
-from tfeti_dolfinx.qp.pcpg import Directions
 from tfeti_dolfinx.qp.problem import QP, FaceOperator, Point
 
 # of ‖F‖: curvature of the way that a solve has gone; less is nearly none, and the way far

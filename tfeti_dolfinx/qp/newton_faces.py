@@ -11,6 +11,7 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.parallel import agreed, any_rank
 from tfeti_dolfinx.qp.coarse import HELD, Coarse, imbalance
 from tfeti_dolfinx.qp.dependent import DependentRows
+from tfeti_dolfinx.qp.directions import Directions
 from tfeti_dolfinx.qp.eased import Eased
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.monitors import Monitor
@@ -24,7 +25,7 @@ from tfeti_dolfinx.qp.newton_curved import (
     restored_on,
 )
 from tfeti_dolfinx.qp.parameters import NewtonParameters
-from tfeti_dolfinx.qp.pcpg import SHORT, Directions, pcpg
+from tfeti_dolfinx.qp.pcpg import SHORT, pcpg
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, FaceOperator, Point, Steps
 from tfeti_dolfinx.qp.stopping import StoppingRule, TargetRule
 from tfeti_dolfinx.qp.trial import Trial
@@ -36,8 +37,8 @@ FINAL = 0.9
 # a solve on a face that stays is looked at whenever it has come down by this: PCPG goes on where it
 # has stopped, and rows that want to carry are found before the wrong face is solved to the end
 STAGE = 0.1
-# of the residual of PCPG: ‖g^P‖ that is at most so large shows that the face hardly bends on the
-# way; the next solve is to be so much better that the end is superlinear
+# of the residual of PCPG: where ‖g^P‖ is at most that, the face hardly bends on the way; the next
+# solve is to be so much better that the end is superlinear
 FOLLOWED = 2.0
 # times λ: what restores Gλ = e by forces so much larger does it with rows that hold nothing
 WILD = 1e6
@@ -146,7 +147,7 @@ class FaceSolver:
 
     def _ready(self) -> None:
         """Make the preconditioner of the face entered, and what its curvature adds to F."""
-        if self._face is None or self._prepared:
+        if self._prepared:
             return
         if self._qp.preconditioner_on is not None:
             self._preconditioner = self._qp.preconditioner_on(self._eased.face)
@@ -167,7 +168,7 @@ class FaceSolver:
         self.settled, self._accepted = not self.curved, True
 
     def forget(self) -> None:
-        """The next direction is a first one: the point is not where PCPG has stopped."""
+        """The next direction is a first one: the point is not where PCPG stopped."""
         self._directions.fresh, self.settled, self._accepted = True, False, False
 
     def solve(self, start: Point, face: Face, optimality: float) -> Trial:
@@ -272,7 +273,7 @@ class FaceSolver:
             self._on_face.coarse.destroy()
         if self._preconditioner is not None:
             self._preconditioner.destroy()
-            self._preconditioner = self._dependent.preconditioner = None
+        self._preconditioner = self._dependent.preconditioner = None
         self._face, self._prepared = None, False
 
     def destroy(self) -> None:

@@ -7,6 +7,7 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.parallel import agreed, summed
+from tfeti_dolfinx.qp.directions import Conjugates, Directions
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.monitors import Monitor, no_monitor
@@ -14,50 +15,10 @@ from tfeti_dolfinx.qp.plateau import Plateau
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, QPResult, Steps
 from tfeti_dolfinx.qp.stopping import StoppingRule
 
-# of the largest curvature of a direction, and of what the preconditioner makes of a residual: less
-# is rounding, as where rows depend on each other
-FLAT = 1e-13
+# of rᵀz, which is rᵀp as long as r is orthogonal to all directions before; else CG begins anew
+DRIFTED = 0.5
 # of λ: a way that is shorter may be rounding of Gλ = e
 SHORT = 1e-6
-
-
-class Directions:
-    """What PCPG remembers, so that it can go on where it has stopped.
-
-    Args:
-        like: A vector of the right layout.
-
-    Attributes:
-        r: Residual −P g.
-        p: The last direction.
-        fresh: Whether the next direction is the first.
-        rz: rᵀz of the last step.
-        norm: Largest Rayleigh quotient of F that a direction has shown; at most ‖PFP‖.
-        helped: Largest rᵀz/rᵀr so far.
-    """
-
-    def __init__(self, like: PETSc.Vec) -> None:
-        self.r, self.p, self.Fp, self.z = (like.duplicate() for _ in range(4))
-        self.fresh, self.rz, self.norm, self.helped = True, 1.0, 0.0, 0.0
-
-    def seen(self, pFp: float, pp: float, short: bool = False) -> bool:
-        """Whether a direction has a curvature that stands out from rounding.
-
-        Of a short step, which may be rounding of Gλ = e, F makes far too much to learn ‖F‖ from.
-        """
-        if not short:
-            self.norm = max(self.norm, pFp / pp if pp > 0.0 else 0.0)
-        return pFp > FLAT * self.norm * pp
-
-    def stands_out(self, rz: float, rr: float) -> bool:
-        """Whether the preconditioner leaves something of a residual."""
-        self.helped = max(self.helped, rz / rr if rr > 0.0 else 0.0)
-        return rz > FLAT * self.helped * rr
-
-    def destroy(self) -> None:
-        """Destroy the vectors. Collective."""
-        for vec in (self.r, self.p, self.Fp, self.z):
-            vec.destroy()
 
 
 def pcpg(
@@ -103,7 +64,7 @@ def pcpg(
     r, p, Fp, z, past = own.r, own.p, own.Fp, own.z, qp.recycled
     norm, reason = _begun(qp, point, own), ConvergedReason.ITERATING
     least = agreed(qp.d.getComm().tompi4py(), SHORT**2 * point.lam.dot(point.lam))
-    progress = Plateau(norm)
+    progress = Plateau(norm, r.getSize())
     while True:
         # test
         if norm <= rule.tolerance:
@@ -121,30 +82,35 @@ def pcpg(
         if reason != ConvergedReason.ITERATING:
             break
         # precondition and project: z = P M r
-        own.rz, previous = _precondition(qp, r, z, norm), own.rz
+        if own.fresh:
+            own.kept.clear()
+        rz, products = _precondition(qp, r, z, own.kept, norm)
         # direction
-        p.aypx(0.0 if own.fresh else own.rz / previous, z)
+        own.kept.take_away(z.array, products)
+        z.copy(p)
         if past is not None:
             past.conjugate(p)
         # step
         qp.F.mult(p, Fp)
         Fp.copy(z)
-        pFp, pp = qp.coarse.project_against(z, p)
-        z.aypx(-own.rz / pFp if pFp else 0.0, r)
-        squared, own.rz, pFp = _square(z, own.rz, pFp)
-        short = bool(pFp) and (own.rz / pFp) ** 2 * pp < least
-        if not (own.seen(pFp, pp, short) and own.stands_out(own.rz, norm**2)):
+        pFp, pp, (rp,) = qp.coarse.project_against(z, p, np.array([r.array_r @ p.array_r]))
+        PFp = np.array(z.array_r)
+        z.aypx(-rp / pFp if pFp else 0.0, r)
+        squared, rz, rp, pFp = _square(z, rz, rp, pFp)
+        short = bool(pFp) and (rp / pFp) ** 2 * pp < least
+        if not (own.seen(pFp, pp, short) and own.stands_out(rz, norm**2)):
             own.fresh, reason = True, _examined(qp, point, rule, norm)
             if reason == ConvergedReason.ITERATING:
                 reason = ConvergedReason.DIVERGED_INDEFINITE_MAT
             break
-        point.move(own.rz / pFp, p, Fp)
+        point.move(rp / pFp, p, Fp)
+        own.kept.keep(p.array_r, PFp, pFp)
         if past is not None:
             past.remember(p, Fp, pFp)
         z.copy(r)
-        own.fresh, norm = False, float(np.sqrt(squared))
+        own.fresh, norm = abs(rp - rz) > DRIFTED * rz, float(np.sqrt(squared))
         steps.cg += 1
-        progress.step(norm, 0.5 * own.rz**2 / pFp)
+        progress.step(norm, 0.5 * rp**2 / pFp)
         monitor(steps, "cg", point.lam, norm, 0.0)
     if past is not None:
         past.keep()
@@ -257,10 +223,13 @@ def _square(x: PETSc.Vec, *known: float) -> Array:
     return summed(comm, sums)
 
 
-def _precondition(qp: QP, r: PETSc.Vec, z: PETSc.Vec, norm: float) -> float:
-    """z = P M r, M the preconditioner or the identity; rᵀz, given ‖r‖."""
+def _precondition(
+    qp: QP, r: PETSc.Vec, z: PETSc.Vec, kept: Conjugates, norm: float
+) -> tuple[float, Array]:
+    """z = P M r, M the preconditioner or the identity; rᵀz, given ‖r‖, and PFp_i·z."""
     if qp.preconditioner is None:
         r.copy(z)
-        return norm**2
+        return norm**2, summed(r.getComm().tompi4py(), kept.products(z.array_r))
     qp.preconditioner.mult(r, z)
-    return qp.coarse.project_against(z, r)[0]
+    rz, _, products = qp.coarse.project_against(z, r, kept.products(z.array_r))
+    return rz, products

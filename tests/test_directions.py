@@ -1,0 +1,83 @@
+"""Directions that conjugate gradients keep."""
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from tfeti_dolfinx.qp.coarse import DenseCoarse
+from tfeti_dolfinx.qp.directions import Conjugates, Directions
+from tfeti_dolfinx.qp.feasible_sets import Product
+from tfeti_dolfinx.qp.pcpg import pcpg
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, Steps
+from tfeti_dolfinx.qp.stopping import TargetRule
+
+n = 60
+
+
+def program(spread):
+    """A program whose F has eigenvalues from 1 to ``spread``, and its minimiser."""
+    rng = np.random.default_rng(0)
+    V = np.linalg.qr(rng.standard_normal((n, n)))[0]
+    F = V @ np.diag(np.geomspace(1.0, spread, n)) @ V.T
+    F = 0.5 * (F + F.T)
+    G = rng.standard_normal((3, n))
+    N = np.linalg.svd(G)[2][3:].T
+    d = F @ rng.standard_normal(n)
+    known = N @ np.linalg.solve(N.T @ F @ N, N.T @ d)
+    mat = PETSc.Mat().createDense((n, n), array=F, comm=PETSc.COMM_SELF)
+    vec = PETSc.Vec().createWithArray(d, comm=PETSc.COMM_SELF)
+    return QP(mat, vec, DenseCoarse(G, np.zeros(3)), Product()), F, known
+
+
+def solved(qp, directions, target, most=1000):
+    steps, point = Steps(), Point(qp.d.duplicate(), qp.d.duplicate())
+    point.lam.set(0.0)
+    point.refresh(qp)
+    target *= point.g.norm()
+    reason = pcpg(qp, point, TargetRule(target), steps, most, directions=directions)
+    return reason, steps.cg, point.lam.array_r.copy()
+
+
+@pytest.mark.parametrize(("spread", "times"), [(1e2, 1.0), (1e6, 1.1), (1e8, 3.0)])
+def test_hardly_more_steps_than_dimensions(spread, times):
+    """In exact arithmetic no more; with the last direction alone rounding makes it many more."""
+    qp, F, known = program(spread)
+    reason, steps, found = solved(qp, Directions(qp.d), 1e-9)
+    assert reason == ConvergedReason.CONVERGED_RTOL
+    assert steps <= times * n
+    error = found - known
+    assert error @ F @ error <= 1e-10 * (known @ F @ known)
+    short = Directions(qp.d)
+    short.kept = Conjugates(qp.d, numbers=2 * n)
+    _, more, _ = solved(qp, short, 1e-9, 5000)
+    assert more >= (steps if spread < 1e6 else 4 * steps)
+
+
+def test_directions_are_conjugate():
+    qp, F, _ = program(1e6)
+    directions = Directions(qp.d)
+    _, steps, _ = solved(qp, directions, 0.0, 40)
+    kept = directions.kept
+    assert kept.number == steps == 40
+    P = kept._p[:40] / np.sqrt(kept._pFp[:40, None])
+    assert np.abs(P @ F @ P.T - np.eye(40)).max() <= 1e-6
+    kept.clear()
+    assert kept.number == 0
+    assert kept.products(np.ones(n)).shape == (0,)
+
+
+def test_where_memory_does_not_last_the_oldest_goes():
+    """Of three that fit two stay when a fourth comes; each is taken away on its own."""
+    comm = MPI.COMM_WORLD
+    like = PETSc.Vec().createMPI((4, None), comm=comm)
+    kept = Conjugates(like, numbers=3 * 2 * 4)
+    for k in range(4):
+        p = np.zeros(4)
+        p[k] = 1.0
+        kept.keep(p, 2.0 * p, 2.0 * comm.size)
+    assert kept.number == 3
+    z = np.arange(1.0, 5.0)
+    kept.take_away(z, comm.allreduce(kept.products(z)))
+    assert z == pytest.approx([1.0, 0.0, 0.0, 0.0])
+    like.destroy()
