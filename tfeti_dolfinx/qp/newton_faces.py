@@ -59,8 +59,7 @@ class FaceSolver:
         settled: Whether λ is where PCPG has stopped on the face entered.
         curved: Whether that face is curved.
         left: The residual there.
-        rounded: So many solves in a row ended at rounding, before their target, or where F is not
-            definite and no row ends the way.
+        rounded: So many solves in a row ended at rounding, or with no row at the end of a flat way.
     """
 
     def __init__(
@@ -154,8 +153,7 @@ class FaceSolver:
         self._dependent.preconditioner = self._preconditioner
         self._dependent.face = self._eased.face
         self._bent = Bent(self._qp.F, self._eased.face) if self.curved else None
-        F = self._bent or self._qp.F
-        on = replace(self._on_face, F=F, preconditioner=self._preconditioner)
+        on = replace(self._on_face, F=self._bent or self._qp.F, preconditioner=self._preconditioner)
         past = None if self.curved or on.recycled is None else on.recycled.on(self._eased.face)
         self._on_face = replace(on, recycled=past)
         self._prepared = True
