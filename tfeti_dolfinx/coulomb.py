@@ -87,7 +87,7 @@ def solve_with_friction(
         result, rule = solve_dual(dual, asked, qp_type, start, monitor, exact)
         iterations, looks = iterations + 1, looks + rule.looks
         steps = steps.plus(result.steps)
-        if bounds.slips_first(result.reason):
+        if bounds.goes_on(result.reason):
             result.destroy()
             continue
         if result.reason <= 0:

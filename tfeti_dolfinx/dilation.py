@@ -91,7 +91,9 @@ class DilatedGaps:
     def _slips(self) -> Array:
         """‖μ_i q_i‖ at the solution with the present gaps; keeps its forces."""
         given = self._dual.qp()
-        d, lam = given.d.copy(), given.d.duplicate()
+        d, lam = given.d.duplicate(), given.d.duplicate()
+        given.coarse.combine(self.mu, d)  # with the last Gᵀμ in d only what changes is left to find
+        d.axpy(1.0, given.d)
         d.array[self._rows] -= self._w
         lam.array[:] = self.lam
         qp: QP = replace(given, d=d, feasible=cone_set(self._dual.constraints))
@@ -105,7 +107,7 @@ class DilatedGaps:
             qp, start, rule, self._options.newton, max_it=self._options.max_it, warm=True
         )
         self._dual.saw(result.norm)
-        self.lam, self.mu = np.array(result.lam.array_r), result.mu
+        self.lam, self.mu = np.array(result.lam.array_r), self.mu + result.mu
         slips = np.linalg.norm(self._mu * result.gradient.array_r[self._tangents], axis=1)
         start.destroy()
         at.destroy()

@@ -173,11 +173,20 @@ class Pressures:
             self._found if sticks else self._forces(self._anderson.next(self._now, self._found))
         )
 
-    def slips_first(self, reason: ConvergedReason) -> bool:
-        """Whether what sticks contradicts itself, as beside a wall that pushes; then all slips."""
-        if not self._sticks or reason != ConvergedReason.DIVERGED_CONTRADICTION:
+    def goes_on(self, reason: ConvergedReason) -> bool:
+        """Whether there is something else to try where a problem has no solution, or none is found.
+
+        What sticks may contradict itself, as beside a wall that pushes; then all slips. Bounds with
+        hardly any forces between them leave faces that are nearly singular: then De Saxcé's fixed
+        point, whose cones have far more.
+        """
+        if self._sticks and reason == ConvergedReason.DIVERGED_CONTRADICTION:
+            self._now = np.zeros_like(self._found)
+            return True
+        lost = reason in (ConvergedReason.DIVERGED_ROUNDING, ConvergedReason.DIVERGED_STALLED)
+        if not lost or self._dilated is not None or self._idle >= PATIENCE:
             return False
-        self._now = np.zeros_like(self._found)
+        self._idle = PATIENCE
         return True
 
     def _forces(self, values: Array) -> Array:
