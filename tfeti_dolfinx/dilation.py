@@ -57,7 +57,8 @@ class DilatedGaps:
         constraints, at = dual.constraints, dual.constraints.pressed
         self._tangents, self._mu = constraints.sets.tangents[at], constraints.coefficients[at]
         self._rows = constraints.pressed_by[at]
-        self.lam, self.mu = lam, np.zeros(dual.coarse.dimension)
+        self.lam = lam
+        self.mu: Array = np.zeros(dual.coarse.dimension)
         self._w: Array = np.zeros(len(at))
         self._anderson = Anderson(self._products, DEPTH)
         self._change, self._first, self.astray = np.inf, 0.0, False
