@@ -31,6 +31,8 @@ from tfeti_dolfinx.qp.trial import Trial
 
 # rows leave a face in so many rounds at most: each round drops one row at least, but most at once
 MOST_ROUNDS = 60
+# rounds that wake rows again, to hold a body: after so many the same ones leave and wake by turns
+MOST_WOKEN = 4
 # of the rule's tolerance, for the last solve on a face: ‖g^P‖ is measured otherwise than ‖P_f g‖
 FINAL = 0.9
 # a solve on a face that stays is looked at whenever it has come down by this: PCPG goes on where it
@@ -83,7 +85,7 @@ class FaceSolver:
         self._on_face, self.rounded = qp, 0
         self._bent: Bent | None = None
         self._preconditioner: FaceOperator | None = None
-        self._prepared, self._stayed, self._stage, self._size = False, False, STAGE, 0.0
+        self._prepared, self._stayed, self._stage, self._size, self._woken = False, False, STAGE, 0.0, 0
 
     @property
     def norm(self) -> float:
@@ -173,7 +175,7 @@ class FaceSolver:
             optimality: ‖g^P‖ there.
         """
         z, first, out, accepted = start.copy(), None, True, self._accepted
-        self._size = start.lam.norm()
+        self._size, self._woken = start.lam.norm(), 0
         stays, rounds = self.enter(face) and accepted, 0
         for _ in range(MOST_ROUNDS):
             self._ready()
@@ -194,7 +196,9 @@ class FaceSolver:
             if first is None:
                 first, face = z.copy(), self._face
             out = has_left(self._qp, self._face, z.lam.array_r)
-            if self._steps.cg >= self._max_it or not (out or (broken and self._dependent.slide(z))):
+            if self._steps.cg >= self._max_it or self._woken >= MOST_WOKEN:
+                break
+            if not (out or (broken and self._dependent.slide(z))):
                 break
             self.rounded = self.rounded if out else 0
             z.lam.array[:] = self._qp.feasible.project(z.lam.array_r)
@@ -215,6 +219,7 @@ class FaceSolver:
         if wild or imbalance_on(*of, near) > HELD:
             # it no longer holds a body: what is nearest names rows that do, near by if it can
             near.destroy()
+            self._woken += 1
             found = nearest(self._qp.coarse, WithinFace(feasible, previous), z.lam)
             if imbalance(self._qp.coarse, found.lam) > HELD:
                 found.lam.destroy()
