@@ -85,7 +85,8 @@ class FaceSolver:
         self._on_face, self.rounded = qp, 0
         self._bent: Bent | None = None
         self._preconditioner: FaceOperator | None = None
-        self._prepared, self._stayed, self._stage, self._size, self._woken = False, False, STAGE, 0.0, 0
+        self._prepared, self._stayed, self._woken = False, False, 0
+        self._stage, self._size = STAGE, 0.0
 
     @property
     def norm(self) -> float:
@@ -196,9 +197,8 @@ class FaceSolver:
             if first is None:
                 first, face = z.copy(), self._face
             out = has_left(self._qp, self._face, z.lam.array_r)
-            if self._steps.cg >= self._max_it or self._woken >= MOST_WOKEN:
-                break
-            if not (out or (broken and self._dependent.slide(z))):
+            ends = self._steps.cg >= self._max_it or self._woken >= MOST_WOKEN
+            if ends or not (out or (broken and self._dependent.slide(z))):
                 break
             self.rounded = self.rounded if out else 0
             z.lam.array[:] = self._qp.feasible.project(z.lam.array_r)
