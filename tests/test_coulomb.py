@@ -305,6 +305,24 @@ def test_a_load_that_the_last_bounds_cannot_hold():
     assert np.allclose(displacement(p)[1], 2.0 * first, rtol=0, atol=1e-6 * np.abs(first).max())
 
 
+def test_bounds_on_the_way_that_hold_the_load_are_tried():
+    """The last ones do, the next ones do not; the farthest part of the way that does is taken."""
+    d = decomposed("quadrilateral", 3, 3)
+    p = problem(d, (0.6 * 0.3 * 0.1, -0.1), [floor(2, tfeti.Coulomb(0.3))], clamped=(), rtol=1e-8)
+    p.solve()
+    constraints = p.dual.constraints
+    held = constraints.pressures[constraints.pressed].copy()
+    bounds = Pressures(p.dual, Options(), (np.zeros(constraints.num_rows), np.zeros(0)))
+    for share, part in ((0.3, 0.5), (0.0, 0.25)):  # 0.6 is needed: 1 − part·(1 − share) ≥ 0.6
+        bounds._held, bounds._now = held, share * held
+        start = (np.ones(constraints.num_rows), np.zeros(0))
+        assert bounds.set_feasible(start) is start
+        expected = (1.0 - part * (1.0 - share)) * held
+        found = constraints.pressures[constraints.pressed]
+        assert np.allclose(found, expected, rtol=1e-12, atol=0.0)
+        assert p.dual.holds
+
+
 @pytest.mark.parametrize("k", [1, 2])
 def test_projections_on_cones(k):
     """x − P(x) is orthogonal to P(x), and at an obtuse angle with all of the cone."""
