@@ -38,8 +38,8 @@ class DilatedGaps:
     With q_i the slip, a gap of g_i + w_i, w_i = ‖μ_i q_i‖, makes Coulomb's law the optimality of
     min ½λᵀFλ − λᵀd over all cones ‖τ_i/μ_i‖ ≤ λ_N,i at once (De Saxcé). Each of these problems is
     convex, and has a solution wherever forces within the law can balance the load, if gaps do not
-    exclude each other; with bounds in the place of cones that is so for some bounds only. w is iterated to its fixed point
-    (Cadoux; Acary, Cadoux, Lemaréchal, Malick, Z. Angew. Math. Mech. 91, 2011).
+    exclude each other; with bounds in the place of cones that is so for some bounds only. w is
+    iterated to its fixed point (Acary, Cadoux, Lemaréchal, Malick, Z. Angew. Math. Mech. 91, 2011).
 
     Args:
         dual: The dual problem.
