@@ -29,6 +29,8 @@ ROOMS = [
     ["solution"],
     ["saved_state", "work"],
     ["solver"],
+    ["dilation"],
+    ["pressures"],
     ["coulomb"],
     ["report_filling", "doubts"],
     ["extensions"],

@@ -16,9 +16,13 @@ import tfeti_dolfinx as tfeti
 from demos import mindlin_3d
 from demos.partial_slip import pushed
 from meshes import half_spaces
-from tfeti_dolfinx.coulomb import _Pressures
+from tfeti_dolfinx import pressures
+from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.pressures import Pressures
 from tfeti_dolfinx.qp.acceleration import Anderson
 from tfeti_dolfinx.qp.cones import Cones
+from tfeti_dolfinx.qp.conformance import check_feasible_set
+from tfeti_dolfinx.qp.faces import Status
 
 # the change of bounds at which they are at rest is 100 rtol: u and forces follow to this
 SHARE = 1e-6
@@ -171,7 +175,7 @@ def test_bounds_of_a_light_body_come_to_rest():
 
 def test_forces_that_rounding_makes_are_none():
     p = solved("quadrilateral", tfeti.Coulomb(0.3), (0.05, -0.05))
-    bounds, lam = _Pressures(p.dual, None), p.dual.d.duplicate()
+    bounds, lam = Pressures(p.dual, Options(), None), p.dual.d.duplicate()
     rows = p.dual.constraints.sets.normals
     lam.set(0.0)
     lam.array[rows] = np.where(np.arange(len(rows)) % 2 == 0, 1e-16, 1.0)
@@ -301,6 +305,24 @@ def test_a_load_that_the_last_bounds_cannot_hold():
     assert np.allclose(displacement(p)[1], 2.0 * first, rtol=0, atol=1e-6 * np.abs(first).max())
 
 
+def test_bounds_on_the_way_that_hold_the_load_are_tried():
+    """The last ones do, the next ones do not; the farthest part of the way that does is taken."""
+    d = decomposed("quadrilateral", 3, 3)
+    p = problem(d, (0.6 * 0.3 * 0.1, -0.1), [floor(2, tfeti.Coulomb(0.3))], clamped=(), rtol=1e-8)
+    p.solve()
+    constraints = p.dual.constraints
+    held = constraints.pressures[constraints.pressed].copy()
+    bounds = Pressures(p.dual, Options(), (np.zeros(constraints.num_rows), np.zeros(0)))
+    for share, part in ((0.3, 0.5), (0.0, 0.25)):  # 0.6 is needed: 1 − part·(1 − share) ≥ 0.6
+        bounds._held, bounds._now = held, share * held
+        start = (np.ones(constraints.num_rows), np.zeros(0))
+        assert bounds.set_feasible(start) is start
+        expected = (1.0 - part * (1.0 - share)) * held
+        found = constraints.pressures[constraints.pressed]
+        assert np.allclose(found, expected, rtol=1e-12, atol=0.0)
+        assert p.dual.holds
+
+
 @pytest.mark.parametrize("k", [1, 2])
 def test_projections_on_cones(k):
     """x − P(x) is orthogonal to P(x), and at an obtuse angle with all of the cone."""
@@ -328,3 +350,55 @@ def test_anderson_finds_the_fixed_point_of_a_linear_map():
     for _ in range(6):
         x = steps.next(x, A @ x + b)
     assert np.allclose(x, np.arange(1.0, 5.0), atol=1e-8)
+
+
+@SOLVERS
+@pytest.mark.parametrize(("cell", "traction"), SCENES)
+def test_gaps_that_grow_with_slips_lead_to_the_same(qp_type, cell, traction, monkeypatch):
+    """De Saxcé's fixed point, from the start, and the one on the bounds."""
+    exact = displacement(solved(cell, tfeti.Coulomb(0.3), traction))[1]
+    monkeypatch.setattr(pressures, "PATIENCE", 0)
+    p = solved(cell, tfeti.Coulomb(0.3), traction, qp_type=qp_type)
+    assert 0 < p.report.friction_iterations <= 5
+    assert p.report.sliding > 0
+    assert np.allclose(displacement(p)[1], exact, rtol=0, atol=1e-7 * np.abs(exact).max())
+
+
+def test_a_body_between_walls_that_nothing_presses_is_an_error():
+    """Forces within the law could hold it, but nothing makes the walls press: it slides on."""
+    d, law = decomposed("quadrilateral", 4, 3), tfeti.Coulomb(0.5)
+    walls = [
+        tfeti.Obstacle(side, tfeti.Plane(point, normal), friction=law, reach=np.inf)
+        for side, point, normal in (("left", (0, 0), (1, 0)), ("right", (1, 0), (-1, 0)))
+    ]
+    p = problem(d, (0.0, -0.05), walls, clamped=(), rtol=1e-6)
+    with pytest.raises(tfeti.ConvergenceError, match="DIVERGED_FRICTION .* wedged between others"):
+        p.solve()
+
+
+@given(st.integers(0, 10_000), st.sampled_from([1, 2]))
+def test_cones_fulfil_the_contract(seed, k):
+    rng = np.random.default_rng(seed)
+    mu = rng.choice([0.0, 0.1, 0.3, 1.0, 2.0], (6, k))
+    mu[np.all(mu == 0.0, axis=1)] = 0.5
+    check_feasible_set(Cones(mu, rng.standard_normal((6, k + 1))), 6 * (k + 1), seed)
+
+
+@given(st.integers(0, 10_000), st.sampled_from([1, 2]))
+def test_points_inside_of_cones_go_to_the_nearest_of_the_boundary(seed, k):
+    """None of 4000 points of the boundary is nearer."""
+    rng = np.random.default_rng(seed)
+    mu = rng.uniform(0.1, 1.0, (1, k))
+    point = rng.standard_normal(k) * mu[0]
+    start = np.r_[np.linalg.norm(point / mu[0]) * rng.uniform(1.0, 3.0), point]
+    found = Cones(mu).onto(start, np.full(k + 1, Status.SLIP))
+    assert np.linalg.norm(found[1:] / mu[0]) == pytest.approx(found[0], rel=1e-9)
+    around = rng.standard_normal((4000, k)) if k == 2 else np.array([[1.0], [-1.0]])
+    rays = np.column_stack((np.ones(len(around)), mu * around / norms(around)))
+    rays /= norms(rays)
+    nearest = np.maximum(rays @ start, 0.0)[:, None] * rays
+    assert np.linalg.norm(found - start) <= norms(nearest - start).min() * (1.0 + 1e-9)
+
+
+def norms(x):
+    return np.linalg.norm(x, axis=1, keepdims=True)

@@ -12,10 +12,14 @@ from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
 from tfeti_dolfinx.qp.directions import Directions
 from tfeti_dolfinx.qp.feasible_sets import Product
 from tfeti_dolfinx.qp.homogenised import homogenise, image
+from tfeti_dolfinx.qp.monitors import no_monitor
 from tfeti_dolfinx.qp.nearest import nearest
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
+from tfeti_dolfinx.qp.newton_faces import FaceSolver
+from tfeti_dolfinx.qp.newton_iterate import Iterate
+from tfeti_dolfinx.qp.parameters import NewtonParameters
 from tfeti_dolfinx.qp.pcpg import solve_by_pcpg
-from tfeti_dolfinx.qp.problem import QP, Start
+from tfeti_dolfinx.qp.problem import QP, Point, Start, Steps
 from tfeti_dolfinx.qp.stopping import ResidualRule
 
 
@@ -289,3 +293,35 @@ def test_a_plateau_is_left_where_q_does_not_fall_either(force, reason):
     result = solve_by_pcpg(qp, homogenise(qp), ResidualRule(1e-9))
     assert result.reason.name == reason
     assert (result.steps.cg <= 1001) == (force > 1.0)
+
+
+def test_forces_out_of_all_size_hold_nothing():
+    """What leaves a face leaves a row behind that could balance e, 1e9 times as large as e."""
+    G, F = np.array([[1.0, 1.0, 1e-9]]), np.eye(3)
+    qp = qp_of(F, np.array([-1.0, -1.0, 0.0]), G, np.ones(1), [0, 1])
+    faces = FaceSolver(qp, ResidualRule(1e-8), NewtonParameters(), Steps(), 1000, no_monitor)
+    z = Point(vector([1.0, 0.0, 0.0]), vector([2.0, 1.0, 0.0]))
+    faces.enter(qp.feasible.face(z.lam.array_r, z.g.array_r))
+    faces.saw(1.0, 1.0)
+    z.lam.array[0] = 0.0
+    faces._size = 1.0
+    faces._drop(z)
+    assert np.allclose(z.lam.array_r, [1.0, 0.0, 0.0], atol=1e-8)
+    assert np.allclose(z.g.array_r, F @ z.lam.array_r + [1.0, 1.0, 0.0], atol=1e-12)
+    faces.destroy()
+
+
+@pytest.mark.parametrize(
+    ("far", "gain", "counts"),
+    [(True, 1e-20, True), (True, 0.0, False), (False, 1e-20, False), (False, 1e-3, True)],
+)
+def test_a_gain_is_worth_more_steps_where_it_stands_out_from_rounding(far, gain, counts):
+    """Far from the end any is, near to it what rounding of q cannot be."""
+    F, d, G, e, bounded = program(0)
+    qp = qp_of(F, d, G, e, bounded)
+    state = Iterate(qp, homogenise(qp, image(qp.F, first_point(qp))))
+    state.residual, state.rounding = (1.0, 1e-10) if far else (1e-9, 1e-10)
+    state.idle = 5
+    state.went_down(gain)
+    assert state.idle == (0 if counts else 5)
+    state.destroy()

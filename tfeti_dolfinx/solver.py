@@ -33,7 +33,8 @@ EXPLANATIONS = {
     "larger rtol, or a scene with smaller ratios of stiffness or size",
     ConvergedReason.DIVERGED_STALLED: "; the forces come no nearer to balancing the load",
     ConvergedReason.DIVERGED_FRICTION: "; the bounds of Coulomb's friction do not come to rest: "
-    "expected a smaller coefficient, smaller load steps, or a larger friction_max_it",
+    "expected a smaller coefficient, smaller load steps, a larger friction_max_it, or a load that "
+    "does not need bodies wedged between others",
     ConvergedReason.DIVERGED_CONTRADICTION: "; contact rows that depend on each other exclude each "
     "other{contacts}: expected gaps that some displacement keeps",
 }

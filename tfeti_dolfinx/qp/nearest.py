@@ -12,7 +12,7 @@ from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.parallel import agreed
-from tfeti_dolfinx.qp.coarse import Coarse, imbalance
+from tfeti_dolfinx.qp.coarse import HELD, Coarse, imbalance
 from tfeti_dolfinx.qp.faces import Face, Status
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 
@@ -137,6 +137,15 @@ def nearest_or_least(coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec) -> Neare
     better = agreed(y.getComm().tompi4py(), least.missing < found.missing)
     (found if better else least).lam.destroy()
     return least if better else found
+
+
+def nearest_within(coarse: Coarse, feasible: FeasibleSet, face: Face, y: PETSc.Vec) -> PETSc.Vec:
+    """The nearest point to y of a face and Gλ = e; of all Ω where the face has none. Collective."""
+    found = nearest(coarse, WithinFace(feasible, face), y)
+    if found.missing > HELD:
+        found.lam.destroy()
+        found = nearest_or_least(coarse, feasible, y)
+    return found.lam
 
 
 class WithinFace:

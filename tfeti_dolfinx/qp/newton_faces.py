@@ -9,13 +9,13 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.parallel import agreed, any_rank
-from tfeti_dolfinx.qp.coarse import HELD, Coarse, imbalance
+from tfeti_dolfinx.qp.coarse import HELD, Coarse
 from tfeti_dolfinx.qp.dependent import DependentRows
 from tfeti_dolfinx.qp.directions import Directions
 from tfeti_dolfinx.qp.eased import Eased
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.monitors import Monitor
-from tfeti_dolfinx.qp.nearest import WithinFace, nearest, nearest_or_least
+from tfeti_dolfinx.qp.nearest import nearest_within
 from tfeti_dolfinx.qp.newton_curved import (
     Bent,
     bent_at,
@@ -32,6 +32,8 @@ from tfeti_dolfinx.qp.trial import Trial
 
 # rows leave a face in so many rounds at most: each round drops one row at least, but most at once
 MOST_ROUNDS = 60
+# rounds that wake rows again, to hold a body: after so many the same ones leave and wake by turns
+MOST_WOKEN = 4
 # of the rule's tolerance, for the last solve on a face: ‖g^P‖ is measured otherwise than ‖P_f g‖
 FINAL = 0.9
 # a solve on a face that stays is looked at whenever it has come down by this: PCPG goes on where it
@@ -80,7 +82,7 @@ class FaceSolver:
         self._face: Face | None = None
         self._eased: Eased
         self.settled, self.curved, self._accepted, self.left = False, False, False, np.inf
-        self._on_face, self.rounded = qp, 0
+        self._on_face, self.rounded, self._woken = qp, 0, 0
         self._bent: Bent | None = None
         self._preconditioner: FaceOperator | None = None
         self._prepared, self._stayed, self._stage, self._size = False, False, STAGE, 0.0
@@ -178,7 +180,7 @@ class FaceSolver:
             optimality: ‖g^P‖ there.
         """
         z, first, out, accepted = start.copy(), None, True, self._accepted
-        self._size = start.lam.norm()
+        self._size, self._woken = start.lam.norm(), 0
         stays, rounds = self.enter(face) and accepted, 0
         for _ in range(MOST_ROUNDS):
             self._ready()
@@ -199,7 +201,8 @@ class FaceSolver:
             if first is None:
                 first, face = z.copy(), self._face
             out = has_left(self._qp, self._face, z.lam.array_r)
-            if self._steps.cg >= self._max_it or not (out or (broken and self._dependent.slide(z))):
+            ends = self._steps.cg >= self._max_it or self._woken >= MOST_WOKEN
+            if ends or not (out or (broken and self._dependent.slide(z))):
                 break
             self.rounded = self.rounded if out else 0
             z.lam.array[:] = self._qp.feasible.project(z.lam.array_r)
@@ -220,11 +223,8 @@ class FaceSolver:
         if wild or imbalance_on(*of, near) > HELD:
             # it no longer holds a body: what is nearest names rows that do, near by if it can
             near.destroy()
-            found = nearest(self._qp.coarse, WithinFace(feasible, previous), z.lam)
-            if imbalance(self._qp.coarse, found.lam) > HELD:
-                found.lam.destroy()
-                found = nearest_or_least(self._qp.coarse, feasible, z.lam)
-            near = found.lam
+            self._woken += 1
+            near = nearest_within(self._qp.coarse, feasible, previous, z.lam)
             on = 0.5 * (z.lam.array_r + near.array_r)
             self.enter(feasible.face(on, z.g.array_r))
         near.copy(z.lam)
