@@ -6,6 +6,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import TINY, Array
+from tfeti_dolfinx.qp.discs import reduced_by
 from tfeti_dolfinx.qp.faces import Face, Status
 
 # halvings of an interval of length 1: down to rounding
@@ -57,9 +58,7 @@ class Cones:
 
     def reduced(self, x: Array, phi: Array, alpha: float) -> Array:
         """φ̃ = (x − P(x − αφ))/α, φ itself where the step stays inside."""
-        trial = x - alpha * phi
-        projected = self.project(trial)
-        return np.where(projected == trial, phi, (x - projected) / alpha)
+        return reduced_by(self.project, x, phi, alpha)
 
     def max_step(self, x: Array, p: Array) -> float:
         """Largest α with x − αp inside: the smallest root of a quadratic equation for each."""

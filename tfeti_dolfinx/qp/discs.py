@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.sparse import csr_array
 
@@ -60,9 +62,7 @@ class Ellipses:
 
     def reduced(self, x: Array, phi: Array, alpha: float) -> Array:
         """φ̃ = (x − P(x − αφ))/α, φ itself where the step stays inside."""
-        trial = x - alpha * phi
-        projected = self.project(trial)
-        return np.where(projected == trial, phi, (x - projected) / alpha)
+        return reduced_by(self.project, x, phi, alpha)
 
     def max_step(self, x: Array, p: Array) -> float:
         """Largest α with x − αp inside: the smallest root of a quadratic equation for each."""
@@ -168,6 +168,13 @@ class Discs(Ellipses):
         """r z/‖z‖."""
         size = np.linalg.norm(z, axis=1, keepdims=True)
         return np.asarray(self.semi_axes[which] * (z / np.maximum(size, TINY)))
+
+
+def reduced_by(project: Callable[[Array], Array], x: Array, phi: Array, alpha: float) -> Array:
+    """φ̃ = (x − P(x − αφ))/α, φ itself where the step stays inside."""
+    trial = x - alpha * phi
+    projected = project(trial)
+    return np.where(projected == trial, phi, (x - projected) / alpha)
 
 
 def _secular(a: Array, z: Array) -> Array:
