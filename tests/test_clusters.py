@@ -181,6 +181,19 @@ def test_subdomains_of_a_body_that_hang_together_elsewhere(serial_only):
     assert all(len(np.unique(whole[finer == one])) == 1 for one in np.unique(finer))
 
 
+@pytest.mark.parametrize("wanted", [4, 8, 16, 24])
+def test_clusters_of_irregular_subdomains_have_about_as_many_each(wanted, serial_only):
+    """Subdomains that touch all around, as METIS makes them; not half of all in one cluster."""
+    x = np.stack(np.meshgrid(range(4), range(4), range(2)), axis=-1).reshape(-1, 3)
+    apart = np.abs(x[:, None] - x).max(axis=2) + np.tri(32)
+    pairs = np.argwhere(apart == 1)
+    steps = np.abs(x[pairs[:, 0]] - x[pairs[:, 1]]).sum(axis=1)
+    part = averages._parts(pairs, np.array([0, 60, 9, 4])[steps], np.zeros(32, int), wanted / 32)
+    sizes = np.bincount(part, minlength=wanted)
+    assert sizes.min() >= 1
+    assert sizes.max() <= np.ceil(32 / wanted) + 1
+
+
 def test_without_them_nothing_is_paid():
     p = square(8, 2)
     p.solve()
