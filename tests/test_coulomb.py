@@ -8,6 +8,7 @@ from dolfinx import fem
 from friction_reference import parts
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mpi4py import MPI
 from scenes import clamp, decomposed, displacement, forms, hooke, problem
 from test_friction_fields import EXACT, SCENES, floor, solved
 from test_tresca import SIDES, SOLVERS, nodal_data, on_the_plane, stresses, two_boxes
@@ -372,8 +373,42 @@ def test_a_body_between_walls_that_nothing_presses_is_an_error():
         for side, point, normal in (("left", (0, 0), (1, 0)), ("right", (1, 0), (-1, 0)))
     ]
     p = problem(d, (0.0, -0.05), walls, clamped=(), rtol=1e-6)
-    with pytest.raises(tfeti.ConvergenceError, match="DIVERGED_FRICTION .* wedged between others"):
+    said = f"DIVERGED_FRICTION .* on the body '{d.body_names[0]}': .* wedged between others"
+    with pytest.raises(tfeti.ConvergenceError, match=said):
         p.solve()
+
+
+def test_the_body_that_slides_without_end_is_named():
+    """Of a square pressed on a plane and one between walls that nothing presses."""
+    parts = [("still", (0.0, 0.0), (1.0, 1.0), (3, 3)), ("loose", (2.0, 0.0), (3.0, 1.0), (3, 3))]
+    mesh, tags, names = boxes("quadrilateral", parts)
+    d = tfeti.decompose(mesh, 4, facet_tags=tags, surfaces=names)
+    planes = {
+        "still bottom": tfeti.Plane((0, 0), (0, 1)),
+        "loose left": tfeti.Plane((2, 0), (1, 0)),
+        "loose right": tfeti.Plane((3, 0), (-1, 0)),
+    }
+    p = two_body_problem(
+        d,
+        lambda v, ds: -0.05 * v[1] * (ds(d.surface("still top")) + ds(d.surface("loose top"))),
+        lambda V: [],
+        [
+            tfeti.Obstacle(side, plane, friction=tfeti.Coulomb(0.5), reach=np.inf)
+            for side, plane in planes.items()
+        ],
+    )
+    loose = d.body_names[body_of(d, "loose left")]
+    with pytest.raises(tfeti.ConvergenceError, match=f"DIVERGED_FRICTION .* body '{loose}'"):
+        p.solve()
+
+
+def body_of(d, surface):
+    """The body that a surface is of."""
+    facets, comm = d.facets(surface), d.comm
+    d.mesh.topology.create_connectivity(1, 2)
+    cells = [d.mesh.topology.connectivity(1, 2).links(f)[0] for f in facets]
+    found = d.body_of_subdomain[d.cell_subdomain[cells]] if cells else np.array([-1])
+    return comm.allreduce(int(found.max()), op=MPI.MAX)
 
 
 @given(st.integers(0, 10_000), st.sampled_from([1, 2]))

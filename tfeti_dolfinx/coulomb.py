@@ -40,12 +40,14 @@ class Settling:
         change: Last change of the bounds, over their size.
         tolerance: What that had to come down to.
         last: Multiplications by F of the last problem.
+        body: The body on which they changed most at last; -1 without Coulomb's law.
     """
 
     iterations: int = 0
     change: float = 0.0
     tolerance: float = 0.0
     last: int = 0
+    body: int = -1
 
 
 def solve_with_friction(
@@ -106,4 +108,4 @@ def solve_with_friction(
         result.destroy()
     result.steps, rule.looks = steps, looks
     last = dual.F.count["solver"] - before
-    return result, rule, Settling(iterations, float(change), tolerance, last)
+    return result, rule, Settling(iterations, float(change), tolerance, last, bounds.restless)

@@ -41,6 +41,9 @@ class Pressures:
         dual: The dual problem.
         options: Options.
         start: Multipliers to start from.
+
+    Attributes:
+        restless: The body on which bounds changed most at last; -1 before.
     """
 
     def __init__(self, dual: Dual, options: Options, start: tuple[Array, Array] | None) -> None:
@@ -55,6 +58,7 @@ class Pressures:
         self._mu = np.linalg.norm(dual.constraints.coefficients[at], axis=1)
         self._weight = self._mu * dual.constraints.tangent_scale[at]
         self._now, self._found, self._none = self._first(start), np.zeros(len(at)), 0.0
+        self.restless = -1
         self._held: Array = np.full(len(at), np.inf)
         self._anderson = Anderson(self._products)
 
@@ -146,7 +150,8 @@ class Pressures:
         miss, size = (self._on_bodies(x) for x in (self._found - self._now, self._found))
         least = self._on_bodies(np.full(len(self._rows), self._none)).max(initial=TINY)
         size = np.maximum(size, max(least, LIGHT * size.max(initial=0.0)))
-        change = agreed(self._comm, float(np.max(miss / size, initial=0.0)))
+        change, body = agreed(self._comm, _largest(miss / size))
+        self.restless = int(body)
         self._idle += 1
         if change <= 0.5 * self._best:
             self._best, self._idle = change, 0
@@ -206,3 +211,9 @@ class Pressures:
     def _products(self, A: Array, B: Array) -> Array:
         weighted = (self._weight[:, None] ** 2) * B
         return agreed(self._comm, summed(self._comm, A.T @ weighted))
+
+
+def _largest(values: Array) -> tuple[float, int]:
+    """The largest of some values that are not negative, and which one it is."""
+    at = int(np.argmax(values)) if len(values) else -1
+    return float(values[at]) if at >= 0 else 0.0, at

@@ -263,7 +263,7 @@ class ContactProblem(Stepping):
             own = self._settings.extensions.monitor
             goal = self._goal()
             solved = solve_with_friction(dual, self.options, qp_type, start, own, goal)
-        result, accuracy, _ = solved
+        result, accuracy, settling = solved
         with stage("recovery", report.seconds):
             multipliers = Multipliers(np.array(result.lam.array_r), result.face)
             solution = self._solution = self._make_solution(accuracy.u, multipliers, gluing)
@@ -274,6 +274,6 @@ class ContactProblem(Stepping):
         report.warnings = self._doubts.found(dual, solution.u, report, self.options.number)
         report.excluding_contacts = system.search.named(gluing.contacts_of(result.excluding))
         result.destroy()
-        comm, excluding = self.decomposition.comm, report.excluding_contacts
-        conclude(result, accuracy, self.options, comm, excluding)
+        names = report.excluding_contacts, self.decomposition.body_names[settling.body]
+        conclude(result, accuracy, self.options, self.decomposition.comm, *names)
         return solution

@@ -32,7 +32,8 @@ EXPLANATIONS = {
     ConvergedReason.DIVERGED_ROUNDING: "; rounding does not let it come lower: expected a "
     "larger rtol, or a scene with smaller ratios of stiffness or size",
     ConvergedReason.DIVERGED_STALLED: "; the forces come no nearer to balancing the load",
-    ConvergedReason.DIVERGED_FRICTION: "; the bounds of Coulomb's friction do not come to rest: "
+    ConvergedReason.DIVERGED_FRICTION: "; the bounds of Coulomb's friction do not come to rest, "
+    "least of all on the body {restless!r}: "
     "expected a smaller coefficient, smaller load steps, a larger friction_max_it, or a load that "
     "does not need bodies wedged between others",
     ConvergedReason.DIVERGED_CONTRADICTION: "; contact rows that depend on each other exclude each "
@@ -192,6 +193,7 @@ def conclude(
     options: Options,
     comm: MPI.Intracomm,
     excluding: Sequence[str] = (),
+    restless: str = "",
 ) -> None:
     """Say why the solver stopped, and raise where it should have gone on.
 
@@ -201,12 +203,14 @@ def conclude(
         options: Options.
         comm: Communicator.
         excluding: Names of the contacts whose rows exclude each other.
+        restless: Name of the body on which bounds of friction change most.
 
     Raises:
         ConvergenceError: It stopped before its tolerance, unless options turn that off.
     """
     contacts = f", those of {' and '.join(excluding)}" if excluding else ""
-    explanation = EXPLANATIONS.get(result.reason, "").format(contacts=contacts)
+    explanation = EXPLANATIONS.get(result.reason, "")
+    explanation = explanation.format(contacts=contacts, restless=restless)
     text = (
         f"{result.reason.name} after {result.steps.outer} outer and {result.steps.inner} inner "
         f"iterations: the worst of its errors is {rule.ratio():.3g} times what rtol "
