@@ -31,6 +31,7 @@ import tfeti_dolfinx as tfeti
 from benchmarks.pictures import column, curves, picture
 from benchmarks.tables import slope
 from benchmarks.tools import command_line, finish
+from tfeti_dolfinx.arrays import node_blocks
 from tfeti_dolfinx.assembly import Forms
 from tfeti_dolfinx.compat import create_mesh_in_place
 from tfeti_dolfinx.contact.search import ContactSearch
@@ -125,8 +126,8 @@ def measure(cell, counts):
     forms, dofs = elasticity(decomposition)
     contacts = [tfeti.Contact("upper bottom", "lower top", secondary="upper bottom")]
     assembly, K = best_time(forms.stiffness)
-    diagonal = dofs.to_primal(K.diagonal())
-    contact, search = best_time(lambda: ContactSearch(contacts, dofs, decomposition, diagonal))
+    blocks = node_blocks(K, dofs.bs)[dofs.dolfinx_node]
+    contact, search = best_time(lambda: ContactSearch(contacts, dofs, decomposition, blocks))
     return {
         "facets": sum(comm.allreduce(len(decomposition.facets(name))) for name in SURFACES),
         "conditions": comm.allreduce(len(search.records)),

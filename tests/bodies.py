@@ -143,8 +143,12 @@ def sided(secondary, primary, **changes):
 
 def searched(contacts, dofs, d):
     """The conditions of contacts, as if all elements were equally stiff."""
-    stiffness = np.ones(dofs.num_nodes * dofs.bs)
-    return ContactSearch(contacts, dofs, d, stiffness).records
+    return ContactSearch(contacts, dofs, d, unit_blocks(dofs)).records
+
+
+def unit_blocks(dofs):
+    """Blocks of K of the nodes if all elements are equally stiff."""
+    return np.tile(np.eye(dofs.bs), (dofs.num_nodes, 1, 1))
 
 
 def held(d, *sides):

@@ -11,6 +11,7 @@ from dolfinx import mesh as dmesh
 from mpi4py import MPI
 from petsc4py import PETSc
 from scenes import clamp, decomposed, forms, hooke, problem, strain
+from scipy.linalg import block_diag, null_space
 from scipy.sparse import csr_array, diags_array
 
 import tfeti_dolfinx as tfeti
@@ -188,6 +189,27 @@ def test_K_ii_is_factored_only_when_somebody_asks():
     assert counters.factorizations == 1
     b.apply_schur(np.ones(len(b.trace_dofs)))
     assert counters.factorizations == 2
+
+
+@pytest.mark.parametrize(("cell", "every"), [("triangle", 1), ("hexahedron", 3)])
+def test_S_is_that_of_the_directions_that_rows_act_along(cell, every):
+    K, x = stiffness(cell, 2)
+    b, bs, n = block(K, x, every), x.shape[1], K.shape[0]
+    trace, rng = np.flatnonzero(np.arange(n) // bs % every == 0), np.random.default_rng(0)
+    b.retrace(trace)
+    Q = np.linalg.qr(rng.standard_normal((len(trace) // bs, bs, bs)))[0]
+    Q[::2, :, 1:] = 0.0  # one direction of every other node
+    b.act_along((Q @ Q.transpose(0, 2, 1)).reshape(-1, bs))
+    along = np.zeros((n, len(trace)))
+    along[trace] = block_diag(*Q)
+    along = along[:, np.any(along, axis=0)]
+    left = null_space(along.T)  # the inside and the directions that are left
+    A, C = left.T @ K @ left, left.T @ K @ along
+    S = along.T @ K @ along - C.T @ np.linalg.lstsq(A, C, rcond=1e-10)[0]
+    found = np.column_stack([b.apply_schur(w) for w in along[trace].T])
+    assert np.allclose(along[trace].T @ found, S, atol=1e-10 * np.abs(K).max())
+    b.act_along(np.tile(np.eye(bs), (len(trace) // bs, 1)))
+    check_block(b, K)
 
 
 def test_fixing_nodes_are_spread():

@@ -21,6 +21,7 @@ from scenes import (
 from scipy.linalg import eigh
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.arrays import node_blocks
 from tfeti_dolfinx.boundary.parts import Parts
 from tfeti_dolfinx.boundary.steklov import Law, rigid_motions
 from tfeti_dolfinx.compat import assemble_csr
@@ -38,7 +39,7 @@ def made_parts(d, K=None):
     dofs, how = TornDofs(V, d), Making()
     parts = Parts(dofs, d, np.ones(len(d.subdomains), dtype=bool), how)
     K = assemble_csr(fem.form(a)) if K is None else K
-    parts.take_stiffness(K, dofs.to_primal(K.diagonal()))
+    parts.take_stiffness(K, node_blocks(K, dofs.bs)[dofs.dolfinx_node])
     return parts, dofs, K, how
 
 

@@ -1,4 +1,4 @@
-"""The type of all numpy arrays here, and sums that numpy's own functions lack.
+"""The type of all numpy arrays here, and sums and parts that numpy's own functions lack.
 
 Shapes and units stand in the docstrings.
 """
@@ -18,7 +18,17 @@ ArrayLike = npt.ArrayLike
 # stands for 0 in a denominator: smaller than any quantity, and its inverse is still finite
 TINY = 1e-300
 
-__all__ = ["TINY", "Array", "ArrayLike", "joined", "parts_of", "sum_rows"]
+__all__ = [
+    "TINY",
+    "Array",
+    "ArrayLike",
+    "joined",
+    "node_blocks",
+    "node_means",
+    "parts_of",
+    "sum_rows",
+    "sums",
+]
 
 
 def sum_rows(row: Array, values: Array, size: int) -> Array:
@@ -50,3 +60,35 @@ def parts_of(sizes: Sequence[int]) -> list[slice]:
 def joined(parts: Sequence[Array]) -> Array:
     """One float array of several, maybe none."""
     return np.concatenate([np.empty(0), *parts])
+
+
+def node_blocks(K: Any, bs: int) -> Array:
+    """The block of each node in a scipy matrix, unknowns of a node one after the other.
+
+    Args:
+        K: Symmetric, shape ``(n, n)``.
+        bs: Unknowns of each node.
+
+    Returns:
+        Shape ``(n / bs, bs, bs)``.
+    """
+    n = K.shape[0]
+    blocks = np.zeros((n // bs, bs, bs))
+    for k in range(min(bs, n)):
+        along = np.append(K.diagonal(k), np.zeros(k)).reshape(-1, bs)
+        for i in range(bs - k):
+            blocks[:, i, i + k] = blocks[:, i + k, i] = along[:, i]
+    return blocks
+
+
+def node_means(x: Array, bs: int) -> Array:
+    """Each entry replaced by the mean of those of its node, shape ``(n,)``.
+
+    Of the diagonal of K these are traces of the nodes' blocks, which do not depend on the axes.
+    """
+    return np.repeat(x.reshape(-1, bs).mean(axis=1), bs)
+
+
+def sums(x: Array, parts: Sequence[slice]) -> list[float]:
+    """Sum over each part of an array."""
+    return [float(x[part].sum()) for part in parts]

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.arrays import Array, node_blocks
 from tfeti_dolfinx.assembly import Forms
 from tfeti_dolfinx.boundary.parts import Parts
 from tfeti_dolfinx.boundary.solved import BoundarySolution
@@ -108,8 +108,8 @@ class Replaced:
         """Whether there are boundary elements."""
         return self._chosen is not None
 
-    def diagonal(self, K: Any, how: Making) -> Array:
-        """Make S; the diagonal of the stiffness in primal order.
+    def node_blocks(self, K: Any, how: Making) -> Array:
+        """Make S; the stiffness's block of each primal node, shape ``(num_nodes, bs, bs)``.
 
         Args:
             K: Stiffness of finite elements in DOLFINx's numbering, scipy CSR.
@@ -119,11 +119,11 @@ class Replaced:
             InputError: The mesh or the stiffness does not fit.
             FactorError: S could not be made.
         """
-        diagonal = self._dofs.to_primal(K.diagonal())
+        blocks = node_blocks(K, self._dofs.bs)[self._dofs.dolfinx_node]
         if self._chosen is None:
-            return diagonal
+            return blocks
         self._parts = Parts(self._dofs, self._decomposition, self._chosen, how)
-        return self._parts.take_stiffness(K, diagonal)
+        return self._parts.take_stiffness(K, blocks)
 
     def load(self, forms: Forms) -> Array:
         """This rank's load in DOLFINx's numbering.

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from mpi4py import MPI
 
-from tfeti_dolfinx.arrays import TINY, Array, joined
+from tfeti_dolfinx.arrays import TINY, Array, joined, sums
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -15,7 +15,7 @@ from tfeti_dolfinx.mesh.quality import flatness
 from tfeti_dolfinx.mesh.sharing import shared_by_bodies
 from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.report import Report
-from tfeti_dolfinx.subdomains.subdomains import Subdomains, sums
+from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # relative rounding of a stiffness
 EPSILON = float(np.finfo(float).eps)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from petsc4py import PETSc
 
-from tfeti_dolfinx.arrays import TINY, Array
+from tfeti_dolfinx.arrays import TINY, Array, sums
 from tfeti_dolfinx.dilation import DilatedGaps, cone_set
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.errors import ConvergenceError
@@ -14,7 +14,6 @@ from tfeti_dolfinx.parallel import agreed, any_rank, summed
 from tfeti_dolfinx.qp.acceleration import Anderson
 from tfeti_dolfinx.qp.nearest import nearest_or_least
 from tfeti_dolfinx.qp.problem import ConvergedReason
-from tfeti_dolfinx.subdomains.subdomains import sums
 
 # of all multipliers: forces of normals that rounding makes of none; as bounds they would be discs
 # whose boundaries bend so much that nothing else is seen beside them

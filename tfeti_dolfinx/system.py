@@ -192,13 +192,13 @@ class System:
 
     def _assemble_stiffness(self) -> None:
         self._K = self.forms.stiffness()
-        self._diagonal = self.replaced.diagonal(self._K, self._settings.making(self._counters))
+        self._blocks = self.replaced.node_blocks(self._K, self._settings.making(self._counters))
         if self.replaced.exists:  # the load that a force per volume makes depends on S
             self.change("load")
 
     def _find_contacts(self) -> None:
         dofs, cut = self._dofs, self._decomposition
-        self._search = ContactSearch(self._contacts, dofs, cut, self._diagonal)
+        self._search = ContactSearch(self._contacts, dofs, cut, self._blocks)
         if self._known_rows is not None:
             self._search.take_rows(*self._known_rows)
             self._known_rows = None
@@ -207,9 +207,10 @@ class System:
         if self._gluing is not None:
             self._gluing.constraints.destroy()
         search = self.search
-        weights = row_weights(self._diagonal, self._settings.options.scaling, self._dofs.comm)
+        scaling, dofs = self._settings.options.scaling, self._dofs
+        weights = row_weights(self._blocks, scaling, dofs.comm)
         prescribed, slip = made(self._prescribed), self.friction.slip(search)
-        self._gluing = glue(self._dofs, prescribed, search.records, search.length, weights, slip)
+        self._gluing = glue(dofs, prescribed, search.records, search.length, weights, slip)
         self.spectrum = {}
 
     def _fill_right_side(self) -> None:
@@ -233,6 +234,11 @@ class System:
             clusters = clusters_of(dofs, cut, given.options.clusters)
             how = self.replaced.blocks(given.make_block(counters)), cut, counters, choice
             self._subdomains = make_subdomains(data, *how, clusters)
+        self._take_trace()
+
+    def _take_trace(self) -> None:
+        rows = self.gluing.constraints
+        made(self._subdomains).retrace(rows.trace, rows.span)
 
     def _make_dual(self) -> None:
         settings, scene = self._settings, (self._dofs, self._decomposition)
@@ -261,7 +267,7 @@ MAKERS: dict[str, Callable[[System], None]] = {
     "friction": lambda system: system.friction.set_limits(system.gluing, system.search),
     "load": System._assemble_load,
     "factors": System._factor,
-    "trace": lambda system: made(system._subdomains).retrace(system.gluing.constraints.trace),
+    "trace": System._take_trace,
     "coarse problem": System._make_dual,
     "linear term": lambda system: system.dual.update_load(),
 }

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.arrays import Array, node_blocks
 from tfeti_dolfinx.boundary.block import BoundaryBlock, Part
 from tfeti_dolfinx.boundary.inside import Inside
 from tfeti_dolfinx.boundary.shape import Shape
@@ -56,21 +56,21 @@ class Parts:
         self.parts: dict[int, Part] = {}
         self._forces: dict[int, Array] = {}
 
-    def take_stiffness(self, K: Any, diagonal: Array) -> Array:
+    def take_stiffness(self, K: Any, blocks: Array) -> Array:
         """Make S from the stiffness of finite elements.
 
         Args:
             K: This rank's, in DOLFINx's numbering, scipy CSR.
-            diagonal: Its diagonal in primal order.
+            blocks: Its block of each primal node, shape ``(num_nodes, bs, bs)``.
 
         Returns:
-            The diagonal with that of K_S in its place.
+            The blocks with those of K_S in their place.
 
         Raises:
             InputError: K is not that of homogeneous, isotropic bodies.
             FactorError: S could not be made.
         """
-        dofs, diagonal = self._dofs, diagonal.copy()
+        dofs, blocks, bs = self._dofs, blocks.copy(), self._dofs.bs
         rows = dofs.dolfinx_dofs()
         primal = np.empty(len(rows), dtype=np.int32)
         primal[rows] = np.arange(len(rows))
@@ -81,8 +81,9 @@ class Parts:
                 own = self._unknowns(s)
                 K_s = submatrix(K, rows[own], primal, own.start)
                 part = self.parts[s] = _part(self._names[s], surface, K_s, shapes, self._how)
-                diagonal[own] = part.shape.diagonal[part.place]
-        return diagonal
+                own_blocks = node_blocks(part.shape.K, bs)[part.place[::bs] // bs]
+                blocks[own.start // bs : own.stop // bs] = own_blocks
+        return blocks
 
     def load(self, f: Array, volume: Array | None, hats: Array | None) -> Array:
         """The load with that of boundary elements in the place of that of finite ones.

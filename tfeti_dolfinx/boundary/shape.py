@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -130,11 +129,6 @@ class Shape:
             raise FactorError(
                 f"{self.name}: the stiffness inside boundary elements: {error}"
             ) from error
-
-    @cached_property
-    def diagonal(self) -> Array:
-        """Diagonal of K_S, shape ``(n,)``."""
-        return np.asarray(self.K.diagonal())
 
 
 def _particular_loads(body: Steklov) -> Array:

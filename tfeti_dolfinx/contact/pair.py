@@ -126,7 +126,7 @@ class Contact:
             decomposition: The torn mesh.
             contact: Index of the contact.
             reach: Conditions with a larger gap are out of reach.
-            stiffness: Diagonal of K in primal order, shape ``(num_nodes * bs,)``.
+            stiffness: Block of K of each primal node, shape ``(num_nodes, bs, bs)``.
 
         Raises:
             InputError: As ``records``.

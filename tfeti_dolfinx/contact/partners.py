@@ -49,7 +49,7 @@ class ContactPartner(Protocol):
         reach: float,
         stiffness: Array,
     ) -> tuple[ContactPartner, ContactRecords]:
-        """The contact with its sides decided from the diagonal of K, and its conditions."""
+        """The contact with its sides decided from the stiffness, and its conditions."""
         ...
 
     def displacement_bound(self, dofs: TornDofs, decomposition: Decomposition, u: Array) -> float:

@@ -35,7 +35,7 @@ class ContactSearch:
         contacts: Obstacles and pairs.
         dofs: Dof maps.
         decomposition: The torn mesh.
-        stiffness: Diagonal of K in primal order, shape ``(num_nodes * bs,)``.
+        stiffness: Block of K of each primal node, shape ``(num_nodes, bs, bs)``.
 
     Attributes:
         contacts: The contacts with their sides decided: of a pair the secondary one comes first.

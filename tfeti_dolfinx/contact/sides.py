@@ -77,7 +77,7 @@ def stiffness_ratio(
     """Stiffness per area of the first side over that of the second. Collective.
 
     Stiffness per area is E/h of the elements at a surface: Σ n_i·K_ii n_i / Σ ∫φ_i over its
-    vertices, K_ii the diagonal before anything is glued, n_i the normal. The vertices that rows
+    vertices, K_ii the block of K before anything is glued, n_i the normal. The vertices that rows
     name are taken, so that a mesh that is fine only where the bodies touch is judged there; where
     there is no such row, all of them.
 
@@ -85,9 +85,10 @@ def stiffness_ratio(
         records: Conditions between the sides.
         sides: Both sides.
         dofs: Dof maps.
-        stiffness: Diagonal of K in primal order, shape ``(num_nodes * bs,)``.
+        stiffness: Block of K of each primal node, shape ``(num_nodes, bs, bs)``.
     """
-    diagonal = dofs.reduce(stiffness.reshape(-1, dofs.bs), np.add, 0.0)
+    whole = dofs.reduce(stiffness.reshape(-1, dofs.bs**2), np.add, 0.0)
+    blocks = whole.reshape(-1, dofs.bs, dofs.bs)
     named = records.entry_group[records.within_reach[records.condition]]
     meets = dofs.add_on_owners(named, np.ones(len(named))) > 0.0
     if dofs.comm.allreduce(int(np.sum(meets))) == 0:
@@ -96,7 +97,8 @@ def stiffness_ratio(
     for side in sides:
         area = dofs.add_on_owners(side.vertices.ravel(), side.areas.ravel())
         at = meets & (area > 0.0)
-        along = np.sum(side.normals[at] ** 2 * diagonal[at])
+        n = side.normals[at]
+        along = np.einsum("gi,gij,gj", n, blocks[at], n)
         sums = dofs.comm.allreduce(np.array([along, area[at].sum()]))
         per_area.append(sums[0] / sums[1])
     return agreed(dofs.comm, float(per_area[0] / per_area[1]))

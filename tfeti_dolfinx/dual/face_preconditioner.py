@@ -24,7 +24,7 @@ class FacePreconditioner:
 
     Gluing and Dirichlet rows are orthonormal in D⁻¹ and orthogonal to contact rows, so W is the
     identity but for its block of contact rows, W_C, normals and tangents. That is the identity too
-    where no two of them meet, as at an obstacle, and D is the same in all directions.
+    where no two of them meet, as at an obstacle, and no component is prescribed.
 
     Where a face is curved M_f stands for (ZᵀFZ + κ)⁻¹. F + κ is the F of a scene in which each
     direction with a curvature moves a spring of stiffness 1/κ besides: for that B_f gains the

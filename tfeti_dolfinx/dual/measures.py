@@ -9,13 +9,13 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from tfeti_dolfinx.arrays import TINY, Array
+from tfeti_dolfinx.arrays import TINY, Array, sums
 from tfeti_dolfinx.dual.closing import closing
 from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
-from tfeti_dolfinx.subdomains.subdomains import Subdomains, sizes, sums
+from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # of the largest forces on a kernel mode: those on a light one beside it count as so large at least,
 # since the rounding of the largest reaches them
@@ -41,11 +41,11 @@ class BodyMeasures:
     """What is known of each body at an iterate, arrays of shape ``(bodies,)``; on all ranks.
 
     Attributes:
-        size: Largest displacement.
-        elastic: Largest displacement but for a rigid motion.
+        size: Largest displacement of a node, as a length.
+        elastic: The same but for a rigid motion.
         energy: uᵀKu.
         correction: Largest displacement v that closes jumps and overlaps.
-        correction_energy: vᵀ diag(K) v.
+        correction_energy: vᵀ diag(K) v, its diagonal as in D the mean at each node.
         change: Largest change since the iterate before, or 0.
         alone: Largest displacement K⁺f of the trace.
         stiffness: Trace of K on the trace unknowns.
@@ -173,17 +173,17 @@ def _bodies(scene: Scene, u: Array, v: Array, before: Array | None) -> BodyMeasu
     subdomains, motions = scene.subdomains, scene.coarse.bodies
     rigid = subdomains.modes_motion(motions.amounts(motions.part_of(u)))
     change = u - before if before is not None else np.zeros_like(u)
-    dofs, trace, diagonal = subdomains.dof_parts, subdomains.trace_parts, subdomains.diagonal
+    trace, diagonal = subdomains.trace_parts, subdomains.diagonal
     energy, correction_energy, stiffness = subdomains.body_sums(
         [subdomains.energies(u), sums(diagonal * v**2, trace), sums(diagonal, trace)]
     )
     size, elastic, correction, changed, alone = subdomains.body_maxima(
         [
-            sizes(u, dofs),
-            sizes(u - rigid, dofs),
-            sizes(v, trace),
-            sizes(change, dofs),
-            sizes(subdomains.pinv_load[subdomains.trace], trace),
+            subdomains.sizes(u),
+            subdomains.sizes(u - rigid),
+            subdomains.sizes(subdomains.extended(v)),
+            subdomains.sizes(change),
+            subdomains.sizes(subdomains.extended(subdomains.pinv_load[subdomains.trace])),
         ]
     )
     return BodyMeasures(

@@ -11,6 +11,7 @@ from petsc4py import PETSc
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.gluing.row_sets import RowSets, row_sets
 from tfeti_dolfinx.gluing.rows import Rows, stack
+from tfeti_dolfinx.gluing.span import row_span
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.parallel import Exchange, chunk_offsets, owner_of
 
@@ -27,6 +28,8 @@ class Constraints:
         c: Right sides, distributed as the rows; 0 until they are set.
         sets: Which local rows are what.
         trace: Local primal unknown of each local trace unknown, ascending.
+        span: Projector of each node of the trace onto the directions that rows act along, the row
+            of each trace unknown, shape ``(t, bs)``.
         weights: D on the local trace unknowns: the rows are scaled with it.
         scale: The s_i of the conditions with rows, one for each of ``sets.normals``: over it what
             a row misses is a length.
@@ -44,6 +47,7 @@ class Constraints:
     c: PETSc.Vec
     sets: RowSets
     trace: Array
+    span: Array
     weights: Array
     scale: Array
     tangent_scale: Array
@@ -105,6 +109,7 @@ def assemble_constraints(
     equalities, normals, tangents = (len(table) for table in tables)
     sets = row_sets(equalities, normals, tangents, dofs.bs)
     trace, column = _trace_columns(dofs, rows.column)
+    span = row_span(dofs, tables[0], stack(list(tables[1:])), trace)
     num_rows, num_columns = len(rows), len(trace)
     order = np.lexsort((column, rows.row))
     indptr = np.concatenate(([0], np.cumsum(np.bincount(rows.row, minlength=num_rows))))
@@ -123,6 +128,7 @@ def assemble_constraints(
         c=c,
         sets=sets,
         trace=trace,
+        span=span,
         weights=weights[trace],
         scale=scale,
         tangent_scale=tangent_scale,

@@ -27,6 +27,8 @@ from tfeti_dolfinx.qp.trial import Trial
 ENOUGH = 0.1
 # of a way along a face that is curved, where q is not low enough at its end
 SHORTER = 0.5
+# of the way to the first bound: what ends there is put on it, and not left inside by rounding
+PAST = 1.0 + 1e-14
 # solves on a face that stays, after the one at whose end q was not low enough
 LONGER = 2
 
@@ -107,7 +109,7 @@ def accept(state: Iterate, trial: Trial, faces: FaceSolver) -> bool:
 
 def _shortened(state: Iterate, trial: Trial, length: float, curved: bool, enough: float) -> bool:
     """Go a part of the first solve's way, if q falls enough there."""
-    shorter, held = part_of_way(state.point, trial.first, length), length > 0.0
+    shorter, held = part_of_way(state.point, trial.first, PAST * length), length > 0.0
     if curved:
         held = brought_back(state.qp, trial.face, shorter) and held
     else:

@@ -51,6 +51,11 @@ class Block(Protocol):
         """1 / number of torn copies of each unknown, shape ``(n,)``."""
         ...
 
+    @property
+    def bs(self) -> int:
+        """Unknowns of each node, which follow each other."""
+        ...
+
     def multiply(self, u: Array) -> Array:
         """K u on all unknowns, shapes ``(n,)``."""
         ...
@@ -94,6 +99,17 @@ class Block(Protocol):
         """Replace the trace: other rows act on the subdomain. Factors of K stay."""
         ...
 
+    def act_along(self, span: Array) -> None:
+        """Say in which directions rows act on the nodes of the trace, until there is a new one.
+
+        S may be that of these directions alone, the others being left free as the inside is.
+
+        Args:
+            span: Projector of each node onto its directions, the row of each trace unknown, shape
+                ``(t, bs)``.
+        """
+        ...
+
     def destroy(self) -> None:
         """Free the factors."""
         ...
@@ -110,6 +126,8 @@ class BlockDefaults:
 
     Attributes:
         name: Name for messages.
+        x: Points of the nodes.
+        bs: Unknowns at each node.
         trace_dofs: Trace unknowns.
         load: f.
         kernel: R.
@@ -178,6 +196,9 @@ class BlockDefaults:
     def retrace(self, trace_dofs: Array) -> None:
         """Replace the trace."""
         self.trace_dofs = trace_dofs
+
+    def act_along(self, span: Array) -> None:
+        """S stays that of the whole trace."""
 
     def destroy(self) -> None:
         """Nothing is to be freed."""

@@ -51,9 +51,9 @@ class ClusteredSubdomains(Subdomains):
             self._null = self._glued = None
         super().update(K, f)
 
-    def retrace(self, trace: Array) -> None:
+    def retrace(self, trace: Array, span: Array | None = None) -> None:
         """As for subdomains."""
-        super().retrace(trace)
+        super().retrace(trace, span)
         self._glued = None
 
     @property

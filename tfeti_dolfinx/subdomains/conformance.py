@@ -42,6 +42,8 @@ def check_kind_of_block(make_block: Callable[[SubdomainData], Block], tol: float
         block.retrace(trace[::2])
         require(np.array_equal(block.trace_dofs, trace[::2]), "retrace replaces the trace")
         check_block(block, K, tol)
+        block.act_along(np.eye(block.bs)[trace[::2] % block.bs])
+        check_block(block, K, tol)
         block.update(K=changed.copy())
         check_block(block, changed, tol)
         block.destroy()

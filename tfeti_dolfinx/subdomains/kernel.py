@@ -15,6 +15,8 @@ NULL = 2e-15
 # Of the largest singular value of the modes, whose entries are of the size 1: what a mode has on
 # its own beside the others. Nodes on a line or in one point make it 0 but for rounding.
 DEPENDENT = 1e-10
+# of a distance: what is nearer to it counts as equal
+EQUAL = 1e-9
 
 
 def candidate_modes(x: Array, bs: int, centre: Array, length: float) -> Array:
@@ -101,6 +103,8 @@ def orthonormal(modes: Array) -> Array:
 def fixing_nodes(x: Array, count: int) -> Array:
     """Well-spread nodes: farthest-point sampling (Gonzalez 1985), from the node farthest out.
 
+    Of equal distances, as of the corners of a cube, the first: rounding must not choose.
+
     Args:
         x: Points of the nodes, shape ``(n, gdim)``.
         count: How many are wanted.
@@ -109,12 +113,16 @@ def fixing_nodes(x: Array, count: int) -> Array:
         Their indices, ascending, at most ``count``.
     """
     distance = np.linalg.norm(x - x.mean(axis=0), axis=1)
-    chosen = [int(np.argmax(distance))]
+    chosen = [_farthest(distance)]
     distance = np.linalg.norm(x - x[chosen[0]], axis=1)
     while len(chosen) < min(count, len(x)):
-        chosen.append(int(np.argmax(distance)))
+        chosen.append(_farthest(distance))
         distance = np.minimum(distance, np.linalg.norm(x - x[chosen[-1]], axis=1))
     return np.unique(chosen)
+
+
+def _farthest(distance: Array) -> int:
+    return int(np.argmax(distance >= (1.0 - EQUAL) * distance.max()))
 
 
 def fixing_dofs(x: Array, node_of_dof: Array) -> Array:

@@ -16,6 +16,9 @@ from tfeti_dolfinx.subdomains.kplus import Making
 from tfeti_dolfinx.subdomains.stiffness import Stiffness
 from tfeti_dolfinx.subdomains.traced import Traced
 
+# between projectors: less is rounding
+SAME_DIRECTION = 1e-9
+
 
 class SparseBlock(BlockDefaults):
     """Block of a sparse stiffness: factors of K_ρ and, when asked for, of K_ii.
@@ -47,6 +50,7 @@ class SparseBlock(BlockDefaults):
         equals: EqualSubdomains | None = None,
     ) -> None:
         self._how, self._equals = how or Making(), equals
+        self._span: Array | None = None
         self._stiffness: Stiffness | None = None
         super().__init__(data)
 
@@ -105,7 +109,13 @@ class SparseBlock(BlockDefaults):
         """Replace the trace; the factor of K_ii goes with it, that of K stays."""
         if not np.array_equal(trace_dofs, self.trace_dofs):
             self._forget_traced()
-            self.trace_dofs = trace_dofs
+            self.trace_dofs, self._span = trace_dofs, None
+
+    def act_along(self, span: Array) -> None:
+        """Let S be that of the directions that rows act along."""
+        if self._span is None or not np.allclose(span, self._span, rtol=0.0, atol=SAME_DIRECTION):
+            self._forget_traced()
+            self._span = span
 
     def destroy(self) -> None:
         """Free the factors, if nobody else needs them."""
@@ -119,7 +129,9 @@ class SparseBlock(BlockDefaults):
     @cached_property
     def traced(self) -> Traced:
         """What the stiffness is on the trace, in its own numbering."""
-        return self.stiffness.on_trace(self.trace_place[self._trace_order])
+        order = self._trace_order
+        span = None if self._span is None else self._span[order]
+        return self.stiffness.on_trace(self.trace_place[order], span)
 
     @property
     def trace_place(self) -> Array:

@@ -15,7 +15,7 @@ from tfeti_dolfinx.subdomains.input_checks import check_stiffness
 from tfeti_dolfinx.subdomains.inverse import FactoredInverse, GeneralisedInverse, solved
 from tfeti_dolfinx.subdomains.kernel import candidate_modes, fixing_dofs, kernel_of
 from tfeti_dolfinx.subdomains.kplus import Making, same_pattern, with_entries
-from tfeti_dolfinx.subdomains.traced import Traced
+from tfeti_dolfinx.subdomains.traced import Traced, seen_along
 
 
 class Stiffness:
@@ -88,11 +88,17 @@ class Stiffness:
         n = float(self.size)
         return FactorSize(n * n / 2.0, REAL * n * n / 2.0)
 
-    def on_trace(self, trace: Array) -> Traced:
-        """K_bb and S on a trace, ascending, made once for each; ``leave`` it in the end."""
-        key = trace.tobytes()
+    def on_trace(self, trace: Array, span: Array | None = None) -> Traced:
+        """K_bb and S on a trace, ascending, made once for each; ``leave`` it in the end.
+
+        Args:
+            trace: The trace.
+            span: Projectors onto the directions of S, as for ``Block.act_along``; default all.
+        """
+        seen = seen_along(trace, span, self.size)
+        key = seen.key
         if key not in self._traced:
-            self._traced[key] = Traced(self.name, self.K, self.kernel, self.x, trace, self._how)
+            self._traced[key] = Traced(self.name, self.K, self.kernel, self.x, seen, self._how)
         self._traced[key].users += 1
         return self._traced[key]
 
@@ -100,7 +106,7 @@ class Stiffness:
         """A Block no longer needs what it has asked for."""
         traced.users -= 1
         if traced.users == 0:
-            self._traced.pop(traced.trace.tobytes(), None)
+            self._traced.pop(traced.seen.key, None)
             traced.destroy()
 
     def destroy(self) -> None:

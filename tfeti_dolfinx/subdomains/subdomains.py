@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import coo_array, csr_array
 
-from tfeti_dolfinx.arrays import Array, joined, parts_of
+from tfeti_dolfinx.arrays import Array, joined, node_means, parts_of
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.subdomains.block import Block, OperatorKind
 from tfeti_dolfinx.subdomains.data import Counters
@@ -42,6 +42,7 @@ class Subdomains:
         trace: Trace unknowns among this rank's, ascending, shape ``(t,)``.
         trace_parts: Where the trace unknowns of each Block lie among the t, and dof_parts its
             unknowns among the n.
+        diagonal: On the trace, the mean of the diagonal of K at each node, shape ``(t,)``.
     """
 
     num_clusters = 0
@@ -70,13 +71,16 @@ class Subdomains:
         self.trace_parts = parts_of([len(dofs) for dofs in traces])
         shifted = [part.start + dofs for part, dofs in zip(self.dof_parts, traces, strict=True)]
         self.trace = joined(shifted).astype(np.int64)
-        self.diagonal = joined([block.diagonal[block.trace_dofs] for block in self.blocks])
+        means = [node_means(block.diagonal, block.bs) for block in self.blocks]
+        self.diagonal = joined([x[dofs] for x, dofs in zip(means, traces, strict=True)])
 
-    def retrace(self, trace: Array) -> None:
-        """Other rows act on the subdomains, on these trace unknowns of the rank, ascending."""
+    def retrace(self, trace: Array, span: Array | None = None) -> None:
+        """Other rows act on these trace unknowns, ascending, along a span (``Block.act_along``)."""
         for block, part in zip(self.blocks, self.dof_parts, strict=True):
-            first, last = np.searchsorted(trace, (part.start, part.stop))
-            block.retrace(trace[first:last] - part.start)
+            own = slice(*np.searchsorted(trace, (part.start, part.stop)))
+            block.retrace(trace[own] - part.start)
+            if span is not None:
+                block.act_along(span[own])
         self._read_trace()
 
     def update(self, K: Sequence[Any] | None = None, f: Array | None = None) -> None:
@@ -161,12 +165,7 @@ class Subdomains:
 
     def modes_metric(self) -> Array:
         """Cᵀ W C of each body, W the shares, shape ``(b, k, k)``. Collective."""
-
-        def metric(block: Block) -> Array:
-            modes = block.modes
-            return np.asarray(modes.T @ (block.shares[:, None] * modes))
-
-        return self._summed(metric)
+        return self._summed(lambda block: block.modes.T @ (block.shares[:, None] * block.modes))
 
     def moments(self, u: Array) -> Array:
         """Cᵀ W u of each body, shape ``(b, k)``, u on all unknowns. Collective."""
@@ -204,9 +203,7 @@ class Subdomains:
 
     def recover(self, w: Array) -> Array:
         """K⁺(f − w) on all unknowns, shape ``(n,)``; w on the trace, shape ``(t,)``."""
-        force = np.zeros(_end(self.dof_parts))
-        force[self.trace] = w
-        return self.pinv_load - self.solve(force)
+        return self.pinv_load - self.solve(self.extended(w))
 
     def solve(self, b: Array) -> Array:
         """K⁺ b on all unknowns, shape ``(n,)``."""
@@ -226,6 +223,18 @@ class Subdomains:
         pairs = zip(self.blocks, self.dof_parts, strict=True)
         return [float(u[part] @ block.multiply(u[part])) for block, part in pairs]
 
+    def extended(self, v: Array) -> Array:
+        """A trace vector, shape ``(t,)``, on all unknowns, 0 elsewhere, shape ``(n,)``."""
+        u = np.zeros(_end(self.dof_parts))
+        u[self.trace] = v
+        return u
+
+    def sizes(self, u: Array) -> list[float]:
+        """Longest displacement of a node in each Block, u of shape ``(n,)``."""
+        pairs = zip(self.blocks, self.dof_parts, strict=True)
+        nodes = [u[part].reshape(-1, block.bs) for block, part in pairs]
+        return [float(np.linalg.norm(x, axis=1).max(initial=0.0)) for x in nodes]
+
     def _summed(self, matrix: Callable[[Block], Array]) -> Array:
         """k × k matrices of the Blocks, summed by bodies. Collective."""
         total = np.zeros((self.num_bodies, self.num_modes, self.num_modes))
@@ -233,16 +242,6 @@ class Subdomains:
             total[body] += matrix(block)
         self.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
         return total
-
-
-def sums(x: Array, parts: Sequence[slice]) -> list[float]:
-    """Sum over each part of an array."""
-    return [float(x[part].sum()) for part in parts]
-
-
-def sizes(x: Array, parts: Sequence[slice]) -> list[float]:
-    """Largest modulus in each part of an array, 0 where that is empty."""
-    return [float(np.max(np.abs(x[part]), initial=0.0)) for part in parts]
 
 
 def _end(parts: Sequence[slice]) -> int:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from scipy.linalg import null_space
+from scipy.sparse import block_array, csr_array, vstack
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.errors import FactorError
@@ -17,6 +19,55 @@ from tfeti_dolfinx.subdomains.kplus import Making, regularised
 # Of the largest singular value of the kernel's trace rows, orthonormal columns of which these are
 # a part: below it a motion is 0 on the trace but for rounding, and K_ii does not resist it.
 NOT_ON_TRACE = 1e-10
+# of projectors onto directions: more are rounding
+DIGITS = 9
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What rows act on.
+
+    Attributes:
+        trace: Trace unknowns, ascending, shape ``(t,)``.
+        loose: Orthonormal directions of the trace that no row acts along, shape ``(n, l)``: to S
+            they belong to the inside; None where there are none.
+        loose_nodes: The node of each, shape ``(l,)``.
+        key: What tells it from others.
+    """
+
+    trace: Array
+    loose: csr_array | None
+    loose_nodes: Array
+    key: bytes
+
+
+def seen_along(trace: Array, span: Array | None, n: int) -> Seen:
+    """What rows act on that see the nodes of a trace in some directions.
+
+    Args:
+        trace: Trace unknowns, ascending, shape ``(t,)``.
+        span: As for ``Block.act_along``; None: in all directions.
+        n: Number of all unknowns.
+    """
+    nothing = np.empty(0, dtype=np.int64)
+    if span is None:
+        return Seen(trace, None, nothing, trace.tobytes())
+    bs = span.shape[1]
+    nodes, place = np.unique(trace // bs, return_inverse=True)
+    left = np.zeros((len(nodes), bs, bs))
+    left[place, trace % bs] = -span
+    left[place, trace % bs, trace % bs] += 1.0
+    at = np.flatnonzero(np.trace(left, axis1=1, axis2=2) > 0.5)
+    values, vectors = np.linalg.eigh(left[at])
+    which, k = np.nonzero(values > 0.5)
+    if len(which) == 0:
+        return Seen(trace, None, nothing, trace.tobytes())
+    node, axes = nodes[at[which]], vectors[which, :, k]
+    rows, columns = node[:, None] * bs + np.arange(bs), np.indices(axes.shape)[0]
+    entries = axes.ravel(), (rows.ravel(), columns.ravel())
+    # rounded, so that equal subdomains on an oblique plane share it
+    key = trace.tobytes() + (np.round(span, DIGITS) + 0.0).tobytes()
+    return Seen(trace, csr_array(entries, shape=(n, len(node))), node, key)
 
 
 class Traced:
@@ -27,18 +78,17 @@ class Traced:
         K: Stiffness, scipy CSR, shape ``(n, n)``.
         kernel: R, shape ``(n, r)``.
         x: Points of the nodes.
-        trace: Trace unknowns, ascending, shape ``(t,)``.
+        seen: The trace, and the directions of S.
         how: How inverses are made.
 
     Attributes:
+        seen: The trace, and the directions of S.
         trace: Trace unknowns.
         users: How many Blocks use it.
     """
 
-    def __init__(
-        self, name: str, K: Any, kernel: Array, x: Array, trace: Array, how: Making
-    ) -> None:
-        self.trace, self.users = trace, 0
+    def __init__(self, name: str, K: Any, kernel: Array, x: Array, seen: Seen, how: Making) -> None:
+        self.seen, self.trace, self.users = seen, seen.trace, 0
         self._name, self._K, self._kernel, self._x, self._how = name, K, kernel, x, how
 
     def apply_stiffness(self, w: Array) -> Array:
@@ -59,7 +109,10 @@ class Traced:
     @cached_property
     def K_ib(self) -> Any:
         """K between the inside and the trace."""
-        return self._K[:, self.trace][self._inner_dofs]
+        K_b, loose = self._K[:, self.trace], self.seen.loose
+        if loose is None:
+            return K_b[self._inner_dofs]
+        return csr_array(vstack((K_b[self._inner_dofs], loose.T @ K_b)))
 
     @cached_property
     def _K_bi(self) -> Any:
@@ -72,16 +125,21 @@ class Traced:
 
         None where there is no inside, or no trace that would ask for it.
         """
-        inner = self._inner_dofs
-        if len(inner) == 0 or len(self.trace) == 0:
+        inner, loose = self._inner_dofs, self.seen.loose
+        if (len(inner) == 0 and loose is None) or len(self.trace) == 0:
             return None
-        R_inner = self._kernel[inner] @ self._motions_not_on_trace()
+        kernel = self._kernel @ self._motions_not_on_trace()
+        R_inner, node = kernel[inner], inner // (self._K.shape[0] // len(self._x))
         self._how.counters.factorizations += 1
         self._how.counters.analyses += 1
         K_ii = self._K[inner][:, inner]
-        bs = self._K.shape[0] // len(self._x)
+        if loose is not None:
+            K_l = csr_array(self._K @ loose)
+            K_ii = csr_array(block_array([[K_ii, K_l[inner]], [K_l[inner].T, loose.T @ K_l]]))
+            R_inner = np.concatenate((R_inner, loose.T @ kernel))
+            node = np.concatenate((node, self.seen.loose_nodes))
         try:
-            return regularised(K_ii, R_inner, fixing_dofs(self._x, inner // bs), self._how.prefix)
+            return regularised(K_ii, R_inner, fixing_dofs(self._x, node), self._how.prefix)
         except FactorError as error:
             raise FactorError(
                 f"{self._name}: the stiffness of the unknowns that no row touches, for the "
@@ -97,7 +155,10 @@ class Traced:
     def _motions_not_on_trace(self) -> Array:
         """Coefficients of the motions of the kernel that are 0 on the trace."""
         # the triangle has the null space of the rows, and few rows itself
-        triangle = np.linalg.qr(self._kernel[self.trace], mode="r")
+        rows = self._kernel[self.trace]
+        if (loose := self.seen.loose) is not None:
+            rows = rows - loose[self.trace] @ (loose.T @ self._kernel)
+        triangle = np.linalg.qr(rows, mode="r")
         return np.asarray(null_space(triangle, rcond=NOT_ON_TRACE))
 
     @property
