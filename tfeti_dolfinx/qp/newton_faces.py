@@ -235,7 +235,7 @@ class FaceSolver:
         """What PCPG aims at: a part of what there is to do; more where the face stays."""
         z.g.copy(self._directions.r)
         self.coarse.project(self._directions.r)
-        start, final = float(self._directions.r.norm()), FINAL * self._rule.tolerance
+        start, final = float(self._directions.r.norm()), FINAL * self._rule.aim
         followed = self._stayed and self.curved and optimality <= FOLLOWED * self.left
         self._stage = STAGE if not stays else self._stage**2 if followed else self._stage
         self._stayed = stays
