@@ -79,8 +79,8 @@ def _ball() -> Plan:
     return plan(name, cases, 10.0)
 
 
-def _punch() -> Plan:
-    name, sizes = "rounded punch", (6.0, 12.0, 24.0, 48.0)
+def _half_planes(name: str) -> Plan:
+    sizes = (6.0, 12.0, 24.0, 48.0)
     cases = both(name, sizes, order=1)
     cases.append(case(name, (1.0, 2.0, 4.0), mesh=UNIFORM))
     cases += both(name, sizes, order=1, ranks=2)
@@ -108,7 +108,8 @@ def _cylinder() -> Plan:
 PLANS = {
     "half cylinder": _line(),
     "half ball": _ball(),
-    "rounded punch": _punch(),
+    "rounded punch": _half_planes("rounded punch"),
+    "partial slip": _half_planes("partial slip"),
     "shrink fit": _rings(),
     "cylinder on block": _cylinder(),
 }

@@ -14,6 +14,7 @@ import tfeti_dolfinx as tfeti
 from benchmarks.profiles import Array, Samples
 from demos import adaptive_2d, cylinder_on_block_2d, hertz_3d
 from demos import cattaneo_mindlin_2d as half_planes_2d
+from demos.partial_slip import pushed
 from meshes import cylinder_on_block, half_ball, half_cylinder, half_planes, rings
 
 UNIFORM, GRADED, ADAPTIVE = "uniform", "graded", "adaptive"
@@ -33,6 +34,8 @@ class Scene:
         exact: The closed form there.
         place: From points of the contact, shape ``(n, 3)``, to places along it.
         young: Young's modulus at points.
+        force: What is compared there, of the contact's data.
+        solve: Solves the problem, in load steps where it takes some.
     """
 
     build: Callable[[float, str], Any]
@@ -41,6 +44,8 @@ class Scene:
     exact: Array
     place: Callable[[Array], Array] = lambda points: points[:, :1]
     young: Callable[[Array], Array] = lambda points: np.ones(len(points))
+    force: Callable[[Any], Array] = lambda data: data.pressure
+    solve: Callable[[tfeti.ContactProblem], None] = lambda problem: problem.solve()
 
 
 def grading(elements: float, mesh: str, a: float, rate: float) -> dict[str, float]:
@@ -164,6 +169,42 @@ def _punch() -> Scene:
     )
 
 
+# of the force at which all slips
+PUSH = 0.5
+
+
+def _slip() -> Scene:
+    """The demo in two steps; what friction leaves, μp − |q|, is Hertz's pressure on |x| < c."""
+    closed, loads = half_planes_2d.CLOSED, []
+    force = PUSH * closed.capacity
+    left = closed.taken(force)
+    samples = Samples.line(left.half_width)
+
+    def make(d: tfeti.Decomposition, degree: int) -> dict[str, Any]:
+        own, parts = half_planes_2d.scene(d, degree)
+        loads[:] = [own]
+        return parts
+
+    def solve(problem: tfeti.ContactProblem) -> None:
+        pushed(problem, loads[0], closed, 0.0)
+        loads[0].set(closed.hertz.load, force)
+        problem.solve()
+
+    def unused(data: Any) -> Array:
+        return closed.mu * data.pressure - np.linalg.norm(data.tangential_traction, axis=1)
+
+    return Scene(
+        build=lambda n, mesh: half_planes.build(
+            half_planes_2d.L, **grading(n, mesh, closed.hertz.half_width, 3.6)
+        ),
+        make=make,
+        samples=samples,
+        exact=samples.exact(left.pressure),
+        force=unused,
+        solve=solve,
+    )
+
+
 OVERLAP = rings.MIDDLE / 1500
 
 
@@ -198,6 +239,7 @@ SCENES: dict[str, Callable[[], Scene]] = {
     "half cylinder": _line,
     "half ball": _ball,
     "rounded punch": _punch,
+    "partial slip": _slip,
     "shrink fit": _rings,
     "cylinder on block": _cylinder,
 }

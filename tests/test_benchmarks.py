@@ -234,6 +234,17 @@ def test_time_against_error(serial_only, shared_tmp, comm):
         assert all(row["energy, slope over unknowns"] < 0.0 for row in groups)
 
 
+@pytest.mark.slow
+def test_partial_slip_against_its_closed_form(serial_only, shared_tmp, comm):
+    """What friction leaves of μp is compared where Cattaneo says that nothing slips."""
+    words = ["--ranks", "1", "--scenes", "partial slip"]
+    rows = quick(time_against_error, shared_tmp, comm, *words)["partial slip"]
+    linear, finer, *_ = rows
+    assert finer["energy"] < 0.5 * linear["energy"]
+    assert finer["pressure, closed form"] < 0.5 * linear["pressure, closed form"]
+    assert max(abs(row["a"]) for row in (linear, finer)) < 0.01
+
+
 def test_seconds_at_an_error_are_between_two_meshes():
     rows = [{"e": 0.08, "seconds": 1.0}, {"e": 0.04, "seconds": 4.0}, {"e": 0.01, "seconds": 64.0}]
     found = [time_against_error.seconds_at(rows, "e", level) for level in (0.1, 0.04, 0.02, 0.001)]

@@ -9,6 +9,7 @@ from scipy.sparse import diags_array
 from test_qp import bounds_on, matrix, vector
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
+from tfeti_dolfinx.qp.dependent import DependentRows
 from tfeti_dolfinx.qp.directions import Directions
 from tfeti_dolfinx.qp.feasible_sets import Product
 from tfeti_dolfinx.qp.homogenised import homogenise, image
@@ -85,6 +86,45 @@ def test_random_programs(kind, seed):
     F, d, G, e, bounded = program(seed, kind)
     result = solved(qp_of(F, d, G, e, bounded), 1e-9)
     check_optimal(F, d, G, e, bounded, result, 1e-8)
+
+
+def many_rows(seed, near=1e-3, m=60, rank=24):
+    """A program whose bounded rows depend on each other but for ``near`` of them."""
+    rng = np.random.default_rng(seed)
+    B = rng.uniform(size=(m, rank)) * (rng.uniform(size=(m, rank)) < 0.2)
+    F = B @ B.T + near**2 * np.diag(rng.uniform(1.0, 2.0, m))
+    G, feasible = B[:, :2].T.copy(), rng.uniform(size=m) * (rng.uniform(size=m) < 0.3)
+    return F, F @ feasible + 0.3 * rng.standard_normal(m), G, G @ feasible, np.arange(m)
+
+
+def test_rows_leave_as_they_block_where_all_at_once_raises_the_cost(monkeypatch):
+    """Where many rows nearly depend on each other, the face without all that went out is small."""
+    programs, counts = [many_rows(seed) for seed in range(6)], []
+    for bold in (False, True):
+        if bold:
+            never = property(lambda _: False, lambda *_: None)
+            monkeypatch.setattr(FaceSolver, "cautious", never, raising=False)
+        counts.append(0)
+        for F, d, G, e, bounded in programs:
+            qp = qp_of(F, d, G, e, bounded)
+            check_optimal(F, d, G, e, bounded, solved(qp, 1e-9), 1e-8)
+            counts[-1] += qp.F.count
+    assert counts[0] <= 0.85 * counts[1], counts
+
+
+def test_what_has_just_come_into_a_face_stays_where_something_else_goes_out():
+    """The first bound of a flat way is its start, but rows that go inwards are off theirs then."""
+    F, d = np.zeros((4, 4)), np.ones(4)
+    qp = QP(Counted(F), vector(d), NoCoarse(vector(d)), bounds_on(np.arange(4)))
+    directions = Directions(qp.d)
+    directions.norm = 1.0
+    rows, lam = DependentRows(qp, directions), np.array([0.0, 0.0, 0.0, 2.0])
+    for move in (rows.shorten, rows.stop):
+        before = Point(vector(lam), vector(-d))
+        z = Point(vector(lam + [1.0, -1.0, 0.5, -1.0]), vector(-d))
+        move(before, z)
+        assert (qp.feasible.project(z.lam.array_r) > 0.0).tolist() == [True, False, True, True]
+        assert np.allclose(z.lam.array_r, lam, rtol=0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", KINDS[:2])

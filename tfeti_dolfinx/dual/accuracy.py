@@ -31,9 +31,10 @@ AT_REST = 1e-14
 SMALL, LITTLE = 1e-2, 0.01
 # the first look is taken at this power of rtol, to learn how far things move
 FIRST_LOOK = 0.5
-# a new tolerance aims a little below what was asked for; it never falls by more than LEAP at
-# once, since the size of the displacement may have been learnt from a poor iterate
-AIM, LEAP = 0.5, 1e-6
+# a new tolerance aims a little below what was asked for, less where a bound of the error in energy
+# asks for it, which follows residuals; it never falls by more than LEAP at once, since the size of
+# the displacement may have been learnt from a poor iterate
+AIM, AIM_AT_BOUND, LEAP = 0.5, 1.0, 1e-6
 # a true residual that fell by fewer digits than this share of those that the solver's own fell by
 # has stalled: once, and the gradient is made anew; twice, and rounding has the last word
 STALL = 0.5
@@ -106,6 +107,11 @@ class Accuracy:
         self.goal: Goal | None = None
         self.reached: list[Reached] = []
 
+    @property
+    def aim(self) -> float:
+        """The tolerance; 0 before a first look at a goal, which is dearer than a step or two."""
+        return 0.0 if self.goal is not None and self.looks == 0 else self.tolerance
+
     def look(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float) -> Measures:
         """Measure an iterate. Collective."""
         before, error = self.measures, residual / self.norm
@@ -136,7 +142,8 @@ class Accuracy:
             return ConvergedReason.CONVERGED_RTOL
         if longest <= self._atol:
             return ConvergedReason.CONVERGED_ATOL
-        tolerance = residual * max(AIM / (ratio if ratio > 1.0 else in_energy), LEAP)
+        aim = AIM_AT_BOUND if agreed(comm, self._over_goal() >= ratio) else AIM
+        tolerance = residual * max(aim / (ratio if ratio > 1.0 else in_energy), LEAP)
         if ratio <= 1.0:
             tolerance = max(tolerance, self._small)
         elif tolerance < OUT_OF_REACH * self._rounding:
@@ -225,9 +232,15 @@ class Accuracy:
             (now.penetration, allowed.penetration),
             (now.balance, allowed.balance),
             (now.error, allowed.energy),
-            *((last.bound.error, last.allowed) for last in self.reached[-1:]),
         ]
-        return max(float(error) / max(float(limit), TINY) for error, limit in pairs)
+        own = max(float(error) / max(float(limit), TINY) for error, limit in pairs)
+        return max(own, self._over_goal())
+
+    def _over_goal(self) -> float:
+        """The bound at the last look over what the goal allows; 0 without a goal."""
+        if not self.reached:
+            return 0.0
+        return self.reached[-1].bound.error / max(self.reached[-1].allowed, TINY)
 
     def relative_error(self) -> float:
         """Largest estimated error of a body over its largest displacement."""

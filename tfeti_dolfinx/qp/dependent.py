@@ -16,6 +16,9 @@ from tfeti_dolfinx.qp.problem import QP, FaceOperator, Point
 LOOSE = 1e-8
 # of the way to the first bound, where nothing else ends it: more rows than one are to leave
 BEYOND = 10.0
+# of a way, beyond its first bound: what blocks it is out then, and what has just come into the
+# face, at its bound as yet, is off it if it goes inwards, and stays in the face
+ONWARDS = 1e-12
 # projections to find forces in Ω on such a way: between two rows each halves what is missing
 ALTERNATIONS = 10
 # of d: rows that want gaps so far apart exclude each other, less may be rounding
@@ -125,7 +128,21 @@ class DependentRows:
         loose = p.dot(Fp) <= LOOSE * self._directions.norm * p.dot(p)
         if agreed(self._comm, length < 1.0 and loose):
             z.take(before)
-            z.move(max(length, 0.0) * BEYOND, p, Fp)
+            z.move(max(length, 0.0) * BEYOND + ONWARDS, p, Fp)
+        p.destroy()
+        Fp.destroy()
+
+    def stop(self, before: Point, z: Point) -> None:
+        """Take z back to where the way from ``before`` first leaves Ω; q is lower there, too.
+
+        What blocks it is at its bound there; F λ − d is known, and Gλ = e kept.
+        """
+        p, Fp = z.lam.copy(), z.g.copy()
+        p.axpy(-1.0, before.lam)
+        Fp.axpy(-1.0, before.g)
+        length = self._to_a_bound(before, p.array_r)
+        z.take(before)
+        z.move(min(max(length, 0.0) + ONWARDS, 1.0), p, Fp)
         p.destroy()
         Fp.destroy()
 

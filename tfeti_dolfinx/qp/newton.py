@@ -146,14 +146,14 @@ def newton(
         start.destroy()
         trial = longer(state, trial, faces)
         # Step 4: accept where q falls enough
-        if faces.contradicts:
+        if faces.dependent.contradicts:
             reason = ConvergedReason.DIVERGED_CONTRADICTION
         elif not accept(state, trial, faces) or state.stalled or faces.rounded > 1:
             reason = ConvergedReason.DIVERGED_ROUNDING
         trial.destroy()
         steps.outer, looked = steps.outer + 1, True
     result = state.result(reason, steps)
-    result.excluding = faces.excluding
+    result.excluding = faces.dependent.excluding
     faces.destroy()
     state.destroy()
     return result

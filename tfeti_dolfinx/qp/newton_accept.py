@@ -9,8 +9,8 @@ import numpy as np
 from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.newton_curved import (
+    PARTS,
     brought_back,
-    brought_parts,
     gradient_on,
     is_curved,
     part_of_way,
@@ -31,6 +31,8 @@ SHORTER = 0.5
 PAST = 1.0 + 1e-14
 # solves on a face that stays, after the one at whose end q was not low enough
 LONGER = 2
+# solves on smaller and smaller faces that are few enough to let rows go one by one in the next step
+FEW_ROUNDS = 10
 
 
 def _enough(state: Iterate) -> float:
@@ -54,7 +56,7 @@ def longer(state: Iterate, trial: Trial, faces: FaceSolver) -> Trial:
         The trial, maybe with another end.
     """
     for _ in range(LONGER):
-        changed = trial.feasible and trial.rounds > 1 and not faces.contradicts
+        changed = trial.feasible and trial.rounds > 1 and not faces.dependent.contradicts
         if not (changed and agreed(state.comm, state.gain(trial.last) < _enough(state))):
             break
         face = _face_at(state, trial.last, faces)
@@ -82,7 +84,8 @@ def accept(state: Iterate, trial: Trial, faces: FaceSolver) -> bool:
     Args:
         state: The iterate; moved.
         trial: What solves on faces have come to.
-        faces: The solver; it is told whether it may go on from there.
+        faces: The solver; it is told whether it may go on from there, and whether to let rows go
+            as boldly next time.
 
     Returns:
         Whether q could be lowered.
@@ -91,7 +94,10 @@ def accept(state: Iterate, trial: Trial, faces: FaceSolver) -> bool:
     gain = state.gain(trial.last)
     hidden = ROUNDING * slipping_work(state.point.lam, state.s, trial.face)
     stays = gain <= 0.0 and state.idle > 1  # what is left is not on the face, but maybe Gλ ≠ e
-    if trial.feasible and agreed(state.comm, gain >= enough - hidden and not stays):
+    taken = trial.feasible and agreed(state.comm, gain >= enough - hidden and not stays)
+    raised = not taken and trial.rounds > 1
+    faces.cautious = raised or (faces.cautious and trial.rounds <= FEW_ROUNDS)
+    if taken:
         state.take(trial.last, gain)
         faces.settle()
         return True
@@ -100,7 +106,7 @@ def accept(state: Iterate, trial: Trial, faces: FaceSolver) -> bool:
     curved = is_curved(state.qp, trial.face)
     shares = [length] if not curved or trial.rounds > 1 else []
     shares += [SHORTER * length, SHORTER**2 * length] if curved else []
-    for share in agreed(state.comm, brought_parts(curved, length, state.slow > 0)):
+    for share in PARTS if curved else ():
         if _went_to(state, projected_part(state.qp, state.point, trial.first, share), enough):
             return True
     taken = any(_shortened(state, trial, share, curved, enough) for share in shares)

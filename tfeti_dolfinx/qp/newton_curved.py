@@ -19,10 +19,8 @@ EXACT = 1e-13
 # points looked at on the way back to circles: it is short, or there is no such way
 BACK = 30
 # of a way along a face that is curved, with all that leaves Ω brought back, which lets go many
-# nodes at once; of one along any face that leaves Ω nearly at once, before the share EARLY of it:
-# to the first bound only, one node would go at a time, and solves on all others be for nothing
+# nodes at once
 PARTS = (0.5, 0.125)
-EARLY, FEW = 0.1, (0.5, 0.1, 0.02, 4e-3, 8e-4)
 
 
 class Bent:
@@ -156,20 +154,6 @@ def part_of_way(at: Point, end: Point, share: float) -> Point:
         kept.scale(1.0 - share)
         kept.axpy(share, last)
     return part
-
-
-def brought_parts(curved: bool, length: float, slow: bool) -> tuple[float, ...]:
-    """Parts of a way that may be gone with all that leaves Ω brought back, the longest first.
-
-    Args:
-        curved: Whether the face is.
-        length: Of the way to the first bound.
-        slow: Whether the step before has not halved ‖g^P‖, either.
-    """
-    if curved:
-        return PARTS
-    early = slow and length < EARLY
-    return tuple(share for share in FEW if early and 2.0 * length < share)
 
 
 def projected_part(qp: QP, at: Point, end: Point, share: float) -> Point:

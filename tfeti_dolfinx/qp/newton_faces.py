@@ -5,9 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from petsc4py import PETSc
 
-from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.parallel import agreed, any_rank
 from tfeti_dolfinx.qp.coarse import HELD, Coarse
 from tfeti_dolfinx.qp.dependent import DependentRows
@@ -25,7 +23,7 @@ from tfeti_dolfinx.qp.newton_curved import (
     restored_on,
 )
 from tfeti_dolfinx.qp.parameters import NewtonParameters
-from tfeti_dolfinx.qp.pcpg import SHORT, pcpg
+from tfeti_dolfinx.qp.pcpg import pcpg
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, FaceOperator, Point, Steps
 from tfeti_dolfinx.qp.stopping import StoppingRule, TargetRule
 from tfeti_dolfinx.qp.trial import Trial
@@ -58,9 +56,12 @@ class FaceSolver:
         monitor: Called after each.
 
     Attributes:
+        dependent: What to do where rows of the face depend on each other.
         settled: Whether λ is where PCPG has stopped on the face entered.
         curved: Whether that face is curved.
         left: The residual there.
+        cautious: Whether rows leave a flat face as they block the way, not all that are out at its
+            end: then q falls for certain, but fewer leave for as many solves.
         rounded: So many solves in a row ended at rounding, or with no row at the end of a flat way.
     """
 
@@ -78,11 +79,11 @@ class FaceSolver:
         self._comm = qp.d.getComm().tompi4py()
         self._directions = Directions(qp.d)
         self._directions.norm = qp.seen
-        self._dependent = DependentRows(qp, self._directions)
+        self.dependent = DependentRows(qp, self._directions)
         self._face: Face | None = None
         self._eased: Eased
         self.settled, self.curved, self._accepted, self.left = False, False, False, np.inf
-        self._on_face, self.rounded, self._woken = qp, 0, 0
+        self._on_face, self.rounded, self._woken, self.cautious = qp, 0, 0, False
         self._bent: Bent | None = None
         self._preconditioner: FaceOperator | None = None
         self._prepared, self._stayed, self._stage, self._size = False, False, STAGE, 0.0
@@ -92,30 +93,9 @@ class FaceSolver:
         """Largest Rayleigh quotient of F seen; at most ‖F‖."""
         return self._directions.norm
 
-    @property
-    def contradicts(self) -> bool:
-        """Whether rows of the face exclude each other."""
-        return self._dependent.contradicts
-
-    @property
-    def excluding(self) -> Array:
-        """The local rows that do."""
-        return self._dependent.excluding
-
     def saw(self, curvature: float, size: float) -> None:
         """Another Rayleigh quotient."""
         self._directions.seen(curvature, size)
-
-    def see(self, point: Point, s: PETSc.Vec) -> None:
-        """Rayleigh quotients at λ, which alone may be far below ‖F‖, and at Ps. Collective."""
-        lam, way, image = point.lam, s.copy(), s.duplicate()
-        self.saw(lam.dot(point.g) + lam.dot(self._qp.d), lam.dot(lam))
-        self._qp.coarse.project(way)
-        if agreed(self._comm, way.norm() > SHORT * s.norm()):
-            self._qp.F.mult(way, image)
-            self.saw(way.dot(image), way.dot(way))
-        way.destroy()
-        image.destroy()
 
     @property
     def coarse(self) -> Coarse:
@@ -152,8 +132,8 @@ class FaceSolver:
             return
         if self._qp.preconditioner_on is not None:
             self._preconditioner = self._qp.preconditioner_on(self._eased.face)
-        self._dependent.preconditioner = self._preconditioner
-        self._dependent.face = self._eased.face
+        self.dependent.preconditioner = self._preconditioner
+        self.dependent.face = self._eased.face
         self._bent = Bent(self._qp.F, self._eased.face) if self.curved else None
         on = replace(self._on_face, F=self._bent or self._qp.F, preconditioner=self._preconditioner)
         past = None if self.curved or on.recycled is None else on.recycled.on(self._eased.face)
@@ -186,8 +166,8 @@ class FaceSolver:
             self._ready()
             assert self._face is not None
             target = self._target(z, optimality, stays)
-            bound = self._dependent.slack(z, target)
-            if self.contradicts:
+            bound = self.dependent.slack(z, target)
+            if self.dependent.contradicts:
                 break
             if bound is not None:
                 first = first or bound
@@ -196,27 +176,43 @@ class FaceSolver:
             before = z.copy()
             broken = self._pcpg(z, target) == ConvergedReason.DIVERGED_INDEFINITE_MAT
             stays, rounds = False, rounds + 1
-            self._dependent.shorten(before, z)
-            before.destroy()
+            self.dependent.shorten(before, z)
             if first is None:
                 first, face = z.copy(), self._face
             out = has_left(self._qp, self._face, z.lam.array_r)
             ends = self._steps.cg >= self._max_it or self._woken >= MOST_WOKEN
-            if ends or not (out or (broken and self._dependent.slide(z))):
+            ends = ends or not (out or (broken and self.dependent.slide(z)))
+            if not ends:
+                self.rounded = self.rounded if out else 0
+                out = not self._let_go(before, z)
+            before.destroy()
+            if ends:
                 break
-            self.rounded = self.rounded if out else 0
-            z.lam.array[:] = self._qp.feasible.project(z.lam.array_r)
-            self._drop(z)
         assert self._face is not None
         back = not out and (not self.curved or self._eased.back(self._qp, self.coarse, z))
         return Trial(first or z.copy(), z, back, face, rounds)
 
-    def _drop(self, z: Point) -> None:
-        """Enter the face of z, and bring z back to Gλ = e in it; multiplies by F once."""
+    def _let_go(self, before: Point, z: Point) -> bool:
+        """What has left Ω leaves the face, or what did so first; whether z stays in Ω then."""
+        blocked = self.cautious and not self.curved
+        if blocked:
+            self.dependent.stop(before, z)
+        z.lam.array[:] = self._qp.feasible.project(z.lam.array_r)
+        self._drop(z, blocked)
+        return blocked and not self.curved
+
+    def _drop(self, z: Point, restored: bool = False) -> None:
+        """Enter the face of z, and bring z back to Gλ = e in it; multiplies by F once.
+
+        Not on a flat face where z has kept it.
+        """
         previous, feasible = self._face, self._qp.feasible
         assert previous is not None
         on = np.array(z.lam.array_r)
         self.enter(feasible.face(on, z.g.array_r))
+        if restored and not self.curved:
+            self.forget()
+            return
         of = (self._qp, self.coarse, self._eased.face)
         near = restored_on(*of, z.lam)
         wild = agreed(self._comm, near.norm() > WILD * max(z.lam.norm(), self._size))
@@ -239,7 +235,7 @@ class FaceSolver:
         """What PCPG aims at: a part of what there is to do; more where the face stays."""
         z.g.copy(self._directions.r)
         self.coarse.project(self._directions.r)
-        start, final = float(self._directions.r.norm()), FINAL * self._rule.tolerance
+        start, final = float(self._directions.r.norm()), FINAL * self._rule.aim
         followed = self._stayed and self.curved and optimality <= FOLLOWED * self.left
         self._stage = STAGE if not stays else self._stage**2 if followed else self._stage
         self._stayed = stays
@@ -271,7 +267,7 @@ class FaceSolver:
             self._on_face.coarse.destroy()
         if self._preconditioner is not None:
             self._preconditioner.destroy()
-        self._preconditioner = self._dependent.preconditioner = None
+        self._preconditioner = self.dependent.preconditioner = None
         self._face, self._prepared = None, False
 
     def destroy(self) -> None:

@@ -15,6 +15,7 @@ from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.nearest import nearest
 from tfeti_dolfinx.qp.newton_curved import slipping_start
 from tfeti_dolfinx.qp.newton_faces import FaceSolver
+from tfeti_dolfinx.qp.pcpg import SHORT
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, QPResult, Steps
 
 # of Fλ − d: where Gᵀμ is nearly all of it, as where gaps are large, it is taken out of d
@@ -91,7 +92,7 @@ class Iterate:
         """Optimality: how far a gradient step, brought back to the feasible set, moves."""
         self._set_multipliers()
         if faces.norm == 0.0:
-            faces.see(self.point, self.s)
+            self._learn_norm(faces)
         self.norm = faces.norm or 1.0
         if faces.settled:
             self.multipliers_on(faces)
@@ -112,6 +113,17 @@ class Iterate:
         self.idle, self.slow = self.idle + 1, self.slow + 1
         if self.residual <= 0.5 * self._best:
             self._best, self.idle, self.slow = self.residual, 0, 0
+
+    def _learn_norm(self, faces: FaceSolver) -> None:
+        """Rayleigh quotients at λ, which alone may be far below ‖F‖, and at Ps."""
+        lam, way, image = self.point.lam, self.s.copy(), self.s.duplicate()
+        faces.saw(lam.dot(self.point.g) + lam.dot(self.qp.d), lam.dot(lam))
+        self.qp.coarse.project(way)
+        if agreed(self.comm, way.norm() > SHORT * self.s.norm()):
+            self.qp.F.mult(way, image)
+            faces.saw(way.dot(image), way.dot(way))
+        way.destroy()
+        image.destroy()
 
     def _set_multipliers(self) -> None:
         self.qp.coarse.combine(self.mu, self.s)

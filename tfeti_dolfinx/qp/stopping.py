@@ -18,6 +18,8 @@ class StoppingRule(Protocol):
 
     Attributes:
         tolerance: Norm of the residuals from which on an examination is worth its price.
+        aim: What solves on faces come down to at most: the tolerance, or 0 where an examination
+            is to wait until one of them is done.
         drifted: Set where an examination finds that the solver's gradient is no longer true;
             the solver makes it anew and takes the flag back.
         norm: ‖F‖, or an estimate: residuals over it are errors of multipliers. A solver that
@@ -27,6 +29,11 @@ class StoppingRule(Protocol):
     tolerance: float
     drifted: bool
     norm: float
+
+    @property
+    def aim(self) -> float:
+        """What solves on faces come down to at most."""
+        ...
 
     def examine(
         self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float
@@ -54,6 +61,11 @@ class ResidualRule:
 
     def __init__(self, tolerance: float) -> None:
         self.tolerance, self.drifted, self.norm = tolerance, False, 1.0
+
+    @property
+    def aim(self) -> float:
+        """The tolerance."""
+        return self.tolerance
 
     def examine(
         self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float
