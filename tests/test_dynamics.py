@@ -308,3 +308,24 @@ def test_steps_in_which_a_wave_crosses_subdomains_cost_no_more(share, soft):
     assert report.soft_modes == soft
     assert report.F_multiplications <= 14
     assert report.kernel_dim == 0
+
+
+def multiplications(cold=False, **keywords):
+    """Median of 24 steps with cτ/H = 0.1 of a square that comes down on a plane."""
+    own = {"subdomains": sixteenths, "stabilised": True, "rtol": 1e-6, **keywords}
+    scene = Thrown("quadrilateral", 16, gap=0.0, **own)
+    counts = []
+    for _ in range(24):
+        if cold:
+            scene.problem._start = None
+        scene.step(0.025 / np.sqrt(0.7 / 1.3 / 0.4))
+        counts.append(scene.problem.report.F_multiplications)
+    scene.problem.destroy()
+    return np.median(counts)
+
+
+def test_steps_save_multiplications_by_those_before():
+    """4 that begin with nothing, 3 that begin with the last forces, 2 with directions kept."""
+    cold = multiplications(cold=True)
+    assert multiplications() <= 0.75 * cold
+    assert multiplications(recycle=60) <= 2 / 3 * cold
