@@ -1,5 +1,6 @@
 """Subdomains with boundary elements: their matrices, loads, and scenes with finite elements."""
 
+import dolfinx
 import numpy as np
 import pytest
 import ufl
@@ -173,11 +174,11 @@ def test_subdomains_do_not_matter_much_and_unknowns_are_those_on_surfaces():
 STRETCH = np.array([0.1, -0.1 * 0.3 / 0.7])
 
 
-def tension(d, elements):
-    """Two volumes under uniaxial tension, solved."""
+def tension(d, elements, t=None):
+    """Two volumes under uniaxial tension, solved; given t, it can be changed afterwards."""
     V, a, _ = forms(d.mesh, d.facet_tags, (0.0, 0.0), d.surface("top"))
     ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
-    t = fem.Constant(d.mesh, (0.1 / (1 - 0.3**2), 0.0))
+    t = fem.Constant(d.mesh, (0.1 / (1 - 0.3**2), 0.0)) if t is None else t
     rollers = [
         fem.dirichletbc(0.0, fem.locate_dofs_topological(V.sub(i), 1, d.facets(s)), V.sub(i))
         for i, s in enumerate(("left", "bottom"))
@@ -326,6 +327,37 @@ def test_fields_inside_of_constant_stresses():
         mises = p.solution.interior.von_mises.x.array
         assert np.abs(mises - t * np.sqrt(1 - 0.3 + 0.3**2)).max(initial=0.0) < 1e-8
         p.destroy()
+
+
+@pytest.mark.skipif(not dolfinx.has_adios2, reason="DOLFINx without ADIOS2")
+def test_fields_inside_in_each_step_of_a_series(shared_tmp):
+    """What the file gets is what the checkpoint keeps, at the times of the steps."""
+    d, full = two_volumes(), 0.1 / (1 - 0.3**2)
+    t = fem.Constant(d.mesh, (full, 0.0))
+    p = tension(d, tfeti.BoundaryElements("low"), t)
+    path, folder = shared_tmp / "inside" / "series.bp", shared_tmp / "inside" / "checkpoint"
+
+    def apply(problem, time):
+        t.value[0] = time * full
+
+    def series(times, resume=False, **keywords):
+        steps = tfeti.LoadSteps(p, apply, times, path=path, checkpoint=folder, **keywords)
+        return steps.run(resume=resume)
+
+    series([0.5, 1.0], interior=True)
+    for number, time in ((1, 0.5), (2, 1.0)):
+        with np.load(folder / f"fields_{number}_{d.comm.rank}.npz") as fields:
+            stress = fields["interior_stress"].reshape(-1, 3, 3)
+            assert np.abs(stress - time * np.diag([full, 0.0, 0.3 * full])).max(initial=0.0) < 1e-8
+            assert {"interior_displacement", "interior_von_mises"} <= set(fields)
+    series([0.5, 1.0, 1.5], resume=True, interior=True)
+    for name in ("series.bp", "series_cells.bp"):
+        assert (path.parent / name / "md.idx").stat().st_size == 64 * (1 + 3)
+    assert not list(path.parent.glob(".*"))
+    series([0.5, 1.0])
+    with pytest.raises(tfeti.InputError, match="checkpoint has no field interior_displacement"):
+        series([0.5, 1.0, 1.5], resume=True, interior=True)
+    p.destroy()
 
 
 @pytest.mark.parametrize(("cell", "sizes"), [("triangle", (8, 16)), ("hexahedron", (3, 6))])

@@ -289,8 +289,14 @@ def test_a_killed_series_goes_on_to_the_same_answer(
     found, expected = np.load(tmp_path / "found.npz"), whole(ranks, scene)
     assert set(found) == set(expected)
     for name in expected:
-        scale = np.abs(expected[name]).max(initial=0.0)
-        assert np.allclose(found[name], expected[name], rtol=0, atol=1e-12 * scale), name
+        values, scale = found[name], np.abs(expected[name]).max(initial=0.0)
+        if name == "F" and scene in ("stabilised", "thrown"):
+            # without a kernel F of a start is known, but not in a new run
+            assert values[done] - expected[name][done] in (0, 1)
+            values = np.concatenate(
+                (values[:done], expected[name][done : done + 1], values[done + 1 :])
+            )
+        assert np.allclose(values, expected[name], rtol=0, atol=1e-12 * scale), name
     assert number_of_steps(tmp_path / "series.bp") == len(TIMES)
     left = {f.name for f in tmp_path.iterdir()}
     assert left == {"checkpoint", "found.npz", "series.bp", "series_cells.bp"}
@@ -328,6 +334,10 @@ def test_mistakes(shared_tmp):
         r"series.vtk: expected a name that ends with .bp": {"path": "series.vtk"},
         "is a folder with other files, 'thesis.tex'": {"checkpoint": foreign},
         "is a file; expected the name of a folder": {"checkpoint": foreign / "thesis.tex"},
+    }
+    options |= {
+        "interior=1: expected True or False": {"path": "series.bp", "interior": 1},
+        r"interior=True: expected LoadSteps\(..., path=\) too": {"interior": True},
     }
     for says, keywords in options.items():
         with pytest.raises(tfeti.InputError, match=says):

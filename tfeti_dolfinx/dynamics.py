@@ -18,7 +18,7 @@ from tfeti_dolfinx.contact_state import Multipliers
 from tfeti_dolfinx.elasticity import Modulus
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.gluing.glue import Gluing
-from tfeti_dolfinx.inertia import InertialForms, mass_form
+from tfeti_dolfinx.inertia import InertialForms, check_copies, mass_form
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.parallel import any_rank
 from tfeti_dolfinx.predictor import Predictor
@@ -90,6 +90,8 @@ class ContactDynamics(ContactProblem):
         v = np.zeros_like(self.u.x.array)
         if velocity is not None:
             v = self._checked_u(velocity, self.dofs.V, "velocity").x.array
+        check_copies(self.u.x.array, self.dofs, "u, the displacement at the begin,")
+        check_copies(v, self.dofs, "velocity")
         self._forms_in_time.move(np.array(self.u.x.array), np.array(v))
         self._first = np.array(self.u.x.array)
         self._predictor: Predictor | None = None

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import ufl
 from dolfinx import fem
+from mpi4py import MPI
 from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import Array
@@ -26,6 +27,7 @@ from tfeti_dolfinx.elasticity import Modulus, in_ufl
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.form_checks import check_form, check_same_space, displacement_space
 from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.subdomains.input_checks import check_stiffness
 
 # of a step: another one that differs by less is the same, since times of equal steps are rounded
@@ -33,6 +35,8 @@ SAME_STEP = 1e-9
 
 # of the sum of the diagonal: the mass of a translation is rounding, as where M has a kernel
 NO_MASS = 1e-10
+# of the largest value: where torn copies differ by less a solver may have left it
+TORN = 1e-3
 STEP = Range("a positive number whose square is one, too", lambda value: min(value, value**2) > 0.0)
 
 log = logging.getLogger(__name__)
@@ -184,6 +188,35 @@ def check_mass(M: csr_array, bs: int) -> None:
             raise InputError(
                 f"mass: a translation along {'xyz'[k]} has the mass {total:.3g}; expected a "
                 "density, or a form such as ∫ρ u·v"
+            )
+
+
+def check_copies(values: Array, dofs: TornDofs, name: str) -> None:
+    """Raise where torn copies of a node differ by more than what a solver leaves. Collective.
+
+    Args:
+        values: A displacement or a velocity in DOLFINx's order.
+        dofs: Dof maps.
+        name: What it is.
+
+    Raises:
+        InputError: They do, or a value is not finite.
+    """
+    primal = dofs.to_primal(np.asarray(values)).reshape(-1, dofs.bs)
+    with raised_on_all_ranks(dofs.comm):
+        if not np.all(np.isfinite(primal)):
+            raise InputError(f"{name} has values that are not finite numbers")
+    most = dofs.reduce(primal, np.maximum, -np.inf)
+    apart = dofs.spread(most - dofs.reduce(primal, np.minimum, np.inf)).max(axis=1, initial=0.0)
+    size = dofs.comm.allreduce(float(np.abs(primal).max(initial=0.0)), op=MPI.MAX)
+    with raised_on_all_ranks(dofs.comm):
+        if np.any(apart > TORN * size):
+            worst = int(np.argmax(apart))
+            x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node[worst]]
+            at = ", ".join(f"{x:.6g}" for x in x[: dofs.bs])
+            raise InputError(
+                f"{name} differs by {apart[worst]:.3g} between torn copies of the node at ({at}); "
+                "expected a continuous function on each body"
             )
 
 

@@ -14,6 +14,7 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.checkpoint import Checkpoint
 from tfeti_dolfinx.checks import (
     checked_callable,
+    checked_flag,
     checked_path,
     checked_type,
     is_whole,
@@ -72,6 +73,7 @@ class LoadSteps:
         path: File for ParaView with all steps, ``.bp``; None: none. It has its name when the
             series has ended, also by an error of this package; before that it is
             ``.<name>.partial`` beside it.
+        interior: Whether the file has the fields of ``solution.interior``, too, as ``write_vtx``.
         checkpoint: Folder for the last converged step; None: none.
         max_halvings: How often a step may be halved.
         progress: Whether rank 0 shows a bar; default where its standard error is a terminal.
@@ -91,6 +93,7 @@ class LoadSteps:
         *,
         begin: float = 0.0,
         path: str | os.PathLike[str] | None = None,
+        interior: bool = False,
         checkpoint: str | os.PathLike[str] | None = None,
         max_halvings: int = 5,
         progress: bool | None = None,
@@ -107,6 +110,9 @@ class LoadSteps:
             raise InputError(f"{path}: this DOLFINx has no ADIOS2, which writes steps")
         self._comm = problem.decomposition.comm
         self._checkpoint = None if checkpoint is None else Checkpoint(checkpoint, self._comm)
+        self._interior = checked_flag(interior, "interior")
+        if self._interior and path is None:
+            raise InputError("interior=True: expected LoadSteps(..., path=) too")
         self._problem, self._apply = problem, apply
         self._max_halvings, self._progress = int(max_halvings), progress
         self._series: Series | None = None
@@ -197,9 +203,9 @@ class LoadSteps:
         fields: dict[str, Array] = {}
         if self._path is not None:
             solution = self._problem.solution
-            fields = fields_of(solution)
+            fields = fields_of(solution, self._interior)
             if self._series is None:
-                self._series = Series(self._path, solution)
+                self._series = Series(self._path, solution, self._interior)
             self._series.write(t, fields)
         if self._checkpoint is not None:
             about = {"place": asdict(place), "begin": self._times[0]}
@@ -242,7 +248,7 @@ class LoadSteps:
         """Write the steps of earlier runs again: a file of ADIOS2 cannot be continued."""
         if self._path is None:
             return
-        self._series = Series(self._path, self._problem.solution)
+        self._series = Series(self._path, self._problem.solution, self._interior)
         for number, record in enumerate(self.records, start=1):
             self._series.write(record.time, checkpoint.read_fields(number))
 

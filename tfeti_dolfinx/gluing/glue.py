@@ -121,11 +121,12 @@ class Gluing:
         if not any_rank(self.dofs.comm, not np.array_equal(flags, flags_before)):
             start[sets.equalities] = lam[before.equalities]
         new, old = _common(self._keys(self.contact), earlier._keys(earlier.contact))
-        force = lam[before.normals[old]] * earlier.contact.scale[old]
-        start[sets.normals[new]] = force / self.contact.scale[new]
+        # ratios: of rows that stay they are exactly 1, and what F makes of the start is known
+        ratio = earlier.contact.scale[old] / self.contact.scale[new]
+        start[sets.normals[new]] = lam[before.normals[old]] * ratio
         new, old = _common(self._keys(self.tangents), earlier._keys(earlier.tangents))
-        forces = lam[before.tangents[old]] * earlier.tangents.scale[old][:, None]
-        start[sets.tangents[new]] = forces / self.tangents.scale[new][:, None]
+        ratio = earlier.tangents.scale[old] / self.tangents.scale[new]
+        start[sets.tangents[new]] = lam[before.tangents[old]] * ratio[:, None]
         return start
 
     def contacts_of(self, rows: Array) -> list[int]:
