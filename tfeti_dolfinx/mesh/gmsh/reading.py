@@ -15,12 +15,12 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.gmsh.join import untorn_mesh
 from tfeti_dolfinx.mesh.gmsh.model import ModelContent, open_model, read_content
 from tfeti_dolfinx.mesh.gmsh.split import find_split_files, read_split_files
+from tfeti_dolfinx.mesh.metis import metis
 from tfeti_dolfinx.mesh.partition import (
     Subdomains,
     assign_subdomains,
     coordinate_bisection,
     default_count,
-    metis,
 )
 from tfeti_dolfinx.mesh.tearing import tear
 from tfeti_dolfinx.timing import stage
