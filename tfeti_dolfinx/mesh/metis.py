@@ -17,8 +17,8 @@ from tfeti_dolfinx.mesh.partition import without_holes
 from tfeti_dolfinx.mesh.pieces import absorb_fragments
 from tfeti_dolfinx.mesh.untorn import UntornMesh
 
-# of the facets that METIS cuts in a body: round parts that cut more are not taken; of quadrilaterals
-# and hexahedra, since what is not cut along their layers is a staircase
+# of the facets that METIS cuts in a body: parts that cut more are not taken; those of boxes less
+# readily, since what is not cut along their layers is a staircase
 CUT, CUT_BOXES = 1.1, 1.0
 
 
@@ -45,6 +45,7 @@ def metis(mesh: UntornMesh, num_parts: int, comm: MPI.Intracomm) -> Array:
             cells = np.flatnonzero(body == b)
             part[cells] = start + _metis_of(graph[cells][:, cells], int(shares[b]))
             start += int(shares[b])
+        del graph
         made_round = _made_round(mesh, part, body, shares)
     made_round = absorb_fragments(mesh, made_round, comm)
     with raised_on_all_ranks(comm):
