@@ -42,7 +42,7 @@ def read_gmsh(
     Args:
         source: A ``.msh`` file, or a gmsh model (``gmsh.model``) that is meshed on rank 0.
         comm: Communicator of the torn mesh.
-        subdomains: Their number (METIS; for split files recursive coordinate bisection); or
+        subdomains: Their number (METIS, made round; split files: coordinate bisection); or
             one id per cell on rank 0, in gmsh's order, and empty arrays elsewhere (for split
             files one id per cell of the files that this rank reads, in the order of the files
             and within a file in gmsh's order, without ghost cells); or a callable of cell
