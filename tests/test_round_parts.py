@@ -98,19 +98,20 @@ def test_what_sticks_out_of_a_flat_interface_is_taken_off():
     mesh = boxes(12)
     x = mesh.midpoints()
     flat = (x[:, 0] > 0.5).astype(int)
-    assert np.array_equal(flatten_interfaces(mesh, flat), flat)
+    assert np.array_equal(flatten_interfaces(mesh, mesh.neighbours(), flat), flat)
     side, y, z = (12 * x).astype(int).T
     some = np.flatnonzero((side == 5 + y // 3 % 2) & (y % 3 == 1) & (z % 3 == 1))
     ragged = flat.copy()
     ragged[some] = 1 - ragged[some]
     assert cuts(mesh, ragged) == cuts(mesh, flat) + 4 * len(some) > cuts(mesh, flat)
-    assert np.array_equal(flatten_interfaces(mesh, ragged), flat)
+    assert np.array_equal(flatten_interfaces(mesh, mesh.neighbours(), ragged), flat)
 
 
 def parts_of_metis(mesh, num_parts, monkeypatch):
     """The parts that METIS makes itself."""
     with monkeypatch.context() as patch:
-        patch.setattr(metis_module, "_made_round", lambda mesh, part, body, shares: part)
+        patch.setattr(metis_module, "_made_round", lambda mesh, part, *others: part)
+        patch.setattr(metis_module, "flatten_interfaces", lambda mesh, pairs, part: part)
         return metis(mesh, num_parts, COMM)
 
 

@@ -17,7 +17,7 @@ FACET = 12.0
 LARGEST, SMALLEST = 1.08, 0.93
 
 
-def flatten_interfaces(mesh: UntornMesh, part: Array) -> Array:
+def flatten_interfaces(mesh: UntornMesh, pairs: tuple[Array, Array], part: Array) -> Array:
     """Let cells join a neighbour's part that has more of what is around them.
 
     Of each part count the cells that share a vertex with a cell, once for each such vertex, and
@@ -26,6 +26,7 @@ def flatten_interfaces(mesh: UntornMesh, part: Array) -> Array:
 
     Args:
         mesh: A mesh that lies on this rank.
+        pairs: Its neighbours.
         part: Part of each cell, shape ``(n,)``.
 
     Returns:
@@ -38,8 +39,7 @@ def flatten_interfaces(mesh: UntornMesh, part: Array) -> Array:
     start = np.arange(0, n * k + 1, k)
     shape = (n, len(mesh.node_ids))
     around = csr_array((np.ones(n * k), vertices.ravel(), start), shape=shape)
-    first, second = mesh.neighbours()
-    faces = coo_array((np.ones(len(first)), (first, second)), shape=(n, n)).tocsr()
+    faces = coo_array((np.ones(len(pairs[0])), pairs), shape=(n, n)).tocsr()
     beside = csr_array(faces + faces.T + eye_array(n, format="csr"))
     part = part.copy()
     for turn in range(ROUNDS):

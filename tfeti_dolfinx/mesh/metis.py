@@ -46,7 +46,9 @@ def metis(mesh: UntornMesh, num_parts: int, comm: MPI.Intracomm) -> Array:
             part[cells] = start + _metis_of(graph[cells][:, cells], int(shares[b]))
             start += int(shares[b])
         del graph
-        made_round = _made_round(mesh, part, body, shares)
+        made_round = flatten_interfaces(
+            mesh, (first, second), _made_round(mesh, part, body, shares)
+        )
     made_round = absorb_fragments(mesh, made_round, comm)
     with raised_on_all_ranks(comm):
         cuts = [
@@ -89,4 +91,4 @@ def _made_round(mesh: UntornMesh, part: Array, body: Array, shares: Array) -> Ar
         cells = np.flatnonzero(body == b)
         of_cells = (x[cells], measure[cells], mesh.cell_ids[cells], part[cells] - start)
         result[cells] = start + compact_parts(*of_cells, int(share), MPI.COMM_SELF)
-    return flatten_interfaces(mesh, result)
+    return result
