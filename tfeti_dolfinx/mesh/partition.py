@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from tfeti_dolfinx.arrays import Array, ArrayLike
 from tfeti_dolfinx.checks import is_whole, named, shown
@@ -65,7 +62,7 @@ def assign_subdomains(
             ids = _checked_ids(found, len(mesh.cells), "callable subdomains")
         else:
             ids = _checked_ids(subdomains, len(mesh.cells), "array subdomains")
-    return _without_holes(ids, comm)
+    return without_holes(ids, comm)
 
 
 def _checked_ids(ids: ArrayLike, num_cells: int, what: str) -> Array:
@@ -88,53 +85,10 @@ def _checked_ids(ids: ArrayLike, num_cells: int, what: str) -> Array:
     return whole
 
 
-def _without_holes(ids: Array, comm: MPI.Intracomm) -> Array:
+def without_holes(ids: Array, comm: MPI.Intracomm) -> Array:
     """Renumber ids to 0, 1, ... in their order."""
     used = np.unique(np.concatenate(comm.allgather(np.unique(ids))))
     return np.searchsorted(used, ids)
-
-
-def metis(mesh: UntornMesh, num_parts: int, comm: MPI.Intracomm) -> Array:
-    """METIS parts of the facet graph, for a mesh that lies on one rank. Collective.
-
-    Each body gets a share of the parts by its number of cells, and at least one.
-    """
-    with raised_on_all_ranks(comm):
-        n = len(mesh.cells)
-        first, second = mesh.neighbours()
-        graph = coo_array((np.ones(len(first)), (first, second)), shape=(n, n)).tocsr()
-        graph = (graph + graph.T).tocsr()
-        num_bodies, body = connected_components(graph, directed=False)
-        shares = _shares(np.bincount(body, minlength=num_bodies), num_parts)
-        part = np.zeros(n, dtype=np.int64)
-        start = 0
-        for b in range(num_bodies):
-            cells = np.flatnonzero(body == b)
-            part[cells] = start + _metis_of(graph[cells][:, cells], int(shares[b]))
-            start += int(shares[b])
-    return _without_holes(part, comm)
-
-
-def _metis_of(graph: Any, num_parts: int) -> Array:
-    import pymetis
-
-    if num_parts == 1:
-        return np.zeros(graph.shape[0], dtype=np.int64)
-    options = pymetis.Options(contig=True, seed=1)
-    adjacency = pymetis.CSRAdjacency(graph.indptr, graph.indices)
-    _, part = pymetis.part_graph(num_parts, adjacency, options=options, recursive=False)
-    return np.asarray(part, dtype=np.int64)
-
-
-def _shares(weights: Array, num_parts: int) -> Array:
-    """Split a number of parts by weights (largest remainders), at least one each."""
-    if len(weights) == 0:
-        return np.zeros(0, dtype=np.int64)
-    exact = weights / weights.sum() * num_parts
-    shares = np.maximum(np.floor(exact).astype(np.int64), 1)
-    for b in np.argsort(shares - exact)[: max(num_parts - shares.sum(), 0)]:
-        shares[b] += 1
-    return np.minimum(shares, weights)
 
 
 def coordinate_bisection(mesh: UntornMesh, num_parts: int, comm: MPI.Intracomm) -> Array:
@@ -143,4 +97,4 @@ def coordinate_bisection(mesh: UntornMesh, num_parts: int, comm: MPI.Intracomm) 
     The parts depend on the cells' vertices only, not on how ranks share the cells.
     """
     part = bisect_points(mesh.midpoints(), num_parts, comm, mesh.extents())
-    return _without_holes(part, comm)
+    return without_holes(part, comm)

@@ -15,12 +15,12 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.gmsh.join import untorn_mesh
 from tfeti_dolfinx.mesh.gmsh.model import ModelContent, open_model, read_content
 from tfeti_dolfinx.mesh.gmsh.split import find_split_files, read_split_files
+from tfeti_dolfinx.mesh.metis import metis
 from tfeti_dolfinx.mesh.partition import (
     Subdomains,
     assign_subdomains,
     coordinate_bisection,
     default_count,
-    metis,
 )
 from tfeti_dolfinx.mesh.tearing import tear
 from tfeti_dolfinx.timing import stage
@@ -42,7 +42,7 @@ def read_gmsh(
     Args:
         source: A ``.msh`` file, or a gmsh model (``gmsh.model``) that is meshed on rank 0.
         comm: Communicator of the torn mesh.
-        subdomains: Their number (METIS; for split files recursive coordinate bisection); or
+        subdomains: Their number (METIS, made round; split files: coordinate bisection); or
             one id per cell on rank 0, in gmsh's order, and empty arrays elsewhere (for split
             files one id per cell of the files that this rank reads, in the order of the files
             and within a file in gmsh's order, without ghost cells); or a callable of cell
