@@ -25,7 +25,7 @@ def row_weights(blocks: Array, scaling: str, comm: MPI.Intracomm) -> Array:
     diagonals = np.diagonal(blocks, axis1=1, axis2=2)
     if scaling == "multiplicity":
         return np.ones(diagonals.size)
-    means = np.linalg.eigvalsh(blocks)[:, -1]
+    means = np.mean(np.maximum(diagonals, 0.0), axis=1)
     positive = means > 0.0  # what is not is reported when Blocks are built
     lowest = float(np.min(means[positive], initial=np.inf))
     D = np.where(positive, means / comm.allreduce(lowest, op=MPI.MIN), 1.0)
