@@ -75,7 +75,7 @@ GIVEN = {
 
 RUN = {
     "a block that is None": own(
-        r"extensions: block gave None without apply_pinv, .*; expected a Block",
+        r"extensions: block gave None without act_along, apply_pinv, .*; expected a Block",
         block=lambda data: None,
     ),
     "a block without methods": own(

@@ -102,7 +102,8 @@ def measure(
     """Recover the displacement of an iterate and see how well it fulfils the rows. Collective.
 
     Rows miss w = Bu − c: rows of equalities and those that press both ways, others where they
-    overlap, tangential ones what of the slip their force does not allow. v, the least displacement
+    overlap, or as far as a force on them says that they are not open, min(c − Bu, ‖F‖λ), tangential
+    ones what of the slip their force does not allow. v, the least displacement
     in D that closes that, makes u + v admissible; so ‖v‖_K bounds the error of u in energy, as far
     as λ balances the load.
 
@@ -119,7 +120,7 @@ def measure(
     w, penetration, gap = _missed(scene, u, lam, norm)
     constraints = scene.constraints
     residual, normals = w.norm(), constraints.sets.normals
-    closed = scene.pressing[normals] | (w.array_r[normals] > 0.0)
+    closed = scene.pressing[normals] | (w.array_r[normals] != 0.0)
     closed = np.concatenate((closed, constraints.limits.ravel() > 0.0))
     bodies = _bodies(scene, u, closing(constraints, w, closed), before)
     balance, forces = _balance(scene.coarse, lam)
@@ -136,7 +137,9 @@ def _missed(scene: Scene, u: Array, lam: PETSc.Vec, norm: float) -> tuple[PETSc.
     w.axpy(-1.0, constraints.c)
     normals = constraints.sets.normals
     rows = w.array_r[normals]
-    rows = np.where(scene.pressing[normals], rows, np.maximum(rows, 0.0))
+    # an open row whose force is not gone yet: of distance and force, as a length, the smaller
+    still = -np.minimum(-rows, norm * lam.array_r[normals])
+    rows = np.where(scene.pressing[normals] | (rows > 0.0), rows, still)
     w.array[normals] = rows
     lengths = np.abs((rows, constraints.c.array_r[normals])) / constraints.scale
     trace.destroy()
