@@ -138,7 +138,7 @@ def _missed(scene: Scene, u: Array, lam: PETSc.Vec, norm: float) -> tuple[PETSc.
     normals = constraints.sets.normals
     rows = w.array_r[normals]
     # an open row whose force is not gone yet: of distance and force, as a length, the smaller
-    still = -np.minimum(-rows, norm * lam.array_r[normals])
+    still = _missed_by(scene, lam.array_r, normals, np.minimum(rows, 0.0), norm)
     rows = np.where(scene.pressing[normals] | (rows > 0.0), rows, still)
     w.array[normals] = rows
     lengths = np.abs((rows, constraints.c.array_r[normals])) / constraints.scale
@@ -146,29 +146,32 @@ def _missed(scene: Scene, u: Array, lam: PETSc.Vec, norm: float) -> tuple[PETSc.
     largest = np.max(lengths, axis=1, initial=0.0)
     tangents = constraints.sets.tangents
     if tangents.size:
-        w.array[tangents] = _slip_missed(scene, lam.array_r, w.array_r[tangents], norm)
+        slip = w.array_r[tangents]
+        w.array[tangents] = _missed_by(scene, lam.array_r, tangents, slip, norm)
         length = np.linalg.norm(w.array_r[tangents], axis=1) / constraints.tangent_scale
         largest[0] = max(largest[0], length.max())
     w.getComm().tompi4py().Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
     return w, float(largest[0]), float(largest[1])
 
 
-def _slip_missed(scene: Scene, lam: Array, slip: Array, norm: float) -> Array:
-    """What of slips is not normal to the set of tangential forces where the force is.
+def _missed_by(scene: Scene, lam: Array, rows: Array, values: Array, norm: float) -> Array:
+    """What of gaps or slips is not normal to the set of forces where the force is.
 
-    A force inside its disc allows no slip, one on the circle only a slip that it opposes: then τ is
-    P(τ + q/‖F‖), and ‖F‖ times the difference is the slip that is missed. Where it is less than q,
-    no force within the disc makes more of a slip than that.
+    A force of a normal allows no gap, but 0 does. A force inside its disc allows no slip, one on
+    the circle only a slip that it opposes: then τ is P(τ + q/‖F‖), and ‖F‖ times the difference is
+    the slip that is missed. Where it is less than q, no force within the disc makes more of a slip
+    than that.
 
     Args:
         scene: The dual problem.
         lam: The multipliers.
-        slip: The q, scaled, shape ``(t, gdim - 1)``.
+        rows: Local rows, any shape.
+        values: Their gaps, negative, or slips, scaled, of the same shape.
         norm: ‖F‖, or an estimate.
     """
-    tangents, moved = scene.constraints.sets.tangents, np.array(lam)
-    moved[tangents] += slip / norm
-    return np.asarray(norm * (scene.feasible.project(moved) - lam)[tangents])
+    moved = np.array(lam)
+    moved[rows] += values / norm
+    return np.asarray(norm * (scene.feasible.project(moved) - lam)[rows])
 
 
 def _bodies(scene: Scene, u: Array, v: Array, before: Array | None) -> BodyMeasures:
