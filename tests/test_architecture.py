@@ -30,7 +30,7 @@ ROOMS = [
     ["saved_state", "work"],
     ["solver"],
     ["dilation"],
-    ["pressures"],
+    ["newton_coulomb", "pressures"],
     ["coulomb"],
     ["report_filling", "doubts"],
     ["extensions"],

@@ -10,6 +10,7 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.accuracy import Accuracy
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.dual.goals import Goal
+from tfeti_dolfinx.newton_coulomb import NewtonOnCoulomb
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.parallel import any_rank
 from tfeti_dolfinx.pressures import Pressures
@@ -80,9 +81,14 @@ def solve_with_friction(
     least = options.number
     tolerance = min(options.friction_rtol, BESIDE_RTOL * least)
     change, rtol, iterations = np.inf, FIRST, 0
+    on_law = NewtonOnCoulomb(dual, options, qp_type)
     while True:
         start = bounds.set_feasible(start)
-        near = change <= NEAR * tolerance
+        solved = on_law.solve(start) if bounds.are_known else None
+        if solved is not None:
+            start = solved
+            bounds.take(start[0])
+        near = change <= NEAR * tolerance or solved is not None
         rtol = least if near else max(least, min(rtol, SHARE * change))
         before = dual.F.count["solver"]
         asked, exact = replace(options, rtol=rtol), goal if rtol <= least else None

@@ -92,6 +92,13 @@ class Options:
         choices=tuple(PARTICULAR),
     )
     norm_steps: int = described(15, "smalse", "Lanczos steps that estimate ‖PFP‖", fits=FROM_1)
+    friction_type: str = described(
+        "auto",
+        "coulomb",
+        "Newton's method on Coulomb's law itself, problems with given bounds where it fails; or "
+        "these alone, as a fixed point; auto takes newton with that as qp_type, else fixed_point",
+        choices=("auto", "newton", "fixed_point"),
+    )
     friction_rtol: float = described(
         1e-4,
         "coulomb",

@@ -177,6 +177,16 @@ class Pressures:
             self._found if sticks else self._forces(self._anderson.next(self._now, self._found))
         )
 
+    def take(self, lam: Array) -> None:
+        """Take the bounds of multipliers for which the law holds."""
+        self._now = self._forces(lam[self._rows])
+        self._constraints.set_pressures(self._now)
+
+    @property
+    def are_known(self) -> bool:
+        """Whether there are bounds to start from, none of which is De Saxcé's."""
+        return self._dilated is None and not self._sticks
+
     def goes_on(self, reason: ConvergedReason) -> bool:
         """Whether there is something else to try where a problem has no solution, or none is found.
 

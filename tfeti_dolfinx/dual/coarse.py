@@ -14,6 +14,7 @@ from tfeti_dolfinx.dual.grams import Grams
 from tfeti_dolfinx.dual.kernel_basis import kernel_basis
 from tfeti_dolfinx.dual.motions import NULL, Motions, unresisted, unsprung
 from tfeti_dolfinx.dual.null_basis import null_basis
+from tfeti_dolfinx.dual.oblique import ObliqueProjectors
 from tfeti_dolfinx.dual.projectors import FaceFactors, FaceProjectors, Projectors
 from tfeti_dolfinx.dual.semidefinite import SemidefiniteFactor
 from tfeti_dolfinx.errors import raised_on_all_ranks
@@ -127,6 +128,15 @@ class CoarseSpace(Projectors):
     def on_face(self, face: Face) -> FaceProjectors:
         """The projectors on a face of the rows."""
         return FaceProjectors(self, face, self.factors)
+
+    def oblique(self, face: Face, C: csr_array) -> ObliqueProjectors:
+        """The projectors on a face of the rows where others follow: λ = (I + C)u.
+
+        Raises:
+            FactorError: Forces on the face do not determine what balances a load.
+        """
+        self.factors.count["face"] += 1
+        return ObliqueProjectors(self.Gt, self.grams, face, C, self.null, self.comm)
 
     def unresisted(self, rows: Array, below: float = NULL) -> Motions:
         """Motions that neither springs, nor equality rows, nor contact rows flagged resist.

@@ -59,7 +59,12 @@ class Grams:
 
 def replicated_gram(Gt: csr_array, comm: MPI.Intracomm) -> csr_array:
     """GGᵀ from all ranks' rows of Gᵀ, shape ``(r, r)``; on all ranks. Collective."""
-    local = (Gt.T @ Gt).tocoo()
+    return replicated(csr_array(Gt.T @ Gt), comm)
+
+
+def replicated(part: csr_array, comm: MPI.Intracomm) -> csr_array:
+    """The sum of all ranks' sparse matrices, on all ranks. Collective."""
+    local = part.tocoo()
     row, column = (np.concatenate(comm.allgather(index)) for index in local.coords)
     value = np.concatenate(comm.allgather(local.data))
-    return coo_array((value, (row, column)), shape=(Gt.shape[1],) * 2).tocsr()
+    return coo_array((value, (row, column)), shape=part.shape).tocsr()

@@ -137,10 +137,14 @@ def slipping_start(
     """A copy of a point with its face, or ``back`` with its own where that slips first. Collective.
 
     Near its circle a point that sticks, and whose gradient points outwards, would leave by far, in
-    a direction of no use. Multiplies by F once where it begins at ``back``.
+    a direction of no use. So would, with friction, one that touches with less force than it is open
+    by: at a start from elsewhere these are few, with forces that restoring Gλ = e has left.
+    Multiplies by F once where it begins at ``back``.
     """
     start = at.copy()
     early = (face.status == Status.STICK) & (pressed.status == Status.SLIP)
+    if is_rubbing(qp, face):
+        early |= (face.status == Status.TOUCHING) & (pressed.status == Status.OPEN)
     if not any_rank(qp.d.getComm().tompi4py(), bool(np.any(early))):
         return start, face
     moved_to(qp, start, back.copy())

@@ -1,0 +1,216 @@
+"""Newton's method on a law of friction whose bounds move with the forces of normals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+from scipy.sparse import csr_array
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.errors import FactorError
+from tfeti_dolfinx.parallel import agreed, any_rank, summed
+from tfeti_dolfinx.qp.faces import Face, Status
+from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
+from tfeti_dolfinx.qp.gcr import gcr
+from tfeti_dolfinx.qp.law import Law
+from tfeti_dolfinx.qp.oblique import Oblique
+from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
+
+# steps; and steps in a row without a residual below the least so far, before one gives up
+MOST_STEPS, PATIENCE = 40, 10
+# directions of one solve
+MOST_DIRECTIONS = 80
+# what a solve leaves of its residual: less where the last step has brought that far down; of the
+# target: no solve leaves less
+SHARE, FOLLOWED, FINAL = 0.3, 0.3, 0.3
+# times ‖F‖: directions that bend more are turned by the projection alone
+HARD = 10.0
+
+
+@dataclass(frozen=True)
+class LawPoint:
+    """Multipliers, this rank's part.
+
+    Attributes:
+        lam: λ.
+        s: Fλ − d − Gᵀμ.
+        mu: μ, replicated.
+    """
+
+    lam: Array
+    s: Array
+    mu: Array
+
+
+@dataclass(frozen=True)
+class OnFace:
+    """What a step knows of a face: its directions, what follows them, where it is entered.
+
+    Attributes:
+        face: The face, hard directions held.
+        C: What λ_T follows.
+        p: A point of the face.
+    """
+
+    face: Face
+    C: csr_array
+    p: Array
+
+    def followed(self, u: Array) -> Array:
+        """(I + C)u."""
+        return np.asarray(u + self.C @ u)
+
+    def entered(self, lam: Array) -> Array:
+        """λ with what is open or slips where p has it; what follows does so."""
+        held = np.isin(self.face.status, (Status.OPEN, Status.SLIP))
+        follows = np.diff(self.C.indptr) > 0
+        return np.where(follows, self.C @ lam, np.where(held, self.p, lam))
+
+    def bend(self, u: Array) -> Array:
+        """Z diag(κ) Zᵀu."""
+        Z = self.face.Z
+        return np.asarray(Z @ (self.face.curvature * (Z.T @ u)))
+
+
+class Turning:
+    """What slips, and where to, from step to step.
+
+    Args:
+        law: The sets.
+        comm: Communicator.
+    """
+
+    def __init__(self, law: Law, comm: MPI.Intracomm) -> None:
+        self._law, self._comm = law, comm
+        self._slips = np.zeros(len(law.normals), dtype=bool)
+        self._to: Array = np.zeros(law.tangents.shape)
+
+    def face(self, feasible: FeasibleSet, p: Array, s: Array) -> tuple[Array, Face]:
+        """p and its face; what slipped the other way a step ago sticks. Collective."""
+        law, face, to = self._law, feasible.face(p, s), p[self._law.tangents]
+        turned = law.slips(face) & self._slips & (np.sum(to * self._to, axis=1) < 0.0)
+        if any_rank(self._comm, bool(np.any(turned))):
+            p = law.stuck(p, turned)
+            face = feasible.face(p, s)
+        self._slips, self._to = law.slips(face), to
+        return p, face
+
+
+def newton_on_law(
+    qp: QP,
+    law: Law,
+    oblique: Callable[[Face, csr_array], Oblique],
+    at: LawPoint,
+    target: float,
+    norm: float,
+) -> tuple[LawPoint | None, int]:
+    """Solve λ = P(λ − s/‖F‖), P the projection onto Ω(λ_N − s_N/‖F‖), and Gλ = e. Collective.
+
+    The natural map of Coulomb's law, by a semismooth Newton method (Alart, Curnier, Comput.
+    Methods Appl. Mech. Engrg. 92, 1991; Hüeber, Stadler, Wohlmuth, SIAM J. Sci. Comput. 30, 2008).
+    No cost falls on the way, and it may fail: whoever calls it has something else to try.
+
+    Args:
+        qp: The program; its set is not looked at.
+        law: The sets.
+        oblique: Makes the projectors of a face and of what follows it.
+        at: Where to start.
+        target: Ends at a residual ‖F‖‖λ − P(λ − s/‖F‖)‖ of that.
+        norm: ‖F‖, or an estimate.
+
+    Returns:
+        Where it has ended, None if it gave up; and the steps taken.
+    """
+    comm = qp.d.getComm().tompi4py()
+    last, best, idle = 0.0, np.inf, 0
+    turning = Turning(law, comm)
+    for step in range(MOST_STEPS):
+        # Step 1: what a gradient step, brought back, moves
+        y = at.lam - at.s / norm
+        feasible, p = law.nearest(y)
+        residual = norm * _length(comm, p - at.lam)
+        if residual <= target:
+            return at, step
+        idle = 0 if residual < best else idle + 1
+        best = min(best, residual)
+        if idle > PATIENCE or not np.isfinite(residual):
+            break
+        # Step 2: the face there
+        p, face = turning.face(feasible, p, at.s)
+        # Steps 3 and 4: onto the face, and a solve there
+        eased = face.with_directions(np.flatnonzero(face.curvature <= HARD * norm))
+        share = min(SHARE, FOLLOWED * residual / last) if step else SHARE
+        on = OnFace(eased, law.following(p, face), p)
+        try:
+            at = _solve_on(qp, on, oblique(eased, on.C), at, (share, FINAL * target))
+        except FactorError:
+            break
+        last = residual
+    return None, step
+
+
+def residual_of(qp: QP, law: Law, at: LawPoint, norm: float) -> float:
+    """‖F‖‖λ − P(λ − s/‖F‖)‖, the same on all ranks. Collective."""
+    _, p = law.nearest(at.lam - at.s / norm)
+    return norm * _length(qp.d.getComm().tompi4py(), p - at.lam)
+
+
+def _solve_on(
+    qp: QP, on: OnFace, oblique: Oblique, at: LawPoint, aim: tuple[float, float]
+) -> LawPoint:
+    """Steps 3 and 4: on the face Zᵀ(Fλ − d − Gᵀμ) + κu = 0 and Gλ = e, λ = λ₁ + (I + C)u.
+
+    Multiplies by F once for the way onto the face, and once for each direction.
+    """
+    comm, face, F = qp.d.getComm().tompi4py(), on.face, _on_arrays(qp.F, qp.d)
+    # Step 3: λ₁ on the face, u₀ that restores Gλ = e
+    lam, x = on.entered(at.lam), qp.d.duplicate()
+    x.array[:] = lam
+    u = oblique.restoring(qp.coarse.residual(x))
+    lam = lam + on.followed(u)
+    s, way = at.s, lam - at.lam
+    if any_rank(comm, bool(np.any(way != 0.0))):
+        s = s + F(way)
+    # Step 4: u by conjugate residuals
+    preconditioner = qp.preconditioner_on(face) if qp.preconditioner_on else None
+    M = _on_arrays(preconditioner, qp.d) if preconditioner else face.restricted
+
+    def apply(z: Array) -> tuple[Array, Array]:
+        Fz = F(on.followed(z))
+        return oblique.project(Fz + on.bend(z)), Fz
+
+    b = -oblique.project(s + on.bend(u))
+    size = max(aim[0] * _length(comm, b), aim[1])
+    gone = gcr(apply, lambda r: oblique.project(M(r)), b, size, MOST_DIRECTIONS, comm)
+    u, lam, s = u + gone.u, lam + on.followed(gone.u), s + gone.image
+    mu = oblique.coordinates(s + on.bend(u))
+    qp.coarse.combine(mu, x)
+    at = LawPoint(lam, s - x.array_r, at.mu + mu)
+    for item in (x, preconditioner):
+        if item is not None:
+            item.destroy()
+    return at
+
+
+def _on_arrays(A: Operator | FaceOperator, like: PETSc.Vec) -> Callable[[Array], Array]:
+    """An operator between this rank's parts of vectors."""
+
+    def mult(values: Array) -> Array:
+        x, y = like.duplicate(), like.duplicate()
+        x.array[:] = values
+        A.mult(x, y)
+        result = np.array(y.array_r)
+        x.destroy()
+        y.destroy()
+        return result
+
+    return mult
+
+
+def _length(comm: MPI.Intracomm, x: Array) -> float:
+    """‖x‖ over all ranks, the same on each."""
+    return agreed(comm, float(np.sqrt(summed(comm, np.array([x @ x]))[0])))
