@@ -58,6 +58,22 @@ SEMISMOOTH = """@article{HintermullerItoKunisch2002,
   volume = {13}, pages = {865--888}, year = {2002}
 }
 """
+ALART_CURNIER = """@article{AlartCurnier1991,
+  title = {A mixed formulation for frictional contact problems prone to {Newton} like solution
+    methods},
+  author = {Alart, Pierre and Curnier, Alain},
+  journal = {Computer Methods in Applied Mechanics and Engineering},
+  volume = {92}, pages = {353--375}, year = {1991}
+}
+"""
+ACTIVE_FRICTION = """@article{HueberStadlerWohlmuth2008,
+  title = {A primal-dual active set algorithm for three-dimensional contact problems with
+    {Coulomb} friction},
+  author = {H{\\"u}eber, Stefan and Stadler, Georg and Wohlmuth, Barbara I.},
+  journal = {SIAM Journal on Scientific Computing},
+  volume = {30}, pages = {572--596}, year = {2008}
+}
+"""
 DUAL_MORTAR = """@article{Wohlmuth2000,
   title = {A mortar finite element method using dual spaces for the {Lagrange} multiplier},
   author = {Wohlmuth, Barbara I.},
@@ -80,6 +96,7 @@ PAPERS = {
     "pcpg": (PCPG,),
     "newton": (SEMISMOOTH, PCPG),
     "smalse": (SCALABLE_CONTACT, SMALSE, MPRGP),
+    "newton on friction": (ALART_CURNIER, ACTIVE_FRICTION),
     "mortar": (DUAL_MORTAR,),
     "boundary elements": (TOTAL_BETI,),
 }

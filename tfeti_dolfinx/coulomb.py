@@ -1,4 +1,7 @@
-"""Coulomb's law: a fixed point iteration on the bounds of friction, each a problem of Tresca's."""
+"""Coulomb's law: problems with given bounds of friction, the next ones from Newton's method.
+
+Or, where that is not wanted or fails, from a fixed point iteration.
+"""
 
 from __future__ import annotations
 
@@ -42,6 +45,7 @@ class Settling:
         tolerance: What that had to come down to.
         last: Multiplications by F of the last problem.
         body: The body on which they changed most at last; -1 without Coulomb's law.
+        newton_steps: Steps of Newton's method on Coulomb's law, beside the problems.
     """
 
     iterations: int = 0
@@ -49,6 +53,7 @@ class Settling:
     tolerance: float = 0.0
     last: int = 0
     body: int = -1
+    newton_steps: int = 0
 
 
 def solve_with_friction(
@@ -114,4 +119,5 @@ def solve_with_friction(
         result.destroy()
     result.steps, rule.looks = steps, looks
     last = dual.F.count["solver"] - before
-    return result, rule, Settling(iterations, float(change), tolerance, last, bounds.restless)
+    how = (float(change), tolerance, last, bounds.restless, on_law.steps)
+    return result, rule, Settling(iterations, *how)

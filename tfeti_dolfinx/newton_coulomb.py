@@ -6,6 +6,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.citations import cite
 from tfeti_dolfinx.dual.dual import Dual, contact_set
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.parallel import agreed
@@ -51,6 +52,7 @@ class NewtonOnCoulomb:
         """
         if start is None or self._tries == 0 or self._dual.seen == 0.0:
             return None
+        cite("newton on friction")
         dual, (lam, mu) = self._dual, start
         known = dual.constraints.pressures[dual.constraints.pressed]
         qp, work, image = dual.qp(), dual.d.copy(), dual.d.duplicate()

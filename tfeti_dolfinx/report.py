@@ -62,7 +62,8 @@ class Report:
         recoveries: Displacements recovered to see how right they are, each for one more solve
             in every subdomain.
         friction_iterations: Problems with given bounds that were solved for Coulomb's friction.
-        friction_last: Multiplications by F of the last of them.
+        friction_newton_steps: Steps of Newton's method on Coulomb's law, beside these problems.
+        friction_last: Multiplications by F of the last of these problems.
         outer_iterations: Outer iterations.
         newton_faces: Faces that block Newton has solved on.
         cg_steps: Conjugate gradient steps.
@@ -133,6 +134,7 @@ class Report:
     power_method_multiplications: int = _counter()
     recoveries: int = _counter()
     friction_iterations: int = _counter()
+    friction_newton_steps: int = _counter()
     friction_last: int = 0
     outer_iterations: int = _counter()
     newton_faces: int = _counter()

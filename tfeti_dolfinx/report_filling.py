@@ -69,6 +69,7 @@ def fill_result(
     if dual.preconditioner is not None:
         report.preconditioner_multiplications += dual.preconditioner.count["solver"]
     report.friction_iterations += settling.iterations
+    report.friction_newton_steps += settling.newton_steps
     report.friction_last = settling.last
     report.outer_iterations += result.steps.outer
     report.newton_faces += result.steps.faces
