@@ -41,7 +41,7 @@ class NewtonOnCoulomb:
     def solve(self, start: tuple[Array, Array] | None) -> tuple[Array, Array] | None:
         """λ on this rank's rows and the multipliers of Gλ = e for which the law holds. Collective.
 
-        Multiplies by F once, and in each step.
+        Multiplies by F in each step, and once where it does not start at the last solution.
 
         Args:
             start: Where to start; None: nothing is tried, nor where no solve has
@@ -55,21 +55,21 @@ class NewtonOnCoulomb:
         cite("newton on friction")
         dual, (lam, mu) = self._dual, start
         known = dual.constraints.pressures[dual.constraints.pressed]
-        qp, work, image = dual.qp(), dual.d.copy(), dual.d.duplicate()
+        qp, work, at = dual.qp(), dual.d.copy(), dual.d.duplicate()
         qp.coarse.project(work)
         target = self._share * self._rtol * agreed(dual.coarse.comm, float(work.norm()))
-        work.array[:] = lam
-        dual.F.mult(work, image)
+        at.array[:] = lam
+        image = dual.last.image(dual.F, at).Fx
         image.axpy(-1.0, dual.d)
         norm, law, points = dual.seen, self._law(), []
         for alpha in (mu, qp.coarse.coordinates(image)):
             qp.coarse.combine(alpha, work)
             point = LawPoint(np.array(lam), image.array_r - work.array_r, alpha)
             points.append((residual_of(qp, law, point, norm), point))
-        work.destroy()
-        image.destroy()
-        at = min(points, key=lambda one: one[0])[1]
-        end, steps = newton_on_law(qp, law, self._oblique, at, target, norm)
+        for item in (work, at, image):
+            item.destroy()
+        first = min(points, key=lambda one: one[0])[1]
+        end, steps = newton_on_law(qp, law, self._oblique, first, target, norm)
         self.steps += steps
         self._share *= FINER
         dual.constraints.set_pressures(known)

@@ -109,8 +109,8 @@ def solve_dual(
     rule.goal = goal
     result = solver.solve(Task(qp, homogenised, rule, options, begin, monitor))
     dual.saw(result.norm)
-    if dual.coarse.dimension == 0:
-        dual.last.keep(result.lam, result.gradient, qp.d)
+    if dual.coarse.dimension == 0 or qp_type == "newton":
+        dual.last.keep(result, qp)
     homogenised.destroy()
     if begin is not None:
         begin.lam.destroy()

@@ -10,7 +10,7 @@ from petsc4py import PETSc
 from tfeti_dolfinx.parallel import any_rank
 from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
-from tfeti_dolfinx.qp.problem import QP, Operator
+from tfeti_dolfinx.qp.problem import QP, Operator, QPResult
 
 # of the terms that a residual is the difference of: what rounding leaves of it at least, and
 # below how many times that rounding may be the reason of anything strange
@@ -50,9 +50,13 @@ class LastImage:
     def __init__(self) -> None:
         self._x, self._Fx = np.zeros(0), np.zeros(0)
 
-    def keep(self, x: PETSc.Vec, gradient: PETSc.Vec, d: PETSc.Vec) -> None:
-        """Take a solution without Gx = e, whose gradient is F x − d in all its parts."""
-        self._x, self._Fx = np.array(x.array_r), gradient.array_r + d.array_r
+    def keep(self, result: QPResult, qp: QP) -> None:
+        """Take a solution, whose gradient is Fx − d − Gᵀμ. Not collective."""
+        by_mu = qp.d.duplicate()
+        qp.coarse.combine(result.mu, by_mu)
+        self._x = np.array(result.lam.array_r)
+        self._Fx = result.gradient.array_r + by_mu.array_r + qp.d.array_r
+        by_mu.destroy()
 
     def image(self, F: Operator, x: PETSc.Vec) -> Image:
         """As ``image``, but nothing is multiplied if x is the last solution. Collective."""
