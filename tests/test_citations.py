@@ -28,7 +28,7 @@ def of(*methods):
         ("cube_3d", [], ("tfeti", "newton")),
         ("cube_3d", ["-tfeti_qp_type", "smalse"], ("tfeti", "smalse")),
         ("tbeti_cube_3d", [], ("tfeti", "newton", "boundary elements")),
-        ("belt_2d", [], ("tfeti", "newton", "newton on friction")),
+        ("belt_2d", [], ("tfeti", "newton", "newton on friction", "mortar")),
         ("stacked_blocks_3d", [], ("tfeti", "newton", "mortar")),
     ],
 )

@@ -84,7 +84,8 @@ def solve_dual(
 
     From the solution of an earlier solve PCPG multiplies by F once, SMALSE-M at most twice: once
     less each if F λ̄ is known, as it is where the dual problem has been solved for the same e, or
-    where there is no kernel and it starts where the last solve has ended.
+    where there is no kernel and it starts where the last solve has ended. Block Newton multiplies
+    once, and not even that where it starts at the end of the last solve.
 
     Args:
         dual: The dual problem.
