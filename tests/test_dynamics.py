@@ -326,6 +326,14 @@ def multiplications(cold=False, **keywords):
 
 def test_steps_save_multiplications_by_those_before():
     """4 that begin with nothing, 3 that begin with the last forces, 2 with directions kept."""
-    cold = multiplications(cold=True)
-    assert multiplications() <= 0.75 * cold
-    assert multiplications(recycle=60) <= 2 / 3 * cold
+    cold = multiplications(cold=True, recycle=0)
+    assert multiplications(recycle=0) <= 0.75 * cold
+    assert multiplications() <= 2 / 3 * cold
+
+
+@pytest.mark.parametrize(("given", "kept"), [({}, 100), ({"recycle": 7}, 7), ({"recycle": 0}, 0)])
+def test_directions_are_kept_unless_told_otherwise(given, kept):
+    scene = Thrown("quadrilateral", 3, **given)
+    assert scene.problem.options.recycle == kept
+    scene.step(0.1, 8)
+    assert (0 < scene.problem.report.recycled_directions <= kept) == (kept > 0)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import ufl
@@ -34,7 +34,8 @@ class ContactDynamics(ContactProblem):
     A step of the size τ solves one contact problem with K/2 + 2M/τ², and ends at u⁺ and v⁺. Contact
     is implicit: no node overlaps at the end of a step, and its forces, λ, are means over the step.
     ``LoadSteps`` goes through many, or by hand: ``take_step(size)``, ``solve()``, ``accept()``.
-    All is collective.
+    All is collective. Since F is that of the steps before, 100 directions of conjugate gradients
+    are kept, unless the option ``recycle`` is given.
 
     With fixed obstacles and supports and no friction the energy E = vᵀMv/2 + uᵀKu/2 changes by the
     work of the load less λᵀ(g − Bu): contact adds none, and takes some where it closes. Forces of
@@ -66,6 +67,8 @@ class ContactDynamics(ContactProblem):
     Raises:
         InputError: What is given does not fit; the message names it.
     """
+
+    defaults: ClassVar[Mapping[str, Any]] = {"recycle": 100}
 
     def __init__(
         self,
