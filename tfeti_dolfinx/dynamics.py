@@ -159,7 +159,8 @@ class ContactDynamics(ContactProblem):
         """The last accepted solution as arrays of this rank, for ``restore``."""
         motion, state = self._forms_in_time.motion, super().state()
         predicted = self._predictor.start if self._predictor is not None else state.predicted
-        return replace(state, velocity=motion.v, load=motion.load, predicted=predicted)
+        moving = {"velocity": motion.v, "load": motion.load, "size": np.array(motion.size)}
+        return replace(state, predicted=predicted, **moving)
 
     def restore(self, state: SavedState) -> None:
         """Go on where another run of the same program has been; the step must have its size.
@@ -174,6 +175,8 @@ class ContactDynamics(ContactProblem):
                 raise InputError("the state is of a problem without mass; expected velocities")
         forms.move(self.dofs.to_dolfinx(state.u), state.velocity, state.load)
         forms.motion.towards = forms.motion.free
+        if state.size > 0.0:  # equal steps of a series differ by rounding, factors are of the first
+            forms.motion.size = float(state.size)
         super().restore(state)
         self.solution.v = state.velocity
         known = any_rank(self.decomposition.comm, state.predicted.size > 0)

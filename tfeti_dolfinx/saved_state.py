@@ -36,6 +36,7 @@ class SavedState:
         velocity: Velocity in DOLFINx's order, empty without inertia.
         load: Load likewise.
         predicted: Multipliers of this rank's rows of the predictor, empty without one.
+        size: That of the step which the matrix was made for, shape ``()``; 0 without inertia.
         directions: What ``Recycled`` keeps of earlier solves, shape ``(2, m, k)``.
     """
 
@@ -52,6 +53,7 @@ class SavedState:
     velocity: Array = field(default_factory=lambda: np.zeros(0))
     load: Array = field(default_factory=lambda: np.zeros(0))
     predicted: Array = field(default_factory=lambda: np.zeros(0))
+    size: Array = field(default_factory=lambda: np.zeros(()))
     directions: Array = field(default_factory=lambda: np.zeros((2, 0, 0)))
 
     @classmethod
