@@ -1,5 +1,7 @@
 """Directions of earlier solves: what they save, and that they stay right."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_repeated import Repeated, distance
@@ -83,6 +85,41 @@ def test_wrong_images_are_found_out():
     scene.solve(load=-0.3, held=0.01)
     assert max(images(scene.problem)) <= 1e-11
     assert distance(scene.problem.solution, scene.fresh(load=-0.3, held=0.01)) <= 1e-8
+
+
+@pytest.mark.parametrize("capacity", [15, 6, 40, 0])
+def test_another_run_goes_on_with_what_was_kept(capacity):
+    """The newest, where it keeps fewer; and takes as many multiplications as the run before."""
+    rng = np.random.default_rng(5)
+    one, other = Repeated("triangle", recycle=15), Repeated("triangle", recycle=capacity)
+    for load, held in rng.uniform([-0.2, -0.02], [0.05, 0.02], (6, 2)):
+        one.solve(load=load, held=held)
+    one.problem.accept()
+    state = one.problem.state()
+    assert state.directions.shape[2] == 15
+    other.change(load=load, held=held)
+    other.problem.restore(state)
+    if capacity:
+        known = other.problem.dual.recycled
+        assert known.count == min(capacity, 15)
+        assert np.array_equal(known.kept, state.directions[:, :, -known.count :])
+        assert max(images(other.problem)) <= 1e-11
+    first, second = (scene.solve(load=-0.13) for scene in (one, other))
+    assert distance(first, second) <= (1e-12 if capacity == 15 else 1e-9)
+    if capacity == 15:
+        counts = [scene.problem.report.cg_steps for scene in (one, other)]
+        assert counts[0] == counts[1]
+
+
+def test_directions_of_other_rows_are_refused():
+    one, other = Repeated("triangle", recycle=15), Repeated("triangle", recycle=15)
+    for scene in (one, other):
+        scene.solve()
+    one.problem.accept()
+    state = one.problem.state()
+    wrong = replace(state, directions=state.directions[:, 1:])
+    with pytest.raises(tfeti.InputError, match="the state has other contact rows"):
+        other.problem.restore(wrong)
 
 
 def test_a_number_of_directions_that_is_none():

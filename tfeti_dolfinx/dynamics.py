@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import ufl
@@ -34,7 +34,8 @@ class ContactDynamics(ContactProblem):
     A step of the size τ solves one contact problem with K/2 + 2M/τ², and ends at u⁺ and v⁺. Contact
     is implicit: no node overlaps at the end of a step, and its forces, λ, are means over the step.
     ``LoadSteps`` goes through many, or by hand: ``take_step(size)``, ``solve()``, ``accept()``.
-    All is collective.
+    All is collective. Since F is that of the steps before, 100 directions of conjugate gradients
+    are kept, unless the option ``recycle`` is given.
 
     With fixed obstacles and supports and no friction the energy E = vᵀMv/2 + uᵀKu/2 changes by the
     work of the load less λᵀ(g − Bu): contact adds none, and takes some where it closes. Forces of
@@ -66,6 +67,8 @@ class ContactDynamics(ContactProblem):
     Raises:
         InputError: What is given does not fit; the message names it.
     """
+
+    defaults: ClassVar[Mapping[str, Any]] = {"recycle": 100}
 
     def __init__(
         self,
@@ -156,7 +159,8 @@ class ContactDynamics(ContactProblem):
         """The last accepted solution as arrays of this rank, for ``restore``."""
         motion, state = self._forms_in_time.motion, super().state()
         predicted = self._predictor.start if self._predictor is not None else state.predicted
-        return replace(state, velocity=motion.v, load=motion.load, predicted=predicted)
+        moving = {"velocity": motion.v, "load": motion.load, "size": np.array(motion.size)}
+        return replace(state, predicted=predicted, **moving)
 
     def restore(self, state: SavedState) -> None:
         """Go on where another run of the same program has been; the step must have its size.
@@ -171,6 +175,8 @@ class ContactDynamics(ContactProblem):
                 raise InputError("the state is of a problem without mass; expected velocities")
         forms.move(self.dofs.to_dolfinx(state.u), state.velocity, state.load)
         forms.motion.towards = forms.motion.free
+        if state.size > 0.0:  # equal steps of a series differ by rounding, factors are of the first
+            forms.motion.size = float(state.size)
         super().restore(state)
         self.solution.v = state.velocity
         known = any_rank(self.decomposition.comm, state.predicted.size > 0)

@@ -20,18 +20,21 @@ from tfeti_dolfinx.options import Options
 FACTOR_OPTION = re.compile(r"(sub|coarse|face)_(pc_factor|mat)_\w+")
 
 
-def parse_options(given: Mapping[str, Any] | None, prefix: str) -> Options:
+def parse_options(
+    given: Mapping[str, Any] | None, prefix: str, defaults: Mapping[str, Any] | None = None
+) -> Options:
     """Options from the command line, else from a dictionary, else the defaults.
 
     Args:
         given: Options of the program, with or without the prefix.
         prefix: Prefix of all options, e.g. ``"tfeti_"``.
+        defaults: By name, those that are not the options' own.
 
     Raises:
         InputError: An option is unknown, its value does not fit, or the command line has options
             that PETSc was not given.
     """
-    named = _without_prefix(given, prefix)
+    named = {**(defaults or {}), **_without_prefix(given, prefix)}
     database = PETSc.Options(prefix)
     _check_reached(named, database, prefix)
     named |= {name: database.getString(name, "") for name in database.getAll()}

@@ -82,7 +82,7 @@ class Options:
         0,
         "pcpg, newton",
         "so many directions of earlier solves with the same F are kept at most, which later ones "
-        "begin with; each takes two dual vectors",
+        "begin with; each takes two dual vectors; of bodies with mass 100 by default",
         fits=FROM_0,
     )
     homogenization: str = described(

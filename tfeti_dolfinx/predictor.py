@@ -40,7 +40,8 @@ class Predictor:
 
     def __init__(self, dofs: TornDofs, decomposition: Decomposition, settings: Settings) -> None:
         self._dofs, self._decomposition = dofs, decomposition
-        self._settings = replace(settings, extensions=Extensions())
+        options = replace(settings.options, recycle=0)  # of a mass there is little to learn
+        self._settings = replace(settings, extensions=Extensions(), options=options)
         self._M: csr_array | None = None
         self._subdomains: Subdomains | None = None
         self._dual: Dual | None = None

@@ -90,7 +90,7 @@ class ContactProblem(Stepping):
         boundary_elements: BoundaryElements | None = None,
     ) -> None:
         require_real_petsc()
-        self.options = parse_options(petsc_options, petsc_options_prefix)
+        self.options = parse_options(petsc_options, petsc_options_prefix, self.defaults)
         extensions = Extensions() if extensions is None else extensions
         checked_type(extensions, Extensions, "extensions", "tfeti_dolfinx.Extensions")
         checked_type(

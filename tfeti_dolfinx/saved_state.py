@@ -36,6 +36,8 @@ class SavedState:
         velocity: Velocity in DOLFINx's order, empty without inertia.
         load: Load likewise.
         predicted: Multipliers of this rank's rows of the predictor, empty without one.
+        size: That of the step which the matrix was made for, shape ``()``; 0 without inertia.
+        directions: What ``Recycled`` keeps of earlier solves, shape ``(2, m, k)``.
     """
 
     layout: Array
@@ -51,6 +53,8 @@ class SavedState:
     velocity: Array = field(default_factory=lambda: np.zeros(0))
     load: Array = field(default_factory=lambda: np.zeros(0))
     predicted: Array = field(default_factory=lambda: np.zeros(0))
+    size: Array = field(default_factory=lambda: np.zeros(()))
+    directions: Array = field(default_factory=lambda: np.zeros((2, 0, 0)))
 
     @classmethod
     def of(cls, solution: Solution, mu: Array, norm: float, reach: list[float]) -> SavedState:
@@ -86,10 +90,11 @@ class SavedState:
         """
         records = gluing.records
         sizes = (len(self.lam), len(self.slip), self.contact.tolist(), self.group.tolist())
-        kept = records.within_reach
+        kept, wide = records.within_reach, self.directions.shape
         found = (records.contact[kept].tolist(), records.group[kept].tolist())
         with raised_on_all_ranks(gluing.dofs.comm):
-            if sizes != (gluing.constraints.num_rows, len(records), *found):
+            rows = gluing.constraints.num_rows
+            if sizes != (rows, len(records), *found) or (wide[2] and wide[:2] != (2, rows)):
                 raise InputError(
                     "the state has other contact rows than the problem: expected the contacts, "
                     "conditions and data that it was found with"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar
 
 from dolfinx import fem
 
@@ -25,7 +26,13 @@ Start = tuple[Gluing, Array, Array]
 
 
 class Stepping:
-    """What of ``ContactProblem`` concerns load steps: what it has found, and where to go on."""
+    """What of ``ContactProblem`` concerns load steps: what it has found, and where to go on.
+
+    Attributes:
+        defaults: Options, by name, that have other defaults than their own.
+    """
+
+    defaults: ClassVar[Mapping[str, Any]] = {}
 
     u: fem.Function
     dofs: TornDofs
@@ -91,8 +98,11 @@ class Stepping:
         solution, start = self._accepted
         if solution is None or start is None:
             raise InputError("there is no state yet; expected a call of accept() before")
-        reach, _ = self._system.search.rows()
-        return SavedState.of(solution, start[2], self._system.dual.seen, reach)
+        (reach, _), dual = self._system.search.rows(), self._system.dual
+        state = SavedState.of(solution, start[2], dual.seen, reach)
+        if dual.recycled is None or dual.constraints is not start[0].constraints:
+            return state
+        return replace(state, directions=dual.recycled.kept)
 
     def restore(self, state: SavedState) -> None:
         """Go on where another run of the same program, on as many ranks, has been. Collective.
@@ -109,9 +119,12 @@ class Stepping:
         system = self._system
         system.know_rows(list(state.reach), state.groups())
         system.look_for_changes()
-        system.make(self.report).saw(float(state.norm))
+        dual = system.make(self.report)
+        dual.saw(float(state.norm))
         gluing = replace(system.gluing, slip=state.slip)
         state.check_rows(gluing)
+        if dual.recycled is not None:
+            dual.recycled.take(state.directions)
         solution = self._make_solution(state.u, state.multipliers(), gluing)
         self._accepted = (solution, (gluing, state.lam, state.mu))
         self.go_back()

@@ -48,7 +48,7 @@ class Recycled:
         Where images are no longer right, all that was kept is forgotten.
         """
         if self.W.shape[1] == 0:
-            self.W, self.FW = (np.zeros((len(x), self.capacity), order="F") for _ in range(2))
+            self._make_room(len(x))
         for passed in range(2):
             W, FW = self.W[:, : self.count], self.FW[:, : self.count]
             a, same = summed(self.comm, np.array([FW.T @ x, W.T @ Fx]))
@@ -65,6 +65,27 @@ class Recycled:
         self._squares[self._next] = square / energy
         self.count = max(self.count, self._next + 1)
         self._next = (self._next + 1) % self.capacity
+
+    @property
+    def kept(self) -> Array:
+        """This rank's part of W and FW, the oldest direction first, shape ``(2, m, count)``."""
+        order = np.roll(np.arange(self.count), -self._next if self.count == self.capacity else 0)
+        return np.array([self.W[:, order], self.FW[:, order]])
+
+    def take(self, kept: Array) -> None:
+        """Go on with what another run has kept, the newest of it if it is too much. Collective."""
+        newest = kept[:, :, max(kept.shape[2] - self.capacity, 0) :]
+        if newest.shape[2] == 0:
+            return
+        self.count = newest.shape[2]
+        self._make_room(newest.shape[1])
+        self.W[:, : self.count], self.FW[:, : self.count] = newest
+        self._next = self.count % self.capacity
+        self._squares[: self.count] = summed(self.comm, np.sum(newest[0] ** 2, axis=0))
+
+    def _make_room(self, rows: int) -> None:
+        """W and FW for so many local rows."""
+        self.W, self.FW = (np.zeros((rows, self.capacity), order="F") for _ in range(2))
 
     def within(self, held: Array | None) -> Array | None:
         """Orthonormal N so that W N is 0 on rows, shape ``(count, k)``. Collective.
