@@ -30,10 +30,10 @@ def test_random_scenes_are_right_or_named(seed, comm):
         assert row["class"].islower(), row
 
 
-# 63: a body that nothing loads, with gaps that are rounding of 0, beside others that move by 1e-6 of
-# their size; 68, 2106: forces that are rounding of 0; 163: gaps 1e12 times as large as the error allowed; 2186:
-# bodies 220 and 600 times as long as thick; 5033: normals of a side at 2e5 of its length; 6044: a
-# kernel of flat triangles; 6114: u is 1e-4 of that of the first look
+# 63: a body that nothing loads, with gaps that are rounding of 0, beside others that move by 1e-6
+# of their size; 68, 2106: forces that are rounding of 0; 163: gaps 1e12 times as large as the error
+# allowed; 2186: bodies 220 and 600 times as long as thick; 5033: normals of a side at 2e5 of its
+# length; 6044: a kernel of flat triangles; 6114: u is 1e-4 of that of the first look
 @pytest.mark.parametrize("qp_type", ["newton", "smalse"])
 @pytest.mark.parametrize("seed", [63, 68, 163, 2106, 2186, 5033, 6044, 6114])
 def test_scenes_near_to_rounding_are_right_with_both_solvers(seed, qp_type, comm):

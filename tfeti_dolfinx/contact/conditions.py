@@ -19,8 +19,8 @@ HARDLY_COVERED = 1e-6
 # of ∫φ_i: a weight below it is what rounding leaves of one that biorthogonality makes 0; as an
 # entry of B it would make an unknown of the trace of every node of a facet
 NEGLIGIBLE = 1e-13
-# of the largest coordinate: a smaller gap is what rounding leaves of none. A body that nothing loads
-# would have such an overlap for its displacement, of which nothing is right.
+# of the largest coordinate: a smaller gap is what rounding leaves of none. A body that nothing
+# loads would have such an overlap for its displacement, of which nothing is right.
 NO_GAP = 1e-14
 
 Triplets = tuple[Array, Array, Array]

@@ -27,7 +27,8 @@ NEARLY, SLOW, SLOWLY = 1e-6, 0.1, 8
 # 1, so that they stay Newton's; where bodies are hardly held it slows the end down, and the
 # smallest that a factor bears takes its place
 DAMPING, LEAST_DAMPING = 1e-8, 1e-14
-# factor on it after a whole step that has met no row but the damping
+# factor on it after a whole step that has met no row but the damping: those of the face may be so
+# soft beside open ones that they hold by less
 EASED = 0.01
 # a step of this share of Newton's changes nothing that is left above rounding
 SHORTEST = 1e-8
@@ -114,7 +115,7 @@ def nearest(
         trials += tried
         whole = agreed(comm, length == 1.0 and float(trial.residual @ step) > LEFT * slope)
         unmet = unmet + 1 if whole else 0
-        if whole:  # rows that carry less than damping does may be what holds: softer ones do
+        if whole:
             damping = max(EASED * damping, LEAST_DAMPING)
         elif length < 1.0 and slowly == 0:
             damping = DAMPING
