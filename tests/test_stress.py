@@ -44,6 +44,14 @@ def test_scenes_near_to_rounding_are_right_with_both_solvers(seed, qp_type, comm
         assert row["class"] == "right", row
 
 
+def test_conjugate_gradients_begin_anew_where_rounding_ends_them(comm):
+    """39: a strip 2500 times as long as thick; the first look finds 130 times its displacement."""
+    scene = replace(random_scene(39), options={"tfeti_rtol": 1e-4})
+    row = judge.run_scene(scene, comm)
+    if comm.rank == 0:
+        assert row["class"] == "right", row
+
+
 def test_soft_rows_hold_with_friction_beside_stiff_ones_that_are_open(comm):
     """54: moduli of subdomains are as 3e6 : 1; bounds that hold the load were taken for none."""
     scene = with_friction(random_scene(54), "coulomb", 0.5)
