@@ -62,6 +62,20 @@ def test_bodies_that_only_touch_have_no_overlap(cell, curvatures, n, sides):
     assert gaps.min() > -1e-12
 
 
+@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+def test_a_gap_that_is_rounding_of_coordinates_is_none(size):
+    """Turned bodies that touch; one that is 1e-12 of their size stays."""
+    for gap in (0.0, 1e-12):
+        d = stacked("triangle", 3, 4, 4, gap=gap)
+        x, y = d.mesh.geometry.x.T[:2].copy()
+        d.mesh.geometry.x[:, 0] = size * (np.cos(0.3) * x - np.sin(0.3) * y)
+        d.mesh.geometry.x[:, 1] = size * (np.sin(0.3) * x + np.cos(0.3) * y)
+        for sides in ORDERS:
+            gaps = gathered(searched([sided(*sides)], dofs_of(d), d).gap)
+            assert len(gaps) > 0
+            assert np.allclose(gaps, gap * size, rtol=1e-2, atol=0.0)
+
+
 # what keeps both bodies where they are: sides without normal displacement, springs everywhere
 HOLDS = {
     "loose": (("lower bottom",), 0.0),

@@ -249,6 +249,15 @@ def test_steps_that_no_row_stops_end():
     assert coarse.steps <= 15
 
 
+@pytest.mark.parametrize("stiff", [1e3, 1e5, 1e6])
+def test_soft_rows_that_hold_are_seen_beside_stiff_ones_that_are_open(stiff):
+    """λ₁ − rλ₂ = 1 at (1, 0): G_f G_fᵀ = 1 beside GGᵀ = 1 + r²."""
+    coarse = DenseCoarse(np.array([[1.0, -stiff]]), np.ones(1))
+    found = nearest(coarse, bounds_on(np.arange(2)), vector([0.0, -1.0 / stiff]))
+    assert found.missing <= 1e-12
+    assert np.allclose(found.lam.array_r, [1.0, 0.0], rtol=0.0, atol=1e-12)
+
+
 def test_the_nearest_point_says_what_nothing_fulfils():
     """λ₁ + λ₂ = −1 with λ ≥ 0."""
     coarse = DenseCoarse(np.ones((1, 2)), np.array([-1.0]))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.contact.records import ContactRecords, Friction
@@ -18,6 +19,9 @@ HARDLY_COVERED = 1e-6
 # of ∫φ_i: a weight below it is what rounding leaves of one that biorthogonality makes 0; as an
 # entry of B it would make an unknown of the trace of every node of a facet
 NEGLIGIBLE = 1e-13
+# of the largest coordinate: a smaller gap is what rounding leaves of none. A body that nothing
+# loads would have such an overlap for its displacement, of which nothing is right.
+NO_GAP = 1e-14
 
 Triplets = tuple[Array, Array, Array]
 
@@ -56,7 +60,7 @@ def conditions(dofs: TornDofs, contact: int, side: Side, shares: Shares) -> Cont
     """
     area = dofs.add_on_owners(shares.vertices.ravel(), shares.covered.ravel())
     whole = dofs.add_on_owners(side.vertices.ravel(), side.areas.ravel())
-    gap = _mean_gaps(dofs, shares, area)
+    gap = _without_rounding(dofs, _mean_gaps(dofs, shares, area))
     chosen = np.flatnonzero(area > HARDLY_COVERED * whole)
     place = np.full(dofs.num_groups, -1)
     place[chosen] = np.arange(len(chosen))
@@ -95,6 +99,13 @@ def _mean_gaps(dofs: TornDofs, shares: Shares, area: Array) -> Array:
     low = dofs.reduce_on_owners(vertices, shares.bounds[0].ravel(), np.minimum, np.inf)
     high = dofs.reduce_on_owners(vertices, shares.bounds[1].ravel(), np.maximum, -np.inf)
     return np.clip(mean, low, high)
+
+
+def _without_rounding(dofs: TornDofs, gap: Array) -> Array:
+    """0 in the place of gaps that rounding of coordinates may have made of it. Collective."""
+    own = float(np.abs(dofs.V.mesh.geometry.x).max(initial=0.0))
+    largest = dofs.comm.allreduce(own, op=MPI.MAX)
+    return np.where(np.abs(gap) <= NO_GAP * largest, 0.0, gap)
 
 
 def _merged(dofs: TornDofs, entries: tuple[Triplets, ...]) -> Triplets:

@@ -27,6 +27,9 @@ NEARLY, SLOW, SLOWLY = 1e-6, 0.1, 8
 # 1, so that they stay Newton's; where bodies are hardly held it slows the end down, and the
 # smallest that a factor bears takes its place
 DAMPING, LEAST_DAMPING = 1e-8, 1e-14
+# factor on it after a whole step that has met no row but the damping: those of the face may be so
+# soft beside open ones that they hold by less
+EASED = 0.01
 # a step of this share of Newton's changes nothing that is left above rounding
 SHORTEST = 1e-8
 # of the slope at its start: a whole step that leaves as much has met no row but the damping; after
@@ -100,10 +103,10 @@ def nearest(
     """
     comm = y.getComm().tompi4py()
     trial = _trial(coarse, feasible, y, np.zeros(coarse.dimension) if alpha is None else alpha)
-    damping, trials, unmet, slowly = DAMPING, 1, 0, 0
+    damping, trials, unmet, slowly, least = DAMPING, 1, 0, 0, trial.left
     while trials < max_trials and unmet < PATIENCE:
-        left, scale = trial.left, float(np.linalg.norm(coarse.forces(trial.lam)))
-        if agreed(comm, left <= BALANCED * scale):
+        scale = float(np.linalg.norm(coarse.forces(trial.lam)))
+        if agreed(comm, trial.left <= BALANCED * scale):
             break
         face = feasible.face(trial.lam.array_r, trial.lam.array_r - trial.z)
         step = coarse.damped_solve(face.damped(), trial.residual, damping)
@@ -112,8 +115,12 @@ def nearest(
         trials += tried
         whole = agreed(comm, length == 1.0 and float(trial.residual @ step) > LEFT * slope)
         unmet = unmet + 1 if whole else 0
-        slow = agreed(comm, trial.left > SLOW * left and trial.left <= NEARLY * scale)
-        slowly = slowly + 1 if slow else 0
+        if whole:
+            damping = max(EASED * damping, LEAST_DAMPING)
+        elif length < 1.0 and slowly == 0:
+            damping = DAMPING
+        slow = agreed(comm, trial.left > SLOW * least and trial.left <= NEARLY * scale)
+        slowly, least = slowly + 1 if slow else 0, min(least, trial.left)
         if agreed(comm, length <= SHORTEST) or slowly > SLOWLY:
             break
         if slow:

@@ -19,6 +19,8 @@ from tfeti_dolfinx.qp.stopping import StoppingRule
 DRIFTED = 0.5
 # of λ: a way that is shorter may be rounding of Gλ = e
 SHORT = 1e-6
+# of ‖P g‖ where directions have ended before: then it is worth the way to begin anew
+DIGIT = 0.1
 
 
 def pcpg(
@@ -129,7 +131,8 @@ def solve_by_pcpg(
 ) -> QPResult:
     """Solve min ½λᵀFλ − λᵀd, Gλ = e, from λ̄ on. Collective.
 
-    Stops as ``pcpg`` does; besides with
+    Stops as ``pcpg`` does, but begins anew with a new gradient where a direction has no positive
+    curvature, as long as the residual is a tenth of what it was there before; besides with
 
     =====================  ======================================================
     reason                 when
@@ -162,7 +165,7 @@ def solve_by_pcpg(
     """
     lam, g, steps = homogenised.lam_bar.copy(), homogenised.gradient.copy(), Steps()
     monitor(steps, "start", lam, homogenised.b.norm(), 0.0)
-    reason = pcpg(qp, Point(lam, g), rule, steps, max_it, monitor)
+    reason = _with_new_gradients(qp, Point(lam, g), rule, steps, max_it, monitor)
     qp.coarse.project(g)
     norm = g.norm()
     if reason == ConvergedReason.DIVERGED_INDEFINITE_MAT and homogenised.is_rounding(norm):
@@ -183,6 +186,24 @@ def solve_by_pcpg(
     )
     moved.destroy()
     return result
+
+
+def _with_new_gradients(
+    qp: QP, point: Point, rule: StoppingRule, steps: Steps, max_it: int, monitor: Monitor
+) -> ConvergedReason:
+    """PCPG, which begins anew where directions end, as long as that brings a digit. Collective.
+
+    Rounding of g at a λ that bends subdomains much farther than the solution does may end them.
+    """
+    least, r = np.inf, point.g.duplicate()
+    while True:
+        reason = pcpg(qp, point, rule, steps, max_it, monitor)
+        norm = agreed(point.lam.getComm().tompi4py(), _residual(qp, point.g, r))
+        if reason != ConvergedReason.DIVERGED_INDEFINITE_MAT or norm > DIGIT * least:
+            r.destroy()
+            return reason
+        least = norm
+        point.refresh(qp)
 
 
 def _face(qp: QP, lam: PETSc.Vec, g: PETSc.Vec) -> Face:
