@@ -89,31 +89,38 @@ def solve_with_friction(
     on_law = NewtonOnCoulomb(dual, options, qp_type)
     while True:
         start = bounds.set_feasible(start)
-        solved = on_law.solve(start) if bounds.are_known else None
+        near = change <= NEAR * tolerance
+        solved = None if near or not bounds.are_known else on_law.solve(start)
         if solved is not None:
-            start = solved
-            bounds.take(start[0])
-        near = change <= NEAR * tolerance or solved is not None
-        rtol = least if near else max(least, min(rtol, SHARE * change))
+            bounds.take(solved[0])
+        else:
+            rtol = least if near else max(least, min(rtol, SHARE * change))
         before = dual.F.count["solver"]
-        asked, exact = replace(options, rtol=rtol), goal if rtol <= least else None
-        result, rule = solve_dual(dual, asked, qp_type, start, monitor, exact)
+        asked = least if solved is not None else rtol
+        exact = goal if asked <= least else None
+        given = replace(options, rtol=asked), qp_type, solved or start
+        result, rule = solve_dual(dual, *given, monitor, exact)
         iterations, looks = iterations + 1, looks + rule.looks
         steps = steps.plus(result.steps)
+        if result.reason <= 0 and solved is not None:
+            on_law.give_up()
+            bounds.take_back()
+            result.destroy()
+            continue
         if bounds.goes_on(result.reason):
             result.destroy()
             continue
         if result.reason <= 0:
             break
         change = bounds.change(result.lam)
-        if change <= tolerance and rtol <= least:
+        if change <= tolerance and asked <= least:
             break
         if bounds.astray or iterations >= options.friction_max_it:
             result.reason = ConvergedReason.DIVERGED_FRICTION
             break
         if change > tolerance:
             bounds.advance()
-        if result.steps.inner == 0:
+        if result.steps.inner == 0 and solved is None:
             rtol *= SHARE
         start = (np.array(result.lam.array_r), result.mu)
         result.destroy()

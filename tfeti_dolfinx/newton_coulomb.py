@@ -9,19 +9,21 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.citations import cite
 from tfeti_dolfinx.dual.dual import Dual, contact_set
 from tfeti_dolfinx.options import Options
-from tfeti_dolfinx.parallel import agreed
+from tfeti_dolfinx.parallel import agreed, summed
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.law import Law
 from tfeti_dolfinx.qp.law_newton import LawPoint, newton_on_law, residual_of
 from tfeti_dolfinx.qp.oblique import NoOblique, Oblique
+from tfeti_dolfinx.qp.problem import QP
 
-# how often it may end and its bounds not be at rest, and the factor on its target each time
-TRIES, FINER = 4, 0.03
+# how often it may end and its bounds not be at rest; the factor on its target each time, and at
+# least on its residual; of ‖F‖‖λ‖: what rounding leaves of that
+TRIES, FINER, ROUNDING = 4, 0.03, 2e-15
 
 
 class NewtonOnCoulomb:
-    """Newton's method on the law of a scene, tried until it fails.
+    """Newton's method on the law of a scene, tried until it fails. All methods are collective.
 
     Args:
         dual: The dual problem.
@@ -37,44 +39,69 @@ class NewtonOnCoulomb:
         self._dual, self._rtol, self.steps = dual, options.number, 0
         self._tries = TRIES if kind == "newton" or (kind == "auto" and qp_type == "newton") else 0
         self._share = 1.0
+        # the same load again: the last bounds are right
+        self._rests = dual.last.is_of(dual.d, dual.coarse.e)
+
+    def give_up(self) -> None:
+        """Try no more."""
+        self._tries = 0
 
     def solve(self, start: tuple[Array, Array] | None) -> tuple[Array, Array] | None:
-        """λ on this rank's rows and the multipliers of Gλ = e for which the law holds. Collective.
+        """λ on this rank's rows and the multipliers of Gλ = e for which the law holds.
 
-        Multiplies by F in each step, and once where it does not start at the last solution.
+        A step multiplies by F once, and once for each direction of its solve; so does the start,
+        where it is not the last solution.
 
         Args:
-            start: Where to start; None: nothing is tried, nor where no solve has
-                seen F yet.
+            start: Where to start; None: nothing is tried, nor where no solve has seen F yet.
 
         Returns:
             None where it is not tried, or fails.
         """
         if start is None or self._tries == 0 or self._dual.seen == 0.0:
             return None
+        if self._rests:
+            self._rests = False
+            return None
         cite("newton on friction")
-        dual, (lam, mu) = self._dual, start
-        known = dual.constraints.pressures[dual.constraints.pressed]
-        qp, work, at = dual.qp(), dual.d.copy(), dual.d.duplicate()
-        qp.coarse.project(work)
-        target = self._share * self._rtol * agreed(dual.coarse.comm, float(work.norm()))
-        at.array[:] = lam
-        image = dual.last.image(dual.F, at).Fx
-        image.axpy(-1.0, dual.d)
-        norm, law, points = dual.seen, self._law(), []
-        for alpha in (mu, qp.coarse.coordinates(image)):
-            qp.coarse.combine(alpha, work)
-            point = LawPoint(np.array(lam), image.array_r - work.array_r, alpha)
-            points.append((residual_of(qp, law, point, norm), point))
-        for item in (work, at, image):
-            item.destroy()
-        first = min(points, key=lambda one: one[0])[1]
-        end, steps = newton_on_law(qp, law, self._oblique, first, target, norm)
-        self.steps += steps
-        self._share *= FINER
-        dual.constraints.set_pressures(known)
+        qp, law, norm = self._dual.qp(), self._law(), self._dual.seen
+        constraints = self._dual.constraints
+        known = constraints.pressures[constraints.pressed]
+        residual, first = self._first(qp, law, start)
+        target = min(self._target(qp), FINER * residual)
+        if target <= agreed(self._dual.coarse.comm, ROUNDING * norm * self._size(start[0])):
+            end, steps = None, 0
+        else:
+            end, steps = newton_on_law(qp, law, self._oblique, first, target, norm)
+        constraints.set_pressures(known)
+        self.steps, self._share = self.steps + steps, FINER * self._share
         self._tries = 0 if end is None else self._tries - 1
         return None if end is None else (end.lam, end.mu)
+
+    def _first(self, qp: QP, law: Law, start: tuple[Array, Array]) -> tuple[float, LawPoint]:
+        """The start with its μ, or with that of least squares: the one with the lesser residual."""
+        (lam, mu), work = start, qp.d.duplicate()
+        work.array[:] = lam
+        at = self._dual.last.image(qp.F, work)
+        at.Fx.axpy(-1.0, qp.d)
+        found = []
+        for alpha in (mu, qp.coarse.coordinates(at.Fx)):
+            qp.coarse.combine(alpha, work)
+            point = LawPoint(np.array(lam), at.Fx.array_r - work.array_r, alpha)
+            found.append((residual_of(qp, law, point, self._dual.seen), point))
+        at.destroy()
+        return min(found, key=lambda one: one[0])
+
+    def _target(self, qp: QP) -> float:
+        """rtol ‖Pd‖, less each time."""
+        Pd = qp.d.copy()
+        qp.coarse.project(Pd)
+        size = agreed(self._dual.coarse.comm, float(Pd.norm()))
+        Pd.destroy()
+        return self._share * self._rtol * size
+
+    def _size(self, x: Array) -> float:
+        return float(np.sqrt(summed(self._dual.coarse.comm, np.array([x @ x]))[0]))
 
     def _oblique(self, face: Face, C: csr_array) -> Oblique:
         coarse = self._dual.coarse

@@ -57,6 +57,7 @@ class Pressures:
         self._mu = np.linalg.norm(dual.constraints.coefficients[at], axis=1)
         self._weight = self._mu * dual.constraints.tangent_scale[at]
         self._now, self._found, self._none = self._first(start), np.zeros(len(at)), 0.0
+        self._before = self._now
         self.restless = -1
         self._held: Array = np.full(len(at), np.inf)
         self._anderson = Anderson(self._products)
@@ -178,9 +179,13 @@ class Pressures:
         )
 
     def take(self, lam: Array) -> None:
-        """Take the bounds of multipliers for which the law holds."""
-        self._now = self._forces(lam[self._rows])
+        """Take the bounds of multipliers for which the law holds, for a try."""
+        self._before, self._now = self._now, self._forces(lam[self._rows])
         self._constraints.set_pressures(self._now)
+
+    def take_back(self) -> None:
+        """Take those again that were there before."""
+        self._now = self._before
 
     @property
     def are_known(self) -> bool:

@@ -11,8 +11,9 @@ from mpi4py import MPI
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.parallel import agreed, summed
 
-# of Az: what earlier directions leave of it; less is rounding
-NEW = 1e-10
+# of Az: what earlier directions leave of it, less is rounding; and of the residual: what a
+# direction takes from it, or there is nothing to gain
+NEW, GAIN = 1e-7, 1e-8
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ def gcr(
     most: int,
     comm: MPI.Intracomm,
 ) -> Gone:
-    """Make ‖b − Au‖ least over more and more directions. Collective; one reduction a step.
+    """Make ‖b − Au‖ least over more and more directions. Collective; one sum over ranks a step.
 
     Eisenstat, Elman, Schultz, SIAM J. Numer. Anal. 20 (1983) 345–357: each direction z = Mr with
     Az orthogonal to those before. All are kept.
@@ -63,7 +64,7 @@ def gcr(
         c, (square, along, left) = sums[:-3], sums[-3:]
         length = float(np.sqrt(max(square - c @ c, 0.0)))
         steps += 1
-        if agreed(comm, length <= NEW * np.sqrt(square)):
+        if agreed(comm, length <= NEW * np.sqrt(square) or abs(along) <= GAIN * length * size):
             break
         q, z, w = ((x - c @ X) / length for x, X in ((q, Q), (z, Z), (w, images)))
         step = along / length

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from petsc4py import PETSc
 
+from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.parallel import any_rank
 from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
@@ -48,7 +49,8 @@ class LastImage:
     """The last solution of a program, and what F makes of it."""
 
     def __init__(self) -> None:
-        self._x, self._Fx = np.zeros(0), np.zeros(0)
+        nothing: Array = np.zeros(0)
+        self._x, self._Fx, self._d, self._e = nothing, nothing, nothing, nothing
 
     def keep(self, result: QPResult, qp: QP) -> None:
         """Take a solution, whose gradient is Fx − d − Gᵀμ. Not collective."""
@@ -56,7 +58,13 @@ class LastImage:
         qp.coarse.combine(result.mu, by_mu)
         self._x = np.array(result.lam.array_r)
         self._Fx = result.gradient.array_r + by_mu.array_r + qp.d.array_r
+        self._d, self._e = np.array(qp.d.array_r), np.array(qp.coarse.e)
         by_mu.destroy()
+
+    def is_of(self, d: PETSc.Vec, e: Array) -> bool:
+        """Whether it was kept from a program with this d and e. Collective."""
+        same = np.array_equal(self._d, d.array_r) and np.array_equal(self._e, e)
+        return not any_rank(d.getComm().tompi4py(), not same)
 
     def image(self, F: Operator, x: PETSc.Vec) -> Image:
         """As ``image``, but nothing is multiplied if x is the last solution. Collective."""

@@ -20,8 +20,8 @@ from tfeti_dolfinx.qp.law import Law
 from tfeti_dolfinx.qp.oblique import Oblique
 from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
 
-# steps; and steps in a row without a residual below the least so far, before one gives up
-MOST_STEPS, PATIENCE = 40, 10
+# steps; and steps in a row without a residual below so much of the least one, before one gives up
+MOST_STEPS, PATIENCE, LESS = 40, 10, 0.98
 # directions of one solve
 MOST_DIRECTIONS = 80
 # what a solve leaves of its residual: less where the last step has brought that far down; of the
@@ -81,21 +81,26 @@ class Turning:
 
     Args:
         law: The sets.
-        comm: Communicator.
     """
 
-    def __init__(self, law: Law, comm: MPI.Intracomm) -> None:
-        self._law, self._comm = law, comm
+    def __init__(self, law: Law) -> None:
+        self._law = law
         self._slips = np.zeros(len(law.normals), dtype=bool)
         self._to: Array = np.zeros(law.tangents.shape)
 
-    def face(self, feasible: FeasibleSet, p: Array, s: Array) -> tuple[Array, Face]:
-        """p and its face; what slipped the other way a step ago sticks. Collective."""
-        law, face, to = self._law, feasible.face(p, s), p[self._law.tangents]
+    def face(self, feasible: FeasibleSet, p: Array, g: Array) -> tuple[Array, Face]:
+        """p and its face; what slipped the other way a step ago sticks.
+
+        Args:
+            feasible: The set.
+            p: The projection of y.
+            g: ‖F‖(p − y), which gives the face the curvature of the projection.
+        """
+        law, face, to = self._law, feasible.face(p, g), p[self._law.tangents]
         turned = law.slips(face) & self._slips & (np.sum(to * self._to, axis=1) < 0.0)
-        if any_rank(self._comm, bool(np.any(turned))):
+        if np.any(turned):
             p = law.stuck(p, turned)
-            face = feasible.face(p, s)
+            face = feasible.face(p, g)
         self._slips, self._to = law.slips(face), to
         return p, face
 
@@ -127,7 +132,7 @@ def newton_on_law(
     """
     comm = qp.d.getComm().tompi4py()
     last, best, idle = 0.0, np.inf, 0
-    turning = Turning(law, comm)
+    turning = Turning(law)
     for step in range(MOST_STEPS):
         # Step 1: what a gradient step, brought back, moves
         y = at.lam - at.s / norm
@@ -135,12 +140,12 @@ def newton_on_law(
         residual = norm * _length(comm, p - at.lam)
         if residual <= target:
             return at, step
-        idle = 0 if residual < best else idle + 1
+        idle = 0 if residual < LESS * best else idle + 1
         best = min(best, residual)
         if idle > PATIENCE or not np.isfinite(residual):
             break
         # Step 2: the face there
-        p, face = turning.face(feasible, p, at.s)
+        p, face = turning.face(feasible, p, norm * (p - y))
         # Steps 3 and 4: onto the face, and a solve there
         eased = face.with_directions(np.flatnonzero(face.curvature <= HARD * norm))
         share = min(SHARE, FOLLOWED * residual / last) if step else SHARE
@@ -150,7 +155,7 @@ def newton_on_law(
         except FactorError:
             break
         last = residual
-    return None, step
+    return None, step + 1
 
 
 def residual_of(qp: QP, law: Law, at: LawPoint, norm: float) -> float:
@@ -167,6 +172,8 @@ def _solve_on(
     Multiplies by F once for the way onto the face, and once for each direction.
     """
     comm, face, F = qp.d.getComm().tompi4py(), on.face, _on_arrays(qp.F, qp.d)
+    preconditioner = qp.preconditioner_on(face) if qp.preconditioner_on else None
+    M = _on_arrays(preconditioner, qp.d) if preconditioner else face.restricted
     # Step 3: λ₁ on the face, u₀ that restores Gλ = e
     lam, x = on.entered(at.lam), qp.d.duplicate()
     x.array[:] = lam
@@ -175,10 +182,8 @@ def _solve_on(
     s, way = at.s, lam - at.lam
     if any_rank(comm, bool(np.any(way != 0.0))):
         s = s + F(way)
-    # Step 4: u by conjugate residuals
-    preconditioner = qp.preconditioner_on(face) if qp.preconditioner_on else None
-    M = _on_arrays(preconditioner, qp.d) if preconditioner else face.restricted
 
+    # Step 4: u by conjugate residuals
     def apply(z: Array) -> tuple[Array, Array]:
         Fz = F(on.followed(z))
         return oblique.project(Fz + on.bend(z)), Fz
