@@ -19,7 +19,7 @@ from tfeti_dolfinx.qp.problem import QP
 
 # how often it may end and its bounds not be at rest; the factor on its target each time, and at
 # least on its residual; of ‖F‖‖λ‖: what rounding leaves of that
-TRIES, FINER, ROUNDING = 4, 0.03, 2e-15
+TRIES, FINER, ROUNDING = 4, 0.03, 2e-16
 
 
 class NewtonOnCoulomb:
