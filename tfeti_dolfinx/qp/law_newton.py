@@ -88,19 +88,13 @@ class Turning:
         self._slips = np.zeros(len(law.normals), dtype=bool)
         self._to: Array = np.zeros(law.tangents.shape)
 
-    def face(self, feasible: FeasibleSet, p: Array, g: Array) -> tuple[Array, Face]:
-        """p and its face; what slipped the other way a step ago sticks.
-
-        Args:
-            feasible: The set.
-            p: The projection of y.
-            g: ‖F‖(p − y), which gives the face the curvature of the projection.
-        """
-        law, face, to = self._law, feasible.face(p, g), p[self._law.tangents]
+    def face(self, feasible: FeasibleSet, p: Array, s: Array) -> tuple[Array, Face]:
+        """p and its face under s; what slipped the other way a step ago sticks."""
+        law, face, to = self._law, feasible.face(p, s), p[self._law.tangents]
         turned = law.slips(face) & self._slips & (np.sum(to * self._to, axis=1) < 0.0)
         if np.any(turned):
             p = law.stuck(p, turned)
-            face = feasible.face(p, g)
+            face = feasible.face(p, s)
         self._slips, self._to = law.slips(face), to
         return p, face
 
@@ -145,7 +139,7 @@ def newton_on_law(
         if idle > PATIENCE or not np.isfinite(residual):
             break
         # Step 2: the face there
-        p, face = turning.face(feasible, p, norm * (p - y))
+        p, face = turning.face(feasible, p, at.s)
         # Steps 3 and 4: onto the face, and a solve there
         eased = face.with_directions(np.flatnonzero(face.curvature <= HARD * norm))
         share = min(SHARE, FOLLOWED * residual / last) if step else SHARE
