@@ -12,7 +12,7 @@ from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.errors import FactorError
-from tfeti_dolfinx.parallel import agreed, any_rank, summed
+from tfeti_dolfinx.parallel import agreed, summed
 from tfeti_dolfinx.qp.faces import Face, Status
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.gcr import gcr
@@ -27,6 +27,8 @@ MOST_DIRECTIONS = 80
 # what a solve leaves of its residual: less where the last step has brought that far down; of the
 # target: no solve leaves less
 SHARE, FOLLOWED, FINAL = 0.3, 0.3, 0.3
+# of the target: what F makes of a way onto a face that is too short to be multiplied
+UNSEEN = 0.1
 # times ‖F‖: directions that bend more are turned by the projection alone
 HARD = 10.0
 
@@ -118,20 +120,18 @@ def newton_on_law(
         law: The sets.
         oblique: Makes the projectors of a face and of what follows it.
         at: Where to start.
-        target: Ends at a residual ‖F‖‖λ − P(λ − s/‖F‖)‖ of that.
+        target: Ends where ‖F‖‖λ − P(λ − s/‖F‖)‖, and ‖F‖ times the distance to Gλ = e, are that.
         norm: ‖F‖, or an estimate.
 
     Returns:
         Where it has ended, None if it gave up; and the steps taken.
     """
-    comm = qp.d.getComm().tompi4py()
     last, best, idle = 0.0, np.inf, 0
     turning = Turning(law)
     for step in range(MOST_STEPS):
-        # Step 1: what a gradient step, brought back, moves
-        y = at.lam - at.s / norm
-        feasible, p = law.nearest(y)
-        residual = norm * _length(comm, p - at.lam)
+        # Step 1: what a gradient step, brought back, moves, and what Gλ lacks
+        feasible, p = law.nearest(at.lam - at.s / norm)
+        residual = norm * _missed(qp, p, at.lam)
         if residual <= target:
             return at, step
         idle = 0 if residual < LESS * best else idle + 1
@@ -145,7 +145,7 @@ def newton_on_law(
         share = min(SHARE, FOLLOWED * residual / last) if step else SHARE
         on = OnFace(eased, law.following(p, face), p)
         try:
-            at = _solve_on(qp, on, oblique(eased, on.C), at, (share, FINAL * target))
+            at = _solve_on(qp, on, oblique(eased, on.C), at, (share, target, norm))
         except FactorError:
             break
         last = residual
@@ -153,17 +153,26 @@ def newton_on_law(
 
 
 def residual_of(qp: QP, law: Law, at: LawPoint, norm: float) -> float:
-    """‖F‖‖λ − P(λ − s/‖F‖)‖, the same on all ranks. Collective."""
-    _, p = law.nearest(at.lam - at.s / norm)
-    return norm * _length(qp.d.getComm().tompi4py(), p - at.lam)
+    """‖F‖ times what λ misses of the law and of Gλ = e, the same on all ranks. Collective."""
+    return norm * _missed(qp, law.nearest(at.lam - at.s / norm)[1], at.lam)
+
+
+def _missed(qp: QP, p: Array, lam: Array) -> float:
+    """√(‖λ − p‖² + ‖Gᵀ(GGᵀ)⁻¹(e − Gλ)‖²), the same on all ranks. Collective."""
+    x = qp.d.duplicate()
+    x.array[:] = lam
+    qp.coarse.combine(qp.coarse.solve(qp.coarse.residual(x)), x)
+    missed = _length(qp.d.getComm().tompi4py(), np.concatenate((p - lam, x.array_r)))
+    x.destroy()
+    return missed
 
 
 def _solve_on(
-    qp: QP, on: OnFace, oblique: Oblique, at: LawPoint, aim: tuple[float, float]
+    qp: QP, on: OnFace, oblique: Oblique, at: LawPoint, aim: tuple[float, float, float]
 ) -> LawPoint:
     """Steps 3 and 4: on the face Zᵀ(Fλ − d − Gᵀμ) + κu = 0 and Gλ = e, λ = λ₁ + (I + C)u.
 
-    Multiplies by F once for the way onto the face, and once for each direction.
+    Multiplies by F once for the way onto the face, where that is seen, and once for each direction.
     """
     comm, face, F = qp.d.getComm().tompi4py(), on.face, _on_arrays(qp.F, qp.d)
     preconditioner = qp.preconditioner_on(face) if qp.preconditioner_on else None
@@ -174,7 +183,8 @@ def _solve_on(
     u = oblique.restoring(qp.coarse.residual(x))
     lam = lam + on.followed(u)
     s, way = at.s, lam - at.lam
-    if any_rank(comm, bool(np.any(way != 0.0))):
+    share, target, norm = aim
+    if norm * _length(comm, way) > UNSEEN * target:
         s = s + F(way)
 
     # Step 4: u by conjugate residuals
@@ -183,7 +193,7 @@ def _solve_on(
         return oblique.project(Fz + on.bend(z)), Fz
 
     b = -oblique.project(s + on.bend(u))
-    size = max(aim[0] * _length(comm, b), aim[1])
+    size = max(share * _length(comm, b), FINAL * target)
     gone = gcr(apply, lambda r: oblique.project(M(r)), b, size, MOST_DIRECTIONS, comm)
     u, lam, s = u + gone.u, lam + on.followed(gone.u), s + gone.image
     mu = oblique.coordinates(s + on.bend(u))
