@@ -200,6 +200,26 @@ def test_it_finds_what_the_fixed_point_finds(cell, traction, law):
     assert newton <= fixed_point
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"qp_type": "smalse"},
+        {"qp_type": "smalse", "pc_type": "dirichlet"},
+        {"pc_type": "lumped"},
+        {"pc_type": "none"},
+    ],
+)
+def test_with_other_solvers_and_preconditioners(options):
+    usual = solved("quadrilateral", tfeti.Coulomb(0.3), (0.05, -0.05))
+    other = {"friction_type": "newton", **options}
+    p = solved("quadrilateral", tfeti.Coulomb(0.3), (0.05, -0.05), **other)
+    u, expected = displacement(p)[1], displacement(usual)[1]
+    assert p.report.friction_newton_steps > 0
+    assert np.abs(u - expected).max() <= 1e-7 * np.abs(expected).max()
+    usual.destroy()
+    p.destroy()
+
+
 def test_a_scene_without_the_law_pays_nothing():
     p = solved("quadrilateral", tfeti.Tresca(0.02), (0.05, -0.05))
     assert p.report.friction_newton_steps == p.report.friction_iterations == 0
