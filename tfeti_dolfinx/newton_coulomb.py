@@ -9,7 +9,7 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.citations import cite
 from tfeti_dolfinx.dual.dual import Dual, contact_set
 from tfeti_dolfinx.options import Options
-from tfeti_dolfinx.parallel import agreed, summed
+from tfeti_dolfinx.parallel import agreed, norm_over
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.law import Law
@@ -69,7 +69,7 @@ class NewtonOnCoulomb:
         known = constraints.pressures[constraints.pressed]
         residual, first = self._first(qp, law, start)
         target = min(self._target(qp), FINER * residual)
-        if target <= agreed(self._dual.coarse.comm, ROUNDING * norm * self._size(start[0])):
+        if target <= ROUNDING * norm * norm_over(self._dual.coarse.comm, start[0]):
             end, steps = None, 0
         else:
             end, steps = newton_on_law(qp, law, self._oblique, first, target, norm)
@@ -99,9 +99,6 @@ class NewtonOnCoulomb:
         size = agreed(self._dual.coarse.comm, float(Pd.norm()))
         Pd.destroy()
         return self._share * self._rtol * size
-
-    def _size(self, x: Array) -> float:
-        return float(np.sqrt(summed(self._dual.coarse.comm, np.array([x @ x]))[0]))
 
     def _oblique(self, face: Face, C: csr_array) -> Oblique:
         coarse = self._dual.coarse

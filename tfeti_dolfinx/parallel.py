@@ -32,6 +32,11 @@ def summed(comm: MPI.Intracomm, values: Array) -> Array:
     return values
 
 
+def norm_over(comm: MPI.Intracomm, x: Array) -> float:
+    """‖x‖ of a vector that is spread over ranks, the same on each. Collective."""
+    return agreed(comm, float(np.sqrt(summed(comm, np.array([x @ x]))[0])))
+
+
 class Exchange:
     """Rows that travel to other ranks, and answers that travel back.
 

@@ -48,7 +48,7 @@ class ObliqueProjectors:
         self._factor = GeneralFactor(grams.of_face(face), replicated(part, comm), null, comm)
 
     def coordinates(self, x: Array) -> Array:
-        """H⁺G(I + C)ZZᵀx, replicated, shape ``(r,)``. Collective."""
+        """H⁺G(I + C)ZZᵀx, replicated, shape ``(r,)`` or ``(r, q)``. Collective."""
         own = self._face.restricted(x)
         return self._factor.solve(summed(self._comm, self._Gt.T @ own + self._following.T @ own))
 
@@ -57,7 +57,7 @@ class ObliqueProjectors:
         return self._face.restricted(self._Gt @ mu)
 
     def project(self, x: Array) -> Array:
-        """P x. Collective."""
+        """P x, shapes ``(m_local,)`` or ``(m_local, q)``. Collective."""
         return self._face.restricted(x) - self.combine(self.coordinates(x))
 
     def restoring(self, y: Array) -> Array:
@@ -93,6 +93,6 @@ class GeneralFactor:
                 raise FactorError(f"the coarse problem of a face with friction: {error}") from error
 
     def solve(self, y: Array) -> Array:
-        """The solution without null modes, for y orthogonal to them."""
-        x = self._factor.solve(self._scale * self._null.removed(y))
-        return self._null.removed(self._scale * x)
+        """The solution without null modes, for y orthogonal to them; ``(r,)`` or ``(r, q)``."""
+        x = self._factor.solve((self._scale * self._null.removed(y).T).T)
+        return self._null.removed((self._scale * x.T).T)

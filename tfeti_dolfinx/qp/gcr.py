@@ -9,11 +9,35 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.parallel import agreed, summed
+from tfeti_dolfinx.parallel import agreed, norm_over, summed
 
 # of Az: what earlier directions leave of it, less is rounding; and of the residual: what a
 # direction takes from it, or there is nothing to gain
 NEW, GAIN = 1e-7, 1e-8
+
+
+@dataclass(frozen=True)
+class Known:
+    """Directions of which A is known, as rows.
+
+    Attributes:
+        Q: Az of each, orthonormal over all ranks, this rank's part, shape ``(k, n)``.
+        Z: The directions z.
+        images: What is given with each Az.
+    """
+
+    Q: Array
+    Z: Array
+    images: Array
+
+    @staticmethod
+    def nothing(like: Array) -> Known:
+        """None, of vectors like one."""
+        return Known(*(np.zeros((0, len(like))) for _ in range(3)))
+
+    def without(self, c: Array, q: Array, z: Array, w: Array) -> tuple[Array, Array, Array]:
+        """A direction with its Az and image, less such parts of those that are known."""
+        return q - c @ self.Q, z - c @ self.Z, w - c @ self.images
 
 
 @dataclass(frozen=True)
@@ -23,14 +47,12 @@ class Gone:
     Attributes:
         u: The solution.
         image: What was given with each Az, combined as u is.
-        residual: ‖b − Au‖.
-        steps: Directions gone, each for one multiplication.
+        new: The directions gone, each for one multiplication.
     """
 
     u: Array
     image: Array
-    residual: float
-    steps: int
+    new: Known
 
 
 def gcr(
@@ -40,6 +62,7 @@ def gcr(
     target: float,
     most: int,
     comm: MPI.Intracomm,
+    known: Known | None = None,
 ) -> Gone:
     """Make ‖b − Au‖ least over more and more directions. Collective; one sum over ranks a step.
 
@@ -53,22 +76,47 @@ def gcr(
         target: Ends at ‖b − Au‖ ≤ target.
         most: Most directions.
         comm: Communicator.
+        known: Directions to begin with.
     """
-    u, image, r = np.zeros_like(b), np.zeros_like(b), np.array(b)
-    Q, Z, images = [np.zeros((0, len(b))) for _ in range(3)]
-    size, steps = agreed(comm, float(np.sqrt(summed(comm, np.array([b @ b]))[0]))), 0
-    while size > target and steps < most:
+    old, new = known or Known.nothing(b), _Growing(len(b))
+    c = summed(comm, old.Q @ b)
+    u, image, r = c @ old.Z, c @ old.images, b - c @ old.Q
+    size = norm_over(comm, r)
+    while size > target and new.count < most:
         z = precondition(r)
         q, w = apply(z)
-        sums = summed(comm, np.concatenate((Q @ q, (q @ q, q @ r, r @ r))))
+        sums = summed(comm, np.concatenate((old.Q @ q, new.rows.Q @ q, (q @ q, q @ r, r @ r))))
         c, (square, along, left) = sums[:-3], sums[-3:]
         length = float(np.sqrt(max(square - c @ c, 0.0)))
-        steps += 1
         if agreed(comm, length <= NEW * np.sqrt(square) or abs(along) <= GAIN * length * size):
             break
-        q, z, w = ((x - c @ X) / length for x, X in ((q, Q), (z, Z), (w, images)))
-        step = along / length
+        q, z, w = new.rows.without(c[len(old.Q) :], *old.without(c[: len(old.Q)], q, z, w))
+        q, z, w, step = q / length, z / length, w / length, along / length
         u, image, r = u + step * z, image + step * w, r - step * q
-        Q, Z, images = (np.vstack((X, x)) for X, x in ((Q, q), (Z, z), (images, w)))
+        new.add(q, z, w)
         size = agreed(comm, float(np.sqrt(max(left - step**2, 0.0))))
-    return Gone(u, image, size, steps)
+    return Gone(u, image, new.rows)
+
+
+class _Growing:
+    """Directions, with room for more.
+
+    Args:
+        size: Of this rank's part.
+    """
+
+    def __init__(self, size: int) -> None:
+        self.count = 0
+        self._room: Array = np.zeros((3, 8, size))
+
+    @property
+    def rows(self) -> Known:
+        """What there is."""
+        return Known(*self._room[:, : self.count])
+
+    def add(self, q: Array, z: Array, w: Array) -> None:
+        """Take one more."""
+        if self.count == self._room.shape[1]:
+            self._room = np.concatenate((self._room, np.zeros_like(self._room)), axis=1)
+        self._room[:, self.count] = q, z, w
+        self.count += 1

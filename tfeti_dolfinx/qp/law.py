@@ -57,3 +57,33 @@ class Law:
         inside = np.array(p)
         inside[self.tangents[at]] *= INSIDE
         return inside
+
+
+@dataclass(frozen=True)
+class OnFace:
+    """What a step knows of a face: its directions, what follows them, where it is entered.
+
+    Attributes:
+        face: The face, hard directions held.
+        C: What λ_T follows.
+        p: A point of the face.
+    """
+
+    face: Face
+    C: csr_array
+    p: Array
+
+    def followed(self, u: Array) -> Array:
+        """(I + C)u, shapes ``(m,)`` or ``(m, q)``."""
+        return np.asarray(u + self.C @ u)
+
+    def entered(self, lam: Array) -> Array:
+        """λ with what is open or slips where p has it; what follows does so."""
+        held = np.isin(self.face.status, (Status.OPEN, Status.SLIP))
+        follows = np.diff(self.C.indptr) > 0
+        return np.where(follows, self.C @ lam, np.where(held, self.p, lam))
+
+    def bend(self, u: Array) -> Array:
+        """Z diag(κ) Zᵀu, shapes ``(m,)`` or ``(m, q)``."""
+        Z = self.face.Z
+        return np.asarray(Z @ (self.face.curvature * (Z.T @ u).T).T)

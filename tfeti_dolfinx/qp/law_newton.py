@@ -6,17 +6,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.errors import FactorError
-from tfeti_dolfinx.parallel import agreed, summed
-from tfeti_dolfinx.qp.faces import Face, Status
+from tfeti_dolfinx.parallel import norm_over
+from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.gcr import gcr
-from tfeti_dolfinx.qp.law import Law
+from tfeti_dolfinx.qp.law import Law, OnFace
+from tfeti_dolfinx.qp.law_recycled import keep, known_on
 from tfeti_dolfinx.qp.oblique import Oblique
 from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
 
@@ -46,36 +46,6 @@ class LawPoint:
     lam: Array
     s: Array
     mu: Array
-
-
-@dataclass(frozen=True)
-class OnFace:
-    """What a step knows of a face: its directions, what follows them, where it is entered.
-
-    Attributes:
-        face: The face, hard directions held.
-        C: What λ_T follows.
-        p: A point of the face.
-    """
-
-    face: Face
-    C: csr_array
-    p: Array
-
-    def followed(self, u: Array) -> Array:
-        """(I + C)u."""
-        return np.asarray(u + self.C @ u)
-
-    def entered(self, lam: Array) -> Array:
-        """λ with what is open or slips where p has it; what follows does so."""
-        held = np.isin(self.face.status, (Status.OPEN, Status.SLIP))
-        follows = np.diff(self.C.indptr) > 0
-        return np.where(follows, self.C @ lam, np.where(held, self.p, lam))
-
-    def bend(self, u: Array) -> Array:
-        """Z diag(κ) Zᵀu."""
-        Z = self.face.Z
-        return np.asarray(Z @ (self.face.curvature * (Z.T @ u)))
 
 
 class Turning:
@@ -162,7 +132,7 @@ def _missed(qp: QP, p: Array, lam: Array) -> float:
     x = qp.d.duplicate()
     x.array[:] = lam
     qp.coarse.combine(qp.coarse.solve(qp.coarse.residual(x)), x)
-    missed = _length(qp.d.getComm().tompi4py(), np.concatenate((p - lam, x.array_r)))
+    missed = norm_over(qp.d.getComm().tompi4py(), np.concatenate((p - lam, x.array_r)))
     x.destroy()
     return missed
 
@@ -184,7 +154,7 @@ def _solve_on(
     lam = lam + on.followed(u)
     s, way = at.s, lam - at.lam
     share, target, norm = aim
-    if norm * _length(comm, way) > UNSEEN * target:
+    if norm * norm_over(comm, way) > UNSEEN * target:
         s = s + F(way)
 
     # Step 4: u by conjugate residuals
@@ -193,8 +163,10 @@ def _solve_on(
         return oblique.project(Fz + on.bend(z)), Fz
 
     b = -oblique.project(s + on.bend(u))
-    size = max(share * _length(comm, b), FINAL * target)
-    gone = gcr(apply, lambda r: oblique.project(M(r)), b, size, MOST_DIRECTIONS, comm)
+    size = max(share * norm_over(comm, b), FINAL * target)
+    known = known_on(qp.recycled, on, oblique.project)
+    gone = gcr(apply, lambda r: oblique.project(M(r)), b, size, MOST_DIRECTIONS, comm, known)
+    keep(qp.recycled, on, gone.new)
     u, lam, s = u + gone.u, lam + on.followed(gone.u), s + gone.image
     mu = oblique.coordinates(s + on.bend(u))
     qp.coarse.combine(mu, x)
@@ -218,8 +190,3 @@ def _on_arrays(A: Operator | FaceOperator, like: PETSc.Vec) -> Callable[[Array],
         return result
 
     return mult
-
-
-def _length(comm: MPI.Intracomm, x: Array) -> float:
-    """‖x‖ over all ranks, the same on each."""
-    return agreed(comm, float(np.sqrt(summed(comm, np.array([x @ x]))[0])))

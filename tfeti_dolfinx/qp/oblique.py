@@ -22,7 +22,7 @@ class Oblique(Protocol):
         ...
 
     def project(self, x: Array) -> Array:
-        """P x. Collective."""
+        """P x, shapes ``(m,)`` or ``(m, q)``. Collective."""
         ...
 
     def restoring(self, y: Array) -> Array:

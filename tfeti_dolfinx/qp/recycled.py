@@ -42,15 +42,26 @@ class Recycled:
         self._squares = np.zeros(capacity)  # of the lengths of W's columns
         self.count = self._next = 0
 
-    def add(self, x: Array, Fx: Array) -> None:
-        """Keep a direction of energy 1, or what is new in it. Collective, three reductions.
+    @property
+    def columns(self) -> tuple[Array, Array]:
+        """This rank's part of W and FW, in no order, shapes ``(m, count)``."""
+        return self.W[:, : self.count], self.FW[:, : self.count]
+
+    def add(self, x: Array, Fx: Array, energy: float) -> None:
+        """Keep a direction, or what is new in it. Collective, three reductions.
 
         Where images are no longer right, all that was kept is forgotten.
+
+        Args:
+            x: The direction, this rank's part.
+            Fx: What F makes of it.
+            energy: xᵀFx > 0, over all ranks.
         """
+        x, Fx = x / np.sqrt(energy), Fx / np.sqrt(energy)
         if self.W.shape[1] == 0:
             self._make_room(len(x))
         for passed in range(2):
-            W, FW = self.W[:, : self.count], self.FW[:, : self.count]
+            W, FW = self.columns
             a, same = summed(self.comm, np.array([FW.T @ x, W.T @ Fx]))
             if passed == 0 and agreed(self.comm, bool(np.any(np.abs(a - same) > WRONG))):
                 self.count = self._next = 0
@@ -93,32 +104,38 @@ class Recycled:
         Args:
             held: Flags of the local rows; None: no rows, and then N is None, too.
         """
-        if held is None:
-            return None
-        R = _triangle(self.W[held, : self.count])
-        R = self.comm.allreduce(R, op=lambda one, other: _triangle(np.vstack((one, other))))
-        _, sizes, Vt = np.linalg.svd(R)
+        return None if held is None else self.without(self.W[held, : self.count])
+
+    def without(self, values: Array) -> Array:
+        """Orthonormal N so that values N = 0, for values of W's columns, shape ``(count, k)``.
+
+        Collective.
+
+        Args:
+            values: Linear in the columns of W, this rank's part, shape ``(l, count)``.
+        """
+        _, sizes, Vt = np.linalg.svd(triangle(self.comm, values))
         longest = float(np.sqrt(self._squares[: self.count].max(initial=0.0)))
-        return agreed(self.comm, Vt[int(np.sum(sizes > HELD * longest)) :].T)
+        return np.asarray(Vt[int(np.sum(sizes > HELD * longest)) :].T)
 
 
 class RecycledOnFace:
     """Directions of earlier solves that lie in a face, by default that of all rows.
 
     Args:
-        known: All directions.
+        known: All directions; kept as an attribute.
         held: Flags of the local rows that are 0 on the face; None: no rows.
     """
 
     def __init__(self, known: Recycled, held: Array | None = None) -> None:
-        self._known, self._held = known, held
+        self.known, self._held = known, held
         self._N: Array | None = None
         self._active = False
-        self._new = deque[tuple[Array, Array]](maxlen=known.capacity)
+        self._new = deque[tuple[Array, Array, float]](maxlen=known.capacity)
 
     def on(self, face: Face) -> RecycledOnFace:
         """Those within another face."""
-        return RecycledOnFace(self._known, face.held)
+        return RecycledOnFace(self.known, face.held)
 
     def go(self, lam: PETSc.Vec, g: PETSc.Vec, r: PETSc.Vec) -> bool:
         """Go where q is least along W. Collective.
@@ -132,33 +149,33 @@ class RecycledOnFace:
             Whether there is any direction.
         """
         self.keep()
-        known = self._known
+        known = self.known
         self._active = known.count > 0
         if self._active:
             self._N = known.within(self._held)
             self._active = self._N is None or self._N.shape[1] > 0
         if self._active:
-            b = self._part(summed(known.comm, known.W[:, : known.count].T @ r.array_r))
+            W, FW = known.columns
+            b = self._part(summed(known.comm, W.T @ r.array_r))
             lam.array[:] += self._combined(b)
-            g.array[:] += known.FW[:, : known.count] @ b
+            g.array[:] += FW @ b
         return self._active
 
     def conjugate(self, p: PETSc.Vec) -> None:
         """Make a direction F-orthogonal to W. Collective, one reduction, or none without W."""
         if self._active:
-            known = self._known
-            a = summed(known.comm, known.FW[:, : known.count].T @ p.array_r)
+            known = self.known
+            a = summed(known.comm, known.columns[1].T @ p.array_r)
             p.array[:] -= self._combined(self._part(a))
 
     def remember(self, p: PETSc.Vec, Fp: PETSc.Vec, energy: float) -> None:
         """A direction was gone; it is kept later, for W stays while a solve goes on."""
-        size = 1.0 / np.sqrt(energy)
-        self._new.append((size * p.array_r, size * Fp.array_r))
+        self._new.append((np.array(p.array_r), np.array(Fp.array_r), energy))
 
     def keep(self) -> None:
         """Keep what was gone. Collective."""
         while self._new:
-            self._known.add(*self._new.popleft())
+            self.known.add(*self._new.popleft())
         self._active = False
 
     def _part(self, a: Array) -> Array:
@@ -167,12 +184,16 @@ class RecycledOnFace:
 
     def _combined(self, b: Array) -> Array:
         """W b, 0 where the face holds rows."""
-        x = self._known.W[:, : self._known.count] @ b
+        x = self.known.columns[0] @ b
         if self._held is not None:
             x[self._held] = 0.0
         return np.asarray(x)
 
 
-def _triangle(A: Array) -> Array:
-    """R of A = QR."""
-    return np.asarray(np.linalg.qr(A, mode="r"))
+def triangle(comm: MPI.Intracomm, A: Array) -> Array:
+    """R of A = QR, the rows of A spread over ranks; the same on all of them. Collective."""
+
+    def of(rows: Array) -> Array:
+        return np.asarray(np.linalg.qr(rows, mode="r"))
+
+    return agreed(comm, comm.allreduce(of(A), op=lambda one, other: of(np.vstack((one, other)))))
