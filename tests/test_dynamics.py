@@ -346,7 +346,7 @@ def test_steps_save_multiplications_by_those_before():
     assert multiplications() <= 2 / 3 * cold
 
 
-@pytest.mark.parametrize(("given", "kept"), [({}, 100), ({"recycle": 7}, 7), ({"recycle": 0}, 0)])
+@pytest.mark.parametrize(("given", "kept"), [({}, 200), ({"recycle": 7}, 7), ({"recycle": 0}, 0)])
 def test_directions_are_kept_unless_told_otherwise(given, kept):
     scene = Thrown("quadrilateral", 3, **given)
     assert scene.problem.options.recycle == kept

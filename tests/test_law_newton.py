@@ -17,11 +17,13 @@ import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.newton_coulomb import NewtonOnCoulomb
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
-from tfeti_dolfinx.qp.gcr import gcr
-from tfeti_dolfinx.qp.law import Law
+from tfeti_dolfinx.qp.gcr import Known, gcr
+from tfeti_dolfinx.qp.law import Law, OnFace
 from tfeti_dolfinx.qp.law_newton import LawPoint, newton_on_law, residual_of
+from tfeti_dolfinx.qp.law_recycled import keep, known_on
 from tfeti_dolfinx.qp.oblique import NoOblique
 from tfeti_dolfinx.qp.problem import QP
+from tfeti_dolfinx.qp.recycled import Recycled, RecycledOnFace
 
 SEEDS = st.integers(0, 1000)
 DIMENSIONS = st.sampled_from([1, 2])
@@ -119,13 +121,43 @@ def test_conjugate_residuals(seed, n):
         return A @ z, W @ z
 
     gone = gcr(apply, lambda r: M @ r, b, 1e-9, 60, MPI.COMM_SELF)
-    assert gone.steps == len(calls) <= n + 1
+    new = gone.new
+    assert len(new.Z) <= len(calls) <= n + 1
     assert np.linalg.norm(b - A @ gone.u) <= 1e-8
-    assert gone.residual == pytest.approx(np.linalg.norm(b - A @ gone.u), abs=1e-8)
     assert np.allclose(gone.image, W @ gone.u, rtol=0, atol=1e-8)
+    assert np.allclose(new.Q @ new.Q.T, np.eye(len(new.Q)), rtol=0, atol=1e-8)
+    assert np.allclose(new.Q, new.Z @ A.T, rtol=0, atol=1e-8)
+    assert np.allclose(new.images, new.Z @ W.T, rtol=0, atol=1e-8)
     none = gcr(apply, lambda r: M @ r, b, 2.0 * np.linalg.norm(b), 60, MPI.COMM_SELF)
-    assert none.steps == 0
+    assert len(none.new.Z) == 0
     assert not np.any(none.u)
+
+
+@given(SEEDS, st.integers(2, 30))
+def test_conjugate_residuals_that_know_directions(seed, n):
+    """What these give to a right side costs nothing, and the others are gone beside them."""
+    rng = np.random.default_rng(seed)
+    A = np.eye(n) + 0.3 * rng.standard_normal((n, n)) / np.sqrt(n)
+    W, k, calls = rng.standard_normal((n, n)), rng.integers(1, n), []
+    Q, _ = np.linalg.qr(A @ rng.standard_normal((n, k)))
+    Z = np.linalg.solve(A, Q)
+    known = Known(Q.T, Z.T, (W @ Z).T)
+
+    def apply(z):
+        calls.append(1)
+        return A @ z, W @ z
+
+    b = A @ (Z @ rng.standard_normal(k))
+    free = gcr(apply, lambda r: r, b, 1e-9, 60, MPI.COMM_SELF, known)
+    assert not calls
+    assert np.allclose(A @ free.u, b, rtol=0, atol=1e-8)
+    assert np.allclose(free.image, W @ free.u, rtol=0, atol=1e-8)
+    b = rng.standard_normal(n)
+    gone = gcr(apply, lambda r: r, b, 1e-9, 60, MPI.COMM_SELF, known)
+    assert len(calls) <= n - k + 1
+    assert np.allclose(A @ gone.u, b, rtol=0, atol=1e-8)
+    assert np.allclose(gone.image, W @ gone.u, rtol=0, atol=1e-8)
+    assert np.allclose(gone.new.Q @ Q, 0.0, rtol=0, atol=1e-8)
 
 
 @given(SEEDS, DIMENSIONS)
@@ -145,6 +177,36 @@ def test_what_slips_follows_its_normal(seed, k):
     assert np.allclose(inside, larger, rtol=0, atol=1e-12)
     stuck = law.stuck(p, slips)
     assert not np.any(law.slips(law.nearest(stuck)[0].face(stuck, y)) & slips)
+
+
+@given(SEEDS, DIMENSIONS, st.sampled_from([0, 3]))
+def test_what_earlier_directions_tell(seed, k, r):
+    """Known directions follow their normals, lie in the face, and have the images of A."""
+    F, _, G, _, law = program(seed, k, r)
+    rng = np.random.default_rng(seed)
+    y = rng.standard_normal(40)
+    feasible, p = law.nearest(y)
+    face = feasible.face(p, rng.standard_normal(40))
+    on = OnFace(face, law.following(p, face), p)
+    past = RecycledOnFace(Recycled(38, MPI.COMM_SELF))
+    Gt_plus = np.linalg.pinv(G) if r else np.zeros((40, 0))
+    for _ in range(38):  # any directions of Gλ = 0
+        x = rng.standard_normal(40)
+        x -= Gt_plus @ (G @ x)
+        past.known.add(x, F @ x, x @ F @ x)
+    oblique = DenseOblique(G, face, on.C) if r else NoOblique(face)
+    known = known_on(past, on, oblique.project)
+    assert known is not None
+    assert np.allclose(known.Q @ known.Q.T, np.eye(len(known.Q)), rtol=0, atol=1e-6)
+    for q, u, image in zip(known.Q, known.Z, known.images, strict=True):
+        assert np.allclose(face.restricted(u), u, rtol=0, atol=1e-6)
+        assert np.allclose(image, F @ on.followed(u), rtol=0, atol=1e-6)
+        assert np.allclose(q, oblique.project(image + on.bend(u)), rtol=0, atol=1e-6)
+        assert np.allclose(G @ on.followed(u), 0.0, rtol=0, atol=1e-6)
+    keep(past, on, known)
+    W, FW = past.known.columns
+    assert np.allclose(W.T @ FW, np.eye(past.known.count), rtol=0, atol=1e-6)
+    assert np.allclose(FW, F @ W, rtol=0, atol=1e-6)
 
 
 def slipping_face(p):

@@ -102,7 +102,7 @@ def test_another_run_goes_on_with_what_was_kept(capacity):
     if capacity:
         known = other.problem.dual.recycled
         assert known.count == min(capacity, 15)
-        assert np.array_equal(known.kept, state.directions[:, :, -known.count :])
+        assert np.array_equal(known.in_order(), state.directions[:, :, -known.count :])
         assert max(images(other.problem)) <= 1e-11
     first, second = (scene.solve(load=-0.13) for scene in (one, other))
     assert distance(first, second) <= (1e-12 if capacity == 15 else 1e-9)

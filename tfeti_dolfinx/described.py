@@ -25,6 +25,7 @@ class Description:
         words: What may stand in the place of a number.
         name: Name on the command line, if it is not the field's.
         symbol: Letter in the literature and in docs/notation.md.
+        kind: Type of its values, if it is not the default's.
     """
 
     algorithm: str
@@ -34,6 +35,7 @@ class Description:
     words: tuple[str, ...] = ()
     name: str = ""
     symbol: str = ""
+    kind: type | None = None
 
 
 def described(default: Any, algorithm: str, text: str, **more: Any) -> Any:

@@ -68,7 +68,7 @@ class ContactDynamics(ContactProblem):
         InputError: What is given does not fit; the message names it.
     """
 
-    defaults: ClassVar[Mapping[str, Any]] = {"recycle": 100}
+    defaults: ClassVar[Mapping[str, Any]] = {"recycle": 200}
 
     def __init__(
         self,
@@ -158,9 +158,12 @@ class ContactDynamics(ContactProblem):
     def state(self) -> SavedState:
         """The last accepted solution as arrays of this rank, for ``restore``."""
         motion, state = self._forms_in_time.motion, super().state()
-        predicted = self._predictor.start if self._predictor is not None else state.predicted
         moving = {"velocity": motion.v, "load": motion.load, "size": np.array(motion.size)}
-        return replace(state, predicted=predicted, **moving)
+        state = replace(state, **moving)
+        if self._predictor is None:
+            return state
+        predicted, image = self._predictor.start
+        return replace(state, predicted=predicted, predicted_image=image)
 
     def restore(self, state: SavedState) -> None:
         """Go on where another run of the same program has been; the step must have its size.
@@ -181,7 +184,8 @@ class ContactDynamics(ContactProblem):
         self.solution.v = state.velocity
         known = any_rank(self.decomposition.comm, state.predicted.size > 0)
         if self._predictor is not None and known:
-            self._predictor.start_from(self._system.gluing, state.predicted)
+            start = state.predicted, state.predicted_image
+            self._predictor.start_from(self._system.gluing, *start)
 
     def destroy(self) -> None:
         """Destroy the PETSc objects; solution and report stay."""

@@ -89,7 +89,8 @@ def _check_reached(named: Mapping[str, Any], database: PETSc.Options, prefix: st
 
 def _converted(option: Parameter, value: Any, prefix: str) -> Any:
     """The value as the type of the option, in its range."""
-    what, kind = f"-{prefix}{option.name}", type(option.default)
+    what = f"-{prefix}{option.name}"
+    kind = option.description.kind or type(option.default)
     if isinstance(value, str) and value in option.description.words:
         return value
     try:

@@ -78,12 +78,15 @@ class Options:
         "the coarse problem has the motions of clusters only; 0: none",
         fits=FROM_0,
     )
-    recycle: int = described(
-        0,
+    recycle: int | str = described(
+        "auto",
         "pcpg, newton",
         "so many directions of earlier solves with the same F are kept at most, which later ones "
-        "begin with; each takes two dual vectors; of bodies with mass 100 by default",
+        "begin with; each takes two dual vectors; auto: none of a first solve, 100 from the second "
+        "on; of bodies with mass 200",
         fits=FROM_0,
+        words=("auto",),
+        kind=int,
     )
     homogenization: str = described(
         "natural",

@@ -46,16 +46,22 @@ class Predictor:
         self._subdomains: Subdomains | None = None
         self._dual: Dual | None = None
         self._start: tuple[Gluing, Array] | None = None
+        self._image: Array = np.zeros(0)
         self.multiplications = 0
 
     @property
-    def start(self) -> Array:
-        """Multipliers that the next call starts from, empty before the first."""
-        return np.zeros(0) if self._start is None else self._start[1]
+    def start(self) -> tuple[Array, Array]:
+        """Multipliers that the next call starts from, and their image. Collective.
 
-    def start_from(self, gluing: Gluing, lam: Array) -> None:
-        """Let the next call start from multipliers of some rows."""
-        self._start = (gluing, lam)
+        Empty before the first, or where the image is not known.
+        """
+        if self._start is None or self._dual is None:
+            return np.zeros(0), np.zeros(0)
+        return self._start[1], self._dual.last.known(self._dofs.comm, self._start[1])
+
+    def start_from(self, gluing: Gluing, lam: Array, image: Array) -> None:
+        """Let the next call start from multipliers of some rows, as ``start`` had them."""
+        self._start, self._image = (gluing, lam), image
 
     def nearest(self, w: Array, M: csr_array, gluing: Gluing) -> Array:
         """The nearest displacement to w.
@@ -110,6 +116,8 @@ class Predictor:
             self._subdomains.retrace(constraints.trace, constraints.span)
         scene = self._dofs, self._decomposition
         self._dual = settings.make_dual(constraints, self._subdomains, *scene, _frictionless)
+        if self._start is not None and self._start[0] is gluing:
+            self._dual.last.take(self._dofs.comm, self._start[1], self._image)
 
     def _solve(self, gluing: Gluing) -> Array:
         """The displacement in primal order."""

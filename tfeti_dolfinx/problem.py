@@ -258,6 +258,7 @@ class ContactProblem(Stepping):
         with stage("qp", report.seconds):
             start = None
             if self._start is not None:
+                self._settings.learn(dual)
                 earlier, lam, mu = self._start
                 start = (gluing.multipliers(earlier, lam), mu)
             own = self._settings.extensions.monitor

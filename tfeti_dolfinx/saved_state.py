@@ -38,6 +38,8 @@ class SavedState:
         predicted: Multipliers of this rank's rows of the predictor, empty without one.
         size: That of the step which the matrix was made for, shape ``()``; 0 without inertia.
         directions: What ``Recycled`` keeps of earlier solves, shape ``(2, m, k)``.
+        image: Fλ; empty where it is not known.
+        predicted_image: The same of the predictor.
     """
 
     layout: Array
@@ -55,6 +57,8 @@ class SavedState:
     predicted: Array = field(default_factory=lambda: np.zeros(0))
     size: Array = field(default_factory=lambda: np.zeros(()))
     directions: Array = field(default_factory=lambda: np.zeros((2, 0, 0)))
+    image: Array = field(default_factory=lambda: np.zeros(0))
+    predicted_image: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def of(cls, solution: Solution, mu: Array, norm: float, reach: list[float]) -> SavedState:

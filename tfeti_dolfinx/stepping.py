@@ -12,6 +12,7 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.contact.partners import ContactPartner
 from tfeti_dolfinx.contact_state import Multipliers
 from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.extensions import Settings
 from tfeti_dolfinx.fields import Stress
 from tfeti_dolfinx.gluing.glue import Gluing
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -39,6 +40,7 @@ class Stepping:
     decomposition: Decomposition
     contacts: list[ContactPartner]
     report: Report
+    _settings: Settings
     _system: System
     _stress: Stress | None
     _thickness: Any
@@ -100,9 +102,12 @@ class Stepping:
             raise InputError("there is no state yet; expected a call of accept() before")
         (reach, _), dual = self._system.search.rows(), self._system.dual
         state = SavedState.of(solution, start[2], dual.seen, reach)
-        if dual.recycled is None or dual.constraints is not start[0].constraints:
+        if dual.constraints is not start[0].constraints:
             return state
-        return replace(state, directions=dual.recycled.kept)
+        state = replace(state, image=dual.last.known(self.dofs.comm, start[1]))
+        if dual.recycled is None:
+            return state
+        return replace(state, directions=dual.recycled.in_order())
 
     def restore(self, state: SavedState) -> None:
         """Go on where another run of the same program, on as many ranks, has been. Collective.
@@ -123,8 +128,10 @@ class Stepping:
         dual.saw(float(state.norm))
         gluing = replace(system.gluing, slip=state.slip)
         state.check_rows(gluing)
+        self._settings.learn(dual)
         if dual.recycled is not None:
             dual.recycled.take(state.directions)
+        dual.last.take(self.dofs.comm, state.lam, state.image)
         solution = self._make_solution(state.u, state.multipliers(), gluing)
         self._accepted = (solution, (gluing, state.lam, state.mu))
         self.go_back()

@@ -18,8 +18,8 @@ from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # of the largest forces on a kernel mode: those on a light one beside it count as so large at least,
-# since the rounding of the largest reaches them
-LIGHT = 1e-4
+# since the rounding of the largest reaches them; and that rounding, which is nobody's to mend
+LIGHT, ROUNDING = 1e-4, 1e-13
 
 
 class Scene(Protocol):
@@ -209,7 +209,8 @@ def _balance(coarse: CoarseSpace, lam: PETSc.Vec) -> tuple[float, float]:
     if coarse.dimension == 0:
         return 0.0, 0.0
     forces = coarse.terms(lam)
-    forces = np.maximum(forces, LIGHT * forces.max())
-    left = np.abs(coarse.G(lam.array_r) - coarse.e)
+    most = forces.max()
+    forces = np.maximum(forces, LIGHT * most)
+    left = np.maximum(np.abs(coarse.G(lam.array_r) - coarse.e) - ROUNDING * most, 0.0)
     worst = int(np.argmax(left / np.maximum(forces, TINY)))
     return float(left[worst]), float(forces[worst])

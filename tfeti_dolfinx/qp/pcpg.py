@@ -219,7 +219,8 @@ def _examined(qp: QP, point: Point, rule: StoppingRule, norm: float) -> Converge
 def _begun(qp: QP, point: Point, own: Directions) -> float:
     """Go where q is least along directions of earlier solves; make r there. Its norm."""
     norm = _residual(qp, point.g, own.r)
-    if qp.recycled is not None and qp.recycled.go(point.lam, point.g, own.r):
+    past = qp.recycled
+    if past is not None and past.go(point.lam, point.g, own.r, qp.coarse.project):
         norm, own.fresh = _residual(qp, point.g, own.r), True
     return norm
 

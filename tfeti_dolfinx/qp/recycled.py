@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 from mpi4py import MPI
@@ -38,8 +39,9 @@ class Recycled:
 
     def __init__(self, capacity: int, comm: MPI.Intracomm) -> None:
         self.capacity, self.comm = capacity, comm
-        self.W, self.FW = np.zeros((0, 0)), np.zeros((0, 0))
-        self._squares = np.zeros(capacity)  # of the lengths of W's columns
+        self.W: Array = np.zeros((0, 0))
+        self.FW: Array = np.zeros((0, 0))
+        self._squares: Array = np.zeros(capacity)  # of the lengths of W's columns
         self.count = self._next = 0
 
     @property
@@ -77,11 +79,16 @@ class Recycled:
         self.count = max(self.count, self._next + 1)
         self._next = (self._next + 1) % self.capacity
 
-    @property
-    def kept(self) -> Array:
-        """This rank's part of W and FW, the oldest direction first, shape ``(2, m, count)``."""
-        order = np.roll(np.arange(self.count), -self._next if self.count == self.capacity else 0)
-        return np.array([self.W[:, order], self.FW[:, order]])
+    def in_order(self) -> Array:
+        """This rank's part of W and FW, shape ``(2, m, count)``, the oldest direction first.
+
+        So they lie from then on: who takes them adds what it adds in the same order.
+        """
+        if self.count == self.capacity:
+            order = np.roll(np.arange(self.count), -self._next)
+            self.W, self.FW = (np.asfortranarray(X[:, order]) for X in (self.W, self.FW))
+            self._squares, self._next = self._squares[order], 0
+        return np.array(self.columns)
 
     def take(self, kept: Array) -> None:
         """Go on with what another run has kept, the newest of it if it is too much. Collective."""
@@ -137,13 +144,20 @@ class RecycledOnFace:
         """Those within another face."""
         return RecycledOnFace(self.known, face.held)
 
-    def go(self, lam: PETSc.Vec, g: PETSc.Vec, r: PETSc.Vec) -> bool:
+    def go(
+        self,
+        lam: PETSc.Vec,
+        g: PETSc.Vec,
+        r: PETSc.Vec,
+        project: Callable[[PETSc.Vec], None],
+    ) -> bool:
         """Go where q is least along W. Collective.
 
         Args:
             lam: A point; updated.
             g: Fλ − d; updated.
             r: −P g.
+            project: P, in place: takes away what rounding of many directions leaves of Gλ = e.
 
         Returns:
             Whether there is any direction.
@@ -157,8 +171,12 @@ class RecycledOnFace:
         if self._active:
             W, FW = known.columns
             b = self._part(summed(known.comm, W.T @ r.array_r))
-            lam.array[:] += self._combined(b)
+            way = lam.duplicate()
+            way.array[:] = self._combined(b)
+            project(way)
+            lam.axpy(1.0, way)
             g.array[:] += FW @ b
+            way.destroy()
         return self._active
 
     def conjugate(self, p: PETSc.Vec) -> None:
