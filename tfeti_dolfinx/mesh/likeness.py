@@ -6,7 +6,7 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.mesh.entities import NO_TAG, equal_pairs, facet_keys
+from tfeti_dolfinx.mesh.entities import NO_TAG, facet_keys
 from tfeti_dolfinx.mesh.untorn import UntornMesh
 from tfeti_dolfinx.parallel import Exchange, summed
 
@@ -76,17 +76,20 @@ def bare_sides(
 def _is_outer(mesh: UntornMesh, comm: MPI.Intracomm) -> Array:
     """Whether facets of cells are facets of no other cell, shape ``(n, num_facets)``."""
     keys = facet_keys(mesh.cells, mesh.cell_type)
-    outer = np.ones(keys.size, dtype=bool)
-    for paired in equal_pairs(keys.ravel()):
-        outer[paired] = False
+    outer = _occur_once(keys.ravel())
     own = keys.ravel()[outer]
     exchange = Exchange(comm, (own % np.uint64(comm.size)).astype(np.int64))
-    received = exchange.send(own)
-    alone = np.ones(len(received), dtype=bool)
-    for paired in equal_pairs(received):
-        alone[paired] = False
-    outer[outer] = exchange.answer(alone)
+    outer[outer] = exchange.answer(_occur_once(exchange.send(own)))
     return outer.reshape(keys.shape)
+
+
+def _occur_once(keys: Array) -> Array:
+    """Flags of those that no other one is equal to."""
+    order = np.argsort(keys)  # not stable: that takes four times as long
+    same = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
+    once = np.ones(len(keys), dtype=bool)
+    once[order[same]] = once[order[same + 1]] = False
+    return once
 
 
 def _moments(d: Array, tags: Array) -> Array:
