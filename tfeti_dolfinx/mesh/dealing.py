@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from itertools import permutations
+
 import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.mesh.bisection import bisect_points
+from tfeti_dolfinx.mesh.likeness import alike, bare_sides, measured
 from tfeti_dolfinx.mesh.untorn import UntornMesh
-from tfeti_dolfinx.parallel import agreed, summed
+from tfeti_dolfinx.parallel import agreed
 
-# Of the time and memory of a subdomain that has a factor of its own: what one more costs that
-# shares it. 0.32 was measured for plane squares of 10 000 nodes, 0.26 for cubes of 2197.
+# Of the time and memory of a subdomain that has factors of its own: what one more costs that
+# shares them. 0.32 was measured for plane squares of 10 000 nodes, 0.26 for cubes of 2197.
 SHARED = 0.3
-# Of the size of a subdomain, in what is measured of its shape: less is rounding of coordinates,
-# more another shape. The root keeps regular grids, which are rational, off the middle between
-# two roundings.
-SHAPE = 1e-6 * np.sqrt(2.0)
+# Beside what K⁺ and S of a subdomain with factors of its own cost each: what is done for each,
+# equal or not, as assembly, gluing and vectors are; roughly, of the same squares and cubes.
+ALIKE = 0.12
+# sides of a box that are so many times shorter than the longest may be cut across as early as it,
+# where ranks cost less by that part
+LONG, GAIN = 4.0, 0.02
+# of costs beside their mean: those that differ by less are the same but for rounding
+DIGITS = 9
 
 
 def dealt(mesh: UntornMesh, subdomain: Array, comm: MPI.Intracomm) -> Array:
@@ -34,70 +42,86 @@ def dealt(mesh: UntornMesh, subdomain: Array, comm: MPI.Intracomm) -> Array:
         Ranks, shape ``(N,)``, the same on all ranks.
     """
     num = comm.allreduce(int(subdomain.max(initial=-1)), op=MPI.MAX) + 1
+    if comm.size == 1:
+        return np.zeros(num, dtype=np.int32)
     cells, centres, shapes = measured(mesh.midpoints(), mesh.cell_tags, subdomain, num, comm)
-    return agreed(comm, deal(costs(cells, shapes), centres, comm.size))
+    kinds = agreed(comm, alike(cells, shapes))
+    if len(np.unique(kinds)) == num:
+        return agreed(comm, deal(cells, centres, comm.size))
+    seen = alike(kinds, bare_sides(mesh, subdomain, cells, centres, comm))
+    return deal_shared(cells, centres, (kinds, seen), comm.size, comm)
 
 
-def measured(
-    x: Array, tags: Array, subdomain: Array, num: int, comm: MPI.Intracomm
-) -> tuple[Array, Array, Array]:
-    """Number of cells of each subdomain, centre and shape. Collective.
+def deal_shared(
+    cells: Array, centres: Array, shared: Sequence[Array], num_ranks: int, comm: MPI.Intracomm
+) -> Array:
+    """Rank of each subdomain, in that of a few orders in which ranks share most. Collective.
 
     Args:
-        x: Midpoints of this rank's cells, shape ``(n, gdim)``.
-        tags: Their material tags.
-        subdomain: Their subdomains.
-        num: Number of subdomains, N.
-        comm: Communicator.
+        cells: Cells of each subdomain, shape ``(N,)``.
+        centres: Their centres, shape ``(N, gdim)``.
+        shared: As for ``dearest``; by the first of them ranks get chunks of equal cost.
+        num_ranks: Number of ranks.
+        comm: Communicator of those that try; each tries its part of the orders.
 
     Returns:
-        Shapes ``(N,)``, ``(N, gdim)`` and ``(N, q)``; what is in the last depends neither on the
-        place nor on the order of the cells.
+        Ranks, shape ``(N,)``, the same on all ranks.
     """
-    sums = _sums(np.column_stack((np.ones(len(x)), x)), subdomain, num, comm)
-    cells, centres = sums[:, 0], sums[:, 1:] / sums[:, :1]
-    moments = _sums(_moments(x - centres[subdomain], tags), subdomain, num, comm)
-    return cells, centres, _scaled(moments / sums[:, :1], x.shape[1])
+    orders, weights = _orders(centres), costs(cells, shared[0])
+    own = range(comm.rank, len(orders), comm.size)
+    found = {i: deal(weights, orders[i][0], num_ranks) for i in own}
+    tried = [
+        (dearest(ranks, cells, shared, num_ranks) * orders[i][1], i) for i, ranks in found.items()
+    ]
+    _, best = comm.allreduce(min(tried, default=(np.inf, -1)), op=MPI.MIN)
+    return np.asarray(comm.bcast(found.get(best), root=best % comm.size))
 
 
-def costs(cells: Array, shapes: Array) -> Array:
+def _orders(centres: Array) -> list[tuple[Array, float]]:
+    """Coordinates to bisect by, and how much worse each is for the sake of short interfaces.
+
+    Which of several sides that are as long as each other is cut across first is for the order of
+    axes to say; sides that are a little shorter are made as long, too.
+    """
+    sides = np.ptp(centres, axis=0)
+    longest = sides.max() or 1.0
+    even = centres / np.where(LONG * sides >= longest, sides, longest)
+    axes = [list(order) for order in permutations(range(centres.shape[1]))]
+    return [
+        (x[:, order], worse) for x, worse in ((centres, 1.0), (even, 1.0 + GAIN)) for order in axes
+    ]
+
+
+def costs(cells: Array, kinds: Array) -> Array:
     """What subdomains cost, in cells: one of several that are equal pays its part of the factor.
 
     Args:
         cells: Cells of each subdomain, shape ``(N,)``.
-        shapes: What must agree, up to ``SHAPE``, where subdomains are equal, shape ``(N, q)``.
+        kinds: A number for each, the same for equal ones, shape ``(N,)``.
     """
-    keys = np.column_stack((cells, np.rint(shapes / SHAPE))).astype(np.int64)
-    _, which, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
-    equal = count[which.ravel()]
+    equal = np.bincount(kinds)[kinds]
     return np.asarray(cells * (SHARED + (1.0 - SHARED) / equal))
 
 
-def _moments(d: Array, tags: Array) -> Array:
-    """Of cells at d from the centre of their subdomain: sums of them tell shapes apart.
+def dearest(ranks: Array, cells: Array, shared: Sequence[Array], num_ranks: int) -> float:
+    """What ranks cost that wait for each other, beside their mean if nothing were shared.
 
-    Degrees 2 and 3 tell mirrored ones from each other, the degree 4 more; tags stand for moduli.
+    They wait after each thing, say K⁺ of all subdomains, of which a rank makes what equal ones
+    share once.
+
+    Args:
+        ranks: Rank of each subdomain, shape ``(N,)``.
+        cells: Cells of each, shape ``(N,)``.
+        shared: For each thing, a number for each subdomain, the same for those that share it.
+        num_ranks: Number of ranks.
     """
-    gdim = d.shape[1]
-    pairs = [d[:, i] * d[:, j] for i in range(gdim) for j in range(i, gdim)]
-    square = np.sum(d**2, axis=1)
-    material = np.sin(tags.astype(float))  # any number of its own for each tag
-    return np.column_stack((*pairs, square[:, None] * d, square**2, material, material * square))
-
-
-def _scaled(moments: Array, gdim: int) -> Array:
-    """Mean moments without their units; lengths are those of the largest subdomain."""
-    pairs = gdim * (gdim + 1) // 2
-    degree = np.array([2] * pairs + [3] * gdim + [4, 0, 2])
-    length = np.sqrt(np.max(np.abs(moments[:, :pairs]), initial=0.0)) or 1.0  # of single cells 0
-    return np.asarray(moments / length**degree)
-
-
-def _sums(values: Array, subdomain: Array, num: int, comm: MPI.Intracomm) -> Array:
-    """Sums over the cells of each subdomain. Collective."""
-    total = np.zeros((num, values.shape[1]))
-    np.add.at(total, subdomain, values)
-    return summed(comm, total)
+    each = np.bincount(ranks, cells, minlength=num_ranks)
+    waited = ALIKE * each.max()
+    for numbers in shared:
+        _, first = np.unique(np.stack((ranks, numbers)), axis=1, return_index=True)
+        made = np.bincount(ranks[first], cells[first], minlength=num_ranks)
+        waited += np.max(SHARED * each + (1.0 - SHARED) * made)
+    return round(float(waited * num_ranks / cells.sum()), DIGITS)
 
 
 def deal(weights: Array, centres: Array, num_ranks: int) -> Array:
