@@ -28,6 +28,7 @@ ROOMS = [
     ["contact_state", "discretisation", "friction_bounds", "interior", "point_values"],
     ["solution"],
     ["saved_state", "work"],
+    ["refinement"],
     ["solver"],
     ["dilation"],
     ["newton_coulomb", "pressures"],

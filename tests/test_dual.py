@@ -5,8 +5,15 @@ import pytest
 from scenes import curved_obstacle, decomposed, problem
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.dual.accuracy import Accuracy
 from tfeti_dolfinx.dual.operator import check_operator
 from tfeti_dolfinx.dual.particular import feasible_particular
+from tfeti_dolfinx.dual.remainder import Remainder
+from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.qp.homogenised import homogenise, image
+from tfeti_dolfinx.qp.newton import feasible_start, newton
+from tfeti_dolfinx.qp.problem import Start
+from tfeti_dolfinx.solver import solve_dual
 
 
 @pytest.fixture(scope="module")
@@ -159,3 +166,24 @@ def test_counters_charge_who_asked(dual):
         dual.F.mult(x, y)
     dual.F.mult(x, y)
     assert (dual.F.count["someone"], dual.F.count["solver"]) == (before[0] + 1, before[1] + 1)
+
+
+@pytest.mark.parametrize("size", [1e-3, 1.0])
+def test_what_any_point_lacks_leads_to_the_same_solution(dual, size):
+    """λ₀ and u₀ need not belong to each other, nor fulfil anything."""
+    known, rule = solve_dual(dual, Options(rtol=1e-10), "newton")
+    rng = np.random.default_rng(dual.coarse.comm.rank)
+    lam = known.lam.array_r + size * known.lam.norm() * random_vec(dual, 7).array_r / 10.0
+    most = rule.measures.bodies.size.max()
+    u = rule.u + size * most * rng.standard_normal(len(rule.u))
+    left = Remainder(dual, lam, u)
+    qp, zero = left.qp(), dual.d.duplicate()
+    zero.set(0.0)
+    start = homogenise(qp, image(qp.F, feasible_start(qp, Start(zero, np.zeros(6)))))
+    own = Accuracy(left, 1e-10, 0.0, (start.scale.reference, start.scale.rounding))
+    result = newton(qp, start, own, warm=True)
+    assert result.reason > 0
+    assert np.abs(own.u - rule.u).max(initial=0.0) <= 1e-8 * most
+    result.lam.array[:] += lam - known.lam.array_r
+    assert result.lam.norm() <= 1e-7 * known.lam.norm()
+    left.destroy()

@@ -52,6 +52,22 @@ def test_conjugate_gradients_begin_anew_where_rounding_ends_them(comm):
         assert row["class"] == "right", row
 
 
+@pytest.mark.parametrize(
+    ("mu", "most"), [(0.0, 500), pytest.param(0.1, 4000, marks=pytest.mark.slow)]
+)
+def test_sheets_are_right_beyond_the_digits_of_the_forces(mu, most, comm):
+    """0: of hexahedra 1000 : 1; rounding of λ alone moves K⁺(f − Bᵀλ) by 3e-5 of the displacement.
+
+    Rounding of K changes the direct solution by 6e-14.
+    """
+    scene = random_scene(0) if mu == 0.0 else with_friction(random_scene(0), "coulomb", mu)
+    row = judge.run_scene(replace(scene, options={"tfeti_rtol": 1e-8}), comm)
+    if comm.rank == 0:
+        assert row["class"] == "right", row
+        assert row["u"] <= 1e-7
+        assert row["F"] <= most
+
+
 def test_soft_rows_hold_with_friction_beside_stiff_ones_that_are_open(comm):
     """54: moduli of subdomains are as 3e6 : 1; bounds that hold the load were taken for none."""
     scene = with_friction(random_scene(54), "coulomb", 0.5)

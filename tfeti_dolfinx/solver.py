@@ -27,6 +27,7 @@ from tfeti_dolfinx.qp.homogenised import (
 from tfeti_dolfinx.qp.monitors import Monitor, PrintMonitor, no_monitor
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, QPResult, Start
 from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver, Task
+from tfeti_dolfinx.refinement import Told, last_look, with_more_digits
 
 EXPLANATIONS = {
     ConvergedReason.DIVERGED_ROUNDING: "; rounding does not let it come lower: expected a "
@@ -116,17 +117,10 @@ def solve_dual(
     if begin is not None:
         begin.lam.destroy()
     if result.reason <= 0:
-        _last_look(result, rule)
+        last_look(result, rule)
+    if goal is None and solver.warm is not None:
+        result, rule = with_more_digits(dual, Told(solver, options, monitor), result, rule)
     return result, rule
-
-
-def _last_look(result: QPResult, rule: Accuracy) -> None:
-    """Measure where a solver has stopped before its tolerance: it may be good enough."""
-    residual = max(result.projected_gradient, result.norm * result.equality)
-    rule.accept_rounding()
-    reason = rule.examine(result.lam, result.gradient, result.face, residual)
-    if reason > 0:
-        result.reason = reason
 
 
 def _start(values: tuple[Array, Array] | None, like: PETSc.Vec) -> Start | None:

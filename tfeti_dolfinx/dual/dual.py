@@ -251,9 +251,13 @@ class Dual:
         Returns:
             This rank's part of u, shape ``(n,)``.
         """
-        B, c = self.constraints.B, self.constraints.c
-        u, gap = recover(B, c, self.coarse, lam, gradient, face)
-        motions, force = nearly_free(self.coarse, lam.array_r, face.carrying, error)
+        B, c, pinv_load = self.constraints.B, self.constraints.c, self.subdomains.pinv_load
+        u, gap = recover(B, c, self.coarse, lam, gradient, face, pinv_load)
+        return self.smallest(u, gap, lam.array_r, face, error)
+
+    def smallest(self, u: Array, gap: Array, lam: Array, face: Face, error: float) -> Array:
+        """Of displacements that are equally right the smallest, given one and its c − Bu."""
+        motions, force = nearly_free(self.coarse, lam, face.carrying, error)
         self.pressing = force
         words = listed(motions, self.coarse.bodies, *self._names)
         self.nearly_free = agreed(self.coarse.comm, words)

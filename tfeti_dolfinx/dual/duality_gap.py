@@ -255,7 +255,7 @@ def _change(scene: LiftedScene, forces: Array) -> Array:
     w, rows = B.createVecRight(), scene.constraints.c.duplicate()
     rows.array[:] = forces
     B.multTranspose(rows, w)
-    change = subdomains.recover(w.array_r) - subdomains.pinv_load
+    change = -subdomains.solve(subdomains.extended(w.array_r))
     w.array[:] = change[subdomains.trace]
     B.mult(w, rows)
     alpha = np.zeros(0)

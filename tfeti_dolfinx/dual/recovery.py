@@ -21,6 +21,7 @@ def recover(
     lam: PETSc.Vec,
     gradient: PETSc.Vec,
     face: Face,
+    pinv_load: Array,
 ) -> tuple[Array, Array]:
     """u = K⁺(f − Bᵀλ) + Rα. Collective.
 
@@ -35,6 +36,7 @@ def recover(
         lam: The multipliers.
         gradient: Fλ − d up to the range of Gᵀ; on rows that the face does not hold it is ν.
         face: The face of λ.
+        pinv_load: K⁺f, shape ``(n,)``.
 
     Returns:
         This rank's part of u, shape ``(n,)``, and c − B u, shape ``(m,)``.
@@ -42,7 +44,7 @@ def recover(
     w, v, residual = B.createVecRight(), B.createVecRight(), c.duplicate()
     B.multTranspose(lam, w)
     subdomains = coarse.subdomains
-    u = subdomains.recover(w.array_r)
+    u = pinv_load - subdomains.solve(subdomains.extended(w.array_r))
     v.array[:] = u[subdomains.trace]
     B.mult(v, residual)
     residual.aypx(-1.0, c)  # c − B K⁺(f − Bᵀλ) = Fλ − d

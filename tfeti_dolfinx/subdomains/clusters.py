@@ -98,6 +98,10 @@ class ClusteredSubdomains(Subdomains):
         allowed = abs(self.null).T @ np.repeat(sizes, counts)
         return np.where(np.abs(part) > BALANCED * allowed, part, 0.0)
 
+    def kernel_part(self, b: Array) -> Array:
+        """R̃ᵀb, shape ``(r̃,)``, for b on all unknowns, shape ``(n,)``."""
+        return np.asarray(self.null.T @ super().kernel_part(b))
+
     def kernel_motion(self, alpha: Array) -> Array:
         """R̃α on all unknowns, shape ``(n,)``, for α of shape ``(r̃,)``."""
         return super().kernel_motion(self.null @ alpha)
@@ -121,9 +125,7 @@ class ClusteredSubdomains(Subdomains):
     def solve(self, b: Array) -> Array:
         """K̃⁺b on all unknowns, shape ``(n,)``."""
         x, B, glue = super().solve(b), self._clusters.averages, self._glue()
-        pairs = zip(self.blocks, self.dof_parts, strict=True)
-        products = joined([block.kernel.T @ b[part] for block, part in pairs])
-        z = glue.apply(np.concatenate((B @ x, -products)))
+        z = glue.apply(np.concatenate((B @ x, -super().kernel_part(b))))
         mu, alpha = z[: B.shape[0]], z[B.shape[0] :]
         return np.asarray(x - super().solve(B.T @ mu) + super().kernel_motion(alpha))
 

@@ -136,6 +136,11 @@ class Subdomains:
         """Rᵀ f, shape ``(r,)``; 0 where it is rounding of f, as of stresses that are given."""
         return joined([_moving_part(block) for block in self.blocks])
 
+    def kernel_part(self, b: Array) -> Array:
+        """Rᵀ b, shape ``(r,)``, for b on all unknowns, shape ``(n,)``."""
+        pairs = zip(self.blocks, self.dof_parts, strict=True)
+        return joined([block.kernel.T @ b[part] for block, part in pairs])
+
     def kernel_motion(self, alpha: Array) -> Array:
         """R α on all unknowns, shape ``(n,)``, for α of shape ``(r,)``."""
         pairs = zip(self.blocks, self.kernel_parts, strict=True)
@@ -200,10 +205,6 @@ class Subdomains:
         return largest
 
     # ------------------------------------------------------------ displacements
-
-    def recover(self, w: Array) -> Array:
-        """K⁺(f − w) on all unknowns, shape ``(n,)``; w on the trace, shape ``(t,)``."""
-        return self.pinv_load - self.solve(self.extended(w))
 
     def solve(self, b: Array) -> Array:
         """K⁺ b on all unknowns, shape ``(n,)``."""
