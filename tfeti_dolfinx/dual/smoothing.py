@@ -70,7 +70,7 @@ class Smoothing:
         comm.Allreduce(MPI.IN_PLACE, sizes, op=MPI.MAX)
         top, size = sizes
         steps, part = (MANY_STEPS, WIDE_RANGE) if top > HIGH * size else (STEPS, RANGE)
-        self._steps = chebyshev(steps, top / part, top)
+        self._steps = chebyshev(steps, top / part, top) if top > 0.0 else []  # no rows: nothing
 
     def mult(self, y: PETSc.Vec, solve: OfArray, springs: Springs) -> None:
         """y ← B_D p(KH) A p(HK) B_Dᵀ y. Collective.
