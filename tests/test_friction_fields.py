@@ -252,4 +252,4 @@ def test_the_preconditioner_follows_any_curvature():
         steps.append(count.cg)
         for item in (M, coarse, point, start):
             item.destroy()
-    assert max(steps) <= 1.5 * steps[0], steps
+    assert max(steps) <= 1.5 * steps[0] + 1, steps

@@ -33,9 +33,9 @@ def test_what_was_learnt_from_a_load_is_right_for_its_multiples(cell, qp_type):
         found = scene.solve(load=load, held=held)
         counts.append(scene.problem.report.F_multiplications)
         assert distance(found, scene.fresh(load=load, held=held)) <= 1e-9
-    assert counts[0] >= 10
+    assert counts[0] >= 8
     assert max(counts[1:]) <= 2
-    assert scene.problem.report.recycled_directions >= 10
+    assert scene.problem.report.recycled_directions >= 8
 
 
 def test_steps_with_contact_take_fewer_multiplications():

@@ -149,32 +149,32 @@ def test_bodies_that_a_mesh_joins_in_nodes_alone_are_named(comm):
 
 # ladder, value, multiplications over those of the first value: a fifth more than measured, and one
 TIMES = [
-    ("soft on stiff", 1e6, 1.42),
+    ("soft on stiff", 1e6, 1.29),
     ("stiff on soft", 1e6, 1.0),
     ("loose stack", 1e6, 1.0),
-    ("subdomains of a body", 1e6, 1.06),
+    ("subdomains of a body", 1e6, 1.43),
     ("subdomains of a pair", 1e6, 1.29),
-    ("cells", 1e6, 1.29),
-    ("slivers", 1e3, 2.8),
-    ("layers at contact", 1e2, 2.9),
-    ("layers at contact", 1e3, 3.2),
-    ("flat block", 10.0, 2.3),
-    ("flat block", 1e2, 3.1),
-    ("plate", 1e2, 1.13),
-    ("plate", 1e3, 1.07),
-    ("arch", 1e3, 3.14),
-    ("strips", 1e3, 10.1),
-    ("hang at corners", 1.0, 0.6),
-    ("random", 3.0, 1.2),
-    ("two obstacles", 1e-6, 1.3),
-    ("two obstacles", 1e-3, 1.3),
-    ("pairs of a node", 2.0, 3.87),
-    ("pairs of a node", 3.0, 8.4),
-    ("grazing", -1e-6, 1.1),
+    ("cells", 1e6, 1.33),
+    ("slivers", 1e3, 1.86),
+    ("layers at contact", 1e2, 2.6),
+    ("layers at contact", 1e3, 3.3),
+    ("flat block", 10.0, 3.54),
+    ("flat block", 1e2, 5.2),
+    ("plate", 1e2, 1.64),
+    ("plate", 1e3, 1.55),
+    ("arch", 1e3, 3.57),
+    ("strips", 1e3, 9.86),
+    ("hang at corners", 1.0, 0.71),
+    ("random", 3.0, 1.12),
+    ("two obstacles", 1e-6, 1.23),
+    ("two obstacles", 1e-3, 1.14),
+    ("pairs of a node", 2.0, 4.78),
+    ("pairs of a node", 3.0, 6.9),
+    ("grazing", -1e-6, 0.9),
     ("all or nothing", 1.0, 1.31),
-    ("P1", 0.499, 8.4),
-    ("P1, loose", 0.499, 5.3),
-    ("P2", 0.499, 4.4),
+    ("P1", 0.499, 5.6),
+    ("P1, loose", 0.499, 4.33),
+    ("P2", 0.499, 3.89),
 ]
 
 
@@ -200,3 +200,19 @@ def test_hard_scenes_cost_what_the_table_says(ladder, cell, value, times, serial
         assert not outcome.error
         found.append(outcome.report["F"])
     assert found[1] <= 1.2 * times * found[0] + 1, found
+
+
+# P1 and P2 tetrahedra: a tenth more than measured; 18, 113, 39 and 191 before displacements were
+# smooth
+COUNTS = [("P1", 0.3, 10), ("P1", 0.499, 56), ("P2", 0.3, 27), ("P2", 0.499, 80)]
+
+
+@pytest.mark.parametrize(
+    ("name", "nu", "most"),
+    [pytest.param(*row, marks=[] if row[0] == "P1" else [pytest.mark.slow]) for row in COUNTS],
+)
+def test_tetrahedra_that_keep_their_volumes(name, nu, most, serial_only):
+    ladder = next(ladder for ladder in LADDERS if (ladder.group, ladder.name) == ("nu", name))
+    scene = ladder.rung("tetrahedron", nu)
+    outcome = solve_scene(scene, grid(scene), MPI.COMM_SELF)
+    assert outcome.report["F"] <= 1.1 * most, outcome

@@ -197,8 +197,9 @@ class Dual:
 
     @property
     def _on_all_rows(self) -> Operator | None:
-        """The preconditioner where nothing is constrained; soft motions are factored once."""
-        if self.soft is None or not self.soft.count:
+        """The preconditioner where nothing is constrained; what it needs is made once."""
+        smooths = self.preconditioner is not None and self.preconditioner.metric is not None
+        if self.soft is None or not (self.soft.count or (smooths and not any(self.contact_rows))):
             return self.preconditioner
         if self._on_all is None:
             rows = self.constraints.num_rows

@@ -8,9 +8,11 @@ from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.contact_factor import Factor, contact_factor
+from tfeti_dolfinx.dual.operator import DualOperator
+from tfeti_dolfinx.dual.smoothing import Smoothing, Springs
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.qp.faces import Face
-from tfeti_dolfinx.qp.problem import FaceOperator, Operator
+from tfeti_dolfinx.qp.problem import FaceOperator
 
 # an entry of B_N D⁻¹ B_Nᵀ − I, whose diagonal is 1, that is rounding
 ORTHONORMAL = 1e-12
@@ -32,6 +34,9 @@ class FacePreconditioner:
     which makes M_f the inverse where F is 1/σ. So it is W_κ⁻¹(B_f D⁻¹ A D⁻¹B_fᵀ + κσ²)W_κ⁻¹ with
     W_κ = W + κσ.
 
+    Where the operator on all rows has a metric, displacements with given jumps are made smooth in
+    it (``Smoothing``).
+
     Args:
         whole: B D⁻¹ A D⁻¹Bᵀ on all rows, A the Schur complements, or the stiffness on the trace.
         constraints: B and D. The constructor is collective.
@@ -40,12 +45,15 @@ class FacePreconditioner:
     """
 
     def __init__(
-        self, whole: Operator, constraints: Constraints, diagonal: Array, prefix: str
+        self, whole: DualOperator, constraints: Constraints, diagonal: Array, prefix: str
     ) -> None:
         self._whole, self._prefix, sets = whole, prefix, constraints.sets
         self._contact = np.concatenate((sets.normals, sets.tangents.ravel()))
         self._gram = _contact_gram(constraints, self._contact)
         self._size = _diagonal(constraints, diagonal)
+        self._smoothing: Smoothing | None = None
+        if whole.metric is not None:
+            self._smoothing = Smoothing(whole, whole.metric, constraints.weights, diagonal)
 
     def on_face(self, face: Face) -> FaceOperator:
         """M_f on a face. Collective.
@@ -68,10 +76,13 @@ class FacePreconditioner:
                 factor = contact_factor(part, self._prefix)
             else:
                 part.destroy()
-        return _OnFace(self._whole, face, Z_C, (bent, bent * size), factor)
+        operator = self._whole if self._smoothing is None else self._smoothing
+        return _OnFace(operator, face, Z_C, (bent, size), factor)
 
     def destroy(self) -> None:
         """Destroy W_C, not the operator on all rows. Collective."""
+        if self._smoothing is not None:
+            self._smoothing.destroy()
         if self._gram is not None:
             self._gram.destroy()
 
@@ -81,24 +92,29 @@ class _OnFace:
 
     def __init__(
         self,
-        whole: Operator,
+        whole: DualOperator | Smoothing,
         face: Face,
         Z_C: csr_array,
         springs: tuple[Array, Array],
         factor: Factor | None,
     ) -> None:
         self._whole, self._face, self._Z_C, self._factor = whole, face, Z_C, factor
-        self._bent, self._moved = springs
-        self._bends = bool(np.any(self._bent))
+        (self._bent, size), bends = springs, springs[0] > 0.0
+        self._bends = bool(np.any(bends))
+        self._springs = Springs(csr_array(Z_C[:, bends]), self._bent[bends], size[bends])
 
     def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = M_f x. Collective."""
-        scaled = x.duplicate()
-        scaled.array[:] = self._scaled(x.array_r)
-        self._whole.mult(scaled, y)
-        if self._bends:
-            y.array[:] += self._Z_C @ (self._moved * (self._Z_C.T @ scaled.array_r))
-        scaled.destroy()
+        if isinstance(self._whole, Smoothing):
+            y.array[:] = self._scaled(x.array_r)
+            self._whole.mult(y, self._scaled, self._springs)
+        else:
+            scaled, springs = x.duplicate(), self._springs
+            scaled.array[:] = self._scaled(x.array_r)
+            self._whole.mult(scaled, y)
+            moved = springs.bent * springs.size * (springs.directions.T @ scaled.array_r)
+            y.array[:] += springs.directions @ moved
+            scaled.destroy()
         y.array[:] = self._scaled(y.array_r)
 
     def dependent(self, x: Array) -> Array | None:

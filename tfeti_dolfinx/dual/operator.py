@@ -13,7 +13,9 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.errors import raised_on_all_ranks, require
+from tfeti_dolfinx.parallel import any_rank
 from tfeti_dolfinx.subdomains.local import LocalOperator
+from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 
@@ -39,18 +41,24 @@ class DualOperator:
     Args:
         B: Dual rows × trace unknowns, MPIAIJ (or scaled).
         local: diag(A_s) on this rank; what its ``prepare`` raises is raised on all ranks.
+        metric: What displacements with given jumps are made smooth in, on faces, before they come
+            to diag(A_s); None: they stay as they are.
 
     Attributes:
         count: Multiplications so far, by who they are charged to (``"solver"`` by default).
     """
 
-    def __init__(self, B: RowMatrix, local: LocalOperator) -> None:
-        self.B, self.local = B, local
+    def __init__(
+        self, B: RowMatrix, local: LocalOperator, metric: LocalOperator | None = None
+    ) -> None:
+        self.B, self.local, self.metric = B, local, metric
         self.count: Counter[str] = Counter()
         self._payer, self._seconds, self._times = "solver", 0.0, 0
         self._w, self._v = B.createVecRight(), B.createVecRight()
         with raised_on_all_ranks(self._w.getComm().tompi4py()):
             local.prepare()
+            if metric is not None:
+                metric.prepare()
 
     @contextmanager
     def charged_to(self, payer: str) -> Iterator[None]:
@@ -63,12 +71,16 @@ class DualOperator:
 
     def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = B diag(A_s) Bᵀ x. Collective."""
-        self.count[self._payer] += 1
         self.B.multTranspose(x, self._w)
-        start = perf_counter()
-        self.local.mult(self._w.array_r, self._v.array)
-        self._seconds, self._times = self._seconds + perf_counter() - start, self._times + 1
+        self.multiply(self._w.array_r, self._v.array)
         self.B.mult(self._v, y)
+
+    def multiply(self, w: Array, out: Array) -> None:
+        """out = diag(A_s) w on this rank's trace, which counts as a multiplication."""
+        self.count[self._payer] += 1
+        start = perf_counter()
+        self.local.mult(w, out)
+        self._seconds, self._times = self._seconds + perf_counter() - start, self._times + 1
 
     @property
     def local_seconds(self) -> float:
@@ -78,6 +90,8 @@ class DualOperator:
     def destroy(self) -> None:
         """Destroy the work vectors and the local operator, not B. Collective."""
         self.local.destroy()
+        if self.metric is not None:
+            self.metric.destroy()
         self._w.destroy()
         self._v.destroy()
 
@@ -128,8 +142,11 @@ def lumped_preconditioner(B: RowMatrix, subdomains: Subdomains) -> DualOperator:
 
 
 def dirichlet_preconditioner(B: RowMatrix, subdomains: Subdomains) -> DualOperator:
-    """B S Bᵀ (Farhat, Mandel, Roux 1994), B or rather B_D. Collective."""
-    return DualOperator(B, subdomains.local_operator("schur"))
+    """B S Bᵀ (Farhat, Mandel, Roux 1994), B or rather B_D; K_bb as metric if sparse. Collective."""
+    own = [block for block in subdomains.blocks if not isinstance(block, SparseBlock)]
+    sparse = not any_rank(subdomains.comm, bool(own))
+    metric = subdomains.local_operator("stiffness") if sparse else None
+    return DualOperator(B, subdomains.local_operator("schur"), metric)
 
 
 MakePreconditioner = Callable[[RowMatrix, Subdomains], DualOperator]

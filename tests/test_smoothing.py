@@ -1,0 +1,166 @@
+"""Displacements with given jumps, made smooth: the preconditioner beside dense matrices."""
+
+from copy import copy
+
+import numpy as np
+import pytest
+from bodies import held, pressed, stacked, two_body_problem
+from hypothesis import given
+from hypothesis import strategies as st
+from mpi4py import MPI
+from numpy.polynomial.chebyshev import Chebyshev
+from scenes import curved_obstacle, decomposed, problem
+from scipy.linalg import block_diag
+from test_own_block import DenseBlock
+from test_solvable_lp import dual_of
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.dual import smoothing
+from tfeti_dolfinx.dual.face_preconditioner import SHIFT, FacePreconditioner
+from tfeti_dolfinx.dual.smoothing import chebyshev, smoothed
+from tfeti_dolfinx.qp.faces import Face, Status, face_of
+
+
+@given(st.integers(1, 8), st.floats(1e-3, 1e3), st.floats(1.5, 100.0), st.integers(0, 1000))
+def test_steps_are_chebyshev_s_polynomial(count, high, ratio, seed):
+    """1 at 0, and T_m moved to the interval over what it is at 0."""
+    low, spectrum = high / ratio, np.random.default_rng(seed).uniform(0.0, high, 20)
+    found = smoothed(chebyshev(count, low, high), lambda u: spectrum * u, np.ones(20))
+    T = Chebyshev.basis(count, domain=[low, high])
+    assert np.allclose(found, T(spectrum) / T(0.0), rtol=1e-9, atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def dual():
+    """Two bodies on meshes that do not match, with friction: contact rows depend on each other."""
+    d = stacked("quadrilateral", 3, 4, 6)
+    contact = tfeti.Contact("upper bottom", "lower top", friction=tfeti.Tresca(0.02))
+    p = two_body_problem(d, pressed(d), held(d, "lower bottom"), [contact], tfeti_rtol=1e-8)
+    yield dual_of(p)
+    p.destroy()
+
+
+def face_with_springs(dual, kappa):
+    """All equalities, every other normal, all tangents, these with springs."""
+    sets, rows = dual.constraints.sets, dual.constraints.num_rows
+    free, status = np.ones(rows, dtype=bool), np.full(rows, Status.FREE)
+    free[sets.normals[::2]] = False
+    flat = face_of(free, status)
+    tangential = np.isin(np.flatnonzero(free), sets.tangents.ravel())
+    return Face(flat.Z, np.where(tangential, kappa, 0.0), status)
+
+
+def dense(operator, like):
+    """An operator between vectors of rows, whole on every rank."""
+    x, y, columns = like.duplicate(), like.duplicate(), []
+    first, last = x.getOwnershipRange()
+    comm = like.getComm().tompi4py()
+    for j in range(x.getSize()):
+        x.set(0.0)
+        if first <= j < last:
+            x.array[j - first] = 1.0
+        operator.mult(x, y)
+        columns.append(np.concatenate(comm.allgather(y.array_r)))
+    x.destroy()
+    y.destroy()
+    return np.array(columns).T
+
+
+def local_matrix(operator, size):
+    out = np.empty((size, size))
+    for j, e in enumerate(np.eye(size)):
+        operator.mult(e, out[j])
+    return out.T
+
+
+@pytest.mark.parametrize(("kappa", "high"), [(0.0, 100.0), (3.0, 100.0), (3.0, 0.0)])
+def test_the_preconditioner_is_what_its_formula_says(dual, kappa, high, serial_only, monkeypatch):
+    """With springs as trace unknowns of their own, of weight 1/(κσ) in D and 1/κ in A and K."""
+    monkeypatch.setattr(smoothing, "HIGH", high)
+    monkeypatch.setattr(dual, "_on_faces", None)
+    steps, part = (8, 50.0) if high == 0.0 else (3, 8.0)
+    c, pc = dual.constraints, dual.preconditioner
+    face = face_with_springs(dual, kappa)
+    M = dual._preconditioner_on(face)
+    K, S = (local_matrix(op, len(c.weights)) for op in (pc.metric, pc.local))
+    B = c.B.convert("dense").getDenseArray().copy()
+    Z, D = face.Z.toarray(), c.weights
+    size = (B**2) @ (dual.subdomains.diagonal / D**2)
+    bends = face.curvature > 0.0
+    B_f, sigma = Z.T @ B, Z.T @ size
+    root = np.sqrt(D)
+    top = 1.01 * np.linalg.eigvalsh(K / np.outer(root, root))[-1]
+    if kappa:
+        B_f = np.hstack((B_f, np.eye(len(sigma))[:, bends]))
+        D = np.concatenate((D, 1.0 / (kappa * sigma[bends])))
+        K, S = (block_diag(A, np.eye(bends.sum()) / kappa) for A in (K, S))
+    shift = np.where(np.isin(np.arange(len(Z)), c.sets.equalities), 0.0, SHIFT)
+    W_inverse = np.linalg.inv((B_f / D) @ B_f.T + np.diag(Z.T @ shift))
+    H = np.diag(1.0 / D) - (B_f / D).T @ W_inverse @ (B_f / D)
+    lifting = (B_f / D).T @ W_inverse
+    for zero in Chebyshev.basis(steps, domain=[top / part, top]).roots():
+        lifting -= H @ K @ lifting / zero
+    assert np.allclose(B_f @ lifting, np.eye(len(B_f)), atol=1e-5)
+    expected = Z @ (lifting.T @ S @ lifting) @ Z.T
+    found = dense(M, dual.d)
+    M.destroy()
+    assert np.abs(found - expected).max() <= 2e-3 * np.abs(expected).max()
+    assert np.allclose(found, found.T, atol=1e-10 * np.abs(found).max())
+
+
+def spectrum(dual, face, smooths):
+    """Eigenvalues of M_f F between vectors of a flat face that balance, whole on every rank."""
+    whole = copy(dual.preconditioner)
+    if not smooths:
+        whole.metric = None
+    c = dual.constraints
+    faces = FacePreconditioner(whole, c, dual.subdomains.diagonal, "tfeti_face_")
+    M_f = faces.on_face(face)
+    comm = c.B.getComm().tompi4py()
+    M, F = dense(M_f, dual.d), dense(dual.F, dual.d)
+    M_f.destroy()
+    faces.destroy()
+    held_rows = np.concatenate(comm.allgather(face.held))
+    G = np.concatenate(comm.allgather(dual.coarse.Gt.toarray()))[~held_rows]
+    U, sizes, _ = np.linalg.svd(G)
+    rank = int(np.sum(sizes > 1e-10 * sizes[0]))
+    M, F = (U[:, rank:].T @ A[~held_rows][:, ~held_rows] @ U[:, rank:] for A in (M, F))
+    L = np.linalg.cholesky(0.5 * (F + F.T))
+    return np.linalg.eigvalsh(L.T @ (0.5 * (M + M.T)) @ L)
+
+
+def test_eigenvalues_come_nearer_to_one_from_above(dual):
+    """None is below 1, as jumps stay what they are; the largest are smaller."""
+    face = face_with_springs(dual, 0.0)
+    plain, smooth = (spectrum(dual, face, smooths) for smooths in (False, True))
+    assert plain[0] >= 1.0 - 1e-6
+    assert smooth[0] >= 1.0 - 1e-6
+    assert smooth[-1] <= 0.7 * plain[-1], (plain[-1], smooth[-1])
+    assert np.log(smooth).sum() <= 0.7 * np.log(plain).sum()
+
+
+def test_it_saves_multiplications_on_any_number_of_ranks(comm):
+    counts = []
+    for of in (comm, MPI.COMM_SELF):
+        d = decomposed("hexahedron", 4, subdomains=6, comm=of)
+        obstacle = tfeti.Obstacle("bottom", curved_obstacle(3))
+        p = problem(d, contacts=[obstacle])
+        p.solve()
+        counts.append(p.report.F_multiplications)
+        p.destroy()
+    assert abs(counts[0] - counts[1]) <= 1
+    assert max(counts) <= 14, counts
+
+
+@pytest.mark.parametrize(
+    ("options", "extensions"),
+    [
+        ({"tfeti_pc_type": "lumped"}, None),
+        ({"tfeti_pc_type": "dirichlet"}, tfeti.Extensions(block=DenseBlock)),
+    ],
+)
+def test_only_sparse_blocks_and_S_have_a_metric(options, extensions):
+    d = decomposed("hexahedron", 3, 4)
+    p = problem(d, extensions=extensions, **options)
+    assert dual_of(p).preconditioner.metric is None
+    p.destroy()
