@@ -6,6 +6,7 @@ from collections.abc import Callable, Hashable, Iterator, Sequence
 from typing import Protocol
 
 import numpy as np
+from scipy.sparse import block_diag, csr_array
 
 from tfeti_dolfinx.arrays import Array, parts_of
 from tfeti_dolfinx.subdomains.block import Block, OperatorKind
@@ -21,29 +22,30 @@ from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
 
 
 class Group:
-    """Blocks of equal subdomains, or one alone.
+    """Blocks of equal subdomains, one alone, or some whose sparse matrices are one.
 
     Args:
         matrix: The matrix that all apply.
-        rows: Its row for each trace unknown, for each Block.
+        rows: Its row for each trace unknown, for each column.
         parts: Where the trace unknowns of each Block lie among those of the rank.
 
     Attributes:
         matrix: The matrix.
         count: Number of Blocks.
+        columns: Of what the matrix is applied to: one for each Block, or one for all.
     """
 
     def __init__(self, matrix: TraceMatrix, rows: Sequence[Array], parts: Sequence[slice]) -> None:
-        self.matrix, self.count = matrix, len(rows)
-        # of an array of one column for each Block, columns first
+        self.matrix, self.count, self.columns = matrix, len(parts), len(rows)
+        # of an array of columns, the first one first
         self._place = np.concatenate([k * matrix.size + row for k, row in enumerate(rows)])
         self._where = np.concatenate([np.arange(part.start, part.stop) for part in parts])
 
     def mult(self, apply: Callable[[Array], Array], w: Array, out: Array) -> None:
         """out = A w on the parts of all Blocks, A W being ``apply``."""
-        columns = np.zeros(self.count * self.matrix.size)
+        columns = np.zeros(self.columns * self.matrix.size)
         columns[self._place] = w[self._where]
-        product = apply(columns.reshape((self.matrix.size, self.count), order="F"))
+        product = apply(columns.reshape((self.matrix.size, self.columns), order="F"))
         out[self._where] = product.ravel(order="F")[self._place]
 
 
@@ -73,8 +75,8 @@ class Implicit:
     """Through factors, with several right sides where there are several Blocks."""
 
     def __init__(self, group: Group) -> None:
-        self.group, self.name = group, "implicit" if group.count == 1 else "shared_implicit"
-        matrix, count = group.matrix, group.count
+        self.group, self.name = group, "implicit" if group.columns == 1 else "shared_implicit"
+        matrix, count = group.matrix, group.columns
         self.cost = Cost(0.0, matrix.seconds(count), matrix.traffic(count))
 
     def prepare(self) -> None:
@@ -89,13 +91,13 @@ class Explicit:
     """By a dense matrix: one product for all Blocks."""
 
     def __init__(self, group: Group) -> None:
-        self.group, self.name = group, "explicit" if group.count == 1 else "shared_explicit"
-        t, count = group.matrix.size, group.count
+        self.group, self.name = group, "explicit" if group.columns == 1 else "shared_explicit"
+        t, count = group.matrix.size, group.columns
         self.cost = Cost(group.matrix.seconds(t), dense_product(t, count), dense_traffic(t, count))
 
     def prepare(self) -> None:
         """Make the matrix."""
-        self._matrix = self.group.matrix.dense(packed=self.group.count == 1)
+        self._matrix = self.group.matrix.dense(packed=self.group.columns == 1)
 
     def mult(self, w: Array, out: Array) -> None:
         """out = A w on the group's parts of trace vectors of the rank."""
@@ -109,7 +111,7 @@ def chosen(group: Group, local_type: str, multiplications: int) -> Form:
         return implicit
     if local_type == "explicit":
         return explicit
-    if local_type == "shared" and group.count == 1:
+    if local_type == "shared" and group.columns == 1:
         return implicit
     if implicit.cost.of(multiplications) <= explicit.cost.of(multiplications):
         return implicit
@@ -117,14 +119,23 @@ def chosen(group: Group, local_type: str, multiplications: int) -> Form:
 
 
 def groups_of(blocks: Sequence[Block], kind: OperatorKind) -> Iterator[Group]:
-    """Groups that are as large as possible; Blocks without a trace have nothing to apply."""
+    """Groups that are as large as possible; Blocks without a trace have nothing to apply.
+
+    K_bb of subdomains that have none equal to them are one sparse matrix.
+    """
     members: dict[Hashable, list[int]] = {}
     for i, block in enumerate(blocks):
         if len(block.trace_dofs):
             members.setdefault(_key(block, kind), []).append(i)
     parts = parts_of([len(block.trace_dofs) for block in blocks])
+    alone = [i for (i, *more) in members.values() if not more and kind == "stiffness"]
+    alone = [i for i in alone if isinstance(blocks[i], SparseBlock)]
     for chosen_blocks in members.values():
-        yield _group([blocks[i] for i in chosen_blocks], kind, [parts[i] for i in chosen_blocks])
+        if chosen_blocks[0] not in alone:
+            own = [blocks[i] for i in chosen_blocks]
+            yield _group(own, kind, [parts[i] for i in chosen_blocks])
+    if alone:
+        yield _joined([blocks[i] for i in alone], [parts[i] for i in alone])
 
 
 def solved_together(blocks: Sequence[Block], parts: Sequence[slice], b: Array) -> Array:
@@ -166,6 +177,19 @@ def _key(block: Block, kind: OperatorKind) -> Hashable:
     return id(block.stiffness) if kind == "pinv" else id(block.traced)
 
 
+def _joined(blocks: Sequence[Block], parts: Sequence[slice]) -> Group:
+    """K_bb of some Blocks as one sparse matrix."""
+    sparse = [block for block in blocks if isinstance(block, SparseBlock)]
+    K_bb = [block.traced.K_bb for block in sparse]
+    begins = np.cumsum([0, *(K.shape[0] for K in K_bb)])
+    rows = [
+        begin + np.searchsorted(block.traced.trace, block.trace_place)
+        for begin, block in zip(begins[:-1], sparse, strict=True)
+    ]
+    matrix = StiffnessMatrix(csr_array(block_diag(K_bb, format="csr")))
+    return Group(matrix, [np.concatenate(rows)], parts)
+
+
 def _group(blocks: Sequence[Block], kind: OperatorKind, parts: Sequence[slice]) -> Group:
     sparse = [block for block in blocks if isinstance(block, SparseBlock)]
     if not sparse:
@@ -178,5 +202,6 @@ def _group(blocks: Sequence[Block], kind: OperatorKind, parts: Sequence[slice]) 
         matrix: TraceMatrix = PinvMatrix(first.stiffness, trace)
     else:
         trace = first.traced.trace
-        matrix = (SchurMatrix if kind == "schur" else StiffnessMatrix)(first.traced)
+        schur = kind == "schur"
+        matrix = SchurMatrix(first.traced) if schur else StiffnessMatrix(first.traced.K_bb)
     return Group(matrix, [np.searchsorted(trace, place) for place in places], parts)
