@@ -13,6 +13,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.operator import DualOperator
+from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.subdomains.local import LocalOperator
 
 # steps, and the part of the spectrum that they make small, from its top down
@@ -68,7 +69,7 @@ class Smoothing:
         comm = self._w.getComm().tompi4py()
         sizes = np.array([self._top(), np.max(diagonal / weights, initial=0.0)])
         comm.Allreduce(MPI.IN_PLACE, sizes, op=MPI.MAX)
-        top, size = sizes
+        top, size = agreed(comm, sizes)
         steps, part = (MANY_STEPS, WIDE_RANGE) if top > HIGH * size else (STEPS, RANGE)
         self._steps = chebyshev(steps, top / part, top) if top > 0.0 else []  # no rows: nothing
 
