@@ -14,7 +14,7 @@ from tfeti_dolfinx.subdomains.soft_motions import SoftMotions
 
 # Of what the stiffness of outer unknowns would make of a motion: one of less energy is soft.
 # Compact clusters of 2 × 2 × 2 cubes have 0.1 and more, chains and hooks 0.01.
-SOFT = 0.03
+SOFT = 0.05
 
 
 class Glue:
