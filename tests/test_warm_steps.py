@@ -60,7 +60,7 @@ def multiplications(scene, cold=False, **options):
 
 @pytest.mark.parametrize("scene", [bar, wall, ball, rough_ball])
 def test_a_step_takes_two_thirds_of_one_that_begins_with_nothing(scene):
-    """0 of 2 multiplications, 1 of 3, 7.5 of 14, and with friction 11 of 21."""
+    """0 of 2 multiplications, 1 of 2, 6 of 11, and with friction 10.5 of 17.5."""
     assert multiplications(scene) <= 2 / 3 * multiplications(scene, cold=True, recycle=0)
 
 

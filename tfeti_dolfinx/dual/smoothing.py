@@ -13,6 +13,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.operator import DualOperator
+from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.subdomains.local import LocalOperator
 
@@ -67,7 +68,9 @@ class Smoothing:
         self._whole, self._metric, self._weights = whole, metric, weights
         self._w = whole.B.createVecRight()
         comm = self._w.getComm().tompi4py()
-        sizes = np.array([self._top(), np.max(diagonal / weights, initial=0.0)])
+        with raised_on_all_ranks(comm):
+            top = self._top()
+        sizes = np.array([top, np.max(diagonal / weights, initial=0.0)])
         comm.Allreduce(MPI.IN_PLACE, sizes, op=MPI.MAX)
         top, size = agreed(comm, sizes)
         steps, part = (MANY_STEPS, WIDE_RANGE) if top > HIGH * size else (STEPS, RANGE)
