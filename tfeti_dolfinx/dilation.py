@@ -10,7 +10,7 @@ from tfeti_dolfinx.arrays import TINY, Array
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.options import Options
-from tfeti_dolfinx.parallel import agreed, summed
+from tfeti_dolfinx.parallel import agreed, norm_over, summed
 from tfeti_dolfinx.qp.acceleration import Anderson
 from tfeti_dolfinx.qp.cones import Cones
 from tfeti_dolfinx.qp.discs import Ellipses
@@ -117,7 +117,7 @@ class DilatedGaps:
         return np.asarray(slips)
 
     def _size(self, x: Array) -> float:
-        return agreed(self._comm, float(np.sqrt(summed(self._comm, np.array([x @ x]))[0])))
+        return norm_over(self._comm, x)
 
     def _products(self, A: Array, B: Array) -> Array:
         return agreed(self._comm, summed(self._comm, A.T @ B))

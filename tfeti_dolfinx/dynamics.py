@@ -34,7 +34,7 @@ class ContactDynamics(ContactProblem):
     A step of the size τ solves one contact problem with K/2 + 2M/τ², and ends at u⁺ and v⁺. Contact
     is implicit: no node overlaps at the end of a step, and its forces, λ, are means over the step.
     ``LoadSteps`` goes through many, or by hand: ``take_step(size)``, ``solve()``, ``accept()``.
-    All is collective. Since F is that of the steps before, 100 directions of conjugate gradients
+    All is collective. Since F is that of the steps before, 200 directions of earlier steps
     are kept, unless the option ``recycle`` is given.
 
     With fixed obstacles and supports and no friction the energy E = vᵀMv/2 + uᵀKu/2 changes by the

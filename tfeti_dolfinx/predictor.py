@@ -116,8 +116,6 @@ class Predictor:
             self._subdomains.retrace(constraints.trace, constraints.span)
         scene = self._dofs, self._decomposition
         self._dual = settings.make_dual(constraints, self._subdomains, *scene, _frictionless)
-        if self._start is not None and self._start[0] is gluing:
-            self._dual.last.take(self._dofs.comm, self._start[1], self._image)
 
     def _solve(self, gluing: Gluing) -> Array:
         """The displacement in primal order."""
@@ -126,6 +124,9 @@ class Predictor:
         dual.forget_counts()
         if self._start is not None:  # nothing has a kernel in M
             start = (gluing.multipliers(*self._start), np.zeros(0))
+            if self._start[0] is gluing:
+                dual.last.take(self._dofs.comm, self._start[1], self._image)
+        self._image = np.zeros(0)  # it is of the F and the start of a restored state alone
         qp_type, _ = resolve_types(options, dual.contact_rows, self._settings.prefix)
         result, accuracy = solve_dual(dual, options, qp_type, start)
         self._start = (gluing, np.array(result.lam.array_r)) if result.reason > 0 else None

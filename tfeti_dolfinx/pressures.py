@@ -10,7 +10,7 @@ from tfeti_dolfinx.dilation import DilatedGaps, cone_set
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.errors import ConvergenceError
 from tfeti_dolfinx.options import Options
-from tfeti_dolfinx.parallel import agreed, any_rank, summed
+from tfeti_dolfinx.parallel import agreed, any_rank, norm_over, summed
 from tfeti_dolfinx.qp.acceleration import Anderson
 from tfeti_dolfinx.qp.nearest import nearest_or_least
 from tfeti_dolfinx.qp.problem import ConvergedReason
@@ -143,7 +143,7 @@ class Pressures:
         Body by body: beside forces elsewhere those on a light one would not be seen.
         """
         values = lam.array_r
-        self._none = NO_FORCE * float(np.sqrt(summed(self._comm, np.array([values @ values]))[0]))
+        self._none = NO_FORCE * norm_over(self._comm, values)
         self._found = self._forces(values[self._rows])
         if self._sticks:
             return float("inf")

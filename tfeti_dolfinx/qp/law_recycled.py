@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.parallel import summed
+from tfeti_dolfinx.parallel import agreed, summed
 from tfeti_dolfinx.qp.gcr import Known
 from tfeti_dolfinx.qp.law import OnFace
 from tfeti_dolfinx.qp.recycled import RecycledOnFace, triangle
@@ -53,5 +53,6 @@ def keep(past: RecycledOnFace | None, on: OnFace, new: Known) -> None:
         return
     for z, Fz in zip(new.Z, new.images, strict=True):
         x = on.followed(z)
-        energy = float(summed(past.known.comm, np.array([x @ Fz]))[0])
-        past.known.add(x, Fz, energy)
+        energy = agreed(past.known.comm, float(summed(past.known.comm, np.array([x @ Fz]))[0]))
+        if energy > 0.0:
+            past.known.add(x, Fz, energy)
