@@ -75,7 +75,7 @@ def test_where_memory_does_not_last_the_oldest_goes():
     for k in range(4):
         p = np.zeros(4)
         p[k] = 1.0
-        kept.keep(p, 2.0 * p, 2.0 * comm.size)
+        kept.keep(p, 2.0 * p, 2.0 * comm.size, 1.0)
     assert kept.number == 3
     z = np.arange(1.0, 5.0)
     kept.take_away(z, comm.allreduce(kept.products(z)))

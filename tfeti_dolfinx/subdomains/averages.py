@@ -21,6 +21,8 @@ from tfeti_dolfinx.subdomains.kernel import candidate_modes
 FLAT, DEPENDENT = 1e-6, 1e-8
 # METIS's: parts may have so many thousandths more than their share
 UNEVEN = 30
+# of the mean size of subdomains: smaller ones, such as are split off, stay with a neighbour
+CRUMB = 0.3
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,9 @@ def clusters_of(dofs: TornDofs, decomposition: Decomposition, wanted: int) -> Cl
     pairs = np.array([face.pair for face in faces], dtype=np.int64).reshape(-1, 2)
     nodes = np.array([len(face.first) for face in faces], dtype=np.int64)
     whole = _connected(pairs, len(decomposition.subdomains))[1]
-    part = _parts(pairs, nodes, whole, wanted / decomposition.num_subdomains)
+    owner = np.searchsorted(dofs.subdomains, dofs.node_subdomain)
+    sizes = np.bincount(owner, minlength=len(whole))
+    part = _parts(pairs, nodes, sizes, whole, wanted / decomposition.num_subdomains)
     within = part[pairs[:, 0]] == part[pairs[:, 1]]
     count, cluster = _connected(pairs[within], len(part))
     chosen = np.flatnonzero(within)
@@ -102,7 +106,12 @@ def _connected(pairs: Array, n: int) -> tuple[int, Array]:
     return int(count), found
 
 
-def _parts(pairs: Array, nodes: Array, whole: Array, share: float) -> Array:
+def _connected_of(graph: csr_array) -> Array:
+    """Component of each vertex."""
+    return np.asarray(connected_components(graph, directed=False)[1])
+
+
+def _parts(pairs: Array, nodes: Array, sizes: Array, whole: Array, share: float) -> Array:
     """Part of each subdomain: each whole gets its share of parts, at least one.
 
     METIS bisects them so that few nodes of faces are cut: slender parts would have soft motions.
@@ -111,29 +120,72 @@ def _parts(pairs: Array, nodes: Array, whole: Array, share: float) -> Array:
     Args:
         pairs: Subdomains that share a face, shape ``(p, 2)``.
         nodes: How many nodes the faces have, shape ``(p,)``.
+        sizes: How many nodes the subdomains have.
         whole: What each subdomain hangs together with, on this rank.
         share: Wanted clusters for each subdomain.
     """
     n, part, first = len(whole), np.zeros(len(whole), dtype=np.int64), 0
     graph = coo_array((nodes, tuple(pairs.T)), shape=(n, n)).tocsr()
     graph = csr_array(graph + graph.T)
+    piece = _joined_crumbs(graph, sizes)
     for which in np.unique(whole):
         members = np.flatnonzero(whole == which)
         count = max(1, round(share * len(members)))
-        part[members] = first + _metis_of(csr_array(graph[members][:, members]), count)
+        _, own = np.unique(piece[members], return_inverse=True)
+        of_piece = csr_array((np.ones(len(own)), (own, np.arange(len(own)))))
+        between = csr_array(of_piece @ graph[members][:, members] @ of_piece.T)
+        between.setdiag(0)
+        between.eliminate_zeros()
+        weights = of_piece @ sizes[members]
+        parts = _metis_of(between, min(count, len(weights)), weights)
+        part[members] = first + _hanging_together(between, parts, weights)[own]
         first += count
     return part
 
 
-def _metis_of(graph: csr_array, count: int) -> Array:
+def _joined_crumbs(graph: csr_array, sizes: Array) -> Array:
+    """Piece of each subdomain: crumbs go to the neighbour with which they share most nodes."""
+    n = len(sizes)
+    whole = _connected_of(graph)
+    mean = (np.bincount(whole, sizes) / np.bincount(whole))[whole] if n else sizes
+    largest = np.asarray(graph.argmax(axis=1)).ravel() if n else sizes
+    small = np.flatnonzero((sizes < CRUMB * mean) & (graph.sum(axis=1) > 0.0))
+    return _connected(np.stack((small, largest[small]), axis=1), n)[1]
+
+
+def _hanging_together(graph: csr_array, part: Array, sizes: Array) -> Array:
+    """Parts that hang together: pieces go to the part with which they share most nodes."""
+    part = part.copy()
+    while True:
+        inner = graph.tocoo()
+        first, second = inner.coords
+        same = part[first] == part[second]
+        count, piece = _connected(np.stack((first[same], second[same]), axis=1), len(part))
+        weight = np.bincount(piece, sizes, minlength=count)
+        order = np.argsort(weight)
+        owner = np.zeros(count, dtype=np.int64)
+        owner[piece] = part
+        main = np.zeros(part.max(initial=-1) + 1, dtype=np.int64)
+        main[owner[order]] = order
+        loose = [int(i) for i in order if main[owner[i]] != i]
+        if not loose:
+            return part
+        bonds = np.bincount(part, graph[piece == loose[0]].sum(axis=0))
+        bonds[owner[loose[0]]] = 0
+        part[piece == loose[0]] = np.argmax(bonds)
+
+
+def _metis_of(graph: csr_array, count: int, sizes: Array) -> Array:
     import pymetis
 
     if count == 1:
         return np.zeros(graph.shape[0], dtype=np.int64)
     options = pymetis.Options(seed=1, ufactor=UNEVEN, ncuts=20)
     adjacency = pymetis.CSRAdjacency(graph.indptr, graph.indices)
-    weights = graph.data.astype(np.int64)
-    found = pymetis.part_graph(count, adjacency, eweights=weights, options=options, recursive=True)
+    edges, vertices = (w.astype(np.int64) for w in (graph.data, sizes))
+    found = pymetis.part_graph(
+        count, adjacency, eweights=edges, vweights=vertices, options=options, recursive=True
+    )
     return np.asarray(found[1], dtype=np.int64)
 
 
