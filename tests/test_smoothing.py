@@ -25,6 +25,7 @@ from tfeti_dolfinx.dual import smoothing
 from tfeti_dolfinx.dual.face_preconditioner import SHIFT, FacePreconditioner
 from tfeti_dolfinx.dual.smoothing import chebyshev, smoothed
 from tfeti_dolfinx.qp.faces import Face, Status, face_of
+from tfeti_dolfinx.subdomains import near as near_module
 from tfeti_dolfinx.subdomains.near import NearStiffness
 from tfeti_dolfinx.subdomains.stiffness import stretch_over_shear
 
@@ -109,9 +110,10 @@ def near_matrix(subdomains):
 
 
 @pytest.mark.parametrize("equal", [True, False])
-def test_K_next_to_the_trace(equal, dual):
-    """Subdomains that share their stiffness, but not their traces, and such that share nothing."""
+def test_K_next_to_the_trace(equal, dual, monkeypatch):
+    """Some subdomains share a stiffness, some a trace, too; and such that share nothing."""
     if equal:
+        monkeypatch.setattr(near_module, "SHARED", 2)
         d = decomposed("quadrilateral", 12, 9)
         p = problem(d, contacts=[tfeti.Obstacle("bottom", curved_obstacle(2))])
         subdomains = dual_of(p).subdomains

@@ -10,18 +10,22 @@ from scipy.sparse import block_diag, csr_array
 from tfeti_dolfinx.arrays import Array, joined, node_means, parts_of
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
 
+# equal subdomains from which on they share a matrix: products with several are slow for few
+SHARED = 16
+
 
 class NearStiffness:
     """K between the trace unknowns of each subdomain and those that share a cell with them.
 
     Its vectors are the t trace unknowns of a rank, as ``Subdomains`` has them, and after them the
-    m ones next to them. Equal subdomains with equal traces share a matrix, all others have one.
+    t_n ones next to them. Many equal subdomains with equal traces share a matrix, all others have
+    one together.
 
     Args:
         blocks: This rank's Blocks.
 
     Attributes:
-        diagonal: Next to the trace, the mean of the diagonal of K at each node, shape ``(m,)``.
+        diagonal: Next to the trace, the mean of the diagonal of K at each node, shape ``(t_n,)``.
     """
 
     def __init__(self, blocks: Sequence[SparseBlock]) -> None:
@@ -44,8 +48,8 @@ class NearStiffness:
         alone: list[tuple[csr_array, Array]] = []
         for of, equal in members.items():
             K = _restricted(seen[equal[0]], next_to[of])
-            if len(equal) == 1:
-                alone.append((K, places[equal[0]]))
+            if len(equal) < SHARED:
+                alone += [(K, places[i]) for i in equal]
             else:
                 self._products.append((K, np.stack([places[i] for i in equal], axis=1)))
         if alone:
@@ -53,7 +57,7 @@ class NearStiffness:
             self._products.append((K, np.concatenate([place for _, place in alone])))
 
     def mult(self, u: Array, out: Array) -> None:
-        """out = K u, shapes ``(t + m,)``; all of out is set."""
+        """out = K u, shapes ``(t + t_n,)``; all of out is set."""
         for K, place in self._products:
             out[place] = K @ u[place]
 
