@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from mpi4py import MPI
 
-from tfeti_dolfinx.arrays import TINY, Array, joined, sums
+from tfeti_dolfinx.arrays import Array, joined, sums
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -15,6 +15,7 @@ from tfeti_dolfinx.mesh.quality import flatness
 from tfeti_dolfinx.mesh.sharing import shared_by_bodies
 from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.report import Report
+from tfeti_dolfinx.subdomains.stiffness import stretch_over_shear
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # relative rounding of a stiffness
@@ -84,22 +85,14 @@ class Doubts:
             )
 
     def _locking(self, subdomains: Subdomains) -> Iterator[str]:
-        """Displacements of degree 1 where a material hardly changes its volume.
-
-        On a subdomain, which is free, uᵀKu of a stretch along an axis is the volume times
-        λ + 2μ, and that of a shear along it the volume times μ.
-        """
-        bs, element = self._dofs.bs, self._dofs.V.element.basix_element
-        if element.degree > 1 or bs != self._decomposition.mesh.geometry.dim or bs == 1:
+        """Displacements of degree 1 where a material hardly changes its volume."""
+        if self._dofs.V.element.basix_element.degree > 1:
             return
         x, ratios = self._points(subdomains), []
-        for i in range(bs):
-            stretch, shear = np.zeros_like(x), np.zeros_like(x)
-            stretch[:, i], shear[:, i] = x[:, i], x[:, (i + 1) % bs]
-            along, across = (np.array(subdomains.energies(v.ravel())) for v in (stretch, shear))
-            ratios.append(along / np.maximum(across, TINY))
-        ratio = np.min(ratios, axis=0) if ratios else np.empty(0)
-        worst = subdomains.body_maxima([list(ratio)])[0]
+        for block, part in zip(subdomains.blocks, subdomains.dof_parts, strict=True):
+            own = x[part.start // self._dofs.bs : part.stop // self._dofs.bs]
+            ratios.append(stretch_over_shear(own, self._dofs.bs, block.multiply))
+        worst = subdomains.body_maxima([ratios])[0]
         if np.any(worst > LOCKS):
             t = float(worst.max())
             yield (

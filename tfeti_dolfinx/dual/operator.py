@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
 from time import perf_counter
 from typing import Any, Protocol
 
@@ -15,8 +17,12 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.errors import raised_on_all_ranks, require
 from tfeti_dolfinx.parallel import any_rank
 from tfeti_dolfinx.subdomains.local import LocalOperator
+from tfeti_dolfinx.subdomains.near import NearStiffness
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
+
+# (λ + 2μ)/μ: 20 of ν = 0.474; from here on what is inside has to follow where a trace moves
+VOLUME = 20.0
 
 
 class RowMatrix(Protocol):
@@ -35,22 +41,36 @@ class RowMatrix(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class Metric:
+    """What displacements with given jumps are made smooth in, on faces.
+
+    Attributes:
+        trace: K_bb.
+        near: Makes K on the trace and on what is next to it, where a subdomain of some rank hardly
+            changes its volume; else None.
+        hard: Whether such a one is in space, where many steps cost less than they save.
+    """
+
+    trace: LocalOperator
+    near: Callable[[], NearStiffness] | None
+    hard: bool
+
+
 class DualOperator:
     """B diag(A_s) Bᵀ, diag(A_s) local to the ranks, with a count of multiplications.
 
     Args:
         B: Dual rows × trace unknowns, MPIAIJ (or scaled).
         local: diag(A_s) on this rank; what its ``prepare`` raises is raised on all ranks.
-        metric: What displacements with given jumps are made smooth in, on faces, before they come
-            to diag(A_s); None: they stay as they are.
+        metric: What displacements with given jumps are made smooth in before they come to
+            diag(A_s); None: they stay as they are.
 
     Attributes:
         count: Multiplications so far, by who they are charged to (``"solver"`` by default).
     """
 
-    def __init__(
-        self, B: RowMatrix, local: LocalOperator, metric: LocalOperator | None = None
-    ) -> None:
+    def __init__(self, B: RowMatrix, local: LocalOperator, metric: Metric | None = None) -> None:
         self.B, self.local, self.metric = B, local, metric
         self.count: Counter[str] = Counter()
         self._payer, self._seconds, self._times = "solver", 0.0, 0
@@ -58,7 +78,7 @@ class DualOperator:
         with raised_on_all_ranks(self._w.getComm().tompi4py()):
             local.prepare()
             if metric is not None:
-                metric.prepare()
+                metric.trace.prepare()
 
     @contextmanager
     def charged_to(self, payer: str) -> Iterator[None]:
@@ -91,7 +111,7 @@ class DualOperator:
         """Destroy the work vectors and the local operator, not B. Collective."""
         self.local.destroy()
         if self.metric is not None:
-            self.metric.destroy()
+            self.metric.trace.destroy()
         self._w.destroy()
         self._v.destroy()
 
@@ -142,10 +162,14 @@ def lumped_preconditioner(B: RowMatrix, subdomains: Subdomains) -> DualOperator:
 
 
 def dirichlet_preconditioner(B: RowMatrix, subdomains: Subdomains) -> DualOperator:
-    """B S Bᵀ (Farhat, Mandel, Roux 1994), B or rather B_D; K_bb as metric if sparse. Collective."""
-    own = [block for block in subdomains.blocks if not isinstance(block, SparseBlock)]
-    sparse = not any_rank(subdomains.comm, bool(own))
-    metric = subdomains.local_operator("stiffness") if sparse else None
+    """B S Bᵀ (Farhat, Mandel, Roux 1994), B or rather B_D; with a metric if sparse. Collective."""
+    sparse = [block for block in subdomains.blocks if isinstance(block, SparseBlock)]
+    metric, comm = None, subdomains.comm
+    if not any_rank(comm, len(sparse) < len(subdomains.blocks)):
+        stiff = [block.bs for block in sparse if block.stiffness.stretch_over_shear > VOLUME]
+        near = partial(NearStiffness, sparse) if any_rank(comm, bool(stiff)) else None
+        hard = any_rank(comm, 3 in stiff)
+        metric = Metric(subdomains.local_operator("stiffness"), near, hard)
     return DualOperator(B, subdomains.local_operator("schur"), metric)
 
 

@@ -12,14 +12,14 @@ from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.dual.operator import DualOperator
+from tfeti_dolfinx.dual.operator import DualOperator, Metric
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.parallel import agreed
-from tfeti_dolfinx.subdomains.local import LocalOperator
 
 # steps, and the part of the spectrum that they make small, from its top down
 STEPS, RANGE = 3, 8.0
-# the same where the top is above so many times diag K: cells that keep their volumes, or are flat
+# the same for cells that keep their volumes, or where the top is above so many times diag K: flat
+# ones
 MANY_STEPS, WIDE_RANGE, HIGH = 8, 50.0, 5.0
 # relative, of the top of the spectrum
 EXACT = 1e-2
@@ -53,27 +53,34 @@ class Smoothing:
     for, and so comes near to the least in K (Saad, Iterative Methods for Sparse Linear Systems,
     SIAM 2003, section 12.3).
 
+    Where a subdomain keeps its volume, displacements are those of the unknowns next to the trace,
+    too, and K is that of them all: what is inside has to follow. There B and A are 0.
+
     With springs a displacement is followed by ρ, of which κσρ is how far they are moved.
 
     Args:
-        whole: B_D A B_Dᵀ, with K_bb as its metric.
-        metric: That.
+        whole: B_D A B_Dᵀ.
+        metric: K_bb, and what more of K there is.
         weights: D on this rank's trace unknowns. The constructor is collective.
         diagonal: That of K there, the mean at each node.
     """
 
     def __init__(
-        self, whole: DualOperator, metric: LocalOperator, weights: Array, diagonal: Array
+        self, whole: DualOperator, metric: Metric, weights: Array, diagonal: Array
     ) -> None:
-        self._whole, self._metric, self._weights = whole, metric, weights
+        self._whole, self._weights, self._trace = whole, weights, len(weights)
+        self._apply: Callable[[Array, Array], None] = metric.trace.mult
         self._w = whole.B.createVecRight()
-        comm = self._w.getComm().tompi4py()
-        with raised_on_all_ranks(comm):
-            top = self._top()
-        sizes = np.array([top, np.max(diagonal / weights, initial=0.0)])
-        comm.Allreduce(MPI.IN_PLACE, sizes, op=MPI.MAX)
-        top, size = agreed(comm, sizes)
-        steps, part = (MANY_STEPS, WIDE_RANGE) if top > HIGH * size else (STEPS, RANGE)
+        self._comm = self._w.getComm().tompi4py()
+        size = self._largest(float(np.max(diagonal / weights, initial=0.0)))
+        if metric.near is not None and size > 0.0:
+            with raised_on_all_ranks(self._comm):
+                near = metric.near()
+            self._apply = near.mult
+            self._weights = np.concatenate((weights, near.diagonal / size))
+        top = self._top()
+        many = metric.hard or top > HIGH * size
+        steps, part = (MANY_STEPS, WIDE_RANGE) if many else (STEPS, RANGE)
         self._steps = chebyshev(steps, top / part, top) if top > 0.0 else []  # no rows: nothing
 
     def mult(self, y: PETSc.Vec, solve: OfArray, springs: Springs) -> None:
@@ -93,11 +100,11 @@ class Smoothing:
             return smooth
 
         def force(u: Array) -> Array:
-            return self._forces(self._metric.mult, u, springs)
+            return self._forces(self._apply, u, springs)
 
         u = self._lifted(y, springs)
         u = smoothed(self._steps, lambda u: without_jumps(force(u)), u)
-        v = self._forces(self._whole.multiply, u, springs)
+        v = self._forces(self._of_trace, u, springs)
         v = smoothed(self._steps, lambda v: force(without_jumps(v)), v)
         self._put_jumps(v, springs, y)
 
@@ -110,40 +117,56 @@ class Smoothing:
         return np.concatenate((self._weights, np.ones(len(springs.size))))
 
     def _lifted(self, y: PETSc.Vec, springs: Springs) -> Array:
-        """B_Dᵀ y, and the springs' part of y."""
+        """B_Dᵀ y, 0 next to the trace, and the springs' part of y."""
         self._whole.B.multTranspose(y, self._w)
-        return np.concatenate((self._w.array_r, springs.directions.T @ y.array_r))
+        next_to = np.zeros(len(self._weights) - self._trace)
+        return np.concatenate((self._w.array_r, next_to, springs.directions.T @ y.array_r))
 
     def _put_jumps(self, v: Array, springs: Springs, y: PETSc.Vec) -> None:
         """y = B_D v, and what springs add to it."""
-        trace = len(self._weights)
-        self._w.array[:] = v[:trace]
+        self._w.array[:] = v[: self._trace]
         self._whole.B.mult(self._w, y)
-        y.array[:] += springs.directions @ (springs.bent * v[trace:])
+        y.array[:] += springs.directions @ (springs.bent * v[len(self._weights) :])
 
     def _forces(self, apply: Callable[[Array, Array], None], u: Array, springs: Springs) -> Array:
         """A u, and the forces of the springs."""
-        trace, out = len(self._weights), np.empty_like(u)
-        apply(u[:trace], out[:trace])
-        out[trace:] = springs.size * u[trace:]
+        size, out = len(self._weights), np.empty_like(u)
+        apply(u[:size], out[:size])
+        out[size:] = springs.size * u[size:]
         return out
 
+    def _of_trace(self, u: Array, out: Array) -> None:
+        """A u; next to the trace 0."""
+        self._whole.multiply(u[: self._trace], out[: self._trace])
+        out[self._trace :] = 0.0
+
     def _top(self) -> float:
-        """At least the largest eigenvalue of D⁻¹K on this rank, as nearly as is of use."""
-        size, root = len(self._weights), np.sqrt(self._weights)
+        """At least the largest eigenvalue of D⁻¹K, as nearly as is of use. Collective."""
+        with raised_on_all_ranks(self._comm):
+            top = _largest_eigenvalue(self._apply, self._weights)
+        return self._largest(top)
 
-        def scaled(x: Array) -> Array:
-            out = np.empty(size)
-            self._metric.mult(x.ravel() / root, out)
-            return out / root
+    def _largest(self, value: float) -> float:
+        """The largest of all ranks, on which all agree. Collective."""
+        return float(agreed(self._comm, self._comm.allreduce(value, op=MPI.MAX)))
 
-        if size <= FEW:
-            columns = [scaled(column) for column in np.eye(size)]
-            return float(np.max(np.linalg.eigvalsh(np.reshape(columns, (size, size))), initial=0.0))
-        start = np.random.default_rng(0).standard_normal(size)
-        K = LinearOperator((size, size), matvec=scaled, dtype=float)
-        (top,) = eigsh(K, k=1, which="LA", v0=start, tol=EXACT, return_eigenvectors=False)
-        return float((1.0 + EXACT) * top)
+
+def _largest_eigenvalue(apply: Callable[[Array, Array], None], weights: Array) -> float:
+    """At least that of D⁻¹K on this rank."""
+    size, root = len(weights), np.sqrt(weights)
+
+    def scaled(x: Array) -> Array:
+        out = np.empty(size)
+        apply(x.ravel() / root, out)
+        return out / root
+
+    if size <= FEW:
+        columns = [scaled(column) for column in np.eye(size)]
+        return float(np.max(np.linalg.eigvalsh(np.reshape(columns, (size, size))), initial=0.0))
+    start = np.random.default_rng(0).standard_normal(size)
+    K = LinearOperator((size, size), matvec=scaled, dtype=float)
+    (top,) = eigsh(K, k=1, which="LA", v0=start, tol=EXACT, return_eigenvectors=False)
+    return float((1.0 + EXACT) * top)
 
 
 def chebyshev(count: int, low: float, high: float) -> list[tuple[float, float]]:

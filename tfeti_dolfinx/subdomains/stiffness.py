@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.arrays import TINY, Array
 from tfeti_dolfinx.errors import FactorError, InputError
 from tfeti_dolfinx.subdomains.dense import Packed, Whole
 from tfeti_dolfinx.subdomains.factor import REAL, FactorSize, NotPositiveDefiniteError
@@ -66,6 +68,7 @@ class Stiffness:
         check_stiffness(self.name, K)
         K = with_entries(K, self._fixing_dofs(K.shape[0]))
         self._forget_traced()
+        self.__dict__.pop("stretch_over_shear", None)
         if self._pinv is not None and same_pattern(K, self.K):
             self.K.data[:] = K.data
         else:
@@ -79,6 +82,11 @@ class Stiffness:
         if self._pinv is None:
             raise FactorError(f"{self.name}: its factor has been destroyed")
         return solved(self._pinv, b)
+
+    @cached_property
+    def stretch_over_shear(self) -> float:
+        """About (λ + 2μ)/μ, as ``stretch_over_shear`` finds it."""
+        return stretch_over_shear(self.x, self.bs, lambda u: self.K @ u)
 
     @property
     def factor_size(self) -> FactorSize:
@@ -148,3 +156,28 @@ class Stiffness:
         except FactorError as error:
             self._pinv = None
             raise FactorError(f"{self.name}: {error}") from error
+
+
+def stretch_over_shear(x: Array, bs: int, multiply: Callable[[Array], Array]) -> float:
+    """About (λ + 2μ)/μ of a subdomain, whatever its cells are.
+
+    On a subdomain, which is free, uᵀKu of a stretch along an axis is the volume times λ + 2μ, and
+    that of a shear along it the volume times μ.
+
+    Args:
+        x: Points of the nodes, shape ``(n / bs, gdim)``.
+        bs: Unknowns at each node.
+        multiply: K u, shapes ``(n,)``.
+
+    Returns:
+        The smallest over the axes; 0 where unknowns are no displacements.
+    """
+    if bs != x.shape[1] or bs == 1 or len(x) == 0:
+        return 0.0
+    x, ratios = x - x.mean(axis=0), []
+    for i in range(bs):
+        stretch, shear = np.zeros_like(x), np.zeros_like(x)
+        stretch[:, i], shear[:, i] = x[:, i], x[:, (i + 1) % bs]
+        along, across = (float(u @ multiply(u)) for u in (stretch.ravel(), shear.ravel()))
+        ratios.append(along / max(across, TINY))
+    return min(ratios)
