@@ -9,12 +9,15 @@ checks of the package say that it has a solution.
 
 A solve fails that ends in an error, in more than ``--steps`` steps, after more than ``--limit``
 seconds (on one rank), or with an error above 100 rtol (and 100 times what rounding does) beside a
-direct solve. Where rounding of the stiffness alone changes the direct solution by more than rtol no
-solver can be right to rtol, and may say so: such solves are in a table of their own. A profile ρ(τ)
-is the share of solves that a solver ends for at most τ times the cost of the best one (Mathematical
-Programming 91, 2002): cost in multiplications by F and by the preconditioner, and in seconds of the
-solver. Each solve is written to results/solver_profiles.jsonl at once; ``--resume`` takes what is
-there, so that a run may be ended, or begin with the default solvers, ``--default``. Results go to
+direct solve. A scene with friction may have no equilibrium though forces within the law could
+balance its load; where a mixed-integer program proves that (``benchmarks.stress.equilibrium``) no
+solver can end, and what the default solver says is in a table of its own. Where rounding of the
+stiffness alone changes the direct solution by more than rtol no solver can be right to rtol, and
+may say so: such solves are in a table of their own. A profile ρ(τ) is the share of solves that a
+solver ends for at most τ times the cost of the best one (Mathematical Programming 91, 2002): cost
+in multiplications by F and by the preconditioner, and in seconds of the solver. Each solve is
+written to results/solver_profiles.jsonl at once; ``--resume`` takes what is there, so that a run
+may be ended, or begin with the default solvers, ``--default``. Results go to
 results/solver_profiles.md, .json and .png.
 """
 
@@ -43,8 +46,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.pictures import picture
 from benchmarks.stability_scenes import CELLS, with_friction
 from benchmarks.stress import ladders, meshes
+from benchmarks.stress.equilibrium import has_none
 from benchmarks.stress.judge import judged
 from benchmarks.stress.package import solve_scene
+from benchmarks.stress.qp import UnsettledError
 from benchmarks.stress.random_scenes import random_scene
 from benchmarks.stress.reference import Answer, Untorn
 from benchmarks.stress.scene import Scene
@@ -139,9 +144,12 @@ def cost(
     why = outcome.error
     if MPI.COMM_WORLD.rank == 0 and not why and answer is not None:
         found = judged(scene, g, outcome, answer)
-        allowed = WITHIN * max(rtol, found["noise"])
-        if "u" in found and max(found["u"], found["jump"]) > allowed:
-            why = f"wrong by {found['u']:.1e}"
+        if "u" in found:
+            errors = np.maximum(found["errors"], found["jump"])
+            # a body that does not move has what rounding of its points makes of that
+            noise = np.maximum(found["noise"], found["of points"])
+            if np.any(errors > WITHIN * np.maximum(rtol, noise)):
+                why = f"wrong by {found['u']:.1e}"
     why = MPI.COMM_WORLD.bcast(why)
     report = outcome.report
     if why:
@@ -149,20 +157,24 @@ def cost(
     return report["F"] + report["S"], report["qp"], ""
 
 
-def takes_part(scene: Scene, g: meshes.Grid):
-    """The direct answer of a scene that has a solution, or what the package says there is none."""
+def takes_part(scene: Scene, g: meshes.Grid) -> tuple[bool, Answer | None, bool]:
+    """Whether the package says that a scene has a solution, the direct one, and if it has none."""
     outcome = solve_scene(replace(scene, options={"tfeti_rtol": 1e-2}), g, MPI.COMM_WORLD)
     if outcome.error.startswith(("NoSolutionError", "InputError")):
-        return False, None
-    answer = None
+        return False, None, False
+    answer, none = None, False
     if MPI.COMM_WORLD.rank == 0:
         try:
-            answer = Untorn(scene, g, outcome.mu, outcome.lmbda).answer()
+            untorn = Untorn(scene, g, outcome.mu, outcome.lmbda)
+            answer = untorn.answer()
+        except UnsettledError as error:
+            none = has_none(untorn)
+            print("no equilibrium" if none else "no direct answer:", error, flush=True)
         except Exception as error:  # the solvers are still compared
             print("no direct answer:", error, flush=True)
         if answer is not None and answer.u is None:
             answer = None
-    return True, answer
+    return True, answer, none
 
 
 def study(name: str, scene: Scene, arguments: Any, known: dict[str, Any]) -> list[dict[str, Any]]:
@@ -184,11 +196,12 @@ def study(name: str, scene: Scene, arguments: Any, known: dict[str, Any]) -> lis
         return [first, *rows]
     g, noise, about = meshes.grid(scene), 0.0, described(name, scene)
     try:
-        part, answer = limited(arguments.limit, lambda: takes_part(scene, g))
+        part, answer, none = limited(arguments.limit, lambda: takes_part(scene, g))
     except LateError:
-        part, answer = True, None
+        part, answer, none = True, None, False
     if answer is not None and answer.noise is not None:
         noise = float(answer.noise.max())
+    about |= {"none": none}
     found = [{"key": name, **about, "part": part, "direct": answer is not None, "noise": noise}]
     for work in works if part else []:
         if (row := known.get(f"{name}, {work}")) is None:
@@ -210,6 +223,7 @@ def gathered(solves: list[dict[str, Any]]) -> list[dict[str, Any]]:
     for solve in solves:
         if "solver" in solve:
             about = {name: solve[name] for name in (*NAMES, "noise")}
+            about["none"] = solve.get("none", False)
             row = rows.setdefault((solve["scene"], solve["rtol"]), about)
             key = solve["solver"]
             row |= {key: solve["cost"], f"{key}, s": solve["seconds"]}
@@ -246,7 +260,8 @@ def profiles(rows: list[dict[str, Any]], solvers, suffix: str = "") -> list[dict
 def tabled(rows: list[dict[str, Any]], unit: str) -> dict[str, list[dict[str, Any]]]:
     """Profiles of multiplications and seconds, and what failed by default."""
     tables: dict[str, list[dict[str, Any]]] = {}
-    reached = [row for row in rows if row["noise"] <= row["rtol"]]
+    solvable = [row for row in rows if not row["none"]]
+    reached = [row for row in solvable if row["noise"] <= row["rtol"]]
     for has_contact, solvers in ((True, CONTACT), (False, LINEAR)):
         default = "{}, {}".format(*DEFAULT[has_contact])
         own = [row for row in reached if default in row]
@@ -257,9 +272,15 @@ def tabled(rows: list[dict[str, Any]], unit: str) -> dict[str, list[dict[str, An
             tables[f"{what}, multiplications"] = profiles(own, tried)
             tables[f"{what}, {unit}"] = profiles(own, tried, ", s")
     failed = "default failed, or needs more than twice the best"
-    for title, some in ((failed, reached), ("below what rounding leaves", rows)):
-        worst = [_beside_best(row) for row in some if title == failed or row not in reached]
-        if worst := [row for row in worst if row and (title != failed or row.pop("bad"))]:
+    below = [row for row in solvable if row not in reached]
+    none = [row for row in rows if row["none"]]
+    for title, some in (
+        (failed, reached),
+        ("below what rounding leaves", below),
+        ("no equilibrium", none),
+    ):
+        worst = [row for row in map(_beside_best, some) if row]
+        if worst := [row for row in worst if title != failed or row["bad"]]:
             tables[title] = [{k: v for k, v in row.items() if k != "bad"} for row in worst]
     return tables
 

@@ -164,6 +164,7 @@ def test_profiles_leave_out_what_rounding_does():
         solver = "{}, {}".format(*pair)
         for k, (cost, noise) in enumerate(zip(costs, (0.0, 1e-9, 1e-7), strict=True)):
             solves.append(solve_row(str(k), 1e-8, solver, cost, noise))
+        solves.append({**solve_row("3", 1e-8, solver, None), "none": True})
     tables = solver_profiles.tabled(solver_profiles.gathered(solves), "seconds")
     for row in tables["contact, multiplications"]:
         assert (row["solves"], row["failed"], row["τ = 4"]) == (2, 0, 1.0)
@@ -171,6 +172,8 @@ def test_profiles_leave_out_what_rounding_does():
     assert (slow["scene"], slow["default"], slow["best"]) == ("0", 7, 3)
     (below,) = tables["below what rounding leaves"]
     assert (below["scene"], below["default"], below["why"]) == ("2", "-", "named")
+    (none,) = tables["no equilibrium"]
+    assert (none["scene"], none["default"], none["why"]) == ("3", "-", "named")
 
 
 def test_profiles_go_on_where_a_run_was_ended(shared_tmp, comm, monkeypatch):

@@ -17,13 +17,14 @@ import tfeti_dolfinx as tfeti
 from demos import mindlin_3d
 from demos.partial_slip import pushed
 from meshes import half_spaces
-from tfeti_dolfinx import pressures
+from tfeti_dolfinx import dilation, pressures
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.pressures import Pressures
 from tfeti_dolfinx.qp.acceleration import Anderson
 from tfeti_dolfinx.qp.cones import Cones
 from tfeti_dolfinx.qp.conformance import check_feasible_set
 from tfeti_dolfinx.qp.faces import Status
+from tfeti_dolfinx.qp.problem import ConvergedReason
 
 # the change of bounds at which they are at rest is 100 rtol: u and forces follow to this
 SHARE = 1e-6
@@ -366,17 +367,37 @@ def test_gaps_that_grow_with_slips_lead_to_the_same(qp_type, cell, traction, mon
     assert np.allclose(displacement(p)[1], exact, rtol=0, atol=1e-7 * np.abs(exact).max())
 
 
-def test_a_body_between_walls_that_nothing_presses_is_an_error():
-    """Forces within the law could hold it, but nothing makes the walls press: it slides on."""
+def between_walls():
+    """A square between two walls that do not press it, pulled along them."""
     d, law = decomposed("quadrilateral", 4, 3), tfeti.Coulomb(0.5)
     walls = [
         tfeti.Obstacle(side, tfeti.Plane(point, normal), friction=law, reach=np.inf)
         for side, point, normal in (("left", (0, 0), (1, 0)), ("right", (1, 0), (-1, 0)))
     ]
-    p = problem(d, (0.0, -0.05), walls, clamped=(), rtol=1e-6)
-    said = f"DIVERGED_FRICTION .* on the body '{d.body_names[0]}': .* wedged between others"
+    return d, problem(d, (0.0, -0.05), walls, clamped=(), rtol=1e-6)
+
+
+def test_a_body_between_walls_that_nothing_presses_is_an_error():
+    """Forces within the law could hold it, but nothing makes the walls press: it slides on."""
+    d, p = between_walls()
+    said = f"DIVERGED_FRICTION .* body '{d.body_names[0]}' slides without end: .* gaps that overlap"
     with pytest.raises(tfeti.ConvergenceError, match=said):
         p.solve()
+
+
+def test_gaps_grow_no_more_where_a_problem_with_them_is_not_solved(monkeypatch):
+    calls, usual = [], dilation.newton
+
+    def unsolved(*arguments, **options):
+        calls.append(1)
+        result = usual(*arguments, **options)
+        result.reason = ConvergedReason.DIVERGED_ITS
+        return result
+
+    monkeypatch.setattr(dilation, "newton", unsolved)
+    with pytest.raises(tfeti.ConvergenceError, match="DIVERGED_FRICTION .* do not come to rest"):
+        between_walls()[1].solve()
+    assert len(calls) == 1
 
 
 def test_the_body_that_slides_without_end_is_named():
@@ -399,7 +420,7 @@ def test_the_body_that_slides_without_end_is_named():
         ],
     )
     loose = d.body_names[body_of(d, "loose left")]
-    with pytest.raises(tfeti.ConvergenceError, match=f"DIVERGED_FRICTION .* body '{loose}'"):
+    with pytest.raises(tfeti.ConvergenceError, match=f"DIVERGED_FRICTION .* body '{loose}' slides"):
         p.solve()
 
 

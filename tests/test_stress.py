@@ -8,11 +8,12 @@ import pytest
 from benchmarks.stability_scenes import with_friction
 from benchmarks.stress import judge, meshes
 from benchmarks.stress.__main__ import main
+from benchmarks.stress.equilibrium import has_none
 from benchmarks.stress.ladders import floor, ladder_scenes, two_bodies
 from benchmarks.stress.package import solve_scene
 from benchmarks.stress.random_scenes import random_scene
 from benchmarks.stress.reference import Untorn
-from benchmarks.stress.scene import Body, Load, Scene
+from benchmarks.stress.scene import Body, Load, Scene, Wall
 
 # 237: no load; 314: a far row is kept, however uncertain its normal; 608: rows of a stiff side on a
 # few soft nodes; 798: u is rounding of points; 913: rows that are rounding of normals of tiny
@@ -121,9 +122,28 @@ def test_a_rung_is_right_on_ranks_without_subdomains(subdomains, comm):
         assert row["noise"] < 1e-9
 
 
-def answer(scene):
+def untorn(scene):
     g = meshes.grid(scene)
-    return Untorn(scene, g, *meshes.materials(scene, g, np.zeros(len(g.cells), dtype=int))).answer()
+    return Untorn(scene, g, *meshes.materials(scene, g, np.zeros(len(g.cells), dtype=int)))
+
+
+def answer(scene):
+    return untorn(scene).answer()
+
+
+# what presses a square that is 1e-2 wider than the room between walls: σ = E 1e-2, on both sides
+# μσ, so a load of 2μσ = 1e-2 with μ = 0.5
+@pytest.mark.parametrize(
+    ("gap", "load", "none"), [(0.01, 1e-3, True), (-0.005, 8e-3, False), (-0.005, 1.2e-2, True)]
+)
+def test_a_mixed_integer_program_says_where_friction_cannot_hold(gap, load, none):
+    law = ("coulomb", 0.5)
+    left = Wall((0, 0, 0), "plane", ((-gap, 0.0), (1.0, 0.0)), law)
+    right = Wall((0, 0, 1), "plane", ((1.0 + gap, 0.0), (-1.0, 0.0)), law)
+    body = Body((0.0, 0.0), (1.0, 1.0), (4, 4), nu=0.0)
+    down = Load((0, 1, 1), (0.0, -load))
+    scene = Scene("quadrilateral", (body,), loads=(down,), walls=(left, right))
+    assert has_none(untorn(scene)) == none
 
 
 def test_the_reference_keeps_rows_that_are_nearly_dependent():

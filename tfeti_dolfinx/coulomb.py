@@ -5,6 +5,7 @@ Or, where that is not wanted or fails, from a fixed point iteration.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -46,6 +47,8 @@ class Settling:
         last: Multiplications by F of the last problem.
         body: The body on which they changed most at last; -1 without Coulomb's law.
         newton_steps: Steps of Newton's method on Coulomb's law, beside the problems.
+        slides: Whether slips have grown without end, as where contact does not press a body that
+            friction would have to hold.
     """
 
     iterations: int = 0
@@ -54,6 +57,11 @@ class Settling:
     last: int = 0
     body: int = -1
     newton_steps: int = 0
+    slides: bool = False
+
+    def restless(self, names: Sequence[str]) -> tuple[str, bool]:
+        """The name of the body of all names, and whether it slides."""
+        return names[self.body], self.slides
 
 
 def solve_with_friction(
@@ -90,7 +98,9 @@ def solve_with_friction(
     while True:
         start = bounds.set_feasible(start)
         near = change <= NEAR * tolerance
-        solved = None if near or not bounds.are_known else on_law.solve(start)
+        # where Newton's method has brought them so near, problems would follow their rounding
+        tries = bounds.are_known and (on_law.steps > 0 or not near)
+        solved = on_law.solve(start) if tries else None
         if solved is not None:
             bounds.take(solved[0])
         else:
@@ -126,5 +136,5 @@ def solve_with_friction(
         result.destroy()
     result.steps, rule.looks = steps, looks
     last = dual.F.count["solver"] - before
-    how = (float(change), tolerance, last, bounds.restless, on_law.steps)
+    how = (float(change), tolerance, last, bounds.restless, on_law.steps, bounds.slides)
     return result, rule, Settling(iterations, *how)

@@ -17,7 +17,7 @@ from tfeti_dolfinx.qp.discs import Ellipses
 from tfeti_dolfinx.qp.feasible_sets import Bounds, Product
 from tfeti_dolfinx.qp.homogenised import homogenise, image
 from tfeti_dolfinx.qp.newton import newton
-from tfeti_dolfinx.qp.problem import QP
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason
 from tfeti_dolfinx.qp.stopping import ResidualRule
 
 # Of the first residual, and of the last change of the slips: what a problem is solved to
@@ -30,6 +30,8 @@ LEAP, BACK = 30.0, 0.1
 PATIENCE = 12
 # times the first slips: more of them are no measure of changes, since they may grow without end
 FARTHER = 100.0
+# times the first slips: so many of them, and still no rest, are bodies that slide
+GROWN = 10.0
 
 
 class DilatedGaps:
@@ -49,7 +51,8 @@ class DilatedGaps:
     Attributes:
         lam: The last forces, on this rank's rows.
         mu: Multipliers of Gλ = e there.
-        astray: Whether slips grow without end, or do not come to rest.
+        astray: Whether slips grow without end, or do not come to rest, or a problem is not solved.
+        slides: Whether they have grown.
     """
 
     def __init__(self, dual: Dual, lam: Array, options: Options) -> None:
@@ -61,12 +64,13 @@ class DilatedGaps:
         self.mu: Array = np.zeros(dual.coarse.dimension)
         self._w: Array = np.zeros(len(at))
         self._anderson = Anderson(self._products, DEPTH)
-        self._change, self._first, self.astray = np.inf, 0.0, False
+        self._change, self._first = np.inf, 0.0
+        self.astray, self.slides, self._spent = False, False, False
 
     def settle(self, share: float) -> Array:
         """Iterate until slips change by less than a share; returns the λ_N under the law."""
         best, idle = np.inf, 0
-        while idle < PATIENCE:
+        while idle < PATIENCE and not self._spent:
             slips = self._slips()
             size, self._change = self._size(slips), self._size(slips - self._w)
             self._first = self._first or size
@@ -76,7 +80,7 @@ class DilatedGaps:
             if self._change <= 0.5 * best:
                 best, idle = self._change, 0
             self._advance(slips)
-        self.astray = True
+        self.astray, self.slides = True, self._size(self._w) > GROWN * self._first
         return np.array(self.lam[self._rows])
 
     def _advance(self, slips: Array) -> None:
@@ -108,6 +112,7 @@ class DilatedGaps:
             qp, start, rule, self._options.newton, max_it=self._options.max_it, warm=True
         )
         self._dual.saw(result.norm)
+        self._spent = result.reason == ConvergedReason.DIVERGED_ITS
         self.lam, self.mu = np.array(result.lam.array_r), self.mu + result.mu
         slips = np.linalg.norm(self._mu * result.gradient.array_r[self._tangents], axis=1)
         start.destroy()

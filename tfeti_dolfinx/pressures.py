@@ -218,6 +218,11 @@ class Pressures:
         return self._dilated is not None and self._dilated.astray
 
     @property
+    def slides(self) -> bool:
+        """Whether slips have grown, and not come to rest."""
+        return self._dilated is not None and self._dilated.slides
+
+    @property
     def _sticks(self) -> bool:
         """Whether no bound is set yet."""
         return any_rank(self._comm, bool(np.any(np.isinf(self._now))))

@@ -275,6 +275,6 @@ class ContactProblem(Stepping):
         report.warnings = self._doubts.found(dual, solution.u, report, self.options.number)
         report.excluding_contacts = system.search.named(gluing.contacts_of(result.excluding))
         result.destroy()
-        names = report.excluding_contacts, self.decomposition.body_names[settling.body]
-        conclude(result, accuracy, self.options, self.decomposition.comm, *names)
+        told = report.excluding_contacts, settling.restless(self.decomposition.body_names)
+        conclude(result, accuracy, self.options, self.decomposition.comm, *told)
         return solution

@@ -40,6 +40,12 @@ EXPLANATIONS = {
     ConvergedReason.DIVERGED_CONTRADICTION: "; contact rows that depend on each other exclude each "
     "other{contacts}: expected gaps that some displacement keeps",
 }
+# in the place of that of DIVERGED_FRICTION
+SLIDES = (
+    "; the body {restless!r} slides without end: forces within Coulomb's law could balance the "
+    "load, but contact does not press as much as they need: expected a body that is held, or "
+    "pressed by a load or by gaps that overlap"
+)
 
 
 def resolve_types(options: Options, rows: Sequence[int], prefix: str) -> tuple[str, str]:
@@ -188,7 +194,7 @@ def conclude(
     options: Options,
     comm: MPI.Intracomm,
     excluding: Sequence[str] = (),
-    restless: str = "",
+    restless: tuple[str, bool] = ("", False),
 ) -> None:
     """Say why the solver stopped, and raise where it should have gone on.
 
@@ -198,14 +204,17 @@ def conclude(
         options: Options.
         comm: Communicator.
         excluding: Names of the contacts whose rows exclude each other.
-        restless: Name of the body on which bounds of friction change most.
+        restless: Name of the body on which bounds of friction change most, and whether it slides.
 
     Raises:
         ConvergenceError: It stopped before its tolerance, unless options turn that off.
     """
     contacts = f", those of {' and '.join(excluding)}" if excluding else ""
+    body, slides = restless
     explanation = EXPLANATIONS.get(result.reason, "")
-    explanation = explanation.format(contacts=contacts, restless=restless)
+    if result.reason == ConvergedReason.DIVERGED_FRICTION and slides:
+        explanation = SLIDES
+    explanation = explanation.format(contacts=contacts, restless=body)
     text = (
         f"{result.reason.name} after {result.steps.outer} outer and {result.steps.inner} inner "
         f"iterations: the worst of its errors is {rule.ratio():.3g} times what rtol "

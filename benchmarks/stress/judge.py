@@ -95,7 +95,9 @@ def _compared(scene: Scene, answer: Answer, outcome: Outcome) -> dict[str, Any]:
     }
     own = np.maximum(answer.rows @ answer.u.ravel() - answer.gap, 0.0).max(initial=0.0)
     # what the reference itself overlaps by, and what is no motion
-    noise = np.maximum(answer.noise, np.maximum(own, answer.point_noise) / scale)
+    of_points = np.maximum(own, answer.point_noise) / scale
+    row["of points"] = [float(share) for share in of_points]
+    noise = np.maximum(answer.noise, of_points)
     allowed = np.maximum(RIGHT, OF_NOISE * noise)
     copies = np.array([jump[outcome.body == b].max() for b in range(len(scene.bodies))])
     worst = np.maximum(np.maximum(error, copies), penetration)
