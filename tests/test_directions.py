@@ -49,7 +49,7 @@ def test_hardly_more_steps_than_dimensions(spread, times):
     error = found - known
     assert error @ F @ error <= 1e-10 * (known @ F @ known)
     short = Directions(qp.d)
-    short.kept = Conjugates(qp.d, numbers=2 * n)
+    short.kept = Conjugates(qp.d, numbers=3 * n)
     _, more, _ = solved(qp, short, 1e-9, 5000)
     assert more >= (steps if spread < 1e6 else 4 * steps)
 
@@ -71,11 +71,11 @@ def test_where_memory_does_not_last_the_oldest_goes():
     """Of three that fit two stay when a fourth comes; each is taken away on its own."""
     comm = MPI.COMM_WORLD
     like = PETSc.Vec().createMPI((4, None), comm=comm)
-    kept = Conjugates(like, numbers=3 * 2 * 4)
+    kept = Conjugates(like, numbers=3 * 3 * 4)
     for k in range(4):
         p = np.zeros(4)
         p[k] = 1.0
-        kept.keep(p, 2.0 * p, 2.0 * comm.size, 1.0)
+        kept.keep(p, 2.0 * p, 2.0 * p, 2.0 * comm.size, 1.0)
     assert kept.number == 3
     z = np.arange(1.0, 5.0)
     kept.take_away(z, comm.allreduce(kept.products(z)))

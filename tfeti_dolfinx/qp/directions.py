@@ -17,7 +17,7 @@ NUMBERS = 16_000_000
 
 
 class Conjugates:
-    """Directions p_i with PFp_i, p_iᵀFp_i, r_iᵀz_i, the last ones where memory lasts not for all.
+    """Directions p_i with Fp_i, PFp_i, p_iᵀFp_i, r_iᵀz_i, the last where memory lasts not for all.
 
     In exact arithmetic a new direction is conjugate to all if it is to the last one. Where F is ill
     conditioned on a face rounding undoes that, and what was solved for has to be solved for again
@@ -31,9 +31,10 @@ class Conjugates:
     def __init__(self, like: PETSc.Vec, numbers: int = NUMBERS) -> None:
         self.comm = like.getComm().tompi4py()
         rows = self.comm.allreduce(like.getLocalSize(), op=MPI.MAX)
-        self._most = max(numbers // (2 * max(rows, 1)), 1)
-        self._p, self._PFp = (np.zeros((0, like.getLocalSize())) for _ in range(2))
-        self._pFp, self._rz = np.zeros(0), np.zeros(0)
+        self._most = max(numbers // (3 * max(rows, 1)), 1)
+        self._p, self._Fp, self._PFp = (np.zeros((0, like.getLocalSize())) for _ in range(3))
+        self._pFp: Array = np.zeros(0)
+        self._rz: Array = np.zeros(0)
         self._count = 0
 
     def clear(self) -> None:
@@ -53,18 +54,19 @@ class Conjugates:
         """Make z conjugate to them, in place; given the sums of products over all ranks."""
         z -= (products / self._pFp[: self.number]) @ self._p[: self.number]
 
-    def keep(self, p: Array, PFp: Array, pFp: float, rz: float) -> None:
+    def keep(self, p: Array, Fp: Array, PFp: Array, pFp: float, rz: float) -> None:
         """Keep another one, in the place of the oldest if there are too many."""
         at = self._count % self._most
         if at == len(self._pFp):
             more = min(max(len(self._pFp), 8), self._most - len(self._pFp))
-            self._p, self._PFp = (
+            self._p, self._Fp, self._PFp = (
                 np.concatenate((known, np.zeros((more, known.shape[1]))))
-                for known in (self._p, self._PFp)
+                for known in (self._p, self._Fp, self._PFp)
             )
             self._pFp = np.append(self._pFp, np.zeros(more))
             self._rz = np.append(self._rz, np.zeros(more))
-        self._p[at], self._PFp[at], self._pFp[at], self._rz[at] = p, PFp, pFp, rz
+        self._p[at], self._Fp[at], self._PFp[at] = p, Fp, PFp
+        self._pFp[at], self._rz[at] = pFp, rz
         self._count += 1
 
     def ritz_vectors(self, high: float, loose: float) -> Array:
@@ -95,8 +97,8 @@ class Conjugates:
         return np.asarray(Y.T)
 
     def combined(self, parts: Array) -> tuple[Array, Array]:
-        """Combinations of the p_i, and what PF makes of them, given rows of coefficients."""
-        return parts @ self._p[: self.number], parts @ self._PFp[: self.number]
+        """Combinations of the p_i, and what F makes of them, given rows of coefficients."""
+        return parts @ self._p[: self.number], parts @ self._Fp[: self.number]
 
 
 class Directions:

@@ -1,4 +1,4 @@
-"""Directions in which conjugate gradients were slow on one face, a coarse space for the next ones."""
+"""Directions that conjugate gradients were slow in on one face: a coarse space for the next."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class SlowDirections:
     """F-orthonormal directions V, and FV, of the faces left.
 
     They are Ritz vectors of M_f F in what conjugate gradients have searched there (Gosselet, Rey,
-    Pebrel, Internat. J. Numer. Methods Engrg. 94, 2013, 60–83), and cost no multiplication. On
-    another face some of their rows are held, and FV lacks rows that were: V is only near to what it
-    was, but what is made of it remains a preconditioner.
+    Pebrel, Internat. J. Numer. Methods Engrg. 94, 2013, 60–83), and cost no multiplication. Where
+    another face holds some of their rows V is only near to what it was, but what is made of it
+    remains a preconditioner.
 
     Attributes:
         count: Their number.

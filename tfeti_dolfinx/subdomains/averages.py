@@ -106,11 +106,6 @@ def _connected(pairs: Array, n: int) -> tuple[int, Array]:
     return int(count), found
 
 
-def _connected_of(graph: csr_array) -> Array:
-    """Component of each vertex."""
-    return np.asarray(connected_components(graph, directed=False)[1])
-
-
 def _parts(pairs: Array, nodes: Array, sizes: Array, whole: Array, share: float) -> Array:
     """Part of each subdomain: each whole gets its share of parts, at least one.
 
@@ -127,7 +122,7 @@ def _parts(pairs: Array, nodes: Array, sizes: Array, whole: Array, share: float)
     n, part, first = len(whole), np.zeros(len(whole), dtype=np.int64), 0
     graph = coo_array((nodes, tuple(pairs.T)), shape=(n, n)).tocsr()
     graph = csr_array(graph + graph.T)
-    piece = _joined_crumbs(graph, sizes)
+    piece = _with_crumbs(graph, sizes, whole)
     for which in np.unique(whole):
         members = np.flatnonzero(whole == which)
         count = max(1, round(share * len(members)))
@@ -143,36 +138,37 @@ def _parts(pairs: Array, nodes: Array, sizes: Array, whole: Array, share: float)
     return part
 
 
-def _joined_crumbs(graph: csr_array, sizes: Array) -> Array:
+def _with_crumbs(graph: csr_array, sizes: Array, whole: Array) -> Array:
     """Piece of each subdomain: crumbs go to the neighbour with which they share most nodes."""
-    n = len(sizes)
-    whole = _connected_of(graph)
-    mean = (np.bincount(whole, sizes) / np.bincount(whole))[whole] if n else sizes
-    largest = np.asarray(graph.argmax(axis=1)).ravel() if n else sizes
-    small = np.flatnonzero((sizes < CRUMB * mean) & (graph.sum(axis=1) > 0.0))
-    return _connected(np.stack((small, largest[small]), axis=1), n)[1]
+    if len(sizes) == 0:
+        return np.zeros(0, dtype=np.int64)
+    mean = np.bincount(whole, sizes) / np.maximum(np.bincount(whole), 1)
+    crumbs = np.flatnonzero((sizes < CRUMB * mean[whole]) & (np.asarray(graph.sum(axis=1)) > 0))
+    nearest = np.asarray(graph.argmax(axis=1)).ravel()
+    return _connected(np.stack((crumbs, nearest[crumbs]), axis=1), len(sizes))[1]
 
 
 def _hanging_together(graph: csr_array, part: Array, sizes: Array) -> Array:
-    """Parts that hang together: pieces go to the part with which they share most nodes."""
+    """Parts that hang together: of each the largest piece stays.
+
+    The others go, the smallest first, to the part with which they share most nodes, if any.
+    """
     part = part.copy()
+    first, second = (np.asarray(i) for i in graph.tocoo().coords)
     while True:
-        inner = graph.tocoo()
-        first, second = inner.coords
         same = part[first] == part[second]
         count, piece = _connected(np.stack((first[same], second[same]), axis=1), len(part))
-        weight = np.bincount(piece, sizes, minlength=count)
-        order = np.argsort(weight)
-        owner = np.zeros(count, dtype=np.int64)
-        owner[piece] = part
-        main = np.zeros(part.max(initial=-1) + 1, dtype=np.int64)
-        main[owner[order]] = order
-        loose = [int(i) for i in order if main[owner[i]] != i]
-        if not loose:
+        order = np.argsort(np.bincount(piece, sizes, minlength=count), kind="stable")
+        part_of, largest = np.zeros(count, dtype=np.int64), np.zeros(len(part), dtype=np.int64)
+        part_of[piece] = part
+        largest[part_of[order]] = order
+        held = np.bincount(piece[first[~same]], minlength=count) > 0
+        loose = order[(largest[part_of[order]] != order) & held[order]]
+        if len(loose) == 0:
             return part
-        bonds = np.bincount(part, graph[piece == loose[0]].sum(axis=0))
-        bonds[owner[loose[0]]] = 0
-        part[piece == loose[0]] = np.argmax(bonds)
+        inside = piece == loose[0]
+        shared = np.bincount(part, graph[inside].sum(axis=0) * ~inside)
+        part[inside] = np.argmax(shared)
 
 
 def _metis_of(graph: csr_array, count: int, sizes: Array) -> Array:
