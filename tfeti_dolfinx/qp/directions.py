@@ -12,8 +12,8 @@ from tfeti_dolfinx.arrays import Array
 # of the largest curvature of a direction, and of what the preconditioner makes of a residual: less
 # is rounding, as where rows depend on each other
 FLAT = 1e-13
-# numbers that a rank keeps at most: 128 MB
-NUMBERS = 16_000_000
+# numbers that a rank keeps at most: 192 MB
+NUMBERS = 24_000_000
 
 
 class Conjugates:
