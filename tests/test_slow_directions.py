@@ -10,7 +10,7 @@ from tfeti_dolfinx.qp.faces import Status, face_of
 from tfeti_dolfinx.qp.feasible_sets import Product
 from tfeti_dolfinx.qp.pcpg import pcpg
 from tfeti_dolfinx.qp.problem import QP, Point, Steps
-from tfeti_dolfinx.qp.slow_directions import HIGH, SlowDirections
+from tfeti_dolfinx.qp.slow_directions import HIGH, WRONG, SlowDirections
 from tfeti_dolfinx.qp.stopping import TargetRule
 
 n = 60
@@ -33,10 +33,10 @@ class Diagonal:
         pass
 
 
-def all_free(but=()):
+def all_free(but=(), status=Status.FREE):
     free = np.ones(n, dtype=bool)
     free[list(but)] = False
-    return face_of(free, np.full(n, Status.FREE))
+    return face_of(free, np.full(n, status))
 
 
 def program(highest=HIGHEST):
@@ -66,7 +66,7 @@ def solved(qp, M, slow, face):
     point.lam.set(0.0)
     point.refresh(qp)
     pcpg(on, point, TargetRule(1e-8), steps, 1000, directions=own)
-    return steps.cg, slow.learn(own.kept)
+    return steps.cg, slow.learn(own.kept, face)
 
 
 def matrix(operator, rows=n):
@@ -109,7 +109,7 @@ def test_they_help_on_another_face_and_stay_positive_definite():
 
 @pytest.mark.parametrize("seed", range(20))
 def test_whatever_is_held_then_what_they_make_is_positive_definite(seed):
-    qp, _, M = program([20.0] * 3 + [1e3] * 2)
+    qp, _, M = program([20.0] * 3 + [250.0] * 2)
     slow = SlowDirections()
     solved(qp, M, slow, all_free())
     held = np.random.default_rng(seed).choice(n, 40, replace=False)
@@ -131,3 +131,14 @@ def test_where_nothing_is_slow_nothing_is_kept():
 def test_values_below_the_threshold_are_not_slow():
     qp, _, M = program([0.99 * HIGH])
     assert solved(qp, M, SlowDirections(), all_free())[1] == 0
+
+
+def test_where_the_preconditioner_is_bad_altogether_nothing_is_kept():
+    qp, _, M = program([30.0, 1.1 * WRONG])
+    assert solved(qp, M, SlowDirections(), all_free())[1] == 0
+
+
+@pytest.mark.parametrize("status", [Status.STICK, Status.SLIP])
+def test_nothing_is_kept_where_points_stick_or_slip(status):
+    qp, _, M = program()
+    assert solved(qp, M, SlowDirections(), all_free(status=status))[1] == 0

@@ -69,7 +69,7 @@ class Conjugates:
         self._pFp[at], self._rz[at] = pFp, rz
         self._count += 1
 
-    def ritz_vectors(self, high: float, loose: float) -> Array:
+    def ritz_vectors(self, high: float, wrong: float, loose: float) -> Array:
         """Ritz vectors of MF of large values, M-orthonormal, as rows of coefficients of the p_i.
 
         Saad, Iterative Methods for Sparse Linear Systems, SIAM 2003, section 6.7.3: z_i/√(r_iᵀz_i)
@@ -78,6 +78,7 @@ class Conjugates:
 
         Args:
             high: Least value.
+            wrong: Where the largest value is above this there are none.
             loose: Largest bound of how far an eigenvalue of MF may be from a value, of the value.
 
         Returns:
@@ -90,6 +91,8 @@ class Conjugates:
         beta = rz[1:] / rz[:-1]
         diagonal = curvature + np.append(0.0, beta * curvature[:-1])
         values, Y = eigh_tridiagonal(diagonal, -np.sqrt(beta) * curvature[:-1])
+        if values[-1] > wrong:
+            return np.zeros((0, n))
         # the entry that comes next in the matrix is about the last curvature
         sharp = np.abs(Y[-1]) * curvature[-1] <= loose * values
         Y = Y[:, (values > high) & sharp] / np.sqrt(rz)[:, None]

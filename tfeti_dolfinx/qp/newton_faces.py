@@ -118,8 +118,8 @@ class FaceSolver:
         same = self.stays_on(face)
         if same and not self.curved:
             return True
-        if self._preconditioner is not None:
-            self._steps.slow += self._slow.learn(self._directions.kept)
+        if self._preconditioner is not None and self._qp.recycled is None:
+            self._steps.slow += self._slow.learn(self._directions.kept, self._eased.face)
         self._leave()
         self._steps.faces += not same
         self.curved = is_curved(self._qp, face)

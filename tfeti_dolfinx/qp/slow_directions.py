@@ -6,13 +6,15 @@ import numpy as np
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.parallel import agreed, summed
+from tfeti_dolfinx.parallel import agreed, any_rank, summed
 from tfeti_dolfinx.qp.directions import Conjugates
-from tfeti_dolfinx.qp.faces import Face
+from tfeti_dolfinx.qp.faces import Face, Status
 from tfeti_dolfinx.qp.problem import FaceOperator
 
-# eigenvalues of M_f F from which on a direction is slow; without inequalities they begin at 1
+# eigenvalues of M_f F from which on a direction is slow; they begin at 1
 HIGH = 5.0
+# an eigenvalue from which on M_f is bad altogether, as with cells 1000 : 1: such are many
+WRONG = 300.0
 # of an eigenvalue: how far it may be from one of M_f F on the whole face
 LOOSE = 0.6
 # directions at most
@@ -41,15 +43,18 @@ class SlowDirections:
         """Number of directions."""
         return len(self._V)
 
-    def learn(self, kept: Conjugates) -> int:
+    def learn(self, kept: Conjugates, face: Face) -> int:
         """Take what was slow among the directions of a face. Collective.
 
-        Where there are too many the oldest go.
+        Where there are too many the oldest go. Nothing is learnt where points stick or slip: from
+        one face to the next too much of that changes.
 
         Returns:
             How many have come.
         """
-        parts = agreed(kept.comm, kept.ritz_vectors(HIGH, LOOSE))
+        if any_rank(kept.comm, bool(np.any(face.status >= Status.STICK))):
+            return 0
+        parts = agreed(kept.comm, kept.ritz_vectors(HIGH, WRONG, LOOSE))
         if len(parts) == 0:
             return 0
         V, FV = kept.combined(parts)
