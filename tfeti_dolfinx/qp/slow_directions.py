@@ -19,7 +19,7 @@ WRONG = 300.0
 LOOSE = 0.6
 # directions at most
 MOST = 40
-# of the energy of a direction: where less stands out from those that are known, it is one of them
+# energy, of HIGH at least, that a direction has beside those known; with less it is one of them
 NEW = 0.1
 
 
