@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 from scenes import curved_obstacle, decomposed, problem
 
 import tfeti_dolfinx as tfeti
@@ -166,6 +167,19 @@ def test_counters_charge_who_asked(dual):
         dual.F.mult(x, y)
     dual.F.mult(x, y)
     assert (dual.F.count["someone"], dual.F.count["solver"]) == (before[0] + 1, before[1] + 1)
+
+
+def test_what_a_point_lacks_has_the_resultants_of_its_forces(dual):
+    """RᵀK = 0, although rounding of K u has resultants where a stiff body moves far."""
+    rng = np.random.default_rng(dual.coarse.comm.rank)
+    lam, subdomains = random_vec(dual, 7).array_r, dual.subdomains
+    far = subdomains.kernel_motion(1e12 * rng.standard_normal(subdomains.kernel_size))
+    at_rest, moved = (Remainder(dual, lam, u) for u in (0.0 * far, far))
+    size = dual.coarse.comm.allreduce(np.abs(at_rest.coarse.e).max(initial=0.0), op=MPI.MAX)
+    assert size > 0.0
+    assert np.abs(moved.coarse.e - at_rest.coarse.e).max(initial=0.0) <= 1e-12 * size
+    at_rest.destroy()
+    moved.destroy()
 
 
 @pytest.mark.parametrize("size", [1e-3, 1.0])

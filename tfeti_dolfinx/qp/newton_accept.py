@@ -93,7 +93,8 @@ def accept(state: Iterate, trial: Trial, faces: FaceSolver) -> bool:
     known, enough = np.isfinite(state.residual), _enough(state)
     gain = state.gain(trial.last)
     hidden = ROUNDING * slipping_work(state.point.lam, state.s, trial.face)
-    stays = gain <= 0.0 and state.idle > 1  # what is left is not on the face, but maybe Gλ ≠ e
+    # what is left is not on the face, but maybe Gλ ≠ e
+    stays = gain <= 0.0 and (state.idle > 1 or gain == 0.0)
     taken = trial.feasible and agreed(state.comm, gain >= enough - hidden and not stays)
     raised = not taken and trial.rounds > 1
     faces.cautious = raised or (faces.cautious and trial.rounds <= FEW_ROUNDS)
@@ -102,6 +103,8 @@ def accept(state: Iterate, trial: Trial, faces: FaceSolver) -> bool:
         faces.settle()
         return True
     faces.forget()
+    if agreed(state.comm, gain == 0.0):  # nothing has moved
+        return _descend(state, known, faces)
     length = trial.feasible_part(state.qp.feasible, state.point)
     curved = is_curved(state.qp, trial.face)
     shares = [length] if not curved or trial.rounds > 1 else []
