@@ -1,5 +1,7 @@
 """Clusters: K̃⁺ against a dense saddle-point problem, and scenes against the same without them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import ufl
@@ -9,9 +11,12 @@ from scenes import clamp, curved_obstacle, decomposed, forms, hooke, strain
 from scipy.sparse import csr_array
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.errors import InputError
+from benchmarks.stability_scenes import LADDERS
+from benchmarks.stress.judge import run_scene
+from tfeti_dolfinx.errors import FactorError, InputError
 from tfeti_dolfinx.subdomains import averages
 from tfeti_dolfinx.subdomains.clusters import ClusteredSubdomains
+from tfeti_dolfinx.subdomains.glue import Saddle
 
 COMM = MPI.COMM_WORLD
 
@@ -271,3 +276,33 @@ def test_more_clusters_than_subdomains():
     with pytest.raises(InputError, match="5 clusters of 4 subdomains; expected at most"):
         p.solve()
     p.destroy()
+
+
+def ladder_scene(name, cell, value, clusters):
+    ladder = next(ladder for ladder in LADDERS if ladder.name == name)
+    scene = ladder.rung(cell, value)
+    return replace(scene, options={**scene.options, "tfeti_clusters": clusters})
+
+
+def test_thin_clusters_are_glued_as_exactly_as_subdomains():
+    """F_c has condition numbers like (L/t)⁴: its inverse, as a matrix, would lose these digits."""
+    row = run_scene(ladder_scene("flat block", "hexahedron", 100.0, 2), COMM)
+    if COMM.rank == 0:
+        assert row["class"] == "right", row
+
+
+def test_averages_that_rounding_makes_dependent_are_named():
+    with pytest.raises(FactorError, match="-tfeti_clusters 0"):
+        Saddle(np.ones((2, 2)), np.eye(2), np.zeros((2, 0)))
+
+
+def test_averages_have_no_part_in_what_clusters_give_way_to(clustered):
+    """K̃⁺B_cᵀ = 0 and B_cK̃⁺ = 0, to rounding of what is left."""
+    subdomains = clustered.dual.subdomains
+    B, rng = subdomains._clusters.averages, np.random.default_rng(COMM.rank)
+    free = np.asarray(B.T @ rng.standard_normal(B.shape[0]))
+    some = rng.standard_normal(len(free))
+    u = subdomains.solve(some)
+    size = np.abs(u).max(initial=1.0)
+    assert np.abs(B @ u).max(initial=0.0) <= 1e-14 * size
+    assert np.abs(subdomains.solve(free)).max(initial=0.0) <= 1e-14 * size

@@ -124,10 +124,14 @@ class ClusteredSubdomains(Subdomains):
 
     def solve(self, b: Array) -> Array:
         """K̃⁺b on all unknowns, shape ``(n,)``."""
-        x, B, glue = super().solve(b), self._clusters.averages, self._glue()
+        B, glue, b = self._clusters.averages, self._glue(), np.array(b)
+        b[self.trace] = glue.beside(b[self.trace])
+        x = super().solve(b)
         z = glue.apply(np.concatenate((B @ x, -super().kernel_part(b))))
         mu, alpha = z[: B.shape[0]], z[B.shape[0] :]
-        return np.asarray(x - super().solve(B.T @ mu) + super().kernel_motion(alpha))
+        x = np.asarray(x - super().solve(B.T @ mu) + super().kernel_motion(alpha))
+        x[self.trace] = glue.beside(x[self.trace])
+        return x
 
     def _glue(self) -> Glue:
         """Z and W of the present trace."""
@@ -193,8 +197,10 @@ class ClusterPinv:
 
     def mult(self, w: Array, out: Array) -> None:
         """out = K̃⁺w, shapes ``(t,)``."""
+        w = self._glue.beside(w)
         self._inner.mult(w, out)
         out -= self._glue.Z @ self._glue.apply(self._glue.Z.T @ w)
+        out[:] = self._glue.beside(out)
 
     def destroy(self) -> None:
         """The factors are the Blocks'."""

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, inv
-from scipy.sparse import coo_array, csr_array, hstack
+from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
+from scipy.sparse import coo_array, csc_array, csr_array, hstack
+from scipy.sparse.linalg import splu
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.errors import FactorError
 from tfeti_dolfinx.subdomains.soft_motions import SoftMotions
 
 # Of what the stiffness of outer unknowns would make of a motion: one of less energy is soft.
@@ -18,7 +20,7 @@ SOFT = 0.05
 
 
 class Glue:
-    """Z and W of all clusters of a rank, W dense for each.
+    """Z and W of all clusters of a rank, W by dense factors for each.
 
     With T = G_cF_c⁻¹G_cᵀ, the energy of motions α of the subdomains of a cluster that averages
     hold, and R̂ = R − YF_c⁻¹G_cᵀ, what they look like: K̃⁺ = K⁺ − YF_c⁻¹Yᵀ + R̂T⁺R̂ᵀ, so that soft
@@ -33,7 +35,7 @@ class Glue:
 
     Attributes:
         Z: [Y, −R] on the trace, scipy CSR.
-        entries: Number of entries of W.
+        entries: Number of entries of the factors of W.
     """
 
     def __init__(
@@ -46,19 +48,21 @@ class Glue:
         B, Y, R = given
         F, G = csr_array(B @ Y), csr_array((B @ R).T)
         self.Z = csr_array(hstack((Y, -R)))
-        self._of_cluster: list[tuple[Array, Array]] = []
+        self._B, self._BBt = B, splu(csc_array(B @ B.T)) if B.shape[0] else None
+        self._of_cluster: list[tuple[Array, Saddle]] = []
         self._soft = [csr_array((len(stiffness), 0))]
         shapes = R.tocsc(), Y.tocsc()
         for at, kernel in places:
+            if not len(at):
+                continue
             F_c = F[at][:, at].toarray()
             F_c, G_c = (F_c + F_c.T) / 2.0, G[kernel][:, at].toarray()
             N = null[kernel].toarray()
             N = N[:, np.any(N != 0.0, axis=0)]
-            W = _inverse(F_c, -G_c, N)
+            W = Saddle(F_c, G_c, N)
             self._of_cluster.append((np.concatenate((at, F.shape[0] + kernel)), W))
-            if len(at):
-                own = shapes[0][:, kernel], shapes[1][:, at]
-                self._soft.append(_softer(F_c, G_c, N, own, stiffness))
+            own = shapes[0][:, kernel], shapes[1][:, at]
+            self._soft.append(_softer(F_c, G_c, N, own, stiffness))
 
     def soft_motions(self, blocks: int) -> SoftMotions:
         """The softer motions of the subdomains, as many, in their clusters."""
@@ -67,15 +71,77 @@ class Glue:
 
     @property
     def entries(self) -> int:
-        """Number of entries of W."""
-        return sum(W.size for _, W in self._of_cluster)
+        """Number of entries of the factors of W."""
+        return sum(W.entries for _, W in self._of_cluster)
+
+    def beside(self, w: Array) -> Array:
+        """(I − B_cᵀ(B_cB_cᵀ)⁻¹B_c)w, shapes ``(t,)``.
+
+        K̃⁺ is zero on the rest but for rounding, which conjugate gradients would take for curvature.
+        """
+        if self._BBt is None:
+            return w
+        return np.asarray(w - self._B.T @ self._BBt.solve(self._B @ w))
 
     def apply(self, s: Array) -> Array:
         """W s."""
         z = np.zeros(len(s))
         for places, W in self._of_cluster:
-            z[places] = W @ s[places]
+            z[places] = W.solve(s[places])
         return z
+
+
+class Saddle:
+    """W of a cluster: the inverse of [F_c −G_cᵀ; −G_c 0] beside null(G_cᵀ), by Cholesky factors.
+
+    W itself, as a matrix, would cost as many digits as the condition number of F_c has, (L/t)⁴ in
+    plates of thickness t; what triangular solves lose lies where F_c is small, and so is Y.
+    Unknowns are scaled, since moduli of subdomains may differ by powers of ten.
+
+    Args:
+        F: F_c, shape ``(a, a)``.
+        G: G_c, shape ``(r, a)``.
+        N: Basis of null(G_cᵀ), shape ``(r, n)``.
+
+    Attributes:
+        entries: Number of entries of the factors.
+
+    Raises:
+        FactorError: F_c is definite no more, for rounding.
+    """
+
+    def __init__(self, F: Array, G: Array, N: Array) -> None:
+        self._mu, self._alpha = _scales(F, G)
+        G = self._alpha[:, None] * G * self._mu
+        self._free, _ = np.linalg.qr(N / self._alpha[:, None])
+        try:
+            self._L = cholesky(self._mu[:, None] * F * self._mu, lower=True)
+            self._M = solve_triangular(self._L, G.T, lower=True)
+            self._T = cholesky(self._M.T @ self._M + self._free @ self._free.T, lower=True)
+        except np.linalg.LinAlgError as error:
+            raise FactorError(
+                "rounding makes averages of faces in a cluster depend on each other, as in thin "
+                "parts; expected -tfeti_clusters 0, thicker parts or fewer subdomains"
+            ) from error
+        self.entries = self._L.size + 2 * self._M.size + self._T.size
+
+    def solve(self, s: Array) -> Array:
+        """W s, shapes ``(a + r,)``."""
+        a = len(self._mu)
+        v = self._lower(self._L, self._mu * s[:a])
+        rest = self._alpha * s[a:] + self._M.T @ v
+        rest -= self._free @ (self._free.T @ rest)
+        alpha = -self._upper(self._T, self._lower(self._T, rest))
+        mu = self._upper(self._L, v + self._M @ alpha)
+        return np.concatenate((self._mu * mu, self._alpha * alpha))
+
+    @staticmethod
+    def _lower(L: Array, b: Array) -> Array:
+        return np.asarray(solve_triangular(L, b, lower=True, check_finite=False))
+
+    @staticmethod
+    def _upper(L: Array, b: Array) -> Array:
+        return np.asarray(solve_triangular(L, b, trans=1, lower=True, check_finite=False))
 
 
 def _softer(F: Array, G: Array, N: Array, shapes: tuple[Any, Any], stiffness: Array) -> csr_array:
@@ -108,19 +174,3 @@ def _scales(F: Array, G: Array) -> tuple[Array, Array]:
     mu = np.diag(F) ** -0.5
     size = np.sum((G * mu) ** 2, axis=1)
     return mu, np.where(size > 0.0, size, 1.0) ** -0.5
-
-
-def _inverse(F: Array, G: Array, N: Array) -> Array:
-    """The inverse of [F Gᵀ; G 0] beside null(Gᵀ), whose basis N is.
-
-    Unknowns are scaled, since moduli of subdomains may differ by powers of ten.
-    """
-    mu, alpha = _scales(F, G)
-    scale, G = np.concatenate((mu, alpha)), alpha[:, None] * G * mu
-    free, _ = np.linalg.qr(N / alpha[:, None])
-    free = free @ free.T
-    A = np.block([[mu[:, None] * F * mu, G.T], [G, free]])
-    W = inv(A, overwrite_a=True)
-    W[len(mu) :, len(mu) :] -= free
-    W = scale[:, None] * W * scale
-    return np.asarray((W + W.T) / 2.0)
