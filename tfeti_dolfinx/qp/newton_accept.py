@@ -94,7 +94,7 @@ def accept(state: Iterate, trial: Trial, faces: FaceSolver) -> bool:
     gain = state.gain(trial.last)
     hidden = ROUNDING * slipping_work(state.point.lam, state.s, trial.face)
     # what is left is not on the face, but maybe Gλ ≠ e
-    stays = gain <= 0.0 and (state.idle > 1 or gain == 0.0)
+    stays = gain <= 0.0 and state.idle > (0 if gain == 0.0 else 1)
     taken = trial.feasible and agreed(state.comm, gain >= enough - hidden and not stays)
     raised = not taken and trial.rounds > 1
     faces.cautious = raised or (faces.cautious and trial.rounds <= FEW_ROUNDS)
