@@ -186,6 +186,51 @@ def test_a_set_of_one_s_own():
     assert error <= p.estimate().algebraic <= 5 * error
 
 
+def of_estimates(p):
+    return [warning for warning in p.report.warnings if warning.startswith("estimates: ")]
+
+
+def test_a_bound_that_says_nothing_is_warned_of():
+    """Forces a hundred times too large stand for such that have no digits left."""
+    p = drawn(0)
+    p.solve()
+    p.estimate()
+    assert of_estimates(p) == []
+    others, right = list(p.report.warnings), p.solution.lam.copy()
+    for _ in range(2):
+        p.solution.lam[:] = 100.0 * right
+        found = p.estimate()
+        assert found.algebraic > 50.0 * found.energy
+        (warning,) = of_estimates(p)
+        assert f"is {found.relative_algebraic:.0e} times the energy norm" in warning
+        assert p.report.warnings == [*others, warning]
+    p.solution.lam[:] = right
+    p.estimate()
+    assert p.report.warnings == others
+
+
+@pytest.mark.parametrize(
+    ("energy", "algebraic", "said"),
+    [
+        (2.0, 2.0, ""),
+        (0.0, 0.0, ""),
+        (2.0, 20.0, "1e+01 times"),
+        (2.0, np.inf, "far beyond"),
+        (0.0, 1.0, "far beyond"),
+    ],
+)
+def test_a_bound_of_the_last_look_is_warned_of_where_it_says_nothing(
+    energy, algebraic, said, monkeypatch
+):
+    looked = {"energy": energy, "algebraic": algebraic}
+    monkeypatch.setattr("tfeti_dolfinx.problem.of_looks", lambda reached: looked)
+    p = problem(decomposed("triangle", 2, 2))
+    p.solve()
+    assert [f"algebraic error is {said}" in warning for warning in of_estimates(p)] == [True] * (
+        said != ""
+    )
+
+
 def test_it_needs_a_solution():
     p = problem(decomposed("triangle", 2, 2))
     with pytest.raises(tfeti.InputError, match="there is no solution yet"):

@@ -138,6 +138,16 @@ def test_where_the_preconditioner_is_bad_altogether_nothing_is_kept():
     assert solved(qp, M, SlowDirections(), all_free())[1] == 0
 
 
+def test_what_was_kept_goes_where_the_preconditioner_turns_out_to_be_bad_altogether():
+    (qp, _, M), (worse, _, _) = program(), program([1.1 * WRONG, *HIGHEST])
+    slow = SlowDirections()
+    assert solved(qp, M, slow, all_free())[1] == slow.count == len(HIGHEST)
+    assert solved(worse, M, slow, all_free())[1] == slow.count == 0
+    inner = Diagonal(M, all_free())
+    assert slow.beside(inner, all_free()) is inner
+    assert solved(qp, M, slow, all_free())[1] == 0
+
+
 @pytest.mark.parametrize("status", [Status.STICK, Status.SLIP])
 def test_nothing_is_kept_where_points_stick_or_slip(status):
     qp, _, M = program()

@@ -30,6 +30,7 @@ LOCKS = 50.0
 # radians; what linear kinematics then takes for strain is half the square, 0.5 %
 TURNS = 0.1
 LISTED = 3  # bodies that a sentence names
+ESTIMATES = "estimates"  # how the sentence on them begins
 
 
 class Doubts:
@@ -63,6 +64,7 @@ class Doubts:
             *self._springs(dual, rtol),
             *self._turned(u, dual.subdomains),
             *self._lasting,
+            *_of_estimates(report),
         ]
 
     def _cells(self) -> Iterator[str]:
@@ -170,6 +172,31 @@ class Doubts:
         listed = ", ".join(names[body] for body in some[:LISTED])
         rest = len(some) - LISTED
         return f"{listed} and {rest} more" if rest > 0 else listed
+
+
+def note_estimates(report: Report, numbers: dict[str, float]) -> None:
+    """Give a report estimates that were made since, and a warning where they say nothing.
+
+    Args:
+        report: That of the solve.
+        numbers: What ``Estimates.numbers`` gives.
+    """
+    report.warnings = [text for text in report.warnings if not text.startswith(ESTIMATES)]
+    report.estimates = numbers
+    report.warnings += _of_estimates(report)
+
+
+def _of_estimates(report: Report) -> Iterator[str]:
+    """A bound of the algebraic error that no displacement of this size can miss."""
+    energy, bound = (report.estimates.get(key, 0.0) for key in ("energy", "algebraic"))
+    if bound > energy:
+        share = f"{bound / energy:.0e} times" if energy and np.isfinite(bound) else "far beyond"
+        yield (
+            f"{ESTIMATES}: the bound of the algebraic error is {share} the energy norm of the "
+            "displacement, so it says nothing of it: forces, which it is made of, are lost in "
+            "rounding, or do not balance the load; residuals['displacement_error'] estimates the "
+            "error of the displacement itself"
+        )
 
 
 def _loose(report: Report) -> Iterator[str]:

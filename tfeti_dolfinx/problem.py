@@ -18,7 +18,7 @@ from tfeti_dolfinx.contact.arguments import Gap, gaps_by_position
 from tfeti_dolfinx.contact.partners import ContactPartner, checked_contacts
 from tfeti_dolfinx.contact_state import Multipliers
 from tfeti_dolfinx.coulomb import solve_with_friction
-from tfeti_dolfinx.doubts import Doubts
+from tfeti_dolfinx.doubts import Doubts, note_estimates
 from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.dual.goals import Goal
 from tfeti_dolfinx.errors import InputError, TfetiError
@@ -178,14 +178,14 @@ class ContactProblem(Stepping):
         """How large the errors of the last solution are, in energy. It costs what it says.
 
         Returns:
-            The estimates, which ``report.estimates`` then has, too.
+            The estimates, which ``report`` then has, too, with a warning where they are of no use.
 
         Raises:
             InputError: There is no solution, or its rows are no longer there.
             FactorError: A matrix could not be factored.
         """
         found = estimate(self._system, self.solution)
-        self.report.estimates = found.numbers()
+        note_estimates(self.report, found.numbers())
         return found
 
     def update(

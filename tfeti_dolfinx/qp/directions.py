@@ -69,7 +69,7 @@ class Conjugates:
         self._pFp[at], self._rz[at] = pFp, rz
         self._count += 1
 
-    def ritz_vectors(self, high: float, wrong: float, loose: float) -> Array:
+    def ritz_vectors(self, high: float, loose: float) -> tuple[float, Array]:
         """Ritz vectors of MF of large values, M-orthonormal, as rows of coefficients of the p_i.
 
         Saad, Iterative Methods for Sparse Linear Systems, SIAM 2003, section 6.7.3: z_i/√(r_iᵀz_i)
@@ -78,26 +78,23 @@ class Conjugates:
 
         Args:
             high: Least value.
-            wrong: Where the largest value is above this there are none.
             loose: Largest bound of how far an eigenvalue of MF may be from a value, of the value.
 
         Returns:
-            Shape ``(k, number)``.
+            The largest value, 0 where none is known; the vectors, shape ``(k, number)``.
         """
         n = self._count
         if n < 3 or n > self._most:
-            return np.zeros((0, self.number))
+            return 0.0, np.zeros((0, self.number))
         rz, curvature = self._rz[:n], self._pFp[:n] / self._rz[:n]
         beta = rz[1:] / rz[:-1]
         diagonal = curvature + np.append(0.0, beta * curvature[:-1])
         values, Y = eigh_tridiagonal(diagonal, -np.sqrt(beta) * curvature[:-1])
-        if values[-1] > wrong:
-            return np.zeros((0, n))
         # the entry that comes next in the matrix is about the last curvature
         sharp = np.abs(Y[-1]) * curvature[-1] <= loose * values
         Y = Y[:, (values > high) & sharp] / np.sqrt(rz)[:, None]
         Y[:-1] -= beta[:, None] * Y[1:]  # z_i = p_i − β_i p_{i−1}
-        return np.asarray(Y.T)
+        return float(values[-1]), np.asarray(Y.T)
 
     def combined(self, parts: Array) -> tuple[Array, Array]:
         """Combinations of the p_i, and what F makes of them, given rows of coefficients."""

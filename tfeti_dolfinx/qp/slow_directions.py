@@ -37,6 +37,7 @@ class SlowDirections:
 
     def __init__(self) -> None:
         self._V, self._FV = (np.zeros((0, 0)) for _ in range(2))
+        self._wrong = False
 
     @property
     def count(self) -> int:
@@ -47,15 +48,19 @@ class SlowDirections:
         """Take what was slow among the directions of a face. Collective.
 
         Where there are too many the oldest go. Nothing is learnt where points stick or slip: from
-        one face to the next too much of that changes.
+        one face to the next too much of that changes. Where M_f turns out to be bad altogether
+        all of them go, and none come any more: they are few of many then, and help none.
 
         Returns:
             How many have come.
         """
-        if any_rank(kept.comm, bool(np.any(face.status >= Status.STICK))):
+        if self._wrong or any_rank(kept.comm, bool(np.any(face.status >= Status.STICK))):
             return 0
-        parts = agreed(kept.comm, kept.ritz_vectors(HIGH, WRONG, LOOSE))
-        if len(parts) == 0:
+        largest, parts = agreed(kept.comm, kept.ritz_vectors(HIGH, LOOSE))
+        if largest > WRONG:
+            self._wrong = True
+            self._V, self._FV = (np.zeros((0, 0)) for _ in range(2))
+        if self._wrong or len(parts) == 0:
             return 0
         V, FV = kept.combined(parts)
         if self.count == 0:
