@@ -158,6 +158,17 @@ def test_rounding_is_called_so(monkeypatch):
     assert error(p, direct(*scene), np.array([2.0, 1.0])) <= 1e-11
 
 
+@pytest.mark.parametrize("length", [2.0, 4000.0])
+def test_an_error_says_what_is_hard(length):
+    """What the report warns of is in the message of a solve that ends early, too."""
+    scene = (12, 6), (length, 1.0), lambda x: 1.0, 0.3, (0.0, 1e-3)
+    p = torn(*scene, 4, [], tfeti_max_it=1)
+    with pytest.raises(tfeti.ConvergenceError, match="DIVERGED_ITS") as caught:
+        p.solve()
+    assert ("the flattest" in str(caught.value)) == (length > 2.0)
+    assert all(warning in str(caught.value) for warning in p.report.warnings)
+
+
 @pytest.mark.parametrize("stiffness", [1.0, 1e7])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_what_rows_miss_is_closed_by_the_least_displacement(cell, stiffness):

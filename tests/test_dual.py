@@ -9,6 +9,7 @@ import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.dual.accuracy import Accuracy
 from tfeti_dolfinx.dual.operator import check_operator
 from tfeti_dolfinx.dual.particular import feasible_particular
+from tfeti_dolfinx.dual.recovery import at_rest
 from tfeti_dolfinx.dual.remainder import Remainder
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.homogenised import homogenise, image
@@ -182,6 +183,17 @@ def test_what_a_point_lacks_has_the_resultants_of_its_forces(dual):
     moved.destroy()
 
 
+def lacked(left):
+    """The solution of what a point lacks, and its accuracy."""
+    qp, zero = left.qp(), left.d.duplicate()
+    zero.set(0.0)
+    start = homogenise(qp, image(qp.F, feasible_start(qp, Start(zero, np.zeros(6)))))
+    own = Accuracy(left, 1e-10, 0.0, (start.scale.reference, start.scale.rounding))
+    result = newton(qp, start, own, warm=True)
+    assert result.reason > 0
+    return result, own
+
+
 @pytest.mark.parametrize("size", [1e-3, 1.0])
 def test_what_any_point_lacks_leads_to_the_same_solution(dual, size):
     """λ₀ and u₀ need not belong to each other, nor fulfil anything."""
@@ -191,13 +203,26 @@ def test_what_any_point_lacks_leads_to_the_same_solution(dual, size):
     most = rule.measures.bodies.size.max()
     u = rule.u + size * most * rng.standard_normal(len(rule.u))
     left = Remainder(dual, lam, u)
-    qp, zero = left.qp(), dual.d.duplicate()
-    zero.set(0.0)
-    start = homogenise(qp, image(qp.F, feasible_start(qp, Start(zero, np.zeros(6)))))
-    own = Accuracy(left, 1e-10, 0.0, (start.scale.reference, start.scale.rounding))
-    result = newton(qp, start, own, warm=True)
-    assert result.reason > 0
+    result, own = lacked(left)
     assert np.abs(own.u - rule.u).max(initial=0.0) <= 1e-8 * most
     result.lam.array[:] += lam - known.lam.array_r
     assert result.lam.norm() <= 1e-7 * known.lam.norm()
+    left.destroy()
+
+
+@pytest.mark.parametrize("far", [1.0, 1e5])
+def test_motions_of_subdomains_are_no_load(dual, far):
+    """From u₀ + Rα as from u₀, where K is asked about v₀ alone, which has no motions."""
+    known, rule = solve_dual(dual, Options(rtol=1e-10), "newton")
+    subdomains, most = dual.subdomains, rule.measures.bodies.size.max()
+    rng = np.random.default_rng(dual.coarse.comm.rank)
+    u = rule.u + 0.1 * most * rng.standard_normal(len(rule.u))
+    v = at_rest(subdomains, u)
+    assert np.abs(subdomains.kernel_part(v)).max(initial=0.0) <= 1e-13 * most * len(v)
+    alpha = far * most * rng.standard_normal(subdomains.kernel_size)
+    left = Remainder(dual, known.lam.array_r, u + subdomains.kernel_motion(alpha), v)
+    result, own = lacked(left)
+    assert np.abs(own.u - rule.u).max(initial=0.0) <= 1e-8 * most
+    bent = at_rest(subdomains, rule.u)
+    assert np.abs(left.at_rest(result.lam) - bent).max(initial=0.0) <= 1e-8 * most
     left.destroy()

@@ -28,6 +28,8 @@ DEPTH = 3
 LEAP, BACK = 30.0, 0.1
 # problems in a row whose change is not half of the least before; then bodies slide on without end
 PATIENCE = 12
+# problems in a row that are not solved: the second one goes on where the first has ended
+UNSOLVED = 2
 # times the first slips: more of them are no measure of changes, since they may grow without end
 FARTHER = 100.0
 # times the first slips: so many of them, and still no rest, are bodies that slide
@@ -51,7 +53,7 @@ class DilatedGaps:
     Attributes:
         lam: The last forces, on this rank's rows.
         mu: Multipliers of Gλ = e there.
-        astray: Whether slips grow without end, or do not come to rest, or a problem is not solved.
+        astray: Whether slips grow without end, or do not come to rest, or problems are not solved.
         slides: Whether they have grown.
     """
 
@@ -65,12 +67,12 @@ class DilatedGaps:
         self._w: Array = np.zeros(len(at))
         self._anderson = Anderson(self._products, DEPTH)
         self._change, self._first = np.inf, 0.0
-        self.astray, self.slides, self._spent = False, False, False
+        self.astray, self.slides, self._unsolved = False, False, 0
 
     def settle(self, share: float) -> Array:
         """Iterate until slips change by less than a share; returns the λ_N under the law."""
         best, idle = np.inf, 0
-        while idle < PATIENCE and not self._spent:
+        while idle < PATIENCE and self._unsolved < UNSOLVED:
             slips = self._slips()
             size, self._change = self._size(slips), self._size(slips - self._w)
             self._first = self._first or size
@@ -112,7 +114,8 @@ class DilatedGaps:
             qp, start, rule, self._options.newton, max_it=self._options.max_it, warm=True
         )
         self._dual.saw(result.norm)
-        self._spent = result.reason == ConvergedReason.DIVERGED_ITS
+        late = result.reason == ConvergedReason.DIVERGED_ITS
+        self._unsolved = self._unsolved + 1 if late else 0
         self.lam, self.mu = np.array(result.lam.array_r), self.mu + result.mu
         slips = np.linalg.norm(self._mu * result.gradient.array_r[self._tangents], axis=1)
         start.destroy()

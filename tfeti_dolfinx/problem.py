@@ -261,8 +261,7 @@ class ContactProblem(Stepping):
                 self._settings.learn(dual)
                 earlier, lam, mu = self._start
                 start = (gluing.multipliers(earlier, lam), mu)
-            own = self._settings.extensions.monitor
-            goal = self._goal()
+            own, goal = self._settings.extensions.monitor, self._goal()
             solved = solve_with_friction(dual, self.options, qp_type, start, own, goal)
         result, accuracy, settling = solved
         with stage("recovery", report.seconds):
@@ -275,6 +274,7 @@ class ContactProblem(Stepping):
         report.warnings = self._doubts.found(dual, solution.u, report, self.options.number)
         report.excluding_contacts = system.search.named(gluing.contacts_of(result.excluding))
         result.destroy()
-        told = report.excluding_contacts, settling.restless(self.decomposition.body_names)
-        conclude(result, accuracy, self.options, self.decomposition.comm, *told)
+        d = self.decomposition
+        told = report.excluding_contacts, settling.restless(d.body_names), report.warnings
+        conclude(result, accuracy, self.options, d.comm, *told)
         return solution

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.accuracy import Accuracy
 from tfeti_dolfinx.dual.dual import Dual
+from tfeti_dolfinx.dual.recovery import at_rest
 from tfeti_dolfinx.dual.remainder import Remainder
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.parallel import agreed
@@ -42,7 +44,10 @@ def with_more_digits(
     """Where rounding has ended a solve, solve for what is left, as long as that brings a digit.
 
     Iterative refinement (Wilkinson): each round begins at the sum of those before, and the residual
-    of that is made from K itself. Collective; does nothing where a solve has ended otherwise.
+    of that is made from K itself. Where this does not suffice, once more from the same answer, and
+    K is not asked about motions of subdomains, of which it makes forces that are its rounding: the
+    residual is made from the displacement less these. Collective; does nothing where a solve has
+    ended otherwise.
 
     Args:
         dual: The dual problem.
@@ -53,27 +58,52 @@ def with_more_digits(
     Returns:
         The multipliers and their displacement, whose sum has more digits than K⁺(f − Bᵀλ).
     """
-    comm, most = dual.coarse.comm, NO_DIGITS / rule.rtol
+    comm, first = dual.coarse.comm, (result, rule)
+    enough = agreed(comm, rule.ratio() <= NO_DIGITS / rule.rtol)
+    if result.reason != ConvergedReason.DIVERGED_ROUNDING or not enough:
+        return first
+    found = _in_rounds(dual, told, first, rule.u)
+    if found[0].reason <= 0 and dual.coarse.dimension:
+        plain = found
+        result.steps, rule.looks = plain[0].steps, plain[1].looks
+        other = _in_rounds(dual, told, first, at_rest(dual.subdomains, rule.u))
+        found = other if agreed(comm, other[1].ratio() < plain[1].ratio()) else plain
+        found[0].steps, found[1].looks = other[0].steps, other[1].looks
+        for answer, _ in (plain, other):
+            if answer is not found[0] and answer is not result:
+                answer.destroy()
+    if found[0] is not result:
+        result.destroy()
+    return found
+
+
+def _in_rounds(
+    dual: Dual, told: Told, first: tuple[QPResult, Accuracy], v: Array
+) -> tuple[QPResult, Accuracy]:
+    """Rounds from a first answer, which stays; v is its displacement, or that less its motions."""
+    result, rule = first
+    comm = dual.coarse.comm
     while result.reason == ConvergedReason.DIVERGED_ROUNDING:
         before = agreed(comm, rule.ratio())
-        if before > most:
-            break
-        more, again = _of_remainder(dual, told, result, rule)
-        most = DIGIT * before
-        if agreed(comm, again.ratio() >= before):
+        more, again, v = _of_remainder(dual, told, result, rule, v)
+        after = agreed(comm, again.ratio())
+        if after >= before:
             more.destroy()
             break
-        result.destroy()
+        if result is not first[0]:
+            result.destroy()
         result, rule = more, again
+        if after > DIGIT * before:
+            break
     return result, rule
 
 
 def _of_remainder(
-    dual: Dual, told: Told, result: QPResult, rule: Accuracy
-) -> tuple[QPResult, Accuracy]:
-    """The sum of a result and the solution of what it lacks, and the accuracy of that sum."""
+    dual: Dual, told: Told, result: QPResult, rule: Accuracy, v: Array
+) -> tuple[QPResult, Accuracy, Array]:
+    """The sum of a result and the solution of what it lacks, its accuracy, and its new v."""
     options, norm = told.options, rule.norm
-    left = Remainder(dual, np.array(result.lam.array_r), rule.u)
+    left = Remainder(dual, np.array(result.lam.array_r), rule.u, v)
     qp = left.qp()
     start = Start(left.start(result.face), np.zeros(qp.coarse.dimension))
     at = image(qp.F, start.lam.copy())
@@ -85,12 +115,13 @@ def _of_remainder(
     if more.reason <= 0:
         last_look(more, again)
     again.looks += rule.looks
+    v = again.u if v is rule.u else left.at_rest(more.lam)
     more.lam.axpy(1.0, result.lam)
     more.mu, more.reference, more.norm = result.mu, result.reference, result.norm
     more.steps = result.steps.plus(more.steps)
     for item in (at, homogenised, start.lam, left):
         item.destroy()
-    return more, again
+    return more, again, v
 
 
 def last_look(result: QPResult, rule: Accuracy) -> None:

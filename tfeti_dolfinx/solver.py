@@ -195,6 +195,7 @@ def conclude(
     comm: MPI.Intracomm,
     excluding: Sequence[str] = (),
     restless: tuple[str, bool] = ("", False),
+    warnings: Sequence[str] = (),
 ) -> None:
     """Say why the solver stopped, and raise where it should have gone on.
 
@@ -205,6 +206,7 @@ def conclude(
         comm: Communicator.
         excluding: Names of the contacts whose rows exclude each other.
         restless: Name of the body on which bounds of friction change most, and whether it slides.
+        warnings: What is known to be hard about the scene; an error says it, too.
 
     Raises:
         ConvergenceError: It stopped before its tolerance, unless options turn that off.
@@ -223,4 +225,5 @@ def conclude(
     if options.converged_reason and comm.rank == 0:
         print(f"TFETI solve {text}", flush=True)
     if result.reason <= 0 and options.error_if_not_converged:
-        raise ConvergenceError(f"the dual solver stopped: {text}")
+        hard = f"; warnings: {'; '.join(warnings)}" if warnings else ""
+        raise ConvergenceError(f"the dual solver stopped: {text}{hard}")

@@ -8,6 +8,7 @@ from petsc4py import PETSc
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.qp.faces import Face
+from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # Of GGᵀ, added to G_f G_fᵀ: rows with a force that hold a motion by less are not asked about it,
 # since they would answer with their rounding over this share.
@@ -41,19 +42,41 @@ def recover(
     Returns:
         This rank's part of u, shape ``(n,)``, and c − B u, shape ``(m,)``.
     """
-    w, v, residual = B.createVecRight(), B.createVecRight(), c.duplicate()
-    B.multTranspose(lam, w)
+    v, residual = B.createVecRight(), c.duplicate()
     subdomains = coarse.subdomains
-    u = pinv_load - subdomains.solve(subdomains.extended(w.array_r))
+    u = bent(B, subdomains, lam, pinv_load)
     v.array[:] = u[subdomains.trace]
     B.mult(v, residual)
     residual.aypx(-1.0, c)  # c − B K⁺(f − Bᵀλ) = Fλ − d
     gap = np.array(residual.array_r)
-    for vec in (w, v, residual):
+    for vec in (v, residual):
         vec.destroy()
     nu = np.where(face.holding, 0.0, gradient.array_r)
     alpha = _alpha(coarse, gap, face.holding, nu)
     return moved(u, coarse, alpha), gap - coarse.Gt @ alpha
+
+
+def bent(B: PETSc.Mat, subdomains: Subdomains, lam: PETSc.Vec, pinv_load: Array) -> Array:
+    """K⁺(f − Bᵀλ), this rank's part, shape ``(n,)``. Collective.
+
+    Args:
+        B: Dual rows × trace unknowns.
+        subdomains: This rank's Blocks.
+        lam: The multipliers.
+        pinv_load: K⁺f, shape ``(n,)``.
+    """
+    w = B.createVecRight()
+    B.multTranspose(lam, w)
+    u = pinv_load - subdomains.solve(subdomains.extended(w.array_r))
+    w.destroy()
+    return np.asarray(u)
+
+
+def at_rest(subdomains: Subdomains, u: Array) -> Array:
+    """u less its motions, u − R Rᵀu, shape ``(n,)``; twice, since these may be far larger."""
+    for _ in range(2):
+        u = u - subdomains.kernel_motion(subdomains.kernel_part(u))
+    return u
 
 
 def moved(u: Array, coarse: CoarseSpace, alpha: Array) -> Array:

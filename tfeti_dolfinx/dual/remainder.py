@@ -10,7 +10,7 @@ from petsc4py import PETSc
 from tfeti_dolfinx.arrays import Array, joined
 from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.dual.dual import Dual
-from tfeti_dolfinx.dual.recovery import recover
+from tfeti_dolfinx.dual.recovery import at_rest, bent, recover
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.qp.coarse import Coarse, NoCoarse
 from tfeti_dolfinx.qp.faces import Face
@@ -24,15 +24,18 @@ from tfeti_dolfinx.subdomains.subdomains import Subdomains
 class Remainder:
     """The dual problem of δλ and δu, for λ = λ₀ + δλ and u = u₀ + δu.
 
-    K δu + Bᵀδλ = f − K u₀ − Bᵀλ₀, B δu = c − B u₀ on what is closed, λ₀ + δλ in Ω: the same F with
+    K δu + Bᵀδλ = f − K v₀ − Bᵀλ₀, B δu = c − B u₀ on what is closed, λ₀ + δλ in Ω: the same F with
     another d, another e and Ω − λ₀. Where subdomains bend by far more than the solution does, the
     rounding of λ alone moves K⁺(f − Bᵀλ) by more than u may be wrong by; δλ has digits that λ has
-    no room for. Creation and all methods are collective.
+    no room for. v₀ is u₀, or u₀ less motions of subdomains: of these K makes forces that are its
+    rounding, which may be more than what bends a body that moves far. Creation and all methods are
+    collective.
 
     Args:
         dual: The dual problem.
         lam: λ₀, this rank's part.
         u: u₀, this rank's part, shape ``(n,)``.
+        v: v₀, this rank's part, shape ``(n,)``; default u₀.
 
     Attributes:
         constraints: Those of the dual problem.
@@ -47,26 +50,27 @@ class Remainder:
     coarse: CoarseSpace
     feasible: FeasibleSet
 
-    def __init__(self, dual: Dual, lam: Array, u: Array) -> None:
+    def __init__(self, dual: Dual, lam: Array, u: Array, v: Array | None = None) -> None:
         self._dual, self._lam, self._u = dual, lam, u
+        self._v = u if v is None else v
         self.constraints, self.subdomains = dual.constraints, dual.subdomains
         self.pressing = dual.pressing
         self.feasible = dual.feasible.shifted(lam)
         B, subdomains = self.constraints.B, self.subdomains
-        w, v, x = B.createVecRight(), B.createVecRight(), dual.d.duplicate()
+        w, on_trace, x = B.createVecRight(), B.createVecRight(), dual.d.duplicate()
         x.array[:] = lam
         B.multTranspose(x, w)
-        force = _force_left(subdomains, u) - subdomains.extended(w.array_r)
+        force = _force_left(subdomains, self._v) - subdomains.extended(w.array_r)
         self._response = subdomains.solve(force)
         self.coarse = dual.coarse.under(force)
         self._c, self.d = dual.d.duplicate(), dual.d.duplicate()
-        v.array[:] = u[subdomains.trace]
-        B.mult(v, self._c)
+        on_trace.array[:] = u[subdomains.trace]
+        B.mult(on_trace, self._c)
         self._c.aypx(-1.0, self.constraints.c)
-        v.array[:] = self._response[subdomains.trace]
-        B.mult(v, self.d)
+        on_trace.array[:] = self._response[subdomains.trace]
+        B.mult(on_trace, self.d)
         self.d.axpy(-1.0, self._c)
-        for vec in (w, v, x):
+        for vec in (w, on_trace, x):
             vec.destroy()
 
     @property
@@ -94,6 +98,11 @@ class Remainder:
         u = self._dual.smallest(self._u + du, gap, self._lam + lam.array_r, face, error)
         self.pressing = self._dual.pressing
         return u
+
+    def at_rest(self, lam: PETSc.Vec) -> Array:
+        """v₀ + δv of a δλ, shape ``(n,)``. Collective."""
+        B, subdomains = self.constraints.B, self.subdomains
+        return self._v + at_rest(subdomains, bent(B, subdomains, lam, self._response))
 
     def destroy(self) -> None:
         """Destroy the vectors."""
