@@ -11,6 +11,7 @@ from scenes import clamp, decomposed, forms
 from scenes import displacement as nodal
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.dual import soft_modes
 
 
 def largest(comm, values):
@@ -323,6 +324,32 @@ def test_steps_in_which_a_wave_crosses_subdomains_cost_no_more(share, soft):
     assert report.soft_modes == soft
     assert report.F_multiplications <= 14
     assert report.kernel_dim == 0
+
+
+def eighths(x):
+    """Two by two by two subdomains."""
+    i, j, k = np.minimum((2 * x).astype(int), 1)
+    return i + 2 * j + 4 * k
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0, 1.5, 2.0, 3.0])
+@pytest.mark.parametrize(
+    ("cell", "n", "subdomains"), [("quadrilateral", 32, sixteenths), ("hexahedron", 8, eighths)]
+)
+def test_soft_motions_are_taken_where_that_pays(monkeypatch, cell, n, subdomains, share):
+    """At most one multiplication more than with all of them, or with none."""
+    counts, soft = [], []
+    H = 1 / (4 if subdomains is sixteenths else 2)
+    for decided in (None, True, False):
+        if decided is not None:
+            monkeypatch.setattr(soft_modes, "_stands_out", lambda *args, answer=decided: answer)
+        scene = Thrown(cell, n, gap=0.0, weight=0.02, subdomains=subdomains, rtol=1e-6)
+        scene.step(share * H / np.sqrt(0.7 / 1.3 / 0.4))
+        counts.append(scene.problem.report.F_multiplications)
+        soft.append(scene.problem.report.soft_modes)
+        scene.problem.destroy()
+    assert counts[0] <= min(counts[1:]) + 1
+    assert soft[0] in {0.5: (0,), 1.0: (0,), 3.0: (48,)}.get(share, (0, 48))
 
 
 def multiplications(cold=False, **keywords):

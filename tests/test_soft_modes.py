@@ -5,8 +5,10 @@ import pytest
 import ufl
 from dolfinx import fem
 from scenes import clamp, curved_obstacle, decomposed, displacement, forms
+from scipy.sparse import csr_array
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.dual import soft_modes
 from tfeti_dolfinx.dual.projectors import FaceFactors
 from tfeti_dolfinx.dual.soft_modes import SoftModes
 from tfeti_dolfinx.qp.faces import Status, face_of
@@ -66,6 +68,40 @@ def test_springs_cost_little(options):
         assert counted <= 2 * without
 
 
+@pytest.mark.parametrize("stiffness", [1.0, 3.0, 10.0, 30.0])
+def test_springs_as_stiff_as_subdomains_cost_nothing(monkeypatch, stiffness):
+    """Where M_f is better alone, it is left alone: at most one more than with all, or none."""
+    counted, _ = multiplications(stiffness)
+    for decided in (True, False):
+        monkeypatch.setattr(soft_modes, "_stands_out", lambda *args, answer=decided: answer)
+        assert counted <= multiplications(stiffness)[0] + 1
+
+
+@pytest.mark.parametrize("largest", [1.0, 1.8, 6.0])
+def test_the_largest_eigenvalue_decides(monkeypatch, largest):
+    """That of ĜM_fĜᵀ for motions of energy 1, here by a dense matrix; from below, by 3 steps."""
+    p = foundation(0.1)
+    p.solve()
+    M, x = p.dual.preconditioner, p.dual.d.duplicate()
+    rows = np.arange(*x.getOwnershipRange())
+    columns = np.random.default_rng(5).standard_normal((x.getSize(), 4))
+    Gt, y = csr_array(columns[rows]), x.duplicate()
+    MGt = np.empty(Gt.shape)
+    for j, column in enumerate(columns.T):
+        x.array[:] = column[rows]
+        M.mult(x, y)
+        MGt[:, j] = y.array_r
+    dense = x.getComm().tompi4py().allreduce(Gt.T @ MGt)
+    Gt = Gt * np.sqrt(largest / np.linalg.eigvalsh(dense)[-1])
+    asked = []
+    for bound in (0.7 * largest, 1.001 * largest):
+        monkeypatch.setattr(soft_modes, "LARGE", bound)
+        asked.append(soft_modes._stands_out(M, csr_array(Gt), x.duplicate()))
+    assert asked == [True, False]
+    assert M.count["soft motions"] == 2 * soft_modes.STEPS
+    p.destroy()
+
+
 def test_springs_along_one_axis():
     """As a bearing's cage: a translation and two rotations of each subdomain are left."""
     without, _ = multiplications(0.0)
@@ -119,7 +155,7 @@ def test_without_springs_nothing_is_made(monkeypatch):
 
     monkeypatch.setattr(SparseBlock, "multiply", refuse)
     monkeypatch.setattr(FaceFactors, "factor", refuse)
-    soft = SoftModes(dual.constraints.B, dual.coarse, dual.constraints.weights)
+    soft = SoftModes(dual.constraints.B, dual.coarse, dual.constraints.weights, dual.preconditioner)
     free = np.ones(dual.constraints.num_rows, dtype=bool)
     face = face_of(free, np.full(len(free), Status.FREE))
     assert soft.count == 0

@@ -121,7 +121,8 @@ class Dual:
         self.coarse = CoarseSpace(B, subdomains, normals, tangents, prefix)
         self.soft: SoftModes | None = None
         if self.preconditioner is not None:
-            self.soft = SoftModes(B, self.coarse, constraints.weights, prefix)
+            also = (constraints.weights, self.preconditioner, prefix)
+            self.soft = SoftModes(B, self.coarse, *also)
         self.contact_rows = constraints.sets.contact_rows(comm)
         self._law, self.feasible = feasible, feasible(constraints)
         self._images = dict[str, tuple[Array, Image]]()
