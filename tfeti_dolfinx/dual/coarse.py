@@ -75,7 +75,7 @@ class CoarseSpace(Projectors):
         offsets = chunk_offsets(comm, subdomains.kernel_size)
         dimension = int(offsets[-1])
         self._own = slice(int(offsets[comm.rank]), int(offsets[comm.rank + 1]))
-        Gt = transposed_G(B, subdomains.kernel_rows, self._own.start, dimension)
+        Gt = transposed_G(B, subdomains.kernel_rows, dimension)
         self.row_size = _sizes(B)
         self.bodies = Bodies(subdomains, self._own.start, dimension)
         self.J = _without_rounding(diags_array(1.0 / self.row_size) @ Gt @ self.bodies.motions)
@@ -100,8 +100,11 @@ class CoarseSpace(Projectors):
         self.bodies.update_load()
 
     def _read_load(self) -> None:
-        e = np.concatenate(self.comm.allgather(self.subdomains.kernel_load))
-        self.e = self._basis.products(e)
+        self.e = self.products(self.subdomains.kernel_load)
+
+    def products(self, part: Array) -> Array:
+        """The r-vector Tᵀy of a y in kernel coordinates, each rank with its part."""
+        return self._basis.products(np.concatenate(self.comm.allgather(part)))
 
     def under(self, b: Array) -> CoarseSpace:
         """The same space for a load b on this rank's unknowns that moves nothing free. Collective.
@@ -110,8 +113,7 @@ class CoarseSpace(Projectors):
             b: The load, shape ``(n,)``; what of it moves what nothing resists is rounding.
         """
         other, part = copy(self), self.subdomains.kernel_part(b)
-        e = self._basis.products(np.concatenate(self.comm.allgather(part)))
-        other.e = self.null.removed(e)
+        other.e = self.null.removed(self.products(part))
         return other
 
     @property
@@ -196,18 +198,25 @@ def _sizes(B: PETSc.Mat) -> Array:
     return np.where(sizes > 0.0, sizes, 1.0)
 
 
-def transposed_G(B: PETSc.Mat, kernel: csr_array, first: int, dimension: int) -> csr_array:
-    """This rank's rows of B R, with global columns; its own kernel coordinates begin at first."""
-    index = PETSc.IntType
-    columns = (kernel.indices + first).astype(index)
-    R = PETSc.Mat().createAIJ(
-        size=((kernel.shape[0], None), (kernel.shape[1], None)),
-        csr=(kernel.indptr.astype(index), columns, kernel.data),
-        comm=B.getComm(),
-    )
-    BR = B.matMult(R)
+def transposed_G(B: PETSc.Mat, kernel: csr_array, dimension: int) -> csr_array:
+    """This rank's rows of B R, with global columns. Collective."""
+    BR = products(B, kernel)
     indptr, indices, data = BR.getValuesCSR()
     Gt = csr_array((data, indices, indptr), shape=(B.getLocalSize()[0], dimension))
-    R.destroy()
     BR.destroy()
     return Gt
+
+
+def products(B: PETSc.Mat, R: csr_array) -> PETSc.Mat:
+    """B R, R the trace unknowns of this rank × columns of its own. Collective."""
+    index, comm = PETSc.IntType, B.getComm()
+    first = comm.tompi4py().exscan(R.shape[1]) or 0
+    columns = (R.indices + first).astype(index)
+    size, table = (
+        ((R.shape[0], None), (R.shape[1], None)),
+        (R.indptr.astype(index), columns, R.data),
+    )
+    matrix = PETSc.Mat().createAIJ(size=size, csr=table, comm=comm)
+    BR = B.matMult(matrix)
+    matrix.destroy()
+    return BR

@@ -20,14 +20,15 @@ from tfeti_dolfinx.parallel import agreed, chunk_offsets, summed
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.problem import FaceOperator
 from tfeti_dolfinx.subdomains.soft_motions import SoftMotions
+from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 
 class SoftModes:
-    """Ĝ of the motions that springs, or averages in clusters, hold more softly than rows would.
+    """Ĝ of the motions that springs hold more softly than rows would.
 
     Such are those with R̂ᵀKR̂ < σ‖Ĝᵀ‖², σ the mean stiffness of a scaled row: only there does F
-    stand out; of a cluster's motions it has chosen those itself. Where every subdomain has all
-    its rigid motions in the kernel there are none, and nothing is multiplied.
+    stand out. Where every subdomain has all its rigid motions in the kernel there are none, and
+    nothing is multiplied. In clusters ``ClusterMotions`` takes the place of this.
 
     Args:
         B: Dual rows × trace unknowns.
@@ -48,11 +49,9 @@ class SoftModes:
         self._comm = coarse.comm
         own = coarse.subdomains.soft_motions()
         Gt, energy, self.amplification = _springs(B, coarse, own)
-        terms = np.array([np.sum(coarse.subdomains.diagonal / weights), len(weights)])
-        stiffness, unknowns = summed(self._comm, terms)
-        sigma = stiffness / max(unknowns, 1.0)
+        sigma = mean_stiffness(coarse.subdomains, weights)
         squares = summed(self._comm, np.asarray(Gt.multiply(Gt).sum(axis=0)).ravel())
-        soft = agreed(self._comm, np.flatnonzero(energy < own.share * sigma * squares))
+        soft = agreed(self._comm, np.flatnonzero(energy < sigma * squares))
         self.count = len(soft)
         self.factors = FaceFactors(self._comm, coarse.null.extended(self.count), prefix)
         self._grams: Grams | None = None
@@ -75,6 +74,9 @@ class SoftModes:
             return on_face
         gram = csr_array(self._grams.of_face(face) + self._damping)
         return _Balanced(self._Gt, face, on_face, self.factors.factor(gram), self._energy)
+
+    def destroy(self) -> None:
+        """Nothing of PETSc is kept."""
 
 
 class _Balanced(Projectors):
@@ -118,6 +120,13 @@ class _Balanced(Projectors):
         self._on_face.destroy()
 
 
+def mean_stiffness(subdomains: Subdomains, weights: Array) -> float:
+    """σ, the mean stiffness of a row scaled with D, the weights. Collective."""
+    terms = np.array([np.sum(subdomains.diagonal / weights), len(weights)])
+    stiffness, unknowns = summed(subdomains.comm, terms)
+    return float(stiffness / max(unknowns, 1.0))
+
+
 def _springs(B: PETSc.Mat, coarse: CoarseSpace, own: SoftMotions) -> tuple[csr_array, Array, Array]:
     """This rank's rows of Ĝᵀ, with all motions outside of kernels as columns; D; amplification.
 
@@ -125,9 +134,9 @@ def _springs(B: PETSc.Mat, coarse: CoarseSpace, own: SoftMotions) -> tuple[csr_a
     """
     subdomains = coarse.subdomains
     offsets = chunk_offsets(coarse.comm, own.rows.shape[1])
-    first, total = int(offsets[coarse.comm.rank]), int(offsets[-1])
+    total = int(offsets[-1])
     if total == 0:
         return csr_array((B.getLocalSize()[0], 0)), np.zeros(0), np.zeros(subdomains.num_bodies)
     energy = np.concatenate(coarse.comm.allgather(own.energy))
-    Gt = transposed_G(B, own.rows, first, total)
+    Gt = transposed_G(B, own.rows, total)
     return Gt, energy, subdomains.body_maxima([own.amplification])[0]

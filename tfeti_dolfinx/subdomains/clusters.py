@@ -12,10 +12,11 @@ matrix beside its kernel null(G_cᵀ), and R̃ = R null(G_cᵀ) are the motions 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.sparse import block_diag, csr_array
+from scipy.sparse import block_diag, csr_array, hstack, vstack
 
 from tfeti_dolfinx.arrays import Array, joined
 from tfeti_dolfinx.subdomains.averages import Clusters
@@ -24,11 +25,29 @@ from tfeti_dolfinx.subdomains.cost import BANDWIDTH, sparse_products, sparse_tra
 from tfeti_dolfinx.subdomains.factor import REAL
 from tfeti_dolfinx.subdomains.glue import Glue
 from tfeti_dolfinx.subdomains.local import ModelledOperator
-from tfeti_dolfinx.subdomains.soft_motions import SoftMotions
 from tfeti_dolfinx.subdomains.subdomains import BALANCED, Subdomains
 
 # of the largest eigenvalue of G_cG_cᵀ: less is a motion that no average resists
 NULL = 1e-9
+
+
+@dataclass(frozen=True)
+class InnerMotions:
+    """Rigid motions R̂ of the subdomains in the clusters of a rank.
+
+    Attributes:
+        rows: R̂ on the trace, scipy CSR, shape ``(t, k)``.
+        energy: The diagonal R̂ᵀKR̂, of springs, shape ``(k,)``.
+        cluster: Cluster of each, shape ``(k,)``.
+        whole: Motions of whole clusters, R̂ whole = R̃ on the trace, shape ``(k, r̃)``.
+        amplification: As of ``SoftMotions``.
+    """
+
+    rows: csr_array
+    energy: Array
+    cluster: Array
+    whole: csr_array
+    amplification: list[float]
 
 
 class ClusteredSubdomains(Subdomains):
@@ -111,9 +130,18 @@ class ClusteredSubdomains(Subdomains):
         """R̃ᵀC, C the candidate modes of all bodies, shape ``(r̃, b * k)``."""
         return csr_array(self.null.T @ super().modes_in_kernel)
 
-    def soft_motions(self) -> SoftMotions:
-        """Motions of subdomains in their clusters that averages hold, the softer ones."""
-        return self._glue().soft_motions(len(self.blocks))
+    def inner_motions(self) -> InnerMotions:
+        """Rigid motions of the subdomains, those first that are in their kernels."""
+        R, held = super().kernel_rows, self.soft_motions()
+        rows = csr_array(hstack((R, held.rows)))
+        energy = np.concatenate((np.zeros(R.shape[1]), held.energy))
+        sizes = [part.stop - part.start for part in self.trace_parts]
+        at = np.repeat(self._clusters.of_subdomain, sizes)
+        entries = rows.tocoo()
+        cluster = np.zeros(rows.shape[1], dtype=np.int64)
+        cluster[entries.coords[1]] = at[entries.coords[0]]
+        whole = csr_array(vstack((self.null, csr_array((held.rows.shape[1], self.kernel_size)))))
+        return InnerMotions(rows, energy, cluster, whole, held.amplification)
 
     # ---------------------------------------------------------------- operators
 
@@ -142,8 +170,7 @@ class ClusteredSubdomains(Subdomains):
         """Z and W, made with K⁺ of the subdomains on the trace."""
         B, R = csr_array(self._clusters.averages[:, self.trace]), super().kernel_rows
         Y = self._responses(B, inner)
-        stiffness = np.where(self._clusters.outer[self.trace], self.diagonal, 0.0)
-        self._glued = Glue((B, Y, R), self.null, self._places(), stiffness)
+        self._glued = Glue((B, Y, R), self.null, self._places())
         return self._glued
 
     def _responses(self, B: csr_array, inner: ModelledOperator) -> csr_array:

@@ -1,0 +1,265 @@
+"""Motions of subdomains within clusters: a coarse space of the preconditioner, solved by steps.
+
+In clusters G = R̃ᵀBᵀ knows whole clusters only, and M_f, which moves one subdomain at a time, is far
+stiffer than a cluster: what jumps all over a cluster's side costs it as many faces as there are,
+the cluster one smooth displacement. With Ĝ = R̂ᵀBᵀ, R̂ the rigid motions of all subdomains, those
+take over what they can of a jump, as they do by P without clusters.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from petsc4py import PETSc
+from scipy.sparse import coo_array, csr_array, diags_array
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.dual.coarse import CoarseSpace, products
+from tfeti_dolfinx.dual.projectors import FaceFactors, Factor
+from tfeti_dolfinx.dual.smoothing import chebyshev
+from tfeti_dolfinx.dual.soft_modes import SoftModes, mean_stiffness
+from tfeti_dolfinx.errors import raised_on_all_ranks
+from tfeti_dolfinx.parallel import Exchange, summed
+from tfeti_dolfinx.qp.faces import Face
+from tfeti_dolfinx.qp.problem import FaceOperator
+from tfeti_dolfinx.subdomains.clusters import ClusteredSubdomains, InnerMotions
+from tfeti_dolfinx.subdomains.factor import CholeskyFactor
+
+# steps, and the part of the spectrum of D⁻¹ĜĜᵀ that they make small, from its top down. On rows
+# between two clusters each the top is 2 at most; where it is above, POWERS show it, MORE added.
+STEPS, RANGE, TOP = 4, 10.0, 2.0
+POWERS, MORE = 8, 1.1
+# relative, added to the diagonal of D: motions of clusters that no row of a face holds
+SHIFT = 1e-8
+
+
+class ClusterMotions:
+    """Ĝ of the rigid motions of all subdomains, in clusters.
+
+    Args:
+        B: Dual rows × trace unknowns.
+        coarse: The natural coarse space, of clusters. The constructor is collective.
+        subdomains: The clusters.
+        weights: D of the rows, on this rank's trace unknowns.
+        prefix: Prefix of the factors' PETSc options.
+
+    Attributes:
+        count: Number of these motions, of all subdomains.
+        amplification: As of ``SoftModes``.
+        factors: Makes the factors of faces, r̃ × r̃, and counts them.
+    """
+
+    def __init__(
+        self,
+        B: PETSc.Mat,
+        coarse: CoarseSpace,
+        subdomains: ClusteredSubdomains,
+        weights: Array,
+        prefix: str = "tfeti_coarse_",
+    ) -> None:
+        self._coarse, self._prefix = coarse, prefix
+        self._own: InnerMotions = subdomains.inner_motions()
+        self.amplification = subdomains.body_maxima([self._own.amplification])[0]
+        self._Gt = products(B, self._own.rows)
+        indptr, columns, values = self._Gt.getValuesCSR()
+        self.count = self._Gt.getSize()[1]
+        self._rows = csr_array((values, columns, indptr), shape=(len(indptr) - 1, self.count))
+        self._damping = self._own.energy / mean_stiffness(subdomains, weights)
+        self._contact = np.concatenate((coarse.bounded, coarse.rubbing))
+        self._always = np.ones(len(indptr) - 1, dtype=bool)
+        self._always[self._contact] = False
+        self._base = _gram(csr_array(self._rows[self._always]))
+        self.factors = FaceFactors(coarse.comm, coarse.null, prefix)
+
+    def balanced(self, face: Face, on_face: FaceOperator) -> FaceOperator:
+        """M_f with these motions. Collective.
+
+        Args:
+            face: The face.
+            on_face: M_f, which is taken over.
+
+        Raises:
+            FactorError: A factor could not be made.
+        """
+        if np.any(face.constrained[self._always]):
+            part = _gram(csr_array(face.Z.T @ self._rows))
+        else:
+            contact = csr_array(face.Z[self._contact].T @ self._rows[self._contact])
+            part = csr_array(self._base + _gram(contact))
+        whole = self.factors.factor(self._coarse.grams.of_face(face))
+        inner = _Inner(self._coarse, self._own, whole, self._assembled(part), self._prefix)
+        return _Balanced(face, on_face, self._Gt, self._own.energy, inner)
+
+    def _assembled(self, part: csr_array) -> PETSc.Mat:
+        """The sum of all ranks' parts, and what springs add. Collective."""
+        terms: coo_array = part.tocoo()
+        row, column = (i.astype(np.int64) for i in terms.coords)
+        ranges = self._Gt.getOwnershipRangesColumn()
+        owner = np.searchsorted(ranges, row, side="right") - 1
+        exchange = Exchange(self._coarse.comm, owner)
+        row, column, values = (exchange.send(x) for x in (row, column, terms.data))
+        own, first = len(self._damping), int(ranges[self._coarse.comm.rank])
+        summed_up = csr_array(coo_array((values, (row - first, column)), shape=(own, self.count)))
+        places = (np.arange(own), first + np.arange(own))
+        damping = coo_array((self._damping, places), shape=(own, self.count))
+        rows = csr_array(summed_up + damping)
+        table = (rows.indptr.astype(PETSc.IntType), rows.indices.astype(PETSc.IntType), rows.data)
+        size, comm = (own, None), self._Gt.getComm()
+        A = PETSc.Mat().createAIJ(size=(size, size), csr=table, comm=comm)
+        return A
+
+    def destroy(self) -> None:
+        """Free Ĝ. Collective."""
+        self._Gt.destroy()
+
+
+def motions_for(
+    B: PETSc.Mat, coarse: CoarseSpace, weights: Array, prefix: str
+) -> SoftModes | ClusterMotions:
+    """What M_f does not know of: soft springs, or the motions of subdomains in clusters."""
+    subdomains = coarse.subdomains
+    if isinstance(subdomains, ClusteredSubdomains):
+        return ClusterMotions(B, coarse, subdomains, weights, prefix)
+    return SoftModes(B, coarse, weights, prefix)
+
+
+class _Inner:
+    """X ≈ A⁺, A = Ĝ_fĜ_fᵀ + D/σ: Chebyshev's steps with the clusters' blocks of A.
+
+    Between them what moves whole clusters is solved for: with N their motions among those of the
+    subdomains, E = N(NᵀAN)⁺Nᵀ and Π = I − EA, X = E + Π q(D_A⁻¹ΠᵀA) D_A⁻¹ Πᵀ, which is symmetric
+    and positive definite (Nicolaides, SIAM J. Numer. Anal. 24, 1987, 355–365; Saad, section 12.3).
+
+    Args:
+        coarse: The natural coarse space.
+        own: This rank's motions.
+        whole: (NᵀAN)⁺ in the coordinates of the coarse space; taken over.
+        A: A; taken over. The constructor and ``solve`` are collective.
+        prefix: Prefix of the factor's PETSc options.
+    """
+
+    def __init__(
+        self, coarse: CoarseSpace, own: InnerMotions, whole: Factor, A: PETSc.Mat, prefix: str
+    ) -> None:
+        self._coarse, self._own, self._whole, self._A = coarse, own, whole, A
+        self._x, self._y = A.createVecs()
+        self._blocks: CholeskyFactor | None = None
+        with raised_on_all_ranks(coarse.comm):
+            if len(own.cluster):
+                self._blocks = CholeskyFactor(_blocks(A, own.cluster), prefix)
+        top = max(TOP, MORE * self._top())
+        self._steps = chebyshev(STEPS, top / RANGE, top)
+
+    def solve(self, b: Array) -> Array:
+        """X b, this rank's entries."""
+        u = self._of_clusters(b)
+        rest, change = b - self._times(u), np.zeros_like(b)
+        for k, (a, c) in enumerate(self._steps):
+            if k:
+                rest -= self._times(change)
+            s = self._solved(rest)
+            change = a * change + c * (s - self._of_clusters(self._times(s)))
+            u += change
+        return u
+
+    def _of_clusters(self, b: Array) -> Array:
+        """E b."""
+        e = self._coarse.products(self._own.whole.T @ b)
+        return np.asarray(self._own.whole @ self._coarse.local_alpha(self._whole.solve(e)))
+
+    def _solved(self, b: Array) -> Array:
+        """D_A⁻¹ b."""
+        return b if self._blocks is None else self._blocks.solve(b)
+
+    def _times(self, u: Array) -> Array:
+        """A u."""
+        self._x.array[:] = u
+        self._A.mult(self._x, self._y)
+        return np.array(self._y.array_r)
+
+    def _top(self) -> float:
+        """A Rayleigh quotient near to the largest eigenvalue of D_A⁻¹A, the same on all ranks."""
+        comm, quotient = self._coarse.comm, 0.0
+        u = np.random.default_rng(comm.rank).standard_normal(len(self._own.cluster))
+        for _ in range(POWERS):
+            Au = self._times(u)
+            s = self._solved(Au)
+            uAu, energy = summed(comm, np.array([u @ Au, s @ Au]))
+            if not (uAu > 0.0 and energy > 0.0):
+                break
+            quotient, u = float(energy / uAu), s / np.sqrt(energy)
+        return self._agreed(quotient)
+
+    def _agreed(self, value: float) -> float:
+        return float(self._coarse.comm.bcast(value, root=0))
+
+    def destroy(self) -> None:
+        """Free A and the factors. Collective."""
+        self._whole.destroy()
+        if self._blocks is not None:
+            self._blocks.destroy()
+        for item in (self._A, self._x, self._y):
+            item.destroy()
+
+
+class _Balanced:
+    """(I − ĜᵀXĜ)M_f(I − ĜᵀXĜ) + ĜᵀXDXĜ, Ĝ on the rows of a face.
+
+    For X = (ĜĜᵀ)⁺, D = 0 that is what plain TFETI has: M_f between its projectors. Whatever X is, a
+    jump that averages allow becomes forces of a displacement that has it, R̂XĜ and what M_f makes
+    of the rest, so that no eigenvalue of M F is below 1.
+    """
+
+    def __init__(
+        self, face: Face, on_face: FaceOperator, Gt: PETSc.Mat, energy: Array, inner: _Inner
+    ) -> None:
+        self._face, self._on_face, self._Gt, self._inner = face, on_face, Gt, inner
+        self._energy, self._alpha = energy, Gt.createVecRight()
+
+    def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """y = M x. Collective."""
+        rest = x.duplicate()
+        rest.array[:] = self._face.restricted(x.array_r)
+        motion = self._inner.solve(self._forces(rest))
+        self._take_away(rest, motion)
+        self._on_face.mult(rest, y)
+        y.array[:] = rest.array[:] = self._face.restricted(y.array_r)
+        self._take_away(y, self._inner.solve(self._forces(rest) - self._energy * motion))
+        rest.destroy()
+
+    def _forces(self, x: PETSc.Vec) -> Array:
+        """Ĝx for x in the face."""
+        self._Gt.multTranspose(x, self._alpha)
+        return np.array(self._alpha.array_r)
+
+    def _take_away(self, x: PETSc.Vec, motion: Array) -> None:
+        """x ← x − ZZᵀĜᵀ motion."""
+        self._alpha.array[:] = motion
+        moved = x.duplicate()
+        self._Gt.mult(self._alpha, moved)
+        x.array[:] -= self._face.restricted(moved.array_r)
+        moved.destroy()
+
+    def dependent(self, x: Array) -> Array | None:
+        """As M_f says."""
+        return self._on_face.dependent(x)
+
+    def destroy(self) -> None:
+        """Free the factors, and M_f. Collective."""
+        self._inner.destroy()
+        self._alpha.destroy()
+        self._on_face.destroy()
+
+
+def _gram(Gt: csr_array) -> csr_array:
+    return csr_array(Gt.T @ Gt)
+
+
+def _blocks(A: PETSc.Mat, cluster: Array) -> csr_array:
+    """The blocks of A between motions of one cluster each, with a shift."""
+    indptr, columns, values = A.getDiagonalBlock().getValuesCSR()
+    own = csr_array((values, columns, indptr), shape=(len(cluster),) * 2).tocoo()
+    within = cluster[own.coords[0]] == cluster[own.coords[1]]
+    places = tuple(i[within] for i in own.coords)
+    blocks = csr_array(coo_array((own.data[within], places), shape=own.shape))
+    diagonal = blocks.diagonal()
+    return csr_array(blocks + diags_array(np.where(diagonal > 0.0, SHIFT * diagonal, 1.0)))
