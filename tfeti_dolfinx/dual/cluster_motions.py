@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 from petsc4py import PETSc
+from scipy.linalg import eigvalsh_tridiagonal
 from scipy.sparse import coo_array, csr_array, diags_array
 
 from tfeti_dolfinx.arrays import Array
@@ -18,16 +19,17 @@ from tfeti_dolfinx.dual.projectors import FaceFactors, Factor
 from tfeti_dolfinx.dual.smoothing import chebyshev
 from tfeti_dolfinx.dual.soft_modes import SoftModes, mean_stiffness
 from tfeti_dolfinx.errors import raised_on_all_ranks
-from tfeti_dolfinx.parallel import Exchange, summed
+from tfeti_dolfinx.parallel import Exchange, agreed, summed
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.problem import FaceOperator
 from tfeti_dolfinx.subdomains.clusters import ClusteredSubdomains, InnerMotions
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor
 
-# steps, and the part of the spectrum of D⁻¹ĜĜᵀ that they make small, from its top down. On rows
-# between two clusters each the top is 2 at most; where it is above, POWERS show it, MORE added.
-STEPS, RANGE, TOP = 4, 10.0, 2.0
-POWERS, MORE = 8, 1.1
+# what Chebyshev's steps leave of an interval, and how far it reaches at most: 13 steps
+LEFT, WIDEST = 0.05, 50.0
+# steps of Lanczos' method for the spectrum, how far it may reach beyond what they see, and when
+# nothing is left to be seen
+SEEN, BELOW, ABOVE, NOTHING = 10, 0.8, 1.1, 1e-12
 # relative, added to the diagonal of D: motions of clusters that no row of a face holds
 SHIFT = 1e-8
 
@@ -146,8 +148,8 @@ class _Inner:
         with raised_on_all_ranks(coarse.comm):
             if len(own.cluster):
                 self._blocks = CholeskyFactor(_blocks(A, own.cluster), prefix)
-        top = max(TOP, MORE * self._top())
-        self._steps = chebyshev(STEPS, top / RANGE, top)
+        low, top = self._spectrum()
+        self._steps = chebyshev(_count(low, top), low, top)
 
     def solve(self, b: Array) -> Array:
         """X b, this rank's entries."""
@@ -176,21 +178,28 @@ class _Inner:
         self._A.mult(self._x, self._y)
         return np.array(self._y.array_r)
 
-    def _top(self) -> float:
-        """A Rayleigh quotient near to the largest eigenvalue of D_A⁻¹A, the same on all ranks."""
-        comm, quotient = self._coarse.comm, 0.0
-        u = np.random.default_rng(comm.rank).standard_normal(len(self._own.cluster))
-        for _ in range(POWERS):
-            Au = self._times(u)
-            s = self._solved(Au)
-            uAu, energy = summed(comm, np.array([u @ Au, s @ Au]))
-            if not (uAu > 0.0 and energy > 0.0):
+    def _spectrum(self) -> tuple[float, float]:
+        """An interval for the eigenvalues of D_A⁻¹ΠᵀA, as conjugate gradients show them."""
+        comm = self._coarse.comm
+        b = self._times(np.random.default_rng(comm.rank).standard_normal(len(self._own.cluster)))
+        (least,) = NOTHING * summed(comm, np.array([b @ self._solved(b)]))
+        r, p = b - self._times(self._of_clusters(b)), np.zeros_like(b)
+        sizes, steps = list[float](), list[float]()
+        for _ in range(SEEN):
+            s = self._solved(r)
+            s -= self._of_clusters(self._times(s))
+            (size,) = summed(comm, np.array([r @ s]))
+            p = s + (size / sizes[-1] if sizes else 0.0) * p
+            Ap = self._times(p)
+            (curvature,) = summed(comm, np.array([p @ Ap]))
+            if agreed(comm, not (size > least and curvature > 0.0)):
                 break
-            quotient, u = float(energy / uAu), s / np.sqrt(energy)
-        return self._agreed(quotient)
-
-    def _agreed(self, value: float) -> float:
-        return float(self._coarse.comm.bcast(value, root=0))
+            sizes.append(float(size))
+            steps.append(float(size / curvature))
+            r -= steps[-1] * Ap
+        values = agreed(comm, _ritz_values(np.array(sizes), np.array(steps)))
+        low, top = float(BELOW * values[0]), float(ABOVE * values[-1])
+        return min(max(low, top / WIDEST), 0.5 * top), top
 
     def destroy(self) -> None:
         """Free A and the factors. Collective."""
@@ -199,6 +208,22 @@ class _Inner:
             self._blocks.destroy()
         for item in (self._A, self._x, self._y):
             item.destroy()
+
+
+def _ritz_values(sizes: Array, steps: Array) -> Array:
+    """Those of conjugate gradients, ascending, from rᵀz and the lengths of steps; 1 without any."""
+    if len(sizes) == 0:
+        return np.ones(1)
+    beta, inverse = sizes[1:] / sizes[:-1], 1.0 / steps
+    diagonal = inverse + np.append(0.0, beta * inverse[:-1])
+    beside = np.sqrt(beta) * inverse[:-1]
+    return np.asarray(eigvalsh_tridiagonal(diagonal, beside))
+
+
+def _count(low: float, high: float) -> int:
+    """How many of Chebyshev's steps leave so little of an interval."""
+    root = np.sqrt(high / low)
+    return int(np.ceil(np.arccosh(1.0 / LEFT) / np.log((root + 1.0) / (root - 1.0))))
 
 
 class _Balanced:
