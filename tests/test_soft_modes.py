@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from mpi4py import MPI
 from scenes import clamp, curved_obstacle, decomposed, displacement, forms
 
 import tfeti_dolfinx as tfeti
@@ -64,6 +65,30 @@ def test_springs_cost_little(options):
         counted, soft = multiplications(stiffness, **options)
         assert soft == (6 * SUBDOMAINS if stiffness <= 1.0 else 0)
         assert counted <= 2 * without
+
+
+def test_springs_in_clusters():
+    """Their motions are among those of subdomains, which the preconditioner has in clusters."""
+    without, _ = multiplications(0.0)
+    for stiffness in (1e-3, 1.0, 1e4):
+        u, v = (displaced(foundation(stiffness, rtol=1e-8, clusters=count)) for count in (0, 4))
+        assert np.abs(u - v).max(initial=0.0) <= 1e-6 * largest(u)
+        counted, motions = multiplications(stiffness, clusters=4)
+        assert motions == 6 * SUBDOMAINS
+        assert counted <= 1.5 * without
+
+
+def displaced(p):
+    """The displacement, on this rank."""
+    p.solve()
+    u = p.solution.u.copy()
+    p.destroy()
+    return u
+
+
+def largest(u):
+    """The largest displacement of all ranks."""
+    return MPI.COMM_WORLD.allreduce(np.abs(u).max(initial=0.0), op=MPI.MAX)
 
 
 def test_springs_along_one_axis():

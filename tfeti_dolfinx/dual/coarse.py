@@ -100,11 +100,8 @@ class CoarseSpace(Projectors):
         self.bodies.update_load()
 
     def _read_load(self) -> None:
-        self.e = self.products(self.subdomains.kernel_load)
-
-    def products(self, part: Array) -> Array:
-        """The r-vector Tᵀy of a y in kernel coordinates, each rank with its part."""
-        return self._basis.products(np.concatenate(self.comm.allgather(part)))
+        e = np.concatenate(self.comm.allgather(self.subdomains.kernel_load))
+        self.e = self._basis.products(e)
 
     def under(self, b: Array) -> CoarseSpace:
         """The same space for a load b on this rank's unknowns that moves nothing free. Collective.
@@ -113,7 +110,8 @@ class CoarseSpace(Projectors):
             b: The load, shape ``(n,)``; what of it moves what nothing resists is rounding.
         """
         other, part = copy(self), self.subdomains.kernel_part(b)
-        other.e = self.null.removed(self.products(part))
+        e = self._basis.products(np.concatenate(self.comm.allgather(part)))
+        other.e = self.null.removed(e)
         return other
 
     @property
@@ -209,14 +207,16 @@ def transposed_G(B: PETSc.Mat, kernel: csr_array, dimension: int) -> csr_array:
 
 def products(B: PETSc.Mat, R: csr_array) -> PETSc.Mat:
     """B R, R the trace unknowns of this rank × columns of its own. Collective."""
-    index, comm = PETSc.IntType, B.getComm()
-    first = comm.tompi4py().exscan(R.shape[1]) or 0
-    columns = (R.indices + first).astype(index)
-    size, table = (
-        ((R.shape[0], None), (R.shape[1], None)),
-        (R.indptr.astype(index), columns, R.data),
-    )
-    matrix = PETSc.Mat().createAIJ(size=size, csr=table, comm=comm)
+    matrix = side_by_side(R, B.getComm())
     BR = B.matMult(matrix)
     matrix.destroy()
     return BR
+
+
+def side_by_side(own: csr_array, comm: PETSc.Comm) -> PETSc.Mat:
+    """A matrix with a block for each rank, which acts on nothing of the others'. Collective."""
+    index = PETSc.IntType
+    first = comm.tompi4py().exscan(own.shape[1]) or 0
+    size = ((own.shape[0], None), (own.shape[1], None))
+    table = (own.indptr.astype(index), (own.indices + first).astype(index), own.data)
+    return PETSc.Mat().createAIJ(size=size, csr=table, comm=comm)

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.sparse import block_diag, csr_array, hstack, vstack
+from scipy.sparse import block_diag, csr_array, hstack
 
 from tfeti_dolfinx.arrays import Array, joined
 from tfeti_dolfinx.subdomains.averages import Clusters
@@ -39,7 +39,8 @@ class InnerMotions:
         rows: R̂ on the trace, scipy CSR, shape ``(t, k)``.
         energy: The diagonal R̂ᵀKR̂, of springs, shape ``(k,)``.
         cluster: Cluster of each, shape ``(k,)``.
-        whole: Motions of whole clusters, R̂ whole = R̃ on the trace, shape ``(k, r̃)``.
+        whole: Motions of whole clusters, which averages leave free, in their kernels or not,
+            shape ``(k, w)``.
         amplification: As of ``SoftMotions``.
     """
 
@@ -79,17 +80,17 @@ class ClusteredSubdomains(Subdomains):
     def null(self) -> csr_array:
         """Motions of clusters, which averages leave free: a basis of ker G_cᵀ, ``(r, r̃)``."""
         if self._null is None:
-            G = (self._clusters.averages[:, self.trace] @ super().kernel_rows).T.tocsr()
-            parts = [_null_of(G[kernel][:, rows].toarray()) for rows, kernel in self._places()]
-            order = joined([kernel for _, kernel in self._places()]).astype(np.int64)
-            stacked = csr_array(block_diag(parts)) if parts else csr_array((0, 0))
-            self._null = csr_array(stacked[np.argsort(order)])
+            G = (self._clusters.averages[:, self.trace] @ super().kernel_rows).T
+            self._null = _nulls(csr_array(G), self._places())
         return self._null
 
     def _places(self) -> list[tuple[Array, Array]]:
         """Rows of B_c, and kernel coordinates of the subdomains, of each cluster."""
         sizes = [part.stop - part.start for part in self.kernel_parts]
-        owner = np.repeat(self._clusters.of_subdomain, sizes)
+        return self._of_clusters(np.repeat(self._clusters.of_subdomain, sizes))
+
+    def _of_clusters(self, owner: Array) -> list[tuple[Array, Array]]:
+        """Rows of B_c, and coordinates, of each cluster."""
         of_row = self._clusters.of_row
         return [
             (np.flatnonzero(of_row == c), np.flatnonzero(owner == c))
@@ -140,7 +141,8 @@ class ClusteredSubdomains(Subdomains):
         entries = rows.tocoo()
         cluster = np.zeros(rows.shape[1], dtype=np.int64)
         cluster[entries.coords[1]] = at[entries.coords[0]]
-        whole = csr_array(vstack((self.null, csr_array((held.rows.shape[1], self.kernel_size)))))
+        G = csr_array((self._clusters.averages[:, self.trace] @ rows).T)
+        whole = _nulls(G, self._of_clusters(cluster))
         return InnerMotions(rows, energy, cluster, whole, held.amplification)
 
     # ---------------------------------------------------------------- operators
@@ -226,6 +228,14 @@ class ClusterPinv:
     def destroy(self) -> None:
         """The factors are the Blocks'."""
         self._inner.destroy()
+
+
+def _nulls(G: csr_array, places: list[tuple[Array, Array]]) -> csr_array:
+    """null(Gᵀ) of all clusters, G of motions × averages."""
+    parts = [_null_of(G[motions][:, rows].toarray()) for rows, motions in places]
+    order = joined([motions for _, motions in places]).astype(np.int64)
+    stacked = csr_array(block_diag(parts)) if parts else csr_array((0, 0))
+    return csr_array(stacked[np.argsort(order)])
 
 
 def _null_of(G: Array) -> Array:
