@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from mpi4py import MPI
 from scenes import clamp, curved_obstacle, decomposed, displacement, forms
 from scipy.sparse import csr_array
 
@@ -100,6 +101,30 @@ def test_the_largest_eigenvalue_decides(monkeypatch, largest):
     assert asked == [True, False]
     assert M.count["soft motions"] == 2 * soft_modes.STEPS
     p.destroy()
+
+
+def test_springs_in_clusters():
+    """Their motions are among those of subdomains, which the preconditioner has in clusters."""
+    without, _ = multiplications(0.0)
+    for stiffness in (1e-3, 1.0, 1e4):
+        u, v = (displaced(foundation(stiffness, rtol=1e-8, clusters=count)) for count in (0, 4))
+        assert np.abs(u - v).max(initial=0.0) <= 1e-6 * largest(u)
+        counted, motions = multiplications(stiffness, clusters=4)
+        assert motions == 6 * SUBDOMAINS
+        assert counted <= 1.5 * without
+
+
+def displaced(p):
+    """The displacement, on this rank."""
+    p.solve()
+    u = p.solution.u.copy()
+    p.destroy()
+    return u
+
+
+def largest(u):
+    """The largest displacement of all ranks."""
+    return MPI.COMM_WORLD.allreduce(np.abs(u).max(initial=0.0), op=MPI.MAX)
 
 
 def test_springs_along_one_axis():

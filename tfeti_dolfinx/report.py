@@ -36,8 +36,8 @@ class Report:
         split_subdomains: Subdomains that were not connected and were split.
         clusters: Clusters of them that averages glue, 0 without.
         kernel_dim: Dimension of the kernel of K.
-        soft_modes: Motions of subdomains that springs, or averages in clusters, hold softly: part
-            of the preconditioner.
+        soft_modes: Motions of subdomains that springs hold softly, or all of those in clusters:
+            part of the preconditioner.
         free_modes: Rigid motions that nothing resists and the load does not drive.
         nearly_free: Rigid motions that contacts with a force hold hardly (``stiffness``: as a
             share of what the same contacts hold at most) or not at all (0): dicts of ``bodies``,
@@ -76,7 +76,8 @@ class Report:
             seconds, ``predicted`` by the model and ``measured`` (largest over ranks).
         coarse_factorizations: Factorisations of GGᵀ.
         face_factorizations: Factorisations of G_f G_fᵀ, f a face of the rows.
-        soft_factorizations: Factorisations of the coarse problem of soft motions, one for a face.
+        soft_factorizations: Factorisations of the coarse problem of soft motions, or of whole
+            clusters, one for a face.
         assemblies: Times that the stiffness was assembled.
         searches: Times that it was searched who meets whom.
         gluings: Times that rows of B were made.

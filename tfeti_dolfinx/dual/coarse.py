@@ -75,7 +75,7 @@ class CoarseSpace(Projectors):
         offsets = chunk_offsets(comm, subdomains.kernel_size)
         dimension = int(offsets[-1])
         self._own = slice(int(offsets[comm.rank]), int(offsets[comm.rank + 1]))
-        Gt = transposed_G(B, subdomains.kernel_rows, self._own.start, dimension)
+        Gt = transposed_G(B, subdomains.kernel_rows, dimension)
         self.row_size = _sizes(B)
         self.bodies = Bodies(subdomains, self._own.start, dimension)
         self.J = _without_rounding(diags_array(1.0 / self.row_size) @ Gt @ self.bodies.motions)
@@ -196,18 +196,27 @@ def _sizes(B: PETSc.Mat) -> Array:
     return np.where(sizes > 0.0, sizes, 1.0)
 
 
-def transposed_G(B: PETSc.Mat, kernel: csr_array, first: int, dimension: int) -> csr_array:
-    """This rank's rows of B R, with global columns; its own kernel coordinates begin at first."""
-    index = PETSc.IntType
-    columns = (kernel.indices + first).astype(index)
-    R = PETSc.Mat().createAIJ(
-        size=((kernel.shape[0], None), (kernel.shape[1], None)),
-        csr=(kernel.indptr.astype(index), columns, kernel.data),
-        comm=B.getComm(),
-    )
-    BR = B.matMult(R)
+def transposed_G(B: PETSc.Mat, kernel: csr_array, dimension: int) -> csr_array:
+    """This rank's rows of B R, with global columns. Collective."""
+    BR = products(B, kernel)
     indptr, indices, data = BR.getValuesCSR()
     Gt = csr_array((data, indices, indptr), shape=(B.getLocalSize()[0], dimension))
-    R.destroy()
     BR.destroy()
     return Gt
+
+
+def products(B: PETSc.Mat, R: csr_array) -> PETSc.Mat:
+    """B R, R the trace unknowns of this rank × columns of its own. Collective."""
+    matrix = side_by_side(R, B.getComm())
+    BR = B.matMult(matrix)
+    matrix.destroy()
+    return BR
+
+
+def side_by_side(own: csr_array, comm: PETSc.Comm) -> PETSc.Mat:
+    """A matrix with a block for each rank, which acts on nothing of the others'. Collective."""
+    index = PETSc.IntType
+    first = comm.tompi4py().exscan(own.shape[1]) or 0
+    size = ((own.shape[0], None), (own.shape[1], None))
+    table = (own.indptr.astype(index), (own.indices + first).astype(index), own.data)
+    return PETSc.Mat().createAIJ(size=size, csr=table, comm=comm)

@@ -9,6 +9,7 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.capacity import check_capacity, holds
+from tfeti_dolfinx.dual.cluster_motions import ClusterMotions, motions_for
 from tfeti_dolfinx.dual.coarse import CoarseSpace
 from tfeti_dolfinx.dual.face_preconditioner import FacePreconditioner
 from tfeti_dolfinx.dual.naming import listed
@@ -76,7 +77,8 @@ class Dual:
         F: B K⁺ Bᵀ.
         preconditioner: The preconditioner, or None.
         coarse: The coarse space.
-        soft: Motions that springs hold softly, for the preconditioner; None without one.
+        soft: Motions that springs hold softly, or of subdomains in clusters, for the
+            preconditioner; None without one.
         contact_rows: Number of normal and of tangential rows on all ranks.
         seen: Largest estimate of ‖F‖ that solves have come to, 0 before.
         feasible: The set Ω of multipliers.
@@ -119,10 +121,10 @@ class Dual:
         normals, tangents = constraints.sets.normals, constraints.sets.tangents.ravel()
         prefix = f"{options_prefix}coarse_"
         self.coarse = CoarseSpace(B, subdomains, normals, tangents, prefix)
-        self.soft: SoftModes | None = None
+        self.soft: SoftModes | ClusterMotions | None = None
         if self.preconditioner is not None:
             also = (constraints.weights, self.preconditioner, prefix)
-            self.soft = SoftModes(B, self.coarse, *also)
+            self.soft = motions_for(B, self.coarse, *also)
         self.contact_rows = constraints.sets.contact_rows(comm)
         self._law, self.feasible = feasible, feasible(constraints)
         self._images = dict[str, tuple[Array, Image]]()
@@ -272,7 +274,7 @@ class Dual:
     def destroy(self) -> None:
         """Destroy the PETSc objects."""
         images = [found for _, found in self._images.values()]
-        own = (self._on_all, self._on_faces, self.preconditioner, self._scaled)
+        own = (self._on_all, self._on_faces, self.soft, self.preconditioner, self._scaled)
         for item in (self.F, *own, self.coarse, self.d, *images):
             if item is not None:
                 item.destroy()

@@ -21,6 +21,7 @@ from tfeti_dolfinx.parallel import agreed, chunk_offsets, summed
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.problem import FaceOperator
 from tfeti_dolfinx.subdomains.soft_motions import SoftMotions
+from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # steps of the power method, and the eigenvalue that it finds from which on a coarse problem pays:
 # with cτ/H = 1.4 on squares, 1.8 on cubes
@@ -30,13 +31,12 @@ ROUNDING = 1e-30
 
 
 class SoftModes:
-    """Ĝ of the motions that springs, or averages in clusters, hold more softly than rows would.
+    """Ĝ of the motions that springs hold more softly than rows would.
 
-    Such are those with R̂ᵀKR̂ < σ‖Ĝᵀ‖², σ the mean stiffness of a scaled row; of a cluster's motions
-    it has chosen those itself. They make eigenvalues of M_f F up to about 1 and the largest one of
+    Such are those with R̂ᵀKR̂ < σ‖Ĝᵀ‖², σ the mean stiffness of a scaled row. They make eigenvalues of M_f F up to about 1 and the largest one of
     D⁻¹ĜM_fĜᵀ: where that is small M_f is better alone, and none of them is taken; some would be
     worse than all or none. Where every subdomain has all its rigid motions in the kernel there are
-    none, and nothing is multiplied.
+    none, and nothing is multiplied. In clusters ``ClusterMotions`` takes the place of this.
 
     Args:
         B: Dual rows × trace unknowns.
@@ -63,12 +63,10 @@ class SoftModes:
         self._comm = coarse.comm
         own = coarse.subdomains.soft_motions()
         Gt, energy, self.amplification = _springs(B, coarse, own)
-        terms = np.array([np.sum(coarse.subdomains.diagonal / weights), len(weights)])
-        stiffness, unknowns = summed(self._comm, terms)
-        sigma = stiffness / max(unknowns, 1.0)
+        sigma = mean_stiffness(coarse.subdomains, weights)
         squares = summed(self._comm, np.asarray(Gt.multiply(Gt).sum(axis=0)).ravel())
-        soft = agreed(self._comm, np.flatnonzero(energy < own.share * sigma * squares))
-        if len(soft) and np.isfinite(own.share):
+        soft = agreed(self._comm, np.flatnonzero(energy < sigma * squares))
+        if len(soft):
             scale = np.sqrt(np.maximum(energy[soft], ROUNDING * sigma * squares[soft]))
             x = B.createVecLeft()
             if not _stands_out(preconditioner, csr_array(Gt[:, soft] / scale), x):
@@ -95,6 +93,9 @@ class SoftModes:
             return on_face
         gram = csr_array(self._grams.of_face(face) + self._damping)
         return _Balanced(self._Gt, face, on_face, self.factors.factor(gram), self._energy)
+
+    def destroy(self) -> None:
+        """Nothing of PETSc is kept."""
 
 
 class _Balanced(Projectors):
@@ -160,6 +161,13 @@ def _stands_out(M: DualOperator, Gt: csr_array, x: PETSc.Vec) -> bool:
     return agreed(comm, size > LARGE)
 
 
+def mean_stiffness(subdomains: Subdomains, weights: Array) -> float:
+    """σ, the mean stiffness of a row scaled with D, the weights. Collective."""
+    terms = np.array([np.sum(subdomains.diagonal / weights), len(weights)])
+    stiffness, unknowns = summed(subdomains.comm, terms)
+    return float(stiffness / max(unknowns, 1.0))
+
+
 def _springs(B: PETSc.Mat, coarse: CoarseSpace, own: SoftMotions) -> tuple[csr_array, Array, Array]:
     """This rank's rows of Ĝᵀ, with all motions outside of kernels as columns; D; amplification.
 
@@ -167,9 +175,9 @@ def _springs(B: PETSc.Mat, coarse: CoarseSpace, own: SoftMotions) -> tuple[csr_a
     """
     subdomains = coarse.subdomains
     offsets = chunk_offsets(coarse.comm, own.rows.shape[1])
-    first, total = int(offsets[coarse.comm.rank]), int(offsets[-1])
+    total = int(offsets[-1])
     if total == 0:
         return csr_array((B.getLocalSize()[0], 0)), np.zeros(0), np.zeros(subdomains.num_bodies)
     energy = np.concatenate(coarse.comm.allgather(own.energy))
-    Gt = transposed_G(B, own.rows, first, total)
+    Gt = transposed_G(B, own.rows, total)
     return Gt, energy, subdomains.body_maxima([own.amplification])[0]

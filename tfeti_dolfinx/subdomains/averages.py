@@ -34,15 +34,12 @@ class Clusters:
         averages: B_c, scipy CSR, shape ``(a, n)``: u = v on a face as far as rigid motions of the
             face show it, for faces within a cluster; independent rows.
         of_row: Cluster of each of its rows, ascending, shape ``(a,)``.
-        outer: Flags of unknowns that are not glued to all their copies within the cluster, shape
-            ``(n,)``.
         total: Number of clusters on all ranks.
     """
 
     of_subdomain: Array
     averages: csr_array
     of_row: Array
-    outer: Array
     total: int
 
     @property
@@ -84,17 +81,7 @@ def clusters_of(dofs: TornDofs, decomposition: Decomposition, wanted: int) -> Cl
     rows = [_independent(averages, np.flatnonzero(of_row == c)) for c in range(count)]
     kept = joined(rows).astype(np.int64)
     total = dofs.comm.allreduce(count, op=MPI.SUM)
-    outer = np.repeat(_outer(dofs, cluster), dofs.bs)
-    return Clusters(cluster, csr_array(averages[kept]), of_row[kept], outer, total)
-
-
-def _outer(dofs: TornDofs, cluster: Array) -> Array:
-    """Flags of nodes that have no copy at all, or one outside of their cluster. Collective."""
-    copies = dofs.spread(dofs.multiplicity)
-    owner = cluster[np.searchsorted(dofs.subdomains, dofs.node_subdomain)]
-    places = np.stack((dofs.group, owner))
-    _, which, count = np.unique(places, axis=1, return_inverse=True, return_counts=True)
-    return np.asarray((copies == 1) | (count[which.ravel()] < copies))
+    return Clusters(cluster, csr_array(averages[kept]), of_row[kept], total)
 
 
 def _connected(pairs: Array, n: int) -> tuple[int, Array]:

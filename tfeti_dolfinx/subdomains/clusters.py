@@ -12,10 +12,11 @@ matrix beside its kernel null(G_cᵀ), and R̃ = R null(G_cᵀ) are the motions 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.sparse import block_diag, csr_array
+from scipy.sparse import block_diag, csr_array, hstack
 
 from tfeti_dolfinx.arrays import Array, joined
 from tfeti_dolfinx.subdomains.averages import Clusters
@@ -24,11 +25,30 @@ from tfeti_dolfinx.subdomains.cost import BANDWIDTH, sparse_products, sparse_tra
 from tfeti_dolfinx.subdomains.factor import REAL
 from tfeti_dolfinx.subdomains.glue import Glue
 from tfeti_dolfinx.subdomains.local import ModelledOperator
-from tfeti_dolfinx.subdomains.soft_motions import SoftMotions
 from tfeti_dolfinx.subdomains.subdomains import BALANCED, Subdomains
 
 # of the largest eigenvalue of G_cG_cᵀ: less is a motion that no average resists
 NULL = 1e-9
+
+
+@dataclass(frozen=True)
+class InnerMotions:
+    """Rigid motions R̂ of the subdomains in the clusters of a rank.
+
+    Attributes:
+        rows: R̂ on the trace, scipy CSR, shape ``(t, k)``.
+        energy: The diagonal R̂ᵀKR̂, of springs, shape ``(k,)``.
+        cluster: Cluster of each, shape ``(k,)``.
+        whole: Motions of whole clusters, which averages leave free, in their kernels or not,
+            shape ``(k, w)``.
+        amplification: As of ``SoftMotions``.
+    """
+
+    rows: csr_array
+    energy: Array
+    cluster: Array
+    whole: csr_array
+    amplification: list[float]
 
 
 class ClusteredSubdomains(Subdomains):
@@ -60,17 +80,17 @@ class ClusteredSubdomains(Subdomains):
     def null(self) -> csr_array:
         """Motions of clusters, which averages leave free: a basis of ker G_cᵀ, ``(r, r̃)``."""
         if self._null is None:
-            G = (self._clusters.averages[:, self.trace] @ super().kernel_rows).T.tocsr()
-            parts = [_null_of(G[kernel][:, rows].toarray()) for rows, kernel in self._places()]
-            order = joined([kernel for _, kernel in self._places()]).astype(np.int64)
-            stacked = csr_array(block_diag(parts)) if parts else csr_array((0, 0))
-            self._null = csr_array(stacked[np.argsort(order)])
+            G = (self._clusters.averages[:, self.trace] @ super().kernel_rows).T
+            self._null = _nulls(csr_array(G), self._places())
         return self._null
 
     def _places(self) -> list[tuple[Array, Array]]:
         """Rows of B_c, and kernel coordinates of the subdomains, of each cluster."""
         sizes = [part.stop - part.start for part in self.kernel_parts]
-        owner = np.repeat(self._clusters.of_subdomain, sizes)
+        return self._of_clusters(np.repeat(self._clusters.of_subdomain, sizes))
+
+    def _of_clusters(self, owner: Array) -> list[tuple[Array, Array]]:
+        """Rows of B_c, and coordinates, of each cluster."""
         of_row = self._clusters.of_row
         return [
             (np.flatnonzero(of_row == c), np.flatnonzero(owner == c))
@@ -111,9 +131,19 @@ class ClusteredSubdomains(Subdomains):
         """R̃ᵀC, C the candidate modes of all bodies, shape ``(r̃, b * k)``."""
         return csr_array(self.null.T @ super().modes_in_kernel)
 
-    def soft_motions(self) -> SoftMotions:
-        """Motions of subdomains in their clusters that averages hold, the softer ones."""
-        return self._glue().soft_motions(len(self.blocks))
+    def inner_motions(self) -> InnerMotions:
+        """Rigid motions of the subdomains, those first that are in their kernels."""
+        R, held = super().kernel_rows, self.soft_motions()
+        rows = csr_array(hstack((R, held.rows)))
+        energy = np.concatenate((np.zeros(R.shape[1]), held.energy))
+        sizes = [part.stop - part.start for part in self.trace_parts]
+        at = np.repeat(self._clusters.of_subdomain, sizes)
+        entries = rows.tocoo()
+        cluster = np.zeros(rows.shape[1], dtype=np.int64)
+        cluster[entries.coords[1]] = at[entries.coords[0]]
+        G = csr_array((self._clusters.averages[:, self.trace] @ rows).T)
+        whole = _nulls(G, self._of_clusters(cluster))
+        return InnerMotions(rows, energy, cluster, whole, held.amplification)
 
     # ---------------------------------------------------------------- operators
 
@@ -146,8 +176,7 @@ class ClusteredSubdomains(Subdomains):
         """Z and W, made with K⁺ of the subdomains on the trace."""
         B, R = csr_array(self._clusters.averages[:, self.trace]), super().kernel_rows
         Y = self._responses(B, inner)
-        stiffness = np.where(self._clusters.outer[self.trace], self.diagonal, 0.0)
-        self._glued = Glue((B, Y, R), self.null, self._places(), stiffness)
+        self._glued = Glue((B, Y, R), self.null, self._places())
         return self._glued
 
     def _responses(self, B: csr_array, inner: ModelledOperator) -> csr_array:
@@ -205,6 +234,14 @@ class ClusterPinv:
     def destroy(self) -> None:
         """The factors are the Blocks'."""
         self._inner.destroy()
+
+
+def _nulls(G: csr_array, places: list[tuple[Array, Array]]) -> csr_array:
+    """null(Gᵀ) of all clusters, G of motions × averages."""
+    parts = [_null_of(G[motions][:, rows].toarray()) for rows, motions in places]
+    order = joined([motions for _, motions in places]).astype(np.int64)
+    stacked = csr_array(block_diag(parts)) if parts else csr_array((0, 0))
+    return csr_array(stacked[np.argsort(order)])
 
 
 def _null_of(G: Array) -> Array:

@@ -22,14 +22,12 @@ class SoftMotions:
     Attributes:
         rows: R̂ on the trace, scipy CSR, shape ``(t, k)``.
         energy: D, shape ``(k,)``.
-        amplification: max diag(K) / min D of each Block, of springs; 0 of averages.
-        share: Of the mean stiffness of a row: what is held by less counts as soft; inf: all do.
+        amplification: max diag(K) / min D of each Block, 0 without springs.
     """
 
     rows: csr_array
     energy: Array
     amplification: list[float]
-    share: float = 1.0
 
 
 def sprung(blocks: Sequence[Block]) -> SoftMotions:
