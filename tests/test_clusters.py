@@ -359,3 +359,14 @@ def test_averages_have_no_part_in_what_clusters_give_way_to(clustered):
     size = np.abs(u).max(initial=1.0)
     assert np.abs(B @ u).max(initial=0.0) <= 1e-14 * size
     assert np.abs(subdomains.solve(free)).max(initial=0.0) <= 1e-14 * size
+
+
+def test_a_cluster_that_no_row_holds_stays_where_it_is():
+    """NᵀAN is rounding there, of any sign."""
+    d = decomposed("triangle", 8, grid(3))
+    V, a, L = forms(d.mesh, d.facet_tags, (0.0, 0.0), d.surface("top"))
+    obstacles = [tfeti.Obstacle("bottom", curved_obstacle(2, gap=0.1), reach=np.inf)]
+    p = tfeti.ContactProblem(a, L, [], obstacles, d, petsc_options={"tfeti_clusters": 1})
+    u, report = solved(p)
+    assert np.abs(u).max(initial=0.0) <= 1e-12
+    assert any("rigid motions are free" in warning for warning in report.warnings)

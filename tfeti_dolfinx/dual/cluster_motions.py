@@ -27,6 +27,9 @@ from tfeti_dolfinx.subdomains.clusters import ClusteredSubdomains, InnerMotions
 
 # relative, added to the diagonal: motions of whole clusters that no row of a face holds
 FREE = 1e-12
+# of the terms that it is the sum of, added, too: what rounding makes of motions of a body that no
+# row of a face holds
+ROUNDED = 1e-14
 
 
 class ClusterMotions:
@@ -117,7 +120,11 @@ class ClusterMotions:
         whole = replicated(csr_array(table, shape=(self._width,) * 2), self._coarse.comm)
         gram.destroy()
         diagonal = whole.diagonal()
-        return self.factors.factor(csr_array(whole + diags_array(FREE * diagonal)))
+        squares, terms = self._own.whole.multiply(self._own.whole), A.getDiagonal()
+        parts = np.concatenate(self._coarse.comm.allgather(squares.T @ terms.array_r))
+        terms.destroy()
+        shift = FREE * np.maximum(diagonal, 0.0) + ROUNDED * parts
+        return self.factors.factor(csr_array(whole + diags_array(shift)))
 
     def destroy(self) -> None:
         """Free Ĝ. Collective."""

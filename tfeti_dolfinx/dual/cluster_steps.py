@@ -137,4 +137,5 @@ def _blocks(A: PETSc.Mat, cluster: Array) -> csr_array:
     places = tuple(i[within] for i in own.coords)
     blocks = csr_array(coo_array((own.data[within], places), shape=own.shape))
     diagonal = blocks.diagonal()
-    return csr_array(blocks + diags_array(np.where(diagonal > 0.0, SHIFT * diagonal, 1.0)))
+    shift = SHIFT * np.maximum(diagonal, SHIFT * diagonal.max(initial=0.0))
+    return csr_array(blocks + diags_array(np.where(shift > 0.0, shift, 1.0)))

@@ -33,10 +33,11 @@ ROUNDING = 1e-30
 class SoftModes:
     """Ĝ of the motions that springs hold more softly than rows would.
 
-    Such are those with R̂ᵀKR̂ < σ‖Ĝᵀ‖², σ the mean stiffness of a scaled row. They make eigenvalues of M_f F up to about 1 and the largest one of
-    D⁻¹ĜM_fĜᵀ: where that is small M_f is better alone, and none of them is taken; some would be
-    worse than all or none. Where every subdomain has all its rigid motions in the kernel there are
-    none, and nothing is multiplied. In clusters ``ClusterMotions`` takes the place of this.
+    Such are those with R̂ᵀKR̂ < σ‖Ĝᵀ‖², σ the mean stiffness of a scaled row. They make eigenvalues
+    of M_f F up to about 1 and the largest one of D⁻¹ĜM_fĜᵀ: where that is small M_f is better
+    alone, and none of them is taken; some would be worse than all or none. Where every subdomain
+    has all its rigid motions in the kernel there are none, and nothing is multiplied. In clusters
+    ``ClusterMotions`` takes the place of this.
 
     Args:
         B: Dual rows × trace unknowns.
