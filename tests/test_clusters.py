@@ -363,9 +363,9 @@ def test_averages_have_no_part_in_what_clusters_give_way_to(clustered):
 
 def test_a_cluster_that_no_row_holds_stays_where_it_is():
     """NᵀAN is rounding there, of any sign."""
-    d = decomposed("triangle", 8, grid(3))
-    V, a, L = forms(d.mesh, d.facet_tags, (0.0, 0.0), d.surface("top"))
-    obstacles = [tfeti.Obstacle("bottom", curved_obstacle(2, gap=0.1), reach=np.inf)]
+    d = decomposed("tetrahedron", 6, grid(3))
+    V, a, L = forms(d.mesh, d.facet_tags, (0.0, 0.0, 0.0), d.surface("top"))
+    obstacles = [tfeti.Obstacle("bottom", curved_obstacle(3, gap=0.1), reach=np.inf)]
     p = tfeti.ContactProblem(a, L, [], obstacles, d, petsc_options={"tfeti_clusters": 1})
     u, report = solved(p)
     assert np.abs(u).max(initial=0.0) <= 1e-12
