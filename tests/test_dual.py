@@ -183,12 +183,12 @@ def test_what_a_point_lacks_has_the_resultants_of_its_forces(dual):
     moved.destroy()
 
 
-def lacked(left):
+def lacked(left, rtol=1e-10):
     """The solution of what a point lacks, and its accuracy."""
     qp, zero = left.qp(), left.d.duplicate()
     zero.set(0.0)
     start = homogenise(qp, image(qp.F, feasible_start(qp, Start(zero, np.zeros(6)))))
-    own = Accuracy(left, 1e-10, 0.0, (start.scale.reference, start.scale.rounding))
+    own = Accuracy(left, rtol, 0.0, (start.scale.reference, start.scale.rounding))
     result = newton(qp, start, own, warm=True)
     assert result.reason > 0
     return result, own
@@ -210,9 +210,12 @@ def test_what_any_point_lacks_leads_to_the_same_solution(dual, size):
     left.destroy()
 
 
-@pytest.mark.parametrize("far", [1.0, 1e5])
-def test_motions_of_subdomains_are_no_load(dual, far):
-    """From u₀ + Rα as from u₀, where K is asked about v₀ alone, which has no motions."""
+@pytest.mark.parametrize(("far", "rtol"), [(1.0, 1e-10), (1e5, 1e-8)])
+def test_motions_of_subdomains_are_no_load(dual, far, rtol):
+    """From u₀ + Rα as from u₀, where K is asked about v₀ alone, which has no motions.
+
+    Rounding of B u₀ is 1e-11 where u₀ is 1e5 times too large, and no answer is better than that.
+    """
     known, rule = solve_dual(dual, Options(rtol=1e-10), "newton")
     subdomains, most = dual.subdomains, rule.measures.bodies.size.max()
     rng = np.random.default_rng(dual.coarse.comm.rank)
@@ -221,8 +224,8 @@ def test_motions_of_subdomains_are_no_load(dual, far):
     assert np.abs(subdomains.kernel_part(v)).max(initial=0.0) <= 1e-13 * most * len(v)
     alpha = far * most * rng.standard_normal(subdomains.kernel_size)
     left = Remainder(dual, known.lam.array_r, u + subdomains.kernel_motion(alpha), v)
-    result, own = lacked(left)
-    assert np.abs(own.u - rule.u).max(initial=0.0) <= 1e-8 * most
+    result, own = lacked(left, rtol)
+    assert np.abs(own.u - rule.u).max(initial=0.0) <= 100.0 * rtol * most
     bent = at_rest(subdomains, rule.u)
-    assert np.abs(left.at_rest(result.lam) - bent).max(initial=0.0) <= 1e-8 * most
+    assert np.abs(left.at_rest(result.lam) - bent).max(initial=0.0) <= 100.0 * rtol * most
     left.destroy()
