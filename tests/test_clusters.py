@@ -168,7 +168,7 @@ def test_motions_within_clusters_are_nearly_solved_for(clustered):
     dual, rows = clustered.dual, clustered.dual.constraints.num_rows
     face = face_of(np.ones(rows, dtype=bool), np.full(rows, Status.FREE))
     balanced = dual._preconditioner_on(face)
-    inner, alpha = balanced._inner, balanced._alpha
+    inner, alpha = balanced._part._inner, balanced._part._alpha
     assert dual.soft.count == alpha.getSize() == 3 * clustered.report.subdomains
 
     def mult(x, y):
@@ -233,7 +233,9 @@ def test_hooks_cost_hardly_more(serial_only, monkeypatch):
     _, plain = solved(square(16, 4))
     _, report = solved(square(16, 4, clusters=2))
     assert report.clusters == 2
-    assert report.F_multiplications <= 1.3 * plain.F_multiplications + 1
+    # conjugate gradient steps; how many faces there are, one F each, is rounding's choice here
+    assert report.preconditioner_multiplications <= 1.3 * plain.preconditioner_multiplications
+    assert report.F_multiplications <= 1.3 * plain.F_multiplications + 2
 
 
 def test_subdomains_of_a_body_that_hang_together_elsewhere(serial_only):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse
@@ -82,7 +83,7 @@ def matrix(operator, rows=n):
 
 def test_large_eigenvalues_are_found_and_taken_away():
     qp, F, M = program()
-    slow = SlowDirections()
+    slow = SlowDirections(MPI.COMM_SELF)
     first, found = solved(qp, M, slow, all_free())
     assert found == slow.count == len(HIGHEST)
     operator = matrix(slow.beside(Diagonal(M, all_free()), all_free()))
@@ -99,7 +100,11 @@ def test_large_eigenvalues_are_found_and_taken_away():
 
 def test_they_help_on_another_face_and_stay_positive_definite():
     qp, _, M = program()
-    slow, fresh, other = SlowDirections(), SlowDirections(), all_free(but=range(3))
+    slow, fresh, other = (
+        SlowDirections(MPI.COMM_SELF),
+        SlowDirections(MPI.COMM_SELF),
+        all_free(but=range(3)),
+    )
     solved(qp, M, slow, all_free())
     operator = matrix(slow.beside(Diagonal(M, other), other))[3:, 3:]
     assert np.abs(operator - operator.T).max() <= 1e-10
@@ -110,7 +115,7 @@ def test_they_help_on_another_face_and_stay_positive_definite():
 @pytest.mark.parametrize("seed", range(20))
 def test_whatever_is_held_then_what_they_make_is_positive_definite(seed):
     qp, _, M = program([20.0] * 3 + [250.0] * 2)
-    slow = SlowDirections()
+    slow = SlowDirections(MPI.COMM_SELF)
     solved(qp, M, slow, all_free())
     held = np.random.default_rng(seed).choice(n, 40, replace=False)
     face, free = all_free(but=held), np.setdiff1d(np.arange(n), held)
@@ -122,7 +127,7 @@ def test_whatever_is_held_then_what_they_make_is_positive_definite(seed):
 
 def test_where_nothing_is_slow_nothing_is_kept():
     qp, _, M = program([])
-    slow = SlowDirections()
+    slow = SlowDirections(MPI.COMM_SELF)
     assert solved(qp, M, slow, all_free())[1] == 0
     inner = Diagonal(M, all_free())
     assert slow.beside(inner, all_free()) is inner
@@ -130,17 +135,17 @@ def test_where_nothing_is_slow_nothing_is_kept():
 
 def test_values_below_the_threshold_are_not_slow():
     qp, _, M = program([0.99 * HIGH])
-    assert solved(qp, M, SlowDirections(), all_free())[1] == 0
+    assert solved(qp, M, SlowDirections(MPI.COMM_SELF), all_free())[1] == 0
 
 
 def test_where_the_preconditioner_is_bad_altogether_nothing_is_kept():
     qp, _, M = program([30.0, 1.1 * WRONG])
-    assert solved(qp, M, SlowDirections(), all_free())[1] == 0
+    assert solved(qp, M, SlowDirections(MPI.COMM_SELF), all_free())[1] == 0
 
 
 def test_what_was_kept_goes_where_the_preconditioner_turns_out_to_be_bad_altogether():
     (qp, _, M), (worse, _, _) = program(), program([1.1 * WRONG, *HIGHEST])
-    slow = SlowDirections()
+    slow = SlowDirections(MPI.COMM_SELF)
     assert solved(qp, M, slow, all_free())[1] == slow.count == len(HIGHEST)
     assert solved(worse, M, slow, all_free())[1] == slow.count == 0
     inner = Diagonal(M, all_free())
@@ -151,4 +156,4 @@ def test_what_was_kept_goes_where_the_preconditioner_turns_out_to_be_bad_altoget
 @pytest.mark.parametrize("status", [Status.STICK, Status.SLIP])
 def test_nothing_is_kept_where_points_stick_or_slip(status):
     qp, _, M = program()
-    assert solved(qp, M, SlowDirections(), all_free(status=status))[1] == 0
+    assert solved(qp, M, SlowDirections(MPI.COMM_SELF), all_free(status=status))[1] == 0

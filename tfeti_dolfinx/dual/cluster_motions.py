@@ -21,6 +21,7 @@ from tfeti_dolfinx.dual.operator import DualOperator
 from tfeti_dolfinx.dual.projectors import FaceFactors, Factor
 from tfeti_dolfinx.dual.soft_modes import SoftModes, mean_stiffness
 from tfeti_dolfinx.parallel import Exchange
+from tfeti_dolfinx.qp.balanced import Balanced
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.problem import FaceOperator
 from tfeti_dolfinx.subdomains.clusters import ClusteredSubdomains, InnerMotions
@@ -90,7 +91,7 @@ class ClusterMotions:
             part = csr_array(self._base + _gram(contact))
         A = self._assembled(part)
         inner = ClusterSteps(self._coarse.comm, self._own, self._of_clusters(A), A, self._prefix)
-        return _Balanced(face, on_face, self._Gt, self._own.energy, inner)
+        return Balanced(on_face, _Inner(face, self._Gt, self._own.energy, inner))
 
     def _assembled(self, part: csr_array) -> PETSc.Mat:
         """The sum of all ranks' parts, and what springs add. Collective."""
@@ -142,53 +143,43 @@ def motions_for(
     return SoftModes(B, coarse, weights, preconditioner, prefix)
 
 
-class _Balanced:
-    """(I − ĜᵀXĜ)M_f(I − ĜᵀXĜ) + ĜᵀXDXĜ, Ĝ on the rows of a face.
+class _Inner:
+    """Y = ZZᵀĜᵀ, C = XYᵀ, X of ``ClusterSteps``.
 
     For X = (ĜĜᵀ)⁺, D = 0 that is what plain TFETI has: M_f between its projectors. Whatever X is, a
     jump that averages allow becomes forces of a displacement that has it, R̂XĜ and what M_f makes
     of the rest, so that no eigenvalue of M F is below 1.
     """
 
-    def __init__(
-        self, face: Face, on_face: FaceOperator, Gt: PETSc.Mat, energy: Array, inner: ClusterSteps
-    ) -> None:
-        self._face, self._on_face, self._Gt, self._inner = face, on_face, Gt, inner
-        self._energy, self._alpha = energy, Gt.createVecRight()
+    def __init__(self, face: Face, Gt: PETSc.Mat, energy: Array, inner: ClusterSteps) -> None:
+        self._face, self._Gt, self._inner, self.energy = face, Gt, inner, energy
+        self._alpha, self._x = Gt.createVecs()
 
-    def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = M x. Collective."""
-        rest = x.duplicate()
-        rest.array[:] = self._face.restricted(x.array_r)
-        motion = self._inner.solve(self._forces(rest))
-        self._take_away(rest, motion)
-        self._on_face.mult(rest, y)
-        y.array[:] = rest.array[:] = self._face.restricted(y.array_r)
-        self._take_away(y, self._inner.solve(self._forces(rest) - self._energy * motion))
-        rest.destroy()
+    def coordinates(self, x: Array) -> Array:
+        """C x."""
+        return self._inner.solve(self.moved(x))
 
-    def _forces(self, x: PETSc.Vec) -> Array:
-        """Ĝx for x in the face."""
-        self._Gt.multTranspose(x, self._alpha)
+    def forces(self, c: Array) -> Array:
+        """Y c."""
+        self._alpha.array[:] = c
+        self._Gt.mult(self._alpha, self._x)
+        return self._face.restricted(self._x.array_r)
+
+    def moved(self, y: Array) -> Array:
+        """Yᵀ y."""
+        self._x.array[:] = self._face.restricted(y)
+        self._Gt.multTranspose(self._x, self._alpha)
         return np.array(self._alpha.array_r)
 
-    def _take_away(self, x: PETSc.Vec, motion: Array) -> None:
-        """x ← x − ZZᵀĜᵀ motion."""
-        self._alpha.array[:] = motion
-        moved = x.duplicate()
-        self._Gt.mult(self._alpha, moved)
-        x.array[:] -= self._face.restricted(moved.array_r)
-        moved.destroy()
-
-    def dependent(self, x: Array) -> Array | None:
-        """As M_f says."""
-        return self._on_face.dependent(x)
+    def directions(self, c: Array) -> Array:
+        """Cᵀ c."""
+        return self.forces(self._inner.solve(c))
 
     def destroy(self) -> None:
-        """Free the factors, and M_f. Collective."""
+        """Free the factors. Collective."""
         self._inner.destroy()
         self._alpha.destroy()
-        self._on_face.destroy()
+        self._x.destroy()
 
 
 def _gram(Gt: csr_array) -> csr_array:

@@ -15,9 +15,10 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace, transposed_G
 from tfeti_dolfinx.dual.grams import Grams
 from tfeti_dolfinx.dual.operator import DualOperator
-from tfeti_dolfinx.dual.projectors import FaceFactors, Projectors
+from tfeti_dolfinx.dual.projectors import FaceFactors
 from tfeti_dolfinx.dual.semidefinite import SemidefiniteFactor
 from tfeti_dolfinx.parallel import agreed, chunk_offsets, summed
+from tfeti_dolfinx.qp.balanced import Balanced
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.problem import FaceOperator
 from tfeti_dolfinx.subdomains.soft_motions import SoftMotions
@@ -93,51 +94,44 @@ class SoftModes:
         if self._grams is None:
             return on_face
         gram = csr_array(self._grams.of_face(face) + self._damping)
-        return _Balanced(self._Gt, face, on_face, self.factors.factor(gram), self._energy)
+        springs = _Springs(self._Gt, face, self.factors.factor(gram), self._energy)
+        return Balanced(on_face, springs)
 
     def destroy(self) -> None:
         """Nothing of PETSc is kept."""
 
 
-class _Balanced(Projectors):
-    """(I − Π)M_f(I − Π) + CᵀDC, Π = [G; Ĝ]ᵀC, C = ([G; Ĝ][G; Ĝ]ᵀ + [0 0; 0 D/σ])⁻¹[G; Ĝ].
+class _Springs:
+    """Y = [G; Ĝ]ᵀ, C = ([G; Ĝ][G; Ĝ]ᵀ + [0 0; 0 D/σ])⁻¹[G; Ĝ]: CFCᵀ is taken for D⁻¹.
 
-    Mandel, Comm. Numer. Methods Engrg. 9 (1993) 233–241, with an inexact coarse problem: CF Cᵀ is
-    taken for D⁻¹. Where springs are soft it nearly is; where they are not, C is small. On faces
-    [G; Ĝ] may lack rank: what is left free Cᵀ does not see.
+    Where springs are soft it nearly is; where they are not, C is small. On faces [G; Ĝ] may lack
+    rank: what is left free Cᵀ does not see.
     """
 
     def __init__(
-        self,
-        Gt: csr_array,
-        face: Face,
-        on_face: FaceOperator,
-        factor: SemidefiniteFactor,
-        energy: Array,
+        self, Gt: csr_array, face: Face, factor: SemidefiniteFactor, energy: Array
     ) -> None:
-        self.comm, self.Gt, self.e = factor.comm, Gt, np.zeros(Gt.shape[1])
-        self._face, self._on_face, self._factor, self._energy = face, on_face, factor, energy
+        self._Gt, self._face, self._factor, self.energy = Gt, face, factor, energy
 
-    def restricted(self, x: Array) -> Array:
-        """ZZᵀx."""
-        return self._face.restricted(x)
+    def coordinates(self, x: Array) -> Array:
+        """C x."""
+        return self._factor.solve(self.moved(x))
 
-    def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = M x. Collective; two reductions besides those of M_f."""
-        motion, rest = self.coordinates(x), x.copy()
-        self._take_away(rest, motion)
-        self._on_face.mult(rest, y)
-        rest.destroy()
-        self._take_away(y, self.solve(self.G(y.array_r) - self._energy * motion))
+    def forces(self, c: Array) -> Array:
+        """[G; Ĝ]ᵀ c."""
+        return self._face.restricted(self._Gt @ c)
 
-    def dependent(self, x: Array) -> Array | None:
-        """As M_f says."""
-        return self._on_face.dependent(x)
+    def moved(self, y: Array) -> Array:
+        """[G; Ĝ] y."""
+        return summed(self._factor.comm, self._Gt.T @ self._face.restricted(y))
+
+    def directions(self, c: Array) -> Array:
+        """Cᵀ c."""
+        return self.forces(self._factor.solve(c))
 
     def destroy(self) -> None:
-        """Free the factors."""
-        super().destroy()
-        self._on_face.destroy()
+        """Free the factor."""
+        self._factor.destroy()
 
 
 def _stands_out(M: DualOperator, Gt: csr_array, x: PETSc.Vec) -> bool:

@@ -78,7 +78,7 @@ class FaceSolver:
         self._qp, self._rule, self._parameters = qp, rule, parameters
         self._steps, self._max_it, self._monitor = steps, max_it, monitor
         self._comm = qp.d.getComm().tompi4py()
-        self._directions, self._slow = Directions(qp.d), SlowDirections()
+        self._directions, self._slow = Directions(qp.d), SlowDirections(self._comm)
         self._directions.norm = qp.seen
         self.dependent = DependentRows(qp, self._directions)
         self._face: Face | None = None

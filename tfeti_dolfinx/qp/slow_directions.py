@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from petsc4py import PETSc
+from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.parallel import agreed, any_rank, summed
+from tfeti_dolfinx.qp.balanced import Balanced
 from tfeti_dolfinx.qp.directions import Conjugates
 from tfeti_dolfinx.qp.faces import Face, Status
 from tfeti_dolfinx.qp.problem import FaceOperator
@@ -31,11 +32,15 @@ class SlowDirections:
     another face holds some of their rows V is only near to what it was, but what is made of it
     remains a preconditioner.
 
+    Args:
+        comm: Communicator.
+
     Attributes:
         count: Their number.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, comm: MPI.Intracomm) -> None:
+        self._comm = comm
         self._V, self._FV = (np.zeros((0, 0)) for _ in range(2))
         self._wrong = False
 
@@ -54,9 +59,9 @@ class SlowDirections:
         Returns:
             How many have come.
         """
-        if self._wrong or any_rank(kept.comm, bool(np.any(face.status >= Status.STICK))):
+        if self._wrong or any_rank(self._comm, bool(np.any(face.status >= Status.STICK))):
             return 0
-        largest, parts = agreed(kept.comm, kept.ritz_vectors(HIGH, LOOSE))
+        largest, parts = agreed(self._comm, kept.ritz_vectors(HIGH, LOOSE))
         if largest > WRONG:
             self._wrong = True
             self._V, self._FV = (np.zeros((0, 0)) for _ in range(2))
@@ -66,11 +71,11 @@ class SlowDirections:
         if self.count == 0:
             self._V, self._FV = np.zeros((0, V.shape[1])), np.zeros((0, V.shape[1]))
         for _ in range(2):
-            a = summed(kept.comm, V @ self._FV.T)
+            a = summed(self._comm, V @ self._FV.T)
             V, FV = V - a @ self._V, FV - a @ self._FV
-        energies, Q = np.linalg.eigh(summed(kept.comm, V @ FV.T))
+        energies, Q = np.linalg.eigh(summed(self._comm, V @ FV.T))
         new = energies > NEW
-        Q = agreed(kept.comm, Q[:, new] / np.sqrt(energies[new]))
+        Q = agreed(self._comm, Q[:, new] / np.sqrt(energies[new]))
         self._V = np.concatenate((self._V, Q.T @ V))[-MOST:]
         self._FV = np.concatenate((self._FV, Q.T @ FV))[-MOST:]
         return int(Q.shape[1])
@@ -82,33 +87,40 @@ class SlowDirections:
             on_face: M_f, which is taken over.
             face: The face.
         """
-        return _Beside(on_face, face, self._V, self._FV) if self.count else on_face
+        if self.count == 0:
+            return on_face
+        return Balanced(on_face, _Slow(self._comm, face, self._V, self._FV))
 
 
-class _Beside:
-    """(I − V(FV)ᵀ) M_f (I − FV Vᵀ) + V Vᵀ, V and FV as far as they lie in a face.
+class _Slow:
+    """C = V, Y = (FV)ᵀ, D = I, V and FV as far as they lie in a face.
 
-    Mandel, Comm. Numer. Methods Engrg. 9 (1993) 233–241. Positive definite whatever V and FV are,
-    and for FV = F V the inverse of F on V.
+    Args:
+        comm: Communicator.
+        face: The face.
+        V: Directions, shape ``(k, m)``, m on this rank.
+        FV: Their images.
     """
 
-    def __init__(self, on_face: FaceOperator, face: Face, V: Array, FV: Array) -> None:
-        self._on_face, self._face, self._V, self._FV = on_face, face, V, FV
+    def __init__(self, comm: MPI.Intracomm, face: Face, V: Array, FV: Array) -> None:
+        self._comm, self._face, self._V, self._FV = comm, face, V, FV
+        self.energy = np.ones(len(V))
 
-    def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = M x, x in the face. Collective; two reductions besides those of M_f."""
-        comm, rest = x.getComm().tompi4py(), x.copy()
-        on = summed(comm, self._V @ x.array_r)
-        rest.array[:] -= self._face.restricted(on @ self._FV)
-        self._on_face.mult(rest, y)
-        rest.destroy()
-        of = summed(comm, self._FV @ y.array_r)
-        y.array[:] += self._face.restricted((on - of) @ self._V)
+    def coordinates(self, x: Array) -> Array:
+        """V x."""
+        return summed(self._comm, self._V @ x)
 
-    def dependent(self, x: Array) -> Array | None:
-        """As M_f says."""
-        return self._on_face.dependent(x)
+    def forces(self, c: Array) -> Array:
+        """(FV)ᵀ c."""
+        return self._face.restricted(c @ self._FV)
+
+    def moved(self, y: Array) -> Array:
+        """FV y."""
+        return summed(self._comm, self._FV @ y)
+
+    def directions(self, c: Array) -> Array:
+        """Vᵀ c."""
+        return self._face.restricted(c @ self._V)
 
     def destroy(self) -> None:
-        """Free M_f. Collective."""
-        self._on_face.destroy()
+        """Nothing of PETSc is kept."""
