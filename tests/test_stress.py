@@ -10,10 +10,11 @@ from benchmarks.stress import judge, meshes
 from benchmarks.stress.__main__ import main
 from benchmarks.stress.equilibrium import has_none
 from benchmarks.stress.ladders import floor, ladder_scenes, two_bodies
-from benchmarks.stress.package import solve_scene
+from benchmarks.stress.package import Outcome, solve_scene
 from benchmarks.stress.random_scenes import random_scene
 from benchmarks.stress.reference import Untorn
 from benchmarks.stress.scene import Body, Load, Scene, Wall
+from tfeti_dolfinx.errors import TfetiError
 
 # 237: no load; 314: a far row is kept, however uncertain its normal; 608: rows of a stiff side on a
 # few soft nodes; 798: u is rounding of points; 913: rows that are rounding of normals of tiny
@@ -217,3 +218,20 @@ def test_a_process_that_dies_is_a_row(serial_only, tmp_path):
     assert rows[1]["class"] == "DEATH"
     assert "ValueError" in rows[1]["error"]
     assert (tmp_path / "stress.md").read_text().startswith("| class | scenes |")
+
+
+def test_every_error_of_the_package_is_a_named_one():
+    """Not those of its conformance checks, which no solve makes."""
+    own = {kind.__name__ for kind in TfetiError.__subclasses__()} - {"ConformanceError"}
+    assert own | {"TfetiError"} == set(judge.NAMED)
+
+
+@pytest.mark.parametrize("kind", ["FactorError", "ConvergenceError"])
+def test_a_named_error_is_no_crash(kind):
+    scene = two_bodies("triangle", 1.0, 1.0)
+    g = meshes.grid(scene)
+    mu, lmbda = meshes.materials(scene, g, np.zeros(len(g.cells), dtype=int))
+    found = judge.judged(scene, g, Outcome(error=f"{kind}: why", mu=mu, lmbda=lmbda))
+    assert found["class"] == "not converged"
+    assert judge.judged(scene, g, Outcome(error=f"{kind}: why"))["class"] == "refused"
+    assert judge.judged(scene, g, Outcome(error="IndexError: why"))["class"] == "CRASH"

@@ -9,12 +9,16 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array, joined, sums
 from tfeti_dolfinx.dual.dual import Dual
+from tfeti_dolfinx.dual.naming import parts_of_motions
+from tfeti_dolfinx.dual.rests_on_friction import FAR, lost_on_friction
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mesh.quality import flatness
 from tfeti_dolfinx.mesh.sharing import shared_by_bodies
 from tfeti_dolfinx.parallel import agreed
 from tfeti_dolfinx.report import Report
+from tfeti_dolfinx.solution import Solution
+from tfeti_dolfinx.subdomains.kernel import mode_names
 from tfeti_dolfinx.subdomains.stiffness import stretch_over_shear
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
@@ -46,20 +50,22 @@ class Doubts:
         self._of: Dual | None = None
         self._lasting: list[str] = []
 
-    def found(self, dual: Dual, u: Array, report: Report, rtol: float) -> list[str]:
+    def found(self, dual: Dual, solution: Solution, report: Report, rtol: float) -> list[str]:
         """Sentences, each of which names the thing. Collective.
 
         Args:
             dual: The dual problem.
-            u: This rank's displacement, shape ``(n,)``.
+            solution: What was found.
             report: What is known already.
             rtol: The relative tolerance that was asked for.
         """
         if self._of is not dual:
             lasting = (self._cells(), self._locking(dual.subdomains), self._hinges())
             self._lasting, self._of = [text for texts in lasting for text in texts], dual
+        u = solution.u
         return [
             *_loose(report),
+            *self._on_friction(dual, u, solution.lam, rtol),
             *self._rounding(dual, u, rtol),
             *self._springs(dual, rtol),
             *self._turned(u, dual.subdomains),
@@ -102,6 +108,26 @@ class Doubts:
                 f"{(t - 2.0) / (2.0 * t - 2.0):.4g} and displacements have degree 1, which makes "
                 "it too stiff (locking); expected degree 2"
             )
+
+    def _on_friction(self, dual: Dual, u: Array, lam: Array, rtol: float) -> Iterator[str]:
+        """Bodies that friction alone holds, but somewhere else."""
+        if dual.contact_rows[1] == 0:
+            return
+        lost = lost_on_friction(dual.coarse, dual.constraints, u, lam, rtol)
+        if lost is None:
+            return
+        modes = mode_names(self._decomposition.mesh.geometry.dim, self._dofs.bs)
+        names = self._decomposition.body_names
+        found = list(parts_of_motions(lost.motions, dual.coarse.bodies, names, modes))
+        for (bodies, mode), share in list(zip(found, lost.share, strict=True))[:LISTED]:
+            yield (
+                f"{', '.join(bodies)}: friction alone holds {mode}, by {share:.0e} of the largest "
+                "load at most, and does not balance the load where the body is: its displacement "
+                f"is wrong along that by more than {FAR:g} rtol, or not determined; expected a "
+                "larger bound or coefficient of friction, or a spring or Dirichlet condition"
+            )
+        if (rest := len(found) - LISTED) > 0:
+            yield f"{rest} more motions that friction alone holds are wrong, or not determined"
 
     def _rounding(self, dual: Dual, u: Array, rtol: float) -> Iterator[str]:
         """Bodies that bend so easily beside what their cells could hold that K's rounding shows.

@@ -271,7 +271,7 @@ class ContactProblem(Stepping):
         self._start = (gluing, solution.lam, result.mu) if result.reason > 0 else None
         fill_result(report, solution, dual, *solved)
         report.estimates = of_looks(accuracy.reached)
-        report.warnings = self._doubts.found(dual, solution.u, report, self.options.number)
+        report.warnings = self._doubts.found(dual, solution, report, self.options.number)
         report.excluding_contacts = system.search.named(gluing.contacts_of(result.excluding))
         result.destroy()
         d = self.decomposition

@@ -18,7 +18,7 @@ RIGHT = 1e-4  # error of u that must hold at rtol 1e-6
 OF_LOAD = 1e-2  # contact forces below are small
 OF_NOISE = 100.0  # beyond what rounding in K explains
 
-NAMED = ("InputError", "NoSolutionError", "ConvergenceError", "TfetiError")
+NAMED = ("InputError", "NoSolutionError", "ConvergenceError", "FactorError", "TfetiError")
 
 
 def run_scene(scene: Scene, comm: MPI.Intracomm) -> dict[str, Any]:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from scipy.linalg import qr
+from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.bodies import Bodies
@@ -43,6 +44,15 @@ def _parts(amounts: Array, mode_names: Sequence[str]) -> tuple[Array, str]:
     share = parts[moving].max(axis=0)
     modes = " and ".join(mode_names[m] for m in np.flatnonzero(share > DOMINANT * share.max()))
     return moving, modes
+
+
+def parts_of_motions(
+    motions: csr_array, bodies: Bodies, body_names: Sequence[str], mode_names: Sequence[str]
+) -> Iterator[tuple[list[str], str]]:
+    """Names of the bodies that take part in each column, and what it is mostly."""
+    for motion in motions.toarray().T:
+        moving, mode = _parts(bodies.amounts(motion), mode_names)
+        yield [body_names[b] for b in moving[:NAMED]], mode
 
 
 def listed(

@@ -86,7 +86,7 @@ def smallest_motion(
     Returns:
         Shape ``(r,)``.
     """
-    N, body = agreed(coarse.comm, _orthonormal(motions, coarse.bodies.k))
+    N, body = agreed(coarse.comm, orthonormal(motions, coarse.bodies.k))
     wanted = -(N.T @ coarse.bodies.part_of(u))
     size = float(np.abs(wanted).max(initial=0.0))
     rows = _rows(coarse, csr_array(coarse.J @ N), gap / coarse.row_size, force, body)
@@ -102,7 +102,7 @@ def smallest_motion(
     return np.asarray(coarse.motions @ (N @ (rows.allowed(y, EXCESS * size, coarse.comm) * y)))
 
 
-def _orthonormal(motions: Motions, k: int) -> tuple[csr_array, Array]:
+def orthonormal(motions: Motions, k: int) -> tuple[csr_array, Array]:
     """Orthonormal basis of the motions, and a body of each."""
     alone, joint = motions.alone, motions.joint
     body = np.repeat(np.arange(len(motions.free)), motions.free.sum(axis=1))
