@@ -158,6 +158,16 @@ def test_rounding_is_called_so(monkeypatch):
     assert error(p, direct(*scene), np.array([2.0, 1.0])) <= 1e-11
 
 
+@pytest.mark.parametrize("contacts", [0, 1])
+def test_rtol_0_asks_for_all_digits(contacts):
+    scene = (12, 6), (2.0, 1.0), checkerboard(1e3), 0.3, (0.0, 1e-3)
+    p = torn(*scene, 4, [floor(1.0)] * contacts, tfeti_rtol=0)
+    p.solve()
+    assert p.report.converged_reason == "CONVERGED_RTOL"
+    assert error(p, direct(*scene), np.array([2.0, 1.0])) <= 1e-11
+    assert any("rounding of the stiffness" in warning for warning in p.report.warnings)
+
+
 @pytest.mark.parametrize("length", [2.0, 4000.0])
 def test_an_error_says_what_is_hard(length):
     """What the report warns of is in the message of a solve that ends early, too."""
