@@ -72,8 +72,12 @@ def real_numbers(values: Any) -> Array:
 
     Raises:
         TypeError: They are no real numbers.
+        ValueError: They are texts.
     """
-    return np.asarray(values).astype(float, casting="same_kind")
+    array = np.asarray(values)
+    if np.iscomplexobj(array):
+        raise TypeError("complex numbers; expected real ones")
+    return np.asarray(array, dtype=float)
 
 
 def checked_flag(value: Any, what: str) -> bool:

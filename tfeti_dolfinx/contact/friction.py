@@ -11,7 +11,7 @@ import ufl
 from dolfinx import fem
 
 from tfeti_dolfinx.arrays import Array, ArrayLike
-from tfeti_dolfinx.checks import Range, checked_number, checked_type, real_numbers, shown
+from tfeti_dolfinx.checks import Range, checked_number, checked_type, shown
 from tfeti_dolfinx.contact.records import ContactRecords, Friction
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -236,7 +236,7 @@ def _checked_values(what: str, value: Any, x: Array) -> Array:
     """A number, a function of points, or values at them: one for each point."""
     if callable(value):
         try:
-            value = real_numbers(value(x.T))
+            value = np.asarray(value(x.T)).astype(float, casting="same_kind")
             value = np.broadcast_to(value, (len(x),))
         except Exception as error:  # a user's function may raise anything
             raise InputError(
