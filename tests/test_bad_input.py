@@ -12,7 +12,7 @@ from petsc4py import PETSc
 from scenes import box, decomposed, forms, hooke, problem, strain
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx import InputError, compat
+from tfeti_dolfinx import InputError, NoSolutionError, compat
 from tfeti_dolfinx.errors import TfetiError, raised_on_all_ranks
 
 ROOT = MPI.COMM_WORLD.rank == 0
@@ -95,6 +95,13 @@ def test_a_load_that_is_nan():
     d = decomposed("hexahedron", 2, 2)
     p = problem(d, (0.0, 0.0, float("nan")))
     with pytest.raises(InputError, match=r"subdomain \d: the load has \d+ entries not finite"):
+        p.solve()
+
+
+def test_prescribed_nodes_that_penetrate_are_counted_on_all_ranks():
+    obstacle = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)), gap=lambda x: -0.02 * x[0])
+    p = problem(decomposed("quadrilateral", 4, 8), contacts=[obstacle], clamped=("bottom",))
+    with pytest.raises(NoSolutionError, match=r": 4 nodes penetrate by up to 0\.02 whatever"):
         p.solve()
 
 
