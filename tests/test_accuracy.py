@@ -158,6 +158,17 @@ def test_rounding_is_called_so(monkeypatch):
     assert error(p, direct(*scene), np.array([2.0, 1.0])) <= 1e-11
 
 
+@pytest.mark.parametrize("contacts", [0, 1])
+def test_rtol_0_asks_for_all_digits(contacts):
+    """Whether rounding is said to have ended it or not, it has them."""
+    scene = (12, 6), (2.0, 1.0), checkerboard(1e3), 0.3, (0.0, 1e-3)
+    contacts = [floor(1.0)] * contacts
+    p = torn(*scene, 4, contacts, tfeti_rtol=0, tfeti_error_if_not_converged=False)
+    p.solve()
+    assert p.report.converged_reason in ("CONVERGED_RTOL", "DIVERGED_ROUNDING")
+    assert error(p, direct(*scene), np.array([2.0, 1.0])) <= 1e-10
+
+
 @pytest.mark.parametrize("length", [2.0, 4000.0])
 def test_an_error_says_what_is_hard(length):
     """What the report warns of is in the message of a solve that ends early, too."""

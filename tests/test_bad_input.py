@@ -12,7 +12,7 @@ from petsc4py import PETSc
 from scenes import box, decomposed, forms, hooke, problem, strain
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx import InputError, compat
+from tfeti_dolfinx import InputError, NoSolutionError, compat
 from tfeti_dolfinx.errors import TfetiError, raised_on_all_ranks
 
 ROOT = MPI.COMM_WORLD.rank == 0
@@ -95,6 +95,13 @@ def test_a_load_that_is_nan():
     d = decomposed("hexahedron", 2, 2)
     p = problem(d, (0.0, 0.0, float("nan")))
     with pytest.raises(InputError, match=r"subdomain \d: the load has \d+ entries not finite"):
+        p.solve()
+
+
+def test_prescribed_nodes_that_penetrate_are_counted_on_all_ranks():
+    obstacle = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)), gap=lambda x: -0.02 * x[0])
+    p = problem(decomposed("quadrilateral", 4, 8), contacts=[obstacle], clamped=("bottom",))
+    with pytest.raises(NoSolutionError, match=r": 4 nodes penetrate by up to 0\.02 whatever"):
         p.solve()
 
 
@@ -223,6 +230,75 @@ def test_an_error_of_one_rank_is_raised_on_all(comm):
     with pytest.raises(InputError, match="only here"), raised_on_all_ranks(comm):
         if comm.rank == comm.size - 1:
             raise InputError("only here")
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"surfaces": {}}, r"surfaces is \{.* on rank \d and \{.*\} on rank 0; expected the same"),
+        ({"subdomains": None}, "number of subdomains is .* on rank 0"),
+        ({"subdomains": 3}, "number of subdomains is .* on rank 0"),
+        ({"facet_tags": None}, "surfaces=.* without facet_tags"),
+    ],
+)
+def test_a_decomposition_that_ranks_are_told_differently(comm, given, message):
+    mesh, tags, names = box("quadrilateral", 4)
+    told = {"subdomains": 2, "facet_tags": tags, "surfaces": names}
+    if comm.rank == comm.size - 1:
+        told |= given
+    if comm.size == 1 and "facet_tags" not in given:
+        tfeti.decompose(mesh, **told)
+        return
+    with pytest.raises(InputError, match=message):
+        tfeti.decompose(mesh, **told)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"tfeti_monitor": True}, "petsc_options: monitor is .* on rank 0"),
+        ({"tfeti_error_if_not_converged": False}, "petsc_options: error_if_not_converged is"),
+        ({"tfeti_sub_mat_mumps_icntl_14": 80}, "petsc_options: of factors is"),
+    ],
+)
+def test_options_of_one_rank(comm, options, message):
+    """A monitor's reductions would wait for those of the other ranks."""
+    told = options if comm.rank == 0 else {}
+    if comm.size == 1:
+        problem(decomposed("quadrilateral", 3, 2), **told)
+        return
+    with pytest.raises(InputError, match=message):
+        problem(decomposed("quadrilateral", 3, 2), **told)
+
+
+def test_an_extension_of_one_rank(comm):
+    def monitor(step):
+        """See nothing."""
+
+    own = tfeti.Extensions(monitor=monitor) if comm.rank == 0 else None
+    if comm.size == 1:
+        problem(decomposed("quadrilateral", 3, 2), extensions=own)
+        return
+    with pytest.raises(InputError, match="extensions: monitor is 'not given' on rank"):
+        problem(decomposed("quadrilateral", 3, 2), extensions=own)
+
+
+@pytest.mark.filterwarnings("ignore::numpy.exceptions.ComplexWarning")
+@pytest.mark.parametrize("what", ["gap", "distance", "gradient"])
+def test_no_part_of_complex_numbers_is_dropped(what):
+    """Also where numpy's warning of it is not an error, as it is in these tests."""
+
+    def fields(name):
+        factor = 1 + 1j if name == what else 1.0
+        return lambda x: factor * (0.1 + x[1])
+
+    def up(x):
+        return (1 + 1j if what == "gradient" else 1.0) * np.array([0, 1, 0])[:, None] + 0 * x
+
+    shape = tfeti.SignedDistance(fields("distance"), up)
+    obstacle = tfeti.Obstacle("bottom", shape, gap=fields("gap"))
+    with pytest.raises(InputError, match=f"obstacle of surface 'bottom': .*{what}.*complex"):
+        problem(decomposed("quadrilateral", 3, 2), contacts=[obstacle]).solve()
 
 
 class OfTwoParts(Exception):

@@ -14,6 +14,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
+from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.errors import InputError, TfetiError
 
 
@@ -64,6 +65,19 @@ def checked_number(value: Any, what: str, expected: Range = FINITE) -> float:
     if not number or not math.isfinite(value) or not expected.holds(float(value)):
         raise InputError(f"{what}={shown(value)}: expected {expected.text}")
     return float(value)
+
+
+def real_numbers(values: Any) -> Array:
+    """What a user's function has returned as floats; of complex numbers no part is dropped.
+
+    Raises:
+        TypeError: They are no real numbers.
+        ValueError: They are texts.
+    """
+    array = np.asarray(values)
+    if np.iscomplexobj(array):
+        raise TypeError("complex numbers; expected real ones")
+    return np.asarray(array, dtype=float)
 
 
 def checked_flag(value: Any, what: str) -> bool:

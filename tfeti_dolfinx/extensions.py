@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.parallel import check_agreed
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.monitors import Monitor
 from tfeti_dolfinx.qp.recycled import Recycled
@@ -153,6 +154,20 @@ class Settings:
     prefix: str
     factor_options: Mapping[str, Any]
     extensions: Extensions
+
+    def check_agreed(self, comm: MPI.Intracomm) -> None:
+        """Raise if ranks were given different settings. Collective.
+
+        Raises:
+            InputError: They were: a monitor of one rank would wait for the others.
+        """
+        options = {**asdict(self.options), "of factors": dict(self.factor_options)}
+        given = {f"petsc_options: {name}": value for name, value in options.items()}
+        given["petsc_options_prefix"] = self.prefix
+        for field in fields(self.extensions):
+            part = getattr(self.extensions, field.name)
+            given[f"extensions: {field.name}"] = "given" if part is not None else "not given"
+        check_agreed(comm, given)
 
     @property
     def local_choice(self) -> LocalChoice:

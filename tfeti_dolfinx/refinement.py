@@ -59,7 +59,7 @@ def with_more_digits(
         The multipliers and their displacement, whose sum has more digits than K⁺(f − Bᵀλ).
     """
     comm, first = dual.coarse.comm, (result, rule)
-    enough = agreed(comm, rule.ratio() <= NO_DIGITS / rule.rtol)
+    enough = agreed(comm, rule.ratio() * rule.rtol <= NO_DIGITS)
     if result.reason != ConvergedReason.DIVERGED_ROUNDING or not enough:
         return first
     found = _in_rounds(dual, told, first, rule.u)

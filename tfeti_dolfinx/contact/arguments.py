@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array, ArrayLike
-from tfeti_dolfinx.checks import checked_type, is_whole, shown
+from tfeti_dolfinx.checks import checked_type, is_whole, real_numbers, shown
 from tfeti_dolfinx.errors import InputError
 
 # of the extent of the smaller surface: few nodes farther off ever touch in small strains, and those
@@ -114,7 +114,7 @@ def given_gaps(name: str, gap: Gap, x: Array) -> Array | None:
     if not callable(gap):
         return np.full(len(x), float(gap))
     try:
-        values = np.asarray(gap(x.T), dtype=float)
+        values = real_numbers(gap(x.T))
         values = np.array(np.broadcast_to(values, (len(x),)))
     except Exception as error:  # a user's function may raise anything
         raise InputError(

@@ -8,7 +8,7 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.checks import named, shown
+from tfeti_dolfinx.checks import named, real_numbers, shown
 from tfeti_dolfinx.contact.shapes import Placed, Shape
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 
@@ -55,7 +55,7 @@ def distance_and_gradient(shape: Shape, x: Array, what: str) -> tuple[Array, Arr
     found = []
     for name, size in (("distance", (len(x),)), ("gradient", (3, len(x)))):
         with named(f"{what}: the {name} at points of shape {points.shape}"):
-            values = np.asarray(getattr(shape, name)(points), dtype=float)
+            values = real_numbers(getattr(shape, name)(points))
         try:
             found.append(np.broadcast_to(values, size))
         except ValueError:

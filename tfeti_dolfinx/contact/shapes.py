@@ -9,7 +9,14 @@ from typing import Protocol
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.checks import POSITIVE, checked_callable, checked_flag, checked_number, named
+from tfeti_dolfinx.checks import (
+    POSITIVE,
+    checked_callable,
+    checked_flag,
+    checked_number,
+    named,
+    real_numbers,
+)
 from tfeti_dolfinx.errors import InputError
 
 Point = tuple[float, ...] | list[float] | Array
@@ -177,11 +184,11 @@ class SignedDistance:
 
     def distance(self, x: Array) -> Array:
         """Signed distance, shape ``(n,)``."""
-        return np.asarray(self.distance_of(x), dtype=float)
+        return real_numbers(self.distance_of(x))
 
     def gradient(self, x: Array) -> Array:
         """Gradient of the signed distance, shape ``(3, n)``."""
-        gradient = np.asarray(self.gradient_of(x), dtype=float)
+        gradient = real_numbers(self.gradient_of(x))
         if gradient.ndim == 2 and len(gradient) == 2:
             return np.pad(gradient, ((0, 1), (0, 0)))
         return gradient

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.errors import NoSolutionError, raised_on_all_ranks
@@ -59,8 +60,8 @@ class ContactRows:
                 a node contradict each other.
         """
         left = self.left_gaps(dofs, values, gaps)
+        _check_decided(left[self.decided], length, dofs.comm)
         with raised_on_all_ranks(dofs.comm):
-            _check_decided(left[self.decided], length)
             self.shared.check(left, length)
         return left[self.condition] * self.scale
 
@@ -90,11 +91,13 @@ def contact_rows(spread: Spread) -> tuple[Rows, ContactRows]:
     return spread.rows(0, condition, scale), found
 
 
-def _check_decided(gaps: Array, length: float) -> None:
-    overlaps = gaps < -OVERLAP * length
-    if np.any(overlaps):
+def _check_decided(gaps: Array, length: float, comm: MPI.Intracomm) -> None:
+    """Raise on all ranks if prescribed components violate conditions, with those of all ranks."""
+    overlaps = comm.allreduce(int(np.sum(gaps < -OVERLAP * length)))
+    deepest = comm.allreduce(float(gaps.min(initial=0.0)), op=MPI.MIN)
+    if overlaps:
         raise NoSolutionError(
             "an obstacle or a contact lies within a part of the surface whose displacement is "
-            f"prescribed: {np.sum(overlaps)} nodes penetrate by up to "
-            f"{-gaps.min():.6g} whatever the rest does"
+            f"prescribed: {overlaps} nodes penetrate by up to "
+            f"{-deepest:.6g} whatever the rest does"
         )
