@@ -27,7 +27,9 @@ class Predictor:
     """argmin ‖u − w‖_M over the u that rows allow, without friction.
 
     A quadratic program with the mass M as stiffness and the rows of the problem. Prescribed
-    components are held where w has them. Creation and all methods are collective.
+    components are held where w has them; contacts meet them where they are at the end of the step:
+    where w has them they may overlap, though nothing does at the end. Creation and all methods are
+    collective.
 
     Args:
         dofs: Dof maps.
@@ -82,7 +84,7 @@ class Predictor:
         before, primal = np.array(constraints.c.array_r), dofs.to_primal(w)
         total = dofs.reduce(primal.reshape(-1, dofs.bs), np.add, 0.0)
         held = total / dofs.multiplicity[:, None]
-        constraints.set_right_side(gluing.right_side(held, gluing.records.gap))
+        constraints.set_right_side(gluing.with_supports_at(held))
         try:
             self._make(M, M @ w, gluing)
             return dofs.to_dolfinx(self._solve(gluing))

@@ -99,6 +99,18 @@ class Gluing:
             slip=self.slip if slip is None else slip,
         )
 
+    def with_supports_at(self, values: Array) -> Array:
+        """This rank's part of c as it is, but for supports, which hold other values.
+
+        Contacts meet prescribed components where the prescribed values have them.
+
+        Args:
+            values: Values of the owned groups, shape ``(g, bs)``.
+        """
+        c = np.array(self.constraints.c.array_r)
+        c[self.constraints.sets.equalities[self.held.row]] = self.held.right_side(values)
+        return c
+
     def gain(self, slip: Array) -> Array:
         """What c gains where a step begins at other slips, shape ``(num_rows,)``."""
         rows, gain = self.tangents, np.zeros(self.constraints.num_rows)

@@ -1,0 +1,67 @@
+"""Stabilised steps of bodies with mass whose supports move, near contact."""
+
+import numpy as np
+import pytest
+import ufl
+from bodies import stacked
+from dolfinx import fem
+from scenes import decomposed, hooke, strain
+
+import tfeti_dolfinx as tfeti
+
+RTOL = 1e-8
+
+
+class Driven:
+    """Sides of a mesh go down or up by what ``place`` says; nothing else moves or loads."""
+
+    def __init__(self, d, sides, contact):
+        V = fem.functionspace(d.mesh, ("Lagrange", 1, (d.mesh.geometry.dim,)))
+        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+        self.place, up = fem.Constant(d.mesh, 0.0), d.mesh.geometry.dim - 1
+        fdim = up
+        held = [fem.locate_dofs_topological(V.sub(up), fdim, d.facets(side)) for side in sides]
+        self.problem = tfeti.ContactDynamics(
+            ufl.inner(hooke()(u), strain(v)) * ufl.dx(domain=d.mesh),
+            ufl.ZeroBaseForm((v,)),
+            [fem.dirichletbc(self.place, dofs, V.sub(up)) for dofs in held],
+            [contact],
+            d,
+            mass=1.0,
+            stabilised=True,
+            petsc_options={"rtol": RTOL},
+        )
+
+    def step(self, size, place):
+        """Go on to where supports have a place; the report."""
+        self.place.value = place
+        self.problem.take_step(size)
+        self.problem.solve()
+        self.problem.accept()
+        return self.problem.report
+
+
+@pytest.mark.parametrize("friction", [None, tfeti.Tresca(0.01)])
+def test_a_support_may_stop_just_above_a_plane(friction):
+    """u + τv, with what is prescribed going on as before, lies below it."""
+    floor = tfeti.Obstacle("bottom", tfeti.Plane((0, -0.1), (0, 1)), reach=1.0, friction=friction)
+    scene = Driven(decomposed("quadrilateral", 4, 4), ["left"], floor)
+    for n in range(1, 9):
+        report = scene.step(0.2, -0.095 * min(n / 5, 1))
+        assert report.motion["predictor"] <= RTOL * report.motion["energy"]
+        assert np.all(scene.problem.solution.remaining_gap >= -0.1 * RTOL)
+
+
+def test_a_body_that_a_support_has_not_reached_stays_where_it_is():
+    """The support stops before the gap is closed, with a velocity that would have closed it."""
+    contact = tfeti.Contact("upper bottom", "lower top", reach=1.0)
+    d = stacked("quadrilateral", 2, 3, 4, gap=0.12)
+    scene = Driven(d, ["lower bottom", "lower top"], contact)
+    V, comm = scene.problem.u.function_space, d.comm
+    above = V.tabulate_dof_coordinates()[:, 1] > 0.06
+    for place in (0.05, 0.1, 0.1, 0.1):
+        report = scene.step(0.5, place)
+        moved = np.abs(scene.problem.u.x.array.reshape(-1, 2)[above])
+        assert comm.allreduce(float(moved.max(initial=0.0)), op=max) <= RTOL * 0.1
+        assert report.contact_forces == [[0.0, 0.0]]
+        assert report.motion["predictor"] == pytest.approx(0.0, abs=1e-12)
