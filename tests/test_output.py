@@ -139,6 +139,20 @@ def test_files_that_cannot_be_written_are_named_on_all_ranks(solution, comm, sha
             write(folder / name)
 
 
+def test_folders_beside_that_are_somebody_s_stay(solution, comm, shared_tmp):
+    """What is written beside the name that was given takes no folder's place either."""
+    kept = [shared_tmp / name / "kept" for name in ("out_cells.bp", "out.h5")]
+    if comm.rank == 0:
+        for folder in kept:
+            folder.mkdir(parents=True)
+    comm.barrier()
+    with pytest.raises(InputError, match=r"out_cells.bp is a directory that VTX has not written"):
+        write_vtx(shared_tmp / "out.bp", solution)
+    with pytest.raises(InputError, match=r"out.h5 is a directory that VTX has not written"):
+        write_xdmf(shared_tmp / "out.xdmf", solution)
+    assert all(folder.is_dir() for folder in kept)
+
+
 def test_a_coordinate_that_one_rank_cannot_compute(solution, comm, shared_tmp):
     def coordinate(x):
         if comm.rank == comm.size - 1:

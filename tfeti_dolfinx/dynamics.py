@@ -119,7 +119,7 @@ class ContactDynamics(ContactProblem):
         """Say how long the next steps are. Another size than before makes and factors all anew.
 
         Raises:
-            InputError: It is not a positive number.
+            InputError: It is not a positive number, or another one on another rank.
         """
         self._forms_in_time.take_step(size)
 

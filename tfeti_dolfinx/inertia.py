@@ -98,11 +98,21 @@ class InertialForms(Forms):
         self._of_m = data_of(mass, V)
         self._of_motion = Data(lambda: [motion.u, motion.load, motion.towards], self._comm)
         self._matrices: tuple[csr_array, csr_array] | None = None
+        self._new_matrices = True
         self._ends = self.motion.load
 
     def take_step(self, size: float) -> None:
-        """Let the next step have a size, which makes the matrix anew if it is another one."""
-        size, known = checked_number(size, "step", STEP), self.motion.size
+        """Let the next step have a size, which makes the matrix anew if it is another one.
+
+        Raises:
+            InputError: It is not a positive number, or another one on another rank.
+        """
+        with raised_on_all_ranks(self._comm):
+            size = checked_number(size, "step", STEP)
+        known, first = self.motion.size, self._comm.bcast(size)
+        with raised_on_all_ranks(self._comm):
+            if size != first:
+                raise InputError(f"step={size} on rank {self._comm.rank}, {first} on rank 0")
         if abs(size - known) <= SAME_STEP * known:
             return
         if known and self._comm.rank == 0:
@@ -120,11 +130,14 @@ class InertialForms(Forms):
         changed = [super().has_new_stiffness(), self._of_m.has_changed()]
         if any(changed):
             self._matrices = None
-        return self._of_step.has_changed() or any(changed)
+        found = self._of_step.has_changed() or any(changed)
+        self._new_matrices |= found
+        return found
 
     def has_new_load(self) -> bool:
-        """Whether L, or where the step begins, has changed since the last call."""
-        changed = super().has_new_load()
+        """Whether L, where the step begins, K, M or the step has changed since the last call."""
+        changed = super().has_new_load() or self._new_matrices
+        self._new_matrices = False
         return self._of_motion.has_changed() or changed
 
     @property

@@ -154,13 +154,15 @@ def _as_geometry(function: fem.Function, decomposition: Decomposition) -> fem.Fu
 
 
 def checked_target(path: str | os.PathLike[str], suffix: str, solution: Solution) -> Path:
-    """The name to write to. Collective."""
+    """The name to write to; what stands there and beside it is replaced. Collective."""
     target = checked_path(path, suffix)
     checked_type(solution, Solution, "solution", "the solution of a ContactProblem")
+    stem = target.stem
+    beside = target.with_name(f"{stem}.h5" if suffix == ".xdmf" else f"{stem}_cells{suffix}")
     with raised_on_all_ranks(solution.decomposition.comm):
-        foreign = target.is_dir() and any(target.iterdir()) and not (target / "md.idx").exists()
-        if foreign:
-            raise InputError(f"{target} is a directory that VTX has not written; expected a file")
+        for name in (target, beside):
+            if name.is_dir() and any(name.iterdir()) and not (name / "md.idx").exists():
+                raise InputError(f"{name} is a directory that VTX has not written; expected a file")
     return target
 
 

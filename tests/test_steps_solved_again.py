@@ -1,0 +1,85 @@
+"""A step of bodies with mass that is solved again, with another mass, stiffness or size."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from scenes import decomposed, hooke, strain
+
+import tfeti_dolfinx as tfeti
+
+RTOL = 1e-9
+
+
+class Stretched:
+    """A square that lies on a plane and is let go; its displacement at the begin is not 0."""
+
+    def __init__(self, stabilised):
+        d = decomposed("quadrilateral", 4, 4)
+        V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
+        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+        self.data = {"E": fem.Constant(d.mesh, 1.0), "density": fem.Constant(d.mesh, 1.0)}
+        begin = fem.Function(V)
+        begin.interpolate(lambda x: np.stack((0.1 * x[0] ** 2, 0.2 * x[1])))
+        self.problem = tfeti.ContactDynamics(
+            self.data["E"] * ufl.inner(hooke()(u), strain(v)) * ufl.dx(domain=d.mesh),
+            ufl.ZeroBaseForm((v,)),
+            [],
+            [tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)))],
+            d,
+            mass=self.data["density"],
+            stabilised=stabilised,
+            u=begin,
+            petsc_options={"rtol": RTOL},
+        )
+
+    def solve(self, step, data):
+        """Of a step from the begin: displacements and velocities of this rank."""
+        for name, value in data.items():
+            self.data[name].value = value
+        self.problem.take_step(step)
+        u = self.problem.solve().x.array.copy()
+        return np.concatenate((u, self.problem.solution.velocity.x.array))
+
+
+@pytest.mark.parametrize("stabilised", [False, True])
+@pytest.mark.parametrize("change", [(0.4, {}), (0.2, {"E": 3.0}), (0.2, {"density": 0.2})])
+def test_a_step_that_is_solved_again_is_that_of_the_new_data(stabilised, change):
+    """The load of a step has 2Mw/τ² − Ku/2 in it, also where u, v and the load have stayed."""
+    scene, other = Stretched(stabilised), Stretched(stabilised)
+    first = scene.solve(0.2, {})
+    scene.problem.go_back()
+    again, anew = scene.solve(*change), other.solve(*change)
+    comm = scene.problem.decomposition.comm
+    size = comm.allreduce(float(np.abs(anew).max(initial=0.0)), op=max)
+    apart = [float(np.abs(part - anew).max(initial=0.0)) for part in (first, again)]
+    changed, wrong = comm.allreduce(np.array(apart), op=np.maximum) / size
+    assert changed > 0.01
+    assert wrong <= 100 * RTOL
+
+
+def test_a_state_is_gone_on_from_with_another_density():
+    """Or with a step whose size was said before the state was taken."""
+    scene = Stretched(False)
+    scene.solve(0.2, {})
+    scene.problem.accept()
+    state = scene.problem.state()
+    anew = scene.solve(0.1, {"density": 0.5})
+    for before in (0.2, 0.1):
+        other = Stretched(False)
+        other.problem.take_step(before)
+        other.problem.restore(state)
+        found = other.solve(0.1, {"density": 0.5})
+        assert np.allclose(found, anew, rtol=0, atol=100 * RTOL)
+
+
+def test_a_step_of_another_size_on_another_rank():
+    """Each rank would solve for a step of its own."""
+    scene = Stretched(False)
+    comm = scene.problem.decomposition.comm
+    if comm.size == 1:
+        pytest.skip("needs two ranks")
+    with pytest.raises(tfeti.InputError, match=r"step=0.2 on rank 1, 0.1 on rank 0"):
+        scene.problem.take_step(0.2 if comm.rank == 1 else 0.1)
+    with pytest.raises(tfeti.InputError, match="step=nan"):
+        scene.problem.take_step(np.nan if comm.rank == 1 else 0.1)
