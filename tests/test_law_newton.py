@@ -203,7 +203,8 @@ def test_what_earlier_directions_tell(seed, k, r):
         assert np.allclose(image, F @ on.followed(u), rtol=0, atol=1e-6)
         assert np.allclose(q, oblique.project(image + on.bend(u)), rtol=0, atol=1e-6)
         assert np.allclose(G @ on.followed(u), 0.0, rtol=0, atol=1e-6)
-    keep(past, on, known)
+    for u, image in zip(known.Z, known.images, strict=True):
+        keep(past, on.followed(u), image)
     W, FW = past.known.columns
     assert np.allclose(W.T @ FW, np.eye(past.known.count), rtol=0, atol=1e-6)
     assert np.allclose(FW, F @ W, rtol=0, atol=1e-6)
