@@ -99,6 +99,37 @@ def test_it_solves_the_law(seed, k, r):
     assert np.allclose(near, end.lam, rtol=0, atol=1e-9)
 
 
+class Counted:
+    """An operator that counts."""
+
+    def __init__(self, A):
+        self.A, self.count = A, 0
+
+    def mult(self, x, y):
+        self.count += 1
+        self.A.mult(x, y)
+
+
+def test_ways_onto_faces_take_directions_along(monkeypatch):
+    """What F makes of both is one multiplication: fewer than of each for itself."""
+
+    def multiplications():
+        total = 0
+        for seed in range(20):
+            F, d, _, _, law = program(seed, 2, 0)
+            counted = Counted(matrix(F))
+            qp = QP(counted, vector(d), NoCoarse(), law.at(np.ones(len(law.normals))))
+            zero = LawPoint(np.zeros(len(d)), -d, np.zeros(0))
+            end, _ = newton_on_law(qp, law, lambda face, C: NoOblique(face), zero, 1e-6, 3.0)
+            assert np.allclose(end.s, F @ end.lam - d, rtol=0, atol=1e-6)
+            total += counted.count
+        return total
+
+    together = multiplications()
+    monkeypatch.setattr("tfeti_dolfinx.qp.law_newton.BESIDE", 0.0)
+    assert together < multiplications()
+
+
 @pytest.mark.parametrize("k", [1, 2])
 def test_the_end_is_superlinear(k):
     """Solves leave 0.3 times what the last step has brought down: six digits in few steps."""
@@ -203,7 +234,8 @@ def test_what_earlier_directions_tell(seed, k, r):
         assert np.allclose(image, F @ on.followed(u), rtol=0, atol=1e-6)
         assert np.allclose(q, oblique.project(image + on.bend(u)), rtol=0, atol=1e-6)
         assert np.allclose(G @ on.followed(u), 0.0, rtol=0, atol=1e-6)
-    keep(past, on, known)
+    for u, image in zip(known.Z, known.images, strict=True):
+        keep(past, on.followed(u), image)
     W, FW = past.known.columns
     assert np.allclose(W.T @ FW, np.eye(past.known.count), rtol=0, atol=1e-6)
     assert np.allclose(FW, F @ W, rtol=0, atol=1e-6)

@@ -17,6 +17,7 @@ from tfeti_dolfinx.qp.homogenised import (
     scale_near,
 )
 from tfeti_dolfinx.qp.mprgp import EXPANSIONS
+from tfeti_dolfinx.qp.newton import first_point, newton
 from tfeti_dolfinx.qp.parameters import SmalseParameters
 from tfeti_dolfinx.qp.problem import QP
 from tfeti_dolfinx.qp.smalse import smalse
@@ -95,6 +96,39 @@ def test_known_images_cost_nothing():
     near = scale_near(qp, other)
     assert counted.count == 3
     assert near.reference >= np.linalg.norm(homogenise(qp, other).b.array_r) / 2
+
+
+def test_the_last_image_is_that_of_a_look():
+    """Else that of the gradient; what another solver passes on stands for what is near."""
+    F, d, G, e, bounded = random_program(3)
+    counted = Counted(matrix(F))
+    qp = QP(counted, vector(d), DenseCoarse(G, e), bounds_on(bounded))
+    homogenised = homogenise(qp, image(qp.F, first_point(qp)))
+    result, last = newton(qp, homogenised, to(1e-9, homogenised)), LastImage()
+    comm, lam = qp.d.getComm().tompi4py(), np.array(result.lam.array_r)
+    last.keep(result, qp)
+    assert np.allclose(last.known(comm, lam), F @ lam, rtol=0, atol=1e-6)
+    exact = F @ lam - d
+    last.look(result.lam, exact)
+    result.gradient.array[:] += 1.0
+    last.keep(result, qp)
+    assert np.array_equal(last.known(comm, lam), exact + d)
+    last.look(qp.d, exact)
+    last.keep(result, qp)
+    assert not np.allclose(last.known(comm, lam), F @ lam, rtol=0, atol=0.5)
+    before, way = counted.count, np.zeros(len(lam))
+    way[0] = 1e-3
+    last.pass_on(lam, F @ lam, 2e-3)
+    near = last.image(counted, vector(lam + way))
+    assert counted.count == before
+    assert np.array_equal(near.Fx.array_r, F @ lam)
+    assert last.known(comm, lam + way).size == 0
+    far = last.image(counted, vector(lam + 3.0 * way))
+    assert counted.count == before + 1
+    assert np.allclose(far.Fx.array_r, F @ (lam + 3.0 * way), rtol=0, atol=1e-12)
+    last.keep(result, qp)
+    last.image(counted, vector(lam + way))
+    assert counted.count == before + 2
 
 
 class Counted:

@@ -13,7 +13,7 @@ from tfeti_dolfinx.parallel import agreed, norm_over
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.law import Law
-from tfeti_dolfinx.qp.law_newton import LawPoint, newton_on_law, residual_of
+from tfeti_dolfinx.qp.law_newton import UNSEEN, LawPoint, newton_on_law, residual_of
 from tfeti_dolfinx.qp.oblique import NoOblique, Oblique
 from tfeti_dolfinx.qp.problem import QP
 
@@ -74,6 +74,8 @@ class NewtonOnCoulomb:
         else:
             end, steps = newton_on_law(qp, law, self._oblique, first, target, norm)
         constraints.set_pressures(known)
+        if end is not None:
+            self._pass_on(qp, end, UNSEEN * target / norm)
         self.steps, self._share = self.steps + steps, FINER * self._share
         self._tries = 0 if end is None else self._tries - 1
         return None if end is None else (end.lam, end.mu)
@@ -91,6 +93,13 @@ class NewtonOnCoulomb:
             found.append((residual_of(qp, law, point, self._dual.seen), point))
         at.destroy()
         return min(found, key=lambda one: one[0])
+
+    def _pass_on(self, qp: QP, end: LawPoint, within: float) -> None:
+        """F of the end is known, and of what is near for the problem with its bounds."""
+        work = qp.d.duplicate()
+        qp.coarse.combine(end.mu, work)
+        self._dual.last.pass_on(end.lam, end.s + work.array_r + qp.d.array_r, within)
+        work.destroy()
 
     def _target(self, qp: QP) -> float:
         """rtol ‖Pd‖, less each time."""

@@ -187,9 +187,8 @@ class Dual:
         self.feasible = self._law(self.constraints)  # c may be another, and what the law refers to
         norm = self._norm_of(coarse, norm_steps) if norm_steps else 1.0
         on = self._preconditioner_on if self.preconditioner is not None else None
-        past = None if self.recycled is None else RecycledOnFace(self.recycled)
-        also = (self._on_all_rows, norm, on, self.seen, past)
-        return QP(self.F, self.d, coarse, self.feasible, *also)
+        W = None if self.recycled is None else RecycledOnFace(self.recycled)
+        return QP(self.F, self.d, coarse, self.feasible, self._on_all_rows, norm, on, self.seen, W)
 
     def saw(self, norm: float) -> None:
         """A solve has estimated ‖F‖: what the next one begins with.
@@ -256,7 +255,8 @@ class Dual:
             This rank's part of u, shape ``(n,)``.
         """
         B, c, pinv_load = self.constraints.B, self.constraints.c, self.subdomains.pinv_load
-        u, gap = recover(B, c, self.coarse, lam, gradient, face, pinv_load)
+        u, gap, g = recover(B, c, self.coarse, lam, gradient, face, pinv_load)
+        self.last.look(lam, g)
         return self.smallest(u, gap, lam.array_r, face, error)
 
     def smallest(self, u: Array, gap: Array, lam: Array, face: Face, error: float) -> Array:

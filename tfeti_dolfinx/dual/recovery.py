@@ -23,7 +23,7 @@ def recover(
     gradient: PETSc.Vec,
     face: Face,
     pinv_load: Array,
-) -> tuple[Array, Array]:
+) -> tuple[Array, Array, Array]:
     """u = K⁺(f − Bᵀλ) + Rα. Collective.
 
     α = (GGᵀ)⁻¹G(Fλ − d − ν) makes the rows' residuals vanish, but for ν, the gaps of open rows
@@ -40,7 +40,7 @@ def recover(
         pinv_load: K⁺f, shape ``(n,)``.
 
     Returns:
-        This rank's part of u, shape ``(n,)``, and c − B u, shape ``(m,)``.
+        This rank's part of u, shape ``(n,)``, of c − B u, and of Fλ − d, shape ``(m,)``.
     """
     v, residual = B.createVecRight(), c.duplicate()
     subdomains = coarse.subdomains
@@ -48,12 +48,12 @@ def recover(
     v.array[:] = u[subdomains.trace]
     B.mult(v, residual)
     residual.aypx(-1.0, c)  # c − B K⁺(f − Bᵀλ) = Fλ − d
-    gap = np.array(residual.array_r)
+    g = np.array(residual.array_r)
     for vec in (v, residual):
         vec.destroy()
     nu = np.where(face.holding, 0.0, gradient.array_r)
-    alpha = _alpha(coarse, gap, face.holding, nu)
-    return moved(u, coarse, alpha), gap - coarse.Gt @ alpha
+    alpha = _alpha(coarse, g, face.holding, nu)
+    return moved(u, coarse, alpha), g - coarse.Gt @ alpha, g
 
 
 def bent(B: PETSc.Mat, subdomains: Subdomains, lam: PETSc.Vec, pinv_load: Array) -> Array:

@@ -94,7 +94,7 @@ class Remainder:
     def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> Array:
         """u₀ + δu of a δλ; arguments as of the dual problem."""
         B, c = self.constraints.B, self._c
-        du, gap = recover(B, c, self.coarse, lam, gradient, face, self._response)
+        du, gap, _ = recover(B, c, self.coarse, lam, gradient, face, self._response)
         u = self._dual.smallest(self._u + du, gap, self._lam + lam.array_r, face, error)
         self.pressing = self._dual.pressing
         return u

@@ -48,11 +48,13 @@ class Gone:
         u: The solution.
         image: What was given with each Az, combined as u is.
         new: The directions gone, each for one multiplication.
+        length: The least step along one of them, over Mr less earlier directions; 0 without any.
     """
 
     u: Array
     image: Array
     new: Known
+    length: float
 
 
 def gcr(
@@ -81,7 +83,7 @@ def gcr(
     old, new = known or Known.nothing(b), _Growing(len(b))
     c = summed(comm, old.Q @ b)
     u, image, r = c @ old.Z, c @ old.images, b - c @ old.Q
-    size = norm_over(comm, r)
+    size, lengths = norm_over(comm, r), list[float]()
     while size > target and new.count < most:
         z = precondition(r)
         q, w = apply(z)
@@ -94,8 +96,9 @@ def gcr(
         q, z, w, step = q / length, z / length, w / length, along / length
         u, image, r = u + step * z, image + step * w, r - step * q
         new.add(q, z, w)
+        lengths.append(step / length)
         size = agreed(comm, float(np.sqrt(max(left - step**2, 0.0))))
-    return Gone(u, image, new.rows)
+    return Gone(u, image, new.rows, agreed(comm, max(min(lengths, default=0.0), 0.0)))
 
 
 class _Growing:

@@ -9,7 +9,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.parallel import any_rank
+from tfeti_dolfinx.parallel import any_rank, norm_over
 from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.problem import QP, Operator, QPResult
@@ -52,15 +52,28 @@ class LastImage:
     def __init__(self) -> None:
         nothing: Array = np.zeros(0)
         self._x, self._Fx, self._d, self._e = nothing, nothing, nothing, nothing
+        self._looked, self._within = (nothing, nothing), 0.0
+
+    def look(self, x: PETSc.Vec, g: Array) -> None:
+        """Take a point of the program, and its Fx − d, as a look at its displacement makes it."""
+        self._looked = (np.array(x.array_r), g)
 
     def keep(self, result: QPResult, qp: QP) -> None:
-        """Take a solution, whose gradient is Fx − d − Gᵀμ. Not collective."""
-        by_mu = qp.d.duplicate()
+        """Take a solution, whose gradient is Fx − d − Gᵀμ, or as a look has made it. Collective.
+
+        So what steps leave out of the gradient does not grow from solve to solve.
+        """
+        (x, g), by_mu = self._looked, qp.d.duplicate()
         qp.coarse.combine(result.mu, by_mu)
-        self._x = np.array(result.lam.array_r)
-        self._Fx = result.gradient.array_r + by_mu.array_r + qp.d.array_r
+        self._x, self._within = np.array(result.lam.array_r), 0.0
+        other = any_rank(qp.d.getComm().tompi4py(), not np.array_equal(x, self._x))
+        self._Fx = (result.gradient.array_r + by_mu.array_r if other else g) + qp.d.array_r
         self._d, self._e = np.array(qp.d.array_r), np.array(qp.coarse.e)
         by_mu.destroy()
+
+    def pass_on(self, x: Array, Fx: Array, within: float) -> None:
+        """Take what another solver has come to; it stands for what is so near to it, too."""
+        self._x, self._Fx, self._within = x, Fx, within
 
     def known(self, comm: MPI.Intracomm, x: Array) -> Array:
         """What F makes of x on this rank; empty if x is not the last solution. Collective."""
@@ -80,12 +93,18 @@ class LastImage:
     def image(self, F: Operator, x: PETSc.Vec) -> Image:
         """As ``image``, but nothing is multiplied if x is the last solution. Collective."""
         comm = x.getComm().tompi4py()
-        known = self.known(comm, x.array_r)
+        known = self._Fx if self._is_near(comm, x.array_r) else self.known(comm, x.array_r)
         if not any_rank(comm, known.size > 0):
             return image(F, x)
         Fx = x.duplicate()
         Fx.array[:] = known
         return Image(x, Fx)
+
+    def _is_near(self, comm: MPI.Intracomm, x: Array) -> bool:
+        """Whether what was passed on stands for x. Collective."""
+        if self._within == 0.0 or any_rank(comm, x.shape != self._x.shape):
+            return False
+        return norm_over(comm, x - self._x) <= self._within
 
 
 def natural(coarse: Coarse, like: PETSc.Vec) -> PETSc.Vec:

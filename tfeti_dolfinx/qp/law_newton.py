@@ -11,10 +11,10 @@ from scipy.sparse import csr_array
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.errors import FactorError
-from tfeti_dolfinx.parallel import norm_over
+from tfeti_dolfinx.parallel import agreed, norm_over
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
-from tfeti_dolfinx.qp.gcr import gcr
+from tfeti_dolfinx.qp.gcr import Gone, gcr
 from tfeti_dolfinx.qp.law import Law, OnFace
 from tfeti_dolfinx.qp.law_recycled import keep, known_on
 from tfeti_dolfinx.qp.oblique import Oblique
@@ -29,6 +29,9 @@ MOST_DIRECTIONS = 80
 SHARE, FOLLOWED, FINAL = 0.3, 0.3, 0.3
 # of the target: what F makes of a way onto a face that is too short to be multiplied
 UNSEEN = 0.1
+# of the residual: what the way may be at most for a direction beside it, which does not know what
+# F makes of the way
+BESIDE = 2.0
 # times ‖F‖: directions that bend more are turned by the projection alone
 HARD = 10.0
 
@@ -96,7 +99,7 @@ def newton_on_law(
     Returns:
         Where it has ended, None if it gave up; and the steps taken.
     """
-    last, best, idle = 0.0, np.inf, 0
+    last, best, idle, length = 0.0, np.inf, 0, 0.0
     turning = Turning(law)
     for step in range(MOST_STEPS):
         # Step 1: what a gradient step, brought back, moves, and what Gλ lacks
@@ -115,10 +118,12 @@ def newton_on_law(
         share = min(SHARE, FOLLOWED * residual / last) if step else SHARE
         on = OnFace(eased, law.following(p, face), p)
         try:
-            at = _solve_on(qp, on, oblique(eased, on.C), at, (share, target, norm))
+            system = _System(qp, on, oblique(eased, on.C), at)
+            system.enter(length, norm, UNSEEN * target)
+            length = min(system.solve(share, FINAL * target) or length, 1.0)
         except FactorError:
             break
-        last = residual
+        at, last = system.end(), residual
     return None, step + 1
 
 
@@ -137,44 +142,101 @@ def _missed(qp: QP, p: Array, lam: Array) -> float:
     return missed
 
 
-def _solve_on(
-    qp: QP, on: OnFace, oblique: Oblique, at: LawPoint, aim: tuple[float, float, float]
-) -> LawPoint:
+class _System:
     """Steps 3 and 4: on the face Zᵀ(Fλ − d − Gᵀμ) + κu = 0 and Gλ = e, λ = λ₁ + (I + C)u.
 
-    Multiplies by F once for the way onto the face, where that is seen, and once for each direction.
+    Args:
+        qp: The program.
+        on: The face.
+        oblique: Its projectors.
+        at: Where to come from.
     """
-    comm, face, F = qp.d.getComm().tompi4py(), on.face, _on_arrays(qp.F, qp.d)
-    preconditioner = qp.preconditioner_on(face) if qp.preconditioner_on else None
-    M = _on_arrays(preconditioner, qp.d) if preconditioner else face.restricted
-    # Step 3: λ₁ on the face, u₀ that restores Gλ = e
-    lam, x = on.entered(at.lam), qp.d.duplicate()
-    x.array[:] = lam
-    u = oblique.restoring(qp.coarse.residual(x))
-    lam = lam + on.followed(u)
-    s, way = at.s, lam - at.lam
-    share, target, norm = aim
-    if norm * norm_over(comm, way) > UNSEEN * target:
-        s = s + F(way)
 
-    # Step 4: u by conjugate residuals
-    def apply(z: Array) -> tuple[Array, Array]:
-        Fz = F(on.followed(z))
-        return oblique.project(Fz + on.bend(z)), Fz
+    def __init__(self, qp: QP, on: OnFace, oblique: Oblique, at: LawPoint) -> None:
+        self._qp, self._on, self._oblique, self._mu = qp, on, oblique, at.mu
+        self._comm = qp.d.getComm().tompi4py()
+        self._F = _on_arrays(qp.F, qp.d)
+        self._made = qp.preconditioner_on(on.face) if qp.preconditioner_on else None
+        self._M = _on_arrays(self._made, qp.d) if self._made else on.face.restricted
+        # Step 3: λ₁ on the face, u₀ that restores Gλ = e; s is of λ before
+        self._work = qp.d.duplicate()
+        lam = self._work.array[:] = on.entered(at.lam)
+        self._u = oblique.restoring(qp.coarse.residual(self._work))
+        self._lam, self._s = lam + on.followed(self._u), at.s
+        self._way = self._lam - at.lam
+        self._known = known_on(qp.recycled, on, oblique.project)
 
-    b = -oblique.project(s + on.bend(u))
-    size = max(share * norm_over(comm, b), FINAL * target)
-    known = known_on(qp.recycled, on, oblique.project)
-    gone = gcr(apply, lambda r: oblique.project(M(r)), b, size, MOST_DIRECTIONS, comm, known)
-    keep(qp.recycled, on, gone.new)
-    u, lam, s = u + gone.u, lam + on.followed(gone.u), s + gone.image
-    mu = oblique.coordinates(s + on.bend(u))
-    qp.coarse.combine(mu, x)
-    at = LawPoint(lam, s - x.array_r, at.mu + mu)
-    for item in (x, preconditioner):
-        if item is not None:
-            item.destroy()
-    return at
+    def enter(self, length: float, norm: float, seen: float) -> None:
+        """What F makes of the way onto the face, where it is more than what is to be seen.
+
+        Beside it goes a first direction, for the same multiplication, so far as those before went;
+        but not beside a way that may be more than what is to be solved for.
+
+        Args:
+            length: Step along a residual, preconditioned; 0: none is known.
+            norm: ‖F‖.
+            seen: What is seen.
+        """
+        size = norm * norm_over(self._comm, self._way)
+        if size <= seen:
+            return
+        self._solve(np.inf)
+        b = self._left()
+        if length and agreed(self._comm, size <= BESIDE * norm_over(self._comm, b)):
+            z = length * self._precondition(b)
+            self._go(z, np.zeros_like(z))
+            self._way = self._way + self._on.followed(z)
+        image = self._F(self._way)
+        self._s = self._s + image
+        if self._qp.coarse.dimension == 0:  # else it restores Gλ = e
+            keep(self._qp.recycled, self._way, image)
+
+    def solve(self, share: float, least: float) -> float:
+        """Step 4: u by conjugate residuals.
+
+        Args:
+            share: Of the residual: what is left of it.
+            least: No solve leaves less.
+
+        Returns:
+            The length of the steps.
+        """
+        gone = self._solve(max(share * norm_over(self._comm, self._left()), least))
+        for z, image in zip(gone.new.Z, gone.new.images, strict=True):
+            keep(self._qp.recycled, self._on.followed(z), image)
+        return gone.length
+
+    def end(self) -> LawPoint:
+        """Where one is; frees what was made."""
+        mu = self._oblique.coordinates(self._s + self._on.bend(self._u))
+        self._qp.coarse.combine(mu, self._work)
+        at = LawPoint(self._lam, self._s - self._work.array_r, self._mu + mu)
+        for item in (self._work, self._made):
+            if item is not None:
+                item.destroy()
+        return at
+
+    def _solve(self, size: float) -> Gone:
+        """Bring the residual down to a size; without one by known directions alone."""
+        b, known = self._left(), self._known
+        gone = gcr(self._apply, self._precondition, b, size, MOST_DIRECTIONS, self._comm, known)
+        self._go(gone.u, gone.image)
+        return gone
+
+    def _go(self, u: Array, image: Array) -> None:
+        self._u, self._lam = self._u + u, self._lam + self._on.followed(u)
+        self._s = self._s + image
+
+    def _left(self) -> Array:
+        """The residual."""
+        return -self._oblique.project(self._s + self._on.bend(self._u))
+
+    def _apply(self, z: Array) -> tuple[Array, Array]:
+        Fz = self._F(self._on.followed(z))
+        return self._oblique.project(Fz + self._on.bend(z)), Fz
+
+    def _precondition(self, r: Array) -> Array:
+        return self._oblique.project(self._M(r))
 
 
 def _on_arrays(A: Operator | FaceOperator, like: PETSc.Vec) -> Callable[[Array], Array]:

@@ -47,12 +47,10 @@ def known_on(
     return Known((AU @ T).T, (U @ T).T, (FU @ T).T)
 
 
-def keep(past: RecycledOnFace | None, on: OnFace, new: Known) -> None:
-    """Keep directions (I + C)u that were gone, with what F makes of them. Collective."""
+def keep(past: RecycledOnFace | None, x: Array, Fx: Array) -> None:
+    """Keep a direction that was gone, of Gx = 0, with what F makes of it. Collective."""
     if past is None:
         return
-    for z, Fz in zip(new.Z, new.images, strict=True):
-        x = on.followed(z)
-        energy = agreed(past.known.comm, float(summed(past.known.comm, np.array([x @ Fz]))[0]))
-        if energy > 0.0:
-            past.known.add(x, Fz, energy)
+    energy = agreed(past.known.comm, float(summed(past.known.comm, np.array([x @ Fx]))[0]))
+    if energy > 0.0:
+        past.known.add(x, Fx, energy)
