@@ -78,6 +78,14 @@ class Options:
         "the coarse problem has the motions of clusters only; 0: none",
         fits=FROM_0,
     )
+    stiffening: float = described(
+        0.0,
+        "subdomains",
+        "so many times its diagonal entry of K is added to K at a component that is prescribed as "
+        "0, beside its row, which leaves the solution as it is: for flat parts that are held along "
+        "a side",
+        fits=FROM_0,
+    )
     recycle: int | str = described(
         "auto",
         "pcpg, newton",

@@ -20,6 +20,7 @@ from tfeti_dolfinx.extensions import Settings
 from tfeti_dolfinx.friction_bounds import FrictionBounds
 from tfeti_dolfinx.gluing.glue import Gluing, glue
 from tfeti_dolfinx.gluing.prescribed import Prescribed, prescribe
+from tfeti_dolfinx.gluing.stiffening import Stiffening
 from tfeti_dolfinx.gluing.weights import row_weights
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -71,6 +72,7 @@ class System:
         self.friction = FrictionBounds(contacts, dofs, decomposition, forms.thickness)
         self.replaced = Replaced(boundary, dofs, decomposition)
         self.spectrum: dict[str, float] = {}
+        self._stiffening = Stiffening(settings.options.stiffening, dofs)
         self._stages, self._counters, self._counted = Stages(), Counters(), 0
         self._seen = 0.0  # of ‖F‖, which more rows hardly change
         self._K: Any = None
@@ -110,6 +112,8 @@ class System:
             self.change("load")
         new, old = prescribe(self._dofs, self.bcs), self._prescribed
         self._prescribed = new
+        if self._stiffening.look(new):
+            self.change("stiffness")
         if old is None or any_rank(self._dofs.comm, not np.array_equal(new.flag, old.flag)):
             self.change("rows")
         elif any_rank(self._dofs.comm, not np.array_equal(new.value, old.value)):
@@ -192,8 +196,9 @@ class System:
         self._stages.forget()
 
     def _assemble_stiffness(self) -> None:
-        self._K = self.forms.stiffness()
-        self._blocks = self.replaced.node_blocks(self._K, self._settings.making(self._counters))
+        K = self.forms.stiffness()
+        self._blocks = self.replaced.node_blocks(K, self._settings.making(self._counters))
+        self._K = self._stiffening.stiffened(K)
         if self.replaced.exists:  # the load that a force per volume makes depends on S
             self.change("load")
 

@@ -16,6 +16,9 @@ from tfeti_dolfinx.subdomains.factor import CholeskyFactor
 from tfeti_dolfinx.subdomains.inverse import FactoredInverse, GeneralisedInverse, lent
 from tfeti_dolfinx.subdomains.pseudoinverse import SchurPseudoinverse, TrailingPseudoinverse
 
+# of the largest entry of a kernel: rounding
+STILL = 1e-8
+
 
 class Regularised(FactoredInverse):
     """K_ρ⁻¹ with K_ρ = K + ρ Nᵀ(NNᵀ)⁻¹N, N the kernel on a few fixing unknowns, ρ = max diag K.
@@ -92,9 +95,10 @@ def same_pattern(K: Any, other: Any) -> bool:
 
 
 def _projector(K: Any, R: Array, fixing_dofs: Array) -> Array:
-    """ρ Nᵀ(NNᵀ)⁻¹N on the fixing unknowns."""
+    """ρ Nᵀ(NNᵀ)⁻¹N on the fixing unknowns; what moves in no motion may be far stiffer."""
     Q, _ = np.linalg.qr(R[fixing_dofs])
-    return np.asarray(K.diagonal().max() * (Q @ Q.T))
+    moves = np.abs(R).max(axis=1) > STILL * np.abs(R).max()
+    return np.asarray(K.diagonal()[moves].max() * (Q @ Q.T))
 
 
 def _places(K: Any, dofs: Array) -> Array:
