@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from benchmarks.stability_scenes import with_friction
-from benchmarks.stress import judge, meshes
+from benchmarks.stress import judge, meshes, reference
 from benchmarks.stress.__main__ import main
 from benchmarks.stress.equilibrium import has_none
 from benchmarks.stress.ladders import floor, ladder_scenes, two_bodies
 from benchmarks.stress.package import Outcome, solve_scene
+from benchmarks.stress.qp import UnsettledError
 from benchmarks.stress.random_scenes import random_scene
 from benchmarks.stress.reference import Untorn
 from benchmarks.stress.scene import Body, Load, Scene, Wall
@@ -170,6 +171,29 @@ def test_the_reference_knows_a_uniform_pressure(cell):
     assert np.allclose(found.u[:, gdim - 1], exact, rtol=0, atol=1e-12)
     assert found.free.shape[1] == (1 if gdim == 2 else 3)
     assert found.forces.sum(axis=0)[-1] == pytest.approx(0.1, rel=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("cell", "traction"),
+    [
+        ("quadrilateral", (0.012, -0.1)),
+        ("quadrilateral", (0.029, -0.1)),
+        ("hexahedron", (0.02, 0.01, -0.1)),
+    ],
+)
+def test_friction_in_decimal_digits_is_what_it_is_in_double_precision(cell, traction, monkeypatch):
+    scene = with_friction(on_the_floor(cell, traction), "coulomb", 0.3)
+    found = answer(scene)
+
+    def unsettled(*_):
+        raise UnsettledError("as where digits are too few")
+
+    monkeypatch.setattr(reference, "solve_sliding", unsettled)
+    again = answer(scene)
+    assert np.abs(found.u).max() > 0.01
+    assert np.allclose(again.u, found.u, rtol=0, atol=1e-12)
+    assert np.allclose(again.forces, found.forces, rtol=0, atol=1e-12)
+    assert 0 < again.noise.max() < 1e-12
 
 
 @pytest.mark.parametrize("traction", [(0.0, 0.1), (1e-6, -0.1), (0.0, 0.0, 0.1)])

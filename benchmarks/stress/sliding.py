@@ -87,7 +87,7 @@ def solve_sliding(
 
 def _solved(J: np.ndarray, right: np.ndarray) -> np.ndarray:
     """By elimination and a correction, or by least squares where a set leaves a motion free."""
-    with contextlib.suppress(np.linalg.LinAlgError):
+    with contextlib.suppress(np.linalg.LinAlgError, ValueError):  # infinite
         factor = lu_factor(J)
         new = lu_solve(factor, right)
         new += lu_solve(factor, right - J @ new)
