@@ -11,7 +11,7 @@ from scenes import clamp, decomposed, displacement, forms, problem
 from scipy.sparse import csr_array
 from test_friction_fields import SCENES, floor, solved
 from test_mpgp import as_set
-from test_qp import matrix, vector
+from test_qp import Counted, matrix, vector
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.newton_coulomb import NewtonOnCoulomb
@@ -97,17 +97,6 @@ def test_it_solves_the_law(seed, k, r):
         assert residual_of(qp, law, LawPoint(end.lam, s, end.mu), size * norm) <= 1e-8
     _, near = law.nearest(end.lam)
     assert np.allclose(near, end.lam, rtol=0, atol=1e-9)
-
-
-class Counted:
-    """An operator that counts."""
-
-    def __init__(self, A):
-        self.A, self.count = A, 0
-
-    def mult(self, x, y):
-        self.count += 1
-        self.A.mult(x, y)
 
 
 def test_ways_onto_faces_take_directions_along(monkeypatch):

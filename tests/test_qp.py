@@ -24,6 +24,17 @@ from tfeti_dolfinx.qp.stopping import ResidualRule
 SELF = PETSc.COMM_SELF
 
 
+class Counted:
+    """An operator that counts."""
+
+    def __init__(self, A):
+        self.A, self.count = A, 0
+
+    def mult(self, x, y):
+        self.count += 1
+        self.A.mult(x, y)
+
+
 def matrix(A):
     A = np.asarray(A, dtype=float)
     return PETSc.Mat().createDense(A.shape, array=A.ravel(order="F").copy(), comm=SELF)

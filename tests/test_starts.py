@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from scenes import curved_obstacle, decomposed, problem
-from test_qp import bounds_on, matrix, random_program, to, vector
+from test_qp import Counted, bounds_on, matrix, random_program, to, vector
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.options import Options
@@ -129,17 +129,6 @@ def test_the_last_image_is_that_of_a_look():
     last.keep(result, qp)
     last.image(counted, vector(lam + way))
     assert counted.count == before + 2
-
-
-class Counted:
-    """An operator that counts."""
-
-    def __init__(self, A):
-        self.A, self.count = A, 0
-
-    def mult(self, x, y):
-        self.count += 1
-        self.A.mult(x, y)
 
 
 @pytest.mark.parametrize(("qp_type", "contacts"), [("pcpg", 0), ("smalse", 1)])

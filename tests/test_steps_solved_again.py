@@ -79,7 +79,7 @@ def test_a_step_of_another_size_on_another_rank():
     comm = scene.problem.decomposition.comm
     if comm.size == 1:
         pytest.skip("needs two ranks")
-    with pytest.raises(tfeti.InputError, match=r"step=0.2 on rank 1, 0.1 on rank 0"):
+    with pytest.raises(tfeti.InputError, match="step is 0.2 on rank 1 and 0.1 on rank 0"):
         scene.problem.take_step(0.2 if comm.rank == 1 else 0.1)
     with pytest.raises(tfeti.InputError, match="step=nan"):
         scene.problem.take_step(np.nan if comm.rank == 1 else 0.1)

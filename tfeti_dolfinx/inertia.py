@@ -28,6 +28,7 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.form_checks import check_form, check_same_space, displacement_space
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.parallel import check_agreed
 from tfeti_dolfinx.subdomains.input_checks import check_stiffness
 
 # of a step: another one that differs by less is the same, since times of equal steps are rounded
@@ -109,10 +110,8 @@ class InertialForms(Forms):
         """
         with raised_on_all_ranks(self._comm):
             size = checked_number(size, "step", STEP)
-        known, first = self.motion.size, self._comm.bcast(size)
-        with raised_on_all_ranks(self._comm):
-            if size != first:
-                raise InputError(f"step={size} on rank {self._comm.rank}, {first} on rank 0")
+        check_agreed(self._comm, {"step": size})
+        known = self.motion.size
         if abs(size - known) <= SAME_STEP * known:
             return
         if known and self._comm.rank == 0:

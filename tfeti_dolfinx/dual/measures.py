@@ -12,6 +12,7 @@ from petsc4py import PETSc
 from tfeti_dolfinx.arrays import TINY, Array, sums
 from tfeti_dolfinx.dual.closing import closing
 from tfeti_dolfinx.dual.coarse import CoarseSpace
+from tfeti_dolfinx.dual.recovery import missed
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
@@ -131,10 +132,7 @@ def measure(
 def _missed(scene: Scene, u: Array, lam: PETSc.Vec, norm: float) -> tuple[PETSc.Vec, float, float]:
     """w, and as lengths the largest of its contact rows and the largest of their gaps."""
     constraints = scene.constraints
-    trace, w = constraints.B.createVecRight(), constraints.c.duplicate()
-    trace.array[:] = u[scene.subdomains.trace]
-    constraints.B.mult(trace, w)
-    w.axpy(-1.0, constraints.c)
+    w = missed(constraints, u[scene.subdomains.trace])
     normals = constraints.sets.normals
     rows = w.array_r[normals]
     # an open row whose force is not gone yet: of distance and force, as a length, the smaller
@@ -142,7 +140,6 @@ def _missed(scene: Scene, u: Array, lam: PETSc.Vec, norm: float) -> tuple[PETSc.
     rows = np.where(scene.pressing[normals] | (rows > 0.0), rows, still)
     w.array[normals] = rows
     lengths = np.abs((rows, constraints.c.array_r[normals])) / constraints.scale
-    trace.destroy()
     largest = np.max(lengths, axis=1, initial=0.0)
     tangents = constraints.sets.tangents
     if tangents.size:

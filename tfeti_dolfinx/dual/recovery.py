@@ -7,6 +7,7 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.dual.coarse import CoarseSpace
+from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
@@ -54,6 +55,16 @@ def recover(
     nu = np.where(face.holding, 0.0, gradient.array_r)
     alpha = _alpha(coarse, g, face.holding, nu)
     return moved(u, coarse, alpha), g - coarse.Gt @ alpha, g
+
+
+def missed(constraints: Constraints, v: Array) -> PETSc.Vec:
+    """B v − c, a new vector, of displacements on this rank's trace. Collective."""
+    trace, w = constraints.B.createVecRight(), constraints.c.duplicate()
+    trace.array[:] = v
+    constraints.B.mult(trace, w)
+    w.axpy(-1.0, constraints.c)
+    trace.destroy()
+    return w
 
 
 def bent(B: PETSc.Mat, subdomains: Subdomains, lam: PETSc.Vec, pinv_load: Array) -> Array:

@@ -10,6 +10,7 @@ from scipy.sparse import csr_array, diags_array
 
 from tfeti_dolfinx.arrays import TINY, Array, sum_rows
 from tfeti_dolfinx.dual.coarse import CoarseSpace
+from tfeti_dolfinx.dual.recovery import missed
 from tfeti_dolfinx.dual.smallest import orthonormal
 from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.parallel import agreed
@@ -56,12 +57,14 @@ def lost_on_friction(
     Returns:
         Those motions of which that is so for 20 rtol of the displacement, or None.
     """
-    missed = _missed(coarse, constraints, u)
+    w = missed(constraints, u[coarse.subdomains.trace])
+    slips = np.array(w.array_r)
+    w.destroy()
     allowed = _allowed(coarse, u, rtol)
-    N = _held_by_nothing_else(coarse, constraints, missed, allowed)
+    N = _held_by_nothing_else(coarse, constraints, slips, allowed)
     if N.shape[1] == 0:
         return None
-    law = _Sliding(coarse, constraints, missed, lam, N)
+    law = _Sliding(coarse, constraints, slips, lam, N)
     reach = _largest(N, np.repeat(allowed, coarse.bodies.k))
     back, ahead = law.left(-reach), law.left(reach)
     # what friction bears is lost in the noise of the solution: there it must say where a body is
@@ -86,7 +89,7 @@ class _Sliding:
         self,
         coarse: CoarseSpace,
         constraints: Constraints,
-        missed: Array,
+        slips: Array,
         lam: Array,
         N: csr_array,
     ) -> None:
@@ -99,7 +102,7 @@ class _Sliding:
         i, self._motion = sum((abs(A) for A in along), csr_array(along[0].shape)).nonzero()
         entries = [np.asarray(A[i, self._motion]).ravel() for A in along]
         self._v = np.stack(entries, axis=1) / size[i]
-        self._q, self._limits = (missed[rows] / size)[i], limits[i]
+        self._q, self._limits = (slips[rows] / size)[i], limits[i]
         self._comm, self._count = coarse.comm, N.shape[1]
         self.most = self._summed(np.linalg.norm(self._limits * self._v, axis=1))
         self._work = N.T @ (coarse.motions.T @ coarse.e)
@@ -120,17 +123,6 @@ class _Sliding:
         return own
 
 
-def _missed(coarse: CoarseSpace, constraints: Constraints, u: Array) -> Array:
-    """B u − c on this rank's rows."""
-    trace, w = constraints.B.createVecRight(), constraints.c.duplicate()
-    trace.array[:] = u[coarse.subdomains.trace]
-    constraints.B.mult(trace, w)
-    missed = np.asarray(w.array_r - constraints.c.array_r)
-    for vec in (trace, w):
-        vec.destroy()
-    return missed
-
-
 def _allowed(coarse: CoarseSpace, u: Array, rtol: float) -> Array:
     """How far each body may be off, shape ``(bodies,)``."""
     size = coarse.subdomains.body_maxima([coarse.subdomains.sizes(u)])[0]
@@ -138,14 +130,14 @@ def _allowed(coarse: CoarseSpace, u: Array, rtol: float) -> Array:
 
 
 def _held_by_nothing_else(
-    coarse: CoarseSpace, constraints: Constraints, missed: Array, allowed: Array
+    coarse: CoarseSpace, constraints: Constraints, slips: Array, allowed: Array
 ) -> csr_array:
     """Orthonormal motions that normals which may be closed do not resist, on all ranks."""
     row, column = coarse.J.tocoo().coords
-    near = np.zeros(len(missed))
+    near = np.zeros(len(slips))
     np.maximum.at(near, row, allowed[column // coarse.bodies.k])
-    closed, normals = np.zeros(len(missed), dtype=bool), constraints.sets.normals
-    closed[normals] = -missed[normals] <= near[normals] * constraints.scale
+    closed, normals = np.zeros(len(slips), dtype=bool), constraints.sets.normals
+    closed[normals] = -slips[normals] <= near[normals] * constraints.scale
     motions = coarse.unresisted(closed)
     return agreed(coarse.comm, orthonormal(motions, coarse.bodies.k)[0])
 
