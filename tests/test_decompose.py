@@ -220,6 +220,16 @@ def test_bisection_leaves_columns_of_flat_cells_whole(thin, parts):
     assert len(np.unique(alone)) == parts
 
 
+@pytest.mark.parametrize("parts", [3, 4, 6])
+def test_bisection_leaves_columns_whole_that_are_most_of_a_part(parts):
+    """Two cells of 500 : 1 on each other, parts of two to four cells: a cut moves by one."""
+    x, extents = grid_of_cells([3, 2, 2], [1.0, 1.0, 0.002])
+    part = bisect_points(x, parts, MPI.COMM_SELF, extents)
+    columns = np.unique(np.round(x[:, :2], 6), axis=0, return_inverse=True)[1]
+    assert len(np.unique(np.stack((columns.ravel(), part)), axis=1).T) == 6
+    assert len(np.unique(part)) == parts
+
+
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])
 def test_bisection_cuts_between_layers(cell):
     """Ten layers of flat cells in three parts: 3, 4 and 3 or so, each interface is a plane."""

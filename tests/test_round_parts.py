@@ -30,9 +30,10 @@ def untorn(kind, cells, x):
     return UntornMesh(dmesh.to_type(kind), None, some, ids, *tags, nodes, x[nodes], PhysicalNames())
 
 
-def boxes(n):
-    """A cube of n³ boxes."""
-    mesh = dmesh.create_unit_cube(MPI.COMM_SELF, n, n, n, dmesh.CellType.hexahedron)
+def boxes(n, layers=None, height=1.0):
+    """A cube of n³ boxes, or a plate of so many layers of that height."""
+    counts, corners = [n, n, layers or n], [(0.0, 0.0, 0.0), (1.0, 1.0, height)]
+    mesh = dmesh.create_box(MPI.COMM_SELF, corners, counts, dmesh.CellType.hexahedron)
     return untorn("hexahedron", mesh.geometry.dofmap, mesh.geometry.x)
 
 
@@ -141,3 +142,20 @@ def test_bodies_keep_their_parts():
     if COMM.rank == 0:
         assert len(np.unique(part)) == 8
         assert not set(part[: len(one)]) & set(part[len(one) :])
+
+
+def test_metis_leaves_columns_of_flat_boxes_whole(monkeypatch):
+    """Three cells of 25 : 1 on each other; METIS alone, which counts facets, cuts columns."""
+    mesh = boxes(12, layers=3, height=0.01)
+    columns = np.unique(np.round(mesh.midpoints()[:, :2], 6), axis=0, return_inverse=True)[1]
+    broken = []
+    for weighted in (True, False):
+        with monkeypatch.context() as patch:
+            if not weighted:
+                patch.setattr(metis_module, "_weights", lambda mesh, first, _: np.ones(len(first)))
+            part = metis(mesh, 6, COMM)
+        pairs = np.unique(np.stack((columns.ravel(), part)), axis=1)
+        broken.append(pairs.shape[1] - len(np.unique(columns)))
+    if COMM.rank == 0:
+        assert broken[0] == 0
+        assert broken[0] < broken[1]

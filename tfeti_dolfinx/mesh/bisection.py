@@ -16,8 +16,8 @@ APART = 0.4
 # of that: midpoints that are nearer to each other count as one; so many different ones a layer has
 # at most, else there are no layers
 ONE, MOST = 0.25, 6
-# of the cells of one part: a cut moves by so many at most to lie between layers, or columns, in a
-# part with a cell that is so many times as long as thick
+# of the cells of one part, but at least one: a cut moves by so many at most to lie between layers,
+# or columns, in a part with a cell that is so many times as long as thick
 MOVED, FLAT = 0.25, 3.0
 
 
@@ -113,7 +113,8 @@ def _halves(
             axes[turned] = axes[turned][:, [0, 2, 1]]
         mean = np.take_along_axis(total[0], axes, axis=1) / np.maximum(count, 1)[:, None]
         gap = np.where(flat[:, None] > 0, (APART * mean).astype(np.int64), -1)
-    return _Halves(np.rint(count * left / whole), MOVED * count / whole, axes, gap)
+    may = np.maximum(MOVED * count / whole, 1.0)
+    return _Halves(np.rint(count * left / whole), may, axes, gap)
 
 
 def _after(grid: Array, part: Array, halves: _Halves, comm: MPI.Intracomm) -> Array:

@@ -9,7 +9,7 @@ from mpi4py import MPI
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.arrays import TINY, Array
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.mesh.compact import compact_parts
 from tfeti_dolfinx.mesh.flatten import flatten_interfaces
@@ -20,6 +20,11 @@ from tfeti_dolfinx.mesh.untorn import UntornMesh
 # of the facets that METIS cuts in a body: parts that cut more are not taken; those of boxes less
 # readily, since what is not cut along their layers is a staircase
 CUT, CUT_BOXES = 1.1, 1.0
+
+# midpoints of cells that are nearer to each other than this part of their size are those of flat
+# cells, which hold each other by the square of that; a cut between them counts so much at most
+FLAT, MOST = 12.0, 100.0
+SIMPLICES = ("triangle", "tetrahedron")
 
 
 def metis(mesh: UntornMesh, num_parts: int, comm: MPI.Intracomm) -> Array:
@@ -35,7 +40,8 @@ def metis(mesh: UntornMesh, num_parts: int, comm: MPI.Intracomm) -> Array:
     with raised_on_all_ranks(comm):
         n = len(mesh.cells)
         first, second = mesh.neighbours()
-        graph = coo_array((np.ones(len(first)), (first, second)), shape=(n, n)).tocsr()
+        weights = _weights(mesh, first, second)
+        graph = coo_array((weights, (first, second)), shape=(n, n)).tocsr()
         graph = (graph + graph.T).tocsr()
         num_bodies, body = connected_components(graph, directed=False)
         shares = _shares(np.bincount(body, minlength=num_bodies), num_parts)
@@ -52,13 +58,25 @@ def metis(mesh: UntornMesh, num_parts: int, comm: MPI.Intracomm) -> Array:
     made_round = absorb_fragments(mesh, made_round, comm)
     with raised_on_all_ranks(comm):
         cuts = [
-            np.bincount(body[first], weights=which[first] != which[second], minlength=num_bodies)
+            np.bincount(
+                body[first], weights=weights * (which[first] != which[second]), minlength=num_bodies
+            )
             for which in (part, made_round)
         ]
-        simplices = mesh.cell_type.name in ("triangle", "tetrahedron")
+        simplices = mesh.cell_type.name in SIMPLICES
         taken = cuts[1] <= (CUT if simplices else CUT_BOXES) * cuts[0]
         part = np.where(taken[body], made_round, part)
     return without_holes(part, comm)
+
+
+def _weights(mesh: UntornMesh, first: Array, second: Array) -> Array:
+    """What a cut between two cells counts: 1, more within columns of flat cells, whole numbers."""
+    if mesh.cell_type.name in SIMPLICES:  # in columns of these midpoints say little
+        return np.ones(len(first))
+    x, size = mesh.midpoints(), np.linalg.norm(mesh.extents(), axis=1)
+    apart = np.linalg.norm(x[first] - x[second], axis=1)
+    flat = np.minimum(size[first], size[second]) / np.maximum(apart, TINY)
+    return np.rint(np.clip((flat / FLAT) ** 2, 1.0, MOST))
 
 
 def _metis_of(graph: Any, num_parts: int) -> Array:
@@ -68,7 +86,10 @@ def _metis_of(graph: Any, num_parts: int) -> Array:
         return np.zeros(graph.shape[0], dtype=np.int64)
     options = pymetis.Options(contig=True, seed=1)
     adjacency = pymetis.CSRAdjacency(graph.indptr, graph.indices)
-    _, part = pymetis.part_graph(num_parts, adjacency, options=options, recursive=False)
+    weights = graph.data.astype(np.int64)
+    _, part = pymetis.part_graph(
+        num_parts, adjacency, eweights=weights, options=options, recursive=False
+    )
     return np.asarray(part, dtype=np.int64)
 
 
