@@ -138,7 +138,7 @@ class Scale:
 
 def scale_at(qp: QP, start: Image) -> Scale:
     """The scale of a program whose λ̄₀ is known with its image. Collective."""
-    return Scale(_projected(qp, start.Fx, qp.d), ROUNDING * (qp.d.norm() + start.Fx.norm()))
+    return Scale(_projected(qp, start.Fx, qp.d), _rounding(qp, start))
 
 
 def scale_near(qp: QP, at: Image) -> Scale:
@@ -147,7 +147,19 @@ def scale_near(qp: QP, at: Image) -> Scale:
     ‖P d‖ and ‖P F λ‖ are equal at the solution, and b₀ is ‖P d‖ where e = 0; the larger one.
     """
     sizes = (_projected(qp, qp.d), _projected(qp, at.Fx))
-    return Scale(max(sizes), ROUNDING * (qp.d.norm() + at.Fx.norm()))
+    return Scale(max(sizes), _rounding(qp, at))
+
+
+def _rounding(qp: QP, at: Image) -> float:
+    """What rounding leaves of g^P, which has nothing of gaps that stay open, however wide."""
+    s = at.Fx.copy()
+    s.axpy(-1.0, qp.d)
+    qp.coarse.project(s)
+    phi, beta = qp.feasible.split(qp.feasible.project(np.array(at.x.array_r)), s.array_r)
+    s.destroy()
+    counts = (phi != 0.0) | (beta != 0.0)
+    parts = (np.where(counts, x.array_r, 0.0) for x in (qp.d, at.Fx))
+    return ROUNDING * sum(norm_over(qp.d.getComm().tompi4py(), part) for part in parts)
 
 
 @dataclass(frozen=True)
