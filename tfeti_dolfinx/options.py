@@ -15,6 +15,8 @@ from tfeti_dolfinx.subdomains.local import LOCAL_TYPES
 
 # what ``auto`` asks of displacements, whatever the mesh is
 LOOSEST = 1e-2
+# ρ of the stiffening that ``auto`` takes
+PENALTY = 10.0
 
 
 @dataclass(frozen=True)
@@ -78,13 +80,15 @@ class Options:
         "the coarse problem has the motions of clusters only; 0: none",
         fits=FROM_0,
     )
-    stiffening: float = described(
-        0.0,
+    stiffening: float | str = described(
+        "auto",
         "subdomains",
         "so many times its diagonal entry of K is added to K at a component that is prescribed as "
-        "0, beside its row, which leaves the solution as it is: for flat parts that are held along "
-        "a side",
+        "0 on a side of flat cells, beside its row, which leaves the solution as it is; 0: "
+        "nothing; auto: 10, with smalse 0",
         fits=FROM_0,
+        words=("auto",),
+        kind=float,
     )
     recycle: int | str = described(
         "auto",
@@ -138,6 +142,13 @@ class Options:
     def number(self) -> float:
         """rtol as a number: what displacements have to be right to."""
         return LOOSEST if isinstance(self.rtol, str) else self.rtol
+
+    @property
+    def penalty(self) -> float:
+        """ρ of the stiffening: without a preconditioner it would only spread eigenvalues of F."""
+        if isinstance(self.stiffening, str):
+            return 0.0 if self.qp_type == "smalse" else PENALTY
+        return self.stiffening
 
     def view_text(self, prefix: str) -> str:
         """One line per option."""

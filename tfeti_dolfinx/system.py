@@ -72,10 +72,11 @@ class System:
         self.friction = FrictionBounds(contacts, dofs, decomposition, forms.thickness)
         self.replaced = Replaced(boundary, dofs, decomposition)
         self.spectrum: dict[str, float] = {}
-        self._stiffening = Stiffening(settings.options.stiffening, dofs)
+        self._stiffening = Stiffening(settings.options.penalty, dofs)
         self._stages, self._counters, self._counted = Stages(), Counters(), 0
         self._seen = 0.0  # of ‖F‖, which more rows hardly change
         self._K: Any = None
+        self._added: Array | None = None
         self._search: ContactSearch | None = None
         self._known_rows: tuple[Sequence[float], Sequence[Array]] | None = None
         self._prescribed: Prescribed | None = None
@@ -198,7 +199,7 @@ class System:
     def _assemble_stiffness(self) -> None:
         K = self.forms.stiffness()
         self._blocks = self.replaced.node_blocks(K, self._settings.making(self._counters))
-        self._K = self._stiffening.stiffened(K)
+        self._K, self._added = K, self._stiffening.added(K)
         if self.replaced.exists:  # the load that a force per volume makes depends on S
             self.change("load")
 
@@ -235,7 +236,7 @@ class System:
             self._stages.made["stiffness"] += 1
         K, self._K = self._K, None  # it goes into the Blocks
         dofs, cut, choice = self._dofs, self._decomposition, given.local_choice
-        data = subdomain_data(dofs, cut, K, self._f, self.gluing.constraints.trace)
+        data = subdomain_data(dofs, cut, K, self._f, self.gluing.constraints.trace, self._added)
         with added_options(given.prefix, given.factor_options):
             clusters = clusters_of(dofs, cut, given.options.clusters)
             how = self.replaced.blocks(given.make_block(counters)), cut, counters, choice

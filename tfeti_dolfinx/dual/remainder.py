@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array, joined
@@ -16,7 +15,6 @@ from tfeti_dolfinx.qp.coarse import Coarse, NoCoarse
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.problem import QP
-from tfeti_dolfinx.subdomains.block import Block
 from tfeti_dolfinx.subdomains.local import LocalOperator
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
@@ -113,13 +111,4 @@ class Remainder:
 def _force_left(subdomains: Subdomains, u: Array) -> Array:
     """f − K u on all unknowns, shape ``(n,)``."""
     pairs = zip(subdomains.blocks, subdomains.dof_parts, strict=True)
-    return joined([block.load - _elastic(block, u[part]) for block, part in pairs])
-
-
-def _elastic(block: Block, u: Array) -> Array:
-    """K u without resultant, shape ``(n,)``.
-
-    RᵀK = 0, but rounding of K u in a stiff body may have more of a resultant than the load.
-    """
-    R, force = block.kernel, block.multiply(u)
-    return np.asarray(force - R @ (R.T @ force))
+    return joined([block.load - block.elastic(u[part]) for block, part in pairs])

@@ -60,6 +60,13 @@ class Block(Protocol):
         """K u on all unknowns, shapes ``(n,)``."""
         ...
 
+    def elastic(self, u: Array) -> Array:
+        """K u without its resultant, which is rounding, and without what K has got added.
+
+        Shapes ``(n,)``.
+        """
+        ...
+
     def solve(self, b: Array) -> Array:
         """K⁺ b on all unknowns, shapes ``(n,)``."""
         ...
@@ -163,6 +170,11 @@ class BlockDefaults:
     def apply_schur(self, w: Array) -> Array:
         """S w, shapes ``(t,)``."""
         raise NotImplementedError("apply_schur")
+
+    def elastic(self, u: Array) -> Array:
+        """K u without its resultant, shapes ``(n,)``."""
+        force = self.multiply(u)
+        return np.asarray(force - self.kernel @ (self.kernel.T @ force))
 
     @property
     def modes(self) -> Array:

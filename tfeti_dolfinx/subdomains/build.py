@@ -29,7 +29,12 @@ MakeBlock = Callable[[SubdomainData], Block]
 
 
 def subdomain_data(
-    dofs: TornDofs, decomposition: Decomposition, K: Any, f: Array, trace: Array
+    dofs: TornDofs,
+    decomposition: Decomposition,
+    K: Any,
+    f: Array,
+    trace: Array,
+    added: Array | None = None,
 ) -> Iterator[SubdomainData]:
     """What the Block of each subdomain of this rank is made from, one at a time. Collective.
 
@@ -39,18 +44,21 @@ def subdomain_data(
         K: This rank's stiffness in DOLFINx's numbering, scipy CSR; not needed any more after it.
         f: Its load in DOLFINx's numbering.
         trace: Local primal unknowns that rows of B touch, ascending.
+        added: What the diagonal of K is to get, in DOLFINx's numbering; None: nothing.
     """
     gdim = decomposition.mesh.geometry.dim
     x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node, :gdim]
     shares = 1.0 / dofs.spread(dofs.multiplicity)
     frames = _body_frames(dofs, decomposition, x, shares)
     loads, starts = dofs.to_primal(f), dofs.node_offsets * dofs.bs
+    more = None if added is None else dofs.to_primal(added)
     cuts = np.searchsorted(trace, starts)
 
     def data() -> Iterator[SubdomainData]:
         pairs = zip(submatrices(dofs, K), dofs.subdomains, strict=True)
         for s, (K_s, subdomain) in enumerate(pairs):
             nodes = slice(dofs.node_offsets[s], dofs.node_offsets[s + 1])
+            own = None if more is None else more[starts[s] : starts[s + 1]]
             yield SubdomainData(
                 name=f"subdomain {subdomain}",
                 K=K_s,
@@ -59,6 +67,7 @@ def subdomain_data(
                 trace_dofs=trace[cuts[s] : cuts[s + 1]] - starts[s],
                 body_frame=frames[decomposition.body_of_subdomain[subdomain]],
                 node_shares=shares[nodes],
+                added=own if own is not None and np.any(own) else None,
             )
 
     return data()

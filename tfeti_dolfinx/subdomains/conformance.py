@@ -165,6 +165,8 @@ def _check_stiffness(block: Block, K: Array, tol: float) -> None:
     u, w = rng.standard_normal(len(K)), rng.standard_normal(len(trace))
     largest = np.abs(K @ u).max()
     require(np.allclose(block.multiply(u), K @ u, atol=tol * largest), "multiply is K")
+    free = K @ u - block.kernel @ (block.kernel.T @ (K @ u))
+    require(np.allclose(block.elastic(u), free, atol=tol * largest), "elastic is K, balanced")
     block.prepare("stiffness")
     expected = K[np.ix_(trace, trace)] @ w
     atol = tol * np.abs(K).max() * np.abs(w).max(initial=0.0)

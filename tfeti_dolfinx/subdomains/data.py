@@ -35,6 +35,8 @@ class SubdomainData:
         trace_dofs: Trace unknowns, ascending, shape ``(t,)``.
         body_frame: Centre and length of the whole body, for its candidate modes.
         node_shares: 1 / number of torn copies of each node, shape ``(n / bs,)``.
+        added: What the diagonal of K is to get where rows hold u at 0, shape ``(n,)``; None:
+            nothing.
     """
 
     name: str
@@ -44,6 +46,7 @@ class SubdomainData:
     trace_dofs: Array
     body_frame: tuple[Array, float]
     node_shares: Array
+    added: Array | None = None
 
     @property
     def bs(self) -> int:

@@ -12,6 +12,9 @@ from tfeti_dolfinx.errors import FactorError
 from tfeti_dolfinx.subdomains.block import BlockDefaults, OperatorKind
 from tfeti_dolfinx.subdomains.data import SubdomainData
 from tfeti_dolfinx.subdomains.equal import EqualSubdomains
+from tfeti_dolfinx.subdomains.firm import holds_firmly
+from tfeti_dolfinx.subdomains.input_checks import check_stiffness
+from tfeti_dolfinx.subdomains.kernel import kernel_of
 from tfeti_dolfinx.subdomains.kplus import Making
 from tfeti_dolfinx.subdomains.stiffness import Stiffness
 from tfeti_dolfinx.subdomains.traced import Traced
@@ -51,6 +54,7 @@ class SparseBlock(BlockDefaults):
     ) -> None:
         self._how, self._equals = how or Making(), equals
         self._span: Array | None = None
+        self._to_add, self._motions = data.added, np.zeros((len(data.f), 0))
         self._stiffness: Stiffness | None = None
         super().__init__(data)
 
@@ -64,6 +68,10 @@ class SparseBlock(BlockDefaults):
     def set_stiffness(self, K: Any) -> None:
         """Take a stiffness; in the pattern of the one before only the numbers are computed anew."""
         self._forget_traced()
+        self._added = self._firm(K)
+        if self._added is not None:
+            self._motions = kernel_of(K, self.modes)
+            K.setdiag(K.diagonal() + self._added)
         old = self._stiffness
         new, self.place = self._found(K, old if old is not None and old.users == 1 else None)
         if new is not old:
@@ -71,6 +79,15 @@ class SparseBlock(BlockDefaults):
             self.destroy()
             self._stiffness = new
         self.diagonal, self.kernel = new.diagonal[self.place], new.kernel[self.place]
+        if self._added is not None:  # what stiffness holds does not move, nor by rounding
+            self.kernel[self._added > 0.0] = 0.0
+
+    def _firm(self, K: Any) -> Array | None:
+        """What K is to get on its diagonal, if that holds no motion softly."""
+        if self._to_add is None:
+            return None
+        check_stiffness(self.name, K)
+        return self._to_add if holds_firmly(self.modes, self._to_add, K.diagonal()) else None
 
     def _found(self, K: Any, own: Stiffness | None) -> tuple[Stiffness, Array]:
         """A Stiffness of K, maybe the own one, and the place of each unknown in it."""
@@ -85,6 +102,13 @@ class SparseBlock(BlockDefaults):
     def multiply(self, u: Array) -> Array:
         """K u on all unknowns, shapes ``(n,)``."""
         return np.asarray((self.stiffness.K @ self._placed(u))[self.place])
+
+    def elastic(self, u: Array) -> Array:
+        """K u without its resultant, nor what K has got added, shapes ``(n,)``."""
+        if self._added is None:
+            return super().elastic(u)
+        force = self.multiply(u) - self._added * u
+        return np.asarray(force - self._motions @ (self._motions.T @ force))
 
     def solve(self, b: Array) -> Array:
         """K⁺ b on all unknowns, shapes ``(n,)``."""
