@@ -12,6 +12,7 @@ from benchmarks.stress.qp import UnsettledError
 
 SETTLED = 1e-10  # last change
 WRONG = 1e-8  # of what a set gives: it leaves a motion free
+BROKEN = 1e-6  # of the largest force: by so much may forces leave the law
 MOST = 100
 
 
@@ -81,7 +82,12 @@ def solve_sliding(
             change[p].max() <= SETTLED * size for p, size in zip(parts, largest, strict=True)
         ]
         if all(settled) and off[:n].max() <= WRONG * np.abs(f).max():
-            return x[:n] / root, x[n : n + c], x[n + c :].reshape(c, t)
+            u, lam, tau = x[:n], x[n : n + c], x[n + c :].reshape(c, t)
+            bound = given + coefficient * np.maximum(lam, 0.0)
+            beyond = np.maximum(np.linalg.norm(tau, axis=1) - bound, -lam).max(initial=0.0)
+            if beyond <= BROKEN * largest[1]:
+                return u / root, lam, tau
+            break
     raise UnsettledError("friction did not settle")
 
 
