@@ -7,6 +7,9 @@ import pytest
 from test_repeated import Repeated, distance
 
 import tfeti_dolfinx as tfeti
+from benchmarks.stability_scenes import pressed, with_friction
+from benchmarks.stress.meshes import grid
+from benchmarks.stress.package import solve_scene
 
 
 def images(problem):
@@ -125,3 +128,20 @@ def test_directions_of_other_rows_are_refused():
 def test_a_number_of_directions_that_is_none():
     with pytest.raises(tfeti.InputError, match="recycle"):
         Repeated("triangle", recycle=-1)
+
+
+def test_steps_on_coulombs_law_learn_from_each_other(comm):
+    """Their faces differ by little, or not at all; a first solve without that law keeps nothing."""
+    scene = with_friction(pressed("triangle", 0.499), "coulomb", 0.3)
+    found = []
+    for kept in ("auto", 0):
+        given = replace(scene, options={"tfeti_recycle": kept})
+        found.append(solve_scene(given, grid(scene), comm))
+        assert not found[-1].error
+    if comm.rank == 0:
+        one, other = found
+        assert one.report["F"] <= 0.7 * other.report["F"]
+        assert np.abs(one.u - other.u).max() <= 1e-4 * np.abs(other.u).max()
+    smooth = Repeated("triangle")
+    smooth.solve()
+    assert smooth.problem.report.recycled_directions == 0

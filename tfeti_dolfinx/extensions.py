@@ -32,9 +32,6 @@ from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, MakeInverse, Making
 from tfeti_dolfinx.subdomains.local import LocalChoice
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
-# directions that are kept where a problem is solved again and options do not say how many
-REPEATED = 100
-
 
 @dataclass(frozen=True)
 class Extensions:
@@ -230,8 +227,3 @@ class Settings:
         if isinstance(self.options.recycle, int) and self.options.recycle:
             dual.recycled = Recycled(self.options.recycle, dofs.comm)
         return dual
-
-    def learn(self, dual: Dual) -> None:
-        """Keep directions from now on, where options leave that open: there are more solves."""
-        if self.options.recycle == "auto" and dual.recycled is None:
-            dual.recycled = Recycled(REPEATED, dual.coarse.comm)

@@ -16,6 +16,7 @@ from tfeti_dolfinx.qp.law import Law
 from tfeti_dolfinx.qp.law_newton import UNSEEN, LawPoint, newton_on_law, residual_of
 from tfeti_dolfinx.qp.oblique import NoOblique, Oblique
 from tfeti_dolfinx.qp.problem import QP
+from tfeti_dolfinx.solver import learn
 
 # how often it may end and its bounds not be at rest; the factor on its target each time, and at
 # least on its residual; of ‖F‖‖λ‖: what rounding leaves of that
@@ -38,13 +39,14 @@ class NewtonOnCoulomb:
         kind = options.friction_type
         self._dual, self._rtol, self.steps = dual, options.number, 0
         self._tries = TRIES if kind == "newton" or (kind == "auto" and qp_type == "newton") else 0
-        self._share = 1.0
+        self._share, self._options = 1.0, options
+        self._recycled = dual.recycled
         # the same load again: the last bounds are right
         self._rests = dual.last.is_of(dual.d, dual.coarse.e)
 
     def give_up(self) -> None:
-        """Try no more."""
-        self._tries = 0
+        """Try no more, and keep nothing of what has led nowhere."""
+        self._tries, self._dual.recycled = 0, self._recycled
 
     def solve(self, start: tuple[Array, Array] | None) -> tuple[Array, Array] | None:
         """λ on this rank's rows and the multipliers of Gλ = e for which the law holds.
@@ -64,6 +66,7 @@ class NewtonOnCoulomb:
             self._rests = False
             return None
         cite("newton on friction")
+        learn(self._dual, self._options)  # steps differ by few rows, if by any
         qp, law, norm = self._dual.qp(), self._law(), self._dual.seen
         constraints = self._dual.constraints
         known = constraints.pressures[constraints.pressed]
@@ -74,11 +77,13 @@ class NewtonOnCoulomb:
         else:
             end, steps = newton_on_law(qp, law, self._oblique, first, target, norm)
         constraints.set_pressures(known)
-        if end is not None:
-            self._pass_on(qp, end, UNSEEN * target / norm)
         self.steps, self._share = self.steps + steps, FINER * self._share
-        self._tries = 0 if end is None else self._tries - 1
-        return None if end is None else (end.lam, end.mu)
+        self._tries -= 1
+        if end is None:
+            self.give_up()
+            return None
+        self._pass_on(qp, end, UNSEEN * target / norm)
+        return end.lam, end.mu
 
     def _first(self, qp: QP, law: Law, start: tuple[Array, Array]) -> tuple[float, LawPoint]:
         """The start with its μ, or with that of least squares: the one with the lesser residual."""

@@ -95,7 +95,7 @@ class Options:
         "pcpg, newton",
         "so many directions of earlier solves with the same F are kept at most, which later ones "
         "begin with; each takes two dual vectors; auto: none of a first solve, 100 from the second "
-        "on; of bodies with mass 200",
+        "on, or from Newton's method on Coulomb's law on; of bodies with mass 200",
         fits=FROM_0,
         words=("auto",),
         kind=int,

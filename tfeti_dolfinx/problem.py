@@ -35,7 +35,7 @@ from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.report_filling import fill_result, settle_seconds
 from tfeti_dolfinx.rounds import solve_in_rounds
 from tfeti_dolfinx.solution import Solution
-from tfeti_dolfinx.solver import conclude, resolve_types
+from tfeti_dolfinx.solver import conclude, learn, resolve_types
 from tfeti_dolfinx.stepping import Stepping
 from tfeti_dolfinx.system import System
 from tfeti_dolfinx.timing import stage
@@ -258,7 +258,7 @@ class ContactProblem(Stepping):
         with stage("qp", report.seconds):
             start = None
             if self._start is not None:
-                self._settings.learn(dual)
+                learn(dual, self.options)
                 earlier, lam, mu = self._start
                 start = (gluing.multipliers(earlier, lam), mu)
             own, goal = self._settings.extensions.monitor, self._goal()

@@ -26,9 +26,12 @@ from tfeti_dolfinx.qp.homogenised import (
 )
 from tfeti_dolfinx.qp.monitors import Monitor, PrintMonitor, no_monitor
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, QPResult, Start
+from tfeti_dolfinx.qp.recycled import Recycled
 from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver, Task
 from tfeti_dolfinx.refinement import Told, last_look, with_more_digits
 
+# directions that are kept where more solves come and options do not say how many
+REPEATED = 100
 EXPLANATIONS = {
     ConvergedReason.DIVERGED_ROUNDING: "; rounding does not let it come lower: expected a "
     "larger rtol, or a scene with smaller ratios of stiffness or size",
@@ -46,6 +49,17 @@ SLIDES = (
     "load, but contact does not press as much as they need: expected a body that is held, or "
     "pressed by a load or by gaps that overlap"
 )
+
+
+def learn(dual: Dual, options: Options) -> None:
+    """Keep directions from now on, where options leave that open: more solves come.
+
+    Args:
+        dual: The dual problem.
+        options: Options.
+    """
+    if options.recycle == "auto" and dual.recycled is None:
+        dual.recycled = Recycled(REPEATED, dual.coarse.comm)
 
 
 def resolve_types(options: Options, rows: Sequence[int], prefix: str) -> tuple[str, str]:

@@ -20,6 +20,7 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.saved_state import SavedState, checked_state
 from tfeti_dolfinx.solution import Solution
+from tfeti_dolfinx.solver import learn
 from tfeti_dolfinx.system import System
 
 # rows, their λ, and the multipliers of Gλ = e
@@ -128,7 +129,7 @@ class Stepping:
         dual.saw(float(state.norm))
         gluing = replace(system.gluing, slip=state.slip)
         state.check_rows(gluing)
-        self._settings.learn(dual)
+        learn(dual, self._settings.options)
         if dual.recycled is not None:
             dual.recycled.take(state.directions)
         dual.last.take(self.dofs.comm, state.lam, state.image)
