@@ -22,6 +22,8 @@ from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
 
 # steps; and steps in a row without a residual below so much of the least one, before one gives up
 MOST_STEPS, PATIENCE, LESS = 40, 10, 0.98
+# of a residual: rounding of the λ that has it; from there nothing comes lower
+ROUNDING = 1e-16
 # directions of one solve
 MOST_DIRECTIONS = 80
 # what a solve leaves of its residual: less where the last step has brought that far down; of the
@@ -109,7 +111,7 @@ def newton_on_law(
             return at, step
         idle = 0 if residual < LESS * best else idle + 1
         best = min(best, residual)
-        if idle > PATIENCE or not np.isfinite(residual):
+        if idle > PATIENCE or not ROUNDING * residual <= target:
             break
         # Step 2: the face there
         p, face = turning.face(feasible, p, at.s)
