@@ -21,7 +21,7 @@ from tfeti_dolfinx.qp.oblique import Oblique
 from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
 
 # steps; and steps in a row without a residual below so much of the least one, before one gives up
-MOST_STEPS, PATIENCE, LESS = 40, 10, 0.98
+MOST_STEPS, PATIENCE, LESS = 80, 10, 0.98
 # of a residual: rounding of the λ that has it; from there nothing comes lower
 ROUNDING = 1e-16
 # directions of one solve
