@@ -326,7 +326,7 @@ def main(argv):
     arguments, _ = command_line(__doc__, argv, configure)
     unit, before = choose_clock(arguments), logging.root.manager.disable
     logging.disable(logging.WARNING)
-    count, rank = 4 if arguments.quick else arguments.scenes, MPI.COMM_WORLD.rank
+    count, rank = 2 if arguments.quick else arguments.scenes, MPI.COMM_WORLD.rank
     journal, solves, known = arguments.output / "solver_profiles.jsonl", [], {}
     if arguments.resume and journal.exists():
         lines = journal.read_text().splitlines()
