@@ -187,9 +187,11 @@ def lacked(left, rtol=1e-10):
     """The solution of what a point lacks, and its accuracy."""
     qp, zero = left.qp(), left.d.duplicate()
     zero.set(0.0)
-    start = homogenise(qp, image(qp.F, feasible_start(qp, Start(zero, np.zeros(6)))))
-    own = Accuracy(left, rtol, 0.0, (start.scale.reference, start.scale.rounding))
-    result = newton(qp, start, own, warm=True)
+    start = Start(zero, np.zeros(qp.coarse.dimension))
+    homogenised = homogenise(qp, image(qp.F, feasible_start(qp, start)))
+    scale = homogenised.scale
+    own = Accuracy(left, rtol, 0.0, (scale.reference, scale.rounding))
+    result = newton(qp, homogenised, own, start=start)
     assert result.reason > 0
     return result, own
 

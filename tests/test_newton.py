@@ -61,7 +61,7 @@ def qp_of(F, d, G, e, bounded):
 
 def solved(qp, tolerance, start=None):
     at = image(qp.F, feasible_start(qp, start) if start else first_point(qp))
-    found = newton(qp, homogenise(qp, at), ResidualRule(tolerance), max_it=3000, warm=bool(start))
+    found = newton(qp, homogenise(qp, at), ResidualRule(tolerance), max_it=3000, start=start)
     assert found.reason > 0
     return found
 
@@ -200,7 +200,7 @@ def test_forces_that_are_rounding_do_not_say_what_touches():
     """min ½λ₁² − λ₁ + λ₂, λ ≥ 0, from λ₂ = 1e-25: nothing rests on the second row."""
     qp = QP(matrix(np.eye(2)), vector([1.0, -1.0]), NoCoarse(), bounds_on(np.arange(2)))
     start = homogenise(qp, image(qp.F, vector([1.0, 1e-25])))
-    found = newton(qp, start, ResidualRule(1e-10), warm=True)
+    found = newton(qp, start, ResidualRule(1e-10), start=Start(start.lam_bar, np.zeros(0)))
     assert found.lam.array_r[1] > 0.0
     assert found.face.carrying.tolist() == [True, False]
 

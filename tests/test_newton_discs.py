@@ -24,7 +24,7 @@ from tfeti_dolfinx.qp.stopping import ResidualRule
 def solved(qp, tolerance, monitor=no_monitor, start=None):
     at = image(qp.F, feasible_start(qp, start) if start else first_point(qp))
     rule = ResidualRule(tolerance)
-    return newton(qp, homogenise(qp, at), rule, max_it=2000, warm=bool(start), monitor=monitor)
+    return newton(qp, homogenise(qp, at), rule, max_it=2000, start=start, monitor=monitor)
 
 
 def agrees_with_an_interior_point_method(seed, k, isotropic):

@@ -12,9 +12,11 @@ from mpi4py import MPI
 from scenes import displacement, hooke, strain
 
 import tfeti_dolfinx as tfeti
+from benchmarks.stress.judge import run_scene
 from benchmarks.stress.meshes import grid
 from benchmarks.stress.package import solve_scene
 from benchmarks.stress.random_scenes import random_scene
+from benchmarks.stress.scene import Body, Held, Load, Scene
 from tfeti_dolfinx.gluing.stiffening import held_flat_sides
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.subdomains.firm import holds_firmly
@@ -32,9 +34,10 @@ class Strip:
         wall: Whether a wall without a gap holds the left end in the place of a condition.
         lift: By how much the rollers lift it.
         thick: Its thickness.
+        qp_type: The solver.
     """
 
-    def __init__(self, stiffening, wall=False, lift=0.0, thick=THICK):
+    def __init__(self, stiffening, wall=False, lift=0.0, thick=THICK, qp_type="auto"):
         strip = ("strip", (0.0, 0.0), (1.0, thick), (16, 1))
         mesh, tags, names = boxes("quadrilateral", [strip])
         d = tfeti.decompose(mesh, SUBDOMAINS, facet_tags=tags, surfaces=names)
@@ -52,7 +55,7 @@ class Strip:
             held,
             [tfeti.Obstacle("strip left", plane)] if wall else [],
             d,
-            petsc_options={"stiffening": stiffening, "rtol": 1e-8},
+            petsc_options={"stiffening": stiffening, "rtol": 1e-8, "qp_type": qp_type},
         )
 
     @staticmethod
@@ -104,8 +107,10 @@ def test_values_that_are_not_0_are_left_alone():
     assert np.array_equal(*diagonals)
 
 
-def test_a_value_that_becomes_0_and_back():
-    strip = Strip(1e3, lift=1e-4)
+@pytest.mark.parametrize("qp_type", ["auto", "newton", "smalse"])
+def test_a_value_that_becomes_0_and_back(qp_type):
+    """The kernel becomes smaller and larger again, and with it μ of the last solve."""
+    strip = Strip(1e3, lift=1e-4, wall=qp_type != "auto", qp_type=qp_type)
     for lift, assembled in ((1e-4, 1), (2e-4, 0), (0.0, 1), (0.0, 0), (1e-4, 1)):
         strip.lift.value = lift
         strip.solve()
@@ -151,7 +156,28 @@ def test_what_holds_motions_softly_is_not_added():
     assert holds_firmly(modes, np.zeros(x.size), diagonal)
     assert not holds_firmly(modes, soft.ravel(), diagonal)
     assert not holds_firmly(modes, 1e-3 * bottom.ravel(), diagonal)
+    along = bottom[:, ::-1].ravel()
+    assert holds_firmly(modes, along, diagonal)
+    turned = x + 1e-6 * x[:, :1] * (0.0, 1.0)
+    assert not holds_firmly(candidate_modes(turned, 2, x.mean(axis=0), 0.5), along, diagonal)
     assert not holds_firmly(modes, end.ravel() * np.tile([1.0, 0.0], len(x)), diagonal)
+
+
+@pytest.mark.parametrize("curvature", [2.5e-7, 1e-6, 2.5e-6])
+def test_what_a_slight_curve_holds_is_not_added(curvature, comm):
+    """A strip held along a side that is not quite straight, which alone keeps it from turning.
+
+    K with that rotation held by 1e-13 of its entries is neither singular nor of full rank.
+    """
+    strip = Body((0.0, 0.0), (1.0, THICK), (3, 1))
+    held = Held((0, 1, 0), (0,)), Held((0, 0, 0), (1,)), Held((0, 0, 1), (1,))
+    load, bent = Load((0, 1, 1), (0.0, -1e-10)), ("arch", 1.0 / curvature)
+    scene = Scene("quadrilateral", (strip,), held, (load,), (), (), subdomains=2, bent=bent)
+    row = run_scene(replace(scene, options={"tfeti_rtol": 1e-7}), comm)
+    if comm.rank == 0:
+        assert row["class"] == "right", row
+        assert row["u"] <= 1e-6
+        assert not any("springs" in warning for warning in row["warnings"])
 
 
 def test_cells_that_are_not_flat_are_left_alone():

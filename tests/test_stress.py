@@ -83,7 +83,16 @@ def test_sheets_that_all_slip_are_right(rtol, comm):
         assert row["class"] == "right", row
 
 
-@pytest.mark.slow
+def test_friction_that_balances_the_load_just_so_leaves_motions_to_the_law(comm):
+    """30 again: with the bounds of the law all slips, so that they tell nothing of μ."""
+    scene = with_friction(random_scene(30), "coulomb", 0.1)
+    scene = replace(scene, options={"tfeti_rtol": 1e-8})
+    outcome = solve_scene(scene, meshes.grid(scene), comm)
+    if comm.rank == 0:
+        assert outcome.error == ""
+        assert outcome.report["F"] <= 160
+
+
 def test_the_reference_keeps_the_law(comm):
     """81: a set that leaves a motion free gave a normal force that pulls, and changed no more."""
     scene = with_friction(random_scene(81), "coulomb", 0.2)

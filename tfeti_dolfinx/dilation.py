@@ -17,7 +17,7 @@ from tfeti_dolfinx.qp.discs import Ellipses
 from tfeti_dolfinx.qp.feasible_sets import Bounds, Product
 from tfeti_dolfinx.qp.homogenised import homogenise, image
 from tfeti_dolfinx.qp.newton import newton
-from tfeti_dolfinx.qp.problem import QP, ConvergedReason
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Start
 from tfeti_dolfinx.qp.stopping import ResidualRule
 
 # Of the first residual, and of the last change of the slips: what a problem is solved to
@@ -105,20 +105,20 @@ class DilatedGaps:
         lam.array[:] = self.lam
         qp: QP = replace(given, d=d, feasible=cone_set(self._dual.constraints))
         at = image(qp.F, lam)
-        start = homogenise(qp, at)
-        tolerance = FIRST * start.scale.reference
+        homogenised, start = homogenise(qp, at), Start(lam, np.zeros_like(self.mu))
+        tolerance = FIRST * homogenised.scale.reference
         if np.isfinite(self._change):
             tolerance = min(tolerance, SHARE * self._change)
-        rule = ResidualRule(max(tolerance, start.scale.rounding))
+        rule = ResidualRule(max(tolerance, homogenised.scale.rounding))
         result = newton(
-            qp, start, rule, self._options.newton, max_it=self._options.max_it, warm=True
+            qp, homogenised, rule, self._options.newton, max_it=self._options.max_it, start=start
         )
         self._dual.saw(result.norm)
         late = result.reason == ConvergedReason.DIVERGED_ITS
         self._unsolved = self._unsolved + 1 if late else 0
         self.lam, self.mu = np.array(result.lam.array_r), self.mu + result.mu
         slips = np.linalg.norm(self._mu * result.gradient.array_r[self._tangents], axis=1)
-        start.destroy()
+        homogenised.destroy()
         at.destroy()
         result.destroy()
         d.destroy()

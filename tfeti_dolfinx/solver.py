@@ -122,7 +122,7 @@ def solve_dual(
     cite("tfeti", qp_type)
     solver = SOLVERS[qp_type]
     qp = dual.qp(options.norm_steps if solver.relative_to_norm else 0)
-    begin = _start(start, qp.d)
+    begin = _start(start, qp)
     homogenised = _homogenise(dual, qp, solver, options, begin)
     if monitor is None:
         monitor = _monitor(dual, homogenised, options)
@@ -143,12 +143,13 @@ def solve_dual(
     return result, rule
 
 
-def _start(values: tuple[Array, Array] | None, like: PETSc.Vec) -> Start | None:
+def _start(values: tuple[Array, Array] | None, qp: QP) -> Start | None:
+    """μ of another kernel, as before conditions have become other ones, is left out."""
     if values is None:
         return None
-    lam = like.duplicate()
+    lam, mu = qp.d.duplicate(), values[1]
     lam.array[:] = values[0]
-    return Start(lam, values[1])
+    return Start(lam, mu if len(mu) == qp.coarse.dimension else np.zeros(qp.coarse.dimension))
 
 
 def _homogenise(

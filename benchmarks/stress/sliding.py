@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import warnings
 
 import numpy as np
-from scipy.linalg import lu_factor, lu_solve
+from scipy.linalg import LinAlgWarning, lu_factor, lu_solve
 from scipy.sparse import csr_array
 
 from benchmarks.stress.qp import UnsettledError
@@ -93,7 +94,9 @@ def solve_sliding(
 
 def _solved(J: np.ndarray, right: np.ndarray) -> np.ndarray:
     """By elimination and a correction, or by least squares where a set leaves a motion free."""
-    with contextlib.suppress(np.linalg.LinAlgError, ValueError):  # infinite
+    singular = np.linalg.LinAlgError, LinAlgWarning, ValueError  # the last: infinite
+    with contextlib.suppress(*singular), warnings.catch_warnings():
+        warnings.simplefilter("error", LinAlgWarning)
         factor = lu_factor(J)
         new = lu_solve(factor, right)
         new += lu_solve(factor, right - J @ new)

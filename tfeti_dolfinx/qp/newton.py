@@ -61,7 +61,7 @@ def newton(
     parameters: NewtonParameters = NewtonParameters(),
     *,
     max_it: int = 10_000,
-    warm: bool = False,
+    start: Start | None = None,
     monitor: Monitor = no_monitor,
 ) -> QPResult:
     """Minimise q(λ) = ½λᵀFλ − λᵀd subject to Gλ = e, λ ∈ Ω. Collective.
@@ -100,22 +100,22 @@ def newton(
         rule: Says when ‖g^P‖ is small enough.
         parameters: Γ and what inner solves reduce.
         max_it: Most conjugate gradient steps, and most faces.
-        warm: Whether the start may be optimal, so that this is looked at first.
+        start: Where it begins, if that may be optimal: this is looked at first, with its μ.
         monitor: Called after each step.
 
     Returns:
         The multipliers, their gradient s, the reason and the residuals.
     """
     steps = Steps()
-    state = Iterate(qp, homogenised)
+    state = Iterate(qp, homogenised, start.mu if start else None)
     faces = FaceSolver(state.qp, rule, parameters, steps, max_it, monitor)
-    reason, looked = ConvergedReason.ITERATING, warm or is_rubbing(qp, state.face())
+    reason, looked = ConvergedReason.ITERATING, bool(start) or is_rubbing(qp, state.face())
     monitor(steps, "start", state.point.lam, homogenised.b.norm(), 0.0)
     if is_rubbing(qp, state.face()) and imbalance(qp.coarse, state.point.lam) > UNBALANCED:
         # no point of Ω balances the load; without friction that is known before
         reason = ConvergedReason.DIVERGED_STALLED
         state.look(faces)
-    elif not warm:
+    elif start is None:
         faces.enter(state.face())
         state.multipliers_on(faces)
     while reason == ConvergedReason.ITERATING:
@@ -139,11 +139,11 @@ def newton(
         # Step 2: the face
         face = state.wanted_face(parameters.gamma, faces) if looked else state.face()
         # Step 3: solve on the face, drop what leaves Ω, restore Gλ = e
-        start, begun = state.begun(face)
+        first, begun = state.begun(face)
         if begun is not face:
             faces.forget()  # PCPG may have stopped on that face, but elsewhere
-        trial = faces.solve(start, begun, state.residual)
-        start.destroy()
+        trial = faces.solve(first, begun, state.residual)
+        first.destroy()
         trial = longer(state, trial, faces)
         # Step 4: accept where q falls enough
         if faces.dependent.contradicts:

@@ -35,6 +35,7 @@ class Iterate:
     Args:
         qp: The program.
         homogenised: Holds the start.
+        mu: Multipliers of Gλ = e there, where they are known.
 
     Attributes:
         qp: The same program, but for a d' = d + Gᵀμ', which adds a constant to q.
@@ -49,14 +50,14 @@ class Iterate:
         slow: So many have not found ‖g^P‖ halved.
     """
 
-    def __init__(self, qp: QP, homogenised: Homogenised) -> None:
+    def __init__(self, qp: QP, homogenised: Homogenised, mu: Array | None = None) -> None:
         self._given, self._homogenised = qp, homogenised
         self.qp = replace(qp, d=qp.d.copy())
         self.comm = qp.d.getComm().tompi4py()
         self.point = Point(homogenised.lam_bar.copy(), homogenised.gradient.copy())
         self.s = qp.d.duplicate()
         self.back: PETSc.Vec | None = None
-        self.mu: Array = np.zeros(qp.coarse.dimension)
+        self.mu: Array = np.zeros(qp.coarse.dimension) if mu is None else mu
         self._taken: Array = np.zeros(qp.coarse.dimension)
         self._set_multipliers()
         self.residual, self._best, self.norm, self.rounding = np.inf, np.inf, 1.0, 0.0

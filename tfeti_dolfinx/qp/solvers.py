@@ -105,7 +105,7 @@ def _newton(task: Task) -> QPResult:
         task.rule,
         task.parameters.newton,
         max_it=task.parameters.max_it,
-        warm=task.start is not None,
+        start=task.start,
         monitor=task.monitor,
     )
 
