@@ -14,7 +14,7 @@ from benchmarks.stress.package import Outcome, solve_scene
 from benchmarks.stress.qp import UnsettledError
 from benchmarks.stress.random_scenes import random_scene
 from benchmarks.stress.reference import Untorn
-from benchmarks.stress.scene import Body, Load, Scene, Wall
+from benchmarks.stress.scene import Body, Held, Load, Pair, Scene, Wall
 from tfeti_dolfinx.errors import TfetiError
 
 # 237: no load; 314: a far row is kept, however uncertain its normal; 608: rows of a stiff side on a
@@ -99,6 +99,25 @@ def test_the_reference_keeps_the_law(comm):
     row = judge.run_scene(replace(scene, options={"tfeti_rtol": 1e-8}), comm)
     if comm.rank == 0:
         assert row["class"] == "right", row
+
+
+@pytest.mark.parametrize("friction", [("coulomb", 0.5), ("tresca", 1e-3)])
+@pytest.mark.parametrize("component", [0, 1])
+def test_friction_where_values_are_prescribed(component, friction, comm):
+    """Of nodes that slip by what is prescribed, and of those whose normal displacement is."""
+    low = Body((0.0, 0.0), (1.0, 1.0), (4, 4))
+    high = Body((0.0, 1.0), (1.0, 2.0), (3, 3))
+    ends = Held((0, 1, 0), (0, 1)), Held((1, 0, 0), (component,), value=-1e-3)
+    pair = Pair((1, 1, 0), (0, 1, 1), friction)
+    wall = Wall((1, 0, 0), "plane", ((-1e-3, 0.0), (1.0, 0.0)), ("tresca", 1e-3))
+    walls = (wall,) if component == 0 else ()
+    held = ends if component == 0 else (*ends, Held((1, 1, 1), (0,)))
+    load = Load((1, 1, 1), (0.0, -1e-2))
+    scene = Scene("triangle", (low, high), held, (load,), walls, (pair,), subdomains=4)
+    row = judge.run_scene(replace(scene, options={"tfeti_rtol": 1e-8}), comm)
+    if comm.rank == 0:
+        assert row["class"] == "right", row
+        assert row["u"] <= 1e-6
 
 
 @pytest.mark.parametrize(("seed", "mu", "most"), [(3, 0.4, 130), (42, 0.3, 110)])

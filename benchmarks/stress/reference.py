@@ -8,7 +8,7 @@ Dirichlet conditions leave (Farkas). The solution comes from the compliance of t
 from __future__ import annotations
 
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import localcontext
 
 import numpy as np
@@ -23,8 +23,8 @@ from benchmarks.stress.conditions import conditions
 from benchmarks.stress.digits import exact, rounded
 from benchmarks.stress.qp import UnsettledError
 from benchmarks.stress.scene import Scene, Side
-from benchmarks.stress.sliding import solve_sliding
-from benchmarks.stress.sliding_digits import Law, SlidingInDigits, without_motions
+from benchmarks.stress.sliding import Law, solve_sliding
+from benchmarks.stress.sliding_digits import SlidingInDigits, without_motions
 from benchmarks.stress.solve import DEPENDENT, EPSILON, null_space, solve, verdict
 from tfeti_dolfinx.compat import geometry_dofmap
 
@@ -160,12 +160,22 @@ class Untorn:
         c = self.conditions
         f = self.f - self.K @ self.values
         T = c.T[:, free]
+        # Tresca's law acts where the normal displacement is prescribed, too
+        size = np.asarray(abs(T).sum(axis=1)).reshape(c.N.shape[0], -1).sum(axis=1)
         moves = np.asarray(abs(c.N[:, free]).sum(axis=1)).ravel() > DEPENDENT
+        moves |= (c.given > 0.0) & (size > DEPENDENT)
         along = np.repeat(moves, T.shape[0] // len(moves))
-        K, N, gap = self.K[free][:, free], c.N[moves][:, free], c.gap[moves]
-        gap, law = gap - c.N[moves] @ self.values, (c.given[moves], c.coefficient[moves])
+        K, gap = self.K[free][:, free], c.gap[moves] - c.N[moves] @ self.values
+        law = Law(
+            c.N[moves][:, free],
+            T[along],
+            gap,
+            c.T[along] @ self.values,
+            c.given[moves],
+            c.coefficient[moves],
+        )
         try:
-            u, lam, tau = solve_sliding(K, f[free], N, T[along], gap, *law)
+            u, lam, tau = solve_sliding(K, f[free], law)
         except UnsettledError:
             if len(self.f) > MOST or self.scene.joined:
                 raise
@@ -179,7 +189,7 @@ class Untorn:
         known.noise = np.zeros(len(self.scene.bodies))
         K, gap = self._shaken(known, K, c.N[moves], gap)
         with contextlib.suppress(UnsettledError):
-            u, *_ = solve_sliding(K, f[free], N, T[along], gap, *law)
+            u, *_ = solve_sliding(K, f[free], replace(law, gap=gap))
             known.noise = body_errors(known, self._smallest(u, known.free))
 
     def _slid_in_digits(
@@ -190,7 +200,7 @@ class Untorn:
         K = without_motions(whole, self.x, self._nodes_of, self.gdim)
         N, T, values = exact(c.N[moves].toarray()), exact(c.T[along].toarray()), exact(self.values)
         gap, laws = exact(c.gap[moves]) - N.dot(values), (c.given[moves], c.coefficient[moves])
-        law = Law(N[:, free], T[:, free], gap, *map(exact, laws))
+        law = Law(N[:, free], T[:, free], gap, T.dot(values), *map(exact, laws))
         sliding = SlidingInDigits(K[np.ix_(free, free)], (exact(self.f) - K.dot(values))[free], law)
         u, force = sliding.solve()
         known.free = np.zeros((len(self.f), 0))

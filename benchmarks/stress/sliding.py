@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import warnings
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.linalg import LinAlgWarning, lu_factor, lu_solve
@@ -17,25 +19,36 @@ BROKEN = 1e-6  # of the largest force: by so much may forces leave the law
 MOST = 100
 
 
+@dataclass
+class Law:
+    """Conditions on the free unknowns: arrays of doubles or of decimal digits, or sparse ones.
+
+    Attributes:
+        N: Conditions N u ≤ gap, shape ``(c, n)``.
+        T: Slips T u + slip, shape ``(c (gdim - 1), n)``.
+        gap: Shape ``(c,)``.
+        slip: What prescribed values slip by, shape ``(c (gdim - 1),)``.
+        given: Bounds of Tresca's law.
+        coefficient: Of Coulomb's law.
+    """
+
+    N: Any
+    T: Any
+    gap: np.ndarray
+    slip: np.ndarray
+    given: np.ndarray
+    coefficient: np.ndarray
+
+
 def solve_sliding(
-    K: csr_array,
-    f: np.ndarray,
-    N: csr_array,
-    T: csr_array,
-    gap: np.ndarray,
-    given: np.ndarray,
-    coefficient: np.ndarray,
+    K: csr_array, f: np.ndarray, law: Law
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """K u + Nᵀλ + Tᵀτ = f, λ ≥ 0, N u ≤ gap; ‖τ_i‖ ≤ given_i or coefficient_i λ_i along T u.
+    """K u + Nᵀλ + Tᵀτ = f, λ ≥ 0, N u ≤ gap; ‖τ_i‖ ≤ given_i or coefficient_i λ_i along the slip.
 
     Args:
         K: Stiffness.
         f: Load.
-        N: Conditions.
-        T: Slips, gdim − 1 rows of each condition.
-        gap: Of the conditions.
-        given: Bounds of Tresca's law.
-        coefficient: Of Coulomb's law.
+        law: The conditions, sparse.
 
     Returns:
         u, λ, and τ of shape ``(c, gdim - 1)``.
@@ -43,34 +56,36 @@ def solve_sliding(
     Raises:
         UnsettledError: Newton's method did not settle.
     """
-    n, c = K.shape[0], N.shape[0]
-    t, root = T.shape[0] // c, np.sqrt(K.diagonal())
-    K, N, T = (np.asarray(A.todense()) / root for A in (K, N, T))
-    K, f, r = K / root[:, None], f / root, 1.0 / np.sum(N**2, axis=1)  # r: a row's own stiffness
+    n, c, gap, given, coefficient = K.shape[0], len(law.gap), law.gap, law.given, law.coefficient
+    t, root = law.T.shape[0] // c, np.sqrt(K.diagonal())
+    K, N, T = (np.asarray(A.todense()) / root for A in (K, law.N, law.T))
+    K, f, slip = K / root[:, None], f / root, law.slip.reshape(c, t)
+    own, turned = np.sum(N**2, axis=1), np.sum(T.reshape(c, -1) ** 2, axis=1)
+    moves, r = own > 0.0, 1.0 / np.where(own > 0.0, own, turned)  # r: a row's own stiffness
     saddle = np.block([[K, N.T, T.T], [np.zeros((c * (1 + t), n + c * (1 + t)))]])
     x, load = np.zeros(len(saddle)), np.abs(f * root).max()
     for k in range(MOST):
         J, right = saddle.copy(), np.concatenate((f, np.zeros(c * (1 + t))))
         u, lam, tau = x[:n], x[n : n + c], x[n + c :].reshape(c, t)
-        z, y = lam + r * (N @ u - gap), tau + r[:, None] * (T @ u).reshape(c, t)
+        z, y = lam + r * (N @ u - gap), tau + r[:, None] * ((T @ u).reshape(c, t) + slip)
         bound = given + coefficient * np.maximum(z, 0.0)
         for i in range(c):
             rows = slice(n + c + i * t, n + c + (i + 1) * t)
-            along, closed = r[i] * T[i * t : (i + 1) * t], z[i] > 0.0 or k == 0
+            along, closed = r[i] * T[i * t : (i + 1) * t], moves[i] and (z[i] > 0.0 or k == 0)
             if closed:
                 J[n + i, :n], right[n + i] = N[i], gap[i]
             else:
                 J[n + i, n + i] = 1.0
             length = np.linalg.norm(y[i])
             if length < bound[i] or (k == 0 and given[i] + coefficient[i] > 0.0):
-                J[rows, :n] = along
+                J[rows, :n], right[rows] = along, -r[i] * slip[i]
                 continue
             # τ = bound y/‖y‖, linearised
             e = y[i] / length if length > 0.0 else y[i]
             turn = bound[i] / (length or 1.0) * (np.eye(t) - np.outer(e, e))
             J[rows, rows] = np.eye(t) - turn
             J[rows, :n] -= turn @ along
-            right[rows] = bound[i] * e
+            right[rows] = bound[i] * e + turn @ (r[i] * slip[i])
             if closed:
                 J[rows, n + i] -= coefficient[i] * e
                 J[rows, :n] -= coefficient[i] * r[i] * np.outer(e, N[i])

@@ -6,7 +6,6 @@ method with the discs ends there. KR = 0 is made to hold.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from decimal import Decimal
 
 import numpy as np
@@ -24,6 +23,7 @@ from benchmarks.stress.digits import (
     zeros,
 )
 from benchmarks.stress.qp import UnsettledError
+from benchmarks.stress.sliding import Law
 
 SPRING = Decimal("1e-50")  # of the largest entry of K
 APART = Decimal("1e-25")  # of the largest load: what keeps bounds from being equal
@@ -31,25 +31,6 @@ SETTLED = Decimal("1e-25")
 SIDES = 6  # of the polygon around a disc
 BORNE = Decimal("1e-15")  # of the largest load: what springs may bear
 PIVOTS, STEPS = 5000, 60
-
-
-@dataclass
-class Law:
-    """Conditions on the free unknowns, in decimal digits.
-
-    Attributes:
-        N: Conditions N u ≤ gap, shape ``(c, n)``.
-        T: Slips, shape ``(c (gdim - 1), n)``.
-        gap: Shape ``(c,)``.
-        given: Bounds of Tresca's law.
-        coefficient: Of Coulomb's law.
-    """
-
-    N: np.ndarray
-    T: np.ndarray
-    gap: np.ndarray
-    given: np.ndarray
-    coefficient: np.ndarray
 
 
 def without_motions(
@@ -88,7 +69,7 @@ class SlidingInDigits:
     Args:
         K: Stiffness, symmetric and semidefinite, shape ``(n, n)``.
         f: Load.
-        law: The conditions.
+        law: The conditions, in decimal digits.
     """
 
     def __init__(self, K: np.ndarray, f: np.ndarray, law: Law) -> None:
@@ -100,7 +81,10 @@ class SlidingInDigits:
         self._factor = Cholesky(K + self._spring * np.diag([ONE] * len(K)))
         self._bent = self._factor.solve(self._H.T)
         self._C = self._H.dot(self._bent)
-        self._r = np.array([ONE / (row * row / np.diag(K)).sum() for row in law.N])
+        self._given = np.concatenate((zeros(self.count), law.slip))
+        sizes = (self._H * self._H / np.diag(K)).sum(axis=1)
+        turned = sizes[self.count :].reshape(self.count, self.axes).sum(axis=1)
+        self._r = np.array([ONE / (a or b) for a, b in zip(sizes, turned, strict=False)])
         self._state: tuple[np.ndarray, np.ndarray] | None = None
 
     def solve(self) -> tuple[np.ndarray, np.ndarray]:
@@ -111,7 +95,7 @@ class SlidingInDigits:
         """
         try:
             free = self._factor.solve(self._f[:, None])[:, 0]
-            moved = self._H.dot(free)
+            moved = self._H.dot(free) + self._given
             force = self._newton(self._sticking_or_slipping(moved), moved)
         except SingularError as error:
             raise UnsettledError(f"friction did not settle in digits: {error}") from error
