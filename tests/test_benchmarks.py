@@ -124,7 +124,7 @@ def test_stability(shared_tmp, comm):
     assert locked["P1 over P2"] < 0.8 * stiff["P1 over P2"]
 
 
-def test_solver_profiles(shared_tmp, comm):
+def test_solver_profiles(serial_only, shared_tmp, comm):
     tables = quick(solver_profiles, shared_tmp, comm, "--steps", "300", "--seed", "5")
     default = tables["contact, multiplications"][2]
     assert default["solver"] == "newton, dirichlet"
