@@ -113,8 +113,10 @@ def _halves(
             axes[turned] = axes[turned][:, [0, 2, 1]]
         mean = np.take_along_axis(total[0], axes, axis=1) / np.maximum(count, 1)[:, None]
         gap = np.where(flat[:, None] > 0, (APART * mean).astype(np.int64), -1)
-    may = np.maximum(MOVED * count / whole, 1.0)
-    return _Halves(np.rint(count * left / whole), may, axes, gap)
+    wanted = np.rint(count * left / whole)
+    spare = np.minimum(wanted - left, (count - wanted) - (whole - left))  # a point for each part
+    may = np.minimum(np.maximum(MOVED * count / whole, 1.0), spare)
+    return _Halves(wanted, may, axes, gap)
 
 
 def _after(grid: Array, part: Array, halves: _Halves, comm: MPI.Intracomm) -> Array:
