@@ -69,12 +69,7 @@ def pcpg(
     progress = Plateau(norm, r.getSize())
     while True:
         # test
-        if norm <= rule.tolerance:
-            reason = _examined(qp, point, rule, norm)
-        ended = reason == ConvergedReason.ITERATING and progress.ended(qp, point)
-        anew = ended and progress.once_more()
-        if ended and not anew:
-            reason = ConvergedReason.DIVERGED_ROUNDING
+        reason, anew = _test(qp, point, rule, progress, norm)
         if rule.drifted or anew:
             point.refresh(qp)
             rule.drifted, own.fresh = False, True
@@ -119,6 +114,20 @@ def pcpg(
     if directions is None:
         own.destroy()
     return reason
+
+
+def _test(
+    qp: QP, point: Point, rule: StoppingRule, progress: Plateau, norm: float
+) -> tuple[ConvergedReason, bool]:
+    """Return why PCPG stops here, and whether the gradient is made anew instead. Collective."""
+    reason = ConvergedReason.ITERATING
+    if norm <= rule.tolerance:
+        reason = _examined(qp, point, rule, norm)
+    if reason != ConvergedReason.ITERATING or not progress.ended(qp, point):
+        return reason, False
+    if progress.once_more():
+        return reason, True
+    return ConvergedReason.DIVERGED_ROUNDING, False
 
 
 def solve_by_pcpg(
