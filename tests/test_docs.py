@@ -191,6 +191,7 @@ def test_the_report_s_fields_are_documented():
 def test_every_page_and_every_public_name_is_in_the_documents():
     index, api = ((ROOT / f"docs/{page}.md").read_text() for page in ("index", "api"))
     pages = {p.stem for p in (ROOT / "docs").glob("*.md")} - {"index"}
+    pages |= {f"developers/{p.stem}" for p in (ROOT / "docs/developers").glob("*.md")}
     pages |= {"../README", "../CONTRIBUTING", "../CHANGELOG", "../environment/README"}
     assert pages <= set(index.splitlines())
     described = set(re.findall(r"^\.\. auto\w+:: (?:\w+\.)*(\w+)$", api, re.MULTILINE))
