@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from dolfinx import fem, la
 from dolfinx import mesh as dmesh
-from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.checks import checked_type
