@@ -95,9 +95,11 @@ def check_mesh(expression: Any, name: str, decomposition: Decomposition) -> None
             continue
         _check_kind(term, name)
         if not isinstance(term, ufl.Constant) and any(d != domain for d in extract_domains(term)):
+            is_function = isinstance(term, fem.Function)
+            how = ", where decomposition.from_original takes functions" if is_function else ""
             raise InputError(
                 f"{name}: {_term_name(term)} is on another mesh (the one before decompose?); "
-                "expected decomposition.mesh, the torn mesh"
+                f"expected decomposition.mesh, the torn mesh{how}"
             )
 
 
@@ -197,7 +199,8 @@ def _check_entities(entities: Array, kind: str, what: str, decomposition: Decomp
         )
     if wrong:
         raise InputError(
-            f"{what}: {wrong} of its facets lie inside a body; expected facets of the boundary only"
+            f"{what}: {wrong} of its facets lie inside a body; expected facets of the boundary "
+            "only, such as of decomposition.facets(name) or decomposition.locate_facets(marker)"
         )
 
 

@@ -26,7 +26,7 @@ from tfeti_dolfinx.estimates import Estimates, estimate, goal_of, of_looks
 from tfeti_dolfinx.extensions import Extensions, Settings, guarded
 from tfeti_dolfinx.fields import Stress, check_stress, checked_thickness
 from tfeti_dolfinx.form_checks import check_same_space, displacement_space
-from tfeti_dolfinx.gluing.prescribed import checked_conditions
+from tfeti_dolfinx.gluing.prescribed import check_not_on_tears, checked_conditions
 from tfeti_dolfinx.gluing.spectrum import extreme_eigenvalues, require_slepc
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -118,6 +118,7 @@ class ContactProblem(Stepping):
             forms = self._forms(a, L, V, form_compiler_options, jit_options)
         with stage("gluing", self.report.seconds):
             self.dofs = TornDofs(V, decomposition)
+            check_not_on_tears(self.bcs, self.dofs, decomposition)
         forms.thickness = self._thickness
         self._doubts = Doubts(decomposition, self.dofs)
         if boundary_elements is not None:
@@ -214,7 +215,10 @@ class ContactProblem(Stepping):
             InputError: Something given does not fit; the message names it. Nothing has changed.
         """
         V, forms = self.dofs.V, copy(self._system.forms)
-        conditions = self.bcs if values is None else checked_conditions(values, V)
+        conditions = self.bcs
+        if values is not None:
+            conditions = checked_conditions(values, V)
+            check_not_on_tears(conditions, self.dofs, self.decomposition)
         if stiffness is not None:
             check_same_space(displacement_space(stiffness, self.decomposition), V, "stiffness", "a")
             forms.replace_stiffness(stiffness)

@@ -32,6 +32,15 @@ def tagged(s, facets, tag):
     return dmesh.meshtags(s.d.mesh, 1, np.sort(facets), np.full_like(facets, tag))
 
 
+def inside(s, marker):
+    """A condition on unknowns that a geometric search finds."""
+    return fem.dirichletbc(np.zeros(2), fem.locate_dofs_geometrical(s.V, marker), s.V)
+
+
+def on_facets(s, facets):
+    return fem.dirichletbc(np.zeros(2), fem.locate_dofs_topological(s.V, 1, facets), s.V)
+
+
 def of_degree(s, degree):
     V = s.space("Lagrange", degree, (2,))
     bc = fem.dirichletbc(np.zeros(2), s.on(V=V), V)
@@ -142,6 +151,18 @@ ACCEPTED = {
                 s.V,
             )
         ],
+    ),
+    "conditions on a region inside": lambda s: solved(
+        s.finer, bcs=[inside(s.finer, lambda x: x[0] < 0.3)]
+    ),
+    "conditions on a plane that is a tear": lambda s: solved(
+        s.finer, bcs=[s.finer.clamp(), inside(s.finer, lambda x: np.isclose(x[0], 0.5))]
+    ),
+    "conditions on the whole boundary": lambda s: solved(
+        s.finer, bcs=[on_facets(s.finer, s.finer.d.boundary)]
+    ),
+    "conditions by a broad marker": lambda s: solved(
+        s.finer, bcs=[on_facets(s.finer, s.finer.d.locate_facets(lambda x: x[0] < 0.6))]
     ),
     "L on an equal space": lambda s: solved(s, L=ufl.inner(s.f, ufl.TestFunction(s.twin)) * s.dx),
     "u on an equal space": lambda s: solved(s, u=fem.Function(s.twin)),

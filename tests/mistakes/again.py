@@ -5,6 +5,7 @@ import ufl
 from dolfinx import fem
 
 import tfeti_dolfinx as tfeti
+from mistakes.conditions import exterior
 from mistakes.scene import raising
 
 FLOOR = "obstacle of surface 'bottom'"
@@ -54,6 +55,10 @@ FORMS_AGAIN = {
     "a stiffness of another degree": updated(
         r"stiffness is from a space of degree 2 .*; expected a, a space of degree 1",
         stiffness=lambda s: s.a_on(of_degree_2(s)),
+    ),
+    "values on facets that are exterior to DOLFINx": updated(
+        r"Dirichlet condition 0 prescribes 2 facets that lie on tears",
+        values=lambda s: [exterior(s)],
     ),
     "values that are one condition": updated(
         r"bcs is a DirichletBC; expected a list", values=lambda s: s.clamp()

@@ -3,6 +3,7 @@
 import numpy as np
 import ufl
 from dolfinx import fem
+from dolfinx import mesh as dmesh
 from scenes import hooke
 
 import tfeti_dolfinx as tfeti
@@ -21,6 +22,22 @@ def untorn(s):
     V = s.untorn_space(*s.vector)
     facets = s.facet_tags.find(1)
     return fem.dirichletbc(np.zeros(2), fem.locate_dofs_topological(V, 1, facets), V)
+
+
+def exterior(s, component=None, marker=None):
+    """A condition on facets that are exterior to DOLFINx, which those on tears are, too."""
+    mesh = s.d.mesh
+    facets = dmesh.exterior_facet_indices(mesh.topology)
+    if marker is not None:
+        facets = dmesh.locate_entities_boundary(mesh, 1, marker)
+    V = s.V if component is None else s.V.sub(component)
+    value = np.zeros(2) if component is None else 0.0
+    return fem.dirichletbc(value, fem.locate_dofs_topological(V, 1, facets), V)
+
+
+def of_untorn_function(s):
+    """DOLFINx does not look whether the value's mesh is that of the space."""
+    return fem.dirichletbc(fem.Function(s.untorn_space(*s.vector)), [s.on(), s.on()], s.V)
 
 
 def of_function(s, value):
@@ -93,6 +110,23 @@ BCS = {
     "the second condition on the mesh before it is torn": (
         lambda s: s.problem(bcs=[s.clamp(), untorn(s)]),
         r"Dirichlet condition 1 is on another mesh",
+    ),
+    "a value that is a function on the mesh before it is torn": (
+        lambda s: s.problem(bcs=[of_untorn_function(s)]),
+        r"value of Dirichlet condition 0 is a function on another mesh; .*from_original\(g\)",
+    ),
+    "all facets that are exterior to DOLFINx": (
+        lambda s: s.problem(bcs=[s.clamp(), exterior(s)]),
+        r"Dirichlet condition 1 prescribes 2 facets that lie on tears inside a body.*expected "
+        r"facets of the boundary: decomposition.boundary, decomposition.facets\(name\) or decomp",
+    ),
+    "a component on all facets that are exterior to DOLFINx": (
+        lambda s: s.problem(bcs=[exterior(s, 1)]),
+        r"Dirichlet condition 0 prescribes 2 facets that lie on tears",
+    ),
+    "facets by a broad marker": (
+        lambda s: s.problem(bcs=[exterior(s, marker=lambda x: (x[0] < 0.6) & (x[1] < 0.6))]),
+        r"Dirichlet condition 0 prescribes 1 facets that lie on tears.*locate_facets\(marker\)",
     ),
     "unknowns that were located in another space": (
         lambda s: in_space(s, s.V, at=s.space("Lagrange", 3, (2,))),

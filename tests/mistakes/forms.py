@@ -4,6 +4,7 @@ import numpy as np
 import ufl
 from basix.ufl import element, mixed_element
 from dolfinx import fem
+from dolfinx import mesh as dmesh
 
 NO_ENTITIES = np.empty(0, dtype=np.int32)
 
@@ -41,8 +42,6 @@ def pure(s):
 
 def other_ds(s):
     """Facet tags that are equal, but other ones."""
-    from dolfinx import mesh as dmesh
-
     tags = s.d.facet_tags
     copy = dmesh.meshtags(s.d.mesh, tags.dim, tags.indices, tags.values)
     return s.ds(copy)
@@ -191,7 +190,8 @@ SPACES = {
 COEFFICIENTS = {
     "E on the mesh before it is torn": (
         lambda s: s.problem(a=modulus(s, s.untorn_space("DG", 0))),
-        r"a: the function 'E' is on another mesh \(the one before decompose\?\); expected",
+        r"a: the function 'E' is on another mesh \(the one before decompose\?\); expected "
+        r"decomposition.mesh, the torn mesh, where decomposition.from_original takes functions",
     ),
     "a load on the mesh before it is torn": (
         lambda s: s.problem(L=load_of(s)),
@@ -327,9 +327,20 @@ MEASURES = {
     ),
     "ds of facets inside a body": (
         lambda s: s.inner.problem(bcs=[], **load(s.inner, s.inner.ds(), 1)),
-        r"L: ds\(1\): \d+ of its facets lie inside a body; expected facets of the boundary only",
+        r"L: ds\(1\): \d+ of its facets lie inside a body; expected facets of the boundary only, "
+        r"such as of decomposition.facets\(name\) or decomposition.locate_facets",
+    ),
+    "ds of one's own tags, from a broad marker": (
+        lambda s: s.problem(**load(s, s.ds(all_exterior(s)), 7)),
+        r"L: ds\(7\): 4 of its facets lie inside a body; .*decomposition.locate_facets",
     ),
 }
+
+
+def all_exterior(s):
+    """Tags of one's own on all facets that are exterior to DOLFINx."""
+    facets = dmesh.exterior_facet_indices(s.d.mesh.topology)
+    return dmesh.meshtags(s.d.mesh, 1, facets, np.full_like(facets, 7))
 
 
 def load_of(s):

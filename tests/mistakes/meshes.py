@@ -1,7 +1,10 @@
 """Mistakes in meshes, tags, names and subdomains that DOLFINx's mesh comes with."""
 
+import gmsh
 import numpy as np
+from dolfinx import fem
 from dolfinx import mesh as dmesh
+from scenes import box
 
 import tfeti_dolfinx as tfeti
 from mistakes.scene import raising
@@ -216,4 +219,82 @@ NAMES = {
     "a surface that is a fraction": (lambda s: s.d.surface(1.0), r"surface 1.0: expected the na"),
 }
 
-TABLES = ("MESHES", "SUBDOMAINS", "TAGS", "NAMES")
+MARKERS = {
+    "no marker": (lambda s: s.d.locate_facets(None), r"marker is None; expected a function of p"),
+    "a marker that is a name": (lambda s: s.d.locate_facets("left"), r"marker is 'left'; expected"),
+    "a marker that fails": (
+        lambda s: s.d.locate_facets(raising),
+        r"marker: ZeroDivisionError: no such place",
+    ),
+    "a marker that returns one flag": (
+        lambda s: s.d.locate_facets(lambda x: True),
+        r"marker: expected flags of shape .* for points of shape \(3, \d+\), got bool of shape",
+    ),
+    "a marker that returns coordinates": (
+        lambda s: s.d.locate_facets(lambda x: x[0]),
+        r"marker: expected flags of shape .*, got float64 of shape \(\d+,\)",
+    ),
+}
+
+
+def from_gmsh(s):
+    """A decomposition of a square of two triangles that gmsh made."""
+    model = None
+    if s.comm.rank == 0:
+        gmsh.initialize(interruptible=False)
+        gmsh.option.setNumber("General.Terminal", 0)
+        model = gmsh.model
+        square = model.occ.addRectangle(0, 0, 0, 1, 1)
+        model.occ.synchronize()
+        model.addPhysicalGroup(2, [square], name="steel")
+        model.mesh.generate(2)
+    d = tfeti.read_gmsh(model, s.comm, subdomains=2)
+    if s.comm.rank == 0:
+        gmsh.finalize()
+    return d
+
+
+def untorn_function(s):
+    return fem.Function(s.untorn_space("Lagrange", 1))
+
+
+def torn_function(s):
+    return fem.Function(s.space("Lagrange", 1))
+
+
+ORIGINALS = {
+    "values for a function": (
+        lambda s: s.d.from_original(np.zeros(3)),
+        r"f is an array of shape \(3,\); expected a dolfinx.fem.Function on the mesh that was gi",
+    ),
+    "a space for a function": (
+        lambda s: s.d.to_original(s.V),
+        r"u is a FunctionSpace; expected a dolfinx.fem.Function on decomposition.mesh, the torn m",
+    ),
+    "a function that is torn already": (
+        lambda s: s.d.from_original(torn_function(s)),
+        r"f is on another mesh; expected a function on the mesh that was given to decompose",
+    ),
+    "a function that is not torn": (
+        lambda s: s.d.to_original(untorn_function(s)),
+        r"u is on another mesh; expected a function on decomposition.mesh, the torn mesh",
+    ),
+    "a function of another mesh that is equal": (
+        lambda s: s.d.from_original(fem.Function(fem.functionspace(box(s.cell, 2)[0], ("P", 1)))),
+        r"f is on another mesh; expected a function on the mesh that was given to decompose",
+    ),
+    "a function of fluxes": (
+        lambda s: s.d.from_original(fem.Function(s.untorn_space("RTCF", 1))),
+        r"f is from .*, whose unknowns depend on the directions of edges and facets; expected a L",
+    ),
+    "a function for a mesh that gmsh made": (
+        lambda s: from_gmsh(s).from_original(untorn_function(s)),
+        r"there is no mesh before it was torn: read_gmsh makes none; expected a decomposition",
+    ),
+    "a function from a mesh that gmsh made": (
+        lambda s: from_gmsh(s).to_original(torn_function(s)),
+        r"there is no mesh before it was torn: read_gmsh makes none; expected a decomposition",
+    ),
+}
+
+TABLES = ("MESHES", "SUBDOMAINS", "TAGS", "NAMES", "MARKERS", "ORIGINALS")

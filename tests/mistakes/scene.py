@@ -15,8 +15,8 @@ import tfeti_dolfinx as tfeti
 class Scene:
     """A square of quadrilaterals, or a cube of hexahedra, in two subdomains; everything is lazy."""
 
-    def __init__(self, cell="quadrilateral"):
-        self.cell = cell
+    def __init__(self, cell="quadrilateral", n=2):
+        self.cell, self.n = cell, n
         self.comm = MPI.COMM_WORLD
 
     @cached_property
@@ -24,8 +24,13 @@ class Scene:
         return Scene("hexahedron")
 
     @cached_property
+    def finer(self):
+        """The same square with 16 cells."""
+        return Scene(n=4)
+
+    @cached_property
     def box(self):
-        return box(self.cell, 2)
+        return box(self.cell, self.n)
 
     @property
     def mesh(self):

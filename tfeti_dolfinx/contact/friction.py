@@ -224,7 +224,8 @@ def _at_groups(what: str, function: fem.Function, dofs: TornDofs) -> Array:
         function.function_space.mesh._cpp_object is not S.mesh._cpp_object
     ):
         raise InputError(
-            f"{what} is on another mesh; expected a function on decomposition.mesh, the torn mesh"
+            f"{what} is on another mesh; expected a function on decomposition.mesh, the torn "
+            "mesh, where decomposition.from_original takes functions"
         )
     on_nodes = fem.Function(S)
     on_nodes.interpolate(function)

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
-from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.checks import is_whole, shown
-from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.arrays import Array, ArrayLike
+from tfeti_dolfinx.checks import checked_callable, is_whole, named, shown
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.mesh.transfer import (
+    CellExchange,
+    cell_values,
+    checked_function,
+    from_cell_values,
+)
 from tfeti_dolfinx.mesh.untorn import PhysicalNames
 
 
@@ -34,6 +42,7 @@ class Decomposition:
         boundary: Local facets on the true boundary, ascending.
         split: New ids of each subdomain that was not connected and was split.
         seconds: Wall seconds that reading and tearing took.
+        untorn: The mesh that was given to ``decompose``; None of ``read_gmsh``.
     """
 
     mesh: dmesh.Mesh
@@ -48,6 +57,7 @@ class Decomposition:
     boundary: Array
     split: dict[int, list[int]]
     seconds: dict[str, float] = field(default_factory=dict)
+    untorn: dmesh.Mesh | None = None
 
     @property
     def comm(self) -> MPI.Intracomm:
@@ -106,6 +116,103 @@ class Decomposition:
     def facets(self, name: str | int) -> Array:
         """Local facets of a surface, ascending."""
         return self.facet_tags.find(self.surface(name))
+
+    def locate_facets(self, marker: Callable[[Array], ArrayLike]) -> Array:
+        """Local facets of the true boundary whose vertices are all marked, ascending. Collective.
+
+        To ``dolfinx.mesh.locate_entities_boundary`` tears are boundary, too. All facets of the
+        true boundary are ``boundary``.
+
+        Args:
+            marker: From points, shape ``(3, n)``, to flags, shape ``(n,)``.
+
+        Raises:
+            InputError: The marker cannot be called, fails or does not return flags.
+
+        Example:
+            >>> square = dmesh.create_unit_square(MPI.COMM_WORLD, 8, 8)
+            >>> decomposition = tfeti.decompose(square, 4)
+            >>> left = decomposition.locate_facets(lambda x: x[0] < 0.3)
+            >>> decomposition.comm.allreduce(len(left))
+            12
+        """
+        checked_callable(marker, "marker", "a function of points of shape (3, n)")
+        fdim, facets = self.mesh.topology.dim - 1, self.boundary.astype(np.int32)
+        self.mesh.topology.create_connectivity(fdim, fdim + 1)
+        with raised_on_all_ranks(self.comm):
+            if len(facets) == 0:  # DOLFINx divides by their number
+                return facets
+            nodes = dmesh.entities_to_geometry(self.mesh, fdim, facets)
+            used, corner = np.unique(nodes, return_inverse=True)
+            with named("marker"):
+                flags = np.asarray(marker(self.mesh.geometry.x[used].T))
+            if flags.dtype != bool or flags.shape != used.shape:
+                raise InputError(
+                    f"marker: expected flags of shape {used.shape} for points of shape "
+                    f"(3, {len(used)}), got {flags.dtype} of shape {flags.shape}"
+                )
+        return facets[np.all(flags[corner.reshape(nodes.shape)], axis=1)]
+
+    def from_original(self, f: fem.Function) -> fem.Function:
+        """A function on the mesh that was given to ``decompose``, on the torn one. Collective.
+
+        DOLFINx's ``interpolate`` between the two meshes gives wrong values and no error.
+
+        Args:
+            f: From any space whose unknowns do not depend on the directions of edges and facets:
+                Lagrange, DG, quadrature, of any degree and shape.
+
+        Returns:
+            The same function, from a space of the same element. It is a copy.
+
+        Raises:
+            InputError: ``f`` is no such function, or the mesh was read by ``read_gmsh``.
+
+        Example:
+            >>> square = dmesh.create_unit_square(MPI.COMM_WORLD, 8, 8)
+            >>> decomposition = tfeti.decompose(square, 4)
+            >>> T = fem.Function(fem.functionspace(square, ("Lagrange", 1)))
+            >>> T.interpolate(lambda x: 20.0 + x[0])
+            >>> decomposition.from_original(T).function_space.mesh is decomposition.mesh
+            True
+        """
+        expected = "the mesh that was given to decompose"
+        with raised_on_all_ranks(self.comm):
+            g = checked_function(f, self._untorn_mesh(), "f", expected)
+        V = fem.functionspace(self.mesh, g.function_space.ufl_element())
+        return from_cell_values(V, self._cells.to_torn(cell_values(g)), f.name)
+
+    def to_original(self, u: fem.Function) -> fem.Function:
+        """A function on the torn mesh, on the one that was given to ``decompose``. Collective.
+
+        Args:
+            u: As for ``from_original``. Where it is continuous in the bodies, but for rounding,
+                so is what is returned; where it jumps at a tear, or two bodies share a node that
+                is no tear, a continuous space gets the mean of the cells there.
+
+        Returns:
+            The same function, from a space of the same element. It is a copy.
+
+        Raises:
+            InputError: ``u`` is no such function, or the mesh was read by ``read_gmsh``.
+        """
+        with raised_on_all_ranks(self.comm):
+            untorn = self._untorn_mesh()
+            g = checked_function(u, self.mesh, "u", "decomposition.mesh, the torn mesh")
+        V = fem.functionspace(untorn, g.function_space.ufl_element())
+        return from_cell_values(V, self._cells.to_untorn(cell_values(g)), u.name)
+
+    def _untorn_mesh(self) -> dmesh.Mesh:
+        if self.untorn is None:
+            raise InputError(
+                "there is no mesh before it was torn: read_gmsh makes none; expected a "
+                "decomposition that decompose made, of a mesh that DOLFINx has read"
+            )
+        return self.untorn
+
+    @cached_property
+    def _cells(self) -> CellExchange:
+        return CellExchange(self._untorn_mesh(), self.original_cells)
 
 
 def _tag(name: str | int, names: dict[str, int], kind: str) -> int:

@@ -85,7 +85,7 @@ def decompose(
         subdomain = assign_subdomains(untorn, subdomains, mesh.comm, coordinate_bisection)
         ours = isinstance(subdomains, (int, np.integer))
         decomposition = tear(untorn, subdomain, mesh.comm, absorb=ours)
-    return replace(decomposition, seconds=seconds)
+    return replace(decomposition, seconds=seconds, untorn=mesh)
 
 
 def _untorn(

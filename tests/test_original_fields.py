@@ -1,0 +1,151 @@
+"""Functions of the mesh before it is torn, and of the torn mesh, on the other one."""
+
+import basix.ufl
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx import mesh as dmesh
+from mpi4py import MPI
+from scenes import box, forms
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.compat import interpolation_points
+
+CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
+KINDS = {
+    "P1": ("Lagrange", 1, ()),
+    "P2 tensor": ("Lagrange", 2, (2, 2)),
+    "P3 vector": ("Lagrange", 3, (2,)),
+    "P4": ("Lagrange", 4, ()),
+    "DG0": ("DG", 0, ()),
+    "DG3 vector": ("DG", 3, (3,)),
+    "quadrature": ("quadrature", 3, ()),
+    "quadrature vector": ("quadrature", 4, (3,)),
+}
+
+
+def bent(cell, ghosts=dmesh.GhostMode.none):
+    """A box without right angles, of cells in two directions or three."""
+    comm, cell_type = MPI.COMM_WORLD, dmesh.to_type(cell)
+    if cell in ("triangle", "quadrilateral"):
+        mesh = dmesh.create_rectangle(comm, [(0, 0), (1, 1)], [5, 4], cell_type, ghost_mode=ghosts)
+    else:
+        corners = [(0, 0, 0), (1, 1, 1)]
+        mesh = dmesh.create_box(comm, corners, [3, 2, 2], cell_type, ghost_mode=ghosts)
+    gdim, x = mesh.geometry.dim, mesh.geometry.x
+    x[:, :gdim] += 0.02 * np.sin(7.0 * np.roll(x[:, :gdim], 1, axis=1))
+    return mesh
+
+
+def space(mesh, family, degree, shape):
+    if family == "quadrature":
+        element = basix.ufl.quadrature_element(
+            mesh.topology.cell_type.name, degree=degree, value_shape=shape
+        )
+    else:
+        element = basix.ufl.element(family, mesh.basix_cell(), degree, shape=shape)
+    return fem.functionspace(mesh, element)
+
+
+def wave(V, name="wave"):
+    """The interpolant of a function that has no symmetry."""
+    f, x = fem.Function(V, name=name), ufl.SpatialCoordinate(V.mesh)
+    s = ufl.sin(3 * x[0] + 2 * x[1] ** 2 - x[-1 % len(x)]) + x[0]
+    shape = V.ufl_element().reference_value_shape
+    values = np.array([(i + 1) * s + i * x[1] for i in range(int(np.prod(shape, dtype=int)))])
+    expression = ufl.as_tensor(values.reshape(shape).tolist()) if shape else s
+    f.interpolate(fem.Expression(expression, interpolation_points(V)))
+    f.x.scatter_forward()
+    return f
+
+
+def farthest(f, g):
+    """Largest difference of unknowns over all ranks."""
+    own = np.abs(f.x.array - g.x.array).max(initial=0.0)
+    return MPI.COMM_WORLD.allreduce(own, op=MPI.MAX)
+
+
+@pytest.mark.parametrize("ghosts", [dmesh.GhostMode.none, dmesh.GhostMode.shared_facet])
+@pytest.mark.parametrize("cell", CELLS)
+def test_functions_are_the_same_on_both_meshes(cell, ghosts):
+    mesh = bent(cell, ghosts)
+    d = tfeti.decompose(mesh, 3)
+    for kind in KINDS.values():
+        untorn, torn = wave(space(mesh, *kind), "T"), wave(space(d.mesh, *kind), "u")
+        there = d.from_original(untorn)
+        assert there.function_space.mesh is d.mesh
+        assert there.name == "T"
+        assert farthest(there, torn) < 1e-13, kind
+        assert farthest(d.to_original(there), untorn) == 0.0, kind
+        back = d.to_original(torn)
+        assert back.function_space.mesh is mesh
+        assert back.name == "u"
+        assert farthest(back, untorn) < 1e-13, kind
+
+
+def test_a_cut_mesh():
+    """It has its cells' numbers from DOLFINx, not from a file."""
+    whole = bent("triangle", dmesh.GhostMode.shared_facet)
+    cells = dmesh.locate_entities(whole, 2, lambda x: x[0] < 0.7)
+    mesh = dmesh.create_submesh(whole, 2, cells)[0]
+    d = tfeti.decompose(mesh, 3)
+    kind = ("Lagrange", 3, (2,))
+    untorn, torn = wave(space(mesh, *kind)), wave(space(d.mesh, *kind))
+    assert farthest(d.from_original(untorn), torn) < 1e-13
+    assert farthest(d.to_original(torn), untorn) < 1e-13
+
+
+def test_a_component_of_a_function():
+    mesh = bent("quadrilateral")
+    d = tfeti.decompose(mesh, 3)
+    untorn, torn = (wave(space(m, "Lagrange", 2, (2,))) for m in (mesh, d.mesh))
+    assert farthest(d.from_original(untorn.sub(1)), torn.sub(1).collapse()) < 1e-13
+    assert farthest(d.to_original(torn.sub(1)), untorn.sub(1).collapse()) < 1e-13
+
+
+def test_values_that_neighbours_have_not_got_yet(comm):
+    """Owners' values count, also where the other ranks' copies are out of date."""
+    mesh = bent("triangle")
+    d = tfeti.decompose(mesh, 3)
+    T = fem.Function(space(mesh, "Lagrange", 1, ()))
+    owned = T.function_space.dofmap.index_map.size_local
+    T.x.array[:owned], T.x.array[owned:] = 5.0, -1.0
+    assert np.all(d.from_original(T).x.array == 5.0)
+    assert np.array_equal(np.unique(T.x.array[owned:]), [-1.0] * (len(T.x.array) > owned))
+
+
+def test_a_jump_at_a_tear(comm):
+    """A continuous space cannot have it: the mean; the discontinuous one keeps it."""
+    square = dmesh.create_unit_square(comm, 4, 4, dmesh.CellType.quadrilateral)
+    d = tfeti.decompose(square, lambda x: x[0] > 0.5)
+    for family in ("Lagrange", "DG"):
+        u = fem.Function(space(d.mesh, family, 1, ()))
+        cells = u.function_space.dofmap.list
+        u.x.array[cells] = d.cell_subdomain[:, None]
+        f = d.to_original(u)
+        x = f.function_space.tabulate_dof_coordinates()[:, 0]
+        if family == "DG":
+            volume = fem.assemble_scalar(fem.form(f * f * ufl.dx))
+            assert np.isclose(comm.allreduce(volume), 0.5)
+        else:
+            assert np.array_equal(f.x.array, np.where(x > 0.51, 1.0, np.where(x < 0.49, 0.0, 0.5)))
+
+
+def test_a_load_of_the_mesh_before_it_is_torn(comm):
+    """Of thermal strain of a temperature that was computed before: as with one subdomain."""
+    mesh, facet_tags, names = box("triangle", 6)
+    T = wave(space(mesh, "Lagrange", 2, ()))
+    energy = []
+    for subdomains in (1, 5):
+        d = tfeti.decompose(mesh, subdomains, facet_tags=facet_tags, surfaces=names)
+        V, a, _ = forms(d.mesh, d.facet_tags, (0.0, 0.0), d.surface("top"))
+        L = d.from_original(T) * ufl.div(ufl.TestFunction(V)) * ufl.dx
+        held = fem.locate_dofs_topological(V, 1, d.facets("left"))
+        bc = fem.dirichletbc(np.zeros(2), held, V)
+        u = tfeti.ContactProblem(a, L, [bc], [], d, petsc_options={"rtol": 1e-10}).solve()
+        back = d.to_original(u)
+        assert back.function_space.mesh is mesh
+        energy.append(comm.allreduce(fem.assemble_scalar(fem.form(T * ufl.div(back) * ufl.dx))))
+    assert energy[0] > 0.0
+    assert np.isclose(*energy, rtol=1e-8)

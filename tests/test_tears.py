@@ -1,0 +1,94 @@
+"""Tears are exterior facets to DOLFINx: conditions on them are named, and the boundary is found."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx import mesh as dmesh
+from scenes import decomposed, displacement, hooke, strain
+
+import tfeti_dolfinx as tfeti
+
+CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
+SAYS = r"Dirichlet condition 0 prescribes (\d+) facets that lie on tears inside a body"
+
+
+def broad(x):
+    return x[0] < 0.6
+
+
+def condition(V, facets, component=None):
+    W = V if component is None else V.sub(component)
+    dofs = fem.locate_dofs_topological(W, V.mesh.topology.dim - 1, facets)
+    return fem.dirichletbc(np.zeros(V.dofmap.bs) if component is None else 0.0, dofs, W)
+
+
+def problem(d, degree, conditions, **options):
+    """The weight of a box, held by what is made from its space."""
+    gdim = d.mesh.geometry.dim
+    V = fem.functionspace(d.mesh, ("Lagrange", degree, (gdim,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    dx = ufl.Measure("dx", domain=d.mesh, metadata={"quadrature_degree": 2 * degree})
+    weight = fem.Constant(d.mesh, (0.0,) * (gdim - 1) + (-0.1,))
+    a, L = ufl.inner(hooke()(u), strain(v)) * dx, ufl.inner(weight, v) * dx
+    return tfeti.ContactProblem(a, L, conditions(V), [], d, petsc_options=options)
+
+
+def shared(mesh, facets):
+    """Facets of one subdomain and of another: how many there are twice on all ranks."""
+    x = dmesh.compute_midpoints(mesh, mesh.topology.dim - 1, facets)
+    x = np.rint(1e8 * np.concatenate(mesh.comm.allgather(x)))
+    return len(x) - len(np.unique(x, axis=0))
+
+
+@pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize("component", [None, 1])
+def test_facets_on_tears_are_refused(cell, degree, component):
+    d = decomposed(cell, 4, 4)
+    tdim = d.mesh.topology.dim
+    for facets in (
+        dmesh.exterior_facet_indices(d.mesh.topology),
+        dmesh.locate_entities_boundary(d.mesh, tdim - 1, broad),
+    ):
+        with pytest.raises(tfeti.InputError, match=SAYS) as error:
+            problem(d, degree, lambda V, f=facets: [condition(V, f, component)])
+        count = int(str(error.value).split()[4])
+        # of degree 1 those in corners have all their nodes on the boundary
+        assert 0 < count <= shared(d.mesh, facets) <= count + 4 * (degree == 1)
+
+
+@pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.parametrize("degree", [1, 2])
+def test_a_marker_finds_the_boundary_alone(cell, degree):
+    """As on a mesh without tears."""
+    found = []
+    for subdomains in (1, 5):
+        d = decomposed(cell, 4, subdomains)
+        facets = d.locate_facets(broad)
+        assert np.all(np.isin(facets, d.boundary))
+        everything = dmesh.locate_entities_boundary(d.mesh, d.mesh.topology.dim - 1, broad)
+        assert np.array_equal(facets, np.intersect1d(everything, d.boundary))
+        p = problem(d, degree, lambda V, f=facets: [condition(V, f)], rtol=1e-10)
+        p.solve()
+        found.append(displacement(p)[1])
+    assert np.abs(found[0]).max() > 1e-3
+    assert np.allclose(*found, rtol=0.0, atol=1e-8 * np.abs(found[0]).max())
+
+
+@pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.parametrize("subdomains", [2, 5])
+def test_nodes_inside_a_body_may_be_held(cell, subdomains):
+    """A region, or a plane by itself, wherever the tears are."""
+    d = decomposed(cell, 4, subdomains)
+
+    def of(*markers):
+        def conditions(V):
+            dofs = (fem.locate_dofs_geometrical(V, marker) for marker in markers)
+            return [fem.dirichletbc(np.zeros(V.dofmap.bs), nodes, V) for nodes in dofs]
+
+        return conditions
+
+    for i in range(d.mesh.geometry.dim):
+        problem(d, 1, of(lambda x, i=i: x[i] < 0.3))
+        problem(d, 1, of(lambda x: x[0] < 0.1, lambda x, i=i: np.isclose(x[i], 0.5)))

@@ -1,0 +1,108 @@
+"""Functions on the mesh that was decomposed and on the torn one: their values go cell by cell."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from dolfinx import fem, la
+from dolfinx import mesh as dmesh
+
+from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.checks import checked_type
+from tfeti_dolfinx.compat import original_cells
+from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.parallel import Exchange
+
+
+class CellExchange:
+    """Rows of values that travel between the cells of two meshes. All is collective.
+
+    The torn mesh has the cells of the one before on other ranks and in another order, but each
+    with its vertices in the same order: a reference cell's points are those of the other's.
+
+    Args:
+        untorn: The mesh that was decomposed.
+        ids: For each cell of the torn mesh the original id, shape ``(n,)``.
+    """
+
+    def __init__(self, untorn: dmesh.Mesh, ids: Array) -> None:
+        comm, topology = untorn.comm, untorn.topology
+        self._num_cells = topology.index_map(topology.dim).size_local
+        known = original_cells(untorn)[: self._num_cells]
+        asking, telling = Exchange(comm, ids % comm.size), Exchange(comm, known % comm.size)
+        known, cell = telling.send(known), telling.send(np.arange(self._num_cells))
+        order = np.argsort(known)
+        found = order[np.searchsorted(known, asking.send(ids), sorter=order)]
+        self._from_owner = Exchange(comm, asking.answer(telling.source[found]))
+        self._cell = self._from_owner.send(asking.answer(cell[found]))
+
+    def to_torn(self, rows: Array) -> Array:
+        """Rows of the owned cells of the untorn mesh as those of the torn one's cells."""
+        return self._from_owner.answer(rows[self._cell])
+
+    def to_untorn(self, rows: Array) -> Array:
+        """Rows of the cells of the torn mesh as those of the untorn one's owned cells."""
+        out = np.empty((self._num_cells, *rows.shape[1:]), dtype=rows.dtype)
+        out[self._cell] = self._from_owner.send(rows)
+        return out
+
+
+def checked_function(f: Any, mesh: dmesh.Mesh, name: str, expected: str) -> fem.Function:
+    """The function, on a space of its own where it is a component of another.
+
+    Args:
+        f: What was given.
+        mesh: The mesh that it must be on.
+        name: Its name in messages.
+        expected: The mesh in messages.
+
+    Raises:
+        InputError: It is no function, on another mesh, or has unknowns that are not values.
+    """
+    checked_type(f, fem.Function, name, f"a dolfinx.fem.Function on {expected}")
+    if f.function_space.mesh._cpp_object is not mesh._cpp_object:
+        raise InputError(f"{name} is on another mesh; expected a function on {expected}")
+    g = f.collapse() if f.function_space.component() else f
+    if g.function_space.element.needs_dof_transformations:
+        raise InputError(
+            f"{name} is from {g.function_space.ufl_element()}, whose unknowns depend on the "
+            "directions of edges and facets; expected a Lagrange, DG or quadrature space"
+        )
+    return g
+
+
+def cell_values(f: fem.Function) -> Array:
+    """Unknowns of a function in each owned cell, shape ``(n, m, bs)``. Collective."""
+    V, values = f.function_space, f.copy().x
+    values.scatter_forward()
+    return values.array.reshape(-1, V.dofmap.bs)[_owned_dofs(V)]
+
+
+def from_cell_values(V: fem.FunctionSpace, values: Array, name: str) -> fem.Function:
+    """The function with these unknowns in the cells, their mean where cells differ. Collective.
+
+    Args:
+        V: Its space.
+        values: Unknowns in each owned cell, shape ``(n, m, bs)``.
+        name: Its name.
+    """
+    f, apart, number = (fem.Function(V, dtype=values.dtype) for _ in range(3))
+    x, sums, counts = (g.x.array.reshape(-1, V.dofmap.bs) for g in (f, apart, number))
+    dofs = _owned_dofs(V)
+    x[dofs] = values
+    f.x.scatter_forward()
+    np.add.at(sums, dofs, values - x[dofs])  # 0 but for rounding where f is continuous
+    np.add.at(counts, dofs, 1.0)
+    for g in (apart, number):
+        g.x.scatter_reverse(la.InsertMode.add)
+        g.x.scatter_forward()
+    x += sums / counts
+    f.name = name
+    return f
+
+
+def _owned_dofs(V: fem.FunctionSpace) -> Array:
+    """Blocks of unknowns of each owned cell, shape ``(n, m)``."""
+    topology = V.mesh.topology
+    return np.asarray(V.dofmap.list)[: topology.index_map(topology.dim).size_local]
