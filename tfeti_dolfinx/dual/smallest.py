@@ -25,9 +25,9 @@ NO_FORCE, NO_EFFECT = 1e-6, 10.0
 # Size of what is left of a joint motion of size 1 that motions of single bodies span already: both
 # come from null spaces of Gram matrices, whose vectors are right to the root of rounding.
 DEPENDENT = 1e-8
-# A motion of size 1 that no row sees by more is free: a mesh's coordinates are not more exact. Excess
-# of a row, as a share of all motion, that is its rounding: more would be an error of bodies that
-# move less. Coefficient of a motion of size 1 that is rounding.
+# A motion of size 1 that no row sees by more is free: a mesh's coordinates are not more exact.
+# Excess of a row, as a share of all motion, that is its rounding: more would be an error of bodies
+# that move less. Coefficient of a motion of size 1 that is rounding.
 UNSEEN, EXCESS, SLOPE = 1e-9, 1e-13, 1e-12
 # of lsq_linear: as far as rounding lets it come
 TIGHT = 1e-14
