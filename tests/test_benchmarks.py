@@ -12,6 +12,7 @@ from benchmarks import (
     kplus_forms,
     linear_price,
     profiles,
+    secondary_side,
     solver_profiles,
     spectrum,
     stability,
@@ -86,6 +87,18 @@ def test_hertz_convergence(shared_tmp, comm):
     for name in hertz_convergence.QUICK:
         coarse, fine = tables[name]
         assert fine["pressure_l2_finer"] < coarse["pressure_l2_finer"]
+
+
+def test_secondary_side(shared_tmp, comm):
+    """The side that is taken has the smaller error, and takes no more multiplications."""
+    tables = quick(secondary_side, shared_tmp, comm)
+    for name in secondary_side.QUICK:
+        for row in tables[name]:
+            (other,) = {"upper", "lower"} - {row["auto"]}
+            assert row[f"nodes, {row['auto']}"] < 0.5 * row[f"nodes, {other}"]
+            assert row[f"field, {row['auto']}"] <= row[f"field, {other}"]
+            assert row[f"F, {row['auto']}"] <= row[f"F, {other}"]
+    assert next(row["nodes, worst"] for row in tables["Rules"]) == 1.0
 
 
 @pytest.mark.parametrize("name", list(linear_price.DEMOS))

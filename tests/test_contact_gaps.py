@@ -174,13 +174,14 @@ def test_an_overhanging_wedge(cell, slope):
     assert np.allclose(gaps, np.maximum(expected, 0.0), rtol=1e-3, atol=1e-12)
 
 
-def ring_problem(cells, overlap, order=1, degree=1, mesh=None, **contact):
+def ring_problem(cells, overlap, order=1, degree=1, mesh=None, springs=1e-6, **contact):
     """The rings; weak springs hold them against motions that contact leaves free."""
     d = rings(MPI.COMM_WORLD, cells, order, overlap=overlap, **(mesh or {}))
     V = fem.functionspace(d.mesh, ("Lagrange", degree, (2,)))
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
     dx = ufl.Measure("dx", domain=d.mesh, metadata={"quadrature_degree": 2 * (degree + order) - 2})
-    a = ufl.inner(hooke()(u), strain(v)) * dx + 1e-6 * ufl.dot(u, v) * dx
+    spring = fem.Constant(d.mesh, springs)
+    a = ufl.inner(hooke()(u), strain(v)) * dx + spring * ufl.dot(u, v) * dx
     L = ufl.dot(fem.Constant(d.mesh, (0.0, 0.0)), v) * dx
     pair = tfeti.Contact("shaft", "hub", **contact)
     return tfeti.ContactProblem(a, L, [], [pair], d, petsc_options={"rtol": 1e-8})
@@ -230,6 +231,31 @@ def test_coarse_triangles_are_too_stiff_whether_they_match_or_not():
     assert 0.005 < fine < coarse < 0.011
     for secondary in ("shaft", "hub"):
         assert fine < mean((48, 64), 0.1, secondary) < coarse
+
+
+@pytest.mark.parametrize(
+    ("cells", "order", "subdomains", "secondary", "contact"),
+    [
+        ((48, 64), 1, 4, "shaft", {"gap": -OVERLAP}),  # a ring that is a subdomain of its own
+        ((48, 64), 1, 8, "shaft", {"gap": -OVERLAP}),
+        ((24, 32), 1, 8, "hub", {"gap": -OVERLAP}),
+        ((24, 32), 2, 8, "shaft", {}),
+        ((48, 64), 2, 8, "hub", {}),
+    ],
+)
+def test_free_rings_are_solved(cells, order, subdomains, secondary, contact):
+    """Rows hold the turn of one in the other by the errors of their normals, or not at all."""
+    overlap = 0.0 if contact else OVERLAP
+    mesh = {"subdomains": subdomains}
+    p = ring_problem(cells, overlap, order, order, mesh, 0.0, secondary=secondary, **contact)
+    mean, _ = against_lame(p)
+    assert p.report.converged_reason == "CONVERGED_RTOL"
+    assert p.report.residuals["displacement_error"] <= 1e-8
+    assert p.report.residuals["penetration"] <= 1e-8 * OVERLAP
+    assert p.report.F_multiplications <= 100
+    assert p.report.free_modes >= 3
+    assert "rotation in the plane" in {motion["mode"] for motion in p.report.nearly_free}
+    assert abs(mean) <= 0.011
 
 
 def test_the_gap_of_an_obstacle_is_what_is_given():

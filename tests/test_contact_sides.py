@@ -1,4 +1,4 @@
-"""The side that carries the multipliers: chosen by stiffness per area, or named."""
+"""The side that carries the multipliers: the coarser, else the softer one, or that named."""
 
 import numpy as np
 import pytest
@@ -33,11 +33,16 @@ def scene(
         ((6, 3), 1.0, UPPER),
         ((4, 4), 5.0, LOWER),
         ((4, 4), 0.2, UPPER),
-        ((6, 3), 5.0, LOWER),
+        ((6, 3), 5.0, UPPER),
+        ((3, 6), 0.1, LOWER),
+        ((16, 15), 0.2, UPPER),
+        ((16, 15), 5.0, LOWER),
         ((4, 4), 1.0, None),
     ],
 )
-def test_the_softer_and_coarser_side_is_taken(n, stiffness, secondary, sides):
+def test_the_coarser_side_is_taken_and_of_equal_meshes_the_softer_one(
+    n, stiffness, secondary, sides
+):
     p = scene(tfeti.Contact(*sides), n, stiffness)
     expected = secondary or sides[0]  # of two equal ones the first
     assert p.solution.contacts[0].surfaces[0] == expected
@@ -76,6 +81,11 @@ def test_a_side_can_be_named(sides, by_tag, caplog):
     named = d.surface(UPPER) if by_tag else UPPER
     p = scene(tfeti.Contact(*sides, secondary=named), (4, 6))
     assert p.solution.contacts[0].surfaces == (UPPER, LOWER)
+    assert "times as stiff" not in caplog.text
+
+
+def test_a_coarser_side_is_not_warned_of_however_stiff_it_is(caplog):
+    scene(sided(UPPER, LOWER), (6, 4), 100.0)
     assert "times as stiff" not in caplog.text
 
 

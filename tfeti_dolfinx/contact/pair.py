@@ -16,7 +16,7 @@ from tfeti_dolfinx.contact.friction import Law, checked_friction, with_friction
 from tfeti_dolfinx.contact.gaps import gaps_of
 from tfeti_dolfinx.contact.meeting import meeting
 from tfeti_dolfinx.contact.records import ContactRecords
-from tfeti_dolfinx.contact.sides import Side, side_of, stiffness_ratio
+from tfeti_dolfinx.contact.sides import Side, ratios, side_of
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -27,9 +27,8 @@ from tfeti_dolfinx.mortar.surfaces import (
     surface_nodes,
 )
 
-# ratios of stiffness per area: up to the first, rounding must not decide; from the second on, the
-# choice of the secondary side shows in the pressure
-EQUAL, MUCH_WORSE = 1.01, 2.0
+# ratio of stiffness per area from which on a finer side that is secondary shows in the pressure
+MUCH_WORSE = 2.0
 
 WORSE = (
     "%s: the secondary side %r is %.3g times as stiff per area as %r, where they meet; the "
@@ -53,7 +52,8 @@ class Contact:
         a: Name or tag of a surface.
         b: Name or tag of the other one.
         secondary: The surface that carries the multipliers and the pressure, ``a`` or ``b``.
-            "auto": the softer one, by the stiffness per area of its elements, E/h.
+            "auto": the one with the coarser mesh where they meet; where both are of one size
+            (to 12 %), the softer one, by the stiffness per area of its elements, E/h.
         gap: "geometry" for the distance between the surfaces, or what replaces it wherever they
             are not farther apart than the reach (negative: interference): a number, or a function
             of the secondary surface's vertices, shape ``(3, n)``.
@@ -135,12 +135,14 @@ class Contact:
         settled = self._named_first(decomposition)
         sides = settled._sides(dofs, decomposition)
         found = settled._meet(sides, dofs, contact, reach, reach)
-        ratio = stiffness_ratio(found, sides, dofs, stiffness)
-        if self.secondary == "auto" and ratio > EQUAL:
-            settled, sides, ratio = settled._exchanged(), (sides[1], sides[0]), 1.0 / ratio
+        compared = ratios(found, sides, dofs, stiffness)
+        if self.secondary == "auto" and compared.second_is_better():
+            settled, sides = settled._exchanged(), (sides[1], sides[0])
+            compared = compared.exchanged
             found = settled._meet(sides, dofs, contact, reach, reach)
         edges = sides[0].has_edges(dofs.comm)
-        if ratio > MUCH_WORSE and dofs.comm.rank == 0:
+        ratio = compared.stiffness
+        if compared.finer and ratio > MUCH_WORSE and dofs.comm.rank == 0:
             log.warning(WORSE, self.name, settled.a, ratio, settled.b, settled.b)
         if edges and dofs.comm.rank == 0:
             log.warning(EDGES, self.name, settled.a)

@@ -1,4 +1,4 @@
-"""Surfaces in contact: their facets, and which of a pair is the stiffer one where they meet."""
+"""Surfaces in contact: their facets, and which of a pair had better be the secondary one."""
 
 from __future__ import annotations
 
@@ -23,6 +23,9 @@ DEGENERATE = 1e-12
 # Facets that make more than about 40 degrees with the averaged normal: on meshes that are fine
 # enough for contact a smooth surface stays well below, at a right-angled edge they make 45.
 CREASE = 0.75
+# Ratios up to which meshes are of one size: an irrational number, so that rounding decides nowhere
+# between counts of equal facets; and materials of one stiffness per area.
+SAME_SIZE, SAME_STIFFNESS = 2 ** (1 / 6), 1.01
 
 
 @dataclass(frozen=True)
@@ -71,13 +74,46 @@ def side_of(contact: str, surface: str | int, dofs: TornDofs, decomposition: Dec
     return Side(facets, vertices, hat_areas(kind, facets), normals)
 
 
-def stiffness_ratio(
+@dataclass(frozen=True)
+class Ratios:
+    """The first side of a pair over the second one, where they meet; the same on all ranks.
+
+    Attributes:
+        size: Of facets (roots of areas, in 2D lengths), h over h.
+        stiffness: Stiffness per area of the elements, E/h over E/h.
+    """
+
+    size: float
+    stiffness: float
+
+    @property
+    def finer(self) -> bool:
+        """Whether the first side has the finer mesh, by more than meshes of one size differ."""
+        return self.size < 1.0 / SAME_SIZE
+
+    @property
+    def exchanged(self) -> Ratios:
+        """The second side over the first one."""
+        return Ratios(1.0 / self.size, 1.0 / self.stiffness)
+
+    def second_is_better(self) -> bool:
+        """Whether the second side had better be the secondary one; of two equal ones it is not.
+
+        The coarser one is; where meshes are of one size, the softer one.
+        """
+        if max(self.size, 1.0 / self.size) > SAME_SIZE:
+            return self.finer
+        return self.stiffness > SAME_STIFFNESS
+
+
+def ratios(
     records: ContactRecords, sides: tuple[Side, Side], dofs: TornDofs, stiffness: Array
-) -> float:
-    """Stiffness per area of the first side over that of the second. Collective.
+) -> Ratios:
+    """Compare the meshes and the stiffness of two sides. Collective.
 
     Stiffness per area is E/h of the elements at a surface: Σ n_i·K_ii n_i / Σ ∫φ_i over its
-    vertices, K_ii the block of K before anything is glued, n_i the normal. The vertices that rows
+    vertices, K_ii the block of K before anything is glued, n_i the normal. Sizes are harmonic
+    means, which a few large facets beside many small ones do not decide. The vertices that rows
     name are taken, so that a mesh that is fine only where the bodies touch is judged there; where
     there is no such row, all of them.
 
@@ -93,12 +129,15 @@ def stiffness_ratio(
     meets = dofs.add_on_owners(named, np.ones(len(named))) > 0.0
     if dofs.comm.allreduce(int(np.sum(meets))) == 0:
         meets[:] = True
-    per_area = []
+    sums = []
     for side in sides:
-        area = dofs.add_on_owners(side.vertices.ravel(), side.areas.ravel())
+        vertices = side.vertices.ravel()
+        area = dofs.add_on_owners(vertices, side.areas.ravel())
+        facets = dofs.add_on_owners(vertices, np.full(len(vertices), 1.0 / side.vertices.shape[1]))
         at = meets & (area > 0.0)
         n = side.normals[at]
         along = np.einsum("gi,gij,gj", n, blocks[at], n)
-        sums = dofs.comm.allreduce(np.array([along, area[at].sum()]))
-        per_area.append(sums[0] / sums[1])
-    return agreed(dofs.comm, float(per_area[0] / per_area[1]))
+        sums.append((along, area[at].sum(), np.sum(facets[at] / area[at]), np.sum(at)))
+    along, area, density, count = dofs.comm.allreduce(np.array(sums, dtype=float)).T
+    size, per_area = (count / density) ** (1.0 / (dofs.bs - 1)), along / area
+    return Ratios(*agreed(dofs.comm, (float(size[0] / size[1]), float(per_area[0] / per_area[1]))))

@@ -25,9 +25,10 @@ NO_FORCE, NO_EFFECT = 1e-6, 10.0
 # Size of what is left of a joint motion of size 1 that motions of single bodies span already: both
 # come from null spaces of Gram matrices, whose vectors are right to the root of rounding.
 DEPENDENT = 1e-8
-# Excess of a row, as a share of the motion, that is let be: below what rtol can see. Coefficient of
-# a motion of size 1 that is rounding.
-EXCESS, SLOPE = 1e-9, 1e-12
+# A motion of size 1 that no row sees by more is free: a mesh's coordinates are not more exact.
+# Excess of a row, as a share of all motion, that is its rounding: more would be an error of bodies
+# that move less. Coefficient of a motion of size 1 that is rounding.
+UNSEEN, EXCESS, SLOPE = 1e-9, 1e-13, 1e-12
 # of lsq_linear: as far as rounding lets it come
 TIGHT = 1e-14
 
@@ -89,7 +90,7 @@ def smallest_motion(
     N, body = agreed(coarse.comm, orthonormal(motions, coarse.bodies.k))
     wanted = -(N.T @ coarse.bodies.part_of(u))
     size = float(np.abs(wanted).max(initial=0.0))
-    rows = _rows(coarse, csr_array(coarse.J @ N), gap / coarse.row_size, force, body)
+    rows = _rows(coarse, _seen(coarse, N), gap / coarse.row_size, force, body)
     y = minimise(
         rows,
         lambda A, b: _nearest(A, b, wanted),
@@ -124,6 +125,17 @@ def _span(columns: Array) -> Array:
     return np.asarray(U[:, size > DEPENDENT])
 
 
+def _seen(coarse: CoarseSpace, N: csr_array) -> csr_array:
+    """Return J N of the local rows, 0 for motions that hardly any row sees. Collective."""
+    A = csr_array(coarse.J @ N)
+    largest = np.zeros(A.shape[1])
+    np.maximum.at(largest, A.indices, np.abs(A.data))
+    coarse.comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
+    A.data[largest[A.indices] <= UNSEEN] = 0.0
+    A.eliminate_zeros()
+    return A
+
+
 def _rows(coarse: CoarseSpace, A: csr_array, gap: Array, force: Array, body: Array) -> Rows:
     """A y ≤ gap on open rows; |gap − A y| no larger on others than it is anywhere."""
     bounded = np.zeros(len(gap), dtype=bool)
@@ -146,7 +158,12 @@ def _nearest(A: csr_array, b: Array, wanted: Array) -> Array:
     part_of_row = part[A.indices[A.indptr[:-1]]]
     for p in np.unique(part_of_row):
         columns, rows = np.flatnonzero(part == p), np.flatnonzero(part_of_row == p)
-        y[columns] += _least_distance(A[rows][:, columns].toarray(), b[rows], wanted[columns])
+        own, limit = A[rows][:, columns].toarray(), b[rows]
+        # rows that hardly hold a motion are lengths as all others are, once their size is 1
+        size = np.linalg.norm(own, axis=1)
+        own, limit = own / size[:, None], limit / size
+        for _ in range(2):  # the second time from a point that is off by rounding
+            y[columns] += _least_distance(own, limit, y[columns])
     return y
 
 

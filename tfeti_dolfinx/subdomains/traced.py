@@ -17,8 +17,9 @@ from tfeti_dolfinx.subdomains.kernel import fixing_dofs
 from tfeti_dolfinx.subdomains.kplus import Making, regularised
 
 # Of the largest singular value of the kernel's trace rows, orthonormal columns of which these are
-# a part: below it a motion is 0 on the trace but for rounding, and K_ii does not resist it.
-NOT_ON_TRACE = 1e-10
+# a part: below it a motion is as good as 0 on the trace. K_ii resists it by the square of that,
+# which a Cholesky factor loses.
+NOT_ON_TRACE = 1e-6
 # of projectors onto directions: more are rounding
 DIGITS = 9
 
