@@ -16,7 +16,7 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.checks import checked_type, named, shown
+from tfeti_dolfinx.checks import checked_type, named
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.saved_state import SavedState
 
@@ -292,7 +292,7 @@ class Checkpoint:
         Raises:
             InputError: The folder is none, or has anything that the checkpoint has not written.
         """
-        what = f"checkpoint {shown(str(self.path))}"
+        what = f"checkpoint {self.path}"
         if self.path.exists() and not self.path.is_dir():
             raise InputError(f"{what} is a file; expected the name of a folder")
         files = sorted(self.path.iterdir()) if self.path.is_dir() else []
@@ -314,7 +314,7 @@ class Checkpoint:
             raise damaged(file, "it") from error
         if isinstance(found, dict) and found.get("version") in (1, 2):
             raise InputError(
-                f"checkpoint {shown(str(self.path))} is of an earlier version of the package, "
+                f"checkpoint {self.path} is of an earlier version of the package, "
                 "without checksums; expected one of this version: finish the series with that "
                 "one, or name another folder"
             )
