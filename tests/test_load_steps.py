@@ -201,7 +201,7 @@ def test_what_a_step_writes_does_not_grow_with_the_steps(shared_tmp):
     sizes, states = [], []
 
     def apply(problem, t):
-        if (folder / "checkpoint.json").exists():
+        if list(folder.glob("state_*")):
             sizes.append((folder / "checkpoint.json").stat().st_size)
             states.append(len(list(folder.glob("state_*"))))
         scene.load.value[-1] = -0.05
@@ -231,7 +231,7 @@ def test_a_record_that_is_torn_is_written_again(shared_tmp, torn):
     if comm.rank == 0:
         (folder / "records.jsonl").write_text("")
     comm.barrier()
-    with pytest.raises(tfeti.InputError, match="records.jsonl has 0 whole records of 4"):
+    with pytest.raises(tfeti.InputError, match="records.jsonl is damaged"):
         tfeti.LoadSteps(second.problem, second.apply, TIMES, checkpoint=folder).run(resume=True)
 
 
@@ -359,7 +359,7 @@ def test_a_checkpoint_of_something_else(shared_tmp):
     if comm.rank == 0:
         (shared_tmp / "c" / f"state_2_{comm.size - 1}.npz").write_bytes(b"half")
     comm.barrier()
-    with pytest.raises(tfeti.InputError, match="cannot read .*state_2_"):
+    with pytest.raises(tfeti.InputError, match="state_2_.* is damaged"):
         again(Driven(), [0.5, 1.0])
 
 

@@ -1,5 +1,6 @@
 """Files for ParaView and pictures: complete, whole, and only when asked for."""
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -9,11 +10,12 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from full_disk import full, left_in
 from scenes import curved_obstacle, decomposed, problem
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx import InputError, TfetiError, draw
-from tfeti_dolfinx.output import cell_fields, nodal_fields, write_vtx, write_xdmf
+from tfeti_dolfinx.output import LITTLE, cell_fields, nodal_fields, write_vtx, write_xdmf
 from tfeti_dolfinx.plot import check_screen, plot_deformed, plot_pressure
 
 
@@ -137,6 +139,47 @@ def test_files_that_cannot_be_written_are_named_on_all_ranks(solution, comm, sha
     }.items():
         with pytest.raises(InputError, match=f"cannot write {folder}"):
             write(folder / name)
+
+
+@pytest.mark.parametrize("size", [0, 3000, 20000])
+def test_on_a_full_disk_nothing_is_lost(solution, comm, shared_tmp, size):
+    """An error on all ranks, and files of an earlier run as they were."""
+    for name, write in {"out.xdmf": write_xdmf, "out.bp": write_vtx}.items():
+        write(shared_tmp / name, solution)
+        before = left_in(shared_tmp, comm)
+        with full(size), pytest.raises(InputError, match=f"cannot write .*{name}.*too large"):
+            write(shared_tmp / name, solution)
+        assert left_in(shared_tmp, comm) == before
+        assert not list(shared_tmp.glob(".*"))
+
+
+@pytest.mark.skipif(not dolfinx.has_adios2, reason="DOLFINx without ADIOS2")
+def test_a_disk_that_gets_full_meanwhile(solution, serial_only, shared_tmp, comm, monkeypatch):
+    """ADIOS2 fails itself, once, and does not end the process later."""
+    write_vtx(shared_tmp / "out.bp", solution)
+    before = left_in(shared_tmp, comm)
+    monkeypatch.setattr("os.posix_fallocate", lambda *_: None)
+    with full(3000), pytest.raises(InputError, match=r"cannot write .*out.bp: RuntimeError"):
+        write_vtx(shared_tmp / "out.bp", solution)
+    assert left_in(shared_tmp, comm) == before
+    assert not list(shared_tmp.glob(".*"))
+
+
+@pytest.mark.skipif(not dolfinx.has_adios2, reason="DOLFINx without ADIOS2")
+def test_place_for_files_is_estimated_closely(solution, comm, shared_tmp, monkeypatch):
+    """Never too little, and not much more than twice of what they take."""
+    asked, allocate = [], os.posix_fallocate
+
+    def spy(file, begin, size):
+        asked.append(size)
+        allocate(file, begin, size)
+
+    monkeypatch.setattr("os.posix_fallocate", spy)
+    files = write_vtx(shared_tmp / "out.bp", solution)
+    taken = [sum(len(c) for c in left_in(f, comm).values()) for f in files]
+    if comm.rank == 0:
+        for most, size in zip([n for n in asked if n != LITTLE], taken, strict=True):
+            assert size <= most <= 2 * size + 2e5
 
 
 def test_folders_beside_that_are_somebody_s_stay(solution, comm, shared_tmp):

@@ -2,77 +2,164 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
-import zipfile
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, BinaryIO, cast
 
 import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.checks import checked_type, named, shown
+from tfeti_dolfinx.checks import checked_type, named
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.saved_state import SavedState
 
-INDEX, RECORDS, VERSION = "checkpoint.json", "records.jsonl", 2
-BROKEN = (OSError, ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile)
+INDEX, RECORDS, VERSION = "checkpoint.json", "records.jsonl", 3
+KIND = "checkpoint of tfeti_dolfinx"
+OF_STEP = re.compile(
+    r"(?P<kind>state|fields)_(?P<number>[1-9]\d*)_(?P<rank>0|[1-9]\d*)\.npz(?P<partial>\.partial)?"
+)
+
+
+@dataclass(frozen=True)
+class Index:
+    """What ``checkpoint.json`` has: which files count, and how their bytes add up.
+
+    Attributes:
+        number: How many steps have converged; 0: the folder is taken, nothing is kept yet.
+        ranks: Number of ranks.
+        states: Checksum of the state's file of each rank.
+        records_length: How many bytes of ``records.jsonl`` count.
+        records_checksum: Their checksum.
+        digest: Describes what the user has given, see ``Checkpoint.write``.
+        about: What else is kept.
+        kind: The mark of a folder that a checkpoint owns.
+        version: Of this form.
+    """
+
+    number: int
+    ranks: int
+    states: list[str] = field(default_factory=list)
+    records_length: int = 0
+    records_checksum: str = ""
+    digest: Any = ""
+    about: dict[str, Any] = field(default_factory=dict)
+    kind: str = KIND
+    version: int = VERSION
+
+    def owns(self, file: Path) -> bool:
+        """Return whether the checkpoint writes a file of this name up to the next step."""
+        if not file.is_file():
+            return False
+        found = OF_STEP.fullmatch(file.name)
+        if found is None:
+            return file.name in (INDEX, f"{INDEX}.partial", RECORDS)
+        first = max(self.number - 1, 1) if found["kind"] == "state" else 1
+        of_series = first <= int(found["number"]) <= self.number + 1
+        return of_series and int(found["rank"]) < self.ranks
+
+    def counts(self, file: Path) -> bool:
+        """Return whether an own file is one of those that the next run reads."""
+        found = OF_STEP.fullmatch(file.name)
+        if found is None:
+            return file.name in (INDEX, RECORDS)
+        number, is_state = int(found["number"]), found["kind"] == "state"
+        known = number == self.number if is_state else number <= self.number
+        return known and not found["partial"]
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What a checkpoint has of a series, the same on all ranks.
+
+    Attributes:
+        number: How many steps have converged.
+        records: The record of each.
+        about: What ``Checkpoint.write`` was given last.
+        digest: Likewise.
+    """
+
+    number: int
+    records: list[dict[str, Any]]
+    about: dict[str, Any]
+    digest: Any
 
 
 class Checkpoint:
     """A folder with the last converged step of a series. Creation and all methods are collective.
 
     Each rank writes its arrays to a file of its own, with the number of the step in its name.
-    The record of the step is a line at the end of ``records.jsonl``. When all are whole,
-    ``checkpoint.json`` takes that number, and how long the lines are: it is written aside and
-    renamed, so it names whole files at any time, and a line that is torn lies beyond what counts.
-    Then files of earlier steps go. What a step writes does not grow with their number.
+    The record of the step is a line at the end of ``records.jsonl``, with the checksums of its
+    fields. When all are whole, ``checkpoint.json`` takes that number, and the checksums of states
+    and lines: it is written aside and renamed, so it names whole files at any time, and a line
+    that is torn lies beyond what counts. Then the state of the step before goes. What a step
+    writes does not grow with their number.
+
+    The folder is the checkpoint's own. ``checkpoint.json`` marks it before anything else is
+    written; it says of which steps and ranks there are files, and only those are ever removed.
 
     Args:
-        path: The folder; it may be there if it is empty or has a checkpoint.
+        path: The folder; it may be there if it is empty or has a checkpoint, and nothing else.
         comm: Communicator.
 
     Raises:
-        InputError: The path is no folder for a checkpoint.
+        InputError: The path is no folder for a checkpoint, or its index is damaged.
     """
 
     def __init__(self, path: str | os.PathLike[str], comm: MPI.Intracomm) -> None:
         checked_type(path, (str, os.PathLike), "checkpoint", "the name of a folder")
         self.path, self._comm = Path(path), comm
-        self._length, self._last = 0, -1  # of records in bytes, on rank 0; the last step kept
+        self._index = Index(0, comm.size)  # rank 0's counts
+        self._lines = _hash()  # of the records that count, likewise
+        self._states: list[str] = []  # checksums of all ranks at the step that was read
+        self._fields: list[list[str]] = []  # of all steps and ranks, likewise
         with raised_on_all_ranks(comm), named(f"checkpoint {self.path}", OSError):
             if comm.rank == 0:
-                _check_folder(self.path)
+                self._index = self._checked_folder()
 
     def forget(self) -> None:
-        """Remove what an earlier series has left."""
+        """Remove what an earlier series has left, and take the folder."""
         with raised_on_all_ranks(self._comm), named(f"checkpoint {self.path}", OSError):
             if self._comm.rank == 0:
+                self._index = self._checked_folder()
                 self.path.mkdir(parents=True, exist_ok=True)
-                (self.path / INDEX).unlink(missing_ok=True)
-                self._remove(f for f in self.path.iterdir() if _is_own(f))
-        self._length, self._last = 0, -1
+                # the index goes last: it says what else is to go
+                for file in sorted(self.path.iterdir(), key=lambda f: f.name == INDEX):
+                    if self._index.owns(file):
+                        file.unlink()
+                self._commit(Index(0, self._comm.size))
+        self._lines = _hash()
 
-    def read_index(self) -> dict[str, Any] | None:
-        """What ``write`` was given last as ``about``, on all ranks, and all ``records``.
+    def read(self) -> Kept | None:
+        """Return what was written last, on all ranks; None if there is nothing.
 
-        None if there is nothing.
+        What a run that was killed has left beside it is removed.
 
         Raises:
-            InputError: It cannot be read, or was written on another number of ranks.
+            InputError: It is damaged, or was written on another number of ranks.
         """
-        found: dict[str, Any] | None = None
-        self._last = -1
-        with raised_on_all_ranks(self._comm), named(f"cannot read {self.path / INDEX}", *BROKEN):
-            if self._comm.rank == 0 and (self.path / INDEX).exists():
-                index = json.loads((self.path / INDEX).read_text())
-                self._check(index)
-                self._length = index["records_length"]
-                found = {**index, "records": self._read_records(index["number"])}
-        return self._comm.bcast(found, root=0)
+        kept: Kept | None = None
+        comm = self._comm
+        with raised_on_all_ranks(comm), named(f"cannot read {self.path}", OSError):
+            if comm.rank == 0:
+                index = self._index = self._checked_folder()
+                if index.number:
+                    self._check_ranks()
+                    records = [json.loads(line) for line in self._read_lines()]
+                    self._fields = [record.pop("fields") for record in records]
+                    self._states = index.states
+                    kept = Kept(index.number, records, index.about, index.digest)
+                    for file in self.path.iterdir():
+                        if index.owns(file) and not index.counts(file):
+                            file.unlink()
+        self._states, self._fields = comm.bcast((self._states, self._fields), root=0)
+        return comm.bcast(kept, root=0)
 
     def write(
         self,
@@ -81,6 +168,7 @@ class Checkpoint:
         record: Mapping[str, Any],
         state: SavedState,
         fields: Mapping[str, Array],
+        digest: Any = "",
     ) -> None:
         """Keep a step; the one before is replaced when this one is whole.
 
@@ -90,110 +178,185 @@ class Checkpoint:
             record: What to keep of every step, likewise.
             state: The state of this rank.
             fields: Fields of the step on this rank, kept for all steps.
+            digest: Describes all that the user has given at this step, for JSON; empty where it
+                is not known. ``read`` gives it back. Rank 0's counts.
 
         Raises:
             InputError: The files cannot be written.
         """
-        rank = self._comm.rank
-        with raised_on_all_ranks(self._comm), named(f"cannot write {self.path}", OSError):
-            self._save(f"state_{number}_{rank}.npz", asdict(state))
+        comm, in_state, in_fields = self._comm, "", ""
+        with raised_on_all_ranks(comm), named(f"cannot write {self.path}", OSError):
+            in_state = self._save(f"state_{number}_{comm.rank}.npz", asdict(state))
             if fields:
-                self._save(f"fields_{number}_{rank}.npz", fields)
-        with raised_on_all_ranks(self._comm), named(f"cannot write {self.path}", OSError):
-            if rank == 0:
-                self._append(record)
-                index = {"version": VERSION, "ranks": self._comm.size, "number": number}
-                length = {"records_length": self._length}
-                text = json.dumps({**index, **length, **about}, indent=1)
-                partial = self.path / f"{INDEX}.partial"
-                partial.write_text(text + "\n")
-                os.replace(partial, self.path / INDEX)
-                self._remove(self._earlier_states(number))
-        self._last = number
+                in_fields = self._save(f"fields_{number}_{comm.rank}.npz", fields)
+        checksums = comm.gather((in_state, in_fields), root=0)
+        with raised_on_all_ranks(comm), named(f"cannot write {self.path}", OSError):
+            if checksums is not None:  # on rank 0
+                states, of_fields = zip(*checksums, strict=True)
+                text = json.dumps({**record, "fields": of_fields if fields else []})
+                line, lines, before = f"{text}\n".encode(), self._lines.copy(), self._index
+                lines.update(line)
+                self._append(line)
+                self._commit(
+                    Index(
+                        number,
+                        comm.size,
+                        list(states),
+                        before.records_length + len(line),
+                        lines.hexdigest(),
+                        digest,
+                        dict(about),
+                    )
+                )
+                self._lines = lines
+                for rank in range(len(before.states)):
+                    (self.path / f"state_{before.number}_{rank}.npz").unlink(missing_ok=True)
 
     def read_state(self, number: int) -> SavedState:
-        """The state of this rank at the step that the index names.
+        """Return the state of this rank at the step that ``read`` found.
 
         Raises:
-            InputError: It cannot be read.
+            InputError: It is not what was written.
         """
-        name = self.path / f"state_{number}_{self._comm.rank}.npz"
-        with raised_on_all_ranks(self._comm), named(f"cannot read {name}", *BROKEN):
-            state = SavedState(**_load(name))
-        return state
+        return SavedState(**self._load(f"state_{number}_{self._comm.rank}.npz", self._states))
 
     def read_fields(self, number: int) -> dict[str, Array]:
-        """Fields of an earlier step on this rank.
+        """Return the fields of a step, of those that ``read`` found, on this rank.
 
         Raises:
-            InputError: They cannot be read.
+            InputError: They are not what was written, or there are none.
         """
-        name = self.path / f"fields_{number}_{self._comm.rank}.npz"
-        with raised_on_all_ranks(self._comm), named(f"cannot read {name}", *BROKEN):
-            fields = _load(name)
-        return fields
+        checksums = self._fields[number - 1]
+        if not checksums:
+            raise InputError(
+                f"checkpoint {self.path} has no fields of step {number}; expected path= as in "
+                "the run that has written it"
+            )
+        return self._load(f"fields_{number}_{self._comm.rank}.npz", checksums)
 
-    def _save(self, name: str, arrays: Mapping[str, Array]) -> None:
-        partial = self.path / f"{name}.partial"
-        with partial.open("wb") as file:
+    def _save(self, name: str, arrays: Mapping[str, Array]) -> str:
+        """Write arrays; return the checksum of the file's bytes."""
+        with self._replaced(name) as file:
             np.savez(file, **cast(dict[str, Any], arrays))
+        return _checksum_in(self.path / name)
+
+    @contextmanager
+    def _replaced(self, name: str) -> Iterator[BinaryIO]:
+        """Give a file to write to; when it is whole, and on the disk, it gets its name."""
+        partial = self.path / f"{name}.partial"
+        try:
+            with partial.open("wb") as file:
+                yield file
+                _settle(file)
+        except OSError:
+            partial.unlink(missing_ok=True)  # a full disk needs the place
+            raise
         os.replace(partial, self.path / name)
 
-    def _append(self, record: Mapping[str, Any]) -> None:
-        """Put a record after those that count; what lies beyond them goes."""
-        line = (json.dumps(record) + "\n").encode()
+    def _load(self, name: str, checksums: list[str]) -> dict[str, Array]:
+        """Return arrays of this rank; nothing looks into a file that is not as it was written."""
+        file = self.path / name
+        with raised_on_all_ranks(self._comm), named(f"cannot read {file}", OSError):
+            if _checksum_in(file) != checksums[self._comm.rank]:
+                raise damaged(file, INDEX if checksums is self._states else RECORDS)
+            with np.load(file) as contents:
+                arrays = dict(contents)
+        return arrays
+
+    def _append(self, line: bytes) -> None:
+        """Put a line after those that count; what lies beyond them goes."""
         with (self.path / RECORDS).open("ab") as file:
-            file.truncate(self._length)
+            file.truncate(self._index.records_length)
             file.write(line)
-        self._length += len(line)
+            _settle(file)
 
-    def _read_records(self, number: int) -> list[Any]:
+    def _read_lines(self) -> list[bytes]:
         with (self.path / RECORDS).open("rb") as file:
-            lines = file.read(self._length).splitlines()
-        if len(lines) != number:
-            raise ValueError(f"{RECORDS} has {len(lines)} whole records of {number}")
-        return [json.loads(line) for line in lines]
+            text = file.read(self._index.records_length)
+        self._lines = _hash(text)
+        if self._lines.hexdigest() != self._index.records_checksum:
+            raise damaged(self.path / RECORDS, INDEX)
+        return text.splitlines()
 
-    def _earlier_states(self, number: int) -> list[Path]:
-        """Those of the last step, or, where that is not known, all but those of this one."""
-        if self._last >= 0:
-            states = [f"state_{self._last}_{rank}.npz" for rank in range(self._comm.size)]
-            return [self.path / name for name in states if self._last != number]
-        kept = f"state_{number}_"
-        return [f for f in self.path.glob("state_*.npz") if kept not in f.name]
+    def _commit(self, index: Index) -> None:
+        """Let an index count."""
+        text = asdict(index)
+        text["checksum"] = _checksum_of(text)
+        with self._replaced(INDEX) as file:
+            file.write(f"{json.dumps(text, indent=1)}\n".encode())
+        self._index = index
 
-    def _check(self, found: Any) -> None:
-        if not isinstance(found, dict) or found.get("version") != VERSION:
-            raise InputError(f"{self.path} has no checkpoint of this version of the package")
-        if found["ranks"] != self._comm.size:
+    def _checked_folder(self) -> Index:
+        """Return the index of the folder, or one of nothing.
+
+        Raises:
+            InputError: The folder is none, or has anything that the checkpoint has not written.
+        """
+        what = f"checkpoint {self.path}"
+        if self.path.exists() and not self.path.is_dir():
+            raise InputError(f"{what} is a file; expected the name of a folder")
+        files = sorted(self.path.iterdir()) if self.path.is_dir() else []
+        marked = self.path / INDEX in files
+        index = self._read_index() if marked else None
+        others = [f.name for f in files if index is None or not index.owns(f)]
+        if others:
             raise InputError(
-                f"{self.path} was written on {found['ranks']} ranks, this run has "
+                f"{what} is a folder with other files, {others[0]!r}; "
+                "expected a new or empty one, or one with a checkpoint and nothing else"
+            )
+        return Index(0, self._comm.size) if index is None else index
+
+    def _read_index(self) -> Index:
+        file = self.path / INDEX
+        try:
+            found = json.loads(file.read_text())
+        except (ValueError, RecursionError) as error:
+            raise damaged(file, "it") from error
+        if isinstance(found, dict) and found.get("version") in (1, 2):
+            raise InputError(
+                f"checkpoint {self.path} is of an earlier version of the package, "
+                "without checksums; expected one of this version: finish the series with that "
+                "one, or name another folder"
+            )
+        if not isinstance(found, dict) or found.get("kind") != KIND:
+            raise damaged(file, "it")
+        checksum = found.pop("checksum", None)
+        if checksum != _checksum_of(found):
+            raise damaged(file, "it")
+        if found["version"] != VERSION:
+            raise InputError(f"{file} is of version {found['version']}; expected {VERSION}")
+        return Index(**found)
+
+    def _check_ranks(self) -> None:
+        if self._index.ranks != self._comm.size:
+            raise InputError(
+                f"{self.path} was written on {self._index.ranks} ranks, this run has "
                 f"{self._comm.size}; expected the same number"
             )
 
-    def _remove(self, files: Iterable[Path]) -> None:
-        for file in list(files):
-            file.unlink()
+
+def damaged(file: Path, where: str) -> InputError:
+    """Return the error of a file whose checksum differs from the one that was written."""
+    return InputError(
+        f"{file} is damaged: it is not what the checkpoint has written, by the checksum in "
+        f"{where}; expected the folder as it was left. Bring the file back, or remove the folder"
+    )
 
 
-def _load(name: Path) -> dict[str, Array]:
-    with np.load(name) as file:
-        return dict(file)
+def _hash(data: bytes = b"") -> Any:
+    return hashlib.blake2b(data, digest_size=16)
 
 
-def _is_own(file: Path) -> bool:
-    """Whether a checkpoint has files of this name."""
-    own = ("state_", "fields_", f"{INDEX}.")
-    return file.name in (INDEX, RECORDS) or file.name.startswith(own)
+def _checksum_in(file: Path) -> str:
+    with file.open("rb") as opened:
+        return hashlib.file_digest(opened, _hash).hexdigest()
 
 
-def _check_folder(path: Path) -> None:
-    if path.exists() and not path.is_dir():
-        raise InputError(f"checkpoint {shown(str(path))} is a file; expected the name of a folder")
-    if path.is_dir():
-        other = [f.name for f in path.iterdir() if not _is_own(f)]
-        if other:
-            raise InputError(
-                f"checkpoint {shown(str(path))} is a folder with other files, {other[0]!r}; "
-                "expected a new or empty one, or one with a checkpoint"
-            )
+def _checksum_of(index: Mapping[str, Any]) -> str:
+    return str(_hash(json.dumps(index, sort_keys=True).encode()).hexdigest())
+
+
+def _settle(file: BinaryIO) -> None:
+    """Bring a file to the disk, so that a name that it gets later never has less."""
+    file.flush()
+    os.fsync(file.fileno())

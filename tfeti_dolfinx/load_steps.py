@@ -137,8 +137,11 @@ class LoadSteps:
         try:
             with shown_progress(self._comm, self._progress) as show:
                 self._steps(place, show)
-        except TfetiError:  # on all ranks; the steps before it are whole
-            self._close()
+        except TfetiError as error:  # on all ranks; the steps before it are whole
+            try:
+                self._close()
+            except TfetiError as another:
+                error.add_note(str(another))
             raise
         self._close()
         return self.records
@@ -201,18 +204,19 @@ class LoadSteps:
     def _keep(self, place: Place, t: float) -> None:
         """Write a step that has converged, and the place of the next."""
         fields: dict[str, Array] = {}
+        solution = self._problem.solution
         if self._path is not None:
-            solution = self._problem.solution
             fields = fields_of(solution, self._interior)
-            if self._series is None:
-                self._series = Series(self._path, solution, self._interior)
-            self._series.write(t, fields)
-        if self._checkpoint is not None:
+        if self._checkpoint is not None:  # before the file, which can be written from it anew
             about = {"place": asdict(place), "begin": self._times[0]}
             if place.done:  # where its step goes
                 about["towards"] = self._times[place.number + 1]
             record, state = asdict(self.records[-1]), self._problem.state()
             self._checkpoint.write(len(self.records), about, record, state, fields)
+        if self._path is not None:
+            if self._series is None:
+                self._series = Series(self._path, solution, self._interior)
+            self._series.write(t, fields)
 
     def _begin(self, resume: bool) -> Place:
         """Where to begin, with the state of that place."""
@@ -221,18 +225,18 @@ class LoadSteps:
             if resume:
                 raise InputError("resume=True: expected LoadSteps(..., checkpoint=) too")
             return Place()
-        index = self._checkpoint.read_index() if resume else None
-        if index is None:
+        kept = self._checkpoint.read() if resume else None
+        if kept is None:
             self._checkpoint.forget()
             return Place()
-        place = Place(**index["place"])
-        self.records = [StepRecord(**record) for record in index["records"]]
+        place = Place(**kept.about["place"])
+        self.records = [StepRecord(**record) for record in kept.records]
         ends = {record.number: record.time for record in self.records}
-        reached = [index["begin"], *(ends[number] for number in range(place.number))]
-        self._check_times(reached + ([index["towards"]] if place.done else []))
+        reached = [kept.about["begin"], *(ends[number] for number in range(place.number))]
+        self._check_times(reached + ([kept.about["towards"]] if place.done else []))
         self._problem.take_step(self.records[-1].size)
         self._set(self.records[-1].time)
-        self._problem.restore(self._checkpoint.read_state(index["number"]))
+        self._problem.restore(self._checkpoint.read_state(kept.number))
         self._replay(self._checkpoint)
         return place
 
@@ -248,11 +252,16 @@ class LoadSteps:
         """Write the steps of earlier runs again: a file of ADIOS2 cannot be continued."""
         if self._path is None:
             return
-        self._series = Series(self._path, self._problem.solution, self._interior)
-        for number, record in enumerate(self.records, start=1):
-            self._series.write(record.time, checkpoint.read_fields(number))
+        series = Series(self._path, self._problem.solution, self._interior)
+        try:
+            for number, record in enumerate(self.records, start=1):
+                series.write(record.time, checkpoint.read_fields(number))
+        except TfetiError:  # on all ranks
+            series.drop()
+            raise
+        self._series = series
 
     def _close(self) -> None:
-        if self._series is not None:
-            self._series.close()
-        self._series = None
+        series, self._series = self._series, None
+        if series is not None:
+            series.close()

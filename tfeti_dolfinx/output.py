@@ -2,21 +2,31 @@
 
 from __future__ import annotations
 
-import itertools
+import ctypes
+import errno
 import os
 import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import dolfinx
 import numpy as np
 from dolfinx import fem, io
+from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.checks import checked_path, checked_type, named
-from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.compat import geometry_dofmap
+from tfeti_dolfinx.errors import InputError, TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.entities import NO_TAG
 from tfeti_dolfinx.solution import Solution
+
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+LITTLE = 2**14  # bytes, more than what a file without fields takes
 
 
 def write_vtx(
@@ -41,17 +51,25 @@ def write_vtx(
         The files written.
 
     Raises:
-        InputError: The name does not end with ``.bp``, or nothing can be written there.
+        InputError: The name does not end with ``.bp``, or the files cannot be written there, as
+            where the disk is full; then what was there before stays.
     """
     target = checked_target(path, ".bp", solution)
     if not dolfinx.has_adios2:
         return write_xdmf(target.with_suffix(".xdmf"), solution, interior)
     cells = target.with_name(f"{target.stem}_cells.bp")
-    for name, functions in zip((target, cells), _fields(solution, interior), strict=True):
-        partial = begin_file(name, solution)
-        with io.VTXWriter(solution.decomposition.comm, partial, functions, engine="BP4") as vtx:
-            vtx.write(0.0)
-        end_file(partial, name, solution)
+    files: list[VtxFile] = []
+    try:
+        for name, functions in zip((target, cells), _fields(solution, interior), strict=True):
+            files.append(VtxFile(name, functions))
+            files[-1].write(0.0)
+            files[-1].close()
+    except TfetiError:  # on all ranks
+        for file in files:
+            file.drop()
+        raise
+    for file in files:
+        file.appear()
     return [target, cells]
 
 
@@ -71,25 +89,104 @@ def write_xdmf(
         The files written.
 
     Raises:
-        InputError: The name does not end with ``.xdmf``, or nothing can be written there.
+        InputError: The name does not end with ``.xdmf``, or the files cannot be written there, as
+            where the disk is full; then what was there before stays.
     """
     target = checked_target(path, ".xdmf", solution)
-    decomposition = solution.decomposition
-    folder = begin_file(target.with_name(f"{target.stem}.folder"), solution)
-    with raised_on_all_ranks(decomposition.comm), named(f"cannot write {target}", OSError):
-        if decomposition.comm.rank == 0:
-            folder.mkdir(parents=True)
-    with io.XDMFFile(decomposition.comm, folder / target.name, "w") as xdmf:
-        xdmf.write_mesh(decomposition.mesh)
-        for function in itertools.chain(*_fields(solution, interior)):
-            xdmf.write_function(_as_geometry(function, decomposition))
+    comm, mesh = solution.decomposition.comm, solution.decomposition.mesh
+    of_nodes, of_cells = _fields(solution, interior)
+    functions = [_as_geometry(f, solution.decomposition) for f in of_nodes + of_cells]
     companion = target.with_suffix(".h5")
+    folder = begin_file(target.with_name(f"{target.stem}.folder"), comm)
+    try:
+        with raised_on_all_ranks(comm), named(f"cannot write {target}", OSError):
+            if comm.rank == 0:
+                folder.mkdir(parents=True)
+        _reserve(target, comm, _bytes_of(functions))
+        with raised_on_all_ranks(comm), named(f"cannot write {target}"):
+            xdmf = io.XDMFFile(comm, folder / target.name, "w")
+        with _written_by(xdmf, target, comm):
+            xdmf.write_mesh(mesh)
+            for function in functions:
+                xdmf.write_function(function)
+            xdmf.close()
+    except TfetiError:  # on all ranks
+        _drop(folder, comm)
+        raise
     for name in (companion, target):
-        end_file(folder / name.name, name, solution)
-    with raised_on_all_ranks(decomposition.comm):
-        if decomposition.comm.rank == 0:
-            folder.rmdir()
+        end_file(folder / name.name, name, comm)
+    _drop(folder, comm)
     return [target, companion]
+
+
+class VtxFile:
+    """A VTX file that has another name until it is whole. Creation and methods are collective.
+
+    ADIOS2 throws where a disk is full, throws again in its destructor, which ends the process, and
+    lets other ranks wait for the one that has failed. So what is to be written is reserved before.
+
+    Args:
+        name: Its name once it is whole.
+        functions: What it has, all of one mesh.
+
+    Attributes:
+        partial: Its name until then.
+
+    Raises:
+        InputError: It cannot be written.
+    """
+
+    def __init__(self, name: Path, functions: Sequence[fem.Function]) -> None:
+        self._name, self._comm = name, functions[0].function_space.mesh.comm
+        self._bytes, self._count, self._open = _bytes_of(functions), 0, False
+        self.partial = begin_file(name, self._comm)
+        _reserve(name, self._comm, LITTLE)
+        with raised_on_all_ranks(self._comm), named(f"cannot write {name}"):
+            self._vtx = io.VTXWriter(self._comm, self.partial, list(functions), engine="BP4")
+        self._open = True
+
+    def write(self, time: float) -> None:
+        """Add what the functions and the mesh have.
+
+        Raises:
+            InputError: It cannot be written; times before this one are whole.
+        """
+        _reserve(self._name, self._comm, self._bytes, self._count * self._bytes)
+        self._of_library(lambda: self._vtx.write(time))
+        self._count += 1
+
+    def close(self) -> None:
+        """Write what is left.
+
+        Raises:
+            InputError: It cannot be written.
+        """
+        if self._open:
+            self._of_library(self._vtx.close)
+        self._open = False
+
+    def appear(self) -> None:
+        """Give the file its name, in the place of what has it.
+
+        Raises:
+            InputError: It cannot have it.
+        """
+        end_file(self.partial, self._name, self._comm)
+
+    def drop(self) -> None:
+        """Remove the file under the name that it has until it is whole."""
+        with suppress(TfetiError):
+            self.close()
+        _drop(self.partial, self._comm)
+
+    def _of_library(self, do: Callable[[], None]) -> None:
+        """Write, and never again where that fails."""
+        try:
+            with _written_by(self._vtx, self._name, self._comm):
+                do()
+        except TfetiError:
+            self._open = False
+            raise
 
 
 def nodal_fields(solution: Solution) -> list[fem.Function]:
@@ -166,10 +263,9 @@ def checked_target(path: str | os.PathLike[str], suffix: str, solution: Solution
     return target
 
 
-def begin_file(name: Path, solution: Solution) -> Path:
+def begin_file(name: Path, comm: MPI.Intracomm) -> Path:
     """Name to write to until the file is whole; what an earlier run left there is removed."""
     partial = name.with_name(f".{name.name}.partial")
-    comm = solution.decomposition.comm
     with raised_on_all_ranks(comm), named(f"cannot write {name}", OSError):
         if comm.rank == 0:
             name.parent.mkdir(parents=True, exist_ok=True)
@@ -177,14 +273,78 @@ def begin_file(name: Path, solution: Solution) -> Path:
     return partial
 
 
-def end_file(partial: Path, name: Path, solution: Solution) -> None:
+def end_file(partial: Path, name: Path, comm: MPI.Intracomm) -> None:
     """Give a whole file its name. Collective."""
-    comm = solution.decomposition.comm
     comm.barrier()
     with raised_on_all_ranks(comm), named(f"cannot write {name}", OSError):
         if comm.rank == 0:
             _remove(name)
             os.replace(partial, name)
+
+
+def _reserve(name: Path, comm: MPI.Intracomm, size: int, before: int = 0) -> None:
+    """Raise unless so many bytes more fit beside a name. Collective.
+
+    Rank 0 takes them for a file without a name, and gives them back: unlike a look at what is
+    free, that knows quotas and limits of a file's size, too. Where a file system cannot take
+    place, the C library writes a byte to each block.
+
+    Args:
+        name: What is to be written.
+        comm: Communicator.
+        size: How many bytes.
+        before: How many bytes the file has.
+
+    Raises:
+        InputError: They do not fit, or nothing can be written there.
+    """
+    what = f"cannot write {name}, up to {size / 1e6:.3g} MB more"
+    with raised_on_all_ranks(comm), named(what, OSError):
+        if comm.rank == 0 and hasattr(os, "posix_fallocate"):  # macOS has none
+            with tempfile.TemporaryFile(dir=name.parent) as file:
+                try:
+                    os.posix_fallocate(file.fileno(), before, size)
+                except OSError as error:
+                    if error.errno in FULL:
+                        raise
+
+
+def _bytes_of(functions: Sequence[fem.Function]) -> int:
+    """Return what a file takes at most for a mesh and functions on it, all ranks. Collective."""
+    mesh = functions[0].function_space.mesh
+    cells, width = geometry_dofmap(mesh).shape
+    nodes, numbers = len(mesh.geometry.x), 0
+    for function in functions:
+        dofmap = function.function_space.dofmap
+        width = max(width, np.shape(dofmap.list)[1])
+        here = len(function.x.array) // dofmap.bs
+        nodes = max(nodes, here)
+        numbers += here * {2: 3, 4: 9}.get(dofmap.bs, dofmap.bs)  # ParaView knows nothing in 2D
+    numbers += 5 * nodes + (width + 3) * cells  # points, their numbers and ghosts; cells and kinds
+    names = LITTLE + 2048 * len(functions)  # and least and largest values
+    return int(mesh.comm.allreduce(8 * numbers + names))
+
+
+@contextmanager
+def _written_by(writer: Any, name: Path, comm: MPI.Intracomm) -> Iterator[None]:
+    """Name what a library raises inside, on all ranks.
+
+    Its object is kept for ever then: the destructor writes again, and ends the process.
+    """
+    try:
+        with raised_on_all_ranks(comm), named(f"cannot write {name}"):
+            yield
+    except TfetiError:
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(writer))
+        raise
+
+
+def _drop(path: Path, comm: MPI.Intracomm) -> None:
+    """Remove what is no longer needed. Collective."""
+    comm.barrier()
+    if comm.rank == 0:
+        with suppress(OSError):
+            _remove(path)
 
 
 def _remove(path: Path) -> None:
