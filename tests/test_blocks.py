@@ -286,10 +286,11 @@ NO_FACTOR = {
 
 
 @pytest.mark.parametrize("kind", list(NO_FACTOR))
-def test_cholesky_says_when_there_is_no_factor(solver, kind):
-    """Also where the solver would make one: LDLᵀ takes pivots of any sign."""
+def test_cholesky_says_when_there_is_no_factor(solver, kind, capfd):
+    """Also where the solver would make one: LDLᵀ takes pivots of any sign. It alone says it."""
     with pytest.raises(NotPositiveDefiniteError, match=f"not positive definite.*{solver}"):
         CholeskyFactor(csr_array(np.array(NO_FACTOR[kind])))
+    assert capfd.readouterr() == ("", "")
 
 
 def test_every_solver_factors(solver):
