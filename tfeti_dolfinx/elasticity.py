@@ -15,7 +15,7 @@ from ufl.algorithms import estimate_total_polynomial_degree
 
 from tfeti_dolfinx.checks import POSITIVE, Range, checked_number, checked_type, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.form_checks import check_mesh
+from tfeti_dolfinx.form_checks import check_mesh, check_not_negative
 from tfeti_dolfinx.mesh.decomposition import Decomposition, known_tags
 
 MODELS = {2: ("plane_strain", "plane_stress", "axisymmetric"), 3: ("3d",)}
@@ -97,6 +97,8 @@ class Elasticity:
             self.thickness = 2 * math.pi * ufl.SpatialCoordinate(self.mesh)[0]
         elif thickness is not None:
             self.thickness = in_ufl(thickness, on, "thickness", POSITIVE)
+            if not isinstance(self.thickness, fem.Constant):
+                check_not_negative(self.thickness, "thickness", self.mesh)
 
     def strain(self, u: Any) -> Any:
         """Linear strain of a displacement, a UFL tensor of shape ``(3, 3)``.
