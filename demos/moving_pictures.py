@@ -9,6 +9,7 @@ import numpy as np
 from dolfinx import mesh as dmesh
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.compat import geometry_dofmap
 
 
 class Film:
@@ -45,10 +46,9 @@ class Film:
     def _at_points(self, function: Any, size: int) -> Any:
         """Values at the points of the mesh, of a function of degree 1."""
         V = function.function_space
-        geometry = V.mesh.geometry
-        points = geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap
-        values = np.zeros((len(geometry.x), size))
-        values[np.asarray(points)] = function.x.array.reshape(-1, size)[np.asarray(V.dofmap.list)]
+        values = np.zeros((len(V.mesh.geometry.x), size))
+        nodal = function.x.array.reshape(-1, size)
+        values[geometry_dofmap(V.mesh)] = nodal[np.asarray(V.dofmap.list)]
         return values
 
     def write(self, path: Path) -> None:

@@ -8,6 +8,7 @@ from mpi4py import MPI
 from scenes import hooke, strain
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.compat import geometry_dofmap
 from tfeti_dolfinx.contact.search import ContactSearch
 
 # as exact as this processor can: the assertion of the test says what that must be
@@ -33,11 +34,9 @@ def boxes(cell, parts, comm=MPI.COMM_WORLD):
             box = dmesh.create_rectangle(MPI.COMM_SELF, [low, high], list(n), cell_type)
         else:
             box = dmesh.create_box(MPI.COMM_SELF, [low, high], list(n), cell_type)
-        geometry = box.geometry
-        dofmap = geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap
-        cells.append(start + np.asarray(dofmap))
-        points.append(geometry.x[:, :gdim])
-        start += len(geometry.x)
+        cells.append(start + geometry_dofmap(box))
+        points.append(box.geometry.x[:, :gdim])
+        start += len(box.geometry.x)
         element = box.ufl_domain().ufl_coordinate_element()
     cells, points = np.concatenate(cells).astype(np.int64), np.concatenate(points)
     if comm.rank:

@@ -258,7 +258,7 @@ def test_a_decomposition_that_ranks_are_told_differently(comm, given, message):
     [
         ({"tfeti_monitor": True}, "petsc_options: monitor is .* on rank 0"),
         ({"tfeti_error_if_not_converged": False}, "petsc_options: error_if_not_converged is"),
-        ({"tfeti_sub_mat_mumps_icntl_14": 80}, "petsc_options: of factors is"),
+        ({"tfeti_sub_pc_factor_fill": 2.0}, "petsc_options: of factors is"),
     ],
 )
 def test_options_of_one_rank(comm, options, message):

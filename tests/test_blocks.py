@@ -22,7 +22,7 @@ from tfeti_dolfinx.subdomains.conformance import check_block, check_kind_of_bloc
 from tfeti_dolfinx.subdomains.data import Counters, SubdomainData
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 from tfeti_dolfinx.subdomains.kernel import candidate_modes, fixing_nodes, kernel_of
-from tfeti_dolfinx.subdomains.kplus import Making
+from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, Making
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
 
 RIGID = {"triangle": 3, "quadrilateral": 3, "tetrahedron": 6, "hexahedron": 6}
@@ -251,16 +251,71 @@ def test_a_negative_stiffness_is_named():
 
 @pytest.mark.parametrize(
     ("share", "message"),
-    [(1e-3, "not positive semidefinite; expected a linear"), (1e-14, "indefinite by rounding")],
+    [
+        (1e-3, "the stiffness is not positive semidefinite; expected a linear"),
+        (1e-14, "the form gives no energy to 1 motion beside the 6 of a rigid body"),
+        (0.0, "the form gives no energy to 1 motion beside the 6 of a rigid body"),
+    ],
 )
-def test_a_negative_energy_is_told_from_rounding(share, message):
+def test_a_negative_energy_is_told_from_none(share, message):
     """The softest deformation has a negative energy, as a share of the stiffest one's."""
     K, x = stiffness("hexahedron", 2)
     values, vectors = np.linalg.eigh(K.toarray())
     softest = vectors[:, RIGID["hexahedron"]]
     change = (values[RIGID["hexahedron"]] + share * values[-1]) * np.outer(softest, softest)
-    with pytest.raises(InputError, match=f"subdomain 5: the stiffness is {message}"):
+    with pytest.raises(InputError, match=f"subdomain 5: {message}"):
         block(csr_array(K - change), x)
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "triangle", "hexahedron", "tetrahedron"])
+@pytest.mark.parametrize("flat", [1e3, 1e6, 1e9])
+def test_flat_cells_are_not_taken_for_a_form_without_energy(cell, flat):
+    """Their softest deformations are as free as those of a wrong form, and lost by rounding."""
+    d = decomposed(cell, 2, 1, comm=MPI.COMM_SELF)
+    d.mesh.geometry.x[:, 0] *= flat
+    gdim = d.mesh.geometry.dim
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (gdim,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    form = ufl.inner(hooke()(u), strain(v)) * ufl.dx(metadata={"quadrature_degree": 2})
+    K = csr_array(assemble_csr(fem.form(form)))
+    said = ""
+    try:
+        block(K, V.tabulate_dof_coordinates()[:, :gdim])
+    except InputError as error:
+        said = str(error)
+    assert not said or (flat > 1e3 and "indefinite by rounding" in said)
+
+
+ENERGIES = {
+    "div-div": lambda u, v: ufl.div(u) * ufl.div(v) * ufl.dx,
+    "one point": lambda u, v: (
+        ufl.inner(hooke()(u), strain(v)) * ufl.dx(metadata={"quadrature_degree": 0})
+    ),
+    "deviator": lambda u, v: ufl.inner(ufl.dev(strain(u)), strain(v)) * ufl.dx,
+    "rotation": lambda u, v: ufl.inner(ufl.skew(ufl.grad(u)), ufl.grad(v)) * ufl.dx,
+}
+WITHOUT = [("quadrilateral", "div-div"), ("triangle", "div-div"), ("quadrilateral", "one point")]
+WITHOUT += [("hexahedron", "deviator"), ("tetrahedron", "deviator"), ("triangle", "rotation")]
+
+
+@pytest.mark.parametrize("kplus", list(KPLUS_TYPES))
+@pytest.mark.parametrize(("cell", "energy"), WITHOUT)
+def test_motions_without_energy_are_counted(cell, energy, kplus):
+    """As many as dense eigenvalues say; rounding alone decided whether a factor was made."""
+    d = decomposed(cell, 2, 1, comm=MPI.COMM_SELF)
+    gdim = d.mesh.geometry.dim
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (gdim,)))
+    form = ENERGIES[energy](ufl.TrialFunction(V), ufl.TestFunction(V))
+    K, x = csr_array(assemble_csr(fem.form(form))), V.tabulate_dof_coordinates()[:, :gdim]
+    values = np.linalg.eigvalsh(K.toarray())
+    rigid = kernel_of(K, candidate_modes(x, gdim, x.mean(axis=0), 1.0)).shape[1]
+    free = int(np.sum(values < 1e-10 * values[-1])) - rigid
+    assert free > 0
+    count = f"{free} motion{'s' * (free > 1)}"
+    with pytest.raises(
+        InputError, match=f"the form gives no energy to {count} beside the {rigid} of a rigid body"
+    ):
+        SparseBlock(data(K, x), Making(kplus=KPLUS_TYPES[kplus]))
 
 
 @pytest.fixture(params=factor.SOLVERS)
@@ -286,10 +341,11 @@ NO_FACTOR = {
 
 
 @pytest.mark.parametrize("kind", list(NO_FACTOR))
-def test_cholesky_says_when_there_is_no_factor(solver, kind):
-    """Also where the solver would make one: LDLᵀ takes pivots of any sign."""
+def test_cholesky_says_when_there_is_no_factor(solver, kind, capfd):
+    """Also where the solver would make one: LDLᵀ takes pivots of any sign. It alone says it."""
     with pytest.raises(NotPositiveDefiniteError, match=f"not positive definite.*{solver}"):
         CholeskyFactor(csr_array(np.array(NO_FACTOR[kind])))
+    assert capfd.readouterr() == ("", "")
 
 
 def test_every_solver_factors(solver):

@@ -21,6 +21,7 @@ from mpi4py import MPI
 from scenes import clamp, displacement, relative
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.compat import geometry_dofmap
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
@@ -118,9 +119,7 @@ def total_height(d, body):
     """Sum of the cells' heights in a body."""
     mesh = d.mesh
     cells = np.flatnonzero(d.body_of_subdomain[d.cell_subdomain] == body)
-    geometry = mesh.geometry
-    dofmap = geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap
-    heights = geometry.x[np.asarray(dofmap)[cells]][:, :, geometry.dim - 1]
+    heights = mesh.geometry.x[geometry_dofmap(mesh)[cells]][:, :, mesh.geometry.dim - 1]
     return total(heights.sum())
 
 

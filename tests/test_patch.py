@@ -72,6 +72,12 @@ def test_uniform_pressure_and_linear_displacement(cell, subdomains, order, degre
     assert error_of_displacement(problem) < 1e-9
 
 
+@pytest.mark.parametrize("cell", CELLS)
+def test_displacements_of_degree_3(cell):
+    order = ("lower top", "upper bottom")
+    test_uniform_pressure_and_linear_displacement(cell, jagged, order, 3)
+
+
 def uncovered(d, pressure):
     """Traction on the cut facets of the upper bottom with the moments of what is not covered.
 

@@ -6,6 +6,7 @@ from dolfinx import mesh as dmesh
 from mpi4py import MPI
 from scipy.spatial import Delaunay
 
+from tfeti_dolfinx.compat import geometry_dofmap
 from tfeti_dolfinx.mesh import metis as metis_module
 from tfeti_dolfinx.mesh.compact import LARGEST, compact_parts
 from tfeti_dolfinx.mesh.flatten import flatten_interfaces
@@ -34,7 +35,7 @@ def boxes(n, layers=None, height=1.0):
     """A cube of n³ boxes, or a plate of so many layers of that height."""
     counts, corners = [n, n, layers or n], [(0.0, 0.0, 0.0), (1.0, 1.0, height)]
     mesh = dmesh.create_box(MPI.COMM_SELF, corners, counts, dmesh.CellType.hexahedron)
-    return untorn("hexahedron", mesh.geometry.dofmap, mesh.geometry.x)
+    return untorn("hexahedron", geometry_dofmap(mesh), mesh.geometry.x)
 
 
 def tetrahedra(n, shift=0.0):

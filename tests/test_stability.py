@@ -28,7 +28,7 @@ def rungs():
                 yield pytest.param(ladder, cell, value, id=name, marks=marks)
 
 
-@pytest.mark.parametrize(("ladder", "cell", "value"), rungs())
+@pytest.mark.parametrize(("ladder", "cell", "value"), list(rungs()))
 def test_a_row_is_right_or_warned_of_or_named(ladder, cell, value, comm):
     scene = ladder.rung(cell, value)
     row = run_scene(scene, comm)

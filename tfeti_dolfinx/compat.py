@@ -1,7 +1,8 @@
-"""The only place that knows DOLFINx versions (0.9 to 0.11)."""
+"""The only place that knows versions of DOLFINx (0.9 to 0.11) and of PETSc."""
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Sequence
 from typing import Any
 
@@ -39,6 +40,21 @@ def require_real_petsc() -> None:
             "this PETSc is built for complex numbers; contact needs a real build "
             "(Debian: python3-petsc4py-real, conda: petsc=*=real_*)"
         )
+
+
+def is_read(option: str) -> bool:
+    """Return whether PETSc has asked for an option of its database.
+
+    Args:
+        option: Its name with its prefix, without the dash.
+    """
+    database = PETSc.Options()
+    if hasattr(database, "used"):
+        return bool(database.used(option))
+    read = ctypes.c_int(0)  # petsc4py older than 3.24 does not tell, its library does
+    if ctypes.CDLL(PETSc.__file__).PetscOptionsUsed(None, option.encode(), ctypes.byref(read)):
+        raise RuntimeError(f"PetscOptionsUsed failed for -{option}")
+    return bool(read.value)
 
 
 def cell_permutation(cell_type: dmesh.CellType, num_nodes: int) -> Array:
@@ -81,6 +97,12 @@ def geometry_dofmap(mesh: dmesh.Mesh) -> Array:
     """Geometry nodes of the local cells, shape ``(num_cells, nodes_per_cell)``."""
     geometry = mesh.geometry
     return np.asarray(geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap)
+
+
+def geometry_degree(mesh: dmesh.Mesh) -> int:
+    """Degree of the coordinate element: 1 on straight cells."""
+    geometry = mesh.geometry
+    return int((geometry.cmaps[0] if hasattr(geometry, "cmaps") else geometry.cmap).degree)
 
 
 def original_cells(mesh: dmesh.Mesh) -> Array:

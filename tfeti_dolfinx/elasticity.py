@@ -15,7 +15,7 @@ from ufl.algorithms import estimate_total_polynomial_degree
 
 from tfeti_dolfinx.checks import POSITIVE, Range, checked_number, checked_type, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.form_checks import check_mesh
+from tfeti_dolfinx.form_checks import check_mesh, check_not_negative
 from tfeti_dolfinx.mesh.decomposition import Decomposition, known_tags
 
 MODELS = {2: ("plane_strain", "plane_stress", "axisymmetric"), 3: ("3d",)}
@@ -46,7 +46,8 @@ class Elasticity:
         nu: Poisson's ratio, between -1 and 0.5.
         model: "3d", "plane_strain", "plane_stress" or "axisymmetric". In 3D it may be left out.
             Axisymmetric, x[0] is the radius r, x[1] the height z, and u = (u_r, u_z).
-        thickness: In plane strain and stress the thickness of the body, a length, by default 1;
+        thickness: In plane strain and stress the thickness of the body, a length, nowhere negative, by
+            default 1;
             the bilinear form is multiplied with it.
 
     Attributes:
@@ -97,6 +98,8 @@ class Elasticity:
             self.thickness = 2 * math.pi * ufl.SpatialCoordinate(self.mesh)[0]
         elif thickness is not None:
             self.thickness = in_ufl(thickness, on, "thickness", POSITIVE)
+            if not isinstance(self.thickness, fem.Constant):
+                check_not_negative(self.thickness, "thickness", self.mesh)
 
     def strain(self, u: Any) -> Any:
         """Linear strain of a displacement, a UFL tensor of shape ``(3, 3)``.

@@ -18,7 +18,7 @@ from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.checks import POSITIVE, checked_callable, checked_number, named, shown
 from tfeti_dolfinx.compat import JIT_OPTIONS, interpolation_points
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.form_checks import check_mesh
+from tfeti_dolfinx.form_checks import check_mesh, check_not_negative
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
@@ -66,10 +66,10 @@ def check_stress(
 
 
 def checked_thickness(thickness: Any, decomposition: Decomposition) -> Any:
-    """What areas of the mesh are multiplied with, a number or a scalar in UFL.
+    """What areas of the mesh are multiplied with, a number or a scalar in UFL. Collective.
 
     Raises:
-        InputError: It is neither, not positive, or on another mesh.
+        InputError: It is neither, not positive, negative somewhere, or on another mesh.
     """
     if not isinstance(thickness, ufl.core.expr.Expr):
         return checked_number(thickness, "thickness", POSITIVE)
@@ -80,6 +80,8 @@ def checked_thickness(thickness: Any, decomposition: Decomposition) -> Any:
         raise InputError("thickness has a test or trial function; expected a scalar with values")
     if isinstance(thickness, fem.Constant):
         checked_number(thickness.value, "thickness", POSITIVE)
+    else:
+        check_not_negative(thickness, "thickness", decomposition.mesh)
     return thickness
 
 

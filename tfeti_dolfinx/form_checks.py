@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import basix
 import numpy as np
 import ufl
 from dolfinx import fem
@@ -16,6 +17,7 @@ from ufl.domain import extract_domains
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.checks import is_whole, named, shown
+from tfeti_dolfinx.compat import JIT_OPTIONS, geometry_dofmap
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition, known_tags
 from tfeti_dolfinx.mesh.entities import cell_facets
@@ -24,6 +26,10 @@ from tfeti_dolfinx.mesh.tags import check_tags
 
 ARITY = {1: "linear", 2: "bilinear"}
 FUNCTIONS = ("test", "trial")
+# degree of the points inside a cell at which a thickness is looked at
+INSIDE = 2
+# of the largest value: less below 0 is rounding
+ROUNDING = 1e-12
 KINDS = {"cell": "dx", "exterior_facet": "ds", "interior_facet": "dS"}
 
 
@@ -61,6 +67,38 @@ def check_form(form: Any, name: str, V: fem.FunctionSpace, decomposition: Decomp
     for integral in form.integrals():
         check_mesh(integral.integrand(), name, decomposition)
     _check_measures(form, name, decomposition)
+
+
+def check_not_negative(value: Any, what: str, mesh: dmesh.Mesh) -> None:
+    """Raise if a scalar in UFL is negative or no number somewhere in a cell. Collective.
+
+    It is asked at the corners of each cell and at points inside.
+
+    Args:
+        value: The scalar, with its present constants and functions.
+        what: Its name in messages.
+        mesh: Its mesh.
+
+    Raises:
+        InputError: It is, or it cannot be asked.
+    """
+    cell_type = getattr(basix.CellType, mesh.topology.cell_type.name)
+    inside, _ = basix.make_quadrature(cell_type, INSIDE)
+    points = np.vstack((basix.geometry(cell_type), inside))
+    cells = np.arange(len(geometry_dofmap(mesh)), dtype=np.int32)
+    with raised_on_all_ranks(mesh.comm), named(what):
+        values = fem.Expression(value, points, jit_options=JIT_OPTIONS).eval(mesh, cells)
+        values = np.asarray(values).reshape(len(cells), len(points))
+        allowed = -ROUNDING * np.abs(values).max(initial=0.0)  # 2πr on the axis
+        wrong = ~(np.isfinite(values) & (values >= allowed))
+        if np.any(wrong):
+            cell, point = np.argwhere(wrong)[0]
+            middle = mesh.geometry.x[geometry_dofmap(mesh)[cell]].mean(axis=0)
+            at = middle[: mesh.geometry.dim].tolist()
+            raise InputError(
+                f"{what} is {values[cell, point]:.6g} in the cell around {at}; expected a "
+                "positive number everywhere"
+            )
 
 
 def is_zero(form: Any) -> bool:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
 import math
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,25 @@ from tfeti_dolfinx.checks import checked_type, shown
 from tfeti_dolfinx.described import Parameter, made, parameters_of
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.subdomains.factor import default_solver, has_solver, unread_options
 
-# what factors of subdomains, the coarse problem and contact rows read from PETSc.s options
-FACTOR_OPTION = re.compile(r"(sub|coarse|face)_(pc_factor|mat)_\w+")
+# what factors of subdomains, the coarse problem and contact rows read from PETSc's options
+FACTOR_OPTION = re.compile(r"(sub|coarse|face)_((?:pc_factor|mat)_\w+)")
+# some of them, for a hint
+FACTOR_NAMES = (
+    "pc_factor_mat_solver_type",
+    "pc_factor_mat_ordering_type",
+    "pc_factor_fill",
+    "pc_factor_shift_type",
+    "pc_factor_shift_amount",
+    "pc_factor_zeropivot",
+    "mat_cholmod_factor",
+    "mat_cholmod_print",
+    "mat_mumps_icntl_14",
+    "mat_mumps_cntl_1",
+)
+# what solvers of PETSc are chosen by, and this one by -qp_type
+TYPES = re.compile(r"(ksp|snes|tao|qp|qps|mat_solver)_type", re.IGNORECASE)
 
 
 def parse_options(
@@ -41,10 +58,8 @@ def parse_options(
     known = {option.name: option for option in parameters_of(Options)}
     for name in named:
         if name not in known and not FACTOR_OPTION.fullmatch(name):
-            raise InputError(
-                f"unknown option -{prefix}{name}; expected one of "
-                + ", ".join(f"-{prefix}{n}" for n in known)
-            )
+            raise InputError(f"unknown option -{prefix}{name}; {_expected(name, known, prefix)}")
+    _check_factors_read(named, prefix)
     values = {n: _converted(known[n], v, prefix) for n, v in named.items() if n in known}
     options: Options = made(Options, values)
     return options
@@ -54,6 +69,61 @@ def factor_options(given: Mapping[str, Any] | None, prefix: str) -> dict[str, An
     """Those options of a dictionary that PETSc itself reads, without the prefix."""
     named = _without_prefix(given, prefix)
     return {name: value for name, value in named.items() if FACTOR_OPTION.fullmatch(name)}
+
+
+def _expected(name: str, known: Mapping[str, Parameter], prefix: str) -> str:
+    """Say what option an unknown name may be meant for; of all of them where none is near."""
+    if TYPES.fullmatch(name):
+        choices = ", ".join(known["qp_type"].description.choices)
+        return (
+            f"expected -{prefix}qp_type, which chooses what solves the dual problem: one of "
+            f"{choices}"
+        )
+    if family := re.match(r"(sub|coarse|face)_", name):
+        return _near_factor_names(name.removeprefix(family[0]), f"{prefix}{family[0]}")
+    low = name.lower()
+    near = [option for option in known if option == low or low.endswith(f"_{option}")]
+    near += [n for n in difflib.get_close_matches(low, known) if n not in near]
+    if near:
+        return f"expected {_listed(near, prefix, ' or ')} perhaps; -{prefix}view prints all options"
+    return f"expected one of {_listed(known, prefix, ', ')}"
+
+
+def _listed(names: Iterable[str], prefix: str, separator: str) -> str:
+    return separator.join(f"-{prefix}{name}" for name in names)
+
+
+def _check_factors_read(named: Mapping[str, Any], prefix: str) -> None:
+    """Raise if an option of factors is none that these factors read."""
+    families: dict[str, dict[str, Any]] = {}
+    for match in filter(None, map(FACTOR_OPTION.fullmatch, named)):
+        families.setdefault(match[1], {})[match[2]] = named[match[0]]
+    for family, given in families.items():
+        chosen = given.get("pc_factor_mat_solver_type")
+        solvers = [default_solver() if chosen is None else str(chosen)]
+        if chosen is None and family != "sub" and has_solver("mumps"):
+            solvers.append("mumps")  # where several ranks share one
+        unread = [unread_options(given, solver) for solver in dict.fromkeys(solvers)]
+        for name in unread[0]:
+            if all(name in names for names in unread):
+                raise InputError(_unread(name, family, solvers, prefix))
+
+
+def _unread(name: str, family: str, solvers: Sequence[str], prefix: str) -> str:
+    """Say that factors do not read an option, and what they may read in its place."""
+    text = f"-{prefix}{family}_{name}: factors by {' or '.join(solvers)} read no such option"
+    package = re.match(r"mat_(cholmod|mumps)_", name)
+    if package and package[1] not in solvers:
+        return f"{text}; expected -{prefix}{family}_pc_factor_mat_solver_type {package[1]} with it"
+    return f"{text}; {_near_factor_names(name, f'{prefix}{family}_')}"
+
+
+def _near_factor_names(name: str, prefix: str) -> str:
+    """Say what option of factors may be meant."""
+    near = difflib.get_close_matches(name, [n for n in FACTOR_NAMES if n != name])
+    if near:
+        return f"expected {_listed(near, prefix, ' or ')} perhaps"
+    return f"expected -{prefix}pc_factor_... or -{prefix}mat_..., which PETSc's -help lists"
 
 
 def _without_prefix(given: Any, prefix: str) -> dict[str, Any]:

@@ -159,6 +159,34 @@ THICKNESS = {
         lambda s: s.problem(thickness=s.v[0]),
         r"thickness has a test or trial function; expected a scalar with values",
     ),
+    "a thickness that an expression makes negative": made(
+        r"thickness is -0\.\d+ in the cell around \[.*; expected a positive number everywhere",
+        thickness=lambda s: ufl.SpatialCoordinate(s.d.mesh)[0] - 0.3,
+    ),
+    "a thickness of degree 2 that is negative": made(
+        r"thickness is -1 in the cell around \[.*; expected a positive number everywhere",
+        thickness=lambda s: function(s, -1.0, "Lagrange", 2),
+    ),
+    "a thickness that is no number somewhere": made(
+        r"thickness is nan in the cell around \[.*; expected a positive number everywhere",
+        thickness=lambda s: ufl.sqrt(ufl.SpatialCoordinate(s.d.mesh)[0] - 0.3),
+    ),
+    "a thickness of two components": made(
+        r"thickness is of shape \(2,\); expected a scalar",
+        thickness=lambda s: ufl.SpatialCoordinate(s.d.mesh),
+    ),
+    "a problem's thickness that an expression makes negative": (
+        lambda s: s.problem(thickness=0.8 - ufl.SpatialCoordinate(s.d.mesh)[1]),
+        r"thickness is -0\.\d+ in the cell around \[.*; expected a positive number everywhere",
+    ),
+    "a problem's thickness that is negative in one cell": (
+        lambda s: s.problem(thickness=wrong_in_one_cell(s)),
+        r"thickness is -1 in the cell around \[.*; expected a positive number everywhere",
+    ),
+    "a problem's thickness of normals": (
+        lambda s: s.problem(thickness=ufl.FacetNormal(s.d.mesh)[0]),
+        r"thickness: \w+: ",
+    ),
     "a thickness of a ring": given(
         r"thickness=0.5: expected none with model='axisymmetric'",
         thickness=0.5,

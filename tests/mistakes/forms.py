@@ -32,6 +32,20 @@ def modulus(s, space, name="E"):
     return E * ufl.inner(s.u, s.v) * s.dx
 
 
+def energy(form, cube=False):
+    """Solve with a form of u and v that is no elastic one."""
+
+    def do(s):
+        s = s.cube if cube else s
+        s.problem(a=form(s.u, s.v, s.dx)).solve()
+
+    return do
+
+
+def stress(u):
+    return 2.0 * ufl.sym(ufl.grad(u)) + ufl.div(u) * ufl.Identity(len(u))
+
+
 def load(s, measure, tag):
     return {"L": ufl.inner(s.f, s.v) * measure(tag)}
 
@@ -348,4 +362,28 @@ def load_of(s):
     return g * s.v[0] * s.dx
 
 
-TABLES = ("ARGUMENTS", "SPACES", "COEFFICIENTS", "MEASURES")
+NO_ENERGY = r"subdomain \d: the form gives no energy to .*\d motions? beside the \d of a rigid body"
+ENERGIES = {
+    "a form of the divergence alone": (
+        energy(lambda u, v, dx: ufl.div(u) * ufl.div(v) * dx),
+        NO_ENERGY + ".*; expected a linear elastic form of the whole strain",
+    ),
+    "a form with one point in a cell": (
+        energy(
+            lambda u, v, dx: (
+                ufl.inner(stress(u), ufl.grad(v)) * dx(metadata={"quadrature_degree": 0})
+            )
+        ),
+        NO_ENERGY + ".*, with quadrature that is fine enough",
+    ),
+    "a form of the rotation": (
+        energy(lambda u, v, dx: ufl.inner(ufl.skew(ufl.grad(u)), ufl.grad(v)) * dx),
+        NO_ENERGY,
+    ),
+    "a form of the deviator in 3D": (
+        energy(lambda u, v, dx: ufl.inner(ufl.dev(ufl.sym(ufl.grad(u))), ufl.grad(v)) * dx, True),
+        NO_ENERGY,
+    ),
+}
+
+TABLES = ("ARGUMENTS", "SPACES", "COEFFICIENTS", "MEASURES", "ENERGIES")

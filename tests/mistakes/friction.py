@@ -71,48 +71,56 @@ LAWS = {
         rf"{FLOOR}: friction is the class Tresca; expected", lambda s: tfeti.Tresca
     ),
     "a negative coefficient": law(
-        rf"{FLOOR}: coefficient=-0.3: expected a number, 0 or more", lambda s: tfeti.Coulomb(-0.3)
+        r"Coulomb: coefficient=-0.3: expected a number, 0 or more", lambda s: tfeti.Coulomb(-0.3)
+    ),
+    "a negative coefficient before there is a contact": (
+        lambda s: tfeti.Coulomb(-0.3),
+        r"^Coulomb: coefficient=-0.3: expected a number, 0 or more",
+    ),
+    "the second of two negative bounds before there is a contact": (
+        lambda s: tfeti.Tresca((1.0, -2.0), direction=(1, 0, 0)),
+        r"^Tresca: bound=-2.0: expected a number, 0 or more",
     ),
     "a bound that is nan": law(
-        rf"{FLOOR}: bound=nan: expected a number, 0 or more", lambda s: tfeti.Tresca(NAN)
+        r"Tresca: bound=nan: expected a number, 0 or more", lambda s: tfeti.Tresca(NAN)
     ),
-    "a bound that is infinite": law(rf"{FLOOR}: bound=inf: expected", lambda s: tfeti.Tresca(INF)),
-    "a bound that is a text": law(rf"{FLOOR}: bound='much': exp", lambda s: tfeti.Tresca("much")),
-    "a bound that is True": law(rf"{FLOOR}: bound=True: expected", lambda s: tfeti.Tresca(True)),
+    "a bound that is infinite": law(r"Tresca: bound=inf: expected", lambda s: tfeti.Tresca(INF)),
+    "a bound that is a text": law(r"Tresca: bound='much': exp", lambda s: tfeti.Tresca("much")),
+    "a bound that is True": law(r"Tresca: bound=True: expected", lambda s: tfeti.Tresca(True)),
     "two bounds without a direction": law(
-        rf"{FLOOR}: bound has 2 values and direction=None; expected one value, or two and the dir",
+        r"Tresca: bound has 2 values and direction=None; expected one value, or two and the dir",
         lambda s: tfeti.Tresca((1.0, 2.0)),
     ),
     "one coefficient with a direction": law(
-        rf"{FLOOR}: coefficient has 1 value and direction=\(1, 0, 0\); expected one value",
+        r"Coulomb: coefficient has 1 value and direction=\(1, 0, 0\); expected one value",
         lambda s: tfeti.Coulomb(0.3, direction=(1, 0, 0)),
     ),
     "three bounds": law(
-        rf"{FLOOR}: bound has 3 values",
+        r"Tresca: bound has 3 values",
         lambda s: tfeti.Tresca((1.0, 2.0, 3.0), direction=(1, 0, 0)),
     ),
     "no bound at all": law(
-        rf"{FLOOR}: bound has 0 values and direction=None; expected one", lambda s: tfeti.Tresca(())
+        r"Tresca: bound has 0 values and direction=None; expected one", lambda s: tfeti.Tresca(())
     ),
     "a bound in UFL": law(
-        rf"{FLOOR}: bound is a \w+; expected a number, a function of points",
+        r"Tresca: bound is a \w+; expected a number, a function of points",
         lambda s: tfeti.Tresca(ufl.SpatialCoordinate(s.d.mesh)[0]),
     ),
     "a coefficient that is a constant of DOLFINx": law(
-        rf"{FLOOR}: coefficient is a Constant; expected a number, a function of points",
+        r"Coulomb: coefficient is a Constant; expected a number, a function of points",
         lambda s: tfeti.Coulomb(fem.Constant(s.d.mesh, 0.3)),
     ),
     "the second of two bounds is negative": law(
-        rf"{FLOOR}: bound=-2.0: expected",
+        r"Tresca: bound=-2.0: expected",
         lambda s: tfeti.Tresca((1.0, -2.0), direction=(1, 0, 0)),
     ),
     "a bound that is a vector function": law(
-        rf"{FLOOR}: bound has the shape \(2,\); expected a scalar function",
+        r"Tresca: bound has the shape \(2,\); expected a scalar function",
         lambda s: tfeti.Tresca(fem.Function(s.V)),
     ),
     "friction of a pair that has a name": (
         lambda s: tfeti.Contact("left", "right", friction=tfeti.Coulomb(-1), name="joint"),
-        r"^joint: coefficient=-1: expected a number, 0 or more",
+        r"^Coulomb: coefficient=-1: expected a number, 0 or more",
     ),
 }
 

@@ -13,12 +13,45 @@ def given(says, **options):
 
 OPTIONS = {
     "a name with a letter too many": given(
-        r"unknown option -tfeti_rtoll; expected one of -tfeti_qp_type", tfeti_rtoll=1e-6
+        r"unknown option -tfeti_rtoll; expected -tfeti_rtol or .* perhaps", tfeti_rtoll=1e-6
     ),
     "the name of another solver's option": given(
-        r"unknown option -tfeti_ksp_rtol; expected one of", ksp_rtol=1e-6
+        r"unknown option -tfeti_ksp_rtol; expected -tfeti_rtol perhaps", ksp_rtol=1e-6
     ),
-    "a name in capitals": given(r"unknown option -tfeti_RTOL", tfeti_RTOL=1e-6),
+    "a name in capitals": given(r"unknown option -tfeti_RTOL; expected -tfeti_rtol", tfeti_RTOL=1),
+    "a name like none": given(r"-tfeti_wibble; expected one of -tfeti_qp_type, ", wibble=1),
+    "a solver of PETSc": given(
+        r"unknown option -tfeti_ksp_type; expected -tfeti_qp_type, which chooses what solves the "
+        r"dual problem: one of auto, pcpg, smalse, newton",
+        ksp_type="cg",
+    ),
+    "a preconditioner of a subdomain": given(
+        r"unknown option -tfeti_sub_pc_type; expected -tfeti_sub_pc_factor_", sub_pc_type="lu"
+    ),
+    "a misspelt option of the subdomains' factors": given(
+        r"-tfeti_sub_pc_factor_mat_solver_typ: factors by \w+ read no such option; "
+        r"expected -tfeti_sub_pc_factor_mat_solver_type",
+        sub_pc_factor_mat_solver_typ="mumps",
+    ),
+    "a misspelt option of the coarse factor": given(
+        r"-tfeti_coarse_pc_factor_fil: factors by .* read no such option; "
+        r"expected -tfeti_coarse_pc_factor_fill",
+        coarse_pc_factor_fil=2,
+    ),
+    "a misspelt option of the factors of faces": given(
+        r"-tfeti_face_mat_mump_icntl_14: factors by .* read no such option; "
+        r"expected -tfeti_face_mat_mumps_icntl_14",
+        face_mat_mump_icntl_14=80,
+    ),
+    "an option of factors like none": given(
+        r"-tfeti_sub_mat_wibble: .* expected -tfeti_sub_pc_factor_\.\.\. or", sub_mat_wibble=1
+    ),
+    "an option of another package than makes the factors": given(
+        r"-tfeti_sub_mat_mumps_icntl_14: factors by petsc read no such option; "
+        r"expected -tfeti_sub_pc_factor_mat_solver_type mumps with it",
+        sub_mat_mumps_icntl_14=80,
+        sub_pc_factor_mat_solver_type="petsc",
+    ),
     "rtol of infinity": given(rf"-tfeti_rtol inf: {RTOL}", tfeti_rtol=INF),
     "rtol of infinity as text": given(rf"-tfeti_rtol inf: {RTOL}", tfeti_rtol="inf"),
     "rtol of nan": given(rf"-tfeti_rtol nan: {RTOL}", tfeti_rtol=NAN),
@@ -107,7 +140,7 @@ OPTIONS = {
     ),
     "a prefix that the options do not have": (
         lambda s: s.problem(petsc_options={"tfeti_rtol": 1e-6}, petsc_options_prefix="ring_"),
-        r"unknown option -ring_tfeti_rtol; expected one of -ring_qp_type",
+        r"unknown option -ring_tfeti_rtol; expected -ring_rtol",
     ),
 }
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.boundary.panels import Panels
+from tfeti_dolfinx.compat import geometry_degree
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -129,7 +130,7 @@ def _of_bilinear(corners: Array) -> Array:
 
 def _check_degrees(dofs: TornDofs) -> None:
     degree = dofs.V.element.basix_element.degree
-    if dofs.V.mesh.geometry.cmap.degree != 1:
+    if geometry_degree(dofs.V.mesh) != 1:
         raise InputError("boundary elements on curved cells; expected a mesh of degree 1")
     if degree != 1 or dofs.bs != dofs.V.mesh.geometry.dim:
         raise InputError(

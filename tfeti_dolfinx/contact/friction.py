@@ -38,6 +38,9 @@ class Tresca:
             and across it; the traction is in the ellipse with these semi-axes.
         direction: Vector along which the first of two bounds holds, projected on the surface.
 
+    Raises:
+        InputError: A bound is negative or no bound, or a direction is missing or too much.
+
     Example:
         >>> tfeti.Tresca((0.02, 0.01), direction=(1, 0, 0)).values
         (0.02, 0.01)
@@ -49,6 +52,9 @@ class Tresca:
 
     what = "bound"
     kind = Friction.GIVEN
+
+    def __post_init__(self) -> None:
+        _check_law(self)
 
     @property
     def values(self) -> tuple[Value, ...]:
@@ -71,6 +77,10 @@ class Coulomb:
         direction: Vector along which the first of two coefficients holds, projected on the
             surface.
 
+    Raises:
+        InputError: A coefficient is negative or no coefficient, or a direction is missing or too
+            much.
+
     Example:
         >>> tfeti.Coulomb(0.3).values
         (0.3,)
@@ -83,6 +93,9 @@ class Coulomb:
     what = "coefficient"
     kind = Friction.COULOMB
 
+    def __post_init__(self) -> None:
+        _check_law(self)
+
     @property
     def values(self) -> tuple[Value, ...]:
         """One coefficient, or two."""
@@ -94,26 +107,29 @@ Law = Tresca | Coulomb
 
 
 def checked_friction(name: str, friction: Law | None) -> None:
-    """Raise if a law is none, or has values that cannot be right anywhere. Not collective.
+    """Raise if what should be a law of friction is none. Not collective.
 
     Args:
         name: Name of the contact, for messages.
         friction: What a user gave.
 
     Raises:
-        InputError: It is not a law, or a value of it negative or of a wrong type.
+        InputError: It is not a law.
     """
-    if friction is None:
-        return
-    expected = "Tresca(bound), Coulomb(coefficient) or None"
-    checked_type(friction, (Tresca, Coulomb), f"{name}: friction", expected)
-    what, count = f"{name}: {friction.what}", len(friction.values)
-    if count not in (1, 2) or (count == 2) != (friction.direction is not None):
+    if friction is not None:
+        expected = "Tresca(bound), Coulomb(coefficient) or None"
+        checked_type(friction, (Tresca, Coulomb), f"{name}: friction", expected)
+
+
+def _check_law(law: Law) -> None:
+    """Raise if a law has values that cannot be right anywhere. Not collective."""
+    what, count = f"{type(law).__name__}: {law.what}", len(law.values)
+    if count not in (1, 2) or (count == 2) != (law.direction is not None):
         raise InputError(
-            f"{what} has {count} value{'s' * (count != 1)} and direction={friction.direction!r}; "
+            f"{what} has {count} value{'s' * (count != 1)} and direction={law.direction!r}; "
             "expected one value, or two and the direction of the first"
         )
-    for value in friction.values:
+    for value in law.values:
         if isinstance(value, fem.Function):
             if value.ufl_shape != ():
                 raise InputError(

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from tfeti_dolfinx.arrays import TINY, Array
+from tfeti_dolfinx.compat import geometry_dofmap
 from tfeti_dolfinx.gluing.prescribed import Prescribed
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mesh.entities import cell_entities
@@ -69,7 +70,7 @@ def held_flat_sides(dofs: TornDofs, held: Array) -> Array:
     facet_dim, cell_type = mesh.topology.dim - 1, mesh.topology.cell_type
     found, nodes = np.zeros_like(held), np.asarray(dofs.V.dofmap.list)
     corners = cell_entities(cell_type, facet_dim)
-    vertices = mesh.geometry.dofmap[:, : len(cell_entities(cell_type, 0))]
+    vertices = geometry_dofmap(mesh)[:, : len(cell_entities(cell_type, 0))]
     x = mesh.geometry.x[vertices][:, :, : mesh.geometry.dim]
     for k, own in enumerate(corners):
         of_facet = nodes[:, layout.entity_closure_dofs(facet_dim, k)]

@@ -14,6 +14,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.compat import is_read
 from tfeti_dolfinx.errors import FactorError
 
 log = logging.getLogger(__name__)
@@ -27,6 +28,10 @@ DEFINITE = {
     "mat_mumps_icntl_13": "1",
     "mat_mumps_icntl_24": "1",
 }
+# CHOLMOD would print a line of its own beside the error that is raised
+QUIET = {"mat_cholmod_print": "0"}
+# prefix of the options of a factor that is made to see what it reads
+TRIAL = "tfeti_trial_"
 # PETSc's error codes, which petsc4py does not name
 OUT_OF_MEMORY, NO_SUPPORT, MISSING_SOLVER = 55, 56, 92
 ZERO_PIVOTS = (71, 81)
@@ -164,15 +169,43 @@ def default_solver() -> str:
 
 def has_solver(solver: str) -> bool:
     """Whether this PETSc makes Cholesky factors by a solver."""
+    return _makes_factor(solver, "")
+
+
+def unread_options(given: Mapping[str, Any], solver: str) -> list[str]:
+    """Return those options that a factor does not ask PETSc for.
+
+    A factor of one unknown is made with them.
+
+    Args:
+        given: Options without a prefix.
+        solver: What makes the factor, where ``given`` does not say.
+
+    Returns:
+        Their names, in their order; none where the factor cannot be made, which has a cause that
+        the factors of the problem name.
+    """
+    chosen = {"pc_factor_mat_solver_type": solver, **given}
+    with added_options(TRIAL, chosen):
+        if not _makes_factor(str(chosen["pc_factor_mat_solver_type"]), TRIAL):
+            return []
+        return [name for name in given if not is_read(TRIAL + name)]
+
+
+def _makes_factor(solver: str, prefix: str) -> bool:
+    """Return whether PETSc makes a Cholesky factor of one unknown; of a prefix with its options."""
     one = PETSc.Mat().createAIJ((1, 1), nnz=1, comm=PETSc.COMM_SELF)
     one.setValue(0, 0, 1.0)
     one.assemble()
     one.setOption(PETSc.Mat.Option.SPD, True)
     pc = PETSc.PC().create(PETSc.COMM_SELF)
     try:
+        pc.setOptionsPrefix(prefix)
         pc.setType(PETSc.PC.Type.CHOLESKY)
         pc.setFactorSolverType(solver)
         pc.setOperators(one)
+        if prefix:
+            pc.setFromOptions()
         pc.setUp()
     except PETSc.Error:
         return False
@@ -221,7 +254,8 @@ def _factored(pc: PETSc.PC, matrix: PETSc.Mat, prefix: str) -> PETSc.Mat:
 
 def _factored_again(pc: PETSc.PC, prefix: str) -> PETSc.Mat:
     """The factor of the present values, numeric only if there has been one."""
-    with added_options(prefix, {"pc_factor_mat_solver_type": default_solver(), **DEFINITE}):
+    given = {"pc_factor_mat_solver_type": default_solver(), **DEFINITE, **QUIET}
+    with added_options(prefix, given):
         pc.setFromOptions()
         pc.setUp()
     reason = pc.getFailedReason()

@@ -12,7 +12,7 @@ from tfeti_dolfinx.arrays import TINY, Array
 from tfeti_dolfinx.errors import FactorError, InputError
 from tfeti_dolfinx.subdomains.dense import Packed, Whole
 from tfeti_dolfinx.subdomains.factor import REAL, FactorSize, NotPositiveDefiniteError
-from tfeti_dolfinx.subdomains.indefinite import why_indefinite
+from tfeti_dolfinx.subdomains.indefinite import check_rank, why_indefinite
 from tfeti_dolfinx.subdomains.input_checks import check_stiffness
 from tfeti_dolfinx.subdomains.inverse import FactoredInverse, GeneralisedInverse, solved
 from tfeti_dolfinx.subdomains.kernel import candidate_modes, fixing_dofs, kernel_of
@@ -146,11 +146,13 @@ class Stiffness:
         try:
             if self._pinv is not None:
                 self._pinv.refactor(self.kernel)
-                return
-            self._how.counters.analyses += 1
-            self._pinv = self._how.kplus(self.K, self.kernel, fixing, prefix)
+            else:
+                self._how.counters.analyses += 1
+                self._pinv = self._how.kplus(self.K, self.kernel, fixing, prefix)
+            if isinstance(self._pinv, FactoredInverse):
+                check_rank(self.K, self.kernel, self.x, self._pinv.solve)
         except NotPositiveDefiniteError as error:
-            self._pinv = None
+            self.destroy()
             why = why_indefinite(self.K, self.kernel, fixing, self.x, prefix)
             raise InputError(f"{self.name}: {why}") from error
         except FactorError as error:
