@@ -28,7 +28,7 @@ from tfeti_dolfinx.dual.soft_modes import SoftModes
 from tfeti_dolfinx.dual.solvability import check_solvable
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.gluing.constraints import Constraints
-from tfeti_dolfinx.parallel import agreed
+from tfeti_dolfinx.parallel import agreed, norm_over
 from tfeti_dolfinx.qp.coarse import Coarse, NoCoarse
 from tfeti_dolfinx.qp.discs import Discs, Ellipses
 from tfeti_dolfinx.qp.faces import Face, Status, face_of
@@ -39,6 +39,10 @@ from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
 from tfeti_dolfinx.qp.recycled import Recycled, RecycledOnFace
 from tfeti_dolfinx.subdomains.local import LocalOperator
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
+
+# times the forces and lengths that load, values and gaps make: multipliers of an earlier problem
+# that are larger would leave so many digits less to the solution
+FAR = 1e3
 
 # from B and c to the set of multipliers, on all local rows
 FeasibleLaw = Callable[[Constraints], FeasibleSet]
@@ -235,6 +239,37 @@ class Dual:
         made = image(self.F, PARTICULAR[kind](self.coarse, self.d))
         self._images[kind] = (self.coarse.e.copy(), made)
         return made
+
+    def is_far(self, lam: Array, mu: Array) -> bool:
+        """Whether multipliers are far beyond what drives the problem, as after unloading.
+
+        Forces and lengths both are: λ beside the least that balances the load; Fλ and Gᵀμ beside d
+        without gaps, which drive nothing. The solution would be a small difference of them, down to
+        their rounding, and of no use but for that. Multiplies by F at most once, and not where
+        λ is the last solution.
+
+        Args:
+            lam: λ on this rank's rows.
+            mu: Multipliers of Gλ = e.
+        """
+        comm, coarse, x = self.coarse.comm, self.coarse, self.d.duplicate()
+        coarse.particular(x)
+        forces = norm_over(comm, lam)
+        if 0.0 < forces <= FAR * norm_over(comm, x.array_r):
+            x.destroy()
+            return False
+        if len(mu) == coarse.dimension:
+            coarse.combine(mu, x)
+        lengths = norm_over(comm, x.array_r)
+        x.array[:] = lam
+        at = self.last.image(self.F, x)
+        self.last.pass_on(np.array(lam), np.array(at.Fx.array_r), 0.0)
+        lengths += norm_over(comm, at.Fx.array_r)
+        at.destroy()
+        c, normals = self.constraints.c.array_r, self.constraints.sets.normals
+        driving = np.array(self.d.array_r)
+        driving[normals] += np.maximum(c[normals], 0.0)
+        return lengths > FAR * norm_over(comm, driving)
 
     def known_image(self, kind: str) -> Image | None:
         """λ̄ and F λ̄ if they are known for the present e."""
