@@ -240,13 +240,20 @@ class Dual:
         self._images[kind] = (self.coarse.e.copy(), made)
         return made
 
+    @property
+    def driving(self) -> float:
+        """Length of what load, prescribed values, slips and overlaps make: d without gaps."""
+        c, normals = self.constraints.c.array_r, self.constraints.sets.normals
+        d = np.array(self.d.array_r)
+        d[normals] += np.maximum(c[normals], 0.0)
+        return norm_over(self.coarse.comm, d)
+
     def is_far(self, lam: Array, mu: Array) -> bool:
         """Whether multipliers are far beyond what drives the problem, as after unloading.
 
-        Forces and lengths both are: λ beside the least that balances the load; Fλ and Gᵀμ beside d
-        without gaps, which drive nothing. The solution would be a small difference of them, down to
-        their rounding, and of no use but for that. Multiplies by F at most once, and not where
-        λ is the last solution.
+        Forces and lengths both are: λ beside the least that balances the load; Fλ and Gᵀμ beside
+        what drives the problem. The solution would be their small difference, with their rounding.
+        Multiplies by F at most once, and not where λ is the last solution.
 
         Args:
             lam: λ on this rank's rows.
@@ -266,10 +273,7 @@ class Dual:
         self.last.pass_on(np.array(lam), np.array(at.Fx.array_r), 0.0)
         lengths += norm_over(comm, at.Fx.array_r)
         at.destroy()
-        c, normals = self.constraints.c.array_r, self.constraints.sets.normals
-        driving = np.array(self.d.array_r)
-        driving[normals] += np.maximum(c[normals], 0.0)
-        return lengths > FAR * norm_over(comm, driving)
+        return lengths > FAR * self.driving
 
     def known_image(self, kind: str) -> Image | None:
         """λ̄ and F λ̄ if they are known for the present e."""
