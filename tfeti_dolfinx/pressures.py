@@ -144,7 +144,7 @@ class Pressures:
         Body by body: beside forces elsewhere those on a light one would not be seen.
         """
         values = lam.array_r
-        driving = self._dual.driving / self._dual.seen if self._dual.seen else 0.0
+        driving = norm_over(self._comm, self._dual.driving) / (self._dual.seen or np.inf)
         self._none = NO_FORCE * max(norm_over(self._comm, values), driving)
         self._found = self._forces(values[self._rows])
         if self._sticks:
