@@ -86,8 +86,6 @@ def solve_with_friction(
         Multipliers, their displacement with its accuracy (of the last step; steps and looks are
         those of all), and how the bounds have come to rest.
     """
-    if start is not None and dual.is_far(*start):
-        start = None
     if not any_rank(dual.coarse.comm, dual.constraints.pressed.size > 0):
         return *solve_dual(dual, options, qp_type, start, monitor, goal), Settling()
     if goal is not None:
