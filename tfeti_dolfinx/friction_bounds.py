@@ -12,7 +12,6 @@ from tfeti_dolfinx.contact.forces import condition_areas
 from tfeti_dolfinx.contact.partners import ContactPartner
 from tfeti_dolfinx.contact.records import slips
 from tfeti_dolfinx.contact.search import ContactSearch
-from tfeti_dolfinx.dual.dual import Dual
 from tfeti_dolfinx.gluing.glue import Gluing
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -51,21 +50,6 @@ class FrictionBounds:
         if self.rest is None:
             return np.zeros(records.tangents.shape[:2])
         return slips(records, self._dofs, self.rest)
-
-    def gain(self, dual: Dual, gluing: Gluing, search: ContactSearch) -> Array:
-        """What μ gains where a load step begins that these rows do not know of yet.
-
-        The bodies are where they were, so Gᵀμ gains what c gains in the range of Gᵀ.
-
-        Args:
-            dual: The dual problem of the rows.
-            gluing: The rows, with the slips of the step before.
-            search: The contacts' conditions.
-        """
-        coarse = dual.coarse
-        if coarse.dimension == 0:
-            return np.zeros(0)
-        return coarse.solve(coarse.G(gluing.gain(self.slip(search))))
 
     def has_changed(self, search: ContactSearch) -> bool:
         """Whether laws say something else than when the limits were last set.

@@ -59,6 +59,11 @@ def norm_over(comm: MPI.Intracomm, x: Array) -> float:
     return agreed(comm, float(np.sqrt(summed(comm, np.array([x @ x]))[0])))
 
 
+def largest(comm: MPI.Intracomm, x: Array) -> float:
+    """Largest modulus of a vector that is spread over ranks, 0 if it is empty. Collective."""
+    return float(comm.allreduce(float(np.abs(x).max(initial=0.0)), op=MPI.MAX))
+
+
 class Exchange:
     """Rows that travel to other ranks, and answers that travel back.
 

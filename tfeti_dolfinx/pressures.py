@@ -15,8 +15,9 @@ from tfeti_dolfinx.qp.acceleration import Anderson
 from tfeti_dolfinx.qp.nearest import nearest_or_least
 from tfeti_dolfinx.qp.problem import ConvergedReason
 
-# of all multipliers: forces of normals that rounding makes of none; as bounds they would be discs
-# whose boundaries bend so much that nothing else is seen beside them
+# of all multipliers, or of those that make what drives the problem: forces of normals that rounding
+# makes of none; as bounds they would be discs whose boundaries bend so much that nothing else is
+# seen beside them, and where only slips of earlier steps drive they might shrink for ever
 NO_FORCE = 1e-13
 # of the largest forces of normals on a body: those on a lighter one count as so large at least
 LIGHT = 1e-6
@@ -143,7 +144,8 @@ class Pressures:
         Body by body: beside forces elsewhere those on a light one would not be seen.
         """
         values = lam.array_r
-        self._none = NO_FORCE * norm_over(self._comm, values)
+        driving = norm_over(self._comm, self._dual.driving) / (self._dual.seen or np.inf)
+        self._none = NO_FORCE * max(norm_over(self._comm, values), driving)
         self._found = self._forces(values[self._rows])
         if self._sticks:
             return float("inf")

@@ -264,7 +264,8 @@ class ContactProblem(Stepping):
             if self._start is not None:
                 learn(dual, self.options)
                 earlier, lam, mu = self._start
-                start = (gluing.multipliers(earlier, lam), mu)
+                start = gluing.multipliers(earlier, lam), mu
+                start = None if dual.is_far(*start) else start
             own, goal = self._settings.extensions.monitor, self._goal()
             solved = solve_with_friction(dual, self.options, qp_type, start, own, goal)
         result, accuracy, settling = solved

@@ -149,7 +149,8 @@ def _start(values: tuple[Array, Array] | None, qp: QP) -> Start | None:
         return None
     lam, mu = qp.d.duplicate(), values[1]
     lam.array[:] = values[0]
-    return Start(lam, mu if len(mu) == qp.coarse.dimension else np.zeros(qp.coarse.dimension))
+    fits = len(mu) == qp.coarse.dimension
+    return Start(lam, np.array(mu) if fits else np.zeros(qp.coarse.dimension))
 
 
 def _homogenise(
@@ -157,7 +158,8 @@ def _homogenise(
 ) -> Homogenised:
     """With λ̄ where the solver starts, or as the options say."""
     if start is not None and solver.warm is not None:
-        at = _no_worse_than_nothing(qp, dual.last.image(qp.F, solver.warm(qp, start)))
+        at = dual.last.image(qp.F, solver.warm(qp, start))
+        _no_worse_than_nothing(qp, at, start)
         known = dual.known_image("natural")
         scale = scale_at(qp, known) if known else scale_near(qp, at)
     elif solver.cold is not None:
@@ -170,8 +172,8 @@ def _homogenise(
     return homogenised
 
 
-def _no_worse_than_nothing(qp: QP, at: Image) -> Image:
-    """0 with its image where it is admissible and q is no less at a start, as after unloading.
+def _no_worse_than_nothing(qp: QP, at: Image, start: Start) -> None:
+    """Begin at 0 where it is admissible and q is no less at a start, as after unloading.
 
     Of what the start has and the solution has not, conjugate gradients would leave its rounding.
     """
@@ -181,7 +183,7 @@ def _no_worse_than_nothing(qp: QP, at: Image) -> Image:
     if not any_rank(comm, not may) and agreed(comm, worse):
         at.x.set(0.0)
         at.Fx.set(0.0)
-    return at
+        start.mu[:] = 0.0
 
 
 def _homogenise_as_told(dual: Dual, qp: QP, options: Options) -> Homogenised:

@@ -76,11 +76,7 @@ class Stepping:
             raise InputError("the last solve has not converged; expected one that has")
         if solution is self._accepted[0]:
             return
-        system, (gluing, lam, mu) = self._system, self._start
-        system.count_slips_from(solution.u)
-        if system.friction.exists:
-            mu = mu + system.friction.gain(system.dual, gluing, system.search)
-        self._start = (gluing, lam, mu)
+        self._system.count_slips_from(solution.u)
         self._accepted = (solution, self._start)
 
     def go_back(self) -> None:

@@ -15,7 +15,8 @@ from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.problem import ConvergedReason
 
 # Differences that are rounding, in a body that hardly moves as well: of the largest displacement
-# of all bodies; of what its load does to its subdomains alone, if that is held where it acts.
+# of all bodies, or slip that friction counts from; of what its load does to its subdomains alone,
+# if that is held where it acts.
 NOISE, LOAD_NOISE = 2.5e-13, 1e-14
 # a body that moves by less than this share of another is stiff beside it, and has the error of the
 # other's forces on top of its own: its own must be as much smaller
@@ -150,7 +151,7 @@ class Accuracy:
             # the change since a poor iterate says little: another look before one gives up
             tolerance = residual * max(AIM / max(own, 1.0), LEAP)
         self._stalls = self._stalls + 1 if agreed(comm, self._stalled(now, residual)) else 0
-        if self._stalls > 1 or agreed(comm, tolerance < OUT_OF_REACH * self._rounding):
+        if self._stalls > 1 or agreed(comm, tolerance <= OUT_OF_REACH * self._rounding):
             return ConvergedReason.DIVERGED_ROUNDING
         self.drifted = self._stalls > 0
         self.tolerance, self._claimed = tolerance, residual
@@ -208,6 +209,7 @@ class Accuracy:
         now = self._looked()
         size, most = now.bodies.size, now.bodies.size.max(initial=0.0)
         share = np.where(size < STIFF * most, STRICTER, 1.0)
+        most = max(most, now.begin)
         alone = LOAD_NOISE * now.bodies.alone
         at_rest = self._at_rest(now)
         displacement = self.rtol * share * size + NOISE * most + alone + at_rest

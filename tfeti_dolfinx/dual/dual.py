@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import Array
@@ -26,9 +27,9 @@ from tfeti_dolfinx.dual.recovery import moved, recover
 from tfeti_dolfinx.dual.smallest import nearly_free, smallest_motion
 from tfeti_dolfinx.dual.soft_modes import SoftModes
 from tfeti_dolfinx.dual.solvability import check_solvable
-from tfeti_dolfinx.errors import raised_on_all_ranks
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.gluing.constraints import Constraints
-from tfeti_dolfinx.parallel import agreed
+from tfeti_dolfinx.parallel import agreed, largest, norm_over
 from tfeti_dolfinx.qp.coarse import Coarse, NoCoarse
 from tfeti_dolfinx.qp.discs import Discs, Ellipses
 from tfeti_dolfinx.qp.faces import Face, Status, face_of
@@ -39,6 +40,13 @@ from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
 from tfeti_dolfinx.qp.recycled import Recycled, RecycledOnFace
 from tfeti_dolfinx.subdomains.local import LocalOperator
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
+
+# times the forces and lengths that load, values and gaps make: multipliers of an earlier problem
+# that are larger would leave so many digits less to the solution
+FAR = 1e3
+
+# of stiffness, lengths and forces: beyond it squares leave the range of floating point
+LEAST, MOST = 1e-130, 1e130
 
 # from B and c to the set of multipliers, on all local rows
 FeasibleLaw = Callable[[Constraints], FeasibleSet]
@@ -88,6 +96,7 @@ class Dual:
         nearly_free: After ``recover``: motions that contacts with a force hold hardly or not.
 
     Raises:
+        InputError: Squares of stiffness, load or values leave the range of floating point.
         NoSolutionError: The load moves a body that nothing holds.
         FactorError: A matrix could not be factored.
     """
@@ -107,6 +116,9 @@ class Dual:
         self._prefix = f"{options_prefix}face_"
         self._names, self.nearly_free = (body_names, mode_names), list[dict[str, object]]()
         B, comm = constraints.B, constraints.B.getComm().tompi4py()
+        self._stiffness = largest(comm, subdomains.diagonal)
+        self.d = linear_term(B, constraints.c, subdomains)
+        self._check_units(comm)
         self.F = dual_operator(B, subdomains)
         self.preconditioner: DualOperator | None = None
         self._scaled: ScaledRows | None = None
@@ -132,18 +144,19 @@ class Dual:
         self.seen, self.last = 0.0, LastImage()
         self.recycled: Recycled | None = None
         self._check()
-        self.d = linear_term(B, constraints.c, subdomains)
 
     def update_load(self) -> None:
         """Take the Blocks' present loads and the present right sides.
 
         Raises:
+            InputError: Squares of load or values leave the range of floating point.
             NoSolutionError: The load moves a body that nothing holds.
         """
-        self.coarse.update_load()
-        self._check()
         self.d.destroy()
         self.d = linear_term(self.constraints.B, self.constraints.c, self.subdomains)
+        self._check_units(self.coarse.comm)
+        self.coarse.update_load()
+        self._check()
 
     @property
     def lifting(self) -> LocalOperator:
@@ -162,6 +175,18 @@ class Dual:
     def _check(self) -> None:
         check_solvable(self.coarse, *self._names)
         check_capacity(self.coarse, self.constraints, *self._names)
+
+    def _check_units(self, comm: MPI.Intracomm) -> None:
+        length = largest(comm, self.driving)
+        sizes = {"stiffness": self._stiffness, "displacements": length}
+        sizes["forces"] = self._stiffness * length
+        if not all(size == 0.0 or LEAST <= size <= MOST for size in sizes.values()):
+            found = ", ".join(f"{name} of {size:.1e}" for name, size in sizes.items())
+            raise InputError(
+                f"load, prescribed values and overlaps, over the stiffness, make {found}, whose "
+                "squares leave the range of floating point; expected units in which all of these "
+                f"are 0 or from {LEAST:g} to {MOST:g}"
+            )
 
     @property
     def holds(self) -> bool:
@@ -235,6 +260,41 @@ class Dual:
         made = image(self.F, PARTICULAR[kind](self.coarse, self.d))
         self._images[kind] = (self.coarse.e.copy(), made)
         return made
+
+    @property
+    def driving(self) -> Array:
+        """What load, prescribed values, slips and overlaps make: d without gaps, local rows."""
+        c, normals = self.constraints.c.array_r, self.constraints.sets.normals
+        d = np.array(self.d.array_r)
+        d[normals] += np.maximum(c[normals], 0.0)
+        return d
+
+    def is_far(self, lam: Array, mu: Array) -> bool:
+        """Whether multipliers are far beyond what drives the problem, as after unloading.
+
+        Forces and lengths both are: λ beside the least that balances the load; Fλ and Gᵀμ beside
+        what drives the problem. The solution would be their small difference, with their rounding.
+        Multiplies by F at most once, and not where λ is the last solution.
+
+        Args:
+            lam: λ on this rank's rows.
+            mu: Multipliers of Gλ = e.
+        """
+        comm, coarse, x = self.coarse.comm, self.coarse, self.d.duplicate()
+        coarse.particular(x)
+        forces = norm_over(comm, lam)
+        if 0.0 < forces <= FAR * norm_over(comm, x.array_r):
+            x.destroy()
+            return False
+        if len(mu) == coarse.dimension:
+            coarse.combine(mu, x)
+        lengths = norm_over(comm, x.array_r)
+        x.array[:] = lam
+        at = self.last.image(self.F, x)
+        self.last.pass_on(np.array(lam), np.array(at.Fx.array_r), 0.0)
+        lengths += norm_over(comm, at.Fx.array_r)
+        at.destroy()
+        return lengths > FAR * norm_over(comm, self.driving)
 
     def known_image(self, kind: str) -> Image | None:
         """λ̄ and F λ̄ if they are known for the present e."""

@@ -75,6 +75,7 @@ class Measures:
         forces: Size of these forces.
         residual: Norm of what rows miss.
         gap: Largest gap of a contact row, or overlap.
+        begin: Largest slip that friction counts from.
     """
 
     u: Array
@@ -84,6 +85,7 @@ class Measures:
     forces: float
     residual: float
     gap: float
+    begin: float
 
     @property
     def error(self) -> float:
@@ -118,7 +120,7 @@ def measure(
         before: The displacement of an earlier iterate.
     """
     u = scene.recover(lam, gradient, face, error)
-    w, penetration, gap = _missed(scene, u, lam, norm)
+    w, (penetration, gap, begin) = _missed(scene, u, lam, norm)
     constraints = scene.constraints
     residual, normals = w.norm(), constraints.sets.normals
     closed = scene.pressing[normals] | (w.array_r[normals] != 0.0)
@@ -126,11 +128,11 @@ def measure(
     bodies = _bodies(scene, u, closing(constraints, w, closed), before)
     balance, forces = _balance(scene.coarse, lam)
     w.destroy()
-    return Measures(u, bodies, penetration, balance, forces, residual, gap)
+    return Measures(u, bodies, penetration, balance, forces, residual, gap, begin)
 
 
-def _missed(scene: Scene, u: Array, lam: PETSc.Vec, norm: float) -> tuple[PETSc.Vec, float, float]:
-    """w, and as lengths the largest of its contact rows and the largest of their gaps."""
+def _missed(scene: Scene, u: Array, lam: PETSc.Vec, norm: float) -> tuple[PETSc.Vec, Array]:
+    """w, and as lengths the largest of its contact rows, of their gaps and slips at first."""
     constraints = scene.constraints
     w = missed(constraints, u[scene.subdomains.trace])
     normals = constraints.sets.normals
@@ -140,15 +142,16 @@ def _missed(scene: Scene, u: Array, lam: PETSc.Vec, norm: float) -> tuple[PETSc.
     rows = np.where(scene.pressing[normals] | (rows > 0.0), rows, still)
     w.array[normals] = rows
     lengths = np.abs((rows, constraints.c.array_r[normals])) / constraints.scale
-    largest = np.max(lengths, axis=1, initial=0.0)
+    largest = np.append(np.max(lengths, axis=1, initial=0.0), 0.0)
     tangents = constraints.sets.tangents
     if tangents.size:
         slip = w.array_r[tangents]
         w.array[tangents] = _missed_by(scene, lam.array_r, tangents, slip, norm)
-        length = np.linalg.norm(w.array_r[tangents], axis=1) / constraints.tangent_scale
-        largest[0] = max(largest[0], length.max())
+        rows = np.stack((w.array_r[tangents], constraints.c.array_r[tangents]))
+        length = np.linalg.norm(rows, axis=2) / constraints.tangent_scale
+        largest[[0, 2]] = np.maximum(largest[[0, 2]], length.max(axis=1))
     w.getComm().tompi4py().Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
-    return w, float(largest[0]), float(largest[1])
+    return w, largest
 
 
 def _missed_by(scene: Scene, lam: Array, rows: Array, values: Array, norm: float) -> Array:

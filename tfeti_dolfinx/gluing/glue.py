@@ -111,13 +111,6 @@ class Gluing:
         c[self.constraints.sets.equalities[self.held.row]] = self.held.right_side(values)
         return c
 
-    def gain(self, slip: Array) -> Array:
-        """What c gains where a step begins at other slips, shape ``(num_rows,)``."""
-        rows, gain = self.tangents, np.zeros(self.constraints.num_rows)
-        more = (slip - self.slip)[rows.condition] * rows.scale[:, None]
-        gain[self.constraints.sets.tangents] = np.where(rows.moves, more, 0.0)
-        return gain
-
     def multipliers(self, earlier: Gluing, lam: Array) -> Array:
         """Multipliers of earlier rows of the same scene on these; zero on rows that are new.
 
