@@ -10,7 +10,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "tfeti_dolfinx"
 ROOMS = [
     ["errors", "arrays", "citations", "version"],
     ["checks", "compat", "parallel", "stages", "states", "timing"],
-    ["described"],
+    ["agreement", "described"],
     ["mesh"],
     ["mortar"],
     ["contact"],

@@ -60,11 +60,7 @@ def checked_conditions(
         InputError: They are no Dirichlet conditions on V or a component of V, or one of them has
             no unknowns, or some that V has not.
     """
-    if isinstance(bcs, fem.DirichletBC) or not isinstance(bcs, Iterable):
-        raise InputError(
-            f"bcs is {shown(bcs)}; expected a list of Dirichlet conditions, [] for none"
-        )
-    conditions = list(bcs)
+    conditions = listed_conditions(bcs)
     count = np.zeros(len(conditions), dtype=np.int64)
     with raised_on_all_ranks(V.mesh.comm):
         for number, bc in enumerate(conditions):
@@ -79,6 +75,19 @@ def checked_conditions(
             "rank; expected at least one"
         )
     return conditions
+
+
+def listed_conditions(bcs: Iterable[fem.DirichletBC]) -> list[fem.DirichletBC]:
+    """The conditions as a list. Not collective.
+
+    Raises:
+        InputError: They are nothing that gives conditions.
+    """
+    if isinstance(bcs, fem.DirichletBC) or not isinstance(bcs, Iterable):
+        raise InputError(
+            f"bcs is {shown(bcs)}; expected a list of Dirichlet conditions, [] for none"
+        )
+    return list(bcs)
 
 
 def _check_space(what: str, bc: fem.DirichletBC, V: fem.FunctionSpace) -> None:
