@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
@@ -35,6 +36,9 @@ DIGEST = 16
 
 # where objects are made that say what a user wants, and have nothing of a rank
 DESCRIPTIONS = ("tfeti_dolfinx.contact.", "tfeti_dolfinx.boundary_elements")
+
+# in a name that was made from an object: that of another rank lies elsewhere
+ADDRESS = re.compile(r" at 0x[0-9a-f]+")
 
 # in an error of ranks that may be in different calls: outer calls must not talk about it again
 TOLD = "_told_to_all_ranks"
@@ -134,7 +138,9 @@ def described(value: Any) -> Any:
     """
     if isinstance(value, np.generic):
         value = value.item()
-    if value is None or isinstance(value, (bool, str)):
+    if isinstance(value, str):
+        return ADDRESS.sub("", value)
+    if value is None or isinstance(value, bool):
         return value
     if isinstance(value, Real):
         return int(value) if isinstance(value, Integral) else float(value)
@@ -190,10 +196,14 @@ def _signature(of: Callable[[], str]) -> str:
 
 
 def _values(constants: Any, functions: Any) -> dict[str, Any]:
-    """Values of constants, and the kinds of functions."""
+    """Values of constants, and the kinds of functions; UFL's own have none."""
     return {
-        "constants": [described(c) for c in constants],
-        "functions": [described(f) for f in functions],
+        "constants": [
+            described(c) if isinstance(c, fem.Constant) else type(c).__qualname__ for c in constants
+        ],
+        "functions": [
+            described(f) if isinstance(f, fem.Function) else type(f).__qualname__ for f in functions
+        ],
     }
 
 

@@ -15,6 +15,7 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.gluing.glue import Gluing
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.parallel import any_rank
 from tfeti_dolfinx.qp.faces import Status, face_of
 from tfeti_dolfinx.solution import Solution
 
@@ -108,8 +109,12 @@ class SavedState:
         sizes = (len(self.lam), len(self.slip), self.contact.tolist(), self.group.tolist())
         kept, wide = records.within_reach, self.directions.shape
         found = (records.contact[kept].tolist(), records.group[kept].tolist())
-        with raised_on_all_ranks(gluing.dofs.comm):
+        comm, parts = gluing.dofs.comm, ("image", "predicted", "predicted_image")
+        known = [name for name in parts if any_rank(comm, getattr(self, name).size > 0)]
+        with raised_on_all_ranks(comm):
             rows = gluing.constraints.num_rows
+            for name in known:
+                _check_broken(name, getattr(self, name).shape == (rows,))
             if sizes != (rows, len(records), *found) or (wide[2] and wide[:2] != (2, rows)):
                 raise InputError(
                     "the state has other contact rows than the problem: expected the contacts, "

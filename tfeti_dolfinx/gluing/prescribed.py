@@ -64,9 +64,7 @@ def checked_conditions(
     count = np.zeros(len(conditions), dtype=np.int64)
     with raised_on_all_ranks(V.mesh.comm):
         for number, bc in enumerate(conditions):
-            what = f"Dirichlet condition {number}"
-            checked_type(bc, fem.DirichletBC, what, "a dolfinx.fem.DirichletBC")
-            _check_space(what, bc, V)
+            _check_space(f"Dirichlet condition {number}", bc, V)
             count[number] = len(bc.dof_indices()[0])
     total = V.mesh.comm.allreduce(count)
     if not np.all(total):
@@ -81,13 +79,17 @@ def listed_conditions(bcs: Iterable[fem.DirichletBC]) -> list[fem.DirichletBC]:
     """The conditions as a list. Not collective.
 
     Raises:
-        InputError: They are nothing that gives conditions.
+        InputError: They are nothing that gives Dirichlet conditions.
     """
     if isinstance(bcs, fem.DirichletBC) or not isinstance(bcs, Iterable):
         raise InputError(
             f"bcs is {shown(bcs)}; expected a list of Dirichlet conditions, [] for none"
         )
-    return list(bcs)
+    conditions = list(bcs)
+    for number, bc in enumerate(conditions):
+        what = f"Dirichlet condition {number}"
+        checked_type(bc, fem.DirichletBC, what, "a dolfinx.fem.DirichletBC")
+    return conditions
 
 
 def _check_space(what: str, bc: fem.DirichletBC, V: fem.FunctionSpace) -> None:
