@@ -262,7 +262,7 @@ class ContactProblem(Stepping):
         sums = sums_of(comm, [d.mesh.geometry.x, *fields.values()])
         found = {name: described(value) for name, value in given.items()}
         found["mesh"] = {**mesh, "points": sums[0]}
-        found["values"] = dict(zip(fields, sums[1:], strict=True))
+        found["sums over functions"] = dict(zip(fields, sums[1:], strict=True))
         return found
 
     def _given(self) -> dict[str, Any]:
