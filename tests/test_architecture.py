@@ -11,7 +11,7 @@ PACKAGE = ROOT / "tfeti_dolfinx"
 ROOMS = [
     ["errors", "arrays", "citations", "version"],
     ["checks", "compat", "parallel", "stages", "states", "timing"],
-    ["described"],
+    ["agreement", "described"],
     ["mesh"],
     ["mortar"],
     ["contact"],

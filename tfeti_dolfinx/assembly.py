@@ -65,6 +65,7 @@ class Forms:
         jit_options: As in DOLFINx.
 
     Attributes:
+        given: The forms as they were given, by their names.
         thickness: What the forms were multiplied with, a number or a scalar in UFL; 1 until it is
             set.
 
@@ -82,6 +83,7 @@ class Forms:
         jit_options: Mapping[str, Any] | None,
     ) -> None:
         self._V, self._decomposition = V, decomposition
+        self.given: dict[str, Any] = {}
         self.thickness: Any = 1.0
         self._keywords = {
             "form_compiler_options": _options(form_compiler_options, "form_compiler_options"),
@@ -95,12 +97,14 @@ class Forms:
         """Take another bilinear form on the same space."""
         check_form(a, "a", self._V, self._decomposition)
         self._a, self._of_a = self._compiled(a, "a"), data_of(a, self._V)
+        self.given = {**self.given, "a": a}
 
     def replace_load(self, L: ufl.Form | ufl.ZeroBaseForm) -> None:
         """Take another linear form on the same space."""
         check_form(L, "L", self._V, self._decomposition)
         self._L = None if is_zero(L) else self._compiled(L, "L")
         self._of_L = data_of(L, self._V)
+        self.given = {**self.given, "L": L}
         self._volume_of_L: ufl.Form | fem.Form | None = cell_integrals(L)
 
     def has_new_points(self) -> bool:

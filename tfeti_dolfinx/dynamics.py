@@ -16,14 +16,14 @@ from tfeti_dolfinx.checks import checked_flag
 from tfeti_dolfinx.contact.partners import ContactPartner
 from tfeti_dolfinx.contact_state import Multipliers
 from tfeti_dolfinx.elasticity import Modulus
-from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.gluing.glue import Gluing
 from tfeti_dolfinx.inertia import InertialForms, check_copies, mass_form
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.parallel import any_rank
 from tfeti_dolfinx.predictor import Predictor
 from tfeti_dolfinx.problem import ContactProblem
-from tfeti_dolfinx.saved_state import SavedState, checked_state
+from tfeti_dolfinx.saved_state import SavedState
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.work import balance, contact_forces
 
@@ -84,8 +84,8 @@ class ContactDynamics(ContactProblem):
         lumped: bool = False,
         **others: Any,
     ) -> None:
-        self._stabilised = checked_flag(stabilised, "stabilised")
-        self._mass, self._lumped = mass, checked_flag(lumped, "lumped")
+        self._stabilised, self._lumped = stabilised, lumped
+        self._mass, self._velocity = mass, velocity
         self._with_thickness = others.get("thickness", 1.0)
         super().__init__(a, L, bcs, contacts, decomposition, **others)
         if self.options.rtol == "auto":
@@ -100,6 +100,12 @@ class ContactDynamics(ContactProblem):
         self._predictor: Predictor | None = None
         if self._stabilised:
             self._predictor = Predictor(self.dofs, decomposition, self._settings)
+
+    def _given_besides(self) -> dict[str, Any]:
+        flags = {"stabilised": self._stabilised, "lumped": self._lumped}
+        for name, flag in flags.items():
+            checked_flag(flag, name)
+        return {**flags, "mass": self._mass, "velocity": self._velocity}
 
     def _forms(self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any) -> Forms:
         mass = self._mass
@@ -129,13 +135,15 @@ class ContactDynamics(ContactProblem):
         Raises:
             InputError: As there, or the step has no size yet.
         """
+        super().solve()
+        self._look()
+        return self.u
+
+    def _set_out(self) -> None:
         motion = self._forms_in_time.motion
         motion.towards = free = motion.free
         if self._predictor is not None:
             motion.towards = self._predicted(self._predictor, free)
-        super().solve()
-        self._look()
-        return self.u
 
     def accept(self) -> None:
         """Take the last solution as the end of the step: the next one begins there.
@@ -143,15 +151,15 @@ class ContactDynamics(ContactProblem):
         Raises:
             InputError: As ``ContactProblem.accept``.
         """
-        if self.solution is self._accepted[0]:
-            return
+        before, _ = self._accepted
         super().accept()
+        if self.solution is before:
+            return
         assert self.solution.v is not None
         self._forms_in_time.move(np.array(self.u.x.array), self.solution.v)
 
-    def go_back(self) -> None:
-        """Return to the begin of the step."""
-        super().go_back()
+    def _return(self) -> None:
+        super()._return()
         if self._solution is None:
             self.u.x.array[:] = self._first
 
@@ -171,21 +179,25 @@ class ContactDynamics(ContactProblem):
         Raises:
             InputError: As ``ContactProblem.restore``, or the state is of a problem without mass.
         """
-        checked_state(state, self.dofs, self.decomposition, len(self.contacts))
-        forms, size = self._forms_in_time, len(self.u.x.array)
-        with raised_on_all_ranks(self.decomposition.comm):
-            if state.velocity.shape != (size,) or state.load.shape != (size,):
-                raise InputError("the state is of a problem without mass; expected velocities")
-        forms.move(self.dofs.to_dolfinx(state.u), state.velocity, state.load)
-        forms.motion.towards = forms.motion.free
-        if state.size > 0.0:  # equal steps of a series differ by rounding, factors are of the first
-            forms.motion.size = float(state.size)
         super().restore(state)
         self.solution.v = state.velocity
         known = any_rank(self.decomposition.comm, state.predicted.size > 0)
         if self._predictor is not None and known:
             start = state.predicted, state.predicted_image
             self._predictor.start_from(self._system.gluing, *start)
+
+    def _check_state(self, state: SavedState) -> None:
+        super()._check_state(state)
+        size = len(self.u.x.array)
+        if state.velocity.shape != (size,) or state.load.shape != (size,):
+            raise InputError("the state is of a problem without mass; expected velocities")
+
+    def _take_motion(self, state: SavedState) -> None:
+        forms = self._forms_in_time
+        forms.move(self.dofs.to_dolfinx(state.u), state.velocity, state.load)
+        forms.motion.towards = forms.motion.free
+        if state.size > 0.0:  # equal steps of a series differ by rounding, factors are of the first
+            forms.motion.size = float(state.size)
 
     def destroy(self) -> None:
         """Destroy the PETSc objects; solution and report stay."""

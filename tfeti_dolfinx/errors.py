@@ -56,8 +56,18 @@ def raised_on_all_ranks(comm: MPI.Intracomm) -> Iterator[None]:
     except Exception as caught:
         error = caught
     raiser = comm.allreduce(comm.size if error is None else comm.rank, op=MPI.MIN)
-    if raiser == comm.size:
-        return
+    if raiser < comm.size:
+        raise_together(comm, error, raiser)
+
+
+def raise_together(comm: MPI.Intracomm, error: Exception | None, raiser: int) -> None:
+    """Raise one rank's exception on all ranks. Collective.
+
+    Args:
+        comm: Communicator.
+        error: The exception that this rank has.
+        raiser: The rank whose exception it is, the same on all ranks.
+    """
     if comm.rank != raiser or error is None:
         raise comm.bcast(None, root=raiser)
     portable = comm.bcast(_portable(error), root=raiser)

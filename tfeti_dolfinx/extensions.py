@@ -17,7 +17,6 @@ from tfeti_dolfinx.gluing.constraints import Constraints
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import Options
-from tfeti_dolfinx.parallel import check_agreed
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.monitors import Monitor
 from tfeti_dolfinx.qp.recycled import Recycled
@@ -152,19 +151,20 @@ class Settings:
     factor_options: Mapping[str, Any]
     extensions: Extensions
 
-    def check_agreed(self, comm: MPI.Intracomm) -> None:
-        """Raise if ranks were given different settings. Collective.
+    @property
+    def given(self) -> dict[str, Any]:
+        """What ranks must have alike: a monitor of one rank would wait for the others.
 
-        Raises:
-            InputError: They were: a monitor of one rank would wait for the others.
+        Parts of one's own count by their presence: a rank may bring another callable.
         """
-        options = {**asdict(self.options), "of factors": dict(self.factor_options)}
-        given = {f"petsc_options: {name}": value for name, value in options.items()}
-        given["petsc_options_prefix"] = self.prefix
-        for field in fields(self.extensions):
-            part = getattr(self.extensions, field.name)
-            given[f"extensions: {field.name}"] = "given" if part is not None else "not given"
-        check_agreed(comm, given)
+        parts = {f.name: getattr(self.extensions, f.name) for f in fields(self.extensions)}
+        return {
+            "petsc_options": {**asdict(self.options), "of factors": dict(self.factor_options)},
+            "petsc_options_prefix": self.prefix,
+            "extensions": {
+                name: "not given" if part is None else "given" for name, part in parts.items()
+            },
+        }
 
     @property
     def local_choice(self) -> LocalChoice:

@@ -52,19 +52,6 @@ def checked_stress(stress: Stress, u: fem.Function) -> Any:
     return sigma
 
 
-def check_stress(
-    stress: Stress | None, u: fem.Function, decomposition: Decomposition
-) -> Stress | None:
-    """The stress as it is, where there is one.
-
-    Raises:
-        InputError: As ``checked_stress``, or it is on another mesh.
-    """
-    if stress is not None:
-        check_mesh(checked_stress(stress, u), "stress", decomposition)
-    return stress
-
-
 def checked_thickness(thickness: Any, decomposition: Decomposition) -> Any:
     """What areas of the mesh are multiplied with, a number or a scalar in UFL. Collective.
 

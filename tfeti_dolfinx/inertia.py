@@ -19,6 +19,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from scipy.sparse import csr_array
 
+from tfeti_dolfinx.agreement import agreeing
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.assembly import Data, Forms, data_of
 from tfeti_dolfinx.checks import POSITIVE, Range, checked_number
@@ -28,7 +29,6 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.form_checks import check_form, check_same_space, displacement_space
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.parallel import check_agreed
 from tfeti_dolfinx.subdomains.input_checks import check_stiffness
 
 # of a step: another one that differs by less is the same, since times of equal steps are rounded
@@ -97,6 +97,7 @@ class InertialForms(Forms):
         self.motion = motion = Motion(zero, zero, super().load())
         self._of_step = Data(lambda: [np.array(motion.size)], self._comm)
         self._of_m = data_of(mass, V)
+        self.given = {**self.given, "mass": mass}
         self._of_motion = Data(lambda: [motion.u, motion.load, motion.towards], self._comm)
         self._matrices: tuple[csr_array, csr_array] | None = None
         self._new_matrices = True
@@ -108,9 +109,8 @@ class InertialForms(Forms):
         Raises:
             InputError: It is not a positive number, or another one on another rank.
         """
-        with raised_on_all_ranks(self._comm):
-            size = checked_number(size, "step", STEP)
-        check_agreed(self._comm, {"step": size})
+        with agreeing(self._comm, "take_step") as given:
+            given["step"] = size = checked_number(size, "step", STEP)
         known = self.motion.size
         if abs(size - known) <= SAME_STEP * known:
             return

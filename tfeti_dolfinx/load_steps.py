@@ -10,6 +10,7 @@ from typing import Any
 import dolfinx
 import numpy as np
 
+from tfeti_dolfinx.agreement import agreeing
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.checkpoint import Checkpoint
 from tfeti_dolfinx.checks import (
@@ -20,7 +21,7 @@ from tfeti_dolfinx.checks import (
     is_whole,
     shown,
 )
-from tfeti_dolfinx.errors import ConvergenceError, InputError, TfetiError, raised_on_all_ranks
+from tfeti_dolfinx.errors import ConvergenceError, InputError, TfetiError
 from tfeti_dolfinx.halving import MOST_HALVINGS, Place, checked_times
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.progress import Show, shown_progress
@@ -99,20 +100,23 @@ class LoadSteps:
         progress: bool | None = None,
     ) -> None:
         checked_type(problem, ContactProblem, "problem", "a tfeti_dolfinx.ContactProblem")
-        checked_callable(apply, "apply", "a function of the problem and a time")
-        if not is_whole(max_halvings) or not 0 <= max_halvings <= MOST_HALVINGS:
-            raise InputError(
-                f"max_halvings={shown(max_halvings)}: expected an integer, 0 to {MOST_HALVINGS}"
-            )
-        self._times = checked_times(begin, times)
-        self._path = None if path is None else checked_path(path, ".bp")
-        if path is not None and not dolfinx.has_adios2:
-            raise InputError(f"{path}: this DOLFINx has no ADIOS2, which writes steps")
         self._comm = problem.decomposition.comm
+        with agreeing(self._comm, "LoadSteps") as given:
+            checked_callable(apply, "apply", "a function of the problem and a time")
+            if not is_whole(max_halvings) or not 0 <= max_halvings <= MOST_HALVINGS:
+                raise InputError(
+                    f"max_halvings={shown(max_halvings)}: expected an integer, 0 to {MOST_HALVINGS}"
+                )
+            self._times = checked_times(begin, times)
+            self._path = None if path is None else checked_path(path, ".bp")
+            if path is not None and not dolfinx.has_adios2:
+                raise InputError(f"{path}: this DOLFINx has no ADIOS2, which writes steps")
+            self._interior = checked_flag(interior, "interior")
+            if self._interior and path is None:
+                raise InputError("interior=True: expected LoadSteps(..., path=) too")
+            given |= {"begin": self._times[0], "times": self._times[1:], "path": path}
+            given |= {"interior": interior, "checkpoint": checkpoint, "max_halvings": max_halvings}
         self._checkpoint = None if checkpoint is None else Checkpoint(checkpoint, self._comm)
-        self._interior = checked_flag(interior, "interior")
-        if self._interior and path is None:
-            raise InputError("interior=True: expected LoadSteps(..., path=) too")
         self._problem, self._apply = problem, apply
         self._max_halvings, self._progress = int(max_halvings), progress
         self._series: Series | None = None
@@ -133,6 +137,10 @@ class LoadSteps:
             NoSolutionError: A step has no solution; a note of the error has its time.
             ConvergenceError: A step did not converge, halved as often as allowed.
         """
+        with agreeing(self._comm, "LoadSteps.run") as given:
+            given["resume"] = bool(resume)
+            if resume and self._checkpoint is None:
+                raise InputError("resume=True: expected LoadSteps(..., checkpoint=) too")
         place = self._begin(resume)
         try:
             with shown_progress(self._comm, self._progress) as show:
@@ -176,7 +184,7 @@ class LoadSteps:
             raise ConvergenceError(f"the dual solver stopped: {reason}")
 
     def _set(self, t: float) -> None:
-        with raised_on_all_ranks(self._comm):
+        with agreeing(self._comm, "apply"):
             self._apply(self._problem, t)
 
     def _halved(self, place: Place, t: float, error: ConvergenceError) -> Place:
@@ -222,8 +230,6 @@ class LoadSteps:
         """Where to begin, with the state of that place."""
         self.records = []
         if self._checkpoint is None:
-            if resume:
-                raise InputError("resume=True: expected LoadSteps(..., checkpoint=) too")
             return Place()
         kept = self._checkpoint.read() if resume else None
         if kept is None:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 
 T = TypeVar("T")
 
@@ -21,26 +19,6 @@ def agreed(comm: MPI.Intracomm, value: T) -> T:
     ranks that decide by their own floats may part ways.
     """
     return comm.bcast(value, root=0)
-
-
-def check_agreed(comm: MPI.Intracomm, given: Mapping[str, Any]) -> None:
-    """Raise if ranks were given different things, with which they would part ways. Collective.
-
-    Args:
-        comm: Communicator.
-        given: Small values by their names, the same names on all ranks.
-
-    Raises:
-        InputError: A value is not that of rank 0.
-    """
-    there = agreed(comm, dict(given))
-    with raised_on_all_ranks(comm):
-        for what, value in given.items():
-            if value != there[what]:
-                raise InputError(
-                    f"{what} is {value!r} on rank {comm.rank} and {there[what]!r} on rank 0; "
-                    "expected the same on all ranks"
-                )
 
 
 def any_rank(comm: MPI.Intracomm, flag: bool) -> bool:

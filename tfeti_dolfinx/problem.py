@@ -10,6 +10,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
+from tfeti_dolfinx.agreement import agreeing, described, fields_in, sums_of
 from tfeti_dolfinx.assembly import Forms
 from tfeti_dolfinx.boundary_elements import BoundaryElements, check_boundary_elements
 from tfeti_dolfinx.checks import checked_type
@@ -24,9 +25,13 @@ from tfeti_dolfinx.dual.goals import Goal
 from tfeti_dolfinx.errors import InputError, TfetiError
 from tfeti_dolfinx.estimates import Estimates, estimate, goal_of, of_looks
 from tfeti_dolfinx.extensions import Extensions, Settings, guarded
-from tfeti_dolfinx.fields import Stress, check_stress, checked_thickness
-from tfeti_dolfinx.form_checks import check_same_space, displacement_space
-from tfeti_dolfinx.gluing.prescribed import check_not_on_tears, checked_conditions
+from tfeti_dolfinx.fields import Stress, checked_thickness
+from tfeti_dolfinx.form_checks import check_mesh, check_same_space, displacement_space
+from tfeti_dolfinx.gluing.prescribed import (
+    check_not_on_tears,
+    checked_conditions,
+    listed_conditions,
+)
 from tfeti_dolfinx.gluing.spectrum import extreme_eigenvalues, require_slepc
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -89,29 +94,40 @@ class ContactProblem(Stepping):
         extensions: Extensions | None = None,
         boundary_elements: BoundaryElements | None = None,
     ) -> None:
-        require_real_petsc()
-        self.options = parse_options(petsc_options, petsc_options_prefix, self.defaults)
-        extensions = Extensions() if extensions is None else extensions
-        checked_type(extensions, Extensions, "extensions", "tfeti_dolfinx.Extensions")
         checked_type(
             decomposition, Decomposition, "decomposition", "what decompose or read_gmsh return"
         )
-        own = guarded(extensions, decomposition.comm)
-        for_factors = factor_options(petsc_options, petsc_options_prefix)
-        self._settings = Settings(self.options, petsc_options_prefix, for_factors, own)
+        self.decomposition, comm = decomposition, decomposition.comm
+        with agreeing(comm, type(self).__name__) as given:
+            require_real_petsc()
+            self.options = parse_options(petsc_options, petsc_options_prefix, self.defaults)
+            extensions = Extensions() if extensions is None else extensions
+            checked_type(extensions, Extensions, "extensions", "tfeti_dolfinx.Extensions")
+            for_factors = factor_options(petsc_options, petsc_options_prefix)
+            own = guarded(extensions, comm)
+            self._settings = Settings(self.options, petsc_options_prefix, for_factors, own)
+            self.contacts = checked_contacts(contacts)
+            bcs = listed_conditions(bcs)
+            given |= {"a": a, "L": L, "bcs": bcs, "contacts": contacts, "thickness": thickness}
+            given |= {"stress": stress, "u": u, "boundary_elements": boundary_elements}
+            given |= {"form_compiler_options": form_compiler_options, **self._settings.given}
+            given |= self._given_besides()
         if self.options.spectrum:
-            require_slepc(decomposition.comm)
-        self.decomposition = decomposition
-        self.contacts = checked_contacts(contacts)
+            require_slepc(comm)
         V = displacement_space(a, decomposition)
         self.bcs = checked_conditions(bcs, V)
         self.u = fem.Function(V, name="displacement") if u is None else self._checked_u(u, V)
-        self._stress = check_stress(stress, self.u, decomposition)
+        self._given_stress = stress
+        if stress is not None:
+            with agreeing(comm, "stress(u)") as given:
+                given["stress(u)"] = sigma = self._look_at_stress()
+                check_mesh(sigma, "stress", decomposition)
         if self.options.rtol == "auto" and stress is None:
             raise InputError(
                 f"-{petsc_options_prefix}rtol auto: the problem has no stress to estimate the "
                 "discretisation error from; expected ContactProblem(..., stress=sigma)"
             )
+        self._boundary_elements = boundary_elements
         self._thickness = checked_thickness(thickness, decomposition)
         self.report = Report(seconds=dict(decomposition.seconds))
         with stage("assembly", self.report.seconds):
@@ -136,6 +152,10 @@ class ContactProblem(Stepping):
     def _forms(self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any) -> Forms:
         """What gives the matrix and the load of a solve."""
         return Forms(a, L, V, self.decomposition, *options)
+
+    def _given_besides(self) -> dict[str, Any]:
+        """What else the problem was given, checked; ranks must have it alike."""
+        return {}
 
     @property
     def dual(self) -> Dual:
@@ -162,8 +182,10 @@ class ContactProblem(Stepping):
             ConvergenceError: The solver stopped before its tolerance.
             FactorError: A matrix could not be factored.
         """
+        self._meet("solve")
         self.report.begin()
         try:
+            self._set_out()
             self._system.look_for_changes()
             solve_in_rounds(self._solve_rows, self._system, self.report)
         except TfetiError:  # on all ranks
@@ -185,6 +207,7 @@ class ContactProblem(Stepping):
             InputError: There is no solution, or its rows are no longer there.
             FactorError: A matrix could not be factored.
         """
+        self._meet("estimate")
         found = estimate(self._system, self.solution)
         note_estimates(self.report, found.numbers())
         return found
@@ -214,10 +237,14 @@ class ContactProblem(Stepping):
         Raises:
             InputError: Something given does not fit; the message names it. Nothing has changed.
         """
+        with agreeing(self.decomposition.comm, "update") as given:
+            conditions = None if values is None else listed_conditions(values)
+            given |= {"load": load, "values": conditions, "stiffness": stiffness, "gap": gap}
         V, forms = self.dofs.V, copy(self._system.forms)
-        conditions = self.bcs
-        if values is not None:
-            conditions = checked_conditions(values, V)
+        if conditions is None:
+            conditions = self.bcs
+        else:
+            conditions = checked_conditions(conditions, V)
             check_not_on_tears(conditions, self.dofs, self.decomposition)
         if stiffness is not None:
             check_same_space(displacement_space(stiffness, self.decomposition), V, "stiffness", "a")
@@ -227,6 +254,31 @@ class ContactProblem(Stepping):
         if gap is not None:
             self._system.set_gaps(gaps_by_position(self.contacts, gap))
         self._system.forms, self.bcs[:] = forms, conditions
+
+    def digest(self) -> dict[str, Any]:
+        """Describe what determines the solution, for checkpoints: short, and as JSON takes it.
+
+        Collective. The forms and the values of their constants, contacts, conditions, mass and
+        mesh, as they are when it is called; of functions on the mesh sums over it, of callables
+        their names. Options, extensions and ``stress`` are none of it.
+        ``agreement.check_same_problem`` compares two of them.
+        """
+        comm, d = self.decomposition.comm, self.decomposition
+        with agreeing(comm, "digest") as given:
+            given |= self._given()
+        fields = fields_in(given)
+        mesh = {"type": "mesh", "subdomains": d.num_subdomains, "bodies": d.num_bodies}
+        sums = sums_of(comm, [d.mesh.geometry.x, *fields.values()])
+        found = {name: described(value) for name, value in given.items()}
+        found["mesh"] = {**mesh, "points": sums[0]}
+        found["sums over functions"] = dict(zip(fields, sums[1:], strict=True))
+        return found
+
+    def _given(self) -> dict[str, Any]:
+        return {**super()._given(), "boundary_elements": self._boundary_elements}
+
+    def _set_out(self) -> None:
+        """Say where a step goes at first: without inertia nothing."""
 
     def _count(self) -> None:
         """What the solve has made and taken."""

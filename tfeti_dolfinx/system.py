@@ -66,7 +66,6 @@ class System:
         settings: Settings,
         boundary: BoundaryElements | None = None,
     ) -> None:
-        settings.check_agreed(decomposition.comm)
         self.forms, self.bcs, self._contacts = forms, bcs, contacts
         self._dofs, self._decomposition, self._settings = dofs, decomposition, settings
         self.friction = FrictionBounds(contacts, dofs, decomposition, forms.thickness)

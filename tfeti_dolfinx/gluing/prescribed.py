@@ -62,17 +62,11 @@ def checked_conditions(
         InputError: They are no Dirichlet conditions on V or a component of V, or one of them has
             no unknowns, or some that V has not.
     """
-    if isinstance(bcs, fem.DirichletBC) or not isinstance(bcs, Iterable):
-        raise InputError(
-            f"bcs is {shown(bcs)}; expected a list of Dirichlet conditions, [] for none"
-        )
-    conditions = list(bcs)
+    conditions = listed_conditions(bcs)
     count = np.zeros(len(conditions), dtype=np.int64)
     with raised_on_all_ranks(V.mesh.comm):
         for number, bc in enumerate(conditions):
-            what = f"Dirichlet condition {number}"
-            checked_type(bc, fem.DirichletBC, what, "a dolfinx.fem.DirichletBC")
-            _check_space(what, bc, V)
+            _check_space(f"Dirichlet condition {number}", bc, V)
             count[number] = len(bc.dof_indices()[0])
     total = V.mesh.comm.allreduce(count)
     if not np.all(total):
@@ -145,6 +139,23 @@ def _facet_nodes(dofs: TornDofs, facets: Array) -> Array:
     element, fdim = V.element.basix_element, V.mesh.topology.dim - 1
     on_facet = np.array(element.entity_closure_dofs[fdim])[place]
     return dofs.primal_nodes(np.take_along_axis(np.asarray(V.dofmap.list)[cell], on_facet, axis=1))
+
+
+def listed_conditions(bcs: Iterable[fem.DirichletBC]) -> list[fem.DirichletBC]:
+    """The conditions as a list. Not collective.
+
+    Raises:
+        InputError: They are nothing that gives Dirichlet conditions.
+    """
+    if isinstance(bcs, fem.DirichletBC) or not isinstance(bcs, Iterable):
+        raise InputError(
+            f"bcs is {shown(bcs)}; expected a list of Dirichlet conditions, [] for none"
+        )
+    conditions = list(bcs)
+    for number, bc in enumerate(conditions):
+        what = f"Dirichlet condition {number}"
+        checked_type(bc, fem.DirichletBC, what, "a dolfinx.fem.DirichletBC")
+    return conditions
 
 
 def _check_space(what: str, bc: fem.DirichletBC, V: fem.FunctionSpace) -> None:

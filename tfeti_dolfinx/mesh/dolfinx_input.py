@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from dolfinx import mesh as dmesh
 
+from tfeti_dolfinx.agreement import agreeing
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.checks import checked_type, is_whole
 from tfeti_dolfinx.compat import geometry_dofmap, original_cells
@@ -22,7 +23,6 @@ from tfeti_dolfinx.mesh.partition import (
 from tfeti_dolfinx.mesh.tags import check_tags, checked_names
 from tfeti_dolfinx.mesh.tearing import tear
 from tfeti_dolfinx.mesh.untorn import PhysicalNames, UntornMesh
-from tfeti_dolfinx.parallel import check_agreed
 from tfeti_dolfinx.timing import stage
 
 CELL_TYPES = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
@@ -67,16 +67,14 @@ def decompose(
     """
     _check_mesh(mesh)
     tagged = ((cell_tags, True, "cell_tags"), (facet_tags, False, "facet_tags"))
-    with raised_on_all_ranks(mesh.comm):
+    with agreeing(mesh.comm, "decompose") as given:
         for tags, of_cells, what in tagged:
             if tags is not None:
                 check_tags(tags, mesh, of_cells, what, f"expected the {what} of the mesh given")
         surfaces = checked_names(surfaces, "surfaces", facet_tags, "facet_tags")
         volumes = checked_names(volumes, "volumes", cell_tags, "cell_tags")
-    number = subdomains if subdomains is None or is_whole(subdomains) else "for each cell"
-    check_agreed(
-        mesh.comm, {"surfaces": surfaces, "volumes": volumes, "number of subdomains": number}
-    )
+        number = subdomains if subdomains is None or is_whole(subdomains) else "for each cell"
+        given |= {"surfaces": surfaces, "volumes": volumes, "number of subdomains": number}
     seconds: dict[str, float] = {}
     with stage("mesh", seconds):
         untorn = _untorn(mesh, cell_tags, facet_tags, surfaces, volumes)
