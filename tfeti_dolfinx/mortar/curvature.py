@@ -7,15 +7,18 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.arrays import Array, sum_rows
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facet_maps import points
 from tfeti_dolfinx.mortar.facets import FacetKind, Facets
 from tfeti_dolfinx.mortar.frames import tangents
+from tfeti_dolfinx.parallel import Exchange, any_rank, owner_of
 
 # cosine of 20 degrees: facets that turn by twice that at a vertex have an edge there, others are
 # those of a smooth surface, with nine facets or more around a pin
 EDGE = 0.94
+# of a cosine: facets that turn by less are parts of a plane
+ROUNDING = 8.0 * np.finfo(float).eps
 # of the weight of one neighbour at a vertex: curvatures that are known by less are taken to be 0
 UNKNOWN = 0.05
 
@@ -35,25 +38,24 @@ def with_curvature(facets: Facets, dofs: TornDofs, kind: FacetKind) -> Facets:
         dofs: Dof maps.
         kind: Elements on the facets.
     """
-    if kind.geometry.degree > 1:
-        return facets
-    groups, normals = facets.groups[:, : kind.num_vertices], facets.vertex_normals
-    axes = tangents(normals.reshape(-1, normals.shape[2])).reshape(
-        *normals.shape[:2], -1, normals.shape[2]
-    )
-    M, b = _normal_equations(facets.corners(kind.num_vertices), normals, axes)
-    size = b.shape[2]
-    sums = dofs.add_on_owners(
-        groups.ravel(),
-        np.concatenate((M.reshape(*groups.shape, -1), b), axis=2).reshape(groups.size, -1),
-    )
+    normals, groups = facets.vertex_normals, facets.groups[:, : kind.num_vertices].ravel()
     cosine = np.einsum("nvg,ng->nv", normals, facets.normal)
-    smooth = dofs.reduce_on_owners(groups.ravel(), cosine.ravel(), np.minimum, 1.0) > EDGE
-    S, r = _without_slopes(
-        sums[:, : size**2].reshape(-1, size, size), sums[:, size**2 :], axes.shape[2]
+    turns = bool(np.any(cosine < 1.0 - ROUNDING))
+    if kind.geometry.degree > 1 or not any_rank(dofs.comm, turns):
+        return facets
+    n, v, gdim = normals.shape
+    axes = tangents(normals.reshape(-1, gdim)).reshape(n, v, gdim - 1, gdim)
+    M, b = _normal_equations(facets.corners(kind.num_vertices), normals, axes)
+    sharp = (cosine <= EDGE).astype(float)
+    exchange = Exchange(dofs.comm, owner_of(dofs.group_offsets, groups))
+    vertex, place = np.unique(exchange.send(groups), return_inverse=True)
+    M, b, sharp = (
+        sum_rows(place, exchange.send(part.reshape(n * v, *part.shape[2:])), len(vertex))
+        for part in (M, b, sharp)
     )
-    S[~smooth], r[~smooth] = 0.0, 0.0
-    S, r = dofs.lookup(groups.ravel(), S, r)
+    S, r = _without_slopes(M, b, gdim - 1)
+    S[sharp > 0.0], r[sharp > 0.0] = 0.0, 0.0
+    S, r = (exchange.answer(part[place]).reshape(n, v, *part.shape[1:]) for part in (S, r))
     return replace(facets, curvature=_on_facets(facets, axes, S, r))
 
 
@@ -122,18 +124,15 @@ def _without_slopes(M: Array, b: Array, count: int) -> tuple[Array, Array]:
 
 def _on_facets(facets: Facets, axes: Array, S: Array, r: Array) -> Array:
     """Curvature of facets from the equations of their vertices, shape ``(n, gdim, gdim)``."""
-    n, v, k, _ = axes.shape
+    k = axes.shape[2]
     own = tangents(facets.normal)
-    # turns a facet's tangents into those of its vertices: what projection leaves, without strain
-    U, _, V = np.linalg.svd(np.einsum("nvig,njg->nvij", axes, own))
-    turn = U @ V
+    turn = _rotations(np.einsum("nvig,njg->nvij", axes, own))
     # K at a vertex, turn K turnᵀ, from the entries of K on the facet
     unit = np.zeros((S.shape[-1], k, k))
     for entry, (i, j) in enumerate(combinations_with_replacement(range(k), 2)):
         unit[entry, i, j] = unit[entry, j, i] = 1.0
     i, j = np.array(list(combinations_with_replacement(range(k), 2))).T
     P = np.einsum("nvia,eab,nvjb->nveij", turn, unit, turn)[..., i, j].swapaxes(2, 3)
-    S, r = S.reshape(n, v, *S.shape[1:]), r.reshape(n, v, -1)
     total = np.einsum("nvki,nvkl,nvlj->nij", P, S, P)
     right = np.einsum("nvki,nvk->ni", P, r)
     value, vector = np.linalg.eigh(total)
@@ -142,3 +141,19 @@ def _on_facets(facets: Facets, axes: Array, S: Array, r: Array) -> Array:
     entries = np.einsum("nik,nk,njk,nj->ni", vector, inverse, vector, right)
     K = np.einsum("ne,eij->nij", entries, unit)
     return np.einsum("nij,nig,njh->ngh", K, own, own)
+
+
+def _rotations(A: Array) -> Array:
+    """What turns tangents of one plane into those of another, from their products.
+
+    Of their projection it leaves out the strain.
+
+    Args:
+        A: Shape ``(..., 1, 1)`` or ``(..., 2, 2)``.
+    """
+    if A.shape[-1] == 1:
+        return np.ones_like(A)
+    cosine, sine = A[..., 0, 0] + A[..., 1, 1], A[..., 1, 0] - A[..., 0, 1]
+    length = np.hypot(cosine, sine)
+    turn = np.array([[cosine, -sine], [sine, cosine]]) / np.where(length > 0.0, length, 1.0)
+    return np.moveaxis(turn, (0, 1), (-2, -1))
