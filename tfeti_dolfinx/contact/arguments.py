@@ -16,6 +16,9 @@ from tfeti_dolfinx.errors import InputError
 # that do are taken in after the solve
 REACH = 0.05
 
+# what the geometry has for a gap: the distance of facets, or of the smooth surfaces through them
+GEOMETRY, CURVED = "geometry", "curved"
+
 Gap = str | float | Callable[[Array], ArrayLike]
 
 
@@ -82,16 +85,16 @@ def checked_reach(name: str, reach: float | None, extent: float) -> float:
 
 
 def checked_gap(name: str, gap: Gap) -> None:
-    """Raise if a gap is none of "geometry", a finite number, a callable.
+    """Raise if a gap is none of "geometry", "curved", a finite number, a callable.
 
     Raises:
         InputError: It is not.
     """
     number = isinstance(gap, Real) and not isinstance(gap, bool) and np.isfinite(float(gap))
-    if not (number or callable(gap) or (isinstance(gap, str) and gap == "geometry")):
+    if not (number or callable(gap) or (isinstance(gap, str) and gap in (GEOMETRY, CURVED))):
         raise InputError(
-            f'{name}: gap={gap!r}, expected "geometry", a finite length (negative: interference), '
-            "or a function of points of shape (3, n)"
+            f'{name}: gap={gap!r}, expected "geometry", "curved", a finite length (negative: '
+            "interference), or a function of points of shape (3, n)"
         )
 
 

@@ -12,6 +12,7 @@ from tfeti_dolfinx.contact.records import ContactRecords, Friction
 from tfeti_dolfinx.contact.sides import Side
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.frames import frames
+from tfeti_dolfinx.mortar.integrals import GapIntegrals
 from tfeti_dolfinx.parallel import Exchange, owner_of
 
 # of ∫φ_i: a node whose hat is covered by less has slivers of facets only, and divides by them
@@ -33,17 +34,16 @@ class Shares:
     Attributes:
         vertices: Global groups of the facets' vertices, shape ``(f, v)``.
         covered: ∫φ_i over the covered part of each facet, shape ``(f, v)``.
-        gap: ∫ψ_i g over the facets, g the gap along the node's normal, shape ``(f, v)``.
+        gap: Gap g along the node's normal, between the facets or of an obstacle.
+        curved_gap: That between the smooth surfaces that facets stand for.
         entries: Triplets (multiplier's group, displacement's group, ∫ψ_i φ_k with its sign).
-        bounds: Smallest and largest g on each facet, shapes ``(f, v)``. ψ_i is negative somewhere,
-            and a mean with it would else fall below the smallest gap.
     """
 
     vertices: Array
     covered: Array
-    gap: Array
+    gap: GapIntegrals
+    curved_gap: GapIntegrals
     entries: tuple[Triplets, ...]
-    bounds: tuple[Array, Array] | None = None
 
 
 def conditions(dofs: TornDofs, contact: int, side: Side, shares: Shares) -> ContactRecords:
@@ -60,8 +60,11 @@ def conditions(dofs: TornDofs, contact: int, side: Side, shares: Shares) -> Cont
     """
     area = dofs.add_on_owners(shares.vertices.ravel(), shares.covered.ravel())
     whole = dofs.add_on_owners(side.vertices.ravel(), side.areas.ravel())
-    gap = _without_rounding(dofs, _mean_gaps(dofs, shares, area))
     chosen = np.flatnonzero(area > HARDLY_COVERED * whole)
+    vertices, areas = shares.vertices, area[chosen]
+    gap, _ = _mean_gaps(dofs, vertices, shares.gap, areas, chosen)
+    curved_gap, spread = _mean_gaps(dofs, vertices, shares.curved_gap, areas, chosen)
+    changed = np.abs(_without_rounding(dofs, curved_gap - gap))
     place = np.full(dofs.num_groups, -1)
     place[chosen] = np.arange(len(chosen))
     slot, column, value = _merged(dofs, shares.entries)
@@ -71,9 +74,11 @@ def conditions(dofs: TornDofs, contact: int, side: Side, shares: Shares) -> Cont
         contact=np.full(len(chosen), contact),
         group=chosen,
         frame=frames(side.normals[chosen]),
-        gap=gap[chosen],
-        geometric_gap=gap[chosen],
-        area=area[chosen],
+        gap=gap,
+        geometric_gap=gap,
+        curved_gap=curved_gap,
+        conforms=changed > spread,
+        area=areas,
         within_reach=np.ones(len(chosen), dtype=bool),
         condition=place[slot],
         entry_group=column,
@@ -89,16 +94,19 @@ def triplets(rows: Array, columns: Array, values: Array) -> Triplets:
     return i.ravel(), j.ravel(), values.ravel()
 
 
-def _mean_gaps(dofs: TornDofs, shares: Shares, area: Array) -> Array:
-    """∫ψ_i g / ∫ψ_i of the owned groups, between the bounds on g; 0 off the surface. Collective."""
-    vertices = shares.vertices.ravel()
-    total = dofs.add_on_owners(vertices, shares.gap.ravel())
-    mean = np.divide(total, area, out=np.zeros_like(area), where=area > 0.0)
-    if shares.bounds is None:
-        return mean
-    low = dofs.reduce_on_owners(vertices, shares.bounds[0].ravel(), np.minimum, np.inf)
-    high = dofs.reduce_on_owners(vertices, shares.bounds[1].ravel(), np.maximum, -np.inf)
-    return np.clip(mean, low, high)
+def _mean_gaps(
+    dofs: TornDofs, vertices: Array, gap: GapIntegrals, area: Array, chosen: Array
+) -> tuple[Array, Array]:
+    """∫ψ_i g / ∫ψ_i of some owned groups, and by how much g varies around them. Collective.
+
+    It is kept between the bounds on g: ψ_i is negative somewhere, and the mean would else fall
+    below the smallest gap.
+    """
+    groups = vertices.ravel()
+    total = dofs.add_on_owners(groups, gap.total.ravel())[chosen]
+    low = dofs.reduce_on_owners(groups, gap.lowest.ravel(), np.minimum, np.inf)[chosen]
+    high = dofs.reduce_on_owners(groups, gap.highest.ravel(), np.maximum, -np.inf)[chosen]
+    return _without_rounding(dofs, np.clip(total / area, low, high)), high - low
 
 
 def _without_rounding(dofs: TornDofs, gap: Array) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.contact.arguments import Gap, given_gaps
+from tfeti_dolfinx.contact.arguments import CURVED, Gap, given_gaps
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -36,5 +36,5 @@ def gaps_of(
     with raised_on_all_ranks(dofs.comm):
         given = given_gaps(name, gap, x)
     if given is None:
-        return records.geometric_gap
+        return records.curved_gap if gap == CURVED else records.geometric_gap
     return np.where(records.geometric_gap <= depth, given, records.geometric_gap)

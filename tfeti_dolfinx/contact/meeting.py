@@ -51,9 +51,9 @@ def meeting(
         vertices=vertices[own],
         covered=integrals.covered,
         gap=integrals.gap,
+        curved_gap=integrals.curved_gap,
         entries=(
             triplets(vertices[own], secondary.groups[own], integrals.own),
             triplets(vertices[pair], theirs, -integrals.other),
         ),
-        bounds=(integrals.lowest, integrals.highest),
     )

@@ -20,7 +20,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facet_maps import hat_areas, whole_facets
 from tfeti_dolfinx.mortar.facets import FacetKind, Facets, facet_kind, local_facets
-from tfeti_dolfinx.mortar.integrals import dual_multipliers
+from tfeti_dolfinx.mortar.integrals import GapIntegrals, dual_multipliers
 from tfeti_dolfinx.mortar.surfaces import (
     diameter,
     extent,
@@ -207,9 +207,12 @@ def _shares(dofs: TornDofs, kind: FacetKind, side: Side, distance: Array) -> Sha
     vertices = side.vertices[dual.facet]
     (at_vertices,) = dofs.lookup(vertices.ravel(), distance)
     own = dual.integrals(kind.displacement.values(xi))
+    at_vertices = at_vertices.reshape(dual.covered.shape)
+    gap = GapIntegrals(at_vertices * dual.covered, at_vertices, at_vertices)
     return Shares(
         vertices=vertices,
         covered=dual.covered,
-        gap=at_vertices.reshape(dual.covered.shape) * dual.covered,
+        gap=gap,
+        curved_gap=gap,
         entries=(triplets(vertices, surface.groups[dual.facet], own),),
     )

@@ -215,9 +215,10 @@ class Contact:
             InputError: The surfaces overlap by more than ``depth`` and no gap is given, or it is
                 no number somewhere.
         """
+        found = gaps_of(self.name, self.gap, records, dofs, depth)
         if isinstance(self.gap, str):
-            self._check_depth(records, depth, dofs.comm)
-        return gaps_of(self.name, self.gap, records, dofs, depth)
+            self._check_depth(found, depth, dofs.comm)
+        return found
 
     def _sides(self, dofs: TornDofs, decomposition: Decomposition) -> tuple[Side, Side]:
         if dofs.bs != decomposition.mesh.geometry.dim:
@@ -254,8 +255,8 @@ class Contact:
     def _exchanged(self) -> Contact:
         return replace(self, a=self.b, b=self.a)
 
-    def _check_depth(self, found: ContactRecords, depth: float, comm: MPI.Intracomm) -> None:
-        lowest = comm.allreduce(float(found.geometric_gap.min(initial=0.0)), op=MPI.MIN)
+    def _check_depth(self, gap: Array, depth: float, comm: MPI.Intracomm) -> None:
+        lowest = comm.allreduce(float(gap.min(initial=0.0)), op=MPI.MIN)
         deepest = -lowest
         if deepest > depth:
             raise InputError(

@@ -29,6 +29,11 @@ class ContactPartner(Protocol):
         ...
 
     @property
+    def gap(self) -> Gap:
+        """What its gaps are: those of the geometry, or given."""
+        ...
+
+    @property
     def friction(self) -> Law | None:
         """Its law of friction."""
         ...

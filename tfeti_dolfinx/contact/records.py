@@ -34,6 +34,10 @@ class ContactRecords:
             in which the node may not go further, the others are tangents.
         gap: Distance g_i, a length, shape ``(n,)``.
         geometric_gap: The distance that the geometry has, whatever a user gives, shape ``(n,)``.
+        curved_gap: The distance between the smooth surfaces that the facets of both sides stand
+            for, shape ``(n,)``.
+        conforms: Whether the facets change the gap by more than that of the smooth surfaces varies
+            from node to node, shape ``(n,)``.
         area: Integral ∫φ_i of the node's hat over the contact surface, of a pair over what the
             other side covers of it, shape ``(n,)``.
         within_reach: Whether a row is made at once; a condition out of reach gets one only if
@@ -50,6 +54,8 @@ class ContactRecords:
     frame: Array
     gap: Array
     geometric_gap: Array
+    curved_gap: Array
+    conforms: Array
     area: Array
     within_reach: Array
     condition: Array
@@ -91,6 +97,8 @@ def concatenate(records: list[ContactRecords], gdim: int) -> ContactRecords:
         frame=join("frame", np.empty((0, gdim, gdim))),
         gap=join("gap", no_number),
         geometric_gap=join("geometric_gap", no_number),
+        curved_gap=join("curved_gap", no_number),
+        conforms=join("conforms", np.empty(0, dtype=bool)),
         area=join("area", no_number),
         within_reach=join("within_reach", np.empty(0, dtype=bool)),
         condition=np.concatenate([no_index, *conditions]),

@@ -12,6 +12,7 @@ from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.mortar.curvature import with_curvature
 from tfeti_dolfinx.mortar.facet_maps import hat_areas
 from tfeti_dolfinx.mortar.facets import Facets, facet_kind, local_facets, with_averaged_normals
 from tfeti_dolfinx.mortar.surfaces import surface_facets
@@ -33,7 +34,7 @@ class Side:
     """A surface of a pair, or one that faces an obstacle.
 
     Attributes:
-        facets: Its facets on this rank, those of a pair with averaged normals.
+        facets: Its facets on this rank, those of a pair with averaged normals and curvature.
         vertices: Global groups of their vertices, shape ``(n, v)``.
         areas: ∫φ_i over each facet, shape ``(n, v)``.
         normals: Direction in which each owned group may not go further: the averaged normal, at
@@ -70,6 +71,7 @@ def side_of(contact: str, surface: str | int, dofs: TornDofs, decomposition: Dec
     if count := dofs.comm.allreduce(flat):
         raise InputError(f"{contact}: {count} facets of {surface!r} have no area")
     facets, normals = with_averaged_normals(facets, dofs, kind.num_vertices)
+    facets = with_curvature(facets, dofs, kind)
     vertices = facets.groups[:, : kind.num_vertices]
     return Side(facets, vertices, hat_areas(kind, facets), normals)
 

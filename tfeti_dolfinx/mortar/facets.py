@@ -48,6 +48,9 @@ class Facets:
         vertex_normals: Unit normals at the vertices, at first the facet's own, then averaged ones,
             shape ``(n, v, gdim)``.
         area: Area (length in 2D), shape ``(n,)``.
+        curvature: Second derivatives of the height of a smooth surface over the facet's tangent
+            plane (``curvature.py``), negative where the body is convex; at first 0, shape
+            ``(n, gdim, gdim)``.
     """
 
     x: Array
@@ -55,6 +58,7 @@ class Facets:
     normal: Array
     vertex_normals: Array
     area: Array
+    curvature: Array
 
     def __len__(self) -> int:
         return len(self.x)
@@ -124,6 +128,7 @@ def local_facets(dofs: TornDofs, decomposition: Decomposition, facets: Array) ->
         normal=normal,
         vertex_normals=_vertex_normals(kind, x, normal),
         area=area,
+        curvature=np.zeros((len(x), gdim, gdim)),
     )
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tfeti_dolfinx.arrays import Array, sum_rows
+from tfeti_dolfinx.mortar.curvature import beside
 from tfeti_dolfinx.mortar.facet_maps import points
 from tfeti_dolfinx.mortar.facets import FacetKind, Facets
 from tfeti_dolfinx.mortar.segments import FacingPoints, Segments
@@ -16,15 +17,29 @@ HARDLY_COVERED = 1e-6
 
 
 @dataclass(frozen=True)
+class GapIntegrals:
+    """Pointwise gaps along the normals of the secondary facets' vertices, n_i·(x_p − x_s) = g.
+
+    Attributes:
+        total: ∫ψ_i g, shape ``(f, v)``.
+        lowest: Smallest g on the covered part, shape ``(f, v)``.
+        highest: The largest one, infinite where a facet is covered in part, shape ``(f, v)``.
+    """
+
+    total: Array
+    lowest: Array
+    highest: Array
+
+
+@dataclass(frozen=True)
 class MortarIntegrals:
     """Integrals with the dual multipliers ψ_i of the secondary facets' vertices.
 
     Attributes:
-        facet: Secondary facet that ``own``, ``gap``, ``covered`` are of, shape ``(f,)``.
+        facet: Secondary facet that ``own``, the gaps and ``covered`` are of, shape ``(f,)``.
         own: ∫ψ_i φ_k of the facet's own displacement nodes, shape ``(f, v, t)``.
-        gap: ∫ψ_i n_i·(x_primary − x_secondary), shape ``(f, v)``.
-        lowest: Smallest n_i·(x_primary − x_secondary) on the covered part, shape ``(f, v)``.
-        highest: The largest one, infinite where a facet is covered in part, shape ``(f, v)``.
+        gap: Between the facets.
+        curved_gap: Between the smooth surfaces that they stand for.
         covered: ∫φ_i over the covered part, shape ``(f, v)``.
         pair_secondary: Secondary facet that ``other`` is of, shape ``(q,)``.
         pair_primary: Primary facet of each, shape ``(q,)``.
@@ -33,9 +48,8 @@ class MortarIntegrals:
 
     facet: Array
     own: Array
-    gap: Array
-    lowest: Array
-    highest: Array
+    gap: GapIntegrals
+    curved_gap: GapIntegrals
     covered: Array
     pair_secondary: Array
     pair_primary: Array
@@ -99,24 +113,17 @@ def integrate(
     """Integrals of the dual multipliers over segments."""
     at = segments.points
     dual = dual_multipliers(kind, secondary.area, at.secondary, at.xi, segments.weight)
-    normals = secondary.vertex_normals[dual.facet]
-    apart = _apart(kind, secondary, primary, at)
-    lowest, highest = _range(
-        dual,
-        normals,
-        np.concatenate((at.secondary, segments.corners.secondary)),
-        np.concatenate((apart, _apart(kind, secondary, primary, segments.corners))),
-        segments.whole,
-    )
+    gap = curved_gap = _gaps(kind, secondary, primary, segments, dual)
+    if np.any(secondary.curvature) or np.any(primary.curvature):
+        curved_gap = _gaps(kind, secondary, primary, segments, dual, curved=True)
     stride = max(len(primary), 1)
     pair, pair_place = np.unique(at.secondary * stride + at.primary, return_inverse=True)
     theirs = kind.displacement.values(at.eta)
     return MortarIntegrals(
         facet=dual.facet,
         own=dual.integrals(kind.displacement.values(at.xi)),
-        gap=np.sum(dual.integrals(apart) * normals, axis=2),
-        lowest=lowest,
-        highest=highest,
+        gap=gap,
+        curved_gap=curved_gap,
         covered=dual.covered,
         pair_secondary=pair // stride,
         pair_primary=pair % stride,
@@ -124,7 +131,32 @@ def integrate(
     )
 
 
-def _apart(kind: FacetKind, secondary: Facets, primary: Facets, at: FacingPoints) -> Array:
+def _gaps(
+    kind: FacetKind,
+    secondary: Facets,
+    primary: Facets,
+    segments: Segments,
+    dual: DualMultipliers,
+    curved: bool = False,
+) -> GapIntegrals:
+    """Gaps over segments, between the facets or the smooth surfaces that they stand for."""
+    normals = secondary.vertex_normals[dual.facet]
+    at, corners = (
+        _apart(kind, secondary, primary, of, curved) for of in (segments.points, segments.corners)
+    )
+    lowest, highest = _range(
+        dual,
+        normals,
+        np.concatenate((segments.points.secondary, segments.corners.secondary)),
+        np.concatenate((at, corners)),
+        segments.whole,
+    )
+    return GapIntegrals(np.sum(dual.integrals(at) * normals, axis=2), lowest, highest)
+
+
+def _apart(
+    kind: FacetKind, secondary: Facets, primary: Facets, at: FacingPoints, curved: bool
+) -> Array:
     """Vectors along the surface's normal that close the gap, shape ``(m, gdim)``.
 
     From one facet to the other one looks along the normal of a whole facet; what closes the gap
@@ -132,6 +164,9 @@ def _apart(kind: FacetKind, secondary: Facets, primary: Facets, at: FacingPoints
     """
     there = points(kind.geometry, primary.x[at.primary], at.eta)
     here = points(kind.geometry, secondary.x[at.secondary], at.xi)
+    if curved:
+        there = there + beside(kind, primary, at.primary, at.eta)
+        here = here + beside(kind, secondary, at.secondary, at.xi)
     normal = points(kind.hats, secondary.vertex_normals[at.secondary], at.xi)
     distance = np.sum((there - here) * normal, axis=1) / np.sum(normal**2, axis=1)
     return distance[:, None] * normal
