@@ -124,7 +124,11 @@ def solve_with_friction(
             break
         change = bounds.change(result.lam)
         if change <= tolerance and asked <= least:
-            break
+            if goal is not None or bounds.fit(result, rule):
+                break
+            if not on_law.may_try:
+                result.reason = ConvergedReason.CONVERGED_FRICTION_RTOL
+                break
         if bounds.astray or iterations >= options.friction_max_it:
             result.reason = ConvergedReason.DIVERGED_FRICTION
             break

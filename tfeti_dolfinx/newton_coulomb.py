@@ -13,7 +13,13 @@ from tfeti_dolfinx.parallel import agreed, norm_over
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.law import Law
-from tfeti_dolfinx.qp.law_newton import UNSEEN, LawPoint, newton_on_law, residual_of
+from tfeti_dolfinx.qp.law_newton import (
+    UNSEEN,
+    LawPoint,
+    follow_friction,
+    newton_on_law,
+    residual_of,
+)
 from tfeti_dolfinx.qp.oblique import NoOblique, Oblique
 from tfeti_dolfinx.qp.problem import QP
 from tfeti_dolfinx.solver import learn
@@ -21,6 +27,8 @@ from tfeti_dolfinx.solver import learn
 # how often it may end and its bounds not be at rest; the factor on its target each time, and at
 # least on its residual; of ‖F‖‖λ‖: what rounding leaves of that
 TRIES, FINER, ROUNDING = 4, 0.03, 2e-16
+# of the first residual: what points on the path of growing friction are solved to
+LOOSE = 1e-3
 
 
 class NewtonOnCoulomb:
@@ -43,6 +51,11 @@ class NewtonOnCoulomb:
         self._recycled = dual.recycled
         # the same load again: the last bounds are right
         self._rests = dual.last.is_of(dual.d, dual.coarse.e)
+
+    @property
+    def may_try(self) -> bool:
+        """Whether it is wanted, has not failed, and may end nearer to the law."""
+        return self._tries > 0
 
     def give_up(self) -> None:
         """Try no more, and keep nothing of what has led nowhere."""
@@ -75,7 +88,11 @@ class NewtonOnCoulomb:
         if target <= ROUNDING * norm * norm_over(self._dual.coarse.comm, start[0]):
             end, steps = None, 0
         else:
-            end, steps = newton_on_law(qp, law, self._oblique, first, target, norm)
+            given = qp, law, self._oblique, first, target, norm
+            end, steps = newton_on_law(*given)
+            if end is None:
+                end, more = follow_friction(*given, loose=LOOSE * residual)
+                steps += more
         constraints.set_pressures(known)
         self.steps, self._share = self.steps + steps, FINER * self._share
         self._tries -= 1

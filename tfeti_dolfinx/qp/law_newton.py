@@ -22,6 +22,8 @@ from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
 
 # steps; and steps in a row without a residual below so much of the least one, before one gives up
 MOST_STEPS, PATIENCE, LESS = 80, 10, 0.98
+# steps for one share of the coefficients, and on the whole path; and its shortest step
+MOST_A_SHARE, MOST_ON_PATH, SHORTEST = 25, 1000, 1e-5
 # of a residual: rounding of the λ that has it; from there nothing comes lower
 ROUNDING = 1e-16
 # directions of one solve
@@ -83,6 +85,7 @@ def newton_on_law(
     at: LawPoint,
     target: float,
     norm: float,
+    most_steps: int = MOST_STEPS,
 ) -> tuple[LawPoint | None, int]:
     """Solve λ = P(λ − s/‖F‖), P the projection onto Ω(λ_N − s_N/‖F‖), and Gλ = e. Collective.
 
@@ -97,13 +100,14 @@ def newton_on_law(
         at: Where to start.
         target: Ends where ‖F‖‖λ − P(λ − s/‖F‖)‖, and ‖F‖ times the distance to Gλ = e, are that.
         norm: ‖F‖, or an estimate.
+        most_steps: Steps at most.
 
     Returns:
         Where it has ended, None if it gave up; and the steps taken.
     """
     last, best, idle, length = 0.0, np.inf, 0, 0.0
     turning = Turning(law)
-    for step in range(MOST_STEPS):
+    for step in range(most_steps):
         # Step 1: what a gradient step, brought back, moves, and what Gλ lacks
         feasible, p = law.nearest(at.lam - at.s / norm)
         residual = norm * _missed(qp, p, at.lam)
@@ -127,6 +131,49 @@ def newton_on_law(
             break
         at, last = system.end(), residual
     return None, step + 1
+
+
+def follow_friction(
+    qp: QP,
+    law: Law,
+    oblique: Callable[[Face, csr_array], Oblique],
+    at: LawPoint,
+    target: float,
+    norm: float,
+    loose: float,
+) -> tuple[LawPoint | None, int]:
+    """Solve the law along the path of its solutions for growing shares of its coefficients.
+
+    Without friction the solution is unique, and where bodies are held the path that begins there is
+    bounded, so that it leads on to the whole coefficients (Allgower, Georg, Introduction to
+    Numerical Continuation Methods, 2003, chapter 11). The share grows by twice the last step, by a
+    quarter of it where Newton's method fails. It gives up where the path turns back. Collective.
+
+    Args:
+        qp: The program; its set is not looked at.
+        law: The sets.
+        oblique: Makes the projectors of a face and of what follows it.
+        at: Where to start.
+        target: As of ``newton_on_law``, at the end.
+        norm: ‖F‖, or an estimate.
+        loose: The same on the way.
+
+    Returns:
+        Where it has ended, None if it gave up; and the steps taken.
+    """
+    point, steps = newton_on_law(qp, law.with_share(0.0), oblique, at, loose, norm)
+    share, length = 0.0, 1.0
+    while point is not None and share < 1.0 and length >= SHORTEST and steps < MOST_ON_PATH:
+        new = min(share + length, 1.0)
+        goal = target if new == 1.0 else loose
+        given = qp, law.with_share(new), oblique, point, goal, norm, MOST_A_SHARE
+        end, taken = newton_on_law(*given)
+        steps += taken
+        if end is None:
+            length *= 0.25
+        else:
+            point, share, length = end, new, 2.0 * length
+    return (point if share == 1.0 else None), steps
 
 
 def residual_of(qp: QP, law: Law, at: LawPoint, norm: float) -> float:
