@@ -61,7 +61,9 @@ class NewtonOnCoulomb:
         """Try no more, and keep nothing of what has led nowhere."""
         self._tries, self._dual.recycled = 0, self._recycled
 
-    def solve(self, start: tuple[Array, Array] | None) -> tuple[Array, Array] | None:
+    def solve(
+        self, start: tuple[Array, Array] | None, aim: float = np.inf
+    ) -> tuple[Array, Array] | None:
         """λ on this rank's rows and the multipliers of Gλ = e for which the law holds.
 
         A step multiplies by F once, and once for each direction of its solve; so does the start,
@@ -69,6 +71,7 @@ class NewtonOnCoulomb:
 
         Args:
             start: Where to start; None: nothing is tried, nor where no solve has seen F yet.
+            aim: What residual an answer must have to be right, as far as a look has told.
 
         Returns:
             None where it is not tried, or fails.
@@ -84,7 +87,7 @@ class NewtonOnCoulomb:
         constraints = self._dual.constraints
         known = constraints.pressures[constraints.pressed]
         residual, first = self._first(qp, law, start)
-        target = min(self._target(qp), FINER * residual)
+        target = min(self._target(qp), FINER * residual, aim)
         if target <= ROUNDING * norm * norm_over(self._dual.coarse.comm, start[0]):
             end, steps = None, 0
         else:
