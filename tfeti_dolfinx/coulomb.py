@@ -93,14 +93,14 @@ def solve_with_friction(
     bounds, steps, looks = Pressures(dual, options, start), Steps(), 0
     least = options.number
     tolerance = min(options.friction_rtol, BESIDE_RTOL * least)
-    change, rtol, iterations = np.inf, FIRST, 0
+    change, rtol, iterations, aim = np.inf, FIRST, 0, np.inf
     on_law = NewtonOnCoulomb(dual, options, qp_type)
     while True:
         start = bounds.set_feasible(start)
         near = change <= NEAR * tolerance
         # where Newton's method has brought them so near, problems would follow their rounding
         tries = bounds.are_known and (on_law.steps > 0 or not near)
-        solved = on_law.solve(start) if tries else None
+        solved = on_law.solve(start, aim) if tries else None
         if solved is not None:
             bounds.take(solved[0])
         else:
@@ -111,6 +111,7 @@ def solve_with_friction(
         given = replace(options, rtol=asked), qp_type, solved or start
         result, rule = solve_dual(dual, *given, monitor, exact)
         iterations, looks = iterations + 1, looks + rule.looks
+        aim = rule.tolerance * least / asked
         steps = steps.plus(result.steps)
         if result.reason <= 0 and solved is not None:
             on_law.give_up()
@@ -124,7 +125,11 @@ def solve_with_friction(
             break
         change = bounds.change(result.lam)
         if change <= tolerance and asked <= least:
-            break
+            if goal is not None or bounds.fit(result, rule):
+                break
+            if not on_law.may_try:
+                result.reason = ConvergedReason.CONVERGED_FRICTION_RTOL
+                break
         if bounds.astray or iterations >= options.friction_max_it:
             result.reason = ConvergedReason.DIVERGED_FRICTION
             break
@@ -132,7 +137,7 @@ def solve_with_friction(
             bounds.advance()
         if result.steps.inner == 0 and solved is None:
             rtol *= SHARE
-        start = (np.array(result.lam.array_r), result.mu)
+        start = solved or (np.array(result.lam.array_r), result.mu)
         result.destroy()
     result.steps, rule.looks = steps, looks
     last = dual.F.count["solver"] - before

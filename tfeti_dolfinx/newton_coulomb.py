@@ -13,7 +13,13 @@ from tfeti_dolfinx.parallel import agreed, norm_over
 from tfeti_dolfinx.qp.faces import Face
 from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.law import Law
-from tfeti_dolfinx.qp.law_newton import UNSEEN, LawPoint, newton_on_law, residual_of
+from tfeti_dolfinx.qp.law_newton import (
+    UNSEEN,
+    LawPoint,
+    follow_friction,
+    newton_on_law,
+    residual_of,
+)
 from tfeti_dolfinx.qp.oblique import NoOblique, Oblique
 from tfeti_dolfinx.qp.problem import QP
 from tfeti_dolfinx.solver import learn
@@ -21,6 +27,8 @@ from tfeti_dolfinx.solver import learn
 # how often it may end and its bounds not be at rest; the factor on its target each time, and at
 # least on its residual; of ‖F‖‖λ‖: what rounding leaves of that
 TRIES, FINER, ROUNDING = 4, 0.03, 2e-16
+# of the first residual: what points on the path of growing friction are solved to
+LOOSE = 1e-3
 
 
 class NewtonOnCoulomb:
@@ -44,11 +52,18 @@ class NewtonOnCoulomb:
         # the same load again: the last bounds are right
         self._rests = dual.last.is_of(dual.d, dual.coarse.e)
 
+    @property
+    def may_try(self) -> bool:
+        """Whether it is wanted, has not failed, and may end nearer to the law."""
+        return self._tries > 0
+
     def give_up(self) -> None:
         """Try no more, and keep nothing of what has led nowhere."""
         self._tries, self._dual.recycled = 0, self._recycled
 
-    def solve(self, start: tuple[Array, Array] | None) -> tuple[Array, Array] | None:
+    def solve(
+        self, start: tuple[Array, Array] | None, aim: float = np.inf
+    ) -> tuple[Array, Array] | None:
         """λ on this rank's rows and the multipliers of Gλ = e for which the law holds.
 
         A step multiplies by F once, and once for each direction of its solve; so does the start,
@@ -56,6 +71,7 @@ class NewtonOnCoulomb:
 
         Args:
             start: Where to start; None: nothing is tried, nor where no solve has seen F yet.
+            aim: What residual an answer must have to be right, as far as a look has told.
 
         Returns:
             None where it is not tried, or fails.
@@ -71,11 +87,15 @@ class NewtonOnCoulomb:
         constraints = self._dual.constraints
         known = constraints.pressures[constraints.pressed]
         residual, first = self._first(qp, law, start)
-        target = min(self._target(qp), FINER * residual)
+        target = min(self._target(qp), FINER * residual, aim)
         if target <= ROUNDING * norm * norm_over(self._dual.coarse.comm, start[0]):
             end, steps = None, 0
         else:
-            end, steps = newton_on_law(qp, law, self._oblique, first, target, norm)
+            given = qp, law, self._oblique, first, target, norm
+            end, steps = newton_on_law(*given)
+            if end is None:
+                end, more = follow_friction(*given, loose=LOOSE * residual)
+                steps += more
         constraints.set_pressures(known)
         self.steps, self._share = self.steps + steps, FINER * self._share
         self._tries -= 1

@@ -7,13 +7,14 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.arrays import TINY, Array, sums
 from tfeti_dolfinx.dilation import DilatedGaps, cone_set
-from tfeti_dolfinx.dual.dual import Dual
+from tfeti_dolfinx.dual.accuracy import Accuracy
+from tfeti_dolfinx.dual.dual import Dual, contact_set
 from tfeti_dolfinx.errors import ConvergenceError
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.parallel import agreed, any_rank, norm_over, summed
 from tfeti_dolfinx.qp.acceleration import Anderson
 from tfeti_dolfinx.qp.nearest import nearest_or_least
-from tfeti_dolfinx.qp.problem import ConvergedReason
+from tfeti_dolfinx.qp.problem import ConvergedReason, QPResult
 
 # of all multipliers, or of those that make what drives the problem: forces of normals that rounding
 # makes of none; as bounds they would be discs whose boundaries bend so much that nothing else is
@@ -59,7 +60,7 @@ class Pressures:
         self._weight = self._mu * dual.constraints.tangent_scale[at]
         self._now, self._found, self._none = self._first(start), np.zeros(len(at)), 0.0
         self._before = self._now
-        self.restless = -1
+        self.restless, self._change = -1, np.inf
         self._held: Array = np.full(len(at), np.inf)
         self._anderson = Anderson(self._products)
 
@@ -153,11 +154,31 @@ class Pressures:
         least = self._on_bodies(np.full(len(self._rows), self._none)).max(initial=TINY)
         size = np.maximum(size, max(least, LIGHT * size.max(initial=0.0)))
         change, body = agreed(self._comm, _largest(miss / size))
-        self.restless = int(body)
+        self.restless, self._change = int(body), change
         self._idle += 1
         if change <= 0.5 * self._best:
             self._best, self._idle = change, 0
         return change
+
+    def fit(self, result: QPResult, rule: Accuracy) -> bool:
+        """Whether u is right to rtol with the limits of the forces that were found, too.
+
+        The rule has looked at the answer with the limits that it was found with; from now on it
+        tells the larger errors. Of an answer that is a sum of two only the change is known.
+
+        Args:
+            result: The last solution.
+            rule: Its accuracy.
+        """
+        if not rule.is_of(self._dual):
+            return self._change <= rule.rtol
+        self._constraints.set_pressures(self._found)
+        given, self._dual.feasible = self._dual.feasible, contact_set(self._constraints)
+        residual = max(result.projected_gradient, result.norm * result.equality)
+        fits = rule.look_again(result.lam, result.gradient, result.face, residual)
+        self._constraints.set_pressures(self._now)
+        self._dual.feasible = given
+        return fits
 
     def _on_bodies(self, pressures: Array) -> Array:
         """Norms of the nodal forces μ times those of normals make on each body."""

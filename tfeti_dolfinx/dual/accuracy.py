@@ -101,12 +101,17 @@ class Accuracy:
         reference, rounding = scale
         self._rounding, self.norm = rounding, norm or 1.0
         self._before: Measures | None = None
+        self._least: Array = np.zeros(1)
         self.tolerance = max(rtol**FIRST_LOOK * reference, atol, rounding)
         self._small = max(SMALL * rtol * reference, LITTLE * rounding)
         self.drifted, self.looks, self._stalls, self._claimed = False, 0, 0, 1.0
         self.measures: Measures | None = None
         self.goal: Goal | None = None
         self.reached: list[Reached] = []
+
+    def is_of(self, scene: LookedAt) -> bool:
+        """Whether this is what is looked at."""
+        return self._scene is scene
 
     @property
     def aim(self) -> float:
@@ -157,6 +162,22 @@ class Accuracy:
         self.tolerance, self._claimed = tolerance, residual
         return ConvergedReason.ITERATING
 
+    def look_again(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float) -> bool:
+        """Measure the iterate of the last look with another set of multipliers. Collective.
+
+        Bounds of friction that a solve was given are not those of its forces. What the last look
+        has seen stays the least of the errors.
+
+        Returns:
+            Whether it is right to the tolerance with that set, too.
+        """
+        self._least = self.errors()
+        self.look(lam, gradient, face, residual)
+        self._before = None
+        now = self._looked()
+        ratio, longest = agreed(self._scene.coarse.comm, (self.ratio(), self._longest(now)))
+        return bool(ratio <= 1.0 or longest <= self._atol)
+
     def accept_rounding(self) -> None:
         """Where no solver comes any farther, what rounding may explain is good enough."""
         self._small = float("inf")
@@ -202,7 +223,7 @@ class Accuracy:
         estimate = shown * own
         if before is not None and before.error > 0.0:
             estimate = np.maximum(estimate, bodies.change * (now.error / before.error))
-        return np.asarray(estimate + bodies.correction)
+        return np.maximum(estimate + bodies.correction, self._least)
 
     def tolerances(self) -> Tolerances:
         """What the last look is compared with."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -24,15 +24,21 @@ class Law:
         at: Makes Ω of the λ_N of all points, shape ``(p,)``.
         normals: Row of λ_N of each point, shape ``(p,)``.
         tangents: Rows of its λ_T, shape ``(p, k)``.
+        share: Of all coefficients of friction: Ω(share λ_N) is the set.
     """
 
     at: Callable[[Array], FeasibleSet]
     normals: Array
     tangents: Array
+    share: float = 1.0
+
+    def with_share(self, share: float) -> Law:
+        """Return the law with this share of all coefficients; 0 is contact without friction."""
+        return replace(self, share=share)
 
     def nearest(self, y: Array) -> tuple[FeasibleSet, Array]:
         """Ω(y_N⁺), and the nearest point to y in it."""
-        feasible = self.at(np.maximum(y[self.normals], 0.0))
+        feasible = self.at(self.share * np.maximum(y[self.normals], 0.0))
         return feasible, feasible.project(y)
 
     def slips(self, face: Face) -> Array:

@@ -22,6 +22,10 @@ from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
 
 # steps; and steps in a row without a residual below so much of the least one, before one gives up
 MOST_STEPS, PATIENCE, LESS = 80, 10, 0.98
+# steps for one share of the coefficients, and on the whole path; and its shortest step
+MOST_A_SHARE, MOST_ON_PATH, SHORTEST = 25, 1000, 1e-5
+MEMORY, LEAST = 5, 0.01
+EXACT = 1e-3
 # of a residual: rounding of the λ that has it; from there nothing comes lower
 ROUNDING = 1e-16
 # directions of one solve
@@ -51,6 +55,13 @@ class LawPoint:
     lam: Array
     s: Array
     mu: Array
+
+    def towards(self, other: LawPoint, length: float) -> LawPoint:
+        """The point so far along the way to another one."""
+        if length == 1.0:
+            return other
+        ends = (self.lam, other.lam), (self.s, other.s), (self.mu, other.mu)
+        return LawPoint(*((1.0 - length) * a + length * b for a, b in ends))
 
 
 class Turning:
@@ -83,6 +94,8 @@ def newton_on_law(
     at: LawPoint,
     target: float,
     norm: float,
+    most_steps: int = MOST_STEPS,
+    most: float = SHARE,
 ) -> tuple[LawPoint | None, int]:
     """Solve λ = P(λ − s/‖F‖), P the projection onto Ω(λ_N − s_N/‖F‖), and Gλ = e. Collective.
 
@@ -97,13 +110,16 @@ def newton_on_law(
         at: Where to start.
         target: Ends where ‖F‖‖λ − P(λ − s/‖F‖)‖, and ‖F‖ times the distance to Gλ = e, are that.
         norm: ‖F‖, or an estimate.
+        most_steps: Steps at most.
+        most: What a solve leaves of its residual at most.
 
     Returns:
         Where it has ended, None if it gave up; and the steps taken.
     """
     last, best, idle, length = 0.0, np.inf, 0, 0.0
+    past: list[float] = []
     turning = Turning(law)
-    for step in range(MOST_STEPS):
+    for step in range(most_steps):
         # Step 1: what a gradient step, brought back, moves, and what Gλ lacks
         feasible, p = law.nearest(at.lam - at.s / norm)
         residual = norm * _missed(qp, p, at.lam)
@@ -117,7 +133,7 @@ def newton_on_law(
         p, face = turning.face(feasible, p, at.s)
         # Steps 3 and 4: onto the face, and a solve there
         eased = face.with_directions(np.flatnonzero(face.curvature <= HARD * norm))
-        share = min(SHARE, FOLLOWED * residual / last) if step else SHARE
+        share = min(most, FOLLOWED * residual / last) if step else most
         on = OnFace(eased, law.following(p, face), p)
         try:
             system = _System(qp, on, oblique(eased, on.C), at)
@@ -125,8 +141,68 @@ def newton_on_law(
             length = min(system.solve(share, FINAL * target) or length, 1.0)
         except FactorError:
             break
-        at, last = system.end(), residual
+        past = [*past[1 - MEMORY :], residual]
+        at, last = _searched(qp, law, at, system.end(), norm, max(past)), residual
     return None, step + 1
+
+
+def _searched(
+    qp: QP, law: Law, at: LawPoint, end: LawPoint, norm: float, most: float
+) -> LawPoint:
+    """The farthest of the whole step, half of it, … that does not raise the residual.
+
+    Where F is known of both ends, it is on all of the way: nothing is multiplied.
+    """
+    length = 1.0
+    while length > LEAST:
+        there = at.towards(end, length)
+        if residual_of(qp, law, there, norm) <= most:
+            return there
+        length *= 0.5
+    return end
+
+
+def follow_friction(
+    qp: QP,
+    law: Law,
+    oblique: Callable[[Face, csr_array], Oblique],
+    at: LawPoint,
+    target: float,
+    norm: float,
+    loose: float,
+) -> tuple[LawPoint | None, int]:
+    """Solve the law along the path of its solutions for growing shares of its coefficients.
+
+    Without friction the solution is unique, and where bodies are held the path that begins there is
+    bounded, so that it leads on to the whole coefficients (Allgower, Georg, Introduction to
+    Numerical Continuation Methods, 2003, chapter 11). The share grows by twice the last step, by a
+    quarter of it where Newton's method fails. It gives up where the path turns back. Collective.
+
+    Args:
+        qp: The program; its set is not looked at.
+        law: The sets.
+        oblique: Makes the projectors of a face and of what follows it.
+        at: Where to start.
+        target: As of ``newton_on_law``, at the end.
+        norm: ‖F‖, or an estimate.
+        loose: The same on the way.
+
+    Returns:
+        Where it has ended, None if it gave up; and the steps taken.
+    """
+    point, steps = newton_on_law(qp, law.with_share(0.0), oblique, at, loose, norm, most=EXACT)
+    share, length = 0.0, 1.0
+    while point is not None and share < 1.0 and length >= SHORTEST and steps < MOST_ON_PATH:
+        new = min(share + length, 1.0)
+        goal = target if new == 1.0 else loose
+        given = qp, law.with_share(new), oblique, point, goal, norm
+        end, taken = newton_on_law(*given, MOST_A_SHARE, EXACT)
+        steps += taken
+        if end is None:
+            length *= 0.25
+        else:
+            point, share, length = end, new, 2.0 * length
+    return (point if share == 1.0 else None), steps
 
 
 def residual_of(qp: QP, law: Law, at: LawPoint, norm: float) -> float:

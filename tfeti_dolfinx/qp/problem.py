@@ -109,6 +109,8 @@ class ConvergedReason(IntEnum):
     """Why a solver stopped; positive: converged. Values as in KSPConvergedReason, where it has one.
 
     ITERATING: it has not stopped.
+    CONVERGED_FRICTION_RTOL: the bounds of Coulomb's friction are at rest to ``friction_rtol``, and
+        u is right to rtol for them, but what they leave of the law is more than rtol allows.
     DIVERGED_ROUNDING: residuals cannot be brought down any further in floating point.
     DIVERGED_STALLED: Gλ = e comes no nearer, as if nothing in Ω fulfilled it.
     DIVERGED_FRICTION: the bounds of friction do not come to rest.
@@ -118,6 +120,7 @@ class ConvergedReason(IntEnum):
 
     CONVERGED_RTOL = 2
     CONVERGED_ATOL = 3
+    CONVERGED_FRICTION_RTOL = 20
     ITERATING = 0
     DIVERGED_ITS = -3
     DIVERGED_INDEFINITE_MAT = -10
