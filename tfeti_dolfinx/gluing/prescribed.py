@@ -131,7 +131,7 @@ def check_not_on_tears(
 
 
 def _facet_nodes(dofs: TornDofs, facets: Array) -> Array:
-    """Primal nodes of local facets of one cell, shape ``(f, nodes per facet)``."""
+    """Return the primal nodes of local facets of one cell, shape ``(f, nodes per facet)``."""
     V, of_cells = dofs.V, cell_facets(dofs.V.mesh)
     chosen = np.zeros(int(of_cells.max(initial=-1)) + 1, dtype=bool)
     chosen[facets] = True

@@ -17,7 +17,7 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.transfer import (
     CellExchange,
     cell_values,
-    checked_function,
+    check_function,
     from_cell_values,
 )
 from tfeti_dolfinx.mesh.untorn import PhysicalNames
@@ -118,13 +118,16 @@ class Decomposition:
         return self.facet_tags.find(self.surface(name))
 
     def locate_facets(self, marker: Callable[[Array], ArrayLike]) -> Array:
-        """Local facets of the true boundary whose vertices are all marked, ascending. Collective.
+        """Return local facets of the true boundary whose vertices are marked. Collective.
 
         To ``dolfinx.mesh.locate_entities_boundary`` tears are boundary, too. All facets of the
         true boundary are ``boundary``.
 
         Args:
             marker: From points, shape ``(3, n)``, to flags, shape ``(n,)``.
+
+        Returns:
+            The facets, ascending.
 
         Raises:
             InputError: The marker cannot be called, fails or does not return flags.
@@ -154,13 +157,13 @@ class Decomposition:
         return facets[np.all(flags[corner.reshape(nodes.shape)], axis=1)]
 
     def from_original(self, f: fem.Function) -> fem.Function:
-        """A function on the mesh that was given to ``decompose``, on the torn one. Collective.
+        """Return on the torn mesh what is on the mesh given to ``decompose``. Collective.
 
-        DOLFINx's ``interpolate`` between the two meshes gives wrong values and no error.
+        DOLFINx's ``interpolate`` between the two meshes may give wrong values and no error.
 
         Args:
-            f: From any space whose unknowns do not depend on the directions of edges and facets:
-                Lagrange, DG, quadrature, of any degree and shape.
+            f: A function from any space whose unknowns do not depend on the directions of edges
+                and facets: Lagrange, DG, quadrature, of any degree and shape.
 
         Returns:
             The same function, from a space of the same element. It is a copy.
@@ -178,17 +181,17 @@ class Decomposition:
         """
         expected = "the mesh that was given to decompose"
         with raised_on_all_ranks(self.comm):
-            g = checked_function(f, self._untorn_mesh(), "f", expected)
+            check_function(f, self._untorn_mesh(), "f", expected)
+        g = f.collapse() if f.function_space.component() else f
         V = fem.functionspace(self.mesh, g.function_space.ufl_element())
         return from_cell_values(V, self._cells.to_torn(cell_values(g)), f.name)
 
     def to_original(self, u: fem.Function) -> fem.Function:
-        """A function on the torn mesh, on the one that was given to ``decompose``. Collective.
+        """Return on the mesh given to ``decompose`` what is on the torn one. Collective.
 
         Args:
-            u: As for ``from_original``. Where it is continuous in the bodies, but for rounding,
-                so is what is returned; where it jumps at a tear, or two bodies share a node that
-                is no tear, a continuous space gets the mean of the cells there.
+            u: A function as for ``from_original``. Where it jumps at a tear, or two bodies share a
+                node that is no tear, a continuous space gets the mean of the cells there.
 
         Returns:
             The same function, from a space of the same element. It is a copy.
@@ -198,7 +201,8 @@ class Decomposition:
         """
         with raised_on_all_ranks(self.comm):
             untorn = self._untorn_mesh()
-            g = checked_function(u, self.mesh, "u", "decomposition.mesh, the torn mesh")
+            check_function(u, self.mesh, "u", "decomposition.mesh, the torn mesh")
+        g = u.collapse() if u.function_space.component() else u
         V = fem.functionspace(untorn, g.function_space.ufl_element())
         return from_cell_values(V, self._cells.to_untorn(cell_values(g)), u.name)
 

@@ -38,18 +38,18 @@ class CellExchange:
         self._cell = self._from_owner.send(asking.answer(cell[found]))
 
     def to_torn(self, rows: Array) -> Array:
-        """Rows of the owned cells of the untorn mesh as those of the torn one's cells."""
+        """Return rows of the owned cells of the untorn mesh as those of the torn one's cells."""
         return self._from_owner.answer(rows[self._cell])
 
     def to_untorn(self, rows: Array) -> Array:
-        """Rows of the cells of the torn mesh as those of the untorn one's owned cells."""
+        """Return rows of the cells of the torn mesh as those of the untorn one's owned cells."""
         out = np.empty((self._num_cells, *rows.shape[1:]), dtype=rows.dtype)
         out[self._cell] = self._from_owner.send(rows)
         return out
 
 
-def checked_function(f: Any, mesh: dmesh.Mesh, name: str, expected: str) -> fem.Function:
-    """The function, on a space of its own where it is a component of another.
+def check_function(f: Any, mesh: dmesh.Mesh, name: str, expected: str) -> None:
+    """Raise unless the unknowns of f in a cell of the mesh are those of a cell like it.
 
     Args:
         f: What was given.
@@ -63,24 +63,22 @@ def checked_function(f: Any, mesh: dmesh.Mesh, name: str, expected: str) -> fem.
     checked_type(f, fem.Function, name, f"a dolfinx.fem.Function on {expected}")
     if f.function_space.mesh._cpp_object is not mesh._cpp_object:
         raise InputError(f"{name} is on another mesh; expected a function on {expected}")
-    g = f.collapse() if f.function_space.component() else f
-    if g.function_space.element.needs_dof_transformations:
+    if f.function_space.element.needs_dof_transformations:
         raise InputError(
-            f"{name} is from {g.function_space.ufl_element()}, whose unknowns depend on the "
+            f"{name} is from {f.function_space.ufl_element()}, whose unknowns depend on the "
             "directions of edges and facets; expected a Lagrange, DG or quadrature space"
         )
-    return g
 
 
 def cell_values(f: fem.Function) -> Array:
-    """Unknowns of a function in each owned cell, shape ``(n, m, bs)``. Collective."""
+    """Return the unknowns of a function in each owned cell, shape ``(n, m, bs)``. Collective."""
     V, values = f.function_space, f.copy().x
     values.scatter_forward()
     return values.array.reshape(-1, V.dofmap.bs)[_owned_dofs(V)]
 
 
 def from_cell_values(V: fem.FunctionSpace, values: Array, name: str) -> fem.Function:
-    """The function with these unknowns in the cells, their mean where cells differ. Collective.
+    """Return the function with these unknowns in the cells, or their means. Collective.
 
     Args:
         V: Its space.
@@ -103,6 +101,6 @@ def from_cell_values(V: fem.FunctionSpace, values: Array, name: str) -> fem.Func
 
 
 def _owned_dofs(V: fem.FunctionSpace) -> Array:
-    """Blocks of unknowns of each owned cell, shape ``(n, m)``."""
+    """Return the blocks of unknowns of each owned cell, shape ``(n, m)``."""
     topology = V.mesh.topology
     return np.asarray(V.dofmap.list)[: topology.index_map(topology.dim).size_local]
