@@ -71,10 +71,10 @@ class LoadSteps:
         times: Ends of the steps, increasing.
         begin: Where the first step begins.
         path: File for ParaView with all steps, ``.bp``; None: none. It has its name when the
-            series has ended, also by an error of this package; before that it is
-            ``.<name>.partial`` beside it.
+            series has ended, also by an error of this package, unless that is its own, as on a
+            full disk; before that it is ``.<name>.partial`` beside it.
         interior: Whether the file has the fields of ``solution.interior``, too, as ``write_vtx``.
-        checkpoint: Folder for the last converged step; None: none.
+        checkpoint: Folder for the last converged step, with nothing else in it; None: none.
         max_halvings: How often a step may be halved.
         progress: Whether rank 0 shows a bar; default where its standard error is a terminal.
 
@@ -129,10 +129,12 @@ class LoadSteps:
             The records, with those of earlier runs.
 
         Raises:
-            InputError: As ``ContactProblem.solve``, or the checkpoint is of another series.
+            InputError: As ``ContactProblem.solve``, or the checkpoint is of another series or
+                damaged, or a file cannot be written.
             NoSolutionError: A step has no solution; a note of the error has its time.
             ConvergenceError: A step did not converge, halved as often as allowed.
         """
+        self._drop()
         place = self._begin(resume)
         try:
             with shown_progress(self._comm, self._progress) as show:
@@ -260,6 +262,12 @@ class LoadSteps:
             series.drop()
             raise
         self._series = series
+
+    def _drop(self) -> None:
+        """Remove what a run has begun to write that an error of the user's has ended."""
+        series, self._series = self._series, None
+        if series is not None:
+            series.drop()
 
     def _close(self) -> None:
         series, self._series = self._series, None
