@@ -375,6 +375,23 @@ def test_an_apply_that_fails_on_one_rank():
         tfeti.LoadSteps(driven.problem, apply, [1.0]).run()
 
 
+def test_a_series_that_runs_again_after_an_error_writes_its_own_steps(shared_tmp):
+    driven, wrong = Driven(n=3), [True]
+
+    def apply(problem, t):
+        driven.apply(problem, t)
+        if t == 1.0 and wrong.pop():
+            raise ZeroDivisionError("mine")
+
+    steps = tfeti.LoadSteps(driven.problem, apply, [0.5, 1.0], path=shared_tmp / "again.bp")
+    with pytest.raises(ZeroDivisionError):
+        steps.run()
+    wrong.append(False)
+    steps.run()
+    assert number_of_steps(shared_tmp / "again.bp") == 2
+    assert not list(shared_tmp.glob(".*"))
+
+
 def test_progress_is_shown_where_wanted(capfd, comm):
     driven = Driven(n=3)
     for wanted in (None, False, True):

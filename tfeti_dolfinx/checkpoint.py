@@ -129,11 +129,10 @@ class Checkpoint:
             if self._comm.rank == 0:
                 self._index = self._checked_folder()
                 self.path.mkdir(parents=True, exist_ok=True)
-                # the index goes last: it says what else is to go
-                for file in sorted(self.path.iterdir(), key=lambda f: f.name == INDEX):
-                    if self._index.owns(file):
+                for file in self.path.iterdir():
+                    if self._index.owns(file) and file.name != INDEX:
                         file.unlink()
-                self._commit(Index(0, self._comm.size))
+                self._commit(Index(0, self._comm.size))  # until here it says what is to go
         self._lines = _hash()
 
     def read(self) -> Kept | None:
@@ -319,7 +318,10 @@ class Checkpoint:
                 "one, or name another folder"
             )
         if not isinstance(found, dict) or found.get("kind") != KIND:
-            raise damaged(file, "it")
+            raise InputError(
+                f"{file} is not that of a checkpoint, or damaged; expected the folder as it was "
+                "left, or another one"
+            )
         checksum = found.pop("checksum", None)
         if checksum != _checksum_of(found):
             raise damaged(file, "it")

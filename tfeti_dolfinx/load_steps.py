@@ -10,7 +10,7 @@ from typing import Any
 import dolfinx
 import numpy as np
 
-from tfeti_dolfinx.agreement import agreeing
+from tfeti_dolfinx.agreement import agreeing, check_same_problem
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.checkpoint import Checkpoint
 from tfeti_dolfinx.checks import (
@@ -72,10 +72,10 @@ class LoadSteps:
         times: Ends of the steps, increasing.
         begin: Where the first step begins.
         path: File for ParaView with all steps, ``.bp``; None: none. It has its name when the
-            series has ended, also by an error of this package; before that it is
-            ``.<name>.partial`` beside it.
+            series has ended, also by an error of this package, unless that is its own, as on a
+            full disk; before that it is ``.<name>.partial`` beside it.
         interior: Whether the file has the fields of ``solution.interior``, too, as ``write_vtx``.
-        checkpoint: Folder for the last converged step; None: none.
+        checkpoint: Folder for the last converged step, with nothing else in it; None: none.
         max_halvings: How often a step may be halved.
         progress: Whether rank 0 shows a bar; default where its standard error is a terminal.
 
@@ -133,7 +133,8 @@ class LoadSteps:
             The records, with those of earlier runs.
 
         Raises:
-            InputError: As ``ContactProblem.solve``, or the checkpoint is of another series.
+            InputError: As ``ContactProblem.solve``, or the checkpoint is of another series or
+                damaged, or a file cannot be written.
             NoSolutionError: A step has no solution; a note of the error has its time.
             ConvergenceError: A step did not converge, halved as often as allowed.
         """
@@ -141,6 +142,7 @@ class LoadSteps:
             given["resume"] = bool(resume)
             if resume and self._checkpoint is None:
                 raise InputError("resume=True: expected LoadSteps(..., checkpoint=) too")
+        self._drop()
         place = self._begin(resume)
         try:
             with shown_progress(self._comm, self._progress) as show:
@@ -220,7 +222,8 @@ class LoadSteps:
             if place.done:  # where its step goes
                 about["towards"] = self._times[place.number + 1]
             record, state = asdict(self.records[-1]), self._problem.state()
-            self._checkpoint.write(len(self.records), about, record, state, fields)
+            digest = self._problem.digest()
+            self._checkpoint.write(len(self.records), about, record, state, fields, digest)
         if self._path is not None:
             if self._series is None:
                 self._series = Series(self._path, solution, self._interior)
@@ -243,6 +246,7 @@ class LoadSteps:
         self._problem.take_step(self.records[-1].size)
         self._set(self.records[-1].time)
         self._problem.restore(self._checkpoint.read_state(kept.number))
+        check_same_problem(kept.digest, self._problem.digest())
         self._replay(self._checkpoint)
         return place
 
@@ -266,6 +270,12 @@ class LoadSteps:
             series.drop()
             raise
         self._series = series
+
+    def _drop(self) -> None:
+        """Remove what a run has begun to write that an error of the user's has ended."""
+        series, self._series = self._series, None
+        if series is not None:
+            series.drop()
 
     def _close(self) -> None:
         series, self._series = self._series, None
