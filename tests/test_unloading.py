@@ -1,6 +1,7 @@
 """Paths of loads that come back to zero, or to next to nothing: right at every step."""
 
 import numpy as np
+import pytest
 import ufl
 from dolfinx import fem
 from friction_reference import Untorn, in_ellipses
@@ -192,3 +193,102 @@ def follow(seed, qp_type="newton", cells=tuple(SIZES), laws=LAWS):
             other.accept(u)
     scene.problem.destroy()
     return wrong
+
+
+LOADS = {"loaded": (0.3, 0.0), "driven": (0.0, 0.3)}  # factors on a traction and on a value
+
+
+@pytest.mark.parametrize("qp_type", ["newton", "smalse"])
+@pytest.mark.parametrize("friction", ["none", "tresca", "coulomb"])
+@pytest.mark.parametrize("kind", list(KINDS))
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
+def test_the_rest_state_is_found_from_any_load(cell, kind, friction, qp_type):
+    scene = Scene(cell, kind, friction, qp_type=qp_type)
+    load = np.array([0.01] * (scene.gdim - 1) + [-0.05])
+
+    def solve(factor):
+        on_traction, on_value = LOADS[kind]
+        return scene.solve(factor * on_traction * load, factor * on_value * load)
+
+    first = solve(1.0)
+    # SMALSE-M does not come to the forces of 0 of a body that is lifted as a whole
+    turned = () if (kind, qp_type) == ("driven", "smalse") else (-1.0, 0.0)
+    for factor in (0.0, 1.0, *turned):
+        u = solve(factor)
+        if factor == 0.0:
+            assert not np.any(u)
+            assert scene.problem.report.F_multiplications <= 2
+        elif factor == 1.0:
+            assert np.abs(u - first).max() <= 1e-4 * np.abs(first).max()
+    # nothing but Tresca's bound has a size of its own
+    if friction != "tresca":
+        for factor in (1e-10, 1e-14, 1e-30):
+            u = solve(factor) / factor
+            assert np.abs(u - first).max() <= 1e-4 * np.abs(first).max()
+    scene.problem.destroy()
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.01])
+def test_a_body_that_contact_alone_holds_comes_to_rest(gap):
+    d = decomposed("triangle", 6, 3)
+    V, a, _ = forms(d.mesh, d.facet_tags, (0.0, 0.0), d.surface("top"))
+    load = fem.Constant(d.mesh, np.zeros(2))
+    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+    L = ufl.dot(load, ufl.TestFunction(V)) * ds(d.surface("top"))
+    left = fem.locate_dofs_topological(V.sub(0), 1, d.facets("left"))
+    plane = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)), gap=gap, reach=0.5)
+    bcs = [fem.dirichletbc(0.0, left, V.sub(0))]
+    problem = tfeti.ContactProblem(a, L, bcs, [plane], d, stress=hooke())
+    for pressed in (0.05, 0.0, 1e-13, 0.05, 0.0):
+        load.value[1] = -pressed
+        problem.solve()
+        down = displacement(problem)[1][:, 1]
+        # ε of plane strain under a pressure: (1 + ν)(1 − 2ν)/(1 − ν)/E would be held at both sides
+        strain = pressed * (1 - 0.3**2)
+        expected = -strain - (gap if pressed else 0.0)
+        assert down.min() == pytest.approx(expected, rel=1e-5, abs=1e-18)
+    problem.destroy()
+
+
+def test_a_series_comes_back_to_rest():
+    """Slips count from step to step, but without pressure there is no friction."""
+    scene = Scene("quadrilateral", "driven", "coulomb", rtol=1e-8)
+    for factor in (1.0, 0.0, -1.0, 0.0, 1e-13, 1.0, 0.0):
+        u = scene.solve((0.0, 0.0), (0.003 * factor, -0.01 * factor))
+        largest = 0.01 * max(abs(factor), 1e-12)
+        assert np.abs(u).max() <= 2.0 * largest
+        scene.problem.accept()
+    scene.problem.destroy()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_random_path_is_right_at_every_step(seed):
+    assert follow(seed) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("qp_type", ["newton", "smalse"])
+@pytest.mark.parametrize("seed", range(6, 50))
+def test_many_random_paths_are_right_at_every_step(seed, qp_type):
+    assert follow(seed, qp_type) == []
+
+
+@pytest.mark.parametrize("size", [1e-300, 1e-160, 1e160])
+def test_loads_whose_squares_leave_the_range_are_named(size):
+    scene = Scene("triangle")
+    with pytest.raises(tfeti.InputError, match="squares leave the range .* expected units"):
+        scene.solve((0.0, -size))
+    scene.solve((0.0, -0.05))
+    assert not np.any(scene.solve((0.0, 0.0)))
+    scene.problem.destroy()
+
+
+def test_a_stiffness_whose_squares_leave_the_range_is_named():
+    d = decomposed("triangle", 3, 2)
+    V, a, L = forms(d.mesh, d.facet_tags, (0.0, -1e-302), d.surface("top"), stress=hooke(1e-300))
+    left = fem.locate_dofs_topological(V, 1, d.facets("left"))
+    bcs = [fem.dirichletbc(np.zeros(2), left, V)]
+    plane = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)))
+    problem = tfeti.ContactProblem(a, L, bcs, [plane], d)
+    with pytest.raises(tfeti.InputError, match="stiffness of .* squares leave the range"):
+        problem.solve()
