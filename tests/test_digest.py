@@ -84,7 +84,7 @@ OTHERS = {
     ),
     "contacts[0]: gap is 0.02, and was 'geometry'": lambda: gap_again(Given()),
     "contacts[0]: shape: point[1] is -0.02, and was -0.01": lambda: Given(plane=0.02).digest(),
-    "a: UFL signature is": lambda: stiffer(Given()),
+    "a: structure is": lambda: stiffer(Given()),
     "L: constants[1] is 2.0, and was 1.0": lambda: factor(Given()),
     "sums over functions: L: function 0[0] is": lambda: Given().digest(1.0, weight=1.1),
     "sums over functions: bcs: function 0[0] is": lambda: Given().digest(1.0, held=1.1),
