@@ -318,7 +318,7 @@ def brief(value: Any) -> str:
     return repr(value) if isinstance(value, Absent) else shown(value)
 
 
-def sums_of(comm: MPI.Intracomm, arrays: list[Array]) -> list[list[float]]:
+def sums_of(comm: MPI.Intracomm, arrays: list[Array]) -> list[list[Any]]:
     """Return what tells fields apart, however they are shared out: one reduction. Collective.
 
     Args:
@@ -326,14 +326,14 @@ def sums_of(comm: MPI.Intracomm, arrays: list[Array]) -> list[list[float]]:
         arrays: Values that this rank has of each field.
 
     Returns:
-        Of each field Σx, Σ|x| and √Σx², over all ranks.
+        Of each field [[Σx, Σ|x|], Σ√|x|] over all ranks: two of a size, and one that knows how the
+        magnitudes are spread, and does not overflow.
     """
     sums = np.zeros((len(arrays), 3))
     for row, x in zip(sums, arrays, strict=True):
-        row[:] = x.sum(), np.abs(x).sum(), np.square(x).sum()
-    summed(comm, sums)
-    sums[:, 2] = np.sqrt(sums[:, 2])
-    return [[float(value) for value in row] for row in sums]
+        size = np.abs(x)
+        row[:] = x.sum(), size.sum(), np.sqrt(size).sum()
+    return [[row[:2].tolist(), float(row[2])] for row in summed(comm, sums)]
 
 
 def fields_in(given: Mapping[str, Any]) -> dict[str, Array]:
