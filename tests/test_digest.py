@@ -84,13 +84,13 @@ OTHERS = {
     ),
     "contacts[0]: gap is 0.02, and was 'geometry'": lambda: gap_again(Given()),
     "contacts[0]: shape: point[1] is -0.02, and was -0.01": lambda: Given(plane=0.02).digest(),
-    "a: UFL signature is": lambda: stiffer(Given()),
+    "a: structure is": lambda: stiffer(Given()),
     "L: constants[1] is 2.0, and was 1.0": lambda: factor(Given()),
-    "sums over functions: L: function 0[0] is": lambda: Given().digest(1.0, weight=1.1),
-    "sums over functions: bcs: function 0[0] is": lambda: Given().digest(1.0, held=1.1),
-    "function 0[0] is -7.5, and was -15.0": lambda: Given().digest(0.5),
+    "sums over functions: L: function 0[0][0] is": lambda: Given().digest(1.0, weight=1.1),
+    "sums over functions: bcs: function 0[0][0] is": lambda: Given().digest(1.0, held=1.1),
+    "function 0[0][0] is -7.5, and was -15.0": lambda: Given().digest(0.5),
     "mesh: subdomains is 3, and was 2": lambda: Given(subdomains=3).digest(),
-    "mesh: points[0] is": lambda: moved(Given()),
+    "mesh: points[0][0] is": lambda: moved(Given()),
 }
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
@@ -18,8 +19,8 @@ from dolfinx import fem
 from mpi4py import MPI
 from ufl.algorithms import extract_coefficients
 from ufl.algorithms.analysis import extract_constants
-from ufl.algorithms.signature import compute_expression_signature
-from ufl.domain import extract_domains
+from ufl.classes import Conj, FixedIndex, Inner, Label, MultiIndex, Product, Sum
+from ufl.corealg.traversal import unique_post_traversal
 
 from tfeti_dolfinx.arrays import Array
 from tfeti_dolfinx.checks import shown
@@ -126,9 +127,10 @@ def _difference_of_ranks(all_told: list[tuple[str, dict[str, Any]]]) -> str | No
 def described(value: Any) -> Any:
     """Describe what a user gave, alike on all ranks that were given the same. Not collective.
 
-    Numbers and texts are themselves, forms and expressions their UFL signature with the values of
-    constants, objects of this package their attributes. Functions on the mesh and conditions are
-    described without what a rank has of them, callables by their names, all else by its type.
+    Numbers and texts are themselves, forms and expressions a hash of their structure with the
+    values of constants, objects of this package their attributes. Functions on the mesh and
+    conditions are described without what a rank has of them, callables by their names, all else by
+    its type.
 
     Args:
         value: Anything.
@@ -167,32 +169,58 @@ def _of_array(values: Array) -> Any:
 
 
 def _of_form(form: ufl.Form) -> dict[str, Any]:
+    constants, functions = form.constants(), form.coefficients()
+    integrals = [
+        _hash(
+            integral.integral_type(),
+            str(integral.subdomain_id()),
+            str(sorted(integral.metadata().items())),
+            _structure(integral.integrand(), constants, functions),
+        )
+        for integral in form.integrals()
+    ]
     return {
         "type": "Form",
-        "UFL signature": _signature(form.signature),
-        **_values(form.constants(), form.coefficients()),
+        "structure": _hash(*sorted(integrals)),
+        **_values(constants, functions),
         "subdomain_data": [type(i.subdomain_data()).__qualname__ for i in form.integrals()],
     }
 
 
 def _of_expression(expression: ufl.core.expr.Expr) -> dict[str, Any]:
     constants, functions = extract_constants(expression), extract_coefficients(expression)
-    domains = extract_domains(expression)
-    numbering = {
-        item: k for items in (domains, constants, functions) for k, item in enumerate(items)
-    }
-    return {
-        "type": "expression",
-        "UFL signature": _signature(lambda: compute_expression_signature(expression, numbering)),
-        **_values(constants, functions),
-    }
+    structure = _structure(expression, constants, functions)
+    return {"type": "expression", "structure": structure, **_values(constants, functions)}
 
 
-def _signature(of: Callable[[], str]) -> str:
-    """The begin of a signature; empty where UFL has none, which other checks say better."""
+def _structure(expression: Any, constants: Any, functions: Any) -> str:
+    """A hash of an expression; empty where UFL does not know a part, which other checks name.
+
+    UFL's own signature depends on the order of operands that commute, and UFL sorts constants by
+    texts with counters in them, which on another rank may have one digit more.
+    """
+    numbers: defaultdict[Any, int] = defaultdict(int)  # all meshes are 0
+    for items in (constants, functions):
+        numbers.update({item: k for k, item in enumerate(items)})
+    known: dict[Any, str] = {}
     with suppress(Exception):
-        return of()[:DIGEST]
-    return ""
+        for part in unique_post_traversal(expression):
+            operands = [known[operand] for operand in part.ufl_operands]
+            if isinstance(part, Conj):  # UFL puts one where it turns an inner product round
+                known[part] = operands[0]
+                continue
+            if isinstance(part, (Sum, Product, Inner)):
+                operands.sort()
+            if isinstance(part, MultiIndex):
+                operands = [str(int(i)) if isinstance(i, FixedIndex) else "free" for i in part]
+            elif part._ufl_is_terminal_ and not isinstance(part, Label):
+                operands = [str(part._ufl_signature_data_(numbers))]
+            known[part] = _hash(type(part).__name__, *operands)
+    return known.get(expression, "")
+
+
+def _hash(*texts: str) -> str:
+    return blake2b("\n".join(texts).encode(), digest_size=8).hexdigest()
 
 
 def _values(constants: Any, functions: Any) -> dict[str, Any]:
@@ -290,7 +318,7 @@ def brief(value: Any) -> str:
     return repr(value) if isinstance(value, Absent) else shown(value)
 
 
-def sums_of(comm: MPI.Intracomm, arrays: list[Array]) -> list[list[float]]:
+def sums_of(comm: MPI.Intracomm, arrays: list[Array]) -> list[list[Any]]:
     """Return what tells fields apart, however they are shared out: one reduction. Collective.
 
     Args:
@@ -298,14 +326,14 @@ def sums_of(comm: MPI.Intracomm, arrays: list[Array]) -> list[list[float]]:
         arrays: Values that this rank has of each field.
 
     Returns:
-        Of each field Σx, Σ|x| and √Σx², over all ranks.
+        Of each field [[Σx, Σ|x|], Σ√|x|] over all ranks: two of a size, and one that knows how the
+        magnitudes are spread, and does not overflow.
     """
     sums = np.zeros((len(arrays), 3))
     for row, x in zip(sums, arrays, strict=True):
-        row[:] = x.sum(), np.abs(x).sum(), np.square(x).sum()
-    summed(comm, sums)
-    sums[:, 2] = np.sqrt(sums[:, 2])
-    return [[float(value) for value in row] for row in sums]
+        size = np.abs(x)
+        row[:] = x.sum(), size.sum(), np.sqrt(size).sum()
+    return [[row[:2].tolist(), float(row[2])] for row in summed(comm, sums)]
 
 
 def fields_in(given: Mapping[str, Any]) -> dict[str, Array]:

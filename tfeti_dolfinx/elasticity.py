@@ -13,6 +13,7 @@ from dolfinx import mesh as dmesh
 from mpi4py import MPI
 from ufl.algorithms import estimate_total_polynomial_degree
 
+from tfeti_dolfinx.agreement import agreeing
 from tfeti_dolfinx.checks import POSITIVE, Range, checked_number, checked_type, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.form_checks import check_mesh, check_not_negative
@@ -83,7 +84,8 @@ class Elasticity:
     ) -> None:
         checked_type(on, (Decomposition, dmesh.Mesh), "on", "what decompose or read_gmsh return")
         self.mesh = on.mesh if isinstance(on, Decomposition) else on
-        with raised_on_all_ranks(self.mesh.comm):
+        with agreeing(self.mesh.comm, "Elasticity") as given:
+            given |= {"E": E, "nu": nu, "model": model, "thickness": thickness}
             self.model = _checked_model(model, self.mesh.geometry.dim)
             _check_no_thickness(thickness, self.model)
         self.E = in_ufl(E, on, "E", POSITIVE)

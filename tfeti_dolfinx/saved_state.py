@@ -113,13 +113,13 @@ class SavedState:
         known = [name for name in parts if any_rank(comm, getattr(self, name).size > 0)]
         with raised_on_all_ranks(comm):
             rows = gluing.constraints.num_rows
-            for name in known:
-                _check_broken(name, getattr(self, name).shape == (rows,))
             if sizes != (rows, len(records), *found) or (wide[2] and wide[:2] != (2, rows)):
                 raise InputError(
                     "the state has other contact rows than the problem: expected the contacts, "
                     "conditions and data that it was found with"
                 )
+            for name in known:
+                _check_broken(name, getattr(self, name).shape == (rows,))
 
 
 def layout_of(dofs: TornDofs, decomposition: Decomposition) -> Array:
