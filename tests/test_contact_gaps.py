@@ -206,13 +206,14 @@ def against_lame(p):
         ((48, 64), 1, {}, {"gap": -OVERLAP}),
         ((48, 64), 1, {}, {"gap": lambda x: -OVERLAP * np.hypot(x[0], x[1])}),
         ((96, 128), 1, {"triangles": True}, {"gap": -OVERLAP}),
+        ((48, 64), 1, {}, {"gap": "curved"}),
         ((40, 48), 2, {}, {}),
         ((40, 48), 2, {"triangles": True}, {}),
     ],
-    ids=["number", "function", "triangles", "geometry", "geometry, triangles"],
+    ids=["number", "function", "triangles", "curved", "geometry", "geometry, triangles"],
 )
 def test_a_ring_shrunk_on_another(cells, order, mesh, contact, secondary):
-    overlap = 0.0 if contact else OVERLAP
+    overlap = OVERLAP if contact.get("gap", "curved") == "curved" else 0.0
     p = ring_problem(cells, overlap, order, order, mesh, secondary=secondary, **contact)
     mean, error = against_lame(p)
     assert abs(mean) <= (0.005 if contact else 0.01)

@@ -214,19 +214,14 @@ class Doubts:
             own = records.contact == i
             largest = comm.allreduce(float(pressure[own].max(initial=0.0)), op=MPI.MAX)
             own &= shown & (change > np.maximum(FACETS * largest * gives, 0.0))
-            worst = np.array(
-                [
-                    column[own].max(initial=-np.inf)
-                    for column in (change, gives, -records.curved_gap)
-                ]
-            )
-            comm.Allreduce(MPI.IN_PLACE, worst, op=MPI.MAX)
-            if worst[0] > 0.0:
+            columns = change, gives, records.curved_gap
+            most = np.array([column[own].max(initial=-np.inf) for column in columns])
+            comm.Allreduce(MPI.IN_PLACE, most, op=MPI.MAX)
+            if most[0] > 0.0:
                 yield (
                     f"{contact.name}: facets are straight where the surfaces are curved, and "
-                    f"change the gap of {-worst[2]:.2g} between them by up to {worst[0]:.2g}, "
-                    "where the largest pressure presses elements together by "
-                    f"{largest * worst[1]:.2g}; "
+                    f"change the gap, at most {most[2]:.2g} there, by up to {most[0]:.2g}, where "
+                    f"the largest pressure presses elements together by {largest * most[1]:.2g}; "
                     'expected gap="curved", a mesh of degree 2, or smaller facets'
                 )
 

@@ -41,8 +41,9 @@ class Obstacle:
         surface: Name or tag of the surface.
         shape: A ``Plane``, ``Sphere``, ``Cylinder``, ``SignedDistance``, or anything with their
             two methods.
-        gap: "geometry" for the shape's distance, or what replaces it (negative: interference):
-            a number, or a function of the surface's vertices, shape ``(3, n)``.
+        gap: "geometry" for the shape's distance from the vertices, where straight facets do not
+            show ("curved" is the same); or what replaces it, however far the shape is (negative:
+            interference): a number, or a function of the vertices, shape ``(3, n)``.
         friction: ``Tresca``, ``Coulomb``, or None.
         reach: Nodes farther than this from the obstacle get no row at first. After the solve
             all are checked, and those that came to overlap get theirs. Default: 5 % of the

@@ -54,13 +54,14 @@ class Contact:
         secondary: The surface that carries the multipliers and the pressure, ``a`` or ``b``.
             "auto": the one with the coarser mesh where they meet; where both are of one size
             (to 12 %), the softer one, by the stiffness per area of its elements, E/h.
-        gap: "geometry" for the distance between the surfaces, or what replaces it wherever they
-            are not farther apart than the reach (negative: interference): a number, or a function
-            of the secondary surface's vertices, shape ``(3, n)``.
+        gap: "geometry" for the distance between the facets; "curved" for that between smooth
+            surfaces fitted to straight facets, as pins and bearings need it; or what replaces the
+            distance where it is at most the reach (negative: interference): a number, or a
+            function of the secondary surface's vertices, shape ``(3, n)``.
         friction: ``Tresca``, ``Coulomb``, or None.
-        reach: Surfaces farther apart than this make no rows at first; after the solve it is
-            checked that none of them has come to overlap. Default: 5 % of the smaller surface's
-            extent.
+        reach: Surfaces farther apart than this make no rows at first; those that have come to
+            overlap after the solve get theirs, and the solve goes on. Default: 5 % of the smaller
+            surface's extent.
         name: For messages and ``solution.contact(name)``. Default: "contact of 'a' with 'b'".
 
     Example:

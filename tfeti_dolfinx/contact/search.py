@@ -97,10 +97,11 @@ class ContactSearch:
         ``take_in_overlapping``, as ever.
 
         Args:
-            gaps: By position in the list: "geometry", a number, or a function of points.
+            gaps: By position in the list: "geometry", "curved", a number, or a function of points.
 
         Raises:
-            InputError: A gap does not fit, or "geometry" overlaps too deep. Nothing has changed.
+            InputError: A gap does not fit, or that of the geometry overlaps too deep. Nothing has
+                changed.
         """
         contacts, records = list(self.contacts), list(self._records)
         for i, gap in gaps.items():

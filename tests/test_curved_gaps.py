@@ -1,0 +1,200 @@
+"""Pins in bores: what straight facets do to a gap, the warning, and gap="curved"."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import ufl
+from bodies import gathered, searched, sided, stacked, two_body_problem
+from dolfinx import fem
+from mpi4py import MPI
+from test_contact_gaps import CELLS, ORDERS, dofs_of, shaped
+from test_mortar_cases import disc_on_block, no_load
+
+import tfeti_dolfinx as tfeti
+from meshes.lug import PIN, lug
+
+CLEARANCE, PUSHED = 0.05, 0.1
+PAIR = ("pin side", "bore")
+SAYS = "contact of 'pin side' with 'bore': facets are straight where the surfaces are curved"
+EXPECTS = 'expected gap="curved", a mesh of degree 2, or smaller facets'
+
+
+def pushed_pin(sizes, contact, order=1, **mesh):
+    """The lug's edge is clamped, the pin's core is moved down; in space the ends stay in planes."""
+    d = lug(MPI.COMM_WORLD, sizes, order, clearance=CLEARANCE, **mesh)
+    gdim = d.mesh.geometry.dim
+    law = {} if gdim == 3 else {"model": "plane_strain"}
+    V = fem.functionspace(d.mesh, ("Lagrange", order, (gdim,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    bcs = []
+    for name, y in (("edge", 0.0), ("core", -PUSHED)):
+        dofs = fem.locate_dofs_topological(V, gdim - 1, d.facets(name))
+        bcs.append(fem.dirichletbc(np.array([0.0, y, 0.0][:gdim]), dofs, V))
+    for name, axis in (("middle", 0), ("ends", 2)):
+        if name in d.names.surfaces:
+            dofs = fem.locate_dofs_topological(V.sub(axis), gdim - 1, d.facets(name))
+            bcs.append(fem.dirichletbc(0.0, dofs, V.sub(axis)))
+    a = tfeti.Elasticity(d, E=210e3, nu=0.3, **law).a(u, v)
+    return tfeti.ContactProblem(
+        a, no_load(v, None), bcs, [contact], d, petsc_options={"rtol": 1e-7}
+    )
+
+
+def pin_in_lug(sizes, gap="geometry", order=1, **mesh):
+    return pushed_pin(sizes, tfeti.Contact(*PAIR, gap=gap), order, **mesh)
+
+
+def force_and_peak(p):
+    """Solve; the force that holds the pin up, and the highest pressure."""
+    p.solve()
+    contact = p.solution.contact()
+    force = gathered(contact.force * contact.normal[:, 1]).sum()
+    return np.array([abs(force), gathered(contact.pressure).max()])
+
+
+@cache
+def reference():
+    """Force and peak on curved cells of degree 2, a sixth of the size."""
+    return force_and_peak(pin_in_lug((0.5, 0.5), order=2))
+
+
+# elements of the pin and of the lug, what the mesh is besides, its share of the force, and how far
+# the peak pressure of degree 1 may be off
+LUGS = {
+    "finer lug": ((3.0, 2.0), {}, 1.0, 0.06),
+    "finer pin": ((2.0, 3.0), {}, 1.0, 0.05),
+    "much finer pin": ((0.75, 3.0), {}, 1.0, 0.05),
+    "half": ((3.0, 2.0), {"half": True}, 0.5, 0.05),
+    "tetrahedra": ((3.0, 2.0), {"thickness": 3.0}, 3.0, 0.1),
+}
+
+
+@pytest.mark.parametrize("name", LUGS)
+def test_facets_that_decide_are_warned_of(name):
+    """They lie up to h²/8R = 0.11 beside surfaces whose clearance is 0.05."""
+    sizes, mesh, share, _ = LUGS[name]
+    p = pin_in_lug(sizes, **mesh)
+    force, _ = force_and_peak(p) / reference()
+    assert abs(force / share - 1.0) > 0.4
+    (warning,) = p.report.warnings
+    assert warning.startswith(SAYS)
+    assert warning.endswith(EXPECTS)
+    assert "change the gap, at most 0.05" in warning
+
+
+@pytest.mark.parametrize("name", LUGS)
+def test_a_pin_in_a_lug_with_curved_gaps(name):
+    sizes, mesh, share, far = LUGS[name]
+    p = pin_in_lug(sizes, "curved", **mesh)
+    force, peak = force_and_peak(p) / reference()
+    assert abs(force / share - 1.0) < 0.01
+    assert abs(peak - 1.0) < far
+    assert not p.report.warnings
+
+
+def test_facets_that_miss_each_other_are_warned_of():
+    """The pin, finer, hangs between its nodes: it would touch, and no node has a force."""
+    p = pin_in_lug((3.0, 0.75))
+    force, peak = force_and_peak(p)
+    assert force == peak == 0.0
+    assert any(text.startswith(SAYS) and "together by 0;" in text for text in p.report.warnings)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "order", "gap"),
+    [((3.0, 2.0), 2, "geometry"), ((3.0, 2.0), 1, CLEARANCE), ((0.3, 0.3), 1, "geometry")],
+    ids=["degree 2", "given", "fine"],
+)
+def test_facets_that_do_not_decide_are_not_warned_of(sizes, order, gap):
+    p = pin_in_lug(sizes, gap, order)
+    force, peak = force_and_peak(p) / reference()
+    assert abs(force - 1.0) < 0.04
+    assert abs(peak - 1.0) < 0.06
+    assert not p.report.warnings
+
+
+@pytest.mark.parametrize("sizes", [("arc", "top"), ("top", "arc")])
+@pytest.mark.parametrize("pushed", [0.01, 0.02])
+def test_a_disc_on_a_block_is_not_warned_of(comm, sizes, pushed):
+    """Surfaces that do not conform: near by, the gap is soon more than coarse facets change."""
+    d, bcs = disc_on_block(comm, 24, 1, pushed=pushed)
+    p = two_body_problem(d, no_load, bcs, [sided(*sizes, reach=0.3)])
+    p.solve()
+    assert p.report.active_contacts > 0
+    assert not any("facets" in text for text in p.report.warnings)
+
+
+@pytest.mark.parametrize("gap", ["geometry", "curved"])
+def test_facets_do_not_show_at_an_obstacle(gap):
+    """Its distance is taken at the vertices, which are on the pin."""
+    bore = tfeti.Cylinder((0, 0), axis=(0, 0, 1), radius=PIN + CLEARANCE, inside=True)
+
+    def pin(size, order):
+        contact = tfeti.Obstacle("pin side", bore, gap=gap)
+        return pushed_pin((size, 3.0), contact, order)
+
+    p = pin(1.5, 1)
+    force, peak = force_and_peak(p) / force_and_peak(pin(0.75, 2))
+    assert abs(force - 1.0) < 0.02
+    assert abs(peak - 1.0) < 0.02
+    assert not p.report.warnings
+
+
+def height(x):
+    """A saddle, or a bent line."""
+    return 0.3 * x[:, 0] ** 2 - (0.2 * x[:, 1] ** 2 if x.shape[1] == 2 else 0.0)
+
+
+@pytest.mark.parametrize("sides", ORDERS)
+@pytest.mark.parametrize("cell", CELLS)
+def test_curved_gaps_of_surfaces_of_degree_2(cell, sides):
+    """Both have the same shape, 0.01 apart: at rims, in corners, and however coarse they are."""
+    d = shaped(cell, 3, 5, height, lambda x: height(x) + 0.01)
+    dofs = dofs_of(d)
+    flat, curved = (
+        searched([sided(*sides, reach=0.5, gap=gap)], dofs, d) for gap in ("geometry", "curved")
+    )
+    expected = 0.01 * np.abs(curved.normal[:, -1])
+    flat, curved = (gathered(np.abs(records.gap - expected)).max() for records in (flat, curved))
+    assert flat > 1e-3
+    assert curved < 0.12 * flat
+
+
+@pytest.mark.parametrize("sides", ORDERS)
+@pytest.mark.parametrize("cell", CELLS)
+def test_edges_are_not_rounded_off(cell, sides):
+    """A roof of 90 degrees in another."""
+    d = shaped(cell, 4, 6, lambda x: -np.abs(x[:, 0]), lambda x: 0.01 - np.abs(x[:, 0]))
+    dofs = dofs_of(d)
+    found = [
+        gathered(searched([sided(*sides, reach=0.5, gap=gap)], dofs, d).gap)
+        for gap in ("geometry", "curved")
+    ]
+    assert len(found[0]) > 0
+    assert np.allclose(*found, rtol=0.0, atol=1e-12)
+
+
+def test_another_gap_needs_no_search():
+    d = lug(MPI.COMM_WORLD, (3.0, 2.0), clearance=CLEARANCE)
+    dofs = dofs_of(d)
+    pair = tfeti.Contact(*PAIR, secondary="bore", reach=1.0)
+    expected = searched([tfeti.Contact(*PAIR, secondary="bore", reach=1.0, gap="curved")], dofs, d)
+    records = searched([pair], dofs, d)
+    assert np.array_equal(pair.with_gap("curved").gaps(dofs, records, 1.0), expected.gap)
+    p = pin_in_lug((3.0, 2.0))
+    p.solve()
+    p.update(gap={0: "curved"})
+    force, peak = force_and_peak(p) / reference()
+    assert p.report.searches == 0
+    assert abs(force - 1.0) < 0.01
+    assert abs(peak - 1.0) < 0.06
+    assert not p.report.warnings
+
+
+def test_flat_sides_have_the_gap_of_the_geometry():
+    d = stacked("tetrahedron", 3, 4, 4, gap=0.01)
+    found = [
+        searched([sided(*ORDERS[0], gap=gap)], dofs_of(d), d).gap for gap in ("geometry", "curved")
+    ]
+    assert np.array_equal(*found)
