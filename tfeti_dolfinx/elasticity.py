@@ -46,9 +46,8 @@ class Elasticity:
         nu: Poisson's ratio, between -1 and 0.5.
         model: "3d", "plane_strain", "plane_stress" or "axisymmetric". In 3D it may be left out.
             Axisymmetric, x[0] is the radius r, x[1] the height z, and u = (u_r, u_z).
-        thickness: In plane strain and stress the thickness of the body, a length, nowhere negative, by
-            default 1;
-            the bilinear form is multiplied with it.
+        thickness: In plane strain and stress the thickness of the body, a length, nowhere negative,
+            by default 1; the bilinear form is multiplied with it.
 
     Attributes:
         mesh: The mesh.
