@@ -73,7 +73,7 @@ def beside(kind: FacetKind, facets: Facets, rows: Array, xi: Array) -> Array:
     """
     x, K = facets.x[rows], facets.curvature[rows]
     d = x[:, : kind.num_vertices] - points(kind.geometry, x, xi)[:, None]
-    height = -0.5 * np.einsum("mv,mvg,mgh,mvh->m", kind.hats.values(xi), d, K, d)
+    height = -0.5 * np.sum(kind.hats.values(xi) * np.sum((d @ K) * d, axis=2), axis=1)
     return height[:, None] * facets.normal[rows]
 
 
@@ -107,10 +107,7 @@ def _normal_equations(x: Array, normals: Array, axes: Array) -> tuple[Array, Arr
     inverse = np.divide(1.0, length, out=np.zeros_like(length), where=other)
     rows = np.concatenate((u * inverse[..., None], _monomials(u)), axis=3)
     height = np.einsum("nvwg,nvg->nvw", d, normals) * inverse**2
-    return (
-        np.einsum("nvwi,nvwj->nvij", rows, rows),
-        np.einsum("nvwi,nvw->nvi", rows, height),
-    )
+    return rows.swapaxes(2, 3) @ rows, np.einsum("nvwi,nvw->nvi", rows, height)
 
 
 def _without_slopes(M: Array, b: Array, count: int) -> tuple[Array, Array]:
@@ -132,15 +129,14 @@ def _on_facets(facets: Facets, axes: Array, S: Array, r: Array) -> Array:
     for entry, (i, j) in enumerate(combinations_with_replacement(range(k), 2)):
         unit[entry, i, j] = unit[entry, j, i] = 1.0
     i, j = np.array(list(combinations_with_replacement(range(k), 2))).T
-    P = np.einsum("nvia,eab,nvjb->nveij", turn, unit, turn)[..., i, j].swapaxes(2, 3)
-    total = np.einsum("nvki,nvkl,nvlj->nij", P, S, P)
+    turn = turn[:, :, None]
+    P = (turn @ unit @ turn.swapaxes(3, 4))[..., i, j].swapaxes(2, 3)
+    value, vector = np.linalg.eigh(np.sum(P.swapaxes(2, 3) @ S @ P, axis=1))
     right = np.einsum("nvki,nvk->ni", P, r)
-    value, vector = np.linalg.eigh(total)
-    known = value > UNKNOWN
-    inverse = np.divide(1.0, value, out=np.zeros_like(value), where=known)
-    entries = np.einsum("nik,nk,njk,nj->ni", vector, inverse, vector, right)
-    K = np.einsum("ne,eij->nij", entries, unit)
-    return np.einsum("nij,nig,njh->ngh", K, own, own)
+    along = np.einsum("nik,ni->nk", vector, right)
+    along = np.divide(along, value, out=np.zeros_like(along), where=value > UNKNOWN)
+    K = np.einsum("nik,nk,iab->nab", vector, along, unit, optimize=True)
+    return own.swapaxes(1, 2) @ K @ own
 
 
 def _rotations(A: Array) -> Array:
