@@ -23,7 +23,7 @@ from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
 # steps; and steps in a row without a residual below so much of the least one, before one gives up
 MOST_STEPS, PATIENCE, LESS = 80, 10, 0.98
 # steps for one share of the coefficients, and on the whole path; and its shortest step
-MOST_A_SHARE, MOST_ON_PATH, SHORTEST = 25, 1000, 1e-5
+MOST_A_SHARE, MOST_ON_PATH, SHORTEST = 25, 200, 1e-4
 MEMORY, LEAST = 5, 0.01
 EXACT = 1e-3
 # of a residual: rounding of the λ that has it; from there nothing comes lower
@@ -146,9 +146,7 @@ def newton_on_law(
     return None, step + 1
 
 
-def _searched(
-    qp: QP, law: Law, at: LawPoint, end: LawPoint, norm: float, most: float
-) -> LawPoint:
+def _searched(qp: QP, law: Law, at: LawPoint, end: LawPoint, norm: float, most: float) -> LawPoint:
     """The farthest of the whole step, half of it, … that does not raise the residual.
 
     Where F is known of both ends, it is on all of the way: nothing is multiplied.
@@ -190,8 +188,11 @@ def follow_friction(
     Returns:
         Where it has ended, None if it gave up; and the steps taken.
     """
-    point, steps = newton_on_law(qp, law.with_share(0.0), oblique, at, loose, norm, most=EXACT)
-    share, length = 0.0, 1.0
+    whole, steps = newton_on_law(qp, law, oblique, at, target, norm, MOST_A_SHARE, EXACT)
+    if whole is not None:
+        return whole, steps
+    point, taken = newton_on_law(qp, law.with_share(0.0), oblique, at, loose, norm, most=EXACT)
+    steps, share, length = steps + taken, 0.0, 1.0
     while point is not None and share < 1.0 and length >= SHORTEST and steps < MOST_ON_PATH:
         new = min(share + length, 1.0)
         goal = target if new == 1.0 else loose
