@@ -24,7 +24,9 @@ from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
 MOST_STEPS, PATIENCE, LESS = 80, 10, 0.98
 # steps for one share of the coefficients, and on the whole path; and its shortest step
 MOST_A_SHARE, MOST_ON_PATH, SHORTEST = 25, 200, 1e-4
+# residuals of so many steps before bound the next one; the shortest part of a step that is tried
 MEMORY, LEAST = 5, 0.01
+# of its residual: what a solve leaves on the path; beside a soft motion SHARE leaves all the others
 EXACT = 1e-3
 # of a residual: rounding of the λ that has it; from there nothing comes lower
 ROUNDING = 1e-16
@@ -101,7 +103,8 @@ def newton_on_law(
 
     The natural map of Coulomb's law, by a semismooth Newton method (Alart, Curnier, Comput.
     Methods Appl. Mech. Engrg. 92, 1991; Hüeber, Stadler, Wohlmuth, SIAM J. Sci. Comput. 30, 2008).
-    No cost falls on the way, and it may fail: whoever calls it has something else to try.
+    The residual may rise above those of a few steps before only where no part of a step of 1/64 or
+    more keeps it below. It may fail: whoever calls it has something else to try.
 
     Args:
         qp: The program; its set is not looked at.
@@ -174,7 +177,8 @@ def follow_friction(
     Without friction the solution is unique, and where bodies are held the path that begins there is
     bounded, so that it leads on to the whole coefficients (Allgower, Georg, Introduction to
     Numerical Continuation Methods, 2003, chapter 11). The share grows by twice the last step, by a
-    quarter of it where Newton's method fails. It gives up where the path turns back. Collective.
+    quarter of it where Newton's method fails. It gives up where the path turns back. Solves are more
+    exact than those of ``newton_on_law`` alone; that may be enough, and is tried first. Collective.
 
     Args:
         qp: The program; its set is not looked at.
