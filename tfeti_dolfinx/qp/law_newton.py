@@ -177,8 +177,9 @@ def follow_friction(
     Without friction the solution is unique, and where bodies are held the path that begins there is
     bounded, so that it leads on to the whole coefficients (Allgower, Georg, Introduction to
     Numerical Continuation Methods, 2003, chapter 11). The share grows by twice the last step, by a
-    quarter of it where Newton's method fails. It gives up where the path turns back. Solves are more
-    exact than those of ``newton_on_law`` alone; that may be enough, and is tried first. Collective.
+    quarter of it where Newton's method fails. It gives up where the path turns back. Solves are
+    exacter than those of ``newton_on_law`` alone; that may be enough, and is tried first.
+    Collective.
 
     Args:
         qp: The program; its set is not looked at.
