@@ -159,3 +159,93 @@ def on_each_other(cell, n, traction, bounds, frame, apart, clamped, coulomb=Fals
     axes = (np.ones_like(area) if coulomb else area)[:, None] * np.asarray(bounds)
     u, force = scene.solve(entries, np.zeros(len(below)), axes, frame, coulomb)
     return u, scene.x[below], force
+
+
+class ClampedLaw:
+    """Coulomb's law of a clamped box of ``scenes`` above a rough plane, condensed on its nodes.
+
+    Args:
+        cell, n: The box.
+        mu: Coefficient.
+        clamped, loaded: Sides.
+        gap: Of the plane.
+    """
+
+    def __init__(self, cell, n, mu, clamped, loaded, gap):
+        gdim = 2 if cell in ("triangle", "quadrilateral") else 3
+        units = np.eye(gdim)
+        scenes = [
+            Untorn(*box(cell, n, MPI.COMM_SELF), {loaded: tuple(unit)}, (clamped,))
+            for unit in units
+        ]
+        self.mu, self.gdim, self.scene = mu, gdim, scenes[0]
+        free = self.free = self.scene.free
+        nodes = self.scene.side("bottom")[0]
+        nodes = nodes[np.isin(nodes * gdim, free)]
+        self.m, frame = len(nodes), np.vstack([-units[-1], units[:-1]])
+        B = np.zeros((gdim, self.m, len(self.scene.f)))
+        for k in range(gdim):
+            for axis in range(gdim):
+                B[k, np.arange(self.m), nodes * gdim + axis] = frame[k, axis]
+        self.B = B.reshape(-1, B.shape[-1])[:, free]
+        self.K = csc_matrix(self.scene.K[free][:, free])
+        solve = splu(self.K).solve
+        self.KB = solve(self.B.T.copy())
+        self.F, self.loads = self.B @ self.KB, np.array([one.f[free] for one in scenes]).T
+        self.bent = solve(self.loads)
+        self.c = np.zeros(len(self.B))
+        self.c[: self.m] = gap
+        self.r = 3.0 / np.linalg.norm(self.F, 2)
+
+    def rest(self, u):
+        """Count slips from a displacement, sorted by point."""
+        self.c[self.m :] = (self.B @ self.own(u))[self.m :]
+
+    def own(self, u):
+        """A displacement that is sorted by point, on free unknowns."""
+        full = np.zeros_like(u)
+        full[self.scene.order] = u
+        return full.ravel()[self.free]
+
+    def distance(self, u, load):
+        """‖u − v‖ / ‖u‖, largest entries, v what Newton's method finds for the law from u on.
+
+        A law with a large coefficient may have several solutions: v is the one that belongs to u.
+        """
+        u, self.d = self.own(u), self.B @ (self.bent @ load) - self.c
+        lam = self.newton(self.B @ (self.loads @ load - self.K @ u))
+        return np.abs(self.bent @ load - self.KB @ lam - u).max() / np.abs(u).max()
+
+    def natural(self, lam):
+        """The natural map λ − P(λ − r(Fλ − d)), and its generalised derivative."""
+        m, mu, one = self.m, self.mu, np.eye(len(lam))
+        y = lam - self.r * (self.F @ lam - self.d)
+        p, T = np.maximum(y[:m], 0.0), y[m:].reshape(self.gdim - 1, m)
+        size, P, i = np.linalg.norm(T, axis=0), np.zeros_like(one), np.arange(m)
+        slips, e = size > mu * p, T / np.maximum(size, 1e-300)
+        P[i, i] = y[:m] > 0.0
+        for a in range(self.gdim - 1):
+            P[m * (a + 1) + i, i] = np.where(slips & (p > 0.0), mu * e[a], 0.0)
+            for b in range(self.gdim - 1):
+                bent = mu * p / np.maximum(size, 1e-300) * ((a == b) - e[a] * e[b])
+                P[m * (a + 1) + i, m * (b + 1) + i] = np.where(slips, bent, float(a == b))
+        tau = np.where(slips, mu * p * e, T)
+        R = lam - np.concatenate((p, tau.ravel()))
+        return R, one - P @ (one - self.r * self.F)
+
+    def newton(self, lam):
+        """A semismooth Newton method with a line search; its residual comes down to rounding."""
+        scale, past = self.r * np.linalg.norm(self.d), []
+        for _ in range(200):
+            R, J = self.natural(lam)
+            past = [*past[-4:], np.linalg.norm(R)]
+            if past[-1] <= 1e-13 * scale:
+                return lam
+            step, length = np.linalg.solve(J, -R), 1.0
+            while length > 1e-4 and np.linalg.norm(self.natural(lam + length * step)[0]) > (
+                1.0 - 1e-4 * length
+            ) * max(past):
+                length *= 0.5
+            lam = lam + length * step
+        assert past[-1] <= 1e-10 * scale, "the reference did not converge"
+        return lam

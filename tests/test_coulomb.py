@@ -181,7 +181,7 @@ def test_forces_that_rounding_makes_are_none():
     rows = p.dual.constraints.sets.normals
     lam.set(0.0)
     lam.array[rows] = np.where(np.arange(len(rows)) % 2 == 0, 1e-16, 1.0)
-    bounds.change(lam)
+    bounds.change(lam, p.solution.u)
     bounds.advance()
     bounds.set_feasible(None)
     found = p.dual.constraints.pressures[p.dual.constraints.pressed]

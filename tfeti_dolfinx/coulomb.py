@@ -123,13 +123,10 @@ def solve_with_friction(
             continue
         if result.reason <= 0:
             break
-        change = bounds.change(result.lam)
-        if change <= tolerance and asked <= least:
-            if goal is not None or bounds.fit(result, rule):
-                break
-            if not on_law.may_try:
-                result.reason = ConvergedReason.CONVERGED_FRICTION_RTOL
-                break
+        change = bounds.change(result.lam, rule.u)
+        at_rest = change <= tolerance and asked <= least
+        if at_rest and (goal is not None or bounds.end(result, rule, on_law.may_try)):
+            break
         if bounds.astray or iterations >= options.friction_max_it:
             result.reason = ConvergedReason.DIVERGED_FRICTION
             break

@@ -30,6 +30,8 @@ LEAP, BACK = 30.0, 0.1
 PATIENCE = 12
 # problems in a row that are not solved: the second one goes on where the first has ended
 UNSOLVED = 2
+# steps of one problem: beyond that it is not solved
+MOST_STEPS = 500
 # times the first slips: more of them are no measure of changes, since they may grow without end
 FARTHER = 100.0
 # times the first slips: so many of them, and still no rest, are bodies that slide
@@ -110,9 +112,8 @@ class DilatedGaps:
         if np.isfinite(self._change):
             tolerance = min(tolerance, SHARE * self._change)
         rule = ResidualRule(max(tolerance, homogenised.scale.rounding))
-        result = newton(
-            qp, homogenised, rule, self._options.newton, max_it=self._options.max_it, start=start
-        )
+        most = min(self._options.max_it, MOST_STEPS)
+        result = newton(qp, homogenised, rule, self._options.newton, max_it=most, start=start)
         self._dual.saw(result.norm)
         late = result.reason == ConvergedReason.DIVERGED_ITS
         self._unsolved = self._unsolved + 1 if late else 0

@@ -93,7 +93,7 @@ class NewtonOnCoulomb:
         else:
             given = qp, law, self._oblique, first, target, norm
             end, steps = newton_on_law(*given)
-            if end is None:
+            if end is None and not self._dual.coarse.unheld.free.any():
                 end, more = follow_friction(*given, loose=LOOSE * residual)
                 steps += more
         constraints.set_pressures(known)

@@ -29,6 +29,8 @@ PATIENCE = 6
 # change of slips at which De Saxcé's fixed point is looked at first; and a factor each time
 # after it
 COARSE, FINER = 1e-4, 0.01
+# the largest share of the change of bounds that is taken to be left of it in the next problem
+SLOWEST = 0.9
 # of a step of bounds that ends where they cannot hold the load: those that can are a convex set
 NEARER = (0.5, 0.25, 0.1)
 
@@ -61,6 +63,7 @@ class Pressures:
         self._now, self._found, self._none = self._first(start), np.zeros(len(at)), 0.0
         self._before = self._now
         self.restless, self._change = -1, np.inf
+        self._solved: list[tuple[Array, Array, Array]] = []
         self._held: Array = np.full(len(at), np.inf)
         self._anderson = Anderson(self._products)
 
@@ -139,15 +142,21 @@ class Pressures:
                 return True
         return False
 
-    def change(self, lam: PETSc.Vec) -> float:
+    def change(self, lam: PETSc.Vec, u: Array) -> float:
         """Take what a solve has found; how far that is from the bounds, over its size.
 
         Body by body: beside forces elsewhere those on a light one would not be seen.
+
+        Args:
+            lam: The multipliers.
+            u: Their displacement, this rank's part.
         """
         values = lam.array_r
         driving = norm_over(self._comm, self._dual.driving) / (self._dual.seen or np.inf)
         self._none = NO_FORCE * max(norm_over(self._comm, values), driving)
         self._found = self._forces(values[self._rows])
+        again = bool(self._solved) and self._now is self._solved[-1][0]
+        self._solved = [*self._solved[: -1 if again else None][-1:], (self._now, self._found, u)]
         if self._sticks:
             return float("inf")
         miss, size = (self._on_bodies(x) for x in (self._found - self._now, self._found))
@@ -160,15 +169,25 @@ class Pressures:
             self._best, self._idle = change, 0
         return change
 
-    def fit(self, result: QPResult, rule: Accuracy) -> bool:
+    def end(self, result: QPResult, rule: Accuracy, may_go_on: bool) -> bool:
+        """Whether bounds at rest end the iteration; if u is not right to rtol, the reason says so.
+
+        Args:
+            result: The last solution.
+            rule: Its accuracy, which tells what bounds leave of the law from now on.
+            may_go_on: Whether something may come nearer to the law.
+        """
+        if self._fit(result, rule):
+            return True
+        if not may_go_on and not self._rest(rule):
+            result.reason = ConvergedReason.CONVERGED_FRICTION_RTOL
+        return not may_go_on
+
+    def _fit(self, result: QPResult, rule: Accuracy) -> bool:
         """Whether u is right to rtol with the limits of the forces that were found, too.
 
         The rule has looked at the answer with the limits that it was found with; from now on it
         tells the larger errors. Of an answer that is a sum of two only the change is known.
-
-        Args:
-            result: The last solution.
-            rule: Its accuracy.
         """
         if not rule.is_of(self._dual):
             return self._change <= rule.rtol
@@ -179,6 +198,26 @@ class Pressures:
         self._constraints.set_pressures(self._now)
         self._dual.feasible = given
         return fits
+
+    def _rest(self, rule: Accuracy) -> bool:
+        """Whether u is right to rtol as far as the last two problems tell; else ``_fit`` has told.
+
+        Between them the bounds ψ and u have changed; so far as the forces are from the bounds yet,
+        u is from its limit by as much, and by what is left of a geometric series.
+        """
+        if len(self._solved) < 2 or not rule.is_of(self._dual):
+            return False
+        (first, of_first, v), (now, found, u) = self._solved
+        way, left, before = (
+            norm_over(self._comm, self._weight * x)
+            for x in (now - first, found - now, of_first - first)
+        )
+        if not agreed(self._comm, 0.0 < way < np.inf):
+            return False
+        rate = min(left / max(before, TINY), SLOWEST)
+        subdomains = self._dual.subdomains
+        moved = subdomains.body_maxima([subdomains.sizes(u - v)])[0]
+        return rule.take(moved * agreed(self._comm, left / way / (1.0 - rate)))
 
     def _on_bodies(self, pressures: Array) -> Array:
         """Norms of the nodal forces μ times those of normals make on each body."""
@@ -242,8 +281,11 @@ class Pressures:
 
     @property
     def slides(self) -> bool:
-        """Whether slips have grown, and not come to rest."""
-        return self._dilated is not None and self._dilated.slides
+        """Whether slips have grown, and not come to rest, on a body that nothing else holds."""
+        free = self._dual.coarse.unheld.free
+        return (
+            self._dilated is not None and self._dilated.slides and bool(free[self.restless].any())
+        )
 
     @property
     def _sticks(self) -> bool:

@@ -23,8 +23,10 @@ from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
 # steps; and steps in a row without a residual below so much of the least one, before one gives up
 MOST_STEPS, PATIENCE, LESS = 80, 10, 0.98
 # steps for one share of the coefficients, and on the whole path; and its shortest step
-MOST_A_SHARE, MOST_ON_PATH, SHORTEST = 25, 1000, 1e-5
+MOST_A_SHARE, MOST_ON_PATH, SHORTEST = 25, 200, 1e-4
+# residuals of so many steps before bound the next one; the shortest part of a step that is tried
 MEMORY, LEAST = 5, 0.01
+# of its residual: what a solve leaves on the path; beside a soft motion SHARE leaves all the others
 EXACT = 1e-3
 # of a residual: rounding of the λ that has it; from there nothing comes lower
 ROUNDING = 1e-16
@@ -101,7 +103,8 @@ def newton_on_law(
 
     The natural map of Coulomb's law, by a semismooth Newton method (Alart, Curnier, Comput.
     Methods Appl. Mech. Engrg. 92, 1991; Hüeber, Stadler, Wohlmuth, SIAM J. Sci. Comput. 30, 2008).
-    No cost falls on the way, and it may fail: whoever calls it has something else to try.
+    The residual may rise above those of a few steps before only where no part of a step of 1/64 or
+    more keeps it below. It may fail: whoever calls it has something else to try.
 
     Args:
         qp: The program; its set is not looked at.
@@ -146,9 +149,7 @@ def newton_on_law(
     return None, step + 1
 
 
-def _searched(
-    qp: QP, law: Law, at: LawPoint, end: LawPoint, norm: float, most: float
-) -> LawPoint:
+def _searched(qp: QP, law: Law, at: LawPoint, end: LawPoint, norm: float, most: float) -> LawPoint:
     """The farthest of the whole step, half of it, … that does not raise the residual.
 
     Where F is known of both ends, it is on all of the way: nothing is multiplied.
@@ -176,7 +177,9 @@ def follow_friction(
     Without friction the solution is unique, and where bodies are held the path that begins there is
     bounded, so that it leads on to the whole coefficients (Allgower, Georg, Introduction to
     Numerical Continuation Methods, 2003, chapter 11). The share grows by twice the last step, by a
-    quarter of it where Newton's method fails. It gives up where the path turns back. Collective.
+    quarter of it where Newton's method fails. It gives up where the path turns back. Solves are
+    exacter than those of ``newton_on_law`` alone; that may be enough, and is tried first.
+    Collective.
 
     Args:
         qp: The program; its set is not looked at.
@@ -190,8 +193,11 @@ def follow_friction(
     Returns:
         Where it has ended, None if it gave up; and the steps taken.
     """
-    point, steps = newton_on_law(qp, law.with_share(0.0), oblique, at, loose, norm, most=EXACT)
-    share, length = 0.0, 1.0
+    whole, steps = newton_on_law(qp, law, oblique, at, target, norm, MOST_A_SHARE, EXACT)
+    if whole is not None:
+        return whole, steps
+    point, taken = newton_on_law(qp, law.with_share(0.0), oblique, at, loose, norm, most=EXACT)
+    steps, share, length = steps + taken, 0.0, 1.0
     while point is not None and share < 1.0 and length >= SHORTEST and steps < MOST_ON_PATH:
         new = min(share + length, 1.0)
         goal = target if new == 1.0 else loose

@@ -1,0 +1,108 @@
+"""Coulomb's law with any coefficient on clamped bodies, beside a dense Newton method."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from friction_reference import ClampedLaw
+from scenes import clamp, decomposed, displacement, forms, hooke
+
+import tfeti_dolfinx as tfeti
+
+PLACES = [("left", "top"), ("left", "right"), ("top", "right"), ("right", "top"), ("top", "left")]
+# what is reported is an estimate; below this rounding is part of an error
+FACTOR, ROUNDING = 10.0, 1e-12
+
+
+def scene(seed):
+    """Cell, n, subdomains, μ, whether steps are accepted, sides clamped and loaded, gap, loads."""
+    rng = np.random.default_rng(seed)
+    cell = rng.choice(["triangle", "quadrilateral"] if rng.random() < 0.7 else ["tetrahedron"])
+    gdim = 3 if cell == "tetrahedron" else 2
+    n, subdomains = int(rng.integers(2, 4 if gdim == 3 else 9)), int(rng.integers(2, 5))
+    mu = float(np.exp(rng.uniform(np.log(0.05), np.log(10.0))))
+    clamped, loaded = PLACES[rng.integers(len(PLACES))]
+    loads = [
+        np.r_[rng.uniform(-0.06, 0.06, gdim - 1), rng.uniform(-0.08, 0.01)]
+        * 10.0 ** min(0.0, rng.uniform(-2.0, 4.0))
+        for _ in range(rng.integers(2, 6))
+    ]
+    return cell, n, subdomains, mu, rng.random() < 0.5, clamped, loaded, 0.01 * (seed % 2), loads
+
+
+def steps(cell, n, subdomains, mu, accepts, clamped, loaded, gap, loads, **options):
+    """Solve all steps: each has to be right to what it reports."""
+    d = decomposed(cell, n, subdomains)
+    gdim = d.mesh.geometry.dim
+    V, a, _ = forms(d.mesh, d.facet_tags, np.zeros(gdim), d.surface(loaded))
+    t = fem.Constant(d.mesh, np.zeros(gdim))
+    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+    up = np.eye(gdim)[-1]
+    floor = tfeti.Obstacle(
+        "bottom", tfeti.Plane(-gap * up, up), friction=tfeti.Coulomb(mu), reach=np.inf
+    )
+    p = tfeti.ContactProblem(
+        a,
+        ufl.dot(t, ufl.TestFunction(V)) * ds(d.surface(loaded)),
+        [clamp(V, d.facets(clamped))],
+        [floor],
+        d,
+        stress=hooke(),
+        petsc_options=options,
+    )
+    law, reports = ClampedLaw(cell, n, mu, clamped, loaded, gap), []
+    for load in loads:
+        t.value[:] = load
+        p.solve()
+        u, reported = displacement(p)[1], p.report.residuals["displacement_error"]
+        error = law.distance(u, load)
+        assert error <= FACTOR * max(reported, ROUNDING), (load, error, reported)
+        right = p.report.converged_reason == "CONVERGED_RTOL"
+        assert right == (reported <= p.report.tolerances["displacement_error"])
+        reports.append((p.report.converged_reason, error))
+        if accepts:
+            p.accept()
+            law.rest(u)
+    p.destroy()
+    return reports
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_random_steps(seed):
+    assert all(reason == "CONVERGED_RTOL" for reason, _ in steps(*scene(seed)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", range(8, 320, 8))
+def test_many_random_steps(first):
+    """About a thousand with those above."""
+    for seed in range(first, first + 8):
+        assert all(reason == "CONVERGED_RTOL" for reason, _ in steps(*scene(seed)))
+
+
+NAMED = [
+    # bounds at rest to friction_rtol, u wrong by 16 and 8 rtol
+    ("quadrilateral", 7, 2, 2.889936444672922, True, "top", "left", 0.01)
+    + ([(-0.054, -0.0504), (0.0451, 0.0056)],),
+    ("triangle", 4, 4, 7.08677777158377, False, "left", "top", 0.0)
+    + ([(-0.0484, -0.0799), (-0.0056, 0.0017), (0.044, -0.0062)],),
+    # by 140, in 249 multiplications by F
+    ("hexahedron", 4, 4, 3.6741693683561043, False, "top", "right", 0.01)
+    + ([(-0.0507, 0.0536, -0.0248)],),
+    # DIVERGED_FRICTION
+    ("hexahedron", 4, 4, 8.491434237593893, False, "top", "left", 0.0)
+    + ([(-0.0409, 0.0587, -0.0569)],),
+    ("quadrilateral", 4, 2, 1.5, False, "left", "top", 0.0)
+    + ([(0.0347, -0.0518), (-0.002, -0.0003)],),
+]
+
+
+@pytest.mark.parametrize("named", NAMED)
+def test_steps_that_went_wrong(named):
+    assert all(reason == "CONVERGED_RTOL" for reason, _ in steps(*named))
+
+
+def test_what_rests_to_friction_rtol_only_says_so():
+    """A fixed point of bounds has no more digits than that, and u is wrong by more than rtol."""
+    reports = steps(*NAMED[1], friction_type="fixed_point", rtol=1e-6)
+    assert any(reason == "CONVERGED_FRICTION_RTOL" and error > 1e-6 for reason, error in reports)
