@@ -66,7 +66,6 @@ class Report:
         friction_last: Multiplications by F of the last of these problems.
         outer_iterations: Outer iterations.
         newton_faces: Faces that block Newton has solved on.
-        slow_directions: Directions in which it was slow on one face, a coarse space for the next.
         cg_steps: Conjugate gradient steps.
         expansion_steps: Expansion steps.
         proportioning_steps: Proportioning steps.
@@ -140,7 +139,6 @@ class Report:
     friction_last: int = 0
     outer_iterations: int = _counter()
     newton_faces: int = _counter()
-    slow_directions: int = _counter()
     cg_steps: int = _counter()
     expansion_steps: int = _counter()
     proportioning_steps: int = _counter()

@@ -73,7 +73,6 @@ def fill_result(
     report.friction_last = settling.last
     report.outer_iterations += result.steps.outer
     report.newton_faces += result.steps.faces
-    report.slow_directions += result.steps.slow
     report.face_factorizations += dual.coarse.factors.count["face"]
     if dual.soft is not None:
         report.soft_factorizations += dual.soft.factors.count["face"]

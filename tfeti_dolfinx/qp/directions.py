@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
-from scipy.linalg import eigh_tridiagonal
 
 from tfeti_dolfinx.arrays import Array
 
@@ -17,7 +16,7 @@ NUMBERS = 24_000_000
 
 
 class Conjugates:
-    """Directions p_i with Fp_i, PFp_i, p_iᵀFp_i, r_iᵀz_i, the last where memory lasts not for all.
+    """Directions p_i with PFp_i and p_iᵀFp_i, the last ones where memory lasts not for all.
 
     In exact arithmetic a new direction is conjugate to all if it is to the last one. Where F is ill
     conditioned on a face rounding undoes that, and what was solved for has to be solved for again
@@ -31,10 +30,9 @@ class Conjugates:
     def __init__(self, like: PETSc.Vec, numbers: int = NUMBERS) -> None:
         self.comm = like.getComm().tompi4py()
         rows = self.comm.allreduce(like.getLocalSize(), op=MPI.MAX)
-        self._most = max(numbers // (3 * max(rows, 1)), 1)
-        self._p, self._Fp, self._PFp = (np.zeros((0, like.getLocalSize())) for _ in range(3))
+        self._most = max(numbers // (2 * max(rows, 1)), 1)
+        self._p, self._PFp = (np.zeros((0, like.getLocalSize())) for _ in range(2))
         self._pFp: Array = np.zeros(0)
-        self._rz: Array = np.zeros(0)
         self._count = 0
 
     def clear(self) -> None:
@@ -54,51 +52,18 @@ class Conjugates:
         """Make z conjugate to them, in place; given the sums of products over all ranks."""
         z -= (products / self._pFp[: self.number]) @ self._p[: self.number]
 
-    def keep(self, p: Array, Fp: Array, PFp: Array, pFp: float, rz: float) -> None:
+    def keep(self, p: Array, PFp: Array, pFp: float) -> None:
         """Keep another one, in the place of the oldest if there are too many."""
         at = self._count % self._most
         if at == len(self._pFp):
             more = min(max(len(self._pFp), 8), self._most - len(self._pFp))
-            self._p, self._Fp, self._PFp = (
+            self._p, self._PFp = (
                 np.concatenate((known, np.zeros((more, known.shape[1]))))
-                for known in (self._p, self._Fp, self._PFp)
+                for known in (self._p, self._PFp)
             )
             self._pFp = np.append(self._pFp, np.zeros(more))
-            self._rz = np.append(self._rz, np.zeros(more))
-        self._p[at], self._Fp[at], self._PFp[at] = p, Fp, PFp
-        self._pFp[at], self._rz[at] = pFp, rz
+        self._p[at], self._PFp[at], self._pFp[at] = p, PFp, pFp
         self._count += 1
-
-    def ritz_vectors(self, high: float, loose: float) -> tuple[float, Array]:
-        """Ritz vectors of MF of large values, M-orthonormal, as rows of coefficients of the p_i.
-
-        Saad, Iterative Methods for Sparse Linear Systems, SIAM 2003, section 6.7.3: z_i/√(r_iᵀz_i)
-        are orthonormal in M⁻¹, and make MF tridiagonal. None where the first directions have gone,
-        or where there are fewer than three.
-
-        Args:
-            high: Least value.
-            loose: Largest bound of how far an eigenvalue of MF may be from a value, of the value.
-
-        Returns:
-            The largest value, 0 where none is known; the vectors, shape ``(k, number)``.
-        """
-        n = self._count
-        if n < 3 or n > self._most:
-            return 0.0, np.zeros((0, self.number))
-        rz, curvature = self._rz[:n], self._pFp[:n] / self._rz[:n]
-        beta = rz[1:] / rz[:-1]
-        diagonal = curvature + np.append(0.0, beta * curvature[:-1])
-        values, Y = eigh_tridiagonal(diagonal, -np.sqrt(beta) * curvature[:-1])
-        # the entry that comes next in the matrix is about the last curvature
-        sharp = np.abs(Y[-1]) * curvature[-1] <= loose * values
-        Y = Y[:, (values > high) & sharp] / np.sqrt(rz)[:, None]
-        Y[:-1] -= beta[:, None] * Y[1:]  # z_i = p_i − β_i p_{i−1}
-        return float(values[-1]), np.asarray(Y.T)
-
-    def combined(self, parts: Array) -> tuple[Array, Array]:
-        """Combinations of the p_i, and what F makes of them, given rows of coefficients."""
-        return parts @ self._p[: self.number], parts @ self._Fp[: self.number]
 
 
 class Directions:

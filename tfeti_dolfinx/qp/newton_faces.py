@@ -25,7 +25,6 @@ from tfeti_dolfinx.qp.newton_curved import (
 from tfeti_dolfinx.qp.parameters import NewtonParameters
 from tfeti_dolfinx.qp.pcpg import pcpg
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, FaceOperator, Point, Steps
-from tfeti_dolfinx.qp.slow_directions import SlowDirections
 from tfeti_dolfinx.qp.stopping import StoppingRule, TargetRule
 from tfeti_dolfinx.qp.trial import Trial
 
@@ -78,7 +77,7 @@ class FaceSolver:
         self._qp, self._rule, self._parameters = qp, rule, parameters
         self._steps, self._max_it, self._monitor = steps, max_it, monitor
         self._comm = qp.d.getComm().tompi4py()
-        self._directions, self._slow = Directions(qp.d), SlowDirections(self._comm)
+        self._directions = Directions(qp.d)
         self._directions.norm = qp.seen
         self.dependent = DependentRows(qp, self._directions)
         self._face: Face | None = None
@@ -118,8 +117,6 @@ class FaceSolver:
         same = self.stays_on(face)
         if same and not self.curved:
             return True
-        if self._preconditioner is not None and self._qp.recycled is None:
-            self._steps.slow += self._slow.learn(self._directions.kept, self._eased.face)
         self._leave()
         self._steps.faces += not same
         self.curved = is_curved(self._qp, face)
@@ -134,8 +131,7 @@ class FaceSolver:
         if self._prepared:
             return
         if self._qp.preconditioner_on is not None:
-            on_face = self._qp.preconditioner_on(self._eased.face)
-            self._preconditioner = self._slow.beside(on_face, self._eased.face)
+            self._preconditioner = self._qp.preconditioner_on(self._eased.face)
         self.dependent.preconditioner = self._preconditioner
         self.dependent.face = self._eased.face
         self._bent = Bent(self._qp.F, self._eased.face) if self.curved else None

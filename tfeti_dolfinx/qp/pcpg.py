@@ -101,7 +101,7 @@ def pcpg(
                 reason = ConvergedReason.DIVERGED_INDEFINITE_MAT
             break
         point.move(rp / pFp, p, Fp)
-        own.kept.keep(p.array_r, Fp.array_r, PFp, pFp, rz)
+        own.kept.keep(p.array_r, PFp, pFp)
         if past is not None:
             past.remember(p, Fp, pFp)
         z.copy(r)

@@ -132,14 +132,13 @@ class ConvergedReason(IntEnum):
 
 @dataclass
 class Steps:
-    """Steps that a solver has taken, by their kind, faces, and directions that were slow there."""
+    """Steps that a solver has taken, by their kind, and faces."""
 
     outer: int = 0
     faces: int = 0
     cg: int = 0
     expansion: int = 0
     proportioning: int = 0
-    slow: int = 0
 
     @property
     def inner(self) -> int:
