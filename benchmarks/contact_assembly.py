@@ -31,10 +31,10 @@ import tfeti_dolfinx as tfeti
 from benchmarks.pictures import column, curves, picture
 from benchmarks.tables import slope
 from benchmarks.tools import command_line, finish
-from tfeti_dolfinx.arrays import node_blocks
-from tfeti_dolfinx.assembly import Forms
-from tfeti_dolfinx.compat import create_mesh_in_place
+from tfeti_dolfinx.common.arrays import node_blocks
+from tfeti_dolfinx.common.compat import create_mesh_in_place
 from tfeti_dolfinx.contact.search import ContactSearch
+from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 SURFACES = {"lower top": 1, "upper bottom": 2}

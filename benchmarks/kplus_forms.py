@@ -30,8 +30,8 @@ from scipy.sparse import csr_array
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.tables import markdown, write_tables
-from tfeti_dolfinx.compat import assemble_csr
-from tfeti_dolfinx.subdomains.kernel import candidate_modes, fixing_nodes, kernel_of
+from tfeti_dolfinx.common.compat import assemble_csr
+from tfeti_dolfinx.subdomains.block import candidate_modes, fixing_nodes, kernel_of
 from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, regular_matrix, with_entries
 
 ASPECT, NU = 4, 0.3

@@ -15,7 +15,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from tfeti_dolfinx.assembly import Forms
+from tfeti_dolfinx.forms.assembly import Forms
 
 # what to try of each; the best one counts
 GAMG, HYPRE = "-pc_type gamg", "-pc_type hypre -pc_hypre_boomeramg"

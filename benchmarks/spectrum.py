@@ -34,10 +34,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import tfeti_dolfinx as tfeti
 from benchmarks.pictures import column, curves, picture
 from benchmarks.tools import command_line, finish
-from tfeti_dolfinx.boundary.panels import Panels
-from tfeti_dolfinx.boundary.steklov import Law, steklov
-from tfeti_dolfinx.boundary.surface import surfaces
-from tfeti_dolfinx.compat import assemble_csr
+from tfeti_dolfinx.bem.panels import Panels, surfaces
+from tfeti_dolfinx.bem.steklov import IsotropicLaw, steklov
+from tfeti_dolfinx.common.compat import assemble_csr
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 # dimension: all H/h with all 1/H
@@ -144,7 +143,7 @@ def steklov_poincare(V, whole):
     (surface,) = surfaces(TornDofs(V, whole), whole, np.ones(1, dtype=bool)).values()
     used, nodes = np.unique(surface.panels.nodes, return_inverse=True)
     panels = Panels(surface.panels.x[used], nodes.reshape(surface.panels.nodes.shape))
-    return steklov(panels, Law(0.5 / (1.0 + NU), NU)).S
+    return steklov(panels, IsotropicLaw(0.5 / (1.0 + NU), NU)).S
 
 
 def row(gdim, parts, cells, boundary):

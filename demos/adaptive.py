@@ -11,7 +11,7 @@ import numpy as np
 
 import tfeti_dolfinx as tfeti
 from meshes.tools import sizes_from_simplices
-from tfeti_dolfinx.compat import geometry_dofmap
+from tfeti_dolfinx.common.compat import geometry_dofmap
 
 # An element becomes at most so many times smaller or larger at once, and the error of all halved:
 # a coarse mesh says little of where a fine one should be.

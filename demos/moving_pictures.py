@@ -9,7 +9,7 @@ import numpy as np
 from dolfinx import mesh as dmesh
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.compat import geometry_dofmap
+from tfeti_dolfinx.common.compat import geometry_dofmap
 
 
 class Film:

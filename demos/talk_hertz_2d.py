@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import tfeti_dolfinx as tfeti
 from demos.demo_tools import Demo
 from demos.hertz import LineContact, compare
-from tfeti_dolfinx.compat import create_mesh_in_place
+from tfeti_dolfinx.common.compat import create_mesh_in_place
 
 SIDES = {"lower bottom": 1, "lower top": 2, "upper bottom": 3, "upper top": 4}
 

@@ -8,7 +8,7 @@ from mpi4py import MPI
 from scenes import hooke, strain
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.compat import geometry_dofmap
+from tfeti_dolfinx.common.compat import geometry_dofmap
 from tfeti_dolfinx.contact.search import ContactSearch
 
 # as exact as this processor can: the assertion of the test says what that must be

@@ -16,7 +16,7 @@ from test_gmsh_split import two_bodies
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.mesh import dolfinx_input
-from tfeti_dolfinx.mesh.gmsh import reading
+from tfeti_dolfinx.mesh import gmsh_reading as reading
 from tfeti_dolfinx.mesh.partition import assign_subdomains
 from tfeti_dolfinx.output import write_vtx, write_xdmf
 from tfeti_dolfinx.plot import plot_deformed, plot_pressure

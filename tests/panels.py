@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tfeti_dolfinx.boundary.panels import Panels
+from tfeti_dolfinx.bem.panels import Panels
 
 
 def polygon(corners, m, grading=1.0):

@@ -13,8 +13,8 @@ from scenes import displacement
 from sheared import Driven
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx import checkpoint
-from tfeti_dolfinx.series import fields_of
+from tfeti_dolfinx.steps import checkpoint
+from tfeti_dolfinx.steps.load_steps import fields_of
 
 TIMES = [0.5, 1.0, 1.75, 2.5, 3.25]
 LAST = MPI.COMM_WORLD.size - 1

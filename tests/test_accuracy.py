@@ -13,7 +13,7 @@ from scipy.sparse.linalg import spsolve
 from test_mortar_cases import no_load
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.dual.closing import closing
+from tfeti_dolfinx.feti.recovery import min_norm_correction
 
 
 def rectangle(cells, size, comm):
@@ -146,7 +146,7 @@ def test_atol_is_a_length():
 
 def test_rounding_is_called_so(monkeypatch):
     """Where no digits are solved apart; with them it converges."""
-    kept = "tfeti_dolfinx.solver.with_more_digits"
+    kept = "tfeti_dolfinx.solve.solver.with_more_digits"
     monkeypatch.setattr(kept, lambda dual, told, result, rule: (result, rule))
     scene = (12, 6), (2.0, 1.0), checkerboard(1e8), 0.3, (0.0, 1e-3)
     p = torn(*scene, 4, [], tfeti_rtol=1e-15)
@@ -195,7 +195,7 @@ def test_what_rows_miss_is_closed_by_the_least_displacement(cell, stiffness):
     w.array[:] = rng.standard_normal(rows.num_rows)
     closed = rng.random(len(rows.sets.normals)) < 0.8
     w.array[rows.sets.normals] *= closed
-    v.array[:] = closing(rows, w, closed)
+    v.array[:] = min_norm_correction(rows, w, closed)
     rows.B.mult(v, missed)
     asked = np.ones(rows.num_rows, dtype=bool)
     asked[rows.sets.normals] = closed
@@ -205,7 +205,7 @@ def test_what_rows_miss_is_closed_by_the_least_displacement(cell, stiffness):
     other.array[:] = rng.standard_normal(len(other.array_r))
     rows.B.mult(other, missed)
     missed.array[~asked] = 0.0
-    nothing = other.array_r - closing(rows, missed, closed)
+    nothing = other.array_r - min_norm_correction(rows, missed, closed)
     product = MPI.COMM_WORLD.allreduce(nothing @ (rows.weights * v.array_r))
     size = MPI.COMM_WORLD.allreduce(np.abs(nothing) @ np.abs(rows.weights * v.array_r))
     assert abs(product) <= 1e-4 * size
@@ -225,7 +225,7 @@ def test_what_rows_of_a_node_miss_in_contradiction_is_closed_as_far_as_it_can_be
     rng = np.random.default_rng(MPI.COMM_WORLD.rank)
     w.set(0.0)
     w.array[rows.sets.normals] = rng.standard_normal(len(closed))
-    v.array[:] = closing(rows, w, closed)
+    v.array[:] = min_norm_correction(rows, w, closed)
     rows.B.mult(v, left)
     left.aypx(-1.0, w)
     assert left.norm() > 0.1 * w.norm()

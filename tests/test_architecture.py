@@ -9,42 +9,32 @@ PACKAGE = ROOT / "tfeti_dolfinx"
 
 # the rooms in their order; those of one line may not import from each other
 ROOMS = [
-    ["errors", "arrays", "citations", "version"],
-    ["checks", "compat", "parallel", "stages", "states", "timing"],
-    ["agreement", "described"],
+    ["errors", "version"],
+    ["common"],
     ["mesh"],
+    ["forms"],
     ["mortar"],
     ["contact"],
-    ["gluing"],
     ["qp"],
+    ["constraints"],
     ["subdomains"],
-    ["boundary"],
-    ["dual"],
-    ["form_checks", "options", "report"],
-    ["assembly", "elasticity", "option_parsing"],
-    ["fields", "inertia"],
-    ["contact_state", "discretisation", "friction_bounds", "interior", "point_values"],
-    ["solution"],
-    ["saved_state", "work"],
-    ["refinement"],
-    ["solver"],
-    ["dilation"],
-    ["newton_coulomb", "pressures"],
-    ["coulomb"],
-    ["report_filling", "doubts"],
+    ["feti"],
+    ["options", "testing"],
+    ["solve"],
     ["extensions"],
-    ["boundary_elements"],
-    ["system", "predictor"],
-    ["estimates", "rounds", "stepping"],
+    ["bem"],
+    ["solution"],
+    ["report", "draw"],
+    ["system", "output", "plot"],
+    ["accuracy"],
     ["problem"],
-    ["draw", "dynamics"],
-    ["output", "plot"],
-    ["checkpoint", "halving", "progress", "series"],
-    ["load_steps"],
+    ["steps"],
 ]
 PLACE = {room: place for place, rooms in enumerate(ROOMS) for room in rooms}
 # the QP solvers know nothing of meshes and rows, the Blocks nothing of rows
-APART = {(own, room) for own in ("qp", "subdomains") for room in ("mortar", "contact", "gluing")}
+APART = {
+    (own, room) for own in ("qp", "subdomains") for room in ("mortar", "contact", "constraints")
+}
 APART.add(("qp", "mesh"))
 # words that a single module may use: what differs between versions, and a heavy library
 ALONE = {

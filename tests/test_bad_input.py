@@ -12,7 +12,8 @@ from petsc4py import PETSc
 from scenes import box, decomposed, forms, hooke, problem, strain
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx import InputError, NoSolutionError, compat
+from tfeti_dolfinx import InputError, NoSolutionError
+from tfeti_dolfinx.common import compat
 from tfeti_dolfinx.errors import TfetiError, raised_on_all_ranks
 
 ROOT = MPI.COMM_WORLD.rank == 0

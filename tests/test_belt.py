@@ -7,7 +7,7 @@ import pytest
 
 import tfeti_dolfinx as tfeti
 from demos import belt_2d
-from tfeti_dolfinx import coulomb
+from tfeti_dolfinx.solve import coulomb
 
 
 @pytest.fixture(scope="module")

@@ -15,15 +15,21 @@ from scipy.linalg import block_diag, null_space
 from scipy.sparse import csr_array, diags_array
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.compat import assemble_csr
+from tfeti_dolfinx.common.compat import assemble_csr
 from tfeti_dolfinx.errors import ConformanceError, FactorError, InputError
-from tfeti_dolfinx.subdomains import factor, traced
-from tfeti_dolfinx.subdomains.conformance import check_block, check_kind_of_block
-from tfeti_dolfinx.subdomains.data import Counters, SubdomainData
+from tfeti_dolfinx.subdomains import factor
+from tfeti_dolfinx.subdomains import stiffness as traced
+from tfeti_dolfinx.subdomains.block import (
+    Counters,
+    SubdomainData,
+    candidate_modes,
+    fixing_nodes,
+    kernel_of,
+)
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
-from tfeti_dolfinx.subdomains.kernel import candidate_modes, fixing_nodes, kernel_of
-from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, Making
+from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, InverseFactory
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
+from tfeti_dolfinx.testing import check_block, check_kind_of_block
 
 RIGID = {"triangle": 3, "quadrilateral": 3, "tetrahedron": 6, "hexahedron": 6}
 
@@ -57,7 +63,7 @@ def data(K, x, every=3, **changes):
 
 
 def block(K, x, every=3, counters=None, **changes):
-    return SparseBlock(data(K, x, every, **changes), Making(counters or Counters()))
+    return SparseBlock(data(K, x, every, **changes), InverseFactory(counters or Counters()))
 
 
 @pytest.mark.parametrize("cell", list(RIGID))
@@ -315,7 +321,7 @@ def test_motions_without_energy_are_counted(cell, energy, kplus):
     with pytest.raises(
         InputError, match=f"the form gives no energy to {count} beside the {rigid} of a rigid body"
     ):
-        SparseBlock(data(K, x), Making(kplus=KPLUS_TYPES[kplus]))
+        SparseBlock(data(K, x), InverseFactory(kplus=KPLUS_TYPES[kplus]))
 
 
 @pytest.fixture(params=factor.SOLVERS)

@@ -22,14 +22,14 @@ from scenes import (
 from scipy.linalg import eigh
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.arrays import node_blocks
-from tfeti_dolfinx.boundary.parts import Parts
-from tfeti_dolfinx.boundary.steklov import Law, rigid_motions
-from tfeti_dolfinx.compat import assemble_csr
+from tfeti_dolfinx.bem.block import Parts
+from tfeti_dolfinx.bem.steklov import IsotropicLaw, rigid_motions
+from tfeti_dolfinx.common.arrays import node_blocks
+from tfeti_dolfinx.common.compat import assemble_csr
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
-from tfeti_dolfinx.subdomains.conformance import check_block
-from tfeti_dolfinx.subdomains.kplus import Making
+from tfeti_dolfinx.subdomains.kplus import InverseFactory
+from tfeti_dolfinx.testing import check_block
 
 ALL = tfeti.BoundaryElements()
 
@@ -37,7 +37,7 @@ ALL = tfeti.BoundaryElements()
 def made_parts(d, K=None):
     """All subdomains of this rank with boundary elements."""
     V, a, _ = forms(d.mesh, d.facet_tags, (0.0,) * d.mesh.geometry.dim, d.surface("top"))
-    dofs, how = TornDofs(V, d), Making()
+    dofs, how = TornDofs(V, d), InverseFactory()
     parts = Parts(dofs, d, np.ones(len(d.subdomains), dtype=bool), how)
     K = assemble_csr(fem.form(a)) if K is None else K
     parts.take_stiffness(K, node_blocks(K, dofs.bs)[dofs.dolfinx_node])
@@ -363,7 +363,7 @@ def test_fields_inside_in_each_step_of_a_series(shared_tmp):
 @pytest.mark.parametrize(("cell", "sizes"), [("triangle", (8, 16)), ("hexahedron", (3, 6))])
 def test_fields_inside_of_a_point_force_outside(cell, sizes):
     """Kelvin's solution: at nodes, and also in the cells that lie on the surface."""
-    law, errors = Law(0.5 / 1.3, 0.3), []
+    law, errors = IsotropicLaw(0.5 / 1.3, 0.3), []
     for n in sizes:
         d = decomposed(cell, n, 2)
         gdim = d.mesh.geometry.dim

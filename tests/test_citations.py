@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tfeti_dolfinx.citations import PAPERS, cite
+from tfeti_dolfinx.common.logging import PAPERS, cite
 from tfeti_dolfinx.qp.solvers import SOLVERS
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -14,10 +14,9 @@ import tfeti_dolfinx as tfeti
 from benchmarks.stability_scenes import LADDERS
 from benchmarks.stress.judge import run_scene
 from tfeti_dolfinx.errors import FactorError, InputError
-from tfeti_dolfinx.qp.faces import Status, face_of
-from tfeti_dolfinx.subdomains import averages
-from tfeti_dolfinx.subdomains.clusters import ClusteredSubdomains
-from tfeti_dolfinx.subdomains.glue import Saddle
+from tfeti_dolfinx.qp.sets import Status, face_of
+from tfeti_dolfinx.subdomains import clusters as averages
+from tfeti_dolfinx.subdomains.clusters import ClusteredSubdomains, Saddle
 
 COMM = MPI.COMM_WORLD
 

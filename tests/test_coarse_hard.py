@@ -11,10 +11,9 @@ from scipy.sparse import csr_array, diags_array
 from test_solvable_lp import dual_of
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.dual.motions import unresisted, unsprung
-from tfeti_dolfinx.dual.null_basis import null_basis
-from tfeti_dolfinx.dual.semidefinite import SemidefiniteFactor
 from tfeti_dolfinx.errors import FactorError
+from tfeti_dolfinx.feti.projectors import SemidefiniteFactor
+from tfeti_dolfinx.feti.rigid_bodies import null_basis, unresisted, unsprung
 
 
 def stiff_upper(d, E):

@@ -9,8 +9,9 @@ from reference import UntornElasticity
 from scenes import curved_obstacle, decomposed, displacement, hooke, problem, relative, strain
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx import ContactStatus, coulomb
-from tfeti_dolfinx.solver import solve_dual
+from tfeti_dolfinx import ContactStatus
+from tfeti_dolfinx.solve import coulomb
+from tfeti_dolfinx.solve.solver import solve_dual
 
 CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from petsc4py import PETSc
 
-from tfeti_dolfinx.dual import contact_factor as module
-from tfeti_dolfinx.dual.contact_factor import contact_factor
+from tfeti_dolfinx.feti import preconditioner as module
+from tfeti_dolfinx.feti.preconditioner import contact_factor
 
 
 def matrix(rows):

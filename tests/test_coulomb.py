@@ -17,14 +17,14 @@ import tfeti_dolfinx as tfeti
 from demos import mindlin_3d
 from demos.partial_slip import pushed
 from meshes import half_spaces
-from tfeti_dolfinx import dilation, pressures
 from tfeti_dolfinx.options import Options
-from tfeti_dolfinx.pressures import Pressures
-from tfeti_dolfinx.qp.acceleration import Anderson
-from tfeti_dolfinx.qp.cones import Cones
-from tfeti_dolfinx.qp.conformance import check_feasible_set
-from tfeti_dolfinx.qp.faces import Status
 from tfeti_dolfinx.qp.problem import ConvergedReason
+from tfeti_dolfinx.qp.sets import Status
+from tfeti_dolfinx.solve import coulomb as pressures
+from tfeti_dolfinx.solve import dilation
+from tfeti_dolfinx.solve.coulomb import FrictionBoundIteration
+from tfeti_dolfinx.solve.dilation import Anderson, Cones
+from tfeti_dolfinx.testing import check_feasible_set
 
 # the change of bounds at which they are at rest is 100 rtol: u and forces follow to this
 SHARE = 1e-6
@@ -177,7 +177,7 @@ def test_bounds_of_a_light_body_come_to_rest():
 
 def test_forces_that_rounding_makes_are_none():
     p = solved("quadrilateral", tfeti.Coulomb(0.3), (0.05, -0.05))
-    bounds, lam = Pressures(p.dual, Options(), None), p.dual.d.duplicate()
+    bounds, lam = FrictionBoundIteration(p.dual, Options(), None), p.dual.d.duplicate()
     rows = p.dual.constraints.sets.normals
     lam.set(0.0)
     lam.array[rows] = np.where(np.arange(len(rows)) % 2 == 0, 1e-16, 1.0)
@@ -315,7 +315,9 @@ def test_bounds_on_the_way_that_hold_the_load_are_tried():
     p.solve()
     constraints = p.dual.constraints
     held = constraints.pressures[constraints.pressed].copy()
-    bounds = Pressures(p.dual, Options(), (np.zeros(constraints.num_rows), np.zeros(0)))
+    bounds = FrictionBoundIteration(
+        p.dual, Options(), (np.zeros(constraints.num_rows), np.zeros(0))
+    )
     for share, part in ((0.3, 0.5), (0.0, 0.25)):  # 0.6 is needed: 1 − part·(1 − share) ≥ 0.6
         bounds._held, bounds._now = held, share * held
         start = (np.ones(constraints.num_rows), np.zeros(0))

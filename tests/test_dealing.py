@@ -10,9 +10,16 @@ from scenes import box
 
 import tfeti_dolfinx as tfeti
 from demos import cube_3d
-from tfeti_dolfinx.mesh.dealing import ALIKE, SHARED, deal_shared, dearest
 from tfeti_dolfinx.mesh.dolfinx_input import _untorn
-from tfeti_dolfinx.mesh.likeness import alike, bare_sides, measured
+from tfeti_dolfinx.mesh.tearing import (
+    ALIKE,
+    SHARED,
+    alike,
+    bare_sides,
+    deal_shared,
+    dearest,
+    measured,
+)
 
 COMM = MPI.COMM_WORLD
 

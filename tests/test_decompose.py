@@ -11,9 +11,8 @@ from mpi4py import MPI
 from scenes import SIDES, box, decomposed
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.mesh.bisection import bisect_points
-from tfeti_dolfinx.mesh.dealing import SHARED, costs, deal
-from tfeti_dolfinx.mesh.likeness import alike, measured
+from tfeti_dolfinx.mesh.partition import bisect_points
+from tfeti_dolfinx.mesh.tearing import SHARED, alike, costs, deal, measured
 
 CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
 

@@ -15,7 +15,7 @@ from mpi4py import MPI
 from scenes import clamp, decomposed, forms, hooke
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.agreement import agreeing, described
+from tfeti_dolfinx.common.agreement import agreeing, described
 
 pytestmark = pytest.mark.timeout(100)
 

@@ -11,7 +11,7 @@ from mpi4py import MPI
 from scenes import decomposed, forms
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.agreement import check_same_problem
+from tfeti_dolfinx.common.agreement import check_same_problem
 
 
 def of_points(x):

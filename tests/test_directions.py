@@ -6,11 +6,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse
-from tfeti_dolfinx.qp.directions import Conjugates, Directions
-from tfeti_dolfinx.qp.feasible_sets import Product
-from tfeti_dolfinx.qp.pcpg import pcpg
-from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, Steps
-from tfeti_dolfinx.qp.stopping import TargetRule
+from tfeti_dolfinx.qp.krylov import Conjugates, Directions, pcpg
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, Steps, TargetRule
+from tfeti_dolfinx.qp.sets import Product
 
 n = 60
 

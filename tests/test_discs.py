@@ -5,10 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tfeti_dolfinx.qp.conformance import check_feasible_set
-from tfeti_dolfinx.qp.discs import Discs, Ellipses
-from tfeti_dolfinx.qp.faces import Status
-from tfeti_dolfinx.qp.feasible_sets import Bounds, Product
+from tfeti_dolfinx.qp.sets import Bounds, Discs, Ellipses, Product, Status
+from tfeti_dolfinx.testing import check_feasible_set
 
 SEEDS = st.integers(0, 10_000)
 

@@ -6,16 +6,16 @@ from mpi4py import MPI
 from scenes import curved_obstacle, decomposed, problem
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.dual.accuracy import Accuracy
-from tfeti_dolfinx.dual.operator import check_operator
-from tfeti_dolfinx.dual.particular import feasible_particular
-from tfeti_dolfinx.dual.recovery import at_rest
-from tfeti_dolfinx.dual.remainder import Remainder
+from tfeti_dolfinx.feti.dual import feasible_particular
+from tfeti_dolfinx.feti.operator import check_operator
+from tfeti_dolfinx.feti.recovery import without_rigid_motions as at_rest
+from tfeti_dolfinx.feti.remainder import DefectProblem
+from tfeti_dolfinx.feti.stopping import Accuracy
 from tfeti_dolfinx.options import Options
-from tfeti_dolfinx.qp.homogenised import homogenise, image
+from tfeti_dolfinx.qp.homogenised import homogenise, operator_product
 from tfeti_dolfinx.qp.newton import feasible_start, newton
 from tfeti_dolfinx.qp.problem import Start
-from tfeti_dolfinx.solver import solve_dual
+from tfeti_dolfinx.solve.solver import solve_dual
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def test_F_is_symmetric_and_positive(dual):
 
 
 def test_preconditioners_are_symmetric_and_positive(dual):
-    from tfeti_dolfinx.dual.operator import PRECONDITIONERS, ScaledRows
+    from tfeti_dolfinx.feti.operator import PRECONDITIONERS, ScaledRows
 
     scaled = ScaledRows(dual.constraints.B, dual.constraints.weights)
     for make in PRECONDITIONERS.values():
@@ -175,7 +175,7 @@ def test_what_a_point_lacks_has_the_resultants_of_its_forces(dual):
     rng = np.random.default_rng(dual.coarse.comm.rank)
     lam, subdomains = random_vec(dual, 7).array_r, dual.subdomains
     far = subdomains.kernel_motion(1e12 * rng.standard_normal(subdomains.kernel_size))
-    at_rest, moved = (Remainder(dual, lam, u) for u in (0.0 * far, far))
+    at_rest, moved = (DefectProblem(dual, lam, u) for u in (0.0 * far, far))
     size = dual.coarse.comm.allreduce(np.abs(at_rest.coarse.e).max(initial=0.0), op=MPI.MAX)
     assert size > 0.0
     assert np.abs(moved.coarse.e - at_rest.coarse.e).max(initial=0.0) <= 1e-12 * size
@@ -188,7 +188,7 @@ def lacked(left, rtol=1e-10):
     qp, zero = left.qp(), left.d.duplicate()
     zero.set(0.0)
     start = Start(zero, np.zeros(qp.coarse.dimension))
-    homogenised = homogenise(qp, image(qp.F, feasible_start(qp, start)))
+    homogenised = homogenise(qp, operator_product(qp.F, feasible_start(qp, start)))
     scale = homogenised.scale
     own = Accuracy(left, rtol, 0.0, (scale.reference, scale.rounding))
     result = newton(qp, homogenised, own, start=start)
@@ -204,7 +204,7 @@ def test_what_any_point_lacks_leads_to_the_same_solution(dual, size):
     lam = known.lam.array_r + size * known.lam.norm() * random_vec(dual, 7).array_r / 10.0
     most = rule.measures.bodies.size.max()
     u = rule.u + size * most * rng.standard_normal(len(rule.u))
-    left = Remainder(dual, lam, u)
+    left = DefectProblem(dual, lam, u)
     result, own = lacked(left)
     assert np.abs(own.u - rule.u).max(initial=0.0) <= 1e-8 * most
     result.lam.array[:] += lam - known.lam.array_r
@@ -225,7 +225,7 @@ def test_motions_of_subdomains_are_no_load(dual, far, rtol):
     v = at_rest(subdomains, u)
     assert np.abs(subdomains.kernel_part(v)).max(initial=0.0) <= 1e-13 * most * len(v)
     alpha = far * most * rng.standard_normal(subdomains.kernel_size)
-    left = Remainder(dual, known.lam.array_r, u + subdomains.kernel_motion(alpha), v)
+    left = DefectProblem(dual, known.lam.array_r, u + subdomains.kernel_motion(alpha), v)
     result, own = lacked(left, rtol)
     assert np.abs(own.u - rule.u).max(initial=0.0) <= 100.0 * rtol * most
     bent = at_rest(subdomains, rule.u)

@@ -12,9 +12,9 @@ from scenes import curved_obstacle, decomposed, problem
 from test_own_set import HalfSpaces
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.dual.duality_gap import admissible
-from tfeti_dolfinx.qp.feasible_sets import Product
-from tfeti_dolfinx.solver import solve_dual
+from tfeti_dolfinx.feti.duality_gap import admissible
+from tfeti_dolfinx.qp.sets import Product
+from tfeti_dolfinx.solve.solver import solve_dual
 
 CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
 LAWS = (

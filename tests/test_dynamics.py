@@ -11,7 +11,7 @@ from scenes import clamp, decomposed, forms
 from scenes import displacement as nodal
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.dual import soft_modes
+from tfeti_dolfinx.feti import deflation as soft_modes
 
 
 def largest(comm, values):

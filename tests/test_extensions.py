@@ -6,8 +6,8 @@ from scenes import curved_obstacle, decomposed, problem
 from scipy.linalg import pinvh
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.dual.operator import DualOperator
-from tfeti_dolfinx.subdomains.local import BlockwiseOperator
+from tfeti_dolfinx.feti.operator import DualOperator
+from tfeti_dolfinx.subdomains.local_operators import BlockwiseOperator
 
 
 class DensePinv:

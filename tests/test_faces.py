@@ -12,11 +12,9 @@ from test_solvable_lp import dual_of
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
-from tfeti_dolfinx.qp.faces import Face, Status, face_of
-from tfeti_dolfinx.qp.feasible_sets import Product
-from tfeti_dolfinx.qp.pcpg import pcpg
-from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, Steps
-from tfeti_dolfinx.qp.stopping import ResidualRule
+from tfeti_dolfinx.qp.krylov import pcpg
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, ResidualRule, Steps
+from tfeti_dolfinx.qp.sets import Face, Product, Status, face_of
 
 
 def in_a_corner(**options):

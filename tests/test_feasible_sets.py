@@ -9,10 +9,8 @@ from hypothesis import strategies as st
 
 from tfeti_dolfinx import InputError
 from tfeti_dolfinx.errors import ConformanceError
-from tfeti_dolfinx.qp.conformance import check_feasible_set
-from tfeti_dolfinx.qp.discs import Discs
-from tfeti_dolfinx.qp.faces import Status, face_of
-from tfeti_dolfinx.qp.feasible_sets import Bounds, Product
+from tfeti_dolfinx.qp.sets import Bounds, Discs, Product, Status, face_of
+from tfeti_dolfinx.testing import check_feasible_set
 
 
 @pytest.mark.parametrize(

@@ -11,13 +11,12 @@ from mpi4py import MPI
 from scenes import curved_obstacle, decomposed
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.arrays import sum_rows
+from tfeti_dolfinx.common.arrays import sum_rows
+from tfeti_dolfinx.constraints.gluing import glue, prescribe
 from tfeti_dolfinx.contact.records import relative_displacement, remaining_gaps, slips
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.gluing.glue import glue
-from tfeti_dolfinx.gluing.prescribed import prescribe
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.frames import SWITCH, frames
+from tfeti_dolfinx.mortar.segments import SWITCH, frames
 from tfeti_dolfinx.mortar.surfaces import group_points
 
 CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]

@@ -13,14 +13,12 @@ from scenes import box, decomposed, displacement, hooke, problem, strain
 from test_tresca import nodal_data
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.dual.measures import _missed_by
+from tfeti_dolfinx.feti.stopping import _missed_by
 from tfeti_dolfinx.output import nodal_fields
-from tfeti_dolfinx.qp.discs import Discs
-from tfeti_dolfinx.qp.faces import Face
-from tfeti_dolfinx.qp.newton_curved import Bent
-from tfeti_dolfinx.qp.pcpg import pcpg
-from tfeti_dolfinx.qp.problem import QP, Point, Steps
-from tfeti_dolfinx.qp.stopping import TargetRule
+from tfeti_dolfinx.qp.krylov import pcpg
+from tfeti_dolfinx.qp.newton_faces import CurvedHessian
+from tfeti_dolfinx.qp.problem import QP, Point, Steps, TargetRule
+from tfeti_dolfinx.qp.sets import Discs, Face
 
 EXACT = {"rtol": 1e-10}
 
@@ -242,7 +240,7 @@ def test_the_preconditioner_follows_any_curvature():
     for kappa in (0.0, 1.0, 1e2, 1e4):
         bent = Face(face.Z, np.where(face.curvature > 0.0, kappa, 0.0), face.status)
         M, coarse = p.dual._preconditioner_on(bent), p.dual.coarse.on_face(bent)
-        qp = QP(Bent(p.dual.F, bent), p.dual.d, coarse, feasible, M)
+        qp = QP(CurvedHessian(p.dual.F, bent), p.dual.d, coarse, feasible, M)
         point, count = Point(p.dual.d.duplicate(), p.dual.d.copy()), Steps()
         point.lam.set(0.0)
         point.g.scale(-1.0)

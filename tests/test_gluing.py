@@ -9,11 +9,9 @@ from scenes import curved_obstacle, decomposed
 from scipy.sparse import csr_array
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.constraints.gluing import _orthonormal, glue, prescribe
 from tfeti_dolfinx.contact.records import concatenate
 from tfeti_dolfinx.errors import InputError, NoSolutionError
-from tfeti_dolfinx.gluing.glue import glue
-from tfeti_dolfinx.gluing.interface import _orthonormal
-from tfeti_dolfinx.gluing.prescribed import prescribe
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 

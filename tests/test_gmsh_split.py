@@ -11,7 +11,7 @@ from test_gmsh import rename_as_partition_groups
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.errors import InputError, TfetiError
-from tfeti_dolfinx.mesh.gmsh.split import SplitFiles
+from tfeti_dolfinx.mesh.gmsh_reading import SplitFiles
 
 gmsh = pytest.importorskip("gmsh")
 ROOT = MPI.COMM_WORLD.rank == 0

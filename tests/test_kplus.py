@@ -12,16 +12,11 @@ from test_extensions import DensePinv
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.errors import ConformanceError
-from tfeti_dolfinx.subdomains.conformance import (
-    check_block,
-    check_kind_of_block,
-    check_kind_of_inverse,
-)
-from tfeti_dolfinx.subdomains.data import Counters
+from tfeti_dolfinx.subdomains.block import Counters, candidate_modes, fixing_dofs, kernel_of
 from tfeti_dolfinx.subdomains.factor import NotPositiveDefiniteError
-from tfeti_dolfinx.subdomains.kernel import candidate_modes, fixing_dofs, kernel_of
-from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, Making
+from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, InverseFactory
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
+from tfeti_dolfinx.testing import check_block, check_kind_of_block, check_kind_of_inverse
 
 TYPES = list(KPLUS_TYPES)
 PSEUDO = ["schur", "lu_svd"]
@@ -40,7 +35,7 @@ def subdomain(cell, degree=1, kernel="all", n=2):
 
 
 def made(kind, K, x, counters=None, **changes):
-    how = Making(counters or Counters(), KPLUS_TYPES[kind])
+    how = InverseFactory(counters or Counters(), KPLUS_TYPES[kind])
     return SparseBlock(data(K.copy(), x, **changes), how)
 
 
@@ -77,7 +72,7 @@ def test_a_generalised_inverse(kind, cell, degree, kernel):
 
 @pytest.mark.parametrize("kind", TYPES)
 def test_blocks_with_it_keep_their_promises(kind):
-    check_kind_of_block(lambda data: SparseBlock(data, Making(kplus=KPLUS_TYPES[kind])))
+    check_kind_of_block(lambda data: SparseBlock(data, InverseFactory(kplus=KPLUS_TYPES[kind])))
 
 
 @pytest.mark.parametrize("kind", TYPES)

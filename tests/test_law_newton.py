@@ -14,16 +14,22 @@ from test_mpgp import as_set
 from test_qp import Counted, matrix, vector
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.newton_coulomb import NewtonOnCoulomb
 from tfeti_dolfinx.options import Options
-from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
-from tfeti_dolfinx.qp.gcr import Known, gcr
-from tfeti_dolfinx.qp.law import Law, OnFace
-from tfeti_dolfinx.qp.law_newton import LawPoint, newton_on_law, residual_of
-from tfeti_dolfinx.qp.law_recycled import keep, known_on
-from tfeti_dolfinx.qp.oblique import NoOblique
+from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse, NoOblique
+from tfeti_dolfinx.qp.friction_newton import (
+    KrylovBasis,
+    Law,
+    LawPoint,
+    OnFace,
+    gcr,
+    keep,
+    known_on,
+    newton_on_law,
+    residual_of,
+)
 from tfeti_dolfinx.qp.problem import QP
-from tfeti_dolfinx.qp.recycled import Recycled, RecycledOnFace
+from tfeti_dolfinx.qp.recycling import Recycled, RecycledOnFace
+from tfeti_dolfinx.solve.coulomb import NewtonOnCoulomb
 
 SEEDS = st.integers(0, 1000)
 DIMENSIONS = st.sampled_from([1, 2])
@@ -115,7 +121,7 @@ def test_ways_onto_faces_take_directions_along(monkeypatch):
         return total
 
     together = multiplications()
-    monkeypatch.setattr("tfeti_dolfinx.qp.law_newton.BESIDE", 0.0)
+    monkeypatch.setattr("tfeti_dolfinx.qp.friction_newton.BESIDE", 0.0)
     assert together < multiplications()
 
 
@@ -161,7 +167,7 @@ def test_conjugate_residuals_that_know_directions(seed, n):
     W, k, calls = rng.standard_normal((n, n)), rng.integers(1, n), []
     Q, _ = np.linalg.qr(A @ rng.standard_normal((n, k)))
     Z = np.linalg.solve(A, Q)
-    known = Known(Q.T, Z.T, (W @ Z).T)
+    known = KrylovBasis(Q.T, Z.T, (W @ Z).T)
 
     def apply(z):
         calls.append(1)

@@ -12,7 +12,7 @@ from steps_script import TIMES
 from test_repeated import COUNTERS, Repeated
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.halving import Place, checked_times
+from tfeti_dolfinx.steps.load_steps import Place, checked_times
 
 HERE = Path(__file__).resolve().parent
 PATH = [0.02, 0.06, 0.06, 0.02, -0.06, -0.08, 0.06, -0.01]

@@ -11,17 +11,24 @@ from scipy.sparse import csr_array
 from test_blocks import data, stiffness
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.dual.operator import check_operator
-from tfeti_dolfinx.subdomains.block import BlockDefaults
-from tfeti_dolfinx.subdomains.conformance import check_block, check_kind_of_block
-from tfeti_dolfinx.subdomains.cost import Cost, dense_product, sweeps
-from tfeti_dolfinx.subdomains.data import Counters
-from tfeti_dolfinx.subdomains.equal import EqualSubdomains
+from tfeti_dolfinx.feti.operator import check_operator
+from tfeti_dolfinx.subdomains.block import BlockDefaults, Counters
 from tfeti_dolfinx.subdomains.factor import FactorSize
-from tfeti_dolfinx.subdomains.groups import Explicit, Implicit, chosen, groups_of
-from tfeti_dolfinx.subdomains.kplus import Making
-from tfeti_dolfinx.subdomains.local import BlockwiseOperator, LocalChoice, local_operator
-from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
+from tfeti_dolfinx.subdomains.kplus import InverseFactory
+from tfeti_dolfinx.subdomains.local_operators import (
+    BlockwiseOperator,
+    Cost,
+    Explicit,
+    Implicit,
+    LocalChoice,
+    chosen,
+    dense_product,
+    groups_of,
+    local_operator,
+    sweeps,
+)
+from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains, SparseBlock
+from tfeti_dolfinx.testing import check_block, check_kind_of_block
 
 CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
 KINDS = ("pinv", "stiffness", "schur")
@@ -182,7 +189,7 @@ def shared(K, x, equals, shift=0.0, order=None, **changes):
 
 @pytest.fixture
 def equals():
-    return EqualSubdomains(Making())
+    return EqualSubdomains(InverseFactory())
 
 
 @pytest.mark.parametrize("cell", CELLS)
@@ -241,7 +248,7 @@ def test_shared_blocks_keep_the_promises_of_a_block(equals):
 
 def test_another_stiffness_leaves_the_others_alone():
     counters = Counters()
-    equals = EqualSubdomains(Making(counters))
+    equals = EqualSubdomains(InverseFactory(counters))
     K, x = stiffness("hexahedron", 2)
     blocks = [shared(K, x, equals, shift=s)[0] for s in range(3)]
     assert counters.factorizations == 1

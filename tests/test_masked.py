@@ -11,9 +11,8 @@ import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
 from tfeti_dolfinx.qp.homogenised import homogenise
-from tfeti_dolfinx.qp.masked import MaskedPreconditioner
-from tfeti_dolfinx.qp.mprgp import Iterate, MprgpParameters, mprgp
-from tfeti_dolfinx.qp.norm import estimate_norm
+from tfeti_dolfinx.qp.krylov import estimate_norm
+from tfeti_dolfinx.qp.mprgp import MaskedPreconditioner, MprgpIterate, MprgpParameters, mprgp
 from tfeti_dolfinx.qp.problem import QP, Steps
 from tfeti_dolfinx.qp.smalse import smalse
 
@@ -47,7 +46,7 @@ def program(seed, spread=1.0):
 def run_mprgp(F, d, bounded, preconditioner):
     """The iterate at the end, and its steps."""
     feasible, x = bounds_on(bounded), vector(np.zeros(len(d)))
-    state, steps = Iterate(matrix(F), x, vector(-d), feasible, preconditioner), Steps()
+    state, steps = MprgpIterate(matrix(F), x, vector(-d), feasible, preconditioner), Steps()
 
     def stop(state):
         assert np.all(x.array[bounded] >= 0.0)
@@ -136,7 +135,7 @@ class Leaky:
 def test_a_set_that_cannot_be_masked_is_named():
     F, d, bounded = program(1)
     masked = MaskedPreconditioner(making(F, []), NoCoarse(), 1.0, vector(d))
-    state = Iterate(
+    state = MprgpIterate(
         matrix(F), vector(np.zeros(len(d))), vector(-d), Leaky(bounds_on(bounded)), masked
     )
     with pytest.raises(InputError, match="the free gradient of the feasible set is not 0 on rows"):

@@ -9,7 +9,7 @@ from dolfinx import mesh as dmesh
 from scenes import displacement
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.compat import geometry_dofmap
+from tfeti_dolfinx.common.compat import geometry_dofmap
 
 KINDS = {
     "finite": None,

@@ -21,7 +21,7 @@ from mpi4py import MPI
 from scenes import clamp, displacement, relative
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.compat import geometry_dofmap
+from tfeti_dolfinx.common.compat import geometry_dofmap
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]

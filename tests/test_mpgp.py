@@ -10,16 +10,20 @@ from hypothesis import strategies as st
 from test_qp import matrix, to, vector
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse
-from tfeti_dolfinx.qp.discs import Discs, Ellipses
-from tfeti_dolfinx.qp.faces import Status
-from tfeti_dolfinx.qp.feasible_sets import Bounds, Product
 from tfeti_dolfinx.qp.homogenised import homogenise
-from tfeti_dolfinx.qp.mprgp import EXPANSIONS, Iterate, MprgpParameters, mprgp
-from tfeti_dolfinx.qp.norm import estimate_norm
+from tfeti_dolfinx.qp.krylov import estimate_norm
+from tfeti_dolfinx.qp.mprgp import (
+    EXPANSIONS,
+    MprgpIterate,
+    MprgpParameters,
+    mprgp,
+    projected_step,
+    step_on_face,
+)
 from tfeti_dolfinx.qp.parameters import SmalseParameters
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Steps
+from tfeti_dolfinx.qp.sets import Bounds, Discs, Ellipses, Product, Status
 from tfeti_dolfinx.qp.smalse import smalse
-from tfeti_dolfinx.qp.tangent_steps import projected_step, step_on_face
 
 
 def program(seed, k, isotropic, m=40, r=4):
@@ -85,7 +89,7 @@ def test_mpgp_slides_sticks_and_falls_off(expansion):
     b = np.array([3.0, 1.0, 0.3, 0.4, 1.0, 1.0])
     discs = Discs(np.array([1.0, 1.0, 0.0]))
     x, g, steps = vector(np.zeros(6)), vector(-b), Steps()
-    state = Iterate(matrix(A), x, g, discs)
+    state = MprgpIterate(matrix(A), x, g, discs)
     parameters = MprgpParameters(1.0 / 6.5, 1.0, EXPANSIONS[expansion])
     assert mprgp(state, parameters, lambda s: s.projected_gradient <= 1e-9, steps, 500) is None
     exact = constrained_qp(
@@ -107,7 +111,7 @@ def test_mpgp_slides_sticks_and_falls_off(expansion):
 def test_the_cost_falls_in_each_step():
     F, d, _, _, bounded, pairs, a = program(3, 2, True)
     x, costs = vector(np.zeros(40)), []
-    state = Iterate(matrix(F), x, vector(-d), as_set(bounded, pairs, a, True))
+    state = MprgpIterate(matrix(F), x, vector(-d), as_set(bounded, pairs, a, True))
 
     def stop(s):
         costs.append(0.5 * float(s.x.array @ (s.g.array - d)))
@@ -134,7 +138,7 @@ def test_steps_on_faces_find_the_minimum(seed):
     exact = constrained_qp(F, d, np.zeros((0, 24)), np.zeros(0), [], pairs, a)
     x = vector(discs.project(exact + 1e-3 * np.sin(np.arange(24.0))))
     start = np.linalg.norm(x.array - exact)
-    state = Iterate(matrix(F), x, vector(F @ x.array - d), discs)
+    state = MprgpIterate(matrix(F), x, vector(F @ x.array - d), discs)
     for _ in range(60):
         if step_on_face(state, 1.0 / np.linalg.norm(F, 2)) == 0:
             break
@@ -149,7 +153,7 @@ def test_each_step_on_a_curved_set_lowers_the_cost(seed):
     feasible, norm = as_set(bounded, pairs, a, True), np.linalg.norm(F, 2)
     rng = np.random.default_rng(seed)
     x = vector(feasible.project(3.0 * rng.standard_normal(40)))
-    state = Iterate(matrix(F), x, vector(F @ x.array - d), feasible)
+    state = MprgpIterate(matrix(F), x, vector(F @ x.array - d), feasible)
     costs = [0.5 * float(x.array @ (state.g.array - d))]
     for step in (step_on_face, projected_step) * 4:
         step(state, 1.0 / norm)

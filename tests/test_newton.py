@@ -9,19 +9,14 @@ from scipy.sparse import diags_array
 from test_qp import bounds_on, matrix, vector
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
-from tfeti_dolfinx.qp.dependent import DependentRows
-from tfeti_dolfinx.qp.directions import Directions
-from tfeti_dolfinx.qp.feasible_sets import Product
-from tfeti_dolfinx.qp.homogenised import homogenise, image
-from tfeti_dolfinx.qp.monitors import no_monitor
-from tfeti_dolfinx.qp.nearest import nearest
-from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
-from tfeti_dolfinx.qp.newton_faces import FaceSolver
-from tfeti_dolfinx.qp.newton_iterate import Iterate
+from tfeti_dolfinx.qp.homogenised import homogenise, operator_product
+from tfeti_dolfinx.qp.krylov import Directions, solve_by_pcpg
+from tfeti_dolfinx.qp.newton import NewtonIterate, feasible_start, first_point, newton
+from tfeti_dolfinx.qp.newton_faces import DependentRows, FaceSolver
 from tfeti_dolfinx.qp.parameters import NewtonParameters
-from tfeti_dolfinx.qp.pcpg import solve_by_pcpg
-from tfeti_dolfinx.qp.problem import QP, Point, Start, Steps
-from tfeti_dolfinx.qp.stopping import ResidualRule
+from tfeti_dolfinx.qp.problem import QP, Point, ResidualRule, Start, Steps, no_monitor
+from tfeti_dolfinx.qp.projection import project_onto_feasible
+from tfeti_dolfinx.qp.sets import Product
 
 
 def program(seed, kind="regular"):
@@ -60,7 +55,7 @@ def qp_of(F, d, G, e, bounded):
 
 
 def solved(qp, tolerance, start=None):
-    at = image(qp.F, feasible_start(qp, start) if start else first_point(qp))
+    at = operator_product(qp.F, feasible_start(qp, start) if start else first_point(qp))
     found = newton(qp, homogenise(qp, at), ResidualRule(tolerance), max_it=3000, start=start)
     assert found.reason > 0
     return found
@@ -149,7 +144,7 @@ def test_the_cost_falls_and_iterates_are_feasible():
             assert np.allclose(G @ lam, e, atol=1e-9)
             seen.append(0.5 * lam @ F @ lam - d @ lam)
 
-    start = homogenise(qp, image(qp.F, first_point(qp)))
+    start = homogenise(qp, operator_product(qp.F, first_point(qp)))
     newton(qp, start, ResidualRule(1e-9), max_it=3000, monitor=monitor)
     assert len(seen) > 3
     assert np.all(np.diff(seen) <= 1e-12 * np.abs(seen[-1]))
@@ -199,7 +194,7 @@ def test_what_equations_take_from_d_does_not_drown_the_rest():
 def test_forces_that_are_rounding_do_not_say_what_touches():
     """min ½λ₁² − λ₁ + λ₂, λ ≥ 0, from λ₂ = 1e-25: nothing rests on the second row."""
     qp = QP(matrix(np.eye(2)), vector([1.0, -1.0]), NoCoarse(), bounds_on(np.arange(2)))
-    start = homogenise(qp, image(qp.F, vector([1.0, 1e-25])))
+    start = homogenise(qp, operator_product(qp.F, vector([1.0, 1e-25])))
     found = newton(qp, start, ResidualRule(1e-10), start=Start(start.lam_bar, np.zeros(0)))
     assert found.lam.array_r[1] > 0.0
     assert found.face.carrying.tolist() == [True, False]
@@ -220,7 +215,7 @@ def test_the_nearest_feasible_point(kind, seed):
     """Gλ = e, λ ∈ Ω, and λ − y = Gᵀα on free rows, at least that on the others."""
     _, d, G, e, bounded = program(seed, kind)
     y = 10.0 * d
-    found = nearest(DenseCoarse(G, e), bounds_on(bounded), vector(y))
+    found = project_onto_feasible(DenseCoarse(G, e), bounds_on(bounded), vector(y))
     lam = found.lam.array_r
     assert found.missing <= 1e-12
     assert np.allclose(G @ lam, e, atol=1e-9 * np.linalg.norm(y))
@@ -243,7 +238,7 @@ def test_steps_that_no_row_stops_end():
             return super().damped_solve(face, y, damping)
 
     coarse = Counting(np.ones((1, 2)), -np.ones(1))
-    found = nearest(coarse, bounds_on(np.arange(2)), vector([1.0, 2.0]))
+    found = project_onto_feasible(coarse, bounds_on(np.arange(2)), vector([1.0, 2.0]))
     assert found.missing == pytest.approx(1.0)
     assert np.array_equal(found.lam.array_r, [0.0, 0.0])
     assert coarse.steps <= 15
@@ -253,7 +248,7 @@ def test_steps_that_no_row_stops_end():
 def test_soft_rows_that_hold_are_seen_beside_stiff_ones_that_are_open(stiff):
     """λ₁ − rλ₂ = 1 at (1, 0): G_f G_fᵀ = 1 beside GGᵀ = 1 + r²."""
     coarse = DenseCoarse(np.array([[1.0, -stiff]]), np.ones(1))
-    found = nearest(coarse, bounds_on(np.arange(2)), vector([0.0, -1.0 / stiff]))
+    found = project_onto_feasible(coarse, bounds_on(np.arange(2)), vector([0.0, -1.0 / stiff]))
     assert found.missing <= 1e-12
     assert np.allclose(found.lam.array_r, [1.0, 0.0], rtol=0.0, atol=1e-12)
 
@@ -261,7 +256,7 @@ def test_soft_rows_that_hold_are_seen_beside_stiff_ones_that_are_open(stiff):
 def test_the_nearest_point_says_what_nothing_fulfils():
     """λ₁ + λ₂ = −1 with λ ≥ 0."""
     coarse = DenseCoarse(np.ones((1, 2)), np.array([-1.0]))
-    found = nearest(coarse, bounds_on(np.arange(2)), vector([1.0, 2.0]))
+    found = project_onto_feasible(coarse, bounds_on(np.arange(2)), vector([1.0, 2.0]))
     assert found.missing >= 0.1
     assert np.all(found.lam.array_r >= 0.0)
 
@@ -314,7 +309,9 @@ def test_rows_that_exclude_each_other_are_named(knows, room, solvable):
     d = vector([1.0, -1.0 - room, 1.0])
     qp = QP(matrix(F), d, NoCoarse(), bounds_on(np.arange(3)), preconditioner_on=knows)
     start = vector([1.0, 1.0, 0.0])  # both touch
-    result = newton(qp, homogenise(qp, image(qp.F, start)), ResidualRule(1e-10), max_it=100)
+    result = newton(
+        qp, homogenise(qp, operator_product(qp.F, start)), ResidualRule(1e-10), max_it=100
+    )
     if not solvable:
         assert result.reason.name == "DIVERGED_CONTRADICTION"
         assert result.excluding.tolist() == [0, 1]
@@ -370,7 +367,7 @@ def test_a_gain_is_worth_more_steps_where_it_stands_out_from_rounding(far, gain,
     """Far from the end any is, near to it what rounding of q cannot be."""
     F, d, G, e, bounded = program(0)
     qp = qp_of(F, d, G, e, bounded)
-    state = Iterate(qp, homogenise(qp, image(qp.F, first_point(qp))))
+    state = NewtonIterate(qp, homogenise(qp, operator_product(qp.F, first_point(qp))))
     state.residual, state.rounding = (1.0, 1e-10) if far else (1e-9, 1e-10)
     state.idle = 5
     state.went_down(gain)

@@ -9,20 +9,21 @@ from test_mpgp import around_circles, as_set, program
 from test_qp import matrix, vector
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
-from tfeti_dolfinx.qp.discs import Discs, Ellipses
-from tfeti_dolfinx.qp.faces import Status
-from tfeti_dolfinx.qp.feasible_sets import Bounds, Product
-from tfeti_dolfinx.qp.homogenised import homogenise, image
-from tfeti_dolfinx.qp.monitors import no_monitor
-from tfeti_dolfinx.qp.nearest import UNBALANCED, WithinFace, nearest, nearest_or_least
+from tfeti_dolfinx.qp.homogenised import homogenise, operator_product
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
-from tfeti_dolfinx.qp.newton_curved import brought_back, brought_into
-from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, Start
-from tfeti_dolfinx.qp.stopping import ResidualRule
+from tfeti_dolfinx.qp.newton_faces import brought_back, brought_into
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, ResidualRule, Start, no_monitor
+from tfeti_dolfinx.qp.projection import (
+    UNBALANCED,
+    WithinFace,
+    project_onto_feasible,
+    project_or_least,
+)
+from tfeti_dolfinx.qp.sets import Bounds, Discs, Ellipses, Product, Status
 
 
 def solved(qp, tolerance, monitor=no_monitor, start=None):
-    at = image(qp.F, feasible_start(qp, start) if start else first_point(qp))
+    at = operator_product(qp.F, feasible_start(qp, start) if start else first_point(qp))
     rule = ResidualRule(tolerance)
     return newton(qp, homogenise(qp, at), rule, max_it=2000, start=start, monitor=monitor)
 
@@ -113,7 +114,7 @@ def test_the_nearest_feasible_point(seed, isotropic):
     _, _, G, e, bounded, pairs, a = program(seed, 2, isotropic)
     y = 2.0 * np.random.default_rng(seed).standard_normal(40)
     feasible = as_set(bounded, pairs, a, isotropic)
-    found = nearest(DenseCoarse(G, e), feasible, vector(y))
+    found = project_onto_feasible(DenseCoarse(G, e), feasible, vector(y))
     assert found.missing <= 1e-12
     exact = constrained_qp(np.eye(40), y, G, e, bounded, pairs, a)
     assert np.linalg.norm(found.lam.array - exact) <= 1e-7 * np.linalg.norm(exact)
@@ -158,8 +159,8 @@ def test_forces_far_beyond_small_discs_do_not_hide_what_balances():
         )
         balanced = np.concatenate((small * rng.uniform(size=n), radius * rng.uniform(-1.0, 1.0, n)))
         coarse, y = DenseCoarse(G, G @ balanced), vector(rng.normal(size=2 * n))
-        missed.append(nearest(coarse, feasible, y).missing)
-        found = nearest_or_least(coarse, feasible, y)
+        missed.append(project_onto_feasible(coarse, feasible, y).missing)
+        found = project_or_least(coarse, feasible, y)
         assert found.missing <= UNBALANCED
         assert np.array_equal(feasible.project(found.lam.array_r), found.lam.array_r)
     assert max(missed) > 0.1
@@ -176,7 +177,7 @@ def test_small_discs_balance_beside_large_forces(scale):
         balanced = np.append(within, 1e8)
         y = balanced + np.append(scale * np.repeat(radius, 2) * rng.normal(size=2 * n), 0.0)
         feasible = Product([(np.arange(2 * n), Discs(radius))])
-        found = nearest(DenseCoarse(G, G @ balanced), feasible, vector(y))
+        found = project_onto_feasible(DenseCoarse(G, G @ balanced), feasible, vector(y))
         assert np.linalg.norm(G @ (found.lam.array - balanced)) <= 1e-12 * 1e8
 
 

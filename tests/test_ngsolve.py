@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from panels import SPACE
 
-from tfeti_dolfinx.boundary.integrals3d import layers_3d
-from tfeti_dolfinx.boundary.steklov import Law, single_layer
+from tfeti_dolfinx.bem.integrals import layers_3d
+from tfeti_dolfinx.bem.steklov import IsotropicLaw, single_layer
 
 ngsolve = pytest.importorskip("ngsolve")
 bem = pytest.importorskip("ngsolve.bem")
@@ -69,7 +69,7 @@ def test_laplace_single_and_double_layer(both):
 
 def test_lame_single_layer(both):
     panels, layers, mesh = both
-    law = Law(0.4, 0.3)
+    law = IsotropicLaw(0.4, 0.3)
     constant, _ = spaces(mesh)
     space = constant**3
     u, v = space.TnT()

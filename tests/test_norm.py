@@ -8,7 +8,7 @@ from test_qp import matrix, vector
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
-from tfeti_dolfinx.qp.norm import estimate_norm
+from tfeti_dolfinx.qp.krylov import estimate_norm
 
 # with the step ᾱ = 1.95/‖·‖ of the default options ‖A‖ᾱ ≤ 2 needs 0.975 of the norm
 LEAST, MOST = 0.975, 1.1

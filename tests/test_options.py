@@ -9,9 +9,8 @@ from petsc4py import PETSc
 from scenes import decomposed, problem
 
 from tfeti_dolfinx import InputError, Options
-from tfeti_dolfinx.described import parameters_of
-from tfeti_dolfinx.option_parsing import factor_options, parse_options
-from tfeti_dolfinx.options import options_table
+from tfeti_dolfinx.common.validation import parameters_of
+from tfeti_dolfinx.options import factor_options, options_table, parse_options
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -10,7 +10,7 @@ from mpi4py import MPI
 from scenes import box, forms
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.compat import interpolation_points
+from tfeti_dolfinx.common.compat import interpolation_points
 
 CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
 KINDS = {

@@ -7,9 +7,8 @@ from scipy.linalg import pinvh
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.subdomains.block import BlockDefaults
-from tfeti_dolfinx.subdomains.conformance import check_kind_of_block
-from tfeti_dolfinx.subdomains.kernel import kernel_of
+from tfeti_dolfinx.subdomains.block import BlockDefaults, kernel_of
+from tfeti_dolfinx.testing import check_kind_of_block
 
 
 class DenseBlock(BlockDefaults):

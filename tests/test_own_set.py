@@ -5,9 +5,8 @@ import pytest
 from scenes import curved_obstacle, decomposed, problem
 
 from tfeti_dolfinx import Extensions, Obstacle
-from tfeti_dolfinx.qp.conformance import check_feasible_set
-from tfeti_dolfinx.qp.faces import Status, face_of
-from tfeti_dolfinx.qp.feasible_sets import Product
+from tfeti_dolfinx.qp.sets import Product, Status, face_of
+from tfeti_dolfinx.testing import check_feasible_set
 
 
 class HalfSpaces:

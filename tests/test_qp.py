@@ -11,15 +11,13 @@ from reference import dense_qp
 from scipy.sparse import diags_array
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
-from tfeti_dolfinx.qp.feasible_sets import Bounds, Product
 from tfeti_dolfinx.qp.homogenised import homogenise
-from tfeti_dolfinx.qp.mprgp import EXPANSIONS, Iterate, MprgpParameters, mprgp
-from tfeti_dolfinx.qp.norm import estimate_norm
+from tfeti_dolfinx.qp.krylov import estimate_norm, solve_by_pcpg
+from tfeti_dolfinx.qp.mprgp import EXPANSIONS, MprgpIterate, MprgpParameters, mprgp
 from tfeti_dolfinx.qp.parameters import SmalseParameters
-from tfeti_dolfinx.qp.pcpg import solve_by_pcpg
-from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Start, Steps
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, ResidualRule, Start, Steps
+from tfeti_dolfinx.qp.sets import Bounds, Product
 from tfeti_dolfinx.qp.smalse import smalse
-from tfeti_dolfinx.qp.stopping import ResidualRule
 
 SELF = PETSc.COMM_SELF
 
@@ -88,7 +86,7 @@ def test_mprgp_on_a_string_over_an_obstacle(expansion, known):
     A, b, lower = string()
     x, g = vector(np.zeros(100)), vector(-b)
     bounds = Bounds(lower)
-    state, steps = Iterate(matrix(A), x, g, bounds), Steps()
+    state, steps = MprgpIterate(matrix(A), x, g, bounds), Steps()
     parameters = MprgpParameters(1.95 / 4, 1.0, EXPANSIONS[expansion])
     tol = 1e-5 * np.linalg.norm(b)
     reason = mprgp(state, parameters, lambda s: s.projected_gradient <= tol, steps, 1000)
@@ -114,7 +112,7 @@ def test_what_projects_to_its_bound_is_exactly_on_it(seed):
     for vec in (x, target):
         vec.array[:] = bounds.project(vec.array_r)
     A = np.diag(rng.random(40))
-    state = Iterate(matrix(A), x, vector(A @ x.array), bounds)
+    state = MprgpIterate(matrix(A), x, vector(A @ x.array), bounds)
     state.move_to(target)
     lam = x.array + lam_bar
     assert np.array_equal(lam == 0.0, target.array <= -lam_bar)
@@ -124,7 +122,7 @@ def test_what_projects_to_its_bound_is_exactly_on_it(seed):
 
 def test_mprgp_stops_at_max_it():
     A, b, lower = string()
-    state = Iterate(matrix(A), vector(np.zeros(100)), vector(-b), Bounds(lower))
+    state = MprgpIterate(matrix(A), vector(np.zeros(100)), vector(-b), Bounds(lower))
     steps = Steps()
     reason = mprgp(state, MprgpParameters(0.4), lambda s: False, steps, 7)
     assert reason == ConvergedReason.DIVERGED_ITS
@@ -133,7 +131,7 @@ def test_mprgp_stops_at_max_it():
 
 def test_mprgp_reports_an_indefinite_operator():
     A = np.diag([1.0, -1.0])
-    state = Iterate(matrix(A), vector([1.0, 1.0]), vector([0.0, -2.0]), Product())
+    state = MprgpIterate(matrix(A), vector([1.0, 1.0]), vector([0.0, -2.0]), Product())
     reason = mprgp(state, MprgpParameters(0.5), lambda s: False, Steps(), 10)
     assert reason == ConvergedReason.DIVERGED_INDEFINITE_MAT
 

@@ -9,12 +9,11 @@ from scenes import curved_obstacle, decomposed, problem
 from test_solvable_lp import dual_of
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.parallel import summed
-from tfeti_dolfinx.qp.faces import Status, face_of
+from tfeti_dolfinx.common.parallel import summed
 from tfeti_dolfinx.qp.homogenised import homogenise
-from tfeti_dolfinx.qp.pcpg import pcpg
-from tfeti_dolfinx.qp.problem import ConvergedReason, Point, Steps
-from tfeti_dolfinx.qp.stopping import ResidualRule
+from tfeti_dolfinx.qp.krylov import pcpg
+from tfeti_dolfinx.qp.problem import ConvergedReason, Point, ResidualRule, Steps
+from tfeti_dolfinx.qp.sets import Status, face_of
 
 # what PETSc logs of vectors; each is a reduction on more ranks than one
 EVENTS = ("VecDot", "VecTDot", "VecMDot", "VecMTDot", "VecNorm", "VecDotNorm2")
@@ -64,7 +63,7 @@ def sums(monkeypatch):
         calls.append(len(values))
         return summed(getattr(comm, "_comm", comm), values)
 
-    for module in ("tfeti_dolfinx.qp.pcpg", "tfeti_dolfinx.dual.projectors"):
+    for module in ("tfeti_dolfinx.qp.krylov", "tfeti_dolfinx.feti.projectors"):
         monkeypatch.setattr(f"{module}.summed", counted)
     return calls
 

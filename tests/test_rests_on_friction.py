@@ -9,8 +9,8 @@ from mpi4py import MPI
 from scenes import clamp, decomposed, displacement, hooke, strain
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx import doubts
-from tfeti_dolfinx.dual.rests_on_friction import lost_on_friction
+from tfeti_dolfinx.accuracy import diagnostics as doubts
+from tfeti_dolfinx.accuracy.diagnostics import lost_on_friction
 
 PRESSURE = 0.01
 # as the silent wrong answer was found

@@ -11,10 +11,9 @@ from scenes import clamp, decomposed
 from test_solvable_lp import in_a_slot
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.constraints.gluing import glue, prescribe
 from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.errors import InputError, NoSolutionError
-from tfeti_dolfinx.gluing.glue import glue
-from tfeti_dolfinx.gluing.prescribed import prescribe
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 PAIR = sided("upper bottom", "lower top", reach=0.5)

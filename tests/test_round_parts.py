@@ -6,12 +6,10 @@ from dolfinx import mesh as dmesh
 from mpi4py import MPI
 from scipy.spatial import Delaunay
 
-from tfeti_dolfinx.compat import geometry_dofmap
+from tfeti_dolfinx.common.compat import geometry_dofmap
 from tfeti_dolfinx.mesh import metis as metis_module
-from tfeti_dolfinx.mesh.compact import LARGEST, compact_parts
-from tfeti_dolfinx.mesh.flatten import flatten_interfaces
-from tfeti_dolfinx.mesh.metis import CUT, metis
-from tfeti_dolfinx.mesh.pieces import split_disconnected
+from tfeti_dolfinx.mesh.metis import CUT, LARGEST, compact_parts, flatten_interfaces, metis
+from tfeti_dolfinx.mesh.partition import split_disconnected
 from tfeti_dolfinx.mesh.untorn import PhysicalNames, UntornMesh
 
 COMM = MPI.COMM_WORLD

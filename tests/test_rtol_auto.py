@@ -7,7 +7,7 @@ from true_errors import AGAINST_FINER, error_against, stress_of_cells
 
 import tfeti_dolfinx as tfeti
 from demos import talk_hertz_2d
-from tfeti_dolfinx.dual.goals import FINEST, TENTH
+from tfeti_dolfinx.feti.stopping import FINEST, TENTH
 
 
 def work(p):

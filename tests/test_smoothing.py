@@ -21,12 +21,11 @@ import tfeti_dolfinx as tfeti
 from benchmarks import stability_scenes
 from benchmarks.stress.meshes import grid
 from benchmarks.stress.package import solve_scene
-from tfeti_dolfinx.dual import smoothing
-from tfeti_dolfinx.dual.face_preconditioner import SHIFT, FacePreconditioner
-from tfeti_dolfinx.dual.smoothing import chebyshev, smoothed
-from tfeti_dolfinx.qp.faces import Face, Status, face_of
-from tfeti_dolfinx.subdomains import near as near_module
-from tfeti_dolfinx.subdomains.near import NearStiffness
+from tfeti_dolfinx.feti import operator as near_module
+from tfeti_dolfinx.feti import preconditioner as smoothing
+from tfeti_dolfinx.feti.operator import NearStiffness
+from tfeti_dolfinx.feti.preconditioner import SHIFT, FacePreconditioner, chebyshev, smoothed
+from tfeti_dolfinx.qp.sets import Face, Status, face_of
 from tfeti_dolfinx.subdomains.stiffness import stretch_over_shear
 
 

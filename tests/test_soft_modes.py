@@ -9,10 +9,10 @@ from scenes import clamp, curved_obstacle, decomposed, displacement, forms
 from scipy.sparse import csr_array
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.dual import soft_modes
-from tfeti_dolfinx.dual.projectors import FaceFactors
-from tfeti_dolfinx.dual.soft_modes import SoftModes
-from tfeti_dolfinx.qp.faces import Status, face_of
+from tfeti_dolfinx.feti import deflation as soft_modes
+from tfeti_dolfinx.feti.deflation import SoftModes
+from tfeti_dolfinx.feti.projectors import FaceFactors
+from tfeti_dolfinx.qp.sets import Status, face_of
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
 
 SUBDOMAINS = 8

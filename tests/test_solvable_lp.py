@@ -15,10 +15,9 @@ from scipy.sparse import csr_array, eye_array
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx import NoSolutionError
-from tfeti_dolfinx.dual.cuts import Rows
-from tfeti_dolfinx.dual.motions import unresisted, unsprung
-from tfeti_dolfinx.dual.solvability import check_solvable, minimiser
-from tfeti_dolfinx.gluing.consistency import SharedNodes
+from tfeti_dolfinx.constraints.contact_rows import SharedNodes
+from tfeti_dolfinx.feti.rigid_bodies import unresisted, unsprung
+from tfeti_dolfinx.feti.solvability import CutRows, check_solvable, minimiser
 
 
 def rigid_scene(rng):
@@ -249,7 +248,7 @@ def test_many_loose_bodies_need_no_large_dense_array():
     assert free.count == 3 * count
     assert free.joint.shape[1] == 0
     assert free.alone.nnz <= count * k * k
-    table = Rows(J, np.zeros(len(rows)), np.repeat(np.arange(count), k))
+    table = CutRows(J, np.zeros(len(rows)), np.repeat(np.arange(count), k))
     first = table.extremes()
     assert count <= len(first) <= 24 * count
     assert len(table.violated(rng.standard_normal(count * k), 1e-9, 1)) <= count

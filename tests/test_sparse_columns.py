@@ -4,8 +4,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 
-from tfeti_dolfinx.dual.null_basis import null_basis
-from tfeti_dolfinx.dual.sparse_columns import orthonormal_columns, parts_of_columns
+from tfeti_dolfinx.feti.rigid_bodies import null_basis, orthonormal_columns, parts_of_columns
 
 
 def scattered(rng):

@@ -11,11 +11,10 @@ from scenes import decomposed, problem
 from scipy.sparse import csr_array
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.constraints import spectrum as module
+from tfeti_dolfinx.constraints.gluing import glue, prescribe
 from tfeti_dolfinx.contact.records import concatenate
 from tfeti_dolfinx.errors import ConvergenceError, InputError
-from tfeti_dolfinx.gluing import spectrum as module
-from tfeti_dolfinx.gluing.glue import glue
-from tfeti_dolfinx.gluing.prescribed import prescribe
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 # the rows alone matter: no step of the solver is made

@@ -13,7 +13,7 @@ from benchmarks.stability_scenes import LADDERS
 from benchmarks.stress.judge import run_scene
 from benchmarks.stress.meshes import grid
 from benchmarks.stress.package import solve_scene
-from tfeti_dolfinx.mesh.quality import flatness
+from tfeti_dolfinx.mesh.diagnostics import flatness
 
 FEW = ("triangle", "hexahedron")
 

@@ -9,10 +9,10 @@ import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.homogenised import (
-    LastImage,
+    LastProduct,
     homogenise,
-    image,
     natural,
+    operator_product,
     scale_at,
     scale_near,
 )
@@ -21,7 +21,7 @@ from tfeti_dolfinx.qp.newton import first_point, newton
 from tfeti_dolfinx.qp.parameters import SmalseParameters
 from tfeti_dolfinx.qp.problem import QP
 from tfeti_dolfinx.qp.smalse import smalse
-from tfeti_dolfinx.solver import solve_dual
+from tfeti_dolfinx.solve.solver import solve_dual
 
 
 def scene(contacts, **options):
@@ -47,7 +47,7 @@ def forget(p):
     for _, found in p.dual._images.values():
         found.destroy()
     p.dual._images.clear()
-    p.dual.last = LastImage()
+    p.dual.last = LastProduct()
 
 
 @pytest.mark.parametrize("qp_type", ["pcpg", "smalse", "newton"])
@@ -84,14 +84,14 @@ def test_known_images_cost_nothing():
     F, d, G, e, bounded = random_program(3)
     counted = Counted(matrix(F))
     qp = QP(counted, vector(d), DenseCoarse(G, e), bounds_on(bounded))
-    at = image(qp.F, natural(qp.coarse, qp.d))
+    at = operator_product(qp.F, natural(qp.coarse, qp.d))
     assert counted.count == 1
     from_image, cold = homogenise(qp, at), homogenise(qp)
     assert counted.count == 2
     assert np.array_equal(from_image.b.array_r, cold.b.array_r)
     assert from_image.scale == cold.scale
     assert np.allclose(from_image.gradient.array_r, F @ at.x.array_r - d)
-    other = image(qp.F, vector(np.linalg.lstsq(G, e, rcond=None)[0]))
+    other = operator_product(qp.F, vector(np.linalg.lstsq(G, e, rcond=None)[0]))
     assert homogenise(qp, other, scale_at(qp, at)).scale == cold.scale
     near = scale_near(qp, other)
     assert counted.count == 3
@@ -103,8 +103,8 @@ def test_the_last_image_is_that_of_a_look():
     F, d, G, e, bounded = random_program(3)
     counted = Counted(matrix(F))
     qp = QP(counted, vector(d), DenseCoarse(G, e), bounds_on(bounded))
-    homogenised = homogenise(qp, image(qp.F, first_point(qp)))
-    result, last = newton(qp, homogenised, to(1e-9, homogenised)), LastImage()
+    homogenised = homogenise(qp, operator_product(qp.F, first_point(qp)))
+    result, last = newton(qp, homogenised, to(1e-9, homogenised)), LastProduct()
     comm, lam = qp.d.getComm().tompi4py(), np.array(result.lam.array_r)
     last.keep(result, qp)
     assert np.allclose(last.known(comm, lam), F @ lam, rtol=0, atol=1e-6)

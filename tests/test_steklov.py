@@ -5,15 +5,26 @@ import pytest
 from panels import HOOK, PLANE, SPACE, SQUARE, box, kelvin, kelvin_energy, moved, polygon
 from scipy.integrate import dblquad
 
-from tfeti_dolfinx.boundary.inside import Inside, share
-from tfeti_dolfinx.boundary.integrals2d import _by_rule, _exact, layers_2d
-from tfeti_dolfinx.boundary.integrals3d import layers_3d
-from tfeti_dolfinx.boundary.panels import Panels
-from tfeti_dolfinx.boundary.rules import apart_rule, touching_rule
-from tfeti_dolfinx.boundary.steklov import Law, rigid_motions, single_layer, steklov, wrong_forces
+from tfeti_dolfinx.bem.inside import Inside, share
+from tfeti_dolfinx.bem.integrals import (
+    _by_rule,
+    _exact,
+    apart_rule,
+    layers_2d,
+    layers_3d,
+    touching_rule,
+)
+from tfeti_dolfinx.bem.panels import Panels
+from tfeti_dolfinx.bem.steklov import (
+    IsotropicLaw,
+    rigid_motions,
+    single_layer,
+    steklov,
+    wrong_forces,
+)
 from tfeti_dolfinx.errors import FactorError, InputError
 
-LAW = Law(mu=0.4, nu=0.3)
+LAW = IsotropicLaw(mu=0.4, nu=0.3)
 SHAPES = {**PLANE, **SPACE}
 GRADIENT = np.array([[1.0, 0.2, 0.3], [0.1, -0.5, 0.2], [0.4, 0.1, 0.3]])
 
@@ -49,7 +60,7 @@ def test_size_and_place_and_direction_do_not_matter(dim):
     S = turn @ steklov(panels, LAW).S @ turn.T
     bound = 1e-12 * np.abs(S).max()
     assert np.abs(steklov(other, LAW).S * 7.0 ** (2 - dim) - S).max() < bound
-    harder = steklov(panels, Law(1e5 * LAW.mu, LAW.nu)).S
+    harder = steklov(panels, IsotropicLaw(1e5 * LAW.mu, LAW.nu)).S
     assert np.abs(turn @ harder @ turn.T / 1e5 - S).max() < bound
 
 

@@ -17,10 +17,10 @@ from benchmarks.stress.meshes import grid
 from benchmarks.stress.package import solve_scene
 from benchmarks.stress.random_scenes import random_scene
 from benchmarks.stress.scene import Body, Held, Load, Scene
-from tfeti_dolfinx.gluing.stiffening import held_flat_sides
+from tfeti_dolfinx.constraints.stiffening import held_flat_sides
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.subdomains.firm import holds_firmly
-from tfeti_dolfinx.subdomains.kernel import candidate_modes
+from tfeti_dolfinx.subdomains.block import candidate_modes
+from tfeti_dolfinx.subdomains.sparse_block import holds_firmly
 
 NU, PULL, THICK = 0.3, 1e-3, 1e-3
 SUBDOMAINS = 4

@@ -6,7 +6,7 @@ from bodies import held, pressed, sided, stacked, two_body_problem
 from mpi4py import MPI
 from test_solvable_lp import dual_of
 
-from tfeti_dolfinx.arrays import sums
+from tfeti_dolfinx.common.arrays import sums
 from tfeti_dolfinx.subdomains.build import submatrices
 
 

@@ -9,11 +9,10 @@ from scenes import curved_obstacle, decomposed
 from test_frames import dofs_on, nodal
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.constraints.gluing import glue, prescribe
 from tfeti_dolfinx.contact.friction import friction_values
 from tfeti_dolfinx.contact.records import relative_displacement, slips
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.gluing.glue import glue
-from tfeti_dolfinx.gluing.prescribed import prescribe
 from tfeti_dolfinx.mortar.surfaces import group_points
 
 TRESCA, COULOMB = tfeti.Tresca(0.1), tfeti.Coulomb(0.3)

@@ -15,7 +15,7 @@ from demos import hertz_3d
 from demos.hertz import LineContact
 from meshes.half_cylinder import build
 from meshes.rings import INNER, MIDDLE, OUTER, lame_pressure, rings
-from tfeti_dolfinx.compat import interpolation_points
+from tfeti_dolfinx.common.compat import interpolation_points
 
 E, NU = 1.0, 0.3
 OVERLAP = MIDDLE / 1500

@@ -28,13 +28,14 @@ Example:
     0.100000
 """
 
-from tfeti_dolfinx.boundary_elements import BoundaryElements
+from tfeti_dolfinx.accuracy.estimates import Estimates
+from tfeti_dolfinx.bem.boundary_elements import BoundaryElements
+from tfeti_dolfinx.bem.interior import Interior
+from tfeti_dolfinx.constraints.contact_state import ContactData, ContactStatus
 from tfeti_dolfinx.contact.friction import Coulomb, Tresca
 from tfeti_dolfinx.contact.obstacle import Obstacle
 from tfeti_dolfinx.contact.pair import Contact
 from tfeti_dolfinx.contact.shapes import Cylinder, Plane, SignedDistance, Sphere
-from tfeti_dolfinx.dynamics import ContactDynamics
-from tfeti_dolfinx.elasticity import Elasticity
 from tfeti_dolfinx.errors import (
     ConvergenceError,
     FactorError,
@@ -42,19 +43,17 @@ from tfeti_dolfinx.errors import (
     NoSolutionError,
     TfetiError,
 )
-from tfeti_dolfinx.estimates import Estimates
 from tfeti_dolfinx.extensions import Extensions
-from tfeti_dolfinx.interior import Interior
-from tfeti_dolfinx.load_steps import LoadSteps, StepRecord
+from tfeti_dolfinx.forms.elasticity import Elasticity
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dolfinx_input import decompose
-from tfeti_dolfinx.mesh.gmsh.reading import read_gmsh
+from tfeti_dolfinx.mesh.gmsh_reading import read_gmsh
 from tfeti_dolfinx.options import Options
-from tfeti_dolfinx.point_values import PointValues
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.report import Report
-from tfeti_dolfinx.solution import Solution
-from tfeti_dolfinx.states import ContactData, ContactStatus
+from tfeti_dolfinx.solution import PointValues, Solution
+from tfeti_dolfinx.steps.dynamics import ContactDynamics
+from tfeti_dolfinx.steps.load_steps import LoadSteps, StepRecord
 from tfeti_dolfinx.version import __version__
 
 __all__ = [

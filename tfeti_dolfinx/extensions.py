@@ -9,26 +9,23 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from tfeti_dolfinx.checks import checked_callable, named, shown
-from tfeti_dolfinx.dual.dual import Dual, FeasibleLaw, contact_set
-from tfeti_dolfinx.dual.operator import PRECONDITIONERS, MakePreconditioner
+from tfeti_dolfinx.common.validation import checked_callable, named, shown
+from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.gluing.constraints import Constraints
+from tfeti_dolfinx.feti.dual import Dual, FeasibleLaw, contact_set
+from tfeti_dolfinx.feti.operator import PRECONDITIONERS, MakePreconditioner
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import Options
-from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
-from tfeti_dolfinx.qp.monitors import Monitor
-from tfeti_dolfinx.qp.recycled import Recycled
-from tfeti_dolfinx.solver import resolve_types
-from tfeti_dolfinx.subdomains.block import Block
+from tfeti_dolfinx.qp.problem import Monitor
+from tfeti_dolfinx.qp.recycling import Recycled
+from tfeti_dolfinx.qp.sets import FeasibleSet
+from tfeti_dolfinx.solve.solver import resolve_types
+from tfeti_dolfinx.subdomains.block import Block, Counters, SubdomainData, mode_names
 from tfeti_dolfinx.subdomains.build import MakeBlock, sparse_blocks
-from tfeti_dolfinx.subdomains.data import Counters, SubdomainData
-from tfeti_dolfinx.subdomains.factor import added_options
-from tfeti_dolfinx.subdomains.inverse import GeneralisedInverse
-from tfeti_dolfinx.subdomains.kernel import mode_names
-from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, MakeInverse, Making
-from tfeti_dolfinx.subdomains.local import LocalChoice
+from tfeti_dolfinx.subdomains.factor import GeneralisedInverse, added_options
+from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, InverseFactory, MakeInverse
+from tfeti_dolfinx.subdomains.local_operators import LocalChoice
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 
@@ -179,10 +176,10 @@ class Settings:
         """
         return self.extensions.block or sparse_blocks(self.making(counters), self.local_choice)
 
-    def making(self, counters: Counters) -> Making:
+    def making(self, counters: Counters) -> InverseFactory:
         """How inverses of subdomains are made."""
         kplus = self.extensions.kplus or KPLUS_TYPES[self.options.kplus_type]
-        return Making(counters, kplus, f"{self.prefix}sub_")
+        return InverseFactory(counters, kplus, f"{self.prefix}sub_")
 
     def preconditioner(self, pc_type: str) -> MakePreconditioner | None:
         """The preconditioner, the program's own if it brings one.

@@ -1,17 +1,39 @@
-"""Options: one typed dataclass from which parsing, ``view`` and docs/options.md are made."""
+"""Options: one typed dataclass, its table, and what a command line says of it."""
 
 from __future__ import annotations
 
+import difflib
+import math
+import re
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from tfeti_dolfinx.checks import Range
-from tfeti_dolfinx.described import FROM_0, FROM_1, described, parameters_of
-from tfeti_dolfinx.dual.operator import PRECONDITIONERS
-from tfeti_dolfinx.dual.particular import PARTICULAR
+import numpy as np
+from petsc4py import PETSc
+
+from tfeti_dolfinx.common.validation import (
+    FROM_0,
+    FROM_1,
+    Parameter,
+    Range,
+    checked_type,
+    described,
+    made,
+    parameters_of,
+    shown,
+)
+from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.feti.dual import PARTICULAR
+from tfeti_dolfinx.feti.operator import PRECONDITIONERS
 from tfeti_dolfinx.qp.parameters import NewtonParameters, SmalseParameters
 from tfeti_dolfinx.qp.solvers import SOLVERS
+from tfeti_dolfinx.subdomains.factor import default_solver, has_solver, unread_options
 from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES
-from tfeti_dolfinx.subdomains.local import LOCAL_TYPES
+from tfeti_dolfinx.subdomains.local_operators import LOCAL_TYPES
+
+# --- Options: one typed dataclass from which parsing, ``view`` and docs/options.md are made ---
 
 # what ``auto`` asks of displacements, whatever the mesh is
 LOOSEST = 1e-2
@@ -168,3 +190,205 @@ def options_table() -> str:
             f"| `-tfeti_{option.name}` | {about.algorithm} | {shown} | {about.text}{values} |"
         )
     return "\n".join(lines)
+
+
+# --- Options from a dictionary and the command line -------------------------------------------
+
+# what factors of subdomains, the coarse problem and contact rows read from PETSc's options
+FACTOR_OPTION = re.compile(r"(sub|coarse|face)_((?:pc_factor|mat)_\w+)")
+# some of them, for a hint
+FACTOR_NAMES = (
+    "pc_factor_mat_solver_type",
+    "pc_factor_mat_ordering_type",
+    "pc_factor_fill",
+    "pc_factor_shift_type",
+    "pc_factor_shift_amount",
+    "pc_factor_zeropivot",
+    "mat_cholmod_factor",
+    "mat_cholmod_print",
+    "mat_mumps_icntl_14",
+    "mat_mumps_cntl_1",
+)
+# what solvers of PETSc are chosen by, and this one by -qp_type
+TYPES = re.compile(r"(ksp|snes|tao|qp|qps|mat_solver)_type", re.IGNORECASE)
+
+
+def parse_options(
+    given: Mapping[str, Any] | None, prefix: str, defaults: Mapping[str, Any] | None = None
+) -> Options:
+    """Options from the command line, else from a dictionary, else the defaults.
+
+    Args:
+        given: Options of the program, with or without the prefix.
+        prefix: Prefix of all options, e.g. ``"tfeti_"``.
+        defaults: By name, those that are not the options' own.
+
+    Raises:
+        InputError: An option is unknown, its value does not fit, or the command line has options
+            that PETSc was not given.
+    """
+    named = {**(defaults or {}), **_without_prefix(given, prefix)}
+    database = PETSc.Options(prefix)
+    _check_reached(named, database, prefix)
+    named |= {name: database.getString(name, "") for name in database.getAll()}
+    known = {option.name: option for option in parameters_of(Options)}
+    for name in named:
+        if name not in known and not FACTOR_OPTION.fullmatch(name):
+            raise InputError(f"unknown option -{prefix}{name}; {_expected(name, known, prefix)}")
+    _check_factors_read(named, prefix)
+    values = {n: _converted(known[n], v, prefix) for n, v in named.items() if n in known}
+    options: Options = made(Options, values)
+    return options
+
+
+def factor_options(given: Mapping[str, Any] | None, prefix: str) -> dict[str, Any]:
+    """Those options of a dictionary that PETSc itself reads, without the prefix."""
+    named = _without_prefix(given, prefix)
+    return {name: value for name, value in named.items() if FACTOR_OPTION.fullmatch(name)}
+
+
+def _expected(name: str, known: Mapping[str, Parameter], prefix: str) -> str:
+    """Say what option an unknown name may be meant for; of all of them where none is near."""
+    if TYPES.fullmatch(name):
+        choices = ", ".join(known["qp_type"].description.choices)
+        return (
+            f"expected -{prefix}qp_type, which chooses what solves the dual problem: one of "
+            f"{choices}"
+        )
+    if family := re.match(r"(sub|coarse|face)_", name):
+        return _near_factor_names(name.removeprefix(family[0]), f"{prefix}{family[0]}")
+    low = name.lower()
+    near = [option for option in known if option == low or low.endswith(f"_{option}")]
+    near += [n for n in difflib.get_close_matches(low, known) if n not in near]
+    if near:
+        return f"expected {_listed(near, prefix, ' or ')} perhaps; -{prefix}view prints all options"
+    return f"expected one of {_listed(known, prefix, ', ')}"
+
+
+def _listed(names: Iterable[str], prefix: str, separator: str) -> str:
+    return separator.join(f"-{prefix}{name}" for name in names)
+
+
+def _check_factors_read(named: Mapping[str, Any], prefix: str) -> None:
+    """Raise if an option of factors is none that these factors read."""
+    families: dict[str, dict[str, Any]] = {}
+    for match in filter(None, map(FACTOR_OPTION.fullmatch, named)):
+        families.setdefault(match[1], {})[match[2]] = named[match[0]]
+    for family, given in families.items():
+        chosen = given.get("pc_factor_mat_solver_type")
+        solvers = [default_solver() if chosen is None else str(chosen)]
+        if chosen is None and family != "sub" and has_solver("mumps"):
+            solvers.append("mumps")  # where several ranks share one
+        unread = [unread_options(given, solver) for solver in dict.fromkeys(solvers)]
+        for name in unread[0]:
+            if all(name in names for names in unread):
+                raise InputError(_unread(name, family, solvers, prefix))
+
+
+def _unread(name: str, family: str, solvers: Sequence[str], prefix: str) -> str:
+    """Say that factors do not read an option, and what they may read in its place."""
+    text = f"-{prefix}{family}_{name}: factors by {' or '.join(solvers)} read no such option"
+    package = re.match(r"mat_(cholmod|mumps)_", name)
+    if package and package[1] not in solvers:
+        return f"{text}; expected -{prefix}{family}_pc_factor_mat_solver_type {package[1]} with it"
+    return f"{text}; {_near_factor_names(name, f'{prefix}{family}_')}"
+
+
+def _near_factor_names(name: str, prefix: str) -> str:
+    """Say what option of factors may be meant."""
+    near = difflib.get_close_matches(name, [n for n in FACTOR_NAMES if n != name])
+    if near:
+        return f"expected {_listed(near, prefix, ' or ')} perhaps"
+    return f"expected -{prefix}pc_factor_... or -{prefix}mat_..., which PETSc's -help lists"
+
+
+def _without_prefix(given: Any, prefix: str) -> dict[str, Any]:
+    """The options given, without the prefix."""
+    if not isinstance(prefix, str) or not re.fullmatch(r"\w+", prefix):
+        raise InputError(
+            f"petsc_options_prefix is {shown(prefix)}; expected letters, digits and underscores, "
+            "such as 'tfeti_'"
+        )
+    if given is None:
+        return {}
+    checked_type(given, Mapping, "petsc_options", "a dictionary such as {'tfeti_rtol': 1e-8}")
+    named: dict[str, Any] = {}
+    for name, value in given.items():
+        checked_type(name, str, f"petsc_options: the key {shown(name)}", "the name of an option")
+        short = name.removeprefix("-").removeprefix(prefix)
+        if short in named:
+            raise InputError(f"petsc_options: -{prefix}{short} is there twice; expected it once")
+        named[short] = value
+    return named
+
+
+def _check_reached(named: Mapping[str, Any], database: PETSc.Options, prefix: str) -> None:
+    """Raise if the command line has options that PETSc was not given."""
+    known = set(named) | set(database.getAll())
+    for word in sys.argv[1:]:
+        if word.startswith(f"-{prefix}") and word.removeprefix(f"-{prefix}") not in known:
+            raise InputError(
+                f"{word} on the command line did not reach PETSc; call petsc4py.init(sys.argv) "
+                "before dolfinx is imported"
+            )
+
+
+def _converted(option: Parameter, value: Any, prefix: str) -> Any:
+    """The value as the type of the option, in its range."""
+    what = f"-{prefix}{option.name}"
+    kind = option.description.kind or type(option.default)
+    if isinstance(value, str) and value in option.description.words:
+        return value
+    try:
+        result = CONVERSIONS[kind](value)
+    except (TypeError, ValueError, OverflowError):
+        words = "".join(f" or {word}" for word in option.description.words)
+        raise InputError(
+            f"{what} {shown(value)}: expected a value of type {kind.__name__}{words}"
+        ) from None
+    choices, fits = option.description.choices, option.description.fits
+    if choices and result not in choices:
+        raise InputError(f"{what} {result}: expected one of {', '.join(choices)}")
+    if kind in (int, float) and not (math.isfinite(result) and fits.holds(result)):
+        raise InputError(f"{what} {result}: expected {fits.text}")
+    return result
+
+
+def _as_bool(value: Any) -> bool:
+    if isinstance(value, str):
+        table = {"": True, "1": True, "true": True, "yes": True, "on": True}
+        table |= {"0": False, "false": False, "no": False, "off": False}
+        if value.lower() not in table:
+            raise ValueError(value)
+        return table[value.lower()]
+    if value is not None and value not in (0, 1):
+        raise ValueError(value)
+    return True if value is None else bool(value)
+
+
+def _as_float(value: Any) -> float:
+    if isinstance(value, (bool, np.bool_)):
+        raise TypeError(value)
+    return float(value)
+
+
+def _as_int(value: Any) -> int:
+    if isinstance(value, str):
+        return int(value)
+    if _as_float(value) != int(value):
+        raise ValueError(value)
+    return int(value)
+
+
+def _as_text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError(value)
+    return value
+
+
+CONVERSIONS: dict[type, Callable[[Any], Any]] = {
+    bool: _as_bool,
+    float: _as_float,
+    int: _as_int,
+    str: _as_text,
+}

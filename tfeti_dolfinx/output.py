@@ -17,12 +17,12 @@ import numpy as np
 from dolfinx import fem, io
 from mpi4py import MPI
 
-from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.checks import checked_path, checked_type, named
-from tfeti_dolfinx.compat import geometry_dofmap
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.compat import geometry_dofmap
+from tfeti_dolfinx.common.validation import checked_path, checked_type, named
 from tfeti_dolfinx.errors import InputError, TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
-from tfeti_dolfinx.mesh.entities import NO_TAG
+from tfeti_dolfinx.mesh.untorn import NO_TAG
 from tfeti_dolfinx.solution import Solution
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)

@@ -15,8 +15,8 @@ import numpy as np
 from dolfinx import plot as dplot
 
 from tfeti_dolfinx import draw
-from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.checks import (
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.validation import (
     FINITE,
     POSITIVE,
     Range,

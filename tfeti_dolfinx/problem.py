@@ -2,48 +2,279 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
-from typing import Any
+from dataclasses import replace
+from typing import Any, ClassVar
 
 import numpy as np
 import ufl
 from dolfinx import fem
 
-from tfeti_dolfinx.agreement import agreeing, described, fields_in, sums_of
-from tfeti_dolfinx.assembly import Forms
-from tfeti_dolfinx.boundary_elements import BoundaryElements, check_boundary_elements
-from tfeti_dolfinx.checks import checked_type
-from tfeti_dolfinx.compat import require_real_petsc
-from tfeti_dolfinx.contact.arguments import Gap, gaps_by_position
-from tfeti_dolfinx.contact.partners import ContactPartner, checked_contacts
-from tfeti_dolfinx.contact_state import Multipliers
-from tfeti_dolfinx.coulomb import solve_with_friction
-from tfeti_dolfinx.doubts import Doubts, note_estimates
-from tfeti_dolfinx.dual.dual import Dual
-from tfeti_dolfinx.dual.goals import Goal
-from tfeti_dolfinx.errors import InputError, TfetiError
-from tfeti_dolfinx.estimates import Estimates, estimate, goal_of, of_looks
-from tfeti_dolfinx.extensions import Extensions, Settings, guarded
-from tfeti_dolfinx.fields import Stress, checked_thickness
-from tfeti_dolfinx.form_checks import check_mesh, check_same_space, displacement_space
-from tfeti_dolfinx.gluing.prescribed import (
+from tfeti_dolfinx.accuracy.diagnostics import Diagnostics, note_estimates
+from tfeti_dolfinx.accuracy.estimates import Estimates, estimate, goal_of, of_looks
+from tfeti_dolfinx.bem.boundary_elements import BoundaryElements, check_boundary_elements
+from tfeti_dolfinx.common.agreement import agreeing, described, fields_in, sums_of
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.compat import require_real_petsc
+from tfeti_dolfinx.common.logging import stage
+from tfeti_dolfinx.common.validation import checked_type
+from tfeti_dolfinx.constraints.contact_state import Multipliers
+from tfeti_dolfinx.constraints.gluing import (
+    Gluing,
     check_not_on_tears,
     checked_conditions,
     listed_conditions,
 )
-from tfeti_dolfinx.gluing.spectrum import extreme_eigenvalues, require_slepc
+from tfeti_dolfinx.constraints.spectrum import extreme_eigenvalues, require_slepc
+from tfeti_dolfinx.contact.records import Gap, gaps_by_position
+from tfeti_dolfinx.contact.search import ContactPartner, checked_contacts
+from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
+from tfeti_dolfinx.extensions import Extensions, Settings, guarded
+from tfeti_dolfinx.feti.dual import Dual
+from tfeti_dolfinx.feti.stopping import ErrorTarget
+from tfeti_dolfinx.forms.assembly import Forms
+from tfeti_dolfinx.forms.checks import check_mesh, check_same_space, displacement_space
+from tfeti_dolfinx.forms.fields import Stress, checked_stress, checked_thickness
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.option_parsing import factor_options, parse_options
-from tfeti_dolfinx.report import Report
-from tfeti_dolfinx.report_filling import fill_result, settle_seconds
-from tfeti_dolfinx.rounds import solve_in_rounds
-from tfeti_dolfinx.solution import Solution
-from tfeti_dolfinx.solver import conclude, learn, resolve_types
-from tfeti_dolfinx.stepping import Stepping
+from tfeti_dolfinx.options import factor_options, parse_options
+from tfeti_dolfinx.report import Report, fill_result, settle_seconds
+from tfeti_dolfinx.solution import SavedState, Solution, check_state
+from tfeti_dolfinx.solve.coulomb import solve_with_friction
+from tfeti_dolfinx.solve.solver import conclude, learn, resolve_types
 from tfeti_dolfinx.system import System
-from tfeti_dolfinx.timing import stage
+
+# --- Solves with more and more contact rows, until no node without one overlaps ---------------
+
+MAX_ROUNDS = 20
+
+
+def solve_in_rounds(solve_rows: Callable[[], Solution], system: System, report: Report) -> None:
+    """Solve until no node without a row overlaps. Collective.
+
+    Args:
+        solve_rows: Solves with the present rows.
+        system: The rows.
+        report: Takes seconds and counts.
+
+    Raises:
+        NoSolutionError: The problem has no solution, however far one looks.
+        ConvergenceError: Nodes without a row still overlap after many rounds.
+    """
+    for _ in range(MAX_ROUNDS):
+        try:
+            solution = solve_rows()
+        except NoSolutionError as error:  # on all ranks: what is far may hold the body yet
+            added = _widen(system, report, error)
+        else:
+            overlap = report.tolerances["penetration"]
+            with stage("contact", report.seconds):
+                added = system.search.take_in_overlapping(solution.u, overlap)
+            if added == 0:
+                return
+        if added:
+            system.change("rows")
+        report.late_contact_rows += added
+    raise ConvergenceError(f"nodes out of reach still overlap after {MAX_ROUNDS} rounds")
+
+
+def _widen(system: System, report: Report, error: NoSolutionError) -> int:
+    """Look farther for what may hold a body; how many rows are new."""
+    search = system.search
+    if not search.is_exhausted:
+        with stage("contact", report.seconds):
+            return search.widen()
+    report.converged_reason = "NO_SOLUTION"
+    if unmet := search.unmet():
+        text = f"{error}; of the contacts meet nobody: {', '.join(unmet)}"
+        raise NoSolutionError(text) from error
+    raise error
+
+
+# --- The solutions of a problem: the last one, and the one that a load step has ended with ----
+
+# rows, their λ, and the multipliers of Gλ = e
+Start = tuple[Gluing, Array, Array]
+
+
+class Stepping:
+    """What of ``ContactProblem`` concerns load steps: what it has found, and where to go on.
+
+    Attributes:
+        defaults: Options, by name, that have other defaults than their own.
+    """
+
+    defaults: ClassVar[Mapping[str, Any]] = {}
+
+    u: fem.Function
+    dofs: TornDofs
+    decomposition: Decomposition
+    contacts: list[ContactPartner]
+    report: Report
+    _settings: Settings
+    _system: System
+    bcs: list[fem.DirichletBC]
+    _given_stress: Stress | None
+    _stress: Stress | None = None
+    _thickness: Any
+    _solution: Solution | None = None
+    _start: Start | None = None
+    _accepted: tuple[Solution | None, Start | None] = (None, None)
+
+    @property
+    def solution(self) -> Solution:
+        """Fields and contact states.
+
+        Raises:
+            InputError: There is none before ``solve``.
+        """
+        if self._solution is None:
+            raise InputError("there is no solution yet; expected a call of solve() before")
+        return self._solution
+
+    def take_step(self, size: float) -> None:
+        """Say how long the next load step is: without inertia it does not matter."""
+
+    def accept(self) -> None:
+        """Take the last solution as the end of a load step. Collective.
+
+        Friction acts on slips from there on (quasi-static), and ``go_back`` returns there.
+
+        Raises:
+            InputError: There is no solution, or the solver stopped before its tolerance.
+        """
+        with agreeing(self.decomposition.comm, "accept"):
+            solution = self.solution
+            if self._start is None:
+                raise InputError("the last solve has not converged; expected one that has")
+        if solution is self._accepted[0] or self._start is None:
+            return
+        self._system.count_slips_from(solution.u)
+        self._accepted = (solution, self._start)
+
+    def go_back(self) -> None:
+        """Return to the last accepted solution, or to none. Collective.
+
+        The next ``solve`` starts from there. Loads, values and gaps stay as they are.
+        """
+        with agreeing(self.decomposition.comm, "go_back"):
+            self._return()
+
+    def _return(self) -> None:
+        """Return to the last accepted solution. Not collective."""
+        self._solution, self._start = self._accepted
+        last = self._solution
+        self.u.x.array[:] = 0.0 if last is None else self.dofs.to_dolfinx(last.u)
+
+    def state(self) -> SavedState:
+        """The last accepted solution as arrays of this rank, for ``restore``. Collective.
+
+        Raises:
+            InputError: No solution was accepted.
+        """
+        solution, start = self._accepted
+        with agreeing(self.decomposition.comm, "state"):
+            if solution is None or start is None:
+                raise InputError("there is no state yet; expected a call of accept() before")
+        assert solution is not None
+        assert start is not None
+        (reach, _), dual = self._system.search.rows(), self._system.dual
+        state = SavedState.of(solution, start[2], dual.seen, reach)
+        if dual.constraints is not start[0].constraints:
+            return state
+        state = replace(state, image=dual.last.known(self.dofs.comm, start[1]))
+        if dual.recycled is None:
+            return state
+        return replace(state, directions=dual.recycled.in_order())
+
+    def restore(self, state: SavedState) -> None:
+        """Go on where another run of the same program, on as many ranks, has been. Collective.
+
+        Constants, functions, values, gaps and points must be those that the state was found with.
+
+        Args:
+            state: What ``state`` returned on this rank.
+
+        Raises:
+            InputError: The state is of another mesh, other contacts or other ranks, or broken.
+        """
+        with agreeing(self.decomposition.comm, "restore") as given:
+            self._check_state(state)
+            given |= {**self._given(), "state": state.common()}
+            self._look_at_stress()
+        self._take_motion(state)
+        system = self._system
+        system.know_rows(list(state.reach), state.groups())
+        system.look_for_changes()
+        dual = system.make(self.report)
+        dual.saw(float(state.norm))
+        gluing = replace(system.gluing, slip=state.slip)
+        state.check_rows(gluing)
+        learn(dual, self._settings.options)
+        if dual.recycled is not None:
+            dual.recycled.take(state.directions)
+        dual.last.take(self.dofs.comm, state.lam, state.image)
+        solution = self._make_solution(state.u, state.multipliers(), gluing)
+        self._accepted = (solution, (gluing, state.lam, state.mu))
+        self._return()
+        system.count_slips_from(solution.u)
+
+    def _check_state(self, state: SavedState) -> None:
+        """Raise unless a state may be one of this problem. Not collective.
+
+        Raises:
+            InputError: It is broken, or of something else.
+        """
+        check_state(state, self.dofs, self.decomposition, len(self.contacts))
+
+    def _take_motion(self, state: SavedState) -> None:
+        """Move as the bodies of a state do: without inertia not at all."""
+
+    def _meet(self, call: str) -> None:
+        """Begin a call: see that all ranks make it, with the same data. Collective.
+
+        Raises:
+            InputError: They do not, or the stress fails.
+        """
+        with agreeing(self.decomposition.comm, call) as given:
+            given |= self._given()
+            self._look_at_stress()
+
+    def _given(self) -> dict[str, Any]:
+        """What determines the solution, as it is now, by name. Not collective."""
+        about = {"bcs": self.bcs, "contacts": self.contacts, "thickness": self._thickness}
+        return {**self._system.forms.given, **about}
+
+    def _look_at_stress(self) -> Any:
+        """The user's stress of ``u`` in UFL, which solutions take until the next look.
+
+        Not collective: it is looked at where what it raises is raised on all ranks.
+
+        Raises:
+            InputError: As ``checked_stress``.
+        """
+        if self._given_stress is None:
+            return None
+        sigma, own = checked_stress(self._given_stress, self.u), self.u
+        self._stress = lambda u: ufl.replace(sigma, {own: u})
+        return sigma
+
+    def _make_solution(self, u: Array, multipliers: Multipliers, gluing: Gluing) -> Solution:
+        solution = Solution(
+            u=u,
+            multipliers=multipliers,
+            decomposition=self.decomposition,
+            gluing=gluing,
+            contacts=list(self._system.search.contacts),
+            stress=self._stress,
+            thickness=self._thickness,
+        )
+        solution.boundary = self._system.replaced.solved(u)
+        return solution
+
+
+# --- The user's door: a contact problem from forms, conditions and contacts to a solution -----
 
 
 class ContactProblem(Stepping):
@@ -136,7 +367,7 @@ class ContactProblem(Stepping):
             self.dofs = TornDofs(V, decomposition)
             check_not_on_tears(self.bcs, self.dofs, decomposition)
         forms.thickness = self._thickness
-        self._doubts = Doubts(decomposition, self.dofs)
+        self._doubts = Diagnostics(decomposition, self.dofs)
         if boundary_elements is not None:
             check_boundary_elements(boundary_elements, extensions)
         self._system = System(
@@ -295,7 +526,7 @@ class ContactProblem(Stepping):
         """Destroy the PETSc objects; solution and report stay. ``solve`` makes them anew."""
         self._system.destroy()
 
-    def _goal(self) -> Goal | None:
+    def _goal(self) -> ErrorTarget | None:
         """What -rtol auto compares the algebraic error with."""
         if self.options.rtol != "auto" or self._stress is None:
             return None

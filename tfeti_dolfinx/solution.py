@@ -1,22 +1,30 @@
-"""The solution of a contact problem: displacement, multipliers, and fields that follow lazily."""
+"""The solution of a problem: fields, contact data, values at points, its saved state."""
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from dolfinx import fem
+from dolfinx import fem, geometry
+from mpi4py import MPI
 
-from tfeti_dolfinx.arrays import Array, sum_rows
-from tfeti_dolfinx.boundary.solved import BoundarySolution
+from tfeti_dolfinx.bem.inside import BoundarySolution
+from tfeti_dolfinx.bem.interior import Interior
+from tfeti_dolfinx.common.arrays import Array, sum_rows
+from tfeti_dolfinx.common.compat import geometry_dofmap
+from tfeti_dolfinx.common.parallel import any_rank
+from tfeti_dolfinx.common.validation import checked_type
+from tfeti_dolfinx.constraints.contact_state import ContactState, ContactStatus, Multipliers
+from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.forces import BodyForces, body_forces, vertex_tractions
-from tfeti_dolfinx.contact.partners import ContactPartner
-from tfeti_dolfinx.contact_state import ContactState, Multipliers
-from tfeti_dolfinx.discretisation import StressRecovery
-from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.fields import (
+from tfeti_dolfinx.contact.search import ContactPartner
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.forms.discretisation import StressRecovery
+from tfeti_dolfinx.forms.fields import (
     Stress,
     cellwise,
     checked_stress,
@@ -26,12 +34,144 @@ from tfeti_dolfinx.fields import (
     vector_from_vertices,
     von_mises,
 )
-from tfeti_dolfinx.gluing.glue import Gluing
-from tfeti_dolfinx.interior import Interior
 from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import hat_integrals
-from tfeti_dolfinx.point_values import PointValues, checked_points, values_at
-from tfeti_dolfinx.states import ContactStatus
+from tfeti_dolfinx.qp.sets import Status, face_of
+
+# --- Displacement and stress at points of the user's ------------------------------------------
+
+# Of the size of the mesh: how far from a cell of finite elements a point may be
+PADDING = 1e-10
+# Share of directions hidden by a body that is neither 0 nor 1: points on its surface
+SURE = 1e-3
+# Their stress is taken so far on the way to the middle of their cell
+BESIDE = 0.1
+
+
+@dataclass(frozen=True)
+class PointValues:
+    """Values at points; not a number where a point is in no body.
+
+    Attributes:
+        displacement: Shape ``(k, gdim)``.
+        stress: Shape ``(k, gdim, gdim)``, in 2D without σ_zz.
+    """
+
+    displacement: Array
+    stress: Array
+
+
+def checked_points(points: Any, gdim: int) -> Array:
+    """Points as an array of shape ``(k, gdim)``.
+
+    Raises:
+        InputError: They are of another shape, or not finite numbers.
+    """
+    try:
+        found = np.array(points, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"points: {error}; expected numbers of shape (k, {gdim})") from error
+    if found.ndim != 2 or found.shape[1] != gdim or not np.all(np.isfinite(found)):
+        raise InputError(
+            f"points of shape {found.shape}; expected finite numbers of shape (k, {gdim})"
+        )
+    return found
+
+
+def values_at(
+    points: Array,
+    boundary: BoundarySolution | None,
+    thickness: Any,
+    u: fem.Function,
+    stress: fem.Function | None,
+) -> PointValues:
+    """Values at points, means of the subdomains that share a point. Collective.
+
+    Args:
+        points: The same on all ranks, shape ``(k, gdim)``.
+        boundary: What boundary elements know.
+        thickness: What stresses of boundary elements have to be divided by.
+        u: Displacement on the torn mesh.
+        stress: Stress in the cells, 3×3, or None.
+    """
+    k, d = points.shape
+    total = np.zeros((k, 1 + d + d * d))
+    place, cells = _cells(u.function_space.mesh, points)
+    if boundary is not None:
+        total += _of_boundary_elements(points, (place, cells), boundary, _number(thickness), u)
+        kept = np.isin(cells, boundary.finite)
+        place, cells = place[kept], cells[kept]
+    if len(place):
+        x = _in_space(points[place])
+        sigma = np.full((len(place), d, d), np.nan)
+        if stress is not None:
+            sigma = stress.eval(x, cells).reshape(-1, 3, 3)[:, :d, :d]
+        np.add.at(total, place, _row(u.eval(x, cells).reshape(-1, d), sigma))
+    u.function_space.mesh.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
+    with np.errstate(invalid="ignore"):
+        mean = np.where(total[:, :1] > 0.0, total[:, 1:] / total[:, :1], np.nan)
+    return PointValues(mean[:, :d], mean[:, d:].reshape(k, d, d))
+
+
+def _of_boundary_elements(
+    points: Array,
+    found: tuple[Array, Array],
+    boundary: BoundarySolution,
+    thickness: float,
+    u: fem.Function,
+) -> Array:
+    """Rows of the bodies of this rank, added for each point."""
+    (k, d), mesh = points.shape, u.function_space.mesh
+    total = np.zeros((k, 1 + d + d * d))
+    (place, cells), owner = found, boundary.cell_subdomain
+    for body in boundary.bodies():
+        share = body.inside.share(points)
+        own = np.flatnonzero(share > 1.0 - SURE)
+        sigma = body.inside.stress(points[own]) / thickness
+        total[own] += _row(body.inside.displacement(points[own]), sigma)
+        on = (share > SURE) & (share <= 1.0 - SURE)
+        there = np.flatnonzero(on[place] & (owner[cells] == body.subdomain))
+        if len(there):
+            own, first = np.unique(place[there], return_index=True)
+            cell, at = cells[there[first]], points[own]
+            middle = mesh.geometry.x[geometry_dofmap(mesh)[cell]].mean(axis=1)[:, :d]
+            sigma = body.inside.stress(at + BESIDE * (middle - at)) / thickness
+            total[own] += _row(u.eval(_in_space(at), cell).reshape(-1, d), sigma)
+    return total
+
+
+def _in_space(points: Array) -> Array:
+    """Points with three coordinates."""
+    x = np.zeros((len(points), 3))
+    x[:, : points.shape[1]] = points
+    return x
+
+
+def _row(u: Array, stress: Array) -> Array:
+    return np.column_stack((np.ones(len(u)), u, stress.reshape(len(u), u.shape[1] ** 2)))
+
+
+def _number(thickness: Any) -> float:
+    """A thickness as a number; where it varies there are no boundary elements."""
+    if isinstance(thickness, fem.Constant):
+        return float(thickness.value)
+    return float(thickness) if isinstance(thickness, float) else 1.0
+
+
+def _cells(mesh: Any, points: Array) -> tuple[Array, Array]:
+    """Points by position, and the cells of this rank that each of them is in."""
+    x = _in_space(points)
+    size = float(np.ptp(mesh.geometry.x, axis=0).max(initial=0.0)) if len(mesh.geometry.x) else 0.0
+    tree = geometry.bb_tree(mesh, mesh.topology.dim, padding=PADDING * size)
+    near = geometry.compute_collisions_points(tree, x)
+    found = geometry.compute_colliding_cells(mesh, near, x)
+    place = np.repeat(np.arange(len(points)), np.diff(found.offsets))
+    return place, np.asarray(found.array)
+
+
+# --- The solution of a contact problem: displacement, multipliers, and fields that follow
+#     lazily ---
 
 
 class Solution(ContactState):
@@ -265,3 +405,168 @@ class Solution(ContactState):
         function = from_vertices(self.dofs, values, vertices)
         function.name = name
         return function
+
+
+# --- A solution as plain arrays, from which another run of the same program goes on -----------
+
+
+@dataclass(frozen=True)
+class SavedState:
+    """An accepted solution on this rank, and what the next solve starts from.
+
+    Attributes:
+        layout: Checksums of this rank's part of the mesh and its unknowns, shape ``(4,)``.
+        u: Displacement in primal order.
+        lam: Multipliers λ of this rank's rows.
+        mu: Multipliers of Gλ = e.
+        norm: Estimate of ‖F‖ that solves have come to, shape ``()``.
+        status: Status of each row, see ``qp.faces``.
+        slip: Where the load step began: tangential v_i of the conditions, ``(n, gdim - 1)``.
+        reach: How far was searched in each contact.
+        contact: Contact of each condition with a row.
+        group: Owned group of each condition with a row.
+        velocity: Velocity in DOLFINx's order, empty without inertia.
+        load: Load likewise.
+        predicted: Multipliers of this rank's rows of the predictor, empty without one.
+        size: That of the step which the matrix was made for, shape ``()``; 0 without inertia.
+        directions: What ``Recycled`` keeps of earlier solves, shape ``(2, m, k)``.
+        image: Fλ; empty where it is not known.
+        predicted_image: The same of the predictor.
+    """
+
+    layout: Array
+    u: Array
+    lam: Array
+    mu: Array
+    norm: Array
+    status: Array
+    slip: Array
+    reach: Array
+    contact: Array
+    group: Array
+    velocity: Array = field(default_factory=lambda: np.zeros(0))
+    load: Array = field(default_factory=lambda: np.zeros(0))
+    predicted: Array = field(default_factory=lambda: np.zeros(0))
+    size: Array = field(default_factory=lambda: np.zeros(()))
+    directions: Array = field(default_factory=lambda: np.zeros((2, 0, 0)))
+    image: Array = field(default_factory=lambda: np.zeros(0))
+    predicted_image: Array = field(default_factory=lambda: np.zeros(0))
+
+    @classmethod
+    def of(cls, solution: Solution, mu: Array, norm: float, reach: list[float]) -> SavedState:
+        """The state of a solution."""
+        records, holding = solution.gluing.records, solution.holding
+        held = np.where(holding, Status.STICK, Status.SLIP)
+        return cls(
+            layout=layout_of(solution.dofs, solution.decomposition),
+            u=solution.u,
+            lam=solution.lam,
+            mu=mu,
+            norm=np.array(norm),
+            status=np.where(solution.carrying, held, Status.OPEN),
+            slip=solution.gluing.slip,
+            reach=np.array(reach, dtype=float),
+            contact=records.contact[records.within_reach],
+            group=records.group[records.within_reach],
+        )
+
+    def groups(self) -> list[Array]:
+        """The groups whose nodes have rows, of each contact."""
+        return [self.group[self.contact == i] for i in range(len(self.reach))]
+
+    def multipliers(self) -> Multipliers:
+        """The multipliers, with a face that only knows what rows do."""
+        return Multipliers(self.lam, face_of(np.zeros(len(self.lam), dtype=bool), self.status))
+
+    def common(self) -> dict[str, Any]:
+        """What the states of all ranks must have alike, since searches and solves go by it."""
+        size = float(np.abs(self.mu).sum())
+        return {
+            "reach": self.reach.tolist(),
+            "size": float(self.size),
+            "norm": float(self.norm),
+            "mu": [len(self.mu), float(self.mu.sum()), size],
+            "number of directions": self.directions.shape[2],
+        }
+
+    def check_rows(self, gluing: Gluing) -> None:
+        """Raise unless rows are those of the state. Collective.
+
+        Raises:
+            InputError: They are others.
+        """
+        records = gluing.records
+        sizes = (len(self.lam), len(self.slip), self.contact.tolist(), self.group.tolist())
+        kept, wide = records.within_reach, self.directions.shape
+        found = (records.contact[kept].tolist(), records.group[kept].tolist())
+        comm, parts = gluing.dofs.comm, ("image", "predicted", "predicted_image")
+        known = [name for name in parts if any_rank(comm, getattr(self, name).size > 0)]
+        with raised_on_all_ranks(comm):
+            rows = gluing.constraints.num_rows
+            if sizes != (rows, len(records), *found) or (wide[2] and wide[:2] != (2, rows)):
+                raise InputError(
+                    "the state has other contact rows than the problem: expected the contacts, "
+                    "conditions and data that it was found with"
+                )
+            for name in known:
+                _check_broken(name, getattr(self, name).shape == (rows,))
+
+
+def layout_of(dofs: TornDofs, decomposition: Decomposition) -> Array:
+    """Checksums of this rank's part of the mesh and its unknowns."""
+    numbers = (
+        decomposition.cell_subdomain,
+        decomposition.original_cells,
+        dofs.dolfinx_node,
+        dofs.group * dofs.bs,
+    )
+    return np.array([zlib.crc32(np.asarray(n, dtype=np.int64).tobytes()) for n in numbers])
+
+
+def check_state(
+    state: SavedState, dofs: TornDofs, decomposition: Decomposition, contacts: int
+) -> None:
+    """Raise unless a state is whole, of this mesh, on these ranks, with so many contacts.
+
+    Not collective: a rank may have a broken one.
+
+    Raises:
+        InputError: It is not.
+    """
+    checked_type(state, SavedState, "state", "what ContactProblem.state returned")
+    for f in fields(state):
+        checked_type(getattr(state, f.name), np.ndarray, f"state: {f.name}", "an array")
+    if not np.array_equal(state.layout, layout_of(dofs, decomposition)):
+        raise InputError(
+            "the state is of another mesh, or of one that was distributed in another way; "
+            "expected the same mesh on as many ranks"
+        )
+    if len(state.reach) != contacts:
+        raise InputError(
+            f"the state is of {len(state.reach)} contacts; expected those of the problem, "
+            f"{contacts}"
+        )
+    rows, conditions = state.lam.shape, state.contact.shape
+    unknowns = (len(dofs.dolfinx_node) * dofs.bs,)
+    shapes = {"u": unknowns, "norm": (), "status": rows, "group": conditions, "size": ()}
+    axes = {"lam": 1, "mu": 1, "slip": 2, "reach": 1, "contact": 1, "directions": 3}
+    for name, shape in shapes.items():
+        _check_broken(name, getattr(state, name).shape == shape)
+    for name, count in axes.items():
+        _check_broken(name, getattr(state, name).ndim == count)
+    for name in ("image", "predicted", "predicted_image"):
+        _check_broken(name, getattr(state, name).shape in ((0,), rows))
+    for name in ("u", "lam", "mu", "norm", "slip", "velocity", "load", "predicted", "directions"):
+        _check_broken(name, bool(np.all(np.isfinite(getattr(state, name)))))
+    for name, size in (("contact", contacts), ("group", dofs.num_groups)):
+        values = getattr(state, name)
+        _check_broken(name, bool(np.all((values >= 0) & (values < size))))
+
+
+def _check_broken(name: str, right: bool) -> None:
+    """Raise an InputError unless an array of a state is right."""
+    if not right:
+        raise InputError(
+            f"the state is broken: {name} has another shape than in any solution of the problem, "
+            "or no numbers; expected what ContactProblem.state returned"
+        )

@@ -1,39 +1,180 @@
-"""From forms to the dual problem, in stages that are kept until their input changes."""
+"""What a solve is made from, in stages that are kept until their input changes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from dolfinx import fem
 
-from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.assembly import Forms
-from tfeti_dolfinx.boundary_elements import BoundaryElements, Replaced
-from tfeti_dolfinx.contact.arguments import Gap
-from tfeti_dolfinx.contact.partners import ContactPartner
-from tfeti_dolfinx.contact.search import ContactSearch
-from tfeti_dolfinx.dual.dual import Dual
+from tfeti_dolfinx.bem.boundary_elements import BoundaryElementAssembly, BoundaryElements
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.logging import stage
+from tfeti_dolfinx.common.parallel import any_rank
+from tfeti_dolfinx.constraints.gluing import Gluing, Prescribed, glue, prescribe
+from tfeti_dolfinx.constraints.rows import row_weights
+from tfeti_dolfinx.constraints.stiffening import Stiffening
+from tfeti_dolfinx.contact.forces import condition_areas
+from tfeti_dolfinx.contact.records import Gap, slips
+from tfeti_dolfinx.contact.search import ContactPartner, ContactSearch
+from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import Settings
-from tfeti_dolfinx.friction_bounds import FrictionBounds
-from tfeti_dolfinx.gluing.glue import Gluing, glue
-from tfeti_dolfinx.gluing.prescribed import Prescribed, prescribe
-from tfeti_dolfinx.gluing.stiffening import Stiffening
-from tfeti_dolfinx.gluing.weights import row_weights
+from tfeti_dolfinx.feti.dual import Dual
+from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.parallel import any_rank
-from tfeti_dolfinx.report import Report
-from tfeti_dolfinx.report_filling import fill_sizes
-from tfeti_dolfinx.stages import STAGES, Stages, made
-from tfeti_dolfinx.subdomains.averages import clusters_of
+from tfeti_dolfinx.report import Report, fill_sizes
+from tfeti_dolfinx.subdomains.block import Counters
 from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
-from tfeti_dolfinx.subdomains.data import Counters
+from tfeti_dolfinx.subdomains.clusters import clusters_of
 from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
-from tfeti_dolfinx.timing import stage
+
+# --- The stages of a solve: their order, what depends on what, and which are out of date ------
+
+T = TypeVar("T")
+
+# in the order in which they are made, with the name that their seconds have in the report
+STAGES = {
+    "stiffness": "assembly",
+    "search": "contact",
+    "rows": "gluing",
+    "right side": "gluing",
+    "friction": "gluing",
+    "load": "assembly",
+    "factors": "subdomains",
+    "trace": "subdomains",
+    "coarse problem": "dual",
+    "linear term": "dual",
+}
+# what has to be made anew where something has changed
+CHANGES = {
+    "points": tuple(STAGES),
+    "stiffness": ("stiffness", "rows", "friction", "factors", "trace", "coarse problem"),
+    "rows": ("rows", "friction", "trace", "coarse problem"),
+    "right side": ("right side", "linear term"),
+    "friction": ("friction", "linear term"),
+    "load": ("load", "linear term"),
+}
+# what comes with a stage
+BRINGS = {"rows": "right side", "factors": "trace", "coarse problem": "linear term"}
+
+
+class Stages:
+    """Which stages are out of date, and which were made.
+
+    Attributes:
+        made: How often each stage was made since the counts were last taken.
+    """
+
+    def __init__(self) -> None:
+        self.made: Counter[str] = Counter()
+        self._stale = set(STAGES)
+
+    def change(self, what: str) -> None:
+        """Something has changed: a key of ``CHANGES``."""
+        self._stale |= set(CHANGES[what])
+
+    def is_stale(self, name: str) -> bool:
+        """Whether a stage is out of date."""
+        return name in self._stale
+
+    def stale(self) -> Iterator[str]:
+        """Stages that are out of date, in order; each is up to date when the next is asked for.
+
+        Where the loop is left, as by an error, the stage that was being made stays out of date.
+        """
+        for name in STAGES:
+            if name in self._stale:
+                yield name
+                self._stale -= {name, BRINGS.get(name, name)}
+                self.made[name] += 1
+
+    def forget(self) -> None:
+        """All stages are out of date."""
+        self._stale = set(STAGES)
+
+    def take_counts(self) -> tuple[Counter[str], list[str]]:
+        """How often each stage was made since the last call, and which were up to date."""
+        made, self.made = self.made, Counter()
+        new = {*made, *(BRINGS.get(name) for name in made), *self._stale}
+        return made, [name for name in STAGES if name not in new]
+
+
+def made(item: T | None) -> T:
+    """What a stage has made."""
+    if item is None:
+        raise InputError("nothing has been made yet; expected a call of solve() before")
+    return item
+
+
+# --- What bounds the tangential forces of a scene, and where its slips count from -------------
+
+
+class FrictionBounds:
+    """Bounds of tangential forces from laws of friction. All methods are collective.
+
+    Args:
+        contacts: Obstacles and pairs; without friction nothing is done.
+        dofs: Dof maps.
+        decomposition: The torn mesh.
+        thickness: What areas of the mesh are multiplied with, a number or a scalar in UFL.
+
+    Attributes:
+        exists: Whether a contact has friction.
+        rest: Displacement at which the load step begins, in primal order; None: no displacement.
+    """
+
+    def __init__(
+        self,
+        contacts: Sequence[ContactPartner],
+        dofs: TornDofs,
+        decomposition: Decomposition,
+        thickness: Any,
+    ) -> None:
+        self._dofs, self._decomposition, self._thickness = dofs, decomposition, thickness
+        self._known: Array | None = None
+        self.exists = any(contact.friction is not None for contact in contacts)
+        self.rest: Array | None = None
+
+    def slip(self, search: ContactSearch) -> Array:
+        """Tangential v_i of all conditions where the load step begins, shape ``(n, gdim - 1)``."""
+        records = search.records
+        if self.rest is None:
+            return np.zeros(records.tangents.shape[:2])
+        return slips(records, self._dofs, self.rest)
+
+    def has_changed(self, search: ContactSearch) -> bool:
+        """Whether laws say something else than when the limits were last set.
+
+        Raises:
+            InputError: A value is negative or no number somewhere.
+        """
+        if not self.exists or self._known is None:
+            return False
+        return any_rank(self._dofs.comm, not np.array_equal(search.friction(), self._known))
+
+    def set_limits(self, gluing: Gluing, search: ContactSearch) -> None:
+        """Fill the ψ_i of the rows, and the μ_i under Coulomb's law.
+
+        Raises:
+            InputError: A value is negative or no number somewhere.
+        """
+        if not self.exists:
+            return
+        contacts = search.contacts
+        surfaces = [contact.surfaces[0] for contact in contacts]
+        of, thickness = self._decomposition, self._thickness
+        area = condition_areas(gluing.records, self._dofs, of, surfaces, thickness)
+        self._known = search.friction()
+        gluing.constraints.set_limits(gluing.tangents.limits(self._known, area))
+        gluing.constraints.coefficients[:] = gluing.tangents.coefficients(self._known)
+
+
+# --- From forms to the dual problem, in stages that are kept until their input changes --------
 
 
 class System:
@@ -69,7 +210,7 @@ class System:
         self.forms, self.bcs, self._contacts = forms, bcs, contacts
         self._dofs, self._decomposition, self._settings = dofs, decomposition, settings
         self.friction = FrictionBounds(contacts, dofs, decomposition, forms.thickness)
-        self.replaced = Replaced(boundary, dofs, decomposition)
+        self.replaced = BoundaryElementAssembly(boundary, dofs, decomposition)
         self.spectrum: dict[str, float] = {}
         self._stiffening = Stiffening(settings.options.penalty, dofs)
         self._stages, self._counters, self._counted = Stages(), Counters(), 0

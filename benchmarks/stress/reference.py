@@ -26,7 +26,7 @@ from benchmarks.stress.scene import Scene, Side
 from benchmarks.stress.sliding import Law, solve_sliding
 from benchmarks.stress.sliding_digits import SlidingInDigits, without_motions
 from benchmarks.stress.solve import DEPENDENT, EPSILON, null_space, solve, verdict
-from tfeti_dolfinx.compat import geometry_dofmap
+from tfeti_dolfinx.common.compat import geometry_dofmap
 
 SMALLEST = 1e-9  # of the largest displacement of all bodies: what a body has at least
 NO_WORK = 1e-13  # of all loads: rounding

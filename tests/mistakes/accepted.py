@@ -7,7 +7,7 @@ from dolfinx import mesh as dmesh
 from scenes import hooke
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.mesh.entities import cell_facets
+from tfeti_dolfinx.mesh.untorn import cell_facets
 
 
 def solved(s, **changes):

@@ -4,7 +4,7 @@ import numpy as np
 
 from mistakes.scene import raising
 from tfeti_dolfinx import Extensions
-from tfeti_dolfinx.qp.feasible_sets import Bounds
+from tfeti_dolfinx.qp.sets import Bounds
 from tfeti_dolfinx.subdomains.block import BlockDefaults
 
 

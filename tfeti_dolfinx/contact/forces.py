@@ -9,7 +9,7 @@ import numpy as np
 from dolfinx.fem.petsc import interpolation_matrix
 from mpi4py import MPI
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs

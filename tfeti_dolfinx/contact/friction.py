@@ -10,12 +10,12 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from tfeti_dolfinx.arrays import Array, ArrayLike
-from tfeti_dolfinx.checks import Range, checked_number, checked_type, shown
+from tfeti_dolfinx.common.arrays import Array, ArrayLike
+from tfeti_dolfinx.common.validation import Range, checked_number, checked_type, shown
 from tfeti_dolfinx.contact.records import ContactRecords, Friction
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.frames import aligned
+from tfeti_dolfinx.mortar.segments import aligned
 from tfeti_dolfinx.mortar.surfaces import group_points
 
 Value: TypeAlias = "float | Callable[[Array], ArrayLike] | fem.Function"

@@ -6,28 +6,31 @@ from dataclasses import KW_ONLY, dataclass, replace
 
 import numpy as np
 
-from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.contact.arguments import Gap, checked_gap, checked_reach, give_name
-from tfeti_dolfinx.contact.conditions import Shares, conditions, triplets
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.contact.conditions import Shares, Side, conditions, triplets
 from tfeti_dolfinx.contact.friction import Law, checked_friction, with_friction
-from tfeti_dolfinx.contact.gaps import gaps_of
-from tfeti_dolfinx.contact.records import ContactRecords
-from tfeti_dolfinx.contact.shape_checks import check_placement, check_shape, distance_and_gradient
-from tfeti_dolfinx.contact.shapes import Shape
-from tfeti_dolfinx.contact.sides import Side
+from tfeti_dolfinx.contact.records import (
+    ContactRecords,
+    Gap,
+    checked_gap,
+    checked_reach,
+    gaps_of,
+    give_name,
+)
+from tfeti_dolfinx.contact.shapes import Shape, check_placement, check_shape, distance_and_gradient
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.facet_maps import hat_areas, whole_facets
-from tfeti_dolfinx.mortar.facets import FacetKind, Facets, facet_kind, local_facets
-from tfeti_dolfinx.mortar.integrals import GapIntegrals, dual_multipliers
-from tfeti_dolfinx.mortar.surfaces import (
-    diameter,
-    extent,
-    group_points,
-    on_surface,
-    surface_facets,
+from tfeti_dolfinx.mortar.facets import (
+    FacetKind,
+    Facets,
+    facet_kind,
+    hat_areas,
+    local_facets,
+    whole_facets,
 )
+from tfeti_dolfinx.mortar.integrals import GapIntegrals, dual_multipliers
+from tfeti_dolfinx.mortar.surfaces import diameter, extent, group_points, on_surface, surface_facets
 
 # times the displacement's degree: exact for ψ_i φ_k on plane facets, and enough on curved ones
 QUADRATURE = 4

@@ -8,24 +8,22 @@ from dataclasses import KW_ONLY, dataclass, replace
 import numpy as np
 from mpi4py import MPI
 
-from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.citations import cite
-from tfeti_dolfinx.contact.arguments import Gap, checked_gap, checked_reach, give_name
-from tfeti_dolfinx.contact.conditions import conditions
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.logging import cite
+from tfeti_dolfinx.contact.conditions import Side, conditions, meeting, ratios, side_of
 from tfeti_dolfinx.contact.friction import Law, checked_friction, with_friction
-from tfeti_dolfinx.contact.gaps import gaps_of
-from tfeti_dolfinx.contact.meeting import meeting
-from tfeti_dolfinx.contact.records import ContactRecords
-from tfeti_dolfinx.contact.sides import Side, ratios, side_of
+from tfeti_dolfinx.contact.records import (
+    ContactRecords,
+    Gap,
+    checked_gap,
+    checked_reach,
+    gaps_of,
+    give_name,
+)
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.surfaces import (
-    diameter,
-    extent,
-    surface_facets,
-    surface_nodes,
-)
+from tfeti_dolfinx.mortar.surfaces import diameter, extent, surface_facets, surface_nodes
 
 # ratio of stiffness per area from which on a finer side that is secondary shows in the pressure
 MUCH_WORSE = 2.0

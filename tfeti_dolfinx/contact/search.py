@@ -1,22 +1,134 @@
-"""All contacts of a problem: their conditions, which of them have rows, and what comes later."""
+"""Obstacles and pairs that a user names, and the search for what meets."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import Protocol
 
 import numpy as np
 
-from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.contact.arguments import Gap
-from tfeti_dolfinx.contact.friction import friction_values
-from tfeti_dolfinx.contact.partners import ContactPartner, check_laws, check_pairs
-from tfeti_dolfinx.contact.records import ContactRecords, concatenate, remaining_gaps
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.parallel import bcast_from_root
+from tfeti_dolfinx.common.validation import shown
+from tfeti_dolfinx.contact.friction import Law, friction_values, same_law
+from tfeti_dolfinx.contact.records import ContactRecords, Gap, concatenate, remaining_gaps
+from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import diameter
-from tfeti_dolfinx.parallel import agreed
+
+# --- What every contact can do, and checks of the list of them --------------------------------
+
+
+class ContactPartner(Protocol):
+    """An obstacle, or a pair of surfaces. All methods are collective."""
+
+    @property
+    def name(self) -> str:
+        """Name for messages."""
+        ...
+
+    @property
+    def surfaces(self) -> tuple[str | int, ...]:
+        """Names or tags of the surfaces, that with the multipliers first."""
+        ...
+
+    @property
+    def gap(self) -> Gap:
+        """What its gaps are: those of the geometry, or given."""
+        ...
+
+    @property
+    def friction(self) -> Law | None:
+        """Its law of friction."""
+        ...
+
+    def first_reach(self, decomposition: Decomposition) -> float:
+        """Distance up to which conditions have rows at first."""
+        ...
+
+    def horizon(self, length: float) -> float:
+        """Reach beyond which no search finds more conditions, in a scene of a length."""
+        ...
+
+    def settled(
+        self,
+        dofs: TornDofs,
+        decomposition: Decomposition,
+        contact: int,
+        reach: float,
+        stiffness: Array,
+    ) -> tuple[ContactPartner, ContactRecords]:
+        """The contact with its sides decided from the stiffness, and its conditions."""
+        ...
+
+    def displacement_bound(self, dofs: TornDofs, decomposition: Decomposition, u: Array) -> float:
+        """How far what lay beyond the reach may have come nearer, u of shape (nodes, bs)."""
+        ...
+
+    def records(
+        self,
+        dofs: TornDofs,
+        decomposition: Decomposition,
+        contact: int,
+        reach: float,
+        depth: float,
+    ) -> ContactRecords:
+        """Conditions up to a distance and beyond, and down to a depth of initial overlap."""
+        ...
+
+    def with_gap(self, gap: Gap) -> ContactPartner:
+        """The same contact with another gap."""
+        ...
+
+    def gaps(self, dofs: TornDofs, records: ContactRecords, depth: float) -> Array:
+        """Gaps of conditions that were made with another gap: no search, no integral."""
+        ...
+
+
+def checked_contacts(contacts: Sequence[ContactPartner]) -> list[ContactPartner]:
+    """The contacts as a list.
+
+    Raises:
+        InputError: They are not a sequence of obstacles and pairs.
+    """
+    if not isinstance(contacts, Sequence):
+        raise InputError(f"contacts: expected a list, got {shown(contacts)}")
+    for contact in contacts:
+        known = all(hasattr(contact, name) for name in ("records", "surfaces", "first_reach"))
+        if isinstance(contact, type) or not known:
+            raise InputError(f"contacts: expected obstacles and pairs, got {shown(contact)}")
+    return list(contacts)
+
+
+def check_pairs(contacts: Sequence[ContactPartner], decomposition: Decomposition) -> None:
+    """Raise if a pair is there twice: its force would be shared between the two."""
+    pairs = set()
+    for contact in contacts:
+        tags = frozenset(decomposition.surface(name) for name in contact.surfaces)
+        if len(tags) == 2 and tags in pairs:
+            raise InputError(f"contacts: the pair of {contact.surfaces} is there twice")
+        pairs.add(tags)
+
+
+def check_laws(contacts: Sequence[ContactPartner], decomposition: Decomposition) -> None:
+    """Raise if a surface that meets several obstacles slides on them by different laws."""
+    found: dict[int, ContactPartner] = {}
+    for contact in contacts:
+        if len(contact.surfaces) > 1 or contact.friction is None:
+            continue
+        first = found.setdefault(decomposition.surface(contact.surfaces[0]), contact)
+        if first.friction is not None and not same_law(first.friction, contact.friction):
+            raise InputError(
+                f"{contact.name}: the same surface has another law of friction in {first.name}; "
+                "expected one law for a surface, or surfaces of their own"
+            )
+
+
+# --- All contacts of a problem: their conditions, which of them have rows, and what comes
+#     later ---
 
 # How much farther one looks for what may hold a body: few rounds, each a search and a solve, up to
 # the length of the scene; of that at least, since a small surface's reach may be as good as none.
@@ -54,9 +166,9 @@ class ContactSearch:
         stiffness: Array,
     ) -> None:
         self._dofs, self._decomposition = dofs, decomposition
-        self.length = agreed(dofs.comm, diameter(decomposition))
+        self.length = bcast_from_root(dofs.comm, diameter(decomposition))
         reach = [contact.first_reach(decomposition) for contact in contacts]
-        self._depths = agreed(dofs.comm, reach)
+        self._depths = bcast_from_root(dofs.comm, reach)
         self._reach, self._said = list(self._depths), list[str]()
         check_pairs(contacts, decomposition)
         check_laws(contacts, decomposition)
@@ -140,7 +252,7 @@ class ContactSearch:
         known = found = self._records[i]
         nodal = u.reshape(-1, self._dofs.bs)
         bound = self.contacts[i].displacement_bound(self._dofs, self._decomposition, nodal)
-        moved = agreed(self._dofs.comm, bound)
+        moved = bcast_from_root(self._dofs.comm, bound)
         if moved > self._reach[i]:
             found = self._with_rows_of(self._search(i, moved), known)
         overlaps, new = self._overlapping(found, u, tolerance)

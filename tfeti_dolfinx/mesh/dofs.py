@@ -1,21 +1,136 @@
-"""The one home of every dof map: DOLFINx's numbering, the subdomains', and the groups of copies."""
+"""Unknowns of the torn mesh: spaces, copies of nodes, their groups."""
 
 from __future__ import annotations
 
 from functools import cached_property
 from typing import Any
 
+import basix
 import numpy as np
 from dolfinx import fem
 from mpi4py import MPI
 
-from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.compat import first_component
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.compat import first_component, geometry_dofmap
+from tfeti_dolfinx.common.parallel import Exchange, chunk_offsets, owner_of
+from tfeti_dolfinx.common.validation import checked_type
+from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
-from tfeti_dolfinx.mesh.entities import mix
-from tfeti_dolfinx.mesh.node_keys import lowest_owners, node_keys
-from tfeti_dolfinx.mesh.spaces import check_space
-from tfeti_dolfinx.parallel import Exchange, chunk_offsets, owner_of
+from tfeti_dolfinx.mesh.untorn import cell_entities, mix, set_key
+
+# --- Which function spaces fit a torn mesh, and which are the same ----------------------------
+
+
+def check_space(V: fem.FunctionSpace, decomposition: Decomposition) -> None:
+    """Raise unless V is a space for displacements on the torn mesh.
+
+    Raises:
+        InputError: It is on another mesh, not continuous, not Lagrange, or neither scalar nor
+            of one component for each dimension.
+    """
+    checked_type(V, fem.FunctionSpace, "the space", "a dolfinx.fem.FunctionSpace")
+    if V.mesh is not decomposition.mesh:
+        raise InputError(
+            "the space is on another mesh (the one before decompose?); expected it on "
+            "decomposition.mesh, the torn mesh"
+        )
+    try:
+        element = V.element.basix_element
+    except RuntimeError as error:
+        raise InputError("mixed spaces are not supported, expected a Lagrange space") from error
+    if element.family != basix.ElementFamily.P or element.discontinuous or element.degree < 1:
+        raise InputError(
+            f"space {V.ufl_element()}: expected a continuous Lagrange space of degree 1 or more"
+        )
+    shape, gdim = tuple(V.ufl_element().reference_value_shape), V.mesh.geometry.dim
+    if shape not in ((), (gdim,)):
+        raise InputError(
+            f"the space has values of shape {shape}; expected displacements of {gdim} components "
+            f"in {gdim}D, shape ({gdim},), or a scalar space"
+        )
+
+
+def is_same_space(V: Any, W: Any) -> bool:
+    """Whether two C++ spaces are the same on this rank: mesh, element and numbering."""
+    if V is W:
+        return True
+    return bool(
+        V.mesh is W.mesh
+        and V.element == W.element
+        and V.dofmap.bs == W.dofmap.bs
+        and np.array_equal(V.dofmap.map(), W.dofmap.map())
+    )
+
+
+def component_of(V: fem.FunctionSpace, component: list[int]) -> Any:
+    """C++ space of a component of V; None if it has no such component."""
+    space = V._cpp_object
+    if len(component) > 1 or any(not 0 <= i < V.num_sub_spaces for i in component):
+        return None
+    return space.sub(component) if component else space
+
+
+def described(V: Any) -> str:
+    """A C++ space for messages."""
+    try:
+        degree = V.element.basix_element.degree
+    except RuntimeError:
+        return "a mixed space"
+    kind = "a component of a space" if V.component() else "a space"
+    return f"{kind} of degree {degree} with {V.dofmap.index_map_bs} unknowns per node"
+
+
+# --- What all torn copies of a node have in common: a key, and the rank of the lowest
+#     subdomain ---
+
+
+def lowest_owners(comm: MPI.Intracomm, key: Array, subdomain: Array) -> Array:
+    """For each key the rank that sends it with the lowest subdomain. Collective."""
+    exchange = Exchange(comm, (key % np.uint64(comm.size)).astype(np.int64))
+    key, subdomain = exchange.send(key), exchange.send(subdomain)
+    order = np.lexsort((subdomain, key))
+    _, start, inverse = np.unique(key[order], return_index=True, return_inverse=True)
+    owner = np.empty(len(key), dtype=np.int64)
+    owner[order] = exchange.source[order][start][inverse]
+    return exchange.answer(owner)
+
+
+def node_keys(V: fem.FunctionSpace, decomposition: Decomposition) -> tuple[Array, Array]:
+    """For each DOLFINx node its lowest original vertex, and a key that all copies share.
+
+    The key comes from the vertices of the mesh entity that the node belongs to; where an entity
+    has several nodes, their relative distances to its vertices tell them apart.
+    """
+    mesh = V.mesh
+    cell_type = mesh.topology.cell_type
+    geometry = geometry_dofmap(mesh)[:, : len(cell_entities(cell_type, 0))]
+    ids = decomposition.original_nodes[geometry]
+    dofs = np.asarray(V.dofmap.list)
+    origin = np.empty(V.dofmap.index_map.size_local, dtype=np.int64)
+    key = np.empty(len(origin), dtype=np.uint64)
+    for dim, entity_dofs in enumerate(V.element.basix_element.entity_dofs):
+        for vertices, entity in zip(cell_entities(cell_type, dim), entity_dofs, strict=True):
+            for j in entity:
+                nodes = dofs[:, j]
+                origin[nodes] = ids[:, vertices].min(axis=1)
+                key[nodes] = set_key(ids[:, vertices])
+                if len(entity) > 1:
+                    corners = mesh.geometry.x[geometry[:, vertices]]
+                    key[nodes] += _place(V, nodes, corners, ids[:, vertices])
+    return origin, key
+
+
+def _place(V: fem.FunctionSpace, nodes: Array, corners: Array, ids: Array) -> Array:
+    """Key of a node's place within an entity: its relative distances to the sorted vertices."""
+    x = V.tabulate_dof_coordinates()[nodes]
+    distance = np.linalg.norm(corners - x[:, None], axis=2)
+    distance = np.take_along_axis(distance, np.argsort(ids, axis=1), axis=1)
+    share = np.rint(1e6 * distance / distance.sum(axis=1, keepdims=True))
+    return mix((share * (1 + np.arange(share.shape[1]))).sum(axis=1).astype(np.uint64))
+
+
+# --- The one home of every dof map: DOLFINx's numbering, the subdomains', and the groups of
+#     copies ---
 
 
 class TornDofs:

@@ -7,23 +7,21 @@ from dataclasses import replace
 import numpy as np
 from dolfinx import mesh as dmesh
 
-from tfeti_dolfinx.agreement import agreeing
-from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.checks import checked_type, is_whole
-from tfeti_dolfinx.compat import geometry_dofmap, original_cells
+from tfeti_dolfinx.common.agreement import agreeing
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.compat import geometry_dofmap, original_cells
+from tfeti_dolfinx.common.logging import stage
+from tfeti_dolfinx.common.validation import checked_type, is_whole
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.mesh.decomposition import Decomposition
-from tfeti_dolfinx.mesh.entities import NO_TAG, cell_facets
+from tfeti_dolfinx.mesh.decomposition import Decomposition, check_tags, checked_names
 from tfeti_dolfinx.mesh.partition import (
     Subdomains,
     assign_subdomains,
     coordinate_bisection,
     default_count,
 )
-from tfeti_dolfinx.mesh.tags import check_tags, checked_names
 from tfeti_dolfinx.mesh.tearing import tear
-from tfeti_dolfinx.mesh.untorn import PhysicalNames, UntornMesh
-from tfeti_dolfinx.timing import stage
+from tfeti_dolfinx.mesh.untorn import NO_TAG, PhysicalNames, UntornMesh, cell_facets
 
 CELL_TYPES = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
 

@@ -1,4 +1,4 @@
-"""METIS parts of a mesh that lies on one rank, made round."""
+"""Parts by METIS, made round by balanced k-means and smooth interfaces."""
 
 from __future__ import annotations
 
@@ -6,16 +6,198 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array, eye_array
 from scipy.sparse.csgraph import connected_components
 
-from tfeti_dolfinx.arrays import TINY, Array
+from tfeti_dolfinx.common.arrays import TINY, Array
+from tfeti_dolfinx.common.parallel import box_over_ranks, summed
 from tfeti_dolfinx.errors import raised_on_all_ranks
-from tfeti_dolfinx.mesh.compact import compact_parts
-from tfeti_dolfinx.mesh.flatten import flatten_interfaces
-from tfeti_dolfinx.mesh.partition import without_holes
-from tfeti_dolfinx.mesh.pieces import absorb_fragments
-from tfeti_dolfinx.mesh.untorn import UntornMesh
+from tfeti_dolfinx.mesh.partition import absorb_fragments, without_holes
+from tfeti_dolfinx.mesh.untorn import UntornMesh, mix
+
+# --- Parts of round shape and equal size, made from parts of any shape ------------------------
+
+# points on a grid of so many bits: their sums and squares are exact, so no order decides
+BITS = 24
+# of each part so many points find centres and influences: rounds in which centres stay, in which
+# they go a part of the way to the means, and stay again; then rounds with all points
+SAMPLE, HELD, MOVING, LAST, ALL, WAY = 300, 20, 30, 10, 4, 0.5
+# an influence grows or shrinks by so much in a round at most
+STEP = 1.1
+# parts that a point may join in a round: those nearest to its own
+NEAREST = 24
+# of the mean number of points, or of the longest part given: with a larger or longer part than that
+# parts stay as they were given; so they do with fewer points in the mean
+LARGEST, LONGER, FEWEST = 1.1, 1.5, 20
+
+
+def compact_parts(
+    x: Array, measure: Array, ids: Array, part: Array, num_parts: int, comm: MPI.Intracomm
+) -> Array:
+    """Balanced k-means, begun at given parts. Collective.
+
+    A point is in the part with the least ‖x − c_k‖/w_k, the centre c_k being the mean of the
+    part, and the influence w_k what gives all parts the same number of points, so that parts are
+    round where a mesh is graded, too (von Looz, Tzovas, Meyerhenke, ICPP 2018,
+    doi:10.1145/3225058.3225148). The result does not depend on how ranks share the points.
+
+    Args:
+        x: Midpoints of this rank's cells, shape ``(n, gdim)``.
+        measure: Their volumes, up to a factor, shape ``(n,)``.
+        ids: Their ids, shape ``(n,)``.
+        part: Their parts, shape ``(n,)``; none is empty.
+        num_parts: Number of parts.
+        comm: Communicator.
+
+    Returns:
+        New parts, shape ``(n,)``; the given ones where these are small, or where the new ones are
+        not balanced, or one of them is far longer.
+    """
+    total = comm.allreduce(len(x))
+    if num_parts == 1 or total < FEWEST * num_parts:
+        return part
+    grid = _on_grid(x, comm)
+    some = mix(ids) % np.uint64(max(total // (SAMPLE * num_parts), 1)) == 0
+    y, own = grid[some], part[some]
+    centre = _means(y, own, np.zeros((num_parts, x.shape[1])), comm)
+    influence = _radii(y, own, centre, np.ones(len(y)), comm)[0]
+    for k in range(HELD + MOVING + LAST + ALL):
+        if k == HELD + MOVING + LAST:
+            y, own = grid, _nearest(grid, part, centre, influence)
+        if HELD <= k < HELD + MOVING:
+            centre += np.rint(WAY * (_means(y, own, centre, comm) - centre))
+        size = _sizes(own, num_parts, comm)
+        wanted = (size.sum() / num_parts / np.maximum(size, 1.0)) ** (1.0 / x.shape[1])
+        influence *= np.clip(wanted, 1.0 / STEP, STEP)
+        own = _nearest(y, own, centre, influence)
+    size = _sizes(own, num_parts, comm)
+    if size.max() > LARGEST * total / num_parts or size.min() == 0.0:
+        return part
+    longest = [_length(grid, which, measure, num_parts, comm) for which in (part, own)]
+    return own if longest[1] <= LONGER * longest[0] else part
+
+
+def _on_grid(x: Array, comm: MPI.Intracomm) -> Array:
+    """Coordinates as whole numbers, on a grid over the box of all points."""
+    low, high = box_over_ranks(comm, x)
+    return np.rint((x - low) * ((2.0**BITS - 1.0) / max(np.max(high - low), 1e-300)))
+
+
+def _sizes(part: Array, num_parts: int, comm: MPI.Intracomm) -> Array:
+    """Number of points of each part."""
+    return summed(comm, np.bincount(part, minlength=num_parts).astype(np.float64))
+
+
+def _means(x: Array, part: Array, before: Array, comm: MPI.Intracomm) -> Array:
+    """Means of the parts, as whole numbers; what has no point stays where it was."""
+    num_parts = len(before)
+    size = _sizes(part, num_parts, comm)[:, None]
+    sums = np.zeros(before.shape)
+    for k, column in enumerate(x.T):
+        sums[:, k] = np.bincount(part, weights=column, minlength=num_parts)
+    means = np.rint(summed(comm, sums) / np.maximum(size, 1.0))
+    return np.where(size > 0.0, means, before)
+
+
+def _radii(
+    x: Array, part: Array, centre: Array, measure: Array, comm: MPI.Intracomm
+) -> tuple[Array, Array]:
+    """Radii of gyration of the parts, at least 1, and their measures."""
+    squares, sums = measure * np.sum((x - centre[part]) ** 2, axis=1), np.zeros((2, len(centre)))
+    for k, weights in enumerate((squares, measure)):
+        sums[k] = np.bincount(part, weights=weights, minlength=len(centre))
+    squared, volume = summed(comm, sums)
+    return np.sqrt(np.maximum(squared / np.maximum(volume, 1e-300), 1.0)), volume
+
+
+def _length(x: Array, part: Array, measure: Array, num_parts: int, comm: MPI.Intracomm) -> float:
+    """The largest ratio of a part's radius of gyration to the size that its measure gives it."""
+    centre = _means(x, part, np.zeros((num_parts, x.shape[1])), comm)
+    radius, volume = _radii(x, part, centre, measure, comm)
+    return float(np.max(radius ** x.shape[1] / volume))
+
+
+def _nearest(x: Array, part: Array, centre: Array, influence: Array) -> Array:
+    """The part with the least ‖x − c‖/w among those near the present one."""
+    apart = np.linalg.norm(centre[:, None] - centre, axis=2) / (influence[:, None] + influence)
+    near = np.argsort(apart, axis=1, kind="stable")[:, :NEAREST]
+    order = np.argsort(part, kind="stable")
+    start = np.searchsorted(part[order], np.arange(len(centre) + 1))
+    found = part.copy()
+    for k in range(len(centre)):
+        own, joined = order[start[k] : start[k + 1]], near[k]
+        y, c = x[own] - centre[k], centre[joined] - centre[k]
+        squares = np.sum(y**2, axis=1)[:, None] - 2.0 * (y @ c.T) + np.sum(c**2, axis=1)
+        found[own] = joined[np.argmin(squares / influence[joined] ** 2, axis=1)]
+    return found
+
+
+# --- Flat interfaces of parts: cells join the part that surrounds them ------------------------
+
+# rounds in which cells change sides, half of those that want to
+ROUNDS = 10
+# what a facet counts beside a vertex that two cells share
+FACET = 12.0
+# of the mean number of cells: what no part gains, or loses, any more
+LARGEST_PART, SMALLEST = 1.08, 0.93
+
+
+def flatten_interfaces(mesh: UntornMesh, pairs: tuple[Array, Array], part: Array) -> Array:
+    """Let cells join a neighbour's part that has more of what is around them.
+
+    Of each part count the cells that share a vertex with a cell, once for each such vertex, and
+    those that share a facet with it twelve times more. A cell that counts more of a neighbour's
+    part than of its own joins it, which takes off what sticks out of an interface.
+
+    Args:
+        mesh: A mesh that lies on this rank.
+        pairs: Its neighbours.
+        part: Part of each cell, shape ``(n,)``.
+
+    Returns:
+        New parts, shape ``(n,)``; some may no longer be connected through facets.
+    """
+    n, k, num_parts = len(part), mesh.num_vertices, int(part.max(initial=-1)) + 1
+    if num_parts < 2:
+        return part
+    vertices = np.searchsorted(mesh.node_ids, mesh.cells[:, :k])
+    start = np.arange(0, n * k + 1, k)
+    shape = (n, len(mesh.node_ids))
+    around = csr_array((np.ones(n * k), vertices.ravel(), start), shape=shape)
+    faces = coo_array((np.ones(len(pairs[0])), pairs), shape=(n, n)).tocsr()
+    beside = csr_array(faces + faces.T + eye_array(n, format="csr"))
+    part = part.copy()
+    for turn in range(ROUNDS):
+        flags = csr_array((np.ones(n), part, np.arange(n + 1)), shape=(n, num_parts))
+        met = csr_array(around.T @ flags)
+        between = (np.diff(met.indptr) > 1).astype(float)
+        near = np.flatnonzero(around @ between)
+        facets = csr_array(beside[near] @ flags)
+        counted = (around[near] @ met).multiply(facets > 0) + FACET * (facets - flags[near])
+        best, most = _largest(csr_array(counted))
+        own = np.asarray(csr_array(counted)[np.arange(len(near)), part[near]]).ravel()
+        lot = mix(mesh.cell_ids[near].astype(np.uint64) + np.uint64(turn) * np.uint64(2**40)) & 1
+        moving = (most > own) & (lot == 0)
+        if not np.any(most > own):
+            break
+        size = np.bincount(part, minlength=num_parts) * (num_parts / n)
+        moving &= (size[best] < LARGEST_PART) & (size[part[near]] > SMALLEST)
+        part[near[moving]] = best[moving]
+    return part
+
+
+def _largest(table: csr_array) -> tuple[Array, Array]:
+    """Column and value of each row's largest entry; of equal ones the first. No row is empty."""
+    if table.shape[0] == 0:
+        return np.zeros(0, dtype=np.int64), np.zeros(0)
+    table.sort_indices()
+    most = np.maximum.reduceat(table.data, table.indptr[:-1])
+    other = table.data < np.repeat(most, np.diff(table.indptr))
+    columns = np.where(other, table.shape[1], table.indices)
+    return np.minimum.reduceat(columns, table.indptr[:-1]).astype(np.int64), most
+
+
+# --- METIS parts of a mesh that lies on one rank, made round ----------------------------------
 
 # of the facets that METIS cuts in a body: parts that cut more are not taken; those of boxes less
 # readily, since what is not cut along their layers is a staircase

@@ -1,17 +1,296 @@
-"""Which subdomain a cell belongs to."""
+"""Parts of a mesh: by bisection or as given, each connected."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from mpi4py import MPI
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from tfeti_dolfinx.arrays import Array, ArrayLike
-from tfeti_dolfinx.checks import is_whole, named, shown
+from tfeti_dolfinx.common.arrays import Array, ArrayLike
+from tfeti_dolfinx.common.parallel import Exchange, box_over_ranks
+from tfeti_dolfinx.common.validation import is_whole, named, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.mesh.bisection import bisect_points
-from tfeti_dolfinx.mesh.untorn import UntornMesh
+from tfeti_dolfinx.mesh.untorn import UntornMesh, equal_pairs, facet_keys
+
+# --- Recursive coordinate bisection of distributed points, or of cells along their layers -----
+
+# of the mean extent of a part's cells: midpoints that are farther apart are of different layers;
+# those of the simplices that a box is cut into are a third of it apart at most
+APART = 0.4
+# of that: midpoints that are nearer to each other count as one; so many different ones a layer has
+# at most, else there are no layers
+ONE, MOST = 0.25, 6
+# of the cells of one part, but at least one: a cut moves by so many at most to lie between layers,
+# or columns, in a part with a cell that is so many times as long as thick
+MOVED, FLAT = 0.25, 3.0
+
+
+class _Halves(NamedTuple):
+    """How parts are to be halved, shapes ``(p,)``.
+
+    Attributes:
+        wanted: Number of points on the left.
+        may: By how many points that may change.
+        axes: The axes, the one that is cut across first, then those that ties are broken by, shape
+            ``(p, gdim)``.
+        gap: Distance of layers along these axes, shape ``(p, gdim)``; -1 in parts without flat
+            cells; None if there are none at all.
+    """
+
+    wanted: Array
+    may: Array
+    axes: Array
+    gap: Array | None
+
+
+def bisect_points(
+    x: Array, num_parts: int, comm: MPI.Intracomm, extents: Array | None = None
+) -> Array:
+    """Recursive coordinate bisection of distributed points (Berger, Bokhari 1987). Collective.
+
+    All parts are halved at once, across the longest side of their box; neighbouring part
+    numbers are neighbours in space.
+
+    Args:
+        x: Points of this rank, shape ``(n, gdim)``.
+        num_parts: Number of parts.
+        comm: Communicator.
+        extents: Of the cells whose midpoints they are, shape ``(n, gdim)``. Where some are flat
+            cuts lie between layers of cells, or at least between columns along the axis in which
+            they are flat, if few cells change sides by that: ragged interfaces cut what holds most.
+
+    Returns:
+        Part of each local point, shape ``(n,)``.
+    """
+    grid, sizes = _on_grid(x, extents, comm)
+    part = np.zeros(len(x), dtype=np.int64)
+    targets = np.array([num_parts])
+    while np.any(targets > 1):
+        left = np.where(targets > 1, targets // 2, targets)
+        after = _after(grid, part, _halves(grid, sizes, part, (targets, left), comm), comm)
+        halves = np.where(targets > 1, 2, 1)
+        first = np.cumsum(halves) - halves
+        part = first[part] + (after & (targets[part] > 1))
+        targets = np.repeat(targets, halves)
+        targets[first] = left
+        second = first[halves == 2] + 1
+        targets[second] -= left[halves == 2]
+    return part
+
+
+def _on_grid(x: Array, extents: Array | None, comm: MPI.Intracomm) -> tuple[Array, Array | None]:
+    """Coordinates, and extents, as integers on a grid over the box of all points."""
+    low, high = box_over_ranks(comm, x)
+    size, last = max(np.max(high - low), 1e-300), 2.0 ** (62 // x.shape[1]) - 1
+    grid = np.rint((x - low) / size * last).astype(np.int64)
+    if extents is None:
+        return grid, None
+    return grid, np.rint(np.minimum(extents / size, 1.0) * last).astype(np.int64)
+
+
+def _halves(
+    grid: Array, sizes: Array | None, part: Array, targets: tuple[Array, Array], comm: MPI.Intracomm
+) -> _Halves:
+    """How parts are halved; targets: how many parts become of each, and of its left half."""
+    (whole, left), gdim = targets, grid.shape[1]
+    num_parts = len(whole)
+    low = np.full((num_parts, gdim), np.iinfo(np.int64).max)
+    high = np.full((num_parts, gdim), -1)
+    np.minimum.at(low, part, grid)
+    np.maximum.at(high, part, grid)
+    comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
+    comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
+    count, gap = _count(part, num_parts, comm), None
+    axes = (np.argmax(high - low, axis=1)[:, None] + np.arange(gdim)) % gdim
+    if sizes is not None:
+        total = np.zeros((2, num_parts, gdim), dtype=np.int64)
+        np.add.at(total[0], part, sizes)
+        largest = np.maximum(sizes.max(axis=1, initial=1)[:, None], 1)
+        np.add.at(total[1], part, (sizes << 10) // largest)
+        comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
+        flat = np.zeros(num_parts, dtype=np.int64)
+        np.maximum.at(flat, part, np.any(FLAT * sizes <= largest, axis=1))
+        comm.Allreduce(MPI.IN_PLACE, flat, op=MPI.MAX)
+        thick = np.take_along_axis(total[1], axes, axis=1)
+        if gdim == 3:
+            turned = (flat > 0) & (thick[:, 1] < thick[:, 2])
+            axes[turned] = axes[turned][:, [0, 2, 1]]
+        mean = np.take_along_axis(total[0], axes, axis=1) / np.maximum(count, 1)[:, None]
+        gap = np.where(flat[:, None] > 0, (APART * mean).astype(np.int64), -1)
+    wanted = np.rint(count * left / whole)
+    spare = np.minimum(wanted - left, (count - wanted) - (whole - left))  # a point for each part
+    may = np.minimum(np.maximum(MOVED * count / whole, 1.0), spare)
+    return _Halves(wanted, may, axes, gap)
+
+
+def _after(grid: Array, part: Array, halves: _Halves, comm: MPI.Intracomm) -> Array:
+    """Whether points come after the cut of their part."""
+    num_parts, gdim = halves.axes.shape
+    digits = np.take_along_axis(grid, halves.axes[part], axis=1)
+    result, before = np.zeros(len(grid), dtype=bool), np.zeros(num_parts, dtype=np.int64)
+    inside = np.arange(len(grid))  # points of layers that cuts go through
+    for k in range(gdim):
+        own, c, bits = part[inside], digits[inside, k], 62 // gdim
+        key = np.zeros(len(own), dtype=np.int64)
+        for others in range(k, gdim):
+            key = (key << bits) | digits[inside, others]
+        kth = _kth_smallest(key, own, halves.wanted - before, comm)
+        result[inside] = key > kth[own]
+        if halves.gap is None or k == gdim - 1 or np.all(halves.gap < 0):
+            break
+        at, gap = kth >> (bits * (gdim - 1 - k)), halves.gap[:, k]
+        low, is_low = _end(c, own, at, gap, comm)
+        high, is_high = _end(-c, own, -at, gap, comm)
+        one = (ONE * gap).astype(np.int64)
+        ends = np.stack((low - one - 1, one - high))  # the largest coordinates on the left
+        left = np.stack([before + _count(own, num_parts, comm, c <= end[own]) for end in ends])
+        off = np.where([is_low, is_high], np.abs(left - halves.wanted), np.inf)
+        better, parts = np.argmin(off, axis=0), np.arange(num_parts)
+        moves = (gap >= 0) & (off[better, parts] <= halves.may)
+        result[inside] = np.where(moves[own], c > ends[better, parts][own], result[inside])
+        through = (
+            ((gap >= 0) & is_low & is_high & ~moves)[own] & (c > ends[0][own]) & (c <= ends[1][own])
+        )
+        inside, before = inside[through], left[0]
+    return result
+
+
+def _end(c: Array, part: Array, at: Array, gap: Array, comm: MPI.Intracomm) -> tuple[Array, Array]:
+    """Where layers around ``at`` end below, and whether they do, both of shape ``(p,)``."""
+    end, found, one = at.copy(), np.zeros(len(at), dtype=bool), (ONE * gap).astype(np.int64)
+    near = np.abs(c - at[part]) <= (MOST + 1) * gap[part]
+    c, part = c[near], part[near]
+    for _ in range(MOST):
+        if np.all(found):
+            break
+        beyond = c < (end - one)[part]
+        following = np.full(len(at), np.iinfo(np.int64).min)
+        np.maximum.at(following, part[beyond], c[beyond])
+        comm.Allreduce(MPI.IN_PLACE, following, op=MPI.MAX)
+        found |= following < end - gap
+        end = np.where(found, end, following)
+    return end, found
+
+
+def _count(part: Array, num_parts: int, comm: MPI.Intracomm, chosen: Array | None = None) -> Array:
+    counts = np.bincount(part if chosen is None else part[chosen], minlength=num_parts)
+    comm.Allreduce(MPI.IN_PLACE, counts, op=MPI.SUM)
+    return counts
+
+
+def _kth_smallest(key: Array, part: Array, k: Array, comm: MPI.Intracomm) -> Array:
+    """In each part the k-th smallest key, by bisection on its bits."""
+    low: Array = np.zeros(len(k), dtype=np.int64)
+    high: Array = np.full(len(k), 2**62 - 1)
+    while np.any(low < high):
+        middle = (low + high) // 2
+        enough = _count(part, len(k), comm, key <= middle[part]) >= k
+        high = np.where(enough, middle, high)
+        low = np.where(enough, low, np.minimum(middle + 1, high))
+    return low
+
+
+# --- Facet-connected pieces of subdomains: a subdomain must have only one ---------------------
+
+
+@dataclass(frozen=True)
+class _Pieces:
+    """Pieces of this rank's subdomains.
+
+    Attributes:
+        of_cell: Piece of each cell.
+        subdomain: Subdomain of each piece.
+        is_main: Whether a piece is the largest of its subdomain (ties: lowest cell id).
+        order: The pieces sorted by subdomain, the main one first, then by lowest cell id.
+    """
+
+    of_cell: Array
+    subdomain: Array
+    is_main: Array
+    order: Array
+
+
+def _pieces(mesh: UntornMesh, subdomain: Array) -> _Pieces:
+    n = len(subdomain)
+    first, second = mesh.neighbours(colours=subdomain)
+    graph = coo_array((np.ones(len(first)), (first, second)), shape=(n, n))
+    _, label = connected_components(graph, directed=False)
+    _, start, of_cell, size = np.unique(
+        label, return_index=True, return_inverse=True, return_counts=True
+    )
+    owner = subdomain[start]
+    lowest = np.full(len(start), np.iinfo(np.int64).max)
+    np.minimum.at(lowest, of_cell, mesh.cell_ids)
+    order = np.lexsort((lowest, -size, owner))
+    is_main = np.ones(len(start), dtype=bool)
+    is_main[order[1:]] = owner[order[1:]] != owner[order[:-1]]
+    return _Pieces(of_cell, owner, is_main, order)
+
+
+def split_disconnected(
+    mesh: UntornMesh, subdomain: Array, comm: MPI.Intracomm
+) -> tuple[Array, dict[int, list[int]]]:
+    """Give the pieces of a subdomain ids of their own. Collective.
+
+    The largest piece keeps the id, the others get ids after the last.
+
+    Args:
+        mesh: Cells on the ranks of their subdomains.
+        subdomain: Their subdomains.
+        comm: Communicator.
+
+    Returns:
+        The subdomains after the split, and for each that was split its new ids.
+    """
+    pieces = _pieces(mesh, subdomain)
+    new = pieces.order[~pieces.is_main[pieces.order]]
+    owner = pieces.subdomain[new]
+    total = comm.allreduce(int(subdomain.max(initial=-1)), op=MPI.MAX) + 1
+    everyone = np.sort(np.concatenate(comm.allgather(owner)))
+    ids = pieces.subdomain.copy()
+    ids[new] = total + np.searchsorted(everyone, owner)
+    ids[new] += np.arange(len(new)) - np.searchsorted(owner, owner)
+    split = {int(s): [int(s), *(total + np.flatnonzero(everyone == s)).tolist()] for s in everyone}
+    return ids[pieces.of_cell], split
+
+
+def absorb_fragments(mesh: UntornMesh, subdomain: Array, comm: MPI.Intracomm) -> Array:
+    """Let the smaller pieces of a subdomain join the neighbour they share most facets with.
+
+    Collective. Only main pieces of other subdomains take fragments in; what finds none stays.
+
+    Args:
+        mesh: Cells on the ranks of their subdomains.
+        subdomain: Their subdomains.
+        comm: Communicator.
+
+    Returns:
+        The new subdomains of the cells.
+    """
+    pieces = _pieces(mesh, subdomain)
+    main = pieces.is_main[pieces.of_cell]
+    keys = facet_keys(mesh.cells, mesh.cell_type)
+    exchange = Exchange(comm, (keys.ravel() % np.uint64(comm.size)).astype(np.int64))
+    owner = exchange.send(np.repeat(np.where(main, subdomain, -1), keys.shape[1]))
+    first, second = equal_pairs(exchange.send(keys.ravel()))
+    across = np.full(len(owner), -1)
+    across[first], across[second] = owner[second], owner[first]
+    neighbour = exchange.answer(across).reshape(keys.shape)
+    cell, facet = np.nonzero((neighbour >= 0) & ~main[:, None])
+    joined = pieces.subdomain.copy()
+    contacts = np.stack((pieces.of_cell[cell], neighbour[cell, facet]), axis=1)
+    (pair, count) = np.unique(contacts, axis=0, return_counts=True)
+    best = np.lexsort((-pair[:, 1], count, pair[:, 0]))
+    joined[pair[best, 0]] = pair[best, 1]
+    return joined[pieces.of_cell]
+
+
+# --- Which subdomain a cell belongs to --------------------------------------------------------
 
 Subdomains = int | ArrayLike | Callable[[Array], ArrayLike]
 

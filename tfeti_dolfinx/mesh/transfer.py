@@ -8,11 +8,11 @@ import numpy as np
 from dolfinx import fem, la
 from dolfinx import mesh as dmesh
 
-from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.checks import checked_type
-from tfeti_dolfinx.compat import original_cells
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.compat import original_cells
+from tfeti_dolfinx.common.parallel import Exchange
+from tfeti_dolfinx.common.validation import checked_type
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.parallel import Exchange
 
 
 class CellExchange:

@@ -1,15 +1,85 @@
-"""The untorn mesh as it comes in: cells that lie on any rank, with original node ids."""
+"""Meshes before they are torn: cells, their facets and edges."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import basix
 import numpy as np
 from dolfinx import mesh as dmesh
 
-from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.mesh.entities import cell_entities, equal_pairs, facet_keys
+from tfeti_dolfinx.common.arrays import Array
+
+# --- Keys by which the same facet or node is recognised in different cells, subdomains and
+#     ranks ---
+
+NO_TAG = np.iinfo(np.int32).min
+
+
+def mix(ids: Array) -> Array:
+    """64-bit finaliser of SplitMix64 (Steele, Lea, Flood 2014), elementwise."""
+    z = np.asarray(ids).astype(np.uint64) + np.uint64(0x9E3779B97F4A7C15)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
+
+
+def set_key(ids: Array) -> Array:
+    """Key of a set of ids along the last axis, whatever their order.
+
+    Two of N sets get the same key with probability N²/2⁶⁵.
+    """
+    return mix(ids).sum(axis=-1, dtype=np.uint64)
+
+
+def cell_dim(cell_type: dmesh.CellType) -> int:
+    """Topological dimension of a cell."""
+    return len(basix.topology(getattr(basix.CellType, cell_type.name))) - 1
+
+
+def cell_entities(cell_type: dmesh.CellType, dim: int) -> list[Array]:
+    """Local vertices of each entity of dimension ``dim``, in DOLFINx's order."""
+    cell = getattr(basix.CellType, cell_type.name)
+    return [np.asarray(vertices) for vertices in basix.topology(cell)[dim]]
+
+
+def facet_vertices(cell_type: dmesh.CellType) -> Array:
+    """Local vertices of each facet, shape ``(num_facets, vertices_per_facet)``."""
+    return np.array(cell_entities(cell_type, cell_dim(cell_type) - 1))
+
+
+def facet_keys(cells: Array, cell_type: dmesh.CellType) -> Array:
+    """Keys of all facets of the cells.
+
+    Args:
+        cells: Node ids, vertices first, shape ``(n, nodes_per_cell)``.
+        cell_type: Type of the cells.
+
+    Returns:
+        Keys, shape ``(n, num_facets)``.
+    """
+    mixed = mix(cells[:, : len(cell_entities(cell_type, 0))])
+    return mixed[:, facet_vertices(cell_type)].sum(axis=-1, dtype=np.uint64)
+
+
+def equal_pairs(keys: Array) -> tuple[Array, Array]:
+    """Positions of keys that occur twice: ``keys[first] == keys[second]``, first < second."""
+    order = np.argsort(keys, kind="stable")
+    same = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
+    return order[same], order[same + 1]
+
+
+def cell_facets(mesh: dmesh.Mesh) -> Array:
+    """Local facets of each cell owned by this rank, shape ``(n, facets_per_cell)``. Collective."""
+    tdim = mesh.topology.dim
+    mesh.topology.create_connectivity(tdim, tdim - 1)
+    per_cell = len(facet_vertices(mesh.topology.cell_type))
+    facets = mesh.topology.connectivity(tdim, tdim - 1).array.reshape(-1, per_cell)
+    return facets[: mesh.topology.index_map(tdim).size_local]
+
+
+# --- The untorn mesh as it comes in: cells that lie on any rank, with original node ids -------
 
 
 @dataclass(frozen=True)

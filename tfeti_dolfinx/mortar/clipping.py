@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import basix
 import numpy as np
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.common.arrays import Array
 
 # of the clipping facet's size: common parts below it are what rounding leaves where facets touch
 SLIVER = 1e-12

@@ -7,12 +7,11 @@ from itertools import combinations_with_replacement
 
 import numpy as np
 
-from tfeti_dolfinx.arrays import Array, sum_rows
+from tfeti_dolfinx.common.arrays import Array, sum_rows
+from tfeti_dolfinx.common.parallel import Exchange, any_rank, owner_of
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.facet_maps import points
-from tfeti_dolfinx.mortar.facets import FacetKind, Facets
-from tfeti_dolfinx.mortar.frames import tangents
-from tfeti_dolfinx.parallel import Exchange, any_rank, owner_of
+from tfeti_dolfinx.mortar.facets import FacetKind, Facets, points
+from tfeti_dolfinx.mortar.segments import tangents
 
 # cosine of 20 degrees: facets that turn by twice that at a vertex have an edge there, others are
 # those of a smooth surface, with nine facets or more around a pin

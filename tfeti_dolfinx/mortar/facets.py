@@ -1,18 +1,103 @@
-"""Facets of contact surfaces, as they travel between ranks."""
+"""Facets of surfaces: shape functions, places, maps between facets."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from functools import cache
+from typing import Any
 
+import basix
 import numpy as np
 
-from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.compat import geometry_dofmap
+from tfeti_dolfinx.common.arrays import Array, sum_rows
+from tfeti_dolfinx.common.compat import geometry_dofmap
+from tfeti_dolfinx.common.parallel import Exchange
+from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mesh.entities import cell_facets
-from tfeti_dolfinx.mortar.facet_element import FACET_OF, FacetElement, facet_dofs, from_first
-from tfeti_dolfinx.parallel import Exchange
+from tfeti_dolfinx.mesh.untorn import cell_facets
+
+# --- Lagrange elements on facets, and which unknowns of a cell are those of its facets --------
+
+# vertices of a facet in the order of its polygon; DOLFINx numbers quadrilaterals as tensors
+POLYGON = {"interval": [0, 1], "triangle": [0, 1, 2], "quadrilateral": [0, 1, 3, 2]}
+FACET_OF = {
+    "triangle": "interval",
+    "quadrilateral": "interval",
+    "tetrahedron": "triangle",
+    "hexahedron": "quadrilateral",
+}
+
+
+class FacetElement:
+    """Lagrange element of a degree on a facet, vertices first.
+
+    Args:
+        facet: interval, triangle or quadrilateral.
+        degree: Polynomial degree.
+        variant: basix' Lagrange variant.
+    """
+
+    def __init__(self, facet: str, degree: int, variant: Any) -> None:
+        self.facet, self.degree = facet, degree
+        self._cell = getattr(basix.CellType, facet)
+        self._element = basix.create_element(basix.ElementFamily.P, self._cell, degree, variant)
+        self.points = self._element.points
+        self.size = self._element.dim
+
+    @property
+    def is_affine(self) -> bool:
+        """Whether all maps with these basis functions are affine."""
+        return self.degree == 1 and self.facet != "quadrilateral"
+
+    def values(self, xi: Array) -> Array:
+        """Basis functions at reference points: shape ``(n, tdim)`` to ``(n, size)``."""
+        if len(xi) == 0:
+            return np.zeros((0, self.size))
+        return self._element.tabulate(0, np.ascontiguousarray(xi))[0, :, :, 0]
+
+    def slopes(self, xi: Array) -> Array:
+        """Derivatives at reference points: shape ``(n, tdim)`` to ``(tdim, n, size)``."""
+        if len(xi) == 0:
+            return np.zeros((self.points.shape[1], 0, self.size))
+        return self._element.tabulate(1, np.ascontiguousarray(xi))[1:, :, :, 0]
+
+
+def from_first(x: Array) -> Array:
+    """Nodes of facets from the first one on, shape ``(n, nodes, d)``.
+
+    Tangents are sums of these times slopes: slopes add up to 0 but for rounding, which would turn
+    a facet that is far from the origin.
+    """
+    return np.asarray(x - x[:, :1])
+
+
+@cache
+def facet_dofs(cell: str, degree: int, variant: Any) -> Array:
+    """Cell unknowns of each facet, in the order of the facet's own element.
+
+    Args:
+        cell: Name of the cell type.
+        degree: Degree of the Lagrange element.
+        variant: Its variant.
+
+    Returns:
+        Shape ``(facets, unknowns per facet)``.
+    """
+    cell_type = getattr(basix.CellType, cell)
+    points = basix.create_element(basix.ElementFamily.P, cell_type, degree, variant).points
+    corners, topology = basix.geometry(cell_type), basix.topology(cell_type)
+    element = FacetElement(FACET_OF[cell], degree, variant)
+    hats = FacetElement(FACET_OF[cell], 1, variant)
+    table = []
+    for vertices in topology[points.shape[1] - 1]:
+        on_facet = hats.values(element.points) @ corners[vertices]
+        distance = np.linalg.norm(on_facet[:, None] - points[None], axis=2)
+        table.append(np.argmin(distance, axis=1))
+    return np.array(table)
+
+
+# --- Facets of contact surfaces, as they travel between ranks ---------------------------------
 
 
 @dataclass(frozen=True)
@@ -187,3 +272,90 @@ def _normals(corners: Array, inside: Array) -> tuple[Array, Array]:
     length = np.linalg.norm(normal, axis=1)
     sign = np.where(outward < 0.0, -1.0, 1.0)
     return sign[:, None] * normal / np.where(length > 0.0, length, 1.0)[:, None], area
+
+
+# --- Maps from reference facets: points, areas, and back from a plane -------------------------
+
+# Newton's method from the affine map: facets that are not folded take 3 or 4 steps. It ends at
+# rounding (of the facet's size); where it stalls above that, a point may still be as good as FAR.
+MAX_STEPS, CLOSE, FAR = 20, 1e-14, 1e-8
+
+
+def points(element: FacetElement, x: Array, xi: Array) -> Array:
+    """Points at reference coordinates of facets with nodes x: ``(m, nodes, d)`` to ``(m, d)``."""
+    return np.einsum("mv,mvd->md", element.values(xi), x[:, : element.size])
+
+
+def densities(element: FacetElement, x: Array, xi: Array) -> Array:
+    """Area per area of the reference facet, shape ``(m,)``; arguments as of ``points``."""
+    nodes = from_first(x[:, : element.size])
+    return _areas(np.einsum("tmv,mvd->mtd", element.slopes(xi), nodes))
+
+
+def reference_points(element: FacetElement, nodes: Array, y: Array) -> Array:
+    """Reference coordinates of points in facets that lie in a line or a plane.
+
+    Args:
+        element: Element of the facets.
+        nodes: Nodes of the facet of each point, shape ``(m, nodes, tdim)``.
+        y: The points, shape ``(m, tdim)``.
+
+    Returns:
+        Shape ``(m, tdim)``: at once where the map is affine, else by Newton's method.
+
+    Raises:
+        InputError: It does not converge, as facets are folded.
+    """
+    origin = nodes[:, 0]
+    xi = _solve((nodes[:, 1 : 1 + y.shape[1]] - origin[:, None]).transpose(0, 2, 1), y - origin)
+    if element.is_affine or len(xi) == 0:
+        return xi
+    size = np.ptp(nodes, axis=1).max(axis=1)
+    for _ in range(MAX_STEPS):
+        slopes = np.einsum("tmv,mvd->mdt", element.slopes(xi), nodes[:, : element.size])
+        away = y - points(element, nodes, xi)
+        if np.all(np.abs(away).max(axis=1) <= CLOSE * size):
+            return xi
+        xi = xi + _solve(slopes, away)
+    left = np.abs(y - points(element, nodes, xi)).max(axis=1)
+    if np.any(~(left <= FAR * size)):
+        raise InputError("a facet of a contact surface is folded, or too far from a plane one")
+    return xi
+
+
+def whole_facets(kind: FacetKind, facets: Facets, degree: int) -> tuple[Array, Array, Array]:
+    """Quadrature points of whole facets.
+
+    Returns:
+        Facet of each point, reference coordinates of shape ``(m, tdim)``, weights.
+    """
+    xi, w = basix.make_quadrature(getattr(basix.CellType, kind.facet), degree)
+    n, q = len(facets), len(w)
+    slopes = np.einsum("tqv,nvd->nqtd", kind.geometry.slopes(xi), from_first(facets.x))
+    weight = _areas(slopes.reshape(n * q, *slopes.shape[2:])) * np.tile(w, n)
+    return np.repeat(np.arange(n), q), np.tile(xi, (n, 1)), weight
+
+
+def hat_areas(kind: FacetKind, facets: Facets) -> Array:
+    """∫φ_i over whole facets, shape ``(n, v)``."""
+    facet, xi, weight = whole_facets(kind, facets, 2 * kind.geometry.degree)
+    return sum_rows(facet, weight[:, None] * kind.hats.values(xi), len(facets))
+
+
+def _areas(slopes: Array) -> Array:
+    """Length or area that tangents span, shape ``(m, tdim, d)`` to ``(m,)``."""
+    if slopes.shape[1] == 1:
+        return np.linalg.norm(slopes[:, 0], axis=1)
+    if slopes.shape[2] == 2:
+        return np.abs(np.linalg.det(slopes))
+    return np.linalg.norm(np.cross(slopes[:, 0], slopes[:, 1]), axis=1)
+
+
+def _solve(A: Array, b: Array) -> Array:
+    """Solutions of many systems of one or two equations."""
+    if b.shape[1] == 1:
+        return b / A[:, :, 0]
+    (p, q), (r, t) = A.transpose(1, 2, 0)
+    x = t * b[:, 0] - q * b[:, 1]
+    y = p * b[:, 1] - r * b[:, 0]
+    return np.stack((x, y), axis=1) / (p * t - q * r)[:, None]

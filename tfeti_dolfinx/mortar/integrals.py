@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tfeti_dolfinx.arrays import Array, sum_rows
+from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.mortar.curvature import beside
-from tfeti_dolfinx.mortar.facet_maps import points
-from tfeti_dolfinx.mortar.facets import FacetKind, Facets
+from tfeti_dolfinx.mortar.facets import FacetKind, Facets, points
 from tfeti_dolfinx.mortar.segments import FacingPoints, Segments
 
 # of a facet's area: on a sliver the hats are nearly dependent, and M_e cannot be inverted

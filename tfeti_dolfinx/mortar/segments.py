@@ -1,19 +1,305 @@
-"""Segments: where facets of two surfaces face each other, and quadrature points there."""
+"""Mortar segments: who meets whom, clipped to common parts."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
+from mpi4py import MPI
+from scipy.spatial import cKDTree
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.parallel import Exchange
+from tfeti_dolfinx.mesh.partition import bisect_points
 from tfeti_dolfinx.mortar.clipping import CommonParts, common_parts, contains, sizes
-from tfeti_dolfinx.mortar.facet_element import POLYGON
-from tfeti_dolfinx.mortar.facet_maps import densities, points, reference_points
-from tfeti_dolfinx.mortar.facets import FacetKind, Facets
-from tfeti_dolfinx.mortar.frames import tangents
-from tfeti_dolfinx.mortar.layers import Look, nearest, truly_overlapping
-from tfeti_dolfinx.mortar.pairing import centre_normals
+from tfeti_dolfinx.mortar.facets import (
+    POLYGON,
+    FacetKind,
+    Facets,
+    densities,
+    points,
+    reference_points,
+)
+
+# --- Orthonormal frames of contact nodes: a normal, then tangents -----------------------------
+
+# |n_x| from which on the first tangent follows the y axis, not the x axis. By the hairy ball
+# theorem no choice of tangents is continuous everywhere; here the switch is where hardly a plane
+# surface lies (26° from the x axis), far from coordinate planes, diagonals and simple slopes, so
+# that rounding of a normal does not turn its tangents.
+SWITCH = 0.9
+
+
+def frames(normal: Array) -> Array:
+    """Right-handed orthonormal frames whose axis 0 is the normal.
+
+    They depend on the normal alone, so they are the same on every rank.
+
+    Args:
+        normal: Unit vectors, shape ``(n, gdim)``.
+
+    Returns:
+        Shape ``(n, gdim, gdim)``: normal, then ``tangents``.
+    """
+    return np.concatenate((normal[:, None], tangents(normal)), axis=1)
+
+
+def aligned(frame: Array, direction: Array) -> tuple[Array, Array]:
+    """Frames of space whose first tangent is along a direction, as far as it is tangential.
+
+    Args:
+        frame: Shape ``(n, 3, 3)``.
+        direction: Unit vector, shape ``(3,)``.
+
+    Returns:
+        The frames, and how long the direction's tangential part is, shape ``(n,)``; where it is
+        0 the frame is as it was.
+    """
+    normal = frame[:, 0]
+    first = direction - np.sum(direction * normal, axis=1, keepdims=True) * normal
+    length = np.linalg.norm(first, axis=1)
+    known = (length > 0.0)[:, None]
+    first = np.where(known, first / np.where(known, length[:, None], 1.0), frame[:, 1])
+    # what rounding has left of the normal in a short tangent
+    first -= np.sum(first * normal, axis=1, keepdims=True) * normal
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack((normal, first, np.cross(normal, first)), axis=1), length
+
+
+def tangents(normal: Array) -> Array:
+    """Orthonormal tangents of unit normals, as close to coordinate axes as they can be.
+
+    In 2D the normal turned left by a right angle. In 3D the x axis without its normal part (the
+    y axis where the normal is within 26° of the x axis), and the normal times that. They are
+    continuous in the normal but for this switch. A scalar space has none.
+
+    Args:
+        normal: Unit vectors, shape ``(n, gdim)``.
+
+    Returns:
+        Shape ``(n, gdim - 1, gdim)``.
+    """
+    gdim = normal.shape[1]
+    if gdim == 1:
+        return np.empty((len(normal), 0, 1))
+    if gdim == 2:
+        return np.stack((-normal[:, 1], normal[:, 0]), axis=1)[:, None]
+    axis = np.eye(3)[(np.abs(normal[:, 0]) >= SWITCH).astype(np.int64)]
+    first = axis - np.sum(axis * normal, axis=1, keepdims=True) * normal
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack((first, np.cross(normal, first)), axis=1)
+
+
+# --- Which of several primary facets over one secondary facet it can meet ---------------------
+
+# of a facet's size: distances closer than this are those of facets of one layer, apart by rounding
+SAME = 1e-9
+# of a facet: common parts that exceed it by less are one layer, whose clipping has rounded
+COVERED_TWICE = 1e-6
+
+# for pairs a and b of the same secondary facet: whether b's primary facet lies over the middle of
+# a's common part, and its distance there
+Look = Callable[[Array, Array], tuple[Array, Array]]
+
+
+def truly_overlapping(s: Array, distance: Array, facing: Array, length: Array, look: Look) -> Array:
+    """Facing pairs whose overlap is real: no way out of the primary body lies before them.
+
+    An overlap means that the primary body reaches from its facet, behind the secondary one, up to
+    that. If it ends before, at a facet that looks the same way as the secondary one, the pair is
+    one of two faces that look away from each other through thin bodies.
+
+    Args:
+        s: Secondary facet of each pair, shape ``(n,)``.
+        distance: Distance along the secondary facet's normal.
+        facing: Whether the facets face each other.
+        length: Size of every secondary facet.
+        look: The way to look at one pair's place along another.
+
+    Returns:
+        Flags, shape ``(n,)``.
+    """
+    found, same = facing.copy(), SAME * length[s]
+    behind = distance < -same
+    within, out = np.flatnonzero(facing & behind), np.flatnonzero(~facing & behind)
+    a, b = pairs_over_one_facet(s, within, out)
+    over, there = look(a, b)
+    found[a[over & (distance[a] < there) & (there < -same[a])]] = False
+    return found
+
+
+def nearest(
+    s: Array, distance: Array, length: Array, size: Array, whole: Array, look: Look
+) -> Array:
+    """Pairs with no other primary facet before theirs.
+
+    Args:
+        s: Secondary facet of each pair, shape ``(n,)``.
+        distance: Distance along the secondary facet's normal.
+        length: Size of every secondary facet.
+        size: Length or area of the common part.
+        whole: Length or area of every secondary facet.
+        look: The way to look at one pair's place along another.
+
+    Returns:
+        Flags, shape ``(n,)``.
+    """
+    found = np.ones(len(s), dtype=bool)
+    covered = np.bincount(s, size, minlength=len(whole))
+    several = np.flatnonzero((covered > (1.0 + COVERED_TWICE) * whole)[s])
+    a, b = pairs_over_one_facet(s, several, several)
+    over, there = look(a, b)
+    found[a[(a != b) & over & (there < distance[a] - SAME * length[s[a]])]] = False
+    return found
+
+
+def pairs_over_one_facet(s: Array, first: Array, second: Array) -> tuple[Array, Array]:
+    """All (a, b), a of ``first`` and b of ``second``, with the same secondary facet."""
+    ordered = second[np.argsort(s[second], kind="stable")]
+    start = np.searchsorted(s[ordered], s[first], side="left")
+    count = np.searchsorted(s[ordered], s[first], side="right") - start
+    offset = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    return np.repeat(first, count), ordered[np.repeat(start, count) + offset]
+
+
+# --- Which facets of two surfaces may meet: rendezvous of ranks, then a tree on each ----------
+
+# asked of a tree at first, and twice as many where that was not all: facets of one size class have
+# about 20 neighbours within their radii
+NEIGHBOURS = 64
+
+
+def rendezvous(
+    secondary: Facets, primary: Facets, distance: float, comm: MPI.Intracomm
+) -> tuple[Facets, Facets]:
+    """Bring facets that may meet to the same rank. Collective.
+
+    Each secondary facet goes to one rank, in chunks of equal number that are compact in space;
+    a primary facet goes to every rank whose box it comes near.
+
+    Args:
+        secondary: Secondary facets of this rank.
+        primary: Primary facets of this rank.
+        distance: How far apart facets may be, their own sizes not counted.
+        comm: Communicator.
+
+    Returns:
+        The secondary and the primary facets that have come to this rank.
+    """
+    here = secondary.sent(Exchange(comm, bisect_points(secondary.centre, comm.size, comm)))
+    size = here.radius.max(initial=0.0)
+    low, high = here.box()
+    gdim = low.shape[1]
+    box = np.stack((low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)))
+    boxes = np.empty((comm.size, 2, gdim))
+    comm.Allgather(box + np.array([[-size], [size]]), boxes)
+    low, high = primary.box()
+    margin = distance + primary.radius[:, None]
+    low, high = low - margin, high + margin
+    # ranks that some facet may meet first: they are few, of however many
+    reach = low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)
+    near = np.flatnonzero(np.all((reach[0] <= boxes[:, 1]) & (reach[1] >= boxes[:, 0]), axis=1))
+    meets = np.ones((len(primary), len(near)), dtype=bool)
+    for axis in range(gdim):
+        meets &= low[:, axis, None] <= boxes[None, near, 1, axis]
+        meets &= high[:, axis, None] >= boxes[None, near, 0, axis]
+    facet, place = np.nonzero(meets)
+    return here, primary.sent(Exchange(comm, near[place]), facet)
+
+
+def possible_pairs(secondary: Facets, primary: Facets, distance: float) -> tuple[Array, Array]:
+    """Pairs of facets that may meet when one looks along the secondary facets' normals.
+
+    A primary facet is found if it comes within a secondary facet's radius of the line through
+    that facet's centre along its averaged normal, no farther than ``distance`` and the facets'
+    sizes from the centre. Primary facets are sorted into classes of equal size up to a factor of 2,
+    each with a tree of its own, so that a graded mesh does not make large facets meet small ones
+    in vain.
+
+    Args:
+        secondary: Secondary facets, with averaged normals.
+        primary: Primary facets.
+        distance: How far to look, to both sides.
+
+    Returns:
+        Secondary and primary facet of each pair.
+    """
+    s_centre, s_size = secondary.centre, secondary.radius
+    p_centre, p_size = primary.centre, primary.radius
+    direction = centre_normals(secondary)
+    keys: list[Array] = [np.empty(0, dtype=np.int64)]
+    classes = np.floor(np.log2(np.maximum(p_size, 1e-300))).astype(np.int64)
+    for size_class in np.unique(classes) if len(secondary) else ():
+        members = np.flatnonzero(classes == size_class)
+        radius = s_size + p_size[members].max()
+        s, hit = _march(cKDTree(p_centre[members]), s_centre, direction, radius, distance + radius)
+        p = members[hit]
+        offset = p_centre[p] - s_centre[s]
+        along = np.sum(offset * direction[s], axis=1)
+        aside = np.linalg.norm(offset - along[:, None] * direction[s], axis=1)
+        sizes = s_size[s] + p_size[p]
+        close = (aside <= sizes) & (np.abs(along) <= distance + sizes + p_size[p])
+        keys.append(s[close] * len(primary) + p[close])
+    return np.divmod(np.unique(np.concatenate(keys)), max(len(primary), 1))
+
+
+def centre_normals(facets: Facets) -> Array:
+    """Mean of each facet's averaged vertex normals, of unit length, shape ``(n, gdim)``."""
+    total = facets.vertex_normals.sum(axis=1)
+    return total / np.linalg.norm(total, axis=1, keepdims=True)
+
+
+def _march(
+    tree: cKDTree, origin: Array, direction: Array, radius: Array, half_length: Array
+) -> tuple[Array, Array]:
+    """Points of a tree within a radius of line segments: steps as long as nothing is near.
+
+    Args:
+        tree: The points.
+        origin: Middle of each segment, shape ``(n, gdim)``.
+        direction: Unit vectors, shape ``(n, gdim)``.
+        radius: One per segment, shape ``(n,)``.
+        half_length: Half the length of each segment, shape ``(n,)``.
+
+    Returns:
+        Segment and point of each pair, some more than once.
+    """
+    found_s: list[Array] = [np.empty(0, dtype=np.int64)]
+    found_p: list[Array] = [np.empty(0, dtype=np.int64)]
+    front = -half_length  # all before it has been seen
+    active = np.arange(len(origin))
+    while len(active):
+        t = front[active] + radius[active]
+        x = origin[active] + t[:, None] * direction[active]
+        nearest, _ = tree.query(x)
+        close = nearest <= 2.0 * radius[active]
+        rows, points = _within(tree, x[close], 2.0 * radius[active[close]])
+        found_s.append(active[close][rows])
+        found_p.append(points)
+        front[active] = t + np.where(close, radius[active], nearest - radius[active])
+        active = active[front[active] < half_length[active]]
+    return np.concatenate(found_s), np.concatenate(found_p)
+
+
+def _within(tree: cKDTree, x: Array, radius: Array) -> tuple[Array, Array]:
+    """Points of a tree within a radius of each x: row and point of each pair."""
+    found: list[tuple[Array, Array]] = [(np.empty(0, dtype=np.int64),) * 2]
+    rows, k = np.arange(len(x)), min(NEIGHBOURS, tree.n)
+    while len(rows):
+        distance, point = tree.query(
+            x[rows], k=np.arange(1, k + 1), distance_upper_bound=np.nextafter(radius.max(), np.inf)
+        )
+        inside = distance <= radius[rows, None]
+        row, column = np.nonzero(inside)
+        full = inside[:, -1] & (k < tree.n)
+        settled = ~full[row]
+        found.append((rows[row[settled]], point[row[settled], column[settled]]))
+        rows, k = rows[full], min(2 * k, tree.n)
+    return tuple(np.concatenate(part) for part in zip(*found, strict=True))
+
+
+# --- Segments: where facets of two surfaces face each other, and quadrature points there ------
 
 # Facets whose normals make a larger angle than about 88 degrees with each other do not face: seen
 # from the side they have no common part but slivers, and rounding must not decide.

@@ -11,12 +11,12 @@ from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
-from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.compat import JIT_OPTIONS
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.compat import JIT_OPTIONS
+from tfeti_dolfinx.common.parallel import box_over_ranks
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.parallel import box_over_ranks
 
 
 def surface_facets(decomposition: Decomposition, name: str | int) -> Array:

@@ -6,7 +6,7 @@ from typing import Protocol
 
 from petsc4py import PETSc
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.qp.problem import FaceOperator
 
 

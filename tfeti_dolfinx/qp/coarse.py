@@ -1,4 +1,4 @@
-"""The constraint Gλ = e as solvers see it: orthogonal projectors, on all rows or on a face."""
+"""The coarse problem as a QP solver sees it: projectors P and Q."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from typing import Protocol
 import numpy as np
 from petsc4py import PETSc
 
-from tfeti_dolfinx.arrays import TINY, Array
-from tfeti_dolfinx.parallel import agreed, summed
-from tfeti_dolfinx.qp.faces import Face
+from tfeti_dolfinx.common.arrays import TINY, Array
+from tfeti_dolfinx.common.parallel import bcast_from_root, summed
+from tfeti_dolfinx.qp.sets import Face
+
+# --- The constraint Gλ = e as solvers see it: orthogonal projectors, on all rows or on a face ---
 
 # of the largest forces on an equation: those on a light one beside it count as so large at least,
 # since the rounding of the largest reaches them
@@ -113,7 +115,7 @@ def imbalance(coarse: Coarse, x: PETSc.Vec) -> float:
     forces = coarse.forces(x)
     floor = max(LIGHT * float(forces.max(initial=0.0)), TINY)
     own = np.max(np.abs(coarse.residual(x)) / np.maximum(forces, floor), initial=0.0)
-    return agreed(x.getComm().tompi4py(), float(own))
+    return bcast_from_root(x.getComm().tompi4py(), float(own))
 
 
 def _products(x: PETSc.Vec, y: PETSc.Vec, more: Array) -> tuple[float, float, Array]:
@@ -261,3 +263,50 @@ class DenseCoarse:
 
     def destroy(self) -> None:
         """Nothing to free."""
+
+
+# --- Gλ = e where some multipliers follow others, as a Newton step on a law of friction sees
+#     it ---
+
+
+class Oblique(Protocol):
+    """Projectors of a face Z on whose vectors u others depend: λ = (I + C)u.
+
+    With G_f = GZ and H = G(I + C)ZG_fᵀ: P = Z(I − G_fᵀH⁺G(I + C)Z)Zᵀ. Vectors are this rank's
+    parts, in the layout of all rows.
+    """
+
+    def coordinates(self, x: Array) -> Array:
+        """H⁺G(I + C)ZZᵀx, replicated, shape ``(r,)``. Collective."""
+        ...
+
+    def project(self, x: Array) -> Array:
+        """P x, shapes ``(m,)`` or ``(m, q)``. Collective."""
+        ...
+
+    def restoring(self, y: Array) -> Array:
+        """u = ZG_fᵀH⁺y, for which G(I + C)u = y if any u does that. Not collective."""
+        ...
+
+
+class NoOblique:
+    """Without Gλ = e: only masks.
+
+    Args:
+        face: The face.
+    """
+
+    def __init__(self, face: Face) -> None:
+        self._face = face
+
+    def coordinates(self, x: Array) -> Array:
+        """None."""
+        return np.zeros(0)
+
+    def project(self, x: Array) -> Array:
+        """ZZᵀx."""
+        return self._face.restricted(x)
+
+    def restoring(self, y: Array) -> Array:
+        """0."""
+        return np.zeros(self._face.Z.shape[0])

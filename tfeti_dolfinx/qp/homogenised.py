@@ -8,11 +8,11 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.parallel import any_rank, norm_over
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.parallel import any_rank, norm_over
 from tfeti_dolfinx.qp.coarse import Coarse
-from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
 from tfeti_dolfinx.qp.problem import QP, Operator, QPResult
+from tfeti_dolfinx.qp.sets import FeasibleSet
 
 # of the terms that a residual is the difference of: what rounding leaves of it at least, and
 # below how many times that rounding may be the reason of anything strange
@@ -20,7 +20,7 @@ ROUNDING, STRANGE = 1e-14, 1e8
 
 
 @dataclass(frozen=True)
-class Image:
+class OperatorProduct:
     """A vector and what F makes of it, so that F need not be asked again.
 
     Attributes:
@@ -37,16 +37,16 @@ class Image:
         self.Fx.destroy()
 
 
-def image(F: Operator, x: PETSc.Vec) -> Image:
+def operator_product(F: Operator, x: PETSc.Vec) -> OperatorProduct:
     """x and F x; takes x over, and multiplies once if x ≠ 0. Collective."""
     Fx = x.duplicate()
     Fx.set(0.0)
     if x.norm() > 0.0:
         F.mult(x, Fx)
-    return Image(x, Fx)
+    return OperatorProduct(x, Fx)
 
 
-class LastImage:
+class LastProduct:
     """The last solution of a program, and what F makes of it."""
 
     def __init__(self) -> None:
@@ -90,15 +90,15 @@ class LastImage:
         same = np.array_equal(self._d, d.array_r) and np.array_equal(self._e, e)
         return not any_rank(d.getComm().tompi4py(), not same)
 
-    def image(self, F: Operator, x: PETSc.Vec) -> Image:
+    def image(self, F: Operator, x: PETSc.Vec) -> OperatorProduct:
         """As ``image``, but nothing is multiplied if x is the last solution. Collective."""
         comm = x.getComm().tompi4py()
         known = self._Fx if self._is_near(comm, x.array_r) else self.known(comm, x.array_r)
         if not any_rank(comm, known.size > 0):
-            return image(F, x)
+            return operator_product(F, x)
         Fx = x.duplicate()
         Fx.array[:] = known
-        return Image(x, Fx)
+        return OperatorProduct(x, Fx)
 
     def _is_near(self, comm: MPI.Intracomm, x: Array) -> bool:
         """Whether what was passed on stands for x. Collective."""
@@ -136,12 +136,12 @@ class Scale:
     rounding: float
 
 
-def scale_at(qp: QP, start: Image) -> Scale:
+def scale_at(qp: QP, start: OperatorProduct) -> Scale:
     """The scale of a program whose λ̄₀ is known with its image. Collective."""
     return Scale(_projected(qp, start.Fx, qp.d), _rounding(qp, start))
 
 
-def scale_near(qp: QP, at: Image) -> Scale:
+def scale_near(qp: QP, at: OperatorProduct) -> Scale:
     """A scale from another solution of Gλ̄ = e, if F λ̄₀ is not known. Collective.
 
     ‖P d‖ and ‖P F λ‖ are equal at the solution, and b₀ is ‖P d‖ where e = 0; the larger one.
@@ -150,7 +150,7 @@ def scale_near(qp: QP, at: Image) -> Scale:
     return Scale(max(sizes), _rounding(qp, at))
 
 
-def _rounding(qp: QP, at: Image) -> float:
+def _rounding(qp: QP, at: OperatorProduct) -> float:
     """What rounding leaves of g^P, which has nothing of gaps that stay open, however wide."""
     s = at.Fx.copy()
     s.axpy(-1.0, qp.d)
@@ -190,7 +190,9 @@ class Homogenised:
             vec.destroy()
 
 
-def homogenise(qp: QP, at: Image | None = None, scale: Scale | None = None) -> Homogenised:
+def homogenise(
+    qp: QP, at: OperatorProduct | None = None, scale: Scale | None = None
+) -> Homogenised:
     """Homogenise a quadratic program. Collective.
 
     Args:
@@ -200,7 +202,7 @@ def homogenise(qp: QP, at: Image | None = None, scale: Scale | None = None) -> H
         scale: The scale of residuals; default that at λ̄.
     """
     if at is None:
-        at = image(qp.F, natural(qp.coarse, qp.d))
+        at = operator_product(qp.F, natural(qp.coarse, qp.d))
         homogenised = homogenise(qp, at, scale)
         at.destroy()
         return homogenised

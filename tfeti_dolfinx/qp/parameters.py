@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from tfeti_dolfinx.checks import Range
-from tfeti_dolfinx.described import ABOVE_0, described
+from tfeti_dolfinx.common.validation import ABOVE_0, Range, described
 from tfeti_dolfinx.qp.mprgp import EXPANSIONS, Expansion, MprgpParameters
 
 

@@ -1,4 +1,4 @@
-"""The quadratic program that every solver gets, and what it gives back."""
+"""The quadratic program, and what its solvers have in common."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ from typing import Protocol
 import numpy as np
 from petsc4py import PETSc
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.qp.coarse import Coarse
-from tfeti_dolfinx.qp.faces import Face
-from tfeti_dolfinx.qp.feasible_sets import FeasibleSet
-from tfeti_dolfinx.qp.recycled import RecycledOnFace
+from tfeti_dolfinx.qp.recycling import RecycledOnFace
+from tfeti_dolfinx.qp.sets import Face, FeasibleSet
+
+# --- The quadratic program that every solver gets, and what it gives back ---------------------
 
 
 class Operator(Protocol):
@@ -197,3 +198,139 @@ class Start:
 
     lam: PETSc.Vec
     mu: Array
+
+
+# --- When a solver may stop: a cheap test in every step, and an examination where that holds ---
+
+
+class StoppingRule(Protocol):
+    """What the residuals of an iterate must come down to.
+
+    A solver compares max(‖g^P‖, ‖F‖‖Qx‖) with ``tolerance`` in every step. Where it is small
+    enough, the iterate is examined; an examination that is not content lowers the tolerance.
+
+    Attributes:
+        tolerance: Norm of the residuals from which on an examination is worth its price.
+        aim: What solves on faces come down to at most: the tolerance, or 0 where an examination
+            is to wait until one of them is done.
+        drifted: Set where an examination finds that the solver's gradient is no longer true;
+            the solver makes it anew and takes the flag back.
+        norm: ‖F‖, or an estimate: residuals over it are errors of multipliers. A solver that
+            learns it on its way says so here.
+    """
+
+    tolerance: float
+    drifted: bool
+    norm: float
+
+    @property
+    def aim(self) -> float:
+        """What solves on faces come down to at most."""
+        ...
+
+    def examine(
+        self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float
+    ) -> ConvergedReason:
+        """Examine an iterate whose residuals are small. Collective.
+
+        Args:
+            lam: The multipliers λ.
+            gradient: Fλ − d up to the range of Gᵀ.
+            face: The face of λ: which rows carry a force.
+            residual: max(‖g^P‖, ‖F‖‖Qx‖).
+
+        Returns:
+            Why to stop, or ITERATING; then ``tolerance`` is below ``residual``.
+        """
+        ...
+
+
+class ResidualRule:
+    """Small residuals are good enough: for a program that stands for itself.
+
+    Args:
+        tolerance: What residuals must come down to.
+    """
+
+    def __init__(self, tolerance: float) -> None:
+        self.tolerance, self.drifted, self.norm = tolerance, False, 1.0
+
+    @property
+    def aim(self) -> float:
+        """The tolerance."""
+        return self.tolerance
+
+    def examine(
+        self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float
+    ) -> ConvergedReason:
+        """Content."""
+        return ConvergedReason.CONVERGED_RTOL
+
+
+class TargetRule(ResidualRule):
+    """Content where the residual is what was asked for, and not before: for a part of a solve."""
+
+    def examine(
+        self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float
+    ) -> ConvergedReason:
+        """Content, if the residual has come down to the tolerance."""
+        small = residual <= self.tolerance
+        return ConvergedReason.CONVERGED_RTOL if small else ConvergedReason.ITERATING
+
+
+# --- Monitors: called once per step with what a solver knows anyway ---------------------------
+
+
+class Monitor(Protocol):
+    """Called on all ranks after each step; a monitor may communicate."""
+
+    def __call__(
+        self, steps: Steps, step: str, x: PETSc.Vec, projected_gradient: float, equality: float
+    ) -> None:
+        """See a step.
+
+        Args:
+            steps: Steps so far.
+            step: Kind of this one: start, cg, expansion, proportioning, outer.
+            x: The iterate.
+            projected_gradient: ‖g^P‖ there.
+            equality: ‖Q x‖ there, how far Gλ = e is from being met.
+        """
+        ...
+
+
+def no_monitor(
+    steps: Steps, step: str, x: PETSc.Vec, projected_gradient: float, equality: float
+) -> None:
+    """Say nothing."""
+
+
+@dataclass(frozen=True)
+class PrintMonitor:
+    """Prints a line per step on rank 0.
+
+    Attributes:
+        touching: Number of free components among the bounded ones of an iterate (collective).
+        multiplications: Multiplications by F so far.
+    """
+
+    touching: Callable[[PETSc.Vec], int]
+    multiplications: Callable[[], int]
+
+    def __call__(
+        self, steps: Steps, step: str, x: PETSc.Vec, projected_gradient: float, equality: float
+    ) -> None:
+        """Print outer iteration, step, ‖g^P‖, ‖Qx‖ if known, touching rows, multiplications."""
+        touching = self.touching(x)
+        if x.getComm().getRank() == 0:
+            print(
+                f"{steps.outer:4d} {step:<13s} |gP| {projected_gradient:.4e}  "
+                f"|Qx| {_known(equality)}  touching {touching:6d}  "
+                f"multiplications {self.multiplications():5d}",
+                flush=True,
+            )
+
+
+def _known(value: float) -> str:
+    """A norm, blank where it was not computed."""
+    return f"{value:.4e}" if value >= 0.0 else " " * 10

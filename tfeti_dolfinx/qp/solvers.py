@@ -9,13 +9,11 @@ from typing import Protocol
 from petsc4py import PETSc
 
 from tfeti_dolfinx.qp.homogenised import Homogenised, restored
-from tfeti_dolfinx.qp.monitors import Monitor
+from tfeti_dolfinx.qp.krylov import solve_by_pcpg
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
 from tfeti_dolfinx.qp.parameters import NewtonParameters, SmalseParameters
-from tfeti_dolfinx.qp.pcpg import solve_by_pcpg
-from tfeti_dolfinx.qp.problem import QP, QPResult, Start
+from tfeti_dolfinx.qp.problem import QP, Monitor, QPResult, Start, StoppingRule
 from tfeti_dolfinx.qp.smalse import smalse
-from tfeti_dolfinx.qp.stopping import StoppingRule
 
 
 class Parameters(Protocol):

@@ -10,19 +10,16 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_array
 
-from tfeti_dolfinx.arrays import Array
+from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.subdomains.averages import Clusters
-from tfeti_dolfinx.subdomains.block import Block
-from tfeti_dolfinx.subdomains.clusters import ClusteredSubdomains
-from tfeti_dolfinx.subdomains.data import Counters, SubdomainData
-from tfeti_dolfinx.subdomains.equal import EqualSubdomains
+from tfeti_dolfinx.subdomains.block import Block, Counters, SubdomainData
+from tfeti_dolfinx.subdomains.clusters import ClusteredSubdomains, Clusters
 from tfeti_dolfinx.subdomains.factor import say_if_not_cholmod
-from tfeti_dolfinx.subdomains.kplus import Making
-from tfeti_dolfinx.subdomains.local import LocalChoice
-from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
+from tfeti_dolfinx.subdomains.kplus import InverseFactory
+from tfeti_dolfinx.subdomains.local_operators import LocalChoice
+from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains, SparseBlock
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 MakeBlock = Callable[[SubdomainData], Block]
@@ -100,7 +97,7 @@ def _lone(starts: Array, entries_of_row: Array) -> Array:
     return np.asarray(count[which.ravel()] == 1)
 
 
-def sparse_blocks(how: Making, choice: LocalChoice) -> MakeBlock:
+def sparse_blocks(how: InverseFactory, choice: LocalChoice) -> MakeBlock:
     """What makes the Blocks of a rank, which share a stiffness where a choice says so."""
     equals = EqualSubdomains(how) if choice.shares else None
     return lambda data: SparseBlock(data, how, equals)

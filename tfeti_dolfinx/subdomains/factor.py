@@ -1,4 +1,4 @@
-"""Sparse Cholesky factors through PETSc: CHOLMOD, or what this PETSc has in its place."""
+"""Factors of sparse symmetric matrices, and inverses made of them."""
 
 from __future__ import annotations
 
@@ -7,15 +7,17 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from tfeti_dolfinx.arrays import Array
-from tfeti_dolfinx.compat import is_read
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.compat import is_read
 from tfeti_dolfinx.errors import FactorError
+
+# --- Sparse Cholesky factors through PETSc: CHOLMOD, or what this PETSc has in its place ------
 
 log = logging.getLogger(__name__)
 
@@ -296,3 +298,71 @@ def _cause(error: Exception, solver: str | None, A: PETSc.Mat) -> FactorError:
             f"this PETSc makes no Cholesky factors by {solver}; expected one of {known}"
         )
     return FactorError(f"{solver} failed: {str(error).strip().splitlines()[-1]}")
+
+
+# --- What a generalised inverse of a stiffness is asked for -----------------------------------
+
+
+class GeneralisedInverse(Protocol):
+    """K⁺ with K K⁺ K = K."""
+
+    def solve(self, b: Array) -> Array:
+        """K⁺ b, shape ``(n,)``."""
+        ...
+
+    def refactor(self, R: Array) -> None:
+        """Follow new values of K in the same pattern; R is their kernel.
+
+        Raises:
+            FactorError: The factor could not be made.
+        """
+        ...
+
+    def destroy(self) -> None:
+        """Free the factor."""
+        ...
+
+
+class FactoredInverse:
+    """Base of the package's own: a sparse factor, which takes several right sides at once."""
+
+    _factor: CholeskyFactor
+
+    def solve(self, b: Array) -> Array:
+        """K⁺ b, shapes ``(n,)`` or ``(n, q)``."""
+        return self._factor.solve(b)
+
+    @property
+    def size(self) -> FactorSize:
+        """What the factor stores."""
+        return self._factor.size
+
+    def refactor(self, R: Array) -> None:
+        """Follow new values of K in the same pattern; R is their kernel.
+
+        Raises:
+            FactorError: The factor could not be made.
+        """
+        raise NotImplementedError("refactor")
+
+    def destroy(self) -> None:
+        """Free the factor."""
+        self._factor.destroy()
+
+
+def solved(inverse: GeneralisedInverse, b: Array) -> Array:
+    """K⁺ b, shapes ``(n,)`` or ``(n, q)``, by an inverse that may know single vectors only."""
+    if b.ndim == 1 or isinstance(inverse, FactoredInverse):
+        return inverse.solve(b)
+    return np.stack([inverse.solve(column) for column in b.T], axis=1)
+
+
+@contextmanager
+def lent(entries: Array, places: Array, values: Array | float) -> Iterator[None]:
+    """Other values at some places, in the block; the old ones come back to the last bit."""
+    kept = entries[places]
+    entries[places] = values
+    try:
+        yield
+    finally:
+        entries[places] = kept

@@ -1,0 +1,1 @@
+"""How right an answer is: warnings and estimates of errors."""

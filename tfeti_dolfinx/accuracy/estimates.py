@@ -1,0 +1,155 @@
+"""The errors that a solve knows: what the solver has left, and what the mesh leaves."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from math import nan
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from dolfinx import fem
+
+from tfeti_dolfinx.common.arrays import TINY, Array
+from tfeti_dolfinx.common.parallel import bcast_from_root
+from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.feti.duality_gap import EnergyBound, energy_bound
+from tfeti_dolfinx.feti.stopping import ErrorTarget, TargetStatus
+from tfeti_dolfinx.forms.discretisation import StressRecovery
+from tfeti_dolfinx.forms.fields import Stress, checked_stress
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.solution import Solution
+from tfeti_dolfinx.system import System
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """Errors of a solution in the energy norm ‖u‖_K = √(uᵀKu); the same on all ranks.
+
+    Attributes:
+        energy: ‖u‖_K, a root of an energy.
+        algebraic: Bound of ‖u − u*‖_K, u* the exact solution of the discrete problem: its rows,
+            and the last bounds of friction. Infinite where no forces balance the load.
+        discretisation: Estimate of ‖u* − ū‖_K, ū the exact solution of the continuous problem;
+            None if the problem was given no stress. ``Solution.discretisation_error`` has its
+            parts.
+        factorizations: Subdomain matrices factored for it.
+        lifting_multiplications: Multiplications by S, the Schur complements.
+        recoveries: Displacements recovered, each for one more solve in every subdomain.
+        closing_steps: Steps that made a displacement admissible, each a multiplication by B and
+            by Bᵀ.
+        seconds: Wall seconds of this rank.
+    """
+
+    energy: float
+    algebraic: float
+    discretisation: float | None
+    factorizations: int
+    lifting_multiplications: int
+    recoveries: int
+    closing_steps: int
+    seconds: float
+
+    @property
+    def relative_algebraic(self) -> float:
+        """The bound over ‖u‖_K."""
+        return self.algebraic / max(self.energy, TINY)
+
+    @property
+    def relative_discretisation(self) -> float:
+        """The estimate over ‖u‖_K; nan if the problem was given no stress."""
+        return (nan if self.discretisation is None else self.discretisation) / max(
+            self.energy, TINY
+        )
+
+    def numbers(self) -> dict[str, float]:
+        """What is known, by name."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
+
+
+def estimate(system: System, solution: Solution) -> Estimates:
+    """Estimate the errors of a solution. Collective.
+
+    Args:
+        system: What the solution was found with.
+        solution: The last solution.
+
+    Raises:
+        InputError: The rows are no longer those of the solution.
+        FactorError: The stiffness inside of a subdomain could not be factored.
+    """
+    if solution.gluing.constraints is not system.gluing.constraints:
+        raise InputError(
+            "estimate: the rows are no longer those of the solution; expected a call after solve()"
+        )
+    counters, comm = system.dual.subdomains.counters, system.dual.coarse.comm
+    start, factored = perf_counter(), counters.factorizations
+    energy, bound = bound_of(system, solution)
+    discretisation = _discretisation(solution) if solution.has_stress else None
+    return Estimates(
+        energy=energy,
+        algebraic=bound.error,
+        discretisation=discretisation,
+        factorizations=comm.allreduce(counters.factorizations - factored),
+        lifting_multiplications=1,
+        recoveries=int(bound.moved > 0.0),
+        closing_steps=bound.steps,
+        seconds=perf_counter() - start,
+    )
+
+
+def goal_of(
+    stress: Stress, dofs: TornDofs, decomposition: Decomposition, thickness: Any
+) -> ErrorTarget:
+    """From displacements in primal order to the estimate of their discretisation error. Collective.
+
+    Args:
+        stress: UFL stress of a displacement.
+        dofs: Dof maps.
+        decomposition: The torn mesh.
+        thickness: What areas of the mesh are multiplied with.
+    """
+    u = fem.Function(dofs.V)
+    recovery = StressRecovery(u, checked_stress(stress, u), dofs, decomposition, thickness)
+
+    def error(values: Array) -> float:
+        u.x.array[:] = dofs.to_dolfinx(values)
+        return recovery.error()
+
+    return error
+
+
+def of_looks(reached: Sequence[TargetStatus]) -> dict[str, float]:
+    """What looks at a goal have found, the last one, and taken, all of them."""
+    if not reached:
+        return {}
+    last = reached[-1]
+    return {
+        "energy": last.energy,
+        "algebraic": last.bound.error,
+        "discretisation": last.goal,
+        "lifting_multiplications": len(reached),
+        "recoveries": sum(look.bound.moved > 0.0 for look in reached),
+        "closing_steps": sum(look.bound.steps for look in reached),
+    }
+
+
+def bound_of(system: System, solution: Solution) -> tuple[float, EnergyBound]:
+    """‖u‖_K, and the bound of the algebraic error. Collective."""
+    dual = system.dual
+    lam = dual.d.duplicate()
+    lam.array[:] = solution.lam
+    bound = energy_bound(dual, lam, solution.u, dual.seen)
+    lam.destroy()
+    comm = dual.coarse.comm
+    square = bcast_from_root(comm, comm.allreduce(sum(dual.subdomains.energies(solution.u))))
+    return float(np.sqrt(max(square, 0.0))), bound
+
+
+def _discretisation(solution: Solution) -> float:
+    """The root of the sum of squares. Collective."""
+    comm = solution.dofs.comm
+    own = float(np.sum(solution.discretisation_error.x.array**2))
+    return float(np.sqrt(bcast_from_root(comm, comm.allreduce(own))))

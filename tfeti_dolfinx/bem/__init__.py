@@ -1,0 +1,1 @@
+"""Boundary elements for bodies in the place of finite ones."""

@@ -1,1 +1,0 @@
-"""Boundary elements: the Steklov–Poincaré operator of an isotropic body on its surface."""

@@ -1,0 +1,1 @@
+"""Arrays, ranks, checks, versions of DOLFINx, times: what every room uses."""

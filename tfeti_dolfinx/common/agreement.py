@@ -1,0 +1,385 @@
+"""Whether all ranks call the same, with the same arguments: one small message at every door."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import fields, is_dataclass
+from hashlib import blake2b
+from numbers import Integral, Real
+from typing import Any
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from ufl.algorithms import extract_coefficients
+from ufl.algorithms.analysis import extract_constants
+from ufl.classes import Conj, FixedIndex, Inner, Label, MultiIndex, Product, Sum
+from ufl.corealg.traversal import unique_post_traversal
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.compat import space_of
+from tfeti_dolfinx.common.parallel import summed
+from tfeti_dolfinx.common.validation import shown
+from tfeti_dolfinx.errors import InputError, raise_together
+
+# of the largest number beside it: what differs by less was computed on processors of other kinds
+ROUNDING = 1e-10
+# numbers of an array that is described by them; a longer one may be a part that a rank holds
+FEW = 16
+# bytes of the digest in the message, after one that says whether the rank has an error
+DIGEST = 16
+
+# where objects are made that say what a user wants, and have nothing of a rank
+DESCRIPTIONS = ("tfeti_dolfinx.contact.", "tfeti_dolfinx.bem.boundary_elements")
+
+# in a name that was made from an object: that of another rank lies elsewhere
+ADDRESS = re.compile(r" at 0x[0-9a-f]+")
+
+# in an error of ranks that may be in different calls: outer calls must not talk about it again
+TOLD = "_told_to_all_ranks"
+
+
+class Absent:
+    """What stands for an entry that one of two descriptions does not have."""
+
+    def __repr__(self) -> str:
+        return "not given"
+
+
+@contextmanager
+def agreeing(comm: MPI.Intracomm, call: str) -> Iterator[dict[str, Any]]:
+    """Raise on all ranks unless all make the same call, with the same arguments. Collective.
+
+    Every public collective call begins with this. Its message has one size, 17 bytes, so ranks that
+    make different calls meet in it, and none of them waits for ever; where they differ, or a rank
+    has an error, they say more. On one rank there is no message.
+
+    The block checks what its rank was given, and puts it into the dictionary, by name; it must not
+    communicate but by calls that begin like this one. An exception of any rank in it is raised on
+    all: that of the lowest rank that has one.
+
+    Args:
+        comm: Communicator.
+        call: Name of the call.
+
+    Raises:
+        InputError: Another rank makes another call, or was given something else.
+    """
+    given: dict[str, Any] = {}
+    if comm.size == 1:
+        yield given
+        return
+    error: Exception | None = None
+    told: dict[str, Any] = {}
+    try:
+        yield given
+        told = {name: described(value) for name, value in given.items()}
+    except Exception as caught:
+        if TOLD in vars(caught):
+            raise
+        error = caught
+    message = np.zeros(1 + DIGEST, dtype=np.uint8)
+    message[0] = error is not None
+    digest = blake2b(repr((call, told)).encode(), digest_size=DIGEST).digest()
+    message[1:] = np.frombuffer(digest, dtype=np.uint8)
+    all_messages = np.empty((comm.size, 1 + DIGEST), dtype=np.uint8)
+    comm.Allgather(message, all_messages)
+    if np.any(all_messages[:, 0]):
+        _raise_everywhere(comm, error, int(np.argmax(all_messages[:, 0])))
+    if np.any(all_messages != all_messages[0]):
+        different = _difference_of_ranks(comm.allgather((call, told)))
+        if different is not None:
+            _raise_everywhere(comm, InputError(different), 0)
+
+
+def _raise_everywhere(comm: MPI.Intracomm, error: Exception | None, raiser: int) -> None:
+    try:
+        raise_together(comm, error, raiser)
+    except Exception as found:
+        vars(found)[TOLD] = True
+        raise
+
+
+def _difference_of_ranks(all_told: list[tuple[str, dict[str, Any]]]) -> str | None:
+    """How the first rank that differs does so from rank 0; None where it is rounding."""
+    first, expected = all_told[0]
+    for rank, (call, told) in enumerate(all_told):
+        if call != first:
+            return (
+                f"rank {rank} has called {call} where rank 0 has called {first}; expected the same "
+                "calls on all ranks"
+            )
+        if (found := difference(told, expected)) is not None:
+            what, own, there = found
+            return (
+                f"{what} is {brief(own)} on rank {rank} and {brief(there)} on rank 0; expected the "
+                "same on all ranks"
+            )
+    return None
+
+
+def described(value: Any) -> Any:
+    """Describe what a user gave, alike on all ranks that were given the same. Not collective.
+
+    Numbers and texts are themselves, forms and expressions a hash of their structure with the
+    values of constants, objects of this package their attributes. Functions on the mesh and
+    conditions are described without what a rank has of them, callables by their names, all else by
+    its type.
+
+    Args:
+        value: Anything.
+
+    Returns:
+        Numbers, texts and None, lists and dictionaries of them, as JSON takes them.
+    """
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, str):
+        return ADDRESS.sub("", value)
+    if value is None or isinstance(value, bool):
+        return value
+    if isinstance(value, Real):
+        return int(value) if isinstance(value, Integral) else float(value)
+    for kind, describe in KINDS:
+        if isinstance(value, kind):
+            return describe(value)
+    if type(value).__module__.startswith(DESCRIPTIONS):
+        return {"type": type(value).__qualname__, **_attributes(value)}
+    if callable(value):
+        name = getattr(value, "__qualname__", type(value).__qualname__)
+        return {"type": f"the callable {name}"}
+    return {"type": type(value).__qualname__}
+
+
+def _attributes(value: Any) -> dict[str, Any]:
+    names = [f.name for f in fields(value)] if is_dataclass(value) else list(vars(value))
+    return {name: described(getattr(value, name)) for name in names if not name.startswith("_")}
+
+
+def _of_array(values: Array) -> Any:
+    if values.size <= FEW:
+        return described(values.tolist())
+    return {"type": f"array of {values.dtype} with {values.ndim} axes"}
+
+
+def _of_form(form: ufl.Form) -> dict[str, Any]:
+    constants, functions = form.constants(), form.coefficients()
+    integrals = [
+        _hash(
+            integral.integral_type(),
+            str(integral.subdomain_id()),
+            str(sorted(integral.metadata().items())),
+            _structure(integral.integrand(), constants, functions),
+        )
+        for integral in form.integrals()
+    ]
+    return {
+        "type": "Form",
+        "structure": _hash(*sorted(integrals)),
+        **_values(constants, functions),
+        "subdomain_data": [type(i.subdomain_data()).__qualname__ for i in form.integrals()],
+    }
+
+
+def _of_expression(expression: ufl.core.expr.Expr) -> dict[str, Any]:
+    constants, functions = extract_constants(expression), extract_coefficients(expression)
+    structure = _structure(expression, constants, functions)
+    return {"type": "expression", "structure": structure, **_values(constants, functions)}
+
+
+def _structure(expression: Any, constants: Any, functions: Any) -> str:
+    """A hash of an expression; empty where UFL does not know a part, which other checks name.
+
+    UFL's own signature depends on the order of operands that commute, and UFL sorts constants by
+    texts with counters in them, which on another rank may have one digit more.
+    """
+    numbers: defaultdict[Any, int] = defaultdict(int)  # all meshes are 0
+    for items in (constants, functions):
+        numbers.update({item: k for k, item in enumerate(items)})
+    known: dict[Any, str] = {}
+    with suppress(Exception):
+        for part in unique_post_traversal(expression):
+            operands = [known[operand] for operand in part.ufl_operands]
+            if isinstance(part, Conj):  # UFL puts one where it turns an inner product round
+                known[part] = operands[0]
+                continue
+            if isinstance(part, (Sum, Product, Inner)):
+                operands.sort()
+            if isinstance(part, MultiIndex):
+                operands = [str(int(i)) if isinstance(i, FixedIndex) else "free" for i in part]
+            elif part._ufl_is_terminal_ and not isinstance(part, Label):
+                operands = [str(part._ufl_signature_data_(numbers))]
+            known[part] = _hash(type(part).__name__, *operands)
+    return known.get(expression, "")
+
+
+def _hash(*texts: str) -> str:
+    return blake2b("\n".join(texts).encode(), digest_size=8).hexdigest()
+
+
+def _values(constants: Any, functions: Any) -> dict[str, Any]:
+    """Values of constants, and the kinds of functions; UFL's own have none."""
+    return {
+        "constants": [
+            described(c) if isinstance(c, fem.Constant) else type(c).__qualname__ for c in constants
+        ],
+        "functions": [
+            described(f) if isinstance(f, fem.Function) else type(f).__qualname__ for f in functions
+        ],
+    }
+
+
+def _of_function(function: fem.Function) -> dict[str, Any]:
+    return {"type": f"Function of {function.function_space.ufl_element()}"}
+
+
+def _of_condition(condition: fem.DirichletBC) -> dict[str, Any]:
+    value = condition.g
+    is_function = hasattr(value, "x")
+    return {
+        "type": "DirichletBC",
+        "component": [int(i) for i in space_of(condition).component()],
+        "value": {"type": "Function"} if is_function else np.asarray(value.value).tolist(),
+    }
+
+
+# in their order: a function is an expression, too
+KINDS: tuple[tuple[Any, Callable[[Any], Any]], ...] = (
+    (np.ndarray, _of_array),
+    (os.PathLike, os.fspath),
+    (Mapping, lambda value: {str(key): described(item) for key, item in value.items()}),
+    ((list, tuple), lambda value: [described(item) for item in value]),
+    (fem.Constant, lambda value: np.asarray(value.value).tolist()),
+    (fem.Function, _of_function),
+    (ufl.Form, _of_form),
+    (ufl.core.expr.Expr, _of_expression),
+    (fem.DirichletBC, _of_condition),
+)
+
+
+def difference(found: Any, expected: Any, what: str = "") -> tuple[str, Any, Any] | None:
+    """Find the first part in which two descriptions differ by more than rounding.
+
+    Args:
+        found: What ``described`` returned.
+        expected: The same of another rank, or of another run.
+        what: Name of the part.
+
+    Returns:
+        The name of that part, what it is, and what it is in ``expected``; None if there is none.
+    """
+    if isinstance(found, dict) and isinstance(expected, dict):
+        beside = f"{what}: " if what else ""
+        names = [*expected, *(name for name in found if name not in expected)]
+        parts = [(f"{beside}{n}", found.get(n, Absent()), expected.get(n, Absent())) for n in names]
+    elif isinstance(found, list) and isinstance(expected, list):
+        if _is_rounding(found, expected):
+            return None
+        if len(found) != len(expected):
+            return f"the number of {what}", len(found), len(expected)
+        parts = [
+            (f"{what}[{k}]", *both) for k, both in enumerate(zip(found, expected, strict=True))
+        ]
+    else:
+        return None if _is_rounding([found], [expected]) else (what, found, expected)
+    for name, one, other in parts:
+        if (deeper := difference(one, other, name)) is not None:
+            return deeper
+    return None
+
+
+def _is_rounding(found: list[Any], expected: list[Any]) -> bool:
+    """Whether two lists are the same, but for what is rounding beside their largest number."""
+    if repr(found) == repr(expected):
+        return True
+    numbers = [*found, *expected]
+    if len(found) != len(expected) or not all(_is_number(value) for value in numbers):
+        return False
+    size = max(abs(value) for value in numbers)
+    return math.isfinite(size) and all(
+        abs(one - other) <= ROUNDING * size for one, other in zip(found, expected, strict=True)
+    )
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool))
+
+
+def brief(value: Any) -> str:
+    """A description for a message."""
+    if isinstance(value, dict) and "type" in value:
+        return f"a {value['type']}" if not value["type"].startswith("the ") else value["type"]
+    return repr(value) if isinstance(value, Absent) else shown(value)
+
+
+def sums_of(comm: MPI.Intracomm, arrays: list[Array]) -> list[list[Any]]:
+    """Return what tells fields apart, however they are shared out: one reduction. Collective.
+
+    Args:
+        comm: Communicator.
+        arrays: Values that this rank has of each field.
+
+    Returns:
+        Of each field [[Σx, Σ|x|], Σ√|x|] over all ranks: two of a size, and one that knows how the
+        magnitudes are spread, and does not overflow.
+    """
+    sums = np.zeros((len(arrays), 3))
+    for row, x in zip(sums, arrays, strict=True):
+        size = np.abs(x)
+        row[:] = x.sum(), size.sum(), np.sqrt(size).sum()
+    return [[row[:2].tolist(), float(row[2])] for row in summed(comm, sums)]
+
+
+def fields_in(given: Mapping[str, Any]) -> dict[str, Array]:
+    """Find this rank's values of the functions on the mesh in what a user gave, by names.
+
+    Args:
+        given: Forms, conditions, contacts, thickness and mass, by their names.
+    """
+    found: dict[str, Array] = {}
+    for name, value in given.items():
+        for k, function in enumerate(_functions(value)):
+            found[f"{name}: function {k}"] = function.x.array
+    return found
+
+
+def _functions(value: Any) -> list[Any]:
+    if isinstance(value, fem.Function):
+        return [value]
+    if isinstance(value, ufl.Form):
+        return list(value.coefficients())
+    if isinstance(value, ufl.core.expr.Expr):
+        return list(extract_coefficients(value))
+    if isinstance(value, fem.DirichletBC):
+        return [value.g] if hasattr(value.g, "x") else []
+    if isinstance(value, Mapping):
+        value = list(value.values())
+    elif type(value).__module__.startswith(DESCRIPTIONS):
+        value = list(vars(value).values())
+    return (
+        [f for item in value for f in _functions(item)] if isinstance(value, (list, tuple)) else []
+    )
+
+
+def check_same_problem(kept: Mapping[str, Any], found: Mapping[str, Any]) -> None:
+    """Raise unless a problem is that of an earlier run. Not collective.
+
+    Args:
+        kept: What ``ContactProblem.digest`` returned there, the same on all ranks.
+        found: What it returns here, at the same place of the series.
+
+    Raises:
+        InputError: It is not; the message names the first difference.
+    """
+    if (different := difference(dict(found), dict(kept))) is not None:
+        what, now, before = different
+        raise InputError(
+            f"{what} is {brief(now)}, and was {brief(before)} when the checkpoint was written; "
+            "expected the same problem, in which apply sets the same at the same time"
+        )

@@ -1,0 +1,157 @@
+"""The only place that knows versions of DOLFINx (0.9 to 0.11) and of PETSc."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Sequence
+from typing import Any
+
+import basix.ufl
+import dolfinx
+import numpy as np
+from dolfinx import fem, graph, la
+from dolfinx import mesh as dmesh
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.errors import InputError
+
+try:  # 0.10 renamed the module
+    from dolfinx.io import gmsh as _gmshio
+except ImportError:
+    from dolfinx.io import gmshio as _gmshio
+
+
+DOLFINX_VERSION = dolfinx.__version__  # a wheel may have another name than fenics-dolfinx
+# a compile by another rank or run may take longer than DOLFINx's 10 seconds
+JIT_OPTIONS = {"timeout": 300}
+
+
+def petsc_scalar_type() -> Any:
+    """The numpy type of PETSc's scalars."""
+    return PETSc.ScalarType
+
+
+def require_real_petsc() -> None:
+    """Raise unless PETSc was built for real numbers."""
+    if np.issubdtype(petsc_scalar_type(), np.complexfloating):
+        raise InputError(
+            "this PETSc is built for complex numbers; contact needs a real build "
+            "(Debian: python3-petsc4py-real, conda: petsc=*=real_*)"
+        )
+
+
+def is_read(option: str) -> bool:
+    """Return whether PETSc has asked for an option of its database.
+
+    Args:
+        option: Its name with its prefix, without the dash.
+    """
+    database = PETSc.Options()
+    if hasattr(database, "used"):
+        return bool(database.used(option))
+    read = ctypes.c_int(0)  # petsc4py older than 3.24 does not tell, its library does
+    if ctypes.CDLL(PETSc.__file__).PetscOptionsUsed(None, option.encode(), ctypes.byref(read)):
+        raise RuntimeError(f"PetscOptionsUsed failed for -{option}")
+    return bool(read.value)
+
+
+def cell_permutation(cell_type: dmesh.CellType, num_nodes: int) -> Array:
+    """Permutation ``p`` from gmsh's node order: ``dolfinx_cell[i] = gmsh_cell[p[i]]``."""
+    return np.asarray(_gmshio.cell_perm_array(cell_type, num_nodes))
+
+
+def coordinate_element(cell_type: dmesh.CellType, degree: int, gdim: int) -> Any:
+    """Lagrange coordinate element with equispaced points, as gmsh numbers them."""
+    return basix.ufl.element(
+        "Lagrange",
+        cell_type.name,
+        degree,
+        basix.LagrangeVariant.equispaced,
+        shape=(gdim,),
+    )
+
+
+def create_mesh_in_place(comm: MPI.Intracomm, cells: Array, x: Array, element: Any) -> dmesh.Mesh:
+    """A mesh whose cells stay on the rank that gives them. Collective.
+
+    This is the one call of DOLFINx's partitioner hook.
+
+    Args:
+        comm: Communicator of the mesh.
+        cells: Global node indices of this rank's cells, shape ``(n, nodes_per_cell)``.
+        x: Coordinates of this rank's chunk of the nodes, shape ``(p, gdim)``.
+        element: Coordinate element.
+    """
+
+    def stay(*_: Any) -> Any:
+        destinations = np.full(len(cells), comm.rank, dtype=np.int32)
+        lists = graph.adjacencylist(destinations, np.arange(len(cells) + 1, dtype=np.int32))
+        return getattr(lists, "_cpp_object", lists)
+
+    return dmesh.create_mesh(comm, cells=cells, x=x, e=element, partitioner=stay)
+
+
+def geometry_dofmap(mesh: dmesh.Mesh) -> Array:
+    """Geometry nodes of the local cells, shape ``(num_cells, nodes_per_cell)``."""
+    geometry = mesh.geometry
+    return np.asarray(geometry.dofmaps[0] if hasattr(geometry, "dofmaps") else geometry.dofmap)
+
+
+def geometry_degree(mesh: dmesh.Mesh) -> int:
+    """Degree of the coordinate element: 1 on straight cells."""
+    geometry = mesh.geometry
+    return int((geometry.cmaps[0] if hasattr(geometry, "cmaps") else geometry.cmap).degree)
+
+
+def original_cells(mesh: dmesh.Mesh) -> Array:
+    """Ids of the local cells before DOLFINx moved them; of a submesh their global indices."""
+    topology = mesh.topology
+    try:
+        return np.asarray(topology.original_cell_index, dtype=np.int64)
+    except RuntimeError:  # a submesh has none
+        cells = topology.index_map(topology.dim)
+        here = np.arange(cells.size_local + cells.num_ghosts, dtype=np.int32)
+        return np.asarray(cells.local_to_global(here), dtype=np.int64)
+
+
+def interpolation_points(V: fem.FunctionSpace) -> Array:
+    """Points of the reference cell at which the element of ``V`` is interpolated."""
+    points = V.element.interpolation_points
+    return np.asarray(points() if callable(points) else points)
+
+
+def first_component(V: fem.FunctionSpace) -> tuple[fem.FunctionSpace, Array]:
+    """Space of the first component of a blocked space, and the dof of ``V`` of each of its dofs."""
+    S, parent = V.sub(0).collapse()
+    # 0.11 wraps the map in a list; without cells it is empty, and numpy's type would be float
+    return S, np.ravel(parent).astype(np.int64)
+
+
+def assemble_csr(form: fem.Form) -> Any:
+    """This rank's diagonal block of a bilinear form, as a scipy CSR matrix.
+
+    Needs a mesh whose vertices are never shared between ranks, so nothing is communicated.
+    """
+    A = fem.create_matrix(form, la.BlockMode.expanded)
+    fem.assemble_matrix(A, form)
+    return A.to_scipy()
+
+
+def space_of(bc: fem.DirichletBC) -> Any:
+    """C++ space of a Dirichlet condition."""
+    space = bc.function_space
+    return getattr(space, "_cpp_object", space)
+
+
+def prescribed_values(bcs: Sequence[fem.DirichletBC], size: int) -> Array:
+    """Values that the boundary conditions prescribe, NaN elsewhere; one row per condition.
+
+    Returns:
+        Array of shape ``(len(bcs), size)``, ``size`` the number of local unrolled dofs.
+    """
+    values = np.full((len(bcs), size), np.nan)
+    for row, bc in zip(values, bcs, strict=True):
+        bc.set(row)
+    return values

@@ -1,0 +1,107 @@
+"""Rows of arrays that travel between ranks."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import numpy as np
+from mpi4py import MPI
+
+from tfeti_dolfinx.common.arrays import Array
+
+T = TypeVar("T")
+
+
+def bcast_from_root(comm: MPI.Intracomm, value: T) -> T:
+    """Rank 0's value on every rank. Collective.
+
+    For what steers collective calls: processors of different kinds may round differently, and
+    ranks that decide by their own floats may part ways.
+    """
+    return comm.bcast(value, root=0)
+
+
+def any_rank(comm: MPI.Intracomm, flag: bool) -> bool:
+    """Whether a flag is set on some rank. Collective."""
+    return bool(comm.allreduce(bool(flag), op=MPI.LOR))
+
+
+def summed(comm: MPI.Intracomm, values: Array) -> Array:
+    """Sums of all ranks' values, entry by entry, in their place: one reduction. Collective."""
+    comm.Allreduce(MPI.IN_PLACE, values, op=MPI.SUM)
+    return values
+
+
+def norm_over(comm: MPI.Intracomm, x: Array) -> float:
+    """‖x‖ of a vector that is spread over ranks, the same on each. Collective."""
+    return bcast_from_root(comm, float(np.sqrt(summed(comm, np.array([x @ x]))[0])))
+
+
+def largest(comm: MPI.Intracomm, x: Array) -> float:
+    """Largest modulus of a vector that is spread over ranks, 0 if it is empty. Collective."""
+    return float(comm.allreduce(float(np.abs(x).max(initial=0.0)), op=MPI.MAX))
+
+
+class Exchange:
+    """Rows that travel to other ranks, and answers that travel back.
+
+    The communication pattern is found once; any number of arrays may follow it.
+
+    Args:
+        comm: Communicator. The constructor and both methods are collective.
+        destination: Rank that each row goes to, shape ``(n,)``.
+
+    Attributes:
+        source: Rank that each received row comes from, shape ``(m,)``, ascending.
+    """
+
+    def __init__(self, comm: MPI.Intracomm, destination: Array) -> None:
+        self._comm = comm
+        self._order = np.argsort(destination, kind="stable")
+        self._sent = np.bincount(destination, minlength=comm.size).astype(np.int64)
+        self._received = np.empty_like(self._sent)
+        comm.Alltoall(self._sent, self._received)
+        self.source = np.repeat(np.arange(comm.size), self._received)
+
+    def send(self, rows: Array) -> Array:
+        """Send ``rows`` (first axis of length n) and return the rows received (m of them)."""
+        return self._travel(np.asarray(rows)[self._order], self._sent, self._received)
+
+    def answer(self, rows: Array) -> Array:
+        """Send one row back for each received row; returns them in the order first sent."""
+        back = self._travel(np.asarray(rows), self._received, self._sent)
+        answers = np.empty_like(back)
+        answers[self._order] = back
+        return answers
+
+    def _travel(self, rows: Array, sent: Array, received: Array) -> Array:
+        rows = np.ascontiguousarray(rows)
+        out = np.empty((int(received.sum()), *rows.shape[1:]), dtype=rows.dtype)
+        width = int(np.prod(rows.shape[1:], dtype=np.int64)) * rows.dtype.itemsize
+        row_type = MPI.BYTE.Create_contiguous(width).Commit()
+        self._comm.Alltoallv([rows, sent, row_type], [out, received, row_type])
+        row_type.Free()
+        return out
+
+
+def offset_of(comm: MPI.Intracomm, size: int) -> int:
+    """First global index of this rank's chunk of ``size`` (exclusive prefix sum). Collective."""
+    return int(comm.scan(size)) - size
+
+
+def owner_of(offsets: Array, index: Array) -> Array:
+    """Rank whose chunk holds each global index; ``offsets`` has comm.size + 1 entries."""
+    return np.searchsorted(offsets, index, side="right") - 1
+
+
+def chunk_offsets(comm: MPI.Intracomm, size: int) -> Array:
+    """Offsets of all ranks' chunks, shape ``(comm.size + 1,)``. Collective."""
+    return np.concatenate(([0], np.cumsum(comm.allgather(size)))).astype(np.int64)
+
+
+def box_over_ranks(comm: MPI.Intracomm, x: Array) -> tuple[Array, Array]:
+    """Lowest and highest coordinates of all ranks' points, shapes ``(gdim,)``. Collective."""
+    low, high = x.min(axis=0, initial=np.inf), x.max(axis=0, initial=-np.inf)
+    comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
+    comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
+    return low, high

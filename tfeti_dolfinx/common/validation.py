@@ -1,0 +1,288 @@
+"""Checks of what is given, and parameters that say once what they are."""
+
+from __future__ import annotations
+
+import math
+import reprlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import Field, dataclass, field, fields, is_dataclass
+from numbers import Integral, Real
+from os import PathLike
+from pathlib import Path
+from typing import Any, TypeGuard
+
+import numpy as np
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.errors import InputError, TfetiError
+
+# --- Checks of what users give: values, types, and what their callables raise -----------------
+
+
+@dataclass(frozen=True)
+class Range:
+    """Which numbers fit, and how a message says it."""
+
+    text: str
+    holds: Callable[[float], bool]
+
+
+FINITE = Range("a finite number", lambda value: True)
+POSITIVE = Range("a positive number", lambda value: value > 0.0)
+
+
+def shown(value: Any) -> str:
+    """A value for a message: short, and of objects their type only."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or isinstance(value, (bool, str, Real, list, tuple, dict)):
+        return reprlib.repr(value)
+    if isinstance(value, np.ndarray):
+        return f"an array of shape {value.shape}"
+    if isinstance(value, type):
+        return f"the class {value.__qualname__}"
+    return f"a {type(value).__qualname__}"
+
+
+def is_whole(value: Any) -> TypeGuard[int]:
+    """Whether a value is an integer, numpy's included; True and False are none."""
+    return isinstance(value, Integral) and not isinstance(value, (bool, np.bool_))
+
+
+def checked_number(value: Any, what: str, expected: Range = FINITE) -> float:
+    """A finite number in a range; numpy's scalars are numbers, booleans and texts are none.
+
+    Args:
+        value: What was given.
+        what: Its name in messages.
+        expected: The range.
+
+    Raises:
+        InputError: It is not a number, not finite, or out of the range.
+    """
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value.item()
+    number = isinstance(value, Real) and not isinstance(value, (bool, np.bool_))
+    if not number or not math.isfinite(value) or not expected.holds(float(value)):
+        raise InputError(f"{what}={shown(value)}: expected {expected.text}")
+    return float(value)
+
+
+def real_numbers(values: Any) -> Array:
+    """What a user's function has returned as floats; of complex numbers no part is dropped.
+
+    Raises:
+        TypeError: They are no real numbers.
+        ValueError: They are texts.
+    """
+    array = np.asarray(values)
+    if np.iscomplexobj(array):
+        raise TypeError("complex numbers; expected real ones")
+    return np.asarray(array, dtype=float)
+
+
+def checked_flag(value: Any, what: str) -> bool:
+    """A boolean, or numpy's.
+
+    Raises:
+        InputError: It is anything else.
+    """
+    if not isinstance(value, (bool, np.bool_)):
+        raise InputError(f"{what}={shown(value)}: expected True or False")
+    return bool(value)
+
+
+def checked_type(value: Any, kinds: type | tuple[type, ...], what: str, expected: str) -> None:
+    """Raise unless a value is of some type.
+
+    Raises:
+        InputError: ``<what> is <value>; expected <expected>``.
+    """
+    if not isinstance(value, kinds):
+        raise InputError(f"{what} is {shown(value)}; expected {expected}")
+
+
+def checked_callable(value: Any, what: str, expected: str) -> None:
+    """Raise unless a value can be called.
+
+    Raises:
+        InputError: It cannot.
+    """
+    if not callable(value):
+        raise InputError(f"{what} is {shown(value)}; expected {expected}")
+
+
+def checked_path(path: Any, suffix: str) -> Path:
+    """A file's name with this ending.
+
+    Raises:
+        InputError: It is no name, or ends otherwise.
+    """
+    expected = f"a name that ends with {suffix}"
+    checked_type(path, (str, PathLike), "path", expected)
+    target = Path(path)
+    if target.suffix != suffix:
+        raise InputError(f"{target}: expected {expected}")
+    return target
+
+
+@contextmanager
+def named(what: str, *kinds: type[Exception]) -> Iterator[None]:
+    """Name what failed: errors of the given kinds (default all) become an InputError.
+
+    Not collective; errors of this package stay as they are.
+
+    Args:
+        what: Begins the message.
+        kinds: Types of errors.
+    """
+    try:
+        yield
+    except TfetiError:
+        raise
+    except Exception as error:
+        if kinds and not isinstance(error, kinds):
+            raise
+        raise InputError(f"{what}: {type(error).__name__}: {error}") from error
+
+
+# --- Parameters that say once what they are: default, range, text, symbol, name as an option ---
+
+FROM_0 = Range("0 or more", lambda value: value >= 0.0)
+FROM_1 = Range("1 or more", lambda value: value >= 1.0)
+ABOVE_0 = Range("more than 0", lambda value: value > 0.0)
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a parameter is.
+
+    Attributes:
+        algorithm: Whose it is.
+        text: What it does.
+        choices: Its values, if they are few.
+        fits: Range of a number.
+        words: What may stand in the place of a number.
+        name: Name on the command line, if it is not the field's.
+        symbol: Letter in the literature and in docs/notation.md.
+        kind: Type of its values, if it is not the default's.
+    """
+
+    algorithm: str
+    text: str
+    choices: tuple[str, ...] = ()
+    fits: Range = FINITE
+    words: tuple[str, ...] = ()
+    name: str = ""
+    symbol: str = ""
+    kind: type | None = None
+
+
+def described(default: Any, algorithm: str, text: str, **more: Any) -> Any:
+    """A field of a dataclass of parameters.
+
+    Args:
+        default: Its default, which says its type too.
+        algorithm: Whose it is.
+        text: What it does.
+        **more: What else ``Description`` has.
+    """
+    return field(default=default, metadata={"is": Description(algorithm, text, **more)})
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A described field, found in a dataclass or in one that is part of it.
+
+    Attributes:
+        name: Name on the command line.
+        default: Its default.
+        description: What it is.
+        path: Names of the attributes that lead to it.
+    """
+
+    name: str
+    default: Any
+    description: Description
+    path: tuple[str, ...]
+
+    def value_in(self, parameters: Any) -> Any:
+        """Its value in an object of the dataclass."""
+        for attribute in self.path:
+            parameters = getattr(parameters, attribute)
+        return parameters
+
+
+def parameters_of(kind: type, path: tuple[str, ...] = ()) -> Iterator[Parameter]:
+    """All parameters of a dataclass, those of dataclasses in it included, in their order."""
+    for f in fields(kind):
+        if is_dataclass(f.default):
+            yield from parameters_of(type(f.default), (*path, f.name))
+        else:
+            about = _description(f)
+            yield Parameter(about.name or f.name, f.default, about, (*path, f.name))
+
+
+def made(kind: type, values: dict[str, Any]) -> Any:
+    """An object of a dataclass of parameters from values by their names on the command line."""
+    given: dict[str, Any] = {}
+    for f in fields(kind):
+        if is_dataclass(f.default):
+            given[f.name] = made(type(f.default), values)
+        elif (name := _description(f).name or f.name) in values:
+            given[f.name] = values[name]
+    return kind(**given)
+
+
+def _description(f: Field[Any]) -> Description:
+    description: Description = f.metadata["is"]
+    return description
+
+
+# --- Is a subdomain's stiffness symmetric, are its load and stiffness finite? -----------------
+
+# Largest entry of K − Kᵀ over that of K: far above what rounding of assembly leaves, far below any
+# term of a form that matters.
+SYMMETRY = 1e-8
+
+
+def check_stiffness(
+    name: str, K: Any, what: str = "the stiffness", form: str = "a linear elastic form"
+) -> None:
+    """Raise if a stiffness is not finite, not symmetric or has a diagonal entry of 0 or less.
+
+    Args:
+        name: Whose it is.
+        K: The matrix.
+        what: What it is called.
+        form: What it should come from.
+
+    Raises:
+        InputError: It says which of them.
+    """
+    if not np.all(np.isfinite(K.data)):
+        raise InputError(f"{name}: {what} has entries that are not finite")
+    scale = np.abs(K.data).max(initial=0.0)
+    skew = np.abs((K - K.T).data).max(initial=0.0)
+    if skew > SYMMETRY * scale:
+        raise InputError(
+            f"{name}: {what} is not symmetric (|K − Kᵀ| = {skew:.3g}, |K| = {scale:.3g}); "
+            f"expected {form}"
+        )
+    lowest = K.diagonal().min(initial=np.inf)
+    if lowest <= 0.0:
+        raise InputError(
+            f"{name}: {what} has a diagonal entry {lowest:.3g}; "
+            f"expected {form}, positive on all unknowns"
+        )
+
+
+def check_load(name: str, f: Array) -> None:
+    """Raise if a load is not finite.
+
+    Raises:
+        InputError: It says how many entries are not.
+    """
+    if not np.all(np.isfinite(f)):
+        raise InputError(f"{name}: the load has {np.sum(~np.isfinite(f))} entries not finite")

@@ -1,0 +1,1 @@
+"""Rows of B and their right sides: interfaces, Dirichlet conditions, contact."""

@@ -1,0 +1,220 @@
+"""Forces, gaps, slips and statuses of conditions at a solution."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.constraints.gluing import Gluing
+from tfeti_dolfinx.contact.forces import condition_areas, nodal_forces
+from tfeti_dolfinx.contact.records import position_of, remaining_gaps, slips
+from tfeti_dolfinx.contact.search import ContactPartner
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mortar.surfaces import group_points
+from tfeti_dolfinx.qp.sets import Face
+
+# --- States of contacts and of rows at a solution ---------------------------------------------
+
+
+class ContactStatus(IntEnum):
+    """Status of a node.
+
+    OPEN: no normal force. TOUCHING: one, and no friction there. SLIP, STICK: one, with friction at
+    its bound, and below it. A node whose normal displacement is prescribed slips or sticks.
+    """
+
+    NONE = 0
+    OPEN = 1
+    TOUCHING = 2
+    SLIP = 3
+    STICK = 4
+
+
+@dataclass(frozen=True)
+class ContactData:
+    """State of the conditions of one contact on this rank, one row per node.
+
+    A node is on one rank only: sums over all ranks are those of the contact.
+
+    Attributes:
+        points: Nodes where they were before the deformation, shape ``(n, 3)``.
+        normal: Direction in which a node may not go further, of unit length, out of its body:
+            the contact pushes it with −force·normal, shape ``(n, gdim)``.
+        force: Normal force on the node, 0 or more, shape ``(n,)``.
+        pressure: Force over area, shape ``(n,)``.
+        area: ∫φ_i of the node's hat over the surface, of a pair over what the other side covers,
+            times the thickness, shape ``(n,)``.
+        gap: Remaining distance, shape ``(n,)``.
+        status: ContactStatus: OPEN without a normal force, else TOUCHING; with friction SLIP or
+            STICK, shape ``(n,)``.
+        tangential_traction: Friction on the node over the area, a vector, shape ``(n, gdim)``.
+        slip: Displacement along the surface, against what the node meets, since the load step
+            began (``ContactProblem.accept``), a vector, shape ``(n, gdim)``.
+    """
+
+    points: Array
+    normal: Array
+    force: Array
+    pressure: Array
+    area: Array
+    gap: Array
+    status: Array
+    tangential_traction: Array
+    slip: Array
+
+
+# --- The state of all contact conditions at a solution: forces, gaps, slips, and what they do ---
+
+
+@dataclass(frozen=True)
+class Multipliers:
+    """Multipliers of this rank's rows.
+
+    Attributes:
+        lam: λ, shape ``(m,)``.
+        face: Which of them carry a force, and which slip.
+    """
+
+    lam: Array
+    face: Face
+
+
+class ContactState:
+    """Displacement, multipliers, and what follows for the contact conditions of this rank.
+
+    Args:
+        u: Displacement in primal order, shape ``(num_nodes * bs,)``.
+        multipliers: Multipliers of this rank's rows.
+        decomposition: The torn mesh.
+        gluing: Rows and contact records.
+        contacts: Obstacles and pairs, the secondary surface of a pair first.
+        thickness: What areas of the mesh are multiplied with, a number or a scalar in UFL.
+    """
+
+    def __init__(
+        self,
+        u: Array,
+        multipliers: Multipliers,
+        decomposition: Decomposition,
+        gluing: Gluing,
+        contacts: Sequence[ContactPartner],
+        thickness: Any,
+    ) -> None:
+        self.u, self.lam = u, multipliers.lam
+        self.carrying, self.holding = multipliers.face.carrying, multipliers.face.holding
+        self.decomposition, self.gluing, self.dofs = decomposition, gluing, gluing.dofs
+        self.contacts, self.thickness = list(contacts), thickness
+
+    def contact(self, which: int | str = 0) -> ContactData:
+        """State of the nodes of a contact, those that this rank owns. Collective.
+
+        Args:
+            which: Position in the list of contacts, or name.
+
+        Raises:
+            InputError: There is no such contact, or several have the name.
+        """
+        records = self.gluing.records
+        own = records.contact == position_of(self.contacts, which)
+        area = self.area[:, None]
+        traction = np.divide(
+            self.tangential_force, area, out=0.0 * self.tangential_force, where=area > 0.0
+        )
+        return ContactData(
+            points=group_points(self.dofs)[records.group[own]],
+            normal=records.normal[own],
+            force=self.force[own],
+            pressure=self.contact_pressure[own],
+            area=self.area[own],
+            gap=self.remaining_gap[own],
+            status=self.status_of_conditions[own],
+            tangential_traction=traction[own],
+            slip=self.slip_of_conditions[own],
+        )
+
+    @cached_property
+    def force(self) -> Array:
+        """Normal force s_i λ_i of each contact condition of this rank, 0 without a row."""
+        rows = self.gluing.contact
+        force = np.zeros(len(self.gluing.records))
+        force[rows.condition] = rows.scale * self.lam[self.gluing.constraints.sets.normals]
+        return force
+
+    @cached_property
+    def tangential_force(self) -> Array:
+        """Friction on the node of each contact condition of this rank, shape ``(n, gdim)``."""
+        rows, records = self.gluing.tangents, self.gluing.records
+        lam = self.lam[self.gluing.constraints.sets.tangents]
+        force = np.zeros(records.normal.shape)
+        along = np.einsum("tk,tkg->tg", lam, rows.tangents)
+        force[rows.condition] = -rows.scale[:, None] * along
+        return force
+
+    @cached_property
+    def contact_pressure(self) -> Array:
+        """Force over area of each contact condition of this rank. Collective at first use."""
+        return np.divide(self.force, self.area, out=0.0 * self.force, where=self.area > 0.0)
+
+    @cached_property
+    def area(self) -> Array:
+        """∫φ_i times the thickness of each contact condition of this rank. Collective at first use.
+
+        Where a pair covers a part of the node's surface, the thickness is its mean over the whole.
+        """
+        records, of = self.gluing.records, self.decomposition
+        return condition_areas(records, self.dofs, of, self.secondary_surfaces, self.thickness)
+
+    @cached_property
+    def remaining_gap(self) -> Array:
+        """Gap after deformation of each contact condition of this rank. Collective at first use."""
+        return remaining_gaps(self.gluing.records, self.dofs, self.u)
+
+    @cached_property
+    def slip_of_conditions(self) -> Array:
+        """How far the tangential v_i of each condition has come in this step, a vector.
+
+        Shape ``(n, gdim)``. Collective at first use.
+        """
+        records = self.gluing.records
+        slip = slips(records, self.dofs, self.u) - self.gluing.slip
+        return np.einsum("nt,ntg->ng", slip, records.tangents)
+
+    @cached_property
+    def dissipation(self) -> Array:
+        """What friction dissipates at each condition in this step, shape ``(n,)``.
+
+        −F·s, F the friction on the node and s its slip. Collective at first use.
+        """
+        return -np.sum(self.tangential_force * self.slip_of_conditions, axis=1)
+
+    @cached_property
+    def status_of_conditions(self) -> Array:
+        """ContactStatus of each contact condition of this rank."""
+        gluing, sets = self.gluing, self.gluing.constraints.sets
+        status = np.full(len(gluing.records), ContactStatus.OPEN)
+        touching = gluing.contact.condition[self.carrying[sets.normals]]
+        status[touching] = ContactStatus.TOUCHING
+        rows = gluing.tangents
+        held = np.all(self.holding[sets.tangents] | ~rows.moves, axis=1)
+        rubbing = np.where(held, ContactStatus.STICK, ContactStatus.SLIP)
+        closed = np.isin(rows.condition, np.concatenate((touching, gluing.contact.decided)))
+        status[rows.condition[closed]] = rubbing[closed]
+        return status
+
+    @property
+    def secondary_surfaces(self) -> list[str | int]:
+        """The surfaces whose nodes have the conditions."""
+        return [contact.surfaces[0] for contact in self.contacts]
+
+    @cached_property
+    def nodal_forces(self) -> Array:
+        """Contact forces on the owned groups, shape ``(g, gdim)``. Collective at first use."""
+        records = self.gluing.records
+        force = self.tangential_force - self.force[:, None] * records.normal
+        return nodal_forces(records, force, self.dofs)

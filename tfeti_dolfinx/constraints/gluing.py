@@ -1,0 +1,498 @@
+"""Rows that glue: interfaces, Dirichlet conditions and contact put together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from dolfinx import fem
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.compat import prescribed_values, space_of
+from tfeti_dolfinx.common.parallel import any_rank
+from tfeti_dolfinx.common.validation import checked_type, shown
+from tfeti_dolfinx.constraints.contact_rows import (
+    ContactRows,
+    TangentRows,
+    contact_rows,
+    tangent_rows,
+)
+from tfeti_dolfinx.constraints.rows import (
+    Constraints,
+    RowBuilder,
+    Rows,
+    assemble_constraints,
+    stack,
+)
+from tfeti_dolfinx.contact.records import ContactRecords
+from tfeti_dolfinx.errors import InputError, TfetiError, raised_on_all_ranks
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs, component_of, described, is_same_space
+from tfeti_dolfinx.mesh.untorn import cell_facets
+
+# --- Rows that glue torn copies together, and rows that hold prescribed components ------------
+
+
+@dataclass(frozen=True)
+class HeldRows:
+    """The equality rows that hold prescribed components; the others have right sides 0.
+
+    Attributes:
+        row: Place of each among the equality rows, shape ``(h,)``.
+        component: Component that it holds, unrolled over the owned groups, shape ``(h,)``.
+        factor: What the component is multiplied by, shape ``(h,)``.
+    """
+
+    row: Array
+    component: Array
+    factor: Array
+
+    def right_side(self, values: Array) -> Array:
+        """Right sides of these rows, from values of the owned groups, shape ``(g, bs)``."""
+        return values.ravel()[self.component] * self.factor
+
+
+def equality_rows(dofs: TornDofs, flag: Array, weights: Array) -> tuple[Rows, HeldRows]:
+    """B_E, and which of its rows hold prescribed components.
+
+    A component that is prescribed has one row per copy and no gluing rows. The k − 1 gluing
+    rows of k copies are orthonormal in the inner product of D⁻¹, D the weights; with equal
+    weights they are (1, …, 1, −j)/√(j + j²), j = 1, …, k − 1. Differences of neighbours instead
+    would have a Gram matrix of condition O(k²).
+
+    Args:
+        dofs: Dof maps.
+        flag: Which components of the owned groups are prescribed, shape ``(g, bs)``.
+        weights: D for each copy of the owned groups, shape ``(c, bs)``.
+    """
+    multiplicities = np.unique(dofs.multiplicity)
+    tables = [_glue(dofs, flag, weights, int(k)) for k in multiplicities if k > 1]
+    holding, component = _hold(dofs, flag, weights)
+    rows = stack([holding, *tables]).sorted_by_group()
+    n = len(holding)  # these rows have one entry each, and their entries come first
+    return rows, HeldRows(rows.row[:n], component, rows.value[:n])
+
+
+def _glue(dofs: TornDofs, flag: Array, weights: Array, k: int) -> Rows:
+    """Gluing rows of all free components of groups with k copies."""
+    group, component = np.nonzero((dofs.multiplicity == k)[:, None] & ~flag)
+    places = dofs.copy_offsets[group][:, None] + np.arange(k)
+    columns = dofs.copies[places] * dofs.bs + component[:, None]
+    pattern = _orthonormal(weights[places, component[:, None]])
+    n = len(group)
+    row, copy = (index.ravel() for index in np.indices((n * (k - 1), k)))
+    return Rows(
+        group=np.repeat(group, k - 1),
+        row=row,
+        column=columns[row // (k - 1), copy],
+        value=pattern.reshape(-1, k)[row, copy],
+    ).without_zeros()
+
+
+def _orthonormal(weights: Array) -> Array:
+    """Rows with zero sum, orthonormal in the inner product of diag(weights)⁻¹.
+
+    Gram–Schmidt on e_i − e_{i+1} in closed form: row j is proportional to (w_1, …, w_j, −W_j)
+    with W_j = w_1 + … + w_j.
+
+    Args:
+        weights: Positive weights, shape ``(n, k)``.
+
+    Returns:
+        Rows, shape ``(n, k - 1, k)``.
+    """
+    k = weights.shape[1]
+    sums = np.cumsum(weights, axis=1)
+    rows = np.tril(np.ones((k - 1, k))) * weights[:, None, :]
+    j = np.arange(k - 1)
+    rows[:, j, j + 1] = -sums[:, :-1]
+    norms = sums[:, :-1] + sums[:, :-1] ** 2 / weights[:, 1:]
+    return rows / np.sqrt(norms)[:, :, None]
+
+
+def _hold(dofs: TornDofs, flag: Array, weights: Array) -> tuple[Rows, Array]:
+    """One row with one entry per copy and prescribed component, and the components."""
+    group = np.repeat(np.arange(dofs.num_groups), dofs.multiplicity)
+    copy, component = np.nonzero(flag[group])
+    rows = Rows(
+        group=group[copy],
+        row=np.arange(len(copy)),
+        column=dofs.copies[copy] * dofs.bs + component,
+        value=np.sqrt(weights[copy, component]),
+    )
+    return rows, group[copy] * dofs.bs + component
+
+
+# --- Dirichlet values, spread over all torn copies of a node ----------------------------------
+
+AGREEMENT = 1e-10
+
+
+@dataclass(frozen=True)
+class Prescribed:
+    """Components that Dirichlet conditions prescribe, for the owned groups.
+
+    Attributes:
+        flag: Whether a component is prescribed, shape ``(g, bs)``.
+        value: Its value, 0 where it is not, shape ``(g, bs)``.
+    """
+
+    flag: Array
+    value: Array
+
+
+def prescribe(dofs: TornDofs, bcs: Sequence[fem.DirichletBC]) -> Prescribed:
+    """Collect Dirichlet values and spread them to all copies of their nodes. Collective.
+
+    Raises:
+        InputError: Conditions do not fit V, contradict each other at a node, or are not finite.
+    """
+    bcs = checked_conditions(bcs, dofs.V)
+    size = dofs.V.dofmap.index_map.size_local * dofs.bs
+    values = prescribed_values(bcs, size)
+    low = np.fmin.reduce(values, axis=0, initial=np.inf)
+    high = np.fmax.reduce(values, axis=0, initial=-np.inf)
+    low = dofs.reduce(dofs.to_primal(low).reshape(-1, dofs.bs), np.minimum, np.inf)
+    high = dofs.reduce(dofs.to_primal(high).reshape(-1, dofs.bs), np.maximum, -np.inf)
+    flag = low <= high
+    with raised_on_all_ranks(dofs.comm):
+        _check_finite(bcs)
+        _check_agreement(low, high, flag)
+    return Prescribed(flag=flag, value=np.where(flag, low, 0.0))
+
+
+def checked_conditions(
+    bcs: Iterable[fem.DirichletBC], V: fem.FunctionSpace
+) -> list[fem.DirichletBC]:
+    """The conditions as a list. Collective.
+
+    Raises:
+        InputError: They are no Dirichlet conditions on V or a component of V, or one of them has
+            no unknowns, or some that V has not.
+    """
+    conditions = listed_conditions(bcs)
+    count = np.zeros(len(conditions), dtype=np.int64)
+    with raised_on_all_ranks(V.mesh.comm):
+        for number, bc in enumerate(conditions):
+            _check_space(f"Dirichlet condition {number}", bc, V)
+            count[number] = len(bc.dof_indices()[0])
+    total = V.mesh.comm.allreduce(count)
+    if not np.all(total):
+        raise InputError(
+            f"Dirichlet condition {int(np.argmin(total))} holds nowhere: it has no unknowns on any "
+            "rank; expected at least one"
+        )
+    return conditions
+
+
+def check_not_on_tears(
+    bcs: Sequence[fem.DirichletBC], dofs: TornDofs, decomposition: Decomposition
+) -> None:
+    """Raise if a condition prescribes facets of tears as if they were of the boundary. Collective.
+
+    To DOLFINx tears are exterior facets, so ``exterior_facet_indices`` and
+    ``locate_entities_boundary`` find them, too. A condition knows unknowns only. It is taken for
+    one on exterior facets if each unknown is one of an exterior facet all of whose unknowns, of a
+    component, are prescribed. It is wrong if some of these facets are of the boundary and some of
+    tears, unless all nodes of the latter are on the boundary. So nodes of a region may be
+    prescribed, which are also inside of subdomains, and those of a surface inside a body, in a
+    condition of its own, wherever the tears are.
+
+    Args:
+        bcs: Conditions on the space of ``dofs``.
+        dofs: Dof maps.
+        decomposition: The torn mesh.
+
+    Raises:
+        InputError: A condition is.
+    """
+    if not bcs or not decomposition.is_torn:
+        return
+    tears, outer = (_facet_nodes(dofs, f) for f in (decomposition.tears, decomposition.boundary))
+    at_boundary = np.zeros(dofs.num_nodes, dtype=bool)
+    at_boundary[outer] = True
+    at_boundary = dofs.spread(dofs.reduce(at_boundary, np.logical_or, False))
+    within = ~np.all(at_boundary[tears], axis=1)
+    count = np.empty((len(bcs), 3, dofs.bs), dtype=np.int64)
+    for number, bc in enumerate(bcs):
+        held = np.zeros(dofs.num_nodes * dofs.bs, dtype=bool)
+        held[bc.dof_indices()[0]] = True
+        held = dofs.to_primal(held).reshape(-1, dofs.bs)
+        of_tears, of_outer = (np.all(held[nodes], axis=1) for nodes in (tears, outer))
+        count[number, 0] = np.sum(of_tears[within], axis=0)
+        count[number, 1] = np.sum(of_outer, axis=0)
+        for nodes, whole in ((tears, of_tears), (outer, of_outer)):
+            facet, component = np.nonzero(whole)
+            held[nodes[facet], component[:, None]] = False
+        count[number, 2] = np.sum(held, axis=0)
+    tear, boundary, others = np.moveaxis(dofs.comm.allreduce(count), 1, 0)
+    wrong = np.max(np.where((boundary > 0) & (others == 0), tear, 0), axis=1)
+    if np.any(wrong):
+        number = int(np.argmax(wrong > 0))
+        raise InputError(
+            f"Dirichlet condition {number} prescribes {(wrong[number] + 1) // 2} facets that lie "
+            "on tears inside a body, besides facets of its boundary: to DOLFINx tears are "
+            "exterior, too; expected facets of the boundary: decomposition.boundary, "
+            "decomposition.facets(name) or decomposition.locate_facets(marker); a surface inside a "
+            "body is for a condition of its own"
+        )
+
+
+def _facet_nodes(dofs: TornDofs, facets: Array) -> Array:
+    """Return the primal nodes of local facets of one cell, shape ``(f, nodes per facet)``."""
+    V, of_cells = dofs.V, cell_facets(dofs.V.mesh)
+    chosen = np.zeros(int(of_cells.max(initial=-1)) + 1, dtype=bool)
+    chosen[facets] = True
+    cell, place = np.nonzero(chosen[of_cells])
+    element, fdim = V.element.basix_element, V.mesh.topology.dim - 1
+    on_facet = np.array(element.entity_closure_dofs[fdim])[place]
+    return dofs.primal_nodes(np.take_along_axis(np.asarray(V.dofmap.list)[cell], on_facet, axis=1))
+
+
+def listed_conditions(bcs: Iterable[fem.DirichletBC]) -> list[fem.DirichletBC]:
+    """The conditions as a list. Not collective.
+
+    Raises:
+        InputError: They are nothing that gives Dirichlet conditions.
+    """
+    if isinstance(bcs, fem.DirichletBC) or not isinstance(bcs, Iterable):
+        raise InputError(
+            f"bcs is {shown(bcs)}; expected a list of Dirichlet conditions, [] for none"
+        )
+    conditions = list(bcs)
+    for number, bc in enumerate(conditions):
+        what = f"Dirichlet condition {number}"
+        checked_type(bc, fem.DirichletBC, what, "a dolfinx.fem.DirichletBC")
+    return conditions
+
+
+def _check_space(what: str, bc: fem.DirichletBC, V: fem.FunctionSpace) -> None:
+    space = space_of(bc)
+    if space.mesh is not V.mesh._cpp_object:
+        raise InputError(
+            f"{what} is on another mesh; expected a space on decomposition.mesh, the torn mesh"
+        )
+    if hasattr(bc.g, "x") and bc.g.function_space.mesh is not space.mesh:
+        raise InputError(
+            f"the value of {what} is a function on another mesh; expected one on "
+            "decomposition.mesh, the torn mesh, such as decomposition.from_original(g)"
+        )
+    own = component_of(V, list(space.component()))
+    if own is None or not is_same_space(space, own):
+        raise InputError(
+            f"{what} is on {described(space)}; expected the space of a, "
+            f"{described(V._cpp_object)}, or V.sub(i) of it"
+        )
+    size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
+    highest = int(bc.dof_indices()[0].max(initial=-1))
+    if highest >= size:
+        raise InputError(
+            f"{what} prescribes the unknown {highest}, but this rank has {size}; expected "
+            "unknowns that were located in the space of a"
+        )
+
+
+def _check_finite(bcs: Sequence[fem.DirichletBC]) -> None:
+    for number, bc in enumerate(bcs):
+        value = bc.g.x.array if hasattr(bc.g, "x") else bc.g.value
+        if not np.all(np.isfinite(value)):
+            raise InputError(f"Dirichlet condition {number} has a value that is not finite")
+
+
+def _check_agreement(low: Array, high: Array, flag: Array) -> None:
+    scale = np.abs(np.concatenate((low[flag], high[flag]))).max(initial=0.0)
+    spread = np.subtract(high, low, out=np.zeros_like(low), where=flag)
+    wrong = spread > AGREEMENT * scale
+    if not np.any(wrong):
+        return
+    group, component = np.argwhere(wrong)[0]
+    raise InputError(
+        f"Dirichlet conditions contradict each other: component {component} of a node is "
+        f"prescribed as {low[group, component]} and as {high[group, component]} "
+        f"(at {wrong.sum()} components of nodes on this rank)"
+    )
+
+
+# --- All rows of a scene: from Dirichlet conditions and contact records to B and c ------------
+
+# more than any mesh has nodes, and times any number of contacts within 64 bits
+MANY_GROUPS = 2**40
+
+
+@dataclass(frozen=True)
+class Gluing:
+    """Rows of a scene, and the Dirichlet values and contact records that they come from.
+
+    B depends on which components are prescribed, on the records' normals and weights, on which
+    of them are within reach, and on D. Prescribed values and gaps are in c alone.
+
+    Attributes:
+        dofs: Dof maps.
+        prescribed: Dirichlet values.
+        records: Contact conditions of this rank.
+        held: The rows that hold prescribed components.
+        contact: What belongs to the normal rows.
+        tangents: What belongs to the tangential rows.
+        constraints: B, c and the sets of rows.
+        length: A length of the scene.
+        slip: Where the load step begins: the tangential v_i of all conditions then, shape
+            ``(n, gdim - 1)``. Friction acts on what comes to it.
+    """
+
+    dofs: TornDofs
+    prescribed: Prescribed
+    records: ContactRecords
+    held: HeldRows
+    contact: ContactRows
+    tangents: TangentRows
+    constraints: Constraints
+    length: float
+    slip: Array
+
+    def right_side(self, values: Array, gaps: Array, slip: Array | None = None) -> Array:
+        """This rank's part of c for any prescribed values, gaps and slips; B stays. Collective.
+
+        Args:
+            values: Prescribed values of the owned groups, shape ``(g, bs)``; what stands at
+                components that are not prescribed has no effect.
+            gaps: Gap of each condition of the records, a length, shape ``(n,)``.
+            slip: Where the load step begins, as the attribute; default that.
+
+        Returns:
+            Shape ``(num_rows,)``, for ``Constraints.set_right_side``.
+
+        Raises:
+            NoSolutionError: Prescribed components alone violate a condition, or the conditions
+                of a node contradict each other.
+        """
+        sets = self.constraints.sets
+        c = np.zeros(sets.num_rows)
+        c[sets.equalities[self.held.row]] = self.held.right_side(values)
+        c[sets.normals] = self.contact.right_side(self.dofs, values, gaps, self.length)
+        slip = self.slip if slip is None else slip
+        c[sets.tangents] = self.tangents.right_side(self.dofs, values, slip)
+        return c
+
+    def with_right_side(self, values: Array, gaps: Array, slip: Array | None = None) -> Gluing:
+        """The same rows with other prescribed values, gaps, slips; c is filled anew. Collective.
+
+        The constraints are shared with these rows: their c is the new one too. What raises
+        leaves it as it was.
+
+        Args:
+            values: Prescribed values of the owned groups, shape ``(g, bs)``.
+            gaps: Gap of each condition of the records, shape ``(n,)``.
+            slip: Where the load step begins, as the attribute; default that.
+
+        Raises:
+            NoSolutionError: As ``right_side``.
+        """
+        self.constraints.set_right_side(self.right_side(values, gaps, slip))
+        flag = self.prescribed.flag
+        return replace(
+            self,
+            prescribed=Prescribed(flag, np.where(flag, values, 0.0)),
+            records=replace(self.records, gap=gaps),
+            slip=self.slip if slip is None else slip,
+        )
+
+    def with_supports_at(self, values: Array) -> Array:
+        """This rank's part of c as it is, but for supports, which hold other values.
+
+        Contacts meet prescribed components where the prescribed values have them.
+
+        Args:
+            values: Values of the owned groups, shape ``(g, bs)``.
+        """
+        c = np.array(self.constraints.c.array_r)
+        c[self.constraints.sets.equalities[self.held.row]] = self.held.right_side(values)
+        return c
+
+    def multipliers(self, earlier: Gluing, lam: Array) -> Array:
+        """Multipliers of earlier rows of the same scene on these; zero on rows that are new.
+
+        Where other components are prescribed all rows of equalities are. Collective.
+
+        Args:
+            earlier: The earlier rows.
+            lam: Their multipliers on this rank.
+        """
+        sets, before = self.constraints.sets, earlier.constraints.sets
+        start = np.zeros(sets.num_rows)
+        flags, flags_before = self.prescribed.flag, earlier.prescribed.flag
+        if not any_rank(self.dofs.comm, not np.array_equal(flags, flags_before)):
+            start[sets.equalities] = lam[before.equalities]
+        new, old = _common(self._keys(self.contact), earlier._keys(earlier.contact))
+        # ratios: of rows that stay they are exactly 1, and what F makes of the start is known
+        ratio = earlier.contact.scale[old] / self.contact.scale[new]
+        start[sets.normals[new]] = lam[before.normals[old]] * ratio
+        new, old = _common(self._keys(self.tangents), earlier._keys(earlier.tangents))
+        ratio = earlier.tangents.scale[old] / self.tangents.scale[new]
+        start[sets.tangents[new]] = lam[before.tangents[old]] * ratio[:, None]
+        return start
+
+    def contacts_of(self, rows: Array) -> list[int]:
+        """Positions, in the user's list, of the contacts that some local rows are of. Collective.
+
+        Args:
+            rows: Local rows; equalities among them belong to no contact.
+        """
+        sets = self.constraints.sets
+        normals = self.contact.condition[np.isin(sets.normals, rows)]
+        tangents = self.tangents.condition[np.isin(sets.tangents, rows).any(axis=1)]
+        own = np.unique(self.records.contact[np.concatenate((normals, tangents))])
+        return sorted(set().union(*self.dofs.comm.allgather(own.tolist())))
+
+    def _keys(self, rows: ContactRows | TangentRows) -> Array:
+        """A number for the contact and the node of each condition with such rows."""
+        kept, records = rows.condition, self.records
+        return records.contact[kept] * MANY_GROUPS + records.group[kept]
+
+
+def _common(keys: Array, earlier: Array) -> tuple[Array, Array]:
+    """Where the numbers stand that are in both arrays."""
+    _, new, old = np.intersect1d(keys, earlier, return_indices=True)
+    return new, old
+
+
+def glue(
+    dofs: TornDofs,
+    prescribed: Prescribed,
+    records: ContactRecords,
+    length: float,
+    weights: Array,
+    slip: Array | None = None,
+) -> Gluing:
+    """Rows of interfaces, Dirichlet conditions and contacts, and their right sides. Collective.
+
+    Args:
+        dofs: Dof maps.
+        prescribed: Dirichlet values.
+        records: Contact conditions of this rank; those within reach get rows.
+        length: A length of the scene.
+        weights: D, positive, one per local primal unknown: the stiffness there, or ones. Rows
+            are orthonormal in the inner product of D⁻¹ as far as they can be.
+        slip: Where the load step begins: the tangential v_i of all conditions then, shape
+            ``(n, gdim - 1)``; default 0.
+
+    Raises:
+        NoSolutionError: Dirichlet conditions and contacts contradict each other.
+    """
+    D = dofs.gather_copies(weights.reshape(-1, dofs.bs))
+    spread = RowBuilder(dofs, prescribed.flag, D, records)
+    normal_rows, contact = contact_rows(spread)
+    sliding_rows, tangents = tangent_rows(dofs, spread, contact)
+    equalities, held = equality_rows(dofs, prescribed.flag, D)
+    tables = (equalities, normal_rows, sliding_rows)
+    constraints = assemble_constraints(
+        dofs, tables, weights, contact.scale, tangents.scale, tangents.normal
+    )
+    slip = np.zeros(records.tangents.shape[:2]) if slip is None else slip
+    gluing = Gluing(dofs, prescribed, records, held, contact, tangents, constraints, length, slip)
+    try:
+        constraints.set_right_side(gluing.right_side(prescribed.value, records.gap))
+    except TfetiError:  # on all ranks
+        constraints.destroy()
+        raise
+    return gluing

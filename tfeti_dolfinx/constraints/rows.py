@@ -1,0 +1,442 @@
+"""Rows of B and right sides c in named sets, and their scaling."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from tfeti_dolfinx.common.arrays import Array, sum_rows
+from tfeti_dolfinx.common.parallel import Exchange, chunk_offsets, owner_of
+from tfeti_dolfinx.contact.records import ContactRecords
+from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.mortar.surfaces import group_points
+
+# --- Tables of rows: the only source of B -----------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Rows of one kind that this rank owns, in coordinate form.
+
+    Attributes:
+        group: Owned group that each row belongs to, shape ``(n,)``.
+        row: Row of each entry, shape ``(k,)``.
+        column: Global primal unknown of each entry, shape ``(k,)``.
+        value: The entries, shape ``(k,)``.
+    """
+
+    group: Array
+    row: Array
+    column: Array
+    value: Array
+
+    def __len__(self) -> int:
+        return len(self.group)
+
+    def without_zeros(self) -> Rows:
+        """The same rows without entries that are zero."""
+        used = self.value != 0.0
+        return Rows(self.group, self.row[used], self.column[used], self.value[used])
+
+    def sorted_by_group(self) -> Rows:
+        """The same rows in the order of their groups (stable); entries stay where they are."""
+        order = np.argsort(self.group, kind="stable")
+        place = np.empty_like(order)
+        place[order] = np.arange(len(order))
+        return Rows(self.group[order], place[self.row], self.column, self.value)
+
+
+def stack(tables: list[Rows]) -> Rows:
+    """The rows of several tables, one table after the other, and so are their entries."""
+    starts = np.cumsum([0, *(len(t) for t in tables)])
+    return Rows(
+        group=np.concatenate([t.group for t in tables]),
+        row=np.concatenate([t.row + s for t, s in zip(tables, starts[:-1], strict=True)]),
+        column=np.concatenate([t.column for t in tables]),
+        value=np.concatenate([t.value for t in tables]),
+    )
+
+
+# --- Which local rows of B are what -----------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RowSets:
+    """Local rows of B by name. Nobody else knows in which order they stand.
+
+    Attributes:
+        equalities: Gluing rows, and rows that hold prescribed components, shape ``(e,)``.
+        normals: Rows of contact conditions along their normals, λ ≥ 0, shape ``(n,)``.
+        tangents: Rows along the tangents of conditions with friction, shape ``(t, gdim - 1)``.
+    """
+
+    equalities: Array
+    normals: Array
+    tangents: Array
+
+    @property
+    def contact(self) -> Array:
+        """All rows of contact conditions, normals first."""
+        return np.concatenate((self.normals, self.tangents.ravel()))
+
+    def contact_rows(self, comm: MPI.Intracomm) -> tuple[int, int]:
+        """Number of normal and of tangential rows on all ranks. Collective."""
+        normals, tangents = comm.allreduce(np.array([self.normals.size, self.tangents.size]))
+        return int(normals), int(tangents)
+
+    @property
+    def num_rows(self) -> int:
+        """All local rows."""
+        return self.equalities.size + self.normals.size + self.tangents.size
+
+
+def row_sets(num_equalities: int, num_normals: int, num_tangents: int, gdim: int) -> RowSets:
+    """Equalities first, then normals, then tangents, those of a condition together."""
+    rows, count = np.arange(num_equalities + num_normals + num_tangents), max(gdim - 1, 1)
+    equalities, normals, tangents = np.split(rows, [num_equalities, num_equalities + num_normals])
+    shape = (num_tangents // count, gdim - 1)
+    return RowSets(equalities, normals, tangents.reshape(shape))
+
+
+# --- D, with which rows of B are scaled -------------------------------------------------------
+
+
+def row_weights(blocks: Array, scaling: str, comm: MPI.Intracomm) -> Array:
+    """D: at each node the mean of the diagonal of K, over the smallest of them; or ones.
+
+    One number for a node: then a scene that is turned has the rows of the scene, turned.
+    Collective.
+
+    Args:
+        blocks: The block of K of each local primal node, shape ``(num_nodes, bs, bs)``.
+        scaling: "stiffness", or "multiplicity" for ones.
+        comm: Communicator.
+
+    Returns:
+        One for each unknown, shape ``(num_nodes * bs,)``.
+    """
+    diagonals = np.diagonal(blocks, axis1=1, axis2=2)
+    if scaling == "multiplicity":
+        return np.ones(diagonals.size)
+    means = np.mean(np.maximum(diagonals, 0.0), axis=1)
+    positive = means > 0.0  # what is not is reported when Blocks are built
+    lowest = float(np.min(means[positive], initial=np.inf))
+    D = np.where(positive, means / comm.allreduce(lowest, op=MPI.MIN), 1.0)
+    return np.repeat(D, blocks.shape[1])
+
+
+# --- The directions in which the rows of B act on a node --------------------------------------
+
+# of the largest square: directions of normals that differ by less are one but for rounding
+ALIKE = 1e-12
+
+
+def row_span(dofs: TornDofs, equalities: Rows, contact: Rows, trace: Array) -> Array:
+    """Projector onto what rows see of each node, as rows for the trace unknowns. Collective.
+
+    A node that only a contact meets is held along the normal, whatever axis that lies along. Where
+    normals of several conditions differ, or there is friction or gluing, it is held in more.
+
+    Args:
+        dofs: Dof maps.
+        equalities: This rank's rows of equalities, one component each.
+        contact: Its rows of contact conditions.
+        trace: Local primal unknowns that rows of any rank touch, ascending.
+
+    Returns:
+        Shape ``(t, bs)``: the row of the component in the bs × bs projector of the node.
+    """
+    bs = dofs.bs
+    columns = np.unique(equalities.column)
+    exchange, start = Exchange(dofs.comm, owner_of(dofs.offsets * bs, columns)), dofs.offsets
+    held = np.zeros(dofs.num_nodes * bs)
+    held[exchange.send(columns) - start[dofs.comm.rank] * bs] = 1.0
+    nodes, grams = _grams(contact, bs)
+    exchange = Exchange(dofs.comm, owner_of(start, nodes))
+    met, place = np.unique(exchange.send(nodes) - start[dofs.comm.rank], return_inverse=True)
+    gram = sum_rows(place, exchange.send(grams), len(met))
+    span, component = np.zeros((len(trace), bs)), trace % bs
+    span[np.arange(len(trace)), component] = held[trace]
+    own, of_met = np.flatnonzero(np.isin(trace // bs, met)), np.searchsorted(met, trace // bs)
+    span[own] = _projectors(gram, held.reshape(-1, bs)[met])[of_met[own], component[own]]
+    return span
+
+
+def _grams(rows: Rows, bs: int) -> tuple[Array, Array]:
+    """Nodes that rows act on, and the sums of aaᵀ of their coefficients a there."""
+    node = rows.column // bs
+    pairs, place = np.unique(node * len(rows) + rows.row, return_inverse=True)
+    a = np.zeros((len(pairs), bs))
+    a[place, rows.column % bs] = rows.value
+    nodes, place = np.unique(pairs // max(len(rows), 1), return_inverse=True)
+    return nodes, sum_rows(place, a[:, :, None] * a[:, None, :], len(nodes))
+
+
+def _projectors(gram: Array, held: Array) -> Array:
+    """Onto the ranges of Σaaᵀ and of the components that are held, shape ``(k, bs, bs)``."""
+    size = np.trace(gram, axis1=1, axis2=2)[:, None, None]
+    gram = np.divide(gram, size, out=np.zeros_like(gram), where=size > 0.0)
+    values, vectors = np.linalg.eigh(gram + held[:, :, None] * np.eye(held.shape[1]))
+    seen = values > ALIKE * values.max(axis=1, initial=0.0, keepdims=True)
+    return np.einsum("nik,nk,njk->nij", vectors, seen, vectors)
+
+
+# --- Coefficients of contact conditions: without prescribed components, shared by torn copies ---
+
+# Of a row's norm: what is left of less is rounding, scaled up to unit norm.
+NOTHING_LEFT = 1e-10
+# of what rounding makes of a condition's coefficients, and of lengths: errors of several add up
+SEVERAL, EPSILON = 10.0, 2.2e-16
+# a condition of which more than this remains is one, however uncertain its normal is
+HARDLY_LEFT = 1e-3
+
+
+@dataclass(frozen=True)
+class HeldPart:
+    """What prescribed components contribute to the relative displacements of conditions.
+
+    Attributes:
+        condition: Condition of each weight of a node with prescribed components.
+        group: Global group of each.
+        weight: Its weight at the prescribed components, else 0, shape ``(h, gdim)``.
+    """
+
+    condition: Array
+    group: Array
+    weight: Array
+
+    def displacement(self, dofs: TornDofs, values: Array, size: int) -> Array:
+        """The v_i of prescribed values alone, shape ``(size, gdim)``. Collective.
+
+        Args:
+            dofs: Dof maps.
+            values: Prescribed values of the owned groups, shape ``(g, bs)``.
+            size: Number of conditions.
+        """
+        (value,) = dofs.lookup(self.group, values)
+        return sum_rows(self.condition, self.weight * value, size)
+
+
+class RowBuilder:
+    """Rows from conditions. Creation and ``rows`` are collective.
+
+    A coefficient a becomes a·w/Σw on each torn copy, w its weight in D (a/k on k copies of equal
+    weight): so rows are orthogonal to the gluing rows in the inner product of D⁻¹. Prescribed
+    components are left to the right side.
+
+    Args:
+        dofs: Dof maps.
+        flag: Which components of the owned groups are prescribed, shape ``(g, bs)``.
+        weights: D for each copy of the owned groups, shape ``(c, bs)``.
+        records: Conditions of this rank.
+
+    Attributes:
+        records: The conditions.
+        points: Points of the owned groups, shape ``(g, 3)``.
+        nothing_left: Share of each condition that is rounding, shape ``(n,)``.
+    """
+
+    def __init__(
+        self, dofs: TornDofs, flag: Array, weights: Array, records: ContactRecords
+    ) -> None:
+        sums = np.add.reduceat(weights, dofs.copy_offsets[:-1]) if len(weights) else weights
+        self.records, self._dofs, self._weights = records, dofs, weights
+        self._prescribed, self._total = dofs.lookup(records.entry_group, flag, sums)
+        self.points = group_points(dofs)
+        self.nothing_left = _nothing_left(records, self.points)
+
+    def free(self, axis: int) -> Array:
+        """Coefficients along an axis of the frames, 0 at prescribed components."""
+        return np.where(self._prescribed, 0.0, self.records.coefficients(axis))
+
+    def squares(self, coefficients: Array) -> Array:
+        """Squared norms in D⁻¹ of the rows that coefficients make, unscaled, shape ``(n,)``."""
+        squares = np.sum(coefficients**2 / self._total, axis=1)
+        return sum_rows(self.records.condition, squares, len(self.records))
+
+    def left(self, axis: int) -> tuple[Array, Array]:
+        """Squared norms without prescribed components, and whether they are more than rounding."""
+        before = self.squares(self.records.coefficients(axis))
+        after = self.squares(self.free(axis))
+        return after, after > self.nothing_left**2 * before
+
+    @cached_property
+    def held(self) -> HeldPart:
+        """What prescribed components contribute."""
+        holds = np.flatnonzero(np.any(self._prescribed, axis=1))
+        records = self.records
+        weight = np.where(self._prescribed, records.weight[:, None], 0.0)[holds]
+        return HeldPart(records.condition[holds], records.entry_group[holds], weight)
+
+    def rows(self, axis: int, condition: Array, scale: Array) -> Rows:
+        """A row for each of these conditions along an axis, times its scale."""
+        records, dofs = self.records, self._dofs
+        place = np.full(len(records), -1)
+        place[condition] = np.arange(len(condition))
+        used = np.flatnonzero(place[records.condition] >= 0)
+        entry, node, weight = dofs.lookup_copies(records.entry_group[used], self._weights)
+        row = place[records.condition[used[entry]]]
+        shares = (self.free(axis) / self._total)[used[entry]]
+        values = shares * weight * scale[row][:, None]
+        columns = node[:, None] * dofs.bs + np.arange(dofs.bs)
+        return Rows(
+            group=records.group[condition],
+            row=np.repeat(row, dofs.bs),
+            column=columns.ravel(),
+            value=values.ravel(),
+        ).without_zeros()
+
+
+def _nothing_left(records: ContactRecords, points: Array) -> Array:
+    """Share of a condition that is rounding, shape ``(n,)``.
+
+    The normal of a facet of size h at x is exact to ε|x|/h, and so is a place on it. At a distance
+    g the normal points that much times g beside the place that it should point to.
+    """
+    x = np.abs(points[records.group]).max(axis=1, initial=0.0)
+    h = records.area ** (1.0 / max(records.normal.shape[1] - 1, 1))
+    g = np.abs(records.geometric_gap)
+    error = EPSILON * (x * (1.0 + g / h) + g) / h
+    return np.clip(SEVERAL * error, NOTHING_LEFT, HARDLY_LEFT)
+
+
+# --- B as a distributed PETSc matrix (dual rows × trace unknowns), and c ----------------------
+
+
+@dataclass(frozen=True)
+class Constraints:
+    """B u = c on equality rows, B u ≤ c on rows of contact normals; tangents have friction.
+
+    B acts on *trace* unknowns only: primal unknowns that some row touches, sorted as the primal
+    ones. It depends neither on prescribed values nor on gaps; c does, and can be filled again.
+
+    Attributes:
+        B: Dual rows × trace unknowns, MPIAIJ.
+        c: Right sides, distributed as the rows; 0 until they are set.
+        sets: Which local rows are what.
+        trace: Local primal unknown of each local trace unknown, ascending.
+        span: Projector of each node of the trace onto the directions that rows act along, the row
+            of each trace unknown, shape ``(t, bs)``.
+        weights: D on the local trace unknowns: the rows are scaled with it.
+        scale: The s_i of the conditions with rows, one for each of ``sets.normals``: over it what
+            a row misses is a length.
+        tangent_scale: The same for each point of ``sets.tangents``, shape ``(t,)``.
+        limits: The ψ_i, semi-axes of the sets of the tangential multipliers, shape
+            ``(t, gdim - 1)``; 0 until they are set.
+        pressed_by: Under Coulomb's law the local row of the condition's normal, else −1, shape
+            ``(t,)``.
+        coefficients: The μ_i of Coulomb's law, else 0, shape ``(t, gdim - 1)``.
+        pressures: The λ_N whose friction the limits are, under Coulomb's law; nan until they
+            are set, shape ``(t,)``.
+    """
+
+    B: PETSc.Mat
+    c: PETSc.Vec
+    sets: RowSets
+    trace: Array
+    span: Array
+    weights: Array
+    scale: Array
+    tangent_scale: Array
+    limits: Array
+    pressed_by: Array
+    coefficients: Array
+    pressures: Array
+
+    @property
+    def num_rows(self) -> int:
+        """All local rows."""
+        return self.sets.num_rows
+
+    def set_right_side(self, c: Array) -> None:
+        """Fill c anew, with this rank's part of it, shape ``(num_rows,)``. B stays."""
+        self.c.array[:] = c
+
+    def set_limits(self, limits: Array) -> None:
+        """Fill the ψ_i anew, shape ``(t, gdim - 1)``. B stays."""
+        self.limits[:] = limits
+
+    @property
+    def pressed(self) -> Array:
+        """Positions of the points of ``sets.tangents`` with a coefficient of Coulomb's law."""
+        return np.flatnonzero(np.any(self.coefficients > 0.0, axis=1))
+
+    def set_pressures(self, pressures: Array) -> None:
+        """Fill the ψ_i under Coulomb's law, μ_i times a λ_N of each of ``pressed``; ∞ sticks."""
+        at = self.pressed
+        self.pressures[at] = pressures
+        mu = self.coefficients[at]
+        self.limits[at] = np.multiply(mu, pressures[:, None], out=np.zeros_like(mu), where=mu > 0.0)
+
+    def destroy(self) -> None:
+        """Destroy the PETSc objects. Collective."""
+        self.B.destroy()
+        self.c.destroy()
+
+
+def assemble_constraints(
+    dofs: TornDofs,
+    tables: Sequence[Rows],
+    weights: Array,
+    scale: Array,
+    tangent_scale: Array,
+    pressed_by: Array,
+) -> Constraints:
+    """Assemble B, with c = 0 and ψ = 0. Collective.
+
+    Args:
+        dofs: Dof maps.
+        tables: This rank's rows: equalities, contact normals, tangents.
+        weights: D on the local primal unknowns.
+        scale: What each normal row was multiplied by.
+        tangent_scale: What the tangential rows of each condition were multiplied by.
+        pressed_by: For each of them the position of its normal row under Coulomb's law, else −1.
+    """
+    rows = stack(list(tables))
+    equalities, normals, tangents = (len(table) for table in tables)
+    sets = row_sets(equalities, normals, tangents, dofs.bs)
+    trace, column = _trace_columns(dofs, rows.column)
+    span = row_span(dofs, tables[0], stack(list(tables[1:])), trace)
+    num_rows, num_columns = len(rows), len(trace)
+    order = np.lexsort((column, rows.row))
+    indptr = np.concatenate(([0], np.cumsum(np.bincount(rows.row, minlength=num_rows))))
+    index = PETSc.IntType
+    B = PETSc.Mat().createAIJ(
+        size=((num_rows, None), (num_columns, None)),
+        csr=(indptr.astype(index), column[order].astype(index), rows.value[order]),
+        comm=dofs.comm,
+    )
+    c = B.createVecLeft()
+    c.set(0.0)
+    shape, row = sets.tangents.shape, pressed_by.copy()
+    row[row >= 0] = sets.normals[row[row >= 0]]
+    return Constraints(
+        B=B,
+        c=c,
+        sets=sets,
+        trace=trace,
+        span=span,
+        weights=weights[trace],
+        scale=scale,
+        tangent_scale=tangent_scale,
+        limits=np.zeros(shape),
+        pressed_by=row,
+        coefficients=np.zeros(shape),
+        pressures=np.full(len(row), np.nan),
+    )
+
+
+def _trace_columns(dofs: TornDofs, column: Array) -> tuple[Array, Array]:
+    """Local primal unknowns that rows of any rank touch, and the entries' global trace column."""
+    offsets = dofs.offsets * dofs.bs
+    needed, place = np.unique(column, return_inverse=True)
+    exchange = Exchange(dofs.comm, owner_of(offsets, needed))
+    asked = exchange.send(needed) - offsets[dofs.comm.rank]
+    trace = np.unique(asked)
+    start = chunk_offsets(dofs.comm, len(trace))[dofs.comm.rank]
+    return trace, exchange.answer(start + np.searchsorted(trace, asked))[place]

@@ -1,1 +1,0 @@
-"""The dual problem: F, G, d, e, coarse projectors, preconditioners, recovery."""

@@ -1,0 +1,1 @@
+"""The dual problem: F, G, preconditioners, coarse space, recovery, the stopping rule."""

@@ -1,0 +1,233 @@
+"""The natural coarse space: G = Rᵀ Bᵀ, its projectors, and motions that no row of B resists."""
+
+from __future__ import annotations
+
+from copy import copy
+from typing import Any, cast
+
+import numpy as np
+from petsc4py import PETSc
+from scipy.sparse import csr_array, diags_array
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.parallel import bcast_from_root, chunk_offsets
+from tfeti_dolfinx.errors import raised_on_all_ranks
+from tfeti_dolfinx.feti.projectors import (
+    FaceFactors,
+    FaceProjectors,
+    Grams,
+    ObliqueProjectors,
+    Projectors,
+    SemidefiniteFactor,
+)
+from tfeti_dolfinx.feti.rigid_bodies import (
+    NULL,
+    Bodies,
+    Motions,
+    kernel_basis,
+    null_basis,
+    unresisted,
+    unsprung,
+)
+from tfeti_dolfinx.qp.sets import Face
+from tfeti_dolfinx.subdomains.subdomains import Subdomains
+
+# Of the size of a row: what of it acts on motions of bodies and is only rounding; and how it acts
+# as a whole if it only glues. Rounding of points far from the origin is more than that of motions,
+# but all other rows act on translations with about their size.
+NO_GRIP, GLUING = 1e-12, 1e-6
+
+
+class CoarseSpace(Projectors):
+    """G, GGᵀ and what follows from them; the r-vectors are replicated on all ranks.
+
+    G = (R T)ᵀ Bᵀ, with T a basis of the kernel that has the bodies' motions as coordinates.
+
+    Args:
+        B: Dual rows × trace unknowns.
+        subdomains: This rank's Blocks. The constructor and all methods are collective.
+        bounded: Local rows with λ ≥ 0.
+        rubbing: Local rows of friction.
+        prefix: Prefix of the factor's PETSc options.
+
+    Attributes:
+        subdomains: This rank's Blocks.
+        dimension: r, the dimension of the kernel of K.
+        e: (R T)ᵀ f, shape ``(r,)``.
+        motions: The bodies' motions in the basis T, scipy CSR, shape ``(r, bodies * k)``.
+        Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
+        bounded: Local rows with λ ≥ 0.
+        rubbing: Local rows of friction.
+        row_size: Sum of the moduli of each local row of B, the same however the mesh is torn. A
+            row over it gives lengths. Shape ``(m_local,)``.
+        bodies: Motions of the bodies.
+        J: This rank's rows of B R over their size, on motions of bodies, scipy CSR, shape
+            ``(m_local, bodies * k)``; empty for gluing rows.
+        unheld: Motions that neither springs nor equality rows resist, friction apart; each of
+            these rows acts on one body.
+        free_motions: Motions that no row resists at all.
+        null: Orthonormal basis of null(Gᵀ).
+        grams: GGᵀ, and those of faces.
+        factors: Makes the factors of faces, and counts them apart from that of GGᵀ.
+    """
+
+    def __init__(
+        self,
+        B: PETSc.Mat,
+        subdomains: Subdomains,
+        bounded: Array,
+        rubbing: Array,
+        prefix: str = "tfeti_coarse_",
+    ) -> None:
+        self.subdomains, self.bounded, self.rubbing = subdomains, bounded, rubbing
+        self.comm = comm = subdomains.comm
+        offsets = chunk_offsets(comm, subdomains.kernel_size)
+        dimension = int(offsets[-1])
+        self._own = slice(int(offsets[comm.rank]), int(offsets[comm.rank + 1]))
+        Gt = transposed_G(B, subdomains.kernel_rows, dimension)
+        self.row_size = _sizes(B)
+        self.bodies = Bodies(subdomains, self._own.start, dimension)
+        self.J = _without_rounding(diags_array(1.0 / self.row_size) @ Gt @ self.bodies.motions)
+        equalities = np.ones(len(self.row_size), dtype=bool)
+        equalities[np.concatenate((bounded, rubbing))] = False
+        self.unheld = self._unresisted(equalities, unsprung(self.bodies.springs), NULL)
+        self.free_motions = self.unresisted(~equalities)
+        # made on one rank: processors that round differently might choose differently
+        self._basis = bcast_from_root(
+            comm, kernel_basis(self.bodies, self.unheld, self.free_motions)
+        )
+        self.motions = self._basis.coordinates(self.bodies.motions)
+        self.Gt = self._basis.rows(Gt, diags_array(self.row_size) @ self.J, equalities)
+        self._read_load()
+        joint = csr_array(self.motions @ self.free_motions.joint)
+        self.null = bcast_from_root(comm, null_basis(np.flatnonzero(self._basis.free), joint))
+        self.grams = Grams(self.Gt, np.flatnonzero(~equalities), comm)
+        self.factors = FaceFactors(comm, self.null, prefix)
+        self._factor = self.factors.factor(self.grams.whole, "whole")
+
+    def update_load(self) -> None:
+        """Replace e = Rᵀ f by that of the Blocks' present loads."""
+        self._read_load()
+        self.bodies.update_load()
+
+    def _read_load(self) -> None:
+        e = np.concatenate(self.comm.allgather(self.subdomains.kernel_load))
+        self.e = self._basis.products(e)
+
+    def under(self, b: Array) -> CoarseSpace:
+        """The same space for a load b on this rank's unknowns that moves nothing free. Collective.
+
+        Args:
+            b: The load, shape ``(n,)``; what of it moves what nothing resists is rounding.
+        """
+        other, part = copy(self), self.subdomains.kernel_part(b)
+        e = self._basis.products(np.concatenate(self.comm.allgather(part)))
+        other.e = self.null.removed(e)
+        return other
+
+    @property
+    def num_free_motions(self) -> int:
+        """Number of motions that no row resists."""
+        return self.free_motions.count
+
+    def local_alpha(self, alpha: Array) -> Array:
+        """Kernel coordinates of this rank's Blocks that belong to an r-vector."""
+        return self._basis.kernel(alpha)[self._own]
+
+    def damped_factor(self, rows: Array, damping: float) -> SemidefiniteFactor:
+        """A factor of G_f G_fᵀ + damping·GGᵀ of the local rows flagged."""
+        return self._damped(self.grams.of_rows(rows), damping)
+
+    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
+        """(G_f G_fᵀ + damping·GGᵀ)⁻¹y, f a face of the rows."""
+        factor = self._damped(self.grams.of_face(face), damping)
+        x = factor.solve(y)
+        factor.destroy()
+        return x
+
+    def _damped(self, gram: csr_array, damping: float) -> SemidefiniteFactor:
+        return self.factors.factor(csr_array(gram + damping * self.grams.whole))
+
+    def on_face(self, face: Face) -> FaceProjectors:
+        """The projectors on a face of the rows."""
+        return FaceProjectors(self, face, self.factors)
+
+    def oblique(self, face: Face, C: csr_array) -> ObliqueProjectors:
+        """The projectors on a face of the rows where others follow: λ = (I + C)u.
+
+        Raises:
+            FactorError: Forces on the face do not determine what balances a load.
+        """
+        self.factors.count["face"] += 1
+        return ObliqueProjectors(self.Gt, self.grams, face, C, self.null, self.comm)
+
+    def unresisted(self, rows: Array, below: float = NULL) -> Motions:
+        """Motions that neither springs, nor equality rows, nor contact rows flagged resist.
+
+        The null space of Gᵀ lives on the bodies' motions: one that no gluing row resists is the
+        same in all subdomains of a body.
+
+        Args:
+            rows: Flags of local rows, those of equalities without effect.
+            below: Motions of a single body that are held by less than this share of what the
+                same rows hold at most are taken in, too.
+        """
+        flags = np.zeros(len(self.row_size), dtype=bool)
+        for own in (self.bounded, self.rubbing):
+            flags[own] = rows[own]
+        return self._unresisted(flags, self.unheld, below)
+
+    def _unresisted(self, rows: Array, within: Motions, below: float) -> Motions:
+        """Found on one rank: processors that round differently might count differently."""
+        if not np.any(within.free):
+            return within.none
+        grams = self.comm.gather(self.J[rows].T @ self.J[rows], root=0)
+        found: Any = None
+        with raised_on_all_ranks(self.comm):
+            if grams is not None:
+                found = unresisted(csr_array(sum(grams)), within, below)
+        return cast(Motions, bcast_from_root(self.comm, found))
+
+
+def _without_rounding(J: Any) -> csr_array:
+    """The same rows without entries that are only rounding."""
+    J = csr_array(J)
+    largest = abs(J).max(axis=1).toarray().ravel()
+    noise = np.where(largest <= GLUING, GLUING, NO_GRIP)
+    J.data[np.abs(J.data) <= np.repeat(noise, np.diff(J.indptr))] = 0.0
+    J.eliminate_zeros()
+    return J
+
+
+def _sizes(B: PETSc.Mat) -> Array:
+    """Sum of the moduli of each local row, 1 where that is 0."""
+    indptr, _, data = B.getValuesCSR()
+    rows = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
+    sizes = np.bincount(rows, np.abs(data), minlength=len(indptr) - 1).astype(float)
+    return np.where(sizes > 0.0, sizes, 1.0)
+
+
+def transposed_G(B: PETSc.Mat, kernel: csr_array, dimension: int) -> csr_array:
+    """This rank's rows of B R, with global columns. Collective."""
+    BR = products(B, kernel)
+    indptr, indices, data = BR.getValuesCSR()
+    Gt = csr_array((data, indices, indptr), shape=(B.getLocalSize()[0], dimension))
+    BR.destroy()
+    return Gt
+
+
+def products(B: PETSc.Mat, R: csr_array) -> PETSc.Mat:
+    """B R, R the trace unknowns of this rank × columns of its own. Collective."""
+    matrix = side_by_side(R, B.getComm())
+    BR = B.matMult(matrix)
+    matrix.destroy()
+    return BR
+
+
+def side_by_side(own: csr_array, comm: PETSc.Comm) -> PETSc.Mat:
+    """A matrix with a block for each rank, which acts on nothing of the others'. Collective."""
+    index = PETSc.IntType
+    first = comm.tompi4py().exscan(own.shape[1]) or 0
+    size = ((own.shape[0], None), (own.shape[1], None))
+    table = (own.indptr.astype(index), (own.indices + first).astype(index), own.data)
+    return PETSc.Mat().createAIJ(size=size, csr=table, comm=comm)

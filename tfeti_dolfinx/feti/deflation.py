@@ -1,0 +1,175 @@
+"""Motions of subdomains that something holds, but softly: a coarse space for preconditioners.
+
+Springs or inertia in a stiffness leave fewer kernel modes than a free subdomain has, and on what is
+left of its rigid motions K⁺ is large: F ≈ F₀ + ĜᵀD⁻¹Ĝ with Ĝ = R̂ᵀBᵀ, D = R̂ᵀKR̂. The natural coarse
+space does not know of them, and M_f is an inverse of F₀ alone.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from petsc4py import PETSc
+from scipy.sparse import csr_array, diags_array, hstack
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.parallel import bcast_from_root, chunk_offsets, summed
+from tfeti_dolfinx.feti.coarse import CoarseSpace, transposed_G
+from tfeti_dolfinx.feti.operator import DualOperator
+from tfeti_dolfinx.feti.projectors import FaceFactors, Grams, SemidefiniteFactor
+from tfeti_dolfinx.qp.balanced import Balanced
+from tfeti_dolfinx.qp.problem import FaceOperator
+from tfeti_dolfinx.qp.sets import Face
+from tfeti_dolfinx.subdomains.subdomains import SoftMotions, Subdomains
+
+# steps of the power method, and the eigenvalue that it finds from which on a coarse problem pays:
+# with cτ/H = 1.4 on squares, 1.8 on cubes
+STEPS, LARGE = 3, 2.4
+# of the stiffness of a motion's rows: the least energy that it is taken to have
+ROUNDING = 1e-30
+
+
+class SoftModes:
+    """Ĝ of the motions that springs hold more softly than rows would.
+
+    Such are those with R̂ᵀKR̂ < σ‖Ĝᵀ‖², σ the mean stiffness of a scaled row. They make eigenvalues
+    of M_f F up to about 1 and the largest one of D⁻¹ĜM_fĜᵀ: where that is small M_f is better
+    alone, and none of them is taken; some would be worse than all or none. Where every subdomain
+    has all its rigid motions in the kernel there are none, and nothing is multiplied. In clusters
+    ``ClusterMotions`` takes the place of this.
+
+    Args:
+        B: Dual rows × trace unknowns.
+        coarse: The natural coarse space. The constructor is collective.
+        weights: D of the rows, on this rank's trace unknowns.
+        preconditioner: That of all rows; three multiplications where springs may be soft.
+        prefix: Prefix of the factors' PETSc options.
+
+    Attributes:
+        count: Number of soft motions of all subdomains.
+        amplification: In each body the largest of max diag(K)/R̂ᵀKR̂, 0 without springs: rounding
+            of K is so much larger in what springs do. Shape ``(b,)``.
+        factors: Makes the factors of faces, and counts them.
+    """
+
+    def __init__(
+        self,
+        B: PETSc.Mat,
+        coarse: CoarseSpace,
+        weights: Array,
+        preconditioner: DualOperator,
+        prefix: str = "tfeti_coarse_",
+    ) -> None:
+        self._comm = coarse.comm
+        own = coarse.subdomains.soft_motions()
+        Gt, energy, self.amplification = _springs(B, coarse, own)
+        sigma = mean_stiffness(coarse.subdomains, weights)
+        squares = summed(self._comm, np.asarray(Gt.multiply(Gt).sum(axis=0)).ravel())
+        soft = bcast_from_root(self._comm, np.flatnonzero(energy < sigma * squares))
+        if len(soft):
+            scale = np.sqrt(np.maximum(energy[soft], ROUNDING * sigma * squares[soft]))
+            x = B.createVecLeft()
+            if not _stands_out(preconditioner, csr_array(Gt[:, soft] / scale), x):
+                soft = soft[:0]
+        self.count = len(soft)
+        self.factors = FaceFactors(self._comm, coarse.null.extended(self.count), prefix)
+        self._grams: Grams | None = None
+        if self.count == 0:
+            return
+        self._energy = np.concatenate((np.zeros(coarse.dimension), energy[soft]))
+        self._damping = diags_array(self._energy / sigma)
+        self._Gt = csr_array(hstack((coarse.Gt, Gt[:, soft]), format="csr"))
+        contact = np.concatenate((coarse.bounded, coarse.rubbing))
+        self._grams = Grams(self._Gt, contact, self._comm)
+
+    def balanced(self, face: Face, on_face: FaceOperator) -> FaceOperator:
+        """An approximate inverse of F on a face; M_f itself where nothing is soft. Collective.
+
+        Args:
+            face: The face.
+            on_face: M_f, which is taken over.
+        """
+        if self._grams is None:
+            return on_face
+        gram = csr_array(self._grams.of_face(face) + self._damping)
+        springs = _Springs(self._Gt, face, self.factors.factor(gram), self._energy)
+        return Balanced(on_face, springs)
+
+    def destroy(self) -> None:
+        """Nothing of PETSc is kept."""
+
+
+class _Springs:
+    """Y = [G; Ĝ]ᵀ, C = ([G; Ĝ][G; Ĝ]ᵀ + [0 0; 0 D/σ])⁻¹[G; Ĝ]: CFCᵀ is taken for D⁻¹.
+
+    Where springs are soft it nearly is; where they are not, C is small. On faces [G; Ĝ] may lack
+    rank: what is left free Cᵀ does not see.
+    """
+
+    def __init__(
+        self, Gt: csr_array, face: Face, factor: SemidefiniteFactor, energy: Array
+    ) -> None:
+        self._Gt, self._face, self._factor, self.energy = Gt, face, factor, energy
+
+    def coordinates(self, x: Array) -> Array:
+        """C x."""
+        return self._factor.solve(self.moved(x))
+
+    def forces(self, c: Array) -> Array:
+        """[G; Ĝ]ᵀ c."""
+        return self._face.restricted(self._Gt @ c)
+
+    def moved(self, y: Array) -> Array:
+        """[G; Ĝ] y."""
+        return summed(self._factor.comm, self._Gt.T @ self._face.restricted(y))
+
+    def directions(self, c: Array) -> Array:
+        """Cᵀ c."""
+        return self.forces(self._factor.solve(c))
+
+    def destroy(self) -> None:
+        """Free the factor."""
+        self._factor.destroy()
+
+
+def _stands_out(M: DualOperator, Gt: csr_array, x: PETSc.Vec) -> bool:
+    """Whether ĜMĜᵀ has a large eigenvalue, by the power method. Collective.
+
+    Args:
+        M: The preconditioner on all rows.
+        Gt: This rank's rows of Ĝᵀ, of motions of energy 1.
+        x: A vector of rows, which is freed.
+    """
+    comm, y = x.getComm().tompi4py(), x.duplicate()
+    v, size = np.random.default_rng(0).standard_normal(Gt.shape[1]), 0.0
+    for _ in range(STEPS):
+        v /= np.linalg.norm(v)
+        x.array[:] = Gt @ v
+        with M.charged_to("soft motions"):
+            M.mult(x, y)
+        image = summed(comm, Gt.T @ y.array_r)
+        size, v = float(v @ image), image
+    for vector in (x, y):
+        vector.destroy()
+    return bcast_from_root(comm, size > LARGE)
+
+
+def mean_stiffness(subdomains: Subdomains, weights: Array) -> float:
+    """σ, the mean stiffness of a row scaled with D, the weights. Collective."""
+    terms = np.array([np.sum(subdomains.diagonal / weights), len(weights)])
+    stiffness, unknowns = summed(subdomains.comm, terms)
+    return float(stiffness / max(unknowns, 1.0))
+
+
+def _springs(B: PETSc.Mat, coarse: CoarseSpace, own: SoftMotions) -> tuple[csr_array, Array, Array]:
+    """This rank's rows of Ĝᵀ, with all motions outside of kernels as columns; D; amplification.
+
+    Collective.
+    """
+    subdomains = coarse.subdomains
+    offsets = chunk_offsets(coarse.comm, own.rows.shape[1])
+    total = int(offsets[-1])
+    if total == 0:
+        return csr_array((B.getLocalSize()[0], 0)), np.zeros(0), np.zeros(subdomains.num_bodies)
+    energy = np.concatenate(coarse.comm.allgather(own.energy))
+    Gt = transposed_G(B, own.rows, total)
+    return Gt, energy, subdomains.body_maxima([own.amplification])[0]

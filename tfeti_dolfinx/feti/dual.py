@@ -1,0 +1,387 @@
+"""The dual problem of a scene: Blocks and rows in, a quadratic program out."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.parallel import bcast_from_root, largest, norm_over
+from tfeti_dolfinx.constraints.rows import Constraints
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.feti.clusters import ClusterMotions, motions_for
+from tfeti_dolfinx.feti.coarse import CoarseSpace
+from tfeti_dolfinx.feti.deflation import SoftModes
+from tfeti_dolfinx.feti.operator import (
+    DualOperator,
+    MakePreconditioner,
+    ScaledRows,
+    dirichlet_preconditioner,
+    dual_operator,
+    linear_term,
+)
+from tfeti_dolfinx.feti.preconditioner import FacePreconditioner
+from tfeti_dolfinx.feti.recovery import moved, nearly_free, recover, smallest_motion
+from tfeti_dolfinx.feti.rigid_bodies import listed
+from tfeti_dolfinx.feti.solvability import check_capacity, check_solvable, holds
+from tfeti_dolfinx.qp.coarse import Coarse, NoCoarse
+from tfeti_dolfinx.qp.homogenised import LastProduct, OperatorProduct, natural, operator_product
+from tfeti_dolfinx.qp.krylov import estimate_norm
+from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
+from tfeti_dolfinx.qp.projection import project_onto_feasible
+from tfeti_dolfinx.qp.recycling import Recycled, RecycledOnFace
+from tfeti_dolfinx.qp.sets import (
+    Bounds,
+    Discs,
+    Ellipses,
+    Face,
+    FeasibleSet,
+    Product,
+    Status,
+    face_of,
+)
+from tfeti_dolfinx.subdomains.local_operators import LocalOperator
+from tfeti_dolfinx.subdomains.subdomains import Subdomains
+
+# --- Multipliers that balance the load: the smallest ones, with and without tension -----------
+
+# Of ‖e‖: what is let pass: below any rtol, and the solver makes Gλ = e good afterwards.
+LET_PASS = 1e-9
+
+log = logging.getLogger(__name__)
+
+
+def feasible_particular(coarse: CoarseSpace, like: PETSc.Vec) -> PETSc.Vec:
+    """λ̄ of min ½‖λ‖² subject to Gλ = e, λ_N ≥ 0. Collective.
+
+    The nearest feasible point to 0 (Dostál's talk, item (ii)). Where that is not found,
+    λ̄ = Gᵀ(GGᵀ)⁻¹e is taken, and a warning says so.
+
+    Args:
+        coarse: The coarse space; the problem has been found solvable.
+        like: A vector of the right layout.
+    """
+    zero = like.duplicate()
+    zero.set(0.0)
+    feasible = Product([(coarse.bounded, Bounds())])
+    found = project_onto_feasible(coarse, feasible, zero, coarse.solve(coarse.e))
+    zero.destroy()
+    if found.missing <= LET_PASS:
+        return found.lam
+    found.lam.destroy()
+    if coarse.comm.rank == 0:
+        log.warning(
+            "homogenization feasible: the smallest feasible multipliers were not found (Gλ − e "
+            "is %.1e of e); natural is taken instead",
+            found.missing,
+        )
+    return natural(coarse, like)
+
+
+# solutions of Gλ̄ = e
+PARTICULAR = {"natural": natural, "feasible": feasible_particular}
+
+
+# --- The dual problem of a scene: Blocks and rows in, a quadratic program out -----------------
+
+# times the forces and lengths that load, values and gaps make: multipliers of an earlier problem
+# that are larger would leave so many digits less to the solution
+FAR = 1e3
+
+# of stiffness, lengths and forces: beyond it squares leave the range of floating point
+LEAST, MOST = 1e-130, 1e130
+
+# from B and c to the set of multipliers, on all local rows
+FeasibleLaw = Callable[[Constraints], FeasibleSet]
+
+
+def contact_set(constraints: Constraints) -> FeasibleSet:
+    """λ_N ≥ 0, and λ_T of each condition with friction in its disc or ellipse: no adhesion."""
+    sets, limits = constraints.sets, constraints.limits
+    normal = (sets.normals, Bounds())
+    if limits.size == 0:
+        return Product([normal])
+    round_ones = np.all(limits == limits[:, :1], axis=1)
+    discs, ellipses = sets.tangents[round_ones], sets.tangents[~round_ones]
+    return Product(
+        [
+            normal,
+            (discs.ravel(), Discs(limits[round_ones].max(axis=1, initial=0.0), limits.shape[1])),
+            (ellipses.ravel(), Ellipses(limits[~round_ones])),
+        ]
+    )
+
+
+class Dual:
+    """F, G, d and e of a scene. Creation and all methods are collective.
+
+    Args:
+        constraints: B and c.
+        subdomains: This rank's Blocks.
+        body_names: Names of all bodies.
+        mode_names: Names of their candidate modes.
+        preconditioner: Makes a preconditioner from B D⁻¹ and the subdomains, or None.
+        options_prefix: Prefix of all PETSc options.
+        feasible: Makes the set of multipliers from B and c; default ``contact_set``.
+
+    Attributes:
+        F: B K⁺ Bᵀ.
+        preconditioner: The preconditioner, or None.
+        coarse: The coarse space.
+        soft: Motions that springs hold softly, or of subdomains in clusters, for the
+            preconditioner; None without one.
+        contact_rows: Number of normal and of tangential rows on all ranks.
+        seen: Largest estimate of ‖F‖ that solves have come to, 0 before.
+        feasible: The set Ω of multipliers.
+        last: The last solution of block Newton, or without a kernel, with its image.
+        recycled: Directions of earlier solves; None: none are kept.
+        pressing: After ``recover``: contact rows whose force is more than the solver's error.
+        nearly_free: After ``recover``: motions that contacts with a force hold hardly or not.
+
+    Raises:
+        InputError: Squares of stiffness, load or values leave the range of floating point.
+        NoSolutionError: The load moves a body that nothing holds.
+        FactorError: A matrix could not be factored.
+    """
+
+    def __init__(
+        self,
+        constraints: Constraints,
+        subdomains: Subdomains,
+        body_names: Sequence[str],
+        mode_names: Sequence[str],
+        preconditioner: MakePreconditioner | None = None,
+        options_prefix: str = "tfeti_",
+        feasible: FeasibleLaw = contact_set,
+    ) -> None:
+        self.constraints, self.subdomains = constraints, subdomains
+        self.pressing = np.zeros(constraints.num_rows, dtype=bool)
+        self._prefix = f"{options_prefix}face_"
+        self._names, self.nearly_free = (body_names, mode_names), list[dict[str, object]]()
+        B, comm = constraints.B, constraints.B.getComm().tompi4py()
+        self._stiffness = largest(comm, subdomains.diagonal)
+        self.d = linear_term(B, constraints.c, subdomains)
+        self._check_units(comm)
+        self.F = dual_operator(B, subdomains)
+        self.preconditioner: DualOperator | None = None
+        self._scaled: ScaledRows | None = None
+        if preconditioner is not None:
+            self._scaled = ScaledRows(B, constraints.weights)
+            self.preconditioner = preconditioner(self._scaled, subdomains)
+        self._lifting: LocalOperator | None = None
+        if self.preconditioner is not None and preconditioner is dirichlet_preconditioner:
+            self._lifting = self.preconditioner.local
+        self._on_faces: FacePreconditioner | None = None
+        self._on_all: FaceOperator | None = None
+        normals, tangents = constraints.sets.normals, constraints.sets.tangents.ravel()
+        prefix = f"{options_prefix}coarse_"
+        self.coarse = CoarseSpace(B, subdomains, normals, tangents, prefix)
+        self.soft: SoftModes | ClusterMotions | None = None
+        if self.preconditioner is not None:
+            also = (constraints.weights, self.preconditioner, prefix)
+            self.soft = motions_for(B, self.coarse, *also)
+        self.contact_rows = constraints.sets.contact_rows(comm)
+        self._law, self.feasible = feasible, feasible(constraints)
+        self._images = dict[str, tuple[Array, OperatorProduct]]()
+        self._norm: tuple[int, float] | None = None
+        self.seen, self.last = 0.0, LastProduct()
+        self.recycled: Recycled | None = None
+        self._check()
+
+    def update_load(self) -> None:
+        """Take the Blocks' present loads and the present right sides.
+
+        Raises:
+            InputError: Squares of load or values leave the range of floating point.
+            NoSolutionError: The load moves a body that nothing holds.
+        """
+        self.d.destroy()
+        self.d = linear_term(self.constraints.B, self.constraints.c, self.subdomains)
+        self._check_units(self.coarse.comm)
+        self.coarse.update_load()
+        self._check()
+
+    @property
+    def lifting(self) -> LocalOperator:
+        """S of this rank's subdomains: that of the Dirichlet preconditioner, or made for it.
+
+        Raises:
+            FactorError: The stiffness inside of a subdomain could not be factored.
+        """
+        if self._lifting is None:
+            made = self.subdomains.local_operator("schur", once=True)
+            with raised_on_all_ranks(self.coarse.comm):
+                made.prepare()
+            self._lifting = made
+        return self._lifting
+
+    def _check(self) -> None:
+        check_solvable(self.coarse, *self._names)
+        check_capacity(self.coarse, self.constraints, *self._names)
+
+    def _check_units(self, comm: MPI.Intracomm) -> None:
+        length = largest(comm, self.driving)
+        sizes = {"stiffness": self._stiffness, "displacements": length}
+        sizes["forces"] = self._stiffness * length
+        if not all(size == 0.0 or LEAST <= size <= MOST for size in sizes.values()):
+            found = ", ".join(f"{name} of {size:.1e}" for name, size in sizes.items())
+            raise InputError(
+                f"load, prescribed values and overlaps, over the stiffness, make {found}, whose "
+                "squares leave the range of floating point; expected units in which all of these "
+                f"are 0 or from {LEAST:g} to {MOST:g}"
+            )
+
+    @property
+    def holds(self) -> bool:
+        """Whether forces within the present limits of friction can balance the load."""
+        return holds(self.coarse, self.constraints)
+
+    def forget_counts(self) -> None:
+        """Count multiplications from 0 on."""
+        for operator in (self.F, self.preconditioner):
+            if operator is not None:
+                operator.count.clear()
+        self.coarse.factors.count["face"] = 0
+        if self.soft is not None:
+            self.soft.factors.count["face"] = 0
+
+    def qp(self, norm_steps: int = 0) -> QP:
+        """The quadratic program; without kernel it has no coarse problem.
+
+        Args:
+            norm_steps: Lanczos steps that estimate ‖PFP‖, once; 0 where nobody asks for it.
+        """
+        coarse: Coarse = self.coarse if self.coarse.dimension else NoCoarse()
+        self.feasible = self._law(self.constraints)  # c may be another, and what the law refers to
+        norm = self._norm_of(coarse, norm_steps) if norm_steps else 1.0
+        on = self._preconditioner_on if self.preconditioner is not None else None
+        W = None if self.recycled is None else RecycledOnFace(self.recycled)
+        return QP(self.F, self.d, coarse, self.feasible, self._on_all_rows, norm, on, self.seen, W)
+
+    def saw(self, norm: float) -> None:
+        """A solve has estimated ‖F‖: what the next one begins with.
+
+        Of its start alone it might see far less, and take its multipliers for less exact.
+        """
+        self.seen = max(self.seen, norm)
+
+    @property
+    def _on_all_rows(self) -> Operator | None:
+        """The preconditioner where nothing is constrained; what it needs is made once."""
+        smooths = self.preconditioner is not None and self.preconditioner.metric is not None
+        if self.soft is None or not (self.soft.count or (smooths and not any(self.contact_rows))):
+            return self.preconditioner
+        if self._on_all is None:
+            rows = self.constraints.num_rows
+            face = face_of(np.ones(rows, dtype=bool), np.full(rows, Status.FREE))
+            self._on_all = self._preconditioner_on(face)
+        return self._on_all
+
+    def _preconditioner_on(self, face: Face) -> FaceOperator:
+        """The preconditioner on a face of the rows; what all faces share is made once."""
+        assert self.preconditioner is not None
+        assert self.soft is not None
+        if self._on_faces is None:
+            diagonal = self.subdomains.diagonal
+            self._on_faces = FacePreconditioner(
+                self.preconditioner, self.constraints, diagonal, self._prefix
+            )
+        return self.soft.balanced(face, self._on_faces.on_face(face))
+
+    def _norm_of(self, coarse: Coarse, steps: int) -> float:
+        if self._norm is None or self._norm[0] != steps:
+            with self.F.charged_to("power method"):
+                self._norm = (steps, estimate_norm(self.F, coarse, self.d, steps))
+        return self._norm[1]
+
+    def image(self, kind: str) -> OperatorProduct:
+        """λ̄ of a kind in ``PARTICULAR`` with F λ̄; multiplies once for each e."""
+        if (found := self.known_image(kind)) is not None:
+            return found
+        if kind in self._images:
+            self._images.pop(kind)[1].destroy()
+        made = operator_product(self.F, PARTICULAR[kind](self.coarse, self.d))
+        self._images[kind] = (self.coarse.e.copy(), made)
+        return made
+
+    @property
+    def driving(self) -> Array:
+        """What load, prescribed values, slips and overlaps make: d without gaps, local rows."""
+        c, normals = self.constraints.c.array_r, self.constraints.sets.normals
+        d = np.array(self.d.array_r)
+        d[normals] += np.maximum(c[normals], 0.0)
+        return d
+
+    def is_far(self, lam: Array, mu: Array) -> bool:
+        """Whether multipliers are far beyond what drives the problem, as after unloading.
+
+        Forces and lengths both are: λ beside the least that balances the load; Fλ and Gᵀμ beside
+        what drives the problem. The solution would be their small difference, with their rounding.
+        Multiplies by F at most once, and not where λ is the last solution.
+
+        Args:
+            lam: λ on this rank's rows.
+            mu: Multipliers of Gλ = e.
+        """
+        comm, coarse, x = self.coarse.comm, self.coarse, self.d.duplicate()
+        coarse.particular(x)
+        forces = norm_over(comm, lam)
+        if 0.0 < forces <= FAR * norm_over(comm, x.array_r):
+            x.destroy()
+            return False
+        if len(mu) == coarse.dimension:
+            coarse.combine(mu, x)
+        lengths = norm_over(comm, x.array_r)
+        x.array[:] = lam
+        at = self.last.image(self.F, x)
+        self.last.pass_on(np.array(lam), np.array(at.Fx.array_r), 0.0)
+        lengths += norm_over(comm, at.Fx.array_r)
+        at.destroy()
+        return lengths > FAR * norm_over(comm, self.driving)
+
+    def known_image(self, kind: str) -> OperatorProduct | None:
+        """λ̄ and F λ̄ if they are known for the present e."""
+        if kind not in self._images or not np.array_equal(self._images[kind][0], self.coarse.e):
+            return None
+        return self._images[kind][1]
+
+    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> Array:
+        """Displacements that belong to multipliers: of equal ones the smallest.
+
+        Args:
+            lam: The multipliers λ.
+            gradient: Fλ − d up to the range of Gᵀ; on open rows the multiplier ν.
+            face: The face of λ: which rows carry a force.
+            error: How large multipliers may be by the solver's error alone.
+
+        Returns:
+            This rank's part of u, shape ``(n,)``.
+        """
+        B, c, pinv_load = self.constraints.B, self.constraints.c, self.subdomains.pinv_load
+        u, gap, g = recover(B, c, self.coarse, lam, gradient, face, pinv_load)
+        self.last.look(lam, g)
+        return self.smallest(u, gap, lam.array_r, face, error)
+
+    def smallest(self, u: Array, gap: Array, lam: Array, face: Face, error: float) -> Array:
+        """Of displacements that are equally right the smallest, given one and its c − Bu."""
+        motions, force = nearly_free(self.coarse, lam, face.carrying, error)
+        self.pressing = force
+        words = listed(motions, self.coarse.bodies, *self._names)
+        self.nearly_free = bcast_from_root(self.coarse.comm, words)
+        if motions.count == 0:
+            return u
+        gap[self.constraints.sets.tangents] = 0.0  # a slip says nothing of how exact rows are
+        alpha = smallest_motion(self.coarse, u, gap, motions, force)
+        return moved(u, self.coarse, alpha)
+
+    def destroy(self) -> None:
+        """Destroy the PETSc objects."""
+        images = [found for _, found in self._images.values()]
+        own = (self._on_all, self._on_faces, self.soft, self.preconditioner, self._scaled)
+        for item in (self.F, *own, self.coarse, self.d, *images):
+            if item is not None:
+                item.destroy()

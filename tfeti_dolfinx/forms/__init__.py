@@ -1,0 +1,1 @@
+"""Forms of a user: checks, assembly, elasticity, stress fields, steps in time."""

@@ -1,0 +1,166 @@
+"""Compiled forms on the torn mesh, their matrices, and whether their data has changed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from hashlib import blake2b
+from typing import Any
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.compat import JIT_OPTIONS, assemble_csr
+from tfeti_dolfinx.common.parallel import any_rank
+from tfeti_dolfinx.common.validation import checked_type, named
+from tfeti_dolfinx.errors import raised_on_all_ranks
+from tfeti_dolfinx.forms.checks import check_form, is_zero
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+
+
+class Data:
+    """Numbers that somebody may change, and what they were last.
+
+    Args:
+        arrays: Gives the numbers as they are now.
+        comm: Communicator.
+    """
+
+    def __init__(self, arrays: Callable[[], list[Array]], comm: MPI.Intracomm) -> None:
+        self._arrays, self._comm, self._seen = arrays, comm, b""
+
+    def has_changed(self) -> bool:
+        """Whether anything is other than at the last call, or this is the first. Collective."""
+        before, self._seen = self._seen, self._digest()
+        return any_rank(self._comm, before != self._seen)
+
+    def _digest(self) -> bytes:
+        digest = blake2b()
+        for array in self._arrays():
+            digest.update(np.ascontiguousarray(array))
+        return digest.digest()
+
+
+def data_of(form: ufl.Form | ufl.ZeroBaseForm, V: fem.FunctionSpace) -> Data:
+    """The constants and coefficients of a form whose arguments are on V."""
+    zero = is_zero(form)
+    constants = [] if zero else list(form.constants())
+    coefficients = [] if zero else list(form.coefficients())
+    return Data(
+        lambda: [*(c.value for c in constants), *(f.x.array for f in coefficients)], V.mesh.comm
+    )
+
+
+class Forms:
+    """The compiled forms of a problem. Creation and all methods are collective.
+
+    Args:
+        a: Bilinear form.
+        L: Linear form.
+        V: The space of a.
+        decomposition: The torn mesh.
+        form_compiler_options: As in DOLFINx.
+        jit_options: As in DOLFINx.
+
+    Attributes:
+        given: The forms as they were given, by their names.
+        thickness: What the forms were multiplied with, a number or a scalar in UFL; 1 until it is
+            set.
+
+    Raises:
+        InputError: A form cannot be integrated on the torn mesh, or not be compiled.
+    """
+
+    def __init__(
+        self,
+        a: ufl.Form,
+        L: ufl.Form | ufl.ZeroBaseForm,
+        V: fem.FunctionSpace,
+        decomposition: Decomposition,
+        form_compiler_options: Mapping[str, Any] | None,
+        jit_options: Mapping[str, Any] | None,
+    ) -> None:
+        self._V, self._decomposition = V, decomposition
+        self.given: dict[str, Any] = {}
+        self.thickness: Any = 1.0
+        self._keywords = {
+            "form_compiler_options": _options(form_compiler_options, "form_compiler_options"),
+            "jit_options": {**JIT_OPTIONS, **_options(jit_options, "jit_options")},
+        }
+        self._points = Data(lambda: [V.mesh.geometry.x], decomposition.comm)
+        self.replace_stiffness(a)
+        self.replace_load(L)
+
+    def replace_stiffness(self, a: ufl.Form) -> None:
+        """Take another bilinear form on the same space."""
+        check_form(a, "a", self._V, self._decomposition)
+        self._a, self._of_a = self._compiled(a, "a"), data_of(a, self._V)
+        self.given = {**self.given, "a": a}
+
+    def replace_load(self, L: ufl.Form | ufl.ZeroBaseForm) -> None:
+        """Take another linear form on the same space."""
+        check_form(L, "L", self._V, self._decomposition)
+        self._L = None if is_zero(L) else self._compiled(L, "L")
+        self._of_L = data_of(L, self._V)
+        self.given = {**self.given, "L": L}
+        self._volume_of_L: ufl.Form | fem.Form | None = cell_integrals(L)
+
+    def has_new_points(self) -> bool:
+        """Whether the mesh has moved since the last call."""
+        return self._points.has_changed()
+
+    def has_new_stiffness(self) -> bool:
+        """Whether a, or what it refers to, has changed since the last call."""
+        return self._of_a.has_changed()
+
+    def has_new_load(self) -> bool:
+        """Whether L, or what it refers to, has changed since the last call."""
+        return self._of_L.has_changed()
+
+    def stiffness(self) -> Any:
+        """This rank's K in DOLFINx's numbering, scipy CSR."""
+        return assemble_csr(self._a)
+
+    def load(self) -> Array:
+        """This rank's f in DOLFINx's numbering."""
+        if self._L is None:
+            return np.zeros(self._V.dofmap.index_map.size_local * self._V.dofmap.index_map_bs)
+        return np.array(fem.assemble_vector(self._L).array)
+
+    def volume_load(self) -> Array | None:
+        """The part of the load from integrals over cells; None if there are none."""
+        if self._volume_of_L is None:
+            return None
+        if isinstance(self._volume_of_L, ufl.Form):  # few problems ask for it
+            self._volume_of_L = self._compiled(self._volume_of_L, "L")
+        return np.array(fem.assemble_vector(self._volume_of_L).array)
+
+    def hats(self) -> Array:
+        """Integrals of the hats over the cells, for each of DOLFINx's nodes."""
+        one = fem.Constant(self._V.mesh, (1.0,) + (0.0,) * (self._V.dofmap.bs - 1))
+        dx = ufl.Measure("dx", domain=self._V.mesh)
+        form = self._compiled(ufl.dot(one, ufl.TestFunction(self._V)) * dx, "the volume")
+        return np.array(fem.assemble_vector(form).array[:: self._V.dofmap.bs])
+
+    def _compiled(self, form: ufl.Form, name: str) -> fem.Form:
+        """The form compiled by DOLFINx, which fails on all ranks or on none."""
+        comm = self._decomposition.comm
+        with raised_on_all_ranks(comm), named(f"{name} cannot be compiled"):
+            return fem.form(form, **self._keywords)
+
+
+def cell_integrals(form: Any) -> ufl.Form | None:
+    """The part of a form over cells; None if it has none."""
+    if is_zero(form):
+        return None
+    parts = [part for part in form.integrals() if part.integral_type() == "cell"]
+    return ufl.Form(parts) if parts else None
+
+
+def _options(given: Mapping[str, Any] | None, what: str) -> dict[str, Any]:
+    if given is None:
+        return {}
+    checked_type(given, Mapping, what, "a dictionary")
+    return dict(given)

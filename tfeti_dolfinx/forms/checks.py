@@ -1,0 +1,288 @@
+"""What forms may be made of: arguments, coefficients, measures and tags on the torn mesh."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import basix
+import numpy as np
+import ufl
+from dolfinx import fem
+from dolfinx import mesh as dmesh
+from ufl.algorithms import compute_form_data, extract_arguments
+from ufl.algorithms.check_arities import ArityMismatch
+from ufl.constantvalue import Zero
+from ufl.corealg.traversal import unique_pre_traversal
+from ufl.domain import extract_domains
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.compat import JIT_OPTIONS, geometry_dofmap
+from tfeti_dolfinx.common.validation import is_whole, named, shown
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.mesh.decomposition import Decomposition, check_tags, known_tags
+from tfeti_dolfinx.mesh.dofs import check_space, described, is_same_space
+from tfeti_dolfinx.mesh.untorn import cell_facets
+
+ARITY = {1: "linear", 2: "bilinear"}
+FUNCTIONS = ("test", "trial")
+# degree of the points inside a cell at which a thickness is looked at
+INSIDE = 2
+# of the largest value: less below 0 is rounding
+ROUNDING = 1e-12
+KINDS = {"cell": "dx", "exterior_facet": "ds", "interior_facet": "dS"}
+
+
+def displacement_space(
+    a: ufl.Form, decomposition: Decomposition, name: str = "a"
+) -> fem.FunctionSpace:
+    """The space of a bilinear form's trial and test functions. Collective.
+
+    Raises:
+        InputError: The form is not bilinear on one space for displacements on the torn mesh.
+    """
+    test, trial = _argument_spaces(a, name, 2)
+    check_space(test, decomposition)
+    check_same_space(trial, test, f"the trial function of {name}", "that of its test function")
+    return test
+
+
+def check_form(form: Any, name: str, V: fem.FunctionSpace, decomposition: Decomposition) -> None:
+    """Raise if a form cannot be integrated on the torn mesh. Collective.
+
+    Args:
+        form: The form; a linear one may be zero.
+        name: ``"a"`` or ``"L"``.
+        V: The space of displacements.
+        decomposition: The torn mesh.
+
+    Raises:
+        InputError: The form's space, coefficients, geometry, measures or tags do not fit.
+    """
+    if name == "L":
+        if is_zero(form):
+            return
+        (space,) = _argument_spaces(form, name, 1)
+        check_same_space(space, V, "the test function of L", "that of a")
+    for integral in form.integrals():
+        check_mesh(integral.integrand(), name, decomposition)
+    _check_measures(form, name, decomposition)
+
+
+def check_not_negative(value: Any, what: str, mesh: dmesh.Mesh) -> None:
+    """Raise if a scalar in UFL is negative or no number somewhere in a cell. Collective.
+
+    It is asked at the corners of each cell and at points inside.
+
+    Args:
+        value: The scalar, with its present constants and functions.
+        what: Its name in messages.
+        mesh: Its mesh.
+
+    Raises:
+        InputError: It is, or it cannot be asked.
+    """
+    cell_type = getattr(basix.CellType, mesh.topology.cell_type.name)
+    inside, _ = basix.make_quadrature(cell_type, INSIDE)
+    points = np.vstack((basix.geometry(cell_type), inside))
+    cells = np.arange(len(geometry_dofmap(mesh)), dtype=np.int32)
+    with raised_on_all_ranks(mesh.comm), named(what):
+        values = fem.Expression(value, points, jit_options=JIT_OPTIONS).eval(mesh, cells)
+        values = np.asarray(values).reshape(len(cells), len(points))
+        allowed = -ROUNDING * np.abs(values).max(initial=0.0)  # 2πr on the axis
+        wrong = ~(np.isfinite(values) & (values >= allowed))
+        if np.any(wrong):
+            cell, point = np.argwhere(wrong)[0]
+            middle = mesh.geometry.x[geometry_dofmap(mesh)[cell]].mean(axis=0)
+            at = middle[: mesh.geometry.dim].tolist()
+            raise InputError(
+                f"{what} is {values[cell, point]:.6g} in the cell around {at}; expected a "
+                "positive number everywhere"
+            )
+
+
+def is_zero(form: Any) -> bool:
+    """Whether a form is one of UFL's zeros, which DOLFINx does not assemble."""
+    if isinstance(form, ufl.Form):
+        return all(isinstance(integral.integrand(), Zero) for integral in form.integrals())
+    return isinstance(form, ufl.ZeroBaseForm) and len(form.arguments()) == 1
+
+
+def check_same_space(V: Any, W: fem.FunctionSpace, what: str, whose: str) -> None:
+    """Raise unless two spaces are the same, or equal in all but their names. Collective."""
+    with raised_on_all_ranks(W.mesh.comm):
+        if not isinstance(V, fem.FunctionSpace):
+            raise InputError(f"{what} is from {shown(V)}; expected a dolfinx.fem.FunctionSpace")
+        if V is W or is_same_space(V._cpp_object, W._cpp_object):
+            return
+        place = "" if V.mesh is W.mesh else " on another mesh"
+        raise InputError(
+            f"{what} is from {described(V._cpp_object)}{place}; expected {whose}, "
+            f"{described(W._cpp_object)}"
+        )
+
+
+def check_mesh(expression: Any, name: str, decomposition: Decomposition) -> None:
+    """Raise if an expression takes functions or geometry from another mesh.
+
+    Constants may be from any: they are numbers.
+    """
+    domain = decomposition.mesh.ufl_domain()
+    for term in unique_pre_traversal(expression):
+        if not term._ufl_is_terminal_:
+            continue
+        _check_kind(term, name)
+        if not isinstance(term, ufl.Constant) and any(d != domain for d in extract_domains(term)):
+            is_function = isinstance(term, fem.Function)
+            how = ", where decomposition.from_original takes functions" if is_function else ""
+            raise InputError(
+                f"{name}: {_term_name(term)} is on another mesh (the one before decompose?); "
+                f"expected decomposition.mesh, the torn mesh{how}"
+            )
+
+
+def _check_kind(term: Any, name: str) -> None:
+    """Raise if a function or a constant has no values."""
+    for kind, expected in ((ufl.Coefficient, fem.Function), (ufl.Constant, fem.Constant)):
+        if isinstance(term, kind) and not isinstance(term, expected):
+            raise InputError(
+                f"{name}: {term} is a ufl.{kind.__name__}, which has no values; expected a "
+                f"dolfinx.fem.{expected.__name__}"
+            )
+
+
+def _term_name(term: Any) -> str:
+    if isinstance(term, fem.Function):
+        return f"the function {term.name!r}"
+    return f"the {type(term).__name__} {term}"
+
+
+def _argument_spaces(form: Any, name: str, arity: int) -> list[Any]:
+    expected = f"a {ARITY[arity]} form"
+    if isinstance(form, fem.Form):
+        raise InputError(f"{name} is a compiled form, dolfinx.fem.Form; expected UFL's own")
+    if not isinstance(form, ufl.Form):
+        hint = ", for no load ufl.ZeroBaseForm((v,))" if arity == 1 else ""
+        raise InputError(f"{name} is {shown(form)}; expected {expected} of UFL{hint}")
+    with named(f"{name} is not {expected}"):
+        arguments = form.arguments()
+    if len(arguments) != arity:
+        raise InputError(f"{name} has {len(arguments)} arguments; expected {expected}")
+    for integral in form.integrals():
+        parts = {argument.number() for argument in extract_arguments(integral.integrand())}
+        if missing := set(range(arity)) - parts:
+            kind = FUNCTIONS[missing.pop()]
+            raise InputError(f"{name}: an integral has no {kind} function; expected {expected}")
+    _check_linearity(form, f"{name} is not {expected}")
+    return [argument.ufl_function_space() for argument in arguments]
+
+
+def _check_linearity(form: ufl.Form, what: str) -> None:
+    """Raise if a form is not linear in its arguments: DOLFINx would say so on one rank only."""
+    with named(what):
+        try:
+            compute_form_data(form)
+        except ArityMismatch as error:  # a BaseException, which nobody else catches
+            raise ValueError(error) from error
+
+
+def _check_measures(form: ufl.Form, name: str, decomposition: Decomposition) -> None:
+    data_of: dict[str, Any] = {}
+    for integral in form.integrals():
+        kind, data = integral.integral_type(), integral.subdomain_data()
+        if kind not in KINDS:
+            raise InputError(f"{name}: integrals of type {kind} are not supported; expected dx, ds")
+        if integral.ufl_domain() != decomposition.mesh.ufl_domain():
+            raise InputError(
+                f"{name}: {KINDS[kind]} is on another mesh (the one before decompose?); expected "
+                "decomposition.mesh, the torn mesh"
+            )
+        if kind == "interior_facet" and decomposition.is_torn:
+            raise InputError("dS has no meaning across the tears of the mesh; use dx and ds(tag)")
+        _check_tags(integral, name, decomposition)
+        if data_of.setdefault(kind, data) is not data:
+            raise InputError(
+                f"{name}: {KINDS[kind]} with different subdomain_data; expected one measure "
+                f"{KINDS[kind]} in a form"
+            )
+
+
+def _check_tags(integral: Any, name: str, decomposition: Decomposition) -> None:
+    tag, data, kind = integral.subdomain_id(), integral.subdomain_data(), integral.integral_type()
+    tags = tag if isinstance(tag, tuple) else (tag,)
+    if "everywhere" in tags or "otherwise" in tags:
+        if kind == "exterior_facet" and decomposition.is_torn:
+            raise InputError(
+                f"{name}: an untagged ds would integrate over the tears of the mesh; use "
+                "ds(decomposition.surface(name)) with subdomain_data=decomposition.facet_tags"
+            )
+        return
+    for t in tags:
+        what = f"{name}: {KINDS[kind]}({t})"
+        with raised_on_all_ranks(decomposition.comm), named(what):
+            entities, values = _tagged(data, kind, decomposition, what)
+        _check_entities(entities[values == t], kind, what, decomposition)
+
+
+def _check_entities(entities: Array, kind: str, what: str, decomposition: Decomposition) -> None:
+    """Raise if a tag has no entities, or facets inside a body. Collective."""
+    outside = decomposition.boundary if kind == "exterior_facet" else entities
+    inside = np.setdiff1d(entities, outside)
+    count, wrong = decomposition.comm.allreduce(np.array([len(entities), len(inside)]))
+    if count == 0:
+        groups = decomposition.names.volumes if kind == "cell" else decomposition.names.surfaces
+        raise InputError(
+            f"{what}: nothing has this tag; the names and tags of the decomposition are: "
+            f"{known_tags(groups)}"
+        )
+    if wrong:
+        raise InputError(
+            f"{what}: {wrong} of its facets lie inside a body; expected facets of the boundary "
+            "only, such as of decomposition.facets(name) or decomposition.locate_facets(marker)"
+        )
+
+
+def _tagged(data: Any, kind: str, decomposition: Decomposition, what: str) -> tuple[Array, Array]:
+    """Local cells or facets of a measure's data, and their tags."""
+    name = "cell_tags" if kind == "cell" else "facet_tags"
+    usual = f"expected subdomain_data=decomposition.{name}"
+    if data is None:
+        raise InputError(f"{what} without subdomain_data: {usual}")
+    if isinstance(data, (list, tuple)) and kind != "interior_facet":
+        return _listed(data, kind, decomposition, what)
+    if not isinstance(data, dmesh.MeshTags):
+        raise InputError(f"{what}: subdomain_data is {shown(data)}; {usual}")
+    check_tags(data, decomposition.mesh, kind == "cell", f"{what}: subdomain_data", usual)
+    return data.indices, data.values
+
+
+def _listed(data: Any, kind: str, decomposition: Decomposition, what: str) -> tuple[Array, Array]:
+    """The same of DOLFINx's lists of a tag and cells, or pairs of a cell and a local facet."""
+    mesh = decomposition.mesh
+    facets = cell_facets(mesh)
+    entities: list[Array] = [np.empty(0, np.int64)]
+    values: list[Array] = [np.empty(0, np.int64)]
+    for item in data:
+        if not (isinstance(item, tuple) and len(item) == 2 and is_whole(item[0])):
+            raise InputError(
+                f"{what}: subdomain_data has {shown(item)}; expected tuples of a tag and an array"
+            )
+        found = np.asarray(item[1], dtype=np.int64).ravel()
+        if kind == "cell":
+            valid = (found >= 0) & (found < len(facets))
+        else:
+            cell, local = found[: len(found) // 2 * 2].reshape(-1, 2).T
+            valid = (cell >= 0) & (cell < len(facets)) & (local >= 0) & (local < facets.shape[1])
+        if (len(found) % 2 and kind != "cell") or not np.all(valid):
+            raise InputError(
+                f"{what}: subdomain_data of tag {item[0]} has entities that this rank has not; "
+                "expected local cells, for ds each followed by its local facet"
+            )
+        entities.append(found if kind == "cell" else facets[cell, local])
+        values.append(np.full(len(entities[-1]), item[0]))
+    tags = [tag for tag, _ in data]
+    if tags != sorted(set(tags)):  # DOLFINx would integrate over some of them only
+        raise InputError(
+            f"{what}: subdomain_data has the tags {shown(tags)}; expected each once, in ascending "
+            "order"
+        )
+    return np.concatenate(entities), np.concatenate(values)

@@ -1,0 +1,170 @@
+"""Fields for a user to look at: stress, von Mises, and nodal averages over cells and tears."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from ufl.algorithms.analysis import (
+    extract_arguments,
+    extract_coefficients,
+    extract_constants,
+)
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.compat import JIT_OPTIONS, interpolation_points
+from tfeti_dolfinx.common.validation import POSITIVE, checked_callable, checked_number, named, shown
+from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.forms.checks import check_mesh, check_not_negative
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
+
+Stress = Callable[[Any], Any]
+
+
+def von_mises(sigma: Any) -> Any:
+    """Von Mises stress of a 3×3 tensor, as a UFL expression."""
+    deviator = sigma - ufl.tr(sigma) / 3 * ufl.Identity(3)
+    return ufl.sqrt(1.5 * ufl.inner(deviator, deviator))
+
+
+def checked_stress(stress: Stress, u: fem.Function) -> Any:
+    """The stress of u as a UFL expression.
+
+    Raises:
+        InputError: It cannot be called, fails, or does not return a 3×3 tensor.
+    """
+    expected = "a callable from a displacement to its stress in UFL"
+    if isinstance(stress, ufl.core.expr.Expr):  # which can be called, but for something else
+        raise InputError(f"stress is an expression; expected {expected}")
+    checked_callable(stress, "stress", expected)
+    with named("stress(u)"):
+        sigma = stress(u)
+    if not isinstance(sigma, ufl.core.expr.Expr):
+        raise InputError(f"stress(u) is {shown(sigma)}; expected a UFL tensor of shape (3, 3)")
+    if sigma.ufl_shape != (3, 3):
+        raise InputError(
+            f"stress(u) has shape {sigma.ufl_shape}; expected (3, 3), in plane strain with σ_zz"
+        )
+    return sigma
+
+
+def checked_thickness(thickness: Any, decomposition: Decomposition) -> Any:
+    """What areas of the mesh are multiplied with, a number or a scalar in UFL. Collective.
+
+    Raises:
+        InputError: It is neither, not positive, negative somewhere, or on another mesh.
+    """
+    if not isinstance(thickness, ufl.core.expr.Expr):
+        return checked_number(thickness, "thickness", POSITIVE)
+    if thickness.ufl_shape != ():
+        raise InputError(f"thickness is of shape {thickness.ufl_shape}; expected a scalar")
+    check_mesh(thickness, "thickness", decomposition)
+    if extract_arguments(thickness):
+        raise InputError("thickness has a test or trial function; expected a scalar with values")
+    if isinstance(thickness, fem.Constant):
+        checked_number(thickness.value, "thickness", POSITIVE)
+    else:
+        check_not_negative(thickness, "thickness", decomposition.mesh)
+    return thickness
+
+
+def frozen(expression: Any, but: fem.Function | None = None) -> Any:
+    """An expression with its constants and functions as they are now, all but one.
+
+    The mesh is no function: where it is moved, the expression moves along.
+    """
+    if not isinstance(expression, ufl.core.expr.Expr):
+        return expression
+    copies = {c: fem.Constant(c.ufl_domain(), c.value) for c in extract_constants(expression)}
+    functions = [f for f in extract_coefficients(expression) if f is not but]
+    return ufl.replace(expression, copies | {f: f.copy() for f in functions})
+
+
+def cellwise(expression: Any, dofs: TornDofs, name: str) -> fem.Function:
+    """A UFL expression at the nodes of each cell, discontinuous between cells. Collective."""
+    element = ("DG", dofs.V.element.basix_element.degree, expression.ufl_shape)
+    W = fem.functionspace(dofs.V.mesh, element if expression.ufl_shape else element[:2])
+    function = fem.Function(W, name=name)
+    points = interpolation_points(W)
+    function.interpolate(fem.Expression(expression, points, jit_options=JIT_OPTIONS))
+    return function
+
+
+def nodal(expression: Any, dofs: TornDofs, name: str) -> fem.Function:
+    """A UFL expression averaged at the nodes, weighted by the cells' volumes. Collective.
+
+    The average goes over the cells of all torn copies, so the field has no jumps at the tears.
+    """
+    in_cells = cellwise(expression, dofs, name)
+    shape = expression.ufl_shape
+    degree = dofs.V.element.basix_element.degree
+    W = fem.functionspace(
+        dofs.V.mesh, ("Lagrange", degree, shape) if shape else ("Lagrange", degree)
+    )
+    size = W.dofmap.index_map_bs
+    cells = np.asarray(W.dofmap.list)
+    weight = np.repeat(_volumes(dofs), cells.shape[1])
+    values = in_cells.x.array.reshape(-1, size)[np.asarray(in_cells.function_space.dofmap.list)]
+    sums = np.zeros((W.dofmap.index_map.size_local, size + 1))
+    np.add.at(
+        sums,
+        cells.ravel(),
+        np.column_stack((values.reshape(-1, size) * weight[:, None], weight)),
+    )
+    sums = dofs.spread(dofs.reduce(sums[dofs.dolfinx_node], np.add, 0.0))
+    averages = np.empty((len(sums), size))
+    averages[dofs.dolfinx_node] = sums[:, :-1] / sums[:, -1:]
+    function = fem.Function(W, name=name)
+    function.x.array[:] = averages.ravel()
+    return function
+
+
+def from_vertices(dofs: TornDofs, values: Array, vertices: Array) -> fem.Function:
+    """Scalar function from values at vertices. Collective.
+
+    Nodes between vertices take the value of the linear interpolant where all those vertices have
+    one, else 0: a field of a surface stays on the surface.
+
+    Args:
+        dofs: Dof maps.
+        values: One value per owned group, shape ``(g,)``.
+        vertices: Which groups are vertices with a value, shape ``(g,)``.
+    """
+    S, dof = dofs.scalar
+    function = fem.Function(S)
+    if S.element.basix_element.degree == 1:
+        function.x.array[dof] = dofs.spread(np.where(vertices, values, 0.0))
+        return function
+    W, node = dofs.hats
+    linear, share, inside = fem.Function(W), fem.Function(W), fem.Function(S)
+    linear.x.array[:] = dofs.spread(np.where(vertices, values, 0.0))[node]
+    share.x.array[:] = dofs.spread(vertices.astype(float))[node]
+    function.interpolate(linear)
+    inside.interpolate(share)
+    function.x.array[inside.x.array < 1.0 - 1e-8] = 0.0
+    return function
+
+
+def vector_from_vertices(dofs: TornDofs, values: Array, vertices: Array, name: str) -> fem.Function:
+    """Vector function from values at vertices, shape ``(g, bs)``, as ``from_vertices``.
+
+    Collective.
+    """
+    function = fem.Function(dofs.V, name=name)
+    components = function.x.array.reshape(-1, dofs.bs)
+    for i in range(dofs.bs):
+        component = from_vertices(dofs, values[:, i], vertices)
+        components[dofs.dolfinx_node, i] = component.x.array[dofs.scalar[1]]
+    return function
+
+
+def _volumes(dofs: TornDofs) -> Array:
+    """Volume of each local cell."""
+    W = fem.functionspace(dofs.V.mesh, ("DG", 0))
+    form = fem.form(ufl.TestFunction(W) * ufl.dx(metadata={"quadrature_degree": 2}))
+    volumes = fem.assemble_vector(form).array
+    return np.asarray(volumes[np.asarray(W.dofmap.list)[:, 0]])

@@ -1,0 +1,264 @@
+"""Forms of bodies with mass: what a step of Newmark's trapezoidal rule solves for.
+
+With τ the step, f the mean load and w = u + τv, or what takes its place,
+
+    (K/2 + 2M/τ²) u⁺ = f + 2Mw/τ² − Ku/2 − Bᵀλ,    v⁺ = v + 2(u⁺ − w)/τ.
+
+It is half of what the literature has, so that λ are forces: their mean in the step.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from scipy.sparse import csr_array
+
+from tfeti_dolfinx.common.agreement import agreeing
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.compat import assemble_csr
+from tfeti_dolfinx.common.validation import POSITIVE, Range, check_stiffness, checked_number
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.forms.assembly import Data, Forms, data_of
+from tfeti_dolfinx.forms.checks import check_form, check_same_space, displacement_space
+from tfeti_dolfinx.forms.elasticity import Modulus, in_ufl
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
+
+# of a step: another one that differs by less is the same, since times of equal steps are rounded
+SAME_STEP = 1e-9
+
+# of the sum of the diagonal: the mass of a translation is rounding, as where M has a kernel
+NO_MASS = 1e-10
+# of the largest value: where torn copies differ by less a solver may have left it
+TORN = 1e-3
+STEP = Range("a positive number whose square is one, too", lambda value: min(value, value**2) > 0.0)
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class Motion:
+    """Where a step begins. Arrays are this rank's, in DOLFINx's numbering.
+
+    Attributes:
+        u: Displacement.
+        v: Velocity.
+        load: Load.
+        towards: w, where the bodies would be without forces: u + τv, or a predictor.
+        size: The step τ, 0 before it is known.
+    """
+
+    u: Array
+    v: Array
+    load: Array
+    towards: Array = field(default_factory=lambda: np.zeros(0))
+    size: float = 0.0
+
+    @property
+    def free(self) -> Array:
+        """u + τv."""
+        return self.u + self.size * self.v
+
+    def velocity(self, u: Array) -> Array:
+        """v⁺ where the step ends at u."""
+        return self.v + 2.0 / self.size * (u - self.towards)
+
+
+class InertialForms(Forms):
+    """The matrix and the load of a step. Creation and all methods are collective.
+
+    Args:
+        mass: Bilinear form of the mass M.
+        as_forms: Arguments of ``Forms``; L is the load as it is at the end of the step.
+
+    Attributes:
+        motion: Where the step begins.
+
+    Raises:
+        InputError: As ``Forms``.
+    """
+
+    def __init__(self, mass: ufl.Form, *as_forms: Any) -> None:
+        super().__init__(*as_forms)
+        V, decomposition = self._V, self._decomposition
+        self._comm = decomposition.comm
+        space = displacement_space(mass, decomposition, "mass")
+        check_same_space(space, V, "the trial function of mass", "that of a")
+        check_form(mass, "mass", V, decomposition)
+        self._m = self._compiled(mass, "mass")
+        zero = np.zeros(V.dofmap.index_map.size_local * V.dofmap.index_map_bs)
+        self.motion = motion = Motion(zero, zero, super().load())
+        self._of_step = Data(lambda: [np.array(motion.size)], self._comm)
+        self._of_m = data_of(mass, V)
+        self.given = {**self.given, "mass": mass}
+        self._of_motion = Data(lambda: [motion.u, motion.load, motion.towards], self._comm)
+        self._matrices: tuple[csr_array, csr_array] | None = None
+        self._new_matrices = True
+        self._ends = self.motion.load
+
+    def take_step(self, size: float) -> None:
+        """Let the next step have a size, which makes the matrix anew if it is another one.
+
+        Raises:
+            InputError: It is not a positive number, or another one on another rank.
+        """
+        with agreeing(self._comm, "take_step") as given:
+            given["step"] = size = checked_number(size, "step", STEP)
+        known = self.motion.size
+        if abs(size - known) <= SAME_STEP * known:
+            return
+        if known and self._comm.rank == 0:
+            log.warning("the step is now %g, it was %g: all is factored anew", size, known)
+        self.motion.size = size
+
+    def has_new_points(self) -> bool:
+        """Whether the mesh has moved since the last call."""
+        if changed := super().has_new_points():
+            self._matrices = None
+        return changed
+
+    def has_new_stiffness(self) -> bool:
+        """Whether K, M or the step has changed since the last call."""
+        changed = [super().has_new_stiffness(), self._of_m.has_changed()]
+        if any(changed):
+            self._matrices = None
+        found = self._of_step.has_changed() or any(changed)
+        self._new_matrices |= found
+        return found
+
+    def has_new_load(self) -> bool:
+        """Whether L, where the step begins, K, M or the step has changed since the last call."""
+        changed = super().has_new_load() or self._new_matrices
+        self._new_matrices = False
+        return self._of_motion.has_changed() or changed
+
+    @property
+    def matrices(self) -> tuple[csr_array, csr_array]:
+        """This rank's K and M in DOLFINx's numbering."""
+        if self._matrices is None:
+            M = assemble_csr(self._m)
+            with raised_on_all_ranks(self._comm):
+                check_mass(M, self._V.dofmap.index_map_bs)
+            self._matrices = (super().stiffness(), M)
+        return self._matrices
+
+    def stiffness(self) -> Any:
+        """This rank's K/2 + 2M/τ²."""
+        if not self.motion.size:
+            raise InputError("the step has no size yet; expected a call of take_step(size) before")
+        K, M = self.matrices
+        share = 2.0 / self.motion.size**2
+        if np.array_equal(K.indptr, M.indptr) and np.array_equal(K.indices, M.indices):
+            made = K.copy()  # with its zeros, as K would have them
+            made.data *= 0.5
+            made.data += share * M.data
+            return made
+        return 0.5 * K + share * M
+
+    def load(self) -> Array:
+        """This rank's f + 2Mw/τ² − Ku/2."""
+        K, M = self.matrices
+        motion, self._ends = self.motion, super().load()
+        pull = M @ motion.towards * (2.0 / motion.size**2)
+        return self.mean_load + pull - 0.5 * (K @ motion.u)
+
+    @property
+    def mean_load(self) -> Array:
+        """f of the step, by the trapezoidal rule."""
+        return 0.5 * (self.motion.load + self._ends)
+
+    def move(self, u: Array, v: Array, load: Array | None = None) -> None:
+        """Let the next step begin at a displacement and a velocity, and with the last load."""
+        motion = self.motion
+        motion.u, motion.v = u, v
+        motion.load = self._ends if load is None else load
+
+
+def check_mass(M: csr_array, bs: int) -> None:
+    """Raise if a matrix is not that of a mass in every direction.
+
+    Args:
+        M: This rank's matrix.
+        bs: Unknowns per node.
+
+    Raises:
+        InputError: It is not symmetric, not positive, or a translation has no mass.
+    """
+    check_stiffness("mass", M, "the matrix", "a density, or a form such as ∫ρ u·v")
+    for k in range(bs):
+        along = np.zeros(M.shape[0])
+        along[k::bs] = 1.0
+        total, sizes = along @ (M @ along), M.diagonal() @ along
+        if total <= NO_MASS * sizes and len(along):
+            raise InputError(
+                f"mass: a translation along {'xyz'[k]} has the mass {total:.3g}; expected a "
+                "density, or a form such as ∫ρ u·v"
+            )
+
+
+def check_copies(values: Array, dofs: TornDofs, name: str) -> None:
+    """Raise where torn copies of a node differ by more than what a solver leaves. Collective.
+
+    Args:
+        values: A displacement or a velocity in DOLFINx's order.
+        dofs: Dof maps.
+        name: What it is.
+
+    Raises:
+        InputError: They do, or a value is not finite.
+    """
+    primal = dofs.to_primal(np.asarray(values)).reshape(-1, dofs.bs)
+    with raised_on_all_ranks(dofs.comm):
+        if not np.all(np.isfinite(primal)):
+            raise InputError(f"{name} has values that are not finite numbers")
+    most = dofs.reduce(primal, np.maximum, -np.inf)
+    apart = dofs.spread(most - dofs.reduce(primal, np.minimum, np.inf)).max(axis=1, initial=0.0)
+    size = dofs.comm.allreduce(float(np.abs(primal).max(initial=0.0)), op=MPI.MAX)
+    with raised_on_all_ranks(dofs.comm):
+        if np.any(apart > TORN * size):
+            worst = int(np.argmax(apart))
+            x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node[worst]]
+            at = ", ".join(f"{x:.6g}" for x in x[: dofs.bs])
+            raise InputError(
+                f"{name} differs by {apart[worst]:.3g} between torn copies of the node at ({at}); "
+                "expected a continuous function on each body"
+            )
+
+
+def mass_form(
+    density: Modulus,
+    V: fem.FunctionSpace,
+    decomposition: Decomposition,
+    thickness: Any,
+    lumped: bool,
+) -> ufl.Form:
+    """∫ρ u·v, times the thickness. Collective.
+
+    Args:
+        density: Mass per volume: a number, a scalar in UFL, or numbers for all volumes by names.
+        V: Space of displacements.
+        decomposition: The torn mesh.
+        thickness: What the other forms were multiplied with.
+        lumped: Whether to integrate at the vertices, which makes M diagonal; of degree 1 only.
+
+    Raises:
+        InputError: The density does not fit, or elements are not of degree 1.
+    """
+    rho = in_ufl(density, decomposition, "mass", POSITIVE)
+    degree = V.element.basix_element.degree
+    if lumped and degree != 1:
+        raise InputError(f"lumped=True on elements of degree {degree}; expected degree 1")
+    rule = {"quadrature_degree": 2 * degree}
+    if lumped:
+        rule = {"quadrature_rule": "vertex", "quadrature_degree": 1}
+    dx = ufl.Measure("dx", domain=decomposition.mesh, metadata=rule)
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    product = rho * ufl.inner(u, v)
+    is_one = isinstance(thickness, float) and thickness == 1.0
+    return product * dx if is_one else thickness * product * dx

@@ -1,1 +1,0 @@
-"""Rows of B and c: interfaces, Dirichlet values, contact."""

@@ -1,1 +1,0 @@
-"""gmsh's files: one or split, and from memory."""

@@ -1,0 +1,400 @@
+"""Read gmsh files: cells, partitions and tags, split among ranks."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from dolfinx import mesh as dmesh
+from mpi4py import MPI
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.compat import cell_permutation, coordinate_element
+from tfeti_dolfinx.common.logging import stage
+from tfeti_dolfinx.common.parallel import Exchange, box_over_ranks
+from tfeti_dolfinx.common.validation import checked_type
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.gmsh_model import (
+    Elements,
+    ModelContent,
+    concatenated,
+    open_model,
+    physical_names,
+    read_content,
+)
+from tfeti_dolfinx.mesh.metis import metis
+from tfeti_dolfinx.mesh.partition import (
+    Subdomains,
+    assign_subdomains,
+    coordinate_bisection,
+    default_count,
+)
+from tfeti_dolfinx.mesh.tearing import tear
+from tfeti_dolfinx.mesh.untorn import (
+    NO_TAG,
+    UntornMesh,
+    cell_dim,
+    equal_pairs,
+    facet_keys,
+    facet_vertices,
+    set_key,
+)
+
+# --- gmsh's split files: one for each partition, each read on one rank ------------------------
+
+ONE_MODEL = "expected files that gmsh has written from one model with Mesh.PartitionSplitMeshFiles"
+# distance, relative to the size of the mesh, up to which a node's places are the same: files in
+# text keep fewer digits than gmsh has
+SAME_PLACE = 1e-9
+
+
+@dataclass(frozen=True)
+class SplitFiles:
+    """The files ``name_1.msh`` to ``name_{count}.msh`` of a mesh ``name.msh``."""
+
+    path: Path
+    count: int
+
+    def file(self, number: int) -> Path:
+        """File of a partition, numbered from 1."""
+        return self.path.with_name(f"{self.path.stem}_{number}{self.path.suffix}")
+
+    def of_rank(self, comm: MPI.Intracomm) -> list[int]:
+        """Numbers of the files that this rank reads: contiguous, and even over the ranks."""
+        numbers = range(1, self.count + 1)
+        return [p for p in numbers if (p - 1) * comm.size // self.count == comm.rank]
+
+
+def find_split_files(source: str | PathLike[str] | Any, comm: MPI.Intracomm) -> SplitFiles | None:
+    """The split files of a mesh, None if it is a model or one file. Collective.
+
+    Only rank 0 looks, at the source that it was given.
+
+    Raises:
+        InputError: A file is missing in the numbering.
+    """
+    files = None
+    with raised_on_all_ranks(comm):
+        if comm.rank == 0 and isinstance(source, (str, PathLike)):
+            files = _found(Path(source))
+    return comm.bcast(files, root=0)
+
+
+def _found(path: Path) -> SplitFiles | None:
+    if path.is_file() or not path.parent.is_dir():
+        return None
+    pattern = re.compile(re.escape(path.stem) + r"_([1-9]\d*)" + re.escape(path.suffix))
+    matches = (pattern.fullmatch(entry.name) for entry in path.parent.iterdir())
+    numbers = {int(match[1]) for match in matches if match}
+    files = SplitFiles(path, max(numbers, default=0))
+    missing = sorted(set(range(1, files.count + 1)) - numbers)
+    if missing:
+        raise InputError(
+            f"{files.file(missing[0])}: no such file, but {files.file(files.count).name} is "
+            f"there; expected either {path.name}, or one file for each partition from 1 on"
+        )
+    return files if numbers else None
+
+
+def read_split_files(files: SplitFiles, comm: MPI.Intracomm) -> list[ModelContent]:
+    """What this rank's files hold, the number of its file as the partition of a cell. Collective.
+
+    Raises:
+        InputError: A file cannot be read, or partitions are missing.
+    """
+    contents = []
+    with raised_on_all_ranks(comm):
+        for number in files.of_rank(comm):
+            # a partition may hold no element in a physical group: gmsh then writes no nodes
+            with open_model(files.file(number), may_be_empty=True) as model:
+                content = read_content(model, files.file(number).name)
+            of_file = {d: _in_partition(e, number) for d, e in content.elements.items()}
+            contents.append(replace(content, elements=of_file))
+    known = comm.allreduce(
+        max((content.num_partitions for content in contents), default=0), op=MPI.MAX
+    )
+    if known > files.count:
+        raise InputError(
+            f"{files.file(files.count + 1)}: no such file; expected one file for each of the "
+            f"{known} partitions"
+        )
+    return contents
+
+
+def _in_partition(elements: Elements, number: int) -> Elements:
+    return replace(elements, partitions=np.full(len(elements.ids), number, dtype=np.int64))
+
+
+def check_shared(
+    mesh: UntornMesh, node_ids: Array, x: Array, extent: float, comm: MPI.Intracomm
+) -> None:
+    """Check that the files are of one mesh. Collective.
+
+    Nodes of one id, and cells of the same nodes, meet on the rank that the id or key names.
+
+    Args:
+        mesh: The mesh joined.
+        node_ids: Ids of the nodes of each file, one file after the other, shape ``(p,)``.
+        x: Their coordinates in these files, shape ``(p, d)``.
+        extent: Length of the mesh.
+        comm: Communicator.
+
+    Raises:
+        InputError: A node lies at different places, or a cell lies in two files.
+    """
+    exchange = Exchange(comm, node_ids % comm.size)
+    node_ids, x = exchange.send(node_ids), exchange.send(x)
+    keys = set_key(mesh.cells[:, : mesh.num_vertices])
+    exchange = Exchange(comm, (keys % np.uint64(comm.size)).astype(np.int64))
+    keys, cell_ids = exchange.send(keys), exchange.send(mesh.cell_ids)
+    with raised_on_all_ranks(comm):
+        first, second = equal_pairs(node_ids)
+        apart = np.abs(x[first] - x[second]).max(axis=1, initial=0.0) > SAME_PLACE * extent
+        if np.any(apart):
+            i, j = first[apart][0], second[apart][0]
+            raise InputError(
+                f"node {node_ids[i]} lies at {x[i].tolist()} in one file and at {x[j].tolist()} "
+                f"in another; {ONE_MODEL}"
+            )
+        first, second = equal_pairs(keys)
+        if len(first):
+            raise InputError(
+                f"cells {cell_ids[first[0]]} and {cell_ids[second[0]]} have the same nodes; "
+                f"{ONE_MODEL}"
+            )
+
+
+# --- What gmsh models on any ranks hold, joined to one untorn mesh ----------------------------
+
+# of the mesh's size: what rounding of coordinates leaves of a plane mesh's height
+FLAT = 1e-12
+# gmsh's element types: DOLFINx's cell type and degree
+CELLS = {
+    2: ("triangle", 1),
+    3: ("quadrilateral", 1),
+    4: ("tetrahedron", 1),
+    5: ("hexahedron", 1),
+    9: ("triangle", 2),
+    10: ("quadrilateral", 2),
+    11: ("tetrahedron", 2),
+    12: ("hexahedron", 2),
+}
+
+
+def untorn_mesh(
+    contents: Sequence[ModelContent], comm: MPI.Intracomm, shared: bool
+) -> tuple[UntornMesh, Array | None]:
+    """The untorn mesh, and the partition of each cell if all cells have one. Collective.
+
+    Args:
+        contents: What this rank has read, maybe nothing.
+        comm: Communicator.
+        shared: Whether models of different ranks may have nodes and facets in common.
+
+    Raises:
+        InputError: There are no physical groups of cells, the cells are of several types or
+            of one that is not supported, plane cells do not lie in a plane, names contradict
+            each other, or the models do not fit together.
+    """
+    top = comm.allreduce(max((content.top for content in contents), default=0), op=MPI.MAX)
+    with_cells = [content for content in contents if top in content.elements]
+    kind, kind_name = _one_kind(with_cells, top, comm)
+    shape, degree = CELLS[kind]
+    cell_type = dmesh.to_type(shape)
+    gdim = cell_dim(cell_type)
+    element = coordinate_element(cell_type, degree, gdim)
+    empty = _no_elements(kind, kind_name, element.dim // gdim)
+    found = concatenated([empty, *(content.elements[top] for content in with_cells)])
+    cells = found.nodes[:, cell_permutation(cell_type, found.nodes.shape[1])]
+    facets = [content.elements[top - 1] for content in contents if top - 1 in content.elements]
+    all_ids = np.concatenate([empty.ids, *(content.node_ids for content in with_cells)])
+    all_x = np.concatenate([np.empty((0, 3)), *(content.x for content in with_cells)])
+    node_ids, first = np.unique(all_ids, return_index=True)
+    mesh = UntornMesh(
+        cell_type=cell_type,
+        element=element,
+        cells=cells,
+        cell_ids=found.ids,
+        cell_tags=found.tags,
+        facet_tags=_facet_tags(cells, cell_type, facets, comm if shared else MPI.COMM_SELF),
+        node_ids=node_ids,
+        x=np.ascontiguousarray(all_x[first, :gdim]),
+        names=physical_names(contents, top, comm),
+    )
+    extent = _checked_extent(all_x, gdim, comm)
+    if shared:
+        check_shared(mesh, all_ids, all_x, extent, comm)
+    partitioned = comm.allreduce(bool(np.all(found.partitions >= 0)), op=MPI.LAND)
+    return mesh, found.partitions if partitioned else None
+
+
+def _one_kind(contents: Sequence[ModelContent], top: int, comm: MPI.Intracomm) -> tuple[int, str]:
+    """Number and name of gmsh's type of all cells of all ranks."""
+    cells = [(content.elements[top], content.where) for content in contents]
+    own = [(found.kind, found.kind_name, where) for found, where in cells]
+    first_of_kind = {kind: (name, where) for kind, name, where in reversed(own)}
+    kinds: dict[int, tuple[str, str]] = {}
+    for of_rank in comm.allgather(first_of_kind):
+        kinds = {**of_rank, **kinds}
+    if not kinds:
+        raise InputError(
+            "the mesh has no physical groups of cells; give the bodies (3D: volumes, 2D: "
+            "surfaces) and the surfaces physical groups in gmsh"
+        )
+    if len(kinds) > 1:
+        found = " and ".join(f"{name!r} in {where}" for _, (name, where) in sorted(kinds.items()))
+        raise InputError(f"cells of several types, {found}; expected one type of cell")
+    ((kind, (name, _)),) = kinds.items()
+    if kind not in CELLS:
+        raise InputError(
+            f"cells of type {name!r} are not supported; expected triangles, quadrilaterals, "
+            "tetrahedra or hexahedra of first or (complete) second order"
+        )
+    return kind, name
+
+
+def _no_elements(kind: int, kind_name: str, num_nodes: int) -> Elements:
+    none = np.empty(0, dtype=np.int64)
+    return Elements(
+        kind=kind,
+        kind_name=kind_name,
+        nodes=none.reshape(0, num_nodes),
+        ids=none,
+        tags=none.astype(np.int32),
+        partitions=none,
+    )
+
+
+def _checked_extent(x: Array, gdim: int, comm: MPI.Intracomm) -> float:
+    """Longest side of the box of all points; raises if plane cells do not lie in a plane."""
+    low, high = box_over_ranks(comm, x)
+    sides = high - low
+    if gdim == 2 and sides[2] > FLAT * sides.max():
+        raise InputError("plane cells that do not lie in a plane z = constant: shells are not")
+    return float(sides.max())
+
+
+def _facet_tags(
+    cells: Array, cell_type: dmesh.CellType, facets: Sequence[Elements], comm: MPI.Intracomm
+) -> Array:
+    """Tag of each facet of each cell, shape ``(n, facets_per_cell)``. Collective.
+
+    A facet of a cell and the element that tags it meet on the rank that their key names.
+    """
+    keys = facet_keys(cells, cell_type)
+    corners = facet_vertices(cell_type).shape[1]
+    tagged = [set_key(elements.nodes[:, :corners]) for elements in facets]
+    known = np.concatenate([np.empty(0, dtype=np.uint64), *tagged])
+    tags = np.concatenate([np.empty(0, dtype=np.int32), *(elements.tags for elements in facets)])
+    asking = _to_named_rank(keys.ravel(), comm)
+    telling = _to_named_rank(known, comm)
+    asked = asking.send(keys.ravel())
+    answers = _looked_up(asked, telling.send(known), telling.send(tags))
+    return asking.answer(answers).reshape(keys.shape)
+
+
+def _to_named_rank(keys: Array, comm: MPI.Intracomm) -> Exchange:
+    return Exchange(comm, (keys % np.uint64(comm.size)).astype(np.int64))
+
+
+def _looked_up(keys: Array, known: Array, tags: Array) -> Array:
+    """Tag of each key, the first one if there are several, NO_TAG where it is not known."""
+    found = np.full(len(keys), NO_TAG, dtype=np.int32)
+    if len(known) == 0:
+        return found
+    known, first = np.unique(known, return_index=True)
+    position = np.minimum(np.searchsorted(known, keys), len(known) - 1)
+    hit = known[position] == keys
+    found[hit] = tags[first[position[hit]]]
+    return found
+
+
+# --- Meshes that gmsh made: physical groups, partitions, and the nodes' own numbers -----------
+
+
+def read_gmsh(
+    source: str | PathLike[str] | Any,
+    comm: MPI.Intracomm,
+    subdomains: Subdomains | None = None,
+) -> Decomposition:
+    """Read a gmsh mesh and tear it into subdomains. Collective.
+
+    Rank 0 reads; no other rank ever holds more than its own subdomains. If there is no file
+    ``name.msh`` but there are the files ``name_1.msh``, ``name_2.msh``, ... that gmsh writes
+    with ``Mesh.PartitionSplitMeshFiles``, one for each partition, then these are shared out
+    evenly: of ``count`` files, rank ``floor((p - 1) * comm.size / count)`` reads the p-th, and
+    no rank ever holds the whole mesh.
+
+    Args:
+        source: A ``.msh`` file, or a gmsh model (``gmsh.model``) that is meshed on rank 0.
+        comm: Communicator of the torn mesh.
+        subdomains: Their number (METIS, made round; split files: coordinate bisection); or
+            one id per cell on rank 0, in gmsh's order, and empty arrays elsewhere (for split
+            files one id per cell of the files that this rank reads, in the order of the files
+            and within a file in gmsh's order, without ghost cells); or a callable of cell
+            midpoints, shape ``(3, n)``. Default: gmsh's own partitions if the mesh has them
+            (split files: one subdomain per file), else about 4000 unknowns each.
+
+    Returns:
+        The torn mesh, its tags and names those of the physical groups. Split files give the
+        same as the partitioned mesh in one file.
+
+    Raises:
+        InputError: The file is missing or not a mesh, there are no physical groups of cells,
+            the cells are of several types, or the subdomains do not fit. Of split files: one
+            is missing, a name or a tag means different groups, a node has different
+            coordinates, or a cell lies in two files.
+
+    Example:
+        gmsh meshes on rank 0; the other ranks give None.
+
+        >>> import gmsh
+        >>> comm, model = MPI.COMM_WORLD, None
+        >>> if comm.rank == 0:
+        ...     gmsh.initialize(interruptible=False)
+        ...     gmsh.option.setNumber("General.Terminal", 0)
+        ...     model = gmsh.model
+        ...     plate = model.occ.addRectangle(0, 0, 0, 2, 1)
+        ...     model.occ.synchronize()
+        ...     steel = model.addPhysicalGroup(2, [plate], name="steel")
+        ...     edges = model.addPhysicalGroup(1, [1, 2, 3, 4], name="edges")
+        ...     model.mesh.generate(2)
+        >>> decomposition = tfeti.read_gmsh(model, comm, subdomains=3)
+        >>> decomposition.num_subdomains, decomposition.body_names
+        (3, ["body 0 (volume 'steel')"])
+    """
+    checked_type(comm, MPI.Intracomm, "comm", "a communicator such as MPI.COMM_WORLD")
+    seconds: dict[str, float] = {}
+    with stage("mesh", seconds):
+        decomposition = _read_and_tear(source, comm, subdomains)
+    return replace(decomposition, seconds=seconds)
+
+
+def _read_and_tear(
+    source: Any, comm: MPI.Intracomm, subdomains: Subdomains | None
+) -> Decomposition:
+    files = find_split_files(source, comm)
+    contents = read_split_files(files, comm) if files else _read_on_rank_0(source, comm)
+    untorn, partitions = untorn_mesh(contents, comm, shared=files is not None)
+    if subdomains is None:
+        subdomains = default_count(untorn, comm) if partitions is None else partitions
+    # METIS needs the mesh on one rank
+    partitioner = coordinate_bisection if files else metis
+    subdomain = assign_subdomains(untorn, subdomains, comm, partitioner)
+    bisected = files is not None and isinstance(subdomains, (int, np.integer))
+    return tear(untorn, subdomain, comm, absorb=bisected)
+
+
+def _read_on_rank_0(source: Any, comm: MPI.Intracomm) -> list[ModelContent]:
+    contents = []
+    with raised_on_all_ranks(comm):
+        if comm.rank == 0:
+            with open_model(source) as model:
+                contents.append(read_content(model, "the mesh"))
+    return contents

@@ -1,0 +1,473 @@
+"""PCPG: preconditioned conjugate projected gradients, with its directions."""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.parallel import bcast_from_root, summed
+from tfeti_dolfinx.qp.coarse import Coarse
+from tfeti_dolfinx.qp.homogenised import Homogenised
+from tfeti_dolfinx.qp.problem import (
+    QP,
+    ConvergedReason,
+    Monitor,
+    Operator,
+    Point,
+    QPResult,
+    Steps,
+    StoppingRule,
+    no_monitor,
+)
+from tfeti_dolfinx.qp.sets import Face
+
+# --- The norm of PFP, which step lengths are relative to --------------------------------------
+
+# an off-diagonal entry this small in units of the norm ends the method: the space is exhausted
+EXHAUSTED = 1e-12
+
+
+def estimate_norm(F: Operator, coarse: Coarse, like: PETSc.Vec, steps: int = 15) -> float:
+    """‖PFP‖ by the Lanczos method: the largest Ritz value, and its residual on top. Collective.
+
+    The Ritz value alone is a lower bound. There is an eigenvalue within the residual of it, the
+    largest one in practice: the sum is an upper bound that is close. The start is random, but
+    the same in every run on the same number of ranks. (Parlett, The Symmetric Eigenvalue
+    Problem, SIAM 1998, section 13.2.)
+
+    Args:
+        F: Symmetric positive semidefinite operator.
+        coarse: Gives the projector P.
+        like: A vector of the right layout.
+        steps: Most multiplications by F.
+    """
+    v, previous, w = (like.duplicate() for _ in range(3))
+    rng = np.random.default_rng(like.getComm().getRank())
+    v.array[:] = rng.standard_normal(v.getLocalSize())
+    coarse.project(v)
+    previous.set(0.0)
+    diagonal: list[float] = []
+    beside: list[float] = [v.norm()]
+    comm = like.getComm().tompi4py()
+    while len(diagonal) < steps and bcast_from_root(
+        comm, beside[-1] > EXHAUSTED * _size(diagonal, beside)
+    ):
+        v.scale(1.0 / beside[-1])
+        F.mult(v, w)
+        coarse.project(w)
+        diagonal.append(w.dot(v))
+        w.axpy(-diagonal[-1], v)
+        if len(diagonal) > 1:
+            w.axpy(-beside[-1], previous)
+        beside.append(w.norm())
+        previous, v, w = v, w, previous
+    for vec in (v, previous, w):
+        vec.destroy()
+    if not diagonal:
+        return 0.0
+    off = np.array(beside[1:-1])
+    values, vectors = np.linalg.eigh(np.diag(diagonal) + np.diag(off, 1) + np.diag(off, -1))
+    return bcast_from_root(comm, float(values[-1] + beside[-1] * abs(vectors[-1, -1])))
+
+
+def _size(diagonal: list[float], beside: list[float]) -> float:
+    """Size of the entries so far; 0 before the first step, whose vector may have any length."""
+    return max(diagonal) + max(beside[1:]) if diagonal else 0.0
+
+
+# --- Directions of conjugate gradients that are kept, so that rounding does not undo what
+#     they did ---
+
+# of the largest curvature of a direction, and of what the preconditioner makes of a residual: less
+# is rounding, as where rows depend on each other
+FLAT = 1e-13
+# numbers that a rank keeps at most: 192 MB
+NUMBERS = 24_000_000
+
+
+class Conjugates:
+    """Directions p_i with PFp_i and p_iᵀFp_i, the last ones where memory lasts not for all.
+
+    In exact arithmetic a new direction is conjugate to all if it is to the last one. Where F is ill
+    conditioned on a face rounding undoes that, and what was solved for has to be solved for again
+    (Farhat, Crivelli, Roux, Comput. Methods Appl. Mech. Engrg. 117, 1994, for FETI).
+
+    Args:
+        like: A vector of the right layout. The constructor is collective.
+        numbers: How many a rank keeps at most.
+    """
+
+    def __init__(self, like: PETSc.Vec, numbers: int = NUMBERS) -> None:
+        self.comm = like.getComm().tompi4py()
+        rows = self.comm.allreduce(like.getLocalSize(), op=MPI.MAX)
+        self._most = max(numbers // (2 * max(rows, 1)), 1)
+        self._p, self._PFp = (np.zeros((0, like.getLocalSize())) for _ in range(2))
+        self._pFp: Array = np.zeros(0)
+        self._count = 0
+
+    def clear(self) -> None:
+        """Forget them."""
+        self._count = 0
+
+    @property
+    def number(self) -> int:
+        """How many there are."""
+        return min(self._count, self._most)
+
+    def products(self, z: Array) -> Array:
+        """This rank's part of PFp_i·z, shape ``(k,)``."""
+        return np.asarray(self._PFp[: self.number] @ z)
+
+    def take_away(self, z: Array, products: Array) -> None:
+        """Make z conjugate to them, in place; given the sums of products over all ranks."""
+        z -= (products / self._pFp[: self.number]) @ self._p[: self.number]
+
+    def keep(self, p: Array, PFp: Array, pFp: float) -> None:
+        """Keep another one, in the place of the oldest if there are too many."""
+        at = self._count % self._most
+        if at == len(self._pFp):
+            more = min(max(len(self._pFp), 8), self._most - len(self._pFp))
+            self._p, self._PFp = (
+                np.concatenate((known, np.zeros((more, known.shape[1]))))
+                for known in (self._p, self._PFp)
+            )
+            self._pFp = np.append(self._pFp, np.zeros(more))
+        self._p[at], self._PFp[at], self._pFp[at] = p, PFp, pFp
+        self._count += 1
+
+
+class Directions:
+    """What PCPG remembers, so that it can go on where it has stopped.
+
+    Args:
+        like: A vector of the right layout.
+
+    Attributes:
+        r: Residual −P g.
+        p: The last direction.
+        fresh: Whether the next direction is the first.
+        kept: Directions that the next one is made conjugate to.
+        norm: Largest Rayleigh quotient of F that a direction has shown; at most ‖PFP‖.
+        helped: Largest rᵀz/rᵀr so far.
+    """
+
+    def __init__(self, like: PETSc.Vec) -> None:
+        self.r, self.p, self.Fp, self.z = (like.duplicate() for _ in range(4))
+        self.fresh, self.norm, self.helped = True, 0.0, 0.0
+        self.kept = Conjugates(like)
+
+    def seen(self, pFp: float, pp: float, short: bool = False) -> bool:
+        """Whether a direction has a curvature that stands out from rounding.
+
+        Of a short step, which may be rounding of Gλ = e, F makes far too much to learn ‖F‖ from.
+        """
+        if not short:
+            self.norm = max(self.norm, pFp / pp if pp > 0.0 else 0.0)
+        return pFp > FLAT * self.norm * pp
+
+    def stands_out(self, rz: float, rr: float) -> bool:
+        """Whether the preconditioner leaves something of a residual."""
+        self.helped = max(self.helped, rz / rr if rr > 0.0 else 0.0)
+        return rz > FLAT * self.helped * rr
+
+    def destroy(self) -> None:
+        """Destroy the vectors. Collective."""
+        for vec in (self.r, self.p, self.Fp, self.z):
+            vec.destroy()
+
+
+# --- Whether conjugate gradients still get anywhere -------------------------------------------
+
+# so many steps in which neither ‖r‖ comes down to a half nor q by what stands out from its rounding
+# have met rounding: at that pace 10 000 steps would bring 6 digits at best; twice as many as there
+# are rows, and a few, have it too
+PLATEAU, FEW, ROUNDING = 500, 20, 1e-15
+
+
+class Plateau:
+    """Whether residuals and q still come down.
+
+    Args:
+        norm: ‖r‖ at the start.
+        rows: Number of rows.
+    """
+
+    def __init__(self, norm: float, rows: int) -> None:
+        self._most = min(PLATEAU, 2 * rows + FEW)
+        self._best, self._steps, self._gain, self._restarted = norm, 0, 0.0, False
+
+    def step(self, norm: float, gain: float) -> None:
+        """A step has lowered q by so much, and ends with that ‖r‖."""
+        self._steps, self._gain = self._steps + 1, self._gain + gain
+        if norm <= 0.5 * self._best:
+            self._best, self._steps, self._gain, self._restarted = norm, 0, 0.0, False
+
+    def ended(self, qp: QP, point: Point) -> bool:
+        """Whether there was none for long. Collective where there were many steps."""
+        if self._steps < self._most:
+            return False
+        sizes = abs(point.lam.dot(point.g)) + abs(point.lam.dot(qp.d))
+        comm = point.lam.getComm().tompi4py()
+        ended = bcast_from_root(comm, self._gain <= ROUNDING * sizes)
+        self._steps, self._gain = 0, 0.0
+        return ended
+
+    def once_more(self) -> bool:
+        """Whether this is the first time since ‖r‖ came down."""
+        first, self._restarted = not self._restarted, True
+        return first
+
+
+# --- PCPG: preconditioned conjugate projected gradients, for programs without inequalities ----
+
+# of rᵀz, which is rᵀp as long as r is orthogonal to all directions before; else CG begins anew
+DRIFTED = 0.5
+# of λ: a way that is shorter may be rounding of Gλ = e
+SHORT = 1e-6
+# of ‖P g‖ where directions have ended before: then it is worth the way to begin anew
+DIGIT = 0.1
+
+
+def pcpg(
+    qp: QP,
+    point: Point,
+    rule: StoppingRule,
+    steps: Steps,
+    max_it: int,
+    monitor: Monitor = no_monitor,
+    directions: Directions | None = None,
+) -> ConvergedReason:
+    """Minimise ½λᵀFλ − λᵀd over λ + range(P), from a point on and in place. Collective.
+
+    Farhat, Mandel, Roux, Comput. Methods Appl. Mech. Engrg. 115 (1994) 365–385, section 3. P is
+    the projector of ``qp.coarse``: on a face λ moves in the face alone. Multiplies by F, and by
+    the preconditioner, once per step, and once more where the rule finds that g has drifted, or
+    where neither ‖P g‖ nor q has come down for long. A step makes three global reductions: one
+    with each projection, one for the norm of the residual; one more where there are directions of
+    earlier solves.
+
+    ===========================  ===================================================
+    reason                       when
+    ===========================  ===================================================
+    the rule's                   ‖P g‖ ≤ ``rule.tolerance``, and the rule is content
+    ``DIVERGED_ITS``             ``max_it`` steps are not enough
+    ``DIVERGED_INDEFINITE_MAT``  a direction has no positive curvature
+    ``DIVERGED_ROUNDING``        neither ‖P g‖ nor q comes down, with a new g neither
+    ===========================  ===================================================
+
+    Args:
+        qp: F, d, P and the preconditioner; its feasible set is kept by nobody.
+        point: λ and F λ − d on all rows; updated.
+        rule: Says when ‖P g‖ is small enough.
+        steps: Counts the steps.
+        max_it: Most steps in ``steps``.
+        monitor: Called after each step.
+        directions: What an earlier call at this point, with this ``qp``, has left; updated.
+
+    Returns:
+        Why it stopped.
+    """
+    own = Directions(point.lam) if directions is None else directions
+    r, p, Fp, z, past = own.r, own.p, own.Fp, own.z, qp.recycled
+    norm, reason = _begun(qp, point, own), ConvergedReason.ITERATING
+    least = bcast_from_root(qp.d.getComm().tompi4py(), SHORT**2 * point.lam.dot(point.lam))
+    progress = Plateau(norm, r.getSize())
+    while True:
+        # test
+        reason, anew = _test(qp, point, rule, progress, norm)
+        if rule.drifted or anew:
+            point.refresh(qp)
+            rule.drifted, own.fresh = False, True
+            norm = _begun(qp, point, own)
+        if reason == ConvergedReason.ITERATING and steps.cg >= max_it:
+            reason = ConvergedReason.DIVERGED_ITS
+        if reason != ConvergedReason.ITERATING:
+            break
+        # precondition and project: z = P M r
+        if own.fresh:
+            own.kept.clear()
+        rz, products = _precondition(qp, r, z, own.kept, norm)
+        # direction
+        own.kept.take_away(z.array, products)
+        z.copy(p)
+        if past is not None:
+            past.conjugate(p)
+        # step
+        qp.F.mult(p, Fp)
+        Fp.copy(z)
+        pFp, pp, (rp,) = qp.coarse.project_against(z, p, np.array([r.array_r @ p.array_r]))
+        PFp = np.array(z.array_r)
+        z.aypx(-rp / pFp if pFp else 0.0, r)
+        squared, rz, rp, pFp = _square(z, rz, rp, pFp)
+        short = bool(pFp) and (rp / pFp) ** 2 * pp < least
+        if not (own.seen(pFp, pp, short) and own.stands_out(rz, norm**2)):
+            own.fresh, reason = True, _examined(qp, point, rule, norm)
+            if reason == ConvergedReason.ITERATING:
+                reason = ConvergedReason.DIVERGED_INDEFINITE_MAT
+            break
+        point.move(rp / pFp, p, Fp)
+        own.kept.keep(p.array_r, PFp, pFp)
+        if past is not None:
+            past.remember(p, Fp, pFp)
+        z.copy(r)
+        own.fresh, norm = abs(rp - rz) > DRIFTED * rz, float(np.sqrt(squared))
+        steps.cg += 1
+        progress.step(norm, 0.5 * rp**2 / pFp)
+        monitor(steps, "cg", point.lam, norm, 0.0)
+    if past is not None:
+        past.keep()
+    if directions is None:
+        own.destroy()
+    return reason
+
+
+def _test(
+    qp: QP, point: Point, rule: StoppingRule, progress: Plateau, norm: float
+) -> tuple[ConvergedReason, bool]:
+    """Return why PCPG stops here, and whether the gradient is made anew instead. Collective."""
+    reason = ConvergedReason.ITERATING
+    if norm <= rule.tolerance:
+        reason = _examined(qp, point, rule, norm)
+    if reason != ConvergedReason.ITERATING or not progress.ended(qp, point):
+        return reason, False
+    if progress.once_more():
+        return reason, True
+    return ConvergedReason.DIVERGED_ROUNDING, False
+
+
+def solve_by_pcpg(
+    qp: QP,
+    homogenised: Homogenised,
+    rule: StoppingRule,
+    *,
+    max_it: int = 10_000,
+    monitor: Monitor = no_monitor,
+) -> QPResult:
+    """Solve min ½λᵀFλ − λᵀd, Gλ = e, from λ̄ on. Collective.
+
+    Stops as ``pcpg`` does, but begins anew with a new gradient where a direction has no positive
+    curvature, as long as the residual is a tenth of what it was there before; besides with
+
+    =====================  ======================================================
+    reason                 when
+    =====================  ======================================================
+    ``DIVERGED_ROUNDING``  no positive curvature, but residuals that are rounding
+    =====================  ======================================================
+
+    >>> import numpy as np
+    >>> from petsc4py import PETSc
+    >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
+    >>> from tfeti_dolfinx.qp.sets import Product
+    >>> from tfeti_dolfinx.qp.homogenised import homogenise
+    >>> from tfeti_dolfinx.qp.problem import ResidualRule
+    >>> F = PETSc.Mat().createDense((3, 3), array=np.diag([1.0, 2.0, 4.0]), comm=PETSc.COMM_SELF)
+    >>> d = PETSc.Vec().createWithArray(np.array([1.0, 1.0, 2.0]), comm=PETSc.COMM_SELF)
+    >>> qp = QP(F, d, DenseCoarse(np.ones((1, 3)), np.ones(1)), Product())
+    >>> result = solve_by_pcpg(qp, homogenise(qp), ResidualRule(1e-12))
+    >>> result.reason.name, result.lam.array.round(6).tolist()
+    ('CONVERGED_RTOL', [0.428571, 0.214286, 0.357143])
+
+    Args:
+        qp: The program; its feasible set is not looked at.
+        homogenised: Its homogenised form, whose λ̄ is the start.
+        rule: Says when ‖P(d − Fλ)‖ is small enough.
+        max_it: Most steps.
+        monitor: Called after each step.
+
+    Returns:
+        The multipliers, the gradient Fλ − d up to the range of Gᵀ, the reason, the residuals.
+    """
+    lam, g, steps = homogenised.lam_bar.copy(), homogenised.gradient.copy(), Steps()
+    monitor(steps, "start", lam, homogenised.b.norm(), 0.0)
+    reason = _with_new_gradients(qp, Point(lam, g), rule, steps, max_it, monitor)
+    qp.coarse.project(g)
+    norm = g.norm()
+    if reason == ConvergedReason.DIVERGED_INDEFINITE_MAT and homogenised.is_rounding(norm):
+        reason = ConvergedReason.DIVERGED_ROUNDING
+    moved = lam.copy()
+    moved.axpy(-1.0, homogenised.lam_bar)
+    result = QPResult(
+        lam=lam,
+        mu=qp.coarse.coordinates(g),
+        gradient=g,
+        face=_face(qp, lam, g),
+        reason=reason,
+        projected_gradient=norm,
+        equality=qp.coarse.norm_Q(moved),
+        reference=homogenised.scale.reference,
+        norm=0.0,
+        steps=steps,
+    )
+    moved.destroy()
+    return result
+
+
+def _with_new_gradients(
+    qp: QP, point: Point, rule: StoppingRule, steps: Steps, max_it: int, monitor: Monitor
+) -> ConvergedReason:
+    """PCPG, which begins anew where directions end, as long as that brings a digit. Collective.
+
+    Rounding of g at a λ that bends subdomains much farther than the solution does may end them.
+    """
+    least, r = np.inf, point.g.duplicate()
+    while True:
+        reason = pcpg(qp, point, rule, steps, max_it, monitor)
+        norm = bcast_from_root(point.lam.getComm().tompi4py(), _residual(qp, point.g, r))
+        if reason != ConvergedReason.DIVERGED_INDEFINITE_MAT or norm > DIGIT * least:
+            r.destroy()
+            return reason
+        least = norm
+        point.refresh(qp)
+
+
+def _face(qp: QP, lam: PETSc.Vec, g: PETSc.Vec) -> Face:
+    """The face of λ."""
+    return qp.feasible.face(lam.array_r, g.array_r)
+
+
+def _examined(qp: QP, point: Point, rule: StoppingRule, norm: float) -> ConvergedReason:
+    """What the rule says of the point."""
+    return rule.examine(point.lam, point.g, _face(qp, point.lam, point.g), norm)
+
+
+def _begun(qp: QP, point: Point, own: Directions) -> float:
+    """Go where q is least along directions of earlier solves; make r there. Its norm."""
+    norm = _residual(qp, point.g, own.r)
+    past = qp.recycled
+    if past is not None and past.go(point.lam, point.g, own.r, qp.coarse.project):
+        norm, own.fresh = _residual(qp, point.g, own.r), True
+    return norm
+
+
+def _residual(qp: QP, g: PETSc.Vec, r: PETSc.Vec) -> float:
+    """r = −P g, and its norm.
+
+    Twice: what G's factor leaves of Gᵀμ the first time is rounding of Fλ − d, not of r, and the
+    preconditioner does not see it, so no step would take it away.
+    """
+    g.copy(r)
+    r.scale(-1.0)
+    qp.coarse.project(r)
+    qp.coarse.project(r)
+    return float(r.norm())
+
+
+def _square(x: PETSc.Vec, *known: float) -> Array:
+    """‖x‖², and rank 0's numbers, since loops end by them. Collective, one reduction."""
+    comm = x.getComm().tompi4py()
+    sums = np.array([x.array_r @ x.array_r, *(known if comm.rank == 0 else np.zeros(len(known)))])
+    return summed(comm, sums)
+
+
+def _precondition(
+    qp: QP, r: PETSc.Vec, z: PETSc.Vec, kept: Conjugates, norm: float
+) -> tuple[float, Array]:
+    """z = P M r, M the preconditioner or the identity; rᵀz, given ‖r‖, and PFp_i·z."""
+    if qp.preconditioner is None:
+        r.copy(z)
+        return norm**2, summed(r.getComm().tompi4py(), kept.products(z.array_r))
+    qp.preconditioner.mult(r, z)
+    rz, _, products = qp.coarse.project_against(z, r, kept.products(z.array_r))
+    return rz, products

@@ -1,0 +1,232 @@
+"""The nearest point of {λ ∈ Ω, Gλ = e}: coarse factors, and no multiplication by F."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+from scipy.sparse import csr_array
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.parallel import bcast_from_root
+from tfeti_dolfinx.qp.coarse import HELD, Coarse, imbalance
+from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
+
+# points looked at: far more than Newton takes where it converges, so that a cycle ends
+MAX_TRIALS = 300
+# of the terms of Gλ − e: what the coarse problem's factors leave at best
+BALANCED = 1e-13
+# of the same: below that, a step that leaves more than this share has met the damping, a kink or,
+# if so many in a row do so with the least damping, rounding
+NEARLY, SLOW, SLOWLY = 1e-6, 0.1, 8
+# of GGᵀ, added to G_f G_fᵀ: keeps steps regular where few rows carry a force, and is small beside
+# 1, so that they stay Newton's; where bodies are hardly held it slows the end down, and the
+# smallest that a factor bears takes its place
+DAMPING, LEAST_DAMPING = 1e-8, 1e-14
+# factor on it after a whole step that has met no row but the damping: those of the face may be so
+# soft beside open ones that they hold by less
+EASED = 0.01
+# a step of this share of Newton's changes nothing that is left above rounding
+SHORTEST = 1e-8
+# of the slope at its start: a whole step that leaves as much has met no row but the damping; after
+# so many in a row it is far beyond y, and nothing in Ω fulfils Gλ = e but for rounding
+LEFT, PATIENCE = 0.5, 10
+# far more than what factors leave of Gλ = e
+UNBALANCED = 1e-3
+# of the cost: what rounding may add to it
+ROUNDING = 1e-14
+
+
+class ConvexSet(Protocol):
+    """What is asked of Ω here; any ``FeasibleSet`` has it."""
+
+    def project(self, x: Array) -> Array:
+        """P_Ω(x)."""
+        ...
+
+    def face(self, x: Array, g: Array) -> Face:
+        """The face of x ∈ Ω."""
+        ...
+
+
+@dataclass(frozen=True)
+class FeasiblePoint:
+    """A point of Ω, and how far it is from Gλ = e.
+
+    Attributes:
+        lam: The point, the caller's own.
+        alpha: λ = P_Ω(y + Gᵀα), replicated.
+        missing: How far Gλ is from e: the worst entry beside its terms, 1 at most.
+    """
+
+    lam: PETSc.Vec
+    alpha: Array
+    missing: float
+
+
+def project_onto_feasible(
+    coarse: Coarse,
+    feasible: ConvexSet,
+    y: PETSc.Vec,
+    alpha: Array | None = None,
+    max_trials: int = MAX_TRIALS,
+) -> FeasiblePoint:
+    """The nearest point to y of {λ ∈ Ω, Gλ = e}, or what comes closest to it. Collective.
+
+    It is λ(α) = P_Ω(y + Gᵀα) with Gλ(α) = e. That is where the convex function
+    ½‖z‖² − ½‖z − P_Ω(z)‖² − αᵀe of z = y + Gᵀα is least, which a semismooth Newton method with a
+    line search finds: each step factors G_f G_fᵀ, f the face of λ(α). Where nothing in Ω fulfils
+    Gλ = e, the cost falls without end along steps that no row stops; a few of them end it.
+
+    >>> import numpy as np
+    >>> from petsc4py import PETSc
+    >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
+    >>> from tfeti_dolfinx.qp.sets import Bounds
+    >>> y = PETSc.Vec().createWithArray(np.array([1.0, -1.0]), comm=PETSc.COMM_SELF)
+    >>> nearest(DenseCoarse(np.ones((1, 2)), np.ones(1)), Bounds(), y).lam.array.tolist()
+    [1.0, 0.0]
+
+    Args:
+        coarse: Gλ = e on all rows.
+        feasible: The set Ω.
+        y: Any point.
+        alpha: Where to start.
+        max_trials: Points looked at, at most.
+
+    Returns:
+        The point; where nothing in Ω fulfils Gλ = e, or α does not converge, it misses some of e:
+        ``missing`` says so.
+    """
+    comm = y.getComm().tompi4py()
+    trial = _trial(coarse, feasible, y, np.zeros(coarse.dimension) if alpha is None else alpha)
+    damping, trials, unmet, slowly, least = DAMPING, 1, 0, 0, trial.left
+    while trials < max_trials and unmet < PATIENCE:
+        scale = float(np.linalg.norm(coarse.forces(trial.lam)))
+        if bcast_from_root(comm, trial.left <= BALANCED * scale):
+            break
+        face = feasible.face(trial.lam.array_r, trial.lam.array_r - trial.z)
+        step = coarse.damped_solve(face.damped(), trial.residual, damping)
+        slope = float(trial.residual @ step)
+        trial, length, tried = _searched(coarse, feasible, y, trial, step)
+        trials += tried
+        whole = bcast_from_root(comm, length == 1.0 and float(trial.residual @ step) > LEFT * slope)
+        unmet = unmet + 1 if whole else 0
+        if whole:
+            damping = max(EASED * damping, LEAST_DAMPING)
+        elif length < 1.0 and slowly == 0:
+            damping = DAMPING
+        slow = bcast_from_root(comm, trial.left > SLOW * least and trial.left <= NEARLY * scale)
+        slowly, least = slowly + 1 if slow else 0, min(least, trial.left)
+        if bcast_from_root(comm, length <= SHORTEST) or slowly > SLOWLY:
+            break
+        if slow:
+            damping = LEAST_DAMPING
+    return FeasiblePoint(trial.lam, trial.alpha, imbalance(coarse, trial.lam))
+
+
+def project_or_least(coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec) -> FeasiblePoint:
+    """The nearest point to y of {λ ∈ Ω, Gλ = e}; the least such λ where that is not found.
+
+    From forces far beyond small discs, as the bounds of another load step are, the way to Gλ = e
+    has so many kinks that ``nearest`` may end before. From 0 it has few. Collective.
+    """
+    found = project_onto_feasible(coarse, feasible, y)
+    if bcast_from_root(y.getComm().tompi4py(), found.missing <= UNBALANCED):
+        return found
+    zero = y.duplicate()
+    zero.set(0.0)
+    least = project_onto_feasible(coarse, feasible, zero)
+    zero.destroy()
+    better = bcast_from_root(y.getComm().tompi4py(), least.missing < found.missing)
+    (found if better else least).lam.destroy()
+    return least if better else found
+
+
+def project_within_face(
+    coarse: Coarse, feasible: FeasibleSet, face: Face, y: PETSc.Vec
+) -> PETSc.Vec:
+    """The nearest point to y of a face and Gλ = e; of all Ω where the face has none. Collective."""
+    found = project_onto_feasible(coarse, WithinFace(feasible, face), y)
+    if found.missing > HELD:
+        found.lam.destroy()
+        found = project_or_least(coarse, feasible, y)
+    return found.lam
+
+
+class WithinFace:
+    """Those points of Ω whose open rows are those of a face, at least.
+
+    Args:
+        feasible: The set Ω.
+        face: The face.
+        slipping: Whether its slipping rows stay on their boundary, too. They do not make a convex
+            set then, but what ``nearest`` minimises is convex with any set.
+    """
+
+    def __init__(self, feasible: FeasibleSet, face: Face, slipping: bool = False) -> None:
+        self._feasible, self._open = feasible, ~face.carrying
+        kept = face.status if slipping else np.where(self._open, Status.OPEN, Status.FREE)
+        self._status = kept
+
+    def project(self, x: Array) -> Array:
+        """P_Ω(x), but for the rows that stay."""
+        return self._feasible.onto(x, self._status)
+
+    def face(self, x: Array, g: Array) -> Face:
+        """The face of x, without the rows that stay open."""
+        face = self._feasible.face(x, g)
+        kept = np.flatnonzero(abs(face.Z).T @ self._open.astype(float) == 0.0)
+        status = np.where(self._open, Status.OPEN, face.status)
+        return Face(csr_array(face.Z[:, kept]), face.curvature[kept], status)
+
+
+@dataclass(frozen=True)
+class _Trial:
+    """λ(α) = P_Ω(z), e − Gλ(α) and the cost there."""
+
+    alpha: Array
+    z: Array
+    lam: PETSc.Vec
+    residual: Array
+    cost: float
+
+    @property
+    def left(self) -> float:
+        """‖e − Gλ‖."""
+        return float(np.linalg.norm(self.residual))
+
+
+def _trial(coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec, alpha: Array) -> _Trial:
+    lam = y.duplicate()
+    coarse.combine(alpha, lam)
+    z = lam.array_r + y.array_r
+    projected = feasible.project(z)
+    lam.array[:] = projected
+    own = float(z @ projected) - 0.5 * float(projected @ projected)
+    cost = y.getComm().tompi4py().allreduce(own, op=MPI.SUM) - float(alpha @ coarse.e)
+    return _Trial(alpha, z, lam, coarse.residual(lam), cost)
+
+
+def _searched(
+    coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec, start: _Trial, step: Array
+) -> tuple[_Trial, float, int]:
+    """The longest of steps 1, ½, ¼, … that does not raise the cost; destroys the start.
+
+    Where the cost still falls at the end of a step, it fell along all of it: it is convex. That
+    holds where rounding hides the cost's difference.
+
+    Returns:
+        The point, the step's length and how many were tried.
+    """
+    comm, length, tried = y.getComm().tompi4py(), 1.0, 0
+    while True:
+        trial, tried = _trial(coarse, feasible, y, start.alpha + length * step), tried + 1
+        fell = trial.cost <= start.cost + ROUNDING * abs(start.cost)
+        if bcast_from_root(comm, fell or float(trial.residual @ step) >= 0.0 or length <= SHORTEST):
+            start.lam.destroy()
+            return trial, length, tried
+        trial.lam.destroy()
+        length *= 0.5

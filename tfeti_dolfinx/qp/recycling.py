@@ -1,0 +1,219 @@
+"""Directions of earlier solves with the same F, and what F makes of them."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.parallel import bcast_from_root, summed
+from tfeti_dolfinx.qp.sets import Face
+
+# of the energy of a direction: what stands out from those that are kept; where less does, rounding
+# of their images would grow from one to the next
+NEW = 0.1
+# of wᵀFp, for w and p of energy 1: where Fw says otherwise than Fp it is no longer F of w
+WRONG = 1e-9
+# of the longest direction: less on rows that a face holds is rounding
+HELD = 1e-10
+
+
+class Recycled:
+    """F-orthonormal directions W that conjugate gradients have gone, and their images FW.
+
+    Farhat, Crivelli, Roux, Comput. Methods Appl. Mech. Engrg. 117 (1994) 195–209: solves with
+    other right sides begin with the best of what is known, and go F-orthogonally to it. Where W is
+    full, the oldest direction goes.
+
+    Args:
+        capacity: Most directions; each takes two vectors, and two more while it is new.
+        comm: Communicator.
+
+    Attributes:
+        count: Number of directions.
+    """
+
+    def __init__(self, capacity: int, comm: MPI.Intracomm) -> None:
+        self.capacity, self.comm = capacity, comm
+        self.W: Array = np.zeros((0, 0))
+        self.FW: Array = np.zeros((0, 0))
+        self._squares: Array = np.zeros(capacity)  # of the lengths of W's columns
+        self.count = self._next = 0
+
+    @property
+    def columns(self) -> tuple[Array, Array]:
+        """This rank's part of W and FW, in no order, shapes ``(m, count)``."""
+        return self.W[:, : self.count], self.FW[:, : self.count]
+
+    def add(self, x: Array, Fx: Array, energy: float) -> None:
+        """Keep a direction, or what is new in it. Collective, three reductions.
+
+        Where images are no longer right, all that was kept is forgotten.
+
+        Args:
+            x: The direction, this rank's part.
+            Fx: What F makes of it.
+            energy: xᵀFx > 0, over all ranks.
+        """
+        x, Fx = x / np.sqrt(energy), Fx / np.sqrt(energy)
+        if self.W.shape[1] == 0:
+            self._make_room(len(x))
+        for passed in range(2):
+            W, FW = self.columns
+            a, same = summed(self.comm, np.array([FW.T @ x, W.T @ Fx]))
+            if passed == 0 and bcast_from_root(self.comm, bool(np.any(np.abs(a - same) > WRONG))):
+                self.count = self._next = 0
+                continue
+            if self.count == self.capacity:
+                a[self._next] = 0.0  # it goes
+            x, Fx = x - W @ a, Fx - FW @ a
+        energy, square = summed(self.comm, np.array([x @ Fx, x @ x]))
+        if not bcast_from_root(self.comm, energy >= NEW):
+            return
+        self.W[:, self._next], self.FW[:, self._next] = x / np.sqrt(energy), Fx / np.sqrt(energy)
+        self._squares[self._next] = square / energy
+        self.count = max(self.count, self._next + 1)
+        self._next = (self._next + 1) % self.capacity
+
+    def in_order(self) -> Array:
+        """This rank's part of W and FW, shape ``(2, m, count)``, the oldest direction first.
+
+        So they lie from then on: who takes them adds what it adds in the same order.
+        """
+        if self.count == self.capacity:
+            order = np.roll(np.arange(self.count), -self._next)
+            self.W, self.FW = (np.asfortranarray(X[:, order]) for X in (self.W, self.FW))
+            self._squares, self._next = self._squares[order], 0
+        return np.array(self.columns)
+
+    def take(self, kept: Array) -> None:
+        """Go on with what another run has kept, the newest of it if it is too much. Collective."""
+        newest = kept[:, :, max(kept.shape[2] - self.capacity, 0) :]
+        if newest.shape[2] == 0:
+            return
+        self.count = newest.shape[2]
+        self._make_room(newest.shape[1])
+        self.W[:, : self.count], self.FW[:, : self.count] = newest
+        self._next = self.count % self.capacity
+        self._squares[: self.count] = summed(self.comm, np.sum(newest[0] ** 2, axis=0))
+
+    def _make_room(self, rows: int) -> None:
+        """W and FW for so many local rows."""
+        self.W, self.FW = (np.zeros((rows, self.capacity), order="F") for _ in range(2))
+
+    def within(self, held: Array | None) -> Array | None:
+        """Orthonormal N so that W N is 0 on rows, shape ``(count, k)``. Collective.
+
+        Args:
+            held: Flags of the local rows; None: no rows, and then N is None, too.
+        """
+        return None if held is None else self.without(self.W[held, : self.count])
+
+    def without(self, values: Array) -> Array:
+        """Orthonormal N so that values N = 0, for values of W's columns, shape ``(count, k)``.
+
+        Collective.
+
+        Args:
+            values: Linear in the columns of W, this rank's part, shape ``(l, count)``.
+        """
+        _, sizes, Vt = np.linalg.svd(triangle(self.comm, values))
+        longest = float(np.sqrt(self._squares[: self.count].max(initial=0.0)))
+        return np.asarray(Vt[int(np.sum(sizes > HELD * longest)) :].T)
+
+
+class RecycledOnFace:
+    """Directions of earlier solves that lie in a face, by default that of all rows.
+
+    Args:
+        known: All directions; kept as an attribute.
+        held: Flags of the local rows that are 0 on the face; None: no rows.
+    """
+
+    def __init__(self, known: Recycled, held: Array | None = None) -> None:
+        self.known, self._held = known, held
+        self._N: Array | None = None
+        self._active = False
+        self._new = deque[tuple[Array, Array, float]](maxlen=known.capacity)
+
+    def on(self, face: Face) -> RecycledOnFace:
+        """Those within another face."""
+        return RecycledOnFace(self.known, face.held)
+
+    def go(
+        self,
+        lam: PETSc.Vec,
+        g: PETSc.Vec,
+        r: PETSc.Vec,
+        project: Callable[[PETSc.Vec], None],
+    ) -> bool:
+        """Go where q is least along W. Collective.
+
+        Args:
+            lam: A point; updated.
+            g: Fλ − d; updated.
+            r: −P g.
+            project: P, in place: takes away what rounding of many directions leaves of Gλ = e.
+
+        Returns:
+            Whether there is any direction.
+        """
+        self.keep()
+        known = self.known
+        self._active = known.count > 0
+        if self._active:
+            self._N = known.within(self._held)
+            self._active = self._N is None or self._N.shape[1] > 0
+        if self._active:
+            W, FW = known.columns
+            b = self._part(summed(known.comm, W.T @ r.array_r))
+            way = lam.duplicate()
+            way.array[:] = self._combined(b)
+            project(way)
+            lam.axpy(1.0, way)
+            g.array[:] += FW @ b
+            way.destroy()
+        return self._active
+
+    def conjugate(self, p: PETSc.Vec) -> None:
+        """Make a direction F-orthogonal to W. Collective, one reduction, or none without W."""
+        if self._active:
+            known = self.known
+            a = summed(known.comm, known.columns[1].T @ p.array_r)
+            p.array[:] -= self._combined(self._part(a))
+
+    def remember(self, p: PETSc.Vec, Fp: PETSc.Vec, energy: float) -> None:
+        """A direction was gone; it is kept later, for W stays while a solve goes on."""
+        self._new.append((np.array(p.array_r), np.array(Fp.array_r), energy))
+
+    def keep(self) -> None:
+        """Keep what was gone. Collective."""
+        while self._new:
+            self.known.add(*self._new.popleft())
+        self._active = False
+
+    def _part(self, a: Array) -> Array:
+        """N Nᵀ a."""
+        return a if self._N is None else self._N @ (self._N.T @ a)
+
+    def _combined(self, b: Array) -> Array:
+        """W b, 0 where the face holds rows."""
+        x = self.known.columns[0] @ b
+        if self._held is not None:
+            x[self._held] = 0.0
+        return np.asarray(x)
+
+
+def triangle(comm: MPI.Intracomm, A: Array) -> Array:
+    """R of A = QR, the rows of A spread over ranks; the same on all of them. Collective."""
+
+    def of(rows: Array) -> Array:
+        return np.asarray(np.linalg.qr(rows, mode="r"))
+
+    return bcast_from_root(
+        comm, comm.allreduce(of(A), op=lambda one, other: of(np.vstack((one, other))))
+    )

@@ -1,0 +1,1 @@
+"""The chosen solver, and Coulomb's law around it."""

@@ -1,0 +1,376 @@
+"""The solver that the options choose, with iterative refinement."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.logging import cite
+from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root
+from tfeti_dolfinx.errors import ConvergenceError, InputError
+from tfeti_dolfinx.feti.dual import Dual
+from tfeti_dolfinx.feti.recovery import without_rigid_motions
+from tfeti_dolfinx.feti.remainder import DefectProblem
+from tfeti_dolfinx.feti.stopping import Accuracy, ErrorTarget
+from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.qp.homogenised import (
+    Homogenised,
+    OperatorProduct,
+    homogenise,
+    operator_product,
+    scale_at,
+    scale_near,
+)
+from tfeti_dolfinx.qp.problem import (
+    QP,
+    ConvergedReason,
+    Monitor,
+    PrintMonitor,
+    QPResult,
+    Start,
+    no_monitor,
+)
+from tfeti_dolfinx.qp.recycling import Recycled
+from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver, Task
+
+# --- More digits where rounding has ended a solve: what its answer lacks is solved for and
+#     added ---
+
+# of the worst error: what a round has to bring, or there is no other; and of the displacement: an
+# answer that is as wrong as that has no digits to add some to
+DIGIT, NO_DIGITS = 0.1, 0.1
+
+
+@dataclass(frozen=True)
+class SolverContext:
+    """A solver, and what it is told.
+
+    Attributes:
+        solver: The solver.
+        options: Options.
+        monitor: Called after each step.
+    """
+
+    solver: Solver
+    options: Options
+    monitor: Monitor
+
+
+def refine_iteratively(
+    dual: Dual, told: SolverContext, result: QPResult, rule: Accuracy
+) -> tuple[QPResult, Accuracy]:
+    """Where rounding has ended a solve, solve for what is left, as long as that brings a digit.
+
+    Iterative refinement (Wilkinson): each round begins at the sum of those before, and the residual
+    of that is made from K itself. Where this does not suffice, once more from the same answer, and
+    K is not asked about motions of subdomains, of which it makes forces that are its rounding: the
+    residual is made from the displacement less these. Collective; does nothing where a solve has
+    ended otherwise.
+
+    Args:
+        dual: The dual problem.
+        told: The solver, which can start somewhere, and what it is told.
+        result: What it returned; becomes the function's own.
+        rule: Its accuracy.
+
+    Returns:
+        The multipliers and their displacement, whose sum has more digits than K⁺(f − Bᵀλ).
+    """
+    comm, first = dual.coarse.comm, (result, rule)
+    enough = bcast_from_root(comm, rule.ratio() * rule.rtol <= NO_DIGITS)
+    if result.reason != ConvergedReason.DIVERGED_ROUNDING or not enough:
+        return first
+    found = _in_rounds(dual, told, first, rule.u)
+    if found[0].reason <= 0 and dual.coarse.dimension:
+        plain = found
+        result.steps, rule.looks = plain[0].steps, plain[1].looks
+        other = _in_rounds(dual, told, first, without_rigid_motions(dual.subdomains, rule.u))
+        found = other if bcast_from_root(comm, other[1].ratio() < plain[1].ratio()) else plain
+        found[0].steps, found[1].looks = other[0].steps, other[1].looks
+        for answer, _ in (plain, other):
+            if answer is not found[0] and answer is not result:
+                answer.destroy()
+    if found[0] is not result:
+        result.destroy()
+    return found
+
+
+def _in_rounds(
+    dual: Dual, told: SolverContext, first: tuple[QPResult, Accuracy], v: Array
+) -> tuple[QPResult, Accuracy]:
+    """Rounds from a first answer, which stays; v is its displacement, or that less its motions."""
+    result, rule = first
+    comm = dual.coarse.comm
+    while result.reason == ConvergedReason.DIVERGED_ROUNDING:
+        before = bcast_from_root(comm, rule.ratio())
+        more, again, v = _of_remainder(dual, told, result, rule, v)
+        after = bcast_from_root(comm, again.ratio())
+        if after >= before:
+            more.destroy()
+            break
+        if result is not first[0]:
+            result.destroy()
+        result, rule = more, again
+        if after > DIGIT * before:
+            break
+    return result, rule
+
+
+def _of_remainder(
+    dual: Dual, told: SolverContext, result: QPResult, rule: Accuracy, v: Array
+) -> tuple[QPResult, Accuracy, Array]:
+    """The sum of a result and the solution of what it lacks, its accuracy, and its new v."""
+    options, norm = told.options, rule.norm
+    left = DefectProblem(dual, np.array(result.lam.array_r), rule.u, v)
+    qp = left.qp()
+    start = Start(left.start(result.face), np.zeros(qp.coarse.dimension))
+    at = operator_product(qp.F, start.lam.copy())
+    homogenised = homogenise(qp, at, scale_near(qp, at))
+    scale = (homogenised.scale.reference, homogenised.scale.rounding)
+    again = Accuracy(left, options.number, options.atol, scale, norm)
+    task = Task(qp, homogenised, again, options, start, told.monitor)
+    more = told.solver.solve(task)
+    if more.reason <= 0:
+        last_look(more, again)
+    again.looks += rule.looks
+    v = again.u if v is rule.u else left.at_rest(more.lam)
+    more.lam.axpy(1.0, result.lam)
+    more.mu, more.reference, more.norm = result.mu, result.reference, result.norm
+    more.steps = result.steps.plus(more.steps)
+    for item in (at, homogenised, start.lam, left):
+        item.destroy()
+    return more, again, v
+
+
+def last_look(result: QPResult, rule: Accuracy) -> None:
+    """Measure where a solver has stopped before its tolerance: it may be good enough."""
+    residual = max(result.projected_gradient, result.norm * result.equality)
+    rule.accept_rounding()
+    reason = rule.examine(result.lam, result.gradient, result.face, residual)
+    if reason > 0:
+        result.reason = reason
+
+
+# --- The solver that the options choose, run on a dual problem --------------------------------
+
+# directions that are kept where more solves come and options do not say how many
+REPEATED = 100
+EXPLANATIONS = {
+    ConvergedReason.DIVERGED_ROUNDING: "; rounding does not let it come lower: expected a "
+    "larger rtol, or a scene with smaller ratios of stiffness or size",
+    ConvergedReason.DIVERGED_STALLED: "; the forces come no nearer to balancing the load",
+    ConvergedReason.DIVERGED_FRICTION: "; the bounds of Coulomb's friction do not come to rest, "
+    "least of all on the body {restless!r}: "
+    "expected a smaller coefficient, smaller load steps, a larger friction_max_it, or a load that "
+    "does not need bodies wedged between others",
+    ConvergedReason.DIVERGED_CONTRADICTION: "; contact rows that depend on each other exclude each "
+    "other{contacts}: expected gaps that some displacement keeps",
+}
+# in the place of that of DIVERGED_FRICTION
+SLIDES = (
+    "; the body {restless!r} slides without end: forces within Coulomb's law could balance the "
+    "load, but contact does not press as much as they need: expected a body that is held, or "
+    "pressed by a load or by gaps that overlap"
+)
+
+
+def learn(dual: Dual, options: Options) -> None:
+    """Keep directions from now on, where options leave that open: more solves come.
+
+    Args:
+        dual: The dual problem.
+        options: Options.
+    """
+    if options.recycle == "auto" and dual.recycled is None:
+        dual.recycled = Recycled(REPEATED, dual.coarse.comm)
+
+
+def resolve_types(options: Options, rows: Sequence[int], prefix: str) -> tuple[str, str]:
+    """The solver and the preconditioner that ``auto`` stands for.
+
+    Args:
+        options: Options.
+        rows: Number of normal and of tangential rows of contacts, on all ranks.
+        prefix: Prefix of all options.
+
+    Raises:
+        InputError: The scene has inequalities or friction, but a solver that does not keep them
+            is asked for.
+    """
+    qp_type, (num_inequalities, num_tangents) = options.qp_type, rows
+    if qp_type == "auto":
+        qp_type = AUTO[num_inequalities + num_tangents > 0]
+    if num_tangents and not SOLVERS[qp_type].keeps_discs:
+        able = [name for name, solver in SOLVERS.items() if solver.keeps_discs]
+        raise InputError(
+            f"-{prefix}qp_type {qp_type}: the scene has friction, {num_tangents} tangential rows, "
+            f"which {qp_type.upper()} cannot keep; expected {' or '.join(['auto', *able])}"
+        )
+    if num_inequalities and not SOLVERS[qp_type].keeps_bounds:
+        able = [name for name, solver in SOLVERS.items() if solver.keeps_bounds]
+        raise InputError(
+            f"-{prefix}qp_type {qp_type}: the scene has {num_inequalities} contact rows, which "
+            f"{qp_type.upper()} cannot keep; expected {' or '.join(['auto', *able])}"
+        )
+    pc_type = options.pc_type
+    return qp_type, SOLVERS[qp_type].pc_type if pc_type == "auto" else pc_type
+
+
+def solve_dual(
+    dual: Dual,
+    options: Options,
+    qp_type: str,
+    start: tuple[Array, Array] | None = None,
+    monitor: Monitor | None = None,
+    goal: ErrorTarget | None = None,
+) -> tuple[QPResult, Accuracy]:
+    """Solve the dual problem, and look at the answer. Collective.
+
+    From the solution of an earlier solve PCPG multiplies by F once, SMALSE-M at most twice: once
+    less each if F λ̄ is known, as it is where the dual problem has been solved for the same e, or
+    where there is no kernel and it starts where the last solve has ended. Block Newton multiplies
+    once, and not even that where it starts at the end of the last solve.
+
+    Args:
+        dual: The dual problem.
+        options: Options.
+        qp_type: A solver of ``SOLVERS``.
+        start: λ on this rank's rows, and the multipliers of Gλ = e, to start from.
+        monitor: Called after each step; default as options say.
+        goal: What bounds the algebraic error in energy has to come down to, too.
+
+    Returns:
+        Multipliers, and their displacement with its measured accuracy.
+    """
+    cite("tfeti", qp_type)
+    solver = SOLVERS[qp_type]
+    qp = dual.qp(options.norm_steps if solver.relative_to_norm else 0)
+    begin = _start(start, qp)
+    homogenised = _homogenise(dual, qp, solver, options, begin)
+    if monitor is None:
+        monitor = _monitor(dual, homogenised, options)
+    scale = homogenised.scale
+    rule = Accuracy(dual, options.number, options.atol, (scale.reference, scale.rounding), qp.norm)
+    rule.goal = goal
+    result = solver.solve(Task(qp, homogenised, rule, options, begin, monitor))
+    dual.saw(result.norm)
+    if dual.coarse.dimension == 0 or qp_type == "newton":
+        dual.last.keep(result, qp)
+    homogenised.destroy()
+    if begin is not None:
+        begin.lam.destroy()
+    if result.reason <= 0:
+        last_look(result, rule)
+    if goal is None and solver.warm is not None:
+        result, rule = refine_iteratively(
+            dual, SolverContext(solver, options, monitor), result, rule
+        )
+    return result, rule
+
+
+def _start(values: tuple[Array, Array] | None, qp: QP) -> Start | None:
+    """μ of another kernel, as before conditions have become other ones, is left out."""
+    if values is None:
+        return None
+    lam, mu = qp.d.duplicate(), values[1]
+    lam.array[:] = values[0]
+    fits = len(mu) == qp.coarse.dimension
+    return Start(lam, np.array(mu) if fits else np.zeros(qp.coarse.dimension))
+
+
+def _homogenise(
+    dual: Dual, qp: QP, solver: Solver, options: Options, start: Start | None
+) -> Homogenised:
+    """With λ̄ where the solver starts, or as the options say."""
+    if start is not None and solver.warm is not None:
+        at = dual.last.image(qp.F, solver.warm(qp, start))
+        _no_worse_than_nothing(qp, at, start)
+        known = dual.known_image("natural")
+        scale = scale_at(qp, known) if known else scale_near(qp, at)
+    elif solver.cold is not None:
+        at = operator_product(qp.F, solver.cold(qp))
+        scale = scale_at(qp, at)
+    else:
+        return _homogenise_as_told(dual, qp, options)
+    homogenised = homogenise(qp, at, scale)
+    at.destroy()
+    return homogenised
+
+
+def _no_worse_than_nothing(qp: QP, at: OperatorProduct, start: Start) -> None:
+    """Begin at 0 where it is admissible and q is no less at a start, as after unloading.
+
+    Of what the start has and the solution has not, conjugate gradients would leave its rounding.
+    """
+    comm, zero = at.x.getComm().tompi4py(), np.zeros(at.x.getLocalSize())
+    may = not np.any(qp.coarse.e) and not np.any(qp.feasible.project(zero))
+    worse = 0.5 * at.x.dot(at.Fx) >= at.x.dot(qp.d)
+    if not any_rank(comm, not may) and bcast_from_root(comm, worse):
+        at.x.set(0.0)
+        at.Fx.set(0.0)
+        start.mu[:] = 0.0
+
+
+def _homogenise_as_told(dual: Dual, qp: QP, options: Options) -> Homogenised:
+    """With λ̄ as the options say; its image is kept."""
+    kind = options.homogenization if any(dual.contact_rows) else "natural"
+    scale = scale_at(qp, dual.image("natural"))
+    return homogenise(qp, dual.image(kind), scale)
+
+
+def _monitor(dual: Dual, homogenised: Homogenised, options: Options) -> Monitor:
+    if not options.monitor:
+        return no_monitor
+    comm, feasible = dual.coarse.comm, homogenised.feasible
+
+    def touching(x: PETSc.Vec) -> int:
+        face = feasible.face(x.array_r, np.zeros(x.getLocalSize()))
+        return int(comm.allreduce(int(np.sum(face.constrained & face.carrying))))
+
+    return PrintMonitor(touching=touching, multiplications=lambda: dual.F.count["solver"])
+
+
+def conclude(
+    result: QPResult,
+    rule: Accuracy,
+    options: Options,
+    comm: MPI.Intracomm,
+    excluding: Sequence[str] = (),
+    restless: tuple[str, bool] = ("", False),
+    warnings: Sequence[str] = (),
+) -> None:
+    """Say why the solver stopped, and raise where it should have gone on.
+
+    Args:
+        result: What it returned.
+        rule: Its accuracy.
+        options: Options.
+        comm: Communicator.
+        excluding: Names of the contacts whose rows exclude each other.
+        restless: Name of the body on which bounds of friction change most, and whether it slides.
+        warnings: What is known to be hard about the scene; an error says it, too.
+
+    Raises:
+        ConvergenceError: It stopped before its tolerance, unless options turn that off.
+    """
+    contacts = f", those of {' and '.join(excluding)}" if excluding else ""
+    body, slides = restless
+    explanation = EXPLANATIONS.get(result.reason, "")
+    if result.reason == ConvergedReason.DIVERGED_FRICTION and slides:
+        explanation = SLIDES
+    explanation = explanation.format(contacts=contacts, restless=body)
+    text = (
+        f"{result.reason.name} after {result.steps.outer} outer and {result.steps.inner} inner "
+        f"iterations: the worst of its errors is {rule.ratio():.3g} times what rtol "
+        f"{options.rtol} allows{explanation}"
+    )
+    if options.converged_reason and comm.rank == 0:
+        print(f"TFETI solve {text}", flush=True)
+    if result.reason <= 0 and options.error_if_not_converged:
+        hard = f"; warnings: {'; '.join(warnings)}" if warnings else ""
+        raise ConvergenceError(f"the dual solver stopped: {text}{hard}")

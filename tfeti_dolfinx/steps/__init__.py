@@ -1,0 +1,1 @@
+"""Series of solves: load steps, dynamics, checkpoints."""

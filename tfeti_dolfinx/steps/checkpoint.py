@@ -1,0 +1,364 @@
+"""Checkpoints of a series of load steps: files of each rank, and one that says which count."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO, cast
+
+import numpy as np
+from mpi4py import MPI
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.validation import checked_type, named
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.solution import SavedState
+
+INDEX, RECORDS, VERSION = "checkpoint.json", "records.jsonl", 3
+KIND = "checkpoint of tfeti_dolfinx"
+OF_STEP = re.compile(
+    r"(?P<kind>state|fields)_(?P<number>[1-9]\d*)_(?P<rank>0|[1-9]\d*)\.npz(?P<partial>\.partial)?"
+)
+
+
+@dataclass(frozen=True)
+class Index:
+    """What ``checkpoint.json`` has: which files count, and how their bytes add up.
+
+    Attributes:
+        number: How many steps have converged; 0: the folder is taken, nothing is kept yet.
+        ranks: Number of ranks.
+        states: Checksum of the state's file of each rank.
+        records_length: How many bytes of ``records.jsonl`` count.
+        records_checksum: Their checksum.
+        digest: Describes what the user has given, see ``Checkpoint.write``.
+        about: What else is kept.
+        kind: The mark of a folder that a checkpoint owns.
+        version: Of this form.
+    """
+
+    number: int
+    ranks: int
+    states: list[str] = field(default_factory=list)
+    records_length: int = 0
+    records_checksum: str = ""
+    digest: Any = ""
+    about: dict[str, Any] = field(default_factory=dict)
+    kind: str = KIND
+    version: int = VERSION
+
+    def owns(self, file: Path) -> bool:
+        """Return whether the checkpoint writes a file of this name up to the next step."""
+        if not file.is_file():
+            return False
+        found = OF_STEP.fullmatch(file.name)
+        if found is None:
+            return file.name in (INDEX, f"{INDEX}.partial", RECORDS)
+        first = max(self.number - 1, 1) if found["kind"] == "state" else 1
+        of_series = first <= int(found["number"]) <= self.number + 1
+        return of_series and int(found["rank"]) < self.ranks
+
+    def counts(self, file: Path) -> bool:
+        """Return whether an own file is one of those that the next run reads."""
+        found = OF_STEP.fullmatch(file.name)
+        if found is None:
+            return file.name in (INDEX, RECORDS)
+        number, is_state = int(found["number"]), found["kind"] == "state"
+        known = number == self.number if is_state else number <= self.number
+        return known and not found["partial"]
+
+
+@dataclass(frozen=True)
+class Kept:
+    """What a checkpoint has of a series, the same on all ranks.
+
+    Attributes:
+        number: How many steps have converged.
+        records: The record of each.
+        about: What ``Checkpoint.write`` was given last.
+        digest: Likewise.
+    """
+
+    number: int
+    records: list[dict[str, Any]]
+    about: dict[str, Any]
+    digest: Any
+
+
+class Checkpoint:
+    """A folder with the last converged step of a series. Creation and all methods are collective.
+
+    Each rank writes its arrays to a file of its own, with the number of the step in its name.
+    The record of the step is a line at the end of ``records.jsonl``, with the checksums of its
+    fields. When all are whole, ``checkpoint.json`` takes that number, and the checksums of states
+    and lines: it is written aside and renamed, so it names whole files at any time, and a line
+    that is torn lies beyond what counts. Then the state of the step before goes. What a step
+    writes does not grow with their number.
+
+    The folder is the checkpoint's own. ``checkpoint.json`` marks it before anything else is
+    written; it says of which steps and ranks there are files, and only those are ever removed.
+
+    Args:
+        path: The folder; it may be there if it is empty or has a checkpoint, and nothing else.
+        comm: Communicator.
+
+    Raises:
+        InputError: The path is no folder for a checkpoint, or its index is damaged.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], comm: MPI.Intracomm) -> None:
+        checked_type(path, (str, os.PathLike), "checkpoint", "the name of a folder")
+        self.path, self._comm = Path(path), comm
+        self._index = Index(0, comm.size)  # rank 0's counts
+        self._lines = _hash()  # of the records that count, likewise
+        self._states: list[str] = []  # checksums of all ranks at the step that was read
+        self._fields: list[list[str]] = []  # of all steps and ranks, likewise
+        with raised_on_all_ranks(comm), named(f"checkpoint {self.path}", OSError):
+            if comm.rank == 0:
+                self._index = self._checked_folder()
+
+    def forget(self) -> None:
+        """Remove what an earlier series has left, and take the folder."""
+        with raised_on_all_ranks(self._comm), named(f"checkpoint {self.path}", OSError):
+            if self._comm.rank == 0:
+                self._index = self._checked_folder()
+                self.path.mkdir(parents=True, exist_ok=True)
+                for file in self.path.iterdir():
+                    if self._index.owns(file) and file.name != INDEX:
+                        file.unlink()
+                self._commit(Index(0, self._comm.size))  # until here it says what is to go
+        self._lines = _hash()
+
+    def read(self) -> Kept | None:
+        """Return what was written last, on all ranks; None if there is nothing.
+
+        What a run that was killed has left beside it is removed.
+
+        Raises:
+            InputError: It is damaged, or was written on another number of ranks.
+        """
+        kept: Kept | None = None
+        comm = self._comm
+        with raised_on_all_ranks(comm), named(f"cannot read {self.path}", OSError):
+            if comm.rank == 0:
+                index = self._index = self._checked_folder()
+                if index.number:
+                    self._check_ranks()
+                    records = [json.loads(line) for line in self._read_lines()]
+                    self._fields = [record.pop("fields") for record in records]
+                    self._states = index.states
+                    kept = Kept(index.number, records, index.about, index.digest)
+                    for file in self.path.iterdir():
+                        if index.owns(file) and not index.counts(file):
+                            file.unlink()
+        self._states, self._fields = comm.bcast((self._states, self._fields), root=0)
+        return comm.bcast(kept, root=0)
+
+    def write(
+        self,
+        number: int,
+        about: Mapping[str, Any],
+        record: Mapping[str, Any],
+        state: SavedState,
+        fields: Mapping[str, Array],
+        digest: Any = "",
+    ) -> None:
+        """Keep a step; the one before is replaced when this one is whole.
+
+        Args:
+            number: How many steps have converged.
+            about: What else to keep of it, for JSON; rank 0's counts.
+            record: What to keep of every step, likewise.
+            state: The state of this rank.
+            fields: Fields of the step on this rank, kept for all steps.
+            digest: Describes all that the user has given at this step, for JSON; empty where it
+                is not known. ``read`` gives it back. Rank 0's counts.
+
+        Raises:
+            InputError: The files cannot be written.
+        """
+        comm, in_state, in_fields = self._comm, "", ""
+        with raised_on_all_ranks(comm), named(f"cannot write {self.path}", OSError):
+            in_state = self._save(f"state_{number}_{comm.rank}.npz", asdict(state))
+            if fields:
+                in_fields = self._save(f"fields_{number}_{comm.rank}.npz", fields)
+        checksums = comm.gather((in_state, in_fields), root=0)
+        with raised_on_all_ranks(comm), named(f"cannot write {self.path}", OSError):
+            if checksums is not None:  # on rank 0
+                states, of_fields = zip(*checksums, strict=True)
+                text = json.dumps({**record, "fields": of_fields if fields else []})
+                line, lines, before = f"{text}\n".encode(), self._lines.copy(), self._index
+                lines.update(line)
+                self._append(line)
+                self._commit(
+                    Index(
+                        number,
+                        comm.size,
+                        list(states),
+                        before.records_length + len(line),
+                        lines.hexdigest(),
+                        digest,
+                        dict(about),
+                    )
+                )
+                self._lines = lines
+                for rank in range(len(before.states)):
+                    (self.path / f"state_{before.number}_{rank}.npz").unlink(missing_ok=True)
+
+    def read_state(self, number: int) -> SavedState:
+        """Return the state of this rank at the step that ``read`` found.
+
+        Raises:
+            InputError: It is not what was written.
+        """
+        return SavedState(**self._load(f"state_{number}_{self._comm.rank}.npz", self._states))
+
+    def read_fields(self, number: int) -> dict[str, Array]:
+        """Return the fields of a step, of those that ``read`` found, on this rank.
+
+        Raises:
+            InputError: They are not what was written, or there are none.
+        """
+        checksums = self._fields[number - 1]
+        if not checksums:
+            raise InputError(
+                f"checkpoint {self.path} has no fields of step {number}; expected path= as in "
+                "the run that has written it"
+            )
+        return self._load(f"fields_{number}_{self._comm.rank}.npz", checksums)
+
+    def _save(self, name: str, arrays: Mapping[str, Array]) -> str:
+        """Write arrays; return the checksum of the file's bytes."""
+        with self._replaced(name) as file:
+            np.savez(file, **cast(dict[str, Any], arrays))
+        return _checksum_in(self.path / name)
+
+    @contextmanager
+    def _replaced(self, name: str) -> Iterator[BinaryIO]:
+        """Give a file to write to; when it is whole, and on the disk, it gets its name."""
+        partial = self.path / f"{name}.partial"
+        try:
+            with partial.open("wb") as file:
+                yield file
+                _settle(file)
+        except OSError:
+            partial.unlink(missing_ok=True)  # a full disk needs the place
+            raise
+        os.replace(partial, self.path / name)
+
+    def _load(self, name: str, checksums: list[str]) -> dict[str, Array]:
+        """Return arrays of this rank; nothing looks into a file that is not as it was written."""
+        file = self.path / name
+        with raised_on_all_ranks(self._comm), named(f"cannot read {file}", OSError):
+            if _checksum_in(file) != checksums[self._comm.rank]:
+                raise damaged(file, INDEX if checksums is self._states else RECORDS)
+            with np.load(file) as contents:
+                arrays = dict(contents)
+        return arrays
+
+    def _append(self, line: bytes) -> None:
+        """Put a line after those that count; what lies beyond them goes."""
+        with (self.path / RECORDS).open("ab") as file:
+            file.truncate(self._index.records_length)
+            file.write(line)
+            _settle(file)
+
+    def _read_lines(self) -> list[bytes]:
+        with (self.path / RECORDS).open("rb") as file:
+            text = file.read(self._index.records_length)
+        self._lines = _hash(text)
+        if self._lines.hexdigest() != self._index.records_checksum:
+            raise damaged(self.path / RECORDS, INDEX)
+        return text.splitlines()
+
+    def _commit(self, index: Index) -> None:
+        """Let an index count."""
+        text = asdict(index)
+        text["checksum"] = _checksum_of(text)
+        with self._replaced(INDEX) as file:
+            file.write(f"{json.dumps(text, indent=1)}\n".encode())
+        self._index = index
+
+    def _checked_folder(self) -> Index:
+        """Return the index of the folder, or one of nothing.
+
+        Raises:
+            InputError: The folder is none, or has anything that the checkpoint has not written.
+        """
+        what = f"checkpoint {self.path}"
+        if self.path.exists() and not self.path.is_dir():
+            raise InputError(f"{what} is a file; expected the name of a folder")
+        files = sorted(self.path.iterdir()) if self.path.is_dir() else []
+        marked = self.path / INDEX in files
+        index = self._read_index() if marked else None
+        others = [f.name for f in files if index is None or not index.owns(f)]
+        if others:
+            raise InputError(
+                f"{what} is a folder with other files, {others[0]!r}; "
+                "expected a new or empty one, or one with a checkpoint and nothing else"
+            )
+        return Index(0, self._comm.size) if index is None else index
+
+    def _read_index(self) -> Index:
+        file = self.path / INDEX
+        try:
+            found = json.loads(file.read_text())
+        except (ValueError, RecursionError) as error:
+            raise damaged(file, "it") from error
+        if isinstance(found, dict) and found.get("version") in (1, 2):
+            raise InputError(
+                f"checkpoint {self.path} is of an earlier version of the package, "
+                "without checksums; expected one of this version: finish the series with that "
+                "one, or name another folder"
+            )
+        if not isinstance(found, dict) or found.get("kind") != KIND:
+            raise InputError(
+                f"{file} is not that of a checkpoint, or damaged; expected the folder as it was "
+                "left, or another one"
+            )
+        checksum = found.pop("checksum", None)
+        if checksum != _checksum_of(found):
+            raise damaged(file, "it")
+        if found["version"] != VERSION:
+            raise InputError(f"{file} is of version {found['version']}; expected {VERSION}")
+        return Index(**found)
+
+    def _check_ranks(self) -> None:
+        if self._index.ranks != self._comm.size:
+            raise InputError(
+                f"{self.path} was written on {self._index.ranks} ranks, this run has "
+                f"{self._comm.size}; expected the same number"
+            )
+
+
+def damaged(file: Path, where: str) -> InputError:
+    """Return the error of a file whose checksum differs from the one that was written."""
+    return InputError(
+        f"{file} is damaged: it is not what the checkpoint has written, by the checksum in "
+        f"{where}; expected the folder as it was left. Bring the file back, or remove the folder"
+    )
+
+
+def _hash(data: bytes = b"") -> Any:
+    return hashlib.blake2b(data, digest_size=16)
+
+
+def _checksum_in(file: Path) -> str:
+    with file.open("rb") as opened:
+        return hashlib.file_digest(opened, _hash).hexdigest()
+
+
+def _checksum_of(index: Mapping[str, Any]) -> str:
+    return str(_hash(json.dumps(index, sort_keys=True).encode()).hexdigest())
+
+
+def _settle(file: BinaryIO) -> None:
+    """Bring a file to the disk, so that a name that it gets later never has less."""
+    file.flush()
+    os.fsync(file.fileno())

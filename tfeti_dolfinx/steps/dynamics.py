@@ -1,0 +1,436 @@
+"""Bodies with mass: contact-stabilised steps in time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from scipy.sparse import csr_array
+
+from tfeti_dolfinx.common.arrays import Array, sum_rows
+from tfeti_dolfinx.common.parallel import any_rank, summed
+from tfeti_dolfinx.common.validation import checked_flag
+from tfeti_dolfinx.constraints.contact_state import Multipliers
+from tfeti_dolfinx.constraints.gluing import Gluing
+from tfeti_dolfinx.constraints.rows import Constraints
+from tfeti_dolfinx.contact.search import ContactPartner
+from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.extensions import Extensions, Settings
+from tfeti_dolfinx.feti.dual import Dual
+from tfeti_dolfinx.forms.assembly import Forms
+from tfeti_dolfinx.forms.elasticity import Modulus
+from tfeti_dolfinx.forms.newmark import InertialForms, check_copies, mass_form
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.problem import ContactProblem
+from tfeti_dolfinx.qp.sets import Bounds, Discs, FeasibleSet, Product
+from tfeti_dolfinx.solution import SavedState, Solution
+from tfeti_dolfinx.solve.solver import conclude, resolve_types, solve_dual
+from tfeti_dolfinx.subdomains.block import Counters
+from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
+from tfeti_dolfinx.subdomains.factor import added_options
+from tfeti_dolfinx.subdomains.subdomains import Subdomains
+
+# --- Energies of bodies with mass, and what was done to them in a step ------------------------
+
+NAMES = ("load", "contact", "friction", "supports", "predictor")
+
+
+def balance(forms: InertialForms, dual: Dual, solution: Solution) -> dict[str, float]:
+    """Energies at the end of a step, and the work that has changed them. Collective.
+
+    Args:
+        forms: Where the step began.
+        dual: Its dual problem.
+        solution: Its end.
+
+    Returns:
+        ``size`` of the step; at its end ``kinetic``, ``elastic`` and ``energy``; work of the
+        ``load``, of normal forces of ``contact``, of ``friction``, of ``supports`` (Dirichlet
+        conditions, and what jumps at tears to the tolerance), what the ``predictor`` has added,
+        at most 0; and ``defect``, what all these leave of the change of the energy: rounding.
+    """
+    motion, (K, M) = forms.motion, forms.matrices
+    u, v = solution.displacement.x.array, solution.velocity.x.array
+    kicked, way = motion.towards - motion.free, u - motion.u
+    own = [
+        0.5 * v @ (M @ v),
+        0.5 * u @ (K @ u),
+        0.5 * motion.v @ (M @ motion.v) + 0.5 * motion.u @ (K @ motion.u),
+        forms.mean_load @ way,
+        *_work_of_rows(dual, solution.lam, solution.dofs.to_primal(way)),
+        -2.0 / motion.size**2 * kicked @ (M @ (u - motion.towards)),
+    ]
+    values = [float(value) for value in summed(solution.dofs.comm, np.array(own))]
+    (kinetic, elastic, before), work = values[:3], values[3:]
+    return {
+        "size": motion.size,
+        "kinetic": kinetic,
+        "elastic": elastic,
+        "energy": kinetic + elastic,
+        **dict(zip(NAMES, work, strict=True)),
+        "defect": kinetic + elastic - before - sum(work),
+    }
+
+
+def _work_of_rows(dual: Dual, lam: Array, way: Array) -> list[float]:
+    """−λᵀB Δu of this rank's normal, tangential and other rows. Collective."""
+    B, sets = dual.constraints.B, dual.constraints.sets
+    moved, rows = B.createVecRight(), dual.constraints.c.duplicate()
+    moved.array[:] = way[dual.subdomains.trace]
+    B.mult(moved, rows)
+    done = -lam * rows.array_r
+    moved.destroy()
+    rows.destroy()
+    kinds = (sets.normals, sets.tangents.ravel(), sets.equalities)
+    return [float(done[kind].sum()) for kind in kinds]
+
+
+def contact_forces(solution: Solution) -> list[list[float]]:
+    """Resultant on the surface of each contact, of a pair the secondary one. Collective."""
+    records = solution.gluing.records
+    force = solution.tangential_force - solution.force[:, None] * records.normal
+    total = summed(solution.dofs.comm, sum_rows(records.contact, force, len(solution.contacts)))
+    return [[float(value) for value in row] for row in total]
+
+
+# --- Where bodies with mass may be without elasticity: the nearest place in M that contact
+#     allows ---
+
+
+class Predictor:
+    """argmin ‖u − w‖_M over the u that rows allow, without friction.
+
+    A quadratic program with the mass M as stiffness and the rows of the problem. Prescribed
+    components are held where w has them; contacts meet them where they are at the end of the step:
+    where w has them they may overlap, though nothing does at the end. Creation and all methods are
+    collective.
+
+    Args:
+        dofs: Dof maps.
+        decomposition: The torn mesh.
+        settings: How to solve.
+
+    Attributes:
+        multiplications: By F of the mass in the last call.
+    """
+
+    def __init__(self, dofs: TornDofs, decomposition: Decomposition, settings: Settings) -> None:
+        self._dofs, self._decomposition = dofs, decomposition
+        options = replace(settings.options, recycle=0)  # of a mass there is little to learn
+        self._settings = replace(settings, extensions=Extensions(), options=options)
+        self._M: csr_array | None = None
+        self._subdomains: Subdomains | None = None
+        self._dual: Dual | None = None
+        self._start: tuple[Gluing, Array] | None = None
+        self._image: Array = np.zeros(0)
+        self.multiplications = 0
+
+    @property
+    def start(self) -> tuple[Array, Array]:
+        """Multipliers that the next call starts from, and their image. Collective.
+
+        Empty before the first, or where the image is not known.
+        """
+        if self._start is None or self._dual is None:
+            return np.zeros(0), np.zeros(0)
+        return self._start[1], self._dual.last.known(self._dofs.comm, self._start[1])
+
+    def start_from(self, gluing: Gluing, lam: Array, image: Array) -> None:
+        """Let the next call start from multipliers of some rows, as ``start`` had them."""
+        self._start, self._image = (gluing, lam), image
+
+    def nearest(self, w: Array, M: csr_array, gluing: Gluing) -> Array:
+        """The nearest displacement to w.
+
+        Args:
+            w: Displacement in DOLFINx's order.
+            M: This rank's mass in DOLFINx's order; factors are kept while it is the same object.
+            gluing: Rows and their right sides, which are as before afterwards.
+
+        Returns:
+            A displacement in DOLFINx's order.
+
+        Raises:
+            ConvergenceError: The solver stopped before its tolerance.
+            FactorError: M could not be factored.
+        """
+        dofs, constraints = self._dofs, gluing.constraints
+        before, primal = np.array(constraints.c.array_r), dofs.to_primal(w)
+        total = dofs.reduce(primal.reshape(-1, dofs.bs), np.add, 0.0)
+        held = total / dofs.multiplicity[:, None]
+        constraints.set_right_side(gluing.with_supports_at(held))
+        try:
+            self._make(M, M @ w, gluing)
+            return dofs.to_dolfinx(self._solve(gluing))
+        finally:
+            constraints.set_right_side(before)
+
+    def _make(self, M: csr_array, f: Array, gluing: Gluing) -> None:
+        """Make what is out of date."""
+        constraints, settings = gluing.constraints, self._settings
+        new_rows = self._dual is None or self._dual.constraints is not constraints
+        if M is not self._M:
+            self.destroy()
+            counters = Counters()
+            data = subdomain_data(self._dofs, self._decomposition, M.copy(), f, constraints.trace)
+            with added_options(settings.prefix, settings.factor_options):
+                self._subdomains = make_subdomains(
+                    data,
+                    settings.make_block(counters),
+                    self._decomposition,
+                    counters,
+                    settings.local_choice,
+                )
+            self._M, new_rows = M, True
+        assert self._subdomains is not None
+        self._subdomains.update(f=self._dofs.to_primal(f))
+        if not new_rows and self._dual is not None:
+            self._dual.update_load()
+            return
+        if self._dual is not None:
+            self._dual.destroy()
+            self._subdomains.retrace(constraints.trace, constraints.span)
+        scene = self._dofs, self._decomposition
+        self._dual = settings.make_dual(constraints, self._subdomains, *scene, _frictionless)
+
+    def _solve(self, gluing: Gluing) -> Array:
+        """The displacement in primal order."""
+        dual, options, start = self._dual, self._settings.options, None
+        assert dual is not None
+        dual.forget_counts()
+        if self._start is not None:  # nothing has a kernel in M
+            start = (gluing.multipliers(*self._start), np.zeros(0))
+            if self._start[0] is gluing:
+                dual.last.take(self._dofs.comm, self._start[1], self._image)
+        self._image = np.zeros(0)  # it is of the F and the start of a restored state alone
+        qp_type, _ = resolve_types(options, dual.contact_rows, self._settings.prefix)
+        result, accuracy = solve_dual(dual, options, qp_type, start)
+        self._start = (gluing, np.array(result.lam.array_r)) if result.reason > 0 else None
+        self.multiplications = dual.F.count["solver"]
+        result.destroy()
+        conclude(result, accuracy, options, self._dofs.comm)
+        return accuracy.u
+
+    def destroy(self) -> None:
+        """Destroy the PETSc objects; the next call makes them anew."""
+        for item in (self._dual, self._subdomains):
+            if item is not None:
+                item.destroy()
+        self._M = self._dual = self._subdomains = None
+
+
+def _frictionless(constraints: Constraints) -> FeasibleSet:
+    """λ_N ≥ 0, and no force along tangents."""
+    sets = constraints.sets
+    none, width = np.zeros(len(sets.tangents)), sets.tangents.shape[1]
+    return Product([(sets.normals, Bounds()), (sets.tangents.ravel(), Discs(none, width))])
+
+
+# --- Contact of bodies with mass: Newmark's trapezoidal rule, plain or contact-stabilised -----
+
+
+class ContactDynamics(ContactProblem):
+    """Linear elasticity with contact of bodies with mass, step by step.
+
+    A step of the size τ solves one contact problem with K/2 + 2M/τ², and ends at u⁺ and v⁺. Contact
+    is implicit: no node overlaps at the end of a step, and its forces, λ, are means over the step.
+    ``LoadSteps`` goes through many, or by hand: ``take_step(size)``, ``solve()``, ``accept()``.
+    All is collective. Since F is that of the steps before, 200 directions of earlier steps
+    are kept, unless the option ``recycle`` is given.
+
+    With fixed obstacles and supports and no friction the energy E = vᵀMv/2 + uᵀKu/2 changes by the
+    work of the load less λᵀ(g − Bu): contact adds none, and takes some where it closes. Forces of
+    the plain step oscillate where bodies touch. The stabilised one (Deuflhard, Krause, Ertel) moves
+    from where inertia alone would bring the bodies to the nearest place that contact allows, in
+    M, and from there on; it takes a little energy at each impact.
+
+    Args:
+        a: Bilinear form of the stiffness.
+        L: Linear form of the load. Its values when the problem is made are those at the begin of
+            the first step, at each solve those at the end of the step; between them it is linear.
+        bcs: Dirichlet conditions, at the end of the step.
+        contacts: Obstacles and pairs. Friction acts on what slips in a step.
+        decomposition: The torn mesh.
+        mass: Mass per volume, a number, a scalar in UFL or numbers for all volumes by names, for
+            M = ∫ρ u·v. Or a bilinear form.
+        velocity: Velocity at the begin, a function; default 0.
+        stabilised: Whether steps are contact-stabilised.
+        lumped: Whether a density is integrated at the vertices, which makes M diagonal; of elements
+            of degree 1 only: vertices alone are too few for others.
+        others: As for ``ContactProblem``. What ``u`` has is the displacement at the begin.
+
+    Attributes:
+        u: The displacement at the end of the step.
+
+    ``report.motion`` has energies and work of the last step, see ``work.balance``, and
+    ``report.contact_forces`` the resultants on the contacts.
+
+    Raises:
+        InputError: What is given does not fit; the message names it.
+    """
+
+    defaults: ClassVar[Mapping[str, Any]] = {"recycle": 200}
+
+    def __init__(
+        self,
+        a: ufl.Form,
+        L: ufl.Form,
+        bcs: Sequence[fem.DirichletBC],
+        contacts: Sequence[ContactPartner],
+        decomposition: Decomposition,
+        *,
+        mass: Modulus | ufl.Form,
+        velocity: fem.Function | None = None,
+        stabilised: bool = False,
+        lumped: bool = False,
+        **others: Any,
+    ) -> None:
+        self._stabilised, self._lumped = stabilised, lumped
+        self._mass, self._velocity = mass, velocity
+        self._with_thickness = others.get("thickness", 1.0)
+        super().__init__(a, L, bcs, contacts, decomposition, **others)
+        if self.options.rtol == "auto":
+            raise InputError("rtol auto: errors of steps in time are not estimated; expected one")
+        v = np.zeros_like(self.u.x.array)
+        if velocity is not None:
+            v = self._checked_u(velocity, self.dofs.V, "velocity").x.array
+        check_copies(self.u.x.array, self.dofs, "u, the displacement at the begin,")
+        check_copies(v, self.dofs, "velocity")
+        self._forms_in_time.move(np.array(self.u.x.array), np.array(v))
+        self._first = np.array(self.u.x.array)
+        self._predictor: Predictor | None = None
+        if self._stabilised:
+            self._predictor = Predictor(self.dofs, decomposition, self._settings)
+
+    def _given_besides(self) -> dict[str, Any]:
+        flags = {"stabilised": self._stabilised, "lumped": self._lumped}
+        for name, flag in flags.items():
+            checked_flag(flag, name)
+        return {**flags, "mass": self._mass, "velocity": self._velocity}
+
+    def _forms(self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any) -> Forms:
+        mass = self._mass
+        if isinstance(mass, ufl.Form) and self._lumped:
+            raise InputError("lumped=True with a form of the mass; expected a density")
+        if not isinstance(mass, ufl.Form):
+            mass = mass_form(mass, V, self.decomposition, self._with_thickness, self._lumped)
+        return InertialForms(mass, a, L, V, self.decomposition, *options)
+
+    @property
+    def _forms_in_time(self) -> InertialForms:
+        forms = self._system.forms
+        assert isinstance(forms, InertialForms)
+        return forms
+
+    def take_step(self, size: float) -> None:
+        """Say how long the next steps are. Another size than before makes and factors all anew.
+
+        Raises:
+            InputError: It is not a positive number, or another one on another rank.
+        """
+        self._forms_in_time.take_step(size)
+
+    def solve(self) -> fem.Function:
+        """Solve for the end of the step; see ``ContactProblem.solve``.
+
+        Raises:
+            InputError: As there, or the step has no size yet.
+        """
+        super().solve()
+        self._look()
+        return self.u
+
+    def _set_out(self) -> None:
+        motion = self._forms_in_time.motion
+        motion.towards = free = motion.free
+        if self._predictor is not None:
+            motion.towards = self._predicted(self._predictor, free)
+
+    def accept(self) -> None:
+        """Take the last solution as the end of the step: the next one begins there.
+
+        Raises:
+            InputError: As ``ContactProblem.accept``.
+        """
+        before, _ = self._accepted
+        super().accept()
+        if self.solution is before:
+            return
+        assert self.solution.v is not None
+        self._forms_in_time.move(np.array(self.u.x.array), self.solution.v)
+
+    def _return(self) -> None:
+        super()._return()
+        if self._solution is None:
+            self.u.x.array[:] = self._first
+
+    def state(self) -> SavedState:
+        """The last accepted solution as arrays of this rank, for ``restore``."""
+        motion, state = self._forms_in_time.motion, super().state()
+        moving = {"velocity": motion.v, "load": motion.load, "size": np.array(motion.size)}
+        state = replace(state, **moving)
+        if self._predictor is None:
+            return state
+        predicted, image = self._predictor.start
+        return replace(state, predicted=predicted, predicted_image=image)
+
+    def restore(self, state: SavedState) -> None:
+        """Go on where another run of the same program has been; the step must have its size.
+
+        Raises:
+            InputError: As ``ContactProblem.restore``, or the state is of a problem without mass.
+        """
+        super().restore(state)
+        self.solution.v = state.velocity
+        known = any_rank(self.decomposition.comm, state.predicted.size > 0)
+        if self._predictor is not None and known:
+            start = state.predicted, state.predicted_image
+            self._predictor.start_from(self._system.gluing, *start)
+
+    def _check_state(self, state: SavedState) -> None:
+        super()._check_state(state)
+        size = len(self.u.x.array)
+        if state.velocity.shape != (size,) or state.load.shape != (size,):
+            raise InputError("the state is of a problem without mass; expected velocities")
+
+    def _take_motion(self, state: SavedState) -> None:
+        forms = self._forms_in_time
+        forms.move(self.dofs.to_dolfinx(state.u), state.velocity, state.load)
+        forms.motion.towards = forms.motion.free
+        if state.size > 0.0:  # equal steps of a series differ by rounding, factors are of the first
+            forms.motion.size = float(state.size)
+
+    def destroy(self) -> None:
+        """Destroy the PETSc objects; solution and report stay."""
+        super().destroy()
+        if self._predictor is not None:
+            self._predictor.destroy()
+
+    def _make_solution(self, u: Array, multipliers: Multipliers, gluing: Gluing) -> Solution:
+        solution = super()._make_solution(u, multipliers, gluing)
+        solution.v = self._forms_in_time.motion.velocity(self.dofs.to_dolfinx(u))
+        return solution
+
+    def _predicted(self, predictor: Predictor, free: Array) -> Array:
+        """Where contact lets the bodies go without elasticity."""
+        system, forms = self._system, self._forms_in_time
+        system.look_for_changes()
+        system.make(self.report)
+        if system.search.take_in_overlapping(self.dofs.to_primal(free), 0.0):
+            system.change("rows")
+            system.make(self.report)
+        return predictor.nearest(free, forms.matrices[1], system.gluing)
+
+    def _look(self) -> None:
+        """Put energies, work and forces into the report."""
+        report, forms = self.report, self._forms_in_time
+        report.motion = balance(forms, self._system.dual, self.solution)
+        report.contact_forces = contact_forces(self.solution)
+        if self._predictor is not None:
+            count = float(self._predictor.multiplications)
+            report.motion["predictor_multiplications"] = count

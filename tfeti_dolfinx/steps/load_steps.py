@@ -1,0 +1,511 @@
+"""Series of load steps, halved where needed, with files and checkpoints."""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import dolfinx
+import numpy as np
+from dolfinx import fem
+from mpi4py import MPI
+
+from tfeti_dolfinx.common.agreement import agreeing, check_same_problem
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.validation import (
+    checked_callable,
+    checked_flag,
+    checked_number,
+    checked_path,
+    checked_type,
+    is_whole,
+    shown,
+)
+from tfeti_dolfinx.errors import ConvergenceError, InputError, TfetiError
+from tfeti_dolfinx.output import VtxFile, cell_fields, checked_target, nodal_fields
+from tfeti_dolfinx.problem import ContactProblem
+from tfeti_dolfinx.solution import Solution
+from tfeti_dolfinx.steps.checkpoint import Checkpoint
+
+# --- Where a series of load steps is, whose steps are halved where they do not converge -------
+
+# whole numbers of the smallest parts are exact in a double, and parts of any real step differ
+MOST_HALVINGS = 30
+
+
+@dataclass(frozen=True)
+class Place:
+    """Before a part of a step.
+
+    Attributes:
+        number: The step.
+        done: What of it is done, of 2^30 parts.
+        level: How often it is halved now.
+    """
+
+    number: int = 0
+    done: int = 0
+    level: int = 0
+
+    @property
+    def _part(self) -> int:
+        return 2 ** (MOST_HALVINGS - self.level)
+
+    def ahead(self) -> Place:
+        """After a part that has converged: the next is as long as its place allows."""
+        done, level = self.done + self._part, self.level
+        if done == 2**MOST_HALVINGS:
+            return Place(self.number + 1)
+        while level and done % 2 ** (MOST_HALVINGS - level + 1) == 0:
+            level -= 1
+        return Place(self.number, done, level)
+
+    def begin(self, times: Sequence[float]) -> float:
+        """Where the part begins; ``times`` begins with the begin of the first step."""
+        return _between(times[self.number], times[self.number + 1], self.done)
+
+    def end(self, times: Sequence[float]) -> float:
+        """Where the part ends."""
+        return _between(times[self.number], times[self.number + 1], self.done + self._part)
+
+
+def _between(begin: float, end: float, done: int) -> float:
+    share = done / 2**MOST_HALVINGS
+    return end if share == 1.0 else begin + share * (end - begin)
+
+
+def checked_times(begin: float, times: Sequence[float]) -> list[float]:
+    """The begin and all times, increasing.
+
+    Raises:
+        InputError: They are no such numbers.
+    """
+    if isinstance(times, (str, bytes)) or not np.iterable(times):
+        raise InputError(f"times is {shown(times)}; expected a list of increasing numbers")
+    first = checked_number(begin, "begin")
+    found = [first, *(checked_number(t, f"times[{i}]") for i, t in enumerate(times))]
+    if len(found) < 2:
+        raise InputError("times is empty; expected at least one time")
+    for i, (before, after) in enumerate(pairwise(found)):
+        if not before < after or not math.isfinite(after - before):
+            raise InputError(
+                f"times[{i}]={after:g} is not after {before:g}; expected increasing times "
+                "after begin"
+            )
+    return found
+
+
+# --- A bar on rank 0's terminal while a series of load steps runs; elsewhere nothing ----------
+
+# called with the share of the series that is done and a few words
+Show = Callable[[float, str], None]
+
+
+def silent(share: float, text: str) -> None:
+    """Show nothing."""
+
+
+@contextmanager
+def shown_progress(comm: MPI.Intracomm, wanted: bool | None) -> Iterator[Show]:
+    """Give what shows how far a series is. Not collective.
+
+    Args:
+        comm: Communicator; only rank 0 shows anything.
+        wanted: None: where rank 0's standard error is a terminal, and rich is there.
+    """
+    if comm.rank != 0 or wanted is False or (wanted is None and not sys.stderr.isatty()):
+        yield silent
+        return
+    try:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+    except ImportError:  # it is optional
+        yield _say if wanted else silent
+        return
+    said = TextColumn("{task.fields[said]}")
+    columns = (TextColumn("load steps"), BarColumn(), TimeElapsedColumn(), said)
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task("", total=1.0, said="")
+        yield lambda share, text: bar.update(task, completed=share, said=text, refresh=True)
+
+
+def _say(share: float, text: str) -> None:
+    print(f"load steps {100 * share:3.0f} %: {text}", file=sys.stderr, flush=True)
+
+
+# --- All load steps in one file that ParaView animates; it appears whole ----------------------
+
+POINTS = "points of the mesh"
+
+
+class Series:
+    """Nodal fields of steps, and cell fields beside them. Creation and all methods are collective.
+
+    Files are written under names with ``.partial`` at the end; ``close`` gives them theirs.
+
+    Args:
+        path: A name that ends with ``.bp``; cell fields go to ``<stem>_cells.bp``.
+        solution: A solution of the problem: its mesh and which fields there are.
+        interior: Whether the fields of ``solution.interior`` are written, too: those of cells at
+            each step, other cell fields are always the same.
+
+    Raises:
+        InputError: The name does not fit, or nothing can be written there.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], solution: Solution, interior: bool = False
+    ) -> None:
+        target = checked_target(path, ".bp", solution)
+        self._names = [target, target.with_name(f"{target.stem}_cells.bp")]
+        self._mesh = solution.decomposition.mesh
+        of_nodes, of_cells = solution.interior.fields if interior else ([], [])
+        self._fields = [_copy(f) for f in nodal_fields(solution) + of_nodes]
+        self._in_cells = [_copy(f) for f in of_cells]
+        self._count, self._ended = 0, False
+        self._files: list[VtxFile] = []
+        contents = (self._fields, cell_fields(solution) + self._in_cells)
+        try:
+            for name, functions in zip(self._names, contents, strict=True):
+                self._files.append(VtxFile(name, functions))
+            self._growing = self._files if self._in_cells else self._files[:1]
+            if not self._in_cells:
+                self._files[1].write(0.0)
+                self._files[1].close()
+        except TfetiError:  # on all ranks
+            self.drop()
+            raise
+
+    def write(self, time: float, values: dict[str, Array]) -> None:
+        """Add a step from what ``fields_of`` returned for it, in this run or an earlier one.
+
+        Raises:
+            InputError: A field is not there, as where an earlier run wrote fewer; or the files
+                cannot be written: then they end, whole, with the step before, under the names
+                that they have until ``close``.
+        """
+        points = self._mesh.geometry.x.copy()
+        for function in self._fields + self._in_cells:
+            if function.name not in values:
+                raise InputError(
+                    f"the step at {time:.6g} of the checkpoint has no field {function.name}; "
+                    "expected interior= as in the run that has written it"
+                )
+            function.x.array[:] = values[function.name]
+        self._mesh.geometry.x[:] = values[POINTS]
+        try:
+            for file in self._growing:
+                file.write(time)
+        except TfetiError as error:  # on all ranks
+            self._end(error)
+            raise
+        finally:
+            self._mesh.geometry.x[:] = points
+        self._count += 1
+
+    def close(self) -> list[Path]:
+        """Give the files their names; which they are. None where they could not be written."""
+        if self._ended:
+            return []
+        for file in self._files:
+            file.close()
+        for file in self._files:
+            file.appear()
+        return self._names
+
+    def drop(self) -> None:
+        """Remove the files under the names that they have until ``close``."""
+        for file in self._files:
+            file.drop()
+
+    def _end(self, error: TfetiError) -> None:
+        """Keep the steps before one that cannot be written, and say where they are."""
+        self._ended = True
+        if not self._count:
+            self.drop()
+            return
+        for file in self._files:
+            with suppress(TfetiError):
+                file.close()
+        here = self._files[0].partial
+        error.add_note(
+            f"the {self._count} steps before are in {here}; {self._names[0]} is as it was"
+        )
+
+
+def fields_of(solution: Solution, interior: bool = False) -> dict[str, Array]:
+    """Fields of a step by name, and where the mesh is. Collective."""
+    of_nodes, of_cells = solution.interior.fields if interior else ([], [])
+    fields = nodal_fields(solution) + of_nodes + of_cells
+    values = {f.name: np.array(f.x.array) for f in fields}
+    return {**values, POINTS: np.array(solution.decomposition.mesh.geometry.x)}
+
+
+def _copy(function: fem.Function) -> fem.Function:
+    return fem.Function(function.function_space, name=function.name)
+
+
+# --- A series of load steps: solved, shown, written, kept, and halved where one does not
+#     converge ---
+
+Apply = Callable[[ContactProblem, float], None]
+
+
+@dataclass(frozen=True)
+class StepRecord:
+    """What is known of a converged step; the same on all ranks.
+
+    Attributes:
+        number: Position in the times of the step that this is, or is a part of.
+        time: Its end.
+        size: Its length.
+        dissipation: What friction has dissipated in it, all contacts together.
+        figures: Sizes, counters and the reason from the report.
+        residuals: Those of the report.
+        seconds: Wall seconds.
+        motion: Energies and work, from the report, of bodies with mass.
+        contact_forces: Resultant of the forces on each contact's surface, likewise.
+    """
+
+    number: int
+    time: float
+    size: float
+    dissipation: float
+    figures: dict[str, Any]
+    residuals: dict[str, float]
+    seconds: float
+    motion: dict[str, float] = field(default_factory=dict)
+    contact_forces: list[list[float]] = field(default_factory=list)
+
+
+class LoadSteps:
+    """A series of load steps of one problem. Creation and ``run`` are collective.
+
+    Each step starts from the one before, makes again only what depends on its changes, and is
+    accepted when it has converged: friction acts on the slip since then. One that does not
+    converge is halved: it begins again at the last accepted step with half the way.
+
+    Args:
+        problem: The problem.
+        apply: Called as ``apply(problem, t)`` before each solve, on all ranks: sets constants,
+            functions, values, points, or calls ``problem.update``. What it sets may depend on t
+            alone, not on what was set before: steps are halved, and a series goes on in a new run.
+        times: Ends of the steps, increasing.
+        begin: Where the first step begins.
+        path: File for ParaView with all steps, ``.bp``; None: none. It has its name when the
+            series has ended, also by an error of this package, unless that is its own, as on a
+            full disk; before that it is ``.<name>.partial`` beside it.
+        interior: Whether the file has the fields of ``solution.interior``, too, as ``write_vtx``.
+        checkpoint: Folder for the last converged step, with nothing else in it; None: none.
+        max_halvings: How often a step may be halved.
+        progress: Whether rank 0 shows a bar; default where its standard error is a terminal.
+
+    Attributes:
+        records: A ``StepRecord`` for each converged step so far.
+
+    Raises:
+        InputError: Something given does not fit; the message names it.
+    """
+
+    def __init__(
+        self,
+        problem: ContactProblem,
+        apply: Apply,
+        times: Sequence[float],
+        *,
+        begin: float = 0.0,
+        path: str | os.PathLike[str] | None = None,
+        interior: bool = False,
+        checkpoint: str | os.PathLike[str] | None = None,
+        max_halvings: int = 5,
+        progress: bool | None = None,
+    ) -> None:
+        checked_type(problem, ContactProblem, "problem", "a tfeti_dolfinx.ContactProblem")
+        self._comm = problem.decomposition.comm
+        with agreeing(self._comm, "LoadSteps") as given:
+            checked_callable(apply, "apply", "a function of the problem and a time")
+            if not is_whole(max_halvings) or not 0 <= max_halvings <= MOST_HALVINGS:
+                raise InputError(
+                    f"max_halvings={shown(max_halvings)}: expected an integer, 0 to {MOST_HALVINGS}"
+                )
+            self._times = checked_times(begin, times)
+            self._path = None if path is None else checked_path(path, ".bp")
+            if path is not None and not dolfinx.has_adios2:
+                raise InputError(f"{path}: this DOLFINx has no ADIOS2, which writes steps")
+            self._interior = checked_flag(interior, "interior")
+            if self._interior and path is None:
+                raise InputError("interior=True: expected LoadSteps(..., path=) too")
+            given |= {"begin": self._times[0], "times": self._times[1:], "path": path}
+            given |= {"interior": interior, "checkpoint": checkpoint, "max_halvings": max_halvings}
+        self._checkpoint = None if checkpoint is None else Checkpoint(checkpoint, self._comm)
+        self._problem, self._apply = problem, apply
+        self._max_halvings, self._progress = int(max_halvings), progress
+        self._series: Series | None = None
+        self.records: list[StepRecord] = []
+
+    def run(self, resume: bool = False) -> list[StepRecord]:
+        """Solve all steps.
+
+        Args:
+            resume: Go on after the last step of the checkpoint, if there is one: in a new run of
+                the same program, on as many ranks. Times that were not reached yet may be others.
+
+        Returns:
+            The records, with those of earlier runs.
+
+        Raises:
+            InputError: As ``ContactProblem.solve``, or the checkpoint is of another series or
+                damaged, or a file cannot be written.
+            NoSolutionError: A step has no solution; a note of the error has its time.
+            ConvergenceError: A step did not converge, halved as often as allowed.
+        """
+        with agreeing(self._comm, "LoadSteps.run") as given:
+            given["resume"] = bool(resume)
+            if resume and self._checkpoint is None:
+                raise InputError("resume=True: expected LoadSteps(..., checkpoint=) too")
+        self._drop()
+        place = self._begin(resume)
+        try:
+            with shown_progress(self._comm, self._progress) as show:
+                self._steps(place, show)
+        except TfetiError as error:  # on all ranks; the steps before it are whole
+            try:
+                self._close()
+            except TfetiError as another:
+                error.add_note(str(another))
+            raise
+        self._close()
+        return self.records
+
+    def _steps(self, place: Place, show: Show) -> None:
+        while place.number < len(self._times) - 1:
+            t = place.end(self._times)
+            show(place.number / (len(self._times) - 1), f"t = {t:.6g}")
+            try:
+                self._solve(t, place)
+            except ConvergenceError as error:
+                place = self._halved(place, t, error)
+            else:
+                self._problem.accept()
+                size = t - place.begin(self._times)
+                self.records.append(self._record(place.number, t, size))
+                place = place.ahead()
+                self._keep(place, t)
+        show(1.0, "done")
+
+    def _solve(self, t: float, place: Place) -> None:
+        problem = self._problem
+        try:
+            problem.take_step(t - place.begin(self._times))
+            self._set(t)
+            problem.solve()
+        except TfetiError as error:
+            error.add_note(f"load step {place.number}, t = {t:.6g}")
+            raise
+        reason = problem.report.converged_reason
+        if not reason.startswith("CONVERGED"):  # options let it be
+            raise ConvergenceError(f"the dual solver stopped: {reason}")
+
+    def _set(self, t: float) -> None:
+        with agreeing(self._comm, "apply"):
+            self._apply(self._problem, t)
+
+    def _halved(self, place: Place, t: float, error: ConvergenceError) -> Place:
+        """Half the way, from the last accepted step."""
+        self._problem.go_back()
+        if place.level >= self._max_halvings:
+            begin = place.begin(self._times)
+            raise ConvergenceError(
+                f"load step {place.number}, from t = {begin:.9g} to {t:.9g}, does not converge, "
+                f"halved {place.level} times (max_halvings={self._max_halvings}): {error}"
+            ) from error
+        return replace(place, level=place.level + 1)
+
+    def _record(self, number: int, t: float, size: float) -> StepRecord:
+        report = self._problem.report
+        figures = {
+            name: value for name, value in asdict(report).items() if isinstance(value, (int, str))
+        }
+        lost = float(np.sum(self._problem.solution.dissipation))
+        total = self._comm.allreduce(lost)
+        residuals, seconds = dict(report.residuals), report.seconds["total"]
+        moving = dict(report.motion), list(report.contact_forces)
+        return StepRecord(number, t, size, total, figures, residuals, seconds, *moving)
+
+    def _keep(self, place: Place, t: float) -> None:
+        """Write a step that has converged, and the place of the next."""
+        fields: dict[str, Array] = {}
+        solution = self._problem.solution
+        if self._path is not None:
+            fields = fields_of(solution, self._interior)
+        if self._checkpoint is not None:  # before the file, which can be written from it anew
+            about = {"place": asdict(place), "begin": self._times[0]}
+            if place.done:  # where its step goes
+                about["towards"] = self._times[place.number + 1]
+            record, state = asdict(self.records[-1]), self._problem.state()
+            digest = self._problem.digest()
+            self._checkpoint.write(len(self.records), about, record, state, fields, digest)
+        if self._path is not None:
+            if self._series is None:
+                self._series = Series(self._path, solution, self._interior)
+            self._series.write(t, fields)
+
+    def _begin(self, resume: bool) -> Place:
+        """Where to begin, with the state of that place."""
+        self.records = []
+        if self._checkpoint is None:
+            return Place()
+        kept = self._checkpoint.read() if resume else None
+        if kept is None:
+            self._checkpoint.forget()
+            return Place()
+        place = Place(**kept.about["place"])
+        self.records = [StepRecord(**record) for record in kept.records]
+        ends = {record.number: record.time for record in self.records}
+        reached = [kept.about["begin"], *(ends[number] for number in range(place.number))]
+        self._check_times(reached + ([kept.about["towards"]] if place.done else []))
+        self._problem.take_step(self.records[-1].size)
+        self._set(self.records[-1].time)
+        self._problem.restore(self._checkpoint.read_state(kept.number))
+        check_same_problem(kept.digest, self._problem.digest())
+        self._replay(self._checkpoint)
+        return place
+
+    def _check_times(self, reached: list[float]) -> None:
+        given = self._times[: len(reached)]
+        if reached != given:
+            raise InputError(
+                f"the checkpoint is of a series with the times {shown(reached)}, begin "
+                f"first; expected those, got {shown(given)}"
+            )
+
+    def _replay(self, checkpoint: Checkpoint) -> None:
+        """Write the steps of earlier runs again: a file of ADIOS2 cannot be continued."""
+        if self._path is None:
+            return
+        series = Series(self._path, self._problem.solution, self._interior)
+        try:
+            for number, record in enumerate(self.records, start=1):
+                series.write(record.time, checkpoint.read_fields(number))
+        except TfetiError:  # on all ranks
+            series.drop()
+            raise
+        self._series = series
+
+    def _drop(self) -> None:
+        """Remove what a run has begun to write that an error of the user's has ended."""
+        series, self._series = self._series, None
+        if series is not None:
+            series.drop()
+
+    def _close(self) -> None:
+        series, self._series = self._series, None
+        if series is not None:
+            series.close()

@@ -1,0 +1,334 @@
+"""Checks that any implementation of a protocol passes: Block, K⁺, feasible set."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from scipy.sparse import csr_array, diags_array
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.errors import require
+from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
+from tfeti_dolfinx.subdomains.block import (
+    Block,
+    SubdomainData,
+    candidate_modes,
+    fixing_dofs,
+    kernel_of,
+)
+from tfeti_dolfinx.subdomains.factor import GeneralisedInverse, solved
+from tfeti_dolfinx.subdomains.kplus import MakeInverse, with_entries
+
+# --- What solvers rely on, checked on any feasible set ----------------------------------------
+
+# Steps along a face, relative to the radius of its curvature: one so short that what is linear in
+# it stands out from what is quadratic; one that is longer, so that what is quadratic stands out
+# from rounding.
+SHORT, LONG = 1e-8, 1e-5
+# Steps along a gradient: small sets are curved so much that only the last ones are short
+SHORTER = (1e-8, 1e-10, 1e-12, 1e-14)
+
+
+def check_feasible_set(feasible: FeasibleSet, size: int, seed: int = 0) -> None:
+    """Check what solvers rely on, at random points of any feasible set.
+
+    The projection is idempotent and the nearest point; a maximal step stays in the set; the
+    projected gradient is how a projected step moves; the reduced free gradient is not longer
+    than the free one; shifting shifts; a face has orthonormal directions, along which a point
+    may move to both sides, and its curvature and its statuses are right.
+
+    Args:
+        feasible: The set; an object of any class.
+        size: Number n of entries of its vectors.
+        seed: Of the random points.
+
+    Raises:
+        ConformanceError: Something of that does not hold; the message says what.
+    """
+    rng = np.random.default_rng(seed)
+    for scale in (0.1, 1.0, 10.0):
+        start, other, g, shift = scale * rng.standard_normal((4, size))
+        x = feasible.project(start)
+        _check_projection(feasible, start, x, feasible.project(other))
+        _check_gradients(feasible, x, g)
+        moved = feasible.shifted(shift).project(start - shift) + shift
+        require(_close(moved, x, 1e-12), "P of Ω − s is P of Ω, shifted")
+        _check_face(feasible.face(x, g), size)
+        t = rng.standard_normal(feasible.face(x, g).Z.shape[1])
+        _check_moves(feasible, x, x - start, t)
+
+
+def _close(a: Array, b: Array, share: float) -> bool:
+    return bool(np.linalg.norm(a - b) <= share * (1.0 + np.linalg.norm(b)))
+
+
+def _check_projection(feasible: FeasibleSet, start: Array, x: Array, y: Array) -> None:
+    obtuse = (start - x) @ (y - x)  # with all points of a convex set
+    size = np.linalg.norm(start - x) * np.linalg.norm(y - x)
+    require(obtuse <= 1e-12 * (1.0 + size), "P(x) is the nearest point of Ω")
+    require(_close(feasible.project(x), x, 1e-14), "P(P(x)) = P(x)")
+
+
+def _check_gradients(feasible: FeasibleSet, x: Array, g: Array) -> None:
+    phi, beta = feasible.split(x, g)
+    reduced = float(feasible.reduced(x, phi, 0.5) @ phi)
+    require(-1e-12 <= reduced <= phi @ phi * (1.0 + 1e-12), "0 ≤ φ̃ᵀφ ≤ φᵀφ")
+    far = x - min(feasible.max_step(x, phi), 1e3) * phi
+    require(_close(feasible.project(far), far, 1e-10), "x − αφ ∈ Ω for the largest step α")
+    right = [_is_derivative(feasible, x, g, phi + beta, step) for step in SHORTER]
+    require(any(right), "φ + β is the projected gradient")
+
+
+def _is_derivative(
+    feasible: FeasibleSet, x: Array, g: Array, projected: Array, step: float
+) -> bool:
+    """Whether a step along −g that is projected goes along −g^P."""
+    apart = np.linalg.norm(feasible.project(x - step * g) - x + step * projected)
+    return bool(apart <= 1e-4 * step * (1.0 + np.linalg.norm(projected)))
+
+
+def _check_face(face: Face, size: int) -> None:
+    """Shapes, and what each row's status says of the directions."""
+    k = len(face.curvature)
+    require(face.Z.shape == (size, k), "Z has a row per entry and a column per curvature")
+    require(face.status.shape == (size,), "there is a status for each row")
+    gram = (face.Z.T @ face.Z).toarray()
+    require(np.allclose(gram, np.eye(k), atol=1e-12), "the columns of Z are orthonormal")
+    require(np.all(face.curvature >= 0.0), "the curvature is 0 or more")
+    free = np.asarray(face.Z.multiply(face.Z).sum(axis=1)).ravel()
+    require(np.allclose(free[face.holding], 1.0), "rows that are held are free in Z")
+    require(np.all(free[~face.carrying] == 0.0), "open rows are not in Z")
+    require(np.isin(face.status, list(Status)).all(), "each status is one of Status")
+
+
+def _check_moves(feasible: FeasibleSet, x: Array, g: Array, t: Array) -> None:
+    """Moves along the face stay in the set, but for what its curvature bends them.
+
+    Args:
+        feasible: The set.
+        x: A point of it.
+        g: A gradient that pushes against the set there, and does nothing else.
+        t: Coefficients of a move.
+    """
+    face = feasible.face(x, g)
+    t = t * np.minimum(1.0, _radii(face, g))
+    step = face.Z @ t
+    for sign in (SHORT, -SHORT):
+        out = np.linalg.norm(feasible.project(x + sign * step) - x - sign * step)
+        stays = out <= 1e-4 * SHORT * (1.0 + np.linalg.norm(step)) + 1e-15 * np.linalg.norm(x)
+        require(stays, "x + Zt stays in Ω to both sides, to first order in t")
+    moved = feasible.project(x + LONG * step)
+    if np.array_equal(feasible.face(moved, g).status, face.status):  # else it met a bound
+        bent = g @ (moved - x - LONG * step)
+        expected = 0.5 * LONG**2 * float(face.curvature @ t**2)
+        rounding = 1e-14 * np.linalg.norm(g) * np.linalg.norm(x)
+        right = abs(bent - expected) <= 0.01 * abs(expected) + rounding
+        require(right, "gᵀx along Ω bends by ½ tᵀ diag(κ) t")
+
+
+def _radii(face: Face, g: Array) -> Array:
+    """Radius of curvature along each direction of a face, infinite where it is flat."""
+    pushing = np.sqrt(abs(face.Z.sign()).T @ g**2)
+    flat = face.curvature == 0.0
+    return np.where(flat, np.inf, pushing / np.where(flat, 1.0, face.curvature))
+
+
+# --- The identities that any Block fulfils ----------------------------------------------------
+
+# Eigenvalues of a stiffness, as a share of the largest, that are 0 but for rounding (which is
+# 1e-16 times a few powers of n); singular values are their roots, and cut off above rounding.
+ZERO, RANK = 1e-12, 1e-10
+# of eps times the condition: what a solve may lose, with room for sums of many terms
+LOST = 100.0
+# what the dual asks a Block for
+PROMISED = [name for name in vars(Block) if not name.startswith("_")]
+
+
+def check_kind_of_block(make_block: Callable[[SubdomainData], Block], tol: float = 1e-9) -> None:
+    """Check a class of Blocks on small trusses: loose, held by springs, and with changes.
+
+    Args:
+        make_block: The class, or what else makes a Block.
+        tol: Relative tolerance, see ``check_block``.
+
+    Raises:
+        ConformanceError: A promise is broken; the message says which.
+    """
+    for data, changed in _trusses():
+        K, trace = data.K.copy(), data.trace_dofs
+        block = make_block(data)
+        check_block(block, K, tol)
+        block.retrace(trace[::2])
+        require(np.array_equal(block.trace_dofs, trace[::2]), "retrace replaces the trace")
+        check_block(block, K, tol)
+        block.act_along(np.eye(block.bs)[trace[::2] % block.bs])
+        check_block(block, K, tol)
+        block.update(K=changed.copy())
+        check_block(block, changed, tol)
+        block.destroy()
+
+
+def check_kind_of_inverse(make_inverse: MakeInverse, tol: float = 1e-9) -> None:
+    """Check a generalised inverse on small trusses: loose, held by springs, and with changes.
+
+    K K⁺ K = K; K⁺ is symmetric positive semidefinite; ``refactor`` follows new values, also where
+    the kernel comes or goes; K is as it was.
+
+    Args:
+        make_inverse: Its class, or what else makes one, as for ``Extensions(kplus=...)``.
+        tol: Relative tolerance.
+
+    Raises:
+        ConformanceError: A promise is broken; the message says which.
+    """
+    for data, changed in _trusses():
+        nodes = np.arange(data.K.shape[0]) // data.bs
+        fixing = fixing_dofs(data.x, nodes)
+        modes = candidate_modes(data.x, data.bs, *data.body_frame)
+        K = with_entries(data.K, fixing)
+        inverse = make_inverse(K, kernel_of(K, modes), fixing, "tfeti_sub_")
+        _check_pinv(inverse, K.toarray(), tol)
+        rows = np.repeat(np.arange(K.shape[0]), np.diff(K.indptr))
+        K.data[:] = changed.toarray()[rows, K.indices]
+        inverse.refactor(kernel_of(K, modes))
+        require(np.array_equal(K.toarray(), changed.toarray()), "K is as it was")
+        _check_pinv(inverse, changed.toarray(), tol)
+        inverse.destroy()
+
+
+def _check_pinv(inverse: GeneralisedInverse, K: Array, tol: float) -> None:
+    """K K⁺ K = K, K⁺ symmetric positive semidefinite."""
+    pinv = solved(inverse, np.eye(len(K)))
+    alone = np.stack([inverse.solve(e) for e in np.eye(len(K))], axis=1)
+    largest = np.abs(pinv).max()
+    require(np.allclose(alone, pinv, atol=tol * largest), "one right side is as several")
+    require(np.allclose(K @ pinv @ K, K, atol=tol * np.abs(K).max()), "K K⁺ K = K")
+    require(np.allclose(pinv, pinv.T, atol=tol * largest), "K⁺ is symmetric")
+    require(np.linalg.eigvalsh(pinv)[0] >= -tol * largest, "K⁺ is positive semidefinite")
+
+
+def _trusses() -> Iterator[tuple[SubdomainData, csr_array]]:
+    """Random points, each held to each by a bar, and another stiffness for each truss."""
+    rng = np.random.default_rng(0)
+    for gdim in (2, 3):
+        x = rng.uniform(size=(9, gdim))
+        i, j = np.triu_indices(len(x), 1)
+        bars, axes = np.zeros((len(i), len(x), gdim)), x[i] - x[j]
+        bars[np.arange(len(i)), i], bars[np.arange(len(i)), j] = axes, -axes
+        rows = bars.reshape(len(i), -1)
+        loose = csr_array(rows.T @ rows)
+        n = loose.shape[0]
+        held = csr_array(loose + diags_array(np.where(np.arange(n) % gdim, 1.0, 0.0)))
+        for K, other in ((loose, held), (held, 2.0 * held)):
+            yield (
+                SubdomainData(
+                    name=f"truss of {len(x)} nodes in {gdim}D",
+                    K=K.copy(),
+                    f=rng.standard_normal(n),
+                    x=x,
+                    trace_dofs=np.arange(0, n, 2),
+                    body_frame=(x.mean(axis=0), 1.0),
+                    node_shares=np.ones(len(x)),
+                ),
+                csr_array(other),
+            )
+
+
+def check_block(block: Block, K: Any, tol: float = 1e-9) -> None:
+    """Check the identities that the dual relies on, for a Block of stiffness ``K``.
+
+    The kernel is orthonormal, annihilated by K and complete; K⁺ is a symmetric generalised
+    inverse: K K⁺ w = w for every trace force w that is orthogonal to the kernel; K_bb and S are
+    what they say; a new load replaces the old one.
+
+    Args:
+        block: The Block, of any class.
+        K: Its stiffness, a scipy sparse matrix of shape ``(n, n)``.
+        tol: Relative tolerance; what goes through an inverse may be off by what rounding makes
+            of the condition of K if that is more.
+
+    Raises:
+        ConformanceError: An identity does not hold; the message names it.
+    """
+    missing = [name for name in PROMISED if not hasattr(block, name)]
+    require(not missing, f"a Block has {', '.join(missing)}")
+    K = K.toarray()
+    values = _check_kernel(block, K, tol)
+    _check_stiffness(block, K, tol)
+    lowest = values[block.kernel.shape[1]]
+    inverse_tol = max(tol, LOST * np.finfo(float).eps * values[-1] / lowest)
+    _check_inverse(block, K, inverse_tol)
+    _check_schur(block, K, inverse_tol)
+    _check_load(block)
+
+
+def _check_kernel(block: Block, K: Array, tol: float) -> Array:
+    """Shapes, and R; returns the eigenvalues of K."""
+    n, R, trace = len(K), block.kernel, block.trace_dofs
+    r = R.shape[1]
+    shapes = [block.load.shape, block.diagonal.shape, block.shares.shape]
+    require(shapes == [(n,)] * 3, "load, diagonal and shares have the shape (n,)")
+    require(R.shape == (n, r) and len(block.modes) == n, "kernel and modes have n rows")
+    require(np.all(np.diff(trace) > 0), "trace_dofs ascend")
+    require(np.allclose(R.T @ R, np.eye(r), atol=tol), "Rᵀ R = I")
+    require(np.abs(K @ R).max(initial=0.0) <= tol * np.abs(K).max(), "K R = 0")
+    values = np.linalg.eigvalsh(K)
+    require(np.sum(values > ZERO * values[-1]) == n - r, "the kernel is complete")
+    return np.asarray(values)
+
+
+def _check_stiffness(block: Block, K: Array, tol: float) -> None:
+    """K, its diagonal, and K_bb."""
+    trace, rng = block.trace_dofs, np.random.default_rng(1)
+    require(np.allclose(block.diagonal, K.diagonal(), rtol=tol), "diagonal is that of K")
+    u, w = rng.standard_normal(len(K)), rng.standard_normal(len(trace))
+    largest = np.abs(K @ u).max()
+    require(np.allclose(block.multiply(u), K @ u, atol=tol * largest), "multiply is K")
+    free = K @ u - block.kernel @ (block.kernel.T @ (K @ u))
+    require(np.allclose(block.elastic(u), free, atol=tol * largest), "elastic is K, balanced")
+    block.prepare("stiffness")
+    expected = K[np.ix_(trace, trace)] @ w
+    atol = tol * np.abs(K).max() * np.abs(w).max(initial=0.0)
+    require(np.allclose(block.apply_stiffness(w), expected, atol=atol), "apply_stiffness is K_bb")
+
+
+def _check_inverse(block: Block, K: Array, tol: float) -> None:
+    """K⁺ is symmetric, and K K⁺ w = w for a balanced w."""
+    block.prepare("pinv")
+    trace, R = block.trace_dofs, block.kernel
+    w, v = np.random.default_rng(0).standard_normal((2, len(trace)))
+    largest = np.abs(block.apply_pinv(w)).max(initial=0.0)
+    product, transposed = v @ block.apply_pinv(w), w @ block.apply_pinv(v)
+    atol = tol * largest * np.linalg.norm(v)
+    require(np.isclose(product, transposed, rtol=tol, atol=atol), "K⁺ is symmetric")
+    # a mode that is 0 on the trace but for rounding must not be scaled up
+    balanced = w - R[trace] @ np.linalg.lstsq(R[trace], w, rcond=RANK)[0]
+    force = np.zeros(len(K))
+    force[trace] = balanced
+    u, largest = block.solve(force), np.abs(force).max()
+    require(np.abs(K @ u - force).max() <= tol * largest, "K K⁺ w = w for Rᵀ w = 0")
+    on_trace, atol = block.apply_pinv(balanced), tol * np.abs(u).max()
+    require(np.allclose(u[trace], on_trace, atol=atol), "solve and apply_pinv agree")
+
+
+def _check_schur(block: Block, K: Array, tol: float) -> None:
+    """S is K_bb − K_bi K_ii⁺ K_ib."""
+    trace = block.trace_dofs
+    inner = np.setdiff1d(np.arange(len(K)), trace)
+    K_bb, K_bi, K_ii = K[np.ix_(trace, trace)], K[np.ix_(trace, inner)], K[np.ix_(inner, inner)]
+    S = K_bb - K_bi @ np.linalg.lstsq(K_ii, K_bi.T, rcond=RANK)[0]
+    w = np.random.default_rng(2).standard_normal(len(trace))
+    block.prepare("schur")
+    atol = tol * np.abs(K_bb @ w).max(initial=0.0)
+    require(np.allclose(block.apply_schur(w), S @ w, atol=atol), "apply_schur is S")
+
+
+def _check_load(block: Block) -> None:
+    """``update`` replaces the load."""
+    before = np.array(block.load)
+    block.update(f=before + 1.0)
+    changed = np.array_equal(block.load, before + 1.0)
+    block.update(f=before)
+    require(changed and np.array_equal(block.load, before), "update(f=...) replaces the load")
