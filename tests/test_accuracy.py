@@ -146,7 +146,7 @@ def test_atol_is_a_length():
 
 def test_rounding_is_called_so(monkeypatch):
     """Where no digits are solved apart; with them it converges."""
-    kept = "tfeti_dolfinx.solve.solver.with_more_digits"
+    kept = "tfeti_dolfinx.solve.solver.refine_iteratively"
     monkeypatch.setattr(kept, lambda dual, told, result, rule: (result, rule))
     scene = (12, 6), (2.0, 1.0), checkerboard(1e8), 0.3, (0.0, 1e-3)
     p = torn(*scene, 4, [], tfeti_rtol=1e-15)
