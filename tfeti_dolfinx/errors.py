@@ -14,7 +14,7 @@ class TfetiError(Exception):
 
 
 class InputError(TfetiError, ValueError):
-    """What the user gave does not fit; the message names it and says what was expected."""
+    """Invalid input; the message names what is wrong and says what was expected."""
 
 
 class NoSolutionError(TfetiError, RuntimeError):

@@ -1,4 +1,4 @@
-"""How to solve: options, and parts that a program may bring itself."""
+"""Settings of a solve: options, and parts that a program may bring itself."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 @dataclass(frozen=True)
 class Extensions:
-    """What takes the place of the package's own parts; by default nothing does.
+    """Parts that take the place of the package's own; by default none.
 
     Attributes:
         block: Makes the Block of a subdomain, say a class; ``BlockDefaults`` leaves four methods
@@ -134,7 +134,7 @@ def _checked_set(law: FeasibleLaw) -> FeasibleLaw:
 
 @dataclass(frozen=True)
 class Settings:
-    """How to solve.
+    """Settings of a solve.
 
     Attributes:
         options: Options.
@@ -150,7 +150,7 @@ class Settings:
 
     @property
     def given(self) -> dict[str, Any]:
-        """What ranks must have alike: a monitor of one rank would wait for the others.
+        """The settings that ranks must share: a monitor of one rank would wait for the others.
 
         Parts of one's own count by their presence: a rank may bring another callable.
         """
@@ -165,11 +165,11 @@ class Settings:
 
     @property
     def local_choice(self) -> LocalChoice:
-        """Which form local operators take."""
+        """Choice of the form of local operators."""
         return LocalChoice(self.options.local_type, self.options.local_multiplications)
 
     def make_block(self, counters: Counters) -> MakeBlock:
-        """What makes the Blocks of a rank.
+        """Return the factory of the Blocks of a rank.
 
         Args:
             counters: Counts factorisations.
@@ -177,7 +177,7 @@ class Settings:
         return self.extensions.block or sparse_blocks(self.making(counters), self.local_choice)
 
     def making(self, counters: Counters) -> InverseFactory:
-        """How inverses of subdomains are made."""
+        """Return the factory of the subdomains' generalised inverses."""
         kplus = self.extensions.kplus or KPLUS_TYPES[self.options.kplus_type]
         return InverseFactory(counters, kplus, f"{self.prefix}sub_")
 

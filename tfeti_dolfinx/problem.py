@@ -99,7 +99,7 @@ Start = tuple[Gluing, Array, Array]
 
 
 class Stepping:
-    """What of ``ContactProblem`` concerns load steps: what it has found, and where to go on.
+    """Load steps of ``ContactProblem``: solutions found, and the state to continue from.
 
     Attributes:
         defaults: Options, by name, that have other defaults than their own.
@@ -242,7 +242,7 @@ class Stepping:
             self._look_at_stress()
 
     def _given(self) -> dict[str, Any]:
-        """What determines the solution, as it is now, by name. Not collective."""
+        """Return what determines the solution at present, by name. Not collective."""
         about = {"bcs": self.bcs, "contacts": self.contacts, "thickness": self._thickness}
         return {**self._system.forms.given, **about}
 
@@ -381,11 +381,11 @@ class ContactProblem(Stepping):
         )
 
     def _forms(self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any) -> Forms:
-        """What gives the matrix and the load of a solve."""
+        """Compile the forms of the matrix and the load."""
         return Forms(a, L, V, self.decomposition, *options)
 
     def _given_besides(self) -> dict[str, Any]:
-        """What else the problem was given, checked; ranks must have it alike."""
+        """Return other input, checked, that ranks must have alike."""
         return {}
 
     @property
@@ -429,7 +429,7 @@ class ContactProblem(Stepping):
         return self.u
 
     def estimate(self) -> Estimates:
-        """How large the errors of the last solution are, in energy. It costs what it says.
+        """Estimate the errors of the last solution in energy. It costs what it says.
 
         Returns:
             The estimates, which ``report`` then has, too, with a warning where they are of no use.
@@ -512,7 +512,7 @@ class ContactProblem(Stepping):
         """Say where a step goes at first: without inertia nothing."""
 
     def _count(self) -> None:
-        """What the solve has made and taken."""
+        """Enter counts and seconds of the solve in the report."""
         self._system.count(self.report)
         settle_seconds(self.report, self.decomposition.comm)
         self.report.end()
@@ -527,7 +527,7 @@ class ContactProblem(Stepping):
         self._system.destroy()
 
     def _goal(self) -> ErrorTarget | None:
-        """What -rtol auto compares the algebraic error with."""
+        """Return the error that -rtol auto compares the algebraic error with."""
         if self.options.rtol != "auto" or self._stress is None:
             return None
         return goal_of(self._stress, self.dofs, self.decomposition, self._thickness)

@@ -175,7 +175,7 @@ def _cells(mesh: Any, points: Array) -> tuple[Array, Array]:
 
 
 class Solution(ContactState):
-    """What a solve has found; fields are made when they are first asked for.
+    """Solution of a contact problem; fields are made when they are first asked for.
 
     It owns its data, the constants and functions in the stress too: a later solve of the same
     problem leaves it as it is. Only a mesh whose points are moved takes along the fields that are
@@ -235,7 +235,7 @@ class Solution(ContactState):
 
     @property
     def has_velocity(self) -> bool:
-        """Whether the bodies have mass."""
+        """True if the bodies have mass."""
         return self.v is not None
 
     def at(self, points: Any) -> PointValues:
@@ -264,17 +264,17 @@ class Solution(ContactState):
 
     @property
     def has_stress(self) -> bool:
-        """Whether the problem was given a stress."""
+        """True if the problem was given a stress."""
         return self._stress is not None
 
     @property
     def has_contact(self) -> bool:
-        """Whether the problem has contacts."""
+        """True if the problem has contacts."""
         return bool(self.contacts)
 
     @property
     def has_friction(self) -> bool:
-        """Whether a contact of the problem has friction."""
+        """True if a contact of the problem has friction."""
         return any(contact.friction is not None for contact in self.contacts)
 
     @cached_property
@@ -312,7 +312,7 @@ class Solution(ContactState):
 
     @property
     def has_discretisation_error(self) -> bool:
-        """Whether ``discretisation_error`` has been made."""
+        """True if ``discretisation_error`` has been made."""
         return "discretisation_error" in self.__dict__
 
     @cached_property
@@ -363,7 +363,7 @@ class Solution(ContactState):
 
     @cached_property
     def slip(self) -> fem.Function:
-        """How far nodes that slip have slid in this load step, a vector; 0 elsewhere.
+        """Slip of the slipping nodes in this load step, a vector; 0 elsewhere.
 
         Of a node that slips on several contacts it is the mean.
         """
@@ -479,7 +479,7 @@ class SavedState:
         return Multipliers(self.lam, face_of(np.zeros(len(self.lam), dtype=bool), self.status))
 
     def common(self) -> dict[str, Any]:
-        """What the states of all ranks must have alike, since searches and solves go by it."""
+        """Return what all ranks' states must share, since searches and solves depend on it."""
         size = float(np.abs(self.mu).sum())
         return {
             "reach": self.reach.tolist(),

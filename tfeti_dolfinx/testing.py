@@ -84,7 +84,7 @@ def _check_gradients(feasible: FeasibleSet, x: Array, g: Array) -> None:
 def _is_derivative(
     feasible: FeasibleSet, x: Array, g: Array, projected: Array, step: float
 ) -> bool:
-    """Whether a step along −g that is projected goes along −g^P."""
+    """Return whether a projected step along −g goes along −g^P."""
     apart = np.linalg.norm(feasible.project(x - step * g) - x + step * projected)
     return bool(apart <= 1e-4 * step * (1.0 + np.linalg.norm(projected)))
 

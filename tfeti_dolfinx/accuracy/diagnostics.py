@@ -1,4 +1,4 @@
-"""Where an answer cannot be trusted: warnings of the report."""
+"""Diagnostics of a solution: the warnings of the report."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ class _Sliding:
 
 
 def _allowed(coarse: CoarseSpace, u: Array, rtol: float) -> Array:
-    """How far each body may be off, shape ``(bodies,)``."""
+    """Return the displacement error allowed to each body, shape ``(bodies,)``."""
     size = coarse.subdomains.body_maxima([coarse.subdomains.sizes(u)])[0]
     return np.asarray(FAR * rtol * size + NOISE * size.max(initial=0.0))
 
@@ -156,7 +156,7 @@ def _held_by_nothing_else(
 
 
 def _largest(N: csr_array, values: Array) -> Array:
-    """Of each column the largest value where it has entries."""
+    """Return for each column the largest value among the rows where it has entries."""
     entries = N.tocoo()
     row, column = entries.coords
     largest = np.zeros(N.shape[1])

@@ -65,7 +65,7 @@ class Estimates:
         )
 
     def numbers(self) -> dict[str, float]:
-        """What is known, by name."""
+        """Return the estimates that are known, by name."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
@@ -122,7 +122,7 @@ def goal_of(
 
 
 def of_looks(reached: Sequence[TargetStatus]) -> dict[str, float]:
-    """What looks at a goal have found, the last one, and taken, all of them."""
+    """Return the errors at the last assessment of a target, and the cost of all of them."""
     if not reached:
         return {}
     last = reached[-1]

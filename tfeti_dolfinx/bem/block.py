@@ -80,7 +80,7 @@ class BoundaryBlock(SparseBlock):
         super().__init__(data, how)
 
     def _found(self, K: Any, own: Stiffness | None) -> tuple[Stiffness, Array]:
-        """That of the shape."""
+        """Return the stiffness of the part's shape, and the place of its unknowns there."""
         return self._part.shape.stiffness, self._part.place
 
 
@@ -176,7 +176,7 @@ class Parts:
         return f
 
     def blocks(self, make_block: MakeBlock) -> MakeBlock:
-        """What makes the Blocks of this rank, those of finite elements as given."""
+        """Return the factory of this rank's Blocks, those of finite elements as given."""
         by_name = {f"subdomain {self._dofs.subdomains[s]}": p for s, p in self.parts.items()}
 
         def make(data: SubdomainData) -> Block:

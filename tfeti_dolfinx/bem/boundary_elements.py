@@ -86,7 +86,7 @@ def check_boundary_elements(elements: Any, own: Extensions) -> None:
 
 
 class BoundaryElementAssembly:
-    """What boundary elements put in the place of finite ones, if there are any.
+    """Stiffness and load of boundary elements in the place of finite ones, if there are any.
 
     Creation and all methods are collective.
 
@@ -105,7 +105,7 @@ class BoundaryElementAssembly:
 
     @property
     def exists(self) -> bool:
-        """Whether there are boundary elements."""
+        """True if there are boundary elements."""
         return self._chosen is not None
 
     def node_blocks(self, K: Any, how: InverseFactory) -> Array:
@@ -141,7 +141,7 @@ class BoundaryElementAssembly:
         return self._dofs.to_dolfinx(replaced)
 
     def blocks(self, make_block: MakeBlock) -> MakeBlock:
-        """What makes the Blocks of this rank, those of finite elements as given."""
+        """Return the factory of this rank's Blocks, those of finite elements as given."""
         return make_block if self._parts is None else self._parts.blocks(make_block)
 
     def solved(self, u: Array) -> BoundarySolution | None:

@@ -60,7 +60,7 @@ class Inside:
         return u
 
     def share(self, points: Array) -> Array:
-        """As the function of that name, shape ``(k,)``."""
+        """Return the shares of the points as ``share`` does, shape ``(k,)``."""
         return share(self._panels, points - self._shift)
 
     def stress(self, points: Array) -> Array:
@@ -92,7 +92,7 @@ class Inside:
         return both, k * density
 
     def _layers(self, seen: _Seen, cut: _Cut) -> Array:
-        """What some panels contribute to u, shape ``(p, d)``."""
+        """Return the contributions of some panels to u, shape ``(p, d)``."""
         panels, (single, tensor) = self._panels, self._densities(cut)
         logs = 1.0 if panels.dim == 3 else -0.5 * np.log(seen.square / panels.rho**2)
         potential = np.sum(seen.over * seen.square * logs, axis=1)
@@ -102,7 +102,7 @@ class Inside:
         return np.asarray(value - np.einsum("py,pyi->pi", double, cut.values))
 
     def _slopes(self, seen: _Seen, cut: _Cut) -> Array:
-        """What some panels contribute to ∂_j u_i, shape ``(p, d, d)``."""
+        """Return the contributions of some panels to ∂_j u_i, shape ``(p, d, d)``."""
         d, (single, tensor) = self._panels.dim, self._densities(cut)
         r, over, along = seen.r, seen.over, seen.along(tensor)
         falling = d * over / seen.square
@@ -149,7 +149,7 @@ def share(panels: Panels, points: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Field:
-    """What is on the panels: t − 2μ𝓜û and 𝓜û, shape ``(ne, d)``, û at corners ``(ne, d, d)``."""
+    """Densities on panels: t − 2μ𝓜û and 𝓜û, shape ``(ne, d)``, û at corners ``(ne, d, d)``."""
 
     density: Array
     turned: Array
@@ -274,7 +274,7 @@ class SolvedBody:
 
 @dataclass(frozen=True)
 class BoundarySolution:
-    """What boundary elements know of a solution.
+    """Solution on the surfaces of the subdomains with boundary elements.
 
     Attributes:
         bodies: Gives the subdomains of this rank that have them, one at a time.

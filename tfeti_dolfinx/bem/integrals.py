@@ -116,7 +116,7 @@ def apart_rule(degree: int) -> PairRule:
 
 
 def _barycentric(s: Array, t: Array) -> Array:
-    """Of the points (s, t), 0 ≤ t ≤ s ≤ 1."""
+    """Return the barycentric coordinates of the points (s, t), 0 ≤ t ≤ s ≤ 1."""
     return np.stack((1.0 - s, s - t, t), axis=1)
 
 

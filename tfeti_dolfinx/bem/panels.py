@@ -77,7 +77,7 @@ class Panels:
 
     @property
     def diameter(self) -> float:
-        """Of a ball around them, whatever way they are turned."""
+        """Diameter of a ball around the panels, the same for all rotations of them."""
         return 2.0 * float(np.linalg.norm(self.x - self.x.mean(axis=0), axis=1).max())
 
     @property

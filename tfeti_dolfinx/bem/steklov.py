@@ -206,7 +206,7 @@ def _sandwich(left: csr_array, right: csr_array, V: Array) -> Array:
 
 
 def _by_nodes(count: int, d: int) -> Array:
-    """Where the unknowns of nodes stand in the order of components."""
+    """Return the places of the unknowns, ordered by nodes, in the order by components."""
     return np.arange(d * count).reshape(d, count).T.ravel()
 
 

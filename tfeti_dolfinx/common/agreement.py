@@ -1,4 +1,4 @@
-"""Whether all ranks call the same, with the same arguments: one small message at every door."""
+"""Checks that all ranks make the same call with the same arguments: one small message each."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ TOLD = "_told_to_all_ranks"
 
 
 class Absent:
-    """What stands for an entry that one of two descriptions does not have."""
+    """Placeholder of an entry that one of two descriptions does not have."""
 
     def __repr__(self) -> str:
         return "not given"
@@ -107,7 +107,7 @@ def _raise_everywhere(comm: MPI.Intracomm, error: Exception | None, raiser: int)
 
 
 def _difference_of_ranks(all_told: list[tuple[str, dict[str, Any]]]) -> str | None:
-    """How the first rank that differs does so from rank 0; None where it is rounding."""
+    """Describe how the first rank that differs does so from rank 0; None: only by rounding."""
     first, expected = all_told[0]
     for rank, (call, told) in enumerate(all_told):
         if call != first:
@@ -295,7 +295,7 @@ def difference(found: Any, expected: Any, what: str = "") -> tuple[str, Any, Any
 
 
 def _is_rounding(found: list[Any], expected: list[Any]) -> bool:
-    """Whether two lists are the same, but for what is rounding beside their largest number."""
+    """Return whether two lists are equal up to rounding beside their largest number."""
     if repr(found) == repr(expected):
         return True
     numbers = [*found, *expected]

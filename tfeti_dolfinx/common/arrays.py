@@ -52,7 +52,7 @@ def sum_rows(row: Array, values: Array, size: int) -> Array:
 
 
 def parts_of(sizes: Sequence[int]) -> list[slice]:
-    """Where arrays of these lengths lie, one after the other."""
+    """Return the slices of arrays of these lengths in their concatenation."""
     ends = np.cumsum([0, *sizes])
     return [slice(int(a), int(b)) for a, b in pairwise(ends)]
 

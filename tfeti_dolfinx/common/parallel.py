@@ -22,7 +22,7 @@ def bcast_from_root(comm: MPI.Intracomm, value: T) -> T:
 
 
 def any_rank(comm: MPI.Intracomm, flag: bool) -> bool:
-    """Whether a flag is set on some rank. Collective."""
+    """Return whether a flag is set on some rank. Collective."""
     return bool(comm.allreduce(bool(flag), op=MPI.LOR))
 
 

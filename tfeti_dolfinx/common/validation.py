@@ -22,7 +22,7 @@ from tfeti_dolfinx.errors import InputError, TfetiError
 
 @dataclass(frozen=True)
 class Range:
-    """Which numbers fit, and how a message says it."""
+    """Range of numbers, with the words that a message describes it by."""
 
     text: str
     holds: Callable[[float], bool]
@@ -46,7 +46,7 @@ def shown(value: Any) -> str:
 
 
 def is_whole(value: Any) -> TypeGuard[int]:
-    """Whether a value is an integer, numpy's included; True and False are none."""
+    """Return whether a value is an integer, numpy's included; True and False are none."""
     return isinstance(value, Integral) and not isinstance(value, (bool, np.bool_))
 
 
@@ -70,7 +70,7 @@ def checked_number(value: Any, what: str, expected: Range = FINITE) -> float:
 
 
 def real_numbers(values: Any) -> Array:
-    """What a user's function has returned as floats; of complex numbers no part is dropped.
+    """Convert what a user's function has returned to floats; drop no imaginary part.
 
     Raises:
         TypeError: They are no real numbers.
@@ -156,7 +156,7 @@ ABOVE_0 = Range("more than 0", lambda value: value > 0.0)
 
 @dataclass(frozen=True)
 class Description:
-    """What a parameter is.
+    """Description of a parameter.
 
     Attributes:
         algorithm: Whose it is.

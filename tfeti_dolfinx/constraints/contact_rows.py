@@ -122,7 +122,7 @@ ROUNDED_OVERLAP = 1e-10
 
 @dataclass(frozen=True)
 class ContactRows:
-    """What the rows B_N are of: it leads back to lengths and forces, and on to right sides.
+    """Origin of the rows B_N: leads to lengths and forces of conditions, and to right sides.
 
     None of it depends on prescribed values or gaps.
 
@@ -213,7 +213,7 @@ NO_ROWS = Rows(NOTHING, NOTHING, NOTHING, np.empty(0))
 
 @dataclass(frozen=True)
 class TangentRows:
-    """What the rows T are of: they lead back to slips and tangential forces.
+    """Origin of the rows T: leads to slips and tangential forces of conditions.
 
     Attributes:
         condition: Condition of each point of ``RowSets.tangents``, shape ``(t,)``.
@@ -235,7 +235,7 @@ class TangentRows:
     normal: Array
 
     def right_side(self, dofs: TornDofs, values: Array, slip: Array) -> Array:
-        """What makes T u − c the scaled slip of a step, prescribed values taken in. Collective.
+        """Return c such that T u − c is the scaled slip of a step. Collective.
 
         Args:
             dofs: Dof maps.

@@ -177,7 +177,7 @@ class ContactState:
 
     @cached_property
     def slip_of_conditions(self) -> Array:
-        """How far the tangential v_i of each condition has come in this step, a vector.
+        """Change of the tangential v_i of each condition in this step, a vector.
 
         Shape ``(n, gdim)``. Collective at first use.
         """
@@ -187,7 +187,7 @@ class ContactState:
 
     @cached_property
     def dissipation(self) -> Array:
-        """What friction dissipates at each condition in this step, shape ``(n,)``.
+        """Energy that friction dissipates at each condition in this step, shape ``(n,)``.
 
         −F·s, F the friction on the node and s its slip. Collective at first use.
         """

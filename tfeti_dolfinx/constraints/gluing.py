@@ -451,7 +451,7 @@ class Gluing:
 
 
 def _common(keys: Array, earlier: Array) -> tuple[Array, Array]:
-    """Where the numbers stand that are in both arrays."""
+    """Return the positions, in both arrays, of the numbers that they have in common."""
     _, new, old = np.intersect1d(keys, earlier, return_indices=True)
     return new, old
 

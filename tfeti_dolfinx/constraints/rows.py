@@ -198,7 +198,7 @@ HARDLY_LEFT = 1e-3
 
 @dataclass(frozen=True)
 class HeldPart:
-    """What prescribed components contribute to the relative displacements of conditions.
+    """Contribution of prescribed components to the relative displacements of conditions.
 
     Attributes:
         condition: Condition of each weight of a node with prescribed components.
@@ -267,7 +267,7 @@ class RowBuilder:
 
     @cached_property
     def held(self) -> HeldPart:
-        """What prescribed components contribute."""
+        """Contribution of prescribed components to the relative displacements."""
         holds = np.flatnonzero(np.any(self._prescribed, axis=1))
         records = self.records
         weight = np.where(self._prescribed, records.weight[:, None], 0.0)[holds]

@@ -56,7 +56,7 @@ class Side:
     normals: Array
 
     def has_edges(self, comm: MPI.Intracomm) -> bool:
-        """Whether a facet stands far off the averaged normal at a vertex of its. Collective."""
+        """Return whether a facet's normal is far off the averaged one at a vertex. Collective."""
         cosine = np.einsum("nvg,ng->nv", self.facets.vertex_normals, self.facets.normal)
         return comm.allreduce(int(np.sum(cosine < CREASE))) > 0
 
@@ -99,7 +99,7 @@ class Ratios:
 
     @property
     def finer(self) -> bool:
-        """Whether the first side has the finer mesh, by more than meshes of one size differ."""
+        """True if the first side has the finer mesh by more than meshes of one size differ."""
         return self.size < 1.0 / SAME_SIZE
 
     @property
@@ -108,7 +108,7 @@ class Ratios:
         return Ratios(1.0 / self.size, 1.0 / self.stiffness)
 
     def second_is_better(self) -> bool:
-        """Whether the second side had better be the secondary one; of two equal ones it is not.
+        """Return whether the second side is the better secondary one; not if both are equal.
 
         The coarser one is; where meshes are of one size, the softer one.
         """
@@ -172,7 +172,7 @@ Triplets = tuple[Array, Array, Array]
 
 @dataclass(frozen=True)
 class Shares:
-    """What facets of a surface contribute to the conditions of their vertices.
+    """Contributions of facets of a surface to the conditions of their vertices.
 
     Attributes:
         vertices: Global groups of the facets' vertices, shape ``(f, v)``.
@@ -284,7 +284,7 @@ SEEN = 3.0
 def meeting(
     name: str, sides: tuple[Side, Side], dofs: TornDofs, reach: float, depth: float
 ) -> Shares:
-    """What facets of the first side that face the second contribute to its conditions. Collective.
+    """Integrate over the first side's facets that face the second. Collective.
 
     Args:
         name: Name of the contact, for messages.

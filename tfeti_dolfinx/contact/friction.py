@@ -145,7 +145,7 @@ def _check_law(law: Law) -> None:
 
 
 def same_law(one: Law, other: Law) -> bool:
-    """Whether two laws say the same, as far as one can tell without asking functions."""
+    """Return whether two laws are the same, as far as one can tell without calling functions."""
     values = [*zip(one.values, other.values, strict=False)]
     return (
         type(one) is type(other)

@@ -204,7 +204,7 @@ class Obstacle:
 
 
 def _shares(dofs: TornDofs, kind: FacetKind, side: Side, distance: Array) -> Shares:
-    """What whole facets contribute, from the distances of the owned groups. Collective."""
+    """Integrate over whole facets, given the distances of the owned groups. Collective."""
     surface = side.facets
     facet, xi, weight = whole_facets(kind, surface, QUADRATURE * kind.displacement.degree)
     dual = dual_multipliers(kind, surface.area, facet, xi, weight)

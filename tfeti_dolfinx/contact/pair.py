@@ -148,7 +148,7 @@ class Contact:
         return settled, found
 
     def displacement_bound(self, dofs: TornDofs, decomposition: Decomposition, u: Array) -> float:
-        """How far the surfaces may have moved towards each other. Collective.
+        """Bound how far the surfaces have moved towards each other. Collective.
 
         Args:
             dofs: Dof maps.

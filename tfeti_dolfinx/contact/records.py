@@ -139,7 +139,7 @@ def given_gaps(name: str, gap: Gap, x: Array) -> Array | None:
 
 
 class Friction(IntEnum):
-    """What bounds the tangential force of a condition: nothing to hold, a given force, pressure."""
+    """Kind of the bound on a condition's tangential force: none, a given force, or pressure."""
 
     NONE = 0
     GIVEN = 1

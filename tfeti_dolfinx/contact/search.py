@@ -37,7 +37,7 @@ class ContactPartner(Protocol):
 
     @property
     def gap(self) -> Gap:
-        """What its gaps are: those of the geometry, or given."""
+        """The gaps of its conditions: those of the geometry, or given ones."""
         ...
 
     @property
@@ -65,7 +65,7 @@ class ContactPartner(Protocol):
         ...
 
     def displacement_bound(self, dofs: TornDofs, decomposition: Decomposition, u: Array) -> float:
-        """How far what lay beyond the reach may have come nearer, u of shape (nodes, bs)."""
+        """Bound how much nearer what lay beyond the reach has come, u of shape (nodes, bs)."""
         ...
 
     def records(
@@ -223,7 +223,7 @@ class ContactSearch:
         self.contacts, self._records = contacts, records
 
     def rows(self) -> tuple[list[float], list[Array]]:
-        """How far one has looked in each contact, and the owned groups whose nodes have rows."""
+        """Return the reach of each contact, and the owned groups whose nodes have rows."""
         return list(self._reach), [r.group[r.within_reach] for r in self._records]
 
     def take_rows(self, reach: Sequence[float], groups: Sequence[Array]) -> None:
@@ -283,7 +283,7 @@ class ContactSearch:
 
     @property
     def is_exhausted(self) -> bool:
-        """Whether every node has been looked at, however far it is, and has its row."""
+        """True if every node has its row, however far it is from the other surface."""
         return all(self._is_exhausted(i) for i in range(len(self.contacts)))
 
     def unmet(self) -> list[str]:

@@ -305,7 +305,7 @@ def _differences(shape: Shape, x: Array, step: float, what: str) -> Array:
 
 
 def _compared(gradient: Array, slope: Array) -> tuple[Array, Array]:
-    """Where both differ grossly, and where there is something to compare."""
+    """Return where gradient and slope differ grossly, and where they can be compared."""
     sizes = np.linalg.norm(gradient, axis=1), np.linalg.norm(slope, axis=1)
     product = sizes[0] * sizes[1]
     says_something = np.isfinite(product) & (product > 0.0)

@@ -133,7 +133,7 @@ def _ritz_values(sizes: Array, steps: Array) -> Array:
 
 
 def _count(low: float, high: float) -> int:
-    """How many of Chebyshev's steps leave so little of an interval."""
+    """Return the number of Chebyshev steps that reduce an interval to ``LEFT``."""
     root = np.sqrt(high / low)
     return int(np.ceil(np.arccosh(1.0 / LEFT) / np.log((root + 1.0) / (root - 1.0))))
 
@@ -267,7 +267,7 @@ class ClusterMotions:
 def motions_for(
     B: PETSc.Mat, coarse: CoarseSpace, weights: Array, preconditioner: DualOperator, prefix: str
 ) -> SoftModes | ClusterMotions:
-    """What M_f does not know of: soft springs, or the motions of subdomains in clusters."""
+    """Return the coarse space of M_f: soft springs, or the motions of subdomains in clusters."""
     subdomains = coarse.subdomains
     if isinstance(subdomains, ClusteredSubdomains):
         return ClusterMotions(B, coarse, subdomains, weights, prefix)

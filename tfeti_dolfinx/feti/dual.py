@@ -237,7 +237,7 @@ class Dual:
 
     @property
     def holds(self) -> bool:
-        """Whether forces within the present limits of friction can balance the load."""
+        """True if forces within the present limits of friction can balance the load."""
         return holds(self.coarse, self.constraints)
 
     def forget_counts(self) -> None:
@@ -310,14 +310,14 @@ class Dual:
 
     @property
     def driving(self) -> Array:
-        """What load, prescribed values, slips and overlaps make: d without gaps, local rows."""
+        """The part of d due to load, prescribed values, slips and overlaps; local rows."""
         c, normals = self.constraints.c.array_r, self.constraints.sets.normals
         d = np.array(self.d.array_r)
         d[normals] += np.maximum(c[normals], 0.0)
         return d
 
     def is_far(self, lam: Array, mu: Array) -> bool:
-        """Whether multipliers are far beyond what drives the problem, as after unloading.
+        """Return whether multipliers far exceed what the data explain, as after unloading.
 
         Forces and lengths both are: λ beside the least that balances the load; Fλ and Gᵀμ beside
         what drives the problem. The solution would be their small difference, with their rounding.
@@ -367,7 +367,7 @@ class Dual:
         return self.smallest(u, gap, lam.array_r, face, error)
 
     def smallest(self, u: Array, gap: Array, lam: Array, face: Face, error: float) -> Array:
-        """Of displacements that are equally right the smallest, given one and its c − Bu."""
+        """Return the smallest displacement that solves as well as u, given u and its c − Bu."""
         motions, force = nearly_free(self.coarse, lam, face.carrying, error)
         self.pressing = force
         words = listed(motions, self.coarse.bodies, *self._names)

@@ -31,7 +31,7 @@ NORM_STEPS = 10
 
 
 class LiftedScene(Protocol):
-    """What a bound needs to know of the dual problem."""
+    """Parts of the dual problem that an error bound needs."""
 
     constraints: Constraints
     subdomains: Subdomains

@@ -115,7 +115,7 @@ class RowMatrix(Protocol):
 
 @dataclass(frozen=True)
 class Metric:
-    """What displacements with given jumps are made smooth in, on faces.
+    """Energy norm in which displacements with given jumps are smoothed, on faces.
 
     Attributes:
         trace: K_bb.

@@ -38,7 +38,7 @@ OfArray = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class Springs:
-    """What curvature adds to a face: directions of contact rows that move a spring each.
+    """Springs of the curvature on a face: one for each direction of contact rows with κ > 0.
 
     Attributes:
         directions: Rows × directions, those with a curvature κ > 0.
@@ -255,10 +255,10 @@ def contact_factor(A: PETSc.Mat, prefix: str) -> GramFactor:
 
 
 class NoRows:
-    """Of a rank without rows."""
+    """Factor of a rank without rows."""
 
     def solve(self, b: Array) -> Array:
-        """Nothing."""
+        """Return b, which is empty."""
         return b
 
     def destroy(self) -> None:

@@ -131,7 +131,7 @@ class SemidefiniteFactor:
                 return
 
     def _factored(self, comm: MPI.Intracomm, what: str, prefix: str) -> bool:
-        """Whether all ranks have a factor with the present shift. Collective."""
+        """Factor A with the present shift; return whether that succeeded everywhere. Collective."""
         lost: NotPositiveDefiniteError | None = None
         with raised_on_all_ranks(comm):
             try:
@@ -387,7 +387,7 @@ class FaceFactors:
 
 
 class AllRows(Protocol):
-    """What projectors of a face know of all rows."""
+    """Data of all rows that projectors of a face need."""
 
     comm: MPI.Intracomm
     Gt: csr_array
@@ -422,7 +422,7 @@ class FaceProjectors(Projectors):
         return self._face.restricted(x)
 
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
-        """As on all rows."""
+        """Solve with the damped coarse matrix of all rows."""
         return self._whole.damped_solve(face, y, damping)
 
     def on_face(self, face: Face) -> FaceProjectors:

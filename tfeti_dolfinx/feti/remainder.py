@@ -1,4 +1,4 @@
-"""What a solution lacks that rounding has ended, as a dual problem of its own."""
+"""The defect problem of iterative refinement, as a dual problem of its own."""
 
 from __future__ import annotations
 

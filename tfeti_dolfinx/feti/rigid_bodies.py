@@ -128,7 +128,7 @@ class Motions:
 
     @property
     def count(self) -> int:
-        """How many they are."""
+        """Number of motions."""
         return int(self.free.sum()) + self.joint.shape[1]
 
 
@@ -308,7 +308,7 @@ class Bodies:
         return np.asarray(np.einsum("bij,bi->bj", W, moments) / self.nodes[:, None]).ravel()
 
     def amounts(self, motion: Array) -> Array:
-        """How much of each mode is in a motion, shape ``(bodies, k)``."""
+        """Return the coefficient of each mode in a motion, shape ``(bodies, k)``."""
         return np.einsum("bij,bj->bi", self.frames, motion.reshape(self.count, self.k))
 
     def _springs(self, shares: Array) -> Array:
@@ -546,7 +546,7 @@ def _pins(motions: csc_array, body: Array) -> tuple[Array, csr_array]:
 
 
 def independent(columns: Array) -> Array:
-    """As many rows as columns, chosen by pivoting, on which the columns are independent."""
+    """Select by pivoting as many rows as columns, on which the columns are independent."""
     if columns.shape[1] == 0:
         return np.empty(0, dtype=np.int64)
     return np.asarray(qr(columns.T, pivoting=True, mode="r")[1][: columns.shape[1]])
@@ -574,7 +574,7 @@ class NullBasis:
         return np.asarray(x)
 
     def pins(self, scale: Array) -> Array:
-        """As many coordinates as vectors, on which these are independent.
+        """Select as many coordinates as vectors, on which these are independent.
 
         Args:
             scale: Coordinates are to be counted in these units.

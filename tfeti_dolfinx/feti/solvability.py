@@ -1,4 +1,4 @@
-"""Whether a load can be balanced: by contact, and by friction."""
+"""Solvability: can contact and friction balance the load on bodies that nothing else holds."""
 
 from __future__ import annotations
 
@@ -63,14 +63,14 @@ class CutRows:
         self.sent = np.zeros(A.shape[0], dtype=bool)
 
     def links(self, bodies: int) -> csr_array:
-        """Which bodies meet in a row, shape ``(bodies, bodies)``."""
+        """Return the matrix of bodies that share a row, shape ``(bodies, bodies)``."""
         row, column = self._entry
         meets = (np.ones(len(row)), (row, self._body[column]))
         incidence = csr_array(meets, shape=(self.A.shape[0], bodies))
         return csr_array(incidence.T @ incidence)
 
     def extremes(self) -> Array:
-        """Of each patch the rows that are outermost in some directions.
+        """Return for each patch the rows that are outermost in some directions.
 
         Of a flat patch they are most of its corners, which imply all other rows.
         """
@@ -83,7 +83,7 @@ class CutRows:
         return np.unique(np.concatenate(found))
 
     def violated(self, y: Array, tolerance: float, most: int) -> Array:
-        """Of each patch the rows, at most so many, that y violates most."""
+        """Return for each patch the rows that y violates most, at most ``most`` of them."""
         excess = self.A @ y - self.b
         row = np.flatnonzero((excess > tolerance) & ~self.sent)
         row = row[np.lexsort((-excess[row], self.patch[row]))]
@@ -307,7 +307,7 @@ MOST, SHARE = 1e3, 1e-4
 
 
 class Resistance:
-    """What normals and friction do against motions of bodies: no overlap, and work of friction.
+    """Resistance of contact and friction to motions of bodies: no overlap, work of friction.
 
     A motion y escapes if the load does more work on it than forces in their sets can take:
     N y ≤ 0 for normals, N_i y + ‖μ_i T_i y‖ ≤ 0 under Coulomb's law, and Σψ_i‖T_i y‖ less than the
@@ -344,7 +344,7 @@ class Resistance:
 
     @property
     def is_idle(self) -> bool:
-        """Whether nothing is left for contact to hold."""
+        """True if the load does no work on the free motions, so contact has nothing to hold."""
         return bool(np.all(np.abs(self._loads) <= self._noise))
 
     def _load(self, rows: CutRows) -> None:
@@ -358,7 +358,7 @@ class Resistance:
         self._loads, self._noise = load / self._scale, noise / self._scale
 
     def _patches(self, rows: CutRows) -> None:
-        """Which of the patches of all ranks each row with a bound belongs to, and its load."""
+        """Assign to each row with a bound its patch, among those of all ranks, and its load."""
         count = self._coarse.bodies.count
         first, last = np.minimum(rows.ends[0], count), rows.ends[1]  # empty rows are of nobody
         own = first * (count + 1) + last
@@ -431,7 +431,7 @@ class Resistance:
 
     @cached_property
     def has_cones(self) -> bool:
-        """Whether some rank has Coulomb's law."""
+        """True if some rank has rows with Coulomb's law."""
         return bool(self._coarse.comm.allreduce(self._pressing.shape[0]))
 
 
@@ -451,7 +451,7 @@ class Escape:
 
 
 def holds(coarse: CoarseSpace, constraints: Constraints) -> bool:
-    """Whether forces within the present limits can balance the load. Collective."""
+    """Return whether forces within the present limits can balance the load. Collective."""
     if not coarse.unheld.free.any():
         return True
     resistance = Resistance(coarse, constraints, cones=False)

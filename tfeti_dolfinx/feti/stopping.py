@@ -28,7 +28,7 @@ LIGHT, ROUNDING = 1e-4, 1e-13
 
 
 class Scene(Protocol):
-    """What a measurement needs to know of the dual problem."""
+    """Parts of the dual problem that measuring an iterate needs."""
 
     constraints: Constraints
     subdomains: Subdomains
@@ -43,7 +43,7 @@ class Scene(Protocol):
 
 @dataclass(frozen=True)
 class BodyMeasures:
-    """What is known of each body at an iterate, arrays of shape ``(bodies,)``; on all ranks.
+    """Measures of each body at an iterate, arrays of shape ``(bodies,)``; on all ranks.
 
     Attributes:
         size: Largest displacement of a node, as a length.
@@ -159,7 +159,7 @@ def _missed(scene: Scene, u: Array, lam: PETSc.Vec, norm: float) -> tuple[PETSc.
 
 
 def _missed_by(scene: Scene, lam: Array, rows: Array, values: Array, norm: float) -> Array:
-    """What of gaps or slips is not normal to the set of forces where the force is.
+    """Return the part of gaps or slips that is not normal to the feasible set at the forces.
 
     A force of a normal allows no gap, but 0 does. A force inside its disc allows no slip, one on
     the circle only a slip that it opposes: then τ is P(τ + q/‖F‖), and ‖F‖ times the difference is
@@ -179,7 +179,7 @@ def _missed_by(scene: Scene, lam: Array, rows: Array, values: Array, norm: float
 
 
 def _bodies(scene: Scene, u: Array, v: Array, before: Array | None) -> BodyMeasures:
-    """What is known of each body. Collective."""
+    """Measure displacements, energies and corrections of each body. Collective."""
     subdomains, motions = scene.subdomains, scene.coarse.bodies
     rigid = subdomains.modes_motion(motions.amounts(motions.part_of(u)))
     change = u - before if before is not None else np.zeros_like(u)
@@ -230,12 +230,12 @@ ErrorTarget = Callable[[Array], float]
 
 
 class LookedAt(Scene, LiftedScene, Protocol):
-    """What a look, and a bound, need to know of the dual problem."""
+    """Parts of the dual problem that an assessment and an error bound need."""
 
 
 @dataclass(frozen=True)
 class TargetStatus:
-    """How far an iterate is from a goal; the same on all ranks.
+    """Algebraic error of an iterate beside its target; the same on all ranks.
 
     Attributes:
         bound: Bound of its algebraic error.
@@ -251,13 +251,13 @@ class TargetStatus:
     def of(
         cls, scene: LiftedScene, lam: PETSc.Vec, now: Measures, goal: ErrorTarget, norm: float
     ) -> TargetStatus:
-        """What it is at a look, ‖F‖ given. Collective."""
+        """Bound the error of an iterate, given ‖F‖, and evaluate the target. Collective."""
         energy = float(np.sqrt(max(now.bodies.energy.sum(), 0.0)))
         return cls(energy_bound(scene, lam, now.u, norm), goal(now.u), energy)
 
     @property
     def allowed(self) -> float:
-        """What the bound may be."""
+        """Largest bound of the algebraic error that meets the target."""
         return max(TENTH * self.goal, FINEST * self.energy)
 
 
@@ -294,7 +294,7 @@ OUT_OF_REACH = 1e-4
 
 @dataclass(frozen=True)
 class Tolerances:
-    """What an answer has to keep, in physical units.
+    """Tolerances of an answer, in physical units.
 
     Attributes:
         displacement: Error of u for each body, a length, shape ``(bodies,)``.
@@ -360,7 +360,7 @@ class Accuracy:
         self.reached: list[TargetStatus] = []
 
     def is_of(self, scene: LookedAt) -> bool:
-        """Whether this is what is looked at."""
+        """Return whether this rule assesses the given dual problem."""
         return self._scene is scene
 
     @property
@@ -384,7 +384,7 @@ class Accuracy:
     def examine(
         self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float
     ) -> ConvergedReason:
-        """Whether an iterate is right. Collective."""
+        """Assess an iterate, and return why to stop, or ITERATING. Collective."""
         now = self.look(lam, gradient, face, residual)
         comm = self._scene.coarse.comm
         values = (
@@ -448,7 +448,7 @@ class Accuracy:
         return bool(ratio <= 1.0 or longest <= self._atol)
 
     def accept_rounding(self) -> None:
-        """Where no solver comes any farther, what rounding may explain is good enough."""
+        """Accept errors that rounding may explain, as no solver reduces them any further."""
         self._small = float("inf")
 
     def _energy_ratio(self, now: Measures) -> float:
@@ -460,7 +460,7 @@ class Accuracy:
         return now.error / max(FORCES * self.rtol * float(energy), TINY)
 
     def _stalled(self, now: Measures, residual: float) -> bool:
-        """Whether the true residual lags behind the one that the solver claims."""
+        """Return whether the true residual lags behind the one that the solver updates."""
         if self._before is None or self._before.residual == 0.0:
             return False
         claimed = residual / self._claimed
@@ -495,7 +495,7 @@ class Accuracy:
         return np.maximum(estimate + bodies.correction, self._least)
 
     def tolerances(self) -> Tolerances:
-        """What the last look is compared with."""
+        """Return the tolerances that the last assessment is compared with."""
         now = self._looked()
         size, most = now.bodies.size, now.bodies.size.max(initial=0.0)
         share = np.where(size < STIFF * most, STRICTER, 1.0)
@@ -517,7 +517,7 @@ class Accuracy:
         return 0.0 if loaded or now.bodies.size.max(initial=0.0) > small else small
 
     def ratio(self, changes: bool = True) -> float:
-        """What must be at most 1: the largest of all errors (``errors``) over their tolerances."""
+        """Return the largest ratio of errors (``errors``) to their tolerances; right if ≤ 1."""
         now, allowed = self._looked(), self.tolerances()
         pairs = [
             *zip(self.errors(changes), allowed.displacement, strict=True),

@@ -32,7 +32,7 @@ class Data:
         self._arrays, self._comm, self._seen = arrays, comm, b""
 
     def has_changed(self) -> bool:
-        """Whether anything is other than at the last call, or this is the first. Collective."""
+        """Return whether data differ from the last call's, or this is the first. Collective."""
         before, self._seen = self._seen, self._digest()
         return any_rank(self._comm, before != self._seen)
 
@@ -108,15 +108,15 @@ class Forms:
         self._volume_of_L: ufl.Form | fem.Form | None = cell_integrals(L)
 
     def has_new_points(self) -> bool:
-        """Whether the mesh has moved since the last call."""
+        """Return whether the mesh has moved since the last call."""
         return self._points.has_changed()
 
     def has_new_stiffness(self) -> bool:
-        """Whether a, or what it refers to, has changed since the last call."""
+        """Return whether a, or what it refers to, has changed since the last call."""
         return self._of_a.has_changed()
 
     def has_new_load(self) -> bool:
-        """Whether L, or what it refers to, has changed since the last call."""
+        """Return whether L, or what it refers to, has changed since the last call."""
         return self._of_L.has_changed()
 
     def stiffness(self) -> Any:

@@ -235,7 +235,7 @@ def in_ufl(value: Any, on: Decomposition | dmesh.Mesh, what: str, expected: Rang
 
 
 def _known_values(value: Any) -> list[float]:
-    """Of a constant its value, of a function that its unknowns bound this rank's extreme ones."""
+    """Return a constant's value, or this rank's extreme ones of a function of degree < 2."""
     if isinstance(value, fem.Constant):
         return [value.value.item()]
     if isinstance(value, fem.Function) and value.function_space.element.basix_element.degree < 2:

@@ -53,7 +53,7 @@ def checked_stress(stress: Stress, u: fem.Function) -> Any:
 
 
 def checked_thickness(thickness: Any, decomposition: Decomposition) -> Any:
-    """What areas of the mesh are multiplied with, a number or a scalar in UFL. Collective.
+    """Check and return the thickness, a number or a scalar in UFL. Collective.
 
     Raises:
         InputError: It is neither, not positive, negative somewhere, or on another mesh.

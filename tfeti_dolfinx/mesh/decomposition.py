@@ -124,7 +124,7 @@ class Decomposition:
 
     @property
     def is_torn(self) -> bool:
-        """Whether any body consists of more than one subdomain."""
+        """True if some body consists of more than one subdomain."""
         return self.num_subdomains > self.num_bodies
 
     @cached_property

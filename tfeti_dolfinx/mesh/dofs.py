@@ -51,7 +51,7 @@ def check_space(V: fem.FunctionSpace, decomposition: Decomposition) -> None:
 
 
 def is_same_space(V: Any, W: Any) -> bool:
-    """Whether two C++ spaces are the same on this rank: mesh, element and numbering."""
+    """Return whether two C++ spaces have the same mesh, element and numbering on this rank."""
     if V is W:
         return True
     return bool(

@@ -41,7 +41,7 @@ class Elements:
 
 @dataclass(frozen=True)
 class ModelContent:
-    """What one model holds of the mesh.
+    """Content of one gmsh model: elements in physical groups, names, nodes.
 
     Attributes:
         where: What messages call the model.
@@ -112,7 +112,7 @@ def open_model(source: str | PathLike[str] | Any, may_be_empty: bool = False) ->
 
 
 def read_content(model: Any, where: str) -> ModelContent:
-    """What a model holds.
+    """Read the elements in physical groups, names and nodes of a gmsh model.
 
     Args:
         model: The gmsh model.

@@ -103,7 +103,7 @@ def _found(path: Path) -> SplitFiles | None:
 
 
 def read_split_files(files: SplitFiles, comm: MPI.Intracomm) -> list[ModelContent]:
-    """What this rank's files hold, the number of its file as the partition of a cell. Collective.
+    """Read this rank's files, a cell's partition being its file's number. Collective.
 
     Raises:
         InputError: A file cannot be read, or partitions are missing.

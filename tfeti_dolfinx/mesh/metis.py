@@ -252,7 +252,7 @@ def metis(mesh: UntornMesh, num_parts: int, comm: MPI.Intracomm) -> Array:
 
 
 def _weights(mesh: UntornMesh, first: Array, second: Array) -> Array:
-    """What a cut between two cells counts: 1, more within columns of flat cells, whole numbers."""
+    """Return the cost of a cut between two cells: 1, more within columns of flat cells; integer."""
     if mesh.cell_type.name in SIMPLICES:  # in columns of these midpoints say little
         return np.ones(len(first))
     x, size = mesh.midpoints(), np.linalg.norm(mesh.extents(), axis=1)

@@ -31,7 +31,7 @@ MOVED, FLAT = 0.25, 3.0
 
 
 class _Halves(NamedTuple):
-    """How parts are to be halved, shapes ``(p,)``.
+    """Data of the halving of parts, shapes ``(p,)``.
 
     Attributes:
         wanted: Number of points on the left.
@@ -96,7 +96,7 @@ def _on_grid(x: Array, extents: Array | None, comm: MPI.Intracomm) -> tuple[Arra
 def _halves(
     grid: Array, sizes: Array | None, part: Array, targets: tuple[Array, Array], comm: MPI.Intracomm
 ) -> _Halves:
-    """How parts are halved; targets: how many parts become of each, and of its left half."""
+    """Plan the halving of parts; targets: numbers of final parts in each, and in its left half."""
     (whole, left), gdim = targets, grid.shape[1]
     num_parts = len(whole)
     low = np.full((num_parts, gdim), np.iinfo(np.int64).max)
@@ -129,7 +129,7 @@ def _halves(
 
 
 def _after(grid: Array, part: Array, halves: _Halves, comm: MPI.Intracomm) -> Array:
-    """Whether points come after the cut of their part."""
+    """Return whether points come after the cut of their part."""
     num_parts, gdim = halves.axes.shape
     digits = np.take_along_axis(grid, halves.axes[part], axis=1)
     result, before = np.zeros(len(grid), dtype=bool), np.zeros(num_parts, dtype=np.int64)
@@ -161,7 +161,7 @@ def _after(grid: Array, part: Array, halves: _Halves, comm: MPI.Intracomm) -> Ar
 
 
 def _end(c: Array, part: Array, at: Array, gap: Array, comm: MPI.Intracomm) -> tuple[Array, Array]:
-    """Where layers around ``at`` end below, and whether they do, both of shape ``(p,)``."""
+    """Find the lower ends of layers around ``at``, and whether they end, both of shape ``(p,)``."""
     end, found, one = at.copy(), np.zeros(len(at), dtype=bool), (ONE * gap).astype(np.int64)
     near = np.abs(c - at[part]) <= (MOST + 1) * gap[part]
     c, part = c[near], part[near]

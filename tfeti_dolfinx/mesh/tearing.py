@@ -62,7 +62,7 @@ def alike(*columns: Array) -> Array:
 def bare_sides(
     mesh: UntornMesh, subdomain: Array, cells: Array, centres: Array, comm: MPI.Intracomm
 ) -> Array:
-    """Where the sides of each subdomain lie that no row will touch. Collective.
+    """Compute moments of each subdomain's sides that no row will touch. Collective.
 
     They are facets of one cell only, without a tag: there is nothing to glue, to prescribe or to
     meet. Equal subdomains with the same ones are likely to share S, too.
@@ -85,7 +85,7 @@ def bare_sides(
 
 
 def _is_outer(mesh: UntornMesh, comm: MPI.Intracomm) -> Array:
-    """Whether facets of cells are facets of no other cell, shape ``(n, num_facets)``."""
+    """Return whether facets of cells are facets of no other cell, shape ``(n, num_facets)``."""
     keys = facet_keys(mesh.cells, mesh.cell_type)
     outer = _occur_once(keys.ravel())
     own = keys.ravel()[outer]
@@ -104,7 +104,7 @@ def _occur_once(keys: Array) -> Array:
 
 
 def _moments(d: Array, tags: Array) -> Array:
-    """Of cells at d from the centre of their subdomain: sums of them tell shapes apart.
+    """Return moments of cells at d from their subdomain's centre; sums tell shapes apart.
 
     Degrees 2 and 3 tell mirrored ones from each other, the degree 4 more; tags stand for moduli.
     """
@@ -211,7 +211,7 @@ def _orders(centres: Array) -> list[tuple[Array, float]]:
 
 
 def costs(cells: Array, kinds: Array) -> Array:
-    """What subdomains cost, in cells: one of several that are equal pays its part of the factor.
+    """Return the cost of subdomains in cells; equal ones share that of their factor.
 
     Args:
         cells: Cells of each subdomain, shape ``(N,)``.
@@ -222,7 +222,7 @@ def costs(cells: Array, kinds: Array) -> Array:
 
 
 def dearest(ranks: Array, cells: Array, shared: Sequence[Array], num_ranks: int) -> float:
-    """What ranks cost that wait for each other, beside their mean if nothing were shared.
+    """Return the cost of the slowest ranks over the mean cost if nothing were shared.
 
     They wait after each thing, say K⁺ of all subdomains, of which a rank makes what equal ones
     share once.

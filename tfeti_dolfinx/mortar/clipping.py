@@ -50,7 +50,7 @@ class CommonParts:
 
 
 def common_parts(subject: Array, clip: Array) -> CommonParts:
-    """What pairs of intervals, or of convex polygons, have in common.
+    """Intersect pairs of intervals or of convex polygons.
 
     Args:
         subject: Vertices in order, shape ``(n, k, tdim)``.
@@ -71,7 +71,7 @@ def sizes(polygon: Array) -> Array:
 
 
 def contains(polygon: Array, y: Array) -> Array:
-    """Whether intervals or convex polygons contain a point each.
+    """Return whether intervals or convex polygons contain a point each.
 
     Args:
         polygon: Vertices in order, shape ``(n, k, tdim)``.

@@ -47,7 +47,7 @@ class FacetElement:
 
     @property
     def is_affine(self) -> bool:
-        """Whether all maps with these basis functions are affine."""
+        """True if all maps with these basis functions are affine."""
         return self.degree == 1 and self.facet != "quadrilateral"
 
     def values(self, xi: Array) -> Array:
@@ -102,7 +102,7 @@ def facet_dofs(cell: str, degree: int, variant: Any) -> Array:
 
 @dataclass(frozen=True)
 class FacetKind:
-    """What all contact facets of a problem have in common.
+    """Cell type and elements that all contact facets of a problem have in common.
 
     Attributes:
         facet: interval, triangle or quadrilateral.

@@ -449,7 +449,7 @@ class _Planes:
         )
 
     def look(self, found: _Meetings) -> Look:
-        """Whether the primary facet of pair b lies over pair a's middle, and how far."""
+        """Return a function: is the primary facet of pair b over pair a's middle, and how far."""
         middle = found.parts.middle
 
         def at(a: Array, b: Array) -> tuple[Array, Array]:
@@ -462,7 +462,7 @@ class _Planes:
         return at
 
     def facing(self, found: _Meetings, pair: Array, y: Array) -> FacingPoints:
-        """What lies over points y of the planes on both facets of pairs, curved or not."""
+        """Return the points of both facets of pairs, curved or not, over points y of the planes."""
         s, p = found.s[pair], found.p[pair]
         element, there = self._kind.geometry, self._on_planes(self._primary.x[found.p], found.s)
         return FacingPoints(

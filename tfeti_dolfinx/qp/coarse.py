@@ -111,7 +111,7 @@ class Coarse(Protocol):
 
 
 def imbalance(coarse: Coarse, x: PETSc.Vec) -> float:
-    """How far Gx is from e: the worst entry beside its terms, 1 at most. Collective."""
+    """Return the largest entry of Gx − e over the size of its terms, at most 1. Collective."""
     forces = coarse.forces(x)
     floor = max(LIGHT * float(forces.max(initial=0.0)), TINY)
     own = np.max(np.abs(coarse.residual(x)) / np.maximum(forces, floor), initial=0.0)

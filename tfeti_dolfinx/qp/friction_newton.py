@@ -51,7 +51,7 @@ class KrylovBasis:
 
 @dataclass(frozen=True)
 class GCRResult:
-    """Where the directions have led from 0.
+    """Result of generalised conjugate residuals, started from 0.
 
     Attributes:
         u: The solution.
@@ -125,7 +125,7 @@ class _GrowingBasis:
 
     @property
     def rows(self) -> KrylovBasis:
-        """What there is."""
+        """The directions stored so far."""
         return KrylovBasis(*self._room[:, : self.count])
 
     def add(self, q: Array, z: Array, w: Array) -> None:
@@ -169,7 +169,7 @@ class Law:
         return feasible, feasible.project(y)
 
     def slips(self, face: Face) -> Array:
-        """Which points slip, flags of shape ``(p,)``."""
+        """Return the slipping points, flags of shape ``(p,)``."""
         return np.asarray(np.any(face.status[self.tangents] == Status.SLIP, axis=1))
 
     def following(self, p: Array, face: Face) -> csr_array:
@@ -194,7 +194,7 @@ class Law:
 
 @dataclass(frozen=True)
 class OnFace:
-    """What a step knows of a face: its directions, what follows them, where it is entered.
+    """Face of a Newton step: its directions, the coupling C of slips, a point to enter it at.
 
     Attributes:
         face: The face, hard directions held.
@@ -231,7 +231,7 @@ NEW_DIRECTION = 1e-7
 def known_on(
     past: RecycledOnFace | None, on: OnFace, project: Callable[[Array], Array]
 ) -> KrylovBasis | None:
-    """What is known of Au = P(F(I + C)u + κu): of directions W N = (I + C)U of earlier solves.
+    """Return known products Au = P(F(I + C)u + κu) from directions WN = (I + C)U of past solves.
 
     Farhat, Crivelli, Roux (``Recycled``); as Carvalho, Gratton, Lago, Vasseur, SIAM J. Sci.
     Comput. 33 (2011) 2463–2490 begin residuals. Multiplies by nothing. Collective.
@@ -317,7 +317,7 @@ class LawPoint:
 
 
 class SlipReversal:
-    """What slips, and where to, from step to step.
+    """Directions of slip of the last step, to detect points whose slip reverses.
 
     Args:
         law: The sets.
@@ -501,7 +501,7 @@ class _System:
         self._known = known_on(qp.recycled, on, oblique.project)
 
     def enter(self, length: float, norm: float, seen: float) -> None:
-        """What F makes of the way onto the face, where it is more than what is to be seen.
+        """Multiply F by the correction onto the face, where its image exceeds ``seen``.
 
         Beside it goes a first direction, for the same multiplication, so far as those before went;
         but not beside a way that may be more than what is to be solved for.
@@ -541,7 +541,7 @@ class _System:
         return gone.length
 
     def end(self) -> LawPoint:
-        """Where one is; frees what was made."""
+        """Return the present point, and free work vectors."""
         mu = self._oblique.coordinates(self._s + self._on.bend(self._u))
         self._qp.coarse.combine(mu, self._work)
         at = LawPoint(self._lam, self._s - self._work.array_r, self._mu + mu)

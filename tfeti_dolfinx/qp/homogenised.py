@@ -76,7 +76,7 @@ class LastProduct:
         self._x, self._Fx, self._within = x, Fx, within
 
     def known(self, comm: MPI.Intracomm, x: Array) -> Array:
-        """What F makes of x on this rank; empty if x is not the last solution. Collective."""
+        """Return this rank's Fx, or an empty array if x is not the last solution. Collective."""
         found = not any_rank(comm, not np.array_equal(self._x, x))
         return np.array(self._Fx) if found else np.zeros(0)
 
@@ -86,12 +86,12 @@ class LastProduct:
             self._x, self._Fx = x, Fx
 
     def is_of(self, d: PETSc.Vec, e: Array) -> bool:
-        """Whether it was kept from a program with this d and e. Collective."""
+        """Return whether it was kept from a program with this d and e. Collective."""
         same = np.array_equal(self._d, d.array_r) and np.array_equal(self._e, e)
         return not any_rank(d.getComm().tompi4py(), not same)
 
     def image(self, F: Operator, x: PETSc.Vec) -> OperatorProduct:
-        """As ``image``, but nothing is multiplied if x is the last solution. Collective."""
+        """Return x with Fx; multiply by F only if x is not the last solution. Collective."""
         comm = x.getComm().tompi4py()
         known = self._Fx if self._is_near(comm, x.array_r) else self.known(comm, x.array_r)
         if not any_rank(comm, known.size > 0):
@@ -101,7 +101,7 @@ class LastProduct:
         return OperatorProduct(x, Fx)
 
     def _is_near(self, comm: MPI.Intracomm, x: Array) -> bool:
-        """Whether what was passed on stands for x. Collective."""
+        """Return whether the stored product may stand for that of x. Collective."""
         if self._within == 0.0 or any_rank(comm, x.shape != self._x.shape):
             return False
         return norm_over(comm, x - self._x) <= self._within
@@ -125,7 +125,7 @@ def restored(coarse: Coarse, lam: PETSc.Vec) -> PETSc.Vec:
 
 @dataclass(frozen=True)
 class Scale:
-    """How large residuals are at the start, and what rounding leaves of them.
+    """Norm of the residual at the start, and its rounding error.
 
     Attributes:
         reference: b₀ = ‖P(d − F λ̄₀)‖ with λ̄₀ = Gᵀ(GGᵀ)⁻¹e.
@@ -151,7 +151,7 @@ def scale_near(qp: QP, at: OperatorProduct) -> Scale:
 
 
 def _rounding(qp: QP, at: OperatorProduct) -> float:
-    """What rounding leaves of g^P, which has nothing of gaps that stay open, however wide."""
+    """Estimate the rounding error of ‖g^P‖, to which open gaps, however wide, do not count."""
     s = at.Fx.copy()
     s.axpy(-1.0, qp.d)
     qp.coarse.project(s)
@@ -181,7 +181,7 @@ class Homogenised:
     scale: Scale
 
     def is_rounding(self, residual: float) -> bool:
-        """Whether a residual is so small that rounding explains what is strange about it."""
+        """Return whether a residual is so small that its behaviour may be due to rounding."""
         return residual <= STRANGE * self.scale.rounding
 
     def destroy(self) -> None:

@@ -113,7 +113,7 @@ class Conjugates:
 
     @property
     def number(self) -> int:
-        """How many there are."""
+        """Number of directions kept."""
         return min(self._count, self._most)
 
     def products(self, z: Array) -> Array:
@@ -139,7 +139,7 @@ class Conjugates:
 
 
 class Directions:
-    """What PCPG remembers, so that it can go on where it has stopped.
+    """State of PCPG between calls, from which it continues where it stopped.
 
     Args:
         like: A vector of the right layout.
@@ -159,7 +159,7 @@ class Directions:
         self.kept = Conjugates(like)
 
     def seen(self, pFp: float, pp: float, short: bool = False) -> bool:
-        """Whether a direction has a curvature that stands out from rounding.
+        """Update the estimate of ‖F‖; return whether pᵀFp is positive beyond rounding.
 
         Of a short step, which may be rounding of Gλ = e, F makes far too much to learn ‖F‖ from.
         """
@@ -168,7 +168,7 @@ class Directions:
         return pFp > FLAT * self.norm * pp
 
     def stands_out(self, rz: float, rr: float) -> bool:
-        """Whether the preconditioner leaves something of a residual."""
+        """Return whether rᵀz, z the preconditioned residual, is positive beyond rounding."""
         self.helped = max(self.helped, rz / rr if rr > 0.0 else 0.0)
         return rz > FLAT * self.helped * rr
 
@@ -187,7 +187,7 @@ PLATEAU, FEW, ROUNDING = 500, 20, 1e-15
 
 
 class Plateau:
-    """Whether residuals and q still come down.
+    """Detection of stagnation: neither residuals nor q decrease.
 
     Args:
         norm: ‖r‖ at the start.
@@ -205,7 +205,7 @@ class Plateau:
             self._best, self._steps, self._gain, self._restarted = norm, 0, 0.0, False
 
     def ended(self, qp: QP, point: Point) -> bool:
-        """Whether there was none for long. Collective where there were many steps."""
+        """Return whether nothing has decreased for long. Collective if many steps were made."""
         if self._steps < self._most:
             return False
         sizes = abs(point.lam.dot(point.g)) + abs(point.lam.dot(qp.d))
@@ -215,7 +215,7 @@ class Plateau:
         return ended
 
     def once_more(self) -> bool:
-        """Whether this is the first time since ‖r‖ came down."""
+        """Return whether this is the first restart since ‖r‖ decreased."""
         first, self._restarted = not self._restarted, True
         return first
 
@@ -428,7 +428,7 @@ def _face(qp: QP, lam: PETSc.Vec, g: PETSc.Vec) -> Face:
 
 
 def _examined(qp: QP, point: Point, rule: StoppingRule, norm: float) -> ConvergedReason:
-    """What the rule says of the point."""
+    """Apply the stopping rule to the point."""
     return rule.examine(point.lam, point.g, _face(qp, point.lam, point.g), norm)
 
 

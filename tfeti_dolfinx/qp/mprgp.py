@@ -39,7 +39,7 @@ TANGENTIAL = 0.5
 
 
 class TangentIterate(Protocol):
-    """What is asked of an iterate."""
+    """Protocol of an iterate that tangent steps need."""
 
     A: Operator
     x: PETSc.Vec
@@ -142,7 +142,7 @@ class _FaceGradients:
         return wanted <= room and residual > self._target and self.steps < MOST_STEPS
 
     def _room(self) -> float:
-        """How far rows that do not slip may go along p."""
+        """Return the largest feasible step along p, rows that do not slip alone."""
         x = self._state.x.array_r + self.d.array_r
         p = np.where(self._inside, self._p.array_r, 0.0)
         own = self._state.feasible.max_step(np.where(self._inside, x, self._state.x.array_r), -p)

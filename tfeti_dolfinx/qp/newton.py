@@ -165,7 +165,7 @@ class NewtonIterate:
         self.s.copy(self.point.g)
 
     def wanted_face(self, gamma: float, faces: FaceSolver) -> Face:
-        """What carries force, and what wants to, if that is most of what is wrong.
+        """Choose the next face: the free set, released by the chopped gradient if that dominates.
 
         The rest is what PCPG has left on the face, if it has stopped at λ.
         """
@@ -184,13 +184,13 @@ class NewtonIterate:
         return self.face()
 
     def begun(self, face: Face) -> tuple[Point, Face]:
-        """Where the solve on a face starts, and on which: λ, or ``back`` where more slips there."""
+        """Return start and face of a solve: λ, or ``back`` where more points slip there."""
         back = self.point.lam if self.back is None else self.back
         return slipping_start(self.qp, self.point, face, back, self.pressed_face())
 
     @property
     def stalled(self) -> bool:
-        """Whether q and ‖g^P‖ have not come down any more for long."""
+        """True if neither q nor ‖g^P‖ has decreased for long."""
         return bcast_from_root(self.comm, self.idle >= PATIENCE or self.slow >= LONG)
 
     def take(self, to: Point, gain: float) -> None:
@@ -257,7 +257,7 @@ FEW_ROUNDS = 10
 
 
 def _enough(state: NewtonIterate) -> float:
-    """What a step has to lower q by."""
+    """Return the sufficient decrease of q that a step must reach."""
     known = np.isfinite(state.residual)
     return ENOUGH * 0.5 / state.norm * state.residual**2 if known else 0.0
 

@@ -33,7 +33,7 @@ from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status, without_slip
 
 @dataclass(frozen=True)
 class Trial:
-    """What solves on faces have come to.
+    """Result of the solves on faces of one Newton step.
 
     Attributes:
         first: Where the first one ended, maybe outside of Ω.
@@ -95,18 +95,18 @@ class CurvedHessian:
 
 
 def is_curved(qp: QP, face: Face) -> bool:
-    """Whether a row of some rank slips along a boundary. Collective."""
+    """Return whether a row of some rank slips along a boundary. Collective."""
     return any_rank(qp.d.getComm().tompi4py(), face.curved)
 
 
 def has_friction_rows(qp: QP, face: Face) -> bool:
-    """Whether a row of some rank sticks or slips. Collective."""
+    """Return whether a row of some rank sticks or slips. Collective."""
     rubbing = np.isin(face.status, (Status.STICK, Status.SLIP))
     return any_rank(qp.d.getComm().tompi4py(), bool(np.any(rubbing)))
 
 
 def has_left(qp: QP, face: Face, x: Array) -> bool:
-    """Whether rows that do not slip are outside of Ω. Collective."""
+    """Return whether rows that do not slip are outside of Ω. Collective."""
     left = without_slip(face, qp.feasible.project(x) - x)
     return any_rank(qp.d.getComm().tompi4py(), bool(np.any(left != 0.0)))
 
@@ -137,12 +137,12 @@ def _restored_once(qp: QP, coarse: Coarse, face: Face, lam: PETSc.Vec) -> PETSc.
 
 
 def imbalance_on(qp: QP, coarse: Coarse, face: Face, lam: PETSc.Vec) -> float:
-    """How far Gλ is from e: the worst entry beside its terms, 1 at most. Collective."""
+    """Return the largest entry of Gλ − e over the size of its terms, at most 1. Collective."""
     return imbalance(qp.coarse if _is_beside(face, lam) else coarse, lam)
 
 
 def _is_beside(face: Face, lam: PETSc.Vec) -> bool:
-    """Whether λ is not 0 in directions that are not the face's, as where rows slip."""
+    """Return whether λ has a part outside the face's directions, as where rows slip."""
     fixed = lam.array_r - face.restricted(lam.array_r)
     return any_rank(lam.getComm().tompi4py(), bool(np.any(fixed)))
 
@@ -347,7 +347,7 @@ TAKES_PART = 1e-3
 
 
 class DependentRows:
-    """What to do on a face where F is singular, or nearly so.
+    """Treatment of faces on which F is singular, or nearly so.
 
     Args:
         qp: The program on all rows.
@@ -397,7 +397,7 @@ class DependentRows:
         return found
 
     def slack(self, z: Point, target: float) -> Point | None:
-        """Where rows that depend on each other want different gaps, let those go that lose.
+        """Step along a null direction of F to a bound, where dependent rows want different gaps.
 
         Between them forces may move that F does not see, and q falls all the way to a bound.
 
@@ -431,7 +431,7 @@ class DependentRows:
         return bound
 
     def shorten(self, before: Point, z: Point) -> None:
-        """Where a solve has gone far because nothing held it, go to the first bound only.
+        """Shorten a long step of hardly any curvature to the first bound.
 
         Rows depend on each other there, or nearly so; numbers of that size would drown the others.
         """
@@ -479,7 +479,7 @@ class DependentRows:
         return False
 
     def _endless(self, length: float, slope: float, way: PETSc.Vec) -> None:
-        """Whether a way down that costs nothing proves that q falls forever. Collective.
+        """Check whether a descent direction proves that q is unbounded below. Collective.
 
         Then it does in Ω's cone of recession, and neither F nor G sees it: rows that slip, and
         rounding of an F that is hardly definite, make ways that are none. Multiplies by F once.
@@ -596,7 +596,7 @@ class FaceSolver:
         return self._on_face.coarse
 
     def stays_on(self, face: Face) -> bool:
-        """Whether each row does on a face what it does on the one entered. Collective."""
+        """Return whether each row has the status that it has on the face entered. Collective."""
         return self._face is not None and not any_rank(
             self._comm, not np.array_equal(face.status, self._face.status)
         )
@@ -686,7 +686,7 @@ class FaceSolver:
         return Trial(first or z.copy(), z, back, face, rounds)
 
     def _let_go(self, before: Point, z: Point) -> bool:
-        """What has left Ω leaves the face, or what did so first; whether z stays in Ω then."""
+        """Project z onto Ω and drop the rows that left it; return whether z stays in Ω."""
         blocked = self.cautious and not self.curved
         if blocked:
             self.dependent.stop(before, z)
@@ -725,7 +725,7 @@ class FaceSolver:
         self.forget()
 
     def _target(self, z: Point, optimality: float, stays: bool) -> float:
-        """What PCPG aims at: a part of what there is to do; more where the face stays."""
+        """Return PCPG's target: a share of the residual, a smaller one where the face stays."""
         z.g.copy(self._directions.r)
         self.coarse.project(self._directions.r)
         start, final = float(self._directions.r.norm()), FINAL * self._rule.aim

@@ -107,7 +107,7 @@ class Point:
 
 
 class ConvergedReason(IntEnum):
-    """Why a solver stopped; positive: converged. Values as in KSPConvergedReason, where it has one.
+    """Reasons of a solver to stop; positive: converged. Values as in KSPConvergedReason, if there.
 
     ITERATING: it has not stopped.
     CONVERGED_FRICTION_RTOL: the bounds of Coulomb's friction are at rest to ``friction_rtol``, and
@@ -153,7 +153,7 @@ class Steps:
 
 @dataclass
 class QPResult:
-    """What a solver returns.
+    """Result of a QP solver.
 
     Attributes:
         lam: The multipliers λ.
@@ -189,7 +189,7 @@ class QPResult:
 
 @dataclass(frozen=True)
 class Start:
-    """Where a solver starts.
+    """Initial guess of a solver.
 
     Attributes:
         lam: Multipliers λ.
@@ -204,7 +204,7 @@ class Start:
 
 
 class StoppingRule(Protocol):
-    """What the residuals of an iterate must come down to.
+    """Stopping rule for the residuals of an iterate.
 
     A solver compares max(‖g^P‖, ‖F‖‖Qx‖) with ``tolerance`` in every step. Where it is small
     enough, the iterate is examined; an examination that is not content lowers the tolerance.
@@ -225,7 +225,7 @@ class StoppingRule(Protocol):
 
     @property
     def aim(self) -> float:
-        """What solves on faces come down to at most."""
+        """Lower limit of the residuals that solves on faces aim at."""
         ...
 
     def examine(

@@ -41,7 +41,7 @@ ROUNDING = 1e-14
 
 
 class ConvexSet(Protocol):
-    """What is asked of Ω here; any ``FeasibleSet`` has it."""
+    """Protocol of the set Ω to project onto; any ``FeasibleSet`` has it."""
 
     def project(self, x: Array) -> Array:
         """P_Ω(x)."""

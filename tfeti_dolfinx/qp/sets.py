@@ -18,7 +18,7 @@ from tfeti_dolfinx.errors import InputError
 
 
 class Status(IntEnum):
-    """What a row does at a point of a feasible set.
+    """Status of a row at a point of a feasible set.
 
     FREE: no set constrains it. OPEN: it is on its bound, and what it multiplies may open.
     TOUCHING: it is off its bound, in contact. STICK: inside its disc. SLIP: on its circle, and
@@ -71,7 +71,7 @@ class Face:
 
     @property
     def curved(self) -> bool:
-        """Whether some row of this rank slips along a boundary."""
+        """True if some row of this rank slips along a boundary."""
         return bool(np.any(np.diff(self.Z.indptr)[self.status == Status.SLIP]))
 
     def damped(self) -> Face:
@@ -93,7 +93,7 @@ class Face:
 
     @cached_property
     def _of_coordinates(self) -> bool:
-        """Whether the directions are coordinates: unit columns with one entry each."""
+        """True if the directions are coordinates: unit columns with one entry each."""
         return bool(self.Z.nnz == self.Z.shape[1] and np.all(np.abs(self.Z.data) == 1.0))
 
 

@@ -148,7 +148,7 @@ class FrictionBoundIteration:
         )
 
     def _holds_nearer(self) -> bool:
-        """Whether bounds between the last ones, which held the load, and the present ones do."""
+        """Retreat towards the last bounds that held the load; return whether those found do."""
         if any_rank(self._comm, not np.all(np.isfinite(self._held))):
             return False
         for share in NEARER:
@@ -187,7 +187,7 @@ class FrictionBoundIteration:
         return change
 
     def end(self, result: QPResult, rule: Accuracy, may_go_on: bool) -> bool:
-        """Whether bounds at rest end the iteration; if u is not right to rtol, the reason says so.
+        """Return whether converged bounds end the iteration; set the reason if u is not right.
 
         Args:
             result: The last solution.
@@ -201,7 +201,7 @@ class FrictionBoundIteration:
         return not may_go_on
 
     def _fit(self, result: QPResult, rule: Accuracy) -> bool:
-        """Whether u is right to rtol with the limits of the forces that were found, too.
+        """Return whether u is right to rtol with the limits that the new forces give, too.
 
         The rule has looked at the answer with the limits that it was found with; from now on it
         tells the larger errors. Of an answer that is a sum of two only the change is known.
@@ -217,7 +217,7 @@ class FrictionBoundIteration:
         return fits
 
     def _rest(self, rule: Accuracy) -> bool:
-        """Whether u is right to rtol as far as the last two problems tell; else ``_fit`` has told.
+        """Return whether u is right to rtol, extrapolated from the last two problems.
 
         Between them the bounds ψ and u have changed; so far as the forces are from the bounds yet,
         u is from its limit by as much, and by what is left of a geometric series.
@@ -268,11 +268,11 @@ class FrictionBoundIteration:
 
     @property
     def are_known(self) -> bool:
-        """Whether there are bounds to start from, none of which is De Saxcé's."""
+        """True if there are bounds to start from, none of which is De Saxcé's."""
         return self._dilated is None and not self._sticks
 
     def goes_on(self, reason: ConvergedReason) -> bool:
-        """Whether there is something else to try where a problem has no solution, or none is found.
+        """Choose what to try next after a failed solve; return whether there is something.
 
         What sticks may contradict itself, as beside a wall that pushes; then all slips. Bounds with
         hardly any forces between them leave faces that are nearly singular: then De Saxcé's fixed
@@ -293,12 +293,12 @@ class FrictionBoundIteration:
 
     @property
     def astray(self) -> bool:
-        """Whether slips of De Saxcé's fixed point grow without end, or do not come to rest."""
+        """True if slips of De Saxcé's fixed point diverge or do not converge."""
         return self._dilated is not None and self._dilated.astray
 
     @property
     def slides(self) -> bool:
-        """Whether slips have grown, and not come to rest, on a body that nothing else holds."""
+        """True if slips grow without converging on a body that nothing else holds."""
         free = self._dual.coarse.unheld.free
         return (
             self._dilated is not None and self._dilated.slides and bool(free[self.restless].any())
@@ -306,7 +306,7 @@ class FrictionBoundIteration:
 
     @property
     def _sticks(self) -> bool:
-        """Whether no bound is set yet."""
+        """True if no bound is set yet, so that all points stick."""
         return any_rank(self._comm, bool(np.any(np.isinf(self._now))))
 
     def _products(self, A: Array, B: Array) -> Array:
@@ -352,7 +352,7 @@ class NewtonOnCoulomb:
 
     @property
     def may_try(self) -> bool:
-        """Whether it is wanted, has not failed, and may end nearer to the law."""
+        """True if Newton's method is wanted, has not failed, and may end nearer to the law."""
         return self._tries > 0
 
     def give_up(self) -> None:
@@ -467,7 +467,7 @@ NEAR = 10.0
 
 @dataclass(frozen=True)
 class FixedPointStatus:
-    """How the bounds of friction have come to rest.
+    """Convergence of the bounds of friction.
 
     Attributes:
         iterations: Problems with given bounds that were solved; 0 without Coulomb's law.

@@ -64,7 +64,7 @@ class SolverContext:
 def refine_iteratively(
     dual: Dual, told: SolverContext, result: QPResult, rule: Accuracy
 ) -> tuple[QPResult, Accuracy]:
-    """Where rounding has ended a solve, solve for what is left, as long as that brings a digit.
+    """Refine a solution iteratively after rounding has stopped the solver.
 
     Iterative refinement (Wilkinson): each round begins at the sum of those before, and the residual
     of that is made from K itself. Where this does not suffice, once more from the same answer, and

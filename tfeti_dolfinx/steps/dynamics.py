@@ -417,7 +417,7 @@ class ContactDynamics(ContactProblem):
         return solution
 
     def _predicted(self, predictor: Predictor, free: Array) -> Array:
-        """Where contact lets the bodies go without elasticity."""
+        """Return the displacement that contact allows the bodies without elasticity."""
         system, forms = self._system, self._forms_in_time
         system.look_for_changes()
         system.make(self.report)

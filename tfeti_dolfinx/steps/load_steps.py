@@ -68,11 +68,11 @@ class Place:
         return Place(self.number, done, level)
 
     def begin(self, times: Sequence[float]) -> float:
-        """Where the part begins; ``times`` begins with the begin of the first step."""
+        """Return the begin of the part; ``times`` starts with the begin of the first step."""
         return _between(times[self.number], times[self.number + 1], self.done)
 
     def end(self, times: Sequence[float]) -> float:
-        """Where the part ends."""
+        """Return the end of the part."""
         return _between(times[self.number], times[self.number + 1], self.done + self._part)
 
 
@@ -260,7 +260,7 @@ Apply = Callable[[ContactProblem, float], None]
 
 @dataclass(frozen=True)
 class StepRecord:
-    """What is known of a converged step; the same on all ranks.
+    """Record of a converged step; the same on all ranks.
 
     Attributes:
         number: Position in the times of the step that this is, or is a part of.
@@ -458,7 +458,7 @@ class LoadSteps:
             self._series.write(t, fields)
 
     def _begin(self, resume: bool) -> Place:
-        """Where to begin, with the state of that place."""
+        """Return the place to begin at, and restore its state."""
         self.records = []
         if self._checkpoint is None:
             return Place()

@@ -16,7 +16,7 @@ from tfeti_dolfinx.common.validation import check_load
 
 @dataclass
 class Counters:
-    """What the Blocks of a rank have cost.
+    """Counters of the factorisations and solves of a rank's Blocks.
 
     Attributes:
         factorizations: Numeric factorisations.
@@ -135,7 +135,7 @@ def kernel_of(K: Any, modes: Array) -> Array:
 
 
 def _terms(K: csr_array, R: Array) -> Array:
-    """What the terms of RᵀKR may be, without their signs, for each mode.
+    """Bound the absolute values of the terms of RᵀKR, for each mode.
 
     In flat cells entries are differences of far larger numbers, which are as large as those that
     other unknowns of the cell have: the largest diagonal entry that a row meets bounds them.

@@ -431,13 +431,13 @@ class ClusteredSubdomains(Subdomains):
         self._glued: Glue | None = None
 
     def update(self, K: Sequence[object] | None = None, f: Array | None = None) -> None:
-        """As for subdomains. Collective."""
+        """Update K and f as ``Subdomains.update`` does. Collective."""
         if K is not None:
             self._null = self._glued = None
         super().update(K, f)
 
     def retrace(self, trace: Array, span: Array | None = None) -> None:
-        """As for subdomains."""
+        """Change the trace as ``Subdomains.retrace`` does."""
         super().retrace(trace, span)
         self._glued = None
 

@@ -47,7 +47,7 @@ class NotPositiveDefiniteError(FactorError, ArithmeticError):
 
 @dataclass(frozen=True)
 class FactorSize:
-    """What a factor stores.
+    """Storage of a factor.
 
     Attributes:
         entries: Entries of L.
@@ -106,7 +106,7 @@ class CholeskyFactor:
 
     @property
     def size(self) -> FactorSize:
-        """What the factor stores, as far as its package tells."""
+        """Storage of the factor, as far as its package tells."""
         info = self._factor.getInfo()
         entries = max(info["nz_used"], float(self._b.getLocalSize()))
         return FactorSize(entries, max(info["memory"], REAL * entries))
@@ -170,7 +170,7 @@ def default_solver() -> str:
 
 
 def has_solver(solver: str) -> bool:
-    """Whether this PETSc makes Cholesky factors by a solver."""
+    """Return whether this PETSc makes Cholesky factors by a solver."""
     return _makes_factor(solver, "")
 
 
@@ -281,7 +281,7 @@ def _check_definite(factor: PETSc.Mat) -> None:
 
 
 def _cause(error: Exception, solver: str | None, A: PETSc.Mat) -> FactorError:
-    """What made the factor of a matrix fail."""
+    """Return the error that says why a matrix could not be factored."""
     if isinstance(error, FactorError):
         return type(error)(f"not positive definite ({solver}: {error})")
     code = getattr(error, "ierr", None)
@@ -334,7 +334,7 @@ class FactoredInverse:
 
     @property
     def size(self) -> FactorSize:
-        """What the factor stores."""
+        """Storage of the factor."""
         return self._factor.size
 
     def refactor(self, R: Array) -> None:

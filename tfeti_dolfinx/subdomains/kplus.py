@@ -70,7 +70,7 @@ class SchurPseudoinverse(FactoredInverse):
 
     @property
     def size(self) -> FactorSize:
-        """What the factor stores, and H, of which a sweep reads half."""
+        """Storage of the factor and of H, of which a sweep reads half."""
         factor = self._factor.size
         return FactorSize(factor.entries + self._H.size, factor.memory + REAL * self._H.size)
 
@@ -129,7 +129,7 @@ class TrailingPseudoinverse(SchurPseudoinverse):
 
 
 def _least(R: Array) -> float:
-    """Of all motions of the kernel, the least that moves some unknowns, in the mean."""
+    """Return the least mean motion of some unknowns, over all unit motions of the kernel."""
     return float(np.linalg.svd(R, compute_uv=False)[-1] / np.sqrt(len(R)))
 
 
@@ -231,7 +231,7 @@ def with_entries(K: Any, dofs: Array) -> Any:
 
 
 def same_pattern(K: Any, other: Any) -> bool:
-    """Whether two CSR matrices store the same entries."""
+    """Return whether two CSR matrices store the same entries."""
     return np.array_equal(K.indptr, other.indptr) and np.array_equal(K.indices, other.indices)
 
 
@@ -243,7 +243,7 @@ def _projector(K: Any, R: Array, fixing_dofs: Array) -> Array:
 
 
 def _places(K: Any, dofs: Array) -> Array:
-    """Where the entries of each pair of dofs are stored, −1 where they are not."""
+    """Return where the entries of each pair of dofs are stored, −1 where they are not."""
     number = csr_array((np.arange(1, K.nnz + 1), K.indices, K.indptr), shape=K.shape)
     return np.asarray(number[dofs][:, dofs].toarray()) - 1
 
@@ -266,7 +266,7 @@ KPLUS_TYPES: dict[str, MakeInverse] = {
 
 @dataclass(frozen=True)
 class InverseFactory:
-    """How inverses are made.
+    """Factory of generalised inverses.
 
     Attributes:
         counters: Counts factorisations.

@@ -111,7 +111,7 @@ class TraceMatrix(Protocol):
 
     @property
     def is_sound(self) -> bool:
-        """Whether a dense one rounds no worse than the factors; may cost a solve."""
+        """True if the dense matrix rounds no worse than the factors; may cost a solve."""
         ...
 
     def apply(self, W: Array) -> Array:
@@ -119,7 +119,7 @@ class TraceMatrix(Protocol):
         ...
 
     def seconds(self, count: int) -> float:
-        """Of ``apply`` to so many vectors, by the model."""
+        """Return the modelled seconds of ``apply`` to so many vectors."""
         ...
 
     def traffic(self, count: int) -> float:
@@ -146,7 +146,7 @@ class PinvMatrix:
 
     @property
     def is_sound(self) -> bool:
-        """Whether random forces of size 1 move the trace by no more than a sound subdomain."""
+        """True if random unit forces move the trace no more than in a well-held subdomain."""
         if self.size == 0:
             return True
         forces = np.random.default_rng(0).standard_normal((self.size, 1))
@@ -164,7 +164,7 @@ class PinvMatrix:
         return out
 
     def seconds(self, count: int) -> float:
-        """Of ``apply`` to so many vectors, by the model."""
+        """Return the modelled seconds of ``apply`` to so many vectors."""
         return sweeps(self._stiffness.factor_size, self._stiffness.size, count)
 
     def traffic(self, count: int) -> float:
@@ -203,7 +203,7 @@ class SchurMatrix:
         return self._traced.apply_schur(W)
 
     def seconds(self, count: int) -> float:
-        """Of ``apply`` to so many vectors, by the model."""
+        """Return the modelled seconds of ``apply`` to so many vectors."""
         inner = self._traced.inner
         products = sparse_products(self._traced.K_bb.nnz, count)
         if inner is None:
@@ -247,7 +247,7 @@ class StiffnessMatrix:
         return np.asarray(self._K_bb @ W)
 
     def seconds(self, count: int) -> float:
-        """Of ``apply`` to so many vectors, by the model."""
+        """Return the modelled seconds of ``apply`` to so many vectors."""
         return sparse_products(self._K_bb.nnz, count)
 
     def traffic(self, count: int) -> float:
@@ -260,7 +260,7 @@ class StiffnessMatrix:
 
 
 class OwnMatrix:
-    """What a Block of another class applies, one vector after the other.
+    """Matrix of a Block of another class, applied to one vector after the other.
 
     Args:
         apply: A w, shapes ``(t,)``.
@@ -331,7 +331,7 @@ class Group:
 
 
 class Form(Protocol):
-    """How a group applies its matrix.
+    """Form in which a group applies its matrix.
 
     Attributes:
         name: Name in reports.
@@ -534,7 +534,7 @@ class ModelledOperator(LocalOperator, Protocol):
 
 @dataclass(frozen=True)
 class LocalChoice:
-    """Which form local operators take.
+    """Choice of the form of local operators.
 
     Attributes:
         type: One of ``LOCAL_TYPES``.
@@ -546,7 +546,7 @@ class LocalChoice:
 
     @property
     def shares(self) -> bool:
-        """Whether equal subdomains share their stiffness."""
+        """True if equal subdomains share their stiffness."""
         return self.type in ("auto", "shared")
 
 

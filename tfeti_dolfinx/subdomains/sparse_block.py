@@ -92,7 +92,7 @@ def _shape_and_order(x: Array, bs: int) -> tuple[bytes, Array]:
 
 
 def _equal(K: Any, other: Stiffness, here: Array) -> bool:
-    """Whether K is the other stiffness, its unknown i being the other's ``here[i]``."""
+    """Return whether K equals the other stiffness, unknown i being the other's ``here[i]``."""
     allowed = SAME * np.abs(other.K.data).max(initial=0.0)
     in_order = np.array_equal(here, np.arange(len(here)))
     if in_order and same_pattern(K, other.K):
@@ -114,7 +114,7 @@ NOTHING, FIRM = 1e-26, 0.02
 
 
 def holds_firmly(modes: Array, added: Array, diagonal: Array) -> bool:
-    """Whether rigid motions are left free, or held about as firmly as a subdomain deforms.
+    """Return whether rigid motions are free, or held about as firmly as the subdomain deforms.
 
     What holds them softly, as a short end or a soft part do, makes a nearly singular matrix of one
     whose kernel is known.
@@ -196,7 +196,7 @@ class SparseBlock(BlockDefaults):
             self.kernel[self._added > 0.0] = 0.0
 
     def _firm(self, K: Any) -> Array | None:
-        """What K is to get on its diagonal, if that holds no motion softly."""
+        """Return the addition to the diagonal of K, or None if it would hold motions softly."""
         if self._to_add is None:
             return None
         check_stiffness(self.name, K)
@@ -265,7 +265,7 @@ class SparseBlock(BlockDefaults):
 
     @cached_property
     def traced(self) -> Traced:
-        """What the stiffness is on the trace, in its own numbering."""
+        """The stiffness on the trace, in its own numbering."""
         order = self._trace_order
         span = None if self._span is None else self._span[order]
         return self.stiffness.on_trace(self.trace_place[order], span)

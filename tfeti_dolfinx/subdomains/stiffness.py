@@ -104,7 +104,7 @@ DIGITS = 9
 
 @dataclass(frozen=True)
 class ConstrainedTrace:
-    """What rows act on.
+    """Unknowns, and directions of nodes, that rows act on.
 
     Attributes:
         trace: Trace unknowns, ascending, shape ``(t,)``.
@@ -121,7 +121,7 @@ class ConstrainedTrace:
 
 
 def seen_along(trace: Array, span: Array | None, n: int) -> ConstrainedTrace:
-    """What rows act on that see the nodes of a trace in some directions.
+    """Return the constrained trace of rows that act on its nodes in some directions only.
 
     Args:
         trace: Trace unknowns, ascending, shape ``(t,)``.
@@ -326,7 +326,7 @@ class Stiffness:
 
     @property
     def factor_size(self) -> FactorSize:
-        """What the factor stores; of an inverse of one's own, as if it were dense."""
+        """Storage of the factor; of an inverse that the user brings, as if it were dense."""
         if isinstance(self._pinv, FactoredInverse):
             return self._pinv.size
         n = float(self.size)

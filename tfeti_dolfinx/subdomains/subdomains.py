@@ -42,7 +42,7 @@ class SoftMotions:
 
 
 def sprung(blocks: Sequence[Block]) -> SoftMotions:
-    """What springs hold in each Block."""
+    """Return the motions of each Block that springs hold."""
     modes, energies = zip(*map(_outside_motions, blocks), strict=True) if blocks else ((), ())
     trace = [R[block.trace_dofs] for R, block in zip(modes, blocks, strict=True)]
     rows = csr_array(block_diag(trace)) if trace else csr_array((0, 0))
@@ -170,7 +170,7 @@ class Subdomains:
 
     @property
     def kernel_parts(self) -> list[slice]:
-        """Where the kernel coordinates of each Block lie among the r."""
+        """Slices of the kernel coordinates of each Block among the r."""
         return parts_of([block.kernel.shape[1] for block in self.blocks])
 
     @property
