@@ -33,7 +33,7 @@ from tfeti_dolfinx.subdomains.factor import default_solver, has_solver, unread_o
 from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES
 from tfeti_dolfinx.subdomains.local_operators import LOCAL_TYPES
 
-# --- Options: one typed dataclass from which parsing, ``view`` and docs/options.md are made ---
+# --- Options ----------------------------------------------------------------------------------
 
 # what ``auto`` asks of displacements, whatever the mesh is
 LOOSEST = 1e-2
@@ -192,7 +192,7 @@ def options_table() -> str:
     return "\n".join(lines)
 
 
-# --- Options from a dictionary and the command line -------------------------------------------
+# --- Parsing of options -----------------------------------------------------------------------
 
 # what factors of subdomains, the coarse problem and contact rows read from PETSc's options
 FACTOR_OPTION = re.compile(r"(sub|coarse|face)_((?:pc_factor|mat)_\w+)")

@@ -45,7 +45,7 @@ from tfeti_dolfinx.solve.coulomb import solve_with_friction
 from tfeti_dolfinx.solve.solver import conclude, learn, resolve_types
 from tfeti_dolfinx.system import System
 
-# --- Solves with more and more contact rows, until no node without one overlaps ---------------
+# --- Solves with more contact rows until nothing overlaps -------------------------------------
 
 MAX_ROUNDS = 20
 
@@ -92,7 +92,7 @@ def _widen(system: System, report: Report, error: NoSolutionError) -> int:
     raise error
 
 
-# --- The solutions of a problem: the last one, and the one that a load step has ended with ----
+# --- Solutions of load steps ------------------------------------------------------------------
 
 # rows, their λ, and the multipliers of Gλ = e
 Start = tuple[Gluing, Array, Array]
@@ -274,7 +274,7 @@ class Stepping:
         return solution
 
 
-# --- The user's door: a contact problem from forms, conditions and contacts to a solution -----
+# --- The contact problem ----------------------------------------------------------------------
 
 
 class ContactProblem(Stepping):

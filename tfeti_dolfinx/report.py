@@ -26,7 +26,7 @@ from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.coulomb import FixedPointStatus
 from tfeti_dolfinx.subdomains.local_operators import ModelledOperator
 
-# --- What a solve took and how good its answer is ---------------------------------------------
+# --- The report -------------------------------------------------------------------------------
 
 PRINTED = 10  # of a list; all of it is in the file
 
@@ -244,7 +244,7 @@ def peak_memory_mb(comm: MPI.Intracomm) -> float:
     return float(comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0))
 
 
-# --- The report of a solve, from the objects that took part in it -----------------------------
+# --- Filling of the report --------------------------------------------------------------------
 
 
 def fill_sizes(

@@ -39,7 +39,7 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import hat_integrals
 from tfeti_dolfinx.qp.sets import Status, face_of
 
-# --- Displacement and stress at points of the user's ------------------------------------------
+# --- Displacement and stress at given points --------------------------------------------------
 
 # Of the size of the mesh: how far from a cell of finite elements a point may be
 PADDING = 1e-10
@@ -170,8 +170,7 @@ def _cells(mesh: Any, points: Array) -> tuple[Array, Array]:
     return place, np.asarray(found.array)
 
 
-# --- The solution of a contact problem: displacement, multipliers, and fields that follow
-#     lazily ---
+# --- The solution -----------------------------------------------------------------------------
 
 
 class Solution(ContactState):
@@ -407,7 +406,7 @@ class Solution(ContactState):
         return function
 
 
-# --- A solution as plain arrays, from which another run of the same program goes on -----------
+# --- Saved state of a solution ----------------------------------------------------------------
 
 
 @dataclass(frozen=True)

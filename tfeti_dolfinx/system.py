@@ -33,7 +33,7 @@ from tfeti_dolfinx.subdomains.clusters import clusters_of
 from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
-# --- The stages of a solve: their order, what depends on what, and which are out of date ------
+# --- Stages and their dependencies ------------------------------------------------------------
 
 T = TypeVar("T")
 
@@ -111,7 +111,7 @@ def made(item: T | None) -> T:
     return item
 
 
-# --- What bounds the tangential forces of a scene, and where its slips count from -------------
+# --- Friction limits and reference of slips ---------------------------------------------------
 
 
 class FrictionBounds:
@@ -174,7 +174,7 @@ class FrictionBounds:
         gluing.constraints.coefficients[:] = gluing.tangents.coefficients(self._known)
 
 
-# --- From forms to the dual problem, in stages that are kept until their input changes --------
+# --- From forms to the dual problem -----------------------------------------------------------
 
 
 class System:

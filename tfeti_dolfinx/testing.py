@@ -21,7 +21,7 @@ from tfeti_dolfinx.subdomains.block import (
 from tfeti_dolfinx.subdomains.factor import GeneralisedInverse, solved
 from tfeti_dolfinx.subdomains.kplus import MakeInverse, with_entries
 
-# --- What solvers rely on, checked on any feasible set ----------------------------------------
+# --- Checks of a feasible set -----------------------------------------------------------------
 
 # Steps along a face, relative to the radius of its curvature: one so short that what is linear in
 # it stands out from what is quadratic; one that is longer, so that what is quadratic stands out
@@ -135,7 +135,7 @@ def _radii(face: Face, g: Array) -> Array:
     return np.where(flat, np.inf, pushing / np.where(flat, 1.0, face.curvature))
 
 
-# --- The identities that any Block fulfils ----------------------------------------------------
+# --- Checks of a Block ------------------------------------------------------------------------
 
 # Eigenvalues of a stiffness, as a share of the largest, that are 0 but for rounding (which is
 # 1e-16 times a few powers of n); singular values are their roots, and cut off above rounding.

@@ -26,7 +26,7 @@ from tfeti_dolfinx.subdomains.block import mode_names
 from tfeti_dolfinx.subdomains.stiffness import stretch_over_shear
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
-# --- Whether friction that alone holds a motion of bodies balances the load where they are ----
+# --- Sliding motions that friction alone must hold --------------------------------------------
 
 # of rtol: how far a body may be from where friction balances its load
 FAR = 20.0
@@ -164,7 +164,7 @@ def _largest(N: csr_array, values: Array) -> Array:
     return largest
 
 
-# --- Where an answer cannot be trusted, or not as far as it seems: sentences for the report ---
+# --- Warnings of the report -------------------------------------------------------------------
 
 # relative rounding of a stiffness
 EPSILON = float(np.finfo(float).eps)

@@ -22,7 +22,7 @@ from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.sparse_block import PLACE, SAME, SparseBlock, places_in_order
 from tfeti_dolfinx.subdomains.stiffness import Stiffness
 
-# --- The Block of a subdomain with boundary elements ------------------------------------------
+# --- Block of a subdomain with boundary elements ----------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class BoundaryBlock(SparseBlock):
         return self._part.shape.stiffness, self._part.place
 
 
-# --- All subdomains of a rank with boundary elements: their stiffness and load ----------------
+# --- Boundary elements of all subdomains of a rank --------------------------------------------
 
 # Of the largest entry of a load: what quadrature leaves of a constant force per volume
 CONSTANT = 1e-7

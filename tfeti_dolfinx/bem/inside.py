@@ -14,7 +14,7 @@ from tfeti_dolfinx.bem.panels import Panels
 from tfeti_dolfinx.bem.steklov import Steklov, gunter, rigid_motions
 from tfeti_dolfinx.common.arrays import Array
 
-# --- Somigliana's identity: displacement and stress inside, from what is on the surface -------
+# --- Somigliana's identity: displacement and stress inside ------------------------------------
 
 # A panel is cut in parts until their middles are as far as FAR of their sizes; from so many sizes
 # on a rule of this degree is exact to 1e-9. What is nearer to the surface than a panel's size over
@@ -254,7 +254,7 @@ def _parts(d: int) -> list[Array]:
     return [*inner, half]
 
 
-# --- The solution of bodies with boundary elements, to be asked for what is inside ------------
+# --- Solution of bodies with boundary elements ------------------------------------------------
 
 
 @dataclass(frozen=True)

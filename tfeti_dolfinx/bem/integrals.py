@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 from tfeti_dolfinx.bem.panels import Panels
 from tfeti_dolfinx.common.arrays import Array
 
-# --- The three integrals that all layer operators of elasticity are made of -------------------
+# --- Integrals of the layer operators ---------------------------------------------------------
 
 # points, or pairs of them, that are looked at together: what they need stays in the cache
 TOGETHER = 2**15
@@ -62,8 +62,7 @@ def in_chunks(items: Array, points: int) -> Iterator[Array]:
         yield items[start : start + step]
 
 
-# --- Quadrature for pairs of triangles: Sauter and Schwab's rules where they meet, and tensor
-#     ones ---
+# --- Quadrature for pairs of triangles --------------------------------------------------------
 
 # Gauss points that integrate polynomials of degree 5: what the products of two hats and the
 # Jacobian are in each variable
@@ -152,7 +151,7 @@ def _vertex(xi: Array, a: Array, b: Array, c: Array) -> list[Map]:
     ]
 
 
-# --- Layer integrals on segments: closed forms where segments are near, Gauss' rule elsewhere ---
+# --- Layer integrals on segments --------------------------------------------------------------
 # With points as complex numbers and z = x − y all of them are integrals of log z, z̄/z and s/z.
 # Far from each other the closed forms are small differences of large numbers, and Gauss' rule is
 # exact to rounding.
@@ -264,7 +263,7 @@ def _difference(F: Array) -> Array:
     return np.asarray(F[:, :, 1] - F[:, :, 0])
 
 
-# --- Layer integrals on triangles: Sauter and Schwab's quadrature where they meet -------------
+# --- Layer integrals on triangles -------------------------------------------------------------
 
 # Gauss points along each variable for pairs that share 1, 2 or 3 corners, up to a distortion of
 # the worse of both (2 is half a square): tractions of constant stresses are right to 1e-4 up to 5.

@@ -15,7 +15,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mesh.untorn import cell_facets, facet_vertices
 
-# --- Flat panels: the closed surface of a body, and its traces of displacements and tractions ---
+# --- Panels of a closed surface ---------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ class Panels:
         return [self.by_corners(turned[:, :, c]) for c in range(3)]
 
 
-# --- Panels of subdomains: the facets of a torn mesh on its outside, tears included -----------
+# --- Panels of subdomains ---------------------------------------------------------------------
 
 # Of the size of a facet: how far its corners may be from a plane
 FLAT = 1e-8

@@ -18,7 +18,7 @@ from tfeti_dolfinx.subdomains.factor import CholeskyFactor
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.stiffness import Stiffness
 
-# --- S, the Galerkin approximation of the Steklov–Poincaré operator of a Lamé body ------------
+# --- Galerkin approximation of the Steklov–Poincaré operator ----------------------------------
 
 # Of the largest nodal force of constant stresses: how wrong quadrature on long thin triangles may
 # make them
@@ -210,7 +210,7 @@ def _by_nodes(count: int, d: int) -> Array:
     return np.arange(d * count).reshape(d, count).T.ravel()
 
 
-# --- The law of a homogeneous, isotropic body, read from the stiffness of its finite elements ---
+# --- Elastic moduli read from a finite element stiffness --------------------------------------
 
 # Of the largest entry: what rounding and quadrature of a constant stress leave
 SAME = 1e-7
@@ -262,7 +262,7 @@ def _isotropic(C: Array) -> IsotropicLaw:
     return IsotropicLaw(mu, lmbda / (2.0 * (lmbda + mu)) if lmbda + mu > 0.0 else np.nan)
 
 
-# --- A subdomain whose surface has boundary elements, in an order of nodes of its own ---------
+# --- A subdomain with its surface nodes in boundary element order -----------------------------
 
 TOGETHER = 256  # right sides that are solved for at once
 

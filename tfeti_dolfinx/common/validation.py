@@ -17,7 +17,7 @@ import numpy as np
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.errors import InputError, TfetiError
 
-# --- Checks of what users give: values, types, and what their callables raise -----------------
+# --- Checks of values, types and callables ----------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def named(what: str, *kinds: type[Exception]) -> Iterator[None]:
         raise InputError(f"{what}: {type(error).__name__}: {error}") from error
 
 
-# --- Parameters that say once what they are: default, range, text, symbol, name as an option ---
+# --- Descriptions of parameters ---------------------------------------------------------------
 
 FROM_0 = Range("0 or more", lambda value: value >= 0.0)
 FROM_1 = Range("1 or more", lambda value: value >= 1.0)
@@ -240,7 +240,7 @@ def _description(f: Field[Any]) -> Description:
     return description
 
 
-# --- Is a subdomain's stiffness symmetric, are its load and stiffness finite? -----------------
+# --- Checks of a subdomain's stiffness and load -----------------------------------------------
 
 # Largest entry of K − Kᵀ over that of K: far above what rounding of assembly leaves, far below any
 # term of a form that matters.

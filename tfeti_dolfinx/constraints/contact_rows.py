@@ -16,7 +16,7 @@ from tfeti_dolfinx.contact.records import ContactRecords, Friction
 from tfeti_dolfinx.errors import NoSolutionError, TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
-# --- Contact conditions of one node that no displacement can meet together --------------------
+# --- Consistency of contact conditions at one node --------------------------------------------
 
 # of the scene's length: overlaps that the linear program's tolerance (for gaps over that length)
 # may leave, with room for as many conditions as a node may have
@@ -205,7 +205,7 @@ def _check_decided(gaps: Array, length: float, comm: MPI.Intracomm) -> None:
         )
 
 
-# --- Rows along the tangents of conditions that have friction ---------------------------------
+# --- Tangential rows of conditions with friction ----------------------------------------------
 
 NOTHING = np.empty(0, dtype=np.int64)
 NO_ROWS = Rows(NOTHING, NOTHING, NOTHING, np.empty(0))

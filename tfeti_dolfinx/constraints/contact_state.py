@@ -19,7 +19,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mortar.surfaces import group_points
 from tfeti_dolfinx.qp.sets import Face
 
-# --- States of contacts and of rows at a solution ---------------------------------------------
+# --- Status of contacts and rows --------------------------------------------------------------
 
 
 class ContactStatus(IntEnum):
@@ -69,7 +69,7 @@ class ContactData:
     slip: Array
 
 
-# --- The state of all contact conditions at a solution: forces, gaps, slips, and what they do ---
+# --- State of contact conditions: forces, gaps, slips -----------------------------------------
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs, component_of, described, is_same_space
 from tfeti_dolfinx.mesh.untorn import cell_facets
 
-# --- Rows that glue torn copies together, and rows that hold prescribed components ------------
+# --- Rows of interfaces and Dirichlet conditions ----------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def _hold(dofs: TornDofs, flag: Array, weights: Array) -> tuple[Rows, Array]:
     return rows, group[copy] * dofs.bs + component
 
 
-# --- Dirichlet values, spread over all torn copies of a node ----------------------------------
+# --- Dirichlet values on torn copies ----------------------------------------------------------
 
 AGREEMENT = 1e-10
 
@@ -314,7 +314,7 @@ def _check_agreement(low: Array, high: Array, flag: Array) -> None:
     )
 
 
-# --- All rows of a scene: from Dirichlet conditions and contact records to B and c ------------
+# --- All rows of a scene ----------------------------------------------------------------------
 
 # more than any mesh has nodes, and times any number of contacts within 64 bits
 MANY_GROUPS = 2**40

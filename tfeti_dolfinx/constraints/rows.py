@@ -16,7 +16,7 @@ from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import group_points
 
-# --- Tables of rows: the only source of B -----------------------------------------------------
+# --- Tables of rows ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def stack(tables: list[Rows]) -> Rows:
     )
 
 
-# --- Which local rows of B are what -----------------------------------------------------------
+# --- Kinds of rows ----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def row_sets(num_equalities: int, num_normals: int, num_tangents: int, gdim: int
     return RowSets(equalities, normals, tangents.reshape(shape))
 
 
-# --- D, with which rows of B are scaled -------------------------------------------------------
+# --- Scaling D of rows ------------------------------------------------------------------------
 
 
 def row_weights(blocks: Array, scaling: str, comm: MPI.Intracomm) -> Array:
@@ -130,7 +130,7 @@ def row_weights(blocks: Array, scaling: str, comm: MPI.Intracomm) -> Array:
     return np.repeat(D, blocks.shape[1])
 
 
-# --- The directions in which the rows of B act on a node --------------------------------------
+# --- Directions in which rows act on a node ---------------------------------------------------
 
 # of the largest square: directions of normals that differ by less are one but for rounding
 ALIKE = 1e-12
@@ -186,7 +186,7 @@ def _projectors(gram: Array, held: Array) -> Array:
     return np.einsum("nik,nk,njk->nij", vectors, seen, vectors)
 
 
-# --- Coefficients of contact conditions: without prescribed components, shared by torn copies ---
+# --- Coefficients of contact conditions -------------------------------------------------------
 
 # Of a row's norm: what is left of less is rounding, scaled up to unit norm.
 NOTHING_LEFT = 1e-10
@@ -305,7 +305,7 @@ def _nothing_left(records: ContactRecords, points: Array) -> Array:
     return np.clip(SEVERAL * error, NOTHING_LEFT, HARDLY_LEFT)
 
 
-# --- B as a distributed PETSc matrix (dual rows × trace unknowns), and c ----------------------
+# --- B as a distributed PETSc matrix, and c ---------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from tfeti_dolfinx.mortar.integrals import GapIntegrals, integrate
 from tfeti_dolfinx.mortar.segments import find_segments, frames, possible_pairs, rendezvous
 from tfeti_dolfinx.mortar.surfaces import surface_facets
 
-# --- Surfaces in contact: their facets, and which of a pair had better be the secondary one ---
+# --- Sides of a contact -----------------------------------------------------------------------
 
 # of the square (in 2D: of the length) of a facet's radius: an area below it is rounding, and the
 # facet has no normal
@@ -156,7 +156,7 @@ def ratios(
     )
 
 
-# --- From integrals over facets to conditions of the nodes' owners ----------------------------
+# --- Assembly of conditions from integrals over facets ----------------------------------------
 
 # of ∫φ_i: a node whose hat is covered by less has slivers of facets only, and divides by them
 HARDLY_COVERED = 1e-6
@@ -274,7 +274,7 @@ def _merged(dofs: TornDofs, entries: tuple[Triplets, ...]) -> Triplets:
     return row[first], column[first], sums
 
 
-# --- Where the two sides of a pair meet: mortar integrals of the secondary one's multipliers ---
+# --- Mortar integrals of a pair ---------------------------------------------------------------
 
 # One looks farther than the reach: else facets at its edge would be covered partly, and an overlap
 # that is too deep would not be seen.

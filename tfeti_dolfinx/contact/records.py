@@ -16,7 +16,7 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import group_points
 
-# --- What a user says of a contact besides its surfaces: its name, how far it looks, its gap ---
+# --- Data common to all contacts: name, reach, gap --------------------------------------------
 
 # of the extent of the smaller surface: few nodes farther off ever touch in small strains, and those
 # that do are taken in after the solve
@@ -135,7 +135,7 @@ def given_gaps(name: str, gap: Gap, x: Array) -> Array | None:
     return values
 
 
-# --- Contact conditions before they become rows of B: a frame and scalar weights each ---------
+# --- Records of contact conditions ------------------------------------------------------------
 
 
 class Friction(IntEnum):
@@ -278,7 +278,7 @@ def slips(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
     return np.einsum("ntg,ng->nt", records.tangents, v)
 
 
-# --- The gaps of conditions: those of the geometry, or what a user gives in their place -------
+# --- Gaps of conditions -----------------------------------------------------------------------
 
 
 def gaps_of(

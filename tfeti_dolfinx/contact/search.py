@@ -19,7 +19,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import diameter
 
-# --- What every contact can do, and checks of the list of them --------------------------------
+# --- Protocol of contacts, and checks of their list -------------------------------------------
 
 
 class ContactPartner(Protocol):
@@ -127,8 +127,7 @@ def check_laws(contacts: Sequence[ContactPartner], decomposition: Decomposition)
             )
 
 
-# --- All contacts of a problem: their conditions, which of them have rows, and what comes
-#     later ---
+# --- The contact search -----------------------------------------------------------------------
 
 # How much farther one looks for what may hold a body: few rounds, each a search and a solve, up to
 # the length of the scene; of that at least, since a small surface's reach may be as good as none.

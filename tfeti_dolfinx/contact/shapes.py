@@ -21,7 +21,7 @@ from tfeti_dolfinx.common.validation import (
 )
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 
-# --- Rigid obstacles: signed distances, positive where a body may be --------------------------
+# --- Shapes of rigid obstacles: signed distances ----------------------------------------------
 
 Point = tuple[float, ...] | list[float] | Array
 
@@ -198,8 +198,7 @@ class SignedDistance:
         return gradient
 
 
-# --- Whether a shape is one: what its callables return, and whether they agree with each
-#     other ---
+# --- Checks of a shape's callables ------------------------------------------------------------
 
 # Differences over 1e-5 of the scene: curvature and rounding are both far below what is looked for
 STEP = 1e-5

@@ -23,7 +23,7 @@ from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.subdomains.clusters import ClusteredSubdomains, InnerMotions
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor
 
-# --- Chebyshev's steps between the blocks of clusters, for what subdomains do within them -----
+# --- Chebyshev iteration between clusters -----------------------------------------------------
 
 # what Chebyshev's steps leave of an interval, and how far it reaches at most: 13 steps
 LEFT, WIDEST = 0.05, 50.0
@@ -150,8 +150,7 @@ def _blocks(A: PETSc.Mat, cluster: Array) -> csr_array:
     return csr_array(blocks + diags_array(np.where(shift > 0.0, shift, 1.0)))
 
 
-# --- Motions of subdomains within clusters: a coarse space of the preconditioner, solved by
-#     steps ---
+# --- Coarse space of subdomain motions within clusters ----------------------------------------
 # In clusters G = R̃ᵀBᵀ knows whole clusters only, and M_f, which moves one subdomain at a time,
 # is far stiffer than a cluster: what jumps all over a cluster's side costs it as many faces as
 # there are, the cluster one smooth displacement. With Ĝ = R̂ᵀBᵀ, R̂ the rigid motions of all

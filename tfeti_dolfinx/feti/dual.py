@@ -47,7 +47,7 @@ from tfeti_dolfinx.qp.sets import (
 from tfeti_dolfinx.subdomains.local_operators import LocalOperator
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
-# --- Multipliers that balance the load: the smallest ones, with and without tension -----------
+# --- Particular multipliers that balance the load ---------------------------------------------
 
 # Of ‖e‖: what is let pass: below any rtol, and the solver makes Gλ = e good afterwards.
 LET_PASS = 1e-9
@@ -86,7 +86,7 @@ def feasible_particular(coarse: CoarseSpace, like: PETSc.Vec) -> PETSc.Vec:
 PARTICULAR = {"natural": natural, "feasible": feasible_particular}
 
 
-# --- The dual problem of a scene: Blocks and rows in, a quadratic program out -----------------
+# --- The dual problem -------------------------------------------------------------------------
 
 # times the forces and lengths that load, values and gaps make: multipliers of an earlier problem
 # that are larger would leave so many digits less to the solution

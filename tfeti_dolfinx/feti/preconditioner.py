@@ -21,7 +21,7 @@ from tfeti_dolfinx.qp.problem import FaceOperator
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, added_options, has_solver
 
-# --- Displacements with given jumps, made smooth: steps towards the least energy of the trace ---
+# --- Smoothing of displacements with given jumps ----------------------------------------------
 
 # steps, and the part of the spectrum that they make small, from its top down
 STEPS, RANGE = 3, 8.0
@@ -208,7 +208,7 @@ def smoothed(steps: list[tuple[float, float]], apply: OfArray, u: Array) -> Arra
     return u
 
 
-# --- Factors of a distributed matrix of contact rows, of which most ranks may have none -------
+# --- Factors of a distributed matrix of contact rows ------------------------------------------
 
 # rows up to which each rank that has any has a factor of the whole: to tell each other of so few
 # costs less than to share their elimination
@@ -308,7 +308,7 @@ class DistributedFactor:
         self._comm.Free()
 
 
-# --- The preconditioner on a face, scaled by the rows of the face alone -----------------------
+# --- Preconditioner on a face -----------------------------------------------------------------
 
 # an entry of B_N D⁻¹ B_Nᵀ − I, whose diagonal is 1, that is rounding
 ORTHONORMAL = 1e-12

@@ -20,7 +20,7 @@ from tfeti_dolfinx.qp.coarse import NOTHING
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 
-# --- GGᵀ of all rows and of faces, sparse, on all ranks ---------------------------------------
+# --- Gram matrices GGᵀ ------------------------------------------------------------------------
 
 
 class Grams:
@@ -80,7 +80,7 @@ def replicated(part: csr_array, comm: MPI.Intracomm) -> csr_array:
     return coo_array((value, (row, column)), shape=part.shape).tocsr()
 
 
-# --- Factors of the coarse problem's matrices, on each rank -----------------------------------
+# --- Factors of the coarse problem ------------------------------------------------------------
 
 # Added to a unit diagonal, where pivots are lost to rounding; so small a shift is made good by
 # refinement in all directions that stand out from rounding.
@@ -165,7 +165,7 @@ class SemidefiniteFactor:
             self._factor = None
 
 
-# --- Projectors of Gλ = e where some multipliers follow others: oblique, not orthogonal -------
+# --- Oblique projectors -----------------------------------------------------------------------
 
 
 class ObliqueProjectors:
@@ -251,7 +251,7 @@ class GeneralFactor:
         return self._null.removed((self._scale * x.T).T)
 
 
-# --- Orthogonal projectors of Gλ = e, r-vectors replicated: on all rows, or on a face ---------
+# --- Orthogonal projectors, on all rows or on a face ------------------------------------------
 
 
 class CoarseFactor(Protocol):

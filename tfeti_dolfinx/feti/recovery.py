@@ -19,7 +19,7 @@ from tfeti_dolfinx.feti.solvability import CutRows, minimise
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
-# --- From multipliers back to displacements ---------------------------------------------------
+# --- Recovery of displacements from multipliers -----------------------------------------------
 
 # Of GGᵀ, added to G_f G_fᵀ: rows with a force that hold a motion by less are not asked about it,
 # since they would answer with their rounding over this share.
@@ -119,7 +119,7 @@ def _alpha(coarse: CoarseSpace, gradient: Array, free: Array, nu: Array) -> Arra
     return alpha + step
 
 
-# --- The smallest of the displacements that solve a problem equally well ----------------------
+# --- Smallest of equally good displacements ---------------------------------------------------
 
 # Motions held by less than this share of what the same contacts hold at most are nearly free:
 # their contacts' normals are off by less than 6 degrees from a right angle.
@@ -288,7 +288,7 @@ def _least_distance(A: Array, b: Array, wanted: Array) -> Array:
     return np.asarray(-scale * r[:-1] / r[-1])
 
 
-# --- The least displacement that closes what rows miss ----------------------------------------
+# --- Minimum-norm correction of constraint residuals ------------------------------------------
 
 # Conjugate gradients for least squares: with the usual eigenvalues of B_f D⁻¹ B_fᵀ, 0.6 to 2, about
 # 15 steps to this part of the first gradient; what is left of w then has at most 1e-2 of its energy

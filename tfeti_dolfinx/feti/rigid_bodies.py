@@ -27,7 +27,7 @@ from tfeti_dolfinx.common.parallel import bcast_from_root
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
-# --- Sparse matrices of few columns in parts that do not meet: dense algebra on each part -----
+# --- Dense algebra on parts of sparse matrices with few columns -------------------------------
 
 
 def parts_of_columns(A: csr_array) -> Iterator[tuple[Array, Array, Array]]:
@@ -79,7 +79,7 @@ def orthonormal_columns(A: csr_array) -> csr_array:
     return by_parts(A, lambda dense: np.linalg.qr(dense)[0])
 
 
-# --- Spaces of motions of bodies: what rows leave free, body by body and of several together ---
+# --- Motions of bodies ------------------------------------------------------------------------
 
 # Stiffness, as a share of the stiffest motion of the same body, that counts as none: rounding
 # makes 1e-15 of it, and pins on neighbouring nodes of a fine mesh hold a turn by 1e-9.
@@ -242,7 +242,7 @@ def _component_null(A: csr_array) -> Array:
         size = min(2 * size, n)
 
 
-# --- What the bodies' rigid motions are in kernel coordinates; the same on all ranks ----------
+# --- Rigid motions of bodies in kernel coordinates --------------------------------------------
 
 # Share of a motion's square that lies outside a subdomain's kernel, and so moves a spring:
 # kernels beside weak springs are inexact, and a share is the square of an angle.
@@ -335,7 +335,7 @@ def _replicated(local: csr_array, first: int, dimension: int, comm: MPI.Intracom
     return csr_array(coo_array((values, (rows, columns)), shape=(dimension, local.shape[1])))
 
 
-# --- Words for motions of bodies --------------------------------------------------------------
+# --- Names of motions in messages -------------------------------------------------------------
 
 # Of the largest coefficient: a body that moves by less than this takes no part in a motion, which
 # is known to rounding only; and a motion is named after modes of this share or more, which leaves
@@ -426,7 +426,7 @@ def _spanning(vectors: Array, mode_names: Sequence[str]) -> list[str]:
     return [mode_names[m] for m in sorted(qr(vectors.T, pivoting=True, mode="r")[1][:count])]
 
 
-# --- A basis of the kernel of K in which the bodies' motions are coordinates of their own -----
+# --- Kernel basis with the bodies' motions as coordinates -------------------------------------
 
 # what holds a direction, in the order of the coordinates
 CONTACT, EQUALITIES, SPRINGS = 1, 2, 5
@@ -552,7 +552,7 @@ def independent(columns: Array) -> Array:
     return np.asarray(qr(columns.T, pivoting=True, mode="r")[1][: columns.shape[1]])
 
 
-# --- Free motions of bodies in kernel coordinates: an orthonormal basis of null(Gᵀ) -----------
+# --- Orthonormal basis of null(Gᵀ) ------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from tfeti_dolfinx.feti.rigid_bodies import (
     orthonormal_columns,
 )
 
-# --- Linear programs with rows on many ranks, of which few matter: cutting planes -------------
+# --- Cutting planes for distributed linear programs -------------------------------------------
 
 # Random directions in which the outermost rows are taken at first: enough for the corners of
 # patches; what they miss comes by and by.
@@ -141,7 +141,7 @@ def minimise(
             return y
 
 
-# --- Whether the multipliers can balance the load: Gλ = e with λ_N ≥ 0 ------------------------
+# --- Balance of the load by contact -----------------------------------------------------------
 
 # Least slope against a contact, of a motion of mean square 1, that counts as an overlap; the
 # tolerances of the linear programs are finer.
@@ -293,7 +293,7 @@ def minimiser(cost: Array, A: csr_array, **rest: Any) -> Array:
     raise TfetiError(f"a linear program of the solvability test failed: {found.message}")
 
 
-# --- Whether friction can hold the load: Gλ = e with all contact forces in their sets ---------
+# --- Balance of the load by contact and friction ----------------------------------------------
 
 # Cutting planes: far more programs than it takes; and what is left of the friction's work, as a
 # share of the load's, where a plane more says nothing new

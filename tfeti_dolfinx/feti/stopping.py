@@ -20,7 +20,7 @@ from tfeti_dolfinx.qp.problem import ConvergedReason
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
-# --- An iterate in physical terms: how far bodies move, and what its rows miss ----------------
+# --- Measures of an iterate in physical units -------------------------------------------------
 
 # of the largest forces on a kernel mode: those on a light one beside it count as so large at least,
 # since the rounding of the largest reaches them; and that rounding, which is nobody's to mend
@@ -220,7 +220,7 @@ def _balance(coarse: CoarseSpace, lam: PETSc.Vec) -> tuple[float, float]:
     return float(left[worst]), float(forces[worst])
 
 
-# --- How small the algebraic error has to be beside another one, in energy --------------------
+# --- Target of the algebraic error ------------------------------------------------------------
 
 # of the other error; of ‖u‖_K where that is more, as where there is no other error
 TENTH, FINEST = 0.1, 1e-6
@@ -261,7 +261,7 @@ class TargetStatus:
         return max(TENTH * self.goal, FINEST * self.energy)
 
 
-# --- The stopping rule: the displacement of each body is right --------------------------------
+# --- The stopping rule ------------------------------------------------------------------------
 
 # Differences that are rounding, in a body that hardly moves as well: of the largest displacement
 # of all bodies, or slip that friction counts from; of what its load does to its subdomains alone,

@@ -18,7 +18,7 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.transfer import CellExchange, cell_values, check_function, from_cell_values
 from tfeti_dolfinx.mesh.untorn import PhysicalNames
 
-# --- Tags and names that users give: do they belong to the mesh? ------------------------------
+# --- Checks of tags and names -----------------------------------------------------------------
 
 
 def check_tags(tags: Any, mesh: dmesh.Mesh, of_cells: bool, what: str, expected: str) -> None:
@@ -63,7 +63,7 @@ def checked_names(names: Any, what: str, tags: Any, tags_name: str) -> dict[str,
     return {name: int(tag) for name, tag in names.items()}
 
 
-# --- The torn mesh and what is known of its subdomains, bodies, tags and tears ----------------
+# --- The decomposition: torn mesh, subdomains, bodies, tags -----------------------------------
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.untorn import cell_entities, mix, set_key
 
-# --- Which function spaces fit a torn mesh, and which are the same ----------------------------
+# --- Function spaces on a torn mesh -----------------------------------------------------------
 
 
 def check_space(V: fem.FunctionSpace, decomposition: Decomposition) -> None:
@@ -80,8 +80,7 @@ def described(V: Any) -> str:
     return f"{kind} of degree {degree} with {V.dofmap.index_map_bs} unknowns per node"
 
 
-# --- What all torn copies of a node have in common: a key, and the rank of the lowest
-#     subdomain ---
+# --- Keys of nodes, common to all torn copies -------------------------------------------------
 
 
 def lowest_owners(comm: MPI.Intracomm, key: Array, subdomain: Array) -> Array:
@@ -129,8 +128,7 @@ def _place(V: fem.FunctionSpace, nodes: Array, corners: Array, ids: Array) -> Ar
     return mix((share * (1 + np.arange(share.shape[1]))).sum(axis=1).astype(np.uint64))
 
 
-# --- The one home of every dof map: DOLFINx's numbering, the subdomains', and the groups of
-#     copies ---
+# --- Dof maps: DOLFINx, primal and group numbering --------------------------------------------
 
 
 class TornDofs:

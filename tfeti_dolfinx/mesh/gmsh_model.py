@@ -18,7 +18,7 @@ from tfeti_dolfinx.common.validation import named, shown
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.untorn import PhysicalNames
 
-# --- One gmsh model as numpy arrays: elements in physical groups, names, nodes ----------------
+# --- Content of one gmsh model as arrays ------------------------------------------------------
 
 # what gmsh calls the physical groups that it makes for partitions
 PARTITION_GROUP = re.compile(r"_part\{\d+\}_physical\{(\d+)\}_dim\{(\d+)\}")
@@ -227,7 +227,7 @@ def _coordinates(model: Any, node_ids: Array) -> Array:
     return x.reshape(-1, 3)[order[np.searchsorted(ids, node_ids, sorter=order)]]
 
 
-# --- Names of the physical groups, merged over the models that ranks have read ----------------
+# --- Names of physical groups, merged over ranks ----------------------------------------------
 
 # dimension and tag of a physical group
 PhysicalGroup = tuple[int, int]

@@ -46,7 +46,7 @@ from tfeti_dolfinx.mesh.untorn import (
     set_key,
 )
 
-# --- gmsh's split files: one for each partition, each read on one rank ------------------------
+# --- Split files of gmsh ----------------------------------------------------------------------
 
 ONE_MODEL = "expected files that gmsh has written from one model with Mesh.PartitionSplitMeshFiles"
 # distance, relative to the size of the mesh, up to which a node's places are the same: files in
@@ -170,7 +170,7 @@ def check_shared(
             )
 
 
-# --- What gmsh models on any ranks hold, joined to one untorn mesh ----------------------------
+# --- Assembly of an untorn mesh from models on any ranks --------------------------------------
 
 # of the mesh's size: what rounding of coordinates leaves of a plane mesh's height
 FLAT = 1e-12
@@ -315,7 +315,7 @@ def _looked_up(keys: Array, known: Array, tags: Array) -> Array:
     return found
 
 
-# --- Meshes that gmsh made: physical groups, partitions, and the nodes' own numbers -----------
+# --- Meshes of gmsh: physical groups, partitions, node numbers --------------------------------
 
 
 def read_gmsh(

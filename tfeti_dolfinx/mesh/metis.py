@@ -15,7 +15,7 @@ from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.mesh.partition import absorb_fragments, without_holes
 from tfeti_dolfinx.mesh.untorn import UntornMesh, mix
 
-# --- Parts of round shape and equal size, made from parts of any shape ------------------------
+# --- Balanced k-means: parts of round shape and equal size ------------------------------------
 
 # points on a grid of so many bits: their sums and squares are exact, so no order decides
 BITS = 24
@@ -132,7 +132,7 @@ def _nearest(x: Array, part: Array, centre: Array, influence: Array) -> Array:
     return found
 
 
-# --- Flat interfaces of parts: cells join the part that surrounds them ------------------------
+# --- Smoothing of interfaces between parts ----------------------------------------------------
 
 # rounds in which cells change sides, half of those that want to
 ROUNDS = 10
@@ -197,7 +197,7 @@ def _largest(table: csr_array) -> tuple[Array, Array]:
     return np.minimum.reduceat(columns, table.indptr[:-1]).astype(np.int64), most
 
 
-# --- METIS parts of a mesh that lies on one rank, made round ----------------------------------
+# --- METIS partition on one rank --------------------------------------------------------------
 
 # of the facets that METIS cuts in a body: parts that cut more are not taken; those of boxes less
 # readily, since what is not cut along their layers is a staircase

@@ -17,7 +17,7 @@ from tfeti_dolfinx.common.validation import is_whole, named, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.untorn import UntornMesh, equal_pairs, facet_keys
 
-# --- Recursive coordinate bisection of distributed points, or of cells along their layers -----
+# --- Recursive coordinate bisection -----------------------------------------------------------
 
 # of the mean extent of a part's cells: midpoints that are farther apart are of different layers;
 # those of the simplices that a box is cut into are a third of it apart at most
@@ -195,7 +195,7 @@ def _kth_smallest(key: Array, part: Array, k: Array, comm: MPI.Intracomm) -> Arr
     return low
 
 
-# --- Facet-connected pieces of subdomains: a subdomain must have only one ---------------------
+# --- Facet-connected pieces of subdomains -----------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -290,7 +290,7 @@ def absorb_fragments(mesh: UntornMesh, subdomain: Array, comm: MPI.Intracomm) ->
     return joined[pieces.of_cell]
 
 
-# --- Which subdomain a cell belongs to --------------------------------------------------------
+# --- Assignment of cells to subdomains --------------------------------------------------------
 
 Subdomains = int | ArrayLike | Callable[[Array], ArrayLike]
 

@@ -19,7 +19,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.partition import absorb_fragments, bisect_points, split_disconnected
 from tfeti_dolfinx.mesh.untorn import NO_TAG, UntornMesh, cell_facets, equal_pairs, facet_keys
 
-# --- Which subdomains look equal but for a translation, before there is any stiffness ---------
+# --- Equality of subdomains up to a translation -----------------------------------------------
 
 # Of the size of a subdomain, in what is measured of its shape: less is rounding of coordinates,
 # more another shape. The root keeps regular grids, which are rational, off the middle between
@@ -130,7 +130,7 @@ def _sums(values: Array, subdomain: Array, num: int, comm: MPI.Intracomm) -> Arr
     return summed(comm, total)
 
 
-# --- Which rank a subdomain belongs to --------------------------------------------------------
+# --- Assignment of subdomains to ranks --------------------------------------------------------
 
 # Of the time and memory of a subdomain that has factors of its own: what one more costs that
 # shares them. 0.32 was measured for plane squares of 10 000 nodes, 0.26 for cubes of 2197.
@@ -266,7 +266,7 @@ def deal(weights: Array, centres: Array, num_ranks: int) -> Array:
     return ranks
 
 
-# --- Cells and their nodes travel to the rank of their subdomain ------------------------------
+# --- Redistribution of cells and nodes --------------------------------------------------------
 
 
 def redistribute(
@@ -317,7 +317,7 @@ def _send_nodes(mesh: UntornMesh, destination: Array, comm: MPI.Intracomm) -> tu
     return node_ids, exchange.send(mesh.x[node])[first]
 
 
-# --- Tearing: every subdomain gets vertices of its own ----------------------------------------
+# --- Tearing ----------------------------------------------------------------------------------
 
 log = logging.getLogger(__name__)
 

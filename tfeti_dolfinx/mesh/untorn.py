@@ -11,8 +11,7 @@ from dolfinx import mesh as dmesh
 
 from tfeti_dolfinx.common.arrays import Array
 
-# --- Keys by which the same facet or node is recognised in different cells, subdomains and
-#     ranks ---
+# --- Keys of facets and nodes -----------------------------------------------------------------
 
 NO_TAG = np.iinfo(np.int32).min
 
@@ -79,7 +78,7 @@ def cell_facets(mesh: dmesh.Mesh) -> Array:
     return facets[: mesh.topology.index_map(tdim).size_local]
 
 
-# --- The untorn mesh as it comes in: cells that lie on any rank, with original node ids -------
+# --- The untorn mesh --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

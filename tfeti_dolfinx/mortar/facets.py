@@ -17,7 +17,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mesh.untorn import cell_facets
 
-# --- Lagrange elements on facets, and which unknowns of a cell are those of its facets --------
+# --- Lagrange elements on facets --------------------------------------------------------------
 
 # vertices of a facet in the order of its polygon; DOLFINx numbers quadrilaterals as tensors
 POLYGON = {"interval": [0, 1], "triangle": [0, 1, 2], "quadrilateral": [0, 1, 3, 2]}
@@ -97,7 +97,7 @@ def facet_dofs(cell: str, degree: int, variant: Any) -> Array:
     return np.array(table)
 
 
-# --- Facets of contact surfaces, as they travel between ranks ---------------------------------
+# --- Facets of contact surfaces ---------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -274,7 +274,7 @@ def _normals(corners: Array, inside: Array) -> tuple[Array, Array]:
     return sign[:, None] * normal / np.where(length > 0.0, length, 1.0)[:, None], area
 
 
-# --- Maps from reference facets: points, areas, and back from a plane -------------------------
+# --- Maps of reference facets -----------------------------------------------------------------
 
 # Newton's method from the affine map: facets that are not folded take 3 or 4 steps. It ends at
 # rounding (of the facet's size); where it stalls above that, a point may still be as good as FAR.

@@ -22,7 +22,7 @@ from tfeti_dolfinx.mortar.facets import (
     reference_points,
 )
 
-# --- Orthonormal frames of contact nodes: a normal, then tangents -----------------------------
+# --- Orthonormal frames of contact nodes ------------------------------------------------------
 
 # |n_x| from which on the first tangent follows the y axis, not the x axis. By the hairy ball
 # theorem no choice of tangents is continuous everywhere; here the switch is where hardly a plane
@@ -91,7 +91,7 @@ def tangents(normal: Array) -> Array:
     return np.stack((first, np.cross(normal, first)), axis=1)
 
 
-# --- Which of several primary facets over one secondary facet it can meet ---------------------
+# --- Choice among primary facets over one secondary facet -------------------------------------
 
 # of a facet's size: distances closer than this are those of facets of one layer, apart by rounding
 SAME = 1e-9
@@ -163,7 +163,7 @@ def pairs_over_one_facet(s: Array, first: Array, second: Array) -> tuple[Array, 
     return np.repeat(first, count), ordered[np.repeat(start, count) + offset]
 
 
-# --- Which facets of two surfaces may meet: rendezvous of ranks, then a tree on each ----------
+# --- Search for pairs of facets ---------------------------------------------------------------
 
 # asked of a tree at first, and twice as many where that was not all: facets of one size class have
 # about 20 neighbours within their radii
@@ -299,7 +299,7 @@ def _within(tree: cKDTree, x: Array, radius: Array) -> tuple[Array, Array]:
     return tuple(np.concatenate(part) for part in zip(*found, strict=True))
 
 
-# --- Segments: where facets of two surfaces face each other, and quadrature points there ------
+# --- Segments and their quadrature points -----------------------------------------------------
 
 # Facets whose normals make a larger angle than about 88 degrees with each other do not face: seen
 # from the side they have no common part but slivers, and rounding must not decide.

@@ -11,7 +11,7 @@ from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.common.parallel import bcast_from_root, summed
 from tfeti_dolfinx.qp.sets import Face
 
-# --- The constraint Gλ = e as solvers see it: orthogonal projectors, on all rows or on a face ---
+# --- The coarse space of Gλ = e ---------------------------------------------------------------
 
 # of the largest forces on an equation: those on a light one beside it count as so large at least,
 # since the rounding of the largest reaches them
@@ -265,8 +265,7 @@ class DenseCoarse:
         """Nothing to free."""
 
 
-# --- Gλ = e where some multipliers follow others, as a Newton step on a law of friction sees
-#     it ---
+# --- Oblique projection of dependent multipliers ----------------------------------------------
 
 
 class Oblique(Protocol):

@@ -18,7 +18,7 @@ from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
 from tfeti_dolfinx.qp.recycling import RecycledOnFace, triangle
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
 
-# --- Generalised conjugate residuals: for operators that are not symmetric --------------------
+# --- Generalised conjugate residuals ----------------------------------------------------------
 
 # of Az: what earlier directions leave of it, less is rounding; and of the residual: what a
 # direction takes from it, or there is nothing to gain
@@ -136,8 +136,7 @@ class _GrowingBasis:
         self.count += 1
 
 
-# --- A law of friction as solvers see it: sets of tangential multipliers that grow with
-#     normals ---
+# --- Laws of friction -------------------------------------------------------------------------
 
 # what sticks for once is moved so far to the centre of its disc
 INSIDE = 0.5
@@ -222,7 +221,7 @@ class OnFace:
         return np.asarray(Z @ (self.face.curvature * (Z.T @ u).T).T)
 
 
-# --- What earlier solves with F tell a step of Newton's method on a law of friction -----------
+# --- Recycled directions of earlier solves ----------------------------------------------------
 
 # of the largest image of a direction: what others leave of one, less would be rounding
 NEW_DIRECTION = 1e-7
@@ -268,7 +267,7 @@ def keep(past: RecycledOnFace | None, x: Array, Fx: Array) -> None:
         past.known.add(x, Fx, energy)
 
 
-# --- Newton's method on a law of friction whose bounds move with the forces of normals --------
+# --- Newton's method on a law of friction -----------------------------------------------------
 
 # steps; and steps in a row without a residual below so much of the least one, before one gives up
 MOST_STEPS, PATIENCE, LESS = 80, 10, 0.98

@@ -23,7 +23,7 @@ from tfeti_dolfinx.qp.problem import (
 )
 from tfeti_dolfinx.qp.sets import Face
 
-# --- The norm of PFP, which step lengths are relative to --------------------------------------
+# --- Estimate of ‖PFP‖ ------------------------------------------------------------------------
 
 # an off-diagonal entry this small in units of the norm ends the method: the space is exhausted
 EXHAUSTED = 1e-12
@@ -77,8 +77,7 @@ def _size(diagonal: list[float], beside: list[float]) -> float:
     return max(diagonal) + max(beside[1:]) if diagonal else 0.0
 
 
-# --- Directions of conjugate gradients that are kept, so that rounding does not undo what
-#     they did ---
+# --- Store of conjugate directions ------------------------------------------------------------
 
 # of the largest curvature of a direction, and of what the preconditioner makes of a residual: less
 # is rounding, as where rows depend on each other
@@ -178,7 +177,7 @@ class Directions:
             vec.destroy()
 
 
-# --- Whether conjugate gradients still get anywhere -------------------------------------------
+# --- Detection of stagnation ------------------------------------------------------------------
 
 # so many steps in which neither ‖r‖ comes down to a half nor q by what stands out from its rounding
 # have met rounding: at that pace 10 000 steps would bring 6 digits at best; twice as many as there
@@ -220,7 +219,7 @@ class Plateau:
         return first
 
 
-# --- PCPG: preconditioned conjugate projected gradients, for programs without inequalities ----
+# --- PCPG: preconditioned conjugate projected gradients ---------------------------------------
 
 # of rᵀz, which is rᵀp as long as r is orthogonal to all directions before; else CG begins anew
 DRIFTED = 0.5

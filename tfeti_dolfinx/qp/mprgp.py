@@ -25,7 +25,7 @@ from tfeti_dolfinx.qp.problem import (
 )
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status, face_of
 
-# --- Steps of MPGP on curved sets: along the face with its tangents, and projected ones -------
+# --- Tangent and projected steps of MPGP ------------------------------------------------------
 
 # Conjugate gradients on a face: what they reduce the residual to, and most of them. One more
 # multiplication then brings the point back to the boundary. Measured on the cube of tresca_3d.py,
@@ -154,7 +154,7 @@ class _FaceGradients:
             vec.destroy()
 
 
-# --- Preconditioning in face: an approximate inverse on the free rows, 0 on the others --------
+# --- Preconditioning in face ------------------------------------------------------------------
 
 
 class MaskedPreconditioner:
@@ -235,7 +235,7 @@ def masked(qp: QP, rho: float) -> MaskedPreconditioner | None:
     return MaskedPreconditioner(qp.preconditioner_on, qp.coarse, rho, qp.d)
 
 
-# --- MPRGP, modified proportioning with reduced gradient projections; MPGP on curved sets -----
+# --- MPRGP and MPGP ---------------------------------------------------------------------------
 
 StoppingTest = Callable[["MprgpIterate"], bool]
 Expansion = Callable[["MprgpIterate", float, float, float], None]

@@ -41,7 +41,7 @@ from tfeti_dolfinx.qp.problem import (
 from tfeti_dolfinx.qp.projection import UNBALANCED, project_onto_feasible, project_or_least
 from tfeti_dolfinx.qp.sets import Face
 
-# --- The iterate of block Newton: what it lacks to be optimal, and which face it wants --------
+# --- The iterate: optimality and choice of the face -------------------------------------------
 
 # of Fλ − d: where Gᵀμ is nearly all of it, as where gaps are large, it is taken out of d
 MOST = 0.1
@@ -242,7 +242,7 @@ class NewtonIterate:
                 vec.destroy()
 
 
-# --- Where block Newton goes: a step is accepted where q falls enough -------------------------
+# --- Globalisation: acceptance of steps -------------------------------------------------------
 
 # of what the gradient step promises at least, (ᾱ/2)‖g^P‖²: a step must lower q by that share
 ENOUGH = 0.1
@@ -381,7 +381,7 @@ def _descend(state: NewtonIterate, known: bool, faces: FaceSolver) -> bool:
     return moved
 
 
-# --- Block Newton: faces of Ω one after the other, each by PCPG, with a cost that falls -------
+# --- Block Newton -----------------------------------------------------------------------------
 
 
 def first_point(qp: QP) -> PETSc.Vec:

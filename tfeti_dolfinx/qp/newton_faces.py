@@ -28,7 +28,7 @@ from tfeti_dolfinx.qp.problem import (
 from tfeti_dolfinx.qp.projection import WithinFace, project_onto_feasible, project_within_face
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status, without_slip
 
-# --- What solves on faces hand to the iterate of block Newton ---------------------------------
+# --- Result of solves on faces ----------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Trial:
         self.last.destroy()
 
 
-# --- Faces that are curved, as where nodes slip: what block Newton does there besides ---------
+# --- Curved faces -----------------------------------------------------------------------------
 
 # of Gλ = e: what is left after a first try to restore it, as where rows hardly hold, is worth a
 # second one
@@ -272,7 +272,7 @@ def brought_into(qp: QP, face: Face, z: Point) -> bool:
     return held
 
 
-# --- Faces without the directions along which they bend so hard that F has no say there -------
+# --- Faces without directions of very high curvature ------------------------------------------
 
 # times ‖F‖: a curvature that leaves F no say in where a force on a small circle points, as where
 # what slips goes far beside what deforms; conjugate gradients and P would see nothing but it
@@ -324,7 +324,7 @@ class FlattenedFace:
         return held
 
 
-# --- Rows of a face that depend on each other: ways along which F sees nothing ----------------
+# --- Dependent rows of a face -----------------------------------------------------------------
 
 # of ‖F‖: curvature of the way that a solve has gone; less is nearly none, and the way far
 LOOSE = 1e-8
@@ -519,7 +519,7 @@ class DependentRows:
         return float(self._comm.allreduce(own, op=MPI.MIN))
 
 
-# --- Solves on faces by PCPG, one after the other: the inner part of block Newton -------------
+# --- Solves on faces by PCPG ------------------------------------------------------------------
 
 # rows leave a face in so many rounds at most: each round drops one row at least, but most at once
 MOST_ROUNDS = 60

@@ -15,7 +15,7 @@ from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.recycling import RecycledOnFace
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet
 
-# --- The quadratic program that every solver gets, and what it gives back ---------------------
+# --- The quadratic program and its result -----------------------------------------------------
 
 
 class Operator(Protocol):
@@ -200,7 +200,7 @@ class Start:
     mu: Array
 
 
-# --- When a solver may stop: a cheap test in every step, and an examination where that holds ---
+# --- Stopping rules ---------------------------------------------------------------------------
 
 
 class StoppingRule(Protocol):
@@ -278,7 +278,7 @@ class TargetRule(ResidualRule):
         return ConvergedReason.CONVERGED_RTOL if small else ConvergedReason.ITERATING
 
 
-# --- Monitors: called once per step with what a solver knows anyway ---------------------------
+# --- Monitors ---------------------------------------------------------------------------------
 
 
 class Monitor(Protocol):

@@ -14,7 +14,7 @@ from scipy.sparse import csr_array, diags_array
 from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.errors import InputError
 
-# --- Faces: in which directions a point of a feasible set may move to both sides --------------
+# --- Faces ------------------------------------------------------------------------------------
 
 
 class Status(IntEnum):
@@ -115,7 +115,7 @@ def face_of(free: Array, status: Array) -> Face:
     return Face(Z, np.zeros(k), status)
 
 
-# --- Closed convex sets that are products of small ones: bounds now, discs and ellipses later ---
+# --- Feasible sets ----------------------------------------------------------------------------
 # A set knows its own rows of this rank as numpy arrays, nothing of ranks and other rows: solvers
 # add up over ranks, ``Product`` puts sets on rows. Nothing here is collective.
 
@@ -294,7 +294,7 @@ def _joined(faces: Sequence[tuple[Array, Face]], status: Array) -> Face:
     return Face(Z, np.concatenate([face.curvature for _, face in faces]), status)
 
 
-# --- Discs and ellipses of multipliers: intervals in the plane, sets of friction on surfaces ---
+# --- Discs and ellipses -----------------------------------------------------------------------
 
 # Of the boundary's distance from the centre: what is so near to the boundary is on it. Projections
 # come within a few roundings of it; those of λ − λ̄ within as many of the centre, −λ̄.

@@ -20,7 +20,7 @@ from tfeti_dolfinx.qp.problem import (
     no_monitor,
 )
 
-# --- What SMALSE-M is made of: its operator, the precision of inner problems and their end ----
+# --- Operator and inner problems of SMALSE-M --------------------------------------------------
 
 # of the Lagrangian: what its value may be wrong by
 ROUNDING = 1e-14
@@ -151,7 +151,7 @@ class InnerTest:
         self._lam.destroy()
 
 
-# --- SMALSE-M: semimonotonic augmented Lagrangians for separable and equality constraints -----
+# --- SMALSE-M ---------------------------------------------------------------------------------
 
 
 def smalse(

@@ -31,7 +31,7 @@ from tfeti_dolfinx.qp.sets import Face, FeasibleSet
 from tfeti_dolfinx.solve.dilation import Anderson, DeSaxceIteration, cone_set
 from tfeti_dolfinx.solve.solver import learn, solve_dual
 
-# --- The forces of normals that Coulomb's law takes its bounds from, and the next ones to try ---
+# --- Friction bounds and their iteration ------------------------------------------------------
 
 # of all multipliers, or of those that make what drives the problem: forces of normals that rounding
 # makes of none; as bounds they would be discs whose boundaries bend so much that nothing else is
@@ -320,7 +320,7 @@ def _largest(values: Array) -> tuple[float, int]:
     return float(values[at]) if at >= 0 else 0.0, at
 
 
-# --- Newton's method on Coulomb's law, from a solution of a problem with given bounds ---------
+# --- Newton's method on Coulomb's law ---------------------------------------------------------
 
 # how often it may end and its bounds not be at rest; the factor on its target each time, and at
 # least on its residual; of ‖F‖‖λ‖: what rounding leaves of that
@@ -447,8 +447,7 @@ class NewtonOnCoulomb:
         return Law(bounded, constraints.pressed_by[at], constraints.sets.tangents[at])
 
 
-# --- Coulomb's law: problems with given bounds of friction, the next ones from Newton's
-#     method ---
+# --- Solve with Coulomb's law -----------------------------------------------------------------
 # Or, where that is not wanted or fails, from a fixed point iteration.
 
 # Inner tolerance: rtol of the first step, and share of the last change of the bounds. Forces are

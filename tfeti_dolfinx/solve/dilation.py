@@ -18,7 +18,7 @@ from tfeti_dolfinx.qp.newton import newton
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, ResidualRule, Start
 from tfeti_dolfinx.qp.sets import Bounds, Ellipses, Face, Product, Status, reduced_by
 
-# --- Anderson's acceleration of a fixed point iteration x ← Φ(x) in x ≥ 0 ---------------------
+# --- Anderson acceleration --------------------------------------------------------------------
 
 # Steps that are remembered: one, which makes it the crossed secant method. More of them mix
 # values of Φ on several faces, each inexact, and took up to twice as many steps.
@@ -79,8 +79,7 @@ class Anderson:
         return np.asarray(dimage @ gamma)
 
 
-# --- Coulomb's cone: tangential entries in an ellipse whose semi-axes grow with the normal
-#     entry ---
+# --- Coulomb's cone ---------------------------------------------------------------------------
 
 # halvings of an interval of length 1: down to rounding
 HALVINGS = 60
@@ -284,7 +283,7 @@ def _columns(parts: list[tuple[Array, Array]], size: int) -> csr_array:
     return csr_array((np.concatenate(value), places), shape=(size, start))
 
 
-# --- Coulomb's law by gaps that grow with slips: De Saxcé's fixed point -----------------------
+# --- De Saxcé's fixed point -------------------------------------------------------------------
 
 # Of the first residual, and of the last change of the slips: what a problem is solved to
 FIRST, SHARE = 1e-4, 1e-3

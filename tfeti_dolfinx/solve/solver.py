@@ -38,8 +38,7 @@ from tfeti_dolfinx.qp.problem import (
 from tfeti_dolfinx.qp.recycling import Recycled
 from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver, Task
 
-# --- More digits where rounding has ended a solve: what its answer lacks is solved for and
-#     added ---
+# --- Iterative refinement ---------------------------------------------------------------------
 
 # of the worst error: what a round has to bring, or there is no other; and of the displacement: an
 # answer that is as wrong as that has no digits to add some to
@@ -156,7 +155,7 @@ def last_look(result: QPResult, rule: Accuracy) -> None:
         result.reason = reason
 
 
-# --- The solver that the options choose, run on a dual problem --------------------------------
+# --- Choice and run of a solver ---------------------------------------------------------------
 
 # directions that are kept where more solves come and options do not say how many
 REPEATED = 100

@@ -35,7 +35,7 @@ from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
 from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
-# --- Energies of bodies with mass, and what was done to them in a step ------------------------
+# --- Energies and work of a step --------------------------------------------------------------
 
 NAMES = ("load", "contact", "friction", "supports", "predictor")
 
@@ -98,8 +98,7 @@ def contact_forces(solution: Solution) -> list[list[float]]:
     return [[float(value) for value in row] for row in total]
 
 
-# --- Where bodies with mass may be without elasticity: the nearest place in M that contact
-#     allows ---
+# --- Predictor: projection in M onto admissible displacements ---------------------------------
 
 
 class Predictor:
@@ -231,7 +230,7 @@ def _frictionless(constraints: Constraints) -> FeasibleSet:
     return Product([(sets.normals, Bounds()), (sets.tangents.ravel(), Discs(none, width))])
 
 
-# --- Contact of bodies with mass: Newmark's trapezoidal rule, plain or contact-stabilised -----
+# --- Newmark's method with contact ------------------------------------------------------------
 
 
 class ContactDynamics(ContactProblem):

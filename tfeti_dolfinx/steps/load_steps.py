@@ -34,7 +34,7 @@ from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.steps.checkpoint import Checkpoint
 
-# --- Where a series of load steps is, whose steps are halved where they do not converge -------
+# --- Place in a series of halved steps --------------------------------------------------------
 
 # whole numbers of the smallest parts are exact in a double, and parts of any real step differ
 MOST_HALVINGS = 30
@@ -102,7 +102,7 @@ def checked_times(begin: float, times: Sequence[float]) -> list[float]:
     return found
 
 
-# --- A bar on rank 0's terminal while a series of load steps runs; elsewhere nothing ----------
+# --- Progress bar -----------------------------------------------------------------------------
 
 # called with the share of the series that is done and a few words
 Show = Callable[[float, str], None]
@@ -140,7 +140,7 @@ def _say(share: float, text: str) -> None:
     print(f"load steps {100 * share:3.0f} %: {text}", file=sys.stderr, flush=True)
 
 
-# --- All load steps in one file that ParaView animates; it appears whole ----------------------
+# --- Output of all load steps in one file -----------------------------------------------------
 
 POINTS = "points of the mesh"
 
@@ -252,8 +252,7 @@ def _copy(function: fem.Function) -> fem.Function:
     return fem.Function(function.function_space, name=function.name)
 
 
-# --- A series of load steps: solved, shown, written, kept, and halved where one does not
-#     converge ---
+# --- The series of load steps -----------------------------------------------------------------
 
 Apply = Callable[[ContactProblem, float], None]
 

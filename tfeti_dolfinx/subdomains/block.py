@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.validation import check_load
 
-# --- What a Block is made from, and what Blocks have cost -------------------------------------
+# --- Input and counters of Blocks -------------------------------------------------------------
 
 
 @dataclass
@@ -60,7 +60,7 @@ class SubdomainData:
         return len(self.f) // max(len(self.x), 1)
 
 
-# --- Kernels of subdomain stiffnesses, found among candidate modes ----------------------------
+# --- Kernels of subdomain stiffnesses ---------------------------------------------------------
 
 # Energy of a mode, as a share of what its terms may be without their signs, that counts as none:
 # rounding makes 2e-16 of it, a spring of 1e-10 of the stiffness 1e-14 and more.
@@ -185,7 +185,7 @@ def fixing_dofs(x: Array, node_of_dof: Array) -> Array:
     return np.flatnonzero(np.isin(node_of_dof, chosen))
 
 
-# --- The Block: all that the dual knows of a subdomain ----------------------------------------
+# --- The Block --------------------------------------------------------------------------------
 
 OperatorKind = Literal["pinv", "stiffness", "schur"]
 

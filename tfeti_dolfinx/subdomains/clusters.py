@@ -27,7 +27,7 @@ from tfeti_dolfinx.subdomains.local_operators import (
 )
 from tfeti_dolfinx.subdomains.subdomains import BALANCED, Subdomains
 
-# --- Clusters of subdomains, and the averages over common faces that glue those of each -------
+# --- Clusters of subdomains and averages over their faces -------------------------------------
 
 # Of the largest singular value of the modes of a face: less is no motion of its own (an edge has
 # no turn about itself); and of an average's square, what is left of it beside the others.
@@ -263,7 +263,7 @@ def _independent(averages: csr_array, rows: Array) -> Array:
     return np.sort(rows[pivots[:rank] - 1])
 
 
-# --- What averages make of the generalised inverses of a rank's subdomains, see ``clusters`` ---
+# --- Generalised inverses under averages ------------------------------------------------------
 
 
 class Glue:
@@ -382,8 +382,7 @@ def _scales(F: Array, G: Array) -> tuple[Array, Array]:
     return mu, np.where(size > 0.0, size, 1.0) ** -0.5
 
 
-# --- Subdomains of a rank in clusters: one kernel for each, K⁺ with its subdomains glued by
-#     averages ---
+# --- Subdomains of a rank in clusters ---------------------------------------------------------
 # Hybrid TFETI: Klawonn, Rheinbach, Z. Angew. Math. Mech. 90 (2010) 5–32. In a cluster u minimises
 # ½uᵀKu − bᵀu under B_c u = 0:
 #

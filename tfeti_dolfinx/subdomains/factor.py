@@ -17,7 +17,7 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import is_read
 from tfeti_dolfinx.errors import FactorError
 
-# --- Sparse Cholesky factors through PETSc: CHOLMOD, or what this PETSc has in its place ------
+# --- Sparse Cholesky factors ------------------------------------------------------------------
 
 log = logging.getLogger(__name__)
 
@@ -300,7 +300,7 @@ def _cause(error: Exception, solver: str | None, A: PETSc.Mat) -> FactorError:
     return FactorError(f"{solver} failed: {str(error).strip().splitlines()[-1]}")
 
 
-# --- What a generalised inverse of a stiffness is asked for -----------------------------------
+# --- Protocol of a generalised inverse --------------------------------------------------------
 
 
 class GeneralisedInverse(Protocol):

@@ -25,7 +25,7 @@ from tfeti_dolfinx.subdomains.factor import (
     lent,
 )
 
-# --- Generalised inverses by the Schur complement on a few unknowns, and two choices of these ---
+# --- Generalised inverses by a Schur complement -----------------------------------------------
 
 # Of the mean size of a motion: one that is less on the last unknowns leaves a pivot of 1e-8 before
 # them, which counts as none.
@@ -155,7 +155,7 @@ def _apart(K: Any, s: Array) -> AbstractContextManager[None]:
     return lent(K.data, np.flatnonzero(coupled), 0.0)
 
 
-# --- Generalised inverses of a subdomain's stiffness ------------------------------------------
+# --- Choice of generalised inverse ------------------------------------------------------------
 
 # of the largest entry of a kernel: rounding
 STILL = 1e-8
@@ -279,7 +279,7 @@ class InverseFactory:
     prefix: str = "tfeti_sub_"
 
 
-# --- Why a stiffness is not positive definite beside its kernel: by rounding, or by its form ---
+# --- Causes of indefinite stiffnesses ---------------------------------------------------------
 
 # Of the diagonal: what this makes positive definite was indefinite by rounding only, which in
 # assembly and factor comes to 1e-14 or so.

@@ -22,7 +22,7 @@ from tfeti_dolfinx.subdomains.stiffness import (
     made_dense,
 )
 
-# --- What local operators cost, by a model, to choose between them ----------------------------
+# --- Cost model of local operators ------------------------------------------------------------
 
 # What one core of a few years ago does; of a faster one all times are shorter alike, and only their
 # ratios choose. Bytes read from memory, and operations of sweeps over a factor and of dense
@@ -90,7 +90,7 @@ def dense_traffic(t: int, count: int) -> float:
     return REAL * (t * t + 4.0 * t * count)
 
 
-# --- K⁺, K_bb and S on a trace as matrices that are applied through factors -------------------
+# --- K⁺, K_bb and S on a trace, applied through factors ---------------------------------------
 
 # Of the stiffness of a node: what K⁺ makes of forces of size 1 on a sound subdomain stays far below
 # it. Above it, where springs or soft parts hardly hold a subdomain, the parts of K⁺ w that cancel
@@ -299,7 +299,7 @@ def _made(matrix: TraceMatrix, packed: bool) -> Packed | SymmetricMatrix:
     return Packed(A) if packed else SymmetricMatrix(A)
 
 
-# --- Groups of Blocks that apply one matrix, each to its own part of it -----------------------
+# --- Groups of Blocks with one matrix ---------------------------------------------------------
 
 
 class Group:
@@ -488,7 +488,7 @@ def _group(blocks: Sequence[Block], kind: OperatorKind, parts: Sequence[slice]) 
     return Group(matrix, [np.searchsorted(trace, place) for place in places], parts)
 
 
-# --- Local operators: K⁺, K_bb or S of all subdomains of a rank at once, on its trace ---------
+# --- Local operators of all subdomains of a rank ----------------------------------------------
 
 LOCAL_TYPES = ("auto", "implicit", "explicit", "shared")
 

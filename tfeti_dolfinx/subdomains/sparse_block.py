@@ -22,7 +22,7 @@ from tfeti_dolfinx.subdomains.block import (
 from tfeti_dolfinx.subdomains.kplus import InverseFactory, same_pattern
 from tfeti_dolfinx.subdomains.stiffness import Stiffness, Traced
 
-# --- Subdomains that are equal but for a translation share their stiffness and its factors ----
+# --- Equal subdomains -------------------------------------------------------------------------
 
 # Of the size of a subdomain: nodes nearer than that have the same place. Which nodes are meant
 # is all that it decides, so it is far below a cell and far above rounding of coordinates; the
@@ -106,7 +106,7 @@ def _equal(K: Any, other: Stiffness, here: Array) -> bool:
     return bool(np.abs((moved - other.K).data).max(initial=0.0) <= allowed)
 
 
-# --- Whether what is added to a stiffness holds motions firmly --------------------------------
+# --- Firmness of additions to the diagonal ----------------------------------------------------
 
 # of the largest diagonal entry of K: an energy of a motion of length 1 that is rounding, and one
 # from which on the motion is held as firmly as others bend
@@ -130,7 +130,7 @@ def holds_firmly(modes: Array, added: Array, diagonal: Array) -> bool:
     return not np.any((energies > NOTHING * most) & (energies < FIRM * most))
 
 
-# --- A subdomain of sparse finite elements ----------------------------------------------------
+# --- Block of sparse finite elements ----------------------------------------------------------
 
 # between projectors: less is rounding
 SAME_DIRECTION = 1e-9

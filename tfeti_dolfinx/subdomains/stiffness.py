@@ -92,7 +92,7 @@ def made_dense(apply: Callable[[Array], Array], size: int, together: int) -> Arr
     return np.asarray(A)
 
 
-# --- K_bb and the Schur complement S of a stiffness on a trace --------------------------------
+# --- K_bb and the Schur complement S on a trace -----------------------------------------------
 
 # Of the largest singular value of the kernel's trace rows, orthonormal columns of which these are
 # a part: below it a motion is as good as 0 on the trace. K_ii resists it by the square of that,
@@ -253,7 +253,7 @@ class Traced:
         return np.setdiff1d(np.arange(self._K.shape[0]), self.trace, assume_unique=True)
 
 
-# --- The stiffness of a subdomain, or of all that are equal, and what is made of it once ------
+# --- Stiffness of one subdomain, or of equal ones ---------------------------------------------
 
 
 class Stiffness:

@@ -20,7 +20,7 @@ from tfeti_dolfinx.subdomains.local_operators import (
     solved_together,
 )
 
-# --- Motions of subdomains that are no kernel, since something holds them, maybe softly -------
+# --- Motions of subdomains that springs hold --------------------------------------------------
 
 # of a mode of length 1: what is left of it outside of the kernel is rounding
 IN_KERNEL = 1e-6
@@ -70,7 +70,7 @@ def _outside_motions(block: Block) -> tuple[Array, Array]:
     return U @ V, np.maximum(energies, 0.0)
 
 
-# --- All subdomains of a rank as one: what the dual asks of Blocks, on arrays of the rank -----
+# --- All subdomains of a rank -----------------------------------------------------------------
 
 # Of ‖f‖: what the load of a subdomain does to rigid motions, which have unit norm. Ten times less
 # was found where it balances itself; more is a load that moves the subdomain.
