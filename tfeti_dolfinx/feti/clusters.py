@@ -152,9 +152,9 @@ def _blocks(A: PETSc.Mat, cluster: Array) -> csr_array:
 
 # --- Coarse space of subdomain motions within clusters ----------------------------------------
 # In clusters G = R̃ᵀBᵀ knows whole clusters only, and M_f, which moves one subdomain at a time,
-# is far stiffer than a cluster: what jumps all over a cluster's side costs it as many faces as
-# there are, the cluster one smooth displacement. With Ĝ = R̂ᵀBᵀ, R̂ the rigid motions of all
-# subdomains, those take over what they can of a jump, as they do by P without clusters.
+# is far stiffer than a cluster: a jump along a whole side of a cluster costs M_f energy on each
+# face of its subdomains, but the cluster only one smooth displacement. Ĝ = R̂ᵀBᵀ, R̂ the rigid
+# motions of all subdomains, takes that part of a jump, as P does without clusters.
 
 # relative, added to the diagonal: motions of whole clusters that no row of a face holds
 FREE = 1e-12

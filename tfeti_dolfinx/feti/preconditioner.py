@@ -148,7 +148,7 @@ class Smoothing:
         out[self._trace :] = 0.0
 
     def _top(self) -> float:
-        """At least the largest eigenvalue of D⁻¹K, as nearly as is of use. Collective."""
+        """Bound the largest eigenvalue of D⁻¹K from above. Collective."""
         with raised_on_all_ranks(self._comm):
             top = _largest_eigenvalue(self._apply, self._weights)
         return self._largest(top)
@@ -159,7 +159,7 @@ class Smoothing:
 
 
 def _largest_eigenvalue(apply: Callable[[Array, Array], None], weights: Array) -> float:
-    """At least that of D⁻¹K on this rank."""
+    """Bound the largest eigenvalue of D⁻¹K on this rank from above."""
     size, root = len(weights), np.sqrt(weights)
 
     def scaled(x: Array) -> Array:
@@ -177,7 +177,7 @@ def _largest_eigenvalue(apply: Callable[[Array, Array], None], weights: Array) -
 
 
 def chebyshev(count: int, low: float, high: float) -> list[tuple[float, float]]:
-    """Steps d ← a d + b r, u ← u + d, that make what has eigenvalues in an interval small.
+    """Return coefficients of Chebyshev steps d ← a d + b r, u ← u + d, for an interval.
 
     Args:
         count: Their number, at least 1.

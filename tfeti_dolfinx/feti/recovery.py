@@ -94,7 +94,7 @@ def bent(B: PETSc.Mat, subdomains: Subdomains, lam: PETSc.Vec, pinv_load: Array)
 
 
 def without_rigid_motions(subdomains: Subdomains, u: Array) -> Array:
-    """u less its motions, u − R Rᵀu, shape ``(n,)``; twice, since these may be far larger."""
+    """Return u − R Rᵀu, shape ``(n,)``; projected twice, as rigid motions may be far larger."""
     for _ in range(2):
         u = u - subdomains.kernel_motion(subdomains.kernel_part(u))
     return u
@@ -242,7 +242,7 @@ def _seen(coarse: CoarseSpace, N: csr_array) -> csr_array:
 
 
 def _rows(coarse: CoarseSpace, A: csr_array, gap: Array, force: Array, body: Array) -> CutRows:
-    """A y ≤ gap on open rows; |gap − A y| no larger on others than it is anywhere."""
+    """Set up A y ≤ gap on open rows, |gap − A y| on others no larger than it is anywhere."""
     bounded = np.zeros(len(gap), dtype=bool)
     bounded[coarse.bounded] = True
     closed = ~bounded | force
@@ -254,7 +254,7 @@ def _rows(coarse: CoarseSpace, A: csr_array, gap: Array, force: Array, body: Arr
 
 
 def _nearest(A: csr_array, b: Array, wanted: Array) -> Array:
-    """The point of A y ≤ b that is nearest to the one wanted, by parts that do not meet."""
+    """Project ``wanted`` onto A y ≤ b, separately for parts that do not meet."""
     y = wanted.copy()
     if A.shape[0] == 0:
         return y

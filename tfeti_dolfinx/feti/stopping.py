@@ -285,8 +285,8 @@ FIRST_LOOK = 0.5
 # asks for it, which follows residuals; it never falls by more than LEAP at once, since the size of
 # the displacement may have been learnt from a poor iterate
 AIM, AIM_AT_BOUND, LEAP = 0.5, 1.0, 1e-6
-# a true residual that fell by fewer digits than this share of those that the solver's own fell by
-# has stalled: once, and the gradient is made anew; twice, and rounding has the last word
+# the true residual has stalled if the digits it fell by are less than this share of those that the
+# updated one fell by; the gradient is then computed anew, and the second time the solve ends
 STALL = 0.5
 # of what rounding leaves of a residual: nothing comes down to that
 OUT_OF_REACH = 1e-4
@@ -365,7 +365,7 @@ class Accuracy:
 
     @property
     def aim(self) -> float:
-        """The tolerance; 0 before a first look at a goal, which is dearer than a step or two."""
+        """The tolerance; 0 before the first assessment against a target, which is costly."""
         return 0.0 if self.goal is not None and self.looks == 0 else self.tolerance
 
     def look(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float) -> Measures:

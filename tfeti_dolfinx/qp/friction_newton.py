@@ -41,11 +41,11 @@ class KrylovBasis:
 
     @staticmethod
     def nothing(like: Array) -> KrylovBasis:
-        """None, of vectors like one."""
+        """Return an empty basis of vectors like one."""
         return KrylovBasis(*(np.zeros((0, len(like))) for _ in range(3)))
 
     def without(self, c: Array, q: Array, z: Array, w: Array) -> tuple[Array, Array, Array]:
-        """A direction with its Az and image, less such parts of those that are known."""
+        """Orthogonalise a direction with its Az and image against the basis."""
         return q - c @ self.Q, z - c @ self.Z, w - c @ self.images
 
 
@@ -206,17 +206,17 @@ class OnFace:
     p: Array
 
     def followed(self, u: Array) -> Array:
-        """(I + C)u, shapes ``(m,)`` or ``(m, q)``."""
+        """Return (I + C)u, shapes ``(m,)`` or ``(m, q)``."""
         return np.asarray(u + self.C @ u)
 
     def entered(self, lam: Array) -> Array:
-        """λ with what is open or slips where p has it; what follows does so."""
+        """Return λ with open and slipping entries set to those of p, coupled ones following."""
         held = np.isin(self.face.status, (Status.OPEN, Status.SLIP))
         follows = np.diff(self.C.indptr) > 0
         return np.where(follows, self.C @ lam, np.where(held, self.p, lam))
 
     def bend(self, u: Array) -> Array:
-        """Z diag(κ) Zᵀu, shapes ``(m,)`` or ``(m, q)``."""
+        """Return Z diag(κ) Zᵀu, shapes ``(m,)`` or ``(m, q)``."""
         Z = self.face.Z
         return np.asarray(Z @ (self.face.curvature * (Z.T @ u).T).T)
 
@@ -259,7 +259,7 @@ def known_on(
 
 
 def keep(past: RecycledOnFace | None, x: Array, Fx: Array) -> None:
-    """Keep a direction that was gone, of Gx = 0, with what F makes of it. Collective."""
+    """Store a search direction x, Gx = 0, with Fx. Collective."""
     if past is None:
         return
     energy = bcast_from_root(past.known.comm, float(summed(past.known.comm, np.array([x @ Fx]))[0]))
@@ -284,10 +284,10 @@ MOST_DIRECTIONS = 80
 # what a solve leaves of its residual: less where the last step has brought that far down; of the
 # target: no solve leaves less
 SHARE, FOLLOWED, FINAL = 0.3, 0.3, 0.3
-# of the target: what F makes of a way onto a face that is too short to be multiplied
+# relative to the target: ‖F‖‖p‖ of a correction p onto a face below which Fp is not computed
 UNSEEN = 0.1
-# of the residual: what the way may be at most for a direction beside it, which does not know what
-# F makes of the way
+# relative to the residual: ‖F‖‖p‖ of that correction up to which a search direction is added to it
+# for the same multiplication; the direction is chosen before Fp is known
 BESIDE = 2.0
 # times ‖F‖: directions that bend more are turned by the projection alone
 HARD = 10.0
@@ -308,7 +308,7 @@ class LawPoint:
     mu: Array
 
     def towards(self, other: LawPoint, length: float) -> LawPoint:
-        """The point so far along the way to another one."""
+        """Return the point at this share of the way to another one."""
         if length == 1.0:
             return other
         ends = (self.lam, other.lam), (self.s, other.s), (self.mu, other.mu)
@@ -328,7 +328,7 @@ class SlipReversal:
         self._to: Array = np.zeros(law.tangents.shape)
 
     def face(self, feasible: FeasibleSet, p: Array, s: Array) -> tuple[Array, Face]:
-        """p and its face under s; what slipped the other way a step ago sticks."""
+        """Return p and its face under s; points whose slip has just reversed stick."""
         law, face, to = self._law, feasible.face(p, s), p[self._law.tangents]
         turned = law.slips(face) & self._slips & (np.sum(to * self._to, axis=1) < 0.0)
         if np.any(turned):
@@ -399,7 +399,7 @@ def newton_on_law(
 
 
 def _searched(qp: QP, law: Law, at: LawPoint, end: LawPoint, norm: float, most: float) -> LawPoint:
-    """The farthest of the whole step, half of it, … that does not raise the residual.
+    """Halve the step until it does not raise the residual.
 
     Where F is known of both ends, it is on all of the way: nothing is multiplied.
     """
@@ -550,7 +550,7 @@ class _System:
         return at
 
     def _solve(self, size: float) -> GCRResult:
-        """Bring the residual down to a size; without one by known directions alone."""
+        """Reduce the residual to a size; without a size by known directions alone."""
         b, known = self._left(), self._known
         gone = gcr(self._apply, self._precondition, b, size, MOST_DIRECTIONS, self._comm, known)
         self._go(gone.u, gone.image)
@@ -561,7 +561,7 @@ class _System:
         self._s = self._s + image
 
     def _left(self) -> Array:
-        """The residual."""
+        """Return the residual."""
         return -self._oblique.project(self._s + self._on.bend(self._u))
 
     def _apply(self, z: Array) -> tuple[Array, Array]:

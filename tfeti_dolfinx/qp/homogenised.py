@@ -21,7 +21,7 @@ ROUNDING, STRANGE = 1e-14, 1e8
 
 @dataclass(frozen=True)
 class OperatorProduct:
-    """A vector and what F makes of it, so that F need not be asked again.
+    """Vector x with the product Fx.
 
     Attributes:
         x: The vector.
@@ -47,7 +47,7 @@ def operator_product(F: Operator, x: PETSc.Vec) -> OperatorProduct:
 
 
 class LastProduct:
-    """The last solution of a program, and what F makes of it."""
+    """Last solution x of a program, with the product Fx."""
 
     def __init__(self) -> None:
         nothing: Array = np.zeros(0)
@@ -72,7 +72,7 @@ class LastProduct:
         by_mu.destroy()
 
     def pass_on(self, x: Array, Fx: Array, within: float) -> None:
-        """Take what another solver has come to; it stands for what is so near to it, too."""
+        """Store another solver's x and Fx, to stand for all vectors within this distance."""
         self._x, self._Fx, self._within = x, Fx, within
 
     def known(self, comm: MPI.Intracomm, x: Array) -> Array:
@@ -81,7 +81,7 @@ class LastProduct:
         return np.array(self._Fx) if found else np.zeros(0)
 
     def take(self, comm: MPI.Intracomm, x: Array, Fx: Array) -> None:
-        """Take what ``known`` has returned in another run. Collective."""
+        """Restore what ``known`` has returned in another run. Collective."""
         if any_rank(comm, Fx.size > 0):
             self._x, self._Fx = x, Fx
 

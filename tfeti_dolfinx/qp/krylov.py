@@ -73,7 +73,7 @@ def estimate_norm(F: Operator, coarse: Coarse, like: PETSc.Vec, steps: int = 15)
 
 
 def _size(diagonal: list[float], beside: list[float]) -> float:
-    """Size of the entries so far; 0 before the first step, whose vector may have any length."""
+    """Return the size of the entries so far; 0 before the first step."""
     return max(diagonal) + max(beside[1:]) if diagonal else 0.0
 
 
@@ -107,7 +107,7 @@ class Conjugates:
         self._count = 0
 
     def clear(self) -> None:
-        """Forget them."""
+        """Drop all directions."""
         self._count = 0
 
     @property
@@ -124,7 +124,7 @@ class Conjugates:
         z -= (products / self._pFp[: self.number]) @ self._p[: self.number]
 
     def keep(self, p: Array, PFp: Array, pFp: float) -> None:
-        """Keep another one, in the place of the oldest if there are too many."""
+        """Store another direction, in the place of the oldest if there are too many."""
         at = self._count % self._most
         if at == len(self._pFp):
             more = min(max(len(self._pFp), 8), self._most - len(self._pFp))
@@ -198,7 +198,7 @@ class Plateau:
         self._best, self._steps, self._gain, self._restarted = norm, 0, 0.0, False
 
     def step(self, norm: float, gain: float) -> None:
-        """A step has lowered q by so much, and ends with that ‖r‖."""
+        """Record a step that lowers q by ``gain`` and ends with ‖r‖ = ``norm``."""
         self._steps, self._gain = self._steps + 1, self._gain + gain
         if norm <= 0.5 * self._best:
             self._best, self._steps, self._gain, self._restarted = norm, 0, 0.0, False
@@ -406,7 +406,7 @@ def solve_by_pcpg(
 def _with_new_gradients(
     qp: QP, point: Point, rule: StoppingRule, steps: Steps, max_it: int, monitor: Monitor
 ) -> ConvergedReason:
-    """PCPG, which begins anew where directions end, as long as that brings a digit. Collective.
+    """Run PCPG, restarted where directions end as long as that gains a digit. Collective.
 
     Rounding of g at a λ that bends subdomains much farther than the solution does may end them.
     """
@@ -432,7 +432,7 @@ def _examined(qp: QP, point: Point, rule: StoppingRule, norm: float) -> Converge
 
 
 def _begun(qp: QP, point: Point, own: Directions) -> float:
-    """Go where q is least along directions of earlier solves; make r there. Its norm."""
+    """Minimise q over directions of earlier solves; compute r there, and return ‖r‖."""
     norm = _residual(qp, point.g, own.r)
     past = qp.recycled
     if past is not None and past.go(point.lam, point.g, own.r, qp.coarse.project):

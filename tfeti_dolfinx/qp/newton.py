@@ -55,7 +55,7 @@ LOST, FAR = 2e-15, 1e3
 
 
 class NewtonIterate:
-    """A feasible point, with what it lacks to be optimal.
+    """Feasible iterate with its optimality residuals.
 
     Args:
         qp: The program.
@@ -194,12 +194,12 @@ class NewtonIterate:
         return bcast_from_root(self.comm, self.idle >= PATIENCE or self.slow >= LONG)
 
     def take(self, to: Point, gain: float) -> None:
-        """Go there; a gain that stands out from the rounding of q is worth more steps."""
+        """Move to a point where q is lower by ``gain``."""
         self.went_down(gain)
         self.point.take(to)
 
     def went_down(self, gain: float) -> None:
-        """See whether q came down by what is no rounding of it."""
+        """Reset the count of idle steps if q falls by more than its rounding."""
         sizes = abs(self.point.lam.dot(self.point.g)) + abs(self.point.lam.dot(self.qp.d))
         if gain > (0.0 if self.residual > FAR * self.rounding else ROUNDING * sizes):
             self.idle = 0
@@ -216,7 +216,7 @@ class NewtonIterate:
         return value
 
     def result(self, reason: ConvergedReason, steps: Steps) -> QPResult:
-        """The answer; takes λ and s over."""
+        """Return the result; takes λ and s over."""
         moved = self.point.lam.copy()
         moved.axpy(-1.0, self._homogenised.lam_bar)
         equality = self.qp.coarse.norm_Q(moved)
@@ -263,7 +263,7 @@ def _enough(state: NewtonIterate) -> float:
 
 
 def longer(state: NewtonIterate, trial: Trial, faces: FaceSolver) -> Trial:
-    """Solve on where the face has changed under way, and stays, but q is not low enough.
+    """Continue the solve if the face changed under way, now stays, but q is not low enough.
 
     What restores Gλ = e after rows are dropped raises q; some more steps of conjugate gradients
     lower it again. Collective.
@@ -340,7 +340,7 @@ def accept(state: NewtonIterate, trial: Trial, faces: FaceSolver) -> bool:
 def _shortened(
     state: NewtonIterate, trial: Trial, length: float, curved: bool, enough: float
 ) -> bool:
-    """Go a part of the first solve's way, if q falls enough there."""
+    """Take the feasible part of the first solve's step if q falls enough there."""
     shorter, held = part_of_way(state.point, trial.first, PAST * length), length > 0.0
     if curved:
         held = brought_back(state.qp, trial.face, shorter) and held
@@ -350,7 +350,7 @@ def _shortened(
 
 
 def _went_to(state: NewtonIterate, to: Point, enough: float, may: bool = True) -> bool:
-    """Go there if q falls enough; the point is taken over."""
+    """Accept a point if q falls enough; it is taken over."""
     gain = state.gain(to)
     taken = bcast_from_root(state.comm, may and gain >= enough)
     if taken:
@@ -360,7 +360,7 @@ def _went_to(state: NewtonIterate, to: Point, enough: float, may: bool = True) -
 
 
 def _descend(state: NewtonIterate, known: bool, faces: FaceSolver) -> bool:
-    """The projected gradient step, or the part of it where q is least."""
+    """Take the projected gradient step, or the part of it where q is least."""
     if not known:
         state.look(faces)
     assert state.back is not None

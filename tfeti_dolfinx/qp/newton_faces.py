@@ -148,7 +148,7 @@ def _is_beside(face: Face, lam: PETSc.Vec) -> bool:
 
 
 def face_with_curvature(qp: QP, coarse: Coarse, face: Face, on: Array, g: PETSc.Vec) -> Face:
-    """A face with the curvature that belongs to another gradient. Collective.
+    """Return a face with the curvature κ of another gradient. Collective.
 
     Args:
         qp: The program.
@@ -184,7 +184,7 @@ def slipping_work(lam: PETSc.Vec, s: PETSc.Vec, face: Face) -> float:
 def slipping_start(
     qp: QP, at: Point, face: Face, back: PETSc.Vec, pressed: Face
 ) -> tuple[Point, Face]:
-    """A copy of a point with its face, or ``back`` with its own where that slips first. Collective.
+    """Copy a point and its face, or ``back`` and its own if more points slip there. Collective.
 
     Near its circle a point that sticks, and whose gradient points outwards, would leave by far, in
     a direction of no use. So would, with friction, one that touches with less force than it is open
@@ -202,7 +202,7 @@ def slipping_start(
 
 
 def part_of_way(at: Point, end: Point, share: float) -> Point:
-    """The point so far from ``at`` to ``end``, the caller's own. Collective."""
+    """Return a new point at this share of the way from ``at`` to ``end``. Collective."""
     part = at.copy()
     for kept, last in ((part.lam, end.lam), (part.g, end.g)):
         kept.scale(1.0 - share)
@@ -211,7 +211,7 @@ def part_of_way(at: Point, end: Point, share: float) -> Point:
 
 
 def projected_part(qp: QP, at: Point, end: Point, share: float) -> Point:
-    """The nearest feasible point to a part of a way. Collective; multiplies by F once."""
+    """Project a point of the segment from ``at`` to ``end`` onto Ω. Collective; one F."""
     part = part_of_way(at, end, share)
     found = project_onto_feasible(qp.coarse, qp.feasible, part.lam)
     moved_to(qp, part, found.lam)
@@ -219,7 +219,7 @@ def projected_part(qp: QP, at: Point, end: Point, share: float) -> Point:
 
 
 def moved_to(qp: QP, z: Point, lam: PETSc.Vec) -> None:
-    """Take z to λ, which is destroyed, and its gradient with it; multiplies by F once."""
+    """Move z to λ, which is destroyed, and update its gradient; multiplies by F once."""
     way, image = lam.copy(), z.g.duplicate()
     way.axpy(-1.0, z.lam)
     qp.F.mult(way, image)
@@ -230,7 +230,7 @@ def moved_to(qp: QP, z: Point, lam: PETSc.Vec) -> None:
 
 
 def brought_back(qp: QP, face: Face, z: Point, near: PETSc.Vec | None = None) -> bool:
-    """Bring z back to where slipping rows are on their boundary and Gz = e. Collective.
+    """Retract z to Gz = e with slipping rows on their boundary. Collective.
 
     Multiplies by F once.
 
@@ -253,7 +253,7 @@ def brought_back(qp: QP, face: Face, z: Point, near: PETSc.Vec | None = None) ->
 
 
 def brought_into(qp: QP, face: Face, z: Point) -> bool:
-    """Bring z to the nearest point with Gz = e and open rows at 0. Collective.
+    """Project z onto Gz = e with open rows at 0. Collective.
 
     Where circles are small beside what Gz lacks, no points of them may balance it; of the discs
     some do. Multiplies by F once.
@@ -280,7 +280,7 @@ HARD = 1e3
 
 
 class FlattenedFace:
-    """A face of which conjugate gradients see what does not bend hard; the rest is turned apart.
+    """Face without its directions of high curvature κ, which are treated apart from PCPG.
 
     Args:
         whole: The face.
@@ -297,12 +297,12 @@ class FlattenedFace:
         self.bend(whole)
 
     def bend(self, whole: Face) -> None:
-        """Take the face with other curvatures; what is held stays."""
+        """Replace the face by one with other curvatures; held directions stay held."""
         self.whole = whole
         self.face = whole.with_directions(self._kept) if self._hard.size else whole
 
     def back(self, qp: QP, coarse: Coarse, z: Point) -> bool:
-        """Bring z back to the circles, turned by −κ⁻¹Zᵀs where these bend hard. Collective.
+        """Retract z to the circles; directions of high curvature move by −κ⁻¹Zᵀs. Collective.
 
         Into the discs where circles do not bear it. Multiplies by F once, or twice.
 
@@ -369,7 +369,7 @@ class DependentRows:
         self.excluding: Array = np.empty(0, dtype=np.int64)
 
     def part(self, x: Array) -> PETSc.Vec | None:
-        """The part of x that F and Gᵀ do not see; None where there is none. Collective.
+        """Return the part of x in the common null space of F and G, or None. Collective.
 
         What the projector only makes small, more of it takes away.
         """
@@ -388,7 +388,7 @@ class DependentRows:
         return None
 
     def _unseen(self, x: Array) -> PETSc.Vec | None:
-        """x projected once."""
+        """Return x projected once."""
         part = self.preconditioner.dependent(x) if self.preconditioner is not None else None
         if part is None:
             return None
@@ -447,7 +447,7 @@ class DependentRows:
         Fp.destroy()
 
     def stop(self, before: Point, z: Point) -> None:
-        """Take z back to where the way from ``before`` first leaves Ω; q is lower there, too.
+        """Move z back to where the segment from ``before`` leaves Ω; q is lower there, too.
 
         What blocks it is at its bound there; F λ − d is known, and Gλ = e kept.
         """
@@ -461,7 +461,7 @@ class DependentRows:
         Fp.destroy()
 
     def slide(self, z: Point) -> bool:
-        """To a bound along a direction or residual without curvature, as of dependent rows.
+        """Step to a bound along a direction of no curvature, as of dependent rows.
 
         Returns:
             Whether there is one.
@@ -505,7 +505,7 @@ class DependentRows:
         work.destroy()
 
     def _recession(self, way: PETSc.Vec) -> PETSc.Vec:
-        """The nearest direction to a way in which Ω has no end: P_Ω(t·way)/t for a large t."""
+        """Project a direction onto the recession cone of Ω: P_Ω(t·way)/t for a large t."""
         p, far = way.copy(), FAR / way.norm(PETSc.NormType.INFINITY)
         p.array[:] = self._qp.feasible.project(far * way.array_r) / far
         return p
@@ -587,7 +587,7 @@ class FaceSolver:
         return self._directions.norm
 
     def saw(self, curvature: float, size: float) -> None:
-        """Another Rayleigh quotient."""
+        """Update the norm estimate by another Rayleigh quotient."""
         self._directions.seen(curvature, size)
 
     @property
@@ -634,14 +634,14 @@ class FaceSolver:
         self._prepared = True
 
     def settle(self) -> None:
-        """The last solve's end was accepted; if its face stays, PCPG goes on from there.
+        """Note that the last solve was accepted; PCPG continues its directions if the face stays.
 
-        Not where it is curved: the end was brought back to it.
+        Not on a curved face, since the point was then retracted to it.
         """
         self.settled, self._accepted = not self.curved, True
 
     def forget(self) -> None:
-        """The next direction is a first one: the point is not where PCPG stopped."""
+        """Restart PCPG at the next solve, since the point is not where it stopped."""
         self._directions.fresh, self.settled, self._accepted = True, False, False
 
     def solve(self, start: Point, face: Face, optimality: float) -> Trial:
@@ -736,7 +736,7 @@ class FaceSolver:
         return max(final, share * min(start, optimality))
 
     def _pcpg(self, z: Point, target: float) -> ConvergedReason:
-        """PCPG on the face entered; what a curvature adds is taken from the gradient again."""
+        """Run PCPG on the face entered; then remove curvature terms from the gradient."""
         before = np.array(z.lam.array_r)
         reason = pcpg(
             self._on_face,
@@ -755,7 +755,7 @@ class FaceSolver:
         return reason
 
     def _leave(self) -> None:
-        """Free what belongs to the face."""
+        """Free projectors and preconditioner of the face."""
         if self._face is not None:
             self._on_face.coarse.destroy()
         if self._preconditioner is not None:

@@ -53,7 +53,7 @@ NEARER = (0.5, 0.25, 0.1)
 
 
 class FrictionBoundIteration:
-    """λ_N of the rows under Coulomb's law, that the limits belong to. All methods are collective.
+    """Iteration for the λ_N that friction limits are taken from. All methods are collective.
 
     Without a start what touches sticks at first: that has a solution wherever any bounds have one.
 
@@ -258,12 +258,12 @@ class FrictionBoundIteration:
         )
 
     def take(self, lam: Array) -> None:
-        """Take the bounds of multipliers for which the law holds, for a try."""
+        """Try the bounds of multipliers for which the law holds."""
         self._before, self._now = self._now, self._forces(lam[self._rows])
         self._constraints.set_pressures(self._now)
 
     def take_back(self) -> None:
-        """Take those again that were there before."""
+        """Restore the bounds from before the try."""
         self._now = self._before
 
     @property
@@ -288,7 +288,7 @@ class FrictionBoundIteration:
         return True
 
     def _forces(self, values: Array) -> Array:
-        """Forces of normals, without what is none but for rounding."""
+        """Return the normal forces, those that are rounding set to 0."""
         return np.where(values > self._none, values, 0.0)
 
     @property
@@ -356,7 +356,7 @@ class NewtonOnCoulomb:
         return self._tries > 0
 
     def give_up(self) -> None:
-        """Try no more, and keep nothing of what has led nowhere."""
+        """Give up Newton's method, and drop the directions of the failed try."""
         self._tries, self._dual.recycled = 0, self._recycled
 
     def solve(
@@ -418,14 +418,14 @@ class NewtonOnCoulomb:
         return min(found, key=lambda one: one[0])
 
     def _pass_on(self, qp: QP, end: LawPoint, within: float) -> None:
-        """F of the end is known, and of what is near for the problem with its bounds."""
+        """Store Fλ of the end, to stand for points near it in the problem with its bounds."""
         work = qp.d.duplicate()
         qp.coarse.combine(end.mu, work)
         self._dual.last.pass_on(end.lam, end.s + work.array_r + qp.d.array_r, within)
         work.destroy()
 
     def _target(self, qp: QP) -> float:
-        """rtol ‖Pd‖, less each time."""
+        """Return the target rtol ‖Pd‖, smaller at each try."""
         Pd = qp.d.copy()
         qp.coarse.project(Pd)
         size = bcast_from_root(self._dual.coarse.comm, float(Pd.norm()))
@@ -448,11 +448,13 @@ class NewtonOnCoulomb:
 
 
 # --- Solve with Coulomb's law -----------------------------------------------------------------
-# Or, where that is not wanted or fails, from a fixed point iteration.
+# Problems with given bounds of friction; the next bounds are those of Newton's method on the law
+# or, where that is off or fails, of a fixed point iteration.
 
 # Inner tolerance: rtol of the first step, and share of the last change of the bounds. Forces are
-# less exact than displacements: with a tenth the acceleration meets noise. It never grows again,
-# and a problem that was solved without a CG step tells nothing of its bounds: the same share then.
+# less exact than displacements: with a tenth of the change the acceleration meets noise. The
+# tolerance never grows, and stays if a problem was solved without a CG step, as the change of the
+# bounds is then no measure of their error.
 FIRST, SHARE = 1e-2, 0.01
 # of the change of the bounds at which they are at rest: rtol where a goal takes its place, since
 # forces have to be known to that change
@@ -488,7 +490,7 @@ class FixedPointStatus:
     slides: bool = False
 
     def restless(self, names: Sequence[str]) -> tuple[str, bool]:
-        """The name of the body of all names, and whether it slides."""
+        """Return the name of the body whose bounds changed most, and whether it slides."""
         return names[self.body], self.slides
 
 

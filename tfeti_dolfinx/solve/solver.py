@@ -47,7 +47,7 @@ DIGIT, NO_DIGITS = 0.1, 0.1
 
 @dataclass(frozen=True)
 class SolverContext:
-    """A solver, and what it is told.
+    """Solver with its options and monitor.
 
     Attributes:
         solver: The solver.
@@ -123,7 +123,7 @@ def _in_rounds(
 def _of_remainder(
     dual: Dual, told: SolverContext, result: QPResult, rule: Accuracy, v: Array
 ) -> tuple[QPResult, Accuracy, Array]:
-    """The sum of a result and the solution of what it lacks, its accuracy, and its new v."""
+    """Return the sum of a result and its correction, its accuracy, and its new v."""
     options, norm = told.options, rule.norm
     left = DefectProblem(dual, np.array(result.lam.array_r), rule.u, v)
     qp = left.qp()
@@ -147,7 +147,7 @@ def _of_remainder(
 
 
 def last_look(result: QPResult, rule: Accuracy) -> None:
-    """Measure where a solver has stopped before its tolerance: it may be good enough."""
+    """Assess the point at which a solver stopped early: it may be good enough."""
     residual = max(result.projected_gradient, result.norm * result.equality)
     rule.accept_rounding()
     reason = rule.examine(result.lam, result.gradient, result.face, residual)
@@ -273,7 +273,7 @@ def solve_dual(
 
 
 def _start(values: tuple[Array, Array] | None, qp: QP) -> Start | None:
-    """μ of another kernel, as before conditions have become other ones, is left out."""
+    """Return the solver's start; μ is 0 if the given one belongs to another kernel."""
     if values is None:
         return None
     lam, mu = qp.d.duplicate(), values[1]
@@ -285,7 +285,7 @@ def _start(values: tuple[Array, Array] | None, qp: QP) -> Start | None:
 def _homogenise(
     dual: Dual, qp: QP, solver: Solver, options: Options, start: Start | None
 ) -> Homogenised:
-    """With λ̄ where the solver starts, or as the options say."""
+    """Homogenise with λ̄ at the solver's start, or as the options say."""
     if start is not None and solver.warm is not None:
         at = dual.last.image(qp.F, solver.warm(qp, start))
         _no_worse_than_nothing(qp, at, start)
@@ -316,7 +316,7 @@ def _no_worse_than_nothing(qp: QP, at: OperatorProduct, start: Start) -> None:
 
 
 def _homogenise_as_told(dual: Dual, qp: QP, options: Options) -> Homogenised:
-    """With λ̄ as the options say; its image is kept."""
+    """Homogenise with λ̄ as the options say; Fλ̄ is kept."""
     kind = options.homogenization if any(dual.contact_rows) else "natural"
     scale = scale_at(qp, dual.image("natural"))
     return homogenise(qp, dual.image(kind), scale)
