@@ -80,7 +80,7 @@ def solve_in_rounds(solve_rows: Callable[[], Solution], system: System, report: 
 
 
 def _widen(system: System, report: Report, error: NoSolutionError) -> int:
-    """Look farther for what may hold a body; how many rows are new."""
+    """Increase the reach of contacts that may hold a body; return the number of new rows."""
     search = system.search
     if not search.is_exhausted:
         with stage("contact", report.seconds):
@@ -232,7 +232,7 @@ class Stepping:
         """Move as the bodies of a state do: without inertia not at all."""
 
     def _meet(self, call: str) -> None:
-        """Begin a call: see that all ranks make it, with the same data. Collective.
+        """Begin a call: check that all ranks make it with the same data. Collective.
 
         Raises:
             InputError: They do not, or the stress fails.
@@ -509,7 +509,7 @@ class ContactProblem(Stepping):
         return {**super()._given(), "boundary_elements": self._boundary_elements}
 
     def _set_out(self) -> None:
-        """Say where a step goes at first: without inertia nothing."""
+        """Set the prediction of a step; nothing without inertia."""
 
     def _count(self) -> None:
         """Enter counts and seconds of the solve in the report."""

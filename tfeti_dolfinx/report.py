@@ -178,7 +178,7 @@ class Report:
     in_all: dict[str, float] = field(default_factory=dict)
 
     def begin(self) -> None:
-        """Forget the solve before, but for what it adds up to. After an error nothing is left."""
+        """Reset all figures but the sums over solves, so that none stays after an error."""
         seconds = {} if self.in_all else self.seconds
         fresh = Report(seconds=seconds, in_all=self.in_all)
         for f in fields(self):
@@ -250,7 +250,7 @@ def peak_memory_mb(comm: MPI.Intracomm) -> float:
 def fill_sizes(
     report: Report, dofs: TornDofs, decomposition: Decomposition, gluing: Gluing, inside: int
 ) -> None:
-    """Fill in what is known before the dual problem is. Collective.
+    """Fill in the sizes that are known before the dual problem. Collective.
 
     Args:
         report: Takes it.
@@ -280,7 +280,7 @@ def fill_result(
     accuracy: Accuracy,
     settling: FixedPointStatus,
 ) -> None:
-    """Fill in what a solve has found; counters add up over rounds. Collective."""
+    """Fill in the results of a solve; counters add up over rounds. Collective."""
     comm = dual.coarse.comm
     report.clusters = dual.subdomains.num_clusters
     report.kernel_dim = dual.coarse.dimension

@@ -300,7 +300,7 @@ class System:
         return self.dual
 
     def count(self, report: Report) -> None:
-        """Put sizes into a report, and what was made since it was last counted."""
+        """Enter sizes and the stages made since the last call in a report."""
         if self._gluing is not None:
             inside = self.replaced.inside()
             fill_sizes(report, self._dofs, self._decomposition, self._gluing, inside)

@@ -185,7 +185,7 @@ ESTIMATES = "estimates"  # how the sentence on them begins
 
 
 class Diagnostics:
-    """Looks at solutions for what a residual does not show; knows again what it has looked at.
+    """Diagnostics of solutions beyond residuals; a solution seen before is not examined again.
 
     Args:
         decomposition: The torn mesh.
@@ -278,7 +278,7 @@ class Diagnostics:
             yield f"{rest} more motions that friction alone holds are wrong, or not determined"
 
     def _rounding(self, dual: Dual, u: Array, rtol: float) -> Iterator[str]:
-        """Bodies that bend so easily beside what their cells could hold that K's rounding shows.
+        """Warn of slender bodies, whose small bending energy is inexact by the rounding of K.
 
         Entries of K are right to ε, so the energy uᵀKu is to ε Σ|K_ij u_i u_j|, about ε uᵀDu, D
         the diagonal; of u less the rigid motion of the body, which K knows to do no work.

@@ -1,4 +1,4 @@
-"""The errors that a solve knows: what the solver has left, and what the mesh leaves."""
+"""Estimates of the algebraic and the discretisation error of a solve."""
 
 from __future__ import annotations
 

@@ -243,7 +243,7 @@ def _part(
 
 
 def _equal(shape: SurfaceStiffness, surface: Surface, K: Any) -> bool:
-    """Also of the same size, which K does not show in 2D."""
+    """Return whether parts are equal, in size too, which K does not show in 2D."""
     pairs = zip(shape.surface.cuts, surface.cuts, strict=True)
     if not all(np.array_equal(one.nodes, other.nodes) for one, other in pairs):
         return False

@@ -176,7 +176,7 @@ class _Cut:
 
 
 class _Seen:
-    """r = x − y from points to parts of panels, and what the kernels are made of.
+    """r = x − y from points to parts of panels, and factors of the kernels.
 
     Attributes:
         r: Shape ``(p, y, d)``.
@@ -198,7 +198,7 @@ class _Seen:
 
 
 def _cuts(panels: Panels, points: Array, values: Array) -> Iterator[_Cut]:
-    """Panels, cut as the distances to points ask for; values at their corners go along."""
+    """Cut panels as finely as the distances to points require, with their corner values."""
     for some in in_chunks(np.arange(len(points)), 4 * len(panels.nodes)):
         point, panel = np.repeat(some, len(panels.nodes)), np.tile(_all(panels), len(some))
         corners, carried, measure = panels.corners[panel], values[panel], panels.measure[panel]

@@ -319,7 +319,7 @@ def brief(value: Any) -> str:
 
 
 def sums_of(comm: MPI.Intracomm, arrays: list[Array]) -> list[list[Any]]:
-    """Return what tells fields apart, however they are shared out: one reduction. Collective.
+    """Return checksums of fields that do not depend on the partition: one reduction. Collective.
 
     Args:
         comm: Communicator.

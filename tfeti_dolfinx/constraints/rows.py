@@ -137,7 +137,7 @@ ALIKE = 1e-12
 
 
 def row_span(dofs: TornDofs, equalities: Rows, contact: Rows, trace: Array) -> Array:
-    """Projector onto what rows see of each node, as rows for the trace unknowns. Collective.
+    """Project each node onto the directions rows act in, as rows of the trace. Collective.
 
     A node that only a contact meets is held along the normal, whatever axis that lies along. Where
     normals of several conditions differ, or there is friction or gluing, it is held in more.
@@ -178,7 +178,7 @@ def _grams(rows: Rows, bs: int) -> tuple[Array, Array]:
 
 
 def _projectors(gram: Array, held: Array) -> Array:
-    """Onto the ranges of Σaaᵀ and of the components that are held, shape ``(k, bs, bs)``."""
+    """Project onto the ranges of Σaaᵀ and of prescribed components, shape ``(k, bs, bs)``."""
     size = np.trace(gram, axis1=1, axis2=2)[:, None, None]
     gram = np.divide(gram, size, out=np.zeros_like(gram), where=size > 0.0)
     values, vectors = np.linalg.eigh(gram + held[:, :, None] * np.eye(held.shape[1]))

@@ -190,7 +190,7 @@ class Shares:
 
 
 def conditions(dofs: TornDofs, contact: int, side: Side, shares: Shares) -> ContactRecords:
-    """Add up what facets contribute to a node, and divide by ∫ψ_i. Collective.
+    """Sum the facets' contributions to each node, and divide by ∫ψ_i. Collective.
 
     A node whose covered share of ∫φ_i is below 1e-6 gets no condition. The gaps are those of the
     geometry, all conditions are taken to be within reach, and none has friction.

@@ -1,4 +1,4 @@
-"""Laws of friction: what a user says of them, and what they say at the contact nodes."""
+"""Laws of friction as the user gives them, and their values at contact nodes."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ Law = Tresca | Coulomb
 
 
 def checked_friction(name: str, friction: Law | None) -> None:
-    """Raise if what should be a law of friction is none. Not collective.
+    """Raise if a law of friction is invalid. Not collective.
 
     Args:
         name: Name of the contact, for messages.

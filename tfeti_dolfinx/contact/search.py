@@ -1,4 +1,4 @@
-"""Obstacles and pairs that a user names, and the search for what meets."""
+"""The search for contact conditions of obstacles and pairs."""
 
 from __future__ import annotations
 
@@ -270,7 +270,7 @@ class ContactSearch:
         return overlaps, self._count(overlaps & ~found.within_reach)
 
     def widen(self) -> int:
-        """Reach farther, until a condition gets a row: what is far may hold a body yet.
+        """Increase the reach until a condition gets a row, since far contact may hold a body.
 
         Returns:
             How many rows are new, on all ranks; 0 where nothing is left to find.
@@ -307,7 +307,7 @@ class ContactSearch:
         return self._count(~self._records[i].within_reach) == 0 and complete
 
     def _widen(self, i: int) -> int:
-        """Reach farther in one contact; how many rows are new."""
+        """Increase the reach of one contact; return the number of new rows."""
         if self._is_exhausted(i):
             return 0
         before, found = self._count(self._records[i].within_reach), self._records[i]

@@ -263,7 +263,7 @@ class Dual:
         return QP(self.F, self.d, coarse, self.feasible, self._on_all_rows, norm, on, self.seen, W)
 
     def saw(self, norm: float) -> None:
-        """A solve has estimated ‖F‖: what the next one begins with.
+        """Store the estimate of ‖F‖ of a solve, for the next one to begin with.
 
         Of its start alone it might see far less, and take its multipliers for less exact.
         """
@@ -271,7 +271,7 @@ class Dual:
 
     @property
     def _on_all_rows(self) -> Operator | None:
-        """The preconditioner where nothing is constrained; what it needs is made once."""
+        """Return the preconditioner on all rows, made once."""
         smooths = self.preconditioner is not None and self.preconditioner.metric is not None
         if self.soft is None or not (self.soft.count or (smooths and not any(self.contact_rows))):
             return self.preconditioner
@@ -282,7 +282,7 @@ class Dual:
         return self._on_all
 
     def _preconditioner_on(self, face: Face) -> FaceOperator:
-        """The preconditioner on a face of the rows; what all faces share is made once."""
+        """Return the preconditioner on a face; parts that all faces share are made once."""
         assert self.preconditioner is not None
         assert self.soft is not None
         if self._on_faces is None:

@@ -24,7 +24,7 @@ from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteE
 
 
 class Grams:
-    """GGᵀ, and G_f G_fᵀ of faces f: what gluing and Dirichlet rows add to all is made once.
+    """GGᵀ, and G_f G_fᵀ of faces f; the part of gluing and Dirichlet rows is made once.
 
     An entry is stored for each pair of coordinates that meet in a row, so that storage grows with
     the number of subdomains. A face costs what its contact rows cost. All methods are collective.
@@ -214,7 +214,7 @@ class ObliqueProjectors:
         return self._face.restricted(x) - self.combine(self.coordinates(x))
 
     def restoring(self, y: Array) -> Array:
-        """u = ZG_fᵀH⁺y, for which G(I + C)u = y if any u does that. Not collective."""
+        """Return u = ZG_fᵀH⁺y, which solves G(I + C)u = y if that is solvable. Not collective."""
         return self.combine(self._factor.solve(y))
 
 

@@ -1,4 +1,4 @@
-"""Displacements of multipliers; of equal ones the smallest."""
+"""Recovery of displacements from multipliers; where several are equally good, the smallest."""
 
 from __future__ import annotations
 

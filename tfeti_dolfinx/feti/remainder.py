@@ -81,7 +81,7 @@ class DefectProblem:
         return replace(self._dual.qp(), d=self.d, coarse=coarse, feasible=self.feasible)
 
     def start(self, face: Face) -> PETSc.Vec:
-        """The least δλ on the face of λ₀ that balances what is left of the load."""
+        """Return the least δλ on the face of λ₀ that balances the load's defect."""
         coarse, lam = self.qp().coarse.on_face(face), self.d.duplicate()
         coarse.particular(lam)
         coarse.destroy()

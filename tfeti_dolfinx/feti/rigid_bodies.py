@@ -362,7 +362,7 @@ def free_to_move(amounts: Array, body_names: Sequence[str], mode_names: Sequence
 
 
 def _parts(amounts: Array, mode_names: Sequence[str]) -> tuple[Array, str]:
-    """The bodies that take part in a motion, and what it is mostly."""
+    """Return the bodies that take part in a motion, and its dominant mode."""
     parts = np.abs(amounts)
     moving = np.flatnonzero(parts.max(axis=1) > TAKES_PART * parts.max())
     share = parts[moving].max(axis=0)

@@ -21,7 +21,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 
 
 class Data:
-    """Numbers that somebody may change, and what they were last.
+    """Data that a user may change, with a digest of their last values.
 
     Args:
         arrays: Gives the numbers as they are now.

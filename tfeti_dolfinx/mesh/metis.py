@@ -89,7 +89,7 @@ def _sizes(part: Array, num_parts: int, comm: MPI.Intracomm) -> Array:
 
 
 def _means(x: Array, part: Array, before: Array, comm: MPI.Intracomm) -> Array:
-    """Means of the parts, as whole numbers; what has no point stays where it was."""
+    """Return the means of the parts as integers; means of empty parts do not change."""
     num_parts = len(before)
     size = _sizes(part, num_parts, comm)[:, None]
     sums = np.zeros(before.shape)
@@ -143,7 +143,7 @@ LARGEST_PART, SMALLEST = 1.08, 0.93
 
 
 def flatten_interfaces(mesh: UntornMesh, pairs: tuple[Array, Array], part: Array) -> Array:
-    """Let cells join a neighbour's part that has more of what is around them.
+    """Move cells to the neighbouring part that most of their surroundings belong to.
 
     Of each part count the cells that share a vertex with a cell, once for each such vertex, and
     those that share a facet with it twelve times more. A cell that counts more of a neighbour's

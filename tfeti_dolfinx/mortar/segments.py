@@ -209,7 +209,7 @@ def rendezvous(
 
 
 def possible_pairs(secondary: Facets, primary: Facets, distance: float) -> tuple[Array, Array]:
-    """Pairs of facets that may meet when one looks along the secondary facets' normals.
+    """Find pairs of facets that may meet along the secondary facets' normals.
 
     A primary facet is found if it comes within a secondary facet's radius of the line through
     that facet's centre along its averaged normal, no farther than ``distance`` and the facets'

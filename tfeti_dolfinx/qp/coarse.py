@@ -284,7 +284,7 @@ class Oblique(Protocol):
         ...
 
     def restoring(self, y: Array) -> Array:
-        """u = ZG_fᵀH⁺y, for which G(I + C)u = y if any u does that. Not collective."""
+        """Return u = ZG_fᵀH⁺y, which solves G(I + C)u = y if that is solvable. Not collective."""
         ...
 
 

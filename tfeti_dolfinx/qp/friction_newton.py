@@ -129,7 +129,7 @@ class _GrowingBasis:
         return KrylovBasis(*self._room[:, : self.count])
 
     def add(self, q: Array, z: Array, w: Array) -> None:
-        """Take one more."""
+        """Store another direction."""
         if self.count == self._room.shape[1]:
             self._room = np.concatenate((self._room, np.zeros_like(self._room)), axis=1)
         self._room[:, self.count] = q, z, w

@@ -55,11 +55,11 @@ class LastProduct:
         self._looked, self._within = (nothing, nothing), 0.0
 
     def look(self, x: PETSc.Vec, g: Array) -> None:
-        """Take a point of the program, and its Fx − d, as a look at its displacement makes it."""
+        """Store a point of the program with Fx − d, as an assessment computes it."""
         self._looked = (np.array(x.array_r), g)
 
     def keep(self, result: QPResult, qp: QP) -> None:
-        """Take a solution, whose gradient is Fx − d − Gᵀμ, or as a look has made it. Collective.
+        """Store a solution with its gradient Fx − d − Gᵀμ, or that of an assessment. Collective.
 
         So what steps leave out of the gradient does not grow from solve to solve.
         """

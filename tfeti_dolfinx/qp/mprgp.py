@@ -416,7 +416,7 @@ def mprgp(
     >>> A = PETSc.Mat().createDense((2, 2), array=np.diag([1.0, 2.0]), comm=PETSc.COMM_SELF)
     >>> x = PETSc.Vec().createWithArray(np.zeros(2), comm=PETSc.COMM_SELF)
     >>> g = PETSc.Vec().createWithArray(np.array([-3.0, 4.0]), comm=PETSc.COMM_SELF)  # Ax − b
-    >>> state, steps = Iterate(A, x, g, Bounds()), Steps()
+    >>> state, steps = MprgpIterate(A, x, g, Bounds()), Steps()
     >>> mprgp(state, MprgpParameters(0.9), lambda s: s.projected_gradient <= 1e-9, steps, 100)
     >>> x.array.round(6).tolist(), steps.inner > 0
     ([3.0, 0.0], True)

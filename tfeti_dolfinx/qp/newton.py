@@ -205,7 +205,7 @@ class NewtonIterate:
             self.idle = 0
 
     def gain(self, to: Point) -> float:
-        """q(λ) − q(to), by differences, and without what Gλ = e makes constant. Collective."""
+        """Return q(λ) − q(to), without terms that Gλ = e makes constant. Collective."""
         apart, gradient = to.lam.copy(), to.g.copy()
         apart.axpy(-1.0, self.point.lam)
         gradient.axpy(-1.0, self.point.g)
@@ -404,7 +404,7 @@ def first_point(qp: QP) -> PETSc.Vec:
 
 
 def _open(qp: QP, face: Face) -> PETSc.Vec | None:
-    """The least λ on a face, None where it does not balance the load."""
+    """Return the least λ on a face, or None if it does not balance the load."""
     coarse, lam = qp.coarse.on_face(face), qp.d.duplicate()
     coarse.particular(lam)
     held = imbalance(coarse, lam) <= HELD
@@ -449,12 +449,12 @@ def newton(
     >>> import numpy as np
     >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
     >>> from tfeti_dolfinx.qp.sets import Bounds
-    >>> from tfeti_dolfinx.qp.homogenised import homogenise, image
+    >>> from tfeti_dolfinx.qp.homogenised import homogenise, operator_product
     >>> from tfeti_dolfinx.qp.problem import ResidualRule
     >>> F = PETSc.Mat().createDense((3, 3), array=np.diag([1.0, 2.0, 4.0]), comm=PETSc.COMM_SELF)
     >>> d = PETSc.Vec().createWithArray(np.array([1.0, -1.0, 2.0]), comm=PETSc.COMM_SELF)
     >>> qp = QP(F, d, DenseCoarse(np.ones((1, 3)), np.ones(1)), Bounds())
-    >>> start = homogenise(qp, image(F, first_point(qp)))
+    >>> start = homogenise(qp, operator_product(F, first_point(qp)))
     >>> result = newton(qp, start, ResidualRule(1e-10))
     >>> result.reason.name, result.lam.array.round(6).tolist()
     ('CONVERGED_RTOL', [0.6, 0.0, 0.4])

@@ -74,7 +74,7 @@ PARTS = (0.5, 0.125)
 
 
 class CurvedHessian:
-    """F + Z diag(κ) Zᵀ: along a face that bends, to second order, q has this Hessian.
+    """Hessian F + Z diag(κ) Zᵀ of q along a curved face, to second order.
 
     Args:
         F: The operator.
@@ -172,7 +172,7 @@ def gradient_on(qp: QP, coarse: Coarse, g: PETSc.Vec) -> PETSc.Vec:
 
 
 def slipping_work(lam: PETSc.Vec, s: PETSc.Vec, face: Face) -> float:
-    """Σ|s_iλ_i| over what slips, where both are large: rounding of it hides changes of q.
+    """Return Σ|s_iλ_i| over slipping rows; its rounding may hide changes of q.
 
     Collective.
     """

@@ -246,7 +246,7 @@ class StoppingRule(Protocol):
 
 
 class ResidualRule:
-    """Small residuals are good enough: for a program that stands for itself.
+    """Stopping rule by residuals alone, for programs without a displacement.
 
     Args:
         tolerance: What residuals must come down to.
@@ -268,7 +268,7 @@ class ResidualRule:
 
 
 class TargetRule(ResidualRule):
-    """Content where the residual is what was asked for, and not before: for a part of a solve."""
+    """Stopping rule by a given residual, for a part of a solve."""
 
     def examine(
         self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float

@@ -74,7 +74,7 @@ def project_onto_feasible(
     alpha: Array | None = None,
     max_trials: int = MAX_TRIALS,
 ) -> FeasiblePoint:
-    """The nearest point to y of {λ ∈ Ω, Gλ = e}, or what comes closest to it. Collective.
+    """Project y onto {λ ∈ Ω, Gλ = e}, or come as close to that set as possible. Collective.
 
     It is λ(α) = P_Ω(y + Gᵀα) with Gλ(α) = e. That is where the convex function
     ½‖z‖² − ½‖z − P_Ω(z)‖² − αᵀe of z = y + Gᵀα is least, which a semismooth Newton method with a
@@ -86,7 +86,8 @@ def project_onto_feasible(
     >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
     >>> from tfeti_dolfinx.qp.sets import Bounds
     >>> y = PETSc.Vec().createWithArray(np.array([1.0, -1.0]), comm=PETSc.COMM_SELF)
-    >>> nearest(DenseCoarse(np.ones((1, 2)), np.ones(1)), Bounds(), y).lam.array.tolist()
+    >>> coarse = DenseCoarse(np.ones((1, 2)), np.ones(1))
+    >>> project_onto_feasible(coarse, Bounds(), y).lam.array.tolist()
     [1.0, 0.0]
 
     Args:
@@ -213,7 +214,7 @@ def _trial(coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec, alpha: Array) -> _
 def _searched(
     coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec, start: _Trial, step: Array
 ) -> tuple[_Trial, float, int]:
-    """The longest of steps 1, ½, ¼, … that does not raise the cost; destroys the start.
+    """Halve the step until it does not raise the cost; destroys the start.
 
     Where the cost still falls at the end of a step, it fell along all of it: it is convex. That
     holds where rounding hides the cost's difference.

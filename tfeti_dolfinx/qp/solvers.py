@@ -58,7 +58,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Solver:
-    """A solver, and what to know before it is called.
+    """QP solver, with its requirements.
 
     Attributes:
         solve: Solves a task.

@@ -122,7 +122,7 @@ class FrictionBoundIteration:
         return self._dilated.lam, self._dilated.mu
 
     def _balanced(self, start: tuple[Array, Array] | None) -> tuple[Array, float]:
-        """Forces within the law that balance the load, near the last ones; what they miss of it."""
+        """Return forces near the last ones, within the law, that balance the load; the defect."""
         lam = self._dual.d.duplicate()
         lam.set(0.0)
         if start is not None:
@@ -160,7 +160,7 @@ class FrictionBoundIteration:
         return False
 
     def change(self, lam: PETSc.Vec, u: Array) -> float:
-        """Take what a solve has found; how far that is from the bounds, over its size.
+        """Store a solve's normal forces; return their relative distance from the bounds.
 
         Body by body: beside forces elsewhere those on a light one would not be seen.
 

@@ -353,7 +353,7 @@ class DeSaxceIteration:
         return np.array(self.lam[self._rows])
 
     def _advance(self, slips: Array) -> None:
-        """The accelerated step, not too long; a plain one where that would go far back."""
+        """Return the accelerated step, limited in length, or a plain one if that goes far back."""
         plain = slips - self._w
         step = self._anderson.next(self._w, slips) - self._w
         along = self._products(step[:, None], plain[:, None])[0, 0]

@@ -114,7 +114,7 @@ def silent(share: float, text: str) -> None:
 
 @contextmanager
 def shown_progress(comm: MPI.Intracomm, wanted: bool | None) -> Iterator[Show]:
-    """Give what shows how far a series is. Not collective.
+    """Return a function that shows the progress of a series. Not collective.
 
     Args:
         comm: Communicator; only rank 0 shows anything.
@@ -417,7 +417,7 @@ class LoadSteps:
             self._apply(self._problem, t)
 
     def _halved(self, place: Place, t: float, error: ConvergenceError) -> Place:
-        """Half the way, from the last accepted step."""
+        """Go back to the last accepted step, and halve the next one."""
         self._problem.go_back()
         if place.level >= self._max_halvings:
             begin = place.begin(self._times)

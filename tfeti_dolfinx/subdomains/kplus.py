@@ -106,7 +106,7 @@ class SchurPseudoinverse(FactoredInverse):
 
 
 class TrailingPseudoinverse(SchurPseudoinverse):
-    """The same where s is what an elimination leaves when it meets its first zero pivot.
+    """Schur pseudoinverse whose s are the unknowns left by elimination at its first zero pivot.
 
     The singular block at the end of a nested dissection, whose pseudo-inverse is found apart,
     as in LU with a singular value decomposition of the last block (Farhat, Géradin, IJNME 41,

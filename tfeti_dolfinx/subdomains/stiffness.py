@@ -38,7 +38,7 @@ from tfeti_dolfinx.subdomains.kplus import (
 
 
 class Packed:
-    """Half of a symmetric matrix, for one vector at a time: what is read is what it costs.
+    """Packed half of a symmetric matrix, for one vector at a time: reading it is the cost.
 
     Args:
         A: The matrix, shape ``(t, t)``.
@@ -347,7 +347,7 @@ class Stiffness:
         return self._traced[key]
 
     def leave(self, traced: Traced) -> None:
-        """A Block no longer needs what it has asked for."""
+        """Drop one user of the matrices on a trace; free them with the last."""
         traced.users -= 1
         if traced.users == 0:
             self._traced.pop(traced.seen.key, None)
