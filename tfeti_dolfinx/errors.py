@@ -77,7 +77,7 @@ def raise_together(comm: MPI.Intracomm, error: Exception | None, raiser: int) ->
 
 
 def _portable(error: Exception) -> Exception:
-    """The error itself if other ranks can rebuild it, else a TfetiError that names it."""
+    """Return the error itself if other ranks can rebuild it, else a TfetiError that names it."""
     try:
         rebuilt = pickle.loads(pickle.dumps(error))
     except Exception:  # whatever the error's own methods raise

@@ -65,7 +65,7 @@ class Extensions:
 
 
 def guarded(own: Extensions, comm: MPI.Intracomm) -> Extensions:
-    """The same parts, of which what fails is named, on all ranks where they run on all.
+    """Return the same parts, of which what fails is named, on all ranks where they run on all.
 
     Blocks and K⁺ are made where ranks raise together.
     """
@@ -81,7 +81,7 @@ def guarded(own: Extensions, comm: MPI.Intracomm) -> Extensions:
 
 
 def _together(part: Any, name: str, comm: MPI.Intracomm) -> Any:
-    """A part whose errors become an InputError of all ranks."""
+    """Return a part whose errors become an InputError of all ranks."""
     if part is None:
         return None
 
@@ -93,7 +93,7 @@ def _together(part: Any, name: str, comm: MPI.Intracomm) -> Any:
 
 
 def _giving(part: Any, name: str, protocol: type) -> Any:
-    """A part whose errors become an InputError, and which must give an implementation."""
+    """Return a part whose errors become an InputError, and which must give an implementation."""
     if part is None:
         return None
 
@@ -116,7 +116,7 @@ def _check_members(made: Any, name: str, protocol: type) -> None:
 
 
 def _checked_set(law: FeasibleLaw) -> FeasibleLaw:
-    """A law whose sets are of multipliers on all rows."""
+    """Return a law whose sets are of multipliers on all rows."""
 
     def checked(constraints: Constraints) -> FeasibleSet:
         made, zero = law(constraints), np.zeros(constraints.num_rows)
@@ -182,7 +182,7 @@ class Settings:
         return InverseFactory(counters, kplus, f"{self.prefix}sub_")
 
     def preconditioner(self, pc_type: str) -> MakePreconditioner | None:
-        """The preconditioner, the program's own if it brings one.
+        """Return the preconditioner, the program's own if it brings one.
 
         Raises:
             InputError: It does, and the solver takes none.
@@ -203,7 +203,7 @@ class Settings:
         decomposition: Decomposition,
         feasible: FeasibleLaw,
     ) -> Dual:
-        """The dual problem of rows and subdomains. Collective.
+        """Return the dual problem of rows and subdomains. Collective.
 
         Raises:
             NoSolutionError: The load moves a body that nothing holds.

@@ -179,7 +179,7 @@ class Options:
 
 
 def options_table() -> str:
-    """The table of docs/options.md."""
+    """Return the table of docs/options.md."""
     lines = ["| option | algorithm | default | effect |", "|---|---|---|---|"]
     for option in parameters_of(Options):
         about, default = option.description, option.default
@@ -303,7 +303,7 @@ def _near_factor_names(name: str, prefix: str) -> str:
 
 
 def _without_prefix(given: Any, prefix: str) -> dict[str, Any]:
-    """The options given, without the prefix."""
+    """Return the options given, without the prefix."""
     if not isinstance(prefix, str) or not re.fullmatch(r"\w+", prefix):
         raise InputError(
             f"petsc_options_prefix is {shown(prefix)}; expected letters, digits and underscores, "
@@ -334,7 +334,7 @@ def _check_reached(named: Mapping[str, Any], database: PETSc.Options, prefix: st
 
 
 def _converted(option: Parameter, value: Any, prefix: str) -> Any:
-    """The value as the type of the option, in its range."""
+    """Return the value as the type of the option, in its range."""
     what = f"-{prefix}{option.name}"
     kind = option.description.kind or type(option.default)
     if isinstance(value, str) and value in option.description.words:

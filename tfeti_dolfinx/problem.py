@@ -168,7 +168,7 @@ class Stepping:
         self.u.x.array[:] = 0.0 if last is None else self.dofs.to_dolfinx(last.u)
 
     def state(self) -> SavedState:
-        """The last accepted solution as arrays of this rank, for ``restore``. Collective.
+        """Return the last accepted solution as arrays of this rank, for ``restore``. Collective.
 
         Raises:
             InputError: No solution was accepted.
@@ -247,7 +247,7 @@ class Stepping:
         return {**self._system.forms.given, **about}
 
     def _look_at_stress(self) -> Any:
-        """The user's stress of ``u`` in UFL, which solutions take until the next look.
+        """Return the user's stress of ``u`` in UFL, which solutions take until the next look.
 
         Not collective: it is looked at where what it raises is raised on all ranks.
 

@@ -32,7 +32,7 @@ PRINTED = 10  # of a list; all of it is in the file
 
 
 def _counter() -> Any:
-    """A counter, which adds up over solves in ``in_all``."""
+    """Return a counter, which adds up over solves in ``in_all``."""
     return field(default=0, metadata={"adds": True})
 
 
@@ -204,7 +204,7 @@ class Report:
         return "\n".join(lines)
 
     def to_json(self) -> str:
-        """The report as JSON."""
+        """Return the report as JSON."""
         return json.dumps(asdict(self), indent=2)
 
     def write(self, path: str | Path, comm: MPI.Intracomm) -> None:
@@ -231,7 +231,7 @@ def _write_whole(target: Path, text: str) -> None:
 
 
 def _item(item: str | list[float] | dict[str, Any]) -> str:
-    """A contact, a force, or a motion that is nearly free, as text."""
+    """Return a contact, a force, or a motion that is nearly free, as text."""
     if isinstance(item, str):
         return item
     if isinstance(item, list):

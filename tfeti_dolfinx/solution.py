@@ -63,7 +63,7 @@ class PointValues:
 
 
 def checked_points(points: Any, gdim: int) -> Array:
-    """Points as an array of shape ``(k, gdim)``.
+    """Return points as an array of shape ``(k, gdim)``.
 
     Raises:
         InputError: They are of another shape, or not finite numbers.
@@ -86,7 +86,7 @@ def values_at(
     u: fem.Function,
     stress: fem.Function | None,
 ) -> PointValues:
-    """Values at points, means of the subdomains that share a point. Collective.
+    """Return values at points, means of the subdomains that share a point. Collective.
 
     Args:
         points: The same on all ranks, shape ``(k, gdim)``.
@@ -121,7 +121,7 @@ def _of_boundary_elements(
     thickness: float,
     u: fem.Function,
 ) -> Array:
-    """Rows of the bodies of this rank, added for each point."""
+    """Return rows of the bodies of this rank, added for each point."""
     (k, d), mesh = points.shape, u.function_space.mesh
     total = np.zeros((k, 1 + d + d * d))
     (place, cells), owner = found, boundary.cell_subdomain
@@ -142,7 +142,7 @@ def _of_boundary_elements(
 
 
 def _in_space(points: Array) -> Array:
-    """Points with three coordinates."""
+    """Return points with three coordinates."""
     x = np.zeros((len(points), 3))
     x[:, : points.shape[1]] = points
     return x
@@ -153,14 +153,14 @@ def _row(u: Array, stress: Array) -> Array:
 
 
 def _number(thickness: Any) -> float:
-    """A thickness as a number; where it varies there are no boundary elements."""
+    """Return a thickness as a number; where it varies there are no boundary elements."""
     if isinstance(thickness, fem.Constant):
         return float(thickness.value)
     return float(thickness) if isinstance(thickness, float) else 1.0
 
 
 def _cells(mesh: Any, points: Array) -> tuple[Array, Array]:
-    """Points by position, and the cells of this rank that each of them is in."""
+    """Return points by position, and the cells of this rank that each of them is in."""
     x = _in_space(points)
     size = float(np.ptp(mesh.geometry.x, axis=0).max(initial=0.0)) if len(mesh.geometry.x) else 0.0
     tree = geometry.bb_tree(mesh, mesh.topology.dim, padding=PADDING * size)
@@ -238,7 +238,7 @@ class Solution(ContactState):
         return self.v is not None
 
     def at(self, points: Any) -> PointValues:
-        """Displacement and stress at points inside the bodies. Collective.
+        """Return displacement and stress at points inside the bodies. Collective.
 
         In finite elements these are the values of ``displacement`` and ``stress``, in boundary
         elements those of Somigliana's identity, which are as accurate inside as on the surface;
@@ -453,7 +453,7 @@ class SavedState:
 
     @classmethod
     def of(cls, solution: Solution, mu: Array, norm: float, reach: list[float]) -> SavedState:
-        """The state of a solution."""
+        """Return the state of a solution."""
         records, holding = solution.gluing.records, solution.holding
         held = np.where(holding, Status.STICK, Status.SLIP)
         return cls(
@@ -470,11 +470,11 @@ class SavedState:
         )
 
     def groups(self) -> list[Array]:
-        """The groups whose nodes have rows, of each contact."""
+        """Return the groups whose nodes have rows, of each contact."""
         return [self.group[self.contact == i] for i in range(len(self.reach))]
 
     def multipliers(self) -> Multipliers:
-        """The multipliers, with a face that only knows what rows do."""
+        """Return the multipliers, with a face that only knows what rows do."""
         return Multipliers(self.lam, face_of(np.zeros(len(self.lam), dtype=bool), self.status))
 
     def common(self) -> dict[str, Any]:

@@ -52,7 +52,7 @@ class Lost:
 def lost_on_friction(
     coarse: CoarseSpace, constraints: Constraints, u: Array, lam: Array, rtol: float
 ) -> Lost | None:
-    """Motions that friction alone holds, but not where the displacement is. Collective.
+    """Return motions that friction alone holds, but not where the displacement is. Collective.
 
     Along a motion y that neither springs, nor equality rows, nor closed normals resist, friction
     balances the load e: ρ(t) = yᵀe − Σψ_i (T_i y)ᵀq_i/‖q_i‖, q_i the slips of u + ty, is 0 or jumps
@@ -145,7 +145,7 @@ def _allowed(coarse: CoarseSpace, u: Array, rtol: float) -> Array:
 def _held_by_nothing_else(
     coarse: CoarseSpace, constraints: Constraints, slips: Array, allowed: Array
 ) -> csr_array:
-    """Orthonormal motions that normals which may be closed do not resist, on all ranks."""
+    """Return orthonormal motions that normals which may be closed do not resist, on all ranks."""
     row, column = coarse.J.tocoo().coords
     near = np.zeros(len(slips))
     np.maximum.at(near, row, allowed[column // coarse.bodies.k])
@@ -369,7 +369,7 @@ class Diagnostics:
                 )
 
     def _points(self, subdomains: Subdomains) -> Array:
-        """Points of this rank's primal nodes, from the middle of their subdomains on."""
+        """Return points of this rank's primal nodes, from the middle of their subdomains on."""
         gdim, bs = self._decomposition.mesh.geometry.dim, self._dofs.bs
         x = self._dofs.V.tabulate_dof_coordinates()[self._dofs.dolfinx_node, :gdim]
         for part in subdomains.dof_parts:
@@ -378,7 +378,7 @@ class Diagnostics:
         return np.asarray(x)
 
     def _names(self, which: Array) -> str:
-        """Names of bodies, the first ones if they are many; the same on all ranks."""
+        """Return names of bodies, the first ones if they are many; the same on all ranks."""
         names = self._decomposition.body_names
         some = bcast_from_root(self._dofs.comm, np.flatnonzero(which))
         listed = ", ".join(names[body] for body in some[:LISTED])

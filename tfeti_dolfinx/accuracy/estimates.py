@@ -149,7 +149,7 @@ def bound_of(system: System, solution: Solution) -> tuple[float, EnergyBound]:
 
 
 def _discretisation(solution: Solution) -> float:
-    """The root of the sum of squares. Collective."""
+    """Return the root of the sum of squares. Collective."""
     comm = solution.dofs.comm
     own = float(np.sum(solution.discretisation_error.x.array**2))
     return float(np.sqrt(bcast_from_root(comm, comm.allreduce(own))))

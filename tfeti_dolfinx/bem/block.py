@@ -149,7 +149,7 @@ class Parts:
         return blocks
 
     def load(self, f: Array, volume: Array | None, hats: Array | None) -> Array:
-        """The load with that of boundary elements in the place of that of finite ones.
+        """Return the load with that of boundary elements in the place of that of finite ones.
 
         Args:
             f: The load in primal order.
@@ -208,7 +208,7 @@ class Parts:
         return bodies
 
     def inside(self) -> int:
-        """Number of unknowns of all ranks that boundary elements do without."""
+        """Return the number of unknowns of all ranks that boundary elements do without."""
         count = sum(int(np.sum(~part.on_surface)) for part in self.parts.values())
         return int(self._dofs.comm.allreduce(count))
 
@@ -224,7 +224,7 @@ def _part(
     shapes: dict[bytes, list[SurfaceStiffness]],
     how: InverseFactory,
 ) -> Part:
-    """A subdomain, of a shape that is known or a new one."""
+    """Return a subdomain, of a shape that is known or a new one."""
     key, order = places_in_order(surface.panels.x)
     outside = np.zeros(len(order), dtype=bool)
     outside[surface.panels.nodes] = True
@@ -254,7 +254,7 @@ def _equal(shape: SurfaceStiffness, surface: Surface, K: Any) -> bool:
 
 
 def _force_per_volume(name: str, volume: Array, hats: Array) -> Array:
-    """The constant b whose load this is."""
+    """Return the constant b whose load this is."""
     forces = volume.reshape(len(hats), -1)
     b = forces.sum(axis=0) / hats.sum()
     if np.abs(forces - hats[:, None] * b).max() > CONSTANT * np.abs(forces).max(initial=0.0):

@@ -52,7 +52,7 @@ class Inside:
         self._field = _Field(t - 2.0 * law.mu * turned, turned, rest[panels.nodes])
 
     def displacement(self, points: Array) -> Array:
-        """Shape ``(k, d)``, at points inside, shape ``(k, d)``."""
+        """Return an array of shape ``(k, d)``, at points inside, shape ``(k, d)``."""
         points = points - self._shift
         u = self._known(points)
         for cut in _cuts(self._panels, points, self._field.on_corners):
@@ -64,7 +64,7 @@ class Inside:
         return share(self._panels, points - self._shift)
 
     def stress(self, points: Array) -> Array:
-        """Shape ``(k, d, d)``, without σ_zz, at points inside, shape ``(k, d)``."""
+        """Return σ, shape ``(k, d, d)``, without σ_zz, at points inside, shape ``(k, d)``."""
         return self._law.stress(self.gradient(points))
 
     def gradient(self, points: Array) -> Array:
@@ -81,7 +81,7 @@ class Inside:
         return self._law.lmbda + 2.0 * self._law.mu
 
     def _known(self, x: Array) -> Array:
-        """The rigid motion and u_p."""
+        """Return the rigid motion and u_p."""
         y = x - self._middle
         return np.asarray(self._moved + y @ self._turn.T - self._b * y**2 / (2.0 * self._stiff))
 

@@ -190,7 +190,7 @@ def _put(layers: Layers, i: Array, j: Array, values: tuple[Array, ...]) -> None:
 
 
 def _by_rule(panels: Panels, i: Array, j: Array, points: int) -> tuple[Array, ...]:
-    """The integrals by Gauss' rule in both variables."""
+    """Return the integrals by Gauss' rule in both variables."""
     rule: Array = np.array(np.polynomial.legendre.leggauss(points))
     s, weights = 0.5 * (rule[0] + 1.0), 0.5 * rule[1]
     z, tau = panels.corners @ np.array([1.0, 1j]), panels.directed @ np.array([1j, -1.0])
@@ -229,7 +229,7 @@ class _Corners:
 
 
 def _exact(panels: Panels, i: Array, j: Array) -> tuple[Array, ...]:
-    """The integrals in closed form; F₁, F₂ are antiderivatives of log z."""
+    """Return the integrals in closed form; F₁, F₂ are antiderivatives of log z."""
     lengths = panels.measure
     z = panels.corners @ np.array([1.0, 1j])
     tau = (panels.directed @ np.array([1j, -1.0])) / lengths
@@ -305,7 +305,7 @@ def layers_3d(panels: Panels) -> Layers:
 
 
 def _shared_corners(nodes: Array, first: Array, second: Array) -> tuple[Array, Array, Array]:
-    """Number of shared corners of pairs, and orders of the corners that put these first."""
+    """Return number of shared corners of pairs, and orders of the corners that put these first."""
     same = nodes[first][:, :, None] == nodes[second][:, None, :]
     own = same.any(axis=2)
     shared = own.sum(axis=1)

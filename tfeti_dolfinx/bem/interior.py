@@ -125,7 +125,7 @@ class _Midpoints:
         )
 
     def of(self, values: Array) -> Array:
-        """Shape ``(cells, 3, 3)``, for values of u in DOLFINx's order."""
+        """Return an array of shape ``(cells, 3, 3)``, for values of u in DOLFINx's order."""
         self._u.x.array[:] = values
         self._values.interpolate(self._expression)
         layout = np.asarray(self._values.function_space.dofmap.list)[:, 0]

@@ -91,7 +91,7 @@ class Panels:
         return float(np.sum(self.midpoints * self.directed) / self.dim)
 
     def by_corners(self, values: Array) -> csr_array:
-        """A sparse matrix, ne × np, from values for the corners, shape ``(ne, d)``."""
+        """Return a sparse matrix, ne × np, from values for the corners, shape ``(ne, d)``."""
         panel = np.repeat(np.arange(len(self.nodes)), self.dim)
         shape = (len(self.nodes), len(self.x))
         return csr_array(coo_array((values.ravel(), (panel, self.nodes.ravel())), shape=shape))
@@ -141,7 +141,7 @@ class Surface:
         return self.cuts[0]
 
     def placed(self, order: Array) -> Surface:
-        """The same with nodes, and therefore panels, in another order."""
+        """Return the same with nodes, and therefore panels, in another order."""
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
         x = self.panels.x[order]

@@ -117,7 +117,7 @@ def steklov(panels: Panels, law: IsotropicLaw) -> Steklov:
 
 
 def wrong_forces(panels: Panels, law: IsotropicLaw, S: Array) -> float:
-    """The largest error of nodal forces of constant stresses, over the largest of these."""
+    """Return the largest error of nodal forces of constant stresses, over the largest of these."""
     d, y = panels.dim, panels.x - panels.x.mean(axis=0)
     gradients = np.eye(d * d).reshape(d * d, d, d)
     u = np.einsum("kij,nj->nik", gradients, y).reshape(-1, d * d)
@@ -188,7 +188,7 @@ def gunter(panels: Panels) -> csr_array:
 
 
 def rigid_motions(x: Array) -> Array:
-    """Orthonormal, shape ``(d np, 3 or 6)``, unknowns ordered node by node."""
+    """Return orthonormal modes, shape ``(d np, 3 or 6)``, unknowns ordered node by node."""
     n, d = x.shape
     y = (x - x.mean(axis=0)) / np.abs(x - x.mean(axis=0)).max()
     modes = [np.tile(axis, n) for axis in np.eye(d)]

@@ -224,7 +224,7 @@ def _hash(*texts: str) -> str:
 
 
 def _values(constants: Any, functions: Any) -> dict[str, Any]:
-    """Values of constants, and the kinds of functions; UFL's own have none."""
+    """Return values of constants, and the kinds of functions; UFL's own have none."""
     return {
         "constants": [
             described(c) if isinstance(c, fem.Constant) else type(c).__qualname__ for c in constants
@@ -312,7 +312,7 @@ def _is_number(value: Any) -> bool:
 
 
 def brief(value: Any) -> str:
-    """A description for a message."""
+    """Return a description for a message."""
     if isinstance(value, dict) and "type" in value:
         return f"a {value['type']}" if not value["type"].startswith("the ") else value["type"]
     return repr(value) if isinstance(value, Absent) else shown(value)

@@ -33,7 +33,7 @@ POSITIVE = Range("a positive number", lambda value: value > 0.0)
 
 
 def shown(value: Any) -> str:
-    """A value for a message: short, and of objects their type only."""
+    """Return a value for a message: short, and of objects their type only."""
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, (bool, str, Real, list, tuple, dict)):
@@ -51,7 +51,7 @@ def is_whole(value: Any) -> TypeGuard[int]:
 
 
 def checked_number(value: Any, what: str, expected: Range = FINITE) -> float:
-    """A finite number in a range; numpy's scalars are numbers, booleans and texts are none.
+    """Return a finite number in a range; numpy's scalars are numbers, booleans and texts are none.
 
     Args:
         value: What was given.
@@ -83,7 +83,7 @@ def real_numbers(values: Any) -> Array:
 
 
 def checked_flag(value: Any, what: str) -> bool:
-    """A boolean, or numpy's.
+    """Return a boolean, or numpy's.
 
     Raises:
         InputError: It is anything else.
@@ -114,7 +114,7 @@ def checked_callable(value: Any, what: str, expected: str) -> None:
 
 
 def checked_path(path: Any, suffix: str) -> Path:
-    """A file's name with this ending.
+    """Return a file's name with this ending.
 
     Raises:
         InputError: It is no name, or ends otherwise.
@@ -180,7 +180,7 @@ class Description:
 
 
 def described(default: Any, algorithm: str, text: str, **more: Any) -> Any:
-    """A field of a dataclass of parameters.
+    """Return a field of a dataclass of parameters.
 
     Args:
         default: Its default, which says its type too.

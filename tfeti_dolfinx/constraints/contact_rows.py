@@ -85,7 +85,7 @@ class SharedNodes:
 
 
 def shared_nodes(records: ContactRecords, free: Array, kept: Array, points: Array) -> SharedNodes:
-    """The conditions of this rank whose nodes have several of them.
+    """Return the conditions of this rank whose nodes have several of them.
 
     Args:
         records: Conditions of this rank.
@@ -102,7 +102,7 @@ def shared_nodes(records: ContactRecords, free: Array, kept: Array, points: Arra
 
 
 def _rows(records: ContactRecords, free: Array, condition: Array) -> csr_array:
-    """Rows of some conditions over the unknowns that they touch."""
+    """Return rows of some conditions over the unknowns that they touch."""
     place = np.full(len(records), -1)
     place[condition] = np.arange(len(condition))
     used = np.flatnonzero(place[records.condition] >= 0)
@@ -323,7 +323,7 @@ def _tangents_of(
 
 
 def _by_condition(tables: list[Rows]) -> Rows:
-    """Rows of several axes, those of a condition one after the other."""
+    """Return rows of several axes, those of a condition one after the other."""
     rows, count = stack(tables), len(tables)
     place = np.arange(len(rows)).reshape(-1, count).T.ravel()
     return Rows(np.repeat(tables[0].group, count), place[rows.row], rows.column, rows.value)

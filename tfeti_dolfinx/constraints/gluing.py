@@ -91,7 +91,7 @@ def _glue(dofs: TornDofs, flag: Array, weights: Array, k: int) -> Rows:
 
 
 def _orthonormal(weights: Array) -> Array:
-    """Rows with zero sum, orthonormal in the inner product of diag(weights)⁻¹.
+    """Return rows with zero sum, orthonormal in the inner product of diag(weights)⁻¹.
 
     Gram–Schmidt on e_i − e_{i+1} in closed form: row j is proportional to (w_1, …, w_j, −W_j)
     with W_j = w_1 + … + w_j.
@@ -165,7 +165,7 @@ def prescribe(dofs: TornDofs, bcs: Sequence[fem.DirichletBC]) -> Prescribed:
 def checked_conditions(
     bcs: Iterable[fem.DirichletBC], V: fem.FunctionSpace
 ) -> list[fem.DirichletBC]:
-    """The conditions as a list. Collective.
+    """Return the conditions as a list. Collective.
 
     Raises:
         InputError: They are no Dirichlet conditions on V or a component of V, or one of them has
@@ -251,7 +251,7 @@ def _facet_nodes(dofs: TornDofs, facets: Array) -> Array:
 
 
 def listed_conditions(bcs: Iterable[fem.DirichletBC]) -> list[fem.DirichletBC]:
-    """The conditions as a list. Not collective.
+    """Return the conditions as a list. Not collective.
 
     Raises:
         InputError: They are nothing that gives Dirichlet conditions.
@@ -398,7 +398,7 @@ class Gluing:
         )
 
     def with_supports_at(self, values: Array) -> Array:
-        """This rank's part of c as it is, but for supports, which hold other values.
+        """Return this rank's part of c as it is, but for supports, which hold other values.
 
         Contacts meet prescribed components where the prescribed values have them.
 
@@ -445,7 +445,7 @@ class Gluing:
         return sorted(set().union(*self.dofs.comm.allgather(own.tolist())))
 
     def _keys(self, rows: ContactRows | TangentRows) -> Array:
-        """A number for the contact and the node of each condition with such rows."""
+        """Return a number for the contact and the node of each condition with such rows."""
         kept, records = rows.condition, self.records
         return records.contact[kept] * MANY_GROUPS + records.group[kept]
 

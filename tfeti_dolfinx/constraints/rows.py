@@ -39,7 +39,7 @@ class Rows:
         return len(self.group)
 
     def without_zeros(self) -> Rows:
-        """The same rows without entries that are zero."""
+        """Return the same rows without entries that are zero."""
         used = self.value != 0.0
         return Rows(self.group, self.row[used], self.column[used], self.value[used])
 
@@ -52,7 +52,7 @@ class Rows:
 
 
 def stack(tables: list[Rows]) -> Rows:
-    """The rows of several tables, one table after the other, and so are their entries."""
+    """Return the rows of several tables, one table after the other, and so are their entries."""
     starts = np.cumsum([0, *(len(t) for t in tables)])
     return Rows(
         group=np.concatenate([t.group for t in tables]),
@@ -85,7 +85,7 @@ class RowSets:
         return np.concatenate((self.normals, self.tangents.ravel()))
 
     def contact_rows(self, comm: MPI.Intracomm) -> tuple[int, int]:
-        """Number of normal and of tangential rows on all ranks. Collective."""
+        """Return the number of normal and of tangential rows on all ranks. Collective."""
         normals, tangents = comm.allreduce(np.array([self.normals.size, self.tangents.size]))
         return int(normals), int(tangents)
 
@@ -168,7 +168,7 @@ def row_span(dofs: TornDofs, equalities: Rows, contact: Rows, trace: Array) -> A
 
 
 def _grams(rows: Rows, bs: int) -> tuple[Array, Array]:
-    """Nodes that rows act on, and the sums of aaᵀ of their coefficients a there."""
+    """Return nodes that rows act on, and the sums of aaᵀ of their coefficients a there."""
     node = rows.column // bs
     pairs, place = np.unique(node * len(rows) + rows.row, return_inverse=True)
     a = np.zeros((len(pairs), bs))
@@ -274,7 +274,7 @@ class RowBuilder:
         return HeldPart(records.condition[holds], records.entry_group[holds], weight)
 
     def rows(self, axis: int, condition: Array, scale: Array) -> Rows:
-        """A row for each of these conditions along an axis, times its scale."""
+        """Return a row for each of these conditions along an axis, times its scale."""
         records, dofs = self.records, self._dofs
         place = np.full(len(records), -1)
         place[condition] = np.arange(len(condition))

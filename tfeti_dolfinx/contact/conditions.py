@@ -62,7 +62,7 @@ class Side:
 
 
 def side_of(contact: str, surface: str | int, dofs: TornDofs, decomposition: Decomposition) -> Side:
-    """A surface of a pair. Collective.
+    """Return a surface of a pair. Collective.
 
     Args:
         contact: Name of the contact, for messages.
@@ -260,7 +260,7 @@ def _without_rounding(dofs: TornDofs, gap: Array) -> Array:
 
 
 def _merged(dofs: TornDofs, entries: tuple[Triplets, ...]) -> Triplets:
-    """Triplets on the ranks that own their rows (as local slots), equal ones added up."""
+    """Return triplets on the ranks that own their rows (as local slots), equal ones added up."""
     row, column, value = (np.concatenate(parts) for parts in zip(*entries, strict=True))
     exchange = Exchange(dofs.comm, owner_of(dofs.group_offsets, row))
     row = exchange.send(row) - dofs.group_offsets[dofs.comm.rank]

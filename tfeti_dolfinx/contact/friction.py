@@ -158,7 +158,7 @@ def same_law(one: Law, other: Law) -> bool:
 def with_friction(
     name: str, friction: Law | None, records: ContactRecords, dofs: TornDofs
 ) -> ContactRecords:
-    """The conditions of a contact with its friction, their tangents along its direction.
+    """Return the conditions of a contact with its friction, their tangents along its direction.
 
     Collective.
 
@@ -250,7 +250,7 @@ def _at_groups(what: str, function: fem.Function, dofs: TornDofs) -> Array:
 
 
 def _checked_values(what: str, value: Any, x: Array) -> Array:
-    """A number, a function of points, or values at them: one for each point."""
+    """Return a number, a function of points, or values at them: one for each point."""
     if callable(value):
         try:
             value = np.asarray(value(x.T)).astype(float, casting="same_kind")

@@ -46,7 +46,7 @@ class ContactPartner(Protocol):
         ...
 
     def first_reach(self, decomposition: Decomposition) -> float:
-        """Distance up to which conditions have rows at first."""
+        """Return the distance up to which conditions have rows at first."""
         ...
 
     def horizon(self, length: float) -> float:
@@ -61,7 +61,7 @@ class ContactPartner(Protocol):
         reach: float,
         stiffness: Array,
     ) -> tuple[ContactPartner, ContactRecords]:
-        """The contact with its sides decided from the stiffness, and its conditions."""
+        """Return the contact with its sides decided from the stiffness, and its conditions."""
         ...
 
     def displacement_bound(self, dofs: TornDofs, decomposition: Decomposition, u: Array) -> float:
@@ -80,16 +80,16 @@ class ContactPartner(Protocol):
         ...
 
     def with_gap(self, gap: Gap) -> ContactPartner:
-        """The same contact with another gap."""
+        """Return the same contact with another gap."""
         ...
 
     def gaps(self, dofs: TornDofs, records: ContactRecords, depth: float) -> Array:
-        """Gaps of conditions that were made with another gap: no search, no integral."""
+        """Return gaps of conditions that were made with another gap: no search, no integral."""
         ...
 
 
 def checked_contacts(contacts: Sequence[ContactPartner]) -> list[ContactPartner]:
-    """The contacts as a list.
+    """Return the contacts as a list.
 
     Raises:
         InputError: They are not a sequence of obstacles and pairs.

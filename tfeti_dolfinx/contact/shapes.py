@@ -39,7 +39,7 @@ class Shape(Protocol):
 
 
 def _vector(values: Point, what: str) -> Array:
-    """A vector of three components from two or three."""
+    """Return a vector of three components from two or three."""
     with named(f"{what}={values!r}, expected two or three finite numbers", TypeError, ValueError):
         array = np.asarray(values, dtype=float)
     if array.shape not in ((2,), (3,)) or not np.all(np.isfinite(array)):

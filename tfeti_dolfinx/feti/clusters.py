@@ -91,7 +91,7 @@ class ClusterSteps:
         return np.array(self._y.array_r)
 
     def _spectrum(self) -> tuple[float, float]:
-        """An interval for the eigenvalues of D_A⁻¹ΠᵀA, as conjugate gradients show them."""
+        """Return an interval for the eigenvalues of D_A⁻¹ΠᵀA, as conjugate gradients show them."""
         comm = self._comm
         b = self._times(np.random.default_rng(comm.rank).standard_normal(len(self._own.cluster)))
         (least,) = NOTHING * summed(comm, np.array([b @ self._solved(b)]))
@@ -139,7 +139,7 @@ def _count(low: float, high: float) -> int:
 
 
 def _blocks(A: PETSc.Mat, cluster: Array) -> csr_array:
-    """The blocks of A between motions of one cluster each, with a shift."""
+    """Return the blocks of A between motions of one cluster each, with a shift."""
     indptr, columns, values = A.getDiagonalBlock().getValuesCSR()
     own = csr_array((values, columns, indptr), shape=(len(cluster),) * 2).tocoo()
     within = cluster[own.coords[0]] == cluster[own.coords[1]]
@@ -224,7 +224,7 @@ class ClusterMotions:
         return Balanced(on_face, _Inner(face, self._Gt, self._own.energy, inner))
 
     def _assembled(self, part: csr_array) -> PETSc.Mat:
-        """The sum of all ranks' parts, and what springs add. Collective."""
+        """Return the sum of all ranks' parts, and what springs add. Collective."""
         terms: coo_array = part.tocoo()
         row, column = (i.astype(np.int64) for i in terms.coords)
         ranges = self._Gt.getOwnershipRangesColumn()

@@ -250,7 +250,7 @@ class Dual:
             self.soft.factors.count["face"] = 0
 
     def qp(self, norm_steps: int = 0) -> QP:
-        """The quadratic program; without kernel it has no coarse problem.
+        """Return the quadratic program; without kernel it has no coarse problem.
 
         Args:
             norm_steps: Lanczos steps that estimate ‖PFP‖, once; 0 where nobody asks for it.
@@ -350,7 +350,7 @@ class Dual:
         return self._images[kind][1]
 
     def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> Array:
-        """Displacements that belong to multipliers: of equal ones the smallest.
+        """Return displacements that belong to multipliers: of equal ones the smallest.
 
         Args:
             lam: The multipliers λ.

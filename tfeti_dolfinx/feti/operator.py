@@ -109,7 +109,7 @@ class RowMatrix(Protocol):
         ...
 
     def createVecRight(self) -> PETSc.Vec:
-        """A trace vector. Collective."""
+        """Return a trace vector. Collective."""
         ...
 
 
@@ -220,7 +220,7 @@ class ScaledRows:
         self.B.mult(x, y)
 
     def createVecRight(self) -> PETSc.Vec:
-        """A trace vector. Collective."""
+        """Return a trace vector. Collective."""
         return self.B.createVecRight()
 
     def destroy(self) -> None:

@@ -154,7 +154,7 @@ class Smoothing:
         return self._largest(top)
 
     def _largest(self, value: float) -> float:
-        """The largest of all ranks, on which all agree. Collective."""
+        """Return the largest of all ranks, on which all agree. Collective."""
         return float(bcast_from_root(self._comm, self._comm.allreduce(value, op=MPI.MAX)))
 
 
@@ -228,7 +228,7 @@ class GramFactor(Protocol):
 
 
 def contact_factor(A: PETSc.Mat, prefix: str) -> GramFactor:
-    """A factor of a symmetric positive definite matrix, which is taken over. Collective.
+    """Return a factor of a symmetric positive definite matrix, which is taken over. Collective.
 
     Ranks without rows have no part in it: MUMPS 5.7 has been seen to hang in a solve with rows on
     one rank of two.
@@ -414,7 +414,7 @@ class _OnFace:
         y.array[:] = self._scaled(y.array_r)
 
     def dependent(self, x: Array) -> Array | None:
-        """The part of x in the null space of W_κ, and so of B_fᵀ. Collective.
+        """Return the part of x in the null space of W_κ, and so of B_fᵀ. Collective.
 
         (1 + W/ε)⁻², ε the shift, leaves (ε/σ)² of what has the eigenvalue σ.
         """
@@ -457,7 +457,7 @@ def _restricted(gram: PETSc.Mat, Z: csr_array) -> PETSc.Mat:
 
 
 def _diagonal(constraints: Constraints, diagonal: Array) -> Array:
-    """The diagonal of B D⁻¹ diag(K) D⁻¹Bᵀ on the local rows. Collective."""
+    """Return the diagonal of B D⁻¹ diag(K) D⁻¹Bᵀ on the local rows. Collective."""
     B = constraints.B
     squares, size = B.copy(), B.createVecRight()
     rows, columns, values = squares.getValuesCSR()

@@ -73,7 +73,7 @@ def replicated_gram(Gt: csr_array, comm: MPI.Intracomm) -> csr_array:
 
 
 def replicated(part: csr_array, comm: MPI.Intracomm) -> csr_array:
-    """The sum of all ranks' sparse matrices, on all ranks. Collective."""
+    """Return the sum of all ranks' sparse matrices, on all ranks. Collective."""
     local = part.tocoo()
     row, column = (np.concatenate(comm.allgather(index)) for index in local.coords)
     value = np.concatenate(comm.allgather(local.data))
@@ -308,7 +308,7 @@ class Projectors:
         return self._factor.solve(y)
 
     def restricted(self, x: Array) -> Array:
-        """The part of x in the face: all of it."""
+        """Return the part of x in the face: all of it."""
         return x
 
     def project(self, x: PETSc.Vec) -> None:
@@ -376,7 +376,7 @@ class FaceFactors:
         self.count: Counter[str] = Counter()
 
     def factor(self, gram: csr_array, kind: str = "face") -> SemidefiniteFactor:
-        """A factor of a Gram matrix. Collective.
+        """Return a factor of a Gram matrix. Collective.
 
         Raises:
             FactorError: It could not be made.
@@ -426,5 +426,5 @@ class FaceProjectors(Projectors):
         return self._whole.damped_solve(face, y, damping)
 
     def on_face(self, face: Face) -> FaceProjectors:
-        """The projectors of another face of all rows."""
+        """Return the projectors of another face of all rows."""
         return FaceProjectors(self._whole, face, self._factors)

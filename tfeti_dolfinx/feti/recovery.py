@@ -106,7 +106,7 @@ def moved(u: Array, coarse: CoarseSpace, alpha: Array) -> Array:
 
 
 def _alpha(coarse: CoarseSpace, gradient: Array, free: Array, nu: Array) -> Array:
-    """Kernel coordinates that make the rows' residuals vanish as far as they can."""
+    """Return kernel coordinates that make the rows' residuals vanish as far as they can."""
     if coarse.dimension == 0:
         return np.zeros(0)
     alpha = coarse.solve(coarse.G(gradient - nu))
@@ -141,7 +141,7 @@ TIGHT = 1e-14
 def nearly_free(
     coarse: CoarseSpace, lam: Array, carrying: Array, error: float
 ) -> tuple[Motions, Array]:
-    """Motions that the contact rows with a force do not hold, or hardly. Collective.
+    """Return motions that the contact rows with a force do not hold, or hardly. Collective.
 
     Args:
         coarse: The coarse space.
@@ -177,7 +177,7 @@ def smallest_motion(
     motions: Motions,
     force: Array,
 ) -> Array:
-    """Kernel coordinates of the motion that makes u the smallest solution. Collective.
+    """Return kernel coordinates of the motion that makes u the smallest solution. Collective.
 
     Of the displacements that differ by these motions, that keep open contacts open and leave the
     rows with a force as near to contact as they are, it has the least mean squares on the bodies.
@@ -209,7 +209,7 @@ def smallest_motion(
 
 
 def orthonormal(motions: Motions, k: int) -> tuple[csr_array, Array]:
-    """Orthonormal basis of the motions, and a body of each."""
+    """Return an orthonormal basis of the motions, and a body of each."""
     alone, joint = motions.alone, motions.joint
     body = np.repeat(np.arange(len(motions.free)), motions.free.sum(axis=1))
     if joint.shape[1] == 0:
@@ -225,7 +225,7 @@ def orthonormal(motions: Motions, k: int) -> tuple[csr_array, Array]:
 
 
 def _span(columns: Array) -> Array:
-    """Orthonormal basis of the span of columns of size 1, or less if they are dependent."""
+    """Return orthonormal basis of the span of columns of size 1, or less if they are dependent."""
     U, size, _ = np.linalg.svd(columns, full_matrices=False)
     return np.asarray(U[:, size > DEPENDENT])
 
@@ -297,7 +297,7 @@ EXACT, MOST_STEPS = 1e-10, 100
 
 
 def min_norm_correction(constraints: Constraints, w: PETSc.Vec, closed: Array) -> Array:
-    """The least displacement v in D for which B_f v comes nearest to w. Collective.
+    """Return the least displacement v in D for which B_f v comes nearest to w. Collective.
 
     Gluing and Dirichlet rows are orthonormal in D⁻¹, and orthogonal to contact rows: D⁻¹B_fᵀw
     closes them. Contact rows are not so to each other: where a stiff and fine side is the secondary
@@ -340,7 +340,7 @@ class _ClosedRows:
         return np.asarray(self._v.array_r / self._constraints.weights)
 
     def nearest(self, w: Array) -> Array:
-        """The least v with B_f v nearest to w, zero off the rows, by conjugate gradients."""
+        """Return the least v with B_f v nearest to w, zero off the rows, by conjugate gradients."""
         D, r = self._constraints.weights, w.copy()
         s = self._upwards(r)
         v, p, left = np.zeros_like(s), s.copy(), self._dot(s, D * s)

@@ -76,7 +76,7 @@ class DefectProblem:
         return self._dual.lifting
 
     def qp(self) -> QP:
-        """The quadratic program of δλ."""
+        """Return the quadratic program of δλ."""
         coarse: Coarse = self.coarse if self.coarse.dimension else NoCoarse()
         return replace(self._dual.qp(), d=self.d, coarse=coarse, feasible=self.feasible)
 

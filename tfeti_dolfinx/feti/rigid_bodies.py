@@ -51,7 +51,7 @@ def parts_of_columns(A: csr_array) -> Iterator[tuple[Array, Array, Array]]:
 
 
 def spread(rows: Array, dense: Array, n: int) -> csr_array:
-    """A dense matrix on some of n rows."""
+    """Return a dense matrix on some of n rows."""
     width = dense.shape[1]
     places = np.repeat(rows, width), np.tile(np.arange(width), len(rows))
     return csr_array((dense.ravel(), places), shape=(n, width))
@@ -75,7 +75,7 @@ def by_parts(A: csr_array, change: Callable[[Array], Array]) -> csr_array:
 
 
 def orthonormal_columns(A: csr_array) -> csr_array:
-    """An orthonormal basis of the span of independent columns."""
+    """Return an orthonormal basis of the span of independent columns."""
     return by_parts(A, lambda dense: np.linalg.qr(dense)[0])
 
 
@@ -152,7 +152,7 @@ def diagonal_blocks(A: csr_array, k: int) -> Array:
 
 
 def unsprung(springs: Array) -> Motions:
-    """Motions that springs do not resist.
+    """Return motions that springs do not resist.
 
     Args:
         springs: Projector onto what they resist, shape ``(bodies, k, k)``.
@@ -163,7 +163,7 @@ def unsprung(springs: Array) -> Motions:
 
 
 def unresisted(gram: csr_array, within: Motions, below: float = NULL) -> Motions:
-    """Motions of a space of single bodies' motions that rows do not resist.
+    """Return motions of a space of single bodies' motions that rows do not resist.
 
     What a body can do alone is found body by body. On what is left the rows' Gram matrix has
     unit diagonal blocks; its null space is that of connected components of bodies.
@@ -198,7 +198,7 @@ def unresisted(gram: csr_array, within: Motions, below: float = NULL) -> Motions
 
 
 def _largest(A: csr_array, k: int) -> Array:
-    """Largest eigenvalue of each diagonal block."""
+    """Return the largest eigenvalue of each diagonal block."""
     return np.asarray(np.linalg.eigvalsh(diagonal_blocks(A, k)).max(axis=1, initial=0.0))
 
 
@@ -296,7 +296,7 @@ class Bodies:
         self.negligible = np.maximum(BALANCE * largest, ROUNDING * largest.max(initial=0.0))
 
     def part_of(self, u: Array) -> Array:
-        """The bodies' motion in a displacement, by least squares over the nodes. Collective.
+        """Return the bodies' motion in a displacement, by least squares over the nodes. Collective.
 
         Args:
             u: This rank's part of the displacement, shape ``(n,)``.
@@ -327,7 +327,7 @@ def _frames(gram: Array) -> Array:
 
 
 def _replicated(local: csr_array, first: int, dimension: int, comm: MPI.Intracomm) -> csr_array:
-    """The rows of all ranks, on every rank; this rank's begin at first."""
+    """Return the rows of all ranks, on every rank; this rank's begin at first."""
     entries = local.tocoo()
     row, column = entries.coords
     every = ((first + row).astype(np.int64), column.astype(np.int64), entries.data)
@@ -346,7 +346,7 @@ NAMED = 4
 
 
 def free_to_move(amounts: Array, body_names: Sequence[str], mode_names: Sequence[str]) -> str:
-    """A sentence about a motion.
+    """Return a sentence about a motion.
 
     Args:
         amounts: How much of each mode is in it, shape ``(bodies, k)``.
@@ -411,13 +411,13 @@ def listed(
 
 
 def _plain(joint: Array) -> Array:
-    """Motions that span the same, each with a coordinate that the others leave alone."""
+    """Return motions that span the same, each with a coordinate that the others leave alone."""
     rows = qr(joint.T, pivoting=True, mode="r")[1][: joint.shape[1]]
     return np.asarray(joint @ np.linalg.inv(joint[np.sort(rows)]))
 
 
 def _spanning(vectors: Array, mode_names: Sequence[str]) -> list[str]:
-    """Names of as many motions as there are columns."""
+    """Return names of as many motions as there are columns."""
     count = vectors.shape[1]
     if count == 1:
         return [_parts(vectors.T, mode_names)[1]]
@@ -491,7 +491,7 @@ class KernelBasis:
 
 
 def kernel_basis(bodies: Bodies, unheld: Motions, free: Motions) -> KernelBasis:
-    """The basis with all motions of bodies that no springs resist, the free ones apart.
+    """Return the basis with all motions of bodies that no springs resist, the free ones apart.
 
     Args:
         bodies: The bodies.
@@ -510,7 +510,7 @@ def kernel_basis(bodies: Bodies, unheld: Motions, free: Motions) -> KernelBasis:
 
 
 def _directions(bodies: Bodies, unheld: Motions, free: Motions) -> tuple[Array, Array]:
-    """Directions of each body that are orthonormal in the kernel, and what holds each.
+    """Return directions of each body that are orthonormal in the kernel, and what holds each.
 
     Each is a combination of those before it: free ones, those that contact holds, those that
     equality rows hold, those that springs resist.
@@ -587,7 +587,7 @@ class NullBasis:
         return np.concatenate(pins)
 
     def extended(self, count: int) -> NullBasis:
-        """The same space, 0 on so many more coordinates."""
+        """Return the same space, 0 on so many more coordinates."""
         rows = self.joint.shape[0] + count
         table = (self.joint.data, self.joint.indices, np.pad(self.joint.indptr, (0, count), "edge"))
         return NullBasis(self.alone, csr_array(table, shape=(rows, self.joint.shape[1])))

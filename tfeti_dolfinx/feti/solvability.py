@@ -92,7 +92,7 @@ class CutRows:
         return row[place < most]
 
     def allowed(self, y: Array, tolerance: float, comm: MPI.Intracomm) -> float:
-        """Largest share of y, up to 1, that meets all rows; 0 does. Collective."""
+        """Return the largest share of y, up to 1, that meets all rows; 0 does. Collective."""
         value = self.A @ y
         beyond = value > self.b + tolerance
         shares = np.maximum(self.b[beyond], 0.0) / value[beyond]
@@ -184,7 +184,7 @@ def check_solvable(
 
 
 def _driven(free: Motions, load: Array, bodies: Bodies) -> Array | None:
-    """The part of the load on free motions, if it is more than rounding."""
+    """Return the part of the load on free motions, if it is more than rounding."""
     alone = (free.alone @ (free.alone.T @ load)).reshape(bodies.count, bodies.k)
     alone[np.linalg.norm(alone, axis=1) <= bodies.negligible] = 0.0
     if np.any(alone):
@@ -223,7 +223,7 @@ def escape(coarse: CoarseSpace) -> Array | None:
 
 
 def load_sizes(load: Array, noise: Array, part: Array) -> Array:
-    """Size of the load on each part of the scene, 1 where there is none.
+    """Return the size of the load on each part of the scene, 1 where there is none.
 
     A load that is no more than rounding is not the size of anything: else its noise would hide
     what drives the other parts.
@@ -242,7 +242,7 @@ def parts_of(coarse: CoarseSpace, rows: CutRows, body: Array) -> Array:
 
 
 def _most_work(A: csr_array, load: Array, noise: Array) -> Array | None:
-    """A motion of much work, if that is more than rounding; A y ≤ 0, −1 ≤ y ≤ 1."""
+    """Return a motion of much work, if that is more than rounding; A y ≤ 0, −1 ≤ y ≤ 1."""
     y = minimiser(-load, A, bounds=(-1.0, 1.0))
     if load @ y <= noise.max():
         return None
@@ -254,7 +254,7 @@ def _most_work(A: csr_array, load: Array, noise: Array) -> Array | None:
 
 
 def _least_motion(A: csr_array, load: Array) -> Array:
-    """The least motion (sum of moduli) of unit work, scaled to 1; A y ≤ 0."""
+    """Return the least motion (sum of moduli) of unit work, scaled to 1; A y ≤ 0."""
     work = np.concatenate((load, -load))[None, :]
     y = _halves(minimiser(np.ones(work.size), _both(A), A_eq=work, b_eq=np.ones(1)))
     return y / np.abs(y).max()
@@ -272,7 +272,7 @@ def _halves(pq: Array) -> Array:
 
 
 def minimiser(cost: Array, A: csr_array, **rest: Any) -> Array:
-    """The minimiser of a linear program over A y ≤ 0.
+    """Return the minimiser of a linear program over A y ≤ 0.
 
     Raises:
         TfetiError: Neither the simplex nor the interior point method found it.
@@ -383,7 +383,7 @@ class Resistance:
         return np.asarray(work), csr_array(sum(gradient for _, gradient in found))
 
     def violated(self, y: Array, factor: float) -> csr_array:
-        """Rows that y violates, at most one of each patch and kind of this rank."""
+        """Return rows that y violates, at most one of each patch and kind of this rank."""
         chosen = self._flat.violated(y, SLOPE, 1)
         self._flat.sent[chosen] = True
         size, direction = _directions(self._cone, y)
@@ -396,7 +396,7 @@ class Resistance:
         return csr_array(vstack([self._flat.A[chosen], rows]))
 
     def escape(self, on_friction: float = 1.0, on_coefficients: float = 1.0) -> Escape | None:
-        """A motion on which the load does more work than friction, if there is one.
+        """Return a motion on which the load does more work than friction, if there is one.
 
         Args:
             on_friction: Factor on the limits.
@@ -508,7 +508,7 @@ def _critical(resistance: Resistance, found: Escape) -> Escape:
 
 
 def _factor(resistance: Resistance) -> float:
-    """The factor on all friction that would hold the load."""
+    """Return the factor on all friction that would hold the load."""
     low, high = 1.0, 2.0
     while high < MOST and resistance.escape(high, high) is not None:
         low, high = high, 2.0 * high
@@ -529,7 +529,7 @@ def _in_units(coarse: CoarseSpace, constraints: Constraints, found: Escape) -> t
 
 
 def _weighted(J: csr_array, rows: Array, weight: Array) -> list[csr_array]:
-    """Rows of each axis, weighted; shapes ``(t, k)``."""
+    """Return rows of each axis, weighted; shapes ``(t, k)``."""
     pairs = zip(rows.T, weight.T, strict=True)
     return [
         csr_array(diags_array(w) @ J[row]) if len(row) else csr_array(J[row]) for row, w in pairs

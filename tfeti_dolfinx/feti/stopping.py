@@ -37,7 +37,7 @@ class Scene(Protocol):
     feasible: FeasibleSet
 
     def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> Array:
-        """This rank's part of u, given the solver's face and error. Collective."""
+        """Return this rank's part of u, given the solver's face and error. Collective."""
         ...
 
 
@@ -452,7 +452,7 @@ class Accuracy:
         self._small = float("inf")
 
     def _energy_ratio(self, now: Measures) -> float:
-        """Error in energy over its tolerance without what that allows for rounding.
+        """Return error in energy over its tolerance without what that allows for rounding.
 
         A body that falls far deforms by less than rounding of its fall, but forces may be known.
         """
@@ -529,19 +529,19 @@ class Accuracy:
         return max(own, self._over_goal())
 
     def _over_goal(self) -> float:
-        """The bound at the last look over what the goal allows; 0 without a goal."""
+        """Return the bound at the last look over what the goal allows; 0 without a goal."""
         if not self.reached:
             return 0.0
         return self.reached[-1].bound.error / max(self.reached[-1].allowed, TINY)
 
     def relative_error(self) -> float:
-        """Largest estimated error of a body over its largest displacement."""
+        """Return the largest estimated error of a body over its largest displacement."""
         noise = self.tolerances().displacement / max(self.rtol, NOISE)
         errors = self.errors()
         return float(np.max(errors / np.maximum(noise, TINY), initial=0.0))
 
     def energy_error(self) -> tuple[float, float]:
-        """Estimated error of u in energy over ‖u‖_K at the last look, and what it may be.
+        """Return estimated error of u in energy over ‖u‖_K at the last look, and what it may be.
 
         Where ‖u‖_K is rounding of a rigid motion, over what rounding may leave of it.
         """

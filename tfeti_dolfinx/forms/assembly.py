@@ -44,7 +44,7 @@ class Data:
 
 
 def data_of(form: ufl.Form | ufl.ZeroBaseForm, V: fem.FunctionSpace) -> Data:
-    """The constants and coefficients of a form whose arguments are on V."""
+    """Return the constants and coefficients of a form whose arguments are on V."""
     zero = is_zero(form)
     constants = [] if zero else list(form.constants())
     coefficients = [] if zero else list(form.coefficients())
@@ -120,17 +120,17 @@ class Forms:
         return self._of_L.has_changed()
 
     def stiffness(self) -> Any:
-        """This rank's K in DOLFINx's numbering, scipy CSR."""
+        """Return this rank's K in DOLFINx's numbering, scipy CSR."""
         return assemble_csr(self._a)
 
     def load(self) -> Array:
-        """This rank's f in DOLFINx's numbering."""
+        """Return this rank's f in DOLFINx's numbering."""
         if self._L is None:
             return np.zeros(self._V.dofmap.index_map.size_local * self._V.dofmap.index_map_bs)
         return np.array(fem.assemble_vector(self._L).array)
 
     def volume_load(self) -> Array | None:
-        """The part of the load from integrals over cells; None if there are none."""
+        """Return the part of the load from integrals over cells; None if there are none."""
         if self._volume_of_L is None:
             return None
         if isinstance(self._volume_of_L, ufl.Form):  # few problems ask for it
@@ -138,21 +138,21 @@ class Forms:
         return np.array(fem.assemble_vector(self._volume_of_L).array)
 
     def hats(self) -> Array:
-        """Integrals of the hats over the cells, for each of DOLFINx's nodes."""
+        """Return integrals of the hats over the cells, for each of DOLFINx's nodes."""
         one = fem.Constant(self._V.mesh, (1.0,) + (0.0,) * (self._V.dofmap.bs - 1))
         dx = ufl.Measure("dx", domain=self._V.mesh)
         form = self._compiled(ufl.dot(one, ufl.TestFunction(self._V)) * dx, "the volume")
         return np.array(fem.assemble_vector(form).array[:: self._V.dofmap.bs])
 
     def _compiled(self, form: ufl.Form, name: str) -> fem.Form:
-        """The form compiled by DOLFINx, which fails on all ranks or on none."""
+        """Return the form compiled by DOLFINx, which fails on all ranks or on none."""
         comm = self._decomposition.comm
         with raised_on_all_ranks(comm), named(f"{name} cannot be compiled"):
             return fem.form(form, **self._keywords)
 
 
 def cell_integrals(form: Any) -> ufl.Form | None:
-    """The part of a form over cells; None if it has none."""
+    """Return the part of a form over cells; None if it has none."""
     if is_zero(form):
         return None
     parts = [part for part in form.integrals() if part.integral_type() == "cell"]

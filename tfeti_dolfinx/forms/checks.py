@@ -35,7 +35,7 @@ KINDS = {"cell": "dx", "exterior_facet": "ds", "interior_facet": "dS"}
 def displacement_space(
     a: ufl.Form, decomposition: Decomposition, name: str = "a"
 ) -> fem.FunctionSpace:
-    """The space of a bilinear form's trial and test functions. Collective.
+    """Return the space of a bilinear form's trial and test functions. Collective.
 
     Raises:
         InputError: The form is not bilinear on one space for displacements on the torn mesh.

@@ -149,7 +149,7 @@ class InertialForms(Forms):
         return self._matrices
 
     def stiffness(self) -> Any:
-        """This rank's K/2 + 2M/τ²."""
+        """Return this rank's K/2 + 2M/τ²."""
         if not self.motion.size:
             raise InputError("the step has no size yet; expected a call of take_step(size) before")
         K, M = self.matrices
@@ -162,7 +162,7 @@ class InertialForms(Forms):
         return 0.5 * K + share * M
 
     def load(self) -> Array:
-        """This rank's f + 2Mw/τ² − Ku/2."""
+        """Return this rank's f + 2Mw/τ² − Ku/2."""
         K, M = self.matrices
         motion, self._ends = self.motion, super().load()
         pull = M @ motion.towards * (2.0 / motion.size**2)

@@ -45,7 +45,7 @@ def check_tags(tags: Any, mesh: dmesh.Mesh, of_cells: bool, what: str, expected:
 
 
 def checked_names(names: Any, what: str, tags: Any, tags_name: str) -> dict[str, int]:
-    """Names of tags as a dictionary.
+    """Return names of tags as a dictionary.
 
     Raises:
         InputError: They are no dictionary from texts to integers, or there are no tags to name.
@@ -273,5 +273,5 @@ def _tag(name: str | int, names: dict[str, int], kind: str) -> int:
 
 
 def known_tags(names: dict[str, int]) -> str:
-    """Names and tags for messages."""
+    """Return names and tags for messages."""
     return ", ".join(f"{n!r} ({t})" for n, t in names.items()) or "none"

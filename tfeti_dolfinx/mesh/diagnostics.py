@@ -52,7 +52,7 @@ def flatness(mesh: dmesh.Mesh) -> Array:
 
 
 def shared_by_bodies(decomposition: Decomposition) -> tuple[Array, Array]:
-    """Pairs of bodies with nodes in common, and how many; the same on all ranks. Collective.
+    """Return pairs of bodies with nodes in common, and how many; the same on all ranks. Collective.
 
     Returns:
         The pairs, shape ``(p, 2)``, and the numbers, shape ``(p,)``.

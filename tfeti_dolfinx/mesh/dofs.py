@@ -221,7 +221,7 @@ class TornDofs:
         return self._to_owner.answer(values[self._to_owner_slot])
 
     def lookup(self, groups: Array, *tables: Array) -> tuple[Array, ...]:
-        """Rows of tables that the owners of groups hold. Collective.
+        """Return rows of tables that the owners of groups hold. Collective.
 
         Args:
             groups: Global groups, any of them, shape ``(k,)``.
@@ -236,7 +236,7 @@ class TornDofs:
         return tuple(exchange.answer(table[asked]) for table in tables)
 
     def add_on_owners(self, groups: Array, values: Array) -> Array:
-        """Sum of the values that all ranks give for each owned group. Collective.
+        """Return the sum of the values that all ranks give for each owned group. Collective.
 
         Args:
             groups: Global groups, any of them, shape ``(k,)``.
@@ -285,7 +285,7 @@ class TornDofs:
         return W, self.primal_nodes(node)
 
     def gather_copies(self, values: Array) -> Array:
-        """Values of the local primal nodes in the order of the owned ``copies``. Collective.
+        """Return values of the local primal nodes in the order of the owned ``copies``. Collective.
 
         Args:
             values: One value (or row) per local primal node, shape ``(n, ...)``.

@@ -78,13 +78,13 @@ def compact_parts(
 
 
 def _on_grid(x: Array, comm: MPI.Intracomm) -> Array:
-    """Coordinates as whole numbers, on a grid over the box of all points."""
+    """Return coordinates as whole numbers, on a grid over the box of all points."""
     low, high = box_over_ranks(comm, x)
     return np.rint((x - low) * ((2.0**BITS - 1.0) / max(np.max(high - low), 1e-300)))
 
 
 def _sizes(part: Array, num_parts: int, comm: MPI.Intracomm) -> Array:
-    """Number of points of each part."""
+    """Return the number of points of each part."""
     return summed(comm, np.bincount(part, minlength=num_parts).astype(np.float64))
 
 
@@ -118,7 +118,7 @@ def _length(x: Array, part: Array, measure: Array, num_parts: int, comm: MPI.Int
 
 
 def _nearest(x: Array, part: Array, centre: Array, influence: Array) -> Array:
-    """The part with the least ‖x − c‖/w among those near the present one."""
+    """Return the part with the least ‖x − c‖/w among those near the present one."""
     apart = np.linalg.norm(centre[:, None] - centre, axis=2) / (influence[:, None] + influence)
     near = np.argsort(apart, axis=1, kind="stable")[:, :NEAREST]
     order = np.argsort(part, kind="stable")

@@ -84,7 +84,7 @@ def bisect_points(
 
 
 def _on_grid(x: Array, extents: Array | None, comm: MPI.Intracomm) -> tuple[Array, Array | None]:
-    """Coordinates, and extents, as integers on a grid over the box of all points."""
+    """Return coordinates, and extents, as integers on a grid over the box of all points."""
     low, high = box_over_ranks(comm, x)
     size, last = max(np.max(high - low), 1e-300), 2.0 ** (62 // x.shape[1]) - 1
     grid = np.rint((x - low) / size * last).astype(np.int64)
@@ -299,7 +299,7 @@ UNKNOWNS_PER_SUBDOMAIN = 4000
 
 
 def default_count(mesh: UntornMesh, comm: MPI.Intracomm) -> int:
-    """Number of subdomains that leaves each about 4000 displacement unknowns. Collective."""
+    """Return number of subdomains that leaves each about 4000 displacement unknowns. Collective."""
     per_cell = 0.5 if mesh.cell_type.name == "triangle" else 1.0
     per_cell = 0.2 if mesh.cell_type.name == "tetrahedron" else per_cell
     unknowns = comm.allreduce(len(mesh.cells)) * per_cell * mesh.gdim * mesh.degree**mesh.gdim

@@ -30,7 +30,7 @@ SHAPE = 1e-6 * np.sqrt(2.0)
 def measured(
     x: Array, tags: Array, subdomain: Array, num: int, comm: MPI.Intracomm
 ) -> tuple[Array, Array, Array]:
-    """Number of cells of each subdomain, centre and shape. Collective.
+    """Return the number of cells of each subdomain, centre and shape. Collective.
 
     Args:
         x: Midpoints of this rank's cells, shape ``(n, gdim)``.
@@ -50,7 +50,7 @@ def measured(
 
 
 def alike(*columns: Array) -> Array:
-    """A number for each subdomain, the same for those that agree up to ``SHAPE``.
+    """Return a number for each subdomain, the same for those that agree up to ``SHAPE``.
 
     Args:
         columns: What must agree, shapes ``(N,)`` or ``(N, q)``.
@@ -95,7 +95,7 @@ def _is_outer(mesh: UntornMesh, comm: MPI.Intracomm) -> Array:
 
 
 def _occur_once(keys: Array) -> Array:
-    """Flags of those that no other one is equal to."""
+    """Return flags of those that no other one is equal to."""
     order = np.argsort(keys)  # not stable: that takes four times as long
     same = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
     once = np.ones(len(keys), dtype=bool)
@@ -124,7 +124,7 @@ def _scaled(moments: Array, gdim: int) -> Array:
 
 
 def _sums(values: Array, subdomain: Array, num: int, comm: MPI.Intracomm) -> Array:
-    """Sums over the cells of each subdomain. Collective."""
+    """Return sums over the cells of each subdomain. Collective."""
     total = np.zeros((num, values.shape[1]))
     np.add.at(total, subdomain, values)
     return summed(comm, total)
@@ -146,7 +146,7 @@ DIGITS = 9
 
 
 def dealt(mesh: UntornMesh, subdomain: Array, comm: MPI.Intracomm) -> Array:
-    """Rank of each subdomain, by what it is likely to cost. Collective.
+    """Return the rank of each subdomain, by what it is likely to cost. Collective.
 
     Subdomains that look equal but for a translation will share a factor, unless a modulus that
     only the forms know tells them apart, or options do; then ranks are balanced less well.
@@ -173,7 +173,7 @@ def dealt(mesh: UntornMesh, subdomain: Array, comm: MPI.Intracomm) -> Array:
 def deal_shared(
     cells: Array, centres: Array, shared: Sequence[Array], num_ranks: int, comm: MPI.Intracomm
 ) -> Array:
-    """Rank of each subdomain, in that of a few orders in which ranks share most. Collective.
+    """Return rank of each subdomain, in that of a few orders in which ranks share most. Collective.
 
     Args:
         cells: Cells of each subdomain, shape ``(N,)``.
@@ -196,7 +196,7 @@ def deal_shared(
 
 
 def _orders(centres: Array) -> list[tuple[Array, float]]:
-    """Coordinates to bisect by, and how much worse each is for the sake of short interfaces.
+    """Return coordinates to bisect by, and how much worse each is for the sake of short interfaces.
 
     Which of several sides that are as long as each other is cut across first is for the order of
     axes to say; sides that are a little shorter are made as long, too.
@@ -243,7 +243,7 @@ def dearest(ranks: Array, cells: Array, shared: Sequence[Array], num_ranks: int)
 
 
 def deal(weights: Array, centres: Array, num_ranks: int) -> Array:
-    """Rank of each subdomain: neighbouring subdomains in chunks of about equal weight.
+    """Return the rank of each subdomain: neighbouring subdomains in chunks of about equal weight.
 
     Args:
         weights: Cells of each subdomain, shape ``(N,)``.
@@ -366,7 +366,7 @@ def tear(
 def _torn_mesh(
     share: UntornMesh, subdomain: Array, comm: MPI.Intracomm
 ) -> tuple[dmesh.Mesh, Array]:
-    """The torn mesh, and the original id of each of its geometry nodes."""
+    """Return the torn mesh, and the original id of each of its geometry nodes."""
     local = np.searchsorted(share.node_ids, share.cells)
     copies = subdomain[:, None].astype(np.int64) * max(len(share.node_ids), 1) + local
     copies, torn = np.unique(copies, return_inverse=True)
@@ -378,7 +378,7 @@ def _torn_mesh(
 
 
 def _input_cells(mesh: dmesh.Mesh, num_cells: int) -> Array:
-    """Position of each local cell in the array that made the mesh."""
+    """Return the position of each local cell in the array that made the mesh."""
     return np.asarray(mesh.topology.original_cell_index) - offset_of(mesh.comm, num_cells)
 
 

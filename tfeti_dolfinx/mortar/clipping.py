@@ -156,7 +156,7 @@ def _signed_area(polygon: Array, count: Array) -> Array:
 
 
 def _counterclockwise(polygon: Array) -> tuple[Array, Array]:
-    """The polygons, counterclockwise, and their areas."""
+    """Return the polygons, counterclockwise, and their areas."""
     area = _signed_area(polygon, np.full(len(polygon), polygon.shape[1]))
     turned = (area < 0.0)[:, None, None]
     return np.where(turned, polygon[:, ::-1], polygon), np.abs(area)

@@ -64,7 +64,7 @@ class FacetElement:
 
 
 def from_first(x: Array) -> Array:
-    """Nodes of facets from the first one on, shape ``(n, nodes, d)``.
+    """Return nodes of facets from the first one on, shape ``(n, nodes, d)``.
 
     Tangents are sums of these times slopes: slopes add up to 0 but for rounding, which would turn
     a facet that is far from the origin.
@@ -149,7 +149,7 @@ class Facets:
         return len(self.x)
 
     def sent(self, exchange: Exchange, rows: Array | None = None) -> Facets:
-        """The facets (or some rows of them) that an exchange brings here. Collective."""
+        """Return the facets (or some rows of them) that an exchange brings here. Collective."""
         chosen = slice(None) if rows is None else rows
         return Facets(*(exchange.send(getattr(self, f.name)[chosen]) for f in fields(self)))
 
@@ -220,7 +220,7 @@ def local_facets(dofs: TornDofs, decomposition: Decomposition, facets: Array) ->
 def with_averaged_normals(
     facets: Facets, dofs: TornDofs, num_vertices: int
 ) -> tuple[Facets, Array]:
-    """The same facets with normals averaged at the vertices, weighted by area. Collective.
+    """Return the same facets with normals averaged at the vertices, weighted by area. Collective.
 
     Returns:
         The facets, and the averaged normal of each owned group, 0 off them, shape ``(g, gdim)``.
@@ -343,7 +343,7 @@ def hat_areas(kind: FacetKind, facets: Facets) -> Array:
 
 
 def _areas(slopes: Array) -> Array:
-    """Length or area that tangents span, shape ``(m, tdim, d)`` to ``(m,)``."""
+    """Return the length or area that tangents span, shape ``(m, tdim, d)`` to ``(m,)``."""
     if slopes.shape[1] == 1:
         return np.linalg.norm(slopes[:, 0], axis=1)
     if slopes.shape[2] == 2:

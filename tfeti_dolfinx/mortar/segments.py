@@ -68,7 +68,7 @@ def aligned(frame: Array, direction: Array) -> tuple[Array, Array]:
 
 
 def tangents(normal: Array) -> Array:
-    """Orthonormal tangents of unit normals, as close to coordinate axes as they can be.
+    """Return orthonormal tangents of unit normals, as close to coordinate axes as they can be.
 
     In 2D the normal turned left by a right angle. In 3D the x axis without its normal part (the
     y axis where the normal is within 26° of the x axis), and the normal times that. They are
@@ -132,7 +132,7 @@ def truly_overlapping(s: Array, distance: Array, facing: Array, length: Array, l
 def nearest(
     s: Array, distance: Array, length: Array, size: Array, whole: Array, look: Look
 ) -> Array:
-    """Pairs with no other primary facet before theirs.
+    """Return pairs with no other primary facet before theirs.
 
     Args:
         s: Secondary facet of each pair, shape ``(n,)``.
@@ -253,7 +253,7 @@ def centre_normals(facets: Facets) -> Array:
 def _march(
     tree: cKDTree, origin: Array, direction: Array, radius: Array, half_length: Array
 ) -> tuple[Array, Array]:
-    """Points of a tree within a radius of line segments: steps as long as nothing is near.
+    """Return points of a tree within a radius of line segments: steps as long as nothing is near.
 
     Args:
         tree: The points.
@@ -283,7 +283,7 @@ def _march(
 
 
 def _within(tree: cKDTree, x: Array, radius: Array) -> tuple[Array, Array]:
-    """Points of a tree within a radius of each x: row and point of each pair."""
+    """Return points of a tree within a radius of each x: row and point of each pair."""
     found: list[tuple[Array, Array]] = [(np.empty(0, dtype=np.int64),) * 2]
     rows, k = np.arange(len(x)), min(NEIGHBOURS, tree.n)
     while len(rows):
@@ -479,11 +479,11 @@ class _Planes:
         return area / densities(element, self._nodes[s], at.xi)
 
     def _on_planes(self, x: Array, s: Array) -> Array:
-        """Coordinates on planes s: shape ``(n, v, gdim)`` to ``(n, v, gdim - 1)``."""
+        """Return coordinates on planes s: shape ``(n, v, gdim)`` to ``(n, v, gdim - 1)``."""
         return np.einsum("nvg,ntg->nvt", x - self._centre[s][:, None], self._tangents[s])
 
     def _distance(self, s: Array, p: Array, corners: Array, y: Array) -> Array:
-        """Distance along the normal at points y of the planes, p's vertices there given.
+        """Return distance along the normal at points y of the planes, p's vertices there given.
 
         From the vertices of the facets: it decides what meets what, and is no gap.
         """

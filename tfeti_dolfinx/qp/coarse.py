@@ -49,7 +49,7 @@ class Coarse(Protocol):
         ...
 
     def forces(self, x: PETSc.Vec) -> Array:
-        """Sum of the moduli of the terms of each entry of the residual. Collective."""
+        """Return the sum of the moduli of the terms of each entry of the residual. Collective."""
         ...
 
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
@@ -102,7 +102,7 @@ class Coarse(Protocol):
         ...
 
     def on_face(self, face: Face) -> Coarse:
-        """The same constraint on (another) face of all rows. Collective."""
+        """Return the same constraint on (another) face of all rows. Collective."""
         ...
 
     def destroy(self) -> None:
@@ -258,7 +258,7 @@ class DenseCoarse:
         x.array[:] = self._Gf.T @ mu
 
     def on_face(self, face: Face) -> DenseCoarse:
-        """The same G on a face."""
+        """Return the same G on a face."""
         return DenseCoarse(self._G, self.e, face)
 
     def destroy(self) -> None:

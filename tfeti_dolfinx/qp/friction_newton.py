@@ -573,7 +573,7 @@ class _System:
 
 
 def _on_arrays(A: Operator | FaceOperator, like: PETSc.Vec) -> Callable[[Array], Array]:
-    """An operator between this rank's parts of vectors."""
+    """Return an operator between this rank's parts of vectors."""
 
     def mult(values: Array) -> Array:
         x, y = like.duplicate(), like.duplicate()

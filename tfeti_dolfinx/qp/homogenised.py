@@ -115,7 +115,7 @@ def natural(coarse: Coarse, like: PETSc.Vec) -> PETSc.Vec:
 
 
 def restored(coarse: Coarse, lam: PETSc.Vec) -> PETSc.Vec:
-    """The nearest solution of Gλ̄ = e to λ: λ + Gᵀ(GGᵀ)⁻¹(e − Gλ). Collective."""
+    """Return the nearest solution of Gλ̄ = e to λ: λ + Gᵀ(GGᵀ)⁻¹(e − Gλ). Collective."""
     x, fixed = lam.copy(), natural(coarse, lam)
     coarse.project(x)
     x.axpy(1.0, fixed)
@@ -137,12 +137,12 @@ class Scale:
 
 
 def scale_at(qp: QP, start: OperatorProduct) -> Scale:
-    """The scale of a program whose λ̄₀ is known with its image. Collective."""
+    """Return the scale of a program whose λ̄₀ is known with its image. Collective."""
     return Scale(_projected(qp, start.Fx, qp.d), _rounding(qp, start))
 
 
 def scale_near(qp: QP, at: OperatorProduct) -> Scale:
-    """A scale from another solution of Gλ̄ = e, if F λ̄₀ is not known. Collective.
+    """Return a scale from another solution of Gλ̄ = e, if F λ̄₀ is not known. Collective.
 
     ‖P d‖ and ‖P F λ‖ are equal at the solution, and b₀ is ‖P d‖ where e = 0; the larger one.
     """

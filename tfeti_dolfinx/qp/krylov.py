@@ -116,7 +116,7 @@ class Conjugates:
         return min(self._count, self._most)
 
     def products(self, z: Array) -> Array:
-        """This rank's part of PFp_i·z, shape ``(k,)``."""
+        """Return this rank's part of PFp_i·z, shape ``(k,)``."""
         return np.asarray(self._PFp[: self.number] @ z)
 
     def take_away(self, z: Array, products: Array) -> None:
@@ -422,7 +422,7 @@ def _with_new_gradients(
 
 
 def _face(qp: QP, lam: PETSc.Vec, g: PETSc.Vec) -> Face:
-    """The face of λ."""
+    """Return the face of λ."""
     return qp.feasible.face(lam.array_r, g.array_r)
 
 

@@ -229,7 +229,7 @@ class MaskedPreconditioner:
 
 
 def masked(qp: QP, rho: float) -> MaskedPreconditioner | None:
-    """The preconditioner of PFP + ρQ on faces of a program; None if it has none."""
+    """Return the preconditioner of PFP + ρQ on faces of a program; None if it has none."""
     if qp.preconditioner_on is None:
         return None
     return MaskedPreconditioner(qp.preconditioner_on, qp.coarse, rho, qp.d)
@@ -295,12 +295,12 @@ class MprgpIterate:
         return float(self._comm.allreduce(own))
 
     def max_step(self, p: PETSc.Vec) -> float:
-        """Largest α with x − α p ∈ Ω."""
+        """Return the largest α with x − α p ∈ Ω."""
         own = self.feasible.max_step(self.x.array_r, p.array_r)
         return float(self._comm.allreduce(own, op=MPI.MIN))
 
     def face(self) -> Face:
-        """The face of x."""
+        """Return the face of x."""
         return self.feasible.face(self.x.array_r, self.g.array_r)
 
     def move(self, alpha: float, p: PETSc.Vec, Ap: PETSc.Vec) -> None:

@@ -89,7 +89,7 @@ class NewtonIterate:
         self.idle = self.slow = 0
 
     def face(self) -> Face:
-        """The face of λ."""
+        """Return the face of λ."""
         return self.qp.feasible.face(self.point.lam.array_r, self.s.array_r)
 
     def pressed_face(self) -> Face:
@@ -292,7 +292,7 @@ def longer(state: NewtonIterate, trial: Trial, faces: FaceSolver) -> Trial:
 
 
 def _face_at(state: NewtonIterate, at: Point, faces: FaceSolver) -> Face:
-    """The face of a point, with multipliers of the face entered."""
+    """Return the face of a point, with multipliers of the face entered."""
     s = gradient_on(state.qp, faces.coarse, at.g)
     face = state.qp.feasible.face(at.lam.array_r, s.array_r)
     s.destroy()

@@ -511,7 +511,7 @@ class DependentRows:
         return p
 
     def _to_a_bound(self, z: Point, way: Array) -> float:
-        """Largest t with λ + t·way ∈ Ω, maybe infinite; rounding ends no way. Collective."""
+        """Return largest t with λ + t·way ∈ Ω, maybe infinite; rounding ends no way. Collective."""
         held = way if self.face is None else without_slip(self.face, way)
         largest = self._comm.allreduce(float(np.max(np.abs(way), initial=0.0)), op=MPI.MAX)
         held = np.where(np.abs(held) > PROOF * largest, held, 0.0)

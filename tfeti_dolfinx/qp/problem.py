@@ -30,7 +30,7 @@ class FaceOperator(Operator, Protocol):
     """An operator that belongs to a face."""
 
     def dependent(self, x: Array) -> Array | None:
-        """The part of x, on this rank's rows of the face, that F makes 0 since rows depend.
+        """Return the part of x, on this rank's rows of the face, that F makes 0 since rows depend.
 
         None where rows cannot depend on each other. Collective.
         """
@@ -82,7 +82,7 @@ class Point:
     g: PETSc.Vec
 
     def copy(self) -> Point:
-        """A point of its own."""
+        """Return a point of its own."""
         return Point(self.lam.copy(), self.g.copy())
 
     def take(self, other: Point) -> None:
@@ -147,7 +147,7 @@ class Steps:
         return self.cg + self.expansion + self.proportioning
 
     def plus(self, other: Steps) -> Steps:
-        """The steps of both."""
+        """Return the steps of both."""
         return Steps(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
 
 
@@ -332,5 +332,5 @@ class PrintMonitor:
 
 
 def _known(value: float) -> str:
-    """A norm, blank where it was not computed."""
+    """Return a norm, blank where it was not computed."""
     return f"{value:.4e}" if value >= 0.0 else " " * 10

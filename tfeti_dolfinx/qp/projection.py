@@ -48,7 +48,7 @@ class ConvexSet(Protocol):
         ...
 
     def face(self, x: Array, g: Array) -> Face:
-        """The face of x ∈ Ω."""
+        """Return the face of x ∈ Ω."""
         ...
 
 
@@ -129,7 +129,7 @@ def project_onto_feasible(
 
 
 def project_or_least(coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec) -> FeasiblePoint:
-    """The nearest point to y of {λ ∈ Ω, Gλ = e}; the least such λ where that is not found.
+    """Return the nearest point to y of {λ ∈ Ω, Gλ = e}; the least such λ where that is not found.
 
     From forces far beyond small discs, as the bounds of another load step are, the way to Gλ = e
     has so many kinks that ``nearest`` may end before. From 0 it has few. Collective.
@@ -177,7 +177,7 @@ class WithinFace:
         return self._feasible.onto(x, self._status)
 
     def face(self, x: Array, g: Array) -> Face:
-        """The face of x, without the rows that stay open."""
+        """Return the face of x, without the rows that stay open."""
         face = self._feasible.face(x, g)
         kept = np.flatnonzero(abs(face.Z).T @ self._open.astype(float) == 0.0)
         status = np.where(self._open, Status.OPEN, face.status)

@@ -80,7 +80,7 @@ class Recycled:
         self._next = (self._next + 1) % self.capacity
 
     def in_order(self) -> Array:
-        """This rank's part of W and FW, shape ``(2, m, count)``, the oldest direction first.
+        """Return this rank's part of W and FW, shape ``(2, m, count)``, the oldest direction first.
 
         So they lie from then on: who takes them adds what it adds in the same order.
         """
@@ -106,7 +106,7 @@ class Recycled:
         self.W, self.FW = (np.zeros((rows, self.capacity), order="F") for _ in range(2))
 
     def within(self, held: Array | None) -> Array | None:
-        """Orthonormal N so that W N is 0 on rows, shape ``(count, k)``. Collective.
+        """Return orthonormal N so that W N is 0 on rows, shape ``(count, k)``. Collective.
 
         Args:
             held: Flags of the local rows; None: no rows, and then N is None, too.

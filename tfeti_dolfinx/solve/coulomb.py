@@ -237,7 +237,7 @@ class FrictionBoundIteration:
         return rule.take(moved * bcast_from_root(self._comm, left / way / (1.0 - rate)))
 
     def _on_bodies(self, pressures: Array) -> Array:
-        """Norms of the nodal forces μ times those of normals make on each body."""
+        """Return norms of the nodal forces μ times those of normals make on each body."""
         B, subdomains = self._constraints.B, self._dual.subdomains
         forces, trace = B.createVecLeft(), B.createVecRight()
         forces.set(0.0)
@@ -315,7 +315,7 @@ class FrictionBoundIteration:
 
 
 def _largest(values: Array) -> tuple[float, int]:
-    """The largest of some values that are not negative, and which one it is."""
+    """Return the largest of some values that are not negative, and which one it is."""
     at = int(np.argmax(values)) if len(values) else -1
     return float(values[at]) if at >= 0 else 0.0, at
 

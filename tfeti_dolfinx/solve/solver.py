@@ -190,7 +190,7 @@ def learn(dual: Dual, options: Options) -> None:
 
 
 def resolve_types(options: Options, rows: Sequence[int], prefix: str) -> tuple[str, str]:
-    """The solver and the preconditioner that ``auto`` stands for.
+    """Return the solver and the preconditioner that ``auto`` stands for.
 
     Args:
         options: Options.

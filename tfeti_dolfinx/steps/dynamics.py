@@ -144,7 +144,7 @@ class Predictor:
         self._start, self._image = (gluing, lam), image
 
     def nearest(self, w: Array, M: csr_array, gluing: Gluing) -> Array:
-        """The nearest displacement to w.
+        """Return the nearest displacement to w.
 
         Args:
             w: Displacement in DOLFINx's order.
@@ -198,7 +198,7 @@ class Predictor:
         self._dual = settings.make_dual(constraints, self._subdomains, *scene, _frictionless)
 
     def _solve(self, gluing: Gluing) -> Array:
-        """The displacement in primal order."""
+        """Return the displacement in primal order."""
         dual, options, start = self._dual, self._settings.options, None
         assert dual is not None
         dual.forget_counts()
@@ -369,7 +369,7 @@ class ContactDynamics(ContactProblem):
             self.u.x.array[:] = self._first
 
     def state(self) -> SavedState:
-        """The last accepted solution as arrays of this rank, for ``restore``."""
+        """Return the last accepted solution as arrays of this rank, for ``restore``."""
         motion, state = self._forms_in_time.motion, super().state()
         moving = {"velocity": motion.v, "load": motion.load, "size": np.array(motion.size)}
         state = replace(state, **moving)

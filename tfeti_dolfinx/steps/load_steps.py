@@ -82,7 +82,7 @@ def _between(begin: float, end: float, done: int) -> float:
 
 
 def checked_times(begin: float, times: Sequence[float]) -> list[float]:
-    """The begin and all times, increasing.
+    """Return the begin and all times, increasing.
 
     Raises:
         InputError: They are no such numbers.

@@ -98,7 +98,7 @@ def clusters_of(dofs: TornDofs, decomposition: Decomposition, wanted: int) -> Cl
 
 
 def _connected(pairs: Array, n: int) -> tuple[int, Array]:
-    """Number of components, and that of each of n subdomains."""
+    """Return the number of components, and that of each of n subdomains."""
     if n == 0:
         return 0, np.zeros(0, dtype=np.int64)
     graph = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(n, n))
@@ -225,7 +225,7 @@ def _copies(dofs: TornDofs) -> tuple[Array, Array]:
 
 
 def _motions(x: Array, bs: int) -> Array | None:
-    """Orthonormal rigid motions of a face, None where it is only an edge or a vertex."""
+    """Return orthonormal rigid motions of a face, None where it is only an edge or a vertex."""
     centre = x.mean(axis=0)
     length = float(np.linalg.norm(x - centre, axis=1).max())
     modes = candidate_modes(x, bs, centre, length)
@@ -253,7 +253,7 @@ def _averages(faces: list[_Face], cluster: Array, dofs: TornDofs) -> tuple[csr_a
 
 
 def _independent(averages: csr_array, rows: Array) -> Array:
-    """Rows that are independent and span the same, ascending."""
+    """Return rows that are independent and span the same, ascending."""
     if len(rows) == 0:
         return rows
     own = averages[rows]
@@ -449,12 +449,12 @@ class ClusteredSubdomains(Subdomains):
         return self._null
 
     def _places(self) -> list[tuple[Array, Array]]:
-        """Rows of B_c, and kernel coordinates of the subdomains, of each cluster."""
+        """Return rows of B_c, and kernel coordinates of the subdomains, of each cluster."""
         sizes = [part.stop - part.start for part in self.kernel_parts]
         return self._of_clusters(np.repeat(self._clusters.of_subdomain, sizes))
 
     def _of_clusters(self, owner: Array) -> list[tuple[Array, Array]]:
-        """Rows of B_c, and coordinates, of each cluster."""
+        """Return rows of B_c, and coordinates, of each cluster."""
         of_row = self._clusters.of_row
         return [
             (np.flatnonzero(of_row == c), np.flatnonzero(owner == c))
@@ -609,6 +609,6 @@ def _nulls(G: csr_array, places: list[tuple[Array, Array]]) -> csr_array:
 
 
 def _null_of(G: Array) -> Array:
-    """Orthonormal basis of null(Gᵀ)."""
+    """Return an orthonormal basis of null(Gᵀ)."""
     values, vectors = np.linalg.eigh(G @ G.T)
     return np.asarray(vectors[:, values <= NULL * values.max(initial=0.0)])

@@ -165,7 +165,7 @@ def added_options(prefix: str, given: Mapping[str, Any]) -> Iterator[None]:
 
 @cache
 def default_solver() -> str:
-    """The first of ``SOLVERS`` that this PETSc has."""
+    """Return the first of ``SOLVERS`` that this PETSc has."""
     return next(solver for solver in SOLVERS if has_solver(solver))
 
 
@@ -247,7 +247,7 @@ def as_petsc_matrix(A: Any) -> PETSc.Mat:
 
 
 def _factored(pc: PETSc.PC, matrix: PETSc.Mat, prefix: str) -> PETSc.Mat:
-    """The factor of a matrix, by PETSc's options with a prefix."""
+    """Return the factor of a matrix, by PETSc's options with a prefix."""
     pc.setOptionsPrefix(prefix)
     pc.setType(PETSc.PC.Type.CHOLESKY)
     pc.setOperators(matrix)
@@ -255,7 +255,7 @@ def _factored(pc: PETSc.PC, matrix: PETSc.Mat, prefix: str) -> PETSc.Mat:
 
 
 def _factored_again(pc: PETSc.PC, prefix: str) -> PETSc.Mat:
-    """The factor of the present values, numeric only if there has been one."""
+    """Return the factor of the present values, numeric only if there has been one."""
     given = {"pc_factor_mat_solver_type": default_solver(), **DEFINITE, **QUIET}
     with added_options(prefix, given):
         pc.setFromOptions()

@@ -115,7 +115,7 @@ class TrailingPseudoinverse(SchurPseudoinverse):
     """
 
     def _chosen(self, R: Array) -> Array:
-        """The last unknowns, as few as hold the kernel."""
+        """Return the last unknowns, as few as hold the kernel."""
         if R.shape[1] == 0:
             return np.empty(0, dtype=np.int64)
         matrix = as_petsc_matrix(self._K)
@@ -249,7 +249,7 @@ def _places(K: Any, dofs: Array) -> Array:
 
 
 def _regular(K: Any, R: Array, fixing_dofs: Array) -> AbstractContextManager[None]:
-    """The values of K_ρ in the place of those of K, for a while."""
+    """Return the values of K_ρ in the place of those of K, for a while."""
     places = _places(K, fixing_dofs)
     added = _projector(K, R, fixing_dofs) if R.shape[1] else 0.0
     return lent(K.data, places, K.data[places] + added)
@@ -377,7 +377,7 @@ def _drawn(n: int, count: int) -> Array:
 
 
 def _beside(R: Array, u: Array) -> Array:
-    """The part that is orthogonal to the kernel."""
+    """Return the part that is orthogonal to the kernel."""
     return u - R @ (R.T @ u)
 
 

@@ -55,28 +55,28 @@ class Cost:
 
 
 def sweeps(factor: FactorSize, n: int, count: int) -> float:
-    """Seconds of a solve with a factor of n unknowns and as many right sides."""
+    """Return seconds of a solve with a factor of n unknowns and as many right sides."""
     reading = sweeps_traffic(factor, n, count) / BANDWIDTH
     return max(reading, 4.0 * factor.entries * count / SWEEPS) + CALL * -(-count // TOGETHER)
 
 
 def sweeps_traffic(factor: FactorSize, n: int, count: int) -> float:
-    """Bytes that go through memory for it: the factor twice, and the right sides."""
+    """Return bytes that go through memory for it: the factor twice, and the right sides."""
     return 2.0 * -(-count // TOGETHER) * factor.memory + 4.0 * REAL * n * count
 
 
 def sparse_traffic(entries: int, count: int) -> float:
-    """Bytes that go through memory for products of a sparse matrix with as many vectors."""
+    """Return bytes that go through memory for products of a sparse matrix with as many vectors."""
     return (REAL + INDEX) * entries * count
 
 
 def sparse_products(entries: int, count: int) -> float:
-    """Seconds of products of a sparse matrix with as many vectors."""
+    """Return seconds of products of a sparse matrix with as many vectors."""
     return SPARSE_ENTRY * entries * count + CALL
 
 
 def dense_product(t: int, count: int) -> float:
-    """Seconds of a product of a dense symmetric t × t matrix with as many vectors."""
+    """Return seconds of a product of a dense symmetric t × t matrix with as many vectors."""
     reading = dense_traffic(t, count) / BANDWIDTH
     if count == 1:
         return reading + CALL
@@ -84,7 +84,7 @@ def dense_product(t: int, count: int) -> float:
 
 
 def dense_traffic(t: int, count: int) -> float:
-    """Bytes that go through memory for it; of a matrix that is used alone half is stored."""
+    """Return bytes that go through memory for it; of a matrix that is used alone half is stored."""
     if count == 1:
         return REAL * t * t / 2.0
     return REAL * (t * t + 4.0 * t * count)
@@ -123,11 +123,11 @@ class TraceMatrix(Protocol):
         ...
 
     def traffic(self, count: int) -> float:
-        """Bytes that ``apply`` to so many vectors moves, by the model."""
+        """Return bytes that ``apply`` to so many vectors moves, by the model."""
         ...
 
     def dense(self, packed: bool) -> Packed | SymmetricMatrix:
-        """The same, dense."""
+        """Return the same, dense."""
         ...
 
 
@@ -168,11 +168,11 @@ class PinvMatrix:
         return sweeps(self._stiffness.factor_size, self._stiffness.size, count)
 
     def traffic(self, count: int) -> float:
-        """Bytes that ``apply`` to so many vectors moves, by the model."""
+        """Return bytes that ``apply`` to so many vectors moves, by the model."""
         return sweeps_traffic(self._stiffness.factor_size, self._stiffness.size, count)
 
     def dense(self, packed: bool) -> Packed | SymmetricMatrix:
-        """The same, dense; kept for the next operator on this trace."""
+        """Return the same, dense; kept for the next operator on this trace."""
         key = packed, self._trace.tobytes()
         kept = self._stiffness.dense_pinv
         if kept is None or kept[0] != key:
@@ -212,7 +212,7 @@ class SchurMatrix:
         return products + sweeps(inner.size, self._traced.K_ib.shape[0], count)
 
     def traffic(self, count: int) -> float:
-        """Bytes that ``apply`` to so many vectors moves, by the model."""
+        """Return bytes that ``apply`` to so many vectors moves, by the model."""
         inner, K_ib = self._traced.inner, self._traced.K_ib
         products = sparse_traffic(self._traced.K_bb.nnz, count)
         if inner is None:
@@ -221,7 +221,7 @@ class SchurMatrix:
         return products + sweeps_traffic(inner.size, K_ib.shape[0], count)
 
     def dense(self, packed: bool) -> Packed | SymmetricMatrix:
-        """The same, dense."""
+        """Return the same, dense."""
         return _made(self, packed)
 
 
@@ -251,11 +251,11 @@ class StiffnessMatrix:
         return sparse_products(self._K_bb.nnz, count)
 
     def traffic(self, count: int) -> float:
-        """Bytes that ``apply`` to so many vectors moves, by the model."""
+        """Return bytes that ``apply`` to so many vectors moves, by the model."""
         return sparse_traffic(self._K_bb.nnz, count)
 
     def dense(self, packed: bool) -> Packed | SymmetricMatrix:
-        """The same, dense."""
+        """Return the same, dense."""
         return _made(self, packed)
 
 
@@ -286,11 +286,11 @@ class OwnMatrix:
         return 0.0
 
     def traffic(self, count: int) -> float:
-        """Bytes that ``apply`` to so many vectors moves, by the model."""
+        """Return bytes that ``apply`` to so many vectors moves, by the model."""
         return 0.0
 
     def dense(self, packed: bool) -> Packed | SymmetricMatrix:
-        """The same, dense."""
+        """Return the same, dense."""
         return _made(self, packed)
 
 
@@ -386,7 +386,7 @@ class Explicit:
 
 
 def chosen(group: Group, local_type: str, multiplications: int) -> Form:
-    """The form of a group, one of a type or what the model says is cheapest."""
+    """Return the form of a group, one of a type or what the model says is cheapest."""
     implicit, explicit = Implicit(group), Explicit(group)
     if local_type == "implicit" or not group.matrix.has_dense:
         return implicit
@@ -618,5 +618,5 @@ class GroupedOperator:
 def local_operator(
     blocks: Sequence[Block], kind: OperatorKind, choice: LocalChoice
 ) -> ModelledOperator:
-    """The local operator of a rank: the one place that chooses its form."""
+    """Return the local operator of a rank: the one place that chooses its form."""
     return GroupedOperator(blocks, kind, choice)

@@ -75,7 +75,7 @@ class EqualSubdomains:
 
 
 def places_in_order(x: Array) -> tuple[bytes, Array]:
-    """The places of the nodes beside the lowest corner in their order, and this order."""
+    """Return the places of the nodes beside the lowest corner in their order, and this order."""
     corner = x.min(axis=0)
     size = float((x.max(axis=0) - corner).max()) or 1.0
     places = np.rint((x - corner) / (PLACE * size)).astype(np.int64)
@@ -84,7 +84,7 @@ def places_in_order(x: Array) -> tuple[bytes, Array]:
 
 
 def _shape_and_order(x: Array, bs: int) -> tuple[bytes, Array]:
-    """The places of the nodes, and the unknowns in their order."""
+    """Return the places of the nodes, and the unknowns in their order."""
     places, nodes = places_in_order(x)
     # sizes that differ show in K; as a part of the key they would have to be rounded
     order = (nodes[:, None] * bs + np.arange(bs)).ravel().astype(np.int32)
@@ -287,13 +287,13 @@ class SparseBlock(BlockDefaults):
         self.__dict__.pop("_trace_order", None)
 
     def _placed(self, u: Array) -> Array:
-        """A vector in the numbering of the stiffness."""
+        """Return a vector in the numbering of the stiffness."""
         placed = np.empty(len(u))
         placed[self.place] = u
         return placed
 
     def _back(self, w: Array) -> Array:
-        """A trace vector of the stiffness in the Block's order."""
+        """Return a trace vector of the stiffness in the Block's order."""
         out = np.empty(len(w))
         out[self._trace_order] = w
         return out

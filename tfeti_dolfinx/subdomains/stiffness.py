@@ -74,7 +74,7 @@ class SymmetricMatrix:
 
 
 def made_dense(apply: Callable[[Array], Array], size: int, together: int) -> Array:
-    """The matrix of a symmetric operator, symmetric to the last bit.
+    """Return the matrix of a symmetric operator, symmetric to the last bit.
 
     Args:
         apply: A W, shapes ``(t, q)``.

@@ -280,7 +280,7 @@ class Subdomains:
         return [float(u[part] @ block.multiply(u[part])) for block, part in pairs]
 
     def extended(self, v: Array) -> Array:
-        """A trace vector, shape ``(t,)``, on all unknowns, 0 elsewhere, shape ``(n,)``."""
+        """Return a trace vector, shape ``(t,)``, on all unknowns, 0 elsewhere, shape ``(n,)``."""
         u = np.zeros(_end(self.dof_parts))
         u[self.trace] = v
         return u
@@ -301,7 +301,7 @@ class Subdomains:
 
 
 def _end(parts: Sequence[slice]) -> int:
-    """Length of what parts lie in."""
+    """Return the length of what parts lie in."""
     return parts[-1].stop if parts else 0
 
 
