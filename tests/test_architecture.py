@@ -44,6 +44,8 @@ ALONE = {
 }
 # what DOLFINx 0.11 warns of: programs of ours use compat's functions, too
 OLD = ("geometry.dofmap", ".cmap")
+# docstrings open with an imperative, or with a noun that names the concept
+ODD = {"What", "Whether", "Where", "Which", "How", "Why", "Of", "As", "That", "Who", "When"}
 PROGRAMS = ("benchmarks", "demos", "meshes", "tests")
 
 
@@ -114,3 +116,14 @@ def test_nothing_stands_twice():
             block = tuple(code[k : k + 10])
             assert block not in seen, f"{path.name} and {seen[block]}: {block[0]}"
             seen[block] = path.name
+
+
+def test_no_docstring_opens_with_a_relative_clause():
+    odd = [
+        f"{path.relative_to(PACKAGE)}: {text.splitlines()[0]}"
+        for path in sorted(PACKAGE.rglob("*.py"))
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+        if (text := ast.get_docstring(node)) and text.split(maxsplit=1)[0] in ODD
+    ]
+    assert not odd

@@ -42,7 +42,10 @@ def test_example(name, comm):
     assert comm.allgather(result.failed) == [0] * comm.size, "".join(said)
 
 
-@pytest.mark.parametrize("name", ["qp.mprgp", "qp.pcpg", "qp.smalse", "qp.feasible_sets"])
+@pytest.mark.parametrize(
+    "name",
+    ["qp.mprgp", "qp.krylov", "qp.smalse", "qp.sets", "qp.projection", "qp.newton"],
+)
 def test_examples_of_solvers(name):
     failed, tried = doctest.testmod(import_module(f"tfeti_dolfinx.{name}"))
     assert tried > 0

@@ -14,7 +14,7 @@ class TfetiError(Exception):
 
 
 class InputError(TfetiError, ValueError):
-    """What the user gave does not fit; the message names it and says what was expected."""
+    """Invalid input; the message names what is wrong and says what was expected."""
 
 
 class NoSolutionError(TfetiError, RuntimeError):
@@ -77,7 +77,7 @@ def raise_together(comm: MPI.Intracomm, error: Exception | None, raiser: int) ->
 
 
 def _portable(error: Exception) -> Exception:
-    """The error itself if other ranks can rebuild it, else a TfetiError that names it."""
+    """Return the error itself if other ranks can rebuild it, else a TfetiError that names it."""
     try:
         rebuilt = pickle.loads(pickle.dumps(error))
     except Exception:  # whatever the error's own methods raise

@@ -1,4 +1,4 @@
-"""How to solve: options, and parts that a program may bring itself."""
+"""Settings of a solve: options, and parts that a program may bring itself."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 @dataclass(frozen=True)
 class Extensions:
-    """What takes the place of the package's own parts; by default nothing does.
+    """Parts that take the place of the package's own; by default none.
 
     Attributes:
         block: Makes the Block of a subdomain, say a class; ``BlockDefaults`` leaves four methods
@@ -65,7 +65,7 @@ class Extensions:
 
 
 def guarded(own: Extensions, comm: MPI.Intracomm) -> Extensions:
-    """The same parts, of which what fails is named, on all ranks where they run on all.
+    """Return the same parts, of which what fails is named, on all ranks where they run on all.
 
     Blocks and K⁺ are made where ranks raise together.
     """
@@ -81,7 +81,7 @@ def guarded(own: Extensions, comm: MPI.Intracomm) -> Extensions:
 
 
 def _together(part: Any, name: str, comm: MPI.Intracomm) -> Any:
-    """A part whose errors become an InputError of all ranks."""
+    """Return a part whose errors become an InputError of all ranks."""
     if part is None:
         return None
 
@@ -93,7 +93,7 @@ def _together(part: Any, name: str, comm: MPI.Intracomm) -> Any:
 
 
 def _giving(part: Any, name: str, protocol: type) -> Any:
-    """A part whose errors become an InputError, and which must give an implementation."""
+    """Return a part whose errors become an InputError, and which must give an implementation."""
     if part is None:
         return None
 
@@ -116,7 +116,7 @@ def _check_members(made: Any, name: str, protocol: type) -> None:
 
 
 def _checked_set(law: FeasibleLaw) -> FeasibleLaw:
-    """A law whose sets are of multipliers on all rows."""
+    """Return a law whose sets are of multipliers on all rows."""
 
     def checked(constraints: Constraints) -> FeasibleSet:
         made, zero = law(constraints), np.zeros(constraints.num_rows)
@@ -134,7 +134,7 @@ def _checked_set(law: FeasibleLaw) -> FeasibleLaw:
 
 @dataclass(frozen=True)
 class Settings:
-    """How to solve.
+    """Settings of a solve.
 
     Attributes:
         options: Options.
@@ -150,7 +150,7 @@ class Settings:
 
     @property
     def given(self) -> dict[str, Any]:
-        """What ranks must have alike: a monitor of one rank would wait for the others.
+        """The settings that ranks must share: a monitor of one rank would wait for the others.
 
         Parts of one's own count by their presence: a rank may bring another callable.
         """
@@ -165,11 +165,11 @@ class Settings:
 
     @property
     def local_choice(self) -> LocalChoice:
-        """Which form local operators take."""
+        """Choice of the form of local operators."""
         return LocalChoice(self.options.local_type, self.options.local_multiplications)
 
     def make_block(self, counters: Counters) -> MakeBlock:
-        """What makes the Blocks of a rank.
+        """Return the factory of the Blocks of a rank.
 
         Args:
             counters: Counts factorisations.
@@ -177,12 +177,12 @@ class Settings:
         return self.extensions.block or sparse_blocks(self.making(counters), self.local_choice)
 
     def making(self, counters: Counters) -> InverseFactory:
-        """How inverses of subdomains are made."""
+        """Return the factory of the subdomains' generalised inverses."""
         kplus = self.extensions.kplus or KPLUS_TYPES[self.options.kplus_type]
         return InverseFactory(counters, kplus, f"{self.prefix}sub_")
 
     def preconditioner(self, pc_type: str) -> MakePreconditioner | None:
-        """The preconditioner, the program's own if it brings one.
+        """Return the preconditioner, the program's own if it brings one.
 
         Raises:
             InputError: It does, and the solver takes none.
@@ -203,7 +203,7 @@ class Settings:
         decomposition: Decomposition,
         feasible: FeasibleLaw,
     ) -> Dual:
-        """The dual problem of rows and subdomains. Collective.
+        """Return the dual problem of rows and subdomains. Collective.
 
         Raises:
             NoSolutionError: The load moves a body that nothing holds.

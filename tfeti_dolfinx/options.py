@@ -33,7 +33,7 @@ from tfeti_dolfinx.subdomains.factor import default_solver, has_solver, unread_o
 from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES
 from tfeti_dolfinx.subdomains.local_operators import LOCAL_TYPES
 
-# --- Options: one typed dataclass from which parsing, ``view`` and docs/options.md are made ---
+# --- Options ----------------------------------------------------------------------------------
 
 # what ``auto`` asks of displacements, whatever the mesh is
 LOOSEST = 1e-2
@@ -179,7 +179,7 @@ class Options:
 
 
 def options_table() -> str:
-    """The table of docs/options.md."""
+    """Return the table of docs/options.md."""
     lines = ["| option | algorithm | default | effect |", "|---|---|---|---|"]
     for option in parameters_of(Options):
         about, default = option.description, option.default
@@ -192,7 +192,7 @@ def options_table() -> str:
     return "\n".join(lines)
 
 
-# --- Options from a dictionary and the command line -------------------------------------------
+# --- Parsing of options -----------------------------------------------------------------------
 
 # what factors of subdomains, the coarse problem and contact rows read from PETSc's options
 FACTOR_OPTION = re.compile(r"(sub|coarse|face)_((?:pc_factor|mat)_\w+)")
@@ -303,7 +303,7 @@ def _near_factor_names(name: str, prefix: str) -> str:
 
 
 def _without_prefix(given: Any, prefix: str) -> dict[str, Any]:
-    """The options given, without the prefix."""
+    """Return the options given, without the prefix."""
     if not isinstance(prefix, str) or not re.fullmatch(r"\w+", prefix):
         raise InputError(
             f"petsc_options_prefix is {shown(prefix)}; expected letters, digits and underscores, "
@@ -334,7 +334,7 @@ def _check_reached(named: Mapping[str, Any], database: PETSc.Options, prefix: st
 
 
 def _converted(option: Parameter, value: Any, prefix: str) -> Any:
-    """The value as the type of the option, in its range."""
+    """Return the value as the type of the option, in its range."""
     what = f"-{prefix}{option.name}"
     kind = option.description.kind or type(option.default)
     if isinstance(value, str) and value in option.description.words:

@@ -238,7 +238,7 @@ def _cell_function(W: fem.FunctionSpace, name: str, values: Array) -> fem.Functi
 
 
 def _as_geometry(function: fem.Function, decomposition: Decomposition) -> fem.Function:
-    """The function on the element of the mesh geometry; cell functions as they are."""
+    """Return the function on the element of the mesh geometry; cell functions as they are."""
     V = function.function_space
     degree = decomposition.mesh.ufl_domain().ufl_coordinate_element().degree
     if V.element.basix_element.degree in (0, degree):
@@ -251,7 +251,7 @@ def _as_geometry(function: fem.Function, decomposition: Decomposition) -> fem.Fu
 
 
 def checked_target(path: str | os.PathLike[str], suffix: str, solution: Solution) -> Path:
-    """The name to write to; what stands there and beside it is replaced. Collective."""
+    """Return the name to write to; what stands there and beside it is replaced. Collective."""
     target = checked_path(path, suffix)
     checked_type(solution, Solution, "solution", "the solution of a ContactProblem")
     stem = target.stem

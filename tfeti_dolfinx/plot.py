@@ -151,7 +151,7 @@ def check_screen() -> None:
 
 
 def _coordinates(coordinate: Callable[[Array], Array], points: Array) -> Array:
-    """The coordinate of each point."""
+    """Return the coordinate of each point."""
     with named(f"coordinate of points of shape {points.shape}"):
         x = np.asarray(coordinate(points), dtype=float)
     if x.shape != (len(points),):
@@ -163,7 +163,7 @@ def _coordinates(coordinate: Callable[[Array], Array], points: Array) -> Array:
 
 
 def _number(value: float | None, what: str, expected: Range) -> float:
-    """A number, nan if it is not given."""
+    """Return a number, nan if it is not given."""
     return np.nan if value is None else checked_number(value, what, expected)
 
 
@@ -179,7 +179,7 @@ def _vector(values: tuple[float, float, float] | None, what: str) -> Array:
 
 
 def _pair(cut: Any) -> tuple[Any, Any]:
-    """A point and a normal, or neither."""
+    """Return a point and a normal, or neither."""
     if cut is None:
         return None, None
     if not isinstance(cut, (tuple, list, np.ndarray)) or len(cut) != 2:
@@ -188,7 +188,7 @@ def _pair(cut: Any) -> tuple[Any, Any]:
 
 
 def _grid(solution: Solution, values: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Cells, types, points, displacements and values of this rank."""
+    """Return cells, types, points, displacements and values of this rank."""
     u = solution.displacement
     if len(u.x.array) == 0:
         empty = np.zeros((0, 3))

@@ -45,7 +45,7 @@ from tfeti_dolfinx.solve.coulomb import solve_with_friction
 from tfeti_dolfinx.solve.solver import conclude, learn, resolve_types
 from tfeti_dolfinx.system import System
 
-# --- Solves with more and more contact rows, until no node without one overlaps ---------------
+# --- Solves with more contact rows until nothing overlaps -------------------------------------
 
 MAX_ROUNDS = 20
 
@@ -80,7 +80,7 @@ def solve_in_rounds(solve_rows: Callable[[], Solution], system: System, report: 
 
 
 def _widen(system: System, report: Report, error: NoSolutionError) -> int:
-    """Look farther for what may hold a body; how many rows are new."""
+    """Increase the reach of contacts that may hold a body; return the number of new rows."""
     search = system.search
     if not search.is_exhausted:
         with stage("contact", report.seconds):
@@ -92,14 +92,14 @@ def _widen(system: System, report: Report, error: NoSolutionError) -> int:
     raise error
 
 
-# --- The solutions of a problem: the last one, and the one that a load step has ended with ----
+# --- Solutions of load steps ------------------------------------------------------------------
 
 # rows, their λ, and the multipliers of Gλ = e
 Start = tuple[Gluing, Array, Array]
 
 
 class Stepping:
-    """What of ``ContactProblem`` concerns load steps: what it has found, and where to go on.
+    """Load steps of ``ContactProblem``: solutions found, and the state to continue from.
 
     Attributes:
         defaults: Options, by name, that have other defaults than their own.
@@ -168,7 +168,7 @@ class Stepping:
         self.u.x.array[:] = 0.0 if last is None else self.dofs.to_dolfinx(last.u)
 
     def state(self) -> SavedState:
-        """The last accepted solution as arrays of this rank, for ``restore``. Collective.
+        """Return the last accepted solution as arrays of this rank, for ``restore``. Collective.
 
         Raises:
             InputError: No solution was accepted.
@@ -232,7 +232,7 @@ class Stepping:
         """Move as the bodies of a state do: without inertia not at all."""
 
     def _meet(self, call: str) -> None:
-        """Begin a call: see that all ranks make it, with the same data. Collective.
+        """Begin a call: check that all ranks make it with the same data. Collective.
 
         Raises:
             InputError: They do not, or the stress fails.
@@ -242,12 +242,12 @@ class Stepping:
             self._look_at_stress()
 
     def _given(self) -> dict[str, Any]:
-        """What determines the solution, as it is now, by name. Not collective."""
+        """Return what determines the solution at present, by name. Not collective."""
         about = {"bcs": self.bcs, "contacts": self.contacts, "thickness": self._thickness}
         return {**self._system.forms.given, **about}
 
     def _look_at_stress(self) -> Any:
-        """The user's stress of ``u`` in UFL, which solutions take until the next look.
+        """Return the user's stress of ``u`` in UFL, which solutions take until the next look.
 
         Not collective: it is looked at where what it raises is raised on all ranks.
 
@@ -274,7 +274,7 @@ class Stepping:
         return solution
 
 
-# --- The user's door: a contact problem from forms, conditions and contacts to a solution -----
+# --- The contact problem ----------------------------------------------------------------------
 
 
 class ContactProblem(Stepping):
@@ -381,11 +381,11 @@ class ContactProblem(Stepping):
         )
 
     def _forms(self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any) -> Forms:
-        """What gives the matrix and the load of a solve."""
+        """Compile the forms of the matrix and the load."""
         return Forms(a, L, V, self.decomposition, *options)
 
     def _given_besides(self) -> dict[str, Any]:
-        """What else the problem was given, checked; ranks must have it alike."""
+        """Return other input, checked, that ranks must have alike."""
         return {}
 
     @property
@@ -429,7 +429,7 @@ class ContactProblem(Stepping):
         return self.u
 
     def estimate(self) -> Estimates:
-        """How large the errors of the last solution are, in energy. It costs what it says.
+        """Estimate the errors of the last solution in energy. It costs what it says.
 
         Returns:
             The estimates, which ``report`` then has, too, with a warning where they are of no use.
@@ -509,10 +509,10 @@ class ContactProblem(Stepping):
         return {**super()._given(), "boundary_elements": self._boundary_elements}
 
     def _set_out(self) -> None:
-        """Say where a step goes at first: without inertia nothing."""
+        """Set the prediction of a step; nothing without inertia."""
 
     def _count(self) -> None:
-        """What the solve has made and taken."""
+        """Enter counts and seconds of the solve in the report."""
         self._system.count(self.report)
         settle_seconds(self.report, self.decomposition.comm)
         self.report.end()
@@ -527,7 +527,7 @@ class ContactProblem(Stepping):
         self._system.destroy()
 
     def _goal(self) -> ErrorTarget | None:
-        """What -rtol auto compares the algebraic error with."""
+        """Return the error that -rtol auto compares the algebraic error with."""
         if self.options.rtol != "auto" or self._stress is None:
             return None
         return goal_of(self._stress, self.dofs, self.decomposition, self._thickness)

@@ -26,13 +26,13 @@ from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.coulomb import FixedPointStatus
 from tfeti_dolfinx.subdomains.local_operators import ModelledOperator
 
-# --- What a solve took and how good its answer is ---------------------------------------------
+# --- The report -------------------------------------------------------------------------------
 
 PRINTED = 10  # of a list; all of it is in the file
 
 
 def _counter() -> Any:
-    """A counter, which adds up over solves in ``in_all``."""
+    """Return a counter, which adds up over solves in ``in_all``."""
     return field(default=0, metadata={"adds": True})
 
 
@@ -178,7 +178,7 @@ class Report:
     in_all: dict[str, float] = field(default_factory=dict)
 
     def begin(self) -> None:
-        """Forget the solve before, but for what it adds up to. After an error nothing is left."""
+        """Reset all figures but the sums over solves, so that none stays after an error."""
         seconds = {} if self.in_all else self.seconds
         fresh = Report(seconds=seconds, in_all=self.in_all)
         for f in fields(self):
@@ -204,7 +204,7 @@ class Report:
         return "\n".join(lines)
 
     def to_json(self) -> str:
-        """The report as JSON."""
+        """Return the report as JSON."""
         return json.dumps(asdict(self), indent=2)
 
     def write(self, path: str | Path, comm: MPI.Intracomm) -> None:
@@ -231,7 +231,7 @@ def _write_whole(target: Path, text: str) -> None:
 
 
 def _item(item: str | list[float] | dict[str, Any]) -> str:
-    """A contact, a force, or a motion that is nearly free, as text."""
+    """Return a contact, a force, or a motion that is nearly free, as text."""
     if isinstance(item, str):
         return item
     if isinstance(item, list):
@@ -244,13 +244,13 @@ def peak_memory_mb(comm: MPI.Intracomm) -> float:
     return float(comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0))
 
 
-# --- The report of a solve, from the objects that took part in it -----------------------------
+# --- Filling of the report --------------------------------------------------------------------
 
 
 def fill_sizes(
     report: Report, dofs: TornDofs, decomposition: Decomposition, gluing: Gluing, inside: int
 ) -> None:
-    """Fill in what is known before the dual problem is. Collective.
+    """Fill in the sizes that are known before the dual problem. Collective.
 
     Args:
         report: Takes it.
@@ -280,7 +280,7 @@ def fill_result(
     accuracy: Accuracy,
     settling: FixedPointStatus,
 ) -> None:
-    """Fill in what a solve has found; counters add up over rounds. Collective."""
+    """Fill in the results of a solve; counters add up over rounds. Collective."""
     comm = dual.coarse.comm
     report.clusters = dual.subdomains.num_clusters
     report.kernel_dim = dual.coarse.dimension

@@ -39,7 +39,7 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import hat_integrals
 from tfeti_dolfinx.qp.sets import Status, face_of
 
-# --- Displacement and stress at points of the user's ------------------------------------------
+# --- Displacement and stress at given points --------------------------------------------------
 
 # Of the size of the mesh: how far from a cell of finite elements a point may be
 PADDING = 1e-10
@@ -63,7 +63,7 @@ class PointValues:
 
 
 def checked_points(points: Any, gdim: int) -> Array:
-    """Points as an array of shape ``(k, gdim)``.
+    """Return points as an array of shape ``(k, gdim)``.
 
     Raises:
         InputError: They are of another shape, or not finite numbers.
@@ -86,7 +86,7 @@ def values_at(
     u: fem.Function,
     stress: fem.Function | None,
 ) -> PointValues:
-    """Values at points, means of the subdomains that share a point. Collective.
+    """Return values at points, means of the subdomains that share a point. Collective.
 
     Args:
         points: The same on all ranks, shape ``(k, gdim)``.
@@ -121,7 +121,7 @@ def _of_boundary_elements(
     thickness: float,
     u: fem.Function,
 ) -> Array:
-    """Rows of the bodies of this rank, added for each point."""
+    """Return rows of the bodies of this rank, added for each point."""
     (k, d), mesh = points.shape, u.function_space.mesh
     total = np.zeros((k, 1 + d + d * d))
     (place, cells), owner = found, boundary.cell_subdomain
@@ -142,7 +142,7 @@ def _of_boundary_elements(
 
 
 def _in_space(points: Array) -> Array:
-    """Points with three coordinates."""
+    """Return points with three coordinates."""
     x = np.zeros((len(points), 3))
     x[:, : points.shape[1]] = points
     return x
@@ -153,14 +153,14 @@ def _row(u: Array, stress: Array) -> Array:
 
 
 def _number(thickness: Any) -> float:
-    """A thickness as a number; where it varies there are no boundary elements."""
+    """Return a thickness as a number; where it varies there are no boundary elements."""
     if isinstance(thickness, fem.Constant):
         return float(thickness.value)
     return float(thickness) if isinstance(thickness, float) else 1.0
 
 
 def _cells(mesh: Any, points: Array) -> tuple[Array, Array]:
-    """Points by position, and the cells of this rank that each of them is in."""
+    """Return points by position, and the cells of this rank that each of them is in."""
     x = _in_space(points)
     size = float(np.ptp(mesh.geometry.x, axis=0).max(initial=0.0)) if len(mesh.geometry.x) else 0.0
     tree = geometry.bb_tree(mesh, mesh.topology.dim, padding=PADDING * size)
@@ -170,12 +170,11 @@ def _cells(mesh: Any, points: Array) -> tuple[Array, Array]:
     return place, np.asarray(found.array)
 
 
-# --- The solution of a contact problem: displacement, multipliers, and fields that follow
-#     lazily ---
+# --- The solution -----------------------------------------------------------------------------
 
 
 class Solution(ContactState):
-    """What a solve has found; fields are made when they are first asked for.
+    """Solution of a contact problem; fields are made when they are first asked for.
 
     It owns its data, the constants and functions in the stress too: a later solve of the same
     problem leaves it as it is. Only a mesh whose points are moved takes along the fields that are
@@ -235,11 +234,11 @@ class Solution(ContactState):
 
     @property
     def has_velocity(self) -> bool:
-        """Whether the bodies have mass."""
+        """True if the bodies have mass."""
         return self.v is not None
 
     def at(self, points: Any) -> PointValues:
-        """Displacement and stress at points inside the bodies. Collective.
+        """Return displacement and stress at points inside the bodies. Collective.
 
         In finite elements these are the values of ``displacement`` and ``stress``, in boundary
         elements those of Somigliana's identity, which are as accurate inside as on the surface;
@@ -264,17 +263,17 @@ class Solution(ContactState):
 
     @property
     def has_stress(self) -> bool:
-        """Whether the problem was given a stress."""
+        """True if the problem was given a stress."""
         return self._stress is not None
 
     @property
     def has_contact(self) -> bool:
-        """Whether the problem has contacts."""
+        """True if the problem has contacts."""
         return bool(self.contacts)
 
     @property
     def has_friction(self) -> bool:
-        """Whether a contact of the problem has friction."""
+        """True if a contact of the problem has friction."""
         return any(contact.friction is not None for contact in self.contacts)
 
     @cached_property
@@ -312,7 +311,7 @@ class Solution(ContactState):
 
     @property
     def has_discretisation_error(self) -> bool:
-        """Whether ``discretisation_error`` has been made."""
+        """True if ``discretisation_error`` has been made."""
         return "discretisation_error" in self.__dict__
 
     @cached_property
@@ -363,7 +362,7 @@ class Solution(ContactState):
 
     @cached_property
     def slip(self) -> fem.Function:
-        """How far nodes that slip have slid in this load step, a vector; 0 elsewhere.
+        """Slip of the slipping nodes in this load step, a vector; 0 elsewhere.
 
         Of a node that slips on several contacts it is the mean.
         """
@@ -407,7 +406,7 @@ class Solution(ContactState):
         return function
 
 
-# --- A solution as plain arrays, from which another run of the same program goes on -----------
+# --- Saved state of a solution ----------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -454,7 +453,7 @@ class SavedState:
 
     @classmethod
     def of(cls, solution: Solution, mu: Array, norm: float, reach: list[float]) -> SavedState:
-        """The state of a solution."""
+        """Return the state of a solution."""
         records, holding = solution.gluing.records, solution.holding
         held = np.where(holding, Status.STICK, Status.SLIP)
         return cls(
@@ -471,15 +470,15 @@ class SavedState:
         )
 
     def groups(self) -> list[Array]:
-        """The groups whose nodes have rows, of each contact."""
+        """Return the groups whose nodes have rows, of each contact."""
         return [self.group[self.contact == i] for i in range(len(self.reach))]
 
     def multipliers(self) -> Multipliers:
-        """The multipliers, with a face that only knows what rows do."""
+        """Return the multipliers, with a face that only knows what rows do."""
         return Multipliers(self.lam, face_of(np.zeros(len(self.lam), dtype=bool), self.status))
 
     def common(self) -> dict[str, Any]:
-        """What the states of all ranks must have alike, since searches and solves go by it."""
+        """Return what all ranks' states must share, since searches and solves depend on it."""
         size = float(np.abs(self.mu).sum())
         return {
             "reach": self.reach.tolist(),

@@ -1,4 +1,4 @@
-"""What a solve is made from, in stages that are kept until their input changes."""
+"""The parts of a solve, made in stages that are kept until their input changes."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from tfeti_dolfinx.subdomains.clusters import clusters_of
 from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
-# --- The stages of a solve: their order, what depends on what, and which are out of date ------
+# --- Stages and their dependencies ------------------------------------------------------------
 
 T = TypeVar("T")
 
@@ -64,7 +64,7 @@ BRINGS = {"rows": "right side", "factors": "trace", "coarse problem": "linear te
 
 
 class Stages:
-    """Which stages are out of date, and which were made.
+    """Stages of a solve: those that are out of date, and those made.
 
     Attributes:
         made: How often each stage was made since the counts were last taken.
@@ -79,7 +79,7 @@ class Stages:
         self._stale |= set(CHANGES[what])
 
     def is_stale(self, name: str) -> bool:
-        """Whether a stage is out of date."""
+        """Return whether a stage is out of date."""
         return name in self._stale
 
     def stale(self) -> Iterator[str]:
@@ -98,20 +98,20 @@ class Stages:
         self._stale = set(STAGES)
 
     def take_counts(self) -> tuple[Counter[str], list[str]]:
-        """How often each stage was made since the last call, and which were up to date."""
+        """Return how often stages were made since the last call, and those that were up to date."""
         made, self.made = self.made, Counter()
         new = {*made, *(BRINGS.get(name) for name in made), *self._stale}
         return made, [name for name in STAGES if name not in new]
 
 
 def made(item: T | None) -> T:
-    """What a stage has made."""
+    """Return a stage's result, or raise if it has not been made."""
     if item is None:
         raise InputError("nothing has been made yet; expected a call of solve() before")
     return item
 
 
-# --- What bounds the tangential forces of a scene, and where its slips count from -------------
+# --- Friction limits and reference of slips ---------------------------------------------------
 
 
 class FrictionBounds:
@@ -148,7 +148,7 @@ class FrictionBounds:
         return slips(records, self._dofs, self.rest)
 
     def has_changed(self, search: ContactSearch) -> bool:
-        """Whether laws say something else than when the limits were last set.
+        """Return whether laws have changed since the limits were last set.
 
         Raises:
             InputError: A value is negative or no number somewhere.
@@ -174,11 +174,11 @@ class FrictionBounds:
         gluing.constraints.coefficients[:] = gluing.tangents.coefficients(self._known)
 
 
-# --- From forms to the dual problem, in stages that are kept until their input changes --------
+# --- From forms to the dual problem -----------------------------------------------------------
 
 
 class System:
-    """What the dual problem of a scene is made from. Creation and all methods are collective.
+    """Parts of a scene's dual problem. Creation and all methods are collective.
 
     Args:
         forms: The compiled forms.
@@ -300,7 +300,7 @@ class System:
         return self.dual
 
     def count(self, report: Report) -> None:
-        """Put sizes into a report, and what was made since it was last counted."""
+        """Enter sizes and the stages made since the last call in a report."""
         if self._gluing is not None:
             inside = self.replaced.inside()
             fill_sizes(report, self._dofs, self._decomposition, self._gluing, inside)

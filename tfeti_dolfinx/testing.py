@@ -21,7 +21,7 @@ from tfeti_dolfinx.subdomains.block import (
 from tfeti_dolfinx.subdomains.factor import GeneralisedInverse, solved
 from tfeti_dolfinx.subdomains.kplus import MakeInverse, with_entries
 
-# --- What solvers rely on, checked on any feasible set ----------------------------------------
+# --- Checks of a feasible set -----------------------------------------------------------------
 
 # Steps along a face, relative to the radius of its curvature: one so short that what is linear in
 # it stands out from what is quadratic; one that is longer, so that what is quadratic stands out
@@ -84,7 +84,7 @@ def _check_gradients(feasible: FeasibleSet, x: Array, g: Array) -> None:
 def _is_derivative(
     feasible: FeasibleSet, x: Array, g: Array, projected: Array, step: float
 ) -> bool:
-    """Whether a step along −g that is projected goes along −g^P."""
+    """Return whether a projected step along −g goes along −g^P."""
     apart = np.linalg.norm(feasible.project(x - step * g) - x + step * projected)
     return bool(apart <= 1e-4 * step * (1.0 + np.linalg.norm(projected)))
 
@@ -135,7 +135,7 @@ def _radii(face: Face, g: Array) -> Array:
     return np.where(flat, np.inf, pushing / np.where(flat, 1.0, face.curvature))
 
 
-# --- The identities that any Block fulfils ----------------------------------------------------
+# --- Checks of a Block ------------------------------------------------------------------------
 
 # Eigenvalues of a stiffness, as a share of the largest, that are 0 but for rounding (which is
 # 1e-16 times a few powers of n); singular values are their roots, and cut off above rounding.

@@ -1,1 +1,1 @@
-"""How right an answer is: warnings and estimates of errors."""
+"""Estimates of errors, and warnings about answers that cannot be trusted."""

@@ -1,4 +1,4 @@
-"""Where an answer cannot be trusted: warnings of the report."""
+"""Diagnostics of a solution: the warnings of the report."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tfeti_dolfinx.subdomains.block import mode_names
 from tfeti_dolfinx.subdomains.stiffness import stretch_over_shear
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
-# --- Whether friction that alone holds a motion of bodies balances the load where they are ----
+# --- Sliding motions that friction alone must hold --------------------------------------------
 
 # of rtol: how far a body may be from where friction balances its load
 FAR = 20.0
@@ -52,7 +52,7 @@ class Lost:
 def lost_on_friction(
     coarse: CoarseSpace, constraints: Constraints, u: Array, lam: Array, rtol: float
 ) -> Lost | None:
-    """Motions that friction alone holds, but not where the displacement is. Collective.
+    """Return motions that friction alone holds, but not where the displacement is. Collective.
 
     Along a motion y that neither springs, nor equality rows, nor closed normals resist, friction
     balances the load e: ρ(t) = yᵀe − Σψ_i (T_i y)ᵀq_i/‖q_i‖, q_i the slips of u + ty, is 0 or jumps
@@ -137,7 +137,7 @@ class _Sliding:
 
 
 def _allowed(coarse: CoarseSpace, u: Array, rtol: float) -> Array:
-    """How far each body may be off, shape ``(bodies,)``."""
+    """Return the displacement error allowed to each body, shape ``(bodies,)``."""
     size = coarse.subdomains.body_maxima([coarse.subdomains.sizes(u)])[0]
     return np.asarray(FAR * rtol * size + NOISE * size.max(initial=0.0))
 
@@ -145,7 +145,7 @@ def _allowed(coarse: CoarseSpace, u: Array, rtol: float) -> Array:
 def _held_by_nothing_else(
     coarse: CoarseSpace, constraints: Constraints, slips: Array, allowed: Array
 ) -> csr_array:
-    """Orthonormal motions that normals which may be closed do not resist, on all ranks."""
+    """Return orthonormal motions that normals which may be closed do not resist, on all ranks."""
     row, column = coarse.J.tocoo().coords
     near = np.zeros(len(slips))
     np.maximum.at(near, row, allowed[column // coarse.bodies.k])
@@ -156,7 +156,7 @@ def _held_by_nothing_else(
 
 
 def _largest(N: csr_array, values: Array) -> Array:
-    """Of each column the largest value where it has entries."""
+    """Return for each column the largest value among the rows where it has entries."""
     entries = N.tocoo()
     row, column = entries.coords
     largest = np.zeros(N.shape[1])
@@ -164,7 +164,7 @@ def _largest(N: csr_array, values: Array) -> Array:
     return largest
 
 
-# --- Where an answer cannot be trusted, or not as far as it seems: sentences for the report ---
+# --- Warnings of the report -------------------------------------------------------------------
 
 # relative rounding of a stiffness
 EPSILON = float(np.finfo(float).eps)
@@ -185,7 +185,7 @@ ESTIMATES = "estimates"  # how the sentence on them begins
 
 
 class Diagnostics:
-    """Looks at solutions for what a residual does not show; knows again what it has looked at.
+    """Diagnostics of solutions beyond residuals; a solution seen before is not examined again.
 
     Args:
         decomposition: The torn mesh.
@@ -278,7 +278,7 @@ class Diagnostics:
             yield f"{rest} more motions that friction alone holds are wrong, or not determined"
 
     def _rounding(self, dual: Dual, u: Array, rtol: float) -> Iterator[str]:
-        """Bodies that bend so easily beside what their cells could hold that K's rounding shows.
+        """Warn of slender bodies, whose small bending energy is inexact by the rounding of K.
 
         Entries of K are right to ε, so the energy uᵀKu is to ε Σ|K_ij u_i u_j|, about ε uᵀDu, D
         the diagonal; of u less the rigid motion of the body, which K knows to do no work.
@@ -369,7 +369,7 @@ class Diagnostics:
                 )
 
     def _points(self, subdomains: Subdomains) -> Array:
-        """Points of this rank's primal nodes, from the middle of their subdomains on."""
+        """Return points of this rank's primal nodes, from the middle of their subdomains on."""
         gdim, bs = self._decomposition.mesh.geometry.dim, self._dofs.bs
         x = self._dofs.V.tabulate_dof_coordinates()[self._dofs.dolfinx_node, :gdim]
         for part in subdomains.dof_parts:
@@ -378,7 +378,7 @@ class Diagnostics:
         return np.asarray(x)
 
     def _names(self, which: Array) -> str:
-        """Names of bodies, the first ones if they are many; the same on all ranks."""
+        """Return names of bodies, the first ones if they are many; the same on all ranks."""
         names = self._decomposition.body_names
         some = bcast_from_root(self._dofs.comm, np.flatnonzero(which))
         listed = ", ".join(names[body] for body in some[:LISTED])

@@ -1,4 +1,4 @@
-"""The errors that a solve knows: what the solver has left, and what the mesh leaves."""
+"""Estimates of the algebraic and the discretisation error of a solve."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Estimates:
         )
 
     def numbers(self) -> dict[str, float]:
-        """What is known, by name."""
+        """Return the estimates that are known, by name."""
         return {name: value for name, value in asdict(self).items() if value is not None}
 
 
@@ -122,7 +122,7 @@ def goal_of(
 
 
 def of_looks(reached: Sequence[TargetStatus]) -> dict[str, float]:
-    """What looks at a goal have found, the last one, and taken, all of them."""
+    """Return the errors at the last assessment of a target, and the cost of all of them."""
     if not reached:
         return {}
     last = reached[-1]
@@ -149,7 +149,7 @@ def bound_of(system: System, solution: Solution) -> tuple[float, EnergyBound]:
 
 
 def _discretisation(solution: Solution) -> float:
-    """The root of the sum of squares. Collective."""
+    """Return the root of the sum of squares. Collective."""
     comm = solution.dofs.comm
     own = float(np.sum(solution.discretisation_error.x.array**2))
     return float(np.sqrt(bcast_from_root(comm, comm.allreduce(own))))

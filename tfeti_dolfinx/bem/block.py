@@ -22,7 +22,7 @@ from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.sparse_block import PLACE, SAME, SparseBlock, places_in_order
 from tfeti_dolfinx.subdomains.stiffness import Stiffness
 
-# --- The Block of a subdomain with boundary elements ------------------------------------------
+# --- Block of a subdomain with boundary elements ----------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -80,11 +80,11 @@ class BoundaryBlock(SparseBlock):
         super().__init__(data, how)
 
     def _found(self, K: Any, own: Stiffness | None) -> tuple[Stiffness, Array]:
-        """That of the shape."""
+        """Return the stiffness of the part's shape, and the place of its unknowns there."""
         return self._part.shape.stiffness, self._part.place
 
 
-# --- All subdomains of a rank with boundary elements: their stiffness and load ----------------
+# --- Boundary elements of all subdomains of a rank --------------------------------------------
 
 # Of the largest entry of a load: what quadrature leaves of a constant force per volume
 CONSTANT = 1e-7
@@ -149,7 +149,7 @@ class Parts:
         return blocks
 
     def load(self, f: Array, volume: Array | None, hats: Array | None) -> Array:
-        """The load with that of boundary elements in the place of that of finite ones.
+        """Return the load with that of boundary elements in the place of that of finite ones.
 
         Args:
             f: The load in primal order.
@@ -176,7 +176,7 @@ class Parts:
         return f
 
     def blocks(self, make_block: MakeBlock) -> MakeBlock:
-        """What makes the Blocks of this rank, those of finite elements as given."""
+        """Return the factory of this rank's Blocks, those of finite elements as given."""
         by_name = {f"subdomain {self._dofs.subdomains[s]}": p for s, p in self.parts.items()}
 
         def make(data: SubdomainData) -> Block:
@@ -208,7 +208,7 @@ class Parts:
         return bodies
 
     def inside(self) -> int:
-        """Number of unknowns of all ranks that boundary elements do without."""
+        """Return the number of unknowns of all ranks that boundary elements do without."""
         count = sum(int(np.sum(~part.on_surface)) for part in self.parts.values())
         return int(self._dofs.comm.allreduce(count))
 
@@ -224,7 +224,7 @@ def _part(
     shapes: dict[bytes, list[SurfaceStiffness]],
     how: InverseFactory,
 ) -> Part:
-    """A subdomain, of a shape that is known or a new one."""
+    """Return a subdomain, of a shape that is known or a new one."""
     key, order = places_in_order(surface.panels.x)
     outside = np.zeros(len(order), dtype=bool)
     outside[surface.panels.nodes] = True
@@ -243,7 +243,7 @@ def _part(
 
 
 def _equal(shape: SurfaceStiffness, surface: Surface, K: Any) -> bool:
-    """Also of the same size, which K does not show in 2D."""
+    """Return whether parts are equal, in size too, which K does not show in 2D."""
     pairs = zip(shape.surface.cuts, surface.cuts, strict=True)
     if not all(np.array_equal(one.nodes, other.nodes) for one, other in pairs):
         return False
@@ -254,7 +254,7 @@ def _equal(shape: SurfaceStiffness, surface: Surface, K: Any) -> bool:
 
 
 def _force_per_volume(name: str, volume: Array, hats: Array) -> Array:
-    """The constant b whose load this is."""
+    """Return the constant b whose load this is."""
     forces = volume.reshape(len(hats), -1)
     b = forces.sum(axis=0) / hats.sum()
     if np.abs(forces - hats[:, None] * b).max() > CONSTANT * np.abs(forces).max(initial=0.0):

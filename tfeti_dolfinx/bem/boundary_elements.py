@@ -49,7 +49,7 @@ class BoundaryElements:
         return f"BoundaryElements({', '.join(repr(volume) for volume in self.volumes)})"
 
     def chosen(self, decomposition: Decomposition) -> Array:
-        """Flags of the subdomains of this rank that get them, shape ``(S,)``. Collective.
+        """Return flags of the subdomains of this rank that get them, shape ``(S,)``. Collective.
 
         Raises:
             InputError: A volume is not known, or a subdomain lies in others, too.
@@ -86,7 +86,7 @@ def check_boundary_elements(elements: Any, own: Extensions) -> None:
 
 
 class BoundaryElementAssembly:
-    """What boundary elements put in the place of finite ones, if there are any.
+    """Stiffness and load of boundary elements in the place of finite ones, if there are any.
 
     Creation and all methods are collective.
 
@@ -105,7 +105,7 @@ class BoundaryElementAssembly:
 
     @property
     def exists(self) -> bool:
-        """Whether there are boundary elements."""
+        """True if there are boundary elements."""
         return self._chosen is not None
 
     def node_blocks(self, K: Any, how: InverseFactory) -> Array:
@@ -126,7 +126,7 @@ class BoundaryElementAssembly:
         return self._parts.take_stiffness(K, blocks)
 
     def load(self, forms: Forms) -> Array:
-        """This rank's load in DOLFINx's numbering.
+        """Return this rank's load in DOLFINx's numbering.
 
         Raises:
             InputError: There is a load that boundary elements cannot take.
@@ -141,11 +141,11 @@ class BoundaryElementAssembly:
         return self._dofs.to_dolfinx(replaced)
 
     def blocks(self, make_block: MakeBlock) -> MakeBlock:
-        """What makes the Blocks of this rank, those of finite elements as given."""
+        """Return the factory of this rank's Blocks, those of finite elements as given."""
         return make_block if self._parts is None else self._parts.blocks(make_block)
 
     def solved(self, u: Array) -> BoundarySolution | None:
-        """The solution, in primal order, inside boundary elements."""
+        """Return the solution, in primal order, inside boundary elements."""
         if self._parts is None or self._chosen is None:
             return None
         cells = self._decomposition.cell_subdomain
@@ -153,5 +153,5 @@ class BoundaryElementAssembly:
         return BoundarySolution(self._parts.solved(u), np.flatnonzero(~have), cells)
 
     def inside(self) -> int:
-        """Number of unknowns of all ranks that boundary elements do without."""
+        """Return the number of unknowns of all ranks that boundary elements do without."""
         return 0 if self._parts is None else self._parts.inside()

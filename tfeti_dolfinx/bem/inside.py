@@ -14,7 +14,7 @@ from tfeti_dolfinx.bem.panels import Panels
 from tfeti_dolfinx.bem.steklov import Steklov, gunter, rigid_motions
 from tfeti_dolfinx.common.arrays import Array
 
-# --- Somigliana's identity: displacement and stress inside, from what is on the surface -------
+# --- Somigliana's identity: displacement and stress inside ------------------------------------
 
 # A panel is cut in parts until their middles are as far as FAR of their sizes; from so many sizes
 # on a rule of this degree is exact to 1e-9. What is nearer to the surface than a panel's size over
@@ -52,7 +52,7 @@ class Inside:
         self._field = _Field(t - 2.0 * law.mu * turned, turned, rest[panels.nodes])
 
     def displacement(self, points: Array) -> Array:
-        """Shape ``(k, d)``, at points inside, shape ``(k, d)``."""
+        """Return an array of shape ``(k, d)``, at points inside, shape ``(k, d)``."""
         points = points - self._shift
         u = self._known(points)
         for cut in _cuts(self._panels, points, self._field.on_corners):
@@ -60,11 +60,11 @@ class Inside:
         return u
 
     def share(self, points: Array) -> Array:
-        """As the function of that name, shape ``(k,)``."""
+        """Return the shares of the points as ``share`` does, shape ``(k,)``."""
         return share(self._panels, points - self._shift)
 
     def stress(self, points: Array) -> Array:
-        """Shape ``(k, d, d)``, without σ_zz, at points inside, shape ``(k, d)``."""
+        """Return σ, shape ``(k, d, d)``, without σ_zz, at points inside, shape ``(k, d)``."""
         return self._law.stress(self.gradient(points))
 
     def gradient(self, points: Array) -> Array:
@@ -81,7 +81,7 @@ class Inside:
         return self._law.lmbda + 2.0 * self._law.mu
 
     def _known(self, x: Array) -> Array:
-        """The rigid motion and u_p."""
+        """Return the rigid motion and u_p."""
         y = x - self._middle
         return np.asarray(self._moved + y @ self._turn.T - self._b * y**2 / (2.0 * self._stiff))
 
@@ -92,7 +92,7 @@ class Inside:
         return both, k * density
 
     def _layers(self, seen: _Seen, cut: _Cut) -> Array:
-        """What some panels contribute to u, shape ``(p, d)``."""
+        """Return the contributions of some panels to u, shape ``(p, d)``."""
         panels, (single, tensor) = self._panels, self._densities(cut)
         logs = 1.0 if panels.dim == 3 else -0.5 * np.log(seen.square / panels.rho**2)
         potential = np.sum(seen.over * seen.square * logs, axis=1)
@@ -102,7 +102,7 @@ class Inside:
         return np.asarray(value - np.einsum("py,pyi->pi", double, cut.values))
 
     def _slopes(self, seen: _Seen, cut: _Cut) -> Array:
-        """What some panels contribute to ∂_j u_i, shape ``(p, d, d)``."""
+        """Return the contributions of some panels to ∂_j u_i, shape ``(p, d, d)``."""
         d, (single, tensor) = self._panels.dim, self._densities(cut)
         r, over, along = seen.r, seen.over, seen.along(tensor)
         falling = d * over / seen.square
@@ -149,7 +149,7 @@ def share(panels: Panels, points: Array) -> Array:
 
 @dataclass(frozen=True)
 class _Field:
-    """What is on the panels: t − 2μ𝓜û and 𝓜û, shape ``(ne, d)``, û at corners ``(ne, d, d)``."""
+    """Densities on panels: t − 2μ𝓜û and 𝓜û, shape ``(ne, d)``, û at corners ``(ne, d, d)``."""
 
     density: Array
     turned: Array
@@ -176,7 +176,7 @@ class _Cut:
 
 
 class _Seen:
-    """r = x − y from points to parts of panels, and what the kernels are made of.
+    """r = x − y from points to parts of panels, and factors of the kernels.
 
     Attributes:
         r: Shape ``(p, y, d)``.
@@ -198,7 +198,7 @@ class _Seen:
 
 
 def _cuts(panels: Panels, points: Array, values: Array) -> Iterator[_Cut]:
-    """Panels, cut as the distances to points ask for; values at their corners go along."""
+    """Cut panels as finely as the distances to points require, with their corner values."""
     for some in in_chunks(np.arange(len(points)), 4 * len(panels.nodes)):
         point, panel = np.repeat(some, len(panels.nodes)), np.tile(_all(panels), len(some))
         corners, carried, measure = panels.corners[panel], values[panel], panels.measure[panel]
@@ -254,7 +254,7 @@ def _parts(d: int) -> list[Array]:
     return [*inner, half]
 
 
-# --- The solution of bodies with boundary elements, to be asked for what is inside ------------
+# --- Solution of bodies with boundary elements ------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -274,7 +274,7 @@ class SolvedBody:
 
 @dataclass(frozen=True)
 class BoundarySolution:
-    """What boundary elements know of a solution.
+    """Solution on the surfaces of the subdomains with boundary elements.
 
     Attributes:
         bodies: Gives the subdomains of this rank that have them, one at a time.

@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 from tfeti_dolfinx.bem.panels import Panels
 from tfeti_dolfinx.common.arrays import Array
 
-# --- The three integrals that all layer operators of elasticity are made of -------------------
+# --- Integrals of the layer operators ---------------------------------------------------------
 
 # points, or pairs of them, that are looked at together: what they need stays in the cache
 TOGETHER = 2**15
@@ -62,8 +62,7 @@ def in_chunks(items: Array, points: int) -> Iterator[Array]:
         yield items[start : start + step]
 
 
-# --- Quadrature for pairs of triangles: Sauter and Schwab's rules where they meet, and tensor
-#     ones ---
+# --- Quadrature for pairs of triangles --------------------------------------------------------
 
 # Gauss points that integrate polynomials of degree 5: what the products of two hats and the
 # Jacobian are in each variable
@@ -116,7 +115,7 @@ def apart_rule(degree: int) -> PairRule:
 
 
 def _barycentric(s: Array, t: Array) -> Array:
-    """Of the points (s, t), 0 ≤ t ≤ s ≤ 1."""
+    """Return the barycentric coordinates of the points (s, t), 0 ≤ t ≤ s ≤ 1."""
     return np.stack((1.0 - s, s - t, t), axis=1)
 
 
@@ -152,7 +151,7 @@ def _vertex(xi: Array, a: Array, b: Array, c: Array) -> list[Map]:
     ]
 
 
-# --- Layer integrals on segments: closed forms where segments are near, Gauss' rule elsewhere ---
+# --- Layer integrals on segments --------------------------------------------------------------
 # With points as complex numbers and z = x − y all of them are integrals of log z, z̄/z and s/z.
 # Far from each other the closed forms are small differences of large numbers, and Gauss' rule is
 # exact to rounding.
@@ -191,7 +190,7 @@ def _put(layers: Layers, i: Array, j: Array, values: tuple[Array, ...]) -> None:
 
 
 def _by_rule(panels: Panels, i: Array, j: Array, points: int) -> tuple[Array, ...]:
-    """The integrals by Gauss' rule in both variables."""
+    """Return the integrals by Gauss' rule in both variables."""
     rule: Array = np.array(np.polynomial.legendre.leggauss(points))
     s, weights = 0.5 * (rule[0] + 1.0), 0.5 * rule[1]
     z, tau = panels.corners @ np.array([1.0, 1j]), panels.directed @ np.array([1j, -1.0])
@@ -230,7 +229,7 @@ class _Corners:
 
 
 def _exact(panels: Panels, i: Array, j: Array) -> tuple[Array, ...]:
-    """The integrals in closed form; F₁, F₂ are antiderivatives of log z."""
+    """Return the integrals in closed form; F₁, F₂ are antiderivatives of log z."""
     lengths = panels.measure
     z = panels.corners @ np.array([1.0, 1j])
     tau = (panels.directed @ np.array([1j, -1.0])) / lengths
@@ -264,7 +263,7 @@ def _difference(F: Array) -> Array:
     return np.asarray(F[:, :, 1] - F[:, :, 0])
 
 
-# --- Layer integrals on triangles: Sauter and Schwab's quadrature where they meet -------------
+# --- Layer integrals on triangles -------------------------------------------------------------
 
 # Gauss points along each variable for pairs that share 1, 2 or 3 corners, up to a distortion of
 # the worse of both (2 is half a square): tractions of constant stresses are right to 1e-4 up to 5.
@@ -306,7 +305,7 @@ def layers_3d(panels: Panels) -> Layers:
 
 
 def _shared_corners(nodes: Array, first: Array, second: Array) -> tuple[Array, Array, Array]:
-    """Number of shared corners of pairs, and orders of the corners that put these first."""
+    """Return number of shared corners of pairs, and orders of the corners that put these first."""
     same = nodes[first][:, :, None] == nodes[second][:, None, :]
     own = same.any(axis=2)
     shared = own.sum(axis=1)

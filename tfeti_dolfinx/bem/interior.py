@@ -72,7 +72,7 @@ class Interior:
 
     @property
     def fields(self) -> tuple[list[fem.Function], list[fem.Function]]:
-        """What there is for files: fields of nodes, and of cells."""
+        """The fields to write to files: those of nodes, and those of cells."""
         return [self.displacement], [] if self._sigma is None else [self.stress, self.von_mises]
 
     def _of_cells(self, name: str, values: Array, shape: tuple[int, ...]) -> fem.Function:
@@ -125,7 +125,7 @@ class _Midpoints:
         )
 
     def of(self, values: Array) -> Array:
-        """Shape ``(cells, 3, 3)``, for values of u in DOLFINx's order."""
+        """Return an array of shape ``(cells, 3, 3)``, for values of u in DOLFINx's order."""
         self._u.x.array[:] = values
         self._values.interpolate(self._expression)
         layout = np.asarray(self._values.function_space.dofmap.list)[:, 0]

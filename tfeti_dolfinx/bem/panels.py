@@ -15,7 +15,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mesh.untorn import cell_facets, facet_vertices
 
-# --- Flat panels: the closed surface of a body, and its traces of displacements and tractions ---
+# --- Panels of a closed surface ---------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Panels:
 
     @property
     def diameter(self) -> float:
-        """Of a ball around them, whatever way they are turned."""
+        """Diameter of a ball around the panels, the same for all rotations of them."""
         return 2.0 * float(np.linalg.norm(self.x - self.x.mean(axis=0), axis=1).max())
 
     @property
@@ -91,7 +91,7 @@ class Panels:
         return float(np.sum(self.midpoints * self.directed) / self.dim)
 
     def by_corners(self, values: Array) -> csr_array:
-        """A sparse matrix, ne × np, from values for the corners, shape ``(ne, d)``."""
+        """Return a sparse matrix, ne × np, from values for the corners, shape ``(ne, d)``."""
         panel = np.repeat(np.arange(len(self.nodes)), self.dim)
         shape = (len(self.nodes), len(self.x))
         return csr_array(coo_array((values.ravel(), (panel, self.nodes.ravel())), shape=shape))
@@ -112,7 +112,7 @@ class Panels:
         return [self.by_corners(turned[:, :, c]) for c in range(3)]
 
 
-# --- Panels of subdomains: the facets of a torn mesh on its outside, tears included -----------
+# --- Panels of subdomains ---------------------------------------------------------------------
 
 # Of the size of a facet: how far its corners may be from a plane
 FLAT = 1e-8
@@ -141,7 +141,7 @@ class Surface:
         return self.cuts[0]
 
     def placed(self, order: Array) -> Surface:
-        """The same with nodes, and therefore panels, in another order."""
+        """Return the same with nodes, and therefore panels, in another order."""
         rank = np.empty_like(order)
         rank[order] = np.arange(len(order))
         x = self.panels.x[order]

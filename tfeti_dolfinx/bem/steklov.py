@@ -18,7 +18,7 @@ from tfeti_dolfinx.subdomains.factor import CholeskyFactor
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.stiffness import Stiffness
 
-# --- S, the Galerkin approximation of the Steklov–Poincaré operator of a Lamé body ------------
+# --- Galerkin approximation of the Steklov–Poincaré operator ----------------------------------
 
 # Of the largest nodal force of constant stresses: how wrong quadrature on long thin triangles may
 # make them
@@ -117,7 +117,7 @@ def steklov(panels: Panels, law: IsotropicLaw) -> Steklov:
 
 
 def wrong_forces(panels: Panels, law: IsotropicLaw, S: Array) -> float:
-    """The largest error of nodal forces of constant stresses, over the largest of these."""
+    """Return the largest error of nodal forces of constant stresses, over the largest of these."""
     d, y = panels.dim, panels.x - panels.x.mean(axis=0)
     gradients = np.eye(d * d).reshape(d * d, d, d)
     u = np.einsum("kij,nj->nik", gradients, y).reshape(-1, d * d)
@@ -188,7 +188,7 @@ def gunter(panels: Panels) -> csr_array:
 
 
 def rigid_motions(x: Array) -> Array:
-    """Orthonormal, shape ``(d np, 3 or 6)``, unknowns ordered node by node."""
+    """Return orthonormal modes, shape ``(d np, 3 or 6)``, unknowns ordered node by node."""
     n, d = x.shape
     y = (x - x.mean(axis=0)) / np.abs(x - x.mean(axis=0)).max()
     modes = [np.tile(axis, n) for axis in np.eye(d)]
@@ -206,11 +206,11 @@ def _sandwich(left: csr_array, right: csr_array, V: Array) -> Array:
 
 
 def _by_nodes(count: int, d: int) -> Array:
-    """Where the unknowns of nodes stand in the order of components."""
+    """Return the places of the unknowns, ordered by nodes, in the order by components."""
     return np.arange(d * count).reshape(d, count).T.ravel()
 
 
-# --- The law of a homogeneous, isotropic body, read from the stiffness of its finite elements ---
+# --- Elastic moduli read from a finite element stiffness --------------------------------------
 
 # Of the largest entry: what rounding and quadrature of a constant stress leave
 SAME = 1e-7
@@ -262,7 +262,7 @@ def _isotropic(C: Array) -> IsotropicLaw:
     return IsotropicLaw(mu, lmbda / (2.0 * (lmbda + mu)) if lmbda + mu > 0.0 else np.nan)
 
 
-# --- A subdomain whose surface has boundary elements, in an order of nodes of its own ---------
+# --- A subdomain with its surface nodes in boundary element order -----------------------------
 
 TOGETHER = 256  # right sides that are solved for at once
 

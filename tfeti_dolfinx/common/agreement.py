@@ -1,4 +1,4 @@
-"""Whether all ranks call the same, with the same arguments: one small message at every door."""
+"""Checks that all ranks make the same call with the same arguments: one small message each."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ TOLD = "_told_to_all_ranks"
 
 
 class Absent:
-    """What stands for an entry that one of two descriptions does not have."""
+    """Placeholder of an entry that one of two descriptions does not have."""
 
     def __repr__(self) -> str:
         return "not given"
@@ -107,7 +107,7 @@ def _raise_everywhere(comm: MPI.Intracomm, error: Exception | None, raiser: int)
 
 
 def _difference_of_ranks(all_told: list[tuple[str, dict[str, Any]]]) -> str | None:
-    """How the first rank that differs does so from rank 0; None where it is rounding."""
+    """Describe how the first rank that differs does so from rank 0; None: only by rounding."""
     first, expected = all_told[0]
     for rank, (call, told) in enumerate(all_told):
         if call != first:
@@ -224,7 +224,7 @@ def _hash(*texts: str) -> str:
 
 
 def _values(constants: Any, functions: Any) -> dict[str, Any]:
-    """Values of constants, and the kinds of functions; UFL's own have none."""
+    """Return values of constants, and the kinds of functions; UFL's own have none."""
     return {
         "constants": [
             described(c) if isinstance(c, fem.Constant) else type(c).__qualname__ for c in constants
@@ -295,7 +295,7 @@ def difference(found: Any, expected: Any, what: str = "") -> tuple[str, Any, Any
 
 
 def _is_rounding(found: list[Any], expected: list[Any]) -> bool:
-    """Whether two lists are the same, but for what is rounding beside their largest number."""
+    """Return whether two lists are equal up to rounding beside their largest number."""
     if repr(found) == repr(expected):
         return True
     numbers = [*found, *expected]
@@ -312,14 +312,14 @@ def _is_number(value: Any) -> bool:
 
 
 def brief(value: Any) -> str:
-    """A description for a message."""
+    """Return a description for a message."""
     if isinstance(value, dict) and "type" in value:
         return f"a {value['type']}" if not value["type"].startswith("the ") else value["type"]
     return repr(value) if isinstance(value, Absent) else shown(value)
 
 
 def sums_of(comm: MPI.Intracomm, arrays: list[Array]) -> list[list[Any]]:
-    """Return what tells fields apart, however they are shared out: one reduction. Collective.
+    """Return checksums of fields that do not depend on the partition: one reduction. Collective.
 
     Args:
         comm: Communicator.

@@ -32,7 +32,7 @@ __all__ = [
 
 
 def sum_rows(row: Array, values: Array, size: int) -> Array:
-    """Sums of the values with the same row.
+    """Return sums of the values with the same row.
 
     Args:
         row: Row of each value, shape ``(k,)``.
@@ -52,7 +52,7 @@ def sum_rows(row: Array, values: Array, size: int) -> Array:
 
 
 def parts_of(sizes: Sequence[int]) -> list[slice]:
-    """Where arrays of these lengths lie, one after the other."""
+    """Return the slices of arrays of these lengths in their concatenation."""
     ends = np.cumsum([0, *sizes])
     return [slice(int(a), int(b)) for a, b in pairwise(ends)]
 
@@ -63,7 +63,7 @@ def joined(parts: Sequence[Array]) -> Array:
 
 
 def node_blocks(K: Any, bs: int) -> Array:
-    """The block of each node in a scipy matrix, unknowns of a node one after the other.
+    """Return the block of each node in a scipy matrix, unknowns of a node one after the other.
 
     Args:
         K: Symmetric, shape ``(n, n)``.
@@ -90,5 +90,5 @@ def node_means(x: Array, bs: int) -> Array:
 
 
 def sums(x: Array, parts: Sequence[slice]) -> list[float]:
-    """Sum over each part of an array."""
+    """Return the sum over each part of an array."""
     return [float(x[part].sum()) for part in parts]

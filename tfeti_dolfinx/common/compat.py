@@ -29,7 +29,7 @@ JIT_OPTIONS = {"timeout": 300}
 
 
 def petsc_scalar_type() -> Any:
-    """The numpy type of PETSc's scalars."""
+    """Return the numpy type of PETSc's scalars."""
     return PETSc.ScalarType
 
 
@@ -74,7 +74,7 @@ def coordinate_element(cell_type: dmesh.CellType, degree: int, gdim: int) -> Any
 
 
 def create_mesh_in_place(comm: MPI.Intracomm, cells: Array, x: Array, element: Any) -> dmesh.Mesh:
-    """A mesh whose cells stay on the rank that gives them. Collective.
+    """Return a mesh whose cells stay on the rank that gives them. Collective.
 
     This is the one call of DOLFINx's partitioner hook.
 
@@ -117,7 +117,7 @@ def original_cells(mesh: dmesh.Mesh) -> Array:
 
 
 def interpolation_points(V: fem.FunctionSpace) -> Array:
-    """Points of the reference cell at which the element of ``V`` is interpolated."""
+    """Return points of the reference cell at which the element of ``V`` is interpolated."""
     points = V.element.interpolation_points
     return np.asarray(points() if callable(points) else points)
 
@@ -130,7 +130,7 @@ def first_component(V: fem.FunctionSpace) -> tuple[fem.FunctionSpace, Array]:
 
 
 def assemble_csr(form: fem.Form) -> Any:
-    """This rank's diagonal block of a bilinear form, as a scipy CSR matrix.
+    """Return this rank's diagonal block of a bilinear form, as a scipy CSR matrix.
 
     Needs a mesh whose vertices are never shared between ranks, so nothing is communicated.
     """
@@ -146,7 +146,7 @@ def space_of(bc: fem.DirichletBC) -> Any:
 
 
 def prescribed_values(bcs: Sequence[fem.DirichletBC], size: int) -> Array:
-    """Values that the boundary conditions prescribe, NaN elsewhere; one row per condition.
+    """Return values that the boundary conditions prescribe, NaN elsewhere; one row per condition.
 
     Returns:
         Array of shape ``(len(bcs), size)``, ``size`` the number of local unrolled dofs.

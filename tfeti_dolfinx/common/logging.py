@@ -8,7 +8,7 @@ from contextlib import contextmanager
 
 from petsc4py import PETSc
 
-# --- Stages: wall time for the report, and a stage of PETSc's log for each --------------------
+# --- Timers and log stages --------------------------------------------------------------------
 
 
 @contextmanager
@@ -24,8 +24,7 @@ def stage(name: str, seconds: MutableMapping[str, float]) -> Iterator[None]:
         seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - start
 
 
-# --- The papers whose methods a run has used: PETSc's option ``-citations`` prints them at
-#     the end ---
+# --- Citations of the methods used ------------------------------------------------------------
 
 TOTAL_FETI = """@article{DostalHorakKucera2006,
   title = {Total {FETI} -- an easier implementable variant of the {FETI} method

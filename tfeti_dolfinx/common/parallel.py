@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 
 def bcast_from_root(comm: MPI.Intracomm, value: T) -> T:
-    """Rank 0's value on every rank. Collective.
+    """Return rank 0's value on every rank. Collective.
 
     For what steers collective calls: processors of different kinds may round differently, and
     ranks that decide by their own floats may part ways.
@@ -22,7 +22,7 @@ def bcast_from_root(comm: MPI.Intracomm, value: T) -> T:
 
 
 def any_rank(comm: MPI.Intracomm, flag: bool) -> bool:
-    """Whether a flag is set on some rank. Collective."""
+    """Return whether a flag is set on some rank. Collective."""
     return bool(comm.allreduce(bool(flag), op=MPI.LOR))
 
 
@@ -90,7 +90,7 @@ def offset_of(comm: MPI.Intracomm, size: int) -> int:
 
 
 def owner_of(offsets: Array, index: Array) -> Array:
-    """Rank whose chunk holds each global index; ``offsets`` has comm.size + 1 entries."""
+    """Return rank whose chunk holds each global index; ``offsets`` has comm.size + 1 entries."""
     return np.searchsorted(offsets, index, side="right") - 1
 
 

@@ -17,12 +17,12 @@ import numpy as np
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.errors import InputError, TfetiError
 
-# --- Checks of what users give: values, types, and what their callables raise -----------------
+# --- Checks of values, types and callables ----------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Range:
-    """Which numbers fit, and how a message says it."""
+    """Range of numbers, with the words that a message describes it by."""
 
     text: str
     holds: Callable[[float], bool]
@@ -33,7 +33,7 @@ POSITIVE = Range("a positive number", lambda value: value > 0.0)
 
 
 def shown(value: Any) -> str:
-    """A value for a message: short, and of objects their type only."""
+    """Return a value for a message: short, and of objects their type only."""
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, (bool, str, Real, list, tuple, dict)):
@@ -46,12 +46,12 @@ def shown(value: Any) -> str:
 
 
 def is_whole(value: Any) -> TypeGuard[int]:
-    """Whether a value is an integer, numpy's included; True and False are none."""
+    """Return whether a value is an integer, numpy's included; True and False are none."""
     return isinstance(value, Integral) and not isinstance(value, (bool, np.bool_))
 
 
 def checked_number(value: Any, what: str, expected: Range = FINITE) -> float:
-    """A finite number in a range; numpy's scalars are numbers, booleans and texts are none.
+    """Return a finite number in a range; numpy's scalars are numbers, booleans and texts are none.
 
     Args:
         value: What was given.
@@ -70,7 +70,7 @@ def checked_number(value: Any, what: str, expected: Range = FINITE) -> float:
 
 
 def real_numbers(values: Any) -> Array:
-    """What a user's function has returned as floats; of complex numbers no part is dropped.
+    """Convert what a user's function has returned to floats; drop no imaginary part.
 
     Raises:
         TypeError: They are no real numbers.
@@ -83,7 +83,7 @@ def real_numbers(values: Any) -> Array:
 
 
 def checked_flag(value: Any, what: str) -> bool:
-    """A boolean, or numpy's.
+    """Return a boolean, or numpy's.
 
     Raises:
         InputError: It is anything else.
@@ -114,7 +114,7 @@ def checked_callable(value: Any, what: str, expected: str) -> None:
 
 
 def checked_path(path: Any, suffix: str) -> Path:
-    """A file's name with this ending.
+    """Return a file's name with this ending.
 
     Raises:
         InputError: It is no name, or ends otherwise.
@@ -147,7 +147,7 @@ def named(what: str, *kinds: type[Exception]) -> Iterator[None]:
         raise InputError(f"{what}: {type(error).__name__}: {error}") from error
 
 
-# --- Parameters that say once what they are: default, range, text, symbol, name as an option ---
+# --- Descriptions of parameters ---------------------------------------------------------------
 
 FROM_0 = Range("0 or more", lambda value: value >= 0.0)
 FROM_1 = Range("1 or more", lambda value: value >= 1.0)
@@ -156,7 +156,7 @@ ABOVE_0 = Range("more than 0", lambda value: value > 0.0)
 
 @dataclass(frozen=True)
 class Description:
-    """What a parameter is.
+    """Description of a parameter.
 
     Attributes:
         algorithm: Whose it is.
@@ -180,7 +180,7 @@ class Description:
 
 
 def described(default: Any, algorithm: str, text: str, **more: Any) -> Any:
-    """A field of a dataclass of parameters.
+    """Return a field of a dataclass of parameters.
 
     Args:
         default: Its default, which says its type too.
@@ -240,7 +240,7 @@ def _description(f: Field[Any]) -> Description:
     return description
 
 
-# --- Is a subdomain's stiffness symmetric, are its load and stiffness finite? -----------------
+# --- Checks of a subdomain's stiffness and load -----------------------------------------------
 
 # Largest entry of K − Kᵀ over that of K: far above what rounding of assembly leaves, far below any
 # term of a form that matters.

@@ -16,7 +16,7 @@ from tfeti_dolfinx.contact.records import ContactRecords, Friction
 from tfeti_dolfinx.errors import NoSolutionError, TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
-# --- Contact conditions of one node that no displacement can meet together --------------------
+# --- Consistency of contact conditions at one node --------------------------------------------
 
 # of the scene's length: overlaps that the linear program's tolerance (for gaps over that length)
 # may leave, with room for as many conditions as a node may have
@@ -85,7 +85,7 @@ class SharedNodes:
 
 
 def shared_nodes(records: ContactRecords, free: Array, kept: Array, points: Array) -> SharedNodes:
-    """The conditions of this rank whose nodes have several of them.
+    """Return the conditions of this rank whose nodes have several of them.
 
     Args:
         records: Conditions of this rank.
@@ -102,7 +102,7 @@ def shared_nodes(records: ContactRecords, free: Array, kept: Array, points: Arra
 
 
 def _rows(records: ContactRecords, free: Array, condition: Array) -> csr_array:
-    """Rows of some conditions over the unknowns that they touch."""
+    """Return rows of some conditions over the unknowns that they touch."""
     place = np.full(len(records), -1)
     place[condition] = np.arange(len(condition))
     used = np.flatnonzero(place[records.condition] >= 0)
@@ -122,7 +122,7 @@ ROUNDED_OVERLAP = 1e-10
 
 @dataclass(frozen=True)
 class ContactRows:
-    """What the rows B_N are of: it leads back to lengths and forces, and on to right sides.
+    """Origin of the rows B_N: leads to lengths and forces of conditions, and to right sides.
 
     None of it depends on prescribed values or gaps.
 
@@ -205,7 +205,7 @@ def _check_decided(gaps: Array, length: float, comm: MPI.Intracomm) -> None:
         )
 
 
-# --- Rows along the tangents of conditions that have friction ---------------------------------
+# --- Tangential rows of conditions with friction ----------------------------------------------
 
 NOTHING = np.empty(0, dtype=np.int64)
 NO_ROWS = Rows(NOTHING, NOTHING, NOTHING, np.empty(0))
@@ -213,7 +213,7 @@ NO_ROWS = Rows(NOTHING, NOTHING, NOTHING, np.empty(0))
 
 @dataclass(frozen=True)
 class TangentRows:
-    """What the rows T are of: they lead back to slips and tangential forces.
+    """Origin of the rows T: leads to slips and tangential forces of conditions.
 
     Attributes:
         condition: Condition of each point of ``RowSets.tangents``, shape ``(t,)``.
@@ -235,7 +235,7 @@ class TangentRows:
     normal: Array
 
     def right_side(self, dofs: TornDofs, values: Array, slip: Array) -> Array:
-        """What makes T u − c the scaled slip of a step, prescribed values taken in. Collective.
+        """Return c such that T u − c is the scaled slip of a step. Collective.
 
         Args:
             dofs: Dof maps.
@@ -323,7 +323,7 @@ def _tangents_of(
 
 
 def _by_condition(tables: list[Rows]) -> Rows:
-    """Rows of several axes, those of a condition one after the other."""
+    """Return rows of several axes, those of a condition one after the other."""
     rows, count = stack(tables), len(tables)
     place = np.arange(len(rows)).reshape(-1, count).T.ravel()
     return Rows(np.repeat(tables[0].group, count), place[rows.row], rows.column, rows.value)

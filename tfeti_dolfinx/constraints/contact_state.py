@@ -19,7 +19,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mortar.surfaces import group_points
 from tfeti_dolfinx.qp.sets import Face
 
-# --- States of contacts and of rows at a solution ---------------------------------------------
+# --- Status of contacts and rows --------------------------------------------------------------
 
 
 class ContactStatus(IntEnum):
@@ -69,7 +69,7 @@ class ContactData:
     slip: Array
 
 
-# --- The state of all contact conditions at a solution: forces, gaps, slips, and what they do ---
+# --- State of contact conditions: forces, gaps, slips -----------------------------------------
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ class ContactState:
 
     @cached_property
     def slip_of_conditions(self) -> Array:
-        """How far the tangential v_i of each condition has come in this step, a vector.
+        """Change of the tangential v_i of each condition in this step, a vector.
 
         Shape ``(n, gdim)``. Collective at first use.
         """
@@ -187,7 +187,7 @@ class ContactState:
 
     @cached_property
     def dissipation(self) -> Array:
-        """What friction dissipates at each condition in this step, shape ``(n,)``.
+        """Energy that friction dissipates at each condition in this step, shape ``(n,)``.
 
         −F·s, F the friction on the node and s its slip. Collective at first use.
         """

@@ -31,7 +31,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs, component_of, described, is_same_space
 from tfeti_dolfinx.mesh.untorn import cell_facets
 
-# --- Rows that glue torn copies together, and rows that hold prescribed components ------------
+# --- Rows of interfaces and Dirichlet conditions ----------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def _glue(dofs: TornDofs, flag: Array, weights: Array, k: int) -> Rows:
 
 
 def _orthonormal(weights: Array) -> Array:
-    """Rows with zero sum, orthonormal in the inner product of diag(weights)⁻¹.
+    """Return rows with zero sum, orthonormal in the inner product of diag(weights)⁻¹.
 
     Gram–Schmidt on e_i − e_{i+1} in closed form: row j is proportional to (w_1, …, w_j, −W_j)
     with W_j = w_1 + … + w_j.
@@ -124,7 +124,7 @@ def _hold(dofs: TornDofs, flag: Array, weights: Array) -> tuple[Rows, Array]:
     return rows, group[copy] * dofs.bs + component
 
 
-# --- Dirichlet values, spread over all torn copies of a node ----------------------------------
+# --- Dirichlet values on torn copies ----------------------------------------------------------
 
 AGREEMENT = 1e-10
 
@@ -165,7 +165,7 @@ def prescribe(dofs: TornDofs, bcs: Sequence[fem.DirichletBC]) -> Prescribed:
 def checked_conditions(
     bcs: Iterable[fem.DirichletBC], V: fem.FunctionSpace
 ) -> list[fem.DirichletBC]:
-    """The conditions as a list. Collective.
+    """Return the conditions as a list. Collective.
 
     Raises:
         InputError: They are no Dirichlet conditions on V or a component of V, or one of them has
@@ -251,7 +251,7 @@ def _facet_nodes(dofs: TornDofs, facets: Array) -> Array:
 
 
 def listed_conditions(bcs: Iterable[fem.DirichletBC]) -> list[fem.DirichletBC]:
-    """The conditions as a list. Not collective.
+    """Return the conditions as a list. Not collective.
 
     Raises:
         InputError: They are nothing that gives Dirichlet conditions.
@@ -314,7 +314,7 @@ def _check_agreement(low: Array, high: Array, flag: Array) -> None:
     )
 
 
-# --- All rows of a scene: from Dirichlet conditions and contact records to B and c ------------
+# --- All rows of a scene ----------------------------------------------------------------------
 
 # more than any mesh has nodes, and times any number of contacts within 64 bits
 MANY_GROUPS = 2**40
@@ -398,7 +398,7 @@ class Gluing:
         )
 
     def with_supports_at(self, values: Array) -> Array:
-        """This rank's part of c as it is, but for supports, which hold other values.
+        """Return this rank's part of c as it is, but for supports, which hold other values.
 
         Contacts meet prescribed components where the prescribed values have them.
 
@@ -445,13 +445,13 @@ class Gluing:
         return sorted(set().union(*self.dofs.comm.allgather(own.tolist())))
 
     def _keys(self, rows: ContactRows | TangentRows) -> Array:
-        """A number for the contact and the node of each condition with such rows."""
+        """Return a number for the contact and the node of each condition with such rows."""
         kept, records = rows.condition, self.records
         return records.contact[kept] * MANY_GROUPS + records.group[kept]
 
 
 def _common(keys: Array, earlier: Array) -> tuple[Array, Array]:
-    """Where the numbers stand that are in both arrays."""
+    """Return the positions, in both arrays, of the numbers that they have in common."""
     _, new, old = np.intersect1d(keys, earlier, return_indices=True)
     return new, old
 

@@ -16,7 +16,7 @@ from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import group_points
 
-# --- Tables of rows: the only source of B -----------------------------------------------------
+# --- Tables of rows ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Rows:
         return len(self.group)
 
     def without_zeros(self) -> Rows:
-        """The same rows without entries that are zero."""
+        """Return the same rows without entries that are zero."""
         used = self.value != 0.0
         return Rows(self.group, self.row[used], self.column[used], self.value[used])
 
@@ -52,7 +52,7 @@ class Rows:
 
 
 def stack(tables: list[Rows]) -> Rows:
-    """The rows of several tables, one table after the other, and so are their entries."""
+    """Return the rows of several tables, one table after the other, and so are their entries."""
     starts = np.cumsum([0, *(len(t) for t in tables)])
     return Rows(
         group=np.concatenate([t.group for t in tables]),
@@ -62,7 +62,7 @@ def stack(tables: list[Rows]) -> Rows:
     )
 
 
-# --- Which local rows of B are what -----------------------------------------------------------
+# --- Kinds of rows ----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class RowSets:
         return np.concatenate((self.normals, self.tangents.ravel()))
 
     def contact_rows(self, comm: MPI.Intracomm) -> tuple[int, int]:
-        """Number of normal and of tangential rows on all ranks. Collective."""
+        """Return the number of normal and of tangential rows on all ranks. Collective."""
         normals, tangents = comm.allreduce(np.array([self.normals.size, self.tangents.size]))
         return int(normals), int(tangents)
 
@@ -103,7 +103,7 @@ def row_sets(num_equalities: int, num_normals: int, num_tangents: int, gdim: int
     return RowSets(equalities, normals, tangents.reshape(shape))
 
 
-# --- D, with which rows of B are scaled -------------------------------------------------------
+# --- Scaling D of rows ------------------------------------------------------------------------
 
 
 def row_weights(blocks: Array, scaling: str, comm: MPI.Intracomm) -> Array:
@@ -130,14 +130,14 @@ def row_weights(blocks: Array, scaling: str, comm: MPI.Intracomm) -> Array:
     return np.repeat(D, blocks.shape[1])
 
 
-# --- The directions in which the rows of B act on a node --------------------------------------
+# --- Directions in which rows act on a node ---------------------------------------------------
 
 # of the largest square: directions of normals that differ by less are one but for rounding
 ALIKE = 1e-12
 
 
 def row_span(dofs: TornDofs, equalities: Rows, contact: Rows, trace: Array) -> Array:
-    """Projector onto what rows see of each node, as rows for the trace unknowns. Collective.
+    """Project each node onto the directions rows act in, as rows of the trace. Collective.
 
     A node that only a contact meets is held along the normal, whatever axis that lies along. Where
     normals of several conditions differ, or there is friction or gluing, it is held in more.
@@ -168,7 +168,7 @@ def row_span(dofs: TornDofs, equalities: Rows, contact: Rows, trace: Array) -> A
 
 
 def _grams(rows: Rows, bs: int) -> tuple[Array, Array]:
-    """Nodes that rows act on, and the sums of aaᵀ of their coefficients a there."""
+    """Return nodes that rows act on, and the sums of aaᵀ of their coefficients a there."""
     node = rows.column // bs
     pairs, place = np.unique(node * len(rows) + rows.row, return_inverse=True)
     a = np.zeros((len(pairs), bs))
@@ -178,7 +178,7 @@ def _grams(rows: Rows, bs: int) -> tuple[Array, Array]:
 
 
 def _projectors(gram: Array, held: Array) -> Array:
-    """Onto the ranges of Σaaᵀ and of the components that are held, shape ``(k, bs, bs)``."""
+    """Project onto the ranges of Σaaᵀ and of prescribed components, shape ``(k, bs, bs)``."""
     size = np.trace(gram, axis1=1, axis2=2)[:, None, None]
     gram = np.divide(gram, size, out=np.zeros_like(gram), where=size > 0.0)
     values, vectors = np.linalg.eigh(gram + held[:, :, None] * np.eye(held.shape[1]))
@@ -186,7 +186,7 @@ def _projectors(gram: Array, held: Array) -> Array:
     return np.einsum("nik,nk,njk->nij", vectors, seen, vectors)
 
 
-# --- Coefficients of contact conditions: without prescribed components, shared by torn copies ---
+# --- Coefficients of contact conditions -------------------------------------------------------
 
 # Of a row's norm: what is left of less is rounding, scaled up to unit norm.
 NOTHING_LEFT = 1e-10
@@ -198,7 +198,7 @@ HARDLY_LEFT = 1e-3
 
 @dataclass(frozen=True)
 class HeldPart:
-    """What prescribed components contribute to the relative displacements of conditions.
+    """Contribution of prescribed components to the relative displacements of conditions.
 
     Attributes:
         condition: Condition of each weight of a node with prescribed components.
@@ -267,14 +267,14 @@ class RowBuilder:
 
     @cached_property
     def held(self) -> HeldPart:
-        """What prescribed components contribute."""
+        """Contribution of prescribed components to the relative displacements."""
         holds = np.flatnonzero(np.any(self._prescribed, axis=1))
         records = self.records
         weight = np.where(self._prescribed, records.weight[:, None], 0.0)[holds]
         return HeldPart(records.condition[holds], records.entry_group[holds], weight)
 
     def rows(self, axis: int, condition: Array, scale: Array) -> Rows:
-        """A row for each of these conditions along an axis, times its scale."""
+        """Return a row for each of these conditions along an axis, times its scale."""
         records, dofs = self.records, self._dofs
         place = np.full(len(records), -1)
         place[condition] = np.arange(len(condition))
@@ -305,7 +305,7 @@ def _nothing_left(records: ContactRecords, points: Array) -> Array:
     return np.clip(SEVERAL * error, NOTHING_LEFT, HARDLY_LEFT)
 
 
-# --- B as a distributed PETSc matrix (dual rows × trace unknowns), and c ----------------------
+# --- B as a distributed PETSc matrix, and c ---------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ def _scaled(constraints: Constraints) -> PETSc.Mat:
 
 
 def _extremes(B: PETSc.Mat) -> tuple[float, float]:
-    """The smallest and the largest eigenvalue of B Bᵀ; B has no more rows than columns."""
+    """Return the smallest and the largest eigenvalue of B Bᵀ; B has no more rows than columns."""
     SLEPc = _slepc()
     which, test = SLEPc.SVD.Which, SLEPc.SVD.Conv
     svd = SLEPc.SVD().create(B.getComm())

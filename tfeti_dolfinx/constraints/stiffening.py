@@ -46,7 +46,7 @@ class Stiffening:
         return any_rank(self._dofs.comm, not np.array_equal(old, self._sides))
 
     def added(self, K: Any) -> Array | None:
-        """What the diagonal of this rank's K gets, in DOLFINx's numbering; None: nothing.
+        """Return the addition to this rank's diagonal of K, in DOLFINx's numbering, or None.
 
         Args:
             K: scipy CSR.
@@ -83,7 +83,7 @@ def held_flat_sides(dofs: TornDofs, held: Array) -> Array:
 
 
 def _is_flat(x: Array, facet: Array) -> Array:
-    """Whether cells are far less thick than a facet of theirs is wide, shape ``(n,)``.
+    """Return whether cells are far less thick than a facet of theirs is wide, shape ``(n,)``.
 
     Args:
         x: Their vertices, shape ``(n, v, gdim)``.

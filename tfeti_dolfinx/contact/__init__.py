@@ -1,1 +1,1 @@
-"""What the user says of contact, and the conditions that follow from the geometry."""
+"""Contacts as the user describes them, and the conditions that the geometry makes of them."""

@@ -25,7 +25,7 @@ from tfeti_dolfinx.mortar.integrals import GapIntegrals, integrate
 from tfeti_dolfinx.mortar.segments import find_segments, frames, possible_pairs, rendezvous
 from tfeti_dolfinx.mortar.surfaces import surface_facets
 
-# --- Surfaces in contact: their facets, and which of a pair had better be the secondary one ---
+# --- Sides of a contact -----------------------------------------------------------------------
 
 # of the square (in 2D: of the length) of a facet's radius: an area below it is rounding, and the
 # facet has no normal
@@ -56,13 +56,13 @@ class Side:
     normals: Array
 
     def has_edges(self, comm: MPI.Intracomm) -> bool:
-        """Whether a facet stands far off the averaged normal at a vertex of its. Collective."""
+        """Return whether a facet's normal is far off the averaged one at a vertex. Collective."""
         cosine = np.einsum("nvg,ng->nv", self.facets.vertex_normals, self.facets.normal)
         return comm.allreduce(int(np.sum(cosine < CREASE))) > 0
 
 
 def side_of(contact: str, surface: str | int, dofs: TornDofs, decomposition: Decomposition) -> Side:
-    """A surface of a pair. Collective.
+    """Return a surface of a pair. Collective.
 
     Args:
         contact: Name of the contact, for messages.
@@ -99,7 +99,7 @@ class Ratios:
 
     @property
     def finer(self) -> bool:
-        """Whether the first side has the finer mesh, by more than meshes of one size differ."""
+        """True if the first side has the finer mesh by more than meshes of one size differ."""
         return self.size < 1.0 / SAME_SIZE
 
     @property
@@ -108,7 +108,7 @@ class Ratios:
         return Ratios(1.0 / self.size, 1.0 / self.stiffness)
 
     def second_is_better(self) -> bool:
-        """Whether the second side had better be the secondary one; of two equal ones it is not.
+        """Return whether the second side is the better secondary one; not if both are equal.
 
         The coarser one is; where meshes are of one size, the softer one.
         """
@@ -156,7 +156,7 @@ def ratios(
     )
 
 
-# --- From integrals over facets to conditions of the nodes' owners ----------------------------
+# --- Assembly of conditions from integrals over facets ----------------------------------------
 
 # of ∫φ_i: a node whose hat is covered by less has slivers of facets only, and divides by them
 HARDLY_COVERED = 1e-6
@@ -172,7 +172,7 @@ Triplets = tuple[Array, Array, Array]
 
 @dataclass(frozen=True)
 class Shares:
-    """What facets of a surface contribute to the conditions of their vertices.
+    """Contributions of facets of a surface to the conditions of their vertices.
 
     Attributes:
         vertices: Global groups of the facets' vertices, shape ``(f, v)``.
@@ -190,7 +190,7 @@ class Shares:
 
 
 def conditions(dofs: TornDofs, contact: int, side: Side, shares: Shares) -> ContactRecords:
-    """Add up what facets contribute to a node, and divide by ∫ψ_i. Collective.
+    """Sum the facets' contributions to each node, and divide by ∫ψ_i. Collective.
 
     A node whose covered share of ∫φ_i is below 1e-6 gets no condition. The gaps are those of the
     geometry, all conditions are taken to be within reach, and none has friction.
@@ -260,7 +260,7 @@ def _without_rounding(dofs: TornDofs, gap: Array) -> Array:
 
 
 def _merged(dofs: TornDofs, entries: tuple[Triplets, ...]) -> Triplets:
-    """Triplets on the ranks that own their rows (as local slots), equal ones added up."""
+    """Return triplets on the ranks that own their rows (as local slots), equal ones added up."""
     row, column, value = (np.concatenate(parts) for parts in zip(*entries, strict=True))
     exchange = Exchange(dofs.comm, owner_of(dofs.group_offsets, row))
     row = exchange.send(row) - dofs.group_offsets[dofs.comm.rank]
@@ -274,7 +274,7 @@ def _merged(dofs: TornDofs, entries: tuple[Triplets, ...]) -> Triplets:
     return row[first], column[first], sums
 
 
-# --- Where the two sides of a pair meet: mortar integrals of the secondary one's multipliers ---
+# --- Mortar integrals of a pair ---------------------------------------------------------------
 
 # One looks farther than the reach: else facets at its edge would be covered partly, and an overlap
 # that is too deep would not be seen.
@@ -284,7 +284,7 @@ SEEN = 3.0
 def meeting(
     name: str, sides: tuple[Side, Side], dofs: TornDofs, reach: float, depth: float
 ) -> Shares:
-    """What facets of the first side that face the second contribute to its conditions. Collective.
+    """Integrate over the first side's facets that face the second. Collective.
 
     Args:
         name: Name of the contact, for messages.

@@ -30,7 +30,7 @@ class BodyForces:
 
 
 def nodal_forces(records: ContactRecords, force: Array, dofs: TornDofs) -> Array:
-    """Forces that contact exerts on the nodes of both sides. Collective.
+    """Return forces that contact exerts on the nodes of both sides. Collective.
 
     Args:
         records: Conditions of this rank.
@@ -109,7 +109,7 @@ def vertex_tractions(
 
 
 def _on_hats(forces: Array, dofs: TornDofs) -> Array:
-    """Moments with the hats of degree 1: Πᵀf, Π the interpolation from degree 1."""
+    """Return moments with the hats of degree 1: Πᵀf, Π the interpolation from degree 1."""
     W, node = dofs.hats
     S, dof = dofs.scalar
     interpolation = interpolation_matrix(W, S)

@@ -1,4 +1,4 @@
-"""Laws of friction: what a user says of them, and what they say at the contact nodes."""
+"""Laws of friction as the user gives them, and their values at contact nodes."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ Law = Tresca | Coulomb
 
 
 def checked_friction(name: str, friction: Law | None) -> None:
-    """Raise if what should be a law of friction is none. Not collective.
+    """Raise if a law of friction is invalid. Not collective.
 
     Args:
         name: Name of the contact, for messages.
@@ -145,7 +145,7 @@ def _check_law(law: Law) -> None:
 
 
 def same_law(one: Law, other: Law) -> bool:
-    """Whether two laws say the same, as far as one can tell without asking functions."""
+    """Return whether two laws are the same, as far as one can tell without calling functions."""
     values = [*zip(one.values, other.values, strict=False)]
     return (
         type(one) is type(other)
@@ -158,7 +158,7 @@ def same_law(one: Law, other: Law) -> bool:
 def with_friction(
     name: str, friction: Law | None, records: ContactRecords, dofs: TornDofs
 ) -> ContactRecords:
-    """The conditions of a contact with its friction, their tangents along its direction.
+    """Return the conditions of a contact with its friction, their tangents along its direction.
 
     Collective.
 
@@ -250,7 +250,7 @@ def _at_groups(what: str, function: fem.Function, dofs: TornDofs) -> Array:
 
 
 def _checked_values(what: str, value: Any, x: Array) -> Array:
-    """A number, a function of points, or values at them: one for each point."""
+    """Return a number, a function of points, or values at them: one for each point."""
     if callable(value):
         try:
             value = np.asarray(value(x.T)).astype(float, casting="same_kind")

@@ -78,7 +78,7 @@ class Obstacle:
         return (self.surface,)
 
     def first_reach(self, decomposition: Decomposition) -> float:
-        """The reach to begin with. Collective.
+        """Return the reach to begin with. Collective.
 
         Raises:
             InputError: The surface is unknown or empty, or gap or reach do not fit.
@@ -99,7 +99,7 @@ class Obstacle:
         reach: float,
         stiffness: Array,
     ) -> tuple[Obstacle, ContactRecords]:
-        """The obstacle itself, which has one side, and its conditions. Collective."""
+        """Return the obstacle itself, which has one side, and its conditions. Collective."""
         return self, self.records(dofs, decomposition, contact, reach, reach)
 
     def displacement_bound(self, dofs: TornDofs, decomposition: Decomposition, u: Array) -> float:
@@ -145,12 +145,12 @@ class Obstacle:
         return replace(found, gap=gap, within_reach=gap <= reach)
 
     def with_gap(self, gap: Gap) -> Obstacle:
-        """The same obstacle with another ``gap=``."""
+        """Return the same obstacle with another ``gap=``."""
         checked_gap(self.name, gap)
         return replace(self, gap=gap)
 
     def gaps(self, dofs: TornDofs, records: ContactRecords, depth: float = np.inf) -> Array:
-        """Gaps of its conditions, as ``gap=`` or the shape has them. Collective.
+        """Return gaps of its conditions, as ``gap=`` or the shape has them. Collective.
 
         Args:
             dofs: Dof maps.
@@ -163,7 +163,7 @@ class Obstacle:
         return gaps_of(self.name, self.gap, records, dofs)
 
     def _at_groups(self, dofs: TornDofs, groups: Array) -> tuple[Array, Array]:
-        """Distance and normal of these owned groups, 0 for the others. Collective."""
+        """Return distance and normal of these owned groups, 0 for the others. Collective."""
         gap, normals = np.zeros(dofs.num_groups), np.zeros((dofs.num_groups, dofs.bs))
         x = group_points(dofs)[groups]
         with raised_on_all_ranks(dofs.comm):
@@ -190,7 +190,7 @@ class Obstacle:
             )
 
     def _distances(self, x: Array, gdim: int) -> tuple[Array, Array]:
-        """Distances and normals at points of shape ``(n, 2)`` or ``(n, 3)``."""
+        """Return distances and normals at points of shape ``(n, 2)`` or ``(n, 3)``."""
         gap, gradient = distance_and_gradient(self.shape, x, self.name)
         gradient = gradient[:, :gdim]
         length = np.linalg.norm(gradient, axis=1)
@@ -204,7 +204,7 @@ class Obstacle:
 
 
 def _shares(dofs: TornDofs, kind: FacetKind, side: Side, distance: Array) -> Shares:
-    """What whole facets contribute, from the distances of the owned groups. Collective."""
+    """Integrate over whole facets, given the distances of the owned groups. Collective."""
     surface = side.facets
     facet, xi, weight = whole_facets(kind, surface, QUADRATURE * kind.displacement.degree)
     dual = dual_multipliers(kind, surface.area, facet, xi, weight)

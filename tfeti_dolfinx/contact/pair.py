@@ -86,7 +86,7 @@ class Contact:
         return self.a, self.b
 
     def first_reach(self, decomposition: Decomposition) -> float:
-        """The reach to begin with. Collective.
+        """Return the reach to begin with. Collective.
 
         Raises:
             InputError: A surface is unknown or empty, both are the same, or secondary, gap or
@@ -107,7 +107,7 @@ class Contact:
         return min(checked_reach(self.name, self.reach, size), diameter(decomposition))
 
     def horizon(self, length: float) -> float:
-        """The length of the scene: no two facets are farther apart."""
+        """Return the length of the scene: no two facets are farther apart."""
         return length
 
     def settled(
@@ -148,7 +148,7 @@ class Contact:
         return settled, found
 
     def displacement_bound(self, dofs: TornDofs, decomposition: Decomposition, u: Array) -> float:
-        """How far the surfaces may have moved towards each other. Collective.
+        """Bound how far the surfaces have moved towards each other. Collective.
 
         Args:
             dofs: Dof maps.
@@ -198,12 +198,12 @@ class Contact:
         return self._meet(sides, dofs, contact, reach, depth)
 
     def with_gap(self, gap: Gap) -> Contact:
-        """The same contact with another ``gap=``."""
+        """Return the same contact with another ``gap=``."""
         checked_gap(self.name, gap)
         return replace(self, gap=gap)
 
     def gaps(self, dofs: TornDofs, records: ContactRecords, depth: float) -> Array:
-        """Gaps of its conditions, as ``gap=`` and the geometry have them. Collective.
+        """Return gaps of its conditions, as ``gap=`` and the geometry have them. Collective.
 
         Args:
             dofs: Dof maps.
@@ -231,7 +231,7 @@ class Contact:
     def _meet(
         self, sides: tuple[Side, Side], dofs: TornDofs, contact: int, reach: float, depth: float
     ) -> ContactRecords:
-        """The conditions; arguments as of ``records``. Collective."""
+        """Return the conditions; arguments as of ``records``. Collective."""
         shares = meeting(self.name, sides, dofs, reach, depth)
         found = conditions(dofs, contact, sides[0], shares)
         found = with_friction(self.name, self.friction, found, dofs)
@@ -239,7 +239,7 @@ class Contact:
         return replace(found, gap=gap, within_reach=gap <= reach)
 
     def _named_first(self, decomposition: Decomposition) -> Contact:
-        """The contact with the side that is named as secondary as ``a``."""
+        """Return the contact with the side that is named as secondary as ``a``."""
         if self.secondary == "auto":
             return self
         tags = [decomposition.surface(name) for name in self.surfaces]

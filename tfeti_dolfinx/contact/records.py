@@ -16,7 +16,7 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import group_points
 
-# --- What a user says of a contact besides its surfaces: its name, how far it looks, its gap ---
+# --- Data common to all contacts: name, reach, gap --------------------------------------------
 
 # of the extent of the smaller surface: few nodes farther off ever touch in small strains, and those
 # that do are taken in after the solve
@@ -39,7 +39,7 @@ def give_name(contact: Any, default: str) -> None:
 
 
 def position_of(contacts: Sequence[Any], which: int | str) -> int:
-    """Position of a contact that is given by its position or its name.
+    """Return the position of a contact that is given by its position or its name.
 
     Raises:
         InputError: There is no such contact, or several have the name.
@@ -57,7 +57,7 @@ def position_of(contacts: Sequence[Any], which: int | str) -> int:
 
 
 def gaps_by_position(contacts: Sequence[Any], gaps: Mapping[int | str, Gap]) -> dict[int, Gap]:
-    """Gaps of contacts that are given by their positions or names, by position.
+    """Return gaps of contacts that are given by their positions or names, by position.
 
     Raises:
         InputError: There is no such contact, or one is there twice.
@@ -73,7 +73,7 @@ def gaps_by_position(contacts: Sequence[Any], gaps: Mapping[int | str, Gap]) -> 
 
 
 def checked_reach(name: str, reach: float | None, extent: float) -> float:
-    """The reach, or its default.
+    """Return the reach, or its default.
 
     Args:
         name: Name of the contact, for messages.
@@ -105,7 +105,7 @@ def checked_gap(name: str, gap: Gap) -> None:
 
 
 def given_gaps(name: str, gap: Gap, x: Array) -> Array | None:
-    """Gaps that a user gives at points, None where the geometry has them.
+    """Return gaps that a user gives at points, None where the geometry has them.
 
     Args:
         name: Name of the contact, for messages.
@@ -135,11 +135,11 @@ def given_gaps(name: str, gap: Gap, x: Array) -> Array | None:
     return values
 
 
-# --- Contact conditions before they become rows of B: a frame and scalar weights each ---------
+# --- Records of contact conditions ------------------------------------------------------------
 
 
 class Friction(IntEnum):
-    """What bounds the tangential force of a condition: nothing to hold, a given force, pressure."""
+    """Kind of the bound on a condition's tangential force: none, a given force, or pressure."""
 
     NONE = 0
     GIVEN = 1
@@ -278,13 +278,13 @@ def slips(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
     return np.einsum("ntg,ng->nt", records.tangents, v)
 
 
-# --- The gaps of conditions: those of the geometry, or what a user gives in their place -------
+# --- Gaps of conditions -----------------------------------------------------------------------
 
 
 def gaps_of(
     name: str, gap: Gap, records: ContactRecords, dofs: TornDofs, depth: float = np.inf
 ) -> Array:
-    """Gaps of the conditions of one contact, without a new search or integral. Collective.
+    """Return gaps of the conditions of one contact, without a new search or integral. Collective.
 
     A given gap is taken at the nodes: that is the mean of its linear interpolant.
 

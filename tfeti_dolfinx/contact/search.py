@@ -1,4 +1,4 @@
-"""Obstacles and pairs that a user names, and the search for what meets."""
+"""The search for contact conditions of obstacles and pairs."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import diameter
 
-# --- What every contact can do, and checks of the list of them --------------------------------
+# --- Protocol of contacts, and checks of their list -------------------------------------------
 
 
 class ContactPartner(Protocol):
@@ -37,7 +37,7 @@ class ContactPartner(Protocol):
 
     @property
     def gap(self) -> Gap:
-        """What its gaps are: those of the geometry, or given."""
+        """The gaps of its conditions: those of the geometry, or given ones."""
         ...
 
     @property
@@ -46,7 +46,7 @@ class ContactPartner(Protocol):
         ...
 
     def first_reach(self, decomposition: Decomposition) -> float:
-        """Distance up to which conditions have rows at first."""
+        """Return the distance up to which conditions have rows at first."""
         ...
 
     def horizon(self, length: float) -> float:
@@ -61,11 +61,11 @@ class ContactPartner(Protocol):
         reach: float,
         stiffness: Array,
     ) -> tuple[ContactPartner, ContactRecords]:
-        """The contact with its sides decided from the stiffness, and its conditions."""
+        """Return the contact with its sides decided from the stiffness, and its conditions."""
         ...
 
     def displacement_bound(self, dofs: TornDofs, decomposition: Decomposition, u: Array) -> float:
-        """How far what lay beyond the reach may have come nearer, u of shape (nodes, bs)."""
+        """Bound how much nearer what lay beyond the reach has come, u of shape (nodes, bs)."""
         ...
 
     def records(
@@ -80,16 +80,16 @@ class ContactPartner(Protocol):
         ...
 
     def with_gap(self, gap: Gap) -> ContactPartner:
-        """The same contact with another gap."""
+        """Return the same contact with another gap."""
         ...
 
     def gaps(self, dofs: TornDofs, records: ContactRecords, depth: float) -> Array:
-        """Gaps of conditions that were made with another gap: no search, no integral."""
+        """Return gaps of conditions that were made with another gap: no search, no integral."""
         ...
 
 
 def checked_contacts(contacts: Sequence[ContactPartner]) -> list[ContactPartner]:
-    """The contacts as a list.
+    """Return the contacts as a list.
 
     Raises:
         InputError: They are not a sequence of obstacles and pairs.
@@ -127,8 +127,7 @@ def check_laws(contacts: Sequence[ContactPartner], decomposition: Decomposition)
             )
 
 
-# --- All contacts of a problem: their conditions, which of them have rows, and what comes
-#     later ---
+# --- The contact search -----------------------------------------------------------------------
 
 # How much farther one looks for what may hold a body: few rounds, each a search and a solve, up to
 # the length of the scene; of that at least, since a small surface's reach may be as good as none.
@@ -223,7 +222,7 @@ class ContactSearch:
         self.contacts, self._records = contacts, records
 
     def rows(self) -> tuple[list[float], list[Array]]:
-        """How far one has looked in each contact, and the owned groups whose nodes have rows."""
+        """Return the reach of each contact, and the owned groups whose nodes have rows."""
         return list(self._reach), [r.group[r.within_reach] for r in self._records]
 
     def take_rows(self, reach: Sequence[float], groups: Sequence[Array]) -> None:
@@ -271,7 +270,7 @@ class ContactSearch:
         return overlaps, self._count(overlaps & ~found.within_reach)
 
     def widen(self) -> int:
-        """Reach farther, until a condition gets a row: what is far may hold a body yet.
+        """Increase the reach until a condition gets a row, since far contact may hold a body.
 
         Returns:
             How many rows are new, on all ranks; 0 where nothing is left to find.
@@ -283,7 +282,7 @@ class ContactSearch:
 
     @property
     def is_exhausted(self) -> bool:
-        """Whether every node has been looked at, however far it is, and has its row."""
+        """True if every node has its row, however far it is from the other surface."""
         return all(self._is_exhausted(i) for i in range(len(self.contacts)))
 
     def unmet(self) -> list[str]:
@@ -308,7 +307,7 @@ class ContactSearch:
         return self._count(~self._records[i].within_reach) == 0 and complete
 
     def _widen(self, i: int) -> int:
-        """Reach farther in one contact; how many rows are new."""
+        """Increase the reach of one contact; return the number of new rows."""
         if self._is_exhausted(i):
             return 0
         before, found = self._count(self._records[i].within_reach), self._records[i]

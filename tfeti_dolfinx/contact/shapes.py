@@ -21,7 +21,7 @@ from tfeti_dolfinx.common.validation import (
 )
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 
-# --- Rigid obstacles: signed distances, positive where a body may be --------------------------
+# --- Shapes of rigid obstacles: signed distances ----------------------------------------------
 
 Point = tuple[float, ...] | list[float] | Array
 
@@ -39,7 +39,7 @@ class Shape(Protocol):
 
 
 def _vector(values: Point, what: str) -> Array:
-    """A vector of three components from two or three."""
+    """Return a vector of three components from two or three."""
     with named(f"{what}={values!r}, expected two or three finite numbers", TypeError, ValueError):
         array = np.asarray(values, dtype=float)
     if array.shape not in ((2,), (3,)) or not np.all(np.isfinite(array)):
@@ -198,8 +198,7 @@ class SignedDistance:
         return gradient
 
 
-# --- Whether a shape is one: what its callables return, and whether they agree with each
-#     other ---
+# --- Checks of a shape's callables ------------------------------------------------------------
 
 # Differences over 1e-5 of the scene: curvature and rounding are both far below what is looked for
 STEP = 1e-5
@@ -305,7 +304,7 @@ def _differences(shape: Shape, x: Array, step: float, what: str) -> Array:
 
 
 def _compared(gradient: Array, slope: Array) -> tuple[Array, Array]:
-    """Where both differ grossly, and where there is something to compare."""
+    """Return where gradient and slope differ grossly, and where they can be compared."""
     sizes = np.linalg.norm(gradient, axis=1), np.linalg.norm(slope, axis=1)
     product = sizes[0] * sizes[1]
     says_something = np.isfinite(product) & (product > 0.0)

@@ -23,7 +23,7 @@ from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.subdomains.clusters import ClusteredSubdomains, InnerMotions
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor
 
-# --- Chebyshev's steps between the blocks of clusters, for what subdomains do within them -----
+# --- Chebyshev iteration between clusters -----------------------------------------------------
 
 # what Chebyshev's steps leave of an interval, and how far it reaches at most: 13 steps
 LEFT, WIDEST = 0.05, 50.0
@@ -91,7 +91,7 @@ class ClusterSteps:
         return np.array(self._y.array_r)
 
     def _spectrum(self) -> tuple[float, float]:
-        """An interval for the eigenvalues of D_A⁻¹ΠᵀA, as conjugate gradients show them."""
+        """Return an interval for the eigenvalues of D_A⁻¹ΠᵀA, as conjugate gradients show them."""
         comm = self._comm
         b = self._times(np.random.default_rng(comm.rank).standard_normal(len(self._own.cluster)))
         (least,) = NOTHING * summed(comm, np.array([b @ self._solved(b)]))
@@ -133,13 +133,13 @@ def _ritz_values(sizes: Array, steps: Array) -> Array:
 
 
 def _count(low: float, high: float) -> int:
-    """How many of Chebyshev's steps leave so little of an interval."""
+    """Return the number of Chebyshev steps that reduce an interval to ``LEFT``."""
     root = np.sqrt(high / low)
     return int(np.ceil(np.arccosh(1.0 / LEFT) / np.log((root + 1.0) / (root - 1.0))))
 
 
 def _blocks(A: PETSc.Mat, cluster: Array) -> csr_array:
-    """The blocks of A between motions of one cluster each, with a shift."""
+    """Return the blocks of A between motions of one cluster each, with a shift."""
     indptr, columns, values = A.getDiagonalBlock().getValuesCSR()
     own = csr_array((values, columns, indptr), shape=(len(cluster),) * 2).tocoo()
     within = cluster[own.coords[0]] == cluster[own.coords[1]]
@@ -150,12 +150,11 @@ def _blocks(A: PETSc.Mat, cluster: Array) -> csr_array:
     return csr_array(blocks + diags_array(np.where(shift > 0.0, shift, 1.0)))
 
 
-# --- Motions of subdomains within clusters: a coarse space of the preconditioner, solved by
-#     steps ---
+# --- Coarse space of subdomain motions within clusters ----------------------------------------
 # In clusters G = R̃ᵀBᵀ knows whole clusters only, and M_f, which moves one subdomain at a time,
-# is far stiffer than a cluster: what jumps all over a cluster's side costs it as many faces as
-# there are, the cluster one smooth displacement. With Ĝ = R̂ᵀBᵀ, R̂ the rigid motions of all
-# subdomains, those take over what they can of a jump, as they do by P without clusters.
+# is far stiffer than a cluster: a jump along a whole side of a cluster costs M_f energy on each
+# face of its subdomains, but the cluster only one smooth displacement. Ĝ = R̂ᵀBᵀ, R̂ the rigid
+# motions of all subdomains, takes that part of a jump, as P does without clusters.
 
 # relative, added to the diagonal: motions of whole clusters that no row of a face holds
 FREE = 1e-12
@@ -225,7 +224,7 @@ class ClusterMotions:
         return Balanced(on_face, _Inner(face, self._Gt, self._own.energy, inner))
 
     def _assembled(self, part: csr_array) -> PETSc.Mat:
-        """The sum of all ranks' parts, and what springs add. Collective."""
+        """Return the sum of all ranks' parts, and what springs add. Collective."""
         terms: coo_array = part.tocoo()
         row, column = (i.astype(np.int64) for i in terms.coords)
         ranges = self._Gt.getOwnershipRangesColumn()
@@ -267,7 +266,7 @@ class ClusterMotions:
 def motions_for(
     B: PETSc.Mat, coarse: CoarseSpace, weights: Array, preconditioner: DualOperator, prefix: str
 ) -> SoftModes | ClusterMotions:
-    """What M_f does not know of: soft springs, or the motions of subdomains in clusters."""
+    """Return the coarse space of M_f: soft springs, or the motions of subdomains in clusters."""
     subdomains = coarse.subdomains
     if isinstance(subdomains, ClusteredSubdomains):
         return ClusterMotions(B, coarse, subdomains, weights, prefix)

@@ -131,11 +131,11 @@ class CoarseSpace(Projectors):
         return self.free_motions.count
 
     def local_alpha(self, alpha: Array) -> Array:
-        """Kernel coordinates of this rank's Blocks that belong to an r-vector."""
+        """Return kernel coordinates of this rank's Blocks that belong to an r-vector."""
         return self._basis.kernel(alpha)[self._own]
 
     def damped_factor(self, rows: Array, damping: float) -> SemidefiniteFactor:
-        """A factor of G_f G_fᵀ + damping·GGᵀ of the local rows flagged."""
+        """Return a factor of G_f G_fᵀ + damping·GGᵀ of the local rows flagged."""
         return self._damped(self.grams.of_rows(rows), damping)
 
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
@@ -149,11 +149,11 @@ class CoarseSpace(Projectors):
         return self.factors.factor(csr_array(gram + damping * self.grams.whole))
 
     def on_face(self, face: Face) -> FaceProjectors:
-        """The projectors on a face of the rows."""
+        """Return the projectors on a face of the rows."""
         return FaceProjectors(self, face, self.factors)
 
     def oblique(self, face: Face, C: csr_array) -> ObliqueProjectors:
-        """The projectors on a face of the rows where others follow: λ = (I + C)u.
+        """Return the projectors on a face of the rows where others follow: λ = (I + C)u.
 
         Raises:
             FactorError: Forces on the face do not determine what balances a load.
@@ -162,7 +162,7 @@ class CoarseSpace(Projectors):
         return ObliqueProjectors(self.Gt, self.grams, face, C, self.null, self.comm)
 
     def unresisted(self, rows: Array, below: float = NULL) -> Motions:
-        """Motions that neither springs, nor equality rows, nor contact rows flagged resist.
+        """Return motions that neither springs, nor equality rows, nor contact rows flagged resist.
 
         The null space of Gᵀ lives on the bodies' motions: one that no gluing row resists is the
         same in all subdomains of a body.
@@ -190,7 +190,7 @@ class CoarseSpace(Projectors):
 
 
 def _without_rounding(J: Any) -> csr_array:
-    """The same rows without entries that are only rounding."""
+    """Return the same rows without entries that are only rounding."""
     J = csr_array(J)
     largest = abs(J).max(axis=1).toarray().ravel()
     noise = np.where(largest <= GLUING, GLUING, NO_GRIP)
@@ -200,7 +200,7 @@ def _without_rounding(J: Any) -> csr_array:
 
 
 def _sizes(B: PETSc.Mat) -> Array:
-    """Sum of the moduli of each local row, 1 where that is 0."""
+    """Return the sum of the moduli of each local row, 1 where that is 0."""
     indptr, _, data = B.getValuesCSR()
     rows = np.repeat(np.arange(len(indptr) - 1), np.diff(indptr))
     sizes = np.bincount(rows, np.abs(data), minlength=len(indptr) - 1).astype(float)
@@ -208,7 +208,7 @@ def _sizes(B: PETSc.Mat) -> Array:
 
 
 def transposed_G(B: PETSc.Mat, kernel: csr_array, dimension: int) -> csr_array:
-    """This rank's rows of B R, with global columns. Collective."""
+    """Return this rank's rows of B R, with global columns. Collective."""
     BR = products(B, kernel)
     indptr, indices, data = BR.getValuesCSR()
     Gt = csr_array((data, indices, indptr), shape=(B.getLocalSize()[0], dimension))

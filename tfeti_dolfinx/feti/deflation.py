@@ -132,7 +132,7 @@ class _Springs:
 
 
 def _stands_out(M: DualOperator, Gt: csr_array, x: PETSc.Vec) -> bool:
-    """Whether ĜMĜᵀ has a large eigenvalue, by the power method. Collective.
+    """Return whether ĜMĜᵀ has a large eigenvalue, by the power method. Collective.
 
     Args:
         M: The preconditioner on all rows.

@@ -47,7 +47,7 @@ from tfeti_dolfinx.qp.sets import (
 from tfeti_dolfinx.subdomains.local_operators import LocalOperator
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
-# --- Multipliers that balance the load: the smallest ones, with and without tension -----------
+# --- Particular multipliers that balance the load ---------------------------------------------
 
 # Of ‖e‖: what is let pass: below any rtol, and the solver makes Gλ = e good afterwards.
 LET_PASS = 1e-9
@@ -86,7 +86,7 @@ def feasible_particular(coarse: CoarseSpace, like: PETSc.Vec) -> PETSc.Vec:
 PARTICULAR = {"natural": natural, "feasible": feasible_particular}
 
 
-# --- The dual problem of a scene: Blocks and rows in, a quadratic program out -----------------
+# --- The dual problem -------------------------------------------------------------------------
 
 # times the forces and lengths that load, values and gaps make: multipliers of an earlier problem
 # that are larger would leave so many digits less to the solution
@@ -237,7 +237,7 @@ class Dual:
 
     @property
     def holds(self) -> bool:
-        """Whether forces within the present limits of friction can balance the load."""
+        """True if forces within the present limits of friction can balance the load."""
         return holds(self.coarse, self.constraints)
 
     def forget_counts(self) -> None:
@@ -250,7 +250,7 @@ class Dual:
             self.soft.factors.count["face"] = 0
 
     def qp(self, norm_steps: int = 0) -> QP:
-        """The quadratic program; without kernel it has no coarse problem.
+        """Return the quadratic program; without kernel it has no coarse problem.
 
         Args:
             norm_steps: Lanczos steps that estimate ‖PFP‖, once; 0 where nobody asks for it.
@@ -263,7 +263,7 @@ class Dual:
         return QP(self.F, self.d, coarse, self.feasible, self._on_all_rows, norm, on, self.seen, W)
 
     def saw(self, norm: float) -> None:
-        """A solve has estimated ‖F‖: what the next one begins with.
+        """Store the estimate of ‖F‖ of a solve, for the next one to begin with.
 
         Of its start alone it might see far less, and take its multipliers for less exact.
         """
@@ -271,7 +271,7 @@ class Dual:
 
     @property
     def _on_all_rows(self) -> Operator | None:
-        """The preconditioner where nothing is constrained; what it needs is made once."""
+        """Return the preconditioner on all rows, made once."""
         smooths = self.preconditioner is not None and self.preconditioner.metric is not None
         if self.soft is None or not (self.soft.count or (smooths and not any(self.contact_rows))):
             return self.preconditioner
@@ -282,7 +282,7 @@ class Dual:
         return self._on_all
 
     def _preconditioner_on(self, face: Face) -> FaceOperator:
-        """The preconditioner on a face of the rows; what all faces share is made once."""
+        """Return the preconditioner on a face; parts that all faces share are made once."""
         assert self.preconditioner is not None
         assert self.soft is not None
         if self._on_faces is None:
@@ -310,14 +310,14 @@ class Dual:
 
     @property
     def driving(self) -> Array:
-        """What load, prescribed values, slips and overlaps make: d without gaps, local rows."""
+        """The part of d due to load, prescribed values, slips and overlaps; local rows."""
         c, normals = self.constraints.c.array_r, self.constraints.sets.normals
         d = np.array(self.d.array_r)
         d[normals] += np.maximum(c[normals], 0.0)
         return d
 
     def is_far(self, lam: Array, mu: Array) -> bool:
-        """Whether multipliers are far beyond what drives the problem, as after unloading.
+        """Return whether multipliers far exceed what the data explain, as after unloading.
 
         Forces and lengths both are: λ beside the least that balances the load; Fλ and Gᵀμ beside
         what drives the problem. The solution would be their small difference, with their rounding.
@@ -350,7 +350,7 @@ class Dual:
         return self._images[kind][1]
 
     def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> Array:
-        """Displacements that belong to multipliers: of equal ones the smallest.
+        """Return displacements that belong to multipliers: of equal ones the smallest.
 
         Args:
             lam: The multipliers λ.
@@ -367,7 +367,7 @@ class Dual:
         return self.smallest(u, gap, lam.array_r, face, error)
 
     def smallest(self, u: Array, gap: Array, lam: Array, face: Face, error: float) -> Array:
-        """Of displacements that are equally right the smallest, given one and its c − Bu."""
+        """Return the smallest displacement that solves as well as u, given u and its c − Bu."""
         motions, force = nearly_free(self.coarse, lam, face.carrying, error)
         self.pressing = force
         words = listed(motions, self.coarse.bodies, *self._names)

@@ -31,7 +31,7 @@ NORM_STEPS = 10
 
 
 class LiftedScene(Protocol):
-    """What a bound needs to know of the dual problem."""
+    """Parts of the dual problem that an error bound needs."""
 
     constraints: Constraints
     subdomains: Subdomains
@@ -208,7 +208,7 @@ class _ScaledGram:
         return estimate_norm(self, NoCoarse(), self._constraints.c, NORM_STEPS)
 
     def sums(self, *values: Array) -> list[float]:
-        """Sums of values over all rows, the same on all ranks."""
+        """Return sums of values over all rows, the same on all ranks."""
         own = np.array([float(np.sum(value)) for value in values])
         return list(bcast_from_root(self._comm, summed(self._comm, own)))
 
@@ -221,7 +221,7 @@ class _ScaledGram:
 def _balanced(
     scene: LiftedScene, lam: PETSc.Vec, u: Array, norm: float
 ) -> tuple[PETSc.Vec, Array, float]:
-    """Forces in Ω with Gλ = e, their displacement, and its distance from u in energy.
+    """Return forces in Ω with Gλ = e, their displacement, and its distance from u in energy.
 
     Where λ does not balance the load, the nearest feasible point to λ − (Fλ − d)/‖F‖ does: that
     to λ might take a force off its bound where something opens or slips far.

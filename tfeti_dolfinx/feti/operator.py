@@ -21,7 +21,7 @@ from tfeti_dolfinx.subdomains.local_operators import LocalOperator
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
-# --- K on a trace and on what is next to it: of all subdomains of a rank at once --------------
+# --- K on the trace and next to it ------------------------------------------------------------
 
 # equal subdomains from which on they share a matrix: products with several are slow for few
 SHARED = 16
@@ -91,7 +91,7 @@ def _restricted_to_rows(block: SparseBlock, next_to: Array) -> csr_array:
     return csr_array(block.stiffness.K[kept][:, kept])
 
 
-# --- F = B K⁺ Bᵀ, and its preconditioners: B does all the communication, the rest is local ----
+# --- The dual operator F = B K⁺ Bᵀ and its preconditioners ------------------------------------
 
 # (λ + 2μ)/μ: 20 of ν = 0.474; from here on what is inside has to follow where a trace moves
 VOLUME = 20.0
@@ -109,13 +109,13 @@ class RowMatrix(Protocol):
         ...
 
     def createVecRight(self) -> PETSc.Vec:
-        """A trace vector. Collective."""
+        """Return a trace vector. Collective."""
         ...
 
 
 @dataclass(frozen=True)
 class Metric:
-    """What displacements with given jumps are made smooth in, on faces.
+    """Energy norm in which displacements with given jumps are smoothed, on faces.
 
     Attributes:
         trace: K_bb.
@@ -220,7 +220,7 @@ class ScaledRows:
         self.B.mult(x, y)
 
     def createVecRight(self) -> PETSc.Vec:
-        """A trace vector. Collective."""
+        """Return a trace vector. Collective."""
         return self.B.createVecRight()
 
     def destroy(self) -> None:

@@ -21,7 +21,7 @@ from tfeti_dolfinx.qp.problem import FaceOperator
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, added_options, has_solver
 
-# --- Displacements with given jumps, made smooth: steps towards the least energy of the trace ---
+# --- Smoothing of displacements with given jumps ----------------------------------------------
 
 # steps, and the part of the spectrum that they make small, from its top down
 STEPS, RANGE = 3, 8.0
@@ -38,7 +38,7 @@ OfArray = Callable[[Array], Array]
 
 @dataclass(frozen=True)
 class Springs:
-    """What curvature adds to a face: directions of contact rows that move a spring each.
+    """Springs of the curvature on a face: one for each direction of contact rows with κ > 0.
 
     Attributes:
         directions: Rows × directions, those with a curvature κ > 0.
@@ -148,18 +148,18 @@ class Smoothing:
         out[self._trace :] = 0.0
 
     def _top(self) -> float:
-        """At least the largest eigenvalue of D⁻¹K, as nearly as is of use. Collective."""
+        """Bound the largest eigenvalue of D⁻¹K from above. Collective."""
         with raised_on_all_ranks(self._comm):
             top = _largest_eigenvalue(self._apply, self._weights)
         return self._largest(top)
 
     def _largest(self, value: float) -> float:
-        """The largest of all ranks, on which all agree. Collective."""
+        """Return the largest of all ranks, on which all agree. Collective."""
         return float(bcast_from_root(self._comm, self._comm.allreduce(value, op=MPI.MAX)))
 
 
 def _largest_eigenvalue(apply: Callable[[Array, Array], None], weights: Array) -> float:
-    """At least that of D⁻¹K on this rank."""
+    """Bound the largest eigenvalue of D⁻¹K on this rank from above."""
     size, root = len(weights), np.sqrt(weights)
 
     def scaled(x: Array) -> Array:
@@ -177,7 +177,7 @@ def _largest_eigenvalue(apply: Callable[[Array, Array], None], weights: Array) -
 
 
 def chebyshev(count: int, low: float, high: float) -> list[tuple[float, float]]:
-    """Steps d ← a d + b r, u ← u + d, that make what has eigenvalues in an interval small.
+    """Return coefficients of Chebyshev steps d ← a d + b r, u ← u + d, for an interval.
 
     Args:
         count: Their number, at least 1.
@@ -208,7 +208,7 @@ def smoothed(steps: list[tuple[float, float]], apply: OfArray, u: Array) -> Arra
     return u
 
 
-# --- Factors of a distributed matrix of contact rows, of which most ranks may have none -------
+# --- Factors of a distributed matrix of contact rows ------------------------------------------
 
 # rows up to which each rank that has any has a factor of the whole: to tell each other of so few
 # costs less than to share their elimination
@@ -228,7 +228,7 @@ class GramFactor(Protocol):
 
 
 def contact_factor(A: PETSc.Mat, prefix: str) -> GramFactor:
-    """A factor of a symmetric positive definite matrix, which is taken over. Collective.
+    """Return a factor of a symmetric positive definite matrix, which is taken over. Collective.
 
     Ranks without rows have no part in it: MUMPS 5.7 has been seen to hang in a solve with rows on
     one rank of two.
@@ -255,10 +255,10 @@ def contact_factor(A: PETSc.Mat, prefix: str) -> GramFactor:
 
 
 class NoRows:
-    """Of a rank without rows."""
+    """Factor of a rank without rows."""
 
     def solve(self, b: Array) -> Array:
-        """Nothing."""
+        """Return b, which is empty."""
         return b
 
     def destroy(self) -> None:
@@ -308,7 +308,7 @@ class DistributedFactor:
         self._comm.Free()
 
 
-# --- The preconditioner on a face, scaled by the rows of the face alone -----------------------
+# --- Preconditioner on a face -----------------------------------------------------------------
 
 # an entry of B_N D⁻¹ B_Nᵀ − I, whose diagonal is 1, that is rounding
 ORTHONORMAL = 1e-12
@@ -414,7 +414,7 @@ class _OnFace:
         y.array[:] = self._scaled(y.array_r)
 
     def dependent(self, x: Array) -> Array | None:
-        """The part of x in the null space of W_κ, and so of B_fᵀ. Collective.
+        """Return the part of x in the null space of W_κ, and so of B_fᵀ. Collective.
 
         (1 + W/ε)⁻², ε the shift, leaves (ε/σ)² of what has the eigenvalue σ.
         """
@@ -457,7 +457,7 @@ def _restricted(gram: PETSc.Mat, Z: csr_array) -> PETSc.Mat:
 
 
 def _diagonal(constraints: Constraints, diagonal: Array) -> Array:
-    """The diagonal of B D⁻¹ diag(K) D⁻¹Bᵀ on the local rows. Collective."""
+    """Return the diagonal of B D⁻¹ diag(K) D⁻¹Bᵀ on the local rows. Collective."""
     B = constraints.B
     squares, size = B.copy(), B.createVecRight()
     rows, columns, values = squares.getValuesCSR()

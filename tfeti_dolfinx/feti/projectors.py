@@ -20,11 +20,11 @@ from tfeti_dolfinx.qp.coarse import NOTHING
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 
-# --- GGᵀ of all rows and of faces, sparse, on all ranks ---------------------------------------
+# --- Gram matrices GGᵀ ------------------------------------------------------------------------
 
 
 class Grams:
-    """GGᵀ, and G_f G_fᵀ of faces f: what gluing and Dirichlet rows add to all is made once.
+    """GGᵀ, and G_f G_fᵀ of faces f; the part of gluing and Dirichlet rows is made once.
 
     An entry is stored for each pair of coordinates that meet in a row, so that storage grows with
     the number of subdomains. A face costs what its contact rows cost. All methods are collective.
@@ -73,14 +73,14 @@ def replicated_gram(Gt: csr_array, comm: MPI.Intracomm) -> csr_array:
 
 
 def replicated(part: csr_array, comm: MPI.Intracomm) -> csr_array:
-    """The sum of all ranks' sparse matrices, on all ranks. Collective."""
+    """Return the sum of all ranks' sparse matrices, on all ranks. Collective."""
     local = part.tocoo()
     row, column = (np.concatenate(comm.allgather(index)) for index in local.coords)
     value = np.concatenate(comm.allgather(local.data))
     return coo_array((value, (row, column)), shape=part.shape).tocsr()
 
 
-# --- Factors of the coarse problem's matrices, on each rank -----------------------------------
+# --- Factors of the coarse problem ------------------------------------------------------------
 
 # Added to a unit diagonal, where pivots are lost to rounding; so small a shift is made good by
 # refinement in all directions that stand out from rounding.
@@ -131,7 +131,7 @@ class SemidefiniteFactor:
                 return
 
     def _factored(self, comm: MPI.Intracomm, what: str, prefix: str) -> bool:
-        """Whether all ranks have a factor with the present shift. Collective."""
+        """Factor A with the present shift; return whether that succeeded everywhere. Collective."""
         lost: NotPositiveDefiniteError | None = None
         with raised_on_all_ranks(comm):
             try:
@@ -165,7 +165,7 @@ class SemidefiniteFactor:
             self._factor = None
 
 
-# --- Projectors of Gλ = e where some multipliers follow others: oblique, not orthogonal -------
+# --- Oblique projectors -----------------------------------------------------------------------
 
 
 class ObliqueProjectors:
@@ -214,7 +214,7 @@ class ObliqueProjectors:
         return self._face.restricted(x) - self.combine(self.coordinates(x))
 
     def restoring(self, y: Array) -> Array:
-        """u = ZG_fᵀH⁺y, for which G(I + C)u = y if any u does that. Not collective."""
+        """Return u = ZG_fᵀH⁺y, which solves G(I + C)u = y if that is solvable. Not collective."""
         return self.combine(self._factor.solve(y))
 
 
@@ -251,7 +251,7 @@ class GeneralFactor:
         return self._null.removed((self._scale * x.T).T)
 
 
-# --- Orthogonal projectors of Gλ = e, r-vectors replicated: on all rows, or on a face ---------
+# --- Orthogonal projectors, on all rows or on a face ------------------------------------------
 
 
 class CoarseFactor(Protocol):
@@ -308,7 +308,7 @@ class Projectors:
         return self._factor.solve(y)
 
     def restricted(self, x: Array) -> Array:
-        """The part of x in the face: all of it."""
+        """Return the part of x in the face: all of it."""
         return x
 
     def project(self, x: PETSc.Vec) -> None:
@@ -376,7 +376,7 @@ class FaceFactors:
         self.count: Counter[str] = Counter()
 
     def factor(self, gram: csr_array, kind: str = "face") -> SemidefiniteFactor:
-        """A factor of a Gram matrix. Collective.
+        """Return a factor of a Gram matrix. Collective.
 
         Raises:
             FactorError: It could not be made.
@@ -387,7 +387,7 @@ class FaceFactors:
 
 
 class AllRows(Protocol):
-    """What projectors of a face know of all rows."""
+    """Data of all rows that projectors of a face need."""
 
     comm: MPI.Intracomm
     Gt: csr_array
@@ -422,9 +422,9 @@ class FaceProjectors(Projectors):
         return self._face.restricted(x)
 
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
-        """As on all rows."""
+        """Solve with the damped coarse matrix of all rows."""
         return self._whole.damped_solve(face, y, damping)
 
     def on_face(self, face: Face) -> FaceProjectors:
-        """The projectors of another face of all rows."""
+        """Return the projectors of another face of all rows."""
         return FaceProjectors(self._whole, face, self._factors)

@@ -1,4 +1,4 @@
-"""Displacements of multipliers; of equal ones the smallest."""
+"""Recovery of displacements from multipliers; where several are equally good, the smallest."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tfeti_dolfinx.feti.solvability import CutRows, minimise
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
-# --- From multipliers back to displacements ---------------------------------------------------
+# --- Recovery of displacements from multipliers -----------------------------------------------
 
 # Of GGᵀ, added to G_f G_fᵀ: rows with a force that hold a motion by less are not asked about it,
 # since they would answer with their rounding over this share.
@@ -94,7 +94,7 @@ def bent(B: PETSc.Mat, subdomains: Subdomains, lam: PETSc.Vec, pinv_load: Array)
 
 
 def without_rigid_motions(subdomains: Subdomains, u: Array) -> Array:
-    """u less its motions, u − R Rᵀu, shape ``(n,)``; twice, since these may be far larger."""
+    """Return u − R Rᵀu, shape ``(n,)``; projected twice, as rigid motions may be far larger."""
     for _ in range(2):
         u = u - subdomains.kernel_motion(subdomains.kernel_part(u))
     return u
@@ -106,7 +106,7 @@ def moved(u: Array, coarse: CoarseSpace, alpha: Array) -> Array:
 
 
 def _alpha(coarse: CoarseSpace, gradient: Array, free: Array, nu: Array) -> Array:
-    """Kernel coordinates that make the rows' residuals vanish as far as they can."""
+    """Return kernel coordinates that make the rows' residuals vanish as far as they can."""
     if coarse.dimension == 0:
         return np.zeros(0)
     alpha = coarse.solve(coarse.G(gradient - nu))
@@ -119,7 +119,7 @@ def _alpha(coarse: CoarseSpace, gradient: Array, free: Array, nu: Array) -> Arra
     return alpha + step
 
 
-# --- The smallest of the displacements that solve a problem equally well ----------------------
+# --- Smallest of equally good displacements ---------------------------------------------------
 
 # Motions held by less than this share of what the same contacts hold at most are nearly free:
 # their contacts' normals are off by less than 6 degrees from a right angle.
@@ -141,7 +141,7 @@ TIGHT = 1e-14
 def nearly_free(
     coarse: CoarseSpace, lam: Array, carrying: Array, error: float
 ) -> tuple[Motions, Array]:
-    """Motions that the contact rows with a force do not hold, or hardly. Collective.
+    """Return motions that the contact rows with a force do not hold, or hardly. Collective.
 
     Args:
         coarse: The coarse space.
@@ -177,7 +177,7 @@ def smallest_motion(
     motions: Motions,
     force: Array,
 ) -> Array:
-    """Kernel coordinates of the motion that makes u the smallest solution. Collective.
+    """Return kernel coordinates of the motion that makes u the smallest solution. Collective.
 
     Of the displacements that differ by these motions, that keep open contacts open and leave the
     rows with a force as near to contact as they are, it has the least mean squares on the bodies.
@@ -209,7 +209,7 @@ def smallest_motion(
 
 
 def orthonormal(motions: Motions, k: int) -> tuple[csr_array, Array]:
-    """Orthonormal basis of the motions, and a body of each."""
+    """Return an orthonormal basis of the motions, and a body of each."""
     alone, joint = motions.alone, motions.joint
     body = np.repeat(np.arange(len(motions.free)), motions.free.sum(axis=1))
     if joint.shape[1] == 0:
@@ -225,7 +225,7 @@ def orthonormal(motions: Motions, k: int) -> tuple[csr_array, Array]:
 
 
 def _span(columns: Array) -> Array:
-    """Orthonormal basis of the span of columns of size 1, or less if they are dependent."""
+    """Return orthonormal basis of the span of columns of size 1, or less if they are dependent."""
     U, size, _ = np.linalg.svd(columns, full_matrices=False)
     return np.asarray(U[:, size > DEPENDENT])
 
@@ -242,7 +242,7 @@ def _seen(coarse: CoarseSpace, N: csr_array) -> csr_array:
 
 
 def _rows(coarse: CoarseSpace, A: csr_array, gap: Array, force: Array, body: Array) -> CutRows:
-    """A y ≤ gap on open rows; |gap − A y| no larger on others than it is anywhere."""
+    """Set up A y ≤ gap on open rows, |gap − A y| on others no larger than it is anywhere."""
     bounded = np.zeros(len(gap), dtype=bool)
     bounded[coarse.bounded] = True
     closed = ~bounded | force
@@ -254,7 +254,7 @@ def _rows(coarse: CoarseSpace, A: csr_array, gap: Array, force: Array, body: Arr
 
 
 def _nearest(A: csr_array, b: Array, wanted: Array) -> Array:
-    """The point of A y ≤ b that is nearest to the one wanted, by parts that do not meet."""
+    """Project ``wanted`` onto A y ≤ b, separately for parts that do not meet."""
     y = wanted.copy()
     if A.shape[0] == 0:
         return y
@@ -288,7 +288,7 @@ def _least_distance(A: Array, b: Array, wanted: Array) -> Array:
     return np.asarray(-scale * r[:-1] / r[-1])
 
 
-# --- The least displacement that closes what rows miss ----------------------------------------
+# --- Minimum-norm correction of constraint residuals ------------------------------------------
 
 # Conjugate gradients for least squares: with the usual eigenvalues of B_f D⁻¹ B_fᵀ, 0.6 to 2, about
 # 15 steps to this part of the first gradient; what is left of w then has at most 1e-2 of its energy
@@ -297,7 +297,7 @@ EXACT, MOST_STEPS = 1e-10, 100
 
 
 def min_norm_correction(constraints: Constraints, w: PETSc.Vec, closed: Array) -> Array:
-    """The least displacement v in D for which B_f v comes nearest to w. Collective.
+    """Return the least displacement v in D for which B_f v comes nearest to w. Collective.
 
     Gluing and Dirichlet rows are orthonormal in D⁻¹, and orthogonal to contact rows: D⁻¹B_fᵀw
     closes them. Contact rows are not so to each other: where a stiff and fine side is the secondary
@@ -340,7 +340,7 @@ class _ClosedRows:
         return np.asarray(self._v.array_r / self._constraints.weights)
 
     def nearest(self, w: Array) -> Array:
-        """The least v with B_f v nearest to w, zero off the rows, by conjugate gradients."""
+        """Return the least v with B_f v nearest to w, zero off the rows, by conjugate gradients."""
         D, r = self._constraints.weights, w.copy()
         s = self._upwards(r)
         v, p, left = np.zeros_like(s), s.copy(), self._dot(s, D * s)

@@ -1,4 +1,4 @@
-"""What a solution lacks that rounding has ended, as a dual problem of its own."""
+"""The defect problem of iterative refinement, as a dual problem of its own."""
 
 from __future__ import annotations
 
@@ -76,12 +76,12 @@ class DefectProblem:
         return self._dual.lifting
 
     def qp(self) -> QP:
-        """The quadratic program of δλ."""
+        """Return the quadratic program of δλ."""
         coarse: Coarse = self.coarse if self.coarse.dimension else NoCoarse()
         return replace(self._dual.qp(), d=self.d, coarse=coarse, feasible=self.feasible)
 
     def start(self, face: Face) -> PETSc.Vec:
-        """The least δλ on the face of λ₀ that balances what is left of the load."""
+        """Return the least δλ on the face of λ₀ that balances the load's defect."""
         coarse, lam = self.qp().coarse.on_face(face), self.d.duplicate()
         coarse.particular(lam)
         coarse.destroy()

@@ -27,7 +27,7 @@ from tfeti_dolfinx.common.parallel import bcast_from_root
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
-# --- Sparse matrices of few columns in parts that do not meet: dense algebra on each part -----
+# --- Dense algebra on parts of sparse matrices with few columns -------------------------------
 
 
 def parts_of_columns(A: csr_array) -> Iterator[tuple[Array, Array, Array]]:
@@ -51,7 +51,7 @@ def parts_of_columns(A: csr_array) -> Iterator[tuple[Array, Array, Array]]:
 
 
 def spread(rows: Array, dense: Array, n: int) -> csr_array:
-    """A dense matrix on some of n rows."""
+    """Return a dense matrix on some of n rows."""
     width = dense.shape[1]
     places = np.repeat(rows, width), np.tile(np.arange(width), len(rows))
     return csr_array((dense.ravel(), places), shape=(n, width))
@@ -75,11 +75,11 @@ def by_parts(A: csr_array, change: Callable[[Array], Array]) -> csr_array:
 
 
 def orthonormal_columns(A: csr_array) -> csr_array:
-    """An orthonormal basis of the span of independent columns."""
+    """Return an orthonormal basis of the span of independent columns."""
     return by_parts(A, lambda dense: np.linalg.qr(dense)[0])
 
 
-# --- Spaces of motions of bodies: what rows leave free, body by body and of several together ---
+# --- Motions of bodies ------------------------------------------------------------------------
 
 # Stiffness, as a share of the stiffest motion of the same body, that counts as none: rounding
 # makes 1e-15 of it, and pins on neighbouring nodes of a fine mesh hold a turn by 1e-9.
@@ -128,7 +128,7 @@ class Motions:
 
     @property
     def count(self) -> int:
-        """How many they are."""
+        """Number of motions."""
         return int(self.free.sum()) + self.joint.shape[1]
 
 
@@ -152,7 +152,7 @@ def diagonal_blocks(A: csr_array, k: int) -> Array:
 
 
 def unsprung(springs: Array) -> Motions:
-    """Motions that springs do not resist.
+    """Return motions that springs do not resist.
 
     Args:
         springs: Projector onto what they resist, shape ``(bodies, k, k)``.
@@ -163,7 +163,7 @@ def unsprung(springs: Array) -> Motions:
 
 
 def unresisted(gram: csr_array, within: Motions, below: float = NULL) -> Motions:
-    """Motions of a space of single bodies' motions that rows do not resist.
+    """Return motions of a space of single bodies' motions that rows do not resist.
 
     What a body can do alone is found body by body. On what is left the rows' Gram matrix has
     unit diagonal blocks; its null space is that of connected components of bodies.
@@ -198,7 +198,7 @@ def unresisted(gram: csr_array, within: Motions, below: float = NULL) -> Motions
 
 
 def _largest(A: csr_array, k: int) -> Array:
-    """Largest eigenvalue of each diagonal block."""
+    """Return the largest eigenvalue of each diagonal block."""
     return np.asarray(np.linalg.eigvalsh(diagonal_blocks(A, k)).max(axis=1, initial=0.0))
 
 
@@ -242,7 +242,7 @@ def _component_null(A: csr_array) -> Array:
         size = min(2 * size, n)
 
 
-# --- What the bodies' rigid motions are in kernel coordinates; the same on all ranks ----------
+# --- Rigid motions of bodies in kernel coordinates --------------------------------------------
 
 # Share of a motion's square that lies outside a subdomain's kernel, and so moves a spring:
 # kernels beside weak springs are inexact, and a share is the square of an angle.
@@ -296,7 +296,7 @@ class Bodies:
         self.negligible = np.maximum(BALANCE * largest, ROUNDING * largest.max(initial=0.0))
 
     def part_of(self, u: Array) -> Array:
-        """The bodies' motion in a displacement, by least squares over the nodes. Collective.
+        """Return the bodies' motion in a displacement, by least squares over the nodes. Collective.
 
         Args:
             u: This rank's part of the displacement, shape ``(n,)``.
@@ -308,7 +308,7 @@ class Bodies:
         return np.asarray(np.einsum("bij,bi->bj", W, moments) / self.nodes[:, None]).ravel()
 
     def amounts(self, motion: Array) -> Array:
-        """How much of each mode is in a motion, shape ``(bodies, k)``."""
+        """Return the coefficient of each mode in a motion, shape ``(bodies, k)``."""
         return np.einsum("bij,bj->bi", self.frames, motion.reshape(self.count, self.k))
 
     def _springs(self, shares: Array) -> Array:
@@ -327,7 +327,7 @@ def _frames(gram: Array) -> Array:
 
 
 def _replicated(local: csr_array, first: int, dimension: int, comm: MPI.Intracomm) -> csr_array:
-    """The rows of all ranks, on every rank; this rank's begin at first."""
+    """Return the rows of all ranks, on every rank; this rank's begin at first."""
     entries = local.tocoo()
     row, column = entries.coords
     every = ((first + row).astype(np.int64), column.astype(np.int64), entries.data)
@@ -335,7 +335,7 @@ def _replicated(local: csr_array, first: int, dimension: int, comm: MPI.Intracom
     return csr_array(coo_array((values, (rows, columns)), shape=(dimension, local.shape[1])))
 
 
-# --- Words for motions of bodies --------------------------------------------------------------
+# --- Names of motions in messages -------------------------------------------------------------
 
 # Of the largest coefficient: a body that moves by less than this takes no part in a motion, which
 # is known to rounding only; and a motion is named after modes of this share or more, which leaves
@@ -346,7 +346,7 @@ NAMED = 4
 
 
 def free_to_move(amounts: Array, body_names: Sequence[str], mode_names: Sequence[str]) -> str:
-    """A sentence about a motion.
+    """Return a sentence about a motion.
 
     Args:
         amounts: How much of each mode is in it, shape ``(bodies, k)``.
@@ -362,7 +362,7 @@ def free_to_move(amounts: Array, body_names: Sequence[str], mode_names: Sequence
 
 
 def _parts(amounts: Array, mode_names: Sequence[str]) -> tuple[Array, str]:
-    """The bodies that take part in a motion, and what it is mostly."""
+    """Return the bodies that take part in a motion, and its dominant mode."""
     parts = np.abs(amounts)
     moving = np.flatnonzero(parts.max(axis=1) > TAKES_PART * parts.max())
     share = parts[moving].max(axis=0)
@@ -411,13 +411,13 @@ def listed(
 
 
 def _plain(joint: Array) -> Array:
-    """Motions that span the same, each with a coordinate that the others leave alone."""
+    """Return motions that span the same, each with a coordinate that the others leave alone."""
     rows = qr(joint.T, pivoting=True, mode="r")[1][: joint.shape[1]]
     return np.asarray(joint @ np.linalg.inv(joint[np.sort(rows)]))
 
 
 def _spanning(vectors: Array, mode_names: Sequence[str]) -> list[str]:
-    """Names of as many motions as there are columns."""
+    """Return names of as many motions as there are columns."""
     count = vectors.shape[1]
     if count == 1:
         return [_parts(vectors.T, mode_names)[1]]
@@ -426,7 +426,7 @@ def _spanning(vectors: Array, mode_names: Sequence[str]) -> list[str]:
     return [mode_names[m] for m in sorted(qr(vectors.T, pivoting=True, mode="r")[1][:count])]
 
 
-# --- A basis of the kernel of K in which the bodies' motions are coordinates of their own -----
+# --- Kernel basis with the bodies' motions as coordinates -------------------------------------
 
 # what holds a direction, in the order of the coordinates
 CONTACT, EQUALITIES, SPRINGS = 1, 2, 5
@@ -491,7 +491,7 @@ class KernelBasis:
 
 
 def kernel_basis(bodies: Bodies, unheld: Motions, free: Motions) -> KernelBasis:
-    """The basis with all motions of bodies that no springs resist, the free ones apart.
+    """Return the basis with all motions of bodies that no springs resist, the free ones apart.
 
     Args:
         bodies: The bodies.
@@ -510,7 +510,7 @@ def kernel_basis(bodies: Bodies, unheld: Motions, free: Motions) -> KernelBasis:
 
 
 def _directions(bodies: Bodies, unheld: Motions, free: Motions) -> tuple[Array, Array]:
-    """Directions of each body that are orthonormal in the kernel, and what holds each.
+    """Return directions of each body that are orthonormal in the kernel, and what holds each.
 
     Each is a combination of those before it: free ones, those that contact holds, those that
     equality rows hold, those that springs resist.
@@ -546,13 +546,13 @@ def _pins(motions: csc_array, body: Array) -> tuple[Array, csr_array]:
 
 
 def independent(columns: Array) -> Array:
-    """As many rows as columns, chosen by pivoting, on which the columns are independent."""
+    """Select by pivoting as many rows as columns, on which the columns are independent."""
     if columns.shape[1] == 0:
         return np.empty(0, dtype=np.int64)
     return np.asarray(qr(columns.T, pivoting=True, mode="r")[1][: columns.shape[1]])
 
 
-# --- Free motions of bodies in kernel coordinates: an orthonormal basis of null(Gᵀ) -----------
+# --- Orthonormal basis of null(Gᵀ) ------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -574,7 +574,7 @@ class NullBasis:
         return np.asarray(x)
 
     def pins(self, scale: Array) -> Array:
-        """As many coordinates as vectors, on which these are independent.
+        """Select as many coordinates as vectors, on which these are independent.
 
         Args:
             scale: Coordinates are to be counted in these units.
@@ -587,7 +587,7 @@ class NullBasis:
         return np.concatenate(pins)
 
     def extended(self, count: int) -> NullBasis:
-        """The same space, 0 on so many more coordinates."""
+        """Return the same space, 0 on so many more coordinates."""
         rows = self.joint.shape[0] + count
         table = (self.joint.data, self.joint.indices, np.pad(self.joint.indptr, (0, count), "edge"))
         return NullBasis(self.alone, csr_array(table, shape=(rows, self.joint.shape[1])))

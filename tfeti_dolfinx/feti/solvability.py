@@ -1,4 +1,4 @@
-"""Whether a load can be balanced: by contact, and by friction."""
+"""Solvability: can contact and friction balance the load on bodies that nothing else holds."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tfeti_dolfinx.feti.rigid_bodies import (
     orthonormal_columns,
 )
 
-# --- Linear programs with rows on many ranks, of which few matter: cutting planes -------------
+# --- Cutting planes for distributed linear programs -------------------------------------------
 
 # Random directions in which the outermost rows are taken at first: enough for the corners of
 # patches; what they miss comes by and by.
@@ -63,14 +63,14 @@ class CutRows:
         self.sent = np.zeros(A.shape[0], dtype=bool)
 
     def links(self, bodies: int) -> csr_array:
-        """Which bodies meet in a row, shape ``(bodies, bodies)``."""
+        """Return the matrix of bodies that share a row, shape ``(bodies, bodies)``."""
         row, column = self._entry
         meets = (np.ones(len(row)), (row, self._body[column]))
         incidence = csr_array(meets, shape=(self.A.shape[0], bodies))
         return csr_array(incidence.T @ incidence)
 
     def extremes(self) -> Array:
-        """Of each patch the rows that are outermost in some directions.
+        """Return for each patch the rows that are outermost in some directions.
 
         Of a flat patch they are most of its corners, which imply all other rows.
         """
@@ -83,7 +83,7 @@ class CutRows:
         return np.unique(np.concatenate(found))
 
     def violated(self, y: Array, tolerance: float, most: int) -> Array:
-        """Of each patch the rows, at most so many, that y violates most."""
+        """Return for each patch the rows that y violates most, at most ``most`` of them."""
         excess = self.A @ y - self.b
         row = np.flatnonzero((excess > tolerance) & ~self.sent)
         row = row[np.lexsort((-excess[row], self.patch[row]))]
@@ -92,7 +92,7 @@ class CutRows:
         return row[place < most]
 
     def allowed(self, y: Array, tolerance: float, comm: MPI.Intracomm) -> float:
-        """Largest share of y, up to 1, that meets all rows; 0 does. Collective."""
+        """Return the largest share of y, up to 1, that meets all rows; 0 does. Collective."""
         value = self.A @ y
         beyond = value > self.b + tolerance
         shares = np.maximum(self.b[beyond], 0.0) / value[beyond]
@@ -141,7 +141,7 @@ def minimise(
             return y
 
 
-# --- Whether the multipliers can balance the load: Gλ = e with λ_N ≥ 0 ------------------------
+# --- Balance of the load by contact -----------------------------------------------------------
 
 # Least slope against a contact, of a motion of mean square 1, that counts as an overlap; the
 # tolerances of the linear programs are finer.
@@ -184,7 +184,7 @@ def check_solvable(
 
 
 def _driven(free: Motions, load: Array, bodies: Bodies) -> Array | None:
-    """The part of the load on free motions, if it is more than rounding."""
+    """Return the part of the load on free motions, if it is more than rounding."""
     alone = (free.alone @ (free.alone.T @ load)).reshape(bodies.count, bodies.k)
     alone[np.linalg.norm(alone, axis=1) <= bodies.negligible] = 0.0
     if np.any(alone):
@@ -223,7 +223,7 @@ def escape(coarse: CoarseSpace) -> Array | None:
 
 
 def load_sizes(load: Array, noise: Array, part: Array) -> Array:
-    """Size of the load on each part of the scene, 1 where there is none.
+    """Return the size of the load on each part of the scene, 1 where there is none.
 
     A load that is no more than rounding is not the size of anything: else its noise would hide
     what drives the other parts.
@@ -242,7 +242,7 @@ def parts_of(coarse: CoarseSpace, rows: CutRows, body: Array) -> Array:
 
 
 def _most_work(A: csr_array, load: Array, noise: Array) -> Array | None:
-    """A motion of much work, if that is more than rounding; A y ≤ 0, −1 ≤ y ≤ 1."""
+    """Return a motion of much work, if that is more than rounding; A y ≤ 0, −1 ≤ y ≤ 1."""
     y = minimiser(-load, A, bounds=(-1.0, 1.0))
     if load @ y <= noise.max():
         return None
@@ -254,7 +254,7 @@ def _most_work(A: csr_array, load: Array, noise: Array) -> Array | None:
 
 
 def _least_motion(A: csr_array, load: Array) -> Array:
-    """The least motion (sum of moduli) of unit work, scaled to 1; A y ≤ 0."""
+    """Return the least motion (sum of moduli) of unit work, scaled to 1; A y ≤ 0."""
     work = np.concatenate((load, -load))[None, :]
     y = _halves(minimiser(np.ones(work.size), _both(A), A_eq=work, b_eq=np.ones(1)))
     return y / np.abs(y).max()
@@ -272,7 +272,7 @@ def _halves(pq: Array) -> Array:
 
 
 def minimiser(cost: Array, A: csr_array, **rest: Any) -> Array:
-    """The minimiser of a linear program over A y ≤ 0.
+    """Return the minimiser of a linear program over A y ≤ 0.
 
     Raises:
         TfetiError: Neither the simplex nor the interior point method found it.
@@ -293,7 +293,7 @@ def minimiser(cost: Array, A: csr_array, **rest: Any) -> Array:
     raise TfetiError(f"a linear program of the solvability test failed: {found.message}")
 
 
-# --- Whether friction can hold the load: Gλ = e with all contact forces in their sets ---------
+# --- Balance of the load by contact and friction ----------------------------------------------
 
 # Cutting planes: far more programs than it takes; and what is left of the friction's work, as a
 # share of the load's, where a plane more says nothing new
@@ -307,7 +307,7 @@ MOST, SHARE = 1e3, 1e-4
 
 
 class Resistance:
-    """What normals and friction do against motions of bodies: no overlap, and work of friction.
+    """Resistance of contact and friction to motions of bodies: no overlap, work of friction.
 
     A motion y escapes if the load does more work on it than forces in their sets can take:
     N y ≤ 0 for normals, N_i y + ‖μ_i T_i y‖ ≤ 0 under Coulomb's law, and Σψ_i‖T_i y‖ less than the
@@ -344,7 +344,7 @@ class Resistance:
 
     @property
     def is_idle(self) -> bool:
-        """Whether nothing is left for contact to hold."""
+        """True if the load does no work on the free motions, so contact has nothing to hold."""
         return bool(np.all(np.abs(self._loads) <= self._noise))
 
     def _load(self, rows: CutRows) -> None:
@@ -358,7 +358,7 @@ class Resistance:
         self._loads, self._noise = load / self._scale, noise / self._scale
 
     def _patches(self, rows: CutRows) -> None:
-        """Which of the patches of all ranks each row with a bound belongs to, and its load."""
+        """Assign to each row with a bound its patch, among those of all ranks, and its load."""
         count = self._coarse.bodies.count
         first, last = np.minimum(rows.ends[0], count), rows.ends[1]  # empty rows are of nobody
         own = first * (count + 1) + last
@@ -383,7 +383,7 @@ class Resistance:
         return np.asarray(work), csr_array(sum(gradient for _, gradient in found))
 
     def violated(self, y: Array, factor: float) -> csr_array:
-        """Rows that y violates, at most one of each patch and kind of this rank."""
+        """Return rows that y violates, at most one of each patch and kind of this rank."""
         chosen = self._flat.violated(y, SLOPE, 1)
         self._flat.sent[chosen] = True
         size, direction = _directions(self._cone, y)
@@ -396,7 +396,7 @@ class Resistance:
         return csr_array(vstack([self._flat.A[chosen], rows]))
 
     def escape(self, on_friction: float = 1.0, on_coefficients: float = 1.0) -> Escape | None:
-        """A motion on which the load does more work than friction, if there is one.
+        """Return a motion on which the load does more work than friction, if there is one.
 
         Args:
             on_friction: Factor on the limits.
@@ -431,7 +431,7 @@ class Resistance:
 
     @cached_property
     def has_cones(self) -> bool:
-        """Whether some rank has Coulomb's law."""
+        """True if some rank has rows with Coulomb's law."""
         return bool(self._coarse.comm.allreduce(self._pressing.shape[0]))
 
 
@@ -451,7 +451,7 @@ class Escape:
 
 
 def holds(coarse: CoarseSpace, constraints: Constraints) -> bool:
-    """Whether forces within the present limits can balance the load. Collective."""
+    """Return whether forces within the present limits can balance the load. Collective."""
     if not coarse.unheld.free.any():
         return True
     resistance = Resistance(coarse, constraints, cones=False)
@@ -508,7 +508,7 @@ def _critical(resistance: Resistance, found: Escape) -> Escape:
 
 
 def _factor(resistance: Resistance) -> float:
-    """The factor on all friction that would hold the load."""
+    """Return the factor on all friction that would hold the load."""
     low, high = 1.0, 2.0
     while high < MOST and resistance.escape(high, high) is not None:
         low, high = high, 2.0 * high
@@ -529,7 +529,7 @@ def _in_units(coarse: CoarseSpace, constraints: Constraints, found: Escape) -> t
 
 
 def _weighted(J: csr_array, rows: Array, weight: Array) -> list[csr_array]:
-    """Rows of each axis, weighted; shapes ``(t, k)``."""
+    """Return rows of each axis, weighted; shapes ``(t, k)``."""
     pairs = zip(rows.T, weight.T, strict=True)
     return [
         csr_array(diags_array(w) @ J[row]) if len(row) else csr_array(J[row]) for row, w in pairs

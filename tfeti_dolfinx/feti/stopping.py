@@ -20,7 +20,7 @@ from tfeti_dolfinx.qp.problem import ConvergedReason
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
-# --- An iterate in physical terms: how far bodies move, and what its rows miss ----------------
+# --- Measures of an iterate in physical units -------------------------------------------------
 
 # of the largest forces on a kernel mode: those on a light one beside it count as so large at least,
 # since the rounding of the largest reaches them; and that rounding, which is nobody's to mend
@@ -28,7 +28,7 @@ LIGHT, ROUNDING = 1e-4, 1e-13
 
 
 class Scene(Protocol):
-    """What a measurement needs to know of the dual problem."""
+    """Parts of the dual problem that measuring an iterate needs."""
 
     constraints: Constraints
     subdomains: Subdomains
@@ -37,13 +37,13 @@ class Scene(Protocol):
     feasible: FeasibleSet
 
     def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> Array:
-        """This rank's part of u, given the solver's face and error. Collective."""
+        """Return this rank's part of u, given the solver's face and error. Collective."""
         ...
 
 
 @dataclass(frozen=True)
 class BodyMeasures:
-    """What is known of each body at an iterate, arrays of shape ``(bodies,)``; on all ranks.
+    """Measures of each body at an iterate, arrays of shape ``(bodies,)``; on all ranks.
 
     Attributes:
         size: Largest displacement of a node, as a length.
@@ -159,7 +159,7 @@ def _missed(scene: Scene, u: Array, lam: PETSc.Vec, norm: float) -> tuple[PETSc.
 
 
 def _missed_by(scene: Scene, lam: Array, rows: Array, values: Array, norm: float) -> Array:
-    """What of gaps or slips is not normal to the set of forces where the force is.
+    """Return the part of gaps or slips that is not normal to the feasible set at the forces.
 
     A force of a normal allows no gap, but 0 does. A force inside its disc allows no slip, one on
     the circle only a slip that it opposes: then τ is P(τ + q/‖F‖), and ‖F‖ times the difference is
@@ -179,7 +179,7 @@ def _missed_by(scene: Scene, lam: Array, rows: Array, values: Array, norm: float
 
 
 def _bodies(scene: Scene, u: Array, v: Array, before: Array | None) -> BodyMeasures:
-    """What is known of each body. Collective."""
+    """Measure displacements, energies and corrections of each body. Collective."""
     subdomains, motions = scene.subdomains, scene.coarse.bodies
     rigid = subdomains.modes_motion(motions.amounts(motions.part_of(u)))
     change = u - before if before is not None else np.zeros_like(u)
@@ -220,7 +220,7 @@ def _balance(coarse: CoarseSpace, lam: PETSc.Vec) -> tuple[float, float]:
     return float(left[worst]), float(forces[worst])
 
 
-# --- How small the algebraic error has to be beside another one, in energy --------------------
+# --- Target of the algebraic error ------------------------------------------------------------
 
 # of the other error; of ‖u‖_K where that is more, as where there is no other error
 TENTH, FINEST = 0.1, 1e-6
@@ -230,12 +230,12 @@ ErrorTarget = Callable[[Array], float]
 
 
 class LookedAt(Scene, LiftedScene, Protocol):
-    """What a look, and a bound, need to know of the dual problem."""
+    """Parts of the dual problem that an assessment and an error bound need."""
 
 
 @dataclass(frozen=True)
 class TargetStatus:
-    """How far an iterate is from a goal; the same on all ranks.
+    """Algebraic error of an iterate beside its target; the same on all ranks.
 
     Attributes:
         bound: Bound of its algebraic error.
@@ -251,17 +251,17 @@ class TargetStatus:
     def of(
         cls, scene: LiftedScene, lam: PETSc.Vec, now: Measures, goal: ErrorTarget, norm: float
     ) -> TargetStatus:
-        """What it is at a look, ‖F‖ given. Collective."""
+        """Bound the error of an iterate, given ‖F‖, and evaluate the target. Collective."""
         energy = float(np.sqrt(max(now.bodies.energy.sum(), 0.0)))
         return cls(energy_bound(scene, lam, now.u, norm), goal(now.u), energy)
 
     @property
     def allowed(self) -> float:
-        """What the bound may be."""
+        """Largest bound of the algebraic error that meets the target."""
         return max(TENTH * self.goal, FINEST * self.energy)
 
 
-# --- The stopping rule: the displacement of each body is right --------------------------------
+# --- The stopping rule ------------------------------------------------------------------------
 
 # Differences that are rounding, in a body that hardly moves as well: of the largest displacement
 # of all bodies, or slip that friction counts from; of what its load does to its subdomains alone,
@@ -285,8 +285,8 @@ FIRST_LOOK = 0.5
 # asks for it, which follows residuals; it never falls by more than LEAP at once, since the size of
 # the displacement may have been learnt from a poor iterate
 AIM, AIM_AT_BOUND, LEAP = 0.5, 1.0, 1e-6
-# a true residual that fell by fewer digits than this share of those that the solver's own fell by
-# has stalled: once, and the gradient is made anew; twice, and rounding has the last word
+# the true residual has stalled if the digits it fell by are less than this share of those that the
+# updated one fell by; the gradient is then computed anew, and the second time the solve ends
 STALL = 0.5
 # of what rounding leaves of a residual: nothing comes down to that
 OUT_OF_REACH = 1e-4
@@ -294,7 +294,7 @@ OUT_OF_REACH = 1e-4
 
 @dataclass(frozen=True)
 class Tolerances:
-    """What an answer has to keep, in physical units.
+    """Tolerances of an answer, in physical units.
 
     Attributes:
         displacement: Error of u for each body, a length, shape ``(bodies,)``.
@@ -360,12 +360,12 @@ class Accuracy:
         self.reached: list[TargetStatus] = []
 
     def is_of(self, scene: LookedAt) -> bool:
-        """Whether this is what is looked at."""
+        """Return whether this rule assesses the given dual problem."""
         return self._scene is scene
 
     @property
     def aim(self) -> float:
-        """The tolerance; 0 before a first look at a goal, which is dearer than a step or two."""
+        """The tolerance; 0 before the first assessment against a target, which is costly."""
         return 0.0 if self.goal is not None and self.looks == 0 else self.tolerance
 
     def look(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float) -> Measures:
@@ -384,7 +384,7 @@ class Accuracy:
     def examine(
         self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float
     ) -> ConvergedReason:
-        """Whether an iterate is right. Collective."""
+        """Assess an iterate, and return why to stop, or ITERATING. Collective."""
         now = self.look(lam, gradient, face, residual)
         comm = self._scene.coarse.comm
         values = (
@@ -448,11 +448,11 @@ class Accuracy:
         return bool(ratio <= 1.0 or longest <= self._atol)
 
     def accept_rounding(self) -> None:
-        """Where no solver comes any farther, what rounding may explain is good enough."""
+        """Accept errors that rounding may explain, as no solver reduces them any further."""
         self._small = float("inf")
 
     def _energy_ratio(self, now: Measures) -> float:
-        """Error in energy over its tolerance without what that allows for rounding.
+        """Return error in energy over its tolerance without what that allows for rounding.
 
         A body that falls far deforms by less than rounding of its fall, but forces may be known.
         """
@@ -460,7 +460,7 @@ class Accuracy:
         return now.error / max(FORCES * self.rtol * float(energy), TINY)
 
     def _stalled(self, now: Measures, residual: float) -> bool:
-        """Whether the true residual lags behind the one that the solver claims."""
+        """Return whether the true residual lags behind the one that the solver updates."""
         if self._before is None or self._before.residual == 0.0:
             return False
         claimed = residual / self._claimed
@@ -495,7 +495,7 @@ class Accuracy:
         return np.maximum(estimate + bodies.correction, self._least)
 
     def tolerances(self) -> Tolerances:
-        """What the last look is compared with."""
+        """Return the tolerances that the last assessment is compared with."""
         now = self._looked()
         size, most = now.bodies.size, now.bodies.size.max(initial=0.0)
         share = np.where(size < STIFF * most, STRICTER, 1.0)
@@ -517,7 +517,7 @@ class Accuracy:
         return 0.0 if loaded or now.bodies.size.max(initial=0.0) > small else small
 
     def ratio(self, changes: bool = True) -> float:
-        """What must be at most 1: the largest of all errors (``errors``) over their tolerances."""
+        """Return the largest ratio of errors (``errors``) to their tolerances; right if ≤ 1."""
         now, allowed = self._looked(), self.tolerances()
         pairs = [
             *zip(self.errors(changes), allowed.displacement, strict=True),
@@ -529,19 +529,19 @@ class Accuracy:
         return max(own, self._over_goal())
 
     def _over_goal(self) -> float:
-        """The bound at the last look over what the goal allows; 0 without a goal."""
+        """Return the bound at the last look over what the goal allows; 0 without a goal."""
         if not self.reached:
             return 0.0
         return self.reached[-1].bound.error / max(self.reached[-1].allowed, TINY)
 
     def relative_error(self) -> float:
-        """Largest estimated error of a body over its largest displacement."""
+        """Return the largest estimated error of a body over its largest displacement."""
         noise = self.tolerances().displacement / max(self.rtol, NOISE)
         errors = self.errors()
         return float(np.max(errors / np.maximum(noise, TINY), initial=0.0))
 
     def energy_error(self) -> tuple[float, float]:
-        """Estimated error of u in energy over ‖u‖_K at the last look, and what it may be.
+        """Return estimated error of u in energy over ‖u‖_K at the last look, and what it may be.
 
         Where ‖u‖_K is rounding of a rigid motion, over what rounding may leave of it.
         """

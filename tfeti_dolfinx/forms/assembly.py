@@ -21,7 +21,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 
 
 class Data:
-    """Numbers that somebody may change, and what they were last.
+    """Data that a user may change, with a digest of their last values.
 
     Args:
         arrays: Gives the numbers as they are now.
@@ -32,7 +32,7 @@ class Data:
         self._arrays, self._comm, self._seen = arrays, comm, b""
 
     def has_changed(self) -> bool:
-        """Whether anything is other than at the last call, or this is the first. Collective."""
+        """Return whether data differ from the last call's, or this is the first. Collective."""
         before, self._seen = self._seen, self._digest()
         return any_rank(self._comm, before != self._seen)
 
@@ -44,7 +44,7 @@ class Data:
 
 
 def data_of(form: ufl.Form | ufl.ZeroBaseForm, V: fem.FunctionSpace) -> Data:
-    """The constants and coefficients of a form whose arguments are on V."""
+    """Return the constants and coefficients of a form whose arguments are on V."""
     zero = is_zero(form)
     constants = [] if zero else list(form.constants())
     coefficients = [] if zero else list(form.coefficients())
@@ -108,29 +108,29 @@ class Forms:
         self._volume_of_L: ufl.Form | fem.Form | None = cell_integrals(L)
 
     def has_new_points(self) -> bool:
-        """Whether the mesh has moved since the last call."""
+        """Return whether the mesh has moved since the last call."""
         return self._points.has_changed()
 
     def has_new_stiffness(self) -> bool:
-        """Whether a, or what it refers to, has changed since the last call."""
+        """Return whether a, or what it refers to, has changed since the last call."""
         return self._of_a.has_changed()
 
     def has_new_load(self) -> bool:
-        """Whether L, or what it refers to, has changed since the last call."""
+        """Return whether L, or what it refers to, has changed since the last call."""
         return self._of_L.has_changed()
 
     def stiffness(self) -> Any:
-        """This rank's K in DOLFINx's numbering, scipy CSR."""
+        """Return this rank's K in DOLFINx's numbering, scipy CSR."""
         return assemble_csr(self._a)
 
     def load(self) -> Array:
-        """This rank's f in DOLFINx's numbering."""
+        """Return this rank's f in DOLFINx's numbering."""
         if self._L is None:
             return np.zeros(self._V.dofmap.index_map.size_local * self._V.dofmap.index_map_bs)
         return np.array(fem.assemble_vector(self._L).array)
 
     def volume_load(self) -> Array | None:
-        """The part of the load from integrals over cells; None if there are none."""
+        """Return the part of the load from integrals over cells; None if there are none."""
         if self._volume_of_L is None:
             return None
         if isinstance(self._volume_of_L, ufl.Form):  # few problems ask for it
@@ -138,21 +138,21 @@ class Forms:
         return np.array(fem.assemble_vector(self._volume_of_L).array)
 
     def hats(self) -> Array:
-        """Integrals of the hats over the cells, for each of DOLFINx's nodes."""
+        """Return integrals of the hats over the cells, for each of DOLFINx's nodes."""
         one = fem.Constant(self._V.mesh, (1.0,) + (0.0,) * (self._V.dofmap.bs - 1))
         dx = ufl.Measure("dx", domain=self._V.mesh)
         form = self._compiled(ufl.dot(one, ufl.TestFunction(self._V)) * dx, "the volume")
         return np.array(fem.assemble_vector(form).array[:: self._V.dofmap.bs])
 
     def _compiled(self, form: ufl.Form, name: str) -> fem.Form:
-        """The form compiled by DOLFINx, which fails on all ranks or on none."""
+        """Return the form compiled by DOLFINx, which fails on all ranks or on none."""
         comm = self._decomposition.comm
         with raised_on_all_ranks(comm), named(f"{name} cannot be compiled"):
             return fem.form(form, **self._keywords)
 
 
 def cell_integrals(form: Any) -> ufl.Form | None:
-    """The part of a form over cells; None if it has none."""
+    """Return the part of a form over cells; None if it has none."""
     if is_zero(form):
         return None
     parts = [part for part in form.integrals() if part.integral_type() == "cell"]

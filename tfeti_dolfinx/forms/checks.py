@@ -1,4 +1,4 @@
-"""What forms may be made of: arguments, coefficients, measures and tags on the torn mesh."""
+"""Checks of forms: arguments, coefficients, measures and tags on the torn mesh."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ KINDS = {"cell": "dx", "exterior_facet": "ds", "interior_facet": "dS"}
 def displacement_space(
     a: ufl.Form, decomposition: Decomposition, name: str = "a"
 ) -> fem.FunctionSpace:
-    """The space of a bilinear form's trial and test functions. Collective.
+    """Return the space of a bilinear form's trial and test functions. Collective.
 
     Raises:
         InputError: The form is not bilinear on one space for displacements on the torn mesh.
@@ -101,7 +101,7 @@ def check_not_negative(value: Any, what: str, mesh: dmesh.Mesh) -> None:
 
 
 def is_zero(form: Any) -> bool:
-    """Whether a form is one of UFL's zeros, which DOLFINx does not assemble."""
+    """Return whether a form is one of UFL's zeros, which DOLFINx does not assemble."""
     if isinstance(form, ufl.Form):
         return all(isinstance(integral.integrand(), Zero) for integral in form.integrals())
     return isinstance(form, ufl.ZeroBaseForm) and len(form.arguments()) == 1

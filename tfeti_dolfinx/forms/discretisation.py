@@ -66,7 +66,7 @@ class StressRecovery:
         self._form = fem.form(density * dx, jit_options=JIT_OPTIONS)
 
     def error(self) -> float:
-        """The estimate for all bodies, a root of an energy; the same on all ranks."""
+        """Return the estimate for all bodies, a root of an energy; the same on all ranks."""
         comm = self._dofs.comm
         return float(np.sqrt(bcast_from_root(comm, comm.allreduce(float(self.squares().sum())))))
 
@@ -118,7 +118,7 @@ class _Patches:
         return found
 
     def _fitted(self, own: Array, values: Array) -> Array:
-        """The fit at each local node of DOLFINx's, from the cells flagged."""
+        """Return the fit at each local node of DOLFINx's, from the cells flagged."""
         dofs, basis = self._dofs, self._basis[own]
         size, q = basis.shape[2], values.shape[2]
         terms = np.concatenate((basis, values), axis=2)[..., None, :] * basis[..., None]
@@ -133,7 +133,7 @@ class _Patches:
 
 
 def _constants(gram: Array, right: Array) -> Array:
-    """The constants of fits, shape ``(n, q)``, from their normal equations."""
+    """Return the constants of fits, shape ``(n, q)``, from their normal equations."""
     slopes = np.arange(1, gram.shape[1])
     spread = gram[:, slopes, slopes].mean(axis=1, keepdims=True) if slopes.size else 0.0
     gram = gram.copy()

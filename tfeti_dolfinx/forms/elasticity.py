@@ -123,7 +123,7 @@ class Elasticity:
         )
 
     def stress(self, u: Any) -> Any:
-        """Stress of a displacement by Hooke's law, a UFL tensor of shape ``(3, 3)``.
+        """Return the stress of a displacement by Hooke's law, a UFL tensor of shape ``(3, 3)``.
 
         This is what ``ContactProblem(..., stress=elasticity.stress)`` takes.
 
@@ -166,7 +166,7 @@ class Elasticity:
         return work * dx if is_one else self.thickness * work * dx
 
     def _across(self, u: Any, e: Any) -> Any:
-        """The third normal strain."""
+        """Return the third normal strain."""
         if self.model == "plane_stress":
             return -self.nu / (1 - self.nu) * (e[0, 0] + e[1, 1])
         if self.model == "plane_strain":
@@ -188,7 +188,7 @@ class Elasticity:
         return int(2 * slope + moduli + curved + ring)
 
     def _checked_radius(self) -> float:
-        """The largest radius of the mesh. Collective."""
+        """Return the largest radius of the mesh. Collective."""
         r, comm = self.mesh.geometry.x[:, 0], self.mesh.comm
         largest = comm.allreduce(float(np.abs(r).max(initial=0.0)), op=MPI.MAX)
         least = comm.allreduce(float(r.min(initial=np.inf)), op=MPI.MIN)
@@ -218,7 +218,7 @@ def _check_no_thickness(thickness: Any, model: str) -> None:
 
 
 def in_ufl(value: Any, on: Decomposition | dmesh.Mesh, what: str, expected: Range) -> Any:
-    """A modulus as a scalar in UFL. Collective."""
+    """Return a modulus as a scalar in UFL. Collective."""
     mesh = on.mesh if isinstance(on, Decomposition) else on
     if isinstance(value, Mapping):
         return _by_volume(value, on, what, expected)
@@ -235,7 +235,7 @@ def in_ufl(value: Any, on: Decomposition | dmesh.Mesh, what: str, expected: Rang
 
 
 def _known_values(value: Any) -> list[float]:
-    """Of a constant its value, of a function that its unknowns bound this rank's extreme ones."""
+    """Return a constant's value, or this rank's extreme ones of a function of degree < 2."""
     if isinstance(value, fem.Constant):
         return [value.value.item()]
     if isinstance(value, fem.Function) and value.function_space.element.basix_element.degree < 2:
@@ -247,7 +247,7 @@ def _known_values(value: Any) -> list[float]:
 def _by_volume(
     values: Mapping[str | int, float], on: Decomposition | dmesh.Mesh, what: str, expected: Range
 ) -> fem.Function:
-    """A function that is constant in each volume. Collective."""
+    """Return a function that is constant in each volume. Collective."""
     if not isinstance(on, Decomposition):
         raise InputError(f"{what} by volumes: expected a Decomposition, which knows their names")
     with raised_on_all_ranks(on.comm):
@@ -271,7 +271,7 @@ def _by_volume(
 def _checked_volumes(
     values: Mapping[str | int, float], on: Decomposition, what: str, expected: Range
 ) -> dict[int, float]:
-    """The values by tags."""
+    """Return the values by tags."""
     by_tag: dict[int, float] = {}
     for name, value in values.items():
         try:

@@ -32,7 +32,7 @@ def von_mises(sigma: Any) -> Any:
 
 
 def checked_stress(stress: Stress, u: fem.Function) -> Any:
-    """The stress of u as a UFL expression.
+    """Return the stress of u as a UFL expression.
 
     Raises:
         InputError: It cannot be called, fails, or does not return a 3×3 tensor.
@@ -53,7 +53,7 @@ def checked_stress(stress: Stress, u: fem.Function) -> Any:
 
 
 def checked_thickness(thickness: Any, decomposition: Decomposition) -> Any:
-    """What areas of the mesh are multiplied with, a number or a scalar in UFL. Collective.
+    """Check and return the thickness, a number or a scalar in UFL. Collective.
 
     Raises:
         InputError: It is neither, not positive, negative somewhere, or on another mesh.
@@ -73,7 +73,7 @@ def checked_thickness(thickness: Any, decomposition: Decomposition) -> Any:
 
 
 def frozen(expression: Any, but: fem.Function | None = None) -> Any:
-    """An expression with its constants and functions as they are now, all but one.
+    """Return an expression with its constants and functions as they are now, all but one.
 
     The mesh is no function: where it is moved, the expression moves along.
     """

@@ -44,7 +44,7 @@ log = logging.getLogger(__name__)
 
 @dataclass
 class Motion:
-    """Where a step begins. Arrays are this rank's, in DOLFINx's numbering.
+    """State at the begin of a time step. Arrays are this rank's, in DOLFINx's numbering.
 
     Attributes:
         u: Displacement.
@@ -118,13 +118,13 @@ class InertialForms(Forms):
         self.motion.size = size
 
     def has_new_points(self) -> bool:
-        """Whether the mesh has moved since the last call."""
+        """Return whether the mesh has moved since the last call."""
         if changed := super().has_new_points():
             self._matrices = None
         return changed
 
     def has_new_stiffness(self) -> bool:
-        """Whether K, M or the step has changed since the last call."""
+        """Return whether K, M or the step has changed since the last call."""
         changed = [super().has_new_stiffness(), self._of_m.has_changed()]
         if any(changed):
             self._matrices = None
@@ -133,7 +133,7 @@ class InertialForms(Forms):
         return found
 
     def has_new_load(self) -> bool:
-        """Whether L, where the step begins, K, M or the step has changed since the last call."""
+        """Return whether L, the state at the step's begin, K, M or the step has changed."""
         changed = super().has_new_load() or self._new_matrices
         self._new_matrices = False
         return self._of_motion.has_changed() or changed
@@ -149,7 +149,7 @@ class InertialForms(Forms):
         return self._matrices
 
     def stiffness(self) -> Any:
-        """This rank's K/2 + 2M/τ²."""
+        """Return this rank's K/2 + 2M/τ²."""
         if not self.motion.size:
             raise InputError("the step has no size yet; expected a call of take_step(size) before")
         K, M = self.matrices
@@ -162,7 +162,7 @@ class InertialForms(Forms):
         return 0.5 * K + share * M
 
     def load(self) -> Array:
-        """This rank's f + 2Mw/τ² − Ku/2."""
+        """Return this rank's f + 2Mw/τ² − Ku/2."""
         K, M = self.matrices
         motion, self._ends = self.motion, super().load()
         pull = M @ motion.towards * (2.0 / motion.size**2)

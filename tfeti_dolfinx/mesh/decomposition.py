@@ -18,7 +18,7 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.transfer import CellExchange, cell_values, check_function, from_cell_values
 from tfeti_dolfinx.mesh.untorn import PhysicalNames
 
-# --- Tags and names that users give: do they belong to the mesh? ------------------------------
+# --- Checks of tags and names -----------------------------------------------------------------
 
 
 def check_tags(tags: Any, mesh: dmesh.Mesh, of_cells: bool, what: str, expected: str) -> None:
@@ -45,7 +45,7 @@ def check_tags(tags: Any, mesh: dmesh.Mesh, of_cells: bool, what: str, expected:
 
 
 def checked_names(names: Any, what: str, tags: Any, tags_name: str) -> dict[str, int]:
-    """Names of tags as a dictionary.
+    """Return names of tags as a dictionary.
 
     Raises:
         InputError: They are no dictionary from texts to integers, or there are no tags to name.
@@ -63,7 +63,7 @@ def checked_names(names: Any, what: str, tags: Any, tags_name: str) -> dict[str,
     return {name: int(tag) for name, tag in names.items()}
 
 
-# --- The torn mesh and what is known of its subdomains, bodies, tags and tears ----------------
+# --- The decomposition: torn mesh, subdomains, bodies, tags -----------------------------------
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class Decomposition:
 
     @property
     def is_torn(self) -> bool:
-        """Whether any body consists of more than one subdomain."""
+        """True if some body consists of more than one subdomain."""
         return self.num_subdomains > self.num_bodies
 
     @cached_property
@@ -273,5 +273,5 @@ def _tag(name: str | int, names: dict[str, int], kind: str) -> int:
 
 
 def known_tags(names: dict[str, int]) -> str:
-    """Names and tags for messages."""
+    """Return names and tags for messages."""
     return ", ".join(f"{n!r} ({t})" for n, t in names.items()) or "none"

@@ -12,7 +12,7 @@ from tfeti_dolfinx.common.parallel import Exchange
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.untorn import cell_entities
 
-# --- How far from regular the cells of a mesh are ---------------------------------------------
+# --- Quality of cells -------------------------------------------------------------------------
 
 # columns: the edges of a regular simplex that leave its first vertex
 REGULAR = {
@@ -48,11 +48,11 @@ def flatness(mesh: dmesh.Mesh) -> Array:
     return np.asarray(sizes / (gdim * np.maximum(np.abs(det), TINY)))
 
 
-# --- Nodes of the untorn mesh that bodies have in common: they meet there, but share no facet ---
+# --- Nodes that bodies share without a common facet -------------------------------------------
 
 
 def shared_by_bodies(decomposition: Decomposition) -> tuple[Array, Array]:
-    """Pairs of bodies with nodes in common, and how many; the same on all ranks. Collective.
+    """Return pairs of bodies with nodes in common, and how many; the same on all ranks. Collective.
 
     Returns:
         The pairs, shape ``(p, 2)``, and the numbers, shape ``(p,)``.

@@ -18,7 +18,7 @@ from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.untorn import cell_entities, mix, set_key
 
-# --- Which function spaces fit a torn mesh, and which are the same ----------------------------
+# --- Function spaces on a torn mesh -----------------------------------------------------------
 
 
 def check_space(V: fem.FunctionSpace, decomposition: Decomposition) -> None:
@@ -51,7 +51,7 @@ def check_space(V: fem.FunctionSpace, decomposition: Decomposition) -> None:
 
 
 def is_same_space(V: Any, W: Any) -> bool:
-    """Whether two C++ spaces are the same on this rank: mesh, element and numbering."""
+    """Return whether two C++ spaces have the same mesh, element and numbering on this rank."""
     if V is W:
         return True
     return bool(
@@ -80,8 +80,7 @@ def described(V: Any) -> str:
     return f"{kind} of degree {degree} with {V.dofmap.index_map_bs} unknowns per node"
 
 
-# --- What all torn copies of a node have in common: a key, and the rank of the lowest
-#     subdomain ---
+# --- Keys of nodes, common to all torn copies -------------------------------------------------
 
 
 def lowest_owners(comm: MPI.Intracomm, key: Array, subdomain: Array) -> Array:
@@ -129,8 +128,7 @@ def _place(V: fem.FunctionSpace, nodes: Array, corners: Array, ids: Array) -> Ar
     return mix((share * (1 + np.arange(share.shape[1]))).sum(axis=1).astype(np.uint64))
 
 
-# --- The one home of every dof map: DOLFINx's numbering, the subdomains', and the groups of
-#     copies ---
+# --- Dof maps: DOLFINx, primal and group numbering --------------------------------------------
 
 
 class TornDofs:
@@ -223,7 +221,7 @@ class TornDofs:
         return self._to_owner.answer(values[self._to_owner_slot])
 
     def lookup(self, groups: Array, *tables: Array) -> tuple[Array, ...]:
-        """Rows of tables that the owners of groups hold. Collective.
+        """Return rows of tables that the owners of groups hold. Collective.
 
         Args:
             groups: Global groups, any of them, shape ``(k,)``.
@@ -238,7 +236,7 @@ class TornDofs:
         return tuple(exchange.answer(table[asked]) for table in tables)
 
     def add_on_owners(self, groups: Array, values: Array) -> Array:
-        """Sum of the values that all ranks give for each owned group. Collective.
+        """Return the sum of the values that all ranks give for each owned group. Collective.
 
         Args:
             groups: Global groups, any of them, shape ``(k,)``.
@@ -287,7 +285,7 @@ class TornDofs:
         return W, self.primal_nodes(node)
 
     def gather_copies(self, values: Array) -> Array:
-        """Values of the local primal nodes in the order of the owned ``copies``. Collective.
+        """Return values of the local primal nodes in the order of the owned ``copies``. Collective.
 
         Args:
             values: One value (or row) per local primal node, shape ``(n, ...)``.

@@ -143,7 +143,7 @@ def _values(tags: dmesh.MeshTags | None, entities: Array) -> Array:
 
 
 def _names(mesh: dmesh.Mesh, tags: dmesh.MeshTags | None, given: dict[str, int]) -> dict[str, int]:
-    """The names given, and for tags without a name their numbers."""
+    """Return the names given, and for tags without a name their numbers."""
     local = set() if tags is None else set(np.unique(tags.values).tolist())
     present = set().union(*mesh.comm.allgather(local))
     unnamed = sorted(present - set(given.values()))

@@ -18,7 +18,7 @@ from tfeti_dolfinx.common.validation import named, shown
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.untorn import PhysicalNames
 
-# --- One gmsh model as numpy arrays: elements in physical groups, names, nodes ----------------
+# --- Content of one gmsh model as arrays ------------------------------------------------------
 
 # what gmsh calls the physical groups that it makes for partitions
 PARTITION_GROUP = re.compile(r"_part\{\d+\}_physical\{(\d+)\}_dim\{(\d+)\}")
@@ -41,7 +41,7 @@ class Elements:
 
 @dataclass(frozen=True)
 class ModelContent:
-    """What one model holds of the mesh.
+    """Content of one gmsh model: elements in physical groups, names, nodes.
 
     Attributes:
         where: What messages call the model.
@@ -112,7 +112,7 @@ def open_model(source: str | PathLike[str] | Any, may_be_empty: bool = False) ->
 
 
 def read_content(model: Any, where: str) -> ModelContent:
-    """What a model holds.
+    """Read the elements in physical groups, names and nodes of a gmsh model.
 
     Args:
         model: The gmsh model.
@@ -152,7 +152,7 @@ def concatenated(found: Sequence[Elements]) -> Elements:
 
 
 def _names(model: Any, dim: int) -> dict[str, int]:
-    """Names of the physical groups of a dimension; without a name, their number."""
+    """Return names of the physical groups of a dimension; without a name, their number."""
     names = {}
     for _, tag in model.getPhysicalGroups(dim):
         name = model.getPhysicalName(dim, tag)
@@ -164,7 +164,7 @@ def _names(model: Any, dim: int) -> dict[str, int]:
 
 
 def _original_physical_group(model: Any, dim: int, tag: int) -> int:
-    """The group that a partition's group stands for, or the group itself."""
+    """Return the group that a partition's group stands for, or the group itself."""
     match = PARTITION_GROUP.fullmatch(model.getPhysicalName(dim, tag))
     return int(match[1]) if match else int(tag)
 
@@ -219,7 +219,7 @@ def _elements(model: Any, dim: int) -> Elements | None:
 
 
 def _coordinates(model: Any, node_ids: Array) -> Array:
-    """Coordinates of nodes, shape ``(p, 3)``."""
+    """Return coordinates of nodes, shape ``(p, 3)``."""
     if len(node_ids) == 0:
         return np.empty((0, 3))
     ids, x, _ = model.mesh.getNodes()
@@ -227,7 +227,7 @@ def _coordinates(model: Any, node_ids: Array) -> Array:
     return x.reshape(-1, 3)[order[np.searchsorted(ids, node_ids, sorter=order)]]
 
 
-# --- Names of the physical groups, merged over the models that ranks have read ----------------
+# --- Names of physical groups, merged over ranks ----------------------------------------------
 
 # dimension and tag of a physical group
 PhysicalGroup = tuple[int, int]
@@ -271,7 +271,7 @@ def physical_names(
 def _checked_names(
     every: Iterable[frozenset[tuple[str, PhysicalGroup]]],
 ) -> dict[PhysicalGroup, str]:
-    """Name of each physical group, sorted by dimension and tag."""
+    """Return the name of each physical group, sorted by dimension and tag."""
     pairs = sorted(set[tuple[str, PhysicalGroup]]().union(*every))
     names = {group: name for name, group in pairs if name == str(group[1])}
     given: dict[PhysicalGroup, str] = {}

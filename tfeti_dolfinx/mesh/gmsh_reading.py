@@ -46,7 +46,7 @@ from tfeti_dolfinx.mesh.untorn import (
     set_key,
 )
 
-# --- gmsh's split files: one for each partition, each read on one rank ------------------------
+# --- Split files of gmsh ----------------------------------------------------------------------
 
 ONE_MODEL = "expected files that gmsh has written from one model with Mesh.PartitionSplitMeshFiles"
 # distance, relative to the size of the mesh, up to which a node's places are the same: files in
@@ -66,13 +66,13 @@ class SplitFiles:
         return self.path.with_name(f"{self.path.stem}_{number}{self.path.suffix}")
 
     def of_rank(self, comm: MPI.Intracomm) -> list[int]:
-        """Numbers of the files that this rank reads: contiguous, and even over the ranks."""
+        """Return numbers of the files that this rank reads: contiguous, and even over the ranks."""
         numbers = range(1, self.count + 1)
         return [p for p in numbers if (p - 1) * comm.size // self.count == comm.rank]
 
 
 def find_split_files(source: str | PathLike[str] | Any, comm: MPI.Intracomm) -> SplitFiles | None:
-    """The split files of a mesh, None if it is a model or one file. Collective.
+    """Return the split files of a mesh, None if it is a model or one file. Collective.
 
     Only rank 0 looks, at the source that it was given.
 
@@ -103,7 +103,7 @@ def _found(path: Path) -> SplitFiles | None:
 
 
 def read_split_files(files: SplitFiles, comm: MPI.Intracomm) -> list[ModelContent]:
-    """What this rank's files hold, the number of its file as the partition of a cell. Collective.
+    """Read this rank's files, a cell's partition being its file's number. Collective.
 
     Raises:
         InputError: A file cannot be read, or partitions are missing.
@@ -170,7 +170,7 @@ def check_shared(
             )
 
 
-# --- What gmsh models on any ranks hold, joined to one untorn mesh ----------------------------
+# --- Assembly of an untorn mesh from models on any ranks --------------------------------------
 
 # of the mesh's size: what rounding of coordinates leaves of a plane mesh's height
 FLAT = 1e-12
@@ -190,7 +190,7 @@ CELLS = {
 def untorn_mesh(
     contents: Sequence[ModelContent], comm: MPI.Intracomm, shared: bool
 ) -> tuple[UntornMesh, Array | None]:
-    """The untorn mesh, and the partition of each cell if all cells have one. Collective.
+    """Return the untorn mesh, and the partition of each cell if all cells have one. Collective.
 
     Args:
         contents: What this rank has read, maybe nothing.
@@ -235,7 +235,7 @@ def untorn_mesh(
 
 
 def _one_kind(contents: Sequence[ModelContent], top: int, comm: MPI.Intracomm) -> tuple[int, str]:
-    """Number and name of gmsh's type of all cells of all ranks."""
+    """Return number and name of gmsh's type of all cells of all ranks."""
     cells = [(content.elements[top], content.where) for content in contents]
     own = [(found.kind, found.kind_name, where) for found, where in cells]
     first_of_kind = {kind: (name, where) for kind, name, where in reversed(own)}
@@ -315,7 +315,7 @@ def _looked_up(keys: Array, known: Array, tags: Array) -> Array:
     return found
 
 
-# --- Meshes that gmsh made: physical groups, partitions, and the nodes' own numbers -----------
+# --- Meshes of gmsh: physical groups, partitions, node numbers --------------------------------
 
 
 def read_gmsh(

@@ -15,7 +15,7 @@ from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.mesh.partition import absorb_fragments, without_holes
 from tfeti_dolfinx.mesh.untorn import UntornMesh, mix
 
-# --- Parts of round shape and equal size, made from parts of any shape ------------------------
+# --- Balanced k-means: parts of round shape and equal size ------------------------------------
 
 # points on a grid of so many bits: their sums and squares are exact, so no order decides
 BITS = 24
@@ -78,18 +78,18 @@ def compact_parts(
 
 
 def _on_grid(x: Array, comm: MPI.Intracomm) -> Array:
-    """Coordinates as whole numbers, on a grid over the box of all points."""
+    """Return coordinates as whole numbers, on a grid over the box of all points."""
     low, high = box_over_ranks(comm, x)
     return np.rint((x - low) * ((2.0**BITS - 1.0) / max(np.max(high - low), 1e-300)))
 
 
 def _sizes(part: Array, num_parts: int, comm: MPI.Intracomm) -> Array:
-    """Number of points of each part."""
+    """Return the number of points of each part."""
     return summed(comm, np.bincount(part, minlength=num_parts).astype(np.float64))
 
 
 def _means(x: Array, part: Array, before: Array, comm: MPI.Intracomm) -> Array:
-    """Means of the parts, as whole numbers; what has no point stays where it was."""
+    """Return the means of the parts as integers; means of empty parts do not change."""
     num_parts = len(before)
     size = _sizes(part, num_parts, comm)[:, None]
     sums = np.zeros(before.shape)
@@ -118,7 +118,7 @@ def _length(x: Array, part: Array, measure: Array, num_parts: int, comm: MPI.Int
 
 
 def _nearest(x: Array, part: Array, centre: Array, influence: Array) -> Array:
-    """The part with the least ‖x − c‖/w among those near the present one."""
+    """Return the part with the least ‖x − c‖/w among those near the present one."""
     apart = np.linalg.norm(centre[:, None] - centre, axis=2) / (influence[:, None] + influence)
     near = np.argsort(apart, axis=1, kind="stable")[:, :NEAREST]
     order = np.argsort(part, kind="stable")
@@ -132,7 +132,7 @@ def _nearest(x: Array, part: Array, centre: Array, influence: Array) -> Array:
     return found
 
 
-# --- Flat interfaces of parts: cells join the part that surrounds them ------------------------
+# --- Smoothing of interfaces between parts ----------------------------------------------------
 
 # rounds in which cells change sides, half of those that want to
 ROUNDS = 10
@@ -143,7 +143,7 @@ LARGEST_PART, SMALLEST = 1.08, 0.93
 
 
 def flatten_interfaces(mesh: UntornMesh, pairs: tuple[Array, Array], part: Array) -> Array:
-    """Let cells join a neighbour's part that has more of what is around them.
+    """Move cells to the neighbouring part that most of their surroundings belong to.
 
     Of each part count the cells that share a vertex with a cell, once for each such vertex, and
     those that share a facet with it twelve times more. A cell that counts more of a neighbour's
@@ -197,7 +197,7 @@ def _largest(table: csr_array) -> tuple[Array, Array]:
     return np.minimum.reduceat(columns, table.indptr[:-1]).astype(np.int64), most
 
 
-# --- METIS parts of a mesh that lies on one rank, made round ----------------------------------
+# --- METIS partition on one rank --------------------------------------------------------------
 
 # of the facets that METIS cuts in a body: parts that cut more are not taken; those of boxes less
 # readily, since what is not cut along their layers is a staircase
@@ -252,7 +252,7 @@ def metis(mesh: UntornMesh, num_parts: int, comm: MPI.Intracomm) -> Array:
 
 
 def _weights(mesh: UntornMesh, first: Array, second: Array) -> Array:
-    """What a cut between two cells counts: 1, more within columns of flat cells, whole numbers."""
+    """Return the cost of a cut between two cells: 1, more within columns of flat cells; integer."""
     if mesh.cell_type.name in SIMPLICES:  # in columns of these midpoints say little
         return np.ones(len(first))
     x, size = mesh.midpoints(), np.linalg.norm(mesh.extents(), axis=1)

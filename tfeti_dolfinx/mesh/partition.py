@@ -17,7 +17,7 @@ from tfeti_dolfinx.common.validation import is_whole, named, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.untorn import UntornMesh, equal_pairs, facet_keys
 
-# --- Recursive coordinate bisection of distributed points, or of cells along their layers -----
+# --- Recursive coordinate bisection -----------------------------------------------------------
 
 # of the mean extent of a part's cells: midpoints that are farther apart are of different layers;
 # those of the simplices that a box is cut into are a third of it apart at most
@@ -31,7 +31,7 @@ MOVED, FLAT = 0.25, 3.0
 
 
 class _Halves(NamedTuple):
-    """How parts are to be halved, shapes ``(p,)``.
+    """Data of the halving of parts, shapes ``(p,)``.
 
     Attributes:
         wanted: Number of points on the left.
@@ -84,7 +84,7 @@ def bisect_points(
 
 
 def _on_grid(x: Array, extents: Array | None, comm: MPI.Intracomm) -> tuple[Array, Array | None]:
-    """Coordinates, and extents, as integers on a grid over the box of all points."""
+    """Return coordinates, and extents, as integers on a grid over the box of all points."""
     low, high = box_over_ranks(comm, x)
     size, last = max(np.max(high - low), 1e-300), 2.0 ** (62 // x.shape[1]) - 1
     grid = np.rint((x - low) / size * last).astype(np.int64)
@@ -96,7 +96,7 @@ def _on_grid(x: Array, extents: Array | None, comm: MPI.Intracomm) -> tuple[Arra
 def _halves(
     grid: Array, sizes: Array | None, part: Array, targets: tuple[Array, Array], comm: MPI.Intracomm
 ) -> _Halves:
-    """How parts are halved; targets: how many parts become of each, and of its left half."""
+    """Plan the halving of parts; targets: numbers of final parts in each, and in its left half."""
     (whole, left), gdim = targets, grid.shape[1]
     num_parts = len(whole)
     low = np.full((num_parts, gdim), np.iinfo(np.int64).max)
@@ -129,7 +129,7 @@ def _halves(
 
 
 def _after(grid: Array, part: Array, halves: _Halves, comm: MPI.Intracomm) -> Array:
-    """Whether points come after the cut of their part."""
+    """Return whether points come after the cut of their part."""
     num_parts, gdim = halves.axes.shape
     digits = np.take_along_axis(grid, halves.axes[part], axis=1)
     result, before = np.zeros(len(grid), dtype=bool), np.zeros(num_parts, dtype=np.int64)
@@ -161,7 +161,7 @@ def _after(grid: Array, part: Array, halves: _Halves, comm: MPI.Intracomm) -> Ar
 
 
 def _end(c: Array, part: Array, at: Array, gap: Array, comm: MPI.Intracomm) -> tuple[Array, Array]:
-    """Where layers around ``at`` end below, and whether they do, both of shape ``(p,)``."""
+    """Find the lower ends of layers around ``at``, and whether they end, both of shape ``(p,)``."""
     end, found, one = at.copy(), np.zeros(len(at), dtype=bool), (ONE * gap).astype(np.int64)
     near = np.abs(c - at[part]) <= (MOST + 1) * gap[part]
     c, part = c[near], part[near]
@@ -195,7 +195,7 @@ def _kth_smallest(key: Array, part: Array, k: Array, comm: MPI.Intracomm) -> Arr
     return low
 
 
-# --- Facet-connected pieces of subdomains: a subdomain must have only one ---------------------
+# --- Facet-connected pieces of subdomains -----------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -290,7 +290,7 @@ def absorb_fragments(mesh: UntornMesh, subdomain: Array, comm: MPI.Intracomm) ->
     return joined[pieces.of_cell]
 
 
-# --- Which subdomain a cell belongs to --------------------------------------------------------
+# --- Assignment of cells to subdomains --------------------------------------------------------
 
 Subdomains = int | ArrayLike | Callable[[Array], ArrayLike]
 
@@ -299,7 +299,7 @@ UNKNOWNS_PER_SUBDOMAIN = 4000
 
 
 def default_count(mesh: UntornMesh, comm: MPI.Intracomm) -> int:
-    """Number of subdomains that leaves each about 4000 displacement unknowns. Collective."""
+    """Return number of subdomains that leaves each about 4000 displacement unknowns. Collective."""
     per_cell = 0.5 if mesh.cell_type.name == "triangle" else 1.0
     per_cell = 0.2 if mesh.cell_type.name == "tetrahedron" else per_cell
     unknowns = comm.allreduce(len(mesh.cells)) * per_cell * mesh.gdim * mesh.degree**mesh.gdim

@@ -19,7 +19,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.partition import absorb_fragments, bisect_points, split_disconnected
 from tfeti_dolfinx.mesh.untorn import NO_TAG, UntornMesh, cell_facets, equal_pairs, facet_keys
 
-# --- Which subdomains look equal but for a translation, before there is any stiffness ---------
+# --- Equality of subdomains up to a translation -----------------------------------------------
 
 # Of the size of a subdomain, in what is measured of its shape: less is rounding of coordinates,
 # more another shape. The root keeps regular grids, which are rational, off the middle between
@@ -30,7 +30,7 @@ SHAPE = 1e-6 * np.sqrt(2.0)
 def measured(
     x: Array, tags: Array, subdomain: Array, num: int, comm: MPI.Intracomm
 ) -> tuple[Array, Array, Array]:
-    """Number of cells of each subdomain, centre and shape. Collective.
+    """Return the number of cells of each subdomain, centre and shape. Collective.
 
     Args:
         x: Midpoints of this rank's cells, shape ``(n, gdim)``.
@@ -50,7 +50,7 @@ def measured(
 
 
 def alike(*columns: Array) -> Array:
-    """A number for each subdomain, the same for those that agree up to ``SHAPE``.
+    """Return a number for each subdomain, the same for those that agree up to ``SHAPE``.
 
     Args:
         columns: What must agree, shapes ``(N,)`` or ``(N, q)``.
@@ -62,7 +62,7 @@ def alike(*columns: Array) -> Array:
 def bare_sides(
     mesh: UntornMesh, subdomain: Array, cells: Array, centres: Array, comm: MPI.Intracomm
 ) -> Array:
-    """Where the sides of each subdomain lie that no row will touch. Collective.
+    """Compute moments of each subdomain's sides that no row will touch. Collective.
 
     They are facets of one cell only, without a tag: there is nothing to glue, to prescribe or to
     meet. Equal subdomains with the same ones are likely to share S, too.
@@ -85,7 +85,7 @@ def bare_sides(
 
 
 def _is_outer(mesh: UntornMesh, comm: MPI.Intracomm) -> Array:
-    """Whether facets of cells are facets of no other cell, shape ``(n, num_facets)``."""
+    """Return whether facets of cells are facets of no other cell, shape ``(n, num_facets)``."""
     keys = facet_keys(mesh.cells, mesh.cell_type)
     outer = _occur_once(keys.ravel())
     own = keys.ravel()[outer]
@@ -95,7 +95,7 @@ def _is_outer(mesh: UntornMesh, comm: MPI.Intracomm) -> Array:
 
 
 def _occur_once(keys: Array) -> Array:
-    """Flags of those that no other one is equal to."""
+    """Return flags of those that no other one is equal to."""
     order = np.argsort(keys)  # not stable: that takes four times as long
     same = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
     once = np.ones(len(keys), dtype=bool)
@@ -104,7 +104,7 @@ def _occur_once(keys: Array) -> Array:
 
 
 def _moments(d: Array, tags: Array) -> Array:
-    """Of cells at d from the centre of their subdomain: sums of them tell shapes apart.
+    """Return moments of cells at d from their subdomain's centre; sums tell shapes apart.
 
     Degrees 2 and 3 tell mirrored ones from each other, the degree 4 more; tags stand for moduli.
     """
@@ -124,13 +124,13 @@ def _scaled(moments: Array, gdim: int) -> Array:
 
 
 def _sums(values: Array, subdomain: Array, num: int, comm: MPI.Intracomm) -> Array:
-    """Sums over the cells of each subdomain. Collective."""
+    """Return sums over the cells of each subdomain. Collective."""
     total = np.zeros((num, values.shape[1]))
     np.add.at(total, subdomain, values)
     return summed(comm, total)
 
 
-# --- Which rank a subdomain belongs to --------------------------------------------------------
+# --- Assignment of subdomains to ranks --------------------------------------------------------
 
 # Of the time and memory of a subdomain that has factors of its own: what one more costs that
 # shares them. 0.32 was measured for plane squares of 10 000 nodes, 0.26 for cubes of 2197.
@@ -146,7 +146,7 @@ DIGITS = 9
 
 
 def dealt(mesh: UntornMesh, subdomain: Array, comm: MPI.Intracomm) -> Array:
-    """Rank of each subdomain, by what it is likely to cost. Collective.
+    """Return the rank of each subdomain, by what it is likely to cost. Collective.
 
     Subdomains that look equal but for a translation will share a factor, unless a modulus that
     only the forms know tells them apart, or options do; then ranks are balanced less well.
@@ -173,7 +173,7 @@ def dealt(mesh: UntornMesh, subdomain: Array, comm: MPI.Intracomm) -> Array:
 def deal_shared(
     cells: Array, centres: Array, shared: Sequence[Array], num_ranks: int, comm: MPI.Intracomm
 ) -> Array:
-    """Rank of each subdomain, in that of a few orders in which ranks share most. Collective.
+    """Return rank of each subdomain, in that of a few orders in which ranks share most. Collective.
 
     Args:
         cells: Cells of each subdomain, shape ``(N,)``.
@@ -196,7 +196,7 @@ def deal_shared(
 
 
 def _orders(centres: Array) -> list[tuple[Array, float]]:
-    """Coordinates to bisect by, and how much worse each is for the sake of short interfaces.
+    """Return coordinates to bisect by, and how much worse each is for the sake of short interfaces.
 
     Which of several sides that are as long as each other is cut across first is for the order of
     axes to say; sides that are a little shorter are made as long, too.
@@ -211,7 +211,7 @@ def _orders(centres: Array) -> list[tuple[Array, float]]:
 
 
 def costs(cells: Array, kinds: Array) -> Array:
-    """What subdomains cost, in cells: one of several that are equal pays its part of the factor.
+    """Return the cost of subdomains in cells; equal ones share that of their factor.
 
     Args:
         cells: Cells of each subdomain, shape ``(N,)``.
@@ -222,7 +222,7 @@ def costs(cells: Array, kinds: Array) -> Array:
 
 
 def dearest(ranks: Array, cells: Array, shared: Sequence[Array], num_ranks: int) -> float:
-    """What ranks cost that wait for each other, beside their mean if nothing were shared.
+    """Return the cost of the slowest ranks over the mean cost if nothing were shared.
 
     They wait after each thing, say K⁺ of all subdomains, of which a rank makes what equal ones
     share once.
@@ -243,7 +243,7 @@ def dearest(ranks: Array, cells: Array, shared: Sequence[Array], num_ranks: int)
 
 
 def deal(weights: Array, centres: Array, num_ranks: int) -> Array:
-    """Rank of each subdomain: neighbouring subdomains in chunks of about equal weight.
+    """Return the rank of each subdomain: neighbouring subdomains in chunks of about equal weight.
 
     Args:
         weights: Cells of each subdomain, shape ``(N,)``.
@@ -266,7 +266,7 @@ def deal(weights: Array, centres: Array, num_ranks: int) -> Array:
     return ranks
 
 
-# --- Cells and their nodes travel to the rank of their subdomain ------------------------------
+# --- Redistribution of cells and nodes --------------------------------------------------------
 
 
 def redistribute(
@@ -317,7 +317,7 @@ def _send_nodes(mesh: UntornMesh, destination: Array, comm: MPI.Intracomm) -> tu
     return node_ids, exchange.send(mesh.x[node])[first]
 
 
-# --- Tearing: every subdomain gets vertices of its own ----------------------------------------
+# --- Tearing ----------------------------------------------------------------------------------
 
 log = logging.getLogger(__name__)
 
@@ -366,7 +366,7 @@ def tear(
 def _torn_mesh(
     share: UntornMesh, subdomain: Array, comm: MPI.Intracomm
 ) -> tuple[dmesh.Mesh, Array]:
-    """The torn mesh, and the original id of each of its geometry nodes."""
+    """Return the torn mesh, and the original id of each of its geometry nodes."""
     local = np.searchsorted(share.node_ids, share.cells)
     copies = subdomain[:, None].astype(np.int64) * max(len(share.node_ids), 1) + local
     copies, torn = np.unique(copies, return_inverse=True)
@@ -378,7 +378,7 @@ def _torn_mesh(
 
 
 def _input_cells(mesh: dmesh.Mesh, num_cells: int) -> Array:
-    """Position of each local cell in the array that made the mesh."""
+    """Return the position of each local cell in the array that made the mesh."""
     return np.asarray(mesh.topology.original_cell_index) - offset_of(mesh.comm, num_cells)
 
 

@@ -11,8 +11,7 @@ from dolfinx import mesh as dmesh
 
 from tfeti_dolfinx.common.arrays import Array
 
-# --- Keys by which the same facet or node is recognised in different cells, subdomains and
-#     ranks ---
+# --- Keys of facets and nodes -----------------------------------------------------------------
 
 NO_TAG = np.iinfo(np.int32).min
 
@@ -26,7 +25,7 @@ def mix(ids: Array) -> Array:
 
 
 def set_key(ids: Array) -> Array:
-    """Key of a set of ids along the last axis, whatever their order.
+    """Return the key of a set of ids along the last axis, whatever their order.
 
     Two of N sets get the same key with probability N²/2⁶⁵.
     """
@@ -50,7 +49,7 @@ def facet_vertices(cell_type: dmesh.CellType) -> Array:
 
 
 def facet_keys(cells: Array, cell_type: dmesh.CellType) -> Array:
-    """Keys of all facets of the cells.
+    """Return keys of all facets of the cells.
 
     Args:
         cells: Node ids, vertices first, shape ``(n, nodes_per_cell)``.
@@ -79,7 +78,7 @@ def cell_facets(mesh: dmesh.Mesh) -> Array:
     return facets[: mesh.topology.index_map(tdim).size_local]
 
 
-# --- The untorn mesh as it comes in: cells that lie on any rank, with original node ids -------
+# --- The untorn mesh --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -144,7 +143,7 @@ class UntornMesh:
         return self.x[vertices]
 
     def neighbours(self, colours: Array | None = None) -> tuple[Array, Array]:
-        """Pairs of local cells that share a facet, and a colour if colours are given."""
+        """Return pairs of local cells that share a facet, and a colour if colours are given."""
         keys = facet_keys(self.cells, self.cell_type)
         first, second = equal_pairs(keys.ravel())
         first, second = first // keys.shape[1], second // keys.shape[1]
@@ -154,5 +153,5 @@ class UntornMesh:
         return first[same], second[same]
 
     def with_cells(self, **changes: Array) -> UntornMesh:
-        """The same mesh with other arrays."""
+        """Return the same mesh with other arrays."""
         return replace(self, **changes)  # type: ignore[arg-type]

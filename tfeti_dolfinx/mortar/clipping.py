@@ -50,7 +50,7 @@ class CommonParts:
 
 
 def common_parts(subject: Array, clip: Array) -> CommonParts:
-    """What pairs of intervals, or of convex polygons, have in common.
+    """Intersect pairs of intervals or of convex polygons.
 
     Args:
         subject: Vertices in order, shape ``(n, k, tdim)``.
@@ -71,7 +71,7 @@ def sizes(polygon: Array) -> Array:
 
 
 def contains(polygon: Array, y: Array) -> Array:
-    """Whether intervals or convex polygons contain a point each.
+    """Return whether intervals or convex polygons contain a point each.
 
     Args:
         polygon: Vertices in order, shape ``(n, k, tdim)``.
@@ -156,7 +156,7 @@ def _signed_area(polygon: Array, count: Array) -> Array:
 
 
 def _counterclockwise(polygon: Array) -> tuple[Array, Array]:
-    """The polygons, counterclockwise, and their areas."""
+    """Return the polygons, counterclockwise, and their areas."""
     area = _signed_area(polygon, np.full(len(polygon), polygon.shape[1]))
     turned = (area < 0.0)[:, None, None]
     return np.where(turned, polygon[:, ::-1], polygon), np.abs(area)

@@ -89,7 +89,7 @@ def _monomials(t: Array) -> Array:
 
 
 def _normal_equations(x: Array, normals: Array, axes: Array) -> tuple[Array, Array]:
-    """What the other vertices of each facet say of a and K at each of its vertices.
+    """Return the least-squares equations for a and K at each vertex, from the others' positions.
 
     Directions count as on the tangent plane, lengths as in space: then a circle has its own
     curvature, however far its points are apart.
@@ -139,7 +139,7 @@ def _on_facets(facets: Facets, axes: Array, S: Array, r: Array) -> Array:
 
 
 def _rotations(A: Array) -> Array:
-    """What turns tangents of one plane into those of another, from their products.
+    """Return the rotations of tangents of one plane to those of another, from their products.
 
     Of their projection it leaves out the strain.
 

@@ -17,7 +17,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mesh.untorn import cell_facets
 
-# --- Lagrange elements on facets, and which unknowns of a cell are those of its facets --------
+# --- Lagrange elements on facets --------------------------------------------------------------
 
 # vertices of a facet in the order of its polygon; DOLFINx numbers quadrilaterals as tensors
 POLYGON = {"interval": [0, 1], "triangle": [0, 1, 2], "quadrilateral": [0, 1, 3, 2]}
@@ -47,7 +47,7 @@ class FacetElement:
 
     @property
     def is_affine(self) -> bool:
-        """Whether all maps with these basis functions are affine."""
+        """True if all maps with these basis functions are affine."""
         return self.degree == 1 and self.facet != "quadrilateral"
 
     def values(self, xi: Array) -> Array:
@@ -64,7 +64,7 @@ class FacetElement:
 
 
 def from_first(x: Array) -> Array:
-    """Nodes of facets from the first one on, shape ``(n, nodes, d)``.
+    """Return nodes of facets from the first one on, shape ``(n, nodes, d)``.
 
     Tangents are sums of these times slopes: slopes add up to 0 but for rounding, which would turn
     a facet that is far from the origin.
@@ -97,12 +97,12 @@ def facet_dofs(cell: str, degree: int, variant: Any) -> Array:
     return np.array(table)
 
 
-# --- Facets of contact surfaces, as they travel between ranks ---------------------------------
+# --- Facets of contact surfaces ---------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class FacetKind:
-    """What all contact facets of a problem have in common.
+    """Cell type and elements that all contact facets of a problem have in common.
 
     Attributes:
         facet: interval, triangle or quadrilateral.
@@ -149,7 +149,7 @@ class Facets:
         return len(self.x)
 
     def sent(self, exchange: Exchange, rows: Array | None = None) -> Facets:
-        """The facets (or some rows of them) that an exchange brings here. Collective."""
+        """Return the facets (or some rows of them) that an exchange brings here. Collective."""
         chosen = slice(None) if rows is None else rows
         return Facets(*(exchange.send(getattr(self, f.name)[chosen]) for f in fields(self)))
 
@@ -220,7 +220,7 @@ def local_facets(dofs: TornDofs, decomposition: Decomposition, facets: Array) ->
 def with_averaged_normals(
     facets: Facets, dofs: TornDofs, num_vertices: int
 ) -> tuple[Facets, Array]:
-    """The same facets with normals averaged at the vertices, weighted by area. Collective.
+    """Return the same facets with normals averaged at the vertices, weighted by area. Collective.
 
     Returns:
         The facets, and the averaged normal of each owned group, 0 off them, shape ``(g, gdim)``.
@@ -274,7 +274,7 @@ def _normals(corners: Array, inside: Array) -> tuple[Array, Array]:
     return sign[:, None] * normal / np.where(length > 0.0, length, 1.0)[:, None], area
 
 
-# --- Maps from reference facets: points, areas, and back from a plane -------------------------
+# --- Maps of reference facets -----------------------------------------------------------------
 
 # Newton's method from the affine map: facets that are not folded take 3 or 4 steps. It ends at
 # rounding (of the facet's size); where it stalls above that, a point may still be as good as FAR.
@@ -343,7 +343,7 @@ def hat_areas(kind: FacetKind, facets: Facets) -> Array:
 
 
 def _areas(slopes: Array) -> Array:
-    """Length or area that tangents span, shape ``(m, tdim, d)`` to ``(m,)``."""
+    """Return the length or area that tangents span, shape ``(m, tdim, d)`` to ``(m,)``."""
     if slopes.shape[1] == 1:
         return np.linalg.norm(slopes[:, 0], axis=1)
     if slopes.shape[2] == 2:

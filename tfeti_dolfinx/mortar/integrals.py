@@ -109,7 +109,7 @@ def dual_multipliers(
 def integrate(
     kind: FacetKind, secondary: Facets, primary: Facets, segments: Segments
 ) -> MortarIntegrals:
-    """Integrals of the dual multipliers over segments."""
+    """Return integrals of the dual multipliers over segments."""
     at = segments.points
     dual = dual_multipliers(kind, secondary.area, at.secondary, at.xi, segments.weight)
     gap = curved_gap = _gaps(kind, secondary, primary, segments, dual)
@@ -138,7 +138,7 @@ def _gaps(
     dual: DualMultipliers,
     curved: bool = False,
 ) -> GapIntegrals:
-    """Gaps over segments, between the facets or the smooth surfaces that they stand for."""
+    """Return gaps over segments, between the facets or the smooth surfaces that they stand for."""
     normals = secondary.vertex_normals[dual.facet]
     at, corners = (
         _apart(kind, secondary, primary, of, curved) for of in (segments.points, segments.corners)

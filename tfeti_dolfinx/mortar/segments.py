@@ -22,7 +22,7 @@ from tfeti_dolfinx.mortar.facets import (
     reference_points,
 )
 
-# --- Orthonormal frames of contact nodes: a normal, then tangents -----------------------------
+# --- Orthonormal frames of contact nodes ------------------------------------------------------
 
 # |n_x| from which on the first tangent follows the y axis, not the x axis. By the hairy ball
 # theorem no choice of tangents is continuous everywhere; here the switch is where hardly a plane
@@ -68,7 +68,7 @@ def aligned(frame: Array, direction: Array) -> tuple[Array, Array]:
 
 
 def tangents(normal: Array) -> Array:
-    """Orthonormal tangents of unit normals, as close to coordinate axes as they can be.
+    """Return orthonormal tangents of unit normals, as close to coordinate axes as they can be.
 
     In 2D the normal turned left by a right angle. In 3D the x axis without its normal part (the
     y axis where the normal is within 26° of the x axis), and the normal times that. They are
@@ -91,7 +91,7 @@ def tangents(normal: Array) -> Array:
     return np.stack((first, np.cross(normal, first)), axis=1)
 
 
-# --- Which of several primary facets over one secondary facet it can meet ---------------------
+# --- Choice among primary facets over one secondary facet -------------------------------------
 
 # of a facet's size: distances closer than this are those of facets of one layer, apart by rounding
 SAME = 1e-9
@@ -132,7 +132,7 @@ def truly_overlapping(s: Array, distance: Array, facing: Array, length: Array, l
 def nearest(
     s: Array, distance: Array, length: Array, size: Array, whole: Array, look: Look
 ) -> Array:
-    """Pairs with no other primary facet before theirs.
+    """Return pairs with no other primary facet before theirs.
 
     Args:
         s: Secondary facet of each pair, shape ``(n,)``.
@@ -163,7 +163,7 @@ def pairs_over_one_facet(s: Array, first: Array, second: Array) -> tuple[Array, 
     return np.repeat(first, count), ordered[np.repeat(start, count) + offset]
 
 
-# --- Which facets of two surfaces may meet: rendezvous of ranks, then a tree on each ----------
+# --- Search for pairs of facets ---------------------------------------------------------------
 
 # asked of a tree at first, and twice as many where that was not all: facets of one size class have
 # about 20 neighbours within their radii
@@ -209,7 +209,7 @@ def rendezvous(
 
 
 def possible_pairs(secondary: Facets, primary: Facets, distance: float) -> tuple[Array, Array]:
-    """Pairs of facets that may meet when one looks along the secondary facets' normals.
+    """Find pairs of facets that may meet along the secondary facets' normals.
 
     A primary facet is found if it comes within a secondary facet's radius of the line through
     that facet's centre along its averaged normal, no farther than ``distance`` and the facets'
@@ -253,7 +253,7 @@ def centre_normals(facets: Facets) -> Array:
 def _march(
     tree: cKDTree, origin: Array, direction: Array, radius: Array, half_length: Array
 ) -> tuple[Array, Array]:
-    """Points of a tree within a radius of line segments: steps as long as nothing is near.
+    """Return points of a tree within a radius of line segments: steps as long as nothing is near.
 
     Args:
         tree: The points.
@@ -283,7 +283,7 @@ def _march(
 
 
 def _within(tree: cKDTree, x: Array, radius: Array) -> tuple[Array, Array]:
-    """Points of a tree within a radius of each x: row and point of each pair."""
+    """Return points of a tree within a radius of each x: row and point of each pair."""
     found: list[tuple[Array, Array]] = [(np.empty(0, dtype=np.int64),) * 2]
     rows, k = np.arange(len(x)), min(NEIGHBOURS, tree.n)
     while len(rows):
@@ -299,7 +299,7 @@ def _within(tree: cKDTree, x: Array, radius: Array) -> tuple[Array, Array]:
     return tuple(np.concatenate(part) for part in zip(*found, strict=True))
 
 
-# --- Segments: where facets of two surfaces face each other, and quadrature points there ------
+# --- Segments and their quadrature points -----------------------------------------------------
 
 # Facets whose normals make a larger angle than about 88 degrees with each other do not face: seen
 # from the side they have no common part but slivers, and rounding must not decide.
@@ -449,7 +449,7 @@ class _Planes:
         )
 
     def look(self, found: _Meetings) -> Look:
-        """Whether the primary facet of pair b lies over pair a's middle, and how far."""
+        """Return a function: is the primary facet of pair b over pair a's middle, and how far."""
         middle = found.parts.middle
 
         def at(a: Array, b: Array) -> tuple[Array, Array]:
@@ -462,7 +462,7 @@ class _Planes:
         return at
 
     def facing(self, found: _Meetings, pair: Array, y: Array) -> FacingPoints:
-        """What lies over points y of the planes on both facets of pairs, curved or not."""
+        """Return the points of both facets of pairs, curved or not, over points y of the planes."""
         s, p = found.s[pair], found.p[pair]
         element, there = self._kind.geometry, self._on_planes(self._primary.x[found.p], found.s)
         return FacingPoints(
@@ -479,11 +479,11 @@ class _Planes:
         return area / densities(element, self._nodes[s], at.xi)
 
     def _on_planes(self, x: Array, s: Array) -> Array:
-        """Coordinates on planes s: shape ``(n, v, gdim)`` to ``(n, v, gdim - 1)``."""
+        """Return coordinates on planes s: shape ``(n, v, gdim)`` to ``(n, v, gdim - 1)``."""
         return np.einsum("nvg,ntg->nvt", x - self._centre[s][:, None], self._tangents[s])
 
     def _distance(self, s: Array, p: Array, corners: Array, y: Array) -> Array:
-        """Distance along the normal at points y of the planes, p's vertices there given.
+        """Return distance along the normal at points y of the planes, p's vertices there given.
 
         From the vertices of the facets: it decides what meets what, and is no gap.
         """

@@ -41,7 +41,7 @@ def surface_facets(decomposition: Decomposition, name: str | int) -> Array:
 def hat_integrals(
     dofs: TornDofs, decomposition: Decomposition, names: Sequence[str | int], thickness: Any = 1.0
 ) -> Array:
-    """Integrals ∫φ_i of the hats of degree 1 over the union of surfaces. Collective.
+    """Return integrals ∫φ_i of the hats of degree 1 over the union of surfaces. Collective.
 
     Args:
         dofs: Dof maps of the displacement space, of any degree.
@@ -83,13 +83,13 @@ def surface_nodes(dofs: TornDofs, decomposition: Decomposition, facets: Array) -
 
 
 def group_points(dofs: TornDofs) -> Array:
-    """Coordinates of the owned groups, shape ``(g, 3)``. Collective."""
+    """Return coordinates of the owned groups, shape ``(g, 3)``. Collective."""
     x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node]
     return dofs.reduce(x, np.minimum, np.inf)
 
 
 def extent(decomposition: Decomposition, facets: Array) -> float:
-    """Length of the diagonal of a surface's box. Collective.
+    """Return the length of the diagonal of a surface's box. Collective.
 
     Args:
         decomposition: The torn mesh.
@@ -106,7 +106,7 @@ def extent(decomposition: Decomposition, facets: Array) -> float:
 
 
 def diameter(decomposition: Decomposition) -> float:
-    """Length of the diagonal of the mesh's box. Collective."""
+    """Return the length of the diagonal of the mesh's box. Collective."""
     return _diagonal(decomposition.mesh.geometry.x, decomposition.comm)
 
 

@@ -67,7 +67,7 @@ class Balanced:
         y.array[:] -= part.directions(part.moved(y.array_r) - part.energy * c)
 
     def dependent(self, x: Array) -> Array | None:
-        """As M_f says."""
+        """Return the dependent part of x that M_f finds, or None."""
         return self._on_face.dependent(x)
 
     def destroy(self) -> None:

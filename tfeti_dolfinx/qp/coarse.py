@@ -11,7 +11,7 @@ from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.common.parallel import bcast_from_root, summed
 from tfeti_dolfinx.qp.sets import Face
 
-# --- The constraint Gλ = e as solvers see it: orthogonal projectors, on all rows or on a face ---
+# --- The coarse space of Gλ = e ---------------------------------------------------------------
 
 # of the largest forces on an equation: those on a light one beside it count as so large at least,
 # since the rounding of the largest reaches them
@@ -49,7 +49,7 @@ class Coarse(Protocol):
         ...
 
     def forces(self, x: PETSc.Vec) -> Array:
-        """Sum of the moduli of the terms of each entry of the residual. Collective."""
+        """Return the sum of the moduli of the terms of each entry of the residual. Collective."""
         ...
 
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
@@ -102,7 +102,7 @@ class Coarse(Protocol):
         ...
 
     def on_face(self, face: Face) -> Coarse:
-        """The same constraint on (another) face of all rows. Collective."""
+        """Return the same constraint on (another) face of all rows. Collective."""
         ...
 
     def destroy(self) -> None:
@@ -111,7 +111,7 @@ class Coarse(Protocol):
 
 
 def imbalance(coarse: Coarse, x: PETSc.Vec) -> float:
-    """How far Gx is from e: the worst entry beside its terms, 1 at most. Collective."""
+    """Return the largest entry of Gx − e over the size of its terms, at most 1. Collective."""
     forces = coarse.forces(x)
     floor = max(LIGHT * float(forces.max(initial=0.0)), TINY)
     own = np.max(np.abs(coarse.residual(x)) / np.maximum(forces, floor), initial=0.0)
@@ -258,15 +258,14 @@ class DenseCoarse:
         x.array[:] = self._Gf.T @ mu
 
     def on_face(self, face: Face) -> DenseCoarse:
-        """The same G on a face."""
+        """Return the same G on a face."""
         return DenseCoarse(self._G, self.e, face)
 
     def destroy(self) -> None:
         """Nothing to free."""
 
 
-# --- Gλ = e where some multipliers follow others, as a Newton step on a law of friction sees
-#     it ---
+# --- Oblique projection of dependent multipliers ----------------------------------------------
 
 
 class Oblique(Protocol):
@@ -285,7 +284,7 @@ class Oblique(Protocol):
         ...
 
     def restoring(self, y: Array) -> Array:
-        """u = ZG_fᵀH⁺y, for which G(I + C)u = y if any u does that. Not collective."""
+        """Return u = ZG_fᵀH⁺y, which solves G(I + C)u = y if that is solvable. Not collective."""
         ...
 
 

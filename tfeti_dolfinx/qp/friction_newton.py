@@ -18,7 +18,7 @@ from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
 from tfeti_dolfinx.qp.recycling import RecycledOnFace, triangle
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
 
-# --- Generalised conjugate residuals: for operators that are not symmetric --------------------
+# --- Generalised conjugate residuals ----------------------------------------------------------
 
 # of Az: what earlier directions leave of it, less is rounding; and of the residual: what a
 # direction takes from it, or there is nothing to gain
@@ -41,17 +41,17 @@ class KrylovBasis:
 
     @staticmethod
     def nothing(like: Array) -> KrylovBasis:
-        """None, of vectors like one."""
+        """Return an empty basis of vectors like one."""
         return KrylovBasis(*(np.zeros((0, len(like))) for _ in range(3)))
 
     def without(self, c: Array, q: Array, z: Array, w: Array) -> tuple[Array, Array, Array]:
-        """A direction with its Az and image, less such parts of those that are known."""
+        """Orthogonalise a direction with its Az and image against the basis."""
         return q - c @ self.Q, z - c @ self.Z, w - c @ self.images
 
 
 @dataclass(frozen=True)
 class GCRResult:
-    """Where the directions have led from 0.
+    """Result of generalised conjugate residuals, started from 0.
 
     Attributes:
         u: The solution.
@@ -125,19 +125,18 @@ class _GrowingBasis:
 
     @property
     def rows(self) -> KrylovBasis:
-        """What there is."""
+        """The directions stored so far."""
         return KrylovBasis(*self._room[:, : self.count])
 
     def add(self, q: Array, z: Array, w: Array) -> None:
-        """Take one more."""
+        """Store another direction."""
         if self.count == self._room.shape[1]:
             self._room = np.concatenate((self._room, np.zeros_like(self._room)), axis=1)
         self._room[:, self.count] = q, z, w
         self.count += 1
 
 
-# --- A law of friction as solvers see it: sets of tangential multipliers that grow with
-#     normals ---
+# --- Laws of friction -------------------------------------------------------------------------
 
 # what sticks for once is moved so far to the centre of its disc
 INSIDE = 0.5
@@ -169,7 +168,7 @@ class Law:
         return feasible, feasible.project(y)
 
     def slips(self, face: Face) -> Array:
-        """Which points slip, flags of shape ``(p,)``."""
+        """Return the slipping points, flags of shape ``(p,)``."""
         return np.asarray(np.any(face.status[self.tangents] == Status.SLIP, axis=1))
 
     def following(self, p: Array, face: Face) -> csr_array:
@@ -194,7 +193,7 @@ class Law:
 
 @dataclass(frozen=True)
 class OnFace:
-    """What a step knows of a face: its directions, what follows them, where it is entered.
+    """Face of a Newton step: its directions, the coupling C of slips, a point to enter it at.
 
     Attributes:
         face: The face, hard directions held.
@@ -207,22 +206,22 @@ class OnFace:
     p: Array
 
     def followed(self, u: Array) -> Array:
-        """(I + C)u, shapes ``(m,)`` or ``(m, q)``."""
+        """Return (I + C)u, shapes ``(m,)`` or ``(m, q)``."""
         return np.asarray(u + self.C @ u)
 
     def entered(self, lam: Array) -> Array:
-        """λ with what is open or slips where p has it; what follows does so."""
+        """Return λ with open and slipping entries set to those of p, coupled ones following."""
         held = np.isin(self.face.status, (Status.OPEN, Status.SLIP))
         follows = np.diff(self.C.indptr) > 0
         return np.where(follows, self.C @ lam, np.where(held, self.p, lam))
 
     def bend(self, u: Array) -> Array:
-        """Z diag(κ) Zᵀu, shapes ``(m,)`` or ``(m, q)``."""
+        """Return Z diag(κ) Zᵀu, shapes ``(m,)`` or ``(m, q)``."""
         Z = self.face.Z
         return np.asarray(Z @ (self.face.curvature * (Z.T @ u).T).T)
 
 
-# --- What earlier solves with F tell a step of Newton's method on a law of friction -----------
+# --- Recycled directions of earlier solves ----------------------------------------------------
 
 # of the largest image of a direction: what others leave of one, less would be rounding
 NEW_DIRECTION = 1e-7
@@ -231,7 +230,7 @@ NEW_DIRECTION = 1e-7
 def known_on(
     past: RecycledOnFace | None, on: OnFace, project: Callable[[Array], Array]
 ) -> KrylovBasis | None:
-    """What is known of Au = P(F(I + C)u + κu): of directions W N = (I + C)U of earlier solves.
+    """Return known products Au = P(F(I + C)u + κu) from directions WN = (I + C)U of past solves.
 
     Farhat, Crivelli, Roux (``Recycled``); as Carvalho, Gratton, Lago, Vasseur, SIAM J. Sci.
     Comput. 33 (2011) 2463–2490 begin residuals. Multiplies by nothing. Collective.
@@ -260,7 +259,7 @@ def known_on(
 
 
 def keep(past: RecycledOnFace | None, x: Array, Fx: Array) -> None:
-    """Keep a direction that was gone, of Gx = 0, with what F makes of it. Collective."""
+    """Store a search direction x, Gx = 0, with Fx. Collective."""
     if past is None:
         return
     energy = bcast_from_root(past.known.comm, float(summed(past.known.comm, np.array([x @ Fx]))[0]))
@@ -268,7 +267,7 @@ def keep(past: RecycledOnFace | None, x: Array, Fx: Array) -> None:
         past.known.add(x, Fx, energy)
 
 
-# --- Newton's method on a law of friction whose bounds move with the forces of normals --------
+# --- Newton's method on a law of friction -----------------------------------------------------
 
 # steps; and steps in a row without a residual below so much of the least one, before one gives up
 MOST_STEPS, PATIENCE, LESS = 80, 10, 0.98
@@ -285,10 +284,10 @@ MOST_DIRECTIONS = 80
 # what a solve leaves of its residual: less where the last step has brought that far down; of the
 # target: no solve leaves less
 SHARE, FOLLOWED, FINAL = 0.3, 0.3, 0.3
-# of the target: what F makes of a way onto a face that is too short to be multiplied
+# relative to the target: ‖F‖‖p‖ of a correction p onto a face below which Fp is not computed
 UNSEEN = 0.1
-# of the residual: what the way may be at most for a direction beside it, which does not know what
-# F makes of the way
+# relative to the residual: ‖F‖‖p‖ of that correction up to which a search direction is added to it
+# for the same multiplication; the direction is chosen before Fp is known
 BESIDE = 2.0
 # times ‖F‖: directions that bend more are turned by the projection alone
 HARD = 10.0
@@ -309,7 +308,7 @@ class LawPoint:
     mu: Array
 
     def towards(self, other: LawPoint, length: float) -> LawPoint:
-        """The point so far along the way to another one."""
+        """Return the point at this share of the way to another one."""
         if length == 1.0:
             return other
         ends = (self.lam, other.lam), (self.s, other.s), (self.mu, other.mu)
@@ -317,7 +316,7 @@ class LawPoint:
 
 
 class SlipReversal:
-    """What slips, and where to, from step to step.
+    """Directions of slip of the last step, to detect points whose slip reverses.
 
     Args:
         law: The sets.
@@ -329,7 +328,7 @@ class SlipReversal:
         self._to: Array = np.zeros(law.tangents.shape)
 
     def face(self, feasible: FeasibleSet, p: Array, s: Array) -> tuple[Array, Face]:
-        """p and its face under s; what slipped the other way a step ago sticks."""
+        """Return p and its face under s; points whose slip has just reversed stick."""
         law, face, to = self._law, feasible.face(p, s), p[self._law.tangents]
         turned = law.slips(face) & self._slips & (np.sum(to * self._to, axis=1) < 0.0)
         if np.any(turned):
@@ -400,7 +399,7 @@ def newton_on_law(
 
 
 def _searched(qp: QP, law: Law, at: LawPoint, end: LawPoint, norm: float, most: float) -> LawPoint:
-    """The farthest of the whole step, half of it, … that does not raise the residual.
+    """Halve the step until it does not raise the residual.
 
     Where F is known of both ends, it is on all of the way: nothing is multiplied.
     """
@@ -501,7 +500,7 @@ class _System:
         self._known = known_on(qp.recycled, on, oblique.project)
 
     def enter(self, length: float, norm: float, seen: float) -> None:
-        """What F makes of the way onto the face, where it is more than what is to be seen.
+        """Multiply F by the correction onto the face, where its image exceeds ``seen``.
 
         Beside it goes a first direction, for the same multiplication, so far as those before went;
         but not beside a way that may be more than what is to be solved for.
@@ -541,7 +540,7 @@ class _System:
         return gone.length
 
     def end(self) -> LawPoint:
-        """Where one is; frees what was made."""
+        """Return the present point, and free work vectors."""
         mu = self._oblique.coordinates(self._s + self._on.bend(self._u))
         self._qp.coarse.combine(mu, self._work)
         at = LawPoint(self._lam, self._s - self._work.array_r, self._mu + mu)
@@ -551,7 +550,7 @@ class _System:
         return at
 
     def _solve(self, size: float) -> GCRResult:
-        """Bring the residual down to a size; without one by known directions alone."""
+        """Reduce the residual to a size; without a size by known directions alone."""
         b, known = self._left(), self._known
         gone = gcr(self._apply, self._precondition, b, size, MOST_DIRECTIONS, self._comm, known)
         self._go(gone.u, gone.image)
@@ -562,7 +561,7 @@ class _System:
         self._s = self._s + image
 
     def _left(self) -> Array:
-        """The residual."""
+        """Return the residual."""
         return -self._oblique.project(self._s + self._on.bend(self._u))
 
     def _apply(self, z: Array) -> tuple[Array, Array]:
@@ -574,7 +573,7 @@ class _System:
 
 
 def _on_arrays(A: Operator | FaceOperator, like: PETSc.Vec) -> Callable[[Array], Array]:
-    """An operator between this rank's parts of vectors."""
+    """Return an operator between this rank's parts of vectors."""
 
     def mult(values: Array) -> Array:
         x, y = like.duplicate(), like.duplicate()

@@ -21,7 +21,7 @@ ROUNDING, STRANGE = 1e-14, 1e8
 
 @dataclass(frozen=True)
 class OperatorProduct:
-    """A vector and what F makes of it, so that F need not be asked again.
+    """Vector x with the product Fx.
 
     Attributes:
         x: The vector.
@@ -47,7 +47,7 @@ def operator_product(F: Operator, x: PETSc.Vec) -> OperatorProduct:
 
 
 class LastProduct:
-    """The last solution of a program, and what F makes of it."""
+    """Last solution x of a program, with the product Fx."""
 
     def __init__(self) -> None:
         nothing: Array = np.zeros(0)
@@ -55,11 +55,11 @@ class LastProduct:
         self._looked, self._within = (nothing, nothing), 0.0
 
     def look(self, x: PETSc.Vec, g: Array) -> None:
-        """Take a point of the program, and its Fx − d, as a look at its displacement makes it."""
+        """Store a point of the program with Fx − d, as an assessment computes it."""
         self._looked = (np.array(x.array_r), g)
 
     def keep(self, result: QPResult, qp: QP) -> None:
-        """Take a solution, whose gradient is Fx − d − Gᵀμ, or as a look has made it. Collective.
+        """Store a solution with its gradient Fx − d − Gᵀμ, or that of an assessment. Collective.
 
         So what steps leave out of the gradient does not grow from solve to solve.
         """
@@ -72,26 +72,26 @@ class LastProduct:
         by_mu.destroy()
 
     def pass_on(self, x: Array, Fx: Array, within: float) -> None:
-        """Take what another solver has come to; it stands for what is so near to it, too."""
+        """Store another solver's x and Fx, to stand for all vectors within this distance."""
         self._x, self._Fx, self._within = x, Fx, within
 
     def known(self, comm: MPI.Intracomm, x: Array) -> Array:
-        """What F makes of x on this rank; empty if x is not the last solution. Collective."""
+        """Return this rank's Fx, or an empty array if x is not the last solution. Collective."""
         found = not any_rank(comm, not np.array_equal(self._x, x))
         return np.array(self._Fx) if found else np.zeros(0)
 
     def take(self, comm: MPI.Intracomm, x: Array, Fx: Array) -> None:
-        """Take what ``known`` has returned in another run. Collective."""
+        """Restore what ``known`` has returned in another run. Collective."""
         if any_rank(comm, Fx.size > 0):
             self._x, self._Fx = x, Fx
 
     def is_of(self, d: PETSc.Vec, e: Array) -> bool:
-        """Whether it was kept from a program with this d and e. Collective."""
+        """Return whether it was kept from a program with this d and e. Collective."""
         same = np.array_equal(self._d, d.array_r) and np.array_equal(self._e, e)
         return not any_rank(d.getComm().tompi4py(), not same)
 
     def image(self, F: Operator, x: PETSc.Vec) -> OperatorProduct:
-        """As ``image``, but nothing is multiplied if x is the last solution. Collective."""
+        """Return x with Fx; multiply by F only if x is not the last solution. Collective."""
         comm = x.getComm().tompi4py()
         known = self._Fx if self._is_near(comm, x.array_r) else self.known(comm, x.array_r)
         if not any_rank(comm, known.size > 0):
@@ -101,7 +101,7 @@ class LastProduct:
         return OperatorProduct(x, Fx)
 
     def _is_near(self, comm: MPI.Intracomm, x: Array) -> bool:
-        """Whether what was passed on stands for x. Collective."""
+        """Return whether the stored product may stand for that of x. Collective."""
         if self._within == 0.0 or any_rank(comm, x.shape != self._x.shape):
             return False
         return norm_over(comm, x - self._x) <= self._within
@@ -115,7 +115,7 @@ def natural(coarse: Coarse, like: PETSc.Vec) -> PETSc.Vec:
 
 
 def restored(coarse: Coarse, lam: PETSc.Vec) -> PETSc.Vec:
-    """The nearest solution of Gλ̄ = e to λ: λ + Gᵀ(GGᵀ)⁻¹(e − Gλ). Collective."""
+    """Return the nearest solution of Gλ̄ = e to λ: λ + Gᵀ(GGᵀ)⁻¹(e − Gλ). Collective."""
     x, fixed = lam.copy(), natural(coarse, lam)
     coarse.project(x)
     x.axpy(1.0, fixed)
@@ -125,7 +125,7 @@ def restored(coarse: Coarse, lam: PETSc.Vec) -> PETSc.Vec:
 
 @dataclass(frozen=True)
 class Scale:
-    """How large residuals are at the start, and what rounding leaves of them.
+    """Norm of the residual at the start, and its rounding error.
 
     Attributes:
         reference: b₀ = ‖P(d − F λ̄₀)‖ with λ̄₀ = Gᵀ(GGᵀ)⁻¹e.
@@ -137,12 +137,12 @@ class Scale:
 
 
 def scale_at(qp: QP, start: OperatorProduct) -> Scale:
-    """The scale of a program whose λ̄₀ is known with its image. Collective."""
+    """Return the scale of a program whose λ̄₀ is known with its image. Collective."""
     return Scale(_projected(qp, start.Fx, qp.d), _rounding(qp, start))
 
 
 def scale_near(qp: QP, at: OperatorProduct) -> Scale:
-    """A scale from another solution of Gλ̄ = e, if F λ̄₀ is not known. Collective.
+    """Return a scale from another solution of Gλ̄ = e, if F λ̄₀ is not known. Collective.
 
     ‖P d‖ and ‖P F λ‖ are equal at the solution, and b₀ is ‖P d‖ where e = 0; the larger one.
     """
@@ -151,7 +151,7 @@ def scale_near(qp: QP, at: OperatorProduct) -> Scale:
 
 
 def _rounding(qp: QP, at: OperatorProduct) -> float:
-    """What rounding leaves of g^P, which has nothing of gaps that stay open, however wide."""
+    """Estimate the rounding error of ‖g^P‖, to which open gaps, however wide, do not count."""
     s = at.Fx.copy()
     s.axpy(-1.0, qp.d)
     qp.coarse.project(s)
@@ -181,7 +181,7 @@ class Homogenised:
     scale: Scale
 
     def is_rounding(self, residual: float) -> bool:
-        """Whether a residual is so small that rounding explains what is strange about it."""
+        """Return whether a residual is so small that its behaviour may be due to rounding."""
         return residual <= STRANGE * self.scale.rounding
 
     def destroy(self) -> None:

@@ -23,7 +23,7 @@ from tfeti_dolfinx.qp.problem import (
 )
 from tfeti_dolfinx.qp.sets import Face
 
-# --- The norm of PFP, which step lengths are relative to --------------------------------------
+# --- Estimate of ‖PFP‖ ------------------------------------------------------------------------
 
 # an off-diagonal entry this small in units of the norm ends the method: the space is exhausted
 EXHAUSTED = 1e-12
@@ -73,12 +73,11 @@ def estimate_norm(F: Operator, coarse: Coarse, like: PETSc.Vec, steps: int = 15)
 
 
 def _size(diagonal: list[float], beside: list[float]) -> float:
-    """Size of the entries so far; 0 before the first step, whose vector may have any length."""
+    """Return the size of the entries so far; 0 before the first step."""
     return max(diagonal) + max(beside[1:]) if diagonal else 0.0
 
 
-# --- Directions of conjugate gradients that are kept, so that rounding does not undo what
-#     they did ---
+# --- Store of conjugate directions ------------------------------------------------------------
 
 # of the largest curvature of a direction, and of what the preconditioner makes of a residual: less
 # is rounding, as where rows depend on each other
@@ -108,16 +107,16 @@ class Conjugates:
         self._count = 0
 
     def clear(self) -> None:
-        """Forget them."""
+        """Drop all directions."""
         self._count = 0
 
     @property
     def number(self) -> int:
-        """How many there are."""
+        """Number of directions kept."""
         return min(self._count, self._most)
 
     def products(self, z: Array) -> Array:
-        """This rank's part of PFp_i·z, shape ``(k,)``."""
+        """Return this rank's part of PFp_i·z, shape ``(k,)``."""
         return np.asarray(self._PFp[: self.number] @ z)
 
     def take_away(self, z: Array, products: Array) -> None:
@@ -125,7 +124,7 @@ class Conjugates:
         z -= (products / self._pFp[: self.number]) @ self._p[: self.number]
 
     def keep(self, p: Array, PFp: Array, pFp: float) -> None:
-        """Keep another one, in the place of the oldest if there are too many."""
+        """Store another direction, in the place of the oldest if there are too many."""
         at = self._count % self._most
         if at == len(self._pFp):
             more = min(max(len(self._pFp), 8), self._most - len(self._pFp))
@@ -139,7 +138,7 @@ class Conjugates:
 
 
 class Directions:
-    """What PCPG remembers, so that it can go on where it has stopped.
+    """State of PCPG between calls, from which it continues where it stopped.
 
     Args:
         like: A vector of the right layout.
@@ -159,7 +158,7 @@ class Directions:
         self.kept = Conjugates(like)
 
     def seen(self, pFp: float, pp: float, short: bool = False) -> bool:
-        """Whether a direction has a curvature that stands out from rounding.
+        """Update the estimate of ‖F‖; return whether pᵀFp is positive beyond rounding.
 
         Of a short step, which may be rounding of Gλ = e, F makes far too much to learn ‖F‖ from.
         """
@@ -168,7 +167,7 @@ class Directions:
         return pFp > FLAT * self.norm * pp
 
     def stands_out(self, rz: float, rr: float) -> bool:
-        """Whether the preconditioner leaves something of a residual."""
+        """Return whether rᵀz, z the preconditioned residual, is positive beyond rounding."""
         self.helped = max(self.helped, rz / rr if rr > 0.0 else 0.0)
         return rz > FLAT * self.helped * rr
 
@@ -178,7 +177,7 @@ class Directions:
             vec.destroy()
 
 
-# --- Whether conjugate gradients still get anywhere -------------------------------------------
+# --- Detection of stagnation ------------------------------------------------------------------
 
 # so many steps in which neither ‖r‖ comes down to a half nor q by what stands out from its rounding
 # have met rounding: at that pace 10 000 steps would bring 6 digits at best; twice as many as there
@@ -187,7 +186,7 @@ PLATEAU, FEW, ROUNDING = 500, 20, 1e-15
 
 
 class Plateau:
-    """Whether residuals and q still come down.
+    """Detection of stagnation: neither residuals nor q decrease.
 
     Args:
         norm: ‖r‖ at the start.
@@ -199,13 +198,13 @@ class Plateau:
         self._best, self._steps, self._gain, self._restarted = norm, 0, 0.0, False
 
     def step(self, norm: float, gain: float) -> None:
-        """A step has lowered q by so much, and ends with that ‖r‖."""
+        """Record a step that lowers q by ``gain`` and ends with ‖r‖ = ``norm``."""
         self._steps, self._gain = self._steps + 1, self._gain + gain
         if norm <= 0.5 * self._best:
             self._best, self._steps, self._gain, self._restarted = norm, 0, 0.0, False
 
     def ended(self, qp: QP, point: Point) -> bool:
-        """Whether there was none for long. Collective where there were many steps."""
+        """Return whether nothing has decreased for long. Collective if many steps were made."""
         if self._steps < self._most:
             return False
         sizes = abs(point.lam.dot(point.g)) + abs(point.lam.dot(qp.d))
@@ -215,12 +214,12 @@ class Plateau:
         return ended
 
     def once_more(self) -> bool:
-        """Whether this is the first time since ‖r‖ came down."""
+        """Return whether this is the first restart since ‖r‖ decreased."""
         first, self._restarted = not self._restarted, True
         return first
 
 
-# --- PCPG: preconditioned conjugate projected gradients, for programs without inequalities ----
+# --- PCPG: preconditioned conjugate projected gradients ---------------------------------------
 
 # of rᵀz, which is rᵀp as long as r is orthogonal to all directions before; else CG begins anew
 DRIFTED = 0.5
@@ -407,7 +406,7 @@ def solve_by_pcpg(
 def _with_new_gradients(
     qp: QP, point: Point, rule: StoppingRule, steps: Steps, max_it: int, monitor: Monitor
 ) -> ConvergedReason:
-    """PCPG, which begins anew where directions end, as long as that brings a digit. Collective.
+    """Run PCPG, restarted where directions end as long as that gains a digit. Collective.
 
     Rounding of g at a λ that bends subdomains much farther than the solution does may end them.
     """
@@ -423,17 +422,17 @@ def _with_new_gradients(
 
 
 def _face(qp: QP, lam: PETSc.Vec, g: PETSc.Vec) -> Face:
-    """The face of λ."""
+    """Return the face of λ."""
     return qp.feasible.face(lam.array_r, g.array_r)
 
 
 def _examined(qp: QP, point: Point, rule: StoppingRule, norm: float) -> ConvergedReason:
-    """What the rule says of the point."""
+    """Apply the stopping rule to the point."""
     return rule.examine(point.lam, point.g, _face(qp, point.lam, point.g), norm)
 
 
 def _begun(qp: QP, point: Point, own: Directions) -> float:
-    """Go where q is least along directions of earlier solves; make r there. Its norm."""
+    """Minimise q over directions of earlier solves; compute r there, and return ‖r‖."""
     norm = _residual(qp, point.g, own.r)
     past = qp.recycled
     if past is not None and past.go(point.lam, point.g, own.r, qp.coarse.project):

@@ -25,7 +25,7 @@ from tfeti_dolfinx.qp.problem import (
 )
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status, face_of
 
-# --- Steps of MPGP on curved sets: along the face with its tangents, and projected ones -------
+# --- Tangent and projected steps of MPGP ------------------------------------------------------
 
 # Conjugate gradients on a face: what they reduce the residual to, and most of them. One more
 # multiplication then brings the point back to the boundary. Measured on the cube of tresca_3d.py,
@@ -39,7 +39,7 @@ TANGENTIAL = 0.5
 
 
 class TangentIterate(Protocol):
-    """What is asked of an iterate."""
+    """Protocol of an iterate that tangent steps need."""
 
     A: Operator
     x: PETSc.Vec
@@ -142,7 +142,7 @@ class _FaceGradients:
         return wanted <= room and residual > self._target and self.steps < MOST_STEPS
 
     def _room(self) -> float:
-        """How far rows that do not slip may go along p."""
+        """Return the largest feasible step along p, rows that do not slip alone."""
         x = self._state.x.array_r + self.d.array_r
         p = np.where(self._inside, self._p.array_r, 0.0)
         own = self._state.feasible.max_step(np.where(self._inside, x, self._state.x.array_r), -p)
@@ -154,7 +154,7 @@ class _FaceGradients:
             vec.destroy()
 
 
-# --- Preconditioning in face: an approximate inverse on the free rows, 0 on the others --------
+# --- Preconditioning in face ------------------------------------------------------------------
 
 
 class MaskedPreconditioner:
@@ -229,13 +229,13 @@ class MaskedPreconditioner:
 
 
 def masked(qp: QP, rho: float) -> MaskedPreconditioner | None:
-    """The preconditioner of PFP + ρQ on faces of a program; None if it has none."""
+    """Return the preconditioner of PFP + ρQ on faces of a program; None if it has none."""
     if qp.preconditioner_on is None:
         return None
     return MaskedPreconditioner(qp.preconditioner_on, qp.coarse, rho, qp.d)
 
 
-# --- MPRGP, modified proportioning with reduced gradient projections; MPGP on curved sets -----
+# --- MPRGP and MPGP ---------------------------------------------------------------------------
 
 StoppingTest = Callable[["MprgpIterate"], bool]
 Expansion = Callable[["MprgpIterate", float, float, float], None]
@@ -295,12 +295,12 @@ class MprgpIterate:
         return float(self._comm.allreduce(own))
 
     def max_step(self, p: PETSc.Vec) -> float:
-        """Largest α with x − α p ∈ Ω."""
+        """Return the largest α with x − α p ∈ Ω."""
         own = self.feasible.max_step(self.x.array_r, p.array_r)
         return float(self._comm.allreduce(own, op=MPI.MIN))
 
     def face(self) -> Face:
-        """The face of x."""
+        """Return the face of x."""
         return self.feasible.face(self.x.array_r, self.g.array_r)
 
     def move(self, alpha: float, p: PETSc.Vec, Ap: PETSc.Vec) -> None:
@@ -416,7 +416,7 @@ def mprgp(
     >>> A = PETSc.Mat().createDense((2, 2), array=np.diag([1.0, 2.0]), comm=PETSc.COMM_SELF)
     >>> x = PETSc.Vec().createWithArray(np.zeros(2), comm=PETSc.COMM_SELF)
     >>> g = PETSc.Vec().createWithArray(np.array([-3.0, 4.0]), comm=PETSc.COMM_SELF)  # Ax − b
-    >>> state, steps = Iterate(A, x, g, Bounds()), Steps()
+    >>> state, steps = MprgpIterate(A, x, g, Bounds()), Steps()
     >>> mprgp(state, MprgpParameters(0.9), lambda s: s.projected_gradient <= 1e-9, steps, 100)
     >>> x.array.round(6).tolist(), steps.inner > 0
     ([3.0, 0.0], True)

@@ -41,7 +41,7 @@ from tfeti_dolfinx.qp.problem import (
 from tfeti_dolfinx.qp.projection import UNBALANCED, project_onto_feasible, project_or_least
 from tfeti_dolfinx.qp.sets import Face
 
-# --- The iterate of block Newton: what it lacks to be optimal, and which face it wants --------
+# --- The iterate: optimality and choice of the face -------------------------------------------
 
 # of Fλ − d: where Gᵀμ is nearly all of it, as where gaps are large, it is taken out of d
 MOST = 0.1
@@ -55,7 +55,7 @@ LOST, FAR = 2e-15, 1e3
 
 
 class NewtonIterate:
-    """A feasible point, with what it lacks to be optimal.
+    """Feasible iterate with its optimality residuals.
 
     Args:
         qp: The program.
@@ -89,7 +89,7 @@ class NewtonIterate:
         self.idle = self.slow = 0
 
     def face(self) -> Face:
-        """The face of λ."""
+        """Return the face of λ."""
         return self.qp.feasible.face(self.point.lam.array_r, self.s.array_r)
 
     def pressed_face(self) -> Face:
@@ -165,7 +165,7 @@ class NewtonIterate:
         self.s.copy(self.point.g)
 
     def wanted_face(self, gamma: float, faces: FaceSolver) -> Face:
-        """What carries force, and what wants to, if that is most of what is wrong.
+        """Choose the next face: the free set, released by the chopped gradient if that dominates.
 
         The rest is what PCPG has left on the face, if it has stopped at λ.
         """
@@ -184,28 +184,28 @@ class NewtonIterate:
         return self.face()
 
     def begun(self, face: Face) -> tuple[Point, Face]:
-        """Where the solve on a face starts, and on which: λ, or ``back`` where more slips there."""
+        """Return start and face of a solve: λ, or ``back`` where more points slip there."""
         back = self.point.lam if self.back is None else self.back
         return slipping_start(self.qp, self.point, face, back, self.pressed_face())
 
     @property
     def stalled(self) -> bool:
-        """Whether q and ‖g^P‖ have not come down any more for long."""
+        """True if neither q nor ‖g^P‖ has decreased for long."""
         return bcast_from_root(self.comm, self.idle >= PATIENCE or self.slow >= LONG)
 
     def take(self, to: Point, gain: float) -> None:
-        """Go there; a gain that stands out from the rounding of q is worth more steps."""
+        """Move to a point where q is lower by ``gain``."""
         self.went_down(gain)
         self.point.take(to)
 
     def went_down(self, gain: float) -> None:
-        """See whether q came down by what is no rounding of it."""
+        """Reset the count of idle steps if q falls by more than its rounding."""
         sizes = abs(self.point.lam.dot(self.point.g)) + abs(self.point.lam.dot(self.qp.d))
         if gain > (0.0 if self.residual > FAR * self.rounding else ROUNDING * sizes):
             self.idle = 0
 
     def gain(self, to: Point) -> float:
-        """q(λ) − q(to), by differences, and without what Gλ = e makes constant. Collective."""
+        """Return q(λ) − q(to), without terms that Gλ = e makes constant. Collective."""
         apart, gradient = to.lam.copy(), to.g.copy()
         apart.axpy(-1.0, self.point.lam)
         gradient.axpy(-1.0, self.point.g)
@@ -216,7 +216,7 @@ class NewtonIterate:
         return value
 
     def result(self, reason: ConvergedReason, steps: Steps) -> QPResult:
-        """The answer; takes λ and s over."""
+        """Return the result; takes λ and s over."""
         moved = self.point.lam.copy()
         moved.axpy(-1.0, self._homogenised.lam_bar)
         equality = self.qp.coarse.norm_Q(moved)
@@ -242,7 +242,7 @@ class NewtonIterate:
                 vec.destroy()
 
 
-# --- Where block Newton goes: a step is accepted where q falls enough -------------------------
+# --- Globalisation: acceptance of steps -------------------------------------------------------
 
 # of what the gradient step promises at least, (ᾱ/2)‖g^P‖²: a step must lower q by that share
 ENOUGH = 0.1
@@ -257,13 +257,13 @@ FEW_ROUNDS = 10
 
 
 def _enough(state: NewtonIterate) -> float:
-    """What a step has to lower q by."""
+    """Return the sufficient decrease of q that a step must reach."""
     known = np.isfinite(state.residual)
     return ENOUGH * 0.5 / state.norm * state.residual**2 if known else 0.0
 
 
 def longer(state: NewtonIterate, trial: Trial, faces: FaceSolver) -> Trial:
-    """Solve on where the face has changed under way, and stays, but q is not low enough.
+    """Continue the solve if the face changed under way, now stays, but q is not low enough.
 
     What restores Gλ = e after rows are dropped raises q; some more steps of conjugate gradients
     lower it again. Collective.
@@ -292,7 +292,7 @@ def longer(state: NewtonIterate, trial: Trial, faces: FaceSolver) -> Trial:
 
 
 def _face_at(state: NewtonIterate, at: Point, faces: FaceSolver) -> Face:
-    """The face of a point, with multipliers of the face entered."""
+    """Return the face of a point, with multipliers of the face entered."""
     s = gradient_on(state.qp, faces.coarse, at.g)
     face = state.qp.feasible.face(at.lam.array_r, s.array_r)
     s.destroy()
@@ -340,7 +340,7 @@ def accept(state: NewtonIterate, trial: Trial, faces: FaceSolver) -> bool:
 def _shortened(
     state: NewtonIterate, trial: Trial, length: float, curved: bool, enough: float
 ) -> bool:
-    """Go a part of the first solve's way, if q falls enough there."""
+    """Take the feasible part of the first solve's step if q falls enough there."""
     shorter, held = part_of_way(state.point, trial.first, PAST * length), length > 0.0
     if curved:
         held = brought_back(state.qp, trial.face, shorter) and held
@@ -350,7 +350,7 @@ def _shortened(
 
 
 def _went_to(state: NewtonIterate, to: Point, enough: float, may: bool = True) -> bool:
-    """Go there if q falls enough; the point is taken over."""
+    """Accept a point if q falls enough; it is taken over."""
     gain = state.gain(to)
     taken = bcast_from_root(state.comm, may and gain >= enough)
     if taken:
@@ -360,7 +360,7 @@ def _went_to(state: NewtonIterate, to: Point, enough: float, may: bool = True) -
 
 
 def _descend(state: NewtonIterate, known: bool, faces: FaceSolver) -> bool:
-    """The projected gradient step, or the part of it where q is least."""
+    """Take the projected gradient step, or the part of it where q is least."""
     if not known:
         state.look(faces)
     assert state.back is not None
@@ -381,7 +381,7 @@ def _descend(state: NewtonIterate, known: bool, faces: FaceSolver) -> bool:
     return moved
 
 
-# --- Block Newton: faces of Ω one after the other, each by PCPG, with a cost that falls -------
+# --- Block Newton -----------------------------------------------------------------------------
 
 
 def first_point(qp: QP) -> PETSc.Vec:
@@ -404,7 +404,7 @@ def first_point(qp: QP) -> PETSc.Vec:
 
 
 def _open(qp: QP, face: Face) -> PETSc.Vec | None:
-    """The least λ on a face, None where it does not balance the load."""
+    """Return the least λ on a face, or None if it does not balance the load."""
     coarse, lam = qp.coarse.on_face(face), qp.d.duplicate()
     coarse.particular(lam)
     held = imbalance(coarse, lam) <= HELD
@@ -449,12 +449,12 @@ def newton(
     >>> import numpy as np
     >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
     >>> from tfeti_dolfinx.qp.sets import Bounds
-    >>> from tfeti_dolfinx.qp.homogenised import homogenise, image
+    >>> from tfeti_dolfinx.qp.homogenised import homogenise, operator_product
     >>> from tfeti_dolfinx.qp.problem import ResidualRule
     >>> F = PETSc.Mat().createDense((3, 3), array=np.diag([1.0, 2.0, 4.0]), comm=PETSc.COMM_SELF)
     >>> d = PETSc.Vec().createWithArray(np.array([1.0, -1.0, 2.0]), comm=PETSc.COMM_SELF)
     >>> qp = QP(F, d, DenseCoarse(np.ones((1, 3)), np.ones(1)), Bounds())
-    >>> start = homogenise(qp, image(F, first_point(qp)))
+    >>> start = homogenise(qp, operator_product(F, first_point(qp)))
     >>> result = newton(qp, start, ResidualRule(1e-10))
     >>> result.reason.name, result.lam.array.round(6).tolist()
     ('CONVERGED_RTOL', [0.6, 0.0, 0.4])

@@ -28,12 +28,12 @@ from tfeti_dolfinx.qp.problem import (
 from tfeti_dolfinx.qp.projection import WithinFace, project_onto_feasible, project_within_face
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status, without_slip
 
-# --- What solves on faces hand to the iterate of block Newton ---------------------------------
+# --- Result of solves on faces ----------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What solves on faces have come to.
+    """Result of the solves on faces of one Newton step.
 
     Attributes:
         first: Where the first one ended, maybe outside of Ω.
@@ -61,7 +61,7 @@ class Trial:
         self.last.destroy()
 
 
-# --- Faces that are curved, as where nodes slip: what block Newton does there besides ---------
+# --- Curved faces -----------------------------------------------------------------------------
 
 # of Gλ = e: what is left after a first try to restore it, as where rows hardly hold, is worth a
 # second one
@@ -74,7 +74,7 @@ PARTS = (0.5, 0.125)
 
 
 class CurvedHessian:
-    """F + Z diag(κ) Zᵀ: along a face that bends, to second order, q has this Hessian.
+    """Hessian F + Z diag(κ) Zᵀ of q along a curved face, to second order.
 
     Args:
         F: The operator.
@@ -95,18 +95,18 @@ class CurvedHessian:
 
 
 def is_curved(qp: QP, face: Face) -> bool:
-    """Whether a row of some rank slips along a boundary. Collective."""
+    """Return whether a row of some rank slips along a boundary. Collective."""
     return any_rank(qp.d.getComm().tompi4py(), face.curved)
 
 
 def has_friction_rows(qp: QP, face: Face) -> bool:
-    """Whether a row of some rank sticks or slips. Collective."""
+    """Return whether a row of some rank sticks or slips. Collective."""
     rubbing = np.isin(face.status, (Status.STICK, Status.SLIP))
     return any_rank(qp.d.getComm().tompi4py(), bool(np.any(rubbing)))
 
 
 def has_left(qp: QP, face: Face, x: Array) -> bool:
-    """Whether rows that do not slip are outside of Ω. Collective."""
+    """Return whether rows that do not slip are outside of Ω. Collective."""
     left = without_slip(face, qp.feasible.project(x) - x)
     return any_rank(qp.d.getComm().tompi4py(), bool(np.any(left != 0.0)))
 
@@ -137,18 +137,18 @@ def _restored_once(qp: QP, coarse: Coarse, face: Face, lam: PETSc.Vec) -> PETSc.
 
 
 def imbalance_on(qp: QP, coarse: Coarse, face: Face, lam: PETSc.Vec) -> float:
-    """How far Gλ is from e: the worst entry beside its terms, 1 at most. Collective."""
+    """Return the largest entry of Gλ − e over the size of its terms, at most 1. Collective."""
     return imbalance(qp.coarse if _is_beside(face, lam) else coarse, lam)
 
 
 def _is_beside(face: Face, lam: PETSc.Vec) -> bool:
-    """Whether λ is not 0 in directions that are not the face's, as where rows slip."""
+    """Return whether λ has a part outside the face's directions, as where rows slip."""
     fixed = lam.array_r - face.restricted(lam.array_r)
     return any_rank(lam.getComm().tompi4py(), bool(np.any(fixed)))
 
 
 def face_with_curvature(qp: QP, coarse: Coarse, face: Face, on: Array, g: PETSc.Vec) -> Face:
-    """A face with the curvature that belongs to another gradient. Collective.
+    """Return a face with the curvature κ of another gradient. Collective.
 
     Args:
         qp: The program.
@@ -172,7 +172,7 @@ def gradient_on(qp: QP, coarse: Coarse, g: PETSc.Vec) -> PETSc.Vec:
 
 
 def slipping_work(lam: PETSc.Vec, s: PETSc.Vec, face: Face) -> float:
-    """Σ|s_iλ_i| over what slips, where both are large: rounding of it hides changes of q.
+    """Return Σ|s_iλ_i| over slipping rows; its rounding may hide changes of q.
 
     Collective.
     """
@@ -184,7 +184,7 @@ def slipping_work(lam: PETSc.Vec, s: PETSc.Vec, face: Face) -> float:
 def slipping_start(
     qp: QP, at: Point, face: Face, back: PETSc.Vec, pressed: Face
 ) -> tuple[Point, Face]:
-    """A copy of a point with its face, or ``back`` with its own where that slips first. Collective.
+    """Copy a point and its face, or ``back`` and its own if more points slip there. Collective.
 
     Near its circle a point that sticks, and whose gradient points outwards, would leave by far, in
     a direction of no use. So would, with friction, one that touches with less force than it is open
@@ -202,7 +202,7 @@ def slipping_start(
 
 
 def part_of_way(at: Point, end: Point, share: float) -> Point:
-    """The point so far from ``at`` to ``end``, the caller's own. Collective."""
+    """Return a new point at this share of the way from ``at`` to ``end``. Collective."""
     part = at.copy()
     for kept, last in ((part.lam, end.lam), (part.g, end.g)):
         kept.scale(1.0 - share)
@@ -211,7 +211,7 @@ def part_of_way(at: Point, end: Point, share: float) -> Point:
 
 
 def projected_part(qp: QP, at: Point, end: Point, share: float) -> Point:
-    """The nearest feasible point to a part of a way. Collective; multiplies by F once."""
+    """Project a point of the segment from ``at`` to ``end`` onto Ω. Collective; one F."""
     part = part_of_way(at, end, share)
     found = project_onto_feasible(qp.coarse, qp.feasible, part.lam)
     moved_to(qp, part, found.lam)
@@ -219,7 +219,7 @@ def projected_part(qp: QP, at: Point, end: Point, share: float) -> Point:
 
 
 def moved_to(qp: QP, z: Point, lam: PETSc.Vec) -> None:
-    """Take z to λ, which is destroyed, and its gradient with it; multiplies by F once."""
+    """Move z to λ, which is destroyed, and update its gradient; multiplies by F once."""
     way, image = lam.copy(), z.g.duplicate()
     way.axpy(-1.0, z.lam)
     qp.F.mult(way, image)
@@ -230,7 +230,7 @@ def moved_to(qp: QP, z: Point, lam: PETSc.Vec) -> None:
 
 
 def brought_back(qp: QP, face: Face, z: Point, near: PETSc.Vec | None = None) -> bool:
-    """Bring z back to where slipping rows are on their boundary and Gz = e. Collective.
+    """Retract z to Gz = e with slipping rows on their boundary. Collective.
 
     Multiplies by F once.
 
@@ -253,7 +253,7 @@ def brought_back(qp: QP, face: Face, z: Point, near: PETSc.Vec | None = None) ->
 
 
 def brought_into(qp: QP, face: Face, z: Point) -> bool:
-    """Bring z to the nearest point with Gz = e and open rows at 0. Collective.
+    """Project z onto Gz = e with open rows at 0. Collective.
 
     Where circles are small beside what Gz lacks, no points of them may balance it; of the discs
     some do. Multiplies by F once.
@@ -272,7 +272,7 @@ def brought_into(qp: QP, face: Face, z: Point) -> bool:
     return held
 
 
-# --- Faces without the directions along which they bend so hard that F has no say there -------
+# --- Faces without directions of very high curvature ------------------------------------------
 
 # times ‖F‖: a curvature that leaves F no say in where a force on a small circle points, as where
 # what slips goes far beside what deforms; conjugate gradients and P would see nothing but it
@@ -280,7 +280,7 @@ HARD = 1e3
 
 
 class FlattenedFace:
-    """A face of which conjugate gradients see what does not bend hard; the rest is turned apart.
+    """Face without its directions of high curvature κ, which are treated apart from PCPG.
 
     Args:
         whole: The face.
@@ -297,12 +297,12 @@ class FlattenedFace:
         self.bend(whole)
 
     def bend(self, whole: Face) -> None:
-        """Take the face with other curvatures; what is held stays."""
+        """Replace the face by one with other curvatures; held directions stay held."""
         self.whole = whole
         self.face = whole.with_directions(self._kept) if self._hard.size else whole
 
     def back(self, qp: QP, coarse: Coarse, z: Point) -> bool:
-        """Bring z back to the circles, turned by −κ⁻¹Zᵀs where these bend hard. Collective.
+        """Retract z to the circles; directions of high curvature move by −κ⁻¹Zᵀs. Collective.
 
         Into the discs where circles do not bear it. Multiplies by F once, or twice.
 
@@ -324,7 +324,7 @@ class FlattenedFace:
         return held
 
 
-# --- Rows of a face that depend on each other: ways along which F sees nothing ----------------
+# --- Dependent rows of a face -----------------------------------------------------------------
 
 # of ‖F‖: curvature of the way that a solve has gone; less is nearly none, and the way far
 LOOSE = 1e-8
@@ -347,7 +347,7 @@ TAKES_PART = 1e-3
 
 
 class DependentRows:
-    """What to do on a face where F is singular, or nearly so.
+    """Treatment of faces on which F is singular, or nearly so.
 
     Args:
         qp: The program on all rows.
@@ -369,7 +369,7 @@ class DependentRows:
         self.excluding: Array = np.empty(0, dtype=np.int64)
 
     def part(self, x: Array) -> PETSc.Vec | None:
-        """The part of x that F and Gᵀ do not see; None where there is none. Collective.
+        """Return the part of x in the common null space of F and G, or None. Collective.
 
         What the projector only makes small, more of it takes away.
         """
@@ -388,7 +388,7 @@ class DependentRows:
         return None
 
     def _unseen(self, x: Array) -> PETSc.Vec | None:
-        """x projected once."""
+        """Return x projected once."""
         part = self.preconditioner.dependent(x) if self.preconditioner is not None else None
         if part is None:
             return None
@@ -397,7 +397,7 @@ class DependentRows:
         return found
 
     def slack(self, z: Point, target: float) -> Point | None:
-        """Where rows that depend on each other want different gaps, let those go that lose.
+        """Step along a null direction of F to a bound, where dependent rows want different gaps.
 
         Between them forces may move that F does not see, and q falls all the way to a bound.
 
@@ -431,7 +431,7 @@ class DependentRows:
         return bound
 
     def shorten(self, before: Point, z: Point) -> None:
-        """Where a solve has gone far because nothing held it, go to the first bound only.
+        """Shorten a long step of hardly any curvature to the first bound.
 
         Rows depend on each other there, or nearly so; numbers of that size would drown the others.
         """
@@ -447,7 +447,7 @@ class DependentRows:
         Fp.destroy()
 
     def stop(self, before: Point, z: Point) -> None:
-        """Take z back to where the way from ``before`` first leaves Ω; q is lower there, too.
+        """Move z back to where the segment from ``before`` leaves Ω; q is lower there, too.
 
         What blocks it is at its bound there; F λ − d is known, and Gλ = e kept.
         """
@@ -461,7 +461,7 @@ class DependentRows:
         Fp.destroy()
 
     def slide(self, z: Point) -> bool:
-        """To a bound along a direction or residual without curvature, as of dependent rows.
+        """Step to a bound along a direction of no curvature, as of dependent rows.
 
         Returns:
             Whether there is one.
@@ -479,7 +479,7 @@ class DependentRows:
         return False
 
     def _endless(self, length: float, slope: float, way: PETSc.Vec) -> None:
-        """Whether a way down that costs nothing proves that q falls forever. Collective.
+        """Check whether a descent direction proves that q is unbounded below. Collective.
 
         Then it does in Ω's cone of recession, and neither F nor G sees it: rows that slip, and
         rounding of an F that is hardly definite, make ways that are none. Multiplies by F once.
@@ -505,13 +505,13 @@ class DependentRows:
         work.destroy()
 
     def _recession(self, way: PETSc.Vec) -> PETSc.Vec:
-        """The nearest direction to a way in which Ω has no end: P_Ω(t·way)/t for a large t."""
+        """Project a direction onto the recession cone of Ω: P_Ω(t·way)/t for a large t."""
         p, far = way.copy(), FAR / way.norm(PETSc.NormType.INFINITY)
         p.array[:] = self._qp.feasible.project(far * way.array_r) / far
         return p
 
     def _to_a_bound(self, z: Point, way: Array) -> float:
-        """Largest t with λ + t·way ∈ Ω, maybe infinite; rounding ends no way. Collective."""
+        """Return largest t with λ + t·way ∈ Ω, maybe infinite; rounding ends no way. Collective."""
         held = way if self.face is None else without_slip(self.face, way)
         largest = self._comm.allreduce(float(np.max(np.abs(way), initial=0.0)), op=MPI.MAX)
         held = np.where(np.abs(held) > PROOF * largest, held, 0.0)
@@ -519,7 +519,7 @@ class DependentRows:
         return float(self._comm.allreduce(own, op=MPI.MIN))
 
 
-# --- Solves on faces by PCPG, one after the other: the inner part of block Newton -------------
+# --- Solves on faces by PCPG ------------------------------------------------------------------
 
 # rows leave a face in so many rounds at most: each round drops one row at least, but most at once
 MOST_ROUNDS = 60
@@ -587,7 +587,7 @@ class FaceSolver:
         return self._directions.norm
 
     def saw(self, curvature: float, size: float) -> None:
-        """Another Rayleigh quotient."""
+        """Update the norm estimate by another Rayleigh quotient."""
         self._directions.seen(curvature, size)
 
     @property
@@ -596,7 +596,7 @@ class FaceSolver:
         return self._on_face.coarse
 
     def stays_on(self, face: Face) -> bool:
-        """Whether each row does on a face what it does on the one entered. Collective."""
+        """Return whether each row has the status that it has on the face entered. Collective."""
         return self._face is not None and not any_rank(
             self._comm, not np.array_equal(face.status, self._face.status)
         )
@@ -634,14 +634,14 @@ class FaceSolver:
         self._prepared = True
 
     def settle(self) -> None:
-        """The last solve's end was accepted; if its face stays, PCPG goes on from there.
+        """Note that the last solve was accepted; PCPG continues its directions if the face stays.
 
-        Not where it is curved: the end was brought back to it.
+        Not on a curved face, since the point was then retracted to it.
         """
         self.settled, self._accepted = not self.curved, True
 
     def forget(self) -> None:
-        """The next direction is a first one: the point is not where PCPG stopped."""
+        """Restart PCPG at the next solve, since the point is not where it stopped."""
         self._directions.fresh, self.settled, self._accepted = True, False, False
 
     def solve(self, start: Point, face: Face, optimality: float) -> Trial:
@@ -686,7 +686,7 @@ class FaceSolver:
         return Trial(first or z.copy(), z, back, face, rounds)
 
     def _let_go(self, before: Point, z: Point) -> bool:
-        """What has left Ω leaves the face, or what did so first; whether z stays in Ω then."""
+        """Project z onto Ω and drop the rows that left it; return whether z stays in Ω."""
         blocked = self.cautious and not self.curved
         if blocked:
             self.dependent.stop(before, z)
@@ -725,7 +725,7 @@ class FaceSolver:
         self.forget()
 
     def _target(self, z: Point, optimality: float, stays: bool) -> float:
-        """What PCPG aims at: a part of what there is to do; more where the face stays."""
+        """Return PCPG's target: a share of the residual, a smaller one where the face stays."""
         z.g.copy(self._directions.r)
         self.coarse.project(self._directions.r)
         start, final = float(self._directions.r.norm()), FINAL * self._rule.aim
@@ -736,7 +736,7 @@ class FaceSolver:
         return max(final, share * min(start, optimality))
 
     def _pcpg(self, z: Point, target: float) -> ConvergedReason:
-        """PCPG on the face entered; what a curvature adds is taken from the gradient again."""
+        """Run PCPG on the face entered; then remove curvature terms from the gradient."""
         before = np.array(z.lam.array_r)
         reason = pcpg(
             self._on_face,
@@ -755,7 +755,7 @@ class FaceSolver:
         return reason
 
     def _leave(self) -> None:
-        """Free what belongs to the face."""
+        """Free projectors and preconditioner of the face."""
         if self._face is not None:
             self._on_face.coarse.destroy()
         if self._preconditioner is not None:

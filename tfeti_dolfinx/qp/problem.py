@@ -15,7 +15,7 @@ from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.recycling import RecycledOnFace
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet
 
-# --- The quadratic program that every solver gets, and what it gives back ---------------------
+# --- The quadratic program and its result -----------------------------------------------------
 
 
 class Operator(Protocol):
@@ -30,7 +30,7 @@ class FaceOperator(Operator, Protocol):
     """An operator that belongs to a face."""
 
     def dependent(self, x: Array) -> Array | None:
-        """The part of x, on this rank's rows of the face, that F makes 0 since rows depend.
+        """Return the part of x, on this rank's rows of the face, that F makes 0 since rows depend.
 
         None where rows cannot depend on each other. Collective.
         """
@@ -82,7 +82,7 @@ class Point:
     g: PETSc.Vec
 
     def copy(self) -> Point:
-        """A point of its own."""
+        """Return a point of its own."""
         return Point(self.lam.copy(), self.g.copy())
 
     def take(self, other: Point) -> None:
@@ -107,7 +107,7 @@ class Point:
 
 
 class ConvergedReason(IntEnum):
-    """Why a solver stopped; positive: converged. Values as in KSPConvergedReason, where it has one.
+    """Reasons of a solver to stop; positive: converged. Values as in KSPConvergedReason, if there.
 
     ITERATING: it has not stopped.
     CONVERGED_FRICTION_RTOL: the bounds of Coulomb's friction are at rest to ``friction_rtol``, and
@@ -147,13 +147,13 @@ class Steps:
         return self.cg + self.expansion + self.proportioning
 
     def plus(self, other: Steps) -> Steps:
-        """The steps of both."""
+        """Return the steps of both."""
         return Steps(*(a + b for a, b in zip(astuple(self), astuple(other), strict=True)))
 
 
 @dataclass
 class QPResult:
-    """What a solver returns.
+    """Result of a QP solver.
 
     Attributes:
         lam: The multipliers λ.
@@ -189,7 +189,7 @@ class QPResult:
 
 @dataclass(frozen=True)
 class Start:
-    """Where a solver starts.
+    """Initial guess of a solver.
 
     Attributes:
         lam: Multipliers λ.
@@ -200,11 +200,11 @@ class Start:
     mu: Array
 
 
-# --- When a solver may stop: a cheap test in every step, and an examination where that holds ---
+# --- Stopping rules ---------------------------------------------------------------------------
 
 
 class StoppingRule(Protocol):
-    """What the residuals of an iterate must come down to.
+    """Stopping rule for the residuals of an iterate.
 
     A solver compares max(‖g^P‖, ‖F‖‖Qx‖) with ``tolerance`` in every step. Where it is small
     enough, the iterate is examined; an examination that is not content lowers the tolerance.
@@ -225,7 +225,7 @@ class StoppingRule(Protocol):
 
     @property
     def aim(self) -> float:
-        """What solves on faces come down to at most."""
+        """Lower limit of the residuals that solves on faces aim at."""
         ...
 
     def examine(
@@ -246,7 +246,7 @@ class StoppingRule(Protocol):
 
 
 class ResidualRule:
-    """Small residuals are good enough: for a program that stands for itself.
+    """Stopping rule by residuals alone, for programs without a displacement.
 
     Args:
         tolerance: What residuals must come down to.
@@ -268,7 +268,7 @@ class ResidualRule:
 
 
 class TargetRule(ResidualRule):
-    """Content where the residual is what was asked for, and not before: for a part of a solve."""
+    """Stopping rule by a given residual, for a part of a solve."""
 
     def examine(
         self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float
@@ -278,7 +278,7 @@ class TargetRule(ResidualRule):
         return ConvergedReason.CONVERGED_RTOL if small else ConvergedReason.ITERATING
 
 
-# --- Monitors: called once per step with what a solver knows anyway ---------------------------
+# --- Monitors ---------------------------------------------------------------------------------
 
 
 class Monitor(Protocol):
@@ -332,5 +332,5 @@ class PrintMonitor:
 
 
 def _known(value: float) -> str:
-    """A norm, blank where it was not computed."""
+    """Return a norm, blank where it was not computed."""
     return f"{value:.4e}" if value >= 0.0 else " " * 10

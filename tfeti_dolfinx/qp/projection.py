@@ -41,14 +41,14 @@ ROUNDING = 1e-14
 
 
 class ConvexSet(Protocol):
-    """What is asked of Ω here; any ``FeasibleSet`` has it."""
+    """Protocol of the set Ω to project onto; any ``FeasibleSet`` has it."""
 
     def project(self, x: Array) -> Array:
         """P_Ω(x)."""
         ...
 
     def face(self, x: Array, g: Array) -> Face:
-        """The face of x ∈ Ω."""
+        """Return the face of x ∈ Ω."""
         ...
 
 
@@ -74,7 +74,7 @@ def project_onto_feasible(
     alpha: Array | None = None,
     max_trials: int = MAX_TRIALS,
 ) -> FeasiblePoint:
-    """The nearest point to y of {λ ∈ Ω, Gλ = e}, or what comes closest to it. Collective.
+    """Project y onto {λ ∈ Ω, Gλ = e}, or come as close to that set as possible. Collective.
 
     It is λ(α) = P_Ω(y + Gᵀα) with Gλ(α) = e. That is where the convex function
     ½‖z‖² − ½‖z − P_Ω(z)‖² − αᵀe of z = y + Gᵀα is least, which a semismooth Newton method with a
@@ -86,7 +86,8 @@ def project_onto_feasible(
     >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
     >>> from tfeti_dolfinx.qp.sets import Bounds
     >>> y = PETSc.Vec().createWithArray(np.array([1.0, -1.0]), comm=PETSc.COMM_SELF)
-    >>> nearest(DenseCoarse(np.ones((1, 2)), np.ones(1)), Bounds(), y).lam.array.tolist()
+    >>> coarse = DenseCoarse(np.ones((1, 2)), np.ones(1))
+    >>> project_onto_feasible(coarse, Bounds(), y).lam.array.tolist()
     [1.0, 0.0]
 
     Args:
@@ -128,7 +129,7 @@ def project_onto_feasible(
 
 
 def project_or_least(coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec) -> FeasiblePoint:
-    """The nearest point to y of {λ ∈ Ω, Gλ = e}; the least such λ where that is not found.
+    """Return the nearest point to y of {λ ∈ Ω, Gλ = e}; the least such λ where that is not found.
 
     From forces far beyond small discs, as the bounds of another load step are, the way to Gλ = e
     has so many kinks that ``nearest`` may end before. From 0 it has few. Collective.
@@ -176,7 +177,7 @@ class WithinFace:
         return self._feasible.onto(x, self._status)
 
     def face(self, x: Array, g: Array) -> Face:
-        """The face of x, without the rows that stay open."""
+        """Return the face of x, without the rows that stay open."""
         face = self._feasible.face(x, g)
         kept = np.flatnonzero(abs(face.Z).T @ self._open.astype(float) == 0.0)
         status = np.where(self._open, Status.OPEN, face.status)
@@ -213,7 +214,7 @@ def _trial(coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec, alpha: Array) -> _
 def _searched(
     coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec, start: _Trial, step: Array
 ) -> tuple[_Trial, float, int]:
-    """The longest of steps 1, ½, ¼, … that does not raise the cost; destroys the start.
+    """Halve the step until it does not raise the cost; destroys the start.
 
     Where the cost still falls at the end of a step, it fell along all of it: it is convex. That
     holds where rounding hides the cost's difference.

@@ -1,4 +1,4 @@
-"""Directions of earlier solves with the same F, and what F makes of them."""
+"""Recycling of search directions, with their products with F, from earlier solves."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ HELD = 1e-10
 
 
 class Recycled:
-    """F-orthonormal directions W that conjugate gradients have gone, and their images FW.
+    """F-orthonormal search directions W of earlier solves, and their images FW.
 
     Farhat, Crivelli, Roux, Comput. Methods Appl. Mech. Engrg. 117 (1994) 195–209: solves with
     other right sides begin with the best of what is known, and go F-orthogonally to it. Where W is
@@ -50,7 +50,7 @@ class Recycled:
         return self.W[:, : self.count], self.FW[:, : self.count]
 
     def add(self, x: Array, Fx: Array, energy: float) -> None:
-        """Keep a direction, or what is new in it. Collective, three reductions.
+        """Store a direction, made F-orthonormal to those stored. Collective, three reductions.
 
         Where images are no longer right, all that was kept is forgotten.
 
@@ -80,7 +80,7 @@ class Recycled:
         self._next = (self._next + 1) % self.capacity
 
     def in_order(self) -> Array:
-        """This rank's part of W and FW, shape ``(2, m, count)``, the oldest direction first.
+        """Return this rank's part of W and FW, shape ``(2, m, count)``, the oldest direction first.
 
         So they lie from then on: who takes them adds what it adds in the same order.
         """
@@ -91,7 +91,7 @@ class Recycled:
         return np.array(self.columns)
 
     def take(self, kept: Array) -> None:
-        """Go on with what another run has kept, the newest of it if it is too much. Collective."""
+        """Restore another run's directions, the newest ones if they are too many. Collective."""
         newest = kept[:, :, max(kept.shape[2] - self.capacity, 0) :]
         if newest.shape[2] == 0:
             return
@@ -106,7 +106,7 @@ class Recycled:
         self.W, self.FW = (np.zeros((rows, self.capacity), order="F") for _ in range(2))
 
     def within(self, held: Array | None) -> Array | None:
-        """Orthonormal N so that W N is 0 on rows, shape ``(count, k)``. Collective.
+        """Return orthonormal N so that W N is 0 on rows, shape ``(count, k)``. Collective.
 
         Args:
             held: Flags of the local rows; None: no rows, and then N is None, too.
@@ -187,11 +187,11 @@ class RecycledOnFace:
             p.array[:] -= self._combined(self._part(a))
 
     def remember(self, p: PETSc.Vec, Fp: PETSc.Vec, energy: float) -> None:
-        """A direction was gone; it is kept later, for W stays while a solve goes on."""
+        """Record a search direction, to be stored after the solve, as W stays during it."""
         self._new.append((np.array(p.array_r), np.array(Fp.array_r), energy))
 
     def keep(self) -> None:
-        """Keep what was gone. Collective."""
+        """Store the recorded directions. Collective."""
         while self._new:
             self.known.add(*self._new.popleft())
         self._active = False

@@ -14,11 +14,11 @@ from scipy.sparse import csr_array, diags_array
 from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.errors import InputError
 
-# --- Faces: in which directions a point of a feasible set may move to both sides --------------
+# --- Faces ------------------------------------------------------------------------------------
 
 
 class Status(IntEnum):
-    """What a row does at a point of a feasible set.
+    """Status of a row at a point of a feasible set.
 
     FREE: no set constrains it. OPEN: it is on its bound, and what it multiplies may open.
     TOUCHING: it is off its bound, in contact. STICK: inside its disc. SLIP: on its circle, and
@@ -71,7 +71,7 @@ class Face:
 
     @property
     def curved(self) -> bool:
-        """Whether some row of this rank slips along a boundary."""
+        """True if some row of this rank slips along a boundary."""
         return bool(np.any(np.diff(self.Z.indptr)[self.status == Status.SLIP]))
 
     def damped(self) -> Face:
@@ -82,7 +82,7 @@ class Face:
         return Face(csr_array(self.Z @ share), self.curvature, self.status)
 
     def with_directions(self, kept: Array) -> Face:
-        """The face with some of its directions only, the others held."""
+        """Return the face with some of its directions only, the others held."""
         return Face(csr_array(self.Z[:, kept]), self.curvature[kept], self.status)
 
     def restricted(self, x: Array) -> Array:
@@ -93,7 +93,7 @@ class Face:
 
     @cached_property
     def _of_coordinates(self) -> bool:
-        """Whether the directions are coordinates: unit columns with one entry each."""
+        """True if the directions are coordinates: unit columns with one entry each."""
         return bool(self.Z.nnz == self.Z.shape[1] and np.all(np.abs(self.Z.data) == 1.0))
 
 
@@ -103,7 +103,7 @@ def without_slip(face: Face, x: Array) -> Array:
 
 
 def face_of(free: Array, status: Array) -> Face:
-    """A flat face whose directions are coordinates.
+    """Return a flat face whose directions are coordinates.
 
     Args:
         free: Flags of the rows that may move, shape ``(m,)``.
@@ -115,7 +115,7 @@ def face_of(free: Array, status: Array) -> Face:
     return Face(Z, np.zeros(k), status)
 
 
-# --- Closed convex sets that are products of small ones: bounds now, discs and ellipses later ---
+# --- Feasible sets ----------------------------------------------------------------------------
 # A set knows its own rows of this rank as numpy arrays, nothing of ranks and other rows: solvers
 # add up over ranks, ``Product`` puts sets on rows. Nothing here is collective.
 
@@ -140,15 +140,15 @@ class FeasibleSet(Protocol):
         ...
 
     def max_step(self, x: Array, p: Array) -> float:
-        """Largest α with x − α p ∈ Ω, maybe infinite."""
+        """Return the largest α with x − α p ∈ Ω, maybe infinite."""
         ...
 
     def shifted(self, shift: Array) -> FeasibleSet:
-        """The set Ω − shift."""
+        """Return the set Ω − shift."""
         ...
 
     def face(self, x: Array, g: Array) -> Face:
-        """The face of x ∈ Ω, given the gradient there."""
+        """Return the face of x ∈ Ω, given the gradient there."""
         ...
 
     def onto(self, x: Array, status: Array) -> Array:
@@ -189,7 +189,7 @@ class Bounds:
         return Bounds(self.lower - shift)
 
     def face(self, x: Array, g: Array) -> Face:
-        """Rows off their bounds are free: they touch."""
+        """Return the face of x: rows off their bounds are free, they touch."""
         off = np.asarray(x > self.lower)
         return face_of(off, np.where(off, Status.TOUCHING, Status.OPEN))
 
@@ -247,7 +247,7 @@ class Product:
         return values
 
     def max_step(self, x: Array, p: Array) -> float:
-        """The least of all sets."""
+        """Return the least of all sets."""
         steps = [factor.max_step(x[rows], p[rows]) for rows, factor in self.factors]
         return min([float(np.inf), *steps])
 
@@ -274,14 +274,14 @@ class Product:
 
 
 def _indices(rows: slice | Array) -> Array:
-    """Rows as indices, in their order."""
+    """Return rows as indices, in their order."""
     if isinstance(rows, slice):
         return np.arange(rows.start or 0, rows.stop, dtype=np.int64)
     return np.asarray(rows, dtype=np.int64)
 
 
 def _joined(faces: Sequence[tuple[Array, Face]], status: Array) -> Face:
-    """The directions of several faces on their rows, one after the other."""
+    """Return the directions of several faces on their rows, one after the other."""
     row, column, value, start = [], [], [], 0
     for rows, face in faces:
         Z = face.Z.tocoo()
@@ -294,7 +294,7 @@ def _joined(faces: Sequence[tuple[Array, Face]], status: Array) -> Face:
     return Face(Z, np.concatenate([face.curvature for _, face in faces]), status)
 
 
-# --- Discs and ellipses of multipliers: intervals in the plane, sets of friction on surfaces ---
+# --- Discs and ellipses -----------------------------------------------------------------------
 
 # Of the boundary's distance from the centre: what is so near to the boundary is on it. Projections
 # come within a few roundings of it; those of λ − λ̄ within as many of the centre, −λ̄.
@@ -328,7 +328,7 @@ class Ellipses:
         )
 
     def project(self, x: Array) -> Array:
-        """The nearest points of the ellipses."""
+        """Return the nearest points of the ellipses."""
         t = self._from_centre(x)
         outside = self._level(t) > 1.0
         nearest = np.where(self._moves, t, 0.0)
@@ -419,7 +419,7 @@ class Ellipses:
         return np.asarray(pushing * np.divide(bent, slope, out=0.0 * slope, where=slope > 0.0))
 
     def _nearest(self, z: Array, which: Array) -> Array:
-        """The nearest points of the boundary: a_j²z_j/(a_j² + μ)."""
+        """Return the nearest points of the boundary: a_j²z_j/(a_j² + μ)."""
         a = self.semi_axes[which]
         scale = np.maximum(a.max(axis=1, initial=TINY), TINY)[:, None]
         a, z = a / scale, z / scale

@@ -20,7 +20,7 @@ from tfeti_dolfinx.qp.problem import (
     no_monitor,
 )
 
-# --- What SMALSE-M is made of: its operator, the precision of inner problems and their end ----
+# --- Operator and inner problems of SMALSE-M --------------------------------------------------
 
 # of the Lagrangian: what its value may be wrong by
 ROUNDING = 1e-14
@@ -87,7 +87,7 @@ class InnerPrecision:
 
     @property
     def stalled(self) -> bool:
-        """Whether neither ‖Bx‖ nor M has changed for long."""
+        """True if neither ‖Bx‖ nor M has changed for long."""
         return self._idle >= PATIENCE
 
 
@@ -117,7 +117,7 @@ class InnerTest:
         self._lam, self._verdict = homogenised.b.duplicate(), ConvergedReason.ITERATING
 
     def __call__(self, state: MprgpIterate) -> bool:
-        """Whether the inner loop may end. Collective."""
+        """Return whether the inner loop may end. Collective."""
         equality = self._coarse.norm_Q(state.x)
         gradient = state.projected_gradient
         residual = max(gradient, self._norm * equality)
@@ -130,7 +130,7 @@ class InnerTest:
         return gradient <= min(wanted, self._eta)
 
     def conclude(self, state: MprgpIterate, reason: ConvergedReason | None) -> ConvergedReason:
-        """Why to stop, or ITERATING, given why the inner loop broke off. Collective."""
+        """Return why to stop, or ITERATING, given why the inner loop broke off. Collective."""
         if reason == ConvergedReason.DIVERGED_INDEFINITE_MAT:  # rounding, or a wrong operator
             equality = self._coarse.norm_Q(state.x)
             residual = max(state.projected_gradient, self._norm * equality)
@@ -151,7 +151,7 @@ class InnerTest:
         self._lam.destroy()
 
 
-# --- SMALSE-M: semimonotonic augmented Lagrangians for separable and equality constraints -----
+# --- SMALSE-M ---------------------------------------------------------------------------------
 
 
 def smalse(

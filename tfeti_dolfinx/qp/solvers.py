@@ -17,7 +17,7 @@ from tfeti_dolfinx.qp.smalse import smalse
 
 
 class Parameters(Protocol):
-    """What solvers are told: each takes its own."""
+    """Parameters of all solvers, of which each takes its own."""
 
     @property
     def max_it(self) -> int:
@@ -37,7 +37,7 @@ class Parameters(Protocol):
 
 @dataclass(frozen=True)
 class Task:
-    """What a solver is called with.
+    """Arguments of a solver's call.
 
     Attributes:
         qp: The program.
@@ -58,7 +58,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Solver:
-    """A solver, and what to know before it is called.
+    """QP solver, with its requirements.
 
     Attributes:
         solve: Solves a task.

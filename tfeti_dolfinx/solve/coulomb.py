@@ -31,7 +31,7 @@ from tfeti_dolfinx.qp.sets import Face, FeasibleSet
 from tfeti_dolfinx.solve.dilation import Anderson, DeSaxceIteration, cone_set
 from tfeti_dolfinx.solve.solver import learn, solve_dual
 
-# --- The forces of normals that Coulomb's law takes its bounds from, and the next ones to try ---
+# --- Friction bounds and their iteration ------------------------------------------------------
 
 # of all multipliers, or of those that make what drives the problem: forces of normals that rounding
 # makes of none; as bounds they would be discs whose boundaries bend so much that nothing else is
@@ -53,7 +53,7 @@ NEARER = (0.5, 0.25, 0.1)
 
 
 class FrictionBoundIteration:
-    """λ_N of the rows under Coulomb's law, that the limits belong to. All methods are collective.
+    """Iteration for the λ_N that friction limits are taken from. All methods are collective.
 
     Without a start what touches sticks at first: that has a solution wherever any bounds have one.
 
@@ -122,7 +122,7 @@ class FrictionBoundIteration:
         return self._dilated.lam, self._dilated.mu
 
     def _balanced(self, start: tuple[Array, Array] | None) -> tuple[Array, float]:
-        """Forces within the law that balance the load, near the last ones; what they miss of it."""
+        """Return forces near the last ones, within the law, that balance the load; the defect."""
         lam = self._dual.d.duplicate()
         lam.set(0.0)
         if start is not None:
@@ -148,7 +148,7 @@ class FrictionBoundIteration:
         )
 
     def _holds_nearer(self) -> bool:
-        """Whether bounds between the last ones, which held the load, and the present ones do."""
+        """Retreat towards the last bounds that held the load; return whether those found do."""
         if any_rank(self._comm, not np.all(np.isfinite(self._held))):
             return False
         for share in NEARER:
@@ -160,7 +160,7 @@ class FrictionBoundIteration:
         return False
 
     def change(self, lam: PETSc.Vec, u: Array) -> float:
-        """Take what a solve has found; how far that is from the bounds, over its size.
+        """Store a solve's normal forces; return their relative distance from the bounds.
 
         Body by body: beside forces elsewhere those on a light one would not be seen.
 
@@ -187,7 +187,7 @@ class FrictionBoundIteration:
         return change
 
     def end(self, result: QPResult, rule: Accuracy, may_go_on: bool) -> bool:
-        """Whether bounds at rest end the iteration; if u is not right to rtol, the reason says so.
+        """Return whether converged bounds end the iteration; set the reason if u is not right.
 
         Args:
             result: The last solution.
@@ -201,7 +201,7 @@ class FrictionBoundIteration:
         return not may_go_on
 
     def _fit(self, result: QPResult, rule: Accuracy) -> bool:
-        """Whether u is right to rtol with the limits of the forces that were found, too.
+        """Return whether u is right to rtol with the limits that the new forces give, too.
 
         The rule has looked at the answer with the limits that it was found with; from now on it
         tells the larger errors. Of an answer that is a sum of two only the change is known.
@@ -217,7 +217,7 @@ class FrictionBoundIteration:
         return fits
 
     def _rest(self, rule: Accuracy) -> bool:
-        """Whether u is right to rtol as far as the last two problems tell; else ``_fit`` has told.
+        """Return whether u is right to rtol, extrapolated from the last two problems.
 
         Between them the bounds ψ and u have changed; so far as the forces are from the bounds yet,
         u is from its limit by as much, and by what is left of a geometric series.
@@ -237,7 +237,7 @@ class FrictionBoundIteration:
         return rule.take(moved * bcast_from_root(self._comm, left / way / (1.0 - rate)))
 
     def _on_bodies(self, pressures: Array) -> Array:
-        """Norms of the nodal forces μ times those of normals make on each body."""
+        """Return norms of the nodal forces μ times those of normals make on each body."""
         B, subdomains = self._constraints.B, self._dual.subdomains
         forces, trace = B.createVecLeft(), B.createVecRight()
         forces.set(0.0)
@@ -258,21 +258,21 @@ class FrictionBoundIteration:
         )
 
     def take(self, lam: Array) -> None:
-        """Take the bounds of multipliers for which the law holds, for a try."""
+        """Try the bounds of multipliers for which the law holds."""
         self._before, self._now = self._now, self._forces(lam[self._rows])
         self._constraints.set_pressures(self._now)
 
     def take_back(self) -> None:
-        """Take those again that were there before."""
+        """Restore the bounds from before the try."""
         self._now = self._before
 
     @property
     def are_known(self) -> bool:
-        """Whether there are bounds to start from, none of which is De Saxcé's."""
+        """True if there are bounds to start from, none of which is De Saxcé's."""
         return self._dilated is None and not self._sticks
 
     def goes_on(self, reason: ConvergedReason) -> bool:
-        """Whether there is something else to try where a problem has no solution, or none is found.
+        """Choose what to try next after a failed solve; return whether there is something.
 
         What sticks may contradict itself, as beside a wall that pushes; then all slips. Bounds with
         hardly any forces between them leave faces that are nearly singular: then De Saxcé's fixed
@@ -288,17 +288,17 @@ class FrictionBoundIteration:
         return True
 
     def _forces(self, values: Array) -> Array:
-        """Forces of normals, without what is none but for rounding."""
+        """Return the normal forces, those that are rounding set to 0."""
         return np.where(values > self._none, values, 0.0)
 
     @property
     def astray(self) -> bool:
-        """Whether slips of De Saxcé's fixed point grow without end, or do not come to rest."""
+        """True if slips of De Saxcé's fixed point diverge or do not converge."""
         return self._dilated is not None and self._dilated.astray
 
     @property
     def slides(self) -> bool:
-        """Whether slips have grown, and not come to rest, on a body that nothing else holds."""
+        """True if slips grow without converging on a body that nothing else holds."""
         free = self._dual.coarse.unheld.free
         return (
             self._dilated is not None and self._dilated.slides and bool(free[self.restless].any())
@@ -306,7 +306,7 @@ class FrictionBoundIteration:
 
     @property
     def _sticks(self) -> bool:
-        """Whether no bound is set yet."""
+        """True if no bound is set yet, so that all points stick."""
         return any_rank(self._comm, bool(np.any(np.isinf(self._now))))
 
     def _products(self, A: Array, B: Array) -> Array:
@@ -315,12 +315,12 @@ class FrictionBoundIteration:
 
 
 def _largest(values: Array) -> tuple[float, int]:
-    """The largest of some values that are not negative, and which one it is."""
+    """Return the largest of some values that are not negative, and which one it is."""
     at = int(np.argmax(values)) if len(values) else -1
     return float(values[at]) if at >= 0 else 0.0, at
 
 
-# --- Newton's method on Coulomb's law, from a solution of a problem with given bounds ---------
+# --- Newton's method on Coulomb's law ---------------------------------------------------------
 
 # how often it may end and its bounds not be at rest; the factor on its target each time, and at
 # least on its residual; of ‖F‖‖λ‖: what rounding leaves of that
@@ -352,11 +352,11 @@ class NewtonOnCoulomb:
 
     @property
     def may_try(self) -> bool:
-        """Whether it is wanted, has not failed, and may end nearer to the law."""
+        """True if Newton's method is wanted, has not failed, and may end nearer to the law."""
         return self._tries > 0
 
     def give_up(self) -> None:
-        """Try no more, and keep nothing of what has led nowhere."""
+        """Give up Newton's method, and drop the directions of the failed try."""
         self._tries, self._dual.recycled = 0, self._recycled
 
     def solve(
@@ -418,14 +418,14 @@ class NewtonOnCoulomb:
         return min(found, key=lambda one: one[0])
 
     def _pass_on(self, qp: QP, end: LawPoint, within: float) -> None:
-        """F of the end is known, and of what is near for the problem with its bounds."""
+        """Store Fλ of the end, to stand for points near it in the problem with its bounds."""
         work = qp.d.duplicate()
         qp.coarse.combine(end.mu, work)
         self._dual.last.pass_on(end.lam, end.s + work.array_r + qp.d.array_r, within)
         work.destroy()
 
     def _target(self, qp: QP) -> float:
-        """rtol ‖Pd‖, less each time."""
+        """Return the target rtol ‖Pd‖, smaller at each try."""
         Pd = qp.d.copy()
         qp.coarse.project(Pd)
         size = bcast_from_root(self._dual.coarse.comm, float(Pd.norm()))
@@ -447,13 +447,14 @@ class NewtonOnCoulomb:
         return Law(bounded, constraints.pressed_by[at], constraints.sets.tangents[at])
 
 
-# --- Coulomb's law: problems with given bounds of friction, the next ones from Newton's
-#     method ---
-# Or, where that is not wanted or fails, from a fixed point iteration.
+# --- Solve with Coulomb's law -----------------------------------------------------------------
+# Problems with given bounds of friction; the next bounds are those of Newton's method on the law
+# or, where that is off or fails, of a fixed point iteration.
 
 # Inner tolerance: rtol of the first step, and share of the last change of the bounds. Forces are
-# less exact than displacements: with a tenth the acceleration meets noise. It never grows again,
-# and a problem that was solved without a CG step tells nothing of its bounds: the same share then.
+# less exact than displacements: with a tenth of the change the acceleration meets noise. The
+# tolerance never grows, and stays if a problem was solved without a CG step, as the change of the
+# bounds is then no measure of their error.
 FIRST, SHARE = 1e-2, 0.01
 # of the change of the bounds at which they are at rest: rtol where a goal takes its place, since
 # forces have to be known to that change
@@ -467,7 +468,7 @@ NEAR = 10.0
 
 @dataclass(frozen=True)
 class FixedPointStatus:
-    """How the bounds of friction have come to rest.
+    """Convergence of the bounds of friction.
 
     Attributes:
         iterations: Problems with given bounds that were solved; 0 without Coulomb's law.
@@ -489,7 +490,7 @@ class FixedPointStatus:
     slides: bool = False
 
     def restless(self, names: Sequence[str]) -> tuple[str, bool]:
-        """The name of the body of all names, and whether it slides."""
+        """Return the name of the body whose bounds changed most, and whether it slides."""
         return names[self.body], self.slides
 
 

@@ -18,7 +18,7 @@ from tfeti_dolfinx.qp.newton import newton
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, ResidualRule, Start
 from tfeti_dolfinx.qp.sets import Bounds, Ellipses, Face, Product, Status, reduced_by
 
-# --- Anderson's acceleration of a fixed point iteration x ← Φ(x) in x ≥ 0 ---------------------
+# --- Anderson acceleration --------------------------------------------------------------------
 
 # Steps that are remembered: one, which makes it the crossed secant method. More of them mix
 # values of Φ on several faces, each inexact, and took up to twice as many steps.
@@ -55,7 +55,7 @@ class Anderson:
         self._least = np.inf
 
     def next(self, x: Array, image: Array) -> Array:
-        """The next x, given the last one and Φ(x). Collective."""
+        """Return the next x, given the last one and Φ(x). Collective."""
         f = image - x
         size = float(np.sqrt(self._products(f[:, None], f[:, None])[0, 0]))
         astray = size > self._growth * self._least
@@ -79,8 +79,7 @@ class Anderson:
         return np.asarray(dimage @ gamma)
 
 
-# --- Coulomb's cone: tangential entries in an ellipse whose semi-axes grow with the normal
-#     entry ---
+# --- Coulomb's cone ---------------------------------------------------------------------------
 
 # halvings of an interval of length 1: down to rounding
 HALVINGS = 60
@@ -111,7 +110,7 @@ class Cones:
         self._inverse = np.divide(1.0, self.mu, out=np.zeros_like(self.mu), where=self._moves)
 
     def project(self, x: Array) -> Array:
-        """The nearest points of the cones."""
+        """Return the nearest points of the cones."""
         values, nearest = self._points(x), self._nearest(self._from_apex(x))
         stays = values - self.apex == nearest  # what stays where it was is not rounded
         return np.where(stays, values, self.apex + nearest).ravel()
@@ -180,7 +179,7 @@ class Cones:
         return Face(Z, np.concatenate([flat, *kappa]), status)
 
     def onto(self, x: Array, status: Array) -> Array:
-        """The nearest points of the cones; of their boundary, from inside too, for slip."""
+        """Return the nearest points of the cones; of their boundary, from inside too, for slip."""
         values, status = self._points(self.project(x)).copy(), self._points(status)[:, 0]
         point = self._from_apex(x)
         within = self._places(point)[1] & np.any(point[:, 1:] != 0.0, axis=1)
@@ -197,7 +196,7 @@ class Cones:
         return np.where(self._own, self._points(x) - self.apex, 0.0)
 
     def _places(self, point: Array) -> tuple[Array, Array]:
-        """Flags of points off the apex, and of those inside."""
+        """Return flags of points off the apex, and of those inside."""
         level = np.linalg.norm(point[:, 1:] * self._inverse, axis=1)
         closed = point[:, 0] > 0.0
         return closed, closed & (level < (1.0 - ON) * point[:, 0])
@@ -209,7 +208,7 @@ class Cones:
         return _unit(np.column_stack((-np.ones(len(point)), steep)))
 
     def _nearest(self, point: Array) -> Array:
-        """The nearest points, from the apex.
+        """Return the nearest points, from the apex.
 
         With m the multiplier of the constraint, τ = μ²t/(μ² + m) and n = n₀/(1 − m): m is below 1
         where n₀ > 0, above it where n₀ < 0. Where nothing but 0 is near, ‖μt‖ ≤ −n₀.
@@ -224,7 +223,7 @@ class Cones:
         return np.column_stack((normal, tau))
 
     def _outwards(self, point: Array, which: Array) -> Array:
-        """The nearest points of the boundary to points inside: the same with m below 0."""
+        """Return the nearest points of the boundary to points inside: the same with m below 0."""
         mu, (n, t) = self.mu[which], (point[:, 0], point[:, 1:])
         low = -(np.min(np.where(mu > 0.0, mu, np.inf), axis=1) ** 2)
         high: Array = np.zeros(len(n))
@@ -284,7 +283,7 @@ def _columns(parts: list[tuple[Array, Array]], size: int) -> csr_array:
     return csr_array((np.concatenate(value), places), shape=(size, start))
 
 
-# --- Coulomb's law by gaps that grow with slips: De Saxcé's fixed point -----------------------
+# --- De Saxcé's fixed point -------------------------------------------------------------------
 
 # Of the first residual, and of the last change of the slips: what a problem is solved to
 FIRST, SHARE = 1e-4, 1e-3
@@ -354,7 +353,7 @@ class DeSaxceIteration:
         return np.array(self.lam[self._rows])
 
     def _advance(self, slips: Array) -> None:
-        """The accelerated step, not too long; a plain one where that would go far back."""
+        """Return the accelerated step, limited in length, or a plain one if that goes far back."""
         plain = slips - self._w
         step = self._anderson.next(self._w, slips) - self._w
         along = self._products(step[:, None], plain[:, None])[0, 0]

@@ -38,8 +38,7 @@ from tfeti_dolfinx.qp.problem import (
 from tfeti_dolfinx.qp.recycling import Recycled
 from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver, Task
 
-# --- More digits where rounding has ended a solve: what its answer lacks is solved for and
-#     added ---
+# --- Iterative refinement ---------------------------------------------------------------------
 
 # of the worst error: what a round has to bring, or there is no other; and of the displacement: an
 # answer that is as wrong as that has no digits to add some to
@@ -48,7 +47,7 @@ DIGIT, NO_DIGITS = 0.1, 0.1
 
 @dataclass(frozen=True)
 class SolverContext:
-    """A solver, and what it is told.
+    """Solver with its options and monitor.
 
     Attributes:
         solver: The solver.
@@ -64,7 +63,7 @@ class SolverContext:
 def refine_iteratively(
     dual: Dual, told: SolverContext, result: QPResult, rule: Accuracy
 ) -> tuple[QPResult, Accuracy]:
-    """Where rounding has ended a solve, solve for what is left, as long as that brings a digit.
+    """Refine a solution iteratively after rounding has stopped the solver.
 
     Iterative refinement (Wilkinson): each round begins at the sum of those before, and the residual
     of that is made from K itself. Where this does not suffice, once more from the same answer, and
@@ -124,7 +123,7 @@ def _in_rounds(
 def _of_remainder(
     dual: Dual, told: SolverContext, result: QPResult, rule: Accuracy, v: Array
 ) -> tuple[QPResult, Accuracy, Array]:
-    """The sum of a result and the solution of what it lacks, its accuracy, and its new v."""
+    """Return the sum of a result and its correction, its accuracy, and its new v."""
     options, norm = told.options, rule.norm
     left = DefectProblem(dual, np.array(result.lam.array_r), rule.u, v)
     qp = left.qp()
@@ -148,7 +147,7 @@ def _of_remainder(
 
 
 def last_look(result: QPResult, rule: Accuracy) -> None:
-    """Measure where a solver has stopped before its tolerance: it may be good enough."""
+    """Assess the point at which a solver stopped early: it may be good enough."""
     residual = max(result.projected_gradient, result.norm * result.equality)
     rule.accept_rounding()
     reason = rule.examine(result.lam, result.gradient, result.face, residual)
@@ -156,7 +155,7 @@ def last_look(result: QPResult, rule: Accuracy) -> None:
         result.reason = reason
 
 
-# --- The solver that the options choose, run on a dual problem --------------------------------
+# --- Choice and run of a solver ---------------------------------------------------------------
 
 # directions that are kept where more solves come and options do not say how many
 REPEATED = 100
@@ -191,7 +190,7 @@ def learn(dual: Dual, options: Options) -> None:
 
 
 def resolve_types(options: Options, rows: Sequence[int], prefix: str) -> tuple[str, str]:
-    """The solver and the preconditioner that ``auto`` stands for.
+    """Return the solver and the preconditioner that ``auto`` stands for.
 
     Args:
         options: Options.
@@ -274,7 +273,7 @@ def solve_dual(
 
 
 def _start(values: tuple[Array, Array] | None, qp: QP) -> Start | None:
-    """μ of another kernel, as before conditions have become other ones, is left out."""
+    """Return the solver's start; μ is 0 if the given one belongs to another kernel."""
     if values is None:
         return None
     lam, mu = qp.d.duplicate(), values[1]
@@ -286,7 +285,7 @@ def _start(values: tuple[Array, Array] | None, qp: QP) -> Start | None:
 def _homogenise(
     dual: Dual, qp: QP, solver: Solver, options: Options, start: Start | None
 ) -> Homogenised:
-    """With λ̄ where the solver starts, or as the options say."""
+    """Homogenise with λ̄ at the solver's start, or as the options say."""
     if start is not None and solver.warm is not None:
         at = dual.last.image(qp.F, solver.warm(qp, start))
         _no_worse_than_nothing(qp, at, start)
@@ -317,7 +316,7 @@ def _no_worse_than_nothing(qp: QP, at: OperatorProduct, start: Start) -> None:
 
 
 def _homogenise_as_told(dual: Dual, qp: QP, options: Options) -> Homogenised:
-    """With λ̄ as the options say; its image is kept."""
+    """Homogenise with λ̄ as the options say; Fλ̄ is kept."""
     kind = options.homogenization if any(dual.contact_rows) else "natural"
     scale = scale_at(qp, dual.image("natural"))
     return homogenise(qp, dual.image(kind), scale)

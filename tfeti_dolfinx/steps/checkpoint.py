@@ -29,7 +29,7 @@ OF_STEP = re.compile(
 
 @dataclass(frozen=True)
 class Index:
-    """What ``checkpoint.json`` has: which files count, and how their bytes add up.
+    """Content of ``checkpoint.json``: the files that count, and their checksums.
 
     Attributes:
         number: How many steps have converged; 0: the folder is taken, nothing is kept yet.
@@ -76,7 +76,7 @@ class Index:
 
 @dataclass(frozen=True)
 class Kept:
-    """What a checkpoint has of a series, the same on all ranks.
+    """Content of a checkpoint of a series, the same on all ranks.
 
     Attributes:
         number: How many steps have converged.

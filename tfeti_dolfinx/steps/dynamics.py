@@ -35,7 +35,7 @@ from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
 from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
-# --- Energies of bodies with mass, and what was done to them in a step ------------------------
+# --- Energies and work of a step --------------------------------------------------------------
 
 NAMES = ("load", "contact", "friction", "supports", "predictor")
 
@@ -98,8 +98,7 @@ def contact_forces(solution: Solution) -> list[list[float]]:
     return [[float(value) for value in row] for row in total]
 
 
-# --- Where bodies with mass may be without elasticity: the nearest place in M that contact
-#     allows ---
+# --- Predictor: projection in M onto admissible displacements ---------------------------------
 
 
 class Predictor:
@@ -145,7 +144,7 @@ class Predictor:
         self._start, self._image = (gluing, lam), image
 
     def nearest(self, w: Array, M: csr_array, gluing: Gluing) -> Array:
-        """The nearest displacement to w.
+        """Return the nearest displacement to w.
 
         Args:
             w: Displacement in DOLFINx's order.
@@ -199,7 +198,7 @@ class Predictor:
         self._dual = settings.make_dual(constraints, self._subdomains, *scene, _frictionless)
 
     def _solve(self, gluing: Gluing) -> Array:
-        """The displacement in primal order."""
+        """Return the displacement in primal order."""
         dual, options, start = self._dual, self._settings.options, None
         assert dual is not None
         dual.forget_counts()
@@ -231,7 +230,7 @@ def _frictionless(constraints: Constraints) -> FeasibleSet:
     return Product([(sets.normals, Bounds()), (sets.tangents.ravel(), Discs(none, width))])
 
 
-# --- Contact of bodies with mass: Newmark's trapezoidal rule, plain or contact-stabilised -----
+# --- Newmark's method with contact ------------------------------------------------------------
 
 
 class ContactDynamics(ContactProblem):
@@ -370,7 +369,7 @@ class ContactDynamics(ContactProblem):
             self.u.x.array[:] = self._first
 
     def state(self) -> SavedState:
-        """The last accepted solution as arrays of this rank, for ``restore``."""
+        """Return the last accepted solution as arrays of this rank, for ``restore``."""
         motion, state = self._forms_in_time.motion, super().state()
         moving = {"velocity": motion.v, "load": motion.load, "size": np.array(motion.size)}
         state = replace(state, **moving)
@@ -417,7 +416,7 @@ class ContactDynamics(ContactProblem):
         return solution
 
     def _predicted(self, predictor: Predictor, free: Array) -> Array:
-        """Where contact lets the bodies go without elasticity."""
+        """Return the displacement that contact allows the bodies without elasticity."""
         system, forms = self._system, self._forms_in_time
         system.look_for_changes()
         system.make(self.report)

@@ -34,7 +34,7 @@ from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.steps.checkpoint import Checkpoint
 
-# --- Where a series of load steps is, whose steps are halved where they do not converge -------
+# --- Place in a series of halved steps --------------------------------------------------------
 
 # whole numbers of the smallest parts are exact in a double, and parts of any real step differ
 MOST_HALVINGS = 30
@@ -68,11 +68,11 @@ class Place:
         return Place(self.number, done, level)
 
     def begin(self, times: Sequence[float]) -> float:
-        """Where the part begins; ``times`` begins with the begin of the first step."""
+        """Return the begin of the part; ``times`` starts with the begin of the first step."""
         return _between(times[self.number], times[self.number + 1], self.done)
 
     def end(self, times: Sequence[float]) -> float:
-        """Where the part ends."""
+        """Return the end of the part."""
         return _between(times[self.number], times[self.number + 1], self.done + self._part)
 
 
@@ -82,7 +82,7 @@ def _between(begin: float, end: float, done: int) -> float:
 
 
 def checked_times(begin: float, times: Sequence[float]) -> list[float]:
-    """The begin and all times, increasing.
+    """Return the begin and all times, increasing.
 
     Raises:
         InputError: They are no such numbers.
@@ -102,7 +102,7 @@ def checked_times(begin: float, times: Sequence[float]) -> list[float]:
     return found
 
 
-# --- A bar on rank 0's terminal while a series of load steps runs; elsewhere nothing ----------
+# --- Progress bar -----------------------------------------------------------------------------
 
 # called with the share of the series that is done and a few words
 Show = Callable[[float, str], None]
@@ -114,7 +114,7 @@ def silent(share: float, text: str) -> None:
 
 @contextmanager
 def shown_progress(comm: MPI.Intracomm, wanted: bool | None) -> Iterator[Show]:
-    """Give what shows how far a series is. Not collective.
+    """Return a function that shows the progress of a series. Not collective.
 
     Args:
         comm: Communicator; only rank 0 shows anything.
@@ -140,7 +140,7 @@ def _say(share: float, text: str) -> None:
     print(f"load steps {100 * share:3.0f} %: {text}", file=sys.stderr, flush=True)
 
 
-# --- All load steps in one file that ParaView animates; it appears whole ----------------------
+# --- Output of all load steps in one file -----------------------------------------------------
 
 POINTS = "points of the mesh"
 
@@ -252,15 +252,14 @@ def _copy(function: fem.Function) -> fem.Function:
     return fem.Function(function.function_space, name=function.name)
 
 
-# --- A series of load steps: solved, shown, written, kept, and halved where one does not
-#     converge ---
+# --- The series of load steps -----------------------------------------------------------------
 
 Apply = Callable[[ContactProblem, float], None]
 
 
 @dataclass(frozen=True)
 class StepRecord:
-    """What is known of a converged step; the same on all ranks.
+    """Record of a converged step; the same on all ranks.
 
     Attributes:
         number: Position in the times of the step that this is, or is a part of.
@@ -418,7 +417,7 @@ class LoadSteps:
             self._apply(self._problem, t)
 
     def _halved(self, place: Place, t: float, error: ConvergenceError) -> Place:
-        """Half the way, from the last accepted step."""
+        """Go back to the last accepted step, and halve the next one."""
         self._problem.go_back()
         if place.level >= self._max_halvings:
             begin = place.begin(self._times)
@@ -458,7 +457,7 @@ class LoadSteps:
             self._series.write(t, fields)
 
     def _begin(self, resume: bool) -> Place:
-        """Where to begin, with the state of that place."""
+        """Return the place to begin at, and restore its state."""
         self.records = []
         if self._checkpoint is None:
             return Place()

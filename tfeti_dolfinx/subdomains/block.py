@@ -11,12 +11,12 @@ from scipy.sparse import csr_array
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.validation import check_load
 
-# --- What a Block is made from, and what Blocks have cost -------------------------------------
+# --- Input and counters of Blocks -------------------------------------------------------------
 
 
 @dataclass
 class Counters:
-    """What the Blocks of a rank have cost.
+    """Counters of the factorisations and solves of a rank's Blocks.
 
     Attributes:
         factorizations: Numeric factorisations.
@@ -60,7 +60,7 @@ class SubdomainData:
         return len(self.f) // max(len(self.x), 1)
 
 
-# --- Kernels of subdomain stiffnesses, found among candidate modes ----------------------------
+# --- Kernels of subdomain stiffnesses ---------------------------------------------------------
 
 # Energy of a mode, as a share of what its terms may be without their signs, that counts as none:
 # rounding makes 2e-16 of it, a spring of 1e-10 of the stiffness 1e-14 and more.
@@ -110,13 +110,13 @@ MODE_NAMES = {
 
 
 def mode_names(gdim: int, bs: int) -> tuple[str, ...]:
-    """Names of the candidate modes of a field with bs components, in their order."""
+    """Return names of the candidate modes of a field with bs components, in their order."""
     constants = tuple(f"constant in component {i}" for i in range(bs))
     return MODE_NAMES.get((gdim, bs), constants)
 
 
 def kernel_of(K: Any, modes: Array) -> Array:
-    """Orthonormal basis of the kernel of K within the span of the candidate modes.
+    """Return an orthonormal basis of the kernel of K within the span of the candidate modes.
 
     The null space of R₀ᵀ K R₀, R₀ an orthonormal basis of the modes; it is smaller than the
     span, or empty, where springs or mass terms hold the subdomain.
@@ -135,7 +135,7 @@ def kernel_of(K: Any, modes: Array) -> Array:
 
 
 def _terms(K: csr_array, R: Array) -> Array:
-    """What the terms of RᵀKR may be, without their signs, for each mode.
+    """Bound the absolute values of the terms of RᵀKR, for each mode.
 
     In flat cells entries are differences of far larger numbers, which are as large as those that
     other unknowns of the cell have: the largest diagonal entry that a row meets bounds them.
@@ -148,7 +148,7 @@ def _terms(K: csr_array, R: Array) -> Array:
 
 
 def orthonormal(modes: Array) -> Array:
-    """Orthonormal basis of the span of the columns (few of them, maybe dependent)."""
+    """Return an orthonormal basis of the span of the columns (few of them, maybe dependent)."""
     U, s, _ = np.linalg.svd(modes, full_matrices=False)
     return U[:, s > DEPENDENT * s.max(initial=0.0)]
 
@@ -179,13 +179,13 @@ def _farthest(distance: Array) -> int:
 
 
 def fixing_dofs(x: Array, node_of_dof: Array) -> Array:
-    """Positions of the unknowns at well-spread nodes, given the node of each unknown."""
+    """Return positions of the unknowns at well-spread nodes, given the node of each unknown."""
     nodes = np.unique(node_of_dof)
     chosen = nodes[fixing_nodes(x[nodes], 2 ** x.shape[1])]
     return np.flatnonzero(np.isin(node_of_dof, chosen))
 
 
-# --- The Block: all that the dual knows of a subdomain ----------------------------------------
+# --- The Block --------------------------------------------------------------------------------
 
 OperatorKind = Literal["pinv", "stiffness", "schur"]
 
@@ -392,7 +392,7 @@ class BlockDefaults:
         """Nothing is to be freed."""
 
     def _extended(self, w: Array) -> Array:
-        """A trace vector on all unknowns, 0 elsewhere."""
+        """Return a trace vector on all unknowns, 0 elsewhere."""
         full = np.zeros(len(self.load))
         full[self.trace_dofs] = w
         return full

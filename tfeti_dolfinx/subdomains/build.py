@@ -33,7 +33,7 @@ def subdomain_data(
     trace: Array,
     added: Array | None = None,
 ) -> Iterator[SubdomainData]:
-    """What the Block of each subdomain of this rank is made from, one at a time. Collective.
+    """Return the data of each subdomain's Block on this rank, one at a time. Collective.
 
     Args:
         dofs: Dof maps.
@@ -98,7 +98,7 @@ def _lone(starts: Array, entries_of_row: Array) -> Array:
 
 
 def sparse_blocks(how: InverseFactory, choice: LocalChoice) -> MakeBlock:
-    """What makes the Blocks of a rank, which share a stiffness where a choice says so."""
+    """Return the factory of a rank's Blocks, which share a stiffness if the choice says so."""
     equals = EqualSubdomains(how) if choice.shares else None
     return lambda data: SparseBlock(data, how, equals)
 

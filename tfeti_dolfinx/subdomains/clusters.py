@@ -27,7 +27,7 @@ from tfeti_dolfinx.subdomains.local_operators import (
 )
 from tfeti_dolfinx.subdomains.subdomains import BALANCED, Subdomains
 
-# --- Clusters of subdomains, and the averages over common faces that glue those of each -------
+# --- Clusters of subdomains and averages over their faces -------------------------------------
 
 # Of the largest singular value of the modes of a face: less is no motion of its own (an edge has
 # no turn about itself); and of an average's square, what is left of it beside the others.
@@ -98,7 +98,7 @@ def clusters_of(dofs: TornDofs, decomposition: Decomposition, wanted: int) -> Cl
 
 
 def _connected(pairs: Array, n: int) -> tuple[int, Array]:
-    """Number of components, and that of each of n subdomains."""
+    """Return the number of components, and that of each of n subdomains."""
     if n == 0:
         return 0, np.zeros(0, dtype=np.int64)
     graph = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(n, n))
@@ -225,7 +225,7 @@ def _copies(dofs: TornDofs) -> tuple[Array, Array]:
 
 
 def _motions(x: Array, bs: int) -> Array | None:
-    """Orthonormal rigid motions of a face, None where it is only an edge or a vertex."""
+    """Return orthonormal rigid motions of a face, None where it is only an edge or a vertex."""
     centre = x.mean(axis=0)
     length = float(np.linalg.norm(x - centre, axis=1).max())
     modes = candidate_modes(x, bs, centre, length)
@@ -253,7 +253,7 @@ def _averages(faces: list[_Face], cluster: Array, dofs: TornDofs) -> tuple[csr_a
 
 
 def _independent(averages: csr_array, rows: Array) -> Array:
-    """Rows that are independent and span the same, ascending."""
+    """Return rows that are independent and span the same, ascending."""
     if len(rows) == 0:
         return rows
     own = averages[rows]
@@ -263,7 +263,7 @@ def _independent(averages: csr_array, rows: Array) -> Array:
     return np.sort(rows[pivots[:rank] - 1])
 
 
-# --- What averages make of the generalised inverses of a rank's subdomains, see ``clusters`` ---
+# --- Generalised inverses under averages ------------------------------------------------------
 
 
 class Glue:
@@ -382,8 +382,7 @@ def _scales(F: Array, G: Array) -> tuple[Array, Array]:
     return mu, np.where(size > 0.0, size, 1.0) ** -0.5
 
 
-# --- Subdomains of a rank in clusters: one kernel for each, K⁺ with its subdomains glued by
-#     averages ---
+# --- Subdomains of a rank in clusters ---------------------------------------------------------
 # Hybrid TFETI: Klawonn, Rheinbach, Z. Angew. Math. Mech. 90 (2010) 5–32. In a cluster u minimises
 # ½uᵀKu − bᵀu under B_c u = 0:
 #
@@ -431,13 +430,13 @@ class ClusteredSubdomains(Subdomains):
         self._glued: Glue | None = None
 
     def update(self, K: Sequence[object] | None = None, f: Array | None = None) -> None:
-        """As for subdomains. Collective."""
+        """Update K and f as ``Subdomains.update`` does. Collective."""
         if K is not None:
             self._null = self._glued = None
         super().update(K, f)
 
     def retrace(self, trace: Array, span: Array | None = None) -> None:
-        """As for subdomains."""
+        """Change the trace as ``Subdomains.retrace`` does."""
         super().retrace(trace, span)
         self._glued = None
 
@@ -450,12 +449,12 @@ class ClusteredSubdomains(Subdomains):
         return self._null
 
     def _places(self) -> list[tuple[Array, Array]]:
-        """Rows of B_c, and kernel coordinates of the subdomains, of each cluster."""
+        """Return rows of B_c, and kernel coordinates of the subdomains, of each cluster."""
         sizes = [part.stop - part.start for part in self.kernel_parts]
         return self._of_clusters(np.repeat(self._clusters.of_subdomain, sizes))
 
     def _of_clusters(self, owner: Array) -> list[tuple[Array, Array]]:
-        """Rows of B_c, and coordinates, of each cluster."""
+        """Return rows of B_c, and coordinates, of each cluster."""
         of_row = self._clusters.of_row
         return [
             (np.flatnonzero(of_row == c), np.flatnonzero(owner == c))
@@ -610,6 +609,6 @@ def _nulls(G: csr_array, places: list[tuple[Array, Array]]) -> csr_array:
 
 
 def _null_of(G: Array) -> Array:
-    """Orthonormal basis of null(Gᵀ)."""
+    """Return an orthonormal basis of null(Gᵀ)."""
     values, vectors = np.linalg.eigh(G @ G.T)
     return np.asarray(vectors[:, values <= NULL * values.max(initial=0.0)])

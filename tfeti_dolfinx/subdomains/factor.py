@@ -17,7 +17,7 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import is_read
 from tfeti_dolfinx.errors import FactorError
 
-# --- Sparse Cholesky factors through PETSc: CHOLMOD, or what this PETSc has in its place ------
+# --- Sparse Cholesky factors ------------------------------------------------------------------
 
 log = logging.getLogger(__name__)
 
@@ -47,7 +47,7 @@ class NotPositiveDefiniteError(FactorError, ArithmeticError):
 
 @dataclass(frozen=True)
 class FactorSize:
-    """What a factor stores.
+    """Storage of a factor.
 
     Attributes:
         entries: Entries of L.
@@ -106,7 +106,7 @@ class CholeskyFactor:
 
     @property
     def size(self) -> FactorSize:
-        """What the factor stores, as far as its package tells."""
+        """Storage of the factor, as far as its package tells."""
         info = self._factor.getInfo()
         entries = max(info["nz_used"], float(self._b.getLocalSize()))
         return FactorSize(entries, max(info["memory"], REAL * entries))
@@ -165,12 +165,12 @@ def added_options(prefix: str, given: Mapping[str, Any]) -> Iterator[None]:
 
 @cache
 def default_solver() -> str:
-    """The first of ``SOLVERS`` that this PETSc has."""
+    """Return the first of ``SOLVERS`` that this PETSc has."""
     return next(solver for solver in SOLVERS if has_solver(solver))
 
 
 def has_solver(solver: str) -> bool:
-    """Whether this PETSc makes Cholesky factors by a solver."""
+    """Return whether this PETSc makes Cholesky factors by a solver."""
     return _makes_factor(solver, "")
 
 
@@ -247,7 +247,7 @@ def as_petsc_matrix(A: Any) -> PETSc.Mat:
 
 
 def _factored(pc: PETSc.PC, matrix: PETSc.Mat, prefix: str) -> PETSc.Mat:
-    """The factor of a matrix, by PETSc's options with a prefix."""
+    """Return the factor of a matrix, by PETSc's options with a prefix."""
     pc.setOptionsPrefix(prefix)
     pc.setType(PETSc.PC.Type.CHOLESKY)
     pc.setOperators(matrix)
@@ -255,7 +255,7 @@ def _factored(pc: PETSc.PC, matrix: PETSc.Mat, prefix: str) -> PETSc.Mat:
 
 
 def _factored_again(pc: PETSc.PC, prefix: str) -> PETSc.Mat:
-    """The factor of the present values, numeric only if there has been one."""
+    """Return the factor of the present values, numeric only if there has been one."""
     given = {"pc_factor_mat_solver_type": default_solver(), **DEFINITE, **QUIET}
     with added_options(prefix, given):
         pc.setFromOptions()
@@ -281,7 +281,7 @@ def _check_definite(factor: PETSc.Mat) -> None:
 
 
 def _cause(error: Exception, solver: str | None, A: PETSc.Mat) -> FactorError:
-    """What made the factor of a matrix fail."""
+    """Return the error that says why a matrix could not be factored."""
     if isinstance(error, FactorError):
         return type(error)(f"not positive definite ({solver}: {error})")
     code = getattr(error, "ierr", None)
@@ -300,7 +300,7 @@ def _cause(error: Exception, solver: str | None, A: PETSc.Mat) -> FactorError:
     return FactorError(f"{solver} failed: {str(error).strip().splitlines()[-1]}")
 
 
-# --- What a generalised inverse of a stiffness is asked for -----------------------------------
+# --- Protocol of a generalised inverse --------------------------------------------------------
 
 
 class GeneralisedInverse(Protocol):
@@ -334,7 +334,7 @@ class FactoredInverse:
 
     @property
     def size(self) -> FactorSize:
-        """What the factor stores."""
+        """Storage of the factor."""
         return self._factor.size
 
     def refactor(self, R: Array) -> None:

@@ -25,7 +25,7 @@ from tfeti_dolfinx.subdomains.factor import (
     lent,
 )
 
-# --- Generalised inverses by the Schur complement on a few unknowns, and two choices of these ---
+# --- Generalised inverses by a Schur complement -----------------------------------------------
 
 # Of the mean size of a motion: one that is less on the last unknowns leaves a pivot of 1e-8 before
 # them, which counts as none.
@@ -70,7 +70,7 @@ class SchurPseudoinverse(FactoredInverse):
 
     @property
     def size(self) -> FactorSize:
-        """What the factor stores, and H, of which a sweep reads half."""
+        """Storage of the factor and of H, of which a sweep reads half."""
         factor = self._factor.size
         return FactorSize(factor.entries + self._H.size, factor.memory + REAL * self._H.size)
 
@@ -106,7 +106,7 @@ class SchurPseudoinverse(FactoredInverse):
 
 
 class TrailingPseudoinverse(SchurPseudoinverse):
-    """The same where s is what an elimination leaves when it meets its first zero pivot.
+    """Schur pseudoinverse whose s are the unknowns left by elimination at its first zero pivot.
 
     The singular block at the end of a nested dissection, whose pseudo-inverse is found apart,
     as in LU with a singular value decomposition of the last block (Farhat, Géradin, IJNME 41,
@@ -115,7 +115,7 @@ class TrailingPseudoinverse(SchurPseudoinverse):
     """
 
     def _chosen(self, R: Array) -> Array:
-        """The last unknowns, as few as hold the kernel."""
+        """Return the last unknowns, as few as hold the kernel."""
         if R.shape[1] == 0:
             return np.empty(0, dtype=np.int64)
         matrix = as_petsc_matrix(self._K)
@@ -129,7 +129,7 @@ class TrailingPseudoinverse(SchurPseudoinverse):
 
 
 def _least(R: Array) -> float:
-    """Of all motions of the kernel, the least that moves some unknowns, in the mean."""
+    """Return the least mean motion of some unknowns, over all unit motions of the kernel."""
     return float(np.linalg.svd(R, compute_uv=False)[-1] / np.sqrt(len(R)))
 
 
@@ -155,7 +155,7 @@ def _apart(K: Any, s: Array) -> AbstractContextManager[None]:
     return lent(K.data, np.flatnonzero(coupled), 0.0)
 
 
-# --- Generalised inverses of a subdomain's stiffness ------------------------------------------
+# --- Choice of generalised inverse ------------------------------------------------------------
 
 # of the largest entry of a kernel: rounding
 STILL = 1e-8
@@ -231,7 +231,7 @@ def with_entries(K: Any, dofs: Array) -> Any:
 
 
 def same_pattern(K: Any, other: Any) -> bool:
-    """Whether two CSR matrices store the same entries."""
+    """Return whether two CSR matrices store the same entries."""
     return np.array_equal(K.indptr, other.indptr) and np.array_equal(K.indices, other.indices)
 
 
@@ -243,13 +243,13 @@ def _projector(K: Any, R: Array, fixing_dofs: Array) -> Array:
 
 
 def _places(K: Any, dofs: Array) -> Array:
-    """Where the entries of each pair of dofs are stored, −1 where they are not."""
+    """Return where the entries of each pair of dofs are stored, −1 where they are not."""
     number = csr_array((np.arange(1, K.nnz + 1), K.indices, K.indptr), shape=K.shape)
     return np.asarray(number[dofs][:, dofs].toarray()) - 1
 
 
 def _regular(K: Any, R: Array, fixing_dofs: Array) -> AbstractContextManager[None]:
-    """The values of K_ρ in the place of those of K, for a while."""
+    """Return the values of K_ρ in the place of those of K, for a while."""
     places = _places(K, fixing_dofs)
     added = _projector(K, R, fixing_dofs) if R.shape[1] else 0.0
     return lent(K.data, places, K.data[places] + added)
@@ -266,7 +266,7 @@ KPLUS_TYPES: dict[str, MakeInverse] = {
 
 @dataclass(frozen=True)
 class InverseFactory:
-    """How inverses are made.
+    """Factory of generalised inverses.
 
     Attributes:
         counters: Counts factorisations.
@@ -279,7 +279,7 @@ class InverseFactory:
     prefix: str = "tfeti_sub_"
 
 
-# --- Why a stiffness is not positive definite beside its kernel: by rounding, or by its form ---
+# --- Causes of indefinite stiffnesses ---------------------------------------------------------
 
 # Of the diagonal: what this makes positive definite was indefinite by rounding only, which in
 # assembly and factor comes to 1e-14 or so.
@@ -377,7 +377,7 @@ def _drawn(n: int, count: int) -> Array:
 
 
 def _beside(R: Array, u: Array) -> Array:
-    """The part that is orthogonal to the kernel."""
+    """Return the part that is orthogonal to the kernel."""
     return u - R @ (R.T @ u)
 
 

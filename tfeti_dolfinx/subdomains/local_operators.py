@@ -22,7 +22,7 @@ from tfeti_dolfinx.subdomains.stiffness import (
     made_dense,
 )
 
-# --- What local operators cost, by a model, to choose between them ----------------------------
+# --- Cost model of local operators ------------------------------------------------------------
 
 # What one core of a few years ago does; of a faster one all times are shorter alike, and only their
 # ratios choose. Bytes read from memory, and operations of sweeps over a factor and of dense
@@ -55,28 +55,28 @@ class Cost:
 
 
 def sweeps(factor: FactorSize, n: int, count: int) -> float:
-    """Seconds of a solve with a factor of n unknowns and as many right sides."""
+    """Return seconds of a solve with a factor of n unknowns and as many right sides."""
     reading = sweeps_traffic(factor, n, count) / BANDWIDTH
     return max(reading, 4.0 * factor.entries * count / SWEEPS) + CALL * -(-count // TOGETHER)
 
 
 def sweeps_traffic(factor: FactorSize, n: int, count: int) -> float:
-    """Bytes that go through memory for it: the factor twice, and the right sides."""
+    """Return bytes that go through memory for it: the factor twice, and the right sides."""
     return 2.0 * -(-count // TOGETHER) * factor.memory + 4.0 * REAL * n * count
 
 
 def sparse_traffic(entries: int, count: int) -> float:
-    """Bytes that go through memory for products of a sparse matrix with as many vectors."""
+    """Return bytes that go through memory for products of a sparse matrix with as many vectors."""
     return (REAL + INDEX) * entries * count
 
 
 def sparse_products(entries: int, count: int) -> float:
-    """Seconds of products of a sparse matrix with as many vectors."""
+    """Return seconds of products of a sparse matrix with as many vectors."""
     return SPARSE_ENTRY * entries * count + CALL
 
 
 def dense_product(t: int, count: int) -> float:
-    """Seconds of a product of a dense symmetric t × t matrix with as many vectors."""
+    """Return seconds of a product of a dense symmetric t × t matrix with as many vectors."""
     reading = dense_traffic(t, count) / BANDWIDTH
     if count == 1:
         return reading + CALL
@@ -84,13 +84,13 @@ def dense_product(t: int, count: int) -> float:
 
 
 def dense_traffic(t: int, count: int) -> float:
-    """Bytes that go through memory for it; of a matrix that is used alone half is stored."""
+    """Return bytes that go through memory for it; of a matrix that is used alone half is stored."""
     if count == 1:
         return REAL * t * t / 2.0
     return REAL * (t * t + 4.0 * t * count)
 
 
-# --- K⁺, K_bb and S on a trace as matrices that are applied through factors -------------------
+# --- K⁺, K_bb and S on a trace, applied through factors ---------------------------------------
 
 # Of the stiffness of a node: what K⁺ makes of forces of size 1 on a sound subdomain stays far below
 # it. Above it, where springs or soft parts hardly hold a subdomain, the parts of K⁺ w that cancel
@@ -111,7 +111,7 @@ class TraceMatrix(Protocol):
 
     @property
     def is_sound(self) -> bool:
-        """Whether a dense one rounds no worse than the factors; may cost a solve."""
+        """True if the dense matrix rounds no worse than the factors; may cost a solve."""
         ...
 
     def apply(self, W: Array) -> Array:
@@ -119,15 +119,15 @@ class TraceMatrix(Protocol):
         ...
 
     def seconds(self, count: int) -> float:
-        """Of ``apply`` to so many vectors, by the model."""
+        """Return the modelled seconds of ``apply`` to so many vectors."""
         ...
 
     def traffic(self, count: int) -> float:
-        """Bytes that ``apply`` to so many vectors moves, by the model."""
+        """Return bytes that ``apply`` to so many vectors moves, by the model."""
         ...
 
     def dense(self, packed: bool) -> Packed | SymmetricMatrix:
-        """The same, dense."""
+        """Return the same, dense."""
         ...
 
 
@@ -146,7 +146,7 @@ class PinvMatrix:
 
     @property
     def is_sound(self) -> bool:
-        """Whether random forces of size 1 move the trace by no more than a sound subdomain."""
+        """True if random unit forces move the trace no more than in a well-held subdomain."""
         if self.size == 0:
             return True
         forces = np.random.default_rng(0).standard_normal((self.size, 1))
@@ -164,15 +164,15 @@ class PinvMatrix:
         return out
 
     def seconds(self, count: int) -> float:
-        """Of ``apply`` to so many vectors, by the model."""
+        """Return the modelled seconds of ``apply`` to so many vectors."""
         return sweeps(self._stiffness.factor_size, self._stiffness.size, count)
 
     def traffic(self, count: int) -> float:
-        """Bytes that ``apply`` to so many vectors moves, by the model."""
+        """Return bytes that ``apply`` to so many vectors moves, by the model."""
         return sweeps_traffic(self._stiffness.factor_size, self._stiffness.size, count)
 
     def dense(self, packed: bool) -> Packed | SymmetricMatrix:
-        """The same, dense; kept for the next operator on this trace."""
+        """Return the same, dense; kept for the next operator on this trace."""
         key = packed, self._trace.tobytes()
         kept = self._stiffness.dense_pinv
         if kept is None or kept[0] != key:
@@ -203,7 +203,7 @@ class SchurMatrix:
         return self._traced.apply_schur(W)
 
     def seconds(self, count: int) -> float:
-        """Of ``apply`` to so many vectors, by the model."""
+        """Return the modelled seconds of ``apply`` to so many vectors."""
         inner = self._traced.inner
         products = sparse_products(self._traced.K_bb.nnz, count)
         if inner is None:
@@ -212,7 +212,7 @@ class SchurMatrix:
         return products + sweeps(inner.size, self._traced.K_ib.shape[0], count)
 
     def traffic(self, count: int) -> float:
-        """Bytes that ``apply`` to so many vectors moves, by the model."""
+        """Return bytes that ``apply`` to so many vectors moves, by the model."""
         inner, K_ib = self._traced.inner, self._traced.K_ib
         products = sparse_traffic(self._traced.K_bb.nnz, count)
         if inner is None:
@@ -221,7 +221,7 @@ class SchurMatrix:
         return products + sweeps_traffic(inner.size, K_ib.shape[0], count)
 
     def dense(self, packed: bool) -> Packed | SymmetricMatrix:
-        """The same, dense."""
+        """Return the same, dense."""
         return _made(self, packed)
 
 
@@ -247,20 +247,20 @@ class StiffnessMatrix:
         return np.asarray(self._K_bb @ W)
 
     def seconds(self, count: int) -> float:
-        """Of ``apply`` to so many vectors, by the model."""
+        """Return the modelled seconds of ``apply`` to so many vectors."""
         return sparse_products(self._K_bb.nnz, count)
 
     def traffic(self, count: int) -> float:
-        """Bytes that ``apply`` to so many vectors moves, by the model."""
+        """Return bytes that ``apply`` to so many vectors moves, by the model."""
         return sparse_traffic(self._K_bb.nnz, count)
 
     def dense(self, packed: bool) -> Packed | SymmetricMatrix:
-        """The same, dense."""
+        """Return the same, dense."""
         return _made(self, packed)
 
 
 class OwnMatrix:
-    """What a Block of another class applies, one vector after the other.
+    """Matrix of a Block of another class, applied to one vector after the other.
 
     Args:
         apply: A w, shapes ``(t,)``.
@@ -286,11 +286,11 @@ class OwnMatrix:
         return 0.0
 
     def traffic(self, count: int) -> float:
-        """Bytes that ``apply`` to so many vectors moves, by the model."""
+        """Return bytes that ``apply`` to so many vectors moves, by the model."""
         return 0.0
 
     def dense(self, packed: bool) -> Packed | SymmetricMatrix:
-        """The same, dense."""
+        """Return the same, dense."""
         return _made(self, packed)
 
 
@@ -299,7 +299,7 @@ def _made(matrix: TraceMatrix, packed: bool) -> Packed | SymmetricMatrix:
     return Packed(A) if packed else SymmetricMatrix(A)
 
 
-# --- Groups of Blocks that apply one matrix, each to its own part of it -----------------------
+# --- Groups of Blocks with one matrix ---------------------------------------------------------
 
 
 class Group:
@@ -331,7 +331,7 @@ class Group:
 
 
 class Form(Protocol):
-    """How a group applies its matrix.
+    """Form in which a group applies its matrix.
 
     Attributes:
         name: Name in reports.
@@ -386,7 +386,7 @@ class Explicit:
 
 
 def chosen(group: Group, local_type: str, multiplications: int) -> Form:
-    """The form of a group, one of a type or what the model says is cheapest."""
+    """Return the form of a group, one of a type or what the model says is cheapest."""
     implicit, explicit = Implicit(group), Explicit(group)
     if local_type == "implicit" or not group.matrix.has_dense:
         return implicit
@@ -488,7 +488,7 @@ def _group(blocks: Sequence[Block], kind: OperatorKind, parts: Sequence[slice]) 
     return Group(matrix, [np.searchsorted(trace, place) for place in places], parts)
 
 
-# --- Local operators: K⁺, K_bb or S of all subdomains of a rank at once, on its trace ---------
+# --- Local operators of all subdomains of a rank ----------------------------------------------
 
 LOCAL_TYPES = ("auto", "implicit", "explicit", "shared")
 
@@ -534,7 +534,7 @@ class ModelledOperator(LocalOperator, Protocol):
 
 @dataclass(frozen=True)
 class LocalChoice:
-    """Which form local operators take.
+    """Choice of the form of local operators.
 
     Attributes:
         type: One of ``LOCAL_TYPES``.
@@ -546,7 +546,7 @@ class LocalChoice:
 
     @property
     def shares(self) -> bool:
-        """Whether equal subdomains share their stiffness."""
+        """True if equal subdomains share their stiffness."""
         return self.type in ("auto", "shared")
 
 
@@ -618,5 +618,5 @@ class GroupedOperator:
 def local_operator(
     blocks: Sequence[Block], kind: OperatorKind, choice: LocalChoice
 ) -> ModelledOperator:
-    """The local operator of a rank: the one place that chooses its form."""
+    """Return the local operator of a rank: the one place that chooses its form."""
     return GroupedOperator(blocks, kind, choice)

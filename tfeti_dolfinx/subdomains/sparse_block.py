@@ -22,7 +22,7 @@ from tfeti_dolfinx.subdomains.block import (
 from tfeti_dolfinx.subdomains.kplus import InverseFactory, same_pattern
 from tfeti_dolfinx.subdomains.stiffness import Stiffness, Traced
 
-# --- Subdomains that are equal but for a translation share their stiffness and its factors ----
+# --- Equal subdomains -------------------------------------------------------------------------
 
 # Of the size of a subdomain: nodes nearer than that have the same place. Which nodes are meant
 # is all that it decides, so it is far below a cell and far above rounding of coordinates; the
@@ -75,7 +75,7 @@ class EqualSubdomains:
 
 
 def places_in_order(x: Array) -> tuple[bytes, Array]:
-    """The places of the nodes beside the lowest corner in their order, and this order."""
+    """Return the places of the nodes beside the lowest corner in their order, and this order."""
     corner = x.min(axis=0)
     size = float((x.max(axis=0) - corner).max()) or 1.0
     places = np.rint((x - corner) / (PLACE * size)).astype(np.int64)
@@ -84,7 +84,7 @@ def places_in_order(x: Array) -> tuple[bytes, Array]:
 
 
 def _shape_and_order(x: Array, bs: int) -> tuple[bytes, Array]:
-    """The places of the nodes, and the unknowns in their order."""
+    """Return the places of the nodes, and the unknowns in their order."""
     places, nodes = places_in_order(x)
     # sizes that differ show in K; as a part of the key they would have to be rounded
     order = (nodes[:, None] * bs + np.arange(bs)).ravel().astype(np.int32)
@@ -92,7 +92,7 @@ def _shape_and_order(x: Array, bs: int) -> tuple[bytes, Array]:
 
 
 def _equal(K: Any, other: Stiffness, here: Array) -> bool:
-    """Whether K is the other stiffness, its unknown i being the other's ``here[i]``."""
+    """Return whether K equals the other stiffness, unknown i being the other's ``here[i]``."""
     allowed = SAME * np.abs(other.K.data).max(initial=0.0)
     in_order = np.array_equal(here, np.arange(len(here)))
     if in_order and same_pattern(K, other.K):
@@ -106,7 +106,7 @@ def _equal(K: Any, other: Stiffness, here: Array) -> bool:
     return bool(np.abs((moved - other.K).data).max(initial=0.0) <= allowed)
 
 
-# --- Whether what is added to a stiffness holds motions firmly --------------------------------
+# --- Firmness of additions to the diagonal ----------------------------------------------------
 
 # of the largest diagonal entry of K: an energy of a motion of length 1 that is rounding, and one
 # from which on the motion is held as firmly as others bend
@@ -114,7 +114,7 @@ NOTHING, FIRM = 1e-26, 0.02
 
 
 def holds_firmly(modes: Array, added: Array, diagonal: Array) -> bool:
-    """Whether rigid motions are left free, or held about as firmly as a subdomain deforms.
+    """Return whether rigid motions are free, or held about as firmly as the subdomain deforms.
 
     What holds them softly, as a short end or a soft part do, makes a nearly singular matrix of one
     whose kernel is known.
@@ -130,7 +130,7 @@ def holds_firmly(modes: Array, added: Array, diagonal: Array) -> bool:
     return not np.any((energies > NOTHING * most) & (energies < FIRM * most))
 
 
-# --- A subdomain of sparse finite elements ----------------------------------------------------
+# --- Block of sparse finite elements ----------------------------------------------------------
 
 # between projectors: less is rounding
 SAME_DIRECTION = 1e-9
@@ -196,7 +196,7 @@ class SparseBlock(BlockDefaults):
             self.kernel[self._added > 0.0] = 0.0
 
     def _firm(self, K: Any) -> Array | None:
-        """What K is to get on its diagonal, if that holds no motion softly."""
+        """Return the addition to the diagonal of K, or None if it would hold motions softly."""
         if self._to_add is None:
             return None
         check_stiffness(self.name, K)
@@ -265,7 +265,7 @@ class SparseBlock(BlockDefaults):
 
     @cached_property
     def traced(self) -> Traced:
-        """What the stiffness is on the trace, in its own numbering."""
+        """The stiffness on the trace, in its own numbering."""
         order = self._trace_order
         span = None if self._span is None else self._span[order]
         return self.stiffness.on_trace(self.trace_place[order], span)
@@ -287,13 +287,13 @@ class SparseBlock(BlockDefaults):
         self.__dict__.pop("_trace_order", None)
 
     def _placed(self, u: Array) -> Array:
-        """A vector in the numbering of the stiffness."""
+        """Return a vector in the numbering of the stiffness."""
         placed = np.empty(len(u))
         placed[self.place] = u
         return placed
 
     def _back(self, w: Array) -> Array:
-        """A trace vector of the stiffness in the Block's order."""
+        """Return a trace vector of the stiffness in the Block's order."""
         out = np.empty(len(w))
         out[self._trace_order] = w
         return out

@@ -38,7 +38,7 @@ from tfeti_dolfinx.subdomains.kplus import (
 
 
 class Packed:
-    """Half of a symmetric matrix, for one vector at a time: what is read is what it costs.
+    """Packed half of a symmetric matrix, for one vector at a time: reading it is the cost.
 
     Args:
         A: The matrix, shape ``(t, t)``.
@@ -74,7 +74,7 @@ class SymmetricMatrix:
 
 
 def made_dense(apply: Callable[[Array], Array], size: int, together: int) -> Array:
-    """The matrix of a symmetric operator, symmetric to the last bit.
+    """Return the matrix of a symmetric operator, symmetric to the last bit.
 
     Args:
         apply: A W, shapes ``(t, q)``.
@@ -92,7 +92,7 @@ def made_dense(apply: Callable[[Array], Array], size: int, together: int) -> Arr
     return np.asarray(A)
 
 
-# --- K_bb and the Schur complement S of a stiffness on a trace --------------------------------
+# --- K_bb and the Schur complement S on a trace -----------------------------------------------
 
 # Of the largest singular value of the kernel's trace rows, orthonormal columns of which these are
 # a part: below it a motion is as good as 0 on the trace. K_ii resists it by the square of that,
@@ -104,7 +104,7 @@ DIGITS = 9
 
 @dataclass(frozen=True)
 class ConstrainedTrace:
-    """What rows act on.
+    """Unknowns, and directions of nodes, that rows act on.
 
     Attributes:
         trace: Trace unknowns, ascending, shape ``(t,)``.
@@ -121,7 +121,7 @@ class ConstrainedTrace:
 
 
 def seen_along(trace: Array, span: Array | None, n: int) -> ConstrainedTrace:
-    """What rows act on that see the nodes of a trace in some directions.
+    """Return the constrained trace of rows that act on its nodes in some directions only.
 
     Args:
         trace: Trace unknowns, ascending, shape ``(t,)``.
@@ -253,7 +253,7 @@ class Traced:
         return np.setdiff1d(np.arange(self._K.shape[0]), self.trace, assume_unique=True)
 
 
-# --- The stiffness of a subdomain, or of all that are equal, and what is made of it once ------
+# --- Stiffness of one subdomain, or of equal ones ---------------------------------------------
 
 
 class Stiffness:
@@ -326,7 +326,7 @@ class Stiffness:
 
     @property
     def factor_size(self) -> FactorSize:
-        """What the factor stores; of an inverse of one's own, as if it were dense."""
+        """Storage of the factor; of an inverse that the user brings, as if it were dense."""
         if isinstance(self._pinv, FactoredInverse):
             return self._pinv.size
         n = float(self.size)
@@ -347,7 +347,7 @@ class Stiffness:
         return self._traced[key]
 
     def leave(self, traced: Traced) -> None:
-        """A Block no longer needs what it has asked for."""
+        """Drop one user of the matrices on a trace; free them with the last."""
         traced.users -= 1
         if traced.users == 0:
             self._traced.pop(traced.seen.key, None)

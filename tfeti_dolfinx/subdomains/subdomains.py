@@ -20,7 +20,7 @@ from tfeti_dolfinx.subdomains.local_operators import (
     solved_together,
 )
 
-# --- Motions of subdomains that are no kernel, since something holds them, maybe softly -------
+# --- Motions of subdomains that springs hold --------------------------------------------------
 
 # of a mode of length 1: what is left of it outside of the kernel is rounding
 IN_KERNEL = 1e-6
@@ -42,7 +42,7 @@ class SoftMotions:
 
 
 def sprung(blocks: Sequence[Block]) -> SoftMotions:
-    """What springs hold in each Block."""
+    """Return the motions of each Block that springs hold."""
     modes, energies = zip(*map(_outside_motions, blocks), strict=True) if blocks else ((), ())
     trace = [R[block.trace_dofs] for R, block in zip(modes, blocks, strict=True)]
     rows = csr_array(block_diag(trace)) if trace else csr_array((0, 0))
@@ -70,7 +70,7 @@ def _outside_motions(block: Block) -> tuple[Array, Array]:
     return U @ V, np.maximum(energies, 0.0)
 
 
-# --- All subdomains of a rank as one: what the dual asks of Blocks, on arrays of the rank -----
+# --- All subdomains of a rank -----------------------------------------------------------------
 
 # Of ‖f‖: what the load of a subdomain does to rigid motions, which have unit norm. Ten times less
 # was found where it balances itself; more is a load that moves the subdomain.
@@ -170,7 +170,7 @@ class Subdomains:
 
     @property
     def kernel_parts(self) -> list[slice]:
-        """Where the kernel coordinates of each Block lie among the r."""
+        """Slices of the kernel coordinates of each Block among the r."""
         return parts_of([block.kernel.shape[1] for block in self.blocks])
 
     @property
@@ -280,7 +280,7 @@ class Subdomains:
         return [float(u[part] @ block.multiply(u[part])) for block, part in pairs]
 
     def extended(self, v: Array) -> Array:
-        """A trace vector, shape ``(t,)``, on all unknowns, 0 elsewhere, shape ``(n,)``."""
+        """Return a trace vector, shape ``(t,)``, on all unknowns, 0 elsewhere, shape ``(n,)``."""
         u = np.zeros(_end(self.dof_parts))
         u[self.trace] = v
         return u
@@ -301,7 +301,7 @@ class Subdomains:
 
 
 def _end(parts: Sequence[slice]) -> int:
-    """Length of what parts lie in."""
+    """Return the length of what parts lie in."""
     return parts[-1].stop if parts else 0
 
 
