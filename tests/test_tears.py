@@ -94,7 +94,9 @@ def test_nodes_inside_a_body_may_be_held(cell, subdomains):
         problem(d, 1, of(lambda x: x[0] < 0.1, lambda x, i=i: np.isclose(x[i], 0.5)))
 
 
-@pytest.mark.parametrize(("cell", "n", "subdomains"), [("quadrilateral", 2, 4), ("hexahedron", 3, 3)])
+@pytest.mark.parametrize(
+    ("cell", "n", "subdomains"), [("quadrilateral", 2, 4), ("hexahedron", 3, 3)]
+)
 def test_a_region_without_nodes_inside_of_subdomains(cell, n, subdomains):
     """Its unknowns are those of exterior facets; the message tells how to hold it."""
     d = decomposed(cell, n, subdomains)

@@ -237,8 +237,8 @@ def check_not_on_tears(
             "on tears inside a body, besides facets of its boundary: to DOLFINx tears are "
             "exterior, too; expected facets of the boundary: decomposition.boundary, "
             "decomposition.facets(name) or decomposition.locate_facets(marker); a surface inside a "
-            "body, and nodes of a region that are not on the boundary, are for a condition of their "
-            "own"
+            "body, and nodes of a region that are not on the boundary, are for a condition of "
+            "their own"
         )
 
 
