@@ -378,6 +378,13 @@ def test_a_solver_that_is_missing_is_named(comm):
     assert not PETSc.Options().hasName(name)
 
 
+@pytest.mark.parametrize("family", ["sub", "coarse"])
+def test_a_value_that_petsc_cannot_read(family):
+    says = rf"PETSc, with options -tfeti_{family}_\.\.\., failed: .* abc has no numeric value"
+    with pytest.raises(FactorError, match=says):
+        problem(decomposed("triangle"), **{f"tfeti_{family}_pc_factor_fill": "abc"}).solve()
+
+
 def test_factors_heed_options_with_their_prefix(monkeypatch):
     made = []
     cholesky = factor._factored

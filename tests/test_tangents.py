@@ -141,12 +141,10 @@ def test_prescribed_values_slip():
     whole = slips(records, dofs, u)
     assert np.allclose(found, whole[rows.condition], rtol=0, atol=1e-12)
     # a load step that begins elsewhere
-    begin, before = np.cos(1.0 + whole), gluing.constraints.c.array_r.copy()
+    begin = np.cos(1.0 + whole)
     later = gluing.with_right_side(gluing.prescribed.value, records.gap, begin)
     found = times_rows(later, u)[gluing.constraints.sets.tangents] / rows.scale[:, None]
     assert np.allclose(found, (whole - begin)[rows.condition], rtol=0, atol=1e-12)
-    gain = gluing.constraints.c.array_r - before
-    assert np.allclose(gluing.gain(begin), gain, rtol=0, atol=1e-12)
     gluing.constraints.destroy()
 
 

@@ -92,3 +92,22 @@ def test_nodes_inside_a_body_may_be_held(cell, subdomains):
     for i in range(d.mesh.geometry.dim):
         problem(d, 1, of(lambda x, i=i: x[i] < 0.3))
         problem(d, 1, of(lambda x: x[0] < 0.1, lambda x, i=i: np.isclose(x[i], 0.5)))
+
+
+@pytest.mark.parametrize(
+    ("cell", "n", "subdomains"), [("quadrilateral", 2, 4), ("hexahedron", 3, 3)]
+)
+def test_a_region_without_nodes_inside_of_subdomains(cell, n, subdomains):
+    """Its unknowns are those of exterior facets; the message tells how to hold it."""
+    d = decomposed(cell, n, subdomains)
+
+    def conditions(V, apart):
+        nodes = fem.locate_dofs_geometrical(V, lambda x: x[0] < 0.51)
+        outer = fem.locate_dofs_topological(V, d.mesh.topology.dim - 1, d.boundary)
+        at_boundary = np.isin(nodes, outer)
+        parts = [nodes[at_boundary], nodes[~at_boundary]] if apart else [nodes]
+        return [fem.dirichletbc(np.zeros(V.dofmap.bs), part, V) for part in parts]
+
+    with pytest.raises(tfeti.InputError, match=SAYS + ".* nodes of a region that are not on"):
+        problem(d, 1, lambda V: conditions(V, False))
+    problem(d, 1, lambda V: conditions(V, True))

@@ -197,7 +197,9 @@ def check_not_on_tears(
     component, are prescribed. It is wrong if some of these facets are of the boundary and some of
     tears, unless all nodes of the latter are on the boundary. So nodes of a region may be
     prescribed, which are also inside of subdomains, and those of a surface inside a body, in a
-    condition of its own, wherever the tears are.
+    condition of its own, wherever the tears are. Where a region has no nodes inside of subdomains,
+    as where these are one cell wide, its unknowns are those of exterior facets: what is not on its
+    boundary needs a condition of its own, too.
 
     Args:
         bcs: Conditions on the space of ``dofs``.
@@ -235,7 +237,8 @@ def check_not_on_tears(
             "on tears inside a body, besides facets of its boundary: to DOLFINx tears are "
             "exterior, too; expected facets of the boundary: decomposition.boundary, "
             "decomposition.facets(name) or decomposition.locate_facets(marker); a surface inside a "
-            "body is for a condition of its own"
+            "body, and nodes of a region that are not on the boundary, are for a condition of "
+            "their own"
         )
 
 

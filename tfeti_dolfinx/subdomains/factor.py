@@ -98,7 +98,9 @@ class CholeskyFactor:
             if not np.all(np.isfinite(self.solve(np.ones(self._b.getLocalSize())))):
                 raise NotPositiveDefiniteError("a pivot is zero")
         except (PETSc.Error, FactorError) as error:
-            cause = _cause(error, self._pc.getFactorSolverType(), self._matrix)
+            # PETSc knows no package yet where it could not read an option
+            solver = self._pc.getFactorSolverType() or f"PETSc, with options -{self._prefix}...,"
+            cause = _cause(error, solver, self._matrix)
             self.destroy()
             raise cause from error
         if not self._keep:
@@ -280,7 +282,7 @@ def _check_definite(factor: PETSc.Mat) -> None:
         raise NotPositiveDefiniteError(f"{negative} eigenvalues are negative, {zero} zero")
 
 
-def _cause(error: Exception, solver: str | None, A: PETSc.Mat) -> FactorError:
+def _cause(error: Exception, solver: str, A: PETSc.Mat) -> FactorError:
     """Return the error that says why a matrix could not be factored."""
     if isinstance(error, FactorError):
         return type(error)(f"not positive definite ({solver}: {error})")
