@@ -226,6 +226,23 @@ def test_the_rest_state_is_found_from_any_load(cell, kind, friction, qp_type):
     scene.problem.destroy()
 
 
+@pytest.mark.parametrize("first", [None, 0.0, 1.0])
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_a_gap_that_stays_open_does_not_limit_what_a_small_load_is_solved_to(cell, first):
+    scene = Scene(cell, gap=0.01, rtol=1e-8)
+    load = np.array([0.01] * (scene.gdim - 1) + [-0.05])
+    small = scene.solve(1e-3 * load)  # the gap stays open, so that all is linear
+    if first is not None:
+        scene.solve(first * load)
+    else:
+        scene.problem.destroy()
+        scene = Scene(cell, gap=0.01, rtol=1e-8)
+    for factor in (1e-12, 1e-14):
+        u = scene.solve(factor * load) / factor * 1e-3
+        assert np.abs(u - small).max() <= 1e-6 * np.abs(small).max()
+    scene.problem.destroy()
+
+
 @pytest.mark.parametrize("friction", ["none", "coulomb"])
 @pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
 def test_a_body_that_is_lifted_as_a_whole_has_no_forces(cell, friction):
