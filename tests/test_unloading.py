@@ -211,9 +211,7 @@ def test_the_rest_state_is_found_from_any_load(cell, kind, friction, qp_type):
         return scene.solve(factor * on_traction * load, factor * on_value * load)
 
     first = solve(1.0)
-    # SMALSE-M does not come to the forces of 0 of a body that is lifted as a whole
-    turned = () if (kind, qp_type) == ("driven", "smalse") else (-1.0, 0.0)
-    for factor in (0.0, 1.0, *turned):
+    for factor in (0.0, 1.0, -1.0, 0.0):
         u = solve(factor)
         if factor == 0.0:
             assert not np.any(u)
@@ -225,6 +223,33 @@ def test_the_rest_state_is_found_from_any_load(cell, kind, friction, qp_type):
         for factor in (1e-10, 1e-14, 1e-30):
             u = solve(factor) / factor
             assert np.abs(u - first).max() <= 1e-4 * np.abs(first).max()
+    scene.problem.destroy()
+
+
+@pytest.mark.parametrize("first", [None, 0.0, 1.0])
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+def test_a_gap_that_stays_open_does_not_limit_what_a_small_load_is_solved_to(cell, first):
+    scene = Scene(cell, gap=0.01, rtol=1e-8)
+    load = np.array([0.01] * (scene.gdim - 1) + [-0.05])
+    small = scene.solve(1e-3 * load)  # the gap stays open, so that all is linear
+    if first is not None:
+        scene.solve(first * load)
+    else:
+        scene.problem.destroy()
+        scene = Scene(cell, gap=0.01, rtol=1e-8)
+    for factor in (1e-12, 1e-14):
+        u = scene.solve(factor * load) / factor * 1e-3
+        assert np.abs(u - small).max() <= 1e-6 * np.abs(small).max()
+    scene.problem.destroy()
+
+
+@pytest.mark.parametrize("friction", ["none", "coulomb"])
+@pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
+def test_a_body_that_is_lifted_as_a_whole_has_no_forces(cell, friction):
+    """SMALSE-M's forces tend to 0, and what does not balance of them with them."""
+    scene = Scene(cell, "driven", friction, qp_type="smalse")
+    lift = np.array([0.003] * (scene.gdim - 1) + [0.015])
+    assert np.abs(scene.solve(0.0, lift) - lift).max() <= 1e-6 * 0.015
     scene.problem.destroy()
 
 

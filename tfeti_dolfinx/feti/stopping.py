@@ -504,10 +504,12 @@ class Accuracy:
         at_rest = self._at_rest(now)
         displacement = self.rtol * share * size + NOISE * most + alone + at_rest
         largest = float(displacement.max(initial=0.0))
-        balance = max(self.rtol, NOISE) * now.forces
-        balance += at_rest * now.bodies.stiffness.max(initial=0.0)
         energy = FORCES * self.rtol * np.sqrt(max(now.bodies.energy.sum(), 0.0))
-        energy += np.sqrt(now.bodies.stiffness @ (RIGID * most + alone + at_rest) ** 2)
+        rigid = np.sqrt(now.bodies.stiffness @ (RIGID * most + alone + at_rest) ** 2)
+        balance = max(self.rtol, NOISE) * now.forces
+        # forces that do not balance have an energy of ‖F‖ times their square
+        balance += at_rest * now.bodies.stiffness.max(initial=0.0) + rigid / np.sqrt(self.norm)
+        energy += rigid
         return Tolerances(displacement, 2.0 * largest, 2.0 * largest, balance, float(energy))
 
     def _at_rest(self, now: Measures) -> float:

@@ -157,7 +157,8 @@ def _rounding(qp: QP, at: OperatorProduct) -> float:
     qp.coarse.project(s)
     phi, beta = qp.feasible.split(qp.feasible.project(np.array(at.x.array_r)), s.array_r)
     s.destroy()
-    counts = (phi != 0.0) | (beta != 0.0)
+    # P makes of gaps a gradient of rows that nothing closes yet: d is negative there
+    counts = (phi != 0.0) | ((beta != 0.0) & (qp.d.array_r > 0.0))
     parts = (np.where(counts, x.array_r, 0.0) for x in (qp.d, at.Fx))
     return ROUNDING * sum(norm_over(qp.d.getComm().tompi4py(), part) for part in parts)
 
