@@ -541,7 +541,7 @@ def solve_with_friction(
         given = replace(options, rtol=asked), qp_type, solved or start
         result, rule = solve_dual(dual, *given, monitor, exact)
         iterations, looks = iterations + 1, looks + rule.looks
-        aim = rule.tolerance * least / asked
+        aim = rule.tolerance if asked <= least else np.inf  # of a coarser look nothing follows
         steps = steps.plus(result.steps)
         if result.reason <= 0 and solved is not None:
             on_law.give_up()
