@@ -57,10 +57,21 @@ class Sheared:
         )
 
 
+FRICTION = tfeti.Tresca(0.01)
+
+
 class Driven:
     """A box on a curved obstacle or a rough plane, clamped on the left, under a traction."""
 
-    def __init__(self, cell="quadrilateral", n=8, subdomains=5, rough=True, **options):
+    def __init__(
+        self,
+        cell="quadrilateral",
+        n=8,
+        subdomains=5,
+        rough=True,
+        friction=FRICTION,
+        **options,
+    ):
         d = decomposed(cell, n, subdomains)
         gdim = d.mesh.geometry.dim
         V = fem.functionspace(d.mesh, ("Lagrange", 1, (gdim,)))
@@ -70,7 +81,7 @@ class Driven:
         left = fem.locate_dofs_topological(V, gdim - 1, d.facets("left"))
         if rough:
             plane = tfeti.Plane(np.zeros(gdim), np.eye(gdim)[-1])
-            contact = tfeti.Obstacle("bottom", plane, friction=tfeti.Tresca(0.01))
+            contact = tfeti.Obstacle("bottom", plane, friction=friction)
         else:  # rows come later
             contact = tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=0.022)
         self.problem = tfeti.ContactProblem(

@@ -363,6 +363,33 @@ def test_a_checkpoint_of_something_else(shared_tmp):
         again(Driven(), [0.5, 1.0])
 
 
+@pytest.mark.parametrize(
+    ("friction", "share", "says"),
+    [
+        (tfeti.Coulomb(0.4), 1.0, "friction: coefficient is 0.4, and was 0.3"),
+        (tfeti.Tresca(0.01), 1.0, "friction: type is 'Tresca', and was 'Coulomb'"),
+        (tfeti.Coulomb(0.3), 1.1, r"L: constants\[0\]\[0\] is .*, and was .*apply"),
+    ],
+)
+def test_a_series_goes_on_with_its_own_problem_only(friction, share, says, shared_tmp):
+    """Another coefficient, law or ``apply`` is named; the same goes on."""
+    times, folder = [0.5, 1.0], shared_tmp / "own"
+
+    def series(friction, share, times):
+        driven = Driven(n=4, subdomains=2, friction=friction)
+
+        def apply(problem, t):
+            driven.apply(problem, t)
+            driven.load.value[:] *= share
+
+        return tfeti.LoadSteps(driven.problem, apply, times, checkpoint=folder)
+
+    series(tfeti.Coulomb(0.3), 1.0, times[:1]).run()
+    with pytest.raises(tfeti.InputError, match=says):
+        series(friction, share, times).run(resume=True)
+    assert len(series(tfeti.Coulomb(0.3), 1.0, times).run(resume=True)) == 2
+
+
 def test_an_apply_that_fails_on_one_rank():
     driven = Driven()
     comm = driven.problem.decomposition.comm

@@ -28,7 +28,12 @@ from tfeti_dolfinx.common.validation import (
     is_whole,
     shown,
 )
-from tfeti_dolfinx.errors import ConvergenceError, InputError, TfetiError
+from tfeti_dolfinx.errors import (
+    ConvergenceError,
+    InputError,
+    TfetiError,
+    raised_on_all_ranks,
+)
 from tfeti_dolfinx.output import VtxFile, cell_fields, checked_target, nodal_fields
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.solution import Solution
@@ -473,7 +478,9 @@ class LoadSteps:
         self._problem.take_step(self.records[-1].size)
         self._set(self.records[-1].time)
         self._problem.restore(self._checkpoint.read_state(kept.number))
-        check_same_problem(kept.digest, self._problem.digest())
+        digest = self._problem.digest()
+        with raised_on_all_ranks(self._comm):
+            check_same_problem(kept.digest, digest)
         self._replay(self._checkpoint)
         return place
 
