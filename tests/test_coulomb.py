@@ -17,14 +17,6 @@ import tfeti_dolfinx as tfeti
 from demos import mindlin_3d
 from demos.partial_slip import pushed
 from meshes import half_spaces
-from tfeti_dolfinx.options import Options
-from tfeti_dolfinx.qp.problem import ConvergedReason
-from tfeti_dolfinx.qp.sets import Status
-from tfeti_dolfinx.solve import coulomb as pressures
-from tfeti_dolfinx.solve import dilation
-from tfeti_dolfinx.solve.coulomb import FrictionBoundIteration
-from tfeti_dolfinx.solve.dilation import Anderson, Cones
-from tfeti_dolfinx.testing import check_feasible_set
 
 # the change of bounds at which they are at rest is 100 rtol: u and forces follow to this
 SHARE = 1e-6
@@ -175,20 +167,6 @@ def test_bounds_of_a_light_body_come_to_rest():
         assert np.abs(u - exact)[on].max() <= 1e-4 * np.abs(exact[on]).max()
 
 
-def test_forces_that_rounding_makes_are_none():
-    p = solved("quadrilateral", tfeti.Coulomb(0.3), (0.05, -0.05))
-    bounds, lam = FrictionBoundIteration(p.dual, Options(), None), p.dual.d.duplicate()
-    rows = p.dual.constraints.sets.normals
-    lam.set(0.0)
-    lam.array[rows] = np.where(np.arange(len(rows)) % 2 == 0, 1e-16, 1.0)
-    bounds.change(lam, p.solution.u)
-    bounds.advance()
-    bounds.set_feasible(None)
-    found = p.dual.constraints.pressures[p.dual.constraints.pressed]
-    assert np.all((found == 0.0) | (found == 1.0))
-    lam.destroy()
-
-
 def test_bounds_that_do_not_come_to_rest_are_an_error():
     slow = {"friction_type": "fixed_point", "friction_max_it": 2}
     with pytest.raises(tfeti.ConvergenceError, match="DIVERGED_FRICTION .*Coulomb's friction do"):
@@ -308,67 +286,6 @@ def test_a_load_that_the_last_bounds_cannot_hold():
     assert np.allclose(displacement(p)[1], 2.0 * first, rtol=0, atol=1e-6 * np.abs(first).max())
 
 
-def test_bounds_on_the_way_that_hold_the_load_are_tried():
-    """The last ones do, the next ones do not; the farthest part of the way that does is taken."""
-    d = decomposed("quadrilateral", 3, 3)
-    p = problem(d, (0.6 * 0.3 * 0.1, -0.1), [floor(2, tfeti.Coulomb(0.3))], clamped=(), rtol=1e-8)
-    p.solve()
-    constraints = p.dual.constraints
-    held = constraints.pressures[constraints.pressed].copy()
-    bounds = FrictionBoundIteration(
-        p.dual, Options(), (np.zeros(constraints.num_rows), np.zeros(0))
-    )
-    for share, part in ((0.3, 0.5), (0.0, 0.25)):  # 0.6 is needed: 1 − part·(1 − share) ≥ 0.6
-        bounds._held, bounds._now = held, share * held
-        start = (np.ones(constraints.num_rows), np.zeros(0))
-        assert bounds.set_feasible(start) is start
-        expected = (1.0 - part * (1.0 - share)) * held
-        found = constraints.pressures[constraints.pressed]
-        assert np.allclose(found, expected, rtol=1e-12, atol=0.0)
-        assert p.dual.holds
-
-
-@pytest.mark.parametrize("k", [1, 2])
-def test_projections_on_cones(k):
-    """x − P(x) is orthogonal to P(x), and at an obtuse angle with all of the cone."""
-    rng = np.random.default_rng(k)
-    mu = rng.choice([0.0, 0.1, 0.3, 2.0], (400, k))
-    mu[np.all(mu == 0.0, axis=1)] = 0.5
-    cones, x, other = Cones(mu), *rng.standard_normal((2, 400 * (k + 1)))
-    y, z = (cones.project(point).reshape(400, -1) for point in (x, other))
-    level = np.divide(y[:, 1:], mu, out=np.zeros_like(mu), where=mu > 0.0)
-    assert np.all(np.linalg.norm(level, axis=1) <= y[:, 0] + 1e-12)
-    away = x.reshape(400, -1) - y
-    assert np.abs(np.sum(away * y, axis=1)).max() <= 1e-12
-    assert np.sum(away * z, axis=1).max() <= 1e-12
-    face = cones.face(y.ravel(), x)
-    assert np.allclose((face.Z.T @ face.Z).toarray(), np.eye(face.Z.shape[1]), atol=1e-12)
-
-
-def test_anderson_finds_the_fixed_point_of_a_linear_map():
-    """In one step more than there are dimensions, where a plain iteration diverges."""
-    rng = np.random.default_rng(0)
-    A, x = rng.standard_normal((4, 4)), np.ones(4)
-    A *= 1.1 / np.abs(np.linalg.eigvals(A)).max()
-    b = (np.eye(4) - A) @ np.arange(1.0, 5.0)
-    steps = Anderson(lambda U, V: U.T @ V, depth=4, growth=np.inf)
-    for _ in range(6):
-        x = steps.next(x, A @ x + b)
-    assert np.allclose(x, np.arange(1.0, 5.0), atol=1e-8)
-
-
-@SOLVERS
-@pytest.mark.parametrize(("cell", "traction"), SCENES)
-def test_gaps_that_grow_with_slips_lead_to_the_same(qp_type, cell, traction, monkeypatch):
-    """De Saxcé's fixed point, from the start, and the one on the bounds."""
-    exact = displacement(solved(cell, tfeti.Coulomb(0.3), traction))[1]
-    monkeypatch.setattr(pressures, "PATIENCE", 0)
-    p = solved(cell, tfeti.Coulomb(0.3), traction, qp_type=qp_type)
-    assert 0 < p.report.friction_iterations <= 5
-    assert p.report.sliding > 0
-    assert np.allclose(displacement(p)[1], exact, rtol=0, atol=1e-7 * np.abs(exact).max())
-
-
 def between_walls():
     """A square between two walls that do not press it, pulled along them."""
     d, law = decomposed("quadrilateral", 4, 3), tfeti.Coulomb(0.5)
@@ -385,21 +302,6 @@ def test_a_body_between_walls_that_nothing_presses_is_an_error():
     said = f"DIVERGED_FRICTION .* body '{d.body_names[0]}' slides without end: .* gaps that overlap"
     with pytest.raises(tfeti.ConvergenceError, match=said):
         p.solve()
-
-
-def test_gaps_grow_no_more_where_problems_with_them_are_not_solved(monkeypatch):
-    calls, usual = [], dilation.newton
-
-    def unsolved(*arguments, **options):
-        calls.append(1)
-        result = usual(*arguments, **options)
-        result.reason = ConvergedReason.DIVERGED_ITS
-        return result
-
-    monkeypatch.setattr(dilation, "newton", unsolved)
-    with pytest.raises(tfeti.ConvergenceError, match="DIVERGED_FRICTION .* do not come to rest"):
-        between_walls()[1].solve()
-    assert len(calls) == dilation.UNSOLVED
 
 
 def test_the_body_that_slides_without_end_is_named():
@@ -433,31 +335,3 @@ def body_of(d, surface):
     cells = [d.mesh.topology.connectivity(1, 2).links(f)[0] for f in facets]
     found = d.body_of_subdomain[d.cell_subdomain[cells]] if cells else np.array([-1])
     return comm.allreduce(int(found.max()), op=MPI.MAX)
-
-
-@given(st.integers(0, 10_000), st.sampled_from([1, 2]))
-def test_cones_fulfil_the_contract(seed, k):
-    rng = np.random.default_rng(seed)
-    mu = rng.choice([0.0, 0.1, 0.3, 1.0, 2.0], (6, k))
-    mu[np.all(mu == 0.0, axis=1)] = 0.5
-    check_feasible_set(Cones(mu, rng.standard_normal((6, k + 1))), 6 * (k + 1), seed)
-
-
-@given(st.integers(0, 10_000), st.sampled_from([1, 2]))
-def test_points_inside_of_cones_go_to_the_nearest_of_the_boundary(seed, k):
-    """None of 4000 points of the boundary is nearer."""
-    rng = np.random.default_rng(seed)
-    mu = rng.uniform(0.1, 1.0, (1, k))
-    point = rng.standard_normal(k) * mu[0]
-    start = np.r_[np.linalg.norm(point / mu[0]) * rng.uniform(1.0, 3.0), point]
-    found = Cones(mu).onto(start, np.full(k + 1, Status.SLIP))
-    assert np.linalg.norm(found[1:] / mu[0]) == pytest.approx(found[0], rel=1e-9)
-    around = rng.standard_normal((4000, k)) if k == 2 else np.array([[1.0], [-1.0]])
-    rays = np.column_stack((np.ones(len(around)), mu * around / norms(around)))
-    rays /= norms(rays)
-    nearest = np.maximum(rays @ start, 0.0)[:, None] * rays
-    assert np.linalg.norm(found - start) <= norms(nearest - start).min() * (1.0 + 1e-9)
-
-
-def norms(x):
-    return np.linalg.norm(x, axis=1, keepdims=True)

@@ -1,5 +1,7 @@
 """Newton's method on Coulomb's law: its pieces on small programs, and it beside the fixed point."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import ufl
@@ -11,25 +13,23 @@ from scenes import clamp, decomposed, displacement, forms, problem
 from scipy.sparse import csr_array
 from test_friction_fields import SCENES, floor, solved
 from test_mpgp import as_set
-from test_qp import Counted, matrix, vector
+from test_qp import matrix, vector
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse, NoOblique
 from tfeti_dolfinx.qp.friction_newton import (
     KrylovBasis,
     Law,
     LawPoint,
+    LawProgram,
     OnFace,
     gcr,
     keep,
     known_on,
     newton_on_law,
-    residual_of,
 )
 from tfeti_dolfinx.qp.problem import QP
 from tfeti_dolfinx.qp.recycling import Recycled, RecycledOnFace
-from tfeti_dolfinx.solve.coulomb import NewtonOnCoulomb
 
 SEEDS = st.integers(0, 1000)
 DIMENSIONS = st.sampled_from([1, 2])
@@ -78,14 +78,14 @@ def program(seed, k, r, points=8, m=40):
 
 def solve(F, d, G, e, law, target=1e-10):
     coarse = DenseCoarse(G, e) if len(e) else NoCoarse()
-    qp, norm = QP(matrix(F), vector(d), coarse, law.at(np.ones(len(law.normals)))), 3.0
-    zero = LawPoint(np.zeros(len(d)), -d, np.zeros(len(e)))
+    qp = QP(matrix(F), vector(d), coarse, law.at(np.ones(len(law.normals))))
 
     def oblique(face, C):
         return DenseOblique(G, face, C) if len(e) else NoOblique(face)
 
-    end, steps = newton_on_law(qp, law, oblique, zero, target, norm)
-    return qp, end, steps, norm
+    program = LawProgram(qp, law, oblique, 3.0)
+    zero = LawPoint(np.zeros(len(d)), -d, np.zeros(len(e)))
+    return program, *newton_on_law(program, zero, target)
 
 
 @settings(max_examples=30)
@@ -93,116 +93,45 @@ def solve(F, d, G, e, law, target=1e-10):
 def test_it_solves_the_law(seed, k, r):
     """λ in its set, Gλ = e, the rest of Fλ − d in the normal cone: the natural map of any step."""
     F, d, G, e, law = program(seed, k, r)
-    qp, end, steps, norm = solve(F, d, G, e, law)
+    whole, end, steps = solve(F, d, G, e, law)
     assert end is not None
     assert 0 < steps < 25
     s = F @ end.lam - d - G.T @ end.mu
     assert np.allclose(end.s, s, rtol=0, atol=1e-11)
     assert np.allclose(G @ end.lam, e, rtol=0, atol=1e-11)
-    for size in (0.1, 1.0, 7.0):  # its zeros do not depend on the step
-        assert residual_of(qp, law, LawPoint(end.lam, s, end.mu), size * norm) <= 1e-8
+    for norm in (0.3, 3.0, 21.0):  # its zeros do not depend on the step
+        assert replace(whole, norm=norm).residual(LawPoint(end.lam, s, end.mu)) <= 1e-8
     _, near = law.nearest(end.lam)
     assert np.allclose(near, end.lam, rtol=0, atol=1e-9)
 
 
-def test_ways_onto_faces_take_directions_along(monkeypatch):
-    """What F makes of both is one multiplication: fewer than of each for itself."""
-
-    def multiplications():
-        total = 0
-        for seed in range(20):
-            F, d, _, _, law = program(seed, 2, 0)
-            counted = Counted(matrix(F))
-            qp = QP(counted, vector(d), NoCoarse(), law.at(np.ones(len(law.normals))))
-            zero = LawPoint(np.zeros(len(d)), -d, np.zeros(0))
-            end, _ = newton_on_law(qp, law, lambda face, C: NoOblique(face), zero, 1e-6, 3.0)
-            assert np.allclose(end.s, F @ end.lam - d, rtol=0, atol=1e-6)
-            total += counted.count
-        return total
-
-    together = multiplications()
-    monkeypatch.setattr("tfeti_dolfinx.qp.friction_newton.BESIDE", 0.0)
-    assert together < multiplications()
-
-
-@pytest.mark.parametrize("k", [1, 2])
-def test_the_end_is_superlinear(k):
-    """Solves leave 0.3 times what the last step has brought down: six digits in few steps."""
-    more = []
-    for seed in range(10):
-        steps = [solve(*program(seed, k, 3), target=target)[2] for target in (1e-4, 1e-10)]
-        more.append(steps[1] - steps[0])
-    assert np.median(more) <= 5
-
-
-@given(SEEDS, st.integers(1, 30))
-def test_conjugate_residuals(seed, n):
-    rng = np.random.default_rng(seed)
-    A = np.eye(n) + 0.3 * rng.standard_normal((n, n)) / np.sqrt(n)
-    M, W, b = np.diag(rng.uniform(0.5, 2.0, n)), rng.standard_normal((n, n)), rng.random(n)
-    calls = []
-
-    def apply(z):
-        calls.append(1)
-        return A @ z, W @ z
-
-    gone = gcr(apply, lambda r: M @ r, b, 1e-9, 60, MPI.COMM_SELF)
-    new = gone.new
-    assert len(new.Z) <= len(calls) <= n + 1
-    assert np.linalg.norm(b - A @ gone.u) <= 1e-8
-    assert np.allclose(gone.image, W @ gone.u, rtol=0, atol=1e-8)
-    assert np.allclose(new.Q @ new.Q.T, np.eye(len(new.Q)), rtol=0, atol=1e-8)
-    assert np.allclose(new.Q, new.Z @ A.T, rtol=0, atol=1e-8)
-    assert np.allclose(new.images, new.Z @ W.T, rtol=0, atol=1e-8)
-    none = gcr(apply, lambda r: M @ r, b, 2.0 * np.linalg.norm(b), 60, MPI.COMM_SELF)
-    assert len(none.new.Z) == 0
-    assert not np.any(none.u)
-
-
 @given(SEEDS, st.integers(2, 30))
-def test_conjugate_residuals_that_know_directions(seed, n):
-    """What these give to a right side costs nothing, and the others are gone beside them."""
+def test_conjugate_residuals(seed, n):
+    """Directions that are known give what they can for nothing; others are gone beside them."""
     rng = np.random.default_rng(seed)
     A = np.eye(n) + 0.3 * rng.standard_normal((n, n)) / np.sqrt(n)
-    W, k, calls = rng.standard_normal((n, n)), rng.integers(1, n), []
+    M, W, k = np.diag(rng.uniform(0.5, 2.0, n)), rng.standard_normal((n, n)), rng.integers(0, n)
     Q, _ = np.linalg.qr(A @ rng.standard_normal((n, k)))
-    Z = np.linalg.solve(A, Q)
-    known = KrylovBasis(Q.T, Z.T, (W @ Z).T)
+    Z, calls = np.linalg.solve(A, Q), []
 
     def apply(z):
         calls.append(1)
         return A @ z, W @ z
 
-    b = A @ (Z @ rng.standard_normal(k))
-    free = gcr(apply, lambda r: r, b, 1e-9, 60, MPI.COMM_SELF, known)
+    def solved(b):
+        known = KrylovBasis(np.stack((Q.T, Z.T, (W @ Z).T)))
+        gone = gcr(apply, lambda r: M @ r, b, 1e-9, known, MPI.COMM_SELF)
+        assert np.linalg.norm(b - A @ gone.u) <= 1e-8
+        assert np.allclose(gone.image, W @ gone.u, rtol=0, atol=1e-8)
+        return gone.basis
+
+    solved(Q @ rng.standard_normal(k))
     assert not calls
-    assert np.allclose(A @ free.u, b, rtol=0, atol=1e-8)
-    assert np.allclose(free.image, W @ free.u, rtol=0, atol=1e-8)
-    b = rng.standard_normal(n)
-    gone = gcr(apply, lambda r: r, b, 1e-9, 60, MPI.COMM_SELF, known)
-    assert len(calls) <= n - k + 1
-    assert np.allclose(A @ gone.u, b, rtol=0, atol=1e-8)
-    assert np.allclose(gone.image, W @ gone.u, rtol=0, atol=1e-8)
-    assert np.allclose(gone.new.Q @ Q, 0.0, rtol=0, atol=1e-8)
-
-
-@given(SEEDS, DIMENSIONS)
-def test_what_slips_follows_its_normal(seed, k):
-    *_, law = program(seed, k, 0)
-    rng = np.random.default_rng(seed)
-    y = rng.standard_normal(40)
-    feasible, p = law.nearest(y)
-    face = feasible.face(p, rng.standard_normal(40))
-    C, slips = law.following(p, face), law.slips(face)
-    assert np.allclose((C @ p)[law.tangents[slips]], p[law.tangents[slips]], rtol=0, atol=1e-14)
-    assert not np.any((C @ p)[law.tangents[~slips]])
-    larger = np.array(p)
-    larger[law.normals] *= 2.0
-    larger[law.tangents[slips]] = (C @ larger)[law.tangents[slips]]
-    inside = law.nearest(larger)[1]  # on the boundary of the larger set
-    assert np.allclose(inside, larger, rtol=0, atol=1e-12)
-    stuck = law.stuck(p, slips)
-    assert not np.any(law.slips(law.nearest(stuck)[0].face(stuck, y)) & slips)
+    basis = solved(rng.standard_normal(n))
+    assert basis.count - k <= len(calls) <= n - k + 1
+    assert np.allclose(basis.Q @ basis.Q.T, np.eye(basis.count), rtol=0, atol=1e-8)
+    assert np.allclose(basis.Q, basis.Z @ A.T, rtol=0, atol=1e-8)
+    assert np.allclose(basis.images, basis.Z @ W.T, rtol=0, atol=1e-8)
 
 
 @given(SEEDS, DIMENSIONS, st.sampled_from([0, 3]))
@@ -238,12 +167,13 @@ def test_what_earlier_directions_tell(seed, k, r):
 
 def slipping_face(p):
     """A face of the scene's rows on which some conditions slip, and what follows."""
-    law = NewtonOnCoulomb(p.dual, Options(), "newton")._law()
-    rows = p.dual.constraints.num_rows
-    y = np.where(np.arange(rows) % 3 == 0, 1.0, -0.5)
-    y[law.normals] = np.where(np.arange(len(law.normals)) % 4 == 3, -1.0, 1.0)
+    constraints = p.dual.constraints
+    normals, tangents = constraints.pressed_by[constraints.pressed], constraints.sets.tangents
+    law = Law(p.dual.set_under, normals, tangents[constraints.pressed])
+    y = np.where(np.arange(constraints.num_rows) % 3 == 0, 1.0, -0.5)
+    y[normals] = np.where(np.arange(len(normals)) % 4 == 3, -1.0, 1.0)
     feasible, at = law.nearest(y)
-    face = feasible.face(at, np.zeros(rows))
+    face = feasible.face(at, np.zeros(constraints.num_rows))
     return face, law.following(at, face)
 
 

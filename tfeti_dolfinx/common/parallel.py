@@ -21,6 +21,13 @@ def bcast_from_root(comm: MPI.Intracomm, value: T) -> T:
     return comm.bcast(value, root=0)
 
 
+def steering(comm: MPI.Intracomm, *values: float) -> Array:
+    """Return rank 0's numbers on every rank: ``bcast_from_root`` by a buffer. Collective."""
+    found = np.array(values, dtype=float)
+    comm.Bcast(found, root=0)
+    return found
+
+
 def any_rank(comm: MPI.Intracomm, flag: bool) -> bool:
     """Return whether a flag is set on some rank. Collective."""
     return bool(comm.allreduce(bool(flag), op=MPI.LOR))
@@ -34,7 +41,7 @@ def summed(comm: MPI.Intracomm, values: Array) -> Array:
 
 def norm_over(comm: MPI.Intracomm, x: Array) -> float:
     """‖x‖ of a vector that is spread over ranks, the same on each. Collective."""
-    return bcast_from_root(comm, float(np.sqrt(summed(comm, np.array([x @ x]))[0])))
+    return float(steering(comm, np.sqrt(summed(comm, np.array([x @ x]))[0]))[0])
 
 
 def largest(comm: MPI.Intracomm, x: Array) -> float:

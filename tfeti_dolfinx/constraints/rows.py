@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -331,8 +331,6 @@ class Constraints:
         pressed_by: Under Coulomb's law the local row of the condition's normal, else −1, shape
             ``(t,)``.
         coefficients: The μ_i of Coulomb's law, else 0, shape ``(t, gdim - 1)``.
-        pressures: The λ_N whose friction the limits are, under Coulomb's law; nan until they
-            are set, shape ``(t,)``.
     """
 
     B: PETSc.Mat
@@ -346,7 +344,6 @@ class Constraints:
     limits: Array
     pressed_by: Array
     coefficients: Array
-    pressures: Array
 
     @property
     def num_rows(self) -> int:
@@ -366,12 +363,16 @@ class Constraints:
         """Positions of the points of ``sets.tangents`` with a coefficient of Coulomb's law."""
         return np.flatnonzero(np.any(self.coefficients > 0.0, axis=1))
 
-    def set_pressures(self, pressures: Array) -> None:
-        """Fill the ψ_i under Coulomb's law, μ_i times a λ_N of each of ``pressed``; ∞ sticks."""
-        at = self.pressed
-        self.pressures[at] = pressures
+    def with_pressures(self, pressures: Array) -> Constraints:
+        """Return the same rows with the ψ_i = μ_i λ_N,i of Coulomb's law; ∞ sticks.
+
+        Args:
+            pressures: λ_N of each of ``pressed``.
+        """
+        at, limits = self.pressed, self.limits.copy()
         mu = self.coefficients[at]
-        self.limits[at] = np.multiply(mu, pressures[:, None], out=np.zeros_like(mu), where=mu > 0.0)
+        limits[at] = np.multiply(mu, pressures[:, None], out=np.zeros_like(mu), where=mu > 0.0)
+        return replace(self, limits=limits)
 
     def destroy(self) -> None:
         """Destroy the PETSc objects. Collective."""
@@ -427,7 +428,6 @@ def assemble_constraints(
         limits=np.zeros(shape),
         pressed_by=row,
         coefficients=np.zeros(shape),
-        pressures=np.full(len(row), np.nan),
     )
 
 

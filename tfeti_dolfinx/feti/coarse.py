@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import copy
 from typing import Any, cast
 
 import numpy as np
@@ -113,17 +112,6 @@ class CoarseSpace(Projectors):
     def _read_load(self) -> None:
         e = np.concatenate(self.comm.allgather(self.subdomains.kernel_load))
         self.e = self._basis.products(e)
-
-    def under(self, b: Array) -> CoarseSpace:
-        """The same space for a load b on this rank's unknowns that moves nothing free. Collective.
-
-        Args:
-            b: The load, shape ``(n,)``; what of it moves what nothing resists is rounding.
-        """
-        other, part = copy(self), self.subdomains.kernel_part(b)
-        e = self._basis.products(np.concatenate(self.comm.allgather(part)))
-        other.e = self.null.removed(e)
-        return other
 
     @property
     def num_free_motions(self) -> int:

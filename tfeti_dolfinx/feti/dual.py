@@ -27,7 +27,7 @@ from tfeti_dolfinx.feti.operator import (
 from tfeti_dolfinx.feti.preconditioner import FacePreconditioner
 from tfeti_dolfinx.feti.recovery import moved, nearly_free, recover, smallest_motion
 from tfeti_dolfinx.feti.rigid_bodies import listed
-from tfeti_dolfinx.feti.solvability import check_capacity, check_solvable, holds
+from tfeti_dolfinx.feti.solvability import check_capacity, check_solvable, sliding_body
 from tfeti_dolfinx.qp.coarse import Coarse, NoCoarse
 from tfeti_dolfinx.qp.homogenised import LastProduct, OperatorProduct, natural, operator_product
 from tfeti_dolfinx.qp.krylov import estimate_norm
@@ -137,6 +137,8 @@ class Dual:
         contact_rows: Number of normal and of tangential rows on all ranks.
         seen: Largest estimate of ‖F‖ that solves have come to, 0 before.
         feasible: The set Ω of multipliers.
+        pressures: The λ_N whose friction bounds Ω under Coulomb's law, of each of
+            ``constraints.pressed``; None before ``bound_friction``.
         last: The last solution of block Newton, or without a kernel, with its image.
         recycled: Directions of earlier solves; None: none are kept.
         pressing: After ``recover``: contact rows whose force is more than the solver's error.
@@ -159,6 +161,8 @@ class Dual:
         feasible: FeasibleLaw = contact_set,
     ) -> None:
         self.constraints, self.subdomains = constraints, subdomains
+        self._given = constraints
+        self.pressures: Array | None = None
         self.pressing = np.zeros(constraints.num_rows, dtype=bool)
         self._prefix = f"{options_prefix}face_"
         self._names, self.nearly_free = (body_names, mode_names), list[dict[str, object]]()
@@ -221,7 +225,7 @@ class Dual:
 
     def _check(self) -> None:
         check_solvable(self.coarse, *self._names)
-        check_capacity(self.coarse, self.constraints, *self._names)
+        check_capacity(self.coarse, self._given, *self._names)
 
     def _check_units(self, comm: MPI.Intracomm) -> None:
         length = largest(comm, self.driving)
@@ -235,10 +239,20 @@ class Dual:
                 f"are 0 or from {LEAST:g} to {MOST:g}"
             )
 
+    def set_under(self, pressures: Array) -> FeasibleSet:
+        """Return the set whose friction limits are those of λ_N of ``constraints.pressed``."""
+        return self._law(self._given.with_pressures(pressures))
+
+    def bound_friction(self, pressures: Array) -> None:
+        """Take λ_N of each of ``constraints.pressed`` to bound friction with; ∞ sticks."""
+        self.pressures = pressures
+        self.constraints = self._given.with_pressures(pressures)
+        self.feasible = self._law(self.constraints)
+
     @property
-    def holds(self) -> bool:
-        """True if forces within the present limits of friction can balance the load."""
-        return holds(self.coarse, self.constraints)
+    def sliding(self) -> int:
+        """The body that the load moves within the present limits of friction; -1: they hold it."""
+        return sliding_body(self.coarse, self.constraints)
 
     def forget_counts(self) -> None:
         """Count multiplications from 0 on."""

@@ -93,13 +93,6 @@ def bent(B: PETSc.Mat, subdomains: Subdomains, lam: PETSc.Vec, pinv_load: Array)
     return np.asarray(u)
 
 
-def without_rigid_motions(subdomains: Subdomains, u: Array) -> Array:
-    """Return u − R Rᵀu, shape ``(n,)``; projected twice, as rigid motions may be far larger."""
-    for _ in range(2):
-        u = u - subdomains.kernel_motion(subdomains.kernel_part(u))
-    return u
-
-
 def moved(u: Array, coarse: CoarseSpace, alpha: Array) -> Array:
     """u + Rα."""
     return u + coarse.subdomains.kernel_motion(coarse.local_alpha(alpha))

@@ -450,12 +450,19 @@ class Escape:
     friction: float
 
 
-def holds(coarse: CoarseSpace, constraints: Constraints) -> bool:
-    """Return whether forces within the present limits can balance the load. Collective."""
+def sliding_body(coarse: CoarseSpace, constraints: Constraints) -> int:
+    """Return a body that the load moves; -1: forces within the limits hold it. Collective.
+
+    Args:
+        coarse: The coarse space.
+        constraints: Rows, with the limits of friction.
+    """
     if not coarse.unheld.free.any():
-        return True
+        return -1
     resistance = Resistance(coarse, constraints, cones=False)
-    return bcast_from_root(coarse.comm, resistance.is_idle) or resistance.escape() is None
+    if bcast_from_root(coarse.comm, resistance.is_idle) or (found := resistance.escape()) is None:
+        return -1
+    return int(np.argmax(np.abs(found.motion))) // coarse.bodies.k
 
 
 def check_capacity(
