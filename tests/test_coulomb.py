@@ -167,6 +167,18 @@ def test_bounds_of_a_light_body_come_to_rest():
         assert np.abs(u - exact)[on].max() <= 1e-4 * np.abs(exact[on]).max()
 
 
+def test_limits_are_values_of_a_set():
+    """A set under other forces of normals leaves the problem, and the rows, as they are."""
+    p = solved("quadrilateral", tfeti.Coulomb(0.3), (0.05, -0.05))
+    rows, now = p.solution.gluing.constraints, p.dual.constraints
+    limits, x = now.limits.copy(), np.linspace(-1.0, 1.0, rows.num_rows)
+    loose = p.dual.set_under(np.full(len(rows.pressed), np.inf)).project(x)
+    assert np.array_equal(loose[rows.sets.tangents], x[rows.sets.tangents])
+    assert np.array_equal(now.limits, limits)
+    assert not np.any(rows.limits)
+    p.destroy()
+
+
 def test_bounds_that_do_not_come_to_rest_are_an_error():
     slow = {"friction_type": "fixed_point", "friction_max_it": 2}
     with pytest.raises(tfeti.ConvergenceError, match="DIVERGED_FRICTION .*Coulomb's friction do"):

@@ -1,24 +1,15 @@
 """What a solution says of friction, and what does not change it: closed forms and limits."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from mpi4py import MPI
 from scenes import box, decomposed, displacement, hooke, problem, strain
 from test_tresca import nodal_data
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.feti.stopping import _missed_by
 from tfeti_dolfinx.output import nodal_fields
-from tfeti_dolfinx.qp.krylov import pcpg
-from tfeti_dolfinx.qp.newton_faces import CurvedHessian
-from tfeti_dolfinx.qp.problem import QP, Point, Steps, TargetRule
-from tfeti_dolfinx.qp.sets import Discs, Face
 
 EXACT = {"rtol": 1e-10}
 
@@ -202,52 +193,3 @@ def test_friction_alone_holds_a_body(cell, comm):
     p = problem(d, traction, [floor(gdim, tfeti.Tresca(0.0))], clamped=(), rtol=1e-6)
     with pytest.raises(tfeti.NoSolutionError, match=r"translation in x.* where there is no fr"):
         p.solve()
-
-
-@settings(max_examples=50)
-@given(st.integers(0, 10_000))
-def test_a_slip_is_missed_where_the_force_may_still_grow(seed):
-    """Of q the part that no force of the set opposes, however exact other multipliers are."""
-    rng = np.random.default_rng(seed)
-    n, norm = 5, 10.0 ** rng.uniform(-3, 3)
-    radius, angle = rng.uniform(0.1, 1.0, n), rng.uniform(0, 2 * np.pi, n)
-    out = np.column_stack((np.cos(angle), np.sin(angle)))
-    inside = np.array([0.0, 0.5, 1.0 - 1e-3, 1.0, 1.0])
-    tangents, scene = np.arange(2 * n).reshape(n, 2), SimpleNamespace(feasible=Discs(radius))
-    lam = ((radius * inside)[:, None] * out).ravel()
-    q = norm * rng.uniform(0.0, 0.4, n) * radius
-    q[2] = norm * 0.1 * radius[2]
-    missed = _missed_by(scene, lam, tangents, q[:, None] * out, norm)
-    size = np.sum(missed * out, axis=1)
-    # well inside all of it, near the circle what is left to it, on the circle nothing
-    room = norm * radius * (1.0 - inside)
-    assert np.allclose(size, np.minimum(q, room), rtol=1e-9, atol=1e-12 * norm)
-    back = _missed_by(scene, lam, tangents, -q[:, None] * out, norm)
-    assert np.allclose(back, -q[:, None] * out, rtol=1e-9, atol=1e-12 * norm)
-
-
-def test_the_preconditioner_follows_any_curvature():
-    """PCPG with F + κ takes about as many steps whatever κ is, from 0 to where it holds."""
-    p = solved("hexahedron", tfeti.Tresca(0.003), (0.0, -0.035, -0.05), 6, 8)
-    p.dual.qp()
-    feasible, lam = p.dual.feasible, p.dual.d.duplicate()
-    lam.array[:] = p.solution.lam
-    g = Point(lam, lam.duplicate())
-    g.refresh(p.dual.qp())
-    face = feasible.face(lam.array_r, g.g.array_r)
-    g.destroy()
-    steps = []
-    for kappa in (0.0, 1.0, 1e2, 1e4):
-        bent = Face(face.Z, np.where(face.curvature > 0.0, kappa, 0.0), face.status)
-        M, coarse = p.dual._preconditioner_on(bent), p.dual.coarse.on_face(bent)
-        qp = QP(CurvedHessian(p.dual.F, bent), p.dual.d, coarse, feasible, M)
-        point, count = Point(p.dual.d.duplicate(), p.dual.d.copy()), Steps()
-        point.lam.set(0.0)
-        point.g.scale(-1.0)
-        start = point.g.copy()
-        coarse.project(start)
-        assert pcpg(qp, point, TargetRule(1e-8 * start.norm()), count, 200) > 0
-        steps.append(count.cg)
-        for item in (M, coarse, point, start):
-            item.destroy()
-    assert max(steps) <= 1.5 * steps[0] + 1, steps

@@ -137,8 +137,8 @@ class Dual:
         contact_rows: Number of normal and of tangential rows on all ranks.
         seen: Largest estimate of ‖F‖ that solves have come to, 0 before.
         feasible: The set Ω of multipliers.
-        pressures: The λ_N whose friction bounds Ω under Coulomb's law, of each of
-            ``constraints.pressed``; None before ``bound_friction``.
+        pressures: The λ_N whose friction bounds Ω under Coulomb's law, of each point of
+            ``constraints.sets.tangents``; nan elsewhere, and before ``bound_friction``.
         last: The last solution of block Newton, or without a kernel, with its image.
         recycled: Directions of earlier solves; None: none are kept.
         pressing: After ``recover``: contact rows whose force is more than the solver's error.
@@ -162,7 +162,7 @@ class Dual:
     ) -> None:
         self.constraints, self.subdomains = constraints, subdomains
         self._given = constraints
-        self.pressures: Array | None = None
+        self.pressures: Array = np.full(len(constraints.sets.tangents), np.nan)
         self.pressing = np.zeros(constraints.num_rows, dtype=bool)
         self._prefix = f"{options_prefix}face_"
         self._names, self.nearly_free = (body_names, mode_names), list[dict[str, object]]()
@@ -245,7 +245,7 @@ class Dual:
 
     def bound_friction(self, pressures: Array) -> None:
         """Take λ_N of each of ``constraints.pressed`` to bound friction with; ∞ sticks."""
-        self.pressures = pressures
+        self.pressures[self._given.pressed] = pressures
         self.constraints = self._given.with_pressures(pressures)
         self.feasible = self._law(self.constraints)
 

@@ -351,6 +351,7 @@ class Accuracy:
         self._rounding, self.norm = rounding, norm or 1.0
         self._before: Measures | None = None
         self._least: Array = np.zeros(1)
+        self._own: Measures | None = None
         self.tolerance = max(rtol**FIRST_LOOK * reference, atol, rounding)
         self._small = max(SMALL * rtol * reference, LITTLE * rounding)
         self.drifted, self.looks, self._stalls, self._claimed = False, 0, 0, 1.0
@@ -418,9 +419,25 @@ class Accuracy:
         Returns:
             Whether it is right to the tolerance with that set, too.
         """
-        self._least = self.errors()
-        now = self.look(lam, gradient, face, residual)
+        self._least, self._own = self.errors(), self.measures
+        self.look(lam, gradient, face, residual)
         self._before = None
+        return self._is_right()
+
+    def take(self, errors: Array) -> bool:
+        """Take known errors of bodies in the place of those of ``look_again``. Collective.
+
+        Args:
+            errors: Lengths, shape ``(bodies,)``.
+
+        Returns:
+            Whether they are within the tolerance.
+        """
+        self.measures, self._least = self._own, self._least + errors
+        return self._is_right()
+
+    def _is_right(self) -> bool:
+        now = self._looked()
         ratio, longest = bcast_from_root(
             self._scene.coarse.comm, (self.ratio(), self._longest(now))
         )

@@ -227,7 +227,7 @@ def newton_on_law(
         # Step 5: halve the step until its residual is none of the largest; F is known on all of it
         past = [*past[1 - parameters.memory :], residual]
         part, there = 1.0, end
-        while program.residual(there) > max(past):
+        while not program.residual(there) <= max(past):
             part *= 0.5
             if part <= parameters.shortest:
                 there = end

@@ -49,6 +49,8 @@ class CoulombParameters:
             takes its place, since forces have to be known to that change.
         patience: Problems in a row whose change is not half of the least one before, and bounds do
             not come to rest.
+        slowest: The largest share of the change of bounds that is taken to be left of it in the
+            next problem.
         shortest: Of a step of bounds: it is halved where the change has grown, down to this.
         no_force: Of all multipliers: forces of normals that rounding makes of none. As bounds they
             would be discs that bend so much that nothing else is seen beside them.
@@ -66,6 +68,7 @@ class CoulombParameters:
     beside_rtol: float = 100.0
     with_target: float = 0.1
     patience: int = 12
+    slowest: float = 0.9
     shortest: float = 0.125
     no_force: float = 1e-13
     light: float = 1e-6
@@ -157,12 +160,13 @@ def solve_with_friction(
             result.destroy()
             continue
         # Step 2: its forces of normals, beside those that the bounds are of
-        change = bounds.change(result.lam)
+        change = bounds.change(result.lam, rule.u)
         near = change <= parameters.near * tolerance
         aim = rule.tolerance if asked <= least else np.inf  # of a coarser look nothing follows
         # Step 3: where they are at rest, what they leave of the law
         if change <= tolerance and asked <= least:
-            if goal is not None or bounds.fit(result, rule):
+            fits = goal is not None or bounds.fit(result, rule)
+            if fits or (not newton.may_try and bounds.fit_soon(rule)):
                 break
             if not newton.may_try and (bounds.idle > 1 or iterations >= options.friction_max_it):
                 result.reason = ConvergedReason.CONVERGED_FRICTION_RTOL
@@ -216,12 +220,13 @@ class FrictionBounds:
         if start is None:
             self._stick()
         else:
-            known = dual.pressures
-            lost = any_rank(self._comm, known is None or not np.all(np.isfinite(known)))
-            self.now = np.maximum(start[0][self._rows], 0.0) if lost or known is None else known
+            known = dual.pressures[at]
+            lost = any_rank(self._comm, not np.all(np.isfinite(known)))
+            self.now = np.maximum(start[0][self._rows], 0.0) if lost else known
         self._before, self._found = self.now, self.now
         self._none, self._best, self._last, self._length = 0.0, np.inf, np.inf, 1.0
         self.idle, self.body = 0, -1
+        self._solved: list[tuple[Array, Array, Array]] = []
 
     def _stick(self) -> None:
         self.now, self._stuck = np.full(len(self._rows), np.inf), True
@@ -254,16 +259,21 @@ class FrictionBounds:
         self.now, self._slipped = np.zeros(len(self._rows)), True
         return True
 
-    def change(self, lam: PETSc.Vec) -> float:
+    def change(self, lam: PETSc.Vec, u: Array) -> float:
         """Store a solve's normal forces; return their relative distance from the bounds.
 
         Body by body, as nodal forces of friction: beside forces elsewhere those on a light one
         would not be seen.
+
+        Args:
+            lam: The multipliers.
+            u: Their displacement, this rank's part.
         """
         values, parameters = lam.array_r, self._parameters
         driving = norm_over(self._comm, self._dual.driving) / (self._dual.seen or np.inf)
         self._none = parameters.no_force * max(norm_over(self._comm, values), driving)
         self._found = self._forces(values)
+        self._solved = [*self._solved[-1:], (self.now, self._found, u)]
         if self.stick:
             return float("inf")
         nothing = np.full(len(self._rows), self._none)
@@ -293,6 +303,26 @@ class FrictionBounds:
         fits = rule.look_again(result.lam, result.gradient, result.face, residual)
         self._dual.bound_friction(self.now)
         return fits
+
+    def fit_soon(self, rule: Accuracy) -> bool:
+        """Return whether u is right to rtol, extrapolated from the last two problems.
+
+        Between them bounds and u have changed; so far as the forces are from the bounds yet, u is
+        from its limit by as much, and by what is left of a geometric series.
+        """
+        if len(self._solved) < 2:
+            return False
+        (first, of_first, v), (now, found, u) = self._solved
+        weight = self._mu * self._constraints.tangent_scale[self._constraints.pressed]
+        way, left, before = (
+            norm_over(self._comm, weight * x) for x in (now - first, found - now, of_first - first)
+        )
+        if not 0.0 < way < np.inf:
+            return False
+        rate = min(left / max(before, TINY), self._parameters.slowest)
+        subdomains = self._dual.subdomains
+        moved = subdomains.body_maxima([subdomains.sizes(u - v)])[0]
+        return rule.take(moved * (left / way / (1.0 - rate)))
 
     def advance(self) -> None:
         """Go towards the forces that were found, all of the way unless that has led away."""

@@ -47,7 +47,8 @@ def last_look(result: QPResult, rule: Accuracy) -> None:
 
 # --- Choice and run of a solver ---------------------------------------------------------------
 
-# directions that are kept where more solves come and options do not say how many
+# directions that are kept where more solves come and options do not say how many: later ones gain
+# hardly anything, and each takes two vectors
 REPEATED = 100
 EXPLANATIONS = {
     ConvergedReason.DIVERGED_ROUNDING: "; rounding does not let it come lower: expected a "
@@ -94,18 +95,16 @@ def resolve_types(options: Options, rows: Sequence[int], prefix: str) -> tuple[s
     qp_type, (num_inequalities, num_tangents) = options.qp_type, rows
     if qp_type == "auto":
         qp_type = AUTO[num_inequalities + num_tangents > 0]
-    if num_tangents and not SOLVERS[qp_type].keeps_discs:
-        able = [name for name, solver in SOLVERS.items() if solver.keeps_discs]
-        raise InputError(
-            f"-{prefix}qp_type {qp_type}: the scene has friction, {num_tangents} tangential rows, "
-            f"which {qp_type.upper()} cannot keep; expected {' or '.join(['auto', *able])}"
-        )
-    if num_inequalities and not SOLVERS[qp_type].keeps_bounds:
-        able = [name for name, solver in SOLVERS.items() if solver.keeps_bounds]
-        raise InputError(
-            f"-{prefix}qp_type {qp_type}: the scene has {num_inequalities} contact rows, which "
-            f"{qp_type.upper()} cannot keep; expected {' or '.join(['auto', *able])}"
-        )
+    for count, keeps, rows_of in (
+        (num_tangents, "keeps_discs", f"friction, {num_tangents} tangential rows,"),
+        (num_inequalities, "keeps_bounds", f"{num_inequalities} contact rows,"),
+    ):
+        if count and not getattr(SOLVERS[qp_type], keeps):
+            able = [name for name, solver in SOLVERS.items() if getattr(solver, keeps)]
+            raise InputError(
+                f"-{prefix}qp_type {qp_type}: the scene has {rows_of} which {qp_type.upper()} "
+                f"cannot keep; expected {' or '.join(['auto', *able])}"
+            )
     pc_type = options.pc_type
     return qp_type, SOLVERS[qp_type].pc_type if pc_type == "auto" else pc_type
 
@@ -183,8 +182,10 @@ def _homogenise(
     elif solver.cold is not None:
         at = operator_product(qp.F, solver.cold(qp))
         scale = scale_at(qp, at)
-    else:
-        return _homogenise_as_told(dual, qp, options)
+    else:  # with λ̄ as options say, whose image is kept
+        kind = options.homogenization if any(dual.contact_rows) else "natural"
+        scale = scale_at(qp, dual.image("natural"))
+        return homogenise(qp, dual.image(kind), scale)
     homogenised = homogenise(qp, at, scale)
     at.destroy()
     return homogenised
@@ -202,13 +203,6 @@ def _no_worse_than_nothing(qp: QP, at: OperatorProduct, start: Start) -> None:
         at.x.set(0.0)
         at.Fx.set(0.0)
         start.mu[:] = 0.0
-
-
-def _homogenise_as_told(dual: Dual, qp: QP, options: Options) -> Homogenised:
-    """Homogenise with λ̄ as the options say; Fλ̄ is kept."""
-    kind = options.homogenization if any(dual.contact_rows) else "natural"
-    scale = scale_at(qp, dual.image("natural"))
-    return homogenise(qp, dual.image(kind), scale)
 
 
 def _monitor(dual: Dual, homogenised: Homogenised, options: Options) -> Monitor:
