@@ -161,8 +161,9 @@ def solve_dual(
 
 
 def _start(values: tuple[Array, Array] | None, qp: QP) -> Start | None:
-    """Return the solver's start; μ is 0 if the given one belongs to another kernel."""
-    if values is None:
+    """Return the solver's start, none from 0; μ is 0 if the given one is of another kernel."""
+    comm = qp.d.getComm().tompi4py()
+    if values is None or not any_rank(comm, bool(np.any(values[0]))):
         return None
     lam, mu = qp.d.duplicate(), values[1]
     lam.array[:] = values[0]
