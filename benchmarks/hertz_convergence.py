@@ -23,9 +23,7 @@ from scipy.interpolate import LinearNDInterpolator
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.pictures import column, curves, picture
-from benchmarks.tables import slope
-from benchmarks.tools import command_line, finish
+from benchmarks.tools import column, command_line, curves, finish, picture, slope
 from demos import cylinder_on_block_2d, hertz_2d, hertz_3d, sphere_on_block_3d
 
 OPTIONS = ("-tfeti_rtol", "1e-8")

@@ -36,9 +36,16 @@ from benchmarks.linear import (
     linear_problem,
     solve,
 )
-from benchmarks.pictures import picture, stacked
-from benchmarks.scenes import DEMOS, LARGE, MIDDLE, sizes
-from benchmarks.tools import choose_clock, command_line, configure_clock, finish, solve_seconds
+from benchmarks.stages import DEMOS, LARGE, MIDDLE, sizes
+from benchmarks.tools import (
+    choose_clock,
+    command_line,
+    configure_clock,
+    finish,
+    picture,
+    solve_seconds,
+    stacked,
+)
 from demos.demo_tools import petsc_options
 
 OTHERS = [kind for kind in SETTINGS if kind != "GAMG"]

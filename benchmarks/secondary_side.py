@@ -33,8 +33,7 @@ from scipy.interpolate import LinearNDInterpolator
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import tfeti_dolfinx as tfeti
-from benchmarks.pictures import curves, picture
-from benchmarks.tools import command_line, finish
+from benchmarks.tools import command_line, curves, finish, picture
 from demos.hertz import LineContact, PointContact
 from meshes.pressed_pair import build
 

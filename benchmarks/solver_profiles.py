@@ -37,7 +37,6 @@ from mpi4py import MPI
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.pictures import picture
 from benchmarks.stability_scenes import CELLS, beam, two_bodies, with_friction
 from benchmarks.stress import meshes
 from benchmarks.stress.judge import judged
@@ -46,7 +45,7 @@ from benchmarks.stress.random_scenes import random_scene
 from benchmarks.stress.reference import Answer, Untorn
 from benchmarks.stress.scene import Scene
 from benchmarks.stress.solve import UnsettledError
-from benchmarks.tools import choose_clock, command_line, configure_clock, finish
+from benchmarks.tools import choose_clock, command_line, configure_clock, finish, picture
 
 PRECONDITIONERS = ("none", "lumped", "dirichlet")
 CONTACT = [(qp, pc) for qp in ("newton", "smalse") for pc in PRECONDITIONERS]

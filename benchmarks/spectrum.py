@@ -32,8 +32,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import tfeti_dolfinx as tfeti
-from benchmarks.pictures import column, curves, picture
-from benchmarks.tools import command_line, finish
+from benchmarks.tools import column, command_line, curves, finish, picture
 from tfeti_dolfinx.bem.panels import Panels, surfaces
 from tfeti_dolfinx.bem.steklov import IsotropicLaw, steklov
 from tfeti_dolfinx.common.compat import assemble_csr

@@ -34,11 +34,10 @@ from mpi4py import MPI
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.pictures import curves, picture
 from benchmarks.stability_scenes import CELLS, LADDERS, Ladder, label
 from benchmarks.stress.judge import run_scene
 from benchmarks.stress.scene import Scene
-from benchmarks.tools import command_line, finish
+from benchmarks.tools import command_line, curves, finish, picture
 
 WITHIN = 100.0  # of rtol, of the report's estimate, of the noise of the direct solution
 QUICK = ("triangle",)

@@ -22,8 +22,7 @@ from mpi4py import MPI
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.pictures import column, curves, picture
-from benchmarks.tools import command_line, finish, solve_seconds
+from benchmarks.tools import column, command_line, curves, finish, picture, solve_seconds
 from demos import cube_3d, talk_hertz_2d, tbeti_cube_3d, tresca_2d, tresca_3d
 
 # subdomains: the talk's primal, dual, kernel dimension, multiplications, seconds (none are given

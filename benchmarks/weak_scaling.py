@@ -13,12 +13,14 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.pictures import column, curves, picture
 from benchmarks.tools import (
     best_runs,
+    column,
     command_line,
     configure_runs,
+    curves,
     finish,
+    picture,
     solve_seconds,
     stage_seconds,
 )

@@ -20,10 +20,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from benchmarks.error_scenes import SCENES, Scene
-from benchmarks.pictures import curves, picture
 from benchmarks.profiles import errors
 from benchmarks.time_against_error import seconds_at
-from benchmarks.tools import Tables, finish
+from benchmarks.tools import Tables, curves, finish, picture
 
 OURS = "tfeti_dolfinx"
 LEVELS = (0.1, 0.05, 0.02, 0.01, 0.005, 0.002)
