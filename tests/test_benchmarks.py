@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from benchmarks import (
-    contact_assembly,
     hertz_convergence,
     kplus_forms,
     linear_price,
@@ -45,15 +44,6 @@ def test_talk_tables(shared_tmp, comm):
         assert row["kernel"] == row["kernel, talk"]
         assert 0 < row["F, Newton"] < row["F, SMALSE"]
         assert ("sticking" in row) == title.startswith("Tresca")
-
-
-def test_contact_assembly(shared_tmp, comm):
-    tables = quick(contact_assembly, shared_tmp, comm)
-    for cell, per_square in (("hexahedron", 1), ("tetrahedron", 2)):
-        rows = tables[f"Contact and assembly, {cell}"]
-        squares = np.array([4**2 + 5**2, 8**2 + 10**2, 16**2 + 20**2])
-        assert [row["facets"] for row in rows] == (per_square * squares).tolist()
-        assert [row["conditions"] for row in rows] == [6**2, 11**2, 21**2]
 
 
 def test_kplus_forms(shared_tmp, comm):
@@ -162,48 +152,21 @@ def test_profiles_count_failures_and_ties():
     assert [row["τ = 4"] for row in found] == [0.5, 0.75, 0.75]
 
 
-def solve_row(scene, rtol, solver, cost, noise=0.0):
-    about = dict.fromkeys(("kind", "cell", "bodies", "friction"), "")
-    row = {"scene": scene, **about, "rtol": rtol, "solver": solver, "noise": noise}
-    return {**row, "cost": cost, "seconds": cost, "failed": "" if cost else "named"}
-
-
 def test_profiles_leave_out_what_rounding_does():
-    solves = [{"key": "a", "part": True}]
-    for pair, costs in (
-        (("newton", "none"), (3, 5, None)),
-        (("newton", "dirichlet"), (7, 5, None)),
-    ):
-        solver = "{}, {}".format(*pair)
-        for k, (cost, noise) in enumerate(zip(costs, (0.0, 1e-9, 1e-7), strict=True)):
-            solves.append(solve_row(str(k), 1e-8, solver, cost, noise))
-        solves.append({**solve_row("3", 1e-8, solver, None), "none": True})
-    tables = solver_profiles.tabled(solver_profiles.gathered(solves), "seconds")
+    about = dict.fromkeys(solver_profiles.NAMES, "")
+    names, rows = ("newton, none", "newton, dirichlet"), []
+    for scene, noise, costs in (("0", 0.0, (3, 7)), ("1", 1e-9, (5, 5)), ("2", 1e-7, (None, None))):
+        row = {**about, "scene": scene, "rtol": 1e-8, "noise": noise}
+        for name, cost in zip(names, costs, strict=True):
+            row |= {name: cost, f"{name}, s": cost, f"{name}, failed": "" if cost else "named"}
+        rows.append(row)
+    tables = solver_profiles.tabled(rows, "seconds")
     for row in tables["contact, multiplications"]:
         assert (row["solves"], row["failed"], row["τ = 4"]) == (2, 0, 1.0)
     (slow,) = tables["default failed, or needs more than twice the best"]
     assert (slow["scene"], slow["default"], slow["best"]) == ("0", 7, 3)
     (below,) = tables["below what rounding leaves"]
     assert (below["scene"], below["default"], below["why"]) == ("2", "-", "named")
-    (none,) = tables["no equilibrium"]
-    assert (none["scene"], none["default"], none["why"]) == ("3", "-", "named")
-
-
-def test_profiles_go_on_where_a_run_was_ended(shared_tmp, comm, monkeypatch):
-    arguments = (shared_tmp, comm, "--default", "--scenes", "1", "--seed", "1")
-    monkeypatch.setattr(solver_profiles, "CELLS", ())
-    scenes = solver_profiles.scenes
-    monkeypatch.setattr(solver_profiles, "scenes", lambda *_: scenes(1, 1, False))
-    tables = quick(solver_profiles, *arguments)
-
-    def refuse(*_):
-        raise AssertionError("it is known")
-
-    monkeypatch.setattr(solver_profiles, "takes_part", refuse)
-    monkeypatch.setattr(solver_profiles, "cost", refuse)
-    again = quick(solver_profiles, *arguments, "--resume")
-    assert again == tables
-    assert [row["solves"] for row in again["contact, multiplications"]] == [2]
 
 
 def test_what_takes_too_long_is_ended(serial_only):
@@ -248,35 +211,6 @@ def test_time_against_error(serial_only, shared_tmp, comm):
         assert quadratic["unknowns"] < finer["unknowns"]
         groups = tables[f"{scene}, slopes and seconds"]
         assert all(row["energy, slope over unknowns"] < 0.0 for row in groups)
-
-
-@pytest.mark.slow
-def test_partial_slip_against_its_closed_form(serial_only, shared_tmp, comm):
-    """What friction leaves of μp is compared where Cattaneo says that nothing slips."""
-    words = ["--ranks", "1", "--scenes", "partial slip"]
-    rows = quick(time_against_error, shared_tmp, comm, *words)["partial slip"]
-    linear, finer, *_ = rows
-    assert finer["energy"] < 0.5 * linear["energy"]
-    assert finer["pressure, closed form"] < 0.5 * linear["pressure, closed form"]
-    assert max(abs(row["a"]) for row in (linear, finer)) < 0.01
-
-
-def test_seconds_at_an_error_are_between_two_meshes():
-    rows = [{"e": 0.08, "seconds": 1.0}, {"e": 0.04, "seconds": 4.0}, {"e": 0.01, "seconds": 64.0}]
-    found = [time_against_error.seconds_at(rows, "e", level) for level in (0.1, 0.04, 0.02, 0.001)]
-    assert found == [1.0, pytest.approx(4.0), pytest.approx(16.0), None]
-
-
-def test_degrees_are_compared_in_the_same_time():
-    """Errors that fall as 1/t and as 4/t², which meet at t = 4."""
-    times = (1.0, 10.0)
-    groups = {
-        "graded P1": [{"seconds": t, "energy": 1 / t, "pressure": 1 / t} for t in times],
-        "graded P2 curved": [{"seconds": t, "energy": 4 / t**2, "pressure": 1 / t} for t in times],
-    }
-    found = time_against_error.degrees(groups)
-    assert [row["energy, P1 over P2"] for row in found] == pytest.approx([0.25, 10**0.5 / 4, 2.5])
-    assert [row["pressure, P1 over P2"] for row in found] == pytest.approx([1.0] * 3)
 
 
 def test_pressures_are_compared_as_functions():
