@@ -122,7 +122,7 @@ def main(argv):
         rows, slopes = STUDIES[name](*sizes, options=(*OPTIONS, *options))
         tables[name] = rows
         tables[f"{name}, slopes"] = [slopes]
-    return finish(arguments.output, "hertz_convergence", tables, draw, MPI.COMM_WORLD.rank)
+    return finish(arguments, "hertz_convergence", tables, draw, MPI.COMM_WORLD.rank)
 
 
 if __name__ == "__main__":

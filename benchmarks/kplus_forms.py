@@ -167,7 +167,7 @@ def main(argv):
     arguments, _ = command_line(__doc__, argv)
     sizes = ((2, 2), (3, 2)) if arguments.quick else ((2, 16), (3, 4))
     tables = dict(study(gdim, n) for gdim, n in sizes)
-    return finish(arguments.output, "kplus_forms", tables, draw, MPI.COMM_WORLD.rank)
+    return finish(arguments, "kplus_forms", tables, draw, MPI.COMM_WORLD.rank)
 
 
 if __name__ == "__main__":

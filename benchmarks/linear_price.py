@@ -177,7 +177,7 @@ def main(argv):
         rows, report = study(DEMOS[name], SIZES[size][name], options, repeats, arguments)
         sizes = f"{report.primal_dofs} unknowns, {report.subdomains} subdomains"
         tables[f"{name}: {sizes}, {comm.size} ranks, {unit}"] = with_ratios(rows)
-    return finish(arguments.output, "linear_price", tables, draw, comm.rank)
+    return finish(arguments, "linear_price", tables, draw, comm.rank)
 
 
 if __name__ == "__main__":

@@ -242,7 +242,7 @@ def main(argv):
     grids = QUICK if arguments.quick else {name: GRIDS[pair.gdim] for name, pair in PAIRS.items()}
     tables = {name: study(PAIRS[name], *grid) for name, grid in grids.items()}
     tables["Rules"] = losses([row for rows in tables.values() for row in rows])
-    return finish(arguments.output, "secondary_side", tables, draw, MPI.COMM_WORLD.rank)
+    return finish(arguments, "secondary_side", tables, draw, MPI.COMM_WORLD.rank)
 
 
 if __name__ == "__main__":

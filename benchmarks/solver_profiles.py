@@ -276,7 +276,7 @@ def main(argv):
             print(name, *(row.values() for row in found), flush=True)
     logging.disable(before)
     tables = MPI.COMM_WORLD.bcast(tabled(rows, unit) if rank == 0 else None)
-    return finish(arguments.output, "solver_profiles", tables, draw, rank)
+    return finish(arguments, "solver_profiles", tables, draw, rank)
 
 
 if __name__ == "__main__":

@@ -132,7 +132,7 @@ def main(argv):
     if MPI.COMM_WORLD.rank == 0 and "nu" in tables:
         tables["locking"] = locking(tables["nu"])
     tables = MPI.COMM_WORLD.bcast({title: rows for title, rows in tables.items() if rows})
-    return finish(arguments.output, "stability", tables, draw, MPI.COMM_WORLD.rank)
+    return finish(arguments, "stability", tables, draw, MPI.COMM_WORLD.rank)
 
 
 if __name__ == "__main__":

@@ -194,7 +194,7 @@ def main(argv):
         for name, found in local.items()
         for operator in ("F", "preconditioner")
     ]
-    return finish(arguments.output, "stages", tables, draw, comm.rank)
+    return finish(arguments, "stages", tables, draw, comm.rank)
 
 
 if __name__ == "__main__":

@@ -111,7 +111,7 @@ def main(argv):
         f"{name}, {arguments.ranks} ranks": table(name, size, counts, arguments, options)
         for name, (size, counts) in SIZES[kind].items()
     }
-    return finish(arguments.output, "subdomain_size", tables, draw)
+    return finish(arguments, "subdomain_size", tables, draw)
 
 
 if __name__ == "__main__":

@@ -142,7 +142,7 @@ def main(argv):
         title: table(demo, talk, list(talk)[:count], arguments, options)
         for title, (demo, talk) in TABLES.items()
     }
-    return finish(arguments.output, "talk_tables", tables, draw, MPI.COMM_WORLD.rank)
+    return finish(arguments, "talk_tables", tables, draw, MPI.COMM_WORLD.rank)
 
 
 if __name__ == "__main__":

@@ -307,7 +307,7 @@ def main(argv):
         with tempfile.TemporaryDirectory() as folder:
             tables |= study(name, arguments, Path(folder))
         write_tables(arguments.output, "time_against_error", tables)  # a later scene may fail
-    return finish(arguments.output, "time_against_error", tables, draw)
+    return finish(arguments, "time_against_error", tables, draw)
 
 
 if __name__ == "__main__":

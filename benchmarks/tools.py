@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -42,6 +43,7 @@ def command_line(
     )
     parser.add_argument("--quick", action="store_true", help="sizes of a few seconds")
     parser.add_argument("--output", type=Path, default=Path("results"), help="folder")
+    parser.add_argument("--document", metavar="COMMIT", help="put the tables into docs/, too")
     if configure is not None:
         configure(parser)
     arguments, rest = parser.parse_known_args(argv)
@@ -76,15 +78,40 @@ def choose_clock(arguments: argparse.Namespace) -> str:
 
 
 def finish(
-    folder: Path, name: str, tables: Tables, draw: Callable[[Path, Tables], None], rank: int = 0
+    arguments: argparse.Namespace,
+    name: str,
+    tables: Tables,
+    draw: Callable[[Path, Tables], None],
+    rank: int = 0,
+    shown: Callable[[Tables], Tables] = dict,
 ) -> Tables:
-    """Write and print tables and their picture on rank 0; the tables."""
+    """Write and print tables and their picture on rank 0; the tables.
+
+    With ``--document`` those that ``shown`` makes of them go between their marks in docs/.
+    """
     if rank == 0:
-        write_tables(folder, name, tables)
-        draw(folder / f"{name}.png", tables)
+        write_tables(arguments.output, name, tables)
+        draw(arguments.output / f"{name}.png", tables)
+        if arguments.document:
+            write_documents(name, shown(tables), arguments.document)
         for title, rows in tables.items():
             print(f"{title}\n\n{markdown(rows)}\n", flush=True)
     return tables
+
+
+def write_documents(name: str, tables: Tables, commit: str, folder: Path = ROOT / "docs") -> None:
+    """Replace what stands between marks of a benchmark's tables in documents.
+
+    A mark is ``<!-- NAME: TITLE, at COMMIT -->``, the end of a table ``<!-- end -->``.
+    """
+    for path in sorted(folder.rglob("*.md")):
+        text = made = path.read_text()
+        for title, rows in tables.items():  # one that no document marks is left out
+            mark = re.escape(f"<!-- {name}: {title}, at ") + r"\w+ -->\n.*?<!-- end -->"
+            new = f"<!-- {name}: {title}, at {commit} -->\n\n{markdown(rows)}\n\n<!-- end -->"
+            made = re.sub(mark, lambda _, new=new: new, made, flags=re.DOTALL)
+        if made != text:
+            path.write_text(made)
 
 
 def run_demo(name: str, arguments: Sequence[object], ranks: int) -> dict[str, Any]:

@@ -78,7 +78,7 @@ def main(argv):
         chosen = counts if arguments.quick or arguments.large else counts[:-1]
         title = f"{name}: {cells} cells along an edge of a subdomain, {arguments.ranks} ranks"
         tables[title] = table(name, chosen, cells, arguments, options)
-    return finish(arguments.output, "weak_scaling", tables, draw)
+    return finish(arguments, "weak_scaling", tables, draw)
 
 
 if __name__ == "__main__":

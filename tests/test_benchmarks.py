@@ -20,6 +20,7 @@ from benchmarks import (
     subdomain_size,
     talk_tables,
     time_against_error,
+    tools,
     weak_scaling,
 )
 
@@ -237,3 +238,15 @@ def test_a_benchmark_that_starts_mpirun_says_so_under_mpirun(monkeypatch, tmp_pa
 def test_a_demo_that_fails_is_named(serial_only, tmp_path):
     with pytest.raises(RuntimeError, match=r"(?s)cube_3d.py .* failed:.*unknown option"):
         weak_scaling.main(["--quick", "--output", str(tmp_path), "-tfeti_rtoll", "1"])
+
+
+def test_tables_go_between_their_marks(tmp_path):
+    page = tmp_path / "page.md"
+    mark = "before\n<!-- spectrum: {}, at {} -->\n\n| old |\n\n<!-- end -->\nafter\n"
+    page.write_text(mark.format("2D", "abc123") + mark.format("3D", "abc123"))
+    tools.write_documents("spectrum", {"2D": [{"κ": 7.5, "rows": 3}]}, "def456", tmp_path)
+    text = page.read_text()
+    assert (
+        "2D, at def456 -->\n\n| κ | rows |\n|---|---|\n| 7.5 | 3 |\n\n<!-- end -->\nafter" in text
+    )
+    assert text.endswith(mark.format("3D", "abc123"))

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from pathlib import Path
@@ -120,7 +121,8 @@ def main(argv: list[str]) -> Tables:
         if (folder / f"{name.replace(' ', '_')}_reference.json").exists():
             rows = rows_of(name, folder)
             tables |= {name: rows, f"{name}, equal errors": equal_errors(rows)}
-    return finish(folder.parent, "peers", tables, draw)
+    given = argparse.Namespace(output=folder.parent, document=None)
+    return finish(given, "peers", tables, draw)
 
 
 if __name__ == "__main__":
