@@ -98,7 +98,7 @@ STUDIES = {
     "Cylinder on a block": study_pair,
     "Ball on a block": study_pair_3d,
 }
-QUICK = {"Half cylinder on a plane": (8, 12, 24), "Cylinder on a block": (8, 12, 24)}
+QUICK = {"Cylinder on a block": (8, 12, 24)}
 
 
 def draw(path, tables):

@@ -117,19 +117,17 @@ def test_stages(shared_tmp, comm, monkeypatch):
 
 def test_stability(shared_tmp, comm):
     """Each row has a test of its own in ``test_stability``."""
-    tables = quick(stability, shared_tmp, comm, "--groups", "moduli", "nu")
-    assert set(tables) == {"moduli", "nu", "locking"}
-    for row in tables["moduli"] + tables["nu"]:
+    tables = quick(stability, shared_tmp, comm, "--groups", "nu")
+    assert set(tables) == {"nu", "locking"}
+    for row in tables["nu"]:
         assert row["verdict"] == "right"
         assert row["error"] <= 1e-4
-    for row in tables["moduli"]:
-        assert row["of friendly"] <= 4.0
     stiff, locked = tables["locking"]
     assert locked["P1 over P2"] < 0.8 * stiff["P1 over P2"]
 
 
 def test_solver_profiles(serial_only, shared_tmp, comm):
-    tables = quick(solver_profiles, shared_tmp, comm, "--steps", "300", "--seed", "5")
+    tables = quick(solver_profiles, shared_tmp, comm, "--steps", "100", "--seed", "5")
     default = tables["contact, multiplications"][2]
     assert default["solver"] == "newton, dirichlet"
     for title, rows in tables.items():
@@ -202,7 +200,7 @@ def test_subdomain_size(serial_only, shared_tmp, comm):
 
 def test_time_against_error(serial_only, shared_tmp, comm):
     """Errors fall, and degree 2 is nearer in energy on a mesh with as many unknowns."""
-    words = ["--ranks", "1", "--scenes", "half cylinder", "shrink fit"]
+    words = ["--ranks", "1", "--scenes", "half cylinder"]
     tables = quick(time_against_error, shared_tmp, comm, *words)
     for scene in words[3:]:
         linear, finer, quadratic, _ = tables[scene]
