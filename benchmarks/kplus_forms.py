@@ -9,8 +9,6 @@ go to results/kplus_forms.md, .json and .png.
 
 from __future__ import annotations
 
-import argparse
-import os
 import sys
 from pathlib import Path
 
@@ -29,7 +27,7 @@ from scipy.sparse import csr_array
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.tables import markdown, write_tables
+from benchmarks.tools import column, command_line, curves, finish, picture
 from tfeti_dolfinx.common.compat import assemble_csr
 from tfeti_dolfinx.subdomains.block import candidate_modes, fixing_nodes, kernel_of
 from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, regular_matrix, with_entries
@@ -152,43 +150,24 @@ def study(gdim, n):
     return title, rows
 
 
-def draw(target, tables):
+def draw(path, tables):
     """Error over condition, a panel for each beam."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10, 4.5), layout="constrained")
-    panels = figure.subplots(1, len(tables), squeeze=False)[0]
-    for axes, (title, rows) in zip(panels, tables.items(), strict=True):
-        for kind, colour in zip(KPLUS_TYPES, ("C0", "C1", "C2"), strict=True):
-            of = [row for row in rows if row["K⁺"] == kind]
-            across = [row["condition of the factor"] for row in of]
-            for name, fill in (("a deformation", colour), ("K K⁺ K", "none")):
-                errors = [row[f"error of {name}"] for row in of]
-                axes.loglog(across, errors, "o", color=colour, mfc=fill, label=f"{kind}, {name}")
-        axes.set_title(title, fontsize=9)
-        axes.set_xlabel("condition of what is factored")
-        axes.set_ylabel("relative error")
-        axes.legend(fontsize=7)
-    partial = target.with_name(f".partial-{target.name}")
-    FigureCanvasAgg(figure).print_png(str(partial))
-    os.replace(partial, target)
+    with picture(path, len(tables)) as axes:
+        for panel, (title, rows) in zip(axes, tables.items(), strict=True):
+            lines = {}
+            for kind in KPLUS_TYPES:
+                of = [row for row in rows if row["K⁺"] == kind]
+                errors = column(of, "error of a deformation")
+                lines[kind] = column(of, "condition of the factor"), errors
+            curves(panel, title, ("condition of what is factored", "relative error"), lines)
 
 
 def main(argv):
     """Run the tables and write them; returns them."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="small beams, for the tests")
-    parser.add_argument("--output", type=Path, default=Path("results"))
-    arguments = parser.parse_args(argv)
+    arguments, _ = command_line(__doc__, argv)
     sizes = ((2, 2), (3, 2)) if arguments.quick else ((2, 16), (3, 4))
     tables = dict(study(gdim, n) for gdim, n in sizes)
-    if MPI.COMM_WORLD.rank == 0:
-        write_tables(arguments.output, "kplus_forms", tables)
-        draw(arguments.output / "kplus_forms.png", tables)
-        for title, rows in tables.items():
-            print(f"{title}\n\n{markdown(rows)}\n")
-    return tables
+    return finish(arguments, "kplus_forms", tables, draw, MPI.COMM_WORLD.rank)
 
 
 if __name__ == "__main__":

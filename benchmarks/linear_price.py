@@ -36,9 +36,16 @@ from benchmarks.linear import (
     linear_problem,
     solve,
 )
-from benchmarks.pictures import picture, stacked
-from benchmarks.scenes import DEMOS, LARGE, MIDDLE, sizes
-from benchmarks.tools import choose_clock, command_line, configure_clock, finish, solve_seconds
+from benchmarks.stages import DEMOS, LARGE, MIDDLE, sizes
+from benchmarks.tools import (
+    choose_clock,
+    command_line,
+    configure_clock,
+    finish,
+    picture,
+    solve_seconds,
+    stacked,
+)
 from demos.demo_tools import petsc_options
 
 OTHERS = [kind for kind in SETTINGS if kind != "GAMG"]
@@ -170,7 +177,7 @@ def main(argv):
         rows, report = study(DEMOS[name], SIZES[size][name], options, repeats, arguments)
         sizes = f"{report.primal_dofs} unknowns, {report.subdomains} subdomains"
         tables[f"{name}: {sizes}, {comm.size} ranks, {unit}"] = with_ratios(rows)
-    return finish(arguments.output, "linear_price", tables, draw, comm.rank)
+    return finish(arguments, "linear_price", tables, draw, comm.rank)
 
 
 if __name__ == "__main__":

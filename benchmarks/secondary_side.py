@@ -33,8 +33,7 @@ from scipy.interpolate import LinearNDInterpolator
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import tfeti_dolfinx as tfeti
-from benchmarks.pictures import curves, picture
-from benchmarks.tools import command_line, finish
+from benchmarks.tools import command_line, curves, finish, picture
 from demos.hertz import LineContact, PointContact
 from meshes.pressed_pair import build
 
@@ -243,7 +242,7 @@ def main(argv):
     grids = QUICK if arguments.quick else {name: GRIDS[pair.gdim] for name, pair in PAIRS.items()}
     tables = {name: study(PAIRS[name], *grid) for name, grid in grids.items()}
     tables["Rules"] = losses([row for rows in tables.values() for row in rows])
-    return finish(arguments.output, "secondary_side", tables, draw, MPI.COMM_WORLD.rank)
+    return finish(arguments, "secondary_side", tables, draw, MPI.COMM_WORLD.rank)
 
 
 if __name__ == "__main__":

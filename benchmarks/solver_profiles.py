@@ -1,30 +1,23 @@
 """Dolan's and Moré's profiles of the solvers and preconditioners over random scenes.
 
-    ./run python3 benchmarks/solver_profiles.py [--quick] [--scenes 100] [--default] [--resume]
+    ./run python3 benchmarks/solver_profiles.py [--quick] [--scenes 100] [--default]
 
 Scenes are those of ``benchmarks.stress`` (boxes in 2D and 3D: single ones, stacks, rows, bridges,
 apart; obstacles, slender, of moduli and units that differ, held by contact alone), every third with
 Coulomb's friction, blocks with Tresca's, and beams without contact. A scene takes part if the
-checks of the package say that it has a solution.
+package says that it has a solution and the direct solver finds it.
 
 A solve fails that ends in an error, in more than ``--steps`` steps, after more than ``--limit``
-seconds (on one rank), or with an error above 100 rtol (and 100 times what rounding does) beside a
-direct solve. A scene with friction may have no equilibrium though forces within the law could
-balance its load; where a mixed-integer program proves that (``benchmarks.stress.equilibrium``) no
-solver can end, and what the default solver says is in a table of its own. Where rounding of the
-stiffness alone changes the direct solution by more than rtol no solver can be right to rtol, and
-may say so: such solves are in a table of their own. Where double precision has too few digits for
-the direct solution with friction it is found in 240 (``benchmarks.stress.sliding_digits``). A
-profile ρ(τ) is the share of solves that a solver ends for at most τ times the cost of the best one
-(Mathematical Programming 91, 2002): cost in multiplications by F and by the preconditioner, and in
-seconds of the solver. Each solve is written to results/solver_profiles.jsonl at once; ``--resume``
-takes what is there, so that a run may be ended, or begin with the default solvers, ``--default``.
-Results go to results/solver_profiles.md, .json and .png.
+seconds (on one rank), or with an error above 100 rtol (and 100 times what rounding does) beside the
+direct solution. Where rounding of the stiffness alone changes that by more than rtol no solver can
+be right to rtol: such solves are in a table of their own. A profile ρ(τ) is the share of solves
+that a solver ends for at most τ times the cost of the best one (Mathematical Programming 91, 2002):
+cost in multiplications by F and by the preconditioner, and in seconds of the solver. Results go to
+results/solver_profiles.md, .json and .png.
 """
 
 from __future__ import annotations
 
-import json
 import logging
 import signal
 import sys
@@ -44,17 +37,15 @@ from mpi4py import MPI
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.pictures import picture
-from benchmarks.stability_scenes import CELLS, with_friction
-from benchmarks.stress import ladders, meshes
-from benchmarks.stress.equilibrium import has_none
+from benchmarks.stability_scenes import CELLS, beam, two_bodies, with_friction
+from benchmarks.stress import meshes
 from benchmarks.stress.judge import judged
 from benchmarks.stress.package import solve_scene
-from benchmarks.stress.qp import UnsettledError
 from benchmarks.stress.random_scenes import random_scene
 from benchmarks.stress.reference import Answer, Untorn
 from benchmarks.stress.scene import Scene
-from benchmarks.tools import choose_clock, command_line, configure_clock, finish
+from benchmarks.stress.solve import UnsettledError
+from benchmarks.tools import choose_clock, command_line, configure_clock, finish, picture
 
 PRECONDITIONERS = ("none", "lumped", "dirichlet")
 CONTACT = [(qp, pc) for qp in ("newton", "smalse") for pc in PRECONDITIONERS]
@@ -63,7 +54,6 @@ DEFAULT = {True: ("newton", "dirichlet"), False: ("pcpg", "dirichlet")}
 TOLERANCES = (1e-4, 1e-8)
 WITHIN = 100.0  # of rtol, and of the noise of the direct solution
 NEAR = 2.0  # of the best
-DIRECT = 600  # seconds of a direct solution, which may take 240 digits
 TAUS = (1.0, 1.5, 2.0, 4.0, 8.0, 16.0)
 NAMES = ("scene", "kind", "cell", "bodies", "friction", "rtol")
 T = TypeVar("T")
@@ -78,7 +68,6 @@ def configure(parser):
     parser.add_argument("--seed", type=int, default=0, help="the first seed")
     parser.add_argument("--limit", type=int, default=60, help="most seconds of a solve, whole")
     parser.add_argument("--default", action="store_true", help="the default solvers only")
-    parser.add_argument("--resume", action="store_true", help="go on with an earlier run's solves")
     configure_clock(parser)
 
 
@@ -117,9 +106,9 @@ def scenes(count: int, seed: int, quick: bool) -> Iterator[tuple[str, Scene]]:
         yield str(k), with_friction(scene, "coulomb", 0.1 + 0.1 * (k % 5)) if k % 3 == 0 else scene
     for cell in CELLS[:1] if quick else CELLS:
         for slenderness in BEAMS[:1] if quick else BEAMS:
-            yield f"beam {cell} {slenderness:g}", ladders.beam(cell, slenderness)
+            yield f"beam {cell} {slenderness:g}", beam(cell, slenderness)
         for ratio in MODULI[:1] if quick else MODULI:
-            scene = ladders.two_bodies(cell, ratio, 1.0)
+            scene = two_bodies(cell, ratio, 1.0)
             yield f"blocks {cell} {ratio:g}", with_friction(scene, "tresca", 1e-3)
 
 
@@ -144,7 +133,7 @@ def cost(
     scene = replace(scene, options={**options, "tfeti_max_it": steps})
     outcome = solve_scene(scene, g, MPI.COMM_WORLD)
     why = outcome.error
-    if MPI.COMM_WORLD.rank == 0 and not why and answer is not None:
+    if answer is not None and not why:
         found = judged(scene, g, outcome, answer)
         if "u" in found:
             errors = np.maximum(found["errors"], found["jump"])
@@ -159,81 +148,40 @@ def cost(
     return report["F"] + report["S"], report["qp"], ""
 
 
-def takes_part(
-    scene: Scene, g: meshes.Grid, steps: int, limit: int
-) -> tuple[bool, Answer | None, bool]:
-    """Whether the package says that a scene has a solution, the direct one, and if it has none."""
+def direct(scene: Scene, g: meshes.Grid, steps: int, limit: int) -> tuple[bool, Answer | None]:
+    """Whether a scene takes part, and its direct solution on rank 0. Collective."""
+    comm, answer = MPI.COMM_WORLD, None
     scene = replace(scene, options={"tfeti_rtol": 1e-2, "tfeti_max_it": steps})
     try:
-        outcome = limited(limit, lambda: solve_scene(scene, g, MPI.COMM_WORLD))
-    except LateError:
-        return True, None, False
-    if outcome.error.startswith(("NoSolutionError", "InputError")):
-        return False, None, False
-    answer, none = None, False
-    if MPI.COMM_WORLD.rank == 0:
-        try:
-            untorn = Untorn(scene, g, outcome.mu, outcome.lmbda)
-            answer = limited(max(limit, DIRECT), untorn.answer)
-        except UnsettledError as error:
-            none = has_none(untorn)
-            print("no equilibrium" if none else "no direct answer:", error, flush=True)
-        except Exception as error:  # the solvers are still compared
-            print("no direct answer:", error, flush=True)
-        if answer is not None and answer.u is None:
-            answer = None
-    return True, answer, none
+        outcome = limited(limit, lambda: solve_scene(scene, g, comm))
+        if comm.rank == 0 and not outcome.error.startswith(("NoSolutionError", "InputError")):
+            answer = limited(limit, Untorn(scene, g, outcome.mu, outcome.lmbda).answer)
+    except (LateError, UnsettledError, RuntimeError, np.linalg.LinAlgError) as error:
+        print("no direct solution:", error, flush=True)
+    return comm.bcast(answer is not None and answer.u is not None), answer
 
 
-def study(name: str, scene: Scene, arguments: Any, known: dict[str, Any]) -> list[dict[str, Any]]:
-    """A row for each solve of a scene, and one that says if it takes part; those known as they are.
-
-    Args:
-        name: Name of the scene.
-        scene: The scene.
-        arguments: Most steps and seconds, and which solvers.
-        known: Rows of an earlier run by ``key``.
-    """
+def study(name: str, scene: Scene, arguments: Any) -> list[dict[str, Any]]:
+    """A row for each tolerance, with the costs of all solvers; none if the scene takes no part."""
     has_contact = bool(scene.walls or scene.pairs)
     solvers = CONTACT if has_contact else LINEAR
     solvers = [DEFAULT[has_contact]] if arguments.default else solvers
-    works = [(qp, pc, rtol) for rtol in TOLERANCES for qp, pc in solvers]
-    first = known.get(name, {})
-    rows = [known[f"{name}, {work}"] for work in works if f"{name}, {work}" in known]
-    if first and (not first["part"] or len(rows) == len(works)):
-        return [first, *rows]
-    g, noise, about = meshes.grid(scene), 0.0, described(name, scene)
-    part, answer, none = takes_part(scene, g, arguments.steps, arguments.limit)
-    if answer is not None and answer.noise is not None:
-        noise = float(answer.noise.max())
-    about |= {"none": none}
-    found = [{"key": name, **about, "part": part, "direct": answer is not None, "noise": noise}]
-    for work in works if part else []:
-        if (row := known.get(f"{name}, {work}")) is None:
-            row = {"key": f"{name}, {work}", **about, "rtol": work[2]}
-            row |= {"solver": "{}, {}".format(*work), "noise": noise}
+    g, rows = meshes.grid(scene), []
+    takes_part, answer = direct(scene, g, arguments.steps, arguments.limit)
+    noise = float(answer.noise.max()) if answer is not None and answer.noise is not None else 0.0
+    if not takes_part:
+        return []
+    for rtol in TOLERANCES:
+        rows.append({**described(name, scene), "rtol": rtol, "noise": noise})
+        for pair in solvers:
             try:
-                run = partial(cost, scene, g, answer, arguments.steps, work)
+                run = partial(cost, scene, g, answer, arguments.steps, (*pair, rtol))
                 mults, seconds, why = limited(arguments.limit, run)
             except LateError as late:
                 mults, seconds, why = None, None, str(late)
-            row |= {"cost": mults, "seconds": seconds, "failed": why}
-        found.append(row)
-    return found
-
-
-def gathered(solves: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """A row for each scene and tolerance, with the columns of all its solvers."""
-    rows: dict[tuple[str, float], dict[str, Any]] = {}
-    for solve in solves:
-        if "solver" in solve:
-            about = {name: solve[name] for name in (*NAMES, "noise")}
-            about["none"] = solve.get("none", False)
-            row = rows.setdefault((solve["scene"], solve["rtol"]), about)
-            key = solve["solver"]
-            row |= {key: solve["cost"], f"{key}, s": solve["seconds"]}
-            row |= {f"{key}, failed": solve["failed"]}
-    return list(rows.values())
+            key = "{}, {}".format(*pair)
+            rows[-1] |= {key: mults, f"{key}, s": seconds, f"{key}, failed": why}
+    return rows
 
 
 def profiles(rows: list[dict[str, Any]], solvers, suffix: str = "") -> list[dict[str, Any]]:
@@ -265,8 +213,7 @@ def profiles(rows: list[dict[str, Any]], solvers, suffix: str = "") -> list[dict
 def tabled(rows: list[dict[str, Any]], unit: str) -> dict[str, list[dict[str, Any]]]:
     """Profiles of multiplications and seconds, and what failed by default."""
     tables: dict[str, list[dict[str, Any]]] = {}
-    solvable = [row for row in rows if not row["none"]]
-    reached = [row for row in solvable if row["noise"] <= row["rtol"]]
+    reached = [row for row in rows if row["noise"] <= row["rtol"]]
     for has_contact, solvers in ((True, CONTACT), (False, LINEAR)):
         default = "{}, {}".format(*DEFAULT[has_contact])
         own = [row for row in reached if default in row]
@@ -277,13 +224,8 @@ def tabled(rows: list[dict[str, Any]], unit: str) -> dict[str, list[dict[str, An
             tables[f"{what}, multiplications"] = profiles(own, tried)
             tables[f"{what}, {unit}"] = profiles(own, tried, ", s")
     failed = "default failed, or needs more than twice the best"
-    below = [row for row in solvable if row not in reached]
-    none = [row for row in rows if row["none"]]
-    for title, some in (
-        (failed, reached),
-        ("below what rounding leaves", below),
-        ("no equilibrium", none),
-    ):
+    below = [row for row in rows if row not in reached]
+    for title, some in ((failed, reached), ("below what rounding leaves", below)):
         worst = [row for row in map(_beside_best, some) if row]
         if worst := [row for row in worst if title != failed or row["bad"]]:
             tables[title] = [{k: v for k, v in row.items() if k != "bad"} for row in worst]
@@ -327,27 +269,14 @@ def main(argv):
     unit, before = choose_clock(arguments), logging.root.manager.disable
     logging.disable(logging.WARNING)
     count, rank = 2 if arguments.quick else arguments.scenes, MPI.COMM_WORLD.rank
-    journal, solves, known = arguments.output / "solver_profiles.jsonl", [], {}
-    if arguments.resume and journal.exists():
-        lines = journal.read_text().splitlines()
-        known = {row["key"]: row for row in map(json.loads, lines)}
-    if rank == 0:
-        journal.parent.mkdir(parents=True, exist_ok=True)
-        journal.write_text("".join(json.dumps(row) + "\n" for row in known.values()))
+    rows: list[dict[str, Any]] = []
     for name, scene in scenes(count, arguments.seed, arguments.quick):
-        found = study(name, scene, arguments, known)
-        solves += found
-        if rank == 0 and (new := [row for row in found if row["key"] not in known]):
-            with journal.open("a") as file:
-                file.writelines(json.dumps(row) + "\n" for row in new)
-            said = [
-                (row["solver"], row["rtol"], row["cost"], row["failed"][:110]) for row in new[1:]
-            ]
-            print(name, found[0]["kind"], found[0]["friction"], *said, flush=True)
-    rows = gathered(solves)
+        rows += (found := study(name, scene, arguments))
+        if rank == 0:
+            print(name, *(row.values() for row in found), flush=True)
     logging.disable(before)
     tables = MPI.COMM_WORLD.bcast(tabled(rows, unit) if rank == 0 else None)
-    return finish(arguments.output, "solver_profiles", tables, draw, rank)
+    return finish(arguments, "solver_profiles", tables, draw, rank)
 
 
 if __name__ == "__main__":

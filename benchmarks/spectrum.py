@@ -32,8 +32,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import tfeti_dolfinx as tfeti
-from benchmarks.pictures import column, curves, picture
-from benchmarks.tools import command_line, finish
+from benchmarks.tools import column, command_line, curves, finish, picture
 from tfeti_dolfinx.bem.panels import Panels, surfaces
 from tfeti_dolfinx.bem.steklov import IsotropicLaw, steklov
 from tfeti_dolfinx.common.compat import assemble_csr
@@ -179,6 +178,22 @@ def draw(path, tables):
             curves(panel, title, ("H/h", "condition number κ"), lines)
 
 
+def shown(tables):
+    """Finite and boundary elements side by side."""
+    kept, found = ("κ(F)", "κ(F)·h/H", "κ(S)", "κ(S)·h/H"), {}
+    for title in tables:
+        name, kind = title.split(", ")
+        if kind == "finite elements":
+            pairs = zip(tables[title], tables[f"{name}, boundary elements"], strict=True)
+            found[name] = [
+                {"H/h": row["H/h"], "1/H": row["1/H"], "rows of B": row["rows"]}
+                | {key: f"{row[key]:.3g}" for key in kept}
+                | {f"BEM: {key}": f"{beside[key]:.3g}" for key in kept}
+                for row, beside in pairs
+            ]
+    return found
+
+
 def main(argv):
     """Run the tables and write them on the first rank; returns them."""
     arguments, _ = command_line(__doc__, argv)
@@ -190,7 +205,7 @@ def main(argv):
         for gdim, (edges, counts) in sizes.items()
         for name, boundary in (("finite elements", False), ("boundary elements", True))
     }
-    return finish(arguments.output, "spectrum", tables, draw, MPI.COMM_WORLD.rank)
+    return finish(arguments, "spectrum", tables, draw, MPI.COMM_WORLD.rank, shown)
 
 
 if __name__ == "__main__":

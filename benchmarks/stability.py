@@ -34,11 +34,10 @@ from mpi4py import MPI
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.pictures import curves, picture
-from benchmarks.stability_scenes import CELLS, LADDERS, UNITS, Ladder
+from benchmarks.stability_scenes import CELLS, LADDERS, Ladder, label
 from benchmarks.stress.judge import run_scene
 from benchmarks.stress.scene import Scene
-from benchmarks.tools import command_line, finish
+from benchmarks.tools import command_line, curves, finish, picture
 
 WITHIN = 100.0  # of rtol, of the report's estimate, of the noise of the direct solution
 QUICK = ("triangle",)
@@ -64,13 +63,6 @@ def verdict(scene: Scene, row: dict[str, Any]) -> str:
     if max(row["u"], row["jump"]) <= WITHIN * allowed:
         return "right"
     return "warned" if row["warnings"] else "SILENT"
-
-
-def label(ladder: Ladder, value: float) -> str:
-    """A value as it stands in the table."""
-    if ladder.name.endswith(("units", "frictionless")) and ladder.values == range(len(UNITS)):
-        return "{:g} m, {:g} Pa".format(*UNITS[int(value)])
-    return f"{value:g}"
 
 
 def climb(ladder: Ladder, cell: str, quick: bool) -> list[dict[str, Any]]:
@@ -140,7 +132,7 @@ def main(argv):
     if MPI.COMM_WORLD.rank == 0 and "nu" in tables:
         tables["locking"] = locking(tables["nu"])
     tables = MPI.COMM_WORLD.bcast({title: rows for title, rows in tables.items() if rows})
-    return finish(arguments.output, "stability", tables, draw, MPI.COMM_WORLD.rank)
+    return finish(arguments, "stability", tables, draw, MPI.COMM_WORLD.rank)
 
 
 if __name__ == "__main__":

@@ -1,15 +1,10 @@
-"""Ladders of ``benchmarks/stability.py``: the first rung of each is the friendly case.
-
-Scenes are those of ``benchmarks.stress``, whose independent solver judges them.
-"""
+"""Ladders: a scene with one number that becomes harder; the first rung is the friendly case."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-from benchmarks.stress import ladders
-from benchmarks.stress.ladders import all_of, block, cells, far_wall, floor, two_bodies, up
 from benchmarks.stress.scene import GDIM, Body, Held, Load, Pair, Scene, Wall
 
 CELLS = ("quadrilateral", "triangle", "hexahedron", "tetrahedron")
@@ -19,6 +14,8 @@ NU = (0.3, 0.49, 0.499, 0.4999)
 ASPECTS = (1.0, 10.0, 1e2, 1e3, 1e4)
 THIN = (1.0, 10.0, 1e2, 1e3)
 RTOL = (1e-6, 1e-2, 1e-4, 1e-8, 1e-10, 1e-12)
+STEEL, PRESSURE = 2.1e11, 1e5
+FAR = (1e-3, 1e-6, 1.0, 1e6)
 UNITS = [(1.0, 1.0)] + [(m, Pa) for m in (1e-9, 1e-3, 1e3) for Pa in (1e3, 1e9, 1e12)]
 
 
@@ -41,6 +38,162 @@ class Ladder:
     cells: Sequence[str] = CELLS
 
 
+def up(cell: str, vertical: float, across: float = 0.0) -> tuple[float, ...]:
+    return (across,) * (GDIM[cell] - 1) + (vertical,)
+
+
+def cells(cell: str, n: int = 4) -> tuple[int, ...]:
+    return (n,) * 2 if GDIM[cell] == 2 else (max(2, n - 1),) * 3
+
+
+def block(
+    cell: str, bottom: float = 0.0, E: float = STEEL, nu: float = 0.3, jump: float = 1.0
+) -> Body:
+    """A unit cube, or square, above a height."""
+    return Body(up(cell, bottom), up(cell, bottom + 1.0, 1.0), cells(cell), E, nu, jump)
+
+
+def all_of(cell: str) -> tuple[int, ...]:
+    return tuple(range(GDIM[cell]))
+
+
+def floor(cell: str, at: float = 0.0, body: int = 0) -> Wall:
+    return Wall((body, GDIM[cell] - 1, 0), "plane", (up(cell, at), up(cell, 1.0)))
+
+
+def far_wall(cell: str, gap: float) -> Wall:
+    """Beyond the high end of x."""
+    rest = (0.0,) * (GDIM[cell] - 1)
+    return Wall((0, 0, 1), "plane", ((1.0 + gap, *rest), (-1.0, *rest)))
+
+
+def far_obstacle(cell: str, gap: float) -> Scene:
+    """A steel block on the ground, pushed towards an obstacle that it does not reach."""
+    last = GDIM[cell] - 1
+    push = (PRESSURE,) + (0.0,) * last
+    return Scene(
+        cell,
+        (block(cell),),
+        held=(Held((0, last, 0), all_of(cell)),),
+        loads=(Load((0, 0, 0), push),),
+        walls=(far_wall(cell, gap),),
+    )
+
+
+def checkerboard_touching(cell: str, jump: float) -> Scene:
+    last = GDIM[cell] - 1
+    return Scene(
+        cell,
+        (block(cell, E=1.0, jump=jump),),
+        held=(Held((0, 0, 0), all_of(cell)),),
+        loads=(Load((0, last, 1), up(cell, -1e-2)),),
+        walls=(floor(cell, -1e-3),),
+    )
+
+
+def subdomain_jumps(cell: str, jump: float) -> Scene:
+    last = GDIM[cell] - 1
+    return Scene(
+        cell,
+        (block(cell, E=1.0),),
+        held=(Held((0, 0, 0), all_of(cell)),),
+        loads=(Load((0, last, 1), up(cell, -1e-2)),),
+        walls=(floor(cell, -1e-3),),
+        subdomains=8,
+        subdomain_jump=jump,
+    )
+
+
+def subdomain_jumps_pair(cell: str, jump: float) -> Scene:
+    return replace(two_bodies(cell, 1.0, 1.0), subdomains=8, subdomain_jump=jump)
+
+
+def two_bodies(cell: str, lower: float, upper: float) -> Scene:
+    """A block that only rollers and contact hold, on a clamped one, pressed and pushed sideways."""
+    last = GDIM[cell] - 1
+    push = (-1e-3,) + (0.0,) * (last - 1) + (-1e-2,)
+    return Scene(
+        cell,
+        (block(cell, E=lower), block(cell, 1.0, E=upper)),
+        held=(Held((0, last, 0), all_of(cell)), Held((1, 0, 0), tuple(range(last)))),
+        loads=(Load((1, last, 1), push),),
+        pairs=(Pair((1, last, 0), (0, last, 1)),),
+        subdomains=6,
+    )
+
+
+def loose_stack(cell: str, jump: float) -> Scene:
+    """Three blocks on the floor, held by contact alone, stiff and soft."""
+    last = GDIM[cell] - 1
+    E = (1.0, jump, 1.0)
+    return Scene(
+        cell,
+        tuple(block(cell, float(k), E=E[k]) for k in range(3)),
+        loads=(Load((2, last, 1), up(cell, -1e-2)),),
+        walls=(floor(cell),),
+        pairs=(Pair((1, last, 0), (0, last, 1)), Pair((2, last, 0), (1, last, 1))),
+        subdomains=6,
+    )
+
+
+def flat_block(cell: str, aspect: float) -> Scene:
+    """A plate on the floor, clamped at one end, pressed."""
+    last = GDIM[cell] - 1
+    plate = Body(up(cell, 0.0), up(cell, 1.0 / aspect, 1.0), cells(cell), 1.0)
+    return Scene(
+        cell,
+        (plate,),
+        held=(Held((0, 0, 0), all_of(cell)),),
+        loads=(Load((0, last, 1), up(cell, -1e-3)),),
+        walls=(floor(cell),),
+    )
+
+
+def strips(cell: str, aspect: float) -> Scene:
+    """Two strips, one on the other, clamped at one end; the upper bends onto the lower."""
+    last, t = GDIM[cell] - 1, 1.0 / aspect
+    n = (12,) + (2,) * last
+    low, high = (0.0,) * (last + 1), (1.0,) + (t,) * last
+    above = tuple(v + (t if k == last else 0.0) for k, v in enumerate(low))
+    top = tuple(v + (t if k == last else 0.0) for k, v in enumerate(high))
+    return Scene(
+        cell,
+        (Body(low, high, n), Body(above, top, n)),
+        held=(Held((0, 0, 0), all_of(cell)), Held((1, 0, 0), all_of(cell))),
+        loads=(Load((1, last, 1), up(cell, -0.1 * t**3)),),
+        pairs=(Pair((1, last, 0), (0, last, 1)),),
+        subdomains=8,
+    )
+
+
+def beam(cell: str, aspect: float) -> Scene:
+    """A cantilever without contact."""
+    last, t = GDIM[cell] - 1, 1.0 / aspect
+    return Scene(
+        cell,
+        (Body((0.0,) * (last + 1), (1.0,) + (t,) * last, (16,) + (2,) * last),),
+        held=(Held((0, 0, 0), all_of(cell)),),
+        loads=(Load((0, last, 1), up(cell, -0.1 * t**3)),),
+        subdomains=8,
+    )
+
+
+def nearly_incompressible(cell: str, nu: float) -> Scene:
+    last = GDIM[cell] - 1
+    return Scene(
+        cell,
+        (block(cell, E=1.0, nu=nu),),
+        held=(Held((0, 0, 0), all_of(cell)),),
+        loads=(Load((0, last, 1), up(cell, -1e-2)),),
+        walls=(floor(cell),),
+    )
+
+
+def nearly_incompressible_loose(cell: str, nu: float) -> Scene:
+    bodies = tuple(block(cell, float(k), E=1.0, nu=nu) for k in range(3))
+    return replace(loose_stack(cell, 1.0), bodies=bodies)
+
+
 def with_friction(scene: Scene, law: str, number: float) -> Scene:
     """The scene with a law of friction on all its contacts."""
     walls = tuple(replace(wall, friction=(law, number)) for wall in scene.walls)
@@ -50,7 +203,7 @@ def with_friction(scene: Scene, law: str, number: float) -> Scene:
 
 def pressed(cell: str, nu: float = 0.3, order: int = 1) -> Scene:
     """A block that is clamped at one end, pressed on the floor."""
-    scene = ladders.nearly_incompressible(cell, nu)
+    scene = nearly_incompressible(cell, nu)
     return replace(scene, order=order)
 
 
@@ -196,25 +349,26 @@ def _ladders() -> list[Ladder]:
     return [
         Ladder("moduli", "soft on stiff", lambda c, v: two_bodies(c, v, 1.0), MODULI),
         Ladder("moduli", "stiff on soft", lambda c, v: two_bodies(c, 1.0, v), MODULI),
-        Ladder("moduli", "loose stack", ladders.loose_stack, MODULI),
-        Ladder("moduli", "subdomains of a body", ladders.subdomain_jumps, MODULI),
-        Ladder("moduli", "subdomains of a pair", ladders.subdomain_jumps_pair, MODULI),
-        Ladder("moduli", "cells", ladders.checkerboard_touching, MODULI),
+        Ladder("moduli", "loose stack", loose_stack, MODULI),
+        Ladder("moduli", "subdomains of a body", subdomain_jumps, MODULI),
+        Ladder("moduli", "subdomains of a pair", subdomain_jumps_pair, MODULI),
+        Ladder("moduli", "cells", checkerboard_touching, MODULI),
         Ladder("nu", "P1", pressed, NU),
-        Ladder("nu", "P1, loose", ladders.nearly_incompressible_loose, NU),
+        Ladder("nu", "P1, loose", nearly_incompressible_loose, NU),
         Ladder("nu", "P2", lambda c, v: pressed(c, v, 2), NU),
         Ladder("aspect", "layers at contact", layered, ASPECTS),
-        Ladder("aspect", "flat block", ladders.flat_block, ASPECTS),
+        Ladder("aspect", "flat block", flat_block, ASPECTS),
         Ladder("aspect", "slivers", slivers, ASPECTS, SIMPLICES),
         Ladder("thin", "plate", thin, THIN),
         Ladder("thin", "arch", lambda c, v: thin(c, v, 1.0), (10.0, 1e2, 1e3)),
-        Ladder("thin", "strips", ladders.strips, (*THIN, 1e4)),
-        Ladder("thin", "beam", ladders.beam, (*THIN, 1e4)),
+        Ladder("thin", "strips", strips, (*THIN, 1e4)),
+        Ladder("thin", "beam", beam, (*THIN, 1e4)),
         Ladder("parts", "hang at corners", hanging, (0.0, 1.0)),
         Ladder("parts", "random", scattered, tuple(map(float, range(6)))),
         Ladder("parts", "hinge", hinge, (0.0, 1.0, 2.0)),
         Ladder("rows", "two obstacles", redundant, (0.0, -1.0, 1e-6, 1e-3)),
         Ladder("rows", "pairs of a node", three_pairs, (1.0, 2.0, 3.0)),
+        Ladder("rows", "far obstacle", far_obstacle, FAR),
         Ladder("rows", "grazing", grazing, (1.0, 1e-3, 1e-6, 1e-9, 0.0, -1e-6)),
         Ladder("rows", "all or nothing", everywhere, (0.0, 1.0, 2.0)),
         Ladder("units", "frictionless", lambda c, v: in_units(c, *UNITS[int(v)]), units),
@@ -260,3 +414,10 @@ def _with_friction() -> list[Ladder]:
 
 
 LADDERS = _ladders()
+
+
+def label(ladder: Ladder, value: float) -> str:
+    """A value as it stands in a table."""
+    if ladder.name.endswith(("units", "frictionless")) and ladder.values == range(len(UNITS)):
+        return "{:g} m, {:g} Pa".format(*UNITS[int(value)])
+    return f"{value:g}"

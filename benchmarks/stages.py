@@ -30,10 +30,35 @@ from mpi4py import MPI
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import tfeti_dolfinx as tfeti
-from benchmarks.pictures import picture, stacked
-from benchmarks.scenes import DEMOS, MIDDLE, SMALL, sizes
-from benchmarks.tools import STAGES, choose_clock, command_line, configure_clock, finish
+from benchmarks.tools import (
+    STAGES,
+    choose_clock,
+    command_line,
+    configure_clock,
+    finish,
+    picture,
+    stacked,
+)
+from demos import cube_3d, hertz_3d
 from demos.demo_tools import petsc_options
+
+DEMOS = {"cube_3d": cube_3d, "hertz_3d": hertz_3d}
+# unknowns and subdomains of the half ball
+QUICK, SMALL, MIDDLE, LARGE = (4_000, 4), (60_000, 16), (235_000, 64), (2_090_000, 256)
+
+
+def sizes(default, large):
+    """Arguments of both demos, quick, default and large; those of the half ball are given."""
+    cubes = {"quick": (8, 4), "default": (64, 10), "large": (512, 10)}
+    balls = {"quick": QUICK, "default": default, "large": large}
+    return {
+        name: {
+            "cube_3d": dict(zip(("subdomains", "cells"), cubes[name], strict=True)),
+            "hertz_3d": dict(zip(("unknowns", "subdomains"), balls[name], strict=True)),
+        }
+        for name in cubes
+    }
+
 
 SIZES = sizes(SMALL, MIDDLE)
 # numbers of an array that is copied; the caches of today's processors hold less
@@ -169,7 +194,7 @@ def main(argv):
         for name, found in local.items()
         for operator in ("F", "preconditioner")
     ]
-    return finish(arguments.output, "stages", tables, draw, comm.rank)
+    return finish(arguments, "stages", tables, draw, comm.rank)
 
 
 if __name__ == "__main__":

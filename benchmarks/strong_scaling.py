@@ -15,12 +15,14 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.pictures import column, curves, picture
 from benchmarks.tools import (
     best_runs,
+    column,
     command_line,
     configure_runs,
+    curves,
     finish,
+    picture,
     solve_seconds,
     stage_seconds,
 )
@@ -81,7 +83,7 @@ def main(argv):
     arguments, options = command_line(__doc__, argv, configure)
     scenes = QUICK if arguments.quick else LARGE if arguments.large else SCENES
     tables = {name: table(name, words, arguments, options) for name, words in scenes.items()}
-    return finish(arguments.output, "strong_scaling", tables, draw)
+    return finish(arguments, "strong_scaling", tables, draw)
 
 
 if __name__ == "__main__":

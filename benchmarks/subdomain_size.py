@@ -17,8 +17,16 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.pictures import column, curves, picture
-from benchmarks.tools import best_runs, command_line, configure_runs, finish, solve_seconds
+from benchmarks.tools import (
+    best_runs,
+    column,
+    command_line,
+    configure_runs,
+    curves,
+    finish,
+    picture,
+    solve_seconds,
+)
 
 TYPES = ("implicit", "explicit", "auto")
 # demo: unknowns or cells of the mesh, and numbers of subdomains, all but the first with --large
@@ -103,7 +111,7 @@ def main(argv):
         f"{name}, {arguments.ranks} ranks": table(name, size, counts, arguments, options)
         for name, (size, counts) in SIZES[kind].items()
     }
-    return finish(arguments.output, "subdomain_size", tables, draw)
+    return finish(arguments, "subdomain_size", tables, draw)
 
 
 if __name__ == "__main__":

@@ -22,8 +22,7 @@ from mpi4py import MPI
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.pictures import column, curves, picture
-from benchmarks.tools import command_line, finish, solve_seconds
+from benchmarks.tools import column, command_line, curves, finish, picture, solve_seconds
 from demos import cube_3d, talk_hertz_2d, tbeti_cube_3d, tresca_2d, tresca_3d
 
 # subdomains: the talk's primal, dual, kernel dimension, multiplications, seconds (none are given
@@ -143,7 +142,7 @@ def main(argv):
         title: table(demo, talk, list(talk)[:count], arguments, options)
         for title, (demo, talk) in TABLES.items()
     }
-    return finish(arguments.output, "talk_tables", tables, draw, MPI.COMM_WORLD.rank)
+    return finish(arguments, "talk_tables", tables, draw, MPI.COMM_WORLD.rank)
 
 
 if __name__ == "__main__":

@@ -1,20 +1,22 @@
-"""What the benchmarks share: command line, tables and pictures, runs of demos on several ranks."""
+"""Share a command line, tables, pictures and runs of demos on several ranks between benchmarks."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import os
+import re
 import resource
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from benchmarks.tables import markdown, write_tables
+import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 MPI_VARIABLES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE")
@@ -23,6 +25,7 @@ STAGES = ("mesh", "assembly", "contact", "gluing", "subdomains", "dual", "qp", "
 COLUMNS = {"subdomains": "K⁺"}  # a table may have a column for their number
 # lines of what a program has printed that are shown where it fails
 SHOWN = 20
+FEW = 8  # values that all can stand beside an axis
 
 Tables = dict[str, list[dict[str, Any]]]
 
@@ -40,6 +43,7 @@ def command_line(
     )
     parser.add_argument("--quick", action="store_true", help="sizes of a few seconds")
     parser.add_argument("--output", type=Path, default=Path("results"), help="folder")
+    parser.add_argument("--document", metavar="COMMIT", help="put the tables into docs/, too")
     if configure is not None:
         configure(parser)
     arguments, rest = parser.parse_known_args(argv)
@@ -74,15 +78,40 @@ def choose_clock(arguments: argparse.Namespace) -> str:
 
 
 def finish(
-    folder: Path, name: str, tables: Tables, draw: Callable[[Path, Tables], None], rank: int = 0
+    arguments: argparse.Namespace,
+    name: str,
+    tables: Tables,
+    draw: Callable[[Path, Tables], None],
+    rank: int = 0,
+    shown: Callable[[Tables], Tables] = dict,
 ) -> Tables:
-    """Write and print tables and their picture on rank 0; the tables."""
+    """Write and print tables and their picture on rank 0; the tables.
+
+    With ``--document`` those that ``shown`` makes of them go between their marks in docs/.
+    """
     if rank == 0:
-        write_tables(folder, name, tables)
-        draw(folder / f"{name}.png", tables)
+        write_tables(arguments.output, name, tables)
+        draw(arguments.output / f"{name}.png", tables)
+        if arguments.document:
+            write_documents(name, shown(tables), arguments.document)
         for title, rows in tables.items():
             print(f"{title}\n\n{markdown(rows)}\n", flush=True)
     return tables
+
+
+def write_documents(name: str, tables: Tables, commit: str, folder: Path = ROOT / "docs") -> None:
+    """Replace what stands between marks of a benchmark's tables in documents.
+
+    A mark is ``<!-- NAME: TITLE, at COMMIT -->``, the end of a table ``<!-- end -->``.
+    """
+    for path in sorted(folder.rglob("*.md")):
+        text = made = path.read_text()
+        for title, rows in tables.items():  # one that no document marks is left out
+            mark = re.escape(f"<!-- {name}: {title}, at ") + r"\w+ -->\n.*?<!-- end -->"
+            new = f"<!-- {name}: {title}, at {commit} -->\n\n{markdown(rows)}\n\n<!-- end -->"
+            made = re.sub(mark, lambda _, new=new: new, made, flags=re.DOTALL)
+        if made != text:
+            path.write_text(made)
 
 
 def run_demo(name: str, arguments: Sequence[object], ranks: int) -> dict[str, Any]:
@@ -139,3 +168,102 @@ def solve_seconds(report: dict[str, Any]) -> float:
 def stage_seconds(report: dict[str, Any]) -> dict[str, float]:
     """Columns of a table: seconds of each stage, that of the subdomains by what it makes."""
     return {COLUMNS.get(stage, stage): report["seconds"].get(stage, 0.0) for stage in STAGES}
+
+
+def markdown(rows: Sequence[dict[str, Any]]) -> str:
+    """A Markdown table of rows that have the same keys."""
+    names = list(rows[0])
+    lines = ["| " + " | ".join(names) + " |", "|" + "---|" * len(names)]
+    lines += ["| " + " | ".join(_text(row[name]) for name in names) + " |" for row in rows]
+    return "\n".join(lines)
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "–"
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def write_tables(folder: Path, name: str, tables: dict[str, Sequence[dict[str, Any]]]) -> None:
+    """Write ``name.md`` and ``name.json``; they appear whole."""
+    folder.mkdir(parents=True, exist_ok=True)
+    text = "\n\n".join(f"## {title}\n\n{markdown(rows)}" for title, rows in tables.items())
+    for suffix, content in ((".md", text), (".json", json.dumps(tables, indent=2))):
+        partial = folder / f".{name}{suffix}.partial"
+        partial.write_text(content + "\n")
+        os.replace(partial, folder / f"{name}{suffix}")
+
+
+def slope(sizes: Sequence[float], errors: Sequence[float]) -> float:
+    """Order of convergence: slope of log(error) over log(size), by least squares."""
+    return float(np.polyfit(np.log(sizes), np.log(errors), 1)[0])
+
+
+@contextmanager
+def picture(path: Path, panels: int, height: float = 3.4, rows: int = 1) -> Iterator[list[Any]]:
+    """Axes of panels side by side, row by row, written when the block ends."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4.6 * panels, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, panels, squeeze=False)
+    yield list(axes.ravel())
+    figure.savefig(path, dpi=120)
+
+
+def stacked(axes: Any, title: str, rows: Sequence[Mapping[str, Any]], parts: Sequence[str]) -> None:
+    """A bar for each row, labelled with its first column, made of columns that are seconds."""
+    labels = [str(next(iter(row.values()))) for row in rows]
+    left = [0.0] * len(rows)
+    for part in parts:
+        widths = [float(row[part]) for row in rows]
+        axes.barh(range(len(rows)), widths, left=left, label=part)
+        left = [a + b for a, b in zip(left, widths, strict=True)]
+    axes.set_yticks(range(len(rows)), labels)
+    axes.invert_yaxis()
+    axes.set_xlim(0.0, 1.3 * max(left))  # room for the legend
+    axes.set_xlabel("seconds")
+    axes.set_title(title, fontsize="medium")
+    if len(parts) > 1:
+        axes.legend(fontsize="small")
+
+
+def curves(
+    axes: Any,
+    title: str,
+    labels: tuple[str, str],
+    lines: Mapping[str, tuple[Sequence[float], Sequence[float]]],
+    log: str = "xy",
+) -> None:
+    """A curve for each name, the axes of ``log`` logarithmic."""
+    for name, (x, y) in lines.items():
+        axes.plot(x, y, marker="o", label=name)
+    if "x" in log:
+        axes.set_xscale("log")
+        plain(axes.xaxis, sorted({value for x, _ in lines.values() for value in x}))
+    if "y" in log:
+        axes.set_yscale("log")
+        plain(axes.yaxis)
+    else:
+        axes.set_ylim(0.0, 1.25 * max(max(y) for _, y in lines.values()))  # room for the legend
+    axes.set_xlabel(labels[0])
+    axes.set_ylabel(labels[1])
+    axes.set_title(title, fontsize="medium")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small")
+
+
+def plain(axis: Any, ticks: Sequence[float] | None = None) -> None:
+    """Numbers as they are on a logarithmic axis: those given if few and short, or 1, 2, 5, ..."""
+    from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
+
+    short = ticks is not None and max(ticks) < 1000 and len(ticks) <= FEW
+    axis.set_major_locator(FixedLocator(ticks) if short else LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+
+
+def column(rows: Sequence[Mapping[str, Any]], name: str) -> list[float]:
+    """A column of a table."""
+    return [row[name] for row in rows]

@@ -13,12 +13,14 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from benchmarks.pictures import column, curves, picture
 from benchmarks.tools import (
     best_runs,
+    column,
     command_line,
     configure_runs,
+    curves,
     finish,
+    picture,
     solve_seconds,
     stage_seconds,
 )
@@ -76,7 +78,7 @@ def main(argv):
         chosen = counts if arguments.quick or arguments.large else counts[:-1]
         title = f"{name}: {cells} cells along an edge of a subdomain, {arguments.ranks} ranks"
         tables[title] = table(name, chosen, cells, arguments, options)
-    return finish(arguments.output, "weak_scaling", tables, draw)
+    return finish(arguments, "weak_scaling", tables, draw)
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import sys
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import pytest
+import quick_demos
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from mpi4py import MPI
@@ -62,6 +63,20 @@ def serial_only():
 def shared_tmp(tmp_path, comm):
     """A temporary folder of rank 0, the same on all ranks."""
     return comm.bcast(tmp_path, root=0)
+
+
+@pytest.fixture(scope="session")
+def quick_demo(tmp_path_factory, comm):
+    """What a demo gives at its quick size; each runs once."""
+    known = {}
+
+    def of(name):
+        if name not in known:
+            folder = tmp_path_factory.mktemp(name) if comm.rank == 0 else None
+            known[name] = quick_demos.run(name, comm.bcast(folder))
+        return known[name]
+
+    return of
 
 
 @given(st.none())

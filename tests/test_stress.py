@@ -5,24 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.stability_scenes import with_friction
-from benchmarks.stress import judge, meshes, reference
+from benchmarks.stability_scenes import floor, two_bodies
+from benchmarks.stress import judge, meshes
 from benchmarks.stress.__main__ import main
-from benchmarks.stress.equilibrium import has_none
-from benchmarks.stress.ladders import floor, ladder_scenes, two_bodies
 from benchmarks.stress.package import Outcome, solve_scene
-from benchmarks.stress.qp import UnsettledError
 from benchmarks.stress.random_scenes import random_scene
 from benchmarks.stress.reference import Untorn
 from benchmarks.stress.scene import Body, Held, Load, Pair, Scene, Wall
 from tfeti_dolfinx.errors import TfetiError
 
-# 237: no load; 314: a far row is kept, however uncertain its normal; 608: rows of a stiff side on a
-# few soft nodes; 798: u is rounding of points; 913: rows that are rounding of normals of tiny
-# facets; 981: rounding of a motion along rows is no hold; 1110: a part whose load is rounding;
-# 6054: a linear program that HiGHS' presolving spoils
-SEEDS = [*range(1, 8), 237, 314, 608, 798, 913, 981, 1110, 6054]
-SEEDS += [pytest.param(seed, marks=pytest.mark.slow) for seed in range(8, 20)]
+SEEDS = [*range(1, 8)]
+SEEDS += [pytest.param(seed, marks=pytest.mark.slow) for seed in range(8, 40)]
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -33,76 +26,7 @@ def test_random_scenes_are_right_or_named(seed, comm):
         assert row["class"].islower(), row
 
 
-# 63: a body that nothing loads, with gaps that are rounding of 0, beside others that move by 1e-6
-# of their size; 68, 2106: forces that are rounding of 0; 163: gaps 1e12 times as large as the error
-# allowed; 2186: bodies 220 and 600 times as long as thick; 5033: normals of a side at 2e5 of its
-# length; 6044: a kernel of flat triangles; 6114: u is 1e-4 of that of the first look
-@pytest.mark.parametrize("qp_type", ["newton", "smalse"])
-@pytest.mark.parametrize("seed", [63, 68, 163, 2106, 2186, 5033, 6044, 6114])
-def test_scenes_near_to_rounding_are_right_with_both_solvers(seed, qp_type, comm):
-    scene = random_scene(seed)
-    scene = replace(scene, options={**scene.options, "tfeti_qp_type": qp_type})
-    row = judge.run_scene(scene, comm)
-    if comm.rank == 0:
-        assert row["class"] == "right", row
-
-
-def test_conjugate_gradients_begin_anew_where_rounding_ends_them(comm):
-    """39: a strip 2500 times as long as thick; the first look finds 130 times its displacement."""
-    scene = replace(random_scene(39), options={"tfeti_rtol": 1e-4})
-    row = judge.run_scene(scene, comm)
-    if comm.rank == 0:
-        assert row["class"] == "right", row
-
-
-@pytest.mark.parametrize(
-    ("mu", "stiffening", "most"),
-    [(0.0, 10.0, 80), (0.1, 10.0, 150), pytest.param(0.1, 0.0, 4000, marks=pytest.mark.slow)],
-)
-def test_sheets_are_right_beyond_the_digits_of_the_forces(mu, stiffening, most, comm):
-    """0: of hexahedra 1000 : 1; rounding of λ alone moves K⁺(f − Bᵀλ) by 3e-5 of the displacement.
-
-    Rounding of K changes the direct solution by 6e-14.
-    """
-    scene = random_scene(0) if mu == 0.0 else with_friction(random_scene(0), "coulomb", mu)
-    options = {"tfeti_rtol": 1e-8, "tfeti_stiffening": stiffening}
-    row = judge.run_scene(replace(scene, options=options), comm)
-    if comm.rank == 0:
-        assert row["class"] == "right", row
-        assert row["u"] <= 1e-7
-        assert row["F"] <= most
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("rtol", [1e-4, 1e-8])
-def test_sheets_that_all_slip_are_right(rtol, comm):
-    """30: a row of sheets 2000 : 1 on rollers; the direct solution takes 240 decimal digits."""
-    scene = with_friction(random_scene(30), "coulomb", 0.1)
-    row = judge.run_scene(replace(scene, options={"tfeti_rtol": rtol}), comm)
-    if comm.rank == 0:
-        assert row["class"] == "right", row
-
-
-def test_friction_that_balances_the_load_just_so_leaves_motions_to_the_law(comm):
-    """30 again: with the bounds of the law all slips, so that they tell nothing of μ."""
-    scene = with_friction(random_scene(30), "coulomb", 0.1)
-    scene = replace(scene, options={"tfeti_rtol": 1e-8})
-    outcome = solve_scene(scene, meshes.grid(scene), comm)
-    if comm.rank == 0:
-        assert outcome.error == ""
-        assert outcome.report["F"] <= 160
-
-
-def test_the_reference_keeps_the_law(comm):
-    """81: a set that leaves a motion free gave a normal force that pulls, and changed no more."""
-    scene = with_friction(random_scene(81), "coulomb", 0.2)
-    row = judge.run_scene(replace(scene, options={"tfeti_rtol": 1e-8}), comm)
-    if comm.rank == 0:
-        assert row["class"] == "right", row
-
-
-@pytest.mark.parametrize("friction", [("coulomb", 0.5), ("tresca", 1e-3)])
-@pytest.mark.parametrize("component", [0, 1])
+@pytest.mark.parametrize(("component", "friction"), [(0, ("coulomb", 0.5)), (1, ("tresca", 1e-3))])
 def test_friction_where_values_are_prescribed(component, friction, comm):
     """Of nodes that slip by what is prescribed, and of those whose normal displacement is."""
     low = Body((0.0, 0.0), (1.0, 1.0), (4, 4))
@@ -120,60 +44,6 @@ def test_friction_where_values_are_prescribed(component, friction, comm):
         assert row["u"] <= 1e-6
 
 
-@pytest.mark.parametrize(("seed", "mu", "most"), [(3, 0.4, 130), (42, 0.3, 110)])
-def test_a_way_to_the_law_that_rounding_has_lost_is_left(seed, mu, most, comm):
-    """A face that is nearly singular makes forces of 1e27: 176 and 163 by F when that went on."""
-    scene = with_friction(random_scene(seed), "coulomb", mu)
-    row = judge.run_scene(replace(scene, options={"tfeti_rtol": 1e-4}), comm)
-    if comm.rank == 0:
-        assert row["class"] == "right", row
-        assert row["F"] <= most
-
-
-def test_soft_rows_hold_with_friction_beside_stiff_ones_that_are_open(comm):
-    """54: moduli of subdomains are as 3e6 : 1; bounds that hold the load were taken for none."""
-    scene = with_friction(random_scene(54), "coulomb", 0.5)
-    row = judge.run_scene(replace(scene, options={"tfeti_rtol": 1e-4}), comm)
-    if comm.rank == 0:
-        assert row["class"] == "right", row
-
-
-def test_forces_after_a_far_fall_are_known(comm):
-    """124: u is the fall, 2e5 lengths, and right to rounding long before the forces are.
-
-    u = 497 is right to 1e-13, and a row of K times that is up to 1e-3 of the forces, 1.5e-12.
-    """
-    row = judge.run_scene(random_scene(124), comm)
-    if comm.rank == 0:
-        assert row["class"] in ("right", "WRONG FORCE"), row
-        assert row["force"] <= 1e-3
-
-
-@pytest.mark.parametrize(
-    "rung",
-    [
-        "far obstacle quadrilateral 0.001",
-        "far obstacle hexahedron 1e+06",
-        "far beside touching triangle 1",
-        "far, held by contact tetrahedron 100",
-        "far pair quadrilateral 0.001",
-        "checkerboard, open tetrahedron 1e+08",
-        "subdomains hexahedron 1e+08",
-        "flat block hexahedron 100",
-    ],
-)
-def test_rungs_that_were_wrong_are_right(rung, comm):
-    row = judge.run_scene(ladder_scenes()[rung], comm)
-    if comm.rank == 0:
-        assert row["class"] == "right", row
-
-
-def test_forces_that_rounding_of_the_stiffness_changes_are_not_called_wrong(comm):
-    row = judge.run_scene(ladder_scenes()["strips triangle 10000"], comm)
-    if comm.rank == 0:
-        assert row["class"] in ("right but for rounding", "not converged"), row
-
-
 @pytest.mark.parametrize("subdomains", [1, 6])
 def test_a_rung_is_right_on_ranks_without_subdomains(subdomains, comm):
     scene = two_bodies("triangle", 1.0, 1e4)
@@ -183,35 +53,10 @@ def test_a_rung_is_right_on_ranks_without_subdomains(subdomains, comm):
         assert row["noise"] < 1e-9
 
 
-def untorn(scene):
-    g = meshes.grid(scene)
-    return Untorn(scene, g, *meshes.materials(scene, g, np.zeros(len(g.cells), dtype=int)))
-
-
 def answer(scene):
-    return untorn(scene).answer()
-
-
-# what presses a square that is 1e-2 wider than the room between walls: σ = E 1e-2, on both sides
-# μσ, so a load of 2μσ = 1e-2 with μ = 0.5
-@pytest.mark.parametrize(
-    ("gap", "load", "none"), [(0.01, 1e-3, True), (-0.005, 8e-3, False), (-0.005, 1.2e-2, True)]
-)
-def test_a_mixed_integer_program_says_where_friction_cannot_hold(gap, load, none):
-    law = ("coulomb", 0.5)
-    left = Wall((0, 0, 0), "plane", ((-gap, 0.0), (1.0, 0.0)), law)
-    right = Wall((0, 0, 1), "plane", ((1.0 + gap, 0.0), (-1.0, 0.0)), law)
-    body = Body((0.0, 0.0), (1.0, 1.0), (4, 4), nu=0.0)
-    down = Load((0, 1, 1), (0.0, -load))
-    scene = Scene("quadrilateral", (body,), loads=(down,), walls=(left, right))
-    assert has_none(untorn(scene)) == none
-
-
-def test_the_reference_keeps_rows_that_are_nearly_dependent():
-    """A fine side 1e7 times as stiff as the nodes that its rows act on besides."""
-    found = answer(random_scene(608))
-    missed = found.rows @ found.u.ravel() - found.gap
-    assert missed.max() <= 1e-9 * np.abs(found.u).max()
+    g = meshes.grid(scene)
+    none = np.zeros(len(g.cells), dtype=int)
+    return Untorn(scene, g, *meshes.materials(scene, g, none)).answer()
 
 
 def on_the_floor(cell, traction):
@@ -232,29 +77,6 @@ def test_the_reference_knows_a_uniform_pressure(cell):
     assert found.forces.sum(axis=0)[-1] == pytest.approx(0.1, rel=1e-10)
 
 
-@pytest.mark.parametrize(
-    ("cell", "traction"),
-    [
-        ("quadrilateral", (0.012, -0.1)),
-        ("quadrilateral", (0.029, -0.1)),
-        ("hexahedron", (0.02, 0.01, -0.1)),
-    ],
-)
-def test_friction_in_decimal_digits_is_what_it_is_in_double_precision(cell, traction, monkeypatch):
-    scene = with_friction(on_the_floor(cell, traction), "coulomb", 0.3)
-    found = answer(scene)
-
-    def unsettled(*_):
-        raise UnsettledError("as where digits are too few")
-
-    monkeypatch.setattr(reference, "solve_sliding", unsettled)
-    again = answer(scene)
-    assert np.abs(found.u).max() > 0.01
-    assert np.allclose(again.u, found.u, rtol=0, atol=1e-12)
-    assert np.allclose(again.forces, found.forces, rtol=0, atol=1e-12)
-    assert 0 < again.noise.max() < 1e-12
-
-
 @pytest.mark.parametrize("traction", [(0.0, 0.1), (1e-6, -0.1), (0.0, 0.0, 0.1)])
 def test_the_reference_knows_what_has_no_solution(traction):
     cell = "triangle" if len(traction) == 2 else "hexahedron"
@@ -264,8 +86,6 @@ def test_the_reference_knows_what_has_no_solution(traction):
 def test_the_two_references_of_the_tests_agree():
     """The lever of ``test_mortar``'s reference, by the harness's own mortar and solver."""
     from mortar_reference import TwoBoxes
-
-    from benchmarks.stress.scene import Held, Pair
 
     lower = Body((0.0, -1.0), (1.0, 0.0), (3, 3))
     upper = Body((0.0, 0.0), (1.0, 1.0), (4, 4))
@@ -290,8 +110,7 @@ def test_a_wrong_answer_is_called_wrong(comm):
         assert judge.judged(scene, g, outcome)["class"] == "WRONG"
 
 
-def test_ladders_have_names_of_their_own_and_scenes_of_a_seed_are_the_same():
-    assert len(ladder_scenes()) > 300
+def test_scenes_of_a_seed_are_the_same():
     assert random_scene(5) == random_scene(5)
 
 

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
 from pathlib import Path
@@ -20,10 +21,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from benchmarks.error_scenes import SCENES, Scene
-from benchmarks.pictures import curves, picture
 from benchmarks.profiles import errors
 from benchmarks.time_against_error import seconds_at
-from benchmarks.tools import Tables, finish
+from benchmarks.tools import Tables, curves, finish, picture
 
 OURS = "tfeti_dolfinx"
 LEVELS = (0.1, 0.05, 0.02, 0.01, 0.005, 0.002)
@@ -121,7 +121,8 @@ def main(argv: list[str]) -> Tables:
         if (folder / f"{name.replace(' ', '_')}_reference.json").exists():
             rows = rows_of(name, folder)
             tables |= {name: rows, f"{name}, equal errors": equal_errors(rows)}
-    return finish(folder.parent, "peers", tables, draw)
+    given = argparse.Namespace(output=folder.parent, document=None)
+    return finish(given, "peers", tables, draw)
 
 
 if __name__ == "__main__":

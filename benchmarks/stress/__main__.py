@@ -1,7 +1,6 @@
-"""Many scenes against an LP and an independent solver.
+"""Random scenes against an LP and an independent solver.
 
     ./run python3 -m benchmarks.stress --scenes 1000 --seed 0 --ranks 1
-    ./run python3 -m benchmarks.stress --ladders
     ./run python3 -m benchmarks.stress --only 17 --ranks 4
 
 Every scene is solved by the package and by ``reference`` and put into a class
@@ -94,11 +93,10 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def summary(rows: list[dict[str, Any]]) -> str:
-    """Counts of the classes, the ladders, then all random scenes that are not right."""
+    """Counts of the classes, then all scenes that are not right."""
     counts = Counter(row["class"] for row in rows)
     lines = ["| class | scenes |", "|---|---|"]
     lines += [f"| {name} | {count} |" for name, count in counts.most_common()]
-    lines += ["", *_ladders([row for row in rows if row["scene"][0].isalpha()])]
     keys = ("u", "u of all", "jump", "force", "noise", "F", "seconds")
     lines += ["", "| scene | class | " + " | ".join(keys) + " | text |", "|---" * 10 + "|"]
     for row in rows:
@@ -109,18 +107,6 @@ def summary(rows: list[dict[str, Any]]) -> str:
         cells = [row["scene"], row["class"], *shown, " ".join(text.split())[:160]]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
-
-
-def _ladders(rows: list[dict[str, Any]]) -> list[str]:
-    """One line a ladder: at each rung the error of u, or the class."""
-    ladders: dict[str, list[str]] = {}
-    for row in rows:
-        name, rung = row["scene"].rsplit(" ", 1)
-        shown = _short(row["u"]) if "u" in row else row["class"]
-        mark = "" if row["class"] == "right" else " (!)" if "u" in row else ""
-        ladders.setdefault(name, []).append(f"{rung}: {shown}{mark}")
-    lines = [f"* {name}: {', '.join(rungs)}" for name, rungs in ladders.items()]
-    return ["error of u at each rung, (!) where it is not right:", "", *lines] if lines else []
 
 
 def _short(value: Any) -> str:
@@ -134,18 +120,11 @@ def main(argv: list[str]) -> list[dict[str, Any]]:
     parser.add_argument("--seed", type=int, default=0, help="the first seed")
     parser.add_argument("--ranks", type=int, default=1)
     parser.add_argument("--limit", type=float, default=60.0, help="seconds for a scene")
-    parser.add_argument("--ladders", action="store_true", help="the ladders instead")
-    parser.add_argument("--only", nargs="*", help="seeds, or names of rungs")
+    parser.add_argument("--only", nargs="*", help="seeds of scenes")
     parser.add_argument("--output", type=Path, default=Path("results"))
     arguments = parser.parse_args(argv)
-    if arguments.only:
-        names = arguments.only
-    elif arguments.ladders:
-        from benchmarks.stress.ladders import ladder_scenes
-
-        names = list(ladder_scenes())
-    else:
-        names = [str(arguments.seed + k) for k in range(arguments.scenes)]
+    some = range(arguments.seed, arguments.seed + arguments.scenes)
+    names = arguments.only or [str(seed) for seed in some]
     rows: list[dict[str, Any]] = []
     for k in range(0, len(names), BATCH):
         rows += run_batch(names[k : k + BATCH], arguments.ranks, arguments.limit)

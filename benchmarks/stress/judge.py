@@ -10,9 +10,9 @@ from scipy.spatial import cKDTree
 
 from benchmarks.stress import meshes
 from benchmarks.stress.package import Outcome, solve_scene
-from benchmarks.stress.qp import UnsettledError
 from benchmarks.stress.reference import Answer, Untorn, body_errors, body_sizes, resultants
 from benchmarks.stress.scene import Scene
+from benchmarks.stress.solve import UnsettledError
 
 RIGHT = 1e-4  # error of u that must hold at rtol 1e-6
 OF_LOAD = 1e-2  # contact forces below are small

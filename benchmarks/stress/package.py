@@ -12,7 +12,6 @@ from mpi4py import MPI
 
 import tfeti_dolfinx as tfeti
 from benchmarks.stress import meshes
-from benchmarks.stress.bending import bend
 from benchmarks.stress.scene import Scene, Wall, side_name, wall_distance
 
 
@@ -143,7 +142,7 @@ def _problem(
     mesh = meshes.make_mesh(scene, g, comm)
     original = np.asarray(mesh.topology.original_cell_index)
     tags = meshes.tag_sides(scene, mesh, g.body[original])
-    bend(scene, mesh)
+    meshes.bend(scene, mesh)
     d = tfeti.decompose(mesh, partition(scene), facet_tags=tags, surfaces=scene.surfaces)
     subdomain = np.zeros(len(g.cells), dtype=np.int64)
     subdomain[d.original_cells] = d.cell_subdomain

@@ -2,10 +2,199 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field, replace
+from typing import Any
+
 import numpy as np
 
-from benchmarks.stress.draw import Draw
-from benchmarks.stress.scene import Scene
+from benchmarks.stress.scene import GDIM, Body, Held, Load, Pair, Scene, Side, Wall
+
+CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
+MOST_CELLS = {2: 7, 3: 3}
+
+
+@dataclass
+class Draw:
+    """A scene in the making, of boxes of size 1 and E of 1; ``up`` is the last axis."""
+
+    rng: np.random.Generator
+    note: str = ""
+    bodies: list[Body] = field(default_factory=list)
+    held: list[Held] = field(default_factory=list)
+    loads: list[Load] = field(default_factory=list)
+    walls: list[Wall] = field(default_factory=list)
+    pairs: list[Pair] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.cell = str(self.rng.choice(CELLS, p=(0.3, 0.3, 0.15, 0.25)))
+        self.gdim = GDIM[self.cell]
+        self.up = self.gdim - 1
+        self.mild = self.chance(0.35)
+        self.jumps = self.spice(0.35)
+        self.flat = 10 ** -self.real(0, 4) if self.spice(0.2) else 1.0
+
+    def chance(self, p: float) -> bool:
+        """True with probability p."""
+        return bool(self.rng.uniform() < p)
+
+    def spice(self, p: float) -> bool:
+        """The same for what makes a scene hard: never in a mild one."""
+        return self.chance(p) and not self.mild
+
+    def real(self, a: float, b: float) -> float:
+        """Uniform between a and b."""
+        return float(self.rng.uniform(a, b))
+
+    def one(self, *values: Any) -> Any:
+        """One of the values."""
+        return values[self.rng.integers(len(values))]
+
+    def gap(self) -> float:
+        """0, small, of the size of the bodies, or far."""
+        p = self.real(0, 0.75 if self.mild else 1)
+        if p < 0.5:
+            return 0.0
+        return 10 ** (
+            self.real(-6, -1) if p < 0.75 else self.real(-1, 0) if p < 0.85 else self.real(0, 6)
+        )
+
+    def box(self, low: np.ndarray, size: np.ndarray) -> int:
+        """A new body; its number."""
+        n = self.rng.integers(1, MOST_CELLS[self.gdim] + 1, self.gdim)
+        n = np.maximum(n, 2 if self.gdim == 2 else 1)
+        nu = self.one(0.0, 0.49, 0.499, 0.4999) if self.spice(0.2) else self.real(0.1, 0.4)
+        self.bodies.append(
+            Body(
+                low=tuple(float(v) for v in low),
+                high=tuple(float(v) for v in low + size),
+                cells=tuple(int(v) for v in n),
+                E=10 ** self.real(-8, 0) if self.jumps else 1.0,
+                nu=nu,
+                jump=10 ** self.real(1, 8) if self.spice(0.15) else 1.0,
+            )
+        )
+        return len(self.bodies) - 1
+
+    def size(self) -> np.ndarray:
+        """Edges of a box."""
+        size = self.rng.uniform(0.4, 1.5, self.gdim)
+        size[-1] *= self.flat
+        return size
+
+    def used(self, side: Side) -> bool:
+        """Whether a side is held or meets something."""
+        return side in (
+            {h.side for h in self.held}
+            | {w.side for w in self.walls}
+            | {s for p in self.pairs for s in (p.secondary, p.primary)}
+        )
+
+    def free_side(self, body: int) -> Side | None:
+        """A side that is not held and meets nothing, if there is one."""
+        sides = [(body, axis, end) for axis in range(self.gdim) for end in (0, 1)]
+        sides = [side for side in sides if not self.used(side)]
+        return sides[self.rng.integers(len(sides))] if sides else None
+
+    def hold(self, side: Side | None, components: tuple[int, ...] | None = None) -> None:
+        """Prescribe components of a side, random ones by default."""
+        if side is None:
+            return
+        if components is None:
+            chosen = np.flatnonzero(self.rng.uniform(size=self.gdim) < 0.6)
+            components = tuple(int(c) for c in chosen) or (side[1],)
+        value = self.real(-0.01, 0.01) if self.chance(0.08) else 0.0
+        others = [h.value for h in self.held if h.side[0] == side[0]]
+        value = others[0] if others else value  # values of sides that meet must agree
+        self.held.append(Held(side, components, value))
+
+    def wall(self, side: Side | None, gap: float | None = None) -> None:
+        """An obstacle of a random shape at a gap from a side."""
+        if side is None:
+            return
+        body, axis, end = side
+        box = self.bodies[body]
+        low, high = np.array(box.low), np.array(box.high)
+        out = np.zeros(self.gdim)
+        out[axis] = 1.0 if end else -1.0
+        centre = 0.5 * (low + high)
+        centre[axis] = (low, high)[end][axis]
+        extent = np.delete(high - low, axis)
+        gap = self.gap() if gap is None else gap
+        kind, at = self.one("plane", "plane", "slope", "bump", "ball", "bowl"), centre + gap * out
+        R = self.real(2, 20) * float(np.linalg.norm(extent))
+        if kind == "plane":
+            data = at, -out
+        elif kind == "slope":
+            kind, tilt = "plane", self.rng.uniform(-0.05, 0.05, self.gdim)
+            data = at + out * 0.05 * extent.sum(), -out + tilt
+        elif kind == "bump":
+            data = at, -out, np.array([1.0 / R])
+        elif kind == "ball":
+            data = at + R * out, np.array([R])
+        else:
+            depth = np.sqrt(R**2 - 0.25 * np.sum(extent**2))
+            data = centre - depth * out, np.array([R + gap])
+        self.walls.append(Wall(side, kind, tuple(tuple(float(c) for c in v) for v in data)))
+
+    def meet(self, a: Side, b: Side) -> None:
+        """A pair, either side secondary."""
+        self.pairs.append(Pair(a, b) if self.chance(0.5) else Pair(b, a))
+
+    def push(self, body: int, direction: np.ndarray | None, side: Side | None = None) -> None:
+        """A traction on a free side, or a force per volume, of about 1."""
+        side = self.free_side(body) if side is None and self.chance(0.7) else side
+        if direction is None:
+            direction = self.rng.normal(size=self.gdim)
+            if self.chance(0.3):
+                direction *= self.rng.uniform(size=self.gdim) < 0.5
+        value = tuple(float(v) for v in 10 ** self.real(-1, 0) * direction)
+        self.loads.append(Load(side or (body, -1, 0), value))
+
+    def down(self) -> np.ndarray:
+        """Down, sometimes aslant."""
+        out = np.zeros(self.gdim)
+        out[-1] = -1.0
+        if self.chance(0.04):
+            out[:-1] = self.rng.normal(size=self.gdim - 1) * 0.3
+        return out
+
+    def scene(self) -> Scene:
+        """The scene, in units of its own."""
+        cells = sum(int(np.prod(b.cells)) for b in self.bodies)
+        subdomains = int(self.rng.integers(1, 9))
+        scattered = int(self.rng.integers(1000)) if self.chance(0.3) else None
+        softest = min(b.E for b in self.bodies)
+        strain = 10 ** self.real(-6, -1.5) * softest
+        length = 10 ** self.real(-9, 6) if self.spice(0.3) else 1.0
+        modulus = 10 ** self.real(0, 12) if self.spice(0.3) else 1.0
+        jump = 10 ** self.real(1, 8) if self.spice(0.12) else 1.0
+        return Scene(
+            cell=self.cell,
+            bodies=tuple(_scaled_body(b, length, modulus) for b in self.bodies),
+            held=tuple(replace(h, value=h.value * length) for h in self.held),
+            loads=tuple(self._scaled_load(load, length, modulus * strain) for load in self.loads),
+            walls=tuple(_scaled_wall(w, length) for w in self.walls),
+            pairs=tuple(self.pairs),
+            subdomains=min(subdomains, cells),
+            scattered=scattered,
+            subdomain_jump=jump,
+            note=self.note,
+        )
+
+    def _scaled_load(self, load: Load, length: float, stress: float) -> Load:
+        factor = stress if load.side[1] >= 0 else stress / length
+        return replace(load, value=tuple(factor * v for v in load.value))
+
+
+def _scaled_body(b: Body, length: float, modulus: float) -> Body:
+    low, high = (tuple(length * v for v in corner) for corner in (b.low, b.high))
+    return replace(b, low=low, high=high, E=modulus * b.E)
+
+
+def _scaled_wall(w: Wall, length: float) -> Wall:
+    powers = {"plane": (1, 0), "ball": (1, 1), "bowl": (1, 1), "bump": (1, 0, -1)}[w.kind]
+    data = zip(w.data, powers, strict=True)
+    return replace(w, data=tuple(tuple(length**k * v for v in vector) for vector, k in data))
 
 
 def random_scene(seed: int) -> Scene:

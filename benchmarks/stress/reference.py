@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass, replace
-from decimal import localcontext
 
 import numpy as np
 from dolfinx import fem
@@ -18,21 +17,23 @@ from mpi4py import MPI
 from scipy.sparse import csr_array
 
 from benchmarks.stress import meshes
-from benchmarks.stress.bending import bend
 from benchmarks.stress.conditions import conditions
-from benchmarks.stress.digits import exact, rounded
-from benchmarks.stress.qp import UnsettledError
 from benchmarks.stress.scene import Scene, Side
 from benchmarks.stress.sliding import Law, solve_sliding
-from benchmarks.stress.sliding_digits import SlidingInDigits, without_motions
-from benchmarks.stress.solve import DEPENDENT, EPSILON, null_space, solve, verdict
+from benchmarks.stress.solve import (
+    DEPENDENT,
+    EPSILON,
+    UnsettledError,
+    null_space,
+    solve,
+    verdict,
+)
 from tfeti_dolfinx.common.compat import geometry_dofmap
 
 SMALLEST = 1e-9  # of the largest displacement of all bodies: what a body has at least
 NO_WORK = 1e-13  # of all loads: rounding
 ALONG = 1e-12  # of a motion: rounding, which must not hold anything
 CARRIES = 1e-7  # of the largest force
-DIGITS, MOST = 240, 400  # decimal ones where double precision does not settle; unknowns
 
 
 @dataclass
@@ -89,7 +90,7 @@ class Untorn:
         mesh = meshes.make_mesh(scene, g, MPI.COMM_SELF)
         cell = np.asarray(mesh.topology.original_cell_index)
         tags = meshes.tag_sides(scene, mesh, g.body[cell])
-        bend(scene, mesh)
+        meshes.bend(scene, mesh)
         loads = meshes.loads_of(scene)[g.body[cell]]
         V, a, L = meshes.elasticity(scene, mesh, tags, mu[cell], lmbda[cell], loads)
         K = fem.assemble_matrix(fem.form(a), block_mode=None).to_scipy()
@@ -174,14 +175,7 @@ class Untorn:
             c.given[moves],
             c.coefficient[moves],
         )
-        try:
-            u, lam, tau = solve_sliding(K, f[free], law)
-        except UnsettledError:
-            if len(self.f) > MOST or self.scene.joined:
-                raise
-            with localcontext(prec=DIGITS):
-                self._slid_in_digits(known, free, moves, along)
-            return
+        u, lam, tau = solve_sliding(K, f[free], law)
         known.free = np.zeros((len(self.f), 0))
         known.u = self._smallest(u, known.free)
         force = c.N[moves].T @ lam + c.T[along].T @ tau.ravel()
@@ -191,26 +185,6 @@ class Untorn:
         with contextlib.suppress(UnsettledError):
             u, *_ = solve_sliding(K, f[free], replace(law, gap=gap))
             known.noise = body_errors(known, self._smallest(u, known.free))
-
-    def _slid_in_digits(
-        self, known: Answer, free: np.ndarray, moves: np.ndarray, along: np.ndarray
-    ) -> None:
-        """The same in decimal digits, KR = 0 made to hold; noise to first order."""
-        c, whole = self.conditions, self.K.toarray()
-        K = without_motions(whole, self.x, self._nodes_of, self.gdim)
-        N, T, values = exact(c.N[moves].toarray()), exact(c.T[along].toarray()), exact(self.values)
-        gap, laws = exact(c.gap[moves]) - N.dot(values), (c.given[moves], c.coefficient[moves])
-        law = Law(N[:, free], T[:, free], gap, T.dot(values), *map(exact, laws))
-        sliding = SlidingInDigits(K[np.ix_(free, free)], (exact(self.f) - K.dot(values))[free], law)
-        u, force = sliding.solve()
-        known.free = np.zeros((len(self.f), 0))
-        known.u = self._smallest(rounded(u), known.free)
-        known.forces = -rounded(np.concatenate((N, T)).T.dot(force)).reshape(-1, self.gdim)
-        own, gaps = csr_array(whole[np.ix_(free, free)]), rounded(gap)
-        shaken, wider = self._shaken(known, own, c.N[moves], gaps)
-        pull = -exact((shaken - own).toarray()).dot(u)
-        change = rounded(sliding.changed(pull, exact(wider - gaps)))
-        known.noise = body_errors(known, self._smallest(rounded(u) + change, known.free))
 
     def _shaken(
         self, known: Answer, K: csr_array, rows: csr_array, gap: np.ndarray

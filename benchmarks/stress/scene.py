@@ -94,7 +94,7 @@ class Scene:
         subdomain_jump: Ratio of moduli between odd and even subdomains.
         order: Degree of the displacements, 1 or 2; 2 for walls of one plane each only.
         joined: Whether bodies share the points that they have in common: hinges.
-        bent: What becomes of the boxes' points, a name of ``bending.BENT``, and a number.
+        bent: What becomes of the boxes' points, a name of ``meshes.BENT``, and a number.
         options: Options of the package.
         note: What the scene is about.
     """

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import LinAlgWarning, lu_factor, lu_solve
 from scipy.sparse import csr_array
 
-from benchmarks.stress.qp import UnsettledError
+from benchmarks.stress.solve import UnsettledError
 
 SETTLED = 1e-10  # last change
 WRONG = 1e-8  # of what a set gives: it leaves a motion free

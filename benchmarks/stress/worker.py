@@ -15,21 +15,18 @@ petsc4py.init(sys.argv[:1])
 from mpi4py import MPI
 
 from benchmarks.stress.judge import run_scene
-from benchmarks.stress.ladders import ladder_scenes
 from benchmarks.stress.random_scenes import random_scene
 
 
 def main(path: str, limit: float, names: list[str]) -> None:
-    """Scenes by their seeds, or the names of rungs; where one stands near its limit is printed."""
+    """Scenes by their seeds; where one stands near its limit is printed."""
     comm = MPI.COMM_WORLD
     logging.disable(logging.WARNING)
-    ladders = ladder_scenes()
     with open(path if comm.rank == 0 else "/dev/null", "a", buffering=1) as lines:
         for name in names:
             lines.write(json.dumps({"begins": name}) + "\n")
             faulthandler.dump_traceback_later(0.9 * limit)
-            scene = ladders[name] if name in ladders else random_scene(int(name))
-            row = {"scene": name, **run_scene(scene, comm)}
+            row = {"scene": name, **run_scene(random_scene(int(name)), comm)}
             lines.write(json.dumps(row, default=float) + "\n")
             faulthandler.cancel_dump_traceback_later()
             gc.collect()

@@ -15,13 +15,6 @@ def solved(s, elements=ALL, **changes):
     s.problem(boundary_elements=elements, **changes).solve()
 
 
-def varying(s):
-    """A modulus that is another one in each cell."""
-    E = fem.Function(s.space("DG", 0))
-    E.x.array[:] = 1.0 + np.arange(len(E.x.array))
-    return E * s.a.integrals()[0].integrand() * s.dx
-
-
 def of_degree_two(s):
     V = s.space("Lagrange", 2, (2,))
     L = ufl.inner(s.f, ufl.TestFunction(V)) * s.dx
@@ -83,12 +76,6 @@ GIVEN = {
 }
 SOLVED = {
     "bodies with mass of boundary elements": (with_mass, LAW),
-    "a modulus that varies in boundary elements": (lambda s: solved(s, a=varying(s)), LAW),
-    "springs on boundary elements": (lambda s: solved(s, a=s.a + s.mass), LAW),
-    "a law of boundary elements that is not isotropic": (
-        lambda s: solved(s, a=s.a + s.u[0].dx(0) * s.v[0].dx(0) * s.dx),
-        LAW,
-    ),
     "an axisymmetric body of boundary elements": (
         lambda s: solved(
             s, a=tfeti.Elasticity(s.d, E=1.0, nu=0.3, model="axisymmetric").a(s.u, s.v)

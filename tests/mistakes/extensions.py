@@ -43,24 +43,9 @@ GIVEN = {
         lambda s: s.problem(extensions=Extensions),
         r"extensions is the class Extensions; expected tfeti_dolfinx.Extensions",
     ),
-    "extensions that are a dictionary": (
-        lambda s: s.problem(extensions={"monitor": print}),
-        r"extensions is {'monitor': .*}; expected tfeti_dolfinx.Extensions",
-    ),
     "a block that is a text": own(
         r"extensions: block is 'dense'; expected a callable", block="dense"
     ),
-    "a K⁺ that is a number": own(r"extensions: kplus is 5; expected a callable", kplus=5),
-    "a preconditioner that is a text": own(
-        r"extensions: preconditioner is 'lumped'; expected a callable", preconditioner="lumped"
-    ),
-    "a feasible set that is None": own(
-        r"extensions: feasible_set is None; expected a callable", feasible_set=None
-    ),
-    "a feasible set that is no law": own(
-        r"extensions: feasible_set is a Bounds; expected a callable", feasible_set=Bounds()
-    ),
-    "a monitor that is True": own(r"extensions: monitor is True; expected a call", monitor=True),
     "a K⁺ that the block does not use": own(
         r"extensions: kplus is given, but only the package's own Block takes it",
         block=BlockDefaults,
@@ -82,10 +67,6 @@ RUN = {
         r"extensions: block: NotImplementedError: set_stiffness", block=BlockDefaults
     ),
     "a block that fails": own(r"extensions: block: ZeroDivisionError: no such", block=raising),
-    "a block that fails on one rank": (
-        lambda s: on_the_last_rank(s, "block"),
-        r"extensions: block(: ZeroDivisionError: no such| gave None without)",
-    ),
     "a K⁺ that is None": own(
         r"extensions: kplus gave None without destroy, refactor, solve", kplus=lambda *_: None
     ),
@@ -102,10 +83,6 @@ RUN = {
         r"extensions: feasible_set projects vectors of shape \(\d+,\) to \(\d+,\); expected a set "
         r"on all rows of this rank",
         feasible_set=lambda constraints: OfThree(),
-    ),
-    "a law that fails on one rank": (
-        lambda s: on_the_last_rank(s, "feasible_set"),
-        r"extensions: feasible_set(: ZeroDivisionError: no such| gave None without)",
     ),
     "a monitor that takes too few": own(
         r"extensions: monitor: TypeError: .*takes 1 positional argument but 5",

@@ -1,0 +1,78 @@
+"""Runs of the demos at their quick size, and the multiplications that they are expected to take.
+
+    ./run python3 tests/quick_demos.py
+
+writes those of this commit to tests/expected_counts.json.
+"""
+
+import importlib
+import io
+import json
+import sys
+from contextlib import redirect_stdout
+from pathlib import Path
+from types import SimpleNamespace
+
+EXPECTED = Path(__file__).with_name("expected_counts.json")
+DEMOS = [
+    "hertz_2d",
+    "hertz_3d",
+    "adaptive_2d",
+    "adaptive_3d",
+    "cube_3d",
+    "linear_3d",
+    "semicoercive_2d",
+    "cylinder_on_block_2d",
+    "sphere_on_block_3d",
+    "stacked_blocks_3d",
+    "ball_bearing_3d",
+    "talk_hertz_2d",
+    "tresca_2d",
+    "tresca_3d",
+    "belt_2d",
+    "four_bodies_2d",
+    "clamped_connection_3d",
+    "cattaneo_mindlin_2d",
+    "unloading_2d",
+    "mindlin_3d",
+    "bouncing_bar",
+    "impact_of_bars",
+    "tbeti_cube_3d",
+    "tbeti_hertz_2d",
+    "falling_balls_3d",
+]
+
+
+def run(name, folder):
+    """Run a demo with all of its outputs: its report, what it printed, its folder. Collective."""
+    demo, out = importlib.import_module(f"demos.{name}"), io.StringIO()
+    file = folder / "report.json"
+    arguments = ["--quick", "--report", str(file), "--output", str(folder), "--plot"]
+    with redirect_stdout(out):
+        solution = demo.main([*arguments, "-tfeti_converged_reason"])
+    solution.decomposition.comm.barrier()
+    report = json.loads(file.read_text())
+    return SimpleNamespace(report=report, out=out.getvalue(), folder=folder)
+
+
+def multiplications(report):
+    """Multiplications by F and by the preconditioner of all solves of a report."""
+    counted = report["in_all"]
+    return counted["F_multiplications"] + counted["preconditioner_multiplications"]
+
+
+def main():
+    """Write the multiplications of all demos."""
+    from tempfile import TemporaryDirectory
+
+    counts = {}
+    for name in DEMOS:
+        with TemporaryDirectory() as folder:
+            counts[name] = multiplications(run(name, Path(folder)).report)
+        print(name, counts[name], flush=True)
+    EXPECTED.write_text(json.dumps(counts, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+    main()
