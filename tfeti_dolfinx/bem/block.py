@@ -19,7 +19,7 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.subdomains.block import Block, SubdomainData
 from tfeti_dolfinx.subdomains.build import MakeBlock, submatrix
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
-from tfeti_dolfinx.subdomains.sparse_block import PLACE, SAME, SparseBlock, places_in_order
+from tfeti_dolfinx.subdomains.sparse_block import TOLERANCES, SparseBlock, places_in_order
 from tfeti_dolfinx.subdomains.stiffness import Stiffness
 
 # --- Block of a subdomain with boundary elements ----------------------------------------------
@@ -79,7 +79,7 @@ class BoundaryBlock(SparseBlock):
             )
         super().__init__(data, how)
 
-    def _found(self, K: Any, own: Stiffness | None) -> tuple[Stiffness, Array]:
+    def _found(self, K: Any) -> tuple[Stiffness, Array]:
         """Return the stiffness of the part's shape, and the place of its unknowns there."""
         return self._part.shape.stiffness, self._part.place
 
@@ -248,9 +248,9 @@ def _equal(shape: SurfaceStiffness, surface: Surface, K: Any) -> bool:
     if not all(np.array_equal(one.nodes, other.nodes) for one, other in pairs):
         return False
     ours, theirs = (x - x.min(axis=0) for x in (surface.panels.x, shape.x))
-    if np.abs(ours - theirs).max() > PLACE * theirs.max():
+    if np.abs(ours - theirs).max() > TOLERANCES.place * theirs.max():
         return False
-    return bool(abs(K - shape.K_fem).max() <= SAME * np.abs(K.data).max())
+    return bool(abs(K - shape.K_fem).max() <= TOLERANCES.entry * np.abs(K.data).max())
 
 
 def _force_per_volume(name: str, volume: Array, hats: Array) -> Array:

@@ -8,11 +8,14 @@ from functools import cache
 
 import basix
 import numpy as np
+from dolfinx import fem
 
 from tfeti_dolfinx.bem.integrals import in_chunks
 from tfeti_dolfinx.bem.panels import Panels
 from tfeti_dolfinx.bem.steklov import Steklov, gunter, rigid_motions
 from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.compat import geometry_dofmap
+from tfeti_dolfinx.solution import in_space, value_row
 
 # --- Somigliana's identity: displacement and stress inside ------------------------------------
 
@@ -272,6 +275,12 @@ class SolvedBody:
     nodes: Array
 
 
+# Share of directions hidden by a body that is neither 0 nor 1: points on its surface
+SURE = 1e-3
+# Their stress is taken so far on the way to the middle of their cell
+BESIDE = 0.1
+
+
 @dataclass(frozen=True)
 class BoundarySolution:
     """Solution on the surfaces of the subdomains with boundary elements.
@@ -285,3 +294,25 @@ class BoundarySolution:
     bodies: Callable[[], Iterable[SolvedBody]]
     finite: Array
     cell_subdomain: Array
+
+    def values_at(
+        self, points: Array, found: tuple[Array, Array], thickness: float, u: fem.Function
+    ) -> Array:
+        """Return rows of the bodies of this rank, added for each point (``InnerSolution``)."""
+        (k, d), mesh = points.shape, u.function_space.mesh
+        total = np.zeros((k, 1 + d + d * d))
+        (place, cells), owner = found, self.cell_subdomain
+        for body in self.bodies():
+            share = body.inside.share(points)
+            own = np.flatnonzero(share > 1.0 - SURE)
+            sigma = body.inside.stress(points[own]) / thickness
+            total[own] += value_row(body.inside.displacement(points[own]), sigma)
+            on = (share > SURE) & (share <= 1.0 - SURE)
+            there = np.flatnonzero(on[place] & (owner[cells] == body.subdomain))
+            if len(there):
+                own, first = np.unique(place[there], return_index=True)
+                cell, at = cells[there[first]], points[own]
+                middle = mesh.geometry.x[geometry_dofmap(mesh)[cell]].mean(axis=1)[:, :d]
+                sigma = body.inside.stress(at + BESIDE * (middle - at)) / thickness
+                total[own] += value_row(u.eval(in_space(at), cell).reshape(-1, d), sigma)
+        return total

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
+from weakref import ref
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
@@ -303,16 +304,18 @@ class SurfaceStiffness:
         except TfetiError as error:
             raise type(error)(f"{name}: {error}") from error
         self.S = np.mean([body.S for body in self.bodies], axis=0)
-        self._stiffness: Stiffness | None = None
+        self._stiffness: ref[Stiffness] | None = None
         self._unit_loads: Array | None = None
         self.K = self._replaced()
 
     @property
     def stiffness(self) -> Stiffness:
-        """K_S with its factors, made when it is first asked for, and again once nobody had it."""
-        if self._stiffness is None or self._stiffness.users == 0:
-            self._stiffness = Stiffness(self.name, self.x, self.K, self._how)
-        return self._stiffness
+        """K_S with its factors, made when it is first asked for, and again once nobody has it."""
+        found = None if self._stiffness is None else self._stiffness()
+        if found is None:
+            found = Stiffness(self.name, self.x, self.K, self._how)
+            self._stiffness = ref(found)
+        return found
 
     def body_force_load(self, hats: Array, b: Array) -> Array:
         """Load on all unknowns of a force b per volume, shape ``(n,)``.
@@ -366,9 +369,8 @@ class SurfaceStiffness:
         return np.asarray(carried)
 
     def _inner_factor(self) -> CholeskyFactor:
-        cut, counters = self._cut, self._how.counters
-        counters.factorizations += 1
-        counters.analyses += 1
+        cut = self._cut
+        self._how.counters.factorizations += 1
         try:
             return CholeskyFactor(self.K_fem[cut:, cut:].tocsr(), self._how.prefix)
         except FactorError as error:

@@ -108,6 +108,9 @@ class DefectProblem:
 
 
 def _force_left(subdomains: Subdomains, u: Array) -> Array:
-    """f − K u on all unknowns, shape ``(n,)``."""
-    pairs = zip(subdomains.blocks, subdomains.dof_parts, strict=True)
-    return joined([block.load - block.elastic(u[part]) for block, part in pairs])
+    """f − K u without its resultants, which are rounding, shape ``(n,)``."""
+    left = []
+    for block, part in zip(subdomains.blocks, subdomains.dof_parts, strict=True):
+        force = block.multiply(u[part])
+        left.append(block.load - force + block.kernel @ (block.kernel.T @ force))
+    return joined(left)
