@@ -55,44 +55,6 @@ def test_conjugate_gradients_begin_anew_where_rounding_ends_them(comm):
         assert row["class"] == "right", row
 
 
-@pytest.mark.parametrize(
-    ("mu", "stiffening", "most"),
-    [(0.0, 10.0, 80), (0.1, 10.0, 150), pytest.param(0.1, 0.0, 4000, marks=pytest.mark.slow)],
-)
-def test_sheets_are_right_beyond_the_digits_of_the_forces(mu, stiffening, most, comm):
-    """0: of hexahedra 1000 : 1; rounding of λ alone moves K⁺(f − Bᵀλ) by 3e-5 of the displacement.
-
-    Rounding of K changes the direct solution by 6e-14.
-    """
-    scene = random_scene(0) if mu == 0.0 else with_friction(random_scene(0), "coulomb", mu)
-    options = {"tfeti_rtol": 1e-8, "tfeti_stiffening": stiffening}
-    row = judge.run_scene(replace(scene, options=options), comm)
-    if comm.rank == 0:
-        assert row["class"] == "right", row
-        assert row["u"] <= 1e-7
-        assert row["F"] <= most
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("rtol", [1e-4, 1e-8])
-def test_sheets_that_all_slip_are_right(rtol, comm):
-    """30: a row of sheets 2000 : 1 on rollers; the direct solution takes 240 decimal digits."""
-    scene = with_friction(random_scene(30), "coulomb", 0.1)
-    row = judge.run_scene(replace(scene, options={"tfeti_rtol": rtol}), comm)
-    if comm.rank == 0:
-        assert row["class"] == "right", row
-
-
-def test_friction_that_balances_the_load_just_so_leaves_motions_to_the_law(comm):
-    """30 again: with the bounds of the law all slips, so that they tell nothing of μ."""
-    scene = with_friction(random_scene(30), "coulomb", 0.1)
-    scene = replace(scene, options={"tfeti_rtol": 1e-8})
-    outcome = solve_scene(scene, meshes.grid(scene), comm)
-    if comm.rank == 0:
-        assert outcome.error == ""
-        assert outcome.report["F"] <= 160
-
-
 def test_the_reference_keeps_the_law(comm):
     """81: a set that leaves a motion free gave a normal force that pulls, and changed no more."""
     scene = with_friction(random_scene(81), "coulomb", 0.2)

@@ -86,9 +86,7 @@ RUN = {
         lambda s: on_the_last_rank(s, "block"),
         r"extensions: block(: ZeroDivisionError: no such| gave None without)",
     ),
-    "a K⁺ that is None": own(
-        r"extensions: kplus gave None without solve", kplus=lambda *_: None
-    ),
+    "a K⁺ that is None": own(r"extensions: kplus gave None without solve", kplus=lambda *_: None),
     "a preconditioner that fails": own(
         r"extensions: preconditioner: ZeroDivisionError: no such place",
         contact=False,
