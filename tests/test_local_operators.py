@@ -13,7 +13,7 @@ from test_blocks import data, stiffness
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.arrays import parts_of
 from tfeti_dolfinx.feti.operator import check_operator
-from tfeti_dolfinx.subdomains.block import BlockDefaults, Counters
+from tfeti_dolfinx.subdomains.block import Block, Counters
 from tfeti_dolfinx.subdomains.factor import FactorSize
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.local_operators import MODEL, GroupedOperator, LocalChoice, groups_of
@@ -244,7 +244,7 @@ def test_a_new_trace_of_one_leaves_the_others_theirs(equals):
             assert close(applied(operator, w), expected, MPI.COMM_SELF)
 
 
-class OwnBlock(BlockDefaults):
+class OwnBlock(Block):
     """K = I."""
 
     def set_stiffness(self, K):

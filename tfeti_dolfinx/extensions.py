@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from importlib import import_module
 from typing import Any
@@ -23,11 +23,10 @@ from tfeti_dolfinx.qp.problem import Monitor
 from tfeti_dolfinx.qp.recycling import Recycled
 from tfeti_dolfinx.qp.sets import FeasibleSet
 from tfeti_dolfinx.solve.solver import resolve_types
-from tfeti_dolfinx.subdomains.block import Block, Counters, SubdomainData, mode_names
+from tfeti_dolfinx.subdomains.block import PROMISED, Block, Counters, SubdomainData, mode_names
 from tfeti_dolfinx.subdomains.build import MakeBlock, SubdomainMethod, sparse_blocks
 from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.kplus import (
-    GeneralisedInverse,
     InverseFactory,
     MakeInverse,
     regularised,
@@ -59,8 +58,8 @@ class Extensions:
     """Parts that take the place of the package's own; by default none.
 
     Attributes:
-        block: Makes the Block of a subdomain, say a class; ``BlockDefaults`` leaves four methods
-            to write, ``check_kind_of_block`` tests it.
+        block: Makes the Block of a subdomain, say a class; ``Block`` leaves four methods to
+            write, ``check_kind_of_block`` tests it.
         kplus: Makes the generalised inverse of a subdomain, for ``SparseBlock``.
         subdomains: From dof maps and the torn mesh to what makes all Blocks of a rank one, with
             the arguments of ``Subdomains``.
@@ -120,8 +119,8 @@ def guarded(own: Extensions, options: Options, comm: MPI.Intracomm) -> Extension
             "deflation": _together(own.deflation, "deflation", comm),
         }
     return Extensions(
-        block=_giving(own.block, "block", Block),
-        kplus=_giving(own.kplus, "kplus", GeneralisedInverse),
+        block=_giving(own.block, "block", "Block", PROMISED),
+        kplus=_giving(own.kplus, "kplus", "GeneralisedInverse", ("solve",)),
         preconditioner=_together(own.preconditioner, "preconditioner", comm),
         feasible_set=own.feasible_set
         if own.feasible_set is contact_set
@@ -155,7 +154,7 @@ def _together(part: Any, name: str, comm: MPI.Intracomm) -> Any:
     return call
 
 
-def _giving(part: Any, name: str, protocol: type) -> Any:
+def _giving(part: Any, name: str, kind: str, members: Sequence[str]) -> Any:
     """Return a part whose errors become an InputError, and which must give an implementation."""
     if part is None:
         return None
@@ -163,18 +162,16 @@ def _giving(part: Any, name: str, protocol: type) -> Any:
     def call(*given: Any) -> Any:
         with named(f"extensions: {name}"):
             made = part(*given)
-            _check_members(made, name, protocol)
+            _check_members(made, name, kind, members)
         return made
 
     return call
 
 
-def _check_members(made: Any, name: str, protocol: type) -> None:
-    members = [member for member in dir(protocol) if not member.startswith("_")]
-    if missing := [member for member in members if not hasattr(made, member)]:
+def _check_members(made: Any, name: str, kind: str, members: Sequence[str]) -> None:
+    if missing := [member for member in sorted(members) if not hasattr(made, member)]:
         raise InputError(
-            f"extensions: {name} gave {shown(made)} without {', '.join(missing)}; expected a "
-            f"{protocol.__name__}"
+            f"extensions: {name} gave {shown(made)} without {', '.join(missing)}; expected a {kind}"
         )
 
 
@@ -183,7 +180,8 @@ def _checked_set(law: FeasibleLaw) -> FeasibleLaw:
 
     def checked(constraints: Constraints) -> FeasibleSet:
         made, zero = law(constraints), np.zeros(constraints.num_rows)
-        _check_members(made, "feasible_set", FeasibleSet)
+        members = [member for member in dir(FeasibleSet) if not member.startswith("_")]
+        _check_members(made, "feasible_set", "FeasibleSet", members)
         if np.shape(made.project(zero)) != zero.shape:
             raise InputError(
                 f"extensions: feasible_set projects vectors of shape {zero.shape} to "

@@ -12,6 +12,7 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.errors import require
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
 from tfeti_dolfinx.subdomains.block import (
+    PROMISED,
     Block,
     SubdomainData,
     candidate_modes,
@@ -141,8 +142,6 @@ def _radii(face: Face, g: Array) -> Array:
 ZERO, RANK = 1e-12, 1e-10
 # of eps times the condition: what a solve may lose, with room for sums of many terms
 LOST = 100.0
-# what the dual asks a Block for
-PROMISED = [name for name in vars(Block) if not name.startswith("_")]
 
 
 def check_kind_of_block(make_block: Callable[[SubdomainData], Block], tol: float = 1e-9) -> None:

@@ -5,7 +5,7 @@ import numpy as np
 from mistakes.scene import raising
 from tfeti_dolfinx import Extensions
 from tfeti_dolfinx.qp.sets import Bounds
-from tfeti_dolfinx.subdomains.block import BlockDefaults
+from tfeti_dolfinx.subdomains.block import Block
 
 
 def own(says, contact=True, options=None, **parts):
@@ -63,7 +63,7 @@ GIVEN = {
     "a monitor that is True": own(r"extensions: monitor is True; expected a call", monitor=True),
     "a K⁺ that the block does not use": own(
         r"extensions: kplus is given, but only the package's own Block takes it",
-        block=BlockDefaults,
+        block=Block,
         kplus=raising,
     ),
     "a preconditioner that nobody takes": own(
@@ -79,7 +79,7 @@ RUN = {
         block=lambda data: None,
     ),
     "a block without methods": own(
-        r"extensions: block: NotImplementedError: set_stiffness", block=BlockDefaults
+        r"extensions: block: NotImplementedError: set_stiffness", block=Block
     ),
     "a block that fails": own(r"extensions: block: ZeroDivisionError: no such", block=raising),
     "a block that fails on one rank": (

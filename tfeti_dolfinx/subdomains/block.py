@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -182,98 +182,21 @@ def fixing_dofs(x: Array, node_of_dof: Array) -> Array:
 OperatorKind = Literal["pinv", "stiffness", "schur"]
 
 
-class Block(Protocol):
+# what the dual knows of a Block
+PROMISED: tuple[str, ...] = (
+    *("load", "kernel", "diagonal", "trace_dofs", "modes", "shares", "bs"),
+    *("multiply", "solve", "apply_pinv", "apply_stiffness", "apply_schur", "prepare"),
+    *("update", "retrace", "destroy"),
+)
+
+
+class Block:
     """One subdomain, seen through the unknowns that rows of B touch (the *trace*).
 
     n is the number of its unknowns, t of its trace unknowns, r the dimension of its kernel.
-    Nothing here is collective. ``BlockDefaults`` has most of it; ``check_block`` tests it.
-    """
-
-    @property
-    def trace_dofs(self) -> Array:
-        """Trace unknowns among the block's own 0, …, n − 1, ascending, shape ``(t,)``."""
-        ...
-
-    @property
-    def load(self) -> Array:
-        """f, shape ``(n,)``."""
-        ...
-
-    @property
-    def kernel(self) -> Array:
-        """R, an orthonormal basis of the kernel of K, shape ``(n, r)``."""
-        ...
-
-    @property
-    def diagonal(self) -> Array:
-        """Diagonal of K, shape ``(n,)``."""
-        ...
-
-    @property
-    def modes(self) -> Array:
-        """C, the candidate modes of the whole body, shape ``(n, k)``."""
-        ...
-
-    @property
-    def shares(self) -> Array:
-        """1 / number of torn copies of each unknown, shape ``(n,)``."""
-        ...
-
-    @property
-    def bs(self) -> int:
-        """Unknowns of each node, which follow each other."""
-        ...
-
-    def multiply(self, u: Array) -> Array:
-        """K u on all unknowns, shapes ``(n,)``."""
-        ...
-
-    def solve(self, b: Array) -> Array:
-        """K⁺ b on all unknowns, shapes ``(n,)``."""
-        ...
-
-    def apply_pinv(self, w: Array) -> Array:
-        """K⁺ w on the trace for a force w on the trace, shapes ``(t,)``."""
-        ...
-
-    def apply_stiffness(self, w: Array) -> Array:
-        """K_bb w, K restricted to the trace, shapes ``(t,)`` (lumped preconditioner)."""
-        ...
-
-    def apply_schur(self, w: Array) -> Array:
-        """S w, S the Schur complement of K on the trace, shapes ``(t,)``."""
-        ...
-
-    def prepare(self, kind: OperatorKind) -> None:
-        """Make what an operator needs, so that no error can come up in a collective call.
-
-        Raises:
-            FactorError: A factor that it needs could not be made.
-        """
-        ...
-
-    def update(self, f: Array) -> None:
-        """Replace the load.
-
-        Raises:
-            InputError: It does not fit.
-        """
-        ...
-
-    def retrace(self, trace_dofs: Array) -> None:
-        """Replace the trace: other rows act on the subdomain. Factors of K stay."""
-        ...
-
-    def destroy(self) -> None:
-        """Free the factors."""
-        ...
-
-
-class BlockDefaults:
-    """A Block but for its stiffness: base of one's own kind.
-
-    A kind gives ``set_stiffness``, which sets ``kernel`` and ``diagonal``, and ``multiply``,
-    ``solve`` and ``apply_schur``; it overrides what it can do at less cost.
+    Nothing here is collective. A kind of subdomain gives ``set_stiffness``, which sets ``kernel``
+    and ``diagonal``, and ``multiply``, ``solve`` and ``apply_schur``; it overrides what it can do
+    at less cost. Any class that has all of it will do; ``check_block`` tests it.
 
     Args:
         data: The subdomain. Its K is handed to ``set_stiffness`` and not kept.
@@ -281,11 +204,11 @@ class BlockDefaults:
     Attributes:
         name: Name for messages.
         x: Points of the nodes.
-        bs: Unknowns at each node.
-        trace_dofs: Trace unknowns.
-        load: f.
-        kernel: R.
-        diagonal: Diagonal of K.
+        bs: Unknowns of each node, which follow each other.
+        trace_dofs: Trace unknowns among the block's own 0, …, n − 1, ascending, shape ``(t,)``.
+        load: f, shape ``(n,)``.
+        kernel: R, an orthonormal basis of the kernel of K, shape ``(n, r)``.
+        diagonal: Diagonal of K, shape ``(n,)``.
     """
 
     kernel: Array
@@ -316,7 +239,7 @@ class BlockDefaults:
         raise NotImplementedError("solve")
 
     def apply_schur(self, w: Array) -> Array:
-        """S w, shapes ``(t,)``."""
+        """S w, S the Schur complement of K on the trace, shapes ``(t,)``."""
         raise NotImplementedError("apply_schur")
 
     @property
@@ -330,30 +253,42 @@ class BlockDefaults:
         return np.repeat(self._node_shares, self.bs)
 
     def apply_pinv(self, w: Array) -> Array:
-        """K⁺ w on the trace, shapes ``(t,)``."""
+        """K⁺ w on the trace for a force w on the trace, shapes ``(t,)``."""
         return self.solve(self._extended(w))[self.trace_dofs]
 
     def apply_stiffness(self, w: Array) -> Array:
-        """K_bb w, shapes ``(t,)``."""
+        """K_bb w, K restricted to the trace, shapes ``(t,)`` (lumped preconditioner)."""
         return self.multiply(self._extended(w))[self.trace_dofs]
 
     def prepare(self, kind: OperatorKind) -> None:
-        """All is there."""
+        """Make what an operator needs, so that no error can come up in a collective call.
+
+        Raises:
+            FactorError: A factor that it needs could not be made.
+        """
 
     def update(self, f: Array) -> None:
-        """Replace the load."""
+        """Replace the load.
+
+        Raises:
+            InputError: It does not fit.
+        """
         check_load(self.name, f)
         self.load = f
 
     def retrace(self, trace_dofs: Array) -> None:
-        """Replace the trace."""
+        """Replace the trace: other rows act on the subdomain. Factors of K stay."""
         self.trace_dofs = trace_dofs
 
     def destroy(self) -> None:
-        """Nothing is to be freed."""
+        """Free the factors."""
 
     def _extended(self, w: Array) -> Array:
         """Return a trace vector on all unknowns, 0 elsewhere."""
         full = np.zeros(len(self.load))
         full[self.trace_dofs] = w
         return full
+
+
+# its earlier name
+BlockDefaults = Block

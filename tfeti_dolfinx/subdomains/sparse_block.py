@@ -13,7 +13,7 @@ from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.errors import FactorError
-from tfeti_dolfinx.subdomains.block import BlockDefaults, OperatorKind, SubdomainData
+from tfeti_dolfinx.subdomains.block import Block, OperatorKind, SubdomainData
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.stiffness import Stiffness, Traced
 
@@ -103,7 +103,7 @@ def _equal(K: Any, other: Stiffness, here: Array) -> bool:
 # --- Block of sparse finite elements ----------------------------------------------------------
 
 
-class SparseBlock(BlockDefaults):
+class SparseBlock(Block):
     """Block of a sparse stiffness: factors of K_ρ and, when asked for, of K_ii.
 
     They belong to its stiffness, which it may share with Blocks that are equal to it. The
