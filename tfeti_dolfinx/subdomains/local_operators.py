@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol, runtime_checkable
@@ -49,10 +49,6 @@ class CostModel:
         sparse_entry: Seconds of an entry of a sparse matrix times one number.
         together: Right sides that go through a factor at once: enough that it is not read for
             each, and few enough that they fit beside it into the cache.
-        hardly_held: Motion under random unit forces, over that of a node by its own stiffness,
-            above which springs or soft parts hardly hold a subdomain: the parts of K⁺w that cancel
-            are so large that a dense product loses two or three times as much to rounding as a
-            factor does.
         real: Bytes of a number.
         index: Bytes of a column of a sparse matrix.
     """
@@ -63,7 +59,6 @@ class CostModel:
     call: float = 2e-5
     sparse_entry: float = 1.2e-9
     together: int = 32
-    hardly_held: float = 1e5
     real: int = 8
     index: int = 4
 
@@ -94,7 +89,7 @@ MODEL = CostModel()
 # --- Matrices on a trace ----------------------------------------------------------------------
 
 
-@dataclass
+@dataclass(frozen=True)
 class TraceMatrix:
     """A symmetric matrix on a trace, which all Blocks of a group apply.
 
@@ -103,25 +98,15 @@ class TraceMatrix:
         apply: A W, shapes ``(t, q)``.
         cost: Cost of ``apply`` to so many vectors.
         can_be_dense: Whether there is use in a dense one.
-        is_sound: Whether a dense one rounds no worse than the factors; may cost a solve.
-        keep: What keeps a dense one for the next operator, if anything.
     """
 
     size: int
     apply: Callable[[Array], Array]
     cost: Callable[[int], Cost]
     can_be_dense: bool = True
-    is_sound: Callable[[], bool] = lambda: True
-    keep: Stiffness | None = None
-    key: Hashable = None
 
     def dense(self) -> Array:
         """Return the matrix, symmetric to the last bit, by columns."""
-        if self.keep is not None and self.keep.dense_pinv is not None:
-            key, A = self.keep.dense_pinv
-            if key == self.key:
-                return np.asarray(A)
-            self.keep.dense_pinv = None  # two of them might be too large
         A = np.empty((self.size, self.size), order="F")
         for first in range(0, self.size, MODEL.together):
             last = min(first + MODEL.together, self.size)
@@ -130,8 +115,6 @@ class TraceMatrix:
             A[:, first:last] = self.apply(unit)
         A += A.T
         A *= 0.5
-        if self.keep is not None:
-            self.keep.dense_pinv = self.key, A
         return A
 
 
@@ -147,14 +130,8 @@ def pinv_matrix(stiffness: Stiffness, trace: Array) -> TraceMatrix:
             out[:, some] = stiffness.solve(B)[trace]
         return out
 
-    def is_sound() -> bool:
-        forces = np.random.default_rng(0).standard_normal((len(trace), 1))
-        moved = np.abs(apply(forces)).max(initial=0.0)
-        return bool(moved * stiffness.diagonal[trace].max(initial=0.0) <= MODEL.hardly_held)
-
     cost = partial(MODEL.solve, stiffness.factor_size, stiffness.size)
-    key = trace.tobytes()
-    return TraceMatrix(len(trace), apply, cost, is_sound=is_sound, keep=stiffness, key=key)
+    return TraceMatrix(len(trace), apply, cost)
 
 
 def schur_matrix(traced: Traced) -> TraceMatrix:
@@ -235,7 +212,7 @@ class Group:
             return False
         setup, once = matrix.cost(matrix.size).seconds, matrix.cost(columns).seconds
         dense = setup + multiplications * MODEL.dense(matrix.size, columns).seconds
-        return multiplications * once > dense and matrix.is_sound()
+        return multiplications * once > dense
 
 
 def groups_of(blocks: Sequence[Block], kind: OperatorKind) -> list[Group]:

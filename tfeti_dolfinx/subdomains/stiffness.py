@@ -45,8 +45,6 @@ class Stiffness:
         K: The stiffness.
         kernel: R, shape ``(n, r)``.
         diagonal: Diagonal of K.
-        dense_pinv: Dense K⁺ on a trace, with what tells it from others, if somebody has put it
-            here to keep.
 
     Raises:
         InputError: K is not symmetric, not finite or not positive semidefinite.
@@ -58,7 +56,6 @@ class Stiffness:
         self.name, self.x, self.K, self.how = name, x, K, how
         self.size = int(K.shape[0])
         self.bs = self.size // max(len(x), 1)
-        self.dense_pinv: tuple[object, Any] | None = None
         self._traced: WeakValueDictionary[bytes, Traced] = WeakValueDictionary()
         centre = x.mean(axis=0)
         length = np.linalg.norm(x - centre, axis=1).max()

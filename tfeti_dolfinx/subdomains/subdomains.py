@@ -54,18 +54,6 @@ class SoftMotions:
     amplification: list[float]
 
 
-def sprung(blocks: Sequence[Block]) -> SoftMotions:
-    """Return the motions of each Block that springs hold."""
-    modes, energies = zip(*map(_outside_motions, blocks), strict=True) if blocks else ((), ())
-    trace = [R[block.trace_dofs] for R, block in zip(modes, blocks, strict=True)]
-    rows = csr_array(block_diag(trace)) if trace else csr_array((0, 0))
-    largest = [
-        float(block.diagonal.max() / max(D.min(), TINY)) if len(D) else 0.0
-        for block, D in zip(blocks, energies, strict=True)
-    ]
-    return SoftMotions(rows, joined(energies), largest)
-
-
 def _outside_motions(block: Block) -> tuple[Array, Array]:
     """R̂, orthonormal, orthogonal to the kernel, shape ``(n, k)``, and the diagonal of R̂ᵀKR̂."""
     modes, R = block.modes, block.kernel
@@ -212,8 +200,16 @@ class Subdomains:
         return joined([block.kernel @ alpha[part] for block, part in pairs])
 
     def soft_motions(self) -> SoftMotions:
-        """Rigid motions that are no kernel."""
-        return sprung(self.blocks)
+        """Return the motions of each Block that springs hold: rigid ones that are no kernel."""
+        found = [_outside_motions(block) for block in self.blocks]
+        pairs = list(zip(self.blocks, found, strict=True))
+        trace = [R[block.trace_dofs] for block, (R, _) in pairs]
+        rows = csr_array(block_diag(trace)) if trace else csr_array((0, 0))
+        largest = [
+            float(block.diagonal.max() / max(D.min(), TINY)) if len(D) else 0.0
+            for block, (_, D) in pairs
+        ]
+        return SoftMotions(rows, joined([D for _, D in found]), largest)
 
     # ------------------------------------------------------------------- bodies
 
