@@ -76,20 +76,16 @@ class SchurPseudoinverse(CholeskyFactor):
         return FactorSize(factor.entries + self._H.size, factor.memory + self._H.nbytes)
 
 
-# Of the mean size of a motion: one that is less on the last unknowns leaves a pivot of 1e-8 before
-# them, which counts as none.
-NO_PIVOT = 1e-4
-
-
 def trailing_pseudoinverse(
-    K: Any, R: Array, fixing_dofs: Array, prefix: str = "tfeti_sub_"
+    K: Any, R: Array, fixing_dofs: Array, prefix: str = "tfeti_sub_", no_pivot: float = 1e-4
 ) -> SchurPseudoinverse:
     """Make the pseudo-inverse with s what elimination leaves at its first zero pivot.
 
     The singular block at the end of a nested dissection, whose pseudo-inverse is found apart,
     as in LU with a singular value decomposition of the last block (Farhat, Géradin, IJNME 41,
     1998). s is found by the kernel instead of by the pivots: the last unknowns, as few as hold
-    it. The given fixing unknowns are not looked at.
+    it: no motion is less than ``no_pivot`` of its mean size on them, which would leave a pivot of
+    1e-8 before them. The given fixing unknowns are not looked at.
     """
     last: Array = np.empty(0, dtype=np.int64)
     if R.shape[1]:
@@ -99,7 +95,7 @@ def trailing_pseudoinverse(
         for item in (rows, columns, matrix):
             item.destroy()
         counts = range(R.shape[1], len(last) + 1)
-        found = bisect_left(counts, NO_PIVOT, key=lambda q: _least(R[last[:q]]) / _least(R))
+        found = bisect_left(counts, no_pivot, key=lambda q: _least(R[last[:q]]) / _least(R))
         last = np.sort(last[: counts[found]])
     return SchurPseudoinverse(K, R, last, prefix)
 

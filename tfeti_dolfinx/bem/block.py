@@ -11,6 +11,7 @@ import numpy as np
 
 from tfeti_dolfinx.bem.inside import Inside, SolvedBody
 from tfeti_dolfinx.bem.panels import Surface, surfaces
+from tfeti_dolfinx.bem.steklov import TOLERANCES as QUADRATURE
 from tfeti_dolfinx.bem.steklov import SurfaceStiffness
 from tfeti_dolfinx.common.arrays import Array, node_blocks
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
@@ -85,9 +86,6 @@ class BoundaryBlock(SparseBlock):
 
 
 # --- Boundary elements of all subdomains of a rank --------------------------------------------
-
-# Of the largest entry of a load: what quadrature leaves of a constant force per volume
-CONSTANT = 1e-7
 
 
 class Parts:
@@ -257,7 +255,9 @@ def _force_per_volume(name: str, volume: Array, hats: Array) -> Array:
     """Return the constant b whose load this is."""
     forces = volume.reshape(len(hats), -1)
     b = forces.sum(axis=0) / hats.sum()
-    if np.abs(forces - hats[:, None] * b).max() > CONSTANT * np.abs(forces).max(initial=0.0):
+    if np.abs(forces - hats[:, None] * b).max() > QUADRATURE.constant * np.abs(forces).max(
+        initial=0.0
+    ):
         raise InputError(
             f"{name}: a load per volume varies there; boundary elements take a constant "
             "force per volume and tractions. Expected one of them, or finite elements"
@@ -267,7 +267,7 @@ def _force_per_volume(name: str, volume: Array, hats: Array) -> Array:
 
 def _check_inside(part: Part, f: Array, size: float) -> None:
     """Raise if something else than an integral over cells acts inside."""
-    if np.abs(f[~part.on_surface]).max(initial=0.0) > CONSTANT * size:
+    if np.abs(f[~part.on_surface]).max(initial=0.0) > QUADRATURE.constant * size:
         raise InputError(
             f"{part.name}: a load acts on facets inside boundary elements; expected tractions on "
             "their surface"

@@ -68,11 +68,15 @@ class KernelTolerances:
         dependent: Singular value of a mode beside the others, over the largest, that counts as
             none: nodes on a line or in one point make it 0 but for rounding.
         equal: Distances that differ by less, relatively, count as equal.
+        on_trace: Singular value of the kernel's trace rows, parts of orthonormal columns, below
+            which a motion is as good as 0 on the trace: K_ii resists it by the square of that,
+            which a Cholesky factor loses.
     """
 
     null: float = 2e-15
     dependent: float = 1e-10
     equal: float = 1e-9
+    on_trace: float = 1e-6
 
 
 TOLERANCES = KernelTolerances()

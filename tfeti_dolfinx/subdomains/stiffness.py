@@ -13,7 +13,7 @@ from scipy.linalg import null_space
 from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.common.validation import check_stiffness
 from tfeti_dolfinx.errors import FactorError, InputError
-from tfeti_dolfinx.subdomains.block import candidate_modes, fixing_dofs, kernel_of
+from tfeti_dolfinx.subdomains.block import TOLERANCES, candidate_modes, fixing_dofs, kernel_of
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, FactorSize, NotPositiveDefiniteError
 from tfeti_dolfinx.subdomains.kplus import (
     GeneralisedInverse,
@@ -23,11 +23,6 @@ from tfeti_dolfinx.subdomains.kplus import (
     solved,
     why_indefinite,
 )
-
-# Of the largest singular value of the kernel's trace rows, orthonormal columns of which these are
-# a part: below it a motion is as good as 0 on the trace. K_ii resists it by the square of that,
-# which a Cholesky factor loses.
-NOT_ON_TRACE = 1e-6
 
 
 class Stiffness:
@@ -144,7 +139,7 @@ class Traced:
             return None
         # the triangle has the null space of the kernel's trace rows, and few rows itself
         triangle = np.linalg.qr(stiffness.kernel[self.trace], mode="r")
-        R = stiffness.kernel[inside] @ null_space(triangle, rcond=NOT_ON_TRACE)
+        R = stiffness.kernel[inside] @ null_space(triangle, rcond=TOLERANCES.on_trace)
         how, K_ii = stiffness.how, stiffness.K[inside][:, inside]
         how.counters.factorizations += 1
         try:
