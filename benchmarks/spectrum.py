@@ -3,10 +3,11 @@
     ./run python3 benchmarks/spectrum.py [--quick]
 
 A unit square and a unit cube, clamped on one side, of (1/H)^d equal subdomains with H/h elements
-along an edge, of finite and of boundary elements. Extreme eigenvalues of PFP on the range of P,
-those of Gᵀ taken away, by Lanczos iterations, and of S, the Schur complement of a floating
-subdomain on its whole boundary, beside its kernel. Bounded columns κ·h/H are what the theorem says
-(Dostál, Optimal Quadratic Programming Algorithms, 2009; Brenner, Numer. Math. 83, 1999, for S).
+along an edge, of finite and of boundary elements. Extreme eigenvalues of B D⁻¹ Bᵀ; of PFP on the
+range of P, those of Gᵀ taken away, by Lanczos iterations; and of S, the Schur complement of a
+floating subdomain on its whole boundary, beside its kernel. Bounded columns κ·h/H are what the
+theorem says (Dostál, Optimal Quadratic Programming Algorithms, 2009; Brenner, Numer. Math. 83,
+1999, for S).
 Nothing is parallel. Results go to
 results/spectrum.md, .json and .png.
 """
@@ -116,6 +117,18 @@ def extremes_of_F(dual):
     return least, largest
 
 
+def extremes_of_B(constraints):
+    """Least and largest eigenvalue of B D⁻¹ Bᵀ; of B Bᵀ where D = I.
+
+    Optimality asks for bounds on them that depend neither on h nor on H (Dostál, Kozubek,
+    Sadowská, Vondrák, Scalable Algorithms for Contact Problems, 2016).
+    """
+    indptr, indices, data = constraints.B.getValuesCSR()
+    B = csr_array((data, indices, indptr), shape=constraints.B.getSize())
+    values = np.linalg.eigvalsh(((B / constraints.weights) @ B.T).toarray())
+    return float(values[0]), float(values[-1])
+
+
 def extremes_of_S(gdim, cells, boundary):
     """Least eigenvalue beside the kernel and largest one of S of a floating subdomain.
 
@@ -148,13 +161,15 @@ def steklov_poincare(V, whole):
 def row(gdim, parts, cells, boundary):
     """A row of a table."""
     problem = solved(gdim, parts, cells, boundary)
-    F = extremes_of_F(problem.dual)
+    B, F = extremes_of_B(problem.dual.constraints), extremes_of_F(problem.dual)
     S = extremes_of_S(gdim, cells, boundary)
     found = {
         "H/h": cells,
         "1/H": parts,
         "unknowns": problem.report.primal_dofs,
         "rows": problem.report.dual_dofs,
+        "λ_min(BD⁻¹Bᵀ)": B[0],
+        "λ_max(BD⁻¹Bᵀ)": B[1],
         "λ_min(F)": F[0],
         "λ_max(F)": F[1],
         "κ(F)": F[1] / F[0],

@@ -104,7 +104,7 @@ def test_a_body_that_contact_alone_holds(comm, shared_tmp):
     ("pc_type", "subdomains"), [("none", 1), ("lumped", 2), ("dirichlet", 1), ("dirichlet", 2)]
 )
 def test_no_contact(comm, shared_tmp, pc_type, subdomains):
-    options = {"tfeti_pc_type": pc_type, "tfeti_spectrum": True, "tfeti_view": True}
+    options = {"tfeti_pc_type": pc_type, "tfeti_view": True}
     p = problem(decomposed("quadrilateral", 4, subdomains), (0.0, -0.05), **options)
     p.solve()
     everything_asked_for(p, shared_tmp)

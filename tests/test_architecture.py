@@ -22,13 +22,14 @@ ROOMS = [
     ["options", "testing"],
     ["solve"],
     ["extensions"],
-    ["bem"],
     ["solution"],
     ["report", "draw"],
     ["system", "output", "plot"],
     ["accuracy"],
     ["problem"],
     ["steps"],
+    # optional: nothing imports them but by their names in extensions.PLUGINS
+    ["bem", "clusters", "pseudoinverse"],
 ]
 PLACE = {room: place for place, rooms in enumerate(ROOMS) for room in rooms}
 # the QP solvers know nothing of meshes and rows, the Blocks nothing of rows

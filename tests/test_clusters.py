@@ -8,15 +8,13 @@ import ufl
 from bodies import held, pressed, sided, stacked, two_body_problem
 from mpi4py import MPI
 from scenes import clamp, curved_obstacle, decomposed, forms, hooke, strain
-from scipy.sparse import csr_array
 
 import tfeti_dolfinx as tfeti
 from benchmarks.stability_scenes import LADDERS
 from benchmarks.stress.judge import run_scene
+from tfeti_dolfinx.clusters.subdomains import ClusteredSubdomains, Saddle
 from tfeti_dolfinx.errors import FactorError, InputError
 from tfeti_dolfinx.qp.sets import Status, face_of
-from tfeti_dolfinx.subdomains import clusters as averages
-from tfeti_dolfinx.subdomains.clusters import ClusteredSubdomains, Saddle
 
 COMM = MPI.COMM_WORLD
 
@@ -162,27 +160,6 @@ def test_the_preconditioner_is_as_near_to_the_inverse_as_without_clusters(cluste
     assert found[0] <= 1.3 * found[1]
 
 
-def test_motions_within_clusters_are_nearly_solved_for(clustered):
-    """‖(I − XA)b‖_A ≤ 0.15‖b‖_A in 4 steps, and X is symmetric."""
-    dual, rows = clustered.dual, clustered.dual.constraints.num_rows
-    face = face_of(np.ones(rows, dtype=bool), np.full(rows, Status.FREE))
-    balanced = dual._preconditioner_on(face)
-    inner, alpha = balanced._part._inner, balanced._part._alpha
-    assert dual.soft.count == alpha.getSize() == 3 * clustered.report.subdomains
-
-    def mult(x, y):
-        y.array[:] = inner.solve(x.array_r)
-
-    A, X = columns_of(inner._A.mult, alpha), columns_of(mult, alpha)
-    assert np.allclose(X, X.T, atol=1e-10 * np.abs(X).max())
-    values, V = np.linalg.eigh(A)
-    root = V * np.sqrt(np.maximum(values, 0.0))
-    left = np.linalg.eigvalsh(root.T @ X @ root)
-    left = left[left > 1e-9]
-    assert np.abs(1.0 - left).max() <= 0.15
-    balanced.destroy()
-
-
 @pytest.mark.parametrize("options", [{}, {"qp_type": "smalse"}, {"pc_type": "lumped"}])
 def test_the_answer_is_the_same(options):
     u, _ = solved(square(8, 4, rtol=1e-9, **options))
@@ -223,72 +200,6 @@ def test_clusters_cost_hardly_more(cell, counts, serial_only):
         _, report = solved(square(cells, 4, cell, clusters=count))
         assert report.kernel_dim == modes * count
         assert report.F_multiplications <= 1.3 * plain.F_multiplications + 1
-
-
-def test_hooks_cost_hardly_more(serial_only, monkeypatch):
-    """Two hooks of 8 of 16 squares hold each other; the preconditioner knows where they bend."""
-    hooks = np.array([0, 0, 0, 0, 0, 1, 1, 1, 0, 0, 0, 1, 1, 1, 1, 1])
-    monkeypatch.setattr(averages, "_metis_of", lambda graph, count, sizes: hooks)
-    _, plain = solved(square(16, 4))
-    _, report = solved(square(16, 4, clusters=2))
-    assert report.clusters == 2
-    # conjugate gradient steps; how many faces there are, one F each, is rounding's choice here
-    assert report.preconditioner_multiplications <= 1.3 * plain.preconditioner_multiplications
-    assert report.F_multiplications <= 1.3 * plain.F_multiplications + 2
-
-
-def test_subdomains_of_a_body_that_hang_together_elsewhere(serial_only):
-    """Of a fork a rank may have the prongs alone."""
-    pairs, nodes = np.array([[0, 1], [2, 3], [4, 5], [6, 7]]), np.full(4, 3)
-    whole = np.array([0, 0, 1, 1, 2, 2, 3, 3])
-    sizes = np.full(8, 100)
-    part = averages._parts(pairs, nodes, sizes, whole, 0.5)
-    assert np.array_equal(part, whole)
-    finer = averages._parts(pairs, nodes, sizes, whole, 1.0)
-    assert all(len(np.unique(whole[finer == one])) == 1 for one in np.unique(finer))
-
-
-@pytest.mark.parametrize("wanted", [4, 8, 16, 24])
-def test_clusters_of_irregular_subdomains_have_about_as_many_each(wanted, serial_only):
-    """Subdomains that touch all around, as METIS makes them; not half of all in one cluster."""
-    x = np.stack(np.meshgrid(range(4), range(4), range(2)), axis=-1).reshape(-1, 3)
-    apart = np.abs(x[:, None] - x).max(axis=2) + np.tri(32)
-    pairs = np.argwhere(apart == 1)
-    steps = np.abs(x[pairs[:, 0]] - x[pairs[:, 1]]).sum(axis=1)
-    nodes, alike = np.array([0, 60, 9, 4])[steps], np.full(32, 500)
-    part = averages._parts(pairs, nodes, alike, np.zeros(32, int), wanted / 32)
-    sizes = np.bincount(part, minlength=wanted)
-    assert sizes.min() >= 1
-    assert sizes.max() <= np.ceil(32 / wanted) + 1
-
-
-@pytest.mark.parametrize("wanted", [1, 2, 4, 6])
-def test_crumbs_stay_with_the_neighbour_that_holds_them_best(wanted, serial_only):
-    """Of a row of six, a crumb at the end of each, which touches the next one a little, too."""
-    row, crumbs = np.arange(6), np.arange(6, 12)
-    ends = (row[:-1], row[1:]), (row, crumbs), (row[1:], crumbs[:-1])
-    pairs = np.concatenate([np.stack(both, axis=1) for both in ends])
-    nodes = np.repeat([60, 20, 4], [5, 6, 5])
-    sizes = np.repeat([500, 50], 6)
-    part = averages._parts(pairs, nodes, sizes, np.zeros(12, int), wanted / 12)
-    assert np.array_equal(part[crumbs], part[row])
-    assert len(np.unique(part)) == wanted
-
-
-def test_parts_hang_together(serial_only):
-    """A piece goes to where its faces have most nodes, unless it has none, the smallest first."""
-    graph = np.zeros((6, 6))
-    for i, j, weight in ((0, 1, 9), (1, 2, 5), (2, 3, 7), (3, 4, 2), (0, 4, 1)):
-        graph[i, j] = graph[j, i] = weight
-    sizes = np.array([5, 5, 1, 5, 2, 5])
-    for given, expected in (
-        ([0, 0, 1, 1, 1, 2], [0, 0, 1, 1, 1, 2]),
-        ([0, 0, 1, 0, 1, 2], [0, 0, 0, 0, 1, 2]),  # 2, the smaller of 1's, goes to 3; 0 is whole
-        ([0, 0, 1, 0, 0, 2], [0, 0, 1, 0, 0, 2]),  # round about by 4
-        ([0, 1, 0, 1, 0, 0], [0, 1, 1, 1, 0, 0]),  # 5 has no neighbour
-    ):
-        found = averages._hanging_together(csr_array(graph), np.array(given), sizes)
-        assert found.tolist() == expected
 
 
 def test_without_them_nothing_is_paid():

@@ -6,32 +6,27 @@ from scenes import curved_obstacle, decomposed, problem
 from scipy.linalg import pinvh
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.feti.deflation import SoftModes
 from tfeti_dolfinx.feti.operator import DualOperator
-from tfeti_dolfinx.subdomains.local_operators import BlockwiseOperator
+from tfeti_dolfinx.subdomains.local_operators import GroupedOperator
+from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 
 class DensePinv:
     """K⁺ of Moore and Penrose."""
 
     def __init__(self, K, R, fixing_dofs, prefix):
-        self.K = K
-        self.refactor(R)
-
-    def refactor(self, R):
-        self.inverse = pinvh(self.K.toarray(), rtol=1e-12)
+        self.inverse = pinvh(K.toarray(), rtol=1e-12)
 
     def solve(self, b):
         return self.inverse @ b
-
-    def destroy(self):
-        pass
 
 
 class Doubled:
     """Twice the stiffness of the trace: scales a preconditioner, which changes nothing."""
 
     def __init__(self, blocks):
-        self.half = BlockwiseOperator(blocks, "stiffness")
+        self.half = GroupedOperator(blocks, "stiffness")
 
     def prepare(self):
         self.half.prepare()
@@ -72,6 +67,27 @@ def test_a_preconditioner_of_one_s_own():
     assert np.abs(own - known).max(initial=0.0) <= 1e-7 * largest
     assert q.report.preconditioner_multiplications > 0
     assert abs(q.report.cg_steps - p.report.cg_steps) <= 1
+
+
+def test_subdomains_and_deflation_of_one_s_own():
+    """Both are asked for, and what they make is used."""
+    asked = []
+
+    def subdomains(dofs, decomposition):
+        asked.append("subdomains")
+        return Subdomains
+
+    def deflation(*given):
+        asked.append("deflation")
+        return SoftModes(*given)
+
+    own = tfeti.Extensions(subdomains=subdomains, deflation=deflation)
+    known, _ = solved()
+    found, _ = solved(extensions=own)
+    assert asked == ["subdomains", "deflation"]
+    assert np.array_equal(found, known)
+    with pytest.raises(tfeti.InputError, match="are given, and clusters, .*; expected one of them"):
+        solved(extensions=own, tfeti_clusters=2)
 
 
 def test_a_preconditioner_that_nobody_takes_is_refused():

@@ -11,22 +11,12 @@ from scipy.sparse import csr_array
 from test_blocks import data, stiffness
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.common.arrays import parts_of
 from tfeti_dolfinx.feti.operator import check_operator
-from tfeti_dolfinx.subdomains.block import BlockDefaults, Counters
+from tfeti_dolfinx.subdomains.block import Block, Counters
 from tfeti_dolfinx.subdomains.factor import FactorSize
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
-from tfeti_dolfinx.subdomains.local_operators import (
-    BlockwiseOperator,
-    Cost,
-    Explicit,
-    Implicit,
-    LocalChoice,
-    chosen,
-    dense_product,
-    groups_of,
-    local_operator,
-    sweeps,
-)
+from tfeti_dolfinx.subdomains.local_operators import MODEL, GroupedOperator, LocalChoice, groups_of
 from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains, SparseBlock
 from tfeti_dolfinx.testing import check_block, check_kind_of_block
 
@@ -67,31 +57,19 @@ def applied(operator, w):
     return out
 
 
+def blockwise(blocks, kind, w):
+    """Each Block applies its own, one after the other."""
+    out, parts = np.full_like(w, np.nan), parts_of([len(block.trace_dofs) for block in blocks])
+    for block, part in zip(blocks, parts, strict=True):
+        block.prepare(kind)
+        out[part] = getattr(block, f"apply_{kind}")(w[part])
+    return out
+
+
 def close(x, y, comm):
     """Whether arrays agree to 1e-10 of the largest entry of all ranks."""
     largest = comm.allreduce(np.abs(y).max(initial=0.0), op=MPI.MAX)
     return comm.allreduce(bool(np.abs(x - y).max(initial=0.0) <= 1e-10 * largest), op=MPI.LAND)
-
-
-def in_form(form):
-    """A local operator whose groups all have a form."""
-
-    class Formed:
-        def __init__(self, blocks, kind):
-            self.forms = [form(group) for group in groups_of(blocks, kind)]
-
-        def prepare(self):
-            for item in self.forms:
-                item.prepare()
-
-        def mult(self, w, out):
-            for item in self.forms:
-                item.mult(w, out)
-
-        def destroy(self):
-            pass
-
-    return Formed
 
 
 @pytest.mark.parametrize("cell", CELLS)
@@ -108,24 +86,17 @@ def test_all_forms_apply_the_same(cell, equal):
     w = random(len(subdomains.trace))
     for kind in KINDS:
         for s in (subdomains, single):
-            reference = BlockwiseOperator(s.blocks, kind)
-            expected = applied(reference, w)
-            for form in (Implicit, Explicit):
-                for _ in range(2):  # what is kept from the first time is right as well
-                    assert close(applied(in_form(form)(s.blocks, kind), w), expected, d.comm)
-        if kind != "pinv":
-            assert close(applied(reference, w), applied(subdomains.local_operator(kind), w), d.comm)
+            expected = blockwise(s.blocks, kind, w)
+            for form in ("implicit", "explicit"):
+                operator = GroupedOperator(s.blocks, kind, LocalChoice(form))
+                assert close(applied(operator, w), expected, d.comm)
     R = subdomains.kernel_rows.toarray()
     balanced = w - R @ np.linalg.lstsq(R, w, rcond=None)[0]
     u, v = (applied(s.local_operator("pinv"), balanced) for s in (subdomains, single))
     assert close(balanced @ u, balanced @ v, d.comm)
-    check_operator(subdomains_dual(p).F, subdomains_dual(p).d)
+    check_operator(p.dual.F, p.dual.d)
     for item in (p, alone):
         item.destroy()
-
-
-def subdomains_dual(p):
-    return p._system.dual
 
 
 @pytest.mark.parametrize("cell", CELLS)
@@ -246,24 +217,15 @@ def test_shared_blocks_keep_the_promises_of_a_block(equals):
     check_kind_of_block(lambda data: SparseBlock(data, equals=equals))
 
 
-def test_another_stiffness_leaves_the_others_alone():
+def test_equal_stiffnesses_are_factored_once_whatever_the_loads():
     counters = Counters()
     equals = EqualSubdomains(InverseFactory(counters))
     K, x = stiffness("hexahedron", 2)
     blocks = [shared(K, x, equals, shift=s)[0] for s in range(3)]
-    assert counters.factorizations == 1
     blocks[1].update(f=2 * blocks[1].load)
     assert counters.factorizations == 1
-    blocks[0].update(K=2 * K)
-    assert counters.factorizations == 2
-    check_block(blocks[0], 2 * K)
-    check_block(blocks[2], K)
-    made_before = counters.factorizations
-    for block in blocks[1:]:
-        block.update(K=2 * K)
-        assert block.stiffness is blocks[0].stiffness
-    assert counters.factorizations == made_before
-    check_block(blocks[2], 2 * K)
+    for block in blocks:
+        check_block(block, K)
 
 
 def test_a_new_trace_of_one_leaves_the_others_theirs(equals):
@@ -276,13 +238,13 @@ def test_a_new_trace_of_one_leaves_the_others_theirs(equals):
         check_block(block, K)
     w = random(sum(len(block.trace_dofs) for block in blocks))
     for kind in KINDS:
-        expected = applied(BlockwiseOperator(blocks, kind), w)
+        expected = blockwise(blocks, kind, w)
         for local_type in ("implicit", "explicit"):
-            operator = local_operator(blocks, kind, LocalChoice(local_type))
+            operator = GroupedOperator(blocks, kind, LocalChoice(local_type))
             assert close(applied(operator, w), expected, MPI.COMM_SELF)
 
 
-class OwnBlock(BlockDefaults):
+class OwnBlock(Block):
     """K = I."""
 
     def set_stiffness(self, K):
@@ -300,12 +262,12 @@ def test_blocks_of_one_s_own_apply_what_they_have(local_type):
     blocks = [OwnBlock(data(K, x)) for _ in range(2)]
     w = random(sum(len(block.trace_dofs) for block in blocks))
     for kind in KINDS:
-        assert np.allclose(applied(local_operator(blocks, kind, LocalChoice(local_type)), w), w)
+        assert np.allclose(applied(GroupedOperator(blocks, kind, LocalChoice(local_type)), w), w)
 
 
 @pytest.mark.parametrize("local_type", ["auto", "implicit", "explicit", "shared"])
 def test_ranks_without_subdomains(local_type):
-    operator = local_operator([], "pinv", LocalChoice(local_type))
+    operator = GroupedOperator([], "pinv", LocalChoice(local_type))
     assert applied(operator, np.empty(0)).shape == (0,)
     assert operator.predicted == 0.0
     d = decomposed("quadrilateral", 4, 1)  # one rank has it
@@ -315,24 +277,23 @@ def test_ranks_without_subdomains(local_type):
     p.destroy()
 
 
-def test_the_model_prefers_what_is_cheaper():
-    """Dense matrices pay off where many multiplications are to come."""
+@pytest.mark.parametrize(
+    ("local_type", "multiplications", "dense"),
+    [
+        ("auto", 0, False),
+        ("auto", 10**9, True),
+        ("shared", 10**9, False),  # it shares nothing
+        ("explicit", 0, True),
+    ],
+)
+def test_dense_matrices_are_made_where_they_pay(local_type, multiplications, dense):
     K, x = stiffness("quadrilateral", 12)
-    block = SparseBlock(data(K, x, trace_dofs=np.arange(20)))
-    (group,) = groups_of([block], "pinv")
-    assert isinstance(chosen(group, "auto", 0), Implicit)
-    assert isinstance(chosen(group, "auto", 10**9), Explicit)
-    assert isinstance(chosen(group, "shared", 10**9), Implicit)  # it shares nothing
-    assert Cost(2.0, 3.0).of(4) == 14.0
+    (group,) = groups_of([SparseBlock(data(K, x, trace_dofs=np.arange(20)))], "pinv")
+    assert group.prefers_dense(local_type, multiplications) is dense
+
+
+def test_the_model_knows_that_right_sides_share_a_sweep():
     small, large = FactorSize(1e3, 8e3), FactorSize(1e6, 8e6)
-    assert sweeps(small, 100, 1) < sweeps(large, 100, 1) < sweeps(large, 100, 64)
-    assert sweeps(large, 100, 64) < 64 * sweeps(large, 100, 1)
-    assert dense_product(100, 64) < 64 * dense_product(100, 1)
-
-
-@pytest.mark.parametrize(("mass", "form"), [(1.0, Explicit), (1e-8, Implicit)])
-def test_a_subdomain_that_is_hardly_held_keeps_its_factors(mass, form):
-    block = SparseBlock(data(*stiffness("quadrilateral", 12, mass=mass), trace_dofs=np.arange(20)))
-    (group,) = groups_of([block], "pinv")
-    assert isinstance(chosen(group, "auto", 10**9), form)
-    assert isinstance(chosen(group, "explicit", 10**9), Explicit)
+    seconds = [MODEL.solve(large, 100, count).seconds for count in (1, 64)]
+    assert MODEL.solve(small, 100, 1).seconds < seconds[0] < seconds[1] < 64 * seconds[0]
+    assert MODEL.dense(100, 64).seconds < 64 * MODEL.dense(100, 1).seconds

@@ -7,11 +7,11 @@ from scipy.linalg import pinvh
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.subdomains.block import BlockDefaults, kernel_of
+from tfeti_dolfinx.subdomains.block import Block, kernel_of
 from tfeti_dolfinx.testing import check_kind_of_block
 
 
-class DenseBlock(BlockDefaults):
+class DenseBlock(Block):
     """K and its Moore–Penrose inverse, dense."""
 
     def set_stiffness(self, K):

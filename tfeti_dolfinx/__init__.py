@@ -28,9 +28,9 @@ Example:
     0.100000
 """
 
+from typing import TYPE_CHECKING, Any
+
 from tfeti_dolfinx.accuracy.estimates import Estimates
-from tfeti_dolfinx.bem.boundary_elements import BoundaryElements
-from tfeti_dolfinx.bem.interior import Interior
 from tfeti_dolfinx.constraints.contact_state import ContactData, ContactStatus
 from tfeti_dolfinx.contact.friction import Coulomb, Tresca
 from tfeti_dolfinx.contact.obstacle import Obstacle
@@ -43,7 +43,7 @@ from tfeti_dolfinx.errors import (
     NoSolutionError,
     TfetiError,
 )
-from tfeti_dolfinx.extensions import Extensions
+from tfeti_dolfinx.extensions import PLUGINS, Extensions, plugin
 from tfeti_dolfinx.forms.elasticity import Elasticity
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dolfinx_input import decompose
@@ -55,6 +55,10 @@ from tfeti_dolfinx.solution import PointValues, Solution
 from tfeti_dolfinx.steps.dynamics import ContactDynamics
 from tfeti_dolfinx.steps.load_steps import LoadSteps, StepRecord
 from tfeti_dolfinx.version import __version__
+
+if TYPE_CHECKING:
+    from tfeti_dolfinx.bem.boundary_elements import BoundaryElements
+    from tfeti_dolfinx.bem.interior import Interior
 
 __all__ = [
     "BoundaryElements",
@@ -90,3 +94,10 @@ __all__ = [
     "decompose",
     "read_gmsh",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Return a public name of an optional part, which is imported when it is first asked for."""
+    if name in __all__ and name in PLUGINS:
+        return plugin(name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

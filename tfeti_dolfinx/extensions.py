@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
-from tfeti_dolfinx.common.validation import checked_callable, named, shown
+from tfeti_dolfinx.common.validation import checked_callable, checked_type, named, shown
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.feti.deflation import MakeDeflation, SoftModes
 from tfeti_dolfinx.feti.dual import Dual, FeasibleLaw, contact_set
 from tfeti_dolfinx.feti.operator import PRECONDITIONERS, MakePreconditioner
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -21,12 +23,34 @@ from tfeti_dolfinx.qp.problem import Monitor
 from tfeti_dolfinx.qp.recycling import Recycled
 from tfeti_dolfinx.qp.sets import FeasibleSet
 from tfeti_dolfinx.solve.solver import resolve_types
-from tfeti_dolfinx.subdomains.block import Block, Counters, SubdomainData, mode_names
-from tfeti_dolfinx.subdomains.build import MakeBlock, sparse_blocks
-from tfeti_dolfinx.subdomains.factor import GeneralisedInverse, added_options
-from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, InverseFactory, MakeInverse
+from tfeti_dolfinx.subdomains.block import PROMISED, Block, Counters, SubdomainData, mode_names
+from tfeti_dolfinx.subdomains.build import MakeBlock, SubdomainMethod, sparse_blocks
+from tfeti_dolfinx.subdomains.factor import added_options
+from tfeti_dolfinx.subdomains.kplus import (
+    InverseFactory,
+    MakeInverse,
+    regularised,
+)
 from tfeti_dolfinx.subdomains.local_operators import LocalChoice
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
+
+# optional parts, which no other module imports: where they are, by name
+PLUGINS = {
+    "BoundaryElements": "tfeti_dolfinx.bem.boundary_elements:BoundaryElements",
+    "Interior": "tfeti_dolfinx.bem.interior:Interior",
+    "clusters": "tfeti_dolfinx.clusters:extension",
+    "schur": "tfeti_dolfinx.pseudoinverse:SchurPseudoinverse",
+    "lu_svd": "tfeti_dolfinx.pseudoinverse:trailing_pseudoinverse",
+}
+
+
+def plugin(name: str) -> Any:
+    """Return an optional part, imported when it is first asked for."""
+    module, _, attribute = PLUGINS[name].partition(":")
+    return getattr(import_module(module), attribute)
+
+
+MakeSubdomains = Callable[[TornDofs, Decomposition], Callable[..., Subdomains]]
 
 
 @dataclass(frozen=True)
@@ -34,11 +58,14 @@ class Extensions:
     """Parts that take the place of the package's own; by default none.
 
     Attributes:
-        block: Makes the Block of a subdomain, say a class; ``BlockDefaults`` leaves four methods
-            to write, ``check_kind_of_block`` tests it.
+        block: Makes the Block of a subdomain, say a class; ``Block`` leaves four methods to
+            write, ``check_kind_of_block`` tests it.
         kplus: Makes the generalised inverse of a subdomain, for ``SparseBlock``.
+        subdomains: From dof maps and the torn mesh to what makes all Blocks of a rank one, with
+            the arguments of ``Subdomains``.
         preconditioner: Makes a preconditioner from B D⁻¹ and the subdomains, for solvers that
             take one.
+        deflation: Makes the coarse space of the preconditioner on faces; default ``SoftModes``.
         feasible_set: From B and c to the set of multipliers, asked before each run of the solver;
             ``check_feasible_set`` tests it.
         monitor: Called after each step of the solver.
@@ -49,7 +76,9 @@ class Extensions:
 
     block: Callable[[SubdomainData], Block] | None = None
     kplus: MakeInverse | None = None
+    subdomains: MakeSubdomains | None = None
     preconditioner: MakePreconditioner | None = None
+    deflation: MakeDeflation | None = None
     feasible_set: FeasibleLaw = contact_set
     monitor: Monitor | None = None
 
@@ -64,20 +93,53 @@ class Extensions:
             )
 
 
-def guarded(own: Extensions, comm: MPI.Intracomm) -> Extensions:
-    """Return the same parts, of which what fails is named, on all ranks where they run on all.
+def guarded(own: Extensions, options: Options, comm: MPI.Intracomm) -> Extensions:
+    """Return the parts of a solve; what fails is named, on all ranks where they run on all.
 
-    Blocks and K⁺ are made where ranks raise together.
+    Blocks and K⁺ are made where ranks raise together. Clusters are parts of the package's own.
+
+    Args:
+        own: What the program brings.
+        options: Options.
+        comm: Communicator.
+
+    Raises:
+        InputError: Clusters are asked for beside other subdomains or another deflation.
     """
+    if options.clusters:
+        if own.subdomains is not None or own.deflation is not None:
+            raise InputError(
+                "extensions: subdomains or deflation are given, and clusters, which take their "
+                "place; expected one of them"
+            )
+        chosen = plugin("clusters")(options.clusters)
+    else:
+        chosen = {
+            "subdomains": _together(own.subdomains, "subdomains", comm),
+            "deflation": _together(own.deflation, "deflation", comm),
+        }
     return Extensions(
-        block=_giving(own.block, "block", Block),
-        kplus=_giving(own.kplus, "kplus", GeneralisedInverse),
+        block=_giving(own.block, "block", "Block", PROMISED),
+        kplus=_giving(own.kplus, "kplus", "GeneralisedInverse", ("solve",)),
         preconditioner=_together(own.preconditioner, "preconditioner", comm),
         feasible_set=own.feasible_set
         if own.feasible_set is contact_set
         else _together(_checked_set(own.feasible_set), "feasible_set", comm),
         monitor=_together(own.monitor, "monitor", comm),
+        **chosen,
     )
+
+
+def check_method(method: Any, own: Extensions) -> None:
+    """Raise if what takes the place of finite elements does not fit what the program brings.
+
+    Raises:
+        InputError: It is something else, or there is a Block of the program's own.
+    """
+    expected = 'tfeti_dolfinx.BoundaryElements, say BoundaryElements("ball")'
+    checked_type(method, SubdomainMethod, "boundary_elements", expected)
+    if own.block is not None:
+        raise InputError("boundary_elements: extensions have a block, too; expected one of them")
 
 
 def _together(part: Any, name: str, comm: MPI.Intracomm) -> Any:
@@ -92,7 +154,7 @@ def _together(part: Any, name: str, comm: MPI.Intracomm) -> Any:
     return call
 
 
-def _giving(part: Any, name: str, protocol: type) -> Any:
+def _giving(part: Any, name: str, kind: str, members: Sequence[str]) -> Any:
     """Return a part whose errors become an InputError, and which must give an implementation."""
     if part is None:
         return None
@@ -100,18 +162,16 @@ def _giving(part: Any, name: str, protocol: type) -> Any:
     def call(*given: Any) -> Any:
         with named(f"extensions: {name}"):
             made = part(*given)
-            _check_members(made, name, protocol)
+            _check_members(made, name, kind, members)
         return made
 
     return call
 
 
-def _check_members(made: Any, name: str, protocol: type) -> None:
-    members = [member for member in dir(protocol) if not member.startswith("_")]
-    if missing := [member for member in members if not hasattr(made, member)]:
+def _check_members(made: Any, name: str, kind: str, members: Sequence[str]) -> None:
+    if missing := [member for member in sorted(members) if not hasattr(made, member)]:
         raise InputError(
-            f"extensions: {name} gave {shown(made)} without {', '.join(missing)}; expected a "
-            f"{protocol.__name__}"
+            f"extensions: {name} gave {shown(made)} without {', '.join(missing)}; expected a {kind}"
         )
 
 
@@ -120,7 +180,8 @@ def _checked_set(law: FeasibleLaw) -> FeasibleLaw:
 
     def checked(constraints: Constraints) -> FeasibleSet:
         made, zero = law(constraints), np.zeros(constraints.num_rows)
-        _check_members(made, "feasible_set", FeasibleSet)
+        members = [member for member in dir(FeasibleSet) if not member.startswith("_")]
+        _check_members(made, "feasible_set", "FeasibleSet", members)
         if np.shape(made.project(zero)) != zero.shape:
             raise InputError(
                 f"extensions: feasible_set projects vectors of shape {zero.shape} to "
@@ -178,7 +239,9 @@ class Settings:
 
     def making(self, counters: Counters) -> InverseFactory:
         """Return the factory of the subdomains' generalised inverses."""
-        kplus = self.extensions.kplus or KPLUS_TYPES[self.options.kplus_type]
+        kplus, name = self.extensions.kplus, self.options.kplus_type
+        if kplus is None:
+            kplus = regularised if name == "regularized" else plugin(name)
         return InverseFactory(counters, kplus, f"{self.prefix}sub_")
 
     def preconditioner(self, pc_type: str) -> MakePreconditioner | None:
@@ -220,6 +283,7 @@ class Settings:
                 preconditioner=self.preconditioner(pc_type),
                 options_prefix=self.prefix,
                 feasible=feasible,
+                deflation=self.extensions.deflation or SoftModes,
             )
         if isinstance(self.options.recycle, int) and self.options.recycle:
             dual.recycled = Recycled(self.options.recycle, dofs.comm)

@@ -37,8 +37,6 @@ from tfeti_dolfinx.subdomains.local_operators import LOCAL_TYPES
 
 # what ``auto`` asks of displacements, whatever the mesh is
 LOOSEST = 1e-2
-# ρ of the stiffening that ``auto`` takes
-PENALTY = 10.0
 
 
 @dataclass(frozen=True)
@@ -82,7 +80,7 @@ class Options:
         "subdomains",
         "generalised inverse of a subdomain: K made regular on fixing nodes, by the Schur "
         "complement on these, or by that on the last unknowns of an elimination",
-        choices=tuple(KPLUS_TYPES),
+        choices=KPLUS_TYPES,
     )
     local_type: str = described(
         "auto",
@@ -101,16 +99,6 @@ class Options:
         "about so many clusters, whose subdomains are glued by averages over their faces, so that "
         "the coarse problem has the motions of clusters only; 0: none",
         fits=FROM_0,
-    )
-    stiffening: float | str = described(
-        "auto",
-        "subdomains",
-        "so many times its diagonal entry of K is added to K at a component that is prescribed as "
-        "0 on a side of flat cells, beside its row, which leaves the solution as it is; 0: "
-        "nothing; auto: 10, with smalse 0",
-        fits=FROM_0,
-        words=("auto",),
-        kind=float,
     )
     recycle: int | str = described(
         "auto",
@@ -151,11 +139,6 @@ class Options:
     error_if_not_converged: bool = described(
         True, "all", "raise ConvergenceError where a solver stops before its tolerance"
     )
-    spectrum: bool = described(
-        False,
-        "all",
-        "put the extreme eigenvalues of B Bᵀ and B D⁻¹ Bᵀ into the report; needs slepc4py",
-    )
     monitor: bool = described(False, "all", "print a line per step")
     converged_reason: bool = described(False, "all", "print why the solver stopped")
     view: bool = described(False, "all", "print the options, the sizes and the report")
@@ -164,13 +147,6 @@ class Options:
     def number(self) -> float:
         """rtol as a number: what displacements have to be right to."""
         return LOOSEST if isinstance(self.rtol, str) else self.rtol
-
-    @property
-    def penalty(self) -> float:
-        """ρ of the stiffening: without a preconditioner it would only spread eigenvalues of F."""
-        if isinstance(self.stiffening, str):
-            return 0.0 if self.qp_type == "smalse" else PENALTY
-        return self.stiffening
 
     def view_text(self, prefix: str) -> str:
         """One line per option."""

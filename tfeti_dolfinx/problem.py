@@ -13,7 +13,6 @@ from dolfinx import fem
 
 from tfeti_dolfinx.accuracy.diagnostics import Diagnostics, note_estimates
 from tfeti_dolfinx.accuracy.estimates import Estimates, estimate, goal_of, of_looks
-from tfeti_dolfinx.bem.boundary_elements import BoundaryElements, check_boundary_elements
 from tfeti_dolfinx.common.agreement import agreeing, described, fields_in, sums_of
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import require_real_petsc
@@ -26,11 +25,10 @@ from tfeti_dolfinx.constraints.gluing import (
     checked_conditions,
     listed_conditions,
 )
-from tfeti_dolfinx.constraints.spectrum import extreme_eigenvalues, require_slepc
 from tfeti_dolfinx.contact.records import Gap, gaps_by_position
 from tfeti_dolfinx.contact.search import ContactPartner, checked_contacts
 from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
-from tfeti_dolfinx.extensions import Extensions, Settings, guarded
+from tfeti_dolfinx.extensions import Extensions, Settings, check_method, guarded
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.stopping import ErrorTarget
 from tfeti_dolfinx.forms.assembly import Forms
@@ -43,6 +41,7 @@ from tfeti_dolfinx.report import Report, fill_result, settle_seconds
 from tfeti_dolfinx.solution import SavedState, Solution, check_state
 from tfeti_dolfinx.solve.coulomb import solve_with_friction
 from tfeti_dolfinx.solve.solver import conclude, learn, resolve_types
+from tfeti_dolfinx.subdomains.build import SubdomainMethod
 from tfeti_dolfinx.system import System
 
 # --- Solves with more contact rows until nothing overlaps -------------------------------------
@@ -270,7 +269,7 @@ class Stepping:
             stress=self._stress,
             thickness=self._thickness,
         )
-        solution.boundary = self._system.replaced.solved(u)
+        solution.boundary = self._system.elements.solved(u)
         return solution
 
 
@@ -323,7 +322,7 @@ class ContactProblem(Stepping):
         form_compiler_options: dict[str, Any] | None = None,
         jit_options: dict[str, Any] | None = None,
         extensions: Extensions | None = None,
-        boundary_elements: BoundaryElements | None = None,
+        boundary_elements: SubdomainMethod | None = None,
     ) -> None:
         checked_type(
             decomposition, Decomposition, "decomposition", "what decompose or read_gmsh return"
@@ -335,7 +334,7 @@ class ContactProblem(Stepping):
             extensions = Extensions() if extensions is None else extensions
             checked_type(extensions, Extensions, "extensions", "tfeti_dolfinx.Extensions")
             for_factors = factor_options(petsc_options, petsc_options_prefix)
-            own = guarded(extensions, comm)
+            own = guarded(extensions, self.options, comm)
             self._settings = Settings(self.options, petsc_options_prefix, for_factors, own)
             self.contacts = checked_contacts(contacts)
             bcs = listed_conditions(bcs)
@@ -343,8 +342,6 @@ class ContactProblem(Stepping):
             given |= {"stress": stress, "u": u, "boundary_elements": boundary_elements}
             given |= {"form_compiler_options": form_compiler_options, **self._settings.given}
             given |= self._given_besides()
-        if self.options.spectrum:
-            require_slepc(comm)
         V = displacement_space(a, decomposition)
         self.bcs = checked_conditions(bcs, V)
         self.u = fem.Function(V, name="displacement") if u is None else self._checked_u(u, V)
@@ -369,7 +366,7 @@ class ContactProblem(Stepping):
         forms.thickness = self._thickness
         self._doubts = Diagnostics(decomposition, self.dofs)
         if boundary_elements is not None:
-            check_boundary_elements(boundary_elements, extensions)
+            check_method(boundary_elements, extensions)
         self._system = System(
             forms,
             self.bcs,
@@ -536,10 +533,6 @@ class ContactProblem(Stepping):
         """Solve with the present rows, from the last solution on."""
         system, report = self._system, self.report
         dual, gluing = system.make(report), system.gluing
-        if self.options.spectrum and not system.spectrum:
-            with stage("spectrum", report.seconds):
-                system.spectrum = extreme_eigenvalues(gluing.constraints)
-        report.spectrum = system.spectrum
         dual.forget_counts()
         qp_type, _ = resolve_types(self.options, dual.contact_rows, self._settings.prefix)
         with stage("qp", report.seconds):

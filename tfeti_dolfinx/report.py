@@ -116,9 +116,6 @@ class Report:
         estimates: What ``ContactProblem.estimate`` has found since, and what it took; see
             ``Estimates``.
         errors: Relative errors against closed forms, filled by demos.
-        spectrum: With ``-tfeti_spectrum``: the extreme eigenvalues ``BBt_min`` and ``BBt_max`` of
-            B Bᵀ, ``BDBt_min`` and ``BDBt_max`` of B D⁻¹ Bᵀ. Their roots are the extreme
-            singular values of B and of B D^-½.
     """
 
     primal_dofs: int = 0
@@ -172,7 +169,6 @@ class Report:
     tolerances: dict[str, float] = field(default_factory=dict)
     estimates: dict[str, float] = field(default_factory=dict)
     errors: dict[str, float] = field(default_factory=dict)
-    spectrum: dict[str, float] = field(default_factory=dict)
     motion: dict[str, float] = field(default_factory=dict)
     contact_forces: list[list[float]] = field(default_factory=list)
     in_all: dict[str, float] = field(default_factory=dict)

@@ -6,16 +6,13 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from dolfinx import fem, geometry
 from mpi4py import MPI
 
-from tfeti_dolfinx.bem.inside import BoundarySolution
-from tfeti_dolfinx.bem.interior import Interior
 from tfeti_dolfinx.common.arrays import Array, sum_rows
-from tfeti_dolfinx.common.compat import geometry_dofmap
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.common.validation import checked_type
 from tfeti_dolfinx.constraints.contact_state import ContactState, ContactStatus, Multipliers
@@ -23,6 +20,7 @@ from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.forces import BodyForces, body_forces, vertex_tractions
 from tfeti_dolfinx.contact.search import ContactPartner
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.extensions import plugin
 from tfeti_dolfinx.forms.discretisation import StressRecovery
 from tfeti_dolfinx.forms.fields import (
     Stress,
@@ -43,10 +41,6 @@ from tfeti_dolfinx.qp.sets import Status, face_of
 
 # Of the size of the mesh: how far from a cell of finite elements a point may be
 PADDING = 1e-10
-# Share of directions hidden by a body that is neither 0 nor 1: points on its surface
-SURE = 1e-3
-# Their stress is taken so far on the way to the middle of their cell
-BESIDE = 0.1
 
 
 @dataclass(frozen=True)
@@ -79,9 +73,32 @@ def checked_points(points: Any, gdim: int) -> Array:
     return found
 
 
+class InnerSolution(Protocol):
+    """Solution inside of subdomains of another method than finite elements.
+
+    Attributes:
+        finite: Cells of this rank that have finite elements.
+    """
+
+    finite: Array
+
+    def values_at(
+        self, points: Array, found: tuple[Array, Array], thickness: float, u: fem.Function
+    ) -> Array:
+        """Return rows of the bodies of this rank, added for each point, as ``value_row``.
+
+        Args:
+            points: Shape ``(k, gdim)``.
+            found: Which of them lie in which cells of this rank.
+            thickness: What stresses have to be divided by.
+            u: Displacement on the torn mesh.
+        """
+        ...
+
+
 def values_at(
     points: Array,
-    boundary: BoundarySolution | None,
+    boundary: InnerSolution | None,
     thickness: Any,
     u: fem.Function,
     stress: fem.Function | None,
@@ -90,7 +107,7 @@ def values_at(
 
     Args:
         points: The same on all ranks, shape ``(k, gdim)``.
-        boundary: What boundary elements know.
+        boundary: What another method than finite elements knows.
         thickness: What stresses of boundary elements have to be divided by.
         u: Displacement on the torn mesh.
         stress: Stress in the cells, 3×3, or None.
@@ -99,56 +116,30 @@ def values_at(
     total = np.zeros((k, 1 + d + d * d))
     place, cells = _cells(u.function_space.mesh, points)
     if boundary is not None:
-        total += _of_boundary_elements(points, (place, cells), boundary, _number(thickness), u)
+        total += boundary.values_at(points, (place, cells), _number(thickness), u)
         kept = np.isin(cells, boundary.finite)
         place, cells = place[kept], cells[kept]
     if len(place):
-        x = _in_space(points[place])
+        x = in_space(points[place])
         sigma = np.full((len(place), d, d), np.nan)
         if stress is not None:
             sigma = stress.eval(x, cells).reshape(-1, 3, 3)[:, :d, :d]
-        np.add.at(total, place, _row(u.eval(x, cells).reshape(-1, d), sigma))
+        np.add.at(total, place, value_row(u.eval(x, cells).reshape(-1, d), sigma))
     u.function_space.mesh.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
     with np.errstate(invalid="ignore"):
         mean = np.where(total[:, :1] > 0.0, total[:, 1:] / total[:, :1], np.nan)
     return PointValues(mean[:, :d], mean[:, d:].reshape(k, d, d))
 
 
-def _of_boundary_elements(
-    points: Array,
-    found: tuple[Array, Array],
-    boundary: BoundarySolution,
-    thickness: float,
-    u: fem.Function,
-) -> Array:
-    """Return rows of the bodies of this rank, added for each point."""
-    (k, d), mesh = points.shape, u.function_space.mesh
-    total = np.zeros((k, 1 + d + d * d))
-    (place, cells), owner = found, boundary.cell_subdomain
-    for body in boundary.bodies():
-        share = body.inside.share(points)
-        own = np.flatnonzero(share > 1.0 - SURE)
-        sigma = body.inside.stress(points[own]) / thickness
-        total[own] += _row(body.inside.displacement(points[own]), sigma)
-        on = (share > SURE) & (share <= 1.0 - SURE)
-        there = np.flatnonzero(on[place] & (owner[cells] == body.subdomain))
-        if len(there):
-            own, first = np.unique(place[there], return_index=True)
-            cell, at = cells[there[first]], points[own]
-            middle = mesh.geometry.x[geometry_dofmap(mesh)[cell]].mean(axis=1)[:, :d]
-            sigma = body.inside.stress(at + BESIDE * (middle - at)) / thickness
-            total[own] += _row(u.eval(_in_space(at), cell).reshape(-1, d), sigma)
-    return total
-
-
-def _in_space(points: Array) -> Array:
+def in_space(points: Array) -> Array:
     """Return points with three coordinates."""
     x = np.zeros((len(points), 3))
     x[:, : points.shape[1]] = points
     return x
 
 
-def _row(u: Array, stress: Array) -> Array:
+def value_row(u: Array, stress: Array) -> Array:
+    """Return a row of ``values_at`` for each point: 1, displacement and stress."""
     return np.column_stack((np.ones(len(u)), u, stress.reshape(len(u), u.shape[1] ** 2)))
 
 
@@ -161,7 +152,7 @@ def _number(thickness: Any) -> float:
 
 def _cells(mesh: Any, points: Array) -> tuple[Array, Array]:
     """Return points by position, and the cells of this rank that each of them is in."""
-    x = _in_space(points)
+    x = in_space(points)
     size = float(np.ptp(mesh.geometry.x, axis=0).max(initial=0.0)) if len(mesh.geometry.x) else 0.0
     tree = geometry.bb_tree(mesh, mesh.topology.dim, padding=PADDING * size)
     near = geometry.compute_collisions_points(tree, x)
@@ -210,7 +201,7 @@ class Solution(ContactState):
     ) -> None:
         super().__init__(u, multipliers, decomposition, gluing, contacts, frozen(thickness))
         self.v: Array | None = None
-        self.boundary: BoundarySolution | None = None
+        self.boundary: InnerSolution | None = None
         self._stress = None
         if stress is not None:
             u_h = self.displacement
@@ -257,9 +248,9 @@ class Solution(ContactState):
         return values_at(points, self.boundary, self.thickness, self.displacement, stress)
 
     @cached_property
-    def interior(self) -> Interior:
+    def interior(self) -> Any:
         """Displacement and stress on the mesh by Somigliana's identity in boundary elements."""
-        return Interior(self.boundary, self.displacement, self._stress, self.dofs)
+        return plugin("Interior")(self.boundary, self.displacement, self._stress, self.dofs)
 
     @property
     def has_stress(self) -> bool:

@@ -10,13 +10,11 @@ from typing import Any, TypeVar
 import numpy as np
 from dolfinx import fem
 
-from tfeti_dolfinx.bem.boundary_elements import BoundaryElementAssembly, BoundaryElements
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.logging import stage
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.constraints.gluing import Gluing, Prescribed, glue, prescribe
 from tfeti_dolfinx.constraints.rows import row_weights
-from tfeti_dolfinx.constraints.stiffening import Stiffening
 from tfeti_dolfinx.contact.forces import condition_areas
 from tfeti_dolfinx.contact.records import Gap, slips
 from tfeti_dolfinx.contact.search import ContactPartner, ContactSearch
@@ -28,8 +26,12 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.report import Report, fill_sizes
 from tfeti_dolfinx.subdomains.block import Counters
-from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
-from tfeti_dolfinx.subdomains.clusters import clusters_of
+from tfeti_dolfinx.subdomains.build import (
+    FiniteElements,
+    SubdomainMethod,
+    make_subdomains,
+    subdomain_data,
+)
 from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
@@ -187,14 +189,13 @@ class System:
         dofs: Dof maps.
         decomposition: The torn mesh.
         settings: How to solve.
-        boundary: Where boundary elements are.
+        method: What takes the place of finite elements, say boundary elements.
 
     Attributes:
         forms: The compiled forms.
         bcs: Dirichlet conditions.
         friction: What bounds tangential forces.
-        replaced: What boundary elements put in the place of finite ones.
-        spectrum: Extreme eigenvalues of B Bᵀ, if somebody has put them here.
+        elements: Stiffness and load of subdomains.
     """
 
     def __init__(
@@ -205,18 +206,17 @@ class System:
         dofs: TornDofs,
         decomposition: Decomposition,
         settings: Settings,
-        boundary: BoundaryElements | None = None,
+        method: SubdomainMethod | None = None,
     ) -> None:
         self.forms, self.bcs, self._contacts = forms, bcs, contacts
         self._dofs, self._decomposition, self._settings = dofs, decomposition, settings
         self.friction = FrictionBounds(contacts, dofs, decomposition, forms.thickness)
-        self.replaced = BoundaryElementAssembly(boundary, dofs, decomposition)
-        self.spectrum: dict[str, float] = {}
-        self._stiffening = Stiffening(settings.options.penalty, dofs)
+        self.elements = (
+            FiniteElements(dofs) if method is None else method.assembly(dofs, decomposition)
+        )
         self._stages, self._counters, self._counted = Stages(), Counters(), 0
         self._seen = 0.0  # of ‖F‖, which more rows hardly change
         self._K: Any = None
-        self._added: Array | None = None
         self._search: ContactSearch | None = None
         self._known_rows: tuple[Sequence[float], Sequence[Array]] | None = None
         self._prescribed: Prescribed | None = None
@@ -253,8 +253,6 @@ class System:
             self.change("load")
         new, old = prescribe(self._dofs, self.bcs), self._prescribed
         self._prescribed = new
-        if self._stiffening.look(new):
-            self.change("stiffness")
         if old is None or any_rank(self._dofs.comm, not np.array_equal(new.flag, old.flag)):
             self.change("rows")
         elif any_rank(self._dofs.comm, not np.array_equal(new.value, old.value)):
@@ -302,7 +300,7 @@ class System:
     def count(self, report: Report) -> None:
         """Enter sizes and the stages made since the last call in a report."""
         if self._gluing is not None:
-            inside = self.replaced.inside()
+            inside = self.elements.inside()
             fill_sizes(report, self._dofs, self._decomposition, self._gluing, inside)
             report.unmet_contacts = self.search.unmet()
         made, report.reused = self._stages.take_counts()
@@ -338,9 +336,9 @@ class System:
 
     def _assemble_stiffness(self) -> None:
         K = self.forms.stiffness()
-        self._blocks = self.replaced.node_blocks(K, self._settings.making(self._counters))
-        self._K, self._added = K, self._stiffening.added(K)
-        if self.replaced.exists:  # the load that a force per volume makes depends on S
+        self._blocks = self.elements.node_blocks(K, self._settings.making(self._counters))
+        self._K = K
+        if self.elements.replaces:  # the load that a force per volume makes depends on S
             self.change("load")
 
     def _find_contacts(self) -> None:
@@ -358,34 +356,34 @@ class System:
         weights = row_weights(self._blocks, scaling, dofs.comm)
         prescribed, slip = made(self._prescribed), self.friction.slip(search)
         self._gluing = glue(dofs, prescribed, search.records, search.length, weights, slip)
-        self.spectrum = {}
 
     def _fill_right_side(self) -> None:
         values, gaps = made(self._prescribed).value, self.search.records.gap
         self._gluing = self.gluing.with_right_side(values, gaps, self.friction.slip(self.search))
 
     def _assemble_load(self) -> None:
-        self._f = self.replaced.load(self.forms)
+        self._f = self.elements.load(self.forms)
         if self._subdomains is not None:
             self._subdomains.update(f=self._dofs.to_primal(self._f))
 
     def _factor(self) -> None:
         counters, given = self._counters, self._settings
-        if self._K is None:  # it went into Blocks that could not be made
-            self._assemble_stiffness()
-            self._stages.made["stiffness"] += 1
-        K, self._K = self._K, None  # it goes into the Blocks
-        dofs, cut, choice = self._dofs, self._decomposition, given.local_choice
-        data = subdomain_data(dofs, cut, K, self._f, self.gluing.constraints.trace, self._added)
+        dofs, cut, trace = self._dofs, self._decomposition, self.gluing.constraints.trace
         with added_options(given.prefix, given.factor_options):
-            clusters = clusters_of(dofs, cut, given.options.clusters)
-            how = self.replaced.blocks(given.make_block(counters)), cut, counters, choice
-            self._subdomains = make_subdomains(data, *how, clusters)
+            kind = given.extensions.subdomains
+            self._subdomains = make_subdomains(
+                subdomain_data(dofs, cut, self._K, self._f, trace),
+                self.elements.blocks(given.make_block(counters)),
+                cut,
+                counters,
+                given.local_choice,
+                Subdomains if kind is None else kind(dofs, cut),
+            )
+        self._K = None
         self._take_trace()
 
     def _take_trace(self) -> None:
-        rows = self.gluing.constraints
-        made(self._subdomains).retrace(rows.trace, rows.span)
+        made(self._subdomains).retrace(self.gluing.constraints.trace)
 
     def _make_dual(self) -> None:
         settings, scene = self._settings, (self._dofs, self._decomposition)

@@ -11,6 +11,7 @@ import numpy as np
 
 from tfeti_dolfinx.bem.inside import Inside, SolvedBody
 from tfeti_dolfinx.bem.panels import Surface, surfaces
+from tfeti_dolfinx.bem.steklov import TOLERANCES as QUADRATURE
 from tfeti_dolfinx.bem.steklov import SurfaceStiffness
 from tfeti_dolfinx.common.arrays import Array, node_blocks
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
@@ -19,7 +20,7 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.subdomains.block import Block, SubdomainData
 from tfeti_dolfinx.subdomains.build import MakeBlock, submatrix
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
-from tfeti_dolfinx.subdomains.sparse_block import PLACE, SAME, SparseBlock, places_in_order
+from tfeti_dolfinx.subdomains.sparse_block import TOLERANCES, SparseBlock, places_in_order
 from tfeti_dolfinx.subdomains.stiffness import Stiffness
 
 # --- Block of a subdomain with boundary elements ----------------------------------------------
@@ -79,15 +80,12 @@ class BoundaryBlock(SparseBlock):
             )
         super().__init__(data, how)
 
-    def _found(self, K: Any, own: Stiffness | None) -> tuple[Stiffness, Array]:
+    def _found(self, K: Any) -> tuple[Stiffness, Array]:
         """Return the stiffness of the part's shape, and the place of its unknowns there."""
         return self._part.shape.stiffness, self._part.place
 
 
 # --- Boundary elements of all subdomains of a rank --------------------------------------------
-
-# Of the largest entry of a load: what quadrature leaves of a constant force per volume
-CONSTANT = 1e-7
 
 
 class Parts:
@@ -248,16 +246,18 @@ def _equal(shape: SurfaceStiffness, surface: Surface, K: Any) -> bool:
     if not all(np.array_equal(one.nodes, other.nodes) for one, other in pairs):
         return False
     ours, theirs = (x - x.min(axis=0) for x in (surface.panels.x, shape.x))
-    if np.abs(ours - theirs).max() > PLACE * theirs.max():
+    if np.abs(ours - theirs).max() > TOLERANCES.place * theirs.max():
         return False
-    return bool(abs(K - shape.K_fem).max() <= SAME * np.abs(K.data).max())
+    return bool(abs(K - shape.K_fem).max() <= TOLERANCES.entry * np.abs(K.data).max())
 
 
 def _force_per_volume(name: str, volume: Array, hats: Array) -> Array:
     """Return the constant b whose load this is."""
     forces = volume.reshape(len(hats), -1)
     b = forces.sum(axis=0) / hats.sum()
-    if np.abs(forces - hats[:, None] * b).max() > CONSTANT * np.abs(forces).max(initial=0.0):
+    if np.abs(forces - hats[:, None] * b).max() > QUADRATURE.constant * np.abs(forces).max(
+        initial=0.0
+    ):
         raise InputError(
             f"{name}: a load per volume varies there; boundary elements take a constant "
             "force per volume and tractions. Expected one of them, or finite elements"
@@ -267,7 +267,7 @@ def _force_per_volume(name: str, volume: Array, hats: Array) -> Array:
 
 def _check_inside(part: Part, f: Array, size: float) -> None:
     """Raise if something else than an integral over cells acts inside."""
-    if np.abs(f[~part.on_surface]).max(initial=0.0) > CONSTANT * size:
+    if np.abs(f[~part.on_surface]).max(initial=0.0) > QUADRATURE.constant * size:
         raise InputError(
             f"{part.name}: a load acts on facets inside boundary elements; expected tractions on "
             "their surface"

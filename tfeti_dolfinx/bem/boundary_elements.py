@@ -8,15 +8,13 @@ import numpy as np
 
 from tfeti_dolfinx.bem.block import Parts
 from tfeti_dolfinx.bem.inside import BoundarySolution
-from tfeti_dolfinx.common.arrays import Array, node_blocks
+from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.logging import cite
-from tfeti_dolfinx.common.validation import checked_type
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.subdomains.build import MakeBlock
+from tfeti_dolfinx.subdomains.build import FiniteElements, MakeBlock
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 
 
@@ -72,86 +70,61 @@ class BoundaryElements:
                 )
             return part > 0
 
-
-def check_boundary_elements(elements: Any, own: Extensions) -> None:
-    """Raise if boundary elements do not fit what the program brings.
-
-    Raises:
-        InputError: They are something else, or there is a Block of the program's own.
-    """
-    expected = 'tfeti_dolfinx.BoundaryElements, say BoundaryElements("ball")'
-    checked_type(elements, BoundaryElements, "boundary_elements", expected)
-    if own.block is not None:
-        raise InputError("boundary_elements: extensions have a block, too; expected one of them")
+    def assembly(self, dofs: TornDofs, decomposition: Decomposition) -> BoundaryElementAssembly:
+        """Return stiffness and load of the subdomains. Collective."""
+        return BoundaryElementAssembly(self, dofs, decomposition)
 
 
-class BoundaryElementAssembly:
-    """Stiffness and load of boundary elements in the place of finite ones, if there are any.
+class BoundaryElementAssembly(FiniteElements):
+    """Stiffness and load of boundary elements in the place of finite ones.
 
     Creation and all methods are collective.
 
     Args:
-        elements: The boundary elements, or None.
+        elements: The boundary elements.
         dofs: Dof maps.
         decomposition: The torn mesh.
     """
 
-    def __init__(
-        self, elements: BoundaryElements | None, dofs: TornDofs, decomposition: Decomposition
-    ) -> None:
-        self._dofs, self._decomposition = dofs, decomposition
-        self._chosen = None if elements is None else elements.chosen(decomposition)
-        self._parts: Parts | None = None
+    replaces = True
 
-    @property
-    def exists(self) -> bool:
-        """True if there are boundary elements."""
-        return self._chosen is not None
+    def __init__(
+        self, elements: BoundaryElements, dofs: TornDofs, decomposition: Decomposition
+    ) -> None:
+        super().__init__(dofs)
+        self._decomposition = decomposition
+        self._chosen = elements.chosen(decomposition)
+        self._made: Parts | None = None
 
     def node_blocks(self, K: Any, how: InverseFactory) -> Array:
-        """Make S; the stiffness's block of each primal node, shape ``(num_nodes, bs, bs)``.
+        """Make S, and return the stiffness's block of each primal node."""
+        self._made = Parts(self._dofs, self._decomposition, self._chosen, how)
+        return self._made.take_stiffness(K, super().node_blocks(K, how))
 
-        Args:
-            K: Stiffness of finite elements in DOLFINx's numbering, scipy CSR.
-            how: How inverses are made.
-
-        Raises:
-            InputError: The mesh or the stiffness does not fit.
-            FactorError: S could not be made.
-        """
-        blocks = node_blocks(K, self._dofs.bs)[self._dofs.dolfinx_node]
-        if self._chosen is None:
-            return blocks
-        self._parts = Parts(self._dofs, self._decomposition, self._chosen, how)
-        return self._parts.take_stiffness(K, blocks)
+    @property
+    def _parts(self) -> Parts:
+        assert self._made is not None
+        return self._made
 
     def load(self, forms: Forms) -> Array:
-        """Return this rank's load in DOLFINx's numbering.
-
-        Raises:
-            InputError: There is a load that boundary elements cannot take.
-        """
-        f = forms.load()
-        if self._parts is None:
-            return f
-        volume = forms.volume_load()
-        of_volume = None if volume is None else self._dofs.to_primal(volume)
-        hats = None if volume is None else forms.hats()[self._dofs.dolfinx_node]
-        replaced = self._parts.load(self._dofs.to_primal(f), of_volume, hats)
+        """Return this rank's load in DOLFINx's numbering."""
+        volume, of_volume, hats = forms.volume_load(), None, None
+        if volume is not None:
+            of_volume = self._dofs.to_primal(volume)
+            hats = forms.hats()[self._dofs.dolfinx_node]
+        replaced = self._parts.load(self._dofs.to_primal(forms.load()), of_volume, hats)
         return self._dofs.to_dolfinx(replaced)
 
     def blocks(self, make_block: MakeBlock) -> MakeBlock:
         """Return the factory of this rank's Blocks, those of finite elements as given."""
-        return make_block if self._parts is None else self._parts.blocks(make_block)
+        return self._parts.blocks(make_block)
 
-    def solved(self, u: Array) -> BoundarySolution | None:
+    def solved(self, u: Array) -> BoundarySolution:
         """Return the solution, in primal order, inside boundary elements."""
-        if self._parts is None or self._chosen is None:
-            return None
         cells = self._decomposition.cell_subdomain
         have = self._chosen[np.searchsorted(self._dofs.subdomains, cells)]
         return BoundarySolution(self._parts.solved(u), np.flatnonzero(~have), cells)
 
     def inside(self) -> int:
         """Return the number of unknowns of all ranks that boundary elements do without."""
-        return 0 if self._parts is None else self._parts.inside()
+        return self._parts.inside()

@@ -8,21 +8,41 @@ from functools import cache
 
 import basix
 import numpy as np
+from dolfinx import fem
 
 from tfeti_dolfinx.bem.integrals import in_chunks
 from tfeti_dolfinx.bem.panels import Panels
 from tfeti_dolfinx.bem.steklov import Steklov, gunter, rigid_motions
 from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.compat import geometry_dofmap
+from tfeti_dolfinx.solution import in_space, value_row
 
 # --- Somigliana's identity: displacement and stress inside ------------------------------------
 
-# A panel is cut in parts until their middles are as far as FAR of their sizes; from so many sizes
-# on a rule of this degree is exact to 1e-9. What is nearer to the surface than a panel's size over
-# 2 to the power of HALVINGS loses that.
-FAR, HALVINGS = 2.0, 12
-# Of the size of the body: so far from its box a point may be and on its surface, by rounding
-ON = 1e-10
-DEGREES = ((32.0, 4), (12.0, 5), (6.0, 6), (3.0, 10), (0.0, 14))
+
+@dataclass(frozen=True)
+class EvaluationParameters:
+    """Parameters of the solution inside and on the surface.
+
+    Attributes:
+        far, halvings: A panel is cut in parts until their middles are as far as ``far`` of their
+            sizes, at most so many times; nearer to the surface digits are lost.
+        degrees: From so many sizes on a rule of this degree is exact to 1e-9.
+        on: Of the size of the body: so far from its box a point may be and on its surface.
+        sure: Share of directions hidden by a body that is neither 0 nor 1 to this: points on its
+            surface.
+        beside: Their stress is taken so far on the way to the middle of their cell.
+    """
+
+    far: float = 2.0
+    halvings: int = 12
+    degrees: tuple[tuple[float, int], ...] = ((32, 4), (12, 5), (6, 6), (3, 10), (0, 14))
+    on: float = 1e-10
+    sure: float = 1e-3
+    beside: float = 0.1
+
+
+PARAMETERS = EvaluationParameters()
 
 
 class Inside:
@@ -138,7 +158,7 @@ def share(panels: Panels, points: Array) -> Array:
     """
     found = np.zeros(len(points))
     ones = np.ones((len(panels.nodes), panels.dim, 1))
-    margin = ON * panels.diameter
+    margin = PARAMETERS.on * panels.diameter
     low, high = panels.x.min(axis=0) - margin, panels.x.max(axis=0) + margin
     near = np.flatnonzero(np.all((points >= low) & (points <= high), axis=1))
     for cut in _cuts(panels, points[near], ones):
@@ -202,11 +222,11 @@ def _cuts(panels: Panels, points: Array, values: Array) -> Iterator[_Cut]:
     for some in in_chunks(np.arange(len(points)), 4 * len(panels.nodes)):
         point, panel = np.repeat(some, len(panels.nodes)), np.tile(_all(panels), len(some))
         corners, carried, measure = panels.corners[panel], values[panel], panels.measure[panel]
-        for level in range(HALVINGS + 1):
+        for level in range(PARAMETERS.halvings + 1):
             apart = np.linalg.norm(points[point] - corners.mean(axis=1), axis=1)
             apart /= panels.size[panel] / 2.0**level
-            far, below = (apart >= FAR) | (level == HALVINGS), np.inf
-            for least, degree in DEGREES:
+            far, below = (apart >= PARAMETERS.far) | (level == PARAMETERS.halvings), np.inf
+            for least, degree in PARAMETERS.degrees:
                 hats, weights = _rule(panels.dim, degree)
                 chosen = np.flatnonzero(far & (apart >= least) & (apart < below))
                 below = least
@@ -285,3 +305,25 @@ class BoundarySolution:
     bodies: Callable[[], Iterable[SolvedBody]]
     finite: Array
     cell_subdomain: Array
+
+    def values_at(
+        self, points: Array, found: tuple[Array, Array], thickness: float, u: fem.Function
+    ) -> Array:
+        """Return rows of the bodies of this rank, added for each point (``InnerSolution``)."""
+        (k, d), mesh = points.shape, u.function_space.mesh
+        total = np.zeros((k, 1 + d + d * d))
+        (place, cells), owner = found, self.cell_subdomain
+        for body in self.bodies():
+            share = body.inside.share(points)
+            own = np.flatnonzero(share > 1.0 - PARAMETERS.sure)
+            sigma = body.inside.stress(points[own]) / thickness
+            total[own] += value_row(body.inside.displacement(points[own]), sigma)
+            on = (share > PARAMETERS.sure) & (share <= 1.0 - PARAMETERS.sure)
+            there = np.flatnonzero(on[place] & (owner[cells] == body.subdomain))
+            if len(there):
+                own, first = np.unique(place[there], return_index=True)
+                cell, at = cells[there[first]], points[own]
+                middle = mesh.geometry.x[geometry_dofmap(mesh)[cell]].mean(axis=1)[:, :d]
+                sigma = body.inside.stress(at + PARAMETERS.beside * (middle - at)) / thickness
+                total[own] += value_row(u.eval(in_space(at), cell).reshape(-1, d), sigma)
+        return total

@@ -15,8 +15,44 @@ from tfeti_dolfinx.common.arrays import Array
 
 # --- Integrals of the layer operators ---------------------------------------------------------
 
-# points, or pairs of them, that are looked at together: what they need stays in the cache
-TOGETHER = 2**15
+
+@dataclass(frozen=True)
+class QuadratureRules:
+    """Rules of the layer integrals.
+
+    Attributes:
+        together: Points, or pairs of them, that are looked at together: what they need stays in
+            the cache.
+        polynomial: Gauss points that integrate polynomials of degree 5: what the products of two
+            hats and the Jacobian are in each variable.
+        segments: Distance of two midpoints over the sum of the lengths from which on Gauss' rule of
+            so many points is exact to rounding: the nearest singularity lies at δ of a half
+            length, outside an ellipse with half axes that sum up to ρ = δ + √(δ² − 1), and the
+            error is ρ^−2n: 6e-18 for δ = 6 and 8 points, 7e-16 for δ = 40 and 4.
+        touching: Gauss points along each variable for pairs of triangles that share 1, 2 or 3
+            corners, up to a distortion of the worse of both (2 is half a square): tractions of
+            constant stresses are right to 1e-4 up to 5.
+        apart: Distance of two midpoints over the longer of their longest edges, and the degree on
+            each triangle from which on it is taken.
+    """
+
+    together: int = 2**15
+    polynomial: int = 3
+    segments: tuple[tuple[float, int], ...] = ((20.0, 4), (3.0, 8))
+    touching: tuple[tuple[float, tuple[int, int, int]], ...] = (
+        (2.1, (6, 10, 8)),
+        (3.0, (8, 12, 12)),
+        (4.0, (10, 14, 18)),
+        (6.0, (14, 18, 24)),
+        (np.inf, (20, 24, 40)),
+    )
+    apart: tuple[tuple[float, int], ...] = (
+        *((8.0, 2), (4.0, 4), (2.0, 6)),
+        *((1.2, 10), (0.6, 16), (0.0, 30)),
+    )
+
+
+RULES = QuadratureRules()
 
 
 @dataclass(frozen=True)
@@ -57,16 +93,12 @@ class Layers:
 
 def in_chunks(items: Array, points: int) -> Iterator[Array]:
     """Parts of the items, each of which needs so many points."""
-    step = max(TOGETHER // max(points, 1), 1)
+    step = max(RULES.together // max(points, 1), 1)
     for start in range(0, len(items), step):
         yield items[start : start + step]
 
 
 # --- Quadrature for pairs of triangles --------------------------------------------------------
-
-# Gauss points that integrate polynomials of degree 5: what the products of two hats and the
-# Jacobian are in each variable
-POLYNOMIAL = 3
 
 
 @dataclass(frozen=True)
@@ -94,7 +126,9 @@ def touching_rule(shared: int, n: int) -> PairRule:
     are shared corners are factors of r = x − y, the first one ξ always. The kernels are homogeneous
     in r, so that what is left of these factors is a polynomial; n points are for the others.
     """
-    rules = [np.polynomial.legendre.leggauss(POLYNOMIAL if k < shared else n) for k in range(4)]
+    rules = [
+        np.polynomial.legendre.leggauss(RULES.polynomial if k < shared else n) for k in range(4)
+    ]
     grid = np.meshgrid(*[0.5 * (points + 1.0) for points, _ in rules], indexing="ij")
     xi, a, b, c = (g.ravel() for g in grid)
     tensor = np.einsum("i,j,k,l->ijkl", *[0.5 * weights for _, weights in rules]).ravel()
@@ -156,12 +190,6 @@ def _vertex(xi: Array, a: Array, b: Array, c: Array) -> list[Map]:
 # Far from each other the closed forms are small differences of large numbers, and Gauss' rule is
 # exact to rounding.
 
-# Distance of two midpoints over the sum of the lengths from which on Gauss' rule of so many points
-# is exact to rounding: the nearest singularity lies at δ of a half length, outside an ellipse with
-# half axes that sum up to ρ = δ + √(δ² − 1), and the error is ρ^−2n: 6e-18 for δ = 6 and 8 points,
-# 7e-16 for δ = 40 and 4.
-FAR = ((20.0, 4), (3.0, 8))
-
 
 def layers_2d(panels: Panels) -> Layers:
     """V_Δ, R and K_Δ of plane strain; ρ as ``Panels`` has it."""
@@ -169,7 +197,7 @@ def layers_2d(panels: Panels) -> Layers:
     first, second = np.indices((len(lengths),) * 2).reshape(2, -1)
     apart = np.linalg.norm(panels.midpoints[first] - panels.midpoints[second], axis=1)
     ratio, below = apart / (lengths[first] + lengths[second]), np.inf
-    for least, points in (*FAR, (-1.0, 0)):
+    for least, points in (*RULES.segments, (-1.0, 0)):
         for some in in_chunks(np.flatnonzero((ratio >= least) & (ratio < below)), points**2):
             i, j = first[some], second[some]
             _put(layers, i, j, _by_rule(panels, i, j, points) if points else _exact(panels, i, j))
@@ -265,19 +293,6 @@ def _difference(F: Array) -> Array:
 
 # --- Layer integrals on triangles -------------------------------------------------------------
 
-# Gauss points along each variable for pairs that share 1, 2 or 3 corners, up to a distortion of
-# the worse of both (2 is half a square): tractions of constant stresses are right to 1e-4 up to 5.
-TOUCHING = (
-    (2.1, {1: 6, 2: 10, 3: 8}),
-    (3.0, {1: 8, 2: 12, 3: 12}),
-    (4.0, {1: 10, 2: 14, 3: 18}),
-    (6.0, {1: 14, 2: 18, 3: 24}),
-    (np.inf, {1: 20, 2: 24, 3: 40}),
-)
-# Distance of two midpoints over the longer of their longest edges, and the degree on each triangle
-# from which on it is taken
-APART = ((8.0, 2), (4.0, 4), (2.0, 6), (1.2, 10), (0.6, 16), (0.0, 30))
-
 
 def layers_3d(panels: Panels) -> Layers:
     """V_Δ, R and K_Δ of three dimensions."""
@@ -287,9 +302,9 @@ def layers_3d(panels: Panels) -> Layers:
     pairs = (first, second, order_i, order_j)
     distortion = np.maximum(panels.distortion[first], panels.distortion[second])
     above = 0.0
-    for most, counts in TOUCHING:
+    for most, counts in RULES.touching:
         fits = (distortion > above) & (distortion <= most)
-        for count, n in counts.items():
+        for count, n in enumerate(counts, start=1):
             some = np.flatnonzero(fits & (shared == count))
             if len(some):
                 _integrate(layers, pairs, some, touching_rule(count, n))
@@ -297,7 +312,7 @@ def layers_3d(panels: Panels) -> Layers:
     apart = np.linalg.norm(panels.midpoints[first] - panels.midpoints[second], axis=1)
     ratio = apart / np.maximum(panels.size[first], panels.size[second])
     below = np.inf
-    for least, degree in APART:
+    for least, degree in RULES.apart:
         some = np.flatnonzero((shared == 0) & (ratio >= least) & (ratio < below))
         _integrate(layers, pairs, some, apart_rule(degree))
         below = least

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
+from weakref import ref
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
@@ -20,9 +21,28 @@ from tfeti_dolfinx.subdomains.stiffness import Stiffness
 
 # --- Galerkin approximation of the Steklov–Poincaré operator ----------------------------------
 
-# Of the largest nodal force of constant stresses: how wrong quadrature on long thin triangles may
-# make them
-WRONG = 1e-2
+
+@dataclass(frozen=True)
+class StiffnessTolerances:
+    """Tolerances of boundary elements.
+
+    Attributes:
+        wrong: Of the largest nodal force of constant stresses: how wrong quadrature on long thin
+            triangles may make them.
+        same: Of the largest entry of a stiffness: what rounding and quadrature of a constant
+            stress leave.
+        constant: Of the largest entry of a load: what quadrature leaves of a constant force per
+            volume.
+        together: Right sides that are solved for at once.
+    """
+
+    wrong: float = 1e-2
+    same: float = 1e-7
+    constant: float = 1e-7
+    together: int = 256
+
+
+TOLERANCES = StiffnessTolerances()
 
 
 @dataclass(frozen=True)
@@ -107,7 +127,7 @@ def steklov(panels: Panels, law: IsotropicLaw) -> Steklov:
     half = SR - 0.5 * R @ (R.T @ SR)
     S = S - half @ R.T - R @ half.T
     S = 0.5 * (S + S.T)
-    if (wrong := wrong_forces(panels, law, S)) > WRONG:
+    if (wrong := wrong_forces(panels, law, S)) > TOLERANCES.wrong:
         raise InputError(
             f"boundary elements on triangles whose longest edge squared is up to "
             f"{2.0 * panels.distortion.max():.0f} times their area make forces of constant "
@@ -212,9 +232,6 @@ def _by_nodes(count: int, d: int) -> Array:
 
 # --- Elastic moduli read from a finite element stiffness --------------------------------------
 
-# Of the largest entry: what rounding and quadrature of a constant stress leave
-SAME = 1e-7
-
 
 def law_of(K: Any, surface: Surface, name: str) -> IsotropicLaw:
     """μ and ν of the constant stress σ that linear displacements have.
@@ -246,7 +263,7 @@ def law_of(K: Any, surface: Surface, name: str) -> IsotropicLaw:
     expected = np.zeros_like(forces)
     stress = law.stress(np.eye(d * d).reshape(d * d, d, d))
     expected[:, : d * d] = np.einsum("lki,ni->nkl", stress, surface.normals).reshape(-1, d * d)
-    most = SAME * np.max(abs(K) @ np.abs(moved))
+    most = TOLERANCES.same * np.max(abs(K) @ np.abs(moved))
     if not (law.mu > 0.0 and -1.0 < law.nu < 0.5 and np.abs(forces - expected).max() <= most):
         raise InputError(
             f"{name}: boundary elements need one homogeneous, isotropic law, and nothing beside "
@@ -263,8 +280,6 @@ def _isotropic(C: Array) -> IsotropicLaw:
 
 
 # --- A subdomain with its surface nodes in boundary element order -----------------------------
-
-TOGETHER = 256  # right sides that are solved for at once
 
 
 class SurfaceStiffness:
@@ -303,16 +318,18 @@ class SurfaceStiffness:
         except TfetiError as error:
             raise type(error)(f"{name}: {error}") from error
         self.S = np.mean([body.S for body in self.bodies], axis=0)
-        self._stiffness: Stiffness | None = None
+        self._stiffness: ref[Stiffness] | None = None
         self._unit_loads: Array | None = None
         self.K = self._replaced()
 
     @property
     def stiffness(self) -> Stiffness:
-        """K_S with its factors, made when it is first asked for, and again once nobody had it."""
-        if self._stiffness is None or self._stiffness.users == 0:
-            self._stiffness = Stiffness(self.name, self.x, self.K, self._how)
-        return self._stiffness
+        """K_S with its factors, made when it is first asked for, and again once nobody has it."""
+        found = None if self._stiffness is None else self._stiffness()
+        if found is None:
+            found = Stiffness(self.name, self.x, self.K, self._how)
+            self._stiffness = ref(found)
+        return found
 
     def body_force_load(self, hats: Array, b: Array) -> Array:
         """Load on all unknowns of a force b per volume, shape ``(n,)``.
@@ -351,7 +368,7 @@ class SurfaceStiffness:
         """K_oi K_ii⁻¹ K_io."""
         cut, K = self._cut, self.K_fem
         K_io, factor = K[cut:, :cut].tocsc(), self._inner_factor()
-        columns = [slice(k, k + TOGETHER) for k in range(0, cut, TOGETHER)]
+        columns = [slice(k, k + TOLERANCES.together) for k in range(0, cut, TOLERANCES.together)]
         parts = [K_io.T @ factor.solve(K_io[:, some].toarray()) for some in columns]
         factor.destroy()
         return np.hstack(parts)
@@ -366,9 +383,8 @@ class SurfaceStiffness:
         return np.asarray(carried)
 
     def _inner_factor(self) -> CholeskyFactor:
-        cut, counters = self._cut, self._how.counters
-        counters.factorizations += 1
-        counters.analyses += 1
+        cut = self._cut
+        self._how.counters.factorizations += 1
         try:
             return CholeskyFactor(self.K_fem[cut:, cut:].tocsr(), self._how.prefix)
         except FactorError as error:

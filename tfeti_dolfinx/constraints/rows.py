@@ -130,62 +130,6 @@ def row_weights(blocks: Array, scaling: str, comm: MPI.Intracomm) -> Array:
     return np.repeat(D, blocks.shape[1])
 
 
-# --- Directions in which rows act on a node ---------------------------------------------------
-
-# of the largest square: directions of normals that differ by less are one but for rounding
-ALIKE = 1e-12
-
-
-def row_span(dofs: TornDofs, equalities: Rows, contact: Rows, trace: Array) -> Array:
-    """Project each node onto the directions rows act in, as rows of the trace. Collective.
-
-    A node that only a contact meets is held along the normal, whatever axis that lies along. Where
-    normals of several conditions differ, or there is friction or gluing, it is held in more.
-
-    Args:
-        dofs: Dof maps.
-        equalities: This rank's rows of equalities, one component each.
-        contact: Its rows of contact conditions.
-        trace: Local primal unknowns that rows of any rank touch, ascending.
-
-    Returns:
-        Shape ``(t, bs)``: the row of the component in the bs × bs projector of the node.
-    """
-    bs = dofs.bs
-    columns = np.unique(equalities.column)
-    exchange, start = Exchange(dofs.comm, owner_of(dofs.offsets * bs, columns)), dofs.offsets
-    held = np.zeros(dofs.num_nodes * bs)
-    held[exchange.send(columns) - start[dofs.comm.rank] * bs] = 1.0
-    nodes, grams = _grams(contact, bs)
-    exchange = Exchange(dofs.comm, owner_of(start, nodes))
-    met, place = np.unique(exchange.send(nodes) - start[dofs.comm.rank], return_inverse=True)
-    gram = sum_rows(place, exchange.send(grams), len(met))
-    span, component = np.zeros((len(trace), bs)), trace % bs
-    span[np.arange(len(trace)), component] = held[trace]
-    own, of_met = np.flatnonzero(np.isin(trace // bs, met)), np.searchsorted(met, trace // bs)
-    span[own] = _projectors(gram, held.reshape(-1, bs)[met])[of_met[own], component[own]]
-    return span
-
-
-def _grams(rows: Rows, bs: int) -> tuple[Array, Array]:
-    """Return nodes that rows act on, and the sums of aaᵀ of their coefficients a there."""
-    node = rows.column // bs
-    pairs, place = np.unique(node * len(rows) + rows.row, return_inverse=True)
-    a = np.zeros((len(pairs), bs))
-    a[place, rows.column % bs] = rows.value
-    nodes, place = np.unique(pairs // max(len(rows), 1), return_inverse=True)
-    return nodes, sum_rows(place, a[:, :, None] * a[:, None, :], len(nodes))
-
-
-def _projectors(gram: Array, held: Array) -> Array:
-    """Project onto the ranges of Σaaᵀ and of prescribed components, shape ``(k, bs, bs)``."""
-    size = np.trace(gram, axis1=1, axis2=2)[:, None, None]
-    gram = np.divide(gram, size, out=np.zeros_like(gram), where=size > 0.0)
-    values, vectors = np.linalg.eigh(gram + held[:, :, None] * np.eye(held.shape[1]))
-    seen = values > ALIKE * values.max(axis=1, initial=0.0, keepdims=True)
-    return np.einsum("nik,nk,njk->nij", vectors, seen, vectors)
-
-
 # --- Coefficients of contact conditions -------------------------------------------------------
 
 # Of a row's norm: what is left of less is rounding, scaled up to unit norm.
@@ -320,8 +264,6 @@ class Constraints:
         c: Right sides, distributed as the rows; 0 until they are set.
         sets: Which local rows are what.
         trace: Local primal unknown of each local trace unknown, ascending.
-        span: Projector of each node of the trace onto the directions that rows act along, the row
-            of each trace unknown, shape ``(t, bs)``.
         weights: D on the local trace unknowns: the rows are scaled with it.
         scale: The s_i of the conditions with rows, one for each of ``sets.normals``: over it what
             a row misses is a length.
@@ -337,7 +279,6 @@ class Constraints:
     c: PETSc.Vec
     sets: RowSets
     trace: Array
-    span: Array
     weights: Array
     scale: Array
     tangent_scale: Array
@@ -402,7 +343,6 @@ def assemble_constraints(
     equalities, normals, tangents = (len(table) for table in tables)
     sets = row_sets(equalities, normals, tangents, dofs.bs)
     trace, column = _trace_columns(dofs, rows.column)
-    span = row_span(dofs, tables[0], stack(list(tables[1:])), trace)
     num_rows, num_columns = len(rows), len(trace)
     order = np.lexsort((column, rows.row))
     indptr = np.concatenate(([0], np.cumsum(np.bincount(rows.row, minlength=num_rows))))
@@ -421,7 +361,6 @@ def assemble_constraints(
         c=c,
         sets=sets,
         trace=trace,
-        span=span,
         weights=weights[trace],
         scale=scale,
         tangent_scale=tangent_scale,

@@ -7,6 +7,9 @@ space does not know of them, and M_f is an inverse of F₀ alone.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Protocol
+
 import numpy as np
 from petsc4py import PETSc
 from scipy.sparse import csr_array, diags_array, hstack
@@ -28,14 +31,35 @@ STEPS, LARGE = 3, 2.4
 ROUNDING = 1e-30
 
 
+class Deflation(Protocol):
+    """A coarse space of a preconditioner on faces.
+
+    Attributes:
+        count: Number of its motions, of all subdomains.
+        amplification: In each body the largest of max diag(K)/R̂ᵀKR̂, shape ``(b,)``.
+        factors: Makes the factors of faces, and counts them.
+    """
+
+    count: int
+    amplification: Array
+    factors: FaceFactors
+
+    def balanced(self, face: Face, on_face: FaceOperator) -> FaceOperator:
+        """Return M_f, which is taken over, with these motions. Collective."""
+        ...
+
+    def destroy(self) -> None:
+        """Free what belongs to it. Collective."""
+        ...
+
+
 class SoftModes:
     """Ĝ of the motions that springs hold more softly than rows would.
 
     Such are those with R̂ᵀKR̂ < σ‖Ĝᵀ‖², σ the mean stiffness of a scaled row. They make eigenvalues
     of M_f F up to about 1 and the largest one of D⁻¹ĜM_fĜᵀ: where that is small M_f is better
     alone, and none of them is taken; some would be worse than all or none. Where every subdomain
-    has all its rigid motions in the kernel there are none, and nothing is multiplied. In clusters
-    ``ClusterMotions`` takes the place of this.
+    has all its rigid motions in the kernel there are none, and nothing is multiplied.
 
     Args:
         B: Dual rows × trace unknowns.
@@ -96,6 +120,10 @@ class SoftModes:
 
     def destroy(self) -> None:
         """Nothing of PETSc is kept."""
+
+
+# from B, the natural coarse space, weights, preconditioner and a prefix of options
+MakeDeflation = Callable[[PETSc.Mat, CoarseSpace, Array, DualOperator, str], Deflation]
 
 
 class _Springs:

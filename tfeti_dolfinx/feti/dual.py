@@ -13,9 +13,8 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root, largest, norm_over
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.feti.clusters import ClusterMotions, motions_for
 from tfeti_dolfinx.feti.coarse import CoarseSpace
-from tfeti_dolfinx.feti.deflation import SoftModes
+from tfeti_dolfinx.feti.deflation import Deflation, MakeDeflation, SoftModes
 from tfeti_dolfinx.feti.operator import (
     DualOperator,
     MakePreconditioner,
@@ -159,6 +158,7 @@ class Dual:
         preconditioner: MakePreconditioner | None = None,
         options_prefix: str = "tfeti_",
         feasible: FeasibleLaw = contact_set,
+        deflation: MakeDeflation = SoftModes,
     ) -> None:
         self.constraints, self.subdomains = constraints, subdomains
         self._given = constraints
@@ -184,10 +184,9 @@ class Dual:
         normals, tangents = constraints.sets.normals, constraints.sets.tangents.ravel()
         prefix = f"{options_prefix}coarse_"
         self.coarse = CoarseSpace(B, subdomains, normals, tangents, prefix)
-        self.soft: SoftModes | ClusterMotions | None = None
+        self.soft: Deflation | None = None
         if self.preconditioner is not None:
-            also = (constraints.weights, self.preconditioner, prefix)
-            self.soft = motions_for(B, self.coarse, *also)
+            self.soft = deflation(B, self.coarse, constraints.weights, self.preconditioner, prefix)
         self.contact_rows = constraints.sets.contact_rows(comm)
         self._law, self.feasible = feasible, feasible(constraints)
         self._images = dict[str, tuple[Array, OperatorProduct]]()

@@ -176,7 +176,7 @@ class Predictor:
         if M is not self._M:
             self.destroy()
             counters = Counters()
-            data = subdomain_data(self._dofs, self._decomposition, M.copy(), f, constraints.trace)
+            data = subdomain_data(self._dofs, self._decomposition, M, f, constraints.trace)
             with added_options(settings.prefix, settings.factor_options):
                 self._subdomains = make_subdomains(
                     data,
@@ -193,7 +193,7 @@ class Predictor:
             return
         if self._dual is not None:
             self._dual.destroy()
-            self._subdomains.retrace(constraints.trace, constraints.span)
+            self._subdomains.retrace(constraints.trace)
         scene = self._dofs, self._decomposition
         self._dual = settings.make_dual(constraints, self._subdomains, *scene, _frictionless)
 

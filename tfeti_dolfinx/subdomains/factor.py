@@ -1,13 +1,14 @@
-"""Factors of sparse symmetric matrices, and inverses made of them."""
+"""Cholesky factors of sparse matrices by PETSc, and the options that they read."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from enum import IntEnum
 from functools import cache
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -16,8 +17,6 @@ from petsc4py import PETSc
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import is_read
 from tfeti_dolfinx.errors import FactorError
-
-# --- Sparse Cholesky factors ------------------------------------------------------------------
 
 log = logging.getLogger(__name__)
 
@@ -34,11 +33,17 @@ DEFINITE = {
 QUIET = {"mat_cholmod_print": "0"}
 # prefix of the options of a factor that is made to see what it reads
 TRIAL = "tfeti_trial_"
-# PETSc's error codes, which petsc4py does not name
-OUT_OF_MEMORY, NO_SUPPORT, MISSING_SOLVER = 55, 56, 92
-ZERO_PIVOTS = (71, 81)
-REAL = 8  # bytes of a number
 CHOLMOD_OUT_OF_MEMORY = "CHOLMOD factorization failed with status -2"
+
+
+class PetscError(IntEnum):
+    """Error codes of PETSc, which petsc4py does not name."""
+
+    OUT_OF_MEMORY = 55
+    NO_SUPPORT = 56
+    ZERO_PIVOT_LU = 71
+    ZERO_PIVOT_CHOLESKY = 81
+    MISSING_SOLVER = 92
 
 
 class NotPositiveDefiniteError(FactorError, ArithmeticError):
@@ -62,93 +67,63 @@ class CholeskyFactor:
     """A = L Lᵀ of a symmetric positive definite matrix on one rank.
 
     Args:
-        A: scipy sparse matrix, both triangles, shape ``(n, n)``.
+        A: scipy sparse matrix, both triangles, shape ``(n, n)``; not needed any more after it.
         prefix: Prefix of the PETSc options ``pc_factor_...`` and ``mat_...`` that it heeds.
-        keep: Whether ``refactor`` will be asked for: the arrays of A, CSR with sorted indices,
-            are then shared, not copied, and its owner may change the values. Else A is let go.
 
     Raises:
         NotPositiveDefiniteError: A is not positive definite.
         FactorError: There is no memory for the factor, PETSc has no such solver, or it fails.
     """
 
-    def __init__(self, A: Any, prefix: str = "tfeti_sub_", keep: bool = False) -> None:
-        self._prefix, self._keep = prefix, keep
-        self._matrix: Any = as_petsc_matrix(A)
-        self._b, self._x = self._matrix.createVecs()
-        self._pc: Any = PETSc.PC().create(PETSc.COMM_SELF)
+    def __init__(self, A: Any, prefix: str = "tfeti_sub_") -> None:
+        matrix, pc = as_petsc_matrix(A), PETSc.PC().create(PETSc.COMM_SELF)
+        self._b, self._x = matrix.createVecs()
         self._factor: Any = None
-        self._make(lambda: _factored(self._pc, self._matrix, prefix))
-
-    def refactor(self) -> None:
-        """Factor the present values of A: no ordering, no symbolic factorisation.
-
-        Raises:
-            NotPositiveDefiniteError: A is not positive definite.
-            FactorError: The factor could not be made.
-        """
-        self._matrix.stateIncrease()  # PETSc does not see that the shared values have changed
-        self._make(lambda: _factored_again(self._pc, self._prefix))
-
-    def _make(self, factored: Callable[[], PETSc.Mat]) -> None:
-        """Make the factor and see that it is one; on an error nothing stays."""
         try:
-            self._factor = factored()
+            self._factor = _factored(pc, matrix, prefix)
             _check_definite(self._factor)
             if not np.all(np.isfinite(self.solve(np.ones(self._b.getLocalSize())))):
                 raise NotPositiveDefiniteError("a pivot is zero")
         except (PETSc.Error, FactorError) as error:
             # PETSc knows no package yet where it could not read an option
-            solver = self._pc.getFactorSolverType() or f"PETSc, with options -{self._prefix}...,"
-            cause = _cause(error, solver, self._matrix)
+            solver = pc.getFactorSolverType() or f"PETSc, with options -{prefix}...,"
             self.destroy()
-            raise cause from error
-        if not self._keep:
-            self._release()
+            raise _cause(error, solver, matrix) from error
+        finally:
+            pc.destroy()
+            matrix.destroy()
 
     @property
     def size(self) -> FactorSize:
         """Storage of the factor, as far as its package tells."""
         info = self._factor.getInfo()
         entries = max(info["nz_used"], float(self._b.getLocalSize()))
-        return FactorSize(entries, max(info["memory"], REAL * entries))
+        return FactorSize(entries, max(info["memory"], self._b.array_r.itemsize * entries))
 
     def solve(self, b: Array) -> Array:
         """A⁻¹ b, shapes ``(n,)`` or ``(n, q)``."""
-        if b.ndim == 2 and b.shape[1] == 1:
-            return self.solve(b[:, 0])[:, None]
         if b.ndim == 2:
-            return self._solve_many(b) if b.shape[1] else np.array(b)
+            if b.shape[1] <= 1:
+                return np.stack([self.solve(column) for column in b.T], axis=1) if b.size else b
+            x = np.empty(b.shape, order="F")
+            given, found = (
+                PETSc.Mat().createDense(b.shape, array=array, comm=PETSc.COMM_SELF)
+                for array in (np.asfortranarray(b), x)
+            )
+            self._factor.matSolve(given, found)
+            x = np.array(found.getDenseArray(readonly=True), order="F")
+            given.destroy()
+            found.destroy()
+            return x
         self._b.array[:] = b
         self._factor.solve(self._b, self._x)
         return np.array(self._x.array_r)
 
-    def _solve_many(self, b: Array) -> Array:
-        """A⁻¹ b, shape ``(n, q)``, in one sweep over the factor."""
-        x = np.empty(b.shape, order="F")
-        given, found = (
-            PETSc.Mat().createDense(b.shape, array=array, comm=PETSc.COMM_SELF)
-            for array in (np.asfortranarray(b), x)
-        )
-        self._factor.matSolve(given, found)
-        x = np.array(found.getDenseArray(readonly=True), order="F")
-        given.destroy()
-        found.destroy()
-        return x
-
     def destroy(self) -> None:
         """Free the factor."""
-        self._release()
         for item in (self._b, self._x, self._factor):
             if item is not None:
                 item.destroy()
-
-    def _release(self) -> None:
-        """Let go of what only the next factorisation would need."""
-        for item in (self._pc, self._matrix):
-            if item is not None:
-                item.destroy()
-        self._pc = self._matrix = None
 
 
 @contextmanager
@@ -221,9 +196,8 @@ def _makes_factor(solver: str, prefix: str) -> bool:
 
 def say_if_not_cholmod(comm: MPI.Intracomm) -> None:
     """Log, on rank 0 and once, what factors the matrices where PETSc has no CHOLMOD."""
-    solver = default_solver()
-    if solver != SOLVERS[0] and comm.rank == 0:
-        _say(solver)
+    if comm.rank == 0 and default_solver() != SOLVERS[0]:
+        _say(default_solver())
 
 
 @cache
@@ -253,18 +227,13 @@ def _factored(pc: PETSc.PC, matrix: PETSc.Mat, prefix: str) -> PETSc.Mat:
     pc.setOptionsPrefix(prefix)
     pc.setType(PETSc.PC.Type.CHOLESKY)
     pc.setOperators(matrix)
-    return _factored_again(pc, prefix)
-
-
-def _factored_again(pc: PETSc.PC, prefix: str) -> PETSc.Mat:
-    """Return the factor of the present values, numeric only if there has been one."""
     given = {"pc_factor_mat_solver_type": default_solver(), **DEFINITE, **QUIET}
     with added_options(prefix, given):
         pc.setFromOptions()
         pc.setUp()
     reason = pc.getFailedReason()
     if reason == PETSc.PC.FailedReason.FACTOR_OUTMEMORY:
-        raise PETSc.Error(OUT_OF_MEMORY)
+        raise PETSc.Error(PetscError.OUT_OF_MEMORY)
     if reason:
         raise NotPositiveDefiniteError("a pivot is zero")
     return pc.getFactorMatrix()
@@ -275,7 +244,7 @@ def _check_definite(factor: PETSc.Mat) -> None:
     try:
         negative, zero, _ = factor.getInertia()
     except PETSc.Error as error:
-        if error.ierr == NO_SUPPORT:
+        if error.ierr == PetscError.NO_SUPPORT:
             return
         raise
     if negative or zero:
@@ -287,84 +256,16 @@ def _cause(error: Exception, solver: str, A: PETSc.Mat) -> FactorError:
     if isinstance(error, FactorError):
         return type(error)(f"not positive definite ({solver}: {error})")
     code = getattr(error, "ierr", None)
-    if code in ZERO_PIVOTS:
+    if code in (PetscError.ZERO_PIVOT_LU, PetscError.ZERO_PIVOT_CHOLESKY):
         return NotPositiveDefiniteError(f"not positive definite (found by {solver})")
-    if code == OUT_OF_MEMORY or CHOLMOD_OUT_OF_MEMORY in str(error):
+    if code == PetscError.OUT_OF_MEMORY or CHOLMOD_OUT_OF_MEMORY in str(error):
         return FactorError(
             f"out of memory: {solver} had none for the factor of {A.getSize()[0]} unknowns with "
             f"{A.getInfo()['nz_used']:.0f} entries; expected smaller subdomains, or more memory"
         )
-    if code == MISSING_SOLVER:
+    if code == PetscError.MISSING_SOLVER:
         known = ", ".join(name for name in SOLVERS if has_solver(name))
         return FactorError(
             f"this PETSc makes no Cholesky factors by {solver}; expected one of {known}"
         )
     return FactorError(f"{solver} failed: {str(error).strip().splitlines()[-1]}")
-
-
-# --- Protocol of a generalised inverse --------------------------------------------------------
-
-
-class GeneralisedInverse(Protocol):
-    """K⁺ with K K⁺ K = K."""
-
-    def solve(self, b: Array) -> Array:
-        """K⁺ b, shape ``(n,)``."""
-        ...
-
-    def refactor(self, R: Array) -> None:
-        """Follow new values of K in the same pattern; R is their kernel.
-
-        Raises:
-            FactorError: The factor could not be made.
-        """
-        ...
-
-    def destroy(self) -> None:
-        """Free the factor."""
-        ...
-
-
-class FactoredInverse:
-    """Base of the package's own: a sparse factor, which takes several right sides at once."""
-
-    _factor: CholeskyFactor
-
-    def solve(self, b: Array) -> Array:
-        """K⁺ b, shapes ``(n,)`` or ``(n, q)``."""
-        return self._factor.solve(b)
-
-    @property
-    def size(self) -> FactorSize:
-        """Storage of the factor."""
-        return self._factor.size
-
-    def refactor(self, R: Array) -> None:
-        """Follow new values of K in the same pattern; R is their kernel.
-
-        Raises:
-            FactorError: The factor could not be made.
-        """
-        raise NotImplementedError("refactor")
-
-    def destroy(self) -> None:
-        """Free the factor."""
-        self._factor.destroy()
-
-
-def solved(inverse: GeneralisedInverse, b: Array) -> Array:
-    """K⁺ b, shapes ``(n,)`` or ``(n, q)``, by an inverse that may know single vectors only."""
-    if b.ndim == 1 or isinstance(inverse, FactoredInverse):
-        return inverse.solve(b)
-    return np.stack([inverse.solve(column) for column in b.T], axis=1)
-
-
-@contextmanager
-def lent(entries: Array, places: Array, values: Array | float) -> Iterator[None]:
-    """Other values at some places, in the block; the old ones come back to the last bit."""
-    kept = entries[places]
-    entries[places] = values
-    try:
-        yield
-    finally:
-        entries[places] = kept

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -14,16 +13,30 @@ from tfeti_dolfinx.common.arrays import TINY, Array, joined, node_means, parts_o
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.subdomains.block import Block, Counters, OperatorKind
 from tfeti_dolfinx.subdomains.local_operators import (
+    GroupedOperator,
     LocalChoice,
     ModelledOperator,
-    local_operator,
     solved_together,
 )
 
 # --- Motions of subdomains that springs hold --------------------------------------------------
 
-# of a mode of length 1: what is left of it outside of the kernel is rounding
-IN_KERNEL = 1e-6
+
+@dataclass(frozen=True)
+class RoundingTolerances:
+    """Tolerances below which motions and loads of subdomains are rounding.
+
+    Attributes:
+        in_kernel: Part of a mode of length 1 outside of the kernel.
+        balanced: Of ‖f‖: what the load of a subdomain does to rigid motions, which have unit norm.
+            Ten times less was found where it balances itself; more moves the subdomain.
+    """
+
+    in_kernel: float = 1e-6
+    balanced: float = 1e-14
+
+
+TOLERANCES = RoundingTolerances()
 
 
 @dataclass(frozen=True)
@@ -41,18 +54,6 @@ class SoftMotions:
     amplification: list[float]
 
 
-def sprung(blocks: Sequence[Block]) -> SoftMotions:
-    """Return the motions of each Block that springs hold."""
-    modes, energies = zip(*map(_outside_motions, blocks), strict=True) if blocks else ((), ())
-    trace = [R[block.trace_dofs] for R, block in zip(modes, blocks, strict=True)]
-    rows = csr_array(block_diag(trace)) if trace else csr_array((0, 0))
-    largest = [
-        float(block.diagonal.max() / max(D.min(), TINY)) if len(D) else 0.0
-        for block, D in zip(blocks, energies, strict=True)
-    ]
-    return SoftMotions(rows, joined(energies), largest)
-
-
 def _outside_motions(block: Block) -> tuple[Array, Array]:
     """R̂, orthonormal, orthogonal to the kernel, shape ``(n, k)``, and the diagonal of R̂ᵀKR̂."""
     modes, R = block.modes, block.kernel
@@ -64,17 +65,13 @@ def _outside_motions(block: Block) -> tuple[Array, Array]:
     for _ in range(2):  # once leaves rounding of the kernel
         rest = rest - R @ (R.T @ rest)
     U, sizes, _ = np.linalg.svd(rest, full_matrices=False)
-    U = U[:, :count][:, sizes[:count] > IN_KERNEL]
+    U = U[:, :count][:, sizes[:count] > TOLERANCES.in_kernel]
     KU = np.array([block.multiply(u) for u in U.T]).reshape(-1, len(modes)).T
     energies, V = np.linalg.eigh(U.T @ KU)
     return U @ V, np.maximum(energies, 0.0)
 
 
 # --- All subdomains of a rank -----------------------------------------------------------------
-
-# Of ‖f‖: what the load of a subdomain does to rigid motions, which have unit norm. Ten times less
-# was found where it balances itself; more is a load that moves the subdomain.
-BALANCED = 1e-14
 
 
 class Subdomains:
@@ -129,27 +126,23 @@ class Subdomains:
         means = [node_means(block.diagonal, block.bs) for block in self.blocks]
         self.diagonal = joined([x[dofs] for x, dofs in zip(means, traces, strict=True)])
 
-    def retrace(self, trace: Array, span: Array | None = None) -> None:
-        """Other rows act on these trace unknowns, ascending, along a span (``Block.act_along``)."""
+    def retrace(self, trace: Array) -> None:
+        """Let other rows act, on these trace unknowns, ascending."""
         for block, part in zip(self.blocks, self.dof_parts, strict=True):
             own = slice(*np.searchsorted(trace, (part.start, part.stop)))
             block.retrace(trace[own] - part.start)
-            if span is not None:
-                block.act_along(span[own])
         self._read_trace()
 
-    def update(self, K: Sequence[Any] | None = None, f: Array | None = None) -> None:
-        """Replace the stiffness of each Block, or the load, shape ``(n,)``. Collective.
+    def update(self, f: Array) -> None:
+        """Replace the load, shape ``(n,)``. Collective.
 
         Raises:
-            InputError: They do not fit.
-            FactorError: A factor could not be made.
+            InputError: It does not fit.
         """
         self._pinv_load = None
         with raised_on_all_ranks(self.comm):
-            for i, (block, part) in enumerate(zip(self.blocks, self.dof_parts, strict=True)):
-                block.update(None if K is None else K[i], None if f is None else f[part])
-        self._read_trace()
+            for block, part in zip(self.blocks, self.dof_parts, strict=True):
+                block.update(f=f[part])
 
     def local_operator(self, kind: OperatorKind, once: bool = False) -> ModelledOperator:
         """K⁺, K_bb or S of all Blocks on the trace; to be made again after ``retrace``.
@@ -159,7 +152,7 @@ class Subdomains:
             once: Whether it is applied a few times only, for which no dense matrix pays.
         """
         choice = LocalChoice("implicit") if once else self._choice
-        return local_operator(self.blocks, kind, choice)
+        return GroupedOperator(self.blocks, kind, choice)
 
     def destroy(self) -> None:
         """Free the factors of the Blocks."""
@@ -189,7 +182,12 @@ class Subdomains:
     @property
     def kernel_load(self) -> Array:
         """Rᵀ f, shape ``(r,)``; 0 where it is rounding of f, as of stresses that are given."""
-        return joined([_moving_part(block) for block in self.blocks])
+        parts = []
+        for block in self.blocks:
+            part = block.kernel.T @ block.load
+            moves = np.linalg.norm(part) > TOLERANCES.balanced * np.linalg.norm(block.load)
+            parts.append(np.where(moves, part, 0.0))
+        return joined(parts)
 
     def kernel_part(self, b: Array) -> Array:
         """Rᵀ b, shape ``(r,)``, for b on all unknowns, shape ``(n,)``."""
@@ -202,8 +200,16 @@ class Subdomains:
         return joined([block.kernel @ alpha[part] for block, part in pairs])
 
     def soft_motions(self) -> SoftMotions:
-        """Rigid motions that are no kernel."""
-        return sprung(self.blocks)
+        """Return the motions of each Block that springs hold: rigid ones that are no kernel."""
+        found = [_outside_motions(block) for block in self.blocks]
+        pairs = list(zip(self.blocks, found, strict=True))
+        trace = [R[block.trace_dofs] for block, (R, _) in pairs]
+        rows = csr_array(block_diag(trace)) if trace else csr_array((0, 0))
+        largest = [
+            float(block.diagonal.max() / max(D.min(), TINY)) if len(D) else 0.0
+            for block, (_, D) in pairs
+        ]
+        return SoftMotions(rows, joined([D for _, D in found]), largest)
 
     # ------------------------------------------------------------------- bodies
 
@@ -221,7 +227,16 @@ class Subdomains:
 
         What springs hold of the modes lies outside the kernels.
         """
-        return self._summed(_outside)
+
+        def outside(block: Block) -> Array:
+            modes, R = block.modes, block.kernel
+            inside = R.T @ modes
+            rest = modes - R @ inside
+            gram = rest.T @ rest
+            whole = float(np.trace(inside.T @ inside + gram))
+            return np.asarray(gram / (whole or 1.0))
+
+        return self._summed(outside)
 
     def modes_metric(self) -> Array:
         """Cᵀ W C of each body, W the shares, shape ``(b, k, k)``. Collective."""
@@ -303,23 +318,6 @@ class Subdomains:
 def _end(parts: Sequence[slice]) -> int:
     """Return the length of what parts lie in."""
     return parts[-1].stop if parts else 0
-
-
-def _moving_part(block: Block) -> Array:
-    """Rᵀ f of a Block."""
-    part = block.kernel.T @ block.load
-    moves = np.linalg.norm(part) > BALANCED * np.linalg.norm(block.load)
-    return np.where(moves, part, 0.0)
-
-
-def _outside(block: Block) -> Array:
-    """Cᵀ(I − R Rᵀ)C over the trace of CᵀC."""
-    modes, R = block.modes, block.kernel
-    inside = R.T @ modes
-    rest = modes - R @ inside
-    gram = rest.T @ rest
-    whole = float(np.trace(inside.T @ inside + gram))
-    return np.asarray(gram / (whole or 1.0))
 
 
 def _assembled(

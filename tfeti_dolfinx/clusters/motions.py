@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.linalg import eigvalsh_tridiagonal
 from scipy.sparse import coo_array, csr_array, diags_array
 
+from tfeti_dolfinx.clusters.subdomains import ClusteredSubdomains, InnerMotions
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import Exchange, bcast_from_root, chunk_offsets, summed
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.coarse import CoarseSpace, products, side_by_side
-from tfeti_dolfinx.feti.deflation import SoftModes, mean_stiffness
+from tfeti_dolfinx.feti.deflation import Deflation, SoftModes, mean_stiffness
 from tfeti_dolfinx.feti.operator import DualOperator
 from tfeti_dolfinx.feti.preconditioner import chebyshev
 from tfeti_dolfinx.feti.projectors import CoarseFactor, FaceFactors, replicated
@@ -20,18 +23,39 @@ from tfeti_dolfinx.feti.rigid_bodies import NullBasis
 from tfeti_dolfinx.qp.balanced import Balanced
 from tfeti_dolfinx.qp.problem import FaceOperator
 from tfeti_dolfinx.qp.sets import Face
-from tfeti_dolfinx.subdomains.clusters import ClusteredSubdomains, InnerMotions
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor
 
 # --- Chebyshev iteration between clusters -----------------------------------------------------
 
-# what Chebyshev's steps leave of an interval, and how far it reaches at most: 13 steps
-LEFT, WIDEST = 0.05, 50.0
-# steps of Lanczos' method for the spectrum, how far it may reach beyond what they see, and when
-# nothing is left to be seen
-SEEN, BELOW, ABOVE, NOTHING = 10, 0.8, 1.1, 1e-12
-# relative, added to the diagonal of D_A: motions of clusters that no row of a face holds
-SHIFT = 1e-8
+
+@dataclass(frozen=True)
+class StepParameters:
+    """Parameters of Chebyshev's steps between clusters.
+
+    Attributes:
+        left: What the steps leave of an interval.
+        widest: Ratio of its ends at most: 13 steps.
+        seen: Steps of Lanczos' method for the spectrum.
+        below, above: How far the spectrum may reach beyond what they see.
+        nothing: Residual, over the first, at which nothing is left to be seen.
+        shift: Relative, added to the diagonal of D_A: motions of clusters that no row holds.
+        free: Relative, added to the diagonal of motions of whole clusters that no row holds.
+        rounded: Of the terms that it is the sum of, added, too: what rounding makes of motions of
+            a body that no row of a face holds.
+    """
+
+    left: float = 0.05
+    widest: float = 50.0
+    seen: int = 10
+    below: float = 0.8
+    above: float = 1.1
+    nothing: float = 1e-12
+    shift: float = 1e-8
+    free: float = 1e-12
+    rounded: float = 1e-14
+
+
+PARAMETERS = StepParameters()
 
 
 class ClusterSteps:
@@ -94,10 +118,10 @@ class ClusterSteps:
         """Return an interval for the eigenvalues of D_A⁻¹ΠᵀA, as conjugate gradients show them."""
         comm = self._comm
         b = self._times(np.random.default_rng(comm.rank).standard_normal(len(self._own.cluster)))
-        (least,) = NOTHING * summed(comm, np.array([b @ self._solved(b)]))
+        (least,) = PARAMETERS.nothing * summed(comm, np.array([b @ self._solved(b)]))
         r, p = b - self._times(self._of_clusters(b)), np.zeros_like(b)
         sizes, steps = list[float](), list[float]()
-        for _ in range(SEEN):
+        for _ in range(PARAMETERS.seen):
             s = self._solved(r)
             s -= self._of_clusters(self._times(s))
             (size,) = summed(comm, np.array([r @ s]))
@@ -110,8 +134,8 @@ class ClusterSteps:
             steps.append(float(size / curvature))
             r -= steps[-1] * Ap
         values = bcast_from_root(comm, _ritz_values(np.array(sizes), np.array(steps)))
-        low, top = float(BELOW * values[0]), float(ABOVE * values[-1])
-        return min(max(low, top / WIDEST), 0.5 * top), top
+        low, top = float(PARAMETERS.below * values[0]), float(PARAMETERS.above * values[-1])
+        return min(max(low, top / PARAMETERS.widest), 0.5 * top), top
 
     def destroy(self) -> None:
         """Free A and the factors. Collective."""
@@ -133,9 +157,9 @@ def _ritz_values(sizes: Array, steps: Array) -> Array:
 
 
 def _count(low: float, high: float) -> int:
-    """Return the number of Chebyshev steps that reduce an interval to ``LEFT``."""
+    """Return the number of Chebyshev steps that reduce an interval to ``left``."""
     root = np.sqrt(high / low)
-    return int(np.ceil(np.arccosh(1.0 / LEFT) / np.log((root + 1.0) / (root - 1.0))))
+    return int(np.ceil(np.arccosh(1.0 / PARAMETERS.left) / np.log((root + 1.0) / (root - 1.0))))
 
 
 def _blocks(A: PETSc.Mat, cluster: Array) -> csr_array:
@@ -146,7 +170,7 @@ def _blocks(A: PETSc.Mat, cluster: Array) -> csr_array:
     places = tuple(i[within] for i in own.coords)
     blocks = csr_array(coo_array((own.data[within], places), shape=own.shape))
     diagonal = blocks.diagonal()
-    shift = SHIFT * np.maximum(diagonal, SHIFT * diagonal.max(initial=0.0))
+    shift = PARAMETERS.shift * np.maximum(diagonal, PARAMETERS.shift * diagonal.max(initial=0.0))
     return csr_array(blocks + diags_array(np.where(shift > 0.0, shift, 1.0)))
 
 
@@ -155,12 +179,6 @@ def _blocks(A: PETSc.Mat, cluster: Array) -> csr_array:
 # is far stiffer than a cluster: a jump along a whole side of a cluster costs M_f energy on each
 # face of its subdomains, but the cluster only one smooth displacement. Ĝ = R̂ᵀBᵀ, R̂ the rigid
 # motions of all subdomains, takes that part of a jump, as P does without clusters.
-
-# relative, added to the diagonal: motions of whole clusters that no row of a face holds
-FREE = 1e-12
-# of the terms that it is the sum of, added, too: what rounding makes of motions of a body that no
-# row of a face holds
-ROUNDED = 1e-14
 
 
 class ClusterMotions:
@@ -254,7 +272,7 @@ class ClusterMotions:
         squares, terms = self._own.whole.multiply(self._own.whole), A.getDiagonal()
         parts = np.concatenate(self._coarse.comm.allgather(squares.T @ terms.array_r))
         terms.destroy()
-        shift = FREE * np.maximum(diagonal, 0.0) + ROUNDED * parts
+        shift = PARAMETERS.free * np.maximum(diagonal, 0.0) + PARAMETERS.rounded * parts
         return self.factors.factor(csr_array(whole + diags_array(shift)))
 
     def destroy(self) -> None:
@@ -265,8 +283,8 @@ class ClusterMotions:
 
 def motions_for(
     B: PETSc.Mat, coarse: CoarseSpace, weights: Array, preconditioner: DualOperator, prefix: str
-) -> SoftModes | ClusterMotions:
-    """Return the coarse space of M_f: soft springs, or the motions of subdomains in clusters."""
+) -> Deflation:
+    """Return the motions of subdomains in clusters; soft springs where there are no clusters."""
     subdomains = coarse.subdomains
     if isinstance(subdomains, ClusteredSubdomains):
         return ClusterMotions(B, coarse, subdomains, weights, prefix)

@@ -1,4 +1,4 @@
-"""Clusters: subdomains glued by averages over their faces."""
+"""Clusters: subdomains glued by averages over their faces, and their generalised inverse."""
 
 from __future__ import annotations
 
@@ -18,24 +18,34 @@ from tfeti_dolfinx.errors import FactorError, InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.subdomains.block import OperatorKind, candidate_modes
-from tfeti_dolfinx.subdomains.factor import REAL
-from tfeti_dolfinx.subdomains.local_operators import (
-    BANDWIDTH,
-    ModelledOperator,
-    sparse_products,
-    sparse_traffic,
-)
-from tfeti_dolfinx.subdomains.subdomains import BALANCED, Subdomains
+from tfeti_dolfinx.subdomains.local_operators import MODEL, ModelledOperator
+from tfeti_dolfinx.subdomains.subdomains import TOLERANCES as ROUNDING
+from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # --- Clusters of subdomains and averages over their faces -------------------------------------
 
-# Of the largest singular value of the modes of a face: less is no motion of its own (an edge has
-# no turn about itself); and of an average's square, what is left of it beside the others.
-FLAT, DEPENDENT = 1e-6, 1e-8
-# METIS's: parts may have so many thousandths more than their share
-UNEVEN = 30
-# of the mean size of subdomains: smaller ones, such as are split off, stay with a neighbour
-CRUMB = 0.3
+
+@dataclass(frozen=True)
+class ClusterParameters:
+    """Parameters of clusters and of averages over their faces.
+
+    Attributes:
+        flat: Singular value of a motion of a face, over the largest, below which it is no motion
+            of its own (an edge has no turn about itself).
+        dependent: What is left of an average's square beside the others that counts as nothing.
+        uneven: Thousandths by which parts may exceed their share, for METIS.
+        crumb: Of the mean size of subdomains: smaller ones stay with a neighbour.
+        null: Of the largest eigenvalue of G_cG_cᵀ: less is a motion that no average resists.
+    """
+
+    flat: float = 1e-6
+    dependent: float = 1e-8
+    uneven: int = 30
+    crumb: float = 0.3
+    null: float = 1e-9
+
+
+PARAMETERS = ClusterParameters()
 
 
 @dataclass(frozen=True)
@@ -61,8 +71,8 @@ class Clusters:
         return int(self.of_subdomain.max(initial=-1)) + 1
 
 
-def clusters_of(dofs: TornDofs, decomposition: Decomposition, wanted: int) -> Clusters | None:
-    """About as many clusters as wanted, None for 0. Collective.
+def clusters_of(dofs: TornDofs, decomposition: Decomposition, wanted: int) -> Clusters:
+    """Make about as many clusters as wanted. Collective.
 
     A cluster is a part of one body on one rank that hangs together by faces, so that there may be
     more of them than wanted, or fewer.
@@ -70,8 +80,6 @@ def clusters_of(dofs: TornDofs, decomposition: Decomposition, wanted: int) -> Cl
     Raises:
         InputError: More are wanted than there are subdomains.
     """
-    if wanted == 0:
-        return None
     if wanted > decomposition.num_subdomains:
         raise InputError(
             f"{wanted} clusters of {decomposition.num_subdomains} subdomains; expected at most "
@@ -143,7 +151,9 @@ def _with_crumbs(graph: csr_array, sizes: Array, whole: Array) -> Array:
     if len(sizes) == 0:
         return np.zeros(0, dtype=np.int64)
     mean = np.bincount(whole, sizes) / np.maximum(np.bincount(whole), 1)
-    crumbs = np.flatnonzero((sizes < CRUMB * mean[whole]) & (np.asarray(graph.sum(axis=1)) > 0))
+    crumbs = np.flatnonzero(
+        (sizes < PARAMETERS.crumb * mean[whole]) & (np.asarray(graph.sum(axis=1)) > 0)
+    )
     nearest = np.asarray(graph.argmax(axis=1)).ravel()
     return _connected(np.stack((crumbs, nearest[crumbs]), axis=1), len(sizes))[1]
 
@@ -176,7 +186,7 @@ def _metis_of(graph: csr_array, count: int, sizes: Array) -> Array:
 
     if count == 1:
         return np.zeros(graph.shape[0], dtype=np.int64)
-    options = pymetis.Options(seed=1, ufactor=UNEVEN, ncuts=20)
+    options = pymetis.Options(seed=1, ufactor=PARAMETERS.uneven, ncuts=20)
     adjacency = pymetis.CSRAdjacency(graph.indptr, graph.indices)
     edges, vertices = (w.astype(np.int64) for w in (graph.data, sizes))
     found = pymetis.part_graph(
@@ -230,7 +240,7 @@ def _motions(x: Array, bs: int) -> Array | None:
     length = float(np.linalg.norm(x - centre, axis=1).max())
     modes = candidate_modes(x, bs, centre, length)
     U, sizes, _ = np.linalg.svd(modes, full_matrices=False)
-    whole = len(sizes) == modes.shape[1] and sizes[-1] > FLAT * sizes[0]
+    whole = len(sizes) == modes.shape[1] and sizes[-1] > PARAMETERS.flat * sizes[0]
     return U if whole else None
 
 
@@ -259,7 +269,7 @@ def _independent(averages: csr_array, rows: Array) -> Array:
     own = averages[rows]
     sizes = diags_array(1.0 / np.sqrt(own.multiply(own).sum(axis=1)))
     gram = (sizes @ own @ own.T @ sizes).toarray()
-    _, pivots, rank, _ = lapack.dpstrf(gram, tol=DEPENDENT)
+    _, pivots, rank, _ = lapack.dpstrf(gram, tol=PARAMETERS.dependent)
     return np.sort(rows[pivots[:rank] - 1])
 
 
@@ -391,9 +401,6 @@ def _scales(F: Array, G: Array) -> tuple[Array, Array]:
 # F_c = B_cK⁺B_cᵀ, G_c = RᵀB_cᵀ, so that K̃⁺ = K⁺ − ZWZᵀ, Z = [K⁺B_cᵀ, −R], W the inverse of that
 # matrix beside its kernel null(G_cᵀ), and R̃ = R null(G_cᵀ) are the motions of whole clusters.
 
-# of the largest eigenvalue of G_cG_cᵀ: less is a motion that no average resists
-NULL = 1e-9
-
 
 @dataclass(frozen=True)
 class InnerMotions:
@@ -429,15 +436,9 @@ class ClusteredSubdomains(Subdomains):
         self._null: csr_array | None = None
         self._glued: Glue | None = None
 
-    def update(self, K: Sequence[object] | None = None, f: Array | None = None) -> None:
-        """Update K and f as ``Subdomains.update`` does. Collective."""
-        if K is not None:
-            self._null = self._glued = None
-        super().update(K, f)
-
-    def retrace(self, trace: Array, span: Array | None = None) -> None:
+    def retrace(self, trace: Array) -> None:
         """Change the trace as ``Subdomains.retrace`` does."""
-        super().retrace(trace, span)
+        super().retrace(trace)
         self._glued = None
 
     @property
@@ -480,7 +481,7 @@ class ClusteredSubdomains(Subdomains):
         sizes = [float(np.linalg.norm(block.load)) for block in self.blocks]
         counts = [kernel.stop - kernel.start for kernel in self.kernel_parts]
         allowed = abs(self.null).T @ np.repeat(sizes, counts)
-        return np.where(np.abs(part) > BALANCED * allowed, part, 0.0)
+        return np.where(np.abs(part) > ROUNDING.balanced * allowed, part, 0.0)
 
     def kernel_part(self, b: Array) -> Array:
         """R̃ᵀb, shape ``(r̃,)``, for b on all unknowns, shape ``(n,)``."""
@@ -583,9 +584,9 @@ class ClusterPinv:
         """Make K⁺, Z and W."""
         self._inner.prepare()
         self._glue = glue = self._subdomains.glue(self._inner)
-        dense = REAL * glue.entries
-        self.traffic = self._inner.traffic + 2.0 * sparse_traffic(glue.Z.nnz, 1) + dense
-        seconds = 2.0 * sparse_products(glue.Z.nnz, 1) + dense / BANDWIDTH
+        sparse, dense = MODEL.sparse(glue.Z.nnz, 1), float(MODEL.real * glue.entries)
+        self.traffic = self._inner.traffic + 2.0 * sparse.traffic + dense
+        seconds = 2.0 * sparse.seconds + dense / MODEL.bandwidth
         self.predicted = self._inner.predicted + seconds
 
     def mult(self, w: Array, out: Array) -> None:
@@ -611,4 +612,4 @@ def _nulls(G: csr_array, places: list[tuple[Array, Array]]) -> csr_array:
 def _null_of(G: Array) -> Array:
     """Return an orthonormal basis of null(Gᵀ)."""
     values, vectors = np.linalg.eigh(G @ G.T)
-    return np.asarray(vectors[:, values <= NULL * values.max(initial=0.0)])
+    return np.asarray(vectors[:, values <= PARAMETERS.null * values.max(initial=0.0)])
