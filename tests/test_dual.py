@@ -2,20 +2,11 @@
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 from scenes import curved_obstacle, decomposed, problem
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.feti.dual import feasible_particular
 from tfeti_dolfinx.feti.operator import check_operator
-from tfeti_dolfinx.feti.recovery import without_rigid_motions as at_rest
-from tfeti_dolfinx.feti.remainder import DefectProblem
-from tfeti_dolfinx.feti.stopping import Accuracy
-from tfeti_dolfinx.options import Options
-from tfeti_dolfinx.qp.homogenised import homogenise, operator_product
-from tfeti_dolfinx.qp.newton import feasible_start, newton
-from tfeti_dolfinx.qp.problem import Start
-from tfeti_dolfinx.solve.solver import solve_dual
 
 
 @pytest.fixture(scope="module")
@@ -168,66 +159,3 @@ def test_counters_charge_who_asked(dual):
         dual.F.mult(x, y)
     dual.F.mult(x, y)
     assert (dual.F.count["someone"], dual.F.count["solver"]) == (before[0] + 1, before[1] + 1)
-
-
-def test_what_a_point_lacks_has_the_resultants_of_its_forces(dual):
-    """RᵀK = 0, although rounding of K u has resultants where a stiff body moves far."""
-    rng = np.random.default_rng(dual.coarse.comm.rank)
-    lam, subdomains = random_vec(dual, 7).array_r, dual.subdomains
-    far = subdomains.kernel_motion(1e12 * rng.standard_normal(subdomains.kernel_size))
-    at_rest, moved = (DefectProblem(dual, lam, u) for u in (0.0 * far, far))
-    size = dual.coarse.comm.allreduce(np.abs(at_rest.coarse.e).max(initial=0.0), op=MPI.MAX)
-    assert size > 0.0
-    assert np.abs(moved.coarse.e - at_rest.coarse.e).max(initial=0.0) <= 1e-12 * size
-    at_rest.destroy()
-    moved.destroy()
-
-
-def lacked(left, rtol=1e-10):
-    """The solution of what a point lacks, and its accuracy."""
-    qp, zero = left.qp(), left.d.duplicate()
-    zero.set(0.0)
-    start = Start(zero, np.zeros(qp.coarse.dimension))
-    homogenised = homogenise(qp, operator_product(qp.F, feasible_start(qp, start)))
-    scale = homogenised.scale
-    own = Accuracy(left, rtol, 0.0, (scale.reference, scale.rounding))
-    result = newton(qp, homogenised, own, start=start)
-    assert result.reason > 0
-    return result, own
-
-
-@pytest.mark.parametrize("size", [1e-3, 1.0])
-def test_what_any_point_lacks_leads_to_the_same_solution(dual, size):
-    """λ₀ and u₀ need not belong to each other, nor fulfil anything."""
-    known, rule = solve_dual(dual, Options(rtol=1e-10), "newton")
-    rng = np.random.default_rng(dual.coarse.comm.rank)
-    lam = known.lam.array_r + size * known.lam.norm() * random_vec(dual, 7).array_r / 10.0
-    most = rule.measures.bodies.size.max()
-    u = rule.u + size * most * rng.standard_normal(len(rule.u))
-    left = DefectProblem(dual, lam, u)
-    result, own = lacked(left)
-    assert np.abs(own.u - rule.u).max(initial=0.0) <= 1e-8 * most
-    result.lam.array[:] += lam - known.lam.array_r
-    assert result.lam.norm() <= 1e-7 * known.lam.norm()
-    left.destroy()
-
-
-@pytest.mark.parametrize(("far", "rtol"), [(1.0, 1e-10), (1e5, 1e-8)])
-def test_motions_of_subdomains_are_no_load(dual, far, rtol):
-    """From u₀ + Rα as from u₀, where K is asked about v₀ alone, which has no motions.
-
-    Rounding of B u₀ is 1e-11 where u₀ is 1e5 times too large, and no answer is better than that.
-    """
-    known, rule = solve_dual(dual, Options(rtol=1e-10), "newton")
-    subdomains, most = dual.subdomains, rule.measures.bodies.size.max()
-    rng = np.random.default_rng(dual.coarse.comm.rank)
-    u = rule.u + 0.1 * most * rng.standard_normal(len(rule.u))
-    v = at_rest(subdomains, u)
-    assert np.abs(subdomains.kernel_part(v)).max(initial=0.0) <= 1e-13 * most * len(v)
-    alpha = far * most * rng.standard_normal(subdomains.kernel_size)
-    left = DefectProblem(dual, known.lam.array_r, u + subdomains.kernel_motion(alpha), v)
-    result, own = lacked(left, rtol)
-    assert np.abs(own.u - rule.u).max(initial=0.0) <= 100.0 * rtol * most
-    bent = at_rest(subdomains, rule.u)
-    assert np.abs(left.at_rest(result.lam) - bent).max(initial=0.0) <= 100.0 * rtol * most
-    left.destroy()

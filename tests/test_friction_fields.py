@@ -13,7 +13,7 @@ from scenes import box, decomposed, displacement, hooke, problem, strain
 from test_tresca import nodal_data
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.feti.stopping import _missed_by
+from tfeti_dolfinx.feti.stopping import missed_by
 from tfeti_dolfinx.output import nodal_fields
 from tfeti_dolfinx.qp.krylov import pcpg
 from tfeti_dolfinx.qp.newton_faces import CurvedHessian
@@ -217,12 +217,12 @@ def test_a_slip_is_missed_where_the_force_may_still_grow(seed):
     lam = ((radius * inside)[:, None] * out).ravel()
     q = norm * rng.uniform(0.0, 0.4, n) * radius
     q[2] = norm * 0.1 * radius[2]
-    missed = _missed_by(scene, lam, tangents, q[:, None] * out, norm)
+    missed = missed_by(scene, lam, tangents, q[:, None] * out, norm)
     size = np.sum(missed * out, axis=1)
     # well inside all of it, near the circle what is left to it, on the circle nothing
     room = norm * radius * (1.0 - inside)
     assert np.allclose(size, np.minimum(q, room), rtol=1e-9, atol=1e-12 * norm)
-    back = _missed_by(scene, lam, tangents, -q[:, None] * out, norm)
+    back = missed_by(scene, lam, tangents, -q[:, None] * out, norm)
     assert np.allclose(back, -q[:, None] * out, rtol=1e-9, atol=1e-12 * norm)
 
 

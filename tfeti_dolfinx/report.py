@@ -285,7 +285,8 @@ def fill_result(
     report.clusters = dual.subdomains.num_clusters
     report.kernel_dim = dual.coarse.dimension
     report.free_modes = dual.coarse.num_free_motions
-    report.nearly_free = dual.nearly_free
+    if accuracy.recovered is not None:
+        report.nearly_free = dual.nearly_free(accuracy.recovered.active)
     active = solution.carrying[solution.gluing.constraints.sets.normals]
     report.active_contacts = comm.allreduce(int(np.sum(active)))
     status = solution.status_of_conditions

@@ -1,9 +1,8 @@
-"""The solver that the options choose, with iterative refinement."""
+"""The solver that the options choose."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
@@ -14,8 +13,6 @@ from tfeti_dolfinx.common.logging import cite
 from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root
 from tfeti_dolfinx.errors import ConvergenceError, InputError
 from tfeti_dolfinx.feti.dual import Dual
-from tfeti_dolfinx.feti.recovery import without_rigid_motions
-from tfeti_dolfinx.feti.remainder import DefectProblem
 from tfeti_dolfinx.feti.stopping import Accuracy, ErrorTarget
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.homogenised import (
@@ -37,113 +34,6 @@ from tfeti_dolfinx.qp.problem import (
 )
 from tfeti_dolfinx.qp.recycling import Recycled
 from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver, Task
-
-# --- Iterative refinement ---------------------------------------------------------------------
-
-# of the worst error: what a round has to bring, or there is no other; and of the displacement: an
-# answer that is as wrong as that has no digits to add some to
-DIGIT, NO_DIGITS = 0.1, 0.1
-
-
-@dataclass(frozen=True)
-class SolverContext:
-    """Solver with its options and monitor.
-
-    Attributes:
-        solver: The solver.
-        options: Options.
-        monitor: Called after each step.
-    """
-
-    solver: Solver
-    options: Options
-    monitor: Monitor
-
-
-def refine_iteratively(
-    dual: Dual, told: SolverContext, result: QPResult, rule: Accuracy
-) -> tuple[QPResult, Accuracy]:
-    """Refine a solution iteratively after rounding has stopped the solver.
-
-    Iterative refinement (Wilkinson): each round begins at the sum of those before, and the residual
-    of that is made from K itself. Where this does not suffice, once more from the same answer, and
-    K is not asked about motions of subdomains, of which it makes forces that are its rounding: the
-    residual is made from the displacement less these. Collective; does nothing where a solve has
-    ended otherwise.
-
-    Args:
-        dual: The dual problem.
-        told: The solver, which can start somewhere, and what it is told.
-        result: What it returned; becomes the function's own.
-        rule: Its accuracy.
-
-    Returns:
-        The multipliers and their displacement, whose sum has more digits than K⁺(f − Bᵀλ).
-    """
-    comm, first = dual.coarse.comm, (result, rule)
-    enough = bcast_from_root(comm, rule.ratio() * rule.rtol <= NO_DIGITS)
-    if result.reason != ConvergedReason.DIVERGED_ROUNDING or not enough:
-        return first
-    found = _in_rounds(dual, told, first, rule.u)
-    if found[0].reason <= 0 and dual.coarse.dimension:
-        plain = found
-        result.steps, rule.looks = plain[0].steps, plain[1].looks
-        other = _in_rounds(dual, told, first, without_rigid_motions(dual.subdomains, rule.u))
-        found = other if bcast_from_root(comm, other[1].ratio() < plain[1].ratio()) else plain
-        found[0].steps, found[1].looks = other[0].steps, other[1].looks
-        for answer, _ in (plain, other):
-            if answer is not found[0] and answer is not result:
-                answer.destroy()
-    if found[0] is not result:
-        result.destroy()
-    return found
-
-
-def _in_rounds(
-    dual: Dual, told: SolverContext, first: tuple[QPResult, Accuracy], v: Array
-) -> tuple[QPResult, Accuracy]:
-    """Rounds from a first answer, which stays; v is its displacement, or that less its motions."""
-    result, rule = first
-    comm = dual.coarse.comm
-    while result.reason == ConvergedReason.DIVERGED_ROUNDING:
-        before = bcast_from_root(comm, rule.ratio())
-        more, again, v = _of_remainder(dual, told, result, rule, v)
-        after = bcast_from_root(comm, again.ratio())
-        if after >= before:
-            more.destroy()
-            break
-        if result is not first[0]:
-            result.destroy()
-        result, rule = more, again
-        if after > DIGIT * before:
-            break
-    return result, rule
-
-
-def _of_remainder(
-    dual: Dual, told: SolverContext, result: QPResult, rule: Accuracy, v: Array
-) -> tuple[QPResult, Accuracy, Array]:
-    """Return the sum of a result and its correction, its accuracy, and its new v."""
-    options, norm = told.options, rule.norm
-    left = DefectProblem(dual, np.array(result.lam.array_r), rule.u, v)
-    qp = left.qp()
-    start = Start(left.start(result.face), np.zeros(qp.coarse.dimension))
-    at = operator_product(qp.F, start.lam.copy())
-    homogenised = homogenise(qp, at, scale_near(qp, at))
-    scale = (homogenised.scale.reference, homogenised.scale.rounding)
-    again = Accuracy(left, options.number, options.atol, scale, norm)
-    task = Task(qp, homogenised, again, options, start, told.monitor)
-    more = told.solver.solve(task)
-    if more.reason <= 0:
-        last_look(more, again)
-    again.looks += rule.looks
-    v = again.u if v is rule.u else left.at_rest(more.lam)
-    more.lam.axpy(1.0, result.lam)
-    more.mu, more.reference, more.norm = result.mu, result.reference, result.norm
-    more.steps = result.steps.plus(more.steps)
-    for item in (at, homogenised, start.lam, left):
-        item.destroy()
-    return more, again, v
 
 
 def last_look(result: QPResult, rule: Accuracy) -> None:
@@ -258,6 +148,8 @@ def solve_dual(
     rule.goal = goal
     result = solver.solve(Task(qp, homogenised, rule, options, begin, monitor))
     dual.saw(result.norm)
+    if (state := rule.recovered) is not None:
+        dual.last.look(state.lam, state.residual)
     if dual.coarse.dimension == 0 or qp_type == "newton":
         dual.last.keep(result, qp)
     homogenised.destroy()
@@ -265,16 +157,15 @@ def solve_dual(
         begin.lam.destroy()
     if result.reason <= 0:
         last_look(result, rule)
-    if goal is None and solver.warm is not None:
-        result, rule = refine_iteratively(
-            dual, SolverContext(solver, options, monitor), result, rule
-        )
     return result, rule
 
 
 def _start(values: tuple[Array, Array] | None, qp: QP) -> Start | None:
-    """Return the solver's start; μ is 0 if the given one belongs to another kernel."""
-    if values is None:
+    """Return the solver's start; μ is 0 if the given one belongs to another kernel.
+
+    A start without forces, as from a state of rest, is none.
+    """
+    if values is None or not any_rank(qp.d.getComm().tompi4py(), bool(np.any(values[0]))):
         return None
     lam, mu = qp.d.duplicate(), values[1]
     lam.array[:] = values[0]
