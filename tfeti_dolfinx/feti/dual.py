@@ -27,7 +27,7 @@ from tfeti_dolfinx.feti.operator import (
 from tfeti_dolfinx.feti.preconditioner import FacePreconditioner
 from tfeti_dolfinx.feti.recovery import Recovered, recover
 from tfeti_dolfinx.feti.rigid_bodies import listed
-from tfeti_dolfinx.feti.solvability import check_capacity, check_solvable, holds
+from tfeti_dolfinx.feti.solvability import check_solvable, sliding_body
 from tfeti_dolfinx.qp.coarse import Coarse, NoCoarse
 from tfeti_dolfinx.qp.homogenised import LastProduct, OperatorProduct, natural, operator_product
 from tfeti_dolfinx.qp.krylov import estimate_norm
@@ -221,8 +221,7 @@ class Dual:
         return self._lifting
 
     def _check(self) -> None:
-        check_solvable(self.coarse, *self._names)
-        check_capacity(self.coarse, self.constraints, *self._names)
+        check_solvable(self.coarse, self.constraints, *self._names)
 
     def _check_units(self, comm: MPI.Intracomm) -> None:
         length = largest(comm, self.driving)
@@ -239,7 +238,7 @@ class Dual:
     @property
     def holds(self) -> bool:
         """True if forces within the present limits of friction can balance the load."""
-        return holds(self.coarse, self.constraints)
+        return sliding_body(self.coarse, self.constraints) < 0
 
     def forget_counts(self) -> None:
         """Count multiplications from 0 on."""
