@@ -201,7 +201,7 @@ class ClusterMotions:
         self._base = _gram(csr_array(self._rows[self._always]))
         self._whole = side_by_side(self._own.whole, self._Gt.getComm())
         self._width = self._whole.getSize()[1]
-        none = NullBasis(csr_array((self._width, 0)))
+        none = NullBasis(np.zeros(0, dtype=np.int64), csr_array((self._width, 0)))
         self.factors = FaceFactors(coarse.comm, none, prefix)
 
     def balanced(self, face: Face, on_face: FaceOperator) -> FaceOperator:

@@ -23,7 +23,8 @@ from tfeti_dolfinx.feti.rigid_bodies import (
     NULL,
     Bodies,
     Motions,
-    NullBasis,
+    kernel_basis,
+    null_basis,
     orthonormal_columns,
     unresisted,
     unsprung,
@@ -40,6 +41,8 @@ NO_GRIP, GLUING = 1e-12, 1e-6
 class CoarseSpace(Projectors):
     """G, GGᵀ and what follows from them; the r-vectors are replicated on all ranks.
 
+    G = (R T)ᵀ Bᵀ, with T a basis of the kernel that has the bodies' motions as coordinates.
+
     Args:
         B: Dual rows × trace unknowns.
         subdomains: This rank's Blocks. The constructor and all methods are collective.
@@ -50,8 +53,8 @@ class CoarseSpace(Projectors):
     Attributes:
         subdomains: This rank's Blocks.
         dimension: r, the dimension of the kernel of K.
-        e: Rᵀf, shape ``(r,)``.
-        motions: The bodies' motions, scipy CSR, shape ``(r, bodies * k)``.
+        e: (R T)ᵀ f, shape ``(r,)``.
+        motions: The bodies' motions in the basis T, scipy CSR, shape ``(r, bodies * k)``.
         Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
         bounded: Local rows with λ ≥ 0.
         rubbing: Local rows of friction.
@@ -92,10 +95,15 @@ class CoarseSpace(Projectors):
         self.free_motions = self.unresisted(~equalities)
         both = csr_array(hstack([self.free_motions.alone, self.free_motions.joint]))
         self.free_basis = bcast_from_root(comm, orthonormal_columns(both))
-        self.Gt, self.motions = Gt, self.bodies.motions
+        # made on one rank: processors that round differently might choose differently
+        self._basis = bcast_from_root(
+            comm, kernel_basis(self.bodies, self.unheld, self.free_motions)
+        )
+        self.motions = self._basis.coordinates(self.bodies.motions)
+        self.Gt = self._basis.rows(Gt, diags_array(self.row_size) @ self.J, equalities)
         self._read_load()
-        free = csr_array(self.motions @ self.free_basis)
-        self.null = NullBasis(bcast_from_root(comm, orthonormal_columns(free)))
+        joint = csr_array(self.motions @ self.free_motions.joint)
+        self.null = bcast_from_root(comm, null_basis(np.flatnonzero(self._basis.free), joint))
         self.grams = Grams(self.Gt, np.flatnonzero(~equalities), comm)
         self.factors = FaceFactors(comm, self.null, prefix)
         self._factor = self.factors.factor(self.grams.whole, "whole")
@@ -106,7 +114,8 @@ class CoarseSpace(Projectors):
         self.bodies.update_load()
 
     def _read_load(self) -> None:
-        self.e = np.concatenate(self.comm.allgather(self.subdomains.kernel_load))
+        e = np.concatenate(self.comm.allgather(self.subdomains.kernel_load))
+        self.e = self._basis.products(e)
 
     @property
     def num_free_motions(self) -> int:
@@ -115,7 +124,7 @@ class CoarseSpace(Projectors):
 
     def local_alpha(self, alpha: Array) -> Array:
         """Return kernel coordinates of this rank's Blocks that belong to an r-vector."""
-        return np.asarray(alpha[self._own])
+        return self._basis.kernel(alpha)[self._own]
 
     def damped_factor(self, rows: Array, damping: float) -> SemidefiniteFactor:
         """Return a factor of G_f G_fᵀ + damping·GGᵀ of the local rows flagged."""

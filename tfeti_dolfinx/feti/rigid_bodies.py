@@ -1,19 +1,30 @@
-"""Rigid body modes: motions of bodies, what resists them, and their names."""
+"""Rigid motions: bodies, their names, the kernel and its null spaces."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from mpi4py import MPI
 from scipy.linalg import qr
-from scipy.sparse import bsr_array, coo_array, csc_array, csr_array, diags_array, hstack, vstack
+from scipy.sparse import (
+    block_diag,
+    bsr_array,
+    coo_array,
+    csc_array,
+    csr_array,
+    diags_array,
+    eye_array,
+    hstack,
+    vstack,
+)
 from scipy.sparse.csgraph import connected_components
 
 from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.common.parallel import bcast_from_root
+from tfeti_dolfinx.subdomains.factor import CholeskyFactor
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # --- Dense algebra on parts of sparse matrices with few columns -------------------------------
@@ -27,9 +38,10 @@ def parts_of_columns(A: csr_array) -> Iterator[tuple[Array, Array, Array]]:
     """
     columns = csc_array(A)
     columns.sort_indices()
-    touched = (np.ones(columns.nnz), columns.indices, columns.indptr)
-    links = csr_array(touched, shape=columns.shape[::-1])
-    _, label = connected_components(links @ links.T, directed=False)
+    touched = csr_array(
+        (np.ones(columns.nnz), columns.indices, columns.indptr), shape=columns.shape[::-1]
+    )
+    _, label = connected_components(touched @ touched.T, directed=False)
     order = np.argsort(label, kind="stable")
     for own in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
         if len(own):
@@ -38,20 +50,33 @@ def parts_of_columns(A: csr_array) -> Iterator[tuple[Array, Array, Array]]:
             yield own, rows, csr_array(part)[rows].toarray()
 
 
-def spread_columns(parts: list[tuple[Array, Array]], n: int) -> csr_array:
-    """Return columns of n rows, side by side, of parts: some rows, and the dense matrix there."""
-    found = [csr_array((n, 0))]
-    for rows, dense in parts:
-        width = dense.shape[1]
-        places = np.repeat(rows, width), np.tile(np.arange(width), len(rows))
-        found.append(csr_array((dense.ravel(), places), shape=(n, width)))
-    return csr_array(hstack(found))
+def spread(rows: Array, dense: Array, n: int) -> csr_array:
+    """Return a dense matrix on some of n rows."""
+    width = dense.shape[1]
+    places = np.repeat(rows, width), np.tile(np.arange(width), len(rows))
+    return csr_array((dense.ravel(), places), shape=(n, width))
+
+
+def side_by_side(parts: list[csr_array], n: int) -> csr_array:
+    """Matrices of n rows, maybe none, one after the other."""
+    return csr_array(hstack([csr_array((n, 0)), *parts]))
+
+
+def by_parts(A: csr_array, change: Callable[[Array], Array]) -> csr_array:
+    """Columns made of those of each part, as by ``change`` of its dense matrix.
+
+    Args:
+        A: Shape ``(n, c)``.
+        change: From a dense matrix to one of as many rows.
+    """
+    n = A.shape[0]
+    changed = [spread(rows, change(dense), n) for _, rows, dense in parts_of_columns(A)]
+    return side_by_side(changed, n)
 
 
 def orthonormal_columns(A: csr_array) -> csr_array:
     """Return an orthonormal basis of the span of independent columns."""
-    parts = [(rows, np.linalg.qr(dense)[0]) for _, rows, dense in parts_of_columns(A)]
-    return spread_columns(parts, A.shape[0])
+    return by_parts(A, lambda dense: np.linalg.qr(dense)[0])
 
 
 # --- Motions of bodies ------------------------------------------------------------------------
@@ -59,6 +84,14 @@ def orthonormal_columns(A: csr_array) -> csr_array:
 # Stiffness, as a share of the stiffest motion of the same body, that counts as none: rounding
 # makes 1e-15 of it, and pins on neighbouring nodes of a fine mesh hold a turn by 1e-9.
 NULL = 1e-13
+# Components of more coordinates than this are looked at by a sparse factor: the time of a dense
+# eigenproblem grows with the cube of its size.
+DENSE = 500
+# Shift of that factor: above rounding, below the softest chain of a thousand bodies.
+SHIFT = 1e-12
+# Inverse iterations, each of which damps what is not null by SHIFT over its stiffness, so that
+# even the softest chain is gone after a few; and vectors at first, doubled if all are null.
+SWEEPS, BLOCK = 4, 32
 # Eigenvalue of a projector, 0 or 1 but for rounding, from which on it is 1.
 HALF = 0.5
 # Stiffness given to directions outside the space, and where those inside, at most 1, end.
@@ -173,17 +206,40 @@ def _null_space(A: csr_array, body: Array) -> csr_array:
     """Null space of a Gram matrix with unit blocks, by components of bodies."""
     if A.shape[0] == 0:
         return csr_array((0, 0))
-    of_body = (np.ones(len(body)), (body, np.arange(len(body))))
-    members = csr_array(of_body, shape=(body.max() + 1, len(body)))
+    members = csr_array(
+        (np.ones(len(body)), (body, np.arange(len(body)))), shape=(body.max() + 1, len(body))
+    )
     strong = csr_array((abs(A.data) > NULL, A.indices, A.indptr), shape=A.shape)
     _, label = connected_components(members @ strong @ members.T, directed=False)
-    order = np.argsort(label[body], kind="stable")
-    parts = []
-    for own in np.split(order, np.flatnonzero(np.diff(label[body][order])) + 1):
-        if body[own[0]] != body[own[-1]]:  # of a body alone nothing is left free
-            values, vectors = np.linalg.eigh(A[own][:, own].toarray())
-            parts.append((own, vectors[:, values <= NULL * len(own)]))
-    return spread_columns(parts, A.shape[0])
+    component = label[body]
+    order = np.argsort(component, kind="stable")
+    cuts = np.flatnonzero(np.diff(component[order])) + 1
+    columns = []
+    for own in np.split(order, cuts):
+        if body[own[0]] == body[own[-1]]:
+            continue  # a body alone: nothing is left free of it
+        null = _component_null(csr_array(A[own][:, own]))
+        columns.append(spread(own, null, A.shape[0]))
+    return side_by_side(columns, A.shape[0])
+
+
+def _component_null(A: csr_array) -> Array:
+    """Null space of a Gram matrix: dense if it is small, else by inverse iteration on blocks."""
+    n = A.shape[0]
+    if n <= DENSE:
+        values, vectors = np.linalg.eigh(A.toarray())
+        return np.asarray(vectors[:, values <= NULL * n])
+    factor, size = CholeskyFactor(csr_array(A + SHIFT * eye_array(n))), BLOCK
+    while True:
+        X = np.random.default_rng(0).standard_normal((n, size))
+        for _ in range(SWEEPS):
+            X = np.linalg.qr(np.stack([factor.solve(x) for x in X.T], axis=1))[0]
+        values, vectors = np.linalg.eigh(X.T @ (A @ X))
+        null = values <= NULL * n
+        if not null[-1] or size == n:  # the block holds more than the null space
+            factor.destroy()
+            return np.asarray(X @ vectors[:, null])
+        size = min(2 * size, n)
 
 
 # --- Rigid motions of bodies in kernel coordinates --------------------------------------------
@@ -214,6 +270,7 @@ class Bodies:
         metric: Sums of the modes' products over a body's nodes, shape ``(bodies, k, k)``.
         nodes: Number of nodes of each body, copies counted once, shape ``(bodies,)``.
         motions: Kernel coordinates of the motions, scipy CSR, shape ``(r, bodies * k)``.
+        size: Their Gram matrices, shape ``(bodies, k, k)``.
         springs: Projectors onto motions that springs resist, shape ``(bodies, k, k)``.
         loads: ‖f‖ of each body, shape ``(bodies,)``.
         negligible: Work of each body's load, on a motion of mean square 1, that counts as none,
@@ -229,6 +286,7 @@ class Bodies:
         self.springs = bcast_from_root(comm, self._springs(subdomains.modes_outside()))
         inside = _replicated(subdomains.modes_in_kernel, first, dimension, comm)
         self.motions = csr_array(inside @ block_diagonal(self.frames))
+        self.size = diagonal_blocks(csr_array(self.motions.T @ self.motions), self.k)
         self.update_load()
 
     def update_load(self) -> None:
@@ -359,22 +417,152 @@ def _spanning(vectors: Array, mode_names: Sequence[str]) -> list[str]:
     return [mode_names[m] for m in sorted(qr(vectors.T, pivoting=True, mode="r")[1][:count])]
 
 
+# --- Kernel basis with the bodies' motions as coordinates -------------------------------------
+
+# what holds a direction, in the order of the coordinates
+CONTACT, EQUALITIES, SPRINGS = 1, 2, 5
+
+
+@dataclass(frozen=True)
+class KernelBasis:
+    """T = [M, E]: motions M of bodies, and unit vectors E of the subdomains' other coordinates.
+
+    Gluing rows of a stiff body are larger than the contact rows that hold it by the root of the
+    ratio of stiffnesses, and so may be rows of conditions on it. In the subdomains' own
+    coordinates GGᵀ would be a sum of both, and rounding of the one could exceed the other.
+    Columns GᵀM know nothing of gluing, and those of motions that only contact holds nothing of
+    conditions.
+
+    Attributes:
+        combined: Directions of each body as columns, so that M = bodies.motions @ combined, shape
+            ``(bodies * k, a)``.
+        motions: M, orthonormal, shape ``(r, a)``.
+        pins: Coordinates that M takes the place of.
+        rest: The others.
+        inverse: Inverse of M's rows at the pins.
+        unheld: Flags of the motions that no equality row resists, shape ``(a,)``.
+        free: Flags of the motions that no row resists, shape ``(a,)``.
+    """
+
+    combined: csr_array
+    motions: csr_array
+    pins: Array
+    rest: Array
+    inverse: csr_array
+    unheld: Array
+    free: Array
+
+    def products(self, x: Array) -> Array:
+        """Tᵀx."""
+        return np.concatenate((self.motions.T @ x, x[self.rest]))
+
+    def kernel(self, y: Array) -> Array:
+        """T y."""
+        x = self.motions @ y[: len(self.pins)]
+        x[self.rest] += y[len(self.pins) :]
+        return np.asarray(x)
+
+    def coordinates(self, X: csr_array) -> csr_array:
+        """T⁻¹X."""
+        first = self.inverse @ X[self.pins]
+        return csr_array(vstack([first, X[self.rest] - self.motions[self.rest] @ first]))
+
+    def rows(self, Gt: csr_array, J: csr_array, equalities: Array) -> csr_array:
+        """Gᵀ T, what is known to be zero left out.
+
+        Args:
+            Gt: Gᵀ in the subdomains' coordinates.
+            J: The same rows on motions of bodies.
+            equalities: Flags of the rows.
+        """
+        of_equalities = diags_array(equalities.astype(float)) @ J
+        GtM = of_equalities @ self.combined.multiply(~self.unheld)
+        GtM = GtM + (J - of_equalities) @ self.combined.multiply(~self.free)
+        return csr_array(hstack([GtM, csc_array(Gt)[:, self.rest]]))
+
+
+def kernel_basis(bodies: Bodies, unheld: Motions, free: Motions) -> KernelBasis:
+    """Return the basis with all motions of bodies that no springs resist, the free ones apart.
+
+    Args:
+        bodies: The bodies.
+        unheld: Motions that neither springs nor equality rows resist.
+        free: Motions that nothing resists.
+    """
+    directions, held_by = _directions(bodies, unheld, free)
+    kept = held_by < SPRINGS
+    combined = csr_array(block_diagonal(directions)[:, np.flatnonzero(kept.ravel())])
+    motions = csr_array(bodies.motions @ combined)
+    body = np.repeat(np.arange(bodies.count), kept.sum(axis=1))
+    pins, inverse = _pins(csc_array(motions), body)
+    rest = np.setdiff1d(np.arange(motions.shape[0]), pins)
+    unheld_of, free_of = held_by[kept] < EQUALITIES, held_by[kept] < CONTACT
+    return KernelBasis(combined, motions, pins, rest, inverse, unheld_of, free_of)
+
+
+def _directions(bodies: Bodies, unheld: Motions, free: Motions) -> tuple[Array, Array]:
+    """Return directions of each body that are orthonormal in the kernel, and what holds each.
+
+    Each is a combination of those before it: free ones, those that contact holds, those that
+    equality rows hold, those that springs resist.
+    """
+    order = 3.0 * bodies.springs - _projector(unheld) - _projector(free)
+    values, V = np.linalg.eigh(order)
+    held_by = np.rint(values) + EQUALITIES
+    kept = held_by < SPRINGS
+    gram = np.swapaxes(V, 1, 2) @ bodies.size @ V
+    gram = np.where(kept[:, :, None] & kept[:, None, :], gram, np.eye(bodies.k))
+    return V @ np.linalg.inv(np.swapaxes(np.linalg.cholesky(gram), 1, 2)), held_by
+
+
+def _projector(motions: Motions) -> Array:
+    """Projectors onto the motions of single bodies, shape ``(bodies, k, k)``."""
+    F = motions.single * motions.free[:, None, :]
+    return np.asarray(F @ np.swapaxes(F, 1, 2))
+
+
+def _pins(motions: csc_array, body: Array) -> tuple[Array, csr_array]:
+    """Coordinates on which the motions of each body are independent, and the inverse there."""
+    if len(body) == 0:
+        return np.empty(0, dtype=np.int64), csr_array((0, 0))
+    pins, inverses = [], []
+    for own in np.split(np.arange(len(body)), np.flatnonzero(np.diff(body)) + 1):
+        part = csr_array(motions[:, own])
+        rows = np.flatnonzero(np.diff(part.indptr))
+        dense = part[rows].toarray()
+        chosen = independent(dense)
+        pins.append(rows[chosen])
+        inverses.append(np.linalg.inv(dense[chosen]))
+    return np.concatenate(pins), csr_array(block_diag([csr_array(X) for X in inverses]))
+
+
+def independent(columns: Array) -> Array:
+    """Select by pivoting as many rows as columns, on which the columns are independent."""
+    if columns.shape[1] == 0:
+        return np.empty(0, dtype=np.int64)
+    return np.asarray(qr(columns.T, pivoting=True, mode="r")[1][: columns.shape[1]])
+
+
 # --- Orthonormal basis of null(Gᵀ) ------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class NullBasis:
-    """An orthonormal basis of a null space.
+    """A null space of unit vectors and a few others.
 
     Attributes:
-        vectors: As columns, scipy CSR, shape ``(r, c)``.
+        alone: Coordinates of the unit vectors.
+        joint: Orthonormal, zero at those coordinates, as columns, scipy CSR, shape ``(r, c)``.
     """
 
-    vectors: csr_array
+    alone: Array
+    joint: csr_array
 
     def removed(self, x: Array) -> Array:
         """x less its part in the space."""
-        return np.asarray(x - self.vectors @ (self.vectors.T @ x))
+        x = x - self.joint @ (self.joint.T @ x) if self.joint.shape[1] else np.array(x)
+        x[self.alone] = 0.0
+        return np.asarray(x)
 
     def pins(self, scale: Array) -> Array:
         """Select as many coordinates as vectors, on which these are independent.
@@ -382,15 +570,29 @@ class NullBasis:
         Args:
             scale: Coordinates are to be counted in these units.
         """
-        pins = [np.empty(0, dtype=np.int64)]
-        for _, rows, dense in parts_of_columns(self.vectors):
-            scaled = dense / scale[rows, None]
-            scaled /= np.maximum(np.linalg.norm(scaled, axis=0), TINY)
-            pins.append(rows[qr(scaled.T, pivoting=True, mode="r")[1][: scaled.shape[1]]])
+        pins = [self.alone]
+        for _, rows, dense in parts_of_columns(self.joint):
+            joint = dense / scale[rows, None]
+            size = np.maximum(np.linalg.norm(joint, axis=0), TINY)
+            pins.append(rows[independent(joint / size)])
         return np.concatenate(pins)
 
     def extended(self, count: int) -> NullBasis:
         """Return the same space, 0 on so many more coordinates."""
-        return NullBasis(
-            csr_array(vstack([self.vectors, csr_array((count, self.vectors.shape[1]))]))
-        )
+        rows = self.joint.shape[0] + count
+        table = (self.joint.data, self.joint.indices, np.pad(self.joint.indptr, (0, count), "edge"))
+        return NullBasis(self.alone, csr_array(table, shape=(rows, self.joint.shape[1])))
+
+
+def null_basis(alone: Array, joint: csr_array) -> NullBasis:
+    """Basis of unit vectors and others.
+
+    Args:
+        alone: Coordinates of the unit vectors.
+        joint: Other vectors as columns, independent of them.
+    """
+    others = np.ones(joint.shape[0])
+    others[alone] = 0.0
+    kept = csr_array(diags_array(others) @ joint)
+    kept.eliminate_zeros()
+    return NullBasis(alone, orthonormal_columns(kept))
