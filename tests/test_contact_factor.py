@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from petsc4py import PETSc
 
-from tfeti_dolfinx.feti import preconditioner as module
-from tfeti_dolfinx.feti.preconditioner import contact_factor
+from tfeti_dolfinx.feti.preconditioner import ContactFactor
 
 
 def matrix(rows):
@@ -21,17 +20,14 @@ def matrix(rows):
     return A
 
 
-@pytest.mark.parametrize("few", [0, 1000])
 @pytest.mark.parametrize("where", ["all", "last", "not the first"])
-def test_a_factor_is_the_inverse_wherever_its_rows_are(comm, monkeypatch, where, few):
-    """Many rows share one factor, of few each rank has one."""
-    monkeypatch.setattr(module, "FEW_ROWS", few)
+def test_a_factor_is_the_inverse_wherever_its_rows_are(comm, where):
     first = {"all": 0, "last": comm.size - 1, "not the first": min(1, comm.size - 1)}[where]
     A = matrix(13 if comm.rank >= first else 0)
     x, b = A.createVecs()
-    for _ in range(20):
+    for _ in range(3):
         x.array[:] = np.random.default_rng(comm.rank).standard_normal(x.local_size)
         A.mult(x, b)
-        factor = contact_factor(A.copy(), "test_contact_factor_")
+        factor = ContactFactor(A.copy(), "test_contact_factor_")
         assert np.allclose(factor.solve(b.array_r), x.array_r, rtol=0, atol=1e-12)
         factor.destroy()

@@ -115,7 +115,7 @@ def test_the_gap_is_that_of_an_admissible_displacement(seed):
     lam = dual.d.duplicate()
     lam.array[:] = p.solution.lam
     assert found.recoveries == 0
-    change, loss, _ = admissible(dual, lam, u)
+    change, loss = admissible(dual, lam.array_r, u, dual.seen)
     lifted = np.empty_like(change)
     dual.lifting.mult(change, lifted)
     gap = summed(p, 0.5 * change @ lifted + loss)

@@ -1,4 +1,4 @@
-"""Motions that contact holds hardly or not at all: named, and the smallest is taken."""
+"""Motions that contact holds hardly or not at all are named; of free ones the smallest is taken."""
 
 import basix.ufl
 import numpy as np
@@ -142,20 +142,19 @@ def test_a_ring_that_polygons_hold_by_a_little():
 
 
 @pytest.mark.parametrize("jitter", [0.0, 0.2])
-def test_three_discs_between_walls_move_alike_on_all_layouts(jitter):
-    """They may slide until they meet, and evenly spaced nodes roll: the least of it is taken."""
+def test_three_discs_between_walls_are_held_alike_on_all_layouts(jitter):
+    """They may slide until they meet, which is said; how they stand is known."""
     results = []
     for subdomains in (3, 7):
         p = three_discs(subdomains, jitter)
         p.solve()
-        results.append(motions(p))
+        results.append(motions(p)[:, 1])
         assert p.report.residuals["penetration"] <= p.report.tolerances["penetration"]
         assert p.report.residuals["gluing_jump"] <= p.report.tolerances["gluing_jump"]
         named = {(m["bodies"][0], m["mode"]) for m in p.report.nearly_free}
         assert {(f"body {b}", "translation in x") for b in range(3)} <= named
+        assert any("do not hold translation in x" in text for text in p.report.warnings)
     assert np.allclose(results[0], results[1], atol=1e-5 * np.abs(results[0]).max())
-    if jitter == 0.0:
-        assert np.abs(results[0][:, 2]).max() <= 1e-8
 
 
 def test_a_block_that_slides_freely_stays_where_it_is():

@@ -7,7 +7,7 @@ from true_errors import AGAINST_FINER, error_against, stress_of_cells
 
 import tfeti_dolfinx as tfeti
 from demos import talk_hertz_2d
-from tfeti_dolfinx.feti.stopping import FINEST, TENTH
+from tfeti_dolfinx.feti.stopping import StoppingTolerances
 
 
 def work(p):
@@ -19,7 +19,7 @@ def work(p):
 
 def is_reached(p):
     found = p.report.estimates
-    allowed = max(TENTH * found["discretisation"], FINEST * found["energy"])
+    allowed = StoppingTolerances().target * max(found["discretisation"], 1e-5 * found["energy"])
     return 0.0 < found["algebraic"] <= allowed * (1 + 1e-12)
 
 

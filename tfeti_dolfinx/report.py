@@ -55,7 +55,7 @@ class Report:
         free_modes: Rigid motions that nothing resists and the load does not drive.
         nearly_free: Rigid motions that contacts with a force hold hardly (``stiffness``: as a
             share of what the same contacts hold at most) or not at all (0): dicts of ``bodies``,
-            ``mode`` and ``stiffness``. The smallest motion was taken.
+            ``mode`` and ``stiffness``. u has one of these motions.
         warnings: Sentences on why the answer cannot be trusted, or not as far as it seems.
         contact_rows: Non-penetration rows.
         contact_candidates: Nodes of the (secondary) contact surfaces.
@@ -281,7 +281,8 @@ def fill_result(
     report.clusters = dual.subdomains.num_clusters
     report.kernel_dim = dual.coarse.dimension
     report.free_modes = dual.coarse.num_free_motions
-    report.nearly_free = dual.nearly_free
+    if accuracy.recovered is not None:
+        report.nearly_free = dual.nearly_free(accuracy.recovered.active)
     active = solution.carrying[solution.gluing.constraints.sets.normals]
     report.active_contacts = comm.allreduce(int(np.sum(active)))
     status = solution.status_of_conditions

@@ -3,166 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
-from scipy.sparse import csr_array, diags_array
 
-from tfeti_dolfinx.common.arrays import TINY, Array, joined, sum_rows, sums
+from tfeti_dolfinx.common.arrays import Array, joined, sum_rows, sums
 from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root
-from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.contact.records import GEOMETRY
-from tfeti_dolfinx.feti.coarse import CoarseSpace
 from tfeti_dolfinx.feti.dual import Dual
-from tfeti_dolfinx.feti.recovery import constraint_residual, orthonormal
-from tfeti_dolfinx.feti.rigid_bodies import parts_of_motions
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.diagnostics import flatness, shared_by_bodies
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.solution import Solution
-from tfeti_dolfinx.subdomains.block import mode_names
 from tfeti_dolfinx.subdomains.stiffness import stretch_over_shear
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
-
-# --- Sliding motions that friction alone must hold --------------------------------------------
-
-# of rtol: how far a body may be from where friction balances its load
-FAR = 20.0
-# rounding of displacements, of the largest; of the work of a load, of the most that it could do;
-# and of that of friction what says nothing of where a body is
-NOISE, ROUNDING, NO_HOLD = 2.5e-13, 1e-14, 1e-6
-
-
-@dataclass(frozen=True)
-class Lost:
-    """Motions of bodies along which a displacement is wrong, or not determined; on all ranks.
-
-    Attributes:
-        motions: As columns on the bodies' motions, scipy CSR, shape ``(bodies * k, lost)``.
-        share: What friction bears along each, of the most that the largest load could do, shape
-            ``(lost,)``.
-    """
-
-    motions: csr_array
-    share: Array
-
-
-def lost_on_friction(
-    coarse: CoarseSpace, constraints: Constraints, u: Array, lam: Array, rtol: float
-) -> Lost | None:
-    """Return motions that friction alone holds, but not where the displacement is. Collective.
-
-    Along a motion y that neither springs, nor equality rows, nor closed normals resist, friction
-    balances the load e: ρ(t) = yᵀe − Σψ_i (T_i y)ᵀq_i/‖q_i‖, q_i the slips of u + ty, is 0 or jumps
-    over it at t = 0. It falls with t, so u is farther than t from such a place along y if ρ does
-    not change its sign between −t and t. Where ψ_i is tiny nothing else sees that: τ_i moves
-    nothing, and a slip that it does not allow is hardly work. Products with B, none with F.
-
-    Args:
-        coarse: The coarse space.
-        constraints: Rows, their limits and coefficients.
-        u: This rank's displacement, shape ``(n,)``.
-        lam: The multipliers of this rank's rows.
-        rtol: The relative tolerance that was asked for.
-
-    Returns:
-        Those motions of which that is so for 20 rtol of the displacement, or None.
-    """
-    w = constraint_residual(constraints, u[coarse.subdomains.trace])
-    slips = np.array(w.array_r)
-    w.destroy()
-    allowed = _allowed(coarse, u, rtol)
-    N = _held_by_nothing_else(coarse, constraints, slips, allowed)
-    if N.shape[1] == 0:
-        return None
-    law = _Sliding(coarse, constraints, slips, lam, N)
-    reach = _largest(N, np.repeat(allowed, coarse.bodies.k))
-    back, ahead = law.left(-reach), law.left(reach)
-    # what friction bears is lost in the noise of the solution: there it must say where a body is
-    weak = law.most <= rtol * law.load
-    sure = np.where(weak, np.maximum(NO_HOLD * law.most, law.noise), -rtol * law.most)
-    lost = bcast_from_root(coarse.comm, (law.most > 0.0) & ((back < sure) | (ahead > -sure)))
-    if not lost.any():
-        return None
-    return Lost(csr_array(N[:, np.flatnonzero(lost)]), law.most[lost] / max(law.load, TINY))
-
-
-class _Sliding:
-    """Load and friction along motions, shape ``(motions,)``, on all ranks. Creation is collective.
-
-    Attributes:
-        most: The most that friction can bear, Σ‖ψ_i T_i y‖.
-        load: The most that the largest load on a body could do.
-        noise: Rounding of the work of the load.
-    """
-
-    def __init__(
-        self,
-        coarse: CoarseSpace,
-        constraints: Constraints,
-        slips: Array,
-        lam: Array,
-        N: csr_array,
-    ) -> None:
-        rows, size = constraints.sets.tangents, constraints.tangent_scale[:, None]
-        by_law = constraints.coefficients * lam[constraints.pressed_by][:, None]
-        pressed = (constraints.pressed_by >= 0)[:, None]
-        limits = np.where(pressed, by_law, constraints.limits) * size
-        J = csr_array(diags_array(coarse.row_size) @ coarse.J @ N)
-        along = [csr_array(J[own]) for own in rows.T]
-        i, self._motion = sum((abs(A) for A in along), csr_array(along[0].shape)).nonzero()
-        entries = [np.asarray(A[i, self._motion]).ravel() for A in along]
-        self._v = np.stack(entries, axis=1) / size[i]
-        self._q, self._limits = (slips[rows] / size)[i], limits[i]
-        self._comm, self._count = coarse.comm, N.shape[1]
-        self.most = self._summed(np.linalg.norm(self._limits * self._v, axis=1))
-        self._work = N.T @ (coarse.motions.T @ coarse.e)
-        bodies = coarse.bodies
-        largest = bodies.loads * np.sqrt(bodies.nodes)
-        self.load = float(largest.max(initial=0.0))
-        self.noise = ROUNDING * _largest(N, np.repeat(largest, bodies.k))
-
-    def left(self, t: Array) -> Array:
-        """ρ of each motion, t of it farther. Collective."""
-        z = self._limits * (self._q + t[self._motion][:, None] * self._v)
-        length = np.maximum(np.linalg.norm(z, axis=1), TINY)
-        return self._work - self._summed(np.sum(self._limits * z * self._v, axis=1) / length)
-
-    def _summed(self, values: Array) -> Array:
-        own = sum_rows(self._motion, values, self._count)
-        self._comm.Allreduce(MPI.IN_PLACE, own, op=MPI.SUM)
-        return own
-
-
-def _allowed(coarse: CoarseSpace, u: Array, rtol: float) -> Array:
-    """Return the displacement error allowed to each body, shape ``(bodies,)``."""
-    size = coarse.subdomains.body_maxima([coarse.subdomains.sizes(u)])[0]
-    return np.asarray(FAR * rtol * size + NOISE * size.max(initial=0.0))
-
-
-def _held_by_nothing_else(
-    coarse: CoarseSpace, constraints: Constraints, slips: Array, allowed: Array
-) -> csr_array:
-    """Return orthonormal motions that normals which may be closed do not resist, on all ranks."""
-    row, column = coarse.J.tocoo().coords
-    near = np.zeros(len(slips))
-    np.maximum.at(near, row, allowed[column // coarse.bodies.k])
-    closed, normals = np.zeros(len(slips), dtype=bool), constraints.sets.normals
-    closed[normals] = -slips[normals] <= near[normals] * constraints.scale
-    motions = coarse.unresisted(closed)
-    return bcast_from_root(coarse.comm, orthonormal(motions, coarse.bodies.k)[0])
-
-
-def _largest(N: csr_array, values: Array) -> Array:
-    """Return for each column the largest value among the rows where it has entries."""
-    entries = N.tocoo()
-    row, column = entries.coords
-    largest = np.zeros(N.shape[1])
-    np.maximum.at(largest, column, np.where(entries.data != 0.0, values[row], 0.0))
-    return largest
-
 
 # --- Warnings of the report -------------------------------------------------------------------
 
@@ -212,9 +67,7 @@ class Diagnostics:
         u = solution.u
         return [
             *_loose(report),
-            *self._on_friction(dual, u, solution.lam, rtol),
             *self._rounding(dual, u, rtol),
-            *self._springs(dual, rtol),
             *self._turned(u, dual.subdomains),
             *self._facets(solution, dual.subdomains),
             *self._lasting,
@@ -257,26 +110,6 @@ class Diagnostics:
                 "it too stiff (locking); expected degree 2"
             )
 
-    def _on_friction(self, dual: Dual, u: Array, lam: Array, rtol: float) -> Iterator[str]:
-        """Bodies that friction alone holds, but somewhere else."""
-        if dual.contact_rows[1] == 0:
-            return
-        lost = lost_on_friction(dual.coarse, dual.constraints, u, lam, rtol)
-        if lost is None:
-            return
-        modes = mode_names(self._decomposition.mesh.geometry.dim, self._dofs.bs)
-        names = self._decomposition.body_names
-        found = list(parts_of_motions(lost.motions, dual.coarse.bodies, names, modes))
-        for (bodies, mode), share in list(zip(found, lost.share, strict=True))[:LISTED]:
-            yield (
-                f"{', '.join(bodies)}: friction alone holds {mode}, by {share:.0e} of the largest "
-                "load at most, and does not balance the load where the body is: its displacement "
-                f"is wrong along that by more than {FAR:g} rtol, or not determined; expected a "
-                "larger bound or coefficient of friction, or a spring or Dirichlet condition"
-            )
-        if (rest := len(found) - LISTED) > 0:
-            yield f"{rest} more motions that friction alone holds are wrong, or not determined"
-
     def _rounding(self, dual: Dual, u: Array, rtol: float) -> Iterator[str]:
         """Warn of slender bodies, whose small bending energy is inexact by the rounding of K.
 
@@ -298,18 +131,6 @@ class Diagnostics:
                 f"{self._names(share > rtol)}: rounding of the stiffness may change the "
                 f"displacement by about {share.max():.0e} of its size, more than rtol {rtol:g}; "
                 "expected thicker parts, fewer cells, or a larger rtol"
-            )
-
-    def _springs(self, dual: Dual, rtol: float) -> Iterator[str]:
-        """Springs so soft that rounding of the stiffness is a part of them."""
-        if dual.soft is None:
-            return
-        share = EPSILON * dual.soft.amplification
-        if np.any(share > rtol):
-            yield (
-                f"{self._names(share > rtol)}: springs hold subdomains so softly that rounding of "
-                f"the stiffness is about {share.max():.0e} of them, more than rtol {rtol:g}; "
-                "expected stiffer ones or none, or a larger rtol"
             )
 
     def _turned(self, u: Array, subdomains: Subdomains) -> Iterator[str]:
@@ -422,6 +243,9 @@ def _loose(report: Report) -> Iterator[str]:
         bodies, mode, held = (motion[key] for key in ("bodies", "mode", "stiffness"))
         assert isinstance(bodies, list)
         share = f"hold hardly ({held:.0e} of what they could)" if held else "do not hold"
-        yield f"{', '.join(bodies)}: contacts with a force {share} {mode}; the smallest was taken"
+        yield (
+            f"{', '.join(bodies)}: contacts with a force {share} {mode}: displacements that differ "
+            "by that are as right, or nearly so"
+        )
     if (rest := len(report.nearly_free) - LISTED) > 0:
         yield f"{rest} more motions are held hardly or not by contacts with a force"

@@ -38,8 +38,6 @@ class Estimates:
         factorizations: Subdomain matrices factored for it.
         lifting_multiplications: Multiplications by S, the Schur complements.
         recoveries: Displacements recovered, each for one more solve in every subdomain.
-        closing_steps: Steps that made a displacement admissible, each a multiplication by B and
-            by Bᵀ.
         seconds: Wall seconds of this rank.
     """
 
@@ -49,7 +47,6 @@ class Estimates:
     factorizations: int
     lifting_multiplications: int
     recoveries: int
-    closing_steps: int
     seconds: float
 
     @property
@@ -95,7 +92,6 @@ def estimate(system: System, solution: Solution) -> Estimates:
         factorizations=comm.allreduce(counters.factorizations - factored),
         lifting_multiplications=1,
         recoveries=int(bound.moved > 0.0),
-        closing_steps=bound.steps,
         seconds=perf_counter() - start,
     )
 
@@ -132,7 +128,6 @@ def of_looks(reached: Sequence[TargetStatus]) -> dict[str, float]:
         "discretisation": last.goal,
         "lifting_multiplications": len(reached),
         "recoveries": sum(look.bound.moved > 0.0 for look in reached),
-        "closing_steps": sum(look.bound.steps for look in reached),
     }
 
 

@@ -6,7 +6,7 @@ from typing import Any, cast
 
 import numpy as np
 from petsc4py import PETSc
-from scipy.sparse import csr_array, diags_array
+from scipy.sparse import csr_array, diags_array, hstack
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root, chunk_offsets
@@ -25,6 +25,7 @@ from tfeti_dolfinx.feti.rigid_bodies import (
     Motions,
     kernel_basis,
     null_basis,
+    orthonormal_columns,
     unresisted,
     unsprung,
 )
@@ -65,6 +66,7 @@ class CoarseSpace(Projectors):
         unheld: Motions that neither springs nor equality rows resist, friction apart; each of
             these rows acts on one body.
         free_motions: Motions that no row resists at all.
+        free_basis: An orthonormal basis of them, scipy CSR, shape ``(bodies * k, c)``.
         null: Orthonormal basis of null(Gᵀ).
         grams: GGᵀ, and those of faces.
         factors: Makes the factors of faces, and counts them apart from that of GGᵀ.
@@ -91,6 +93,8 @@ class CoarseSpace(Projectors):
         equalities[np.concatenate((bounded, rubbing))] = False
         self.unheld = self._unresisted(equalities, unsprung(self.bodies.springs), NULL)
         self.free_motions = self.unresisted(~equalities)
+        both = csr_array(hstack([self.free_motions.alone, self.free_motions.joint]))
+        self.free_basis = bcast_from_root(comm, orthonormal_columns(both))
         # made on one rank: processors that round differently might choose differently
         self._basis = bcast_from_root(
             comm, kernel_basis(self.bodies, self.unheld, self.free_motions)

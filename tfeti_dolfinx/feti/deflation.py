@@ -70,8 +70,6 @@ class SoftModes:
 
     Attributes:
         count: Number of soft motions of all subdomains.
-        amplification: In each body the largest of max diag(K)/R̂ᵀKR̂, 0 without springs: rounding
-            of K is so much larger in what springs do. Shape ``(b,)``.
         factors: Makes the factors of faces, and counts them.
     """
 
@@ -85,7 +83,7 @@ class SoftModes:
     ) -> None:
         self._comm = coarse.comm
         own = coarse.subdomains.soft_motions()
-        Gt, energy, self.amplification = _springs(B, coarse, own)
+        Gt, energy = _springs(B, coarse, own)
         sigma = mean_stiffness(coarse.subdomains, weights)
         squares = summed(self._comm, np.asarray(Gt.multiply(Gt).sum(axis=0)).ravel())
         soft = bcast_from_root(self._comm, np.flatnonzero(energy < sigma * squares))
@@ -188,16 +186,10 @@ def mean_stiffness(subdomains: Subdomains, weights: Array) -> float:
     return float(stiffness / max(unknowns, 1.0))
 
 
-def _springs(B: PETSc.Mat, coarse: CoarseSpace, own: SoftMotions) -> tuple[csr_array, Array, Array]:
-    """This rank's rows of Ĝᵀ, with all motions outside of kernels as columns; D; amplification.
-
-    Collective.
-    """
-    subdomains = coarse.subdomains
-    offsets = chunk_offsets(coarse.comm, own.rows.shape[1])
-    total = int(offsets[-1])
+def _springs(B: PETSc.Mat, coarse: CoarseSpace, own: SoftMotions) -> tuple[csr_array, Array]:
+    """This rank's rows of Ĝᵀ, with all motions outside of kernels as columns; D. Collective."""
+    total = int(chunk_offsets(coarse.comm, own.rows.shape[1])[-1])
     if total == 0:
-        return csr_array((B.getLocalSize()[0], 0)), np.zeros(0), np.zeros(subdomains.num_bodies)
+        return csr_array((B.getLocalSize()[0], 0)), np.zeros(0)
     energy = np.concatenate(coarse.comm.allgather(own.energy))
-    Gt = transposed_G(B, own.rows, total)
-    return Gt, energy, subdomains.body_maxima([own.amplification])[0]
+    return transposed_G(B, own.rows, total), energy

@@ -24,9 +24,9 @@ from tfeti_dolfinx.feti.operator import (
     linear_term,
 )
 from tfeti_dolfinx.feti.preconditioner import FacePreconditioner
-from tfeti_dolfinx.feti.recovery import moved, nearly_free, recover, smallest_motion
+from tfeti_dolfinx.feti.recovery import Recovered, recover
 from tfeti_dolfinx.feti.rigid_bodies import listed
-from tfeti_dolfinx.feti.solvability import check_capacity, check_solvable, sliding_body
+from tfeti_dolfinx.feti.solvability import check_solvable, sliding_body
 from tfeti_dolfinx.qp.coarse import Coarse, NoCoarse
 from tfeti_dolfinx.qp.homogenised import LastProduct, OperatorProduct, natural, operator_product
 from tfeti_dolfinx.qp.krylov import estimate_norm
@@ -94,6 +94,10 @@ FAR = 1e3
 # of stiffness, lengths and forces: beyond it squares leave the range of floating point
 LEAST, MOST = 1e-130, 1e130
 
+# Motions held by less than this share of what the same contacts hold at most are nearly free:
+# their contacts' normals are off by less than 6 degrees from a right angle.
+NEARLY = 1e-2
+
 # from B and c to the set of multipliers, on all local rows
 FeasibleLaw = Callable[[Constraints], FeasibleSet]
 
@@ -140,8 +144,6 @@ class Dual:
             ``constraints.sets.tangents``; nan elsewhere, and before ``bound_friction``.
         last: The last solution of block Newton, or without a kernel, with its image.
         recycled: Directions of earlier solves; None: none are kept.
-        pressing: After ``recover``: contact rows whose force is more than the solver's error.
-        nearly_free: After ``recover``: motions that contacts with a force hold hardly or not.
 
     Raises:
         InputError: Squares of stiffness, load or values leave the range of floating point.
@@ -163,9 +165,8 @@ class Dual:
         self.constraints, self.subdomains = constraints, subdomains
         self._given = constraints
         self.pressures: Array = np.full(len(constraints.sets.tangents), np.nan)
-        self.pressing = np.zeros(constraints.num_rows, dtype=bool)
         self._prefix = f"{options_prefix}face_"
-        self._names, self.nearly_free = (body_names, mode_names), list[dict[str, object]]()
+        self._names = body_names, mode_names
         B, comm = constraints.B, constraints.B.getComm().tompi4py()
         self._stiffness = largest(comm, subdomains.diagonal)
         self.d = linear_term(B, constraints.c, subdomains)
@@ -223,8 +224,7 @@ class Dual:
         return self._lifting
 
     def _check(self) -> None:
-        check_solvable(self.coarse, *self._names)
-        check_capacity(self.coarse, self._given, *self._names)
+        check_solvable(self.coarse, self._given, *self._names)
 
     def _check_units(self, comm: MPI.Intracomm) -> None:
         length = largest(comm, self.driving)
@@ -362,34 +362,27 @@ class Dual:
             return None
         return self._images[kind][1]
 
-    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> Array:
-        """Return displacements that belong to multipliers: of equal ones the smallest.
+    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> Recovered:
+        """Return the displacement of multipliers; changes nothing.
 
         Args:
             lam: The multipliers λ.
             gradient: Fλ − d up to the range of Gᵀ; on open rows the multiplier ν.
             face: The face of λ: which rows carry a force.
             error: How large multipliers may be by the solver's error alone.
-
-        Returns:
-            This rank's part of u, shape ``(n,)``.
         """
-        B, c, pinv_load = self.constraints.B, self.constraints.c, self.subdomains.pinv_load
-        u, gap, g = recover(B, c, self.coarse, lam, gradient, face, pinv_load)
-        self.last.look(lam, g)
-        return self.smallest(u, gap, lam.array_r, face, error)
+        response = self.subdomains.pinv_load
+        values = lam.array_r, gradient.array_r, face, error
+        return recover(self.constraints, self.coarse, response, *values)
 
-    def smallest(self, u: Array, gap: Array, lam: Array, face: Face, error: float) -> Array:
-        """Return the smallest displacement that solves as well as u, given u and its c − Bu."""
-        motions, force = nearly_free(self.coarse, lam, face.carrying, error)
-        self.pressing = force
-        words = listed(motions, self.coarse.bodies, *self._names)
-        self.nearly_free = bcast_from_root(self.coarse.comm, words)
-        if motions.count == 0:
-            return u
-        gap[self.constraints.sets.tangents] = 0.0  # a slip says nothing of how exact rows are
-        alpha = smallest_motion(self.coarse, u, gap, motions, force)
-        return moved(u, self.coarse, alpha)
+    def nearly_free(self, active: Array) -> list[dict[str, object]]:
+        """List motions that contact rows with a force hold hardly or not, see ``listed``.
+
+        Args:
+            active: Flags of these rows, as ``Recovered`` has them.
+        """
+        motions = self.coarse.unresisted(active, below=NEARLY)
+        return bcast_from_root(self.coarse.comm, listed(motions, self.coarse.bodies, *self._names))
 
     def destroy(self) -> None:
         """Destroy the PETSc objects."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import numpy as np
 from mpi4py import MPI
@@ -15,11 +14,11 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root
 from tfeti_dolfinx.constraints.rows import Constraints
-from tfeti_dolfinx.errors import FactorError, raised_on_all_ranks
+from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.operator import DualOperator, Metric
 from tfeti_dolfinx.qp.problem import FaceOperator
 from tfeti_dolfinx.qp.sets import Face
-from tfeti_dolfinx.subdomains.factor import CholeskyFactor, added_options, has_solver
+from tfeti_dolfinx.subdomains.factor import CholeskyFactor
 
 # --- Smoothing of displacements with given jumps ----------------------------------------------
 
@@ -208,104 +207,50 @@ def smoothed(steps: list[tuple[float, float]], apply: OfArray, u: Array) -> Arra
     return u
 
 
-# --- Factors of a distributed matrix of contact rows ------------------------------------------
-
-# rows up to which each rank that has any has a factor of the whole: to tell each other of so few
-# costs less than to share their elimination
-FEW_ROWS = 1000
+# --- Factor of a distributed matrix of contact rows -------------------------------------------
 
 
-class GramFactor(Protocol):
-    """The inverse of a matrix."""
-
-    def solve(self, b: Array) -> Array:
-        """A⁻¹b, of this rank's parts. Collective."""
-        ...
-
-    def destroy(self) -> None:
-        """Free it. Collective."""
-        ...
-
-
-def contact_factor(A: PETSc.Mat, prefix: str) -> GramFactor:
-    """Return a factor of a symmetric positive definite matrix, which is taken over. Collective.
-
-    Ranks without rows have no part in it: MUMPS 5.7 has been seen to hang in a solve with rows on
-    one rank of two.
+class ContactFactor:
+    """Cholesky factor of a matrix of contact rows, whole on each rank; it is small and sparse.
 
     Args:
-        A: Symmetric positive definite, AIJ.
+        A: Symmetric positive definite, AIJ; taken over. The constructor is collective.
         prefix: Prefix of the factor's PETSc options.
 
     Raises:
         FactorError: It could not be made.
     """
-    comm, (rows, size) = A.getComm().tompi4py(), A.getSizes()[0]
-    indptr, indices, data = A.getValuesCSR()
-    A.destroy()
-    owners = comm.Split(0 if rows else MPI.UNDEFINED, comm.rank)
-    with raised_on_all_ranks(comm):
-        if not rows:
-            return NoRows()
-        if owners.size == 1:
-            owners.Free()
-            return CholeskyFactor(csr_array((data, indices, indptr), shape=(size, size)), prefix)
-        part = PETSc.Mat().createAIJ(((rows, size),) * 2, csr=(indptr, indices, data), comm=owners)
-        return DistributedFactor(part, owners, prefix)
 
-
-class NoRows:
-    """Factor of a rank without rows."""
-
-    def solve(self, b: Array) -> Array:
-        """Return b, which is empty."""
-        return b
-
-    def destroy(self) -> None:
-        """There is nothing to free."""
-
-
-class DistributedFactor:
-    """A = L Lᵀ shared by ranks with rows, by MUMPS; of few rows, or without it, whole on each.
-
-    Args:
-        A: Symmetric positive definite, MPIAIJ; taken over. The constructor is collective.
-        comm: Its communicator; taken over.
-        prefix: Prefix of the PETSc options.
-
-    Raises:
-        FactorError: It could not be made.
-    """
-
-    def __init__(self, A: PETSc.Mat, comm: MPI.Intracomm, prefix: str) -> None:
-        A.setOption(PETSc.Mat.Option.SPD, True)
-        self._comm = comm
-        self._b, self._x = A.createVecs()
-        self._pc: Any = PETSc.PC().create(A.getComm())
-        self._pc.setOptionsPrefix(prefix)
-        self._pc.setOperators(A)
-        parallel = A.getSize()[0] > FEW_ROWS and has_solver("mumps")
-        self._pc.setType(PETSc.PC.Type.CHOLESKY if parallel else PETSc.PC.Type.REDUNDANT)
-        given = {"pc_factor_mat_solver_type": "mumps"} if parallel else {}
-        with raised_on_all_ranks(comm), added_options(prefix, given):
-            try:
-                self._pc.setFromOptions()
-                self._pc.setUp()
-            except PETSc.Error as error:
-                raise FactorError(f"the contact rows of a face: {error}") from error
+    def __init__(self, A: PETSc.Mat, prefix: str) -> None:
+        self._comm, size = A.getComm().tompi4py(), A.getSize()[0]
+        first, last = A.getOwnershipRange()
+        self._own = slice(first, last)
+        indptr, indices, data = A.getValuesCSR()
         A.destroy()
+        counts = joined_over(self._comm, np.diff(indptr))
+        table = np.concatenate(([0], np.cumsum(counts)))
+        parts = (joined_over(self._comm, part) for part in (data, indices))
+        with raised_on_all_ranks(self._comm):
+            self._factor = CholeskyFactor(csr_array((*parts, table), shape=(size, size)), prefix)
 
     def solve(self, b: Array) -> Array:
-        """A⁻¹b, of this rank's parts."""
-        self._b.array[:] = b
-        self._pc.apply(self._b, self._x)
-        return np.array(self._x.array_r)
+        """A⁻¹b, of this rank's parts. Collective."""
+        return np.asarray(self._factor.solve(joined_over(self._comm, b))[self._own])
 
     def destroy(self) -> None:
         """Free the factor."""
-        for item in (self._pc, self._b, self._x):
-            item.destroy()
-        self._comm.Free()
+        self._factor.destroy()
+
+
+def joined_over(comm: MPI.Intracomm, own: Array) -> Array:
+    """Return the arrays of all ranks, one after the other. Collective."""
+    if comm.size == 1:
+        return own
+    sizes = np.empty(comm.size, dtype=np.int64)
+    comm.Allgather(np.array([len(own)]), sizes)
+    whole = np.empty(int(sizes.sum()), dtype=own.dtype)
+    comm.Allgatherv(np.ascontiguousarray(own), [whole, sizes.tolist()])
+    return whole
 
 
 # --- Preconditioner on a face -----------------------------------------------------------------
@@ -369,7 +314,7 @@ class FacePreconditioner:
             part.setDiagonal(added, PETSc.InsertMode.ADD_VALUES)
             added.destroy()
             if part.getSize()[0]:
-                factor = contact_factor(part, self._prefix)
+                factor = ContactFactor(part, self._prefix)
             else:
                 part.destroy()
         operator = self._whole if self._smoothing is None else self._smoothing
@@ -392,7 +337,7 @@ class _OnFace:
         face: Face,
         Z_C: csr_array,
         springs: tuple[Array, Array],
-        factor: GramFactor | None,
+        factor: ContactFactor | None,
     ) -> None:
         self._whole, self._face, self._Z_C, self._factor = whole, face, Z_C, factor
         (self._bent, size), bends = springs, springs[0] > 0.0

@@ -295,13 +295,11 @@ class Projectors:
 
     def forces(self, x: PETSc.Vec) -> Array:
         """Σ|G||x| + |e|, shape ``(r,)``."""
-        return self.terms(x) + np.abs(self.e)
+        return self.terms(x.array_r) + np.abs(self.e)
 
-    def terms(self, x: PETSc.Vec) -> Array:
+    def terms(self, x: Array) -> Array:
         """Σ|G||x|, shape ``(r,)``."""
-        Gt = self.Gt
-        moduli = csr_array((np.abs(Gt.data), Gt.indices, Gt.indptr), shape=Gt.shape)
-        return summed(self.comm, moduli.T @ np.abs(self.restricted(x.array_r)))
+        return summed(self.comm, abs(self.Gt).T @ np.abs(self.restricted(x)))
 
     def solve(self, y: Array) -> Array:
         """(GGᵀ)⁺ y for y in the range of G, orthogonal to the free motions."""

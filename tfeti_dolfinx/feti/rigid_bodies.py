@@ -370,15 +370,6 @@ def _parts(amounts: Array, mode_names: Sequence[str]) -> tuple[Array, str]:
     return moving, modes
 
 
-def parts_of_motions(
-    motions: csr_array, bodies: Bodies, body_names: Sequence[str], mode_names: Sequence[str]
-) -> Iterator[tuple[list[str], str]]:
-    """Names of the bodies that take part in each column, and what it is mostly."""
-    for motion in motions.toarray().T:
-        moving, mode = _parts(bodies.amounts(motion), mode_names)
-        yield [body_names[b] for b in moving[:NAMED]], mode
-
-
 def listed(
     motions: Motions, bodies: Bodies, body_names: Sequence[str], mode_names: Sequence[str]
 ) -> list[dict[str, object]]:

@@ -11,33 +11,63 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import TINY, Array, sums
-from tfeti_dolfinx.common.parallel import bcast_from_root
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.feti.coarse import CoarseSpace
 from tfeti_dolfinx.feti.duality_gap import EnergyBound, LiftedScene, energy_bound
-from tfeti_dolfinx.feti.recovery import constraint_residual, min_norm_correction
+from tfeti_dolfinx.feti.recovery import Recovered, min_norm_correction
+from tfeti_dolfinx.qp.coarse import LIGHT
 from tfeti_dolfinx.qp.problem import ConvergedReason
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
+# from the displacement on this rank to the other error, a root of an energy; collective
+ErrorTarget = Callable[[Array], float]
+
+
+@dataclass(frozen=True)
+class StoppingTolerances:
+    """What rtol does not say of an answer that is right.
+
+    Attributes:
+        noise: Rounding of displacements, of the largest of all bodies, or of the slip that friction
+            counts from; a 25th of it of what the load does to subdomains alone, and of gaps.
+        energy: Of rtol: error of u in energy over all bodies, so that forces are right where
+            bodies move much and deform little.
+        target: Of the other error, or of a 1e-5th of ‖u‖_K where that is more: the bound of the
+            algebraic error.
+        aim: Of the tolerance: residuals are aimed a little below what was asked for.
+        leap: A tolerance never falls by more at once, since the size of the displacement may have
+            been learnt from a poor iterate.
+        stall: The true residual has stalled if the digits it fell by are less than this share of
+            those that the updated one fell by.
+    """
+
+    noise: float = 2.5e-13
+    energy: float = 10.0
+    target: float = 0.1
+    aim: float = 0.5
+    leap: float = 1e-6
+    stall: float = 0.5
+
+    @property
+    def load_noise(self) -> float:
+        """Rounding of displacements, of what the load does to a body's subdomains alone."""
+        return self.noise / 25.0
+
+
 # --- Measures of an iterate in physical units -------------------------------------------------
 
-# of the largest forces on a kernel mode: those on a light one beside it count as so large at least,
-# since the rounding of the largest reaches them; and that rounding, which is nobody's to mend
-LIGHT, ROUNDING = 1e-4, 1e-13
 
-
-class Scene(Protocol):
-    """Parts of the dual problem that measuring an iterate needs."""
+class Scene(LiftedScene, Protocol):
+    """Parts of the dual problem that an assessment needs."""
 
     constraints: Constraints
     subdomains: Subdomains
     coarse: CoarseSpace
-    pressing: Array
     feasible: FeasibleSet
 
-    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> Array:
-        """Return this rank's part of u, given the solver's face and error. Collective."""
+    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> Recovered:
+        """Return the displacement of multipliers, given the solver's face and error. Collective."""
         ...
 
 
@@ -68,10 +98,9 @@ class BodyMeasures:
 
 @dataclass(frozen=True)
 class Measures:
-    """An iterate in physical terms; the same on all ranks but for the displacements.
+    """An iterate in physical terms; the same on all ranks.
 
     Attributes:
-        u: This rank's part of the displacement, shape ``(n,)``.
         bodies: What is known of each body.
         penetration: Deepest overlap, distance of a row that carries a force, or slip that friction
             does not allow.
@@ -82,7 +111,6 @@ class Measures:
         begin: Largest slip that friction counts from.
     """
 
-    u: Array
     bodies: BodyMeasures
     penetration: float
     balance: float
@@ -96,69 +124,60 @@ class Measures:
         """Norm of the correction in energy, over all bodies."""
         return float(np.sqrt(self.bodies.correction_energy.sum()))
 
+    @property
+    def energy(self) -> float:
+        """‖u‖_K."""
+        return float(np.sqrt(max(self.bodies.energy.sum(), 0.0)))
 
-def measure(
-    scene: Scene,
-    lam: PETSc.Vec,
-    gradient: PETSc.Vec,
-    face: Face,
-    norm: float,
-    error: float,
-    before: Array | None = None,
-) -> Measures:
-    """Recover the displacement of an iterate and see how well it fulfils the rows. Collective.
 
-    Rows miss w = Bu − c: rows of equalities and those that press both ways, others where they
-    overlap, or as far as a force on them says that they are not open, min(c − Bu, ‖F‖λ), tangential
-    ones what of the slip their force does not allow. v, the least displacement
+def measure(scene: Scene, state: Recovered, norm: float, before: Array | None = None) -> Measures:
+    """Measure how well the displacement of an iterate fulfils the rows. Collective.
+
+    Rows miss w: of Bu − c all of equalities and of rows that press both ways, of others where they
+    overlap, or as far as a force on them says that they are not open, min(c − Bu, ‖F‖λ), of
+    tangential ones what of the slip their force does not allow. v, the least displacement
     in D that closes that, makes u + v admissible; so ‖v‖_K bounds the error of u in energy, as far
     as λ balances the load.
 
     Args:
         scene: The dual problem.
-        lam: The multipliers λ.
-        gradient: Fλ − d up to the range of Gᵀ.
-        face: The face of λ.
+        state: The displacement, recovered.
         norm: ‖F‖, or an estimate.
-        error: How large multipliers may be by the solver's error alone.
         before: The displacement of an earlier iterate.
     """
-    u = scene.recover(lam, gradient, face, error)
-    w, (penetration, gap, begin) = _missed(scene, u, lam, norm)
-    constraints = scene.constraints
-    residual, normals = w.norm(), constraints.sets.normals
-    closed = scene.pressing[normals] | (w.array_r[normals] != 0.0)
-    closed = np.concatenate((closed, constraints.limits.ravel() > 0.0))
-    bodies = _bodies(scene, u, min_norm_correction(constraints, w, closed), before)
-    balance, forces = _balance(scene.coarse, lam)
-    w.destroy()
-    return Measures(u, bodies, penetration, balance, forces, residual, gap, begin)
-
-
-def _missed(scene: Scene, u: Array, lam: PETSc.Vec, norm: float) -> tuple[PETSc.Vec, Array]:
-    """w, and as lengths the largest of its contact rows, of their gaps and slips at first."""
-    constraints = scene.constraints
-    w = constraint_residual(constraints, u[scene.subdomains.trace])
-    normals = constraints.sets.normals
-    rows = w.array_r[normals]
+    constraints, sets, comm = scene.constraints, scene.constraints.sets, scene.coarse.comm
+    c, normals, tangents = constraints.c.array_r, sets.normals, sets.tangents
+    w = -state.gap
+    overlap, closed = w[normals], state.active[normals]
     # an open row whose force is not gone yet: of distance and force, as a length, the smaller
-    still = _missed_by(scene, lam.array_r, normals, np.minimum(rows, 0.0), norm)
-    rows = np.where(scene.pressing[normals] | (rows > 0.0), rows, still)
-    w.array[normals] = rows
-    lengths = np.abs((rows, constraints.c.array_r[normals])) / constraints.scale
-    largest = np.append(np.max(lengths, axis=1, initial=0.0), 0.0)
-    tangents = constraints.sets.tangents
+    still = missed_by(scene, state.lam, normals, np.minimum(overlap, 0.0), norm)
+    w[normals] = np.where(closed | (overlap > 0.0), overlap, still)
+    lengths = np.abs((w[normals], c[normals])) / constraints.scale
+    penetration, gap = np.max(lengths, axis=1, initial=0.0)
+    begin = 0.0
     if tangents.size:
-        slip = w.array_r[tangents]
-        w.array[tangents] = _missed_by(scene, lam.array_r, tangents, slip, norm)
-        rows = np.stack((w.array_r[tangents], constraints.c.array_r[tangents]))
-        length = np.linalg.norm(rows, axis=2) / constraints.tangent_scale
-        largest[[0, 2]] = np.maximum(largest[[0, 2]], length.max(axis=1))
-    w.getComm().tompi4py().Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
-    return w, largest
+        w[tangents] = missed_by(scene, state.lam, tangents, w[tangents], norm)
+        slips = np.linalg.norm((w[tangents], c[tangents]), axis=2) / constraints.tangent_scale
+        penetration, begin = max(penetration, slips[0].max()), slips[1].max()
+    closed = np.concatenate((closed | (w[normals] != 0.0), constraints.limits.ravel() > 0.0))
+    largest = np.array([penetration, gap, begin])
+    comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
+    square = np.array([w @ w])
+    comm.Allreduce(MPI.IN_PLACE, square, op=MPI.SUM)
+    v = min_norm_correction(constraints, w, closed)
+    balance, forces = _balance(scene.coarse, state.lam)
+    return Measures(
+        bodies=_bodies(scene, state.u, v, before),
+        penetration=float(largest[0]),
+        balance=balance,
+        forces=forces,
+        residual=float(np.sqrt(square[0])),
+        gap=float(largest[1]),
+        begin=float(largest[2]),
+    )
 
 
-def _missed_by(scene: Scene, lam: Array, rows: Array, values: Array, norm: float) -> Array:
+def missed_by(scene: Scene, lam: Array, rows: Array, values: Array, norm: float) -> Array:
     """Return the part of gaps or slips that is not normal to the feasible set at the forces.
 
     A force of a normal allows no gap, but 0 does. A force inside its disc allows no slip, one on
@@ -182,19 +201,15 @@ def _bodies(scene: Scene, u: Array, v: Array, before: Array | None) -> BodyMeasu
     """Measure displacements, energies and corrections of each body. Collective."""
     subdomains, motions = scene.subdomains, scene.coarse.bodies
     rigid = subdomains.modes_motion(motions.amounts(motions.part_of(u)))
-    change = u - before if before is not None else np.zeros_like(u)
     trace, diagonal = subdomains.trace_parts, subdomains.diagonal
     energy, correction_energy, stiffness = subdomains.body_sums(
         [subdomains.energies(u), sums(diagonal * v**2, trace), sums(diagonal, trace)]
     )
+    alone = subdomains.extended(subdomains.pinv_load[subdomains.trace])
+    change = np.zeros_like(u) if before is None else u - before
+    displacements = u, u - rigid, subdomains.extended(v), change, alone
     size, elastic, correction, changed, alone = subdomains.body_maxima(
-        [
-            subdomains.sizes(u),
-            subdomains.sizes(u - rigid),
-            subdomains.sizes(subdomains.extended(v)),
-            subdomains.sizes(change),
-            subdomains.sizes(subdomains.extended(subdomains.pinv_load[subdomains.trace])),
-        ]
+        [subdomains.sizes(values) for values in displacements]
     )
     return BodyMeasures(
         size=size,
@@ -208,29 +223,17 @@ def _bodies(scene: Scene, u: Array, v: Array, before: Array | None) -> BodyMeasu
     )
 
 
-def _balance(coarse: CoarseSpace, lam: PETSc.Vec) -> tuple[float, float]:
+def _balance(coarse: CoarseSpace, lam: Array) -> tuple[float, float]:
     """Entry of Gλ − e that is largest beside the forces on its mode, and those. Collective."""
     if coarse.dimension == 0:
         return 0.0, 0.0
     forces = coarse.terms(lam)
     most = forces.max()
     forces = np.maximum(forces, LIGHT * most)
-    left = np.maximum(np.abs(coarse.G(lam.array_r) - coarse.e) - ROUNDING * most, 0.0)
+    # rounding of the largest forces is nobody's to mend
+    left = np.maximum(np.abs(coarse.G(lam) - coarse.e) - StoppingTolerances.noise * most, 0.0)
     worst = int(np.argmax(left / np.maximum(forces, TINY)))
     return float(left[worst]), float(forces[worst])
-
-
-# --- Target of the algebraic error ------------------------------------------------------------
-
-# of the other error; of ‖u‖_K where that is more, as where there is no other error
-TENTH, FINEST = 0.1, 1e-6
-
-# from the displacement on this rank to the other error, a root of an energy; collective
-ErrorTarget = Callable[[Array], float]
-
-
-class LookedAt(Scene, LiftedScene, Protocol):
-    """Parts of the dual problem that an assessment and an error bound need."""
 
 
 @dataclass(frozen=True)
@@ -241,55 +244,16 @@ class TargetStatus:
         bound: Bound of its algebraic error.
         goal: The other error.
         energy: ‖u‖_K.
+        allowed: Largest bound of the algebraic error that meets the target.
     """
 
     bound: EnergyBound
     goal: float
     energy: float
-
-    @classmethod
-    def of(
-        cls, scene: LiftedScene, lam: PETSc.Vec, now: Measures, goal: ErrorTarget, norm: float
-    ) -> TargetStatus:
-        """Bound the error of an iterate, given ‖F‖, and evaluate the target. Collective."""
-        energy = float(np.sqrt(max(now.bodies.energy.sum(), 0.0)))
-        return cls(energy_bound(scene, lam, now.u, norm), goal(now.u), energy)
-
-    @property
-    def allowed(self) -> float:
-        """Largest bound of the algebraic error that meets the target."""
-        return max(TENTH * self.goal, FINEST * self.energy)
+    allowed: float
 
 
 # --- The stopping rule ------------------------------------------------------------------------
-
-# Differences that are rounding, in a body that hardly moves as well: of the largest displacement
-# of all bodies, or slip that friction counts from; of what its load does to its subdomains alone,
-# if that is held where it acts.
-NOISE, LOAD_NOISE = 2.5e-13, 1e-14
-# a body that moves by less than this share of another is stiff beside it, and has the error of the
-# other's forces on top of its own: its own must be as much smaller
-STIFF, STRICTER = 1e-3, 0.1
-# of rtol: error of u in energy over all bodies, so that forces are right where bodies move much
-# and deform little; what rounding leaves of bodies that do not deform at all, as a displacement
-FORCES, RIGID = 10.0, 1e-12
-# of the largest gap of a contact row: without load all displacements may be that small and are
-# what rounding leaves of 0 (seen: 3e-15)
-AT_REST = 1e-14
-# of rtol b₀, and of what rounding leaves of a residual where numbers of all sizes meet: a residual
-# that is good enough where rounding may explain an error in energy
-SMALL, LITTLE = 1e-2, 0.01
-# the first look is taken at this power of rtol, to learn how far things move
-FIRST_LOOK = 0.5
-# a new tolerance aims a little below what was asked for, less where a bound of the error in energy
-# asks for it, which follows residuals; it never falls by more than LEAP at once, since the size of
-# the displacement may have been learnt from a poor iterate
-AIM, AIM_AT_BOUND, LEAP = 0.5, 1.0, 1e-6
-# the true residual has stalled if the digits it fell by are less than this share of those that the
-# updated one fell by; the gradient is then computed anew, and the second time the solve ends
-STALL = 0.5
-# of what rounding leaves of a residual: nothing comes down to that
-OUT_OF_REACH = 1e-4
 
 
 @dataclass(frozen=True)
@@ -326,12 +290,14 @@ class Accuracy:
         atol: A length that errors may have whatever moves.
         scale: b₀, the norm of the residual at the start, and what rounding leaves of it.
         norm: ‖F‖, or an estimate; residuals over it are errors of multipliers.
+        limits: What rtol does not say.
 
     Attributes:
         rtol: Relative tolerance.
         tolerance: Norm of the residuals from which on one looks (again).
         drifted: Whether the solver's gradient has to be made anew.
         norm: ‖F‖, or an estimate.
+        recovered: The displacement of the last look.
         measures: What the last look has seen.
         looks: How many looks there were.
         goal: An error beside which the algebraic one has to be small, too, or None.
@@ -340,21 +306,24 @@ class Accuracy:
 
     def __init__(
         self,
-        scene: LookedAt,
+        scene: Scene,
         rtol: float,
         atol: float,
         scale: tuple[float, float],
         norm: float = 1.0,
+        limits: StoppingTolerances | None = None,
     ) -> None:
         self._scene, self.rtol, self._atol = scene, rtol, atol
+        self._limits = limits or StoppingTolerances()
         reference, rounding = scale
         self._rounding, self.norm = rounding, norm or 1.0
         self._before: Measures | None = None
         self._least: Array = np.zeros(1)
-        self._own: Measures | None = None
-        self.tolerance = max(rtol**FIRST_LOOK * reference, atol, rounding)
-        self._small = max(SMALL * rtol * reference, LITTLE * rounding)
+        self._own: tuple[Recovered, Measures] | None = None
+        self.tolerance = max(rtol**0.5 * reference, atol, rounding)
+        self._small = 0.01 * max(rtol * reference, rounding)
         self.drifted, self.looks, self._stalls, self._claimed = False, 0, 0, 1.0
+        self.recovered: Recovered | None = None
         self.measures: Measures | None = None
         self.goal: ErrorTarget | None = None
         self.reached: list[TargetStatus] = []
@@ -364,51 +333,52 @@ class Accuracy:
         """The tolerance; 0 before the first assessment against a target, which is costly."""
         return 0.0 if self.goal is not None and self.looks == 0 else self.tolerance
 
-    def look(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float) -> Measures:
-        """Measure an iterate. Collective."""
-        before, error = self.measures, residual / self.norm
-        self.measures = measure(
-            self._scene, lam, gradient, face, self.norm, error, before.u if before else None
-        )
-        self.looks += 1
-        self._before = before
-        if self.goal is not None:
-            reached = TargetStatus.of(self._scene, lam, self.measures, self.goal, self.norm)
-            self.reached.append(reached)
-        return self.measures
-
     def examine(
         self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float
     ) -> ConvergedReason:
         """Assess an iterate, and return why to stop, or ITERATING. Collective."""
-        now = self.look(lam, gradient, face, residual)
-        comm = self._scene.coarse.comm
-        values = (
+        self.look(lam, gradient, face, residual)
+        given = self._limits
+        # 1. errors over their tolerances
+        ratio, own, longest, in_energy, bound, stalled = self._agreed(
             self.ratio(),
             self.ratio(changes=False),
-            self._longest(now),
-            self._energy_ratio(now),
+            self._longest(),
+            self._energy_ratio(),
+            self._over_goal(),
+            self._stalled(residual),
         )
-        ratio, own, longest, in_energy = bcast_from_root(comm, values)
         if ratio <= 1.0 and (in_energy <= 1.0 or residual <= self._small):
             return ConvergedReason.CONVERGED_RTOL
         if longest <= self._atol:
             return ConvergedReason.CONVERGED_ATOL
-        aim = AIM_AT_BOUND if bcast_from_root(comm, self._over_goal() >= ratio) else AIM
-        tolerance = residual * max(aim / (ratio if ratio > 1.0 else in_energy), LEAP)
+        # 2. residuals at which the next look is worth its price
+        aim = 1.0 if bound >= ratio else given.aim  # a bound follows residuals
+        least = 1e-4 * self._rounding  # no residual comes down to that
+        tolerance = residual * max(aim / (ratio if ratio > 1.0 else in_energy), given.leap)
         if ratio <= 1.0:
             tolerance = max(tolerance, self._small)
-        elif tolerance < OUT_OF_REACH * self._rounding:
-            # the change since a poor iterate says little: another look before one gives up
-            tolerance = residual * max(AIM / max(own, 1.0), LEAP)
-        self._stalls = (
-            self._stalls + 1 if bcast_from_root(comm, self._stalled(now, residual)) else 0
-        )
-        if self._stalls > 1 or bcast_from_root(comm, tolerance <= OUT_OF_REACH * self._rounding):
+        elif tolerance < least:  # the change since a poor iterate says little
+            tolerance = residual * max(given.aim / max(own, 1.0), given.leap)
+        # 3. where the true residual lags behind the solver's: a new gradient, then rounding
+        self._stalls = self._stalls + 1 if stalled else 0
+        if self._stalls > 1 or tolerance <= least:
             return ConvergedReason.DIVERGED_ROUNDING
         self.drifted = self._stalls > 0
         self.tolerance, self._claimed = tolerance, residual
         return ConvergedReason.ITERATING
+
+    def look(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float) -> None:
+        """Recover the displacement of an iterate, and measure it. Collective."""
+        before = self.recovered
+        state = self._scene.recover(lam, gradient, face, residual / self.norm)
+        now = measure(self._scene, state, self.norm, None if before is None else before.u)
+        self._before, self.recovered, self.measures = self.measures, state, now
+        self.looks += 1
+        if self.goal is not None:
+            bound, goal = energy_bound(self._scene, lam, state.u, self.norm), self.goal(state.u)
+            allowed = self._limits.target * max(goal, 1e-5 * now.energy)
+            self.reached.append(TargetStatus(bound, goal, now.energy, allowed))
 
     def look_again(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float) -> bool:
         """Measure the iterate of the last look with another set of multipliers. Collective.
@@ -419,7 +389,7 @@ class Accuracy:
         Returns:
             Whether it is right to the tolerance with that set, too.
         """
-        self._least, self._own = self.errors(), self.measures
+        self._least, self._own = self.errors(), self._looked()
         self.look(lam, gradient, face, residual)
         self._before = None
         return self._is_right()
@@ -433,44 +403,14 @@ class Accuracy:
         Returns:
             Whether they are within the tolerance.
         """
-        self.measures, self._least = self._own, self._least + errors
+        if self._own is not None:
+            self.recovered, self.measures = self._own
+        self._least = self._least + errors
         return self._is_right()
-
-    def _is_right(self) -> bool:
-        now = self._looked()
-        ratio, longest = bcast_from_root(
-            self._scene.coarse.comm, (self.ratio(), self._longest(now))
-        )
-        return bool(ratio <= 1.0 or longest <= self._atol)
 
     def accept_rounding(self) -> None:
         """Accept errors that rounding may explain, as no solver reduces them any further."""
         self._small = float("inf")
-
-    def _energy_ratio(self, now: Measures) -> float:
-        """Return error in energy over its tolerance without what that allows for rounding.
-
-        A body that falls far deforms by less than rounding of its fall, but forces may be known.
-        """
-        energy = np.sqrt(max(now.bodies.energy.sum(), 0.0))
-        return now.error / max(FORCES * self.rtol * float(energy), TINY)
-
-    def _stalled(self, now: Measures, residual: float) -> bool:
-        """Return whether the true residual lags behind the one that the solver updates."""
-        if self._before is None or self._before.residual == 0.0:
-            return False
-        claimed = residual / self._claimed
-        return now.residual / self._before.residual > claimed**STALL
-
-    @property
-    def balance(self) -> float:
-        """Largest force left on a kernel mode at the last look."""
-        return self._looked().balance
-
-    @property
-    def u(self) -> Array:
-        """This rank's part of the displacement at the last look, shape ``(n,)``."""
-        return self._looked().u
 
     def errors(self, changes: bool = True) -> Array:
         """Estimated errors of u at the last look, a length for each body, shape ``(bodies,)``.
@@ -478,12 +418,12 @@ class Accuracy:
         Args:
             changes: Whether what has changed since the look before it counts.
         """
-        now, before = self._looked(), self._before if changes else None
+        now, before = self._looked()[1], self._before if changes else None
         bodies, energy = now.bodies, np.sqrt(np.maximum(now.bodies.energy, 0.0))
         own = np.sqrt(bodies.correction_energy)
         # where all is rounding, energy does not say how far anything moves
-        moves = bodies.size > NOISE * bodies.size.max(initial=0.0)
-        known = (energy > 0.0) & moves & (self._at_rest(now) == 0.0)
+        noise = self._limits.noise * bodies.size.max(initial=0.0) + self._at_rest(now)
+        known = (energy > 0.0) & (bodies.size > noise)
         shown = np.divide(bodies.elastic, energy, out=np.zeros_like(energy), where=known)
         estimate = shown * own
         if before is not None and before.error > 0.0:
@@ -492,31 +432,25 @@ class Accuracy:
 
     def tolerances(self) -> Tolerances:
         """Return the tolerances that the last assessment is compared with."""
-        now = self._looked()
+        now, given = self._looked()[1], self._limits
         size, most = now.bodies.size, now.bodies.size.max(initial=0.0)
-        share = np.where(size < STIFF * most, STRICTER, 1.0)
+        # a body that is stiff beside another has the error of the other's forces on top
+        share = np.where(size < 1e-3 * most, 0.1, 1.0)
         most = max(most, now.begin)
-        alone = LOAD_NOISE * now.bodies.alone
         at_rest = self._at_rest(now)
-        displacement = self.rtol * share * size + NOISE * most + alone + at_rest
+        noise = given.noise * most + given.load_noise * now.bodies.alone + at_rest
+        displacement = self.rtol * share * size + noise
         largest = float(displacement.max(initial=0.0))
-        energy = FORCES * self.rtol * np.sqrt(max(now.bodies.energy.sum(), 0.0))
-        rigid = np.sqrt(now.bodies.stiffness @ (RIGID * most + alone + at_rest) ** 2)
-        balance = max(self.rtol, NOISE) * now.forces
-        # forces that do not balance have an energy of ‖F‖ times their square
-        balance += at_rest * now.bodies.stiffness.max(initial=0.0) + rigid / np.sqrt(self.norm)
-        energy += rigid
-        return Tolerances(displacement, 2.0 * largest, 2.0 * largest, balance, float(energy))
-
-    def _at_rest(self, now: Measures) -> float:
-        """The size of displacements that are rounding of 0 where nothing is loaded, else 0."""
-        small = AT_REST * now.gap
-        loaded = bool(now.bodies.alone.any())
-        return 0.0 if loaded or now.bodies.size.max(initial=0.0) > small else small
+        # rounding of bodies that do not deform at all: its energy, and forces that make it
+        rigid = float(np.sqrt(now.bodies.stiffness @ (noise + 3.0 * given.noise * most) ** 2))
+        balance = max(self.rtol, given.noise) * now.forces + rigid / np.sqrt(self.norm)
+        balance += at_rest * now.bodies.stiffness.max(initial=0.0)
+        energy = given.energy * self.rtol * now.energy + rigid
+        return Tolerances(displacement, 2.0 * largest, 2.0 * largest, balance, energy)
 
     def ratio(self, changes: bool = True) -> float:
         """Return the largest ratio of errors (``errors``) to their tolerances; right if ≤ 1."""
-        now, allowed = self._looked(), self.tolerances()
+        now, allowed = self._looked()[1], self.tolerances()
         pairs = [
             *zip(self.errors(changes), allowed.displacement, strict=True),
             (now.penetration, allowed.penetration),
@@ -526,31 +460,72 @@ class Accuracy:
         own = max(float(error) / max(float(limit), TINY) for error, limit in pairs)
         return max(own, self._over_goal())
 
-    def _over_goal(self) -> float:
-        """Return the bound at the last look over what the goal allows; 0 without a goal."""
-        if not self.reached:
-            return 0.0
-        return self.reached[-1].bound.error / max(self.reached[-1].allowed, TINY)
-
     def relative_error(self) -> float:
         """Return the largest estimated error of a body over its largest displacement."""
-        noise = self.tolerances().displacement / max(self.rtol, NOISE)
-        errors = self.errors()
-        return float(np.max(errors / np.maximum(noise, TINY), initial=0.0))
+        noise = self.tolerances().displacement / max(self.rtol, self._limits.noise)
+        return float(np.max(self.errors() / np.maximum(noise, TINY), initial=0.0))
 
     def energy_error(self) -> tuple[float, float]:
         """Return estimated error of u in energy over ‖u‖_K at the last look, and what it may be.
 
         Where ‖u‖_K is rounding of a rigid motion, over what rounding may leave of it.
         """
-        now, allowed = self._looked(), self.tolerances().energy
-        size = max(float(np.sqrt(max(now.bodies.energy.sum(), 0.0))), allowed, TINY)
+        now, allowed = self._looked()[1], self.tolerances().energy
+        size = max(now.energy, allowed, TINY)
         return now.error / size, allowed / size
 
-    def _longest(self, now: Measures) -> float:
+    @property
+    def balance(self) -> float:
+        """Largest force left on a kernel mode at the last look."""
+        return self._looked()[1].balance
+
+    @property
+    def u(self) -> Array:
+        """This rank's part of the displacement at the last look, shape ``(n,)``."""
+        return self._looked()[0].u
+
+    def _looked(self) -> tuple[Recovered, Measures]:
+        if self.recovered is None or self.measures is None:
+            raise RuntimeError("nothing has been measured yet")
+        return self.recovered, self.measures
+
+    def _agreed(self, *values: float) -> list[float]:
+        """Rank 0's values on all ranks. Collective."""
+        numbers = np.array(values, dtype=float)
+        self._scene.coarse.comm.Bcast(numbers, root=0)
+        return [float(number) for number in numbers]
+
+    def _is_right(self) -> bool:
+        ratio, longest = self._agreed(self.ratio(), self._longest())
+        return ratio <= 1.0 or longest <= self._atol
+
+    def _longest(self) -> float:
+        now = self._looked()[1]
         return max(float(now.bodies.correction.max(initial=0.0)), now.penetration)
 
-    def _looked(self) -> Measures:
-        if self.measures is None:
-            raise RuntimeError("nothing has been measured yet")
-        return self.measures
+    def _energy_ratio(self) -> float:
+        """Return error in energy over its tolerance without what that allows for rounding.
+
+        A body that falls far deforms by less than rounding of its fall, but forces may be known.
+        """
+        now = self._looked()[1]
+        return now.error / max(self._limits.energy * self.rtol * now.energy, TINY)
+
+    def _stalled(self, residual: float) -> bool:
+        """Return whether the true residual lags behind the one that the solver updates."""
+        now, before = self._looked()[1], self._before
+        if before is None or before.residual == 0.0:
+            return False
+        return now.residual / before.residual > (residual / self._claimed) ** self._limits.stall
+
+    def _at_rest(self, now: Measures) -> float:
+        """The size of displacements that are rounding of 0 where nothing is loaded, else 0."""
+        small = self._limits.load_noise * now.gap
+        unloaded = not now.bodies.alone.any() and now.bodies.size.max(initial=0.0) <= small
+        return small if unloaded else 0.0
+
+    def _over_goal(self) -> float:
+        """Return the bound at the last look over what the goal allows; 0 without a goal."""
+        if not self.reached:
+            return 0.0
+        return self.reached[-1].bound.error / max(self.reached[-1].allowed, TINY)

@@ -54,9 +54,9 @@ class LastProduct:
         self._x, self._Fx, self._d, self._e = nothing, nothing, nothing, nothing
         self._looked, self._within = (nothing, nothing), 0.0
 
-    def look(self, x: PETSc.Vec, g: Array) -> None:
+    def look(self, x: Array, g: Array) -> None:
         """Store a point of the program with Fx − d, as an assessment computes it."""
-        self._looked = (np.array(x.array_r), g)
+        self._looked = (x, g)
 
     def keep(self, result: QPResult, qp: QP) -> None:
         """Store a solution with its gradient Fx − d − Gᵀμ, or that of an assessment. Collective.

@@ -1,4 +1,4 @@
-"""The solver that the options choose, with iterative refinement."""
+"""The solver that the options choose."""
 
 from __future__ import annotations
 
@@ -150,6 +150,8 @@ def solve_dual(
     rule.goal = goal
     result = solver.solve(Task(qp, homogenised, rule, options, begin, monitor))
     dual.saw(result.norm)
+    if (state := rule.recovered) is not None:
+        dual.last.look(state.lam, state.residual)
     if dual.coarse.dimension == 0 or qp_type == "newton":
         dual.last.keep(result, qp)
     homogenised.destroy()
