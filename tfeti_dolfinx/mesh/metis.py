@@ -32,22 +32,12 @@ def metis(mesh: UntornMesh, num_parts: int, comm: MPI.Intracomm) -> Array:
         num_bodies, body = connected_components(graph, directed=False)
         shares = _shares(np.bincount(body, minlength=num_bodies), num_parts)
         x, part = mesh.midpoints(), np.zeros(n, dtype=np.int64)
-        made_round = part.copy()
         for b, start in enumerate(np.cumsum(shares) - shares):
             cells = np.flatnonzero(body == b)
             own = _metis_of(graph[cells][:, cells], int(shares[b]))
-            part[cells] = start + own
-            made_round[cells] = start + compact_parts(x[cells], own, int(shares[b]))
-        made_round = flatten_interfaces(mesh, pairs, made_round)
-    made_round = absorb_fragments(mesh, made_round, comm)
-    with raised_on_all_ranks(comm):
-        first, second = pairs
-        before, after = (
-            np.bincount(body[first], weights=which[first] != which[second], minlength=num_bodies)
-            for which in (part, made_round)
-        )
-        taken = (after <= PARTITION.more_cut * before)[body]
-    return without_holes(np.where(taken, made_round, part), comm)
+            part[cells] = start + compact_parts(x[cells], own, int(shares[b]))
+        part = flatten_interfaces(mesh, pairs, part)
+    return without_holes(absorb_fragments(mesh, part, comm), comm)
 
 
 def _metis_of(graph: Any, num_parts: int) -> Array:

@@ -38,7 +38,6 @@ class PartitionParameters:
         candidates: Parts that a point may join in a round, those nearest to its own.
         fewest: Cells of a part in the mean, below which parts are not made round.
         largest: Size over the mean, above which round parts are not taken.
-        more_cut: Facets cut over those that METIS cuts, above which round parts are not taken.
         facet: Weight of a facet over that of a vertex that a cell shares with another part.
         flattening: Rounds in which cells change sides, until interfaces are flat.
         gains: Size over the mean, above which a part gains no cells where interfaces are flattened.
@@ -56,7 +55,6 @@ class PartitionParameters:
     candidates: int = 24
     fewest: int = 20
     largest: float = 1.1
-    more_cut: float = 1.1
     facet: float = 12.0
     flattening: int = 10
     gains: float = 1.08
