@@ -385,7 +385,7 @@ class System:
 
     def _take_trace(self) -> None:
         rows = self.gluing.constraints
-        made(self._subdomains).retrace(rows.trace, rows.span)
+        made(self._subdomains).retrace(rows.trace)
 
     def _make_dual(self) -> None:
         settings, scene = self._settings, (self._dofs, self._decomposition)

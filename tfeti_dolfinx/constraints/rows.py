@@ -16,6 +16,35 @@ from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import group_points
 
+
+@dataclass(frozen=True)
+class RowTolerances:
+    """Tolerances of rows.
+
+    Attributes:
+        agreement: Values that conditions prescribe at a node differ by less, relative to all.
+        rounding: What rounding makes of a condition's coefficients and of lengths, of which
+            several errors add up.
+        nothing_left: Of a row's norm: if prescribed components leave less, the row is dropped.
+        hardly_left: A condition of which more is left has a row, however uncertain its normal is.
+        overlap: Overlap, over the scene's length, that rounding of gaps and prescribed values may
+            leave.
+        contradiction: The same of conditions at one node, whose linear program ends at
+            ``program``.
+        program: Tolerance of the linear program, for gaps over the scene's length.
+    """
+
+    agreement: float = 1e-10
+    rounding: float = 2.2e-15
+    nothing_left: float = 1e-10
+    hardly_left: float = 1e-3
+    overlap: float = 1e-10
+    contradiction: float = 1e-8
+    program: float = 1e-10
+
+
+TOLERANCES = RowTolerances()
+
 # --- Tables of rows ---------------------------------------------------------------------------
 
 
@@ -67,7 +96,7 @@ def stack(tables: list[Rows]) -> Rows:
 
 @dataclass(frozen=True)
 class RowSets:
-    """Local rows of B by name. Nobody else knows in which order they stand.
+    """Local rows of B by name: nobody else knows in which order they stand.
 
     Attributes:
         equalities: Gluing rows, and rows that hold prescribed components, shape ``(e,)``.
@@ -93,14 +122,6 @@ class RowSets:
     def num_rows(self) -> int:
         """All local rows."""
         return self.equalities.size + self.normals.size + self.tangents.size
-
-
-def row_sets(num_equalities: int, num_normals: int, num_tangents: int, gdim: int) -> RowSets:
-    """Equalities first, then normals, then tangents, those of a condition together."""
-    rows, count = np.arange(num_equalities + num_normals + num_tangents), max(gdim - 1, 1)
-    equalities, normals, tangents = np.split(rows, [num_equalities, num_equalities + num_normals])
-    shape = (num_tangents // count, gdim - 1)
-    return RowSets(equalities, normals, tangents.reshape(shape))
 
 
 # --- Scaling D of rows ------------------------------------------------------------------------
@@ -130,70 +151,7 @@ def row_weights(blocks: Array, scaling: str, comm: MPI.Intracomm) -> Array:
     return np.repeat(D, blocks.shape[1])
 
 
-# --- Directions in which rows act on a node ---------------------------------------------------
-
-# of the largest square: directions of normals that differ by less are one but for rounding
-ALIKE = 1e-12
-
-
-def row_span(dofs: TornDofs, equalities: Rows, contact: Rows, trace: Array) -> Array:
-    """Project each node onto the directions rows act in, as rows of the trace. Collective.
-
-    A node that only a contact meets is held along the normal, whatever axis that lies along. Where
-    normals of several conditions differ, or there is friction or gluing, it is held in more.
-
-    Args:
-        dofs: Dof maps.
-        equalities: This rank's rows of equalities, one component each.
-        contact: Its rows of contact conditions.
-        trace: Local primal unknowns that rows of any rank touch, ascending.
-
-    Returns:
-        Shape ``(t, bs)``: the row of the component in the bs × bs projector of the node.
-    """
-    bs = dofs.bs
-    columns = np.unique(equalities.column)
-    exchange, start = Exchange(dofs.comm, owner_of(dofs.offsets * bs, columns)), dofs.offsets
-    held = np.zeros(dofs.num_nodes * bs)
-    held[exchange.send(columns) - start[dofs.comm.rank] * bs] = 1.0
-    nodes, grams = _grams(contact, bs)
-    exchange = Exchange(dofs.comm, owner_of(start, nodes))
-    met, place = np.unique(exchange.send(nodes) - start[dofs.comm.rank], return_inverse=True)
-    gram = sum_rows(place, exchange.send(grams), len(met))
-    span, component = np.zeros((len(trace), bs)), trace % bs
-    span[np.arange(len(trace)), component] = held[trace]
-    own, of_met = np.flatnonzero(np.isin(trace // bs, met)), np.searchsorted(met, trace // bs)
-    span[own] = _projectors(gram, held.reshape(-1, bs)[met])[of_met[own], component[own]]
-    return span
-
-
-def _grams(rows: Rows, bs: int) -> tuple[Array, Array]:
-    """Return nodes that rows act on, and the sums of aaᵀ of their coefficients a there."""
-    node = rows.column // bs
-    pairs, place = np.unique(node * len(rows) + rows.row, return_inverse=True)
-    a = np.zeros((len(pairs), bs))
-    a[place, rows.column % bs] = rows.value
-    nodes, place = np.unique(pairs // max(len(rows), 1), return_inverse=True)
-    return nodes, sum_rows(place, a[:, :, None] * a[:, None, :], len(nodes))
-
-
-def _projectors(gram: Array, held: Array) -> Array:
-    """Project onto the ranges of Σaaᵀ and of prescribed components, shape ``(k, bs, bs)``."""
-    size = np.trace(gram, axis1=1, axis2=2)[:, None, None]
-    gram = np.divide(gram, size, out=np.zeros_like(gram), where=size > 0.0)
-    values, vectors = np.linalg.eigh(gram + held[:, :, None] * np.eye(held.shape[1]))
-    seen = values > ALIKE * values.max(axis=1, initial=0.0, keepdims=True)
-    return np.einsum("nik,nk,njk->nij", vectors, seen, vectors)
-
-
 # --- Coefficients of contact conditions -------------------------------------------------------
-
-# Of a row's norm: what is left of less is rounding, scaled up to unit norm.
-NOTHING_LEFT = 1e-10
-# of what rounding makes of a condition's coefficients, and of lengths: errors of several add up
-SEVERAL, EPSILON = 10.0, 2.2e-16
-# a condition of which more than this remains is one, however uncertain its normal is
-HARDLY_LEFT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -238,7 +196,6 @@ class RowBuilder:
     Attributes:
         records: The conditions.
         points: Points of the owned groups, shape ``(g, 3)``.
-        nothing_left: Share of each condition that is rounding, shape ``(n,)``.
     """
 
     def __init__(
@@ -248,21 +205,32 @@ class RowBuilder:
         self.records, self._dofs, self._weights = records, dofs, weights
         self._prescribed, self._total = dofs.lookup(records.entry_group, flag, sums)
         self.points = group_points(dofs)
-        self.nothing_left = _nothing_left(records, self.points)
+
+    @cached_property
+    def nothing_left(self) -> Array:
+        """Share of a condition that is rounding, shape ``(n,)``.
+
+        The normal of a facet of size h at x is exact to ε|x|/h, and so is a place on it. At a
+        distance g the normal points that much times g beside the place that it should point to.
+        """
+        records, t = self.records, TOLERANCES
+        x = np.abs(self.points[records.group]).max(axis=1, initial=0.0)
+        h = records.area ** (1.0 / max(records.normal.shape[1] - 1, 1))
+        g = np.abs(records.geometric_gap)
+        error = t.rounding * (x * (1.0 + g / h) + g) / h
+        return np.clip(error, t.nothing_left, t.hardly_left)
 
     def free(self, axis: int) -> Array:
         """Coefficients along an axis of the frames, 0 at prescribed components."""
         return np.where(self._prescribed, 0.0, self.records.coefficients(axis))
 
-    def squares(self, coefficients: Array) -> Array:
-        """Squared norms in D⁻¹ of the rows that coefficients make, unscaled, shape ``(n,)``."""
-        squares = np.sum(coefficients**2 / self._total, axis=1)
-        return sum_rows(self.records.condition, squares, len(self.records))
-
     def left(self, axis: int) -> tuple[Array, Array]:
-        """Squared norms without prescribed components, and whether they are more than rounding."""
-        before = self.squares(self.records.coefficients(axis))
-        after = self.squares(self.free(axis))
+        """Squared norms in D⁻¹ without prescribed components; whether they exceed rounding."""
+        records = self.records
+        before, after = (
+            sum_rows(records.condition, np.sum(a**2 / self._total, axis=1), len(records))
+            for a in (records.coefficients(axis), self.free(axis))
+        )
         return after, after > self.nothing_left**2 * before
 
     @cached_property
@@ -292,19 +260,6 @@ class RowBuilder:
         ).without_zeros()
 
 
-def _nothing_left(records: ContactRecords, points: Array) -> Array:
-    """Share of a condition that is rounding, shape ``(n,)``.
-
-    The normal of a facet of size h at x is exact to ε|x|/h, and so is a place on it. At a distance
-    g the normal points that much times g beside the place that it should point to.
-    """
-    x = np.abs(points[records.group]).max(axis=1, initial=0.0)
-    h = records.area ** (1.0 / max(records.normal.shape[1] - 1, 1))
-    g = np.abs(records.geometric_gap)
-    error = EPSILON * (x * (1.0 + g / h) + g) / h
-    return np.clip(SEVERAL * error, NOTHING_LEFT, HARDLY_LEFT)
-
-
 # --- B as a distributed PETSc matrix, and c ---------------------------------------------------
 
 
@@ -320,8 +275,6 @@ class Constraints:
         c: Right sides, distributed as the rows; 0 until they are set.
         sets: Which local rows are what.
         trace: Local primal unknown of each local trace unknown, ascending.
-        span: Projector of each node of the trace onto the directions that rows act along, the row
-            of each trace unknown, shape ``(t, bs)``.
         weights: D on the local trace unknowns: the rows are scaled with it.
         scale: The s_i of the conditions with rows, one for each of ``sets.normals``: over it what
             a row misses is a length.
@@ -339,7 +292,6 @@ class Constraints:
     c: PETSc.Vec
     sets: RowSets
     trace: Array
-    span: Array
     weights: Array
     scale: Array
     tangent_scale: Array
@@ -398,10 +350,18 @@ def assemble_constraints(
         pressed_by: For each of them the position of its normal row under Coulomb's law, else −1.
     """
     rows = stack(list(tables))
-    equalities, normals, tangents = (len(table) for table in tables)
-    sets = row_sets(equalities, normals, tangents, dofs.bs)
-    trace, column = _trace_columns(dofs, rows.column)
-    span = row_span(dofs, tables[0], stack(list(tables[1:])), trace)
+    ends = np.cumsum([len(table) for table in tables])[:-1]
+    equalities, normals, tangents = np.split(np.arange(len(rows)), ends)
+    width = dofs.bs - 1  # rows of a condition stand together
+    sets = RowSets(equalities, normals, tangents.reshape(len(tangents) // max(width, 1), width))
+    # the trace: local primal unknowns that rows of any rank touch
+    offsets = dofs.offsets * dofs.bs
+    needed, place = np.unique(rows.column, return_inverse=True)
+    exchange = Exchange(dofs.comm, owner_of(offsets, needed))
+    asked = exchange.send(needed) - offsets[dofs.comm.rank]
+    trace = np.unique(asked)
+    start = chunk_offsets(dofs.comm, len(trace))[dofs.comm.rank]
+    column = exchange.answer(start + np.searchsorted(trace, asked))[place]
     num_rows, num_columns = len(rows), len(trace)
     order = np.lexsort((column, rows.row))
     indptr = np.concatenate(([0], np.cumsum(np.bincount(rows.row, minlength=num_rows))))
@@ -420,7 +380,6 @@ def assemble_constraints(
         c=c,
         sets=sets,
         trace=trace,
-        span=span,
         weights=weights[trace],
         scale=scale,
         tangent_scale=tangent_scale,
@@ -429,14 +388,3 @@ def assemble_constraints(
         coefficients=np.zeros(shape),
         pressures=np.full(len(row), np.nan),
     )
-
-
-def _trace_columns(dofs: TornDofs, column: Array) -> tuple[Array, Array]:
-    """Local primal unknowns that rows of any rank touch, and the entries' global trace column."""
-    offsets = dofs.offsets * dofs.bs
-    needed, place = np.unique(column, return_inverse=True)
-    exchange = Exchange(dofs.comm, owner_of(offsets, needed))
-    asked = exchange.send(needed) - offsets[dofs.comm.rank]
-    trace = np.unique(asked)
-    start = chunk_offsets(dofs.comm, len(trace))[dofs.comm.rank]
-    return trace, exchange.answer(start + np.searchsorted(trace, asked))[place]

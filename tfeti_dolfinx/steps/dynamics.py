@@ -193,7 +193,7 @@ class Predictor:
             return
         if self._dual is not None:
             self._dual.destroy()
-            self._subdomains.retrace(constraints.trace, constraints.span)
+            self._subdomains.retrace(constraints.trace)
         scene = self._dofs, self._decomposition
         self._dual = settings.make_dual(constraints, self._subdomains, *scene, _frictionless)
 
