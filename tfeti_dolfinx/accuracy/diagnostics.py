@@ -12,7 +12,7 @@ from scipy.sparse import csr_array, diags_array
 from tfeti_dolfinx.common.arrays import TINY, Array, joined, sum_rows, sums
 from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root
 from tfeti_dolfinx.constraints.rows import Constraints
-from tfeti_dolfinx.contact.records import GEOMETRY
+from tfeti_dolfinx.contact.partner import GEOMETRY
 from tfeti_dolfinx.feti.coarse import CoarseSpace
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.recovery import constraint_residual, orthonormal
