@@ -17,6 +17,7 @@ from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import diameter, surface_facets, surface_nodes
+from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 WORSE = (
     "%s: the secondary side %r is %.3g times as stiff per area as %r, where they meet; the "
@@ -61,9 +62,6 @@ class Contact(ContactPartner):
     b: str | int
     _: KW_ONLY
     secondary: str | int = "auto"
-
-    # ratio of stiffness per area from which on a finer secondary side shows in the pressure
-    much_worse = 2.0
 
     def __post_init__(self) -> None:
         self._check_data(f"contact of {self.a!r} with {self.b!r}")
@@ -128,7 +126,7 @@ class Contact(ContactPartner):
             found = settled._meet(sides, dofs, contact, reach, reach)
         edges = sides[0].has_edges(dofs.comm)
         ratio = compared.stiffness
-        if compared.finer and ratio > self.much_worse and dofs.comm.rank == 0:
+        if compared.finer and ratio > SEARCH.much_stiffer and dofs.comm.rank == 0:
             log.warning(WORSE, self.name, settled.a, ratio, settled.b, settled.b)
         if edges and dofs.comm.rank == 0:
             log.warning(EDGES, self.name, settled.a)

@@ -17,6 +17,7 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import extent, group_points, surface_facets
+from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 Gap: TypeAlias = str | float | Callable[[Array], ArrayLike]
 # what the geometry has for a gap: the distance of facets, or of the smooth surfaces through them
@@ -30,7 +31,7 @@ class ContactPartner:
     Attributes:
         gap: The gaps of its conditions: those of the geometry, or given ones.
         friction: Its law of friction.
-        reach: Distance up to which conditions have rows at first; None: ``share`` of the surface.
+        reach: Distance up to which conditions have rows at first; None: 5 % of the surface.
         name: Name for messages.
     """
 
@@ -38,10 +39,6 @@ class ContactPartner:
     friction: Law | None = None
     reach: float | None = None
     name: str = ""
-
-    # Of the extent of the smaller surface: few nodes farther off ever touch in small strains, and
-    # those that do are taken in after the solve.
-    default_reach = 0.05
 
     def _check_data(self, default_name: str) -> None:
         """Give the contact a name if it has none, and check what is known at once."""
@@ -75,7 +72,7 @@ class ContactPartner:
         self._check_gap()
         size, reach = min(extent(decomposition, surface) for surface in facets), self.reach
         if reach is None:
-            return self.default_reach * size
+            return SEARCH.reach * size
         if not isinstance(reach, Real) or isinstance(reach, bool) or not reach > 0.0:
             raise InputError(f"{self.name}: reach={reach!r}, expected a positive length or None")
         return float(reach)

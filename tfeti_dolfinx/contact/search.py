@@ -16,6 +16,7 @@ from tfeti_dolfinx.contact.records import ContactRecords, concatenate, remaining
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import diameter
+from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 log = logging.getLogger(__name__)
 
@@ -40,10 +41,6 @@ class ContactSearch:
     Raises:
         InputError: A pair is there twice, or a contact raises it.
     """
-
-    # How much farther one looks for what may hold a body: few rounds, each a search and a solve;
-    # at least so far, over the scene's length: a small surface's reach may be as good as none.
-    wider, least = 4.0, 0.01
 
     def __init__(
         self,
@@ -192,7 +189,7 @@ class ContactSearch:
             return 0
         found = self._records[i]
         before = self._count(found.within_reach)
-        reach = max(self.wider * self._reach[i], self.least * self.length)
+        reach = max(SEARCH.wider * self._reach[i], SEARCH.least * self.length)
         if self._reach[i] < self.contacts[i].horizon(self.length):
             found = self._search(i, reach)
         self._reach[i] = reach
