@@ -175,23 +175,6 @@ def test_edges_are_not_rounded_off(cell, sides):
     assert np.allclose(*found, rtol=0.0, atol=1e-12)
 
 
-def test_another_gap_needs_no_search():
-    d = lug(MPI.COMM_WORLD, (3.0, 2.0), clearance=CLEARANCE)
-    dofs = dofs_of(d)
-    pair = tfeti.Contact(*PAIR, secondary="bore", reach=1.0)
-    expected = searched([tfeti.Contact(*PAIR, secondary="bore", reach=1.0, gap="curved")], dofs, d)
-    records = searched([pair], dofs, d)
-    assert np.array_equal(pair.with_gap("curved").gaps(dofs, records, 1.0), expected.gap)
-    p = pin_in_lug((3.0, 2.0))
-    p.solve()
-    p.update(gap={0: "curved"})
-    force, peak = force_and_peak(p) / reference()
-    assert p.report.searches == 0
-    assert abs(force - 1.0) < 0.01
-    assert abs(peak - 1.0) < 0.06
-    assert not p.report.warnings
-
-
 def test_flat_sides_have_the_gap_of_the_geometry():
     d = stacked("tetrahedron", 3, 4, 4, gap=0.01)
     found = [

@@ -12,7 +12,7 @@ from scenes import SIDES, box, decomposed
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.mesh.partition import bisect_points
-from tfeti_dolfinx.mesh.tearing import SHARED, alike, costs, deal, measured
+from tfeti_dolfinx.mesh.tearing import deal
 
 CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
 
@@ -101,20 +101,6 @@ def test_disconnected_subdomains_are_split_and_reported(caplog):
         assert "split" in caplog.text
 
 
-def test_a_subdomain_connected_through_a_vertex_only_is_split():
-    def checkers(x):
-        return (x[0] > 0.5) ^ (x[1] > 0.5)
-
-    d = decomposed("quadrilateral", n=2, subdomains=checkers)
-    assert d.num_subdomains == 4
-
-
-def test_bisection_leaves_no_fragments():
-    d = decomposed("tetrahedron", n=6, subdomains=11)
-    assert d.num_subdomains == 11
-    assert not d.split
-
-
 def test_bodies_are_the_components_of_the_untorn_mesh():
     comm = MPI.COMM_WORLD
     left = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], dtype=float)
@@ -130,12 +116,6 @@ def test_bodies_are_the_components_of_the_untorn_mesh():
     assert not d.is_torn
 
 
-def test_more_ranks_than_subdomains():
-    d = decomposed("quadrilateral", n=3, subdomains=1)
-    assert d.num_subdomains == 1
-    assert d.comm.allreduce(len(d.cell_subdomain)) == 9
-
-
 @settings(max_examples=25)
 @given(st.integers(1, 40), st.integers(1, 40), st.integers(0, 10**6))
 def test_dealing_is_balanced_and_leaves_no_rank_idle(num_subdomains, num_ranks, seed):
@@ -145,41 +125,6 @@ def test_dealing_is_balanced_and_leaves_no_rank_idle(num_subdomains, num_ranks, 
     assert len(np.unique(ranks)) == min(num_subdomains, num_ranks)
     loads = np.bincount(ranks, weights, minlength=num_ranks)
     assert loads.max() <= weights.sum() / num_ranks + 2 * weights.max()
-
-
-@pytest.mark.parametrize("gdim", [2, 3])
-@pytest.mark.parametrize("shift", [0.0, 1e3])
-def test_only_subdomains_that_are_moved_look_equal(gdim, shift):
-    """A cloud of cells, and others: moved, in another order; mirrored, larger, of other tags."""
-    rng = np.random.default_rng(0)
-    x, tags = rng.random((50, gdim)), rng.integers(0, 3, 50)
-    order, mirror = rng.permutation(50), np.ones(gdim)
-    mirror[0] = -1.0
-    clouds = [x, x[order] + shift, mirror * x, 1.01 * x, x[:, ::-1], x]
-    materials = [tags, tags[order], tags, tags, tags, (tags + 1) % 3]
-    cells, _, shapes = measured(
-        np.concatenate(clouds),
-        np.concatenate(materials),
-        np.repeat(np.arange(6), 50),
-        6,
-        MPI.COMM_SELF,
-    )
-    weights = costs(cells, alike(cells, shapes))
-    assert weights[0] == weights[1] == pytest.approx(50 * (SHARED + (1 - SHARED) / 2))
-    assert weights[2:].tolist() == [50.0] * 4
-
-
-@pytest.mark.parametrize(("bend", "counts"), [(0.0, [4, 4]), (0.1, [5, 3])])
-def test_who_gets_equal_subdomains_gets_more_of_them(bend, counts):
-    """Eight strips; the right half is bent, so that no two of its strips are equal."""
-    mesh = dmesh.create_unit_square(MPI.COMM_WORLD, 32, 4)
-    x, y, _ = mesh.geometry.x.T  # views
-    y += bend * np.maximum(x - 0.5, 0.0) ** 2
-    d = tfeti.decompose(mesh, lambda x: (8 * x[0]).astype(int))
-    found = d.comm.allgather(len(d.subdomains))
-    assert sum(found) == 8
-    if d.comm.size == 2:
-        assert found == counts
 
 
 @settings(max_examples=25)
@@ -219,16 +164,6 @@ def test_bisection_leaves_columns_of_flat_cells_whole(thin, parts):
     assert len(np.unique(alone)) == parts
 
 
-@pytest.mark.parametrize("parts", [3, 4, 6])
-def test_bisection_leaves_columns_whole_that_are_most_of_a_part(parts):
-    """Two cells of 500 : 1 on each other, parts of two to four cells: a cut moves by one."""
-    x, extents = grid_of_cells([3, 2, 2], [1.0, 1.0, 0.002])
-    part = bisect_points(x, parts, MPI.COMM_SELF, extents)
-    columns = np.unique(np.round(x[:, :2], 6), axis=0, return_inverse=True)[1]
-    assert len(np.unique(np.stack((columns.ravel(), part)), axis=1).T) == 6
-    assert len(np.unique(part)) == parts
-
-
 @pytest.mark.parametrize(("counts", "parts"), [((6, 2), 8), ((6, 2), 12), ((4, 4, 2), 20)])
 def test_columns_of_flat_cells_leave_no_part_empty(counts, parts):
     """More parts than columns: a part for each was wished for."""
@@ -266,10 +201,3 @@ def test_bisection_along_layers_stays_balanced(parts, gdim, seed):
     counts = np.bincount(bisect_points(x, parts, MPI.COMM_SELF, extents), minlength=parts)
     assert counts.min() >= max(0.55 * len(x) / parts - 1.0, 1.0)
     assert counts.max() <= 1.6 * len(x) / parts + 1.0
-
-
-def test_bisection_of_cells_that_are_not_flat_only_counts():
-    x, extents = grid_of_cells([3, 4, 5], [1.0, 0.5, 0.4])
-    for parts in (2, 4, 7):
-        found = bisect_points(x, parts, MPI.COMM_SELF, extents)
-        assert np.array_equal(found, bisect_points(x, parts, MPI.COMM_SELF))

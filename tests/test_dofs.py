@@ -7,7 +7,6 @@ from mpi4py import MPI
 from scenes import box, decomposed
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
@@ -94,17 +93,3 @@ def test_scalar_spaces():
     _, dofs = torn(shape=())
     assert dofs.bs == 1
     assert dofs.comm.allreduce(dofs.num_groups) == 4**3
-
-
-@pytest.mark.parametrize("element", [("DG", 1, (3,)), ("N1curl", 1)])
-def test_other_spaces_are_refused(element):
-    d = decomposed("tetrahedron", 2, 2)
-    with pytest.raises(InputError, match="expected a continuous Lagrange space"):
-        TornDofs(fem.functionspace(d.mesh, element), d)
-
-
-def test_a_space_on_another_mesh_is_refused():
-    d = decomposed("tetrahedron", 2, 2)
-    other, _, _ = box("tetrahedron", 2)
-    with pytest.raises(InputError, match="the space is on another mesh"):
-        TornDofs(fem.functionspace(other, ("Lagrange", 1, (3,))), d)

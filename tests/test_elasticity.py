@@ -88,15 +88,6 @@ def test_uniaxial_stress(model, cell, degree, comm):
         ("quadrilateral", 1),
         ("tetrahedron", 1),
         ("hexahedron", 2),
-        *(
-            pytest.param(*scene, marks=pytest.mark.slow)
-            for scene in (
-                ("triangle", 1),
-                ("quadrilateral", 2),
-                ("tetrahedron", 2),
-                ("hexahedron", 1),
-            )
-        ),
     ],
 )
 def test_the_form_is_the_one_that_users_write(cell, degree):
@@ -181,12 +172,10 @@ def functions_of(d):
     "modulus",
     [
         lambda d: YOUNG,
-        lambda d: np.float32(YOUNG),
-        lambda d: fem.Constant(d.mesh, YOUNG),
         functions_of,
         lambda d: ufl.conditional(ufl.gt(ufl.SpatialCoordinate(d.mesh)[1], 0.5), YOUNG, YOUNG),
     ],
-    ids=["number", "numpy", "constant", "function", "expression"],
+    ids=["number", "function", "expression"],
 )
 def test_moduli_of_all_kinds(modulus, comm):
     d = decomposed("triangle", 2, 2)

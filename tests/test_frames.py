@@ -16,8 +16,9 @@ from tfeti_dolfinx.constraints.gluing import glue, prescribe
 from tfeti_dolfinx.contact.records import relative_displacement, remaining_gaps, slips
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.segments import SWITCH, frames
+from tfeti_dolfinx.mortar.segments import frames
 from tfeti_dolfinx.mortar.surfaces import group_points
+from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
 ORDERS = [("upper bottom", "lower top"), ("lower top", "upper bottom")]
@@ -65,7 +66,7 @@ def test_faces_along_coordinate_planes_have_tangents_along_axes(gdim):
 @pytest.mark.parametrize("gdim", [2, 3])
 def test_rounding_of_a_normal_does_not_turn_its_tangents(gdim):
     normal = simple_normals(gdim)
-    assert np.all(np.abs(np.abs(normal[:, 0]) - SWITCH) > 1e-3)
+    assert np.all(np.abs(np.abs(normal[:, 0]) - SEARCH.axis_switch) > 1e-3)
     rng = np.random.default_rng(0)
     for size in (1e-15, 1e-9):
         moved = unit(normal + size * rng.standard_normal(normal.shape))
@@ -77,11 +78,13 @@ def test_frames_are_continuous_but_for_the_switch(seed):
     rng = np.random.default_rng(seed)
     normal = unit(rng.standard_normal((50, 3)))
     moved = unit(normal + 1e-4 * rng.standard_normal((50, 3)))
-    same_side = (np.abs(normal[:, 0]) < SWITCH) == (np.abs(moved[:, 0]) < SWITCH)
+    same_side = (np.abs(normal[:, 0]) < SEARCH.axis_switch) == (
+        np.abs(moved[:, 0]) < SEARCH.axis_switch
+    )
     change = np.linalg.norm(moved - normal, axis=1)
     turned = np.abs(frames(moved) - frames(normal)).max(axis=(1, 2))
     # the first tangent is e − (e·n)n over its length, which is √(1 − 0.9²) at least
-    assert np.all(turned[same_side] <= 3.0 / np.sqrt(1 - SWITCH**2) * change[same_side])
+    assert np.all(turned[same_side] <= 3.0 / np.sqrt(1 - SEARCH.axis_switch**2) * change[same_side])
 
 
 def test_frames_are_the_same_on_any_number_of_ranks():

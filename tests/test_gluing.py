@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.constraints.gluing import _orthonormal, glue, prescribe
 from tfeti_dolfinx.contact.records import concatenate
-from tfeti_dolfinx.errors import InputError, NoSolutionError
+from tfeti_dolfinx.errors import NoSolutionError
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 
@@ -193,27 +193,3 @@ def test_an_obstacle_pushed_through_a_fixed_face_is_an_error():
     plane = tfeti.Obstacle("left", tfeti.Plane((2, 0, 0), (1, 0, 0)))
     with pytest.raises(NoSolutionError, match="prescribed: .* penetrate by up to 1 "):
         Scene(contacts=[plane])
-
-
-def test_contradictory_dirichlet_values_are_an_error():
-    d = decomposed("hexahedron", 2, 2)
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (3,)))
-    bcs = [
-        fem.dirichletbc(np.full(3, v), fem.locate_dofs_topological(V, 2, d.facets(name)), V)
-        for name, v in (("left", 0.0), ("bottom", 1.0))
-    ]
-    dofs, records = TornDofs(V, d), concatenate([], 3)
-    with pytest.raises(InputError, match=r"contradict each other: component \d .* 0.0 and as 1.0"):
-        glue(dofs, prescribe(dofs, bcs), records, 1.0, np.ones(dofs.num_nodes * 3))
-    same = [bcs[0], fem.dirichletbc(np.zeros(3), bcs[1].dof_indices()[0][::3] // 3, V)]
-    glue(dofs, prescribe(dofs, same), records, 1.0, np.ones(dofs.num_nodes * 3))
-
-
-def test_dirichlet_values_that_are_not_finite_are_an_error():
-    d = decomposed("hexahedron", 2, 2)
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (3,)))
-    left = fem.locate_dofs_topological(V, 2, d.facets("left"))
-    dofs, records = TornDofs(V, d), concatenate([], 3)
-    with pytest.raises(InputError, match="Dirichlet condition 0 has a value that is not finite"):
-        bc = fem.dirichletbc(np.full(3, np.nan), left, V)
-        glue(dofs, prescribe(dofs, [bc]), records, 1.0, np.ones(dofs.num_nodes * 3))

@@ -1,21 +1,16 @@
 """gmsh's split files, one per partition: the same as the partitioned mesh in one file."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
 from scenes import displacement, problem, relative
-from test_gmsh import rename_as_partition_groups
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.errors import InputError, TfetiError
-from tfeti_dolfinx.mesh.gmsh_reading import SplitFiles
 
 gmsh = pytest.importorskip("gmsh")
 ROOT = MPI.COMM_WORLD.rank == 0
-CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
 
 
 @pytest.fixture(autouse=True)
@@ -127,58 +122,29 @@ def solved(d):
     return displacement(p)
 
 
-@pytest.mark.parametrize("cell", CELLS)
-@pytest.mark.parametrize("ghosts", [False, True])
-def test_the_same_as_one_file(comm, shared_tmp, cell, ghosts):
+@pytest.mark.parametrize(
+    ("cell", "order", "ghosts", "version"),
+    [
+        ("triangle", 1, True, 4.1),
+        ("quadrilateral", 1, False, 4.1),
+        ("tetrahedron", 2, True, 4.1),
+        ("hexahedron", 1, False, 4.1),
+        ("tetrahedron", 1, False, 2.2),
+    ],
+)
+def test_the_same_as_one_file(comm, shared_tmp, cell, order, ghosts, version):
+    """Of version 2, a file names only its own groups, and nodes and cells are numbered anew."""
     if ROOT:
-        two_bodies(cell)
-        write(shared_tmp, ghosts=ghosts)
+        two_bodies(cell, order)
+        write(shared_tmp, version, ghosts)
     whole, split = both(shared_tmp, comm)
-    check_same(whole, split)
+    check_same(whole, split, ids=version > 3)
+    assert split.mesh.ufl_domain().ufl_coordinate_element().degree == order
     assert split.num_subdomains >= 5
     assert split.num_bodies == 2
     assert split.names.volumes == {"left": 7, "right": 9, "far": 11}
     assert split.names.surfaces == {"held": 3, "4": 4, "middle": 5}
     assert split.mesh.topology.cell_type.name == cell
-
-
-@pytest.mark.parametrize("cell", CELLS)
-def test_the_same_displacement(comm, shared_tmp, cell):
-    if ROOT:
-        two_bodies(cell)
-        write(shared_tmp)
-    whole, split = both(shared_tmp, comm)
-    (points, u), (split_points, split_u) = solved(whole), solved(split)
-    assert np.allclose(split_points, points, atol=1e-14)
-    assert relative(split_u, u) <= 1e-10
-
-
-@pytest.mark.parametrize("cell", CELLS)
-def test_cells_of_second_order(comm, shared_tmp, cell):
-    if ROOT:
-        two_bodies(cell, order=2)
-        write(shared_tmp, partition=3)
-    whole, split = both(shared_tmp, comm)
-    check_same(whole, split)
-    assert split.mesh.ufl_domain().ufl_coordinate_element().degree == 2
-
-
-@pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
-def test_version_2_where_a_file_names_only_its_own_groups(comm, shared_tmp, cell):
-    if ROOT:
-        two_bodies(cell)
-        write(shared_tmp, version=2.2)
-    # gmsh numbers nodes and cells anew when it writes one file of version 2
-    check_same(*both(shared_tmp, comm), ids=False)
-
-
-def test_partition_groups_of_gmsh(comm, shared_tmp):
-    if ROOT:
-        two_bodies()
-        gmsh.model.mesh.partition(3)
-        rename_as_partition_groups()
-        write(shared_tmp, partition=0)
-    check_same(*both(shared_tmp, comm))
 
 
 def partition_by(partition):
@@ -211,17 +177,6 @@ def test_a_partition_without_cells_in_groups(comm, shared_tmp):
     assert set(split.names.volumes) == {"left", "right"}
 
 
-def test_a_file_without_nodes(comm, shared_tmp):
-    """What gmsh writes in version 2 for a partition without cells in groups."""
-    write_squares(shared_tmp, {}, {}, {})
-    if ROOT:
-        empty = "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n0\n$EndNodes\n"
-        (shared_tmp / "squares_2.msh").write_text(empty)
-    comm.barrier()
-    d = tfeti.read_gmsh(shared_tmp / "squares.msh", comm)
-    assert (d.num_subdomains, d.num_bodies) == (2, 2)
-
-
 def test_more_ranks_than_files(comm, shared_tmp):
     if ROOT:
         two_bodies("tetrahedron")
@@ -246,7 +201,7 @@ def test_partitions_can_be_overruled(comm, shared_tmp, cell):
 
 
 def test_ids_of_cells_in_the_order_of_the_files(comm, shared_tmp):
-    numbers = SplitFiles(shared_tmp / "squares.msh", 3).of_rank(comm)
+    numbers = [p for p in (1, 2, 3) if (p - 1) * comm.size // 3 == comm.rank]
     write_squares(shared_tmp, {}, {}, {})
     ids = np.array([[2 * p, 2 * p + 1] for p in numbers], dtype=int).ravel()
     d = tfeti.read_gmsh(shared_tmp / "squares.msh", comm, ids)
@@ -254,24 +209,6 @@ def test_ids_of_cells_in_the_order_of_the_files(comm, shared_tmp):
     assert np.array_equal(d.original_cells, 10 * (d.cell_subdomain // 2 + 1) + d.cell_subdomain % 2)
     with pytest.raises(InputError, match="array subdomains: expected one id for each of the"):
         tfeti.read_gmsh(shared_tmp / "squares.msh", comm, np.zeros(7))
-
-
-@pytest.mark.parametrize(("size", "count"), [(1, 4), (2, 5), (3, 3), (3, 2), (4, 11)])
-def test_files_are_dealt_in_even_chunks(tmp_path, size, count):
-    files = SplitFiles(tmp_path / "any.msh", count)
-    dealt = [files.of_rank(SimpleNamespace(rank=rank, size=size)) for rank in range(size)]
-    assert [number for own in dealt for number in own] == list(range(1, count + 1))
-    assert max(map(len, dealt)) - min(map(len, dealt)) <= 1
-
-
-def test_one_file_goes_before_split_files(comm, shared_tmp):
-    write_squares(shared_tmp, {}, {}, {})
-    if ROOT:
-        (shared_tmp / "squares.msh").write_text(square(1))
-    comm.barrier()
-    assert (
-        comm.allreduce(len(tfeti.read_gmsh(shared_tmp / "squares.msh", comm).cell_subdomain)) == 2
-    )
 
 
 def square(number, tag=1, name="body", curve=None, shift=0.0, quads=False, column=None):

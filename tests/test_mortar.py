@@ -184,17 +184,6 @@ def test_a_body_that_only_far_surfaces_hold_is_found():
     assert np.allclose(gathered(problem.solution.contact().pressure), 0.1, atol=1e-6)
 
 
-def test_far_surfaces_make_no_rows():
-    d = stacked("quadrilateral", 3, 4, 4, gap=0.2)
-    bcs = clamped(d, "lower bottom", "upper top")
-    problem = two_body_problem(d, pressed(d, 0.0, "upper left"), bcs, [PAIR])
-    problem.solve()
-    report = problem.report
-    assert report.contact_candidates == report.far_contact_nodes == 5
-    assert report.contact_rows == 0
-    assert report.power_method_multiplications == 0
-
-
 def three(cell="quadrilateral"):
     """A box on two boxes that stand side by side, all meshed differently."""
     parts = [
@@ -303,12 +292,6 @@ def check_message(d, contact, message):
     problem = two_body_problem(d, pressed(d), bcs, [contact])
     with pytest.raises(tfeti.InputError, match=message):
         problem.solve()
-
-
-def test_surfaces_that_overlap_too_deep():
-    d = stacked("quadrilateral", 3, 4, 4, gap=-0.1)
-    message = r"contact of .* with .*: the surfaces overlap by up to 0\.1, more than the reach"
-    check_message(d, PAIR, message)
 
 
 def test_surfaces_that_overlap_a_little_are_pushed_apart():

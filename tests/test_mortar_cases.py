@@ -21,7 +21,7 @@ from bodies import (
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import box, clamp, decomposed, problem
+from scenes import decomposed, problem
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -229,41 +229,6 @@ def test_a_pair_without_conditions_has_empty_data():
     assert len(p.solution.contact(0).force) == 0
     with pytest.raises(tfeti.InputError, match="contact 1: there are 1, counted from 0"):
         p.solution.contact(1)
-
-
-def test_contacts_that_are_none():
-    d = stacked("quadrilateral", 3, 4, 4)
-    with pytest.raises(tfeti.InputError, match="contacts: expected a list, got a Contact"):
-        tfeti.ContactProblem(*forms_of(d), PAIR, d)
-    with pytest.raises(tfeti.InputError, match="expected obstacles and pairs, got 'lower top'"):
-        tfeti.ContactProblem(*forms_of(d), ["lower top"], d)
-    twice = tfeti.ContactProblem(*forms_of(d), [PAIR, sided("lower top", "upper bottom")], d)
-    with pytest.raises(tfeti.InputError, match="the pair of .* is there twice"):
-        twice.solve()
-
-
-def forms_of(d):
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    zero = fem.Constant(d.mesh, (0.0, 0.0))
-    return ufl.inner(ufl.sym(ufl.grad(u)), ufl.grad(v)) * ufl.dx, ufl.dot(zero, v) * ufl.dx, []
-
-
-def test_conditions_on_the_untorn_mesh_are_refused():
-    mesh, tags, names = box("quadrilateral", 4)
-    d = tfeti.decompose(mesh, 4, facet_tags=tags, surfaces=names)
-    p = problem(d, clamped=())
-    V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
-    p.bcs.append(clamp(V, tags.find(names["left"])))
-    with pytest.raises(tfeti.InputError, match="Dirichlet condition 0 is on another mesh"):
-        p.solve()
-
-
-def test_an_obstacle_with_its_normal_turned():
-    d = decomposed("quadrilateral", 4)
-    plane = tfeti.Plane((0, -0.01), (0, -1))
-    with pytest.raises(tfeti.InputError, match="'bottom': the surface faces away from it"):
-        problem(d, contacts=[tfeti.Obstacle("bottom", plane)]).solve()
 
 
 def test_options_that_did_not_reach_petsc(monkeypatch):

@@ -25,8 +25,12 @@ from tfeti_dolfinx.constraints.gluing import (
     checked_conditions,
     listed_conditions,
 )
-from tfeti_dolfinx.contact.records import Gap, gaps_by_position
-from tfeti_dolfinx.contact.search import ContactPartner, checked_contacts
+from tfeti_dolfinx.contact.partner import (
+    ContactPartner,
+    Gap,
+    checked_contacts,
+    gaps_by_position,
+)
 from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
 from tfeti_dolfinx.extensions import Extensions, Settings, check_method, guarded
 from tfeti_dolfinx.feti.dual import Dual

@@ -18,7 +18,7 @@ from tfeti_dolfinx.common.validation import checked_type
 from tfeti_dolfinx.constraints.contact_state import ContactState, ContactStatus, Multipliers
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.forces import BodyForces, body_forces, vertex_tractions
-from tfeti_dolfinx.contact.search import ContactPartner
+from tfeti_dolfinx.contact.partner import ContactPartner
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.extensions import plugin
 from tfeti_dolfinx.forms.discretisation import StressRecovery

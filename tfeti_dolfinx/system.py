@@ -16,8 +16,9 @@ from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.constraints.gluing import Gluing, Prescribed, glue, prescribe
 from tfeti_dolfinx.constraints.rows import row_weights
 from tfeti_dolfinx.contact.forces import condition_areas
-from tfeti_dolfinx.contact.records import Gap, slips
-from tfeti_dolfinx.contact.search import ContactPartner, ContactSearch
+from tfeti_dolfinx.contact.partner import ContactPartner, Gap
+from tfeti_dolfinx.contact.records import slips
+from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import Settings
 from tfeti_dolfinx.feti.dual import Dual

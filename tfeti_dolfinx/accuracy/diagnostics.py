@@ -9,7 +9,7 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array, joined, sum_rows, sums
 from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root
-from tfeti_dolfinx.contact.records import GEOMETRY
+from tfeti_dolfinx.contact.partner import GEOMETRY
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.diagnostics import flatness, shared_by_bodies

@@ -193,7 +193,6 @@ class ClusterMotions:
 
     Attributes:
         count: Number of these motions, of all subdomains.
-        amplification: As of ``SoftModes``.
         factors: Makes the factors of faces, of motions of whole clusters, and counts them.
     """
 
@@ -207,7 +206,6 @@ class ClusterMotions:
     ) -> None:
         self._coarse, self._prefix = coarse, prefix
         self._own: InnerMotions = subdomains.inner_motions()
-        self.amplification = subdomains.body_maxima([self._own.amplification])[0]
         self._Gt = products(B, self._own.rows)
         indptr, columns, values = self._Gt.getValuesCSR()
         self.count = self._Gt.getSize()[1]

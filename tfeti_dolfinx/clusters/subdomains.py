@@ -412,14 +412,12 @@ class InnerMotions:
         cluster: Cluster of each, shape ``(k,)``.
         whole: Motions of whole clusters, which averages leave free, in their kernels or not,
             shape ``(k, w)``.
-        amplification: As of ``SoftMotions``.
     """
 
     rows: csr_array
     energy: Array
     cluster: Array
     whole: csr_array
-    amplification: list[float]
 
 
 class ClusteredSubdomains(Subdomains):
@@ -508,7 +506,7 @@ class ClusteredSubdomains(Subdomains):
         cluster[entries.coords[1]] = at[entries.coords[0]]
         G = csr_array((self._clusters.averages[:, self.trace] @ rows).T)
         whole = _nulls(G, self._of_clusters(cluster))
-        return InnerMotions(rows, energy, cluster, whole, held.amplification)
+        return InnerMotions(rows, energy, cluster, whole)
 
     # ---------------------------------------------------------------- operators
 

@@ -11,16 +11,12 @@ from scipy.sparse import csr_array, eye_array, hstack
 
 from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.common.parallel import any_rank
-from tfeti_dolfinx.constraints.rows import HeldPart, RowBuilder, Rows, stack
+from tfeti_dolfinx.constraints.rows import TOLERANCES, HeldPart, RowBuilder, Rows, stack
 from tfeti_dolfinx.contact.records import ContactRecords, Friction
 from tfeti_dolfinx.errors import NoSolutionError, TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 # --- Consistency of contact conditions at one node --------------------------------------------
-
-# of the scene's length: overlaps that the linear program's tolerance (for gaps over that length)
-# may leave, with room for as many conditions as a node may have
-OVERLAP, LP_TOLERANCE = 1e-8, 1e-10
 
 
 @dataclass(frozen=True)
@@ -66,14 +62,14 @@ class SharedNodes:
             b_ub=gaps[self.condition] / length,
             bounds=[(None, None)] * unknowns + [(0.0, None)] * n,
             method="highs",
-            options={"primal_feasibility_tolerance": LP_TOLERANCE},
+            options={"primal_feasibility_tolerance": TOLERANCES.program},
         )
         if found.status != 0:
             raise TfetiError(
                 f"the linear program of contradicting contacts failed: {found.message}"
             )
         overlap = found.x[unknowns:]
-        if overlap.max() <= OVERLAP:
+        if overlap.max() <= TOLERANCES.contradiction:
             return
         worst = np.argmax(overlap)
         numbers = np.unique(self.contact[self.group == self.group[worst]])
@@ -96,13 +92,6 @@ def shared_nodes(records: ContactRecords, free: Array, kept: Array, points: Arra
     per_node = np.bincount(records.group[kept], minlength=len(points))
     condition = np.flatnonzero(kept & (per_node[records.group] > 1))
     group = records.group[condition]
-    return SharedNodes(
-        condition, records.contact[condition], group, points[group], _rows(records, free, condition)
-    )
-
-
-def _rows(records: ContactRecords, free: Array, condition: Array) -> csr_array:
-    """Return rows of some conditions over the unknowns that they touch."""
     place = np.full(len(records), -1)
     place[condition] = np.arange(len(condition))
     used = np.flatnonzero(place[records.condition] >= 0)
@@ -111,13 +100,11 @@ def _rows(records: ContactRecords, free: Array, condition: Array) -> csr_array:
     columns = column.ravel()[:, None] * gdim + np.arange(gdim)
     rows = np.repeat(place[records.condition[used]], gdim)
     shape = (len(condition), len(groups) * gdim)
-    return csr_array((free[used].ravel(), (rows, columns.ravel())), shape=shape)
+    A = csr_array((free[used].ravel(), (rows, columns.ravel())), shape=shape)
+    return SharedNodes(condition, records.contact[condition], group, points[group], A)
 
 
 # --- Non-penetration rows and their right sides -----------------------------------------------
-
-# of the scene's length: overlaps below it are rounding of gaps and prescribed values
-ROUNDED_OVERLAP = 1e-10
 
 
 @dataclass(frozen=True)
@@ -143,11 +130,6 @@ class ContactRows:
     held: HeldPart
     shared: SharedNodes
 
-    def left_gaps(self, dofs: TornDofs, values: Array, gaps: Array) -> Array:
-        """Gaps of all conditions less what prescribed values use up, shape ``(n,)``. Collective."""
-        v = self.held.displacement(dofs, values, len(gaps))
-        return np.asarray(gaps - np.sum(self.normal * v, axis=1))
-
     def right_side(self, dofs: TornDofs, values: Array, gaps: Array, length: float) -> Array:
         """Right sides of the normal rows. Collective.
 
@@ -161,8 +143,17 @@ class ContactRows:
             NoSolutionError: Prescribed components alone violate a condition, or the conditions of
                 a node contradict each other.
         """
-        left = self.left_gaps(dofs, values, gaps)
-        _check_decided(left[self.decided], length, dofs.comm)
+        v = self.held.displacement(dofs, values, len(gaps))
+        left = gaps - np.sum(self.normal * v, axis=1)
+        decided, comm = left[self.decided], dofs.comm
+        overlaps = comm.allreduce(int(np.sum(decided < -TOLERANCES.overlap * length)))
+        deepest = comm.allreduce(float(decided.min(initial=0.0)), op=MPI.MIN)
+        if overlaps:
+            raise NoSolutionError(
+                "an obstacle or a contact lies within a part of the surface whose displacement is "
+                f"prescribed: {overlaps} nodes penetrate by up to {-deepest:.6g} whatever the rest "
+                "does"
+            )
         with raised_on_all_ranks(dofs.comm):
             self.shared.check(left, length)
         return left[self.condition] * self.scale
@@ -193,22 +184,7 @@ def contact_rows(spread: RowBuilder) -> tuple[Rows, ContactRows]:
     return spread.rows(0, condition, scale), found
 
 
-def _check_decided(gaps: Array, length: float, comm: MPI.Intracomm) -> None:
-    """Raise on all ranks if prescribed components violate conditions, with those of all ranks."""
-    overlaps = comm.allreduce(int(np.sum(gaps < -ROUNDED_OVERLAP * length)))
-    deepest = comm.allreduce(float(gaps.min(initial=0.0)), op=MPI.MIN)
-    if overlaps:
-        raise NoSolutionError(
-            "an obstacle or a contact lies within a part of the surface whose displacement is "
-            f"prescribed: {overlaps} nodes penetrate by up to "
-            f"{-deepest:.6g} whatever the rest does"
-        )
-
-
 # --- Tangential rows of conditions with friction ----------------------------------------------
-
-NOTHING = np.empty(0, dtype=np.int64)
-NO_ROWS = Rows(NOTHING, NOTHING, NOTHING, np.empty(0))
 
 
 @dataclass(frozen=True)
@@ -293,37 +269,31 @@ def tangent_rows(
         normals: What the normal rows are of.
     """
     records, count = spread.records, dofs.bs - 1
-    if not any_rank(dofs.comm, bool(np.any(records.friction != Friction.NONE))):
-        none = np.ones((0, count), dtype=bool)
-        return NO_ROWS, _tangents_of(spread, NOTHING, np.zeros(0), none, NOTHING)
-    squares, moves = np.zeros((len(records), count)), np.zeros((len(records), count), dtype=bool)
-    for k in range(count):
-        squares[:, k], moves[:, k] = spread.left(1 + k)
-    normal_scale = np.zeros(len(records))
-    normal_scale[normals.condition] = normals.scale
-    rubs = (records.friction == Friction.GIVEN) & records.within_reach
-    rubs |= (records.friction == Friction.COULOMB) & (normal_scale > 0.0)
-    condition = np.flatnonzero(rubs & np.any(moves, axis=1))
-    longest = np.sqrt(squares[condition].max(axis=1, initial=0.0))
-    scale = normal_scale[condition]
-    scale = np.where(scale > 0.0, scale, 1.0 / np.maximum(longest, TINY))
-    row = np.full(len(records), -1)
-    row[normals.condition] = np.arange(len(normals.condition))
-    row[records.friction != Friction.COULOMB] = -1
-    found = _tangents_of(spread, condition, scale, moves[condition], row[condition])
-    tables = [spread.rows(1 + k, condition, scale * found.moves[:, k]) for k in range(count)]
-    return _by_condition(tables), found
-
-
-def _tangents_of(
-    spread: RowBuilder, condition: Array, scale: Array, moves: Array, normal: Array
-) -> TangentRows:
-    tangents = spread.records.tangents[condition]
-    return TangentRows(condition, scale, moves, tangents, spread.held, normal)
-
-
-def _by_condition(tables: list[Rows]) -> Rows:
-    """Return rows of several axes, those of a condition one after the other."""
-    rows, count = stack(tables), len(tables)
-    place = np.arange(len(rows)).reshape(-1, count).T.ravel()
-    return Rows(np.repeat(tables[0].group, count), place[rows.row], rows.column, rows.value)
+    condition: Array = np.empty(0, dtype=np.int64)
+    normal: Array = condition
+    scale: Array = np.zeros(0)
+    moves: Array = np.ones((0, count), dtype=bool)
+    rows = Rows(condition, condition, condition, scale)
+    if any_rank(dofs.comm, bool(np.any(records.friction != Friction.NONE))):
+        squares, left = (np.zeros((len(records), count)) for _ in range(2))
+        for k in range(count):
+            squares[:, k], left[:, k] = spread.left(1 + k)
+        of_normal, row = np.zeros(len(records)), np.full(len(records), -1)
+        of_normal[normals.condition] = normals.scale
+        row[normals.condition] = np.arange(len(normals.condition))
+        row[records.friction != Friction.COULOMB] = -1
+        rubs = (records.friction == Friction.GIVEN) & records.within_reach
+        rubs |= (records.friction == Friction.COULOMB) & (of_normal > 0.0)
+        condition = np.flatnonzero(rubs & np.any(left > 0.0, axis=1))
+        longest = np.sqrt(squares[condition].max(axis=1, initial=0.0))
+        normal, moves = row[condition], left[condition] > 0.0
+        scale = of_normal[condition]
+        scale = np.where(scale > 0.0, scale, 1.0 / np.maximum(longest, TINY))
+        rows = stack([spread.rows(1 + k, condition, scale * moves[:, k]) for k in range(count)])
+        # those of a condition one after the other
+        place = np.arange(len(rows)).reshape(-1, count).T.ravel()
+        group = np.repeat(records.group[condition], count)
+        rows = Rows(group, place[rows.row], rows.column, rows.value)
+    return rows, TangentRows(
+        condition, scale, moves, records.tangents[condition], spread.held, normal
+    )

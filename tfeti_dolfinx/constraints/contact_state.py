@@ -13,8 +13,8 @@ import numpy as np
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.forces import condition_areas, nodal_forces
-from tfeti_dolfinx.contact.records import position_of, remaining_gaps, slips
-from tfeti_dolfinx.contact.search import ContactPartner
+from tfeti_dolfinx.contact.partner import ContactPartner, position_of
+from tfeti_dolfinx.contact.records import remaining_gaps, slips
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mortar.surfaces import group_points
 from tfeti_dolfinx.qp.sets import Face

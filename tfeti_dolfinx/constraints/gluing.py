@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from dolfinx import fem
@@ -19,6 +20,7 @@ from tfeti_dolfinx.constraints.contact_rows import (
     tangent_rows,
 )
 from tfeti_dolfinx.constraints.rows import (
+    TOLERANCES,
     Constraints,
     RowBuilder,
     Rows,
@@ -126,8 +128,6 @@ def _hold(dofs: TornDofs, flag: Array, weights: Array) -> tuple[Rows, Array]:
 
 # --- Dirichlet values on torn copies ----------------------------------------------------------
 
-AGREEMENT = 1e-10
-
 
 @dataclass(frozen=True)
 class Prescribed:
@@ -157,8 +157,19 @@ def prescribe(dofs: TornDofs, bcs: Sequence[fem.DirichletBC]) -> Prescribed:
     high = dofs.reduce(dofs.to_primal(high).reshape(-1, dofs.bs), np.maximum, -np.inf)
     flag = low <= high
     with raised_on_all_ranks(dofs.comm):
-        _check_finite(bcs)
-        _check_agreement(low, high, flag)
+        for number, bc in enumerate(bcs):
+            value = bc.g.x.array if hasattr(bc.g, "x") else bc.g.value
+            if not np.all(np.isfinite(value)):
+                raise InputError(f"Dirichlet condition {number} has a value that is not finite")
+        scale = np.abs(np.concatenate((low[flag], high[flag]))).max(initial=0.0)
+        apart = np.subtract(high, low, out=np.zeros_like(low), where=flag)
+        if np.any(wrong := apart > TOLERANCES.agreement * scale):
+            at = tuple(np.argwhere(wrong)[0])
+            raise InputError(
+                f"Dirichlet conditions contradict each other: component {at[1]} of a node is "
+                f"prescribed as {low[at]} and as {high[at]} "
+                f"(at {wrong.sum()} components of nodes on this rank)"
+            )
     return Prescribed(flag=flag, value=np.where(flag, low, 0.0))
 
 
@@ -296,31 +307,7 @@ def _check_space(what: str, bc: fem.DirichletBC, V: fem.FunctionSpace) -> None:
         )
 
 
-def _check_finite(bcs: Sequence[fem.DirichletBC]) -> None:
-    for number, bc in enumerate(bcs):
-        value = bc.g.x.array if hasattr(bc.g, "x") else bc.g.value
-        if not np.all(np.isfinite(value)):
-            raise InputError(f"Dirichlet condition {number} has a value that is not finite")
-
-
-def _check_agreement(low: Array, high: Array, flag: Array) -> None:
-    scale = np.abs(np.concatenate((low[flag], high[flag]))).max(initial=0.0)
-    spread = np.subtract(high, low, out=np.zeros_like(low), where=flag)
-    wrong = spread > AGREEMENT * scale
-    if not np.any(wrong):
-        return
-    group, component = np.argwhere(wrong)[0]
-    raise InputError(
-        f"Dirichlet conditions contradict each other: component {component} of a node is "
-        f"prescribed as {low[group, component]} and as {high[group, component]} "
-        f"(at {wrong.sum()} components of nodes on this rank)"
-    )
-
-
 # --- All rows of a scene ----------------------------------------------------------------------
-
-# more than any mesh has nodes, and times any number of contacts within 64 bits
-MANY_GROUPS = 2**40
 
 
 @dataclass(frozen=True)
@@ -426,13 +413,16 @@ class Gluing:
         flags, flags_before = self.prescribed.flag, earlier.prescribed.flag
         if not any_rank(self.dofs.comm, not np.array_equal(flags, flags_before)):
             start[sets.equalities] = lam[before.equalities]
-        new, old = _common(self._keys(self.contact), earlier._keys(earlier.contact))
         # ratios: of rows that stay they are exactly 1, and what F makes of the start is known
-        ratio = earlier.contact.scale[old] / self.contact.scale[new]
-        start[sets.normals[new]] = lam[before.normals[old]] * ratio
-        new, old = _common(self._keys(self.tangents), earlier._keys(earlier.tangents))
-        ratio = earlier.tangents.scale[old] / self.tangents.scale[new]
-        start[sets.tangents[new]] = lam[before.tangents[old]] * ratio[:, None]
+        pairs: list[tuple[Any, Any, Array, Array]] = [
+            (self.contact, earlier.contact, sets.normals[:, None], before.normals[:, None]),
+            (self.tangents, earlier.tangents, sets.tangents, before.tangents),
+        ]
+        for rows, rows_before, to, of in pairs:
+            keys = self._keys(rows), earlier._keys(rows_before)
+            _, new, old = np.intersect1d(*keys, return_indices=True)
+            ratio = rows_before.scale[old] / rows.scale[new]
+            start[to[new]] = lam[of[old]] * ratio[:, None]
         return start
 
     def contacts_of(self, rows: Array) -> list[int]:
@@ -450,13 +440,7 @@ class Gluing:
     def _keys(self, rows: ContactRows | TangentRows) -> Array:
         """Return a number for the contact and the node of each condition with such rows."""
         kept, records = rows.condition, self.records
-        return records.contact[kept] * MANY_GROUPS + records.group[kept]
-
-
-def _common(keys: Array, earlier: Array) -> tuple[Array, Array]:
-    """Return the positions, in both arrays, of the numbers that they have in common."""
-    _, new, old = np.intersect1d(keys, earlier, return_indices=True)
-    return new, old
+        return (records.contact[kept] << 40) + records.group[kept]  # no mesh has so many nodes
 
 
 def glue(

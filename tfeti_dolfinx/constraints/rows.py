@@ -16,6 +16,35 @@ from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import group_points
 
+
+@dataclass(frozen=True)
+class RowTolerances:
+    """Tolerances of rows.
+
+    Attributes:
+        agreement: Values that conditions prescribe at a node differ by less, relative to all.
+        rounding: What rounding makes of a condition's coefficients and of lengths, of which
+            several errors add up.
+        nothing_left: Of a row's norm: if prescribed components leave less, the row is dropped.
+        hardly_left: A condition of which more is left has a row, however uncertain its normal is.
+        overlap: Overlap, over the scene's length, that rounding of gaps and prescribed values may
+            leave.
+        contradiction: The same of conditions at one node, whose linear program ends at
+            ``program``.
+        program: Tolerance of the linear program, for gaps over the scene's length.
+    """
+
+    agreement: float = 1e-10
+    rounding: float = 2.2e-15
+    nothing_left: float = 1e-10
+    hardly_left: float = 1e-3
+    overlap: float = 1e-10
+    contradiction: float = 1e-8
+    program: float = 1e-10
+
+
+TOLERANCES = RowTolerances()
+
 # --- Tables of rows ---------------------------------------------------------------------------
 
 
@@ -67,7 +96,7 @@ def stack(tables: list[Rows]) -> Rows:
 
 @dataclass(frozen=True)
 class RowSets:
-    """Local rows of B by name. Nobody else knows in which order they stand.
+    """Local rows of B by name: nobody else knows in which order they stand.
 
     Attributes:
         equalities: Gluing rows, and rows that hold prescribed components, shape ``(e,)``.
@@ -93,14 +122,6 @@ class RowSets:
     def num_rows(self) -> int:
         """All local rows."""
         return self.equalities.size + self.normals.size + self.tangents.size
-
-
-def row_sets(num_equalities: int, num_normals: int, num_tangents: int, gdim: int) -> RowSets:
-    """Equalities first, then normals, then tangents, those of a condition together."""
-    rows, count = np.arange(num_equalities + num_normals + num_tangents), max(gdim - 1, 1)
-    equalities, normals, tangents = np.split(rows, [num_equalities, num_equalities + num_normals])
-    shape = (num_tangents // count, gdim - 1)
-    return RowSets(equalities, normals, tangents.reshape(shape))
 
 
 # --- Scaling D of rows ------------------------------------------------------------------------
@@ -131,13 +152,6 @@ def row_weights(blocks: Array, scaling: str, comm: MPI.Intracomm) -> Array:
 
 
 # --- Coefficients of contact conditions -------------------------------------------------------
-
-# Of a row's norm: what is left of less is rounding, scaled up to unit norm.
-NOTHING_LEFT = 1e-10
-# of what rounding makes of a condition's coefficients, and of lengths: errors of several add up
-SEVERAL, EPSILON = 10.0, 2.2e-16
-# a condition of which more than this remains is one, however uncertain its normal is
-HARDLY_LEFT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -182,7 +196,6 @@ class RowBuilder:
     Attributes:
         records: The conditions.
         points: Points of the owned groups, shape ``(g, 3)``.
-        nothing_left: Share of each condition that is rounding, shape ``(n,)``.
     """
 
     def __init__(
@@ -192,21 +205,32 @@ class RowBuilder:
         self.records, self._dofs, self._weights = records, dofs, weights
         self._prescribed, self._total = dofs.lookup(records.entry_group, flag, sums)
         self.points = group_points(dofs)
-        self.nothing_left = _nothing_left(records, self.points)
+
+    @cached_property
+    def nothing_left(self) -> Array:
+        """Share of a condition that is rounding, shape ``(n,)``.
+
+        The normal of a facet of size h at x is exact to ε|x|/h, and so is a place on it. At a
+        distance g the normal points that much times g beside the place that it should point to.
+        """
+        records, t = self.records, TOLERANCES
+        x = np.abs(self.points[records.group]).max(axis=1, initial=0.0)
+        h = records.area ** (1.0 / max(records.normal.shape[1] - 1, 1))
+        g = np.abs(records.geometric_gap)
+        error = t.rounding * (x * (1.0 + g / h) + g) / h
+        return np.clip(error, t.nothing_left, t.hardly_left)
 
     def free(self, axis: int) -> Array:
         """Coefficients along an axis of the frames, 0 at prescribed components."""
         return np.where(self._prescribed, 0.0, self.records.coefficients(axis))
 
-    def squares(self, coefficients: Array) -> Array:
-        """Squared norms in D⁻¹ of the rows that coefficients make, unscaled, shape ``(n,)``."""
-        squares = np.sum(coefficients**2 / self._total, axis=1)
-        return sum_rows(self.records.condition, squares, len(self.records))
-
     def left(self, axis: int) -> tuple[Array, Array]:
-        """Squared norms without prescribed components, and whether they are more than rounding."""
-        before = self.squares(self.records.coefficients(axis))
-        after = self.squares(self.free(axis))
+        """Squared norms in D⁻¹ without prescribed components; whether they exceed rounding."""
+        records = self.records
+        before, after = (
+            sum_rows(records.condition, np.sum(a**2 / self._total, axis=1), len(records))
+            for a in (records.coefficients(axis), self.free(axis))
+        )
         return after, after > self.nothing_left**2 * before
 
     @cached_property
@@ -234,19 +258,6 @@ class RowBuilder:
             column=columns.ravel(),
             value=values.ravel(),
         ).without_zeros()
-
-
-def _nothing_left(records: ContactRecords, points: Array) -> Array:
-    """Share of a condition that is rounding, shape ``(n,)``.
-
-    The normal of a facet of size h at x is exact to ε|x|/h, and so is a place on it. At a distance
-    g the normal points that much times g beside the place that it should point to.
-    """
-    x = np.abs(points[records.group]).max(axis=1, initial=0.0)
-    h = records.area ** (1.0 / max(records.normal.shape[1] - 1, 1))
-    g = np.abs(records.geometric_gap)
-    error = EPSILON * (x * (1.0 + g / h) + g) / h
-    return np.clip(SEVERAL * error, NOTHING_LEFT, HARDLY_LEFT)
 
 
 # --- B as a distributed PETSc matrix, and c ---------------------------------------------------
@@ -340,9 +351,18 @@ def assemble_constraints(
         pressed_by: For each of them the position of its normal row under Coulomb's law, else −1.
     """
     rows = stack(list(tables))
-    equalities, normals, tangents = (len(table) for table in tables)
-    sets = row_sets(equalities, normals, tangents, dofs.bs)
-    trace, column = _trace_columns(dofs, rows.column)
+    ends = np.cumsum([len(table) for table in tables])[:-1]
+    equalities, normals, tangents = np.split(np.arange(len(rows)), ends)
+    width = dofs.bs - 1  # rows of a condition stand together
+    sets = RowSets(equalities, normals, tangents.reshape(len(tangents) // max(width, 1), width))
+    # the trace: local primal unknowns that rows of any rank touch
+    offsets = dofs.offsets * dofs.bs
+    needed, place = np.unique(rows.column, return_inverse=True)
+    exchange = Exchange(dofs.comm, owner_of(offsets, needed))
+    asked = exchange.send(needed) - offsets[dofs.comm.rank]
+    trace = np.unique(asked)
+    start = chunk_offsets(dofs.comm, len(trace))[dofs.comm.rank]
+    column = exchange.answer(start + np.searchsorted(trace, asked))[place]
     num_rows, num_columns = len(rows), len(trace)
     order = np.lexsort((column, rows.row))
     indptr = np.concatenate(([0], np.cumsum(np.bincount(rows.row, minlength=num_rows))))
@@ -368,14 +388,3 @@ def assemble_constraints(
         pressed_by=row,
         coefficients=np.zeros(shape),
     )
-
-
-def _trace_columns(dofs: TornDofs, column: Array) -> tuple[Array, Array]:
-    """Local primal unknowns that rows of any rank touch, and the entries' global trace column."""
-    offsets = dofs.offsets * dofs.bs
-    needed, place = np.unique(column, return_inverse=True)
-    exchange = Exchange(dofs.comm, owner_of(offsets, needed))
-    asked = exchange.send(needed) - offsets[dofs.comm.rank]
-    trace = np.unique(asked)
-    start = chunk_offsets(dofs.comm, len(trace))[dofs.comm.rank]
-    return trace, exchange.answer(start + np.searchsorted(trace, asked))[place]

@@ -24,18 +24,9 @@ from tfeti_dolfinx.mortar.facets import (
 from tfeti_dolfinx.mortar.integrals import GapIntegrals, integrate
 from tfeti_dolfinx.mortar.segments import find_segments, frames, possible_pairs, rendezvous
 from tfeti_dolfinx.mortar.surfaces import surface_facets
+from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 # --- Sides of a contact -----------------------------------------------------------------------
-
-# of the square (in 2D: of the length) of a facet's radius: an area below it is rounding, and the
-# facet has no normal
-DEGENERATE = 1e-12
-# Facets that make more than about 40 degrees with the averaged normal: on meshes that are fine
-# enough for contact a smooth surface stays well below, at a right-angled edge they make 45.
-CREASE = 0.75
-# Ratios up to which meshes are of one size: an irrational number, so that rounding decides nowhere
-# between counts of equal facets; and materials of one stiffness per area.
-SAME_SIZE, SAME_STIFFNESS = 2 ** (1 / 6), 1.01
 
 
 @dataclass(frozen=True)
@@ -58,7 +49,7 @@ class Side:
     def has_edges(self, comm: MPI.Intracomm) -> bool:
         """Return whether a facet's normal is far off the averaged one at a vertex. Collective."""
         cosine = np.einsum("nvg,ng->nv", self.facets.vertex_normals, self.facets.normal)
-        return comm.allreduce(int(np.sum(cosine < CREASE))) > 0
+        return comm.allreduce(int(np.sum(cosine < SEARCH.crease))) > 0
 
 
 def side_of(contact: str, surface: str | int, dofs: TornDofs, decomposition: Decomposition) -> Side:
@@ -76,7 +67,7 @@ def side_of(contact: str, surface: str | int, dofs: TornDofs, decomposition: Dec
     kind = facet_kind(dofs)
     facets = local_facets(dofs, decomposition, surface_facets(decomposition, surface))
     whole = facets.radius ** (facets.x.shape[2] - 1)
-    flat = int(np.sum(facets.area <= DEGENERATE * whole))
+    flat = int(np.sum(facets.area <= SEARCH.degenerate * whole))
     if count := dofs.comm.allreduce(flat):
         raise InputError(f"{contact}: {count} facets of {surface!r} have no area")
     facets, normals = with_averaged_normals(facets, dofs, kind.num_vertices)
@@ -100,7 +91,7 @@ class Ratios:
     @property
     def finer(self) -> bool:
         """True if the first side has the finer mesh by more than meshes of one size differ."""
-        return self.size < 1.0 / SAME_SIZE
+        return self.size < 1.0 / SEARCH.same_size
 
     @property
     def exchanged(self) -> Ratios:
@@ -112,9 +103,9 @@ class Ratios:
 
         The coarser one is; where meshes are of one size, the softer one.
         """
-        if max(self.size, 1.0 / self.size) > SAME_SIZE:
+        if max(self.size, 1.0 / self.size) > SEARCH.same_size:
             return self.finer
-        return self.stiffness > SAME_STIFFNESS
+        return self.stiffness > SEARCH.same_stiffness
 
 
 def ratios(
@@ -158,14 +149,6 @@ def ratios(
 
 # --- Assembly of conditions from integrals over facets ----------------------------------------
 
-# of ∫φ_i: a node whose hat is covered by less has slivers of facets only, and divides by them
-HARDLY_COVERED = 1e-6
-# of ∫φ_i: a weight below it is what rounding leaves of one that biorthogonality makes 0; as an
-# entry of B it would make an unknown of the trace of every node of a facet
-NEGLIGIBLE = 1e-13
-# of the largest coordinate: a smaller gap is what rounding leaves of none. A body that nothing
-# loads would have such an overlap for its displacement, of which nothing is right.
-NO_GAP = 1e-14
 
 Triplets = tuple[Array, Array, Array]
 
@@ -203,7 +186,7 @@ def conditions(dofs: TornDofs, contact: int, side: Side, shares: Shares) -> Cont
     """
     area = dofs.add_on_owners(shares.vertices.ravel(), shares.covered.ravel())
     whole = dofs.add_on_owners(side.vertices.ravel(), side.areas.ravel())
-    chosen = np.flatnonzero(area > HARDLY_COVERED * whole)
+    chosen = np.flatnonzero(area > SEARCH.hardly_covered * whole)
     vertices, areas = shares.vertices, area[chosen]
     gap, _ = _mean_gaps(dofs, vertices, shares.gap, areas, chosen)
     curved_gap, spread = _mean_gaps(dofs, vertices, shares.curved_gap, areas, chosen)
@@ -211,7 +194,7 @@ def conditions(dofs: TornDofs, contact: int, side: Side, shares: Shares) -> Cont
     place = np.full(dofs.num_groups, -1)
     place[chosen] = np.arange(len(chosen))
     slot, column, value = _merged(dofs, shares.entries)
-    kept = (place[slot] >= 0) & (np.abs(value) > NEGLIGIBLE * np.maximum(area[slot], 1e-300))
+    kept = (place[slot] >= 0) & (np.abs(value) > SEARCH.negligible * np.maximum(area[slot], 1e-300))
     slot, column, value = slot[kept], column[kept], value[kept]
     return ContactRecords(
         contact=np.full(len(chosen), contact),
@@ -256,7 +239,7 @@ def _without_rounding(dofs: TornDofs, gap: Array) -> Array:
     """0 in the place of gaps that rounding of coordinates may have made of it. Collective."""
     own = float(np.abs(dofs.V.mesh.geometry.x).max(initial=0.0))
     largest = dofs.comm.allreduce(own, op=MPI.MAX)
-    return np.where(np.abs(gap) <= NO_GAP * largest, 0.0, gap)
+    return np.where(np.abs(gap) <= SEARCH.no_gap * largest, 0.0, gap)
 
 
 def _merged(dofs: TornDofs, entries: tuple[Triplets, ...]) -> Triplets:
@@ -276,10 +259,6 @@ def _merged(dofs: TornDofs, entries: tuple[Triplets, ...]) -> Triplets:
 
 # --- Mortar integrals of a pair ---------------------------------------------------------------
 
-# One looks farther than the reach: else facets at its edge would be covered partly, and an overlap
-# that is too deep would not be seen.
-SEEN = 3.0
-
 
 def meeting(
     name: str, sides: tuple[Side, Side], dofs: TornDofs, reach: float, depth: float
@@ -297,11 +276,13 @@ def meeting(
         InputError: The surfaces face away from each other.
     """
     kind, comm = facet_kind(dofs), dofs.comm
-    distance = SEEN * max(reach, depth)
+    distance = SEARCH.seen * max(reach, depth)
     secondary, primary = rendezvous(sides[0].facets, sides[1].facets, distance, comm)
     with raised_on_all_ranks(comm):
         pairs = possible_pairs(secondary, primary, distance)
-        segments = find_segments(kind, secondary, primary, pairs, SEEN * depth, SEEN * reach)
+        segments = find_segments(
+            kind, secondary, primary, pairs, SEARCH.seen * depth, SEARCH.seen * reach
+        )
         integrals = integrate(kind, secondary, primary, segments)
     averted = comm.allreduce(int(segments.averted))
     if averted and comm.allreduce(len(segments.weight)) == 0:

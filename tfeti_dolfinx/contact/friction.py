@@ -17,12 +17,11 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.segments import aligned
 from tfeti_dolfinx.mortar.surfaces import group_points
+from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 Value: TypeAlias = "float | Callable[[Array], ArrayLike] | fem.Function"
 
 NOT_NEGATIVE = Range("a number, 0 or more", lambda value: value >= 0.0)
-# of a direction: what is left in the tangent plane of less says nothing of where it points
-ALONG = 1e-3
 
 
 @dataclass(frozen=True)
@@ -182,7 +181,7 @@ def with_friction(
         direction = _checked_direction(name, friction.direction)
         with raised_on_all_ranks(dofs.comm):
             frame, left = aligned(records.frame, direction)
-            if np.any(left < ALONG):
+            if np.any(left < SEARCH.along):
                 x = group_points(dofs)[records.group[np.argmin(left)]]
                 raise InputError(
                     f"{name}: direction {friction.direction} is along the normal at the node "

@@ -2,42 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.contact.conditions import Shares, Side, conditions, triplets
-from tfeti_dolfinx.contact.friction import Law, checked_friction, with_friction
-from tfeti_dolfinx.contact.records import (
-    ContactRecords,
-    Gap,
-    checked_gap,
-    checked_reach,
-    gaps_of,
-    give_name,
-)
+from tfeti_dolfinx.contact.partner import ContactPartner
+from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.shapes import Shape, check_placement, check_shape, distance_and_gradient
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import (
     FacetKind,
-    Facets,
     facet_kind,
     hat_areas,
     local_facets,
     whole_facets,
 )
 from tfeti_dolfinx.mortar.integrals import GapIntegrals, dual_multipliers
-from tfeti_dolfinx.mortar.surfaces import diameter, extent, group_points, on_surface, surface_facets
-
-# times the displacement's degree: exact for ψ_i φ_k on plane facets, and enough on curved ones
-QUADRATURE = 4
+from tfeti_dolfinx.mortar.surfaces import diameter, group_points, on_surface, surface_facets
 
 
 @dataclass(frozen=True)
-class Obstacle:
+class Obstacle(ContactPartner):
     """A surface may not enter a rigid shape.
 
     Args:
@@ -61,50 +50,15 @@ class Obstacle:
 
     surface: str | int
     shape: Shape
-    _: KW_ONLY
-    gap: Gap = "geometry"
-    friction: Law | None = None
-    reach: float | None = None
-    name: str = ""
 
     def __post_init__(self) -> None:
-        give_name(self, f"obstacle of surface {self.surface!r}")
+        self._check_data(f"obstacle of surface {self.surface!r}")
         check_shape(self.shape, self.name)
-        checked_friction(self.name, self.friction)
 
     @property
     def surfaces(self) -> tuple[str | int, ...]:
         """The surface."""
         return (self.surface,)
-
-    def first_reach(self, decomposition: Decomposition) -> float:
-        """Return the reach to begin with. Collective.
-
-        Raises:
-            InputError: The surface is unknown or empty, or gap or reach do not fit.
-        """
-        checked_gap(self.name, self.gap)
-        size = extent(decomposition, surface_facets(decomposition, self.surface))
-        return checked_reach(self.name, self.reach, size)
-
-    def horizon(self, length: float) -> float:
-        """None: all nodes of the surface are looked at, whatever the reach is."""
-        return 0.0
-
-    def settled(
-        self,
-        dofs: TornDofs,
-        decomposition: Decomposition,
-        contact: int,
-        reach: float,
-        stiffness: Array,
-    ) -> tuple[Obstacle, ContactRecords]:
-        """Return the obstacle itself, which has one side, and its conditions. Collective."""
-        return self, self.records(dofs, decomposition, contact, reach, reach)
-
-    def displacement_bound(self, dofs: TornDofs, decomposition: Decomposition, u: Array) -> float:
-        """Nothing comes from beyond the reach, however large the displacement is."""
-        return 0.0
 
     def records(
         self,
@@ -134,60 +88,28 @@ class Obstacle:
         """
         facets = surface_facets(decomposition, self.surface)
         kind, surface = facet_kind(dofs), local_facets(dofs, decomposition, facets)
-        self._check_placement(surface, kind.num_vertices, dofs, decomposition)
-        self._check_side(surface, kind.num_vertices, dofs)
-        distance, normals = self._at_groups(dofs, on_surface(dofs, decomposition, facets))
-        vertices = surface.groups[:, : kind.num_vertices]
-        side = Side(surface, vertices, hat_areas(kind, surface), normals)
-        found = conditions(dofs, contact, side, _shares(dofs, kind, side, distance))
-        found = with_friction(self.name, self.friction, found, dofs)
-        gap = self.gaps(dofs, found)
-        return replace(found, gap=gap, within_reach=gap <= reach)
-
-    def with_gap(self, gap: Gap) -> Obstacle:
-        """Return the same obstacle with another ``gap=``."""
-        checked_gap(self.name, gap)
-        return replace(self, gap=gap)
-
-    def gaps(self, dofs: TornDofs, records: ContactRecords, depth: float = np.inf) -> Array:
-        """Return gaps of its conditions, as ``gap=`` or the shape has them. Collective.
-
-        Args:
-            dofs: Dof maps.
-            records: The conditions, of any ``gap=``.
-            depth: Not used: a given gap holds however deep a body lies in an obstacle.
-
-        Raises:
-            InputError: A given gap is no number at a node.
-        """
-        return gaps_of(self.name, self.gap, records, dofs)
-
-    def _at_groups(self, dofs: TornDofs, groups: Array) -> tuple[Array, Array]:
-        """Return distance and normal of these owned groups, 0 for the others. Collective."""
-        gap, normals = np.zeros(dofs.num_groups), np.zeros((dofs.num_groups, dofs.bs))
+        centres = surface.corners(kind.num_vertices).mean(axis=1)
+        if dofs.bs > 1:  # of a scalar space the gradient's first component counts
+            size = diameter(decomposition)
+            check_placement(self.shape, centres, dofs.bs, self.name, size, dofs.comm)
+        groups = on_surface(dofs, decomposition, facets)
+        distance, normals = np.zeros(dofs.num_groups), np.zeros((dofs.num_groups, dofs.bs))
         x = group_points(dofs)[groups]
         with raised_on_all_ranks(dofs.comm):
-            gap[groups], normals[groups] = self._distances(x, dofs.bs)
-        return gap, normals
-
-    def _check_placement(
-        self, surface: Facets, num_vertices: int, dofs: TornDofs, decomposition: Decomposition
-    ) -> None:
-        if dofs.bs > 1:  # of a scalar space the gradient's first component counts
-            x = surface.corners(num_vertices).mean(axis=1)
-            size = diameter(decomposition)
-            check_placement(self.shape, x, dofs.bs, self.name, size, decomposition.comm)
-
-    def _check_side(self, surface: Facets, num_vertices: int, dofs: TornDofs) -> None:
-        """Raise if no facet faces the obstacle. Collective."""
-        with raised_on_all_ranks(dofs.comm):
-            _, towards = self._distances(surface.corners(num_vertices).mean(axis=1), dofs.bs)
-        facing = int(np.sum(np.sum(towards * surface.normal, axis=1) > 0.0))
-        if dofs.bs > 1 and dofs.comm.allreduce(facing) == 0:
+            _, towards = self._distances(centres, dofs.bs)
+        facing = dofs.comm.allreduce(int(np.sum(np.sum(towards * surface.normal, axis=1) > 0.0)))
+        if dofs.bs > 1 and facing == 0:
             raise InputError(
                 f"{self.name}: the surface faces away from it; expected "
                 "a shape whose distance falls along the outward normal (is its normal turned?)"
             )
+        with raised_on_all_ranks(dofs.comm):
+            distance[groups], normals[groups] = self._distances(x, dofs.bs)
+        vertices = surface.groups[:, : kind.num_vertices]
+        side = Side(surface, vertices, hat_areas(kind, surface), normals)
+        found = conditions(dofs, contact, side, _shares(dofs, kind, side, distance))
+        # a body may lie in an obstacle as deep as it likes
+        return self._with_gaps_and_friction(dofs, found, reach, np.inf)
 
     def _distances(self, x: Array, gdim: int) -> tuple[Array, Array]:
         """Return distances and normals at points of shape ``(n, 2)`` or ``(n, 3)``."""
@@ -206,7 +128,8 @@ class Obstacle:
 def _shares(dofs: TornDofs, kind: FacetKind, side: Side, distance: Array) -> Shares:
     """Integrate over whole facets, given the distances of the owned groups. Collective."""
     surface = side.facets
-    facet, xi, weight = whole_facets(kind, surface, QUADRATURE * kind.displacement.degree)
+    # exact for ψ_i φ_k on plane facets, and enough on curved ones
+    facet, xi, weight = whole_facets(kind, surface, 4 * kind.displacement.degree)
     dual = dual_multipliers(kind, surface.area, facet, xi, weight)
     vertices = side.vertices[dual.facet]
     (at_vertices,) = dofs.lookup(vertices.ravel(), distance)

@@ -11,22 +11,13 @@ from mpi4py import MPI
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.logging import cite
 from tfeti_dolfinx.contact.conditions import Side, conditions, meeting, ratios, side_of
-from tfeti_dolfinx.contact.friction import Law, checked_friction, with_friction
-from tfeti_dolfinx.contact.records import (
-    ContactRecords,
-    Gap,
-    checked_gap,
-    checked_reach,
-    gaps_of,
-    give_name,
-)
+from tfeti_dolfinx.contact.partner import ContactPartner
+from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.surfaces import diameter, extent, surface_facets, surface_nodes
-
-# ratio of stiffness per area from which on a finer side that is secondary shows in the pressure
-MUCH_WORSE = 2.0
+from tfeti_dolfinx.mortar.surfaces import diameter, surface_facets, surface_nodes
+from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 WORSE = (
     "%s: the secondary side %r is %.3g times as stiff per area as %r, where they meet; the "
@@ -41,7 +32,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Contact:
+class Contact(ContactPartner):
     """Two surfaces may not enter each other.
 
     Surfaces should be smooth: the sides of an edge are surfaces, and pairs, of their own.
@@ -71,14 +62,9 @@ class Contact:
     b: str | int
     _: KW_ONLY
     secondary: str | int = "auto"
-    gap: Gap = "geometry"
-    friction: Law | None = None
-    reach: float | None = None
-    name: str = ""
 
     def __post_init__(self) -> None:
-        give_name(self, f"contact of {self.a!r} with {self.b!r}")
-        checked_friction(self.name, self.friction)
+        self._check_data(f"contact of {self.a!r} with {self.b!r}")
 
     @property
     def surfaces(self) -> tuple[str | int, ...]:
@@ -93,7 +79,8 @@ class Contact:
                 reach do not fit.
         """
         try:
-            facets = [surface_facets(decomposition, name) for name in self.surfaces]
+            for name in self.surfaces:
+                surface_facets(decomposition, name)
         except InputError as error:  # on all ranks
             raise InputError(f"{self.name}: {error}") from error
         if decomposition.surface(self.a) == decomposition.surface(self.b):
@@ -102,9 +89,7 @@ class Contact:
                 "not supported, give its two sides different names"
             )
         self._named_first(decomposition)
-        checked_gap(self.name, self.gap)
-        size = min(extent(decomposition, surface) for surface in facets)
-        return min(checked_reach(self.name, self.reach, size), diameter(decomposition))
+        return min(super().first_reach(decomposition), diameter(decomposition))
 
     def horizon(self, length: float) -> float:
         """Return the length of the scene: no two facets are farther apart."""
@@ -136,12 +121,12 @@ class Contact:
         found = settled._meet(sides, dofs, contact, reach, reach)
         compared = ratios(found, sides, dofs, stiffness)
         if self.secondary == "auto" and compared.second_is_better():
-            settled, sides = settled._exchanged(), (sides[1], sides[0])
+            settled, sides = replace(settled, a=settled.b, b=settled.a), sides[::-1]
             compared = compared.exchanged
             found = settled._meet(sides, dofs, contact, reach, reach)
         edges = sides[0].has_edges(dofs.comm)
         ratio = compared.stiffness
-        if compared.finer and ratio > MUCH_WORSE and dofs.comm.rank == 0:
+        if compared.finer and ratio > SEARCH.much_stiffer and dofs.comm.rank == 0:
             log.warning(WORSE, self.name, settled.a, ratio, settled.b, settled.b)
         if edges and dofs.comm.rank == 0:
             log.warning(EDGES, self.name, settled.a)
@@ -173,8 +158,8 @@ class Contact:
         dofs: TornDofs,
         decomposition: Decomposition,
         contact: int,
-        reach: float,
-        depth: float,
+        reach: float = np.inf,
+        depth: float = np.inf,
     ) -> ContactRecords:
         """One condition per node of ``a`` that faces ``b``. Collective.
 
@@ -197,12 +182,7 @@ class Contact:
         sides = self._sides(dofs, decomposition)
         return self._meet(sides, dofs, contact, reach, depth)
 
-    def with_gap(self, gap: Gap) -> Contact:
-        """Return the same contact with another ``gap=``."""
-        checked_gap(self.name, gap)
-        return replace(self, gap=gap)
-
-    def gaps(self, dofs: TornDofs, records: ContactRecords, depth: float) -> Array:
+    def gaps(self, dofs: TornDofs, records: ContactRecords, depth: float = np.inf) -> Array:
         """Return gaps of its conditions, as ``gap=`` and the geometry have them. Collective.
 
         Args:
@@ -214,9 +194,13 @@ class Contact:
             InputError: The surfaces overlap by more than ``depth`` and no gap is given, or it is
                 no number somewhere.
         """
-        found = gaps_of(self.name, self.gap, records, dofs, depth)
-        if isinstance(self.gap, str):
-            self._check_depth(found, depth, dofs.comm)
+        found = super().gaps(dofs, records, depth)
+        deepest = -dofs.comm.allreduce(float(found.min(initial=0.0)), op=MPI.MIN)
+        if isinstance(self.gap, str) and deepest > depth:
+            raise InputError(
+                f"{self.name}: the surfaces overlap by up to {deepest:.6g}, more than the reach "
+                f"{depth:.6g}; expected bodies that are apart, a larger reach, or a gap="
+            )
         return found
 
     def _sides(self, dofs: TornDofs, decomposition: Decomposition) -> tuple[Side, Side]:
@@ -234,9 +218,7 @@ class Contact:
         """Return the conditions; arguments as of ``records``. Collective."""
         shares = meeting(self.name, sides, dofs, reach, depth)
         found = conditions(dofs, contact, sides[0], shares)
-        found = with_friction(self.name, self.friction, found, dofs)
-        gap = self.gaps(dofs, found, depth)
-        return replace(found, gap=gap, within_reach=gap <= reach)
+        return self._with_gaps_and_friction(dofs, found, reach, depth)
 
     def _named_first(self, decomposition: Decomposition) -> Contact:
         """Return the contact with the side that is named as secondary as ``a``."""
@@ -249,16 +231,4 @@ class Contact:
             raise InputError(
                 f'{self.name}: secondary={self.secondary!r}, expected one of its surfaces or "auto"'
             ) from None
-        return self._exchanged() if named else self
-
-    def _exchanged(self) -> Contact:
-        return replace(self, a=self.b, b=self.a)
-
-    def _check_depth(self, gap: Array, depth: float, comm: MPI.Intracomm) -> None:
-        lowest = comm.allreduce(float(gap.min(initial=0.0)), op=MPI.MIN)
-        deepest = -lowest
-        if deepest > depth:
-            raise InputError(
-                f"{self.name}: the surfaces overlap by up to {deepest:.6g}, more than the reach "
-                f"{depth:.6g}; expected bodies that are apart, a larger reach, or a gap="
-            )
+        return replace(self, a=self.b, b=self.a) if named else self

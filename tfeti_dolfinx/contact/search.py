@@ -5,133 +5,18 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root
-from tfeti_dolfinx.common.validation import shown
-from tfeti_dolfinx.contact.friction import Law, friction_values, same_law
-from tfeti_dolfinx.contact.records import ContactRecords, Gap, concatenate, remaining_gaps
-from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.contact.friction import friction_values
+from tfeti_dolfinx.contact.partner import ContactPartner, Gap, check_together
+from tfeti_dolfinx.contact.records import ContactRecords, concatenate, remaining_gaps
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import diameter
-
-# --- Protocol of contacts, and checks of their list -------------------------------------------
-
-
-class ContactPartner(Protocol):
-    """An obstacle, or a pair of surfaces. All methods are collective."""
-
-    @property
-    def name(self) -> str:
-        """Name for messages."""
-        ...
-
-    @property
-    def surfaces(self) -> tuple[str | int, ...]:
-        """Names or tags of the surfaces, that with the multipliers first."""
-        ...
-
-    @property
-    def gap(self) -> Gap:
-        """The gaps of its conditions: those of the geometry, or given ones."""
-        ...
-
-    @property
-    def friction(self) -> Law | None:
-        """Its law of friction."""
-        ...
-
-    def first_reach(self, decomposition: Decomposition) -> float:
-        """Return the distance up to which conditions have rows at first."""
-        ...
-
-    def horizon(self, length: float) -> float:
-        """Reach beyond which no search finds more conditions, in a scene of a length."""
-        ...
-
-    def settled(
-        self,
-        dofs: TornDofs,
-        decomposition: Decomposition,
-        contact: int,
-        reach: float,
-        stiffness: Array,
-    ) -> tuple[ContactPartner, ContactRecords]:
-        """Return the contact with its sides decided from the stiffness, and its conditions."""
-        ...
-
-    def displacement_bound(self, dofs: TornDofs, decomposition: Decomposition, u: Array) -> float:
-        """Bound how much nearer what lay beyond the reach has come, u of shape (nodes, bs)."""
-        ...
-
-    def records(
-        self,
-        dofs: TornDofs,
-        decomposition: Decomposition,
-        contact: int,
-        reach: float,
-        depth: float,
-    ) -> ContactRecords:
-        """Conditions up to a distance and beyond, and down to a depth of initial overlap."""
-        ...
-
-    def with_gap(self, gap: Gap) -> ContactPartner:
-        """Return the same contact with another gap."""
-        ...
-
-    def gaps(self, dofs: TornDofs, records: ContactRecords, depth: float) -> Array:
-        """Return gaps of conditions that were made with another gap: no search, no integral."""
-        ...
-
-
-def checked_contacts(contacts: Sequence[ContactPartner]) -> list[ContactPartner]:
-    """Return the contacts as a list.
-
-    Raises:
-        InputError: They are not a sequence of obstacles and pairs.
-    """
-    if not isinstance(contacts, Sequence):
-        raise InputError(f"contacts: expected a list, got {shown(contacts)}")
-    for contact in contacts:
-        known = all(hasattr(contact, name) for name in ("records", "surfaces", "first_reach"))
-        if isinstance(contact, type) or not known:
-            raise InputError(f"contacts: expected obstacles and pairs, got {shown(contact)}")
-    return list(contacts)
-
-
-def check_pairs(contacts: Sequence[ContactPartner], decomposition: Decomposition) -> None:
-    """Raise if a pair is there twice: its force would be shared between the two."""
-    pairs = set()
-    for contact in contacts:
-        tags = frozenset(decomposition.surface(name) for name in contact.surfaces)
-        if len(tags) == 2 and tags in pairs:
-            raise InputError(f"contacts: the pair of {contact.surfaces} is there twice")
-        pairs.add(tags)
-
-
-def check_laws(contacts: Sequence[ContactPartner], decomposition: Decomposition) -> None:
-    """Raise if a surface that meets several obstacles slides on them by different laws."""
-    found: dict[int, ContactPartner] = {}
-    for contact in contacts:
-        if len(contact.surfaces) > 1 or contact.friction is None:
-            continue
-        first = found.setdefault(decomposition.surface(contact.surfaces[0]), contact)
-        if first.friction is not None and not same_law(first.friction, contact.friction):
-            raise InputError(
-                f"{contact.name}: the same surface has another law of friction in {first.name}; "
-                "expected one law for a surface, or surfaces of their own"
-            )
-
-
-# --- The contact search -----------------------------------------------------------------------
-
-# How much farther one looks for what may hold a body: few rounds, each a search and a solve, up to
-# the length of the scene; of that at least, since a small surface's reach may be as good as none.
-WIDER, LEAST = 4.0, 0.01
+from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 log = logging.getLogger(__name__)
 
@@ -169,8 +54,7 @@ class ContactSearch:
         reach = [contact.first_reach(decomposition) for contact in contacts]
         self._depths = bcast_from_root(dofs.comm, reach)
         self._reach, self._said = list(self._depths), list[str]()
-        check_pairs(contacts, decomposition)
-        check_laws(contacts, decomposition)
+        check_together(contacts, decomposition)
         settled = [
             contact.settled(dofs, decomposition, i, self._reach[i], stiffness)
             for i, contact in enumerate(contacts)
@@ -247,27 +131,20 @@ class ContactSearch:
         return sum(self._take_in(i, u, tolerance) for i in range(len(self.contacts)))
 
     def _take_in(self, i: int, u: Array, tolerance: float) -> int:
-        """Give rows to violated conditions of one contact; how many rows are new."""
-        known = found = self._records[i]
-        nodal = u.reshape(-1, self._dofs.bs)
+        """Give rows to violated conditions of one contact; return the number of new rows."""
+        known, nodal = self._records[i], u.reshape(-1, self._dofs.bs)
         bound = self.contacts[i].displacement_bound(self._dofs, self._decomposition, nodal)
         moved = bcast_from_root(self._dofs.comm, bound)
+        tried = [(known, self._reach[i])]
         if moved > self._reach[i]:
-            found = self._with_rows_of(self._search(i, moved), known)
-        overlaps, new = self._overlapping(found, u, tolerance)
-        if new == 0 and found is not known:
-            found = known
-            overlaps, new = self._overlapping(found, u, tolerance)
-        if new:
-            self._records[i] = replace(found, within_reach=found.within_reach | overlaps)
-            if found is not known:
-                self._reach[i] = moved
-        return new
-
-    def _overlapping(self, found: ContactRecords, u: Array, tolerance: float) -> tuple[Array, int]:
-        """Conditions that a displacement violates, and how many of them have no row."""
-        overlaps = remaining_gaps(found, self._dofs, u) < -tolerance
-        return overlaps, self._count(overlaps & ~found.within_reach)
+            tried.insert(0, (self._search(i, moved), moved))
+        for found, reach in tried:
+            overlaps = remaining_gaps(found, self._dofs, u) < -tolerance
+            if new := self._count(overlaps & ~found.within_reach):
+                self._records[i] = replace(found, within_reach=found.within_reach | overlaps)
+                self._reach[i] = reach
+                return new
+        return 0
 
     def widen(self) -> int:
         """Increase the reach until a condition gets a row, since far contact may hold a body.
@@ -310,21 +187,21 @@ class ContactSearch:
         """Increase the reach of one contact; return the number of new rows."""
         if self._is_exhausted(i):
             return 0
-        before, found = self._count(self._records[i].within_reach), self._records[i]
-        reach = max(WIDER * self._reach[i], LEAST * self.length)
+        found = self._records[i]
+        before = self._count(found.within_reach)
+        reach = max(SEARCH.wider * self._reach[i], SEARCH.least * self.length)
         if self._reach[i] < self.contacts[i].horizon(self.length):
-            found = self._with_rows_of(self._search(i, reach), found)
+            found = self._search(i, reach)
         self._reach[i] = reach
         self._records[i] = replace(found, within_reach=found.within_reach | (found.gap <= reach))
         return self._count(self._records[i].within_reach) - before
 
-    def _search(self, index: int, reach: float) -> ContactRecords:
-        contact = self.contacts[index]
-        return contact.records(self._dofs, self._decomposition, index, reach, self._depths[index])
-
-    def _with_rows_of(self, found: ContactRecords, known: ContactRecords) -> ContactRecords:
-        """Conditions of a wider search, within reach where they had rows before."""
-        return replace(found, within_reach=np.isin(found.group, known.group[known.within_reach]))
+    def _search(self, i: int, reach: float) -> ContactRecords:
+        """Conditions up to a larger reach, of which those have rows that had them before."""
+        dofs, known, depth = self._dofs, self._records[i], self._depths[i]
+        found = self.contacts[i].records(dofs, self._decomposition, i, reach, depth)
+        had_rows = np.isin(found.group, known.group[known.within_reach])
+        return replace(found, within_reach=had_rows)
 
     def _count(self, flags: Array) -> int:
         return int(self._dofs.comm.allreduce(int(np.sum(flags))))

@@ -20,6 +20,7 @@ from tfeti_dolfinx.common.validation import (
     shown,
 )
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 # --- Shapes of rigid obstacles: signed distances ----------------------------------------------
 
@@ -200,13 +201,6 @@ class SignedDistance:
 
 # --- Checks of a shape's callables ------------------------------------------------------------
 
-# Differences over 1e-5 of the scene: curvature and rounding are both far below what is looked for
-STEP = 1e-5
-# points of each rank, those next to the shape: a wrong gradient is wrong nearly everywhere
-SAMPLE = 16
-# More than 60 degrees, or a factor of 100: a gradient may be rounded off or of any length
-COSINE, FACTOR = 0.5, 100.0
-
 
 def check_shape(shape: Any, what: str) -> None:
     """Raise unless an object is a shape.
@@ -277,8 +271,8 @@ def check_placement(
         shape.check_dimension(gdim, what)
     with raised_on_all_ranks(comm):
         phi, gradient = distance_and_gradient(shape, x, what)
-        nearest = np.argsort(np.abs(phi))[:SAMPLE]
-        slope = _differences(shape, x[nearest], STEP * size, what)
+        nearest = np.argsort(np.abs(phi))[: SEARCH.samples]
+        slope = _differences(shape, x[nearest], SEARCH.difference * size, what)
         gradient = gradient[nearest, : x.shape[1]]
         differs, says_something = _compared(gradient, slope)
     wrong, compared = comm.allreduce(np.array([np.sum(differs), np.sum(says_something)]))
@@ -304,10 +298,13 @@ def _differences(shape: Shape, x: Array, step: float, what: str) -> Array:
 
 
 def _compared(gradient: Array, slope: Array) -> tuple[Array, Array]:
-    """Return where gradient and slope differ grossly, and where they can be compared."""
+    """Return where gradient and slope differ grossly, and where they can be compared.
+
+    By more than 60°, or a factor of 100: a gradient may be rounded off or of any length.
+    """
     sizes = np.linalg.norm(gradient, axis=1), np.linalg.norm(slope, axis=1)
     product = sizes[0] * sizes[1]
     says_something = np.isfinite(product) & (product > 0.0)
-    turned = np.sum(gradient * slope, axis=1) < COSINE * product
-    scaled = np.maximum(*sizes) > FACTOR * np.minimum(*sizes)
+    turned = np.sum(gradient * slope, axis=1) < SEARCH.same_direction * product
+    scaled = np.maximum(*sizes) > SEARCH.same_length * np.minimum(*sizes)
     return says_something & (turned | scaled), says_something

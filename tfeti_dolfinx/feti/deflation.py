@@ -36,12 +36,10 @@ class Deflation(Protocol):
 
     Attributes:
         count: Number of its motions, of all subdomains.
-        amplification: In each body the largest of max diag(K)/R̂ᵀKR̂, shape ``(b,)``.
         factors: Makes the factors of faces, and counts them.
     """
 
     count: int
-    amplification: Array
     factors: FaceFactors
 
     def balanced(self, face: Face, on_face: FaceOperator) -> FaceOperator:

@@ -25,10 +25,6 @@ from tfeti_dolfinx.mesh.untorn import cell_facets
 
 ARITY = {1: "linear", 2: "bilinear"}
 FUNCTIONS = ("test", "trial")
-# degree of the points inside a cell at which a thickness is looked at
-INSIDE = 2
-# of the largest value: less below 0 is rounding
-ROUNDING = 1e-12
 KINDS = {"cell": "dx", "exterior_facet": "ds", "interior_facet": "dS"}
 
 
@@ -68,7 +64,9 @@ def check_form(form: Any, name: str, V: fem.FunctionSpace, decomposition: Decomp
     _check_measures(form, name, decomposition)
 
 
-def check_not_negative(value: Any, what: str, mesh: dmesh.Mesh) -> None:
+def check_not_negative(
+    value: Any, what: str, mesh: dmesh.Mesh, degree: int = 2, rounding: float = 1e-12
+) -> None:
     """Raise if a scalar in UFL is negative or no number somewhere in a cell. Collective.
 
     It is asked at the corners of each cell and at points inside.
@@ -77,18 +75,20 @@ def check_not_negative(value: Any, what: str, mesh: dmesh.Mesh) -> None:
         value: The scalar, with its present constants and functions.
         what: Its name in messages.
         mesh: Its mesh.
+        degree: Of the quadrature whose points inside are taken.
+        rounding: Share of the largest value that may be missing to 0.
 
     Raises:
         InputError: It is, or it cannot be asked.
     """
     cell_type = getattr(basix.CellType, mesh.topology.cell_type.name)
-    inside, _ = basix.make_quadrature(cell_type, INSIDE)
+    inside, _ = basix.make_quadrature(cell_type, degree)
     points = np.vstack((basix.geometry(cell_type), inside))
     cells = np.arange(len(geometry_dofmap(mesh)), dtype=np.int32)
     with raised_on_all_ranks(mesh.comm), named(what):
         values = fem.Expression(value, points, jit_options=JIT_OPTIONS).eval(mesh, cells)
         values = np.asarray(values).reshape(len(cells), len(points))
-        allowed = -ROUNDING * np.abs(values).max(initial=0.0)  # 2πr on the axis
+        allowed = -rounding * np.abs(values).max(initial=0.0)  # 2πr on the axis
         wrong = ~(np.isfinite(values) & (values >= allowed))
         if np.any(wrong):
             cell, point = np.argwhere(wrong)[0]

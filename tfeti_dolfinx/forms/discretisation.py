@@ -16,10 +16,6 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mesh.untorn import NO_TAG
 
-# Of the mean square distance of a patch's cells from its node, added where a slope is fitted: a
-# patch with too few cells for a slope keeps the mean
-RIDGE = 1e-2
-
 
 class StressRecovery:
     """σ* − σ_h and ε* − ε_h, σ* and ε* recovered from the cells around each node.
@@ -132,12 +128,16 @@ class _Patches:
         return found
 
 
-def _constants(gram: Array, right: Array) -> Array:
-    """Return the constants of fits, shape ``(n, q)``, from their normal equations."""
+def _constants(gram: Array, right: Array, ridge: float = 1e-2) -> Array:
+    """Return the constants of fits, shape ``(n, q)``, from their normal equations.
+
+    A patch with too few cells for a slope keeps the mean: the ridge, of the mean square distance of
+    its cells from the node, is added where a slope is fitted.
+    """
     slopes = np.arange(1, gram.shape[1])
     spread = gram[:, slopes, slopes].mean(axis=1, keepdims=True) if slopes.size else 0.0
     gram = gram.copy()
-    gram[:, slopes, slopes] += RIDGE * spread
+    gram[:, slopes, slopes] += ridge * spread
     gram[gram[:, 0, 0] == 0.0] = np.eye(gram.shape[1])  # no cell of this kind
     return np.asarray(np.linalg.solve(gram, right)[:, 0])
 

@@ -23,9 +23,6 @@ MODELS = {2: ("plane_strain", "plane_stress", "axisymmetric"), 3: ("3d",)}
 POISSON = Range("more than -1 and less than 0.5", lambda value: -1.0 < value < 0.5)
 # in plane stress what does not change its volume is as good as anything else
 POISSON_OF_SHEETS = Range("more than -1 and at most 0.5", lambda value: -1.0 < value <= 0.5)
-# points that are this near to the axis, in terms of the largest radius, are on it: coordinates from
-# files are rounded, and u_r/r is 0/0 there
-ON_AXIS = 1e-10
 
 Number: TypeAlias = "float | fem.Constant | fem.Function | ufl.core.expr.Expr"
 Modulus: TypeAlias = "Number | Mapping[str | int, float]"
@@ -73,6 +70,10 @@ class Elasticity:
         10.000000
     """
 
+    # points that are this near to the axis, over the largest radius, are on it: coordinates from
+    # files are rounded, and u_r/r is 0/0 there
+    _near_axis = 1e-10
+
     def __init__(
         self,
         on: Decomposition | dmesh.Mesh,
@@ -95,7 +96,7 @@ class Elasticity:
         self.mu = self.E / 2 / (1 + self.nu)
         self.thickness: Any = 1.0
         if self.model == "axisymmetric":
-            self._on_axis = ON_AXIS * self._checked_radius()
+            self._on_axis = self._near_axis * self._checked_radius()
             self.thickness = 2 * math.pi * ufl.SpatialCoordinate(self.mesh)[0]
         elif thickness is not None:
             self.thickness = in_ufl(thickness, on, "thickness", POSITIVE)
@@ -192,7 +193,7 @@ class Elasticity:
         r, comm = self.mesh.geometry.x[:, 0], self.mesh.comm
         largest = comm.allreduce(float(np.abs(r).max(initial=0.0)), op=MPI.MAX)
         least = comm.allreduce(float(r.min(initial=np.inf)), op=MPI.MIN)
-        if least < -ON_AXIS * largest:
+        if least < -self._near_axis * largest:
             raise InputError(
                 f"model='axisymmetric': the mesh has points with the radius x[0] = {least:.6g}; "
                 "expected 0 or more"

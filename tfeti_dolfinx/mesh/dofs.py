@@ -16,7 +16,7 @@ from tfeti_dolfinx.common.parallel import Exchange, chunk_offsets, owner_of
 from tfeti_dolfinx.common.validation import checked_type
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
-from tfeti_dolfinx.mesh.untorn import cell_entities, mix, set_key
+from tfeti_dolfinx.mesh.untorn import cell_entities, exchange_by_key, mix, set_key
 
 # --- Function spaces on a torn mesh -----------------------------------------------------------
 
@@ -83,17 +83,6 @@ def described(V: Any) -> str:
 # --- Keys of nodes, common to all torn copies -------------------------------------------------
 
 
-def lowest_owners(comm: MPI.Intracomm, key: Array, subdomain: Array) -> Array:
-    """For each key the rank that sends it with the lowest subdomain. Collective."""
-    exchange = Exchange(comm, (key % np.uint64(comm.size)).astype(np.int64))
-    key, subdomain = exchange.send(key), exchange.send(subdomain)
-    order = np.lexsort((subdomain, key))
-    _, start, inverse = np.unique(key[order], return_index=True, return_inverse=True)
-    owner = np.empty(len(key), dtype=np.int64)
-    owner[order] = exchange.source[order][start][inverse]
-    return exchange.answer(owner)
-
-
 def node_keys(V: fem.FunctionSpace, decomposition: Decomposition) -> tuple[Array, Array]:
     """For each DOLFINx node its lowest original vertex, and a key that all copies share.
 
@@ -104,7 +93,7 @@ def node_keys(V: fem.FunctionSpace, decomposition: Decomposition) -> tuple[Array
     cell_type = mesh.topology.cell_type
     geometry = geometry_dofmap(mesh)[:, : len(cell_entities(cell_type, 0))]
     ids = decomposition.original_nodes[geometry]
-    dofs = np.asarray(V.dofmap.list)
+    dofs, x = np.asarray(V.dofmap.list), V.tabulate_dof_coordinates()
     origin = np.empty(V.dofmap.index_map.size_local, dtype=np.int64)
     key = np.empty(len(origin), dtype=np.uint64)
     for dim, entity_dofs in enumerate(V.element.basix_element.entity_dofs):
@@ -113,19 +102,16 @@ def node_keys(V: fem.FunctionSpace, decomposition: Decomposition) -> tuple[Array
                 nodes = dofs[:, j]
                 origin[nodes] = ids[:, vertices].min(axis=1)
                 key[nodes] = set_key(ids[:, vertices])
-                if len(entity) > 1:
-                    corners = mesh.geometry.x[geometry[:, vertices]]
-                    key[nodes] += _place(V, nodes, corners, ids[:, vertices])
+                if len(entity) == 1:
+                    continue
+                corners = mesh.geometry.x[geometry[:, vertices]]
+                distance = np.linalg.norm(corners - x[nodes][:, None], axis=2)
+                order = np.argsort(ids[:, vertices], axis=1)
+                distance = np.take_along_axis(distance, order, axis=1)
+                share = np.rint(1e6 * distance / distance.sum(axis=1, keepdims=True))
+                place = (share * (1 + np.arange(len(vertices)))).sum(axis=1)
+                key[nodes] += mix(place.astype(np.uint64))
     return origin, key
-
-
-def _place(V: fem.FunctionSpace, nodes: Array, corners: Array, ids: Array) -> Array:
-    """Key of a node's place within an entity: its relative distances to the sorted vertices."""
-    x = V.tabulate_dof_coordinates()[nodes]
-    distance = np.linalg.norm(corners - x[:, None], axis=2)
-    distance = np.take_along_axis(distance, np.argsort(ids, axis=1), axis=1)
-    share = np.rint(1e6 * distance / distance.sum(axis=1, keepdims=True))
-    return mix((share * (1 + np.arange(share.shape[1]))).sum(axis=1).astype(np.uint64))
 
 
 # --- Dof maps: DOLFINx, primal and group numbering --------------------------------------------
@@ -236,15 +222,7 @@ class TornDofs:
         return tuple(exchange.answer(table[asked]) for table in tables)
 
     def add_on_owners(self, groups: Array, values: Array) -> Array:
-        """Return the sum of the values that all ranks give for each owned group. Collective.
-
-        Args:
-            groups: Global groups, any of them, shape ``(k,)``.
-            values: One value (or row) for each, shape ``(k, ...)``.
-
-        Returns:
-            The sums, shape ``(g, ...)``.
-        """
+        """Add what all ranks give for each owned group, as ``reduce_on_owners``. Collective."""
         return self.reduce_on_owners(groups, values, np.add, 0)
 
     def reduce_on_owners(self, groups: Array, values: Array, op: np.ufunc, initial: Any) -> Array:
@@ -338,8 +316,17 @@ class TornDofs:
         body = decomposition.body_of_subdomain[self.node_subdomain]
         key = mix(key + mix(body))
         owner = np.full(self.num_nodes, self.comm.rank, dtype=np.int64)
-        shared = self._boundary_nodes(decomposition)
-        owner[shared] = lowest_owners(self.comm, key[shared], self.node_subdomain[shared])
+        facets = np.union1d(decomposition.tears, decomposition.boundary).astype(np.int32)
+        fdim = decomposition.mesh.topology.dim - 1
+        on_facets = fem.locate_dofs_topological(self.V, fdim, facets, remote=False)
+        shared = self.primal_nodes(on_facets)
+        meeting = exchange_by_key(self.comm, key[shared])
+        met, subdomain = meeting.send(key[shared]), meeting.send(self.node_subdomain[shared])
+        order = np.lexsort((subdomain, met))
+        _, start, inverse = np.unique(met[order], return_index=True, return_inverse=True)
+        lowest = np.empty(len(met), dtype=np.int64)
+        lowest[order] = meeting.source[order][start][inverse]
+        owner[shared] = meeting.answer(lowest)
         exchange = Exchange(self.comm, owner)
         node = exchange.send(self.offsets[self.comm.rank] + np.arange(self.num_nodes))
         subdomain = exchange.send(self.node_subdomain)
@@ -354,8 +341,3 @@ class TornDofs:
         self._to_owner, self._to_owner_slot, self._copy_order = exchange, slot, order
         self.group_offsets = chunk_offsets(self.comm, self.num_groups)
         self.group = exchange.answer(self.group_offsets[self.comm.rank] + slot)
-
-    def _boundary_nodes(self, decomposition: Decomposition) -> Array:
-        facets = np.union1d(decomposition.tears, decomposition.boundary).astype(np.int32)
-        fdim = decomposition.mesh.topology.dim - 1
-        return self.primal_nodes(fem.locate_dofs_topological(self.V, fdim, facets, remote=False))

@@ -169,16 +169,6 @@ def _original_physical_group(model: Any, dim: int, tag: int) -> int:
     return int(match[1]) if match else int(tag)
 
 
-def _physical_groups(model: Any, dim: int, entity: int) -> set[int]:
-    """Physical groups of an entity, or of the entity that gmsh partitioned it from."""
-    groups = model.getPhysicalGroupsForEntity(dim, entity)
-    if len(groups) == 0:
-        parent_dim, parent = model.getParent(dim, entity)
-        if parent_dim == dim:
-            groups = model.getPhysicalGroupsForEntity(dim, parent)
-    return {_original_physical_group(model, dim, tag) for tag in groups}
-
-
 def _elements(model: Any, dim: int) -> Elements | None:
     """All elements of a dimension that lie in physical groups; None if there are none.
 
@@ -186,7 +176,12 @@ def _elements(model: Any, dim: int) -> Elements | None:
     """
     found: list[Elements] = []
     for _, entity in model.getEntities(dim):
-        groups = _physical_groups(model, dim, entity)
+        of_entity = model.getPhysicalGroupsForEntity(dim, entity)
+        if len(of_entity) == 0:  # of a partition the entity that it was cut from may have one
+            parent_dim, parent = model.getParent(dim, entity)
+            if parent_dim == dim:
+                of_entity = model.getPhysicalGroupsForEntity(dim, parent)
+        groups = {_original_physical_group(model, dim, tag) for tag in of_entity}
         kinds, ids, nodes = model.mesh.getElements(dim, entity)
         if not groups or len(kinds) == 0:
             continue
@@ -197,7 +192,6 @@ def _elements(model: Any, dim: int) -> Elements | None:
                 "expected at most one, since a cell or facet has one tag"
             )
         parts = model.getPartitions(dim, entity)
-        partition = int(parts[0]) if len(parts) == 1 else -1
         for kind, kind_ids, kind_nodes in zip(kinds, ids, nodes, strict=True):
             n = len(kind_ids)
             found.append(
@@ -207,7 +201,7 @@ def _elements(model: Any, dim: int) -> Elements | None:
                     nodes=np.asarray(kind_nodes, dtype=np.int64).reshape(n, -1),
                     ids=np.asarray(kind_ids, dtype=np.int64),
                     tags=np.full(n, groups.copy().pop(), dtype=np.int32),
-                    partitions=np.full(n, partition, dtype=np.int64),
+                    partitions=np.full(n, parts[0] if len(parts) == 1 else -1, dtype=np.int64),
                 )
             )
     kind_names = {elements.kind: elements.kind_name for elements in found}
@@ -229,8 +223,7 @@ def _coordinates(model: Any, node_ids: Array) -> Array:
 
 # --- Names of physical groups, merged over ranks ----------------------------------------------
 
-# dimension and tag of a physical group
-PhysicalGroup = tuple[int, int]
+PhysicalGroup = tuple[int, int]  # dimension and tag
 
 
 def physical_names(

@@ -16,7 +16,7 @@ from mpi4py import MPI
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import cell_permutation, coordinate_element
 from tfeti_dolfinx.common.logging import stage
-from tfeti_dolfinx.common.parallel import Exchange, box_over_ranks
+from tfeti_dolfinx.common.parallel import box_over_ranks
 from tfeti_dolfinx.common.validation import checked_type
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -41,6 +41,7 @@ from tfeti_dolfinx.mesh.untorn import (
     UntornMesh,
     cell_dim,
     equal_pairs,
+    exchange_by_key,
     facet_keys,
     facet_vertices,
     set_key,
@@ -49,9 +50,6 @@ from tfeti_dolfinx.mesh.untorn import (
 # --- Split files of gmsh ----------------------------------------------------------------------
 
 ONE_MODEL = "expected files that gmsh has written from one model with Mesh.PartitionSplitMeshFiles"
-# distance, relative to the size of the mesh, up to which a node's places are the same: files in
-# text keep fewer digits than gmsh has
-SAME_PLACE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -64,11 +62,6 @@ class SplitFiles:
     def file(self, number: int) -> Path:
         """File of a partition, numbered from 1."""
         return self.path.with_name(f"{self.path.stem}_{number}{self.path.suffix}")
-
-    def of_rank(self, comm: MPI.Intracomm) -> list[int]:
-        """Return numbers of the files that this rank reads: contiguous, and even over the ranks."""
-        numbers = range(1, self.count + 1)
-        return [p for p in numbers if (p - 1) * comm.size // self.count == comm.rank]
 
 
 def find_split_files(source: str | PathLike[str] | Any, comm: MPI.Intracomm) -> SplitFiles | None:
@@ -110,15 +103,16 @@ def read_split_files(files: SplitFiles, comm: MPI.Intracomm) -> list[ModelConten
     """
     contents = []
     with raised_on_all_ranks(comm):
-        for number in files.of_rank(comm):
+        for number in range(1, files.count + 1):
+            if (number - 1) * comm.size // files.count != comm.rank:
+                continue
             # a partition may hold no element in a physical group: gmsh then writes no nodes
             with open_model(files.file(number), may_be_empty=True) as model:
                 content = read_content(model, files.file(number).name)
-            of_file = {d: _in_partition(e, number) for d, e in content.elements.items()}
-            contents.append(replace(content, elements=of_file))
-    known = comm.allreduce(
-        max((content.num_partitions for content in contents), default=0), op=MPI.MAX
-    )
+            for elements in content.elements.values():
+                elements.partitions[:] = number
+            contents.append(content)
+    known = comm.allreduce(max((c.num_partitions for c in contents), default=0), op=MPI.MAX)
     if known > files.count:
         raise InputError(
             f"{files.file(files.count + 1)}: no such file; expected one file for each of the "
@@ -127,12 +121,13 @@ def read_split_files(files: SplitFiles, comm: MPI.Intracomm) -> list[ModelConten
     return contents
 
 
-def _in_partition(elements: Elements, number: int) -> Elements:
-    return replace(elements, partitions=np.full(len(elements.ids), number, dtype=np.int64))
-
-
 def check_shared(
-    mesh: UntornMesh, node_ids: Array, x: Array, extent: float, comm: MPI.Intracomm
+    mesh: UntornMesh,
+    node_ids: Array,
+    x: Array,
+    extent: float,
+    comm: MPI.Intracomm,
+    same_place: float = 1e-9,
 ) -> None:
     """Check that the files are of one mesh. Collective.
 
@@ -144,18 +139,20 @@ def check_shared(
         x: Their coordinates in these files, shape ``(p, d)``.
         extent: Length of the mesh.
         comm: Communicator.
+        same_place: Distance over that length up to which a node's places are the same: files in
+            text keep fewer digits than gmsh has.
 
     Raises:
         InputError: A node lies at different places, or a cell lies in two files.
     """
-    exchange = Exchange(comm, node_ids % comm.size)
+    exchange = exchange_by_key(comm, node_ids)
     node_ids, x = exchange.send(node_ids), exchange.send(x)
     keys = set_key(mesh.cells[:, : mesh.num_vertices])
-    exchange = Exchange(comm, (keys % np.uint64(comm.size)).astype(np.int64))
+    exchange = exchange_by_key(comm, keys)
     keys, cell_ids = exchange.send(keys), exchange.send(mesh.cell_ids)
     with raised_on_all_ranks(comm):
         first, second = equal_pairs(node_ids)
-        apart = np.abs(x[first] - x[second]).max(axis=1, initial=0.0) > SAME_PLACE * extent
+        apart = np.abs(x[first] - x[second]).max(axis=1, initial=0.0) > same_place * extent
         if np.any(apart):
             i, j = first[apart][0], second[apart][0]
             raise InputError(
@@ -172,8 +169,6 @@ def check_shared(
 
 # --- Assembly of an untorn mesh from models on any ranks --------------------------------------
 
-# of the mesh's size: what rounding of coordinates leaves of a plane mesh's height
-FLAT = 1e-12
 # gmsh's element types: DOLFINx's cell type and degree
 CELLS = {
     2: ("triangle", 1),
@@ -209,7 +204,9 @@ def untorn_mesh(
     cell_type = dmesh.to_type(shape)
     gdim = cell_dim(cell_type)
     element = coordinate_element(cell_type, degree, gdim)
-    empty = _no_elements(kind, kind_name, element.dim // gdim)
+    none = np.empty(0, dtype=np.int64)
+    nodes = none.reshape(0, element.dim // gdim)
+    empty = Elements(kind, kind_name, nodes, none, none.astype(np.int32), none)
     found = concatenated([empty, *(content.elements[top] for content in with_cells)])
     cells = found.nodes[:, cell_permutation(cell_type, found.nodes.shape[1])]
     facets = [content.elements[top - 1] for content in contents if top - 1 in content.elements]
@@ -259,23 +256,11 @@ def _one_kind(contents: Sequence[ModelContent], top: int, comm: MPI.Intracomm) -
     return kind, name
 
 
-def _no_elements(kind: int, kind_name: str, num_nodes: int) -> Elements:
-    none = np.empty(0, dtype=np.int64)
-    return Elements(
-        kind=kind,
-        kind_name=kind_name,
-        nodes=none.reshape(0, num_nodes),
-        ids=none,
-        tags=none.astype(np.int32),
-        partitions=none,
-    )
-
-
 def _checked_extent(x: Array, gdim: int, comm: MPI.Intracomm) -> float:
     """Longest side of the box of all points; raises if plane cells do not lie in a plane."""
     low, high = box_over_ranks(comm, x)
     sides = high - low
-    if gdim == 2 and sides[2] > FLAT * sides.max():
+    if gdim == 2 and sides[2] > 1e-12 * sides.max():  # more than rounding
         raise InputError("plane cells that do not lie in a plane z = constant: shells are not")
     return float(sides.max())
 
@@ -285,34 +270,23 @@ def _facet_tags(
 ) -> Array:
     """Tag of each facet of each cell, shape ``(n, facets_per_cell)``. Collective.
 
-    A facet of a cell and the element that tags it meet on the rank that their key names.
+    A facet of a cell and the element that tags it meet on the rank that their key names; of several
+    elements the first counts.
     """
     keys = facet_keys(cells, cell_type)
     corners = facet_vertices(cell_type).shape[1]
     tagged = [set_key(elements.nodes[:, :corners]) for elements in facets]
     known = np.concatenate([np.empty(0, dtype=np.uint64), *tagged])
     tags = np.concatenate([np.empty(0, dtype=np.int32), *(elements.tags for elements in facets)])
-    asking = _to_named_rank(keys.ravel(), comm)
-    telling = _to_named_rank(known, comm)
-    asked = asking.send(keys.ravel())
-    answers = _looked_up(asked, telling.send(known), telling.send(tags))
-    return asking.answer(answers).reshape(keys.shape)
-
-
-def _to_named_rank(keys: Array, comm: MPI.Intracomm) -> Exchange:
-    return Exchange(comm, (keys % np.uint64(comm.size)).astype(np.int64))
-
-
-def _looked_up(keys: Array, known: Array, tags: Array) -> Array:
-    """Tag of each key, the first one if there are several, NO_TAG where it is not known."""
-    found = np.full(len(keys), NO_TAG, dtype=np.int32)
-    if len(known) == 0:
-        return found
-    known, first = np.unique(known, return_index=True)
-    position = np.minimum(np.searchsorted(known, keys), len(known) - 1)
-    hit = known[position] == keys
-    found[hit] = tags[first[position[hit]]]
-    return found
+    asking, telling = exchange_by_key(comm, keys.ravel()), exchange_by_key(comm, known)
+    asked, known, tags = asking.send(keys.ravel()), telling.send(known), telling.send(tags)
+    found = np.full(len(asked), NO_TAG, dtype=np.int32)
+    if len(known):
+        known, first = np.unique(known, return_index=True)
+        position = np.minimum(np.searchsorted(known, asked), len(known) - 1)
+        hit = known[position] == asked
+        found[hit] = tags[first[position[hit]]]
+    return asking.answer(found).reshape(keys.shape)
 
 
 # --- Meshes of gmsh: physical groups, partitions, node numbers --------------------------------
@@ -372,29 +346,20 @@ def read_gmsh(
     checked_type(comm, MPI.Intracomm, "comm", "a communicator such as MPI.COMM_WORLD")
     seconds: dict[str, float] = {}
     with stage("mesh", seconds):
-        decomposition = _read_and_tear(source, comm, subdomains)
+        files, contents = find_split_files(source, comm), list[ModelContent]()
+        if files:
+            contents = read_split_files(files, comm)
+        else:
+            with raised_on_all_ranks(comm):
+                if comm.rank == 0:
+                    with open_model(source) as model:
+                        contents.append(read_content(model, "the mesh"))
+        untorn, partitions = untorn_mesh(contents, comm, shared=files is not None)
+        if subdomains is None:
+            subdomains = default_count(untorn, comm) if partitions is None else partitions
+        # METIS needs the mesh on one rank
+        partitioner = coordinate_bisection if files else metis
+        subdomain = assign_subdomains(untorn, subdomains, comm, partitioner)
+        bisected = files is not None and isinstance(subdomains, (int, np.integer))
+        decomposition = tear(untorn, subdomain, comm, absorb=bisected)
     return replace(decomposition, seconds=seconds)
-
-
-def _read_and_tear(
-    source: Any, comm: MPI.Intracomm, subdomains: Subdomains | None
-) -> Decomposition:
-    files = find_split_files(source, comm)
-    contents = read_split_files(files, comm) if files else _read_on_rank_0(source, comm)
-    untorn, partitions = untorn_mesh(contents, comm, shared=files is not None)
-    if subdomains is None:
-        subdomains = default_count(untorn, comm) if partitions is None else partitions
-    # METIS needs the mesh on one rank
-    partitioner = coordinate_bisection if files else metis
-    subdomain = assign_subdomains(untorn, subdomains, comm, partitioner)
-    bisected = files is not None and isinstance(subdomains, (int, np.integer))
-    return tear(untorn, subdomain, comm, absorb=bisected)
-
-
-def _read_on_rank_0(source: Any, comm: MPI.Intracomm) -> list[ModelContent]:
-    contents = []
-    with raised_on_all_ranks(comm):
-        if comm.rank == 0:
-            with open_model(source) as model:
-                contents.append(read_content(model, "the mesh"))
-    return contents

@@ -11,31 +11,67 @@ from mpi4py import MPI
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from tfeti_dolfinx.common.arrays import Array, ArrayLike
-from tfeti_dolfinx.common.parallel import Exchange, box_over_ranks
+from tfeti_dolfinx.common.arrays import TINY, Array, ArrayLike
+from tfeti_dolfinx.common.parallel import box_over_ranks
 from tfeti_dolfinx.common.validation import is_whole, named, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.mesh.untorn import UntornMesh, equal_pairs, facet_keys
+from tfeti_dolfinx.mesh.untorn import UntornMesh, equal_pairs, exchange_by_key, facet_keys
+
+Subdomains = int | ArrayLike | Callable[[Array], ArrayLike]
+
+
+@dataclass(frozen=True)
+class PartitionParameters:
+    """Parameters of partitions.
+
+    Attributes:
+        unknowns: Displacement unknowns of a subdomain where nobody gives a number: its factor is
+            cheap, and kernels and interfaces are still few.
+        flat: Cells that are so many times as long as thick make cuts follow layers and columns.
+        layer_gap: Midpoints farther apart than this, over the mean extent of a part's cells, are of
+            different layers; those of the simplices of a box are a third of it apart.
+        same_place: Over that gap: midpoints nearer to each other than this are at one place.
+        layer_places: Places that a layer has at most, six with the simplices of a box.
+        moved: A cut moves by this share of a part's cells at most, to lie between layers.
+        sample: Points of each part that find the centres of round parts.
+        influence_step: Factor by which a part's influence changes in a round at most.
+        candidates: Parts that a point may join in a round, those nearest to its own.
+        fewest: Cells of a part in the mean, below which parts are not made round.
+        largest: Size over the mean, above which round parts are not taken.
+        facet: Weight of a facet over that of a vertex that a cell shares with another part.
+        flattening: Rounds in which cells change sides, until interfaces are flat.
+        gains: Size over the mean, above which a part gains no cells where interfaces are flattened.
+        loses: Size over the mean, below which it loses none.
+    """
+
+    unknowns: int = 4000
+    flat: float = 3.0
+    layer_gap: float = 0.4
+    same_place: float = 0.25
+    layer_places: int = 6
+    moved: float = 0.25
+    sample: int = 300
+    influence_step: float = 1.1
+    candidates: int = 24
+    fewest: int = 20
+    largest: float = 1.1
+    facet: float = 12.0
+    flattening: int = 10
+    gains: float = 1.08
+    loses: float = 0.93
+
+
+PARTITION = PartitionParameters()
 
 # --- Recursive coordinate bisection -----------------------------------------------------------
 
-# of the mean extent of a part's cells: midpoints that are farther apart are of different layers;
-# those of the simplices that a box is cut into are a third of it apart at most
-APART = 0.4
-# of that: midpoints that are nearer to each other count as one; so many different ones a layer has
-# at most, else there are no layers
-ONE, MOST = 0.25, 6
-# of the cells of one part, but at least one: a cut moves by so many at most to lie between layers,
-# or columns, in a part with a cell that is so many times as long as thick
-MOVED, FLAT = 0.25, 3.0
-
 
 class _Halves(NamedTuple):
-    """Data of the halving of parts, shapes ``(p,)``.
+    """Plan of a halving of all parts.
 
     Attributes:
-        wanted: Number of points on the left.
-        may: By how many points that may change.
+        wanted: Number of points on the left, shape ``(p,)``.
+        may: By how many points that may change, shape ``(p,)``.
         axes: The axes, the one that is cut across first, then those that ties are broken by, shape
             ``(p, gdim)``.
         gap: Distance of layers along these axes, shape ``(p, gdim)``; -1 in parts without flat
@@ -60,14 +96,20 @@ def bisect_points(
         x: Points of this rank, shape ``(n, gdim)``.
         num_parts: Number of parts.
         comm: Communicator.
-        extents: Of the cells whose midpoints they are, shape ``(n, gdim)``. Where some are flat
+        extents: Of the cells whose midpoints they are, shape ``(n, gdim)``. Where some are flat,
             cuts lie between layers of cells, or at least between columns along the axis in which
-            they are flat, if few cells change sides by that: ragged interfaces cut what holds most.
+            they are flat, if few cells change sides by that.
 
     Returns:
         Part of each local point, shape ``(n,)``.
     """
-    grid, sizes = _on_grid(x, extents, comm)
+    # integers on a grid, so that the parts do not depend on how ranks share the points
+    low, high = box_over_ranks(comm, x)
+    size, last = max(np.max(high - low), TINY), 2.0 ** (62 // x.shape[1]) - 1
+    grid = np.rint((x - low) / size * last).astype(np.int64)
+    sizes = None
+    if extents is not None:
+        sizes = np.rint(np.minimum(extents / size, 1.0) * last).astype(np.int64)
     part = np.zeros(len(x), dtype=np.int64)
     targets = np.array([num_parts])
     while np.any(targets > 1):
@@ -78,19 +120,8 @@ def bisect_points(
         part = first[part] + (after & (targets[part] > 1))
         targets = np.repeat(targets, halves)
         targets[first] = left
-        second = first[halves == 2] + 1
-        targets[second] -= left[halves == 2]
+        targets[first[halves == 2] + 1] -= left[halves == 2]
     return part
-
-
-def _on_grid(x: Array, extents: Array | None, comm: MPI.Intracomm) -> tuple[Array, Array | None]:
-    """Return coordinates, and extents, as integers on a grid over the box of all points."""
-    low, high = box_over_ranks(comm, x)
-    size, last = max(np.max(high - low), 1e-300), 2.0 ** (62 // x.shape[1]) - 1
-    grid = np.rint((x - low) / size * last).astype(np.int64)
-    if extents is None:
-        return grid, None
-    return grid, np.rint(np.minimum(extents / size, 1.0) * last).astype(np.int64)
 
 
 def _halves(
@@ -98,82 +129,84 @@ def _halves(
 ) -> _Halves:
     """Plan the halving of parts; targets: numbers of final parts in each, and in its left half."""
     (whole, left), gdim = targets, grid.shape[1]
-    num_parts = len(whole)
-    low = np.full((num_parts, gdim), np.iinfo(np.int64).max)
-    high = np.full((num_parts, gdim), -1)
-    np.minimum.at(low, part, grid)
-    np.maximum.at(high, part, grid)
-    comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
-    comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
-    count, gap = _count(part, num_parts, comm), None
-    axes = (np.argmax(high - low, axis=1)[:, None] + np.arange(gdim)) % gdim
+    box = np.full((2, len(whole), gdim), np.iinfo(np.int64).max)  # of x and of -x
+    np.minimum.at(box[0], part, grid)
+    np.minimum.at(box[1], part, -grid)
+    comm.Allreduce(MPI.IN_PLACE, box, op=MPI.MIN)
+    count, gap = _count(part, len(whole), comm), None
+    axes = (np.argmax(-box[1] - box[0], axis=1)[:, None] + np.arange(gdim)) % gdim
     if sizes is not None:
-        total = np.zeros((2, num_parts, gdim), dtype=np.int64)
-        np.add.at(total[0], part, sizes)
         largest = np.maximum(sizes.max(axis=1, initial=1)[:, None], 1)
+        is_flat = np.any(PARTITION.flat * sizes <= largest, axis=1)
+        total = np.zeros((2, len(whole), gdim), dtype=np.int64)
+        np.add.at(total[0], part, sizes)
         np.add.at(total[1], part, (sizes << 10) // largest)
         comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
-        flat = np.zeros(num_parts, dtype=np.int64)
-        np.maximum.at(flat, part, np.any(FLAT * sizes <= largest, axis=1))
-        comm.Allreduce(MPI.IN_PLACE, flat, op=MPI.MAX)
-        thick = np.take_along_axis(total[1], axes, axis=1)
-        if gdim == 3:
-            turned = (flat > 0) & (thick[:, 1] < thick[:, 2])
+        flat = _count(part, len(whole), comm, is_flat) > 0
+        if gdim == 3:  # of two ties the thinner axis is the last to be cut across
+            thick = np.take_along_axis(total[1], axes, axis=1)
+            turned = flat & (thick[:, 1] < thick[:, 2])
             axes[turned] = axes[turned][:, [0, 2, 1]]
         mean = np.take_along_axis(total[0], axes, axis=1) / np.maximum(count, 1)[:, None]
-        gap = np.where(flat[:, None] > 0, (APART * mean).astype(np.int64), -1)
+        gap = np.where(flat[:, None], (PARTITION.layer_gap * mean).astype(np.int64), -1)
     wanted = np.rint(count * left / whole)
     spare = np.minimum(wanted - left, (count - wanted) - (whole - left))  # a point for each part
-    may = np.minimum(np.maximum(MOVED * count / whole, 1.0), spare)
+    may = np.minimum(np.maximum(PARTITION.moved * count / whole, 1.0), spare)
     return _Halves(wanted, may, axes, gap)
 
 
 def _after(grid: Array, part: Array, halves: _Halves, comm: MPI.Intracomm) -> Array:
-    """Return whether points come after the cut of their part."""
+    """Return whether points come after the cut of their part.
+
+    A cut that goes through a layer moves to one of its ends if few points change sides by that;
+    else it is made inside the layer along the next axis, where it may lie between columns.
+    """
     num_parts, gdim = halves.axes.shape
-    digits = np.take_along_axis(grid, halves.axes[part], axis=1)
+    digits, bits = np.take_along_axis(grid, halves.axes[part], axis=1), 62 // gdim
     result, before = np.zeros(len(grid), dtype=bool), np.zeros(num_parts, dtype=np.int64)
     inside = np.arange(len(grid))  # points of layers that cuts go through
     for k in range(gdim):
-        own, c, bits = part[inside], digits[inside, k], 62 // gdim
+        own, c = part[inside], digits[inside, k]
         key = np.zeros(len(own), dtype=np.int64)
-        for others in range(k, gdim):
-            key = (key << bits) | digits[inside, others]
+        for axis in range(k, gdim):
+            key = (key << bits) | digits[inside, axis]
         kth = _kth_smallest(key, own, halves.wanted - before, comm)
         result[inside] = key > kth[own]
         if halves.gap is None or k == gdim - 1 or np.all(halves.gap < 0):
             break
         at, gap = kth >> (bits * (gdim - 1 - k)), halves.gap[:, k]
-        low, is_low = _end(c, own, at, gap, comm)
-        high, is_high = _end(-c, own, -at, gap, comm)
-        one = (ONE * gap).astype(np.int64)
-        ends = np.stack((low - one - 1, one - high))  # the largest coordinates on the left
+        low, is_low = _end_of_layer(c, own, at, gap, comm)
+        high, is_high = _end_of_layer(-c, own, -at, gap, comm)
+        same = (PARTITION.same_place * gap).astype(np.int64)
+        ends = np.stack((low - same - 1, same - high))  # the largest coordinates on the left
         left = np.stack([before + _count(own, num_parts, comm, c <= end[own]) for end in ends])
         off = np.where([is_low, is_high], np.abs(left - halves.wanted), np.inf)
         better, parts = np.argmin(off, axis=0), np.arange(num_parts)
         moves = (gap >= 0) & (off[better, parts] <= halves.may)
         result[inside] = np.where(moves[own], c > ends[better, parts][own], result[inside])
-        through = (
-            ((gap >= 0) & is_low & is_high & ~moves)[own] & (c > ends[0][own]) & (c <= ends[1][own])
-        )
-        inside, before = inside[through], left[0]
+        through = ((gap >= 0) & is_low & is_high & ~moves)[own]
+        inside = inside[through & (c > ends[0][own]) & (c <= ends[1][own])]
+        before = left[0]
     return result
 
 
-def _end(c: Array, part: Array, at: Array, gap: Array, comm: MPI.Intracomm) -> tuple[Array, Array]:
+def _end_of_layer(
+    c: Array, part: Array, at: Array, gap: Array, comm: MPI.Intracomm
+) -> tuple[Array, Array]:
     """Find the lower ends of layers around ``at``, and whether they end, both of shape ``(p,)``."""
-    end, found, one = at.copy(), np.zeros(len(at), dtype=bool), (ONE * gap).astype(np.int64)
-    near = np.abs(c - at[part]) <= (MOST + 1) * gap[part]
+    places, same = PARTITION.layer_places, (PARTITION.same_place * gap).astype(np.int64)
+    end, found = at.copy(), np.zeros(len(at), dtype=bool)
+    near = np.abs(c - at[part]) <= (places + 1) * gap[part]
     c, part = c[near], part[near]
-    for _ in range(MOST):
-        if np.all(found):
-            break
-        beyond = c < (end - one)[part]
+    for _ in range(places):
+        beyond = c < (end - same)[part]
         following = np.full(len(at), np.iinfo(np.int64).min)
         np.maximum.at(following, part[beyond], c[beyond])
         comm.Allreduce(MPI.IN_PLACE, following, op=MPI.MAX)
         found |= following < end - gap
         end = np.where(found, end, following)
+        if np.all(found):
+            break
     return end, found
 
 
@@ -198,9 +231,8 @@ def _kth_smallest(key: Array, part: Array, k: Array, comm: MPI.Intracomm) -> Arr
 # --- Facet-connected pieces of subdomains -----------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _Pieces:
-    """Pieces of this rank's subdomains.
+class _Pieces(NamedTuple):
+    """Connected pieces of this rank's subdomains.
 
     Attributes:
         of_cell: Piece of each cell.
@@ -275,7 +307,7 @@ def absorb_fragments(mesh: UntornMesh, subdomain: Array, comm: MPI.Intracomm) ->
     pieces = _pieces(mesh, subdomain)
     main = pieces.is_main[pieces.of_cell]
     keys = facet_keys(mesh.cells, mesh.cell_type)
-    exchange = Exchange(comm, (keys.ravel() % np.uint64(comm.size)).astype(np.int64))
+    exchange = exchange_by_key(comm, keys.ravel())
     owner = exchange.send(np.repeat(np.where(main, subdomain, -1), keys.shape[1]))
     first, second = equal_pairs(exchange.send(keys.ravel()))
     across = np.full(len(owner), -1)
@@ -292,18 +324,12 @@ def absorb_fragments(mesh: UntornMesh, subdomain: Array, comm: MPI.Intracomm) ->
 
 # --- Assignment of cells to subdomains --------------------------------------------------------
 
-Subdomains = int | ArrayLike | Callable[[Array], ArrayLike]
-
-# displacement unknowns: a factor of that size is cheap, and kernels and interfaces are still few
-UNKNOWNS_PER_SUBDOMAIN = 4000
-
 
 def default_count(mesh: UntornMesh, comm: MPI.Intracomm) -> int:
     """Return number of subdomains that leaves each about 4000 displacement unknowns. Collective."""
-    per_cell = 0.5 if mesh.cell_type.name == "triangle" else 1.0
-    per_cell = 0.2 if mesh.cell_type.name == "tetrahedron" else per_cell
+    per_cell = {"triangle": 0.5, "tetrahedron": 0.2}.get(mesh.cell_type.name, 1.0)
     unknowns = comm.allreduce(len(mesh.cells)) * per_cell * mesh.gdim * mesh.degree**mesh.gdim
-    return max(1, round(unknowns / UNKNOWNS_PER_SUBDOMAIN))
+    return max(1, round(unknowns / PARTITION.unknowns))
 
 
 def assign_subdomains(

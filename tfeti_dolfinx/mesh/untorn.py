@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import basix
 import numpy as np
 from dolfinx import mesh as dmesh
+from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.parallel import Exchange
 
 # --- Keys of facets and nodes -----------------------------------------------------------------
 
@@ -67,6 +69,11 @@ def equal_pairs(keys: Array) -> tuple[Array, Array]:
     order = np.argsort(keys, kind="stable")
     same = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
     return order[same], order[same + 1]
+
+
+def exchange_by_key(comm: MPI.Intracomm, keys: Array) -> Exchange:
+    """Let equal keys, or ids, of all ranks meet on the rank that they name. Collective."""
+    return Exchange(comm, (keys % keys.dtype.type(comm.size)).astype(np.int64))
 
 
 def cell_facets(mesh: dmesh.Mesh) -> Array:
@@ -151,7 +158,3 @@ class UntornMesh:
             return first, second
         same = colours[first] == colours[second]
         return first[same], second[same]
-
-    def with_cells(self, **changes: Array) -> UntornMesh:
-        """Return the same mesh with other arrays."""
-        return replace(self, **changes)  # type: ignore[arg-type]

@@ -8,9 +8,7 @@ import basix
 import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array
-
-# of the clipping facet's size: common parts below it are what rounding leaves where facets touch
-SLIVER = 1e-12
+from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,7 @@ def clip_intervals(subject: Array, clip: Array) -> tuple[Array, Array]:
     """
     low = np.maximum(subject.min(axis=1), clip.min(axis=1))
     high = np.minimum(subject.max(axis=1), clip.max(axis=1))
-    return np.stack((low, high), axis=1), high - low > SLIVER * np.ptp(clip, axis=1)
+    return np.stack((low, high), axis=1), high - low > SEARCH.sliver * np.ptp(clip, axis=1)
 
 
 def clip_polygons(subject: Array, clip: Array) -> CommonParts:
@@ -119,7 +117,7 @@ def clip_polygons(subject: Array, clip: Array) -> CommonParts:
         start, end = clip[:, side], clip[:, (side + 1) % sides]
         polygon, count = _cut(polygon, count, start, end - start)
     area = np.abs(_signed_area(polygon, count))
-    count[area <= SLIVER * whole] = 0
+    count[area <= SEARCH.sliver * whole] = 0
     return CommonParts(polygon, count, np.where(count > 0, area, 0.0))
 
 

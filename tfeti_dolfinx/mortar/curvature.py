@@ -12,14 +12,7 @@ from tfeti_dolfinx.common.parallel import Exchange, any_rank, owner_of
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import FacetKind, Facets, points
 from tfeti_dolfinx.mortar.segments import tangents
-
-# cosine of 20 degrees: facets that turn by twice that at a vertex have an edge there, others are
-# those of a smooth surface, with nine facets or more around a pin
-EDGE = 0.94
-# of a cosine: facets that turn by less are parts of a plane
-ROUNDING = 8.0 * np.finfo(float).eps
-# of the weight of one neighbour at a vertex: curvatures that are known by less are taken to be 0
-UNKNOWN = 0.05
+from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 
 def with_curvature(facets: Facets, dofs: TornDofs, kind: FacetKind) -> Facets:
@@ -39,13 +32,13 @@ def with_curvature(facets: Facets, dofs: TornDofs, kind: FacetKind) -> Facets:
     """
     normals, groups = facets.vertex_normals, facets.groups[:, : kind.num_vertices].ravel()
     cosine = np.einsum("nvg,ng->nv", normals, facets.normal)
-    turns = bool(np.any(cosine < 1.0 - ROUNDING))
+    turns = bool(np.any(cosine < 1.0 - SEARCH.turned))
     if kind.geometry.degree > 1 or not any_rank(dofs.comm, turns):
         return facets
     n, v, gdim = normals.shape
     axes = tangents(normals.reshape(-1, gdim)).reshape(n, v, gdim - 1, gdim)
     M, b = _normal_equations(facets.corners(kind.num_vertices), normals, axes)
-    sharp = (cosine <= EDGE).astype(float)
+    sharp = (cosine <= SEARCH.edge).astype(float)
     exchange = Exchange(dofs.comm, owner_of(dofs.group_offsets, groups))
     vertex, place = np.unique(exchange.send(groups), return_inverse=True)
     M, b, sharp = (
@@ -133,7 +126,7 @@ def _on_facets(facets: Facets, axes: Array, S: Array, r: Array) -> Array:
     value, vector = np.linalg.eigh(np.sum(P.swapaxes(2, 3) @ S @ P, axis=1))
     right = np.einsum("nvki,nvk->ni", P, r)
     along = np.einsum("nik,ni->nk", vector, right)
-    along = np.divide(along, value, out=np.zeros_like(along), where=value > UNKNOWN)
+    along = np.divide(along, value, out=np.zeros_like(along), where=value > SEARCH.unknown)
     K = np.einsum("nik,nk,iab->nab", vector, along, unit, optimize=True)
     return own.swapaxes(1, 2) @ K @ own
 

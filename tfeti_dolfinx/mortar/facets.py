@@ -16,6 +16,7 @@ from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mesh.untorn import cell_facets
+from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 # --- Lagrange elements on facets --------------------------------------------------------------
 
@@ -276,10 +277,6 @@ def _normals(corners: Array, inside: Array) -> tuple[Array, Array]:
 
 # --- Maps of reference facets -----------------------------------------------------------------
 
-# Newton's method from the affine map: facets that are not folded take 3 or 4 steps. It ends at
-# rounding (of the facet's size); where it stalls above that, a point may still be as good as FAR.
-MAX_STEPS, CLOSE, FAR = 20, 1e-14, 1e-8
-
 
 def points(element: FacetElement, x: Array, xi: Array) -> Array:
     """Points at reference coordinates of facets with nodes x: ``(m, nodes, d)`` to ``(m, d)``."""
@@ -311,14 +308,14 @@ def reference_points(element: FacetElement, nodes: Array, y: Array) -> Array:
     if element.is_affine or len(xi) == 0:
         return xi
     size = np.ptp(nodes, axis=1).max(axis=1)
-    for _ in range(MAX_STEPS):
+    for _ in range(SEARCH.newton_steps):
         slopes = np.einsum("tmv,mvd->mdt", element.slopes(xi), nodes[:, : element.size])
         away = y - points(element, nodes, xi)
-        if np.all(np.abs(away).max(axis=1) <= CLOSE * size):
+        if np.all(np.abs(away).max(axis=1) <= SEARCH.close * size):
             return xi
         xi = xi + _solve(slopes, away)
     left = np.abs(y - points(element, nodes, xi)).max(axis=1)
-    if np.any(~(left <= FAR * size)):
+    if np.any(~(left <= SEARCH.far * size)):
         raise InputError("a facet of a contact surface is folded, or too far from a plane one")
     return xi
 

@@ -10,9 +10,7 @@ from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.mortar.curvature import beside
 from tfeti_dolfinx.mortar.facets import FacetKind, Facets, points
 from tfeti_dolfinx.mortar.segments import FacingPoints, Segments
-
-# of a facet's area: on a sliver the hats are nearly dependent, and M_e cannot be inverted
-HARDLY_COVERED = 1e-6
+from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 
 @dataclass(frozen=True)
@@ -98,7 +96,7 @@ def dual_multipliers(
     hats = kind.hats.values(xi)
     covered = sum_rows(place, weight[:, None] * hats, len(facets))
     mass = sum_rows(place, weight[:, None, None] * hats[:, :, None] * hats[:, None], len(facets))
-    hardly = covered.sum(axis=1) <= HARDLY_COVERED * area[facets]
+    hardly = covered.sum(axis=1) <= SEARCH.hardly_covered * area[facets]
     mass[hardly] = np.eye(kind.num_vertices)
     covered[hardly] = 0.0
     dual = covered[:, :, None] * np.linalg.inv(mass)

@@ -21,14 +21,9 @@ from tfeti_dolfinx.mortar.facets import (
     points,
     reference_points,
 )
+from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 # --- Orthonormal frames of contact nodes ------------------------------------------------------
-
-# |n_x| from which on the first tangent follows the y axis, not the x axis. By the hairy ball
-# theorem no choice of tangents is continuous everywhere; here the switch is where hardly a plane
-# surface lies (26° from the x axis), far from coordinate planes, diagonals and simple slopes, so
-# that rounding of a normal does not turn its tangents.
-SWITCH = 0.9
 
 
 def frames(normal: Array) -> Array:
@@ -85,7 +80,7 @@ def tangents(normal: Array) -> Array:
         return np.empty((len(normal), 0, 1))
     if gdim == 2:
         return np.stack((-normal[:, 1], normal[:, 0]), axis=1)[:, None]
-    axis = np.eye(3)[(np.abs(normal[:, 0]) >= SWITCH).astype(np.int64)]
+    axis = np.eye(3)[(np.abs(normal[:, 0]) >= SEARCH.axis_switch).astype(np.int64)]
     first = axis - np.sum(axis * normal, axis=1, keepdims=True) * normal
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return np.stack((first, np.cross(normal, first)), axis=1)
@@ -93,10 +88,6 @@ def tangents(normal: Array) -> Array:
 
 # --- Choice among primary facets over one secondary facet -------------------------------------
 
-# of a facet's size: distances closer than this are those of facets of one layer, apart by rounding
-SAME = 1e-9
-# of a facet: common parts that exceed it by less are one layer, whose clipping has rounded
-COVERED_TWICE = 1e-6
 
 # for pairs a and b of the same secondary facet: whether b's primary facet lies over the middle of
 # a's common part, and its distance there
@@ -120,7 +111,7 @@ def truly_overlapping(s: Array, distance: Array, facing: Array, length: Array, l
     Returns:
         Flags, shape ``(n,)``.
     """
-    found, same = facing.copy(), SAME * length[s]
+    found, same = facing.copy(), SEARCH.same_layer * length[s]
     behind = distance < -same
     within, out = np.flatnonzero(facing & behind), np.flatnonzero(~facing & behind)
     a, b = pairs_over_one_facet(s, within, out)
@@ -147,10 +138,10 @@ def nearest(
     """
     found = np.ones(len(s), dtype=bool)
     covered = np.bincount(s, size, minlength=len(whole))
-    several = np.flatnonzero((covered > (1.0 + COVERED_TWICE) * whole)[s])
+    several = np.flatnonzero((covered > (1.0 + SEARCH.covered_twice) * whole)[s])
     a, b = pairs_over_one_facet(s, several, several)
     over, there = look(a, b)
-    found[a[(a != b) & over & (there < distance[a] - SAME * length[s[a]])]] = False
+    found[a[(a != b) & over & (there < distance[a] - SEARCH.same_layer * length[s[a]])]] = False
     return found
 
 
@@ -164,10 +155,6 @@ def pairs_over_one_facet(s: Array, first: Array, second: Array) -> tuple[Array, 
 
 
 # --- Search for pairs of facets ---------------------------------------------------------------
-
-# asked of a tree at first, and twice as many where that was not all: facets of one size class have
-# about 20 neighbours within their radii
-NEIGHBOURS = 64
 
 
 def rendezvous(
@@ -285,7 +272,7 @@ def _march(
 def _within(tree: cKDTree, x: Array, radius: Array) -> tuple[Array, Array]:
     """Return points of a tree within a radius of each x: row and point of each pair."""
     found: list[tuple[Array, Array]] = [(np.empty(0, dtype=np.int64),) * 2]
-    rows, k = np.arange(len(x)), min(NEIGHBOURS, tree.n)
+    rows, k = np.arange(len(x)), min(SEARCH.neighbours, tree.n)
     while len(rows):
         distance, point = tree.query(
             x[rows], k=np.arange(1, k + 1), distance_upper_bound=np.nextafter(radius.max(), np.inf)
@@ -300,17 +287,6 @@ def _within(tree: cKDTree, x: Array, radius: Array) -> tuple[Array, Array]:
 
 
 # --- Segments and their quadrature points -----------------------------------------------------
-
-# Facets whose normals make a larger angle than about 88 degrees with each other do not face: seen
-# from the side they have no common part but slivers, and rounding must not decide.
-FACING = -0.03
-# hats of quadrilaterals that are no parallelograms (by more than rounding, of their radius) are
-# rational on the plane: no degree is exact, this one leaves less than the mesh does
-PARALLEL, TWISTED = 1e-10, 12
-# on curved facets areas are no polynomials: so many degrees more than on plane ones
-CURVED = 2
-# share of a facet that rounding of the common parts may leave uncovered
-WHOLE = 1e-6
 
 
 @dataclass(frozen=True)
@@ -375,8 +351,8 @@ def find_segments(
     found = planes.meetings(*pairs)
     slack = secondary.radius[found.s] + primary.radius[found.p]
     within = (found.distance >= -depth - slack) & (found.distance <= height + slack)
-    found = found[within & (np.abs(found.cosine) > -FACING)]
-    facing, length = found.cosine < FACING, secondary.radius
+    found = found[within & (np.abs(found.cosine) > -SEARCH.facing)]
+    facing, length = found.cosine < SEARCH.facing, secondary.radius
     averted = bool(np.any(~facing))
     found = found[truly_overlapping(found.s, found.distance, facing, length, planes.look(found))]
     size = found.parts.size, planes.size
@@ -388,7 +364,7 @@ def find_segments(
         points=at,
         weight=weight * planes.slant(at),
         corners=planes.facing(found, *found.parts.corners()),
-        whole=covered >= (1.0 - WHOLE) * planes.size,
+        whole=covered >= (1.0 - SEARCH.uncovered) * planes.size,
         averted=averted,
     )
 
@@ -496,11 +472,11 @@ class _Planes:
 
 def _degree(kind: FacetKind, secondary: Facets, primary: Facets) -> int:
     """Degree of the quadrature: exact on plane intervals, triangles and parallelograms."""
-    exact = 1 + kind.displacement.degree + (CURVED if kind.geometry.degree > 1 else 0)
+    exact = 1 + kind.displacement.degree + (SEARCH.curved_degree if kind.geometry.degree > 1 else 0)
     if kind.facet != "quadrilateral":
         return exact
     for facets in (secondary, primary):
         a, b, c, d = facets.corners(4).transpose(1, 0, 2)
-        if np.any(np.linalg.norm(a - b - c + d, axis=1) > PARALLEL * facets.radius):
-            return TWISTED
+        if np.any(np.linalg.norm(a - b - c + d, axis=1) > SEARCH.parallel * facets.radius):
+            return SEARCH.rational_degree
     return 2 * exact

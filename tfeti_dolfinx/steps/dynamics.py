@@ -17,7 +17,7 @@ from tfeti_dolfinx.common.validation import checked_flag
 from tfeti_dolfinx.constraints.contact_state import Multipliers
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.constraints.rows import Constraints
-from tfeti_dolfinx.contact.search import ContactPartner
+from tfeti_dolfinx.contact.partner import ContactPartner
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import Extensions, Settings
 from tfeti_dolfinx.feti.dual import Dual

@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import block_diag, coo_array, csr_array
 
-from tfeti_dolfinx.common.arrays import TINY, Array, joined, node_means, parts_of
+from tfeti_dolfinx.common.arrays import Array, joined, node_means, parts_of
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.subdomains.block import Block, Counters, OperatorKind
 from tfeti_dolfinx.subdomains.local_operators import (
@@ -46,12 +46,10 @@ class SoftMotions:
     Attributes:
         rows: R̂ on the trace, scipy CSR, shape ``(t, k)``.
         energy: D, shape ``(k,)``.
-        amplification: max diag(K) / min D of each Block, 0 without springs.
     """
 
     rows: csr_array
     energy: Array
-    amplification: list[float]
 
 
 def _outside_motions(block: Block) -> tuple[Array, Array]:
@@ -205,11 +203,7 @@ class Subdomains:
         pairs = list(zip(self.blocks, found, strict=True))
         trace = [R[block.trace_dofs] for block, (R, _) in pairs]
         rows = csr_array(block_diag(trace)) if trace else csr_array((0, 0))
-        largest = [
-            float(block.diagonal.max() / max(D.min(), TINY)) if len(D) else 0.0
-            for block, (_, D) in pairs
-        ]
-        return SoftMotions(rows, joined([D for _, D in found]), largest)
+        return SoftMotions(rows, joined([D for _, D in found]))
 
     # ------------------------------------------------------------------- bodies
 
