@@ -43,6 +43,8 @@ def test_a_generalised_inverse(kind, cell, degree, kernel, n):
     check_block(b, sparse)
     K, pinv = sparse.toarray(), b.stiffness.solve(np.eye(sparse.shape[0]))
     largest = np.abs(pinv).max()
+    alone = b.stiffness.solve(np.eye(len(K))[:, :1])
+    assert np.allclose(alone, pinv[:, :1], rtol=0, atol=1e-12 * largest)
     assert np.allclose(K @ pinv @ K, K, rtol=0, atol=1e-10 * np.abs(K).max())
     assert np.allclose(pinv, pinv.T, rtol=0, atol=1e-11 * largest)
     assert np.linalg.eigvalsh(pinv).min() >= -1e-11 * largest

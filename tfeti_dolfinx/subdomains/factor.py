@@ -103,8 +103,10 @@ class CholeskyFactor:
     def solve(self, b: Array) -> Array:
         """A⁻¹ b, shapes ``(n,)`` or ``(n, q)``."""
         if b.ndim == 2:
-            if b.shape[1] <= 1:
-                return np.stack([self.solve(column) for column in b.T], axis=1) if b.size else b
+            if b.shape[1] == 1:  # a subclass may have a solve of its own
+                return CholeskyFactor.solve(self, b[:, 0])[:, None]
+            if b.size == 0:
+                return np.array(b)
             x = np.empty(b.shape, order="F")
             given, found = (
                 PETSc.Mat().createDense(b.shape, array=array, comm=PETSc.COMM_SELF)
