@@ -159,7 +159,9 @@ def _rounding(qp: QP, at: OperatorProduct) -> float:
     s.destroy()
     # P makes of gaps a gradient of rows that nothing closes yet: d is negative there
     counts = (phi != 0.0) | ((beta != 0.0) & (qp.d.array_r > 0.0))
-    parts = (np.where(counts, x.array_r, 0.0) for x in (qp.d, at.Fx))
+    Fx, gaps = np.abs(at.Fx.array_r), np.abs(open_gaps(qp))
+    d = np.where(gaps > 0.0, np.minimum(gaps, Fx), qp.d.array_r)
+    parts = (np.where(counts, x, 0.0) for x in (d, Fx))
     return ROUNDING * sum(norm_over(qp.d.getComm().tompi4py(), part) for part in parts)
 
 
@@ -211,9 +213,19 @@ def homogenise(
     gradient.axpy(-1.0, qp.d)
     b = gradient.copy()
     b.scale(-1.0)
+    gaps = open_gaps(qp)
+    b.array[:] -= gaps
     qp.coarse.project(b)
+    b.array[:] += gaps
     feasible = qp.feasible.shifted(np.array(at.x.array_r))
     return Homogenised(at.x.copy(), gradient, b, feasible, scale or scale_at(qp, at))
+
+
+def open_gaps(qp: QP) -> Array:
+    """The part of d on rows that are open without forces: P would spread it over all others."""
+    d = qp.d.array_r
+    phi, beta = qp.feasible.split(qp.feasible.project(np.zeros(len(d))), -d)
+    return np.where((phi == 0.0) & (beta == 0.0), d, 0.0)
 
 
 def _projected(qp: QP, x: PETSc.Vec, less: PETSc.Vec | None = None) -> float:
