@@ -16,14 +16,21 @@ def bcast_from_root(comm: MPI.Intracomm, value: T) -> T:
     """Return rank 0's value on every rank. Collective.
 
     For what steers collective calls: processors of different kinds may round differently, and
-    ranks that decide by their own floats may part ways.
+    ranks that decide by their own floats may part ways. Numbers and flags travel as a buffer; all
+    ranks pass the same type.
     """
+    if isinstance(value, bool | float | np.bool_ | np.floating):
+        number = np.array([float(value)])
+        comm.Bcast(number, root=0)
+        return type(value)(number[0])
     return comm.bcast(value, root=0)
 
 
 def any_rank(comm: MPI.Intracomm, flag: bool) -> bool:
     """Return whether a flag is set on some rank. Collective."""
-    return bool(comm.allreduce(bool(flag), op=MPI.LOR))
+    found = np.array([int(flag)])
+    comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
+    return bool(found[0])
 
 
 def summed(comm: MPI.Intracomm, values: Array) -> Array:
