@@ -28,6 +28,8 @@ from tfeti_dolfinx.qp.sets import Face, Status
 
 # of the terms of q: what its differences may be wrong by
 ROUNDING = 1e-15
+# of a gradient: a projection that is shorter may be rounding
+SHORT = 1e-6
 
 # --- Step 0: start ----------------------------------------------------------------------------
 
@@ -123,9 +125,7 @@ class _Newton:
         """Step 1: how far a gradient step, brought back to the feasible set, moves."""
         state, program = self.state, self.program
         if self.solver.norm == 0.0:
-            lam = state.z.lam
-            energy, size = program.dot((lam, state.z.g + program.qp.d.array_r), (lam, lam))
-            self.solver.saw(energy, size)
+            self._learn_norm()
         state.norm = self.solver.norm or 1.0
         if state.resume:
             state.mu = self.solver.multipliers(state.z.g)
@@ -144,6 +144,37 @@ class _Newton:
         state.idle += 1
         if state.residual <= 0.5 * state.least:
             state.least, state.idle = state.residual, 0
+
+    def vectors(self) -> tuple[PETSc.Vec, PETSc.Vec]:
+        """Return new vectors λ and s."""
+        d = self.program.qp.d
+        lam, s = d.duplicate(), d.duplicate()
+        lam.array[:], s.array[:] = self.state.z.lam, self.state.s
+        return lam, s
+
+    def examine(self, rule: StoppingRule) -> ConvergedReason:
+        """Apply the stopping rule where ‖g^P‖ is small enough."""
+        state = self.state
+        if state.residual > max(rule.tolerance, state.rounding):
+            return ConvergedReason.ITERATING
+        rule.norm = state.norm
+        lam, s = self.vectors()
+        reason = rule.examine(lam, s, self.pressed_face(), state.residual)
+        lam.destroy()
+        s.destroy()
+        return reason
+
+    def _learn_norm(self) -> None:
+        """Take Rayleigh quotients of F at λ, which alone may be far below ‖F‖, and at Ps."""
+        program, z = self.program, self.state.z
+        Ps = program.vec(z.g)
+        self.coarse.project(Ps)
+        p, g_d = np.array(Ps.array_r), z.g + program.qp.d.array_r
+        energy, size, pp, gg = program.dot((z.lam, g_d), (z.lam, z.lam), (p, p), (z.g, z.g))
+        self.solver.saw(energy, size)
+        if pp > SHORT**2 * gg:
+            (curvature,) = program.dot((p, program.F(p)))
+            self.solver.saw(curvature, pp)
 
     def pressed_face(self) -> Face:
         """Return the face of λ̂: a row that carries less than it is open by, λ_i < ᾱs_i, is open.
@@ -168,6 +199,8 @@ class _Newton:
         beta = beta - along
         phi = phi + along
         free, chopped = self.program.dot((phi, phi), (beta, beta))
+        if state.resume:  # what PCPG has left on the face, and not what ᾱ makes of μ
+            free = self.solver.left**2
         if chopped > self.parameters.gamma**2 * free:
             moved = self.feasible.project(z.lam - beta / state.norm)
             face = self.feasible.face(0.5 * (z.lam + moved), state.s)
@@ -193,7 +226,8 @@ class _Newton:
         least.
         """
         state = self.state
-        enough = self.parameters.enough * 0.5 / state.norm * state.residual**2
+        looked = np.isfinite(state.residual)
+        enough = self.parameters.enough * 0.5 / state.norm * state.residual**2 if looked else 0.0
         # on circles s and λ are both large: their product's rounding hides changes of q
         (hidden,) = self.program.dot((np.abs(state.z.lam), np.abs(state.s)))
         gain = self.gain(trial.last)
@@ -202,6 +236,8 @@ class _Newton:
         state.resume = taken
         if taken:
             self._go(trial.last, gain)
+        if not taken and not looked:
+            self.look()
         return taken or self._descend()
 
     def _descend(self) -> bool:
@@ -295,26 +331,25 @@ def newton(
         # no point of Ω balances the load; without friction that is known before
         reason = ConvergedReason.DIVERGED_STALLED
         method.look()
+    # without friction and an earlier λ the first solve is on the face of the start, as it shows ‖F‖
+    looks = start is not None or friction
     while reason == ConvergedReason.ITERATING:
-        # Step 1: optimality
-        method.look()
-        monitor(steps, "outer", program.vec(state.z.lam), state.residual, 0.0)
-        if state.residual <= max(rule.tolerance, state.rounding):
-            rule.norm = state.norm
-            lam, s = _vectors(qp, state)
-            reason = rule.examine(lam, s, method.pressed_face(), state.residual)
-            for vec in (lam, s):
-                vec.destroy()
-        if rule.drifted:
-            state.z = program.refreshed(state.z.lam)
-            state.resume = rule.drifted = False
-            continue
-        if reason == ConvergedReason.ITERATING and max(steps.outer, steps.cg) >= max_it:
-            reason = ConvergedReason.DIVERGED_ITS
-        if reason != ConvergedReason.ITERATING:
-            break
-        # Step 2: the face
-        first, face = method.wanted_face()
+        first, face = state.z, qp.feasible.face(state.z.lam, state.s)
+        if looks:
+            # Step 1: optimality
+            method.look()
+            monitor(steps, "outer", program.vec(state.z.lam), state.residual, 0.0)
+            reason = method.examine(rule)
+            if rule.drifted:
+                state.z = program.refreshed(state.z.lam)
+                state.resume = rule.drifted = False
+                continue
+            if reason == ConvergedReason.ITERATING and max(steps.outer, steps.cg) >= max_it:
+                reason = ConvergedReason.DIVERGED_ITS
+            if reason != ConvergedReason.ITERATING:
+                break
+            # Step 2: the face
+            first, face = method.wanted_face()
         # Step 3: solve on the face, drop what leaves Ω, restore Gλ = e
         trial = solver.solve(first, face, state.residual, state.resume, state.cautious)
         # Step 4: accept where q falls enough
@@ -322,8 +357,8 @@ def newton(
             reason = ConvergedReason.DIVERGED_CONTRADICTION
         elif not method.accept(trial) or state.idle >= parameters.patience:
             reason = ConvergedReason.DIVERGED_ROUNDING
-        steps.outer += 1
-    lam, s = _vectors(qp, state)
+        steps.outer, looks = steps.outer + 1, True
+    lam, s = method.vectors()
     result = QPResult(
         lam=lam,
         mu=state.mu,
@@ -341,10 +376,3 @@ def newton(
     solver.destroy()
     program.destroy()
     return result
-
-
-def _vectors(qp: QP, state: NewtonState) -> tuple[PETSc.Vec, PETSc.Vec]:
-    """Return new vectors λ and s. Collective."""
-    lam, s = qp.d.duplicate(), qp.d.duplicate()
-    lam.array[:], s.array[:] = state.z.lam, state.s
-    return lam, s

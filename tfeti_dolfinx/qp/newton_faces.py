@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from mpi4py import MPI
@@ -164,6 +165,7 @@ class FaceSolver:
         monitor: Called after each.
 
     Attributes:
+        left: ‖P_f(Fλ − d)‖ where PCPG has stopped.
         excluding: Local rows that exclude each other, if a solve has found that; else None.
     """
 
@@ -184,7 +186,7 @@ class FaceSolver:
         self._point = Point(self._qp.d.duplicate(), self._qp.d.duplicate())
         self._face: Face | None = None
         self._on_face, self._preconditioner = self._qp, None
-        self.excluding: Array | None = None
+        self.left, self.excluding = np.inf, cast(Array | None, None)
 
     @property
     def norm(self) -> float:
@@ -365,6 +367,8 @@ class FaceSolver:
         target = share * min(float(z_residual.norm()), optimality)
         rule = TargetRule(max(target, self._parameters.final * self._rule.aim))
         reason = pcpg(on_face, self._point, rule, self._steps, self._max_it, self._monitor, own)
+        (square,) = self._program.dot((own.r.array_r, own.r.array_r))
+        self.left = float(np.sqrt(square))
         lam, g = np.array(self._point.lam.array_r), np.array(self._point.g.array_r)
         if isinstance(on_face.F, CurvedHessian):
             g -= on_face.F.bend(lam - z.lam)
