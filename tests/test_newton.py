@@ -258,5 +258,3 @@ def test_a_plateau_is_left_where_q_does_not_fall_either(force, reason):
     result = solve_by_pcpg(qp, homogenise(qp), ResidualRule(1e-9))
     assert result.reason.name == reason
     assert (result.steps.cg <= 1001) == (force > 1.0)
-
-

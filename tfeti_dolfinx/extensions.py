@@ -220,6 +220,7 @@ class Settings:
                 preconditioner=self.preconditioner(pc_type),
                 options_prefix=self.prefix,
                 feasible=feasible,
+                without=self.options.without,
             )
         if isinstance(self.options.recycle, int) and self.options.recycle:
             dual.recycled = Recycled(self.options.recycle, dofs.comm)

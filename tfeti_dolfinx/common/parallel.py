@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import numpy as np
 from mpi4py import MPI
@@ -22,7 +22,7 @@ def bcast_from_root(comm: MPI.Intracomm, value: T) -> T:
     if isinstance(value, bool | float | np.bool_ | np.floating):
         number = np.array([float(value)])
         comm.Bcast(number, root=0)
-        return type(value)(number[0])
+        return cast(T, type(value)(number[0]))
     return comm.bcast(value, root=0)
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 from mpi4py import MPI
+from petsc4py import PETSc
 from scipy.sparse import coo_array, csr_array, eye_array
 from scipy.sparse.csgraph import connected_components
 
@@ -234,9 +235,11 @@ def metis(mesh: UntornMesh, num_parts: int, comm: MPI.Intracomm) -> Array:
             part[cells] = start + _metis_of(graph[cells][:, cells], int(shares[b]))
             start += int(shares[b])
         del graph
-        made_round = flatten_interfaces(
-            mesh, (first, second), _made_round(mesh, part, body, shares)
-        )
+        made_round = part
+        if "round_parts" not in PETSc.Options("tfeti_").getString("without", "").split(","):
+            made_round = flatten_interfaces(
+                mesh, (first, second), _made_round(mesh, part, body, shares)
+            )
     made_round = absorb_fragments(mesh, made_round, comm)
     with raised_on_all_ranks(comm):
         cuts = [

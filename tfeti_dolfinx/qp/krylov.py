@@ -142,6 +142,7 @@ class Directions:
 
     Args:
         like: A vector of the right layout.
+        keeps: Whether all directions are kept that memory lasts for, or the last one.
 
     Attributes:
         r: Residual −P g.
@@ -152,10 +153,10 @@ class Directions:
         helped: Largest rᵀz/rᵀr so far.
     """
 
-    def __init__(self, like: PETSc.Vec) -> None:
+    def __init__(self, like: PETSc.Vec, keeps: bool = True) -> None:
         self.r, self.p, self.Fp, self.z = (like.duplicate() for _ in range(4))
         self.fresh, self.norm, self.helped = True, 0.0, 0.0
-        self.kept = Conjugates(like)
+        self.kept = Conjugates(like, NUMBERS if keeps else 0)
 
     def seen(self, pFp: float, pp: float, short: bool = False) -> bool:
         """Update the estimate of ‖F‖; return whether pᵀFp is positive beyond rounding.
@@ -268,7 +269,7 @@ def pcpg(
     Returns:
         Why it stopped.
     """
-    own = Directions(point.lam) if directions is None else directions
+    own = Directions(point.lam, qp.keeps) if directions is None else directions
     r, p, Fp, z, past = own.r, own.p, own.Fp, own.z, qp.recycled
     norm, reason = _begun(qp, point, own), ConvergedReason.ITERATING
     least = bcast_from_root(qp.d.getComm().tompi4py(), SHORT**2 * point.lam.dot(point.lam))

@@ -232,7 +232,7 @@ class _Newton:
         (hidden,) = self.program.dot((np.abs(state.z.lam), np.abs(state.s)))
         gain = self.gain(trial.last)
         taken = trial.feasible and gain >= enough - ROUNDING * hidden
-        state.cautious = not taken and trial.rounds > 1
+        state.cautious = self.parameters.cautious and not taken and trial.rounds > 1
         state.resume = taken
         if taken:
             self._go(trial.last, gain)

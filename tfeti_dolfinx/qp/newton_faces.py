@@ -26,7 +26,7 @@ from tfeti_dolfinx.qp.problem import (
     TargetRule,
 )
 from tfeti_dolfinx.qp.projection import WithinFace, project_onto_feasible, project_within_face
-from tfeti_dolfinx.qp.sets import Face, Status, without_slip
+from tfeti_dolfinx.qp.sets import Face, without_slip
 
 # of a way, beyond its first bound: what blocks it is out there, what goes inwards is off its bound
 ONWARDS = 1e-12
@@ -181,11 +181,11 @@ class FaceSolver:
         self._program, self._qp, self._rule = program, program.qp, rule
         self._parameters, self._steps, self._max_it = parameters, steps, max_it
         self._monitor = monitor
-        self._directions = Directions(self._qp.d)
+        self._directions = Directions(self._qp.d, self._qp.keeps)
         self._directions.norm = self._qp.seen
         self._point = Point(self._qp.d.duplicate(), self._qp.d.duplicate())
         self._face: Face | None = None
-        self._on_face, self._preconditioner = self._qp, None
+        self._on_face, self._preconditioner = self._qp, cast(FaceOperator | None, None)
         self.left, self.excluding = np.inf, cast(Array | None, None)
 
     @property

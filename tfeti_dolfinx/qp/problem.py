@@ -56,6 +56,7 @@ class QP:
             the face in the layout of all rows; or None.
         seen: Largest Rayleigh quotient of F that earlier solves have seen; 0 if there were none.
         recycled: Directions of earlier solves, which those of PCPG are made F-orthogonal to.
+        keeps: Whether a direction of PCPG is made conjugate to all before it, not the last alone.
     """
 
     F: Operator
@@ -67,6 +68,7 @@ class QP:
     preconditioner_on: Callable[[Face], FaceOperator] | None = None
     seen: float = 0.0
     recycled: RecycledOnFace | None = None
+    keeps: bool = True
 
 
 @dataclass(frozen=True)

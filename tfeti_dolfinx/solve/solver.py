@@ -82,6 +82,7 @@ def refine_iteratively(
     """
     comm, first = dual.coarse.comm, (result, rule)
     enough = bcast_from_root(comm, rule.ratio() * rule.rtol <= NO_DIGITS)
+    enough = enough and "refinement" not in told.options.without
     if result.reason != ConvergedReason.DIVERGED_ROUNDING or not enough:
         return first
     found = _in_rounds(dual, told, first, rule.u)
