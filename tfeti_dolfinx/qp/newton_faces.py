@@ -30,6 +30,8 @@ from tfeti_dolfinx.qp.sets import Face, without_slip
 
 # of a way, beyond its first bound: what blocks it is out there, what goes inwards is off its bound
 ONWARDS = 1e-12
+# of the way to the first bound, where hardly any curvature ends it: more rows than one are to leave
+BEYOND = 10.0
 # of d: rows that want gaps so far apart exclude each other, less may be rounding; of the largest
 # force of such a direction: rows with less have no part in it; and how far it is followed
 APART, TAKES_PART, FAR = 1e-8, 1e-3, 1e30
@@ -220,21 +222,19 @@ class FaceSolver:
             # PCPG on the face
             end, broken = self._pcpg(z, optimality, stays)
             rounds, stays = rounds + 1, False
-            on = feasible.project(end.lam)
-            assert self._face is not None
-            out = self._program.any(without_slip(self._face, on - end.lam) != 0.0)
-            if broken and not out:
-                self.excluding = self._exclusion()
+            if broken and not self._has_left(end):
+                end = self._along_null_space(end)
+            out = self._has_left(end)
             if not out or rounds == self._parameters.most_rounds or self._ended:
                 break
             # rows that have left Ω leave the face, and Gλ = e is restored in the smaller one
-            loose = not self._curved and self._is_loose(z, end)
-            if loose or (cautious and not self._curved):
-                z = self._up_to_bound(z, end)
-                z = self._program.refreshed(z.lam) if loose else z
+            if not self._curved and cautious:
+                z = self._up_to_bound(z, end, 1.0)
                 self._enter(feasible.face(z.lam, z.g))
                 continue
-            smaller = self._restored(on, end.g)
+            if not broken and not self._curved and self._is_loose(z, end):
+                end = self._up_to_bound(z, end, BEYOND)
+            smaller = self._restored(feasible.project(end.lam), end.g)
             if smaller is None:
                 break
             z = smaller
@@ -307,18 +307,62 @@ class FaceSolver:
         curvature, size = self._program.dot((way, end.g - z.g), (way, way))
         return curvature <= self._parameters.loose * self.norm * size
 
-    def _up_to_bound(self, z: Multipliers, end: Multipliers) -> Multipliers:
-        """Return where the segment from z leaves Ω: what blocks it is at its bound there.
+    def _has_left(self, z: Multipliers) -> bool:
+        """Return whether rows that do not slip are outside of Ω."""
+        assert self._face is not None
+        apart = self._qp.feasible.project(z.lam) - z.lam
+        return self._program.any(without_slip(self._face, apart) != 0.0)
 
-        q is lower there, too, Gλ = e is kept, and F multiplied by nothing.
+    def _to_a_bound(self, lam: Array, way: Array) -> float:
+        """Return the largest t with λ + t·way ∈ Ω, maybe infinite; rounding ends no way."""
+        assert self._face is not None
+        held, small = without_slip(self._face, way), self._parameters.rounding
+        held = np.where(np.abs(held) > small * largest(self._program.comm, way), held, 0.0)
+        own = self._qp.feasible.max_step(lam, -held)
+        return float(self._program.comm.allreduce(max(own, 0.0), op=MPI.MIN))
+
+    def _up_to_bound(self, z: Multipliers, end: Multipliers, times: float) -> Multipliers:
+        """Return where the segment from z leaves Ω, or so many times as far, in Ω.
+
+        What blocks it is at its bound there. Once as far q is lower, Gλ = e is kept, and F
+        multiplied by nothing.
         """
-        way = end.lam - z.lam
-        way[np.abs(way) <= self._parameters.rounding * largest(self._program.comm, way)] = 0.0
-        own = self._qp.feasible.max_step(z.lam, -way)
-        length = float(self._program.comm.allreduce(max(own, 0.0), op=MPI.MIN))
+        length = self._to_a_bound(z.lam, end.lam - z.lam)
         # what has just come into the face, at its bound as yet, stays in it if it goes inwards
-        part = z.towards(end, min(length + ONWARDS, 1.0))
+        part = z.towards(end, min(times * length + ONWARDS, 1.0))
         return Multipliers(self._qp.feasible.project(part.lam), part.g)
+
+    def _along_null_space(self, z: Multipliers) -> Multipliers:
+        """Go beyond a bound along a direction without curvature, where PCPG has found one.
+
+        Rows depend on each other. Where no bound ends the way, neither F nor G sees it and q falls
+        along it, they want gaps that exclude each other: ``excluding`` says so. Multiplies by F
+        once or twice.
+        """
+        program, own, qp = self._program, self._directions, self._qp
+        for vec in (own.p, own.r):
+            way = np.array(vec.array_r)
+            size = largest(program.comm, way)
+            Fw = program.F(way)
+            curvature, square = program.dot((way, Fw), (way, way))
+            if size == 0.0 or own.seen(curvature, square):
+                continue
+            length = self._to_a_bound(z.lam, way)
+            if np.isfinite(length):
+                return Multipliers(z.lam + BEYOND * length * way, z.g + BEYOND * length * Fw)
+            # in the cone of recession of Ω
+            p = qp.feasible.project(FAR / size * way) * (size / FAR)
+            Pp = program.vec(p)
+            qp.coarse.project(Pp)
+            Qp, d = p - Pp.array_r, qp.d.array_r
+            Fp = program.F(p)
+            FF, QQ, pp, pd, dd = program.dot((Fp, Fp), (Qp, Qp), (p, p), (p, d), (d, d))
+            unseen = max(FF / max(self.norm, TINY) ** 2, QQ) <= self._parameters.rounding**2 * pp
+            if pp > 0.0 and unseen and pd > APART * np.sqrt(dd * pp):
+                most = largest(program.comm, p)
+                self.excluding = np.flatnonzero(np.abs(p) > TAKES_PART * most)
+            break
+        return z
 
     def _onto_boundary(self, z: Multipliers) -> tuple[Multipliers, bool]:
         """Retract z to Gz = e with slipping points on their boundaries; one multiplication by F.
@@ -330,28 +374,6 @@ class FaceSolver:
         within = WithinFace(self._qp.feasible, self._face, slipping=True)
         lam, held = self._program.projected(z, within)
         return self._program.moved(z, lam), held
-
-    def _exclusion(self) -> Array | None:
-        """Return the rows of a direction of recession along which q falls for ever, or None.
-
-        Neither F nor G sees it then: rows that depend on each other want gaps that exclude each
-        other. Multiplies by F once or twice.
-        """
-        program, small, qp = self._program, self._parameters.rounding, self._qp
-        for vec in (self._directions.p, self._directions.r):
-            size = largest(program.comm, vec.array_r)
-            if size == 0.0:
-                continue
-            p = qp.feasible.project(FAR / size * vec.array_r) * (size / FAR)
-            Fp, d = program.F(p), qp.d.array_r
-            Qp = program.vec(p)
-            qp.coarse.project(Qp)
-            seen = p - Qp.array_r
-            pp, FF, QQ, pd, dd = program.dot((p, p), (Fp, Fp), (seen, seen), (p, d), (d, d))
-            unseen = max(FF / max(self.norm, TINY) ** 2, QQ) <= small**2 * pp
-            if pp > 0.0 and unseen and pd > APART * np.sqrt(dd * pp):
-                return np.flatnonzero(np.abs(p) > TAKES_PART * largest(program.comm, p))
-        return None
 
     def _pcpg(self, z: Multipliers, optimality: float, resume: bool) -> tuple[Multipliers, bool]:
         """Run PCPG on the face entered; return its end, and whether rounding has ended it."""
