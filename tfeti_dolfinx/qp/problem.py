@@ -29,13 +29,6 @@ class Operator(Protocol):
 class FaceOperator(Operator, Protocol):
     """An operator that belongs to a face."""
 
-    def dependent(self, x: Array) -> Array | None:
-        """Return the part of x, on this rank's rows of the face, that F makes 0 since rows depend.
-
-        None where rows cannot depend on each other. Collective.
-        """
-        ...
-
     def destroy(self) -> None:
         """Free what it holds. Collective."""
         ...
