@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks import (
+    ablation,
     hertz_convergence,
     kplus_forms,
     linear_price,
@@ -45,6 +46,18 @@ def test_talk_tables(shared_tmp, comm):
         assert row["kernel"] == row["kernel, talk"]
         assert 0 < row["F, Newton"] < row["F, SMALSE"]
         assert ("sticking" in row) == title.startswith("Tresca")
+
+
+def test_ablation(serial_only, tmp_path):
+    """A column for each mechanism, a row for each scene, and the page of the documents."""
+    page, given = tmp_path / "page.md", ["--mechanisms", "smooth_displacements", "kept_directions"]
+    tables = ablation.main(["--quick", "--output", str(tmp_path), "--page", str(page), *given])
+    assert len(tables["Multiplications"]) == len(tables["Change of u"]) == 2
+    for row in tables["Multiplications"]:
+        assert float(row["kept_directions"]) == pytest.approx(1.0, abs=0.1)
+    assert max(float(row["smooth_displacements"]) for row in tables["Multiplications"]) > 1.1
+    assert all(float(row["kept_directions"]) < 1e-4 for row in tables["Change of u"])
+    assert "smooth_displacements" in page.read_text()
 
 
 def test_kplus_forms(shared_tmp, comm):

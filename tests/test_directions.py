@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse
-from tfeti_dolfinx.qp.krylov import Conjugates, Directions, pcpg
+from tfeti_dolfinx.qp.krylov import Directions, pcpg
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, Steps, TargetRule
+from tfeti_dolfinx.qp.recycling import DirectionStore
 from tfeti_dolfinx.qp.sets import Product
 
 n = 60
@@ -46,9 +46,7 @@ def test_hardly_more_steps_than_dimensions(spread, times):
     assert steps <= times * n
     error = found - known
     assert error @ F @ error <= 1e-10 * (known @ F @ known)
-    short = Directions(qp.d)
-    short.kept = Conjugates(qp.d, numbers=3 * n)
-    _, more, _ = solved(qp, short, 1e-9, 5000)
+    _, more, _ = solved(qp, Directions(qp.d, keeps=False), 1e-9, 5000)
     assert more >= (steps if spread < 1e6 else 4 * steps)
 
 
@@ -57,25 +55,17 @@ def test_directions_are_conjugate():
     directions = Directions(qp.d)
     _, steps, _ = solved(qp, directions, 0.0, 40)
     kept = directions.kept
-    assert kept.number == steps == 40
-    P = kept._p[:40] / np.sqrt(kept._pFp[:40, None])
+    assert kept.count == steps == 40
+    P = kept.directions
     assert np.abs(P @ F @ P.T - np.eye(40)).max() <= 1e-6
     kept.clear()
-    assert kept.number == 0
-    assert kept.products(np.ones(n)).shape == (0,)
+    assert kept.images.shape == (0, n)
 
 
 def test_where_memory_does_not_last_the_oldest_goes():
-    """Of three that fit two stay when a fourth comes; each is taken away on its own."""
-    comm = MPI.COMM_WORLD
-    like = PETSc.Vec().createMPI((4, None), comm=comm)
-    kept = Conjugates(like, numbers=2 * 3 * 4)
+    kept = DirectionStore(3, 2)
     for k in range(4):
-        p = np.zeros(4)
-        p[k] = 1.0
-        kept.keep(p, 2.0 * p, 2.0 * comm.size)
-    assert kept.number == 3
-    z = np.arange(1.0, 5.0)
-    kept.take_away(z, comm.allreduce(kept.products(z)))
-    assert z == pytest.approx([1.0, 0.0, 0.0, 0.0])
-    like.destroy()
+        kept.put(np.full(2, k), np.full(2, -k))
+    assert kept.count == 3
+    assert sorted(kept.directions[:, 0]) == [1, 2, 3]
+    assert np.array_equal(kept.images, -kept.directions)

@@ -11,8 +11,7 @@ from test_qp import matrix, vector
 from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
 from tfeti_dolfinx.qp.homogenised import homogenise, operator_product
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
-from tfeti_dolfinx.qp.newton_faces import brought_back, brought_into
-from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, ResidualRule, Start, no_monitor
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, ResidualRule, Start, no_monitor
 from tfeti_dolfinx.qp.projection import (
     UNBALANCED,
     WithinFace,
@@ -181,19 +180,6 @@ def test_small_discs_balance_beside_large_forces(scale):
         assert np.linalg.norm(G @ (found.lam.array - balanced)) <= 1e-12 * 1e8
 
 
-def test_where_a_circle_cannot_balance_its_disc_does():
-    """A disc of radius 1 that slips, and has to carry 0.2."""
-    qp = QP(
-        matrix(np.eye(2)), vector(np.ones(2)), DenseCoarse(np.eye(2), [0.2, 0.0]), Discs(np.ones(1))
-    )
-    on = np.array([0.8, 0.6])
-    face, z = qp.feasible.face(on, -on), Point(vector(on), vector(on - 1.0))
-    assert not brought_back(qp, face, z)
-    assert brought_into(qp, face, z)
-    assert np.allclose(z.lam.array, [0.2, 0.0], atol=1e-12)
-    assert np.allclose(z.g.array, [-0.8, -1.0], atol=1e-12)
-
-
 def test_what_nothing_in_the_set_balances_is_said():
     """Two discs of radius 1 cannot carry 3."""
     qp = QP(
@@ -203,25 +189,6 @@ def test_what_nothing_in_the_set_balances_is_said():
         Discs(np.ones(2)),
     )
     assert solved(qp, 1e-9).reason == ConvergedReason.DIVERGED_STALLED
-
-
-@pytest.mark.parametrize("small", [1e-4, 1e-8, 1e-12])
-@pytest.mark.parametrize("seed", range(4))
-def test_what_slips_far_on_small_circles_costs_no_steps(seed, small):
-    """κ = |s|/ψ is all that F + κ shows then; where a force points, its slip alone decides."""
-    F, d, radius = around_circles(seed)
-    n, rng = len(d), np.random.default_rng(seed)
-    free = rng.standard_normal((6, n + 6))
-    F = np.block([[F, np.zeros((n, 6))], [np.zeros((6, n)), np.eye(6)]]) + free.T @ free / n
-    d = np.concatenate((d, rng.standard_normal(6)))
-    set_of_all = Product([(np.arange(n), Discs(small * radius))])
-    qp = QP(matrix(F), vector(d), NoCoarse(), set_of_all)
-    result = solved(qp, 1e-9 * np.linalg.norm(d))
-    assert result.reason == ConvergedReason.CONVERGED_RTOL
-    assert result.steps.cg <= 25
-    s = (F @ result.lam.array - d)[:n].reshape(-1, 2)
-    along = np.sum(result.lam.array[:n].reshape(-1, 2) * s, axis=1)
-    assert np.allclose(along, -small * radius * np.linalg.norm(s, axis=1), rtol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -284,6 +284,7 @@ class Settings:
                 options_prefix=self.prefix,
                 feasible=feasible,
                 deflation=self.extensions.deflation or SoftModes,
+                without=self.options.without,
             )
         if isinstance(self.options.recycle, int) and self.options.recycle:
             dual.recycled = Recycled(self.options.recycle, dofs.comm)

@@ -7,7 +7,7 @@ import math
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -37,6 +37,23 @@ from tfeti_dolfinx.subdomains.local_operators import LOCAL_TYPES
 
 # what ``auto`` asks of displacements, whatever the mesh is
 LOOSEST = 1e-2
+
+# mechanisms that are on by default, by the names that -tfeti_without takes
+MECHANISMS = {
+    "d_scaling": "rows of B weighted by the diagonal of K, not by the number of copies",
+    "smooth_displacements": "displacements with given jumps made smooth in the preconditioner",
+    "soft_springs": "motions that springs hold softly as a coarse space of the preconditioner",
+    "kept_directions": "directions of PCPG conjugate to all before, not to the last one alone",
+    "recycled_directions": "directions of earlier solves",
+    "cautious": "rows leave a face one by one after a step of block Newton that has raised q",
+    "newton_on_coulomb": "Newton's method on Coulomb's law, before bounds as a fixed point",
+}
+# those that an option of their own switches off
+SWITCHES: dict[str, dict[str, Any]] = {
+    "d_scaling": {"scaling": "multiplicity"},
+    "recycled_directions": {"recycle": 0},
+    "newton_on_coulomb": {"friction_type": "fixed_point"},
+}
 
 
 @dataclass(frozen=True)
@@ -136,6 +153,12 @@ class Options:
     )
     newton: NewtonParameters = NewtonParameters()
     smalse: SmalseParameters = SmalseParameters()
+    without: tuple[str, ...] = described(
+        (),
+        "all",
+        "switch off named mechanisms, to measure what each is worth; names apart by commas",
+        choices=tuple(MECHANISMS),
+    )
     error_if_not_converged: bool = described(
         True, "all", "raise ConvergenceError where a solver stops before its tolerance"
     )
@@ -162,6 +185,7 @@ def options_table() -> str:
         known = (*about.choices, *(("a number", *about.words) if about.words else ()))
         values = " (" + ", ".join(known) + ")" if known else ""
         shown = str(default).lower() if isinstance(default, bool) else f"{default}"
+        shown = shown if default != () else "none"
         lines.append(
             f"| `-tfeti_{option.name}` | {about.algorithm} | {shown} | {about.text}{values} |"
         )
@@ -213,7 +237,11 @@ def parse_options(
             raise InputError(f"unknown option -{prefix}{name}; {_expected(name, known, prefix)}")
     _check_factors_read(named, prefix)
     values = {n: _converted(known[n], v, prefix) for n, v in named.items() if n in known}
+    for name in values.get("without", ()):
+        values |= SWITCHES.get(name, {})
     options: Options = made(Options, values)
+    if "cautious" in options.without:
+        options = replace(options, newton=replace(options.newton, cautious=False))
     return options
 
 
@@ -323,7 +351,10 @@ def _converted(option: Parameter, value: Any, prefix: str) -> Any:
             f"{what} {shown(value)}: expected a value of type {kind.__name__}{words}"
         ) from None
     choices, fits = option.description.choices, option.description.fits
-    if choices and result not in choices:
+    unknown = [name for name in result if name not in choices] if kind is tuple else []
+    if unknown:
+        raise InputError(f"{what} {', '.join(unknown)}: expected some of {', '.join(choices)}")
+    if choices and kind is not tuple and result not in choices:
         raise InputError(f"{what} {result}: expected one of {', '.join(choices)}")
     if kind in (int, float) and not (math.isfinite(result) and fits.holds(result)):
         raise InputError(f"{what} {result}: expected {fits.text}")
@@ -362,9 +393,15 @@ def _as_text(value: Any) -> str:
     return value
 
 
+def _as_names(value: Any) -> tuple[str, ...]:
+    parts = value.split(",") if isinstance(value, str) else value
+    return tuple(dict.fromkeys(_as_text(part).strip() for part in parts if part))
+
+
 CONVERSIONS: dict[type, Callable[[Any], Any]] = {
     bool: _as_bool,
     float: _as_float,
     int: _as_int,
     str: _as_text,
+    tuple: _as_names,
 }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import numpy as np
 from mpi4py import MPI
@@ -16,8 +16,13 @@ def bcast_from_root(comm: MPI.Intracomm, value: T) -> T:
     """Return rank 0's value on every rank. Collective.
 
     For what steers collective calls: processors of different kinds may round differently, and
-    ranks that decide by their own floats may part ways.
+    ranks that decide by their own floats may part ways. Numbers and flags travel as a buffer; all
+    ranks pass the same type.
     """
+    if isinstance(value, bool | float | np.bool_ | np.floating):
+        number = np.array([float(value)])
+        comm.Bcast(number, root=0)
+        return cast(T, type(value)(number[0]))
     return comm.bcast(value, root=0)
 
 
@@ -30,7 +35,9 @@ def steering(comm: MPI.Intracomm, *values: float) -> Array:
 
 def any_rank(comm: MPI.Intracomm, flag: bool) -> bool:
     """Return whether a flag is set on some rank. Collective."""
-    return bool(comm.allreduce(bool(flag), op=MPI.LOR))
+    found = np.array([int(flag)])
+    comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
+    return bool(found[0])
 
 
 def summed(comm: MPI.Intracomm, values: Array) -> Array:

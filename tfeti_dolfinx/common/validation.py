@@ -215,11 +215,11 @@ class Parameter:
 
 
 def parameters_of(kind: type, path: tuple[str, ...] = ()) -> Iterator[Parameter]:
-    """All parameters of a dataclass, those of dataclasses in it included, in their order."""
+    """All described parameters of a dataclass, those of dataclasses in it included, in order."""
     for f in fields(kind):
         if is_dataclass(f.default):
             yield from parameters_of(type(f.default), (*path, f.name))
-        else:
+        elif "is" in f.metadata:
             about = _description(f)
             yield Parameter(about.name or f.name, f.default, about, (*path, f.name))
 
@@ -230,7 +230,7 @@ def made(kind: type, values: dict[str, Any]) -> Any:
     for f in fields(kind):
         if is_dataclass(f.default):
             given[f.name] = made(type(f.default), values)
-        elif (name := _description(f).name or f.name) in values:
+        elif "is" in f.metadata and (name := _description(f).name or f.name) in values:
             given[f.name] = values[name]
     return kind(**given)
 

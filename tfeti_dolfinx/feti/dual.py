@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
 from mpi4py import MPI
@@ -130,6 +130,7 @@ class Dual:
         preconditioner: Makes a preconditioner from B D⁻¹ and the subdomains, or None.
         options_prefix: Prefix of all PETSc options.
         feasible: Makes the set of multipliers from B and c; default ``contact_set``.
+        without: Mechanisms that are switched off (``options.MECHANISMS``).
 
     Attributes:
         F: B K⁺ Bᵀ.
@@ -161,7 +162,9 @@ class Dual:
         options_prefix: str = "tfeti_",
         feasible: FeasibleLaw = contact_set,
         deflation: MakeDeflation = SoftModes,
+        without: Collection[str] = (),
     ) -> None:
+        self.keeps_directions = "kept_directions" not in without
         self.constraints, self.subdomains = constraints, subdomains
         self._given = constraints
         self.pressures: Array = np.full(len(constraints.sets.tangents), np.nan)
@@ -176,7 +179,12 @@ class Dual:
         self._scaled: ScaledRows | None = None
         if preconditioner is not None:
             self._scaled = ScaledRows(B, constraints.weights)
-            self.preconditioner = preconditioner(self._scaled, subdomains)
+            plain = preconditioner is dirichlet_preconditioner and "smooth_displacements" in without
+            self.preconditioner = (
+                DualOperator(self._scaled, subdomains.local_operator("schur"))
+                if plain
+                else preconditioner(self._scaled, subdomains)
+            )
         self._lifting: LocalOperator | None = None
         if self.preconditioner is not None and preconditioner is dirichlet_preconditioner:
             self._lifting = self.preconditioner.local
@@ -186,7 +194,7 @@ class Dual:
         prefix = f"{options_prefix}coarse_"
         self.coarse = CoarseSpace(B, subdomains, normals, tangents, prefix)
         self.soft: Deflation | None = None
-        if self.preconditioner is not None:
+        if self.preconditioner is not None and "soft_springs" not in without:
             self.soft = deflation(B, self.coarse, constraints.weights, self.preconditioner, prefix)
         self.contact_rows = constraints.sets.contact_rows(comm)
         self._law, self.feasible = feasible, feasible(constraints)
@@ -273,7 +281,8 @@ class Dual:
         norm = self._norm_of(coarse, norm_steps) if norm_steps else 1.0
         on = self._preconditioner_on if self.preconditioner is not None else None
         W = None if self.recycled is None else RecycledOnFace(self.recycled)
-        return QP(self.F, self.d, coarse, self.feasible, self._on_all_rows, norm, on, self.seen, W)
+        M, keeps = self._on_all_rows, self.keeps_directions
+        return QP(self.F, self.d, coarse, self.feasible, M, norm, on, self.seen, W, keeps)
 
     def saw(self, norm: float) -> None:
         """Store the estimate of ‖F‖ of a solve, for the next one to begin with.
@@ -286,7 +295,8 @@ class Dual:
     def _on_all_rows(self) -> Operator | None:
         """Return the preconditioner on all rows, made once."""
         smooths = self.preconditioner is not None and self.preconditioner.metric is not None
-        if self.soft is None or not (self.soft.count or (smooths and not any(self.contact_rows))):
+        count = 0 if self.soft is None else self.soft.count
+        if not (count or (smooths and not any(self.contact_rows))):
             return self.preconditioner
         if self._on_all is None:
             rows = self.constraints.num_rows
@@ -297,13 +307,13 @@ class Dual:
     def _preconditioner_on(self, face: Face) -> FaceOperator:
         """Return the preconditioner on a face; parts that all faces share are made once."""
         assert self.preconditioner is not None
-        assert self.soft is not None
         if self._on_faces is None:
             diagonal = self.subdomains.diagonal
             self._on_faces = FacePreconditioner(
                 self.preconditioner, self.constraints, diagonal, self._prefix
             )
-        return self.soft.balanced(face, self._on_faces.on_face(face))
+        made = self._on_faces.on_face(face)
+        return made if self.soft is None else self.soft.balanced(face, made)
 
     def _norm_of(self, coarse: Coarse, steps: int) -> float:
         if self._norm is None or self._norm[0] != steps:

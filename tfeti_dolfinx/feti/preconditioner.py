@@ -358,18 +358,6 @@ class _OnFace:
             scaled.destroy()
         y.array[:] = self._scaled(y.array_r)
 
-    def dependent(self, x: Array) -> Array | None:
-        """Return the part of x in the null space of W_κ, and so of B_fᵀ. Collective.
-
-        (1 + W/ε)⁻², ε the shift, leaves (ε/σ)² of what has the eigenvalue σ.
-        """
-        if self._factor is None:
-            return None
-        values = self._Z_C.T @ x
-        for _ in range(2):
-            values = SHIFT * self._factor.solve(values)
-        return np.asarray(self._Z_C @ values)
-
     def _scaled(self, x: Array) -> Array:
         """W_κ⁻¹x on the rows of the face."""
         values = self._face.restricted(x)

@@ -66,10 +66,6 @@ class Balanced:
         rest.destroy()
         y.array[:] -= part.directions(part.moved(y.array_r) - part.energy * c)
 
-    def dependent(self, x: Array) -> Array | None:
-        """Return the dependent part of x that M_f finds, or None."""
-        return self._on_face.dependent(x)
-
     def destroy(self) -> None:
         """Free both. Collective."""
         self._part.destroy()

@@ -21,6 +21,7 @@ from tfeti_dolfinx.qp.problem import (
     StoppingRule,
     no_monitor,
 )
+from tfeti_dolfinx.qp.recycling import DirectionStore
 from tfeti_dolfinx.qp.sets import Face
 
 # --- Estimate of ‖PFP‖ ------------------------------------------------------------------------
@@ -86,76 +87,31 @@ FLAT = 1e-13
 NUMBERS = 24_000_000
 
 
-class Conjugates:
-    """Directions p_i with PFp_i and p_iᵀFp_i, the last ones where memory lasts not for all.
-
-    In exact arithmetic a new direction is conjugate to all if it is to the last one. Where F is ill
-    conditioned on a face rounding undoes that, and what was solved for has to be solved for again
-    (Farhat, Crivelli, Roux, Comput. Methods Appl. Mech. Engrg. 117, 1994, for FETI).
-
-    Args:
-        like: A vector of the right layout. The constructor is collective.
-        numbers: How many a rank keeps at most.
-    """
-
-    def __init__(self, like: PETSc.Vec, numbers: int = NUMBERS) -> None:
-        self.comm = like.getComm().tompi4py()
-        rows = self.comm.allreduce(like.getLocalSize(), op=MPI.MAX)
-        self._most = max(numbers // (2 * max(rows, 1)), 1)
-        self._p, self._PFp = (np.zeros((0, like.getLocalSize())) for _ in range(2))
-        self._pFp: Array = np.zeros(0)
-        self._count = 0
-
-    def clear(self) -> None:
-        """Drop all directions."""
-        self._count = 0
-
-    @property
-    def number(self) -> int:
-        """Number of directions kept."""
-        return min(self._count, self._most)
-
-    def products(self, z: Array) -> Array:
-        """Return this rank's part of PFp_i·z, shape ``(k,)``."""
-        return np.asarray(self._PFp[: self.number] @ z)
-
-    def take_away(self, z: Array, products: Array) -> None:
-        """Make z conjugate to them, in place; given the sums of products over all ranks."""
-        z -= (products / self._pFp[: self.number]) @ self._p[: self.number]
-
-    def keep(self, p: Array, PFp: Array, pFp: float) -> None:
-        """Store another direction, in the place of the oldest if there are too many."""
-        at = self._count % self._most
-        if at == len(self._pFp):
-            more = min(max(len(self._pFp), 8), self._most - len(self._pFp))
-            self._p, self._PFp = (
-                np.concatenate((known, np.zeros((more, known.shape[1]))))
-                for known in (self._p, self._PFp)
-            )
-            self._pFp = np.append(self._pFp, np.zeros(more))
-        self._p[at], self._PFp[at], self._pFp[at] = p, PFp, pFp
-        self._count += 1
-
-
 class Directions:
     """State of PCPG between calls, from which it continues where it stopped.
 
     Args:
         like: A vector of the right layout.
+        keeps: Whether all directions are kept that memory lasts for, or the last one.
 
     Attributes:
         r: Residual −P g.
         p: The last direction.
         fresh: Whether the next direction is the first.
-        kept: Directions that the next one is made conjugate to.
+        kept: Directions, and what PF makes of them, that the next one is made conjugate to: all
+            that memory lasts for. In exact arithmetic it is conjugate to all if it is to the last
+            one; rounding undoes that where F is ill conditioned on a face (Farhat, Crivelli, Roux,
+            Comput. Methods Appl. Mech. Engrg. 117, 1994, for FETI).
         norm: Largest Rayleigh quotient of F that a direction has shown; at most ‖PFP‖.
         helped: Largest rᵀz/rᵀr so far.
     """
 
-    def __init__(self, like: PETSc.Vec) -> None:
+    def __init__(self, like: PETSc.Vec, keeps: bool = True) -> None:
         self.r, self.p, self.Fp, self.z = (like.duplicate() for _ in range(4))
         self.fresh, self.norm, self.helped = True, 0.0, 0.0
-        self.kept = Conjugates(like)
+        rows = like.getComm().tompi4py().allreduce(like.getLocalSize(), op=MPI.MAX)
+        most = max(NUMBERS // (2 * max(rows, 1)), 1) if keeps else 1
+        self.kept = DirectionStore(most, like.getLocalSize())
 
     def seen(self, pFp: float, pp: float, short: bool = False) -> bool:
         """Update the estimate of ‖F‖; return whether pᵀFp is positive beyond rounding.
@@ -268,7 +224,7 @@ def pcpg(
     Returns:
         Why it stopped.
     """
-    own = Directions(point.lam) if directions is None else directions
+    own = Directions(point.lam, qp.keeps) if directions is None else directions
     r, p, Fp, z, past = own.r, own.p, own.Fp, own.z, qp.recycled
     norm, reason = _begun(qp, point, own), ConvergedReason.ITERATING
     least = bcast_from_root(qp.d.getComm().tompi4py(), SHORT**2 * point.lam.dot(point.lam))
@@ -289,7 +245,7 @@ def pcpg(
             own.kept.clear()
         rz, products = _precondition(qp, r, z, own.kept, norm)
         # direction
-        own.kept.take_away(z.array, products)
+        z.array[:] -= products @ own.kept.directions
         z.copy(p)
         if past is not None:
             past.conjugate(p)
@@ -307,7 +263,7 @@ def pcpg(
                 reason = ConvergedReason.DIVERGED_INDEFINITE_MAT
             break
         point.move(rp / pFp, p, Fp)
-        own.kept.keep(p.array_r, PFp, pFp)
+        own.kept.put(p.array_r / np.sqrt(pFp), PFp / np.sqrt(pFp))
         if past is not None:
             past.remember(p, Fp, pFp)
         z.copy(r)
@@ -461,12 +417,12 @@ def _square(x: PETSc.Vec, *known: float) -> Array:
 
 
 def _precondition(
-    qp: QP, r: PETSc.Vec, z: PETSc.Vec, kept: Conjugates, norm: float
+    qp: QP, r: PETSc.Vec, z: PETSc.Vec, kept: DirectionStore, norm: float
 ) -> tuple[float, Array]:
     """z = P M r, M the preconditioner or the identity; rᵀz, given ‖r‖, and PFp_i·z."""
     if qp.preconditioner is None:
         r.copy(z)
-        return norm**2, summed(r.getComm().tompi4py(), kept.products(z.array_r))
+        return norm**2, summed(r.getComm().tompi4py(), kept.images @ z.array_r)
     qp.preconditioner.mult(r, z)
-    rz, _, products = qp.coarse.project_against(z, r, kept.products(z.array_r))
+    rz, _, products = qp.coarse.project_against(z, r, kept.images @ z.array_r)
     return rz, products

@@ -10,7 +10,19 @@ from tfeti_dolfinx.qp.mprgp import EXPANSIONS, Expansion, MprgpParameters
 
 @dataclass(frozen=True)
 class NewtonParameters:
-    """Parameters of block Newton; each says itself what it is."""
+    """Parameters of block Newton; options say themselves what they are.
+
+    Attributes:
+        enough: Share of (ᾱ/2)‖g^P‖², which the gradient step promises, that a step lowers q by.
+        final: Of the rule's tolerance: what no solve goes below, as ‖g^P‖ is not quite ‖P_f g‖.
+        stage: What a solve on a face that stays reduces its residual to, before step 1 looks at it.
+        loose: Of ‖F‖: curvature of a way; less is nearly none, and the way far.
+        cautious: Whether rows leave a flat face one by one after a step that has raised q.
+        most_rounds: Solves on smaller and smaller faces of one step; each drops one row at least.
+        patience: Steps in a row that neither halve ‖g^P‖ nor lower q beyond its rounding.
+        lost: Of ‖F‖‖λ‖: what rounding of λ − ᾱs leaves of ‖g^P‖.
+        rounding: Of the largest entry of a way: less is none.
+    """
 
     gamma: float = described(
         1.0,
@@ -27,6 +39,15 @@ class NewtonParameters:
         name="newton_reduction",
         fits=Range("between 0 and 1", lambda value: 0.0 < value < 1.0),
     )
+    enough: float = 0.1
+    final: float = 0.9
+    stage: float = 0.1
+    loose: float = 1e-8
+    cautious: bool = True
+    most_rounds: int = 60
+    patience: int = 10
+    lost: float = 2e-15
+    rounding: float = 1e-10
 
 
 @dataclass(frozen=True)

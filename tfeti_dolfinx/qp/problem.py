@@ -29,13 +29,6 @@ class Operator(Protocol):
 class FaceOperator(Operator, Protocol):
     """An operator that belongs to a face."""
 
-    def dependent(self, x: Array) -> Array | None:
-        """Return the part of x, on this rank's rows of the face, that F makes 0 since rows depend.
-
-        None where rows cannot depend on each other. Collective.
-        """
-        ...
-
     def destroy(self) -> None:
         """Free what it holds. Collective."""
         ...
@@ -56,6 +49,7 @@ class QP:
             the face in the layout of all rows; or None.
         seen: Largest Rayleigh quotient of F that earlier solves have seen; 0 if there were none.
         recycled: Directions of earlier solves, which those of PCPG are made F-orthogonal to.
+        keeps: Whether a direction of PCPG is made conjugate to all before it, not the last alone.
     """
 
     F: Operator
@@ -67,6 +61,7 @@ class QP:
     preconditioner_on: Callable[[Face], FaceOperator] | None = None
     seen: float = 0.0
     recycled: RecycledOnFace | None = None
+    keeps: bool = True
 
 
 @dataclass(frozen=True)

@@ -22,32 +22,66 @@ WRONG = 1e-9
 HELD = 1e-10
 
 
-class Recycled:
-    """F-orthonormal search directions W of earlier solves, and their images FW.
-
-    Farhat, Crivelli, Roux, Comput. Methods Appl. Mech. Engrg. 117 (1994) 195–209: solves with
-    other right sides begin with the best of what is known, and go F-orthogonally to it. Where W is
-    full, the oldest direction goes.
+class DirectionStore:
+    """Directions p of energy pᵀFp = 1 and their images, as rows; this rank's part.
 
     Args:
-        capacity: Most directions; each takes two vectors, and two more while it is new.
-        comm: Communicator.
+        capacity: Most directions; where they are more the oldest goes.
+        size: Rows of this rank.
 
     Attributes:
         count: Number of directions.
     """
 
-    def __init__(self, capacity: int, comm: MPI.Intracomm) -> None:
-        self.capacity, self.comm = capacity, comm
-        self.W: Array = np.zeros((0, 0))
-        self.FW: Array = np.zeros((0, 0))
-        self._squares: Array = np.zeros(capacity)  # of the lengths of W's columns
+    def __init__(self, capacity: int, size: int) -> None:
+        self.capacity, self.count, self._next = capacity, 0, 0
+        self._rows: Array = np.zeros((2, 0, size))
+
+    @property
+    def directions(self) -> Array:
+        """Directions, in no order, shape ``(count, m)``."""
+        return np.asarray(self._rows[0, : self.count])
+
+    @property
+    def images(self) -> Array:
+        """Their images, likewise."""
+        return np.asarray(self._rows[1, : self.count])
+
+    def put(self, p: Array, image: Array) -> None:
+        """Store another direction."""
+        room = self._rows.shape[1]
+        if self._next == room:
+            more = min(max(room, 8), self.capacity - room)
+            more_rows = np.zeros((2, more, self._rows.shape[2]))
+            self._rows = np.concatenate((self._rows, more_rows), axis=1)
+        self._rows[0, self._next], self._rows[1, self._next] = p, image
+        self.count = max(self.count, self._next + 1)
+        self._next = (self._next + 1) % self.capacity
+
+    def clear(self) -> None:
+        """Drop all directions."""
         self.count = self._next = 0
+
+
+class Recycled(DirectionStore):
+    """F-orthonormal search directions W of earlier solves, and their images FW.
+
+    Farhat, Crivelli, Roux, Comput. Methods Appl. Mech. Engrg. 117 (1994) 195–209: solves with
+    other right sides begin with the best of what is known, and go F-orthogonally to it.
+
+    Args:
+        capacity: Most directions; each takes two vectors, and two more while it is new.
+        comm: Communicator.
+    """
+
+    def __init__(self, capacity: int, comm: MPI.Intracomm) -> None:
+        super().__init__(capacity, 0)
+        self.comm = comm
 
     @property
     def columns(self) -> tuple[Array, Array]:
         """This rank's part of W and FW, in no order, shapes ``(m, count)``."""
-        return self.W[:, : self.count], self.FW[:, : self.count]
+        return self.directions.T, self.images.T
 
     def add(self, x: Array, Fx: Array, energy: float) -> None:
         """Store a direction, made F-orthonormal to those stored. Collective, three reductions.
@@ -60,24 +94,24 @@ class Recycled:
             energy: xᵀFx > 0, over all ranks.
         """
         x, Fx = x / np.sqrt(energy), Fx / np.sqrt(energy)
-        if self.W.shape[1] == 0:
-            self._make_room(len(x))
+        self._set_size(len(x))
         for passed in range(2):
-            W, FW = self.columns
-            a, same = summed(self.comm, np.array([FW.T @ x, W.T @ Fx]))
+            W, FW = self.directions, self.images
+            a, same = summed(self.comm, np.array([FW @ x, W @ Fx]))
             if passed == 0 and bcast_from_root(self.comm, bool(np.any(np.abs(a - same) > WRONG))):
-                self.count = self._next = 0
+                self.clear()
                 continue
             if self.count == self.capacity:
                 a[self._next] = 0.0  # it goes
-            x, Fx = x - W @ a, Fx - FW @ a
-        energy, square = summed(self.comm, np.array([x @ Fx, x @ x]))
-        if not bcast_from_root(self.comm, energy >= NEW):
-            return
-        self.W[:, self._next], self.FW[:, self._next] = x / np.sqrt(energy), Fx / np.sqrt(energy)
-        self._squares[self._next] = square / energy
-        self.count = max(self.count, self._next + 1)
-        self._next = (self._next + 1) % self.capacity
+            x, Fx = x - a @ W, Fx - a @ FW
+        energy = float(summed(self.comm, np.array([x @ Fx]))[0])
+        if bcast_from_root(self.comm, energy >= NEW):
+            self.put(x / np.sqrt(energy), Fx / np.sqrt(energy))
+
+    def _set_size(self, size: int) -> None:
+        """Make room for vectors of so many rows, if there is none."""
+        if not self.count and self._rows.shape[2] != size:
+            self._rows = np.zeros((2, 0, size))
 
     def in_order(self) -> Array:
         """Return this rank's part of W and FW, shape ``(2, m, count)``, the oldest direction first.
@@ -85,25 +119,16 @@ class Recycled:
         So they lie from then on: who takes them adds what it adds in the same order.
         """
         if self.count == self.capacity:
-            order = np.roll(np.arange(self.count), -self._next)
-            self.W, self.FW = (np.asfortranarray(X[:, order]) for X in (self.W, self.FW))
-            self._squares, self._next = self._squares[order], 0
-        return np.array(self.columns)
+            self._rows, self._next = np.roll(self._rows, -self._next, axis=1), 0
+        return np.array(self._rows[:, : self.count].transpose(0, 2, 1))
 
     def take(self, kept: Array) -> None:
-        """Restore another run's directions, the newest ones if they are too many. Collective."""
+        """Restore another run's directions, the newest ones if they are too many."""
         newest = kept[:, :, max(kept.shape[2] - self.capacity, 0) :]
-        if newest.shape[2] == 0:
-            return
-        self.count = newest.shape[2]
-        self._make_room(newest.shape[1])
-        self.W[:, : self.count], self.FW[:, : self.count] = newest
-        self._next = self.count % self.capacity
-        self._squares[: self.count] = summed(self.comm, np.sum(newest[0] ** 2, axis=0))
-
-    def _make_room(self, rows: int) -> None:
-        """W and FW for so many local rows."""
-        self.W, self.FW = (np.zeros((rows, self.capacity), order="F") for _ in range(2))
+        self.clear()
+        self._set_size(newest.shape[1])
+        for w, Fw in zip(newest[0].T, newest[1].T, strict=True):
+            self.put(w, Fw)
 
     def within(self, held: Array | None) -> Array | None:
         """Return orthonormal N so that W N is 0 on rows, shape ``(count, k)``. Collective.
@@ -111,7 +136,7 @@ class Recycled:
         Args:
             held: Flags of the local rows; None: no rows, and then N is None, too.
         """
-        return None if held is None else self.without(self.W[held, : self.count])
+        return None if held is None else self.without(self.columns[0][held])
 
     def without(self, values: Array) -> Array:
         """Orthonormal N so that values N = 0, for values of W's columns, shape ``(count, k)``.
@@ -122,7 +147,8 @@ class Recycled:
             values: Linear in the columns of W, this rank's part, shape ``(l, count)``.
         """
         _, sizes, Vt = np.linalg.svd(triangle(self.comm, values))
-        longest = float(np.sqrt(self._squares[: self.count].max(initial=0.0)))
+        squares = summed(self.comm, np.sum(self.directions**2, axis=1))
+        longest = float(np.sqrt(bcast_from_root(self.comm, float(squares.max(initial=0.0)))))
         return np.asarray(Vt[int(np.sum(sizes > HELD * longest)) :].T)
 
 

@@ -1,0 +1,170 @@
+"""Worth of each mechanism: what user scenes cost, and answer, without it.
+
+A mechanism stays in the core only if at least two scenes need a tenth more multiplications without
+it, or fail.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import runpy
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import petsc4py
+
+petsc4py.init(sys.argv)
+
+from petsc4py import PETSc
+
+from benchmarks.tools import ROOT, Tables, command_line, markdown, write_tables
+from tfeti_dolfinx import ContactProblem
+from tfeti_dolfinx.options import MECHANISMS
+
+# name, demo and its arguments
+SCENES = {
+    "Hertz 2D": "hertz_2d",
+    "cylinder on block": "cylinder_on_block_2d",
+    "semicoercive": "semicoercive_2d",
+    "talk's Hertz": "talk_hertz_2d --quick",
+    "Tresca 2D": "tresca_2d",
+    "belt": "belt_2d",
+    "four bodies": "four_bodies_2d",
+    "Cattaneo": "cattaneo_mindlin_2d",
+    "unloading": "unloading_2d",
+    "clamps": "clamped_connection_3d",
+    "Tresca 3D": "tresca_3d --subdomains 64",
+    "stacked blocks": "stacked_blocks_3d",
+    "cube": "cube_3d --subdomains 64",
+    "no contact": "linear_3d",
+    "moduli 1 : 1000": "linear_3d --ratio 1000",
+    "sphere": "sphere_on_block_3d --quick",
+    "Mindlin": "mindlin_3d --quick",
+    "ball bearing": "ball_bearing_3d --quick",
+    "Hertz 3D": "hertz_3d --quick",
+    "bars": "impact_of_bars --quick",
+    "falling balls": "falling_balls_3d --quick",
+}
+QUICK = ("semicoercive", "talk's Hertz")
+PAGE = ROOT / "docs" / "developers" / "ablation.md"
+# what may change by rounding, of u; and what costs too much, of the multiplications
+SAME, DEARER = 1e-4, 1.1
+
+
+@dataclass
+class Counts:
+    """Totals over all solves of a scene."""
+
+    F: int = 0
+    S: int = 0
+    u: float = 0.0
+    reasons: Counter[str] = field(default_factory=Counter)
+
+
+@contextlib.contextmanager
+def counted() -> Iterator[Counts]:
+    """Count the multiplications of all solves within."""
+    counts, solve = Counts(), ContactProblem.solve
+
+    def solve_and_count(problem: ContactProblem, *given: Any, **named: Any) -> Any:
+        try:
+            return solve(problem, *given, **named)
+        finally:
+            report = problem.report
+            counts.F += report.F_multiplications
+            counts.S += report.preconditioner_multiplications
+            counts.reasons[report.converged_reason] += 1
+            counts.u = float(problem.u.x.petsc_vec.norm())
+
+    ContactProblem.solve = solve_and_count
+    try:
+        yield counts
+    finally:
+        ContactProblem.solve = solve
+
+
+def run(demo: str, without: str) -> Counts:
+    """Run a demo without a mechanism; what it raises stands among the reasons."""
+    name, *words = demo.split()
+    options, argv = PETSc.Options(), sys.argv
+    options.setValue("-tfeti_without", without)
+    sys.argv = [str(ROOT / "demos" / f"{name}.py"), *words]
+    try:
+        with counted() as counts, contextlib.redirect_stdout(io.StringIO()):
+            try:
+                runpy.run_path(sys.argv[0], run_name="__main__")
+            except SystemExit:
+                pass
+            except Exception as error:
+                counts.reasons[type(error).__name__] += 1
+    finally:
+        options.delValue("-tfeti_without")
+        sys.argv = argv
+    return counts
+
+
+def compared(counts: Counts, whole: Counts) -> tuple[str, str]:
+    """Return the multiplications over those with all mechanisms, or what has failed; and |du|."""
+    ratio = f"{(counts.F + counts.S) / max(whole.F + whole.S, 1):.2f}"
+    failed = counts.reasons - whole.reasons
+    change = abs(counts.u - whole.u) / max(whole.u, 1e-300)
+    return ", ".join(failed) if failed else ratio, f"{change:.0e}"
+
+
+def main(argv: list[str]) -> Tables:
+    """Run all scenes without each mechanism, write the page; returns the tables."""
+    arguments, _ = command_line(__doc__, argv, configure)
+    names = arguments.only or (QUICK if arguments.quick else tuple(SCENES))
+    mechanisms = arguments.mechanisms or tuple(MECHANISMS)
+    ratios: list[dict[str, Any]] = []
+    changes: list[dict[str, Any]] = []
+    for name in names:
+        whole = run(SCENES[name], "")
+        row = {"scene": name, "F + S": f"{whole.F} + {whole.S}"}
+        found = {m: compared(run(SCENES[name], m), whole) for m in mechanisms}
+        ratios.append(row | {m: cost for m, (cost, _) in found.items()})
+        changes.append(row | {m: change for m, (_, change) in found.items()})
+        print(markdown(ratios[-1:]).splitlines()[-1], flush=True)
+    tables = {"Multiplications": ratios, "Change of u": changes}
+    write_tables(arguments.output, "ablation", tables)
+    if arguments.page:
+        arguments.page.write_text(page(tables), encoding="utf-8")
+    return tables
+
+
+def configure(parser: Any) -> None:
+    """Arguments of this benchmark."""
+    parser.add_argument("--only", nargs="+", choices=tuple(SCENES), help="scenes")
+    parser.add_argument("--mechanisms", nargs="+", choices=tuple(MECHANISMS))
+    parser.add_argument("--page", type=Path, nargs="?", const=PAGE, help="write the page, too")
+
+
+def page(tables: Tables) -> str:
+    """Return the generated page of the documents."""
+    named = "\n".join(f"* `{name}`: {text}" for name, text in MECHANISMS.items())
+    return f"""# What each mechanism is worth
+
+Written by `./run python3 -m benchmarks.ablation --page`. Each column is a run with
+`-tfeti_without NAME`: multiplications by F and S over those with all mechanisms, or why the solver
+or the demo has stopped. A mechanism stays if two scenes at least need a tenth more without it,
+or fail.
+
+{named}
+
+## Multiplications
+
+{markdown(tables["Multiplications"])}
+
+## Change of ‖u‖
+
+{markdown(tables["Change of u"])}
+"""
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
