@@ -9,7 +9,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from tfeti_dolfinx.version import __version__  # noqa: E402
+from tfeti_dolfinx import __version__  # noqa: E402
 
 project = "tfeti_dolfinx"
 author = "The tfeti_dolfinx developers"

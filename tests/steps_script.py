@@ -46,8 +46,8 @@ def die_at(name, count, before):
 # file, and whether the process dies before it has its name
 DEATHS = {
     "writing": (f"state_3_{LAST}.npz", 1, True),
-    "committing": (checkpoint.INDEX, 4, True),  # it is there before the first step
-    "committed": (checkpoint.INDEX, 4, False),
+    "committing": (checkpoint.INDEX, 5, True),  # it is written twice before the first step
+    "committed": (checkpoint.INDEX, 5, False),
 }
 
 

@@ -9,7 +9,7 @@ PACKAGE = ROOT / "tfeti_dolfinx"
 
 # the rooms in their order; those of one line may not import from each other
 ROOMS = [
-    ["errors", "version"],
+    ["errors"],
     ["common"],
     ["mesh"],
     ["forms"],

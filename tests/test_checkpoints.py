@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from full_disk import clear, fill, left_in
+from full_disk import clear, fill, full, left_in
 from sheared import Driven
 
 import tfeti_dolfinx as tfeti
@@ -227,6 +227,29 @@ def test_a_checkpoint_of_an_earlier_version_is_named(scene):
     before = left_in(scene.copy, scene.comm)
     with pytest.raises(tfeti.InputError, match="copy is of an earlier version of the package"):
         scene.series(scene.copy, LATER)
+    assert left_in(scene.copy, scene.comm) == before
+
+
+def test_a_folder_that_another_run_has_is_refused(scene):
+    """Two runs would take each other's files."""
+
+    def apply(problem, t):
+        scene.driven.apply(problem, t)
+        scene.series(scene.copy, TIMES).run(resume=True)
+
+    scene.begin()
+    outer = tfeti.LoadSteps(scene.driven.problem, apply, LATER, checkpoint=scene.copy)
+    with pytest.raises(tfeti.InputError, match="copy is in use by another run"):
+        outer.run()
+    scene.begin()
+    assert not scene.check("")
+
+
+def test_a_series_that_begins_anew_on_a_full_disk_leaves_what_is_there(scene):
+    scene.begin()
+    before = left_in(scene.copy, scene.comm)
+    with full(0), pytest.raises(tfeti.InputError, match="copy: OSError: .*too large"):
+        scene.series(scene.copy, TIMES).run()
     assert left_in(scene.copy, scene.comm) == before
 
 

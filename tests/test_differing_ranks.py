@@ -5,6 +5,7 @@ On one rank the same calls are right. A case that hangs ends all ranks.
 
 import re
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -16,6 +17,8 @@ from scenes import clamp, decomposed, forms, hooke
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.agreement import agreeing, described
+from tfeti_dolfinx.output import write_vtx, write_xdmf
+from tfeti_dolfinx.plot import plot_deformed, plot_pressure
 
 pytestmark = pytest.mark.timeout(100)
 
@@ -184,6 +187,52 @@ def other(usual, odd):
     return lambda s: odd(s) if ODD else usual(s)
 
 
+def constantly(depth):
+    return lambda x: depth + 0 * x[0]
+
+
+def of_depth(x, depth):
+    return depth + 0 * x[0]
+
+
+class Floor:
+    """An obstacle of one's own."""
+
+    def __init__(self, low):
+        self.low = low
+
+    def distance(self, x):
+        return x[1] + self.low
+
+    def gradient(self, x):
+        return np.stack((0 * x[0], 1 + 0 * x[0], 0 * x[0]))
+
+
+def constant_beside_a_large_one(s, folder):
+    E, nu = fem.Constant(s.d.mesh, 1e11), fem.Constant(s.d.mesh, 0.4 if ODD else 0.3)
+    tfeti.ContactProblem(E * nu * s.a, s.load(), [s.held()], [], s.d)
+
+
+def written(write, usual, odd, **given):
+    """Write what was solved to another name on one rank."""
+
+    def do(s, folder):
+        write(folder / (odd if ODD else usual), s.solved(stress=hooke()).solution, **given)
+
+    return do
+
+
+def call_on_one(usual, odd):
+    """Make another call on one rank."""
+
+    def do(s, folder):
+        problem = s.solved(contacts=[floor()])
+        (odd if ODD else usual)(problem, folder)
+        problem.solve()
+
+    return do
+
+
 TRESCA, COULOMB = tfeti.Tresca(0.01), tfeti.Coulomb(0.3)
 ON = r" on rank \d and "
 HUNG = {
@@ -276,7 +325,7 @@ MORE = {
     ),
     "another stress on one": (
         lambda s, folder: s.problem(stress=hooke(2.0 if ODD else 1.0)),
-        rf"stress\(u\): structure is '\w+'{ON}",
+        rf"stress: lmbda is .*{ON}",
     ),
     "a stress that raises on one, later": (
         stress_that_fails_later,
@@ -321,7 +370,62 @@ MORE = {
     "stabilised by something on one": (thrown(stabilised=(False, 5)), "stabilised=5: expected T"),
     "a step of another size on one": (thrown(step=(0.1, 0.2)), rf"step is 0.2{ON}0.1 on rank 0"),
 }
-CASES = {**HUNG, **SILENT, **MORE}
+HUNG_LATER = {
+    "a file of another kind on one": (
+        written(write_vtx, "a.bp", "a.vtu"),
+        "a.vtu: expected a name that ends with .bp",
+    ),
+    "a file of another name on one": (
+        written(write_xdmf, "a.xdmf", "b.xdmf"),
+        rf"path is '.*b.xdmf'{ON}'.*a.xdmf' on rank 0",
+    ),
+    "fields inside on one": (
+        written(write_vtx, "a.bp", "a.bp", interior=ODD),
+        rf"interior is True{ON}False on rank 0",
+    ),
+    "a picture of another kind on one": (
+        written(plot_deformed, "a.png", "a.pdf"),
+        "a.pdf: expected a name that ends with .png",
+    ),
+    "a picture of another contact on one": (
+        lambda s, folder: plot_pressure(
+            folder / "a.png",
+            s.solved(contacts=[floor(), floor()]).solution,
+            lambda x: x[:, 0],
+            contact=int(ODD),
+        ),
+        rf"contact is 1{ON}0 on rank 0",
+    ),
+    "a file on others": (
+        call_on_one(lambda p, folder: write_vtx(folder / "a.bp", p.solution), lambda p, folder: 0),
+        r"rank \d has called solve where rank 0 has called write_vtx",
+    ),
+    "destroy on one": (
+        call_on_one(lambda p, folder: 0, lambda p, folder: p.destroy()),
+        r"rank \d has called destroy where rank 0 has called solve",
+    ),
+}
+SILENT_LATER = {
+    "another closure on one": (
+        contacts([floor(gap=constantly(0.01))], [floor(gap=constantly(0.02))]),
+        rf"contacts\[0\]: gap: depth is 0.02{ON}0.01 on rank 0",
+    ),
+    "other bound arguments on one": (
+        contacts(
+            *([floor(friction=tfeti.Coulomb(partial(of_depth, depth=d)))] for d in (0.1, 0.2))
+        ),
+        rf"coefficient: depth is 0.2{ON}0.1 on rank 0",
+    ),
+    "another obstacle of one's own on one": (
+        contacts(*([tfeti.Obstacle("bottom", Floor(low))] for low in (0.01, 0.02))),
+        rf"contacts\[0\]: shape: low is 0.02{ON}0.01 on rank 0",
+    ),
+    "a constant beside a large one on one": (
+        constant_beside_a_large_one,
+        rf"a: constants\[1\] is 0.4{ON}0.3 on rank 0",
+    ),
+}
+CASES = {**HUNG_LATER, **SILENT_LATER, **HUNG, **SILENT, **MORE}
 
 
 @pytest.fixture(scope="module")
@@ -370,6 +474,29 @@ def test_rounding_is_no_difference(comm):
     one = 0.1 * (1.0 + 1e-15 * comm.rank)
     with agreeing(comm, "here") as given:
         given |= {"number": one, "vector": [one, 1e-17 * comm.rank], "name": "same"}
+
+
+def test_rounding_in_a_form_or_a_function_is_no_difference(scene):
+    share = 0.3 if ODD else 0.1 + 0.2
+    contact = floor(gap=constantly(0.1 * share))
+    tfeti.ContactProblem(share * scene.a, scene.load(), [scene.held()], [contact], scene.d).solve()
+
+
+def test_a_table_of_a_rank_in_a_function_is_no_difference(scene, comm):
+    """Nor are counters, nor what a closure gets later."""
+    x, calls = np.linspace(0, 1, 3 + comm.rank), comm.rank
+
+    def gap(points):
+        nonlocal calls
+        calls += 1
+        return np.interp(points[0], x, np.full(len(x), depth))
+
+    friction = tfeti.Coulomb(partial(np.interp, xp=x, fp=0 * x + 0.3))
+    with pytest.raises(tfeti.InputError):  # np.interp takes no points of shape (3, n)
+        scene.problem(contacts=[floor(friction=friction)]).solve()
+    problem = scene.problem(contacts=[floor(gap=gap)])
+    depth = 0.01
+    problem.solve()
 
 
 def test_counters_of_ufl_are_no_difference(scene, comm):

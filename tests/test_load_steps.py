@@ -351,9 +351,9 @@ def test_a_checkpoint_of_something_else(shared_tmp):
 
     with pytest.raises(tfeti.InputError, match="a series with the times"):
         again(Driven(), [0.5, 1.5])
-    with pytest.raises(tfeti.InputError, match="the state is of another mesh"):
+    with pytest.raises(tfeti.InputError, match="mesh: points"):
         again(Driven(n=6), [0.5, 1.0])
-    with pytest.raises(tfeti.InputError, match="other contact rows"):
+    with pytest.raises(tfeti.InputError, match="contacts"):
         again(Driven(rough=False), [0.5, 1.0])
     comm = driven.problem.decomposition.comm
     if comm.rank == 0:
@@ -372,8 +372,11 @@ def test_a_checkpoint_of_something_else(shared_tmp):
     ],
 )
 def test_a_series_goes_on_with_its_own_problem_only(friction, share, says, shared_tmp):
-    """Another coefficient, law or ``apply`` is named; the same goes on."""
-    times, folder = [0.5, 1.0], shared_tmp / "own"
+    """Another coefficient, law or ``apply`` is named, and its problem is as it was.
+
+    The same goes on, also where the times that were reached are rounded in another way.
+    """
+    times, folder = [0.3, 0.5, 1.0], shared_tmp / "own"
 
     def series(friction, share, times):
         driven = Driven(n=4, subdomains=2, friction=friction)
@@ -384,10 +387,17 @@ def test_a_series_goes_on_with_its_own_problem_only(friction, share, says, share
 
         return tfeti.LoadSteps(driven.problem, apply, times, checkpoint=folder)
 
-    series(tfeti.Coulomb(0.3), 1.0, times[:1]).run()
+    series(tfeti.Coulomb(0.3), 1.0, times[:2]).run()
+    other = series(friction, share, times)
     with pytest.raises(tfeti.InputError, match=says):
-        series(friction, share, times).run(resume=True)
-    assert len(series(tfeti.Coulomb(0.3), 1.0, times).run(resume=True)) == 2
+        other.run(resume=True)
+    assert other.records == []
+    assert not np.any(other._problem.u.x.array)
+    with pytest.raises(tfeti.InputError, match=r"0.5001 in the place of 0.5"):
+        series(tfeti.Coulomb(0.3), 1.0, [0.3, 0.5001, 1.0]).run(resume=True)
+    rounded = [0.1 + 0.2, 0.5, 1.0]
+    assert rounded != times
+    assert len(series(tfeti.Coulomb(0.3), 1.0, rounded).run(resume=True)) == 3
 
 
 def test_an_apply_that_fails_on_one_rank():

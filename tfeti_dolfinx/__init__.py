@@ -54,7 +54,8 @@ from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.solution import PointValues, Solution
 from tfeti_dolfinx.steps.dynamics import ContactDynamics
 from tfeti_dolfinx.steps.load_steps import LoadSteps, StepRecord
-from tfeti_dolfinx.version import __version__
+
+__version__ = "0.1.0.dev0"
 
 if TYPE_CHECKING:
     from tfeti_dolfinx.bem.boundary_elements import BoundaryElements

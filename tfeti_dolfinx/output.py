@@ -17,6 +17,7 @@ import numpy as np
 from dolfinx import fem, io
 from mpi4py import MPI
 
+from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import geometry_dofmap
 from tfeti_dolfinx.common.validation import checked_path, checked_type, named
@@ -54,7 +55,7 @@ def write_vtx(
         InputError: The name does not end with ``.bp``, or the files cannot be written there, as
             where the disk is full; then what was there before stays.
     """
-    target = checked_target(path, ".bp", solution)
+    target = checked_target(path, ".bp", solution, interior)
     if not dolfinx.has_adios2:
         return write_xdmf(target.with_suffix(".xdmf"), solution, interior)
     cells = target.with_name(f"{target.stem}_cells.bp")
@@ -92,7 +93,7 @@ def write_xdmf(
         InputError: The name does not end with ``.xdmf``, or the files cannot be written there, as
             where the disk is full; then what was there before stays.
     """
-    target = checked_target(path, ".xdmf", solution)
+    target = checked_target(path, ".xdmf", solution, interior)
     comm, mesh = solution.decomposition.comm, solution.decomposition.mesh
     of_nodes, of_cells = _fields(solution, interior)
     functions = [_as_geometry(f, solution.decomposition) for f in of_nodes + of_cells]
@@ -250,13 +251,16 @@ def _as_geometry(function: fem.Function, decomposition: Decomposition) -> fem.Fu
     return copy
 
 
-def checked_target(path: str | os.PathLike[str], suffix: str, solution: Solution) -> Path:
+def checked_target(
+    path: str | os.PathLike[str], suffix: str, solution: Solution, interior: bool = False
+) -> Path:
     """Return the name to write to; what stands there and beside it is replaced. Collective."""
-    target = checked_path(path, suffix)
     checked_type(solution, Solution, "solution", "the solution of a ContactProblem")
-    stem = target.stem
-    beside = target.with_name(f"{stem}.h5" if suffix == ".xdmf" else f"{stem}_cells{suffix}")
-    with raised_on_all_ranks(solution.decomposition.comm):
+    call = "write_vtx" if suffix == ".bp" else "write_xdmf"
+    with agreeing(solution.decomposition.comm, call) as given:
+        given |= {"path": path, "interior": bool(interior)}
+        target = checked_path(path, suffix)
+        beside = target.with_name(f"{target.stem}{'_cells.bp' if suffix == '.bp' else '.h5'}")
         for name in (target, beside):
             if name.is_dir() and any(name.iterdir()) and not (name / "md.idx").exists():
                 raise InputError(f"{name} is a directory that VTX has not written; expected a file")

@@ -15,6 +15,7 @@ import numpy as np
 from dolfinx import plot as dplot
 
 from tfeti_dolfinx import draw
+from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.validation import (
     FINITE,
@@ -70,18 +71,19 @@ def plot_deformed(
             an argument does not fit.
         TfetiError: The picture could not be drawn.
     """
-    target = checked_path(path, ".png")
     checked_type(solution, Solution, "solution", "the solution of a ContactProblem")
-    scene = {
-        "factor": _number(factor, "factor", FINITE),
-        "zoom": checked_number(zoom, "zoom", POSITIVE),
-        "focus": _vector(focus, "focus"),
-        "edges": checked_flag(show_edges, "show_edges"),
-        "highest": _number(highest, "highest", POSITIVE),
-        "view": _vector(view, "view"),
-        "cut": np.stack([_vector(v, "cut") for v in _pair(cut)]),
-    }
     comm = solution.decomposition.comm
+    with agreeing(comm, "plot_deformed"):
+        target = checked_path(path, ".png")
+        scene = {
+            "factor": _number(factor, "factor", FINITE),
+            "zoom": checked_number(zoom, "zoom", POSITIVE),
+            "focus": _vector(focus, "focus"),
+            "edges": checked_flag(show_edges, "show_edges"),
+            "highest": _number(highest, "highest", POSITIVE),
+            "view": _vector(view, "view"),
+            "cut": np.stack([_vector(v, "cut") for v in _pair(cut)]),
+        }
     if factor is None and solution.has_contact:
         scene["factor"] = 1.0
     parts = comm.gather(_grid(solution, solution.nodal_von_mises.x.array), root=0)
@@ -119,14 +121,16 @@ def plot_pressure(
     Raises:
         InputError: An argument does not fit, or a callable fails.
     """
-    target = checked_path(path, ".png")
     checked_type(solution, Solution, "solution", "the solution of a ContactProblem")
-    checked_callable(coordinate, "coordinate", "a callable of points of shape (n, 3)")
-    if closed_form is not None:
-        checked_callable(closed_form, "closed_form", "a callable of coordinates of shape (n,)")
-    if limit is not None:
-        checked_number(limit, "limit", POSITIVE)
     comm = solution.decomposition.comm
+    with agreeing(comm, "plot_pressure") as given:
+        given["contact"] = contact
+        target = checked_path(path, ".png")
+        checked_callable(coordinate, "coordinate", "a callable of points of shape (n, 3)")
+        if closed_form is not None:
+            checked_callable(closed_form, "closed_form", "a callable of coordinates of shape (n,)")
+        if limit is not None:
+            checked_number(limit, "limit", POSITIVE)
     data = solution.contact(contact)
     with raised_on_all_ranks(comm):
         x = _coordinates(coordinate, data.points)

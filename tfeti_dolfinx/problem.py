@@ -524,7 +524,12 @@ class ContactProblem(Stepping):
         return u
 
     def destroy(self) -> None:
-        """Destroy the PETSc objects; solution and report stay. ``solve`` makes them anew."""
+        """Destroy the PETSc objects; solution and report stay. ``solve`` makes them anew.
+
+        Collective.
+        """
+        with agreeing(self.decomposition.comm, "destroy"):
+            pass
         self._system.destroy()
 
     def _goal(self) -> ErrorTarget | None:

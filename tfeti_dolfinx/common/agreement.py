@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import os
 import re
@@ -9,8 +10,10 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
+from functools import partial
 from hashlib import blake2b
 from numbers import Integral, Real
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -19,7 +22,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from ufl.algorithms import extract_coefficients
 from ufl.algorithms.analysis import extract_constants
-from ufl.classes import Conj, FixedIndex, Inner, Label, MultiIndex, Product, Sum
+from ufl.classes import Conj, FixedIndex, FloatValue, Inner, Label, MultiIndex, Product, Sum
 from ufl.corealg.traversal import unique_post_traversal
 
 from tfeti_dolfinx.common.arrays import Array
@@ -30,8 +33,6 @@ from tfeti_dolfinx.errors import InputError, raise_together
 
 # of the largest number beside it: what differs by less was computed on processors of other kinds
 ROUNDING = 1e-10
-# numbers of an array that is described by them; a longer one may be a part that a rank holds
-FEW = 16
 # bytes of the digest in the message, after one that says whether the rank has an error
 DIGEST = 16
 
@@ -129,8 +130,8 @@ def described(value: Any) -> Any:
 
     Numbers and texts are themselves, forms and expressions a hash of their structure with the
     values of constants, objects of this package their attributes. Functions on the mesh and
-    conditions are described without what a rank has of them, callables by their names, all else by
-    its type.
+    conditions are described without what a rank has of them, all else by its name and the floats
+    in it: constants, defaults, what a closure or ``partial`` holds, attributes.
 
     Args:
         value: Anything.
@@ -151,10 +152,7 @@ def described(value: Any) -> Any:
             return describe(value)
     if type(value).__module__.startswith(DESCRIPTIONS):
         return {"type": type(value).__qualname__, **_attributes(value)}
-    if callable(value):
-        name = getattr(value, "__qualname__", type(value).__qualname__)
-        return {"type": f"the callable {name}"}
-    return {"type": type(value).__qualname__}
+    return _of_program(value)
 
 
 def _attributes(value: Any) -> dict[str, Any]:
@@ -162,10 +160,34 @@ def _attributes(value: Any) -> dict[str, Any]:
     return {name: described(getattr(value, name)) for name in names if not name.startswith("_")}
 
 
-def _of_array(values: Array) -> Any:
-    if values.size <= FEW:
-        return described(values.tolist())
-    return {"type": f"array of {values.dtype} with {values.ndim} axes"}
+def _of_program(value: Any) -> dict[str, Any]:
+    """Describe a callable or an object of a user's program: its name and the numbers it holds.
+
+    Not whole ones, which may count something, and no arrays: they may be those of a rank.
+    """
+    given: dict[str, Any] = {}
+    while isinstance(value, partial):
+        given = (
+            {f"argument {k}": item for k, item in enumerate(value.args)} | value.keywords | given
+        )
+        value = value.func
+    held: dict[str, Any] = {}
+    if isinstance(function := getattr(value, "__func__", value), FunctionType):
+        code = function.__code__
+        held |= {f"number {k}": item for k, item in enumerate(code.co_consts)}
+        held |= {name: function.__globals__.get(name) for name in code.co_names}
+        held |= {p.name: p.default for p in inspect.signature(function).parameters.values()}
+        for name, cell in zip(code.co_freevars, function.__closure__ or (), strict=True):
+            with suppress(ValueError):  # it is set later
+                held[name] = cell.cell_contents
+    held |= getattr(getattr(value, "__self__", value), "__dict__", {})
+    numbers = {
+        name: float(item)
+        for name, item in {**held, **given}.items()
+        if isinstance(item, (float, np.floating))
+    }
+    name = getattr(value, "__qualname__", type(value).__qualname__)
+    return {"type": f"the callable {name}" if callable(value) else name, **numbers}
 
 
 def _of_form(form: ufl.Form) -> dict[str, Any]:
@@ -194,7 +216,7 @@ def _of_expression(expression: ufl.core.expr.Expr) -> dict[str, Any]:
 
 
 def _structure(expression: Any, constants: Any, functions: Any) -> str:
-    """A hash of an expression; empty where UFL does not know a part, which other checks name.
+    """Return a hash of an expression, with its numbers to ten digits.
 
     UFL's own signature depends on the order of operands that commute, and UFL sorts constants by
     texts with counters in them, which on another rank may have one digit more.
@@ -203,20 +225,21 @@ def _structure(expression: Any, constants: Any, functions: Any) -> str:
     for items in (constants, functions):
         numbers.update({item: k for k, item in enumerate(items)})
     known: dict[Any, str] = {}
-    with suppress(Exception):
-        for part in unique_post_traversal(expression):
-            operands = [known[operand] for operand in part.ufl_operands]
-            if isinstance(part, Conj):  # UFL puts one where it turns an inner product round
-                known[part] = operands[0]
-                continue
-            if isinstance(part, (Sum, Product, Inner)):
-                operands.sort()
-            if isinstance(part, MultiIndex):
-                operands = [str(int(i)) if isinstance(i, FixedIndex) else "free" for i in part]
-            elif part._ufl_is_terminal_ and not isinstance(part, Label):
-                operands = [str(part._ufl_signature_data_(numbers))]
-            known[part] = _hash(type(part).__name__, *operands)
-    return known.get(expression, "")
+    for part in unique_post_traversal(expression):
+        operands = [known[operand] for operand in part.ufl_operands]
+        if isinstance(part, Conj):  # UFL puts one where it turns an inner product round
+            known[part] = operands[0]
+            continue
+        if isinstance(part, (Sum, Product, Inner)):
+            operands.sort()
+        if isinstance(part, MultiIndex):
+            operands = [str(int(i)) if isinstance(i, FixedIndex) else "free" for i in part]
+        elif isinstance(part, FloatValue):
+            operands = [f"{float(part):.9e}"]
+        elif part._ufl_is_terminal_ and not isinstance(part, Label):
+            operands = [str(part._ufl_signature_data_(numbers))]
+        known[part] = _hash(type(part).__name__, *operands)
+    return known[expression]
 
 
 def _hash(*texts: str) -> str:
@@ -226,9 +249,10 @@ def _hash(*texts: str) -> str:
 def _values(constants: Any, functions: Any) -> dict[str, Any]:
     """Return values of constants, and the kinds of functions; UFL's own have none."""
     return {
-        "constants": [
-            described(c) if isinstance(c, fem.Constant) else type(c).__qualname__ for c in constants
-        ],
+        **{
+            f"constants[{k}]": described(c) if isinstance(c, fem.Constant) else type(c).__qualname__
+            for k, c in enumerate(constants)
+        },
         "functions": [
             described(f) if isinstance(f, fem.Function) else type(f).__qualname__ for f in functions
         ],
@@ -251,7 +275,7 @@ def _of_condition(condition: fem.DirichletBC) -> dict[str, Any]:
 
 # in their order: a function is an expression, too
 KINDS: tuple[tuple[Any, Callable[[Any], Any]], ...] = (
-    (np.ndarray, _of_array),
+    (np.ndarray, lambda value: described(value.tolist())),
     (os.PathLike, os.fspath),
     (Mapping, lambda value: {str(key): described(item) for key, item in value.items()}),
     ((list, tuple), lambda value: [described(item) for item in value]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
@@ -123,12 +124,30 @@ class Checkpoint:
             if comm.rank == 0:
                 self._index = self._checked_folder()
 
-    def forget(self) -> None:
-        """Remove what an earlier series has left, and take the folder."""
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Keep other runs out of the folder inside the block, while this process lives.
+
+        Raises:
+            InputError: Another run has it, or it is no folder for a checkpoint.
+        """
+        lock = None
         with raised_on_all_ranks(self._comm), named(f"checkpoint {self.path}", OSError):
             if self._comm.rank == 0:
                 self._index = self._checked_folder()
                 self.path.mkdir(parents=True, exist_ok=True)
+                lock = _locked(self.path)
+        try:
+            yield
+        finally:
+            if lock is not None:
+                os.close(lock)
+
+    def forget(self) -> None:
+        """Remove what an earlier series has left, and take the folder, which is held."""
+        with raised_on_all_ranks(self._comm), named(f"checkpoint {self.path}", OSError):
+            if self._comm.rank == 0:
+                self._commit(self._index)  # on a full disk nothing goes
                 for file in self.path.iterdir():
                     if self._index.owns(file) and file.name != INDEX:
                         file.unlink()
@@ -136,7 +155,7 @@ class Checkpoint:
         self._lines = _hash()
 
     def read(self) -> Kept | None:
-        """Return what was written last, on all ranks; None if there is nothing.
+        """Return what was written last, on all ranks; None if there is nothing. It is held.
 
         What a run that was killed has left beside it is removed.
 
@@ -147,7 +166,7 @@ class Checkpoint:
         comm = self._comm
         with raised_on_all_ranks(comm), named(f"cannot read {self.path}", OSError):
             if comm.rank == 0:
-                index = self._index = self._checked_folder()
+                index = self._index
                 if index.number:
                     self._check_ranks()
                     records = [json.loads(line) for line in self._read_lines()]
@@ -343,6 +362,22 @@ def damaged(file: Path, where: str) -> InputError:
         f"{file} is damaged: it is not what the checkpoint has written, by the checksum in "
         f"{where}; expected the folder as it was left. Bring the file back, or remove the folder"
     )
+
+
+def _locked(folder: Path) -> int:
+    """Lock a folder until the descriptor is closed, where its file system can."""
+    lock = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(lock)
+        raise InputError(
+            f"checkpoint {folder} is in use by another run; expected one that has ended, "
+            "or another folder"
+        ) from None
+    except OSError:
+        pass
+    return lock
 
 
 def _hash(data: bytes = b"") -> Any:
