@@ -194,6 +194,7 @@ class System:
         bcs: Dirichlet conditions.
         friction: What bounds tangential forces.
         replaced: What boundary elements put in the place of finite ones.
+        origin: Displacement in primal order at which the mesh is, in finite strain; else None.
         spectrum: Extreme eigenvalues of B Bᵀ, if somebody has put them here.
     """
 
@@ -214,6 +215,7 @@ class System:
         self.spectrum: dict[str, float] = {}
         self._stiffening = Stiffening(settings.options.penalty, dofs)
         self._stages, self._counters, self._counted = Stages(), Counters(), 0
+        self.origin: Array | None = None
         self._seen = 0.0  # of ‖F‖, which more rows hardly change
         self._K: Any = None
         self._added: Array | None = None
@@ -238,6 +240,11 @@ class System:
     def dual(self) -> Dual:
         """The dual problem."""
         return made(self._dual)
+
+    @property
+    def subdomains(self) -> Subdomains:
+        """The subdomains with their factors."""
+        return made(self._subdomains)
 
     def look_for_changes(self) -> None:
         """See whether the mesh, or what forms and Dirichlet conditions refer to, has changed.
@@ -345,7 +352,9 @@ class System:
 
     def _find_contacts(self) -> None:
         dofs, cut = self._dofs, self._decomposition
-        self._search = ContactSearch(self._contacts, dofs, cut, self._blocks)
+        self._search = ContactSearch(self._contacts, dofs, cut, self._blocks, self.origin)
+        if self.origin is not None:  # sides stay those of the first search
+            self._contacts[:] = self._search.contacts
         if self._known_rows is not None:
             self._search.take_rows(*self._known_rows)
             self._known_rows = None

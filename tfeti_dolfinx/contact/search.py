@@ -13,7 +13,13 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root
 from tfeti_dolfinx.common.validation import shown
 from tfeti_dolfinx.contact.friction import Law, friction_values, same_law
-from tfeti_dolfinx.contact.records import ContactRecords, Gap, concatenate, remaining_gaps
+from tfeti_dolfinx.contact.records import (
+    ContactRecords,
+    Gap,
+    concatenate,
+    relative_displacement,
+    remaining_gaps,
+)
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -147,6 +153,8 @@ class ContactSearch:
         dofs: Dof maps.
         decomposition: The torn mesh.
         stiffness: Block of K of each primal node, shape ``(num_nodes, bs, bs)``.
+        origin: Displacement in primal order at which the mesh is; None: 0. Gaps are those of the
+            total displacement.
 
     Attributes:
         contacts: The contacts with their sides decided: of a pair the secondary one comes first.
@@ -163,8 +171,9 @@ class ContactSearch:
         dofs: TornDofs,
         decomposition: Decomposition,
         stiffness: Array,
+        origin: Array | None = None,
     ) -> None:
-        self._dofs, self._decomposition = dofs, decomposition
+        self._dofs, self._decomposition, self._origin = dofs, decomposition, origin
         self.length = bcast_from_root(dofs.comm, diameter(decomposition))
         reach = [contact.first_reach(decomposition) for contact in contacts]
         self._depths = bcast_from_root(dofs.comm, reach)
@@ -176,7 +185,7 @@ class ContactSearch:
             for i, contact in enumerate(contacts)
         ]
         self.contacts = [contact for contact, _ in settled]
-        self._records = [records for _, records in settled]
+        self._records = [self._from_origin(records) for _, records in settled]
 
     @property
     def records(self) -> ContactRecords:
@@ -249,7 +258,8 @@ class ContactSearch:
     def _take_in(self, i: int, u: Array, tolerance: float) -> int:
         """Give rows to violated conditions of one contact; how many rows are new."""
         known = found = self._records[i]
-        nodal = u.reshape(-1, self._dofs.bs)
+        way = u if self._origin is None else u - self._origin
+        nodal = way.reshape(-1, self._dofs.bs)
         bound = self.contacts[i].displacement_bound(self._dofs, self._decomposition, nodal)
         moved = bcast_from_root(self._dofs.comm, bound)
         if moved > self._reach[i]:
@@ -315,12 +325,22 @@ class ContactSearch:
         if self._reach[i] < self.contacts[i].horizon(self.length):
             found = self._with_rows_of(self._search(i, reach), found)
         self._reach[i] = reach
-        self._records[i] = replace(found, within_reach=found.within_reach | (found.gap <= reach))
+        distance = found.gap if self._origin is None else found.geometric_gap
+        self._records[i] = replace(found, within_reach=found.within_reach | (distance <= reach))
         return self._count(self._records[i].within_reach) - before
 
     def _search(self, index: int, reach: float) -> ContactRecords:
         contact = self.contacts[index]
-        return contact.records(self._dofs, self._decomposition, index, reach, self._depths[index])
+        depth = self._depths[index]
+        found = contact.records(self._dofs, self._decomposition, index, reach, depth)
+        return self._from_origin(found)
+
+    def _from_origin(self, found: ContactRecords) -> ContactRecords:
+        """Conditions with the gaps of the total displacement."""
+        if self._origin is None:
+            return found
+        way = relative_displacement(found, self._dofs, self._origin)
+        return replace(found, gap=found.gap + np.sum(found.normal * way, axis=1))
 
     def _with_rows_of(self, found: ContactRecords, known: ContactRecords) -> ContactRecords:
         """Conditions of a wider search, within reach where they had rows before."""
