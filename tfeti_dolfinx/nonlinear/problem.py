@@ -15,11 +15,11 @@ from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.common.parallel import bcast_from_root, largest, summed
 from tfeti_dolfinx.common.validation import checked_callable, checked_flag, checked_type
 from tfeti_dolfinx.contact.search import ContactPartner
-from tfeti_dolfinx.errors import ConvergenceError, InputError, TfetiError
+from tfeti_dolfinx.errors import ConvergenceError, FactorError, InputError, TfetiError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.nonlinear.forms import CurrentPlaces, NewtonForms
 from tfeti_dolfinx.nonlinear.state import InternalVariables, NewValue
-from tfeti_dolfinx.nonlinear.tangent import material_tangent
+from tfeti_dolfinx.nonlinear.tangent import rotation_free_tangent
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.report import Report
 
@@ -48,6 +48,9 @@ class NewtonTolerances:
             most this: its directions of conjugate gradients then serve the next problems, too.
         settled: And where the increment was at most this share of the load step's first one.
         anderson: Iterates that Anderson's acceleration combines.
+        shift: Where a tangent in finite strain cannot be factored, a form with the same kernel is
+            added, beside its mean diagonal first the square of this, then its inverse times as
+            much; from tangent to tangent it falls by this factor.
     """
 
     max_it: int = 50
@@ -62,6 +65,7 @@ class NewtonTolerances:
     keeping: float = 0.5
     settled: float = 0.05
     anderson: int = 5
+    shift: float = 0.1
 
 
 class NonlinearContactProblem(ContactProblem):
@@ -98,7 +102,7 @@ class NonlinearContactProblem(ContactProblem):
             functions in F and J that depend on u.
         finite: Whether strains and displacements are finite: F is integrated on the mesh as it
             was, contact and friction act where the bodies are, at X + u. J may not be given: the
-            tangent is the material part, see ``material_tangent``. ``decomposition.mesh`` is where
+            tangent knows no rotations, see ``rotation_free_tangent``. ``decomposition.mesh`` is where
             it was after each solve.
         tolerances: Those of Newton's method.
         others: As for ``ContactProblem``; ``rtol`` is that of the displacement.
@@ -127,11 +131,12 @@ class NonlinearContactProblem(ContactProblem):
         if update is not None:
             checked_callable(update, "update", "a function without arguments")
         self._tolerances = NewtonTolerances() if tolerances is None else tolerances
+        self._strains: ufl.Form | None = None
         self._update, self._finite = update, checked_flag(finite, "finite")
         if finite and J is not None:
             raise InputError("finite=True: expected no J, since the tangent is made from F")
         if finite:
-            J, _ = material_tangent(F, u)
+            J, self._strains = rotation_free_tangent(F, u)
         elif J is None:
             J = ufl.derivative(F, u)
         checked_type(J, ufl.Form, "J", "a bilinear form")
@@ -143,8 +148,8 @@ class NonlinearContactProblem(ContactProblem):
         self._places = CurrentPlaces(u, self.dofs) if finite else None
 
     def _forms(self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any) -> NewtonForms:
-        given_u: fem.Function = self.u
-        return NewtonForms(a, L, V, self.decomposition, *options, u=given_u, finite=self._finite)
+        given = (a, L, V, self.decomposition, *options)
+        return NewtonForms(*given, u=self.u, strains=self._strains)
 
     @property
     def _newton_forms(self) -> NewtonForms:
@@ -201,14 +206,13 @@ class NonlinearContactProblem(ContactProblem):
             # 4. step
             if step == 0:  # what conditions prescribe is met from then on
                 first, self._last_increment = size, min(increment, tol.loosest)
-            if t < 1.0 or step == 0:
-                faster.forget()
                 self._set(u + t * d)
             else:
-                self._set(faster.next(u, d) if self._finite or forms.kept else u + d)
+                exact_tangent = not (self._finite or forms.kept)
+                self._set(u + t * d if exact_tangent else faster.next(u, d, t))
                 if self._smallest_volume() <= 0.0:
                     faster.forget()
-                    self._set(u + d)
+                    self._set(u + t * d)
             forms.kept = (
                 t == 1.0 and not short and remainder <= tol.keeping and size <= tol.settled * first
             )
@@ -224,13 +228,26 @@ class NonlinearContactProblem(ContactProblem):
         if self._places is None or self._newton_forms.kept:
             super().solve()
             return
-        self._places.move()
-        self._system.origin = self.dofs.to_primal(self.u.x.array)
-        self._system.friction.rest = self.dofs.to_primal(self._begin)
+        forms, tol = self._newton_forms, self._tolerances
+        self._go_to_places(self._places)
+        forms.shift = forms.shift * tol.shift if forms.shift > tol.shift**3 else 0.0
         try:
-            super().solve()
+            while True:
+                try:
+                    super().solve()
+                    return
+                except FactorError:  # on all ranks
+                    forms.shift = max(forms.shift / tol.shift, tol.shift**2)
+                    if forms.shift > 1.0 / tol.shift:
+                        raise
         finally:
             self._places.back()
+
+    def _go_to_places(self, places: CurrentPlaces) -> None:
+        """Let contact and rigid motions be those of X + u. Collective."""
+        places.move()
+        self._system.origin = self.dofs.to_primal(self.u.x.array)
+        self._system.friction.rest = self.dofs.to_primal(self._begin)
 
     def _set(self, u: Array) -> None:
         """Take a displacement, and what depends on it. Collective."""
@@ -350,17 +367,17 @@ class Anderson:
     def forget(self) -> None:
         """Forget the iterates so far."""
         self._steps: list[Array] = []
-        self._ends: list[Array] = []
+        self._places: list[Array] = []
 
-    def next(self, u: Array, d: Array) -> Array:
-        """Return the next iterate after u, whose step is d. Collective."""
-        end = moved = u + d
+    def next(self, u: Array, d: Array, t: float) -> Array:
+        """Return the next iterate after u, whose step is t d. Collective."""
+        end = moved = u + t * d
         if self._steps:
             steps = d[:, None] - np.array(self._steps).T
             gram = summed(self._comm, steps.T @ np.column_stack((steps, d)))
             gram = bcast_from_root(self._comm, gram)
             share = np.linalg.lstsq(gram[:, :-1], gram[:, -1], rcond=None)[0]
-            moved = end - (end[:, None] - np.array(self._ends).T) @ share
+            moved = end - (u[:, None] - np.array(self._places).T + t * steps) @ share
         self._steps = [*self._steps, d][-self._depth :]
-        self._ends = [*self._ends, end][-self._depth :]
+        self._places = [*self._places, u][-self._depth :]
         return moved

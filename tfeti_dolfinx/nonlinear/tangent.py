@@ -15,29 +15,22 @@ from ufl.corealg.traversal import unique_pre_traversal
 from tfeti_dolfinx.errors import InputError
 
 
-class GeometricPart(MultiFunction):
-    """Replace ∇v in a residual, so that it becomes the geometric part of the tangent.
-
-    With F = I + ∇u and A = ∇w F⁻¹ the geometric part ∫∇w S : ∇v of the tangent along w, S = F⁻¹P
-    and P the first Piola–Kirchhoff stress, is ∫AP : ∇v = ∫P : Aᵀ∇v. So ∇v becomes Aᵀ∇v, and what
-    has v itself, as body forces have, is dropped.
+class GradientReplaced(MultiFunction):
+    """Replace ∇v in a residual by a tensor, and v itself, as body forces have it, by 0.
 
     Args:
-        u: The displacement.
         v: The test function of the residual.
-        w: The trial function.
+        gradient: What ∇v becomes.
     """
 
-    def __init__(self, u: fem.Function, v: Any, w: Any) -> None:
+    def __init__(self, v: Any, gradient: Any) -> None:
         super().__init__()
-        F = ufl.Identity(len(u)) + ufl.grad(u)
-        self._v = v
-        self._gradient = expand_derivatives(ufl.dot((ufl.grad(w) * ufl.inv(F)).T, ufl.grad(v)))
+        self._v, self._gradient = v, expand_derivatives(gradient)
 
     expr = MultiFunction.reuse_if_untouched
 
     def grad(self, o: Any) -> Any:
-        """Map ∇v to Aᵀ∇v; other gradients stay."""
+        """Map ∇v; other gradients stay."""
         if o.ufl_operands[0] == self._v:
             return self._gradient
         if self._v in set(unique_pre_traversal(o)):
@@ -49,19 +42,22 @@ class GeometricPart(MultiFunction):
         return Zero(o.ufl_shape) if o == self._v else o
 
 
-def material_tangent(F: ufl.Form, u: fem.Function) -> tuple[ufl.Form, ufl.Form]:
-    """Return the material part of the tangent of a residual on the mesh as it was.
+def rotation_free_tangent(F: ufl.Form, u: fem.Function) -> tuple[ufl.Form, ufl.Form]:
+    """Return a tangent of a residual whose kernel are the rigid motions about X + u.
 
-    The full tangent of a body under stress does not know rotations, and may be indefinite. The
-    material part, ∫(Fᵀ∇w)_sym : C : (Fᵀ∇v)_sym, has the rigid motions about X + u in its kernel at
-    any strain. Forces on facets that turn with the body have no part in it.
+    With F = I + ∇u, the first Piola–Kirchhoff stress P and S = F⁻¹P the tangent along w has a
+    material part, ∫E(w) : C : E(v), E(w) = sym(Fᵀ∇w), and a geometric one, ∫∇w S : ∇v = ∫P : Aᵀ∇v,
+    A = ∇w F⁻¹. A body under stress resists rotations by the latter, so the whole has a smaller
+    kernel, and is often indefinite. Here F⁻ᵀE(w) and F⁻ᵀE(v) take the place of ∇w and ∇v in the
+    geometric part: what stretches a body is as stiff as it is, and rotations, E = 0, cost nothing.
+    Forces on facets that turn with the body have no part in it.
 
     Args:
         F: Residual, linear in its test function, for instance ∫P(u):∇v dx less that of loads.
         u: The displacement.
 
     Returns:
-        The material part, and ∫(Fᵀ∇w)_sym : (Fᵀ∇v)_sym, whose kernel is the same.
+        The tangent, and ∫E(w) : E(v), whose kernel is the same.
     """
     F = expand_derivatives(F)
     (v,) = F.arguments()
@@ -72,15 +68,21 @@ def material_tangent(F: ufl.Form, u: fem.Function) -> tuple[ufl.Form, ufl.Form]:
         for i in F.integrals()
         if i.integral_type() != "cell" and not _has_gradient_of(i.integrand(), u)
     ]
-    geometric = map_integrand_dags(GeometricPart(u, v, w), inside)
     tangent = ufl.derivative(ufl.Form([*inside.integrals(), *on_facets]), u, w)
     deformation = ufl.Identity(len(u)) + ufl.grad(u)
+    inverse = ufl.inv(deformation)
 
     def strain(y: Any) -> Any:
         return ufl.sym(deformation.T * ufl.grad(y))
 
+    def geometric(of_w: Any, of_v: Any) -> ufl.Form:
+        gradient = (of_w * inverse).T * of_v
+        return map_integrand_dags(GradientReplaced(v, gradient), inside)
+
+    whole = geometric(ufl.grad(w), ufl.grad(v))
+    of_stretches = geometric(inverse.T * strain(w), inverse.T * strain(v))
     measure = ufl.dx(domain=u.function_space.mesh)
-    return tangent - geometric, ufl.inner(strain(w), strain(v)) * measure
+    return tangent - whole + of_stretches, ufl.inner(strain(w), strain(v)) * measure
 
 
 def _has_gradient_of(expression: Any, u: fem.Function) -> bool:
