@@ -65,6 +65,7 @@ class NewtonTolerances:
     keeping: float = 0.5
     settled: float = 0.05
     anderson: int = 5
+    new_map: float = 2.0
     shift: float = 0.1
 
 
@@ -184,8 +185,8 @@ class NonlinearContactProblem(ContactProblem):
 
     def _newton(self, total: Totals) -> None:
         tol, exact, comm = self._tolerances, self._exact, self.decomposition.comm
-        forms, faster = self._newton_forms, Anderson(self._tolerances.anderson, comm)
-        first, expected = 0.0, self._last_increment
+        forms, expected = self._newton_forms, self._last_increment
+        faster, first, before = Anderson(tol.anderson, comm), 0.0, np.inf
         for step in range(tol.max_it):
             u = np.array(self.u.x.array)
             # 1. model
@@ -204,18 +205,21 @@ class NonlinearContactProblem(ContactProblem):
                 self._set(u + d)
                 return
             # 4. step
+            if size > tol.new_map * before:  # rows of new places
+                faster.forget()
             if step == 0:  # what conditions prescribe is met from then on
                 first, self._last_increment = size, min(increment, tol.loosest)
                 self._set(u + t * d)
+            elif self._finite or forms.kept:
+                self._set(faster.next(u, d, t))
             else:
-                exact_tangent = not (self._finite or forms.kept)
-                self._set(u + t * d if exact_tangent else faster.next(u, d, t))
-                if self._smallest_volume() <= 0.0:
-                    faster.forget()
-                    self._set(u + t * d)
-            forms.kept = (
-                t == 1.0 and not short and remainder <= tol.keeping and size <= tol.settled * first
-            )
+                self._set(u + t * d)
+            if self._smallest_volume() <= 0.0:
+                faster.forget()
+                self._set(u + t * d)
+            in_line = t == 1.0 and remainder <= tol.keeping and size <= tol.settled * first
+            forms.kept = in_line and not (self._finite and short)
+            before = size
         raise ConvergenceError(
             f"Newton's method: the increment is still {increment:.1e} of the displacement after "
             f"{tol.max_it} steps; expected {exact:.0e}: smaller load steps, or a tangent J that is "
