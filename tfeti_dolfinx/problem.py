@@ -103,9 +103,11 @@ class Stepping:
 
     Attributes:
         defaults: Options, by name, that have other defaults than their own.
+        form_name: Name of the bilinear form, for messages.
     """
 
     defaults: ClassVar[Mapping[str, Any]] = {}
+    form_name: ClassVar[str] = "a"
 
     u: fem.Function
     dofs: TornDofs
@@ -345,7 +347,7 @@ class ContactProblem(Stepping):
             given |= self._given_besides()
         if self.options.spectrum:
             require_slepc(comm)
-        V = displacement_space(a, decomposition)
+        V = displacement_space(a, decomposition, self.form_name)
         self.bcs = checked_conditions(bcs, V)
         self.u = fem.Function(V, name="displacement") if u is None else self._checked_u(u, V)
         self._given_stress = stress

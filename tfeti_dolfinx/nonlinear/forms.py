@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, ClassVar
 
 import basix
 import numpy as np
@@ -42,6 +42,8 @@ class NewtonForms(Forms):
             material softens J is indefinite, and the residual stays as it is.
         kept: Whether matrix, rows and factors stay as they are, though u changes.
     """
+
+    names: ClassVar[tuple[str, str]] = ("J", "F")
 
     def __init__(
         self, J: ufl.Form, F: ufl.Form, *as_forms: Any, u: fem.Function, strains: ufl.Form | None

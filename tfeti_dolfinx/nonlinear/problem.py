@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import ufl
@@ -22,6 +22,7 @@ from tfeti_dolfinx.nonlinear.state import InternalVariables, NewValue
 from tfeti_dolfinx.nonlinear.tangent import rotation_free_tangent
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.report import Report
+from tfeti_dolfinx.solution import SavedState
 
 
 @dataclass(frozen=True)
@@ -112,6 +113,8 @@ class NonlinearContactProblem(ContactProblem):
         InputError: Something given does not fit; the message names it.
     """
 
+    form_name: ClassVar[str] = "J"
+
     def __init__(
         self,
         F: ufl.Form,
@@ -147,6 +150,7 @@ class NonlinearContactProblem(ContactProblem):
         self._first = self._begin = np.array(u.x.array)
         self._last_increment = self._tolerances.loosest
         self._places = CurrentPlaces(u, self.dofs) if finite else None
+        self._doubts.finite = self._finite
 
     def _forms(self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any) -> NewtonForms:
         given = (a, L, V, self.decomposition, *options)
@@ -323,6 +327,41 @@ class NonlinearContactProblem(ContactProblem):
             self._state.commit()
             self._begin = np.array(self.u.x.array)
             self._set(self._begin)
+
+    def state(self) -> SavedState:
+        """Return the last accepted solution, with internal variables, for ``restore``."""
+        state = super().state()
+        return replace(state, internal=np.concatenate([np.zeros(0), *self._state.values()]))
+
+    def restore(self, state: SavedState) -> None:
+        """Go on where another run of the same program has been.
+
+        Raises:
+            InputError: As ``ContactProblem.restore``, or of other internal variables.
+        """
+        try:
+            super().restore(state)
+        finally:
+            if self._places is not None:
+                self._places.back()
+        self._begin = np.array(self.u.x.array)
+
+    def _check_state(self, state: SavedState) -> None:
+        super()._check_state(state)
+        expected = sum(len(value) for value in self._state.values())
+        if state.internal.shape != (expected,):
+            raise InputError(
+                f"the state has {state.internal.size} values of internal variables on this rank; "
+                f"expected {expected}, those of state="
+            )
+
+    def _take_motion(self, state: SavedState) -> None:
+        sizes = [len(value) for value in self._state.values()]
+        self._state.set(np.split(state.internal, np.cumsum(sizes)[:-1]) if sizes else [])
+        self._begin = self.dofs.to_dolfinx(state.u)
+        self._set(self._begin)
+        if self._places is not None:
+            self._go_to_places(self._places)
 
     def _return(self) -> None:
         super()._return()
