@@ -49,6 +49,11 @@ class NewtonTolerances:
             most this: its directions of conjugate gradients then serve the next problems, too.
         settled: And where the increment was at most this share of the load step's first one.
         anderson: Iterates that Anderson's acceleration combines.
+        dependent: Eigenvalues of the Gram matrix of its differences below this share of the largest
+            are taken for 0.
+        slow: A kept model is made anew where an increment is more than this share of the last one.
+        other: Anderson's acceleration begins anew where an increment is so many times the last
+            one, as with rows of new places.
         shift: Where a tangent in finite strain cannot be factored, a form with the same kernel is
             added, beside its mean diagonal first the square of this, then its inverse times as
             much; from tangent to tangent it falls by this factor.
@@ -66,7 +71,9 @@ class NewtonTolerances:
     keeping: float = 0.5
     settled: float = 0.05
     anderson: int = 5
-    new_map: float = 2.0
+    dependent: float = 1e-12
+    slow: float = 0.7
+    other: float = 2.0
     shift: float = 0.1
 
 
@@ -190,7 +197,8 @@ class NonlinearContactProblem(ContactProblem):
     def _newton(self, total: Totals) -> None:
         tol, exact, comm = self._tolerances, self._exact, self.decomposition.comm
         forms, expected = self._newton_forms, self._last_increment
-        faster, first, before = Anderson(tol.anderson, comm), 0.0, np.inf
+        faster = Anderson(tol, comm)
+        first = before = 0.0  # sizes of d: the load step's first one, and the last one
         for step in range(tol.max_it):
             u = np.array(self.u.x.array)
             # 1. model
@@ -209,20 +217,18 @@ class NonlinearContactProblem(ContactProblem):
                 self._set(u + d)
                 return
             # 4. step
-            if size > tol.new_map * before:  # rows of new places
-                faster.forget()
             if step == 0:  # what conditions prescribe is met from then on
                 first, self._last_increment = size, min(increment, tol.loosest)
-                self._set(u + t * d)
-            elif self._finite or forms.kept:
-                self._set(faster.next(u, d, t))
-            else:
-                self._set(u + t * d)
+            slow = forms.kept and size > tol.slow * before
+            if slow or size > tol.other * before:
+                faster.forget()
+            exact_model = step == 0 or not (self._finite or forms.kept)
+            self._set(u + t * d if exact_model else faster.next(u, d, t))
             if self._smallest_volume() <= 0.0:
                 faster.forget()
                 self._set(u + t * d)
             in_line = t == 1.0 and remainder <= tol.keeping and size <= tol.settled * first
-            forms.kept = in_line and not (self._finite and short)
+            forms.kept = in_line and not slow and not (self._finite and short)
             before = size
         raise ConvergenceError(
             f"Newton's method: the increment is still {increment:.1e} of the displacement after "
@@ -399,12 +405,12 @@ class Anderson:
     """Anderson's acceleration of u ← u + d: the last differences of d in least squares.
 
     Args:
-        depth: Most differences.
+        tolerances: Those of Newton's method.
         comm: Communicator.
     """
 
-    def __init__(self, depth: int, comm: MPI.Intracomm) -> None:
-        self._depth, self._comm = depth, comm
+    def __init__(self, tolerances: NewtonTolerances, comm: MPI.Intracomm) -> None:
+        self._depth, self._rcond, self._comm = tolerances.anderson, tolerances.dependent, comm
         self.forget()
 
     def forget(self) -> None:
@@ -419,7 +425,7 @@ class Anderson:
             steps = d[:, None] - np.array(self._steps).T
             gram = summed(self._comm, steps.T @ np.column_stack((steps, d)))
             gram = bcast_from_root(self._comm, gram)
-            share = np.linalg.lstsq(gram[:, :-1], gram[:, -1], rcond=None)[0]
+            share = np.linalg.lstsq(gram[:, :-1], gram[:, -1], rcond=self._rcond)[0]
             moved = end - (u[:, None] - np.array(self._places).T + t * steps) @ share
         self._steps = [*self._steps, d][-self._depth :]
         self._places = [*self._places, u][-self._depth :]
