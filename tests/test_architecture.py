@@ -27,6 +27,7 @@ ROOMS = [
     ["system", "output", "plot"],
     ["accuracy"],
     ["problem"],
+    ["nonlinear"],
     ["steps"],
     # optional: nothing imports them but by their names in extensions.PLUGINS
     ["bem", "clusters", "pseudoinverse"],

@@ -48,6 +48,8 @@ from tfeti_dolfinx.forms.elasticity import Elasticity
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dolfinx_input import decompose
 from tfeti_dolfinx.mesh.gmsh_reading import read_gmsh
+from tfeti_dolfinx.nonlinear.materials import J2Plasticity
+from tfeti_dolfinx.nonlinear.problem import NewtonTolerances, NonlinearContactProblem
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.report import Report
@@ -78,8 +80,11 @@ __all__ = [
     "FactorError",
     "InputError",
     "Interior",
+    "J2Plasticity",
     "LoadSteps",
+    "NewtonTolerances",
     "NoSolutionError",
+    "NonlinearContactProblem",
     "Obstacle",
     "Options",
     "Plane",

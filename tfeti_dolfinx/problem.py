@@ -106,9 +106,11 @@ class Stepping:
 
     Attributes:
         defaults: Options, by name, that have other defaults than their own.
+        form_name: Name of the bilinear form, for messages.
     """
 
     defaults: ClassVar[Mapping[str, Any]] = {}
+    form_name: ClassVar[str] = "a"
 
     u: fem.Function
     dofs: TornDofs
@@ -346,7 +348,7 @@ class ContactProblem(Stepping):
             given |= {"stress": stress, "u": u, "boundary_elements": boundary_elements}
             given |= {"form_compiler_options": form_compiler_options, **self._settings.given}
             given |= self._given_besides()
-        V = displacement_space(a, decomposition)
+        V = displacement_space(a, decomposition, self.form_name)
         self.bcs = checked_conditions(bcs, V)
         self.u = fem.Function(V, name="displacement") if u is None else self._checked_u(u, V)
         self._given_stress = stress

@@ -78,6 +78,7 @@ class Report:
         friction_iterations: Problems with given bounds that were solved for Coulomb's friction.
         friction_newton_steps: Steps of Newton's method on Coulomb's law, beside these problems.
         friction_last: Multiplications by F of the last of these problems.
+        newton_steps: Steps of Newton's method of a nonlinear problem, each a linearised problem.
         outer_iterations: Outer iterations.
         newton_faces: Faces that block Newton has solved on.
         cg_steps: Conjugate gradient steps.
@@ -148,6 +149,7 @@ class Report:
     friction_iterations: int = _counter()
     friction_newton_steps: int = _counter()
     friction_last: int = 0
+    newton_steps: int = 0
     outer_iterations: int = _counter()
     newton_faces: int = _counter()
     cg_steps: int = _counter()

@@ -420,6 +420,7 @@ class SavedState:
         predicted: Multipliers of this rank's rows of the predictor, empty without one.
         size: That of the step which the matrix was made for, shape ``()``; 0 without inertia.
         directions: What ``Recycled`` keeps of earlier solves, shape ``(2, m, k)``.
+        internal: Internal variables of a nonlinear problem, one after the other; else empty.
         image: Fλ; empty where it is not known.
         predicted_image: The same of the predictor.
     """
@@ -439,6 +440,7 @@ class SavedState:
     predicted: Array = field(default_factory=lambda: np.zeros(0))
     size: Array = field(default_factory=lambda: np.zeros(()))
     directions: Array = field(default_factory=lambda: np.zeros((2, 0, 0)))
+    internal: Array = field(default_factory=lambda: np.zeros(0))
     image: Array = field(default_factory=lambda: np.zeros(0))
     predicted_image: Array = field(default_factory=lambda: np.zeros(0))
 
@@ -546,7 +548,8 @@ def check_state(
         _check_broken(name, getattr(state, name).ndim == count)
     for name in ("image", "predicted", "predicted_image"):
         _check_broken(name, getattr(state, name).shape in ((0,), rows))
-    for name in ("u", "lam", "mu", "norm", "slip", "velocity", "load", "predicted", "directions"):
+    numbers = ("u", "lam", "mu", "norm", "slip", "velocity", "load", "predicted")
+    for name in (*numbers, "directions", "internal"):
         _check_broken(name, bool(np.all(np.isfinite(getattr(state, name)))))
     for name, size in (("contact", contacts), ("group", dofs.num_groups)):
         values = getattr(state, name)

@@ -197,6 +197,7 @@ class System:
         bcs: Dirichlet conditions.
         friction: What bounds tangential forces.
         elements: Stiffness and load of subdomains.
+        origin: Displacement in primal order at which the mesh is, in finite strain; else None.
     """
 
     def __init__(
@@ -216,6 +217,7 @@ class System:
             FiniteElements(dofs) if method is None else method.assembly(dofs, decomposition)
         )
         self._stages, self._counters, self._counted = Stages(), Counters(), 0
+        self.origin: Array | None = None
         self._seen = 0.0  # of ‖F‖, which more rows hardly change
         self._K: Any = None
         self._search: ContactSearch | None = None
@@ -239,6 +241,11 @@ class System:
     def dual(self) -> Dual:
         """The dual problem."""
         return made(self._dual)
+
+    @property
+    def subdomains(self) -> Subdomains:
+        """The subdomains with their factors."""
+        return made(self._subdomains)
 
     def look_for_changes(self) -> None:
         """See whether the mesh, or what forms and Dirichlet conditions refer to, has changed.
@@ -344,7 +351,9 @@ class System:
 
     def _find_contacts(self) -> None:
         dofs, cut = self._dofs, self._decomposition
-        self._search = ContactSearch(self._contacts, dofs, cut, self._blocks)
+        self._search = ContactSearch(self._contacts, dofs, cut, self._blocks, self.origin)
+        if self.origin is not None:  # sides stay those of the first search
+            self._contacts[:] = self._search.contacts
         if self._known_rows is not None:
             self._search.take_rows(*self._known_rows)
             self._known_rows = None

@@ -45,10 +45,14 @@ class Diagnostics:
     Args:
         decomposition: The torn mesh.
         dofs: Dof maps.
+
+    Attributes:
+        finite: Whether kinematics are not linear, so that bodies may turn.
     """
 
     def __init__(self, decomposition: Decomposition, dofs: TornDofs) -> None:
         self._decomposition, self._dofs = decomposition, dofs
+        self.finite = False
         self._of: Dual | None = None
         self._lasting: list[str] = []
 
@@ -136,7 +140,7 @@ class Diagnostics:
     def _turned(self, u: Array, subdomains: Subdomains) -> Iterator[str]:
         """Bodies that turn farther than linear kinematics bears."""
         bs = self._dofs.bs
-        if bs != self._decomposition.mesh.geometry.dim or bs == 1:
+        if self.finite or bs != self._decomposition.mesh.geometry.dim or bs == 1:
             return
         x, angles = self._points(subdomains), []
         for part in subdomains.dof_parts:

@@ -12,7 +12,12 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root
 from tfeti_dolfinx.contact.friction import friction_values
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, check_together
-from tfeti_dolfinx.contact.records import ContactRecords, concatenate, remaining_gaps
+from tfeti_dolfinx.contact.records import (
+    ContactRecords,
+    concatenate,
+    relative_displacement,
+    remaining_gaps,
+)
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import diameter
@@ -32,6 +37,8 @@ class ContactSearch:
         dofs: Dof maps.
         decomposition: The torn mesh.
         stiffness: Block of K of each primal node, shape ``(num_nodes, bs, bs)``.
+        origin: Displacement in primal order at which the mesh is; None: 0. Gaps are those of the
+            total displacement.
 
     Attributes:
         contacts: The contacts with their sides decided: of a pair the secondary one comes first.
@@ -48,8 +55,9 @@ class ContactSearch:
         dofs: TornDofs,
         decomposition: Decomposition,
         stiffness: Array,
+        origin: Array | None = None,
     ) -> None:
-        self._dofs, self._decomposition = dofs, decomposition
+        self._dofs, self._decomposition, self._origin = dofs, decomposition, origin
         self.length = bcast_from_root(dofs.comm, diameter(decomposition))
         reach = [contact.first_reach(decomposition) for contact in contacts]
         self._depths = bcast_from_root(dofs.comm, reach)
@@ -60,7 +68,7 @@ class ContactSearch:
             for i, contact in enumerate(contacts)
         ]
         self.contacts = [contact for contact, _ in settled]
-        self._records = [records for _, records in settled]
+        self._records = [self._from_origin(records) for _, records in settled]
 
     @property
     def records(self) -> ContactRecords:
@@ -132,7 +140,8 @@ class ContactSearch:
 
     def _take_in(self, i: int, u: Array, tolerance: float) -> int:
         """Give rows to violated conditions of one contact; return the number of new rows."""
-        known, nodal = self._records[i], u.reshape(-1, self._dofs.bs)
+        way = u if self._origin is None else u - self._origin
+        known, nodal = self._records[i], way.reshape(-1, self._dofs.bs)
         bound = self.contacts[i].displacement_bound(self._dofs, self._decomposition, nodal)
         moved = bcast_from_root(self._dofs.comm, bound)
         tried = [(known, self._reach[i])]
@@ -193,7 +202,8 @@ class ContactSearch:
         if self._reach[i] < self.contacts[i].horizon(self.length):
             found = self._search(i, reach)
         self._reach[i] = reach
-        self._records[i] = replace(found, within_reach=found.within_reach | (found.gap <= reach))
+        distance = found.gap if self._origin is None else found.geometric_gap
+        self._records[i] = replace(found, within_reach=found.within_reach | (distance <= reach))
         return self._count(self._records[i].within_reach) - before
 
     def _search(self, i: int, reach: float) -> ContactRecords:
@@ -201,7 +211,14 @@ class ContactSearch:
         dofs, known, depth = self._dofs, self._records[i], self._depths[i]
         found = self.contacts[i].records(dofs, self._decomposition, i, reach, depth)
         had_rows = np.isin(found.group, known.group[known.within_reach])
-        return replace(found, within_reach=had_rows)
+        return replace(self._from_origin(found), within_reach=had_rows)
+
+    def _from_origin(self, found: ContactRecords) -> ContactRecords:
+        """Conditions with the gaps of the total displacement."""
+        if self._origin is None:
+            return found
+        way = relative_displacement(found, self._dofs, self._origin)
+        return replace(found, gap=found.gap + np.sum(found.normal * way, axis=1))
 
     def _count(self, flags: Array) -> int:
         return int(self._dofs.comm.allreduce(int(np.sum(flags))))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from hashlib import blake2b
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import ufl
@@ -65,6 +65,7 @@ class Forms:
         jit_options: As in DOLFINx.
 
     Attributes:
+        names: Those of the bilinear and the linear form, for messages.
         given: The forms as they were given, by their names.
         thickness: What the forms were multiplied with, a number or a scalar in UFL; 1 until it is
             set.
@@ -72,6 +73,8 @@ class Forms:
     Raises:
         InputError: A form cannot be integrated on the torn mesh, or not be compiled.
     """
+
+    names: ClassVar[tuple[str, str]] = ("a", "L")
 
     def __init__(
         self,
@@ -95,16 +98,18 @@ class Forms:
 
     def replace_stiffness(self, a: ufl.Form) -> None:
         """Take another bilinear form on the same space."""
-        check_form(a, "a", self._V, self._decomposition)
-        self._a, self._of_a = self._compiled(a, "a"), data_of(a, self._V)
-        self.given = {**self.given, "a": a}
+        name = self.names[0]
+        check_form(a, name, self._V, self._decomposition)
+        self._a, self._of_a = self.compiled(a, name), data_of(a, self._V)
+        self.given = {**self.given, name: a}
 
     def replace_load(self, L: ufl.Form | ufl.ZeroBaseForm) -> None:
         """Take another linear form on the same space."""
-        check_form(L, "L", self._V, self._decomposition)
-        self._L = None if is_zero(L) else self._compiled(L, "L")
+        name = self.names[1]
+        check_form(L, name, self._V, self._decomposition)
+        self._L = None if is_zero(L) else self.compiled(L, name)
         self._of_L = data_of(L, self._V)
-        self.given = {**self.given, "L": L}
+        self.given = {**self.given, name: L}
         self._volume_of_L: ufl.Form | fem.Form | None = cell_integrals(L)
 
     def has_new_points(self) -> bool:
@@ -134,17 +139,17 @@ class Forms:
         if self._volume_of_L is None:
             return None
         if isinstance(self._volume_of_L, ufl.Form):  # few problems ask for it
-            self._volume_of_L = self._compiled(self._volume_of_L, "L")
+            self._volume_of_L = self.compiled(self._volume_of_L, "L")
         return np.array(fem.assemble_vector(self._volume_of_L).array)
 
     def hats(self) -> Array:
         """Return integrals of the hats over the cells, for each of DOLFINx's nodes."""
         one = fem.Constant(self._V.mesh, (1.0,) + (0.0,) * (self._V.dofmap.bs - 1))
         dx = ufl.Measure("dx", domain=self._V.mesh)
-        form = self._compiled(ufl.dot(one, ufl.TestFunction(self._V)) * dx, "the volume")
+        form = self.compiled(ufl.dot(one, ufl.TestFunction(self._V)) * dx, "the volume")
         return np.array(fem.assemble_vector(form).array[:: self._V.dofmap.bs])
 
-    def _compiled(self, form: ufl.Form, name: str) -> fem.Form:
+    def compiled(self, form: ufl.Form, name: str) -> fem.Form:
         """Return the form compiled by DOLFINx, which fails on all ranks or on none."""
         comm = self._decomposition.comm
         with raised_on_all_ranks(comm), named(f"{name} cannot be compiled"):

@@ -23,6 +23,8 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition, check_tags, known_ta
 from tfeti_dolfinx.mesh.dofs import check_space, described, is_same_space
 from tfeti_dolfinx.mesh.untorn import cell_facets
 
+# linear forms, a load and a residual, and the bilinear ones beside them
+LINEAR = {"L": "a", "F": "J"}
 ARITY = {1: "linear", 2: "bilinear"}
 FUNCTIONS = ("test", "trial")
 KINDS = {"cell": "dx", "exterior_facet": "ds", "interior_facet": "dS"}
@@ -47,18 +49,18 @@ def check_form(form: Any, name: str, V: fem.FunctionSpace, decomposition: Decomp
 
     Args:
         form: The form; a linear one may be zero.
-        name: ``"a"`` or ``"L"``.
+        name: ``"a"`` or ``"L"``, of nonlinear problems ``"J"`` or ``"F"``.
         V: The space of displacements.
         decomposition: The torn mesh.
 
     Raises:
         InputError: The form's space, coefficients, geometry, measures or tags do not fit.
     """
-    if name == "L":
+    if name in LINEAR:
         if is_zero(form):
             return
         (space,) = _argument_spaces(form, name, 1)
-        check_same_space(space, V, "the test function of L", "that of a")
+        check_same_space(space, V, f"the test function of {name}", f"that of {LINEAR[name]}")
     for integral in form.integrals():
         check_mesh(integral.integrand(), name, decomposition)
     _check_measures(form, name, decomposition)

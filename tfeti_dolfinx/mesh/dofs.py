@@ -139,6 +139,7 @@ class TornDofs:
         copy_offsets: First copy of each owned group, shape ``(g + 1,)``.
         copies: Global primal nodes of the owned groups, by subdomain, shape ``(c,)``.
         copy_subdomains: Their subdomains, shape ``(c,)``.
+        nodes: Places of DOLFINx's nodes in finite strain, shape ``(n, 3)``; None: on the mesh.
 
     Raises:
         InputError: ``V`` is not a space for displacements on the torn mesh.
@@ -150,6 +151,7 @@ class TornDofs:
         self.comm = decomposition.comm
         self.bs = V.dofmap.index_map_bs
         self._number_nodes(decomposition)
+        self.nodes: Array | None = None
         self.offsets = chunk_offsets(self.comm, self.num_nodes)
         origin, key = node_keys(V, decomposition)
         self._find_groups(decomposition, origin[self.dolfinx_node], key[self.dolfinx_node])
@@ -158,6 +160,11 @@ class TornDofs:
     def num_nodes(self) -> int:
         """Primal nodes of this rank."""
         return len(self.dolfinx_node)
+
+    def points(self) -> Array:
+        """Return the place of each primal node, shape ``(n, 3)``."""
+        x = self.V.tabulate_dof_coordinates() if self.nodes is None else self.nodes
+        return np.asarray(x[self.dolfinx_node])
 
     @property
     def num_groups(self) -> int:

@@ -84,8 +84,7 @@ def surface_nodes(dofs: TornDofs, decomposition: Decomposition, facets: Array) -
 
 def group_points(dofs: TornDofs) -> Array:
     """Return coordinates of the owned groups, shape ``(g, 3)``. Collective."""
-    x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node]
-    return dofs.reduce(x, np.minimum, np.inf)
+    return dofs.reduce(dofs.points(), np.minimum, np.inf)
 
 
 def extent(decomposition: Decomposition, facets: Array) -> float:

@@ -108,7 +108,7 @@ def subdomain_data(
         trace: Local primal unknowns that rows of B touch, ascending.
     """
     gdim = decomposition.mesh.geometry.dim
-    x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node, :gdim]
+    x = dofs.points()[:, :gdim]
     shares = 1.0 / dofs.spread(dofs.multiplicity)
     frames = _body_frames(dofs, decomposition, x, shares)
     loads, starts = dofs.to_primal(f), dofs.node_offsets * dofs.bs

@@ -1,0 +1,153 @@
+"""Nonlinear bodies above rigid planes by PETSc's active set Newton method, on the untorn mesh."""
+
+import basix.ufl
+import numpy as np
+import ufl
+from dolfinx import fem
+from dolfinx import mesh as dmesh
+from dolfinx.fem import petsc as fem_petsc
+from mpi4py import MPI
+from petsc4py import PETSc
+from scipy.spatial import cKDTree
+
+
+def block(gdim, n, bulge, comm=MPI.COMM_SELF):
+    """A block [0, 2] × ([0, 1] ×) [0, 1], whose lower side is a bulge above the plane 0.
+
+    Returns the mesh and tags of its lower (1) and upper (2) side.
+    """
+    if gdim == 2:
+        mesh = dmesh.create_rectangle(
+            comm, [[0.0, 0.0], [2.0, 1.0]], (2 * n, n), dmesh.CellType.quadrilateral
+        )
+    else:
+        mesh = dmesh.create_box(
+            comm, [[0.0] * 3, [2.0, 1.0, 1.0]], (2 * n, n, n), dmesh.CellType.hexahedron
+        )
+    x, up = mesh.geometry.x, gdim - 1
+    low = bulge * (0.02 + (x[:, 0] - 1.0) ** 2 + (0.5 * x[:, 1] ** 2 if gdim == 3 else 0.0))
+    height = x[:, up].copy()
+    mesh.topology.create_connectivity(gdim - 1, gdim)
+    sides = [
+        dmesh.locate_entities_boundary(mesh, gdim - 1, lambda p, z=z: np.isclose(p[up], z))
+        for z in (0.0, 1.0)
+    ]
+    x[:, up] += low * (1.0 - height)
+    facets = np.concatenate(sides)
+    values = np.repeat(np.array([1, 2], dtype=np.int32), [len(side) for side in sides])
+    order = np.argsort(facets)
+    return mesh, dmesh.meshtags(mesh, gdim - 1, facets[order], values[order])
+
+
+def above_plane(F, J, u, bcs, touching, up, starts):
+    """Yield u for each start of a load step: F(u) = 0 where u_up + x_up ≥ 0 allows it.
+
+    Args:
+        F: Residual.
+        J: Its derivative.
+        u: The displacement, changed in place.
+        bcs: Dirichlet conditions.
+        touching: Nodes that may not go below 0.
+        up: The axis.
+        starts: Called before each step: set values, return nothing.
+    """
+    V = u.function_space
+    residual, jacobian = fem.form(F), fem.form(J)
+    points, bs = V.tabulate_dof_coordinates(), V.dofmap.bs
+    low, high = fem.Function(V), fem.Function(V)
+    low.x.array[:], high.x.array[:] = -1e10, 1e10
+    low.x.array[bs * touching + up] = -points[touching, up]
+    x = fem.Function(V)
+
+    def function(_, y, f):
+        y.copy(u.x.petsc_vec)
+        f.set(0.0)
+        fem_petsc.assemble_vector(f, residual)
+        fem_petsc.apply_lifting(f, [jacobian], bcs=[bcs], x0=[y], alpha=-1.0)
+        fem_petsc.set_bc(f, bcs, y, -1.0)
+
+    def derivative(_, y, A, P):
+        A.zeroEntries()
+        fem_petsc.assemble_matrix(A, jacobian, bcs=bcs)
+        A.assemble()
+
+    A, b = fem_petsc.create_matrix(jacobian), x.x.petsc_vec.duplicate()
+    snes = PETSc.SNES().create(MPI.COMM_SELF)
+    snes.setFunction(function, b)
+    snes.setJacobian(derivative, A, A)
+    snes.setType("vinewtonrsls")
+    snes.setTolerances(rtol=1e-13, atol=1e-13, stol=0.0, max_it=100)
+    snes.getKSP().setType("preonly")
+    snes.getKSP().getPC().setType("lu")
+    snes.setVariableBounds(low.x.petsc_vec, high.x.petsc_vec)
+    for start in starts:
+        start()
+        for bc in bcs:
+            bc.set(x.x.array)
+        np.maximum(x.x.array, low.x.array, out=x.x.array)
+        snes.solve(None, x.x.petsc_vec)
+        assert snes.getConvergedReason() > 0
+        u.x.array[:] = x.x.array
+        yield np.array(x.x.array.reshape(-1, bs))
+    snes.destroy()
+
+
+def nearest_nodes(V, W):
+    """For each node of W that of V at the same place."""
+    distance, found = cKDTree(V.tabulate_dof_coordinates()).query(W.tabulate_dof_coordinates())
+    assert np.all(distance < 1e-12)
+    return found
+
+
+class SimplePlasticity:
+    """J2 with linear hardening, plane strain or in space, by UFL alone: the return in one form."""
+
+    def __init__(self, u, E, nu, sy, H, degree):
+        mesh = u.function_space.mesh
+        self.u, self.sy, self.H = u, sy, H
+        self.mu, self.bulk = E / 2 / (1 + nu), E / 3 / (1 - 2 * nu)
+        cell, self.gdim = mesh.basix_cell(), mesh.geometry.dim
+        self.dx = ufl.dx(
+            domain=mesh, metadata={"quadrature_degree": degree, "quadrature_scheme": "default"}
+        )
+        tensor = basix.ufl.quadrature_element(cell, value_shape=(9,), degree=degree)
+        scalar = basix.ufl.quadrature_element(cell, degree=degree)
+        self.ep = fem.Function(fem.functionspace(mesh, tensor))
+        self.p = fem.Function(fem.functionspace(mesh, scalar))
+        _, dp, n = self._returned()
+        new = self._ep() + dp * n
+        self.state = {
+            self.ep: ufl.as_vector([new[i, j] for i in range(3) for j in range(3)]),
+            self.p: self.p + dp,
+        }
+
+    def _ep(self):
+        return ufl.as_matrix([[self.ep[3 * i + j] for j in range(3)] for i in range(3)])
+
+    def strain(self, w):
+        e = ufl.sym(ufl.grad(w))
+        if self.gdim == 3:
+            return e
+        return ufl.as_matrix([[e[0, 0], e[0, 1], 0], [e[1, 0], e[1, 1], 0], [0, 0, 0]])
+
+    def _returned(self):
+        e = self.strain(self.u)
+        s = 2 * self.mu * ufl.dev(e - self._ep())
+        q = ufl.sqrt(1.5 * ufl.inner(s, s) + 1e-24)
+        f = q - (self.sy + self.H * self.p)
+        dp = ufl.conditional(ufl.gt(f, 1e-12), f / (3 * self.mu + self.H), 0.0)
+        n = 1.5 * s / q
+        return self.bulk * ufl.tr(e) * ufl.Identity(3) + s - 2 * self.mu * dp * n, dp, n
+
+    def residual(self, v):
+        return ufl.inner(self._returned()[0], self.strain(v)) * self.dx
+
+
+def neo_hooke(u, E, nu):
+    """Energy per volume of a compressible neo-Hookean body, in plane strain or in space."""
+    g = ufl.grad(u)
+    if len(u) == 2:
+        g = ufl.as_matrix([[g[0, 0], g[0, 1], 0], [g[1, 0], g[1, 1], 0], [0, 0, 0]])
+    F = ufl.Identity(3) + g
+    J, mu, lmbda = ufl.det(F), E / 2 / (1 + nu), E * nu / (1 + nu) / (1 - 2 * nu)
+    return mu / 2 * (ufl.tr(F.T * F) - 3) - mu * ufl.ln(J) + lmbda / 2 * ufl.ln(J) ** 2

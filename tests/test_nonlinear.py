@@ -1,0 +1,315 @@
+"""Nonlinear bodies in contact beside independent solvers, and exact identities."""
+
+import gmsh
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+import tfeti_dolfinx as tfeti
+from tests.nonlinear_reference import (
+    SimplePlasticity,
+    above_plane,
+    block,
+    nearest_nodes,
+    neo_hooke,
+)
+from tfeti_dolfinx.nonlinear.state import InternalVariables
+
+E, NU = 1.0, 0.3
+DX = {"metadata": {"quadrature_degree": 4}}
+
+
+def torn(comm, gdim, n, bulge, subdomains):
+    """The block of ``nonlinear_reference``, torn."""
+    mesh, tags = block(gdim, n, bulge, comm)
+    surfaces = {"low": 1, "top": 2}
+    return tfeti.decompose(mesh, subdomains, facet_tags=tags, surfaces=surfaces)
+
+
+def plane(gdim):
+    up = np.eye(gdim)[-1]
+    return tfeti.Obstacle("low", tfeti.Plane((0.0,) * gdim, normal=tuple(up)))
+
+
+def held_top(V, decomposition):
+    """A displacement of the upper side, and its condition."""
+    gdim = decomposition.mesh.geometry.dim
+    value = fem.Constant(decomposition.mesh, (0.0,) * gdim)
+    dofs = fem.locate_dofs_topological(V, gdim - 1, decomposition.facets("top"))
+    return value, fem.dirichletbc(value, dofs, V)
+
+
+def reference(gdim, n, bulge, make, path):
+    """Displacements of all steps by PETSc's solver, and their space."""
+    mesh, tags = block(gdim, n, bulge)
+    V = fem.functionspace(mesh, ("Lagrange", 1, (gdim,)))
+    u, v, du = fem.Function(V), ufl.TestFunction(V), ufl.TrialFunction(V)
+    F, state = make(u, v)
+    internal = InternalVariables(state, mesh)
+    value = fem.Constant(mesh, (0.0,) * gdim)
+    low, top = (fem.locate_dofs_topological(V, gdim - 1, tags.find(tag)) for tag in (1, 2))
+    bcs, steps = [fem.dirichletbc(value, top, V)], []
+
+    def start(down):
+        if steps:
+            internal.commit()
+        value.value[-1] = down
+
+    starts = [lambda down=down: start(down) for down in path]
+    for found in above_plane(F, ufl.derivative(F, u, du), u, bcs, low, gdim - 1, starts):
+        steps.append(found)
+    return V, steps
+
+
+def test_plasticity_is_that_of_an_active_set_method(comm):
+    """Loading, unloading to above the plane, reloading: u of every step to 1e-8 of its size."""
+    path, sy, H = [-0.04, -0.08, -0.03, 0.01, -0.05, -0.1], 0.01, 0.05
+
+    def make(u, v):
+        law = SimplePlasticity(u, E, NU, sy, H, 2)
+        return law.residual(v), law.state
+
+    W, steps = reference(2, 5, 0.05, make, path)
+    decomposition = torn(comm, 2, 5, 0.05, 4)
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+    u, v, du = fem.Function(V), ufl.TestFunction(V), ufl.TrialFunction(V)
+    elastic = tfeti.Elasticity(decomposition, E=E, nu=NU, model="plane_strain")
+    law = tfeti.J2Plasticity(elastic, u, yield_stress=sy, hardening=H)
+    value, bc = held_top(V, decomposition)
+    problem = tfeti.NonlinearContactProblem(
+        law.residual(v),
+        u,
+        [bc],
+        [plane(2)],
+        decomposition,
+        J=law.tangent(du, v),
+        state=law.state,
+        update=law.update,
+        stress=law.stress,
+        petsc_options={"rtol": 1e-9},
+    )
+    nodes = nearest_nodes(W, V)
+    for down, expected in zip(path, steps, strict=True):
+        value.value[-1] = down
+        problem.solve()
+        problem.accept()
+        error = np.abs(u.x.array.reshape(-1, 2) - expected[nodes]).max(initial=0.0)
+        assert comm.allreduce(error, op=MPI.MAX) < 1e-8 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize(("gdim", "n", "down"), [(2, 5, -0.4), (3, 2, -0.3)])
+def test_finite_strain_is_that_of_an_active_set_method(gdim, n, down, comm):
+    path = down * np.linspace(0.25, 1.0, 4)
+
+    def make(u, v):
+        return ufl.derivative(neo_hooke(u, E, NU) * ufl.dx(**DX), u, v), {}
+
+    W, steps = reference(gdim, n, 0.2, make, path)
+    decomposition = torn(comm, gdim, n, 0.2, 4)
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (gdim,)))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    value, bc = held_top(V, decomposition)
+    F = make(u, v)[0]
+    problem = tfeti.NonlinearContactProblem(
+        F, u, [bc], [plane(gdim)], decomposition, finite=True, petsc_options={"rtol": 2e-9}
+    )
+    nodes, x = nearest_nodes(W, V), decomposition.mesh.geometry.x.copy()
+    for move, expected in zip(path, steps, strict=True):
+        value.value[-1] = move
+        problem.solve()
+        problem.accept()
+        error = np.abs(u.x.array.reshape(-1, gdim) - expected[nodes]).max(initial=0.0)
+        assert comm.allreduce(error, op=MPI.MAX) < 1e-8 * np.abs(expected).max()
+    assert np.array_equal(decomposition.mesh.geometry.x, x)
+
+
+def test_a_turned_body_has_no_stress(comm):
+    """A block that is turned by 90° in steps has stresses of rounding only."""
+    decomposition = torn(comm, 2, 4, 0.05, 3)
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    turned = fem.Function(V)
+    dofs = fem.locate_dofs_topological(V, 1, decomposition.facets("top"))
+    F = ufl.derivative(neo_hooke(u, E, NU) * ufl.dx(**DX), u, v)
+    problem = tfeti.NonlinearContactProblem(
+        F,
+        u,
+        [fem.dirichletbc(turned, dofs)],
+        [],
+        decomposition,
+        finite=True,
+        petsc_options={"rtol": 1e-11},
+    )
+    for angle in np.linspace(0.0, np.pi / 2, 7)[1:]:
+        c, s = np.cos(angle), np.sin(angle)
+        turned.interpolate(
+            lambda x, c=c, s=s: (c * x[0] - s * x[1] - x[0], s * x[0] + c * x[1] - x[1])
+        )
+        problem.solve()
+        problem.accept()
+        error = np.abs(u.x.array - turned.x.array).max(initial=0.0)
+        assert comm.allreduce(error, op=MPI.MAX) < 1e-9
+
+
+def plastic(comm, hardening=0.05):
+    """The block of J2 material, its problem, and the constant that moves its upper side."""
+    decomposition = torn(comm, 2, 4, 0.05, 3)
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+    u, v, du = fem.Function(V), ufl.TestFunction(V), ufl.TrialFunction(V)
+    elastic = tfeti.Elasticity(decomposition, E=E, nu=NU, model="plane_strain")
+    law = tfeti.J2Plasticity(elastic, u, yield_stress=0.01, hardening=hardening)
+    value, bc = held_top(V, decomposition)
+    F, J = law.residual(v), law.tangent(du, v)
+    given = {"J": J, "state": law.state, "update": law.update, "petsc_options": {"rtol": 1e-8}}
+    problem = tfeti.NonlinearContactProblem(F, u, [bc], [plane(2)], decomposition, **given)
+    return problem, law, value
+
+
+def test_series_goes_on_from_its_checkpoint(comm, shared_tmp):
+    """Load steps with internal variables: stopped, resumed, the same as in one run."""
+    times = [1.0, 2.0, 3.0, 4.0]
+
+    def series(until, folder, resume=False):
+        problem, law, value = plastic(comm)
+
+        def apply(_, t):
+            value.value[-1] = -0.06 * np.sin(0.6 * t)
+
+        steps = tfeti.LoadSteps(problem, apply, times[:until], checkpoint=shared_tmp / folder)
+        steps.run(resume=resume)
+        return problem.u.x.array.copy(), law.p.x.array.copy()
+
+    whole = series(4, "whole")
+    series(2, "parts")
+    for found, expected in zip(series(4, "parts", resume=True), whole, strict=True):
+        assert np.abs(found - expected).max(initial=0.0) < 1e-7 * 0.06
+
+
+def test_a_step_that_is_given_up_leaves_no_trace(comm):
+    """What was not accepted is gone after ``go_back``: displacement and internal variables."""
+    problem, law, value = plastic(comm)
+    value.value[-1] = -0.05
+    problem.solve()
+    problem.accept()
+    u, p = problem.u.x.array.copy(), law.p.x.array.copy()
+    value.value[-1] = -0.09
+    problem.solve()
+    problem.go_back()
+    assert np.array_equal(problem.u.x.array, u)
+    assert np.array_equal(law.p.x.array, p)
+
+
+def test_perfect_plasticity_keeps_the_stress_below_yield(comm):
+    problem, law, value = plastic(comm, hardening=0.0)
+    for down in (-0.04, -0.05, -0.06):
+        value.value[-1] = down
+        problem.solve()
+        problem.accept()
+    law.update()
+    assert law.regularisation > 0.0
+    assert comm.allreduce(law.p.x.array.max(initial=0.0), op=MPI.MAX) > 1e-3
+
+
+@pytest.mark.parametrize("degree", [1, 2])
+def test_patch_of_two_finite_bodies_is_exact(degree, comm):
+    """Two blocks that do not match, pressed by a twentieth: homogeneous strain, ν = 0."""
+    decomposition = two_blocks(comm)
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", degree, (2,)))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    F = ufl.derivative(neo_hooke(u, E, 0.0) * ufl.dx(**DX), u, v)
+    value = fem.Constant(decomposition.mesh, 0.0)
+    bcs = [
+        fem.dirichletbc(
+            constant, fem.locate_dofs_topological(V.sub(i), 1, decomposition.facets(name)), V.sub(i)
+        )
+        for name, i, constant in (("top", 1, value), ("floor", 1, 0.0), ("left", 0, 0.0))
+    ]
+    problem = tfeti.NonlinearContactProblem(
+        F,
+        u,
+        bcs,
+        [tfeti.Contact("under", "over")],
+        decomposition,
+        finite=True,
+        petsc_options={"rtol": 1e-9},
+    )
+    for move in (-0.05, -0.1):
+        value.value = move
+        problem.solve()
+        problem.accept()
+    exact = ufl.as_vector((0, 0.5 * move * ufl.SpatialCoordinate(V.mesh)[1]))
+    error = fem.form(ufl.inner(u - exact, u - exact) * ufl.dx)
+    assert comm.allreduce(fem.assemble_scalar(error)) ** 0.5 < 1e-8
+
+
+def two_blocks(comm):
+    """Two blocks of height 1, one upon the other, whose meshes do not match."""
+    if comm.rank == 0:
+        gmsh.initialize()
+        gmsh.option.setNumber("General.Terminal", 0)
+        model = gmsh.model
+        model.add("blocks")
+        lines = {}
+        for name, y, h in (("lower", 0.0, 0.4), ("upper", 1.0, 0.27)):
+            places = ((0.0, y), (1.5, y), (1.5, y + 1), (0.0, y + 1))
+            points = [model.geo.addPoint(a, b, 0, h) for a, b in places]
+            lines[name] = [model.geo.addLine(points[i], points[(i + 1) % 4]) for i in range(4)]
+            loop = model.geo.addCurveLoop(lines[name])
+            surface = model.geo.addPlaneSurface([loop])
+            model.geo.synchronize()
+            model.addPhysicalGroup(2, [surface], name=name)
+        low, up = lines["lower"], lines["upper"]
+        groups = {"floor": [low[0]], "under": [low[2]], "over": [up[0]], "top": [up[2]]}
+        groups["left"] = [low[3], up[3]]
+        for name, tags in groups.items():
+            model.addPhysicalGroup(1, tags, name=name)
+        model.mesh.generate(2)
+    decomposition = tfeti.read_gmsh(gmsh.model if comm.rank == 0 else None, comm, subdomains=5)
+    if comm.rank == 0:
+        gmsh.finalize()
+    return decomposition
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"F": "square"}, "F"),
+        ({"J": "skew"}, "not symmetric"),
+        ({"finite": True}, "no J"),
+        ({"state": {1: 2}}, "state: a key"),
+        ({"update": 3}, "update"),
+        ({"u": None}, "u is"),
+    ],
+)
+def test_mistakes_are_named(change, said, comm):
+    decomposition = torn(comm, 2, 2, 0.05, 2)
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+    u, v, du = fem.Function(V), ufl.TestFunction(V), ufl.TrialFunction(V)
+    elastic = tfeti.Elasticity(decomposition, E=E, nu=NU, model="plane_strain")
+    _, bc = held_top(V, decomposition)
+    forms = {"F": elastic.a(u, v), "J": elastic.a(du, v)}
+    if change.get("F") == "square":
+        change = {"F": ufl.inner(v, v) * ufl.inner(u, v) * ufl.dx}
+    if change.get("J") == "skew":
+        change = {"J": forms["J"] + 0.1 * du[0].dx(1) * v[1] * ufl.dx}
+    given = {**forms, "u": u, **change}
+    F, u = given.pop("F"), given.pop("u")
+    with pytest.raises(tfeti.InputError, match=said):
+        tfeti.NonlinearContactProblem(F, u, [bc], [plane(2)], decomposition, **given).solve()
+
+
+def test_a_law_that_gives_no_number_is_named(comm):
+    decomposition = torn(comm, 2, 2, 0.05, 2)
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    elastic = tfeti.Elasticity(decomposition, E=E, nu=NU, model="plane_strain")
+    value, bc = held_top(V, decomposition)
+    F = elastic.a(u, v) + ufl.sqrt(1e-3 - u[1] ** 2) * v[0] * ufl.dx
+    J = elastic.a(ufl.TrialFunction(V), v)
+    problem = tfeti.NonlinearContactProblem(F, u, [bc], [plane(2)], decomposition, J=J)
+    value.value[-1] = -0.3
+    with pytest.raises(tfeti.TfetiError, match="not finite"):
+        problem.solve()
+    assert np.all(problem.u.x.array == 0.0)

@@ -1,0 +1,1 @@
+"""Nonlinear bodies in contact: materials with and without a memory, small and finite strain."""

@@ -1,0 +1,146 @@
+"""Forms of Newton's method: its matrix and load, on the mesh as it was or as it is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, ClassVar
+
+import basix
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from scipy.sparse import csr_array
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.compat import assemble_csr, geometry_dofmap
+from tfeti_dolfinx.common.parallel import summed
+from tfeti_dolfinx.forms.assembly import Data, Forms
+from tfeti_dolfinx.mesh.dofs import TornDofs
+
+# degree of the quadrature whose points det F is looked at
+DEGREE = 4
+
+
+class NewtonForms(Forms):
+    """Matrix J(u) and load J u − F(u) of the linearised problem at u.
+
+    Its solution is the next displacement, not an increment, which would be rounding of u in the
+    end. Creation and all methods are collective.
+
+    Args:
+        J: Derivative of F.
+        F: Residual.
+        as_forms: The other arguments of ``Forms``.
+        u: The displacement.
+        strains: In finite strain the form ∫(Fᵀ∇w)_sym : (Fᵀ∇v)_sym; forms are integrated over the
+            mesh as it was, wherever it is. None in small strain.
+
+    Attributes:
+        shift: So many times ``strains`` is added to J, beside the mean of its diagonal: where a
+            material softens J is indefinite, and the residual stays as it is.
+        kept: Whether matrix, rows and factors stay as they are, though u changes.
+    """
+
+    names: ClassVar[tuple[str, str]] = ("J", "F")
+
+    def __init__(
+        self, J: ufl.Form, F: ufl.Form, *as_forms: Any, u: fem.Function, strains: ufl.Form | None
+    ) -> None:
+        self._u, self.kept, self._new_matrix, self.shift = u, False, True, 0.0
+        self._x = u.function_space.mesh.geometry.x
+        self._reference = None if strains is None else self._x.copy()
+        self._matrix: csr_array | None = None
+        super().__init__(J, F, *as_forms)
+        self._strains = None if strains is None else self.compiled(strains, "the strains")
+        self._of_shift = Data(lambda: [np.array(self.shift)], u.function_space.mesh.comm)
+
+    def has_new_points(self) -> bool:
+        """Return whether the mesh has moved since the last call; never where all is kept."""
+        return not self.kept and super().has_new_points()
+
+    def has_new_stiffness(self) -> bool:
+        """Return whether J has changed since the last call; never where it is kept."""
+        changed = not self.kept and super().has_new_stiffness()
+        self._new_matrix = self._of_shift.has_changed() or changed
+        return self._new_matrix
+
+    def has_new_load(self) -> bool:
+        """Return whether u, or what F and J refer to, has changed since the last call."""
+        return super().has_new_load() or self._new_matrix
+
+    def stiffness(self) -> Any:
+        """Return this rank's J(u)."""
+        with self._in_place():
+            self._matrix = K = super().stiffness()
+            if self.shift and self._strains is not None:
+                G = assemble_csr(self._strains)
+                sizes = np.array([np.abs(K.diagonal()).sum(), G.diagonal().sum()])
+                total, of_strains = summed(self._u.function_space.mesh.comm, sizes)
+                self._matrix = K + (self.shift * total / of_strains) * G
+        return self._matrix.copy()  # Blocks take their data from it
+
+    def load(self) -> Array:
+        """Return this rank's J u − F(u)."""
+        assert self._matrix is not None  # stages make it before
+        owned = self._matrix.shape[1]
+        return np.asarray(self._matrix @ self._u.x.array[:owned] - self.residual())
+
+    def residual(self) -> Array:
+        """Return this rank's F(u)."""
+        with self._in_place():
+            return super().load()
+
+    @contextmanager
+    def _in_place(self) -> Iterator[None]:
+        """Integrate over the mesh as it was, in finite strain."""
+        here = self._x.copy()
+        if self._reference is not None:
+            self._x[:] = self._reference
+        try:
+            yield
+        finally:
+            self._x[:] = here
+
+
+class CurrentPlaces:
+    """The places X + u of a mesh and of its nodes. Creation and ``move`` are collective.
+
+    Args:
+        u: The displacement.
+        dofs: Its dof maps, whose nodes move, too.
+    """
+
+    def __init__(self, u: fem.Function, dofs: TornDofs) -> None:
+        V = u.function_space
+        self._u, self._dofs, self._mesh = u, dofs, V.mesh
+        self._points, self._nodes = V.mesh.geometry.x.copy(), V.tabulate_dof_coordinates()
+        element = V.mesh.ufl_domain().ufl_coordinate_element()
+        self._at_points = fem.Function(fem.functionspace(V.mesh, element))
+        cells = np.asarray(self._at_points.function_space.dofmap.list)
+        self._from, self._to = cells.ravel(), geometry_dofmap(V.mesh)[: len(cells)].ravel()
+        det = ufl.det(ufl.Identity(len(u)) + ufl.grad(u))
+        points, _ = basix.make_quadrature(V.mesh.basix_cell(), DEGREE)
+        self._det = fem.Expression(det, points)
+        self._cells = np.arange(len(cells), dtype=np.int32)
+
+    def move(self) -> None:
+        """Put mesh and nodes to X + u, u as it is now."""
+        gdim = self._mesh.geometry.dim
+        self._at_points.interpolate(self._u)
+        moved = self._at_points.x.array.reshape(-1, gdim)
+        self._mesh.geometry.x[self._to, :gdim] = self._points[self._to, :gdim] + moved[self._from]
+        nodes = self._nodes.copy()
+        nodes[:, :gdim] += self._u.x.array.reshape(-1, gdim)
+        self._dofs.nodes = nodes
+
+    def back(self) -> None:
+        """Put them to where they were. Not collective."""
+        self._mesh.geometry.x[:] = self._points
+        self._dofs.nodes = None
+
+    def smallest_volume_ratio(self) -> float:
+        """Return the smallest det F at points of cells, u as it is now. Collective."""
+        own = float(np.min(self._det.eval(self._mesh, self._cells), initial=np.inf))
+        return float(self._mesh.comm.allreduce(own, op=MPI.MIN))

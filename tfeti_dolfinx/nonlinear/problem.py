@@ -1,0 +1,432 @@
+"""Nonlinear bodies in contact by Newton's method, each step a contact problem of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+from tfeti_dolfinx.common.arrays import TINY, Array
+from tfeti_dolfinx.common.parallel import bcast_from_root, largest, summed
+from tfeti_dolfinx.common.validation import checked_callable, checked_flag, checked_type
+from tfeti_dolfinx.contact.partner import ContactPartner
+from tfeti_dolfinx.errors import ConvergenceError, FactorError, InputError, TfetiError
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.nonlinear.forms import CurrentPlaces, NewtonForms
+from tfeti_dolfinx.nonlinear.state import InternalVariables, NewValue
+from tfeti_dolfinx.nonlinear.tangent import rotation_free_tangent
+from tfeti_dolfinx.problem import ContactProblem
+from tfeti_dolfinx.report import Report
+from tfeti_dolfinx.solution import SavedState
+
+
+@dataclass(frozen=True)
+class NewtonTolerances:
+    """Tolerances of Newton's method with the contact inside.
+
+    Attributes:
+        max_it: Most linearised problems in a load step.
+        safety: What the next increment is expected to be is multiplied with, before it is compared
+            with the tolerance.
+        forcing: Share of the expected increment to which a linearised problem is solved (the
+            forcing term of Eisenstat and Walker).
+        loosest: Relative tolerance of a linearised problem at most: a rough displacement may open
+            contacts that the next step has to close again.
+        final: Share of ``rtol`` to which the last linearised problems are solved at least, so that
+            increments can fall below ``rtol``.
+        curvature: A step is shortened where the residual along it, contact forces included, has
+            at its end more than this share of its value at its begin, with the other sign.
+        max_line_search: Most residuals that a line search assembles.
+        rounding: Share of dᵀD d, D the diagonal of J, that is rounding of dᵀJ d: a rigid step has
+            no energy.
+        shortest: Length at which a step that turns cells inside out is given up.
+        keeping: A tangent is kept, with its rows and factors, where the last remainder was at
+            most this: its directions of conjugate gradients then serve the next problems, too.
+        settled: And where the increment was at most this share of the load step's first one.
+        anderson: Iterates that Anderson's acceleration combines.
+        dependent: Eigenvalues of the Gram matrix of its differences below this share of the largest
+            are taken for 0.
+        slow: A kept model is made anew where an increment is more than this share of the last one.
+        other: Anderson's acceleration begins anew where an increment is so many times the last
+            one, as with rows of new places.
+        shift: Where a tangent in finite strain cannot be factored, a form with the same kernel is
+            added, beside its mean diagonal first the square of this, then its inverse times as
+            much; from tangent to tangent it falls by this factor.
+    """
+
+    max_it: int = 50
+    safety: float = 10.0
+    forcing: float = 0.1
+    loosest: float = 1e-2
+    final: float = 0.2
+    curvature: float = 0.5
+    max_line_search: int = 12
+    rounding: float = 1e-13
+    shortest: float = 0.01
+    keeping: float = 0.5
+    settled: float = 0.05
+    anderson: int = 5
+    dependent: float = 1e-12
+    slow: float = 0.7
+    other: float = 2.0
+    shift: float = 0.1
+
+
+class NonlinearContactProblem(ContactProblem):
+    """Nonlinear bodies in contact, by Newton's method with the contact inside.
+
+    Mirrors ``dolfinx.fem.petsc.NonlinearProblem``. One load step is the minimum of an incremental
+    potential over the displacements that conditions and contacts allow. A Newton step minimises
+    its quadratic model over the same set: a ``ContactProblem`` with the stiffness J(u) and the
+    load J(u) u − F(u). Its multipliers start the next one. All is collective.
+
+    Newton's method, u the iterate, û the solution of the linearised problem, d = û − u:
+
+    1. *Model.* Assemble J(u), or keep it with rows and factors where the last step was short and
+       in line with it. Solve the contact problem for û, to the forcing term of Eisenstat and
+       Walker.
+    2. *Line search.* r(t) = F(u + t d; d) + λᵀB d is the slope along d of the potential with the
+       contact forces of û, and r(0) = −dᵀJ d < 0. Where r(1) is much larger than 0, the step has
+       gone beyond the minimum, and t is a root of r. |r(1)/r(0)| is the remainder.
+    3. *End* where |d|, or the remainder times |d|, which the next one is expected to be, is at
+       most rtol |u| in the maximum norm; with rows of where the bodies are.
+    4. *Step.* u ← u + t d; where t = 1 and J is not the derivative of F, or kept, accelerated by
+       Anderson's method.
+
+    Args:
+        F: Residual F(u; v), a linear form in a test function on a Lagrange space of the torn mesh.
+        u: The displacement in F. It is the start of the first load step, and has the solution.
+        bcs: Dirichlet conditions on the displacement.
+        contacts: Obstacles and pairs of surfaces.
+        decomposition: The torn mesh.
+        J: Derivative of F, a symmetric bilinear form; default ``ufl.derivative(F, u)``.
+        state: Internal variables: for each function what gives its value at the end of a load
+            step, see ``InternalVariables``. They are committed by ``accept``.
+        update: Called without arguments when ``u`` has changed, before a form is assembled: for
+            functions in F and J that depend on u.
+        finite: Whether strains and displacements are finite: F is integrated on the mesh as it
+            was, contact and friction act where the bodies are, at X + u. J may not be given: the
+            tangent knows no rotations, see ``rotation_free_tangent``. After each solve
+            ``decomposition.mesh`` is where it was.
+        tolerances: Those of Newton's method.
+        others: As for ``ContactProblem``; ``rtol`` is that of the displacement.
+
+    Raises:
+        InputError: Something given does not fit; the message names it.
+    """
+
+    form_name: ClassVar[str] = "J"
+
+    def __init__(
+        self,
+        F: ufl.Form,
+        u: fem.Function,
+        bcs: Sequence[fem.DirichletBC],
+        contacts: Sequence[ContactPartner],
+        decomposition: Decomposition,
+        *,
+        J: ufl.Form | None = None,
+        state: Mapping[fem.Function, NewValue] | None = None,
+        update: Callable[[], None] | None = None,
+        finite: bool = False,
+        tolerances: NewtonTolerances | None = None,
+        **others: Any,
+    ) -> None:
+        checked_type(u, fem.Function, "u", "the dolfinx.fem.Function that F is a residual of")
+        checked_type(F, ufl.Form, "F", "a linear form")
+        if update is not None:
+            checked_callable(update, "update", "a function without arguments")
+        self._tolerances = NewtonTolerances() if tolerances is None else tolerances
+        self._strains: ufl.Form | None = None
+        self._update, self._finite = update, checked_flag(finite, "finite")
+        if finite and J is not None:
+            raise InputError("finite=True: expected no J, since the tangent is made from F")
+        if finite:
+            J, self._strains = rotation_free_tangent(F, u)
+        elif J is None:
+            J = ufl.derivative(F, u)
+        checked_type(J, ufl.Form, "J", "a bilinear form")
+        self._state = InternalVariables({} if state is None else state, decomposition.mesh)
+        super().__init__(J, F, bcs, contacts, decomposition, u=u, **others)
+        self._exact = self.options.number
+        self._first = self._begin = np.array(u.x.array)
+        self._last_increment = self._tolerances.loosest
+        self._places = CurrentPlaces(u, self.dofs) if finite else None
+        self._doubts.finite = self._finite
+
+    def _forms(self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any) -> NewtonForms:
+        given = (a, L, V, self.decomposition, *options)
+        return NewtonForms(*given, u=self.u, strains=self._strains)
+
+    @property
+    def _newton_forms(self) -> NewtonForms:
+        forms = self._system.forms
+        assert isinstance(forms, NewtonForms)
+        return forms
+
+    def solve(self) -> fem.Function:
+        """Solve the load step from the last displacement on.
+
+        Returns:
+            The displacement, on the torn mesh.
+
+        Raises:
+            InputError: As ``ContactProblem.solve``.
+            NoSolutionError: A linearised problem has no solution.
+            ConvergenceError: Newton's method, or a linearised problem, did not converge. ``u`` is
+                where the load step began.
+            FactorError: A tangent stiffness could not be factored.
+        """
+        begin, total = np.array(self.u.x.array), Totals(self.report)
+        try:
+            self._newton(total)
+        except TfetiError:  # on all ranks
+            self._set(begin)
+            raise
+        finally:
+            self._newton_forms.kept = False
+            self.options = replace(self.options, rtol=self._exact)
+            total.enter(self.report)
+        return self.u
+
+    def _newton(self, total: Totals) -> None:
+        tol, exact, comm = self._tolerances, self._exact, self.decomposition.comm
+        forms, expected = self._newton_forms, self._last_increment
+        faster = Anderson(tol, comm)
+        first = before = 0.0  # sizes of d: the load step's first one, and the last one
+        for step in range(tol.max_it):
+            u = np.array(self.u.x.array)
+            # 1. model
+            rtol = float(np.clip(tol.forcing * expected, tol.final * exact, tol.loosest))
+            self._solve_linearised(rtol)
+            total.add(self.report)
+            d = self.u.x.array - u
+            size = largest(comm, d)
+            increment = size / max(largest(comm, self.u.x.array), TINY)
+            # 2. line search
+            t, remainder = self._line_search(u, d)
+            expected = min(remainder, 1.0) * increment
+            # 3. end
+            short = increment <= exact or (t == 1.0 and tol.safety * expected <= exact)
+            if short and rtol <= exact and not (self._finite and forms.kept):
+                self._set(u + d)
+                return
+            # 4. step
+            if step == 0:  # what conditions prescribe is met from then on
+                first, self._last_increment = size, min(increment, tol.loosest)
+            slow = forms.kept and size > tol.slow * before
+            if slow or size > tol.other * before:
+                faster.forget()
+            exact_model = step == 0 or not (self._finite or forms.kept)
+            self._set(u + t * d if exact_model else faster.next(u, d, t))
+            if self._smallest_volume() <= 0.0:
+                faster.forget()
+                self._set(u + t * d)
+            in_line = t == 1.0 and remainder <= tol.keeping and size <= tol.settled * first
+            forms.kept = in_line and not slow and not (self._finite and short)
+            before = size
+        raise ConvergenceError(
+            f"Newton's method: the increment is still {increment:.1e} of the displacement after "
+            f"{tol.max_it} steps; expected {exact:.0e}: smaller load steps, or a tangent J that is "
+            "the derivative of F"
+        )
+
+    def _solve_linearised(self, rtol: float) -> None:
+        """Solve the contact problem of the model at u. Collective."""
+        self.options = replace(self.options, rtol=rtol)
+        if self._places is None or self._newton_forms.kept:
+            super().solve()
+            return
+        forms, tol = self._newton_forms, self._tolerances
+        self._go_to_places(self._places)
+        forms.shift = forms.shift * tol.shift if forms.shift > tol.shift**3 else 0.0
+        try:
+            while True:
+                try:
+                    super().solve()
+                    return
+                except FactorError:  # on all ranks
+                    forms.shift = max(forms.shift / tol.shift, tol.shift**2)
+                    if forms.shift > 1.0 / tol.shift:
+                        raise
+        finally:
+            self._places.back()
+
+    def _go_to_places(self, places: CurrentPlaces) -> None:
+        """Let contact and rigid motions be those of X + u. Collective."""
+        places.move()
+        self._system.origin = self.dofs.to_primal(self.u.x.array)
+        self._system.friction.rest = self.dofs.to_primal(self._begin)
+
+    def _set(self, u: Array) -> None:
+        """Take a displacement, and what depends on it. Collective."""
+        self.u.x.array[:] = u
+        if self._update is not None:
+            self._update()
+
+    def _smallest_volume(self) -> float:
+        """Return the smallest det F; 1 in small strain. Collective."""
+        return 1.0 if self._places is None else self._places.smallest_volume_ratio()
+
+    def _line_search(self, u: Array, d: Array) -> tuple[float, float]:
+        """Return the length t in (0, 1] of the step d from u, and |r(1)/r(0)|. Collective."""
+        tol = self._tolerances
+        subdomains, primal = self._system.subdomains, self.dofs.to_primal(d)
+        diagonal = sum(
+            float(block.diagonal @ primal[part] ** 2)
+            for block, part in zip(subdomains.blocks, subdomains.dof_parts, strict=True)
+        )
+        own = np.array([sum(subdomains.energies(primal)), diagonal])
+        energy, diagonal = summed(self.decomposition.comm, own)
+        start, rounding = -float(energy), tol.rounding * float(diagonal)
+        forces = start - self._slope(u, d, 0.0)  # λᵀB d, since J d + F(u) + Bᵀλ = 0
+        b, high = self._longest(u, d, forces)
+        if high <= max(tol.curvature * abs(start), rounding):
+            return b, abs(high / start) if abs(high) > rounding else 0.0
+        a, low, remainder = 0.0, start, abs(high / start)
+        for _ in range(tol.max_line_search):  # regula falsi in Illinois' form
+            t = b - high * (b - a) / (high - low)
+            slope = self._slope(u, d, t) + forces
+            if abs(slope) <= tol.curvature * abs(start):
+                break
+            if slope > 0.0:
+                b, high, low = t, slope, 0.5 * low
+            else:
+                a, low, high = t, slope, 0.5 * high
+        return t, remainder
+
+    def _longest(self, u: Array, d: Array, forces: float) -> tuple[float, float]:
+        """Return the longest step that leaves no cell inside out, and r at its end. Collective."""
+        t = 1.0
+        while t >= self._tolerances.shortest:
+            self._set(u + t * d)
+            if self._smallest_volume() > 0.0:
+                slope = self._slope(u, d, t) + forces
+                if np.isfinite(slope):
+                    return t, slope
+            t *= 0.5
+        raise ConvergenceError(
+            f"Newton's method: a step shortened to {t:.1e} still turns a cell inside out (det F "
+            "≤ 0), or gives a residual that is not finite; expected smaller load steps"
+        )
+
+    def _slope(self, u: Array, d: Array, t: float) -> float:
+        """F(u + t d; d). Collective."""
+        self._set(u + t * d)
+        own = self._newton_forms.residual() @ d
+        return float(summed(self.decomposition.comm, np.array([own]))[0])
+
+    def accept(self) -> None:
+        """Take the last solution as the end of a load step; internal variables are committed.
+
+        Raises:
+            InputError: As ``ContactProblem.accept``.
+        """
+        before, _ = self._accepted
+        super().accept()
+        if self._accepted[0] is not before:
+            self._state.commit()
+            self._begin = np.array(self.u.x.array)
+            self._set(self._begin)
+
+    def state(self) -> SavedState:
+        """Return the last accepted solution, with internal variables, for ``restore``."""
+        state = super().state()
+        return replace(state, internal=np.concatenate([np.zeros(0), *self._state.values()]))
+
+    def restore(self, state: SavedState) -> None:
+        """Go on where another run of the same program has been.
+
+        Raises:
+            InputError: As ``ContactProblem.restore``, or of other internal variables.
+        """
+        try:
+            super().restore(state)
+        finally:
+            if self._places is not None:
+                self._places.back()
+        self._begin = np.array(self.u.x.array)
+
+    def _check_state(self, state: SavedState) -> None:
+        super()._check_state(state)
+        expected = sum(len(value) for value in self._state.values())
+        if state.internal.shape != (expected,):
+            raise InputError(
+                f"the state has {state.internal.size} values of internal variables on this rank; "
+                f"expected {expected}, those of state="
+            )
+
+    def _take_motion(self, state: SavedState) -> None:
+        sizes = [len(value) for value in self._state.values()]
+        self._state.set(np.split(state.internal, np.cumsum(sizes)[:-1]) if sizes else [])
+        self._begin = self.dofs.to_dolfinx(state.u)
+        self._set(self._begin)
+        if self._places is not None:
+            self._go_to_places(self._places)
+
+    def _return(self) -> None:
+        super()._return()
+        if self._solution is None:
+            self.u.x.array[:] = self._first
+        self._set(self.u.x.array)
+
+
+class Totals:
+    """Counters and seconds of the linearised problems of a load step, for its report."""
+
+    def __init__(self, report: Report) -> None:
+        names = [f.name for f in fields(report) if f.metadata.get("adds")]
+        self._sums: dict[str, float] = dict.fromkeys(names, 0)
+        self._seconds: dict[str, float] = {}
+        self.steps = 0
+
+    def add(self, report: Report) -> None:
+        """Add those of a linearised problem."""
+        self.steps += 1
+        for name in self._sums:
+            self._sums[name] += getattr(report, name)
+        for name, value in report.seconds.items():
+            self._seconds[name] = self._seconds.get(name, 0.0) + value
+
+    def enter(self, report: Report) -> None:
+        """Enter the sums in the report of the load step."""
+        for name, value in self._sums.items():
+            setattr(report, name, value)
+        report.seconds = self._seconds
+        report.newton_steps = self.steps
+
+
+class Anderson:
+    """Anderson's acceleration of u ← u + d: the last differences of d in least squares.
+
+    Args:
+        tolerances: Those of Newton's method.
+        comm: Communicator.
+    """
+
+    def __init__(self, tolerances: NewtonTolerances, comm: MPI.Intracomm) -> None:
+        self._depth, self._rcond, self._comm = tolerances.anderson, tolerances.dependent, comm
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget the iterates so far."""
+        self._steps: list[Array] = []
+        self._places: list[Array] = []
+
+    def next(self, u: Array, d: Array, t: float) -> Array:
+        """Return the next iterate after u, whose step is t d. Collective."""
+        end = moved = u + t * d
+        if self._steps:
+            steps = d[:, None] - np.array(self._steps).T
+            gram = summed(self._comm, steps.T @ np.column_stack((steps, d)))
+            gram = bcast_from_root(self._comm, gram)
+            share = np.linalg.lstsq(gram[:, :-1], gram[:, -1], rcond=self._rcond)[0]
+            moved = end - (u[:, None] - np.array(self._places).T + t * steps) @ share
+        self._steps = [*self._steps, d][-self._depth :]
+        self._places = [*self._places, u][-self._depth :]
+        return moved

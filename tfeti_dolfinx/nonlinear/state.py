@@ -1,0 +1,98 @@
+"""Internal variables of materials: functions that get new values at the end of a load step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.compat import interpolation_points
+from tfeti_dolfinx.common.validation import checked_type, named, shown
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+
+NewValue = Any  # a UFL expression, or a callable that returns an array of the function's size
+
+
+class InternalVariables:
+    """Internal variables with what gives their values at the end of a step. Collective.
+
+    Args:
+        given: For each function on the torn mesh (a quadrature or discontinuous space) a UFL
+            expression of its new value, in terms of the displacement and of old values, or a
+            callable without arguments that returns the new ``x.array``.
+        mesh: The torn mesh.
+
+    Raises:
+        InputError: A function or its new value does not fit; the message names it.
+    """
+
+    def __init__(self, given: Mapping[fem.Function, NewValue], mesh: Any) -> None:
+        self._comm: MPI.Intracomm = mesh.comm
+        self._new: list[tuple[fem.Function, Callable[[], Array]]] = []
+        checked_type(given, Mapping, "state", "a dictionary from functions to their new values")
+        for function, value in given.items():
+            checked_type(function, fem.Function, "state: a key", "a dolfinx.fem.Function")
+            name = f"state: the new value of {function.name}"
+            if function.function_space.mesh is not mesh:
+                raise InputError(f"state: {function.name} is on another mesh than the torn one")
+            if callable(value) and not isinstance(value, ufl.core.expr.Expr):
+                self._new.append((function, value))
+                continue
+            if getattr(value, "ufl_shape", None) != function.ufl_shape:
+                raise InputError(
+                    f"{name} is {shown(value)}; expected a UFL expression of shape "
+                    f"{function.ufl_shape}, or a callable"
+                )
+            with raised_on_all_ranks(self._comm), named(f"{name} cannot be compiled"):
+                self._new.append((function, _evaluated(value, function)))
+
+    @property
+    def functions(self) -> list[fem.Function]:
+        """The functions, in the order in which they were given."""
+        return [function for function, _ in self._new]
+
+    def values(self) -> list[Array]:
+        """Return copies of the present values."""
+        return [np.array(function.x.array) for function in self.functions]
+
+    def set(self, values: list[Array]) -> None:
+        """Set values that ``values`` has returned."""
+        for function, value in zip(self.functions, values, strict=True):
+            function.x.array[:] = value
+
+    def commit(self) -> None:
+        """Take the values at the end of a step: all are evaluated before any is set. Collective.
+
+        Raises:
+            InputError: A value is not finite, or a callable fails. Nothing has changed.
+        """
+        found = []
+        with raised_on_all_ranks(self._comm):
+            for function, value in self._new:
+                with named(f"state: the new value of {function.name}"):
+                    new = np.asarray(value(), dtype=float)
+                if new.shape != function.x.array.shape or not np.all(np.isfinite(new)):
+                    raise InputError(
+                        f"state: the new value of {function.name} has the shape {new.shape} or is "
+                        f"not finite; expected finite numbers of shape {function.x.array.shape}"
+                    )
+                found.append(new)
+        self.set(found)
+
+
+def _evaluated(value: Any, function: fem.Function) -> Callable[[], Array]:
+    """Return a callable that interpolates an expression into the space of a function."""
+    V = function.function_space
+    expression = fem.Expression(value, interpolation_points(V))
+    target = fem.Function(V)
+
+    def evaluate() -> Array:
+        target.interpolate(expression)
+        return np.array(target.x.array)
+
+    return evaluate

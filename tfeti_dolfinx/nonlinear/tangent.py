@@ -1,0 +1,91 @@
+"""The tangent of finite strain that has rigid motions about the current places in its kernel."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import ufl
+from dolfinx import fem
+from ufl.algorithms import expand_derivatives
+from ufl.algorithms.map_integrands import map_integrand_dags
+from ufl.constantvalue import Zero
+from ufl.corealg.multifunction import MultiFunction
+from ufl.corealg.traversal import unique_pre_traversal
+
+from tfeti_dolfinx.errors import InputError
+
+
+class GradientReplaced(MultiFunction):  # type: ignore[misc]
+    """Replace ∇v in a residual by a tensor, and v itself, as body forces have it, by 0.
+
+    Args:
+        v: The test function of the residual.
+        gradient: What ∇v becomes.
+    """
+
+    def __init__(self, v: Any, gradient: Any) -> None:
+        super().__init__()
+        self._v, self._gradient = v, expand_derivatives(gradient)
+
+    expr = MultiFunction.reuse_if_untouched
+
+    def grad(self, o: Any) -> Any:
+        """Map ∇v; other gradients stay."""
+        if o.ufl_operands[0] == self._v:
+            return self._gradient
+        if self._v in set(unique_pre_traversal(o)):
+            raise InputError("F: second derivatives of the test function; expected first ones")
+        return o
+
+    def argument(self, o: Any) -> Any:
+        """Map v to 0."""
+        return Zero(o.ufl_shape) if o == self._v else o
+
+
+def rotation_free_tangent(F: ufl.Form, u: fem.Function) -> tuple[ufl.Form, ufl.Form]:
+    """Return a tangent of a residual whose kernel are the rigid motions about X + u.
+
+    With F = I + ∇u, the first Piola–Kirchhoff stress P and S = F⁻¹P the tangent along w has a
+    material part, ∫E(w) : C : E(v), E(w) = sym(Fᵀ∇w), and a geometric one, ∫∇w S : ∇v = ∫P : Aᵀ∇v,
+    A = ∇w F⁻¹. A body under stress resists rotations by the latter, so the whole has a smaller
+    kernel, and is often indefinite. Here F⁻ᵀE(w) and F⁻ᵀE(v) take the place of ∇w and ∇v in the
+    geometric part: what stretches a body is as stiff as it is, and rotations, E = 0, cost nothing.
+    Forces on facets that turn with the body have no part in it.
+
+    Args:
+        F: Residual, linear in its test function, for instance ∫P(u):∇v dx less that of loads.
+        u: The displacement.
+
+    Returns:
+        The tangent, and ∫E(w) : E(v), whose kernel is the same.
+    """
+    F = expand_derivatives(F)
+    (v,) = F.arguments()
+    w = ufl.TrialFunction(u.function_space)
+    inside = ufl.Form([i for i in F.integrals() if i.integral_type() == "cell"])
+    on_facets = [
+        i
+        for i in F.integrals()
+        if i.integral_type() != "cell" and not _has_gradient_of(i.integrand(), u)
+    ]
+    tangent = ufl.derivative(ufl.Form([*inside.integrals(), *on_facets]), u, w)
+    deformation = ufl.Identity(len(u)) + ufl.grad(u)
+    inverse = ufl.inv(deformation)
+
+    def strain(y: Any) -> Any:
+        return ufl.sym(deformation.T * ufl.grad(y))
+
+    def geometric(of_w: Any, of_v: Any) -> ufl.Form:
+        gradient = (of_w * inverse).T * of_v
+        return map_integrand_dags(GradientReplaced(v, gradient), inside)
+
+    whole = geometric(ufl.grad(w), ufl.grad(v))
+    of_stretches = geometric(inverse.T * strain(w), inverse.T * strain(v))
+    measure = ufl.dx(domain=u.function_space.mesh)
+    return tangent - whole + of_stretches, ufl.inner(strain(w), strain(v)) * measure
+
+
+def _has_gradient_of(expression: Any, u: fem.Function) -> bool:
+    """Return whether ∇u is in an expression."""
+    gradients = (e for e in unique_pre_traversal(expression) if isinstance(e, ufl.classes.Grad))
+    return any(e.ufl_operands[0] == u for e in gradients)
