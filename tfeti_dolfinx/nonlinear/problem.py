@@ -66,7 +66,7 @@ class NewtonTolerances:
     final: float = 0.2
     curvature: float = 0.5
     max_line_search: int = 12
-    rounding: float = 1e-13
+    rounding: float = 1e-11
     shortest: float = 0.01
     keeping: float = 0.5
     settled: float = 0.05
@@ -93,8 +93,9 @@ class NonlinearContactProblem(ContactProblem):
     2. *Line search.* r(t) = F(u + t d; d) + λᵀB d is the slope along d of the potential with the
        contact forces of û, and r(0) = −dᵀJ d < 0. Where r(1) is much larger than 0, the step has
        gone beyond the minimum, and t is a root of r. |r(1)/r(0)| is the remainder.
-    3. *End* where |d|, or the remainder times |d|, which the next one is expected to be, is at
-       most rtol |u| in the maximum norm; with rows of where the bodies are.
+    3. *End* where |d| is at most rtol |u| in the maximum norm, in finite strain with rows of where
+       the bodies are; in small strain where the remainder times |d| is, which the next one is
+       expected to be.
     4. *Step.* u ← u + t d; where t = 1 and J is not the derivative of F, or kept, accelerated by
        Anderson's method.
 
@@ -212,7 +213,9 @@ class NonlinearContactProblem(ContactProblem):
             t, remainder = self._line_search(u, d)
             expected = min(remainder, 1.0) * increment
             # 3. end
-            short = increment <= exact or (t == 1.0 and tol.safety * expected <= exact)
+            short = increment <= exact
+            if not self._finite:  # whose slopes do not see rotations
+                short |= t == 1.0 and tol.safety * expected <= exact
             if short and rtol <= exact and not (self._finite and forms.kept):
                 self._set(u + d)
                 return
@@ -286,9 +289,11 @@ class NonlinearContactProblem(ContactProblem):
         start, rounding = -float(energy), tol.rounding * float(diagonal)
         forces = start - self._slope(u, d, 0.0)  # λᵀB d, since J d + F(u) + Bᵀλ = 0
         b, high = self._longest(u, d, forces)
+        # of a step that is rigid, or nearly, slopes are rounding and say nothing
+        remainder = abs(high / start) if abs(start) > rounding else 1.0
         if high <= max(tol.curvature * abs(start), rounding):
-            return b, abs(high / start) if abs(high) > rounding else 0.0
-        a, low, remainder = 0.0, start, abs(high / start)
+            return b, remainder
+        a, low = 0.0, start
         for _ in range(tol.max_line_search):  # regula falsi in Illinois' form
             t = b - high * (b - a) / (high - low)
             slope = self._slope(u, d, t) + forces
