@@ -282,7 +282,8 @@ class Dual:
     def _on_all_rows(self) -> Operator | None:
         """Return the preconditioner on all rows, made once."""
         smooths = self.preconditioner is not None and self.preconditioner.metric is not None
-        if self.soft is None or not (self.soft.count or (smooths and not any(self.contact_rows))):
+        count = 0 if self.soft is None else self.soft.count
+        if not (count or (smooths and not any(self.contact_rows))):
             return self.preconditioner
         if self._on_all is None:
             rows = self.constraints.num_rows
