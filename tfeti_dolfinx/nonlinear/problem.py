@@ -45,7 +45,7 @@ class NewtonTolerances:
         rounding: Share of dᵀD d, D the diagonal of J, that is rounding of dᵀJ d: a rigid step has
             no energy.
         shortest: Length at which a step that turns cells inside out is given up.
-        keeping: A tangent is kept, with its rows and factors, where the last remainder was at
+        keeping: In small strain a tangent is kept, with its factors, where the last remainder was at
             most this: its directions of conjugate gradients then serve the next problems, too.
         settled: And where the increment was at most this share of the load step's first one.
         anderson: Iterates that Anderson's acceleration combines.
@@ -87,8 +87,8 @@ class NonlinearContactProblem(ContactProblem):
 
     Newton's method, u the iterate, û the solution of the linearised problem, d = û − u:
 
-    1. *Model.* Assemble J(u), or keep it with rows and factors where the last step was short and
-       in line with it. Solve the contact problem for û, to the forcing term of Eisenstat and
+    1. *Model.* Assemble J(u); in small strain keep it, with its factors, where the last step was
+       short and in line with it. Solve the contact problem for û, to the forcing term of Eisenstat and
        Walker.
     2. *Line search.* r(t) = F(u + t d; d) + λᵀB d is the slope along d of the potential with the
        contact forces of û, and r(0) = −dᵀJ d < 0. Where r(1) is much larger than 0, the step has
@@ -216,7 +216,7 @@ class NonlinearContactProblem(ContactProblem):
             short = increment <= exact
             if not self._finite:  # whose slopes do not see rotations
                 short |= t == 1.0 and tol.safety * expected <= exact
-            if short and rtol <= exact and not (self._finite and forms.kept):
+            if short and rtol <= exact:
                 self._set(u + d)
                 return
             # 4. step
@@ -231,7 +231,7 @@ class NonlinearContactProblem(ContactProblem):
                 faster.forget()
                 self._set(u + t * d)
             in_line = t == 1.0 and remainder <= tol.keeping and size <= tol.settled * first
-            forms.kept = in_line and not slow and not (self._finite and short)
+            forms.kept = in_line and not slow and not self._finite
             before = size
         raise ConvergenceError(
             f"Newton's method: the increment is still {increment:.1e} of the displacement after "
@@ -242,7 +242,7 @@ class NonlinearContactProblem(ContactProblem):
     def _solve_linearised(self, rtol: float) -> None:
         """Solve the contact problem of the model at u. Collective."""
         self.options = replace(self.options, rtol=rtol)
-        if self._places is None or self._newton_forms.kept:
+        if self._places is None:
             super().solve()
             return
         forms, tol = self._newton_forms, self._tolerances
