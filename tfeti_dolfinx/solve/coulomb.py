@@ -43,6 +43,8 @@ LIGHT = 1e-6
 LARGER = (1.0, 1.001, 1.1, 2.0)
 # problems in a row whose change is not half of the least before: bounds come no nearer to rest
 PATIENCE = 6
+# problems in a row whose forces are less than half of their bounds: these fall to 0
+FALLS = 2
 # change of slips at which De Saxcé's fixed point is looked at first; and a factor each time
 # after it
 COARSE, FINER = 1e-4, 0.01
@@ -69,7 +71,7 @@ class FrictionBoundIteration:
     def __init__(self, dual: Dual, options: Options, start: tuple[Array, Array] | None) -> None:
         self._dual, self._constraints, self._options = dual, dual.constraints, options
         self._dilated: DeSaxceIteration | None = None
-        self._lost, self._share = False, COARSE
+        self._lost, self._share, self._falls = False, COARSE, 0
         self._best, self._idle = np.inf, 0
         self._comm = dual.coarse.comm
         at = dual.constraints.pressed
@@ -179,6 +181,7 @@ class FrictionBoundIteration:
         miss, size = (self._on_bodies(x) for x in (self._found - self._now, self._found))
         least = self._on_bodies(np.full(len(self._rows), self._none)).max(initial=TINY)
         size = np.maximum(size, max(least, LIGHT * size.max(initial=0.0)))
+        miss = np.where(miss > least, miss, 0.0)  # less is rounding
         change, body = bcast_from_root(self._comm, _largest(miss / size))
         self.restless, self._change = int(body), change
         self._idle += 1
@@ -249,13 +252,22 @@ class FrictionBoundIteration:
         return np.asarray(np.sqrt(squares))
 
     def advance(self) -> None:
-        """Take the next bounds; not where De Saxcé's fixed point gives them."""
+        """Take the next bounds; not where De Saxcé's fixed point gives them.
+
+        Forces that fall to less than half again and again, as where slips of earlier steps alone
+        drive, make a geometric series: of its bounds the limit 0 is tried.
+        """
         if self._dilated is not None:
             return
-        sticks = self._sticks
-        self._now = (
-            self._found if sticks else self._forces(self._anderson.next(self._now, self._found))
-        )
+        if self._sticks:
+            self._now = self._found
+            return
+        self._falls = self._falls + 1 if self._change > 1.0 else 0
+        if self._falls == FALLS:
+            self._now = np.zeros_like(self._found)
+            self._anderson = Anderson(self._products)
+        else:
+            self._now = self._forces(self._anderson.next(self._now, self._found))
 
     def take(self, lam: Array) -> None:
         """Try the bounds of multipliers for which the law holds."""
