@@ -165,8 +165,8 @@ EXPLANATIONS = {
     ConvergedReason.DIVERGED_STALLED: "; the forces come no nearer to balancing the load",
     ConvergedReason.DIVERGED_FRICTION: "; the bounds of Coulomb's friction do not come to rest, "
     "least of all on the body {restless!r}: "
-    "expected a smaller coefficient, smaller load steps, a larger friction_max_it, the solver "
-    "newton, or a load that does not need bodies wedged between others",
+    "expected a smaller coefficient, smaller load steps, a larger friction_max_it, or a load that "
+    "does not need bodies wedged between others",
     ConvergedReason.DIVERGED_CONTRADICTION: "; contact rows that depend on each other exclude each "
     "other{contacts}: expected gaps that some displacement keeps",
 }
