@@ -226,20 +226,22 @@ def test_the_rest_state_is_found_from_any_load(cell, kind, friction, qp_type):
     scene.problem.destroy()
 
 
+@pytest.mark.parametrize("qp_type", ["newton", "smalse"])
 @pytest.mark.parametrize("first", [None, 0.0, 1.0])
 @pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_a_gap_that_stays_open_does_not_limit_what_a_small_load_is_solved_to(cell, first):
-    scene = Scene(cell, gap=0.01, rtol=1e-8)
+def test_a_gap_that_stays_open_does_not_limit_what_a_small_load_is_solved_to(cell, first, qp_type):
+    options = {"qp_type": qp_type, "rtol": 1e-8 if qp_type == "newton" else 1e-6}
+    scene = Scene(cell, gap=0.01, **options)
     load = np.array([0.01] * (scene.gdim - 1) + [-0.05])
     small = scene.solve(1e-3 * load)  # the gap stays open, so that all is linear
     if first is not None:
         scene.solve(first * load)
     else:
         scene.problem.destroy()
-        scene = Scene(cell, gap=0.01, rtol=1e-8)
+        scene = Scene(cell, gap=0.01, **options)
     for factor in (1e-12, 1e-14):
         u = scene.solve(factor * load) / factor * 1e-3
-        assert np.abs(u - small).max() <= 1e-6 * np.abs(small).max()
+        assert np.abs(u - small).max() <= 1e2 * options["rtol"] * np.abs(small).max()
     scene.problem.destroy()
 
 
@@ -275,13 +277,16 @@ def test_a_body_that_contact_alone_holds_comes_to_rest(gap):
     problem.destroy()
 
 
-def test_a_series_comes_back_to_rest():
+@pytest.mark.parametrize("qp_type", ["newton", "smalse"])
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
+def test_a_series_comes_back_to_rest(cell, qp_type):
     """Slips count from step to step, but without pressure there is no friction."""
-    scene = Scene("quadrilateral", "driven", "coulomb", rtol=1e-8)
-    for factor in (1.0, 0.0, -1.0, 0.0, 1e-13, 1.0, 0.0):
-        u = scene.solve((0.0, 0.0), (0.003 * factor, -0.01 * factor))
-        largest = 0.01 * max(abs(factor), 1e-12)
-        assert np.abs(u).max() <= 2.0 * largest
+    rtol = 1e-8 if qp_type == "newton" else 1e-6
+    scene = Scene(cell, "driven", "coulomb", qp_type=qp_type, rtol=rtol)
+    value = np.array([0.003] * (scene.gdim - 1) + [-0.01])
+    for factor in (1.0, 0.0, -1.0, 0.0, 1e-12, 1.0, 0.0):
+        u = scene.solve(0.0, factor * value)
+        assert np.abs(u).max() <= 0.02 * max(abs(factor), 1e-12)
         scene.problem.accept()
     scene.problem.destroy()
 

@@ -260,6 +260,11 @@ def _expected(name: str, known: Mapping[str, Parameter], prefix: str) -> str:
             f"{choices}"
         )
     if family := re.match(r"(sub|coarse|face)_", name):
+        if name == f"{family[0]}pc_type":
+            return (
+                "factors are always Cholesky's; "
+                f"expected -{prefix}{family[0]}pc_factor_mat_solver_type, which chooses the package"
+            )
         return _near_factor_names(name.removeprefix(family[0]), f"{prefix}{family[0]}")
     low = name.lower()
     near = [option for option in known if option == low or low.endswith(f"_{option}")]

@@ -500,7 +500,7 @@ class ContactProblem(Stepping):
         comm, d = self.decomposition.comm, self.decomposition
         with agreeing(comm, "digest") as given:
             given |= self._given()
-        fields = fields_in(given)
+        fields = fields_in(self._known_before(given))
         mesh = {"type": "mesh", "subdomains": d.num_subdomains, "bodies": d.num_bodies}
         sums = sums_of(comm, [d.mesh.geometry.x, *fields.values()])
         found = {name: described(value) for name, value in given.items()}
@@ -510,6 +510,10 @@ class ContactProblem(Stepping):
 
     def _given(self) -> dict[str, Any]:
         return {**super()._given(), "boundary_elements": self._boundary_elements}
+
+    def _known_before(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Return that of the input whose functions are not those of the solution."""
+        return given
 
     def _set_out(self) -> None:
         """Set the prediction of a step; nothing without inertia."""

@@ -22,7 +22,9 @@ OPTIONS = {
         ksp_type="cg",
     ),
     "a preconditioner of a subdomain": given(
-        r"unknown option -tfeti_sub_pc_type; expected -tfeti_sub_pc_factor_", sub_pc_type="lu"
+        r"unknown option -tfeti_sub_pc_type; factors are always Cholesky's; "
+        r"expected -tfeti_sub_pc_factor_mat_solver_type, which chooses the package",
+        sub_pc_type="cholesky",
     ),
     "a misspelt option of the subdomains' factors": given(
         r"-tfeti_sub_pc_factor_mat_solver_typ: factors by \w+ read no such option; "

@@ -374,6 +374,9 @@ class NonlinearContactProblem(ContactProblem):
         if self._places is not None:
             self._go_to_places(self._places)
 
+    def _known_before(self, given: dict[str, Any]) -> dict[str, Any]:
+        return {name: value for name, value in given.items() if name not in NewtonForms.names}
+
     def _return(self) -> None:
         super()._return()
         if self._solution is None:
