@@ -26,7 +26,7 @@ ErrorTarget = Callable[[Array], float]
 
 @dataclass(frozen=True)
 class StoppingTolerances:
-    """What rtol does not say of an answer that is right.
+    """Tolerances of an answer that is right, beside rtol.
 
     Attributes:
         noise: Rounding of displacements, of the largest of all bodies, or of the slip that friction

@@ -52,6 +52,7 @@ class CoulombParameters:
         slowest: The largest share of the change of bounds that is taken to be left of it in the
             next problem.
         shortest: Of a step of bounds: it is halved where the change has grown, down to this.
+        falls: Problems in a row whose forces are less than half of their bounds: these fall to 0.
         no_force: Of all multipliers: forces of normals that rounding makes of none. As bounds they
             would be discs that bend so much that nothing else is seen beside them.
         light: Of the largest forces of normals on a body: those of a lighter one count as so large.
@@ -70,6 +71,7 @@ class CoulombParameters:
     patience: int = 12
     slowest: float = 0.9
     shortest: float = 0.125
+    falls: int = 2
     no_force: float = 1e-13
     light: float = 1e-6
     rounding: float = 2e-16
@@ -225,7 +227,7 @@ class FrictionBounds:
             self.now = np.maximum(start[0][self._rows], 0.0) if lost else known
         self._before, self._found = self.now, self.now
         self._none, self._best, self._last, self._length = 0.0, np.inf, np.inf, 1.0
-        self.idle, self.body = 0, -1
+        self.idle, self.body, self._falls = 0, -1, 0
         self._solved: list[tuple[Array, Array, Array]] = []
 
     def _stick(self) -> None:
@@ -283,11 +285,13 @@ class FrictionBounds:
         lightest = parameters.light * size.max(initial=0.0)
         size = np.maximum(size, max(least.max(initial=TINY), lightest))
         self.body = int(np.argmax(miss / size))
+        miss = np.where(miss > least, miss, 0.0)  # less is rounding
         change = float(miss[self.body] / size[self.body])
         self.idle += 1
         # where plain steps lead away, shorter ones of Φ, which turns back, may not
         self._length *= 0.5 if change > self._last and self._length > parameters.shortest else 1.0
         self._last = change
+        self._falls = self._falls + 1 if change > 1.0 else 0
         if change <= 0.5 * self._best:
             self._best, self.idle = change, 0
         return change
@@ -325,7 +329,14 @@ class FrictionBounds:
         return rule.take(moved * (left / way / (1.0 - rate)))
 
     def advance(self) -> None:
-        """Go towards the forces that were found, all of the way unless that has led away."""
+        """Go towards the forces that were found, all of the way unless that has led away.
+
+        Forces that fall to less than half again and again, as where slips of earlier steps alone
+        drive, make a geometric series: of its bounds the limit 0 is tried.
+        """
+        if self._falls == self._parameters.falls and not self.stick:
+            self.now = np.zeros_like(self._found)
+            return
         whole = self.stick or self._length == 1.0
         self.now = self._found if whole else self.now + self._length * (self._found - self.now)
 

@@ -181,13 +181,14 @@ def _homogenise(
         at = dual.last.image(qp.F, solver.warm(qp, start))
         _no_worse_than_nothing(qp, at, start)
         known = dual.known_image("natural")
-        scale = scale_at(qp, known) if known else scale_near(qp, at)
+        count = solver.cold is not None  # else λ̄ and rows that stay open are apart
+        scale = scale_at(qp, known, count) if known else scale_near(qp, at, count)
     elif solver.cold is not None:
         at = operator_product(qp.F, solver.cold(qp))
         scale = scale_at(qp, at)
     else:  # with λ̄ as options say, whose image is kept
         kind = options.homogenization if any(dual.contact_rows) else "natural"
-        scale = scale_at(qp, dual.image("natural"))
+        scale = scale_at(qp, dual.image("natural"), gaps_count=False)
         return homogenise(qp, dual.image(kind), scale)
     homogenised = homogenise(qp, at, scale)
     at.destroy()
