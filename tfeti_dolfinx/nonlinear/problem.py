@@ -45,8 +45,8 @@ class NewtonTolerances:
         rounding: Share of dᵀD d, D the diagonal of J, that is rounding of dᵀJ d: a rigid step has
             no energy.
         shortest: Length at which a step that turns cells inside out is given up.
-        keeping: In small strain a tangent is kept, with its factors, where the last remainder was at
-            most this: its directions of conjugate gradients then serve the next problems, too.
+        keeping: In small strain a tangent is kept, with its factors, where the last remainder was
+            at most this: its directions of conjugate gradients then serve the next problems, too.
         settled: And where the increment was at most this share of the load step's first one.
         anderson: Iterates that Anderson's acceleration combines.
         dependent: Eigenvalues of the Gram matrix of its differences below this share of the largest
@@ -88,8 +88,8 @@ class NonlinearContactProblem(ContactProblem):
     Newton's method, u the iterate, û the solution of the linearised problem, d = û − u:
 
     1. *Model.* Assemble J(u); in small strain keep it, with its factors, where the last step was
-       short and in line with it. Solve the contact problem for û, to the forcing term of Eisenstat and
-       Walker.
+       short and in line with it. Solve the contact problem for û, to the forcing term of Eisenstat
+       and Walker.
     2. *Line search.* r(t) = F(u + t d; d) + λᵀB d is the slope along d of the potential with the
        contact forces of û, and r(0) = −dᵀJ d < 0. Where r(1) is much larger than 0, the step has
        gone beyond the minimum, and t is a root of r. |r(1)/r(0)| is the remainder.

@@ -20,6 +20,8 @@ class NewtonParameters:
         cautious: Whether rows leave a flat face one by one after a step that has raised q.
         most_rounds: Solves on smaller and smaller faces of one step; each drops one row at least.
         patience: Steps in a row that neither halve ‖g^P‖ nor lower q beyond its rounding.
+        unseen: Of the gradient: multipliers of Gλ = e that make it longer than that are rounding of
+            motions that a face does not see.
         lost: Of ‖F‖‖λ‖: what rounding of λ − ᾱs leaves of ‖g^P‖.
         rounding: Of the largest entry of a way: less is none.
     """
@@ -47,6 +49,7 @@ class NewtonParameters:
     most_rounds: int = 60
     patience: int = 10
     lost: float = 2e-15
+    unseen: float = 1e6
     rounding: float = 1e-10
 
 
