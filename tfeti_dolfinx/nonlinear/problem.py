@@ -92,9 +92,9 @@ class NonlinearContactProblem(ContactProblem):
        and Walker.
     2. *Line search.* r(t) = F(u + t d; d) + λᵀB d is the slope along d of the potential with the
        contact forces of û, and r(0) = −dᵀJ d < 0. Where r(1) is much larger than 0, the step has
-       gone beyond the minimum, and t is a root of r. |r(1)/r(0)| is the remainder.
-    3. *End* where |d| is at most rtol |u| in the maximum norm, in finite strain with rows of where
-       the bodies are; in small strain where the remainder times |d| is, which the next one is
+       gone beyond the minimum, and t is a root of r. The modulus of r(1)/r(0) is the remainder.
+    3. *End* where ‖d‖ is at most rtol ‖u‖ in the maximum norm, in finite strain with rows of where
+       the bodies are; in small strain where the remainder times ‖d‖ is, which the next one is
        expected to be.
     4. *Step.* u ← u + t d; where t = 1 and J is not the derivative of F, or kept, accelerated by
        Anderson's method.
