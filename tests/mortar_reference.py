@@ -75,6 +75,7 @@ class TwoBoxes:
         last = self.gdim - 1
         N[np.arange(len(D)), self.secondary * self.gdim + last] = -D
         N[:, self.primary * self.gdim + last] += M
+        self.N, self.D = N, D
         free = np.setdiff1d(np.arange(self.K.shape[0]), self.fixed)
         held = np.abs(N[:, free]).sum(axis=1) > 0
         rows = np.flatnonzero(held)
@@ -90,3 +91,7 @@ class TwoBoxes:
         order = np.lexsort(np.rint(self.x.T * 1e7))
         u = full.reshape(-1, self.gdim)[order]
         return self.x[order], u, self.x[self.secondary], lam
+
+    def on_nodes(self, lam):
+        """Forces on all nodes that are not prescribed, of forces of the secondary nodes."""
+        return np.delete((lam / self.D) @ self.N, self.fixed)

@@ -35,6 +35,8 @@ BEYOND = 10.0
 # of d: rows that want gaps so far apart exclude each other, less may be rounding; of the largest
 # force of such a direction: rows with less have no part in it; and how far it is followed
 APART, TAKES_PART, FAR = 1e-8, 1e-3, 1e30
+# of ‖F‖‖w‖: what may be left of Fw where F is not to see w, and most multiplications for that
+UNSEEN, PURIFYING = 1e-14, 200
 
 # --- Points and products as numpy arrays ------------------------------------------------------
 
@@ -336,8 +338,7 @@ class FaceSolver:
         """Go beyond a bound along a direction without curvature, where PCPG has found one.
 
         Rows depend on each other. Where no bound ends the way, neither F nor G sees it and q falls
-        along it, they want gaps that exclude each other: ``excluding`` says so. Multiplies by F
-        once or twice.
+        along it, they want gaps that exclude each other: ``excluding`` says so.
         """
         program, own, qp = self._program, self._directions, self._qp
         for vec in (own.p, own.r):
@@ -347,6 +348,7 @@ class FaceSolver:
             curvature, square = program.dot((way, Fw), (way, way))
             if size == 0.0 or own.seen(curvature, square):
                 continue
+            way, Fw = self._unseen(way, Fw)
             length = self._to_a_bound(z.lam, way)
             if np.isfinite(length):
                 return Multipliers(z.lam + BEYOND * length * way, z.g + BEYOND * length * Fw)
@@ -363,6 +365,24 @@ class FaceSolver:
                 self.excluding = np.flatnonzero(np.abs(p) > TAKES_PART * most)
             break
         return z
+
+    def _unseen(self, way: Array, Fw: Array) -> tuple[Array, Array]:
+        """Return w − (PFP)⁺Fw by PCPG, with its image: the part of w ≠ 0 that F does not see.
+
+        What PCPG has left of the others in w is small beside it, but its bounds would end the way.
+        """
+        own, program = Directions(self._qp.d), self._program
+        on_face = replace(self._on_face, F=self._qp.F, preconditioner=self._preconditioner)
+        point = Point(self._qp.d.duplicate(), self._qp.d.duplicate())
+        point.g.array[:] = -Fw
+        (square,) = program.dot((way, way))
+        exact = TargetRule(UNSEEN * self.norm * float(np.sqrt(square)))
+        on_face = replace(on_face, d=-point.g, recycled=None)
+        pcpg(on_face, point, exact, Steps(), PURIFYING, directions=own)
+        way, Fw = way - point.lam.array_r, -np.array(point.g.array_r)
+        for held in (own, point, on_face.d):
+            held.destroy()
+        return way, Fw
 
     def _onto_boundary(self, z: Multipliers) -> tuple[Multipliers, bool]:
         """Retract z to Gz = e with slipping points on their boundaries; one multiplication by F.
