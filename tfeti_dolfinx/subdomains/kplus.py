@@ -10,7 +10,7 @@ import numpy as np
 from scipy.sparse import coo_array, diags_array
 
 from tfeti_dolfinx.common.arrays import TINY, Array
-from tfeti_dolfinx.subdomains.block import Counters
+from tfeti_dolfinx.subdomains.block import Counters, candidate_modes
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 
 # --- K⁺ -----------------------------------------------------------------------------------------
@@ -132,7 +132,8 @@ def why_indefinite(K: Any, R: Array, fixing_dofs: Array, x: Array, prefix: str) 
         factor = CholeskyFactor(shifted, prefix)
     except NotPositiveDefiniteError:
         return "the stiffness is not positive semidefinite; expected a linear elastic form"
-    free = 0 if _may_hide_energy(K, x) else _motions_without_energy(K, R, factor)
+    soft = _with_weakly_held(K, R, x)
+    free = 0 if _may_hide_energy(K, x) else _motions_without_energy(K, soft, factor)
     factor.destroy()
     if free:
         count = f"{'at least ' if free == TOLERANCES.counted else ''}{free} motion"
@@ -159,6 +160,7 @@ def check_rank(K: Any, R: Array, x: Array, inverse: CholeskyFactor) -> None:
     Raises:
         NotPositiveDefiniteError: It does.
     """
+    R = _with_weakly_held(K, R, x)
     u = _beside(R, inverse.solve(_beside(R, _drawn(K.shape[0], 1)[:, 0])))
     lost = float(u @ (K @ u)) <= TOLERANCES.rounding * float(u @ (K.diagonal() * u))
     if lost and not _may_hide_energy(K, x):
@@ -176,13 +178,25 @@ def _may_hide_energy(K: Any, x: Array) -> bool:
 
 
 def _motions_without_energy(K: Any, R: Array, inverse: CholeskyFactor) -> int:
-    """Count motions beside the kernel that K gives no energy; K_ρ has been made regular."""
+    """Count motions beside those of R that K gives no energy; K_ρ has been made regular."""
     U = _drawn(K.shape[0], min(TOLERANCES.counted, K.shape[0] - R.shape[1]))
     for _ in range(2):  # subspace iteration: what it looks for stands out by 1e8 or more
         U = np.linalg.qr(_beside(R, inverse.solve(U)))[0]
     energies, turn = np.linalg.eigh(U.T @ (K @ U))
     own = np.sum((U @ turn) ** 2 * K.diagonal()[:, None], axis=0)
     return int(np.sum(np.abs(energies) <= TOLERANCES.no_energy * own))
+
+
+def _with_weakly_held(K: Any, R: Array, x: Array) -> Array:
+    """Return an orthonormal basis of the kernel and of rigid motions that weak springs hold."""
+    centre, length = x.mean(axis=0), float(np.linalg.norm(np.ptp(x, axis=0)))
+    modes = candidate_modes(x, K.shape[0] // len(x), centre, length)
+    U, s, _ = np.linalg.svd(_beside(R, modes), full_matrices=False)
+    U = U[:, s > TOLERANCES.still * np.linalg.norm(modes, axis=0).max()]
+    energies, turn = np.linalg.eigh(U.T @ (K @ U))
+    U = U @ turn
+    own = np.sum(U**2 * K.diagonal()[:, None], axis=0)
+    return np.hstack((R, U[:, energies <= TOLERANCES.no_energy * own]))
 
 
 def _drawn(n: int, count: int) -> Array:
