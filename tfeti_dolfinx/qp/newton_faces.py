@@ -408,12 +408,14 @@ class FaceSolver:
         share = self._parameters.stage if resume else self._parameters.reduction
         target = share * min(float(z_residual.norm()), optimality)
         rule = TargetRule(max(target, self._parameters.final * self._rule.aim))
+        norm = own.norm
         reason = pcpg(on_face, self._point, rule, self._steps, self._max_it, self._monitor, own)
         (square,) = self._program.dot((own.r.array_r, own.r.array_r))
         self.left = float(np.sqrt(square))
         lam, g = np.array(self._point.lam.array_r), np.array(self._point.g.array_r)
         if isinstance(on_face.F, CurvedHessian):
             g -= on_face.F.bend(lam - z.lam)
+            own.norm = norm  # small circles bend far more than F does
         return Multipliers(lam, g), reason != ConvergedReason.CONVERGED_RTOL and not self._ended
 
     def _leave(self) -> None:
