@@ -9,7 +9,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import any_rank, norm_over
+from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, norm_over
 from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.problem import QP, Operator, QPResult
 from tfeti_dolfinx.qp.sets import FeasibleSet
@@ -17,6 +17,8 @@ from tfeti_dolfinx.qp.sets import FeasibleSet
 # of the terms that a residual is the difference of: what rounding leaves of it at least, and
 # below how many times that rounding may be the reason of anything strange
 ROUNDING, STRANGE = 1e-14, 1e8
+# of open gaps: what drives the others is less, and would be lost in what P spreads of the gaps
+FAR_OPEN = 1e-6
 
 
 @dataclass(frozen=True)
@@ -221,10 +223,15 @@ def homogenise(
     gradient.axpy(-1.0, qp.d)
     b = gradient.copy()
     b.scale(-1.0)
-    gaps = open_gaps(qp)
-    b.array[:] -= gaps
-    qp.coarse.project(b)
-    b.array[:] += gaps
+    gaps, comm = open_gaps(qp), qp.d.getComm().tompi4py()
+    without = b.copy()
+    without.array[:] -= gaps
+    qp.coarse.project(without)
+    if bcast_from_root(comm, without.norm() <= FAR_OPEN * norm_over(comm, gaps)):
+        b.array[:] = without.array_r + gaps
+    else:
+        qp.coarse.project(b)
+    without.destroy()
     feasible = qp.feasible.shifted(np.array(at.x.array_r))
     return Homogenised(at.x.copy(), gradient, b, feasible, scale or scale_at(qp, at))
 
