@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
 import tfeti_dolfinx as tfeti
@@ -151,9 +152,12 @@ def test_a_turned_body_has_no_stress(comm):
         problem.accept()
         error = np.abs(u.x.array - turned.x.array).max(initial=0.0)
         assert comm.allreduce(error, op=MPI.MAX) < 1e-9
+        # the energy is that of strains below 1e-10
+        energy = comm.allreduce(fem.assemble_scalar(fem.form(neo_hooke(u, E, NU) * ufl.dx(**DX))))
+        assert abs(energy) < 1e-14
 
 
-def plastic(comm, hardening=0.05):
+def plastic(comm, hardening=0.05, **more):
     """The block of J2 material, its problem, and the constant that moves its upper side."""
     decomposition = torn(comm, 2, 4, 0.05, 3)
     V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
@@ -162,8 +166,9 @@ def plastic(comm, hardening=0.05):
     law = tfeti.J2Plasticity(elastic, u, yield_stress=0.01, hardening=hardening)
     value, bc = held_top(V, decomposition)
     F, J = law.residual(v), law.tangent(du, v)
-    given = {"J": J, "state": law.state, "update": law.update, "petsc_options": {"rtol": 1e-8}}
-    problem = tfeti.NonlinearContactProblem(F, u, [bc], [plane(2)], decomposition, **given)
+    more = {"petsc_options": {"rtol": 1e-8}, **more}
+    given = {"J": J, "state": law.state, "update": law.update}
+    problem = tfeti.NonlinearContactProblem(F, u, [bc], [plane(2)], decomposition, **given, **more)
     return problem, law, value
 
 
@@ -210,6 +215,74 @@ def test_perfect_plasticity_keeps_the_stress_below_yield(comm):
     law.update()
     assert law.regularisation > 0.0
     assert comm.allreduce(law.p.x.array.max(initial=0.0), op=MPI.MAX) > 1e-3
+    sigma = ufl.dev(law.stress(problem.u))
+    beyond = ufl.conditional(ufl.gt(1.5 * ufl.inner(sigma, sigma), 0.01**2 * (1 + 1e-8)), 1.0, 0.0)
+    assert comm.allreduce(fem.assemble_scalar(fem.form(beyond * law.dx))) == 0.0
+
+
+@pytest.mark.parametrize(("saturation", "rate"), [(0.0, 0.0), (0.02, 30.0)])
+def test_stress_of_a_bar_follows_its_hardening(saturation, rate, comm):
+    """Pulled along an axis and free across: σ = σ_y(p), p = ε − σ/E, loaded and unloaded."""
+    mesh = dmesh.create_box(comm, [[0.0] * 3, [1.0] * 3], (2, 2, 2))
+    mesh.topology.create_connectivity(2, 3)
+    sides = [
+        dmesh.locate_entities_boundary(mesh, 2, lambda x, k=k, z=z: np.isclose(x[k], z))
+        for k, z in ((0, 0.0), (0, 1.0), (1, 0.0), (2, 0.0))
+    ]
+    values = np.repeat(np.arange(4, dtype=np.int32), [len(side) for side in sides])
+    order = np.argsort(np.concatenate(sides))
+    tags = dmesh.meshtags(mesh, 2, np.concatenate(sides)[order], values[order])
+    names = {"left": 0, "right": 1, "front": 2, "under": 3}
+    decomposition = tfeti.decompose(mesh, 3, facet_tags=tags, surfaces=names)
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (3,)))
+    u, v, du = fem.Function(V), ufl.TestFunction(V), ufl.TrialFunction(V)
+    law = tfeti.J2Plasticity(
+        tfeti.Elasticity(decomposition, E=E, nu=NU),
+        u,
+        yield_stress=0.01,
+        hardening=0.05,
+        saturation=saturation,
+        rate=rate,
+    )
+    pulled = fem.Constant(decomposition.mesh, 0.0)
+    held = (("left", 0, 0.0), ("right", 0, pulled), ("front", 1, 0.0), ("under", 2, 0.0))
+    bcs = [
+        fem.dirichletbc(
+            value, fem.locate_dofs_topological(V.sub(i), 2, decomposition.facets(name)), V.sub(i)
+        )
+        for name, i, value in held
+    ]
+    given = {"J": law.tangent(du, v), "state": law.state, "update": law.update}
+    problem = tfeti.NonlinearContactProblem(
+        law.residual(v), u, bcs, [], decomposition, petsc_options={"rtol": 1e-10}, **given
+    )
+    force = fem.form(law.stress(u)[0, 0] * law.dx)
+    found = {}
+    for strain in (0.005, 0.02, 0.04, 0.035):
+        pulled.value = strain
+        problem.solve()
+        problem.accept()
+        stress = comm.allreduce(fem.assemble_scalar(force))
+        p = comm.allreduce(law.p.x.array.max(initial=0.0), op=MPI.MAX)
+        found[strain] = stress, p
+    assert found[0.005] == pytest.approx((0.005 * E, 0.0), abs=1e-9)
+    for strain in (0.02, 0.04):
+        stress, p = found[strain]
+        assert p == pytest.approx(strain - stress / E, abs=1e-9)
+        hard = 0.01 + 0.05 * p + saturation * (1 - np.exp(-rate * p))
+        assert stress == pytest.approx(hard, abs=1e-9)
+    stress, p = found[0.04]
+    assert found[0.035] == pytest.approx((stress - 0.005 * E, p), abs=1e-9)
+
+
+def test_a_step_that_did_not_converge_is_not_accepted(comm):
+    problem, _, value = plastic(comm, tolerances=tfeti.NewtonTolerances(max_it=2))
+    value.value[-1] = -0.09
+    with pytest.raises(tfeti.ConvergenceError, match="increment is still"):
+        problem.solve()
+    assert np.all(problem.u.x.array == 0.0)
+    with pytest.raises(tfeti.InputError, match="has not converged"):
+        problem.accept()
 
 
 @pytest.mark.parametrize("degree", [1, 2])
@@ -275,7 +348,7 @@ def two_blocks(comm):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"F": "square"}, "F"),
+        ({"F": "square"}, "F is not a linear form"),
         ({"J": "skew"}, "not symmetric"),
         ({"finite": True}, "no J"),
         ({"state": {1: 2}}, "state: a key"),
@@ -298,6 +371,20 @@ def test_mistakes_are_named(change, said, comm):
     F, u = given.pop("F"), given.pop("u")
     with pytest.raises(tfeti.InputError, match=said):
         tfeti.NonlinearContactProblem(F, u, [bc], [plane(2)], decomposition, **given).solve()
+
+
+def test_what_a_nonlinear_problem_does_not_take_is_named(comm):
+    problem, _, _ = plastic(comm)
+    with pytest.raises(tfeti.InputError, match="load and stiffness are those of linear problems"):
+        problem.update(load=ufl.ZeroBaseForm((ufl.TestFunction(problem.u.function_space),)))
+    with pytest.raises(tfeti.InputError, match="rtol auto: it is for linear problems"):
+        plastic(comm, stress=lambda u: ufl.Identity(3) * u[0], petsc_options={"rtol": "auto"})
+    decomposition = torn(comm, 2, 2, 0.05, 2)
+    u = fem.Function(fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,))))
+    F = ufl.derivative(neo_hooke(u, E, NU) * ufl.dx, u, ufl.TestFunction(u.function_space))
+    pressed = tfeti.Obstacle("low", tfeti.Plane((0.0, 0.0), normal=(0.0, 1.0)), gap=-0.01)
+    with pytest.raises(tfeti.InputError, match="a given gap with finite=True"):
+        tfeti.NonlinearContactProblem(F, u, [], [pressed], decomposition, finite=True)
 
 
 def test_a_law_that_gives_no_number_is_named(comm):

@@ -100,14 +100,14 @@ class Forms:
         """Take another bilinear form on the same space."""
         name = self.names[0]
         check_form(a, name, self._V, self._decomposition)
-        self._a, self._of_a = self.compiled(a, name), data_of(a, self._V)
+        self._a, self._of_a = self._compiled(a, name), data_of(a, self._V)
         self.given = {**self.given, name: a}
 
     def replace_load(self, L: ufl.Form | ufl.ZeroBaseForm) -> None:
         """Take another linear form on the same space."""
         name = self.names[1]
         check_form(L, name, self._V, self._decomposition)
-        self._L = None if is_zero(L) else self.compiled(L, name)
+        self._L = None if is_zero(L) else self._compiled(L, name)
         self._of_L = data_of(L, self._V)
         self.given = {**self.given, name: L}
         self._volume_of_L: ufl.Form | fem.Form | None = cell_integrals(L)
@@ -139,17 +139,17 @@ class Forms:
         if self._volume_of_L is None:
             return None
         if isinstance(self._volume_of_L, ufl.Form):  # few problems ask for it
-            self._volume_of_L = self.compiled(self._volume_of_L, "L")
+            self._volume_of_L = self._compiled(self._volume_of_L, "L")
         return np.array(fem.assemble_vector(self._volume_of_L).array)
 
     def hats(self) -> Array:
         """Return integrals of the hats over the cells, for each of DOLFINx's nodes."""
         one = fem.Constant(self._V.mesh, (1.0,) + (0.0,) * (self._V.dofmap.bs - 1))
         dx = ufl.Measure("dx", domain=self._V.mesh)
-        form = self.compiled(ufl.dot(one, ufl.TestFunction(self._V)) * dx, "the volume")
+        form = self._compiled(ufl.dot(one, ufl.TestFunction(self._V)) * dx, "the volume")
         return np.array(fem.assemble_vector(form).array[:: self._V.dofmap.bs])
 
-    def compiled(self, form: ufl.Form, name: str) -> fem.Form:
+    def _compiled(self, form: ufl.Form, name: str) -> fem.Form:
         """Return the form compiled by DOLFINx, which fails on all ranks or on none."""
         comm = self._decomposition.comm
         with raised_on_all_ranks(comm), named(f"{name} cannot be compiled"):

@@ -91,7 +91,7 @@ class InertialForms(Forms):
         space = displacement_space(mass, decomposition, "mass")
         check_same_space(space, V, "the trial function of mass", "that of a")
         check_form(mass, "mass", V, decomposition)
-        self._m = self.compiled(mass, "mass")
+        self._m = self._compiled(mass, "mass")
         zero = np.zeros(V.dofmap.index_map.size_local * V.dofmap.index_map_bs)
         self.motion = motion = Motion(zero, zero, super().load())
         self._of_step = Data(lambda: [np.array(motion.size)], self._comm)

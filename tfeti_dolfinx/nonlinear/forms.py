@@ -14,9 +14,8 @@ from mpi4py import MPI
 from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.compat import assemble_csr, geometry_dofmap
-from tfeti_dolfinx.common.parallel import summed
-from tfeti_dolfinx.forms.assembly import Data, Forms
+from tfeti_dolfinx.common.compat import geometry_dofmap
+from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 # degree of the quadrature whose points det F is looked at
@@ -34,36 +33,26 @@ class NewtonForms(Forms):
         F: Residual.
         as_forms: The other arguments of ``Forms``.
         u: The displacement.
-        strains: In finite strain the form ∫(Fᵀ∇w)_sym : (Fᵀ∇v)_sym; forms are integrated over the
-            mesh as it was, wherever it is. None in small strain.
+        finite: Whether forms are integrated over the mesh as it was, wherever it is.
 
     Attributes:
-        shift: So many times ``strains`` is added to J, beside the mean of its diagonal: where a
-            material softens J is indefinite, and the residual stays as it is.
-        kept: Whether matrix, rows and factors stay as they are, though u changes.
+        kept: Whether matrix and factors stay as they are, though u changes.
     """
 
     names: ClassVar[tuple[str, str]] = ("J", "F")
 
     def __init__(
-        self, J: ufl.Form, F: ufl.Form, *as_forms: Any, u: fem.Function, strains: ufl.Form | None
+        self, J: ufl.Form, F: ufl.Form, *as_forms: Any, u: fem.Function, finite: bool
     ) -> None:
-        self._u, self.kept, self._new_matrix, self.shift = u, False, True, 0.0
+        self._u, self.kept, self._new_matrix = u, False, True
         self._x = u.function_space.mesh.geometry.x
-        self._reference = None if strains is None else self._x.copy()
+        self._reference = self._x.copy() if finite else None
         self._matrix: csr_array | None = None
         super().__init__(J, F, *as_forms)
-        self._strains = None if strains is None else self.compiled(strains, "the strains")
-        self._of_shift = Data(lambda: [np.array(self.shift)], u.function_space.mesh.comm)
-
-    def has_new_points(self) -> bool:
-        """Return whether the mesh has moved since the last call; never where all is kept."""
-        return not self.kept and super().has_new_points()
 
     def has_new_stiffness(self) -> bool:
         """Return whether J has changed since the last call; never where it is kept."""
-        changed = not self.kept and super().has_new_stiffness()
-        self._new_matrix = self._of_shift.has_changed() or changed
+        self._new_matrix = not self.kept and super().has_new_stiffness()
         return self._new_matrix
 
     def has_new_load(self) -> bool:
@@ -73,12 +62,7 @@ class NewtonForms(Forms):
     def stiffness(self) -> Any:
         """Return this rank's J(u)."""
         with self._in_place():
-            self._matrix = K = super().stiffness()
-            if self.shift and self._strains is not None:
-                G = assemble_csr(self._strains)
-                sizes = np.array([np.abs(K.diagonal()).sum(), G.diagonal().sum()])
-                total, of_strains = summed(self._u.function_space.mesh.comm, sizes)
-                self._matrix = K + (self.shift * total / of_strains) * G
+            self._matrix = super().stiffness()
         return self._matrix.copy()  # Blocks take their data from it
 
     def load(self) -> Array:
@@ -95,9 +79,11 @@ class NewtonForms(Forms):
     @contextmanager
     def _in_place(self) -> Iterator[None]:
         """Integrate over the mesh as it was, in finite strain."""
+        if self._reference is None:
+            yield
+            return
         here = self._x.copy()
-        if self._reference is not None:
-            self._x[:] = self._reference
+        self._x[:] = self._reference
         try:
             yield
         finally:

@@ -13,7 +13,7 @@ from dolfinx import fem
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import interpolation_points
 from tfeti_dolfinx.common.validation import FROM_0, POSITIVE, checked_number, checked_type
-from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.errors import ConvergenceError, InputError, raised_on_all_ranks
 from tfeti_dolfinx.forms.elasticity import Elasticity
 
 
@@ -118,7 +118,7 @@ class J2Plasticity:
         points = interpolation_points(Q)
         s = self._trial(u)
         self._q_of_u = fem.Expression(ufl.sqrt(1.5 * ufl.inner(s, s)), points)
-        self._G_of_x = fem.Expression(_scalar(elasticity.mu, mesh), points)
+        self._G_of_x = fem.Expression(elasticity.mu, points)
         self._n = self._normal(u)
         new = self._tensor(self.plastic_strain) + self._dp * self._n
         self.state = {self.plastic_strain: _components(new, self._gdim), self.p: self.p + self._dp}
@@ -140,12 +140,19 @@ class J2Plasticity:
             if not np.all(np.isfinite(q)):
                 raise InputError("J2Plasticity: the stress is not finite")
         plastic = q > (1.0 + tol.yielding) * self._yield_stress(p)[0]
+        left = bool(np.any(plastic))
         for _ in range(tol.max_it):  # concave in dp: Newton's method goes up monotonically
+            if not left:
+                break
             y, slope = self._yield_stress(p + dp)
             f = np.where(plastic, q - 3.0 * G * dp - y, 0.0)
-            if not np.any(np.abs(f) > tol.rtol * (q + y)):
-                break
             dp += f / (3.0 * G + slope)
+            left = bool(np.any(np.abs(f) > tol.rtol * (q + y)))
+        with raised_on_all_ranks(self.u.function_space.mesh.comm):
+            if left:
+                raise ConvergenceError(
+                    f"J2Plasticity: the return takes more than {tol.max_it} steps somewhere"
+                )
         self._dp.x.array[:] = dp
         self._slope.x.array[:] = self._yield_stress(p + dp)[1]
 
@@ -214,8 +221,3 @@ def _components(t: Any, gdim: int) -> Any:
     """Return the components of symmetric 3×3 tensors."""
     places = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
     return ufl.as_vector([t[i, j] for i, j in places[: 6 if gdim == 3 else 4]])
-
-
-def _scalar(value: Any, mesh: Any) -> Any:
-    """Return a scalar as a UFL expression on a mesh, which ``fem.Expression`` needs."""
-    return value + 0 * ufl.SpatialCoordinate(mesh)[0]

@@ -11,11 +11,12 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 
+from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.common.parallel import bcast_from_root, largest, summed
 from tfeti_dolfinx.common.validation import checked_callable, checked_flag, checked_type
-from tfeti_dolfinx.contact.partner import ContactPartner
-from tfeti_dolfinx.errors import ConvergenceError, FactorError, InputError, TfetiError
+from tfeti_dolfinx.contact.partner import ContactPartner, Gap, checked_contacts
+from tfeti_dolfinx.errors import ConvergenceError, InputError, TfetiError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.nonlinear.forms import CurrentPlaces, NewtonForms
 from tfeti_dolfinx.nonlinear.state import InternalVariables, NewValue
@@ -54,9 +55,6 @@ class NewtonTolerances:
         slow: A kept model is made anew where an increment is more than this share of the last one.
         other: Anderson's acceleration begins anew where an increment is so many times the last
             one, as with rows of new places.
-        shift: Where a tangent in finite strain cannot be factored, a form with the same kernel is
-            added, beside its mean diagonal first the square of this, then its inverse times as
-            much; from tangent to tangent it falls by this factor.
     """
 
     max_it: int = 50
@@ -74,7 +72,6 @@ class NewtonTolerances:
     dependent: float = 1e-12
     slow: float = 0.7
     other: float = 2.0
-    shift: float = 0.1
 
 
 class NonlinearContactProblem(ContactProblem):
@@ -96,8 +93,8 @@ class NonlinearContactProblem(ContactProblem):
     3. *End* where ‖d‖ is at most rtol ‖u‖ in the maximum norm, in finite strain with rows of where
        the bodies are; in small strain where the remainder times ‖d‖ is, which the next one is
        expected to be.
-    4. *Step.* u ← u + t d; where t = 1 and J is not the derivative of F, or kept, accelerated by
-       Anderson's method.
+    4. *Step.* u ← u + t d; in finite strain, where J is not the derivative of F, and where J is
+       kept, accelerated by Anderson's method.
 
     Args:
         F: Residual F(u; v), a linear form in a test function on a Lagrange space of the torn mesh.
@@ -138,22 +135,30 @@ class NonlinearContactProblem(ContactProblem):
         tolerances: NewtonTolerances | None = None,
         **others: Any,
     ) -> None:
-        checked_type(u, fem.Function, "u", "the dolfinx.fem.Function that F is a residual of")
-        checked_type(F, ufl.Form, "F", "a linear form")
-        if update is not None:
-            checked_callable(update, "update", "a function without arguments")
+        checked_type(
+            decomposition, Decomposition, "decomposition", "what decompose or read_gmsh return"
+        )
+        with agreeing(decomposition.comm, type(self).__name__) as given:
+            given["finite"] = self._finite = checked_flag(finite, "finite")
+            given["update"] = "not given" if update is None else "given"
+            checked_type(u, fem.Function, "u", "the dolfinx.fem.Function that F is a residual of")
+            checked_type(F, ufl.Form, "F", "a linear form")
+            if update is not None:
+                checked_callable(update, "update", "a function without arguments")
+            if finite and J is not None:
+                raise InputError("finite=True: expected no J, since the tangent is made from F")
+            if finite:
+                check_gaps(contacts)
+                J = rotation_free_tangent(F, u)
+            elif J is None:
+                J = ufl.derivative(F, u)
+            checked_type(J, ufl.Form, "J", "a bilinear form")
         self._tolerances = NewtonTolerances() if tolerances is None else tolerances
-        self._strains: ufl.Form | None = None
-        self._update, self._finite = update, checked_flag(finite, "finite")
-        if finite and J is not None:
-            raise InputError("finite=True: expected no J, since the tangent is made from F")
-        if finite:
-            J, self._strains = rotation_free_tangent(F, u)
-        elif J is None:
-            J = ufl.derivative(F, u)
-        checked_type(J, ufl.Form, "J", "a bilinear form")
+        self._update = update
         self._state = InternalVariables({} if state is None else state, decomposition.mesh)
         super().__init__(J, F, bcs, contacts, decomposition, u=u, **others)
+        if self.options.rtol == "auto":
+            raise InputError("rtol auto: it is for linear problems; expected a number")
         self._exact = self.options.number
         self._first = self._begin = np.array(u.x.array)
         self._last_increment = self._tolerances.loosest
@@ -162,7 +167,7 @@ class NonlinearContactProblem(ContactProblem):
 
     def _forms(self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any) -> NewtonForms:
         given = (a, L, V, self.decomposition, *options)
-        return NewtonForms(*given, u=self.u, strains=self._strains)
+        return NewtonForms(*given, u=self.u, finite=self._finite)
 
     @property
     def _newton_forms(self) -> NewtonForms:
@@ -188,6 +193,7 @@ class NonlinearContactProblem(ContactProblem):
             self._newton(total)
         except TfetiError:  # on all ranks
             self._set(begin)
+            self._start = None  # that of a linearised problem is no end of a load step
             raise
         finally:
             self._newton_forms.kept = False
@@ -245,18 +251,9 @@ class NonlinearContactProblem(ContactProblem):
         if self._places is None:
             super().solve()
             return
-        forms, tol = self._newton_forms, self._tolerances
         self._go_to_places(self._places)
-        forms.shift = forms.shift * tol.shift if forms.shift > tol.shift**3 else 0.0
         try:
-            while True:
-                try:
-                    super().solve()
-                    return
-                except FactorError:  # on all ranks
-                    forms.shift = max(forms.shift / tol.shift, tol.shift**2)
-                    if forms.shift > 1.0 / tol.shift:
-                        raise
+            super().solve()
         finally:
             self._places.back()
 
@@ -285,7 +282,7 @@ class NonlinearContactProblem(ContactProblem):
             for block, part in zip(subdomains.blocks, subdomains.dof_parts, strict=True)
         )
         own = np.array([sum(subdomains.energies(primal)), diagonal])
-        energy, diagonal = summed(self.decomposition.comm, own)
+        energy, diagonal = self._total(own)
         start, rounding = -float(energy), tol.rounding * float(diagonal)
         forces = start - self._slope(u, d, 0.0)  # λᵀB d, since J d + F(u) + Bᵀλ = 0
         b, high = self._longest(u, d, forces)
@@ -323,8 +320,35 @@ class NonlinearContactProblem(ContactProblem):
     def _slope(self, u: Array, d: Array, t: float) -> float:
         """F(u + t d; d). Collective."""
         self._set(u + t * d)
-        own = self._newton_forms.residual() @ d
-        return float(summed(self.decomposition.comm, np.array([own]))[0])
+        (slope,) = self._total(np.array([self._newton_forms.residual() @ d]))
+        return float(slope)
+
+    def _total(self, own: Array) -> Array:
+        """Sum over ranks, the same on each: it steers them. Collective."""
+        comm = self.decomposition.comm
+        return bcast_from_root(comm, summed(comm, own))
+
+    def update(
+        self,
+        *,
+        load: ufl.Form | None = None,
+        values: Sequence[fem.DirichletBC] | None = None,
+        stiffness: ufl.Form | None = None,
+        gap: Mapping[int | str, Gap] | None = None,
+    ) -> None:
+        """Take other Dirichlet conditions or gaps; see ``ContactProblem.update``.
+
+        Raises:
+            InputError: As there, or a load or a stiffness is given, or a gap in finite strain.
+        """
+        if load is not None or stiffness is not None:
+            raise InputError(
+                "update: load and stiffness are those of linear problems; expected constants and "
+                "functions in F that change"
+            )
+        if gap is not None and self._finite:
+            raise InputError("update: gaps in finite strain are those of the places; expected none")
+        super().update(values=values, gap=gap)
 
     def accept(self) -> None:
         """Take the last solution as the end of a load step; internal variables are committed.
@@ -382,6 +406,19 @@ class NonlinearContactProblem(ContactProblem):
         if self._solution is None:
             self.u.x.array[:] = self._first
         self._set(self.u.x.array)
+
+
+def check_gaps(contacts: Sequence[ContactPartner]) -> None:
+    """Raise if a contact in finite strain has a given gap, which no place would change.
+
+    Raises:
+        InputError: It names the contact.
+    """
+    for contact in checked_contacts(contacts):
+        if not isinstance(contact.gap, str):
+            raise InputError(
+                f'{contact.name}: a given gap with finite=True; expected gap="geometry" or "curved"'
+            )
 
 
 class Totals:

@@ -42,7 +42,7 @@ class GradientReplaced(MultiFunction):  # type: ignore[misc]
         return Zero(o.ufl_shape) if o == self._v else o
 
 
-def rotation_free_tangent(F: ufl.Form, u: fem.Function) -> tuple[ufl.Form, ufl.Form]:
+def rotation_free_tangent(F: ufl.Form, u: fem.Function) -> ufl.Form:
     """Return a tangent of a residual whose kernel are the rigid motions about X + u.
 
     With F = I + ∇u, the first Piola–Kirchhoff stress P and S = F⁻¹P the tangent along w has a
@@ -55,9 +55,6 @@ def rotation_free_tangent(F: ufl.Form, u: fem.Function) -> tuple[ufl.Form, ufl.F
     Args:
         F: Residual, linear in its test function, for instance ∫P(u):∇v dx less that of loads.
         u: The displacement.
-
-    Returns:
-        The tangent, and ∫E(w) : E(v), whose kernel is the same.
     """
     F = expand_derivatives(F)
     (v,) = F.arguments()
@@ -81,8 +78,7 @@ def rotation_free_tangent(F: ufl.Form, u: fem.Function) -> tuple[ufl.Form, ufl.F
 
     whole = geometric(ufl.grad(w), ufl.grad(v))
     of_stretches = geometric(inverse.T * strain(w), inverse.T * strain(v))
-    measure = ufl.dx(domain=u.function_space.mesh)
-    return tangent - whole + of_stretches, ufl.inner(strain(w), strain(v)) * measure
+    return tangent - whole + of_stretches
 
 
 def _has_gradient_of(expression: Any, u: fem.Function) -> bool:
