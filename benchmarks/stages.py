@@ -115,7 +115,7 @@ def solved(demo, size, options):
     scene = demo.scene(demo.torn_mesh(argparse.Namespace(quick=False, **size)))
     mesh = memory()
     problem = tfeti.ContactProblem(**scene, petsc_options={"tfeti_qp_type": "newton", **options})
-    seconds = problem.report.seconds = Watched(problem.report.seconds, mesh)
+    seconds = problem._seconds = Watched(problem._seconds, mesh)
     problem.solve()
     problem.destroy()
     return problem.report, seconds

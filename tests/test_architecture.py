@@ -30,7 +30,7 @@ ROOMS = [
     ["nonlinear"],
     ["steps"],
     # optional: nothing imports them but by their names in extensions.PLUGINS
-    ["bem", "clusters", "pseudoinverse"],
+    ["bem", "clusters"],
 ]
 PLACE = {room: place for place, rooms in enumerate(ROOMS) for room in rooms}
 # the QP solvers know nothing of meshes and rows, the Blocks nothing of rows

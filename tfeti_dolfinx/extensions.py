@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from importlib import import_module
 from typing import Any
 
@@ -24,14 +24,16 @@ from tfeti_dolfinx.qp.recycling import Recycled
 from tfeti_dolfinx.qp.sets import FeasibleSet
 from tfeti_dolfinx.solve.solver import resolve_types
 from tfeti_dolfinx.subdomains.block import PROMISED, Block, Counters, SubdomainData, mode_names
-from tfeti_dolfinx.subdomains.build import MakeBlock, SubdomainMethod, sparse_blocks
-from tfeti_dolfinx.subdomains.factor import added_options
-from tfeti_dolfinx.subdomains.kplus import (
-    InverseFactory,
-    MakeInverse,
-    regularised,
+from tfeti_dolfinx.subdomains.build import (
+    MakeBlock,
+    SubdomainMethod,
+    make_subdomains,
+    sparse_blocks,
 )
+from tfeti_dolfinx.subdomains.factor import added_options
+from tfeti_dolfinx.subdomains.kplus import InverseFactory, MakeInverse
 from tfeti_dolfinx.subdomains.local_operators import LocalChoice
+from tfeti_dolfinx.subdomains.pseudoinverse import KPLUS_TYPES
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # optional parts, which no other module imports: where they are, by name
@@ -39,8 +41,6 @@ PLUGINS = {
     "BoundaryElements": "tfeti_dolfinx.bem.boundary_elements:BoundaryElements",
     "Interior": "tfeti_dolfinx.bem.interior:Interior",
     "clusters": "tfeti_dolfinx.clusters:extension",
-    "schur": "tfeti_dolfinx.pseudoinverse:SchurPseudoinverse",
-    "lu_svd": "tfeti_dolfinx.pseudoinverse:trailing_pseudoinverse",
 }
 
 
@@ -195,7 +195,7 @@ def _checked_set(law: FeasibleLaw) -> FeasibleLaw:
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of a solve.
+    """Settings of a solve, and what they make.
 
     Attributes:
         options: Options.
@@ -224,39 +224,39 @@ class Settings:
             },
         }
 
-    @property
-    def local_choice(self) -> LocalChoice:
-        """Choice of the form of local operators."""
-        return LocalChoice(self.options.local_type, self.options.local_multiplications)
-
-    def make_block(self, counters: Counters) -> MakeBlock:
-        """Return the factory of the Blocks of a rank.
-
-        Args:
-            counters: Counts factorisations.
-        """
-        return self.extensions.block or sparse_blocks(self.making(counters), self.local_choice)
-
-    def making(self, counters: Counters) -> InverseFactory:
+    def inverses(self, counters: Counters) -> InverseFactory:
         """Return the factory of the subdomains' generalised inverses."""
-        kplus, name = self.extensions.kplus, self.options.kplus_type
-        if kplus is None:
-            kplus = regularised if name == "regularized" else plugin(name)
+        kplus = self.extensions.kplus or KPLUS_TYPES[self.options.kplus_type]
         return InverseFactory(counters, kplus, f"{self.prefix}sub_")
 
-    def preconditioner(self, pc_type: str) -> MakePreconditioner | None:
-        """Return the preconditioner, the program's own if it brings one.
+    def make_subdomains(
+        self,
+        data: Iterable[SubdomainData],
+        dofs: TornDofs,
+        decomposition: Decomposition,
+        counters: Counters,
+        replaced: Callable[[MakeBlock], MakeBlock] | None = None,
+    ) -> Subdomains:
+        """Return all Blocks of a rank as one. Collective.
+
+        Args:
+            data: The subdomains, each of which is let go when its Block is made.
+            dofs: Dof maps.
+            decomposition: The torn mesh.
+            counters: Counts factorisations and solves.
+            replaced: From the factory of Blocks to one that makes some of them otherwise.
 
         Raises:
-            InputError: It does, and the solver takes none.
+            InputError: Stiffness or load do not fit.
+            FactorError: A factor could not be made.
         """
-        own = self.extensions.preconditioner
-        if own is not None and pc_type == "none":
-            raise InputError(
-                f"extensions: a preconditioner is given, but -{self.prefix}pc_type is none, as "
-                "auto is with smalse; expected lumped or dirichlet, whose place it takes"
-            )
-        return own or PRECONDITIONERS.get(pc_type)
+        own, options = self.extensions, self.options
+        choice = LocalChoice(options.local_type, options.local_multiplications)
+        make = own.block or sparse_blocks(self.inverses(counters), choice)
+        make = make if replaced is None else replaced(make)
+        kind = Subdomains if own.subdomains is None else own.subdomains(dofs, decomposition)
+        with added_options(self.prefix, self.factor_options):
+            return make_subdomains(data, make, decomposition, counters, choice, kind)
 
     def make_dual(
         self,
@@ -265,22 +265,29 @@ class Settings:
         dofs: TornDofs,
         decomposition: Decomposition,
         feasible: FeasibleLaw,
-    ) -> Dual:
-        """Return the dual problem of rows and subdomains. Collective.
+    ) -> tuple[Dual, Options]:
+        """Return the dual problem, and the options with what ``auto`` stands for. Collective.
 
         Raises:
+            InputError: The solver cannot keep the rows, or takes no preconditioner of one's own.
             NoSolutionError: The load moves a body that nothing holds.
             FactorError: A matrix could not be factored.
         """
         rows = constraints.sets.contact_rows(dofs.comm)
-        _, pc_type = resolve_types(self.options, rows, self.prefix)
+        qp_type, pc_type = resolve_types(self.options, rows, self.prefix)
+        preconditioner = self.extensions.preconditioner
+        if preconditioner is not None and pc_type == "none":
+            raise InputError(
+                f"extensions: a preconditioner is given, but -{self.prefix}pc_type is none, as "
+                "auto is with smalse; expected lumped or dirichlet, whose place it takes"
+            )
         with added_options(self.prefix, self.factor_options):
             dual = Dual(
                 constraints=constraints,
                 subdomains=subdomains,
                 body_names=decomposition.body_names,
                 mode_names=mode_names(decomposition.mesh.geometry.dim, dofs.bs),
-                preconditioner=self.preconditioner(pc_type),
+                preconditioner=preconditioner or PRECONDITIONERS.get(pc_type),
                 options_prefix=self.prefix,
                 feasible=feasible,
                 deflation=self.extensions.deflation or SoftModes,
@@ -288,4 +295,4 @@ class Settings:
             )
         if isinstance(self.options.recycle, int) and self.options.recycle:
             dual.recycled = Recycled(self.options.recycle, dofs.comm)
-        return dual
+        return dual, replace(self.options, qp_type=qp_type, pc_type=pc_type)

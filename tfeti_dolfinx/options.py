@@ -6,7 +6,7 @@ import difflib
 import math
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,8 +30,8 @@ from tfeti_dolfinx.feti.operator import PRECONDITIONERS
 from tfeti_dolfinx.qp.parameters import NewtonParameters, SmalseParameters
 from tfeti_dolfinx.qp.solvers import SOLVERS
 from tfeti_dolfinx.subdomains.factor import default_solver, has_solver, unread_options
-from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES
 from tfeti_dolfinx.subdomains.local_operators import LOCAL_TYPES
+from tfeti_dolfinx.subdomains.pseudoinverse import KPLUS_TYPES
 
 # --- Options ----------------------------------------------------------------------------------
 
@@ -97,7 +97,7 @@ class Options:
         "subdomains",
         "generalised inverse of a subdomain: K made regular on fixing nodes, by the Schur "
         "complement on these, or by that on the last unknowns of an elimination",
-        choices=KPLUS_TYPES,
+        choices=tuple(KPLUS_TYPES),
     )
     local_type: str = described(
         "auto",
@@ -209,6 +209,12 @@ FACTOR_NAMES = (
     "mat_mumps_icntl_14",
     "mat_mumps_cntl_1",
 )
+# options that are gone, and what to do without them
+REMOVED = {
+    "stiffening": "flat cells are not stiffened; expected cells that are less flat",
+    "spectrum": "benchmarks/spectrum.py has these eigenvalues",
+    "bbt": "benchmarks/spectrum.py has these eigenvalues",
+}
 # what solvers of PETSc are chosen by, and this one by -qp_type
 TYPES = re.compile(r"(ksp|snes|tao|qp|qps|mat_solver)_type", re.IGNORECASE)
 
@@ -229,8 +235,8 @@ def parse_options(
     """
     named = {**(defaults or {}), **_without_prefix(given, prefix)}
     database = PETSc.Options(prefix)
-    _check_reached(named, database, prefix)
     named |= {name: database.getString(name, "") for name in database.getAll()}
+    _check_reached(named, prefix)
     known = {option.name: option for option in parameters_of(Options)}
     for name in named:
         if name not in known and not FACTOR_OPTION.fullmatch(name):
@@ -253,6 +259,8 @@ def factor_options(given: Mapping[str, Any] | None, prefix: str) -> dict[str, An
 
 def _expected(name: str, known: Mapping[str, Parameter], prefix: str) -> str:
     """Say what option an unknown name may be meant for; of all of them where none is near."""
+    if name in REMOVED:
+        return f"it is no option any more: {REMOVED[name]}"
     if TYPES.fullmatch(name):
         choices = ", ".join(known["qp_type"].description.choices)
         return (
@@ -289,18 +297,13 @@ def _check_factors_read(named: Mapping[str, Any], prefix: str) -> None:
         if chosen is None and family != "sub" and has_solver("mumps"):
             solvers.append("mumps")  # where several ranks share one
         unread = [unread_options(given, solver) for solver in dict.fromkeys(solvers)]
-        for name in unread[0]:
-            if all(name in names for names in unread):
-                raise InputError(_unread(name, family, solvers, prefix))
-
-
-def _unread(name: str, family: str, solvers: Sequence[str], prefix: str) -> str:
-    """Say that factors do not read an option, and what they may read in its place."""
-    text = f"-{prefix}{family}_{name}: factors by {' or '.join(solvers)} read no such option"
-    package = re.match(r"mat_(cholmod|mumps)_", name)
-    if package and package[1] not in solvers:
-        return f"{text}; expected -{prefix}{family}_pc_factor_mat_solver_type {package[1]} with it"
-    return f"{text}; {_near_factor_names(name, f'{prefix}{family}_')}"
+        for name in (name for name in given if all(name in names for names in unread)):
+            own, package = f"{prefix}{family}_", re.match(r"mat_(cholmod|mumps)_", name)
+            hint = _near_factor_names(name, own)
+            if package and package[1] not in solvers:
+                hint = f"expected -{own}pc_factor_mat_solver_type {package[1]} with it"
+            makers = " or ".join(solvers)
+            raise InputError(f"-{own}{name}: factors by {makers} read no such option; {hint}")
 
 
 def _near_factor_names(name: str, prefix: str) -> str:
@@ -331,11 +334,10 @@ def _without_prefix(given: Any, prefix: str) -> dict[str, Any]:
     return named
 
 
-def _check_reached(named: Mapping[str, Any], database: PETSc.Options, prefix: str) -> None:
+def _check_reached(named: Mapping[str, Any], prefix: str) -> None:
     """Raise if the command line has options that PETSc was not given."""
-    known = set(named) | set(database.getAll())
     for word in sys.argv[1:]:
-        if word.startswith(f"-{prefix}") and word.removeprefix(f"-{prefix}") not in known:
+        if word.startswith(f"-{prefix}") and word.removeprefix(f"-{prefix}") not in named:
             raise InputError(
                 f"{word} on the command line did not reach PETSc; call petsc4py.init(sys.argv) "
                 "before dolfinx is imported"
@@ -367,15 +369,12 @@ def _converted(option: Parameter, value: Any, prefix: str) -> Any:
 
 
 def _as_bool(value: Any) -> bool:
-    if isinstance(value, str):
-        table = {"": True, "1": True, "true": True, "yes": True, "on": True}
-        table |= {"0": False, "false": False, "no": False, "off": False}
-        if value.lower() not in table:
-            raise ValueError(value)
-        return table[value.lower()]
-    if value is not None and value not in (0, 1):
-        raise ValueError(value)
-    return True if value is None else bool(value)
+    word = "" if value is None else str(value).lower()
+    if word in ("", "1", "true", "yes", "on"):
+        return True
+    if word in ("0", "false", "no", "off"):
+        return False
+    raise ValueError(value)
 
 
 def _as_float(value: Any) -> float:
@@ -385,9 +384,7 @@ def _as_float(value: Any) -> float:
 
 
 def _as_int(value: Any) -> int:
-    if isinstance(value, str):
-        return int(value)
-    if _as_float(value) != int(value):
+    if not isinstance(value, str) and _as_float(value) != int(value):
         raise ValueError(value)
     return int(value)
 

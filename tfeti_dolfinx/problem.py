@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -11,7 +11,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from tfeti_dolfinx.accuracy.diagnostics import Diagnostics, note_estimates
+from tfeti_dolfinx.accuracy.diagnostics import Diagnostics, with_estimates
 from tfeti_dolfinx.accuracy.estimates import Estimates, estimate, goal_of, of_looks
 from tfeti_dolfinx.common.agreement import agreeing, described, fields_in, sums_of
 from tfeti_dolfinx.common.arrays import Array
@@ -41,91 +41,133 @@ from tfeti_dolfinx.forms.fields import Stress, checked_stress, checked_thickness
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import factor_options, parse_options
-from tfeti_dolfinx.report import Report, fill_result, settle_seconds
+from tfeti_dolfinx.report import Outcome, Report, SolverCounts, largest_over_ranks
 from tfeti_dolfinx.solution import SavedState, Solution, check_state
 from tfeti_dolfinx.solve.coulomb import solve_with_friction
-from tfeti_dolfinx.solve.solver import conclude, learn, resolve_types
+from tfeti_dolfinx.solve.solver import conclude, learn
 from tfeti_dolfinx.subdomains.build import SubdomainMethod
 from tfeti_dolfinx.system import System
 
-# --- Solves with more contact rows until nothing overlaps -------------------------------------
-
-MAX_ROUNDS = 20
-
-
-def solve_in_rounds(solve_rows: Callable[[], Solution], system: System, report: Report) -> None:
-    """Solve until no node without a row overlaps. Collective.
-
-    Args:
-        solve_rows: Solves with the present rows.
-        system: The rows.
-        report: Takes seconds and counts.
-
-    Raises:
-        NoSolutionError: The problem has no solution, however far one looks.
-        ConvergenceError: Nodes without a row still overlap after many rounds.
-    """
-    for _ in range(MAX_ROUNDS):
-        try:
-            solution = solve_rows()
-        except NoSolutionError as error:  # on all ranks: what is far may hold the body yet
-            added = _widen(system, report, error)
-        else:
-            overlap = report.tolerances["penetration"]
-            with stage("contact", report.seconds):
-                added = system.search.take_in_overlapping(solution.u, overlap)
-            if added == 0:
-                return
-        if added:
-            system.change("rows")
-        report.late_contact_rows += added
-    raise ConvergenceError(f"nodes out of reach still overlap after {MAX_ROUNDS} rounds")
-
-
-def _widen(system: System, report: Report, error: NoSolutionError) -> int:
-    """Increase the reach of contacts that may hold a body; return the number of new rows."""
-    search = system.search
-    if not search.is_exhausted:
-        with stage("contact", report.seconds):
-            return search.widen()
-    report.converged_reason = "NO_SOLUTION"
-    if unmet := search.unmet():
-        text = f"{error}; of the contacts meet nobody: {', '.join(unmet)}"
-        raise NoSolutionError(text) from error
-    raise error
-
-
-# --- Solutions of load steps ------------------------------------------------------------------
+MAX_ROUNDS = 20  # of solves with more and more contact rows
 
 # rows, their λ, and the multipliers of Gλ = e
 Start = tuple[Gluing, Array, Array]
 
 
-class Stepping:
-    """Load steps of ``ContactProblem``: solutions found, and the state to continue from.
+class ContactProblem:
+    """Linear elasticity with contact on a torn mesh, solved by Total FETI.
+
+    Mirrors ``dolfinx.fem.petsc.LinearProblem``; all is collective. The package has an example.
+
+    Args:
+        a: Bilinear form on a Lagrange space of the torn mesh.
+        L: Linear form; for no load ``ufl.ZeroBaseForm((v,))``.
+        bcs: Dirichlet conditions; their values hold on all torn copies of a node.
+        contacts: Obstacles and pairs of surfaces; none for a linear problem.
+        decomposition: The torn mesh.
+        stress: From a displacement to its 3×3 stress in UFL, for stress fields.
+        thickness: What the forms were multiplied with, a number or a scalar in UFL: a thickness
+            in 2D, 2πr if axisymmetric. Contact pressures are forces over areas times it.
+        u: Function that takes the solution; default a new one.
+        petsc_options: Options, with or without the prefix; the command line beats them.
+        petsc_options_prefix: Prefix of the options.
+        form_compiler_options: As in DOLFINx.
+        jit_options: As in DOLFINx.
+        extensions: Parts of one's own: a Block, a feasible set, a preconditioner, a K⁺, a monitor.
+        boundary_elements: Which volumes get boundary elements.
 
     Attributes:
         defaults: Options, by name, that have other defaults than their own.
         form_name: Name of the bilinear form, for messages.
+        u: The displacement of the last solve.
+        report: Sizes, counters, residuals and times of the last solve.
+        options: The options.
+        dofs: Dof maps.
+
+    Raises:
+        InputError: Something given does not fit; the message names it.
     """
 
     defaults: ClassVar[Mapping[str, Any]] = {}
     form_name: ClassVar[str] = "a"
 
-    u: fem.Function
-    dofs: TornDofs
-    decomposition: Decomposition
-    contacts: list[ContactPartner]
-    report: Report
-    _settings: Settings
-    _system: System
-    bcs: list[fem.DirichletBC]
-    _given_stress: Stress | None
-    _stress: Stress | None = None
-    _thickness: Any
-    _solution: Solution | None = None
-    _start: Start | None = None
-    _accepted: tuple[Solution | None, Start | None] = (None, None)
+    def __init__(
+        self,
+        a: ufl.Form,
+        L: ufl.Form,
+        bcs: Sequence[fem.DirichletBC],
+        contacts: Sequence[ContactPartner],
+        decomposition: Decomposition,
+        *,
+        stress: Stress | None = None,
+        thickness: Any = 1.0,
+        u: fem.Function | None = None,
+        petsc_options: Mapping[str, Any] | None = None,
+        petsc_options_prefix: str = "tfeti_",
+        form_compiler_options: dict[str, Any] | None = None,
+        jit_options: dict[str, Any] | None = None,
+        extensions: Extensions | None = None,
+        boundary_elements: SubdomainMethod | None = None,
+    ) -> None:
+        checked_type(
+            decomposition, Decomposition, "decomposition", "what decompose or read_gmsh return"
+        )
+        self.decomposition, comm = decomposition, decomposition.comm
+        with agreeing(comm, type(self).__name__) as given:
+            require_real_petsc()
+            self.options = parse_options(petsc_options, petsc_options_prefix, self.defaults)
+            extensions = Extensions() if extensions is None else extensions
+            checked_type(extensions, Extensions, "extensions", "tfeti_dolfinx.Extensions")
+            for_factors = factor_options(petsc_options, petsc_options_prefix)
+            own = guarded(extensions, self.options, comm)
+            self._settings = Settings(self.options, petsc_options_prefix, for_factors, own)
+            self.contacts = checked_contacts(contacts)
+            bcs = listed_conditions(bcs)
+            given |= {"a": a, "L": L, "bcs": bcs, "contacts": contacts, "thickness": thickness}
+            given |= {"stress": stress, "u": u, "boundary_elements": boundary_elements}
+            given |= {"form_compiler_options": form_compiler_options, **self._settings.given}
+            given |= self._given_besides()
+        V = displacement_space(a, decomposition, self.form_name)
+        self.bcs = checked_conditions(bcs, V)
+        self.u = fem.Function(V, name="displacement") if u is None else self._checked_u(u, V)
+        self._given_stress = stress
+        self._stress: Stress | None = None
+        if stress is not None:
+            with agreeing(comm, "stress(u)") as given:
+                given["stress(u)"] = sigma = self._look_at_stress()
+                check_mesh(sigma, "stress", decomposition)
+        if self.options.rtol == "auto" and stress is None:
+            raise InputError(
+                f"-{petsc_options_prefix}rtol auto: the problem has no stress to estimate the "
+                "discretisation error from; expected ContactProblem(..., stress=sigma)"
+            )
+        self._counts, self._outcome = SolverCounts(), Outcome()
+        self._in_all: dict[str, float] = {}
+        self._solution: Solution | None = None
+        self._start: Start | None = None
+        self._accepted: tuple[Solution | None, Start | None] = (None, None)
+        self._boundary_elements = boundary_elements
+        self._thickness = checked_thickness(thickness, decomposition)
+        self._seconds = dict(decomposition.seconds)  # of the next solve
+        self.report = Report(seconds=self._seconds)
+        with stage("assembly", self._seconds):
+            forms = self._forms(a, L, V, form_compiler_options, jit_options)
+        with stage("gluing", self._seconds):
+            self.dofs = TornDofs(V, decomposition)
+            check_not_on_tears(self.bcs, self.dofs, decomposition)
+        forms.thickness = self._thickness
+        self._diagnostics = Diagnostics(decomposition, self.dofs)
+        if boundary_elements is not None:
+            check_method(boundary_elements, extensions)
+        self._system = System(
+            forms,
+            self.bcs,
+            self.contacts,
+            self.dofs,
+            decomposition,
+            self._settings,
+            boundary_elements,
+        )
 
     @property
     def solution(self) -> Solution:
@@ -137,6 +179,231 @@ class Stepping:
         if self._solution is None:
             raise InputError("there is no solution yet; expected a call of solve() before")
         return self._solution
+
+    @property
+    def dual(self) -> Dual:
+        """The dual problem of the last solve, for experts.
+
+        Raises:
+            InputError: There is none before ``solve``, and after ``destroy``.
+        """
+        return self._system.dual
+
+    # -------------------------------------------------------------------- solve
+
+    def solve(self) -> fem.Function:
+        """Solve the problem.
+
+        What a solve has made is kept. Constants and functions in the forms, Dirichlet values and
+        the points of the mesh may change between two solves: only what depends on them is made
+        again, and the solver starts from the last solution. See ``update`` for new forms.
+
+        Returns:
+            The displacement, on the torn mesh.
+
+        Raises:
+            InputError: Dirichlet values, contacts, stiffness or load do not fit.
+            NoSolutionError: The problem has no solution.
+            ConvergenceError: The solver stopped before its tolerance.
+            FactorError: A matrix could not be factored.
+        """
+        self._meet("solve")
+        self._counts, self._outcome = SolverCounts(), Outcome()
+        try:
+            self._set_out()
+            self._system.look_for_changes()
+            self._solve_in_rounds()
+        except NoSolutionError:  # as any TfetiError on all ranks
+            self._compose_report(replace(self._outcome, converged_reason="NO_SOLUTION"))
+            raise
+        except TfetiError:
+            self._compose_report(self._outcome)
+            raise
+        self._compose_report(self._outcome)
+        self._system.search.warn_of_unmet()
+        if self.options.view and self.decomposition.comm.rank == 0:
+            print(self.options.view_text(self._settings.prefix), self.report, sep="\n", flush=True)
+        return self.u
+
+    def _solve_in_rounds(self) -> None:
+        """Solve, with more and more contact rows, until no node without a row overlaps.
+
+        Raises:
+            NoSolutionError: The problem has no solution, however far one looks.
+            ConvergenceError: Nodes without a row still overlap after many rounds.
+        """
+        system = self._system
+        for _ in range(MAX_ROUNDS):
+            try:
+                solution, overlap = self._solve_rows()
+            except NoSolutionError as error:  # on all ranks: what is far may hold the body yet
+                if not system.search.is_exhausted:
+                    with stage("contact", self._seconds):
+                        added = system.search.widen()
+                elif unmet := system.search.unmet():
+                    text = f"{error}; of the contacts meet nobody: {', '.join(unmet)}"
+                    raise NoSolutionError(text) from error
+                else:
+                    raise
+            else:
+                with stage("contact", self._seconds):
+                    added = system.search.take_in_overlapping(solution.u, overlap)
+                if added == 0:
+                    return
+            if added:
+                system.change("rows")
+            self._counts = self._counts.plus(SolverCounts(late_contact_rows=added))
+        raise ConvergenceError(f"nodes out of reach still overlap after {MAX_ROUNDS} rounds")
+
+    def _solve_rows(self) -> tuple[Solution, float]:
+        """Solve with the present rows, from the last solution on; return what may overlap, too."""
+        system, seconds, d = self._system, self._seconds, self.decomposition
+        dual, gluing = system.make(seconds), system.gluing
+        options = replace(system.options, rtol=self.options.rtol)
+        dual.forget_counts()
+        # 1. the multipliers
+        with stage("qp", seconds):
+            start = None
+            if self._start is not None:
+                learn(dual, options)
+                earlier, lam, mu = self._start
+                start = gluing.multipliers(earlier, lam), mu
+                start = None if dual.is_far(*start) else start
+            own, goal = self._settings.extensions.monitor, self._goal()
+            solved = solve_with_friction(dual, options, options.qp_type, start, own, goal)
+        result, accuracy, settling = solved
+        # 2. their displacement
+        with stage("recovery", seconds):
+            multipliers = Multipliers(np.array(result.lam.array_r), result.face)
+            solution = self._solution = self._make_solution(accuracy.u, multipliers, gluing)
+            self.u.x.array[:] = self.dofs.to_dolfinx(solution.u)
+        self._start = (gluing, solution.lam, result.mu) if result.reason > 0 else None
+        # 3. what the report says of it
+        self._counts = self._counts.plus(SolverCounts.of_run(dual, *solved))
+        excluding = system.search.named(gluing.contacts_of(result.excluding))
+        outcome = Outcome.of_answer(solution, dual, *solved, excluding, of_looks(accuracy.reached))
+        warnings = self._diagnostics.found(dual, solution, outcome, options.number)
+        self._outcome = replace(outcome, warnings=warnings)
+        result.destroy()
+        restless = settling.restless(d.body_names)
+        conclude(result, accuracy, self.options, d.comm, excluding, restless, warnings)
+        return solution, accuracy.tolerances().penetration
+
+    def _compose_report(self, outcome: Outcome) -> None:
+        """Compose the report of a solve, from records of its stages. Collective."""
+        seconds = largest_over_ranks(self._seconds, self.decomposition.comm)
+        records = self._system.sizes(), self._system.take_counts(), self._counts, outcome
+        self.report = Report.composed(records, seconds, self._in_all)
+        self._seconds, self._in_all = {}, self.report.in_all
+
+    def _goal(self) -> ErrorTarget | None:
+        """Return the error that -rtol auto compares the algebraic error with."""
+        if self.options.rtol != "auto" or self._stress is None:
+            return None
+        return goal_of(self._stress, self.dofs, self.decomposition, self._thickness)
+
+    def _make_solution(self, u: Array, multipliers: Multipliers, gluing: Gluing) -> Solution:
+        solution = Solution(
+            u=u,
+            multipliers=multipliers,
+            decomposition=self.decomposition,
+            gluing=gluing,
+            contacts=list(self._system.search.contacts),
+            stress=self._stress,
+            thickness=self._thickness,
+        )
+        solution.boundary = self._system.elements.solved(u)
+        return solution
+
+    # ------------------------------------------------------- after a solve
+
+    def estimate(self) -> Estimates:
+        """Estimate the errors of the last solution in energy. It costs what it says.
+
+        Returns:
+            The estimates, which ``report`` then has, too, with a warning where they are of no use.
+
+        Raises:
+            InputError: There is no solution, or its rows are no longer there.
+            FactorError: A matrix could not be factored.
+        """
+        self._meet("estimate")
+        found = estimate(self._system, self.solution)
+        self.report = with_estimates(self.report, found.numbers())
+        return found
+
+    def update(
+        self,
+        *,
+        load: ufl.Form | None = None,
+        values: Sequence[fem.DirichletBC] | None = None,
+        stiffness: ufl.Form | None = None,
+        gap: Mapping[int | str, Gap] | None = None,
+    ) -> None:
+        """Take other forms or conditions; the next ``solve`` makes again what depends on them.
+
+        Not needed where constants, functions or Dirichlet values have only got other values:
+        ``solve`` sees that itself. Of conditions on the same unknowns only the values count; a
+        new load, new values or new gaps need no row and no factor, a new stiffness no search:
+        with ``secondary="auto"`` the sides of a pair stay those of the first stiffness.
+
+        Args:
+            load: A linear form instead of ``L``.
+            values: Dirichlet conditions instead of ``bcs``.
+            stiffness: A bilinear form on the same space instead of ``a``.
+            gap: For contacts, by position or name, what their ``gap=`` is from now on. Rows stay;
+                nodes that have none and come to overlap get theirs, as ever.
+
+        Raises:
+            InputError: Something given does not fit; the message names it. Nothing has changed.
+        """
+        with agreeing(self.decomposition.comm, "update") as given:
+            conditions = None if values is None else listed_conditions(values)
+            given |= {"load": load, "values": conditions, "stiffness": stiffness, "gap": gap}
+        V, forms = self.dofs.V, copy(self._system.forms)
+        if conditions is None:
+            conditions = self.bcs
+        else:
+            conditions = checked_conditions(conditions, V)
+            check_not_on_tears(conditions, self.dofs, self.decomposition)
+        if stiffness is not None:
+            check_same_space(displacement_space(stiffness, self.decomposition), V, "stiffness", "a")
+            forms.replace_stiffness(stiffness)
+        if load is not None:
+            forms.replace_load(load)
+        if gap is not None:
+            self._system.set_gaps(gaps_by_position(self.contacts, gap))
+        self._system.forms, self.bcs[:] = forms, conditions
+
+    def digest(self) -> dict[str, Any]:
+        """Describe what determines the solution, for checkpoints: short, and as JSON takes it.
+
+        Collective. The forms and the values of their constants, contacts, conditions, mass and
+        mesh, as they are when it is called; of functions on the mesh sums over it, of callables
+        their names. Options, extensions and ``stress`` are none of it.
+        ``agreement.check_same_problem`` compares two of them.
+        """
+        comm, d = self.decomposition.comm, self.decomposition
+        with agreeing(comm, "digest") as given:
+            given |= self._given()
+        fields = fields_in(self._known_before(given))
+        mesh = {"type": "mesh", "subdomains": d.num_subdomains, "bodies": d.num_bodies}
+        sums = sums_of(comm, [d.mesh.geometry.x, *fields.values()])
+        found = {name: described(value) for name, value in given.items()}
+        found["mesh"] = {**mesh, "points": sums[0]}
+        found["sums over functions"] = dict(zip(fields, sums[1:], strict=True))
+        return found
+
+    def destroy(self) -> None:
+        """Destroy the PETSc objects; solution and report stay. ``solve`` makes them anew.
+
+        Collective.
+        """
+        with agreeing(self.decomposition.comm, "destroy"):
+            pass
+        self._system.destroy()
+
+    # -------------------------------------------------------------- load steps
 
     def take_step(self, size: float) -> None:
         """Say how long the next load step is: without inertia it does not matter."""
@@ -212,7 +479,7 @@ class Stepping:
         system = self._system
         system.know_rows(list(state.reach), state.groups())
         system.look_for_changes()
-        dual = system.make(self.report)
+        dual = system.make(self._seconds)
         dual.saw(float(state.norm))
         gluing = replace(system.gluing, slip=state.slip)
         state.check_rows(gluing)
@@ -225,6 +492,23 @@ class Stepping:
         self._return()
         system.count_slips_from(solution.u)
 
+    # ------------------------------------- what bodies with mass and nonlinear ones add
+
+    def _forms(self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any) -> Forms:
+        """Compile the forms of the matrix and the load."""
+        return Forms(a, L, V, self.decomposition, *options)
+
+    def _given_besides(self) -> dict[str, Any]:
+        """Return other input, checked, that ranks must have alike."""
+        return {}
+
+    def _set_out(self) -> None:
+        """Set the prediction of a step; nothing without inertia."""
+
+    def _known_before(self, given: dict[str, Any]) -> dict[str, Any]:
+        """Return that of the input whose functions are not those of the solution."""
+        return given
+
     def _check_state(self, state: SavedState) -> None:
         """Raise unless a state may be one of this problem. Not collective.
 
@@ -235,6 +519,8 @@ class Stepping:
 
     def _take_motion(self, state: SavedState) -> None:
         """Move as the bodies of a state do: without inertia not at all."""
+
+    # ------------------------------------------------------------------- checks
 
     def _meet(self, call: str) -> None:
         """Begin a call: check that all ranks make it with the same data. Collective.
@@ -249,7 +535,8 @@ class Stepping:
     def _given(self) -> dict[str, Any]:
         """Return what determines the solution at present, by name. Not collective."""
         about = {"bcs": self.bcs, "contacts": self.contacts, "thickness": self._thickness}
-        return {**self._system.forms.given, **about}
+        elements = {"boundary_elements": self._boundary_elements}
+        return {**self._system.forms.given, **about, **elements}
 
     def _look_at_stress(self) -> Any:
         """Return the user's stress of ``u`` in UFL, which solutions take until the next look.
@@ -265,312 +552,7 @@ class Stepping:
         self._stress = lambda u: ufl.replace(sigma, {own: u})
         return sigma
 
-    def _make_solution(self, u: Array, multipliers: Multipliers, gluing: Gluing) -> Solution:
-        solution = Solution(
-            u=u,
-            multipliers=multipliers,
-            decomposition=self.decomposition,
-            gluing=gluing,
-            contacts=list(self._system.search.contacts),
-            stress=self._stress,
-            thickness=self._thickness,
-        )
-        solution.boundary = self._system.elements.solved(u)
-        return solution
-
-
-# --- The contact problem ----------------------------------------------------------------------
-
-
-class ContactProblem(Stepping):
-    """Linear elasticity with contact on a torn mesh, solved by Total FETI.
-
-    Mirrors ``dolfinx.fem.petsc.LinearProblem``; all is collective. The package has an example.
-
-    Args:
-        a: Bilinear form on a Lagrange space of the torn mesh.
-        L: Linear form; for no load ``ufl.ZeroBaseForm((v,))``.
-        bcs: Dirichlet conditions; their values hold on all torn copies of a node.
-        contacts: Obstacles and pairs of surfaces; none for a linear problem.
-        decomposition: The torn mesh.
-        stress: From a displacement to its 3×3 stress in UFL, for stress fields.
-        thickness: What the forms were multiplied with, a number or a scalar in UFL: a thickness
-            in 2D, 2πr if axisymmetric. Contact pressures are forces over areas times it.
-        u: Function that takes the solution; default a new one.
-        petsc_options: Options, with or without the prefix; the command line beats them.
-        petsc_options_prefix: Prefix of the options.
-        form_compiler_options: As in DOLFINx.
-        jit_options: As in DOLFINx.
-        extensions: Parts of one's own: a Block, a feasible set, a preconditioner, a K⁺, a monitor.
-        boundary_elements: Which volumes get boundary elements.
-
-    Attributes:
-        u: The displacement of the last solve.
-        report: Sizes, counters, residuals and times.
-
-    Raises:
-        InputError: Something given does not fit; the message names it.
-    """
-
-    def __init__(
-        self,
-        a: ufl.Form,
-        L: ufl.Form,
-        bcs: Sequence[fem.DirichletBC],
-        contacts: Sequence[ContactPartner],
-        decomposition: Decomposition,
-        *,
-        stress: Stress | None = None,
-        thickness: Any = 1.0,
-        u: fem.Function | None = None,
-        petsc_options: Mapping[str, Any] | None = None,
-        petsc_options_prefix: str = "tfeti_",
-        form_compiler_options: dict[str, Any] | None = None,
-        jit_options: dict[str, Any] | None = None,
-        extensions: Extensions | None = None,
-        boundary_elements: SubdomainMethod | None = None,
-    ) -> None:
-        checked_type(
-            decomposition, Decomposition, "decomposition", "what decompose or read_gmsh return"
-        )
-        self.decomposition, comm = decomposition, decomposition.comm
-        with agreeing(comm, type(self).__name__) as given:
-            require_real_petsc()
-            self.options = parse_options(petsc_options, petsc_options_prefix, self.defaults)
-            extensions = Extensions() if extensions is None else extensions
-            checked_type(extensions, Extensions, "extensions", "tfeti_dolfinx.Extensions")
-            for_factors = factor_options(petsc_options, petsc_options_prefix)
-            own = guarded(extensions, self.options, comm)
-            self._settings = Settings(self.options, petsc_options_prefix, for_factors, own)
-            self.contacts = checked_contacts(contacts)
-            bcs = listed_conditions(bcs)
-            given |= {"a": a, "L": L, "bcs": bcs, "contacts": contacts, "thickness": thickness}
-            given |= {"stress": stress, "u": u, "boundary_elements": boundary_elements}
-            given |= {"form_compiler_options": form_compiler_options, **self._settings.given}
-            given |= self._given_besides()
-        V = displacement_space(a, decomposition, self.form_name)
-        self.bcs = checked_conditions(bcs, V)
-        self.u = fem.Function(V, name="displacement") if u is None else self._checked_u(u, V)
-        self._given_stress = stress
-        if stress is not None:
-            with agreeing(comm, "stress(u)") as given:
-                given["stress(u)"] = sigma = self._look_at_stress()
-                check_mesh(sigma, "stress", decomposition)
-        if self.options.rtol == "auto" and stress is None:
-            raise InputError(
-                f"-{petsc_options_prefix}rtol auto: the problem has no stress to estimate the "
-                "discretisation error from; expected ContactProblem(..., stress=sigma)"
-            )
-        self._boundary_elements = boundary_elements
-        self._thickness = checked_thickness(thickness, decomposition)
-        self.report = Report(seconds=dict(decomposition.seconds))
-        with stage("assembly", self.report.seconds):
-            forms = self._forms(a, L, V, form_compiler_options, jit_options)
-        with stage("gluing", self.report.seconds):
-            self.dofs = TornDofs(V, decomposition)
-            check_not_on_tears(self.bcs, self.dofs, decomposition)
-        forms.thickness = self._thickness
-        self._doubts = Diagnostics(decomposition, self.dofs)
-        if boundary_elements is not None:
-            check_method(boundary_elements, extensions)
-        self._system = System(
-            forms,
-            self.bcs,
-            self.contacts,
-            self.dofs,
-            decomposition,
-            self._settings,
-            boundary_elements,
-        )
-
-    def _forms(self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any) -> Forms:
-        """Compile the forms of the matrix and the load."""
-        return Forms(a, L, V, self.decomposition, *options)
-
-    def _given_besides(self) -> dict[str, Any]:
-        """Return other input, checked, that ranks must have alike."""
-        return {}
-
-    @property
-    def dual(self) -> Dual:
-        """The dual problem of the last solve, for experts.
-
-        Raises:
-            InputError: There is none before ``solve``, and after ``destroy``.
-        """
-        return self._system.dual
-
-    def solve(self) -> fem.Function:
-        """Solve the problem.
-
-        What a solve has made is kept. Constants and functions in the forms, Dirichlet values and
-        the points of the mesh may change between two solves: only what depends on them is made
-        again, and the solver starts from the last solution. See ``update`` for new forms.
-
-        Returns:
-            The displacement, on the torn mesh.
-
-        Raises:
-            InputError: Dirichlet values, contacts, stiffness or load do not fit.
-            NoSolutionError: The problem has no solution.
-            ConvergenceError: The solver stopped before its tolerance.
-            FactorError: A matrix could not be factored.
-        """
-        self._meet("solve")
-        self.report.begin()
-        try:
-            self._set_out()
-            self._system.look_for_changes()
-            solve_in_rounds(self._solve_rows, self._system, self.report)
-        except TfetiError:  # on all ranks
-            self._count()
-            raise
-        self._count()
-        self._system.search.warn_of_unmet()
-        if self.options.view and self.decomposition.comm.rank == 0:
-            print(self.options.view_text(self._settings.prefix), self.report, sep="\n", flush=True)
-        return self.u
-
-    def estimate(self) -> Estimates:
-        """Estimate the errors of the last solution in energy. It costs what it says.
-
-        Returns:
-            The estimates, which ``report`` then has, too, with a warning where they are of no use.
-
-        Raises:
-            InputError: There is no solution, or its rows are no longer there.
-            FactorError: A matrix could not be factored.
-        """
-        self._meet("estimate")
-        found = estimate(self._system, self.solution)
-        note_estimates(self.report, found.numbers())
-        return found
-
-    def update(
-        self,
-        *,
-        load: ufl.Form | None = None,
-        values: Sequence[fem.DirichletBC] | None = None,
-        stiffness: ufl.Form | None = None,
-        gap: Mapping[int | str, Gap] | None = None,
-    ) -> None:
-        """Take other forms or conditions; the next ``solve`` makes again what depends on them.
-
-        Not needed where constants, functions or Dirichlet values have only got other values:
-        ``solve`` sees that itself. Of conditions on the same unknowns only the values count; a
-        new load, new values or new gaps need no row and no factor, a new stiffness no search:
-        with ``secondary="auto"`` the sides of a pair stay those of the first stiffness.
-
-        Args:
-            load: A linear form instead of ``L``.
-            values: Dirichlet conditions instead of ``bcs``.
-            stiffness: A bilinear form on the same space instead of ``a``.
-            gap: For contacts, by position or name, what their ``gap=`` is from now on. Rows stay;
-                nodes that have none and come to overlap get theirs, as ever.
-
-        Raises:
-            InputError: Something given does not fit; the message names it. Nothing has changed.
-        """
-        with agreeing(self.decomposition.comm, "update") as given:
-            conditions = None if values is None else listed_conditions(values)
-            given |= {"load": load, "values": conditions, "stiffness": stiffness, "gap": gap}
-        V, forms = self.dofs.V, copy(self._system.forms)
-        if conditions is None:
-            conditions = self.bcs
-        else:
-            conditions = checked_conditions(conditions, V)
-            check_not_on_tears(conditions, self.dofs, self.decomposition)
-        if stiffness is not None:
-            check_same_space(displacement_space(stiffness, self.decomposition), V, "stiffness", "a")
-            forms.replace_stiffness(stiffness)
-        if load is not None:
-            forms.replace_load(load)
-        if gap is not None:
-            self._system.set_gaps(gaps_by_position(self.contacts, gap))
-        self._system.forms, self.bcs[:] = forms, conditions
-
-    def digest(self) -> dict[str, Any]:
-        """Describe what determines the solution, for checkpoints: short, and as JSON takes it.
-
-        Collective. The forms and the values of their constants, contacts, conditions, mass and
-        mesh, as they are when it is called; of functions on the mesh sums over it, of callables
-        their names. Options, extensions and ``stress`` are none of it.
-        ``agreement.check_same_problem`` compares two of them.
-        """
-        comm, d = self.decomposition.comm, self.decomposition
-        with agreeing(comm, "digest") as given:
-            given |= self._given()
-        fields = fields_in(self._known_before(given))
-        mesh = {"type": "mesh", "subdomains": d.num_subdomains, "bodies": d.num_bodies}
-        sums = sums_of(comm, [d.mesh.geometry.x, *fields.values()])
-        found = {name: described(value) for name, value in given.items()}
-        found["mesh"] = {**mesh, "points": sums[0]}
-        found["sums over functions"] = dict(zip(fields, sums[1:], strict=True))
-        return found
-
-    def _given(self) -> dict[str, Any]:
-        return {**super()._given(), "boundary_elements": self._boundary_elements}
-
-    def _known_before(self, given: dict[str, Any]) -> dict[str, Any]:
-        """Return that of the input whose functions are not those of the solution."""
-        return given
-
-    def _set_out(self) -> None:
-        """Set the prediction of a step; nothing without inertia."""
-
-    def _count(self) -> None:
-        """Enter counts and seconds of the solve in the report."""
-        self._system.count(self.report)
-        settle_seconds(self.report, self.decomposition.comm)
-        self.report.end()
-
     def _checked_u(self, u: fem.Function, V: fem.FunctionSpace, name: str = "u") -> fem.Function:
         checked_type(u, fem.Function, name, "a dolfinx.fem.Function on the space of a")
         check_same_space(u.function_space, V, name, "the space of a")
         return u
-
-    def destroy(self) -> None:
-        """Destroy the PETSc objects; solution and report stay. ``solve`` makes them anew.
-
-        Collective.
-        """
-        with agreeing(self.decomposition.comm, "destroy"):
-            pass
-        self._system.destroy()
-
-    def _goal(self) -> ErrorTarget | None:
-        """Return the error that -rtol auto compares the algebraic error with."""
-        if self.options.rtol != "auto" or self._stress is None:
-            return None
-        return goal_of(self._stress, self.dofs, self.decomposition, self._thickness)
-
-    def _solve_rows(self) -> Solution:
-        """Solve with the present rows, from the last solution on."""
-        system, report = self._system, self.report
-        dual, gluing = system.make(report), system.gluing
-        dual.forget_counts()
-        qp_type, _ = resolve_types(self.options, dual.contact_rows, self._settings.prefix)
-        with stage("qp", report.seconds):
-            start = None
-            if self._start is not None:
-                learn(dual, self.options)
-                earlier, lam, mu = self._start
-                start = gluing.multipliers(earlier, lam), mu
-                start = None if dual.is_far(*start) else start
-            own, goal = self._settings.extensions.monitor, self._goal()
-            solved = solve_with_friction(dual, self.options, qp_type, start, own, goal)
-        result, accuracy, settling = solved
-        with stage("recovery", report.seconds):
-            multipliers = Multipliers(np.array(result.lam.array_r), result.face)
-            solution = self._solution = self._make_solution(accuracy.u, multipliers, gluing)
-            self.u.x.array[:] = self.dofs.to_dolfinx(solution.u)
-        self._start = (gluing, solution.lam, result.mu) if result.reason > 0 else None
-        fill_result(report, solution, dual, *solved)
-        report.estimates = of_looks(accuracy.reached)
-        report.warnings = self._doubts.found(dual, solution, report, self.options.number)
-        report.excluding_contacts = system.search.named(gluing.contacts_of(result.excluding))
-        result.destroy()
-        d = self.decomposition
-        told = report.excluding_contacts, settling.restless(d.body_names), report.warnings
-        conclude(result, accuracy, self.options, d.comm, *told)
-        return solution

@@ -1,13 +1,14 @@
-"""The report of a solve: sizes, counters, residuals and times."""
+"""The report of a solve, composed of the records that its stages return."""
 
 from __future__ import annotations
 
 import json
 import os
 import resource
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from mpi4py import MPI
@@ -26,168 +27,242 @@ from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.coulomb import FixedPointStatus
 from tfeti_dolfinx.subdomains.local_operators import ModelledOperator
 
+# --- Records of stages ------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Sizes of a problem, known before it is solved."""
+
+    primal_dofs: int = 0  # of the torn mesh; with boundary elements those on their surface
+    dual_dofs: int = 0  # rows of B
+    subdomains: int = 0
+    bodies: int = 0
+    split_subdomains: int = 0  # that were not connected and were split
+    contact_rows: int = 0  # of non-penetration
+    contact_candidates: int = 0  # nodes of the (secondary) contact surfaces
+    far_contact_nodes: int = 0  # those that were out of reach or not covered, and have no row
+    unmet_contacts: list[str] = field(default_factory=list)  # none of whose nodes has a row
+    dropped_contact_rows: int = 0  # that prescribed components decide alone
+    tangential_rows: int = 0  # of contacts that have friction
+
+    @classmethod
+    def of_rows(
+        cls,
+        dofs: TornDofs,
+        decomposition: Decomposition,
+        gluing: Gluing,
+        inside: int,
+        unmet: list[str],
+    ) -> Self:
+        """Count rows and unknowns, ``inside`` of which boundary elements do without. Collective."""
+        comm, constraints, records = dofs.comm, gluing.constraints, gluing.records
+        own = (
+            constraints.num_rows,
+            len(constraints.sets.normals),
+            records.candidates,
+            records.candidates - int(np.sum(records.within_reach)),
+            len(gluing.contact.decided),
+            constraints.sets.tangents.size,
+        )
+        rows, normals, candidates, far, dropped, tangents = comm.allreduce(np.array(own)).tolist()
+        return cls(
+            primal_dofs=int(dofs.offsets[-1]) * dofs.bs - inside,
+            dual_dofs=rows,
+            subdomains=decomposition.num_subdomains,
+            bodies=decomposition.num_bodies,
+            split_subdomains=len(decomposition.split),
+            contact_rows=normals,
+            contact_candidates=candidates,
+            far_contact_nodes=far,
+            unmet_contacts=unmet,
+            dropped_contact_rows=dropped,
+            tangential_rows=tangents,
+        )
+
+
+@dataclass(frozen=True)
+class StageCounts:
+    """Counts of what was made anew for a solve."""
+
+    factorizations: int = 0  # of subdomain matrices
+    coarse_factorizations: int = 0  # of GGᵀ
+    assemblies: int = 0  # of the stiffness
+    searches: int = 0  # of who meets whom
+    gluings: int = 0  # times that rows of B were made
+    reused: list[str] = field(default_factory=list)  # stages taken over from the solve before
+
+
+@dataclass(frozen=True)
+class SolverCounts:
+    """Counts of a solver, which add up over solves with more and more contact rows."""
+
+    late_contact_rows: int = 0  # of nodes out of reach that overlapped after a solve
+    F_multiplications: int = 0  # all but the power method's
+    preconditioner_multiplications: int = 0
+    power_method_multiplications: int = 0  # that estimated ‖PFP‖
+    recoveries: int = 0  # displacements recovered to see how right they are, each one more solve
+    friction_iterations: int = 0  # problems with given bounds of Coulomb's friction
+    friction_newton_steps: int = 0  # of Newton's method on Coulomb's law, beside these problems
+    outer_iterations: int = 0
+    newton_faces: int = 0  # that block Newton has solved on
+    cg_steps: int = 0
+    expansion_steps: int = 0
+    proportioning_steps: int = 0
+    face_factorizations: int = 0  # of G_f G_fᵀ, f a face of the rows
+    soft_factorizations: int = 0  # of soft motions, or of whole clusters, one for a face
+
+    @classmethod
+    def of_run(
+        cls, dual: Dual, result: QPResult, accuracy: Accuracy, settling: FixedPointStatus
+    ) -> Self:
+        """Return the counts of a solver's run."""
+        preconditioner, soft, steps = dual.preconditioner, dual.soft, result.steps
+        return cls(
+            F_multiplications=dual.F.count["solver"],
+            preconditioner_multiplications=(
+                0 if preconditioner is None else preconditioner.count["solver"]
+            ),
+            power_method_multiplications=dual.F.count["power method"],
+            recoveries=accuracy.looks,
+            friction_iterations=settling.iterations,
+            friction_newton_steps=settling.newton_steps,
+            outer_iterations=steps.outer,
+            newton_faces=steps.faces,
+            cg_steps=steps.cg,
+            expansion_steps=steps.expansion,
+            proportioning_steps=steps.proportioning,
+            face_factorizations=dual.coarse.factors.count["face"],
+            soft_factorizations=0 if soft is None else soft.factors.count["face"],
+        )
+
+    def plus(self, other: SolverCounts) -> SolverCounts:
+        """Return the sums of counts."""
+        return SolverCounts(**added(vars(self), vars(other)))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The end of a solver's last run, and diagnostics of its answer; see docs/report.md."""
+
+    clusters: int = 0  # of subdomains that averages glue
+    kernel_dim: int = 0  # of K
+    soft_modes: int = 0  # motions that springs hold softly, or all of clusters: preconditioned
+    free_modes: int = 0  # rigid motions that nothing resists and the load does not drive
+    # rigid motions that contacts with a force hold hardly or not (0): bodies, mode, stiffness
+    nearly_free: list[dict[str, object]] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)  # why the answer cannot be trusted
+    excluding_contacts: list[str] = field(default_factory=list)  # whose rows exclude each other
+    active_contacts: int = 0  # rows with a positive force
+    sticking: int = 0  # nodes with friction that touch and stick
+    sliding: int = 0  # those that slip
+    recycled_directions: int = 0  # that the next solve begins with
+    friction_last: int = 0  # multiplications by F of the last problem with given bounds
+    # of F and preconditioner: subdomains in each form, bytes, seconds predicted and measured
+    local_operators: dict[str, float] = field(default_factory=dict)
+    converged_reason: str = "NOT_SOLVED"  # a ConvergedReason, or NO_SOLUTION
+    peak_memory_mb: float = 0.0  # summed over ranks
+    residuals: dict[str, float] = field(default_factory=dict)
+    tolerances: dict[str, float] = field(default_factory=dict)  # what they may be at most
+    estimates: dict[str, float] = field(default_factory=dict)  # see ``Estimates``
+
+    @classmethod
+    def of_answer(
+        cls,
+        solution: Solution,
+        dual: Dual,
+        result: QPResult,
+        accuracy: Accuracy,
+        settling: FixedPointStatus,
+        excluding: list[str],
+        estimates: dict[str, float],
+    ) -> Self:
+        """Measure an answer, warnings apart. Collective.
+
+        Args:
+            solution: The solution.
+            dual: The dual problem.
+            result: What the solver returned.
+            accuracy: Its accuracy.
+            settling: How bounds of friction have come to rest.
+            excluding: Names of the contacts whose rows exclude each other.
+            estimates: Errors at the last assessment of a target of the error in energy.
+        """
+        status, normals = solution.status_of_conditions, solution.gluing.constraints.sets.normals
+        own = (
+            np.sum(solution.carrying[normals]),
+            np.sum(status == ContactStatus.STICK),
+            np.sum(status == ContactStatus.SLIP),
+        )
+        recovered = accuracy.recovered
+        active, sticking, sliding = dual.coarse.comm.allreduce(np.array(own)).tolist()
+        return cls(
+            clusters=dual.subdomains.num_clusters,
+            kernel_dim=dual.coarse.dimension,
+            soft_modes=0 if dual.soft is None else dual.soft.count,
+            free_modes=dual.coarse.num_free_motions,
+            nearly_free=[] if recovered is None else dual.nearly_free(recovered.active),
+            excluding_contacts=excluding,
+            active_contacts=active,
+            sticking=sticking,
+            sliding=sliding,
+            recycled_directions=0 if dual.recycled is None else dual.recycled.count,
+            friction_last=settling.last,
+            local_operators=_local_operators(dual),
+            converged_reason=result.reason.name,
+            peak_memory_mb=peak_memory_mb(dual.coarse.comm),
+            residuals=_residuals(solution, dual, result, accuracy) | {"friction": settling.change},
+            tolerances=_tolerances(solution, dual, accuracy) | {"friction": settling.tolerance},
+            estimates=estimates,
+        )
+
+
 # --- The report -------------------------------------------------------------------------------
 
 PRINTED = 10  # of a list; all of it is in the file
+# what adds up over solves, in ``in_all``
+COUNTERS = [f.name for kind in (SolverCounts, StageCounts) for f in fields(kind) if f.default == 0]
 
 
-def _counter() -> Any:
-    """Return a counter, which adds up over solves in ``in_all``."""
-    return field(default=0, metadata={"adds": True})
-
-
-@dataclass
-class Report:
+@dataclass(frozen=True)
+class Report(Outcome, SolverCounts, StageCounts, Sizes):
     """Sizes, counters, residuals and times of a solve; the same on all ranks.
 
-    Counters and seconds are those of the last solve; the first has what was before it, too.
-
-    Attributes:
-        primal_dofs: Unknowns of the torn mesh; with boundary elements those on their surface.
-        dual_dofs: Rows of B.
-        subdomains: Number of subdomains.
-        bodies: Number of bodies.
-        split_subdomains: Subdomains that were not connected and were split.
-        clusters: Clusters of them that averages glue, 0 without.
-        kernel_dim: Dimension of the kernel of K.
-        soft_modes: Motions of subdomains that springs hold softly, or all of those in clusters:
-            part of the preconditioner.
-        free_modes: Rigid motions that nothing resists and the load does not drive.
-        nearly_free: Rigid motions that contacts with a force hold hardly (``stiffness``: as a
-            share of what the same contacts hold at most) or not at all (0): dicts of ``bodies``,
-            ``mode`` and ``stiffness``. u has one of these motions.
-        warnings: Sentences on why the answer cannot be trusted, or not as far as it seems.
-        contact_rows: Non-penetration rows.
-        contact_candidates: Nodes of the (secondary) contact surfaces.
-        far_contact_nodes: Those that were out of reach or not covered, and have no row.
-        late_contact_rows: Rows that nodes out of reach got after a solve, since they overlapped.
-        unmet_contacts: Contacts none of whose nodes has a row: position in the list, and name.
-        excluding_contacts: Contacts whose rows exclude each other, likewise, if the solver has
-            stopped since they do.
-        dropped_contact_rows: Those that prescribed components decide alone.
-        active_contacts: Rows with a positive force.
-        tangential_rows: Rows along tangents, of contacts that have friction.
-        sticking: Nodes with friction that touch and stick.
-        sliding: Those that slip.
-        F_multiplications: Multiplications by F, all but the power method's.
-        preconditioner_multiplications: Multiplications by the preconditioner.
-        recycled_directions: Directions of this and earlier solves that the next one begins with.
-        power_method_multiplications: Multiplications that estimated ‖PFP‖.
-        recoveries: Displacements recovered to see how right they are, each for one more solve
-            in every subdomain.
-        friction_iterations: Problems with given bounds that were solved for Coulomb's friction.
-        friction_newton_steps: Steps of Newton's method on Coulomb's law, beside these problems.
-        friction_last: Multiplications by F of the last of these problems.
-        newton_steps: Steps of Newton's method of a nonlinear problem, each a linearised problem.
-        outer_iterations: Outer iterations.
-        newton_faces: Faces that block Newton has solved on.
-        cg_steps: Conjugate gradient steps.
-        expansion_steps: Expansion steps.
-        proportioning_steps: Proportioning steps.
-        factorizations: Factorisations of subdomain matrices.
-        local_operators: Of ``F`` and ``preconditioner``: how many subdomains apply theirs in each
-            form, ``bytes`` that one multiplication moves on all ranks by the model, and its
-            seconds, ``predicted`` by the model and ``measured`` (largest over ranks).
-        coarse_factorizations: Factorisations of GGᵀ.
-        face_factorizations: Factorisations of G_f G_fᵀ, f a face of the rows.
-        soft_factorizations: Factorisations of the coarse problem of soft motions, or of whole
-            clusters, one for a face.
-        assemblies: Times that the stiffness was assembled.
-        searches: Times that it was searched who meets whom.
-        gluings: Times that rows of B were made.
-        reused: Stages that this solve took over from the one before, see ``stages``.
-        converged_reason: Name of the ConvergedReason; NO_SOLUTION where there is none,
-            NOT_SOLVED before a solve and where one ended in another error.
-        peak_memory_mb: Peak resident memory, summed over ranks.
-        seconds: Wall seconds of each stage (largest over ranks), and ``total``.
-        residuals: ``projected_gradient`` and ``equilibrium`` relative to b₀;
-            ``displacement_error``, the estimated error of u in the maximum norm relative to the
-            displacement of the body where it is worst; ``energy_error``, that in energy relative
-            to ‖u‖_K; in physical units ``gluing_jump`` and
-            ``penetration`` (lengths), ``tension`` (most negative pressure), ``complementarity``
-            (largest force times gap), ``balance`` (force left on a kernel mode where
-            it is largest beside the forces there); ``friction``, the last change of the bounds of
-            Coulomb's friction over their size.
-        tolerances: What they were at most allowed to be, all but the first two.
-        motion: Of bodies with mass the energies at the end of the step and what was done in it,
-            see ``ContactDynamics``.
-        contact_forces: Of bodies with mass the mean force of the step on the surface of each
-            contact, of a pair on the secondary one, a vector.
-        in_all: Solves, counters and ``seconds`` of all solves together.
-        estimates: What ``ContactProblem.estimate`` has found since, and what it took; see
-            ``Estimates``.
-        errors: Relative errors against closed forms, filled by demos.
+    Counters and seconds are those of the last solve; the first has what was before it, too. The
+    fields of its bases are its own; docs/report.md says what each means.
     """
 
-    primal_dofs: int = 0
-    dual_dofs: int = 0
-    subdomains: int = 0
-    bodies: int = 0
-    split_subdomains: int = 0
-    clusters: int = 0
-    kernel_dim: int = 0
-    soft_modes: int = 0
-    free_modes: int = 0
-    nearly_free: list[dict[str, object]] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
-    contact_rows: int = 0
-    contact_candidates: int = 0
-    far_contact_nodes: int = 0
-    late_contact_rows: int = _counter()
-    unmet_contacts: list[str] = field(default_factory=list)
-    excluding_contacts: list[str] = field(default_factory=list)
-    dropped_contact_rows: int = 0
-    active_contacts: int = 0
-    tangential_rows: int = 0
-    sticking: int = 0
-    sliding: int = 0
-    F_multiplications: int = _counter()
-    preconditioner_multiplications: int = _counter()
-    recycled_directions: int = 0
-    power_method_multiplications: int = _counter()
-    recoveries: int = _counter()
-    friction_iterations: int = _counter()
-    friction_newton_steps: int = _counter()
-    friction_last: int = 0
-    newton_steps: int = 0
-    outer_iterations: int = _counter()
-    newton_faces: int = _counter()
-    cg_steps: int = _counter()
-    expansion_steps: int = _counter()
-    proportioning_steps: int = _counter()
-    factorizations: int = _counter()
-    local_operators: dict[str, float] = field(default_factory=dict)
-    coarse_factorizations: int = _counter()
-    face_factorizations: int = _counter()
-    soft_factorizations: int = _counter()
-    assemblies: int = _counter()
-    searches: int = _counter()
-    gluings: int = _counter()
-    reused: list[str] = field(default_factory=list)
-    converged_reason: str = "NOT_SOLVED"
-    peak_memory_mb: float = 0.0
-    seconds: dict[str, float] = field(default_factory=dict)
-    residuals: dict[str, float] = field(default_factory=dict)
-    tolerances: dict[str, float] = field(default_factory=dict)
-    estimates: dict[str, float] = field(default_factory=dict)
-    errors: dict[str, float] = field(default_factory=dict)
-    motion: dict[str, float] = field(default_factory=dict)
-    contact_forces: list[list[float]] = field(default_factory=list)
-    in_all: dict[str, float] = field(default_factory=dict)
+    newton_steps: int = 0  # of a nonlinear problem, each a linearised problem
+    seconds: dict[str, float] = field(default_factory=dict)  # of each stage, and ``total``
+    motion: dict[str, float] = field(default_factory=dict)  # of bodies with mass: energies, work
+    contact_forces: list[list[float]] = field(default_factory=list)  # of bodies with mass: means
+    in_all: dict[str, float] = field(default_factory=dict)  # solves, counters, seconds of all
+    errors: dict[str, float] = field(default_factory=dict)  # against closed forms, by demos
 
-    def begin(self) -> None:
-        """Reset all figures but the sums over solves, so that none stays after an error."""
-        seconds = {} if self.in_all else self.seconds
-        fresh = Report(seconds=seconds, in_all=self.in_all)
-        for f in fields(self):
-            setattr(self, f.name, getattr(fresh, f.name))
+    @classmethod
+    def composed(
+        cls,
+        records: Sequence[Sizes | StageCounts | SolverCounts | Outcome],
+        seconds: Mapping[str, float],
+        before: Mapping[str, float],
+    ) -> Report:
+        """Compose the report of a solve.
 
-    def end(self) -> None:
-        """Add the counters and seconds of a solve, whatever its end was, to ``in_all``."""
-        self.seconds["total"] = sum(v for k, v in self.seconds.items() if k != "total")
-        added = {f.name: getattr(self, f.name) for f in fields(self) if f.metadata.get("adds")}
-        for name, value in {"solves": 1, **added, "seconds": self.seconds["total"]}.items():
-            self.in_all[name] = self.in_all.get(name, 0) + value
+        Args:
+            records: What stages have returned, as far as they came.
+            seconds: Seconds of each stage.
+            before: ``in_all`` of the solves before it.
+        """
+        known = {name: value for record in records for name, value in vars(record).items()}
+        total = sum(seconds.values())
+        counts = {name: known[name] for name in COUNTERS if name in known}
+        own = {"solves": 1, **dict.fromkeys(COUNTERS, 0), **counts, "seconds": total}
+        return cls(**known, seconds={**seconds, "total": total}, in_all=added(before, own))
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """The counters, by name."""
+        return {name: getattr(self, name) for name in COUNTERS}
 
     def __str__(self) -> str:
         lines = []
@@ -242,86 +317,19 @@ def peak_memory_mb(comm: MPI.Intracomm) -> float:
     return float(comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0))
 
 
-# --- Filling of the report --------------------------------------------------------------------
+# --- Residuals and costs ----------------------------------------------------------------------
 
 
-def fill_sizes(
-    report: Report, dofs: TornDofs, decomposition: Decomposition, gluing: Gluing, inside: int
-) -> None:
-    """Fill in the sizes that are known before the dual problem. Collective.
-
-    Args:
-        report: Takes it.
-        dofs: Dof maps.
-        decomposition: The torn mesh.
-        gluing: Rows.
-        inside: Unknowns that boundary elements do without.
-    """
-    comm, constraints = dofs.comm, gluing.constraints
-    report.primal_dofs = int(dofs.offsets[-1]) * dofs.bs - inside
-    report.dual_dofs = comm.allreduce(constraints.num_rows)
-    report.subdomains, report.bodies = decomposition.num_subdomains, decomposition.num_bodies
-    report.split_subdomains = len(decomposition.split)
-    report.contact_rows = comm.allreduce(len(constraints.sets.normals))
-    report.tangential_rows = comm.allreduce(constraints.sets.tangents.size)
-    report.contact_candidates = comm.allreduce(gluing.records.candidates)
-    within_reach = comm.allreduce(int(np.sum(gluing.records.within_reach)))
-    report.far_contact_nodes = report.contact_candidates - within_reach
-    report.dropped_contact_rows = comm.allreduce(len(gluing.contact.decided))
+def added(one: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the sums of numbers by name."""
+    return {name: one.get(name, 0) + other.get(name, 0) for name in {**one, **other}}
 
 
-def fill_result(
-    report: Report,
-    solution: Solution,
-    dual: Dual,
-    result: QPResult,
-    accuracy: Accuracy,
-    settling: FixedPointStatus,
-) -> None:
-    """Fill in the results of a solve; counters add up over rounds. Collective."""
-    comm = dual.coarse.comm
-    report.clusters = dual.subdomains.num_clusters
-    report.kernel_dim = dual.coarse.dimension
-    report.free_modes = dual.coarse.num_free_motions
-    if accuracy.recovered is not None:
-        report.nearly_free = dual.nearly_free(accuracy.recovered.active)
-    active = solution.carrying[solution.gluing.constraints.sets.normals]
-    report.active_contacts = comm.allreduce(int(np.sum(active)))
-    status = solution.status_of_conditions
-    report.sticking = comm.allreduce(int(np.sum(status == ContactStatus.STICK)))
-    report.sliding = comm.allreduce(int(np.sum(status == ContactStatus.SLIP)))
-    report.F_multiplications += dual.F.count["solver"]
-    report.power_method_multiplications += dual.F.count["power method"]
-    report.recycled_directions = 0 if dual.recycled is None else dual.recycled.count
-    if dual.preconditioner is not None:
-        report.preconditioner_multiplications += dual.preconditioner.count["solver"]
-    report.friction_iterations += settling.iterations
-    report.friction_newton_steps += settling.newton_steps
-    report.friction_last = settling.last
-    report.outer_iterations += result.steps.outer
-    report.newton_faces += result.steps.faces
-    report.face_factorizations += dual.coarse.factors.count["face"]
-    if dual.soft is not None:
-        report.soft_factorizations += dual.soft.factors.count["face"]
-        report.soft_modes = dual.soft.count
-    report.cg_steps += result.steps.cg
-    report.expansion_steps += result.steps.expansion
-    report.proportioning_steps += result.steps.proportioning
-    report.converged_reason = result.reason.name
-    report.local_operators = _local_operators(dual)
-    report.recoveries += accuracy.looks
-    report.residuals = _residuals(solution, dual, result, accuracy)
-    report.residuals["friction"] = settling.change
-    report.tolerances = _tolerances(solution, dual, accuracy)
-    report.tolerances["friction"] = settling.tolerance
-    report.peak_memory_mb = peak_memory_mb(comm)
-
-
-def settle_seconds(report: Report, comm: MPI.Intracomm) -> None:
-    """Make the seconds of each stage those of the slowest rank. Collective."""
-    of_ranks = comm.allgather(report.seconds)
-    names = dict.fromkeys(name for seconds in of_ranks for name in seconds)
-    report.seconds.update({name: max(s.get(name, 0.0) for s in of_ranks) for name in names})
+def largest_over_ranks(seconds: Mapping[str, float], comm: MPI.Intracomm) -> dict[str, float]:
+    """Return the seconds of each stage on the slowest rank. Collective."""
+    of_ranks = comm.allgather(dict(seconds))
+    names = dict.fromkeys(name for own in of_ranks for name in own)
+    return {name: max(own.get(name, 0.0) for own in of_ranks) for name in names}
 
 
 def _local_operators(dual: Dual) -> dict[str, float]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from mpi4py import MPI
@@ -14,7 +15,7 @@ from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.diagnostics import flatness, shared_by_bodies
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.report import Report
+from tfeti_dolfinx.report import Outcome, Report
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.subdomains.stiffness import stretch_over_shear
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
@@ -56,13 +57,13 @@ class Diagnostics:
         self._of: Dual | None = None
         self._lasting: list[str] = []
 
-    def found(self, dual: Dual, solution: Solution, report: Report, rtol: float) -> list[str]:
+    def found(self, dual: Dual, solution: Solution, outcome: Outcome, rtol: float) -> list[str]:
         """Sentences, each of which names the thing. Collective.
 
         Args:
             dual: The dual problem.
             solution: What was found.
-            report: What is known already.
+            outcome: What is known already.
             rtol: The relative tolerance that was asked for.
         """
         if self._of is not dual:
@@ -70,12 +71,12 @@ class Diagnostics:
             self._lasting, self._of = [text for texts in lasting for text in texts], dual
         u = solution.u
         return [
-            *_loose(report),
+            *_loose(outcome),
             *self._rounding(dual, u, rtol),
             *self._turned(u, dual.subdomains),
             *self._facets(solution, dual.subdomains),
             *self._lasting,
-            *_of_estimates(report),
+            *_of_estimates(outcome),
         ]
 
     def _cells(self) -> Iterator[str]:
@@ -211,21 +212,21 @@ class Diagnostics:
         return f"{listed} and {rest} more" if rest > 0 else listed
 
 
-def note_estimates(report: Report, numbers: dict[str, float]) -> None:
-    """Give a report estimates that were made since, and a warning where they say nothing.
+def with_estimates(report: Report, numbers: dict[str, float]) -> Report:
+    """Return a report with estimates made since, and a warning where they say nothing.
 
     Args:
         report: That of the solve.
         numbers: What ``Estimates.numbers`` gives.
     """
-    report.warnings = [text for text in report.warnings if not text.startswith(ESTIMATES)]
-    report.estimates = numbers
-    report.warnings += _of_estimates(report)
+    kept = [text for text in report.warnings if not text.startswith(ESTIMATES)]
+    report = replace(report, estimates=numbers)
+    return replace(report, warnings=[*kept, *_of_estimates(report)])
 
 
-def _of_estimates(report: Report) -> Iterator[str]:
+def _of_estimates(outcome: Outcome) -> Iterator[str]:
     """A bound of the algebraic error that no displacement of this size can miss."""
-    energy, bound = (report.estimates.get(key, 0.0) for key in ("energy", "algebraic"))
+    energy, bound = (outcome.estimates.get(key, 0.0) for key in ("energy", "algebraic"))
     if bound > energy:
         share = f"{bound / energy:.0e} times" if energy and np.isfinite(bound) else "far beyond"
         yield (
@@ -236,14 +237,14 @@ def _of_estimates(report: Report) -> Iterator[str]:
         )
 
 
-def _loose(report: Report) -> Iterator[str]:
+def _loose(outcome: Outcome) -> Iterator[str]:
     """Motions that are not determined, or hardly."""
-    if report.free_modes:
+    if outcome.free_modes:
         yield (
-            f"{report.free_modes} rigid motions are free: nothing resists or drives them, the "
+            f"{outcome.free_modes} rigid motions are free: nothing resists or drives them, the "
             "smallest displacement was taken"
         )
-    for motion in report.nearly_free[:LISTED]:
+    for motion in outcome.nearly_free[:LISTED]:
         bodies, mode, held = (motion[key] for key in ("bodies", "mode", "stiffness"))
         assert isinstance(bodies, list)
         share = f"hold hardly ({held:.0e} of what they could)" if held else "do not hold"
@@ -251,5 +252,5 @@ def _loose(report: Report) -> Iterator[str]:
             f"{', '.join(bodies)}: contacts with a force {share} {mode}: displacements that differ "
             "by that are as right, or nearly so"
         )
-    if (rest := len(report.nearly_free) - LISTED) > 0:
+    if (rest := len(outcome.nearly_free) - LISTED) > 0:
         yield f"{rest} more motions are held hardly or not by contacts with a force"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,7 +22,7 @@ from tfeti_dolfinx.nonlinear.forms import CurrentPlaces, NewtonForms
 from tfeti_dolfinx.nonlinear.state import InternalVariables, NewValue
 from tfeti_dolfinx.nonlinear.tangent import rotation_free_tangent
 from tfeti_dolfinx.problem import ContactProblem
-from tfeti_dolfinx.report import Report
+from tfeti_dolfinx.report import COUNTERS, Report, added
 from tfeti_dolfinx.solution import SavedState
 
 
@@ -163,7 +163,7 @@ class NonlinearContactProblem(ContactProblem):
         self._first = self._begin = np.array(u.x.array)
         self._last_increment = self._tolerances.loosest
         self._places = CurrentPlaces(u, self.dofs) if finite else None
-        self._doubts.finite = self._finite
+        self._diagnostics.finite = self._finite
 
     def _forms(self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any) -> NewtonForms:
         given = (a, L, V, self.decomposition, *options)
@@ -188,7 +188,7 @@ class NonlinearContactProblem(ContactProblem):
                 where the load step began.
             FactorError: A tangent stiffness could not be factored.
         """
-        begin, total = np.array(self.u.x.array), Totals(self.report)
+        begin, total = np.array(self.u.x.array), Totals()
         try:
             self._newton(total)
         except TfetiError:  # on all ranks
@@ -198,7 +198,7 @@ class NonlinearContactProblem(ContactProblem):
         finally:
             self._newton_forms.kept = False
             self.options = replace(self.options, rtol=self._exact)
-            total.enter(self.report)
+            self.report = total.entered(self.report)
         return self.u
 
     def _newton(self, total: Totals) -> None:
@@ -261,7 +261,7 @@ class NonlinearContactProblem(ContactProblem):
         """Let contact and rigid motions be those of X + u. Collective."""
         places.move()
         self._system.origin = self.dofs.to_primal(self.u.x.array)
-        self._system.friction.rest = self.dofs.to_primal(self._begin)
+        self._system.rest = self.dofs.to_primal(self._begin)
 
     def _set(self, u: Array) -> None:
         """Take a displacement, and what depends on it. Collective."""
@@ -424,26 +424,20 @@ def check_gaps(contacts: Sequence[ContactPartner]) -> None:
 class Totals:
     """Counters and seconds of the linearised problems of a load step, for its report."""
 
-    def __init__(self, report: Report) -> None:
-        names = [f.name for f in fields(report) if f.metadata.get("adds")]
-        self._sums: dict[str, float] = dict.fromkeys(names, 0)
+    def __init__(self) -> None:
+        self._sums: dict[str, Any] = dict.fromkeys(COUNTERS, 0)
         self._seconds: dict[str, float] = {}
         self.steps = 0
 
     def add(self, report: Report) -> None:
         """Add those of a linearised problem."""
         self.steps += 1
-        for name in self._sums:
-            self._sums[name] += getattr(report, name)
-        for name, value in report.seconds.items():
-            self._seconds[name] = self._seconds.get(name, 0.0) + value
+        self._sums = added(self._sums, report.counters)
+        self._seconds = added(self._seconds, report.seconds)
 
-    def enter(self, report: Report) -> None:
-        """Enter the sums in the report of the load step."""
-        for name, value in self._sums.items():
-            setattr(report, name, value)
-        report.seconds = self._seconds
-        report.newton_steps = self.steps
+    def entered(self, report: Report) -> Report:
+        """Return the report of the load step."""
+        return replace(report, **self._sums, seconds=self._seconds, newton_steps=self.steps)
 
 
 class Anderson:

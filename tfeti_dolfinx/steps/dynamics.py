@@ -29,10 +29,9 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.qp.sets import Bounds, Discs, FeasibleSet, Product
 from tfeti_dolfinx.solution import SavedState, Solution
-from tfeti_dolfinx.solve.solver import conclude, resolve_types, solve_dual
+from tfeti_dolfinx.solve.solver import conclude, solve_dual
 from tfeti_dolfinx.subdomains.block import Counters
-from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
-from tfeti_dolfinx.subdomains.factor import added_options
+from tfeti_dolfinx.subdomains.build import subdomain_data
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # --- Energies and work of a step --------------------------------------------------------------
@@ -122,6 +121,7 @@ class Predictor:
         self._dofs, self._decomposition = dofs, decomposition
         options = replace(settings.options, recycle=0)  # of a mass there is little to learn
         self._settings = replace(settings, extensions=Extensions(), options=options)
+        self._options = options
         self._M: csr_array | None = None
         self._subdomains: Subdomains | None = None
         self._dual: Dual | None = None
@@ -172,19 +172,12 @@ class Predictor:
     def _make(self, M: csr_array, f: Array, gluing: Gluing) -> None:
         """Make what is out of date."""
         constraints, settings = gluing.constraints, self._settings
+        scene = self._dofs, self._decomposition
         new_rows = self._dual is None or self._dual.constraints is not constraints
         if M is not self._M:
             self.destroy()
-            counters = Counters()
-            data = subdomain_data(self._dofs, self._decomposition, M, f, constraints.trace)
-            with added_options(settings.prefix, settings.factor_options):
-                self._subdomains = make_subdomains(
-                    data,
-                    settings.make_block(counters),
-                    self._decomposition,
-                    counters,
-                    settings.local_choice,
-                )
+            data = subdomain_data(*scene, M, f, constraints.trace)
+            self._subdomains = settings.make_subdomains(data, *scene, Counters())
             self._M, new_rows = M, True
         assert self._subdomains is not None
         self._subdomains.update(f=self._dofs.to_primal(f))
@@ -194,12 +187,12 @@ class Predictor:
         if self._dual is not None:
             self._dual.destroy()
             self._subdomains.retrace(constraints.trace)
-        scene = self._dofs, self._decomposition
-        self._dual = settings.make_dual(constraints, self._subdomains, *scene, _frictionless)
+        law = _frictionless
+        self._dual, self._options = settings.make_dual(constraints, self._subdomains, *scene, law)
 
     def _solve(self, gluing: Gluing) -> Array:
         """Return the displacement in primal order."""
-        dual, options, start = self._dual, self._settings.options, None
+        dual, options, start = self._dual, self._options, None
         assert dual is not None
         dual.forget_counts()
         if self._start is not None:  # nothing has a kernel in M
@@ -207,8 +200,7 @@ class Predictor:
             if self._start[0] is gluing:
                 dual.last.take(self._dofs.comm, self._start[1], self._image)
         self._image = np.zeros(0)  # it is of the F and the start of a restored state alone
-        qp_type, _ = resolve_types(options, dual.contact_rows, self._settings.prefix)
-        result, accuracy = solve_dual(dual, options, qp_type, start)
+        result, accuracy = solve_dual(dual, options, options.qp_type, start)
         self._start = (gluing, np.array(result.lam.array_r)) if result.reason > 0 else None
         self.multiplications = dual.F.count["solver"]
         result.destroy()
@@ -419,17 +411,16 @@ class ContactDynamics(ContactProblem):
         """Return the displacement that contact allows the bodies without elasticity."""
         system, forms = self._system, self._forms_in_time
         system.look_for_changes()
-        system.make(self.report)
+        system.make(self._seconds)
         if system.search.take_in_overlapping(self.dofs.to_primal(free), 0.0):
             system.change("rows")
-            system.make(self.report)
+            system.make(self._seconds)
         return predictor.nearest(free, forms.matrices[1], system.gluing)
 
     def _look(self) -> None:
         """Put energies, work and forces into the report."""
-        report, forms = self.report, self._forms_in_time
-        report.motion = balance(forms, self._system.dual, self.solution)
-        report.contact_forces = contact_forces(self.solution)
+        motion = balance(self._forms_in_time, self._system.dual, self.solution)
         if self._predictor is not None:
-            count = float(self._predictor.multiplications)
-            report.motion["predictor_multiplications"] = count
+            motion["predictor_multiplications"] = float(self._predictor.multiplications)
+        forces = contact_forces(self.solution)
+        self.report = replace(self.report, motion=motion, contact_forces=forces)

@@ -83,7 +83,7 @@ TOLERANCES = KernelTolerances()
 
 
 def candidate_modes(x: Array, bs: int, centre: Array, length: float) -> Array:
-    """Rigid motions for vectors of the space's dimension, constants otherwise.
+    """Return rigid motions for vectors of the space's dimension, constants otherwise.
 
     Args:
         x: Points of the nodes, shape ``(n, gdim)``.
@@ -106,37 +106,20 @@ def candidate_modes(x: Array, bs: int, centre: Array, length: float) -> Array:
     return np.stack(modes, axis=1)
 
 
-MODE_NAMES = {
-    (2, 2): ("translation in x", "translation in y", "rotation in the plane"),
-    (3, 3): (
-        "translation in x",
-        "translation in y",
-        "translation in z",
-        "rotation about z",
-        "rotation about y",
-        "rotation about x",
-    ),
-}
-
-
 def mode_names(gdim: int, bs: int) -> tuple[str, ...]:
     """Return names of the candidate modes of a field with bs components, in their order."""
-    constants = tuple(f"constant in component {i}" for i in range(bs))
-    return MODE_NAMES.get((gdim, bs), constants)
+    if bs != gdim or gdim == 1:
+        return tuple(f"constant in component {i}" for i in range(bs))
+    turns = ["in the plane"] if gdim == 2 else ["about z", "about y", "about x"]
+    moves = [f"translation in {axis}" for axis in "xyz"[:gdim]]
+    return (*moves, *(f"rotation {turn}" for turn in turns))
 
 
 def kernel_of(K: Any, modes: Array) -> Array:
     """Return an orthonormal basis of the kernel of K within the span of the candidate modes.
 
-    The null space of R₀ᵀ K R₀, R₀ an orthonormal basis of the modes; it is smaller than the
-    span, or empty, where springs or mass terms hold the subdomain.
-
-    Args:
-        K: Stiffness, shape ``(n, n)``.
-        modes: Candidate modes, shape ``(n, k)``.
-
-    Returns:
-        R, shape ``(n, r)``, r ≤ k.
+    R, shape ``(n, r)``: the null space of R₀ᵀ K R₀, R₀ an orthonormal basis of the modes, shape
+    ``(n, k)``; r < k where springs or mass terms hold the subdomain.
     """
     U, s, _ = np.linalg.svd(modes, full_matrices=False)
     R0 = U[:, s > TOLERANCES.dependent * s.max(initial=0.0)]
@@ -153,17 +136,10 @@ def kernel_of(K: Any, modes: Array) -> Array:
 
 
 def fixing_nodes(x: Array, count: int) -> Array:
-    """Choose well-spread nodes by farthest-point sampling, from the node farthest out.
+    """Choose at most ``count`` well-spread nodes by farthest-point sampling, ascending.
 
-    Of equal distances, as of the corners of a cube, the first: rounding must not choose
-    (Gonzalez, Theor. Comput. Sci. 38, 1985).
-
-    Args:
-        x: Points of the nodes, shape ``(n, gdim)``.
-        count: How many are wanted.
-
-    Returns:
-        Their indices, ascending, at most ``count``.
+    From the node farthest out; of equal distances, as of the corners of a cube, the first:
+    rounding must not choose (Gonzalez, Theor. Comput. Sci. 38, 1985).
     """
     chosen: list[int] = []
     distance = np.linalg.norm(x - x.mean(axis=0), axis=1)
@@ -184,8 +160,6 @@ def fixing_dofs(x: Array, node_of_dof: Array) -> Array:
 # --- The Block --------------------------------------------------------------------------------
 
 OperatorKind = Literal["pinv", "stiffness", "schur"]
-
-
 # what the dual knows of a Block
 PROMISED: tuple[str, ...] = (
     *("load", "kernel", "diagonal", "trace_dofs", "modes", "shares", "bs"),

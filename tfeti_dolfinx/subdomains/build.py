@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from itertools import pairwise
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -98,7 +97,7 @@ def subdomain_data(
     f: Array,
     trace: Array,
 ) -> Iterator[SubdomainData]:
-    """Return the data of each subdomain's Block on this rank, one at a time. Collective.
+    """Return the data of each subdomain's Block on this rank, made one at a time. Collective.
 
     Args:
         dofs: Dof maps.
@@ -111,33 +110,25 @@ def subdomain_data(
     x = dofs.points()[:, :gdim]
     shares = 1.0 / dofs.spread(dofs.multiplicity)
     frames = _body_frames(dofs, decomposition, x, shares)
-    loads, starts = dofs.to_primal(f), dofs.node_offsets * dofs.bs
-    cuts = np.searchsorted(trace, starts)
-
-    def data() -> Iterator[SubdomainData]:
-        pairs = zip(submatrices(dofs, K), dofs.subdomains, strict=True)
-        for s, (K_s, subdomain) in enumerate(pairs):
-            nodes = slice(dofs.node_offsets[s], dofs.node_offsets[s + 1])
-            yield SubdomainData(
-                name=f"subdomain {subdomain}",
-                K=K_s,
-                f=loads[starts[s] : starts[s + 1]],
-                x=x[nodes],
-                trace_dofs=trace[cuts[s] : cuts[s + 1]] - starts[s],
-                body_frame=frames[decomposition.body_of_subdomain[subdomain]],
-                node_shares=shares[nodes],
-            )
-
-    return data()
-
-
-def submatrices(dofs: TornDofs, K: Any) -> Iterator[csr_array]:
-    """Yield the stiffness of each subdomain of this rank in primal order, from that of all."""
-    dolfinx = dofs.dolfinx_dofs()
+    loads, starts = dofs.to_primal(f), (dofs.node_offsets * dofs.bs).tolist()
+    cuts, dolfinx = np.searchsorted(trace, starts), dofs.dolfinx_dofs()
     primal = np.empty(len(dolfinx), dtype=np.int32)
     primal[dolfinx] = np.arange(len(dolfinx))
-    for first, last in pairwise((dofs.node_offsets * dofs.bs).tolist()):
-        yield submatrix(K, dolfinx[first:last], primal, first)
+
+    def data_of(s: int) -> SubdomainData:
+        nodes = slice(dofs.node_offsets[s], dofs.node_offsets[s + 1])
+        own = slice(starts[s], starts[s + 1])
+        return SubdomainData(
+            name=f"subdomain {dofs.subdomains[s]}",
+            K=submatrix(K, dolfinx[own], primal, starts[s]),
+            f=loads[own],
+            x=x[nodes],
+            trace_dofs=trace[cuts[s] : cuts[s + 1]] - starts[s],
+            body_frame=frames[decomposition.body_of_subdomain[dofs.subdomains[s]]],
+            node_shares=shares[nodes],
+        )
+
+    return map(data_of, range(len(dofs.subdomains)))
 
 
 def sparse_blocks(how: InverseFactory, choice: LocalChoice) -> MakeBlock:
@@ -176,8 +167,7 @@ def make_subdomains(
 def submatrix(K: Any, rows: Array, primal: Array, first: int) -> csr_array:
     """Stiffness of one subdomain, in primal order."""
     K_s = K[rows]
-    n = len(rows)
-    A = csr_array((K_s.data, primal[K_s.indices] - first, K_s.indptr), shape=(n, n))
+    A = csr_array((K_s.data, primal[K_s.indices] - first, K_s.indptr), shape=(len(rows),) * 2)
     A.sort_indices()
     return A
 

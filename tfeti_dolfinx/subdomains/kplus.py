@@ -40,8 +40,6 @@ class InverseTolerances:
 
 
 TOLERANCES = InverseTolerances()
-# the generalised inverses that an option names; those of other modules are plug-ins
-KPLUS_TYPES = ("regularized", "schur", "lu_svd")
 
 
 class GeneralisedInverse(Protocol):
@@ -61,12 +59,6 @@ def regularised(K: Any, R: Array, fixing_dofs: Array, prefix: str = "tfeti_sub_"
 
     K_ρ⁻¹ is an exact generalised inverse, because N R is regular
     (Brzobohatý, Dostál, Kozubek, Kovář, Markopoulos, IJNME 88, 2011, section 4).
-
-    Args:
-        K: Stiffness, scipy CSR, shape ``(n, n)``.
-        R: Kernel, shape ``(n, r)``; without columns K itself is factored.
-        fixing_dofs: Unknowns of the fixing nodes.
-        prefix: Prefix of the factor's PETSc options.
 
     Raises:
         NotPositiveDefiniteError: K_ρ has no Cholesky factor.
@@ -115,13 +107,6 @@ class InverseFactory:
 
 def why_indefinite(K: Any, R: Array, fixing_dofs: Array, x: Array, prefix: str) -> str:
     """Say what is wrong with a stiffness whose K_ρ has no Cholesky factor, or a useless one.
-
-    Args:
-        K: Stiffness, its diagonal positive, shape ``(n, n)``.
-        R: Kernel, shape ``(n, r)``.
-        fixing_dofs: Unknowns of the fixing nodes.
-        x: Points of the nodes.
-        prefix: Prefix of the factor's PETSc options.
 
     Raises:
         FactorError: It could not be found out, say for want of memory.
@@ -182,9 +167,7 @@ def _motions_without_energy(K: Any, R: Array, inverse: CholeskyFactor) -> int:
     U = _drawn(K.shape[0], min(TOLERANCES.counted, K.shape[0] - R.shape[1]))
     for _ in range(2):  # subspace iteration: what it looks for stands out by 1e8 or more
         U = np.linalg.qr(_beside(R, inverse.solve(U)))[0]
-    energies, turn = np.linalg.eigh(U.T @ (K @ U))
-    own = np.sum((U @ turn) ** 2 * K.diagonal()[:, None], axis=0)
-    return int(np.sum(np.abs(energies) <= TOLERANCES.no_energy * own))
+    return _without_energy(K, U).shape[1]
 
 
 def _with_weakly_held(K: Any, R: Array, x: Array) -> Array:
@@ -193,10 +176,15 @@ def _with_weakly_held(K: Any, R: Array, x: Array) -> Array:
     modes = candidate_modes(x, K.shape[0] // len(x), centre, length)
     U, s, _ = np.linalg.svd(_beside(R, modes), full_matrices=False)
     U = U[:, s > TOLERANCES.still * np.linalg.norm(modes, axis=0).max()]
+    return np.hstack((R, _without_energy(K, U)))
+
+
+def _without_energy(K: Any, U: Array) -> Array:
+    """Return the motions within the span of some, orthonormal, that K gives no energy."""
     energies, turn = np.linalg.eigh(U.T @ (K @ U))
     U = U @ turn
     own = np.sum(U**2 * K.diagonal()[:, None], axis=0)
-    return np.hstack((R, U[:, energies <= TOLERANCES.no_energy * own]))
+    return np.asarray(U[:, np.abs(energies) <= TOLERANCES.no_energy * own])
 
 
 def _drawn(n: int, count: int) -> Array:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from scipy.linalg.blas import dsymm, dsymv
@@ -16,7 +15,6 @@ from tfeti_dolfinx.common.arrays import Array, parts_of
 from tfeti_dolfinx.subdomains.block import Block, OperatorKind
 from tfeti_dolfinx.subdomains.factor import FactorSize
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
-from tfeti_dolfinx.subdomains.stiffness import Stiffness, Traced
 
 # --- Cost model of local operators ------------------------------------------------------------
 
@@ -86,174 +84,157 @@ class CostModel:
 
 MODEL = CostModel()
 
-# --- Matrices on a trace ----------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class TraceMatrix:
-    """A symmetric matrix on a trace, which all Blocks of a group apply.
-
-    Attributes:
-        size: Number of its rows, t.
-        apply: A W, shapes ``(t, q)``.
-        cost: Cost of ``apply`` to so many vectors.
-        can_be_dense: Whether there is use in a dense one.
-    """
-
-    size: int
-    apply: Callable[[Array], Array]
-    cost: Callable[[int], Cost]
-    can_be_dense: bool = True
-
-    def dense(self) -> Array:
-        """Return the matrix, symmetric to the last bit, by columns."""
-        A = np.empty((self.size, self.size), order="F")
-        for first in range(0, self.size, MODEL.together):
-            last = min(first + MODEL.together, self.size)
-            unit = np.zeros((self.size, last - first), order="F")
-            unit[np.arange(first, last), np.arange(last - first)] = 1.0
-            A[:, first:last] = self.apply(unit)
-        A += A.T
-        A *= 0.5
-        return A
-
-
-def pinv_matrix(stiffness: Stiffness, trace: Array) -> TraceMatrix:
-    """K⁺ on a trace, through the factor, with as many right sides as are good for the cache."""
-
-    def apply(W: Array) -> Array:
-        out = np.empty(W.shape, order="F")
-        for first in range(0, W.shape[1], MODEL.together):
-            some = slice(first, first + MODEL.together)
-            B = np.zeros((stiffness.size, W[:, some].shape[1]), order="F")
-            B[trace] = W[:, some]
-            out[:, some] = stiffness.solve(B)[trace]
-        return out
-
-    cost = partial(MODEL.solve, stiffness.factor_size, stiffness.size)
-    return TraceMatrix(len(trace), apply, cost)
-
-
-def schur_matrix(traced: Traced) -> TraceMatrix:
-    """S on a trace, through the factor of K_ii."""
-
-    def cost(count: int) -> Cost:
-        products = MODEL.sparse(traced.K_bb.nnz, count)
-        if traced.inner is None:
-            return products
-        across = MODEL.sparse(traced.K_ib.nnz, count)
-        return (
-            products + across + across + MODEL.solve(traced.inner.size, len(traced.inside), count)
-        )
-
-    return TraceMatrix(len(traced.trace), traced.apply_schur, cost)
-
-
-def stiffness_matrix(K_bb: Any) -> TraceMatrix:
-    """K_bb on a trace: sparse as it is."""
-    cost = partial(MODEL.sparse, K_bb.nnz)
-    return TraceMatrix(K_bb.shape[0], lambda W: np.asarray(K_bb @ W), cost, can_be_dense=False)
-
-
-def own_matrix(block: Block, kind: OperatorKind) -> TraceMatrix:
-    """Matrix of a Block of another class, one vector after the other; it costs nothing known."""
-    apply = getattr(block, f"apply_{kind}")
-
-    def columns(W: Array) -> Array:
-        return np.stack([apply(np.ascontiguousarray(w)) for w in W.T], axis=1)
-
-    return TraceMatrix(len(block.trace_dofs), columns, lambda count: Cost())
-
-
 # --- Groups of Blocks with one matrix ---------------------------------------------------------
 
 
 @dataclass
 class Group:
-    """Blocks of equal subdomains, one alone, or some whose sparse matrices are one.
+    """Blocks that apply one symmetric matrix A on a trace: equal ones, or one alone.
 
     Attributes:
-        matrix: The matrix that all apply.
         count: Number of Blocks.
-        columns: Of what the matrix is applied to: one for each Block, or one for all.
-        place: Where the trace unknowns go in an array of columns, the first column first.
+        size: Rows of A.
+        columns: Vectors that A is applied to at once.
+        place: Where the trace unknowns go in these columns, the first column first.
         where: Where they lie among those of the rank.
-        dense: The matrix, dense, where that is cheaper.
+        apply: A W, shapes ``(size, q)``.
+        cost: Cost of ``apply`` to so many vectors.
+        can_be_dense: Whether there is use in a dense A.
+        dense: A, where that is cheaper.
     """
 
-    matrix: TraceMatrix
     count: int
+    size: int
     columns: int
     place: Array
     where: Array
+    apply: Callable[[Array], Array]
+    cost: Callable[[int], Cost]
+    can_be_dense: bool = True
     dense: Array | None = None
-
-    @classmethod
-    def of(cls, matrix: TraceMatrix, rows: Sequence[Array], parts: Sequence[slice]) -> Group:
-        """Return the group of Blocks whose trace unknowns are these rows of the matrix.
-
-        Args:
-            matrix: The matrix.
-            rows: Rows for each column.
-            parts: Where the trace unknowns of each Block lie among those of the rank.
-        """
-        place = np.concatenate([k * matrix.size + row for k, row in enumerate(rows)])
-        where = np.concatenate([np.arange(part.start, part.stop) for part in parts])
-        return cls(matrix, len(parts), len(rows), place, where)
 
     def prefers_dense(self, local_type: str, multiplications: int) -> bool:
         """Return whether the group takes a dense matrix: by its type, or as the model says."""
-        matrix, columns = self.matrix, self.columns
-        if local_type == "implicit" or not matrix.can_be_dense:
+        if local_type == "implicit" or not self.can_be_dense:
             return False
         if local_type == "explicit":
             return True
-        if local_type == "shared" and columns == 1:
+        if local_type == "shared" and self.columns == 1:
             return False
-        setup, once = matrix.cost(matrix.size).seconds, matrix.cost(columns).seconds
-        dense = setup + multiplications * MODEL.dense(matrix.size, columns).seconds
+        setup, once = self.cost(self.size).seconds, self.cost(self.columns).seconds
+        dense = setup + multiplications * MODEL.dense(self.size, self.columns).seconds
         return multiplications * once > dense
+
+    def make_dense(self) -> None:
+        """Make A dense, symmetric to the last bit, by columns."""
+        A = _in_chunks(self.apply, np.eye(self.size, order="F"))
+        A += A.T
+        self.dense = 0.5 * A
+
+    def mult(self, w: Array, out: Array) -> None:
+        """Set this group's part of out = diag(A_s) w, shapes ``(t,)``."""
+        flat = np.zeros(self.size * self.columns)
+        flat[self.place] = w[self.where]
+        columns = flat.reshape((self.size, self.columns), order="F")
+        if self.dense is None:
+            product = self.apply(columns)
+        elif self.columns == 1:
+            product = dsymv(1.0, self.dense, flat)
+        else:
+            product = dsymm(1.0, self.dense, columns)
+        out[self.where] = product.ravel(order="F")[self.place]
 
 
 def groups_of(blocks: Sequence[Block], kind: OperatorKind) -> list[Group]:
-    """Return groups that are as large as possible; Blocks without a trace have nothing to apply.
-
-    K_bb of subdomains that have none equal to them are one sparse matrix.
-    """
+    """Return groups that are as large as possible; Blocks without a trace have nothing to apply."""
     parts = parts_of([len(block.trace_dofs) for block in blocks])
-    members: dict[int, list[tuple[SparseBlock, slice]]] = {}
-    groups = []
-    for block, part in zip(blocks, parts, strict=True):
-        if len(block.trace_dofs) == 0:
-            continue
-        if isinstance(block, SparseBlock):
-            shared = block.stiffness if kind == "pinv" else block.traced
-            members.setdefault(id(shared), []).append((block, part))
-        else:
-            own = own_matrix(block, kind)
-            groups.append(Group.of(own, [np.arange(own.size)], [part]))
-    alone = [equal[0] for equal in members.values() if len(equal) == 1 and kind == "stiffness"]
-    for equal in members.values():
-        if kind == "stiffness" and len(equal) == 1:
-            continue
-        own_parts, first = [part for _, part in equal], equal[0][0]
-        if kind == "pinv":
-            # K⁺ on a part of a trace is a part of K⁺ on the trace, so that all may be joined
-            trace = np.unique(np.concatenate([block.trace_place for block, _ in equal]))
-            matrix = pinv_matrix(first.stiffness, trace)
-            rows = [np.searchsorted(trace, block.trace_place) for block, _ in equal]
-        else:
-            schur, traced = kind == "schur", first.traced
-            matrix = schur_matrix(traced) if schur else stiffness_matrix(traced.K_bb)
-            rows = [block.trace_rows for block, _ in equal]
-        groups.append(Group.of(matrix, rows, own_parts))
-    if alone:
-        K_bb = [block.traced.K_bb for block, _ in alone]
-        begins = np.cumsum([0, *(K.shape[0] for K in K_bb)])
-        rows = [a + block.trace_rows for a, (block, _) in zip(begins[:-1], alone, strict=True)]
-        matrix = stiffness_matrix(csr_array(block_diag(K_bb, format="csr")))
-        groups.append(Group.of(matrix, [np.concatenate(rows)], [part for _, part in alone]))
-    return groups
+    pairs = [(b, part) for b, part in zip(blocks, parts, strict=True) if len(b.trace_dofs)]
+    groups = [_own_group(b, kind, part) for b, part in pairs if not isinstance(b, SparseBlock)]
+    sparse = [(block, part) for block, part in pairs if isinstance(block, SparseBlock)]
+    if kind == "stiffness":
+        return [*groups, _stiffness_group(sparse)] if sparse else groups
+    of_kind = {"pinv": _pinv_group, "schur": _schur_group}[kind]
+    shared = [block.stiffness if kind == "pinv" else block.traced for block, _ in sparse]
+    members: dict[int, list[tuple[SparseBlock, slice]]] = defaultdict(list)
+    for pair, what in zip(sparse, shared, strict=True):
+        members[id(what)].append(pair)
+    return [*groups, *(of_kind(equal) for equal in members.values())]
+
+
+def _pinv_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
+    """K⁺ on a trace that has those of all: a part of it is K⁺ on a part."""
+    stiffness = equal[0][0].stiffness
+    trace = np.unique(np.concatenate([block.trace_place for block, _ in equal]))
+
+    def apply(W: Array) -> Array:
+        B = np.zeros((stiffness.size, W.shape[1]), order="F")
+        B[trace] = W
+        return stiffness.solve(B)[trace]
+
+    def cost(count: int) -> Cost:
+        return MODEL.solve(stiffness.factor_size, stiffness.size, count)
+
+    rows = [np.searchsorted(trace, block.trace_place) for block, _ in equal]
+    places = _places(rows, len(trace), [part for _, part in equal])
+    return Group(len(equal), len(trace), len(equal), *places, lambda W: _in_chunks(apply, W), cost)
+
+
+def _schur_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
+    """S through the factor of K_ii."""
+    traced = equal[0][0].traced
+
+    def cost(count: int) -> Cost:
+        products = MODEL.sparse(traced.K_bb.nnz, count)
+        if traced.inner is None:
+            return products
+        across = MODEL.sparse(2 * traced.K_ib.nnz, count)
+        return products + across + MODEL.solve(traced.inner.size, len(traced.inside), count)
+
+    size, parts = len(traced.trace), [part for _, part in equal]
+    places = _places([block.trace_rows for block, _ in equal], size, parts)
+    return Group(len(equal), size, len(equal), *places, traced.apply_schur, cost)
+
+
+def _stiffness_group(sparse: Sequence[tuple[SparseBlock, slice]]) -> Group:
+    """K_bb of all subdomains as one sparse matrix."""
+    K_bb = csr_array(block_diag([block.traced.K_bb for block, _ in sparse], format="csr"))
+    begins = np.cumsum([0, *(len(block.trace_dofs) for block, _ in sparse)])[:-1]
+    rows = [begin + block.trace_rows for begin, (block, _) in zip(begins, sparse, strict=True)]
+    places = _places([np.concatenate(rows)], 0, [part for _, part in sparse])
+    size = K_bb.shape[0]
+    return Group(
+        len(sparse),
+        size,
+        1,
+        *places,
+        lambda W: np.asarray(K_bb @ W),
+        lambda count: MODEL.sparse(K_bb.nnz, count),
+        can_be_dense=False,
+    )
+
+
+def _own_group(block: Block, kind: OperatorKind, part: slice) -> Group:
+    """A Block of another class, one vector after the other; it costs nothing known."""
+    apply, size = getattr(block, f"apply_{kind}"), len(block.trace_dofs)
+
+    def columns(W: Array) -> Array:
+        return np.stack([apply(np.ascontiguousarray(w)) for w in W.T], axis=1)
+
+    places = _places([np.arange(size)], size, [part])
+    return Group(1, size, 1, *places, columns, lambda count: Cost())
+
+
+def _places(rows: Sequence[Array], size: int, parts: Sequence[slice]) -> tuple[Array, Array]:
+    """Return ``place`` and ``where`` of a group with these rows of its matrix in each column."""
+    place = np.concatenate([k * size + row for k, row in enumerate(rows)])
+    return place, np.concatenate([np.arange(part.start, part.stop) for part in parts])
+
+
+def _in_chunks(apply: Callable[[Array], Array], W: Array) -> Array:
+    """A W, as many columns at a time as are good for the cache."""
+    starts = range(0, W.shape[1], MODEL.together)
+    chunks = [apply(W[:, first : first + MODEL.together]) for first in starts]
+    return chunks[0] if len(chunks) == 1 else np.asfortranarray(np.concatenate(chunks, axis=1))
 
 
 def solved_together(blocks: Sequence[Block], parts: Sequence[slice], b: Array) -> Array:
@@ -265,22 +246,20 @@ def solved_together(blocks: Sequence[Block], parts: Sequence[slice], b: Array) -
         b: Right sides.
     """
     x = np.empty(len(b))
-    members: dict[int, list[tuple[SparseBlock, slice]]] = {}
+    members: dict[int, list[tuple[SparseBlock, slice]]] = defaultdict(list)
     for block, part in zip(blocks, parts, strict=True):
         if isinstance(block, SparseBlock):
-            members.setdefault(id(block.stiffness), []).append((block, part))
+            members[id(block.stiffness)].append((block, part))
         else:
             x[part] = block.solve(b[part])
     for equal in members.values():
         stiffness = equal[0][0].stiffness
-        for first in range(0, len(equal), MODEL.together):
-            some = equal[first : first + MODEL.together]
-            columns = np.empty((stiffness.size, len(some)), order="F")
-            for j, (block, part) in enumerate(some):
-                columns[block.place, j] = b[part]
-            columns = stiffness.solve(columns)
-            for j, (block, part) in enumerate(some):
-                x[part] = columns[block.place, j]
+        columns = np.empty((stiffness.size, len(equal)), order="F")
+        for j, (block, part) in enumerate(equal):
+            columns[block.place, j] = b[part]
+        columns = _in_chunks(stiffness.solve, columns)
+        for j, (block, part) in enumerate(equal):
+            x[part] = columns[block.place, j]
     return x
 
 
@@ -372,10 +351,10 @@ class GroupedOperator:
             block.prepare(self._kind)
         self._groups = groups_of(self._blocks, self._kind)
         for group in self._groups:
-            cost, form = group.matrix.cost(group.columns), "implicit"
+            cost, form = group.cost(group.columns), "implicit"
             if group.prefers_dense(self._choice.type, self._choice.multiplications):
-                group.dense = group.matrix.dense()
-                cost, form = MODEL.dense(group.matrix.size, group.columns), "explicit"
+                group.make_dense()
+                cost, form = MODEL.dense(group.size, group.columns), "explicit"
             self.predicted += cost.seconds
             self.traffic += cost.traffic
             self.forms["shared_" * (group.columns > 1) + form] += group.count
@@ -383,16 +362,7 @@ class GroupedOperator:
     def mult(self, w: Array, out: Array) -> None:
         """out = diag(A_s) w, shapes ``(t,)``."""
         for group in self._groups:
-            size, q, A = group.matrix.size, group.columns, group.dense
-            columns = np.zeros(q * size)
-            columns[group.place] = w[group.where]
-            if A is None:
-                product = group.matrix.apply(columns.reshape((size, q), order="F"))
-            elif q == 1:
-                product = dsymv(1.0, A, columns)
-            else:
-                product = dsymm(1.0, A, columns.reshape((size, q), order="F"))
-            out[group.where] = product.ravel(order="F")[group.place]
+            group.mult(w, out)
 
     def destroy(self) -> None:
         """Let dense matrices go; the factors are the Blocks'."""

@@ -161,7 +161,7 @@ class SparseBlock(Block):
 
     def apply_stiffness(self, w: Array) -> Array:
         """K_bb w, shapes ``(t,)``."""
-        return self.traced.apply_stiffness(placed(w, self.trace_rows))[self.trace_rows]
+        return np.asarray((self.traced.K_bb @ placed(w, self.trace_rows))[self.trace_rows])
 
     def apply_schur(self, w: Array) -> Array:
         """S w = K_bb w − K_bi K_ii⁻¹ K_ib w, shapes ``(t,)``; K_ii is factored once."""

@@ -103,15 +103,10 @@ class Traced:
         self._stiffness, self.trace = stiffness, trace
         self.inside = np.setdiff1d(np.arange(stiffness.size), trace, assume_unique=True)
 
-    def apply_stiffness(self, w: Array) -> Array:
-        """K_bb w, shapes ``(t,)`` or ``(t, q)``."""
-        return np.asarray(self.K_bb @ w)
-
     def apply_schur(self, w: Array) -> Array:
         """S w = K_bb w − K_bi K_ii⁻¹ K_ib w, shapes ``(t,)`` or ``(t, q)``; K_ii factored once."""
-        if self.inner is None:
-            return self.apply_stiffness(w)
-        return self.apply_stiffness(w) - self._K_bi @ self.inner.solve(self.K_ib @ w)
+        Kw = np.asarray(self.K_bb @ w)
+        return Kw if self.inner is None else Kw - self._K_bi @ self.inner.solve(self.K_ib @ w)
 
     @cached_property
     def K_bb(self) -> Any:

@@ -1,4 +1,4 @@
-"""Generalised inverses by a Schur complement: plug-ins for ``-tfeti_kplus_type``."""
+"""Generalised inverses by a Schur complement, and the table of all that an option names."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from tfeti_dolfinx.subdomains.factor import (
     NotPositiveDefiniteError,
     as_petsc_matrix,
 )
+from tfeti_dolfinx.subdomains.kplus import MakeInverse, regularised
 
 
 class SchurPseudoinverse(CholeskyFactor):
@@ -37,7 +38,6 @@ class SchurPseudoinverse(CholeskyFactor):
 
     Raises:
         NotPositiveDefiniteError: K_rr has no Cholesky factor, or S is not semidefinite.
-        FactorError: It could not be made for another reason.
     """
 
     def __init__(self, K: Any, R: Array, fixing_dofs: Array, prefix: str = "tfeti_sub_") -> None:
@@ -98,6 +98,14 @@ def trailing_pseudoinverse(
         found = bisect_left(counts, no_pivot, key=lambda q: _least(R[last[:q]]) / _least(R))
         last = np.sort(last[: counts[found]])
     return SchurPseudoinverse(K, R, last, prefix)
+
+
+# the generalised inverses that an option names
+KPLUS_TYPES: dict[str, MakeInverse] = {
+    "regularized": regularised,
+    "schur": SchurPseudoinverse,
+    "lu_svd": trailing_pseudoinverse,
+}
 
 
 def _least(R: Array) -> float:
