@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import nullcontext
 from dataclasses import asdict, dataclass, fields, replace
 from importlib import import_module
 from typing import Any
@@ -106,28 +107,20 @@ def guarded(own: Extensions, options: Options, comm: MPI.Intracomm) -> Extension
     Raises:
         InputError: Clusters are asked for beside other subdomains or another deflation.
     """
+    if options.clusters and (own.subdomains is not None or own.deflation is not None):
+        raise InputError(
+            "extensions: subdomains or deflation are given, and clusters, which take their "
+            "place; expected one of them"
+        )
+    parts = {f.name: getattr(own, f.name) for f in fields(own)}
+    if own.feasible_set is not contact_set:
+        parts["feasible_set"] = _on_all_rows(own.feasible_set)
+    for name, part in parts.items():
+        if part is not None and part is not contact_set:
+            parts[name] = _guarded(part, name, None if name in ("block", "kplus") else comm)
     if options.clusters:
-        if own.subdomains is not None or own.deflation is not None:
-            raise InputError(
-                "extensions: subdomains or deflation are given, and clusters, which take their "
-                "place; expected one of them"
-            )
-        chosen = plugin("clusters")(options.clusters)
-    else:
-        chosen = {
-            "subdomains": _together(own.subdomains, "subdomains", comm),
-            "deflation": _together(own.deflation, "deflation", comm),
-        }
-    return Extensions(
-        block=_giving(own.block, "block", "Block", PROMISED),
-        kplus=_giving(own.kplus, "kplus", "GeneralisedInverse", ("solve",)),
-        preconditioner=_together(own.preconditioner, "preconditioner", comm),
-        feasible_set=own.feasible_set
-        if own.feasible_set is contact_set
-        else _together(_checked_set(own.feasible_set), "feasible_set", comm),
-        monitor=_together(own.monitor, "monitor", comm),
-        **chosen,
-    )
+        parts |= plugin("clusters")(options.clusters)
+    return Extensions(**parts)
 
 
 def check_method(method: Any, own: Extensions) -> None:
@@ -142,51 +135,43 @@ def check_method(method: Any, own: Extensions) -> None:
         raise InputError("boundary_elements: extensions have a block, too; expected one of them")
 
 
-def _together(part: Any, name: str, comm: MPI.Intracomm) -> Any:
-    """Return a part whose errors become an InputError of all ranks."""
-    if part is None:
-        return None
+# what must be there of what a part gives
+GIVES = {
+    "block": ("Block", PROMISED),
+    "kplus": ("GeneralisedInverse", ("solve",)),
+    "feasible_set": ("FeasibleSet", [name for name in dir(FeasibleSet) if name[0] != "_"]),
+}
+
+
+def _guarded(part: Callable[..., Any], name: str, comm: MPI.Intracomm | None) -> Any:
+    """Return a part whose errors become an InputError, of all ranks if it runs on all of them."""
+    kind, members = GIVES.get(name, ("", ()))
 
     def call(*given: Any) -> Any:
-        with raised_on_all_ranks(comm), named(f"extensions: {name}"):
-            return part(*given)
-
-    return call
-
-
-def _giving(part: Any, name: str, kind: str, members: Sequence[str]) -> Any:
-    """Return a part whose errors become an InputError, and which must give an implementation."""
-    if part is None:
-        return None
-
-    def call(*given: Any) -> Any:
-        with named(f"extensions: {name}"):
+        together = nullcontext() if comm is None else raised_on_all_ranks(comm)
+        with together, named(f"extensions: {name}"):
             made = part(*given)
-            _check_members(made, name, kind, members)
-        return made
+            if missing := [member for member in sorted(members) if not hasattr(made, member)]:
+                raise InputError(
+                    f"extensions: {name} gave {shown(made)} without {', '.join(missing)}; "
+                    f"expected a {kind}"
+                )
+            return made
 
     return call
 
 
-def _check_members(made: Any, name: str, kind: str, members: Sequence[str]) -> None:
-    if missing := [member for member in sorted(members) if not hasattr(made, member)]:
-        raise InputError(
-            f"extensions: {name} gave {shown(made)} without {', '.join(missing)}; expected a {kind}"
-        )
-
-
-def _checked_set(law: FeasibleLaw) -> FeasibleLaw:
+def _on_all_rows(law: FeasibleLaw) -> FeasibleLaw:
     """Return a law whose sets are of multipliers on all rows."""
 
     def checked(constraints: Constraints) -> FeasibleSet:
         made, zero = law(constraints), np.zeros(constraints.num_rows)
-        members = [member for member in dir(FeasibleSet) if not member.startswith("_")]
-        _check_members(made, "feasible_set", "FeasibleSet", members)
-        if np.shape(made.project(zero)) != zero.shape:
+        projected = np.shape(made.project(zero)) if hasattr(made, "project") else zero.shape
+        if projected != zero.shape:
             raise InputError(
-                f"extensions: feasible_set projects vectors of shape {zero.shape} to "
-                f"{np.shape(made.project(zero))}; expected a set on all rows of this rank, say a "
-                "Product of sets on constraints.sets.normals"
+                f"extensions: feasible_set projects vectors of shape {zero.shape} to {projected}; "
+                "expected a set on all rows of this rank, say a Product of sets on "
+                "constraints.sets.normals"
             )
         return made
 

@@ -6,7 +6,7 @@ import difflib
 import math
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -209,6 +209,8 @@ FACTOR_NAMES = (
     "mat_mumps_icntl_14",
     "mat_mumps_cntl_1",
 )
+# words of switches
+YES, NO = ("", "1", "true", "yes", "on"), ("0", "false", "no", "off")
 # options that are gone, and what to do without them
 REMOVED = {
     "stiffening": "flat cells are not stiffened; expected cells that are less flat",
@@ -351,8 +353,8 @@ def _converted(option: Parameter, value: Any, prefix: str) -> Any:
     if isinstance(value, str) and value in option.description.words:
         return value
     try:
-        result = CONVERSIONS[kind](value)
-    except (TypeError, ValueError, OverflowError):
+        result = _as_kind(kind, value)
+    except (KeyError, TypeError, ValueError, OverflowError):
         words = "".join(f" or {word}" for word in option.description.words)
         raise InputError(
             f"{what} {shown(value)}: expected a value of type {kind.__name__}{words}"
@@ -368,42 +370,23 @@ def _converted(option: Parameter, value: Any, prefix: str) -> Any:
     return result
 
 
-def _as_bool(value: Any) -> bool:
-    word = "" if value is None else str(value).lower()
-    if word in ("", "1", "true", "yes", "on"):
-        return True
-    if word in ("0", "false", "no", "off"):
-        return False
-    raise ValueError(value)
+def _as_kind(kind: type, value: Any) -> Any:
+    """Return a value as a bool, a float, an int, text or a tuple of names.
 
-
-def _as_float(value: Any) -> float:
-    if isinstance(value, (bool, np.bool_)):
+    Raises:
+        KeyError: It is no word of a switch.
+        TypeError: It is of another type.
+        ValueError: It is no such number.
+    """
+    if kind is bool:
+        word = "" if value is None else str(value).lower()
+        return {**dict.fromkeys(YES, True), **dict.fromkeys(NO, False)}[word]
+    if kind is tuple:
+        parts = value.split(",") if isinstance(value, str) else value
+        return tuple(dict.fromkeys(_as_kind(str, part).strip() for part in parts if part))
+    text, number = isinstance(value, str), kind in (int, float)
+    if isinstance(value, bool | np.bool_) or not (text or number):
         raise TypeError(value)
-    return float(value)
-
-
-def _as_int(value: Any) -> int:
-    if not isinstance(value, str) and _as_float(value) != int(value):
+    if kind is int and not text and float(value) != int(value):
         raise ValueError(value)
-    return int(value)
-
-
-def _as_text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise TypeError(value)
-    return value
-
-
-def _as_names(value: Any) -> tuple[str, ...]:
-    parts = value.split(",") if isinstance(value, str) else value
-    return tuple(dict.fromkeys(_as_text(part).strip() for part in parts if part))
-
-
-CONVERSIONS: dict[type, Callable[[Any], Any]] = {
-    bool: _as_bool,
-    float: _as_float,
-    int: _as_int,
-    str: _as_text,
-    tuple: _as_names,
-}
+    return kind(value)

@@ -193,7 +193,7 @@ class VtxFile:
 def nodal_fields(solution: Solution) -> list[fem.Function]:
     """All nodal fields, on the displacement's element. Collective."""
     fields = [solution.displacement, solution.pressure, solution.gap, solution.status]
-    if solution.has_velocity:
+    if solution.v is not None:
         fields.append(solution.velocity)
     if solution.has_contact:
         fields.append(solution.traction)

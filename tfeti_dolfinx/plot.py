@@ -20,7 +20,6 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.validation import (
     FINITE,
     POSITIVE,
-    Range,
     checked_callable,
     checked_flag,
     checked_number,
@@ -76,13 +75,13 @@ def plot_deformed(
     with agreeing(comm, "plot_deformed"):
         target = checked_path(path, ".png")
         scene = {
-            "factor": _number(factor, "factor", FINITE),
+            "factor": np.nan if factor is None else checked_number(factor, "factor", FINITE),
             "zoom": checked_number(zoom, "zoom", POSITIVE),
             "focus": _vector(focus, "focus"),
             "edges": checked_flag(show_edges, "show_edges"),
-            "highest": _number(highest, "highest", POSITIVE),
+            "highest": np.nan if highest is None else checked_number(highest, "highest", POSITIVE),
             "view": _vector(view, "view"),
-            "cut": np.stack([_vector(v, "cut") for v in _pair(cut)]),
+            "cut": _pair(cut),
         }
     if factor is None and solution.has_contact:
         scene["factor"] = 1.0
@@ -166,11 +165,6 @@ def _coordinates(coordinate: Callable[[Array], Array], points: Array) -> Array:
     return x
 
 
-def _number(value: float | None, what: str, expected: Range) -> float:
-    """Return a number, nan if it is not given."""
-    return np.nan if value is None else checked_number(value, what, expected)
-
-
 def _vector(values: tuple[float, float, float] | None, what: str) -> Array:
     """Three numbers, nan if they are not given."""
     if values is None:
@@ -182,13 +176,13 @@ def _vector(values: tuple[float, float, float] | None, what: str) -> Array:
     return vector
 
 
-def _pair(cut: Any) -> tuple[Any, Any]:
-    """Return a point and a normal, or neither."""
+def _pair(cut: Any) -> Array:
+    """Return a point and a normal, nan if they are not given."""
     if cut is None:
-        return None, None
+        cut = None, None
     if not isinstance(cut, (tuple, list, np.ndarray)) or len(cut) != 2:
         raise InputError(f"cut={shown(cut)}: expected a point and a normal")
-    return cut[0], cut[1]
+    return np.stack([_vector(values, "cut") for values in cut])
 
 
 def _grid(solution: Solution, values: Array) -> tuple[Array, Array, Array, Array, Array]:

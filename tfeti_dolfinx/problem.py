@@ -34,7 +34,6 @@ from tfeti_dolfinx.contact.partner import (
 from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
 from tfeti_dolfinx.extensions import Extensions, Settings, check_method, guarded
 from tfeti_dolfinx.feti.dual import Dual
-from tfeti_dolfinx.feti.stopping import ErrorTarget
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.forms.checks import check_mesh, check_same_space, displacement_space
 from tfeti_dolfinx.forms.fields import Stress, checked_stress, checked_thickness
@@ -213,13 +212,12 @@ class ContactProblem:
             self._set_out()
             self._system.look_for_changes()
             self._solve_in_rounds()
-        except NoSolutionError:  # as any TfetiError on all ranks
-            self._compose_report(replace(self._outcome, converged_reason="NO_SOLUTION"))
+        except TfetiError as error:  # on all ranks
+            if isinstance(error, NoSolutionError):
+                self._outcome = replace(self._outcome, converged_reason="NO_SOLUTION")
+            self._compose_report()
             raise
-        except TfetiError:
-            self._compose_report(self._outcome)
-            raise
-        self._compose_report(self._outcome)
+        self._compose_report()
         self._system.search.warn_of_unmet()
         if self.options.view and self.decomposition.comm.rank == 0:
             print(self.options.view_text(self._settings.prefix), self.report, sep="\n", flush=True)
@@ -269,7 +267,10 @@ class ContactProblem:
                 earlier, lam, mu = self._start
                 start = gluing.multipliers(earlier, lam), mu
                 start = None if dual.is_far(*start) else start
-            own, goal = self._settings.extensions.monitor, self._goal()
+            goal = None
+            if options.rtol == "auto" and self._stress is not None:
+                goal = goal_of(self._stress, self.dofs, d, self._thickness)
+            own = self._settings.extensions.monitor
             solved = solve_with_friction(dual, options, options.qp_type, start, own, goal)
         result, accuracy, settling = solved
         # 2. their displacement
@@ -289,18 +290,12 @@ class ContactProblem:
         conclude(result, accuracy, self.options, d.comm, excluding, restless, warnings)
         return solution, accuracy.tolerances().penetration
 
-    def _compose_report(self, outcome: Outcome) -> None:
+    def _compose_report(self) -> None:
         """Compose the report of a solve, from records of its stages. Collective."""
         seconds = largest_over_ranks(self._seconds, self.decomposition.comm)
-        records = self._system.sizes(), self._system.take_counts(), self._counts, outcome
+        records = self._system.sizes(), self._system.take_counts(), self._counts, self._outcome
         self.report = Report.composed(records, seconds, self._in_all)
         self._seconds, self._in_all = {}, self.report.in_all
-
-    def _goal(self) -> ErrorTarget | None:
-        """Return the error that -rtol auto compares the algebraic error with."""
-        if self.options.rtol != "auto" or self._stress is None:
-            return None
-        return goal_of(self._stress, self.dofs, self.decomposition, self._thickness)
 
     def _make_solution(self, u: Array, multipliers: Multipliers, gluing: Gluing) -> Solution:
         solution = Solution(

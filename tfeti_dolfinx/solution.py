@@ -6,7 +6,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from dolfinx import fem, geometry
@@ -73,32 +73,9 @@ def checked_points(points: Any, gdim: int) -> Array:
     return found
 
 
-class InnerSolution(Protocol):
-    """Solution inside of subdomains of another method than finite elements.
-
-    Attributes:
-        finite: Cells of this rank that have finite elements.
-    """
-
-    finite: Array
-
-    def values_at(
-        self, points: Array, found: tuple[Array, Array], thickness: float, u: fem.Function
-    ) -> Array:
-        """Return rows of the bodies of this rank, added for each point, as ``value_row``.
-
-        Args:
-            points: Shape ``(k, gdim)``.
-            found: Which of them lie in which cells of this rank.
-            thickness: What stresses have to be divided by.
-            u: Displacement on the torn mesh.
-        """
-        ...
-
-
 def values_at(
     points: Array,
-    boundary: InnerSolution | None,
+    boundary: Any,
     thickness: Any,
     u: fem.Function,
     stress: fem.Function | None,
@@ -107,25 +84,35 @@ def values_at(
 
     Args:
         points: The same on all ranks, shape ``(k, gdim)``.
-        boundary: What another method than finite elements knows.
+        boundary: What another method than finite elements knows: ``values_at`` has its rows, and
+            ``finite`` are the cells of this rank without it. Or None.
         thickness: What stresses of boundary elements have to be divided by.
         u: Displacement on the torn mesh.
         stress: Stress in the cells, 3×3, or None.
     """
-    k, d = points.shape
-    total = np.zeros((k, 1 + d + d * d))
-    place, cells = _cells(u.function_space.mesh, points)
+    (k, d), mesh = points.shape, u.function_space.mesh
+    total, x = np.zeros((k, 1 + d + d * d)), in_space(points)
+    size = float(np.ptp(mesh.geometry.x, axis=0).max(initial=0.0)) if len(mesh.geometry.x) else 0.0
+    tree = geometry.bb_tree(mesh, mesh.topology.dim, padding=PADDING * size)
+    near = geometry.compute_collisions_points(tree, x)
+    found = geometry.compute_colliding_cells(mesh, near, x)
+    place = np.repeat(np.arange(k), np.diff(found.offsets))
+    cells = np.asarray(found.array)
     if boundary is not None:
-        total += boundary.values_at(points, (place, cells), _number(thickness), u)
+        if isinstance(thickness, fem.Constant):
+            thickness = float(thickness.value)
+        # where it varies there are no boundary elements
+        number = thickness if isinstance(thickness, float) else 1.0
+        total += boundary.values_at(points, (place, cells), number, u)
         kept = np.isin(cells, boundary.finite)
         place, cells = place[kept], cells[kept]
     if len(place):
-        x = in_space(points[place])
+        x = x[place]
         sigma = np.full((len(place), d, d), np.nan)
         if stress is not None:
             sigma = stress.eval(x, cells).reshape(-1, 3, 3)[:, :d, :d]
         np.add.at(total, place, value_row(u.eval(x, cells).reshape(-1, d), sigma))
-    u.function_space.mesh.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
+    mesh.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
     with np.errstate(invalid="ignore"):
         mean = np.where(total[:, :1] > 0.0, total[:, 1:] / total[:, :1], np.nan)
     return PointValues(mean[:, :d], mean[:, d:].reshape(k, d, d))
@@ -141,24 +128,6 @@ def in_space(points: Array) -> Array:
 def value_row(u: Array, stress: Array) -> Array:
     """Return a row of ``values_at`` for each point: 1, displacement and stress."""
     return np.column_stack((np.ones(len(u)), u, stress.reshape(len(u), u.shape[1] ** 2)))
-
-
-def _number(thickness: Any) -> float:
-    """Return a thickness as a number; where it varies there are no boundary elements."""
-    if isinstance(thickness, fem.Constant):
-        return float(thickness.value)
-    return float(thickness) if isinstance(thickness, float) else 1.0
-
-
-def _cells(mesh: Any, points: Array) -> tuple[Array, Array]:
-    """Return points by position, and the cells of this rank that each of them is in."""
-    x = in_space(points)
-    size = float(np.ptp(mesh.geometry.x, axis=0).max(initial=0.0)) if len(mesh.geometry.x) else 0.0
-    tree = geometry.bb_tree(mesh, mesh.topology.dim, padding=PADDING * size)
-    near = geometry.compute_collisions_points(tree, x)
-    found = geometry.compute_colliding_cells(mesh, near, x)
-    place = np.repeat(np.arange(len(points)), np.diff(found.offsets))
-    return place, np.asarray(found.array)
 
 
 # --- The solution -----------------------------------------------------------------------------
@@ -201,7 +170,7 @@ class Solution(ContactState):
     ) -> None:
         super().__init__(u, multipliers, decomposition, gluing, contacts, frozen(thickness))
         self.v: Array | None = None
-        self.boundary: InnerSolution | None = None
+        self.boundary: Any = None
         self._stress = None
         if stress is not None:
             u_h = self.displacement
@@ -216,17 +185,16 @@ class Solution(ContactState):
 
     @cached_property
     def velocity(self) -> fem.Function:
-        """Velocity on the torn mesh, of a problem with mass."""
+        """Velocity on the torn mesh, of a problem with mass.
+
+        Raises:
+            InputError: It has none.
+        """
         if self.v is None:
             raise InputError("no velocity: expected the solution of a ContactDynamics")
         function = fem.Function(self.dofs.V, name="velocity")
         function.x.array[:] = self.v
         return function
-
-    @property
-    def has_velocity(self) -> bool:
-        """True if the bodies have mass."""
-        return self.v is not None
 
     def at(self, points: Any) -> PointValues:
         """Return displacement and stress at points inside the bodies. Collective.
@@ -312,15 +280,14 @@ class Solution(ContactState):
         A node of several contacts has the sum of their forces over their areas, each part of a
         surface counted once.
         """
-        values = self._over_areas(self.force[:, None])[:, 0]
-        return self._field(values, self._vertices, "pressure")
+        return self._field(self._over_areas(self.force[:, None])[:, 0], "pressure")
 
     @cached_property
     def gap(self) -> fem.Function:
         """Remaining gap after deformation; 0 where there is no contact condition (see status)."""
         values = np.full(self.dofs.num_groups, np.inf)
         np.minimum.at(values, self.gluing.records.group, self.remaining_gap)
-        return self._field(np.where(self._vertices, values, 0.0), self._vertices, "gap")
+        return self._field(np.where(self._vertices, values, 0.0), "gap")
 
     @cached_property
     def status(self) -> fem.Function:
@@ -328,7 +295,7 @@ class Solution(ContactState):
         values = np.full(self.dofs.num_groups, float(ContactStatus.NONE))
         known = self.status_of_conditions.astype(float)
         np.maximum.at(values, self.gluing.records.group, known)
-        function = self._field(values, self._vertices, "status")
+        function = self._field(values, "status")
         function.x.array[:] = np.floor(function.x.array)  # between nodes: the lesser of the two
         return function
 
@@ -390,14 +357,17 @@ class Solution(ContactState):
         area = np.minimum(area, whole)[:, None]
         return np.divide(total, area, out=np.zeros_like(total), where=area > 0.0)
 
-    def _field(self, values: Array, vertices: Array, name: str) -> fem.Function:
-        """Scalar function from values of the owned groups at these vertices, 0 elsewhere."""
-        function = from_vertices(self.dofs, values, vertices)
+    def _field(self, values: Array, name: str) -> fem.Function:
+        """Scalar function from values of the owned groups with a condition, 0 elsewhere."""
+        function = from_vertices(self.dofs, values, self._vertices)
         function.name = name
         return function
 
 
 # --- Saved state of a solution ----------------------------------------------------------------
+
+# vectors of all rows that the next solve starts from, if they are known
+STARTS = ("predicted", "image", "predicted_image")
 
 
 @dataclass(frozen=True)
@@ -472,12 +442,11 @@ class SavedState:
 
     def common(self) -> dict[str, Any]:
         """Return what all ranks' states must share, since searches and solves depend on it."""
-        size = float(np.abs(self.mu).sum())
         return {
             "reach": self.reach.tolist(),
             "size": float(self.size),
             "norm": float(self.norm),
-            "mu": [len(self.mu), float(self.mu.sum()), size],
+            "mu": [len(self.mu), float(self.mu.sum()), float(np.abs(self.mu).sum())],
             "number of directions": self.directions.shape[2],
         }
 
@@ -491,8 +460,8 @@ class SavedState:
         sizes = (len(self.lam), len(self.slip), self.contact.tolist(), self.group.tolist())
         kept, wide = records.within_reach, self.directions.shape
         found = (records.contact[kept].tolist(), records.group[kept].tolist())
-        comm, parts = gluing.dofs.comm, ("image", "predicted", "predicted_image")
-        known = [name for name in parts if any_rank(comm, getattr(self, name).size > 0)]
+        comm = gluing.dofs.comm
+        known = [name for name in STARTS if any_rank(comm, getattr(self, name).size > 0)]
         with raised_on_all_ranks(comm):
             rows = gluing.constraints.num_rows
             if sizes != (rows, len(records), *found) or (wide[2] and wide[:2] != (2, rows)):
@@ -538,22 +507,18 @@ def check_state(
             f"the state is of {len(state.reach)} contacts; expected those of the problem, "
             f"{contacts}"
         )
-    rows, conditions = state.lam.shape, state.contact.shape
-    unknowns = (len(dofs.dolfinx_node) * dofs.bs,)
-    shapes = {"u": unknowns, "norm": (), "status": rows, "group": conditions, "size": ()}
+    rows, unknowns = state.lam.shape, (len(dofs.dolfinx_node) * dofs.bs,)
     axes = {"lam": 1, "mu": 1, "slip": 2, "reach": 1, "contact": 1, "directions": 3}
-    for name, shape in shapes.items():
-        _check_broken(name, getattr(state, name).shape == shape)
-    for name, count in axes.items():
-        _check_broken(name, getattr(state, name).ndim == count)
-    for name in ("image", "predicted", "predicted_image"):
-        _check_broken(name, getattr(state, name).shape in ((0,), rows))
-    numbers = ("u", "lam", "mu", "norm", "slip", "velocity", "load", "predicted")
-    for name in (*numbers, "directions", "internal"):
-        _check_broken(name, bool(np.all(np.isfinite(getattr(state, name)))))
-    for name, size in (("contact", contacts), ("group", dofs.num_groups)):
-        values = getattr(state, name)
-        _check_broken(name, bool(np.all((values >= 0) & (values < size))))
+    shapes = {"u": [unknowns], "norm": [()], "status": [rows], "group": [state.contact.shape]}
+    shapes |= {"size": [()], **{name: [(0,), rows] for name in STARTS}}
+    sizes = {"contact": contacts, "group": dofs.num_groups}
+    for f in fields(state):
+        values, name = getattr(state, f.name), f.name
+        right = name not in shapes or values.shape in shapes[name]
+        right &= values.ndim == axes.get(name, values.ndim)
+        right &= bool(np.all(np.isfinite(values)))
+        right &= name not in sizes or bool(np.all((values >= 0) & (values < sizes[name])))
+        _check_broken(name, right)
 
 
 def _check_broken(name: str, right: bool) -> None:

@@ -19,7 +19,7 @@ from tfeti_dolfinx.subdomains.block import (
     fixing_dofs,
     kernel_of,
 )
-from tfeti_dolfinx.subdomains.kplus import GeneralisedInverse, MakeInverse, solved
+from tfeti_dolfinx.subdomains.kplus import MakeInverse, solved
 
 # --- Checks of a feasible set -----------------------------------------------------------------
 
@@ -50,11 +50,27 @@ def check_feasible_set(feasible: FeasibleSet, size: int, seed: int = 0) -> None:
     rng = np.random.default_rng(seed)
     for scale in (0.1, 1.0, 10.0):
         start, other, g, shift = scale * rng.standard_normal((4, size))
-        x = feasible.project(start)
-        _check_projection(feasible, start, x, feasible.project(other))
-        _check_gradients(feasible, x, g)
+        x, y = feasible.project(start), feasible.project(other)
+        # the projection
+        obtuse = (start - x) @ (y - x)  # with all points of a convex set
+        least = 1e-12 * (1.0 + np.linalg.norm(start - x) * np.linalg.norm(y - x))
+        require(obtuse <= least, "P(x) is the nearest point of Ω")
+        require(_close(feasible.project(x), x, 1e-14), "P(P(x)) = P(x)")
         moved = feasible.shifted(shift).project(start - shift) + shift
         require(_close(moved, x, 1e-12), "P of Ω − s is P of Ω, shifted")
+        # gradients
+        phi, beta = feasible.split(x, g)
+        reduced = float(feasible.reduced(x, phi, 0.5) @ phi)
+        require(-1e-12 <= reduced <= phi @ phi * (1.0 + 1e-12), "0 ≤ φ̃ᵀφ ≤ φᵀφ")
+        far = x - min(feasible.max_step(x, phi), 1e3) * phi
+        require(_close(feasible.project(far), far, 1e-10), "x − αφ ∈ Ω for the largest step α")
+        length = 1.0 + np.linalg.norm(phi + beta)
+        apart = [feasible.project(x - a * g) - x + a * (phi + beta) for a in SHORTER]
+        right = [
+            np.linalg.norm(d) <= 1e-4 * a * length for d, a in zip(apart, SHORTER, strict=True)
+        ]
+        require(any(right), "φ + β is the projected gradient")
+        # the face
         _check_face(feasible.face(x, g), size)
         t = rng.standard_normal(feasible.face(x, g).Z.shape[1])
         _check_moves(feasible, x, x - start, t)
@@ -62,31 +78,6 @@ def check_feasible_set(feasible: FeasibleSet, size: int, seed: int = 0) -> None:
 
 def _close(a: Array, b: Array, share: float) -> bool:
     return bool(np.linalg.norm(a - b) <= share * (1.0 + np.linalg.norm(b)))
-
-
-def _check_projection(feasible: FeasibleSet, start: Array, x: Array, y: Array) -> None:
-    obtuse = (start - x) @ (y - x)  # with all points of a convex set
-    size = np.linalg.norm(start - x) * np.linalg.norm(y - x)
-    require(obtuse <= 1e-12 * (1.0 + size), "P(x) is the nearest point of Ω")
-    require(_close(feasible.project(x), x, 1e-14), "P(P(x)) = P(x)")
-
-
-def _check_gradients(feasible: FeasibleSet, x: Array, g: Array) -> None:
-    phi, beta = feasible.split(x, g)
-    reduced = float(feasible.reduced(x, phi, 0.5) @ phi)
-    require(-1e-12 <= reduced <= phi @ phi * (1.0 + 1e-12), "0 ≤ φ̃ᵀφ ≤ φᵀφ")
-    far = x - min(feasible.max_step(x, phi), 1e3) * phi
-    require(_close(feasible.project(far), far, 1e-10), "x − αφ ∈ Ω for the largest step α")
-    right = [_is_derivative(feasible, x, g, phi + beta, step) for step in SHORTER]
-    require(any(right), "φ + β is the projected gradient")
-
-
-def _is_derivative(
-    feasible: FeasibleSet, x: Array, g: Array, projected: Array, step: float
-) -> bool:
-    """Return whether a projected step along −g goes along −g^P."""
-    apart = np.linalg.norm(feasible.project(x - step * g) - x + step * projected)
-    return bool(apart <= 1e-4 * step * (1.0 + np.linalg.norm(projected)))
 
 
 def _check_face(face: Face, size: int) -> None:
@@ -106,14 +97,12 @@ def _check_face(face: Face, size: int) -> None:
 def _check_moves(feasible: FeasibleSet, x: Array, g: Array, t: Array) -> None:
     """Moves along the face stay in the set, but for what its curvature bends them.
 
-    Args:
-        feasible: The set.
-        x: A point of it.
-        g: A gradient that pushes against the set there, and does nothing else.
-        t: Coefficients of a move.
+    g is a gradient that pushes against the set at x and does nothing else, t coefficients.
     """
     face = feasible.face(x, g)
-    t = t * np.minimum(1.0, _radii(face, g))
+    flat, pushing = face.curvature == 0.0, np.sqrt(abs(face.Z.sign()).T @ g**2)
+    radii = np.where(flat, np.inf, pushing / np.where(flat, 1.0, face.curvature))
+    t = t * np.minimum(1.0, radii)
     step = face.Z @ t
     for sign in (SHORT, -SHORT):
         out = np.linalg.norm(feasible.project(x + sign * step) - x - sign * step)
@@ -126,13 +115,6 @@ def _check_moves(feasible: FeasibleSet, x: Array, g: Array, t: Array) -> None:
         rounding = 1e-14 * np.linalg.norm(g) * np.linalg.norm(x)
         right = abs(bent - expected) <= 0.01 * abs(expected) + rounding
         require(right, "gᵀx along Ω bends by ½ tᵀ diag(κ) t")
-
-
-def _radii(face: Face, g: Array) -> Array:
-    """Radius of curvature along each direction of a face, infinite where it is flat."""
-    pushing = np.sqrt(abs(face.Z.sign()).T @ g**2)
-    flat = face.curvature == 0.0
-    return np.where(flat, np.inf, pushing / np.where(flat, 1.0, face.curvature))
 
 
 # --- Checks of a Block ------------------------------------------------------------------------
@@ -181,18 +163,13 @@ def check_kind_of_inverse(make_inverse: MakeInverse, tol: float = 1e-9) -> None:
         modes, before = candidate_modes(data.x, data.bs, *data.body_frame), K.toarray()
         inverse = make_inverse(K, kernel_of(K, modes), fixing, "tfeti_sub_")
         require(np.array_equal(K.toarray(), before), "K is as it was")
-        _check_pinv(inverse, before, tol)
-
-
-def _check_pinv(inverse: GeneralisedInverse, K: Array, tol: float) -> None:
-    """K K⁺ K = K, K⁺ symmetric positive semidefinite."""
-    pinv = solved(inverse, np.eye(len(K)))
-    alone = np.stack([inverse.solve(e) for e in np.eye(len(K))], axis=1)
-    largest = np.abs(pinv).max()
-    require(np.allclose(alone, pinv, atol=tol * largest), "one right side is as several")
-    require(np.allclose(K @ pinv @ K, K, atol=tol * np.abs(K).max()), "K K⁺ K = K")
-    require(np.allclose(pinv, pinv.T, atol=tol * largest), "K⁺ is symmetric")
-    require(np.linalg.eigvalsh(pinv)[0] >= -tol * largest, "K⁺ is positive semidefinite")
+        K, pinv = before, solved(inverse, np.eye(len(before)))
+        alone = np.stack([inverse.solve(e) for e in np.eye(len(K))], axis=1)
+        largest = np.abs(pinv).max()
+        require(np.allclose(alone, pinv, atol=tol * largest), "one right side is as several")
+        require(np.allclose(K @ pinv @ K, K, atol=tol * np.abs(K).max()), "K K⁺ K = K")
+        require(np.allclose(pinv, pinv.T, atol=tol * largest), "K⁺ is symmetric")
+        require(np.linalg.eigvalsh(pinv)[0] >= -tol * largest, "K⁺ is positive semidefinite")
 
 
 def _trusses() -> Iterator[SubdomainData]:
@@ -237,20 +214,9 @@ def check_block(block: Block, K: Any, tol: float = 1e-9) -> None:
     """
     missing = [name for name in PROMISED if not hasattr(block, name)]
     require(not missing, f"a Block has {', '.join(missing)}")
-    K = K.toarray()
-    values = _check_kernel(block, K, tol)
-    _check_stiffness(block, K, tol)
-    lowest = values[block.kernel.shape[1]]
-    inverse_tol = max(tol, LOST * np.finfo(float).eps * values[-1] / lowest)
-    _check_inverse(block, K, inverse_tol)
-    _check_schur(block, K, inverse_tol)
-    _check_load(block)
-
-
-def _check_kernel(block: Block, K: Array, tol: float) -> Array:
-    """Shapes, and R; returns the eigenvalues of K."""
-    n, R, trace = len(K), block.kernel, block.trace_dofs
-    r = R.shape[1]
+    K, R, trace = K.toarray(), block.kernel, block.trace_dofs
+    n, r, rng = len(K), R.shape[1], np.random.default_rng(0)
+    # the kernel
     shapes = [block.load.shape, block.diagonal.shape, block.shares.shape]
     require(shapes == [(n,)] * 3, "load, diagonal and shares have the shape (n,)")
     require(R.shape == (n, r) and len(block.modes) == n, "kernel and modes have n rows")
@@ -259,27 +225,34 @@ def _check_kernel(block: Block, K: Array, tol: float) -> Array:
     require(np.abs(K @ R).max(initial=0.0) <= tol * np.abs(K).max(), "K R = 0")
     values = np.linalg.eigvalsh(K)
     require(np.sum(values > ZERO * values[-1]) == n - r, "the kernel is complete")
-    return np.asarray(values)
-
-
-def _check_stiffness(block: Block, K: Array, tol: float) -> None:
-    """K, its diagonal, and K_bb."""
-    trace, rng = block.trace_dofs, np.random.default_rng(1)
+    # K and K_bb
     require(np.allclose(block.diagonal, K.diagonal(), rtol=tol), "diagonal is that of K")
-    u, w = rng.standard_normal(len(K)), rng.standard_normal(len(trace))
-    largest = np.abs(K @ u).max()
-    require(np.allclose(block.multiply(u), K @ u, atol=tol * largest), "multiply is K")
+    u, (w, v) = rng.standard_normal(n), rng.standard_normal((2, len(trace)))
+    require(np.allclose(block.multiply(u), K @ u, atol=tol * np.abs(K @ u).max()), "multiply is K")
+    inner, K_bb = np.setdiff1d(np.arange(n), trace), K[np.ix_(trace, trace)]
     block.prepare("stiffness")
-    expected = K[np.ix_(trace, trace)] @ w
     atol = tol * np.abs(K).max() * np.abs(w).max(initial=0.0)
-    require(np.allclose(block.apply_stiffness(w), expected, atol=atol), "apply_stiffness is K_bb")
+    require(np.allclose(block.apply_stiffness(w), K_bb @ w, atol=atol), "apply_stiffness is K_bb")
+    # K⁺ and S
+    tol = max(tol, LOST * np.finfo(float).eps * values[-1] / values[r])
+    _check_inverse(block, K, w, v, tol)
+    K_bi, K_ii = K[np.ix_(trace, inner)], K[np.ix_(inner, inner)]
+    Sw = K_bb @ w - K_bi @ (np.linalg.lstsq(K_ii, K_bi.T, rcond=RANK)[0] @ w)
+    block.prepare("schur")
+    atol = tol * np.abs(K_bb @ w).max(initial=0.0)
+    require(np.allclose(block.apply_schur(w), Sw, atol=atol), "apply_schur is S")
+    # the load
+    before = np.array(block.load)
+    block.update(f=before + 1.0)
+    changed = np.array_equal(block.load, before + 1.0)
+    block.update(f=before)
+    require(changed and np.array_equal(block.load, before), "update(f=...) replaces the load")
 
 
-def _check_inverse(block: Block, K: Array, tol: float) -> None:
+def _check_inverse(block: Block, K: Array, w: Array, v: Array, tol: float) -> None:
     """K⁺ is symmetric, and K K⁺ w = w for a balanced w."""
     block.prepare("pinv")
     trace, R = block.trace_dofs, block.kernel
-    w, v = np.random.default_rng(0).standard_normal((2, len(trace)))
     largest = np.abs(block.apply_pinv(w)).max(initial=0.0)
     product, transposed = v @ block.apply_pinv(w), w @ block.apply_pinv(v)
     atol = tol * largest * np.linalg.norm(v)
@@ -292,24 +265,3 @@ def _check_inverse(block: Block, K: Array, tol: float) -> None:
     require(np.abs(K @ u - force).max() <= tol * largest, "K K⁺ w = w for Rᵀ w = 0")
     on_trace, atol = block.apply_pinv(balanced), tol * np.abs(u).max()
     require(np.allclose(u[trace], on_trace, atol=atol), "solve and apply_pinv agree")
-
-
-def _check_schur(block: Block, K: Array, tol: float) -> None:
-    """S is K_bb − K_bi K_ii⁺ K_ib."""
-    trace = block.trace_dofs
-    inner = np.setdiff1d(np.arange(len(K)), trace)
-    K_bb, K_bi, K_ii = K[np.ix_(trace, trace)], K[np.ix_(trace, inner)], K[np.ix_(inner, inner)]
-    S = K_bb - K_bi @ np.linalg.lstsq(K_ii, K_bi.T, rcond=RANK)[0]
-    w = np.random.default_rng(2).standard_normal(len(trace))
-    block.prepare("schur")
-    atol = tol * np.abs(K_bb @ w).max(initial=0.0)
-    require(np.allclose(block.apply_schur(w), S @ w, atol=atol), "apply_schur is S")
-
-
-def _check_load(block: Block) -> None:
-    """``update`` replaces the load."""
-    before = np.array(block.load)
-    block.update(f=before + 1.0)
-    changed = np.array_equal(block.load, before + 1.0)
-    block.update(f=before)
-    require(changed and np.array_equal(block.load, before), "update(f=...) replaces the load")

@@ -309,7 +309,7 @@ class BoundarySolution:
     def values_at(
         self, points: Array, found: tuple[Array, Array], thickness: float, u: fem.Function
     ) -> Array:
-        """Return rows of the bodies of this rank, added for each point (``InnerSolution``)."""
+        """Return rows of the bodies of this rank, added for each point (``value_row``)."""
         (k, d), mesh = points.shape, u.function_space.mesh
         total = np.zeros((k, 1 + d + d * d))
         (place, cells), owner = found, self.cell_subdomain

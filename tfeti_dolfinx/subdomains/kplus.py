@@ -146,7 +146,8 @@ def check_rank(K: Any, R: Array, x: Array, inverse: CholeskyFactor) -> None:
         NotPositiveDefiniteError: It does.
     """
     R = _with_weakly_held(K, R, x)
-    u = _beside(R, inverse.solve(_beside(R, _drawn(K.shape[0], 1)[:, 0])))
+    force = _beside(R, np.random.default_rng(0).standard_normal(K.shape[0]))
+    u = _beside(R, inverse.solve(force))
     lost = float(u @ (K @ u)) <= TOLERANCES.rounding * float(u @ (K.diagonal() * u))
     if lost and not _may_hide_energy(K, x):
         raise NotPositiveDefiniteError("a pivot is zero but for rounding")
@@ -164,7 +165,8 @@ def _may_hide_energy(K: Any, x: Array) -> bool:
 
 def _motions_without_energy(K: Any, R: Array, inverse: CholeskyFactor) -> int:
     """Count motions beside those of R that K gives no energy; K_ρ has been made regular."""
-    U = _drawn(K.shape[0], min(TOLERANCES.counted, K.shape[0] - R.shape[1]))
+    count = min(TOLERANCES.counted, K.shape[0] - R.shape[1])
+    U = np.random.default_rng(0).standard_normal((K.shape[0], count))
     for _ in range(2):  # subspace iteration: what it looks for stands out by 1e8 or more
         U = np.linalg.qr(_beside(R, inverse.solve(U)))[0]
     return _without_energy(K, U).shape[1]
@@ -185,10 +187,6 @@ def _without_energy(K: Any, U: Array) -> Array:
     U = U @ turn
     own = np.sum(U**2 * K.diagonal()[:, None], axis=0)
     return np.asarray(U[:, np.abs(energies) <= TOLERANCES.no_energy * own])
-
-
-def _drawn(n: int, count: int) -> Array:
-    return np.random.default_rng(0).standard_normal((n, count))
 
 
 def _beside(R: Array, u: Array) -> Array:

@@ -159,10 +159,6 @@ class SparseBlock(Block):
         """K⁺ b on all unknowns, shapes ``(n,)``."""
         return self.stiffness.solve(placed(b, self.place))[self.place]
 
-    def apply_stiffness(self, w: Array) -> Array:
-        """K_bb w, shapes ``(t,)``."""
-        return np.asarray((self.traced.K_bb @ placed(w, self.trace_rows))[self.trace_rows])
-
     def apply_schur(self, w: Array) -> Array:
         """S w = K_bb w − K_bi K_ii⁻¹ K_ib w, shapes ``(t,)``; K_ii is factored once."""
         return self.traced.apply_schur(placed(w, self.trace_rows))[self.trace_rows]
