@@ -98,11 +98,8 @@ def write_xdmf(
     of_nodes, of_cells = _fields(solution, interior)
     functions = [_as_geometry(f, solution.decomposition) for f in of_nodes + of_cells]
     companion = target.with_suffix(".h5")
-    folder = begin_file(target.with_name(f"{target.stem}.folder"), comm)
+    folder = begin_file(target.with_name(f"{target.stem}.folder"), comm, is_folder=True)
     try:
-        with raised_on_all_ranks(comm), named(f"cannot write {target}", OSError):
-            if comm.rank == 0:
-                folder.mkdir(parents=True)
         _reserve(target, comm, _bytes_of(functions))
         with raised_on_all_ranks(comm), named(f"cannot write {target}"):
             xdmf = io.XDMFFile(comm, folder / target.name, "w")
@@ -134,7 +131,7 @@ class VtxFile:
         partial: Its name until then.
 
     Raises:
-        InputError: It cannot be written.
+        InputError: It cannot be written, as all methods but ``drop`` say, too.
     """
 
     def __init__(self, name: Path, functions: Sequence[fem.Function]) -> None:
@@ -147,31 +144,19 @@ class VtxFile:
         self._open = True
 
     def write(self, time: float) -> None:
-        """Add what the functions and the mesh have.
-
-        Raises:
-            InputError: It cannot be written; times before this one are whole.
-        """
+        """Add what the functions and the mesh have; times before this one are whole."""
         _reserve(self._name, self._comm, self._bytes, self._count * self._bytes)
         self._of_library(lambda: self._vtx.write(time))
         self._count += 1
 
     def close(self) -> None:
-        """Write what is left.
-
-        Raises:
-            InputError: It cannot be written.
-        """
+        """Write what is left."""
         if self._open:
             self._of_library(self._vtx.close)
         self._open = False
 
     def appear(self) -> None:
-        """Give the file its name, in the place of what has it.
-
-        Raises:
-            InputError: It cannot have it.
-        """
+        """Give the file its name, in the place of what has it."""
         end_file(self.partial, self._name, self._comm)
 
     def drop(self) -> None:
@@ -267,13 +252,15 @@ def checked_target(
     return target
 
 
-def begin_file(name: Path, comm: MPI.Intracomm) -> Path:
+def begin_file(name: Path, comm: MPI.Intracomm, is_folder: bool = False) -> Path:
     """Name to write to until the file is whole; what an earlier run left there is removed."""
     partial = name.with_name(f".{name.name}.partial")
     with raised_on_all_ranks(comm), named(f"cannot write {name}", OSError):
         if comm.rank == 0:
             name.parent.mkdir(parents=True, exist_ok=True)
             _remove(partial)
+            if is_folder:
+                partial.mkdir()
     return partial
 
 
@@ -287,20 +274,11 @@ def end_file(partial: Path, name: Path, comm: MPI.Intracomm) -> None:
 
 
 def _reserve(name: Path, comm: MPI.Intracomm, size: int, before: int = 0) -> None:
-    """Raise unless so many bytes more fit beside a name. Collective.
+    """Raise unless so many bytes fit beside a name, after those that a file has. Collective.
 
     Rank 0 takes them for a file without a name, and gives them back: unlike a look at what is
     free, that knows quotas and limits of a file's size, too. Where a file system cannot take
     place, the C library writes a byte to each block.
-
-    Args:
-        name: What is to be written.
-        comm: Communicator.
-        size: How many bytes.
-        before: How many bytes the file has.
-
-    Raises:
-        InputError: They do not fit, or nothing can be written there.
     """
     what = f"cannot write {name}, up to {size / 1e6:.3g} MB more"
     with raised_on_all_ranks(comm), named(what, OSError):

@@ -148,33 +148,24 @@ def default_solver() -> str:
     return next(solver for solver in SOLVERS if has_solver(solver))
 
 
-def has_solver(solver: str) -> bool:
-    """Return whether this PETSc makes Cholesky factors by a solver."""
-    return _makes_factor(solver, "")
-
-
 def unread_options(given: Mapping[str, Any], solver: str) -> list[str]:
-    """Return those options that a factor does not ask PETSc for.
+    """Return those options that a factor does not ask PETSc for, by one of a single unknown.
 
-    A factor of one unknown is made with them.
+    None where that cannot be made, which has a cause that the factors of the problem name.
 
     Args:
         given: Options without a prefix.
         solver: What makes the factor, where ``given`` does not say.
-
-    Returns:
-        Their names, in their order; none where the factor cannot be made, which has a cause that
-        the factors of the problem name.
     """
     chosen = {"pc_factor_mat_solver_type": solver, **given}
     with added_options(TRIAL, chosen):
-        if not _makes_factor(str(chosen["pc_factor_mat_solver_type"]), TRIAL):
+        if not has_solver(str(chosen["pc_factor_mat_solver_type"]), TRIAL):
             return []
         return [name for name in given if not is_read(TRIAL + name)]
 
 
-def _makes_factor(solver: str, prefix: str) -> bool:
-    """Return whether PETSc makes a Cholesky factor of one unknown; of a prefix with its options."""
+def has_solver(solver: str, prefix: str = "") -> bool:
+    """Return whether this PETSc makes Cholesky factors by a solver, and options with a prefix."""
     one = PETSc.Mat().createAIJ((1, 1), nnz=1, comm=PETSc.COMM_SELF)
     one.setValue(0, 0, 1.0)
     one.assemble()

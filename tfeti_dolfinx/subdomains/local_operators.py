@@ -294,11 +294,7 @@ class LocalOperator(Protocol):
     """
 
     def prepare(self) -> None:
-        """Make what ``mult`` needs; called where ranks can raise together.
-
-        Raises:
-            FactorError: A factor could not be made.
-        """
+        """Make what ``mult`` needs; errors are raised by ranks together."""
         ...
 
     def mult(self, w: Array, out: Array) -> None:

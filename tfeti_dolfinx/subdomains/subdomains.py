@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -221,28 +221,24 @@ class Subdomains:
 
         What springs hold of the modes lies outside the kernels.
         """
-
-        def outside(block: Block) -> Array:
-            modes, R = block.modes, block.kernel
-            inside = R.T @ modes
-            rest = modes - R @ inside
+        found = []
+        for block in self.blocks:
+            inside = block.kernel.T @ block.modes
+            rest = block.modes - block.kernel @ inside
             gram = rest.T @ rest
-            whole = float(np.trace(inside.T @ inside + gram))
-            return np.asarray(gram / (whole or 1.0))
-
-        return self._summed(outside)
+            found.append(gram / (float(np.trace(inside.T @ inside + gram)) or 1.0))
+        return self._on_bodies(found, (self.num_modes, self.num_modes))
 
     def modes_metric(self) -> Array:
         """Cᵀ W C of each body, W the shares, shape ``(b, k, k)``. Collective."""
-        return self._summed(lambda block: block.modes.T @ (block.shares[:, None] * block.modes))
+        found = [block.modes.T @ (block.shares[:, None] * block.modes) for block in self.blocks]
+        return self._on_bodies(found, (self.num_modes, self.num_modes))
 
     def moments(self, u: Array) -> Array:
         """Cᵀ W u of each body, shape ``(b, k)``, u on all unknowns. Collective."""
-        total = np.zeros((self.num_bodies, self.num_modes))
-        for block, part, body in zip(self.blocks, self.dof_parts, self.body_of_block, strict=True):
-            total[body] += block.modes.T @ (block.shares * u[part])
-        self.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
-        return total
+        pairs = zip(self.blocks, self.dof_parts, strict=True)
+        found = [block.modes.T @ (block.shares * u[part]) for block, part in pairs]
+        return self._on_bodies(found, (self.num_modes,))
 
     def modes_motion(self, amounts: Array) -> Array:
         """C times amounts of each body's modes, of shape ``(b, k)``, shape ``(n,)``."""
@@ -251,22 +247,19 @@ class Subdomains:
 
     def load_norms(self) -> Array:
         """‖f‖ of each body, shape ``(b,)``. Collective."""
-        squares = [float(np.linalg.norm(block.load)) ** 2 for block in self.blocks]
-        return np.sqrt(self.body_sums([squares])[0])
+        return np.sqrt(
+            self.body_sums([[float(block.load @ block.load) for block in self.blocks]])[0]
+        )
 
     def body_sums(self, values: Sequence[Sequence[float]]) -> Array:
         """Sums over the Blocks of each body, shape ``(q, b)``, of q values each. Collective."""
-        total = np.zeros((len(values), self.num_bodies))
-        np.add.at(total.T, self.body_of_block, np.array(values, dtype=float).T)
-        self.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
-        return total
+        found = np.array(values, dtype=float).T
+        return np.ascontiguousarray(self._on_bodies(found, (len(values),)).T)
 
     def body_maxima(self, values: Sequence[Sequence[float]]) -> Array:
         """Largest over the Blocks of each body, at least 0, as in ``body_sums``. Collective."""
-        largest = np.zeros((len(values), self.num_bodies))
-        np.maximum.at(largest.T, self.body_of_block, np.array(values, dtype=float).T)
-        self.comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
-        return largest
+        found = np.array(values, dtype=float).T
+        return np.ascontiguousarray(self._on_bodies(found, (len(values),), np.maximum, MPI.MAX).T)
 
     # ------------------------------------------------------------ displacements
 
@@ -300,12 +293,17 @@ class Subdomains:
         nodes = [u[part].reshape(-1, block.bs) for block, part in pairs]
         return [float(np.linalg.norm(x, axis=1).max(initial=0.0)) for x in nodes]
 
-    def _summed(self, matrix: Callable[[Block], Array]) -> Array:
-        """k × k matrices of the Blocks, summed by bodies. Collective."""
-        total = np.zeros((self.num_bodies, self.num_modes, self.num_modes))
-        for block, body in zip(self.blocks, self.body_of_block, strict=True):
-            total[body] += matrix(block)
-        self.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
+    def _on_bodies(
+        self,
+        values: Sequence[Array] | Array,
+        shape: tuple[int, ...],
+        combine: np.ufunc = np.add,
+        op: MPI.Op = MPI.SUM,
+    ) -> Array:
+        """Values of the Blocks, each of this shape, combined by bodies from 0 on. Collective."""
+        total = np.zeros((self.num_bodies, *shape))
+        combine.at(total, self.body_of_block, np.reshape(values, (len(self.blocks), *shape)))
+        self.comm.Allreduce(MPI.IN_PLACE, total, op=op)
         return total
 
 
