@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import resource
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Self
@@ -242,21 +242,20 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
     @classmethod
     def composed(
         cls,
-        records: Sequence[Sizes | StageCounts | SolverCounts | Outcome],
+        records: tuple[Sizes, StageCounts, SolverCounts, Outcome],
         seconds: Mapping[str, float],
         before: Mapping[str, float],
     ) -> Report:
         """Compose the report of a solve.
 
         Args:
-            records: What stages have returned, as far as they came.
+            records: What its stages have returned.
             seconds: Seconds of each stage.
             before: ``in_all`` of the solves before it.
         """
         known = {name: value for record in records for name, value in vars(record).items()}
         total = sum(seconds.values())
-        counts = {name: known[name] for name in COUNTERS if name in known}
-        own = {"solves": 1, **dict.fromkeys(COUNTERS, 0), **counts, "seconds": total}
+        own = {"solves": 1, **{name: known[name] for name in COUNTERS}, "seconds": total}
         return cls(**known, seconds={**seconds, "total": total}, in_all=added(before, own))
 
     @property

@@ -73,51 +73,6 @@ def checked_points(points: Any, gdim: int) -> Array:
     return found
 
 
-def values_at(
-    points: Array,
-    boundary: Any,
-    thickness: Any,
-    u: fem.Function,
-    stress: fem.Function | None,
-) -> PointValues:
-    """Return values at points, means of the subdomains that share a point. Collective.
-
-    Args:
-        points: The same on all ranks, shape ``(k, gdim)``.
-        boundary: What another method than finite elements knows: ``values_at`` has its rows, and
-            ``finite`` are the cells of this rank without it. Or None.
-        thickness: What stresses of boundary elements have to be divided by.
-        u: Displacement on the torn mesh.
-        stress: Stress in the cells, 3×3, or None.
-    """
-    (k, d), mesh = points.shape, u.function_space.mesh
-    total, x = np.zeros((k, 1 + d + d * d)), in_space(points)
-    size = float(np.ptp(mesh.geometry.x, axis=0).max(initial=0.0)) if len(mesh.geometry.x) else 0.0
-    tree = geometry.bb_tree(mesh, mesh.topology.dim, padding=PADDING * size)
-    near = geometry.compute_collisions_points(tree, x)
-    found = geometry.compute_colliding_cells(mesh, near, x)
-    place = np.repeat(np.arange(k), np.diff(found.offsets))
-    cells = np.asarray(found.array)
-    if boundary is not None:
-        if isinstance(thickness, fem.Constant):
-            thickness = float(thickness.value)
-        # where it varies there are no boundary elements
-        number = thickness if isinstance(thickness, float) else 1.0
-        total += boundary.values_at(points, (place, cells), number, u)
-        kept = np.isin(cells, boundary.finite)
-        place, cells = place[kept], cells[kept]
-    if len(place):
-        x = x[place]
-        sigma = np.full((len(place), d, d), np.nan)
-        if stress is not None:
-            sigma = stress.eval(x, cells).reshape(-1, 3, 3)[:, :d, :d]
-        np.add.at(total, place, value_row(u.eval(x, cells).reshape(-1, d), sigma))
-    mesh.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
-    with np.errstate(invalid="ignore"):
-        mean = np.where(total[:, :1] > 0.0, total[:, 1:] / total[:, :1], np.nan)
-    return PointValues(mean[:, :d], mean[:, d:].reshape(k, d, d))
-
-
 def in_space(points: Array) -> Array:
     """Return points with three coordinates."""
     x = np.zeros((len(points), 3))
@@ -126,7 +81,7 @@ def in_space(points: Array) -> Array:
 
 
 def value_row(u: Array, stress: Array) -> Array:
-    """Return a row of ``values_at`` for each point: 1, displacement and stress."""
+    """Return a row for each point: 1, displacement and stress."""
     return np.column_stack((np.ones(len(u)), u, stress.reshape(len(u), u.shape[1] ** 2)))
 
 
@@ -152,7 +107,8 @@ class Solution(ContactState):
     Attributes:
         u: Displacement in primal order.
         lam: Multipliers of this rank's rows.
-        boundary: What boundary elements know of it, if there are any.
+        boundary: What boundary elements know of it, if there are any: ``values_at``, which gives
+            rows as ``value_row``, and ``finite``, the cells of this rank without them.
         contacts: The contacts with their sides decided: ``contacts[i].surfaces[0]`` has the
             multipliers and the pressure.
         v: Velocity in DOLFINx's order of bodies with mass, else None.
@@ -211,9 +167,37 @@ class Solution(ContactState):
         Raises:
             InputError: The points are of another shape, or not finite.
         """
-        points = checked_points(points, self.decomposition.mesh.geometry.dim)
+        mesh, u = self.decomposition.mesh, self.displacement
+        points = checked_points(points, mesh.geometry.dim)
+        (k, d), x = points.shape, in_space(points)
+        # cells of this rank, each with a point by its position
+        nodes = mesh.geometry.x
+        size = float(np.ptp(nodes, axis=0).max(initial=0.0)) if len(nodes) else 0.0
+        tree = geometry.bb_tree(mesh, mesh.topology.dim, padding=PADDING * size)
+        near = geometry.compute_collisions_points(tree, x)
+        found = geometry.compute_colliding_cells(mesh, near, x)
+        place, cells = np.repeat(np.arange(k), np.diff(found.offsets)), np.asarray(found.array)
+        # rows of each subdomain that has a point, added
+        total = np.zeros((k, 1 + d + d * d))
+        if self.boundary is not None:  # where a thickness varies there is none
+            thickness = self.thickness
+            if isinstance(thickness, fem.Constant):
+                thickness = float(thickness.value)
+            number = thickness if isinstance(thickness, float) else 1.0
+            total += self.boundary.values_at(points, (place, cells), number, u)
+            kept = np.isin(cells, self.boundary.finite)
+            place, cells = place[kept], cells[kept]
         stress = self.stress if self.has_stress else None
-        return values_at(points, self.boundary, self.thickness, self.displacement, stress)
+        if len(place):
+            sigma = np.full((len(place), d, d), np.nan)
+            if stress is not None:
+                sigma = stress.eval(x[place], cells).reshape(-1, 3, 3)[:, :d, :d]
+            np.add.at(total, place, value_row(u.eval(x[place], cells).reshape(-1, d), sigma))
+        # means of the subdomains that share a point
+        mesh.comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
+        with np.errstate(invalid="ignore"):
+            mean = np.where(total[:, :1] > 0.0, total[:, 1:] / total[:, :1], np.nan)
+        return PointValues(mean[:, :d], mean[:, d:].reshape(k, d, d))
 
     @cached_property
     def interior(self) -> Any:
@@ -509,8 +493,9 @@ def check_state(
         )
     rows, unknowns = state.lam.shape, (len(dofs.dolfinx_node) * dofs.bs,)
     axes = {"lam": 1, "mu": 1, "slip": 2, "reach": 1, "contact": 1, "directions": 3}
-    shapes = {"u": [unknowns], "norm": [()], "status": [rows], "group": [state.contact.shape]}
-    shapes |= {"size": [()], **{name: [(0,), rows] for name in STARTS}}
+    shapes: dict[str, list[tuple[int, ...]]] = {name: [(0,), rows] for name in STARTS}
+    shapes |= {"u": [unknowns], "status": [rows], "group": [state.contact.shape]}
+    shapes |= {"norm": [()], "size": [()]}
     sizes = {"contact": contacts, "group": dofs.num_groups}
     for f in fields(state):
         values, name = getattr(state, f.name), f.name

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,14 +22,34 @@ from tfeti_dolfinx.subdomains.block import (
 )
 from tfeti_dolfinx.subdomains.kplus import MakeInverse, solved
 
-# --- Checks of a feasible set -----------------------------------------------------------------
 
-# Steps along a face, relative to the radius of its curvature: one so short that what is linear in
-# it stands out from what is quadratic; one that is longer, so that what is quadratic stands out
-# from rounding.
-SHORT, LONG = 1e-8, 1e-5
-# Steps along a gradient: small sets are curved so much that only the last ones are short
-SHORTER = (1e-8, 1e-10, 1e-12, 1e-14)
+@dataclass(frozen=True)
+class CheckTolerances:
+    """Steps and tolerances of the checks.
+
+    Attributes:
+        short: Step along a face, relative to the radius of its curvature, so short that what is
+            linear in it stands out from what is quadratic.
+        long: A longer one, so that what is quadratic stands out from rounding.
+        shorter: Steps along a gradient: small sets are curved so much that only the last ones are
+            short.
+        zero: Eigenvalues of a stiffness, over the largest, that are 0 but for rounding (which is
+            1e-16 times a few powers of n).
+        rank: Singular values, their roots, likewise.
+        lost: Of eps times the condition: what a solve may lose, with room for sums of many terms.
+    """
+
+    short: float = 1e-8
+    long: float = 1e-5
+    shorter: tuple[float, ...] = (1e-8, 1e-10, 1e-12, 1e-14)
+    zero: float = 1e-12
+    rank: float = 1e-10
+    lost: float = 100.0
+
+
+TOLERANCES = CheckTolerances()
+
+# --- Checks of a feasible set -----------------------------------------------------------------
 
 
 def check_feasible_set(feasible: FeasibleSet, size: int, seed: int = 0) -> None:
@@ -65,9 +86,10 @@ def check_feasible_set(feasible: FeasibleSet, size: int, seed: int = 0) -> None:
         far = x - min(feasible.max_step(x, phi), 1e3) * phi
         require(_close(feasible.project(far), far, 1e-10), "x − αφ ∈ Ω for the largest step α")
         length = 1.0 + np.linalg.norm(phi + beta)
-        apart = [feasible.project(x - a * g) - x + a * (phi + beta) for a in SHORTER]
+        apart = [feasible.project(x - a * g) - x + a * (phi + beta) for a in TOLERANCES.shorter]
         right = [
-            np.linalg.norm(d) <= 1e-4 * a * length for d, a in zip(apart, SHORTER, strict=True)
+            np.linalg.norm(d) <= 1e-4 * a * length
+            for d, a in zip(apart, TOLERANCES.shorter, strict=True)
         ]
         require(any(right), "φ + β is the projected gradient")
         # the face
@@ -99,31 +121,25 @@ def _check_moves(feasible: FeasibleSet, x: Array, g: Array, t: Array) -> None:
 
     g is a gradient that pushes against the set at x and does nothing else, t coefficients.
     """
-    face = feasible.face(x, g)
+    face, short, long = feasible.face(x, g), TOLERANCES.short, TOLERANCES.long
     flat, pushing = face.curvature == 0.0, np.sqrt(abs(face.Z.sign()).T @ g**2)
     radii = np.where(flat, np.inf, pushing / np.where(flat, 1.0, face.curvature))
     t = t * np.minimum(1.0, radii)
     step = face.Z @ t
-    for sign in (SHORT, -SHORT):
+    for sign in (short, -short):
         out = np.linalg.norm(feasible.project(x + sign * step) - x - sign * step)
-        stays = out <= 1e-4 * SHORT * (1.0 + np.linalg.norm(step)) + 1e-15 * np.linalg.norm(x)
+        stays = out <= 1e-4 * short * (1.0 + np.linalg.norm(step)) + 1e-15 * np.linalg.norm(x)
         require(stays, "x + Zt stays in Ω to both sides, to first order in t")
-    moved = feasible.project(x + LONG * step)
+    moved = feasible.project(x + long * step)
     if np.array_equal(feasible.face(moved, g).status, face.status):  # else it met a bound
-        bent = g @ (moved - x - LONG * step)
-        expected = 0.5 * LONG**2 * float(face.curvature @ t**2)
+        bent = g @ (moved - x - long * step)
+        expected = 0.5 * long**2 * float(face.curvature @ t**2)
         rounding = 1e-14 * np.linalg.norm(g) * np.linalg.norm(x)
         right = abs(bent - expected) <= 0.01 * abs(expected) + rounding
         require(right, "gᵀx along Ω bends by ½ tᵀ diag(κ) t")
 
 
 # --- Checks of a Block ------------------------------------------------------------------------
-
-# Eigenvalues of a stiffness, as a share of the largest, that are 0 but for rounding (which is
-# 1e-16 times a few powers of n); singular values are their roots, and cut off above rounding.
-ZERO, RANK = 1e-12, 1e-10
-# of eps times the condition: what a solve may lose, with room for sums of many terms
-LOST = 100.0
 
 
 def check_kind_of_block(make_block: Callable[[SubdomainData], Block], tol: float = 1e-9) -> None:
@@ -224,7 +240,7 @@ def check_block(block: Block, K: Any, tol: float = 1e-9) -> None:
     require(np.allclose(R.T @ R, np.eye(r), atol=tol), "Rᵀ R = I")
     require(np.abs(K @ R).max(initial=0.0) <= tol * np.abs(K).max(), "K R = 0")
     values = np.linalg.eigvalsh(K)
-    require(np.sum(values > ZERO * values[-1]) == n - r, "the kernel is complete")
+    require(np.sum(values > TOLERANCES.zero * values[-1]) == n - r, "the kernel is complete")
     # K and K_bb
     require(np.allclose(block.diagonal, K.diagonal(), rtol=tol), "diagonal is that of K")
     u, (w, v) = rng.standard_normal(n), rng.standard_normal((2, len(trace)))
@@ -234,10 +250,10 @@ def check_block(block: Block, K: Any, tol: float = 1e-9) -> None:
     atol = tol * np.abs(K).max() * np.abs(w).max(initial=0.0)
     require(np.allclose(block.apply_stiffness(w), K_bb @ w, atol=atol), "apply_stiffness is K_bb")
     # K⁺ and S
-    tol = max(tol, LOST * np.finfo(float).eps * values[-1] / values[r])
+    tol = max(tol, TOLERANCES.lost * np.finfo(float).eps * values[-1] / values[r])
     _check_inverse(block, K, w, v, tol)
     K_bi, K_ii = K[np.ix_(trace, inner)], K[np.ix_(inner, inner)]
-    Sw = K_bb @ w - K_bi @ (np.linalg.lstsq(K_ii, K_bi.T, rcond=RANK)[0] @ w)
+    Sw = K_bb @ w - K_bi @ (np.linalg.lstsq(K_ii, K_bi.T, rcond=TOLERANCES.rank)[0] @ w)
     block.prepare("schur")
     atol = tol * np.abs(K_bb @ w).max(initial=0.0)
     require(np.allclose(block.apply_schur(w), Sw, atol=atol), "apply_schur is S")
@@ -258,7 +274,7 @@ def _check_inverse(block: Block, K: Array, w: Array, v: Array, tol: float) -> No
     atol = tol * largest * np.linalg.norm(v)
     require(np.isclose(product, transposed, rtol=tol, atol=atol), "K⁺ is symmetric")
     # a mode that is 0 on the trace but for rounding must not be scaled up
-    balanced = w - R[trace] @ np.linalg.lstsq(R[trace], w, rcond=RANK)[0]
+    balanced = w - R[trace] @ np.linalg.lstsq(R[trace], w, rcond=TOLERANCES.rank)[0]
     force = np.zeros(len(K))
     force[trace] = balanced
     u, largest = block.solve(force), np.abs(force).max()

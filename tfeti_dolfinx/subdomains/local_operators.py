@@ -148,17 +148,19 @@ class Group:
 def groups_of(blocks: Sequence[Block], kind: OperatorKind) -> list[Group]:
     """Return groups that are as large as possible; Blocks without a trace have nothing to apply."""
     parts = parts_of([len(block.trace_dofs) for block in blocks])
-    pairs = [(b, part) for b, part in zip(blocks, parts, strict=True) if len(b.trace_dofs)]
-    groups = [_own_group(b, kind, part) for b, part in pairs if not isinstance(b, SparseBlock)]
-    sparse = [(block, part) for block, part in pairs if isinstance(block, SparseBlock)]
-    if kind == "stiffness":
-        return [*groups, _stiffness_group(sparse)] if sparse else groups
-    of_kind = {"pinv": _pinv_group, "schur": _schur_group}[kind]
-    shared = [block.stiffness if kind == "pinv" else block.traced for block, _ in sparse]
+    groups = []
     members: dict[int, list[tuple[SparseBlock, slice]]] = defaultdict(list)
-    for pair, what in zip(sparse, shared, strict=True):
-        members[id(what)].append(pair)
-    return [*groups, *(of_kind(equal) for equal in members.values())]
+    for block, part in zip(blocks, parts, strict=True):
+        if isinstance(block, SparseBlock) and len(block.trace_dofs):
+            members[id(block.stiffness if kind == "pinv" else block.traced)].append((block, part))
+        elif len(block.trace_dofs):
+            groups.append(_own_group(block, kind, part))
+    if kind == "stiffness":
+        alone = [equal[0] for equal in members.values() if len(equal) == 1]
+        shared = [equal for equal in members.values() if len(equal) > 1]
+        return [*groups, *map(_stiffness_group, [alone, *shared] if alone else shared)]
+    of_kind = _pinv_group if kind == "pinv" else _schur_group
+    return [*groups, *map(of_kind, members.values())]
 
 
 def _pinv_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
@@ -195,18 +197,20 @@ def _schur_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
     return Group(len(equal), size, len(equal), *places, traced.apply_schur, cost)
 
 
-def _stiffness_group(sparse: Sequence[tuple[SparseBlock, slice]]) -> Group:
-    """K_bb of all subdomains as one sparse matrix."""
-    K_bb = csr_array(block_diag([block.traced.K_bb for block, _ in sparse], format="csr"))
-    begins = np.cumsum([0, *(len(block.trace_dofs) for block, _ in sparse)])[:-1]
-    rows = [begin + block.trace_rows for begin, (block, _) in zip(begins, sparse, strict=True)]
-    places = _places([np.concatenate(rows)], 0, [part for _, part in sparse])
-    size = K_bb.shape[0]
+def _stiffness_group(blocks: Sequence[tuple[SparseBlock, slice]]) -> Group:
+    """K_bb of equal subdomains, or those of subdomains without equals as one sparse matrix."""
+    traces = {id(block.traced): block.traced for block, _ in blocks}.values()
+    rows, K_bb = [block.trace_rows for block, _ in blocks], next(iter(traces)).K_bb
+    if len(traces) > 1:
+        begins = np.cumsum([0, *(len(row) for row in rows)])[:-1]
+        K_bb = csr_array(block_diag([traced.K_bb for traced in traces], format="csr"))
+        rows = [np.concatenate([a + row for a, row in zip(begins, rows, strict=True)])]
+    size, parts = K_bb.shape[0], [part for _, part in blocks]
     return Group(
-        len(sparse),
+        len(blocks),
         size,
-        1,
-        *places,
+        len(rows),
+        *_places(rows, size, parts),
         lambda W: np.asarray(K_bb @ W),
         lambda count: MODEL.sparse(K_bb.nnz, count),
         can_be_dense=False,
