@@ -293,9 +293,6 @@ class System:
         self._dual = settings.make_dual(self.gluing.constraints, self.subdomains, *scene, law)
         self.dual.saw(self._seen)
 
-    def _update_linear_term(self) -> None:
-        self.dual.update_load()
-
     def _slip(self) -> Array:
         """Tangential v_i of all conditions where the load step begins, shape ``(n, gdim - 1)``."""
         records = self.search.records
@@ -326,7 +323,7 @@ STAGES: dict[str, tuple[str, Callable[[System], None]]] = {
     "factors": ("subdomains", System._factor),
     "trace": ("subdomains", System._take_trace),
     "coarse problem": ("dual", System._make_dual),
-    "linear term": ("dual", System._update_linear_term),
+    "linear term": ("dual", lambda system: system.dual.update_load()),
 }
 # what has to be made anew where something has changed
 CHANGES = {

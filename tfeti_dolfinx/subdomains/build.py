@@ -133,7 +133,7 @@ def subdomain_data(
 
 def sparse_blocks(how: InverseFactory, choice: LocalChoice) -> MakeBlock:
     """Return the factory of a rank's Blocks, which share a stiffness if the choice says so."""
-    equals = EqualSubdomains(how) if choice.shares else None
+    equals = EqualSubdomains(how) if choice.type in ("auto", "shared") else None
     return lambda data: SparseBlock(data, how, equals)
 
 

@@ -284,11 +284,6 @@ class LocalChoice:
     type: str = "auto"
     multiplications: int = 50
 
-    @property
-    def shares(self) -> bool:
-        """True if equal subdomains share their stiffness."""
-        return self.type in ("auto", "shared")
-
 
 class LocalOperator(Protocol):
     """diag(A_s) over the subdomains of a rank, on its t trace unknowns. Nothing is collective.
