@@ -32,7 +32,7 @@ from tfeti_dolfinx.contact.partner import (
     gaps_by_position,
 )
 from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
-from tfeti_dolfinx.extensions import Extensions, Settings, check_method, guarded
+from tfeti_dolfinx.extensions import Extensions, check_method, guarded
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.forms.checks import check_mesh, check_same_space, displacement_space
@@ -45,7 +45,7 @@ from tfeti_dolfinx.solution import SavedState, Solution, check_state
 from tfeti_dolfinx.solve.coulomb import solve_with_friction
 from tfeti_dolfinx.solve.solver import conclude, learn
 from tfeti_dolfinx.subdomains.build import SubdomainMethod
-from tfeti_dolfinx.system import System
+from tfeti_dolfinx.system import Settings, System
 
 MAX_ROUNDS = 20  # of solves with more and more contact rows
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, MutableMapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -14,22 +14,147 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.logging import stage
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.constraints.gluing import Gluing, Prescribed, glue, prescribe
-from tfeti_dolfinx.constraints.rows import row_weights
+from tfeti_dolfinx.constraints.rows import Constraints, row_weights
 from tfeti_dolfinx.contact.forces import condition_areas
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap
 from tfeti_dolfinx.contact.records import slips
 from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.extensions import Settings
-from tfeti_dolfinx.feti.dual import Dual
+from tfeti_dolfinx.extensions import Extensions
+from tfeti_dolfinx.feti.deflation import SoftModes
+from tfeti_dolfinx.feti.dual import Dual, FeasibleLaw
+from tfeti_dolfinx.feti.operator import PRECONDITIONERS
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import Options
+from tfeti_dolfinx.qp.recycling import Recycled
 from tfeti_dolfinx.report import Sizes, StageCounts
-from tfeti_dolfinx.subdomains.block import Counters
-from tfeti_dolfinx.subdomains.build import FiniteElements, SubdomainMethod, subdomain_data
+from tfeti_dolfinx.solve.solver import resolve_types
+from tfeti_dolfinx.subdomains.block import Counters, SubdomainData, mode_names
+from tfeti_dolfinx.subdomains.build import (
+    FiniteElements,
+    MakeBlock,
+    SubdomainMethod,
+    make_subdomains,
+    sparse_blocks,
+    subdomain_data,
+)
+from tfeti_dolfinx.subdomains.factor import added_options
+from tfeti_dolfinx.subdomains.kplus import InverseFactory
+from tfeti_dolfinx.subdomains.local_operators import LocalChoice
+from tfeti_dolfinx.subdomains.pseudoinverse import KPLUS_TYPES
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
+
+# --- Settings of a solve ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of a solve, and what they make.
+
+    Attributes:
+        options: Options.
+        prefix: Prefix of all options.
+        factor_options: Options that PETSc's factors read, without prefix.
+        extensions: Parts that the program brings.
+    """
+
+    options: Options
+    prefix: str
+    factor_options: Mapping[str, Any]
+    extensions: Extensions
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """The settings that ranks must share: a monitor of one rank would wait for the others.
+
+        Parts of one's own count by their presence: a rank may bring another callable.
+        """
+        parts = {f.name: getattr(self.extensions, f.name) for f in fields(self.extensions)}
+        return {
+            "petsc_options": {**asdict(self.options), "of factors": dict(self.factor_options)},
+            "petsc_options_prefix": self.prefix,
+            "extensions": {
+                name: "not given" if part is None else "given" for name, part in parts.items()
+            },
+        }
+
+    def inverses(self, counters: Counters) -> InverseFactory:
+        """Return the factory of the subdomains' generalised inverses."""
+        kplus = self.extensions.kplus or KPLUS_TYPES[self.options.kplus_type]
+        return InverseFactory(counters, kplus, f"{self.prefix}sub_")
+
+    def make_subdomains(
+        self,
+        data: Iterable[SubdomainData],
+        dofs: TornDofs,
+        decomposition: Decomposition,
+        counters: Counters,
+        replaced: Callable[[MakeBlock], MakeBlock] | None = None,
+    ) -> Subdomains:
+        """Return all Blocks of a rank as one. Collective.
+
+        Args:
+            data: The subdomains, each of which is let go when its Block is made.
+            dofs: Dof maps.
+            decomposition: The torn mesh.
+            counters: Counts factorisations and solves.
+            replaced: From the factory of Blocks to one that makes some of them otherwise.
+
+        Raises:
+            InputError: Stiffness or load do not fit.
+            FactorError: A factor could not be made.
+        """
+        own, options = self.extensions, self.options
+        choice = LocalChoice(options.local_type, options.local_multiplications)
+        make = own.block or sparse_blocks(self.inverses(counters), choice)
+        make = make if replaced is None else replaced(make)
+        kind = Subdomains if own.subdomains is None else own.subdomains(dofs, decomposition)
+        with added_options(self.prefix, self.factor_options):
+            return make_subdomains(data, make, decomposition, counters, choice, kind)
+
+    def make_dual(
+        self,
+        constraints: Constraints,
+        subdomains: Subdomains,
+        dofs: TornDofs,
+        decomposition: Decomposition,
+        feasible: FeasibleLaw,
+    ) -> tuple[Dual, Options]:
+        """Return the dual problem, and the options with what ``auto`` stands for. Collective.
+
+        Raises:
+            InputError: The solver cannot keep the rows, or takes no preconditioner of one's own.
+            NoSolutionError: The load moves a body that nothing holds.
+            FactorError: A matrix could not be factored.
+        """
+        rows = constraints.sets.contact_rows(dofs.comm)
+        qp_type, pc_type = resolve_types(self.options, rows, self.prefix)
+        preconditioner = self.extensions.preconditioner
+        if preconditioner is not None and pc_type == "none":
+            raise InputError(
+                f"extensions: a preconditioner is given, but -{self.prefix}pc_type is none, as "
+                "auto is with smalse; expected lumped or dirichlet, whose place it takes"
+            )
+        with added_options(self.prefix, self.factor_options):
+            dual = Dual(
+                constraints=constraints,
+                subdomains=subdomains,
+                body_names=decomposition.body_names,
+                mode_names=mode_names(decomposition.mesh.geometry.dim, dofs.bs),
+                preconditioner=preconditioner or PRECONDITIONERS.get(pc_type),
+                options_prefix=self.prefix,
+                feasible=feasible,
+                deflation=self.extensions.deflation or SoftModes,
+                without=self.options.without,
+            )
+        if isinstance(self.options.recycle, int) and self.options.recycle:
+            dual.recycled = Recycled(self.options.recycle, dofs.comm)
+        return dual, replace(self.options, qp_type=qp_type, pc_type=pc_type)
+
+
+# --- The stages of a solve --------------------------------------------------------------------
 
 T = TypeVar("T")
 

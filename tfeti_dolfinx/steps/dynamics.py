@@ -19,7 +19,7 @@ from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.contact.partner import ContactPartner
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.extensions import Extensions, Settings
+from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.forms.elasticity import Modulus
@@ -33,6 +33,7 @@ from tfeti_dolfinx.solve.solver import conclude, solve_dual
 from tfeti_dolfinx.subdomains.block import Counters
 from tfeti_dolfinx.subdomains.build import subdomain_data
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
+from tfeti_dolfinx.system import Settings
 
 # --- Energies and work of a step --------------------------------------------------------------
 
