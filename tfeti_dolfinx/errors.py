@@ -61,13 +61,7 @@ def raised_on_all_ranks(comm: MPI.Intracomm) -> Iterator[None]:
 
 
 def raise_together(comm: MPI.Intracomm, error: Exception | None, raiser: int) -> None:
-    """Raise one rank's exception on all ranks. Collective.
-
-    Args:
-        comm: Communicator.
-        error: The exception that this rank has.
-        raiser: The rank whose exception it is, the same on all ranks.
-    """
+    """Raise the exception of the rank ``raiser`` on all ranks. Collective."""
     if comm.rank != raiser or error is None:
         raise comm.bcast(None, root=raiser)
     portable = comm.bcast(_portable(error), root=raiser)

@@ -89,11 +89,6 @@ def guarded(own: Extensions, options: Options, comm: MPI.Intracomm) -> Extension
 
     Blocks and K⁺ are made where ranks raise together. Clusters are parts of the package's own.
 
-    Args:
-        own: What the program brings.
-        options: Options.
-        comm: Communicator.
-
     Raises:
         InputError: Clusters are asked for beside other subdomains or another deflation.
     """

@@ -177,17 +177,7 @@ class Outcome:
         excluding: list[str],
         estimates: dict[str, float],
     ) -> Self:
-        """Measure an answer, warnings apart. Collective.
-
-        Args:
-            solution: The solution.
-            dual: The dual problem.
-            result: What the solver returned.
-            accuracy: Its accuracy.
-            settling: How bounds of friction have come to rest.
-            excluding: Names of the contacts whose rows exclude each other.
-            estimates: Errors at the last assessment of a target of the error in energy.
-        """
+        """Measure an answer, warnings apart. Collective."""
         status, normals = solution.status_of_conditions, solution.gluing.constraints.sets.normals
         own = (
             np.sum(solution.carrying[normals]),
@@ -246,13 +236,7 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         seconds: Mapping[str, float],
         before: Mapping[str, float],
     ) -> Report:
-        """Compose the report of a solve.
-
-        Args:
-            records: What its stages have returned.
-            seconds: Seconds of each stage.
-            before: ``in_all`` of the solves before it.
-        """
+        """Compose the report of a solve; ``before`` is ``in_all`` of the solves before it."""
         known = {name: value for record in records for name, value in vars(record).items()}
         total = sum(seconds.values())
         own = {"solves": 1, **{name: known[name] for name in COUNTERS}, "seconds": total}
@@ -287,19 +271,15 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         """
         with raised_on_all_ranks(comm), named(f"cannot write {path}", OSError):
             if comm.rank == 0:
-                _write_whole(Path(path), self.to_json() + "\n")
-
-
-def _write_whole(target: Path, text: str) -> None:
-    """Write a file aside and give it its name when it is whole."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(f".{target.name}.partial")
-    partial.write_text(text)
-    try:
-        os.replace(partial, target)
-    except OSError:
-        partial.unlink()
-        raise
+                target = Path(path)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                partial = target.with_name(f".{target.name}.partial")
+                partial.write_text(self.to_json() + "\n")
+                try:
+                    os.replace(partial, target)
+                except OSError:
+                    partial.unlink()
+                    raise
 
 
 def _item(item: str | list[float] | dict[str, Any]) -> str:

@@ -95,17 +95,8 @@ class Solution(ContactState):
     problem leaves it as it is. Only a mesh whose points are moved takes along the fields that are
     made later. Creating a field is collective.
 
-    Args:
-        u: Displacement in primal order, shape ``(num_nodes * bs,)``.
-        multipliers: Multipliers of this rank's rows.
-        decomposition: The torn mesh.
-        gluing: Rows and contact records.
-        contacts: Obstacles and pairs, the secondary surface of a pair first.
-        stress: UFL stress of a displacement, or None.
-        thickness: What areas of the mesh are multiplied with, a number or a scalar in UFL.
-
     Attributes:
-        u: Displacement in primal order.
+        u: Displacement in primal order, shape ``(num_nodes * bs,)``.
         lam: Multipliers of this rank's rows.
         boundary: What boundary elements know of it, if there are any: ``values_at``, which gives
             rows as ``value_row``, and ``finite``, the cells of this rank without them.

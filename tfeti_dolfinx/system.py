@@ -95,12 +95,7 @@ class Settings:
     ) -> Subdomains:
         """Return all Blocks of a rank as one. Collective.
 
-        Args:
-            data: The subdomains, each of which is let go when its Block is made.
-            dofs: Dof maps.
-            decomposition: The torn mesh.
-            counters: Counts factorisations and solves.
-            replaced: From the factory of Blocks to one that makes some of them otherwise.
+        ``replaced`` takes the factory of Blocks to one that makes some of them otherwise.
 
         Raises:
             InputError: Stiffness or load do not fit.
@@ -171,19 +166,10 @@ class System:
 
     ``STAGES`` below are made in their order, where something they depend on has changed.
 
-    Args:
-        forms: The compiled forms.
-        bcs: Dirichlet conditions.
-        contacts: Obstacles and pairs.
-        dofs: Dof maps.
-        decomposition: The torn mesh.
-        settings: How to solve.
-        method: What takes the place of finite elements, say boundary elements.
-
     Attributes:
         forms: The compiled forms.
         bcs: Dirichlet conditions.
-        elements: Stiffness and load of subdomains.
+        elements: Stiffness and load of subdomains, by finite elements or another method.
         origin: Displacement in primal order at which the mesh is, in finite strain; else None.
         rest: Displacement in primal order at which the load step begins; None: no displacement.
     """

@@ -25,18 +25,12 @@ MakeBlock = Callable[[SubdomainData], Block]
 
 
 class FiniteElements:
-    """Stiffness and load of a rank's subdomains as the forms give them.
+    """Stiffness and load of a rank's subdomains as the forms give them; base of other methods.
 
-    Base of other methods. Creation and all methods are collective.
-
-    Args:
-        dofs: Dof maps.
-
-    Attributes:
-        replaces: Whether something takes the place of finite elements.
+    Creation and all methods are collective.
     """
 
-    replaces = False
+    replaces = False  # whether something takes the place of finite elements
 
     def __init__(self, dofs: TornDofs) -> None:
         self._dofs = dofs
@@ -44,22 +38,12 @@ class FiniteElements:
     def node_blocks(self, K: Any, how: InverseFactory) -> Array:
         """Return the stiffness's block of each primal node, shape ``(num_nodes, bs, bs)``.
 
-        Args:
-            K: Stiffness of finite elements in DOLFINx's numbering, scipy CSR.
-            how: How inverses are made.
-
-        Raises:
-            InputError: The mesh or the stiffness does not fit.
-            FactorError: A factor could not be made.
+        K is the stiffness of finite elements in DOLFINx's numbering, scipy CSR.
         """
         return node_blocks(K, self._dofs.bs)[self._dofs.dolfinx_node]
 
     def load(self, forms: Forms) -> Array:
-        """Return this rank's load in DOLFINx's numbering.
-
-        Raises:
-            InputError: There is a load that the method cannot take.
-        """
+        """Return this rank's load in DOLFINx's numbering."""
         return forms.load()
 
     def blocks(self, make_block: MakeBlock) -> MakeBlock:
@@ -99,12 +83,8 @@ def subdomain_data(
 ) -> Iterator[SubdomainData]:
     """Return the data of each subdomain's Block on this rank, made one at a time. Collective.
 
-    Args:
-        dofs: Dof maps.
-        decomposition: The torn mesh.
-        K: This rank's stiffness in DOLFINx's numbering, scipy CSR.
-        f: Its load in DOLFINx's numbering.
-        trace: Local primal unknowns that rows of B touch, ascending.
+    K, scipy CSR, and f are this rank's, in DOLFINx's numbering; ``trace`` are the local primal
+    unknowns that rows of B touch, ascending.
     """
     gdim = decomposition.mesh.geometry.dim
     x = dofs.points()[:, :gdim]
@@ -145,16 +125,9 @@ def make_subdomains(
     choice: LocalChoice | None = None,
     kind: Callable[..., Subdomains] = Subdomains,
 ) -> Subdomains:
-    """A Block for each subdomain of this rank. Collective.
+    """Make a Block of each subdomain of this rank, whose data is let go then. Collective.
 
-    Args:
-        data: The subdomains; each is let go when its Block is made.
-        make_block: Makes one, say ``SparseBlock`` or a class of one's own; what it raises is
-            raised on all ranks.
-        decomposition: The torn mesh.
-        counters: Counts solves.
-        choice: Which form local operators take.
-        kind: Class of the result.
+    What ``make_block`` raises, say a class of one's own, is raised on all ranks.
     """
     comm = decomposition.comm
     say_if_not_cholmod(comm)

@@ -242,13 +242,7 @@ def _in_chunks(apply: Callable[[Array], Array], W: Array) -> Array:
 
 
 def solved_together(blocks: Sequence[Block], parts: Sequence[slice], b: Array) -> Array:
-    """K⁺ b of all Blocks, shape ``(n,)``; of equal ones with several right sides at once.
-
-    Args:
-        blocks: The Blocks.
-        parts: Where the unknowns of each lie among the n.
-        b: Right sides.
-    """
+    """K⁺ b of all Blocks, shape ``(n,)``; of equal ones with several right sides at once."""
     x = np.empty(len(b))
     members: dict[int, list[tuple[SparseBlock, slice]]] = defaultdict(list)
     for block, part in zip(blocks, parts, strict=True):
@@ -321,16 +315,7 @@ class ModelledOperator(LocalOperator, Protocol):
 
 
 class GroupedOperator:
-    """Equal subdomains apply theirs at once, each group in the form that suits it.
-
-    Args:
-        blocks: This rank's Blocks.
-        kind: ``"pinv"``, ``"stiffness"`` or ``"schur"``.
-        choice: Which form groups take.
-
-    Attributes:
-        predicted, traffic, forms: As of ``ModelledOperator``.
-    """
+    """Equal subdomains apply theirs at once, each group in the form that suits it."""
 
     def __init__(
         self, blocks: Sequence[Block], kind: OperatorKind, choice: LocalChoice | None = None

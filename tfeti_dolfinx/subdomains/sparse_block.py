@@ -41,11 +41,7 @@ TOLERANCES = EqualityTolerances()
 
 
 class EqualSubdomains:
-    """The stiffnesses of a rank, each held once.
-
-    Args:
-        how: How inverses are made.
-    """
+    """The stiffnesses of a rank, each held once."""
 
     def __init__(self, how: InverseFactory) -> None:
         self._how = how
@@ -53,11 +49,6 @@ class EqualSubdomains:
 
     def find(self, name: str, x: Array, K: Any) -> tuple[Stiffness, Array]:
         """Return the stiffness that is equal to K, or a new one; and where K's unknowns are in it.
-
-        Args:
-            name: Name for messages.
-            x: Points of the nodes.
-            K: scipy CSR with sorted indices; not needed any more after it.
 
         Raises:
             InputError: K does not fit.

@@ -92,12 +92,7 @@ class Stiffness:
 
 
 class Traced:
-    """A stiffness seen from a trace; each matrix is made when it is first asked for.
-
-    Args:
-        stiffness: The stiffness.
-        trace: Trace unknowns of it, ascending, shape ``(t,)``.
-    """
+    """A stiffness seen from a trace, ascending; each matrix is made when it is first asked for."""
 
     def __init__(self, stiffness: Stiffness, trace: Array) -> None:
         self._stiffness, self.trace = stiffness, trace
@@ -151,15 +146,8 @@ def stretch_over_shear(x: Array, bs: int, multiply: Callable[[Array], Array]) ->
     """About (λ + 2μ)/μ of a subdomain, whatever its cells are.
 
     On a subdomain, which is free, uᵀKu of a stretch along an axis is the volume times λ + 2μ, and
-    that of a shear along it the volume times μ.
-
-    Args:
-        x: Points of the nodes, shape ``(n / bs, gdim)``.
-        bs: Unknowns at each node.
-        multiply: K u, shapes ``(n,)``.
-
-    Returns:
-        The smallest over the axes; 0 where unknowns are no displacements.
+    that of a shear along it the volume times μ. The smallest ratio over the axes; 0 where unknowns
+    are no displacements.
     """
     if bs != x.shape[1] or bs == 1 or len(x) == 0:
         return 0.0
