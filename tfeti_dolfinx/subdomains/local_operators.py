@@ -129,7 +129,8 @@ class Group:
         """Make A dense, symmetric to the last bit, by columns."""
         A = _in_chunks(self.apply, np.eye(self.size, order="F"))
         A += A.T
-        self.dense = 0.5 * A
+        A *= 0.5
+        self.dense = A
 
     def mult(self, w: Array, out: Array) -> None:
         """Set this group's part of out = diag(A_s) w, shapes ``(t,)``."""
@@ -236,9 +237,11 @@ def _places(rows: Sequence[Array], size: int, parts: Sequence[slice]) -> tuple[A
 
 def _in_chunks(apply: Callable[[Array], Array], W: Array) -> Array:
     """A W, as many columns at a time as are good for the cache."""
-    starts = range(0, W.shape[1], MODEL.together)
-    chunks = [apply(W[:, first : first + MODEL.together]) for first in starts]
-    return chunks[0] if len(chunks) == 1 else np.asfortranarray(np.concatenate(chunks, axis=1))
+    out = np.empty(W.shape, order="F")
+    for first in range(0, W.shape[1], MODEL.together):
+        some = slice(first, first + MODEL.together)
+        out[:, some] = apply(W[:, some])
+    return out
 
 
 def solved_together(blocks: Sequence[Block], parts: Sequence[slice], b: Array) -> Array:
