@@ -294,7 +294,7 @@ class ContactProblem:
         """Compose the report of a solve, from records of its stages. Collective."""
         seconds = largest_over_ranks(self._seconds, self.decomposition.comm)
         records = self._system.sizes(), self._system.take_counts(), self._counts, self._outcome
-        self.report = Report.composed(records, seconds, self._in_all)
+        self.report.take(Report.composed(records, seconds, self._in_all))
         self._seconds, self._in_all = {}, self.report.in_all
 
     def _make_solution(self, u: Array, multipliers: Multipliers, gluing: Gluing) -> Solution:
@@ -324,7 +324,7 @@ class ContactProblem:
         """
         self._meet("estimate")
         found = estimate(self._system, self.solution)
-        self.report = with_estimates(self.report, found.numbers())
+        self.report.take(with_estimates(self.report, found.numbers()))
         return found
 
     def update(

@@ -30,7 +30,7 @@ from tfeti_dolfinx.subdomains.local_operators import ModelledOperator
 # --- Records of stages ------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
+@dataclass
 class Sizes:
     """Sizes of a problem, known before it is solved."""
 
@@ -81,7 +81,7 @@ class Sizes:
         )
 
 
-@dataclass(frozen=True)
+@dataclass
 class StageCounts:
     """Counts of what was made anew for a solve."""
 
@@ -93,7 +93,7 @@ class StageCounts:
     reused: list[str] = field(default_factory=list)  # stages taken over from the solve before
 
 
-@dataclass(frozen=True)
+@dataclass
 class SolverCounts:
     """Counts of a solver, which add up over solves with more and more contact rows."""
 
@@ -141,7 +141,7 @@ class SolverCounts:
         return SolverCounts(**added(vars(self), vars(other)))
 
 
-@dataclass(frozen=True)
+@dataclass
 class Outcome:
     """The end of a solver's last run, and diagnostics of its answer; see docs/report.md."""
 
@@ -214,7 +214,7 @@ PRINTED = 10  # of a list; all of it is in the file
 COUNTERS = [f.name for kind in (SolverCounts, StageCounts) for f in fields(kind) if f.default == 0]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Report(Outcome, SolverCounts, StageCounts, Sizes):
     """Sizes, counters, residuals and times of a solve; the same on all ranks.
 
@@ -241,6 +241,11 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         total = sum(seconds.values())
         own = {"solves": 1, **{name: known[name] for name in COUNTERS}, "seconds": total}
         return cls(**known, seconds={**seconds, "total": total}, in_all=added(before, own))
+
+    def take(self, other: Report) -> None:
+        """Take all fields of another report: a program may hold this one over many solves."""
+        for f in fields(self):
+            setattr(self, f.name, getattr(other, f.name))
 
     @property
     def counters(self) -> dict[str, int]:

@@ -198,7 +198,7 @@ class NonlinearContactProblem(ContactProblem):
         finally:
             self._newton_forms.kept = False
             self.options = replace(self.options, rtol=self._exact)
-            self.report = total.entered(self.report)
+            self.report.take(total.entered(self.report))
         return self.u
 
     def _newton(self, total: Totals) -> None:

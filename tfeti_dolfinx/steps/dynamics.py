@@ -424,4 +424,4 @@ class ContactDynamics(ContactProblem):
         if self._predictor is not None:
             motion["predictor_multiplications"] = float(self._predictor.multiplications)
         forces = contact_forces(self.solution)
-        self.report = replace(self.report, motion=motion, contact_forces=forces)
+        self.report.take(replace(self.report, motion=motion, contact_forces=forces))
