@@ -20,6 +20,7 @@ settings.register_profile(
     derandomize=True,
     deadline=None,
     database=None,
+    max_examples=25,
     phases=[Phase.explicit, Phase.generate],
 )
 settings.load_profile("ranks")

@@ -5,7 +5,7 @@ import pytest
 import ufl
 from dolfinx import fem
 from mpi4py import MPI
-from reference import UntornElasticity
+from reference.active_set import UntornElasticity
 from scenes import curved_obstacle, decomposed, displacement, hooke, problem, relative, strain
 
 import tfeti_dolfinx as tfeti

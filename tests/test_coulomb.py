@@ -5,10 +5,10 @@ import pytest
 import ufl
 from bodies import boxes, two_body_problem
 from dolfinx import fem
-from friction_reference import parts
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpi4py import MPI
+from reference.friction import parts
 from scenes import clamp, decomposed, displacement, forms, hooke, problem
 from test_friction_fields import EXACT, SCENES, floor, solved
 from test_tresca import SIDES, SOLVERS, nodal_data, on_the_plane, stresses, two_boxes

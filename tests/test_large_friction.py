@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from friction_reference import ClampedLaw
+from reference.friction import ClampedLaw
 from scenes import clamp, decomposed, displacement, forms, hooke
 
 import tfeti_dolfinx as tfeti

@@ -5,7 +5,7 @@ import pytest
 import ufl
 from dolfinx import fem
 from petsc4py import PETSc
-from reference import UntornElasticity
+from reference.active_set import UntornElasticity
 from scenes import decomposed, displacement, hooke, problem, relative, strain
 
 import tfeti_dolfinx as tfeti

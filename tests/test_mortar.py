@@ -16,8 +16,8 @@ from bodies import (
     two_body_problem,
 )
 from dolfinx import fem
-from mortar_reference import TwoBoxes
 from mpi4py import MPI
+from reference.mortar import TwoBoxes
 from scenes import clamp, displacement, relative
 
 import tfeti_dolfinx as tfeti

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conic import constrained_qp
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference.conic import constrained_qp
 from test_qp import matrix, to, vector
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from reference import dense_qp
+from reference.active_set import dense_qp
 from scipy.sparse import diags_array
 from test_qp import bounds_on, matrix, vector
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from conic import constrained_qp
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference.conic import constrained_qp
 from test_mpgp import around_circles, as_set, program
 from test_qp import matrix, vector
 

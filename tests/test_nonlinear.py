@@ -7,15 +7,15 @@ import ufl
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-
-import tfeti_dolfinx as tfeti
-from tests.nonlinear_reference import (
+from reference.nonlinear import (
     SimplePlasticity,
     above_plane,
     block,
     nearest_nodes,
     neo_hooke,
 )
+
+import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.nonlinear.state import InternalVariables
 
 E, NU = 1.0, 0.3
@@ -23,7 +23,7 @@ DX = {"metadata": {"quadrature_degree": 4}}
 
 
 def torn(comm, gdim, n, bulge, subdomains):
-    """The block of ``nonlinear_reference``, torn."""
+    """The block of ``reference.nonlinear``, torn."""
     mesh, tags = block(gdim, n, bulge, comm)
     surfaces = {"low": 1, "top": 2}
     return tfeti.decompose(mesh, subdomains, facet_tags=tags, surfaces=surfaces)

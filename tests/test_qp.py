@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from petsc4py import PETSc
-from reference import dense_qp
+from reference.active_set import dense_qp
 from scipy.sparse import diags_array
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse

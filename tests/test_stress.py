@@ -85,7 +85,7 @@ def test_the_reference_knows_what_has_no_solution(traction):
 
 def test_the_two_references_of_the_tests_agree():
     """The lever of ``test_mortar``'s reference, by the harness's own mortar and solver."""
-    from mortar_reference import TwoBoxes
+    from reference.mortar import TwoBoxes
 
     lower = Body((0.0, -1.0), (1.0, 0.0), (3, 3))
     upper = Body((0.0, 0.0), (1.0, 1.0), (4, 4))

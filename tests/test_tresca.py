@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from bodies import boxes
-from friction_reference import on_each_other, on_plane, parts
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference.friction import on_each_other, on_plane, parts
 from scenes import clamp, decomposed, displacement, forms, hooke, problem
 
 import tfeti_dolfinx as tfeti

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from friction_reference import Untorn, in_ellipses
 from mpi4py import MPI
+from reference.friction import Untorn, in_ellipses
 from scenes import box, decomposed, displacement, forms, hooke
 
 import tfeti_dolfinx as tfeti

@@ -7,9 +7,10 @@ import ufl
 from bodies import boxes
 from dolfinx import fem
 from mpi4py import MPI
-from reference import primal_active_set
 from scenes import hooke, strain
 from scipy.sparse import csr_matrix
+
+from reference.active_set import primal_active_set
 
 
 def mortar_1d(secondary, primary):
