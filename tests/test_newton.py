@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from petsc4py import PETSc
 from reference.active_set import dense_qp
-from scipy.sparse import diags_array
+from scipy.sparse import block_diag, csr_array, diags_array
 from test_qp import bounds_on, matrix, vector
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
@@ -74,7 +75,7 @@ KINDS = ["regular", "held by bounds", "dependent"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("seed", range(15))
+@pytest.mark.parametrize("seed", range(5))
 def test_random_programs(kind, seed):
     F, d, G, e, bounded = program(seed, kind)
     result = solved(qp_of(F, d, G, e, bounded), 1e-9)
@@ -82,10 +83,11 @@ def test_random_programs(kind, seed):
     check_optimal(F, d, G, e, bounded, result, 1e-5 if kind == "dependent" else 1e-8)
 
 
-@pytest.mark.parametrize("kind", KINDS[:2])
-@pytest.mark.parametrize("seed", range(5))
-def test_an_independent_active_set_finds_the_same(kind, seed):
-    F, d, G, e, bounded = program(100 + seed, kind)
+@pytest.mark.parametrize("kind", [*KINDS[:2], "no kernel"])
+def test_an_independent_active_set_finds_the_same(kind):
+    F, d, G, e, bounded = program(100, kind)
+    if kind == "no kernel":
+        G, e = G[:0], e[:0]
     lam = solved(qp_of(F, d, G, e, bounded), 1e-10).lam.array_r
     reference = dense_qp(F, d, G, e, bounded)
     assert np.allclose(lam, reference, rtol=0.0, atol=1e-6 * np.abs(reference).max())
@@ -118,33 +120,7 @@ def test_from_its_own_solution_it_multiplies_once():
     assert np.allclose(again.lam.array_r, found.lam.array_r, atol=1e-8)
 
 
-def test_without_a_kernel():
-    F, d, _, _, bounded = program(4)
-    qp = QP(matrix(F), vector(d), NoCoarse(), bounds_on(bounded))
-    lam = solved(qp, 1e-10).lam.array_r
-    reference = dense_qp(F, d, np.zeros((0, len(d))), np.zeros(0), bounded)
-    assert np.allclose(lam, reference, atol=1e-7 * np.abs(reference).max())
-
-
-def test_forces_that_are_rounding_do_not_say_what_touches():
-    """min ½λ₁² − λ₁ + λ₂, λ ≥ 0, from λ₂ = 1e-25: nothing rests on the second row."""
-    qp = QP(matrix(np.eye(2)), vector([1.0, -1.0]), NoCoarse(), bounds_on(np.arange(2)))
-    start = homogenise(qp, operator_product(qp.F, vector([1.0, 1e-25])))
-    found = newton(qp, start, ResidualRule(1e-10), start=Start(start.lam_bar, np.zeros(0)))
-    assert found.lam.array_r[1] > 0.0
-    assert found.face.carrying.tolist() == [True, False]
-
-
-def test_nothing_to_do_costs_nothing():
-    """d = 0, e = 0: the start is the solution."""
-    F, d, G, e, bounded = program(5)
-    qp = qp_of(F, 0.0 * d, G, 0.0 * e, bounded)
-    result = solved(qp, 1e-12)
-    assert qp.F.count == 0
-    assert not result.lam.array_r.any()
-
-
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("kind", KINDS[:2])
 def test_the_nearest_feasible_point(kind, seed):
     """Gλ = e, λ ∈ Ω, and λ − y = Gᵀα on free rows, at least that on the others."""
@@ -179,7 +155,7 @@ def test_steps_that_no_row_stops_end():
     assert coarse.steps <= 15
 
 
-@pytest.mark.parametrize("stiff", [1e3, 1e5, 1e6])
+@pytest.mark.parametrize("stiff", [1e3, 1e6])
 def test_soft_rows_that_hold_are_seen_beside_stiff_ones_that_are_open(stiff):
     """λ₁ − rλ₂ = 1 at (1, 0): G_f G_fᵀ = 1 beside GGᵀ = 1 + r²."""
     coarse = DenseCoarse(np.array([[1.0, -stiff]]), np.ones(1))
@@ -188,9 +164,9 @@ def test_soft_rows_that_hold_are_seen_beside_stiff_ones_that_are_open(stiff):
     assert np.allclose(found.lam.array_r, [1.0, 0.0], rtol=0.0, atol=1e-12)
 
 
-def nearly_dependent(seed, near=1e-6, m=60):
+def nearly_dependent(near=1e-6, m=60):
     """Two rows of G that are nearly the same, d nearly all in Gᵀμ, and an M that has Gᵀ for 0."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     A = rng.standard_normal((m, m)) * 10.0 ** rng.uniform(-0.5, 0.5, m)
     F = A @ A.T / m + 0.1 * np.eye(m)
     G = rng.standard_normal((4, m))
@@ -202,10 +178,9 @@ def nearly_dependent(seed, near=1e-6, m=60):
     return QP(matrix(F), vector(d), DenseCoarse(G, G @ np.ones(m)), Product(), matrix(M)), F, P
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_what_nearly_dependent_rows_of_G_leave_is_no_residual(seed):
+def test_what_nearly_dependent_rows_of_G_leave_is_no_residual():
     """κ(GGᵀ) = 1e12: a projection leaves 1e-7 of d, which M does not see."""
-    qp, F, P = nearly_dependent(seed)
+    qp, F, P = nearly_dependent()
     result = solve_by_pcpg(qp, homogenise(qp), ResidualRule(1e-9), max_it=3000)
     assert result.reason > 0
     assert np.linalg.norm(P @ (F @ result.lam.array_r - qp.d.array_r)) <= 2e-8
@@ -233,12 +208,10 @@ def test_rows_that_exclude_each_other_are_named(room, solvable):
 def string_beside(force, n=1500):
     """A string whose ‖r‖ is not below that at the start for 1000 steps, and a known force."""
     A = diags_array([-np.ones(n - 1), 2 * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1])
-    F = np.zeros((n + 1, n + 1))
-    F[:n, :n] = A.toarray()
-    G, d = np.zeros((1, n + 1)), np.zeros(n + 1)
-    G[0, n] = F[n, n] = 1.0
-    d[:n], d[n] = np.arange(n) / n, force
-    return QP(matrix(F), vector(d), DenseCoarse(G, np.array([force])), Product())
+    F = csr_array(block_diag((A, 1.0)))
+    G, d = np.eye(1, n + 1, n), np.append(np.arange(n) / n, force)
+    F = PETSc.Mat().createAIJ(F.shape, csr=(F.indptr, F.indices, F.data), comm=PETSc.COMM_SELF)
+    return QP(F, vector(d), DenseCoarse(G, np.array([force])), Product())
 
 
 @pytest.mark.parametrize(
