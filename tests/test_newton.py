@@ -92,23 +92,6 @@ def test_from_its_own_solution_it_multiplies_once():
     assert np.allclose(again.lam.array_r, found.lam.array_r, atol=1e-8)
 
 
-def test_steps_that_no_row_stops_end():
-    """λ ≥ 0 and λ₁ + λ₂ = −1: the cost falls for ever along α < 0."""
-
-    class Counting(DenseCoarse):
-        steps = 0
-
-        def damped_solve(self, face, y, damping):
-            self.steps += 1
-            return super().damped_solve(face, y, damping)
-
-    coarse = Counting(np.ones((1, 2)), -np.ones(1))
-    found = project_onto_feasible(coarse, bounds_on(np.arange(2)), vector([1.0, 2.0]))
-    assert found.missing == pytest.approx(1.0)
-    assert np.array_equal(found.lam.array_r, [0.0, 0.0])
-    assert coarse.steps <= 15
-
-
 @pytest.mark.parametrize("stiff", [1e3, 1e6])
 def test_soft_rows_that_hold_are_seen_beside_stiff_ones_that_are_open(stiff):
     """λ₁ − rλ₂ = 1 at (1, 0): G_f G_fᵀ = 1 beside GGᵀ = 1 + r²."""

@@ -13,12 +13,9 @@ from tfeti_dolfinx.qp.homogenised import homogenise, operator_product
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, ResidualRule, Start, no_monitor
 from tfeti_dolfinx.qp.projection import (
-    UNBALANCED,
-    WithinFace,
     project_onto_feasible,
-    project_or_least,
 )
-from tfeti_dolfinx.qp.sets import Bounds, Discs, Ellipses, Product, Status
+from tfeti_dolfinx.qp.sets import Discs, Status
 
 
 def solved(qp, tolerance, monitor=no_monitor, start=None):
@@ -105,42 +102,6 @@ def test_the_nearest_feasible_point(seed, isotropic):
     assert found.missing <= 1e-12
     exact = constrained_qp(np.eye(40), y, G, e, bounded, pairs, a)
     assert np.linalg.norm(found.lam.array - exact) <= 1e-7 * np.linalg.norm(exact)
-
-
-@given(st.integers(0, 1000))
-def test_within_a_face_what_slips_stays_on_its_boundary(seed):
-    rng = np.random.default_rng(seed)
-    a = rng.uniform(0.2, 2.0, (30, 2))
-    angle = rng.uniform(0.0, 2.0 * np.pi, 30)
-    x = (a * np.stack((np.cos(angle), np.sin(angle)), axis=1)).ravel()
-    for feasible in (Ellipses(a), Discs(a[:, 0])):
-        on = feasible.project(10.0 * x)
-        face = feasible.face(on, np.zeros(60))
-        normal = feasible.project(2.0 * on) - 2.0 * on
-        near = on + 0.05 * np.repeat(a.min(axis=1), 2) * rng.uniform(-1.0, 1.0, 60)
-        y = WithinFace(feasible, face, slipping=True).project(near)
-        assert np.all(feasible.face(y, np.zeros(60)).status == Status.SLIP)
-        # the way to the nearest point of a boundary is normal to it
-        tangents = feasible.face(y, normal).Z
-        assert np.allclose(tangents.T @ (near - y), 0.0, atol=1e-9)
-
-
-def test_forces_far_beyond_small_discs_do_not_hide_what_balances():
-    """As from a step in which all sticks to bounds that are a millionth of its forces."""
-    missed, small, n = [], 1e-6, 6
-    for seed in range(8):
-        rng = np.random.default_rng(seed)
-        G, radius = rng.normal(size=(4, 2 * n)), small * 10.0 ** rng.uniform(-2.0, 2.0, n)
-        feasible = Product(
-            [(np.arange(n), Bounds()), (np.arange(n, 2 * n), Ellipses(radius[:, None]))]
-        )
-        balanced = np.concatenate((small * rng.uniform(size=n), radius * rng.uniform(-1.0, 1.0, n)))
-        coarse, y = DenseCoarse(G, G @ balanced), vector(rng.normal(size=2 * n))
-        missed.append(project_onto_feasible(coarse, feasible, y).missing)
-        found = project_or_least(coarse, feasible, y)
-        assert found.missing <= UNBALANCED
-        assert np.array_equal(feasible.project(found.lam.array_r), found.lam.array_r)
-    assert max(missed) > 0.1
 
 
 def test_what_nothing_in_the_set_balances_is_said():

@@ -5,7 +5,7 @@ import pytest
 from test_qp import matrix, vector
 
 from tfeti_dolfinx.options import Options
-from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
+from tfeti_dolfinx.qp.coarse import NoCoarse
 from tfeti_dolfinx.qp.krylov import estimate_norm
 
 # with the step ᾱ = 1.95/‖·‖ of the default options ‖A‖ᾱ ≤ 2 needs 0.975 of the norm
@@ -39,13 +39,3 @@ def test_norm_of_any_spectrum(kind):
     F = operator(SPECTRA[kind], 0)
     estimate = estimate_norm(matrix(F), NoCoarse(), vector(np.zeros(SIZE)), Options().norm_steps)
     holds(estimate, np.linalg.norm(F, 2))
-
-
-@pytest.mark.parametrize("kind", list(SPECTRA))
-def test_norm_on_the_kernel_of_a_coarse_space(kind):
-    F = operator(SPECTRA[kind], 7)
-    G = np.random.default_rng(8).standard_normal((6, SIZE))
-    P = np.eye(SIZE) - G.T @ np.linalg.solve(G @ G.T, G)
-    coarse = DenseCoarse(G, np.zeros(6))
-    estimate = estimate_norm(matrix(F), coarse, vector(np.zeros(SIZE)), Options().norm_steps)
-    holds(estimate, np.linalg.norm(P @ F @ P, 2))

@@ -46,13 +46,10 @@ def test_only_the_dirichlet_preconditioner_factors_K_ii(contact, qp_type, pc_typ
 
 @pytest.mark.parametrize("qp_type", ["pcpg", "smalse", "newton"])
 def test_without_a_kernel_there_is_no_coarse_problem(qp_type):
-    d = decomposed("hexahedron", 3, 4)
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (3,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    a = (ufl.inner(hooke()(u), strain(v)) + 0.1 * ufl.inner(u, v)) * ufl.dx
     obstacles = [tfeti.Obstacle("bottom", curved_obstacle(3))] if qp_type != "pcpg" else []
     options = {"rtol": 1e-9, "qp_type": qp_type}
-    p = tfeti.ContactProblem(a, -0.1 * v[2] * ufl.dx, [], obstacles, d, petsc_options=options)
+    d = decomposed("hexahedron", 3, 4)
+    p = problem(d, (0.0, 0.0, -0.1), obstacles, clamped=(), springs=0.1, **options)
     p.solve()
     assert p.report.kernel_dim == p.report.coarse_factorizations == 0
     assert p.report.face_factorizations == 0

@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-import ufl
-from dolfinx import fem
 from mpi4py import MPI
-from scenes import clamp, curved_obstacle, decomposed, displacement, forms
+from scenes import curved_obstacle, decomposed, displacement, problem
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.qp.sets import Status, face_of
@@ -21,20 +19,9 @@ def cubes(x):
 
 def foundation(stiffness, contact=True, **options):
     """A block of 8 cubes, clamped on the left, with springs in each of its points."""
+    obstacles = [tfeti.Obstacle("bottom", curved_obstacle(3), reach=0.2)] if contact else []
     d = decomposed("hexahedron", 6, cubes)
-    V, a, L = forms(d.mesh, d.facet_tags, (0.0, 0.0, -0.1), d.surface("top"))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    spring = fem.Constant(d.mesh, stiffness)
-    dx = ufl.Measure("dx", domain=d.mesh, metadata={"quadrature_degree": 2})
-    a += spring * ufl.dot(u, v) * dx
-    return tfeti.ContactProblem(
-        a,
-        L,
-        [clamp(V, d.facets("left"))],
-        [tfeti.Obstacle("bottom", curved_obstacle(3), reach=0.2)] if contact else [],
-        d,
-        petsc_options={f"tfeti_{name}": value for name, value in options.items()},
-    )
+    return problem(d, (0.0, 0.0, -0.1), obstacles, springs=stiffness, **options)
 
 
 def multiplications(stiffness, **options):

@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-from panels import PLANE, SPACE, box, kelvin, kelvin_energy, moved, polygon
-from scipy.integrate import dblquad
+from panels import PLANE, SPACE, box, kelvin, kelvin_energy, moved
 
 from tfeti_dolfinx.bem.inside import Inside, share
 from tfeti_dolfinx.bem.integrals import (
     apart_rule,
-    layers_2d,
     touching_rule,
 )
 from tfeti_dolfinx.bem.panels import Panels
@@ -58,30 +56,6 @@ def test_size_and_place_and_direction_do_not_matter(dim):
     assert np.abs(steklov(other, LAW).S * 7.0 ** (2 - dim) - S).max() < bound
     harder = steklov(panels, IsotropicLaw(1e5 * LAW.mu, LAW.nu)).S
     assert np.abs(turn @ harder @ turn.T / 1e5 - S).max() < bound
-
-
-def test_closed_forms_are_the_integrals():
-    panels = polygon([(0, 0), (1, 0.2), (1.5, 1.3), (0.2, 2.0)], 3, 1.5)
-    layers = layers_2d(panels)
-    corners, rho = panels.corners, 2 * panels.diameter
-    for i, j in ((0, 1), (1, 0), (0, 5), (4, 2)):
-        a, b = corners[i], corners[j]
-        scale = panels.measure[i] * panels.measure[j]
-
-        def over(kernel, a=a, b=b, j=j, scale=scale):
-            def value(t, s):
-                r = a[0] + s * (a[1] - a[0]) - b[0] - t * (b[1] - b[0])
-                return kernel(r, np.linalg.norm(r), panels.normal[j], t)
-
-            return scale / (2 * np.pi) * dblquad(value, 0, 1, 0, 1, epsabs=1e-10)[0]
-
-        assert layers.single[i, j] == pytest.approx(over(lambda r, d, n, t: -np.log(d / rho)), 1e-7)
-        for k, m in ((0, 0), (0, 1), (1, 1)):
-            found = over(lambda r, d, n, t, k=k, m=m: r[k] * r[m] / d**2)
-            assert layers.tensor[k, m][i, j] == pytest.approx(found, abs=1e-8)
-        for k in range(2):
-            found = over(lambda r, d, n, t, k=k: r @ n / d**2 * (t if k else 1 - t))
-            assert layers.on_corners[k][i, j] == pytest.approx(found, abs=1e-8)
 
 
 @pytest.mark.parametrize("shared", [0, 1, 2, 3])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from bodies import gathered, searched, sided, stacked
+from bodies import searched, sided, stacked
 from dolfinx import fem
 from mpi4py import MPI
 from scenes import curved_obstacle, decomposed
@@ -167,18 +167,3 @@ def test_frames_along_a_direction_are_the_same_on_any_number_of_ranks():
         x, frame = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
         found.append(frame[np.lexsort(np.round(x, 9).T)])
     assert np.allclose(*found, rtol=0, atol=1e-13)
-
-
-def test_bounds_of_functions_are_those_at_the_nodes():
-    d = decomposed("quadrilateral", 4, 3)
-    dofs = dofs_on(d, 2)
-    plane = tfeti.Plane((0, 0), (0, 1))
-    function = fem.Function(fem.functionspace(d.mesh, ("Lagrange", 1)))
-    function.interpolate(lambda x: 1.0 + 2.0 * x[0])
-    for law in (tfeti.Tresca(lambda x: 1.0 + 2.0 * x[0]), tfeti.Tresca(function)):
-        records = searched([tfeti.Obstacle("bottom", plane, friction=law)], dofs, d)
-        values = friction_values("floor", law, records, dofs)
-        x = group_points(dofs)[records.group]
-        assert values.shape == (len(records), 1)
-        assert np.allclose(values[:, 0], 1.0 + 2.0 * x[:, 0])
-        assert len(gathered(values)) == 5
