@@ -8,21 +8,14 @@ from demos import clamped_connection_3d
 from demos.clamped_connection_3d import BARS, BOLT, PROFILES
 from meshes.clamped_connection import CLAMPS, Connection, build
 
-# the talk's, for 1 592 853 unknowns
-TALK = 1922
 SIDES = ("lower", "upper")
 
 
-@pytest.fixture(scope="module")
-def connection():
-    """Solution and report at the quick size; nothing in them changes."""
-    return clamped_connection_3d.run(["--quick"])
-
-
-def test_friction_holds_the_load_and_the_bolts_press(connection, comm):
-    solution, report = connection
-    assert report.bodies == 6
-    assert abs(report.errors["force"]) <= 1e-5
+def test_friction_holds_the_load_and_the_bolts_press(quick_demo, comm):
+    found = quick_demo("clamped_connection_3d")
+    solution, report = found.solution, found.report
+    assert report["bodies"] == 6
+    assert abs(report["errors"]["force"]) <= 1e-5
     pressed = 2 * CLAMPS * BOLT
     for side in SIDES:
         data = [solution.contact(f"{side} bar {i}") for i in (1, 2)]
@@ -30,13 +23,8 @@ def test_friction_holds_the_load_and_the_bolts_press(connection, comm):
         assert comm.allreduce(force) == pytest.approx(pressed, rel=1e-5)
     between = comm.allreduce(float(solution.contact(PROFILES[0]).force.sum()))
     assert between == pytest.approx(pressed, rel=0.2)  # the ends bear the rest
-
-
-def test_coulombs_law(connection):
-    solution, report = connection
-    assert report.sticking > 0
-    assert report.sliding > 0
-    assert report.residuals["friction"] <= 1e-4
+    assert min(report["sticking"], report["sliding"]) > 0
+    assert report["residuals"]["friction"] <= 1e-4
     for name in (PROFILES[0], *(a for a, _ in BARS)):
         data = solution.contact(name)
         size = np.linalg.norm(data.tangential_traction, axis=1)
@@ -44,21 +32,6 @@ def test_coulombs_law(connection):
         largest = data.pressure.max(initial=0.0)
         assert np.all(size <= 0.3 * data.pressure + 1e-3 * largest)
         assert np.all(np.sum(data.tangential_traction * data.slip, axis=1)[slips] < 0.0)
-
-
-def test_few_problems_and_multiplications(connection):
-    _, report = connection
-    assert report.friction_iterations <= 10
-    assert report.friction_last <= TALK / 5
-    assert report.F_multiplications <= TALK
-
-
-@pytest.mark.slow
-def test_few_multiplications_at_the_default_size():
-    _, report = clamped_connection_3d.run([])
-    assert report.friction_iterations <= 10
-    assert report.friction_last <= TALK / 5
-    assert report.F_multiplications <= TALK
 
 
 def test_a_load_that_friction_cannot_hold_is_named():

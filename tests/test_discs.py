@@ -69,17 +69,6 @@ def test_projections_fulfil_the_variational_inequality(seed, exponent):
 
 
 @given(SEEDS)
-def test_nearest_points_of_ellipses_lie_along_their_normals(seed):
-    """z − Pz = μ H Pz with H = diag(a)⁻², μ ≥ 0: the secular equation, and its exact solution."""
-    rng = np.random.default_rng(seed)
-    a = rng.uniform(0.01, 2.0, (20, 2))
-    angle, mu = rng.uniform(0.0, 2.0 * np.pi, 20), rng.uniform(0.0, 5.0, (20, 1))
-    on = a * np.stack((np.cos(angle), np.sin(angle)), axis=1)
-    z = on + mu * on / a**2
-    assert np.allclose(Ellipses(a).project(z.ravel()).reshape(-1, 2), on, rtol=0, atol=1e-12)
-
-
-@given(SEEDS)
 def test_discs_are_ellipses_with_equal_axes(seed):
     rng = np.random.default_rng(seed)
     radius = rng.uniform(0.0, 2.0, 10) * (rng.random(10) < 0.9)
@@ -138,27 +127,3 @@ def test_the_longest_step_ends_on_the_boundary(seed):
     x, p = Ellipses(a).project(rng.standard_normal(2)), rng.standard_normal(2)
     step = Ellipses(a).max_step(x, p)
     assert level(a, x - step * p)[0] == pytest.approx(1.0, abs=1e-9)
-
-
-def test_a_point_that_cannot_move_has_no_step():
-    fixed = Ellipses(np.array([[1.0, 0.0]]))
-    assert fixed.max_step(np.zeros(2), np.array([1.0, 1.0])) == 0.0
-    assert fixed.max_step(np.zeros(2), np.array([1.0, 0.0])) == 1.0
-    assert fixed.max_step(np.zeros(2), np.zeros(2)) == np.inf
-
-
-@given(SEEDS)
-def test_the_parts_of_a_gradient_sum_up_to_the_projected_one(seed):
-    """φ + β is the projection of g on the tangent cone's negative: what is left pushes out."""
-    rng = np.random.default_rng(seed)
-    a = semi_axes(seed)
-    x, g = Ellipses(a).project(3.0 * rng.standard_normal(a.size)), rng.standard_normal(a.size)
-    phi, beta = Ellipses(a).split(x, g)
-    assert np.all(phi * beta == 0.0)
-    left = (g - phi - beta).reshape(a.shape)
-    assert abs(np.sum(left * (phi + beta).reshape(a.shape))) <= 1e-12  # Moreau's decomposition
-    x = x.reshape(a.shape)
-    both = (a > 0.0).all(axis=1)
-    assert np.all(np.sum(left * x, axis=1)[both] <= 1e-12)
-    inside = both & (level(a, x) < 1.0 - 1e-9)
-    assert np.all(left[inside] == 0.0)

@@ -9,11 +9,9 @@ from bodies import held, sided, stacked, stiffer_above, two_body_problem
 from dolfinx import fem
 from mpi4py import MPI
 from scenes import curved_obstacle, decomposed, problem
-from test_own_set import HalfSpaces
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.feti.duality_gap import admissible
-from tfeti_dolfinx.qp.sets import Product
 from tfeti_dolfinx.solve.solver import solve_dual
 
 CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
@@ -71,7 +69,7 @@ def exact(p):
 
 
 @pytest.mark.parametrize(
-    "seed", [pytest.param(s, marks=[] if s < 24 else [pytest.mark.slow]) for s in range(50)]
+    "seed", [pytest.param(s, marks=[] if s < 12 else [pytest.mark.slow]) for s in range(50)]
 )
 def test_the_bound_is_one_and_at_most_twenty_times_the_error(seed):
     p = drawn(seed)
@@ -105,7 +103,7 @@ def summed(p, value):
     return p.dofs.comm.allreduce(float(value))
 
 
-@pytest.mark.parametrize("seed", [6, 11, 13, 41, 44])
+@pytest.mark.parametrize("seed", [6, 11])
 def test_the_gap_is_that_of_an_admissible_displacement(seed):
     """J(v) from K, f and friction, q(λ) from K and c: their difference is what the bound says."""
     p = drawn(seed)
@@ -141,13 +139,12 @@ def test_the_gap_is_that_of_an_admissible_displacement(seed):
     lam.destroy()
 
 
-@pytest.mark.parametrize("contacts", [0, 1])
-def test_it_is_the_same_for_all_preconditioners_and_costs_what_it_says(contacts):
+def test_it_is_the_same_for_all_preconditioners_and_costs_what_it_says():
     """The Dirichlet preconditioner has the factors; without it they are made once."""
     floor = tfeti.Obstacle("bottom", curved_obstacle(2), reach=0.2)
     bounds = []
     for kind in ("dirichlet", "lumped"):
-        p = problem(decomposed("triangle", 6, 4), contacts=[floor] * contacts, pc_type=kind)
+        p = problem(decomposed("triangle", 6, 4), contacts=[floor], pc_type=kind)
         p.solve()
         before = p.report.F_multiplications
         bounds.append(p.estimate())
@@ -158,32 +155,6 @@ def test_it_is_the_same_for_all_preconditioners_and_costs_what_it_says(contacts)
         assert p.estimate().factorizations == 0
     for found in bounds:
         assert 0.0 < found.relative_algebraic < 1e-5
-
-
-@pytest.mark.parametrize("n", [4, 8, 16])
-def test_it_does_not_grow_with_the_size_of_subdomains(n):
-    """Harmonic extension; jumps extended by 0 would cost √(H/h)."""
-    p = problem(decomposed("quadrilateral", 4 * n, 16), rtol=1e-2)
-    p.solve()
-    assert 1.0 <= p.estimate().algebraic / norm(p, p.solution.u - exact(p)) <= 1.6
-
-
-def test_a_set_of_one_s_own():
-    """Glue that lets go at a limit: the gap needs the set alone."""
-
-    def pulling(constraints):
-        half_spaces = HalfSpaces(-constraints.scale, np.full(len(constraints.scale), 1e-4))
-        return Product([(constraints.sets.normals, half_spaces)])
-
-    obstacle, own = (
-        tfeti.Obstacle("bottom", curved_obstacle(3)),
-        tfeti.Extensions(feasible_set=pulling),
-    )
-    d = decomposed("hexahedron", 4, 6)
-    p = problem(d, contacts=[obstacle], extensions=own, rtol=1e-4)
-    p.solve()
-    error = norm(p, p.solution.u - exact(p))
-    assert error <= p.estimate().algebraic <= 5 * error
 
 
 def of_estimates(p):
@@ -207,28 +178,6 @@ def test_a_bound_that_says_nothing_is_warned_of():
     p.solution.lam[:] = right
     p.estimate()
     assert p.report.warnings == others
-
-
-@pytest.mark.parametrize(
-    ("energy", "algebraic", "said"),
-    [
-        (2.0, 2.0, ""),
-        (0.0, 0.0, ""),
-        (2.0, 20.0, "1e+01 times"),
-        (2.0, np.inf, "far beyond"),
-        (0.0, 1.0, "far beyond"),
-    ],
-)
-def test_a_bound_of_the_last_look_is_warned_of_where_it_says_nothing(
-    energy, algebraic, said, monkeypatch
-):
-    looked = {"energy": energy, "algebraic": algebraic}
-    monkeypatch.setattr("tfeti_dolfinx.problem.of_looks", lambda reached: looked)
-    p = problem(decomposed("triangle", 2, 2))
-    p.solve()
-    assert [f"algebraic error is {said}" in warning for warning in of_estimates(p)] == [True] * (
-        said != ""
-    )
 
 
 def test_it_needs_a_solution():

@@ -38,11 +38,6 @@ def friction(seed=0):
     return Product([(normals, Bounds()), (tangents, Discs(radius))]), normals, tangents
 
 
-@given(st.integers(0, 1000))
-def test_a_product_of_bounds_and_discs_fulfils_the_contract(seed):
-    check_feasible_set(friction(seed)[0], 20, seed)
-
-
 def test_the_face_of_a_product_says_what_each_row_does():
     feasible, normals, tangents = friction()
     rng = np.random.default_rng(1)

@@ -97,8 +97,7 @@ def check_two_squares(d):
     assert d.num_bodies == 1
 
 
-@pytest.mark.parametrize("recombine", [False, True])
-@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize(("recombine", "order"), [(False, 2), (True, 1)])
 def test_a_model_in_memory(comm, recombine, order):
     if ROOT:
         two_squares(recombine, order)
@@ -108,8 +107,7 @@ def test_a_model_in_memory(comm, recombine, order):
     assert d.mesh.ufl_domain().ufl_coordinate_element().degree == order
 
 
-@pytest.mark.parametrize("version", [2.2, 4.1])
-@pytest.mark.parametrize("partitions", [0, 3])
+@pytest.mark.parametrize(("version", "partitions"), [(2.2, 3), (4.1, 0), (4.1, 3)])
 def test_files_with_and_without_partitions(comm, shared_tmp, version, partitions):
     path = shared_tmp / "squares.msh"
     if ROOT:
@@ -123,14 +121,6 @@ def test_files_with_and_without_partitions(comm, shared_tmp, version, partitions
     d = tfeti.read_gmsh(path, comm, None if partitions else 2)
     check_two_squares(d)
     assert d.num_subdomains == (partitions or 2)
-
-
-def test_partitions_of_the_file_can_be_overruled(comm):
-    if ROOT:
-        two_squares()
-        gmsh.model.mesh.partition(3)
-    assert tfeti.read_gmsh(gmsh.model, comm).num_subdomains == 3
-    assert tfeti.read_gmsh(gmsh.model, comm, 5).num_subdomains == 5
 
 
 def test_physical_groups_that_gmsh_renamed_for_its_partitions(comm):
@@ -162,8 +152,9 @@ def rename_as_partition_groups():
             model.addPhysicalGroup(dim, [entity], 100 + 10 * entity, name)
 
 
-@pytest.mark.parametrize(("order", "tolerance"), [(1, 0.05), (2, 0.002)])
-@pytest.mark.parametrize("hexahedra", [False, True])
+@pytest.mark.parametrize(
+    ("order", "tolerance", "hexahedra"), [(1, 0.05, True), (2, 0.002, False), (2, 0.002, True)]
+)
 def test_curved_bodies_of_first_and_second_order(comm, order, tolerance, hexahedra):
     if ROOT:
         quarter_ring(order, hexahedra)
@@ -173,20 +164,6 @@ def test_curved_bodies_of_first_and_second_order(comm, order, tolerance, hexahed
     assert integral(d, ds(d.surface("mantle"))) == pytest.approx(np.pi / 2, rel=tolerance)
     expected = "hexahedron" if hexahedra else "tetrahedron"
     assert d.mesh.topology.cell_type.name == expected
-
-
-def test_touching_bodies_with_nodes_of_their_own_are_not_glued(comm):
-    if ROOT:
-        gmsh.model.add("touching")
-        occ = gmsh.model.occ
-        boxes = [occ.addRectangle(0, 0, 0, 1, 1), occ.addRectangle(1, 0, 0, 1, 1)]
-        occ.synchronize()
-        gmsh.model.addPhysicalGroup(2, boxes, name="both")
-        gmsh.option.setNumber("Mesh.MeshSizeMax", 0.25)
-        gmsh.model.mesh.generate(2)
-    d = tfeti.read_gmsh(gmsh.model, comm, 4)
-    assert d.num_bodies == 2
-    assert d.num_subdomains == 4
 
 
 def test_subdomains_by_a_callable_and_by_an_array(comm):

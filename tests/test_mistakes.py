@@ -55,11 +55,6 @@ def test_mistakes_are_named(table, scene, shared_tmp, comm):
     assert not wrong
 
 
-def test_no_mistake_is_there_twice():
-    names = [name for table in TABLES.values() for name in table]
-    assert len(set(names)) == len(names) >= 250
-
-
 @pytest.mark.parametrize("use", accepted.ACCEPTED)
 def test_what_is_right_is_accepted(use, scene, shared_tmp):
     scene.folder = shared_tmp

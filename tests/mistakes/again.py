@@ -1,7 +1,6 @@
 """Mistakes with what a problem takes for another solve."""
 
 from mistakes.conditions import exterior
-from mistakes.scene import raising
 
 FLOOR = "obstacle of surface 'bottom'"
 
@@ -27,9 +26,6 @@ def of_degree_2(s):
 
 
 FORMS_AGAIN = {
-    "a load that is bilinear": updated(
-        r"L has 2 arguments; expected a linear form", load=lambda s: s.a
-    ),
     "a stiffness of another degree": updated(
         r"stiffness is from a space of degree 2 .*; expected a, a space of degree 1",
         stiffness=lambda s: s.a_on(of_degree_2(s)),
@@ -38,9 +34,6 @@ FORMS_AGAIN = {
         r"Dirichlet condition 0 prescribes 2 facets that lie on tears",
         values=lambda s: [exterior(s)],
     ),
-    "values that are one condition": updated(
-        r"bcs is a DirichletBC; expected a list", values=lambda s: s.clamp()
-    ),
 }
 
 GAPS_AGAIN = {
@@ -48,13 +41,6 @@ GAPS_AGAIN = {
     "another gap of nobody": gaps(r"contact 'lid': there are 1, counted from 0", {"lid": 0.1}),
     "another gap of one contact twice": gaps(
         r"gap: contact 0 is there twice, by position and by name", {0: 0.1, FLOOR: 0.2}
-    ),
-    "another gap of None": gaps(rf"{FLOOR}: gap=None, expected \"geometry\"", {0: None}),
-    "another gap that is a vector": gaps(
-        rf"{FLOOR}: gap, a function, did not give one number for each", {0: lambda x: x}
-    ),
-    "another gap that fails": gaps(
-        rf"{FLOOR}: gap, .* shape .*: ZeroDivisionError: no such place", {0: raising}
     ),
 }
 

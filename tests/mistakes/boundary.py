@@ -41,12 +41,6 @@ def loaded_inside(s):
     tfeti.ContactProblem(inner.a, L, [], [], inner.d, boundary_elements=ALL).solve()
 
 
-def with_mass(s):
-    """The matrix of a step in time is stiffness and mass."""
-    problem = tfeti.ContactDynamics(s.a, s.L, [], [], s.d, mass=s.mass, boundary_elements=ALL)
-    tfeti.LoadSteps(problem, lambda problem, t: None, np.array([0.1])).run()
-
-
 def of_bent_facets(s):
     """A cube of hexahedra, a node of whose upper side is lifted."""
     mesh, facet_tags, names = box("hexahedron", 2)
@@ -65,17 +59,12 @@ GIVEN = {
         lambda s: s.problem(boundary_elements="steel"),
         r"boundary_elements is 'steel'; expected tfeti_dolfinx.BoundaryElements",
     ),
-    "boundary elements on an unknown volume": (
-        lambda s: s.problem(boundary_elements=tfeti.BoundaryElements("brass")),
-        r"no volume 'brass' in the mesh; its volumes are: 'steel' \(5\)",
-    ),
     "boundary elements and a block of one's own": (
         lambda s: s.problem(boundary_elements=ALL, extensions=tfeti.Extensions(block=SparseBlock)),
         r"boundary_elements: extensions have a block, too; expected one of them",
     ),
 }
 SOLVED = {
-    "bodies with mass of boundary elements": (with_mass, LAW),
     "an axisymmetric body of boundary elements": (
         lambda s: solved(
             s, a=tfeti.Elasticity(s.d, E=1.0, nu=0.3, model="axisymmetric").a(s.u, s.v)
@@ -109,10 +98,6 @@ SOLVED = {
     "points of another dimension": (
         lambda s: s.solved.at([(0.0, 0.0, 0.0)]),
         r"points of shape \(1, 3\); expected finite numbers of shape \(k, 2\)",
-    ),
-    "points that are a text": (
-        lambda s: s.solved.at("middle"),
-        r"points: could not convert string to float: 'middle'; expected numbers of shape",
     ),
 }
 

@@ -63,28 +63,10 @@ RUN = {
         r"extensions: block gave None without apply_pinv, .*; expected a Block",
         block=lambda data: None,
     ),
-    "a block without methods": own(
-        r"extensions: block: NotImplementedError: set_stiffness", block=Block
-    ),
-    "a block that fails": own(r"extensions: block: ZeroDivisionError: no such", block=raising),
-    "a K⁺ that is None": own(r"extensions: kplus gave None without solve", kplus=lambda *_: None),
-    "a preconditioner that fails": own(
-        r"extensions: preconditioner: ZeroDivisionError: no such place",
-        contact=False,
-        preconditioner=raising,
-    ),
-    "a law that gives nothing": own(
-        r"extensions: feasible_set gave None without face, max_step, onto, project",
-        feasible_set=lambda constraints: None,
-    ),
     "a law of other rows": own(
         r"extensions: feasible_set projects vectors of shape \(\d+,\) to \(\d+,\); expected a set "
         r"on all rows of this rank",
         feasible_set=lambda constraints: OfThree(),
-    ),
-    "a monitor that takes too few": own(
-        r"extensions: monitor: TypeError: .*takes 1 positional argument but 5",
-        monitor=lambda step: None,
     ),
     "a monitor that fails on one rank": (
         lambda s: on_the_last_rank(s, "monitor"),

@@ -71,11 +71,6 @@ def meshed(gmsh, square):
     gmsh.model.mesh.generate(2)
 
 
-def group_of_curves(gmsh, square):
-    gmsh.model.addPhysicalGroup(1, [1], name="edge")
-    gmsh.model.mesh.generate(2)
-
-
 def two_groups(gmsh, square):
     in_group(gmsh, square)
     gmsh.model.addPhysicalGroup(2, [square], name="again")
@@ -87,20 +82,15 @@ SOURCES = {
         lambda s: tfeti.read_gmsh(s.folder / "none.msh", s.comm),
         r"none.msh: no such file; expected a gmsh mesh",
     ),
-    "no source": source(
-        r"source is None; expected a .msh file, or a gmsh model", lambda gmsh: None
-    ),
     "no communicator": (
         lambda s: tfeti.read_gmsh("ring.msh", None),
         r"comm is None; expected a communicator such as MPI.COMM_WORLD",
     ),
-    "a text that is no mesh": file("text.msh", "this is not a mesh\n", r"text.msh: "),
     "a mesh without nodes": file("bare.msh", BARE, r"bare.msh: not a mesh, gmsh finds no nodes"),
     "a model when gmsh is not initialised": source(
         r"gmsh.model \(is gmsh initialised, with a model in it\?\)", closed
     ),
     "a model that is not meshed": model(r"the mesh has no physical groups of cells", in_group),
-    "a model with groups of curves alone": model(r".*", group_of_curves),
     "cells in two groups": model(
         r"elements of dimension 2 lie in several physical groups, \['again', 'plate'\]", two_groups
     ),
