@@ -3,17 +3,14 @@
 import numpy as np
 import pytest
 import ufl
-from bodies import held, sided, stacked, stiffer_above, two_body_problem
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
 from scenes import clamp, gathered, hooke, strain
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import spsolve
-from test_mortar_cases import no_load
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.feti.recovery import jumps, min_norm_correction
 
 
 def rectangle(cells, size, comm):
@@ -171,27 +168,3 @@ def test_an_error_says_what_is_hard():
         p.solve()
     assert "the flattest" in str(caught.value)
     assert all(warning in str(caught.value) for warning in p.report.warnings)
-
-
-@pytest.mark.parametrize(("cell", "stiffness"), [("triangle", 1e7), ("hexahedron", 1.0)])
-def test_what_rows_miss_is_closed_by_the_least_displacement(cell, stiffness):
-    """Also where the fine side is stiff: its rows act on the other side's few soft nodes."""
-    d = stacked(cell, 2, 5)
-    stress = stiffer_above(d, stiffness)
-    bcs = held(d, "lower bottom", "upper top")
-    p = two_body_problem(d, no_load, bcs, [sided("upper bottom", "lower top")], stress=stress)
-    p.solve()
-    rows = p.solution.gluing.constraints
-    rng, normals = np.random.default_rng(MPI.COMM_WORLD.rank), rows.sets.normals
-    asked = np.ones(rows.num_rows, dtype=bool)
-    asked[normals] = closed = rng.random(len(normals)) < 0.8
-    w = np.where(asked, rng.standard_normal(rows.num_rows), 0.0)
-    v = min_norm_correction(rows, w, closed)
-    assert np.allclose(jumps(rows.B, v)[asked], w[asked], atol=1e-4)
-    # least in D: D v is in the range of B_fᵀ, so D-orthogonal to what closes nothing
-    other = rng.standard_normal(len(v))
-    missed = np.where(asked, jumps(rows.B, other), 0.0)
-    nothing = other - min_norm_correction(rows, missed, closed)
-    product = MPI.COMM_WORLD.allreduce(nothing @ (rows.weights * v))
-    size = MPI.COMM_WORLD.allreduce(np.abs(nothing) @ np.abs(rows.weights * v))
-    assert abs(product) <= 1e-4 * size

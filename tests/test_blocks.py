@@ -205,15 +205,11 @@ def test_cholesky_says_when_there_is_no_factor(solver, kind, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_every_solver_factors(solver):
+def test_every_solver_factors_and_what_stands_in_for_cholmod_is_said_once(solver, caplog):
     K, _ = stiffness("tetrahedron", 2, mass=1.0)
-    found = CholeskyFactor(K)
-    b = np.random.default_rng(0).standard_normal(K.shape[0])
+    found, b = CholeskyFactor(K), np.random.default_rng(0).standard_normal(K.shape[0])
     assert np.allclose(K @ found.solve(b), b, atol=1e-9)
     found.destroy()
-
-
-def test_what_stands_in_for_cholmod_is_said_once(solver, caplog):
     d = decomposed("quadrilateral", 3, 2)
     for _ in range(2):
         problem(d, (0.0, -0.05)).solve()

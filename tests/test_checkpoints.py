@@ -123,16 +123,6 @@ def test_what_is_damaged_is_named(scene, way):
         assert said or (way, name) == ("more at the end", "records.jsonl")
 
 
-def test_an_older_state_in_the_place_of_a_newer_one_is_named(scene):
-    """Both are whole: of the same program, on the same mesh."""
-    scene.begin()
-    scene.series(scene.copy, LATER).run(resume=True)
-    last = scene.copy / f"state_3_{scene.comm.rank}.npz"
-    shutil.copy(scene.kept / f"state_2_{scene.comm.rank}.npz", last)
-    with pytest.raises(tfeti.InputError, match=r"state_3_\d\.npz is damaged"):
-        scene.series(scene.copy, [*LATER, 2.0]).run(resume=True)
-
-
 def test_files_that_are_not_the_checkpoint_s_stay(scene, shared_tmp):
     """Also those whose names begin as its own."""
     for name in ("checkpoint.json.old", "state_1_0.npz"):

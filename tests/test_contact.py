@@ -9,7 +9,6 @@ from reference import UntornElasticity
 from scenes import curved_obstacle, decomposed, displacement, hooke, problem, relative, strain
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx import ContactStatus
 
 CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
 
@@ -76,23 +75,6 @@ def test_the_laws_of_contact_hold_below_the_tolerance():
     p.solve()
     for name, allowed in p.report.tolerances.items():
         assert p.report.residuals[name] <= allowed, name
-
-
-def test_fields_tell_the_state_of_contact():
-    p = contact_problem()
-    p.solve()
-    s = p.solution
-    status, pressure, gap = (f.x.array for f in (s.status, s.pressure, s.gap))
-    z = p.u.function_space.tabulate_dof_coordinates()[:, 2]
-    assert np.array_equal(status == ContactStatus.NONE, z > 1e-9)
-    assert np.all((pressure > 0) == (status == ContactStatus.TOUCHING))
-    assert np.all(np.abs(gap[status == ContactStatus.TOUCHING]) <= 1e-9)
-    assert np.all(gap[status == ContactStatus.OPEN] > -1e-9)
-    comm = p.decomposition.comm
-    assert comm.allreduce(np.sum(status == ContactStatus.OPEN)) > 0
-    data = s.contact(0)
-    total = comm.allreduce(np.sum(data.pressure * data.area))
-    assert total == pytest.approx(comm.allreduce(data.force.sum()))
 
 
 def test_forces_are_in_equilibrium_with_the_stress():

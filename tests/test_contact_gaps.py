@@ -201,18 +201,10 @@ def test_a_ring_shrunk_on_another(cells, order, mesh, contact, secondary):
     assert error <= (0.03 if contact else 0.05)
 
 
-@pytest.mark.parametrize(
-    ("cells", "order", "subdomains", "secondary", "contact"),
-    [
-        ((48, 64), 1, 4, "shaft", {"gap": -OVERLAP}),  # a ring that is a subdomain of its own
-        ((24, 32), 2, 8, "hub", {}),
-    ],
-)
-def test_free_rings_are_solved(cells, order, subdomains, secondary, contact):
+def test_free_rings_are_solved():
     """Rows hold the turn of one in the other by the errors of their normals, or not at all."""
-    overlap = 0.0 if contact else OVERLAP
-    mesh = {"subdomains": subdomains}
-    p = ring_problem(cells, overlap, order, order, mesh, 0.0, secondary=secondary, **contact)
+    mesh = {"subdomains": 8}
+    p = ring_problem((24, 32), OVERLAP, 2, 2, mesh, 0.0, secondary="hub")
     mean, _ = against_lame(p)
     assert p.report.converged_reason == "CONVERGED_RTOL"
     assert p.report.residuals["displacement_error"] <= 1e-8

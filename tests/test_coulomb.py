@@ -7,9 +7,9 @@ from dolfinx import fem
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpi4py import MPI
-from scenes import decomposed, displacement, forms, problem
+from scenes import decomposed, forms, problem
 from test_friction_fields import SCENES, floor, solved
-from test_tresca import SIDES, SOLVERS, nodal_data, on_the_plane, stresses, two_boxes
+from test_tresca import SIDES, SOLVERS, on_the_plane, stresses, two_boxes
 
 import tfeti_dolfinx as tfeti
 
@@ -63,24 +63,6 @@ def test_a_cube_on_a_cube(qp_type, scene, secondary):
     two_boxes(*scene, secondary, kind=tfeti.Coulomb, share=SHARE, qp_type=qp_type)
 
 
-def test_a_coefficient_of_0_is_no_friction():
-    without, with_none = (
-        solved(*SCENES[0][:1], law, SCENES[0][1]) for law in (None, tfeti.Coulomb(0.0))
-    )
-    assert np.allclose(displacement(with_none)[1], displacement(without)[1], rtol=0, atol=1e-9)
-    assert with_none.report.sticking == with_none.report.friction_iterations == 0
-
-
-@pytest.mark.parametrize(("cell", "traction"), SCENES)
-def test_a_large_coefficient_sticks(cell, traction, comm):
-    p = solved(cell, tfeti.Coulomb(1e3), traction)
-    assert p.report.sliding == 0
-    assert p.report.sticking == p.report.active_contacts > 0
-    _, _, status, slip = nodal_data(p.solution, comm)
-    sticks = status == tfeti.ContactStatus.STICK
-    assert np.abs(slip[sticks]).max() <= 1e-9 * np.abs(displacement(p)[1]).max()
-
-
 @pytest.mark.parametrize(("cell", "traction"), SCENES)
 def test_the_law_holds(cell, traction, comm):
     """Traction at most μ times pressure; slip against it where they are equal, else none."""
@@ -105,21 +87,6 @@ def test_bounds_that_do_not_come_to_rest_are_an_error():
     slow = {"friction_type": "fixed_point", "friction_max_it": 2}
     with pytest.raises(tfeti.ConvergenceError, match="DIVERGED_FRICTION .*Coulomb's friction do"):
         solved("quadrilateral", tfeti.Coulomb(0.3), (0.05, -0.05), **slow)
-
-
-def test_friction_alone_holds_a_body(comm):
-    """Up to μ times what presses it; beyond that the error says by how much."""
-    d, mu, press = decomposed("quadrilateral", 3, 3), 0.3, 0.1
-    rough = [floor(2, tfeti.Coulomb(mu))]
-    p = problem(d, (0.9 * mu * press, -press), rough, clamped=(), rtol=1e-8)
-    p.solve()
-    data = p.solution.contact()
-    friction = comm.allreduce((data.area[:, None] * data.tangential_traction).sum(axis=0))
-    assert np.allclose(friction, (-0.9 * mu * press, 0.0), rtol=0, atol=1e-7)
-    assert p.report.free_modes == 0
-    p = problem(d, (1.5 * mu * press, -press), rough, clamped=(), rtol=1e-6)
-    with pytest.raises(tfeti.NoSolutionError, match=r"translation in x.* 1\.5\d* times as large"):
-        p.solve()
 
 
 MU = (0.4, 0.15)

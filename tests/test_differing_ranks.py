@@ -7,7 +7,6 @@ import re
 from dataclasses import replace
 from functools import partial
 
-import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
@@ -256,23 +255,6 @@ def test_rounding_is_no_difference(comm):
     one = 0.1 * (1.0 + 1e-15 * comm.rank)
     with agreeing(comm, "here") as given:
         given |= {"number": one, "vector": [one, 1e-17 * comm.rank], "name": "same"}
-
-
-def test_a_table_of_a_rank_in_a_function_is_no_difference(scene, comm):
-    """Nor are counters, nor what a closure gets later."""
-    x, calls = np.linspace(0, 1, 3 + comm.rank), comm.rank
-
-    def gap(points):
-        nonlocal calls
-        calls += 1
-        return np.interp(points[0], x, np.full(len(x), depth))
-
-    friction = tfeti.Coulomb(partial(np.interp, xp=x, fp=0 * x + 0.3))
-    with pytest.raises(tfeti.InputError):  # np.interp takes no points of shape (3, n)
-        scene.problem(contacts=[floor(friction=friction)]).solve()
-    problem = scene.problem(contacts=[floor(gap=gap)])
-    depth = 0.01
-    problem.solve()
 
 
 def test_counters_of_ufl_are_no_difference(scene, comm):

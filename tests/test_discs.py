@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tfeti_dolfinx.qp.sets import Bounds, Discs, Ellipses, Product, Status
@@ -24,6 +24,7 @@ def level(a, x):
     return np.sum(np.divide(x, a, out=np.zeros_like(x), where=a > 0.0) ** 2, axis=1)
 
 
+@settings(max_examples=40)
 @given(SEEDS, st.sampled_from([1, 2]), st.sampled_from([1.0, 1e-3, 1e-6]))
 def test_discs_fulfil_the_contract(seed, k, size):
     rng = np.random.default_rng(seed)
@@ -31,6 +32,7 @@ def test_discs_fulfil_the_contract(seed, k, size):
     check_feasible_set(Discs(radius, k, size * rng.standard_normal((6, k))), 6 * k, seed)
 
 
+@settings(max_examples=40)
 @given(SEEDS, st.sampled_from([1, 2]))
 def test_ellipses_fulfil_the_contract(seed, k):
     rng = np.random.default_rng(seed)

@@ -1,6 +1,5 @@
 """Elasticity offered once: closed forms in every model, moduli by names, pressures of rings."""
 
-import gmsh
 import numpy as np
 import pytest
 import ufl
@@ -11,8 +10,6 @@ from mpi4py import MPI
 from scenes import box, decomposed
 
 import tfeti_dolfinx as tfeti
-from demos.hertz import PointContact, compare
-from meshes.tools import graded_size, started_model
 
 PRESSURE, YOUNG, POISSON = 0.1, 2.0, 0.3
 EXACT = {"rtol": 1e-12, "error_if_not_converged": False}
@@ -203,50 +200,3 @@ def test_pressure_of_a_cylinder_on_a_plane(comm):
     assert np.isclose(comm.allreduce(data.area.sum()), np.pi, rtol=1e-12)
     assert np.isclose(comm.allreduce(data.force.sum()), PRESSURE * np.pi, rtol=1e-8)
     assert np.isclose(solution.body_forces.force[0, 1], PRESSURE * np.pi, rtol=1e-8)
-
-
-def quarter_disc(comm, a, elements):
-    """Half of a half disc, r ≥ 0: a half ball on the plane z = 0."""
-    model = None
-    if comm.rank == 0:
-        model = started_model("quarter_disc")
-        geo = model.geo
-        lowest, centre, right = (geo.addPoint(*x, 0.0) for x in ((0, 0), (0, 1), (1, 1)))
-        arc, top = geo.addCircleArc(lowest, centre, right), geo.addLine(right, centre)
-        axis = geo.addLine(centre, lowest)
-        body = geo.addPlaneSurface([geo.addCurveLoop([arc, top, axis])])
-        geo.synchronize()
-        model.addPhysicalGroup(2, [body], name="ball")
-        for name, curve in (("arc", arc), ("top", top), ("axis", axis)):
-            model.addPhysicalGroup(1, [curve], name=name)
-        graded_size((0.0, 0.0, 0.0), a / elements, 1.5 * a, 0.3)
-        gmsh.model.mesh.generate(2)
-    return tfeti.read_gmsh(model, comm, subdomains=4)
-
-
-def test_hertz_of_a_ball(comm):
-    """The closed form that the demo in 3D has with 60 000 unknowns, in the plane."""
-    a, nu = 0.05, 0.3
-    hertz = PointContact.from_half_width(a, 1.0, 1 / (1 - nu**2))
-    d = quarter_disc(comm, a, 15)
-    elastic = tfeti.Elasticity(d, E={"ball": 1.0}, nu=nu, model="axisymmetric")
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
-    push = fem.Constant(d.mesh, (0.0, -hertz.load / np.pi))
-    axis = fem.locate_dofs_topological(V.sub(0), 1, d.facets("axis"))
-    problem = tfeti.ContactProblem(
-        elastic.a(u, v),
-        elastic.thickness * ufl.dot(push, v) * ds(d.surface("top")),
-        [fem.dirichletbc(0.0, axis, V.sub(0))],
-        [tfeti.Obstacle("arc", tfeti.Plane((0, 0), normal=(0, 1)), reach=2 * a**2)],
-        d,
-        thickness=elastic.thickness,
-        petsc_options={"rtol": 1e-8},
-    )
-    problem.solve()
-    data = problem.solution.contact()
-    errors = compare(comm, data, data.points[:, 0], hertz)
-    assert abs(errors["force"]) < 1e-6
-    for name in ("half_width", "peak_pressure", "pressure_l2"):
-        assert abs(errors[name]) < 0.02, name

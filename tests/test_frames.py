@@ -11,7 +11,6 @@ from mpi4py import MPI
 from scenes import decomposed
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.constraints.gluing import glue, prescribe
 from tfeti_dolfinx.contact.records import relative_displacement, remaining_gaps, slips
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -109,28 +108,6 @@ def check_motion(records, dofs, motion, v):
     tangential = v - np.sum(records.normal * v, axis=1)[:, None] * records.normal
     found = np.einsum("nt,ntg->ng", along, records.tangents)
     assert np.allclose(found, tangential, rtol=0, atol=1e-12)
-
-
-def test_rows_of_normals_measure_what_records_do():
-    """On displacements without jumps B_N u = s_i n_i·v_i, v_i from the records."""
-    d = stacked("tetrahedron", 3, 4, 6)
-    dofs = dofs_on(d)
-    records = searched([sided(*ORDERS[1])], dofs, d)
-    weights = 1.0 + np.arange(dofs.num_nodes * 3) % 7
-    gluing = glue(dofs, prescribe(dofs, []), records, 1.0, weights)
-    u = nodal(dofs, lambda x: np.cos(2.0 * x) - x[:, [1, 2, 0]])
-    constraints = gluing.constraints
-    trace, Bu = constraints.B.createVecs()
-    trace.array[:] = u[constraints.trace]
-    constraints.B.mult(trace, Bu)
-    v = relative_displacement(records, dofs, u)
-    expected = np.sum(records.normal * v, axis=1)[gluing.contact.condition]
-    rows = Bu.array_r[constraints.sets.normals] / constraints.scale
-    assert MPI.COMM_WORLD.allreduce(len(rows)) > 0
-    assert np.allclose(rows, expected, rtol=0, atol=1e-12)
-    for vec in (trace, Bu):
-        vec.destroy()
-    constraints.destroy()
 
 
 def scalar_problem(d, contacts, flux=0.3):

@@ -188,24 +188,20 @@ def test_ids_of_cells_in_the_order_of_the_files(comm, shared_tmp):
         tfeti.read_gmsh(shared_tmp / "squares.msh", comm, np.zeros(7))
 
 
-def square(number, tag=1, name="body", curve=None, shift=0.0, quads=False, column=None):
-    """MSH 2.2 of the square [number − 1, number] × [0, 1], maybe with a named curve below it."""
+def square(number, tag=1, name="body", shift=0.0, quads=False, column=None):
+    """MSH 2.2 of the square [number − 1, number] × [0, 1]."""
     column = number if column is None else column
     a, b, c, d = 2 * column - 1, 2 * column + 1, 2 * column + 2, 2 * column
     x = column - 1 + shift
     nodes = [(a, x, 0), (b, column, 0), (c, column, 1), (d, x, 1)]
     cells = [(3, (a, b, c, d))] if quads else [(2, (a, b, c)), (2, (a, c, d))]
-    groups = [f'2 {tag} "{name}"']
     lines = [
         f"{10 * number + i} {kind} 2 {tag} {tag} {' '.join(map(str, own))}"
         for i, (kind, own) in enumerate(cells)
     ]
-    if curve:
-        groups.append(f'1 8 "{curve}"')
-        lines.append(f"{10 * number + 5} 1 2 8 8 {a} {b}")
     sections = {
         "MeshFormat": ["2.2 0 8"],
-        "PhysicalNames": [str(len(groups)), *groups],
+        "PhysicalNames": ["1", f'2 {tag} "{name}"'],
         "Nodes": ["4", *(f"{i} {x} {y} 0" for i, x, y in nodes)],
         "Elements": [str(len(lines)), *lines],
     }
@@ -235,13 +231,6 @@ def test_files_that_do_not_fit_together(comm, shared_tmp, message, change):
     write_squares(shared_tmp, {}, {}, change)
     with pytest.raises(InputError, match=message):
         tfeti.read_gmsh(shared_tmp / "squares.msh", comm)
-
-
-def test_a_name_that_one_file_gives_to_a_surface_and_a_body(comm, shared_tmp):
-    both_groups = {"name": "steel", "curve": "steel"}
-    write_squares(shared_tmp, {"name": "steel"}, both_groups)
-    d = tfeti.read_gmsh(shared_tmp / "squares.msh", comm)
-    assert (d.surface("steel"), d.volume("steel")) == (8, 1)
 
 
 def test_a_missing_last_file(comm, shared_tmp):

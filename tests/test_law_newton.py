@@ -8,10 +8,8 @@ import ufl
 from dolfinx import fem
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mpi4py import MPI
 from scenes import clamp, decomposed, displacement, forms, problem
-from scipy.sparse import csr_array
-from test_friction_fields import SCENES, floor, solved
+from test_friction_fields import floor, solved
 from test_mpgp import as_set
 from test_qp import matrix, vector
 
@@ -97,44 +95,6 @@ def test_it_solves_the_law(seed, k, r):
         assert replace(whole, norm=norm).residual(LawPoint(end.lam, s, end.mu)) <= 1e-8
     _, near = law.nearest(end.lam)
     assert np.allclose(near, end.lam, rtol=0, atol=1e-9)
-
-
-def slipping_face(p):
-    """A face of the scene's rows on which some conditions slip, and what follows."""
-    constraints = p.dual.constraints
-    normals, tangents = constraints.pressed_by[constraints.pressed], constraints.sets.tangents
-    law = Law(p.dual.set_under, normals, tangents[constraints.pressed])
-    y = np.where(np.arange(constraints.num_rows) % 3 == 0, 1.0, -0.5)
-    y[normals] = np.where(np.arange(len(normals)) % 4 == 3, -1.0, 1.0)
-    feasible, at = law.nearest(y)
-    face = feasible.face(at, np.zeros(constraints.num_rows))
-    return face, law.following(at, face)
-
-
-def test_oblique_projectors(comm):
-    cell, traction = SCENES[1]
-    p = solved(cell, tfeti.Coulomb(0.3), traction)
-    coarse, (face, C) = p.dual.coarse, slipping_face(p)
-    assert comm.allreduce(C.nnz) > 0
-    oblique, rows = coarse.oblique(face, C), p.dual.constraints.num_rows
-    x = np.random.default_rng(comm.rank).standard_normal(rows)
-    Px, y = oblique.project(x), coarse.G(x)
-    assert np.allclose(oblique.project(Px), Px, rtol=0, atol=1e-9)
-    assert np.allclose(coarse.G(Px + C @ Px), 0.0, atol=1e-9)
-    given_by_G = face.restricted(coarse.Gt @ y)
-    size = comm.allreduce(float(np.abs(given_by_G).max(initial=0.0)), op=MPI.MAX)
-    assert np.allclose(oblique.project(given_by_G), 0.0, atol=1e-9 * size)
-    u = oblique.restoring(y)
-    assert np.allclose(coarse.G(u + C @ u), y, rtol=0, atol=1e-8 * np.abs(y).max())
-    # without what follows it is the orthogonal one
-    plain, flat = coarse.oblique(face, csr_array(C.shape)), coarse.on_face(face)
-    vec = p.dual.d.duplicate()
-    vec.array[:] = x
-    flat.project(vec)
-    assert np.allclose(plain.project(x), vec.array_r, rtol=0, atol=1e-9)
-    flat.destroy()
-    vec.destroy()
-    p.destroy()
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from petsc4py import PETSc
 from reference import UntornElasticity
 from scenes import decomposed, displacement, hooke, problem, relative, strain
 
@@ -74,27 +73,6 @@ def test_patch_test():
     assert np.allclose(uh.x.array, linear.x.array, atol=1e-9)
 
 
-def test_a_scalar_problem():
-    d = decomposed("quadrilateral", 8, 7)
-    V = fem.functionspace(d.mesh, ("Lagrange", 1))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    left = fem.locate_dofs_topological(V, 1, d.facets("left"))
-    one = fem.Constant(d.mesh, PETSc.ScalarType(1.0))
-    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
-    p = tfeti.ContactProblem(
-        ufl.inner(ufl.grad(u), ufl.grad(v)) * ufl.dx,
-        one * v * ds(d.surface("right")),
-        [fem.dirichletbc(PETSc.ScalarType(0.0), left, V)],
-        [],
-        d,
-        petsc_options={"tfeti_rtol": 1e-11},
-    )
-    uh = p.solve()
-    x = V.tabulate_dof_coordinates()
-    assert np.allclose(uh.x.array, x[:, 0], atol=1e-10)
-    assert p.report.kernel_dim == 7
-
-
 def test_springs_leave_no_coarse_problem():
     d = decomposed("hexahedron", 3, 4)
     V = fem.functionspace(d.mesh, ("Lagrange", 1, (3,)))
@@ -105,30 +83,3 @@ def test_springs_leave_no_coarse_problem():
     uh = p.solve()
     assert p.report.kernel_dim == 0
     assert np.allclose(uh.x.array.reshape(-1, 3), (0, 0, -1), atol=1e-9)
-
-
-def test_jumps_of_stiffness_cost_little():
-    """Stiffness scaling, against one weight per copy: the number of iterations stays flat."""
-
-    def iterations(ratio, scaling):
-        d = decomposed("hexahedron", 8, lambda x: np.floor(4 * x[0]) + 4 * (x[2] > 0.5))
-        V = fem.functionspace(d.mesh, ("Lagrange", 1, (3,)))
-        E = fem.Function(fem.functionspace(d.mesh, ("DG", 0)))
-        E.x.array[:] = np.where(d.cell_subdomain % 2, ratio, 1.0)
-        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-        left = fem.locate_dofs_topological(V, 2, d.facets("left"))
-        ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
-        p = tfeti.ContactProblem(
-            E * ufl.inner(hooke()(u), strain(v)) * ufl.dx(metadata={"quadrature_degree": 2}),
-            ufl.dot(fem.Constant(d.mesh, (0.0, 0.0, -1.0)), v) * ds(d.surface("right")),
-            [fem.dirichletbc(np.zeros(3), left, V)],
-            [],
-            d,
-            petsc_options={"tfeti_scaling": scaling},
-        )
-        p.solve()
-        return p.report.cg_steps
-
-    flat = iterations(1.0, "stiffness")
-    assert iterations(1e4, "stiffness") <= flat + 5
-    assert iterations(1e4, "multiplicity") >= 2 * flat

@@ -20,79 +20,53 @@ def occupied(s):
     return folder
 
 
-def contact(says, index):
+def contact(index):
     """Ask for a contact of the solution."""
-    return lambda s: s.solved.contact(index), says
+    return lambda s: s.solved.contact(index)
 
 
-def picture(says, **arguments):
+def picture(**arguments):
     """A picture of the deformed body."""
-    return lambda s: plot_deformed(s.folder / "a.png", s.solved, **arguments), says
+    return lambda s: plot_deformed(s.folder / "a.png", s.solved, **arguments)
 
 
-def curve(says, coordinate, *others, **arguments):
+def curve(coordinate, *others, **arguments):
     """A picture of the pressure."""
     return (
         lambda s: plot_pressure(s.folder / "a.png", s.solved, coordinate, *others, **arguments),
-        says,
     )
 
 
 FIELDS = {
-    "the solution before there is one": (
-        lambda s: s.problem().solution,
-        r"there is no solution yet; expected a call of solve\(\) before",
+    r"there is no solution yet; expected a call of solve\(\) before": lambda s: (
+        s.problem().solution
     ),
-    "a contact by its surface": contact(
-        r"contact 'bottom': there are 1, counted from 0; their positions and names, of which one "
-        r"was expected, are 0: obstacle of surface 'bottom'",
-        "bottom",
+    r"contact 'bottom': there are 1, counted from 0; their positions and names, of which one "
+    r"was expected, are 0: obstacle of surface 'bottom'": contact("bottom"),
+    r"contact .*bottom.*: there are 2, .* are 0: obstacle .*, 1: obstacle": lambda s: (
+        s.twice.contact("obstacle of surface 'bottom'")
     ),
-    "a contact by a name that two have": (
-        lambda s: s.twice.contact("obstacle of surface 'bottom'"),
-        r"contact .*bottom.*: there are 2, .* are 0: obstacle .*, 1: obstacle",
-    ),
-    "stress where none was given": (
-        lambda s: s.bare.stress,
-        r"no stress: give ContactProblem\(..., stress=sigma\)",
-    ),
+    r"no stress: give ContactProblem\(..., stress=sigma\)": lambda s: s.bare.stress,
 }
 
 FILES = {
-    "VTX with another ending": (
-        lambda s: write_vtx(s.folder / "x.vtu", s.solved),
-        r"x.vtu: expected a name that ends with .bp",
-    ),
-    "VTX below a file": (
-        lambda s: write_vtx(occupied(s) / "file" / "x.bp", s.solved),
-        r"cannot write .*x.bp: ",
-    ),
-    "VTX over somebody's folder": (
-        lambda s: write_vtx(occupied(s) / "mine.bp", s.solved),
-        r"mine.bp is a directory that VTX has not written",
+    r"x.vtu: expected a name that ends with .bp": lambda s: write_vtx(s.folder / "x.vtu", s.solved),
+    r"cannot write .*x.bp: ": lambda s: write_vtx(occupied(s) / "file" / "x.bp", s.solved),
+    r"mine.bp is a directory that VTX has not written": lambda s: write_vtx(
+        occupied(s) / "mine.bp", s.solved
     ),
 }
 
 PICTURES = {
-    "a picture of the problem": (
-        lambda s: plot_deformed(s.folder / "a.png", s.problem()),
-        SOLUTION,
+    SOLUTION: lambda s: plot_deformed(s.folder / "a.png", s.problem()),
+    r"zoom=0: expected a positive number": picture(zoom=0),
+    r"focus=\(0, 0\): expected three finite numbers": picture(focus=(0, 0)),
+    r"cut=\(0, 0, 0\): expected a point and a normal": picture(cut=(0, 0, 0)),
+    r"coordinate of points of shape \(\d, 3\) has the shape \(\d, 3\); expected \(\d,\)": curve(
+        lambda x: x
     ),
-    "a picture magnified by 0": picture(r"zoom=0: expected a positive number", zoom=0),
-    "a picture with a focus in 2D": picture(
-        r"focus=\(0, 0\): expected three finite numbers", focus=(0, 0)
-    ),
-    "a picture with a cut of one point": picture(
-        r"cut=\(0, 0, 0\): expected a point and a normal", cut=(0, 0, 0)
-    ),
-    "a curve over points": curve(
-        r"coordinate of points of shape \(\d, 3\) has the shape \(\d, 3\); expected \(\d,\)",
-        lambda x: x,
-    ),
-    "a curve with a closed form that is an array": curve(
-        r"closed_form is an array of shape \(3,\); expected a callable",
-        lambda x: x[:, 0],
-        np.zeros(3),
+    r"closed_form is an array of shape \(3,\); expected a callable": curve(
+        lambda x: x[:, 0], np.zeros(3)
     ),
 }
 
