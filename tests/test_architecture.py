@@ -4,6 +4,10 @@ import ast
 from graphlib import TopologicalSorter
 from pathlib import Path
 
+import pytest
+
+pytestmark = pytest.mark.usefixtures("serial_only")
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "tfeti_dolfinx"
 

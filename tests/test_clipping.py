@@ -1,6 +1,7 @@
 """Segments against scipy's half-space intersections, and by their areas."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
@@ -11,6 +12,8 @@ from tfeti_dolfinx.mortar.clipping import (
     clip_polygons,
     quadrature_on_intervals,
 )
+
+pytestmark = pytest.mark.usefixtures("serial_only")
 
 
 def random_convex(rng, k, n):

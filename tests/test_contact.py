@@ -63,13 +63,6 @@ def test_variants_find_the_same(options):
     assert relative(displacement(p)[1], reference()[0]) <= 1e-8
 
 
-@pytest.mark.parametrize("subdomains", [1, 16])
-def test_subdomains_do_not_matter(subdomains):
-    p = contact_problem("tetrahedron", 6, subdomains)
-    p.solve()
-    assert relative(displacement(p)[1], reference("tetrahedron")[0]) <= 1e-8
-
-
 def test_the_laws_of_contact_hold_below_the_tolerance():
     p = contact_problem(tfeti_rtol=1e-6)
     p.solve()
@@ -94,18 +87,6 @@ def test_forces_are_in_equilibrium_with_the_stress():
     bottom_only = np.isclose(x[:, 2], 0) & (x[:, 0] > 1e-9)
     assert d.comm.allreduce(int(np.sum(bottom_only))) > 0
     assert np.allclose(lifted[bottom_only], forces[bottom_only], atol=1e-9)
-
-
-def test_nodes_out_of_reach_get_rows_only_where_they_come_to_overlap():
-    # without a preconditioner: interiors of subdomains that get rows would be factored anew
-    whole, part = (contact_problem(reach=reach, **SMALSE) for reach in (np.inf, 0.022))
-    whole.solve()
-    part.solve()
-    assert part.report.far_contact_nodes > 0
-    assert part.report.late_contact_rows > 0
-    assert part.report.contact_rows < whole.report.contact_rows
-    assert relative(displacement(part)[1], displacement(whole)[1]) <= 1e-8
-    assert part.report.factorizations == whole.report.factorizations
 
 
 @pytest.mark.parametrize(

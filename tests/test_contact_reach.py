@@ -60,6 +60,7 @@ def test_the_reach_does_not_change_the_answer(reach):
     found = [problem(d, (0.0, -0.05), [below(0.02, reach=one)], rtol=1e-10) for one in (reach, 1.0)]
     for p in found:
         p.solve()
+    assert (found[0].report.late_contact_rows > 0) == (reach == 1e-3)
     assert 0 < found[0].report.active_contacts == found[1].report.active_contacts
     assert relative(*(displacement(p)[1] for p in found)) <= 1e-7
 

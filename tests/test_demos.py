@@ -39,14 +39,6 @@ def test_unknown_arguments_are_refused():
         demo.main(["--quick", "stray"])
 
 
-def test_stacked_blocks_are_held_by_contact_alone(quick_demo):
-    """Each of the three upper blocks slides and turns freely on its flat sides: 3 modes each."""
-    report = quick_demo("stacked_blocks_3d").report
-    assert report["bodies"] == 4
-    assert report["free_modes"] == 9
-    assert abs(report["errors"]["force_base"]) <= 1e-5
-
-
 def test_a_mesh_that_follows_the_error_needs_a_tenth_of_a_uniform_one():
     """7.9 % took 38 836 unknowns of equal size, and 8 856 of hand-graded ones."""
     solution, report = adaptive_2d.run(["--error", "0.078"])
@@ -54,14 +46,6 @@ def test_a_mesh_that_follows_the_error_needs_a_tenth_of_a_uniform_one():
     assert report.primal_dofs <= 3900
     assert report.errors["pressure_l2"] <= 0.02
     assert solution.has_discretisation_error
-
-
-def test_a_bouncing_bar_is_as_in_closed_form(quick_demo):
-    """Up to the end of the first impact, on few cells."""
-    report = quick_demo("bouncing_bar").report
-    for name, most in (("first_begin", 0.01), ("first_end", 0.03), ("first_pressure", 0.01)):
-        assert abs(report["errors"][name]) <= most
-    assert report["in_all"]["assemblies"] == report["in_all"]["gluings"] == 1
 
 
 @pytest.mark.slow
@@ -78,19 +62,6 @@ def test_a_bouncing_bar_comes_back_as_in_closed_form():
         coarse, middle, fine = (abs(errors[name]) for errors in found)
         assert middle <= 0.7 * coarse, name
         assert fine <= 0.6 * middle, name
-
-
-def test_an_impact_of_bars_is_as_in_closed_form(quick_demo):
-    """On few cells, of two equal bars that exchange their velocities."""
-    errors = quick_demo("impact_of_bars").report["errors"]
-    most = {
-        "pressure": 0.01,
-        "duration": 0.01,
-        "oscillates": 0.01,
-        "velocity": 0.03,
-        "energy": 0.02,
-    }
-    assert all(abs(errors[f"two_{name}"]) <= bound for name, bound in most.items())
 
 
 @pytest.mark.slow

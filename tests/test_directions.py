@@ -9,6 +9,8 @@ from tfeti_dolfinx.qp.krylov import Directions, pcpg
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, Steps, TargetRule
 from tfeti_dolfinx.qp.sets import Product
 
+pytestmark = pytest.mark.usefixtures("serial_only")
+
 n = 60
 
 

@@ -8,6 +8,8 @@ from hypothesis import strategies as st
 from tfeti_dolfinx.qp.sets import Bounds, Discs, Ellipses, Product, Status
 from tfeti_dolfinx.testing import check_feasible_set
 
+pytestmark = pytest.mark.usefixtures("serial_only")
+
 SEEDS = st.integers(0, 10_000)
 
 

@@ -69,16 +69,3 @@ def test_recovered_displacement_meets_the_rows(solved):
     closed = lam[bounded] > 0.0
     assert solved.decomposition.comm.allreduce(int(np.sum(closed))) > 0
     assert np.all(np.abs(residual[bounded][closed]) <= 1e-8 * size)
-
-
-def test_recovered_displacement_is_in_equilibrium(solved):
-    """K u = f − Bᵀλ in every subdomain."""
-    constraints = solved.dual.constraints
-    lam, force = constraints.c.duplicate(), constraints.B.createVecRight()
-    lam.array[:] = solved.solution.lam
-    constraints.B.multTranspose(lam, force)
-    dofs = solved.dofs
-    forms = solved._system.forms
-    left = dofs.to_primal(forms.stiffness() @ solved.u.x.array - forms.load())
-    left[constraints.trace] += force.array_r
-    assert np.all(np.abs(left) <= 1e-9 * force.norm())

@@ -116,12 +116,11 @@ def test_friction_slows_down_what_slides():
         weight=0.05,
         thrown=(0.0, speed, 0.0),
     )
-    lost, energies = 0.0, []
+    lost = 0.0
     for n in range(1, 13):
         ((motion, forces),) = scene.step(0.25)
         assert motion["friction"] <= 1e-12
         assert abs(motion["defect"]) <= 1e-13
-        energies.append(motion["energy"])
         lost -= motion["friction"]
         v = mean(scene, scene.problem.solution.velocity.x.array.reshape(-1, 2))
         assert v[0] == pytest.approx(speed - bound * 0.25 * n, abs=1e-9)

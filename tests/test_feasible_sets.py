@@ -12,6 +12,8 @@ from tfeti_dolfinx.errors import ConformanceError
 from tfeti_dolfinx.qp.sets import Bounds, Discs, Product, Status, face_of
 from tfeti_dolfinx.testing import check_feasible_set
 
+pytestmark = pytest.mark.usefixtures("serial_only")
+
 
 @pytest.mark.parametrize(
     "feasible",

@@ -206,14 +206,3 @@ def test_blocks_of_one_s_own_apply_what_they_have(local_type):
     w = random(sum(len(block.trace_dofs) for block in blocks))
     for kind in KINDS:
         assert np.allclose(applied(GroupedOperator(blocks, kind, LocalChoice(local_type)), w), w)
-
-
-@pytest.mark.parametrize("local_type", ["auto", "explicit"])
-def test_ranks_without_subdomains(local_type):
-    operator = GroupedOperator([], "pinv", LocalChoice(local_type))
-    assert applied(operator, np.empty(0)).shape == (0,)
-    d = decomposed("quadrilateral", 4, 1)  # one rank has it
-    p = problem(d, tfeti_local_type=local_type)
-    p.solve()
-    assert sum(v for k, v in p.report.local_operators.items() if k[2:] in FORMS) == 1
-    p.destroy()

@@ -13,9 +13,8 @@ def occupied(s):
     folder = s.folder
     if s.comm.rank == 0:
         (folder / "file").write_text("mine")
-        for name in ("mine.bp", "mine.xdmf", "mine.png"):
-            (folder / name).mkdir(exist_ok=True)
-            (folder / name / "notes.txt").write_text("mine")
+        (folder / "mine.bp").mkdir(exist_ok=True)
+        (folder / "mine.bp" / "notes.txt").write_text("mine")
     s.comm.barrier()
     return folder
 
@@ -32,9 +31,7 @@ def picture(**arguments):
 
 def curve(coordinate, *others, **arguments):
     """A picture of the pressure."""
-    return (
-        lambda s: plot_pressure(s.folder / "a.png", s.solved, coordinate, *others, **arguments),
-    )
+    return lambda s: plot_pressure(s.folder / "a.png", s.solved, coordinate, *others, **arguments)
 
 
 FIELDS = {
