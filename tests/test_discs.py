@@ -42,6 +42,7 @@ def test_ellipses_fulfil_the_contract(seed, k):
     check_feasible_set(Ellipses(a, rng.standard_normal((6, k))), 6 * k, seed)
 
 
+@settings(max_examples=40)
 @given(SEEDS)
 def test_a_product_of_all_of_them_fulfils_the_contract(seed):
     order = np.random.default_rng(seed).permutation(26)

@@ -23,7 +23,7 @@ def falls(rows, name):
 
 
 # elements along the half width; the last solution is the reference
-SIZES = [(6, 12, 24, 48), pytest.param((8, 16, 32, 128), marks=pytest.mark.slow)]
+SIZES = [(8, 16, 32, 64), pytest.param((8, 16, 32, 128), marks=pytest.mark.slow)]
 
 
 @pytest.mark.parametrize("sizes", SIZES)
