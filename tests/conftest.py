@@ -57,7 +57,7 @@ def comm():
 @pytest.fixture(scope="session")
 def serial_only():
     if MPI.COMM_WORLD.size > 1:
-        pytest.skip("starts mpirun itself")
+        pytest.skip("knows nothing of ranks, or starts mpirun itself")
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from bodies import held, pressed, stacked, two_body_problem
 from dolfinx import fem
 from mpi4py import MPI
 from scenes import curved_obstacle, decomposed, displacement, forms, problem, relative
-from test_gmsh_split import two_bodies
+from test_gmsh import two_bodies
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.mesh import dolfinx_input
