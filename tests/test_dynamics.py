@@ -231,9 +231,3 @@ def test_a_state_or_a_solution_without_velocity():
     still.solve()
     with pytest.raises(tfeti.InputError, match="no velocity: expected the solution of a Contact"):
         still.solution.velocity  # noqa: B018
-
-
-def sixteenths(x):
-    """Four by four subdomains."""
-    i, j = np.minimum((4 * x[:2]).astype(int), 3)
-    return i + 4 * j

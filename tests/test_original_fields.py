@@ -89,14 +89,6 @@ def test_functions_are_the_same_on_both_meshes(cell):
         assert farthest(back, untorn) < 1e-13, kind
 
 
-def test_a_component_of_a_function():
-    mesh = bent("quadrilateral")
-    d = tfeti.decompose(mesh, 3)
-    untorn, torn = (wave(space(m, "Lagrange", 2, (2,))) for m in (mesh, d.mesh))
-    assert farthest(d.from_original(untorn.sub(1)), torn.sub(1).collapse()) < 1e-13
-    assert farthest(d.to_original(torn.sub(1)), untorn.sub(1).collapse()) < 1e-13
-
-
 def test_a_jump_at_a_tear(comm):
     """A continuous space cannot have it: the mean; the discontinuous one keeps it."""
     square = dmesh.create_unit_square(comm, 4, 4, dmesh.CellType.quadrilateral)
