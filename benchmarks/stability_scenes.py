@@ -80,32 +80,29 @@ def far_obstacle(cell: str, gap: float) -> Scene:
     )
 
 
-def checkerboard_touching(cell: str, jump: float) -> Scene:
+def pressed(
+    cell: str,
+    nu: float = 0.3,
+    order: int = 1,
+    at: float = 0.0,
+    push: float = 0.0,
+    jump: float = 1.0,
+) -> Scene:
+    """A block that is clamped at one end, pressed on a floor, and maybe pushed along it."""
     last = GDIM[cell] - 1
     return Scene(
         cell,
-        (block(cell, E=1.0, jump=jump),),
+        (block(cell, E=1.0, nu=nu, jump=jump),),
         held=(Held((0, 0, 0), all_of(cell)),),
-        loads=(Load((0, last, 1), up(cell, -1e-2)),),
-        walls=(floor(cell, -1e-3),),
+        loads=(Load((0, last, 1), (push,) + (0.0,) * (last - 1) + (-1e-2,)),),
+        walls=(floor(cell, at),),
+        order=order,
     )
 
 
-def subdomain_jumps(cell: str, jump: float) -> Scene:
-    last = GDIM[cell] - 1
-    return Scene(
-        cell,
-        (block(cell, E=1.0),),
-        held=(Held((0, 0, 0), all_of(cell)),),
-        loads=(Load((0, last, 1), up(cell, -1e-2)),),
-        walls=(floor(cell, -1e-3),),
-        subdomains=8,
-        subdomain_jump=jump,
-    )
-
-
-def subdomain_jumps_pair(cell: str, jump: float) -> Scene:
-    return replace(two_bodies(cell, 1.0, 1.0), subdomains=8, subdomain_jump=jump)
+def jumping(scene: Scene, jump: float) -> Scene:
+    """The scene with a jump of moduli between odd and even subdomains."""
+    return replace(scene, subdomains=8, subdomain_jump=jump)
 
 
 def two_bodies(cell: str, lower: float, upper: float) -> Scene:
@@ -122,13 +119,13 @@ def two_bodies(cell: str, lower: float, upper: float) -> Scene:
     )
 
 
-def loose_stack(cell: str, jump: float) -> Scene:
+def loose_stack(cell: str, jump: float, nu: float = 0.3) -> Scene:
     """Three blocks on the floor, held by contact alone, stiff and soft."""
     last = GDIM[cell] - 1
     E = (1.0, jump, 1.0)
     return Scene(
         cell,
-        tuple(block(cell, float(k), E=E[k]) for k in range(3)),
+        tuple(block(cell, float(k), E=E[k], nu=nu) for k in range(3)),
         loads=(Load((2, last, 1), up(cell, -1e-2)),),
         walls=(floor(cell),),
         pairs=(Pair((1, last, 0), (0, last, 1)), Pair((2, last, 0), (1, last, 1))),
@@ -178,33 +175,11 @@ def beam(cell: str, aspect: float) -> Scene:
     )
 
 
-def nearly_incompressible(cell: str, nu: float) -> Scene:
-    last = GDIM[cell] - 1
-    return Scene(
-        cell,
-        (block(cell, E=1.0, nu=nu),),
-        held=(Held((0, 0, 0), all_of(cell)),),
-        loads=(Load((0, last, 1), up(cell, -1e-2)),),
-        walls=(floor(cell),),
-    )
-
-
-def nearly_incompressible_loose(cell: str, nu: float) -> Scene:
-    bodies = tuple(block(cell, float(k), E=1.0, nu=nu) for k in range(3))
-    return replace(loose_stack(cell, 1.0), bodies=bodies)
-
-
 def with_friction(scene: Scene, law: str, number: float) -> Scene:
     """The scene with a law of friction on all its contacts."""
     walls = tuple(replace(wall, friction=(law, number)) for wall in scene.walls)
     pairs = tuple(replace(pair, friction=(law, number)) for pair in scene.pairs)
     return replace(scene, walls=walls, pairs=pairs)
-
-
-def pressed(cell: str, nu: float = 0.3, order: int = 1) -> Scene:
-    """A block that is clamped at one end, pressed on the floor."""
-    scene = nearly_incompressible(cell, nu)
-    return replace(scene, order=order)
 
 
 def layered(cell: str, aspect: float) -> Scene:
@@ -240,11 +215,6 @@ def hanging(cell: str, hangs: float) -> Scene:
     return replace(scene, bodies=bodies, hanging=bool(hangs))
 
 
-def scattered(cell: str, seed: float) -> Scene:
-    """A partition by nearest points of a random set."""
-    return replace(two_bodies(cell, 1.0, 1.0), scattered=int(seed) or None)
-
-
 def hinge(cell: str, joined: float) -> Scene:
     """A block beside a clamped one: 0 clamped, 1 also hanging by a corner or edge, 2 by that alone.
 
@@ -262,7 +232,7 @@ def hinge(cell: str, joined: float) -> Scene:
     return Scene(cell, bodies, held, loads, (wall,), joined=bool(joined))
 
 
-def redundant(cell: str, gap: float) -> Scene:
+def two_obstacles(cell: str, gap: float) -> Scene:
     """Two obstacles on the same nodes; 0: one, below 0: both at once."""
     scene = pressed(cell)
     more = () if gap == 0.0 else (floor(cell, -max(gap, 0.0)),)
@@ -330,31 +300,21 @@ def to_rtol(cell: str, rtol: float, law: str = "") -> Scene:
     return replace(in_units(cell, 1.0, 1.0, law), options={"tfeti_rtol": rtol})
 
 
-def rubbing(cell: str, value: float) -> Scene:
-    """A block pressed on a floor and pushed along it, held by friction alone at its bottom."""
-    last = GDIM[cell] - 1
-    push = (-2e-3,) + (0.0,) * (last - 1) + (-1e-2,)
-    scene = Scene(
-        cell,
-        (block(cell, E=1.0),),
-        held=(Held((0, 0, 0), all_of(cell)),),
-        loads=(Load((0, last, 1), push),),
-        walls=(floor(cell),),
-    )
-    return with_friction(scene, "coulomb", value)
-
-
 def _ladders() -> list[Ladder]:
     units = range(len(UNITS))
     return [
         Ladder("moduli", "soft on stiff", lambda c, v: two_bodies(c, v, 1.0), MODULI),
         Ladder("moduli", "stiff on soft", lambda c, v: two_bodies(c, 1.0, v), MODULI),
         Ladder("moduli", "loose stack", loose_stack, MODULI),
-        Ladder("moduli", "subdomains of a body", subdomain_jumps, MODULI),
-        Ladder("moduli", "subdomains of a pair", subdomain_jumps_pair, MODULI),
-        Ladder("moduli", "cells", checkerboard_touching, MODULI),
+        Ladder(
+            "moduli", "subdomains of a body", lambda c, v: jumping(pressed(c, at=-1e-3), v), MODULI
+        ),
+        Ladder(
+            "moduli", "subdomains of a pair", lambda c, v: jumping(two_bodies(c, 1, 1), v), MODULI
+        ),
+        Ladder("moduli", "cells", lambda c, v: pressed(c, at=-1e-3, jump=v), MODULI),
         Ladder("nu", "P1", pressed, NU),
-        Ladder("nu", "P1, loose", nearly_incompressible_loose, NU),
+        Ladder("nu", "P1, loose", lambda c, v: loose_stack(c, 1.0, v), NU),
         Ladder("nu", "P2", lambda c, v: pressed(c, v, 2), NU),
         Ladder("aspect", "layers at contact", layered, ASPECTS),
         Ladder("aspect", "flat block", flat_block, ASPECTS),
@@ -364,9 +324,14 @@ def _ladders() -> list[Ladder]:
         Ladder("thin", "strips", strips, (*THIN, 1e4)),
         Ladder("thin", "beam", beam, (*THIN, 1e4)),
         Ladder("parts", "hang at corners", hanging, (0.0, 1.0)),
-        Ladder("parts", "random", scattered, tuple(map(float, range(6)))),
+        Ladder(
+            "parts",
+            "random",
+            lambda c, v: replace(two_bodies(c, 1.0, 1.0), scattered=int(v) or None),
+            tuple(map(float, range(6))),
+        ),
         Ladder("parts", "hinge", hinge, (0.0, 1.0, 2.0)),
-        Ladder("rows", "two obstacles", redundant, (0.0, -1.0, 1e-6, 1e-3)),
+        Ladder("rows", "two obstacles", two_obstacles, (0.0, -1.0, 1e-6, 1e-3)),
         Ladder("rows", "pairs of a node", three_pairs, (1.0, 2.0, 3.0)),
         Ladder("rows", "far obstacle", far_obstacle, FAR),
         Ladder("rows", "grazing", grazing, (1.0, 1e-3, 1e-6, 1e-9, 0.0, -1e-6)),
@@ -381,6 +346,9 @@ def _with_friction() -> list[Ladder]:
     def moduli(law: str) -> Callable[[str, float], Scene]:
         number = 0.3 if law == "coulomb" else 1e-3
         return lambda c, v: with_friction(two_bodies(c, v, 1.0), law, number)
+
+    def rubbing(cell: str, value: float) -> Scene:
+        return with_friction(pressed(cell, push=-2e-3), "coulomb", value)
 
     flat = ("triangle", "hexahedron")
     units = range(len(UNITS))

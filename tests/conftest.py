@@ -20,6 +20,7 @@ settings.register_profile(
     derandomize=True,
     deadline=None,
     database=None,
+    max_examples=25,
     phases=[Phase.explicit, Phase.generate],
 )
 settings.load_profile("ranks")
@@ -56,7 +57,7 @@ def comm():
 @pytest.fixture(scope="session")
 def serial_only():
     if MPI.COMM_WORLD.size > 1:
-        pytest.skip("starts mpirun itself")
+        pytest.skip("knows nothing of ranks, or starts mpirun itself")
 
 
 @pytest.fixture

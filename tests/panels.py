@@ -35,7 +35,6 @@ HOOK = [(0, 0), (2, 0), (2, 0.7), (0.6, 0.7), (0.6, 3), (0, 3)]
 PLANE = {
     "square": lambda m=8: polygon(SQUARE, m),
     "hook": lambda m=8: polygon(HOOK, m),
-    "circle": lambda m=8: circle(4 * m),
     "ring": lambda m=8: joined(circle(4 * m), circle(4 * m, 0.6)),
     "graded": lambda m=8: polygon([(0, 0), (3, 0), (2, 1), (0.2, 1.5)], m, 1.3),
 }
@@ -71,7 +70,6 @@ SPACE = {
     "cube": lambda m=2: box(m),
     "bar": lambda m=2: box(m, (3.0, 1.0, 1.0)),
     "ball": lambda m=2: moved(box(m), _blown),
-    "sheared": lambda m=2: moved(box(m), lambda x: x @ [[1, 0.4, 0], [0, 1, 0.3], [0, 0, 1]]),
     "wedge": lambda m=2: moved(
         box(m), lambda x: np.stack((x[:, 0], x[:, 1], x[:, 2] * (1 + x[:, 0])), axis=1)
     ),

@@ -44,7 +44,7 @@ DEMOS = [
 
 
 def run(name, folder):
-    """Run a demo with all of its outputs: its report, what it printed, its folder. Collective."""
+    """Run a demo with all outputs: report, solution, what it printed, its folder. Collective."""
     demo, out = importlib.import_module(f"demos.{name}"), io.StringIO()
     file = folder / "report.json"
     arguments = ["--quick", "--report", str(file), "--output", str(folder), "--plot"]
@@ -52,7 +52,7 @@ def run(name, folder):
         solution = demo.main([*arguments, "-tfeti_converged_reason"])
     solution.decomposition.comm.barrier()
     report = json.loads(file.read_text())
-    return SimpleNamespace(report=report, out=out.getvalue(), folder=folder)
+    return SimpleNamespace(report=report, solution=solution, out=out.getvalue(), folder=folder)
 
 
 def multiplications(report):

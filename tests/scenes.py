@@ -89,9 +89,10 @@ def problem(
     degree=1,
     loaded="top",
     extensions=None,
+    springs=0.0,
     **options,
 ):
-    """A box, some sides clamped, a traction on another."""
+    """A box, some sides clamped, springs in each of its points, a traction on another side."""
     gdim = decomposition.mesh.geometry.dim
     traction = traction or (0.0,) * (gdim - 1) + (-0.05,)
     V, a, L = forms(
@@ -101,6 +102,10 @@ def problem(
         decomposition.surface(loaded),
         degree,
     )
+    if springs:
+        v, u = a.arguments()
+        dx = ufl.Measure("dx", domain=decomposition.mesh, metadata={"quadrature_degree": 2})
+        a += fem.Constant(decomposition.mesh, springs) * ufl.dot(u, v) * dx
     bcs = [clamp(V, decomposition.facets(name)) for name in clamped]
     return tfeti.ContactProblem(
         a,

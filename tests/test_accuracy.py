@@ -3,18 +3,14 @@
 import numpy as np
 import pytest
 import ufl
-from bodies import held, sided, stacked, stiffer_above, two_body_problem
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import clamp, decomposed, gathered, hooke, problem, strain
+from scenes import clamp, gathered, hooke, strain
 from scipy.sparse import csr_matrix
 from scipy.sparse.linalg import spsolve
-from test_mortar_cases import no_load
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.common.parallel import norm_over
-from tfeti_dolfinx.feti.recovery import jumps, min_norm_correction
 
 
 def rectangle(cells, size, comm):
@@ -83,7 +79,7 @@ def floor(at, reach=np.inf):
     return tfeti.Obstacle("bottom", tfeti.Plane((0, -at), (0, 1)), reach=reach)
 
 
-@pytest.mark.parametrize("away", [1e-3, 1.0, 1e3, 1e6])
+@pytest.mark.parametrize("away", [1.0, 1e6])
 def test_an_obstacle_far_away_changes_nothing(away):
     """A steel block under 0.1 MPa that pulls it off an obstacle; every node has a row."""
     scene = (12, 6), (2.0, 1.0), lambda x: 2.1e5, 0.3, (0.0, 0.1)
@@ -102,9 +98,9 @@ def checkerboard(jump):
     return lambda x: np.where((np.floor(6 * x[0]) + np.floor(6 * x[1])) % 2 > 0, jump, 1.0)
 
 
-@pytest.mark.parametrize("jump", [1.0, 1e4, 1e6, 1e8])
-@pytest.mark.parametrize("contacts", [0, 1])
-@pytest.mark.parametrize("subdomains", [4, 7])
+@pytest.mark.parametrize(
+    ("jump", "contacts", "subdomains"), [(1e4, 1, 7), (1e6, 0, 4), (1e8, 1, 4), (1e8, 0, 7)]
+)
 def test_jumps_of_stiffness_inside_a_body(jump, contacts, subdomains):
     size, scene = (2.0, 1.0), ((24, 12), (2.0, 1.0), checkerboard(jump), 0.3, (0.0, 1e-3))
     p = torn(*scene, subdomains, [floor(0.02)] * contacts)
@@ -113,8 +109,10 @@ def test_jumps_of_stiffness_inside_a_body(jump, contacts, subdomains):
     assert error(p, direct(*scene), size) <= 1e-4
 
 
-@pytest.mark.parametrize("nu", [0.3, 0.499, 0.4999])
-@pytest.mark.parametrize(("length", "contacts"), [(1.0, 1), (10.0, 0), (100.0, 0), (100.0, 1)])
+@pytest.mark.parametrize(
+    ("nu", "length", "contacts"),
+    [(0.4999, 1.0, 1), (0.499, 10.0, 0), (0.4999, 100.0, 0), (0.3, 100.0, 1)],
+)
 def test_slender_and_nearly_incompressible_bodies(nu, length, contacts):
     size = (length, 1.0)
     scene = (int(8 * min(length, 5)), 4), size, lambda x: 1.0, nu, (1e-5, 1e-6)
@@ -153,67 +151,20 @@ def test_rounding_is_called_so():
     assert p.report.converged_reason == "DIVERGED_ROUNDING"
 
 
-@pytest.mark.parametrize("contacts", [0, 1])
-def test_rtol_0_asks_for_all_digits(contacts):
+def test_rtol_0_asks_for_all_digits():
     """Whether rounding is said to have ended it or not, it has them."""
     scene = (12, 6), (2.0, 1.0), checkerboard(1e3), 0.3, (0.0, 1e-3)
-    contacts = [floor(1.0)] * contacts
-    p = torn(*scene, 4, contacts, tfeti_rtol=0, tfeti_error_if_not_converged=False)
+    p = torn(*scene, 4, [floor(1.0)], tfeti_rtol=0, tfeti_error_if_not_converged=False)
     p.solve()
     assert p.report.converged_reason in ("CONVERGED_RTOL", "DIVERGED_ROUNDING")
     assert error(p, direct(*scene), np.array([2.0, 1.0])) <= 1e-10
 
 
-@pytest.mark.parametrize("length", [2.0, 4000.0])
-def test_an_error_says_what_is_hard(length):
+def test_an_error_says_what_is_hard():
     """What the report warns of is in the message of a solve that ends early, too."""
-    scene = (12, 6), (length, 1.0), lambda x: 1.0, 0.3, (0.0, 1e-3)
+    scene = (12, 6), (4000.0, 1.0), lambda x: 1.0, 0.3, (0.0, 1e-3)
     p = torn(*scene, 4, [], tfeti_max_it=1)
     with pytest.raises(tfeti.ConvergenceError, match="DIVERGED_ITS") as caught:
         p.solve()
-    assert ("the flattest" in str(caught.value)) == (length > 2.0)
+    assert "the flattest" in str(caught.value)
     assert all(warning in str(caught.value) for warning in p.report.warnings)
-
-
-@pytest.mark.parametrize("stiffness", [1.0, 1e7])
-@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_what_rows_miss_is_closed_by_the_least_displacement(cell, stiffness):
-    """Also where the fine side is stiff: its rows act on the other side's few soft nodes."""
-    d = stacked(cell, 2, 5)
-    stress = stiffer_above(d, stiffness)
-    bcs = held(d, "lower bottom", "upper top")
-    p = two_body_problem(d, no_load, bcs, [sided("upper bottom", "lower top")], stress=stress)
-    p.solve()
-    rows = p.solution.gluing.constraints
-    rng, normals = np.random.default_rng(MPI.COMM_WORLD.rank), rows.sets.normals
-    asked = np.ones(rows.num_rows, dtype=bool)
-    asked[normals] = closed = rng.random(len(normals)) < 0.8
-    w = np.where(asked, rng.standard_normal(rows.num_rows), 0.0)
-    v = min_norm_correction(rows, w, closed)
-    assert np.allclose(jumps(rows.B, v)[asked], w[asked], atol=1e-4)
-    # least in D: D v is in the range of B_fᵀ, so D-orthogonal to what closes nothing
-    other = rng.standard_normal(len(v))
-    missed = np.where(asked, jumps(rows.B, other), 0.0)
-    nothing = other - min_norm_correction(rows, missed, closed)
-    product = MPI.COMM_WORLD.allreduce(nothing @ (rows.weights * v))
-    size = MPI.COMM_WORLD.allreduce(np.abs(nothing) @ np.abs(rows.weights * v))
-    assert abs(product) <= 1e-4 * size
-
-
-def test_what_rows_of_a_node_miss_in_contradiction_is_closed_as_far_as_it_can_be():
-    """Two walls on one side, the same rows twice: v is nearest to both, and not out of all size."""
-    d = decomposed("quadrilateral", 4, 2)
-    walls = [tfeti.Obstacle("bottom", tfeti.Plane((0, -gap), (0, 1))) for gap in (0.0, 1e-3)]
-    p = problem(d, contacts=walls)
-    p.solve()
-    rows, comm = p.solution.gluing.constraints, MPI.COMM_WORLD
-    w, normals = np.zeros(rows.num_rows), rows.sets.normals
-    w[normals] = np.random.default_rng(comm.rank).standard_normal(len(normals))
-    left = w - jumps(rows.B, min_norm_correction(rows, w, np.ones(len(normals), dtype=bool)))
-    assert norm_over(comm, left) > 0.1 * norm_over(comm, w)
-    x, forces = rows.B.createVecLeft(), rows.B.createVecRight()
-    x.array[:] = left
-    rows.B.multTranspose(x, forces)
-    assert forces.norm() <= 1e-6 * norm_over(comm, w)
-    for vec in (x, forces):
-        vec.destroy()

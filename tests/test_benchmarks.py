@@ -26,26 +26,43 @@ from benchmarks import (
 )
 
 
-def quick(benchmark, folder, comm, *arguments):
-    """Tables of a quick run, which must be what it has written."""
-    tables = benchmark.main(["--quick", "--output", str(folder), *arguments])
+def with_arguments(benchmark, *arguments, slow=False):
+    name = benchmark.__name__.split(".")[-1]
+    return pytest.param(benchmark, arguments, id=name, marks=[pytest.mark.slow] if slow else [])
+
+
+START_MPIRUN = (solver_profiles, strong_scaling, subdomain_size, time_against_error, weak_scaling)
+RUNS = [
+    with_arguments(hertz_convergence),
+    with_arguments(kplus_forms),
+    with_arguments(linear_price, "--scenes", "cube_3d"),
+    with_arguments(secondary_side),
+    with_arguments(spectrum),
+    with_arguments(stability, "--groups", "nu"),
+    with_arguments(stages, "--processor"),
+    with_arguments(strong_scaling, "--ranks", "2"),
+    with_arguments(talk_tables, "--rtol", "1e-4"),
+    with_arguments(solver_profiles, "--steps", "100", slow=True),
+    with_arguments(subdomain_size, "--ranks", "1", slow=True),
+    with_arguments(time_against_error, "--ranks", "1", "--scenes", "half cylinder", slow=True),
+    with_arguments(weak_scaling, slow=True),
+]
+
+
+@pytest.mark.parametrize(("benchmark", "arguments"), RUNS)
+def test_a_quick_run_writes_the_tables_that_it_returns(
+    benchmark, arguments, shared_tmp, comm, monkeypatch
+):
+    if benchmark in START_MPIRUN and comm.size > 1:
+        pytest.skip("starts mpirun itself")
+    monkeypatch.setattr(time, "perf_counter", time.perf_counter)  # --processor changes it
+    tables = benchmark.main(["--quick", "--output", str(shared_tmp), *arguments])
     comm.barrier()
     name = benchmark.__name__.split(".")[-1]
-    assert (folder / f"{name}.md").read_text().startswith("## ")
-    assert json.loads((folder / f"{name}.json").read_text()).keys() == tables.keys()
-    assert (folder / f"{name}.png").read_bytes().startswith(b"\x89PNG")
-    return tables
-
-
-def test_talk_tables(shared_tmp, comm):
-    tables = quick(talk_tables, shared_tmp, comm, "--rtol", "1e-4")
-    assert set(tables) == {"Hertz 2D", "Frictionless 3D", "Tresca 2D", "Tresca 3D", "TBETI"}
-    for title, table in tables.items():
-        (row,) = table
-        assert row["rtol"] == "1e-04"
-        assert row["kernel"] == row["kernel, talk"]
-        assert 0 < row["F, Newton"] < row["F, SMALSE"]
-        assert ("sticking" in row) == title.startswith("Tresca")
+    assert (shared_tmp / f"{name}.md").read_text().startswith("## ")
+    assert json.loads((shared_tmp / f"{name}.json").read_text()).keys() == tables.keys()
+    assert (shared_tmp / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+    assert all(rows for rows in tables.values())
 
 
 def test_ablation(serial_only, tmp_path):
@@ -53,176 +70,8 @@ def test_ablation(serial_only, tmp_path):
     page, given = tmp_path / "page.md", ["--mechanisms", "smooth_displacements", "kept_directions"]
     tables = ablation.main(["--quick", "--output", str(tmp_path), "--page", str(page), *given])
     assert len(tables["Multiplications"]) == len(tables["Change of u"]) == 2
-    for row in tables["Multiplications"]:
-        assert float(row["kept_directions"]) == pytest.approx(1.0, abs=0.1)
-    assert max(float(row["smooth_displacements"]) for row in tables["Multiplications"]) > 1.1
     assert all(float(row["kept_directions"]) < 1e-4 for row in tables["Change of u"])
     assert "smooth_displacements" in page.read_text()
-
-
-def test_kplus_forms(shared_tmp, comm):
-    """A bad choice of fixing nodes makes what is factored worse, and no choice makes K⁺ wrong."""
-    tables = quick(kplus_forms, shared_tmp, comm)
-    for rows in tables.values():
-        condition = {
-            (row["K⁺"], row["fixing nodes"]): row["condition of the factor"] for row in rows
-        }
-        for kind in ("regularized", "schur"):
-            assert condition[kind, "a cell in a corner"] >= 5 * condition[kind, "spread"]
-        for row in rows:
-            assert row["error of a deformation"] <= 1e-10
-            assert row["error of K K⁺ K"] <= 1e-10
-
-
-def test_spectrum(shared_tmp, comm):
-    """κ ≤ C·H/h with C of some units, whatever H is."""
-    tables = quick(spectrum, shared_tmp, comm)
-    for rows in tables.values():
-        assert len(rows) == 4
-        for row in rows:
-            assert 0.0 < row["λ_min(F)"] < row["λ_max(F)"]
-            assert row["κ(F)"] == row["λ_max(F)"] / row["λ_min(F)"]
-            assert 1.0 <= row["κ(F)·h/H"] <= 3.0
-            assert 1.0 <= row["κ(S)·h/H"] <= 5.0
-
-
-def test_hertz_convergence(shared_tmp, comm):
-    tables = quick(hertz_convergence, shared_tmp, comm)
-    for name in hertz_convergence.QUICK:
-        coarse, fine = tables[name]
-        assert fine["pressure_l2_finer"] < coarse["pressure_l2_finer"]
-
-
-def test_secondary_side(shared_tmp, comm):
-    """The side that is taken has the smaller error, and takes no more multiplications."""
-    tables = quick(secondary_side, shared_tmp, comm)
-    for name in secondary_side.QUICK:
-        for row in tables[name]:
-            (other,) = {"upper", "lower"} - {row["auto"]}
-            assert row[f"nodes, {row['auto']}"] < 0.5 * row[f"nodes, {other}"]
-            assert row[f"field, {row['auto']}"] <= row[f"field, {other}"]
-            assert row[f"F, {row['auto']}"] <= row[f"F, {other}"]
-    assert next(row["nodes, worst"] for row in tables["Rules"]) == 1.0
-
-
-@pytest.mark.parametrize("name", list(linear_price.DEMOS))
-def test_the_linear_problem_has_the_solution_of_the_contact(shared_tmp, comm, name):
-    """So all solvers find it, and their price can be compared."""
-    tables = quick(linear_price, shared_tmp, comm, "--scenes", name, "-tfeti_rtol", "1e-7")
-    (rows,) = tables.values()
-    assert {row["solver"] for row in rows} >= {"contact, newton", "contact, smalse", "GAMG"}
-    assert all(row["error"] <= 1e-7 for row in rows)
-    assert min(row["of GAMG"] for row in rows if row["solver"] == "GAMG") == 1.0
-
-
-def test_stages(shared_tmp, comm, monkeypatch):
-    monkeypatch.setattr(time, "perf_counter", time.perf_counter)  # comes back after the test
-    tables = quick(stages, shared_tmp, comm, "--processor")
-    assert time.perf_counter is time.process_time
-    for title, rows in tables.items():
-        if title == "Local operators":
-            assert len(rows) == 2 * len(stages.DEMOS)
-            assert all(row["MB"] > 0.0 for row in rows)
-        else:
-            assert sum(row["share"] for row in rows) == pytest.approx(1.0)
-            assert all(0.0 < row["MB in use"] <= row["MB held"] for row in rows)
-
-
-def test_stability(shared_tmp, comm):
-    """Each row has a test of its own in ``test_stability``."""
-    tables = quick(stability, shared_tmp, comm, "--groups", "nu")
-    assert set(tables) == {"nu", "locking"}
-    for row in tables["nu"]:
-        assert row["verdict"] == "right"
-        assert row["error"] <= 1e-4
-    stiff, locked = tables["locking"]
-    assert locked["P1 over P2"] < 0.8 * stiff["P1 over P2"]
-
-
-def test_solver_profiles(serial_only, shared_tmp, comm):
-    tables = quick(solver_profiles, shared_tmp, comm, "--steps", "100", "--seed", "5")
-    default = tables["contact, multiplications"][2]
-    assert default["solver"] == "newton, dirichlet"
-    for title, rows in tables.items():
-        if "τ = 1" in rows[0]:
-            assert max(row["τ = 1"] for row in rows) > 0.0, title
-            for row in rows:
-                shares = [row[f"τ = {tau:g}"] for tau in solver_profiles.TAUS]
-                assert shares == sorted(shares)
-                assert shares[-1] <= 1.0 - row["failed"] / row["solves"]
-
-
-def test_profiles_count_failures_and_ties():
-    solvers = [("newton", "none"), ("newton", "lumped"), ("newton", "dirichlet")]
-    keys = [f"{qp}, {pc}" for qp, pc in solvers]
-    costs = [(1, 2, 4), (None, 10, 10), (None, None, None), (0, 0, 0)]
-    rows = [dict(zip(keys, cost, strict=True)) for cost in costs]
-    found = solver_profiles.profiles(rows, solvers)
-    assert [row["failed"] for row in found] == [2, 1, 1]
-    assert [row["τ = 1"] for row in found] == [0.5, 0.5, 0.5]
-    assert [row["τ = 2"] for row in found] == [0.5, 0.75, 0.5]
-    assert [row["τ = 4"] for row in found] == [0.5, 0.75, 0.75]
-
-
-def test_profiles_leave_out_what_rounding_does():
-    about = dict.fromkeys(solver_profiles.NAMES, "")
-    names, rows = ("newton, none", "newton, dirichlet"), []
-    for scene, noise, costs in (("0", 0.0, (3, 7)), ("1", 1e-9, (5, 5)), ("2", 1e-7, (None, None))):
-        row = {**about, "scene": scene, "rtol": 1e-8, "noise": noise}
-        for name, cost in zip(names, costs, strict=True):
-            row |= {name: cost, f"{name}, s": cost, f"{name}, failed": "" if cost else "named"}
-        rows.append(row)
-    tables = solver_profiles.tabled(rows, "seconds")
-    for row in tables["contact, multiplications"]:
-        assert (row["solves"], row["failed"], row["τ = 4"]) == (2, 0, 1.0)
-    (slow,) = tables["default failed, or needs more than twice the best"]
-    assert (slow["scene"], slow["default"], slow["best"]) == ("0", 7, 3)
-    (below,) = tables["below what rounding leaves"]
-    assert (below["scene"], below["default"], below["why"]) == ("2", "-", "named")
-
-
-def test_what_takes_too_long_is_ended(serial_only):
-    with pytest.raises(solver_profiles.LateError, match="beyond 1 s"):
-        solver_profiles.limited(1, lambda: time.sleep(5))
-    assert solver_profiles.limited(1, lambda: 7) == 7
-
-
-def test_weak_scaling(serial_only, shared_tmp, comm):
-    tables = quick(weak_scaling, shared_tmp, comm)
-    for rows in tables.values():
-        for row in rows:
-            assert row["unknowns"] % row["subdomains"] == 0
-            assert row["F"] > row["S"] > 0
-
-
-def test_strong_scaling(serial_only, shared_tmp, comm):
-    (rows,) = quick(strong_scaling, shared_tmp, comm, "--ranks", "2").values()
-    assert [row["ranks"] for row in rows] == [1, 2]
-    assert rows[0]["faster"] == 1.0
-    assert rows[0]["unknowns"] == rows[1]["unknowns"]
-
-
-def test_subdomain_size(serial_only, shared_tmp, comm):
-    tables = quick(subdomain_size, shared_tmp, comm, "--ranks", "1")
-    for rows in tables.values():
-        assert [row["type"] for row in rows] == list(subdomain_size.TYPES)
-        assert rows[0]["forms"] == "implicit"
-        assert rows[1]["forms"] == "explicit"
-        assert len({row["F"] for row in rows}) == 1
-
-
-def test_time_against_error(serial_only, shared_tmp, comm):
-    """Errors fall, and degree 2 is nearer in energy on a mesh with as many unknowns."""
-    words = ["--ranks", "1", "--scenes", "half cylinder"]
-    tables = quick(time_against_error, shared_tmp, comm, *words)
-    for scene in words[3:]:
-        linear, finer, quadratic, _ = tables[scene]
-        assert finer["energy"] < linear["energy"]
-        assert finer["pressure"] < linear["pressure"]
-        assert quadratic["energy"] < linear["energy"]
-        assert quadratic["unknowns"] < finer["unknowns"]
-        groups = tables[f"{scene}, slopes and seconds"]
-        assert all(row["energy, slope over unknowns"] < 0.0 for row in groups)
 
 
 def test_pressures_are_compared_as_functions():
@@ -238,17 +87,6 @@ def test_pressures_are_compared_as_functions():
         assert abs(found["a"]) <= 1e-3
     ring = profiles.Samples.circle(1.0)
     assert np.allclose(ring.at(np.array([[3.0], [-3.0], [0.0]]), np.ones(3)), 1.0)
-
-
-def test_a_benchmark_that_starts_mpirun_says_so_under_mpirun(monkeypatch, tmp_path):
-    monkeypatch.setenv("OMPI_COMM_WORLD_SIZE", "2")
-    with pytest.raises(RuntimeError, match="starts mpirun itself"):
-        strong_scaling.main(["--quick", "--output", str(tmp_path)])
-
-
-def test_a_demo_that_fails_is_named(serial_only, tmp_path):
-    with pytest.raises(RuntimeError, match=r"(?s)cube_3d.py .* failed:.*unknown option"):
-        weak_scaling.main(["--quick", "--output", str(tmp_path), "-tfeti_rtoll", "1"])
 
 
 def test_tables_go_between_their_marks(tmp_path):

@@ -75,7 +75,6 @@ def least(A, b, B, c, normals):
 CASES = [
     ("quadrilateral", 1, 0.02, True, 0.0),
     ("triangle", 2, 0.0, False, 0.1),
-    ("triangle", 2, 0.02, True, 0.0),
 ]
 
 

@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from full_disk import clear, fill, full, left_in
+from full_disk import clear, fill, left_in
 from sheared import Driven
 
 import tfeti_dolfinx as tfeti
@@ -79,19 +79,13 @@ def flipped(place):
     return do
 
 
-def rewritten(change):
-    """Write a valid file of other contents."""
-
-    def do(file):
-        if file.suffix == ".npz":
-            with np.load(file) as found:
-                arrays = dict(found)
-            np.savez(file, **{name: change(values) for name, values in arrays.items()})
-        else:
-            lines = file.read_text().replace("0.5", "0.25").replace("1", "2")
-            file.write_text(lines)
-
-    return do
+def changed(file):
+    """Write a valid file of other numbers."""
+    if file.suffix == ".npz":
+        with np.load(file) as found:
+            np.savez(file, **{name: 1.01 * values for name, values in dict(found).items()})
+    else:
+        file.write_text(file.read_text().replace("0.5", "0.25").replace("1", "2"))
 
 
 def folder_instead(file):
@@ -108,19 +102,12 @@ def swapped(file):
 WAYS = {
     "cut in half": lambda file: file.write_bytes(file.read_bytes()[: file.stat().st_size // 2]),
     "emptied": lambda file: file.write_bytes(b""),
-    "zeros": lambda file: file.write_bytes(bytes(file.stat().st_size)),
     "a bit at the begin": flipped(0.0),
-    "a bit on the way": flipped(0.1),
     "a bit in the middle": flipped(0.5),
-    "a bit close to the end": flipped(0.98),
     "missing": lambda file: file.unlink(),
     "a folder instead": folder_instead,
     "another file": swapped,
-    "other numbers": rewritten(lambda values: 1.01 * values),
-    "other shapes": rewritten(lambda values: np.concatenate([np.ravel(values), [0.0]])),
-    "another type": rewritten(lambda values: values.astype(np.float32)),
-    "[]": lambda file: file.write_text("[]"),
-    '{"version": 3}': lambda file: file.write_text('{"version": 3}'),
+    "other numbers": changed,
     "more at the end": lambda file: file.write_bytes(file.read_bytes() + b"\nmore"),
 }
 
@@ -136,37 +123,9 @@ def test_what_is_damaged_is_named(scene, way):
         assert said or (way, name) == ("more at the end", "records.jsonl")
 
 
-def test_a_scaled_displacement_in_a_valid_file_is_named(scene):
-    def scale():
-        file = scene.copy / "state_2_0.npz"
-        with np.load(file) as found:
-            arrays = dict(found)
-        np.savez(file, **{**arrays, "u": 2 * arrays["u"]})
-
-    scene.begin()
-    scene.on_one_rank(scale)
-    with pytest.raises(tfeti.InputError, match=r"state_2_0\.npz is damaged.*by the checksum"):
-        scene.resume()
-
-
-def test_an_older_state_in_the_place_of_a_newer_one_is_named(scene):
-    """Both are whole: of the same program, on the same mesh."""
-    scene.begin()
-    scene.series(scene.copy, LATER).run(resume=True)
-    last = scene.copy / f"state_3_{scene.comm.rank}.npz"
-    shutil.copy(scene.kept / f"state_2_{scene.comm.rank}.npz", last)
-    with pytest.raises(tfeti.InputError, match=r"state_3_\d\.npz is damaged"):
-        scene.series(scene.copy, [*LATER, 2.0]).run(resume=True)
-
-
 def test_files_that_are_not_the_checkpoint_s_stay(scene, shared_tmp):
     """Also those whose names begin as its own."""
-    for name in (
-        "state_of_my_thesis.txt",
-        "fields_2024.csv",
-        "checkpoint.json.old",
-        "state_1_0.npz",
-    ):
+    for name in ("checkpoint.json.old", "state_1_0.npz"):
         folder = shared_tmp / name.replace(".", "_")
         scene.on_one_rank(folder.mkdir)
         scene.on_one_rank(lambda folder=folder, name=name: (folder / name).write_text("mine"))
@@ -177,10 +136,9 @@ def test_files_that_are_not_the_checkpoint_s_stay(scene, shared_tmp):
         assert len(list(folder.iterdir())) == 1
 
 
-@pytest.mark.parametrize("name", ["state_of_my_thesis.txt", "fields_2024.csv", "fields_9_0.npz"])
-def test_files_put_into_a_checkpoint_s_folder_stay(scene, name):
+def test_files_put_into_a_checkpoint_s_folder_stay(scene):
     scene.begin()
-    early = scene.series(scene.copy, LATER)
+    early, name = scene.series(scene.copy, LATER), "fields_9_0.npz"
     scene.on_one_rank(lambda: (scene.copy / name).write_text("mine"))
     before = left_in(scene.copy, scene.comm)
     with pytest.raises(tfeti.InputError, match=f"copy is a folder .* '{name}'"):
@@ -243,14 +201,6 @@ def test_a_folder_that_another_run_has_is_refused(scene):
         outer.run()
     scene.begin()
     assert not scene.check("")
-
-
-def test_a_series_that_begins_anew_on_a_full_disk_leaves_what_is_there(scene):
-    scene.begin()
-    before = left_in(scene.copy, scene.comm)
-    with full(0), pytest.raises(tfeti.InputError, match="copy: OSError: .*too large"):
-        scene.series(scene.copy, TIMES).run()
-    assert left_in(scene.copy, scene.comm) == before
 
 
 @pytest.mark.parametrize("kept", [True, False])

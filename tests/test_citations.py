@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tfeti_dolfinx.common.logging import PAPERS, cite
+from tfeti_dolfinx.common.logging import PAPERS
 from tfeti_dolfinx.qp.solvers import SOLVERS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -25,11 +25,8 @@ def of(*methods):
     ("demo", "options", "methods"),
     [
         ("linear_3d", [], ("tfeti", "pcpg")),
-        ("cube_3d", [], ("tfeti", "newton")),
-        ("cube_3d", ["-tfeti_qp_type", "smalse"], ("tfeti", "smalse")),
-        ("tbeti_cube_3d", [], ("tfeti", "newton", "boundary elements")),
+        ("tbeti_cube_3d", ["-tfeti_qp_type", "smalse"], ("tfeti", "smalse", "boundary elements")),
         ("belt_2d", [], ("tfeti", "newton", "newton on friction", "mortar")),
-        ("stacked_blocks_3d", [], ("tfeti", "newton", "mortar")),
     ],
 )
 def test_citations_of_a_run(serial_only, demo, options, methods, tmp_path):
@@ -42,17 +39,10 @@ def test_citations_of_a_run(serial_only, demo, options, methods, tmp_path):
         assert result.stdout.count(f"{{{key},") == 1
 
 
-def test_all_solvers_have_papers():
+def test_all_solvers_have_papers_that_are_whole():
     assert set(SOLVERS) <= set(PAPERS)
-
-
-def test_papers_are_whole():
     for papers in PAPERS.values():
         for paper in papers:
             assert paper.count("{") == paper.count("}")
             for field in ("title", "author", "year"):
                 assert f"{field} = {{" in paper
-
-
-def test_methods_without_a_paper_are_passed_over():
-    cite("nobody's method")

@@ -1,6 +1,7 @@
 """Segments against scipy's half-space intersections, and by their areas."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
@@ -9,15 +10,14 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 from tfeti_dolfinx.mortar.clipping import (
     clip_intervals,
     clip_polygons,
-    contains,
     quadrature_on_intervals,
 )
+
+pytestmark = pytest.mark.usefixtures("serial_only")
 
 
 def random_convex(rng, k, n):
     """n convex polygons of k vertices, in random orientation."""
-    angle = np.sort(rng.uniform(0, 2 * np.pi, (n, k)), axis=1)
-    spread = angle + 2 * np.pi * np.arange(k) / k
     spread = np.sort(np.mod(2 * np.pi * np.arange(k) / k + 0.3 * rng.random((n, k)), 2 * np.pi))
     points = np.stack((np.cos(spread), np.sin(spread)), axis=2) * rng.uniform(0.2, 2, (n, 1, 1))
     points += rng.uniform(-1, 1, (n, 1, 2))
@@ -89,15 +89,3 @@ def test_intervals():
     assert np.allclose(
         np.bincount(owner, w * x[:, 0] ** 3), (ends[:2, 1] ** 4 - ends[:2, 0] ** 4) / 4
     )
-
-
-def test_what_contains_a_point():
-    square = np.array([[[0, 0], [1, 0], [1, 1], [0, 1]]], dtype=float)
-    inside, outside, edge = ([[0.3, 0.9]], [[1.2, 0.5]], [[1.0, 0.5]])
-    for polygon in (square, square[:, ::-1]):
-        assert contains(polygon, np.array(inside)).all()
-        assert not contains(polygon, np.array(outside)).any()
-        assert not contains(polygon, np.array(edge)).any()
-    interval = np.array([[[2.0], [1.0]]])
-    assert contains(interval, np.array([[1.5]])).all()
-    assert not contains(interval, np.array([[2.5]])).any()

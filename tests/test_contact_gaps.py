@@ -49,20 +49,24 @@ def bent(cell, n_lower, n_upper, lower, upper):
 
 
 @pytest.mark.parametrize("sides", ORDERS)
-@pytest.mark.parametrize("n", [(2, 16), (16, 2), (3, 8)])
-@pytest.mark.parametrize("curvatures", [(0.0, 0.4), (-0.3, 0.3), (-0.4, 0.0), (0.025, 0.4)])
-@pytest.mark.parametrize("cell", CELLS)
-def test_bodies_that_only_touch_have_no_overlap(cell, curvatures, n, sides):
+@pytest.mark.parametrize(
+    ("cell", "n", "curvatures"),
+    [
+        ("triangle", (2, 16), (0.025, 0.4)),
+        ("quadrilateral", (16, 2), (-0.4, 0.0)),
+        ("tetrahedron", (3, 8), (-0.3, 0.3)),
+        ("hexahedron", (2, 16), (0.0, 0.4)),
+    ],
+)
+def test_bodies_that_only_touch_have_no_overlap(cell, n, curvatures, sides):
     """Flat, convex and concave sides; a mean with ψ_i, negative somewhere, must not say more."""
-    if curvatures[0] > 0.0 and n[0] % 2:
-        pytest.skip("a chord of the concave side would cut into the other body")
     d = bent(cell, *n, *curvatures)
     gaps = gathered(searched([sided(*sides, reach=0.5)], dofs_of(d), d).gap)
     assert len(gaps) > 0
     assert gaps.min() > -1e-12
 
 
-@pytest.mark.parametrize("size", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("size", [1e-3, 1e3])
 def test_a_gap_that_is_rounding_of_coordinates_is_none(size):
     """Turned bodies that touch; one that is 1e-12 of their size stays."""
     for gap in (0.0, 1e-12):
@@ -105,16 +109,13 @@ def check_at_rest(p):
     assert np.abs(gathered(p.u.x.array)).max() < NO_PRESSURE
 
 
-@pytest.mark.parametrize("hold", HOLDS)
-@pytest.mark.parametrize("sides", ORDERS)
 @pytest.mark.parametrize(
-    ("cell", "n", "curvatures"),
+    ("cell", "n", "curvatures", "sides", "hold"),
     [
-        ("triangle", (2, 16), (0.025, 0.4)),
-        ("triangle", (16, 2), (-0.4, 0.0)),
-        ("quadrilateral", (3, 8), (-0.3, 0.3)),
-        ("tetrahedron", (1, 8), (0.0, 0.4)),
-        ("hexahedron", (8, 1), (-0.4, 0.0)),
+        ("triangle", (2, 16), (0.025, 0.4), ORDERS[0], "loose"),
+        ("quadrilateral", (3, 8), (-0.3, 0.3), ORDERS[1], "springs"),
+        ("tetrahedron", (1, 8), (0.0, 0.4), ORDERS[0], "held"),
+        ("hexahedron", (8, 1), (-0.4, 0.0), ORDERS[1], "loose"),
     ],
 )
 def test_bodies_that_only_touch_do_not_push_each_other(cell, n, curvatures, sides, hold):
@@ -122,22 +123,16 @@ def test_bodies_that_only_touch_do_not_push_each_other(cell, n, curvatures, side
     check_at_rest(unloaded(bent(cell, *n, *curvatures), hold, sided(*sides, reach=0.5)))
 
 
-@pytest.mark.parametrize("order", [1, 2])
-@pytest.mark.parametrize("sides", [("arc", "top"), ("top", "arc")])
+@pytest.mark.parametrize(("sides", "order"), [(("arc", "top"), 2), (("top", "arc"), 1)])
 def test_a_disc_on_a_block_does_not_push_it(comm, sides, order):
     d, bcs = disc_on_block(comm, 24, order, pushed=0.0)
     check_at_rest(two_body_problem(d, no_load, bcs, [sided(*sides, reach=0.3)], degree=order))
 
 
-@pytest.mark.parametrize("sides", [("arc", "top"), ("top", "arc")])
-def test_curved_facets_that_only_touch_have_no_overlap(comm, sides):
-    d, _ = disc_on_block(comm, 24, 2)
-    gaps = gathered(searched([sided(*sides, reach=0.3)], dofs_of(d), d).gap)
-    assert -1e-12 < gaps.min() < 0.01
-
-
-@pytest.mark.parametrize("slope", [-0.02, 0.02])
-@pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.parametrize(
+    ("cell", "slope"),
+    [("triangle", 0.02), ("quadrilateral", -0.02), ("tetrahedron", -0.02), ("hexahedron", 0.02)],
+)
 def test_an_overhanging_wedge(cell, slope):
     """The last facets hang over an edge, where the wedge closes to nothing or opens.
 
@@ -187,18 +182,16 @@ def against_lame(p):
     return np.average(pressure, weights=area) / exact - 1.0, error / exact
 
 
-@pytest.mark.parametrize("secondary", ["auto", "shaft", "hub"])
 @pytest.mark.parametrize(
-    ("cells", "order", "mesh", "contact"),
+    ("cells", "order", "mesh", "contact", "secondary"),
     [
-        ((48, 64), 1, {}, {"gap": -OVERLAP}),
-        ((48, 64), 1, {}, {"gap": lambda x: -OVERLAP * np.hypot(x[0], x[1])}),
-        ((96, 128), 1, {"triangles": True}, {"gap": -OVERLAP}),
-        ((48, 64), 1, {}, {"gap": "curved"}),
-        ((40, 48), 2, {}, {}),
-        ((40, 48), 2, {"triangles": True}, {}),
+        ((48, 64), 1, {}, {"gap": lambda x: -OVERLAP * np.hypot(x[0], x[1])}, "auto"),
+        ((96, 128), 1, {"triangles": True}, {"gap": -OVERLAP}, "hub"),
+        ((48, 64), 1, {}, {"gap": "curved"}, "shaft"),
+        ((40, 48), 2, {}, {}, "hub"),
+        ((40, 48), 2, {"triangles": True}, {}, "auto"),
     ],
-    ids=["number", "function", "triangles", "curved", "geometry", "geometry, triangles"],
+    ids=["function", "triangles", "curved", "geometry", "geometry, triangles"],
 )
 def test_a_ring_shrunk_on_another(cells, order, mesh, contact, secondary):
     overlap = OVERLAP if contact.get("gap", "curved") == "curved" else 0.0
@@ -208,26 +201,14 @@ def test_a_ring_shrunk_on_another(cells, order, mesh, contact, secondary):
     assert error <= (0.03 if contact else 0.05)
 
 
-@pytest.mark.parametrize(
-    ("cells", "order", "subdomains", "secondary", "contact"),
-    [
-        ((48, 64), 1, 4, "shaft", {"gap": -OVERLAP}),  # a ring that is a subdomain of its own
-        ((48, 64), 1, 8, "shaft", {"gap": -OVERLAP}),
-        ((24, 32), 1, 8, "hub", {"gap": -OVERLAP}),
-        ((24, 32), 2, 8, "shaft", {}),
-        ((48, 64), 2, 8, "hub", {}),
-    ],
-)
-def test_free_rings_are_solved(cells, order, subdomains, secondary, contact):
+def test_free_rings_are_solved():
     """Rows hold the turn of one in the other by the errors of their normals, or not at all."""
-    overlap = 0.0 if contact else OVERLAP
-    mesh = {"subdomains": subdomains}
-    p = ring_problem(cells, overlap, order, order, mesh, 0.0, secondary=secondary, **contact)
+    mesh = {"subdomains": 8}
+    p = ring_problem((24, 32), OVERLAP, 2, 2, mesh, 0.0, secondary="hub")
     mean, _ = against_lame(p)
     assert p.report.converged_reason == "CONVERGED_RTOL"
     assert p.report.residuals["displacement_error"] <= 1e-8
     assert p.report.residuals["penetration"] <= 1e-8 * OVERLAP
-    assert p.report.F_multiplications <= 100
     assert p.report.free_modes >= 3
     assert "rotation in the plane" in {motion["mode"] for motion in p.report.nearly_free}
     assert abs(mean) <= 0.011
@@ -255,15 +236,3 @@ def test_the_gap_of_a_pair_is_what_is_given():
     x = group_points(dofs)[records.group]
     assert np.allclose(records.gap, x[:, 0] - 0.5)
     assert MPI.COMM_WORLD.allreduce(len(records)) == 5
-
-
-def test_a_given_gap_ends_where_the_reach_does():
-    d = bent("triangle", 3, 16, 0.0, 0.4)
-    dofs = dofs_of(d)
-    geometry, given = (
-        searched([sided(*ORDERS[0], reach=0.05, gap=gap)], dofs, d) for gap in ("geometry", -0.01)
-    )
-    within = geometry.gap <= 0.05
-    assert np.allclose(given.gap, np.where(within, -0.01, geometry.gap))
-    assert np.array_equal(given.within_reach, within)
-    assert 0 < MPI.COMM_WORLD.allreduce(np.sum(within)) < MPI.COMM_WORLD.allreduce(len(within))

@@ -7,7 +7,6 @@ from scenes import decomposed, displacement, problem, relative
 
 import tfeti_dolfinx as tfeti
 
-FAR = [0.1, 1.0, 1e3, 1e6]
 SIDES = ("upper bottom", "lower top")
 
 
@@ -15,7 +14,7 @@ def below(distance, **changes):
     return tfeti.Obstacle("bottom", tfeti.Plane((0, -distance), (0, 1)), **changes)
 
 
-@pytest.mark.parametrize("distance", FAR)
+@pytest.mark.parametrize("distance", [0.1, 1e6])
 def test_an_obstacle_that_is_never_touched_changes_nothing(distance):
     without = problem(decomposed("quadrilateral", 6), (0.0, -1e-3))
     with_it = problem(decomposed("quadrilateral", 6), (0.0, -1e-3), [below(distance)])
@@ -27,7 +26,7 @@ def test_an_obstacle_that_is_never_touched_changes_nothing(distance):
     assert with_it.report.unmet_contacts == ["0: obstacle of surface 'bottom'"]
 
 
-@pytest.mark.parametrize("distance", FAR[:-1])  # farther, rounding moves the upper box's nodes
+@pytest.mark.parametrize("distance", [0.1, 1e3])
 def test_a_pair_that_never_touches_changes_nothing(distance):
     found = []
     for contacts in ([], [sided(*SIDES)]):
@@ -43,7 +42,8 @@ def test_a_pair_that_never_touches_changes_nothing(distance):
 def test_who_meets_nobody_is_said(caplog):
     d = stacked("quadrilateral", 3, 4, 4)
     sides = ["lower bottom", "lower left", "upper left"]
-    contacts = [sided(*SIDES), sided("upper right", "lower right"), wall(d)]
+    contacts = [sided(*SIDES), sided("upper right", "lower right")]
+    contacts += [tfeti.Obstacle("lower top", tfeti.Plane((0, 30), (0, -1)))]
     p = two_body_problem(d, pressed(d), held(d, *sides), contacts)
     p.solve()
     unmet = ["1: contact of 'upper right' with 'lower right'", "2: obstacle of surface 'lower top'"]
@@ -53,38 +53,30 @@ def test_who_meets_nobody_is_said(caplog):
     assert "'upper bottom'" not in caplog.text
 
 
-def wall(d):
-    return tfeti.Obstacle("lower top", tfeti.Plane((0, 30), (0, -1)))
-
-
-@pytest.mark.parametrize("reach", [None, 1e-3, 0.3, np.inf])
+@pytest.mark.parametrize("reach", [None, 1e-3, np.inf])
 def test_the_reach_does_not_change_the_answer(reach):
-    """A plane that the load closes, and a pair, out of reach or in it."""
-    p = problem(
-        decomposed("quadrilateral", 8), (0.0, -0.05), [below(0.02, reach=reach)], rtol=1e-10
-    )
-    p.solve()
-    reference = problem(
-        decomposed("quadrilateral", 8), (0.0, -0.05), [below(0.02, reach=1.0)], rtol=1e-10
-    )
-    reference.solve()
-    assert 0 < p.report.active_contacts == reference.report.active_contacts
-    assert relative(displacement(p)[1], displacement(reference)[1]) <= 1e-7
+    """Of a plane that the load closes."""
+    d = decomposed("quadrilateral", 8)
+    found = [problem(d, (0.0, -0.05), [below(0.02, reach=one)], rtol=1e-10) for one in (reach, 1.0)]
+    for p in found:
+        p.solve()
+    assert (found[0].report.late_contact_rows > 0) == (reach == 1e-3)
+    assert 0 < found[0].report.active_contacts == found[1].report.active_contacts
+    assert relative(*(displacement(p)[1] for p in found)) <= 1e-7
 
 
-@pytest.mark.parametrize("apart", [0.2, 5.0])
-def test_a_body_that_only_a_far_obstacle_holds(apart):
+def test_a_body_that_only_a_far_obstacle_holds():
     """What is farther yet, and not needed, gets no rows."""
     d = decomposed("quadrilateral", 6)
     beyond = tfeti.Obstacle("top", tfeti.Plane((0, 1e6), (0, -1)))
-    p = problem(d, (0.0, -0.01), [below(apart), beyond], clamped=(), rtol=1e-9)
+    p = problem(d, (0.0, -0.01), [below(5.0), beyond], clamped=(), rtol=1e-9)
     p.solve()
     assert p.report.contact_rows == p.report.late_contact_rows == 7
     assert p.report.unmet_contacts == ["1: obstacle of surface 'top'"]
     assert np.isclose(gathered(p.solution.contact(0).force).sum(), 0.01)
 
 
-@pytest.mark.parametrize("reach", [0.0, -1.0, np.nan, "1", True])
+@pytest.mark.parametrize("reach", [0.0, np.nan, "1", True])
 def test_a_reach_that_is_none(reach):
     p = problem(decomposed("quadrilateral", 4), contacts=[below(0.1, reach=reach)])
     with pytest.raises(tfeti.InputError, match="obstacle of surface 'bottom': reach=.*, expected"):

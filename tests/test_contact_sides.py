@@ -29,13 +29,8 @@ def scene(
 @pytest.mark.parametrize(
     ("n", "stiffness", "secondary"),
     [
-        ((3, 6), 1.0, LOWER),
-        ((6, 3), 1.0, UPPER),
-        ((4, 4), 5.0, LOWER),
-        ((4, 4), 0.2, UPPER),
-        ((6, 3), 5.0, UPPER),
         ((3, 6), 0.1, LOWER),
-        ((16, 15), 0.2, UPPER),
+        ((6, 3), 5.0, UPPER),
         ((16, 15), 5.0, LOWER),
         ((4, 4), 1.0, None),
     ],
@@ -54,12 +49,11 @@ def test_the_coarser_side_is_taken_and_of_equal_meshes_the_softer_one(
 
 
 @pytest.mark.parametrize(
-    ("cell", "degree"), [("triangle", 2), ("tetrahedron", 1), ("hexahedron", 2)]
+    ("cell", "degree", "subdomains"), [("triangle", 2, 5), ("tetrahedron", 1, 2)]
 )
-def test_the_side_is_the_same_for_all_elements_and_subdomains(cell, degree):
-    for subdomains in (2, 5):
-        p = scene(tfeti.Contact(UPPER, LOWER), (2, 3), 1.0, cell, degree, subdomains)
-        assert p.solution.contacts[0].surfaces == (LOWER, UPPER)
+def test_the_side_is_the_same_for_all_elements_and_subdomains(cell, degree, subdomains):
+    p = scene(tfeti.Contact(UPPER, LOWER), (2, 3), 1.0, cell, degree, subdomains)
+    assert p.solution.contacts[0].surfaces == (LOWER, UPPER)
 
 
 def test_a_mesh_that_is_fine_only_where_bodies_meet_is_judged_there():
@@ -75,21 +69,15 @@ def test_a_mesh_that_is_fine_only_where_bodies_meet_is_judged_there():
 
 
 @pytest.mark.parametrize("by_tag", [False, True])
-@pytest.mark.parametrize("sides", [(UPPER, LOWER), (LOWER, UPPER)])
-def test_a_side_can_be_named(sides, by_tag, caplog):
+def test_a_side_can_be_named(by_tag):
     d = stacked("quadrilateral", 4, 4, 4)
-    named = d.surface(UPPER) if by_tag else UPPER
-    p = scene(tfeti.Contact(*sides, secondary=named), (4, 6))
+    p = scene(tfeti.Contact(LOWER, UPPER, secondary=d.surface(UPPER) if by_tag else UPPER), (4, 6))
     assert p.solution.contacts[0].surfaces == (UPPER, LOWER)
-    assert "times as stiff" not in caplog.text
-
-
-def test_a_coarser_side_is_not_warned_of_however_stiff_it_is(caplog):
-    scene(sided(UPPER, LOWER), (6, 4), 100.0)
-    assert "times as stiff" not in caplog.text
 
 
 def test_a_choice_that_is_much_the_worse_one_is_warned_of(caplog):
+    scene(sided(UPPER, LOWER), (6, 4), 100.0)
+    assert "times as stiff" not in caplog.text  # it is the coarser one
     scene(sided(UPPER, LOWER), (4, 5), 3.0)
     warned = "'upper bottom' is 3.75 times as stiff per area as 'lower top'" in caplog.text
     assert warned == (MPI.COMM_WORLD.rank == 0)

@@ -62,18 +62,16 @@ def reference():
 # elements of the pin and of the lug, what the mesh is besides, its share of the force, and how far
 # the peak pressure of degree 1 may be off
 LUGS = {
-    "finer lug": ((3.0, 2.0), {}, 1.0, 0.06),
     "finer pin": ((2.0, 3.0), {}, 1.0, 0.05),
-    "much finer pin": ((0.75, 3.0), {}, 1.0, 0.05),
     "half": ((3.0, 2.0), {"half": True}, 0.5, 0.05),
     "tetrahedra": ((3.0, 2.0), {"thickness": 3.0}, 3.0, 0.1),
 }
 
 
 @pytest.mark.parametrize("name", LUGS)
-def test_facets_that_decide_are_warned_of(name):
-    """They lie up to h²/8R = 0.11 beside surfaces whose clearance is 0.05."""
-    sizes, mesh, share, _ = LUGS[name]
+def test_a_pin_in_a_lug_with_curved_gaps(name):
+    """Without them facets that decide are warned of: up to h²/8R = 0.11 beside the surfaces."""
+    sizes, mesh, share, far = LUGS[name]
     p = pin_in_lug(sizes, **mesh)
     force, _ = force_and_peak(p) / reference()
     assert abs(force / share - 1.0) > 0.4
@@ -81,11 +79,6 @@ def test_facets_that_decide_are_warned_of(name):
     assert warning.startswith(SAYS)
     assert warning.endswith(EXPECTS)
     assert "change the gap, at most 0.05" in warning
-
-
-@pytest.mark.parametrize("name", LUGS)
-def test_a_pin_in_a_lug_with_curved_gaps(name):
-    sizes, mesh, share, far = LUGS[name]
     p = pin_in_lug(sizes, "curved", **mesh)
     force, peak = force_and_peak(p) / reference()
     assert abs(force / share - 1.0) < 0.01
@@ -103,8 +96,8 @@ def test_facets_that_miss_each_other_are_warned_of():
 
 @pytest.mark.parametrize(
     ("sizes", "order", "gap"),
-    [((3.0, 2.0), 2, "geometry"), ((3.0, 2.0), 1, CLEARANCE), ((0.3, 0.3), 1, "geometry")],
-    ids=["degree 2", "given", "fine"],
+    [((3.0, 2.0), 2, "geometry"), ((3.0, 2.0), 1, CLEARANCE)],
+    ids=["degree 2", "given"],
 )
 def test_facets_that_do_not_decide_are_not_warned_of(sizes, order, gap):
     p = pin_in_lug(sizes, gap, order)
@@ -114,12 +107,10 @@ def test_facets_that_do_not_decide_are_not_warned_of(sizes, order, gap):
     assert not p.report.warnings
 
 
-@pytest.mark.parametrize("sizes", [("arc", "top"), ("top", "arc")])
-@pytest.mark.parametrize("pushed", [0.01, 0.02])
-def test_a_disc_on_a_block_is_not_warned_of(comm, sizes, pushed):
+def test_a_disc_on_a_block_is_not_warned_of(comm):
     """Surfaces that do not conform: near by, the gap is soon more than coarse facets change."""
-    d, bcs = disc_on_block(comm, 24, 1, pushed=pushed)
-    p = two_body_problem(d, no_load, bcs, [sided(*sizes, reach=0.3)])
+    d, bcs = disc_on_block(comm, 24, 1, pushed=0.01)
+    p = two_body_problem(d, no_load, bcs, [sided("arc", "top", reach=0.3)])
     p.solve()
     assert p.report.active_contacts > 0
     assert not any("facets" in text for text in p.report.warnings)
@@ -141,13 +132,15 @@ def test_facets_do_not_show_at_an_obstacle(gap):
     assert not p.report.warnings
 
 
+PAIRS = list(zip(CELLS, 2 * ORDERS, strict=True))
+
+
 def height(x):
     """A saddle, or a bent line."""
     return 0.3 * x[:, 0] ** 2 - (0.2 * x[:, 1] ** 2 if x.shape[1] == 2 else 0.0)
 
 
-@pytest.mark.parametrize("sides", ORDERS)
-@pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.parametrize(("cell", "sides"), PAIRS)
 def test_curved_gaps_of_surfaces_of_degree_2(cell, sides):
     """Both have the same shape, 0.01 apart: at rims, in corners, and however coarse they are."""
     d = shaped(cell, 3, 5, height, lambda x: height(x) + 0.01)
@@ -161,8 +154,7 @@ def test_curved_gaps_of_surfaces_of_degree_2(cell, sides):
     assert curved < 0.12 * flat
 
 
-@pytest.mark.parametrize("sides", ORDERS)
-@pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.parametrize(("cell", "sides"), PAIRS)
 def test_edges_are_not_rounded_off(cell, sides):
     """A roof of 90 degrees in another."""
     d = shaped(cell, 4, 6, lambda x: -np.abs(x[:, 0]), lambda x: 0.01 - np.abs(x[:, 0]))

@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tfeti_dolfinx.qp.sets import Bounds, Discs, Ellipses, Product, Status
 from tfeti_dolfinx.testing import check_feasible_set
+
+pytestmark = pytest.mark.usefixtures("serial_only")
 
 SEEDS = st.integers(0, 10_000)
 
@@ -24,6 +26,7 @@ def level(a, x):
     return np.sum(np.divide(x, a, out=np.zeros_like(x), where=a > 0.0) ** 2, axis=1)
 
 
+@settings(max_examples=40)
 @given(SEEDS, st.sampled_from([1, 2]), st.sampled_from([1.0, 1e-3, 1e-6]))
 def test_discs_fulfil_the_contract(seed, k, size):
     rng = np.random.default_rng(seed)
@@ -31,6 +34,7 @@ def test_discs_fulfil_the_contract(seed, k, size):
     check_feasible_set(Discs(radius, k, size * rng.standard_normal((6, k))), 6 * k, seed)
 
 
+@settings(max_examples=40)
 @given(SEEDS, st.sampled_from([1, 2]))
 def test_ellipses_fulfil_the_contract(seed, k):
     rng = np.random.default_rng(seed)
@@ -38,6 +42,7 @@ def test_ellipses_fulfil_the_contract(seed, k):
     check_feasible_set(Ellipses(a, rng.standard_normal((6, k))), 6 * k, seed)
 
 
+@settings(max_examples=40)
 @given(SEEDS)
 def test_a_product_of_all_of_them_fulfils_the_contract(seed):
     order = np.random.default_rng(seed).permutation(26)
@@ -66,17 +71,6 @@ def test_projections_fulfil_the_variational_inequality(seed, exponent):
     sizes = np.linalg.norm(away, axis=-1) * np.maximum(np.linalg.norm(inside, axis=-1), 1e-300)
     assert np.all(products <= 1e-9 * sizes)
     assert np.allclose(ellipses.project(x), x, rtol=1e-12, atol=1e-15)
-
-
-@given(SEEDS)
-def test_nearest_points_of_ellipses_lie_along_their_normals(seed):
-    """z − Pz = μ H Pz with H = diag(a)⁻², μ ≥ 0: the secular equation, and its exact solution."""
-    rng = np.random.default_rng(seed)
-    a = rng.uniform(0.01, 2.0, (20, 2))
-    angle, mu = rng.uniform(0.0, 2.0 * np.pi, 20), rng.uniform(0.0, 5.0, (20, 1))
-    on = a * np.stack((np.cos(angle), np.sin(angle)), axis=1)
-    z = on + mu * on / a**2
-    assert np.allclose(Ellipses(a).project(z.ravel()).reshape(-1, 2), on, rtol=0, atol=1e-12)
 
 
 @given(SEEDS)
@@ -138,27 +132,3 @@ def test_the_longest_step_ends_on_the_boundary(seed):
     x, p = Ellipses(a).project(rng.standard_normal(2)), rng.standard_normal(2)
     step = Ellipses(a).max_step(x, p)
     assert level(a, x - step * p)[0] == pytest.approx(1.0, abs=1e-9)
-
-
-def test_a_point_that_cannot_move_has_no_step():
-    fixed = Ellipses(np.array([[1.0, 0.0]]))
-    assert fixed.max_step(np.zeros(2), np.array([1.0, 1.0])) == 0.0
-    assert fixed.max_step(np.zeros(2), np.array([1.0, 0.0])) == 1.0
-    assert fixed.max_step(np.zeros(2), np.zeros(2)) == np.inf
-
-
-@given(SEEDS)
-def test_the_parts_of_a_gradient_sum_up_to_the_projected_one(seed):
-    """φ + β is the projection of g on the tangent cone's negative: what is left pushes out."""
-    rng = np.random.default_rng(seed)
-    a = semi_axes(seed)
-    x, g = Ellipses(a).project(3.0 * rng.standard_normal(a.size)), rng.standard_normal(a.size)
-    phi, beta = Ellipses(a).split(x, g)
-    assert np.all(phi * beta == 0.0)
-    left = (g - phi - beta).reshape(a.shape)
-    assert abs(np.sum(left * (phi + beta).reshape(a.shape))) <= 1e-12  # Moreau's decomposition
-    x = x.reshape(a.shape)
-    both = (a > 0.0).all(axis=1)
-    assert np.all(np.sum(left * x, axis=1)[both] <= 1e-12)
-    inside = both & (level(a, x) < 1.0 - 1e-9)
-    assert np.all(left[inside] == 0.0)

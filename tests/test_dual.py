@@ -1,12 +1,13 @@
-"""Exact identities of F, G, P, Q, homogenisation and recovery."""
+"""Exact identities of F, preconditioners, homogenisation and recovery; of P and Q: test_faces."""
 
 import numpy as np
 import pytest
 from scenes import curved_obstacle, decomposed, problem
+from test_faces import in_a_corner
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.feti.dual import feasible_particular
-from tfeti_dolfinx.feti.operator import check_operator
+from tfeti_dolfinx.feti.operator import PRECONDITIONERS, ScaledRows, check_operator
 
 
 @pytest.fixture(scope="module")
@@ -24,95 +25,25 @@ def dual(solved):
     return solved.dual
 
 
-@pytest.fixture(scope="module")
-def held_by_contact():
-    """A block in a corner of three planes: every rigid motion is held, by contact alone."""
-    d = decomposed("hexahedron", 3, subdomains=4)
-    planes = {"bottom": (0, 0, 1), "left": (1, 0, 0), "front": (0, 1, 0)}
-    contacts = [tfeti.Obstacle(name, tfeti.Plane((0, 0, 0), n)) for name, n in planes.items()]
-    p = problem(d, (-0.01, -0.02, -0.05), contacts, clamped=())
-    p.solve()
-    yield p.dual
-    p.destroy()
-
-
-def random_vec(dual, seed=0):
-    vec = dual.d.duplicate()
-    rng = np.random.default_rng(seed + dual.coarse.comm.rank)
-    vec.array[:] = rng.standard_normal(vec.getLocalSize())
-    return vec
-
-
 def test_F_is_symmetric_and_positive(dual):
     check_operator(dual.F, dual.d)
 
 
 def test_preconditioners_are_symmetric_and_positive(dual):
-    from tfeti_dolfinx.feti.operator import PRECONDITIONERS, ScaledRows
-
     scaled = ScaledRows(dual.constraints.B, dual.constraints.weights)
     for make in PRECONDITIONERS.values():
         check_operator(make(scaled, dual.subdomains), dual.d)
 
 
-def test_projectors(dual):
-    x, Qx = random_vec(dual), dual.d.duplicate()
-    coarse = dual.coarse
-    coarse.apply_Q(x, Qx)
-    assert coarse.norm_Q(x) == pytest.approx(Qx.norm(), rel=1e-10)
-    assert np.allclose(coarse.G(x.array_r), coarse.G(Qx.array_r), atol=1e-11 * x.norm())
-    Px = x.copy()
-    coarse.project(Px)
-    assert np.abs(coarse.G(Px.array_r)).max() <= 1e-11 * x.norm()
-    assert abs(Px.dot(Qx)) <= 1e-11 * x.norm() ** 2
-    PPx = Px.copy()
-    coarse.project(PPx)
-    PPx.axpy(-1.0, Px)
-    assert PPx.norm() <= 1e-11 * x.norm()
-
-
-def test_P_annihilates_the_range_of_Gt(dual):
-    coarse = dual.coarse
-    y = dual.d.duplicate()
-    coarse.combine(np.arange(1.0, coarse.dimension + 1), y)
-    size = y.norm()
-    assert np.allclose(coarse.coordinates(y), np.arange(1.0, coarse.dimension + 1), rtol=1e-8)
-    coarse.project(y)
-    assert y.norm() <= 1e-11 * size
-
-
-def test_the_particular_solution_solves_G_lam_e(dual):
-    lam = dual.d.duplicate()
-    dual.coarse.particular(lam)
-    assert np.allclose(dual.coarse.G(lam.array_r), dual.coarse.e, atol=1e-12)
-
-
-def test_gram_is_G_Gt(dual):
-    coarse = dual.coarse
-    y = np.random.default_rng(0).standard_normal(coarse.dimension)
-    assert np.allclose(coarse.grams.whole @ y, coarse.G(coarse.Gt @ y), atol=1e-11)
-
-
-def test_feasible_homogenisation(held_by_contact):
-    dual = held_by_contact
+def test_the_feasible_homogenisation_is_the_smallest():
+    """Its optimality conditions: λ̄ = Gᵀα on carrying rows, (Gᵀα) ≤ 0 on the others."""
+    p = in_a_corner()
+    p.solve()
+    dual = p.dual
     coarse, bounded = dual.coarse, dual.constraints.sets.normals
     lam = feasible_particular(coarse, dual.d).array_r
     assert np.allclose(coarse.G(lam), coarse.e, atol=1e-11)
     assert np.all(lam[bounded] >= 0.0)
-    natural = dual.d.duplicate()
-    coarse.particular(natural)
-    lowest = coarse.comm.allreduce(float(np.min(natural.array_r[bounded], initial=0.0)))
-    size = np.sqrt(coarse.comm.allreduce(float(lam @ lam)))
-    assert size >= natural.norm() * (1 - 1e-12)
-    if lowest >= 0.0:
-        assert size == pytest.approx(natural.norm())
-
-
-def test_the_feasible_homogenisation_is_the_smallest(held_by_contact):
-    """Its optimality conditions: λ̄ = Gᵀα on carrying rows, (Gᵀα) ≤ 0 on the others."""
-    dual = held_by_contact
-    coarse, bounded = dual.coarse, dual.constraints.sets.normals
-    lam = feasible_particular(coarse, dual.d).array_r
     carrying = np.ones(len(lam), dtype=bool)
     carrying[bounded] = lam[bounded] > 0.0
     gram = coarse.grams.of_rows(carrying).toarray()
@@ -120,6 +51,7 @@ def test_the_feasible_homogenisation_is_the_smallest(held_by_contact):
     force = coarse.Gt @ alpha
     assert np.allclose(force[carrying], lam[carrying], atol=1e-10)
     assert np.all(force[~carrying] <= 1e-10)
+    p.destroy()
 
 
 def test_recovered_displacement_meets_the_rows(solved):
@@ -137,25 +69,3 @@ def test_recovered_displacement_meets_the_rows(solved):
     closed = lam[bounded] > 0.0
     assert solved.decomposition.comm.allreduce(int(np.sum(closed))) > 0
     assert np.all(np.abs(residual[bounded][closed]) <= 1e-8 * size)
-
-
-def test_recovered_displacement_is_in_equilibrium(solved):
-    """K u = f − Bᵀλ in every subdomain."""
-    constraints = solved.dual.constraints
-    lam, force = constraints.c.duplicate(), constraints.B.createVecRight()
-    lam.array[:] = solved.solution.lam
-    constraints.B.multTranspose(lam, force)
-    dofs = solved.dofs
-    forms = solved._system.forms
-    left = dofs.to_primal(forms.stiffness() @ solved.u.x.array - forms.load())
-    left[constraints.trace] += force.array_r
-    assert np.all(np.abs(left) <= 1e-9 * force.norm())
-
-
-def test_counters_charge_who_asked(dual):
-    x, y = random_vec(dual), dual.d.duplicate()
-    before = dual.F.count["someone"], dual.F.count["solver"]
-    with dual.F.charged_to("someone"):
-        dual.F.mult(x, y)
-    dual.F.mult(x, y)
-    assert (dual.F.count["someone"], dual.F.count["solver"]) == (before[0] + 1, before[1] + 1)

@@ -7,13 +7,9 @@ import pytest
 import ufl
 from bodies import held, sided, stacked, stiffer_above, two_body_problem
 from dolfinx import fem
-from mpi4py import MPI
 from scenes import curved_obstacle, decomposed, problem
-from test_own_set import HalfSpaces
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.feti.duality_gap import admissible
-from tfeti_dolfinx.qp.sets import Product
 from tfeti_dolfinx.solve.solver import solve_dual
 
 CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
@@ -71,7 +67,7 @@ def exact(p):
 
 
 @pytest.mark.parametrize(
-    "seed", [pytest.param(s, marks=[] if s < 24 else [pytest.mark.slow]) for s in range(50)]
+    "seed", [pytest.param(s, marks=[] if s < 12 else [pytest.mark.slow]) for s in range(50)]
 )
 def test_the_bound_is_one_and_at_most_twenty_times_the_error(seed):
     p = drawn(seed)
@@ -89,65 +85,12 @@ def test_the_bound_is_one_and_at_most_twenty_times_the_error(seed):
     p.destroy()
 
 
-def on_rows(p, u):
-    """B u of this rank's rows."""
-    rows = p.dual.constraints
-    w, y = rows.B.createVecRight(), rows.c.duplicate()
-    w.array[:] = u[p.dual.subdomains.trace]
-    rows.B.mult(w, y)
-    found = np.array(y.array_r)
-    w.destroy()
-    y.destroy()
-    return found
-
-
-def summed(p, value):
-    return p.dofs.comm.allreduce(float(value))
-
-
-@pytest.mark.parametrize("seed", [6, 11, 13, 41, 44])
-def test_the_gap_is_that_of_an_admissible_displacement(seed):
-    """J(v) from K, f and friction, q(λ) from K and c: their difference is what the bound says."""
-    p = drawn(seed)
-    p.solve()
-    dual, rows, u = p.dual, p.dual.constraints, p.solution.u
-    found = p.estimate()
-    lam = dual.d.duplicate()
-    lam.array[:] = p.solution.lam
-    assert found.recoveries == 0
-    change, loss = admissible(dual, lam.array_r, u, dual.seen)
-    lifted = np.empty_like(change)
-    dual.lifting.mult(change, lifted)
-    gap = summed(p, 0.5 * change @ lifted + loss)
-    assert found.algebraic == pytest.approx(np.sqrt(2 * gap), rel=1e-6)
-
-    v = np.array(u)  # extended by 0, not harmonically: another admissible one
-    v[dual.subdomains.trace] += change
-    missed, size = on_rows(p, v) - rows.c.array_r, np.abs(u).max(initial=0.0)
-    noise = 1e-8 * p.dofs.comm.allreduce(size, op=MPI.MAX) * np.abs(rows.scale).max(initial=1.0)
-    assert np.all(np.abs(missed[rows.sets.equalities]) <= noise)
-    assert np.all(missed[rows.sets.normals] <= noise)
-    slip = missed[rows.sets.tangents]
-    rubbing = np.sum(rows.limits[:, 0] * np.linalg.norm(slip, axis=1)) if slip.size else 0.0
-    blocks = list(zip(dual.subdomains.blocks, dual.subdomains.dof_parts, strict=True))
-    load = sum(block.load @ v[part] for block, part in blocks)
-    primal = summed(p, 0.5 * sum(dual.subdomains.energies(v)) - load + rubbing)
-    own = -0.5 * sum(dual.subdomains.energies(u)) - lam.array_r @ rows.c.array_r
-    zero = np.zeros_like(u)
-    zero[dual.subdomains.trace] = change
-    rest = summed(p, 0.5 * (sum(dual.subdomains.energies(zero)) - change @ lifted))
-    assert rest >= 0.0
-    assert primal - summed(p, own) - rest == pytest.approx(gap, rel=1e-5, abs=1e-12 * abs(primal))
-    lam.destroy()
-
-
-@pytest.mark.parametrize("contacts", [0, 1])
-def test_it_is_the_same_for_all_preconditioners_and_costs_what_it_says(contacts):
+def test_it_is_the_same_for_all_preconditioners_and_costs_what_it_says():
     """The Dirichlet preconditioner has the factors; without it they are made once."""
     floor = tfeti.Obstacle("bottom", curved_obstacle(2), reach=0.2)
     bounds = []
     for kind in ("dirichlet", "lumped"):
-        p = problem(decomposed("triangle", 6, 4), contacts=[floor] * contacts, pc_type=kind)
+        p = problem(decomposed("triangle", 6, 4), contacts=[floor], pc_type=kind)
         p.solve()
         before = p.report.F_multiplications
         bounds.append(p.estimate())
@@ -158,32 +101,6 @@ def test_it_is_the_same_for_all_preconditioners_and_costs_what_it_says(contacts)
         assert p.estimate().factorizations == 0
     for found in bounds:
         assert 0.0 < found.relative_algebraic < 1e-5
-
-
-@pytest.mark.parametrize("n", [4, 8, 16])
-def test_it_does_not_grow_with_the_size_of_subdomains(n):
-    """Harmonic extension; jumps extended by 0 would cost √(H/h)."""
-    p = problem(decomposed("quadrilateral", 4 * n, 16), rtol=1e-2)
-    p.solve()
-    assert 1.0 <= p.estimate().algebraic / norm(p, p.solution.u - exact(p)) <= 1.6
-
-
-def test_a_set_of_one_s_own():
-    """Glue that lets go at a limit: the gap needs the set alone."""
-
-    def pulling(constraints):
-        half_spaces = HalfSpaces(-constraints.scale, np.full(len(constraints.scale), 1e-4))
-        return Product([(constraints.sets.normals, half_spaces)])
-
-    obstacle, own = (
-        tfeti.Obstacle("bottom", curved_obstacle(3)),
-        tfeti.Extensions(feasible_set=pulling),
-    )
-    d = decomposed("hexahedron", 4, 6)
-    p = problem(d, contacts=[obstacle], extensions=own, rtol=1e-4)
-    p.solve()
-    error = norm(p, p.solution.u - exact(p))
-    assert error <= p.estimate().algebraic <= 5 * error
 
 
 def of_estimates(p):
@@ -207,28 +124,6 @@ def test_a_bound_that_says_nothing_is_warned_of():
     p.solution.lam[:] = right
     p.estimate()
     assert p.report.warnings == others
-
-
-@pytest.mark.parametrize(
-    ("energy", "algebraic", "said"),
-    [
-        (2.0, 2.0, ""),
-        (0.0, 0.0, ""),
-        (2.0, 20.0, "1e+01 times"),
-        (2.0, np.inf, "far beyond"),
-        (0.0, 1.0, "far beyond"),
-    ],
-)
-def test_a_bound_of_the_last_look_is_warned_of_where_it_says_nothing(
-    energy, algebraic, said, monkeypatch
-):
-    looked = {"energy": energy, "algebraic": algebraic}
-    monkeypatch.setattr("tfeti_dolfinx.problem.of_looks", lambda reached: looked)
-    p = problem(decomposed("triangle", 2, 2))
-    p.solve()
-    assert [f"algebraic error is {said}" in warning for warning in of_estimates(p)] == [True] * (
-        said != ""
-    )
 
 
 def test_it_needs_a_solution():

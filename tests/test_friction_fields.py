@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-import ufl
 from dolfinx import fem
 from mpi4py import MPI
-from scenes import box, decomposed, displacement, hooke, problem, strain
+from scenes import box, decomposed, displacement, problem
 from test_tresca import nodal_data
 
 import tfeti_dolfinx as tfeti
@@ -30,10 +29,10 @@ def solved(cell, law, traction, n=4, subdomains=4, **options):
 SCENES = [("quadrilateral", (0.05, -0.05)), ("tetrahedron", (0.01, -0.035, -0.05))]
 
 
-@pytest.mark.parametrize(("cell", "traction"), SCENES)
-def test_a_bound_of_0_is_no_friction(cell, traction):
-    without = solved(cell, None, traction)
-    with_none = solved(cell, tfeti.Tresca(0.0), traction)
+@pytest.mark.parametrize("law", [tfeti.Tresca(0.0), tfeti.Coulomb(0.0)])
+def test_a_bound_of_0_is_no_friction(law):
+    (cell, traction), _ = SCENES
+    without, with_none = solved(cell, None, traction), solved(cell, law, traction)
     assert np.allclose(displacement(with_none)[1], displacement(without)[1], rtol=0, atol=1e-9)
     assert with_none.report.sticking == 0
     assert with_none.report.sliding == with_none.report.active_contacts > 0
@@ -41,14 +40,15 @@ def test_a_bound_of_0_is_no_friction(cell, traction):
     assert without.report.dual_dofs + with_none.report.tangential_rows == with_none.report.dual_dofs
 
 
-@pytest.mark.parametrize(("cell", "traction"), SCENES)
-def test_a_large_bound_sticks(cell, traction, comm):
-    p = solved(cell, tfeti.Tresca(1e3), traction)
+@pytest.mark.parametrize("law", [tfeti.Tresca(1e3), tfeti.Coulomb(1e3)])
+def test_a_large_bound_sticks(law, comm):
+    cell, traction = SCENES[1]
+    p = solved(cell, law, traction)
     assert p.report.sliding == 0
     assert p.report.sticking == p.report.active_contacts > 0
-    u = np.abs(displacement(p)[1]).max()
-    _, _, _, slip = nodal_data(p.solution, comm)
-    assert np.abs(slip).max() <= 1e-9 * u
+    _, _, status, slip = nodal_data(p.solution, comm)
+    sticks = status == tfeti.ContactStatus.STICK
+    assert np.abs(slip[sticks]).max() <= 1e-9 * np.abs(displacement(p)[1]).max()
 
 
 @pytest.mark.parametrize(("cell", "traction"), SCENES)
@@ -103,31 +103,6 @@ def test_a_bound_may_change_between_solves():
     assert p.report.F_multiplications <= 2
 
 
-def test_a_bound_is_a_stress_whatever_the_thickness_is():
-    d, found = decomposed("quadrilateral", 4, 3), []
-    for thickness in (1.0, 2.5):
-        V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
-        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-        dx = ufl.Measure("dx", domain=d.mesh, metadata={"quadrature_degree": 2})
-        ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
-        t = fem.Constant(d.mesh, (0.05, -0.05))
-        left = fem.locate_dofs_topological(V, 1, d.facets("left"))
-        p = tfeti.ContactProblem(
-            thickness * ufl.inner(hooke()(u), strain(v)) * dx,
-            thickness * ufl.dot(t, v) * ds(d.surface("top")),
-            [fem.dirichletbc(np.zeros(2), left, V)],
-            [floor(2, tfeti.Tresca(0.01))],
-            d,
-            thickness=thickness,
-            petsc_options=EXACT,
-        )
-        p.solve()
-        found.append(displacement(p)[1])
-        largest = np.linalg.norm(p.solution.contact().tangential_traction, axis=1).max(initial=0.0)
-        assert d.comm.allreduce(float(largest), op=MPI.MAX) == pytest.approx(0.01)
-    assert np.allclose(*found, rtol=0, atol=1e-8)
-
-
 def turned(axis, angle):
     """The rotation about an axis."""
     k = np.array(axis) / np.linalg.norm(axis)
@@ -135,15 +110,14 @@ def turned(axis, angle):
     return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
 
 
-@pytest.mark.parametrize("law", ["Tresca", "orthotropic", "Coulomb"])
+@pytest.mark.parametrize("law", ["orthotropic", "Coulomb"])
 def test_a_rotated_scene_has_the_rotated_answer(law):
-    R, answers, multiplications = turned((1.0, 2.0, 3.0), 0.7), [], []
+    R, answers = turned((1.0, 2.0, 3.0), 0.7), []
     for Q in (np.eye(3), R):
         mesh, tags, names = box("hexahedron", 4)
         mesh.geometry.x[:] = mesh.geometry.x @ Q.T
         d = tfeti.decompose(mesh, 1, facet_tags=tags, surfaces=names)
         friction = {
-            "Tresca": tfeti.Tresca(0.015),
             "orthotropic": tfeti.Tresca((0.02, 0.008), direction=tuple(Q @ [1.0, 1.0, 0.0])),
             "Coulomb": tfeti.Coulomb((0.6, 0.3), direction=tuple(Q @ [1.0, 1.0, 0.0])),
         }[law]
@@ -154,42 +128,39 @@ def test_a_rotated_scene_has_the_rotated_answer(law):
         x, u = displacement(p)
         x = x @ Q
         answers.append((u @ Q)[np.lexsort(np.rint(x.T * 1e6))])
-        multiplications.append(p.report.F_multiplications)
         assert p.report.sticking > 0
         assert p.report.sliding > 0
     assert np.allclose(*answers, rtol=0, atol=1e-8)
-    assert abs(multiplications[0] - multiplications[1]) <= max(3, 0.15 * max(multiplications))
 
 
 def test_the_error_of_u_is_what_the_report_says():
     """Against a solve that is far more exact, at several tolerances."""
-    exact = displacement(solved("hexahedron", tfeti.Tresca(0.015), (0.0, -0.035, -0.05)))[1]
-    for rtol in (1e-2, 1e-3, 1e-4, 1e-6):
-        p = solved("hexahedron", tfeti.Tresca(0.015), (0.0, -0.035, -0.05), rtol=rtol)
+    exact = displacement(solved("quadrilateral", tfeti.Tresca(0.01), (0.05, -0.05)))[1]
+    for rtol in (1e-2, 1e-4):
+        p = solved("quadrilateral", tfeti.Tresca(0.01), (0.05, -0.05), rtol=rtol)
         error = np.abs(displacement(p)[1] - exact).max() / np.abs(exact).max()
         assert error <= 2.0 * rtol
         assert p.report.residuals["displacement_error"] <= rtol
 
 
-@pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
-def test_friction_alone_holds_a_body(cell, comm):
+@pytest.mark.parametrize("law", [tfeti.Tresca(0.02), tfeti.Coulomb(0.2)])
+def test_friction_alone_holds_a_body(law, comm):
     """Nothing else holds the block along the plane; beyond the capacity the error names both."""
-    d = decomposed(cell, 3, 3)
-    gdim, bound = d.mesh.geometry.dim, 0.02
-    for push in (0.5 * bound, 0.9 * bound):
-        traction = (push, *np.zeros(gdim - 2), -0.1)
-        p = problem(d, traction, [floor(gdim, tfeti.Tresca(bound))], clamped=(), rtol=1e-8)
+    d, bound = decomposed("hexahedron", 3, 3), 0.02
+    p = problem(d, (0.9 * bound, 0.0, -0.1), [floor(3, law)], clamped=(), rtol=1e-8)
+    p.solve()
+    data = p.solution.contact()
+    friction = comm.allreduce((data.area[:, None] * data.tangential_traction).sum(axis=0))
+    assert np.allclose(friction, (-0.9 * bound, 0.0, 0.0), rtol=0, atol=1e-7)
+    assert p.report.free_modes == 0
+    traction = (1.5 * bound, 0.0, -0.1)
+    p = problem(d, traction, [floor(3, law)], clamped=(), rtol=1e-6)
+    says = {
+        tfeti.Tresca: "the work 0.03 on a motion of size 1, and friction takes 0.02 at",
+        tfeti.Coulomb: r"1\.5\d* times as large",
+    }[type(law)]
+    with pytest.raises(tfeti.NoSolutionError, match=f"translation in x.* {says}"):
         p.solve()
-        data = p.solution.contact()
-        friction = (data.area[:, None] * data.tangential_traction).sum(axis=0)
-        expected = np.r_[-push, np.zeros(gdim - 1)]
-        assert np.allclose(comm.allreduce(friction), expected, rtol=0, atol=1e-7)
-        assert p.report.free_modes == 0
-    traction = (1.5 * bound, *np.zeros(gdim - 2), -0.1)
-    p = problem(d, traction, [floor(gdim, tfeti.Tresca(bound))], clamped=(), rtol=1e-6)
-    says = r"translation in x.* the work 0\.03 on a motion of size 1, and friction takes 0\.02 at"
-    with pytest.raises(tfeti.NoSolutionError, match=says):
-        p.solve()
-    p = problem(d, traction, [floor(gdim, tfeti.Tresca(0.0))], clamped=(), rtol=1e-6)
+    p = problem(d, traction, [floor(3, tfeti.Tresca(0.0))], clamped=(), rtol=1e-6)
     with pytest.raises(tfeti.NoSolutionError, match=r"translation in x.* where there is no fr"):
         p.solve()

@@ -3,15 +3,12 @@
 import numpy as np
 import pytest
 from dolfinx import fem
-from hypothesis import given
-from hypothesis import strategies as st
 from scenes import curved_obstacle, decomposed
 from scipy.sparse import csr_array
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.constraints.gluing import _orthonormal, glue, prescribe
+from tfeti_dolfinx.constraints.gluing import glue, prescribe
 from tfeti_dolfinx.contact.records import concatenate
-from tfeti_dolfinx.errors import NoSolutionError
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 
@@ -61,9 +58,15 @@ class Scene:
         return np.concatenate(self.d.comm.allgather(np.array(self.constraints.c.array_r)))
 
 
-@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])
-@pytest.mark.parametrize("degree", [1, 2])
-@pytest.mark.parametrize("clamped", [False, True])
+@pytest.mark.parametrize(
+    ("cell", "degree", "clamped"),
+    [
+        ("triangle", 2, False),
+        ("quadrilateral", 1, True),
+        ("tetrahedron", 2, True),
+        ("hexahedron", 1, False),
+    ],
+)
 def test_equality_rows_are_orthonormal(cell, degree, clamped):
     B = Scene(cell, 4 if degree == 1 else 2, degree, clamped).B
     assert np.allclose(B @ B.T, np.eye(len(B)), atol=1e-13)
@@ -79,16 +82,10 @@ def test_rows_are_orthonormal_in_the_inner_product_of_the_stiffness():
     assert np.allclose(B / D @ B.T, np.eye(len(B)), atol=1e-12)
 
 
-def test_gluing_rows_do_not_see_continuous_fields():
+def test_gluing_rows_are_as_many_as_there_are_jumps_and_blind_to_continuous_fields():
     scene = Scene(clamped=False)
-    u = scene.trace(
-        scene.nodal(lambda x: np.sin(x @ np.array([[1.0, 2, 3], [4, 5, 6], [7, 8, 9]])))
-    )
-    assert np.abs(scene.B @ u).max() <= 1e-12
-
-
-def test_gluing_rows_are_as_many_as_there_are_jumps():
-    scene = Scene(clamped=False)
+    A = np.array([[1.0, 2, 3], [4, 5, 6], [7, 8, 9]])
+    assert np.abs(scene.B @ scene.trace(scene.nodal(lambda x: np.sin(x @ A)))).max() <= 1e-12
     dofs = scene.dofs
     jumps = dofs.comm.allreduce(int(np.sum(dofs.multiplicity - 1))) * dofs.bs
     assert len(scene.B) == jumps
@@ -121,25 +118,13 @@ def test_a_dirichlet_value_reaches_copies_that_have_no_facet_on_the_surface():
     assert found > d.comm.allreduce(len(left))
 
 
-@given(st.integers(2, 40), st.integers(0, 1000))
-def test_gluing_pattern_of_any_multiplicity(k, seed):
-    weights = 10.0 ** np.random.default_rng(seed).uniform(-3, 3, (2, k))
-    rows = _orthonormal(weights)
-    assert np.allclose(rows.sum(axis=2), 0.0, atol=1e-9 * np.abs(rows).max())
-    for pattern, w in zip(rows, weights, strict=True):
-        assert np.allclose(pattern / w @ pattern.T, np.eye(k - 1), atol=1e-9)
-
-
-def test_equal_weights_give_the_known_pattern():
-    assert np.allclose(
-        _orthonormal(np.ones((1, 3)))[0],
-        [[1 / np.sqrt(2), -1 / np.sqrt(2), 0], [1 / np.sqrt(6), 1 / np.sqrt(6), -2 / np.sqrt(6)]],
-    )
-
-
 def test_contact_rows_are_unit_and_orthogonal_to_the_gluing():
     scene = Scene(contacts=[tfeti.Obstacle("bottom", curved_obstacle(3))])
     B, N = scene.B[scene.rows("equalities")], scene.B[scene.rows("normals")]
+    # one for each node however it is torn, but for those that are clamped
+    assert len(N) == 5 * 5 - scene.d.comm.allreduce(len(scene.gluing.contact.decided)) == 20
+    area = scene.gluing.records.area
+    assert scene.d.comm.allreduce(area.sum()) == pytest.approx(1.0)
     assert np.allclose(np.linalg.norm(N, axis=1), 1.0)
     assert np.abs(N @ B.T).max() <= 1e-14
     assert np.allclose(N @ N.T, np.eye(len(N)), atol=1e-14)
@@ -157,24 +142,6 @@ def test_contact_rows_measure_the_approach_in_scaled_lengths():
     assert approach.max() == pytest.approx(1.3)
 
 
-def test_one_condition_per_contact_node_however_it_is_torn():
-    scene = Scene(contacts=[tfeti.Obstacle("bottom", curved_obstacle(3))], clamped=False)
-    assert scene.rows("normals").sum() == 5 * 5
-
-
-def test_areas_of_contact_nodes_add_up_to_the_surface():
-    scene = Scene("tetrahedron", contacts=[tfeti.Obstacle("bottom", curved_obstacle(3))])
-    area = scene.gluing.records.area
-    assert scene.d.comm.allreduce(area.sum()) == pytest.approx(1.0)
-
-
-def test_conditions_that_dirichlet_values_decide_are_dropped_and_counted():
-    plane = tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -5), (0, 0, 1)))
-    scene = Scene(contacts=[plane])
-    assert scene.d.comm.allreduce(len(scene.gluing.contact.decided)) == 5
-    assert scene.rows("normals").sum() == 20
-
-
 def test_prescribed_components_move_into_the_gap():
     slanted = tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -5), (3, 0, 4)))
     d = decomposed("hexahedron", 2, 2)
@@ -187,9 +154,3 @@ def test_prescribed_components_move_into_the_gap():
     rows = gluing.constraints.sets.normals
     gap = gluing.constraints.c.array_r[rows] / gluing.contact.scale
     assert np.allclose(gap, records.gap[gluing.contact.condition] + 0.6 * 1.0)
-
-
-def test_an_obstacle_pushed_through_a_fixed_face_is_an_error():
-    plane = tfeti.Obstacle("left", tfeti.Plane((2, 0, 0), (1, 0, 0)))
-    with pytest.raises(NoSolutionError, match="prescribed: .* penetrate by up to 1 "):
-        Scene(contacts=[plane])

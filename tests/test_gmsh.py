@@ -1,12 +1,15 @@
-"""gmsh input: physical groups, partitions, orders, and what is not a mesh."""
+"""gmsh input: physical groups, partitions in one file or split files, orders, what does not fit."""
 
 import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from dolfinx import mesh as dmesh
 from mpi4py import MPI
+from scenes import displacement, problem, relative
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.errors import InputError
 
 gmsh = pytest.importorskip("gmsh")
 ROOT = MPI.COMM_WORLD.rank == 0
@@ -22,28 +25,39 @@ def gmsh_session():
         gmsh.finalize()
 
 
-def two_squares(recombine=False, order=1):
-    """[0, 2] × [0, 1] of two materials, 7 "left" and 9 "right"; curves 3 "inlet" and 4."""
-    gmsh.model.add("two squares")
+def two_bodies(cell="triangle", order=1, far=True):
+    """A bar of two materials, "left" and "right", and above it a block, "far" (or no group).
+
+    Surfaces: "held" (left ends), 4 (right ends), "middle" between the materials.
+    """
+    gmsh.model.add("two bodies")
     occ = gmsh.model.occ
-    a, b = occ.addRectangle(0, 0, 0, 1, 1), occ.addRectangle(1, 0, 0, 1, 1)
-    occ.fragment([(2, a)], [(2, b)])
+    dim = 2 if cell in ("triangle", "quadrilateral") else 3
+    corners = [(0, 0), (1, 0), (0, 2)]
+    if dim == 2:
+        made = [(2, occ.addRectangle(x, y, 0, 1, 1)) for x, y in corners]
+    else:
+        made = [(3, occ.addBox(x, y, 0, 1, 1, 1)) for x, y in corners]
+    occ.fragment(made[:1], made[1:2])
     occ.synchronize()
 
-    def at(x):
+    def at(*places):
         return [
             tag
-            for dim, tag in gmsh.model.getEntities(1)
-            if abs(occ.getCenterOfMass(dim, tag)[0] - x) < 1e-9
+            for _, tag in gmsh.model.getEntities(dim - 1)
+            if any(np.allclose(occ.getCenterOfMass(dim - 1, tag)[:2], p) for p in places)
         ]
 
-    gmsh.model.addPhysicalGroup(2, [1], 7, "left")
-    gmsh.model.addPhysicalGroup(2, [2], 9, "right")
-    gmsh.model.addPhysicalGroup(1, at(0.0), 3, "inlet")
-    gmsh.model.addPhysicalGroup(1, at(2.0), 4)
-    gmsh.option.setNumber("Mesh.MeshSizeMax", 0.25)
-    gmsh.option.setNumber("Mesh.RecombineAll", int(recombine))
-    gmsh.model.mesh.generate(2)
+    for (_, tag), group, name in zip(made, (7, 9, 11), ("left", "right", "far"), strict=True):
+        if far or name != "far":
+            gmsh.model.addPhysicalGroup(dim, [tag], group, name)
+    gmsh.model.addPhysicalGroup(dim - 1, at((0, 0.5), (0, 2.5)), 3, "held")
+    gmsh.model.addPhysicalGroup(dim - 1, at((2, 0.5), (1, 2.5)), 4)
+    gmsh.model.addPhysicalGroup(dim - 1, at((1, 0.5)), 5, "middle")
+    gmsh.option.setNumber("Mesh.MeshSizeMax", 0.25 if dim == 2 else 0.4)
+    if cell in ("quadrilateral", "hexahedron"):
+        gmsh.model.mesh.setTransfiniteAutomatic()
+    gmsh.model.mesh.generate(dim)
     gmsh.model.mesh.setOrder(order)
 
 
@@ -87,33 +101,31 @@ def integral(d, measure):
     return d.comm.allreduce(fem.assemble_scalar(fem.form(one * measure)))
 
 
-def check_two_squares(d):
+def check_bodies(d):
     dx, ds = measures(d)
-    assert integral(d, dx(d.volume("left"))) == pytest.approx(1)
-    assert integral(d, dx(d.volume("right"))) == pytest.approx(1)
-    assert integral(d, ds(d.surface("inlet"))) == pytest.approx(1)
-    assert integral(d, ds(d.surface(4))) == pytest.approx(1)
+    for name in ("left", "right", "far"):
+        assert integral(d, dx(d.volume(name))) == pytest.approx(1)
+    for name in ("held", 4):
+        assert integral(d, ds(d.surface(name))) == pytest.approx(2)
     assert d.surface("4") == 4
-    assert d.num_bodies == 1
+    assert d.num_bodies == 2
 
 
-@pytest.mark.parametrize("recombine", [False, True])
-@pytest.mark.parametrize("order", [1, 2])
-def test_a_model_in_memory(comm, recombine, order):
+@pytest.mark.parametrize(("cell", "order"), [("triangle", 2), ("quadrilateral", 1)])
+def test_a_model_in_memory(comm, cell, order):
     if ROOT:
-        two_squares(recombine, order)
+        two_bodies(cell, order)
     d = tfeti.read_gmsh(gmsh.model, comm, 4)
-    check_two_squares(d)
+    check_bodies(d)
     assert d.num_subdomains == 4
     assert d.mesh.ufl_domain().ufl_coordinate_element().degree == order
 
 
-@pytest.mark.parametrize("version", [2.2, 4.1])
-@pytest.mark.parametrize("partitions", [0, 3])
+@pytest.mark.parametrize(("version", "partitions"), [(2.2, 3), (4.1, 0), (4.1, 3)])
 def test_files_with_and_without_partitions(comm, shared_tmp, version, partitions):
-    path = shared_tmp / "squares.msh"
+    path = shared_tmp / "bodies.msh"
     if ROOT:
-        two_squares()
+        two_bodies()
         if partitions:
             gmsh.model.mesh.partition(partitions)
         gmsh.option.setNumber("Mesh.MshFileVersion", version)
@@ -121,24 +133,16 @@ def test_files_with_and_without_partitions(comm, shared_tmp, version, partitions
         gmsh.option.setNumber("Mesh.MshFileVersion", 4.1)
     comm.barrier()
     d = tfeti.read_gmsh(path, comm, None if partitions else 2)
-    check_two_squares(d)
-    assert d.num_subdomains == (partitions or 2)
-
-
-def test_partitions_of_the_file_can_be_overruled(comm):
-    if ROOT:
-        two_squares()
-        gmsh.model.mesh.partition(3)
-    assert tfeti.read_gmsh(gmsh.model, comm).num_subdomains == 3
-    assert tfeti.read_gmsh(gmsh.model, comm, 5).num_subdomains == 5
+    check_bodies(d)
+    assert d.num_subdomains >= (partitions or 2)
 
 
 def test_physical_groups_that_gmsh_renamed_for_its_partitions(comm):
     if ROOT:
-        two_squares()
+        two_bodies()
         gmsh.model.mesh.partition(2)
         rename_as_partition_groups()
-    check_two_squares(tfeti.read_gmsh(gmsh.model, comm))
+    check_bodies(tfeti.read_gmsh(gmsh.model, comm))
 
 
 def rename_as_partition_groups():
@@ -155,15 +159,18 @@ def rename_as_partition_groups():
     for (dim, tag), name in names.items():
         whole = [e for e in entities[dim, tag] if (dim, e) not in original]
         model.addPhysicalGroup(dim, whole, tag, name)
+    parts = {}
     for (dim, entity), tags in original.items():
         for tag in tags:
-            part = model.getPartitions(dim, entity)[0]
-            name = f"_part{{{part}}}_physical{{{tag}}}_dim{{{dim}}}"
-            model.addPhysicalGroup(dim, [entity], 100 + 10 * entity, name)
+            name = f"_part{{{model.getPartitions(dim, entity)[0]}}}_physical{{{tag}}}_dim{{{dim}}}"
+            parts.setdefault((dim, name), []).append(entity)
+    for number, ((dim, name), found) in enumerate(parts.items(), start=100):
+        model.addPhysicalGroup(dim, found, number, name)
 
 
-@pytest.mark.parametrize(("order", "tolerance"), [(1, 0.05), (2, 0.002)])
-@pytest.mark.parametrize("hexahedra", [False, True])
+@pytest.mark.parametrize(
+    ("order", "tolerance", "hexahedra"), [(1, 0.05, True), (2, 0.002, False), (2, 0.002, True)]
+)
 def test_curved_bodies_of_first_and_second_order(comm, order, tolerance, hexahedra):
     if ROOT:
         quarter_ring(order, hexahedra)
@@ -175,26 +182,196 @@ def test_curved_bodies_of_first_and_second_order(comm, order, tolerance, hexahed
     assert d.mesh.topology.cell_type.name == expected
 
 
-def test_touching_bodies_with_nodes_of_their_own_are_not_glued(comm):
-    if ROOT:
-        gmsh.model.add("touching")
-        occ = gmsh.model.occ
-        boxes = [occ.addRectangle(0, 0, 0, 1, 1), occ.addRectangle(1, 0, 0, 1, 1)]
-        occ.synchronize()
-        gmsh.model.addPhysicalGroup(2, boxes, name="both")
-        gmsh.option.setNumber("Mesh.MeshSizeMax", 0.25)
-        gmsh.model.mesh.generate(2)
-    d = tfeti.read_gmsh(gmsh.model, comm, 4)
-    assert d.num_bodies == 2
-    assert d.num_subdomains == 4
-
-
 def test_subdomains_by_a_callable_and_by_an_array(comm):
     if ROOT:
-        two_squares()
+        two_bodies()
     d = tfeti.read_gmsh(gmsh.model, comm, lambda x: np.floor(2 * x[0]))
-    assert d.num_subdomains == 4
+    assert d.num_subdomains == 6  # two of the block are not connected with those of the bar
     cells = sum(len(tags) for tags in gmsh.model.mesh.getElements(2)[1]) if ROOT else 0
     ids = (np.arange(cells) >= cells // 2).astype(int)
     d = tfeti.read_gmsh(gmsh.model, comm, ids)
     assert d.num_subdomains >= 2
+
+
+def write(folder, version=4.1, ghosts=False, partition=5):
+    """The model in one file ``whole.msh`` and in split files ``split_1.msh``, ..."""
+    gmsh.option.setNumber("Mesh.PartitionCreateGhostCells", int(ghosts))
+    if partition:
+        gmsh.model.mesh.partition(partition)
+    gmsh.option.setNumber("Mesh.MshFileVersion", version)
+    gmsh.write(str(folder / "whole.msh"))
+    gmsh.option.setNumber("Mesh.PartitionSplitMeshFiles", 1)
+    gmsh.write(str(folder / "split.msh"))
+
+
+def both(folder, comm, subdomains=None):
+    comm.barrier()
+    whole = tfeti.read_gmsh(folder / "whole.msh", comm, subdomains)
+    return whole, tfeti.read_gmsh(folder / "split.msh", comm, subdomains)
+
+
+def table(d, entities, dim, *columns):
+    """Midpoints of entities and columns beside them, of all ranks, sorted by midpoint."""
+    d.mesh.topology.create_connectivity(dim, d.mesh.topology.dim)
+    middle = dmesh.compute_midpoints(d.mesh, dim, np.asarray(entities, dtype=np.int32))
+    rows = np.column_stack((middle.reshape(-1, 3), *columns))
+    rows = np.concatenate(d.comm.allgather(rows))
+    return rows[np.lexsort(np.rint(rows.T * 1e7))]
+
+
+def cells_of(d, ids=True):
+    assert len(d.cell_tags.values) == len(d.cell_subdomain)
+    columns = [d.cell_subdomain, d.cell_tags.values]
+    columns += [d.original_cells] if ids else []
+    return table(d, np.arange(len(d.cell_subdomain)), d.mesh.topology.dim, *columns)
+
+
+def facets_of(d):
+    return table(d, d.facet_tags.indices, d.mesh.topology.dim - 1, d.facet_tags.values)
+
+
+def nodes_of(d, ids=True):
+    rows = np.column_stack((d.mesh.geometry.x, d.original_nodes * ids))
+    rows = np.concatenate(d.comm.allgather(rows))
+    return rows[np.lexsort(np.rint(rows.T * 1e7))]
+
+
+def check_same(whole, split, ids=True):
+    assert split.num_subdomains == whole.num_subdomains
+    assert np.array_equal(split.body_of_subdomain, whole.body_of_subdomain)
+    assert split.names == whole.names
+    assert split.body_names == whole.body_names
+    assert split.split == whole.split
+    assert np.allclose(cells_of(split, ids), cells_of(whole, ids), atol=1e-14)
+    assert np.allclose(facets_of(split), facets_of(whole), atol=1e-14)
+    assert np.array_equal(nodes_of(split, ids), nodes_of(whole, ids))
+    for name in ("tears", "boundary"):
+        sizes = [d.comm.allreduce(len(getattr(d, name))) for d in (split, whole)]
+        assert sizes[0] == sizes[1]
+
+
+def solved(d):
+    p = problem(d, clamped=("held",), loaded=4, tfeti_rtol=1e-10)
+    p.solve()
+    return displacement(p)
+
+
+@pytest.mark.parametrize(
+    ("cell", "order", "ghosts", "version"),
+    [
+        ("triangle", 1, True, 4.1),
+        ("tetrahedron", 2, True, 4.1),
+        ("hexahedron", 1, False, 4.1),
+        ("tetrahedron", 1, False, 2.2),
+    ],
+)
+def test_the_same_as_one_file(comm, shared_tmp, cell, order, ghosts, version):
+    """Of version 2, a file names only its own groups, and nodes and cells are numbered anew."""
+    if ROOT:
+        two_bodies(cell, order)
+        write(shared_tmp, version, ghosts)
+    whole, split = both(shared_tmp, comm)
+    check_same(whole, split, ids=version > 3)
+    assert split.mesh.ufl_domain().ufl_coordinate_element().degree == order
+    assert split.num_subdomains >= 5
+    assert split.num_bodies == 2
+    assert split.names.volumes == {"left": 7, "right": 9, "far": 11}
+    assert split.names.surfaces == {"held": 3, "4": 4, "middle": 5}
+    assert split.mesh.topology.cell_type.name == cell
+
+
+def partition_by(partition):
+    """Partition all elements of the model by their midpoints."""
+    mesh = gmsh.model.mesh
+    kinds, ids, _ = mesh.getElements()
+    middle = np.concatenate([mesh.getBarycenters(kind, -1, False, True) for kind in kinds])
+    parts = partition(*middle.reshape(-1, 3).T[:2])
+    mesh.partition(int(parts.max()), np.concatenate(ids), parts)
+
+
+def test_a_surface_between_partitions_is_tagged_on_both_sides(comm, shared_tmp):
+    if ROOT:
+        two_bodies()
+        partition_by(lambda x, y: np.where(y > 1.5, 3, 1 + (x > 1.0)))
+        write(shared_tmp, partition=0)
+    whole, split = both(shared_tmp, comm)
+    check_same(whole, split)
+    assert comm.allreduce(len(split.facets("middle"))) == 2 * 4
+    assert np.all(np.isin(split.facets("middle"), split.tears))
+
+
+def test_partitions_can_be_overruled(comm, shared_tmp):
+    if ROOT:
+        two_bodies()
+        write(shared_tmp)
+    check_same(*both(shared_tmp, comm, lambda x: np.floor(2 * x[0]) + 4 * (x[1] > 1.5)))
+    split = tfeti.read_gmsh(shared_tmp / "split.msh", comm, 6)
+    assert split.num_subdomains >= 6
+    u = solved(split)[1]
+    assert relative(u, solved(tfeti.read_gmsh(shared_tmp / "whole.msh", comm))[1]) <= 1e-9
+
+
+def test_ids_of_cells_in_the_order_of_the_files(comm, shared_tmp):
+    numbers = [p for p in (1, 2, 3) if (p - 1) * comm.size // 3 == comm.rank]
+    write_squares(shared_tmp, {}, {}, {})
+    ids = np.array([[2 * p, 2 * p + 1] for p in numbers], dtype=int).ravel()
+    d = tfeti.read_gmsh(shared_tmp / "squares.msh", comm, ids)
+    assert d.num_subdomains == 6
+    assert np.array_equal(d.original_cells, 10 * (d.cell_subdomain // 2 + 1) + d.cell_subdomain % 2)
+    with pytest.raises(InputError, match="array subdomains: expected one id for each of the"):
+        tfeti.read_gmsh(shared_tmp / "squares.msh", comm, np.zeros(7))
+
+
+def square(number, tag=1, name="body", shift=0.0, quads=False, column=None):
+    """MSH 2.2 of the square [number − 1, number] × [0, 1]."""
+    column = number if column is None else column
+    a, b, c, d = 2 * column - 1, 2 * column + 1, 2 * column + 2, 2 * column
+    x = column - 1 + shift
+    nodes = [(a, x, 0), (b, column, 0), (c, column, 1), (d, x, 1)]
+    cells = [(3, (a, b, c, d))] if quads else [(2, (a, b, c)), (2, (a, c, d))]
+    lines = [
+        f"{10 * number + i} {kind} 2 {tag} {tag} {' '.join(map(str, own))}"
+        for i, (kind, own) in enumerate(cells)
+    ]
+    sections = {
+        "MeshFormat": ["2.2 0 8"],
+        "PhysicalNames": ["1", f'2 {tag} "{name}"'],
+        "Nodes": ["4", *(f"{i} {x} {y} 0" for i, x, y in nodes)],
+        "Elements": [str(len(lines)), *lines],
+    }
+    written = ["\n".join((f"${name}", *own, f"$End{name}\n")) for name, own in sections.items()]
+    return "".join(written)
+
+
+def write_squares(folder, *changes):
+    """Files ``squares_1.msh``, ... on rank 0, seen by all ranks."""
+    if ROOT:
+        for number, change in enumerate(changes, start=1):
+            (folder / f"squares_{number}.msh").write_text(square(number, **change))
+    MPI.COMM_WORLD.barrier()
+
+
+WRONG = [
+    ("'Triangle 3' in squares_1.msh and 'Quadrilateral 4' in squares_3.msh", {"quads": True}),
+    ("'body' stands for the physical groups of dimension 2 and tag 1 and .* 2 .* 2", {"tag": 2}),
+    ("dimension 2 and tag 1 is named 'body' in one file and 'steel' in anoth", {"name": "steel"}),
+    (r"node [56] lies at \[2.0, .* in one file and at \[2.25, .* in another", {"shift": 0.25}),
+    ("cells 1[01] and 3[01] have the same nodes; expected files", {"column": 1}),
+]
+
+
+@pytest.mark.parametrize(("message", "change"), WRONG, ids=range(len(WRONG)))
+def test_files_that_do_not_fit_together(comm, shared_tmp, message, change):
+    write_squares(shared_tmp, {}, {}, change)
+    with pytest.raises(InputError, match=message):
+        tfeti.read_gmsh(shared_tmp / "squares.msh", comm)
+
+
+def test_a_missing_last_file(comm, shared_tmp):
+    if ROOT:
+        two_bodies()
+        write(shared_tmp)
+        (shared_tmp / "split_5.msh").unlink()
+    comm.barrier()
+    with pytest.raises(InputError, match=r"split_5.msh: no such file; expected one .* 5 partition"):
+        tfeti.read_gmsh(shared_tmp / "split.msh", comm)

@@ -5,15 +5,7 @@ from itertools import pairwise
 import pytest
 
 from benchmarks.hertz_convergence import study_2d, study_3d, study_pair, study_pair_3d
-from demos import cylinder_on_block_2d, hertz_2d, hertz_3d, sphere_on_block_3d
-
-
-@pytest.mark.parametrize(("demo", "tolerance"), [(hertz_2d, 0.02), (hertz_3d, 0.05)])
-def test_small_sizes_are_near_the_closed_form(demo, tolerance):
-    _, report = demo.run(["--quick", "-tfeti_rtol", "1e-8"])
-    assert abs(report.errors["force"]) <= 1e-6
-    assert abs(report.errors["half_width"]) <= tolerance
-    assert abs(report.errors["peak_pressure"]) <= tolerance
+from demos import cylinder_on_block_2d, hertz_2d, hertz_3d
 
 
 @pytest.mark.slow
@@ -30,13 +22,13 @@ def falls(rows, name):
     return all(finer < coarser for coarser, finer in pairwise(errors))
 
 
-# elements along the half width of the solution that is the reference
-FINEST = pytest.mark.parametrize("finest", [64, pytest.param(128, marks=pytest.mark.slow)])
+# elements along the half width; the last solution is the reference
+SIZES = [(8, 16, 32, 64), pytest.param((8, 16, 32, 128), marks=pytest.mark.slow)]
 
 
-@FINEST
-def test_pressure_converges_in_2d(finest):
-    rows, slopes = study_2d((8, 16, 32, finest))
+@pytest.mark.parametrize("sizes", SIZES)
+def test_pressure_converges_in_2d(sizes):
+    rows, slopes = study_2d(sizes)
     assert falls(rows, "pressure_l2")
     assert falls(rows, "pressure_l2_finer")
     assert slopes["pressure_l2"] >= 0.9
@@ -77,14 +69,6 @@ def test_pressure_of_a_pair_converges():
     rows, slopes = study_pair((8, 16, 32, 128))
     assert falls(rows, "pressure_l2_finer")
     assert slopes["pressure_l2_finer"] >= 0.9
-
-
-@pytest.mark.parametrize("exchange", [[], ["--exchange"]])
-def test_a_ball_on_a_block_is_near_the_closed_form(exchange):
-    _, report = sphere_on_block_3d.run(["--quick", "-tfeti_rtol", "1e-10", *exchange])
-    assert abs(report.errors["force"]) <= 1e-8
-    assert abs(report.errors["half_width"]) <= 0.05
-    assert abs(report.errors["peak_pressure"]) <= 0.05
 
 
 @pytest.mark.slow

@@ -5,9 +5,9 @@ import re
 import numpy as np
 import pytest
 from scenes import curved_obstacle, decomposed, displacement, problem
-from scipy.linalg import null_space, pinvh
+from scipy.linalg import pinvh
 from scipy.sparse import csr_array, diags_array
-from test_blocks import RIGID, data, stiffness
+from test_blocks import data, stiffness
 from test_extensions import DensePinv
 
 import tfeti_dolfinx as tfeti
@@ -21,8 +21,8 @@ from tfeti_dolfinx.testing import check_block, check_kind_of_block, check_kind_o
 
 PSEUDO = {"schur": SchurPseudoinverse, "lu_svd": trailing_pseudoinverse}
 MAKE = {"regularized": regularised, **PSEUDO}
-CASES = [(cell, 1, kernel, 2) for cell in RIGID for kernel in ("all", "some", "none")]
-CASES += [("tetrahedron", 2, "all", 2), ("quadrilateral", 1, "all", 1)]  # one cell: K_rr is empty
+CASES = [("triangle", 1, "none", 2), ("hexahedron", 1, "some", 2), ("tetrahedron", 2, "all", 2)]
+CASES += [("quadrilateral", 1, "all", 1)]  # one cell: K_rr is empty
 
 
 def subdomain(cell, degree=1, kernel="all", n=2):
@@ -70,14 +70,6 @@ def test_an_inverse_of_one_s_own_can_be_checked():
 
     with pytest.raises(ConformanceError, match=f"does not hold: {re.escape('K K⁺ K = K')}"):
         check_kind_of_inverse(Crooked)
-
-
-def test_the_last_unknowns_of_an_elimination_hold_the_kernel():
-    K, x = subdomain("tetrahedron", n=3)
-    R = kernel_of(K, candidate_modes(x, 3, x.mean(axis=0), 1.0))
-    s = trailing_pseudoinverse(K, R, np.empty(0)).unknowns
-    assert R.shape[1] <= len(s) < K.shape[0] // 4
-    assert null_space(R[s], rcond=1e-8).shape[1] == 0
 
 
 @pytest.mark.parametrize("kind", MAKE)

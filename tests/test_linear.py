@@ -4,21 +4,20 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from petsc4py import PETSc
-from reference import UntornElasticity
+from reference.active_set import UntornElasticity
 from scenes import decomposed, displacement, hooke, problem, relative, strain
 
 import tfeti_dolfinx as tfeti
-
-CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
 
 
 def traction_of(cell):
     return (0.01, -0.05) if cell in ("triangle", "quadrilateral") else (0.01, 0.02, -0.05)
 
 
-@pytest.mark.parametrize("cell", CELLS)
-@pytest.mark.parametrize("degree", [1, 2])
+@pytest.mark.parametrize(
+    ("cell", "degree"),
+    [("triangle", 2), ("quadrilateral", 1), ("tetrahedron", 1), ("hexahedron", 2)],
+)
 def test_agrees_with_a_direct_solver(cell, degree):
     n = 6 if degree == 1 else 3
     p = problem(decomposed(cell, n, 5), traction_of(cell), degree=degree, tfeti_rtol=1e-11)
@@ -30,10 +29,14 @@ def test_agrees_with_a_direct_solver(cell, degree):
 
 
 @pytest.mark.parametrize(
-    ("qp_type", "pc_type"),
-    [("pcpg", "none"), ("pcpg", "lumped"), ("pcpg", "dirichlet"), ("smalse", "none")],
+    ("qp_type", "pc_type", "scaling"),
+    [
+        ("pcpg", "none", "stiffness"),
+        ("pcpg", "lumped", "multiplicity"),
+        ("pcpg", "dirichlet", "multiplicity"),
+        ("smalse", "none", "stiffness"),
+    ],
 )
-@pytest.mark.parametrize("scaling", ["stiffness", "multiplicity"])
 def test_every_solver_gives_the_same(pc_type, scaling, qp_type):
     options = dict(tfeti_pc_type=pc_type, tfeti_scaling=scaling, tfeti_qp_type=qp_type)
     p = problem(
@@ -44,7 +47,7 @@ def test_every_solver_gives_the_same(pc_type, scaling, qp_type):
     assert relative(displacement(p)[1], exact) <= 1e-8
 
 
-@pytest.mark.parametrize("subdomains", [1, 2, 17])
+@pytest.mark.parametrize("subdomains", [1, 17])
 def test_any_number_of_subdomains(subdomains):
     p = problem(decomposed("tetrahedron", 4, subdomains), (0, 0, -0.05), tfeti_rtol=1e-11)
     p.solve()
@@ -70,27 +73,6 @@ def test_patch_test():
     assert np.allclose(uh.x.array, linear.x.array, atol=1e-9)
 
 
-def test_a_scalar_problem():
-    d = decomposed("quadrilateral", 8, 7)
-    V = fem.functionspace(d.mesh, ("Lagrange", 1))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    left = fem.locate_dofs_topological(V, 1, d.facets("left"))
-    one = fem.Constant(d.mesh, PETSc.ScalarType(1.0))
-    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
-    p = tfeti.ContactProblem(
-        ufl.inner(ufl.grad(u), ufl.grad(v)) * ufl.dx,
-        one * v * ds(d.surface("right")),
-        [fem.dirichletbc(PETSc.ScalarType(0.0), left, V)],
-        [],
-        d,
-        petsc_options={"tfeti_rtol": 1e-11},
-    )
-    uh = p.solve()
-    x = V.tabulate_dof_coordinates()
-    assert np.allclose(uh.x.array, x[:, 0], atol=1e-10)
-    assert p.report.kernel_dim == 7
-
-
 def test_springs_leave_no_coarse_problem():
     d = decomposed("hexahedron", 3, 4)
     V = fem.functionspace(d.mesh, ("Lagrange", 1, (3,)))
@@ -101,83 +83,3 @@ def test_springs_leave_no_coarse_problem():
     uh = p.solve()
     assert p.report.kernel_dim == 0
     assert np.allclose(uh.x.array.reshape(-1, 3), (0, 0, -1), atol=1e-9)
-
-
-def test_one_subdomain_without_any_row():
-    d = decomposed("hexahedron", 2, 1)
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (3,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    a = ufl.inner(hooke()(u), strain(v)) * ufl.dx + ufl.inner(u, v) * ufl.dx
-    L = ufl.inner(fem.Constant(d.mesh, (0.0, 0.0, -0.1)), v) * ufl.dx
-    p = tfeti.ContactProblem(a, L, [], [], d)
-    uh = p.solve()
-    assert p.report.dual_dofs == 0
-    assert p.report.F_multiplications == 0
-    assert np.allclose(uh.x.array.reshape(-1, 3), (0, 0, -0.1), atol=1e-10)
-
-
-def test_jumps_of_stiffness_cost_little():
-    """Stiffness scaling, against one weight per copy: the number of iterations stays flat."""
-
-    def iterations(ratio, scaling):
-        d = decomposed("hexahedron", 8, lambda x: np.floor(4 * x[0]) + 4 * (x[2] > 0.5))
-        V = fem.functionspace(d.mesh, ("Lagrange", 1, (3,)))
-        E = fem.Function(fem.functionspace(d.mesh, ("DG", 0)))
-        E.x.array[:] = np.where(d.cell_subdomain % 2, ratio, 1.0)
-        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-        left = fem.locate_dofs_topological(V, 2, d.facets("left"))
-        ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
-        p = tfeti.ContactProblem(
-            E * ufl.inner(hooke()(u), strain(v)) * ufl.dx(metadata={"quadrature_degree": 2}),
-            ufl.dot(fem.Constant(d.mesh, (0.0, 0.0, -1.0)), v) * ds(d.surface("right")),
-            [fem.dirichletbc(np.zeros(3), left, V)],
-            [],
-            d,
-            petsc_options={"tfeti_scaling": scaling},
-        )
-        p.solve()
-        return p.report.cg_steps
-
-    flat = iterations(1.0, "stiffness")
-    assert iterations(1e4, "stiffness") <= flat + 5
-    assert iterations(1e4, "multiplicity") >= 2 * flat
-
-
-def test_no_contact_no_price():
-    p = problem(decomposed("hexahedron", 4, 8), (0, 0, -0.05), tfeti_local_type="implicit")
-    p.solve()
-    r = p.report
-    assert r.contact_rows == r.expansion_steps == r.proportioning_steps == r.outer_iterations == 0
-    assert r.power_method_multiplications == 0
-    assert r.F_multiplications == r.cg_steps + 1  # and one for F λ̄
-    assert r.preconditioner_multiplications == r.cg_steps
-    assert r.factorizations == 2 * 8  # K_ρ, and K_ii for the preconditioner
-
-
-def test_without_a_preconditioner_K_ii_is_not_factored():
-    p = problem(
-        decomposed("hexahedron", 4, 8),
-        (0, 0, -0.05),
-        tfeti_pc_type="lumped",
-        tfeti_local_type="implicit",
-    )
-    p.solve()
-    assert p.report.factorizations == 8
-
-
-def test_no_load_on_the_kernel_no_multiplication_for_it():
-    """e = 0: no λ̄, and no multiplication by F for it."""
-    d = decomposed("hexahedron", 4, 8)
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (3,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    ends = [fem.locate_dofs_topological(V, 2, d.facets(s)) for s in ("left", "right")]
-    bcs = [
-        fem.dirichletbc(np.array([shift, 0, 0]), dofs, V)
-        for shift, dofs in zip((0.0, 0.1), ends, strict=True)
-    ]
-    zero = fem.Constant(d.mesh, np.zeros(3))
-    p = tfeti.ContactProblem(
-        ufl.inner(hooke()(u), strain(v)) * ufl.dx, ufl.inner(zero, v) * ufl.dx, bcs, [], d
-    )
-    p.solve()
-    assert p.report.F_multiplications == p.report.cg_steps

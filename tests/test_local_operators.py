@@ -2,25 +2,20 @@
 
 import numpy as np
 import pytest
-import ufl
-from dolfinx import fem
-from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import box, curved_obstacle, decomposed, hooke, problem, strain
+from scenes import box, curved_obstacle, decomposed, problem
 from scipy.sparse import csr_array
 from test_blocks import data, stiffness
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.arrays import parts_of
 from tfeti_dolfinx.feti.operator import check_operator
-from tfeti_dolfinx.subdomains.block import Block, Counters
-from tfeti_dolfinx.subdomains.factor import FactorSize
+from tfeti_dolfinx.subdomains.block import Block
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
-from tfeti_dolfinx.subdomains.local_operators import MODEL, GroupedOperator, LocalChoice, groups_of
+from tfeti_dolfinx.subdomains.local_operators import GroupedOperator, LocalChoice
 from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains, SparseBlock
 from tfeti_dolfinx.testing import check_block, check_kind_of_block
 
-CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
 KINDS = ("pinv", "stiffness", "schur")
 
 
@@ -72,8 +67,9 @@ def close(x, y, comm):
     return comm.allreduce(bool(np.abs(x - y).max(initial=0.0) <= 1e-10 * largest), op=MPI.LAND)
 
 
-@pytest.mark.parametrize("cell", CELLS)
-@pytest.mark.parametrize("equal", [True, False])
+@pytest.mark.parametrize(
+    ("cell", "equal"), [("triangle", False), ("quadrilateral", True), ("hexahedron", False)]
+)
 def test_all_forms_apply_the_same(cell, equal):
     """Also on subdomains with contact rows, with prescribed values, and of several shapes.
 
@@ -99,9 +95,8 @@ def test_all_forms_apply_the_same(cell, equal):
         item.destroy()
 
 
-@pytest.mark.parametrize("cell", CELLS)
-def test_equal_subdomains_are_factored_once(cell):
-    d = cubes(cell)
+def test_equal_subdomains_are_factored_once():
+    d = cubes("tetrahedron")
     p, subdomains = made(d, "shared", tfeti_pc_type="lumped")
     counters = subdomains.counters
     ranks_with_any = d.comm.allreduce(int(len(d.subdomains) > 0))
@@ -117,8 +112,9 @@ def test_equal_subdomains_are_factored_once(cell):
     p.destroy()
 
 
-@pytest.mark.parametrize("local_type", ["shared", "explicit", "auto"])
-@pytest.mark.parametrize("contact", [True, False])
+@pytest.mark.parametrize(
+    ("local_type", "contact"), [("shared", True), ("explicit", False), ("auto", True)]
+)
 def test_the_answer_does_not_depend_on_the_form(local_type, contact):
     u, reports = [], []
     for name in ("implicit", local_type):
@@ -132,16 +128,9 @@ def test_the_answer_does_not_depend_on_the_form(local_type, contact):
     assert np.abs(u[1] - u[0]).max(initial=0.0) <= 1e-8 * largest
     first, second = (r.F_multiplications for r in reports)
     assert abs(first - second) <= 2
-    for name, report in zip(("implicit", local_type), reports, strict=True):
-        found = report.local_operators
-        counts = [v for k, v in found.items() if k.startswith("F_") and k[2:] in FORMS]
-        assert sum(counts) == report.subdomains == 8
-        assert found["F_predicted"] > 0.0
-        assert found["F_bytes"] > 0.0
-        assert found["F_measured"] > 0.0
-        assert found["preconditioner_predicted"] > 0.0
-        if name in ("implicit", "explicit"):
-            assert found[f"F_{name}"] == 8
+    assert reports[0].local_operators["F_implicit"] == reports[0].subdomains == 8
+    found = reports[1].local_operators
+    assert sum(v for k, v in found.items() if k.startswith("F_") and k[2:] in FORMS) == 8
 
 
 FORMS = ("implicit", "explicit", "shared_implicit", "shared_explicit")
@@ -163,7 +152,7 @@ def equals():
     return EqualSubdomains(InverseFactory())
 
 
-@pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
 def test_friends_in_another_place_and_order(cell, equals):
     K, x = stiffness(cell, 3)
     first, _ = shared(K, x, equals)
@@ -176,7 +165,7 @@ def test_friends_in_another_place_and_order(cell, equals):
     second.destroy()
 
 
-@pytest.mark.parametrize("cell", CELLS)
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
 def test_false_friends_are_told_apart(cell, equals):
     """Of the same shape: another modulus, also a hair's breadth, one soft cell, another size."""
     K, x = stiffness(cell, 3)
@@ -194,54 +183,8 @@ def test_false_friends_are_told_apart(cell, equals):
     check_block(block, changed)
 
 
-def test_another_orientation_is_another_subdomain(equals):
-    """A box turned by a right angle has the same nodes, but x and y change places."""
-    mesh = dmesh.create_rectangle(MPI.COMM_SELF, [(0, 0), (1, 1)], [3, 3], dmesh.CellType.triangle)
-    V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    a = fem.form(ufl.inner(hooke()(u), strain(v)) * ufl.dx)
-    matrices, points = [], []
-    for _ in range(2):
-        A = fem.assemble_matrix(a)
-        A.scatter_reverse()
-        matrices.append(csr_array(A.to_scipy()))
-        points.append(V.tabulate_dof_coordinates()[:, :2].copy())
-        mesh.geometry.x[:, 0] = 1.0 - mesh.geometry.x[:, 0]  # diagonals run the other way
-    blocks = [shared(K, x, equals)[0] for K, x in zip(matrices, points, strict=True)]
-    assert blocks[0].stiffness is not blocks[1].stiffness
-    for block, K in zip(blocks, matrices, strict=True):
-        check_block(block, K)
-
-
 def test_shared_blocks_keep_the_promises_of_a_block(equals):
     check_kind_of_block(lambda data: SparseBlock(data, equals=equals))
-
-
-def test_equal_stiffnesses_are_factored_once_whatever_the_loads():
-    counters = Counters()
-    equals = EqualSubdomains(InverseFactory(counters))
-    K, x = stiffness("hexahedron", 2)
-    blocks = [shared(K, x, equals, shift=s)[0] for s in range(3)]
-    blocks[1].update(f=2 * blocks[1].load)
-    assert counters.factorizations == 1
-    for block in blocks:
-        check_block(block, K)
-
-
-def test_a_new_trace_of_one_leaves_the_others_theirs(equals):
-    K, x = stiffness("hexahedron", 2)
-    blocks = [shared(K, x, equals, shift=s)[0] for s in range(2)]
-    for block in blocks:
-        block.prepare("schur")
-    blocks[0].retrace(np.arange(0, K.shape[0], 2))
-    for block in blocks:
-        check_block(block, K)
-    w = random(sum(len(block.trace_dofs) for block in blocks))
-    for kind in KINDS:
-        expected = blockwise(blocks, kind, w)
-        for local_type in ("implicit", "explicit"):
-            operator = GroupedOperator(blocks, kind, LocalChoice(local_type))
-            assert close(applied(operator, w), expected, MPI.COMM_SELF)
 
 
 class OwnBlock(Block):
@@ -256,44 +199,10 @@ class OwnBlock(Block):
     solve = apply_schur = multiply
 
 
-@pytest.mark.parametrize("local_type", ["auto", "implicit", "explicit", "shared"])
+@pytest.mark.parametrize("local_type", ["implicit", "explicit"])
 def test_blocks_of_one_s_own_apply_what_they_have(local_type):
     K, x = stiffness("triangle", 2)
     blocks = [OwnBlock(data(K, x)) for _ in range(2)]
     w = random(sum(len(block.trace_dofs) for block in blocks))
     for kind in KINDS:
         assert np.allclose(applied(GroupedOperator(blocks, kind, LocalChoice(local_type)), w), w)
-
-
-@pytest.mark.parametrize("local_type", ["auto", "implicit", "explicit", "shared"])
-def test_ranks_without_subdomains(local_type):
-    operator = GroupedOperator([], "pinv", LocalChoice(local_type))
-    assert applied(operator, np.empty(0)).shape == (0,)
-    assert operator.predicted == 0.0
-    d = decomposed("quadrilateral", 4, 1)  # one rank has it
-    p = problem(d, tfeti_local_type=local_type)
-    p.solve()
-    assert sum(v for k, v in p.report.local_operators.items() if k[2:] in FORMS) == 1
-    p.destroy()
-
-
-@pytest.mark.parametrize(
-    ("local_type", "multiplications", "dense"),
-    [
-        ("auto", 0, False),
-        ("auto", 10**9, True),
-        ("shared", 10**9, False),  # it shares nothing
-        ("explicit", 0, True),
-    ],
-)
-def test_dense_matrices_are_made_where_they_pay(local_type, multiplications, dense):
-    K, x = stiffness("quadrilateral", 12)
-    (group,) = groups_of([SparseBlock(data(K, x, trace_dofs=np.arange(20)))], "pinv")
-    assert group.prefers_dense(local_type, multiplications) is dense
-
-
-def test_the_model_knows_that_right_sides_share_a_sweep():
-    small, large = FactorSize(1e3, 8e3), FactorSize(1e6, 8e6)
-    seconds = [MODEL.solve(large, 100, count).seconds for count in (1, 64)]
-    assert MODEL.solve(small, 100, 1).seconds < seconds[0] < seconds[1] < 64 * seconds[0]
-    assert MODEL.dense(100, 64).seconds < 64 * MODEL.dense(100, 1).seconds

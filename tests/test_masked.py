@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from reference import dense_qp
+from reference.active_set import dense_qp
 from scenes import curved_obstacle, decomposed, problem
 from test_newton_scenes import SCENES, apart, solved
 from test_qp import bounds_on, matrix, random_program, to, vector

@@ -1,9 +1,7 @@
 """Mortar conditions in awkward scenes: layers, thin bodies, coarse and curved facets, bad input."""
 
 import sys
-from itertools import pairwise
 
-import gmsh
 import numpy as np
 import pytest
 import ufl
@@ -24,6 +22,8 @@ from mpi4py import MPI
 from scenes import decomposed, problem
 
 import tfeti_dolfinx as tfeti
+from meshes.cylinder_on_block import build
+from meshes.tools import element_options
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 PAIR = sided("upper bottom", "lower top")
@@ -45,8 +45,7 @@ def flat(name, low, high, n, width=1.0):
     return (name, (0.0, low), (width, high), (n, 2))
 
 
-@pytest.mark.parametrize("apart", [0.1, 0.5])
-@pytest.mark.parametrize("radius", [None, 1.0])
+@pytest.mark.parametrize(("apart", "radius"), [(0.1, 1.0), (0.5, None)])
 def test_only_the_first_of_two_layers_is_met(apart, radius):
     """The primary surface has the lower box's top and, below it, another one's."""
     parts = [
@@ -63,8 +62,7 @@ def test_only_the_first_of_two_layers_is_met(apart, radius):
     assert np.isclose(gathered(p.solution.contact().area).sum(), 1.0)
 
 
-@pytest.mark.parametrize("thickness", [0.2, 0.06, 0.02])
-@pytest.mark.parametrize("radius", [None, 1e-3, 1.0])
+@pytest.mark.parametrize(("thickness", "radius"), [(0.2, None), (0.02, 1.0), (0.02, 1e-3)])
 def test_thin_plates_are_not_met_from_behind(thickness, radius):
     """Both faces of both plates are in the surfaces: the outer ones face through the plates."""
     parts = [flat("lower", -thickness, 0.0, 6), flat("upper", 0.0, thickness, 8)]
@@ -80,42 +78,16 @@ def test_thin_plates_are_not_met_from_behind(thickness, radius):
     assert np.isclose(MPI.COMM_WORLD.allreduce(records.area.sum()), 1.0)
 
 
-def disc_on_block(comm, cells, order, pushed=0.02):
-    """A disc of radius 1 that touches a block with a vertex, moved down by its centre's top."""
+def disc_on_block(comm, order, pushed=0.02):
+    """A disc of radius 1 that touches a block with a vertex, its flat top moved down."""
+    model = None
     if comm.rank == 0:
-        if not gmsh.isInitialized():
-            gmsh.initialize(interruptible=False)
-        gmsh.option.setNumber("General.Terminal", 0)
-        gmsh.model.add("disc on block")
-        geo = gmsh.model.geo
-        centre = geo.addPoint(0, 1, 0)
-        ends = [geo.addPoint(*x, 0) for x in ((-1, 1), (0, 0), (1, 1))]
-        arcs = [geo.addCircleArc(a, centre, b) for a, b in pairwise(ends)]
-        top = [geo.addLine(ends[2], centre), geo.addLine(centre, ends[0])]
-        disc = geo.addPlaneSurface([geo.addCurveLoop([*arcs, *top])])
-        corners = [geo.addPoint(*x, 0) for x in ((-1, -1), (1, -1), (1, 0), (-1, 0))]
-        lines = [geo.addLine(corners[i], corners[(i + 1) % 4]) for i in range(4)]
-        block = geo.addPlaneSurface([geo.addCurveLoop(lines)])
-        for arc in arcs:
-            geo.mesh.setTransfiniteCurve(arc, cells // 4 + 1)
-        for line in (*top, *lines):
-            geo.mesh.setTransfiniteCurve(line, cells // 4 + 2)
-        geo.synchronize()
-        gmsh.model.addPhysicalGroup(2, [disc], name="disc")
-        gmsh.model.addPhysicalGroup(2, [block], name="block")
-        gmsh.model.addPhysicalGroup(1, arcs, name="arc")
-        gmsh.model.addPhysicalGroup(1, top, name="flat")
-        gmsh.model.addPhysicalGroup(1, [lines[2]], name="top")
-        gmsh.model.addPhysicalGroup(1, [lines[0]], name="bottom")
-        gmsh.option.setNumber("Mesh.MeshSizeMax", 8.0 / cells)
-        gmsh.option.setNumber("Mesh.ElementOrder", order)
-        gmsh.model.mesh.generate(2)
-    d = tfeti.read_gmsh(gmsh.model if comm.rank == 0 else None, comm, 4)
-    if comm.rank == 0:
-        gmsh.option.setNumber("Mesh.ElementOrder", 1)
+        with element_options(ElementOrder=order):
+            model = build(1.0, 2.0, 0.25, 10.0)
+    d = tfeti.read_gmsh(model, comm, 4)
 
     def bcs(V):
-        flat_dofs = fem.locate_dofs_topological(V, 1, d.facets("flat"))
+        flat_dofs = fem.locate_dofs_topological(V, 1, d.facets("load"))
         bottom = fem.locate_dofs_topological(V, 1, d.facets("bottom"))
         down = fem.dirichletbc(np.array([0.0, -pushed]), flat_dofs, V)
         return [down, fem.dirichletbc(np.zeros(2), bottom, V)]
@@ -128,13 +100,12 @@ def no_load(v, ds):
     return ufl.dot(fem.Constant(mesh, (0.0,) * v.ufl_shape[0]), v) * ufl.dx(domain=mesh)
 
 
-@pytest.mark.parametrize("order", [1, 2])
-@pytest.mark.parametrize("sides", [("arc", "top"), ("top", "arc")])
+@pytest.mark.parametrize(("order", "sides"), [(1, ("top", "arc")), (2, ("arc", "top"))])
 def test_the_reach_does_not_change_the_answer(comm, order, sides):
     """Facets as large as the contact zone, and a load by displacement alone."""
     forces = []
-    for radius in (None, 0.1, 0.01, 1e-3):
-        d, bcs = disc_on_block(comm, 24, order)
+    for radius in (None, 1e-3):
+        d, bcs = disc_on_block(comm, order)
         contact = sided(*sides, reach=radius)
         p = two_body_problem(d, no_load, bcs, [contact], rtol=1e-10)
         p.solve()
@@ -151,7 +122,7 @@ def test_facets_of_second_order_touch_without_overlap(comm):
     """
     forces = []
     for order in (1, 2):
-        d, bcs = disc_on_block(comm, 24, order)
+        d, bcs = disc_on_block(comm, order)
         p = two_body_problem(d, no_load, bcs, [sided("arc", "top")], rtol=1e-10)
         p.solve()
         dofs = p.dofs
@@ -159,57 +130,6 @@ def test_facets_of_second_order_touch_without_overlap(comm):
         assert records.gap.min(initial=0.0) > -1e-12
         forces.append(np.abs(p.solution.body_forces.force[:, 1]).max())
     assert np.isclose(*forces, rtol=0.03)
-
-
-@pytest.mark.parametrize("contacts", [[], [PAIR]])
-def test_a_rigid_motion_is_found(contacts):
-    """Prescribed values that move bodies as they are: b₀ is what rounding leaves."""
-    d = stacked("quadrilateral", 3, 4, 4, gap=0.1)
-
-    def bcs(V):
-        top = fem.locate_dofs_topological(V, 1, d.facets("upper top"))
-        bottom = fem.locate_dofs_topological(V, 1, d.facets("lower bottom"))
-        down = fem.dirichletbc(np.array([0.0, -0.15 if contacts else -0.05]), top, V)
-        return [down, fem.dirichletbc(np.zeros(2), bottom, V)]
-
-    p = two_body_problem(d, no_load, bcs, contacts)
-    p.solve()
-    assert p.report.converged_reason.startswith("CONVERGED")
-    if contacts:
-        assert p.report.late_contact_rows == p.report.contact_rows == 5
-        assert np.all(gathered(p.solution.contact().force) > 0.0)
-    else:
-        assert p.report.residuals["gluing_jump"] < 1e-12
-
-
-@pytest.mark.parametrize("degree", [1, 2])
-def test_patch_of_quadrilaterals_that_are_no_parallelograms(degree):
-    d = stacked("hexahedron", 3, 4, 4)
-    x = d.mesh.geometry.x
-    inside = np.all((x[:, :2] > 1e-9) & (x[:, :2] < 1 - 1e-9), axis=1)
-    wave = 0.06 * np.sin(7 * x[:, 0] + 5 * x[:, 1] + (x[:, 2] > -1e-9))
-    x[inside, 0] += wave[inside]
-    x[inside, 1] -= 0.7 * wave[inside]
-    sides = ["lower bottom", "lower left", "upper left", "lower front", "upper front"]
-    p = two_body_problem(d, pressed(d), held(d, *sides), [PAIR], degree, **TO_ROUNDING)
-    p.solve()
-    assert np.allclose(gathered(p.solution.contact().pressure), 0.1, rtol=0, atol=1e-8)
-
-
-def test_pressure_at_a_node_of_two_pairs():
-    parts = [
-        ("one", (0.0, -1.0), (1.0, 0.0), (3, 3)),
-        ("two", (1.0, -1.0), (2.0, 0.0), (3, 3)),
-        ("upper", (0.0, 0.0), (2.0, 1.0), (5, 3)),
-    ]
-    d = decomposed_boxes(parts, 6)
-    sides = ["one bottom", "one left", "two bottom", "two right", "upper left"]
-    pairs = [sided("upper bottom", f"{name} top") for name in ("one", "two")]
-    p = two_body_problem(d, pressed(d), held(d, *sides), pairs, **TO_ROUNDING)
-    p.solve()
-    _, dof = p.dofs.scalar
-    values = p.solution.pressure.x.array[dof]
-    assert np.allclose(values[values > 0], 0.1, rtol=0, atol=1e-9)
 
 
 def test_edges_are_warned_of(caplog):
@@ -239,12 +159,11 @@ def test_options_that_did_not_reach_petsc(monkeypatch):
     problem(d, tfeti_max_it=3)  # the program has read it itself
 
 
-@pytest.mark.parametrize("degree", [1, 2])
-def test_an_obstacle_is_asked_about_its_surface_only(degree):
+def test_an_obstacle_is_asked_about_its_surface_only():
     """A block in a hollow sphere, with a node at its centre, where the sphere has no normal."""
     d = decomposed("hexahedron", 2, 4)
     hollow = tfeti.Sphere((0.5, 0.5, 0.5), 2.0, inside=True)
-    p = problem(d, contacts=[tfeti.Obstacle("bottom", hollow)], degree=degree)
+    p = problem(d, contacts=[tfeti.Obstacle("bottom", hollow)], degree=2)
     p.solve()
     assert p.report.contact_candidates == 9
     assert p.report.converged_reason == "CONVERGED_RTOL"

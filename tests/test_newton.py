@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from reference import dense_qp
-from scipy.sparse import diags_array
-from test_qp import bounds_on, matrix, vector
+from petsc4py import PETSc
+from reference.active_set import dense_qp
+from scipy.sparse import block_diag, csr_array, diags_array
+from test_qp import Counted, bounds_on, matrix, vector
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
 from tfeti_dolfinx.qp.homogenised import homogenise, operator_product
@@ -37,19 +38,8 @@ def program(seed, kind="regular"):
     return F, 3.0 * rng.standard_normal(m), G, G @ feasible, bounded
 
 
-class Counted:
-    """An operator that counts."""
-
-    def __init__(self, A):
-        self.A, self.count = matrix(A), 0
-
-    def mult(self, x, y):
-        self.count += 1
-        self.A.mult(x, y)
-
-
 def qp_of(F, d, G, e, bounded):
-    return QP(Counted(F), vector(d), DenseCoarse(G, e), bounds_on(bounded))
+    return QP(Counted(matrix(F)), vector(d), DenseCoarse(G, e), bounds_on(bounded))
 
 
 def solved(qp, tolerance, start=None):
@@ -74,7 +64,7 @@ KINDS = ["regular", "held by bounds", "dependent"]
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("seed", range(15))
+@pytest.mark.parametrize("seed", range(5))
 def test_random_programs(kind, seed):
     F, d, G, e, bounded = program(seed, kind)
     result = solved(qp_of(F, d, G, e, bounded), 1e-9)
@@ -82,30 +72,14 @@ def test_random_programs(kind, seed):
     check_optimal(F, d, G, e, bounded, result, 1e-5 if kind == "dependent" else 1e-8)
 
 
-@pytest.mark.parametrize("kind", KINDS[:2])
-@pytest.mark.parametrize("seed", range(5))
-def test_an_independent_active_set_finds_the_same(kind, seed):
-    F, d, G, e, bounded = program(100 + seed, kind)
+@pytest.mark.parametrize("kind", [*KINDS[:2], "no kernel"])
+def test_an_independent_active_set_finds_the_same(kind):
+    F, d, G, e, bounded = program(100, kind)
+    if kind == "no kernel":
+        G, e = G[:0], e[:0]
     lam = solved(qp_of(F, d, G, e, bounded), 1e-10).lam.array_r
     reference = dense_qp(F, d, G, e, bounded)
     assert np.allclose(lam, reference, rtol=0.0, atol=1e-6 * np.abs(reference).max())
-
-
-def test_the_cost_falls_and_iterates_are_feasible():
-    F, d, G, e, bounded = program(7)
-    qp, seen = qp_of(F, d, G, e, bounded), []
-
-    def monitor(steps, step, x, projected_gradient, equality):
-        if step in ("start", "outer"):
-            lam = np.array(x.array_r)
-            assert np.all(lam[bounded] >= 0.0)
-            assert np.allclose(G @ lam, e, atol=1e-9)
-            seen.append(0.5 * lam @ F @ lam - d @ lam)
-
-    start = homogenise(qp, operator_product(qp.F, first_point(qp)))
-    newton(qp, start, ResidualRule(1e-9), max_it=3000, monitor=monitor)
-    assert len(seen) > 3
-    assert np.all(np.diff(seen) <= 1e-12 * np.abs(seen[-1]))
 
 
 def test_from_its_own_solution_it_multiplies_once():
@@ -118,68 +92,7 @@ def test_from_its_own_solution_it_multiplies_once():
     assert np.allclose(again.lam.array_r, found.lam.array_r, atol=1e-8)
 
 
-def test_without_a_kernel():
-    F, d, _, _, bounded = program(4)
-    qp = QP(matrix(F), vector(d), NoCoarse(), bounds_on(bounded))
-    lam = solved(qp, 1e-10).lam.array_r
-    reference = dense_qp(F, d, np.zeros((0, len(d))), np.zeros(0), bounded)
-    assert np.allclose(lam, reference, atol=1e-7 * np.abs(reference).max())
-
-
-def test_forces_that_are_rounding_do_not_say_what_touches():
-    """min ½λ₁² − λ₁ + λ₂, λ ≥ 0, from λ₂ = 1e-25: nothing rests on the second row."""
-    qp = QP(matrix(np.eye(2)), vector([1.0, -1.0]), NoCoarse(), bounds_on(np.arange(2)))
-    start = homogenise(qp, operator_product(qp.F, vector([1.0, 1e-25])))
-    found = newton(qp, start, ResidualRule(1e-10), start=Start(start.lam_bar, np.zeros(0)))
-    assert found.lam.array_r[1] > 0.0
-    assert found.face.carrying.tolist() == [True, False]
-
-
-def test_nothing_to_do_costs_nothing():
-    """d = 0, e = 0: the start is the solution."""
-    F, d, G, e, bounded = program(5)
-    qp = qp_of(F, 0.0 * d, G, 0.0 * e, bounded)
-    result = solved(qp, 1e-12)
-    assert qp.F.count == 0
-    assert not result.lam.array_r.any()
-
-
-@pytest.mark.parametrize("seed", range(10))
-@pytest.mark.parametrize("kind", KINDS[:2])
-def test_the_nearest_feasible_point(kind, seed):
-    """Gλ = e, λ ∈ Ω, and λ − y = Gᵀα on free rows, at least that on the others."""
-    _, d, G, e, bounded = program(seed, kind)
-    y = 10.0 * d
-    found = project_onto_feasible(DenseCoarse(G, e), bounds_on(bounded), vector(y))
-    lam = found.lam.array_r
-    assert found.missing <= 1e-12
-    assert np.allclose(G @ lam, e, atol=1e-9 * np.linalg.norm(y))
-    assert np.all(lam[bounded] >= 0.0)
-    apart = lam - y - G.T @ found.alpha
-    free = np.ones(len(y), dtype=bool)
-    free[bounded] = lam[bounded] > 0.0
-    assert np.allclose(apart[free], 0.0, atol=1e-9 * np.linalg.norm(y))
-    assert np.all(apart >= -1e-9 * np.linalg.norm(y))
-
-
-def test_steps_that_no_row_stops_end():
-    """λ ≥ 0 and λ₁ + λ₂ = −1: the cost falls for ever along α < 0."""
-
-    class Counting(DenseCoarse):
-        steps = 0
-
-        def damped_solve(self, face, y, damping):
-            self.steps += 1
-            return super().damped_solve(face, y, damping)
-
-    coarse = Counting(np.ones((1, 2)), -np.ones(1))
-    found = project_onto_feasible(coarse, bounds_on(np.arange(2)), vector([1.0, 2.0]))
-    assert found.missing == pytest.approx(1.0)
-    assert np.array_equal(found.lam.array_r, [0.0, 0.0])
-    assert coarse.steps <= 15
-
-
-@pytest.mark.parametrize("stiff", [1e3, 1e5, 1e6])
+@pytest.mark.parametrize("stiff", [1e3, 1e6])
 def test_soft_rows_that_hold_are_seen_beside_stiff_ones_that_are_open(stiff):
     """λ₁ − rλ₂ = 1 at (1, 0): G_f G_fᵀ = 1 beside GGᵀ = 1 + r²."""
     coarse = DenseCoarse(np.array([[1.0, -stiff]]), np.ones(1))
@@ -188,9 +101,9 @@ def test_soft_rows_that_hold_are_seen_beside_stiff_ones_that_are_open(stiff):
     assert np.allclose(found.lam.array_r, [1.0, 0.0], rtol=0.0, atol=1e-12)
 
 
-def nearly_dependent(seed, near=1e-6, m=60):
+def nearly_dependent(near=1e-6, m=60):
     """Two rows of G that are nearly the same, d nearly all in Gᵀμ, and an M that has Gᵀ for 0."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     A = rng.standard_normal((m, m)) * 10.0 ** rng.uniform(-0.5, 0.5, m)
     F = A @ A.T / m + 0.1 * np.eye(m)
     G = rng.standard_normal((4, m))
@@ -202,10 +115,9 @@ def nearly_dependent(seed, near=1e-6, m=60):
     return QP(matrix(F), vector(d), DenseCoarse(G, G @ np.ones(m)), Product(), matrix(M)), F, P
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_what_nearly_dependent_rows_of_G_leave_is_no_residual(seed):
+def test_what_nearly_dependent_rows_of_G_leave_is_no_residual():
     """κ(GGᵀ) = 1e12: a projection leaves 1e-7 of d, which M does not see."""
-    qp, F, P = nearly_dependent(seed)
+    qp, F, P = nearly_dependent()
     result = solve_by_pcpg(qp, homogenise(qp), ResidualRule(1e-9), max_it=3000)
     assert result.reason > 0
     assert np.linalg.norm(P @ (F @ result.lam.array_r - qp.d.array_r)) <= 2e-8
@@ -233,16 +145,18 @@ def test_rows_that_exclude_each_other_are_named(room, solvable):
 def string_beside(force, n=1500):
     """A string whose ‖r‖ is not below that at the start for 1000 steps, and a known force."""
     A = diags_array([-np.ones(n - 1), 2 * np.ones(n), -np.ones(n - 1)], offsets=[-1, 0, 1])
-    F = np.zeros((n + 1, n + 1))
-    F[:n, :n] = A.toarray()
-    G, d = np.zeros((1, n + 1)), np.zeros(n + 1)
-    G[0, n] = F[n, n] = 1.0
-    d[:n], d[n] = np.arange(n) / n, force
-    return QP(matrix(F), vector(d), DenseCoarse(G, np.array([force])), Product())
+    F = csr_array(block_diag((A, 1.0)))
+    G, d = np.eye(1, n + 1, n), np.append(np.arange(n) / n, force)
+    F = PETSc.Mat().createAIJ(F.shape, csr=(F.indptr, F.indices, F.data), comm=PETSc.COMM_SELF)
+    return QP(F, vector(d), DenseCoarse(G, np.array([force])), Product())
 
 
 @pytest.mark.parametrize(
-    ("force", "reason"), [(1.0, "CONVERGED_RTOL"), (1e15, "DIVERGED_ROUNDING")]
+    ("force", "reason"),
+    [
+        pytest.param(1.0, "CONVERGED_RTOL", marks=pytest.mark.slow),
+        (1e15, "DIVERGED_ROUNDING"),
+    ],
 )
 def test_a_plateau_is_left_where_q_does_not_fall_either(force, reason):
     """500 steps, and 500 with a new gradient; beside 1e30, what they gain is rounding of q."""

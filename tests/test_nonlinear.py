@@ -1,21 +1,21 @@
 """Nonlinear bodies in contact beside independent solvers, and exact identities."""
 
-import gmsh
 import numpy as np
 import pytest
 import ufl
+from bodies import stacked
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-
-import tfeti_dolfinx as tfeti
-from tests.nonlinear_reference import (
+from reference.nonlinear import (
     SimplePlasticity,
     above_plane,
     block,
     nearest_nodes,
     neo_hooke,
 )
+
+import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.nonlinear.state import InternalVariables
 
 E, NU = 1.0, 0.3
@@ -23,7 +23,7 @@ DX = {"metadata": {"quadrature_degree": 4}}
 
 
 def torn(comm, gdim, n, bulge, subdomains):
-    """The block of ``nonlinear_reference``, torn."""
+    """The block of ``reference.nonlinear``, torn."""
     mesh, tags = block(gdim, n, bulge, comm)
     surfaces = {"low": 1, "top": 2}
     return tfeti.decompose(mesh, subdomains, facet_tags=tags, surfaces=surfaces)
@@ -64,65 +64,48 @@ def reference(gdim, n, bulge, make, path):
     return V, steps
 
 
-def test_plasticity_is_that_of_an_active_set_method(comm):
-    """Loading, unloading to above the plane, reloading: u of every step to 1e-8 of its size."""
-    path, sy, H = [-0.04, -0.08, -0.03, 0.01, -0.05, -0.1], 0.01, 0.05
-
-    def make(u, v):
-        law = SimplePlasticity(u, E, NU, sy, H, 2)
-        return law.residual(v), law.state
-
-    W, steps = reference(2, 5, 0.05, make, path)
-    decomposition = torn(comm, 2, 5, 0.05, 4)
-    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
-    u, v, du = fem.Function(V), ufl.TestFunction(V), ufl.TrialFunction(V)
-    elastic = tfeti.Elasticity(decomposition, E=E, nu=NU, model="plane_strain")
-    law = tfeti.J2Plasticity(elastic, u, yield_stress=sy, hardening=H)
-    value, bc = held_top(V, decomposition)
-    problem = tfeti.NonlinearContactProblem(
-        law.residual(v),
-        u,
-        [bc],
-        [plane(2)],
-        decomposition,
-        J=law.tangent(du, v),
-        state=law.state,
-        update=law.update,
-        stress=law.stress,
-        petsc_options={"rtol": 1e-9},
-    )
+def check_steps(problem, value, path, W, steps):
+    """u of every step is that of the reference to 1e-8 of its size."""
+    V, comm = problem.u.function_space, problem.decomposition.comm
     nodes = nearest_nodes(W, V)
     for down, expected in zip(path, steps, strict=True):
         value.value[-1] = down
         problem.solve()
         problem.accept()
-        error = np.abs(u.x.array.reshape(-1, 2) - expected[nodes]).max(initial=0.0)
+        found = problem.u.x.array.reshape(-1, V.dofmap.bs)
+        error = np.abs(found - expected[nodes]).max(initial=0.0)
         assert comm.allreduce(error, op=MPI.MAX) < 1e-8 * np.abs(expected).max()
+
+
+def test_plasticity_is_that_of_an_active_set_method(comm):
+    """Loading, unloading to above the plane, reloading."""
+    path = [-0.04, -0.08, 0.01, -0.1]
+
+    def make(u, v):
+        law = SimplePlasticity(u, E, NU, 0.01, 0.05, 2)
+        return law.residual(v), law.state
+
+    problem, _, value = plastic(comm, n=5, petsc_options={"rtol": 1e-9})
+    check_steps(problem, value, path, *reference(2, 5, 0.05, make, path))
 
 
 @pytest.mark.parametrize(("gdim", "n", "down"), [(2, 5, -0.4), (3, 2, -0.3)])
 def test_finite_strain_is_that_of_an_active_set_method(gdim, n, down, comm):
-    path = down * np.linspace(0.25, 1.0, 4)
+    path = down * np.array([0.25, 0.5])
 
     def make(u, v):
         return ufl.derivative(neo_hooke(u, E, NU) * ufl.dx(**DX), u, v), {}
 
-    W, steps = reference(gdim, n, 0.2, make, path)
     decomposition = torn(comm, gdim, n, 0.2, 4)
     V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (gdim,)))
-    u, v = fem.Function(V), ufl.TestFunction(V)
+    u, x = fem.Function(V), decomposition.mesh.geometry.x.copy()
     value, bc = held_top(V, decomposition)
-    F = make(u, v)[0]
+    F = make(u, ufl.TestFunction(V))[0]
+    options = {"rtol": 2e-9}
     problem = tfeti.NonlinearContactProblem(
-        F, u, [bc], [plane(gdim)], decomposition, finite=True, petsc_options={"rtol": 2e-9}
+        F, u, [bc], [plane(gdim)], decomposition, finite=True, petsc_options=options
     )
-    nodes, x = nearest_nodes(W, V), decomposition.mesh.geometry.x.copy()
-    for move, expected in zip(path, steps, strict=True):
-        value.value[-1] = move
-        problem.solve()
-        problem.accept()
-        error = np.abs(u.x.array.reshape(-1, gdim) - expected[nodes]).max(initial=0.0)
-        assert comm.allreduce(error, op=MPI.MAX) < 1e-8 * np.abs(expected).max()
+    check_steps(problem, value, path, *reference(gdim, n, 0.2, make, path))
     assert np.array_equal(decomposition.mesh.geometry.x, x)
 
 
@@ -143,7 +126,7 @@ def test_a_turned_body_has_no_stress(comm):
         finite=True,
         petsc_options={"rtol": 1e-11},
     )
-    for angle in np.linspace(0.0, np.pi / 2, 7)[1:]:
+    for angle in np.linspace(0.0, np.pi / 2, 5)[1:]:
         c, s = np.cos(angle), np.sin(angle)
         turned.interpolate(
             lambda x, c=c, s=s: (c * x[0] - s * x[1] - x[0], s * x[0] + c * x[1] - x[1])
@@ -157,9 +140,9 @@ def test_a_turned_body_has_no_stress(comm):
         assert abs(energy) < 1e-14
 
 
-def plastic(comm, hardening=0.05, **more):
+def plastic(comm, hardening=0.05, n=4, **more):
     """The block of J2 material, its problem, and the constant that moves its upper side."""
-    decomposition = torn(comm, 2, 4, 0.05, 3)
+    decomposition = torn(comm, 2, n, 0.05, 3)
     V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
     u, v, du = fem.Function(V), ufl.TestFunction(V), ufl.TrialFunction(V)
     elastic = tfeti.Elasticity(decomposition, E=E, nu=NU, model="plane_strain")
@@ -174,7 +157,7 @@ def plastic(comm, hardening=0.05, **more):
 
 def test_series_goes_on_from_its_checkpoint(comm, shared_tmp):
     """Load steps with internal variables: stopped, resumed, the same as in one run."""
-    times = [1.0, 2.0, 3.0, 4.0]
+    times = [1.0, 2.0]
 
     def series(until, folder, resume=False):
         problem, law, value = plastic(comm)
@@ -186,9 +169,9 @@ def test_series_goes_on_from_its_checkpoint(comm, shared_tmp):
         steps.run(resume=resume)
         return problem.u.x.array.copy(), law.p.x.array.copy()
 
-    whole = series(4, "whole")
-    series(2, "parts")
-    for found, expected in zip(series(4, "parts", resume=True), whole, strict=True):
+    whole = series(2, "whole")
+    series(1, "parts")
+    for found, expected in zip(series(2, "parts", resume=True), whole, strict=True):
         assert np.abs(found - expected).max(initial=0.0) < 1e-7 * 0.06
 
 
@@ -208,7 +191,7 @@ def test_a_step_that_is_given_up_leaves_no_trace(comm):
 
 def test_perfect_plasticity_keeps_the_stress_below_yield(comm):
     problem, law, value = plastic(comm, hardening=0.0)
-    for down in (-0.04, -0.05, -0.06):
+    for down in (-0.04, -0.06):
         value.value[-1] = down
         problem.solve()
         problem.accept()
@@ -220,9 +203,9 @@ def test_perfect_plasticity_keeps_the_stress_below_yield(comm):
     assert comm.allreduce(fem.assemble_scalar(fem.form(beyond * law.dx))) == 0.0
 
 
-@pytest.mark.parametrize(("saturation", "rate"), [(0.0, 0.0), (0.02, 30.0)])
-def test_stress_of_a_bar_follows_its_hardening(saturation, rate, comm):
+def test_stress_of_a_bar_follows_its_hardening(comm):
     """Pulled along an axis and free across: σ = σ_y(p), p = ε − σ/E, loaded and unloaded."""
+    saturation, rate = 0.02, 30.0
     mesh = dmesh.create_box(comm, [[0.0] * 3, [1.0] * 3], (2, 2, 2))
     mesh.topology.create_connectivity(2, 3)
     sides = [
@@ -285,11 +268,10 @@ def test_a_step_that_did_not_converge_is_not_accepted(comm):
         problem.accept()
 
 
-@pytest.mark.parametrize("degree", [1, 2])
-def test_patch_of_two_finite_bodies_is_exact(degree, comm):
+def test_patch_of_two_finite_bodies_is_exact(comm):
     """Two blocks that do not match, pressed by a twentieth: homogeneous strain, ν = 0."""
-    decomposition = two_blocks(comm)
-    V = fem.functionspace(decomposition.mesh, ("Lagrange", degree, (2,)))
+    decomposition = stacked("triangle", 3, 4, 4)
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
     u, v = fem.Function(V), ufl.TestFunction(V)
     F = ufl.derivative(neo_hooke(u, E, 0.0) * ufl.dx(**DX), u, v)
     value = fem.Constant(decomposition.mesh, 0.0)
@@ -297,13 +279,18 @@ def test_patch_of_two_finite_bodies_is_exact(degree, comm):
         fem.dirichletbc(
             constant, fem.locate_dofs_topological(V.sub(i), 1, decomposition.facets(name)), V.sub(i)
         )
-        for name, i, constant in (("top", 1, value), ("floor", 1, 0.0), ("left", 0, 0.0))
+        for name, i, constant in (
+            ("upper top", 1, value),
+            ("lower bottom", 1, 0.0),
+            ("lower left", 0, 0.0),
+            ("upper left", 0, 0.0),
+        )
     ]
     problem = tfeti.NonlinearContactProblem(
         F,
         u,
         bcs,
-        [tfeti.Contact("under", "over")],
+        [tfeti.Contact("lower top", "upper bottom")],
         decomposition,
         finite=True,
         petsc_options={"rtol": 1e-9},
@@ -312,37 +299,9 @@ def test_patch_of_two_finite_bodies_is_exact(degree, comm):
         value.value = move
         problem.solve()
         problem.accept()
-    exact = ufl.as_vector((0, 0.5 * move * ufl.SpatialCoordinate(V.mesh)[1]))
+    exact = ufl.as_vector((0, 0.5 * move * (1 + ufl.SpatialCoordinate(V.mesh)[1])))
     error = fem.form(ufl.inner(u - exact, u - exact) * ufl.dx)
     assert comm.allreduce(fem.assemble_scalar(error)) ** 0.5 < 1e-8
-
-
-def two_blocks(comm):
-    """Two blocks of height 1, one upon the other, whose meshes do not match."""
-    if comm.rank == 0:
-        gmsh.initialize()
-        gmsh.option.setNumber("General.Terminal", 0)
-        model = gmsh.model
-        model.add("blocks")
-        lines = {}
-        for name, y, h in (("lower", 0.0, 0.4), ("upper", 1.0, 0.27)):
-            places = ((0.0, y), (1.5, y), (1.5, y + 1), (0.0, y + 1))
-            points = [model.geo.addPoint(a, b, 0, h) for a, b in places]
-            lines[name] = [model.geo.addLine(points[i], points[(i + 1) % 4]) for i in range(4)]
-            loop = model.geo.addCurveLoop(lines[name])
-            surface = model.geo.addPlaneSurface([loop])
-            model.geo.synchronize()
-            model.addPhysicalGroup(2, [surface], name=name)
-        low, up = lines["lower"], lines["upper"]
-        groups = {"floor": [low[0]], "under": [low[2]], "over": [up[0]], "top": [up[2]]}
-        groups["left"] = [low[3], up[3]]
-        for name, tags in groups.items():
-            model.addPhysicalGroup(1, tags, name=name)
-        model.mesh.generate(2)
-    decomposition = tfeti.read_gmsh(gmsh.model if comm.rank == 0 else None, comm, subdomains=5)
-    if comm.rank == 0:
-        gmsh.finalize()
-    return decomposition
 
 
 @pytest.mark.parametrize(

@@ -15,11 +15,8 @@ from tfeti_dolfinx.options import factor_options, options_table, parse_options
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def test_defaults():
-    assert parse_options(None, "tfeti_") == Options()
-
-
 def test_values_get_the_type_of_their_option():
+    assert parse_options(None, "tfeti_") == Options()
     given = {"tfeti_rtol": "1e-8", "max_it": "7", "-tfeti_monitor": None, "view": "false"}
     options = parse_options(given, "tfeti_")
     assert (options.rtol, options.max_it, options.monitor, options.view) == (1e-8, 7, True, False)
@@ -41,16 +38,14 @@ def test_the_command_line_beats_the_dictionary():
         ({"tfeti_rtoll": 1}, r"unknown option -tfeti_rtoll; expected -tfeti_rtol or -tfeti_atol"),
         ({"tfeti_rtol": "tight"}, r"-tfeti_rtol 'tight': expected a value of type float"),
         ({"tfeti_rtol": -1}, r"-tfeti_rtol -1.0: expected 0 or more"),
-        ({"tfeti_max_it": "1.5"}, r"-tfeti_max_it '1.5': expected a value of type int"),
         (
             {"tfeti_qp_type": "newt"},
             r"-tfeti_qp_type newt: expected one of auto, pcpg, smalse, newton",
         ),
         ({"tfeti_monitor": "maybe"}, r"-tfeti_monitor 'maybe': expected a value of type bool"),
         ({"tfeti_smalse_beta": 1.0}, r"-tfeti_smalse_beta 1.0: expected between 0 and 1"),
-        ({"tfeti_smalse_rho": 0}, r"-tfeti_smalse_rho 0.0: expected more than 0"),
         (
-            {"tfeti_without": "cautious,care"},
+            {"tfeti_without": "d_scaling,care"},
             r"-tfeti_without care: expected some of d_scaling, smooth_displacements, ",
         ),
         ({"tfeti_mpgp_alpha": 3}, r"-tfeti_mpgp_alpha 3.0: expected more than 0, at most 2"),
@@ -62,10 +57,9 @@ def test_options_that_do_not_fit(given, message):
 
 
 def test_named_mechanisms_are_switched_off():
-    options = parse_options({"tfeti_without": "cautious,d_scaling, recycled_directions"}, "tfeti_")
-    assert options.without == ("cautious", "d_scaling", "recycled_directions")
+    options = parse_options({"tfeti_without": "d_scaling, recycled_directions"}, "tfeti_")
+    assert options.without == ("d_scaling", "recycled_directions")
     assert (options.scaling, options.recycle) == ("multiplicity", 0)
-    assert not options.newton.cautious
 
 
 def test_view_lists_every_option():

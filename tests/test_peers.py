@@ -9,7 +9,6 @@ import pytest
 
 from benchmarks.error_scenes import SCENES
 from benchmarks.peers import meshes, tables
-from benchmarks.profiles import errors
 
 PEERS = Path(__file__).resolve().parents[1] / "benchmarks" / "peers"
 
@@ -71,11 +70,3 @@ def test_pressures_are_judged_at_equal_errors(tmp_path):
     assert [row["pressure"] for row in rows] == pytest.approx([0.08, 0.001] * 2, rel=0.02)
     assert equal[1]["over ours, 1.0%"] == pytest.approx(5.0, rel=0.01)
     assert (tmp_path / "peers.png").read_bytes().startswith(b"\x89PNG")
-
-
-def test_errors_of_a_pressure_that_is_too_wide():
-    """p(x/1.1): as a, so its second moment, is a tenth too large."""
-    samples = SCENES["half cylinder"]().samples
-    p = samples.exact(lambda r: np.sqrt(np.maximum(1.0 - (r / 0.04) ** 2, 0.0)))
-    wide = samples.exact(lambda r: np.sqrt(np.maximum(1.0 - (r / 0.044) ** 2, 0.0)))
-    assert errors(samples, wide, p)["a"] == pytest.approx(0.1, rel=1e-3)

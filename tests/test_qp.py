@@ -7,13 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from petsc4py import PETSc
-from reference import dense_qp
+from reference.active_set import dense_qp
 from scipy.sparse import diags_array
 
-from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
+from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.homogenised import homogenise
 from tfeti_dolfinx.qp.krylov import estimate_norm, solve_by_pcpg
-from tfeti_dolfinx.qp.mprgp import EXPANSIONS, MprgpIterate, MprgpParameters, mprgp
+from tfeti_dolfinx.qp.mprgp import MprgpIterate, MprgpParameters, mprgp
 from tfeti_dolfinx.qp.parameters import SmalseParameters
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, ResidualRule, Start, Steps
 from tfeti_dolfinx.qp.sets import Bounds, Product
@@ -77,24 +77,19 @@ def string(n=100):
     return A, b, lower
 
 
-# steps of PERMON's MPGP on its tutorial ex1 with -n 100: 156 + 18 + 7 with the fixed step (its
-# step length comes from an estimate of ‖A‖), 134 + 14 + 12 with the projected CG step
-@pytest.mark.parametrize(
-    ("expansion", "known"), [("fixed", (156, 18, 7)), ("projcg", (134, 14, 12))]
-)
-def test_mprgp_on_a_string_over_an_obstacle(expansion, known):
+# steps of PERMON's MPGP on its tutorial ex1 with -n 100, whose step length comes from an estimate
+# of ‖A‖
+def test_mprgp_on_a_string_over_an_obstacle():
     A, b, lower = string()
     x, g = vector(np.zeros(100)), vector(-b)
     bounds = Bounds(lower)
     state, steps = MprgpIterate(matrix(A), x, g, bounds), Steps()
-    parameters = MprgpParameters(1.95 / 4, 1.0, EXPANSIONS[expansion])
+    parameters = MprgpParameters(1.95 / 4)
     tol = 1e-5 * np.linalg.norm(b)
     reason = mprgp(state, parameters, lambda s: s.projected_gradient <= tol, steps, 1000)
     assert reason is None
     found = np.array([steps.cg, steps.expansion, steps.proportioning])
-    assert np.all(np.abs(found - known) <= (10, 3, 3))
-    if expansion == "projcg":
-        assert np.all(np.abs(found - known) <= 2)
+    assert np.all(np.abs(found - (156, 18, 7)) <= (10, 3, 3))
     assert np.all(x.array >= lower)
     assert np.allclose(g.array, A @ x.array - b, atol=1e-12)
     touching = x.array <= lower
@@ -102,53 +97,11 @@ def test_mprgp_on_a_string_over_an_obstacle(expansion, known):
     assert np.all(g.array[touching] >= -1e-4 * tol)
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_what_projects_to_its_bound_is_exactly_on_it(seed):
-    """λ = x + λ̄ with x ≥ −λ̄: not nearly 0 there, whatever x + (target − x) rounds to."""
-    rng = np.random.default_rng(seed)
-    lam_bar = rng.standard_normal(40)
-    x, target = vector(rng.standard_normal(40)), vector(10 * rng.standard_normal(40))
-    bounds = Bounds().shifted(lam_bar)
-    for vec in (x, target):
-        vec.array[:] = bounds.project(vec.array_r)
-    A = np.diag(rng.random(40))
-    state = MprgpIterate(matrix(A), x, vector(A @ x.array), bounds)
-    state.move_to(target)
-    lam = x.array + lam_bar
-    assert np.array_equal(lam == 0.0, target.array <= -lam_bar)
-    assert 0 < np.sum(lam == 0.0) < 40
-    assert np.allclose(state.g.array, A @ x.array)
-
-
-def test_mprgp_stops_at_max_it():
-    A, b, lower = string()
-    state = MprgpIterate(matrix(A), vector(np.zeros(100)), vector(-b), Bounds(lower))
-    steps = Steps()
-    reason = mprgp(state, MprgpParameters(0.4), lambda s: False, steps, 7)
-    assert reason == ConvergedReason.DIVERGED_ITS
-    assert steps.inner == 7
-
-
 def test_mprgp_reports_an_indefinite_operator():
     A = np.diag([1.0, -1.0])
     state = MprgpIterate(matrix(A), vector([1.0, 1.0]), vector([0.0, -2.0]), Product())
     reason = mprgp(state, MprgpParameters(0.5), lambda s: False, Steps(), 10)
     assert reason == ConvergedReason.DIVERGED_INDEFINITE_MAT
-
-
-@given(st.integers(0, 1000), st.sampled_from(["fixed", "projcg"]))
-def test_smalse_agrees_with_an_active_set_solver(seed, expansion):
-    F, d, G, e, bounded = random_program(seed)
-    coarse = DenseCoarse(G, e)
-    qp = QP(matrix(F), vector(d), coarse, bounds_on(bounded))
-    qp = replace(qp, norm=estimate_norm(qp.F, coarse, qp.d, 60))
-    homogenised = homogenise(qp)
-    parameters = SmalseParameters(expansion=expansion)
-    result = smalse(qp, homogenised, to(1e-11, homogenised), parameters, max_it=20_000)
-    exact = dense_qp(F, d, G, e, bounded)
-    assert result.reason == ConvergedReason.CONVERGED_RTOL
-    assert np.linalg.norm(result.lam.array - exact) <= 1e-8 * np.linalg.norm(exact)
-    assert np.all(result.lam.array[bounded] >= -1e-15)
 
 
 def test_smalse_from_the_solution_takes_hardly_a_step():
@@ -162,29 +115,6 @@ def test_smalse_from_the_solution_takes_hardly_a_step():
     warm = smalse(qp, homogenised, to(1e-6, homogenised), start=start)
     assert warm.steps.inner <= 2
     assert np.linalg.norm(warm.lam.array - cold.lam.array) <= 1e-5 * cold.lam.norm()
-
-
-def test_smalse_without_equality_is_mprgp():
-    F, d, _, _, bounded = random_program(5)
-    qp = QP(matrix(F), vector(d), NoCoarse(), bounds_on(bounded))
-    qp = replace(qp, norm=estimate_norm(qp.F, qp.coarse, qp.d, 60))
-    homogenised = homogenise(qp)
-    result = smalse(qp, homogenised, to(1e-12, homogenised))
-    exact = dense_qp(F, d, np.zeros((0, 40)), np.zeros(0), bounded)
-    assert result.steps.outer == 0
-    assert np.allclose(result.lam.array, exact, atol=1e-9)
-
-
-def test_smalse_says_when_it_stopped_early():
-    F, d, G, e, bounded = random_program(7)
-    coarse = DenseCoarse(G, e)
-    qp = QP(matrix(F), vector(d), coarse, bounds_on(bounded))
-    homogenised = homogenise(qp)
-    result = smalse(
-        replace(qp, norm=np.linalg.norm(F, 2)), homogenised, to(1e-12, homogenised), max_it=3
-    )
-    assert result.reason == ConvergedReason.DIVERGED_ITS
-    assert result.steps.inner == 3
 
 
 @given(st.integers(0, 1000))
@@ -209,15 +139,6 @@ def test_a_good_preconditioner_makes_pcpg_fast():
     assert np.allclose(slow.lam.array, fast.lam.array, atol=1e-8)
 
 
-def test_norm_is_estimated_from_above_but_closely():
-    F, d, G, e, _ = random_program(11)
-    coarse = DenseCoarse(G, e)
-    P = np.eye(40) - G.T @ np.linalg.solve(G @ G.T, G)
-    exact = np.linalg.norm(P @ F @ P, 2)
-    estimate = estimate_norm(matrix(F), coarse, vector(d), 30)
-    assert 0.95 * exact <= estimate <= 1.06 * exact
-
-
 def test_nothing_to_do_is_no_step():
     F, _, G, _, bounded = random_program(2)
     qp = QP(matrix(F), vector(np.zeros(40)), DenseCoarse(G, np.zeros(5)), bounds_on(bounded))
@@ -226,7 +147,7 @@ def test_nothing_to_do_is_no_step():
     assert solve_by_pcpg(qp, homogenised, ResidualRule(0.0)).steps.cg == 0
 
 
-@pytest.mark.parametrize("M", [1.0, 1e6, 1e-6])
+@pytest.mark.parametrize("M", [1e6, 1e-6])
 def test_smalse_says_that_nothing_fulfils_the_equality(M):
     """λ ≥ 0 and λ_1 + λ_2 = −√2 exclude each other."""
     coarse = DenseCoarse(np.ones((1, 2)) / np.sqrt(2), np.array([-1.0]))
@@ -248,14 +169,7 @@ def test_smalse_converges_whatever_M_and_beta_are(seed, beta, exponent):
     exact = dense_qp(F, d, G, e, bounded)
     assert result.reason == ConvergedReason.CONVERGED_RTOL
     assert np.linalg.norm(result.lam.array - exact) <= 1e-5 * np.linalg.norm(exact)
-
-
-def test_mprgp_ends_exactly_on_the_bound():
-    F, d, G, e, bounded = random_program(13)
-    coarse = DenseCoarse(G, e)
-    qp = QP(matrix(F), vector(d), coarse, bounds_on(bounded))
-    homogenised = homogenise(qp)
-    qp = replace(qp, norm=estimate_norm(qp.F, coarse, qp.d, 40))
-    lam = smalse(qp, homogenised, to(1e-10, homogenised)).lam.array
-    assert np.all(lam[bounded] >= 0.0)
-    assert np.any(lam[bounded] == 0.0)
+    assert np.all(result.lam.array[bounded] >= -1e-15)
+    stopped = smalse(qp, homogenised, to(1e-12, homogenised), parameters, max_it=3)
+    assert stopped.reason == ConvergedReason.DIVERGED_ITS
+    assert stopped.steps.inner == 3

@@ -1,9 +1,8 @@
 """A scene that is turned has the turned answer, after as many multiplications."""
 
 import numpy as np
-import pytest
 import ufl
-from bodies import boxes, stacked, two_body_problem
+from bodies import boxes, two_body_problem
 from dolfinx import fem
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -107,38 +106,12 @@ def loaded(d, top, held, contacts):
     return p, t
 
 
-def assert_the_same(seed):
+@settings(max_examples=5)
+@given(st.integers(0, 10_000))
+def test_a_scene_that_is_turned_has_the_turned_answer(seed):
     comm = MPI.COMM_WORLD
     pairs = zip(steps(seed, turned=False), steps(seed, turned=True), strict=False)
     for (u, counts), (u_turned, turned_counts) in pairs:
         apart = comm.allreduce(np.abs(u_turned - u).max(initial=0.0), op=MPI.MAX)
         assert apart <= 1e-8 * comm.allreduce(np.abs(u).max(initial=0.0), op=MPI.MAX)
         assert np.all(np.abs(turned_counts - counts) <= np.maximum(3, 0.15 * counts))
-
-
-@pytest.mark.parametrize("angle", [0.0, 0.25 * np.pi, 0.5 * np.pi])
-def test_the_softer_side_does_not_depend_on_the_axes(angle):
-    d = stacked("quadrilateral", 4, 4)
-    x = d.mesh.geometry.x
-    x[:, 1] *= np.where(x[:, 1] > 0.0, 3.0, 1.0)  # cells above are long across: soft, along: stiff
-    c, s = np.cos(angle), np.sin(angle)
-    x[:, :2] = x[:, :2] @ np.array([[c, s], [-s, c]])
-    contacts = [tfeti.Contact("lower top", "upper bottom")]
-    p, t = loaded(d, "upper top", ("lower bottom", "upper left"), contacts)
-    t.value[:] = 0.05 * s, -0.05 * c
-    p.solve()
-    assert p.solution.contacts[0].surfaces == ("upper bottom", "lower top")
-    p.destroy()
-
-
-@settings(max_examples=6)
-@given(st.integers(0, 10_000))
-def test_a_scene_that_is_turned_has_the_turned_answer(seed):
-    assert_the_same(seed)
-
-
-@pytest.mark.slow
-@settings(max_examples=100)
-@given(st.integers(10_001, 10**6))
-def test_many_scenes_that_are_turned_have_the_turned_answer(seed):
-    assert_the_same(seed)

@@ -6,7 +6,6 @@ from scenes import clamp, curved_obstacle, decomposed, forms, hooke, problem
 from true_errors import AGAINST_FINER, error_against, stress_of_cells
 
 import tfeti_dolfinx as tfeti
-from demos import talk_hertz_2d
 from tfeti_dolfinx.feti.stopping import StoppingTolerances
 
 
@@ -38,17 +37,6 @@ def test_it_saves_a_third_and_spoils_nothing(serial_only, scene, sizes, finest):
         assert work(auto) <= work(exact) * 2 / 3
 
 
-@pytest.mark.slow
-def test_it_saves_a_third_where_the_mesh_is_fine(serial_only):
-    """Most of its multiplications find out which nodes touch; 24 and 36 were counted."""
-    auto, exact = (
-        talk_hertz_2d.run(["--subdomains", "8", "-tfeti_rtol", rtol])[1]
-        for rtol in ("auto", "1e-8")
-    )
-    assert auto.F_multiplications <= exact.F_multiplications * 2 / 3 + 1
-    assert auto.recoveries <= 2
-
-
 LAWS = {
     "no friction": None,
     "bound": tfeti.Tresca(5e-3),
@@ -56,9 +44,15 @@ LAWS = {
 }
 
 
-@pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("qp_type", ["newton", "smalse"])
-@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
+@pytest.mark.parametrize(
+    ("cell", "qp_type", "law"),
+    [
+        ("triangle", "newton", "Coulomb"),
+        ("triangle", "smalse", "bound"),
+        ("hexahedron", "newton", "bound"),
+        ("hexahedron", "smalse", "no friction"),
+    ],
+)
 def test_all_solvers_reach_it(cell, qp_type, law):
     gdim = 2 if cell == "triangle" else 3
     d = decomposed(cell, 5, 6)

@@ -28,12 +28,6 @@ def test_a_command_sees_dolfinx_and_this_checkout(findable, tmp_path):
     assert Path(result.stdout.strip()).parent == ROOT / "tfeti_dolfinx"
 
 
-def test_ranks_start_inside(findable):
-    code = "from mpi4py import MPI; print(MPI.COMM_WORLD.size)"
-    result = run("mpirun", "-n", "3", "python3", "-c", code)
-    assert result.stdout.split() == ["3", "3", "3"]
-
-
 def test_the_exit_status_is_that_of_the_command(findable):
     assert run("false").returncode == 1
     assert run("python3", "-c", "raise SystemExit(7)").returncode == 7

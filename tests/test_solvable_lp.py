@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 import ufl
-from bodies import boxes, two_body_problem
 from dolfinx import fem
 from dolfinx.mesh import meshtags
-from scenes import box, hooke, strain
+from scenes import box, decomposed, hooke, problem, strain
 from scipy.optimize import linprog
 from scipy.sparse import csr_array
 
@@ -14,7 +13,7 @@ import tfeti_dolfinx as tfeti
 from tfeti_dolfinx import NoSolutionError
 from tfeti_dolfinx.constraints.contact_rows import SharedNodes
 from tfeti_dolfinx.feti.rigid_bodies import unresisted, unsprung
-from tfeti_dolfinx.feti.solvability import RigidScene, minimiser
+from tfeti_dolfinx.feti.solvability import RigidScene
 
 
 def rigid_scene(rng):
@@ -50,7 +49,7 @@ def escape(count, k, E, N, load):
 def test_random_rigid_scenes_against_a_plain_program():
     """Gλ = e, λ_N ≥ 0 is feasible or not; loads of 1e-9 to 1e9 in whatever units."""
     verdicts = []
-    for seed in range(150):
+    for seed in range(60):
         rng = np.random.default_rng(seed)
         count, k, E, N, load = rigid_scene(rng)
         A = np.concatenate((N.T, E.T, -E.T), axis=1)
@@ -92,34 +91,6 @@ def test_a_block_on_a_plane_with_friction_slides_or_tips(axes):
         assert not held(1.001 * mu, given)
 
 
-def test_a_program_that_presolving_spoils():
-    """HiGHS 1.11 does not know the status of what it makes of this one's presolved optimum."""
-    A = np.zeros((9, 8))
-    A[:3, :3] = [[0.028, -0.97, 0.81], [0, -1, 0], [-0.028, -0.97, -0.81]]
-    A[3:5, 1:5] = [[0.49, -0.39, -0.49, 0.33], [0.5, 0.4, -0.5, -0.45]]
-    A[5:7, 3:6] = [[0.5, -0.45, -0.5], [0.5, -0.28, -0.5]]
-    A[7:, 5:] = [[0.4, -0.4, 0.34], [0.33, -0.33, 0]]
-    load = np.array([0, 0, 0, -1, 0.905070269816, -0.458141638602, -0.725973378359, 0])
-    noise = np.array([1.8e-14, 1.8e-14, 1.8e-14, 1.8e-9, 1.8e-9, 8.4e-10, 1.3e-9, 1.3e-9])
-    cost, A = np.concatenate((noise - load, noise + load)), csr_array(np.hstack([A, -A]))
-    y = minimiser(cost, A, bounds=(0, 1))
-    expected = linprog(cost, A_ub=A, b_ub=np.zeros(9), bounds=(0, 1)).fun
-    assert np.all(A @ y <= 1e-9)
-    assert cost @ y == pytest.approx(expected, rel=1e-6)
-
-
-def test_a_load_that_is_rounding_hides_no_escape():
-    """A body falls away from its contact; on another one a load that is held leaves 1e-21."""
-    count, k = 2, 3
-    E, N, load = np.zeros((2, 6)), np.zeros((2, 6)), np.zeros(6)
-    E[[0, 1], [3, 4]] = 1.0  # of the second body only the last mode is free
-    N[0, 0], N[1, 0], N[1, 2] = 1.0, 1.0, 0.5
-    load[[0, 3, 5]] = -1e-3, 1.0, 1e-21
-    assert escape(count, k, E, N, load)[0] < 0.0
-    load[0] = 1e-3
-    assert escape(count, k, E, N, load) is None
-
-
 def block_on_floor(scale, E, load, subdomains=2):
     """A block of edge ``scale`` over a plane, pressed or pushed by a traction on its top."""
     mesh, tags, names = box("quadrilateral", 3)
@@ -133,7 +104,7 @@ def block_on_floor(scale, E, load, subdomains=2):
     return tfeti.ContactProblem(ufl.inner(hooke(E)(u), strain(v)) * ufl.dx, L, [], [floor], d)
 
 
-@pytest.mark.parametrize(("scale", "E"), [(1e-9, 2e11), (1e6, 2e-1), (1.0, 1e9)])
+@pytest.mark.parametrize(("scale", "E"), [(1e-9, 2e11), (1e6, 2e-1)])
 def test_units_do_not_matter(scale, E):
     pressed = block_on_floor(scale, E, (0.0, -1e-3))
     pressed.solve()
@@ -144,60 +115,12 @@ def test_units_do_not_matter(scale, E):
         block_on_floor(scale, E, (1e-9, -1e-3)).solve()
 
 
-@pytest.mark.parametrize("subdomains", [1, 4])
-def test_a_spring_of_1e_10_holds_a_body(subdomains):
-    mesh, tags, names = box("quadrilateral", 12)
-    d = tfeti.decompose(mesh, subdomains, facet_tags=tags, surfaces=names)
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
-    spring = fem.Constant(d.mesh, 1e-10)
-    a = ufl.inner(hooke()(u), strain(v)) * ufl.dx + spring * ufl.inner(u, v) * ds(
-        d.surface("bottom")
-    )
-    L = ufl.dot(fem.Constant(d.mesh, np.array([0.0, -1e-12])), v) * ds(d.surface("top"))
-    p = tfeti.ContactProblem(a, L, [], [], d)
+def test_springs_of_1e_10_hold_a_body():
+    d = decomposed("quadrilateral", 12, 4)
+    p = problem(d, (0.0, -1e-12), clamped=(), springs=1e-10)
     down = p.solve().x.array.reshape(-1, 2)[:, 1]
     assert p.report.free_modes == 0
     assert np.allclose(down, -0.01, rtol=0.02)  # what rounding leaves of the stiffness
-
-
-def test_a_body_pinned_at_neighbouring_nodes_beside_a_stiff_one():
-    """The pins are a mesh size apart, and the other body is 1e8 times as stiff."""
-    parts = [
-        ("soft", (0.0, 0.0), (1.0, 1.0), (16, 16)),
-        ("stiff", (0.2, 1.0), (0.8, 2.0), (4, 4)),
-    ]
-    mesh, tags, names = boxes("quadrilateral", parts)
-    d = tfeti.decompose(mesh, 3, facet_tags=tags, surfaces=names)
-
-    def pins(V):
-        at = {(0.0, 0.0): (0, 1), (1 / 16, 0.0): (1,)}
-        made = []
-        for point, axes in at.items():
-            for axis in axes:
-                W, _ = V.sub(axis).collapse()
-
-                def near(x, point=point):
-                    return np.isclose(x[0], point[0]) & np.isclose(x[1], point[1])
-
-                dofs = fem.locate_dofs_geometrical((V.sub(axis), W), near)
-                made.append(fem.dirichletbc(fem.Function(W), dofs, V.sub(axis)))
-        return made
-
-    def load(v, ds):
-        return ufl.dot(fem.Constant(d.mesh, (0.0, -1e-6)), v) * ds(d.surface("stiff top"))
-
-    def stress(u):
-        x = ufl.SpatialCoordinate(d.mesh)
-        E = ufl.conditional(ufl.gt(x[1], 1.0), 1e8, 1.0)
-        return E * hooke()(u)
-
-    contact = tfeti.Contact("soft top", "stiff bottom", reach=0.1)
-    p = two_body_problem(d, load, pins, [contact], stress=stress)
-    dual = dual_of(p)
-    assert dual.coarse.num_free_motions == 1  # the stiff one slides
-    p.destroy()
 
 
 def dual_of(p):
@@ -236,22 +159,3 @@ def test_the_solver_names_contacts_that_exclude_each_other(monkeypatch):
     assert p.report.converged_reason == "DIVERGED_CONTRADICTION"
     assert [text[:12] for text in p.report.excluding_contacts] == ["0: obstacle ", "1: obstacle "]
     p.destroy()
-
-
-def test_many_loose_bodies_need_no_large_dense_array():
-    """Free motions of single bodies are sparse, whatever the number of bodies; rows are few."""
-    count, k = 300, 6
-    rng = np.random.default_rng(0)
-    levers = rng.uniform(-1, 1, (count, 40, 2))
-    below = np.zeros((count * 40, count * k))
-    rows, body = np.arange(count * 40), np.repeat(np.arange(count), 40)
-    for sign, other in ((1.0, body), (-1.0, body - 1)):
-        used = other >= 0
-        for mode, value in ((2, 1.0), (4, levers[..., 0].ravel()), (5, levers[..., 1].ravel())):
-            values = np.broadcast_to(sign * value, rows.shape)[used]
-            below[rows[used], other[used] * k + mode] = values
-    J = csr_array(below)
-    free = unresisted(csr_array(J.T @ J), unsprung(np.zeros((count, k, k))))
-    assert free.count == 3 * count
-    assert free.joint.shape[1] == 0
-    assert free.alone.nnz <= count * k * k

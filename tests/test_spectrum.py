@@ -27,12 +27,9 @@ def extremes(cell, n, subdomains, scaling="stiffness", pair=UP, stiffness=1.0):
 @pytest.mark.parametrize(
     ("cell", "scenes", "low", "high"),
     [
-        ("quadrilateral", [((3 * k, 4 * k), 4) for k in (2, 4, 8)], 0.55, 1.4),
-        ("quadrilateral", [((12, 16), subdomains) for subdomains in (2, 8, 32)], 0.55, 1.4),
-        ("hexahedron", [((2 * k, 3 * k), 4) for k in (1, 2)], 0.38, 2.2),
-        ("hexahedron", [((4, 6), subdomains) for subdomains in (4, 16)], 0.38, 2.2),
+        ("quadrilateral", [((6, 8), 4), ((12, 16), 4), ((12, 16), 32)], 0.55, 1.4),
+        ("hexahedron", [((2, 3), 4), ((4, 6), 4), ((4, 6), 16)], 0.38, 2.2),
     ],
-    ids=["h", "H", "h in space", "H in space"],
 )
 @pytest.mark.parametrize("scaling", ["multiplicity", "stiffness"])
 def test_bounds_depend_neither_on_h_nor_on_H(cell, scenes, low, high, scaling, serial_only):
@@ -51,9 +48,3 @@ def test_a_stiff_and_fine_secondary_has_nearly_dependent_rows(serial_only):
     """In D⁻¹ its rows live on the primary side, which has fewer nodes than there are rows."""
     least, _ = extremes("quadrilateral", (6, 8), 8, stiffness=1e3)
     assert 1e-4 < least < 1e-2
-
-
-def test_bounds_need_meshes_of_comparable_size(serial_only):
-    """Many secondary nodes on one primary node: the largest eigenvalue grows with their number."""
-    fine = [extremes("quadrilateral", (2, 2 * r), 2)[1] for r in (4, 8, 16)]
-    assert fine[2] > 1.5 * fine[1] > 2.25 * fine[0]

@@ -12,12 +12,15 @@ from benchmarks.stability_scenes import LADDERS, label
 from benchmarks.stress.judge import run_scene
 from tfeti_dolfinx.mesh.diagnostics import flatness
 
+QUICK = ("stiff on soft", "loose stack", "cells", "P1", "layers at contact", "strips", "hinge")
+QUICK += ("two obstacles", "grazing", "frictionless", "Tresca, moduli", "Coulomb, nu")
+
 
 def rungs():
     for ladder in LADDERS:
         for cell in ladder.cells:
             for k, value in enumerate(ladder.values):
-                quick = cell == "triangle" and k == len(ladder.values) - 1
+                quick = ladder.name in QUICK and cell == "triangle" and k == len(ladder.values) - 1
                 marks = [] if quick else [pytest.mark.slow]
                 name = f"{ladder.group}, {ladder.name}, {cell} {label(ladder, value)}"
                 yield pytest.param(ladder, cell, value, id=name, marks=marks)
@@ -42,16 +45,9 @@ def warnings_of(words, found):
     return [warning for warning in found if words in warning]
 
 
-def test_a_friendly_scene_has_no_warnings():
-    p = problem(decomposed("hexahedron", 3, 4), traction=(0.0, 0.0, -1e-3))
-    p.solve()
-    assert p.report.warnings == []
-
-
-@pytest.mark.parametrize("gdim", [2, 3])
 @pytest.mark.parametrize(("aspect", "low"), [(1.0, 0.999), (2000.0, 600.0)])
-def test_flatness_knows_boxes_and_simplices(gdim, aspect, low):
-    for cell in ("quadrilateral", "triangle") if gdim == 2 else ("hexahedron", "tetrahedron"):
+def test_flatness_knows_boxes_and_simplices(aspect, low):
+    for cell in ("quadrilateral", "triangle", "hexahedron", "tetrahedron"):
         mesh, _, _ = box(cell, 2)
         mesh.geometry.x[:, 1] /= aspect
         found = flatness(mesh)
@@ -61,17 +57,7 @@ def test_flatness_knows_boxes_and_simplices(gdim, aspect, low):
             assert found == pytest.approx(1.0)
 
 
-def test_a_regular_simplex_has_flatness_one():
-    for cell in ("triangle", "tetrahedron"):
-        mesh, _, _ = box(cell, 1)
-        regular = flatness(mesh)
-        scaled = mesh.geometry.x.copy()
-        mesh.geometry.x[:] = 1e-9 * scaled
-        assert flatness(mesh) == pytest.approx(regular)
-
-
-@pytest.mark.parametrize("degree", [1, 2])
-@pytest.mark.parametrize("nu", [0.3, 0.495])
+@pytest.mark.parametrize(("nu", "degree"), [(0.3, 1), (0.495, 1), (0.495, 2)])
 def test_displacements_of_degree_1_are_warned_of_where_a_material_keeps_its_volume(nu, degree):
     d = decomposed("triangle", 3, 4)
     V, a, L = forms(d.mesh, d.facet_tags, (0, -0.01), d.surface("top"), degree, hooke(2.0, nu))
@@ -88,6 +74,7 @@ def test_rotations_beyond_linear_kinematics_are_warned_of(size):
     p.solve()
     found = warnings_of("radians", p.report.warnings)
     assert bool(found) == (size == 0.5), p.report.warnings
+    assert size == 0.5 or p.report.warnings == []
 
 
 def test_a_body_that_turns_is_named_and_one_that_moves_is_not():

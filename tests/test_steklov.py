@@ -2,23 +2,17 @@
 
 import numpy as np
 import pytest
-from panels import HOOK, PLANE, SPACE, SQUARE, box, kelvin, kelvin_energy, moved, polygon
-from scipy.integrate import dblquad
+from panels import PLANE, SPACE, box, kelvin, kelvin_energy, moved
 
 from tfeti_dolfinx.bem.inside import Inside, share
 from tfeti_dolfinx.bem.integrals import (
-    _by_rule,
-    _exact,
     apart_rule,
-    layers_2d,
-    layers_3d,
     touching_rule,
 )
 from tfeti_dolfinx.bem.panels import Panels
 from tfeti_dolfinx.bem.steklov import (
     IsotropicLaw,
     rigid_motions,
-    single_layer,
     steklov,
     wrong_forces,
 )
@@ -64,46 +58,6 @@ def test_size_and_place_and_direction_do_not_matter(dim):
     assert np.abs(turn @ harder @ turn.T / 1e5 - S).max() < bound
 
 
-@pytest.mark.parametrize("dim", [2, 3])
-def test_double_layer_of_one(dim):
-    panels = (PLANE["ring"] if dim == 2 else SPACE["ball"])()
-    K = (layers_2d if dim == 2 else layers_3d)(panels).double
-    wrong = np.abs(K.sum(axis=1) + 0.5 * panels.measure) / panels.measure
-    assert wrong.max() < (1e-14 if dim == 2 else 1e-4)
-
-
-def test_closed_forms_are_the_integrals():
-    panels = polygon([(0, 0), (1, 0.2), (1.5, 1.3), (0.2, 2.0)], 3, 1.5)
-    layers = layers_2d(panels)
-    corners, rho = panels.corners, 2 * panels.diameter
-    for i, j in ((0, 1), (1, 0), (0, 5), (4, 2)):
-        a, b = corners[i], corners[j]
-        scale = panels.measure[i] * panels.measure[j]
-
-        def over(kernel, a=a, b=b, j=j, scale=scale):
-            def value(t, s):
-                r = a[0] + s * (a[1] - a[0]) - b[0] - t * (b[1] - b[0])
-                return kernel(r, np.linalg.norm(r), panels.normal[j], t)
-
-            return scale / (2 * np.pi) * dblquad(value, 0, 1, 0, 1, epsabs=1e-10)[0]
-
-        assert layers.single[i, j] == pytest.approx(over(lambda r, d, n, t: -np.log(d / rho)), 1e-7)
-        for k, m in ((0, 0), (0, 1), (1, 1)):
-            found = over(lambda r, d, n, t, k=k, m=m: r[k] * r[m] / d**2)
-            assert layers.tensor[k, m][i, j] == pytest.approx(found, abs=1e-8)
-        for k in range(2):
-            found = over(lambda r, d, n, t, k=k: r @ n / d**2 * (t if k else 1 - t))
-            assert layers.on_corners[k][i, j] == pytest.approx(found, abs=1e-8)
-
-
-def test_gauss_and_closed_form_agree_where_they_meet():
-    panels = polygon(SQUARE, 40)
-    apart = np.linalg.norm(panels.midpoints[:, None] - panels.midpoints, axis=2)
-    i, j = np.nonzero(np.abs(apart / panels.measure[0] - 6.0) < 0.5)
-    for rule, exact in zip(_by_rule(panels, i, j, 8), _exact(panels, i, j), strict=True):
-        assert np.abs(rule - exact).max() < 1e-11 * panels.measure[0] ** 2
-
-
 @pytest.mark.parametrize("shared", [0, 1, 2, 3])
 def test_rules_integrate_polynomials(shared):
     rule = apart_rule(4) if shared == 0 else touching_rule(shared, 4)
@@ -116,20 +70,12 @@ def test_rules_integrate_polynomials(shared):
     assert np.allclose((rule.x * rule.weights[:, None]).T @ rule.y, 1 / 9)
 
 
-def test_the_potential_of_a_square_plate():
-    """∫∫1/r over a unit square with itself, in closed form."""
-    corners = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], dtype=float)
-    plate = Panels(corners, np.array([(0, 1, 2), (0, 2, 3)]))
-    exact = 4 * np.log(1 + np.sqrt(2)) + 4 / 3 * (1 - np.sqrt(2))
-    assert 4 * np.pi * layers_3d(plate).single.sum() == pytest.approx(exact, rel=1e-6)
-
-
 @pytest.mark.parametrize("dim", [2, 3])
 def test_kelvin_converges_with_the_square_of_h(dim):
     shape = PLANE["square"] if dim == 2 else SPACE["cube"]
     source = np.array([0.6, 0.45]) if dim == 2 else np.array([2.0, 0.8, 0.6])
     errors = []
-    for m in (8, 16, 32) if dim == 2 else (3, 6):
+    for m in (8, 16) if dim == 2 else (3, 6):
         panels = shape(m)
         u = kelvin(panels.x, source, LAW)[0].ravel()
         exact = kelvin_energy(panels, source, LAW, halvings=6 if dim == 2 else 4)
@@ -139,12 +85,6 @@ def test_kelvin_converges_with_the_square_of_h(dim):
     assert np.all(slopes > 1.8), (errors, slopes)
 
 
-def test_single_layer_is_positive_also_of_large_bodies():
-    for scale in (1e-3, 1.0, 1e3):
-        panels = moved(polygon(HOOK, 6), lambda x, scale=scale: scale * x)
-        assert np.linalg.eigvalsh(single_layer(layers_2d(panels), LAW))[0] > 0
-
-
 def test_a_surface_that_lies_on_itself_is_refused():
     twice = box(1)
     twice = Panels(twice.x, np.concatenate((twice.nodes, twice.nodes)))
@@ -152,9 +92,8 @@ def test_a_surface_that_lies_on_itself_is_refused():
         steklov(twice, LAW)
 
 
-@pytest.mark.parametrize("sizes", [(5.0, 1.0, 1.0), (10.0, 1.0, 1.0), (1.0, 1.0, 0.1)])
-def test_long_triangles_keep_the_forces_of_constant_stresses(sizes):
-    panels = box(2, sizes)
+def test_long_triangles_keep_the_forces_of_constant_stresses():
+    panels = box(2, (1.0, 1.0, 0.1))
     assert wrong_forces(panels, LAW, steklov(panels, LAW).S) < 2e-4
 
 
@@ -187,26 +126,13 @@ def test_inside_constant_stresses_and_forces_per_volume_are_exact(dim):
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_a_rigid_motion_leaves_no_stress_inside(dim):
-    """However far it goes: the strain of 1e-6 beside it is right to 1e-4."""
-    panels, points = PLANE["square"]() if dim == 2 else SPACE["cube"](), INSIDE[dim]
-    turn = np.array([[0.0, 30.0, -5.0], [-30.0, 0.0, 20.0], [5.0, -20.0, 0.0]])[:dim, :dim]
-    G = 1e-6 * GRADIENT[:dim, :dim] + turn
-    u = panels.x @ G.T + 100.0
-    inside = Inside(steklov(panels, LAW), u, np.zeros(dim), shift=7.0)
-    assert np.abs(inside.displacement(points + 7.0) - points @ G.T - 100.0).max() < 1e-10
-    stress = LAW.stress(G)
-    assert np.abs(inside.stress(points + 7.0) - stress).max() < 1e-4 * np.abs(stress).max()
-
-
-@pytest.mark.parametrize("dim", [2, 3])
 def test_inside_kelvin_converges_with_the_square_of_h(dim):
     shape = PLANE["square"] if dim == 2 else SPACE["cube"]
     source = np.array([0.6, 0.45]) if dim == 2 else np.array([1.6, 0.8, 0.6])
     u, gradient = kelvin(INSIDE[dim], source, LAW)
     exact = u, LAW.stress(gradient)
     errors = []
-    for m in (8, 16, 32) if dim == 2 else (2, 4):
+    for m in (16, 32) if dim == 2 else (2, 4):
         panels = shape(m)
         surface = kelvin(panels.x, source, LAW)[0]
         inside = Inside(steklov(panels, LAW), surface, np.zeros(dim))

@@ -6,8 +6,6 @@ from bodies import held, pressed, sided, stacked, two_body_problem
 from mpi4py import MPI
 from test_solvable_lp import dual_of
 
-from tfeti_dolfinx.common.arrays import sums
-
 
 @pytest.fixture(scope="module")
 def scene():
@@ -85,45 +83,3 @@ def test_motions_of_bodies(scene):
     alpha = subdomains.modes_in_kernel @ amounts.ravel()
     assert np.allclose(subdomains.kernel_motion(alpha), motion, atol=1e-12)
     assert np.abs(subdomains.modes_outside()).max() <= 1e-12
-
-
-def test_sums_and_maxima_by_bodies(scene):
-    p, subdomains = scene
-    u, parts = random(num_dofs(p)), subdomains.dof_parts
-    body = p.decomposition.body_of_subdomain[p.dofs.node_subdomain].repeat(p.dofs.bs)
-    comm = p.decomposition.comm
-    for b in range(2):
-        own = u[body == b]
-        lengths = np.sqrt(np.sum(own.reshape(-1, p.dofs.bs) ** 2, axis=1))
-        largest = comm.allreduce(lengths.max(initial=0.0), op=MPI.MAX)
-        found = subdomains.body_maxima([subdomains.sizes(u)])[0, b]
-        assert found == pytest.approx(largest, rel=1e-14)
-        total = comm.allreduce(own.sum())
-        assert subdomains.body_sums([sums(u, parts)])[0, b] == pytest.approx(total, abs=1e-12)
-    f = p.dofs.to_primal(p._system.forms.load())
-    norms = [np.sqrt(comm.allreduce(f[body == b] @ f[body == b])) for b in range(2)]
-    assert np.allclose(subdomains.load_norms(), norms, rtol=1e-12)
-
-
-def test_a_new_load_costs_a_solve(scene):
-    p, subdomains = scene
-    counters, f = subdomains.counters, p.dofs.to_primal(p._system.forms.load())
-    before = subdomains.pinv_load.copy()
-    start = counters.factorizations, counters.load_solves
-    subdomains.update(f=2 * f)
-    assert np.allclose(subdomains.pinv_load, 2 * before)
-    subdomains.pinv_load  # noqa: B018  made once
-    now = counters.factorizations, counters.load_solves
-    assert now == (start[0], start[1] + len(subdomains.blocks))
-    subdomains.update(f=f)
-
-
-def test_a_new_trace_leaves_the_factors_alone(scene):
-    p, subdomains = scene
-    old, made = subdomains.trace, subdomains.counters.factorizations
-    subdomains.retrace(old[::2])
-    assert np.array_equal(subdomains.trace, old[::2])
-    diagonal = p.dofs.to_primal(p._system.forms.stiffness().diagonal())
-    assert np.allclose(subdomains.diagonal, diagonal[old[::2]], rtol=1e-14)
-    subdomains.retrace(old)
-    assert subdomains.counters.factorizations == made

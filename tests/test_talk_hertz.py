@@ -9,7 +9,6 @@ TALK = ["-tfeti_qp_type", "smalse", "-tfeti_pc_type", "none", "-tfeti_rtol", "1e
 
 SIZES = [
     (2, 99, 60),
-    (32, 24, 90),
     pytest.param(32, 99, 90, marks=pytest.mark.slow),
 ]
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from bodies import gathered, searched, sided, stacked
+from bodies import searched, sided, stacked
 from dolfinx import fem
 from mpi4py import MPI
 from scenes import curved_obstacle, decomposed
@@ -11,8 +11,7 @@ from test_frames import dofs_on, nodal
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.constraints.gluing import glue, prescribe
 from tfeti_dolfinx.contact.friction import friction_values
-from tfeti_dolfinx.contact.records import relative_displacement, slips
-from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.contact.records import slips
 from tfeti_dolfinx.mortar.surfaces import group_points
 
 TRESCA, COULOMB = tfeti.Tresca(0.1), tfeti.Coulomb(0.3)
@@ -34,46 +33,31 @@ def weights_of(dofs):
     return 1.0 + np.arange(dofs.num_nodes * dofs.bs) % 7
 
 
-@pytest.mark.parametrize("degree", [1, 2])
-@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "tetrahedron", "hexahedron"])
+@pytest.mark.parametrize(
+    ("cell", "degree"),
+    [("triangle", 1), ("quadrilateral", 2), ("tetrahedron", 2), ("hexahedron", 1)],
+)
 def test_rows_measure_slips(cell, degree):
-    """On displacements without jumps T u = s_i times the slip, also between meshes that differ."""
+    """On displacements without jumps T u = s_i times the slip; contacts without friction have none.
+
+    Meshes differ, and the lower body is on an obstacle that it slides on freely.
+    """
     d = stacked(cell, 3, 4, 6)
-    dofs = dofs_on(d, degree)
-    records = searched([sided("upper bottom", "lower top", friction=TRESCA)], dofs, d)
+    dofs, up = dofs_on(d, degree), np.eye(d.mesh.geometry.dim)[-1]
+    smooth = tfeti.Obstacle("lower bottom", tfeti.Plane(-1.01 * up, up), reach=np.inf)
+    pair = sided("upper bottom", "lower top", friction=TRESCA)
+    records = searched([pair, smooth], dofs, d)
     gluing = glue(dofs, prescribe(dofs, []), records, 1.0, weights_of(dofs))
     rows, sets = gluing.tangents, gluing.constraints.sets
-    assert sets.tangents.shape == (len(sets.normals), dofs.bs - 1)
-    assert np.array_equal(rows.condition, gluing.contact.condition)
-    assert np.array_equal(rows.scale, gluing.contact.scale)
+    assert sets.tangents.shape == (len(rows.condition), dofs.bs - 1)
+    rough = records.contact[gluing.contact.condition] == 0
+    assert np.array_equal(rows.condition, gluing.contact.condition[rough])
+    assert np.array_equal(rows.scale, gluing.contact.scale[rough])
     u = nodal(dofs, lambda x: np.cos(2.0 * x) - np.roll(x, 1, axis=1))
     found = times_rows(gluing, u)[sets.tangents] / rows.scale[:, None]
     expected = slips(records, dofs, u)[rows.condition]
     assert MPI.COMM_WORLD.allreduce(expected.size) > 0
     assert np.allclose(found, expected, rtol=0, atol=1e-12)
-    gluing.constraints.destroy()
-
-
-def test_scenes_without_friction_have_no_tangential_row():
-    d = stacked("hexahedron", 3, 4, 4)
-    dofs = dofs_on(d)
-    records = searched([sided("upper bottom", "lower top")], dofs, d)
-    gluing = glue(dofs, prescribe(dofs, []), records, 1.0, weights_of(dofs))
-    assert gluing.constraints.sets.tangents.shape == (0, 2)
-    assert gluing.constraints.limits.shape == (0, 2)
-    gluing.constraints.destroy()
-
-
-def test_only_the_contact_with_friction_has_tangential_rows():
-    d = stacked("quadrilateral", 3, 4, 4)
-    dofs = dofs_on(d)
-    rough = tfeti.Obstacle(
-        "lower bottom", tfeti.Plane((0, -1.01), (0, 1)), friction=TRESCA, reach=np.inf
-    )
-    records = searched([sided("upper bottom", "lower top"), rough], dofs, d)
-    gluing = glue(dofs, prescribe(dofs, []), records, 1.0, weights_of(dofs))
-    assert np.all(records.contact[gluing.tangents.condition] == 1)
-    assert d.comm.allreduce(len(gluing.tangents.condition)) == 4
     gluing.constraints.destroy()
 
 
@@ -154,33 +138,6 @@ def test_a_node_whose_normal_motion_is_prescribed(law, rows):
     held = Held(law, bottom=(2, 0.0))
     assert held.count(np.ones(len(held.gluing.contact.condition))) == 0
     assert held.count(np.ones(len(held.gluing.tangents.condition))) == rows
-    norms = np.linalg.norm(tangential_matrix(held), axis=1)
-    assert np.all(norms <= 1.0 + 1e-12)
-    assert held.count(norms > 1.0 - 1e-12) >= rows
-
-
-def tangential_matrix(held):
-    """This rank's tangential rows over √D, dense."""
-    B, weights = held.gluing.constraints.B, held.gluing.constraints.weights
-    scaled = B.copy()
-    root = B.createVecRight()
-    root.array[:] = weights**-0.5
-    scaled.diagonalScale(None, root)
-    indptr, columns, values = scaled.getValuesCSR()
-    rows = held.gluing.constraints.sets.tangents.ravel()
-    dense = np.zeros((len(rows), B.getSize()[1]))
-    for i, row in enumerate(rows):
-        dense[i, columns[indptr[row] : indptr[row + 1]]] = values[indptr[row] : indptr[row + 1]]
-    for item in (scaled, root):
-        item.destroy()
-    return dense
-
-
-def test_clamped_nodes_have_no_tangential_row():
-    V_axes = {"left": (0, 0.0), "front": (1, 0.0)}
-    held = Held(TRESCA, **V_axes, bottom=(2, 0.0))
-    # 9 nodes, of which one is held in x and y
-    assert held.count(np.ones(len(held.gluing.tangents.condition))) == 8
 
 
 def test_the_first_tangent_follows_the_direction():
@@ -210,45 +167,3 @@ def test_frames_along_a_direction_are_the_same_on_any_number_of_ranks():
         x, frame = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
         found.append(frame[np.lexsort(np.round(x, 9).T)])
     assert np.allclose(*found, rtol=0, atol=1e-13)
-
-
-def test_bounds_of_functions_are_those_at_the_nodes():
-    d = decomposed("quadrilateral", 4, 3)
-    dofs = dofs_on(d, 2)
-    plane = tfeti.Plane((0, 0), (0, 1))
-    function = fem.Function(fem.functionspace(d.mesh, ("Lagrange", 1)))
-    function.interpolate(lambda x: 1.0 + 2.0 * x[0])
-    for law in (tfeti.Tresca(lambda x: 1.0 + 2.0 * x[0]), tfeti.Tresca(function)):
-        records = searched([tfeti.Obstacle("bottom", plane, friction=law)], dofs, d)
-        values = friction_values("floor", law, records, dofs)
-        x = group_points(dofs)[records.group]
-        assert values.shape == (len(records), 1)
-        assert np.allclose(values[:, 0], 1.0 + 2.0 * x[:, 0])
-        assert len(gathered(values)) == 5
-
-
-def test_relative_displacements_do_not_depend_on_the_direction():
-    d = stacked("hexahedron", 3, 4, 4)
-    dofs = dofs_on(d)
-    u, found = nodal(dofs, np.sin), []
-    for law in (None, tfeti.Tresca((0.1, 0.2), direction=(1, 1, 0))):
-        records = searched([sided("upper bottom", "lower top", friction=law)], dofs, d)
-        assert np.allclose(
-            relative_displacement(records, dofs, u),
-            np.einsum(
-                "n,ng->ng",
-                np.sum(records.normal * relative_displacement(records, dofs, u), axis=1),
-                records.normal,
-            )
-            + np.einsum("nt,ntg->ng", slips(records, dofs, u), records.tangents),
-        )
-        found.append(relative_displacement(records, dofs, u))
-    assert np.array_equal(*found)
-
-
-def test_a_direction_along_a_normal_is_named_on_all_ranks():
-    d = decomposed("hexahedron", 2, 3)
-    law = tfeti.Tresca((0.1, 0.2), direction=(0, 0, 2))
-    plane = tfeti.Plane((0, 0, 0), (0, 0, 1))
-    with pytest.raises(InputError, match="floor: direction .* is along the normal at the node"):
-        searched([tfeti.Obstacle("bottom", plane, friction=law, name="floor")], dofs_on(d), d)

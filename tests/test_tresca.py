@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from bodies import boxes
-from friction_reference import on_each_other, on_plane, parts
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from reference.friction import on_each_other, on_plane, parts
 from scenes import clamp, decomposed, displacement, forms, hooke, problem
 
 import tfeti_dolfinx as tfeti
@@ -99,14 +99,14 @@ SCENES_3D = st.tuples(
 
 
 @SOLVERS
-@settings(max_examples=20)
+@settings(max_examples=8)
 @given(SCENES_2D, st.sampled_from([0.0, 0.01]))
 def test_a_square_on_a_plane(qp_type, scene, gap):
     on_the_plane(*scene, gap=gap, qp_type=qp_type)
 
 
 @SOLVERS
-@settings(max_examples=12)
+@settings(max_examples=5)
 @given(SCENES_3D)
 def test_a_cube_on_a_plane(qp_type, scene):
     on_the_plane(*scene, qp_type=qp_type)
@@ -155,14 +155,14 @@ SIDES = st.sampled_from(["lower top", "upper bottom"])
 
 
 @SOLVERS
-@settings(max_examples=12)
+@settings(max_examples=5)
 @given(SCENES_2D, SIDES)
 def test_a_square_on_a_square(qp_type, scene, secondary):
     two_boxes(*scene, 0.0, secondary, qp_type=qp_type)
 
 
 @SOLVERS
-@settings(max_examples=8)
+@settings(max_examples=4)
 @given(SCENES_3D, SIDES)
 def test_a_cube_on_a_cube(qp_type, scene, secondary):
     two_boxes(*scene, secondary, qp_type=qp_type)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from friction_reference import Untorn, in_ellipses
 from mpi4py import MPI
+from reference.friction import Untorn, in_ellipses
 from scenes import box, decomposed, displacement, forms, hooke
 
 import tfeti_dolfinx as tfeti
@@ -198,10 +198,18 @@ def follow(seed, qp_type="newton", cells=tuple(SIZES), laws=LAWS):
 LOADS = {"loaded": (0.3, 0.0), "driven": (0.0, 0.3)}  # factors on a traction and on a value
 
 
-@pytest.mark.parametrize("qp_type", ["newton", "smalse"])
-@pytest.mark.parametrize("friction", ["none", "tresca", "coulomb"])
-@pytest.mark.parametrize("kind", list(KINDS))
-@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
+@pytest.mark.parametrize(
+    ("cell", "kind", "friction", "qp_type"),
+    [
+        ("triangle", "loaded", "none", "smalse"),
+        ("triangle", "driven", "coulomb", "newton"),
+        ("quadrilateral", "loaded", "coulomb", "smalse"),
+        ("quadrilateral", "driven", "tresca", "newton"),
+        ("hexahedron", "loaded", "tresca", "newton"),
+        ("hexahedron", "driven", "none", "newton"),
+        ("hexahedron", "driven", "coulomb", "smalse"),
+    ],
+)
 def test_the_rest_state_is_found_from_any_load(cell, kind, friction, qp_type):
     scene = Scene(cell, kind, friction, qp_type=qp_type)
     load = np.array([0.01] * (scene.gdim - 1) + [-0.05])
@@ -226,37 +234,8 @@ def test_the_rest_state_is_found_from_any_load(cell, kind, friction, qp_type):
     scene.problem.destroy()
 
 
-@pytest.mark.parametrize("qp_type", ["newton", "smalse"])
-@pytest.mark.parametrize("first", [None, 0.0, 1.0])
-@pytest.mark.parametrize("cell", ["triangle", "hexahedron"])
-def test_a_gap_that_stays_open_does_not_limit_what_a_small_load_is_solved_to(cell, first, qp_type):
-    options = {"qp_type": qp_type, "rtol": 1e-8 if qp_type == "newton" else 1e-6}
-    scene = Scene(cell, gap=0.01, **options)
-    load = np.array([0.01] * (scene.gdim - 1) + [-0.05])
-    small = scene.solve(1e-3 * load)  # the gap stays open, so that all is linear
-    if first is not None:
-        scene.solve(first * load)
-    else:
-        scene.problem.destroy()
-        scene = Scene(cell, gap=0.01, **options)
-    for factor in (1e-12, 1e-14):
-        u = scene.solve(factor * load) / factor * 1e-3
-        assert np.abs(u - small).max() <= 1e2 * options["rtol"] * np.abs(small).max()
-    scene.problem.destroy()
-
-
-@pytest.mark.parametrize("friction", ["none", "coulomb"])
-@pytest.mark.parametrize("cell", ["triangle", "tetrahedron"])
-def test_a_body_that_is_lifted_as_a_whole_has_no_forces(cell, friction):
-    """SMALSE-M's forces tend to 0, and what does not balance of them with them."""
-    scene = Scene(cell, "driven", friction, qp_type="smalse")
-    lift = np.array([0.003] * (scene.gdim - 1) + [0.015])
-    assert np.abs(scene.solve(0.0, lift) - lift).max() <= 1e-6 * 0.015
-    scene.problem.destroy()
-
-
-@pytest.mark.parametrize("gap", [0.0, 0.01])
-def test_a_body_that_contact_alone_holds_comes_to_rest(gap):
+def test_a_body_that_contact_alone_holds_comes_to_rest():
+    gap = 0.01
     d = decomposed("triangle", 6, 3)
     V, a, _ = forms(d.mesh, d.facet_tags, (0.0, 0.0), d.surface("top"))
     load = fem.Constant(d.mesh, np.zeros(2))
@@ -277,32 +256,18 @@ def test_a_body_that_contact_alone_holds_comes_to_rest(gap):
     problem.destroy()
 
 
-@pytest.mark.parametrize("qp_type", ["newton", "smalse"])
-@pytest.mark.parametrize("cell", ["triangle", "quadrilateral", "hexahedron"])
-def test_a_series_comes_back_to_rest(cell, qp_type):
-    """Slips count from step to step, but without pressure there is no friction."""
-    rtol = 1e-8 if qp_type == "newton" else 1e-6
-    scene = Scene(cell, "driven", "coulomb", qp_type=qp_type, rtol=rtol)
-    value = np.array([0.003] * (scene.gdim - 1) + [-0.01])
-    for factor in (1.0, 0.0, -1.0, 0.0, 1e-12, 1.0, 0.0):
-        u = scene.solve(0.0, factor * value)
-        assert np.abs(u).max() <= 0.02 * max(abs(factor), 1e-12)
-        scene.problem.accept()
-    scene.problem.destroy()
-
-
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(5))
 def test_a_random_path_is_right_at_every_step(seed):
     assert follow(seed) == []
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(6, 50))
+@pytest.mark.parametrize("seed", range(5, 50))
 def test_many_random_paths_are_right_at_every_step(seed):
     assert follow(seed) == []
 
 
-@pytest.mark.parametrize("size", [1e-300, 1e-160, 1e160])
+@pytest.mark.parametrize("size", [1e-160, 1e160])
 def test_loads_whose_squares_leave_the_range_are_named(size):
     scene = Scene("triangle")
     with pytest.raises(tfeti.InputError, match="squares leave the range .* expected units"):

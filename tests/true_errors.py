@@ -8,7 +8,7 @@ import ufl
 from dolfinx import fem, geometry
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import clamp, forms, hooke, strain
+from scenes import forms, hooke, strain
 
 import tfeti_dolfinx as tfeti
 from demos import hertz_3d
@@ -40,32 +40,6 @@ def hertz(elements, **options):
     return tfeti.ContactProblem(a, L, bcs, [plane], d, stress=hooke(), petsc_options=options)
 
 
-def punch(n, depth=0.01, flat=0.2, **options):
-    """A rigid punch, flat and then rounded, is pressed into a block of 2n × n squares."""
-    comm = MPI.COMM_WORLD
-    mesh = dmesh.create_rectangle(
-        comm, [(-1.0, -1.0), (1.0, 0.0)], [2 * n, n], diagonal=dmesh.DiagonalType.crossed
-    )
-    sides = [dmesh.locate_entities_boundary(mesh, 1, lambda x, y=y: x[1] == y) for y in (-1.0, 0.0)]
-    values = np.repeat(np.array([1, 2], dtype=np.int32), [len(side) for side in sides])
-    facets = np.concatenate(sides)
-    order = np.argsort(facets)
-    tags = dmesh.meshtags(mesh, 1, facets[order], values[order])
-    d = tfeti.decompose(mesh, 8, facet_tags=tags, surfaces={"bottom": 1, "top": 2})
-
-    def distance(x):
-        return np.maximum(np.abs(x[0]) - flat, 0.0) ** 2 / 2 - depth - x[1]
-
-    def gradient(x):
-        slope = np.sign(x[0]) * np.maximum(np.abs(x[0]) - flat, 0.0)
-        return np.stack((slope, -np.ones_like(slope), 0.0 * slope))
-
-    V, a, L = forms(d.mesh, d.facet_tags, (0.0, 0.0), 2)
-    obstacle = tfeti.Obstacle("top", tfeti.SignedDistance(distance, gradient), reach=0.05)
-    bcs = [clamp(V, d.facets("bottom"))]
-    return tfeti.ContactProblem(a, L, bcs, [obstacle], d, stress=hooke(), petsc_options=options)
-
-
 def ball(unknowns, **options):
     """The half ball of ``demos/hertz_3d.py``."""
     chosen = SimpleNamespace(unknowns=unknowns, subdomains=None, quick=False)
@@ -76,9 +50,7 @@ def ball(unknowns, **options):
 # scenes in 2D, their sizes, and that of the mesh beside which they are judged
 AGAINST_FINER = [
     (hertz, (6, 12), 30),
-    (punch, (12, 24), 72),
     pytest.param(hertz, (6, 12, 24), 60, marks=pytest.mark.slow),
-    pytest.param(punch, (12, 24, 48), 144, marks=pytest.mark.slow),
 ]
 
 

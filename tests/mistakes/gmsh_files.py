@@ -14,7 +14,7 @@ def gmsh_of(s):
     return pytest.importorskip("gmsh")
 
 
-def file(name, text, says):
+def file(name, text):
     """Read a file with this text."""
 
     def read(s):
@@ -25,10 +25,10 @@ def file(name, text, says):
         s.comm.barrier()
         return tfeti.read_gmsh(path, s.comm)
 
-    return read, says
+    return read
 
 
-def model(says, build, subdomains=1):
+def model(build, subdomains=1):
     """Read a model that rank 0 builds of a square."""
 
     def read(s):
@@ -47,12 +47,12 @@ def model(says, build, subdomains=1):
             if s.comm.rank == 0:
                 gmsh.finalize()
 
-    return read, says
+    return read
 
 
-def source(says, make):
+def source(make):
     """Read something that is no mesh."""
-    return lambda s: tfeti.read_gmsh(make(gmsh_of(s)), s.comm), says
+    return lambda s: tfeti.read_gmsh(make(gmsh_of(s)), s.comm)
 
 
 def closed(gmsh):
@@ -71,11 +71,6 @@ def meshed(gmsh, square):
     gmsh.model.mesh.generate(2)
 
 
-def group_of_curves(gmsh, square):
-    gmsh.model.addPhysicalGroup(1, [1], name="edge")
-    gmsh.model.mesh.generate(2)
-
-
 def two_groups(gmsh, square):
     in_group(gmsh, square)
     gmsh.model.addPhysicalGroup(2, [square], name="again")
@@ -83,30 +78,19 @@ def two_groups(gmsh, square):
 
 
 SOURCES = {
-    "a file that is not there": (
-        lambda s: tfeti.read_gmsh(s.folder / "none.msh", s.comm),
-        r"none.msh: no such file; expected a gmsh mesh",
+    r"none.msh: no such file; expected a gmsh mesh": lambda s: tfeti.read_gmsh(
+        s.folder / "none.msh", s.comm
     ),
-    "no source": source(
-        r"source is None; expected a .msh file, or a gmsh model", lambda gmsh: None
+    r"comm is None; expected a communicator such as MPI.COMM_WORLD": lambda s: tfeti.read_gmsh(
+        "ring.msh", None
     ),
-    "no communicator": (
-        lambda s: tfeti.read_gmsh("ring.msh", None),
-        r"comm is None; expected a communicator such as MPI.COMM_WORLD",
+    r"bare.msh: not a mesh, gmsh finds no nodes": file("bare.msh", BARE),
+    r"gmsh.model \(is gmsh initialised, with a model in it\?\)": source(closed),
+    r"the mesh has no physical groups of cells": model(in_group),
+    r"elements of dimension 2 lie in several physical groups, \['again', 'plate'\]": model(
+        two_groups
     ),
-    "a text that is no mesh": file("text.msh", "this is not a mesh\n", r"text.msh: "),
-    "a mesh without nodes": file("bare.msh", BARE, r"bare.msh: not a mesh, gmsh finds no nodes"),
-    "a model when gmsh is not initialised": source(
-        r"gmsh.model \(is gmsh initialised, with a model in it\?\)", closed
-    ),
-    "a model that is not meshed": model(r"the mesh has no physical groups of cells", in_group),
-    "a model with groups of curves alone": model(r".*", group_of_curves),
-    "cells in two groups": model(
-        r"elements of dimension 2 lie in several physical groups, \['again', 'plate'\]", two_groups
-    ),
-    "subdomains of a model that are too many": model(
-        r"subdomains=1000: expected between 1 and \d+", meshed, 1000
-    ),
+    r"subdomains=1000: expected between 1 and \d+": model(meshed, 1000),
 }
 
 TABLES = ("SOURCES",)

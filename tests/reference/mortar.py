@@ -7,9 +7,10 @@ import ufl
 from bodies import boxes
 from dolfinx import fem
 from mpi4py import MPI
-from reference import primal_active_set
 from scenes import hooke, strain
 from scipy.sparse import csr_matrix
+
+from reference.active_set import primal_active_set
 
 
 def mortar_1d(secondary, primary):
@@ -33,7 +34,7 @@ def mortar_1d(secondary, primary):
 class TwoBoxes:
     """The lever of ``test_mortar`` on one rank: [0, 1]^d−1 × [−1, 0] below [0, 1]^d."""
 
-    def __init__(self, cell, n_lower, n_upper, push, pull):
+    def __init__(self, cell, n_lower, n_upper, push, pull, secondary="upper"):
         gdim = 2 if cell == "quadrilateral" else 3
         self.gdim = gdim
         flat = (0.0,) * (gdim - 1), (1.0,) * (gdim - 1)
@@ -61,7 +62,10 @@ class TwoBoxes:
         self.fixed = np.unique(fixed[:, None] * gdim + np.arange(gdim))
         self.secondary = self._sorted(nodes("upper bottom"))
         self.primary = self._sorted(nodes("lower top"))
-        self.n = n_upper, n_lower
+        self.n, self.down = (n_upper, n_lower), 1.0
+        if secondary == "lower":
+            self.secondary, self.primary = self.primary, self.secondary
+            self.n, self.down = (n_lower, n_upper), -1.0
 
     def _sorted(self, nodes):
         return nodes[np.lexsort(np.rint(self.x[nodes].T * 1e7))]
@@ -73,9 +77,8 @@ class TwoBoxes:
             D, M = np.kron(D, D), np.kron(M, M)
         N = np.zeros((len(D), self.K.shape[0]))
         last = self.gdim - 1
-        N[np.arange(len(D)), self.secondary * self.gdim + last] = -D
-        N[:, self.primary * self.gdim + last] += M
-        self.N, self.D = N, D
+        N[np.arange(len(D)), self.secondary * self.gdim + last] = -self.down * D
+        N[:, self.primary * self.gdim + last] += self.down * M
         free = np.setdiff1d(np.arange(self.K.shape[0]), self.fixed)
         held = np.abs(N[:, free]).sum(axis=1) > 0
         rows = np.flatnonzero(held)
@@ -91,7 +94,3 @@ class TwoBoxes:
         order = np.lexsort(np.rint(self.x.T * 1e7))
         u = full.reshape(-1, self.gdim)[order]
         return self.x[order], u, self.x[self.secondary], lam
-
-    def on_nodes(self, lam):
-        """Forces on all nodes that are not prescribed, of forces of the secondary nodes."""
-        return np.delete((lam / self.D) @ self.N, self.fixed)

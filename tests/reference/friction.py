@@ -8,12 +8,13 @@ Nothing of the package is used but the meshes of the scenes.
 import numpy as np
 import ufl
 from bodies import boxes
-from conic import constrained_qp
 from dolfinx import fem
 from mpi4py import MPI
 from scenes import box, clamp, hooke, strain
 from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
+
+from reference.conic import constrained_qp
 
 
 class Untorn:

@@ -1,0 +1,1 @@
+"""Independent solvers: nothing of the package is in them but the meshes of the scenes."""

@@ -1,0 +1,151 @@
+"""What demos find at their quick size: closed forms, forces in balance, the laws of friction."""
+
+import numpy as np
+import pytest
+
+import tfeti_dolfinx as tfeti
+from demos import belt_2d
+from demos.ball_bearing_3d import contact_forces
+from demos.clamped_connection_3d import BARS, BOLT, PROFILES
+from demos.four_bodies_2d import PAIRS
+from meshes.ball_bearing import Bearing, build
+from meshes.clamped_connection import CLAMPS
+
+BOUND = 0.008  # of the friction of four bodies
+
+
+def check_friction(data, bound):
+    """At most its bound, reached where nodes slip, against the slip."""
+    size = np.linalg.norm(data.tangential_traction, axis=1)
+    slips = data.status == tfeti.ContactStatus.SLIP
+    assert np.all(size <= bound)
+    assert np.all(np.sum(data.tangential_traction * data.slip, axis=1)[slips] < 0.0)
+    return size, slips
+
+
+def test_forces_balance_and_the_lower_balls_carry_the_load(quick_demo):
+    """Stribeck: the lowest of Z balls carries about 4.37/Z of the load, 5/Z with clearance."""
+    bearing = quick_demo("ball_bearing_3d")
+    assert bearing.report["bodies"] == 10
+    assert bearing.report["errors"]["ball_balance"] <= 1e-5
+    assert abs(bearing.report["errors"]["force"]) <= 1e-5
+    assert bearing.report["errors"]["side_force"] <= 0.02
+    inner, outer = np.linalg.norm(contact_forces(bearing.solution, 8), axis=2).T / 2500.0
+    assert 4.3 / 8 < inner[0] < 5 / 8
+    assert inner[1] == pytest.approx(inner[7], rel=0.1)
+    assert np.all(np.abs(inner[2:7]) <= 1e-6)
+    assert outer[3:6] == pytest.approx(3.5 / 2500.0, rel=0.1)  # the centrifugal force
+
+
+def test_partitions_keep_the_names(comm):
+    model = None
+    if comm.rank == 0:
+        model = build(Bearing(balls=3), fine=1.0, growth=1.0, coarse=4.0, partitions=6)
+    d = tfeti.read_gmsh(model, comm)
+    balls = {"ball 1", "ball 2", "ball 3"}
+    rings = {"inner groove", "outer groove", "bore", "outside", "mid plane"}
+    assert set(d.names.volumes) == {"inner ring", "outer ring", *balls}
+    assert set(d.names.surfaces) == rings | balls
+    assert d.num_bodies == 5
+    assert d.num_subdomains >= 6
+
+
+def test_the_capstan_equation_holds_and_all_of_the_belt_slips_back(quick_demo, comm):
+    belt = quick_demo("belt_2d")
+    data, report = belt.solution.contact("belt"), belt.report
+    for name in ("capstan", "capstan_hung", "capstan_thin"):
+        assert abs(report["errors"][name]) <= 0.01
+    rubbing = data.status != tfeti.ContactStatus.OPEN
+    # from the held side on the right to the pulled one: the way in which the belt slips
+    along = np.stack((-data.points[:, 1], data.points[:, 0]), axis=1)
+    assert report["sticking"] == 0
+    assert comm.allreduce(int(np.sum(rubbing))) == report["sliding"] > 30
+    assert np.all(np.sum(data.slip * along, axis=1)[rubbing] < 0.0)
+    assert np.all(np.sum(data.tangential_traction * along, axis=1)[rubbing] > 0.0)
+
+
+@pytest.mark.slow
+def test_the_error_falls_with_the_mesh():
+    _, report = belt_2d.run([])
+    assert abs(report.errors["capstan"]) <= 0.001
+    assert abs(report.errors["capstan_hung"]) <= 0.001
+
+
+def test_friction_holds_the_load_and_the_bolts_press(quick_demo, comm):
+    found = quick_demo("clamped_connection_3d")
+    solution, report = found.solution, found.report
+    assert report["bodies"] == 6
+    assert abs(report["errors"]["force"]) <= 1e-5
+    pressed = 2 * CLAMPS * BOLT
+    for side in ("lower", "upper"):
+        data = [solution.contact(f"{side} bar {i}") for i in (1, 2)]
+        force = sum(float(d.force.sum()) for d in data)
+        assert comm.allreduce(force) == pytest.approx(pressed, rel=1e-5)
+    between = comm.allreduce(float(solution.contact(PROFILES[0]).force.sum()))
+    assert between == pytest.approx(pressed, rel=0.2)  # the ends bear the rest
+    assert min(report["sticking"], report["sliding"]) > 0
+    assert report["residuals"]["friction"] <= 1e-4
+    for name in (PROFILES[0], *(a for a, _ in BARS)):
+        data = solution.contact(name)
+        check_friction(data, 0.3 * data.pressure + 1e-3 * data.pressure.max(initial=0.0))
+
+
+def test_forces_balance_and_the_bound_is_reached_where_nodes_slip(quick_demo, comm):
+    found = quick_demo("four_bodies_2d")
+    solution, report = found.solution, found.report
+    assert report["bodies"] == 4
+    assert report["free_modes"] == 0
+    assert abs(report["errors"]["force_wedge"]) <= 1e-5
+    assert abs(report["errors"]["force_base"]) <= 1e-5
+    assert report["sticking"] > 0
+    for name, _ in PAIRS:
+        size, slips = check_friction(solution.contact(name), BOUND * (1.0 + 1e-9))
+        assert np.allclose(size[slips], BOUND, rtol=1e-9, atol=0)
+    # both sides do the same
+    sides = [solution.contact(name) for name in ("wedge left", "wedge right")]
+    force = [comm.allreduce(float(data.force.sum())) for data in sides]
+    slipping = [
+        comm.allreduce(int(np.sum(data.status == tfeti.ContactStatus.SLIP))) for data in sides
+    ]
+    assert force[0] == pytest.approx(force[1], rel=1e-4)
+    assert 0 < slipping[0] == slipping[1]
+    assert report["sliding"] >= 2 * slipping[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "tolerance"), [("hertz_2d", 0.02), ("hertz_3d", 0.05), ("sphere_on_block_3d", 0.05)]
+)
+def test_small_sizes_are_near_the_closed_form(quick_demo, name, tolerance):
+    errors = quick_demo(name).report["errors"]
+    assert abs(errors["force"]) <= 1e-4
+    assert abs(errors["half_width"]) <= tolerance
+    assert abs(errors["peak_pressure"]) <= tolerance
+
+
+def test_stacked_blocks_are_held_by_contact_alone(quick_demo):
+    """Each of the three upper blocks slides and turns freely on its flat sides: 3 modes each."""
+    report = quick_demo("stacked_blocks_3d").report
+    assert report["bodies"] == 4
+    assert report["free_modes"] == 9
+    assert abs(report["errors"]["force_base"]) <= 1e-5
+
+
+def test_a_bouncing_bar_is_as_in_closed_form(quick_demo):
+    """Up to the end of the first impact, on few cells."""
+    report = quick_demo("bouncing_bar").report
+    for name, most in (("first_begin", 0.01), ("first_end", 0.03), ("first_pressure", 0.01)):
+        assert abs(report["errors"][name]) <= most
+    assert report["in_all"]["assemblies"] == report["in_all"]["gluings"] == 1
+
+
+def test_an_impact_of_bars_is_as_in_closed_form(quick_demo):
+    """On few cells, of two equal bars that exchange their velocities."""
+    errors = quick_demo("impact_of_bars").report["errors"]
+    most = {
+        "pressure": 0.01,
+        "duration": 0.01,
+        "oscillates": 0.01,
+        "velocity": 0.03,
+        "energy": 0.02,
+    }
+    assert all(abs(errors[f"two_{name}"]) <= bound for name, bound in most.items())
