@@ -95,14 +95,16 @@ def test_links_lead_somewhere():
                 assert (path.parent / target).exists(), f"{path.name}: {target}"
 
 
-@pytest.mark.parametrize("folder", ["demos", "benchmarks"])
-def test_the_readme_lists_all_programs(folder):
+@pytest.mark.parametrize(
+    ("folder", "page"), [("demos", "gallery"), ("benchmarks", "developers/benchmarks")]
+)
+def test_a_page_lists_all_programs(folder, page):
     files = (ROOT / folder).glob("*.py")
     own = {"error_case.py"}  # started by time_against_error.py
     programs = [p.name for p in files if "\ndef main(" in p.read_text() and p.name not in own]
     assert len(programs) > 10
-    readme = (ROOT / "README.md").read_text()
-    assert not [name for name in programs if f"`{name}`" not in readme]
+    text = (ROOT / f"docs/{page}.md").read_text()
+    assert not [name for name in programs if f"`{name}`" not in text]
 
 
 def test_notation_names_what_is_in_the_code():
