@@ -1,5 +1,6 @@
 """Series of load steps: slips count from step to step, steps are halved, killed series go on."""
 
+import csv
 import json
 import subprocess
 import sys
@@ -54,7 +55,7 @@ def test_without_accept_friction_acts_on_the_whole_slip():
     assert np.allclose(scene.problem.u.x.array, fresh.problem.u.x.array, rtol=0, atol=1e-9)
 
 
-def test_a_series_and_what_it_dissipates():
+def test_a_series_and_what_it_dissipates(shared_tmp):
     """Pushed to and fro: no step dissipates less than nothing, and what was slipped stays."""
     scene = Driven(rtol=1e-10)
     comm = scene.problem.decomposition.comm
@@ -70,6 +71,19 @@ def test_a_series_and_what_it_dissipates():
     assert np.all(lost >= -1e-10)
     assert np.sum(lost > 1e-7) >= 5
     assert all(r.figures["factorizations"] == 0 for r in records[1:])
+    steps.write_csv(shared_tmp / "pushed.csv")
+    with (shared_tmp / "pushed.csv").open(newline="") as file:
+        table = list(csv.DictReader(file))
+    assert [float(row["time"]) for row in table] == list(range(9))
+    name = scene.problem.contacts[0].name
+    forces = np.array([[float(row[f"{name} {axis}"]) for axis in "xy"] for row in table])
+    last = scene.problem.solution.contact().resultant.force
+    assert np.allclose(forces[-1], last, rtol=1e-12, atol=0)
+    assert np.allclose(forces, [r.contact_forces[0] for r in records], rtol=1e-12, atol=0)
+    held = scene.problem.solution.reaction("left").force  # beside the load of the last step
+    assert np.allclose(forces[-1] + held, (0.0, 0.03), rtol=0, atol=1e-6)
+    with pytest.raises(tfeti.InputError, match="csv"):
+        steps.write_csv(shared_tmp / "pushed.txt")
     fresh = Driven(rtol=1e-10)
     fresh.load.value[:] = (0.0, -0.03)
     fresh.problem.solve()
