@@ -14,7 +14,7 @@ from meshes.tools import element_options, started_model
 INNER, MIDDLE, OUTER = 0.5, 1.0, 1.6
 
 
-def build(cells, overlap=0.0, turn=0.1, triangles=False):
+def build(cells, overlap=0.0, turn=0.1, triangles=False, radii=(INNER, MIDDLE, OUTER)):
     """Mesh two rings on this rank and return gmsh's model.
 
     Physical groups: the surfaces "inner" and "outer"; the curves "bore" and "shaft" of the inner
@@ -25,17 +25,19 @@ def build(cells, overlap=0.0, turn=0.1, triangles=False):
         overlap: How much larger the shaft's radius is than the hub's.
         turn: Angle between the meshes.
         triangles: Halves of the quadrilaterals instead of them.
+        radii: Of the bore, the contact and the rim.
     """
     model = started_model("rings")
-    shaft, hub = MIDDLE + overlap / 2, MIDDLE - overlap / 2
-    _ring("inner", {"bore": INNER, "shaft": shaft}, cells[0], 0.0, triangles)
-    _ring("outer", {"hub": hub, "rim": OUTER}, cells[1], turn, triangles)
+    inner, middle, outer = radii
+    shaft, hub = middle + overlap / 2, middle - overlap / 2
+    _ring("inner", {"bore": inner, "shaft": shaft}, cells[0], 0.0, triangles)
+    _ring("outer", {"hub": hub, "rim": outer}, cells[1], turn, triangles)
     gmsh.model.mesh.generate(2)
     return model
 
 
 def rings(comm, cells, order=1, *, subdomains=4, **options):
-    """Two rings with their contact at the radius 1, torn; ``options`` are those of ``build``.
+    """Two rings with their contact, torn; ``options`` are those of ``build``.
 
     Args:
         comm: Communicator.

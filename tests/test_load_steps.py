@@ -1,5 +1,6 @@
 """Series of load steps: slips count from step to step, steps are halved, killed series go on."""
 
+import csv
 import json
 import subprocess
 import sys
@@ -51,6 +52,32 @@ def test_without_accept_friction_acts_on_the_whole_slip():
         item.top.value = 0.02
         item.problem.solve()
     assert np.allclose(scene.problem.u.x.array, fresh.problem.u.x.array, rtol=0, atol=1e-9)
+
+
+def test_forces_over_load_steps_are_a_table(shared_tmp):
+    """Pushed to and fro: no step dissipates less than nothing; forces and supports balance."""
+    scene = Driven(rtol=1e-10)
+    path = np.array([0.0, 1.0, 0.0, -1.0])
+
+    def apply(problem, t):
+        scene.load.value[:] = (0.06 * path[round(t) % 4], -0.03)
+
+    steps = tfeti.LoadSteps(scene.problem, apply, range(9), begin=-1.0)
+    records = steps.run()
+    assert all(r.dissipation >= -1e-10 for r in records)
+    steps.write_csv(shared_tmp / "pushed.csv")
+    with (shared_tmp / "pushed.csv").open(newline="") as file:
+        table = list(csv.DictReader(file))
+    assert [float(row["time"]) for row in table] == list(range(9))
+    name = scene.problem.contacts[0].name
+    forces = np.array([[float(row[f"{name} {axis}"]) for axis in "xy"] for row in table])
+    last = scene.problem.solution.contact().resultant.force
+    assert np.allclose(forces[-1], last, rtol=1e-12, atol=0)
+    assert np.allclose(forces, [r.contact_forces[0] for r in records], rtol=1e-12, atol=0)
+    held = scene.problem.solution.reaction("left").force  # beside the load of the last step
+    assert np.allclose(forces[-1] + held, (0.0, 0.03), rtol=0, atol=1e-6)
+    with pytest.raises(tfeti.InputError, match="csv"):
+        steps.write_csv(shared_tmp / "pushed.txt")
 
 
 def test_halved_steps_begin_at_the_last_accepted_one():

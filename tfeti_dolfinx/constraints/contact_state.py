@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.arrays import Array, sum_rows
+from tfeti_dolfinx.common.parallel import summed
 from tfeti_dolfinx.constraints.gluing import Gluing
-from tfeti_dolfinx.contact.forces import condition_areas, nodal_forces
+from tfeti_dolfinx.contact.forces import Resultant, condition_areas, nodal_forces, resultant
 from tfeti_dolfinx.contact.partner import ContactPartner, position_of
 from tfeti_dolfinx.contact.records import remaining_gaps, slips
 from tfeti_dolfinx.mesh.decomposition import Decomposition
-from tfeti_dolfinx.mortar.surfaces import group_points
+from tfeti_dolfinx.mortar.surfaces import group_points, on_surface, surface_facets
 from tfeti_dolfinx.qp.sets import Face
 
 # --- Status of contacts and rows --------------------------------------------------------------
@@ -56,6 +57,9 @@ class ContactData:
         tangential_traction: Friction on the node over the area, a vector, shape ``(n, gdim)``.
         slip: Displacement along the surface, against what the node meets, since the load step
             began (``ContactProblem.accept``), a vector, shape ``(n, gdim)``.
+        surface: Surface whose nodes these are: of a pair the secondary one.
+        resultant: Force and moment, friction included, by which the contact acts on that surface;
+            the same on all ranks.
     """
 
     points: Array
@@ -67,6 +71,8 @@ class ContactData:
     status: Array
     tangential_traction: Array
     slip: Array
+    surface: str | int
+    resultant: Resultant
 
 
 # --- State of contact conditions: forces, gaps, slips -----------------------------------------
@@ -120,14 +126,15 @@ class ContactState:
         Raises:
             InputError: There is no such contact, or several have the name.
         """
-        records = self.gluing.records
-        own = records.contact == position_of(self.contacts, which)
+        records, position = self.gluing.records, position_of(self.contacts, which)
+        own = records.contact == position
+        points = group_points(self.dofs)[records.group[own]]
         area = self.area[:, None]
         traction = np.divide(
             self.tangential_force, area, out=0.0 * self.tangential_force, where=area > 0.0
         )
         return ContactData(
-            points=group_points(self.dofs)[records.group[own]],
+            points=points,
             normal=records.normal[own],
             force=self.force[own],
             pressure=self.contact_pressure[own],
@@ -136,7 +143,26 @@ class ContactState:
             status=self.status_of_conditions[own],
             tangential_traction=traction[own],
             slip=self.slip_of_conditions[own],
+            surface=self.contacts[position].surfaces[0],
+            resultant=resultant(self.dofs.comm, points, self.condition_forces[own]),
         )
+
+    def reaction(self, surface: str | int) -> Resultant:
+        """Return the force and moment by which Dirichlet conditions hold a surface. Collective.
+
+        Contact forces are not in it. Of a node that two surfaces share, both have the whole force.
+        Of bodies with mass it is the mean of the step.
+
+        Args:
+            surface: Name or tag.
+
+        Raises:
+            InputError: The surface is unknown, has no facets, or lies inside a body.
+        """
+        facets = surface_facets(self.decomposition, surface)
+        groups = on_surface(self.dofs, self.decomposition, facets)
+        force = self.support_forces[groups]
+        return resultant(self.dofs.comm, group_points(self.dofs)[groups], force)
 
     @cached_property
     def force(self) -> Array:
@@ -213,8 +239,36 @@ class ContactState:
         return [contact.surfaces[0] for contact in self.contacts]
 
     @cached_property
+    def condition_forces(self) -> Array:
+        """Force on the node of each contact condition of this rank, shape ``(n, gdim)``."""
+        return self.tangential_force - self.force[:, None] * self.gluing.records.normal
+
+    @cached_property
+    def resultant_forces(self) -> list[list[float]]:
+        """Force of each contact on its surface, as in ``ContactData.resultant``. Collective."""
+        contact, count = self.gluing.records.contact, len(self.contacts)
+        total = summed(self.dofs.comm, sum_rows(contact, self.condition_forces, count))
+        return [[float(value) for value in row] for row in total]
+
+    @cached_property
     def nodal_forces(self) -> Array:
         """Contact forces on the owned groups, shape ``(g, gdim)``. Collective at first use."""
-        records = self.gluing.records
-        force = self.tangential_force - self.force[:, None] * records.normal
-        return nodal_forces(records, force, self.dofs)
+        return nodal_forces(self.gluing.records, self.condition_forces, self.dofs)
+
+    @cached_property
+    def support_forces(self) -> Array:
+        """Forces of Dirichlet conditions on the owned groups. Collective at first use.
+
+        −Bᵀλ, summed over the copies of a node, less the contact forces: gluing forces cancel.
+        Shape ``(g, gdim)``.
+        """
+        constraints = self.gluing.constraints
+        trace, rows = constraints.B.createVecs()
+        rows.array[:] = self.lam
+        constraints.B.multTranspose(rows, trace)
+        forces = np.zeros_like(self.u)
+        forces[constraints.trace] = -trace.array_r
+        trace.destroy()
+        rows.destroy()
+        total = self.dofs.reduce(forces.reshape(-1, self.dofs.bs), np.add, 0.0)
+        return total - self.nodal_forces

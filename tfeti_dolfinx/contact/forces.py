@@ -17,6 +17,19 @@ from tfeti_dolfinx.mortar.surfaces import group_points, hat_integrals
 
 
 @dataclass(frozen=True)
+class Resultant:
+    """Resultant of forces on nodes, the same on all ranks.
+
+    Attributes:
+        force: Shape ``(gdim,)``; with a thickness, that on all of it.
+        moment: About the origin, shape ``(3,)``; in 2D only its last component is not 0.
+    """
+
+    force: Array
+    moment: Array
+
+
+@dataclass(frozen=True)
 class BodyForces:
     """Resultants of the contact forces on each body, the same on all ranks.
 
@@ -27,6 +40,26 @@ class BodyForces:
 
     force: Array
     moment: Array
+
+
+def resultant(comm: MPI.Comm, points: Array, forces: Array) -> Resultant:
+    """Return the resultant of forces at points of this rank. Collective.
+
+    Args:
+        comm: Communicator.
+        points: Shape ``(n, 3)``.
+        forces: Shape ``(n, gdim)``.
+    """
+    own = np.sum(_with_moments(points, forces), axis=0)
+    comm.Allreduce(MPI.IN_PLACE, own)
+    return Resultant(own[:-3], own[-3:])
+
+
+def _with_moments(points: Array, forces: Array) -> Array:
+    """Return forces and their moments about the origin, shape ``(n, gdim + 3)``."""
+    spatial = np.zeros((len(forces), 3))
+    spatial[:, : forces.shape[1]] = forces
+    return np.column_stack((forces, np.cross(points, spatial)))
 
 
 def nodal_forces(records: ContactRecords, force: Array, dofs: TornDofs) -> Array:
@@ -72,9 +105,7 @@ def body_forces(forces: Array, dofs: TornDofs, decomposition: Decomposition) -> 
     """Resultants of nodal forces, shape ``(g, gdim)``, on each body. Collective."""
     lowest = dofs.copy_subdomains[dofs.copy_offsets[:-1]]
     body = decomposition.body_of_subdomain[lowest]
-    spatial = np.zeros((len(forces), 3))
-    spatial[:, : forces.shape[1]] = forces
-    terms = np.column_stack((forces, np.cross(group_points(dofs), spatial)))
+    terms = _with_moments(group_points(dofs), forces)
     sums = np.zeros((decomposition.num_bodies, terms.shape[1]))
     np.add.at(sums, body, terms)
     dofs.comm.Allreduce(MPI.IN_PLACE, sums)

@@ -11,7 +11,7 @@ import ufl
 from dolfinx import fem
 from scipy.sparse import csr_array
 
-from tfeti_dolfinx.common.arrays import Array, sum_rows
+from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import any_rank, summed
 from tfeti_dolfinx.common.validation import checked_flag
 from tfeti_dolfinx.constraints.contact_state import Multipliers
@@ -88,14 +88,6 @@ def _work_of_rows(dual: Dual, lam: Array, way: Array) -> list[float]:
     rows.destroy()
     kinds = (sets.normals, sets.tangents.ravel(), sets.equalities)
     return [float(done[kind].sum()) for kind in kinds]
-
-
-def contact_forces(solution: Solution) -> list[list[float]]:
-    """Resultant on the surface of each contact, of a pair the secondary one. Collective."""
-    records = solution.gluing.records
-    force = solution.tangential_force - solution.force[:, None] * records.normal
-    total = summed(solution.dofs.comm, sum_rows(records.contact, force, len(solution.contacts)))
-    return [[float(value) for value in row] for row in total]
 
 
 # --- Predictor: projection in M onto admissible displacements ---------------------------------
@@ -423,5 +415,5 @@ class ContactDynamics(ContactProblem):
         motion = balance(self._forms_in_time, self._system.dual, self.solution)
         if self._predictor is not None:
             motion["predictor_multiplications"] = float(self._predictor.multiplications)
-        forces = contact_forces(self.solution)
+        forces = self.solution.resultant_forces
         self.report.take(replace(self.report, motion=motion, contact_forces=forces))

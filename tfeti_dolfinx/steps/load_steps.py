@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 import os
 import sys
@@ -26,6 +27,7 @@ from tfeti_dolfinx.common.validation import (
     checked_path,
     checked_type,
     is_whole,
+    named,
     shown,
 )
 from tfeti_dolfinx.errors import (
@@ -34,7 +36,14 @@ from tfeti_dolfinx.errors import (
     TfetiError,
     raised_on_all_ranks,
 )
-from tfeti_dolfinx.output import VtxFile, cell_fields, checked_target, nodal_fields
+from tfeti_dolfinx.output import (
+    VtxFile,
+    begin_file,
+    cell_fields,
+    checked_target,
+    end_file,
+    nodal_fields,
+)
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.steps.checkpoint import Checkpoint
@@ -277,7 +286,8 @@ class StepRecord:
         residuals: Those of the report.
         seconds: Wall seconds.
         motion: Energies and work, from the report, of bodies with mass.
-        contact_forces: Resultant of the forces on each contact's surface, likewise.
+        contact_forces: Resultant of the forces on each contact's surface, of a pair the secondary
+            one; of bodies with mass their mean over the step.
     """
 
     number: int
@@ -392,6 +402,38 @@ class LoadSteps:
         self._close()
         return self.records
 
+    def write_csv(self, path: str | os.PathLike[str]) -> None:
+        """Write a table of the steps so far, a line a step, by rank 0. Collective.
+
+        Columns: time, the force on each contact by name and axis, what friction dissipates,
+        multiplications by F, seconds.
+
+        Args:
+            path: File, ending in ``.csv``; one that is there is replaced.
+
+        Raises:
+            InputError: The path does not fit, or the file cannot be written.
+        """
+        with agreeing(self._comm, "LoadSteps.write_csv") as given:
+            given["path"] = path
+            target = checked_path(path, ".csv")
+        axes = "xyz"[: self._problem.decomposition.mesh.geometry.dim]
+        names = [contact.name for contact in self._problem.contacts]
+        partial = begin_file(target, self._comm)
+        with raised_on_all_ranks(self._comm), named(f"cannot write {target}", OSError):
+            if self._comm.rank == 0:
+                with partial.open("w", newline="", encoding="utf-8") as file:
+                    table = csv.writer(file)
+                    forces = [f"{name} {axis}" for name in names for axis in axes]
+                    table.writerow(["time", *forces, "dissipation", "F", "seconds"])
+                    for record in self.records:
+                        values = [value for force in record.contact_forces for value in force]
+                        count = record.figures["F_multiplications"]
+                        table.writerow(
+                            [record.time, *values, record.dissipation, count, record.seconds]
+                        )
+        end_file(partial, target, self._comm)
+
     def _steps(self, place: Place, show: Show) -> None:
         while place.number < len(self._times) - 1:
             t = place.end(self._times)
@@ -444,7 +486,8 @@ class LoadSteps:
         lost = float(np.sum(self._problem.solution.dissipation))
         total = self._comm.allreduce(lost)
         residuals, seconds = dict(report.residuals), report.seconds["total"]
-        moving = dict(report.motion), list(report.contact_forces)
+        forces = self._problem.solution.resultant_forces
+        moving = dict(report.motion), forces
         return StepRecord(number, t, size, total, figures, residuals, seconds, *moving)
 
     def _keep(self, place: Place, t: float) -> None:

@@ -1,0 +1,571 @@
+"""Published cases: reference, got, difference, mesh and multiplications of each.
+
+Writes docs/validation.md with ``--page``. Lengths in mm, forces in N, unless a case says otherwise.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from math import log, pi, sqrt
+from pathlib import Path
+from typing import Any
+
+import petsc4py
+
+petsc4py.init(sys.argv[:1])
+
+import gmsh
+import numpy as np
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+
+import tfeti_dolfinx as tfeti
+from benchmarks.tools import ROOT, Tables, command_line, markdown, write_tables
+from demos.hertz import LineContact, fit
+from demos.impact_of_bars import Bars, Impact, look
+from meshes.blocks import Block
+from meshes.blocks import build as build_blocks
+from meshes.cylinder_on_block import build as build_cylinder_on_block
+from meshes.rings import lame_pressure, rings
+from meshes.tools import graded_size, started_model
+
+PAGE = ROOT / "docs" / "validation.md"
+COMM = MPI.COMM_WORLD
+# sizes of elements, over those of the quick run
+FINE = 0.4
+
+
+@dataclass
+class Row:
+    """A figure of a case.
+
+    Attributes:
+        case: Its name, with its source.
+        quantity: The figure.
+        reference: The published figure, or the closed form.
+        got: Ours.
+        allowed: Relative difference that the source allows, or None where it is for information.
+        problem: What was solved.
+        multiplications: By F and S in all.
+    """
+
+    case: str
+    quantity: str
+    reference: float
+    got: float
+    allowed: float | None
+    problem: tfeti.ContactProblem
+    multiplications: int
+
+    @property
+    def difference(self) -> float:
+        """Relative, but of a reference of 0."""
+        return (self.got - self.reference) / (abs(self.reference) or 1.0)
+
+    def columns(self) -> dict[str, Any]:
+        """Row of the table."""
+        return {
+            "case": self.case,
+            "quantity": self.quantity,
+            "reference": f"{self.reference:.5g}",
+            "got": f"{self.got:.5g}",
+            "difference": f"{100 * self.difference:+.2f} %",
+            "allowed": None if self.allowed is None else f"{100 * self.allowed:g} %",
+            "unknowns": self.problem.report.primal_dofs,
+            "F + S": self.multiplications,
+        }
+
+
+def work(problem: tfeti.ContactProblem) -> int:
+    """Multiplications of the last solve."""
+    report = problem.report
+    return report.F_multiplications + report.preconditioner_multiplications
+
+
+# --- Meshes and forms -------------------------------------------------------------------------
+
+
+def quarter_disc(radius: float, fine: float, fine_radius: float) -> tfeti.Decomposition:
+    """Half of a half disc, r ≥ 0, whose lowest point is the origin: "arc", "top", "axis"."""
+    model = None
+    if COMM.rank == 0:
+        model = started_model("quarter_disc")
+        geo = model.geo
+        lowest, centre, right = (
+            geo.addPoint(*x, 0.0) for x in ((0, 0), (0, radius), (radius, radius))
+        )
+        arc, top = geo.addCircleArc(lowest, centre, right), geo.addLine(right, centre)
+        axis = geo.addLine(centre, lowest)
+        body = geo.addPlaneSurface([geo.addCurveLoop([arc, top, axis])])
+        geo.synchronize()
+        model.addPhysicalGroup(2, [body], name="ball")
+        for name, curve in (("arc", arc), ("top", top), ("axis", axis)):
+            model.addPhysicalGroup(1, [curve], name=name)
+        graded_size((0.0, 0.0, 0.0), fine, fine_radius, 0.2)
+        gmsh.model.mesh.generate(2)
+    return tfeti.read_gmsh(model, COMM, subdomains=8)
+
+
+def rectangle(
+    low: tuple[float, float],
+    high: tuple[float, float],
+    cells: tuple[int, int],
+    fine: float = 0.0,
+    fine_radius: float = 0.0,
+) -> tfeti.Decomposition:
+    """A rectangle of quadrilaterals, or of triangles graded to its upper left corner."""
+    model = None
+    if COMM.rank == 0:
+        model = started_model("rectangle")
+        geo = model.geo
+        corners = [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
+        points = [geo.addPoint(*x, 0.0) for x in corners]
+        sides = [geo.addLine(points[k], points[(k + 1) % 4]) for k in range(4)]
+        body = geo.addPlaneSurface([geo.addCurveLoop(sides)])
+        if not fine:
+            for k, side in enumerate(sides):
+                geo.mesh.setTransfiniteCurve(side, cells[k % 2] + 1)
+            geo.mesh.setTransfiniteSurface(body)
+            geo.mesh.setRecombine(2, body)
+        geo.synchronize()
+        model.addPhysicalGroup(2, [body], name="body")
+        for name, side in zip(("bottom", "right", "top", "left"), sides, strict=True):
+            model.addPhysicalGroup(1, [side], name=name)
+        if fine:
+            graded_size((low[0], high[1], 0.0), fine, fine_radius, 0.2)
+        gmsh.model.mesh.generate(2)
+    return tfeti.read_gmsh(model, COMM, subdomains=4)
+
+
+class Scene:
+    """Elastic bodies with their space; loads and conditions are added by name.
+
+    Args:
+        decomposition: The torn mesh.
+        E: Young's modulus, or moduli of volumes.
+        nu: Poisson's ratio.
+        model: As for ``Elasticity``.
+        degree: Of the displacement.
+    """
+
+    def __init__(
+        self, decomposition: tfeti.Decomposition, E: Any, nu: float, model: str, degree: int = 1
+    ) -> None:
+        self.decomposition = d = decomposition
+        self.gdim = d.mesh.geometry.dim
+        self.elastic = tfeti.Elasticity(d, E=E, nu=nu, model=model)
+        self.V = fem.functionspace(d.mesh, ("Lagrange", degree, (self.gdim,)))
+        self.v = ufl.TestFunction(self.V)
+        self.ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+        self.bcs: list[fem.DirichletBC] = []
+        self.L: Any = ufl.ZeroBaseForm((self.v,))
+
+    def dofs(self, surface: str, axis: int) -> Any:
+        """Dofs of a component on a surface."""
+        facets = self.decomposition.facets(surface)
+        return fem.locate_dofs_topological(self.V.sub(axis), self.gdim - 1, facets)
+
+    def hold(self, surface: str, axis: int, value: float = 0.0) -> fem.Constant:
+        """Prescribe a component; returns what its value may be changed by."""
+        given = fem.Constant(self.decomposition.mesh, value)
+        self.bcs.append(fem.dirichletbc(given, self.dofs(surface, axis), self.V.sub(axis)))
+        return given
+
+    def load(self, surface: str, traction: Any) -> None:
+        """Add a traction, a vector in UFL."""
+        ds = self.ds(self.decomposition.surface(surface))
+        self.L = self.L + self.elastic.thickness * ufl.dot(traction, self.v) * ds
+
+    def problem(self, contacts: list[Any], **options: Any) -> tfeti.ContactProblem:
+        """The linear problem."""
+        u = ufl.TrialFunction(self.V)
+        return tfeti.ContactProblem(
+            self.elastic.a(u, self.v),
+            self.L,
+            self.bcs,
+            contacts,
+            self.decomposition,
+            stress=self.elastic.stress,
+            thickness=self.elastic.thickness,
+            petsc_options={"rtol": 1e-8, **options},
+        )
+
+
+def contact_force(problem: tfeti.ContactProblem) -> float:
+    """Resultant of the first contact along the last axis. Collective."""
+    data = problem.solution.contact()
+    return abs(COMM.allreduce(float((data.force @ data.normal)[-1])))
+
+
+# --- Cases ------------------------------------------------------------------------------------
+
+
+def hemispheres(scale: float) -> Iterator[Row]:
+    """Two equal hemispheres pressed together: one of them against the plane between them."""
+    R, E, nu, case = 50.0, 2e4, 0.3, "SSNV104, two hemispheres"
+    for approach, peak, radius in ((2.0, 1978.7, 7.071), (4.0, 2798.3, 10.0)):
+        d = quarter_disc(R, scale * 0.6, 1.5 * radius)
+        scene = Scene(d, E, nu, "axisymmetric")
+        scene.hold("axis", 0)
+        scene.hold("top", 1, -approach / 2)
+        plane = tfeti.Obstacle("arc", tfeti.Plane((0, 0), normal=(0, 1)), reach=2 * approach)
+        problem = scene.problem([plane])
+        problem.solve()
+        data, force = problem.solution.contact(), contact_force(problem)
+        a, p0 = fit(COMM, data.points[:, 0], data.pressure, peak)
+        modulus, relative = E / (2 * (1 - nu**2)), R / 2
+        of_force = (3 * force * relative / (4 * modulus)) ** (1 / 3)
+        named = f"{case}, approach {approach:g}"
+        yield Row(
+            named,
+            "p₀ of the force, Hertz",
+            3 * force / (2 * pi * of_force**2),
+            p0,
+            0.05,
+            problem,
+            work(problem),
+        )
+        yield Row(named, "a of the force, Hertz", of_force, a, 0.05, problem, work(problem))
+        yield Row(named, "p₀, published", peak, p0, 0.15, problem, work(problem))
+        yield Row(named, "a, published", radius, a, 0.15, problem, work(problem))
+
+
+def cylinder_on_block(scale: float) -> Iterator[Row]:
+    """A steel cylinder on a block of aluminium, plane strain."""
+    R, P, nu = 50.0, 35e3, 0.3
+    young = {"cylinder": 2.1e5, "block": 7e4}
+    hertz = LineContact.from_load(P, R, 1 / sum((1 - nu**2) / E for E in young.values()))
+    model = None
+    if COMM.rank == 0:
+        a = hertz.half_width
+        model = build_cylinder_on_block(R, fine=scale * a / 8, fine_radius=1.5 * a, growth=0.2)
+    scene = Scene(tfeti.read_gmsh(model, COMM, 8), young, nu, "plane_strain")
+    scene.hold("axis", 0)
+    scene.hold("bottom", 1)
+    scene.load("load", fem.Constant(scene.decomposition.mesh, (0.0, -P / (2 * R))))
+    problem = scene.problem([tfeti.Contact("arc", "top")])
+    problem.solve()
+    data = problem.solution.contact()
+    a, p0 = fit(COMM, data.points[:, 0], data.pressure, hertz.peak)
+    case = "NAFEMS B1 (SSNP154), cylinder on block"
+    yield Row(case, "p₀", 3585.4, p0, 0.01, problem, work(problem))
+    yield Row(case, "a", 6.21, a, 0.01, problem, work(problem))
+
+
+def sliding_wedge(scale: float) -> Iterator[Row]:
+    """A block on a slope, pushed up by the largest force at which friction holds it."""
+    slope, weight = 0.1, 1.0
+    d = rectangle((0.0, 0.0), (4.0, 2.0), (8, 4))
+    c, s = 1 / sqrt(1 + slope**2), slope / sqrt(1 + slope**2)
+    d.mesh.geometry.x[:, :2] = d.mesh.geometry.x[:, :2] @ np.array([[c, s], [-s, c]])
+    for mu, published in ((0.1, 0.2020), (0.2, 0.3061), (0.3, 0.41237)):
+        scene = Scene(d, 1e3, 0.3, "plane_strain")
+        area = 8.0
+        push = fem.Constant(d.mesh, (0.0, -weight / area))
+        scene.L = ufl.dot(push, scene.v) * ufl.dx(domain=d.mesh)
+        plane = tfeti.Plane((0, 0), normal=(-s, c))
+        floor = tfeti.Obstacle("bottom", plane, friction=tfeti.Coulomb(mu))
+        problem, low, high, total = scene.problem([floor]), 0.0, 1.0, 0
+        while high - low > 1e-5:
+            force = 0.5 * (low + high)
+            push.value = (force / area, -weight / area)
+            try:
+                problem.solve()
+            except (tfeti.NoSolutionError, tfeti.ConvergenceError):
+                high = force
+            else:
+                low = force
+            total += work(problem)
+            problem.go_back()
+        yield Row(
+            "NAFEMS CGS-4, sliding wedge",
+            f"F/G, μ = {mu:g}",
+            published,
+            low / weight,
+            0.002,
+            problem,
+            total,
+        )
+
+
+def concentric_rings(scale: float) -> Iterator[Row]:
+    """Rings that touch, under a pressure from outside, plane stress (m, N)."""
+    E, nu, p, (R1, R2, R3) = 1e9, 0.2, 1e6, (1.0, 0.6, 0.2)
+    published = 9.2593e5
+    n = round(40 / scale)
+    d = rings(COMM, (n, n + n // 3), order=2, radii=(R3, R2, R1), subdomains=8)
+    scene = Scene(d, E, nu, "plane_stress", degree=2)
+    scene.load("rim", -p * ufl.FacetNormal(d.mesh))
+    problem = scene.problem([tfeti.Contact("shaft", "hub", gap=0.0)])
+    problem.solve()
+    data = problem.solution.contact()
+    sums = [
+        data.area @ data.pressure,
+        data.area @ (data.pressure - published) ** 2,
+        data.area.sum(),
+    ]
+    total, squares, area = COMM.allreduce(np.array(sums))
+    case = "SSNP152, concentric rings"
+    yield Row(case, "mean pressure", published, total / area, 0.007, problem, work(problem))
+    yield Row(
+        case,
+        "1 + L² error of the pressure",
+        1.0,
+        1 + sqrt(squares / area) / published,
+        0.007,
+        problem,
+        work(problem),
+    )
+
+
+def patches(scale: float) -> Iterator[Row]:
+    """Two blocks that do not match, ν = 0."""
+    for gdim, E, down, pressure in ((2, 2e6, -0.1, 1e5), (3, 2e5, -0.2, 1e4)):
+        model = None
+        if COMM.rank == 0:
+            depth, height, n = (1.0, 1.0, 1) if gdim == 2 else (2.0, 2.0, 4)
+            lower = Block("lower", (0, 0, 0), (2.0, depth, height), (5, n, 3))
+            upper = Block("upper", (0, 0, height), (2.0, depth, height), (7, max(n - 1, 1), 4))
+            model = build_blocks([lower, upper])
+        scene = Scene(tfeti.read_gmsh(model, COMM, 4), E, 0.0, "3d")
+        for surface in ("lower bottom", "upper top"):  # nothing moves across, since ν = 0
+            scene.hold(surface, 0)
+            scene.hold(surface, 1)
+        scene.hold("lower bottom", 2)
+        scene.hold("upper top", 2, down)
+        problem = scene.problem([tfeti.Contact("upper bottom", "lower top")], rtol=1e-10)
+        problem.solve()
+        data = problem.solution.contact()
+        worst = np.max(np.abs(data.pressure - pressure), initial=0.0)
+        worst = COMM.allreduce(worst, op=MPI.MAX)
+        case = f"{'SSNP121' if gdim == 2 else 'SSNV167'}, patch test"
+        yield Row(
+            case, "pressure, worst node", pressure, pressure + worst, 1e-6, problem, work(problem)
+        )
+
+
+def rigid_sphere(scale: float) -> Iterator[Row]:
+    """An elastic ball on a rigid one of the same radius."""
+    R, E, nu, d = 2.0, 1.40625e7, 0.25, 0.01
+    scene = Scene(quarter_disc(R, scale * 0.01, 0.15), E, nu, "axisymmetric")
+    scene.hold("axis", 0)
+    scene.hold("top", 1, -d)
+    ball = tfeti.Obstacle("arc", tfeti.Sphere((0.0, -R), R), reach=4 * d)
+    problem = scene.problem([ball])
+    problem.solve()
+    data, force = problem.solution.contact(), contact_force(problem)
+    a, p0 = fit(COMM, data.points[:, 0], data.pressure, 9.55e5)
+    modulus, relative = E / (1 - nu**2), R / 2
+    of_force = (3 * force * relative / (4 * modulus)) ** (1 / 3)
+    case = "MOOSE, rigid sphere"
+    yield Row(
+        case,
+        "p₀ of the force, Hertz",
+        3 * force / (2 * pi * of_force**2),
+        p0,
+        0.01,
+        problem,
+        work(problem),
+    )
+    yield Row(case, "a of the force, Hertz", of_force, a, 0.01, problem, work(problem))
+    for name, published, got in (("F", 2.0e4, force), ("a", 0.1, a), ("p₀", 9.55e5, p0)):
+        yield Row(case, f"{name}, published", published, got, None, problem, work(problem))
+
+
+def press_fit(scale: float) -> Iterator[Row]:
+    """A ring shrunk on another one, plane strain, beside Lamé's pressure."""
+    n, overlap = round(40 / scale), 1e-3
+    d = rings(COMM, (n, n + n // 3), overlap=overlap)
+    scene = Scene(d, 1.0, 0.3, "plane_strain")
+    problem = scene.problem([tfeti.Contact("shaft", "hub", gap=-overlap)])
+    problem.solve()
+    data = problem.solution.contact()
+    total, area = COMM.allreduce(np.array([data.area @ data.pressure, data.area.sum()]))
+    yield Row(
+        "press fit (Lamé)",
+        "mean pressure",
+        lame_pressure(overlap),
+        total / area,
+        0.01,
+        problem,
+        work(problem),
+    )
+
+
+def bar_on_wall(scale: float) -> Iterator[Row]:
+    """A bar with ν = 0 hits a rigid wall (m, s, N)."""
+    impact = Impact(0.2, 0.02, 2e11, 0.0, 8000.0, 100.0, 2e-3, below=False)
+    bars = Bars(impact, round(40 / scale), True, {})
+    t, p, velocity, records = bars.run()
+    found, problem = look(bars, t, p, velocity, records), bars.problem
+    rows = (
+        ("begin of contact", 2e-5, 2e-5 * (1 + found["begin"])),
+        ("end of contact", 1e-4, 2e-5 * (1 + found["begin"]) + 8e-5 * (1 + found["duration"])),
+        ("stress", 4e9, 4e9 * (1 + found["pressure"])),
+        ("velocity afterwards", 100.0, float(velocity)),
+    )
+    for quantity, published, got in rows:
+        yield Row(
+            "SDNV100, bar on a rigid wall", quantity, published, got, 0.05, problem, found["F"]
+        )
+
+
+def plastic_indentation(scale: float) -> Iterator[Row]:
+    """A rigid sphere pressed into a perfectly plastic block, axisymmetric; force per radian."""
+    R, E, nu, strength = 500.0, 2.1e5, 0.3, 50.0
+    d = rectangle((0.0, -1620.0), (1920.0, 0.0), (0, 0), scale * 24.0, 420.0)
+    scene = Scene(d, E, nu, "axisymmetric", degree=2)
+    scene.hold("left", 0)
+    for axis in (0, 1):
+        scene.hold("bottom", axis)
+    u = fem.Function(scene.V)
+    steel = tfeti.J2Plasticity(scene.elastic, u, yield_stress=strength)
+    top = tfeti.Obstacle("top", tfeti.Sphere((0.0, R), R), name="ball")
+    problem = tfeti.NonlinearContactProblem(
+        steel.residual(scene.v),
+        u,
+        scene.bcs,
+        [top],
+        d,
+        J=steel.tangent(ufl.TrialFunction(scene.V), scene.v),
+        state=steel.state,
+        update=steel.update,
+        stress=steel.stress,
+        thickness=scene.elastic.thickness,
+        petsc_options={"rtol": 1e-5},
+    )
+    code_aster = {20: 2.068e6, 40: 4.047e6, 60: 5.827e6, 80: 7.666e6, 100: 9.119e6}
+    allowed = {20: 0.05, 40: 0.05, 60: 0.05, 80: 0.10, 100: 0.15}
+    total, depths = 0, np.arange(4.0, 100.5, 4.0)
+
+    def gap(depth: float) -> Callable[[Any], Any]:
+        return lambda x: R - depth - np.sqrt(np.maximum(R**2 - x[0] ** 2, 0.0))
+
+    for depth in depths:
+        problem.update(gap={"ball": gap(depth)})
+        problem.solve()
+        problem.accept()
+        total += work(problem)
+        if depth not in code_aster:
+            continue
+        force = contact_force(problem) / (2 * pi)
+        yield Row(
+            "SSNV506, plastic indentation",
+            f"force at {depth:g}, slip lines",
+            2.038e6 * depth / 20,
+            force,
+            allowed[depth],
+            problem,
+            total,
+        )
+        yield Row(
+            "SSNV506, plastic indentation",
+            f"force at {depth:g}, Code_Aster",
+            code_aster[depth],
+            force,
+            None,
+            problem,
+            total,
+        )
+
+
+def thick_cylinder(scale: float) -> Iterator[Row]:
+    """A thick cylinder, perfectly plastic, to its limit load; plane strain."""
+    Ri, Ro, E, nu, strength = 1.0, 1.3, 7e4, 0.3, 250.0
+    n = round(12 / scale)
+    d = rectangle((Ri, 0.0), (Ro, 0.1), (n, max(n // 3, 1)))
+    scene = Scene(d, E, nu, "axisymmetric", degree=2)
+    out = scene.hold("left", 0)
+    for side in ("bottom", "top"):
+        scene.hold(side, 1)
+    u = fem.Function(scene.V)
+    steel = tfeti.J2Plasticity(scene.elastic, u, yield_stress=strength)
+    problem = tfeti.NonlinearContactProblem(
+        steel.residual(scene.v),
+        u,
+        scene.bcs,
+        [],
+        d,
+        J=steel.tangent(ufl.TrialFunction(scene.V), scene.v),
+        state=steel.state,
+        update=steel.update,
+        petsc_options={"rtol": 1e-8},
+    )
+    inner, total = scene.dofs("left", 0), 0
+    residual = fem.form(steel.residual(scene.v))
+    for value in np.linspace(0.001, 0.02, 20):
+        out.value = value
+        problem.solve()
+        problem.accept()
+        total += work(problem)
+    reaction = fem.assemble_vector(residual).array[inner]
+    owned = inner < scene.V.dofmap.index_map.size_local * scene.V.dofmap.index_map_bs
+    force = COMM.allreduce(float(np.sum(reaction[owned])))
+    pressure = force / (2 * pi * Ri * 0.1)
+    limit = 2 / sqrt(3) * strength * log(Ro / Ri)
+    yield Row("thick cylinder to collapse", "limit pressure", limit, pressure, 0.01, problem, total)
+
+
+CASES: dict[str, Callable[[float], Iterator[Row]]] = {
+    "hemispheres": hemispheres,
+    "cylinder_on_block": cylinder_on_block,
+    "sliding_wedge": sliding_wedge,
+    "bar_on_wall": bar_on_wall,
+    "concentric_rings": concentric_rings,
+    "patches": patches,
+    "rigid_sphere": rigid_sphere,
+    "press_fit": press_fit,
+    "plastic_indentation": plastic_indentation,
+    "thick_cylinder": thick_cylinder,
+}
+QUICK = (
+    "cylinder_on_block",
+    "sliding_wedge",
+    "concentric_rings",
+    "patches",
+    "press_fit",
+    "thick_cylinder",
+)
+
+
+def main(argv: list[str]) -> Tables:
+    """Run the cases; returns their table."""
+    arguments, _ = command_line(__doc__, argv, configure)
+    scale = 1.0 if arguments.quick else FINE
+    rows = []
+    for name in arguments.only or (QUICK if arguments.quick else tuple(CASES)):
+        for row in CASES[name](scale):
+            rows.append(row.columns())
+            if COMM.rank == 0:
+                print(markdown(rows[-1:]).splitlines()[-1], flush=True)
+    tables = {"Published cases": rows}
+    if COMM.rank == 0:
+        write_tables(arguments.output, "validation", tables)
+        if arguments.page:
+            arguments.page.write_text(page(rows), encoding="utf-8")
+    return tables
+
+
+def configure(parser: Any) -> None:
+    """Arguments of this benchmark."""
+    parser.add_argument("--only", nargs="+", choices=tuple(CASES), help="cases")
+    parser.add_argument("--page", type=Path, nargs="?", const=PAGE, help="write the page, too")
+
+
+def page(rows: list[dict[str, Any]]) -> str:
+    """Return the generated page of the documents."""
+    return f"""# Validation
+
+Published cases, and what this package finds. Written by
+`./run python3 -m benchmarks.validation --page`. *allowed* is what the source allows, or what a
+closed form should be met to; where it is empty the published figure is shown for information.
+
+{markdown(rows)}
+"""
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
