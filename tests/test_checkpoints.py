@@ -120,7 +120,7 @@ WAYS = {
     "other shapes": rewritten(lambda values: np.concatenate([np.ravel(values), [0.0]])),
     "another type": rewritten(lambda values: values.astype(np.float32)),
     "[]": lambda file: file.write_text("[]"),
-    '{"version": 3}': lambda file: file.write_text('{"version": 3}'),
+    '{"version": 4}': lambda file: file.write_text('{"version": 4}'),
     "more at the end": lambda file: file.write_bytes(file.read_bytes() + b"\nmore"),
 }
 
@@ -219,7 +219,7 @@ def test_what_a_killed_run_has_left_goes(scene):
 
 def test_a_checkpoint_of_an_earlier_version_is_named(scene):
     def write():
-        text = {"version": 2, "ranks": scene.comm.size, "number": 2, "records_length": 7}
+        text = {"version": 3, "ranks": scene.comm.size, "number": 2, "records_length": 7}
         (scene.copy / "checkpoint.json").write_text(json.dumps(text))
 
     scene.begin()
