@@ -256,10 +256,6 @@ WRONG = [
         ({}, {}, {"tag": 2}),
     ),
     (
-        f"'steel' stands for the physical groups of {GROUP.format(1, 8)} and {GROUP.format(2, 1)}",
-        (STEEL, STEEL, {"tag": 3, "curve": "steel"}),
-    ),
-    (
         f"{GROUP.format(2, 1)} is named 'body' in one file and 'steel' in another",
         ({}, {}, STEEL),
     ),

@@ -156,12 +156,12 @@ def test_going_back():
 def test_places():
     times = checked_times(0.0, [1.0, 3.0])
     place = Place()
-    assert (place.begin(times), place.end(times)) == (0.0, 1.0)
-    quarter = Place(0, 0, 2)
-    seen = [quarter.end(times)]
+    assert place.part(times) == (0.0, 1.0)
+    quarter = Place(0, 0.0, 2)
+    seen = [quarter.part(times)[1]]
     place = quarter.ahead()
     while place.number < 2:
-        seen.append(place.end(times))
+        seen.append(place.part(times)[1])
         place = place.ahead()
     assert seen == [0.25, 0.5, 1.0, 3.0]
 
