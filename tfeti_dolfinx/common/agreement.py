@@ -31,8 +31,6 @@ from tfeti_dolfinx.common.parallel import summed
 from tfeti_dolfinx.common.validation import shown
 from tfeti_dolfinx.errors import InputError, raise_together
 
-# of the largest number beside it: what differs by less was computed on processors of other kinds
-ROUNDING = 1e-10
 # where objects are made that say what a user wants, and have nothing of a rank
 DESCRIPTIONS = ("tfeti_dolfinx.contact.", "tfeti_dolfinx.bem.boundary_elements")
 # in a name that was made from an object: that of another rank lies elsewhere
@@ -270,15 +268,18 @@ def difference(found: Any, expected: Any, what: str = "") -> tuple[str, Any, Any
     return next((deeper for deeper in found_in_parts if deeper is not None), None)
 
 
-def _is_rounding(found: list[Any], expected: list[Any]) -> bool:
-    """Return whether two lists are equal up to rounding beside their largest number."""
+def _is_rounding(found: list[Any], expected: list[Any], rounding: float = 1e-10) -> bool:
+    """Return whether two lists are equal up to rounding beside their largest number.
+
+    What differs by less was computed on processors of other kinds.
+    """
     if repr(found) == repr(expected):
         return True
     numbers = [*found, *expected]
     if len(found) != len(expected) or any(type(x) not in (int, float) for x in numbers):
         return False
     size = max(abs(x) for x in numbers)
-    return math.isfinite(size) and np.allclose(found, expected, rtol=0.0, atol=ROUNDING * size)
+    return math.isfinite(size) and np.allclose(found, expected, rtol=0.0, atol=rounding * size)
 
 
 def brief(value: Any) -> str:

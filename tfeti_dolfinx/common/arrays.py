@@ -18,18 +18,6 @@ ArrayLike = npt.ArrayLike
 # stands for 0 in a denominator: smaller than any quantity, and its inverse is still finite
 TINY = 1e-300
 
-__all__ = [
-    "TINY",
-    "Array",
-    "ArrayLike",
-    "joined",
-    "node_blocks",
-    "node_means",
-    "parts_of",
-    "sum_rows",
-    "sums",
-]
-
 
 def sum_rows(row: Array, values: Array, size: int) -> Array:
     """Return sums of the values with the same row.

@@ -6,7 +6,7 @@ import math
 import reprlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import Field, dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from numbers import Integral, Real
 from os import PathLike
 from pathlib import Path
@@ -220,7 +220,7 @@ def parameters_of(kind: type, path: tuple[str, ...] = ()) -> Iterator[Parameter]
         if is_dataclass(f.default):
             yield from parameters_of(type(f.default), (*path, f.name))
         elif "is" in f.metadata:
-            about = _description(f)
+            about: Description = f.metadata["is"]
             yield Parameter(about.name or f.name, f.default, about, (*path, f.name))
 
 
@@ -230,25 +230,20 @@ def made(kind: type, values: dict[str, Any]) -> Any:
     for f in fields(kind):
         if is_dataclass(f.default):
             given[f.name] = made(type(f.default), values)
-        elif "is" in f.metadata and (name := _description(f).name or f.name) in values:
+        elif "is" in f.metadata and (name := f.metadata["is"].name or f.name) in values:
             given[f.name] = values[name]
     return kind(**given)
 
 
-def _description(f: Field[Any]) -> Description:
-    description: Description = f.metadata["is"]
-    return description
-
-
 # --- Checks of a subdomain's stiffness and load -----------------------------------------------
-
-# Largest entry of K − Kᵀ over that of K: far above what rounding of assembly leaves, far below any
-# term of a form that matters.
-SYMMETRY = 1e-8
 
 
 def check_stiffness(
-    name: str, K: Any, what: str = "the stiffness", form: str = "a linear elastic form"
+    name: str,
+    K: Any,
+    what: str = "the stiffness",
+    form: str = "a linear elastic form",
+    symmetry: float = 1e-8,
 ) -> None:
     """Raise if a stiffness is not finite, not symmetric or has a diagonal entry of 0 or less.
 
@@ -257,6 +252,8 @@ def check_stiffness(
         K: The matrix.
         what: What it is called.
         form: What it should come from.
+        symmetry: Largest entry of K − Kᵀ over that of K: far above what rounding of assembly
+            leaves, far below any term of a form that matters.
 
     Raises:
         InputError: It says which of them.
@@ -265,7 +262,7 @@ def check_stiffness(
         raise InputError(f"{name}: {what} has entries that are not finite")
     scale = np.abs(K.data).max(initial=0.0)
     skew = np.abs((K - K.T).data).max(initial=0.0)
-    if skew > SYMMETRY * scale:
+    if skew > symmetry * scale:
         raise InputError(
             f"{name}: {what} is not symmetric (|K − Kᵀ| = {skew:.3g}, |K| = {scale:.3g}); "
             f"expected {form}"

@@ -52,9 +52,7 @@ def check_space(V: fem.FunctionSpace, decomposition: Decomposition) -> None:
 
 def is_same_space(V: Any, W: Any) -> bool:
     """Return whether two C++ spaces have the same mesh, element and numbering on this rank."""
-    if V is W:
-        return True
-    return bool(
+    return V is W or bool(
         V.mesh is W.mesh
         and V.element == W.element
         and V.dofmap.bs == W.dofmap.bs
@@ -223,16 +221,12 @@ class TornDofs:
         Returns:
             For each table its rows for ``groups``.
         """
-        owner = owner_of(self.group_offsets, groups)
-        exchange = Exchange(self.comm, owner)
-        asked = exchange.send(groups) - self.group_offsets[self.comm.rank]
+        exchange, asked = self._to_owners_of(groups)
         return tuple(exchange.answer(table[asked]) for table in tables)
 
-    def add_on_owners(self, groups: Array, values: Array) -> Array:
-        """Add what all ranks give for each owned group, as ``reduce_on_owners``. Collective."""
-        return self.reduce_on_owners(groups, values, np.add, 0)
-
-    def reduce_on_owners(self, groups: Array, values: Array, op: np.ufunc, initial: Any) -> Array:
+    def reduce_on_owners(
+        self, groups: Array, values: Array, op: np.ufunc = np.add, initial: Any = 0
+    ) -> Array:
         """Combine the values that all ranks give for each owned group. Collective.
 
         Args:
@@ -244,11 +238,15 @@ class TornDofs:
         Returns:
             Shape ``(g, ...)``.
         """
-        exchange = Exchange(self.comm, owner_of(self.group_offsets, groups))
-        slot = exchange.send(groups) - self.group_offsets[self.comm.rank]
+        exchange, slot = self._to_owners_of(groups)
         out = np.full((self.num_groups, *values.shape[1:]), initial, dtype=values.dtype)
         op.at(out, slot, exchange.send(values))
         return out
+
+    def _to_owners_of(self, groups: Array) -> tuple[Exchange, Array]:
+        """Return the exchange with the owners of groups, and which of theirs are asked for."""
+        exchange = Exchange(self.comm, owner_of(self.group_offsets, groups))
+        return exchange, exchange.send(groups) - self.group_offsets[self.comm.rank]
 
     @cached_property
     def scalar(self) -> tuple[fem.FunctionSpace, Array]:
@@ -270,14 +268,7 @@ class TornDofs:
         return W, self.primal_nodes(node)
 
     def gather_copies(self, values: Array) -> Array:
-        """Return values of the local primal nodes in the order of the owned ``copies``. Collective.
-
-        Args:
-            values: One value (or row) per local primal node, shape ``(n, ...)``.
-
-        Returns:
-            One per copy, shape ``(c, ...)``.
-        """
+        """Give values of nodes, ``(n, ...)``, to the owned ``copies``, ``(c, ...)``. Collective."""
         return self._to_owner.send(values)[self._copy_order]
 
     def lookup_copies(self, groups: Array, *tables: Array) -> tuple[Array, ...]:

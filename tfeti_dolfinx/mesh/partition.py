@@ -401,5 +401,5 @@ def coordinate_bisection(mesh: UntornMesh, num_parts: int, comm: MPI.Intracomm) 
 
     The parts depend on the cells' vertices only, not on how ranks share the cells.
     """
-    part = bisect_points(mesh.midpoints(), num_parts, comm, mesh.extents())
+    part = bisect_points(mesh.midpoints(), num_parts, comm, np.ptp(mesh.corners(), axis=1))
     return without_holes(part, comm)

@@ -139,13 +139,10 @@ class UntornMesh:
 
     def midpoints(self) -> Array:
         """Mean of each cell's vertices, shape ``(n, gdim)``."""
-        return self._corners().mean(axis=1)
+        return self.corners().mean(axis=1)
 
-    def extents(self) -> Array:
-        """Sides of the box around each cell's vertices, shape ``(n, gdim)``."""
-        return np.ptp(self._corners(), axis=1)
-
-    def _corners(self) -> Array:
+    def corners(self) -> Array:
+        """Vertices of each cell, shape ``(n, vertices, gdim)``."""
         vertices = np.searchsorted(self.node_ids, self.cells[:, : self.num_vertices])
         return self.x[vertices]
 

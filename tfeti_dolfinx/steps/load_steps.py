@@ -42,8 +42,6 @@ from tfeti_dolfinx.steps.checkpoint import Checkpoint
 
 # shares of a step are exact in a double, and parts of any real step differ
 MOST_HALVINGS = 30
-# of the shortest step: times that are the same but for rounding, as of a longer ``linspace``
-SAME_TIME = 1e-6
 
 
 @dataclass(frozen=True)
@@ -476,9 +474,10 @@ class LoadSteps:
                 raise
         return place
 
-    def _check_times(self, reached: list[float]) -> None:
+    def _check_times(self, reached: list[float], same: float = 1e-6) -> None:
+        """Raise unless times are those reached, but for rounding, as of a longer ``linspace``."""
         given = self._times[: len(reached)]
-        rounding = SAME_TIME * min(np.diff(reached), default=0.0)
+        rounding = same * min(np.diff(reached), default=0.0)
         for now, before in zip_longest(given, reached):
             if now is None or abs(now - before) > rounding:
                 raise InputError(
