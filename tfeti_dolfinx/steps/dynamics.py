@@ -37,8 +37,6 @@ from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # --- Energies and work of a step --------------------------------------------------------------
 
-NAMES = ("load", "contact", "friction", "supports", "predictor")
-
 
 def balance(forms: InertialForms, dual: Dual, solution: Solution) -> dict[str, float]:
     """Energies at the end of a step, and the work that has changed them. Collective.
@@ -57,37 +55,33 @@ def balance(forms: InertialForms, dual: Dual, solution: Solution) -> dict[str, f
     motion, (K, M) = forms.motion, forms.matrices
     u, v = solution.displacement.x.array, solution.velocity.x.array
     kicked, way = motion.towards - motion.free, u - motion.u
+    # −λᵀB Δu of this rank's normal, tangential and other rows
+    B, sets = dual.constraints.B, dual.constraints.sets
+    moved, rows = B.createVecRight(), dual.constraints.c.duplicate()
+    moved.array[:] = solution.dofs.to_primal(way)[dual.subdomains.trace]
+    B.mult(moved, rows)
+    done = -solution.lam * rows.array_r
+    moved.destroy()
+    rows.destroy()
     own = [
         0.5 * v @ (M @ v),
         0.5 * u @ (K @ u),
         0.5 * motion.v @ (M @ motion.v) + 0.5 * motion.u @ (K @ motion.u),
         forms.mean_load @ way,
-        *_work_of_rows(dual, solution.lam, solution.dofs.to_primal(way)),
+        *(done[kind].sum() for kind in (sets.normals, sets.tangents.ravel(), sets.equalities)),
         -2.0 / motion.size**2 * kicked @ (M @ (u - motion.towards)),
     ]
     values = [float(value) for value in summed(solution.dofs.comm, np.array(own))]
     (kinetic, elastic, before), work = values[:3], values[3:]
+    names = ("load", "contact", "friction", "supports", "predictor")
     return {
         "size": motion.size,
         "kinetic": kinetic,
         "elastic": elastic,
         "energy": kinetic + elastic,
-        **dict(zip(NAMES, work, strict=True)),
+        **dict(zip(names, work, strict=True)),
         "defect": kinetic + elastic - before - sum(work),
     }
-
-
-def _work_of_rows(dual: Dual, lam: Array, way: Array) -> list[float]:
-    """−λᵀB Δu of this rank's normal, tangential and other rows. Collective."""
-    B, sets = dual.constraints.B, dual.constraints.sets
-    moved, rows = B.createVecRight(), dual.constraints.c.duplicate()
-    moved.array[:] = way[dual.subdomains.trace]
-    B.mult(moved, rows)
-    done = -lam * rows.array_r
-    moved.destroy()
-    rows.destroy()
-    kinds = (sets.normals, sets.tangents.ravel(), sets.equalities)
-    return [float(done[kind].sum()) for kind in kinds]
 
 
 def contact_forces(solution: Solution) -> list[list[float]]:
@@ -125,8 +119,7 @@ class Predictor:
         self._M: csr_array | None = None
         self._subdomains: Subdomains | None = None
         self._dual: Dual | None = None
-        self._start: tuple[Gluing, Array] | None = None
-        self._image: Array = np.zeros(0)
+        self._start: tuple[Gluing, Array, Array] | None = None
         self.multiplications = 0
 
     @property
@@ -141,7 +134,7 @@ class Predictor:
 
     def start_from(self, gluing: Gluing, lam: Array, image: Array) -> None:
         """Let the next call start from multipliers of some rows, as ``start`` had them."""
-        self._start, self._image = (gluing, lam), image
+        self._start = gluing, lam, image
 
     def nearest(self, w: Array, M: csr_array, gluing: Gluing) -> Array:
         """Return the nearest displacement to w.
@@ -203,13 +196,15 @@ class Predictor:
         assert dual is not None
         dual.forget_counts()
         if self._start is not None:  # nothing has a kernel in M
-            start = (gluing.multipliers(*self._start), np.zeros(0))
-            if self._start[0] is gluing:
-                dual.last.take(self._dofs.comm, self._start[1], self._image)
-        self._image = np.zeros(0)  # it is of the F and the start of a restored state alone
+            known, lam, image = self._start
+            start = (gluing.multipliers(known, lam), np.zeros(0))
+            if known is gluing:
+                dual.last.take(self._dofs.comm, lam, image)
         qp_type, _ = resolve_types(options, dual.contact_rows, self._settings.prefix)
         result, accuracy = solve_dual(dual, options, qp_type, start)
-        self._start = (gluing, np.array(result.lam.array_r)) if result.reason > 0 else None
+        self._start = None
+        if result.reason > 0:
+            self._start = gluing, np.array(result.lam.array_r), np.zeros(0)
         self.multiplications = dual.F.count["solver"]
         result.destroy()
         conclude(result, accuracy, options, self._dofs.comm)
@@ -341,14 +336,27 @@ class ContactDynamics(ContactProblem):
             InputError: As there, or the step has no size yet.
         """
         super().solve()
-        self._look()
+        report = self.report
+        report.motion = balance(self._forms_in_time, self._system.dual, self.solution)
+        report.contact_forces = contact_forces(self.solution)
+        if self._predictor is not None:
+            count = float(self._predictor.multiplications)
+            report.motion["predictor_multiplications"] = count
         return self.u
 
     def _set_out(self) -> None:
-        motion = self._forms_in_time.motion
-        motion.towards = free = motion.free
-        if self._predictor is not None:
-            motion.towards = self._predicted(self._predictor, free)
+        system, forms = self._system, self._forms_in_time
+        free = forms.motion.free
+        forms.motion.towards = free
+        if self._predictor is None:
+            return
+        system.look_for_changes()
+        system.make(self.report)
+        if system.search.take_in_overlapping(self.dofs.to_primal(free), 0.0):
+            system.change("rows")
+            system.make(self.report)
+        near = self._predictor.nearest(free, forms.matrices[1], system.gluing)
+        forms.motion.towards = near
 
     def accept(self) -> None:
         """Take the last solution as the end of the step: the next one begins there.
@@ -414,22 +422,3 @@ class ContactDynamics(ContactProblem):
         solution = super()._make_solution(u, multipliers, gluing)
         solution.v = self._forms_in_time.motion.velocity(self.dofs.to_dolfinx(u))
         return solution
-
-    def _predicted(self, predictor: Predictor, free: Array) -> Array:
-        """Return the displacement that contact allows the bodies without elasticity."""
-        system, forms = self._system, self._forms_in_time
-        system.look_for_changes()
-        system.make(self.report)
-        if system.search.take_in_overlapping(self.dofs.to_primal(free), 0.0):
-            system.change("rows")
-            system.make(self.report)
-        return predictor.nearest(free, forms.matrices[1], system.gluing)
-
-    def _look(self) -> None:
-        """Put energies, work and forces into the report."""
-        report, forms = self.report, self._forms_in_time
-        report.motion = balance(forms, self._system.dual, self.solution)
-        report.contact_forces = contact_forces(self.solution)
-        if self._predictor is not None:
-            count = float(self._predictor.multiplications)
-            report.motion["predictor_multiplications"] = count
