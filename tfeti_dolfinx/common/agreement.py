@@ -119,11 +119,7 @@ def described(value: Any) -> Any:
     conditions are described without what a rank has of them, all else by its name and the floats
     in it: constants, defaults, what a closure or ``partial`` holds, attributes.
 
-    Args:
-        value: Anything.
-
-    Returns:
-        Numbers, texts and None, lists and dictionaries of them, as JSON takes them.
+    Return numbers, texts and None, lists and dictionaries of them, as JSON takes them.
     """
     if isinstance(value, np.generic):
         value = value.item()
@@ -241,13 +237,7 @@ KINDS: tuple[tuple[Any, Callable[[Any], Any]], ...] = (
 def difference(found: Any, expected: Any, what: str = "") -> tuple[str, Any, Any] | None:
     """Find the first part in which two descriptions differ by more than rounding.
 
-    Args:
-        found: What ``described`` returned.
-        expected: The same of another rank, or of another run.
-        what: Name of the part.
-
-    Returns:
-        The name of that part, what it is, and what it is in ``expected``; None if there is none.
+    Return its name, what it is in ``found``, and what in ``expected``; None if there is none.
     """
     if isinstance(found, dict) and isinstance(expected, dict):
         beside = f"{what}: " if what else ""
@@ -292,13 +282,8 @@ def brief(value: Any) -> str:
 def sums_of(comm: MPI.Intracomm, arrays: list[Array]) -> list[list[Any]]:
     """Return checksums of fields that do not depend on the partition: one reduction. Collective.
 
-    Args:
-        comm: Communicator.
-        arrays: Values that this rank has of each field.
-
-    Returns:
-        Of each field [[Σx, Σ|x|], Σ√|x|] over all ranks: two of a size, and one that knows how the
-        magnitudes are spread, and does not overflow.
+    Of each field [[Σx, Σ|x|], Σ√|x|] over all ranks: two of a size, and one that knows how the
+    magnitudes are spread, and does not overflow.
     """
     sums = np.zeros((len(arrays), 3))
     for row, x in zip(sums, arrays, strict=True):
@@ -308,11 +293,7 @@ def sums_of(comm: MPI.Intracomm, arrays: list[Array]) -> list[list[Any]]:
 
 
 def fields_in(given: Mapping[str, Any]) -> dict[str, Array]:
-    """Find this rank's values of the functions on the mesh in what a user gave, by names.
-
-    Args:
-        given: Forms, conditions, contacts, thickness and mass, by their names.
-    """
+    """Find this rank's values of the functions on the mesh in what a user gave, by names."""
     return {
         f"{name}: function {k}": function.x.array
         for name, value in given.items()
@@ -334,14 +315,11 @@ def _functions(value: Any) -> list[Any]:
 
 
 def check_same_problem(kept: Mapping[str, Any], found: Mapping[str, Any]) -> None:
-    """Raise unless a problem is that of an earlier run. Not collective.
+    """Raise an InputError, which names the first difference, unless two problems are the same.
 
     Args:
-        kept: What ``ContactProblem.digest`` returned there, the same on all ranks.
+        kept: What ``ContactProblem.digest`` returned in an earlier run, the same on all ranks.
         found: What it returns here, at the same place of the series.
-
-    Raises:
-        InputError: It is not; the message names the first difference.
     """
     if (different := difference(dict(found), dict(kept))) is not None:
         what, now, before = different

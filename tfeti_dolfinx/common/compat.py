@@ -43,11 +43,7 @@ def require_real_petsc() -> None:
 
 
 def is_read(option: str) -> bool:
-    """Return whether PETSc has asked for an option of its database.
-
-    Args:
-        option: Its name with its prefix, without the dash.
-    """
+    """Return whether PETSc has asked for an option, its name without the dash."""
     database = PETSc.Options()
     if hasattr(database, "used"):
         return bool(database.used(option))
@@ -146,10 +142,9 @@ def space_of(bc: fem.DirichletBC) -> Any:
 
 
 def prescribed_values(bcs: Sequence[fem.DirichletBC], size: int) -> Array:
-    """Return values that the boundary conditions prescribe, NaN elsewhere; one row per condition.
+    """Return values that conditions prescribe, NaN elsewhere, shape ``(len(bcs), size)``.
 
-    Returns:
-        Array of shape ``(len(bcs), size)``, ``size`` the number of local unrolled dofs.
+    ``size`` is the number of local unrolled dofs.
     """
     values = np.full((len(bcs), size), np.nan)
     for row, bc in zip(values, bcs, strict=True):

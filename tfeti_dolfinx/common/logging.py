@@ -36,11 +36,7 @@ def stage(name: str, seconds: MutableMapping[str, float]) -> Iterator[None]:
 
 
 def cite(*methods: str) -> None:
-    """Let ``-citations`` print the papers of these methods, each once.
-
-    Args:
-        methods: Names in ``PAPERS``; those of methods without a paper are passed over.
-    """
+    """Let ``-citations`` print the papers of methods in ``PAPERS``, each once; pass over others."""
     for method in methods:
         for key in PAPERS.get(method, ()):
             PETSc.Sys.registerCitation(entry(key))

@@ -33,8 +33,7 @@ def displacement_space(
 ) -> fem.FunctionSpace:
     """Return the space of a bilinear form's trial and test functions. Collective.
 
-    Raises:
-        InputError: The form is not bilinear on one space for displacements on the torn mesh.
+    Raise an InputError unless it is bilinear on one space for displacements on the torn mesh.
     """
     test, trial = _argument_spaces(a, name, 2)
     check_space(test, decomposition)
@@ -43,16 +42,15 @@ def displacement_space(
 
 
 def check_form(form: Any, name: str, V: fem.FunctionSpace, decomposition: Decomposition) -> None:
-    """Raise if a form cannot be integrated on the torn mesh. Collective.
+    """Raise an InputError if space, coefficients, geometry, measures or tags of a form do not fit.
+
+    Collective.
 
     Args:
         form: The form; a linear one may be zero.
         name: ``"a"`` or ``"L"``, of nonlinear problems ``"J"`` or ``"F"``.
         V: The space of displacements.
         decomposition: The torn mesh.
-
-    Raises:
-        InputError: The form's space, coefficients, geometry, measures or tags do not fit.
     """
     if name in LINEAR:
         if is_zero(form):
@@ -67,9 +65,9 @@ def check_form(form: Any, name: str, V: fem.FunctionSpace, decomposition: Decomp
 def check_not_negative(
     value: Any, what: str, mesh: dmesh.Mesh, degree: int = 2, rounding: float = 1e-12
 ) -> None:
-    """Raise if a scalar in UFL is negative or no number somewhere in a cell. Collective.
+    """Raise an InputError if a scalar in UFL is negative or no number somewhere in a cell.
 
-    It is asked at the corners of each cell and at points inside.
+    Collective. It is asked at the corners of each cell and at points inside.
 
     Args:
         value: The scalar, with its present constants and functions.
@@ -77,9 +75,6 @@ def check_not_negative(
         mesh: Its mesh.
         degree: Of the quadrature whose points inside are taken.
         rounding: Share of the largest value that may be missing to 0.
-
-    Raises:
-        InputError: It is, or it cannot be asked.
     """
     cell_type = getattr(basix.CellType, mesh.topology.cell_type.name)
     inside, _ = basix.make_quadrature(cell_type, degree)

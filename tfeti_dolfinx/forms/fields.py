@@ -32,11 +32,7 @@ def von_mises(sigma: Any) -> Any:
 
 
 def checked_stress(stress: Stress, u: fem.Function) -> Any:
-    """Return the stress of u as a UFL expression.
-
-    Raises:
-        InputError: It cannot be called, fails, or does not return a 3×3 tensor.
-    """
+    """Return the stress of u as a UFL expression; raise an InputError unless it is a 3×3 tensor."""
     expected = "a callable from a displacement to its stress in UFL"
     if isinstance(stress, ufl.core.expr.Expr):  # which can be called, but for something else
         raise InputError(f"stress is an expression; expected {expected}")
@@ -55,8 +51,7 @@ def checked_stress(stress: Stress, u: fem.Function) -> Any:
 def checked_thickness(thickness: Any, decomposition: Decomposition) -> Any:
     """Check and return the thickness, a number or a scalar in UFL. Collective.
 
-    Raises:
-        InputError: It is neither, not positive, negative somewhere, or on another mesh.
+    Raise an InputError where it is neither, negative somewhere, or on another mesh.
     """
     if not isinstance(thickness, ufl.core.expr.Expr):
         return checked_number(thickness, "thickness", POSITIVE)

@@ -72,9 +72,6 @@ class InertialForms(Forms):
 
     Attributes:
         motion: Where the step begins.
-
-    Raises:
-        InputError: As ``Forms``.
     """
 
     def __init__(self, mass: ufl.Form, *as_forms: Any) -> None:
@@ -96,14 +93,11 @@ class InertialForms(Forms):
         self._ends = self.motion.load
 
     def take_step(self, size: float, same: float = 1e-9) -> None:
-        """Let the next step have a size, which makes the matrix anew if it is another one.
+        """Let the next step have a size; another one than the last makes the matrix anew.
 
         Args:
-            size: The size.
+            size: The size; an InputError is raised unless it is positive and on all ranks the same.
             same: Share of it by which equal steps differ, since their times are rounded.
-
-        Raises:
-            InputError: It is not a positive number, or another one on another rank.
         """
         with agreeing(self._comm, "take_step") as given:
             given["step"] = size = checked_number(size, "step", STEP)
@@ -178,16 +172,13 @@ class InertialForms(Forms):
 
 
 def check_mass(M: csr_array, bs: int, rounding: float = 1e-10) -> None:
-    """Raise if a matrix is not that of a mass in every direction.
+    """Raise an InputError unless a matrix is that of a mass in every direction.
 
     Args:
         M: This rank's matrix.
         bs: Unknowns per node.
         rounding: Share of the sum of the diagonal up to which the mass of a translation is 0, as
             where M has a kernel.
-
-    Raises:
-        InputError: It is not symmetric, not positive, or a translation has no mass.
     """
     check_stiffness("mass", M, "the matrix", "a density, or a form such as ∫ρ u·v")
     for k in range(bs):
@@ -202,16 +193,13 @@ def check_mass(M: csr_array, bs: int, rounding: float = 1e-10) -> None:
 
 
 def check_copies(values: Array, dofs: TornDofs, name: str, left: float = 1e-3) -> None:
-    """Raise where torn copies of a node differ by more than what a solver leaves. Collective.
+    """Raise an InputError where torn copies of a node differ, or a value is not finite. Collective.
 
     Args:
         values: A displacement or a velocity in DOLFINx's order.
         dofs: Dof maps.
         name: What it is.
-        left: Share of the largest value by which they may differ.
-
-    Raises:
-        InputError: They do, or a value is not finite.
+        left: Share of the largest value by which a solver may have left them apart.
     """
     primal = dofs.to_primal(np.asarray(values)).reshape(-1, dofs.bs)
     with raised_on_all_ranks(dofs.comm):
@@ -238,17 +226,15 @@ def mass_form(
     thickness: Any,
     lumped: bool,
 ) -> ufl.Form:
-    """∫ρ u·v, times the thickness. Collective.
+    """Return ∫ρ u·v, times the thickness. Collective.
 
     Args:
         density: Mass per volume: a number, a scalar in UFL, or numbers for all volumes by names.
         V: Space of displacements.
         decomposition: The torn mesh.
         thickness: What the other forms were multiplied with.
-        lumped: Whether to integrate at the vertices, which makes M diagonal; of degree 1 only.
-
-    Raises:
-        InputError: The density does not fit, or elements are not of degree 1.
+        lumped: Whether to integrate at the vertices, which makes M diagonal; an InputError is
+            raised for elements of another degree than 1.
     """
     rho = in_ufl(density, decomposition, "mass", POSITIVE)
     degree = V.element.basix_element.degree

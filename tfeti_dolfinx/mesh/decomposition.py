@@ -22,7 +22,7 @@ from tfeti_dolfinx.mesh.untorn import PhysicalNames
 
 
 def check_tags(tags: Any, mesh: dmesh.Mesh, of_cells: bool, what: str, expected: str) -> None:
-    """Raise unless tags are those of a mesh's cells, or of its facets.
+    """Raise an InputError unless tags are those of a mesh's cells, or of its facets.
 
     Args:
         tags: What was given.
@@ -30,9 +30,6 @@ def check_tags(tags: Any, mesh: dmesh.Mesh, of_cells: bool, what: str, expected:
         of_cells: Whether cells are tagged, else facets.
         what: The tags' name in messages.
         expected: What to give instead, for messages.
-
-    Raises:
-        InputError: They are no tags, of another mesh, or of entities of another dimension.
     """
     checked_type(tags, dmesh.MeshTags, what, "dolfinx.mesh.MeshTags")
     if tags.topology is not mesh.topology._cpp_object:
@@ -45,11 +42,7 @@ def check_tags(tags: Any, mesh: dmesh.Mesh, of_cells: bool, what: str, expected:
 
 
 def checked_names(names: Any, what: str, tags: Any, tags_name: str) -> dict[str, int]:
-    """Return names of tags as a dictionary.
-
-    Raises:
-        InputError: They are no dictionary from texts to integers, or there are no tags to name.
-    """
+    """Return names of tags as a dictionary; raise an InputError unless they are such names."""
     if names is None:
         return {}
     checked_type(names, dict, what, "a dictionary of names and tags, such as {'top': 1}")

@@ -22,12 +22,7 @@ from tfeti_dolfinx.mesh.untorn import cell_entities, exchange_by_key, mix, set_k
 
 
 def check_space(V: fem.FunctionSpace, decomposition: Decomposition) -> None:
-    """Raise unless V is a space for displacements on the torn mesh.
-
-    Raises:
-        InputError: It is on another mesh, not continuous, not Lagrange, or neither scalar nor
-            of one component for each dimension.
-    """
+    """Raise an InputError unless V is a Lagrange space for displacements on the torn mesh."""
     checked_type(V, fem.FunctionSpace, "the space", "a dolfinx.fem.FunctionSpace")
     if V.mesh is not decomposition.mesh:
         raise InputError(

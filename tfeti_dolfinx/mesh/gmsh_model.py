@@ -64,14 +64,9 @@ class ModelContent:
 
 @contextmanager
 def open_model(source: str | PathLike[str] | Any, may_be_empty: bool = False) -> Iterator[Any]:
-    """The gmsh model of a file, closed afterwards; or the model itself.
+    """Give the gmsh model of a file, closed afterwards; or the model itself.
 
-    Args:
-        source: A file, or a model.
-        may_be_empty: Whether a file without nodes is a mesh.
-
-    Raises:
-        InputError: The file is missing or not a mesh.
+    Raise an InputError where the file is missing or not a mesh, as without nodes unless it may be.
     """
     import gmsh
 
@@ -114,13 +109,8 @@ def open_model(source: str | PathLike[str] | Any, may_be_empty: bool = False) ->
 def read_content(model: Any, where: str) -> ModelContent:
     """Read the elements in physical groups, names and nodes of a gmsh model.
 
-    Args:
-        model: The gmsh model.
-        where: What messages call it.
-
-    Raises:
-        InputError: An element lies in several physical groups, or the elements of a dimension
-            are of several types.
+    Raise an InputError where an element lies in several physical groups, or the elements of a
+    dimension are of several types. Messages call the model ``where``.
     """
     with named("gmsh.model (is gmsh initialised, with a model in it?)"):
         top = max((dim for dim, _ in model.getPhysicalGroups()), default=0)
@@ -216,19 +206,11 @@ def _elements(model: Any, dim: int) -> Elements | None:
 def physical_names(
     contents: Sequence[ModelContent], top: int, comm: MPI.Intracomm
 ) -> PhysicalNames:
-    """Names of the physical groups of cells and facets in all models of all ranks. Collective.
+    """Return the names of the groups of cells and facets in all models of all ranks. Collective.
 
     A model may know only some of them. One that a model knows only by its number has the name
-    that another gives it.
-
-    Args:
-        contents: What this rank has read.
-        top: Dimension of the cells.
-        comm: Communicator.
-
-    Raises:
-        InputError: A name of surfaces or of volumes has different tags in the models, or a tag
-            different names.
+    that another gives it. Raise an InputError where a name of surfaces or of volumes has different
+    tags in the models, or a tag different names.
     """
     own = [
         {(t, n) for c in contents for n, t in c.names.get(d, {}).items()} for d in (top - 1, top)

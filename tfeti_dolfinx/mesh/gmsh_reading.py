@@ -55,10 +55,8 @@ ONE_MODEL = "expected files that gmsh has written from one model with Mesh.Parti
 def find_split_files(source: str | PathLike[str] | Any, comm: MPI.Intracomm) -> list[Path]:
     """Return the files ``name_1.msh``, ``name_2.msh``, ... of a mesh; none of a model or one file.
 
-    Collective. Only rank 0 looks, at the source that it was given.
-
-    Raises:
-        InputError: A file is missing in the numbering.
+    Collective. Only rank 0 looks, at the source that it was given. Raise an InputError where a file
+    is missing in the numbering.
     """
     files: list[Path] = []
     with raised_on_all_ranks(comm):
@@ -86,8 +84,7 @@ def _part(path: Path, number: int) -> Path:
 def read_split_files(files: Sequence[Path], comm: MPI.Intracomm) -> list[ModelContent]:
     """Read this rank's files, a cell's partition being its file's number. Collective.
 
-    Raises:
-        InputError: A file cannot be read, or partitions are missing.
+    Raise an InputError where a file cannot be read, or partitions are missing.
     """
     contents = []
     with raised_on_all_ranks(comm):
@@ -118,9 +115,10 @@ def check_shared(
     comm: MPI.Intracomm,
     same_place: float = 1e-9,
 ) -> None:
-    """Check that the files are of one mesh. Collective.
+    """Raise an InputError unless the files are of one mesh. Collective.
 
-    Nodes of one id, and cells of the same nodes, meet on the rank that the id or key names.
+    Nodes of one id, and cells of the same nodes, meet on the rank that the id or key names: a node
+    may not lie at different places, nor a cell in two files.
 
     Args:
         mesh: The mesh joined.
@@ -130,9 +128,6 @@ def check_shared(
         comm: Communicator.
         same_place: Distance over that length up to which a node's places are the same: files in
             text keep fewer digits than gmsh has.
-
-    Raises:
-        InputError: A node lies at different places, or a cell lies in two files.
     """
     exchange = exchange_by_key(comm, node_ids)
     node_ids, x = exchange.send(node_ids), exchange.send(x)
@@ -182,9 +177,9 @@ def untorn_mesh(
         shared: Whether models of different ranks may have nodes and facets in common.
 
     Raises:
-        InputError: There are no physical groups of cells, the cells are of several types or
-            of one that is not supported, plane cells do not lie in a plane, names contradict
-            each other, or the models do not fit together.
+        InputError: There are no physical groups of cells, the cells are of several types or of
+            one that is not supported, plane cells do not lie in a plane, names contradict each
+            other, or the models do not fit together.
     """
     top = comm.allreduce(max((content.top for content in contents), default=0), op=MPI.MAX)
     with_cells = [content for content in contents if top in content.elements]

@@ -50,16 +50,9 @@ class CellExchange:
 
 
 def check_function(f: Any, mesh: dmesh.Mesh, name: str, expected: str) -> None:
-    """Raise unless the unknowns of f in a cell of the mesh are those of a cell like it.
+    """Raise an InputError unless f is a function on a mesh whose unknowns are values.
 
-    Args:
-        f: What was given.
-        mesh: The mesh that it must be on.
-        name: Its name in messages.
-        expected: The mesh in messages.
-
-    Raises:
-        InputError: It is no function, on another mesh, or has unknowns that are not values.
+    Those of a cell are then those of a cell like it. ``name`` and ``expected`` are for messages.
     """
     checked_type(f, fem.Function, name, f"a dolfinx.fem.Function on {expected}")
     if f.function_space.mesh._cpp_object is not mesh._cpp_object:
@@ -76,13 +69,8 @@ def carried(
 ) -> fem.Function:
     """Return a function on the other mesh, in a space of the same element. Collective.
 
-    Args:
-        given: The function; a component of another is collapsed.
-        mesh: The other mesh.
-        exchange: Method of ``CellExchange`` from the function's cells to those of the mesh.
-
-    Returns:
-        The function with the same unknowns in the cells, or with their means.
+    The exchange takes rows of its cells to those of the other mesh, where the result has the same
+    unknowns in the cells, or their means.
     """
     g = given.collapse() if given.function_space.component() else given
     V, source = g.function_space, g.copy().x

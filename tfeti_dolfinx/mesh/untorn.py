@@ -51,15 +51,7 @@ def facet_vertices(cell_type: dmesh.CellType) -> Array:
 
 
 def facet_keys(cells: Array, cell_type: dmesh.CellType) -> Array:
-    """Return keys of all facets of the cells.
-
-    Args:
-        cells: Node ids, vertices first, shape ``(n, nodes_per_cell)``.
-        cell_type: Type of the cells.
-
-    Returns:
-        Keys, shape ``(n, num_facets)``.
-    """
+    """Return keys of all facets of cells, from their node ids, vertices first, ``(n, facets)``."""
     mixed = mix(cells[:, : len(cell_entities(cell_type, 0))])
     return mixed[:, facet_vertices(cell_type)].sum(axis=-1, dtype=np.uint64)
 

@@ -115,8 +115,7 @@ class Checkpoint:
     def held(self) -> Iterator[None]:
         """Keep other runs out of the folder inside the block, while this process lives.
 
-        Raises:
-            InputError: Another run has it, or it is no folder for a checkpoint.
+        Raise an InputError where another run has it, or it is no folder for a checkpoint.
         """
         lock = None
         with raised_on_all_ranks(self._comm), named(f"checkpoint {self.path}", OSError):
@@ -143,10 +142,8 @@ class Checkpoint:
     def read(self) -> Kept | None:
         """Return what was written last, on all ranks; None if there is nothing. It is held.
 
-        What a run that was killed has left beside it is removed.
-
-        Raises:
-            InputError: It is damaged, or was written on another number of ranks.
+        What a run that was killed has left beside it is removed. Raise an InputError where it is
+        damaged, or was written on another number of ranks.
         """
         kept: Kept | None = None
         with raised_on_all_ranks(self._comm), named(f"cannot read {self.path}", OSError):
@@ -216,8 +213,7 @@ class Checkpoint:
     def read_state(self, kept: Kept) -> SavedState:
         """Return the state of this rank at the step that ``read`` found.
 
-        Raises:
-            InputError: It is not what was written.
+        Raise an InputError where it is not what was written.
         """
         index = kept.index
         return SavedState(**self._load("state", index.number, index.states, INDEX))
@@ -225,8 +221,7 @@ class Checkpoint:
     def read_fields(self, kept: Kept, number: int) -> dict[str, Array]:
         """Return the fields of a step, of those that ``read`` found, on this rank.
 
-        Raises:
-            InputError: They are not what was written, or there are none.
+        Raise an InputError where they are not what was written, or there are none.
         """
         checksums = kept.fields[number - 1]
         if not checksums:
@@ -272,11 +267,7 @@ class Checkpoint:
         self._index = index
 
     def _checked_folder(self) -> Index:
-        """Return the index of the folder, or one of nothing.
-
-        Raises:
-            InputError: The folder is none, or has anything that the checkpoint has not written.
-        """
+        """Return the index of the folder, or one of nothing; raise where there is anything else."""
         what = f"checkpoint {self.path}"
         if self.path.exists() and not self.path.is_dir():
             raise InputError(f"{what} is a file; expected the name of a folder")

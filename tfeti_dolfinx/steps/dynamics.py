@@ -39,18 +39,12 @@ from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 
 def balance(forms: InertialForms, dual: Dual, solution: Solution) -> dict[str, float]:
-    """Energies at the end of a step, and the work that has changed them. Collective.
+    """Return energies at the end of a step, and the work that has changed them. Collective.
 
-    Args:
-        forms: Where the step began.
-        dual: Its dual problem.
-        solution: Its end.
-
-    Returns:
-        ``size`` of the step; at its end ``kinetic``, ``elastic`` and ``energy``; work of the
-        ``load``, of normal forces of ``contact``, of ``friction``, of ``supports`` (Dirichlet
-        conditions, and what jumps at tears to the tolerance), what the ``predictor`` has added,
-        at most 0; and ``defect``, what all these leave of the change of the energy: rounding.
+    They are ``size`` of the step; at its end ``kinetic``, ``elastic`` and ``energy``; work of the
+    ``load``, of normal forces of ``contact``, of ``friction``, of ``supports`` (Dirichlet
+    conditions, and what jumps at tears to the tolerance), what the ``predictor`` has added,
+    at most 0; and ``defect``, what all these leave of the change of the energy: rounding.
     """
     motion, (K, M) = forms.motion, forms.matrices
     u, v = solution.displacement.x.array, solution.velocity.x.array
@@ -137,15 +131,12 @@ class Predictor:
         self._start = gluing, lam, image
 
     def nearest(self, w: Array, M: csr_array, gluing: Gluing) -> Array:
-        """Return the nearest displacement to w.
+        """Return the nearest displacement to w, in DOLFINx's order.
 
         Args:
             w: Displacement in DOLFINx's order.
             M: This rank's mass in DOLFINx's order; factors are kept while it is the same object.
             gluing: Rows and their right sides, which are as before afterwards.
-
-        Returns:
-            A displacement in DOLFINx's order.
 
         Raises:
             ConvergenceError: The solver stopped before its tolerance.

@@ -76,11 +76,7 @@ class Place:
 
 
 def checked_times(begin: float, times: Sequence[float]) -> list[float]:
-    """Return the begin and all times, increasing.
-
-    Raises:
-        InputError: They are no such numbers.
-    """
+    """Return the begin and all times; raise an InputError unless these are increasing numbers."""
     if isinstance(times, (str, bytes)) or not np.iterable(times):
         raise InputError(f"times is {shown(times)}; expected a list of increasing numbers")
     first = checked_number(begin, "begin")
@@ -104,11 +100,9 @@ Show = Callable[[float, str], None]
 
 @contextmanager
 def shown_progress(comm: MPI.Intracomm, wanted: bool | None) -> Iterator[Show]:
-    """Return a function that shows the progress of a series. Not collective.
+    """Return a function that shows the progress of a series, on rank 0 only. Not collective.
 
-    Args:
-        comm: Communicator; only rank 0 shows anything.
-        wanted: None: where rank 0's standard error is a terminal, and rich is there.
+    Where nothing is wanted or refused: if standard error is a terminal, and rich is there.
     """
     if comm.rank != 0 or wanted is False or (wanted is None and not sys.stderr.isatty()):
         yield lambda share, text: None
@@ -139,16 +133,14 @@ POINTS = "points of the mesh"
 class Series:
     """Nodal fields of steps, and cell fields beside them. Creation and all methods are collective.
 
-    Files are written under names with ``.partial`` at the end; ``close`` gives them theirs.
+    Files are written under names with ``.partial`` at the end; ``close`` gives them theirs. An
+    InputError is raised where a name does not fit, or nothing can be written there.
 
     Args:
         path: A name that ends with ``.bp``; cell fields go to ``<stem>_cells.bp``.
         solution: A solution of the problem: its mesh and which fields there are.
         interior: Whether the fields of ``solution.interior`` are written, too: those of cells at
             each step, other cell fields are always the same.
-
-    Raises:
-        InputError: The name does not fit, or nothing can be written there.
     """
 
     def __init__(
@@ -180,10 +172,9 @@ class Series:
     def write(self, time: float, values: dict[str, Array]) -> None:
         """Add a step from what ``fields_of`` returned for it, in this run or an earlier one.
 
-        Raises:
-            InputError: A field is not there, as where an earlier run wrote fewer; or the files
-                cannot be written: then they end, whole, with the step before, under the names
-                that they have until ``close``.
+        Raise an InputError where a field is not there, as of an earlier run that wrote fewer, or
+        the files cannot be written: then they end, whole, with the step before, under the names
+        that they have until ``close``.
         """
         points = self._mesh.geometry.x.copy()
         for function in self._functions:
