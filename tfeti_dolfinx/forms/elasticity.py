@@ -222,7 +222,7 @@ def in_ufl(value: Any, on: Decomposition | dmesh.Mesh, what: str, expected: Rang
             values = value.value.ravel()
         elif isinstance(value, fem.Function) and value.ufl_element().degree < 2:
             values = np.sort(value.x.array)  # a nan comes last
-        for number in (*values[:1].tolist(), *values[-1:].tolist()):
+        for number in np.append(values[:1], values[-1:]).tolist():
             checked_number(number, what, expected)
     return value
 

@@ -116,7 +116,8 @@ def read_content(model: Any, where: str) -> ModelContent:
         top = max((dim for dim, _ in model.getPhysicalGroups()), default=0)
     found = {dim: _elements(model, dim) for dim in range(max(top - 1, 1), top + 1)}
     elements = {dim: of_dim for dim, of_dim in found.items() if of_dim is not None}
-    used, x = np.empty(0, dtype=np.int64), np.empty((0, 3))
+    used: Array = np.empty(0, dtype=np.int64)
+    x: Array = np.empty((0, 3))
     if top in elements:
         used = np.unique(elements[top].nodes)
         ids, coordinates, _ = model.mesh.getNodes()

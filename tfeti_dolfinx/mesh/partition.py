@@ -314,8 +314,8 @@ def absorb_fragments(mesh: UntornMesh, subdomain: Array, comm: MPI.Intracomm) ->
 def default_count(mesh: UntornMesh, comm: MPI.Intracomm) -> int:
     """Return the number of subdomains of about 4000 displacement unknowns each. Collective."""
     per_cell = {"triangle": 0.5, "tetrahedron": 0.2}.get(mesh.cell_type.name, 1.0)
-    unknowns = comm.allreduce(len(mesh.cells)) * per_cell * mesh.gdim * mesh.degree**mesh.gdim
-    return max(1, round(unknowns / PARTITION.unknowns))
+    per_cell *= mesh.gdim * mesh.element.degree**mesh.gdim
+    return max(1, round(comm.allreduce(len(mesh.cells)) * per_cell / PARTITION.unknowns))
 
 
 def assign_subdomains(

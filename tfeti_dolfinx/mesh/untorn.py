@@ -120,11 +120,6 @@ class UntornMesh:
         return self.x.shape[1]
 
     @property
-    def degree(self) -> int:
-        """Polynomial degree of the geometry."""
-        return int(self.element.degree)
-
-    @property
     def num_vertices(self) -> int:
         """Vertices of a cell."""
         return len(cell_entities(self.cell_type, 0))

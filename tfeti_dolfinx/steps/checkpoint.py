@@ -345,7 +345,7 @@ def _sealed(content: Mapping[str, Any]) -> bytes:
 
 def _unsealed(line: bytes, file: Path, where: str) -> dict[str, Any]:
     """Return the content of a line that ``_sealed`` has made; raise if the file is damaged."""
-    with suppress(ValueError, RecursionError, AttributeError, KeyError):
+    with suppress(ValueError, RecursionError, AttributeError, KeyError, TypeError):
         found: dict[str, Any] = json.loads(line)
         checksum = found.pop("checksum")
         if checksum == _hash(json.dumps(found).encode()).hexdigest():
