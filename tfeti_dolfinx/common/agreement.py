@@ -22,7 +22,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from ufl.algorithms import extract_coefficients
 from ufl.algorithms.analysis import extract_constants
-from ufl.classes import Conj, Expr, FloatValue, Label, MultiIndex
+from ufl.classes import Conj, Expr, FixedIndex, FloatValue, Label, MultiIndex
 from ufl.corealg.traversal import unique_post_traversal
 
 from tfeti_dolfinx.common.arrays import Array
@@ -191,20 +191,26 @@ def _of_ufl(given: ufl.Form | Expr) -> dict[str, Any]:
 
 
 def _structure(expression: Any, numbers: Mapping[Any, int]) -> str:
-    """Return a hash of the operators and terminals in an expression, floats to ten digits.
+    """Return a hash of an expression, whatever the order of operands, floats to ten digits.
 
     UFL's own signature depends on the order of operands that commute, and UFL sorts constants by
     texts with counters in them, which on another rank may have one digit more.
     """
-    parts = []
+    known: dict[Any, str] = {}
     for part in unique_post_traversal(expression):
-        if isinstance(part, FloatValue):
-            parts.append(f"{float(part):.9e}")
-        elif part._ufl_is_terminal_ and not isinstance(part, (Label, MultiIndex)):
-            parts.append(str(part._ufl_signature_data_(numbers)))
-        elif not isinstance(part, Conj):  # UFL puts one where it turns an inner product round
-            parts.append(type(part).__name__)
-    return _hash(parts)
+        operands = [known[operand] for operand in part.ufl_operands]
+        if isinstance(part, Conj):  # UFL puts one where it turns an inner product round
+            known[part] = operands[0]
+            continue
+        text = type(part).__name__
+        if isinstance(part, MultiIndex):
+            text = str([int(i) if isinstance(i, FixedIndex) else "free" for i in part])
+        elif isinstance(part, FloatValue):
+            text = f"{float(part):.9e}"
+        elif part._ufl_is_terminal_ and not isinstance(part, Label):
+            text = str(part._ufl_signature_data_(numbers))
+        known[part] = _hash([text, *operands])
+    return known[expression]
 
 
 def _hash(parts: list[str]) -> str:
