@@ -6,7 +6,6 @@ import ctypes
 from collections.abc import Sequence
 from typing import Any
 
-import basix.ufl
 import dolfinx
 import numpy as np
 from dolfinx import fem, graph, la
@@ -56,17 +55,6 @@ def is_read(option: str) -> bool:
 def cell_permutation(cell_type: dmesh.CellType, num_nodes: int) -> Array:
     """Permutation ``p`` from gmsh's node order: ``dolfinx_cell[i] = gmsh_cell[p[i]]``."""
     return np.asarray(_gmshio.cell_perm_array(cell_type, num_nodes))
-
-
-def coordinate_element(cell_type: dmesh.CellType, degree: int, gdim: int) -> Any:
-    """Lagrange coordinate element with equispaced points, as gmsh numbers them."""
-    return basix.ufl.element(
-        "Lagrange",
-        cell_type.name,
-        degree,
-        basix.LagrangeVariant.equispaced,
-        shape=(gdim,),
-    )
 
 
 def create_mesh_in_place(comm: MPI.Intracomm, cells: Array, x: Array, element: Any) -> dmesh.Mesh:

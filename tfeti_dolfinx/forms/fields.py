@@ -123,13 +123,9 @@ def from_vertices(dofs: TornDofs, values: Array, vertices: Array) -> fem.Functio
         values: One value per owned group, shape ``(g,)``.
         vertices: Which groups are vertices with a value, shape ``(g,)``.
     """
-    S, dof = dofs.scalar
-    function = fem.Function(S)
-    if S.element.basix_element.degree == 1:
-        function.x.array[dof] = dofs.spread(np.where(vertices, values, 0.0))
-        return function
-    W, node = dofs.hats
-    linear, share, inside = fem.Function(W), fem.Function(W), fem.Function(S)
+    (S, _), (W, node) = dofs.scalar, dofs.hats
+    function, inside = fem.Function(S), fem.Function(S)
+    linear, share = fem.Function(W), fem.Function(W)
     linear.x.array[:] = dofs.spread(np.where(vertices, values, 0.0))[node]
     share.x.array[:] = dofs.spread(vertices.astype(float))[node]
     function.interpolate(linear)

@@ -9,12 +9,13 @@ from os import PathLike
 from pathlib import Path
 from typing import Any
 
+import basix.ufl
 import numpy as np
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.compat import cell_permutation, coordinate_element
+from tfeti_dolfinx.common.compat import cell_permutation
 from tfeti_dolfinx.common.logging import stage
 from tfeti_dolfinx.common.parallel import box_over_ranks
 from tfeti_dolfinx.common.validation import checked_type
@@ -187,7 +188,8 @@ def untorn_mesh(
     shape, degree = CELLS[kind]
     cell_type = dmesh.to_type(shape)
     gdim = cell_dim(cell_type)
-    element = coordinate_element(cell_type, degree, gdim)
+    variant = basix.LagrangeVariant.equispaced  # as gmsh numbers the nodes
+    element = basix.ufl.element("Lagrange", shape, degree, variant, shape=(gdim,))
     none = np.empty(0, dtype=np.int64)
     nodes = none.reshape(0, element.dim // gdim)
     empty = Elements(kind, kind_name, nodes, none, none.astype(np.int32), none)
