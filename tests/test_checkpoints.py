@@ -177,7 +177,7 @@ def test_what_a_killed_run_has_left_goes(scene):
 
 def test_a_checkpoint_of_an_earlier_version_is_named(scene):
     def write():
-        text = {"version": 2, "ranks": scene.comm.size, "number": 2, "records_length": 7}
+        text = {"version": 3, "ranks": scene.comm.size, "number": 2, "records_length": 7}
         (scene.copy / "checkpoint.json").write_text(json.dumps(text))
 
     scene.begin()

@@ -5,6 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import ufl
+from dolfinx import fem
 
 from tfeti_dolfinx.bem.block import Parts
 from tfeti_dolfinx.bem.inside import BoundarySolution
@@ -12,6 +14,7 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.logging import cite
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.forms.assembly import Forms
+from tfeti_dolfinx.forms.checks import is_zero
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.subdomains.build import FiniteElements, MakeBlock
@@ -108,10 +111,14 @@ class BoundaryElementAssembly(FiniteElements):
 
     def load(self, forms: Forms) -> Array:
         """Return this rank's load in DOLFINx's numbering."""
-        volume, of_volume, hats = forms.volume_load(), None, None
-        if volume is not None:
-            of_volume = self._dofs.to_primal(volume)
-            hats = forms.hats()[self._dofs.dolfinx_node]
+        V, of_volume, hats = self._dofs.V, None, None
+        L = forms.given[forms.names[1]]
+        parts = [] if is_zero(L) else [i for i in L.integrals() if i.integral_type() == "cell"]
+        if parts:
+            of_volume = self._dofs.to_primal(forms.assembled(ufl.Form(parts), "L"))
+            one = fem.Constant(V.mesh, (1.0,) + (0.0,) * (self._dofs.bs - 1))
+            volume = ufl.dot(one, ufl.TestFunction(V)) * ufl.dx(domain=V.mesh)
+            hats = forms.assembled(volume, "the volume")[:: self._dofs.bs][self._dofs.dolfinx_node]
         replaced = self._parts.load(self._dofs.to_primal(forms.load()), of_volume, hats)
         return self._dofs.to_dolfinx(replaced)
 

@@ -22,7 +22,7 @@ from dolfinx import fem
 from mpi4py import MPI
 from ufl.algorithms import extract_coefficients
 from ufl.algorithms.analysis import extract_constants
-from ufl.classes import Conj, FixedIndex, FloatValue, Inner, Label, MultiIndex, Product, Sum
+from ufl.classes import Conj, Expr, FixedIndex, FloatValue, Label, MultiIndex
 from ufl.corealg.traversal import unique_post_traversal
 
 from tfeti_dolfinx.common.arrays import Array
@@ -31,26 +31,14 @@ from tfeti_dolfinx.common.parallel import summed
 from tfeti_dolfinx.common.validation import shown
 from tfeti_dolfinx.errors import InputError, raise_together
 
-# of the largest number beside it: what differs by less was computed on processors of other kinds
-ROUNDING = 1e-10
-# bytes of the digest in the message, after one that says whether the rank has an error
-DIGEST = 16
-
 # where objects are made that say what a user wants, and have nothing of a rank
 DESCRIPTIONS = ("tfeti_dolfinx.contact.", "tfeti_dolfinx.bem.boundary_elements")
-
 # in a name that was made from an object: that of another rank lies elsewhere
 ADDRESS = re.compile(r" at 0x[0-9a-f]+")
-
 # in an error of ranks that may be in different calls: outer calls must not talk about it again
 TOLD = "_told_to_all_ranks"
-
-
-class Absent:
-    """Placeholder of an entry that one of two descriptions does not have."""
-
-    def __repr__(self) -> str:
-        return "not given"
+# a part that one of two descriptions does not have
+NOT_GIVEN = "not given"
 
 
 @contextmanager
@@ -85,11 +73,9 @@ def agreeing(comm: MPI.Intracomm, call: str) -> Iterator[dict[str, Any]]:
         if TOLD in vars(caught):
             raise
         error = caught
-    message = np.zeros(1 + DIGEST, dtype=np.uint8)
-    message[0] = error is not None
-    digest = blake2b(repr((call, told)).encode(), digest_size=DIGEST).digest()
-    message[1:] = np.frombuffer(digest, dtype=np.uint8)
-    all_messages = np.empty((comm.size, 1 + DIGEST), dtype=np.uint8)
+    digest = blake2b(repr((call, told)).encode(), digest_size=16).digest()
+    message = np.frombuffer(bytes([error is not None]) + digest, dtype=np.uint8)
+    all_messages = np.empty((comm.size, message.size), dtype=np.uint8)
     comm.Allgather(message, all_messages)
     if np.any(all_messages[:, 0]):
         _raise_everywhere(comm, error, int(np.argmax(all_messages[:, 0])))
@@ -133,11 +119,7 @@ def described(value: Any) -> Any:
     conditions are described without what a rank has of them, all else by its name and the floats
     in it: constants, defaults, what a closure or ``partial`` holds, attributes.
 
-    Args:
-        value: Anything.
-
-    Returns:
-        Numbers, texts and None, lists and dictionaries of them, as JSON takes them.
+    Return numbers, texts and None, lists and dictionaries of them, as JSON takes them.
     """
     if isinstance(value, np.generic):
         value = value.item()
@@ -151,19 +133,16 @@ def described(value: Any) -> Any:
         if isinstance(value, kind):
             return describe(value)
     if type(value).__module__.startswith(DESCRIPTIONS):
-        return {"type": type(value).__qualname__, **_attributes(value)}
+        names = [f.name for f in fields(value)] if is_dataclass(value) else list(vars(value))
+        public = {n: described(getattr(value, n)) for n in names if not n.startswith("_")}
+        return {"type": type(value).__qualname__, **public}
     return _of_program(value)
 
 
-def _attributes(value: Any) -> dict[str, Any]:
-    names = [f.name for f in fields(value)] if is_dataclass(value) else list(vars(value))
-    return {name: described(getattr(value, name)) for name in names if not name.startswith("_")}
-
-
 def _of_program(value: Any) -> dict[str, Any]:
-    """Describe a callable or an object of a user's program: its name and the numbers it holds.
+    """Describe a callable or an object of a user's program: its name and the floats it holds.
 
-    Not whole ones, which may count something, and no arrays: they may be those of a rank.
+    Not whole numbers, which may count something, and no arrays: they may be those of a rank.
     """
     given: dict[str, Any] = {}
     while isinstance(value, partial):
@@ -173,94 +152,69 @@ def _of_program(value: Any) -> dict[str, Any]:
         value = value.func
     held: dict[str, Any] = {}
     if isinstance(function := getattr(value, "__func__", value), FunctionType):
-        code = function.__code__
-        held |= {f"number {k}": item for k, item in enumerate(code.co_consts)}
-        held |= {name: function.__globals__.get(name) for name in code.co_names}
-        held |= {p.name: p.default for p in inspect.signature(function).parameters.values()}
-        for name, cell in zip(code.co_freevars, function.__closure__ or (), strict=True):
-            with suppress(ValueError):  # it is set later
-                held[name] = cell.cell_contents
-    held |= getattr(getattr(value, "__self__", value), "__dict__", {})
-    numbers = {
-        name: float(item)
-        for name, item in {**held, **given}.items()
-        if isinstance(item, (float, np.floating))
-    }
+        numbers = (*function.__code__.co_consts, *(function.__defaults__ or ()))
+        held |= {f"number {k}": item for k, item in enumerate(numbers)}
+        with suppress(ValueError):  # a variable is set later
+            known = inspect.getclosurevars(function)
+            held |= {**known.globals, **known.nonlocals}
+        held |= function.__kwdefaults__ or {}
+    held |= getattr(getattr(value, "__self__", value), "__dict__", {}) | given
+    floats = {name: float(x) for name, x in held.items() if isinstance(x, (float, np.floating))}
     name = getattr(value, "__qualname__", type(value).__qualname__)
-    return {"type": f"the callable {name}" if callable(value) else name, **numbers}
+    return {"type": f"the callable {name}" if callable(value) else name, **floats}
 
 
-def _of_form(form: ufl.Form) -> dict[str, Any]:
-    constants, functions = form.constants(), form.coefficients()
-    integrals = [
-        _hash(
-            integral.integral_type(),
-            str(integral.subdomain_id()),
-            str(sorted(integral.metadata().items())),
-            _structure(integral.integrand(), constants, functions),
-        )
-        for integral in form.integrals()
-    ]
+def _of_ufl(given: ufl.Form | Expr) -> dict[str, Any]:
+    """Describe a form or an expression by a hash of its structure and the values of constants."""
+    constants, functions = extract_constants(given), extract_coefficients(given)
+    numbers: defaultdict[Any, int] = defaultdict(int)  # all meshes are 0
+    for items in (constants, functions):
+        numbers.update({item: k for k, item in enumerate(items)})
+    is_form = isinstance(given, ufl.Form)
+    if is_form:
+        parts = [
+            f"{i.integral_type()} {i.subdomain_id()} {sorted(i.metadata().items())} "
+            f"{type(i.subdomain_data()).__qualname__} {_structure(i.integrand(), numbers)}"
+            for i in given.integrals()
+        ]
+    else:
+        parts = [_structure(given, numbers)]
     return {
-        "type": "Form",
-        "structure": _hash(*sorted(integrals)),
-        **_values(constants, functions),
-        "subdomain_data": [type(i.subdomain_data()).__qualname__ for i in form.integrals()],
+        "type": "Form" if is_form else "expression",
+        "structure": _hash(parts),
+        **{
+            f"constants[{k}]": described(getattr(c, "value", type(c).__qualname__))
+            for k, c in enumerate(constants)
+        },
+        "functions": [str(f.ufl_element()) for f in functions],
     }
 
 
-def _of_expression(expression: ufl.core.expr.Expr) -> dict[str, Any]:
-    constants, functions = extract_constants(expression), extract_coefficients(expression)
-    structure = _structure(expression, constants, functions)
-    return {"type": "expression", "structure": structure, **_values(constants, functions)}
-
-
-def _structure(expression: Any, constants: Any, functions: Any) -> str:
-    """Return a hash of an expression, with its numbers to ten digits.
+def _structure(expression: Any, numbers: Mapping[Any, int]) -> str:
+    """Return a hash of an expression, whatever the order of operands, floats to ten digits.
 
     UFL's own signature depends on the order of operands that commute, and UFL sorts constants by
     texts with counters in them, which on another rank may have one digit more.
     """
-    numbers: defaultdict[Any, int] = defaultdict(int)  # all meshes are 0
-    for items in (constants, functions):
-        numbers.update({item: k for k, item in enumerate(items)})
     known: dict[Any, str] = {}
     for part in unique_post_traversal(expression):
         operands = [known[operand] for operand in part.ufl_operands]
         if isinstance(part, Conj):  # UFL puts one where it turns an inner product round
             known[part] = operands[0]
             continue
-        if isinstance(part, (Sum, Product, Inner)):
-            operands.sort()
+        text = type(part).__name__
         if isinstance(part, MultiIndex):
-            operands = [str(int(i)) if isinstance(i, FixedIndex) else "free" for i in part]
+            text = str([int(i) if isinstance(i, FixedIndex) else "free" for i in part])
         elif isinstance(part, FloatValue):
-            operands = [f"{float(part):.9e}"]
+            text = f"{float(part):.9e}"
         elif part._ufl_is_terminal_ and not isinstance(part, Label):
-            operands = [str(part._ufl_signature_data_(numbers))]
-        known[part] = _hash(type(part).__name__, *operands)
+            text = str(part._ufl_signature_data_(numbers))
+        known[part] = _hash([text, *operands])
     return known[expression]
 
 
-def _hash(*texts: str) -> str:
-    return blake2b("\n".join(texts).encode(), digest_size=8).hexdigest()
-
-
-def _values(constants: Any, functions: Any) -> dict[str, Any]:
-    """Return values of constants, and the kinds of functions; UFL's own have none."""
-    return {
-        **{
-            f"constants[{k}]": described(c) if isinstance(c, fem.Constant) else type(c).__qualname__
-            for k, c in enumerate(constants)
-        },
-        "functions": [
-            described(f) if isinstance(f, fem.Function) else type(f).__qualname__ for f in functions
-        ],
-    }
-
-
-def _of_function(function: fem.Function) -> dict[str, Any]:
-    return {"type": f"Function of {function.function_space.ufl_element()}"}
+def _hash(parts: list[str]) -> str:
+    return blake2b("\n".join(sorted(parts)).encode(), digest_size=8).hexdigest()
 
 
 def _of_condition(condition: fem.DirichletBC) -> dict[str, Any]:
@@ -280,9 +234,8 @@ KINDS: tuple[tuple[Any, Callable[[Any], Any]], ...] = (
     (Mapping, lambda value: {str(key): described(item) for key, item in value.items()}),
     ((list, tuple), lambda value: [described(item) for item in value]),
     (fem.Constant, lambda value: np.asarray(value.value).tolist()),
-    (fem.Function, _of_function),
-    (ufl.Form, _of_form),
-    (ufl.core.expr.Expr, _of_expression),
+    (fem.Function, lambda value: {"type": f"Function of {value.ufl_element()}"}),
+    ((ufl.Form, Expr), _of_ufl),
     (fem.DirichletBC, _of_condition),
 )
 
@@ -290,68 +243,53 @@ KINDS: tuple[tuple[Any, Callable[[Any], Any]], ...] = (
 def difference(found: Any, expected: Any, what: str = "") -> tuple[str, Any, Any] | None:
     """Find the first part in which two descriptions differ by more than rounding.
 
-    Args:
-        found: What ``described`` returned.
-        expected: The same of another rank, or of another run.
-        what: Name of the part.
-
-    Returns:
-        The name of that part, what it is, and what it is in ``expected``; None if there is none.
+    Return its name, what it is in ``found``, and what in ``expected``; None if there is none.
     """
     if isinstance(found, dict) and isinstance(expected, dict):
         beside = f"{what}: " if what else ""
-        names = [*expected, *(name for name in found if name not in expected)]
-        parts = [(f"{beside}{n}", found.get(n, Absent()), expected.get(n, Absent())) for n in names]
+        names = dict.fromkeys([*expected, *found])
+        parts = [
+            (f"{beside}{n}", found.get(n, NOT_GIVEN), expected.get(n, NOT_GIVEN)) for n in names
+        ]
     elif isinstance(found, list) and isinstance(expected, list):
         if _is_rounding(found, expected):
             return None
         if len(found) != len(expected):
             return f"the number of {what}", len(found), len(expected)
-        parts = [
-            (f"{what}[{k}]", *both) for k, both in enumerate(zip(found, expected, strict=True))
-        ]
+        both = enumerate(zip(found, expected, strict=True))
+        parts = [(f"{what}[{k}]", one, other) for k, (one, other) in both]
     else:
         return None if _is_rounding([found], [expected]) else (what, found, expected)
-    for name, one, other in parts:
-        if (deeper := difference(one, other, name)) is not None:
-            return deeper
-    return None
+    found_in_parts = (difference(one, other, name) for name, one, other in parts)
+    return next((deeper for deeper in found_in_parts if deeper is not None), None)
 
 
-def _is_rounding(found: list[Any], expected: list[Any]) -> bool:
-    """Return whether two lists are equal up to rounding beside their largest number."""
+def _is_rounding(found: list[Any], expected: list[Any], rounding: float = 1e-10) -> bool:
+    """Return whether two lists are equal up to rounding beside their largest number.
+
+    What differs by less was computed on processors of other kinds.
+    """
     if repr(found) == repr(expected):
         return True
     numbers = [*found, *expected]
-    if len(found) != len(expected) or not all(_is_number(value) for value in numbers):
+    if len(found) != len(expected) or any(type(x) not in (int, float) for x in numbers):
         return False
-    size = max(abs(value) for value in numbers)
-    return math.isfinite(size) and all(
-        abs(one - other) <= ROUNDING * size for one, other in zip(found, expected, strict=True)
-    )
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, float) or (isinstance(value, int) and not isinstance(value, bool))
+    size = max(abs(x) for x in numbers)
+    return math.isfinite(size) and np.allclose(found, expected, rtol=0.0, atol=rounding * size)
 
 
 def brief(value: Any) -> str:
     """Return a description for a message."""
     if isinstance(value, dict) and "type" in value:
         return f"a {value['type']}" if not value["type"].startswith("the ") else value["type"]
-    return repr(value) if isinstance(value, Absent) else shown(value)
+    return NOT_GIVEN if value is NOT_GIVEN else shown(value)
 
 
 def sums_of(comm: MPI.Intracomm, arrays: list[Array]) -> list[list[Any]]:
     """Return checksums of fields that do not depend on the partition: one reduction. Collective.
 
-    Args:
-        comm: Communicator.
-        arrays: Values that this rank has of each field.
-
-    Returns:
-        Of each field [[Σx, Σ|x|], Σ√|x|] over all ranks: two of a size, and one that knows how the
-        magnitudes are spread, and does not overflow.
+    Of each field [[Σx, Σ|x|], Σ√|x|] over all ranks: two of a size, and one that knows how the
+    magnitudes are spread, and does not overflow.
     """
     sums = np.zeros((len(arrays), 3))
     for row, x in zip(sums, arrays, strict=True):
@@ -361,45 +299,33 @@ def sums_of(comm: MPI.Intracomm, arrays: list[Array]) -> list[list[Any]]:
 
 
 def fields_in(given: Mapping[str, Any]) -> dict[str, Array]:
-    """Find this rank's values of the functions on the mesh in what a user gave, by names.
-
-    Args:
-        given: Forms, conditions, contacts, thickness and mass, by their names.
-    """
-    found: dict[str, Array] = {}
-    for name, value in given.items():
-        for k, function in enumerate(_functions(value)):
-            found[f"{name}: function {k}"] = function.x.array
-    return found
+    """Find this rank's values of the functions on the mesh in what a user gave, by names."""
+    return {
+        f"{name}: function {k}": function.x.array
+        for name, value in given.items()
+        for k, function in enumerate(_functions(value))
+    }
 
 
 def _functions(value: Any) -> list[Any]:
-    if isinstance(value, fem.Function):
-        return [value]
-    if isinstance(value, ufl.Form):
-        return list(value.coefficients())
-    if isinstance(value, ufl.core.expr.Expr):
+    if isinstance(value, (ufl.Form, Expr)):
         return list(extract_coefficients(value))
     if isinstance(value, fem.DirichletBC):
         return [value.g] if hasattr(value.g, "x") else []
+    if type(value).__module__.startswith(DESCRIPTIONS):
+        value = vars(value)
     if isinstance(value, Mapping):
         value = list(value.values())
-    elif type(value).__module__.startswith(DESCRIPTIONS):
-        value = list(vars(value).values())
-    return (
-        [f for item in value for f in _functions(item)] if isinstance(value, (list, tuple)) else []
-    )
+    items = value if isinstance(value, (list, tuple)) else []
+    return [function for item in items for function in _functions(item)]
 
 
 def check_same_problem(kept: Mapping[str, Any], found: Mapping[str, Any]) -> None:
-    """Raise unless a problem is that of an earlier run. Not collective.
+    """Raise an InputError, which names the first difference, unless two problems are the same.
 
     Args:
-        kept: What ``ContactProblem.digest`` returned there, the same on all ranks.
+        kept: What ``ContactProblem.digest`` returned in an earlier run, the same on all ranks.
         found: What it returns here, at the same place of the series.
-
-    Raises:
-        InputError: It is not; the message names the first difference.
     """
     if (different := difference(dict(found), dict(kept))) is not None:
         what, now, before = different

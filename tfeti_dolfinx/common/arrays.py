@@ -18,18 +18,6 @@ ArrayLike = npt.ArrayLike
 # stands for 0 in a denominator: smaller than any quantity, and its inverse is still finite
 TINY = 1e-300
 
-__all__ = [
-    "TINY",
-    "Array",
-    "ArrayLike",
-    "joined",
-    "node_blocks",
-    "node_means",
-    "parts_of",
-    "sum_rows",
-    "sums",
-]
-
 
 def sum_rows(row: Array, values: Array, size: int) -> Array:
     """Return sums of the values with the same row.
@@ -40,8 +28,7 @@ def sum_rows(row: Array, values: Array, size: int) -> Array:
         size: Number of rows.
 
     Returns:
-        Shape ``(size, ...)``, of real numbers also where nothing is added up; there
-        ``numpy.bincount`` returns integers, which must not travel between ranks as real numbers.
+        Real numbers, shape ``(size, ...)``; of nothing ``numpy.bincount`` returns integers.
     """
     shape = values.shape[1:]
     flat = values.reshape(len(values), math.prod(shape))
@@ -63,14 +50,9 @@ def joined(parts: Sequence[Array]) -> Array:
 
 
 def node_blocks(K: Any, bs: int) -> Array:
-    """Return the block of each node in a scipy matrix, unknowns of a node one after the other.
+    """Return the ``bs × bs`` block of each node in a symmetric scipy matrix, shape ``(n, bs, bs)``.
 
-    Args:
-        K: Symmetric, shape ``(n, n)``.
-        bs: Unknowns of each node.
-
-    Returns:
-        Shape ``(n / bs, bs, bs)``.
+    Unknowns of a node follow each other.
     """
     n = K.shape[0]
     blocks = np.zeros((n // bs, bs, bs))

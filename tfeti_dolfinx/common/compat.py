@@ -6,7 +6,6 @@ import ctypes
 from collections.abc import Sequence
 from typing import Any
 
-import basix.ufl
 import dolfinx
 import numpy as np
 from dolfinx import fem, graph, la
@@ -43,11 +42,7 @@ def require_real_petsc() -> None:
 
 
 def is_read(option: str) -> bool:
-    """Return whether PETSc has asked for an option of its database.
-
-    Args:
-        option: Its name with its prefix, without the dash.
-    """
+    """Return whether PETSc has asked for an option, its name without the dash."""
     database = PETSc.Options()
     if hasattr(database, "used"):
         return bool(database.used(option))
@@ -60,17 +55,6 @@ def is_read(option: str) -> bool:
 def cell_permutation(cell_type: dmesh.CellType, num_nodes: int) -> Array:
     """Permutation ``p`` from gmsh's node order: ``dolfinx_cell[i] = gmsh_cell[p[i]]``."""
     return np.asarray(_gmshio.cell_perm_array(cell_type, num_nodes))
-
-
-def coordinate_element(cell_type: dmesh.CellType, degree: int, gdim: int) -> Any:
-    """Lagrange coordinate element with equispaced points, as gmsh numbers them."""
-    return basix.ufl.element(
-        "Lagrange",
-        cell_type.name,
-        degree,
-        basix.LagrangeVariant.equispaced,
-        shape=(gdim,),
-    )
 
 
 def create_mesh_in_place(comm: MPI.Intracomm, cells: Array, x: Array, element: Any) -> dmesh.Mesh:
@@ -146,10 +130,9 @@ def space_of(bc: fem.DirichletBC) -> Any:
 
 
 def prescribed_values(bcs: Sequence[fem.DirichletBC], size: int) -> Array:
-    """Return values that the boundary conditions prescribe, NaN elsewhere; one row per condition.
+    """Return values that conditions prescribe, NaN elsewhere, shape ``(len(bcs), size)``.
 
-    Returns:
-        Array of shape ``(len(bcs), size)``, ``size`` the number of local unrolled dofs.
+    ``size`` is the number of local unrolled dofs.
     """
     values = np.full((len(bcs), size), np.nan)
     for row, bc in zip(values, bcs, strict=True):

@@ -6,7 +6,7 @@ import math
 import reprlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import Field, dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 from numbers import Integral, Real
 from os import PathLike
 from pathlib import Path
@@ -53,13 +53,7 @@ def is_whole(value: Any) -> TypeGuard[int]:
 def checked_number(value: Any, what: str, expected: Range = FINITE) -> float:
     """Return a finite number in a range; numpy's scalars are numbers, booleans and texts are none.
 
-    Args:
-        value: What was given.
-        what: Its name in messages.
-        expected: The range.
-
-    Raises:
-        InputError: It is not a number, not finite, or out of the range.
+    Raise an InputError ``<what>=<value>: expected <range>`` where it is not.
     """
     if isinstance(value, np.ndarray) and value.ndim == 0:
         value = value.item()
@@ -72,9 +66,7 @@ def checked_number(value: Any, what: str, expected: Range = FINITE) -> float:
 def real_numbers(values: Any) -> Array:
     """Convert what a user's function has returned to floats; drop no imaginary part.
 
-    Raises:
-        TypeError: They are no real numbers.
-        ValueError: They are texts.
+    Raise a TypeError where they are no real numbers, a ValueError where they are texts.
     """
     array = np.asarray(values)
     if np.iscomplexobj(array):
@@ -83,42 +75,26 @@ def real_numbers(values: Any) -> Array:
 
 
 def checked_flag(value: Any, what: str) -> bool:
-    """Return a boolean, or numpy's.
-
-    Raises:
-        InputError: It is anything else.
-    """
+    """Return a boolean, or numpy's, as a boolean; raise an InputError for anything else."""
     if not isinstance(value, (bool, np.bool_)):
         raise InputError(f"{what}={shown(value)}: expected True or False")
     return bool(value)
 
 
 def checked_type(value: Any, kinds: type | tuple[type, ...], what: str, expected: str) -> None:
-    """Raise unless a value is of some type.
-
-    Raises:
-        InputError: ``<what> is <value>; expected <expected>``.
-    """
+    """Raise ``InputError: <what> is <value>; expected <expected>`` unless a value is of a type."""
     if not isinstance(value, kinds):
         raise InputError(f"{what} is {shown(value)}; expected {expected}")
 
 
 def checked_callable(value: Any, what: str, expected: str) -> None:
-    """Raise unless a value can be called.
-
-    Raises:
-        InputError: It cannot.
-    """
+    """Raise an InputError unless a value can be called."""
     if not callable(value):
         raise InputError(f"{what} is {shown(value)}; expected {expected}")
 
 
 def checked_path(path: Any, suffix: str) -> Path:
-    """Return a file's name with this ending.
-
-    Raises:
-        InputError: It is no name, or ends otherwise.
-    """
+    """Return a file's name with this ending; raise an InputError where it is no such name."""
     expected = f"a name that ends with {suffix}"
     checked_type(path, (str, PathLike), "path", expected)
     target = Path(path)
@@ -131,11 +107,7 @@ def checked_path(path: Any, suffix: str) -> Path:
 def named(what: str, *kinds: type[Exception]) -> Iterator[None]:
     """Name what failed: errors of the given kinds (default all) become an InputError.
 
-    Not collective; errors of this package stay as they are.
-
-    Args:
-        what: Begins the message.
-        kinds: Types of errors.
+    Not collective; errors of this package stay as they are. The message begins with ``what``.
     """
     try:
         yield
@@ -180,13 +152,9 @@ class Description:
 
 
 def described(default: Any, algorithm: str, text: str, **more: Any) -> Any:
-    """Return a field of a dataclass of parameters.
+    """Return a field of a dataclass of parameters: its default, whose it is, what it does.
 
-    Args:
-        default: Its default, which says its type too.
-        algorithm: Whose it is.
-        text: What it does.
-        **more: What else ``Description`` has.
+    ``more`` is what else a ``Description`` has.
     """
     return field(default=default, metadata={"is": Description(algorithm, text, **more)})
 
@@ -220,7 +188,7 @@ def parameters_of(kind: type, path: tuple[str, ...] = ()) -> Iterator[Parameter]
         if is_dataclass(f.default):
             yield from parameters_of(type(f.default), (*path, f.name))
         elif "is" in f.metadata:
-            about = _description(f)
+            about: Description = f.metadata["is"]
             yield Parameter(about.name or f.name, f.default, about, (*path, f.name))
 
 
@@ -230,42 +198,36 @@ def made(kind: type, values: dict[str, Any]) -> Any:
     for f in fields(kind):
         if is_dataclass(f.default):
             given[f.name] = made(type(f.default), values)
-        elif "is" in f.metadata and (name := _description(f).name or f.name) in values:
+        elif "is" in f.metadata and (name := f.metadata["is"].name or f.name) in values:
             given[f.name] = values[name]
     return kind(**given)
 
 
-def _description(f: Field[Any]) -> Description:
-    description: Description = f.metadata["is"]
-    return description
-
-
 # --- Checks of a subdomain's stiffness and load -----------------------------------------------
-
-# Largest entry of K − Kᵀ over that of K: far above what rounding of assembly leaves, far below any
-# term of a form that matters.
-SYMMETRY = 1e-8
 
 
 def check_stiffness(
-    name: str, K: Any, what: str = "the stiffness", form: str = "a linear elastic form"
+    name: str,
+    K: Any,
+    what: str = "the stiffness",
+    form: str = "a linear elastic form",
+    symmetry: float = 1e-8,
 ) -> None:
-    """Raise if a stiffness is not finite, not symmetric or has a diagonal entry of 0 or less.
+    """Raise an InputError unless a stiffness is finite, symmetric and of a positive diagonal.
 
     Args:
         name: Whose it is.
         K: The matrix.
         what: What it is called.
         form: What it should come from.
-
-    Raises:
-        InputError: It says which of them.
+        symmetry: Largest entry of K − Kᵀ over that of K: far above what rounding of assembly
+            leaves, far below any term of a form that matters.
     """
     if not np.all(np.isfinite(K.data)):
         raise InputError(f"{name}: {what} has entries that are not finite")
     scale = np.abs(K.data).max(initial=0.0)
     skew = np.abs((K - K.T).data).max(initial=0.0)
-    if skew > SYMMETRY * scale:
+    if skew > symmetry * scale:
         raise InputError(
             f"{name}: {what} is not symmetric (|K − Kᵀ| = {skew:.3g}, |K| = {scale:.3g}); "
             f"expected {form}"
@@ -279,10 +241,6 @@ def check_stiffness(
 
 
 def check_load(name: str, f: Array) -> None:
-    """Raise if a load is not finite.
-
-    Raises:
-        InputError: It says how many entries are not.
-    """
+    """Raise an InputError, which counts the wrong entries, unless a load is finite."""
     if not np.all(np.isfinite(f)):
         raise InputError(f"{name}: the load has {np.sum(~np.isfinite(f))} entries not finite")

@@ -128,14 +128,16 @@ def ratios(
     whole = dofs.reduce(stiffness.reshape(-1, dofs.bs**2), np.add, 0.0)
     blocks = whole.reshape(-1, dofs.bs, dofs.bs)
     named = records.entry_group[records.within_reach[records.condition]]
-    meets = dofs.add_on_owners(named, np.ones(len(named))) > 0.0
+    meets = dofs.reduce_on_owners(named, np.ones(len(named))) > 0.0
     if dofs.comm.allreduce(int(np.sum(meets))) == 0:
         meets[:] = True
     sums = []
     for side in sides:
         vertices = side.vertices.ravel()
-        area = dofs.add_on_owners(vertices, side.areas.ravel())
-        facets = dofs.add_on_owners(vertices, np.full(len(vertices), 1.0 / side.vertices.shape[1]))
+        area = dofs.reduce_on_owners(vertices, side.areas.ravel())
+        facets = dofs.reduce_on_owners(
+            vertices, np.full(len(vertices), 1.0 / side.vertices.shape[1])
+        )
         at = meets & (area > 0.0)
         n = side.normals[at]
         along = np.einsum("gi,gij,gj", n, blocks[at], n)
@@ -184,8 +186,8 @@ def conditions(dofs: TornDofs, contact: int, side: Side, shares: Shares) -> Cont
         side: The surface whose vertices get conditions, along its normals.
         shares: What facets on any rank contribute.
     """
-    area = dofs.add_on_owners(shares.vertices.ravel(), shares.covered.ravel())
-    whole = dofs.add_on_owners(side.vertices.ravel(), side.areas.ravel())
+    area = dofs.reduce_on_owners(shares.vertices.ravel(), shares.covered.ravel())
+    whole = dofs.reduce_on_owners(side.vertices.ravel(), side.areas.ravel())
     chosen = np.flatnonzero(area > SEARCH.hardly_covered * whole)
     vertices, areas = shares.vertices, area[chosen]
     gap, _ = _mean_gaps(dofs, vertices, shares.gap, areas, chosen)
@@ -229,7 +231,7 @@ def _mean_gaps(
     below the smallest gap.
     """
     groups = vertices.ravel()
-    total = dofs.add_on_owners(groups, gap.total.ravel())[chosen]
+    total = dofs.reduce_on_owners(groups, gap.total.ravel())[chosen]
     low = dofs.reduce_on_owners(groups, gap.lowest.ravel(), np.minimum, np.inf)[chosen]
     high = dofs.reduce_on_owners(groups, gap.highest.ravel(), np.maximum, -np.inf)[chosen]
     return _without_rounding(dofs, np.clip(total / area, low, high)), high - low

@@ -74,7 +74,7 @@ def nodal_forces(records: ContactRecords, force: Array, dofs: TornDofs) -> Array
         Σ_i w_ij F_i for each owned group, shape ``(g, gdim)``.
     """
     shares = records.weight[:, None] * force[records.condition]
-    return dofs.add_on_owners(records.entry_group, shares)
+    return dofs.reduce_on_owners(records.entry_group, shares)
 
 
 def condition_areas(

@@ -33,24 +33,19 @@ class Data:
 
     def has_changed(self) -> bool:
         """Return whether data differ from the last call's, or this is the first. Collective."""
-        before, self._seen = self._seen, self._digest()
-        return any_rank(self._comm, before != self._seen)
-
-    def _digest(self) -> bytes:
         digest = blake2b()
         for array in self._arrays():
             digest.update(np.ascontiguousarray(array))
-        return digest.digest()
+        before, self._seen = self._seen, digest.digest()
+        return any_rank(self._comm, before != self._seen)
 
 
 def data_of(form: ufl.Form | ufl.ZeroBaseForm, V: fem.FunctionSpace) -> Data:
     """Return the constants and coefficients of a form whose arguments are on V."""
-    zero = is_zero(form)
-    constants = [] if zero else list(form.constants())
-    coefficients = [] if zero else list(form.coefficients())
-    return Data(
-        lambda: [*(c.value for c in constants), *(f.x.array for f in coefficients)], V.mesh.comm
-    )
+    if is_zero(form):
+        return Data(lambda: [], V.mesh.comm)
+    values, functions = form.constants(), form.coefficients()
+    return Data(lambda: [*(c.value for c in values), *(f.x.array for f in functions)], V.mesh.comm)
 
 
 class Forms:
@@ -88,9 +83,12 @@ class Forms:
         self._V, self._decomposition = V, decomposition
         self.given: dict[str, Any] = {}
         self.thickness: Any = 1.0
+        given = {"form_compiler_options": form_compiler_options, "jit_options": jit_options}
+        for name, options in given.items():
+            checked_type(options, (Mapping, type(None)), name, "a dictionary")
         self._keywords = {
-            "form_compiler_options": _options(form_compiler_options, "form_compiler_options"),
-            "jit_options": {**JIT_OPTIONS, **_options(jit_options, "jit_options")},
+            "form_compiler_options": dict(form_compiler_options or {}),
+            "jit_options": {**JIT_OPTIONS, **(jit_options or {})},
         }
         self._points = Data(lambda: [V.mesh.geometry.x], decomposition.comm)
         self.replace_stiffness(a)
@@ -110,7 +108,6 @@ class Forms:
         self._L = None if is_zero(L) else self._compiled(L, name)
         self._of_L = data_of(L, self._V)
         self.given = {**self.given, name: L}
-        self._volume_of_L: ufl.Form | fem.Form | None = cell_integrals(L)
 
     def has_new_points(self) -> bool:
         """Return whether the mesh has moved since the last call."""
@@ -134,38 +131,12 @@ class Forms:
             return np.zeros(self._V.dofmap.index_map.size_local * self._V.dofmap.index_map_bs)
         return np.array(fem.assemble_vector(self._L).array)
 
-    def volume_load(self) -> Array | None:
-        """Return the part of the load from integrals over cells; None if there are none."""
-        if self._volume_of_L is None:
-            return None
-        if isinstance(self._volume_of_L, ufl.Form):  # few problems ask for it
-            self._volume_of_L = self._compiled(self._volume_of_L, "L")
-        return np.array(fem.assemble_vector(self._volume_of_L).array)
-
-    def hats(self) -> Array:
-        """Return integrals of the hats over the cells, for each of DOLFINx's nodes."""
-        one = fem.Constant(self._V.mesh, (1.0,) + (0.0,) * (self._V.dofmap.bs - 1))
-        dx = ufl.Measure("dx", domain=self._V.mesh)
-        form = self._compiled(ufl.dot(one, ufl.TestFunction(self._V)) * dx, "the volume")
-        return np.array(fem.assemble_vector(form).array[:: self._V.dofmap.bs])
+    def assembled(self, form: ufl.Form, name: str) -> Array:
+        """Return the vector of a linear form, which is compiled for this call."""
+        return np.array(fem.assemble_vector(self._compiled(form, name)).array)
 
     def _compiled(self, form: ufl.Form, name: str) -> fem.Form:
         """Return the form compiled by DOLFINx, which fails on all ranks or on none."""
         comm = self._decomposition.comm
         with raised_on_all_ranks(comm), named(f"{name} cannot be compiled"):
             return fem.form(form, **self._keywords)
-
-
-def cell_integrals(form: Any) -> ufl.Form | None:
-    """Return the part of a form over cells; None if it has none."""
-    if is_zero(form):
-        return None
-    parts = [part for part in form.integrals() if part.integral_type() == "cell"]
-    return ufl.Form(parts) if parts else None
-
-
-def _options(given: Mapping[str, Any] | None, what: str) -> dict[str, Any]:
-    if given is None:
-        return {}
-    checked_type(given, Mapping, what, "a dictionary")
-    return dict(given)

@@ -25,8 +25,6 @@ from tfeti_dolfinx.mesh.untorn import cell_facets
 
 # linear forms, a load and a residual, and the bilinear ones beside them
 LINEAR = {"L": "a", "F": "J"}
-ARITY = {1: "linear", 2: "bilinear"}
-FUNCTIONS = ("test", "trial")
 KINDS = {"cell": "dx", "exterior_facet": "ds", "interior_facet": "dS"}
 
 
@@ -35,8 +33,7 @@ def displacement_space(
 ) -> fem.FunctionSpace:
     """Return the space of a bilinear form's trial and test functions. Collective.
 
-    Raises:
-        InputError: The form is not bilinear on one space for displacements on the torn mesh.
+    Raise an InputError unless it is bilinear on one space for displacements on the torn mesh.
     """
     test, trial = _argument_spaces(a, name, 2)
     check_space(test, decomposition)
@@ -45,16 +42,15 @@ def displacement_space(
 
 
 def check_form(form: Any, name: str, V: fem.FunctionSpace, decomposition: Decomposition) -> None:
-    """Raise if a form cannot be integrated on the torn mesh. Collective.
+    """Raise an InputError if space, coefficients, geometry, measures or tags of a form do not fit.
+
+    Collective.
 
     Args:
         form: The form; a linear one may be zero.
         name: ``"a"`` or ``"L"``, of nonlinear problems ``"J"`` or ``"F"``.
         V: The space of displacements.
         decomposition: The torn mesh.
-
-    Raises:
-        InputError: The form's space, coefficients, geometry, measures or tags do not fit.
     """
     if name in LINEAR:
         if is_zero(form):
@@ -69,9 +65,9 @@ def check_form(form: Any, name: str, V: fem.FunctionSpace, decomposition: Decomp
 def check_not_negative(
     value: Any, what: str, mesh: dmesh.Mesh, degree: int = 2, rounding: float = 1e-12
 ) -> None:
-    """Raise if a scalar in UFL is negative or no number somewhere in a cell. Collective.
+    """Raise an InputError if a scalar in UFL is negative or no number somewhere in a cell.
 
-    It is asked at the corners of each cell and at points inside.
+    Collective. It is asked at the corners of each cell and at points inside.
 
     Args:
         value: The scalar, with its present constants and functions.
@@ -79,9 +75,6 @@ def check_not_negative(
         mesh: Its mesh.
         degree: Of the quadrature whose points inside are taken.
         rounding: Share of the largest value that may be missing to 0.
-
-    Raises:
-        InputError: It is, or it cannot be asked.
     """
     cell_type = getattr(basix.CellType, mesh.topology.cell_type.name)
     inside, _ = basix.make_quadrature(cell_type, degree)
@@ -132,34 +125,25 @@ def check_mesh(expression: Any, name: str, decomposition: Decomposition) -> None
     for term in unique_pre_traversal(expression):
         if not term._ufl_is_terminal_:
             continue
-        _check_kind(term, name)
+        for kind, expected in ((ufl.Coefficient, fem.Function), (ufl.Constant, fem.Constant)):
+            if isinstance(term, kind) and not isinstance(term, expected):
+                raise InputError(
+                    f"{name}: {term} is a ufl.{kind.__name__}, which has no values; expected a "
+                    f"dolfinx.fem.{expected.__name__}"
+                )
         if not isinstance(term, ufl.Constant) and any(d != domain for d in extract_domains(term)):
-            is_function = isinstance(term, fem.Function)
-            how = ", where decomposition.from_original takes functions" if is_function else ""
+            what, how = f"{type(term).__name__} {term}", ""
+            if isinstance(term, fem.Function):
+                what = f"function {term.name!r}"
+                how = ", where decomposition.from_original takes functions"
             raise InputError(
-                f"{name}: {_term_name(term)} is on another mesh (the one before decompose?); "
+                f"{name}: the {what} is on another mesh (the one before decompose?); "
                 f"expected decomposition.mesh, the torn mesh{how}"
             )
 
 
-def _check_kind(term: Any, name: str) -> None:
-    """Raise if a function or a constant has no values."""
-    for kind, expected in ((ufl.Coefficient, fem.Function), (ufl.Constant, fem.Constant)):
-        if isinstance(term, kind) and not isinstance(term, expected):
-            raise InputError(
-                f"{name}: {term} is a ufl.{kind.__name__}, which has no values; expected a "
-                f"dolfinx.fem.{expected.__name__}"
-            )
-
-
-def _term_name(term: Any) -> str:
-    if isinstance(term, fem.Function):
-        return f"the function {term.name!r}"
-    return f"the {type(term).__name__} {term}"
-
-
 def _argument_spaces(form: Any, name: str, arity: int) -> list[Any]:
-    expected = f"a {ARITY[arity]} form"
+    expected = f"a {'linear' if arity == 1 else 'bilinear'} form"
     if isinstance(form, fem.Form):
         raise InputError(f"{name} is a compiled form, dolfinx.fem.Form; expected UFL's own")
     if not isinstance(form, ufl.Form):
@@ -172,19 +156,14 @@ def _argument_spaces(form: Any, name: str, arity: int) -> list[Any]:
     for integral in form.integrals():
         parts = {argument.number() for argument in extract_arguments(integral.integrand())}
         if missing := set(range(arity)) - parts:
-            kind = FUNCTIONS[missing.pop()]
+            kind = ("test", "trial")[missing.pop()]
             raise InputError(f"{name}: an integral has no {kind} function; expected {expected}")
-    _check_linearity(form, f"{name} is not {expected}")
-    return [argument.ufl_function_space() for argument in arguments]
-
-
-def _check_linearity(form: ufl.Form, what: str) -> None:
-    """Raise if a form is not linear in its arguments: DOLFINx would say so on one rank only."""
-    with named(what):
+    with named(f"{name} is not {expected}"):  # DOLFINx would say so on one rank only
         try:
             compute_form_data(form)
         except ArityMismatch as error:  # a BaseException, which nobody else catches
             raise ValueError(error) from error
+    return [argument.ufl_function_space() for argument in arguments]
 
 
 def _check_measures(form: ufl.Form, name: str, decomposition: Decomposition) -> None:
@@ -209,7 +188,7 @@ def _check_measures(form: ufl.Form, name: str, decomposition: Decomposition) -> 
 
 
 def _check_tags(integral: Any, name: str, decomposition: Decomposition) -> None:
-    tag, data, kind = integral.subdomain_id(), integral.subdomain_data(), integral.integral_type()
+    tag, kind = integral.subdomain_id(), integral.integral_type()
     tags = tag if isinstance(tag, tuple) else (tag,)
     if "everywhere" in tags or "otherwise" in tags:
         if kind == "exterior_facet" and decomposition.is_torn:
@@ -221,26 +200,24 @@ def _check_tags(integral: Any, name: str, decomposition: Decomposition) -> None:
     for t in tags:
         what = f"{name}: {KINDS[kind]}({t})"
         with raised_on_all_ranks(decomposition.comm), named(what):
-            entities, values = _tagged(data, kind, decomposition, what)
-        _check_entities(entities[values == t], kind, what, decomposition)
-
-
-def _check_entities(entities: Array, kind: str, what: str, decomposition: Decomposition) -> None:
-    """Raise if a tag has no entities, or facets inside a body. Collective."""
-    outside = decomposition.boundary if kind == "exterior_facet" else entities
-    inside = np.setdiff1d(entities, outside)
-    count, wrong = decomposition.comm.allreduce(np.array([len(entities), len(inside)]))
-    if count == 0:
-        groups = decomposition.names.volumes if kind == "cell" else decomposition.names.surfaces
-        raise InputError(
-            f"{what}: nothing has this tag; the names and tags of the decomposition are: "
-            f"{known_tags(groups)}"
-        )
-    if wrong:
-        raise InputError(
-            f"{what}: {wrong} of its facets lie inside a body; expected facets of the boundary "
-            "only, such as of decomposition.facets(name) or decomposition.locate_facets(marker)"
-        )
+            entities, values = _tagged(integral.subdomain_data(), kind, decomposition, what)
+        entities = entities[values == t]
+        outside = decomposition.boundary if kind == "exterior_facet" else entities
+        inside = np.setdiff1d(entities, outside)
+        count, wrong = decomposition.comm.allreduce(np.array([len(entities), len(inside)]))
+        if count == 0:
+            names = decomposition.names
+            groups = names.volumes if kind == "cell" else names.surfaces
+            raise InputError(
+                f"{what}: nothing has this tag; the names and tags of the decomposition are: "
+                f"{known_tags(groups)}"
+            )
+        if wrong:
+            raise InputError(
+                f"{what}: {wrong} of its facets lie inside a body; expected facets of the boundary "
+                "only, such as of decomposition.facets(name) or "
+                "decomposition.locate_facets(marker)"
+            )
 
 
 def _tagged(data: Any, kind: str, decomposition: Decomposition, what: str) -> tuple[Array, Array]:
@@ -259,8 +236,7 @@ def _tagged(data: Any, kind: str, decomposition: Decomposition, what: str) -> tu
 
 def _listed(data: Any, kind: str, decomposition: Decomposition, what: str) -> tuple[Array, Array]:
     """The same of DOLFINx's lists of a tag and cells, or pairs of a cell and a local facet."""
-    mesh = decomposition.mesh
-    facets = cell_facets(mesh)
+    facets = cell_facets(decomposition.mesh)
     entities: list[Array] = [np.empty(0, np.int64)]
     values: list[Array] = [np.empty(0, np.int64)]
     for item in data:
@@ -269,17 +245,16 @@ def _listed(data: Any, kind: str, decomposition: Decomposition, what: str) -> tu
                 f"{what}: subdomain_data has {shown(item)}; expected tuples of a tag and an array"
             )
         found = np.asarray(item[1], dtype=np.int64).ravel()
-        if kind == "cell":
-            valid = (found >= 0) & (found < len(facets))
-        else:
-            cell, local = found[: len(found) // 2 * 2].reshape(-1, 2).T
-            valid = (cell >= 0) & (cell < len(facets)) & (local >= 0) & (local < facets.shape[1])
-        if (len(found) % 2 and kind != "cell") or not np.all(valid):
+        place = (found,) if kind == "cell" else (found[::2], found[1::2])
+        if len(found) % len(place) or any(
+            np.any((index < 0) | (index >= size))
+            for index, size in zip(place, facets.shape, strict=False)
+        ):
             raise InputError(
                 f"{what}: subdomain_data of tag {item[0]} has entities that this rank has not; "
                 "expected local cells, for ds each followed by its local facet"
             )
-        entities.append(found if kind == "cell" else facets[cell, local])
+        entities.append(found if kind == "cell" else facets[place])
         values.append(np.full(len(entities[-1]), item[0]))
     tags = [tag for tag, _ in data]
     if tags != sorted(set(tags)):  # DOLFINx would integrate over some of them only

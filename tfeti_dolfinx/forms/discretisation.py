@@ -47,12 +47,24 @@ class StressRecovery:
         thickness: Any,
     ) -> None:
         self._dofs, mesh, degree = dofs, dofs.V.mesh, dofs.V.element.basix_element.degree
-        self._patches = _Patches(dofs, decomposition)
+        # the cells around each node, by body and material
+        self._layout, self._kinds = np.asarray(dofs.V.dofmap.list), _kinds(decomposition)
+        self._count = dofs.comm.allreduce(int(self._kinds.max(initial=0)) + 1, op=MPI.MAX)
+        self._basis = np.ones((*self._layout.shape, 1))
+        if degree == 1:
+            at = dofs.V.tabulate_dof_coordinates()[self._layout, : mesh.geometry.dim]
+            offset = at.mean(axis=1, keepdims=True) - at
+            self._basis = np.concatenate((self._basis, offset), axis=2)
         W = fem.functionspace(mesh, ("DG", degree, (3, 3)))
+        e = ufl.sym(ufl.grad(u))
+        if e.ufl_shape == (2, 2):
+            # where another entry of the strain is not 0, the same entry of the stress is (plane
+            # stress), or it has no derivative of u, and its error is of higher order (axisymmetry)
+            e = ufl.as_tensor([[e[0, 0], e[0, 1], 0], [e[1, 0], e[1, 1], 0], [0, 0, 0]])
         points = interpolation_points(W)
         self._pairs = [
             (fem.Expression(tensor, points, jit_options=JIT_OPTIONS), fem.Function(W))
-            for tensor in (sigma, _strain(u))
+            for tensor in (sigma, e)
         ]
         self.cells = fem.functionspace(mesh, ("DG", 0))
         self.cell_dof = np.asarray(self.cells.dofmap.list)[:, 0]
@@ -72,59 +84,23 @@ class StressRecovery:
             function.interpolate(expression)
             layout = np.asarray(function.function_space.dofmap.list)
             values = function.x.array.reshape(-1, 9)[layout]
-            function.x.array.reshape(-1, 9)[layout] = self._patches.recovered(values) - values
+            function.x.array.reshape(-1, 9)[layout] = self._recovered(values) - values
         return np.maximum(fem.assemble_vector(self._form).array[self.cell_dof], 0.0)
 
-
-def _strain(u: fem.Function) -> Any:
-    """sym ∇u as a 3×3 tensor.
-
-    Where another entry of the strain is not 0, the same entry of the stress is (plane stress), or
-    it has no derivative of u, and its error is of higher order (axisymmetry).
-    """
-    e = ufl.sym(ufl.grad(u))
-    if e.ufl_shape == (3, 3):
-        return e
-    return ufl.as_tensor([[e[0, 0], e[0, 1], 0], [e[1, 0], e[1, 1], 0], [0, 0, 0]])
-
-
-class _Patches:
-    """The cells around each node, by body and material."""
-
-    def __init__(self, dofs: TornDofs, decomposition: Decomposition) -> None:
-        self._dofs, self._cells = dofs, np.asarray(dofs.V.dofmap.list)
-        self._kinds = _kinds(decomposition)
-        self._count = dofs.comm.allreduce(int(self._kinds.max(initial=0)) + 1, op=MPI.MAX)
-        nodes = dofs.V.tabulate_dof_coordinates()[:, : dofs.V.mesh.geometry.dim]
-        basis = np.ones((*self._cells.shape, 1))
-        if dofs.V.element.basix_element.degree == 1:
-            at = nodes[self._cells]
-            offset = at.mean(axis=1, keepdims=True) - at
-            basis = np.concatenate((basis, offset), axis=2)
-        self._basis = basis
-
-    def recovered(self, values: Array) -> Array:
+    def _recovered(self, values: Array) -> Array:
         """Values at the nodes of cells from such, shape ``(cells, nodes, q)``. Collective."""
+        dofs, size, q = self._dofs, self._basis.shape[2], values.shape[2]
         found = np.empty_like(values)
-        if self._basis.shape[2] > 1:
+        if size > 1:
             values = np.repeat(values.mean(axis=1, keepdims=True), values.shape[1], axis=1)
         for kind in range(self._count):
             own = self._kinds == kind
-            found[own] = self._fitted(own, values[own])[self._cells[own]]
-        return found
-
-    def _fitted(self, own: Array, values: Array) -> Array:
-        """Return the fit at each local node of DOLFINx's, from the cells flagged."""
-        dofs, basis = self._dofs, self._basis[own]
-        size, q = basis.shape[2], values.shape[2]
-        terms = np.concatenate((basis, values), axis=2)[..., None, :] * basis[..., None]
-        sums = sum_rows(
-            self._cells[own].ravel(), terms.reshape(-1, size * (size + q)), dofs.num_nodes
-        )
-        system = dofs.reduce(sums[dofs.dolfinx_node], np.add, 0.0).reshape(-1, size, size + q)
-        at_nodes = dofs.spread(_constants(system[:, :, :size], system[:, :, size:]))
-        found = np.empty_like(at_nodes)
-        found[dofs.dolfinx_node] = at_nodes
+            cells, basis = self._layout[own], self._basis[own]
+            terms = np.concatenate((basis, values[own]), axis=2)[..., None, :] * basis[..., None]
+            sums = sum_rows(cells.ravel(), terms.reshape(-1, size * (size + q)), dofs.num_nodes)
+            system = dofs.reduce(sums[dofs.dolfinx_node], np.add, 0.0).reshape(-1, size, size + q)
+            at_nodes = dofs.spread(_constants(system[:, :, :size], system[:, :, size:]))
+            found[own] = at_nodes[dofs.primal_nodes(cells)]
         return found
 
 
@@ -147,16 +123,8 @@ def _kinds(decomposition: Decomposition) -> Array:
     tags = np.full(len(decomposition.cell_subdomain), NO_TAG)
     tags[decomposition.cell_tags.indices] = decomposition.cell_tags.values
     body = decomposition.body_of_subdomain[decomposition.cell_subdomain]
-    pairs = np.stack((body, tags), axis=1)
-    known = np.unique(
-        np.concatenate(decomposition.comm.allgather(np.unique(pairs, axis=0))), axis=0
-    )
-    first = np.searchsorted(known[:, 0], known[:, 0])
-    kind = np.arange(len(known)) - first
-    place = np.searchsorted(_joined(known), _joined(pairs))
-    return np.asarray(kind[place])
-
-
-def _joined(pairs: Array) -> Array:
-    """Body and tag as one number, in the order of the pairs."""
-    return pairs[:, 0].astype(np.int64) * 2**33 + pairs[:, 1]
+    # body and tag as one number, in the order of the pairs; tags from 0 on
+    pair = (body.astype(np.int64) << 32) + (tags.astype(np.int64) - NO_TAG)
+    known = np.unique(np.concatenate(decomposition.comm.allgather(np.unique(pair))))
+    first = np.searchsorted(known >> 32, known >> 32)
+    return np.searchsorted(known, pair) - first[np.searchsorted(known, pair)]

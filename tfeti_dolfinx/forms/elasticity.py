@@ -14,6 +14,7 @@ from mpi4py import MPI
 from ufl.algorithms import estimate_total_polynomial_degree
 
 from tfeti_dolfinx.common.agreement import agreeing
+from tfeti_dolfinx.common.compat import geometry_degree
 from tfeti_dolfinx.common.validation import POSITIVE, Range, checked_number, checked_type, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.forms.checks import check_mesh, check_not_negative
@@ -88,7 +89,11 @@ class Elasticity:
         with agreeing(self.mesh.comm, "Elasticity") as given:
             given |= {"E": E, "nu": nu, "model": model, "thickness": thickness}
             self.model = _checked_model(model, self.mesh.geometry.dim)
-            _check_no_thickness(thickness, self.model)
+            if thickness is not None and not self.model.startswith("plane"):
+                raise InputError(
+                    f"thickness={shown(thickness)}: expected none with model={self.model!r}; it "
+                    "belongs to plane strain and plane stress"
+                )
         self.E = in_ufl(E, on, "E", POSITIVE)
         self.nu = in_ufl(
             nu, on, "nu", POISSON_OF_SHEETS if self.model == "plane_stress" else POISSON
@@ -116,12 +121,17 @@ class Elasticity:
             raise InputError(
                 f"u is {shown(u)}{of_shape}; expected a displacement of {gdim} components"
             )
-        e = ufl.sym(ufl.grad(u))
+        e, across = ufl.sym(ufl.grad(u)), 0  # the third normal strain
         if gdim == 3:
             return e
-        return ufl.as_tensor(
-            [[e[0, 0], e[0, 1], 0], [e[1, 0], e[1, 1], 0], [0, 0, self._across(u, e)]]
-        )
+        if self.model == "plane_stress":
+            across = -self.nu / (1 - self.nu) * (e[0, 0] + e[1, 1])
+        elif self.model == "axisymmetric":
+            # on the axis the limit ∂u_r/∂r; the form compiler has no conditionals of test functions
+            r, near = ufl.SpatialCoordinate(self.mesh)[0], self._on_axis
+            beside = ufl.conditional(ufl.gt(r, near), 1.0, 0.0)
+            across = beside * u[0] / ufl.max_value(r, near) + (1 - beside) * e[0, 0]
+        return ufl.as_tensor([[e[0, 0], e[0, 1], 0], [e[1, 0], e[1, 1], 0], [0, 0, across]])
 
     def stress(self, u: Any) -> Any:
         """Return the stress of a displacement by Hooke's law, a UFL tensor of shape ``(3, 3)``.
@@ -160,33 +170,18 @@ class Elasticity:
         """
         work = ufl.inner(self.stress(u), self.strain(v))
         if dx is None:
-            degree = {"quadrature_degree": self._quadrature_degree(v)}
+            element = v.ufl_function_space().ufl_element()
+            simplex = self.mesh.topology.cell_type.name in ("triangle", "tetrahedron")
+            slope = element.degree - 1 if simplex else element.degree
+            moduli = sum(estimate_total_polynomial_degree(c) for c in (self.E, self.nu))
+            curved = 2 * (geometry_degree(self.mesh) - 1)
+            # r times products of u_r/r, whose numerator has the displacement's degree
+            ring = 3 if self.model == "axisymmetric" else 0
+            degree = {"quadrature_degree": int(2 * slope + moduli + curved + ring)}
             dx = ufl.Measure("dx", domain=self.mesh, metadata=degree)
         checked_type(dx, ufl.Measure, "dx", "a measure of UFL, or None")
         is_one = isinstance(self.thickness, float)
         return work * dx if is_one else self.thickness * work * dx
-
-    def _across(self, u: Any, e: Any) -> Any:
-        """Return the third normal strain."""
-        if self.model == "plane_stress":
-            return -self.nu / (1 - self.nu) * (e[0, 0] + e[1, 1])
-        if self.model == "plane_strain":
-            return 0
-        # on the axis the limit ∂u_r/∂r; the form compiler has no conditionals of test functions
-        r, near = ufl.SpatialCoordinate(self.mesh)[0], self._on_axis
-        beside = ufl.conditional(ufl.gt(r, near), 1.0, 0.0)
-        return beside * u[0] / ufl.max_value(r, near) + (1 - beside) * e[0, 0]
-
-    def _quadrature_degree(self, v: Any) -> int:
-        element = v.ufl_function_space().ufl_element()
-        geometry = self.mesh.ufl_domain().ufl_coordinate_element().degree
-        simplex = self.mesh.topology.cell_type.name in ("triangle", "tetrahedron")
-        slope = element.degree - 1 if simplex else element.degree
-        moduli = sum(estimate_total_polynomial_degree(c) for c in (self.E, self.nu))
-        curved = 2 * (geometry - 1)
-        # r times products of u_r/r, whose numerator has the displacement's degree
-        ring = 3 if self.model == "axisymmetric" else 0
-        return int(2 * slope + moduli + curved + ring)
 
     def _checked_radius(self) -> float:
         """Return the largest radius of the mesh. Collective."""
@@ -210,14 +205,6 @@ def _checked_model(model: Any, gdim: int) -> str:
     return model
 
 
-def _check_no_thickness(thickness: Any, model: str) -> None:
-    if thickness is not None and not model.startswith("plane"):
-        raise InputError(
-            f"thickness={shown(thickness)}: expected none with model={model!r}; it belongs to "
-            "plane strain and plane stress"
-        )
-
-
 def in_ufl(value: Any, on: Decomposition | dmesh.Mesh, what: str, expected: Range) -> Any:
     """Return a modulus as a scalar in UFL. Collective."""
     mesh = on.mesh if isinstance(on, Decomposition) else on
@@ -230,19 +217,14 @@ def in_ufl(value: Any, on: Decomposition | dmesh.Mesh, what: str, expected: Rang
             raise InputError(f"{what} is of shape {value.ufl_shape}; expected a scalar")
         if isinstance(on, Decomposition):
             check_mesh(value, what, on)
-        for number in _known_values(value):
+        values = np.zeros(0)
+        if isinstance(value, fem.Constant):
+            values = value.value.ravel()
+        elif isinstance(value, fem.Function) and value.ufl_element().degree < 2:
+            values = np.sort(value.x.array)  # a nan comes last
+        for number in np.append(values[:1], values[-1:]).tolist():
             checked_number(number, what, expected)
     return value
-
-
-def _known_values(value: Any) -> list[float]:
-    """Return a constant's value, or this rank's extreme ones of a function of degree < 2."""
-    if isinstance(value, fem.Constant):
-        return [value.value.item()]
-    if isinstance(value, fem.Function) and value.function_space.element.basix_element.degree < 2:
-        x = np.sort(value.x.array)  # a nan comes last
-        return [x[0].item(), x[-1].item()] if len(x) else []
-    return []
 
 
 def _by_volume(
@@ -252,7 +234,17 @@ def _by_volume(
     if not isinstance(on, Decomposition):
         raise InputError(f"{what} by volumes: expected a Decomposition, which knows their names")
     with raised_on_all_ranks(on.comm):
-        by_tag = _checked_volumes(values, on, what, expected)
+        by_tag: dict[int, float] = {}
+        for name, value in values.items():
+            try:
+                tag = on.volume(name)
+            except InputError as error:
+                raise InputError(f"{what}: {error}") from error
+            if tag in by_tag:
+                raise InputError(
+                    f"{what}: the volume {name!r} is there twice, by its name and its tag"
+                )
+            by_tag[tag] = checked_number(value, f"{what}[{name!r}]", expected)
     function = fem.Function(fem.functionspace(on.mesh, ("DG", 0)), name=what)
     cell_dof = np.asarray(function.function_space.dofmap.list)[:, 0]
     given = np.zeros(len(cell_dof), dtype=bool)
@@ -267,19 +259,3 @@ def _by_volume(
             f"are: {known_tags(others)}"
         )
     return function
-
-
-def _checked_volumes(
-    values: Mapping[str | int, float], on: Decomposition, what: str, expected: Range
-) -> dict[int, float]:
-    """Return the values by tags."""
-    by_tag: dict[int, float] = {}
-    for name, value in values.items():
-        try:
-            tag = on.volume(name)
-        except InputError as error:
-            raise InputError(f"{what}: {error}") from error
-        if tag in by_tag:
-            raise InputError(f"{what}: the volume {name!r} is there twice, by its name and its tag")
-        by_tag[tag] = checked_number(value, f"{what}[{name!r}]", expected)
-    return by_tag

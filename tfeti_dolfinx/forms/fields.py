@@ -14,7 +14,7 @@ from ufl.algorithms.analysis import (
     extract_constants,
 )
 
-from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.common.compat import JIT_OPTIONS, interpolation_points
 from tfeti_dolfinx.common.validation import POSITIVE, checked_callable, checked_number, named, shown
 from tfeti_dolfinx.errors import InputError
@@ -32,11 +32,7 @@ def von_mises(sigma: Any) -> Any:
 
 
 def checked_stress(stress: Stress, u: fem.Function) -> Any:
-    """Return the stress of u as a UFL expression.
-
-    Raises:
-        InputError: It cannot be called, fails, or does not return a 3×3 tensor.
-    """
+    """Return the stress of u as a UFL expression; raise an InputError unless it is a 3×3 tensor."""
     expected = "a callable from a displacement to its stress in UFL"
     if isinstance(stress, ufl.core.expr.Expr):  # which can be called, but for something else
         raise InputError(f"stress is an expression; expected {expected}")
@@ -55,8 +51,7 @@ def checked_stress(stress: Stress, u: fem.Function) -> Any:
 def checked_thickness(thickness: Any, decomposition: Decomposition) -> Any:
     """Check and return the thickness, a number or a scalar in UFL. Collective.
 
-    Raises:
-        InputError: It is neither, not positive, negative somewhere, or on another mesh.
+    Raise an InputError where it is neither, negative somewhere, or on another mesh.
     """
     if not isinstance(thickness, ufl.core.expr.Expr):
         return checked_number(thickness, "thickness", POSITIVE)
@@ -99,27 +94,21 @@ def nodal(expression: Any, dofs: TornDofs, name: str) -> fem.Function:
 
     The average goes over the cells of all torn copies, so the field has no jumps at the tears.
     """
-    in_cells = cellwise(expression, dofs, name)
-    shape = expression.ufl_shape
-    degree = dofs.V.element.basix_element.degree
-    W = fem.functionspace(
-        dofs.V.mesh, ("Lagrange", degree, shape) if shape else ("Lagrange", degree)
-    )
-    size = W.dofmap.index_map_bs
-    cells = np.asarray(W.dofmap.list)
-    weight = np.repeat(_volumes(dofs), cells.shape[1])
-    values = in_cells.x.array.reshape(-1, size)[np.asarray(in_cells.function_space.dofmap.list)]
-    sums = np.zeros((W.dofmap.index_map.size_local, size + 1))
-    np.add.at(
-        sums,
-        cells.ravel(),
-        np.column_stack((values.reshape(-1, size) * weight[:, None], weight)),
-    )
+    in_cells, mesh = cellwise(expression, dofs, name), dofs.V.mesh
+    shape, degree = expression.ufl_shape, dofs.V.element.basix_element.degree
+    element = ("Lagrange", degree, shape) if shape else ("Lagrange", degree)
+    function = fem.Function(fem.functionspace(mesh, element), name=name)
+    DG0 = fem.functionspace(mesh, ("DG", 0))
+    form = fem.form(ufl.TestFunction(DG0) * ufl.dx(metadata={"quadrature_degree": 2}))
+    volume = fem.assemble_vector(form).array[np.asarray(DG0.dofmap.list)[:, 0]]
+    cells = np.asarray(function.function_space.dofmap.list)
+    weight = np.repeat(volume, cells.shape[1])[:, None]
+    values = function.x.array.reshape(-1, function.function_space.dofmap.index_map_bs)
+    layout = np.asarray(in_cells.function_space.dofmap.list).ravel()
+    terms = in_cells.x.array.reshape(-1, values.shape[1])[layout] * weight
+    sums = sum_rows(cells.ravel(), np.hstack((terms, weight)), dofs.num_nodes)
     sums = dofs.spread(dofs.reduce(sums[dofs.dolfinx_node], np.add, 0.0))
-    averages = np.empty((len(sums), size))
-    averages[dofs.dolfinx_node] = sums[:, :-1] / sums[:, -1:]
-    function = fem.Function(W, name=name)
-    function.x.array[:] = averages.ravel()
+    values[dofs.dolfinx_node] = sums[:, :-1] / sums[:, -1:]
     return function
 
 
@@ -134,13 +123,9 @@ def from_vertices(dofs: TornDofs, values: Array, vertices: Array) -> fem.Functio
         values: One value per owned group, shape ``(g,)``.
         vertices: Which groups are vertices with a value, shape ``(g,)``.
     """
-    S, dof = dofs.scalar
-    function = fem.Function(S)
-    if S.element.basix_element.degree == 1:
-        function.x.array[dof] = dofs.spread(np.where(vertices, values, 0.0))
-        return function
-    W, node = dofs.hats
-    linear, share, inside = fem.Function(W), fem.Function(W), fem.Function(S)
+    (S, _), (W, node) = dofs.scalar, dofs.hats
+    function, inside = fem.Function(S), fem.Function(S)
+    linear, share = fem.Function(W), fem.Function(W)
     linear.x.array[:] = dofs.spread(np.where(vertices, values, 0.0))[node]
     share.x.array[:] = dofs.spread(vertices.astype(float))[node]
     function.interpolate(linear)
@@ -160,11 +145,3 @@ def vector_from_vertices(dofs: TornDofs, values: Array, vertices: Array, name: s
         component = from_vertices(dofs, values[:, i], vertices)
         components[dofs.dolfinx_node, i] = component.x.array[dofs.scalar[1]]
     return function
-
-
-def _volumes(dofs: TornDofs) -> Array:
-    """Volume of each local cell."""
-    W = fem.functionspace(dofs.V.mesh, ("DG", 0))
-    form = fem.form(ufl.TestFunction(W) * ufl.dx(metadata={"quadrature_degree": 2}))
-    volumes = fem.assemble_vector(form).array
-    return np.asarray(volumes[np.asarray(W.dofmap.list)[:, 0]])

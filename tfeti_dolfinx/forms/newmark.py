@@ -30,13 +30,6 @@ from tfeti_dolfinx.forms.elasticity import Modulus, in_ufl
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
-# of a step: another one that differs by less is the same, since times of equal steps are rounded
-SAME_STEP = 1e-9
-
-# of the sum of the diagonal: the mass of a translation is rounding, as where M has a kernel
-NO_MASS = 1e-10
-# of the largest value: where torn copies differ by less a solver may have left it
-TORN = 1e-3
 STEP = Range("a positive number whose square is one, too", lambda value: min(value, value**2) > 0.0)
 
 log = logging.getLogger(__name__)
@@ -79,9 +72,6 @@ class InertialForms(Forms):
 
     Attributes:
         motion: Where the step begins.
-
-    Raises:
-        InputError: As ``Forms``.
     """
 
     def __init__(self, mass: ufl.Form, *as_forms: Any) -> None:
@@ -102,16 +92,17 @@ class InertialForms(Forms):
         self._new_matrices = True
         self._ends = self.motion.load
 
-    def take_step(self, size: float) -> None:
-        """Let the next step have a size, which makes the matrix anew if it is another one.
+    def take_step(self, size: float, same: float = 1e-9) -> None:
+        """Let the next step have a size; another one than the last makes the matrix anew.
 
-        Raises:
-            InputError: It is not a positive number, or another one on another rank.
+        Args:
+            size: The size; an InputError is raised unless it is positive and on all ranks the same.
+            same: Share of it by which equal steps differ, since their times are rounded.
         """
         with agreeing(self._comm, "take_step") as given:
             given["step"] = size = checked_number(size, "step", STEP)
         known = self.motion.size
-        if abs(size - known) <= SAME_STEP * known:
+        if abs(size - known) <= same * known:
             return
         if known and self._comm.rank == 0:
             log.warning("the step is now %g, it was %g: all is factored anew", size, known)
@@ -180,38 +171,35 @@ class InertialForms(Forms):
         motion.load = self._ends if load is None else load
 
 
-def check_mass(M: csr_array, bs: int) -> None:
-    """Raise if a matrix is not that of a mass in every direction.
+def check_mass(M: csr_array, bs: int, rounding: float = 1e-10) -> None:
+    """Raise an InputError unless a matrix is that of a mass in every direction.
 
     Args:
         M: This rank's matrix.
         bs: Unknowns per node.
-
-    Raises:
-        InputError: It is not symmetric, not positive, or a translation has no mass.
+        rounding: Share of the sum of the diagonal up to which the mass of a translation is 0, as
+            where M has a kernel.
     """
     check_stiffness("mass", M, "the matrix", "a density, or a form such as ∫ρ u·v")
     for k in range(bs):
         along = np.zeros(M.shape[0])
         along[k::bs] = 1.0
         total, sizes = along @ (M @ along), M.diagonal() @ along
-        if total <= NO_MASS * sizes and len(along):
+        if total <= rounding * sizes and len(along):
             raise InputError(
                 f"mass: a translation along {'xyz'[k]} has the mass {total:.3g}; expected a "
                 "density, or a form such as ∫ρ u·v"
             )
 
 
-def check_copies(values: Array, dofs: TornDofs, name: str) -> None:
-    """Raise where torn copies of a node differ by more than what a solver leaves. Collective.
+def check_copies(values: Array, dofs: TornDofs, name: str, left: float = 1e-3) -> None:
+    """Raise an InputError where torn copies of a node differ, or a value is not finite. Collective.
 
     Args:
         values: A displacement or a velocity in DOLFINx's order.
         dofs: Dof maps.
         name: What it is.
-
-    Raises:
-        InputError: They do, or a value is not finite.
+        left: Share of the largest value by which a solver may have left them apart.
     """
     primal = dofs.to_primal(np.asarray(values)).reshape(-1, dofs.bs)
     with raised_on_all_ranks(dofs.comm):
@@ -221,7 +209,7 @@ def check_copies(values: Array, dofs: TornDofs, name: str) -> None:
     apart = dofs.spread(most - dofs.reduce(primal, np.minimum, np.inf)).max(axis=1, initial=0.0)
     size = dofs.comm.allreduce(float(np.abs(primal).max(initial=0.0)), op=MPI.MAX)
     with raised_on_all_ranks(dofs.comm):
-        if np.any(apart > TORN * size):
+        if np.any(apart > left * size):
             worst = int(np.argmax(apart))
             x = dofs.V.tabulate_dof_coordinates()[dofs.dolfinx_node[worst]]
             at = ", ".join(f"{x:.6g}" for x in x[: dofs.bs])
@@ -238,17 +226,15 @@ def mass_form(
     thickness: Any,
     lumped: bool,
 ) -> ufl.Form:
-    """∫ρ u·v, times the thickness. Collective.
+    """Return ∫ρ u·v, times the thickness. Collective.
 
     Args:
         density: Mass per volume: a number, a scalar in UFL, or numbers for all volumes by names.
         V: Space of displacements.
         decomposition: The torn mesh.
         thickness: What the other forms were multiplied with.
-        lumped: Whether to integrate at the vertices, which makes M diagonal; of degree 1 only.
-
-    Raises:
-        InputError: The density does not fit, or elements are not of degree 1.
+        lumped: Whether to integrate at the vertices, which makes M diagonal; an InputError is
+            raised for elements of another degree than 1.
     """
     rho = in_ufl(density, decomposition, "mass", POSITIVE)
     degree = V.element.basix_element.degree

@@ -15,14 +15,14 @@ from mpi4py import MPI
 from tfeti_dolfinx.common.arrays import Array, ArrayLike
 from tfeti_dolfinx.common.validation import checked_callable, checked_type, is_whole, named, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.mesh.transfer import CellExchange, cell_values, check_function, from_cell_values
+from tfeti_dolfinx.mesh.transfer import CellExchange, carried, check_function
 from tfeti_dolfinx.mesh.untorn import PhysicalNames
 
 # --- Checks of tags and names -----------------------------------------------------------------
 
 
 def check_tags(tags: Any, mesh: dmesh.Mesh, of_cells: bool, what: str, expected: str) -> None:
-    """Raise unless tags are those of a mesh's cells, or of its facets.
+    """Raise an InputError unless tags are those of a mesh's cells, or of its facets.
 
     Args:
         tags: What was given.
@@ -30,9 +30,6 @@ def check_tags(tags: Any, mesh: dmesh.Mesh, of_cells: bool, what: str, expected:
         of_cells: Whether cells are tagged, else facets.
         what: The tags' name in messages.
         expected: What to give instead, for messages.
-
-    Raises:
-        InputError: They are no tags, of another mesh, or of entities of another dimension.
     """
     checked_type(tags, dmesh.MeshTags, what, "dolfinx.mesh.MeshTags")
     if tags.topology is not mesh.topology._cpp_object:
@@ -45,11 +42,7 @@ def check_tags(tags: Any, mesh: dmesh.Mesh, of_cells: bool, what: str, expected:
 
 
 def checked_names(names: Any, what: str, tags: Any, tags_name: str) -> dict[str, int]:
-    """Return names of tags as a dictionary.
-
-    Raises:
-        InputError: They are no dictionary from texts to integers, or there are no tags to name.
-    """
+    """Return names of tags as a dictionary; raise an InputError unless they are such names."""
     if names is None:
         return {}
     checked_type(names, dict, what, "a dictionary of names and tags, such as {'top': 1}")
@@ -132,13 +125,14 @@ class Decomposition:
         """A name for each body, with the volumes that it consists of. Collective at first use."""
         body = self.body_of_subdomain[self.cell_subdomain[self.cell_tags.indices]]
         pairs = np.unique(np.stack((body, self.cell_tags.values), axis=1), axis=0)
-        pairs = np.unique(np.concatenate(self.comm.allgather(pairs)), axis=0)
-        volume = {tag: name for name, tag in self.names.volumes.items()}
-        names = []
-        for b in range(self.num_bodies):
-            own = ", ".join(repr(volume[tag]) for tag in pairs[pairs[:, 0] == b, 1].tolist())
-            names.append(f"body {b} (volume {own})" if own else f"body {b}")
-        return names
+        volume = {tag: repr(name) for name, tag in self.names.volumes.items()}
+        of_body: list[list[str]] = [[] for _ in range(self.num_bodies)]
+        for b, tag in np.unique(np.concatenate(self.comm.allgather(pairs)), axis=0).tolist():
+            of_body[b].append(volume[tag])
+        return [
+            f"body {b} (volume {', '.join(own)})" if own else f"body {b}"
+            for b, own in enumerate(of_body)
+        ]
 
     def surface(self, name: str | int) -> int:
         """Tag of a surface, given its name or its tag.
@@ -225,9 +219,7 @@ class Decomposition:
         expected = "the mesh that was given to decompose"
         with raised_on_all_ranks(self.comm):
             check_function(f, self._untorn_mesh(), "f", expected)
-        g = f.collapse() if f.function_space.component() else f
-        V = fem.functionspace(self.mesh, g.function_space.ufl_element())
-        return from_cell_values(V, self._cells.to_torn(cell_values(g)), f.name)
+        return carried(f, self.mesh, self._cells.to_torn)
 
     def to_original(self, u: fem.Function) -> fem.Function:
         """Return on the mesh given to ``decompose`` what is on the torn one. Collective.
@@ -245,9 +237,7 @@ class Decomposition:
         with raised_on_all_ranks(self.comm):
             untorn = self._untorn_mesh()
             check_function(u, self.mesh, "u", "decomposition.mesh, the torn mesh")
-        g = u.collapse() if u.function_space.component() else u
-        V = fem.functionspace(untorn, g.function_space.ufl_element())
-        return from_cell_values(V, self._cells.to_untorn(cell_values(g)), u.name)
+        return carried(u, untorn, self._cells.to_untorn)
 
     def _untorn_mesh(self) -> dmesh.Mesh:
         if self.untorn is None:

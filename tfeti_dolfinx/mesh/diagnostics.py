@@ -39,13 +39,7 @@ def flatness(mesh: dmesh.Mesh) -> Array:
     J = np.einsum("dv,cvg->cgd", slopes, mesh.geometry.x[corners, :gdim])
     if cell_type.name in REGULAR:
         J = J @ np.linalg.inv(REGULAR[cell_type.name])
-    if gdim == 2:
-        cofactor, det = J, J[:, 0, 0] * J[:, 1, 1] - J[:, 0, 1] * J[:, 1, 0]
-    else:
-        cofactor = np.cross(J[:, [1, 2, 0]], J[:, [2, 0, 1]])
-        det = np.sum(J[:, 0] * cofactor[:, 0], axis=1)
-    sizes = np.linalg.norm(J, axis=(1, 2)) * np.linalg.norm(cofactor, axis=(1, 2))
-    return np.asarray(sizes / (gdim * np.maximum(np.abs(det), TINY)))
+    return np.asarray(np.minimum(np.linalg.cond(J, "fro") / gdim, 1.0 / TINY))
 
 
 # --- Nodes that bodies share without a common facet -------------------------------------------
@@ -76,8 +70,6 @@ def shared_by_bodies(decomposition: Decomposition) -> tuple[Array, Array]:
     same = met[1:, 0] == met[:-1, 0]
     local = np.stack((met[:-1, 1], met[1:, 1]), axis=1)[same]
     own, count = np.unique(local, axis=0, return_counts=True)  # few pairs, however many nodes
-    every = np.concatenate(comm.allgather(own))
+    every, counts = map(np.concatenate, zip(*comm.allgather((own, count)), strict=True))
     pairs, place = np.unique(every, axis=0, return_inverse=True)
-    counts = np.zeros(len(pairs), dtype=np.int64)
-    np.add.at(counts, place.ravel(), np.concatenate(comm.allgather(count)))
-    return pairs, counts
+    return pairs, np.bincount(place.ravel(), counts, minlength=len(pairs)).astype(np.int64)

@@ -22,12 +22,7 @@ from tfeti_dolfinx.mesh.untorn import cell_entities, exchange_by_key, mix, set_k
 
 
 def check_space(V: fem.FunctionSpace, decomposition: Decomposition) -> None:
-    """Raise unless V is a space for displacements on the torn mesh.
-
-    Raises:
-        InputError: It is on another mesh, not continuous, not Lagrange, or neither scalar nor
-            of one component for each dimension.
-    """
+    """Raise an InputError unless V is a Lagrange space for displacements on the torn mesh."""
     checked_type(V, fem.FunctionSpace, "the space", "a dolfinx.fem.FunctionSpace")
     if V.mesh is not decomposition.mesh:
         raise InputError(
@@ -52,9 +47,7 @@ def check_space(V: fem.FunctionSpace, decomposition: Decomposition) -> None:
 
 def is_same_space(V: Any, W: Any) -> bool:
     """Return whether two C++ spaces have the same mesh, element and numbering on this rank."""
-    if V is W:
-        return True
-    return bool(
+    return V is W or bool(
         V.mesh is W.mesh
         and V.element == W.element
         and V.dofmap.bs == W.dofmap.bs
@@ -223,16 +216,12 @@ class TornDofs:
         Returns:
             For each table its rows for ``groups``.
         """
-        owner = owner_of(self.group_offsets, groups)
-        exchange = Exchange(self.comm, owner)
-        asked = exchange.send(groups) - self.group_offsets[self.comm.rank]
+        exchange, asked = self._to_owners_of(groups)
         return tuple(exchange.answer(table[asked]) for table in tables)
 
-    def add_on_owners(self, groups: Array, values: Array) -> Array:
-        """Add what all ranks give for each owned group, as ``reduce_on_owners``. Collective."""
-        return self.reduce_on_owners(groups, values, np.add, 0)
-
-    def reduce_on_owners(self, groups: Array, values: Array, op: np.ufunc, initial: Any) -> Array:
+    def reduce_on_owners(
+        self, groups: Array, values: Array, op: np.ufunc = np.add, initial: Any = 0
+    ) -> Array:
         """Combine the values that all ranks give for each owned group. Collective.
 
         Args:
@@ -244,11 +233,15 @@ class TornDofs:
         Returns:
             Shape ``(g, ...)``.
         """
-        exchange = Exchange(self.comm, owner_of(self.group_offsets, groups))
-        slot = exchange.send(groups) - self.group_offsets[self.comm.rank]
+        exchange, slot = self._to_owners_of(groups)
         out = np.full((self.num_groups, *values.shape[1:]), initial, dtype=values.dtype)
         op.at(out, slot, exchange.send(values))
         return out
+
+    def _to_owners_of(self, groups: Array) -> tuple[Exchange, Array]:
+        """Return the exchange with the owners of groups, and which of theirs are asked for."""
+        exchange = Exchange(self.comm, owner_of(self.group_offsets, groups))
+        return exchange, exchange.send(groups) - self.group_offsets[self.comm.rank]
 
     @cached_property
     def scalar(self) -> tuple[fem.FunctionSpace, Array]:
@@ -270,14 +263,7 @@ class TornDofs:
         return W, self.primal_nodes(node)
 
     def gather_copies(self, values: Array) -> Array:
-        """Return values of the local primal nodes in the order of the owned ``copies``. Collective.
-
-        Args:
-            values: One value (or row) per local primal node, shape ``(n, ...)``.
-
-        Returns:
-            One per copy, shape ``(c, ...)``.
-        """
+        """Give values of nodes, ``(n, ...)``, to the owned ``copies``, ``(c, ...)``. Collective."""
         return self._to_owner.send(values)[self._copy_order]
 
     def lookup_copies(self, groups: Array, *tables: Array) -> tuple[Array, ...]:

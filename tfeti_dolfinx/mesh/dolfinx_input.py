@@ -134,11 +134,10 @@ def _check_mesh(mesh: dmesh.Mesh) -> None:
 
 def _values(tags: dmesh.MeshTags | None, entities: Array) -> Array:
     """Tag of each entity, NO_TAG where there is none."""
-    if tags is None or len(tags.indices) == 0:
-        return np.full(entities.shape, NO_TAG, dtype=np.int32)
-    size = max(entities.max(initial=-1), tags.indices.max()) + 1
+    size = max(entities.max(initial=-1), -1 if tags is None else tags.indices.max(initial=-1)) + 1
     values = np.full(size, NO_TAG, dtype=np.int32)
-    values[tags.indices] = tags.values
+    if tags is not None:
+        values[tags.indices] = tags.values
     return values[entities]
 
 

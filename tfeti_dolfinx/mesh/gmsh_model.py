@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from os import PathLike
@@ -64,14 +64,9 @@ class ModelContent:
 
 @contextmanager
 def open_model(source: str | PathLike[str] | Any, may_be_empty: bool = False) -> Iterator[Any]:
-    """The gmsh model of a file, closed afterwards; or the model itself.
+    """Give the gmsh model of a file, closed afterwards; or the model itself.
 
-    Args:
-        source: A file, or a model.
-        may_be_empty: Whether a file without nodes is a mesh.
-
-    Raises:
-        InputError: The file is missing or not a mesh.
+    Raise an InputError where the file is missing or not a mesh, as without nodes unless it may be.
     """
     import gmsh
 
@@ -114,41 +109,37 @@ def open_model(source: str | PathLike[str] | Any, may_be_empty: bool = False) ->
 def read_content(model: Any, where: str) -> ModelContent:
     """Read the elements in physical groups, names and nodes of a gmsh model.
 
-    Args:
-        model: The gmsh model.
-        where: What messages call it.
-
-    Raises:
-        InputError: An element lies in several physical groups, or the elements of a dimension
-            are of several types.
+    Raise an InputError where an element lies in several physical groups, or the elements of a
+    dimension are of several types. Messages call the model ``where``.
     """
     with named("gmsh.model (is gmsh initialised, with a model in it?)"):
         top = max((dim for dim, _ in model.getPhysicalGroups()), default=0)
-    elements = {}
-    for dim in range(max(top - 1, 1), top + 1):
-        found = _elements(model, dim)
-        if found is not None:
-            elements[dim] = found
-    cells = elements.get(top)
-    used = np.unique(cells.nodes if cells else np.empty(0, dtype=np.int64))
+    found = {dim: _elements(model, dim) for dim in range(max(top - 1, 1), top + 1)}
+    elements = {dim: of_dim for dim, of_dim in found.items() if of_dim is not None}
+    used: Array = np.empty(0, dtype=np.int64)
+    x: Array = np.empty((0, 3))
+    if top in elements:
+        used = np.unique(elements[top].nodes)
+        ids, coordinates, _ = model.mesh.getNodes()
+        order = np.argsort(ids)
+        x = coordinates.reshape(-1, 3)[order[np.searchsorted(ids, used, sorter=order)]]
     return ModelContent(
         where=where,
         top=top,
         elements=elements,
         names={dim: _names(model, dim) for dim in (1, 2, 3)},
         node_ids=used,
-        x=_coordinates(model, used),
+        x=x,
         num_partitions=int(model.getNumberOfPartitions()),
     )
 
 
 def concatenated(found: Sequence[Elements]) -> Elements:
     """Elements of one type in one; at least one."""
-    arrays = {
-        name: np.concatenate([getattr(elements, name) for elements in found])
-        for name in ("nodes", "ids", "tags", "partitions")
-    }
-    return replace(found[0], **arrays)
+    names = ("nodes", "ids", "tags", "partitions")
+    return replace(
+        found[0], **{name: np.concatenate([getattr(e, name) for e in found]) for name in names}
+    )
 
 
 def _names(model: Any, dim: int) -> dict[str, int]:
@@ -200,93 +191,53 @@ def _elements(model: Any, dim: int) -> Elements | None:
                     kind_name=model.mesh.getElementProperties(kind)[0],
                     nodes=np.asarray(kind_nodes, dtype=np.int64).reshape(n, -1),
                     ids=np.asarray(kind_ids, dtype=np.int64),
-                    tags=np.full(n, groups.copy().pop(), dtype=np.int32),
+                    tags=np.full(n, min(groups), dtype=np.int32),
                     partitions=np.full(n, parts[0] if len(parts) == 1 else -1, dtype=np.int64),
                 )
             )
-    kind_names = {elements.kind: elements.kind_name for elements in found}
-    if len(kind_names) > 1:
-        raise InputError(
-            f"elements of several types, {list(kind_names.values())}; expected one type of cell"
-        )
+    kinds = list(dict.fromkeys(elements.kind_name for elements in found))
+    if len(kinds) > 1:
+        raise InputError(f"elements of several types, {kinds}; expected one type of cell")
     return concatenated(found) if found else None
 
 
-def _coordinates(model: Any, node_ids: Array) -> Array:
-    """Return coordinates of nodes, shape ``(p, 3)``."""
-    if len(node_ids) == 0:
-        return np.empty((0, 3))
-    ids, x, _ = model.mesh.getNodes()
-    order = np.argsort(ids)
-    return x.reshape(-1, 3)[order[np.searchsorted(ids, node_ids, sorter=order)]]
-
-
 # --- Names of physical groups, merged over ranks ----------------------------------------------
-
-PhysicalGroup = tuple[int, int]  # dimension and tag
 
 
 def physical_names(
     contents: Sequence[ModelContent], top: int, comm: MPI.Intracomm
 ) -> PhysicalNames:
-    """Names of the physical groups of cells and facets in all models of all ranks. Collective.
+    """Return the names of the groups of cells and facets in all models of all ranks. Collective.
 
     A model may know only some of them. One that a model knows only by its number has the name
-    that another gives it.
-
-    Args:
-        contents: What this rank has read.
-        top: Dimension of the cells.
-        comm: Communicator.
-
-    Raises:
-        InputError: A name has different tags or dimensions in the models (unless one model has
-            them all: gmsh lets a surface and a volume have the same name), or a tag different
-            names.
+    that another gives it. Raise an InputError where a name of surfaces or of volumes has different
+    tags in the models, or a tag different names.
     """
-    # equal sets of names count once, so that what is gathered stays small
-    own = {
-        frozenset(
-            (name, (d, tag))
-            for d in (top - 1, top)
-            for name, tag in content.names.get(d, {}).items()
-        )
-        for content in contents
-    }
-    every = set[frozenset[tuple[str, PhysicalGroup]]]().union(*comm.allgather(own))
-    names = _checked_names(every)
-    return PhysicalNames(
-        surfaces={name: tag for (dim, tag), name in names.items() if dim == top - 1},
-        volumes={name: tag for (dim, tag), name in names.items() if dim == top},
+    own = [
+        {(t, n) for c in contents for n, t in c.names.get(d, {}).items()} for d in (top - 1, top)
+    ]
+    gathered = comm.allgather(own)
+    surfaces, volumes = (
+        _merged_names(sorted(set().union(*(names[k] for names in gathered))), top - 1 + k)
+        for k in (0, 1)
     )
+    return PhysicalNames(surfaces, volumes)
 
 
-def _checked_names(
-    every: Iterable[frozenset[tuple[str, PhysicalGroup]]],
-) -> dict[PhysicalGroup, str]:
-    """Return the name of each physical group, sorted by dimension and tag."""
-    pairs = sorted(set[tuple[str, PhysicalGroup]]().union(*every))
-    names = {group: name for name, group in pairs if name == str(group[1])}
-    given: dict[PhysicalGroup, str] = {}
-    groups: dict[str, set[PhysicalGroup]] = {}
-    for name, group in pairs:
-        if name == str(group[1]):
-            continue
-        groups.setdefault(name, set()).add(group)
-        if given.setdefault(group, name) != name:
+def _merged_names(pairs: list[tuple[int, str]], dim: int) -> dict[str, int]:
+    """Return the names of all groups of a dimension, from tags and names of some models each."""
+    given = [(tag, name) for tag, name in pairs if name != str(tag)]
+    name_of, tag_of = dict(given), {name: tag for tag, name in given}
+    for tag, name in given:
+        group = f"dimension {dim} and tag {tag}"
+        if name_of[tag] != name:
             raise InputError(
-                f"the physical group of {_described(group)} is named {given[group]!r} in one file "
-                f"and {name!r} in another; expected one name"
+                f"the physical group of {group} is named {name!r} in one file and "
+                f"{name_of[tag]!r} in another; expected one name"
             )
-    for name, its_groups in groups.items():
-        if not any(all((name, group) in content for group in its_groups) for content in every):
-            said = " and ".join(_described(group) for group in sorted(its_groups))
+        if tag_of[name] != tag:
             raise InputError(
-                f"the name {name!r} stands for the physical groups of {said} in different "
-                "files; expected one dimension and tag"
+                f"the name {name!r} stands for the physical groups of {group} and dimension {dim} "
+                f"and tag {tag_of[name]} in different files; expected one tag"
             )
-    return dict(sorted({**names, **given}.items()))
-
-
-def _described(group: PhysicalGroup) -> str:
-    return f"dimension {group[0]} and tag {group[1]}"
+    return {name_of.get(tag, name): tag for tag, name in pairs}

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
+import basix.ufl
 import numpy as np
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.compat import cell_permutation, coordinate_element
+from tfeti_dolfinx.common.compat import cell_permutation
 from tfeti_dolfinx.common.logging import stage
 from tfeti_dolfinx.common.parallel import box_over_ranks
 from tfeti_dolfinx.common.validation import checked_type
@@ -52,71 +53,57 @@ from tfeti_dolfinx.mesh.untorn import (
 ONE_MODEL = "expected files that gmsh has written from one model with Mesh.PartitionSplitMeshFiles"
 
 
-@dataclass(frozen=True)
-class SplitFiles:
-    """The files ``name_1.msh`` to ``name_{count}.msh`` of a mesh ``name.msh``."""
+def find_split_files(source: str | PathLike[str] | Any, comm: MPI.Intracomm) -> list[Path]:
+    """Return the files ``name_1.msh``, ``name_2.msh``, ... of a mesh; none of a model or one file.
 
-    path: Path
-    count: int
-
-    def file(self, number: int) -> Path:
-        """File of a partition, numbered from 1."""
-        return self.path.with_name(f"{self.path.stem}_{number}{self.path.suffix}")
-
-
-def find_split_files(source: str | PathLike[str] | Any, comm: MPI.Intracomm) -> SplitFiles | None:
-    """Return the split files of a mesh, None if it is a model or one file. Collective.
-
-    Only rank 0 looks, at the source that it was given.
-
-    Raises:
-        InputError: A file is missing in the numbering.
+    Collective. Only rank 0 looks, at the source that it was given. Raise an InputError where a file
+    is missing in the numbering.
     """
-    files = None
+    files: list[Path] = []
     with raised_on_all_ranks(comm):
         if comm.rank == 0 and isinstance(source, (str, PathLike)):
-            files = _found(Path(source))
+            path = Path(source)
+            parts = re.compile(re.escape(path.stem) + r"_([1-9]\d*)" + re.escape(path.suffix))
+            if not path.is_file() and path.parent.is_dir():
+                matches = (parts.fullmatch(entry.name) for entry in path.parent.iterdir())
+                numbers = {int(match[1]) for match in matches if match}
+                files = [_part(path, number) for number in range(1, max(numbers, default=0) + 1)]
+                if len(files) > len(numbers):
+                    missing = min(set(range(1, len(files) + 1)) - numbers)
+                    raise InputError(
+                        f"{_part(path, missing)}: no such file, but {files[-1].name} is there; "
+                        f"expected either {path.name}, or one file for each partition from 1 on"
+                    )
     return comm.bcast(files, root=0)
 
 
-def _found(path: Path) -> SplitFiles | None:
-    if path.is_file() or not path.parent.is_dir():
-        return None
-    pattern = re.compile(re.escape(path.stem) + r"_([1-9]\d*)" + re.escape(path.suffix))
-    matches = (pattern.fullmatch(entry.name) for entry in path.parent.iterdir())
-    numbers = {int(match[1]) for match in matches if match}
-    files = SplitFiles(path, max(numbers, default=0))
-    missing = sorted(set(range(1, files.count + 1)) - numbers)
-    if missing:
-        raise InputError(
-            f"{files.file(missing[0])}: no such file, but {files.file(files.count).name} is "
-            f"there; expected either {path.name}, or one file for each partition from 1 on"
-        )
-    return files if numbers else None
+def _part(path: Path, number: int) -> Path:
+    """Return the name of the file of a partition, numbered from 1."""
+    return path.with_name(f"{path.stem}_{number}{path.suffix}")
 
 
-def read_split_files(files: SplitFiles, comm: MPI.Intracomm) -> list[ModelContent]:
+def read_split_files(files: Sequence[Path], comm: MPI.Intracomm) -> list[ModelContent]:
     """Read this rank's files, a cell's partition being its file's number. Collective.
 
-    Raises:
-        InputError: A file cannot be read, or partitions are missing.
+    Raise an InputError where a file cannot be read, or partitions are missing.
     """
     contents = []
     with raised_on_all_ranks(comm):
-        for number in range(1, files.count + 1):
-            if (number - 1) * comm.size // files.count != comm.rank:
+        for number, file in enumerate(files, start=1):
+            if (number - 1) * comm.size // len(files) != comm.rank:
                 continue
             # a partition may hold no element in a physical group: gmsh then writes no nodes
-            with open_model(files.file(number), may_be_empty=True) as model:
-                content = read_content(model, files.file(number).name)
+            with open_model(file, may_be_empty=True) as model:
+                content = read_content(model, file.name)
             for elements in content.elements.values():
                 elements.partitions[:] = number
             contents.append(content)
     known = comm.allreduce(max((c.num_partitions for c in contents), default=0), op=MPI.MAX)
-    if known > files.count:
+    if known > len(files):
+        stem = files[-1].stem.removesuffix(f"_{len(files)}")
+        missing = files[-1].with_stem(f"{stem}_{len(files) + 1}")
         raise InputError(
-            f"{files.file(files.count + 1)}: no such file; expected one file for each of the "
-            f"{known} partitions"
+            f"{missing}: no such file; expected one file for each of the {known} partitions"
         )
     return contents
 
@@ -129,9 +116,10 @@ def check_shared(
     comm: MPI.Intracomm,
     same_place: float = 1e-9,
 ) -> None:
-    """Check that the files are of one mesh. Collective.
+    """Raise an InputError unless the files are of one mesh. Collective.
 
-    Nodes of one id, and cells of the same nodes, meet on the rank that the id or key names.
+    Nodes of one id, and cells of the same nodes, meet on the rank that the id or key names: a node
+    may not lie at different places, nor a cell in two files.
 
     Args:
         mesh: The mesh joined.
@@ -141,9 +129,6 @@ def check_shared(
         comm: Communicator.
         same_place: Distance over that length up to which a node's places are the same: files in
             text keep fewer digits than gmsh has.
-
-    Raises:
-        InputError: A node lies at different places, or a cell lies in two files.
     """
     exchange = exchange_by_key(comm, node_ids)
     node_ids, x = exchange.send(node_ids), exchange.send(x)
@@ -193,9 +178,9 @@ def untorn_mesh(
         shared: Whether models of different ranks may have nodes and facets in common.
 
     Raises:
-        InputError: There are no physical groups of cells, the cells are of several types or
-            of one that is not supported, plane cells do not lie in a plane, names contradict
-            each other, or the models do not fit together.
+        InputError: There are no physical groups of cells, the cells are of several types or of
+            one that is not supported, plane cells do not lie in a plane, names contradict each
+            other, or the models do not fit together.
     """
     top = comm.allreduce(max((content.top for content in contents), default=0), op=MPI.MAX)
     with_cells = [content for content in contents if top in content.elements]
@@ -203,7 +188,8 @@ def untorn_mesh(
     shape, degree = CELLS[kind]
     cell_type = dmesh.to_type(shape)
     gdim = cell_dim(cell_type)
-    element = coordinate_element(cell_type, degree, gdim)
+    variant = basix.LagrangeVariant.equispaced  # as gmsh numbers the nodes
+    element = basix.ufl.element("Lagrange", shape, degree, variant, shape=(gdim,))
     none = np.empty(0, dtype=np.int64)
     nodes = none.reshape(0, element.dim // gdim)
     empty = Elements(kind, kind_name, nodes, none, none.astype(np.int32), none)
@@ -233,20 +219,19 @@ def untorn_mesh(
 
 def _one_kind(contents: Sequence[ModelContent], top: int, comm: MPI.Intracomm) -> tuple[int, str]:
     """Return number and name of gmsh's type of all cells of all ranks."""
-    cells = [(content.elements[top], content.where) for content in contents]
-    own = [(found.kind, found.kind_name, where) for found, where in cells]
-    first_of_kind = {kind: (name, where) for kind, name, where in reversed(own)}
     kinds: dict[int, tuple[str, str]] = {}
-    for of_rank in comm.allgather(first_of_kind):
-        kinds = {**of_rank, **kinds}
+    cells = [(content.elements[top], content.where) for content in contents]
+    own = [(found.kind, (found.kind_name, where)) for found, where in cells]
+    for kind, name_and_file in (pair for of_rank in comm.allgather(own) for pair in of_rank):
+        kinds.setdefault(kind, name_and_file)
     if not kinds:
         raise InputError(
             "the mesh has no physical groups of cells; give the bodies (3D: volumes, 2D: "
             "surfaces) and the surfaces physical groups in gmsh"
         )
     if len(kinds) > 1:
-        found = " and ".join(f"{name!r} in {where}" for _, (name, where) in sorted(kinds.items()))
-        raise InputError(f"cells of several types, {found}; expected one type of cell")
+        text = " and ".join(f"{name!r} in {where}" for _, (name, where) in sorted(kinds.items()))
+        raise InputError(f"cells of several types, {text}; expected one type of cell")
     ((kind, (name, _)),) = kinds.items()
     if kind not in CELLS:
         raise InputError(
@@ -354,12 +339,12 @@ def read_gmsh(
                 if comm.rank == 0:
                     with open_model(source) as model:
                         contents.append(read_content(model, "the mesh"))
-        untorn, partitions = untorn_mesh(contents, comm, shared=files is not None)
+        untorn, partitions = untorn_mesh(contents, comm, shared=bool(files))
         if subdomains is None:
             subdomains = default_count(untorn, comm) if partitions is None else partitions
         # METIS needs the mesh on one rank
         partitioner = coordinate_bisection if files else metis
         subdomain = assign_subdomains(untorn, subdomains, comm, partitioner)
-        bisected = files is not None and isinstance(subdomains, (int, np.integer))
+        bisected = bool(files) and isinstance(subdomains, (int, np.integer))
         decomposition = tear(untorn, subdomain, comm, absorb=bisected)
     return replace(decomposition, seconds=seconds)

@@ -72,8 +72,7 @@ class _Halves(NamedTuple):
     Attributes:
         wanted: Number of points on the left, shape ``(p,)``.
         may: By how many points that may change, shape ``(p,)``.
-        axes: The axes, the one that is cut across first, then those that ties are broken by, shape
-            ``(p, gdim)``.
+        axes: The axis that is cut across first, then those that ties are broken by, ``(p, gdim)``.
         gap: Distance of layers along these axes, shape ``(p, gdim)``; -1 in parts without flat
             cells; None if there are none at all.
     """
@@ -269,15 +268,9 @@ def split_disconnected(
 ) -> tuple[Array, dict[int, list[int]]]:
     """Give the pieces of a subdomain ids of their own. Collective.
 
-    The largest piece keeps the id, the others get ids after the last.
-
-    Args:
-        mesh: Cells on the ranks of their subdomains.
-        subdomain: Their subdomains.
-        comm: Communicator.
-
-    Returns:
-        The subdomains after the split, and for each that was split its new ids.
+    Cells are on the ranks of their subdomains. The largest piece keeps the id, the others get ids
+    after the last. Return the subdomains of the cells after the split, and for each that was
+    split its new ids.
     """
     pieces = _pieces(mesh, subdomain)
     new = pieces.order[~pieces.is_main[pieces.order]]
@@ -295,14 +288,7 @@ def absorb_fragments(mesh: UntornMesh, subdomain: Array, comm: MPI.Intracomm) ->
     """Let the smaller pieces of a subdomain join the neighbour they share most facets with.
 
     Collective. Only main pieces of other subdomains take fragments in; what finds none stays.
-
-    Args:
-        mesh: Cells on the ranks of their subdomains.
-        subdomain: Their subdomains.
-        comm: Communicator.
-
-    Returns:
-        The new subdomains of the cells.
+    Return the new subdomains of the cells.
     """
     pieces = _pieces(mesh, subdomain)
     main = pieces.is_main[pieces.of_cell]
@@ -326,10 +312,10 @@ def absorb_fragments(mesh: UntornMesh, subdomain: Array, comm: MPI.Intracomm) ->
 
 
 def default_count(mesh: UntornMesh, comm: MPI.Intracomm) -> int:
-    """Return number of subdomains that leaves each about 4000 displacement unknowns. Collective."""
+    """Return the number of subdomains of about 4000 displacement unknowns each. Collective."""
     per_cell = {"triangle": 0.5, "tetrahedron": 0.2}.get(mesh.cell_type.name, 1.0)
-    unknowns = comm.allreduce(len(mesh.cells)) * per_cell * mesh.gdim * mesh.degree**mesh.gdim
-    return max(1, round(unknowns / PARTITION.unknowns))
+    per_cell *= mesh.gdim * mesh.element.degree**mesh.gdim
+    return max(1, round(comm.allreduce(len(mesh.cells)) * per_cell / PARTITION.unknowns))
 
 
 def assign_subdomains(
@@ -401,5 +387,5 @@ def coordinate_bisection(mesh: UntornMesh, num_parts: int, comm: MPI.Intracomm) 
 
     The parts depend on the cells' vertices only, not on how ranks share the cells.
     """
-    part = bisect_points(mesh.midpoints(), num_parts, comm, mesh.extents())
+    part = bisect_points(mesh.midpoints(), num_parts, comm, np.ptp(mesh.corners(), axis=1))
     return without_holes(part, comm)

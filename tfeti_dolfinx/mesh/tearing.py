@@ -57,14 +57,8 @@ def redistribute(
 ) -> tuple[UntornMesh, Array]:
     """Send every cell to the rank of its subdomain. Collective.
 
-    Args:
-        mesh: This rank's share of the untorn mesh.
-        subdomain: Subdomain of each local cell, shape ``(n,)``.
-        comm: Communicator.
-
-    Returns:
-        The share after the move, cells sorted by subdomain and then original id, and their
-        subdomains.
+    Return the share after the move, cells sorted by subdomain and then original id, and their
+    subdomains, shape ``(n,)`` as before.
     """
     num = comm.allreduce(int(subdomain.max(initial=-1)), op=MPI.MAX) + 1
     terms = np.column_stack((np.ones(len(subdomain)), mesh.midpoints()))

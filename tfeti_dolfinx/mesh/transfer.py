@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -49,16 +50,9 @@ class CellExchange:
 
 
 def check_function(f: Any, mesh: dmesh.Mesh, name: str, expected: str) -> None:
-    """Raise unless the unknowns of f in a cell of the mesh are those of a cell like it.
+    """Raise an InputError unless f is a function on a mesh whose unknowns are values.
 
-    Args:
-        f: What was given.
-        mesh: The mesh that it must be on.
-        name: Its name in messages.
-        expected: The mesh in messages.
-
-    Raises:
-        InputError: It is no function, on another mesh, or has unknowns that are not values.
+    Those of a cell are then those of a cell like it. ``name`` and ``expected`` are for messages.
     """
     checked_type(f, fem.Function, name, f"a dolfinx.fem.Function on {expected}")
     if f.function_space.mesh._cpp_object is not mesh._cpp_object:
@@ -70,33 +64,31 @@ def check_function(f: Any, mesh: dmesh.Mesh, name: str, expected: str) -> None:
         )
 
 
-def cell_values(f: fem.Function) -> Array:
-    """Return the unknowns of a function in each owned cell, shape ``(n, m, bs)``. Collective."""
-    V, values = f.function_space, f.copy().x
-    values.scatter_forward()
-    return values.array.reshape(-1, V.dofmap.bs)[_owned_dofs(V)]
+def carried(
+    given: fem.Function, mesh: dmesh.Mesh, exchange: Callable[[Array], Array]
+) -> fem.Function:
+    """Return a function on the other mesh, in a space of the same element. Collective.
 
-
-def from_cell_values(V: fem.FunctionSpace, values: Array, name: str) -> fem.Function:
-    """Return the function with these unknowns in the cells, or their means. Collective.
-
-    Args:
-        V: Its space.
-        values: Unknowns in each owned cell, shape ``(n, m, bs)``.
-        name: Its name.
+    The exchange takes rows of its cells to those of the other mesh, where the result has the same
+    unknowns in the cells, or their means.
     """
-    f, apart, number = (fem.Function(V, dtype=values.dtype) for _ in range(3))
-    x, sums, counts = (g.x.array.reshape(-1, V.dofmap.bs) for g in (f, apart, number))
-    dofs = _owned_dofs(V)
+    g = given.collapse() if given.function_space.component() else given
+    V, source = g.function_space, g.copy().x
+    source.scatter_forward()
+    values = exchange(source.array.reshape(-1, V.dofmap.bs)[_owned_dofs(V)])
+    W = fem.functionspace(mesh, V.ufl_element())
+    f, apart, number = (fem.Function(W, dtype=values.dtype) for _ in range(3))
+    x, sums, counts = (h.x.array.reshape(-1, W.dofmap.bs) for h in (f, apart, number))
+    dofs = _owned_dofs(W)
     x[dofs] = values
     f.x.scatter_forward()
     np.add.at(sums, dofs, values - x[dofs])  # 0 but for rounding where f is continuous
     np.add.at(counts, dofs, 1.0)
-    for g in (apart, number):
-        g.x.scatter_reverse(la.InsertMode.add)
-        g.x.scatter_forward()
+    for h in (apart, number):
+        h.x.scatter_reverse(la.InsertMode.add)
+        h.x.scatter_forward()
     x += sums / counts
-    f.name = name
+    f.name = given.name
     return f
 
 

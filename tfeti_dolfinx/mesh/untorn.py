@@ -51,15 +51,7 @@ def facet_vertices(cell_type: dmesh.CellType) -> Array:
 
 
 def facet_keys(cells: Array, cell_type: dmesh.CellType) -> Array:
-    """Return keys of all facets of the cells.
-
-    Args:
-        cells: Node ids, vertices first, shape ``(n, nodes_per_cell)``.
-        cell_type: Type of the cells.
-
-    Returns:
-        Keys, shape ``(n, num_facets)``.
-    """
+    """Return keys of all facets of cells, from their node ids, vertices first, ``(n, facets)``."""
     mixed = mix(cells[:, : len(cell_entities(cell_type, 0))])
     return mixed[:, facet_vertices(cell_type)].sum(axis=-1, dtype=np.uint64)
 
@@ -128,24 +120,16 @@ class UntornMesh:
         return self.x.shape[1]
 
     @property
-    def degree(self) -> int:
-        """Polynomial degree of the geometry."""
-        return int(self.element.degree)
-
-    @property
     def num_vertices(self) -> int:
         """Vertices of a cell."""
         return len(cell_entities(self.cell_type, 0))
 
     def midpoints(self) -> Array:
         """Mean of each cell's vertices, shape ``(n, gdim)``."""
-        return self._corners().mean(axis=1)
+        return self.corners().mean(axis=1)
 
-    def extents(self) -> Array:
-        """Sides of the box around each cell's vertices, shape ``(n, gdim)``."""
-        return np.ptp(self._corners(), axis=1)
-
-    def _corners(self) -> Array:
+    def corners(self) -> Array:
+        """Vertices of each cell, shape ``(n, vertices, gdim)``."""
         vertices = np.searchsorted(self.node_ids, self.cells[:, : self.num_vertices])
         return self.x[vertices]
 

@@ -228,7 +228,7 @@ def with_averaged_normals(
     """
     groups = facets.groups[:, :num_vertices]
     weighted = facets.vertex_normals * facets.area[:, None, None]
-    total = dofs.add_on_owners(groups.ravel(), weighted.reshape(-1, weighted.shape[2]))
+    total = dofs.reduce_on_owners(groups.ravel(), weighted.reshape(-1, weighted.shape[2]))
     length = np.linalg.norm(total, axis=1, keepdims=True)
     averaged = total / np.where(length > 0.0, length, 1.0)
     (at_vertices,) = dofs.lookup(groups.ravel(), averaged)

@@ -8,7 +8,7 @@ import json
 import os
 import re
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -21,7 +21,7 @@ from tfeti_dolfinx.common.validation import checked_type, named
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.solution import SavedState
 
-INDEX, RECORDS, VERSION = "checkpoint.json", "records.jsonl", 3
+INDEX, RECORDS, VERSION = "checkpoint.json", "records.jsonl", 4
 KIND = "checkpoint of tfeti_dolfinx"
 OF_STEP = re.compile(
     r"(?P<kind>state|fields)_(?P<number>[1-9]\d*)_(?P<rank>0|[1-9]\d*)\.npz(?P<partial>\.partial)?"
@@ -30,14 +30,12 @@ OF_STEP = re.compile(
 
 @dataclass(frozen=True)
 class Index:
-    """Content of ``checkpoint.json``: the files that count, and their checksums.
+    """Content of ``checkpoint.json``: the step that counts.
 
     Attributes:
         number: How many steps have converged; 0: the folder is taken, nothing is kept yet.
         ranks: Number of ranks.
         states: Checksum of the state's file of each rank.
-        records_length: How many bytes of ``records.jsonl`` count.
-        records_checksum: Their checksum.
         digest: Describes what the user has given, see ``Checkpoint.write``.
         about: What else is kept.
         kind: The mark of a folder that a checkpoint owns.
@@ -47,8 +45,6 @@ class Index:
     number: int
     ranks: int
     states: list[str] = field(default_factory=list)
-    records_length: int = 0
-    records_checksum: str = ""
     digest: Any = ""
     about: dict[str, Any] = field(default_factory=dict)
     kind: str = KIND
@@ -56,14 +52,10 @@ class Index:
 
     def owns(self, file: Path) -> bool:
         """Return whether the checkpoint writes a file of this name up to the next step."""
-        if not file.is_file():
-            return False
         found = OF_STEP.fullmatch(file.name)
-        if found is None:
-            return file.name in (INDEX, f"{INDEX}.partial", RECORDS)
-        first = max(self.number - 1, 1) if found["kind"] == "state" else 1
-        of_series = first <= int(found["number"]) <= self.number + 1
-        return of_series and int(found["rank"]) < self.ranks
+        if not file.is_file() or found is None:
+            return file.is_file() and file.name in (INDEX, f"{INDEX}.partial", RECORDS)
+        return int(found["number"]) <= self.number + 1 and int(found["rank"]) < self.ranks
 
     def counts(self, file: Path) -> bool:
         """Return whether an own file is one of those that the next run reads."""
@@ -80,16 +72,14 @@ class Kept:
     """Content of a checkpoint of a series, the same on all ranks.
 
     Attributes:
-        number: How many steps have converged.
-        records: The record of each.
-        about: What ``Checkpoint.write`` was given last.
-        digest: Likewise.
+        index: The step that counts.
+        records: The record of each step.
+        fields: Checksums of the fields' files of all ranks, of each step; empty where none are.
     """
 
-    number: int
+    index: Index
     records: list[dict[str, Any]]
-    about: dict[str, Any]
-    digest: Any
+    fields: list[list[str]]
 
 
 class Checkpoint:
@@ -97,9 +87,9 @@ class Checkpoint:
 
     Each rank writes its arrays to a file of its own, with the number of the step in its name.
     The record of the step is a line at the end of ``records.jsonl``, with the checksums of its
-    fields. When all are whole, ``checkpoint.json`` takes that number, and the checksums of states
-    and lines: it is written aside and renamed, so it names whole files at any time, and a line
-    that is torn lies beyond what counts. Then the state of the step before goes. What a step
+    fields. When all are whole, ``checkpoint.json`` takes that number, and the checksums of states:
+    it is written aside and renamed, so it names whole files at any time, and a line that is torn
+    lies beyond the lines of so many steps. Then the state of the step before goes. What a step
     writes does not grow with their number.
 
     The folder is the checkpoint's own. ``checkpoint.json`` marks it before anything else is
@@ -117,9 +107,6 @@ class Checkpoint:
         checked_type(path, (str, os.PathLike), "checkpoint", "the name of a folder")
         self.path, self._comm = Path(path), comm
         self._index = Index(0, comm.size)  # rank 0's counts
-        self._lines = _hash()  # of the records that count, likewise
-        self._states: list[str] = []  # checksums of all ranks at the step that was read
-        self._fields: list[list[str]] = []  # of all steps and ranks, likewise
         with raised_on_all_ranks(comm), named(f"checkpoint {self.path}", OSError):
             if comm.rank == 0:
                 self._index = self._checked_folder()
@@ -128,8 +115,7 @@ class Checkpoint:
     def held(self) -> Iterator[None]:
         """Keep other runs out of the folder inside the block, while this process lives.
 
-        Raises:
-            InputError: Another run has it, or it is no folder for a checkpoint.
+        Raise an InputError where another run has it, or it is no folder for a checkpoint.
         """
         lock = None
         with raised_on_all_ranks(self._comm), named(f"checkpoint {self.path}", OSError):
@@ -152,32 +138,37 @@ class Checkpoint:
                     if self._index.owns(file) and file.name != INDEX:
                         file.unlink()
                 self._commit(Index(0, self._comm.size))  # until here it says what is to go
-        self._lines = _hash()
 
     def read(self) -> Kept | None:
         """Return what was written last, on all ranks; None if there is nothing. It is held.
 
-        What a run that was killed has left beside it is removed.
-
-        Raises:
-            InputError: It is damaged, or was written on another number of ranks.
+        What a run that was killed has left beside it is removed. Raise an InputError where it is
+        damaged, or was written on another number of ranks.
         """
         kept: Kept | None = None
-        comm = self._comm
-        with raised_on_all_ranks(comm), named(f"cannot read {self.path}", OSError):
-            if comm.rank == 0:
-                index = self._index
-                if index.number:
-                    self._check_ranks()
-                    records = [json.loads(line) for line in self._read_lines()]
-                    self._fields = [record.pop("fields") for record in records]
-                    self._states = index.states
-                    kept = Kept(index.number, records, index.about, index.digest)
-                    for file in self.path.iterdir():
-                        if index.owns(file) and not index.counts(file):
-                            file.unlink()
-        self._states, self._fields = comm.bcast((self._states, self._fields), root=0)
-        return comm.bcast(kept, root=0)
+        with raised_on_all_ranks(self._comm), named(f"cannot read {self.path}", OSError):
+            if self._comm.rank == 0 and self._index.number:
+                kept = self._read()
+                for file in self.path.iterdir():
+                    if self._index.owns(file) and not self._index.counts(file):
+                        file.unlink()
+        return self._comm.bcast(kept, root=0)
+
+    def _read(self) -> Kept:
+        """Return what rank 0 reads; what lies beyond the lines that count goes."""
+        index, file = self._index, self.path / RECORDS
+        if index.ranks != self._comm.size:
+            raise InputError(
+                f"{self.path} was written on {index.ranks} ranks, this run has "
+                f"{self._comm.size}; expected the same number"
+            )
+        lines = file.read_bytes().splitlines(keepends=True)[: index.number]
+        found = [_unsealed(line, file, INDEX) for line in lines]
+        if len(found) < index.number:
+            raise damaged(file, INDEX)
+        os.truncate(file, sum(len(line) for line in lines))
+        fields = [record.pop("fields") for record in found]
+        return Kept(index, found, fields)
 
     def write(
         self,
@@ -210,47 +201,35 @@ class Checkpoint:
         checksums = comm.gather((in_state, in_fields), root=0)
         with raised_on_all_ranks(comm), named(f"cannot write {self.path}", OSError):
             if checksums is not None:  # on rank 0
-                states, of_fields = zip(*checksums, strict=True)
-                text = json.dumps({**record, "fields": of_fields if fields else []})
-                line, lines, before = f"{text}\n".encode(), self._lines.copy(), self._index
-                lines.update(line)
-                self._append(line)
-                self._commit(
-                    Index(
-                        number,
-                        comm.size,
-                        list(states),
-                        before.records_length + len(line),
-                        lines.hexdigest(),
-                        digest,
-                        dict(about),
-                    )
-                )
-                self._lines = lines
+                states, of_fields = (list(column) for column in zip(*checksums, strict=True))
+                before = self._index
+                with (self.path / RECORDS).open("ab") as file:
+                    file.write(_sealed({**record, "fields": of_fields if fields else []}))
+                    _settle(file)
+                self._commit(Index(number, comm.size, states, digest, dict(about)))
                 for rank in range(len(before.states)):
                     (self.path / f"state_{before.number}_{rank}.npz").unlink(missing_ok=True)
 
-    def read_state(self, number: int) -> SavedState:
+    def read_state(self, kept: Kept) -> SavedState:
         """Return the state of this rank at the step that ``read`` found.
 
-        Raises:
-            InputError: It is not what was written.
+        Raise an InputError where it is not what was written.
         """
-        return SavedState(**self._load(f"state_{number}_{self._comm.rank}.npz", self._states))
+        index = kept.index
+        return SavedState(**self._load("state", index.number, index.states, INDEX))
 
-    def read_fields(self, number: int) -> dict[str, Array]:
+    def read_fields(self, kept: Kept, number: int) -> dict[str, Array]:
         """Return the fields of a step, of those that ``read`` found, on this rank.
 
-        Raises:
-            InputError: They are not what was written, or there are none.
+        Raise an InputError where they are not what was written, or there are none.
         """
-        checksums = self._fields[number - 1]
+        checksums = kept.fields[number - 1]
         if not checksums:
             raise InputError(
                 f"checkpoint {self.path} has no fields of step {number}; expected path= as in "
                 "the run that has written it"
             )
-        return self._load(f"fields_{number}_{self._comm.rank}.npz", checksums)
+        return self._load("fields", number, checksums, RECORDS)
 
     def _save(self, name: str, arrays: Mapping[str, Array]) -> str:
         """Write arrays; return the checksum of the file's bytes."""
@@ -271,89 +250,58 @@ class Checkpoint:
             raise
         os.replace(partial, self.path / name)
 
-    def _load(self, name: str, checksums: list[str]) -> dict[str, Array]:
+    def _load(self, kind: str, number: int, checksums: list[str], where: str) -> dict[str, Array]:
         """Return arrays of this rank; nothing looks into a file that is not as it was written."""
-        file = self.path / name
+        file = self.path / f"{kind}_{number}_{self._comm.rank}.npz"
         with raised_on_all_ranks(self._comm), named(f"cannot read {file}", OSError):
             if _checksum_in(file) != checksums[self._comm.rank]:
-                raise damaged(file, INDEX if checksums is self._states else RECORDS)
+                raise damaged(file, where)
             with np.load(file) as contents:
                 arrays = dict(contents)
         return arrays
 
-    def _append(self, line: bytes) -> None:
-        """Put a line after those that count; what lies beyond them goes."""
-        with (self.path / RECORDS).open("ab") as file:
-            file.truncate(self._index.records_length)
-            file.write(line)
-            _settle(file)
-
-    def _read_lines(self) -> list[bytes]:
-        with (self.path / RECORDS).open("rb") as file:
-            text = file.read(self._index.records_length)
-        self._lines = _hash(text)
-        if self._lines.hexdigest() != self._index.records_checksum:
-            raise damaged(self.path / RECORDS, INDEX)
-        return text.splitlines()
-
     def _commit(self, index: Index) -> None:
         """Let an index count."""
-        text = asdict(index)
-        text["checksum"] = _checksum_of(text)
         with self._replaced(INDEX) as file:
-            file.write(f"{json.dumps(text, indent=1)}\n".encode())
+            file.write(_sealed(asdict(index)))
         self._index = index
 
     def _checked_folder(self) -> Index:
-        """Return the index of the folder, or one of nothing.
-
-        Raises:
-            InputError: The folder is none, or has anything that the checkpoint has not written.
-        """
+        """Return the index of the folder, or one of nothing; raise where there is anything else."""
         what = f"checkpoint {self.path}"
         if self.path.exists() and not self.path.is_dir():
             raise InputError(f"{what} is a file; expected the name of a folder")
         files = sorted(self.path.iterdir()) if self.path.is_dir() else []
-        marked = self.path / INDEX in files
-        index = self._read_index() if marked else None
+        index = self._read_index() if self.path / INDEX in files else None
         others = [f.name for f in files if index is None or not index.owns(f)]
         if others:
             raise InputError(
                 f"{what} is a folder with other files, {others[0]!r}; "
                 "expected a new or empty one, or one with a checkpoint and nothing else"
             )
-        return Index(0, self._comm.size) if index is None else index
+        return index or Index(0, self._comm.size)
 
     def _read_index(self) -> Index:
         file = self.path / INDEX
         try:
-            found = json.loads(file.read_text())
+            found = json.loads(text := file.read_bytes())
         except (ValueError, RecursionError) as error:
             raise damaged(file, "it") from error
-        if isinstance(found, dict) and found.get("version") in (1, 2):
+        if isinstance(found, dict) and found.get("version") in range(1, VERSION):
             raise InputError(
-                f"checkpoint {self.path} is of an earlier version of the package, "
-                "without checksums; expected one of this version: finish the series with that "
-                "one, or name another folder"
+                f"checkpoint {self.path} is of an earlier version of the package; "
+                "expected one of this version: finish the series with that one, or name another "
+                "folder"
             )
         if not isinstance(found, dict) or found.get("kind") != KIND:
             raise InputError(
                 f"{file} is not that of a checkpoint, or damaged; expected the folder as it was "
                 "left, or another one"
             )
-        checksum = found.pop("checksum", None)
-        if checksum != _checksum_of(found):
-            raise damaged(file, "it")
+        found = _unsealed(text, file, "it")
         if found["version"] != VERSION:
             raise InputError(f"{file} is of version {found['version']}; expected {VERSION}")
         return Index(**found)
-
-    def _check_ranks(self) -> None:
-        if self._index.ranks != self._comm.size:
-            raise InputError(
-                f"{self.path} was written on {self._index.ranks} ranks, this run has "
-                f"{self._comm.size}; expected the same number"
-            )
 
 
 def damaged(file: Path, where: str) -> InputError:
@@ -389,8 +337,20 @@ def _checksum_in(file: Path) -> str:
         return hashlib.file_digest(opened, _hash).hexdigest()
 
 
-def _checksum_of(index: Mapping[str, Any]) -> str:
-    return str(_hash(json.dumps(index, sort_keys=True).encode()).hexdigest())
+def _sealed(content: Mapping[str, Any]) -> bytes:
+    """Return a line of JSON, the checksum of the content at its end."""
+    checksum = _hash(json.dumps(content).encode()).hexdigest()
+    return f"{json.dumps({**content, 'checksum': checksum})}\n".encode()
+
+
+def _unsealed(line: bytes, file: Path, where: str) -> dict[str, Any]:
+    """Return the content of a line that ``_sealed`` has made; raise if the file is damaged."""
+    with suppress(ValueError, RecursionError, AttributeError, KeyError, TypeError):
+        found: dict[str, Any] = json.loads(line)
+        checksum = found.pop("checksum")
+        if checksum == _hash(json.dumps(found).encode()).hexdigest():
+            return found
+    raise damaged(file, where)
 
 
 def _settle(file: BinaryIO) -> None:

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise, zip_longest
-from pathlib import Path
 from typing import Any
 
 import dolfinx
@@ -50,10 +49,8 @@ from tfeti_dolfinx.steps.checkpoint import Checkpoint
 
 # --- Place in a series of halved steps --------------------------------------------------------
 
-# whole numbers of the smallest parts are exact in a double, and parts of any real step differ
+# shares of a step are exact in a double, and parts of any real step differ
 MOST_HALVINGS = 30
-# of the shortest step: times that are the same but for rounding, as of a longer ``linspace``
-SAME_TIME = 1e-6
 
 
 @dataclass(frozen=True)
@@ -62,47 +59,33 @@ class Place:
 
     Attributes:
         number: The step.
-        done: What of it is done, of 2^30 parts.
+        done: Share of it that is done, a multiple of 2^-level.
         level: How often it is halved now.
     """
 
     number: int = 0
-    done: int = 0
+    done: float = 0.0
     level: int = 0
-
-    @property
-    def _part(self) -> int:
-        return 2 ** (MOST_HALVINGS - self.level)
 
     def ahead(self) -> Place:
         """After a part that has converged: the next is as long as its place allows."""
-        done, level = self.done + self._part, self.level
-        if done == 2**MOST_HALVINGS:
+        done, level = self.done + 0.5**self.level, self.level
+        if done == 1.0:
             return Place(self.number + 1)
-        while level and done % 2 ** (MOST_HALVINGS - level + 1) == 0:
+        while (done * 2 ** (level - 1)).is_integer():
             level -= 1
         return Place(self.number, done, level)
 
-    def begin(self, times: Sequence[float]) -> float:
-        """Return the begin of the part; ``times`` starts with the begin of the first step."""
-        return _between(times[self.number], times[self.number + 1], self.done)
-
-    def end(self, times: Sequence[float]) -> float:
-        """Return the end of the part."""
-        return _between(times[self.number], times[self.number + 1], self.done + self._part)
-
-
-def _between(begin: float, end: float, done: int) -> float:
-    share = done / 2**MOST_HALVINGS
-    return end if share == 1.0 else begin + share * (end - begin)
+    def part(self, times: Sequence[float]) -> tuple[float, float]:
+        """Return begin and end of the part; ``times`` starts with the begin of the first step."""
+        begin, end = times[self.number], times[self.number + 1]
+        after = self.done + 0.5**self.level
+        last = end if after == 1.0 else begin + after * (end - begin)
+        return begin + self.done * (end - begin), last
 
 
 def checked_times(begin: float, times: Sequence[float]) -> list[float]:
-    """Return the begin and all times, increasing.
-
-    Raises:
-        InputError: They are no such numbers.
-    """
+    """Return the begin and all times; raise an InputError unless these are increasing numbers."""
     if isinstance(times, (str, bytes)) or not np.iterable(times):
         raise InputError(f"times is {shown(times)}; expected a list of increasing numbers")
     first = checked_number(begin, "begin")
@@ -124,36 +107,31 @@ def checked_times(begin: float, times: Sequence[float]) -> list[float]:
 Show = Callable[[float, str], None]
 
 
-def silent(share: float, text: str) -> None:
-    """Show nothing."""
-
-
 @contextmanager
 def shown_progress(comm: MPI.Intracomm, wanted: bool | None) -> Iterator[Show]:
-    """Return a function that shows the progress of a series. Not collective.
+    """Return a function that shows the progress of a series, on rank 0 only. Not collective.
 
-    Args:
-        comm: Communicator; only rank 0 shows anything.
-        wanted: None: where rank 0's standard error is a terminal, and rich is there.
+    Where nothing is wanted or refused: if standard error is a terminal, and rich is there.
     """
     if comm.rank != 0 or wanted is False or (wanted is None and not sys.stderr.isatty()):
-        yield silent
+        yield lambda share, text: None
         return
     try:
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
     except ImportError:  # it is optional
-        yield _say if wanted else silent
+
+        def say(share: float, text: str) -> None:
+            if wanted:
+                print(f"load steps {100 * share:3.0f} %: {text}", file=sys.stderr, flush=True)
+
+        yield say
         return
     said = TextColumn("{task.fields[said]}")
     columns = (TextColumn("load steps"), BarColumn(), TimeElapsedColumn(), said)
     with Progress(*columns, console=Console(stderr=True)) as bar:
         task = bar.add_task("", total=1.0, said="")
         yield lambda share, text: bar.update(task, completed=share, said=text, refresh=True)
-
-
-def _say(share: float, text: str) -> None:
-    print(f"load steps {100 * share:3.0f} %: {text}", file=sys.stderr, flush=True)
 
 
 # --- Output of all load steps in one file -----------------------------------------------------
@@ -164,16 +142,14 @@ POINTS = "points of the mesh"
 class Series:
     """Nodal fields of steps, and cell fields beside them. Creation and all methods are collective.
 
-    Files are written under names with ``.partial`` at the end; ``close`` gives them theirs.
+    Files are written under names with ``.partial`` at the end; ``close`` gives them theirs. An
+    InputError is raised where a name does not fit, or nothing can be written there.
 
     Args:
         path: A name that ends with ``.bp``; cell fields go to ``<stem>_cells.bp``.
         solution: A solution of the problem: its mesh and which fields there are.
         interior: Whether the fields of ``solution.interior`` are written, too: those of cells at
             each step, other cell fields are always the same.
-
-    Raises:
-        InputError: The name does not fit, or nothing can be written there.
     """
 
     def __init__(
@@ -183,16 +159,19 @@ class Series:
         self._names = [target, target.with_name(f"{target.stem}_cells.bp")]
         self._mesh = solution.decomposition.mesh
         of_nodes, of_cells = solution.interior.fields if interior else ([], [])
-        self._fields = [_copy(f) for f in nodal_fields(solution) + of_nodes]
-        self._in_cells = [_copy(f) for f in of_cells]
+        nodal, cellwise = (
+            [fem.Function(f.function_space, name=f.name) for f in fields]
+            for fields in (nodal_fields(solution) + of_nodes, of_cells)
+        )
+        self._functions = nodal + cellwise
         self._count, self._ended = 0, False
         self._files: list[VtxFile] = []
-        contents = (self._fields, cell_fields(solution) + self._in_cells)
+        contents = (nodal, cell_fields(solution) + cellwise)
         try:
             for name, functions in zip(self._names, contents, strict=True):
                 self._files.append(VtxFile(name, functions))
-            self._growing = self._files if self._in_cells else self._files[:1]
-            if not self._in_cells:
+            self._growing = self._files if cellwise else self._files[:1]
+            if not cellwise:
                 self._files[1].write(0.0)
                 self._files[1].close()
         except TfetiError:  # on all ranks
@@ -202,13 +181,12 @@ class Series:
     def write(self, time: float, values: dict[str, Array]) -> None:
         """Add a step from what ``fields_of`` returned for it, in this run or an earlier one.
 
-        Raises:
-            InputError: A field is not there, as where an earlier run wrote fewer; or the files
-                cannot be written: then they end, whole, with the step before, under the names
-                that they have until ``close``.
+        Raise an InputError where a field is not there, as of an earlier run that wrote fewer, or
+        the files cannot be written: then they end, whole, with the step before, under the names
+        that they have until ``close``.
         """
         points = self._mesh.geometry.x.copy()
-        for function in self._fields + self._in_cells:
+        for function in self._functions:
             if function.name not in values:
                 raise InputError(
                     f"the step at {time:.6g} of the checkpoint has no field {function.name}; "
@@ -220,40 +198,35 @@ class Series:
             for file in self._growing:
                 file.write(time)
         except TfetiError as error:  # on all ranks
-            self._end(error)
+            self._ended = True
+            if not self._count:
+                self.drop()
+                raise
+            for file in self._files:
+                with suppress(TfetiError):
+                    file.close()
+            error.add_note(
+                f"the {self._count} steps before are in {self._files[0].partial}; "
+                f"{self._names[0]} is as it was"
+            )
             raise
         finally:
             self._mesh.geometry.x[:] = points
         self._count += 1
 
-    def close(self) -> list[Path]:
-        """Give the files their names; which they are. None where they could not be written."""
+    def close(self) -> None:
+        """Give the files their names, but not where they could not be written."""
         if self._ended:
-            return []
+            return
         for file in self._files:
             file.close()
         for file in self._files:
             file.appear()
-        return self._names
 
     def drop(self) -> None:
         """Remove the files under the names that they have until ``close``."""
         for file in self._files:
             file.drop()
-
-    def _end(self, error: TfetiError) -> None:
-        """Keep the steps before one that cannot be written, and say where they are."""
-        self._ended = True
-        if not self._count:
-            self.drop()
-            return
-        for file in self._files:
-            with suppress(TfetiError):
-                file.close()
-        here = self._files[0].partial
-        error.add_note(
-            f"the {self._count} steps before are in {here}; {self._names[0]} is as it was"
-        )
 
 
 def fields_of(solution: Solution, interior: bool = False) -> dict[str, Array]:
@@ -262,10 +235,6 @@ def fields_of(solution: Solution, interior: bool = False) -> dict[str, Array]:
     fields = nodal_fields(solution) + of_nodes + of_cells
     values = {f.name: np.array(f.x.array) for f in fields}
     return {**values, POINTS: np.array(solution.decomposition.mesh.geometry.x)}
-
-
-def _copy(function: fem.Function) -> fem.Function:
-    return fem.Function(function.function_space, name=function.name)
 
 
 # --- The series of load steps -----------------------------------------------------------------
@@ -387,7 +356,9 @@ class LoadSteps:
             given["resume"] = bool(resume)
             if resume and self._checkpoint is None:
                 raise InputError("resume=True: expected LoadSteps(..., checkpoint=) too")
-        self._drop()
+        if self._series is not None:  # that an error of the user's has ended
+            self._series.drop()
+            self._series = None
         with nullcontext() if self._checkpoint is None else self._checkpoint.held():
             place = self._begin(resume)
             try:
@@ -435,60 +406,54 @@ class LoadSteps:
         end_file(partial, target, self._comm)
 
     def _steps(self, place: Place, show: Show) -> None:
-        while place.number < len(self._times) - 1:
-            t = place.end(self._times)
-            show(place.number / (len(self._times) - 1), f"t = {t:.6g}")
+        problem, times = self._problem, self._times
+        while place.number < len(times) - 1:
+            begin, t = place.part(times)
+            show(place.number / (len(times) - 1), f"t = {t:.6g}")
             try:
-                self._solve(t, place)
-            except ConvergenceError as error:
-                place = self._halved(place, t, error)
-            else:
-                self._problem.accept()
-                size = t - place.begin(self._times)
-                self.records.append(self._record(place.number, t, size))
-                place = place.ahead()
-                self._keep(place, t)
+                problem.take_step(t - begin)
+                self._set(t)
+                problem.solve()
+                reason = problem.report.converged_reason
+                if not reason.startswith("CONVERGED"):  # options let it be
+                    raise ConvergenceError(f"the dual solver stopped: {reason}")
+            except TfetiError as error:
+                error.add_note(f"load step {place.number}, t = {t:.6g}")
+                if not isinstance(error, ConvergenceError):
+                    raise
+                problem.go_back()
+                if place.level >= self._max_halvings:
+                    raise ConvergenceError(
+                        f"load step {place.number}, from t = {begin:.9g} to {t:.9g}, does not "
+                        f"converge, halved {place.level} times "
+                        f"(max_halvings={self._max_halvings}): {error}"
+                    ) from error
+                place = replace(place, level=place.level + 1)
+                continue
+            problem.accept()
+            self.records.append(self._record(place.number, t, t - begin))
+            place = place.ahead()
+            self._keep(place, t)
         show(1.0, "done")
-
-    def _solve(self, t: float, place: Place) -> None:
-        problem = self._problem
-        try:
-            problem.take_step(t - place.begin(self._times))
-            self._set(t)
-            problem.solve()
-        except TfetiError as error:
-            error.add_note(f"load step {place.number}, t = {t:.6g}")
-            raise
-        reason = problem.report.converged_reason
-        if not reason.startswith("CONVERGED"):  # options let it be
-            raise ConvergenceError(f"the dual solver stopped: {reason}")
 
     def _set(self, t: float) -> None:
         with agreeing(self._comm, "apply"):
             self._apply(self._problem, t)
 
-    def _halved(self, place: Place, t: float, error: ConvergenceError) -> Place:
-        """Go back to the last accepted step, and halve the next one."""
-        self._problem.go_back()
-        if place.level >= self._max_halvings:
-            begin = place.begin(self._times)
-            raise ConvergenceError(
-                f"load step {place.number}, from t = {begin:.9g} to {t:.9g}, does not converge, "
-                f"halved {place.level} times (max_halvings={self._max_halvings}): {error}"
-            ) from error
-        return replace(place, level=place.level + 1)
-
     def _record(self, number: int, t: float, size: float) -> StepRecord:
         report = self._problem.report
-        figures = {
-            name: value for name, value in asdict(report).items() if isinstance(value, (int, str))
-        }
-        lost = float(np.sum(self._problem.solution.dissipation))
-        total = self._comm.allreduce(lost)
-        residuals, seconds = dict(report.residuals), report.seconds["total"]
-        forces = self._problem.solution.resultant_forces
-        moving = dict(report.motion), forces
-        return StepRecord(number, t, size, total, figures, residuals, seconds, *moving)
+        lost = self._comm.allreduce(float(np.sum(self._problem.solution.dissipation)))
+        return StepRecord(
+            number=number,
+            time=t,
+            size=size,
+            dissipation=lost,
+            figures={k: v for k, v in asdict(report).items() if isinstance(v, (int, str))},
+            residuals=dict(report.residuals),
+            seconds=report.seconds["total"],
+            motion=dict(report.motion),
+            contact_forces=self._problem.solution.resultant_forces,
+        )
 
     def _keep(self, place: Place, t: float) -> None:
         """Write a step that has converged, and the place of the next."""
@@ -511,57 +476,47 @@ class LoadSteps:
     def _begin(self, resume: bool) -> Place:
         """Return the place to begin at, and restore its state."""
         self.records = []
-        if self._checkpoint is None:
+        checkpoint = self._checkpoint
+        if checkpoint is None:
             return Place()
-        kept = self._checkpoint.read() if resume else None
+        kept = checkpoint.read() if resume else None
         if kept is None:
-            self._checkpoint.forget()
+            checkpoint.forget()
             return Place()
-        place = Place(**kept.about["place"])
+        about = kept.index.about
+        place = Place(**about["place"])
         records = [StepRecord(**record) for record in kept.records]
         ends = {record.number: record.time for record in records}
-        reached = [kept.about["begin"], *(ends[number] for number in range(place.number))]
-        self._check_times(reached + ([kept.about["towards"]] if place.done else []))
+        reached = [about["begin"], *(ends[number] for number in range(place.number))]
+        self._check_times(reached + ([about["towards"]] if place.done else []))
         self._problem.take_step(records[-1].size)
         self._set(records[-1].time)
         digest = self._problem.digest()
         with raised_on_all_ranks(self._comm):
-            check_same_problem(kept.digest, digest)
-        self._problem.restore(self._checkpoint.read_state(kept.number))
+            check_same_problem(kept.index.digest, digest)
+        self._problem.restore(checkpoint.read_state(kept))
         self.records = records
-        self._replay(self._checkpoint)
+        if self._path is not None:  # a file of ADIOS2 cannot be continued
+            self._series = Series(self._path, self._problem.solution, self._interior)
+            try:
+                for number, record in enumerate(records, start=1):
+                    self._series.write(record.time, checkpoint.read_fields(kept, number))
+            except TfetiError:  # on all ranks
+                self._series.drop()
+                self._series = None
+                raise
         return place
 
-    def _check_times(self, reached: list[float]) -> None:
-        given, rounding = (
-            self._times[: len(reached)],
-            SAME_TIME * min(np.diff(reached), default=0.0),
-        )
+    def _check_times(self, reached: list[float], same: float = 1e-6) -> None:
+        """Raise unless times are those reached, but for rounding, as of a longer ``linspace``."""
+        given = self._times[: len(reached)]
+        rounding = same * min(np.diff(reached), default=0.0)
         for now, before in zip_longest(given, reached):
             if now is None or abs(now - before) > rounding:
                 raise InputError(
                     f"the checkpoint is of a series with the times {shown(reached)}, begin "
                     f"first; expected those, got {shown(given)}, {now} in the place of {before}"
                 )
-
-    def _replay(self, checkpoint: Checkpoint) -> None:
-        """Write the steps of earlier runs again: a file of ADIOS2 cannot be continued."""
-        if self._path is None:
-            return
-        series = Series(self._path, self._problem.solution, self._interior)
-        try:
-            for number, record in enumerate(self.records, start=1):
-                series.write(record.time, checkpoint.read_fields(number))
-        except TfetiError:  # on all ranks
-            series.drop()
-            raise
-        self._series = series
-
-    def _drop(self) -> None:
-        """Remove what a run has begun to write that an error of the user's has ended."""
-        series, self._series = self._series, None
-        if series is not None:
-            series.drop()
 
     def _close(self) -> None:
         series, self._series = self._series, None
