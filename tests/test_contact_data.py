@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from bodies import gathered, held, pressed, stacked, two_body_problem
+from scenes import decomposed, problem
 
 import tfeti_dolfinx as tfeti
 
