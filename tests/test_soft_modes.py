@@ -1,5 +1,7 @@
 """Springs in the stiffness: the preconditioner knows what they hold softly."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import ufl
@@ -96,10 +98,11 @@ def test_the_largest_eigenvalue_decides(monkeypatch, largest):
     Gt = Gt * np.sqrt(largest / np.linalg.eigvalsh(dense)[-1])
     asked = []
     for bound in (0.7 * largest, 1.001 * largest):
-        monkeypatch.setattr(soft_modes, "LARGE", bound)
+        given = replace(soft_modes.PARAMETERS, large=bound)
+        monkeypatch.setattr(soft_modes, "PARAMETERS", given)
         asked.append(soft_modes._stands_out(M, csr_array(Gt), x.duplicate()))
     assert asked == [True, False]
-    assert M.count["soft motions"] == 2 * soft_modes.STEPS
+    assert M.count["soft motions"] == 2 * soft_modes.PARAMETERS.steps
     p.destroy()
 
 

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 
-from tfeti_dolfinx.feti.rigid_bodies import null_basis, orthonormal_columns, parts_of_columns
+from tfeti_dolfinx.feti.rigid_bodies import orthonormal_columns, parts_of_columns
 
 
 def scattered(rng):
@@ -30,17 +30,3 @@ def test_orthonormal_columns_span_the_same():
     assert Q.nnz <= 4 * 2 + 5 * 3
     assert np.allclose((Q.T @ Q).toarray(), np.eye(5), atol=1e-14)
     assert np.allclose(Q @ (Q.T @ dense), dense, atol=1e-14)
-
-
-def test_a_null_basis_of_unit_vectors_and_others():
-    rng = np.random.default_rng(2)
-    dense = scattered(rng)
-    alone = np.flatnonzero(~dense.any(axis=1))
-    basis = null_basis(alone, csr_array(dense))
-    x = basis.removed(rng.standard_normal(10))
-    assert np.allclose(dense.T @ x, 0.0, atol=1e-14)
-    assert np.array_equal(x[alone], np.zeros(len(alone)))
-    pins = basis.pins(np.ones(10))
-    whole = np.column_stack((np.eye(10)[:, alone], basis.joint.toarray()))
-    assert len(pins) == whole.shape[1]
-    assert np.linalg.matrix_rank(whole[pins]) == len(pins)
