@@ -7,7 +7,8 @@ from test_faces import in_a_corner
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.feti.dual import feasible_particular
-from tfeti_dolfinx.feti.operator import PRECONDITIONERS, ScaledRows, check_operator
+from tfeti_dolfinx.feti.operator import PRECONDITIONERS, scaled_rows
+from tfeti_dolfinx.qp.sets import Status, face_of
 
 
 @pytest.fixture(scope="module")
@@ -25,12 +26,25 @@ def dual(solved):
     return solved.dual
 
 
+def check_operator(F, like):
+    """It is symmetric and positive semidefinite on random vectors."""
+    rng = np.random.default_rng(like.getComm().getRank())
+    x, y, Fx, Fy = (like.duplicate() for _ in range(4))
+    for _ in range(3):
+        for vec in (x, y):
+            vec.array[:] = rng.standard_normal(vec.getLocalSize())
+        F.mult(x, Fx)
+        F.mult(y, Fy)
+        assert x.dot(Fx) >= 0.0
+        assert abs(y.dot(Fx) - x.dot(Fy)) <= 1e-10 * Fx.norm() * y.norm()
+
+
 def test_F_is_symmetric_and_positive(dual):
     check_operator(dual.F, dual.d)
 
 
 def test_preconditioners_are_symmetric_and_positive(dual):
-    scaled = ScaledRows(dual.constraints.B, dual.constraints.weights)
+    scaled = scaled_rows(dual.constraints.B, dual.constraints.weights)
     for make in PRECONDITIONERS.values():
         check_operator(make(scaled, dual.subdomains), dual.d)
 
@@ -46,7 +60,8 @@ def test_the_feasible_homogenisation_is_the_smallest():
     assert np.all(lam[bounded] >= 0.0)
     carrying = np.ones(len(lam), dtype=bool)
     carrying[bounded] = lam[bounded] > 0.0
-    gram = coarse.grams.of_rows(carrying).toarray()
+    face = face_of(carrying, np.where(carrying, Status.FREE, Status.OPEN))
+    gram = coarse.grams.of_face(face).toarray()
     alpha = np.linalg.lstsq(gram, coarse.e, rcond=1e-12)[0]
     force = coarse.Gt @ alpha
     assert np.allclose(force[carrying], lam[carrying], atol=1e-10)

@@ -6,10 +6,10 @@ from mpi4py import MPI
 from scenes import box, curved_obstacle, decomposed, problem
 from scipy.sparse import csr_array
 from test_blocks import data, stiffness
+from test_dual import check_operator
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.arrays import parts_of
-from tfeti_dolfinx.feti.operator import check_operator
 from tfeti_dolfinx.subdomains.block import Block
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.local_operators import GroupedOperator, LocalChoice

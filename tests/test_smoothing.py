@@ -14,7 +14,7 @@ from test_own_block import DenseBlock
 from test_solvable_lp import dual_of
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.feti.preconditioner import chebyshev, smoothed
+from tfeti_dolfinx.feti.preconditioner import PARAMETERS, chebyshev, smoothed
 from tfeti_dolfinx.qp.sets import Face, Status, face_of
 from tfeti_dolfinx.subdomains.stiffness import stretch_over_shear
 
@@ -103,7 +103,7 @@ def test_the_preconditioner_is_what_its_formula_says(dual, kappa, serial_only):
         B_f = np.hstack((B_f, np.eye(len(sigma))[:, bends]))
         D = np.concatenate((D, 1.0 / (kappa * sigma[bends])))
         K, S = (block_diag(A, np.eye(bends.sum()) / kappa) for A in (K, S))
-    shift = np.where(np.isin(np.arange(len(Z)), c.sets.equalities), 0.0, 1e-8)
+    shift = np.where(np.isin(np.arange(len(Z)), c.sets.equalities), 0.0, PARAMETERS.shift)
     W_inverse = np.linalg.inv((B_f / D) @ B_f.T + np.diag(Z.T @ shift))
     H = np.diag(1.0 / D) - (B_f / D).T @ W_inverse @ (B_f / D)
     lifting = (B_f / D).T @ W_inverse

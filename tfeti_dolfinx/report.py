@@ -357,9 +357,9 @@ def _tolerances(solution: Solution, dual: Dual, accuracy: Accuracy) -> dict[str,
         "displacement_error": accuracy.rtol,
         "energy_error": accuracy.energy_error()[1],
         "gluing_jump": allowed.jump,
-        "penetration": allowed.penetration,
+        "penetration": allowed.jump,
         "tension": 0.0,
-        "complementarity": _largest(dual, solution.force) * allowed.penetration,
+        "complementarity": _largest(dual, solution.force) * allowed.jump,
         "balance": allowed.balance,
     }
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
@@ -20,24 +20,35 @@ from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.subdomains.stiffness import stretch_over_shear
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
-# --- Warnings of the report -------------------------------------------------------------------
-
 # relative rounding of a stiffness
 EPSILON = float(np.finfo(float).eps)
-# errors of beams and strips that are 10⁴ times as long as thick, over the estimate of rounding:
-# 10 to 50 were seen
-OF_ROUNDING = 30.0
-# ‖J‖‖J⁻¹‖/gdim of a cell that is about 1000 times as long as thick
-FLAT = 500.0
-# (λ + 2μ)/μ: 51 of ν = 0.49; from here on linear displacements are too stiff
-LOCKS = 50.0
-# radians; what linear kinematics then takes for strain is half the square, 0.5 %
-TURNS = 0.1
-# of what the largest pressure presses together: gaps that straight facets change by as much had
-# forces and pressures wrong by 4 to 10 %
-FACETS = 0.5
-LISTED = 3  # bodies that a sentence names
 ESTIMATES = "estimates"  # how the sentence on them begins
+
+
+@dataclass(frozen=True)
+class WarningLimits:
+    """Limits from which on the report warns.
+
+    Attributes:
+        rounding: Errors of beams and strips that are 10⁴ times as long as thick, over the estimate
+            of rounding: 10 to 50 were seen.
+        flat: ‖J‖‖J⁻¹‖/gdim of a cell that is about 1000 times as long as thick.
+        locks: (λ + 2μ)/μ, 51 of ν = 0.49: from here on linear displacements are too stiff.
+        turns: Radians; what linear kinematics takes for strain is half the square, 0.5 %.
+        facets: Of what the largest pressure presses together: gaps that straight facets change by
+            as much had forces and pressures wrong by 4 to 10 %.
+        listed: Bodies that a sentence names.
+    """
+
+    rounding: float = 30.0
+    flat: float = 500.0
+    locks: float = 50.0
+    turns: float = 0.1
+    facets: float = 0.5
+    listed: int = 3
+
+
+LIMITS = WarningLimits()
 
 
 class Diagnostics:
@@ -83,7 +94,7 @@ class Diagnostics:
         """Cells that are far from regular."""
         flat = float(np.max(flatness(self._decomposition.mesh), initial=1.0))
         worst = float(self._dofs.comm.allreduce(flat, op=MPI.MAX))
-        if worst > FLAT:
+        if worst > LIMITS.flat:
             yield (
                 f"cells: the flattest is about {2.0 * worst:.0e} times as long as thick; forces "
                 "and multiplications suffer from more than 10"
@@ -107,10 +118,10 @@ class Diagnostics:
             own = x[part.start // self._dofs.bs : part.stop // self._dofs.bs]
             ratios.append(stretch_over_shear(own, self._dofs.bs, block.multiply))
         worst = subdomains.body_maxima([ratios])[0]
-        if np.any(worst > LOCKS):
+        if np.any(worst > LIMITS.locks):
             t = float(worst.max())
             yield (
-                f"{self._names(worst > LOCKS)}: Poisson's ratio is about "
+                f"{self._names(worst > LIMITS.locks)}: Poisson's ratio is about "
                 f"{(t - 2.0) / (2.0 * t - 2.0):.4g} and displacements have degree 1, which makes "
                 "it too stiff (locking); expected degree 2"
             )
@@ -129,7 +140,9 @@ class Diagnostics:
         )
         known = energy > EPSILON * energy.max(initial=0.0)
         share = (
-            OF_ROUNDING * EPSILON * np.divide(terms, energy, out=np.zeros_like(terms), where=known)
+            LIMITS.rounding
+            * EPSILON
+            * np.divide(terms, energy, out=np.zeros_like(terms), where=known)
         )
         if np.any(share > rtol):
             yield (
@@ -149,9 +162,10 @@ class Diagnostics:
             slope = np.linalg.lstsq(x[rows], u[part].reshape(-1, bs), rcond=None)[0]
             angles.append(float(np.linalg.norm(slope - slope.T)) / 8.0**0.5)
         worst = subdomains.body_maxima([angles])[0]
-        if np.any(worst > TURNS):
+        turned = worst > LIMITS.turns
+        if np.any(turned):
             yield (
-                f"{self._names(worst > TURNS)}: parts turn by up to {worst.max():.2g} radians; "
+                f"{self._names(turned)}: parts turn by up to {worst.max():.2g} radians; "
                 "linear kinematics takes half the square of that for strain: expected smaller "
                 "loads, or a nonlinear model"
             )
@@ -182,7 +196,7 @@ class Diagnostics:
         for i, contact in enumerate(solution.contacts):
             own = records.contact == i
             largest = comm.allreduce(float(pressure[own].max(initial=0.0)), op=MPI.MAX)
-            own &= shown & (change > np.maximum(FACETS * largest * gives, 0.0))
+            own &= shown & (change > np.maximum(LIMITS.facets * largest * gives, 0.0))
             columns = change, gives, records.curved_gap
             most = np.array([column[own].max(initial=-np.inf) for column in columns])
             comm.Allreduce(MPI.IN_PLACE, most, op=MPI.MAX)
@@ -207,8 +221,8 @@ class Diagnostics:
         """Return names of bodies, the first ones if they are many; the same on all ranks."""
         names = self._decomposition.body_names
         some = bcast_from_root(self._dofs.comm, np.flatnonzero(which))
-        listed = ", ".join(names[body] for body in some[:LISTED])
-        rest = len(some) - LISTED
+        listed = ", ".join(names[body] for body in some[: LIMITS.listed])
+        rest = len(some) - LIMITS.listed
         return f"{listed} and {rest} more" if rest > 0 else listed
 
 
@@ -244,7 +258,7 @@ def _loose(outcome: Outcome) -> Iterator[str]:
             f"{outcome.free_modes} rigid motions are free: nothing resists or drives them, the "
             "smallest displacement was taken"
         )
-    for motion in outcome.nearly_free[:LISTED]:
+    for motion in outcome.nearly_free[: LIMITS.listed]:
         bodies, mode, held = (motion[key] for key in ("bodies", "mode", "stiffness"))
         assert isinstance(bodies, list)
         share = f"hold hardly ({held:.0e} of what they could)" if held else "do not hold"
@@ -252,5 +266,5 @@ def _loose(outcome: Outcome) -> Iterator[str]:
             f"{', '.join(bodies)}: contacts with a force {share} {mode}: displacements that differ "
             "by that are as right, or nearly so"
         )
-    if (rest := len(outcome.nearly_free) - LISTED) > 0:
+    if (rest := len(outcome.nearly_free) - LIMITS.listed) > 0:
         yield f"{rest} more motions are held hardly or not by contacts with a force"

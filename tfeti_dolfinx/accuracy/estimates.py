@@ -12,9 +12,9 @@ import numpy as np
 from dolfinx import fem
 
 from tfeti_dolfinx.common.arrays import TINY, Array
-from tfeti_dolfinx.common.parallel import bcast_from_root
+from tfeti_dolfinx.common.parallel import steering, summed
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.feti.duality_gap import EnergyBound, energy_bound
+from tfeti_dolfinx.feti.duality_gap import energy_bound
 from tfeti_dolfinx.feti.stopping import ErrorTarget, TargetStatus
 from tfeti_dolfinx.forms.discretisation import StressRecovery
 from tfeti_dolfinx.forms.fields import Stress, checked_stress
@@ -81,14 +81,22 @@ def estimate(system: System, solution: Solution) -> Estimates:
         raise InputError(
             "estimate: the rows are no longer those of the solution; expected a call after solve()"
         )
-    counters, comm = system.dual.subdomains.counters, system.dual.coarse.comm
+    dual, u = system.dual, solution.u
+    comm, counters = dual.coarse.comm, dual.subdomains.counters
     start, factored = perf_counter(), counters.factorizations
-    energy, bound = bound_of(system, solution)
-    discretisation = _discretisation(solution) if solution.has_stress else None
+    lam = dual.d.duplicate()
+    lam.array[:] = solution.lam
+    bound = energy_bound(dual, lam, u, dual.seen)
+    lam.destroy()
+    squares = [float(sum(dual.subdomains.energies(u))), 0.0]
+    if solution.has_stress:
+        squares[1] = float(np.sum(solution.discretisation_error.x.array**2))
+    sizes = np.sqrt(np.maximum(summed(comm, np.array(squares)), 0.0))
+    energy, discretisation = steering(comm, *sizes)
     return Estimates(
-        energy=energy,
+        energy=float(energy),
         algebraic=bound.error,
-        discretisation=discretisation,
+        discretisation=float(discretisation) if solution.has_stress else None,
         factorizations=comm.allreduce(counters.factorizations - factored),
         lifting_multiplications=1,
         recoveries=int(bound.moved > 0.0),
@@ -129,22 +137,3 @@ def of_looks(reached: Sequence[TargetStatus]) -> dict[str, float]:
         "lifting_multiplications": len(reached),
         "recoveries": sum(look.bound.moved > 0.0 for look in reached),
     }
-
-
-def bound_of(system: System, solution: Solution) -> tuple[float, EnergyBound]:
-    """‖u‖_K, and the bound of the algebraic error. Collective."""
-    dual = system.dual
-    lam = dual.d.duplicate()
-    lam.array[:] = solution.lam
-    bound = energy_bound(dual, lam, solution.u, dual.seen)
-    lam.destroy()
-    comm = dual.coarse.comm
-    square = bcast_from_root(comm, comm.allreduce(sum(dual.subdomains.energies(solution.u))))
-    return float(np.sqrt(max(square, 0.0))), bound
-
-
-def _discretisation(solution: Solution) -> float:
-    """Return the root of the sum of squares. Collective."""
-    comm = solution.dofs.comm
-    own = float(np.sum(solution.discretisation_error.x.array**2))
-    return float(np.sqrt(bcast_from_root(comm, comm.allreduce(own))))

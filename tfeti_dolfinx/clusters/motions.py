@@ -18,8 +18,7 @@ from tfeti_dolfinx.feti.coarse import CoarseSpace, products, side_by_side
 from tfeti_dolfinx.feti.deflation import Deflation, SoftModes, mean_stiffness
 from tfeti_dolfinx.feti.operator import DualOperator
 from tfeti_dolfinx.feti.preconditioner import chebyshev
-from tfeti_dolfinx.feti.projectors import CoarseFactor, FaceFactors, replicated
-from tfeti_dolfinx.feti.rigid_bodies import NullBasis
+from tfeti_dolfinx.feti.projectors import FaceFactors, SemidefiniteFactor, replicated
 from tfeti_dolfinx.qp.balanced import Balanced
 from tfeti_dolfinx.qp.problem import FaceOperator
 from tfeti_dolfinx.qp.sets import Face
@@ -74,7 +73,12 @@ class ClusterSteps:
     """
 
     def __init__(
-        self, comm: MPI.Intracomm, own: InnerMotions, whole: CoarseFactor, A: PETSc.Mat, prefix: str
+        self,
+        comm: MPI.Intracomm,
+        own: InnerMotions,
+        whole: SemidefiniteFactor,
+        A: PETSc.Mat,
+        prefix: str,
     ) -> None:
         self._comm, self._own, self._whole, self._A = comm, own, whole, A
         offsets = chunk_offsets(comm, own.whole.shape[1])
@@ -217,8 +221,7 @@ class ClusterMotions:
         self._base = _gram(csr_array(self._rows[self._always]))
         self._whole = side_by_side(self._own.whole, self._Gt.getComm())
         self._width = self._whole.getSize()[1]
-        none = NullBasis(np.zeros(0, dtype=np.int64), csr_array((self._width, 0)))
-        self.factors = FaceFactors(coarse.comm, none, prefix)
+        self.factors = FaceFactors(coarse.comm, csr_array((self._width, 0)), prefix)
 
     def balanced(self, face: Face, on_face: FaceOperator) -> FaceOperator:
         """M_f with these motions. Collective.
@@ -257,7 +260,7 @@ class ClusterMotions:
         A = PETSc.Mat().createAIJ(size=(size, size), csr=table, comm=comm)
         return A
 
-    def _of_clusters(self, A: PETSc.Mat) -> CoarseFactor:
+    def _of_clusters(self, A: PETSc.Mat) -> SemidefiniteFactor:
         """(NᵀAN)⁻¹ on all ranks, N the motions of whole clusters, with a shift. Collective."""
         gram = A.PtAP(self._whole)
         indptr, columns, values = gram.getValuesCSR()
@@ -301,9 +304,9 @@ class _Inner:
         self._face, self._Gt, self._inner, self.energy = face, Gt, inner, energy
         self._alpha, self._x = Gt.createVecs()
 
-    def coordinates(self, x: Array) -> Array:
-        """C x."""
-        return self._inner.solve(self.moved(x))
+    def solve(self, c: Array) -> Array:
+        """X c."""
+        return self._inner.solve(c)
 
     def forces(self, c: Array) -> Array:
         """Y c."""
@@ -316,10 +319,6 @@ class _Inner:
         self._x.array[:] = self._face.restricted(y)
         self._Gt.multTranspose(self._x, self._alpha)
         return np.array(self._alpha.array_r)
-
-    def directions(self, c: Array) -> Array:
-        """Cᵀ c."""
-        return self.forces(self._inner.solve(c))
 
     def destroy(self) -> None:
         """Free the factors. Collective."""

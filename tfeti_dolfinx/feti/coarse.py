@@ -13,35 +13,23 @@ from tfeti_dolfinx.common.parallel import bcast_from_root, chunk_offsets
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.projectors import (
     FaceFactors,
-    FaceProjectors,
     Grams,
     ObliqueProjectors,
     Projectors,
-    SemidefiniteFactor,
 )
 from tfeti_dolfinx.feti.rigid_bodies import (
-    NULL,
+    TOLERANCES,
     Bodies,
     Motions,
-    kernel_basis,
-    null_basis,
     orthonormal_columns,
     unresisted,
-    unsprung,
 )
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
-# Of the size of a row: what of it acts on motions of bodies and is only rounding; and how it acts
-# as a whole if it only glues. Rounding of points far from the origin is more than that of motions,
-# but all other rows act on translations with about their size.
-NO_GRIP, GLUING = 1e-12, 1e-6
-
 
 class CoarseSpace(Projectors):
     """G, GGᵀ and what follows from them; the r-vectors are replicated on all ranks.
-
-    G = (R T)ᵀ Bᵀ, with T a basis of the kernel that has the bodies' motions as coordinates.
 
     Args:
         B: Dual rows × trace unknowns.
@@ -53,8 +41,7 @@ class CoarseSpace(Projectors):
     Attributes:
         subdomains: This rank's Blocks.
         dimension: r, the dimension of the kernel of K.
-        e: (R T)ᵀ f, shape ``(r,)``.
-        motions: The bodies' motions in the basis T, scipy CSR, shape ``(r, bodies * k)``.
+        e: Rᵀ f, shape ``(r,)``.
         Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
         bounded: Local rows with λ ≥ 0.
         rubbing: Local rows of friction.
@@ -67,7 +54,7 @@ class CoarseSpace(Projectors):
             these rows acts on one body.
         free_motions: Motions that no row resists at all.
         free_basis: An orthonormal basis of them, scipy CSR, shape ``(bodies * k, c)``.
-        null: Orthonormal basis of null(Gᵀ).
+        null: Orthonormal basis of null(Gᵀ), scipy CSR, shape ``(r, c)``.
         grams: GGᵀ, and those of faces.
         factors: Makes the factors of faces, and counts them apart from that of GGᵀ.
     """
@@ -91,31 +78,23 @@ class CoarseSpace(Projectors):
         self.J = _without_rounding(diags_array(1.0 / self.row_size) @ Gt @ self.bodies.motions)
         equalities = np.ones(len(self.row_size), dtype=bool)
         equalities[np.concatenate((bounded, rubbing))] = False
-        self.unheld = self._unresisted(equalities, unsprung(self.bodies.springs), NULL)
+        self.unheld = self.unresisted(equalities, self.bodies.unsprung)
         self.free_motions = self.unresisted(~equalities)
         both = csr_array(hstack([self.free_motions.alone, self.free_motions.joint]))
         self.free_basis = bcast_from_root(comm, orthonormal_columns(both))
-        # made on one rank: processors that round differently might choose differently
-        self._basis = bcast_from_root(
-            comm, kernel_basis(self.bodies, self.unheld, self.free_motions)
-        )
-        self.motions = self._basis.coordinates(self.bodies.motions)
-        self.Gt = self._basis.rows(Gt, diags_array(self.row_size) @ self.J, equalities)
-        self._read_load()
-        joint = csr_array(self.motions @ self.free_motions.joint)
-        self.null = bcast_from_root(comm, null_basis(np.flatnonzero(self._basis.free), joint))
+        self.Gt, self.e = Gt, self._load()
+        self.null = bcast_from_root(comm, orthonormal_columns(self.bodies.motions @ both))
         self.grams = Grams(self.Gt, np.flatnonzero(~equalities), comm)
         self.factors = FaceFactors(comm, self.null, prefix)
         self._factor = self.factors.factor(self.grams.whole, "whole")
 
+    def _load(self) -> Array:
+        return np.concatenate(self.comm.allgather(self.subdomains.kernel_load))
+
     def update_load(self) -> None:
         """Replace e = Rᵀ f by that of the Blocks' present loads."""
-        self._read_load()
+        self.e = self._load()
         self.bodies.update_load()
-
-    def _read_load(self) -> None:
-        e = np.concatenate(self.comm.allgather(self.subdomains.kernel_load))
-        self.e = self._basis.products(e)
 
     @property
     def num_free_motions(self) -> int:
@@ -124,25 +103,19 @@ class CoarseSpace(Projectors):
 
     def local_alpha(self, alpha: Array) -> Array:
         """Return kernel coordinates of this rank's Blocks that belong to an r-vector."""
-        return self._basis.kernel(alpha)[self._own]
-
-    def damped_factor(self, rows: Array, damping: float) -> SemidefiniteFactor:
-        """Return a factor of G_f G_fᵀ + damping·GGᵀ of the local rows flagged."""
-        return self._damped(self.grams.of_rows(rows), damping)
+        return alpha[self._own]
 
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
         """(G_f G_fᵀ + damping·GGᵀ)⁻¹y, f a face of the rows."""
-        factor = self._damped(self.grams.of_face(face), damping)
+        gram = csr_array(self.grams.of_face(face) + damping * self.grams.whole)
+        factor = self.factors.factor(gram)
         x = factor.solve(y)
         factor.destroy()
         return x
 
-    def _damped(self, gram: csr_array, damping: float) -> SemidefiniteFactor:
-        return self.factors.factor(csr_array(gram + damping * self.grams.whole))
-
     def on_face(self, face: Face) -> FaceProjectors:
         """Return the projectors on a face of the rows."""
-        return FaceProjectors(self, face, self.factors)
+        return FaceProjectors(self, face)
 
     def oblique(self, face: Face, C: csr_array) -> ObliqueProjectors:
         """Return the projectors on a face of the rows where others follow: λ = (I + C)u.
@@ -153,39 +126,67 @@ class CoarseSpace(Projectors):
         self.factors.count["face"] += 1
         return ObliqueProjectors(self.Gt, self.grams, face, C, self.null, self.comm)
 
-    def unresisted(self, rows: Array, below: float = NULL) -> Motions:
-        """Return motions that neither springs, nor equality rows, nor contact rows flagged resist.
+    def unresisted(
+        self, rows: Array, within: Motions | None = None, below: float = TOLERANCES.null
+    ) -> Motions:
+        """Return motions of a space that rows do not resist.
 
         The null space of Gᵀ lives on the bodies' motions: one that no gluing row resists is the
-        same in all subdomains of a body.
+        same in all subdomains of a body. Found on one rank: processors that round differently
+        might count differently.
 
         Args:
-            rows: Flags of local rows, those of equalities without effect.
+            rows: Flags of local rows.
+            within: The space, default ``unheld``.
             below: Motions of a single body that are held by less than this share of what the
                 same rows hold at most are taken in, too.
         """
-        flags = np.zeros(len(self.row_size), dtype=bool)
-        for own in (self.bounded, self.rubbing):
-            flags[own] = rows[own]
-        return self._unresisted(flags, self.unheld, below)
-
-    def _unresisted(self, rows: Array, within: Motions, below: float) -> Motions:
-        """Found on one rank: processors that round differently might count differently."""
-        if not np.any(within.free):
-            return within.none
         grams = self.comm.gather(self.J[rows].T @ self.J[rows], root=0)
         found: Any = None
         with raised_on_all_ranks(self.comm):
             if grams is not None:
-                found = unresisted(csr_array(sum(grams)), within, below)
+                found = unresisted(csr_array(sum(grams)), within or self.unheld, below)
         return cast(Motions, bcast_from_root(self.comm, found))
 
 
+class FaceProjectors(Projectors):
+    """P and Q on a face of the rows: G_f = GZ, vectors in the layout of all rows.
+
+    A face that leaves motions free that all rows hold has a G_f without full rank: harmless for
+    P and Q, since what the factor makes of such a motion G_fᵀ does not see.
+
+    Args:
+        whole: The coarse space of all rows.
+        face: The face. The constructor is collective.
+    """
+
+    def __init__(self, whole: CoarseSpace, face: Face) -> None:
+        self._whole, self._face = whole, face
+        self.comm, self.Gt, self.e = whole.comm, whole.Gt, whole.e
+        self._factor = whole.factors.factor(whole.grams.of_face(face))
+
+    def restricted(self, x: Array) -> Array:
+        """ZZᵀ x."""
+        return self._face.restricted(x)
+
+    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
+        """Solve with the damped coarse matrix of all rows."""
+        return self._whole.damped_solve(face, y, damping)
+
+    def on_face(self, face: Face) -> FaceProjectors:
+        """Return the projectors of another face of all rows."""
+        return FaceProjectors(self._whole, face)
+
+
 def _without_rounding(J: Any) -> csr_array:
-    """Return the same rows without entries that are only rounding."""
+    """Return the same rows without entries that are only rounding.
+
+    Rounding of points far from the origin is more than that of motions, but all rows that do not
+    only glue act on translations with about their size.
+    """
     J = csr_array(J)
     largest = abs(J).max(axis=1).toarray().ravel()
-    noise = np.where(largest <= GLUING, GLUING, NO_GRIP)
+    noise = np.where(largest <= TOLERANCES.gluing, TOLERANCES.gluing, TOLERANCES.no_grip)
     J.data[np.abs(J.data) <= np.repeat(noise, np.diff(J.indptr))] = 0.0
     J.eliminate_zeros()
     return J

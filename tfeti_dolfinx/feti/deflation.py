@@ -8,11 +8,12 @@ space does not know of them, and M_f is an inverse of F₀ alone.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from petsc4py import PETSc
-from scipy.sparse import csr_array, diags_array, hstack
+from scipy.sparse import csr_array, diags_array, hstack, vstack
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root, chunk_offsets, summed
@@ -24,11 +25,24 @@ from tfeti_dolfinx.qp.problem import FaceOperator
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.subdomains.subdomains import SoftMotions, Subdomains
 
-# steps of the power method, and the eigenvalue that it finds from which on a coarse problem pays:
-# with cτ/H = 1.4 on squares, 1.8 on cubes
-STEPS, LARGE = 3, 2.4
-# of the stiffness of a motion's rows: the least energy that it is taken to have
-ROUNDING = 1e-30
+
+@dataclass(frozen=True)
+class SoftParameters:
+    """Parameters of soft motions.
+
+    Attributes:
+        steps: Steps of the power method.
+        large: The eigenvalue that it finds from which on a coarse problem pays: with cτ/H = 1.4 on
+            squares, 1.8 on cubes.
+        rounding: Of the stiffness of a motion's rows: the least energy that it is taken to have.
+    """
+
+    steps: int = 3
+    large: float = 2.4
+    rounding: float = 1e-30
+
+
+PARAMETERS = SoftParameters()
 
 
 class Deflation(Protocol):
@@ -86,12 +100,13 @@ class SoftModes:
         squares = summed(self._comm, np.asarray(Gt.multiply(Gt).sum(axis=0)).ravel())
         soft = bcast_from_root(self._comm, np.flatnonzero(energy < sigma * squares))
         if len(soft):
-            scale = np.sqrt(np.maximum(energy[soft], ROUNDING * sigma * squares[soft]))
+            scale = np.sqrt(np.maximum(energy[soft], PARAMETERS.rounding * sigma * squares[soft]))
             x = B.createVecLeft()
             if not _stands_out(preconditioner, csr_array(Gt[:, soft] / scale), x):
                 soft = soft[:0]
         self.count = len(soft)
-        self.factors = FaceFactors(self._comm, coarse.null.extended(self.count), prefix)
+        null = csr_array(vstack([coarse.null, csr_array((self.count, coarse.null.shape[1]))]))
+        self.factors = FaceFactors(self._comm, null, prefix)
         self._grams: Grams | None = None
         if self.count == 0:
             return
@@ -123,7 +138,7 @@ MakeDeflation = Callable[[PETSc.Mat, CoarseSpace, Array, DualOperator, str], Def
 
 
 class _Springs:
-    """Y = [G; Ĝ]ᵀ, C = ([G; Ĝ][G; Ĝ]ᵀ + [0 0; 0 D/σ])⁻¹[G; Ĝ]: CFCᵀ is taken for D⁻¹.
+    """Y = [G; Ĝ]ᵀ, X = ([G; Ĝ][G; Ĝ]ᵀ + [0 0; 0 D/σ])⁻¹, C = XYᵀ: CFCᵀ is taken for D⁻¹.
 
     Where springs are soft it nearly is; where they are not, C is small. On faces [G; Ĝ] may lack
     rank: what is left free Cᵀ does not see.
@@ -134,9 +149,9 @@ class _Springs:
     ) -> None:
         self._Gt, self._face, self._factor, self.energy = Gt, face, factor, energy
 
-    def coordinates(self, x: Array) -> Array:
-        """C x."""
-        return self._factor.solve(self.moved(x))
+    def solve(self, c: Array) -> Array:
+        """X c."""
+        return self._factor.solve(c)
 
     def forces(self, c: Array) -> Array:
         """[G; Ĝ]ᵀ c."""
@@ -145,10 +160,6 @@ class _Springs:
     def moved(self, y: Array) -> Array:
         """[G; Ĝ] y."""
         return summed(self._factor.comm, self._Gt.T @ self._face.restricted(y))
-
-    def directions(self, c: Array) -> Array:
-        """Cᵀ c."""
-        return self.forces(self._factor.solve(c))
 
     def destroy(self) -> None:
         """Free the factor."""
@@ -165,7 +176,7 @@ def _stands_out(M: DualOperator, Gt: csr_array, x: PETSc.Vec) -> bool:
     """
     comm, y = x.getComm().tompi4py(), x.duplicate()
     v, size = np.random.default_rng(0).standard_normal(Gt.shape[1]), 0.0
-    for _ in range(STEPS):
+    for _ in range(PARAMETERS.steps):
         v /= np.linalg.norm(v)
         x.array[:] = Gt @ v
         with M.charged_to("soft motions"):
@@ -174,7 +185,7 @@ def _stands_out(M: DualOperator, Gt: csr_array, x: PETSc.Vec) -> bool:
         size, v = float(v @ image), image
     for vector in (x, y):
         vector.destroy()
-    return bcast_from_root(comm, size > LARGE)
+    return bcast_from_root(comm, size > PARAMETERS.large)
 
 
 def mean_stiffness(subdomains: Subdomains, weights: Array) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
@@ -18,10 +19,10 @@ from tfeti_dolfinx.feti.deflation import Deflation, MakeDeflation, SoftModes
 from tfeti_dolfinx.feti.operator import (
     DualOperator,
     MakePreconditioner,
-    ScaledRows,
     dirichlet_preconditioner,
     dual_operator,
     linear_term,
+    scaled_rows,
 )
 from tfeti_dolfinx.feti.preconditioner import FacePreconditioner
 from tfeti_dolfinx.feti.recovery import Recovered, recover
@@ -46,12 +47,33 @@ from tfeti_dolfinx.qp.sets import (
 from tfeti_dolfinx.subdomains.local_operators import LocalOperator
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
-# --- Particular multipliers that balance the load ---------------------------------------------
-
-# Of ‖e‖: what is let pass: below any rtol, and the solver makes Gλ = e good afterwards.
-LET_PASS = 1e-9
-
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class DualLimits:
+    """Limits of a dual problem.
+
+    Attributes:
+        let_pass: Of ‖e‖: what a feasible λ̄ may miss, below any rtol; the solver makes it good.
+        far: Times the forces and lengths that load, values and gaps make: multipliers of an earlier
+            problem that are larger would leave so many digits less to the solution.
+        least, most: Of stiffness, lengths and forces: beyond it squares leave the range of floating
+            point.
+        nearly: Motions held by less than this share of what the same contacts hold at most are
+            nearly free: their contacts' normals are off by less than 6 degrees from a right angle.
+    """
+
+    let_pass: float = 1e-9
+    far: float = 1e3
+    least: float = 1e-130
+    most: float = 1e130
+    nearly: float = 1e-2
+
+
+LIMITS = DualLimits()
+
+# --- Particular multipliers that balance the load ---------------------------------------------
 
 
 def feasible_particular(coarse: CoarseSpace, like: PETSc.Vec) -> PETSc.Vec:
@@ -69,7 +91,7 @@ def feasible_particular(coarse: CoarseSpace, like: PETSc.Vec) -> PETSc.Vec:
     feasible = Product([(coarse.bounded, Bounds())])
     found = project_onto_feasible(coarse, feasible, zero, coarse.solve(coarse.e))
     zero.destroy()
-    if found.missing <= LET_PASS:
+    if found.missing <= LIMITS.let_pass:
         return found.lam
     found.lam.destroy()
     if coarse.comm.rank == 0:
@@ -86,17 +108,6 @@ PARTICULAR = {"natural": natural, "feasible": feasible_particular}
 
 
 # --- The dual problem -------------------------------------------------------------------------
-
-# times the forces and lengths that load, values and gaps make: multipliers of an earlier problem
-# that are larger would leave so many digits less to the solution
-FAR = 1e3
-
-# of stiffness, lengths and forces: beyond it squares leave the range of floating point
-LEAST, MOST = 1e-130, 1e130
-
-# Motions held by less than this share of what the same contacts hold at most are nearly free:
-# their contacts' normals are off by less than 6 degrees from a right angle.
-NEARLY = 1e-2
 
 # from B and c to the set of multipliers, on all local rows
 FeasibleLaw = Callable[[Constraints], FeasibleSet]
@@ -176,9 +187,9 @@ class Dual:
         self._check_units(comm)
         self.F = dual_operator(B, subdomains)
         self.preconditioner: DualOperator | None = None
-        self._scaled: ScaledRows | None = None
+        self._scaled: PETSc.Mat | None = None
         if preconditioner is not None:
-            self._scaled = ScaledRows(B, constraints.weights)
+            self._scaled = scaled_rows(B, constraints.weights)
             plain = preconditioner is dirichlet_preconditioner and "smooth_displacements" in without
             self.preconditioner = (
                 DualOperator(self._scaled, subdomains.local_operator("schur"))
@@ -199,10 +210,10 @@ class Dual:
         self.contact_rows = constraints.sets.contact_rows(comm)
         self._law, self.feasible = feasible, feasible(constraints)
         self._images = dict[str, tuple[Array, OperatorProduct]]()
-        self._norm: tuple[int, float] | None = None
+        self._norms = dict[int, float]()  # of so many Lanczos steps
         self.seen, self.last = 0.0, LastProduct()
         self.recycled: Recycled | None = None
-        self._check()
+        check_solvable(self.coarse, self._given, *self._names)
 
     def update_load(self) -> None:
         """Take the Blocks' present loads and the present right sides.
@@ -215,7 +226,7 @@ class Dual:
         self.d = linear_term(self.constraints.B, self.constraints.c, self.subdomains)
         self._check_units(self.coarse.comm)
         self.coarse.update_load()
-        self._check()
+        check_solvable(self.coarse, self._given, *self._names)
 
     @property
     def lifting(self) -> LocalOperator:
@@ -231,19 +242,16 @@ class Dual:
             self._lifting = made
         return self._lifting
 
-    def _check(self) -> None:
-        check_solvable(self.coarse, self._given, *self._names)
-
     def _check_units(self, comm: MPI.Intracomm) -> None:
         length = largest(comm, self.driving)
         sizes = {"stiffness": self._stiffness, "displacements": length}
         sizes["forces"] = self._stiffness * length
-        if not all(size == 0.0 or LEAST <= size <= MOST for size in sizes.values()):
+        if not all(size == 0.0 or LIMITS.least <= size <= LIMITS.most for size in sizes.values()):
             found = ", ".join(f"{name} of {size:.1e}" for name, size in sizes.items())
             raise InputError(
                 f"load, prescribed values and overlaps, over the stiffness, make {found}, whose "
                 "squares leave the range of floating point; expected units in which all of these "
-                f"are 0 or from {LEAST:g} to {MOST:g}"
+                f"are 0 or from {LIMITS.least:g} to {LIMITS.most:g}"
             )
 
     def set_under(self, pressures: Array) -> FeasibleSet:
@@ -278,7 +286,10 @@ class Dual:
         """
         coarse: Coarse = self.coarse if self.coarse.dimension else NoCoarse()
         self.feasible = self._law(self.constraints)  # c may be another, and what the law refers to
-        norm = self._norm_of(coarse, norm_steps) if norm_steps else 1.0
+        if norm_steps and norm_steps not in self._norms:
+            with self.F.charged_to("power method"):
+                self._norms[norm_steps] = estimate_norm(self.F, coarse, self.d, norm_steps)
+        norm = self._norms.get(norm_steps, 1.0)
         on = self._preconditioner_on if self.preconditioner is not None else None
         W = None if self.recycled is None else RecycledOnFace(self.recycled)
         M, keeps = self._on_all_rows, self.keeps_directions
@@ -315,21 +326,14 @@ class Dual:
         made = self._on_faces.on_face(face)
         return made if self.soft is None else self.soft.balanced(face, made)
 
-    def _norm_of(self, coarse: Coarse, steps: int) -> float:
-        if self._norm is None or self._norm[0] != steps:
-            with self.F.charged_to("power method"):
-                self._norm = (steps, estimate_norm(self.F, coarse, self.d, steps))
-        return self._norm[1]
-
     def image(self, kind: str) -> OperatorProduct:
         """λ̄ of a kind in ``PARTICULAR`` with F λ̄; multiplies once for each e."""
-        if (found := self.known_image(kind)) is not None:
-            return found
-        if kind in self._images:
-            self._images.pop(kind)[1].destroy()
-        made = operator_product(self.F, PARTICULAR[kind](self.coarse, self.d))
-        self._images[kind] = (self.coarse.e.copy(), made)
-        return made
+        if (found := self.known_image(kind)) is None:
+            if kind in self._images:
+                self._images.pop(kind)[1].destroy()
+            found = operator_product(self.F, PARTICULAR[kind](self.coarse, self.d))
+            self._images[kind] = (self.coarse.e.copy(), found)
+        return found
 
     @property
     def driving(self) -> Array:
@@ -353,7 +357,7 @@ class Dual:
         comm, coarse, x = self.coarse.comm, self.coarse, self.d.duplicate()
         coarse.particular(x)
         forces = norm_over(comm, lam)
-        if 0.0 < forces <= FAR * norm_over(comm, x.array_r):
+        if 0.0 < forces <= LIMITS.far * norm_over(comm, x.array_r):
             x.destroy()
             return False
         if len(mu) == coarse.dimension:
@@ -364,7 +368,7 @@ class Dual:
         self.last.pass_on(np.array(lam), np.array(at.Fx.array_r), 0.0)
         lengths += norm_over(comm, at.Fx.array_r)
         at.destroy()
-        return lengths > FAR * norm_over(comm, self.driving)
+        return lengths > LIMITS.far * norm_over(comm, self.driving)
 
     def known_image(self, kind: str) -> OperatorProduct | None:
         """λ̄ and F λ̄ if they are known for the present e."""
@@ -381,9 +385,7 @@ class Dual:
             face: The face of λ: which rows carry a force.
             error: How large multipliers may be by the solver's error alone.
         """
-        response = self.subdomains.pinv_load
-        values = lam.array_r, gradient.array_r, face, error
-        return recover(self.constraints, self.coarse, response, *values)
+        return recover(self.constraints, self.coarse, lam.array_r, gradient.array_r, face, error)
 
     def nearly_free(self, active: Array) -> list[dict[str, object]]:
         """List motions that contact rows with a force hold hardly or not, see ``listed``.
@@ -391,7 +393,7 @@ class Dual:
         Args:
             active: Flags of these rows, as ``Recovered`` has them.
         """
-        motions = self.coarse.unresisted(active, below=NEARLY)
+        motions = self.coarse.unresisted(active, below=LIMITS.nearly)
         return bcast_from_root(self.coarse.comm, listed(motions, self.coarse.bodies, *self._names))
 
     def destroy(self) -> None:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, largest, summed
-from tfeti_dolfinx.constraints.rows import Constraints
-from tfeti_dolfinx.feti.coarse import CoarseSpace
+from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.recovery import (
     constraint_residual,
     elastic_displacement,
@@ -22,27 +20,6 @@ from tfeti_dolfinx.feti.recovery import (
 from tfeti_dolfinx.qp.coarse import HELD, NoCoarse, imbalance
 from tfeti_dolfinx.qp.projection import project_onto_feasible
 from tfeti_dolfinx.qp.sets import FeasibleSet
-from tfeti_dolfinx.subdomains.local_operators import LocalOperator
-from tfeti_dolfinx.subdomains.subdomains import Subdomains
-
-# rounds in which rows that have come to overlap are closed, too; in the last one all are
-PASSES = 4
-# of the forces: the step from λ along a gap or a slip that ends where Ω ends
-FAR = 1e8
-
-
-class LiftedScene(Protocol):
-    """Parts of the dual problem that an error bound needs."""
-
-    constraints: Constraints
-    subdomains: Subdomains
-    coarse: CoarseSpace
-    feasible: FeasibleSet
-
-    @property
-    def lifting(self) -> LocalOperator:
-        """S of all subdomains of this rank, the energy of harmonic extensions. Collective."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -61,7 +38,7 @@ class EnergyBound:
 
 
 def energy_bound(
-    scene: LiftedScene, lam: PETSc.Vec, u: Array, norm: float, balanced: float = 1e-12
+    dual: Dual, lam: PETSc.Vec, u: Array, norm: float, balanced: float = 1e-12
 ) -> EnergyBound:
     """Bound the algebraic error of a displacement that belongs to multipliers. Collective.
 
@@ -75,25 +52,27 @@ def energy_bound(
     subdomain more where λ does not balance the load.
 
     Args:
-        scene: The dual problem.
+        dual: The dual problem.
         lam: The multipliers λ ∈ Ω.
         u: The displacement K⁺(f − Bᵀλ) + Rα on this rank, shape ``(n,)``.
         norm: ‖F‖, or an estimate; 0 where there is none.
         balanced: Worst entry of Gλ − e beside its terms from which on the forces are balanced.
     """
-    forces, displacement, apart = _balanced(scene, lam, u, norm, balanced)
+    forces, displacement, apart = _balanced(dual, lam, u, norm, balanced)
     if not np.isfinite(apart):
         return EnergyBound(apart, apart, apart)
-    change, loss = admissible(scene, forces, displacement, norm)
+    change, loss = admissible(dual, forces, displacement, norm)
     lifted = np.empty_like(change)
-    scene.lifting.mult(change, lifted)
-    comm = scene.coarse.comm
+    dual.lifting.mult(change, lifted)
+    comm = dual.coarse.comm
     energy, own = summed(comm, np.array([0.5 * float(change @ lifted), loss]))
     gap = bcast_from_root(comm, float(max(energy + own, 0.0)))
     return EnergyBound(apart + float(np.sqrt(2.0 * gap)), gap, apart)
 
 
-def admissible(scene: LiftedScene, lam: Array, u: Array, norm: float) -> tuple[Array, float]:
+def admissible(
+    dual: Dual, lam: Array, u: Array, norm: float, passes: int = 4, far: float = 1e8
+) -> tuple[Array, float]:
     """δ = v − u on the trace, which makes v admissible, and what contact loses by v. Collective.
 
     1. Equality rows are closed, and those of contact where λ + (Bu − c)/‖F‖ is in Ω: where a force
@@ -102,29 +81,31 @@ def admissible(scene: LiftedScene, lam: Array, u: Array, norm: float) -> tuple[A
     3. Contact loses max μᵀq − λᵀq, μ ∈ Ω, by q = Bv − c; the maximum is at P_Ω(λ + tq), t large.
 
     Args:
-        scene: The dual problem.
+        dual: The dual problem.
         lam: The multipliers λ ∈ Ω, shape ``(m,)``.
         u: Their displacement, shape ``(n,)``.
         norm: ‖F‖, or an estimate; 0 where there is none.
+        passes: Rounds in which rows that have come to overlap are closed, too; then all are.
+        far: Of the forces: the step from λ along a gap or a slip that ends where Ω ends.
 
     Returns:
         δ on this rank's trace unknowns; this rank's part of what contact loses, and of what closed
         rows still miss, as they depend on each other, times their forces.
     """
-    constraints, comm = scene.constraints, scene.coarse.comm
+    constraints, comm = dual.constraints, dual.coarse.comm
     contact = constraints.sets.contact
-    g = constraint_residual(constraints, u[scene.subdomains.trace])
+    g = constraint_residual(constraints, u[dual.subdomains.trace])
     p = lam + g / (norm or 1.0)
-    closed = (scene.feasible.project(p) == p)[contact]
+    closed = (dual.feasible.project(p) == p)[contact]
     wanted = -g
-    for last in (*[False] * PASSES, True):
+    for last in (*[False] * passes, True):
         wanted[contact] = np.where(closed | last, -g[contact], 0.0)
         change = min_norm_correction(constraints, wanted, closed | last)
         left = jumps(constraints.B, change) - wanted  # of rows that are not closed: B δ
         q = np.where(closed | last, 0.0, (g + left)[contact])
-        far = FAR * largest(comm, lam) / (largest(comm, q) or 1.0)
-        moved_by = _within(scene.feasible, lam, contact, far * q)
-        overlaps = (np.abs(moved_by) > 0.5 * far * np.abs(q)) & (q != 0.0)
+        t = far * largest(comm, lam) / (largest(comm, q) or 1.0)
+        moved_by = within(dual.feasible, lam, contact, t * q)
+        overlaps = (np.abs(moved_by) > 0.5 * t * np.abs(q)) & (q != 0.0)
         if not any_rank(comm, bool(overlaps.any())):
             break
         closed |= overlaps
@@ -132,7 +113,7 @@ def admissible(scene: LiftedScene, lam: Array, u: Array, norm: float) -> tuple[A
     return change, float(moved_by @ q + np.abs(lam[contact]) @ still)
 
 
-def _within(feasible: FeasibleSet, lam: Array, rows: Array, step: Array) -> Array:
+def within(feasible: FeasibleSet, lam: Array, rows: Array, step: Array) -> Array:
     """P_Ω(λ + step) − λ on some rows."""
     to = np.array(lam)
     to[rows] += step
@@ -140,31 +121,31 @@ def _within(feasible: FeasibleSet, lam: Array, rows: Array, step: Array) -> Arra
 
 
 def _balanced(
-    scene: LiftedScene, lam: PETSc.Vec, u: Array, norm: float, balanced: float
+    dual: Dual, lam: PETSc.Vec, u: Array, norm: float, balanced: float
 ) -> tuple[Array, Array, float]:
     """Return forces in Ω with Gλ = e, their displacement, and its distance from u in energy.
 
     Where λ does not balance the load, the nearest feasible point to λ − (Fλ − d)/‖F‖ does: that
     to λ might take a force off its bound where something opens or slips far.
     """
-    coarse, subdomains, given = scene.coarse, scene.subdomains, np.array(lam.array_r)
-    outside = float(np.sum((scene.feasible.project(given) - given) ** 2))
+    coarse, subdomains, given = dual.coarse, dual.subdomains, np.array(lam.array_r)
+    outside = float(np.sum((dual.feasible.project(given) - given) ** 2))
     left, size = summed(coarse.comm, np.array([outside, float(given @ given)]))
     inside = bcast_from_root(coarse.comm, bool(left <= balanced**2 * size))
     if inside and (coarse.dimension == 0 or imbalance(coarse, lam) <= balanced):
         return given, u, 0.0
     wanted = lam.copy()
     if norm > 0.0:
-        wanted.array[:] += constraint_residual(scene.constraints, u[subdomains.trace]) / norm
-    within = coarse if coarse.dimension else NoCoarse()
-    found = project_onto_feasible(within, scene.feasible, wanted)
+        wanted.array[:] += constraint_residual(dual.constraints, u[subdomains.trace]) / norm
+    on = coarse if coarse.dimension else NoCoarse()
+    found = project_onto_feasible(on, dual.feasible, wanted)
     forces = np.array(found.lam.array_r)
     wanted.destroy()
     found.lam.destroy()
     if found.missing > HELD:
         return given, u, float("inf")
     # −K⁺Bᵀ(λ' − λ) + Rα, α such that rows miss as much as before
-    B, zero = scene.constraints.B, np.zeros_like(u)
+    B, zero = dual.constraints.B, np.zeros_like(u)
     change = elastic_displacement(B, subdomains, forces - given, zero)
     if coarse.dimension:
         rows = jumps(B, change[subdomains.trace])

@@ -8,109 +8,53 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from time import perf_counter
-from typing import Any, Protocol
 
 import numpy as np
 from petsc4py import PETSc
 from scipy.sparse import block_diag, csr_array
 
-from tfeti_dolfinx.common.arrays import Array, joined, node_means, parts_of
+from tfeti_dolfinx.common.arrays import Array, joined, node_means
 from tfeti_dolfinx.common.parallel import any_rank
-from tfeti_dolfinx.errors import raised_on_all_ranks, require
+from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.subdomains.local_operators import LocalOperator
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # --- K on the trace and next to it ------------------------------------------------------------
 
-# equal subdomains from which on they share a matrix: products with several are slow for few
-SHARED = 16
 
-
-class NearStiffness:
+def near_stiffness(blocks: Sequence[SparseBlock]) -> tuple[csr_array, Array]:
     """K between the trace unknowns of each subdomain and those that share a cell with them.
-
-    Its vectors are the t trace unknowns of a rank, as ``Subdomains`` has them, and after them the
-    t_n ones next to them. Many equal subdomains with equal traces share a matrix, all others have
-    one together.
 
     Args:
         blocks: This rank's Blocks.
 
-    Attributes:
-        diagonal: Next to the trace, the mean of the diagonal of K at each node, shape ``(t_n,)``.
+    Returns:
+        K of shape ``(t + t_n,) * 2``: on the t trace unknowns of this rank, as ``Subdomains`` has
+        them, and after them on the t_n ones next to them; there the mean of the diagonal of K at
+        each node, shape ``(t_n,)``.
     """
-
-    def __init__(self, blocks: Sequence[SparseBlock]) -> None:
-        seen = [block for block in blocks if len(block.trace_dofs)]
-        members: dict[int, list[int]] = {}
-        for i, block in enumerate(seen):
-            members.setdefault(id(block.traced), []).append(i)
-        next_to = {of: _next_to(seen[first]) for of, (first, *_) in members.items()}
-        own = [next_to[id(block.traced)] for block in seen]
-        pairs = zip(seen, own, strict=True)
-        means = [node_means(b.stiffness.diagonal, b.bs)[dofs] for b, dofs in pairs]
-        self.diagonal = joined(means)
-        traces = parts_of([len(block.trace_dofs) for block in seen])
-        parts = parts_of([*([traces[-1].stop] if seen else []), *map(len, own)])[1:]
-        places = [
-            np.concatenate((trace.start + np.argsort(b.trace_place), np.arange(p.start, p.stop)))
-            for b, trace, p in zip(seen, traces, parts, strict=True)
-        ]
-        self._products: list[tuple[csr_array, Array]] = []
-        alone: list[tuple[csr_array, Array]] = []
-        for of, equal in members.items():
-            K = _restricted_to_rows(seen[equal[0]], next_to[of])
-            if len(equal) < SHARED:
-                alone += [(K, places[i]) for i in equal]
-            else:
-                self._products.append((K, np.stack([places[i] for i in equal], axis=1)))
-        if alone:
-            K = csr_array(block_diag([K for K, _ in alone], format="csr"))
-            self._products.append((K, np.concatenate([place for _, place in alone])))
-
-    def mult(self, u: Array, out: Array) -> None:
-        """out = K u, shapes ``(t + t_n,)``; all of out is set."""
-        for K, place in self._products:
-            out[place] = K @ u[place]
-
-
-def _next_to(block: SparseBlock) -> Array:
-    """Unknowns of the stiffness that are not in the trace, of nodes that share a cell with it."""
-    trace, bs = block.traced.trace, block.bs
-    rows = block.stiffness.K[trace]
-    rows.eliminate_zeros()  # entries between fixing nodes
-    nodes = np.unique(rows.indices // bs)
-    reached = (bs * nodes[:, None] + np.arange(bs)).ravel()
-    return np.setdiff1d(reached, trace, assume_unique=True)
-
-
-def _restricted_to_rows(block: SparseBlock, next_to: Array) -> csr_array:
-    """K on the trace, ascending, and on these unknowns."""
-    kept = np.concatenate((block.traced.trace, next_to))
-    return csr_array(block.stiffness.K[kept][:, kept])
+    parts, means = [], []
+    places: list[Array] = [np.empty(0, dtype=np.int64)]
+    start, end = 0, sum(len(block.trace_dofs) for block in blocks)
+    for block in (block for block in blocks if len(block.trace_dofs)):
+        trace, bs, K = block.traced.trace, block.bs, block.stiffness.K
+        rows = K[trace]
+        rows.eliminate_zeros()  # entries between fixing nodes
+        nodes = np.unique(rows.indices // bs)
+        reached = (bs * nodes[:, None] + np.arange(bs)).ravel()
+        next_to = np.setdiff1d(reached, trace, assume_unique=True)
+        kept = np.concatenate((trace, next_to))
+        parts.append(K[kept][:, kept])
+        means.append(node_means(block.stiffness.diagonal, bs)[next_to])
+        places += [start + np.argsort(block.trace_place), end + np.arange(len(next_to))]
+        start, end = start + len(trace), end + len(next_to)
+    order = np.argsort(np.concatenate(places))
+    K = csr_array(block_diag(parts, format="csr")) if parts else csr_array((0, 0))
+    return csr_array(K[order][:, order]), joined(means)
 
 
 # --- The dual operator F = B K⁺ Bᵀ and its preconditioners ------------------------------------
-
-# (λ + 2μ)/μ: 20 of ν = 0.474; from here on what is inside has to follow where a trace moves
-VOLUME = 20.0
-
-
-class RowMatrix(Protocol):
-    """B, or something that stands for it between dual and trace vectors."""
-
-    def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = B x; x may be overwritten. Collective."""
-        ...
-
-    def multTranspose(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = Bᵀ x. Collective."""
-        ...
-
-    def createVecRight(self) -> PETSc.Vec:
-        """Return a trace vector. Collective."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -119,13 +63,13 @@ class Metric:
 
     Attributes:
         trace: K_bb.
-        near: Makes K on the trace and on what is next to it, where a subdomain of some rank hardly
+        near: Makes ``near_stiffness``, where a subdomain of some rank hardly
             changes its volume; else None.
         hard: Whether such a one is in space, where many steps cost less than they save.
     """
 
     trace: LocalOperator
-    near: Callable[[], NearStiffness] | None
+    near: Callable[[], tuple[csr_array, Array]] | None
     hard: bool
 
 
@@ -142,7 +86,7 @@ class DualOperator:
         count: Multiplications so far, by who they are charged to (``"solver"`` by default).
     """
 
-    def __init__(self, B: RowMatrix, local: LocalOperator, metric: Metric | None = None) -> None:
+    def __init__(self, B: PETSc.Mat, local: LocalOperator, metric: Metric | None = None) -> None:
         self.B, self.local, self.metric = B, local, metric
         self.count: Counter[str] = Counter()
         self._payer, self._seconds, self._times = "solver", 0.0, 0
@@ -193,8 +137,8 @@ def dual_operator(B: PETSc.Mat, subdomains: Subdomains) -> DualOperator:
     return DualOperator(B, subdomains.local_operator("pinv"))
 
 
-class ScaledRows:
-    """B_D = B D⁻¹, which is (B D⁻¹ Bᵀ)⁻¹ B D⁻¹ for rows that are orthonormal in D⁻¹.
+def scaled_rows(B: PETSc.Mat, weights: Array) -> PETSc.Mat:
+    """B_D = B D⁻¹, (B D⁻¹ Bᵀ)⁻¹ B D⁻¹ for rows that are orthonormal in D⁻¹. Collective.
 
     With D the stiffness, preconditioners built on B_D bear jumps of stiffness between subdomains
     (Klawonn, Widlund, Comm. Pure Appl. Math. 54, 2001, section 4).
@@ -203,49 +147,40 @@ class ScaledRows:
         B: Dual rows × trace unknowns.
         weights: D on this rank's trace unknowns.
     """
-
-    def __init__(self, B: PETSc.Mat, weights: Array) -> None:
-        self.B = B
-        self._inverse = B.createVecRight()
-        self._inverse.array[:] = 1.0 / weights
-
-    def multTranspose(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = B_Dᵀ x. Collective."""
-        self.B.multTranspose(x, y)
-        y.pointwiseMult(y, self._inverse)
-
-    def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = B_D x; x is overwritten. Collective."""
-        x.pointwiseMult(x, self._inverse)
-        self.B.mult(x, y)
-
-    def createVecRight(self) -> PETSc.Vec:
-        """Return a trace vector. Collective."""
-        return self.B.createVecRight()
-
-    def destroy(self) -> None:
-        """Destroy D, not B. Collective."""
-        self._inverse.destroy()
+    scaled, inverse = B.copy(), B.createVecRight()
+    inverse.array[:] = 1.0 / weights
+    scaled.diagonalScale(None, inverse)
+    inverse.destroy()
+    return scaled
 
 
-def lumped_preconditioner(B: RowMatrix, subdomains: Subdomains) -> DualOperator:
+def lumped_preconditioner(B: PETSc.Mat, subdomains: Subdomains) -> DualOperator:
     """B K_bb Bᵀ (Farhat, Roux 1991), B or rather B_D. Collective."""
     return DualOperator(B, subdomains.local_operator("stiffness"))
 
 
-def dirichlet_preconditioner(B: RowMatrix, subdomains: Subdomains) -> DualOperator:
-    """B S Bᵀ (Farhat, Mandel, Roux 1994), B or rather B_D; with a metric if sparse. Collective."""
+def dirichlet_preconditioner(
+    B: PETSc.Mat, subdomains: Subdomains, volume: float = 20.0
+) -> DualOperator:
+    """B S Bᵀ (Farhat, Mandel, Roux 1994), B or rather B_D; with a metric if sparse. Collective.
+
+    Args:
+        B: B_D.
+        subdomains: This rank's Blocks.
+        volume: (λ + 2μ)/μ, 20 of ν = 0.474, from which on what is inside has to follow where a
+            trace moves.
+    """
     sparse = [block for block in subdomains.blocks if isinstance(block, SparseBlock)]
     metric, comm = None, subdomains.comm
     if not any_rank(comm, len(sparse) < len(subdomains.blocks)):
-        stiff = [block.bs for block in sparse if block.stiffness.stretch_over_shear > VOLUME]
-        near = partial(NearStiffness, sparse) if any_rank(comm, bool(stiff)) else None
+        stiff = [block.bs for block in sparse if block.stiffness.stretch_over_shear > volume]
+        near = partial(near_stiffness, sparse) if any_rank(comm, bool(stiff)) else None
         hard = any_rank(comm, 3 in stiff)
         metric = Metric(subdomains.local_operator("stiffness"), near, hard)
     return DualOperator(B, subdomains.local_operator("schur"), metric)
 
 
-MakePreconditioner = Callable[[RowMatrix, Subdomains], DualOperator]
+MakePreconditioner = Callable[[PETSc.Mat, Subdomains], DualOperator]
 PRECONDITIONERS: dict[str, MakePreconditioner] = {
     "lumped": lumped_preconditioner,
     "dirichlet": dirichlet_preconditioner,
@@ -260,22 +195,3 @@ def linear_term(B: PETSc.Mat, c: PETSc.Vec, subdomains: Subdomains) -> PETSc.Vec
     d.axpy(-1.0, c)
     v.destroy()
     return d
-
-
-def check_operator(F: Any, like: PETSc.Vec, tol: float = 1e-10) -> None:
-    """Check that an operator is symmetric and positive semidefinite on random vectors. Collective.
-
-    Raises:
-        ConformanceError: It is not; the message says which.
-    """
-    rng = np.random.default_rng(like.getComm().getRank())
-    x, y, Fx, Fy = (like.duplicate() for _ in range(4))
-    for _ in range(3):
-        for vec in (x, y):
-            vec.array[:] = rng.standard_normal(vec.getLocalSize())
-        F.mult(x, Fx)
-        F.mult(y, Fy)
-        require(x.dot(Fx) >= 0.0, "xᵀFx ≥ 0")
-        require(abs(y.dot(Fx) - x.dot(Fy)) <= tol * Fx.norm() * y.norm(), "yᵀFx = xᵀFy")
-    for vec in (x, y, Fx, Fy):
-        vec.destroy()

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
-from typing import Protocol
 
 import numpy as np
 from mpi4py import MPI
@@ -12,10 +10,10 @@ from petsc4py import PETSc
 from scipy.sparse import coo_array, csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
 
-from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, summed
 from tfeti_dolfinx.errors import FactorError, raised_on_all_ranks
-from tfeti_dolfinx.feti.rigid_bodies import NullBasis
+from tfeti_dolfinx.feti.rigid_bodies import independent, parts_of_columns
 from tfeti_dolfinx.qp.coarse import NOTHING
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
@@ -24,15 +22,15 @@ from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteE
 
 
 class Grams:
-    """GGᵀ, and G_f G_fᵀ of faces f; the part of gluing and Dirichlet rows is made once.
+    """GGᵀ, and GZ(GZ)ᵀ of faces; the part of gluing and Dirichlet rows is made once.
 
     An entry is stored for each pair of coordinates that meet in a row, so that storage grows with
-    the number of subdomains. A face costs what its contact rows cost. All methods are collective.
+    the number of subdomains. A face costs what its contact rows cost.
 
     Args:
         Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
         bounded: Local rows that some set may constrain.
-        comm: Communicator. The constructor is collective.
+        comm: Communicator. The constructor and ``of_face`` are collective.
 
     Attributes:
         whole: GGᵀ, shape ``(r, r)``.
@@ -46,24 +44,11 @@ class Grams:
         self._base = replicated_gram(csr_array(Gt[self._always]), comm)
         self.whole = csr_array(self._base + replicated_gram(self._contact, comm))
 
-    def of_rows(self, kept: Array) -> csr_array:
-        """G_f G_fᵀ of the local rows flagged, shape ``(r, r)``."""
-        contact = csr_array(self._contact[kept[self._bounded]])
-        all_others = bool(np.all(kept[self._always]))
-        return self._sum(contact, all_others, lambda: csr_array(self._Gt[kept]))
-
     def of_face(self, face: Face) -> csr_array:
-        """GZ(GZ)ᵀ, shape ``(r, r)``."""
+        """GZ(GZ)ᵀ, shape ``(r, r)``; of all rows anew where a set constrains any other row."""
+        if any_rank(self._comm, bool(np.any(face.constrained[self._always]))):
+            return replicated_gram(csr_array(face.Z.T @ self._Gt), self._comm)
         contact = csr_array(face.Z[self._bounded].T @ self._contact)
-        all_others = not np.any(face.constrained[self._always])
-        return self._sum(contact, all_others, lambda: csr_array(face.Z.T @ self._Gt))
-
-    def _sum(
-        self, contact: csr_array, all_others: bool, rows: Callable[[], csr_array]
-    ) -> csr_array:
-        """With contact rows; with all of the rows anew where some other one is constrained."""
-        if any_rank(self._comm, not all_others):
-            return replicated_gram(rows(), self._comm)
         return csr_array(self._base + replicated_gram(contact, self._comm))
 
 
@@ -82,22 +67,21 @@ def replicated(part: csr_array, comm: MPI.Intracomm) -> csr_array:
 
 # --- Factors of the coarse problem ------------------------------------------------------------
 
-# Added to a unit diagonal, where pivots are lost to rounding; so small a shift is made good by
-# refinement in all directions that stand out from rounding.
+# Added to a unit diagonal, where pivots are lost to rounding, as on faces that leave a body free
 SHIFTS = (0.0, 1e-14, 1e-13, 1e-12)
-# each divides the error in a direction of eigenvalue σ by σ / shift: three do for σ from 1e-8 on
-REFINEMENTS = 3
 
 
 class SemidefiniteFactor:
     """A⁺ of a sparse positive semidefinite A with a known null space, on each rank.
 
     S A S + E Eᵀ with a unit diagonal of S A S, E unit vectors of entries that determine the null
-    modes: an exact generalised inverse for right sides orthogonal to them.
+    modes: an exact generalised inverse for right sides orthogonal to them. Where a pivot is lost a
+    small shift takes its place, made good by three steps of refinement: each divides the error in a
+    direction of eigenvalue σ by σ / shift.
 
     Args:
         A: scipy CSR, shape ``(r, r)``, the same on all ranks.
-        null: Its null space.
+        null: Its null space, orthonormal columns, shape ``(r, c)``.
         comm: Communicator. The constructor is collective.
         what: Name of A for messages.
         prefix: Prefix of the factor's PETSc options.
@@ -112,57 +96,64 @@ class SemidefiniteFactor:
     def __init__(
         self,
         A: csr_array,
-        null: NullBasis,
+        null: csr_array,
         comm: MPI.Intracomm,
         what: str,
         prefix: str = "tfeti_coarse_",
     ) -> None:
-        self.comm, self._null, diagonal = comm, null, A.diagonal()
-        pinned = np.where(diagonal > 0.0, 0.0, 1.0)  # what nothing holds at all stands for itself
-        self._scale = np.where(diagonal > 0.0, diagonal, 1.0) ** -0.5
-        pinned[null.pins(self._scale)] = 1.0
+        self.comm, self._null = comm, null
+        self._scale, pinned = _scaling(A, null)
         scaled = csr_array(A, copy=True)  # quicker than products of sparse matrices
         scaled.data *= np.repeat(self._scale, np.diff(A.indptr))
         scaled.data *= self._scale[A.indices]
         self._A = csr_array(scaled + diags_array(pinned)) if np.any(pinned) else scaled
         self._factor: CholeskyFactor | None = None
         for self._shift in SHIFTS if A.shape[0] else ():
-            if self._factored(comm, what, prefix):
+            lost = False
+            with raised_on_all_ranks(comm):
+                try:
+                    shifted = self._A + self._shift * eye_array(A.shape[0])
+                    self._factor = CholeskyFactor(shifted if self._shift else self._A, prefix)
+                except FactorError as error:
+                    lost = isinstance(error, NotPositiveDefiniteError)
+                    if not lost or self._shift == SHIFTS[-1]:
+                        raise type(error)(f"{what}: {error}") from error
+            if not any_rank(comm, lost):
                 return
-
-    def _factored(self, comm: MPI.Intracomm, what: str, prefix: str) -> bool:
-        """Factor A with the present shift; return whether that succeeded everywhere. Collective."""
-        lost: NotPositiveDefiniteError | None = None
-        with raised_on_all_ranks(comm):
-            try:
-                shift = self._shift * eye_array(self._A.shape[0])
-                self._factor = CholeskyFactor(self._A + shift if self._shift else self._A, prefix)
-            except NotPositiveDefiniteError as error:
-                lost = error
-                if self._shift == SHIFTS[-1]:
-                    raise type(error)(f"{what}: {error}") from error
-            except FactorError as error:
-                raise FactorError(f"{what}: {error}") from error
-        if not comm.allreduce(lost is not None, op=MPI.LOR):
-            return True
-        self.destroy()
-        return False
+            self.destroy()
 
     def solve(self, y: Array) -> Array:
         """A⁺ y up to null modes that are removed, y orthogonal to them."""
         if self._factor is None:
             return y
-        b = self._scale * self._null.removed(y)
+        b = self._scale * _without(self._null, y)
         x = self._factor.solve(b)
-        for _ in range(REFINEMENTS if self._shift else 0):
+        for _ in range(3 if self._shift else 0):
             x += self._factor.solve(b - self._A @ x)
-        return self._null.removed(self._scale * x)
+        return _without(self._null, self._scale * x)
 
     def destroy(self) -> None:
         """Free the factor."""
         if self._factor is not None:
             self._factor.destroy()
             self._factor = None
+
+
+def _scaling(A: csr_array, null: csr_array) -> tuple[Array, Array]:
+    """S of a unit diagonal of SAS; flags of entries that determine the null modes, or are 0."""
+    diagonal = A.diagonal()
+    scale = np.where(diagonal > 0.0, diagonal, 1.0) ** -0.5
+    pinned = np.where(diagonal > 0.0, 0.0, 1.0)  # what nothing holds at all stands for itself
+    for _, rows, dense in parts_of_columns(null):
+        modes = dense / scale[rows, None]
+        size = np.maximum(np.linalg.norm(modes, axis=0), TINY)
+        pinned[rows[independent(modes / size)]] = 1.0
+    return scale, pinned
+
+
+def _without(null: csr_array, x: Array) -> Array:
+    """x less its part in the null space."""
+    return np.asarray(x - null @ (null.T @ x)) if null.shape[1] else x
 
 
 # --- Oblique projectors -----------------------------------------------------------------------
@@ -172,7 +163,8 @@ class ObliqueProjectors:
     """P = Z(I − G_fᵀH⁺G(I + C)Z)Zᵀ with H = G(I + C)ZG_fᵀ, of a face and C.
 
     λ = (I + C)u moves with u in the face: G(I + C)u = 0 for u = Pv, and P makes nothing of what
-    G_fᵀ gives. With C = 0 it is the orthogonal projector of the face.
+    G_fᵀ gives. With C = 0 it is the orthogonal projector of the face. H is G_fG_fᵀ and a part that
+    has the same null space; scaled and pinned as in ``SemidefiniteFactor``.
 
     Args:
         Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
@@ -192,52 +184,14 @@ class ObliqueProjectors:
         grams: Grams,
         face: Face,
         C: csr_array,
-        null: NullBasis,
+        null: csr_array,
         comm: MPI.Intracomm,
     ) -> None:
-        self._comm, self._face, self._Gt = comm, face, Gt
+        self._comm, self._face, self._Gt, self._null = comm, face, Gt, null
         self._following = csr_array(C.T @ Gt)
         part = csr_array((face.Z.T @ self._following).T @ (face.Z.T @ Gt))
-        self._factor = GeneralFactor(grams.of_face(face), replicated(part, comm), null, comm)
-
-    def coordinates(self, x: Array) -> Array:
-        """H⁺G(I + C)ZZᵀx, replicated, shape ``(r,)`` or ``(r, q)``. Collective."""
-        own = self._face.restricted(x)
-        return self._factor.solve(summed(self._comm, self._Gt.T @ own + self._following.T @ own))
-
-    def combine(self, mu: Array) -> Array:
-        """ZZᵀGᵀμ, this rank's part. Not collective."""
-        return self._face.restricted(self._Gt @ mu)
-
-    def project(self, x: Array) -> Array:
-        """P x, shapes ``(m_local,)`` or ``(m_local, q)``. Collective."""
-        return self._face.restricted(x) - self.combine(self.coordinates(x))
-
-    def restoring(self, y: Array) -> Array:
-        """Return u = ZG_fᵀH⁺y, which solves G(I + C)u = y if that is solvable. Not collective."""
-        return self.combine(self._factor.solve(y))
-
-
-class GeneralFactor:
-    """(A + N)⁺ of a sparse positive semidefinite A, with a null space that N keeps, on each rank.
-
-    Scaled to a unit diagonal of A, with unit vectors added as in ``SemidefiniteFactor``.
-
-    Args:
-        A: scipy CSR, shape ``(r, r)``, the same on all ranks.
-        N: The same.
-        null: The null space of both, and of their transposes.
-        comm: Communicator. The constructor is collective.
-
-    Raises:
-        FactorError: The sum is singular besides.
-    """
-
-    def __init__(self, A: csr_array, N: csr_array, null: NullBasis, comm: MPI.Intracomm) -> None:
-        self._null, diagonal = null, A.diagonal()
-        pinned = np.where(diagonal > 0.0, 0.0, 1.0)
-        self._scale = np.where(diagonal > 0.0, diagonal, 1.0) ** -0.5
-        pinned[null.pins(self._scale)] = 1.0
+        A, N = grams.of_face(face), replicated(part, comm)
+        self._scale, pinned = _scaling(A, null)
         S = diags_array(self._scale)
         with raised_on_all_ranks(comm):
             try:
@@ -245,25 +199,26 @@ class GeneralFactor:
             except RuntimeError as error:
                 raise FactorError(f"the coarse problem of a face with friction: {error}") from error
 
-    def solve(self, y: Array) -> Array:
-        """The solution without null modes, for y orthogonal to them; ``(r,)`` or ``(r, q)``."""
-        x = self._factor.solve((self._scale * self._null.removed(y).T).T)
-        return self._null.removed((self._scale * x.T).T)
+    def _solve(self, y: Array) -> Array:
+        """H⁺y without null modes, for y orthogonal to them; shape ``(r,)`` or ``(r, q)``."""
+        x = self._factor.solve((self._scale * _without(self._null, y).T).T)
+        return _without(self._null, (self._scale * x.T).T)
+
+    def coordinates(self, x: Array) -> Array:
+        """H⁺G(I + C)ZZᵀx, replicated, shape ``(r,)`` or ``(r, q)``. Collective."""
+        own = self._face.restricted(x)
+        return self._solve(summed(self._comm, self._Gt.T @ own + self._following.T @ own))
+
+    def project(self, x: Array) -> Array:
+        """P x, shapes ``(m_local,)`` or ``(m_local, q)``. Collective."""
+        return self._face.restricted(x - self._Gt @ self.coordinates(x))
+
+    def restoring(self, y: Array) -> Array:
+        """Return u = ZG_fᵀH⁺y, which solves G(I + C)u = y if that is solvable. Not collective."""
+        return self._face.restricted(self._Gt @ self._solve(y))
 
 
 # --- Orthogonal projectors, on all rows or on a face ------------------------------------------
-
-
-class CoarseFactor(Protocol):
-    """A generalised inverse on r-vectors."""
-
-    def solve(self, y: Array) -> Array:
-        """A⁺ y."""
-        ...
-
-    def destroy(self) -> None:
-        """Free it."""
-        ...
 
 
 class Projectors:
@@ -278,7 +233,7 @@ class Projectors:
     comm: MPI.Intracomm
     Gt: csr_array
     e: Array
-    _factor: CoarseFactor
+    _factor: SemidefiniteFactor
 
     def G(self, x: Array) -> Array:
         """G x, shape ``(r,)``, from this rank's part of x."""
@@ -369,7 +324,7 @@ class FaceFactors:
         count: How many factors there were so far: of the whole, and of faces.
     """
 
-    def __init__(self, comm: MPI.Intracomm, null: NullBasis, prefix: str) -> None:
+    def __init__(self, comm: MPI.Intracomm, null: csr_array, prefix: str) -> None:
         self.comm, self._null, self._prefix = comm, null, prefix
         self.count: Counter[str] = Counter()
 
@@ -382,47 +337,3 @@ class FaceFactors:
         self.count[kind] += 1
         what = f"GGᵀ of the {'coarse problem' if kind == 'whole' else 'rows of a face'}"
         return SemidefiniteFactor(gram, self._null, self.comm, what, self._prefix)
-
-
-class AllRows(Protocol):
-    """Data of all rows that projectors of a face need."""
-
-    comm: MPI.Intracomm
-    Gt: csr_array
-    e: Array
-    grams: Grams
-
-    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
-        """(G_f G_fᵀ + damping·GGᵀ)⁻¹y."""
-        ...
-
-
-class FaceProjectors(Projectors):
-    """P and Q on a face of the rows: G_f = GZ, vectors in the layout of all rows.
-
-    A face that leaves motions free that all rows hold has a G_f without full rank: harmless for
-    P and Q, since what the factor makes of such a motion G_fᵀ does not see.
-
-    Args:
-        whole: Gᵀ of all rows, e, and the factors of other faces.
-        face: The face.
-        factors: Makes the factor. Collective.
-    """
-
-    def __init__(self, whole: AllRows, face: Face, factors: FaceFactors) -> None:
-        self.comm, self._whole, self._face = whole.comm, whole, face
-        self.Gt, self.e = whole.Gt, whole.e
-        self._factor = factors.factor(whole.grams.of_face(face))
-        self._factors = factors
-
-    def restricted(self, x: Array) -> Array:
-        """ZZᵀ x."""
-        return self._face.restricted(x)
-
-    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
-        """Solve with the damped coarse matrix of all rows."""
-        return self._whole.damped_solve(face, y, damping)
-
-    def on_face(self, face: Face) -> FaceProjectors:
-        """Return the projectors of another face of all rows."""
-        return FaceProjectors(self._whole, face, self._factors)

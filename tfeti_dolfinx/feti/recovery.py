@@ -5,30 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.feti.coarse import CoarseSpace
-from tfeti_dolfinx.qp.sets import Face
+from tfeti_dolfinx.qp.sets import Face, face_of
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
-
-
-@dataclass(frozen=True)
-class RecoveryParameters:
-    """Parameters of the recovery.
-
-    Attributes:
-        damping: Of GGᵀ, added to G_f G_fᵀ: rows with a force that hold a motion by less would
-            answer with their rounding over this share.
-        no_force: Force that counts as none, of the largest on the same bodies, or of their loads.
-        no_effect: The same in multiples of the solver's own error.
-    """
-
-    damping: float = 1e-8
-    no_force: float = 1e-6
-    no_effect: float = 10.0
 
 
 @dataclass(frozen=True)
@@ -54,46 +37,50 @@ class Recovered:
 def recover(
     constraints: Constraints,
     coarse: CoarseSpace,
-    response: Array,
     lam: Array,
     gradient: Array,
     face: Face,
     error: float,
-    parameters: RecoveryParameters | None = None,
+    no_effect: float = 10.0,
+    damping: float = 1e-8,
 ) -> Recovered:
     """u = K⁺(f − Bᵀλ) + Rα; of displacements that differ by free motions the smallest. Collective.
 
     α = (GGᵀ)⁻¹G(Fλ − d − ν) makes the rows' residuals vanish, but for ν, the gaps of open rows
     as the solver left them. A step of the damped normal equations on the rows f that the face
-    holds (equalities, λ_N > 0) makes theirs as small as α can.
+    holds (equalities, λ_N > 0) makes theirs as small as α can: gaps may be far larger than u.
 
     Args:
         constraints: B and c.
         coarse: The coarse space.
-        response: K⁺f, shape ``(n,)``.
         lam: The multipliers, shape ``(m,)``.
         gradient: Fλ − d up to the range of Gᵀ; on rows that the face does not hold it is ν.
         face: The face of λ.
         error: How large multipliers may be by the solver's error alone.
-        parameters: Parameters.
+        no_effect: Of that: a larger force of a normal counts.
+        damping: Of GGᵀ, added to G_f G_fᵀ: rows with a force that hold a motion by less would
+            answer with their rounding over this share.
     """
-    given, subdomains = parameters or RecoveryParameters(), coarse.subdomains
-    u = elastic_displacement(constraints.B, subdomains, lam, response)
+    subdomains = coarse.subdomains
+    u = elastic_displacement(constraints.B, subdomains, lam, subdomains.pinv_load)
     residual = -constraint_residual(constraints, u[subdomains.trace])  # = Fλ − d
     alpha: Array = np.zeros(0)
     if coarse.dimension:
         held = face.holding
         alpha = coarse.solve(coarse.G(residual - np.where(held, 0.0, gradient)))
         if coarse.comm.allreduce(int(np.sum(~held))):
-            factor = coarse.damped_factor(held, given.damping)
             left = np.where(held, residual - coarse.Gt @ alpha, 0.0)
-            alpha = alpha + factor.solve(coarse.G(left))
-            factor.destroy()
+            on_held = face_of(held, face.status)
+            alpha = alpha + coarse.damped_solve(on_held, coarse.G(left), damping)
         u = moved(u, coarse, alpha)
     gap = residual - coarse.Gt @ alpha
     if (N := coarse.free_basis).shape[1]:  # gaps do not change
-        u = moved(u, coarse, coarse.motions @ (N @ -(N.T @ coarse.bodies.part_of(u))))
-    active = active_contact(coarse, lam, face.carrying, error, given)
+        u = moved(u, coarse, coarse.bodies.motions @ (N @ -(N.T @ coarse.bodies.part_of(u))))
+    # what sticks holds, pushed or not, and so do all rows of friction that carry a force
+    active = np.zeros(len(lam), dtype=bool)
+    active[coarse.bounded] = (np.abs(lam) > no_effect * error)[coarse.bounded]
+    active[coarse.rubbing] = True
+    active &= face.carrying
     return Recovered(np.array(lam), u, gap, residual, active)
 
 
@@ -129,42 +116,6 @@ def constraint_residual(constraints: Constraints, v: Array) -> Array:
 def moved(u: Array, coarse: CoarseSpace, alpha: Array) -> Array:
     """u + Rα."""
     return u + coarse.subdomains.kernel_motion(coarse.local_alpha(alpha))
-
-
-def active_contact(
-    coarse: CoarseSpace,
-    lam: Array,
-    carrying: Array,
-    error: float,
-    parameters: RecoveryParameters | None = None,
-) -> Array:
-    """Flag contact rows whose force is more than the solver's error. Collective.
-
-    What sticks holds, pushed or not, and so do all rows of friction that carry a force.
-
-    Args:
-        coarse: The coarse space.
-        lam: The multipliers, shape ``(m,)``.
-        carrying: Flags of the local rows that carry a force.
-        error: How large multipliers may be by the solver's error alone.
-        parameters: Parameters.
-    """
-    given = parameters or RecoveryParameters()
-    lam, force = np.where(carrying, np.abs(lam), 0.0), np.zeros(len(lam))
-    force[coarse.bounded] = (lam * coarse.row_size)[coarse.bounded]
-    row, column = coarse.J.tocoo().coords
-    body = column // coarse.bodies.k
-    largest = np.zeros(coarse.bodies.count)
-    np.maximum.at(largest, body, force[row])
-    coarse.comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
-    loads = np.where(coarse.bodies.loads > 0.0, coarse.bodies.loads, np.inf)
-    of_forces, of_loads = np.full((2, len(lam)), np.inf)
-    np.minimum.at(of_forces, row, largest[body])
-    np.minimum.at(of_loads, row, loads[body])
-    error_alone = (lam <= given.no_effect * error) & (force <= given.no_force * of_loads)
-    active = (force > 0.0) & (force > given.no_force * of_forces) & ~error_alone
-    active[coarse.rubbing] = carrying[coarse.rubbing]
-    return active
 
 
 # --- Minimum-norm correction of constraint residuals ------------------------------------------

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from itertools import product
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.optimize import linprog
-from scipy.sparse import csr_array, diags_array, eye_array, hstack, vstack
+from scipy.sparse import csr_array, diags_array, hstack, vstack
 from scipy.sparse.csgraph import connected_components
 
 from tfeti_dolfinx.common.arrays import TINY, Array
@@ -77,164 +76,91 @@ class RigidScene:
     cones: tuple[csr_array, ...] = ()
     given: tuple[csr_array, ...] = ()
 
-    def parts(self) -> Iterator[tuple[Array, RigidScene]]:
-        """Split into parts that do not meet, each with its motions, and a load of size 1.
+    def escape(self, factor: float = 1.0) -> Array | None:
+        """Return a motion that escapes friction of so many times its size, if there is one.
 
-        Parts may be loaded by very different forces. Those are left out whose load is rounding.
+        Programs in y = p − q, p, q ≥ 0, and the work t of friction begin without rows; those that
+        their minimiser violates are added until there are none. None, too, where that takes too
+        many programs: then the solver will see.
         """
-        if (n := len(self.load)) == 0:
-            return
+        n = len(self.load)
+        scale = self._scale() if n else self.load
+        if not scale.any():
+            return None
+        cones = tuple(factor * M for M in self.cones)
+        given = tuple(csr_array(factor * W @ diags_array(scale)) for W in self.given)
+        load, noise = scale * self.load, np.where(scale > 0.0, scale * self.noise, 1.0)
+        cuts = csr_array((0, n + 1))
+
+        def minimised(cost: Array, upper: float | None, **rest: Any) -> tuple[Array, float]:
+            nonlocal cuts
+            count, bounds = 2 * n, [(0.0, upper)] * (2 * n) + [(0.0, None)]
+            for _ in range(PARAMETERS.max_programs):
+                A = csr_array(hstack([cuts[:, :n], -cuts[:, :n], cuts[:, n:]]))
+                x = minimiser(cost, A, bounds=bounds, **rest)
+                y = x[:n] - x[n : 2 * n]
+                size = max(np.abs(y).max(initial=0.0), 1.0)
+                new = self._violated(cones, given, y / size, float(x[-1]) / size, count)
+                if new.shape[0] == 0:
+                    return y, float(cost @ x)
+                cuts, count = csr_array(vstack([cuts, new])), 2 * count
+            return np.zeros(n), 0.0
+
+        # 1. the most work, less what counts as none: of heavily loaded bodies that would hide a
+        # light one. A motion that gains something gains more until a bound stops it.
+        least = PARAMETERS.work if cones or given else 0.0
+        y, value = minimised(np.concatenate((noise - load, noise + load, [1.0])), 1.0)
+        if value >= -least or np.abs(y).max() <= 0.5:
+            return None
+        # 2. the least motion (sum of moduli) of unit work, which leaves out what costs nothing
+        work = csr_array(np.concatenate((load, -load, [-1.0]))[None, :])
+        y, _ = minimised(np.append(np.ones(2 * n), 0.0), None, A_eq=work, b_eq=np.ones(1))
+        largest = np.abs(y).max()
+        return y / largest if largest > 0.0 else None
+
+    def _scale(self) -> Array:
+        """Inverse size of the load on each part that does not meet others; 0: it is rounding."""
+        n = len(self.load)
         bodies = csr_array((np.ones(n), (self.body, np.arange(n))))
         rows = abs(csr_array(vstack([self.normals, self.pressing, *self.cones, *self.given])))
         links = bodies.T @ bodies + rows.T @ rows
-        _, label = connected_components(links, directed=False)
-        for part in range(label.max(initial=-1) + 1):
-            own = np.flatnonzero(label == part)
-            driving = np.abs(self.load[own]) > self.noise[own]
-            if not driving.any():
-                continue
-            size = np.abs(self.load[own][driving]).max()
+        count, label = connected_components(links, directed=False)
+        size = np.zeros(count)
+        np.maximum.at(size, label, np.where(abs(self.load) > self.noise, abs(self.load), 0.0))
+        return np.where(size > 0.0, 1.0 / np.maximum(size, TINY), 0.0)[label]
 
-            def cut(*matrices: csr_array, own: Array = own, over: float = 1.0) -> list[csr_array]:
-                columns = [csr_array(A[:, own] / over) for A in matrices]
-                touched = sum((abs(A).sum(axis=1) for A in columns), np.zeros(matrices[0].shape[0]))
-                return [csr_array(A[np.flatnonzero(touched)]) for A in columns]
-
-            above, *cones = cut(self.pressing, *self.cones)
-            yield (
-                own,
-                RigidScene(
-                    self.load[own] / size,
-                    self.noise[own] / size,
-                    self.body[own],
-                    cut(self.normals)[0],
-                    above,
-                    tuple(cones),
-                    tuple(cut(*self.given, over=size)) if self.given else (),
-                ),
-            )
-
-    def escape(self, factor: float = 1.0) -> Array | None:
-        """Return a motion that escapes friction of so many times its size, if there is one."""
-        for own, part in self.parts():
-            scene = replace(
-                part,
-                cones=tuple(factor * M for M in part.cones),
-                given=tuple(factor * W for W in part.given),
-            )
-            y = _Programs(scene).escape()
-            if y is not None:
-                whole = np.zeros(len(self.load))
-                whole[own] = y
-                return whole
-        return None
-
-    def friction(self, y: Array) -> float:
-        """Work that friction with given bounds takes of a motion."""
-        return float(_directions(self.given, y)[0].sum())
-
-
-class _Programs:
-    """The linear programs of one part of a scene; cuts that were found are kept."""
-
-    def __init__(self, scene: RigidScene) -> None:
-        self._scene, n = scene, len(scene.load)
-        # work of friction is a number for the points between the same bodies
-        points = scene.given[0].shape[0] if scene.given else 0
-        meets = np.zeros((points, 2))
-        if points:
-            entries = csr_array(sum(abs(W) for W in scene.given)).tocoo()
-            meets[:] = (len(scene.body), -1)
-            np.minimum.at(meets[:, 0], entries.coords[0], scene.body[entries.coords[1]])
-            np.maximum.at(meets[:, 1], entries.coords[0], scene.body[entries.coords[1]])
-        _, patch = np.unique(meets, axis=0, return_inverse=True)
-        self._patches = int(patch.max(initial=-1)) + 1
-        at = np.ones(points), (patch.ravel(), np.arange(points))
-        self._sums = csr_array(at, shape=(self._patches, points))
-        self._sent = np.zeros(scene.normals.shape[0], dtype=bool)
-        self._cuts = csr_array((0, n + self._patches))
-
-    def escape(self) -> Array | None:
-        """Return a motion that escapes: the least (sum of moduli) of those with its work."""
-        load, noise, t = self._scene.load, self._scene.noise, np.ones(self._patches)
-        # 1. the most work, less what counts as none: of heavily loaded bodies that would hide a
-        # light one
-        most = np.concatenate((noise - load, noise + load, t))
-        least = PARAMETERS.work if self._scene.cones or self._scene.given else 0.0
-        y = self._minimised(most, -least, upper=1.0)
-        # a cone: a motion that gains something gains more until a bound stops it
-        if y is None or np.abs(y).max() <= 0.5:
-            return None
-        # 2. the least motion of unit work, which leaves out what costs nothing
-        work = csr_array(np.concatenate((load, -load, -t))[None, :])
-        sizes = np.concatenate((np.ones(2 * len(load)), 0.0 * t))
-        y = self._minimised(sizes, np.inf, A_eq=work, b_eq=np.ones(1))
-        return None if y is None else y / np.abs(y).max()
-
-    def _minimised(
-        self, cost: Array, below: float, upper: float | None = None, **rest: Any
-    ) -> Array | None:
-        """Minimise over (p, q, t) ≥ 0, y = p − q, with cuts until none is violated.
-
-        None: the minimum is not below a number, or that is undecided.
-        """
-        n, count = len(self._scene.load), 2
-        bounds = [(0.0, upper)] * (2 * n) + [(0.0, None)] * self._patches
-        for _ in range(PARAMETERS.max_programs):
-            A = csr_array(hstack([self._cuts[:, :n], -self._cuts[:, :n], self._cuts[:, n:]]))
-            x = minimiser(cost, A, bounds=bounds, **rest)
-            if cost @ x >= below:
-                return None
-            p, q, t = np.split(x, [n, 2 * n])
-            y = p - q
-            size = max(np.abs(y).max(initial=0.0), 1.0)
-            if self._has_cut(y / size, t / size, count) == 0:
-                return np.asarray(y)
-            count *= 2
-        return None  # the solver will see
-
-    def _has_cut(self, y: Array, t: Array, count: int) -> int:
-        """Add rows that a motion violates most, so many of each kind; return their number."""
-        scene, new = self._scene, []
-        excess = np.where(self._sent, 0.0, scene.normals @ y)
+    def _violated(
+        self,
+        cones: tuple[csr_array, ...],
+        given: tuple[csr_array, ...],
+        y: Array,
+        t: float,
+        count: int,
+    ) -> csr_array:
+        """Rows of (y, t) that a motion violates most, so many of each kind."""
+        excess = self.normals @ y
         cut = np.argsort(-excess)[:count]
-        cut = cut[excess[cut] > PARAMETERS.slope]
-        self._sent[cut] = True
-        new.append(csr_array(scene.normals[cut]))
-        if scene.cones:
-            size, direction = _directions(scene.cones, y)
-            excess = scene.pressing @ y + size
-            cut = np.argsort(-excess)[: count * len(y)]
+        rows = [self.normals[cut[excess[cut] > PARAMETERS.slope]]]
+        if cones:
+            size, direction = _directions(cones, y)
+            excess = self.pressing @ y + size
+            cut = np.argsort(-excess)[:count]
             cut = cut[excess[cut] > PARAMETERS.slope]
-            rows = scene.pressing[cut]
-            for d, M in zip(direction.T, scene.cones, strict=True):
-                rows = rows + diags_array(d[cut]) @ M[cut]
-            new.append(csr_array(rows))
-        flat = vstack(new)
-        cuts = [hstack([flat, csr_array((flat.shape[0], self._patches))])]
-        if self._patches:
-            work, gradient = self._friction(y)
-            short = np.flatnonzero(work - t > PARAMETERS.exact)
-            cuts.append(hstack([gradient[short], -eye_array(self._patches, format="csr")[short]]))
-        found = csr_array(vstack(cuts))
-        self._cuts = csr_array(vstack([self._cuts, found]))
-        return int(found.shape[0])
-
-    def _friction(self, y: Array) -> tuple[Array, csr_array]:
-        """Work of friction on each patch, and its gradient."""
-        if not self._patches:
-            return np.zeros(0), csr_array((0, len(y)))
-        size, direction = _directions(self._scene.given, y)
-        rows = csr_array(self._scene.given[0].shape)
-        for d, W in zip(direction.T, self._scene.given, strict=True):
-            rows = rows + diags_array(d) @ W
-        return self._sums @ size, csr_array(self._sums @ rows)
+            rows.append(self.pressing[cut])
+            for d, M in zip(direction.T, cones, strict=True):
+                rows[-1] = rows[-1] + diags_array(d[cut]) @ M[cut]
+        flat = csr_array(vstack(rows))
+        found = [hstack([flat, csr_array((flat.shape[0], 1))])]
+        if given:
+            size, direction = _directions(given, y)
+            if size.sum() - t > PARAMETERS.exact:
+                slope = sum(d @ W for d, W in zip(direction.T, given, strict=True))
+                found.append(csr_array(np.append(slope, -1.0)[None, :]))
+        return csr_array(vstack(found))
 
 
 def _directions(rows: Sequence[csr_array], y: Array) -> tuple[Array, Array]:
     """‖T_i y‖ and T_i y over it, T_i with a row for each axis."""
-    if not rows:
-        return np.zeros(0), np.zeros((0, 0))
     slip = np.stack([T @ y for T in rows], axis=1)
     size = np.linalg.norm(slip, axis=1)
     return size, slip / np.maximum(size, TINY)[:, None]
@@ -246,13 +172,12 @@ def minimiser(cost: Array, A: csr_array, **rest: Any) -> Array:
     Raises:
         TfetiError: Neither the simplex nor the interior point method found it.
     """
-    # what is undone after presolving may miss the tolerance; without it nothing is undone
-    for presolve, method in product((True, False), ("highs-ds", "highs-ipm")):
-        options = {
-            "primal_feasibility_tolerance": PARAMETERS.program,
-            "dual_feasibility_tolerance": PARAMETERS.program,
-            "presolve": presolve,
-        }
+    options = {
+        "primal_feasibility_tolerance": PARAMETERS.program,
+        "dual_feasibility_tolerance": PARAMETERS.program,
+        "presolve": False,  # what is undone after presolving may miss the tolerance
+    }
+    for method in ("highs-ds", "highs-ipm"):
         found = linprog(
             cost, A_ub=A, b_ub=np.zeros(A.shape[0]), method=method, options=options, **rest
         )
@@ -283,7 +208,7 @@ def check_solvable(
     """
     if coarse.dimension == 0:
         return
-    load = coarse.motions.T @ coarse.e
+    load = coarse.bodies.motions.T @ coarse.e
     motion = bcast_from_root(coarse.comm, _driven(coarse.free_motions, load, coarse.bodies))
     reason = (
         "nothing resists that and the load drives it; add a Dirichlet condition, a contact or a "
@@ -346,7 +271,7 @@ def rigid_scene(coarse: CoarseSpace, constraints: Constraints, cones: bool) -> R
         return None
     normals, pressing, of_cones, of_given = zip(*ranks, strict=True)
     return RigidScene(
-        Z.T @ (coarse.motions.T @ coarse.e),
+        Z.T @ (coarse.bodies.motions.T @ coarse.e),
         bodies.negligible[body],
         body,
         csr_array(vstack(normals)),
@@ -409,8 +334,8 @@ def _explained(
     # of a motion whose largest translation, or turn, is 1
     amounts = np.abs(coarse.bodies.amounts(motion))
     size = amounts[:, : num_tangents + 1].max(initial=0.0) or amounts.max(initial=0.0)
-    load, capacity = float(scene.load @ y) / size, scene.friction(y) / size
+    capacity = float(_directions(scene.given, y)[0].sum())
     return motion, (
-        f"the load does the work {load:.4g} on a motion of size 1, and friction takes "
-        f"{capacity:.4g} at most"
+        f"the load does the work {float(scene.load @ y) / size:.4g} on a motion of size 1, and "
+        f"friction takes {capacity / size:.4g} at most"
     )

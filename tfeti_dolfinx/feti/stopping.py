@@ -4,21 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import TINY, Array, sums
-from tfeti_dolfinx.constraints.rows import Constraints
+from tfeti_dolfinx.common.parallel import steering
 from tfeti_dolfinx.feti.coarse import CoarseSpace
-from tfeti_dolfinx.feti.duality_gap import EnergyBound, LiftedScene, energy_bound
+from tfeti_dolfinx.feti.dual import Dual
+from tfeti_dolfinx.feti.duality_gap import EnergyBound, energy_bound, within
 from tfeti_dolfinx.feti.recovery import Recovered, min_norm_correction
 from tfeti_dolfinx.qp.coarse import LIGHT
 from tfeti_dolfinx.qp.problem import ConvergedReason
-from tfeti_dolfinx.qp.sets import Face, FeasibleSet
-from tfeti_dolfinx.subdomains.subdomains import Subdomains
+from tfeti_dolfinx.qp.sets import Face
 
 # from the displacement on this rank to the other error, a root of an energy; collective
 ErrorTarget = Callable[[Array], float]
@@ -30,7 +29,8 @@ class StoppingTolerances:
 
     Attributes:
         noise: Rounding of displacements, of the largest of all bodies, or of the slip that friction
-            counts from; a 25th of it of what the load does to subdomains alone, and of gaps.
+            counts from.
+        load_noise: The same of what the load does to subdomains alone, and of gaps.
         energy: Of rtol: error of u in energy over all bodies, so that forces are right where
             bodies move much and deform little.
         target: Of the other error, or of a 1e-5th of ‖u‖_K where that is more: the bound of the
@@ -43,65 +43,30 @@ class StoppingTolerances:
     """
 
     noise: float = 2.5e-13
+    load_noise: float = 1e-14
     energy: float = 10.0
     target: float = 0.1
     aim: float = 0.5
     leap: float = 1e-6
     stall: float = 0.5
 
-    @property
-    def load_noise(self) -> float:
-        """Rounding of displacements, of what the load does to a body's subdomains alone."""
-        return self.noise / 25.0
-
 
 # --- Measures of an iterate in physical units -------------------------------------------------
 
 
-class Scene(LiftedScene, Protocol):
-    """Parts of the dual problem that an assessment needs."""
-
-    constraints: Constraints
-    subdomains: Subdomains
-    coarse: CoarseSpace
-    feasible: FeasibleSet
-
-    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> Recovered:
-        """Return the displacement of multipliers, given the solver's face and error. Collective."""
-        ...
-
-
-@dataclass(frozen=True)
-class BodyMeasures:
-    """Measures of each body at an iterate, arrays of shape ``(bodies,)``; on all ranks.
-
-    Attributes:
-        size: Largest displacement of a node, as a length.
-        elastic: The same but for a rigid motion.
-        energy: uᵀKu.
-        correction: Largest displacement v that closes jumps and overlaps.
-        correction_energy: vᵀ diag(K) v, its diagonal as in D the mean at each node.
-        change: Largest change since the iterate before, or 0.
-        alone: Largest displacement K⁺f of the trace.
-        stiffness: Trace of K on the trace unknowns.
-    """
-
-    size: Array
-    elastic: Array
-    energy: Array
-    correction: Array
-    correction_energy: Array
-    change: Array
-    alone: Array
-    stiffness: Array
-
-
 @dataclass(frozen=True)
 class Measures:
-    """An iterate in physical terms; the same on all ranks.
+    """An iterate in physical terms; the same on all ranks. Arrays have the shape ``(bodies,)``.
 
     Attributes:
-        bodies: What is known of each body.
+        size: Largest displacement of a node of each body, as a length.
+        elastic: The same but for a rigid motion.
+        energies: uᵀKu of each body.
+        correction: Largest displacement v of each body that closes jumps and overlaps.
+        correction_energies: vᵀ diag(K) v, its diagonal as in D the mean at each node.
+        change: Largest change of each body since the iterate before, or 0.
+        alone: Largest displacement K⁺f of the trace of each body.
+        stiffness: Trace of K on the trace unknowns of each body.
         penetration: Deepest overlap, distance of a row that carries a force, or slip that friction
             does not allow.
         balance: Force left on a kernel mode, where it is largest beside the forces there.
@@ -111,7 +76,14 @@ class Measures:
         begin: Largest slip that friction counts from.
     """
 
-    bodies: BodyMeasures
+    size: Array
+    elastic: Array
+    energies: Array
+    correction: Array
+    correction_energies: Array
+    change: Array
+    alone: Array
+    stiffness: Array
     penetration: float
     balance: float
     forces: float
@@ -122,104 +94,85 @@ class Measures:
     @property
     def error(self) -> float:
         """Norm of the correction in energy, over all bodies."""
-        return float(np.sqrt(self.bodies.correction_energy.sum()))
+        return float(np.sqrt(self.correction_energies.sum()))
 
     @property
     def energy(self) -> float:
         """‖u‖_K."""
-        return float(np.sqrt(max(self.bodies.energy.sum(), 0.0)))
+        return float(np.sqrt(max(self.energies.sum(), 0.0)))
 
 
-def measure(scene: Scene, state: Recovered, norm: float, before: Array | None = None) -> Measures:
+def measure(dual: Dual, state: Recovered, norm: float, before: Array | None = None) -> Measures:
     """Measure how well the displacement of an iterate fulfils the rows. Collective.
 
-    Rows miss w: of Bu − c all of equalities and of rows that press both ways, of others where they
-    overlap, or as far as a force on them says that they are not open, min(c − Bu, ‖F‖λ), of
-    tangential ones what of the slip their force does not allow. v, the least displacement
-    in D that closes that, makes u + v admissible; so ‖v‖_K bounds the error of u in energy, as far
-    as λ balances the load.
+    1. Rows miss w: of Bu − c all of equalities and of rows that press both ways, of others where
+       they overlap, or as far as a force on them says that they are not open, min(c − Bu, ‖F‖λ),
+       of tangential ones what of the slip their force does not allow: inside its disc all, on the
+       circle, where τ = P(τ + q/‖F‖) for a slip q that it opposes, ‖F‖ times the difference.
+    2. v, the least displacement in D that closes that, makes u + v admissible; so ‖v‖_K bounds the
+       error of u in energy, as far as λ balances the load.
+    3. Sizes and energies of u, of its elastic part and of v, body by body.
 
     Args:
-        scene: The dual problem.
+        dual: The dual problem.
         state: The displacement, recovered.
         norm: ‖F‖, or an estimate.
         before: The displacement of an earlier iterate.
     """
-    constraints, sets, comm = scene.constraints, scene.constraints.sets, scene.coarse.comm
+    # 1. what rows miss
+    constraints, sets, comm = dual.constraints, dual.constraints.sets, dual.coarse.comm
     c, normals, tangents = constraints.c.array_r, sets.normals, sets.tangents
     w = -state.gap
     overlap, closed = w[normals], state.active[normals]
     # an open row whose force is not gone yet: of distance and force, as a length, the smaller
-    still = missed_by(scene, state.lam, normals, np.minimum(overlap, 0.0), norm)
+    still = norm * within(dual.feasible, state.lam, normals, np.minimum(overlap, 0.0) / norm)
     w[normals] = np.where(closed | (overlap > 0.0), overlap, still)
     lengths = np.abs((w[normals], c[normals])) / constraints.scale
     penetration, gap = np.max(lengths, axis=1, initial=0.0)
     begin = 0.0
     if tangents.size:
-        w[tangents] = missed_by(scene, state.lam, tangents, w[tangents], norm)
+        w[tangents] = norm * within(dual.feasible, state.lam, tangents, w[tangents] / norm)
         slips = np.linalg.norm((w[tangents], c[tangents]), axis=2) / constraints.tangent_scale
         penetration, begin = max(penetration, slips[0].max()), slips[1].max()
-    closed = np.concatenate((closed | (w[normals] != 0.0), constraints.limits.ravel() > 0.0))
     largest = np.array([penetration, gap, begin])
     comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
     square = np.array([w @ w])
     comm.Allreduce(MPI.IN_PLACE, square, op=MPI.SUM)
+    # 2. its correction
+    closed = np.concatenate((closed | (w[normals] != 0.0), constraints.limits.ravel() > 0.0))
     v = min_norm_correction(constraints, w, closed)
-    balance, forces = _balance(scene.coarse, state.lam)
+    # 3. bodies
+    u, subdomains, bodies = state.u, dual.subdomains, dual.coarse.bodies
+    trace, diagonal = subdomains.trace_parts, subdomains.diagonal
+    energies, correction_energies, stiffness = subdomains.body_sums(
+        [subdomains.energies(u), sums(diagonal * v**2, trace), sums(diagonal, trace)]
+    )
+    displacements = (
+        u,
+        u - subdomains.modes_motion(bodies.amounts(bodies.part_of(u))),
+        subdomains.extended(v),
+        np.zeros_like(u) if before is None else u - before,
+        subdomains.extended(subdomains.pinv_load[subdomains.trace]),
+    )
+    size, elastic, correction, change, alone = subdomains.body_maxima(
+        [subdomains.sizes(values) for values in displacements]
+    )
+    balance, forces = _balance(dual.coarse, state.lam)
     return Measures(
-        bodies=_bodies(scene, state.u, v, before),
+        size=size,
+        elastic=elastic,
+        energies=energies,
+        correction=correction,
+        correction_energies=correction_energies,
+        change=change,
+        alone=alone,
+        stiffness=stiffness,
         penetration=float(largest[0]),
         balance=balance,
         forces=forces,
         residual=float(np.sqrt(square[0])),
         gap=float(largest[1]),
         begin=float(largest[2]),
-    )
-
-
-def missed_by(scene: Scene, lam: Array, rows: Array, values: Array, norm: float) -> Array:
-    """Return the part of gaps or slips that is not normal to the feasible set at the forces.
-
-    A force of a normal allows no gap, but 0 does. A force inside its disc allows no slip, one on
-    the circle only a slip that it opposes: then τ is P(τ + q/‖F‖), and ‖F‖ times the difference is
-    the slip that is missed. Where it is less than q, no force within the disc makes more of a slip
-    than that.
-
-    Args:
-        scene: The dual problem.
-        lam: The multipliers.
-        rows: Local rows, any shape.
-        values: Their gaps, negative, or slips, scaled, of the same shape.
-        norm: ‖F‖, or an estimate.
-    """
-    moved = np.array(lam)
-    moved[rows] += values / norm
-    return np.asarray(norm * (scene.feasible.project(moved) - lam)[rows])
-
-
-def _bodies(scene: Scene, u: Array, v: Array, before: Array | None) -> BodyMeasures:
-    """Measure displacements, energies and corrections of each body. Collective."""
-    subdomains, motions = scene.subdomains, scene.coarse.bodies
-    rigid = subdomains.modes_motion(motions.amounts(motions.part_of(u)))
-    trace, diagonal = subdomains.trace_parts, subdomains.diagonal
-    energy, correction_energy, stiffness = subdomains.body_sums(
-        [subdomains.energies(u), sums(diagonal * v**2, trace), sums(diagonal, trace)]
-    )
-    alone = subdomains.extended(subdomains.pinv_load[subdomains.trace])
-    change = np.zeros_like(u) if before is None else u - before
-    displacements = u, u - rigid, subdomains.extended(v), change, alone
-    size, elastic, correction, changed, alone = subdomains.body_maxima(
-        [subdomains.sizes(values) for values in displacements]
-    )
-    return BodyMeasures(
-        size=size,
-        elastic=elastic,
-        energy=energy,
-        correction=correction,
-        correction_energy=correction_energy,
-        change=changed,
-        alone=alone,
-        stiffness=stiffness,
     )
 
 
@@ -234,6 +187,9 @@ def _balance(coarse: CoarseSpace, lam: Array) -> tuple[float, float]:
     left = np.maximum(np.abs(coarse.G(lam) - coarse.e) - StoppingTolerances.noise * most, 0.0)
     worst = int(np.argmax(left / np.maximum(forces, TINY)))
     return float(left[worst]), float(forces[worst])
+
+
+# --- The stopping rule ------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -253,24 +209,20 @@ class TargetStatus:
     allowed: float
 
 
-# --- The stopping rule ------------------------------------------------------------------------
-
-
 @dataclass(frozen=True)
 class Tolerances:
     """Tolerances of an answer, in physical units.
 
     Attributes:
         displacement: Error of u for each body, a length, shape ``(bodies,)``.
-        jump: Jumps at tears, and distances from Dirichlet values.
-        penetration: Overlaps, and distances where a force acts.
+        jump: Jumps at tears, distances from Dirichlet values, overlaps, and distances where a
+            force acts.
         balance: Force left on a kernel mode.
         energy: Norm of the correction in energy, over all bodies.
     """
 
     displacement: Array
     jump: float
-    penetration: float
     balance: float
     energy: float
 
@@ -285,7 +237,7 @@ class Accuracy:
     collective; ``examine`` is, and costs one solve in each subdomain.
 
     Args:
-        scene: The dual problem.
+        dual: The dual problem.
         rtol: Relative tolerance of displacements and forces.
         atol: A length that errors may have whatever moves.
         scale: b₀, the norm of the residual at the start, and what rounding leaves of it.
@@ -298,7 +250,6 @@ class Accuracy:
         drifted: Whether the solver's gradient has to be made anew.
         norm: ‖F‖, or an estimate.
         recovered: The displacement of the last look.
-        measures: What the last look has seen.
         looks: How many looks there were.
         goal: An error beside which the algebraic one has to be small, too, or None.
         reached: What looks have seen of that.
@@ -306,25 +257,25 @@ class Accuracy:
 
     def __init__(
         self,
-        scene: Scene,
+        dual: Dual,
         rtol: float,
         atol: float,
         scale: tuple[float, float],
         norm: float = 1.0,
         limits: StoppingTolerances | None = None,
     ) -> None:
-        self._scene, self.rtol, self._atol = scene, rtol, atol
-        self._limits = limits or StoppingTolerances()
-        reference, rounding = scale
-        self._rounding, self.norm = rounding, norm or 1.0
-        self._before: Measures | None = None
-        self._least: Array = np.zeros(1)
-        self._own: tuple[Recovered, Measures] | None = None
-        self.tolerance = max(rtol**0.5 * reference, atol, rounding)
-        self._small = 0.01 * max(rtol * reference, rounding)
+        self._dual, self.rtol, self._atol = dual, rtol, atol
+        self._limits, self.norm = limits or StoppingTolerances(), norm or 1.0
+        reference, self._rounding = scale
+        self.tolerance = max(rtol**0.5 * reference, atol, self._rounding)
+        self._small = 0.01 * max(rtol * reference, self._rounding)
         self.drifted, self.looks, self._stalls, self._claimed = False, 0, 0, 1.0
         self.recovered: Recovered | None = None
-        self.measures: Measures | None = None
+        self._measures: Measures | None = None
+        self._before: Measures | None = None
+        # of a look with other multipliers: the first one's errors, and itself
+        self._least: Array = np.zeros(1)
+        self._own: tuple[Recovered | None, Measures | None] = None, None
         self.goal: ErrorTarget | None = None
         self.reached: list[TargetStatus] = []
 
@@ -338,15 +289,21 @@ class Accuracy:
     ) -> ConvergedReason:
         """Assess an iterate, and return why to stop, or ITERATING. Collective."""
         self.look(lam, gradient, face, residual)
-        given = self._limits
-        # 1. errors over their tolerances
-        ratio, own, longest, in_energy, bound, stalled = self._agreed(
+        given, now, before = self._limits, self._seen, self._before
+        # 1. errors over their tolerances; forces of a body that falls far may be known better
+        # than the rounding of its fall allows
+        stalled = False
+        if before is not None and before.residual > 0.0:
+            fell = (residual / self._claimed) ** given.stall
+            stalled = now.residual / before.residual > fell
+        ratio, own, longest, in_energy, bound, lags = steering(
+            self._dual.coarse.comm,
             self.ratio(),
             self.ratio(changes=False),
             self._longest(),
-            self._energy_ratio(),
+            now.error / max(given.energy * self.rtol * now.energy, TINY),
             self._over_goal(),
-            self._stalled(residual),
+            float(stalled),
         )
         if ratio <= 1.0 and (in_energy <= 1.0 or residual <= self._small):
             return ConvergedReason.CONVERGED_RTOL
@@ -361,22 +318,22 @@ class Accuracy:
         elif tolerance < least:  # the change since a poor iterate says little
             tolerance = residual * max(given.aim / max(own, 1.0), given.leap)
         # 3. where the true residual lags behind the solver's: a new gradient, then rounding
-        self._stalls = self._stalls + 1 if stalled else 0
+        self._stalls = self._stalls + 1 if lags else 0
         if self._stalls > 1 or tolerance <= least:
             return ConvergedReason.DIVERGED_ROUNDING
         self.drifted = self._stalls > 0
-        self.tolerance, self._claimed = tolerance, residual
+        self.tolerance, self._claimed = float(tolerance), residual
         return ConvergedReason.ITERATING
 
     def look(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float) -> None:
         """Recover the displacement of an iterate, and measure it. Collective."""
-        before = self.recovered
-        state = self._scene.recover(lam, gradient, face, residual / self.norm)
-        now = measure(self._scene, state, self.norm, None if before is None else before.u)
-        self._before, self.recovered, self.measures = self.measures, state, now
+        before = None if self.recovered is None else self.recovered.u
+        state = self._dual.recover(lam, gradient, face, residual / self.norm)
+        now = measure(self._dual, state, self.norm, before)
+        self._before, self.recovered, self._measures = self._measures, state, now
         self.looks += 1
         if self.goal is not None:
-            bound, goal = energy_bound(self._scene, lam, state.u, self.norm), self.goal(state.u)
+            bound, goal = energy_bound(self._dual, lam, state.u, self.norm), self.goal(state.u)
             allowed = self._limits.target * max(goal, 1e-5 * now.energy)
             self.reached.append(TargetStatus(bound, goal, now.energy, allowed))
 
@@ -389,7 +346,7 @@ class Accuracy:
         Returns:
             Whether it is right to the tolerance with that set, too.
         """
-        self._least, self._own = self.errors(), self._looked()
+        self._least, self._own = self.errors(), (self.recovered, self._measures)
         self.look(lam, gradient, face, residual)
         self._before = None
         return self._is_right()
@@ -403,8 +360,8 @@ class Accuracy:
         Returns:
             Whether they are within the tolerance.
         """
-        if self._own is not None:
-            self.recovered, self.measures = self._own
+        if self._own[0] is not None:
+            self.recovered, self._measures = self._own
         self._least = self._least + errors
         return self._is_right()
 
@@ -418,47 +375,42 @@ class Accuracy:
         Args:
             changes: Whether what has changed since the look before it counts.
         """
-        now, before = self._looked()[1], self._before if changes else None
-        bodies, energy = now.bodies, np.sqrt(np.maximum(now.bodies.energy, 0.0))
-        own = np.sqrt(bodies.correction_energy)
+        now, before = self._seen, self._before if changes else None
+        energy = np.sqrt(np.maximum(now.energies, 0.0))
         # where all is rounding, energy does not say how far anything moves
-        noise = self._limits.noise * bodies.size.max(initial=0.0) + self._at_rest(now)
-        known = (energy > 0.0) & (bodies.size > noise)
-        shown = np.divide(bodies.elastic, energy, out=np.zeros_like(energy), where=known)
-        estimate = shown * own
+        noise = self._limits.noise * now.size.max(initial=0.0) + self._at_rest()
+        known = (energy > 0.0) & (now.size > noise)
+        shown = np.divide(now.elastic, energy, out=np.zeros_like(energy), where=known)
+        estimate = shown * np.sqrt(now.correction_energies)
         if before is not None and before.error > 0.0:
-            estimate = np.maximum(estimate, bodies.change * (now.error / before.error))
-        return np.maximum(estimate + bodies.correction, self._least)
+            estimate = np.maximum(estimate, now.change * (now.error / before.error))
+        return np.maximum(estimate + now.correction, self._least)
 
     def tolerances(self) -> Tolerances:
         """Return the tolerances that the last assessment is compared with."""
-        now, given = self._looked()[1], self._limits
-        size, most = now.bodies.size, now.bodies.size.max(initial=0.0)
+        now, given, at_rest = self._seen, self._limits, self._at_rest()
+        most = now.size.max(initial=0.0)
         # a body that is stiff beside another has the error of the other's forces on top
-        share = np.where(size < 1e-3 * most, 0.1, 1.0)
+        share = np.where(now.size < 1e-3 * most, 0.1, 1.0)
         most = max(most, now.begin)
-        at_rest = self._at_rest(now)
-        noise = given.noise * most + given.load_noise * now.bodies.alone + at_rest
-        displacement = self.rtol * share * size + noise
-        largest = float(displacement.max(initial=0.0))
+        noise = given.noise * most + given.load_noise * now.alone + at_rest
+        displacement = self.rtol * share * now.size + noise
         # rounding of bodies that do not deform at all: its energy, and forces that make it
-        rigid = float(np.sqrt(now.bodies.stiffness @ (noise + 3.0 * given.noise * most) ** 2))
+        rigid = float(np.sqrt(now.stiffness @ (noise + 3.0 * given.noise * most) ** 2))
         balance = max(self.rtol, given.noise) * now.forces + rigid / np.sqrt(self.norm)
-        balance += at_rest * now.bodies.stiffness.max(initial=0.0)
-        energy = given.energy * self.rtol * now.energy + rigid
-        return Tolerances(displacement, 2.0 * largest, 2.0 * largest, balance, energy)
+        return Tolerances(
+            displacement=displacement,
+            jump=2.0 * float(displacement.max(initial=0.0)),
+            balance=balance + at_rest * now.stiffness.max(initial=0.0),
+            energy=given.energy * self.rtol * now.energy + rigid,
+        )
 
     def ratio(self, changes: bool = True) -> float:
         """Return the largest ratio of errors (``errors``) to their tolerances; right if ≤ 1."""
-        now, allowed = self._looked()[1], self.tolerances()
-        pairs = [
-            *zip(self.errors(changes), allowed.displacement, strict=True),
-            (now.penetration, allowed.penetration),
-            (now.balance, allowed.balance),
-            (now.error, allowed.energy),
-        ]
-        own = max(float(error) / max(float(limit), TINY) for error, limit in pairs)
-        return max(own, self._over_goal())
+        now, allowed = self._seen, self.tolerances()
+        errors = np.append(self.errors(changes), (now.penetration, now.balance, now.error))
+        limits = np.append(allowed.displacement, (allowed.jump, allowed.balance, allowed.energy))
+        return max(float(np.max(errors / np.maximum(limits, TINY))), self._over_goal())
 
     def relative_error(self) -> float:
         """Return the largest estimated error of a body over its largest displacement."""
@@ -470,58 +422,40 @@ class Accuracy:
 
         Where ‖u‖_K is rounding of a rigid motion, over what rounding may leave of it.
         """
-        now, allowed = self._looked()[1], self.tolerances().energy
+        now, allowed = self._seen, self.tolerances().energy
         size = max(now.energy, allowed, TINY)
         return now.error / size, allowed / size
 
     @property
     def balance(self) -> float:
         """Largest force left on a kernel mode at the last look."""
-        return self._looked()[1].balance
+        return self._seen.balance
 
     @property
     def u(self) -> Array:
         """This rank's part of the displacement at the last look, shape ``(n,)``."""
-        return self._looked()[0].u
+        assert self.recovered is not None, "nothing has been measured yet"
+        return self.recovered.u
 
-    def _looked(self) -> tuple[Recovered, Measures]:
-        if self.recovered is None or self.measures is None:
-            raise RuntimeError("nothing has been measured yet")
-        return self.recovered, self.measures
-
-    def _agreed(self, *values: float) -> list[float]:
-        """Rank 0's values on all ranks. Collective."""
-        numbers = np.array(values, dtype=float)
-        self._scene.coarse.comm.Bcast(numbers, root=0)
-        return [float(number) for number in numbers]
+    @property
+    def _seen(self) -> Measures:
+        """Measures of the last look."""
+        assert self._measures is not None, "nothing has been measured yet"
+        return self._measures
 
     def _is_right(self) -> bool:
-        ratio, longest = self._agreed(self.ratio(), self._longest())
-        return ratio <= 1.0 or longest <= self._atol
+        ratio, longest = steering(self._dual.coarse.comm, self.ratio(), self._longest())
+        return bool(ratio <= 1.0 or longest <= self._atol)
 
     def _longest(self) -> float:
-        now = self._looked()[1]
-        return max(float(now.bodies.correction.max(initial=0.0)), now.penetration)
+        """Return the longest of what rows miss, and of what closes that."""
+        return max(float(self._seen.correction.max(initial=0.0)), self._seen.penetration)
 
-    def _energy_ratio(self) -> float:
-        """Return error in energy over its tolerance without what that allows for rounding.
-
-        A body that falls far deforms by less than rounding of its fall, but forces may be known.
-        """
-        now = self._looked()[1]
-        return now.error / max(self._limits.energy * self.rtol * now.energy, TINY)
-
-    def _stalled(self, residual: float) -> bool:
-        """Return whether the true residual lags behind the one that the solver updates."""
-        now, before = self._looked()[1], self._before
-        if before is None or before.residual == 0.0:
-            return False
-        return now.residual / before.residual > (residual / self._claimed) ** self._limits.stall
-
-    def _at_rest(self, now: Measures) -> float:
+    def _at_rest(self) -> float:
         """The size of displacements that are rounding of 0 where nothing is loaded, else 0."""
+        now = self._seen
         small = self._limits.load_noise * now.gap
-        unloaded = not now.bodies.alone.any() and now.bodies.size.max(initial=0.0) <= small
+        unloaded = not now.alone.any() and now.size.max(initial=0.0) <= small
         return small if unloaded else 0.0
 
     def _over_goal(self) -> float:

@@ -11,19 +11,19 @@ from tfeti_dolfinx.qp.problem import FaceOperator
 
 
 class CoarsePart(Protocol):
-    """C and Y, which take a vector of a face to coordinates and these to forces, and D.
+    """Y and X, C = XYᵀ, and a diagonal D.
 
     Vectors of rows are this rank's parts; coordinates may be replicated or distributed. All methods
     are collective.
 
     Attributes:
-        energy: D, a diagonal; shape of the coordinates.
+        energy: D, shape of the coordinates.
     """
 
     energy: Array
 
-    def coordinates(self, x: Array) -> Array:
-        """C x, x in the face."""
+    def solve(self, c: Array) -> Array:
+        """X c."""
         ...
 
     def forces(self, c: Array) -> Array:
@@ -32,10 +32,6 @@ class CoarsePart(Protocol):
 
     def moved(self, y: Array) -> Array:
         """Yᵀ y, y in the face."""
-        ...
-
-    def directions(self, c: Array) -> Array:
-        """Cᵀ c, in the face."""
         ...
 
     def destroy(self) -> None:
@@ -51,7 +47,7 @@ class Balanced:
 
     Args:
         on_face: M_f; taken over.
-        part: C, Y and D; taken over.
+        part: Y, X and D; taken over.
     """
 
     def __init__(self, on_face: FaceOperator, part: CoarsePart) -> None:
@@ -60,11 +56,11 @@ class Balanced:
     def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = M x, x in the face. Collective."""
         part, rest = self._part, x.copy()
-        c = part.coordinates(x.array_r)
+        c = part.solve(part.moved(x.array_r))
         rest.array[:] -= part.forces(c)
         self._on_face.mult(rest, y)
         rest.destroy()
-        y.array[:] -= part.directions(part.moved(y.array_r) - part.energy * c)
+        y.array[:] -= part.forces(part.solve(part.moved(y.array_r) - part.energy * c))
 
     def destroy(self) -> None:
         """Free both. Collective."""
