@@ -152,7 +152,7 @@ class ContactState:
         rows, records = self.gluing.tangents, self.gluing.records
         lam = self.lam[self.gluing.constraints.sets.tangents]
         force = np.zeros(records.normal.shape)
-        along = np.einsum("tk,tkg->tg", lam, rows.tangents)
+        along = np.einsum("tk,tkg->tg", lam, records.tangents[rows.condition])
         force[rows.condition] = -rows.scale[:, None] * along
         return force
 
