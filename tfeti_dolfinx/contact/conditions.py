@@ -21,7 +21,7 @@ from tfeti_dolfinx.mortar.facets import (
     local_facets,
     with_averaged_normals,
 )
-from tfeti_dolfinx.mortar.integrals import GapIntegrals, integrate
+from tfeti_dolfinx.mortar.integrals import GapIntegrals, MortarIntegrals, Triplets, integrate
 from tfeti_dolfinx.mortar.segments import find_segments, frames, possible_pairs, rendezvous
 from tfeti_dolfinx.mortar.surfaces import surface_facets
 from tfeti_dolfinx.mortar.tolerances import SEARCH
@@ -35,14 +35,12 @@ class Side:
 
     Attributes:
         facets: Its facets on this rank, those of a pair with averaged normals and curvature.
-        vertices: Global groups of their vertices, shape ``(n, v)``.
         areas: ∫φ_i over each facet, shape ``(n, v)``.
         normals: Direction in which each owned group may not go further: the averaged normal, at
             an obstacle that towards the shape; 0 off the surface, shape ``(g, gdim)``.
     """
 
     facets: Facets
-    vertices: Array
     areas: Array
     normals: Array
 
@@ -70,10 +68,9 @@ def side_of(contact: str, surface: str | int, dofs: TornDofs, decomposition: Dec
     flat = int(np.sum(facets.area <= SEARCH.degenerate * whole))
     if count := dofs.comm.allreduce(flat):
         raise InputError(f"{contact}: {count} facets of {surface!r} have no area")
-    facets, normals = with_averaged_normals(facets, dofs, kind.num_vertices)
+    facets, normals = with_averaged_normals(facets, dofs)
     facets = with_curvature(facets, dofs, kind)
-    vertices = facets.groups[:, : kind.num_vertices]
-    return Side(facets, vertices, hat_areas(kind, facets), normals)
+    return Side(facets, hat_areas(kind, facets), normals)
 
 
 @dataclass(frozen=True)
@@ -133,9 +130,11 @@ def ratios(
         meets[:] = True
     sums = []
     for side in sides:
-        vertices = side.vertices.ravel()
+        vertices = side.facets.vertices.ravel()
         area = dofs.add_on_owners(vertices, side.areas.ravel())
-        facets = dofs.add_on_owners(vertices, np.full(len(vertices), 1.0 / side.vertices.shape[1]))
+        facets = dofs.add_on_owners(
+            vertices, np.full(len(vertices), 1.0 / side.facets.vertices.shape[1])
+        )
         at = meets & (area > 0.0)
         n = side.normals[at]
         along = np.einsum("gi,gij,gj", n, blocks[at], n)
@@ -150,29 +149,7 @@ def ratios(
 # --- Assembly of conditions from integrals over facets ----------------------------------------
 
 
-Triplets = tuple[Array, Array, Array]
-
-
-@dataclass(frozen=True)
-class Shares:
-    """Contributions of facets of a surface to the conditions of their vertices.
-
-    Attributes:
-        vertices: Global groups of the facets' vertices, shape ``(f, v)``.
-        covered: ∫φ_i over the covered part of each facet, shape ``(f, v)``.
-        gap: Gap g along the node's normal, between the facets or of an obstacle.
-        curved_gap: That between the smooth surfaces that facets stand for.
-        entries: Triplets (multiplier's group, displacement's group, ∫ψ_i φ_k with its sign).
-    """
-
-    vertices: Array
-    covered: Array
-    gap: GapIntegrals
-    curved_gap: GapIntegrals
-    entries: tuple[Triplets, ...]
-
-
-def conditions(dofs: TornDofs, contact: int, side: Side, shares: Shares) -> ContactRecords:
+def conditions(dofs: TornDofs, contact: int, side: Side, shares: MortarIntegrals) -> ContactRecords:
     """Sum the facets' contributions to each node, and divide by ∫ψ_i. Collective.
 
     A node whose covered share of ∫φ_i is below 1e-6 gets no condition. The gaps are those of the
@@ -185,7 +162,7 @@ def conditions(dofs: TornDofs, contact: int, side: Side, shares: Shares) -> Cont
         shares: What facets on any rank contribute.
     """
     area = dofs.add_on_owners(shares.vertices.ravel(), shares.covered.ravel())
-    whole = dofs.add_on_owners(side.vertices.ravel(), side.areas.ravel())
+    whole = dofs.add_on_owners(side.facets.vertices.ravel(), side.areas.ravel())
     chosen = np.flatnonzero(area > SEARCH.hardly_covered * whole)
     vertices, areas = shares.vertices, area[chosen]
     gap, _ = _mean_gaps(dofs, vertices, shares.gap, areas, chosen)
@@ -212,12 +189,6 @@ def conditions(dofs: TornDofs, contact: int, side: Side, shares: Shares) -> Cont
         friction=np.full(len(chosen), Friction.NONE),
         candidates=int(np.sum(whole > 0.0)),
     )
-
-
-def triplets(rows: Array, columns: Array, values: Array) -> Triplets:
-    """Row groups, column groups and values of many small matrices."""
-    i, j = np.broadcast_arrays(rows[:, :, None], columns[:, None, :])
-    return i.ravel(), j.ravel(), values.ravel()
 
 
 def _mean_gaps(
@@ -262,7 +233,7 @@ def _merged(dofs: TornDofs, entries: tuple[Triplets, ...]) -> Triplets:
 
 def meeting(
     name: str, sides: tuple[Side, Side], dofs: TornDofs, reach: float, depth: float
-) -> Shares:
+) -> MortarIntegrals:
     """Integrate over the first side's facets that face the second. Collective.
 
     Args:
@@ -290,16 +261,4 @@ def meeting(
             f"{name}: the surfaces are near but face away from each other; expected "
             "outward normals that oppose each other"
         )
-    vertices = secondary.groups[:, : kind.num_vertices]
-    own, pair = integrals.facet, integrals.pair_secondary
-    theirs = primary.groups[integrals.pair_primary]
-    return Shares(
-        vertices=vertices[own],
-        covered=integrals.covered,
-        gap=integrals.gap,
-        curved_gap=integrals.curved_gap,
-        entries=(
-            triplets(vertices[own], secondary.groups[own], integrals.own),
-            triplets(vertices[pair], theirs, -integrals.other),
-        ),
-    )
+    return integrals

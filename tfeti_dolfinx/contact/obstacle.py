@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.contact.conditions import Shares, Side, conditions, triplets
+from tfeti_dolfinx.contact.conditions import Side, conditions
 from tfeti_dolfinx.contact.partner import ContactPartner
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.shapes import Shape, check_placement, check_shape, distance_and_gradient
@@ -15,13 +15,11 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import (
-    FacetKind,
     facet_kind,
     hat_areas,
     local_facets,
-    whole_facets,
 )
-from tfeti_dolfinx.mortar.integrals import GapIntegrals, dual_multipliers
+from tfeti_dolfinx.mortar.integrals import integrate_distance
 from tfeti_dolfinx.mortar.surfaces import diameter, group_points, on_surface, surface_facets
 
 
@@ -88,7 +86,7 @@ class Obstacle(ContactPartner):
         """
         facets = surface_facets(decomposition, self.surface)
         kind, surface = facet_kind(dofs), local_facets(dofs, decomposition, facets)
-        centres = surface.corners(kind.num_vertices).mean(axis=1)
+        centres = surface.corners.mean(axis=1)
         if dofs.bs > 1:  # of a scalar space the gradient's first component counts
             size = diameter(decomposition)
             check_placement(self.shape, centres, dofs.bs, self.name, size, dofs.comm)
@@ -105,9 +103,10 @@ class Obstacle(ContactPartner):
             )
         with raised_on_all_ranks(dofs.comm):
             distance[groups], normals[groups] = self._distances(x, dofs.bs)
-        vertices = surface.groups[:, : kind.num_vertices]
-        side = Side(surface, vertices, hat_areas(kind, surface), normals)
-        found = conditions(dofs, contact, side, _shares(dofs, kind, side, distance))
+        side = Side(surface, hat_areas(kind, surface), normals)
+        (at_vertices,) = dofs.lookup(surface.vertices.ravel(), distance)
+        shares = integrate_distance(kind, surface, at_vertices.reshape(surface.vertices.shape))
+        found = conditions(dofs, contact, side, shares)
         # a body may lie in an obstacle as deep as it likes
         return self._with_gaps_and_friction(dofs, found, reach, np.inf)
 
@@ -123,23 +122,3 @@ class Obstacle(ContactPartner):
                 f"{x[wrong][0].tolist()}: distance {gap[wrong][0]}, gradient {gradient[wrong][0]}"
             )
         return gap / length, -gradient / length[:, None]
-
-
-def _shares(dofs: TornDofs, kind: FacetKind, side: Side, distance: Array) -> Shares:
-    """Integrate over whole facets, given the distances of the owned groups. Collective."""
-    surface = side.facets
-    # exact for ψ_i φ_k on plane facets, and enough on curved ones
-    facet, xi, weight = whole_facets(kind, surface, 4 * kind.displacement.degree)
-    dual = dual_multipliers(kind, surface.area, facet, xi, weight)
-    vertices = side.vertices[dual.facet]
-    (at_vertices,) = dofs.lookup(vertices.ravel(), distance)
-    own = dual.integrals(kind.displacement.values(xi))
-    at_vertices = at_vertices.reshape(dual.covered.shape)
-    gap = GapIntegrals(at_vertices * dual.covered, at_vertices, at_vertices)
-    return Shares(
-        vertices=vertices,
-        covered=dual.covered,
-        gap=gap,
-        curved_gap=gap,
-        entries=(triplets(vertices, surface.groups[dual.facet], own),),
-    )
