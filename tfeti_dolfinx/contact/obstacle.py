@@ -20,7 +20,7 @@ from tfeti_dolfinx.mortar.facets import (
     local_facets,
 )
 from tfeti_dolfinx.mortar.integrals import integrate_distance
-from tfeti_dolfinx.mortar.surfaces import diameter, group_points, on_surface, surface_facets
+from tfeti_dolfinx.mortar.surfaces import diameter, surface_facets
 
 
 @dataclass(frozen=True)
@@ -72,42 +72,29 @@ class Obstacle(ContactPartner):
         given), the condition is that of a dual multiplier, ∫ψ_i n_i·u ≤ g_i ∫ψ_i, divided by ∫ψ_i.
         Of a displacement of degree 1 it is n·u ≤ g at the node, since ψ_i is biorthogonal to its
         hats.
-
-        Args:
-            dofs: Dof maps.
-            decomposition: The torn mesh.
-            contact: Index of the contact.
-            reach: Conditions with a larger gap are out of reach.
-            depth: Not used: a body may lie in an obstacle as deep as it likes.
-
-        Raises:
-            InputError: The surface faces away, the shape has no normal at a node, a given gap is
-                no number there, or the friction does not fit.
         """
-        facets = surface_facets(decomposition, self.surface)
-        kind, surface = facet_kind(dofs), local_facets(dofs, decomposition, facets)
-        centres = surface.corners.mean(axis=1)
+        local = surface_facets(decomposition, self.surface)
+        kind, facets = facet_kind(dofs), local_facets(dofs, decomposition, local)
+        centres, corners = facets.corners.mean(axis=1), facets.corners
         if dofs.bs > 1:  # of a scalar space the gradient's first component counts
             size = diameter(decomposition)
             check_placement(self.shape, centres, dofs.bs, self.name, size, dofs.comm)
-        groups = on_surface(dofs, decomposition, facets)
-        distance, normals = np.zeros(dofs.num_groups), np.zeros((dofs.num_groups, dofs.bs))
-        x = group_points(dofs)[groups]
         with raised_on_all_ranks(dofs.comm):
             _, towards = self._distances(centres, dofs.bs)
-        facing = dofs.comm.allreduce(int(np.sum(np.sum(towards * surface.normal, axis=1) > 0.0)))
+        facing = dofs.comm.allreduce(int(np.sum(np.sum(towards * facets.normal, axis=1) > 0.0)))
         if dofs.bs > 1 and facing == 0:
             raise InputError(
                 f"{self.name}: the surface faces away from it; expected "
                 "a shape whose distance falls along the outward normal (is its normal turned?)"
             )
         with raised_on_all_ranks(dofs.comm):
-            distance[groups], normals[groups] = self._distances(x, dofs.bs)
-        side = Side(surface, hat_areas(kind, surface), normals)
-        (at_vertices,) = dofs.lookup(surface.vertices.ravel(), distance)
-        shares = integrate_distance(kind, surface, at_vertices.reshape(surface.vertices.shape))
-        found = conditions(dofs, contact, side, shares)
-        # a body may lie in an obstacle as deep as it likes
+            distance, towards = self._distances(corners.reshape(-1, corners.shape[2]), dofs.bs)
+        vertices = facets.vertices.ravel()
+        normals = dofs.reduce_on_owners(vertices, towards, np.maximum, -np.inf)
+        normals[~np.isfinite(normals)] = 0.0  # off the surface
+        side = Side(facets, hat_areas(kind, facets), normals)
+        integrals = integrate_distance(kind, facets, distance.reshape(facets.vertices.shape))
+        found = conditions(dofs, contact, side, integrals)
         return self._with_gaps_and_friction(dofs, found, reach, np.inf)
 
     def _distances(self, x: Array, gdim: int) -> tuple[Array, Array]:

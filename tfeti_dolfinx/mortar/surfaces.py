@@ -64,17 +64,6 @@ def hat_integrals(
     return dofs.reduce(per_node, np.add, 0.0)
 
 
-def on_surface(dofs: TornDofs, decomposition: Decomposition, facets: Array) -> Array:
-    """Owned groups that have a copy on the given local facets, ascending. Collective.
-
-    A copy that touches the surface only at a vertex or an edge has no facet there, so
-    membership is found on the copies that do and spread to the group.
-    """
-    member = np.zeros(dofs.num_nodes, dtype=bool)
-    member[surface_nodes(dofs, decomposition, facets)] = True
-    return np.flatnonzero(dofs.reduce(member, np.logical_or, False))
-
-
 def surface_nodes(dofs: TornDofs, decomposition: Decomposition, facets: Array) -> Array:
     """Primal nodes of local facets."""
     fdim = decomposition.mesh.topology.dim - 1
