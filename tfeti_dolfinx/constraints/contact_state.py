@@ -12,7 +12,7 @@ import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.constraints.gluing import Gluing
-from tfeti_dolfinx.contact.forces import condition_areas, nodal_forces
+from tfeti_dolfinx.contact.forces import condition_areas
 from tfeti_dolfinx.contact.partner import ContactPartner, position_of
 from tfeti_dolfinx.contact.records import remaining_gaps, slips
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -214,7 +214,11 @@ class ContactState:
 
     @cached_property
     def nodal_forces(self) -> Array:
-        """Contact forces on the owned groups, shape ``(g, gdim)``. Collective at first use."""
+        """Contact forces Σ_i w_ij F_i on the owned groups. Collective at first use.
+
+        Shape ``(g, gdim)``, of both sides.
+        """
         records = self.gluing.records
         force = self.tangential_force - self.force[:, None] * records.normal
-        return nodal_forces(records, force, self.dofs)
+        shares = records.weight[:, None] * force[records.condition]
+        return self.dofs.add_on_owners(records.entry_group, shares)

@@ -204,14 +204,11 @@ def check_not_on_tears(
     """Raise if a condition prescribes facets of tears as if they were of the boundary. Collective.
 
     To DOLFINx tears are exterior facets, so ``exterior_facet_indices`` and
-    ``locate_entities_boundary`` find them, too. A condition knows unknowns only. It is taken for
-    one on exterior facets if each unknown is one of an exterior facet all of whose unknowns, of a
-    component, are prescribed. It is wrong if some of these facets are of the boundary and some of
-    tears, unless all nodes of the latter are on the boundary. So nodes of a region may be
-    prescribed, which are also inside of subdomains, and those of a surface inside a body, in a
-    condition of its own, wherever the tears are. Where a region has no nodes inside of subdomains,
-    as where these are one cell wide, its unknowns are those of exterior facets: what is not on its
-    boundary needs a condition of its own, too.
+    ``locate_entities_boundary`` find them, too. A condition knows unknowns only. It is wrong if
+    each of its unknowns is on an exterior facet that it prescribes wholly, in a component, and some
+    of these facets are of the boundary, some of tears with nodes off the boundary. So a region may
+    be prescribed that has nodes inside of subdomains, and a surface inside a body in a condition of
+    its own.
 
     Args:
         bcs: Conditions on the space of ``dofs``.
@@ -384,16 +381,8 @@ class Gluing:
     def with_right_side(self, values: Array, gaps: Array, slip: Array | None = None) -> Gluing:
         """The same rows with other prescribed values, gaps, slips; c is filled anew. Collective.
 
-        The constraints are shared with these rows: their c is the new one too. What raises
-        leaves it as it was.
-
-        Args:
-            values: Prescribed values of the owned groups, shape ``(g, bs)``.
-            gaps: Gap of each condition of the records, shape ``(n,)``.
-            slip: Where the load step begins, as the attribute; default that.
-
-        Raises:
-            NoSolutionError: As ``right_side``.
+        Arguments and errors are those of ``right_side``. The constraints are shared with these
+        rows: their c is the new one too. What raises leaves it as it was.
         """
         self.constraints.set_right_side(self.right_side(values, gaps, slip))
         flag = self.prescribed.flag

@@ -21,7 +21,7 @@ from tfeti_dolfinx.mortar.curvature import with_curvature
 from tfeti_dolfinx.mortar.facets import facet_kind, hat_areas, local_facets, with_averaged_normals
 from tfeti_dolfinx.mortar.integrals import integrate
 from tfeti_dolfinx.mortar.segments import find_segments, possible_pairs, rendezvous
-from tfeti_dolfinx.mortar.surfaces import diameter, surface_facets, surface_nodes
+from tfeti_dolfinx.mortar.surfaces import diameter, surface_facets
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 WORSE = (
@@ -91,10 +91,6 @@ class Contact(ContactPartner):
         self._named_first(decomposition)
         return min(super().first_reach(decomposition), diameter(decomposition))
 
-    def horizon(self, length: float) -> float:
-        """Return the length of the scene: no two facets are farther apart."""
-        return length
-
     def settled(
         self,
         dofs: TornDofs,
@@ -126,27 +122,6 @@ class Contact(ContactPartner):
         if edges and dofs.comm.rank == 0:
             log.warning(EDGES, self.name, settled.a)
         return settled, found
-
-    def displacement_bound(self, dofs: TornDofs, decomposition: Decomposition, u: Array) -> float:
-        """Bound how far the surfaces have moved towards each other. Collective.
-
-        Args:
-            dofs: Dof maps.
-            decomposition: The torn mesh.
-            u: Displacement in primal order, shape ``(num_nodes, gdim)``.
-
-        Returns:
-            Largest displacements of both surfaces, against their common mean, added up.
-        """
-        comm = decomposition.comm
-        moved = [
-            u[surface_nodes(dofs, decomposition, decomposition.facets(name))]
-            for name in self.surfaces
-        ]
-        total = comm.allreduce(np.sum([part.sum(axis=0) for part in moved], axis=0))
-        mean = total / comm.allreduce(sum(len(part) for part in moved))
-        largest = [np.linalg.norm(part - mean, axis=1).max(initial=0.0) for part in moved]
-        return sum(comm.allreduce(float(size), op=MPI.MAX) for size in largest)
 
     def records(
         self,

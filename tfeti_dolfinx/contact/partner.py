@@ -92,10 +92,6 @@ class ContactPartner:
             raise InputError(f"{self.name}: reach={reach!r}, expected a positive length or None")
         return float(reach)
 
-    def horizon(self, length: float) -> float:
-        """Return the reach beyond which no search finds more conditions, in a scene of a length."""
-        return 0.0
-
     def settled(
         self,
         dofs: TornDofs,
@@ -114,10 +110,6 @@ class ContactPartner:
             stiffness: Block of K of each primal node, shape ``(num_nodes, bs, bs)``.
         """
         return self, self.records(dofs, decomposition, contact, reach, reach)
-
-    def displacement_bound(self, dofs: TornDofs, decomposition: Decomposition, u: Array) -> float:
-        """Bound how much nearer what lay beyond the reach has come, u of shape (nodes, bs)."""
-        return 0.0
 
     def with_gap(self, gap: Gap) -> Self:
         """Return the same contact with another ``gap=``."""
