@@ -72,7 +72,11 @@ def equality_rows(dofs: TornDofs, flag: Array, weights: Array) -> tuple[Rows, He
     multiplicities = np.unique(dofs.multiplicity)
     tables = [_glue(dofs, flag, weights, int(k)) for k in multiplicities if k > 1]
     holding, component = _hold(dofs, flag, weights)
-    rows = stack([holding, *tables]).sorted_by_group()
+    rows = stack([holding, *tables])
+    order = np.argsort(rows.group, kind="stable")
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    rows = Rows(rows.group[order], place[rows.row], rows.column, rows.value)
     n = len(holding)  # these rows have one entry each, and their entries come first
     return rows, HeldRows(rows.row[:n], component, rows.value[:n])
 

@@ -60,13 +60,6 @@ class Rows:
         used = self.value != 0.0
         return Rows(self.group, self.row[used], self.column[used], self.value[used])
 
-    def sorted_by_group(self) -> Rows:
-        """The same rows in the order of their groups (stable); entries stay where they are."""
-        order = np.argsort(self.group, kind="stable")
-        place = np.empty_like(order)
-        place[order] = np.arange(len(order))
-        return Rows(self.group[order], place[self.row], self.column, self.value)
-
 
 def stack(tables: list[Rows]) -> Rows:
     """Return the rows of several tables, one table after the other, and so are their entries."""

@@ -32,11 +32,6 @@ class Side:
     areas: Array
     normals: Array
 
-    def has_edges(self, comm: MPI.Intracomm) -> bool:
-        """Return whether a facet's normal is far off the averaged one at a vertex. Collective."""
-        cosine = np.einsum("nvg,ng->nv", self.facets.vertex_normals, self.facets.normal)
-        return comm.allreduce(int(np.sum(cosine < SEARCH.crease))) > 0
-
 
 def conditions(
     dofs: TornDofs, contact: int, side: Side, integrals: MortarIntegrals

@@ -115,7 +115,9 @@ class Contact(ContactPartner):
             settled, sides = replace(settled, a=settled.b, b=settled.a), sides[::-1]
             size, per_area = 1.0 / size, 1.0 / per_area
             found = settled._meet(sides, dofs, contact, reach, reach)
-        edges = sides[0].has_edges(dofs.comm)
+        facets = sides[0].facets
+        cosine = np.einsum("nvg,ng->nv", facets.vertex_normals, facets.normal)
+        edges = dofs.comm.allreduce(int(np.sum(cosine < SEARCH.crease)))
         worse = size < 1.0 / SEARCH.same_size and per_area > SEARCH.much_stiffer
         if worse and dofs.comm.rank == 0:
             log.warning(WORSE, self.name, settled.a, per_area, settled.b, settled.b)
