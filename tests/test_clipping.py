@@ -7,11 +7,7 @@ from hypothesis import strategies as st
 from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection, QhullError
 
-from tfeti_dolfinx.mortar.clipping import (
-    clip_intervals,
-    clip_polygons,
-    quadrature_on_intervals,
-)
+from tfeti_dolfinx.mortar.clipping import common_parts
 
 pytestmark = pytest.mark.usefixtures("serial_only")
 
@@ -48,29 +44,29 @@ def exact_area(p, q):
 def test_areas_of_common_parts(k, m, seed):
     rng = np.random.default_rng(seed)
     p, q = random_convex(rng, k, 4), random_convex(rng, m, 4)
-    parts = clip_polygons(p, q)
+    parts = common_parts(p, q)
     owner, _, weight = parts.quadrature(1)
     area = np.bincount(owner, weight, minlength=4)
     assert np.allclose(parts.size, area, atol=1e-12)
     assert np.allclose(area, [exact_area(a, b) for a, b in zip(p, q, strict=True)], atol=1e-9)
-    owner, _, weight = clip_polygons(q, p).quadrature(1)
+    owner, _, weight = common_parts(q, p).quadrature(1)
     assert np.allclose(np.bincount(owner, weight, minlength=4), area, atol=1e-12)
 
 
 def test_a_polygon_in_itself_and_apart():
     square = np.array([[[0, 0], [1, 0], [1, 1], [0, 1]]], dtype=float)
-    parts = clip_polygons(square, square)
+    parts = common_parts(square, square)
     assert parts.count.tolist() == [4]
     assert np.array_equal(np.sort(parts.vertices[0, :4], axis=0), np.sort(square[0], axis=0))
     for shift in ((1, 0), (0, -1), (3, 3)):  # side by side counts as apart
-        apart = clip_polygons(square + np.array(shift), square)
+        apart = common_parts(square + np.array(shift), square)
         assert apart.count.tolist() == [0]
         assert apart.size.tolist() == [0.0]
 
 
 def test_quadrature_is_exact_on_polygons():
     rng = np.random.default_rng(0)
-    parts = clip_polygons(random_convex(rng, 4, 50), random_convex(rng, 3, 50))
+    parts = common_parts(random_convex(rng, 4, 50), random_convex(rng, 3, 50))
     fine = parts.quadrature(8)
     for degree in (1, 2, 4):
         owner, x, w = parts.quadrature(degree)
@@ -80,12 +76,12 @@ def test_quadrature_is_exact_on_polygons():
 
 
 def test_intervals():
-    ends, kept = clip_intervals(
-        np.array([[0, 1], [1, 0], [0, 1.0]]), np.array([[0.5, 2], [0.2, 0.4], [1, 2]])
-    )
-    assert np.allclose(ends[:2], [[0.5, 1], [0.2, 0.4]])
-    assert kept.tolist() == [True, True, False]
-    owner, x, w = quadrature_on_intervals(ends[:2], 3)
+    first, second = np.array([[0, 1], [1, 0], [0, 1.0]]), np.array([[0.5, 2], [0.2, 0.4], [1, 2]])
+    parts = common_parts(first[:, :, None], second[:, :, None])
+    ends = parts.vertices[:2, :, 0]
+    assert np.allclose(ends, [[0.5, 1], [0.2, 0.4]])
+    assert parts.count.tolist() == [2, 2, 0]
+    owner, x, w = parts.quadrature(3)
     assert np.allclose(
-        np.bincount(owner, w * x[:, 0] ** 3), (ends[:2, 1] ** 4 - ends[:2, 0] ** 4) / 4
+        np.bincount(owner, w * x[:, 0] ** 3), (ends[:, 1] ** 4 - ends[:, 0] ** 4) / 4
     )

@@ -89,7 +89,7 @@ def test_a_prescribed_tangent_leaves_a_row_without_entries():
     on_left = group_points(held.dofs)[held.records.group[rows.condition], 0] < 1e-9
     assert held.count(on_left) == 3
     assert held.count(~rows.moves) == 3
-    along_x = np.abs(rows.tangents[:, :, 0]) > 0.5
+    along_x = np.abs(held.records.tangents[rows.condition, :, 0]) > 0.5
     assert np.array_equal(~rows.moves, along_x & on_left[:, None])
     bound = rows.limits(np.full((len(held.records), 2), 0.5), held.records.area)
     assert np.all((bound > 0.0) == rows.moves)

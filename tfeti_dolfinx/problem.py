@@ -288,7 +288,7 @@ class ContactProblem:
         result.destroy()
         restless = settling.restless(d.body_names)
         conclude(result, accuracy, self.options, d.comm, excluding, restless, warnings)
-        return solution, accuracy.tolerances().penetration
+        return solution, accuracy.tolerances().jump
 
     def _compose_report(self) -> None:
         """Compose the report of a solve, from records of its stages. Collective."""

@@ -55,15 +55,17 @@ def judged(
     if answer.verdict == "borderline":
         return {**row, "class": "not judged"}
     if outcome.error:
-        return {**row, "class": _named(answer.verdict, kind)}
+        return {**row, "class": _named(answer.verdict, outcome.error)}
     if answer.verdict != "solvable":
         return {**row, "class": "WRONG VERDICT"}
     return {**row, **_compared(scene, answer, outcome)}
 
 
-def _named(verdict: str, kind: str) -> str:
+def _named(verdict: str, error: str) -> str:
     """The class of a scene in which the package raised an error of its own."""
-    if kind == "NoSolutionError" or (kind == "InputError" and verdict == "contradiction"):
+    kind = error.split(":")[0]
+    prescribed = kind == "InputError" and verdict == "contradiction"
+    if kind == "NoSolutionError" or prescribed or "DIVERGED_CONTRADICTION" in error:
         return "right: no solution" if verdict != "solvable" else "WRONG VERDICT"
     if kind == "InputError":
         return "refused"

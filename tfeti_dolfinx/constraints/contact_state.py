@@ -13,7 +13,7 @@ import numpy as np
 from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.common.parallel import summed
 from tfeti_dolfinx.constraints.gluing import Gluing
-from tfeti_dolfinx.contact.forces import Resultant, condition_areas, nodal_forces, resultant
+from tfeti_dolfinx.contact.forces import Resultant, condition_areas, resultant
 from tfeti_dolfinx.contact.partner import ContactPartner, position_of
 from tfeti_dolfinx.contact.records import remaining_gaps, slips
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -178,7 +178,7 @@ class ContactState:
         rows, records = self.gluing.tangents, self.gluing.records
         lam = self.lam[self.gluing.constraints.sets.tangents]
         force = np.zeros(records.normal.shape)
-        along = np.einsum("tk,tkg->tg", lam, rows.tangents)
+        along = np.einsum("tk,tkg->tg", lam, records.tangents[rows.condition])
         force[rows.condition] = -rows.scale[:, None] * along
         return force
 
@@ -252,8 +252,13 @@ class ContactState:
 
     @cached_property
     def nodal_forces(self) -> Array:
-        """Contact forces on the owned groups, shape ``(g, gdim)``. Collective at first use."""
-        return nodal_forces(self.gluing.records, self.condition_forces, self.dofs)
+        """Contact forces Σ_i w_ij F_i on the owned groups. Collective at first use.
+
+        Shape ``(g, gdim)``, of both sides.
+        """
+        records = self.gluing.records
+        shares = records.weight[:, None] * self.condition_forces[records.condition]
+        return self.dofs.reduce_on_owners(records.entry_group, shares)
 
     @cached_property
     def support_forces(self) -> Array:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from dolfinx import fem
+from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import prescribed_values, space_of
@@ -15,6 +16,7 @@ from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.common.validation import checked_type, shown
 from tfeti_dolfinx.constraints.contact_rows import (
     ContactRows,
+    RowBuilder,
     TangentRows,
     contact_rows,
     tangent_rows,
@@ -22,13 +24,12 @@ from tfeti_dolfinx.constraints.contact_rows import (
 from tfeti_dolfinx.constraints.rows import (
     TOLERANCES,
     Constraints,
-    RowBuilder,
     Rows,
     assemble_constraints,
     stack,
 )
-from tfeti_dolfinx.contact.records import ContactRecords
-from tfeti_dolfinx.errors import InputError, TfetiError, raised_on_all_ranks
+from tfeti_dolfinx.contact.records import ContactRecords, relative_motion
+from tfeti_dolfinx.errors import InputError, NoSolutionError, TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs, component_of, described, is_same_space
 from tfeti_dolfinx.mesh.untorn import cell_facets
@@ -71,7 +72,11 @@ def equality_rows(dofs: TornDofs, flag: Array, weights: Array) -> tuple[Rows, He
     multiplicities = np.unique(dofs.multiplicity)
     tables = [_glue(dofs, flag, weights, int(k)) for k in multiplicities if k > 1]
     holding, component = _hold(dofs, flag, weights)
-    rows = stack([holding, *tables]).sorted_by_group()
+    rows = stack([holding, *tables])
+    order = np.argsort(rows.group, kind="stable")
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    rows = Rows(rows.group[order], place[rows.row], rows.column, rows.value)
     n = len(holding)  # these rows have one entry each, and their entries come first
     return rows, HeldRows(rows.row[:n], component, rows.value[:n])
 
@@ -203,14 +208,11 @@ def check_not_on_tears(
     """Raise if a condition prescribes facets of tears as if they were of the boundary. Collective.
 
     To DOLFINx tears are exterior facets, so ``exterior_facet_indices`` and
-    ``locate_entities_boundary`` find them, too. A condition knows unknowns only. It is taken for
-    one on exterior facets if each unknown is one of an exterior facet all of whose unknowns, of a
-    component, are prescribed. It is wrong if some of these facets are of the boundary and some of
-    tears, unless all nodes of the latter are on the boundary. So nodes of a region may be
-    prescribed, which are also inside of subdomains, and those of a surface inside a body, in a
-    condition of its own, wherever the tears are. Where a region has no nodes inside of subdomains,
-    as where these are one cell wide, its unknowns are those of exterior facets: what is not on its
-    boundary needs a condition of its own, too.
+    ``locate_entities_boundary`` find them, too. A condition knows unknowns only. It is wrong if
+    each of its unknowns is on an exterior facet that it prescribes wholly, in a component, and some
+    of these facets are of the boundary, some of tears with nodes off the boundary. So a region may
+    be prescribed that has nodes inside of subdomains, and a surface inside a body in a condition of
+    its own.
 
     Args:
         bcs: Conditions on the space of ``dofs``.
@@ -322,8 +324,8 @@ class Gluing:
         prescribed: Dirichlet values.
         records: Contact conditions of this rank.
         held: The rows that hold prescribed components.
-        contact: What belongs to the normal rows.
-        tangents: What belongs to the tangential rows.
+        contact: Origin of the normal rows.
+        tangents: Origin of the tangential rows.
         constraints: B, c and the sets of rows.
         length: A length of the scene.
         slip: Where the load step begins: the tangential v_i of all conditions then, shape
@@ -353,30 +355,38 @@ class Gluing:
             Shape ``(num_rows,)``, for ``Constraints.set_right_side``.
 
         Raises:
-            NoSolutionError: Prescribed components alone violate a condition, or the conditions
-                of a node contradict each other.
+            NoSolutionError: Prescribed components alone violate a condition.
         """
-        sets = self.constraints.sets
+        sets, records = self.constraints.sets, self.records
+        normals, tangents = self.contact, self.tangents
+        held = relative_motion(records, self.dofs, np.where(self.prescribed.flag, values, 0.0))
+        left = gaps - np.sum(records.normal * held, axis=1)
+        self._check_decided(left[normals.decided])
+        along = np.einsum("ntg,ng->nt", records.tangents, held)
+        slips = ((self.slip if slip is None else slip) - along)[tangents.condition]
         c = np.zeros(sets.num_rows)
         c[sets.equalities[self.held.row]] = self.held.right_side(values)
-        c[sets.normals] = self.contact.right_side(self.dofs, values, gaps, self.length)
-        slip = self.slip if slip is None else slip
-        c[sets.tangents] = self.tangents.right_side(self.dofs, values, slip)
+        c[sets.normals] = left[normals.condition] * normals.scale
+        c[sets.tangents] = np.where(tangents.moves, slips * tangents.scale[:, None], 0.0)
         return c
+
+    def _check_decided(self, left: Array) -> None:
+        """Raise where gaps less what prescribed components use up are negative. Collective."""
+        comm = self.dofs.comm
+        overlaps = comm.allreduce(int(np.sum(left < -TOLERANCES.overlap * self.length)))
+        deepest = comm.allreduce(float(left.min(initial=0.0)), op=MPI.MIN)
+        if overlaps:
+            raise NoSolutionError(
+                "an obstacle or a contact lies within a part of the surface whose displacement is "
+                f"prescribed: {overlaps} nodes penetrate by up to {-deepest:.6g} whatever the rest "
+                "does"
+            )
 
     def with_right_side(self, values: Array, gaps: Array, slip: Array | None = None) -> Gluing:
         """The same rows with other prescribed values, gaps, slips; c is filled anew. Collective.
 
-        The constraints are shared with these rows: their c is the new one too. What raises
-        leaves it as it was.
-
-        Args:
-            values: Prescribed values of the owned groups, shape ``(g, bs)``.
-            gaps: Gap of each condition of the records, shape ``(n,)``.
-            slip: Where the load step begins, as the attribute; default that.
-
-        Raises:
-            NoSolutionError: As ``right_side``.
+        Arguments and errors are those of ``right_side``. The constraints are shared with these
+        rows: their c is the new one too. What raises leaves it as it was.
         """
         self.constraints.set_right_side(self.right_side(values, gaps, slip))
         flag = self.prescribed.flag
@@ -467,9 +477,9 @@ def glue(
         NoSolutionError: Dirichlet conditions and contacts contradict each other.
     """
     D = dofs.gather_copies(weights.reshape(-1, dofs.bs))
-    spread = RowBuilder(dofs, prescribed.flag, D, records)
-    normal_rows, contact = contact_rows(spread)
-    sliding_rows, tangents = tangent_rows(dofs, spread, contact)
+    builder = RowBuilder(dofs, prescribed.flag, D, records)
+    normal_rows, contact = contact_rows(builder)
+    sliding_rows, tangents = tangent_rows(dofs, builder, contact)
     equalities, held = equality_rows(dofs, prescribed.flag, D)
     tables = (equalities, normal_rows, sliding_rows)
     constraints = assemble_constraints(

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from tfeti_dolfinx.common.arrays import Array, sum_rows
+from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import Exchange, chunk_offsets, owner_of
-from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.surfaces import group_points
 
 
 @dataclass(frozen=True)
@@ -23,24 +20,15 @@ class RowTolerances:
 
     Attributes:
         agreement: Values that conditions prescribe at a node differ by less, relative to all.
-        rounding: What rounding makes of a condition's coefficients and of lengths, of which
-            several errors add up.
-        nothing_left: Of a row's norm: if prescribed components leave less, the row is dropped.
-        hardly_left: A condition of which more is left has a row, however uncertain its normal is.
+        nothing_left: Of a row's norm: if prescribed components leave less, rounding of the normal
+            has made it (ε|x|/h of a facet of size h at x), and the row is dropped.
         overlap: Overlap, over the scene's length, that rounding of gaps and prescribed values may
             leave.
-        contradiction: The same of conditions at one node, whose linear program ends at
-            ``program``.
-        program: Tolerance of the linear program, for gaps over the scene's length.
     """
 
     agreement: float = 1e-10
-    rounding: float = 2.2e-15
-    nothing_left: float = 1e-10
-    hardly_left: float = 1e-3
+    nothing_left: float = 1e-6
     overlap: float = 1e-10
-    contradiction: float = 1e-8
-    program: float = 1e-10
 
 
 TOLERANCES = RowTolerances()
@@ -71,13 +59,6 @@ class Rows:
         """Return the same rows without entries that are zero."""
         used = self.value != 0.0
         return Rows(self.group, self.row[used], self.column[used], self.value[used])
-
-    def sorted_by_group(self) -> Rows:
-        """The same rows in the order of their groups (stable); entries stay where they are."""
-        order = np.argsort(self.group, kind="stable")
-        place = np.empty_like(order)
-        place[order] = np.arange(len(order))
-        return Rows(self.group[order], place[self.row], self.column, self.value)
 
 
 def stack(tables: list[Rows]) -> Rows:
@@ -149,115 +130,6 @@ def row_weights(blocks: Array, scaling: str, comm: MPI.Intracomm) -> Array:
     lowest = float(np.min(means[positive], initial=np.inf))
     D = np.where(positive, means / comm.allreduce(lowest, op=MPI.MIN), 1.0)
     return np.repeat(D, blocks.shape[1])
-
-
-# --- Coefficients of contact conditions -------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class HeldPart:
-    """Contribution of prescribed components to the relative displacements of conditions.
-
-    Attributes:
-        condition: Condition of each weight of a node with prescribed components.
-        group: Global group of each.
-        weight: Its weight at the prescribed components, else 0, shape ``(h, gdim)``.
-    """
-
-    condition: Array
-    group: Array
-    weight: Array
-
-    def displacement(self, dofs: TornDofs, values: Array, size: int) -> Array:
-        """The v_i of prescribed values alone, shape ``(size, gdim)``. Collective.
-
-        Args:
-            dofs: Dof maps.
-            values: Prescribed values of the owned groups, shape ``(g, bs)``.
-            size: Number of conditions.
-        """
-        (value,) = dofs.lookup(self.group, values)
-        return sum_rows(self.condition, self.weight * value, size)
-
-
-class RowBuilder:
-    """Rows from conditions. Creation and ``rows`` are collective.
-
-    A coefficient a becomes a·w/Σw on each torn copy, w its weight in D (a/k on k copies of equal
-    weight): so rows are orthogonal to the gluing rows in the inner product of D⁻¹. Prescribed
-    components are left to the right side.
-
-    Args:
-        dofs: Dof maps.
-        flag: Which components of the owned groups are prescribed, shape ``(g, bs)``.
-        weights: D for each copy of the owned groups, shape ``(c, bs)``.
-        records: Conditions of this rank.
-
-    Attributes:
-        records: The conditions.
-        points: Points of the owned groups, shape ``(g, 3)``.
-    """
-
-    def __init__(
-        self, dofs: TornDofs, flag: Array, weights: Array, records: ContactRecords
-    ) -> None:
-        sums = np.add.reduceat(weights, dofs.copy_offsets[:-1]) if len(weights) else weights
-        self.records, self._dofs, self._weights = records, dofs, weights
-        self._prescribed, self._total = dofs.lookup(records.entry_group, flag, sums)
-        self.points = group_points(dofs)
-
-    @cached_property
-    def nothing_left(self) -> Array:
-        """Share of a condition that is rounding, shape ``(n,)``.
-
-        The normal of a facet of size h at x is exact to ε|x|/h, and so is a place on it. At a
-        distance g the normal points that much times g beside the place that it should point to.
-        """
-        records, t = self.records, TOLERANCES
-        x = np.abs(self.points[records.group]).max(axis=1, initial=0.0)
-        h = records.area ** (1.0 / max(records.normal.shape[1] - 1, 1))
-        g = np.abs(records.geometric_gap)
-        error = t.rounding * (x * (1.0 + g / h) + g) / h
-        return np.clip(error, t.nothing_left, t.hardly_left)
-
-    def free(self, axis: int) -> Array:
-        """Coefficients along an axis of the frames, 0 at prescribed components."""
-        return np.where(self._prescribed, 0.0, self.records.coefficients(axis))
-
-    def left(self, axis: int) -> tuple[Array, Array]:
-        """Squared norms in D⁻¹ without prescribed components; whether they exceed rounding."""
-        records = self.records
-        before, after = (
-            sum_rows(records.condition, np.sum(a**2 / self._total, axis=1), len(records))
-            for a in (records.coefficients(axis), self.free(axis))
-        )
-        return after, after > self.nothing_left**2 * before
-
-    @cached_property
-    def held(self) -> HeldPart:
-        """Contribution of prescribed components to the relative displacements."""
-        holds = np.flatnonzero(np.any(self._prescribed, axis=1))
-        records = self.records
-        weight = np.where(self._prescribed, records.weight[:, None], 0.0)[holds]
-        return HeldPart(records.condition[holds], records.entry_group[holds], weight)
-
-    def rows(self, axis: int, condition: Array, scale: Array) -> Rows:
-        """Return a row for each of these conditions along an axis, times its scale."""
-        records, dofs = self.records, self._dofs
-        place = np.full(len(records), -1)
-        place[condition] = np.arange(len(condition))
-        used = np.flatnonzero(place[records.condition] >= 0)
-        entry, node, weight = dofs.lookup_copies(records.entry_group[used], self._weights)
-        row = place[records.condition[used[entry]]]
-        shares = (self.free(axis) / self._total)[used[entry]]
-        values = shares * weight * scale[row][:, None]
-        columns = node[:, None] * dofs.bs + np.arange(dofs.bs)
-        return Rows(
-            group=records.group[condition],
-            row=np.repeat(row, dofs.bs),
-            column=columns.ravel(),
-            value=values.ravel(),
-        ).without_zeros()
 
 
 # --- B as a distributed PETSc matrix, and c ---------------------------------------------------

@@ -62,21 +62,6 @@ def _with_moments(points: Array, forces: Array) -> Array:
     return np.column_stack((forces, np.cross(points, spatial)))
 
 
-def nodal_forces(records: ContactRecords, force: Array, dofs: TornDofs) -> Array:
-    """Return forces that contact exerts on the nodes of both sides. Collective.
-
-    Args:
-        records: Conditions of this rank.
-        force: Force of each on its own node, shape ``(n, gdim)``.
-        dofs: Dof maps.
-
-    Returns:
-        Σ_i w_ij F_i for each owned group, shape ``(g, gdim)``.
-    """
-    shares = records.weight[:, None] * force[records.condition]
-    return dofs.reduce_on_owners(records.entry_group, shares)
-
-
 def condition_areas(
     records: ContactRecords,
     dofs: TornDofs,

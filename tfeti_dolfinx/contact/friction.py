@@ -4,14 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 import ufl
 from dolfinx import fem
 
 from tfeti_dolfinx.common.arrays import Array, ArrayLike
-from tfeti_dolfinx.common.validation import Range, checked_number, checked_type, shown
+from tfeti_dolfinx.common.validation import (
+    FINITE,
+    Range,
+    checked_number,
+    real_numbers,
+    shown,
+)
 from tfeti_dolfinx.contact.records import ContactRecords, Friction
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -24,8 +30,59 @@ Value: TypeAlias = "float | Callable[[Array], ArrayLike] | fem.Function"
 NOT_NEGATIVE = Range("a number, 0 or more", lambda value: value >= 0.0)
 
 
+class FrictionLaw:
+    """One or two values of a bound on the tangential traction.
+
+    Attributes:
+        what: Name of the attribute that has the values.
+        kind: Kind of the bound.
+        direction: Vector along which the first of two values holds.
+    """
+
+    what: ClassVar[str]
+    kind: ClassVar[Friction]
+    direction: Sequence[float] | None
+
+    def __post_init__(self) -> None:
+        what, count = f"{type(self).__name__}: {self.what}", len(self.values)
+        if count not in (1, 2) or (count == 2) != (self.direction is not None):
+            raise InputError(
+                f"{what} has {count} value{'s' * (count != 1)} and direction={self.direction!r}; "
+                "expected one value, or two and the direction of the first"
+            )
+        for value in self.values:
+            if isinstance(value, fem.Function):
+                if value.ufl_shape != ():
+                    raise InputError(
+                        f"{what} has the shape {value.ufl_shape}; expected a scalar function"
+                    )
+            elif isinstance(value, ufl.core.expr.Expr):  # which can be called, with points
+                raise InputError(
+                    f"{what} is {shown(value)}; expected a number, a function of points of shape "
+                    "(3, n), or a scalar dolfinx.fem.Function, into which UFL can be interpolated"
+                )
+            elif not callable(value):
+                checked_number(value, what, NOT_NEGATIVE)
+
+    @property
+    def values(self) -> tuple[Value, ...]:
+        """One value, or two."""
+        given = getattr(self, self.what)
+        return tuple(given) if isinstance(given, (tuple, list)) else (given,)
+
+    def is_same_as(self, other: FrictionLaw) -> bool:
+        """Return whether two laws are the same, as far as one can tell without calling them."""
+        values = [*zip(self.values, other.values, strict=False)]
+        return (
+            type(self) is type(other)
+            and len(self.values) == len(other.values)
+            and all(a is b or (not callable(a) and a == b) for a, b in values)
+            and repr(self.direction) == repr(other.direction)
+        )
+
+
 @dataclass(frozen=True)
-class Tresca:
+class Tresca(FrictionLaw):
     """The tangential traction is at most a given bound, whatever the pressure is.
 
     It acts on all nodes with a contact condition within reach, open ones as well, and on those
@@ -52,18 +109,9 @@ class Tresca:
     what = "bound"
     kind = Friction.GIVEN
 
-    def __post_init__(self) -> None:
-        _check_law(self)
-
-    @property
-    def values(self) -> tuple[Value, ...]:
-        """One bound, or two."""
-        given = self.bound
-        return tuple(given) if isinstance(given, (tuple, list)) else (given,)
-
 
 @dataclass(frozen=True)
-class Coulomb:
+class Coulomb(FrictionLaw):
     """The tangential traction is at most a coefficient times the pressure.
 
     Nodes whose normal displacement is prescribed have no friction: their contact force is hidden
@@ -92,70 +140,9 @@ class Coulomb:
     what = "coefficient"
     kind = Friction.COULOMB
 
-    def __post_init__(self) -> None:
-        _check_law(self)
-
-    @property
-    def values(self) -> tuple[Value, ...]:
-        """One coefficient, or two."""
-        given = self.coefficient
-        return tuple(given) if isinstance(given, (tuple, list)) else (given,)
-
-
-Law = Tresca | Coulomb
-
-
-def checked_friction(name: str, friction: Law | None) -> None:
-    """Raise if a law of friction is invalid. Not collective.
-
-    Args:
-        name: Name of the contact, for messages.
-        friction: What a user gave.
-
-    Raises:
-        InputError: It is not a law.
-    """
-    if friction is not None:
-        expected = "Tresca(bound), Coulomb(coefficient) or None"
-        checked_type(friction, (Tresca, Coulomb), f"{name}: friction", expected)
-
-
-def _check_law(law: Law) -> None:
-    """Raise if a law has values that cannot be right anywhere. Not collective."""
-    what, count = f"{type(law).__name__}: {law.what}", len(law.values)
-    if count not in (1, 2) or (count == 2) != (law.direction is not None):
-        raise InputError(
-            f"{what} has {count} value{'s' * (count != 1)} and direction={law.direction!r}; "
-            "expected one value, or two and the direction of the first"
-        )
-    for value in law.values:
-        if isinstance(value, fem.Function):
-            if value.ufl_shape != ():
-                raise InputError(
-                    f"{what} has the shape {value.ufl_shape}; expected a scalar function"
-                )
-        elif isinstance(value, ufl.core.expr.Expr):  # which can be called, with points
-            raise InputError(
-                f"{what} is {shown(value)}; expected a number, a function of points of shape "
-                "(3, n), or a scalar dolfinx.fem.Function, into which UFL can be interpolated"
-            )
-        elif not callable(value):
-            checked_number(value, what, NOT_NEGATIVE)
-
-
-def same_law(one: Law, other: Law) -> bool:
-    """Return whether two laws are the same, as far as one can tell without calling functions."""
-    values = [*zip(one.values, other.values, strict=False)]
-    return (
-        type(one) is type(other)
-        and len(one.values) == len(other.values)
-        and all(a is b or (not callable(a) and a == b) for a, b in values)
-        and repr(one.direction) == repr(other.direction)
-    )
-
 
 def with_friction(
-    name: str, friction: Law | None, records: ContactRecords, dofs: TornDofs
+    name: str, friction: FrictionLaw | None, records: ContactRecords, dofs: TornDofs
 ) -> ContactRecords:
     """Return the conditions of a contact with its friction, their tangents along its direction.
 
@@ -191,7 +178,9 @@ def with_friction(
     return replace(records, friction=np.full(len(records), friction.kind))
 
 
-def friction_values(name: str, friction: Law, records: ContactRecords, dofs: TornDofs) -> Array:
+def friction_values(
+    name: str, friction: FrictionLaw, records: ContactRecords, dofs: TornDofs
+) -> Array:
     """Bounds or coefficients of all conditions along their tangents. Collective.
 
     Args:
@@ -210,11 +199,9 @@ def friction_values(name: str, friction: Law, records: ContactRecords, dofs: Tor
     columns = []
     for value in friction.values:
         if isinstance(value, fem.Function):
-            column = _at_groups(what, value, dofs)[records.group]
-        else:
-            column = None
+            value = _at_groups(what, value, dofs)[records.group]
         with raised_on_all_ranks(dofs.comm):
-            columns.append(_checked_values(what, value if column is None else column, x))
+            columns.append(numbers_at(what, value, x, lowest=0.0))
     if len(columns) < dofs.bs - 1:
         columns = columns * (dofs.bs - 1)
     return np.stack(columns, axis=1)
@@ -248,21 +235,31 @@ def _at_groups(what: str, function: fem.Function, dofs: TornDofs) -> Array:
     return np.asarray(total / dofs.multiplicity)
 
 
-def _checked_values(what: str, value: Any, x: Array) -> Array:
-    """Return a number, a function of points, or values at them: one for each point."""
+def numbers_at(what: str, value: Any, x: Array, lowest: float = -np.inf) -> Array:
+    """Return what a user gives at points, a number for each. Not collective.
+
+    Args:
+        what: Begins messages.
+        value: A number, a function of points of shape ``(3, n)``, or an array of their values.
+        x: The points, shape ``(n, 3)``.
+        lowest: What they may not be below: 0, or −∞.
+
+    Raises:
+        InputError: The function fails, or a number is out of the range.
+    """
     if callable(value):
         try:
-            value = np.asarray(value(x.T)).astype(float, casting="same_kind")
-            value = np.broadcast_to(value, (len(x),))
+            value = np.broadcast_to(real_numbers(value(x.T)), (len(x),))
         except Exception as error:  # a user's function may raise anything
             raise InputError(
                 f"{what}, a function, did not give one number for each of {len(x)} points of "
                 f"shape (3, {len(x)}): {type(error).__name__}: {error}"
             ) from error
     values = np.array(np.broadcast_to(value, (len(x),)), dtype=float)
-    if np.any(wrong := ~(np.isfinite(values) & (values >= 0.0))):
+    if np.any(wrong := ~(np.isfinite(values) & (values >= lowest))):
+        expected = FINITE if lowest < 0.0 else NOT_NEGATIVE
         raise InputError(
             f"{what} is {values[wrong][0]} at the point {x[wrong][0].tolist()}; expected "
-            f"{NOT_NEGATIVE.text}"
+            f"{expected.text}"
         )
     return values

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.contact.conditions import Shares, Side, conditions, triplets
+from tfeti_dolfinx.contact.conditions import Side, conditions
 from tfeti_dolfinx.contact.partner import ContactPartner
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.shapes import Shape, check_placement, check_shape, distance_and_gradient
@@ -15,14 +15,12 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import (
-    FacetKind,
     facet_kind,
     hat_areas,
     local_facets,
-    whole_facets,
 )
-from tfeti_dolfinx.mortar.integrals import GapIntegrals, dual_multipliers
-from tfeti_dolfinx.mortar.surfaces import diameter, group_points, on_surface, surface_facets
+from tfeti_dolfinx.mortar.integrals import integrate_distance
+from tfeti_dolfinx.mortar.surfaces import diameter, surface_facets
 
 
 @dataclass(frozen=True)
@@ -74,41 +72,29 @@ class Obstacle(ContactPartner):
         given), the condition is that of a dual multiplier, ∫ψ_i n_i·u ≤ g_i ∫ψ_i, divided by ∫ψ_i.
         Of a displacement of degree 1 it is n·u ≤ g at the node, since ψ_i is biorthogonal to its
         hats.
-
-        Args:
-            dofs: Dof maps.
-            decomposition: The torn mesh.
-            contact: Index of the contact.
-            reach: Conditions with a larger gap are out of reach.
-            depth: Not used: a body may lie in an obstacle as deep as it likes.
-
-        Raises:
-            InputError: The surface faces away, the shape has no normal at a node, a given gap is
-                no number there, or the friction does not fit.
         """
-        facets = surface_facets(decomposition, self.surface)
-        kind, surface = facet_kind(dofs), local_facets(dofs, decomposition, facets)
-        centres = surface.corners(kind.num_vertices).mean(axis=1)
+        local = surface_facets(decomposition, self.surface)
+        kind, facets = facet_kind(dofs), local_facets(dofs, decomposition, local)
+        centres, corners = facets.corners.mean(axis=1), facets.corners
         if dofs.bs > 1:  # of a scalar space the gradient's first component counts
             size = diameter(decomposition)
             check_placement(self.shape, centres, dofs.bs, self.name, size, dofs.comm)
-        groups = on_surface(dofs, decomposition, facets)
-        distance, normals = np.zeros(dofs.num_groups), np.zeros((dofs.num_groups, dofs.bs))
-        x = group_points(dofs)[groups]
         with raised_on_all_ranks(dofs.comm):
             _, towards = self._distances(centres, dofs.bs)
-        facing = dofs.comm.allreduce(int(np.sum(np.sum(towards * surface.normal, axis=1) > 0.0)))
+        facing = dofs.comm.allreduce(int(np.sum(np.sum(towards * facets.normal, axis=1) > 0.0)))
         if dofs.bs > 1 and facing == 0:
             raise InputError(
                 f"{self.name}: the surface faces away from it; expected "
                 "a shape whose distance falls along the outward normal (is its normal turned?)"
             )
         with raised_on_all_ranks(dofs.comm):
-            distance[groups], normals[groups] = self._distances(x, dofs.bs)
-        vertices = surface.groups[:, : kind.num_vertices]
-        side = Side(surface, vertices, hat_areas(kind, surface), normals)
-        found = conditions(dofs, contact, side, _shares(dofs, kind, side, distance))
-        # a body may lie in an obstacle as deep as it likes
+            distance, towards = self._distances(corners.reshape(-1, corners.shape[2]), dofs.bs)
+        vertices = facets.vertices.ravel()
+        normals = dofs.reduce_on_owners(vertices, towards, np.maximum, -np.inf)
+        normals[~np.isfinite(normals)] = 0.0  # off the surface
+        side = Side(facets, hat_areas(kind, facets), normals)
+        integrals = integrate_distance(kind, facets, distance.reshape(facets.vertices.shape))
+        found = conditions(dofs, contact, side, integrals)
         return self._with_gaps_and_friction(dofs, found, reach, np.inf)
 
     def _distances(self, x: Array, gdim: int) -> tuple[Array, Array]:
@@ -123,23 +109,3 @@ class Obstacle(ContactPartner):
                 f"{x[wrong][0].tolist()}: distance {gap[wrong][0]}, gradient {gradient[wrong][0]}"
             )
         return gap / length, -gradient / length[:, None]
-
-
-def _shares(dofs: TornDofs, kind: FacetKind, side: Side, distance: Array) -> Shares:
-    """Integrate over whole facets, given the distances of the owned groups. Collective."""
-    surface = side.facets
-    # exact for ψ_i φ_k on plane facets, and enough on curved ones
-    facet, xi, weight = whole_facets(kind, surface, 4 * kind.displacement.degree)
-    dual = dual_multipliers(kind, surface.area, facet, xi, weight)
-    vertices = side.vertices[dual.facet]
-    (at_vertices,) = dofs.lookup(vertices.ravel(), distance)
-    own = dual.integrals(kind.displacement.values(xi))
-    at_vertices = at_vertices.reshape(dual.covered.shape)
-    gap = GapIntegrals(at_vertices * dual.covered, at_vertices, at_vertices)
-    return Shares(
-        vertices=vertices,
-        covered=dual.covered,
-        gap=gap,
-        curved_gap=gap,
-        entries=(triplets(vertices, surface.groups[dual.facet], own),),
-    )

@@ -10,13 +10,18 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.logging import cite
-from tfeti_dolfinx.contact.conditions import Side, conditions, meeting, ratios, side_of
+from tfeti_dolfinx.common.parallel import bcast_from_root
+from tfeti_dolfinx.contact.conditions import Side, conditions
 from tfeti_dolfinx.contact.partner import ContactPartner
 from tfeti_dolfinx.contact.records import ContactRecords
-from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.surfaces import diameter, surface_facets, surface_nodes
+from tfeti_dolfinx.mortar.curvature import with_curvature
+from tfeti_dolfinx.mortar.facets import facet_kind, hat_areas, local_facets, with_averaged_normals
+from tfeti_dolfinx.mortar.integrals import integrate
+from tfeti_dolfinx.mortar.segments import find_segments, possible_pairs, rendezvous
+from tfeti_dolfinx.mortar.surfaces import diameter, surface_facets
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 WORSE = (
@@ -72,12 +77,7 @@ class Contact(ContactPartner):
         return self.a, self.b
 
     def first_reach(self, decomposition: Decomposition) -> float:
-        """Return the reach to begin with. Collective.
-
-        Raises:
-            InputError: A surface is unknown or empty, both are the same, or secondary, gap or
-                reach do not fit.
-        """
+        """Return the reach to begin with, and check the surfaces. Collective."""
         try:
             for name in self.surfaces:
                 surface_facets(decomposition, name)
@@ -91,10 +91,6 @@ class Contact(ContactPartner):
         self._named_first(decomposition)
         return min(super().first_reach(decomposition), diameter(decomposition))
 
-    def horizon(self, length: float) -> float:
-        """Return the length of the scene: no two facets are farther apart."""
-        return length
-
     def settled(
         self,
         dofs: TornDofs,
@@ -103,55 +99,31 @@ class Contact(ContactPartner):
         reach: float,
         stiffness: Array,
     ) -> tuple[Contact, ContactRecords]:
-        """The contact with its secondary side decided, as ``a``, and its conditions. Collective.
+        """Return the contact with its secondary side as ``a``, and its conditions. Collective.
 
-        Args:
-            dofs: Dof maps.
-            decomposition: The torn mesh.
-            contact: Index of the contact.
-            reach: Conditions with a larger gap are out of reach.
-            stiffness: Block of K of each primal node, shape ``(num_nodes, bs, bs)``.
-
-        Raises:
-            InputError: As ``records``.
+        The secondary side is that which is named, else the one with the coarser mesh; where meshes
+        are of one size, the softer one; of equal ones the first.
         """
         cite("mortar")
         settled = self._named_first(decomposition)
         sides = settled._sides(dofs, decomposition)
         found = settled._meet(sides, dofs, contact, reach, reach)
-        compared = ratios(found, sides, dofs, stiffness)
-        if self.secondary == "auto" and compared.second_is_better():
+        size, per_area = _ratios(found, sides, dofs, stiffness)
+        of_one_size = max(size, 1.0 / size) <= SEARCH.same_size
+        exchange = per_area > SEARCH.same_stiffness if of_one_size else size < 1.0
+        if self.secondary == "auto" and exchange:
             settled, sides = replace(settled, a=settled.b, b=settled.a), sides[::-1]
-            compared = compared.exchanged
+            size, per_area = 1.0 / size, 1.0 / per_area
             found = settled._meet(sides, dofs, contact, reach, reach)
-        edges = sides[0].has_edges(dofs.comm)
-        ratio = compared.stiffness
-        if compared.finer and ratio > SEARCH.much_stiffer and dofs.comm.rank == 0:
-            log.warning(WORSE, self.name, settled.a, ratio, settled.b, settled.b)
+        facets = sides[0].facets
+        cosine = np.einsum("nvg,ng->nv", facets.vertex_normals, facets.normal)
+        edges = dofs.comm.allreduce(int(np.sum(cosine < SEARCH.crease)))
+        worse = size < 1.0 / SEARCH.same_size and per_area > SEARCH.much_stiffer
+        if worse and dofs.comm.rank == 0:
+            log.warning(WORSE, self.name, settled.a, per_area, settled.b, settled.b)
         if edges and dofs.comm.rank == 0:
             log.warning(EDGES, self.name, settled.a)
         return settled, found
-
-    def displacement_bound(self, dofs: TornDofs, decomposition: Decomposition, u: Array) -> float:
-        """Bound how far the surfaces have moved towards each other. Collective.
-
-        Args:
-            dofs: Dof maps.
-            decomposition: The torn mesh.
-            u: Displacement in primal order, shape ``(num_nodes, gdim)``.
-
-        Returns:
-            Largest displacements of both surfaces, against their common mean, added up.
-        """
-        comm = decomposition.comm
-        moved = [
-            u[surface_nodes(dofs, decomposition, decomposition.facets(name))]
-            for name in self.surfaces
-        ]
-        total = comm.allreduce(np.sum([part.sum(axis=0) for part in moved], axis=0))
-        mean = total / comm.allreduce(sum(len(part) for part in moved))
-        largest = [np.linalg.norm(part - mean, axis=1).max(initial=0.0) for part in moved]
-        return sum(comm.allreduce(float(size), op=MPI.MAX) for size in largest)
 
     def records(
         self,
@@ -165,35 +137,11 @@ class Contact(ContactPartner):
 
         With D_i = ∫ψ_i over the covered part and n_i the averaged normal the condition is
         n_i · (Σ_k D_ik u_k − Σ_j M_ij u_j)/D_i ≤ g_i, g_i the mean gap weighted with ψ_i.
-
-        Args:
-            dofs: Dof maps.
-            decomposition: The torn mesh.
-            contact: Index of the contact.
-            reach: Conditions with a larger gap are out of reach; those of surfaces three times as
-                far apart are not made.
-            depth: Largest initial overlap of the geometry, and how far a given gap replaces it.
-
-        Raises:
-            InputError: The surfaces overlap by more than ``depth`` (they are looked at up to three
-                times as deep), face away from each other, or have facets without area; a given
-                gap is no number somewhere; or the friction does not fit.
         """
-        sides = self._sides(dofs, decomposition)
-        return self._meet(sides, dofs, contact, reach, depth)
+        return self._meet(self._sides(dofs, decomposition), dofs, contact, reach, depth)
 
     def gaps(self, dofs: TornDofs, records: ContactRecords, depth: float = np.inf) -> Array:
-        """Return gaps of its conditions, as ``gap=`` and the geometry have them. Collective.
-
-        Args:
-            dofs: Dof maps.
-            records: The conditions, of any ``gap=``.
-            depth: Largest initial overlap of the geometry, and how far a given gap replaces it.
-
-        Raises:
-            InputError: The surfaces overlap by more than ``depth`` and no gap is given, or it is
-                no number somewhere.
-        """
+        """Return gaps of its conditions; those of the geometry may not overlap too deep."""
         found = super().gaps(dofs, records, depth)
         deepest = -dofs.comm.allreduce(float(found.min(initial=0.0)), op=MPI.MIN)
         if isinstance(self.gap, str) and deepest > depth:
@@ -204,20 +152,43 @@ class Contact(ContactPartner):
         return found
 
     def _sides(self, dofs: TornDofs, decomposition: Decomposition) -> tuple[Side, Side]:
+        """Facets of both surfaces, with averaged normals and curvature."""
         if dofs.bs != decomposition.mesh.geometry.dim:
             raise InputError(
                 f"{self.name}: the space is scalar; expected displacements of "
                 f"{decomposition.mesh.geometry.dim} components, since surfaces meet along normals"
             )
-        a, b = (side_of(self.name, side, dofs, decomposition) for side in self.surfaces)
-        return a, b
+        sides, kind = [], facet_kind(dofs)
+        for surface in self.surfaces:
+            facets = local_facets(dofs, decomposition, surface_facets(decomposition, surface))
+            whole = facets.radius ** (dofs.bs - 1)
+            flat = int(np.sum(facets.area <= SEARCH.degenerate * whole))
+            if count := dofs.comm.allreduce(flat):
+                raise InputError(f"{self.name}: {count} facets of {surface!r} have no area")
+            facets, normals = with_averaged_normals(facets, dofs)
+            facets = with_curvature(facets, dofs, kind)
+            sides.append(Side(facets, hat_areas(kind, facets), normals))
+        return sides[0], sides[1]
 
     def _meet(
         self, sides: tuple[Side, Side], dofs: TornDofs, contact: int, reach: float, depth: float
     ) -> ContactRecords:
-        """Return the conditions; arguments as of ``records``. Collective."""
-        shares = meeting(self.name, sides, dofs, reach, depth)
-        found = conditions(dofs, contact, sides[0], shares)
+        """Return conditions from integrals over the first side's facets that face the second."""
+        kind, comm = facet_kind(dofs), dofs.comm
+        height, deep = SEARCH.seen * reach, SEARCH.seen * depth
+        distance = max(height, deep)
+        secondary, primary = rendezvous(sides[0].facets, sides[1].facets, distance, comm)
+        with raised_on_all_ranks(comm):
+            pairs = possible_pairs(secondary, primary, distance)
+            segments = find_segments(kind, secondary, primary, pairs, deep, height)
+            integrals = integrate(kind, secondary, primary, segments)
+        averted = comm.allreduce(int(segments.averted))
+        if averted and comm.allreduce(len(segments.weight)) == 0:
+            raise InputError(
+                f"{self.name}: the surfaces are near but face away from each other; expected "
+                "outward normals that oppose each other"
+            )
+        found = conditions(dofs, contact, sides[0], integrals)
         return self._with_gaps_and_friction(dofs, found, reach, depth)
 
     def _named_first(self, decomposition: Decomposition) -> Contact:
@@ -232,3 +203,38 @@ class Contact(ContactPartner):
                 f'{self.name}: secondary={self.secondary!r}, expected one of its surfaces or "auto"'
             ) from None
         return replace(self, a=self.b, b=self.a) if named else self
+
+
+def _ratios(
+    records: ContactRecords, sides: tuple[Side, Side], dofs: TornDofs, stiffness: Array
+) -> tuple[float, float]:
+    """Compare the sides of a pair where they meet: the first over the second. Collective.
+
+    Stiffness per area is E/h of the elements at a surface: Σ n_i·K_ii n_i / Σ ∫φ_i over its
+    vertices, K_ii the block of K before anything is glued, n_i the normal. Sizes are harmonic
+    means, which a few large facets beside many small ones do not decide. The vertices that rows
+    name are taken, so that a mesh that is fine only where the bodies touch is judged there; where
+    there is no such row, all of them.
+
+    Returns:
+        Sizes of facets (roots of areas, in 2D lengths), h over h; stiffness per area, E/h over
+        E/h; the same on all ranks.
+    """
+    whole = dofs.reduce(stiffness.reshape(-1, dofs.bs**2), np.add, 0.0)
+    blocks = whole.reshape(-1, dofs.bs, dofs.bs)
+    named = records.entry_group[records.within_reach[records.condition]]
+    meets = dofs.reduce_on_owners(named, np.ones(len(named))) > 0.0
+    if dofs.comm.allreduce(int(np.sum(meets))) == 0:
+        meets[:] = True
+    sums = []
+    for side in sides:
+        vertices = side.facets.vertices.ravel()
+        area = dofs.reduce_on_owners(vertices, side.areas.ravel())
+        facets = dofs.reduce_on_owners(vertices, np.full(len(vertices), 1.0 / side.areas.shape[1]))
+        at = meets & (area > 0.0)
+        n = side.normals[at]
+        along = np.einsum("gi,gij,gj", n, blocks[at], n)
+        sums.append((along, area[at].sum(), np.sum(facets[at] / area[at]), np.sum(at)))
+    along, area, density, count = dofs.comm.allreduce(np.array(sums, dtype=float)).T
+    size, per_area = (count / density) ** (1.0 / (dofs.bs - 1)), along / area
+    return bcast_from_root(dofs.comm, (float(size[0] / size[1]), float(per_area[0] / per_area[1])))

@@ -10,8 +10,8 @@ from typing import Self, TypeAlias
 import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array, ArrayLike
-from tfeti_dolfinx.common.validation import checked_type, is_whole, real_numbers, shown
-from tfeti_dolfinx.contact.friction import Law, checked_friction, same_law, with_friction
+from tfeti_dolfinx.common.validation import checked_type, is_whole, shown
+from tfeti_dolfinx.contact.friction import FrictionLaw, numbers_at, with_friction
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -36,7 +36,7 @@ class ContactPartner:
     """
 
     gap: Gap = GEOMETRY
-    friction: Law | None = None
+    friction: FrictionLaw | None = None
     reach: float | None = None
     name: str = ""
 
@@ -44,7 +44,9 @@ class ContactPartner:
         """Give the contact a name if it has none, and check what is known at once."""
         checked_type(self.name, str, f"{default_name}: name", "a text")
         object.__setattr__(self, "name", self.name or default_name)  # it is frozen
-        checked_friction(self.name, self.friction)
+        if self.friction is not None:
+            expected = "Tresca(bound), Coulomb(coefficient) or None"
+            checked_type(self.friction, FrictionLaw, f"{self.name}: friction", expected)
 
     @property
     def surfaces(self) -> tuple[str | int, ...]:
@@ -59,7 +61,20 @@ class ContactPartner:
         reach: float = np.inf,
         depth: float = np.inf,
     ) -> ContactRecords:
-        """Conditions up to a distance and beyond, and down to a depth of initial overlap."""
+        """Return the conditions.
+
+        Args:
+            dofs: Dof maps.
+            decomposition: The torn mesh.
+            contact: Index of the contact.
+            reach: Conditions with a larger gap are out of reach; those of surfaces three times as
+                far apart are not made.
+            depth: Largest initial overlap of two surfaces, and how far a given gap replaces it.
+                A body may lie in an obstacle as deep as it likes.
+
+        Raises:
+            InputError: Surfaces, shape, gap or friction do not fit.
+        """
         raise NotImplementedError
 
     def first_reach(self, decomposition: Decomposition) -> float:
@@ -77,10 +92,6 @@ class ContactPartner:
             raise InputError(f"{self.name}: reach={reach!r}, expected a positive length or None")
         return float(reach)
 
-    def horizon(self, length: float) -> float:
-        """Return the reach beyond which no search finds more conditions, in a scene of a length."""
-        return 0.0
-
     def settled(
         self,
         dofs: TornDofs,
@@ -89,12 +100,16 @@ class ContactPartner:
         reach: float,
         stiffness: Array,
     ) -> tuple[ContactPartner, ContactRecords]:
-        """Return the contact with its sides decided from the stiffness, and its conditions."""
-        return self, self.records(dofs, decomposition, contact, reach, reach)
+        """Return the contact with its sides decided, and its conditions; arguments as ``records``.
 
-    def displacement_bound(self, dofs: TornDofs, decomposition: Decomposition, u: Array) -> float:
-        """Bound how much nearer what lay beyond the reach has come, u of shape (nodes, bs)."""
-        return 0.0
+        Args:
+            dofs: Dof maps.
+            decomposition: The torn mesh.
+            contact: Index of the contact.
+            reach: Reach, and depth.
+            stiffness: Block of K of each primal node, shape ``(num_nodes, bs, bs)``.
+        """
+        return self, self.records(dofs, decomposition, contact, reach, reach)
 
     def with_gap(self, gap: Gap) -> Self:
         """Return the same contact with another ``gap=``."""
@@ -103,7 +118,7 @@ class ContactPartner:
         return found
 
     def gaps(self, dofs: TornDofs, records: ContactRecords, depth: float = np.inf) -> Array:
-        """Return gaps of its conditions, as ``gap=`` and the geometry have them.
+        """Return gaps of its conditions, as ``gap=`` and the geometry have them, shape ``(n,)``.
 
         No search, no integral: a given gap is taken at the nodes, which is the mean of its linear
         interpolant.
@@ -113,19 +128,15 @@ class ContactPartner:
             records: The conditions, of any ``gap=``.
             depth: A given gap replaces that of the geometry up to this one.
 
-        Returns:
-            Lengths, shape ``(n,)``.
-
         Raises:
-            InputError: A given gap is no number somewhere.
+            InputError: A given gap is no number somewhere, or surfaces overlap too deep.
         """
         if self.gap == CURVED:
             return records.curved_gap
         if self.gap == GEOMETRY:
             return records.geometric_gap
-        x = group_points(dofs)[records.group]
         with raised_on_all_ranks(dofs.comm):
-            given = self._given_gaps(x)
+            given = numbers_at(f"{self.name}: gap", self.gap, group_points(dofs)[records.group])
         return np.where(records.geometric_gap <= depth, given, records.geometric_gap)
 
     def _with_gaps_and_friction(
@@ -145,24 +156,6 @@ class ContactPartner:
                 f'{self.name}: gap={gap!r}, expected "geometry", "curved", a finite length '
                 "(negative: interference), or a function of points of shape (3, n)"
             )
-
-    def _given_gaps(self, x: Array) -> Array:
-        """Return the gaps that a user gives at points of shape ``(n, 3)``."""
-        if not callable(self.gap):
-            return np.full(len(x), float(self.gap))
-        try:
-            values = real_numbers(self.gap(x.T))
-            values = np.array(np.broadcast_to(values, (len(x),)))
-        except Exception as error:  # a user's function may raise anything
-            raise InputError(
-                f"{self.name}: gap, a function, did not give one number for each of {len(x)} "
-                f"points of shape (3, {len(x)}): {type(error).__name__}: {error}"
-            ) from error
-        if np.any(wrong := ~np.isfinite(values)):
-            raise InputError(
-                f"{self.name}: gap is {values[wrong][0]} at the point {x[wrong][0].tolist()}"
-            )
-        return values
 
 
 # --- Lists of contacts ------------------------------------------------------------------------
@@ -234,7 +227,7 @@ def check_together(contacts: Sequence[ContactPartner], decomposition: Decomposit
         if len(tags) > 1 or contact.friction is None:
             continue
         first = obstacles.setdefault(min(tags), contact)
-        if first.friction is not None and not same_law(first.friction, contact.friction):
+        if first.friction is not None and not first.friction.is_same_as(contact.friction):
             raise InputError(
                 f"{contact.name}: the same surface has another law of friction in {first.name}; "
                 "expected one law for a surface, or surfaces of their own"

@@ -96,43 +96,42 @@ def concatenate(records: list[ContactRecords], gdim: int) -> ContactRecords:
     return ContactRecords(**joined, candidates=sum(r.candidates for r in records))
 
 
-def relative_displacement(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
-    """v_i = Σ_j w_ij u_j of all conditions of this rank: the node's, less what it meets.
+def relative_motion(records: ContactRecords, dofs: TornDofs, values: Array) -> Array:
+    """Σ_j w_ij u_j of all conditions of this rank: the node's, less that of what it meets.
 
     Collective.
 
     Args:
         records: The conditions.
         dofs: Dof maps.
-        u: Displacement in primal order, shape ``(num_nodes * bs,)``; of torn copies the mean.
+        values: The u_j of the owned groups, shape ``(g, gdim)``.
 
     Returns:
         Lengths, shape ``(n, gdim)``.
     """
-    total = dofs.reduce(u.reshape(-1, dofs.bs), np.add, 0.0)
-    (values,) = dofs.lookup(records.entry_group, total / dofs.multiplicity[:, None])
-    return sum_rows(records.condition, records.weight[:, None] * values, len(records))
+    (u,) = dofs.lookup(records.entry_group, values)
+    return sum_rows(records.condition, records.weight[:, None] * u, len(records))
 
 
-def remaining_gaps(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
-    """g_i − n_i · v_i, negative where bodies overlap, shape ``(n,)``. Collective.
+def relative_displacement(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
+    """Return the v_i, shape ``(n, gdim)``. Collective.
 
     Args:
         records: The conditions.
         dofs: Dof maps.
-        u: Displacement in primal order, shape ``(num_nodes * bs,)``.
+        u: Displacement in primal order, shape ``(num_nodes * bs,)``; of torn copies the mean.
     """
+    total = dofs.reduce(u.reshape(-1, dofs.bs), np.add, 0.0)
+    return relative_motion(records, dofs, total / dofs.multiplicity[:, None])
+
+
+def remaining_gaps(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
+    """g_i − n_i · v_i, negative where bodies overlap, shape ``(n,)``. Collective."""
     v = relative_displacement(records, dofs, u)
     return records.gap - np.sum(records.normal * v, axis=1)
 
 
 def slips(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
-    """v_i along the tangents of its frame, shape ``(n, gdim - 1)``. Collective.
-
-    Args:
-        records: The conditions.
-        dofs: Dof maps.
-        u: Displacement in primal order, shape ``(num_nodes * bs,)``.
-    """
+    """Return the v_i along the tangents of the frames, shape ``(n, gdim - 1)``. Collective."""
     v = relative_displacement(records, dofs, u)
     return np.einsum("ntg,ng->nt", records.tangents, v)

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root
@@ -20,7 +21,7 @@ from tfeti_dolfinx.contact.records import (
 )
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.surfaces import diameter
+from tfeti_dolfinx.mortar.surfaces import diameter, surface_nodes
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 log = logging.getLogger(__name__)
@@ -131,29 +132,26 @@ class ContactSearch:
 
         Args:
             u: Displacement in primal order, shape ``(num_nodes * bs,)``.
-            tolerance: Overlaps up to this are let be.
+            tolerance: Overlaps up to this length are none.
 
         Returns:
             How many rows are new, on all ranks.
         """
-        return sum(self._take_in(i, u, tolerance) for i in range(len(self.contacts)))
-
-    def _take_in(self, i: int, u: Array, tolerance: float) -> int:
-        """Give rows to violated conditions of one contact; return the number of new rows."""
         way = u if self._origin is None else u - self._origin
-        known, nodal = self._records[i], way.reshape(-1, self._dofs.bs)
-        bound = self.contacts[i].displacement_bound(self._dofs, self._decomposition, nodal)
-        moved = bcast_from_root(self._dofs.comm, bound)
-        tried = [(known, self._reach[i])]
-        if moved > self._reach[i]:
-            tried.insert(0, (self._search(i, moved), moved))
-        for found, reach in tried:
-            overlaps = remaining_gaps(found, self._dofs, u) < -tolerance
-            if new := self._count(overlaps & ~found.within_reach):
-                self._records[i] = replace(found, within_reach=found.within_reach | overlaps)
-                self._reach[i] = reach
-                return new
-        return 0
+        count = 0
+        for i, contact in enumerate(self.contacts):
+            moved = self._approach(contact, way.reshape(-1, self._dofs.bs))
+            tried = [(self._records[i], self._reach[i])]
+            if moved > self._reach[i]:
+                tried.insert(0, (self._search(i, moved), moved))
+            for found, reach in tried:
+                overlaps = remaining_gaps(found, self._dofs, u) < -tolerance
+                if new := self._count(overlaps & ~found.within_reach):
+                    self._records[i] = replace(found, within_reach=found.within_reach | overlaps)
+                    self._reach[i] = reach
+                    count += new
+                    break
+        return count
 
     def widen(self) -> int:
         """Increase the reach until a condition gets a row, since far contact may hold a body.
@@ -161,10 +159,10 @@ class ContactSearch:
         Returns:
             How many rows are new, on all ranks; 0 where nothing is left to find.
         """
-        while not self.is_exhausted:
-            if new := sum(self._widen(i) for i in range(len(self.contacts))):
-                return new
-        return 0
+        new = 0
+        while new == 0 and not self.is_exhausted:
+            new = sum(self._widen(i) for i in range(len(self.contacts)))
+        return new
 
     @property
     def is_exhausted(self) -> bool:
@@ -174,8 +172,7 @@ class ContactSearch:
     def unmet(self) -> list[str]:
         """Contacts none of whose nodes has a row: position in the list, and name."""
         rows = np.array([np.sum(known.within_reach) for known in self._records], dtype=np.int64)
-        rows = self._dofs.comm.allreduce(rows)
-        return self.named(np.flatnonzero(rows == 0))
+        return self.named(np.flatnonzero(self._dofs.comm.allreduce(rows) == 0))
 
     def named(self, positions: Iterable[int] | Array) -> list[str]:
         """Contacts as reports name them: position in the list, and name."""
@@ -188,9 +185,27 @@ class ContactSearch:
             if self._dofs.comm.rank == 0 and contact not in before:
                 log.warning("contact %s has met nobody, and has no rows", contact)
 
+    def _approach(self, contact: ContactPartner, u: Array) -> float:
+        """Bound how much nearer two surfaces have come, 0 of an obstacle, the same on all ranks.
+
+        Largest displacements of both surfaces, against their common mean, added up.
+        """
+        dofs, cut, comm = self._dofs, self._decomposition, self._dofs.comm
+        if len(contact.surfaces) == 1:
+            return 0.0
+        moved = [u[surface_nodes(dofs, cut, cut.facets(name))] for name in contact.surfaces]
+        total = comm.allreduce(np.sum([part.sum(axis=0) for part in moved], axis=0))
+        mean = total / comm.allreduce(sum(len(part) for part in moved))
+        largest = np.array([np.linalg.norm(u - mean, axis=1).max(initial=0.0) for u in moved])
+        comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
+        return bcast_from_root(comm, float(largest.sum()))
+
+    def _is_complete(self, i: int) -> bool:
+        """Return whether a wider search finds no more conditions: an obstacle has them all."""
+        return len(self.contacts[i].surfaces) == 1 or self._reach[i] >= self.length
+
     def _is_exhausted(self, i: int) -> bool:
-        complete = self._reach[i] >= self.contacts[i].horizon(self.length)
-        return self._count(~self._records[i].within_reach) == 0 and complete
+        return self._count(~self._records[i].within_reach) == 0 and self._is_complete(i)
 
     def _widen(self, i: int) -> int:
         """Increase the reach of one contact; return the number of new rows."""
@@ -199,7 +214,7 @@ class ContactSearch:
         found = self._records[i]
         before = self._count(found.within_reach)
         reach = max(SEARCH.wider * self._reach[i], SEARCH.least * self.length)
-        if self._reach[i] < self.contacts[i].horizon(self.length):
+        if not self._is_complete(i):
             found = self._search(i, reach)
         self._reach[i] = reach
         distance = found.gap if self._origin is None else found.geometric_gap

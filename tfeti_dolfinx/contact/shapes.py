@@ -230,22 +230,25 @@ def distance_and_gradient(shape: Shape, x: Array, what: str) -> tuple[Array, Arr
     Raises:
         InputError: A callable fails, or returns arrays of another shape.
     """
+    return _values_of(shape, "distance", x, what), _values_of(shape, "gradient", x, what)
+
+
+def _values_of(shape: Shape, method: str, x: Array, what: str) -> Array:
+    """Return what a method of a shape gives at points, one row for each."""
+    size = (len(x),) if method == "distance" else (3, len(x))
     if len(x) == 0:
-        return np.zeros(0), np.zeros((0, 3))
+        return np.zeros(size).T
     points = np.zeros((3, len(x)))
     points[: x.shape[1]] = x.T
-    found = []
-    for name, size in (("distance", (len(x),)), ("gradient", (3, len(x)))):
-        with named(f"{what}: the {name} at points of shape {points.shape}"):
-            values = real_numbers(getattr(shape, name)(points))
-        try:
-            found.append(np.broadcast_to(values, size))
-        except ValueError:
-            raise InputError(
-                f"{what}: the {name} at points of shape {points.shape} has the shape "
-                f"{values.shape}; expected {size}"
-            ) from None
-    return found[0], found[1].T
+    with named(f"{what}: the {method} at points of shape {points.shape}"):
+        values = real_numbers(getattr(shape, method)(points))
+    try:
+        return np.broadcast_to(values, size).T
+    except ValueError:
+        raise InputError(
+            f"{what}: the {method} at points of shape {points.shape} has the shape "
+            f"{values.shape}; expected {size}"
+        ) from None
 
 
 def check_placement(
@@ -253,8 +256,9 @@ def check_placement(
 ) -> None:
     """Raise if a shape is not one of this dimension, or its gradient not that of its distance.
 
-    Collective. The gradient is compared with differences of the distance at a few points of each
-    rank; wrong are most of them, or none.
+    Collective. The gradient is compared with central differences of the distance at a few points
+    of each rank: it is wrong where they differ by more than 60° or a factor of 100, since it may be
+    rounded off or of any length. Wrong are most of them, or none.
 
     Args:
         shape: The shape.
@@ -269,42 +273,26 @@ def check_placement(
     """
     if isinstance(shape, Placed):
         shape.check_dimension(gdim, what)
-    with raised_on_all_ranks(comm):
+    with raised_on_all_ranks(comm), np.errstate(invalid="ignore"):  # of what is not finite
         phi, gradient = distance_and_gradient(shape, x, what)
         nearest = np.argsort(np.abs(phi))[: SEARCH.samples]
-        slope = _differences(shape, x[nearest], SEARCH.difference * size, what)
-        gradient = gradient[nearest, : x.shape[1]]
-        differs, says_something = _compared(gradient, slope)
-    wrong, compared = comm.allreduce(np.array([np.sum(differs), np.sum(says_something)]))
+        x, gradient, step = x[nearest], gradient[nearest, :gdim], SEARCH.difference * size
+        ahead, behind = (
+            [_values_of(shape, "distance", x + shift, what) for shift in sign * np.eye(gdim)]
+            for sign in (step, -step)
+        )
+        slope = (np.array(ahead) - np.array(behind)).T / (2.0 * step)
+        lengths = np.linalg.norm(gradient, axis=1), np.linalg.norm(slope, axis=1)
+        product = lengths[0] * lengths[1]
+        known = np.isfinite(product) & (product > 0.0)
+        turned = np.sum(gradient * slope, axis=1) < SEARCH.same_direction * product
+        scaled = np.maximum(*lengths) > SEARCH.same_length * np.minimum(*lengths)
+        differs = known & (turned | scaled)
+    wrong, compared = comm.allreduce(np.array([np.sum(differs), np.sum(known)]))
     with raised_on_all_ranks(comm):
         if 2 * wrong > compared and np.any(differs):
             i = int(np.argmax(differs))
             raise InputError(
-                f"{what}: the gradient does not fit the distance; at {x[nearest[i]].tolist()} "
+                f"{what}: the gradient does not fit the distance; at {x[i].tolist()} "
                 f"it is {gradient[i].tolist()}, expected about {slope[i].tolist()}"
             )
-
-
-def _differences(shape: Shape, x: Array, step: float, what: str) -> Array:
-    """Central differences of the distance, shape of x."""
-    shifts = step * np.eye(x.shape[1])
-    columns = []
-    for shift in shifts:
-        ahead, _ = distance_and_gradient(shape, x + shift, what)
-        behind, _ = distance_and_gradient(shape, x - shift, what)
-        with np.errstate(invalid="ignore"):  # what is not finite is named elsewhere
-            columns.append((ahead - behind) / (2.0 * step))
-    return np.stack(columns, axis=1)
-
-
-def _compared(gradient: Array, slope: Array) -> tuple[Array, Array]:
-    """Return where gradient and slope differ grossly, and where they can be compared.
-
-    By more than 60°, or a factor of 100: a gradient may be rounded off or of any length.
-    """
-    sizes = np.linalg.norm(gradient, axis=1), np.linalg.norm(slope, axis=1)
-    product = sizes[0] * sizes[1]
-    says_something = np.isfinite(product) & (product > 0.0)
-    turned = np.sum(gradient * slope, axis=1) < SEARCH.same_direction * product
-    scaled = np.maximum(*sizes) > SEARCH.same_length * np.minimum(*sizes)
-    return says_something & (turned | scaled), says_something

@@ -1,4 +1,4 @@
-"""Segments: the common parts of projected facets, all pairs at once."""
+"""Common parts of projected facets, all pairs at once."""
 
 from __future__ import annotations
 
@@ -41,24 +41,58 @@ class CommonParts:
         return part, self.vertices[part, place]
 
     def quadrature(self, degree: int) -> tuple[Array, Array, Array]:
-        """Part of each point, points of shape ``(m, tdim)``, weights, exact up to a degree."""
-        if self.vertices.shape[2] == 1:
-            return quadrature_on_intervals(self.vertices[:, :, 0], degree)
-        return quadrature_on_polygons(self.vertices, self.count, degree)
+        """Quadrature points of all parts; polygons are cut into triangles at their first vertex.
+
+        Args:
+            degree: Degree that is integrated exactly.
+
+        Returns:
+            Part of each point, points of shape ``(m, tdim)``, weights of shape ``(m,)``.
+        """
+        y, count = self.vertices, self.count
+        if y.shape[2] == 1:
+            x, w = basix.make_quadrature(basix.CellType.interval, degree)
+            part = np.flatnonzero(count)
+            a, sides = y[part, 0], (y[part, 1] - y[part, 0])[:, None]
+            scale = np.abs(sides[:, 0, 0])
+        else:
+            x, w = basix.make_quadrature(basix.CellType.triangle, degree)
+            part, k = np.nonzero(np.arange(2, y.shape[1]) < count[:, None])
+            a = y[part, 0]
+            sides = np.stack((y[part, k + 1], y[part, k + 2]), axis=1) - a[:, None]
+            scale = np.abs(np.linalg.det(sides))
+        points = (a[:, None] + x @ sides).reshape(-1, y.shape[2])
+        return np.repeat(part, len(w)), points, (scale[:, None] * w).ravel()
 
 
 def common_parts(subject: Array, clip: Array) -> CommonParts:
-    """Intersect pairs of intervals or of convex polygons.
+    """Intersect pairs of intervals, or of convex polygons (Sutherland, Hodgman 1974).
 
     Args:
         subject: Vertices in order, shape ``(n, k, tdim)``.
         clip: Vertices in order, shape ``(n, l, tdim)``.
+
+    Returns:
+        Parts of up to 2 or k + l vertices; none where they are apart or meet in a sliver only.
     """
+    whole = sizes(clip)
     if subject.shape[2] == 1:
-        ends, met = clip_intervals(subject[:, :, 0], clip[:, :, 0])
-        size = np.where(met, ends[:, 1] - ends[:, 0], 0.0)
-        return CommonParts(ends[:, :, None], np.where(met, 2, 0), size)
-    return clip_polygons(subject, clip)
+        low = np.maximum(subject.min(axis=1), clip.min(axis=1))
+        high = np.minimum(subject.max(axis=1), clip.max(axis=1))
+        vertices, count = np.stack((low, high), axis=1), np.full(len(clip), 2)
+        size = (high - low)[:, 0]
+    else:
+        n, sides = clip.shape[:2]
+        turned = (_signed_area(clip, np.full(n, sides)) < 0.0)[:, None, None]
+        clip = np.where(turned, clip[:, ::-1], clip)
+        count = np.full(n, subject.shape[1])
+        vertices = np.concatenate((subject, np.zeros((n, sides, 2))), axis=1)
+        for side in range(sides):
+            start, end = clip[:, side], clip[:, (side + 1) % sides]
+            vertices, count = _cut(vertices, count, start, end - start)
+        size = np.abs(_signed_area(vertices, count))
+    met = size > SEARCH.sliver * whole
+    return CommonParts(vertices, np.where(met, count, 0), np.where(met, size, 0.0))
 
 
 def sizes(polygon: Array) -> Array:
@@ -81,44 +115,6 @@ def contains(polygon: Array, y: Array) -> Array:
     offset = y[:, None] - polygon
     side = edge[:, :, 0] * offset[:, :, 1] - edge[:, :, 1] * offset[:, :, 0]
     return np.all(side > 0.0, axis=1) | np.all(side < 0.0, axis=1)
-
-
-def clip_intervals(subject: Array, clip: Array) -> tuple[Array, Array]:
-    """Common parts of pairs of intervals.
-
-    Args:
-        subject: End points, shape ``(n, 2)``.
-        clip: End points, shape ``(n, 2)``.
-
-    Returns:
-        Their ends, shape ``(n, 2)``, low before high, and whether there is any.
-    """
-    low = np.maximum(subject.min(axis=1), clip.min(axis=1))
-    high = np.minimum(subject.max(axis=1), clip.max(axis=1))
-    return np.stack((low, high), axis=1), high - low > SEARCH.sliver * np.ptp(clip, axis=1)
-
-
-def clip_polygons(subject: Array, clip: Array) -> CommonParts:
-    """Common parts of pairs of convex polygons (Sutherland, Hodgman 1974).
-
-    Args:
-        subject: Vertices in order, shape ``(n, k, 2)``.
-        clip: Vertices in order, shape ``(n, l, 2)``.
-
-    Returns:
-        CommonParts of up to k + l vertices; none where polygons are apart or meet in a sliver only.
-    """
-    clip, whole = _counterclockwise(clip)
-    n, sides = len(subject), clip.shape[1]
-    polygon = np.zeros((n, subject.shape[1] + sides, 2))
-    polygon[:, : subject.shape[1]], _ = _counterclockwise(subject)
-    count = np.full(n, subject.shape[1])
-    for side in range(sides):
-        start, end = clip[:, side], clip[:, (side + 1) % sides]
-        polygon, count = _cut(polygon, count, start, end - start)
-    area = np.abs(_signed_area(polygon, count))
-    count[area <= SEARCH.sliver * whole] = 0
-    return CommonParts(polygon, count, np.where(count > 0, area, 0.0))
 
 
 def _cut(polygon: Array, count: Array, point: Array, direction: Array) -> tuple[Array, Array]:
@@ -151,47 +147,3 @@ def _signed_area(polygon: Array, count: Array) -> Array:
     after = np.take_along_axis(polygon, following[:, :, None], axis=1)
     cross = polygon[:, :, 0] * after[:, :, 1] - polygon[:, :, 1] * after[:, :, 0]
     return 0.5 * np.sum(np.where(k < count[:, None], cross, 0.0), axis=1)
-
-
-def _counterclockwise(polygon: Array) -> tuple[Array, Array]:
-    """Return the polygons, counterclockwise, and their areas."""
-    area = _signed_area(polygon, np.full(len(polygon), polygon.shape[1]))
-    turned = (area < 0.0)[:, None, None]
-    return np.where(turned, polygon[:, ::-1], polygon), np.abs(area)
-
-
-def quadrature_on_intervals(ends: Array, degree: int) -> tuple[Array, Array, Array]:
-    """Gauss points of intervals.
-
-    Args:
-        ends: Shape ``(n, 2)``.
-        degree: Degree that is integrated exactly.
-
-    Returns:
-        Interval of each point, points of shape ``(m, 1)``, weights of shape ``(m,)``.
-    """
-    x, w = basix.make_quadrature(basix.CellType.interval, degree)
-    length = ends[:, 1:] - ends[:, :1]
-    points = ends[:, :1] + length * x[:, 0]
-    owner = np.repeat(np.arange(len(ends)), len(w))
-    return owner, points.reshape(-1, 1), (length * w).ravel()
-
-
-def quadrature_on_polygons(polygon: Array, count: Array, degree: int) -> tuple[Array, Array, Array]:
-    """Quadrature points of convex polygons, cut into triangles from their first vertex.
-
-    Args:
-        polygon: Vertices, shape ``(n, k, 2)``.
-        count: How many of them are used.
-        degree: Degree that is integrated exactly.
-
-    Returns:
-        Polygon of each point, points of shape ``(m, 2)``, weights of shape ``(m,)``.
-    """
-    x, w = basix.make_quadrature(basix.CellType.triangle, degree)
-    owner, k = np.nonzero(np.arange(2, polygon.shape[1]) < count[:, None])
-    a, b, c = polygon[owner, 0], polygon[owner, k + 1], polygon[owner, k + 2]
-    points = a[:, None] + x[:, :1] * (b - a)[:, None] + x[:, 1:] * (c - a)[:, None]
-    cross = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
-    weights = np.abs(cross)[:, None] * w
-    return np.repeat(owner, len(w)), points.reshape(-1, 2), weights.ravel()

@@ -30,14 +30,14 @@ def with_curvature(facets: Facets, dofs: TornDofs, kind: FacetKind) -> Facets:
         dofs: Dof maps.
         kind: Elements on the facets.
     """
-    normals, groups = facets.vertex_normals, facets.groups[:, : kind.num_vertices].ravel()
+    normals, groups = facets.vertex_normals, facets.vertices.ravel()
     cosine = np.einsum("nvg,ng->nv", normals, facets.normal)
     turns = bool(np.any(cosine < 1.0 - SEARCH.turned))
     if kind.geometry.degree > 1 or not any_rank(dofs.comm, turns):
         return facets
     n, v, gdim = normals.shape
     axes = tangents(normals.reshape(-1, gdim)).reshape(n, v, gdim - 1, gdim)
-    M, b = _normal_equations(facets.corners(kind.num_vertices), normals, axes)
+    M, b = _normal_equations(facets.corners, normals, axes)
     sharp = (cosine <= SEARCH.edge).astype(float)
     exchange = Exchange(dofs.comm, owner_of(dofs.group_offsets, groups))
     vertex, place = np.unique(exchange.send(groups), return_inverse=True)
@@ -64,7 +64,7 @@ def beside(kind: FacetKind, facets: Facets, rows: Array, xi: Array) -> Array:
         xi: Reference coordinates, shape ``(m, tdim)``.
     """
     x, K = facets.x[rows], facets.curvature[rows]
-    d = x[:, : kind.num_vertices] - points(kind.geometry, x, xi)[:, None]
+    d = x[:, : kind.hats.size] - points(kind.geometry, x, xi)[:, None]
     height = -0.5 * np.sum(kind.hats.values(xi) * np.sum((d @ K) * d, axis=2), axis=1)
     return height[:, None] * facets.normal[rows]
 

@@ -118,9 +118,9 @@ class FacetKind:
     geometry: FacetElement
 
     @property
-    def num_vertices(self) -> int:
-        """Vertices of a facet."""
-        return self.hats.size
+    def reference_area(self) -> float:
+        """Area of the reference facet."""
+        return 0.5 if self.facet == "triangle" else 1.0
 
 
 @dataclass(frozen=True)
@@ -154,13 +154,15 @@ class Facets:
         chosen = slice(None) if rows is None else rows
         return Facets(*(exchange.send(getattr(self, f.name)[chosen]) for f in fields(self)))
 
-    def corners(self, num_vertices: int) -> Array:
+    @property
+    def corners(self) -> Array:
         """Vertices, shape ``(n, v, gdim)``."""
-        return self.x[:, :num_vertices]
+        return self.x[:, : self.vertex_normals.shape[1]]
 
-    def box(self) -> tuple[Array, Array]:
-        """Lowest and highest coordinates of each facet, shapes ``(n, gdim)``."""
-        return self.x.min(axis=1), self.x.max(axis=1)
+    @property
+    def vertices(self) -> Array:
+        """Global groups of the vertices, shape ``(n, v)``."""
+        return self.groups[:, : self.vertex_normals.shape[1]]
 
     @property
     def centre(self) -> Array:
@@ -205,33 +207,33 @@ def local_facets(dofs: TornDofs, decomposition: Decomposition, facets: Array) ->
     trace = facet_dofs(cell_type.name, element.degree, element.lagrange_variant)[place]
     displacement = np.take_along_axis(np.asarray(dofs.V.dofmap.list)[cell], trace, axis=1)
     kind = facet_kind(dofs)
-    num_vertices = kind.num_vertices
     inside = mesh.geometry.x[nodes[:, : coordinate.dim // gdim]].mean(axis=1)[:, :gdim]
-    normal, area = _normals(x[:, :num_vertices], inside)
+    hats, corners = kind.hats, x[:, : kind.hats.size]
+    (normal,) = _normals(hats, corners, hats.points.mean(axis=0)[None])
+    area = kind.reference_area * np.linalg.norm(normal, axis=1)
+    outward = np.sum(normal * (corners.mean(axis=1) - inside), axis=1)
+    normal = _unit(np.where(outward < 0.0, -1.0, 1.0)[:, None] * normal)
+    at_vertices = _normals(kind.geometry, x, hats.points)
+    sign = np.sign(np.sum(at_vertices * normal, axis=2, keepdims=True))
     return Facets(
         x=np.ascontiguousarray(x),
         groups=dofs.group[dofs.primal_nodes(displacement)],
         normal=normal,
-        vertex_normals=_vertex_normals(kind, x, normal),
+        vertex_normals=np.ascontiguousarray((sign * _unit(at_vertices)).swapaxes(0, 1)),
         area=area,
         curvature=np.zeros((len(x), gdim, gdim)),
     )
 
 
-def with_averaged_normals(
-    facets: Facets, dofs: TornDofs, num_vertices: int
-) -> tuple[Facets, Array]:
+def with_averaged_normals(facets: Facets, dofs: TornDofs) -> tuple[Facets, Array]:
     """Return the same facets with normals averaged at the vertices, weighted by area. Collective.
 
     Returns:
         The facets, and the averaged normal of each owned group, 0 off them, shape ``(g, gdim)``.
     """
-    groups = facets.groups[:, :num_vertices]
-    weighted = facets.vertex_normals * facets.area[:, None, None]
-    total = dofs.reduce_on_owners(groups.ravel(), weighted.reshape(-1, weighted.shape[2]))
-    length = np.linalg.norm(total, axis=1, keepdims=True)
-    averaged = total / np.where(length > 0.0, length, 1.0)
-    (at_vertices,) = dofs.lookup(groups.ravel(), averaged)
+    groups, weighted = facets.vertices.ravel(), facets.vertex_normals * facets.area[:, None, None]
+    averaged = _unit(dofs.reduce_on_owners(groups, weighted.reshape(len(groups), dofs.bs)))
+    (at_vertices,) = dofs.lookup(groups, averaged)
     return replace(facets, vertex_normals=at_vertices.reshape(weighted.shape)), averaged
 
 
@@ -245,34 +247,18 @@ def _cells_of(decomposition: Decomposition, facets: Array) -> tuple[Array, Array
     return cell, place
 
 
-def _vertex_normals(kind: FacetKind, x: Array, normal: Array) -> Array:
-    """Unit normals of curved facets at their vertices, on the side of plane facets' normals."""
-    slopes = kind.geometry.slopes(kind.hats.points)
-    tangents = np.einsum("tvg,ngd->tnvd", slopes, from_first(x))
+def _normals(element: FacetElement, x: Array, xi: Array) -> Array:
+    """Normals at reference points, as long as area per area there, shape ``(points, n, gdim)``."""
+    tangents = np.einsum("tvg,ngd->tvnd", element.slopes(xi), from_first(x))
     if len(tangents) == 1:
-        found = np.stack((tangents[0, :, :, 1], -tangents[0, :, :, 0]), axis=2)
-    else:
-        found = np.cross(*tangents)
-    length = np.linalg.norm(found, axis=2) * np.sign(np.einsum("nvd,nd->nv", found, normal))
-    return found / np.where(length != 0.0, length, np.inf)[:, :, None]
+        return np.stack((tangents[0, :, :, 1], -tangents[0, :, :, 0]), axis=2)
+    return np.cross(*tangents)
 
 
-def _normals(corners: Array, inside: Array) -> tuple[Array, Array]:
-    """Unit normals at the centres, away from points inside, and areas."""
-    if corners.shape[2] == 2:
-        edge = corners[:, 1] - corners[:, 0]
-        normal = np.stack((edge[:, 1], -edge[:, 0]), axis=1)
-        area = np.linalg.norm(normal, axis=1)
-    elif corners.shape[1] == 3:
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area = 0.5 * np.linalg.norm(normal, axis=1)
-    else:  # the diagonals of a quadrilateral
-        normal = np.cross(corners[:, 3] - corners[:, 0], corners[:, 2] - corners[:, 1])
-        area = 0.5 * np.linalg.norm(normal, axis=1)
-    outward = np.sum(normal * (corners.mean(axis=1) - inside), axis=1)
-    length = np.linalg.norm(normal, axis=1)
-    sign = np.where(outward < 0.0, -1.0, 1.0)
-    return sign[:, None] * normal / np.where(length > 0.0, length, 1.0)[:, None], area
+def _unit(vectors: Array) -> Array:
+    """Return vectors over their lengths, along the last axis; 0 stays 0."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / np.where(length > 0.0, length, 1.0)
 
 
 # --- Maps of reference facets -----------------------------------------------------------------

@@ -8,7 +8,7 @@ import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.mortar.curvature import beside
-from tfeti_dolfinx.mortar.facets import FacetKind, Facets, points
+from tfeti_dolfinx.mortar.facets import FacetKind, Facets, points, whole_facets
 from tfeti_dolfinx.mortar.segments import FacingPoints, Segments
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
@@ -28,29 +28,27 @@ class GapIntegrals:
     highest: Array
 
 
+Triplets = tuple[Array, Array, Array]
+
+
 @dataclass(frozen=True)
 class MortarIntegrals:
-    """Integrals with the dual multipliers ψ_i of the secondary facets' vertices.
+    """Contributions of facets of a surface to the conditions of their vertices.
 
     Attributes:
-        facet: Secondary facet that ``own``, the gaps and ``covered`` are of, shape ``(f,)``.
-        own: ∫ψ_i φ_k of the facet's own displacement nodes, shape ``(f, v, t)``.
-        gap: Between the facets.
-        curved_gap: Between the smooth surfaces that they stand for.
-        covered: ∫φ_i over the covered part, shape ``(f, v)``.
-        pair_secondary: Secondary facet that ``other`` is of, shape ``(q,)``.
-        pair_primary: Primary facet of each, shape ``(q,)``.
-        other: ∫ψ_i φ_j of the primary facet's displacement nodes, shape ``(q, v, t)``.
+        vertices: Global groups of the facets' vertices, shape ``(f, v)``.
+        covered: ∫φ_i over the covered part of each facet, shape ``(f, v)``.
+        gap: Gap g along the node's normal, between the facets or of an obstacle.
+        curved_gap: That between the smooth surfaces that facets stand for.
+        entries: Triplets (multiplier's group, displacement's group, ∫ψ_i φ_k with its sign), ψ_i
+            the dual multipliers.
     """
 
-    facet: Array
-    own: Array
+    vertices: Array
+    covered: Array
     gap: GapIntegrals
     curved_gap: GapIntegrals
-    covered: Array
-    pair_secondary: Array
-    pair_primary: Array
-    other: Array
+    entries: tuple[Triplets, ...]
 
 
 @dataclass(frozen=True)
@@ -97,35 +95,61 @@ def dual_multipliers(
     covered = sum_rows(place, weight[:, None] * hats, len(facets))
     mass = sum_rows(place, weight[:, None, None] * hats[:, :, None] * hats[:, None], len(facets))
     hardly = covered.sum(axis=1) <= SEARCH.hardly_covered * area[facets]
-    mass[hardly] = np.eye(kind.num_vertices)
+    mass[hardly] = np.eye(kind.hats.size)
     covered[hardly] = 0.0
     dual = covered[:, :, None] * np.linalg.inv(mass)
     psi = np.einsum("mij,mj->mi", dual[place], hats)
     return DualMultipliers(facets, place, weight[:, None] * psi, covered)
 
 
+def triplets(rows: Array, columns: Array, values: Array) -> Triplets:
+    """Row groups, column groups and values of many small matrices."""
+    i, j = np.broadcast_arrays(rows[:, :, None], columns[:, None, :])
+    return i.ravel(), j.ravel(), values.ravel()
+
+
 def integrate(
     kind: FacetKind, secondary: Facets, primary: Facets, segments: Segments
 ) -> MortarIntegrals:
-    """Return integrals of the dual multipliers over segments."""
+    """Return integrals of the secondary facets' dual multipliers over segments."""
     at = segments.points
     dual = dual_multipliers(kind, secondary.area, at.secondary, at.xi, segments.weight)
     gap = curved_gap = _gaps(kind, secondary, primary, segments, dual)
     if np.any(secondary.curvature) or np.any(primary.curvature):
         curved_gap = _gaps(kind, secondary, primary, segments, dual, curved=True)
-    stride = max(len(primary), 1)
-    pair, pair_place = np.unique(at.secondary * stride + at.primary, return_inverse=True)
+    own = dual.integrals(kind.displacement.values(at.xi))
+    pair, place = np.unique(at.secondary * len(primary) + at.primary, return_inverse=True)
     theirs = kind.displacement.values(at.eta)
+    other = sum_rows(place, dual.weighted[:, :, None] * theirs[:, None], len(pair))
+    s, p = np.divmod(pair, max(len(primary), 1))
     return MortarIntegrals(
-        facet=dual.facet,
-        own=dual.integrals(kind.displacement.values(at.xi)),
+        vertices=secondary.vertices[dual.facet],
+        covered=dual.covered,
         gap=gap,
         curved_gap=curved_gap,
-        covered=dual.covered,
-        pair_secondary=pair // stride,
-        pair_primary=pair % stride,
-        other=sum_rows(pair_place, dual.weighted[:, :, None] * theirs[:, None], len(pair)),
+        entries=(
+            triplets(secondary.vertices[dual.facet], secondary.groups[dual.facet], own),
+            triplets(secondary.vertices[s], primary.groups[p], -other),
+        ),
     )
+
+
+def integrate_distance(kind: FacetKind, facets: Facets, distance: Array) -> MortarIntegrals:
+    """Return integrals of the dual multipliers over whole facets that face an obstacle.
+
+    Args:
+        kind: Elements on the facets.
+        facets: The facets.
+        distance: Distance of the obstacle at their vertices, shape ``(n, v)``.
+    """
+    # exact for ψ_i φ_k on plane facets, and enough on curved ones
+    facet, xi, weight = whole_facets(kind, facets, 4 * kind.displacement.degree)
+    dual = dual_multipliers(kind, facets.area, facet, xi, weight)
+    at_vertices, vertices = distance[dual.facet], facets.vertices[dual.facet]
+    gap = GapIntegrals(at_vertices * dual.covered, at_vertices, at_vertices)
+    own = dual.integrals(kind.displacement.values(xi))
+    entries = triplets(vertices, facets.groups[dual.facet], own)
+    return MortarIntegrals(vertices, dual.covered, gap, gap, (entries,))
 
 
 def _gaps(

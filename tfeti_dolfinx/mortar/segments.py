@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
+from itertools import chain
 
 import numpy as np
 from mpi4py import MPI
@@ -86,74 +86,6 @@ def tangents(normal: Array) -> Array:
     return np.stack((first, np.cross(normal, first)), axis=1)
 
 
-# --- Choice among primary facets over one secondary facet -------------------------------------
-
-
-# for pairs a and b of the same secondary facet: whether b's primary facet lies over the middle of
-# a's common part, and its distance there
-Look = Callable[[Array, Array], tuple[Array, Array]]
-
-
-def truly_overlapping(s: Array, distance: Array, facing: Array, length: Array, look: Look) -> Array:
-    """Facing pairs whose overlap is real: no way out of the primary body lies before them.
-
-    An overlap means that the primary body reaches from its facet, behind the secondary one, up to
-    that. If it ends before, at a facet that looks the same way as the secondary one, the pair is
-    one of two faces that look away from each other through thin bodies.
-
-    Args:
-        s: Secondary facet of each pair, shape ``(n,)``.
-        distance: Distance along the secondary facet's normal.
-        facing: Whether the facets face each other.
-        length: Size of every secondary facet.
-        look: The way to look at one pair's place along another.
-
-    Returns:
-        Flags, shape ``(n,)``.
-    """
-    found, same = facing.copy(), SEARCH.same_layer * length[s]
-    behind = distance < -same
-    within, out = np.flatnonzero(facing & behind), np.flatnonzero(~facing & behind)
-    a, b = pairs_over_one_facet(s, within, out)
-    over, there = look(a, b)
-    found[a[over & (distance[a] < there) & (there < -same[a])]] = False
-    return found
-
-
-def nearest(
-    s: Array, distance: Array, length: Array, size: Array, whole: Array, look: Look
-) -> Array:
-    """Return pairs with no other primary facet before theirs.
-
-    Args:
-        s: Secondary facet of each pair, shape ``(n,)``.
-        distance: Distance along the secondary facet's normal.
-        length: Size of every secondary facet.
-        size: Length or area of the common part.
-        whole: Length or area of every secondary facet.
-        look: The way to look at one pair's place along another.
-
-    Returns:
-        Flags, shape ``(n,)``.
-    """
-    found = np.ones(len(s), dtype=bool)
-    covered = np.bincount(s, size, minlength=len(whole))
-    several = np.flatnonzero((covered > (1.0 + SEARCH.covered_twice) * whole)[s])
-    a, b = pairs_over_one_facet(s, several, several)
-    over, there = look(a, b)
-    found[a[(a != b) & over & (there < distance[a] - SEARCH.same_layer * length[s[a]])]] = False
-    return found
-
-
-def pairs_over_one_facet(s: Array, first: Array, second: Array) -> tuple[Array, Array]:
-    """All (a, b), a of ``first`` and b of ``second``, with the same secondary facet."""
-    ordered = second[np.argsort(s[second], kind="stable")]
-    start = np.searchsorted(s[ordered], s[first], side="left")
-    count = np.searchsorted(s[ordered], s[first], side="right") - start
-    offset = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
-    return np.repeat(first, count), ordered[np.repeat(start, count) + offset]
-
-
 # --- Search for pairs of facets ---------------------------------------------------------------
 
 
@@ -176,22 +108,17 @@ def rendezvous(
     """
     here = secondary.sent(Exchange(comm, bisect_points(secondary.centre, comm.size, comm)))
     size = here.radius.max(initial=0.0)
-    low, high = here.box()
-    gdim = low.shape[1]
-    box = np.stack((low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)))
+    x, gdim = here.x, here.x.shape[2]
+    low, high = x.min(axis=(0, 1), initial=np.inf), x.max(axis=(0, 1), initial=-np.inf)
     boxes = np.empty((comm.size, 2, gdim))
-    comm.Allgather(box + np.array([[-size], [size]]), boxes)
-    low, high = primary.box()
+    comm.Allgather(np.stack((low - size, high + size)), boxes)
     margin = distance + primary.radius[:, None]
-    low, high = low - margin, high + margin
+    low, high = primary.x.min(axis=1) - margin, primary.x.max(axis=1) + margin
     # ranks that some facet may meet first: they are few, of however many
     reach = low.min(axis=0, initial=np.inf), high.max(axis=0, initial=-np.inf)
     near = np.flatnonzero(np.all((reach[0] <= boxes[:, 1]) & (reach[1] >= boxes[:, 0]), axis=1))
-    meets = np.ones((len(primary), len(near)), dtype=bool)
-    for axis in range(gdim):
-        meets &= low[:, axis, None] <= boxes[None, near, 1, axis]
-        meets &= high[:, axis, None] >= boxes[None, near, 0, axis]
-    facet, place = np.nonzero(meets)
+    meets = (low[:, None] <= boxes[near, 1]) & (high[:, None] >= boxes[near, 0])
+    facet, place = np.nonzero(np.all(meets, axis=2))
     return here, primary.sent(Exchange(comm, near[place]), facet)
 
 
@@ -252,38 +179,22 @@ def _march(
     Returns:
         Segment and point of each pair, some more than once.
     """
-    found_s: list[Array] = [np.empty(0, dtype=np.int64)]
-    found_p: list[Array] = [np.empty(0, dtype=np.int64)]
+    segments: list[Array] = [np.empty(0, dtype=np.int64)]
+    points: list[Array] = [np.empty(0, dtype=np.int64)]
     front = -half_length  # all before it has been seen
     active = np.arange(len(origin))
     while len(active):
         t = front[active] + radius[active]
         x = origin[active] + t[:, None] * direction[active]
-        nearest, _ = tree.query(x)
-        close = nearest <= 2.0 * radius[active]
-        rows, points = _within(tree, x[close], 2.0 * radius[active[close]])
-        found_s.append(active[close][rows])
-        found_p.append(points)
-        front[active] = t + np.where(close, radius[active], nearest - radius[active])
+        distance, _ = tree.query(x)
+        close = distance <= 2.0 * radius[active]
+        hits = tree.query_ball_point(x[close], 2.0 * radius[active[close]])
+        count = np.fromiter(map(len, hits), dtype=np.int64, count=len(hits))
+        segments.append(np.repeat(active[close], count))
+        points.append(np.fromiter(chain.from_iterable(hits), dtype=np.int64, count=count.sum()))
+        front[active] = t + np.where(close, radius[active], distance - radius[active])
         active = active[front[active] < half_length[active]]
-    return np.concatenate(found_s), np.concatenate(found_p)
-
-
-def _within(tree: cKDTree, x: Array, radius: Array) -> tuple[Array, Array]:
-    """Return points of a tree within a radius of each x: row and point of each pair."""
-    found: list[tuple[Array, Array]] = [(np.empty(0, dtype=np.int64),) * 2]
-    rows, k = np.arange(len(x)), min(SEARCH.neighbours, tree.n)
-    while len(rows):
-        distance, point = tree.query(
-            x[rows], k=np.arange(1, k + 1), distance_upper_bound=np.nextafter(radius.max(), np.inf)
-        )
-        inside = distance <= radius[rows, None]
-        row, column = np.nonzero(inside)
-        full = inside[:, -1] & (k < tree.n)
-        settled = ~full[row]
-        found.append((rows[row[settled]], point[row[settled], column[settled]]))
-        rows, k = rows[full], min(2 * k, tree.n)
-    return tuple(np.concatenate(part) for part in zip(*found, strict=True))
+    return np.concatenate(segments), np.concatenate(points)
 
 
 # --- Segments and their quadrature points -----------------------------------------------------
@@ -335,9 +246,8 @@ def find_segments(
 ) -> Segments:
     """Clip pairs of facets on the secondary facets' averaged normal planes.
 
-    Of several primary facets over the same place the first one is met; facets that face each
-    other through thin bodies do not meet (``layers``). Lengths are exceeded by the facets' own
-    sizes, so that no facet within them is covered in part only.
+    Lengths are exceeded by the facets' own sizes, so that no facet within them is covered in part
+    only.
 
     Args:
         kind: Elements on the facets.
@@ -348,15 +258,18 @@ def find_segments(
         height: Nor do facets farther apart than this.
     """
     planes = _Planes(kind, secondary, primary)
+    # 1. common parts of facets that are neither too far nor seen from the side
     found = planes.meetings(*pairs)
     slack = secondary.radius[found.s] + primary.radius[found.p]
     within = (found.distance >= -depth - slack) & (found.distance <= height + slack)
     found = found[within & (np.abs(found.cosine) > -SEARCH.facing)]
-    facing, length = found.cosine < SEARCH.facing, secondary.radius
-    averted = bool(np.any(~facing))
-    found = found[truly_overlapping(found.s, found.distance, facing, length, planes.look(found))]
-    size = found.parts.size, planes.size
-    found = found[nearest(found.s, found.distance, length, *size, planes.look(found))]
+    # 2. those that face each other, not through a thin body
+    facing = found.cosine < SEARCH.facing
+    averted = not np.all(facing)
+    found = found[facing & ~planes.behind(found, facing)]
+    # 3. of several layers the first
+    found = found[planes.first_layer(found)]
+    # 4. quadrature on the planes, and the points of both facets over it
     pair, y, weight = found.parts.quadrature(_degree(kind, secondary, primary))
     at = planes.facing(found, pair, y)
     covered = np.bincount(found.s, found.parts.size, minlength=len(secondary))
@@ -399,16 +312,15 @@ class _Planes:
     def __init__(self, kind: FacetKind, secondary: Facets, primary: Facets) -> None:
         self._kind, self._secondary, self._primary = kind, secondary, primary
         self._order = POLYGON[kind.facet]
-        corners = secondary.corners(kind.num_vertices)
         self.normal = centre_normals(secondary)
-        self._centre, self._tangents = corners.mean(axis=1), tangents(self.normal)
+        self._centre, self._tangents = secondary.corners.mean(axis=1), tangents(self.normal)
         self._nodes = self._on_planes(secondary.x, np.arange(len(secondary)))
-        self.corners = self._nodes[:, : kind.num_vertices]
+        self.corners = self._nodes[:, : kind.hats.size]
         self.size = sizes(self.corners[:, self._order])
 
     def meetings(self, s: Array, p: Array) -> _Meetings:
         """Those of the pairs that have a common part."""
-        corners = self._on_planes(self._primary.corners(self._kind.num_vertices)[p], s)
+        corners = self._on_planes(self._primary.corners[p], s)
         low, high = self.corners.min(axis=1)[s], self.corners.max(axis=1)[s]
         boxes_meet = np.all((corners.min(axis=1) <= high) & (corners.max(axis=1) >= low), axis=1)
         s, p, corners = s[boxes_meet], p[boxes_meet], corners[boxes_meet]
@@ -424,18 +336,48 @@ class _Planes:
             distance=self._distance(s, p, corners, parts.middle),
         )
 
-    def look(self, found: _Meetings) -> Look:
-        """Return a function: is the primary facet of pair b over pair a's middle, and how far."""
+    def behind(self, found: _Meetings, facing: Array) -> Array:
+        """Return which overlaps are none: a way out of the primary body lies before them.
+
+        An overlap means that the primary body reaches from its facet, behind the secondary one, up
+        to that. If it ends before, at a facet that looks the same way as the secondary one, the
+        pair is one of two faces that look away from each other through thin bodies.
+        """
+        same = SEARCH.same_layer * self._secondary.radius[found.s]
+        deep = found.distance < -same
+        a, there = self._over(found, np.flatnonzero(facing & deep), np.flatnonzero(~facing & deep))
+        behind = np.zeros(len(found.s), dtype=bool)
+        behind[a[(found.distance[a] < there) & (there < -same[a])]] = True
+        return behind
+
+    def first_layer(self, found: _Meetings) -> Array:
+        """Return the pairs with no other primary facet before theirs."""
+        covered = np.bincount(found.s, found.parts.size, minlength=len(self.size))
+        twice = covered > (1.0 + SEARCH.covered_twice) * self.size
+        several = np.flatnonzero(twice[found.s])
+        a, there = self._over(found, several, several)
+        first = np.ones(len(found.s), dtype=bool)
+        same = SEARCH.same_layer * self._secondary.radius[found.s[a]]
+        first[a[there < found.distance[a] - same]] = False
+        return first
+
+    def _over(self, found: _Meetings, first: Array, second: Array) -> tuple[Array, Array]:
+        """Return pairs a whose middle another pair's primary facet lies over, and its distance.
+
+        Args:
+            found: All pairs.
+            first: Pairs to choose a from.
+            second: The other pairs; they count where the secondary facet is the same.
+        """
+        ordered = second[np.argsort(found.s[second], kind="stable")]
+        start = np.searchsorted(found.s[ordered], found.s[first], side="left")
+        count = np.searchsorted(found.s[ordered], found.s[first], side="right") - start
+        offset = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        a, b = np.repeat(first, count), ordered[np.repeat(start, count) + offset]
         middle = found.parts.middle
-
-        def at(a: Array, b: Array) -> tuple[Array, Array]:
-            over = contains(found.corners[b][:, self._order], middle[a])
-            there = np.full(len(a), np.inf)
-            a, b = a[over], b[over]
-            there[over] = self._distance(found.s[a], found.p[b], found.corners[b], middle[a])
-            return over, there
-
-        return at
+        over = (a != b) & contains(found.corners[b][:, self._order], middle[a])
+        a, b = a[over], b[over]
+        return a, self._distance(found.s[a], found.p[b], found.corners[b], middle[a])
 
     def facing(self, found: _Meetings, pair: Array, y: Array) -> FacingPoints:
         """Return the points of both facets of pairs, curved or not, over points y of the planes."""
@@ -476,7 +418,7 @@ def _degree(kind: FacetKind, secondary: Facets, primary: Facets) -> int:
     if kind.facet != "quadrilateral":
         return exact
     for facets in (secondary, primary):
-        a, b, c, d = facets.corners(4).transpose(1, 0, 2)
+        a, b, c, d = facets.corners.transpose(1, 0, 2)
         if np.any(np.linalg.norm(a - b - c + d, axis=1) > SEARCH.parallel * facets.radius):
             return SEARCH.rational_degree
     return 2 * exact

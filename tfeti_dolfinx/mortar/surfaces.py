@@ -9,7 +9,6 @@ import numpy as np
 import ufl
 from dolfinx import fem
 from dolfinx import mesh as dmesh
-from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import JIT_OPTIONS
@@ -64,17 +63,6 @@ def hat_integrals(
     return dofs.reduce(per_node, np.add, 0.0)
 
 
-def on_surface(dofs: TornDofs, decomposition: Decomposition, facets: Array) -> Array:
-    """Owned groups that have a copy on the given local facets, ascending. Collective.
-
-    A copy that touches the surface only at a vertex or an edge has no facet there, so
-    membership is found on the copies that do and spread to the group.
-    """
-    member = np.zeros(dofs.num_nodes, dtype=bool)
-    member[surface_nodes(dofs, decomposition, facets)] = True
-    return np.flatnonzero(dofs.reduce(member, np.logical_or, False))
-
-
 def surface_nodes(dofs: TornDofs, decomposition: Decomposition, facets: Array) -> Array:
     """Primal nodes of local facets."""
     fdim = decomposition.mesh.topology.dim - 1
@@ -88,12 +76,7 @@ def group_points(dofs: TornDofs) -> Array:
 
 
 def extent(decomposition: Decomposition, facets: Array) -> float:
-    """Return the length of the diagonal of a surface's box. Collective.
-
-    Args:
-        decomposition: The torn mesh.
-        facets: Local facets of the surface.
-    """
+    """Return the length of the diagonal of the box of local facets of a surface. Collective."""
     mesh = decomposition.mesh
     fdim = mesh.topology.dim - 1
     mesh.topology.create_connectivity(fdim, mesh.topology.dim)
@@ -101,14 +84,11 @@ def extent(decomposition: Decomposition, facets: Array) -> float:
     if len(facets):  # DOLFINx divides by their number
         nodes = dmesh.entities_to_geometry(mesh, fdim, facets.astype(np.int32))
         x = mesh.geometry.x[np.unique(nodes)]
-    return _diagonal(x, decomposition.comm)
+    low, high = box_over_ranks(decomposition.comm, x)
+    return float(np.linalg.norm(high - low))
 
 
 def diameter(decomposition: Decomposition) -> float:
     """Return the length of the diagonal of the mesh's box. Collective."""
-    return _diagonal(decomposition.mesh.geometry.x, decomposition.comm)
-
-
-def _diagonal(x: Array, comm: MPI.Intracomm) -> float:
-    low, high = box_over_ranks(comm, x)
+    low, high = box_over_ranks(decomposition.comm, decomposition.mesh.geometry.x)
     return float(np.linalg.norm(high - low))

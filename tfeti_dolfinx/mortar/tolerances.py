@@ -28,7 +28,6 @@ class SearchTolerances:
             hardly a plane surface lies, so that rounding of a normal does not turn its tangents.
         same_layer: Distances closer than this are those of facets of one layer.
         covered_twice: Common parts that exceed a facet by less are one layer.
-        neighbours: Points asked of a tree at first: facets of one size have about 20 within reach.
         facing: Cosine, of about 92°: facets seen from the side have only slivers in common.
         parallel: Quadrilaterals that are farther from parallelograms have rational hats.
         rational_degree: Degree of quadrature for those; none is exact.
@@ -71,7 +70,6 @@ class SearchTolerances:
     axis_switch: float = 0.9
     same_layer: float = 1e-9
     covered_twice: float = 1e-6
-    neighbours: int = 64
     facing: float = -0.03
     parallel: float = 1e-10
     rational_degree: int = 12
