@@ -17,7 +17,7 @@ from tfeti_dolfinx.contact.forces import Resultant, condition_areas, resultant
 from tfeti_dolfinx.contact.partner import ContactPartner, position_of
 from tfeti_dolfinx.contact.records import remaining_gaps, slips
 from tfeti_dolfinx.mesh.decomposition import Decomposition
-from tfeti_dolfinx.mortar.surfaces import group_points, on_surface, surface_facets
+from tfeti_dolfinx.mortar.surfaces import group_points, surface_facets, surface_nodes
 from tfeti_dolfinx.qp.sets import Face
 
 # --- Status of contacts and rows --------------------------------------------------------------
@@ -160,7 +160,9 @@ class ContactState:
             InputError: The surface is unknown, has no facets, or lies inside a body.
         """
         facets = surface_facets(self.decomposition, surface)
-        groups = on_surface(self.dofs, self.decomposition, facets)
+        member = np.zeros(self.dofs.num_nodes, dtype=bool)
+        member[surface_nodes(self.dofs, self.decomposition, facets)] = True
+        groups = np.flatnonzero(self.dofs.reduce(member, np.logical_or, False))
         force = self.support_forces[groups]
         return resultant(self.dofs.comm, group_points(self.dofs)[groups], force)
 
