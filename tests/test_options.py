@@ -50,7 +50,7 @@ def test_the_command_line_beats_the_dictionary():
         ({"tfeti_smalse_beta": 1.0}, r"-tfeti_smalse_beta 1.0: expected between 0 and 1"),
         ({"tfeti_smalse_rho": 0}, r"-tfeti_smalse_rho 0.0: expected more than 0"),
         (
-            {"tfeti_without": "cautious,care"},
+            {"tfeti_without": "d_scaling,care"},
             r"-tfeti_without care: expected some of d_scaling, smooth_displacements, ",
         ),
         ({"tfeti_mpgp_alpha": 3}, r"-tfeti_mpgp_alpha 3.0: expected more than 0, at most 2"),
@@ -62,10 +62,9 @@ def test_options_that_do_not_fit(given, message):
 
 
 def test_named_mechanisms_are_switched_off():
-    options = parse_options({"tfeti_without": "cautious,d_scaling, recycled_directions"}, "tfeti_")
-    assert options.without == ("cautious", "d_scaling", "recycled_directions")
+    options = parse_options({"tfeti_without": "d_scaling, recycled_directions"}, "tfeti_")
+    assert options.without == ("d_scaling", "recycled_directions")
     assert (options.scaling, options.recycle) == ("multiplicity", 0)
-    assert not options.newton.cautious
 
 
 def test_view_lists_every_option():

@@ -7,7 +7,7 @@ import math
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -45,7 +45,6 @@ MECHANISMS = {
     "soft_springs": "motions that springs hold softly as a coarse space of the preconditioner",
     "kept_directions": "directions of PCPG conjugate to all before, not to the last one alone",
     "recycled_directions": "directions of earlier solves",
-    "cautious": "rows leave a face one by one after a step of block Newton that has raised q",
     "newton_on_coulomb": "Newton's method on Coulomb's law, before bounds as a fixed point",
 }
 # those that an option of their own switches off
@@ -240,8 +239,6 @@ def parse_options(
     for name in values.get("without", ()):
         values |= SWITCHES.get(name, {})
     options: Options = made(Options, values)
-    if "cautious" in options.without:
-        options = replace(options, newton=replace(options.newton, cautious=False))
     return options
 
 

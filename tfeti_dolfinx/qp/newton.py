@@ -85,7 +85,6 @@ class NewtonState:
         least: The last ‖g^P‖ that was half of the one before.
         idle: So many looks in a row have found neither q nor ‖g^P‖ lower.
         resume: Whether λ is where PCPG has stopped.
-        cautious: Whether dropping rows at the end of a way has raised q.
     """
 
     z: Multipliers
@@ -98,7 +97,6 @@ class NewtonState:
     least: float = np.inf
     idle: int = 0
     resume: bool = False
-    cautious: bool = False
 
 
 class _Newton:
@@ -236,7 +234,6 @@ class _Newton:
         (hidden,) = self.program.dot((np.abs(state.z.lam), np.abs(state.s)))
         gain = self.gain(trial.last)
         taken = trial.feasible and gain >= enough - ROUNDING * hidden
-        state.cautious = self.parameters.cautious and not taken and trial.rounds > 1
         state.resume = taken
         if taken:
             self._go(trial.last, gain)
@@ -355,7 +352,7 @@ def newton(
             # Step 2: the face
             first, face = method.wanted_face()
         # Step 3: solve on the face, drop what leaves Ω, restore Gλ = e
-        trial = solver.solve(first, face, state.residual, state.resume, state.cautious)
+        trial = solver.solve(first, face, state.residual, state.resume)
         # Step 4: accept where q falls enough
         if solver.excluding is not None:
             reason = ConvergedReason.DIVERGED_CONTRADICTION

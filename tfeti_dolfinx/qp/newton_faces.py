@@ -206,7 +206,7 @@ class FaceSolver:
         return self._on_face.coarse.coordinates(self._program.vec(g))
 
     def solve(
-        self, start: Multipliers, face: Face, optimality: float, resume: bool, cautious: bool
+        self, start: Multipliers, face: Face, optimality: float, resume: bool
     ) -> FaceSolve:
         """Solve on a face; drop what leaves Ω, restore Gλ = e, solve again. Collective.
 
@@ -215,8 +215,6 @@ class FaceSolver:
             face: The face.
             optimality: ‖g^P‖ there.
             resume: Whether PCPG has stopped at ``start``: it goes on if the face stays.
-            cautious: Whether rows leave a flat face as they block the way, not all that are out at
-                its end: q falls for certain then, but fewer leave for as many solves.
         """
         feasible, z, rounds = self._qp.feasible, start, 0
         stays = self._enter(face) and resume
@@ -230,10 +228,6 @@ class FaceSolver:
             if not out or rounds == self._parameters.most_rounds or self._ended:
                 break
             # rows that have left Ω leave the face, and Gλ = e is restored in the smaller one
-            if not self._curved and cautious:
-                z = self._up_to_bound(z, end, 1.0)
-                self._enter(feasible.face(z.lam, z.g))
-                continue
             if not broken and not self._curved and self._is_loose(z, end):
                 end = self._up_to_bound(z, end, BEYOND)
             smaller = self._restored(feasible.project(end.lam), end.g)

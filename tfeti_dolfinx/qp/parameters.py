@@ -17,7 +17,6 @@ class NewtonParameters:
         final: Of the rule's tolerance: what no solve goes below, as ‖g^P‖ is not quite ‖P_f g‖.
         stage: What a solve on a face that stays reduces its residual to, before step 1 looks at it.
         loose: Of ‖F‖: curvature of a way; less is nearly none, and the way far.
-        cautious: Whether rows leave a flat face one by one after a step that has raised q.
         most_rounds: Solves on smaller and smaller faces of one step; each drops one row at least.
         patience: Steps in a row that neither halve ‖g^P‖ nor lower q beyond its rounding.
         unseen: Of the gradient: multipliers of Gλ = e that make it longer than that are rounding of
@@ -45,7 +44,6 @@ class NewtonParameters:
     final: float = 0.9
     stage: float = 0.1
     loose: float = 1e-8
-    cautious: bool = True
     most_rounds: int = 60
     patience: int = 10
     lost: float = 2e-15
