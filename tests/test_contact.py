@@ -50,20 +50,12 @@ def test_agrees_with_an_active_set_on_the_untorn_mesh(cell):
 @pytest.mark.parametrize(
     "options",
     [
-        SMALSE | {"tfeti_mpgp_expansion": "projcg"},
         SMALSE | {"tfeti_homogenization": "feasible"},
         {"tfeti_scaling": "multiplicity"},
         SMALSE | {"tfeti_smalse_rho": 5, "tfeti_smalse_M": 10, "tfeti_smalse_beta": 0.2},
         SMALSE | {"tfeti_mpgp_gamma": 10.0, "tfeti_mpgp_alpha": 1.0},
         {"tfeti_qp_type": "newton", "tfeti_newton_reduction": 0.1, "tfeti_newton_gamma": 0.3},
         {"tfeti_qp_type": "newton", "tfeti_pc_type": "lumped"},
-        {"tfeti_qp_type": "smalse", "tfeti_pc_type": "lumped"},
-        {"tfeti_qp_type": "smalse", "tfeti_pc_type": "dirichlet"},
-        {
-            "tfeti_qp_type": "smalse",
-            "tfeti_pc_type": "dirichlet",
-            "tfeti_mpgp_expansion": "projcg",
-        },
     ],
 )
 def test_variants_find_the_same(options):

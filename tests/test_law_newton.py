@@ -224,7 +224,6 @@ def test_it_finds_what_the_fixed_point_finds(cell, traction, law):
     "options",
     [
         {"qp_type": "smalse"},
-        {"qp_type": "smalse", "pc_type": "dirichlet"},
         {"pc_type": "lumped"},
         {"pc_type": "none"},
     ],

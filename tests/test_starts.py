@@ -16,11 +16,8 @@ from tfeti_dolfinx.qp.homogenised import (
     scale_at,
     scale_near,
 )
-from tfeti_dolfinx.qp.mprgp import EXPANSIONS
 from tfeti_dolfinx.qp.newton import first_point, newton
-from tfeti_dolfinx.qp.parameters import SmalseParameters
 from tfeti_dolfinx.qp.problem import QP
-from tfeti_dolfinx.qp.smalse import smalse
 from tfeti_dolfinx.solve.solver import solve_dual
 
 
@@ -145,20 +142,3 @@ def test_a_monitor_of_one_s_own(qp_type, contacts):
     assert inner[-1] < 0.1 * max(inner)
     result.destroy()
     p.destroy()
-
-
-def test_an_expansion_of_one_s_own():
-    F, d, G, e, bounded = random_program(9)
-    qp = QP(matrix(F), vector(d), DenseCoarse(G, e), bounds_on(bounded), norm=np.linalg.norm(F, 2))
-    lengths = []
-
-    def mine(state, alpha_f, alpha_cg, alpha_bar):
-        lengths.append((alpha_f, alpha_cg))
-        EXPANSIONS["fixed"](state, alpha_f, alpha_cg, alpha_bar)
-
-    homogenised = homogenise(qp)
-    own = smalse(qp, homogenised, to(1e-9, homogenised), SmalseParameters(expansion=mine))
-    known = smalse(qp, homogenised, to(1e-9, homogenised))
-    assert len(lengths) == own.steps.expansion == known.steps.expansion > 0
-    assert all(alpha_f < alpha_cg for alpha_f, alpha_cg in lengths)
-    assert np.array_equal(own.lam.array_r, known.lam.array_r)

@@ -205,9 +205,7 @@ class FaceSolver:
         """Return the μ of the face entered: (G_fG_fᵀ)⁺G_fZᵀg, replicated. Collective."""
         return self._on_face.coarse.coordinates(self._program.vec(g))
 
-    def solve(
-        self, start: Multipliers, face: Face, optimality: float, resume: bool
-    ) -> FaceSolve:
+    def solve(self, start: Multipliers, face: Face, optimality: float, resume: bool) -> FaceSolve:
         """Solve on a face; drop what leaves Ω, restore Gλ = e, solve again. Collective.
 
         Args:

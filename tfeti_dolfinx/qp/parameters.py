@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from tfeti_dolfinx.common.validation import ABOVE_0, Range, described
-from tfeti_dolfinx.qp.mprgp import EXPANSIONS, Expansion, MprgpParameters
+from tfeti_dolfinx.qp.mprgp import MprgpParameters
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,13 @@ class NewtonParameters:
 class SmalseParameters:
     """Parameters of SMALSE-M and of its inner MPRGP, for F scaled to ‖PFP‖ = 1.
 
-    Each says itself what it is; ``expansion`` may be a function of one's own, too.
+    Attributes:
+        enough: Of the rule's tolerance: inner problems are not solved more exactly, as M may be
+            too small.
+        rounding: Of the Lagrangian: what its value may be wrong by.
+        change: Where nothing fulfils Bx = 0, ‖Bx‖ tends to a limit: a change by less than this
+            share is none; the slowest scenes change by 1e-3 a step.
+        patience: Outer steps without a change of ‖Bx‖ and M that are a stall.
     """
 
     rho: float = described(
@@ -91,15 +97,11 @@ class SmalseParameters:
         symbol="ᾱ",
         fits=Range("more than 0, at most 2", lambda value: 0.0 < value <= 2.0),
     )
-    expansion: str | Expansion = described(
-        "fixed",
-        "mprgp",
-        "expansion step: fixed, or projcg",
-        name="mpgp_expansion",
-        choices=tuple(EXPANSIONS),
-    )
+    enough: float = 1e-3
+    rounding: float = 1e-14
+    change: float = 1e-3
+    patience: int = 1000
 
     def inner(self, norm: float) -> MprgpParameters:
-        """Parameters of MPRGP for an operator A of this norm."""
-        expand = EXPANSIONS[self.expansion] if isinstance(self.expansion, str) else self.expansion
-        return MprgpParameters(self.alpha_bar / norm, self.gamma, expand)
+        """Parameters of MPRGP for an operator F of this norm."""
+        return MprgpParameters(self.alpha_bar / (max(norm, self.rho * norm) or 1.0), self.gamma)

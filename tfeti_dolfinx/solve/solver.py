@@ -90,7 +90,7 @@ def resolve_types(options: Options, rows: Sequence[int], prefix: str) -> tuple[s
 
     Raises:
         InputError: The scene has inequalities or friction, but a solver that does not keep them
-            is asked for.
+            is asked for; or a preconditioner with a solver that takes none.
     """
     qp_type, (num_inequalities, num_tangents) = options.qp_type, rows
     if qp_type == "auto":
@@ -105,8 +105,13 @@ def resolve_types(options: Options, rows: Sequence[int], prefix: str) -> tuple[s
                 f"-{prefix}qp_type {qp_type}: the scene has {rows_of} which {qp_type.upper()} "
                 f"cannot keep; expected {' or '.join(['auto', *able])}"
             )
-    pc_type = options.pc_type
-    return qp_type, SOLVERS[qp_type].pc_type if pc_type == "auto" else pc_type
+    own = SOLVERS[qp_type].pc_type
+    if own == "none" and options.pc_type not in ("auto", "none"):
+        raise InputError(
+            f"-{prefix}pc_type {options.pc_type}: {qp_type.upper()} takes no preconditioner; "
+            "expected auto or none"
+        )
+    return qp_type, own if options.pc_type == "auto" else options.pc_type
 
 
 def solve_dual(
