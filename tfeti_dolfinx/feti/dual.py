@@ -32,7 +32,7 @@ from tfeti_dolfinx.qp.homogenised import LastProduct, OperatorProduct, natural, 
 from tfeti_dolfinx.qp.krylov import estimate_norm
 from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
 from tfeti_dolfinx.qp.projection import project_onto_feasible
-from tfeti_dolfinx.qp.recycling import Recycled, RecycledOnFace
+from tfeti_dolfinx.qp.recycling import Recycled
 from tfeti_dolfinx.qp.sets import (
     Bounds,
     Discs,
@@ -280,9 +280,18 @@ class Dual:
         self.feasible = self._law(self.constraints)  # c may be another, and what the law refers to
         norm = self._norm_of(coarse, norm_steps) if norm_steps else 1.0
         on = self._preconditioner_on if self.preconditioner is not None else None
-        W = None if self.recycled is None else RecycledOnFace(self.recycled)
-        M, keeps = self._on_all_rows, self.keeps_directions
-        return QP(self.F, self.d, coarse, self.feasible, M, norm, on, self.seen, W, keeps)
+        return QP(
+            self.F,
+            self.d,
+            coarse,
+            self.feasible,
+            preconditioner=self._on_all_rows,
+            norm=norm,
+            preconditioner_on=on,
+            seen=self.seen,
+            recycled=self.recycled,
+            keeps=self.keeps_directions,
+        )
 
     def saw(self, norm: float) -> None:
         """Store the estimate of ‖F‖ of a solve, for the next one to begin with.

@@ -16,11 +16,7 @@ class NewtonParameters:
         enough: Share of (ᾱ/2)‖g^P‖², which the gradient step promises, that a step lowers q by.
         final: Of the rule's tolerance: what no solve goes below, as ‖g^P‖ is not quite ‖P_f g‖.
         stage: What a solve on a face that stays reduces its residual to, before step 1 looks at it.
-        loose: Of ‖F‖: curvature of a way; less is nearly none, and the way far.
-        most_rounds: Solves on smaller and smaller faces of one step; each drops one row at least.
         patience: Steps in a row that neither halve ‖g^P‖ nor lower q beyond its rounding.
-        unseen: Of the gradient: multipliers of Gλ = e that make it longer than that are rounding of
-            motions that a face does not see.
         lost: Of ‖F‖‖λ‖: what rounding of λ − ᾱs leaves of ‖g^P‖.
         rounding: Of the largest entry of a way: less is none.
     """
@@ -43,11 +39,8 @@ class NewtonParameters:
     enough: float = 0.1
     final: float = 0.9
     stage: float = 0.1
-    loose: float = 1e-8
-    most_rounds: int = 60
     patience: int = 10
     lost: float = 2e-15
-    unseen: float = 1e6
     rounding: float = 1e-10
 
 

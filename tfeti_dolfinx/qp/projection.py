@@ -12,7 +12,7 @@ from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root
-from tfeti_dolfinx.qp.coarse import HELD, Coarse, imbalance
+from tfeti_dolfinx.qp.coarse import Coarse, imbalance
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
 
 # points looked at: far more than Newton takes where it converges, so that a cycle ends
@@ -128,59 +128,28 @@ def project_onto_feasible(
     return FeasiblePoint(trial.lam, trial.alpha, imbalance(coarse, trial.lam))
 
 
-def project_or_least(coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec) -> FeasiblePoint:
-    """Return the nearest point to y of {λ ∈ Ω, Gλ = e}; the least such λ where that is not found.
+class OnBoundary:
+    """Points of Ω whose open rows are those of a face, its slipping ones on their boundary.
 
-    From forces far beyond small discs, as the bounds of another load step are, the way to Gλ = e
-    has so many kinks that ``nearest`` may end before. From 0 it has few. Collective.
-    """
-    found = project_onto_feasible(coarse, feasible, y)
-    if bcast_from_root(y.getComm().tompi4py(), found.missing <= UNBALANCED):
-        return found
-    zero = y.duplicate()
-    zero.set(0.0)
-    least = project_onto_feasible(coarse, feasible, zero)
-    zero.destroy()
-    better = bcast_from_root(y.getComm().tompi4py(), least.missing < found.missing)
-    (found if better else least).lam.destroy()
-    return least if better else found
-
-
-def project_within_face(
-    coarse: Coarse, feasible: FeasibleSet, face: Face, y: PETSc.Vec
-) -> PETSc.Vec:
-    """The nearest point to y of a face and Gλ = e; of all Ω where the face has none. Collective."""
-    found = project_onto_feasible(coarse, WithinFace(feasible, face), y)
-    if found.missing > HELD:
-        found.lam.destroy()
-        found = project_or_least(coarse, feasible, y)
-    return found.lam
-
-
-class WithinFace:
-    """Those points of Ω whose open rows are those of a face, at least.
+    They make no convex set, but what ``project_onto_feasible`` minimises is convex with any set.
 
     Args:
         feasible: The set Ω.
         face: The face.
-        slipping: Whether its slipping rows stay on their boundary, too. They do not make a convex
-            set then, but what ``nearest`` minimises is convex with any set.
     """
 
-    def __init__(self, feasible: FeasibleSet, face: Face, slipping: bool = False) -> None:
-        self._feasible, self._open = feasible, ~face.carrying
-        kept = face.status if slipping else np.where(self._open, Status.OPEN, Status.FREE)
-        self._status = kept
+    def __init__(self, feasible: FeasibleSet, face: Face) -> None:
+        self._feasible, self._kept = feasible, face
 
     def project(self, x: Array) -> Array:
         """P_Ω(x), but for the rows that stay."""
-        return self._feasible.onto(x, self._status)
+        return self._feasible.onto(x, self._kept.status)
 
     def face(self, x: Array, g: Array) -> Face:
         """Return the face of x, without the rows that stay open."""
-        face = self._feasible.face(x, g)
-        kept = np.flatnonzero(abs(face.Z).T @ self._open.astype(float) == 0.0)
-        status = np.where(self._open, Status.OPEN, face.status)
+        face, is_open = self._feasible.face(x, g), ~self._kept.carrying
+        kept = np.flatnonzero(abs(face.Z).T @ is_open.astype(float) == 0.0)
+        status = np.where(is_open, Status.OPEN, face.status)
         return Face(csr_array(face.Z[:, kept]), face.curvature[kept], status)
 
 

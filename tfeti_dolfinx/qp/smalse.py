@@ -184,9 +184,7 @@ def smalse(
         indefinite = broken == ConvergedReason.DIVERGED_INDEFINITE_MAT  # or rounding
         if indefinite and homogenised.is_rounding(test.examine(state)):
             broken = ConvergedReason.DIVERGED_ROUNDING
-        reason = test.reason
-        if reason == ConvergedReason.ITERATING and broken is not None:
-            reason = broken
+        reason = test.reason or broken or ConvergedReason.ITERATING
         if reason != ConvergedReason.ITERATING:
             break
         if rule.drifted:
