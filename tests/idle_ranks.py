@@ -114,7 +114,6 @@ def test_no_contact(comm, shared_tmp, pc_type, subdomains):
     ("cell", "options"),
     [
         ("quadrilateral", {}),
-        ("quadrilateral", {"homogenization": "feasible"}),
         ("quadrilateral", {"qp_type": "smalse"}),
         ("tetrahedron", {"kplus_type": "schur"}),
     ],

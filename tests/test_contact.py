@@ -50,7 +50,6 @@ def test_agrees_with_an_active_set_on_the_untorn_mesh(cell):
 @pytest.mark.parametrize(
     "options",
     [
-        SMALSE | {"tfeti_homogenization": "feasible"},
         {"tfeti_scaling": "multiplicity"},
         SMALSE | {"tfeti_smalse_rho": 5, "tfeti_smalse_M": 10, "tfeti_smalse_beta": 0.2},
         SMALSE | {"tfeti_mpgp_gamma": 10.0, "tfeti_mpgp_alpha": 1.0},

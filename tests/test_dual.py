@@ -5,7 +5,6 @@ import pytest
 from scenes import curved_obstacle, decomposed, problem
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.feti.dual import feasible_particular
 from tfeti_dolfinx.feti.operator import check_operator
 
 
@@ -22,18 +21,6 @@ def solved():
 @pytest.fixture(scope="module")
 def dual(solved):
     return solved.dual
-
-
-@pytest.fixture(scope="module")
-def held_by_contact():
-    """A block in a corner of three planes: every rigid motion is held, by contact alone."""
-    d = decomposed("hexahedron", 3, subdomains=4)
-    planes = {"bottom": (0, 0, 1), "left": (1, 0, 0), "front": (0, 1, 0)}
-    contacts = [tfeti.Obstacle(name, tfeti.Plane((0, 0, 0), n)) for name, n in planes.items()]
-    p = problem(d, (-0.01, -0.02, -0.05), contacts, clamped=())
-    p.solve()
-    yield p.dual
-    p.destroy()
 
 
 def random_vec(dual, seed=0):
@@ -91,35 +78,6 @@ def test_gram_is_G_Gt(dual):
     coarse = dual.coarse
     y = np.random.default_rng(0).standard_normal(coarse.dimension)
     assert np.allclose(coarse.grams.whole @ y, coarse.G(coarse.Gt @ y), atol=1e-11)
-
-
-def test_feasible_homogenisation(held_by_contact):
-    dual = held_by_contact
-    coarse, bounded = dual.coarse, dual.constraints.sets.normals
-    lam = feasible_particular(coarse, dual.d).array_r
-    assert np.allclose(coarse.G(lam), coarse.e, atol=1e-11)
-    assert np.all(lam[bounded] >= 0.0)
-    natural = dual.d.duplicate()
-    coarse.particular(natural)
-    lowest = coarse.comm.allreduce(float(np.min(natural.array_r[bounded], initial=0.0)))
-    size = np.sqrt(coarse.comm.allreduce(float(lam @ lam)))
-    assert size >= natural.norm() * (1 - 1e-12)
-    if lowest >= 0.0:
-        assert size == pytest.approx(natural.norm())
-
-
-def test_the_feasible_homogenisation_is_the_smallest(held_by_contact):
-    """Its optimality conditions: λ̄ = Gᵀα on carrying rows, (Gᵀα) ≤ 0 on the others."""
-    dual = held_by_contact
-    coarse, bounded = dual.coarse, dual.constraints.sets.normals
-    lam = feasible_particular(coarse, dual.d).array_r
-    carrying = np.ones(len(lam), dtype=bool)
-    carrying[bounded] = lam[bounded] > 0.0
-    gram = coarse.grams.of_rows(carrying).toarray()
-    alpha = np.linalg.lstsq(gram, coarse.e, rcond=1e-12)[0]
-    force = coarse.Gt @ alpha
-    assert np.allclose(force[carrying], lam[carrying], atol=1e-10)
-    assert np.all(force[~carrying] <= 1e-10)
 
 
 def test_recovered_displacement_meets_the_rows(solved):

@@ -41,9 +41,9 @@ def cost(p, qp_type, start, **options):
 
 def forget(p):
     """As if the dual problem were new."""
-    for _, found in p.dual._images.values():
-        found.destroy()
-    p.dual._images.clear()
+    if p.dual._image is not None:
+        p.dual._image[1].destroy()
+    p.dual._image = None
     p.dual.last = LastProduct()
 
 

@@ -25,7 +25,6 @@ from tfeti_dolfinx.common.validation import (
     shown,
 )
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.feti.dual import PARTICULAR
 from tfeti_dolfinx.feti.operator import PRECONDITIONERS
 from tfeti_dolfinx.qp.parameters import NewtonParameters, SmalseParameters
 from tfeti_dolfinx.qp.solvers import SOLVERS
@@ -125,12 +124,6 @@ class Options:
         fits=FROM_0,
         words=("auto",),
         kind=int,
-    )
-    homogenization: str = described(
-        "natural",
-        "smalse",
-        "λ̄ with Gλ̄ = e: natural is Gᵀ(GGᵀ)⁻¹e, feasible the smallest one with λ̄_N ≥ 0",
-        choices=tuple(PARTICULAR),
     )
     norm_steps: int = described(15, "smalse", "Lanczos steps that estimate ‖PFP‖", fits=FROM_1)
     friction_type: str = described(

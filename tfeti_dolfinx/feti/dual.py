@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Collection, Sequence
 
 import numpy as np
@@ -31,7 +30,6 @@ from tfeti_dolfinx.qp.coarse import Coarse, NoCoarse
 from tfeti_dolfinx.qp.homogenised import LastProduct, OperatorProduct, natural, operator_product
 from tfeti_dolfinx.qp.krylov import estimate_norm
 from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
-from tfeti_dolfinx.qp.projection import project_onto_feasible
 from tfeti_dolfinx.qp.recycling import Recycled
 from tfeti_dolfinx.qp.sets import (
     Bounds,
@@ -45,45 +43,6 @@ from tfeti_dolfinx.qp.sets import (
 )
 from tfeti_dolfinx.subdomains.local_operators import LocalOperator
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
-
-# --- Particular multipliers that balance the load ---------------------------------------------
-
-# Of ‖e‖: what is let pass: below any rtol, and the solver makes Gλ = e good afterwards.
-LET_PASS = 1e-9
-
-log = logging.getLogger(__name__)
-
-
-def feasible_particular(coarse: CoarseSpace, like: PETSc.Vec) -> PETSc.Vec:
-    """λ̄ of min ½‖λ‖² subject to Gλ = e, λ_N ≥ 0. Collective.
-
-    The nearest feasible point to 0 (Dostál's talk, item (ii)). Where that is not found,
-    λ̄ = Gᵀ(GGᵀ)⁻¹e is taken, and a warning says so.
-
-    Args:
-        coarse: The coarse space; the problem has been found solvable.
-        like: A vector of the right layout.
-    """
-    zero = like.duplicate()
-    zero.set(0.0)
-    feasible = Product([(coarse.bounded, Bounds())])
-    found = project_onto_feasible(coarse, feasible, zero, coarse.solve(coarse.e))
-    zero.destroy()
-    if found.missing <= LET_PASS:
-        return found.lam
-    found.lam.destroy()
-    if coarse.comm.rank == 0:
-        log.warning(
-            "homogenization feasible: the smallest feasible multipliers were not found (Gλ − e "
-            "is %.1e of e); natural is taken instead",
-            found.missing,
-        )
-    return natural(coarse, like)
-
-
-# solutions of Gλ̄ = e
-PARTICULAR = {"natural": natural, "feasible": feasible_particular}
-
 
 # --- The dual problem -------------------------------------------------------------------------
 
@@ -198,7 +157,7 @@ class Dual:
             self.soft = deflation(B, self.coarse, constraints.weights, self.preconditioner, prefix)
         self.contact_rows = constraints.sets.contact_rows(comm)
         self._law, self.feasible = feasible, feasible(constraints)
-        self._images = dict[str, tuple[Array, OperatorProduct]]()
+        self._image: tuple[Array, OperatorProduct] | None = None
         self._norm: tuple[int, float] | None = None
         self.seen, self.last = 0.0, LastProduct()
         self.recycled: Recycled | None = None
@@ -330,14 +289,14 @@ class Dual:
                 self._norm = (steps, estimate_norm(self.F, coarse, self.d, steps))
         return self._norm[1]
 
-    def image(self, kind: str) -> OperatorProduct:
-        """λ̄ of a kind in ``PARTICULAR`` with F λ̄; multiplies once for each e."""
-        if (found := self.known_image(kind)) is not None:
+    def natural_image(self) -> OperatorProduct:
+        """λ̄₀ = Gᵀ(GGᵀ)⁻¹e with F λ̄₀; multiplies once for each e. Collective."""
+        if (found := self.known_image()) is not None:
             return found
-        if kind in self._images:
-            self._images.pop(kind)[1].destroy()
-        made = operator_product(self.F, PARTICULAR[kind](self.coarse, self.d))
-        self._images[kind] = (self.coarse.e.copy(), made)
+        if self._image is not None:
+            self._image[1].destroy()
+        made = operator_product(self.F, natural(self.coarse, self.d))
+        self._image = (self.coarse.e.copy(), made)
         return made
 
     @property
@@ -375,11 +334,11 @@ class Dual:
         at.destroy()
         return lengths > FAR * norm_over(comm, self.driving)
 
-    def known_image(self, kind: str) -> OperatorProduct | None:
-        """λ̄ and F λ̄ if they are known for the present e."""
-        if kind not in self._images or not np.array_equal(self._images[kind][0], self.coarse.e):
+    def known_image(self) -> OperatorProduct | None:
+        """λ̄₀ and F λ̄₀ if they are known for the present e."""
+        if self._image is None or not np.array_equal(self._image[0], self.coarse.e):
             return None
-        return self._images[kind][1]
+        return self._image[1]
 
     def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> Recovered:
         """Return the displacement of multipliers; changes nothing.
@@ -405,8 +364,8 @@ class Dual:
 
     def destroy(self) -> None:
         """Destroy the PETSc objects."""
-        images = [found for _, found in self._images.values()]
+        image = self._image[1] if self._image is not None else None
         own = (self._on_all, self._on_faces, self.soft, self.preconditioner, self._scaled)
-        for item in (self.F, *own, self.coarse, self.d, *images):
+        for item in (self.F, *own, self.coarse, self.d, image):
             if item is not None:
                 item.destroy()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -80,11 +82,35 @@ def _size(diagonal: list[float], beside: list[float]) -> float:
 
 # --- Store of conjugate directions ------------------------------------------------------------
 
-# of the largest curvature of a direction, and of what the preconditioner makes of a residual: less
-# is rounding, as where rows depend on each other
-FLAT = 1e-13
-# numbers that a rank keeps at most: 192 MB
-NUMBERS = 24_000_000
+
+@dataclass(frozen=True)
+class PcpgParameters:
+    """Tolerances of PCPG.
+
+    Attributes:
+        flat: Of the largest curvature of a direction, and of what the preconditioner makes of a
+            residual: less is rounding, as where rows depend on each other.
+        numbers: What a rank keeps of directions at most: 192 MB.
+        plateau: So many steps in which neither ‖r‖ comes down to a half nor q by what stands out
+            from its rounding have met rounding: at that pace 10 000 steps would bring 6 digits at
+            best; twice as many as there are rows, and a few, have it too.
+        few: Those.
+        rounding: Of the terms of q.
+        drifted: Of rᵀz, which is rᵀp as long as r is orthogonal to all directions before; else
+            conjugate gradients begin anew.
+        short: Of λ: a way that is shorter may be rounding of Gλ = e.
+    """
+
+    flat: float = 1e-13
+    numbers: int = 24_000_000
+    plateau: int = 500
+    few: int = 20
+    rounding: float = 1e-15
+    drifted: float = 0.5
+    short: float = 1e-6
+
+
+DEFAULT = PcpgParameters()
 
 
 class Directions:
@@ -110,7 +136,7 @@ class Directions:
         self.r, self.p, self.Fp, self.z = (like.duplicate() for _ in range(4))
         self.fresh, self.norm, self.helped = True, 0.0, 0.0
         rows = like.getComm().tompi4py().allreduce(like.getLocalSize(), op=MPI.MAX)
-        most = max(NUMBERS // (2 * max(rows, 1)), 1) if keeps else 1
+        most = max(DEFAULT.numbers // (2 * max(rows, 1)), 1) if keeps else 1
         self.kept = DirectionStore(most, like.getLocalSize())
 
     def seen(self, pFp: float, pp: float, short: bool = False) -> bool:
@@ -120,12 +146,12 @@ class Directions:
         """
         if not short:
             self.norm = max(self.norm, pFp / pp if pp > 0.0 else 0.0)
-        return pFp > FLAT * self.norm * pp
+        return pFp > DEFAULT.flat * self.norm * pp
 
     def stands_out(self, rz: float, rr: float) -> bool:
         """Return whether rᵀz, z the preconditioned residual, is positive beyond rounding."""
         self.helped = max(self.helped, rz / rr if rr > 0.0 else 0.0)
-        return rz > FLAT * self.helped * rr
+        return rz > DEFAULT.flat * self.helped * rr
 
     def destroy(self) -> None:
         """Destroy the vectors. Collective."""
@@ -134,11 +160,6 @@ class Directions:
 
 
 # --- Detection of stagnation ------------------------------------------------------------------
-
-# so many steps in which neither ‖r‖ comes down to a half nor q by what stands out from its rounding
-# have met rounding: at that pace 10 000 steps would bring 6 digits at best; twice as many as there
-# are rows, and a few, have it too
-PLATEAU, FEW, ROUNDING = 500, 20, 1e-15
 
 
 class Progress:
@@ -150,7 +171,7 @@ class Progress:
     """
 
     def __init__(self, norm: float, rows: int) -> None:
-        self._most = min(PLATEAU, 2 * rows + FEW)
+        self._most = min(DEFAULT.plateau, 2 * rows + DEFAULT.few)
         self._best, self._steps, self._gain = norm, 0, 0.0
 
     def step(self, norm: float, gain: float) -> None:
@@ -165,15 +186,10 @@ class Progress:
             return False
         sizes = abs(point.lam.dot(point.g)) + abs(point.lam.dot(qp.d))
         gain, self._steps, self._gain = self._gain, 0, 0.0
-        return bcast_from_root(point.lam.getComm().tompi4py(), gain <= ROUNDING * sizes)
+        return bcast_from_root(point.lam.getComm().tompi4py(), gain <= DEFAULT.rounding * sizes)
 
 
 # --- PCPG: preconditioned conjugate projected gradients ---------------------------------------
-
-# of rᵀz, which is rᵀp as long as r is orthogonal to all directions before; else CG begins anew
-DRIFTED = 0.5
-# of λ: a way that is shorter may be rounding of Gλ = e
-SHORT = 1e-6
 
 
 def pcpg(
@@ -218,7 +234,7 @@ def pcpg(
     r, p, Fp, z, comm = own.r, own.p, own.Fp, own.z, point.lam.getComm().tompi4py()
     recycled, (past, norm) = qp.recycled, _begun(qp, point, own)
     new = list[tuple[Array, Array, float]]()  # the past stays as it is during a solve
-    least = bcast_from_root(comm, SHORT**2 * point.lam.dot(point.lam))
+    least = bcast_from_root(comm, DEFAULT.short**2 * point.lam.dot(point.lam))
     progress = Progress(norm, r.getSize())
     while True:
         # test
@@ -262,7 +278,7 @@ def pcpg(
         if recycled is not None:
             new = [*new[1 - recycled.capacity :], (p.array.copy(), Fp.array.copy(), pFp)]
         z.copy(r)
-        own.fresh, norm = abs(rp - rz) > DRIFTED * rz, float(np.sqrt(squared))
+        own.fresh, norm = abs(rp - rz) > DEFAULT.drifted * rz, float(np.sqrt(squared))
         steps.cg += 1
         progress.step(norm, 0.5 * rp**2 / pFp)
         monitor(steps, "cg", point.lam, norm, 0.0)

@@ -26,11 +26,6 @@ from tfeti_dolfinx.qp.problem import (
 from tfeti_dolfinx.qp.projection import UNBALANCED, project_onto_feasible
 from tfeti_dolfinx.qp.sets import Face, Status
 
-# of the terms of q: what its differences may be wrong by
-ROUNDING = 1e-15
-# of a gradient: a projection that is shorter may be rounding
-SHORT = 1e-6
-
 # --- Step 0: start ----------------------------------------------------------------------------
 
 
@@ -175,7 +170,7 @@ class _Newton:
         p, g_d = np.array(Ps.array_r), z.g + program.qp.d.array_r
         energy, size, pp, gg = program.dot((z.lam, g_d), (z.lam, z.lam), (p, p), (z.g, z.g))
         self.solver.directions.seen(energy, size)
-        if pp > SHORT**2 * gg:
+        if pp > self.parameters.short**2 * gg:
             (curvature,) = program.dot((p, program.F(p)))
             self.solver.directions.seen(curvature, pp)
 
@@ -234,7 +229,7 @@ class _Newton:
         # on circles s and λ are both large: their product's rounding hides changes of q
         (hidden,) = self.program.dot((np.abs(state.z.lam), np.abs(state.s)))
         gain = self.gain(end)
-        taken = feasible and gain >= enough - ROUNDING * hidden
+        taken = feasible and gain >= enough - self.parameters.hidden * hidden
         state.resume = taken
         if taken:
             self._go(end, gain)
@@ -260,7 +255,7 @@ class _Newton:
         """Move to a point where q is lower by ``gain``."""
         z = self.state.z
         work, load = self.program.dot((z.lam, z.g), (z.lam, self.program.qp.d.array_r))
-        if gain > ROUNDING * (abs(work) + abs(load)):
+        if gain > self.parameters.hidden * (abs(work) + abs(load)):
             self.state.idle = 0
         self.state.z = to
 

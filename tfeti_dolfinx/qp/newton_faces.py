@@ -28,12 +28,6 @@ from tfeti_dolfinx.qp.problem import (
 from tfeti_dolfinx.qp.projection import ConvexSet, OnBoundary, project_onto_feasible
 from tfeti_dolfinx.qp.sets import Face, without_slip
 
-# of the way to the first bound, where no curvature ends it: more rows than one are to leave
-BEYOND = 10.0
-# of d: rows that want gaps so far apart exclude each other, less may be rounding; of the largest
-# force of such a direction: rows with less have no part in it
-APART, TAKES_PART = 1e-8, 1e-3
-
 # --- Points and products as numpy arrays ------------------------------------------------------
 
 
@@ -288,12 +282,15 @@ class FaceSolver:
                 continue
             length = self._to_a_bound(z.lam, way)
             if np.isfinite(length):
-                return Multipliers(z.lam + BEYOND * length * way, z.g + BEYOND * length * Fw)
+                return Multipliers(
+                    z.lam + self._parameters.beyond * length * way,
+                    z.g + self._parameters.beyond * length * Fw,
+                )
             d = self._qp.d.array_r
             falls, size = program.dot((way, d), (d, d))
-            if falls > APART * np.sqrt(size * square):
+            if falls > self._parameters.apart * np.sqrt(size * square):
                 most = largest(program.comm, way)
-                self.excluding = np.flatnonzero(np.abs(way) > TAKES_PART * most)
+                self.excluding = np.flatnonzero(np.abs(way) > self._parameters.takes_part * most)
             break
         return z
 

@@ -19,6 +19,12 @@ class NewtonParameters:
         patience: Steps in a row that neither halve ‖g^P‖ nor lower q beyond its rounding.
         lost: Of ‖F‖‖λ‖: what rounding of λ − ᾱs leaves of ‖g^P‖.
         rounding: Of the largest entry of a way: less is none.
+        hidden: Of the terms of q: what its differences may be wrong by.
+        short: Of a gradient: a projection that is shorter may be rounding.
+        beyond: Of the way to the first bound, where no curvature ends it: more rows than one are
+            to leave.
+        apart: Of ‖d‖: rows that want gaps so far apart exclude each other, less may be rounding.
+        takes_part: Of the largest force of such a direction: rows with less have no part in it.
     """
 
     gamma: float = described(
@@ -42,6 +48,11 @@ class NewtonParameters:
     patience: int = 10
     lost: float = 2e-15
     rounding: float = 1e-10
+    hidden: float = 1e-15
+    short: float = 1e-6
+    beyond: float = 10.0
+    apart: float = 1e-8
+    takes_part: float = 1e-3
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
@@ -10,13 +11,22 @@ from mpi4py import MPI
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root, summed
 
-# of the energy of a direction: what stands out from those that are kept; where less does, rounding
-# of their images would grow from one to the next
-NEW = 0.1
-# of wᵀFp, for w and p of energy 1: where Fw says otherwise than Fp it is no longer F of w
-WRONG = 1e-9
-# of the longest direction: less on rows that a face holds is rounding
-HELD = 1e-10
+
+@dataclass(frozen=True)
+class RecyclingParameters:
+    """Tolerances of directions that are kept.
+
+    Attributes:
+        new: Of the energy of a direction: what stands out from those that are kept; where less
+            does, rounding of their images would grow from one to the next.
+        wrong: Of wᵀFp, for w and p of energy 1: where Fw says otherwise than Fp it is no longer
+            F of w.
+        held: Of the longest direction: less on rows that a face holds is rounding.
+    """
+
+    new: float = 0.1
+    wrong: float = 1e-9
+    held: float = 1e-10
 
 
 class DirectionStore:
@@ -69,11 +79,17 @@ class Recycled(DirectionStore):
     Args:
         capacity: Most directions; each takes two vectors, and two more while it is new.
         comm: Communicator.
+        parameters: Tolerances.
     """
 
-    def __init__(self, capacity: int, comm: MPI.Intracomm) -> None:
+    def __init__(
+        self,
+        capacity: int,
+        comm: MPI.Intracomm,
+        parameters: RecyclingParameters = RecyclingParameters(),
+    ) -> None:
         super().__init__(capacity, 0)
-        self.comm = comm
+        self.comm, self.parameters = comm, parameters
 
     @property
     def columns(self) -> tuple[Array, Array]:
@@ -95,14 +111,16 @@ class Recycled(DirectionStore):
         for passed in range(2):
             W, FW = self.directions, self.images
             a, same = summed(self.comm, np.array([FW @ x, W @ Fx]))
-            if passed == 0 and bcast_from_root(self.comm, bool(np.any(np.abs(a - same) > WRONG))):
+            if passed == 0 and bcast_from_root(
+                self.comm, bool(np.any(np.abs(a - same) > self.parameters.wrong))
+            ):
                 self.clear()
                 continue
             if self.count == self.capacity:
                 a[self._next] = 0.0  # it goes
             x, Fx = x - a @ W, Fx - a @ FW
         energy = self._energy(x, Fx)
-        if energy >= NEW:
+        if energy >= self.parameters.new:
             self.put(x / np.sqrt(energy), Fx / np.sqrt(energy))
 
     def add_all(self, directions: Iterable[tuple[Array, Array, float]]) -> None:
@@ -153,7 +171,7 @@ class Recycled(DirectionStore):
         _, sizes, Vt = np.linalg.svd(triangle(self.comm, values))
         squares = summed(self.comm, np.sum(self.directions**2, axis=1))
         longest = float(np.sqrt(bcast_from_root(self.comm, float(squares.max(initial=0.0)))))
-        return np.asarray(Vt[int(np.sum(sizes > HELD * longest)) :].T)
+        return np.asarray(Vt[int(np.sum(sizes > self.parameters.held * longest)) :].T)
 
 
 class RecycledOnFace:

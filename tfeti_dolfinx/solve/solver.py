@@ -33,7 +33,7 @@ from tfeti_dolfinx.qp.problem import (
     no_monitor,
 )
 from tfeti_dolfinx.qp.recycling import Recycled
-from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver, Task
+from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver
 
 
 def last_look(result: QPResult, rule: Accuracy) -> None:
@@ -146,14 +146,14 @@ def solve_dual(
     solver = SOLVERS[qp_type]
     qp = dual.qp(options.norm_steps if solver.relative_to_norm else 0)
     begin = _start(start, qp)
-    homogenised = _homogenise(dual, qp, solver, options, begin)
+    homogenised = _homogenise(dual, qp, solver, begin)
     if monitor is None:
         monitor = _monitor(dual, homogenised, options)
     scale = homogenised.scale
     rtol = options.number if rtol is None else rtol
     rule = Accuracy(dual, rtol, options.atol, (scale.reference, scale.rounding), qp.norm)
     rule.goal = goal
-    result = solver.solve(Task(qp, homogenised, rule, options, begin, monitor))
+    result = solver.solve(qp, homogenised, rule, options, begin, monitor)
     dual.saw(result.norm)
     if (state := rule.recovered) is not None:
         dual.last.look(state.lam, state.residual)
@@ -178,23 +178,20 @@ def _start(values: tuple[Array, Array] | None, qp: QP) -> Start | None:
     return Start(lam, np.array(mu) if fits else np.zeros(qp.coarse.dimension))
 
 
-def _homogenise(
-    dual: Dual, qp: QP, solver: Solver, options: Options, start: Start | None
-) -> Homogenised:
-    """Homogenise with λ̄ at the solver's start, or as the options say."""
+def _homogenise(dual: Dual, qp: QP, solver: Solver, start: Start | None) -> Homogenised:
+    """Homogenise with λ̄ at the solver's start, or λ̄₀, whose image is kept."""
     if start is not None and solver.warm is not None:
         at = dual.last.image(qp.F, solver.warm(qp, start))
         _no_worse_than_nothing(qp, at, start)
-        known = dual.known_image("natural")
+        known = dual.known_image()
         count = solver.cold is not None  # else λ̄ and rows that stay open are apart
         scale = scale_at(qp, known, count) if known else scale_near(qp, at, count)
     elif solver.cold is not None:
         at = operator_product(qp.F, solver.cold(qp))
         scale = scale_at(qp, at)
-    else:  # with λ̄ as options say, whose image is kept
-        kind = options.homogenization if any(dual.contact_rows) else "natural"
-        scale = scale_at(qp, dual.image("natural"), gaps_count=False)
-        return homogenise(qp, dual.image(kind), scale)
+    else:
+        image = dual.natural_image()
+        return homogenise(qp, image, scale_at(qp, image, gaps_count=False))
     homogenised = homogenise(qp, at, scale)
     at.destroy()
     return homogenised
