@@ -259,10 +259,13 @@ class FaceSolver:
         apart = self._qp.feasible.project(z.lam) - z.lam
         return self._program.any(without_slip(self._face, apart) != 0.0)
 
-    def _to_a_bound(self, lam: Array, way: Array) -> float:
-        """Return the largest t with λ + t·way ∈ Ω, maybe infinite; rounding ends no way."""
+    def _to_a_bound(self, lam: Array, way: Array, slips: bool = False) -> float:
+        """Return the largest t with λ + t·way ∈ Ω, maybe infinite; rounding ends no way.
+
+        Rows that slip bound it only if ``slips``.
+        """
         assert self._face is not None
-        held, small = without_slip(self._face, way), self._parameters.rounding
+        held, small = way if slips else without_slip(self._face, way), self._parameters.rounding
         held = np.where(np.abs(held) > small * largest(self._program.comm, way), held, 0.0)
         own = self._qp.feasible.max_step(lam, -held)
         return float(self._program.comm.allreduce(max(own, 0.0), op=MPI.MIN))
@@ -270,8 +273,8 @@ class FaceSolver:
     def _along_null_space(self, z: Multipliers) -> Multipliers:
         """Go beyond a bound along a direction without curvature, where PCPG has found one.
 
-        Rows depend on each other. Where no bound ends the way and q falls along it, they want gaps
-        that exclude each other: ``excluding`` says so.
+        Rows depend on each other. Where nothing ends the way, F does not see it and q falls along
+        it, they want gaps that exclude each other: ``excluding`` says so.
         """
         program, own = self._program, self.directions
         for vec in (own.p, own.r):
@@ -287,8 +290,10 @@ class FaceSolver:
                     z.g + self._parameters.beyond * length * Fw,
                 )
             d = self._qp.d.array_r
-            falls, size = program.dot((way, d), (d, d))
-            if falls > self._parameters.apart * np.sqrt(size * square):
+            falls, size, seen = program.dot((way, d), (d, d), (Fw, Fw))
+            unseen = seen <= (self._parameters.rounding * own.norm) ** 2 * square
+            endless = np.isinf(self._to_a_bound(z.lam, way, slips=True))
+            if unseen and endless and falls > self._parameters.apart * np.sqrt(size * square):
                 most = largest(program.comm, way)
                 self.excluding = np.flatnonzero(np.abs(way) > self._parameters.takes_part * most)
             break
