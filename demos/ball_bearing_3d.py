@@ -120,7 +120,7 @@ def run(argv):
         contacts,
         decomposition,
         stress=elastic.stress,
-        petsc_options={"tfeti_mpgp_expansion": "projcg", **demo.petsc_options},
+        petsc_options=demo.petsc_options,
     )
     uh = problem.solve()
 

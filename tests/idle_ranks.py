@@ -100,7 +100,7 @@ def test_a_body_that_contact_alone_holds(comm, shared_tmp):
 @pytest.mark.parametrize(
     ("cell", "options"),
     [
-        ("quadrilateral", {"homogenization": "feasible"}),
+        ("quadrilateral", {}),
         ("quadrilateral", {"qp_type": "smalse"}),
         ("tetrahedron", {}),
     ],

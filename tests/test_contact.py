@@ -49,10 +49,7 @@ def test_agrees_with_an_active_set_on_the_untorn_mesh(cell):
 @pytest.mark.parametrize(
     "options",
     [
-        SMALSE | {"tfeti_homogenization": "feasible"},
         SMALSE | {"tfeti_smalse_rho": 5, "tfeti_smalse_M": 10, "tfeti_mpgp_gamma": 10.0},
-        SMALSE | {"tfeti_pc_type": "dirichlet", "tfeti_mpgp_expansion": "projcg"},
-        SMALSE | {"tfeti_pc_type": "lumped"},
         {"tfeti_newton_reduction": 0.1, "tfeti_newton_gamma": 0.3, "tfeti_pc_type": "lumped"},
         {"tfeti_scaling": "multiplicity"},
     ],

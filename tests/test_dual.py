@@ -3,12 +3,9 @@
 import numpy as np
 import pytest
 from scenes import curved_obstacle, decomposed, problem
-from test_faces import in_a_corner
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.feti.dual import feasible_particular
 from tfeti_dolfinx.feti.operator import PRECONDITIONERS, scaled_rows
-from tfeti_dolfinx.qp.sets import Status, face_of
 
 
 @pytest.fixture(scope="module")
@@ -47,26 +44,6 @@ def test_preconditioners_are_symmetric_and_positive(dual):
     scaled = scaled_rows(dual.constraints.B, dual.constraints.weights)
     for make in PRECONDITIONERS.values():
         check_operator(make(scaled, dual.subdomains), dual.d)
-
-
-def test_the_feasible_homogenisation_is_the_smallest():
-    """Its optimality conditions: λ̄ = Gᵀα on carrying rows, (Gᵀα) ≤ 0 on the others."""
-    p = in_a_corner()
-    p.solve()
-    dual = p.dual
-    coarse, bounded = dual.coarse, dual.constraints.sets.normals
-    lam = feasible_particular(coarse, dual.d).array_r
-    assert np.allclose(coarse.G(lam), coarse.e, atol=1e-11)
-    assert np.all(lam[bounded] >= 0.0)
-    carrying = np.ones(len(lam), dtype=bool)
-    carrying[bounded] = lam[bounded] > 0.0
-    face = face_of(carrying, np.where(carrying, Status.FREE, Status.OPEN))
-    gram = coarse.grams.of_face(face).toarray()
-    alpha = np.linalg.lstsq(gram, coarse.e, rcond=1e-12)[0]
-    force = coarse.Gt @ alpha
-    assert np.allclose(force[carrying], lam[carrying], atol=1e-10)
-    assert np.all(force[~carrying] <= 1e-10)
-    p.destroy()
 
 
 def test_recovered_displacement_meets_the_rows(solved):

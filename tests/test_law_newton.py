@@ -100,7 +100,6 @@ def test_it_solves_the_law(seed, k, r):
     [
         {},
         {"qp_type": "smalse"},
-        {"qp_type": "smalse", "pc_type": "dirichlet"},
         {"pc_type": "lumped"},
         {"pc_type": "none"},
     ],

@@ -38,7 +38,6 @@ def multiplications(stiffness, **options):
     [
         {"contact": False},
         {"qp_type": "newton"},
-        pytest.param({"qp_type": "smalse", "pc_type": "dirichlet"}, marks=pytest.mark.slow),
     ],
 )
 def test_springs_cost_little(options):

@@ -7,7 +7,7 @@ import math
 import re
 import sys
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,7 +25,6 @@ from tfeti_dolfinx.common.validation import (
     shown,
 )
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.feti.dual import PARTICULAR
 from tfeti_dolfinx.feti.operator import PRECONDITIONERS
 from tfeti_dolfinx.qp.parameters import NewtonParameters, SmalseParameters
 from tfeti_dolfinx.qp.solvers import SOLVERS
@@ -45,7 +44,6 @@ MECHANISMS = {
     "soft_springs": "motions that springs hold softly as a coarse space of the preconditioner",
     "kept_directions": "directions of PCPG conjugate to all before, not to the last one alone",
     "recycled_directions": "directions of earlier solves",
-    "cautious": "rows leave a face one by one after a step of block Newton that has raised q",
     "newton_on_coulomb": "Newton's method on Coulomb's law, before bounds as a fixed point",
 }
 # those that an option of their own switches off
@@ -126,12 +124,6 @@ class Options:
         fits=FROM_0,
         words=("auto",),
         kind=int,
-    )
-    homogenization: str = described(
-        "natural",
-        "smalse",
-        "λ̄ with Gλ̄ = e: natural is Gᵀ(GGᵀ)⁻¹e, feasible the smallest one with λ̄_N ≥ 0",
-        choices=tuple(PARTICULAR),
     )
     norm_steps: int = described(15, "smalse", "Lanczos steps that estimate ‖PFP‖", fits=FROM_1)
     friction_type: str = described(
@@ -248,8 +240,6 @@ def parse_options(
     for name in values.get("without", ()):
         values |= SWITCHES.get(name, {})
     options: Options = made(Options, values)
-    if "cautious" in options.without:
-        options = replace(options, newton=replace(options.newton, cautious=False))
     return options
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 
@@ -32,8 +31,7 @@ from tfeti_dolfinx.qp.coarse import Coarse, NoCoarse
 from tfeti_dolfinx.qp.homogenised import LastProduct, OperatorProduct, natural, operator_product
 from tfeti_dolfinx.qp.krylov import estimate_norm
 from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
-from tfeti_dolfinx.qp.projection import project_onto_feasible
-from tfeti_dolfinx.qp.recycling import Recycled, RecycledOnFace
+from tfeti_dolfinx.qp.recycling import Recycled
 from tfeti_dolfinx.qp.sets import (
     Bounds,
     Discs,
@@ -47,15 +45,12 @@ from tfeti_dolfinx.qp.sets import (
 from tfeti_dolfinx.subdomains.local_operators import LocalOperator
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
-log = logging.getLogger(__name__)
-
 
 @dataclass(frozen=True)
 class DualLimits:
     """Limits of a dual problem.
 
     Attributes:
-        let_pass: Of ‖e‖: what a feasible λ̄ may miss, below any rtol; the solver makes it good.
         far: Times the forces and lengths that load, values and gaps make: multipliers of an earlier
             problem that are larger would leave so many digits less to the solution.
         least, most: Of stiffness, lengths and forces: beyond it squares leave the range of floating
@@ -64,7 +59,6 @@ class DualLimits:
             nearly free: their contacts' normals are off by less than 6 degrees from a right angle.
     """
 
-    let_pass: float = 1e-9
     far: float = 1e3
     least: float = 1e-130
     most: float = 1e130
@@ -72,40 +66,6 @@ class DualLimits:
 
 
 LIMITS = DualLimits()
-
-# --- Particular multipliers that balance the load ---------------------------------------------
-
-
-def feasible_particular(coarse: CoarseSpace, like: PETSc.Vec) -> PETSc.Vec:
-    """λ̄ of min ½‖λ‖² subject to Gλ = e, λ_N ≥ 0. Collective.
-
-    The nearest feasible point to 0 (Dostál's talk, item (ii)). Where that is not found,
-    λ̄ = Gᵀ(GGᵀ)⁻¹e is taken, and a warning says so.
-
-    Args:
-        coarse: The coarse space; the problem has been found solvable.
-        like: A vector of the right layout.
-    """
-    zero = like.duplicate()
-    zero.set(0.0)
-    feasible = Product([(coarse.bounded, Bounds())])
-    found = project_onto_feasible(coarse, feasible, zero, coarse.solve(coarse.e))
-    zero.destroy()
-    if found.missing <= LIMITS.let_pass:
-        return found.lam
-    found.lam.destroy()
-    if coarse.comm.rank == 0:
-        log.warning(
-            "homogenization feasible: the smallest feasible multipliers were not found (Gλ − e "
-            "is %.1e of e); natural is taken instead",
-            found.missing,
-        )
-    return natural(coarse, like)
-
-
-# solutions of Gλ̄ = e
-PARTICULAR = {"natural": natural, "feasible": feasible_particular}
-
 
 # --- The dual problem -------------------------------------------------------------------------
 
@@ -209,7 +169,7 @@ class Dual:
             self.soft = deflation(B, self.coarse, constraints.weights, self.preconditioner, prefix)
         self.contact_rows = constraints.sets.contact_rows(comm)
         self._law, self.feasible = feasible, feasible(constraints)
-        self._images = dict[str, tuple[Array, OperatorProduct]]()
+        self._image: tuple[Array, OperatorProduct] | None = None
         self._norms = dict[int, float]()  # of so many Lanczos steps
         self.seen, self.last = 0.0, LastProduct()
         self.recycled: Recycled | None = None
@@ -291,9 +251,18 @@ class Dual:
                 self._norms[norm_steps] = estimate_norm(self.F, coarse, self.d, norm_steps)
         norm = self._norms.get(norm_steps, 1.0)
         on = self._preconditioner_on if self.preconditioner is not None else None
-        W = None if self.recycled is None else RecycledOnFace(self.recycled)
-        M, keeps = self._on_all_rows, self.keeps_directions
-        return QP(self.F, self.d, coarse, self.feasible, M, norm, on, self.seen, W, keeps)
+        return QP(
+            self.F,
+            self.d,
+            coarse,
+            self.feasible,
+            preconditioner=self._on_all_rows,
+            norm=norm,
+            preconditioner_on=on,
+            seen=self.seen,
+            recycled=self.recycled,
+            keeps=self.keeps_directions,
+        )
 
     def saw(self, norm: float) -> None:
         """Store the estimate of ‖F‖ of a solve, for the next one to begin with.
@@ -326,14 +295,15 @@ class Dual:
         made = self._on_faces.on_face(face)
         return made if self.soft is None else self.soft.balanced(face, made)
 
-    def image(self, kind: str) -> OperatorProduct:
-        """λ̄ of a kind in ``PARTICULAR`` with F λ̄; multiplies once for each e."""
-        if (found := self.known_image(kind)) is None:
-            if kind in self._images:
-                self._images.pop(kind)[1].destroy()
-            found = operator_product(self.F, PARTICULAR[kind](self.coarse, self.d))
-            self._images[kind] = (self.coarse.e.copy(), found)
-        return found
+    def natural_image(self) -> OperatorProduct:
+        """λ̄₀ = Gᵀ(GGᵀ)⁻¹e with F λ̄₀; multiplies once for each e. Collective."""
+        if (found := self.known_image()) is not None:
+            return found
+        if self._image is not None:
+            self._image[1].destroy()
+        made = operator_product(self.F, natural(self.coarse, self.d))
+        self._image = (self.coarse.e.copy(), made)
+        return made
 
     @property
     def driving(self) -> Array:
@@ -370,11 +340,11 @@ class Dual:
         at.destroy()
         return lengths > LIMITS.far * norm_over(comm, self.driving)
 
-    def known_image(self, kind: str) -> OperatorProduct | None:
-        """λ̄ and F λ̄ if they are known for the present e."""
-        if kind not in self._images or not np.array_equal(self._images[kind][0], self.coarse.e):
+    def known_image(self) -> OperatorProduct | None:
+        """λ̄₀ and F λ̄₀ if they are known for the present e."""
+        if self._image is None or not np.array_equal(self._image[0], self.coarse.e):
             return None
-        return self._images[kind][1]
+        return self._image[1]
 
     def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> Recovered:
         """Return the displacement of multipliers; changes nothing.
@@ -398,8 +368,8 @@ class Dual:
 
     def destroy(self) -> None:
         """Destroy the PETSc objects."""
-        images = [found for _, found in self._images.values()]
+        image = self._image[1] if self._image is not None else None
         own = (self._on_all, self._on_faces, self.soft, self.preconditioner, self._scaled)
-        for item in (self.F, *own, self.coarse, self.d, *images):
+        for item in (self.F, *own, self.coarse, self.d, image):
             if item is not None:
                 item.destroy()

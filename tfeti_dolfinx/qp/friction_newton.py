@@ -7,15 +7,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import norm_over, steering, summed
 from tfeti_dolfinx.errors import FactorError
 from tfeti_dolfinx.qp.coarse import Oblique
-from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
-from tfeti_dolfinx.qp.recycling import RecycledOnFace, triangle
+from tfeti_dolfinx.qp.problem import QP, Operator
+from tfeti_dolfinx.qp.recycling import Recycled, triangle
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
 
 
@@ -159,14 +158,36 @@ class LawProgram:
         """Ω(y_N⁺) and P(y)."""
         return self.law.nearest(at.lam - at.s / self.norm)
 
+    def apply(self, A: Operator, x: Array) -> Array:
+        """A x, between this rank's parts of vectors."""
+        x_vec, y_vec = self.qp.d.duplicate(), self.qp.d.duplicate()
+        x_vec.array[:] = x
+        A.mult(x_vec, y_vec)
+        y = np.array(y_vec.array_r)
+        x_vec.destroy()
+        y_vec.destroy()
+        return y
+
+    def imbalance(self, lam: Array) -> Array:
+        """e − Gλ, replicated."""
+        x = self.qp.d.duplicate()
+        x.array[:] = lam
+        missing = self.qp.coarse.residual(x)
+        x.destroy()
+        return missing
+
+    def normal(self, mu: Array) -> Array:
+        """Gᵀμ."""
+        x = self.qp.d.duplicate()
+        self.qp.coarse.combine(mu, x)
+        values = np.array(x.array_r)
+        x.destroy()
+        return values
+
     def missed(self, p: Array, lam: Array) -> float:
         """‖F‖ √(‖λ − p‖² + ‖Gᵀ(GGᵀ)⁻¹(e − Gλ)‖²), the same on all ranks."""
-        x, coarse = self.qp.d.duplicate(), self.qp.coarse
-        x.array[:] = lam
-        coarse.combine(coarse.solve(coarse.residual(x)), x)
-        missed = norm_over(self.comm, np.concatenate((p - lam, x.array_r)))
-        x.destroy()
-        return self.norm * missed
+        balancing = self.normal(self.qp.coarse.solve(self.imbalance(lam)))
+        return self.norm * norm_over(self.comm, np.concatenate((p - lam, balancing)))
 
     def residual(self, at: LawPoint) -> float:
         """‖F‖ times what λ misses of the law and of Gλ = e, the same on all ranks."""
@@ -212,19 +233,15 @@ def newton_on_law(
         face = feasible.face(p, at.s)
         soft = np.flatnonzero(face.curvature <= parameters.hard * program.norm)
         on = OnFace(face.with_directions(soft), program.law.following(p, face), p)
+        # Step 3: the system there
         share = parameters.reduction
         if past:
             share = min(share, parameters.followed * residual / past[-1])
         try:
-            # Step 3: onto the face
-            system = _System(program, on, at, parameters)
-            system.enter(length, parameters.unseen * target)
-            # Step 4: the system there
-            length = min(system.solve(share, parameters.followed * target) or length, 1.0)
+            end, length = _solved_on_face(program, on, at, length, share, target, parameters)
         except FactorError:
             return None, step + 1
-        end = system.end()
-        # Step 5: halve the step until its residual is none of the largest; F is known on all of it
+        # Step 4: halve the step until its residual is none of the largest; F is known on all of it
         past = [*past[1 - parameters.memory :], residual]
         part, there = 1.0, end
         while not program.residual(there) <= max(past):
@@ -319,170 +336,77 @@ class OnFace:
         return np.asarray(Z @ (self.face.curvature * (Z.T @ u).T).T)
 
 
-class _System:
-    """Steps 3 and 4: on the face Zᵀ(Fλ − d − Gᵀμ) + κu = 0 and Gλ = e, λ = λ₁ + (I + C)u."""
+def _solved_on_face(
+    program: LawProgram,
+    on: OnFace,
+    at: LawPoint,
+    length: float,
+    share: float,
+    target: float,
+    parameters: FrictionParameters,
+) -> tuple[LawPoint, float]:
+    """Solve Zᵀ(Fλ − d − Gᵀμ) + κu = 0 and Gλ = e on a face, λ = λ₁ + (I + C)u. Collective.
 
-    def __init__(
-        self, program: LawProgram, on: OnFace, at: LawPoint, parameters: FrictionParameters
-    ) -> None:
-        qp = self._qp = program.qp
-        self._on, self._mu, self._parameters = on, at.mu, parameters
-        self._norm, self._comm = program.norm, program.comm
-        self._oblique = program.oblique(on.face, on.C)
-        self._F = _on_arrays(qp.F, qp.d)
-        self._made = qp.preconditioner_on(on.face) if qp.preconditioner_on else None
-        self._M = _on_arrays(self._made, qp.d) if self._made else on.face.restricted
-        # λ₁ on the face, u₀ that restores Gλ = e; s is of λ before
-        self._work = qp.d.duplicate()
-        lam = self._work.array[:] = on.entered(at.lam)
-        self._u = self._oblique.restoring(qp.coarse.residual(self._work))
-        self._lam, self._s = lam + on.followed(self._u), at.s
-        self._way = self._lam - at.lam
-        self._basis = known_on(qp.recycled, on, self._oblique.project)
+    Args:
+        program: The law.
+        on: The face.
+        at: The point before.
+        length: Step along a residual, preconditioned; 0: none is known.
+        share: What is left of the residual.
+        target: Of the whole method.
+        parameters: Parameters.
 
-    def enter(self, length: float, seen: float) -> None:
-        """Multiply F by the correction onto the face, where its image exceeds ``seen``.
+    Returns:
+        The solution, and the least step along a direction.
+    """
+    qp, comm = program.qp, program.comm
+    oblique = program.oblique(on.face, on.C)
+    M = qp.preconditioner_on(on.face) if qp.preconditioner_on else None
 
-        Beside a short one goes a first direction, for the same multiplication.
+    def apply(z: Array) -> tuple[Array, Array]:
+        Fz = program.apply(qp.F, on.followed(z))
+        return oblique.project(Fz + on.bend(z)), Fz
 
-        Args:
-            length: Step along a residual, preconditioned; 0: none is known.
-            seen: What is seen.
-        """
-        size = self._norm * norm_over(self._comm, self._way)
-        if size <= seen:
-            return
-        self._reduce(np.inf)  # by known directions, without a multiplication
-        b = self._left()
-        if length and size <= self._parameters.beside * norm_over(self._comm, b):
-            z = length * self._precondition(b)
-            self._go(z, np.zeros_like(z))
-            self._way = self._way + self._on.followed(z)
-        image = self._F(self._way)
-        self._s = self._s + image
-        if self._qp.coarse.dimension == 0:  # else it restores Gλ = e
-            keep(self._qp.recycled, self._way, image)
+    def precondition(r: Array) -> Array:
+        return oblique.project(on.face.restricted(r) if M is None else program.apply(M, r))
 
-    def solve(self, share: float, least: float) -> float:
-        """Find u by conjugate residuals, down to a share of the residual; no less than ``least``.
-
-        Returns:
-            The least step along a direction, 0 without any.
-        """
-        known = self._basis.count if self._basis is not None else 0
-        length = self._reduce(max(share * norm_over(self._comm, self._left()), least))
-        if self._basis is not None:
-            for z, image in zip(self._basis.Z[known:], self._basis.images[known:], strict=True):
-                keep(self._qp.recycled, self._on.followed(z), image)
-        return length
-
-    def end(self) -> LawPoint:
-        """Return the present point, and free work vectors."""
-        mu = self._oblique.coordinates(self._s + self._on.bend(self._u))
-        self._qp.coarse.combine(mu, self._work)
-        at = LawPoint(self._lam, self._s - self._work.array_r, self._mu + mu)
-        for item in (self._work, self._made):
-            if item is not None:
-                item.destroy()
-        return at
-
-    def _reduce(self, target: float) -> float:
-        """Reduce the residual; return the least step."""
-        gone = gcr(
-            self._apply,
-            self._precondition,
-            self._left(),
-            target,
-            self._basis,
-            self._comm,
-            self._parameters,
-        )
-        self._basis = gone.basis
-        self._go(gone.u, gone.image)
-        return gone.length
-
-    def _go(self, u: Array, image: Array) -> None:
-        self._u, self._lam = self._u + u, self._lam + self._on.followed(u)
-        self._s = self._s + image
-
-    def _left(self) -> Array:
-        return -self._oblique.project(self._s + self._on.bend(self._u))
-
-    def _apply(self, z: Array) -> tuple[Array, Array]:
-        Fz = self._F(self._on.followed(z))
-        return self._oblique.project(Fz + self._on.bend(z)), Fz
-
-    def _precondition(self, r: Array) -> Array:
-        return self._oblique.project(self._M(r))
-
-
-def _on_arrays(A: Operator | FaceOperator, like: PETSc.Vec) -> Callable[[Array], Array]:
-    """Return an operator between this rank's parts of vectors."""
-
-    def mult(values: Array) -> Array:
-        x, y = like.duplicate(), like.duplicate()
-        x.array[:] = values
-        A.mult(x, y)
-        result = np.array(y.array_r)
-        x.destroy()
-        y.destroy()
-        return result
-
-    return mult
+    # Step 3a: λ₁ on the face, and u that restores Gλ = e; s is of λ before
+    lam, s = on.entered(at.lam), at.s
+    u = oblique.restoring(program.imbalance(lam))
+    way = lam + on.followed(u) - at.lam
+    basis = known_on(qp.recycled, on, oblique.project)
+    size = program.norm * norm_over(comm, way)
+    if size > parameters.unseen * target:
+        # Step 3b: F of the way, if it can be seen. Known directions come before, for nothing, and
+        # beside a short way a first new one, for the same multiplication
+        b = -oblique.project(s + on.bend(u))
+        z, image, *_ = gcr(apply, precondition, b, np.inf, basis, comm, parameters)
+        u, s = u + z, s + image
+        b = -oblique.project(s + on.bend(u))
+        if length and size <= parameters.beside * norm_over(comm, b):
+            z = length * precondition(b)
+            u, way = u + z, way + on.followed(z)
+        image = program.apply(qp.F, way)
+        s = s + image
+        if qp.recycled is not None and qp.coarse.dimension == 0:  # else it restores Gλ = e
+            qp.recycled.keep(way, image)
+    # Step 3c: conjugate residuals
+    b = -oblique.project(s + on.bend(u))
+    goal = max(share * norm_over(comm, b), parameters.followed * target)
+    known = basis.shape[1]
+    z, image, basis, shortest = gcr(apply, precondition, b, goal, basis, comm, parameters)
+    u, s = u + z, s + image
+    if qp.recycled is not None:
+        for z, image in basis[1:, known:].transpose(1, 0, 2):
+            qp.recycled.keep(on.followed(z), image)
+    if M is not None:
+        M.destroy()
+    mu = oblique.coordinates(s + on.bend(u))
+    end = LawPoint(lam + on.followed(u), s - program.normal(mu), at.mu + mu)
+    return end, min(shortest or length, 1.0)
 
 
 # --- Generalised conjugate residuals ----------------------------------------------------------
-
-
-class KrylovBasis:
-    """Directions z with q = Az, orthonormal over all ranks, and an image of each; as rows.
-
-    Args:
-        rows: q, z and images of those to begin with, this rank's part, shape ``(3, k, n)``.
-        room: How many more there may be; what is not filled takes no memory.
-    """
-
-    def __init__(self, rows: Array, room: int = DEFAULT.max_directions) -> None:
-        self.count = rows.shape[1]
-        self._rows = np.empty((3, self.count + room, rows.shape[2]))
-        self._rows[:, : self.count] = rows
-
-    @property
-    def Q(self) -> Array:
-        """Az of each, shape ``(count, n)``."""
-        return self._rows[0, : self.count]
-
-    @property
-    def Z(self) -> Array:
-        """The directions."""
-        return self._rows[1, : self.count]
-
-    @property
-    def images(self) -> Array:
-        """The image given with each Az."""
-        return self._rows[2, : self.count]
-
-    def add(self, q: Array, z: Array, image: Array) -> None:
-        """Store another direction."""
-        self._rows[:, self.count] = q, z, image
-        self.count += 1
-
-
-@dataclass(frozen=True)
-class GCRResult:
-    """Result of generalised conjugate residuals, started from 0.
-
-    Attributes:
-        u: The solution.
-        image: What was given with each Az, combined as u is.
-        basis: All directions; new ones, each for one multiplication, come last.
-        length: The least step along a new one, over Mr less earlier directions; 0 without any.
-    """
-
-    u: Array
-    image: Array
-    basis: KrylovBasis
-    length: float
 
 
 def gcr(
@@ -490,33 +414,38 @@ def gcr(
     precondition: Callable[[Array], Array],
     b: Array,
     target: float,
-    basis: KrylovBasis | None,
+    basis: Array,
     comm: MPI.Intracomm,
     parameters: FrictionParameters = DEFAULT,
-) -> GCRResult:
-    """Make ‖b − Au‖ least over more and more directions. Collective.
+) -> tuple[Array, Array, Array, float]:
+    """Make ‖b − Au‖ least over more and more directions, from u = 0 on. Collective.
 
     Eisenstat, Elman, Schultz, SIAM J. Numer. Anal. 20 (1983) 345–357. A step multiplies by A once,
     and has one reduction and one broadcast beside what A and M need.
 
     Args:
-        apply: Gives Az, and what else is linear in z and wanted of u.
+        apply: Gives Az, and what else is linear in z and wanted of u: its image.
         precondition: M.
-        b: Right side, this rank's part.
+        b: Right side, this rank's part, shape ``(n,)``.
         target: Ends at ‖b − Au‖ ≤ target.
-        basis: Directions to begin with, which grow; None: none.
+        basis: q = Az, orthonormal over all ranks, z and images of directions to begin with, shape
+            ``(3, k, n)``.
         comm: Communicator.
         parameters: Parameters.
+
+    Returns:
+        u, its image, all directions, of which new ones, each for one multiplication, come last,
+        and the least step along a new one, over Mr less earlier directions; 0 without any.
     """
-    known = KrylovBasis(np.zeros((3, 0, len(b)))) if basis is None else basis
-    c = summed(comm, known.Q @ b)
-    u, image, r = c @ known.Z, c @ known.images, b - c @ known.Q
+    Q, Z, images = basis
+    c = summed(comm, Q @ b)
+    u, image, r = c @ Z, c @ images, b - c @ Q
     size, lengths = norm_over(comm, r), list[float]()
     while size > target and len(lengths) < parameters.max_directions:
         # Step 1: the preconditioned residual, made orthogonal to all before
         z = precondition(r)
         q, w = apply(z)
-        sums = summed(comm, np.concatenate((known.Q @ q, (q @ q, q @ r, r @ r))))
+        sums = summed(comm, np.concatenate((Q @ q, (q @ q, q @ r, r @ r))))
         c, (square, along, left) = sums[:-3], sums[-3:]
         length = float(np.sqrt(max(square - c @ c, 0.0)))
         step = along / length if length > parameters.new * np.sqrt(square) else 0.0
@@ -524,25 +453,19 @@ def gcr(
         length, step, after = (float(x) for x in steering(comm, length, step, after))
         if abs(step) <= parameters.gain * size:
             break
-        q, z, w = q - c @ known.Q, z - c @ known.Z, w - c @ known.images
         # Step 2: the least residual along it
-        known.add(q / length, z / length, w / length)
-        u, image, r = (
-            u + step * known.Z[-1],
-            image + step * known.images[-1],
-            r - step * known.Q[-1],
-        )
+        new = np.stack((q - c @ Q, z - c @ Z, w - c @ images)) / length
+        basis = np.concatenate((basis, new[:, None]), axis=1)
+        Q, Z, images = basis
+        u, image, r = u + step * new[1], image + step * new[2], r - step * new[0]
         lengths.append(step / length)
         size = after
-    return GCRResult(u, image, known, max(min(lengths, default=0.0), 0.0))
+    return u, image, basis, max(min(lengths, default=0.0), 0.0)
 
 
 def known_on(
-    past: RecycledOnFace | None,
-    on: OnFace,
-    project: Callable[[Array], Array],
-    new: float = DEFAULT.new,
-) -> KrylovBasis | None:
+    past: Recycled | None, on: OnFace, project: Callable[[Array], Array], new: float = DEFAULT.new
+) -> Array:
     """Return known products Au = P(F(I + C)u + κu) from directions WN = (I + C)U of past solves.
 
     Farhat, Crivelli, Roux (``Recycled``); as Carvalho, Gratton, Lago, Vasseur, SIAM J. Sci.
@@ -555,27 +478,19 @@ def known_on(
         new: Of the largest image: what others leave of one, less is rounding.
 
     Returns:
-        U with AU orthonormal, and FWN combined likewise; None where there is nothing.
+        AU, orthonormal, U, and FWN combined likewise, as rows, shape ``(3, k, m)``.
     """
-    if past is None or past.known.count == 0:
-        return None
-    comm, (W, FW) = past.known.comm, past.known.columns
+    nothing = np.zeros((3, 0, len(on.p)))
+    if past is None or past.count == 0:
+        return nothing
+    W, FW = past.columns
     U = on.face.restricted(W - on.C @ W)
-    N = past.known.without(W - on.followed(U))
+    N = past.without(W - on.followed(U))
     if N.shape[1] == 0:
-        return None
+        return nothing
     U, FU = U @ N, FW @ N
     AU = project(FU + on.bend(U))
-    _, sizes, Vt = np.linalg.svd(triangle(comm, AU))
+    _, sizes, Vt = np.linalg.svd(triangle(past.comm, AU))
     kept = sizes > new * sizes[0]
     T = Vt[kept].T / sizes[kept]
-    return KrylovBasis(np.stack([(X @ T).T for X in (AU, U, FU)]))
-
-
-def keep(past: RecycledOnFace | None, x: Array, Fx: Array) -> None:
-    """Store a search direction x, Gx = 0, with Fx. Collective."""
-    if past is None:
-        return
-    (energy,) = steering(past.known.comm, *summed(past.known.comm, np.array([x @ Fx])))
-    if energy > 0.0:
-        past.known.add(x, Fx, float(energy))
+    return np.stack([(X @ T).T for X in (AU, U, FU)])

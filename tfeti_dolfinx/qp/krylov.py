@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
@@ -21,7 +23,7 @@ from tfeti_dolfinx.qp.problem import (
     StoppingRule,
     no_monitor,
 )
-from tfeti_dolfinx.qp.recycling import DirectionStore
+from tfeti_dolfinx.qp.recycling import DirectionStore, RecycledOnFace
 from tfeti_dolfinx.qp.sets import Face
 
 # --- Estimate of ‖PFP‖ ------------------------------------------------------------------------
@@ -80,11 +82,35 @@ def _size(diagonal: list[float], beside: list[float]) -> float:
 
 # --- Store of conjugate directions ------------------------------------------------------------
 
-# of the largest curvature of a direction, and of what the preconditioner makes of a residual: less
-# is rounding, as where rows depend on each other
-FLAT = 1e-13
-# numbers that a rank keeps at most: 192 MB
-NUMBERS = 24_000_000
+
+@dataclass(frozen=True)
+class PcpgParameters:
+    """Tolerances of PCPG.
+
+    Attributes:
+        flat: Of the largest curvature of a direction, and of what the preconditioner makes of a
+            residual: less is rounding, as where rows depend on each other.
+        numbers: What a rank keeps of directions at most: 192 MB.
+        plateau: So many steps in which neither ‖r‖ comes down to a half nor q by what stands out
+            from its rounding have met rounding: at that pace 10 000 steps would bring 6 digits at
+            best; twice as many as there are rows, and a few, have it too.
+        few: Those.
+        rounding: Of the terms of q.
+        drifted: Of rᵀz, which is rᵀp as long as r is orthogonal to all directions before; else
+            conjugate gradients begin anew.
+        short: Of λ: a way that is shorter may be rounding of Gλ = e.
+    """
+
+    flat: float = 1e-13
+    numbers: int = 24_000_000
+    plateau: int = 500
+    few: int = 20
+    rounding: float = 1e-15
+    drifted: float = 0.5
+    short: float = 1e-6
+
+
+DEFAULT = PcpgParameters()
 
 
 class Directions:
@@ -110,7 +136,7 @@ class Directions:
         self.r, self.p, self.Fp, self.z = (like.duplicate() for _ in range(4))
         self.fresh, self.norm, self.helped = True, 0.0, 0.0
         rows = like.getComm().tompi4py().allreduce(like.getLocalSize(), op=MPI.MAX)
-        most = max(NUMBERS // (2 * max(rows, 1)), 1) if keeps else 1
+        most = max(DEFAULT.numbers // (2 * max(rows, 1)), 1) if keeps else 1
         self.kept = DirectionStore(most, like.getLocalSize())
 
     def seen(self, pFp: float, pp: float, short: bool = False) -> bool:
@@ -120,12 +146,12 @@ class Directions:
         """
         if not short:
             self.norm = max(self.norm, pFp / pp if pp > 0.0 else 0.0)
-        return pFp > FLAT * self.norm * pp
+        return pFp > DEFAULT.flat * self.norm * pp
 
     def stands_out(self, rz: float, rr: float) -> bool:
         """Return whether rᵀz, z the preconditioned residual, is positive beyond rounding."""
         self.helped = max(self.helped, rz / rr if rr > 0.0 else 0.0)
-        return rz > FLAT * self.helped * rr
+        return rz > DEFAULT.flat * self.helped * rr
 
     def destroy(self) -> None:
         """Destroy the vectors. Collective."""
@@ -135,14 +161,9 @@ class Directions:
 
 # --- Detection of stagnation ------------------------------------------------------------------
 
-# so many steps in which neither ‖r‖ comes down to a half nor q by what stands out from its rounding
-# have met rounding: at that pace 10 000 steps would bring 6 digits at best; twice as many as there
-# are rows, and a few, have it too
-PLATEAU, FEW, ROUNDING = 500, 20, 1e-15
 
-
-class Plateau:
-    """Detection of stagnation: neither residuals nor q decrease.
+class Progress:
+    """Tells when neither residuals nor q have decreased for long.
 
     Args:
         norm: ‖r‖ at the start.
@@ -150,39 +171,25 @@ class Plateau:
     """
 
     def __init__(self, norm: float, rows: int) -> None:
-        self._most = min(PLATEAU, 2 * rows + FEW)
-        self._best, self._steps, self._gain, self._restarted = norm, 0, 0.0, False
+        self._most = min(DEFAULT.plateau, 2 * rows + DEFAULT.few)
+        self._best, self._steps, self._gain = norm, 0, 0.0
 
     def step(self, norm: float, gain: float) -> None:
         """Record a step that lowers q by ``gain`` and ends with ‖r‖ = ``norm``."""
         self._steps, self._gain = self._steps + 1, self._gain + gain
         if norm <= 0.5 * self._best:
-            self._best, self._steps, self._gain, self._restarted = norm, 0, 0.0, False
+            self._best, self._steps, self._gain = norm, 0, 0.0
 
-    def ended(self, qp: QP, point: Point) -> bool:
+    def stagnates(self, qp: QP, point: Point) -> bool:
         """Return whether nothing has decreased for long. Collective if many steps were made."""
         if self._steps < self._most:
             return False
         sizes = abs(point.lam.dot(point.g)) + abs(point.lam.dot(qp.d))
-        comm = point.lam.getComm().tompi4py()
-        ended = bcast_from_root(comm, self._gain <= ROUNDING * sizes)
-        self._steps, self._gain = 0, 0.0
-        return ended
-
-    def once_more(self) -> bool:
-        """Return whether this is the first restart since ‖r‖ decreased."""
-        first, self._restarted = not self._restarted, True
-        return first
+        gain, self._steps, self._gain = self._gain, 0, 0.0
+        return bcast_from_root(point.lam.getComm().tompi4py(), gain <= DEFAULT.rounding * sizes)
 
 
 # --- PCPG: preconditioned conjugate projected gradients ---------------------------------------
-
-# of rᵀz, which is rᵀp as long as r is orthogonal to all directions before; else CG begins anew
-DRIFTED = 0.5
-# of λ: a way that is shorter may be rounding of Gλ = e
-SHORT = 1e-6
-# of ‖P g‖ where directions have ended before: then it is worth the way to begin anew
-DIGIT = 0.1
 
 
 def pcpg(
@@ -198,10 +205,9 @@ def pcpg(
 
     Farhat, Mandel, Roux, Comput. Methods Appl. Mech. Engrg. 115 (1994) 365–385, section 3. P is
     the projector of ``qp.coarse``: on a face λ moves in the face alone. Multiplies by F, and by
-    the preconditioner, once per step, and once more where the rule finds that g has drifted, or
-    where neither ‖P g‖ nor q has come down for long. A step makes three global reductions: one
-    with each projection, one for the norm of the residual; one more where there are directions of
-    earlier solves.
+    the preconditioner, once per step, and once more where the rule finds that g has drifted. A step
+    makes three global reductions: one with each projection, one for the norm of the residual; one
+    more where there are directions of earlier solves.
 
     ===========================  ===================================================
     reason                       when
@@ -209,7 +215,7 @@ def pcpg(
     the rule's                   ‖P g‖ ≤ ``rule.tolerance``, and the rule is content
     ``DIVERGED_ITS``             ``max_it`` steps are not enough
     ``DIVERGED_INDEFINITE_MAT``  a direction has no positive curvature
-    ``DIVERGED_ROUNDING``        neither ‖P g‖ nor q comes down, with a new g neither
+    ``DIVERGED_ROUNDING``        neither ‖P g‖ nor q has come down for long
     ===========================  ===================================================
 
     Args:
@@ -225,17 +231,24 @@ def pcpg(
         Why it stopped.
     """
     own = Directions(point.lam, qp.keeps) if directions is None else directions
-    r, p, Fp, z, past = own.r, own.p, own.Fp, own.z, qp.recycled
-    norm, reason = _begun(qp, point, own), ConvergedReason.ITERATING
-    least = bcast_from_root(qp.d.getComm().tompi4py(), SHORT**2 * point.lam.dot(point.lam))
-    progress = Plateau(norm, r.getSize())
+    r, p, Fp, z, comm = own.r, own.p, own.Fp, own.z, point.lam.getComm().tompi4py()
+    recycled, (past, norm) = qp.recycled, _begun(qp, point, own)
+    new = list[tuple[Array, Array, float]]()  # the past stays as it is during a solve
+    least = bcast_from_root(comm, DEFAULT.short**2 * point.lam.dot(point.lam))
+    progress = Progress(norm, r.getSize())
     while True:
         # test
-        reason, anew = _test(qp, point, rule, progress, norm)
-        if rule.drifted or anew:
+        reason = (
+            _examined(qp, point, rule, norm)
+            if norm <= rule.tolerance
+            else ConvergedReason.ITERATING
+        )
+        if rule.drifted:
             point.refresh(qp)
             rule.drifted, own.fresh = False, True
-            norm = _begun(qp, point, own)
+            past, norm = _begun(qp, point, own)
+        if reason == ConvergedReason.ITERATING and progress.stagnates(qp, point):
+            reason = ConvergedReason.DIVERGED_ROUNDING
         if reason == ConvergedReason.ITERATING and steps.cg >= max_it:
             reason = ConvergedReason.DIVERGED_ITS
         if reason != ConvergedReason.ITERATING:
@@ -245,10 +258,9 @@ def pcpg(
             own.kept.clear()
         rz, products = _precondition(qp, r, z, own.kept, norm)
         # direction
-        z.array[:] -= products @ own.kept.directions
-        z.copy(p)
+        p.array[:] = z.array_r - products @ own.kept.directions
         if past is not None:
-            past.conjugate(p)
+            p.array[:] = past.conjugate(p.array_r)
         # step
         qp.F.mult(p, Fp)
         Fp.copy(z)
@@ -258,38 +270,23 @@ def pcpg(
         squared, rz, rp, pFp = _square(z, rz, rp, pFp)
         short = bool(pFp) and (rp / pFp) ** 2 * pp < least
         if not (own.seen(pFp, pp, short) and own.stands_out(rz, norm**2)):
-            own.fresh, reason = True, _examined(qp, point, rule, norm)
-            if reason == ConvergedReason.ITERATING:
-                reason = ConvergedReason.DIVERGED_INDEFINITE_MAT
+            own.fresh = True
+            reason = _examined(qp, point, rule, norm) or ConvergedReason.DIVERGED_INDEFINITE_MAT
             break
         point.move(rp / pFp, p, Fp)
         own.kept.put(p.array_r / np.sqrt(pFp), PFp / np.sqrt(pFp))
-        if past is not None:
-            past.remember(p, Fp, pFp)
+        if recycled is not None:
+            new = [*new[1 - recycled.capacity :], (p.array.copy(), Fp.array.copy(), pFp)]
         z.copy(r)
-        own.fresh, norm = abs(rp - rz) > DRIFTED * rz, float(np.sqrt(squared))
+        own.fresh, norm = abs(rp - rz) > DEFAULT.drifted * rz, float(np.sqrt(squared))
         steps.cg += 1
         progress.step(norm, 0.5 * rp**2 / pFp)
         monitor(steps, "cg", point.lam, norm, 0.0)
-    if past is not None:
-        past.keep()
+    if recycled is not None:
+        recycled.add_all(new)
     if directions is None:
         own.destroy()
     return reason
-
-
-def _test(
-    qp: QP, point: Point, rule: StoppingRule, progress: Plateau, norm: float
-) -> tuple[ConvergedReason, bool]:
-    """Return why PCPG stops here, and whether the gradient is made anew instead. Collective."""
-    reason = ConvergedReason.ITERATING
-    if norm <= rule.tolerance:
-        reason = _examined(qp, point, rule, norm)
-    if reason != ConvergedReason.ITERATING or not progress.ended(qp, point):
-        return reason, False
-    if progress.once_more():
-        return reason, True
-    return ConvergedReason.DIVERGED_ROUNDING, False
 
 
 def solve_by_pcpg(
@@ -302,14 +299,8 @@ def solve_by_pcpg(
 ) -> QPResult:
     """Solve min ½λᵀFλ − λᵀd, Gλ = e, from λ̄ on. Collective.
 
-    Stops as ``pcpg`` does, but begins anew with a new gradient where a direction has no positive
-    curvature, as long as the residual is a tenth of what it was there before; besides with
-
-    =====================  ======================================================
-    reason                 when
-    =====================  ======================================================
-    ``DIVERGED_ROUNDING``  no positive curvature, but residuals that are rounding
-    =====================  ======================================================
+    Stops as ``pcpg`` does; with ``DIVERGED_ROUNDING`` where residuals are rounding, too, and a
+    direction has no positive curvature.
 
     >>> import numpy as np
     >>> from petsc4py import PETSc
@@ -336,7 +327,7 @@ def solve_by_pcpg(
     """
     lam, g, steps = homogenised.lam_bar.copy(), homogenised.gradient.copy(), Steps()
     monitor(steps, "start", lam, homogenised.b.norm(), 0.0)
-    reason = _with_new_gradients(qp, Point(lam, g), rule, steps, max_it, monitor)
+    reason = pcpg(qp, Point(lam, g), rule, steps, max_it, monitor)
     qp.coarse.project(g)
     norm = g.norm()
     if reason == ConvergedReason.DIVERGED_INDEFINITE_MAT and homogenised.is_rounding(norm):
@@ -359,24 +350,6 @@ def solve_by_pcpg(
     return result
 
 
-def _with_new_gradients(
-    qp: QP, point: Point, rule: StoppingRule, steps: Steps, max_it: int, monitor: Monitor
-) -> ConvergedReason:
-    """Run PCPG, restarted where directions end as long as that gains a digit. Collective.
-
-    Rounding of g at a λ that bends subdomains much farther than the solution does may end them.
-    """
-    least, r = np.inf, point.g.duplicate()
-    while True:
-        reason = pcpg(qp, point, rule, steps, max_it, monitor)
-        norm = bcast_from_root(point.lam.getComm().tompi4py(), _residual(qp, point.g, r))
-        if reason != ConvergedReason.DIVERGED_INDEFINITE_MAT or norm > DIGIT * least:
-            r.destroy()
-            return reason
-        least = norm
-        point.refresh(qp)
-
-
 def _face(qp: QP, lam: PETSc.Vec, g: PETSc.Vec) -> Face:
     """Return the face of λ."""
     return qp.feasible.face(lam.array_r, g.array_r)
@@ -387,13 +360,20 @@ def _examined(qp: QP, point: Point, rule: StoppingRule, norm: float) -> Converge
     return rule.examine(point.lam, point.g, _face(qp, point.lam, point.g), norm)
 
 
-def _begun(qp: QP, point: Point, own: Directions) -> float:
-    """Minimise q over directions of earlier solves; compute r there, and return ‖r‖."""
+def _begun(qp: QP, point: Point, own: Directions) -> tuple[RecycledOnFace | None, float]:
+    """Minimise q over directions of earlier solves; return these, if any, and ‖r‖."""
     norm = _residual(qp, point.g, own.r)
-    past = qp.recycled
-    if past is not None and past.go(point.lam, point.g, own.r, qp.coarse.project):
-        norm, own.fresh = _residual(qp, point.g, own.r), True
-    return norm
+    if qp.recycled is None or qp.recycled.count == 0:
+        return None, norm
+    past = RecycledOnFace(qp.recycled, qp.held)
+    if past.count == 0:
+        return None, norm
+    own.p.array[:], image = past.least(own.r.array_r)
+    qp.coarse.project(own.p)  # rounding of many directions is none of Gλ = e
+    point.lam.axpy(1.0, own.p)
+    point.g.array[:] += image
+    own.fresh = True
+    return past, _residual(qp, point.g, own.r)
 
 
 def _residual(qp: QP, g: PETSc.Vec, r: PETSc.Vec) -> float:

@@ -11,7 +11,7 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.qp.coarse import HELD, imbalance
 from tfeti_dolfinx.qp.homogenised import Homogenised
-from tfeti_dolfinx.qp.newton_faces import FaceSolve, FaceSolver, LocalProgram, Multipliers
+from tfeti_dolfinx.qp.newton_faces import FaceSolver, LocalProgram, Multipliers
 from tfeti_dolfinx.qp.parameters import NewtonParameters
 from tfeti_dolfinx.qp.problem import (
     QP,
@@ -23,13 +23,8 @@ from tfeti_dolfinx.qp.problem import (
     StoppingRule,
     no_monitor,
 )
-from tfeti_dolfinx.qp.projection import UNBALANCED, project_onto_feasible, project_or_least
+from tfeti_dolfinx.qp.projection import UNBALANCED, project_onto_feasible
 from tfeti_dolfinx.qp.sets import Face, Status
-
-# of the terms of q: what its differences may be wrong by
-ROUNDING = 1e-15
-# of a gradient: a projection that is shorter may be rounding
-SHORT = 1e-6
 
 # --- Step 0: start ----------------------------------------------------------------------------
 
@@ -57,8 +52,16 @@ def first_point(qp: QP) -> PETSc.Vec:
 
 
 def feasible_start(qp: QP, start: Start) -> PETSc.Vec:
-    """Step 0: the nearest feasible point to earlier multipliers. Collective."""
-    return project_or_least(qp.coarse, qp.feasible, start.lam).lam
+    """Step 0: the nearest feasible point to earlier multipliers, or the first. Collective.
+
+    From forces far beyond small discs, as the bounds of another load step are, the way to Gλ = e
+    has so many kinks that the projection may end before.
+    """
+    found = project_onto_feasible(qp.coarse, qp.feasible, start.lam)
+    if found.missing <= UNBALANCED:
+        return found.lam
+    found.lam.destroy()
+    return first_point(qp)
 
 
 def _has_friction(qp: QP, face: Face) -> bool:
@@ -85,7 +88,6 @@ class NewtonState:
         least: The last ‖g^P‖ that was half of the one before.
         idle: So many looks in a row have found neither q nor ‖g^P‖ lower.
         resume: Whether λ is where PCPG has stopped.
-        cautious: Whether dropping rows at the end of a way has raised q.
     """
 
     z: Multipliers
@@ -98,7 +100,6 @@ class NewtonState:
     least: float = np.inf
     idle: int = 0
     resume: bool = False
-    cautious: bool = False
 
 
 class _Newton:
@@ -124,22 +125,15 @@ class _Newton:
     def look(self) -> None:
         """Step 1: how far a gradient step, brought back to the feasible set, moves."""
         state, program = self.state, self.program
-        if self.solver.norm == 0.0:
+        if self.solver.directions.norm == 0.0:
             self._learn_norm()
-        state.norm = self.solver.norm or 1.0
+        state.norm = self.solver.directions.norm or 1.0
         if state.resume:
-            mu = self.solver.multipliers(state.z.g)
-            s = state.z.g - program.normal(mu)
-            # of motions that the face does not see μ is rounding over rounding
-            sizes = program.dot((s, s), (state.z.g, state.z.g))
-            state.mu = mu if sizes[0] <= self.parameters.unseen**2 * sizes[1] else 0.0 * mu
+            state.mu = self.solver.multipliers(state.z.g)
         # not λ − ᾱ(Fλ − d): what Gᵀμ takes from it may be large
         state.s = state.z.g - program.normal(state.mu)
-        target = program.vec(state.z.lam - state.s / state.norm)
-        found = project_onto_feasible(self.coarse, self.feasible, target)
-        state.back = np.array(found.lam.array_r)
-        found.lam.destroy()
-        state.mu = state.mu + state.norm * found.alpha
+        state.back, alpha, _ = program.projected(state.z.lam - state.s / state.norm)
+        state.mu = state.mu + state.norm * alpha
         state.s = state.z.g - program.normal(state.mu)
         moved = state.z.lam - state.back
         square, size = program.dot((moved, moved), (state.z.lam, state.z.lam))
@@ -175,10 +169,10 @@ class _Newton:
         self.coarse.project(Ps)
         p, g_d = np.array(Ps.array_r), z.g + program.qp.d.array_r
         energy, size, pp, gg = program.dot((z.lam, g_d), (z.lam, z.lam), (p, p), (z.g, z.g))
-        self.solver.saw(energy, size)
-        if pp > SHORT**2 * gg:
+        self.solver.directions.seen(energy, size)
+        if pp > self.parameters.short**2 * gg:
             (curvature,) = program.dot((p, program.F(p)))
-            self.solver.saw(curvature, pp)
+            self.solver.directions.seen(curvature, pp)
 
     def pressed_face(self) -> Face:
         """Return the face of λ̂: a row that carries less than it is open by, λ_i < ᾱs_i, is open.
@@ -223,7 +217,7 @@ class _Newton:
         (double,) = self.program.dot((z.lam - to.lam, to.g - z.g + 2.0 * self.state.s))
         return 0.5 * double
 
-    def accept(self, trial: FaceSolve) -> bool:
+    def accept(self, end: Multipliers, feasible: bool) -> bool:
         """Step 4: go where q falls enough; return whether q could be lowered.
 
         That is the end of step 3, else the projected gradient step or the part of it where q is
@@ -234,12 +228,11 @@ class _Newton:
         enough = self.parameters.enough * 0.5 / state.norm * state.residual**2 if looked else 0.0
         # on circles s and λ are both large: their product's rounding hides changes of q
         (hidden,) = self.program.dot((np.abs(state.z.lam), np.abs(state.s)))
-        gain = self.gain(trial.last)
-        taken = trial.feasible and gain >= enough - ROUNDING * hidden
-        state.cautious = self.parameters.cautious and not taken and trial.rounds > 1
+        gain = self.gain(end)
+        taken = feasible and gain >= enough - self.parameters.hidden * hidden
         state.resume = taken
         if taken:
-            self._go(trial.last, gain)
+            self._go(end, gain)
         if not taken and not looked:
             self.look()
         return taken or self._descend()
@@ -252,7 +245,7 @@ class _Newton:
         slope, curvature, size = self.program.dot((-state.s, p), (p, Fp), (p, p))
         if size <= 0.0 or slope <= 0.0:
             return False
-        self.solver.saw(curvature, size)
+        self.solver.directions.seen(curvature, size)
         length = min(1.0, slope / curvature) if curvature > 0.0 else 1.0
         lam = self.feasible.project(z.lam + length * p)
         self._go(Multipliers(lam, z.g + length * Fp), 0.5 * length * slope)
@@ -262,7 +255,7 @@ class _Newton:
         """Move to a point where q is lower by ``gain``."""
         z = self.state.z
         work, load = self.program.dot((z.lam, z.g), (z.lam, self.program.qp.d.array_r))
-        if gain > ROUNDING * (abs(work) + abs(load)):
+        if gain > self.parameters.hidden * (abs(work) + abs(load)):
             self.state.idle = 0
         self.state.z = to
 
@@ -355,11 +348,11 @@ def newton(
             # Step 2: the face
             first, face = method.wanted_face()
         # Step 3: solve on the face, drop what leaves Ω, restore Gλ = e
-        trial = solver.solve(first, face, state.residual, state.resume, state.cautious)
+        end, feasible = solver.solve(first, face, state.residual, state.resume)
         # Step 4: accept where q falls enough
         if solver.excluding is not None:
             reason = ConvergedReason.DIVERGED_CONTRADICTION
-        elif not method.accept(trial) or state.idle >= parameters.patience:
+        elif not method.accept(end, feasible) or state.idle >= parameters.patience:
             reason = ConvergedReason.DIVERGED_ROUNDING
         steps.outer, looks = steps.outer + 1, True
     lam, s = method.vectors()

@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from tfeti_dolfinx.common.arrays import TINY, Array
+from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import any_rank, largest, summed
 from tfeti_dolfinx.qp.coarse import HELD, Coarse, imbalance
 from tfeti_dolfinx.qp.krylov import Directions, pcpg
@@ -25,18 +25,8 @@ from tfeti_dolfinx.qp.problem import (
     StoppingRule,
     TargetRule,
 )
-from tfeti_dolfinx.qp.projection import WithinFace, project_onto_feasible, project_within_face
+from tfeti_dolfinx.qp.projection import ConvexSet, OnBoundary, project_onto_feasible
 from tfeti_dolfinx.qp.sets import Face, without_slip
-
-# of a way, beyond its first bound: what blocks it is out there, what goes inwards is off its bound
-ONWARDS = 1e-12
-# of the way to the first bound, where hardly any curvature ends it: more rows than one are to leave
-BEYOND = 10.0
-# of d: rows that want gaps so far apart exclude each other, less may be rounding; of the largest
-# force of such a direction: rows with less have no part in it; and how far it is followed
-APART, TAKES_PART, FAR = 1e-8, 1e-3, 1e30
-# of ‖F‖‖w‖: what may be left of Fw where F is not to see w, and most multiplications for that
-UNSEEN, PURIFYING = 1e-14, 200
 
 # --- Points and products as numpy arrays ------------------------------------------------------
 
@@ -52,12 +42,6 @@ class Multipliers:
 
     lam: Array
     g: Array
-
-    def towards(self, end: Multipliers, share: float) -> Multipliers:
-        """Return the point at this share of the way to another one."""
-        return Multipliers(
-            self.lam + share * (end.lam - self.lam), self.g + share * (end.g - self.g)
-        )
 
 
 class LocalProgram:
@@ -100,13 +84,16 @@ class LocalProgram:
         self.qp.coarse.combine(mu, self._y)
         return np.array(self._y.array_r)
 
-    def projected(self, z: Multipliers, within: WithinFace | None = None) -> tuple[Array, bool]:
-        """Return the nearest point of Ω, or of a part, with Gλ = e; and whether it has that."""
-        onto = within or self.qp.feasible
-        found = project_onto_feasible(self.qp.coarse, onto, self.vec(z.lam))
-        lam = np.array(found.lam.array_r)
+    def projected(self, lam: Array, onto: ConvexSet | None = None) -> tuple[Array, Array, float]:
+        """Return the nearest point to λ of a set, by default Ω, with Gλ = e.
+
+        Returns:
+            The point λ̂ = P(λ + Gᵀα), α, and how far Gλ̂ is from e.
+        """
+        found = project_onto_feasible(self.qp.coarse, onto or self.qp.feasible, self.vec(lam))
+        values = np.array(found.lam.array_r)
         found.lam.destroy()
-        return lam, found.missing <= HELD
+        return values, found.alpha, found.missing
 
     def any(self, flags: Array) -> bool:
         """Return whether a flag is set on some rank."""
@@ -142,21 +129,6 @@ class CurvedHessian:
 # --- Solves on faces --------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class FaceSolve:
-    """Result of the solves on faces of one Newton step.
-
-    Attributes:
-        last: Where PCPG ended on the last face.
-        feasible: Whether ``last`` is in Ω and fulfils Gλ = e.
-        rounds: Number of solves.
-    """
-
-    last: Multipliers
-    feasible: bool
-    rounds: int
-
-
 class FaceSolver:
     """PCPG on faces; keeps projectors, preconditioner and directions while the face stays.
 
@@ -169,6 +141,7 @@ class FaceSolver:
         monitor: Called after each.
 
     Attributes:
+        directions: Those of PCPG, with an estimate of ‖F‖.
         left: ‖P_f(Fλ − d)‖ where PCPG has stopped.
         excluding: Local rows that exclude each other, if a solve has found that; else None.
     """
@@ -185,65 +158,49 @@ class FaceSolver:
         self._program, self._qp, self._rule = program, program.qp, rule
         self._parameters, self._steps, self._max_it = parameters, steps, max_it
         self._monitor = monitor
-        self._directions = Directions(self._qp.d, self._qp.keeps)
-        self._directions.norm = self._qp.seen
+        self.directions = Directions(self._qp.d, self._qp.keeps)
+        self.directions.norm = self._qp.seen
         self._point = Point(self._qp.d.duplicate(), self._qp.d.duplicate())
         self._face: Face | None = None
         self._on_face, self._preconditioner = self._qp, cast(FaceOperator | None, None)
         self.left, self.excluding = np.inf, cast(Array | None, None)
-
-    @property
-    def norm(self) -> float:
-        """Largest Rayleigh quotient of F seen; at most ‖F‖."""
-        return self._directions.norm
-
-    def saw(self, curvature: float, size: float) -> None:
-        """Update the estimate of ‖F‖ by another Rayleigh quotient."""
-        self._directions.seen(curvature, size)
 
     def multipliers(self, g: Array) -> Array:
         """Return the μ of the face entered: (G_fG_fᵀ)⁺G_fZᵀg, replicated. Collective."""
         return self._on_face.coarse.coordinates(self._program.vec(g))
 
     def solve(
-        self, start: Multipliers, face: Face, optimality: float, resume: bool, cautious: bool
-    ) -> FaceSolve:
-        """Solve on a face; drop what leaves Ω, restore Gλ = e, solve again. Collective.
+        self, start: Multipliers, face: Face, optimality: float, resume: bool
+    ) -> tuple[Multipliers, bool]:
+        """Step 3: solve on a face; drop what leaves Ω, restore Gλ = e, solve again. Collective.
 
         Args:
             start: A feasible point of the face.
             face: The face.
             optimality: ‖g^P‖ there.
             resume: Whether PCPG has stopped at ``start``: it goes on if the face stays.
-            cautious: Whether rows leave a flat face as they block the way, not all that are out at
-                its end: q falls for certain then, but fewer leave for as many solves.
+
+        Returns:
+            Where PCPG ended on the last face, and whether that is in Ω and fulfils Gλ = e.
         """
-        feasible, z, rounds = self._qp.feasible, start, 0
-        stays = self._enter(face) and resume
+        z, stays = start, self._enter(face) and resume
         while True:
-            # PCPG on the face
+            # Step 3a: PCPG on the face; where F does not see a direction, along it past a bound
             end, broken = self._pcpg(z, optimality, stays)
-            rounds, stays = rounds + 1, False
             if broken and not self._has_left(end):
                 end = self._along_null_space(end)
-            out = self._has_left(end)
-            if not out or rounds == self._parameters.most_rounds or self._ended:
+            # Step 3b: rows that have left Ω leave the face, where Gλ = e is restored
+            out, stays = self._has_left(end), False
+            if not out or self._ended:
                 break
-            # rows that have left Ω leave the face, and Gλ = e is restored in the smaller one
-            if not self._curved and cautious:
-                z = self._up_to_bound(z, end, 1.0)
-                self._enter(feasible.face(z.lam, z.g))
-                continue
-            if not broken and not self._curved and self._is_loose(z, end):
-                end = self._up_to_bound(z, end, BEYOND)
-            smaller = self._restored(feasible.project(end.lam), end.g)
-            if smaller is None:
-                break
-            z = smaller
+            z = self._restored(end)
+        # Step 3c: slipping rows, which followed their tangents, come back onto their boundary
         if self._curved and not out:
-            end, held = self._onto_boundary(end)
-            out = not held
-        return FaceSolve(end, not out, rounds)
+            assert self._face is not None
+            boundary = OnBoundary(self._qp.feasible, self._face)
+            lam, _, missing = self._program.projected(end.lam, boundary)
+            end, out = self._program.moved(end, lam), missing > HELD
+        return end, not out
 
     @property
     def _ended(self) -> bool:
@@ -269,45 +226,32 @@ class FaceSolver:
     def _set_face(self, face: Face, coarse: Coarse) -> None:
         curved = any_rank(self._program.comm, face.curved)
         F = CurvedHessian(self._qp.F, face) if curved else self._qp.F
-        past = None if curved or self._qp.recycled is None else self._qp.recycled.on(face)
+        past = None if curved else self._qp.recycled
         self._face = face
-        self._on_face = replace(self._qp, F=F, coarse=coarse, preconditioner=None, recycled=past)
+        self._on_face = replace(self._qp, F=F, coarse=coarse, recycled=past, held=face.held)
 
-    def _restored(self, on: Array, g: Array) -> Multipliers | None:
-        """Return the point of the face of ``on`` with Gλ = e next to it; one multiplication by F.
+    def _restored(self, end: Multipliers) -> Multipliers:
+        """Enter the face of P_Ω(λ), and return its point next to that with Gλ = e.
 
-        Where the smaller face no longer holds a body, the nearest feasible point within the one
-        before names rows that do. None where there is no such point.
+        Where that face holds a body no longer, the nearest feasible point names rows that do.
+        Multiplies by F once.
         """
-        qp, program, before = self._qp, self._program, self._face
-        assert before is not None
-        self._enter(qp.feasible.face(on, g))
+        qp, program = self._qp, self._program
+        on = qp.feasible.project(end.lam)
+        self._enter(qp.feasible.face(on, end.g))
         coarse = self._on_face.coarse
-        missing = qp.coarse.residual(program.vec(on))
-        coarse.combine(coarse.solve(missing), self._point.lam)
+        coarse.combine(coarse.solve(qp.coarse.residual(program.vec(on))), self._point.lam)
         lam = on + self._point.lam.array_r
         if imbalance(qp.coarse, program.vec(lam)) > HELD:
-            near = project_within_face(qp.coarse, qp.feasible, before, program.vec(on))
-            lam = np.array(near.array_r)
-            near.destroy()
+            lam, *_ = program.projected(on)
             on = 0.5 * (on + lam)
-            self._enter(qp.feasible.face(on, g))
+            self._enter(qp.feasible.face(on, end.g))
         z = program.refreshed(lam)
         if self._curved and self._face is not None:
-            self._set_face(self._bent(on, z.g), self._on_face.coarse)
+            s = z.g - program.normal(self.multipliers(z.g))
+            curvature = qp.feasible.face(on, s).curvature
+            self._set_face(replace(self._face, curvature=curvature), self._on_face.coarse)
         return z
-
-    def _bent(self, on: Array, g: Array) -> Face:
-        """Return the face entered with the curvature κ of another gradient."""
-        assert self._face is not None
-        s = g - self._program.normal(self.multipliers(g))
-        return replace(self._face, curvature=self._qp.feasible.face(on, s).curvature)
-
-    def _is_loose(self, z: Multipliers, end: Multipliers) -> bool:
-        """Return whether F hardly sees a way, which goes far then: rows depend on each other."""
-        way = end.lam - z.lam
-        curvature, size = self._program.dot((way, end.g - z.g), (way, way))
-        return curvature <= self._parameters.loose * self.norm * size
 
     def _has_left(self, z: Multipliers) -> bool:
         """Return whether rows that do not slip are outside of Ω."""
@@ -315,92 +259,52 @@ class FaceSolver:
         apart = self._qp.feasible.project(z.lam) - z.lam
         return self._program.any(without_slip(self._face, apart) != 0.0)
 
-    def _to_a_bound(self, lam: Array, way: Array) -> float:
-        """Return the largest t with λ + t·way ∈ Ω, maybe infinite; rounding ends no way."""
+    def _to_a_bound(self, lam: Array, way: Array, slips: bool = False) -> float:
+        """Return the largest t with λ + t·way ∈ Ω, maybe infinite; rounding ends no way.
+
+        Rows that slip bound it only if ``slips``.
+        """
         assert self._face is not None
-        held, small = without_slip(self._face, way), self._parameters.rounding
+        held, small = way if slips else without_slip(self._face, way), self._parameters.rounding
         held = np.where(np.abs(held) > small * largest(self._program.comm, way), held, 0.0)
         own = self._qp.feasible.max_step(lam, -held)
         return float(self._program.comm.allreduce(max(own, 0.0), op=MPI.MIN))
 
-    def _up_to_bound(self, z: Multipliers, end: Multipliers, times: float) -> Multipliers:
-        """Return where the segment from z leaves Ω, or so many times as far, in Ω.
-
-        What blocks it is at its bound there. Once as far q is lower, Gλ = e is kept, and F
-        multiplied by nothing.
-        """
-        length = self._to_a_bound(z.lam, end.lam - z.lam)
-        # what has just come into the face, at its bound as yet, stays in it if it goes inwards
-        part = z.towards(end, min(times * length + ONWARDS, 1.0))
-        return Multipliers(self._qp.feasible.project(part.lam), part.g)
-
     def _along_null_space(self, z: Multipliers) -> Multipliers:
         """Go beyond a bound along a direction without curvature, where PCPG has found one.
 
-        Rows depend on each other. Where no bound ends the way, neither F nor G sees it and q falls
-        along it, they want gaps that exclude each other: ``excluding`` says so.
+        Rows depend on each other. Where nothing ends the way, F does not see it and q falls along
+        it, they want gaps that exclude each other: ``excluding`` says so.
         """
-        program, own, qp = self._program, self._directions, self._qp
+        program, own = self._program, self.directions
         for vec in (own.p, own.r):
             way = np.array(vec.array_r)
-            size = largest(program.comm, way)
             Fw = program.F(way)
             curvature, square = program.dot((way, Fw), (way, way))
-            if size == 0.0 or own.seen(curvature, square):
+            if square == 0.0 or own.seen(curvature, square):
                 continue
-            way, Fw = self._unseen(way, Fw)
             length = self._to_a_bound(z.lam, way)
             if np.isfinite(length):
-                return Multipliers(z.lam + BEYOND * length * way, z.g + BEYOND * length * Fw)
-            # in the cone of recession of Ω
-            p = qp.feasible.project(FAR / size * way) * (size / FAR)
-            Pp = program.vec(p)
-            qp.coarse.project(Pp)
-            Qp, d = p - Pp.array_r, qp.d.array_r
-            Fp = program.F(p)
-            FF, QQ, pp, pd, dd = program.dot((Fp, Fp), (Qp, Qp), (p, p), (p, d), (d, d))
-            unseen = max(FF / max(self.norm, TINY) ** 2, QQ) <= self._parameters.rounding**2 * pp
-            if pp > 0.0 and unseen and pd > APART * np.sqrt(dd * pp):
-                most = largest(program.comm, p)
-                self.excluding = np.flatnonzero(np.abs(p) > TAKES_PART * most)
+                return Multipliers(
+                    z.lam + self._parameters.beyond * length * way,
+                    z.g + self._parameters.beyond * length * Fw,
+                )
+            d = self._qp.d.array_r
+            falls, size, seen = program.dot((way, d), (d, d), (Fw, Fw))
+            unseen = seen <= (self._parameters.rounding * own.norm) ** 2 * square
+            endless = np.isinf(self._to_a_bound(z.lam, way, slips=True))
+            if unseen and endless and falls > self._parameters.apart * np.sqrt(size * square):
+                most = largest(program.comm, way)
+                self.excluding = np.flatnonzero(np.abs(way) > self._parameters.takes_part * most)
             break
         return z
-
-    def _unseen(self, way: Array, Fw: Array) -> tuple[Array, Array]:
-        """Return w − (PFP)⁺Fw by PCPG, with its image: the part of w ≠ 0 that F does not see.
-
-        What PCPG has left of the others in w is small beside it, but its bounds would end the way.
-        """
-        own, program = Directions(self._qp.d), self._program
-        on_face = replace(self._on_face, F=self._qp.F, preconditioner=self._preconditioner)
-        point = Point(self._qp.d.duplicate(), self._qp.d.duplicate())
-        point.g.array[:] = -Fw
-        (square,) = program.dot((way, way))
-        exact = TargetRule(UNSEEN * self.norm * float(np.sqrt(square)))
-        on_face = replace(on_face, d=-point.g, recycled=None)
-        pcpg(on_face, point, exact, Steps(), PURIFYING, directions=own)
-        way, Fw = way - point.lam.array_r, -np.array(point.g.array_r)
-        for held in (own, point, on_face.d):
-            held.destroy()
-        return way, Fw
-
-    def _onto_boundary(self, z: Multipliers) -> tuple[Multipliers, bool]:
-        """Retract z to Gz = e with slipping points on their boundaries; one multiplication by F.
-
-        Returns:
-            The point, and whether there is one near by.
-        """
-        assert self._face is not None
-        within = WithinFace(self._qp.feasible, self._face, slipping=True)
-        lam, held = self._program.projected(z, within)
-        return self._program.moved(z, lam), held
 
     def _pcpg(self, z: Multipliers, optimality: float, resume: bool) -> tuple[Multipliers, bool]:
         """Run PCPG on the face entered; return its end, and whether rounding has ended it."""
         if self._preconditioner is None and self._qp.preconditioner_on is not None:
             assert self._face is not None
             self._preconditioner = self._qp.preconditioner_on(self._face)
-        on_face, own = replace(self._on_face, preconditioner=self._preconditioner), self._directions
+        on_face, own = replace(self._on_face, preconditioner=self._preconditioner), self.directions
         own.fresh = own.fresh or not resume or self._curved
         self._point.lam.array[:], self._point.g.array[:] = z.lam, z.g
         z_residual = self._program.vec(z.g)
@@ -429,5 +333,5 @@ class FaceSolver:
     def destroy(self) -> None:
         """Free what it holds. Collective."""
         self._leave()
-        self._directions.destroy()
+        self.directions.destroy()
         self._point.destroy()

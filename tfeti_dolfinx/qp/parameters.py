@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from tfeti_dolfinx.common.validation import ABOVE_0, Range, described
-from tfeti_dolfinx.qp.mprgp import EXPANSIONS, Expansion, MprgpParameters
+from tfeti_dolfinx.qp.mprgp import MprgpParameters
 
 
 @dataclass(frozen=True)
@@ -16,14 +16,15 @@ class NewtonParameters:
         enough: Share of (ᾱ/2)‖g^P‖², which the gradient step promises, that a step lowers q by.
         final: Of the rule's tolerance: what no solve goes below, as ‖g^P‖ is not quite ‖P_f g‖.
         stage: What a solve on a face that stays reduces its residual to, before step 1 looks at it.
-        loose: Of ‖F‖: curvature of a way; less is nearly none, and the way far.
-        cautious: Whether rows leave a flat face one by one after a step that has raised q.
-        most_rounds: Solves on smaller and smaller faces of one step; each drops one row at least.
         patience: Steps in a row that neither halve ‖g^P‖ nor lower q beyond its rounding.
-        unseen: Of the gradient: multipliers of Gλ = e that make it longer than that are rounding of
-            motions that a face does not see.
         lost: Of ‖F‖‖λ‖: what rounding of λ − ᾱs leaves of ‖g^P‖.
         rounding: Of the largest entry of a way: less is none.
+        hidden: Of the terms of q: what its differences may be wrong by.
+        short: Of a gradient: a projection that is shorter may be rounding.
+        beyond: Of the way to the first bound, where no curvature ends it: more rows than one are
+            to leave.
+        apart: Of ‖d‖: rows that want gaps so far apart exclude each other, less may be rounding.
+        takes_part: Of the largest force of such a direction: rows with less have no part in it.
     """
 
     gamma: float = described(
@@ -44,20 +45,27 @@ class NewtonParameters:
     enough: float = 0.1
     final: float = 0.9
     stage: float = 0.1
-    loose: float = 1e-8
-    cautious: bool = True
-    most_rounds: int = 60
     patience: int = 10
     lost: float = 2e-15
-    unseen: float = 1e6
     rounding: float = 1e-10
+    hidden: float = 1e-15
+    short: float = 1e-6
+    beyond: float = 10.0
+    apart: float = 1e-8
+    takes_part: float = 1e-3
 
 
 @dataclass(frozen=True)
 class SmalseParameters:
     """Parameters of SMALSE-M and of its inner MPRGP, for F scaled to ‖PFP‖ = 1.
 
-    Each says itself what it is; ``expansion`` may be a function of one's own, too.
+    Attributes:
+        enough: Of the rule's tolerance: inner problems are not solved more exactly, as M may be
+            too small.
+        rounding: Of the Lagrangian: what its value may be wrong by.
+        change: Where nothing fulfils Bx = 0, ‖Bx‖ tends to a limit: a change by less than this
+            share is none; the slowest scenes change by 1e-3 a step.
+        patience: Outer steps without a change of ‖Bx‖ and M that are a stall.
     """
 
     rho: float = described(
@@ -93,15 +101,11 @@ class SmalseParameters:
         symbol="ᾱ",
         fits=Range("more than 0, at most 2", lambda value: 0.0 < value <= 2.0),
     )
-    expansion: str | Expansion = described(
-        "fixed",
-        "mprgp",
-        "expansion step: fixed, or projcg",
-        name="mpgp_expansion",
-        choices=tuple(EXPANSIONS),
-    )
+    enough: float = 1e-3
+    rounding: float = 1e-14
+    change: float = 1e-3
+    patience: int = 1000
 
     def inner(self, norm: float) -> MprgpParameters:
-        """Parameters of MPRGP for an operator A of this norm."""
-        expand = EXPANSIONS[self.expansion] if isinstance(self.expansion, str) else self.expansion
-        return MprgpParameters(self.alpha_bar / norm, self.gamma, expand)
+        """Parameters of MPRGP for an operator F of this norm."""
+        return MprgpParameters(self.alpha_bar / (max(norm, self.rho * norm) or 1.0), self.gamma)

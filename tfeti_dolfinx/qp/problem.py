@@ -12,7 +12,7 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.qp.coarse import Coarse
-from tfeti_dolfinx.qp.recycling import RecycledOnFace
+from tfeti_dolfinx.qp.recycling import Recycled
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet
 
 # --- The quadratic program and its result -----------------------------------------------------
@@ -49,6 +49,7 @@ class QP:
             the face in the layout of all rows; or None.
         seen: Largest Rayleigh quotient of F that earlier solves have seen; 0 if there were none.
         recycled: Directions of earlier solves, which those of PCPG are made F-orthogonal to.
+        held: Flags of the local rows that are 0 on the face of ``coarse``; None: of no face.
         keeps: Whether a direction of PCPG is made conjugate to all before it, not the last alone.
     """
 
@@ -60,7 +61,8 @@ class QP:
     norm: float = 1.0
     preconditioner_on: Callable[[Face], FaceOperator] | None = None
     seen: float = 0.0
-    recycled: RecycledOnFace | None = None
+    recycled: Recycled | None = None
+    held: Array | None = None
     keeps: bool = True
 
 

@@ -12,32 +12,50 @@ from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root
-from tfeti_dolfinx.qp.coarse import HELD, Coarse, imbalance
+from tfeti_dolfinx.qp.coarse import Coarse, imbalance
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
 
-# points looked at: far more than Newton takes where it converges, so that a cycle ends
-MAX_TRIALS = 300
-# of the terms of Gλ − e: what the coarse problem's factors leave at best
-BALANCED = 1e-13
-# of the same: below that, a step that leaves more than this share has met the damping, a kink or,
-# if so many in a row do so with the least damping, rounding
-NEARLY, SLOW, SLOWLY = 1e-6, 0.1, 8
-# of GGᵀ, added to G_f G_fᵀ: keeps steps regular where few rows carry a force, and is small beside
-# 1, so that they stay Newton's; where bodies are hardly held it slows the end down, and the
-# smallest that a factor bears takes its place
-DAMPING, LEAST_DAMPING = 1e-8, 1e-14
-# factor on it after a whole step that has met no row but the damping: those of the face may be so
-# soft beside open ones that they hold by less
-EASED = 0.01
-# a step of this share of Newton's changes nothing that is left above rounding
-SHORTEST = 1e-8
-# of the slope at its start: a whole step that leaves as much has met no row but the damping; after
-# so many in a row it is far beyond y, and nothing in Ω fulfils Gλ = e but for rounding
-LEFT, PATIENCE = 0.5, 10
 # far more than what factors leave of Gλ = e
 UNBALANCED = 1e-3
-# of the cost: what rounding may add to it
-ROUNDING = 1e-14
+
+
+@dataclass(frozen=True)
+class ProjectionParameters:
+    """Parameters of the projection onto {λ ∈ Ω, Gλ = e}.
+
+    Attributes:
+        max_trials: Points looked at: far more than Newton takes where it converges.
+        balanced: Of the terms of Gλ − e: what the coarse problem's factors leave at best.
+        nearly: Of the same: below it a step that leaves more than ``slow`` has met the damping, a
+            kink, or rounding.
+        slow: Share of what is left.
+        slowly: So many such steps in a row, with the least damping, and rounding has ended it.
+        damping: Of GGᵀ, added to G_f G_fᵀ: keeps steps regular where few rows carry a force, and
+            is small beside 1, so that they stay Newton's.
+        least_damping: The smallest that a factor bears: where bodies are hardly held.
+        eased: Factor on the damping after a whole step that has met no row but it: those of the
+            face may be so soft beside open ones that they hold by less.
+        shortest: Of Newton's step: less changes nothing that is left above rounding.
+        left: Of the slope at its start: a whole step that leaves as much has met only the damping.
+        patience: After so many of these in a row nothing in Ω fulfils Gλ = e but for rounding.
+        rounding: Of the cost: what rounding may add to it.
+    """
+
+    max_trials: int = 300
+    balanced: float = 1e-13
+    nearly: float = 1e-6
+    slow: float = 0.1
+    slowly: int = 8
+    damping: float = 1e-8
+    least_damping: float = 1e-14
+    eased: float = 0.01
+    shortest: float = 1e-8
+    left: float = 0.5
+    patience: int = 10
+    rounding: float = 1e-14
+
+
+DEFAULT = ProjectionParameters()
 
 
 class ConvexSet(Protocol):
@@ -71,8 +89,7 @@ def project_onto_feasible(
     coarse: Coarse,
     feasible: ConvexSet,
     y: PETSc.Vec,
-    alpha: Array | None = None,
-    max_trials: int = MAX_TRIALS,
+    parameters: ProjectionParameters = DEFAULT,
 ) -> FeasiblePoint:
     """Project y onto {λ ∈ Ω, Gλ = e}, or come as close to that set as possible. Collective.
 
@@ -94,93 +111,63 @@ def project_onto_feasible(
         coarse: Gλ = e on all rows.
         feasible: The set Ω.
         y: Any point.
-        alpha: Where to start.
-        max_trials: Points looked at, at most.
+        parameters: Parameters.
 
     Returns:
         The point; where nothing in Ω fulfils Gλ = e, or α does not converge, it misses some of e:
         ``missing`` says so.
     """
     comm = y.getComm().tompi4py()
-    trial = _trial(coarse, feasible, y, np.zeros(coarse.dimension) if alpha is None else alpha)
-    damping, trials, unmet, slowly, least = DAMPING, 1, 0, 0, trial.left
-    while trials < max_trials and unmet < PATIENCE:
+    trial = _trial(coarse, feasible, y, np.zeros(coarse.dimension))
+    damping, trials, unmet, slowly, least = parameters.damping, 1, 0, 0, trial.left
+    while trials < parameters.max_trials and unmet < parameters.patience:
         scale = float(np.linalg.norm(coarse.forces(trial.lam)))
-        if bcast_from_root(comm, trial.left <= BALANCED * scale):
+        if bcast_from_root(comm, trial.left <= parameters.balanced * scale):
             break
         face = feasible.face(trial.lam.array_r, trial.lam.array_r - trial.z)
         step = coarse.damped_solve(face.damped(), trial.residual, damping)
         slope = float(trial.residual @ step)
-        trial, length, tried = _searched(coarse, feasible, y, trial, step)
+        trial, length, tried = _searched(coarse, feasible, y, trial, step, parameters)
         trials += tried
-        whole = bcast_from_root(comm, length == 1.0 and float(trial.residual @ step) > LEFT * slope)
+        left = float(trial.residual @ step)
+        whole = bcast_from_root(comm, length == 1.0 and left > parameters.left * slope)
         unmet = unmet + 1 if whole else 0
         if whole:
-            damping = max(EASED * damping, LEAST_DAMPING)
+            damping = max(parameters.eased * damping, parameters.least_damping)
         elif length < 1.0 and slowly == 0:
-            damping = DAMPING
-        slow = bcast_from_root(comm, trial.left > SLOW * least and trial.left <= NEARLY * scale)
+            damping = parameters.damping
+        near = trial.left <= parameters.nearly * scale
+        slow = bcast_from_root(comm, near and trial.left > parameters.slow * least)
         slowly, least = slowly + 1 if slow else 0, min(least, trial.left)
-        if bcast_from_root(comm, length <= SHORTEST) or slowly > SLOWLY:
+        if bcast_from_root(comm, length <= parameters.shortest) or slowly > parameters.slowly:
             break
         if slow:
-            damping = LEAST_DAMPING
+            damping = parameters.least_damping
     return FeasiblePoint(trial.lam, trial.alpha, imbalance(coarse, trial.lam))
 
 
-def project_or_least(coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec) -> FeasiblePoint:
-    """Return the nearest point to y of {λ ∈ Ω, Gλ = e}; the least such λ where that is not found.
+class OnBoundary:
+    """Points of Ω whose open rows are those of a face, its slipping ones on their boundary.
 
-    From forces far beyond small discs, as the bounds of another load step are, the way to Gλ = e
-    has so many kinks that ``nearest`` may end before. From 0 it has few. Collective.
-    """
-    found = project_onto_feasible(coarse, feasible, y)
-    if bcast_from_root(y.getComm().tompi4py(), found.missing <= UNBALANCED):
-        return found
-    zero = y.duplicate()
-    zero.set(0.0)
-    least = project_onto_feasible(coarse, feasible, zero)
-    zero.destroy()
-    better = bcast_from_root(y.getComm().tompi4py(), least.missing < found.missing)
-    (found if better else least).lam.destroy()
-    return least if better else found
-
-
-def project_within_face(
-    coarse: Coarse, feasible: FeasibleSet, face: Face, y: PETSc.Vec
-) -> PETSc.Vec:
-    """The nearest point to y of a face and Gλ = e; of all Ω where the face has none. Collective."""
-    found = project_onto_feasible(coarse, WithinFace(feasible, face), y)
-    if found.missing > HELD:
-        found.lam.destroy()
-        found = project_or_least(coarse, feasible, y)
-    return found.lam
-
-
-class WithinFace:
-    """Those points of Ω whose open rows are those of a face, at least.
+    They make no convex set, but what ``project_onto_feasible`` minimises is convex with any set.
 
     Args:
         feasible: The set Ω.
         face: The face.
-        slipping: Whether its slipping rows stay on their boundary, too. They do not make a convex
-            set then, but what ``nearest`` minimises is convex with any set.
     """
 
-    def __init__(self, feasible: FeasibleSet, face: Face, slipping: bool = False) -> None:
-        self._feasible, self._open = feasible, ~face.carrying
-        kept = face.status if slipping else np.where(self._open, Status.OPEN, Status.FREE)
-        self._status = kept
+    def __init__(self, feasible: FeasibleSet, face: Face) -> None:
+        self._feasible, self._kept = feasible, face
 
     def project(self, x: Array) -> Array:
         """P_Ω(x), but for the rows that stay."""
-        return self._feasible.onto(x, self._status)
+        return self._feasible.onto(x, self._kept.status)
 
     def face(self, x: Array, g: Array) -> Face:
         """Return the face of x, without the rows that stay open."""
-        face = self._feasible.face(x, g)
-        kept = np.flatnonzero(abs(face.Z).T @ self._open.astype(float) == 0.0)
-        status = np.where(self._open, Status.OPEN, face.status)
+        face, is_open = self._feasible.face(x, g), ~self._kept.carrying
+        kept = np.flatnonzero(abs(face.Z).T @ is_open.astype(float) == 0.0)
+        status = np.where(is_open, Status.OPEN, face.status)
         return Face(csr_array(face.Z[:, kept]), face.curvature[kept], status)
 
 
@@ -212,7 +199,12 @@ def _trial(coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec, alpha: Array) -> _
 
 
 def _searched(
-    coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec, start: _Trial, step: Array
+    coarse: Coarse,
+    feasible: ConvexSet,
+    y: PETSc.Vec,
+    start: _Trial,
+    step: Array,
+    parameters: ProjectionParameters,
 ) -> tuple[_Trial, float, int]:
     """Halve the step until it does not raise the cost; destroys the start.
 
@@ -225,8 +217,9 @@ def _searched(
     comm, length, tried = y.getComm().tompi4py(), 1.0, 0
     while True:
         trial, tried = _trial(coarse, feasible, y, start.alpha + length * step), tried + 1
-        fell = trial.cost <= start.cost + ROUNDING * abs(start.cost)
-        if bcast_from_root(comm, fell or float(trial.residual @ step) >= 0.0 or length <= SHORTEST):
+        fell = trial.cost <= start.cost + parameters.rounding * abs(start.cost)
+        fell = fell or float(trial.residual @ step) >= 0.0
+        if bcast_from_root(comm, fell or length <= parameters.shortest):
             start.lam.destroy()
             return trial, length, tried
         trial.lam.destroy()

@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root, summed
-from tfeti_dolfinx.qp.sets import Face
 
-# of the energy of a direction: what stands out from those that are kept; where less does, rounding
-# of their images would grow from one to the next
-NEW = 0.1
-# of wᵀFp, for w and p of energy 1: where Fw says otherwise than Fp it is no longer F of w
-WRONG = 1e-9
-# of the longest direction: less on rows that a face holds is rounding
-HELD = 1e-10
+
+@dataclass(frozen=True)
+class RecyclingParameters:
+    """Tolerances of directions that are kept.
+
+    Attributes:
+        new: Of the energy of a direction: what stands out from those that are kept; where less
+            does, rounding of their images would grow from one to the next.
+        wrong: Of wᵀFp, for w and p of energy 1: where Fw says otherwise than Fp it is no longer
+            F of w.
+        held: Of the longest direction: less on rows that a face holds is rounding.
+    """
+
+    new: float = 0.1
+    wrong: float = 1e-9
+    held: float = 1e-10
 
 
 class DirectionStore:
@@ -72,11 +79,17 @@ class Recycled(DirectionStore):
     Args:
         capacity: Most directions; each takes two vectors, and two more while it is new.
         comm: Communicator.
+        parameters: Tolerances.
     """
 
-    def __init__(self, capacity: int, comm: MPI.Intracomm) -> None:
+    def __init__(
+        self,
+        capacity: int,
+        comm: MPI.Intracomm,
+        parameters: RecyclingParameters = RecyclingParameters(),
+    ) -> None:
         super().__init__(capacity, 0)
-        self.comm = comm
+        self.comm, self.parameters = comm, parameters
 
     @property
     def columns(self) -> tuple[Array, Array]:
@@ -98,15 +111,32 @@ class Recycled(DirectionStore):
         for passed in range(2):
             W, FW = self.directions, self.images
             a, same = summed(self.comm, np.array([FW @ x, W @ Fx]))
-            if passed == 0 and bcast_from_root(self.comm, bool(np.any(np.abs(a - same) > WRONG))):
+            if passed == 0 and bcast_from_root(
+                self.comm, bool(np.any(np.abs(a - same) > self.parameters.wrong))
+            ):
                 self.clear()
                 continue
             if self.count == self.capacity:
                 a[self._next] = 0.0  # it goes
             x, Fx = x - a @ W, Fx - a @ FW
-        energy = float(summed(self.comm, np.array([x @ Fx]))[0])
-        if bcast_from_root(self.comm, energy >= NEW):
+        energy = self._energy(x, Fx)
+        if energy >= self.parameters.new:
             self.put(x / np.sqrt(energy), Fx / np.sqrt(energy))
+
+    def add_all(self, directions: Iterable[tuple[Array, Array, float]]) -> None:
+        """Store directions with images and energies. Collective."""
+        for direction in directions:
+            self.add(*direction)
+
+    def keep(self, x: Array, Fx: Array) -> None:
+        """Store a direction with Fx, if its energy is positive. Collective."""
+        energy = self._energy(x, Fx)
+        if energy > 0.0:
+            self.add(x, Fx, energy)
+
+    def _energy(self, x: Array, Fx: Array) -> float:
+        """xᵀFx, the same on all ranks. Collective."""
+        return bcast_from_root(self.comm, float(summed(self.comm, np.array([x @ Fx]))[0]))
 
     def _set_size(self, size: int) -> None:
         """Make room for vectors of so many rows, if there is none."""
@@ -130,14 +160,6 @@ class Recycled(DirectionStore):
         for w, Fw in zip(newest[0].T, newest[1].T, strict=True):
             self.put(w, Fw)
 
-    def within(self, held: Array | None) -> Array | None:
-        """Return orthonormal N so that W N is 0 on rows, shape ``(count, k)``. Collective.
-
-        Args:
-            held: Flags of the local rows; None: no rows, and then N is None, too.
-        """
-        return None if held is None else self.without(self.columns[0][held])
-
     def without(self, values: Array) -> Array:
         """Orthonormal N so that values N = 0, for values of W's columns, shape ``(count, k)``.
 
@@ -149,86 +171,42 @@ class Recycled(DirectionStore):
         _, sizes, Vt = np.linalg.svd(triangle(self.comm, values))
         squares = summed(self.comm, np.sum(self.directions**2, axis=1))
         longest = float(np.sqrt(bcast_from_root(self.comm, float(squares.max(initial=0.0)))))
-        return np.asarray(Vt[int(np.sum(sizes > HELD * longest)) :].T)
+        return np.asarray(Vt[int(np.sum(sizes > self.parameters.held * longest)) :].T)
 
 
 class RecycledOnFace:
-    """Directions of earlier solves that lie in a face, by default that of all rows.
+    """Directions of earlier solves that lie in a face. Creation and all methods are collective.
 
     Args:
-        known: All directions; kept as an attribute.
+        known: All directions; they must stay as they are meanwhile.
         held: Flags of the local rows that are 0 on the face; None: no rows.
+
+    Attributes:
+        count: Number of directions.
     """
 
     def __init__(self, known: Recycled, held: Array | None = None) -> None:
-        self.known, self._held = known, held
-        self._N: Array | None = None
-        self._active = False
-        self._new = deque[tuple[Array, Array, float]](maxlen=known.capacity)
+        self._known, self._held = known, held
+        self._N = None if held is None else known.without(known.columns[0][held])
+        self.count = known.count if self._N is None else self._N.shape[1]
 
-    def on(self, face: Face) -> RecycledOnFace:
-        """Those within another face."""
-        return RecycledOnFace(self.known, face.held)
+    def least(self, r: Array) -> tuple[Array, Array]:
+        """Return the step along W to where q is least, given r = −P(Fλ − d), and its image."""
+        b = self._part(r, self._known.directions)
+        return self._combined(b), self._known.columns[1] @ b
 
-    def go(
-        self,
-        lam: PETSc.Vec,
-        g: PETSc.Vec,
-        r: PETSc.Vec,
-        project: Callable[[PETSc.Vec], None],
-    ) -> bool:
-        """Go where q is least along W. Collective.
+    def conjugate(self, p: Array) -> Array:
+        """Return a direction made F-orthogonal to W; one reduction."""
+        return p - self._combined(self._part(p, self._known.images))
 
-        Args:
-            lam: A point; updated.
-            g: Fλ − d; updated.
-            r: −P g.
-            project: P, in place: takes away what rounding of many directions leaves of Gλ = e.
-
-        Returns:
-            Whether there is any direction.
-        """
-        self.keep()
-        known = self.known
-        self._active = known.count > 0
-        if self._active:
-            self._N = known.within(self._held)
-            self._active = self._N is None or self._N.shape[1] > 0
-        if self._active:
-            W, FW = known.columns
-            b = self._part(summed(known.comm, W.T @ r.array_r))
-            way = lam.duplicate()
-            way.array[:] = self._combined(b)
-            project(way)
-            lam.axpy(1.0, way)
-            g.array[:] += FW @ b
-            way.destroy()
-        return self._active
-
-    def conjugate(self, p: PETSc.Vec) -> None:
-        """Make a direction F-orthogonal to W. Collective, one reduction, or none without W."""
-        if self._active:
-            known = self.known
-            a = summed(known.comm, known.columns[1].T @ p.array_r)
-            p.array[:] -= self._combined(self._part(a))
-
-    def remember(self, p: PETSc.Vec, Fp: PETSc.Vec, energy: float) -> None:
-        """Record a search direction, to be stored after the solve, as W stays during it."""
-        self._new.append((np.array(p.array_r), np.array(Fp.array_r), energy))
-
-    def keep(self) -> None:
-        """Store the recorded directions. Collective."""
-        while self._new:
-            self.known.add(*self._new.popleft())
-        self._active = False
-
-    def _part(self, a: Array) -> Array:
-        """N Nᵀ a."""
+    def _part(self, x: Array, rows: Array) -> Array:
+        """N Nᵀ times products of x with rows."""
+        a = summed(self._known.comm, rows @ x)
         return a if self._N is None else self._N @ (self._N.T @ a)
 
     def _combined(self, b: Array) -> Array:
         """W b, 0 where the face holds rows."""
-        x = self.known.columns[0] @ b
+        x = self._known.columns[0] @ b
         if self._held is not None:
             x[self._held] = 0.0
         return np.asarray(x)

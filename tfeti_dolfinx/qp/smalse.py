@@ -6,7 +6,7 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.homogenised import Homogenised
-from tfeti_dolfinx.qp.mprgp import MprgpIterate, masked, mprgp
+from tfeti_dolfinx.qp.mprgp import MprgpIterate, mprgp
 from tfeti_dolfinx.qp.parameters import SmalseParameters
 from tfeti_dolfinx.qp.problem import (
     QP,
@@ -19,16 +19,6 @@ from tfeti_dolfinx.qp.problem import (
     StoppingRule,
     no_monitor,
 )
-
-# --- Operator and inner problems of SMALSE-M --------------------------------------------------
-
-# of the Lagrangian: what its value may be wrong by
-ROUNDING = 1e-14
-# where nothing fulfils Bx = 0, ‖Bx‖ tends to a limit: that it has changed by less than this share,
-# and M not at all, for so many outer steps is a stall; the slowest scenes change by 1e-3 a step
-CHANGE, PATIENCE = 1e-3, 1000
-# of the tolerance: inner problems are not solved more exactly than that
-ENOUGH = 1e-3
 
 
 class PenalisedOperator:
@@ -61,97 +51,61 @@ class PenalisedOperator:
         self._work.destroy()
 
 
-class InnerPrecision:
-    """M, which weighs the projected gradient against ‖Bx‖, and whether ‖Bx‖ still falls.
-
-    Args:
-        M: M₀.
-        beta: Factor on M when the Lagrangian does not grow enough.
-        rho: Penalty ρ.
-    """
-
-    def __init__(self, M: float, beta: float, rho: float) -> None:
-        self.M, self._beta, self._rho = M, beta, rho
-        self._lagrangian, self._equality, self._idle = -float("inf"), float("inf"), 0
-
-    def update(self, lagrangian: float, equality: float) -> None:
-        """Step 4: after an outer step, from L(x, μ) before the multipliers' update and ‖Bx‖."""
-        growth, self._lagrangian = lagrangian - self._lagrangian, lagrangian
-        self._idle += 1
-        # a growth that rounding decides says nothing of M
-        if growth < 0.5 * self._rho * equality**2 - ROUNDING * abs(lagrangian):
-            self.M *= self._beta
-            self._idle = 0
-        if not abs(equality - self._equality) <= CHANGE * equality:
-            self._equality, self._idle = equality, 0
-
-    @property
-    def stalled(self) -> bool:
-        """True if neither ‖Bx‖ nor M has changed for long."""
-        return self._idle >= PATIENCE
-
-
 class InnerTest:
     """Ends the inner loop where the rule is content, or x is exact enough for an outer step.
 
     Args:
-        homogenised: The homogenised program.
-        coarse: Its projectors.
+        qp: The program.
+        homogenised: Its homogenised form.
         rule: The stopping rule.
-        precision: Holds M.
-        norm: Estimate of ‖F‖.
-        eta: Least exactness η.
+        parameters: Parameters.
+
+    Attributes:
+        M: Weighs the projected gradient against ‖Bx‖.
+        reason: The rule's reason to stop.
+        idle: So many outer steps have changed neither ‖Bx‖ nor M.
     """
 
     def __init__(
-        self,
-        homogenised: Homogenised,
-        coarse: Coarse,
-        rule: StoppingRule,
-        precision: InnerPrecision,
-        norm: float,
-        eta: float,
+        self, qp: QP, homogenised: Homogenised, rule: StoppingRule, parameters: SmalseParameters
     ) -> None:
-        self._homogenised, self._coarse, self._rule = homogenised, coarse, rule
-        self._precision, self._norm, self._eta = precision, norm, eta
-        self._lam, self._verdict = homogenised.b.duplicate(), ConvergedReason.ITERATING
+        self._qp, self._homogenised, self._rule = qp, homogenised, rule
+        self._parameters = parameters
+        self._eta = parameters.eta * homogenised.b.norm()
+        self.M, self.reason, self.idle = parameters.M * qp.norm, ConvergedReason.ITERATING, 0
+        self._lagrangian, self._equality = -float("inf"), float("inf")
 
     def __call__(self, state: MprgpIterate) -> bool:
         """Return whether the inner loop may end. Collective."""
-        equality = self._coarse.norm_Q(state.x)
-        gradient = state.projected_gradient
-        residual = max(gradient, self._norm * equality)
-        if residual <= self._rule.tolerance:
-            self._examine(state, residual)
-        if self._verdict != ConvergedReason.ITERATING or self._rule.drifted:
+        equality, gradient = self._qp.coarse.norm_Q(state.x), state.projected_gradient
+        if max(gradient, self._qp.norm * equality) <= self._rule.tolerance:
+            self.examine(state)
+        if self.reason != ConvergedReason.ITERATING or self._rule.drifted:
             return True
-        # much below the tolerance a gradient has no business: M may be too small
-        wanted = max(self._precision.M * equality, ENOUGH * self._rule.tolerance)
+        wanted = max(self.M * equality, self._parameters.enough * self._rule.tolerance)
         return gradient <= min(wanted, self._eta)
 
-    def conclude(self, state: MprgpIterate, reason: ConvergedReason | None) -> ConvergedReason:
-        """Return why to stop, or ITERATING, given why the inner loop broke off. Collective."""
-        if reason == ConvergedReason.DIVERGED_INDEFINITE_MAT:  # rounding, or a wrong operator
-            equality = self._coarse.norm_Q(state.x)
-            residual = max(state.projected_gradient, self._norm * equality)
-            self._examine(state, residual)
-            if self._homogenised.is_rounding(residual):
-                reason = ConvergedReason.DIVERGED_ROUNDING
-        if self._verdict != ConvergedReason.ITERATING or reason is None:
-            return self._verdict
-        return reason
+    def examine(self, state: MprgpIterate) -> float:
+        """Apply the stopping rule, and return the residual. Collective."""
+        equality, lam = self._qp.coarse.norm_Q(state.x), state.x.copy()
+        residual = max(state.projected_gradient, self._qp.norm * equality)
+        lam.axpy(1.0, self._homogenised.lam_bar)
+        self.reason = self._rule.examine(lam, state.g, state.face(), residual)
+        lam.destroy()
+        return residual
 
-    def _examine(self, state: MprgpIterate, residual: float) -> None:
-        state.x.copy(self._lam)
-        self._lam.axpy(1.0, self._homogenised.lam_bar)
-        self._verdict = self._rule.examine(self._lam, state.g, state.face(), residual)
-
-    def destroy(self) -> None:
-        """Destroy the work vector. Collective."""
-        self._lam.destroy()
-
-
-# --- SMALSE-M ---------------------------------------------------------------------------------
+    def update(self, lagrangian: float, equality: float) -> None:
+        """Step 4: M after an outer step, from L(x, μ) before the multipliers' update and ‖Bx‖."""
+        parameters = self._parameters
+        growth, self._lagrangian = lagrangian - self._lagrangian, lagrangian
+        least = 0.5 * parameters.rho * self._qp.norm * equality**2
+        self.idle += 1
+        # a growth that rounding decides says nothing of M
+        if growth < least - parameters.rounding * abs(lagrangian):
+            self.M *= parameters.beta
+            self.idle = 0
+        if not abs(equality - self._equality) <= parameters.change * equality:
+            self._equality, self.idle = equality, 0
 
 
 def smalse(
@@ -194,11 +148,10 @@ def smalse(
     ('CONVERGED_RTOL', [0.6, 0.0, 0.4])
 
     Args:
-        qp: The program; parameters are relative to its norm. ``preconditioner_on`` preconditions
-            the conjugate gradient steps.
+        qp: The program; parameters are relative to its norm, its preconditioners are not used.
         homogenised: Its homogenised form.
         rule: Says when ‖g^P‖ and ‖F‖‖Qx‖ are small enough; asked in the inner loop too.
-        parameters: ρ, M, β, η, Γ, ᾱ, expansion.
+        parameters: ρ, M, β, η, Γ, ᾱ.
         max_it: Most inner steps, and most outer ones.
         start: Where to start; default x = P_Ω(0), μ = 0.
         monitor: Called after each step.
@@ -206,16 +159,21 @@ def smalse(
     Returns:
         The multipliers, their gradient, the reason and the residuals.
     """
-    b, feasible, coarse, norm = homogenised.b, homogenised.feasible, qp.coarse, qp.norm
-    rho, eta = parameters.rho * norm, parameters.eta * b.norm()
-    precision = InnerPrecision(parameters.M * norm, parameters.beta, rho)
-    A = PenalisedOperator(qp.F, coarse, rho, b)
-    x, y, Qx = _start(start, homogenised), b.duplicate(), b.duplicate()
+    b, coarse, norm, rho = homogenised.b, qp.coarse, qp.norm, parameters.rho * qp.norm
+    A, steps = PenalisedOperator(qp.F, coarse, rho, b), Steps()
+    test = InnerTest(qp, homogenised, rule, parameters)
+    # x = P_Ω(0), or that of a given λ − λ̄; g = Ax − b + y
+    x, g, y, Qx = (b.duplicate() for _ in range(4))
     if start is not None:
+        start.lam.copy(x)
+        x.axpy(-1.0, homogenised.lam_bar)
         coarse.combine(start.mu, y)
-    state = MprgpIterate(A, x, _gradient(A, x, b, y), feasible, masked(qp, rho))
-    inner = parameters.inner(max(norm, rho) or 1.0)
-    steps, test = Steps(), InnerTest(homogenised, coarse, rule, precision, norm, eta)
+    x.array[:] = homogenised.feasible.project(x.array_r)
+    if x.norm() > 0.0:
+        A.mult(x, g)
+    g.axpy(-1.0, b)
+    g.axpy(1.0, y)
+    state, inner = MprgpIterate(A, x, g, homogenised.feasible), parameters.inner(norm)
     reason = ConvergedReason.ITERATING
     while reason == ConvergedReason.ITERATING:
         # Step 1: x with ‖g^P(x, μ)‖ ≤ min(M‖Bx‖, η)
@@ -223,7 +181,10 @@ def smalse(
         # Step 2: test
         coarse.apply_Q(x, Qx)
         monitor(steps, "outer", x, state.projected_gradient, Qx.norm())
-        reason = test.conclude(state, broken)
+        indefinite = broken == ConvergedReason.DIVERGED_INDEFINITE_MAT  # or rounding
+        if indefinite and homogenised.is_rounding(test.examine(state)):
+            broken = ConvergedReason.DIVERGED_ROUNDING
+        reason = test.reason or broken or ConvergedReason.ITERATING
         if reason != ConvergedReason.ITERATING:
             break
         if rule.drifted:
@@ -233,24 +194,24 @@ def smalse(
             rule.drifted = False
             continue
         # Step 4 needs L(x, μ) = ½xᵀAx − bᵀx + yᵀx before the update, g = Ax − b + y
-        lagrangian = 0.5 * (x.dot(state.g) - x.dot(b) + x.dot(y))
+        lagrangian = 0.5 * (x.dot(g) - x.dot(b) + x.dot(y))
         # Step 3: update multipliers
         y.axpy(rho, Qx)
-        state.g.axpy(rho, Qx)
+        g.axpy(rho, Qx)
         state.split()
         # Step 4: update M
-        precision.update(lagrangian, Qx.norm())
+        test.update(lagrangian, Qx.norm())
         # Step 5
         steps.outer += 1
-        if precision.stalled:
+        if test.idle >= parameters.patience:
             reason = ConvergedReason.DIVERGED_STALLED
         elif steps.outer >= max_it:
             reason = ConvergedReason.DIVERGED_ITS
-    state.project(x)  # what rounding left off its bound by a hair is on it
+    x.array[:] = homogenised.feasible.project(x.array_r)  # rounding may leave it off its bounds
     result = QPResult(
         lam=x,
         mu=coarse.coordinates(y),
-        gradient=state.g,
+        gradient=g,
         face=state.face(),
         reason=reason,
         projected_gradient=state.projected_gradient,
@@ -260,26 +221,6 @@ def smalse(
         steps=steps,
     )
     x.axpy(1.0, homogenised.lam_bar)
-    for item in (A, state, test, y, Qx):
+    for item in (A, state, y, Qx):
         item.destroy()
     return result
-
-
-def _start(start: Start | None, homogenised: Homogenised) -> PETSc.Vec:
-    """x in Ω − λ̄: the projection of 0, or of a given λ − λ̄."""
-    x = homogenised.b.duplicate()
-    if start is not None:
-        start.lam.copy(x)
-        x.axpy(-1.0, homogenised.lam_bar)
-    x.array[:] = homogenised.feasible.project(x.array_r)
-    return x
-
-
-def _gradient(A: Operator, x: PETSc.Vec, b: PETSc.Vec, y: PETSc.Vec) -> PETSc.Vec:
-    """A x − b + y, without a multiplication where x = 0."""
-    g = b.duplicate()
-    if x.norm() > 0.0:
-        A.mult(x, g)
-    g.axpy(-1.0, b)
-    g.axpy(1.0, y)
-    return g

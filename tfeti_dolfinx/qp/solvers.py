@@ -36,41 +36,20 @@ class Parameters(Protocol):
 
 
 @dataclass(frozen=True)
-class Task:
-    """Arguments of a solver's call.
-
-    Attributes:
-        qp: The program.
-        homogenised: Its homogenised form.
-        rule: Says when to stop.
-        parameters: Parameters of all solvers.
-        start: Where to start, or None.
-        monitor: Called after each step.
-    """
-
-    qp: QP
-    homogenised: Homogenised
-    rule: StoppingRule
-    parameters: Parameters
-    start: Start | None
-    monitor: Monitor
-
-
-@dataclass(frozen=True)
 class Solver:
     """QP solver, with its requirements.
 
     Attributes:
-        solve: Solves a task.
+        solve: Solves a program, from its homogenised form.
         keeps_bounds: Whether it keeps inequalities.
         keeps_discs: Whether it keeps discs and ellipses.
         pc_type: Preconditioner that ``auto`` stands for.
         relative_to_norm: Whether its steps are relative to ‖PFP‖.
-        cold: Where it starts, which is its λ̄; None: λ̄ is as options say.
+        cold: Where it starts, which is its λ̄; None: λ̄₀ = Gᵀ(GGᵀ)⁻¹e.
         warm: From a start to its λ̄; None: λ̄ is as without one.
     """
 
-    solve: Callable[[Task], QPResult]
+    solve: Callable[[QP, Homogenised, StoppingRule, Parameters, Start | None, Monitor], QPResult]
     keeps_bounds: bool
     keeps_discs: bool
     pc_type: str
@@ -79,33 +58,39 @@ class Solver:
     warm: Callable[[QP, Start], PETSc.Vec] | None = None
 
 
-def _pcpg(task: Task) -> QPResult:
-    max_it = task.parameters.max_it
-    return solve_by_pcpg(task.qp, task.homogenised, task.rule, max_it=max_it, monitor=task.monitor)
+def _pcpg(
+    qp: QP,
+    homogenised: Homogenised,
+    rule: StoppingRule,
+    parameters: Parameters,
+    start: Start | None,
+    monitor: Monitor,
+) -> QPResult:
+    return solve_by_pcpg(qp, homogenised, rule, max_it=parameters.max_it, monitor=monitor)
 
 
-def _smalse(task: Task) -> QPResult:
-    return smalse(
-        task.qp,
-        task.homogenised,
-        task.rule,
-        task.parameters.smalse,
-        max_it=task.parameters.max_it,
-        start=task.start,
-        monitor=task.monitor,
-    )
+def _smalse(
+    qp: QP,
+    homogenised: Homogenised,
+    rule: StoppingRule,
+    parameters: Parameters,
+    start: Start | None,
+    monitor: Monitor,
+) -> QPResult:
+    own, max_it = parameters.smalse, parameters.max_it
+    return smalse(qp, homogenised, rule, own, max_it=max_it, start=start, monitor=monitor)
 
 
-def _newton(task: Task) -> QPResult:
-    return newton(
-        task.qp,
-        task.homogenised,
-        task.rule,
-        task.parameters.newton,
-        max_it=task.parameters.max_it,
-        start=task.start,
-        monitor=task.monitor,
-    )
+def _newton(
+    qp: QP,
+    homogenised: Homogenised,
+    rule: StoppingRule,
+    parameters: Parameters,
+    start: Start | None,
+    monitor: Monitor,
+) -> QPResult:
+    own, max_it = parameters.newton, parameters.max_it
+    return newton(qp, homogenised, rule, own, max_it=max_it, start=start, monitor=monitor)
 
 
 def _restored(qp: QP, start: Start) -> PETSc.Vec:

@@ -33,7 +33,7 @@ from tfeti_dolfinx.qp.problem import (
     no_monitor,
 )
 from tfeti_dolfinx.qp.recycling import Recycled
-from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver, Task
+from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver
 
 
 def last_look(result: QPResult, rule: Accuracy) -> None:
@@ -90,7 +90,7 @@ def resolve_types(options: Options, rows: Sequence[int], prefix: str) -> tuple[s
 
     Raises:
         InputError: The scene has inequalities or friction, but a solver that does not keep them
-            is asked for.
+            is asked for; or a preconditioner with a solver that takes none.
     """
     qp_type, (num_inequalities, num_tangents) = options.qp_type, rows
     if qp_type == "auto":
@@ -105,8 +105,13 @@ def resolve_types(options: Options, rows: Sequence[int], prefix: str) -> tuple[s
                 f"-{prefix}qp_type {qp_type}: the scene has {rows_of} which {qp_type.upper()} "
                 f"cannot keep; expected {' or '.join(['auto', *able])}"
             )
-    pc_type = options.pc_type
-    return qp_type, SOLVERS[qp_type].pc_type if pc_type == "auto" else pc_type
+    own = SOLVERS[qp_type].pc_type
+    if own == "none" and options.pc_type not in ("auto", "none"):
+        raise InputError(
+            f"-{prefix}pc_type {options.pc_type}: {qp_type.upper()} takes no preconditioner; "
+            "expected auto or none"
+        )
+    return qp_type, own if options.pc_type == "auto" else options.pc_type
 
 
 def solve_dual(
@@ -141,14 +146,14 @@ def solve_dual(
     solver = SOLVERS[qp_type]
     qp = dual.qp(options.norm_steps if solver.relative_to_norm else 0)
     begin = _start(start, qp)
-    homogenised = _homogenise(dual, qp, solver, options, begin)
+    homogenised = _homogenise(dual, qp, solver, begin)
     if monitor is None:
         monitor = _monitor(dual, homogenised, options)
     scale = homogenised.scale
     rtol = options.number if rtol is None else rtol
     rule = Accuracy(dual, rtol, options.atol, (scale.reference, scale.rounding), qp.norm)
     rule.goal = goal
-    result = solver.solve(Task(qp, homogenised, rule, options, begin, monitor))
+    result = solver.solve(qp, homogenised, rule, options, begin, monitor)
     dual.saw(result.norm)
     if (state := rule.recovered) is not None:
         dual.last.look(state.lam, state.residual)
@@ -173,23 +178,20 @@ def _start(values: tuple[Array, Array] | None, qp: QP) -> Start | None:
     return Start(lam, np.array(mu) if fits else np.zeros(qp.coarse.dimension))
 
 
-def _homogenise(
-    dual: Dual, qp: QP, solver: Solver, options: Options, start: Start | None
-) -> Homogenised:
-    """Homogenise with λ̄ at the solver's start, or as the options say."""
+def _homogenise(dual: Dual, qp: QP, solver: Solver, start: Start | None) -> Homogenised:
+    """Homogenise with λ̄ at the solver's start, or λ̄₀, whose image is kept."""
     if start is not None and solver.warm is not None:
         at = dual.last.image(qp.F, solver.warm(qp, start))
         _no_worse_than_nothing(qp, at, start)
-        known = dual.known_image("natural")
+        known = dual.known_image()
         count = solver.cold is not None  # else λ̄ and rows that stay open are apart
         scale = scale_at(qp, known, count) if known else scale_near(qp, at, count)
     elif solver.cold is not None:
         at = operator_product(qp.F, solver.cold(qp))
         scale = scale_at(qp, at)
-    else:  # with λ̄ as options say, whose image is kept
-        kind = options.homogenization if any(dual.contact_rows) else "natural"
-        scale = scale_at(qp, dual.image("natural"), gaps_count=False)
-        return homogenise(qp, dual.image(kind), scale)
+    else:
+        image = dual.natural_image()
+        return homogenise(qp, image, scale_at(qp, image, gaps_count=False))
     homogenised = homogenise(qp, at, scale)
     at.destroy()
     return homogenised
