@@ -155,7 +155,7 @@ class Stepping:
                 raise InputError("the last solve has not converged; expected one that has")
         if solution is self._accepted[0] or self._start is None:
             return
-        self._system.count_slips_from(solution.u)
+        self._count_slips_from(solution)
         self._accepted = (solution, self._start)
 
     def go_back(self) -> None:
@@ -223,7 +223,11 @@ class Stepping:
         solution = self._make_solution(state.u, state.multipliers(), gluing)
         self._accepted = (solution, (gluing, state.lam, state.mu))
         self._return()
-        system.count_slips_from(solution.u)
+        self._count_slips_from(solution)
+
+    def _count_slips_from(self, solution: Solution) -> None:
+        known = solution.gluing.records, solution.slip_at_end
+        self._system.count_slips_from(solution.u, known)
 
     def _check_state(self, state: SavedState) -> None:
         """Raise unless a state may be one of this problem. Not collective.

@@ -17,7 +17,7 @@ from tfeti_dolfinx.constraints.gluing import Gluing, Prescribed, glue, prescribe
 from tfeti_dolfinx.constraints.rows import row_weights
 from tfeti_dolfinx.contact.forces import condition_areas
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap
-from tfeti_dolfinx.contact.records import slips
+from tfeti_dolfinx.contact.records import ContactRecords, slips
 from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import Settings
@@ -129,6 +129,8 @@ class FrictionBounds:
     Attributes:
         exists: Whether a contact has friction.
         rest: Displacement at which the load step begins, in primal order; None: no displacement.
+        known: The conditions of the step before with their slips at its end, where that is
+            ``rest``; they count as long as conditions stay the same.
     """
 
     def __init__(
@@ -142,12 +144,21 @@ class FrictionBounds:
         self._known: Array | None = None
         self.exists = any(contact.friction is not None for contact in contacts)
         self.rest: Array | None = None
+        self.known: tuple[ContactRecords, Array] | None = None
+
+    def begin(self, rest: Array, known: tuple[ContactRecords, Array] | None = None) -> None:
+        """Let a load step begin at a displacement. Not collective."""
+        self.rest, self.known = rest, known
 
     def slip(self, search: ContactSearch) -> Array:
         """Tangential v_i of all conditions where the load step begins, shape ``(n, gdim - 1)``."""
         records = search.records
         if self.rest is None:
             return np.zeros(records.tangents.shape[:2])
+        if self.known is not None:
+            before, slip = self.known
+            if not any_rank(self._dofs.comm, not records.slips_as(before)):
+                return slip
         return slips(records, self._dofs, self.rest)
 
     def has_changed(self, search: ContactSearch) -> bool:
@@ -320,9 +331,9 @@ class System:
         report.factorizations = self._dofs.comm.allreduce(factored - self._counted)
         self._counted = factored
 
-    def count_slips_from(self, u: Array) -> None:
-        """Let slips count from a displacement in primal order."""
-        self.friction.rest = u
+    def count_slips_from(self, u: Array, known: tuple[ContactRecords, Array]) -> None:
+        """Let slips count from a displacement in primal order, with those of its conditions."""
+        self.friction.begin(u, known)
         if self.friction.exists:
             self.change("right side")
         elif self._gluing is not None:
