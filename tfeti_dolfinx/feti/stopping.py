@@ -438,13 +438,15 @@ class Accuracy:
         share = np.where(size < 1e-3 * most, 0.1, 1.0)
         most = max(most, now.begin)
         at_rest = self._at_rest(now)
-        noise = given.noise * most + given.load_noise * now.bodies.alone + at_rest
+        all_rest = at_rest.min() if len(at_rest) else 0.0  # then forces are rounding, too
+        noise = given.noise * most + given.load_noise * now.bodies.alone + all_rest
         displacement = self.rtol * share * size + noise
         largest = float(displacement.max(initial=0.0))
+        displacement = np.maximum(displacement, at_rest)
         # rounding of bodies that do not deform at all: its energy, and forces that make it
         rigid = float(np.sqrt(now.bodies.stiffness @ (noise + 3.0 * given.noise * most) ** 2))
         balance = max(self.rtol, given.noise) * now.forces + rigid / np.sqrt(self.norm)
-        balance += at_rest * now.bodies.stiffness.max(initial=0.0)
+        balance += all_rest * now.bodies.stiffness.max(initial=0.0)
         energy = given.energy * self.rtol * now.energy + rigid
         return Tolerances(displacement, 2.0 * largest, 2.0 * largest, balance, energy)
 
@@ -518,11 +520,10 @@ class Accuracy:
             return False
         return now.residual / before.residual > (residual / self._claimed) ** self._limits.stall
 
-    def _at_rest(self, now: Measures) -> float:
-        """The size of displacements that are rounding of 0 where nothing is loaded, else 0."""
+    def _at_rest(self, now: Measures) -> Array:
+        """The size of displacements that are rounding of 0, of bodies without a load, else 0."""
         small = self._limits.load_noise * now.gap
-        unloaded = not now.bodies.alone.any() and now.bodies.size.max(initial=0.0) <= small
-        return small if unloaded else 0.0
+        return np.where((now.bodies.alone == 0.0) & (now.bodies.size <= small), small, 0.0)
 
     def _over_goal(self) -> float:
         """Return the bound at the last look over what the goal allows; 0 without a goal."""
