@@ -8,6 +8,7 @@ from reference.friction import ClampedLaw
 from scenes import clamp, decomposed, displacement, forms, hooke
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.solve.coulomb import FrictionBounds
 
 PLACES = [("left", "top"), ("left", "right"), ("top", "right"), ("right", "top"), ("top", "left")]
 # what is reported is an estimate; below this rounding is part of an error
@@ -85,7 +86,15 @@ TURNED = ("quadrilateral", 7, 2, 2.9, True, "top", "left", 0.01)
 TURNED += ([(-0.054, -0.05), (0.045, 0.006)],)
 
 
-def test_what_rests_to_friction_rtol_only_says_so():
-    """Bounds of a fixed point come no nearer to the law, which leaves more than rtol allows."""
+def test_what_rests_to_friction_rtol_only_says_so(monkeypatch):
+    """Bounds that always go half the way rest early, and leave more than rtol allows."""
+    monkeypatch.setattr(FrictionBounds, "_relaxation", lambda bounds: 0.5)
     reports = steps(*TURNED, friction_type="fixed_point", rtol=1e-6)
     assert any(reason == "CONVERGED_FRICTION_RTOL" for reason, _ in reports)
+
+
+def test_a_fixed_point_that_goes_to_and_fro_comes_to_rest():
+    """Its steps take as much of the way as the last two problems say, not less for ever."""
+    loads = [(-0.0457, 0.0355, -0.0747), (0.0345, -0.0386, -0.0028), (1.37e-4, -7.2e-5, 7.2e-6)]
+    scene = ("tetrahedron", 3, 1, 0.9460614226015337, True, "top", "right", 0.0, loads)
+    assert all(reason == "CONVERGED_RTOL" for reason, _ in steps(*scene, qp_type="smalse"))

@@ -417,7 +417,7 @@ class ContactProblem:
                 raise InputError("the last solve has not converged; expected one that has")
         if solution is self._accepted[0] or self._start is None:
             return
-        self._system.count_slips_from(solution.u)
+        self._count_slips_from(solution)
         self._accepted = (solution, self._start)
 
     def go_back(self) -> None:
@@ -485,7 +485,11 @@ class ContactProblem:
         solution = self._make_solution(state.u, state.multipliers(), gluing)
         self._accepted = (solution, (gluing, state.lam, state.mu))
         self._return()
-        system.count_slips_from(solution.u)
+        self._count_slips_from(solution)
+
+    def _count_slips_from(self, solution: Solution) -> None:
+        known = solution.gluing.records, solution.slip_at_end
+        self._system.count_slips_from(solution.u, known)
 
     # ------------------------------------- what bodies with mass and nonlinear ones add
 

@@ -17,7 +17,7 @@ from tfeti_dolfinx.constraints.gluing import Gluing, Prescribed, glue, prescribe
 from tfeti_dolfinx.constraints.rows import Constraints, row_weights
 from tfeti_dolfinx.contact.forces import condition_areas
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap
-from tfeti_dolfinx.contact.records import slips
+from tfeti_dolfinx.contact.records import ContactRecords, slips
 from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import Extensions
@@ -171,7 +171,6 @@ class System:
         bcs: Dirichlet conditions.
         elements: Stiffness and load of subdomains, by finite elements or another method.
         origin: Displacement in primal order at which the mesh is, in finite strain; else None.
-        rest: Displacement in primal order at which the load step begins; None: no displacement.
     """
 
     def __init__(
@@ -191,7 +190,9 @@ class System:
             FiniteElements(dofs) if method is None else method.assembly(dofs, decomposition)
         )
         self.origin: Array | None = None
-        self.rest: Array | None = None
+        # displacement in primal order at which the load step begins; None: no displacement
+        self._rest: Array | None = None
+        self._known_slips: tuple[ContactRecords, Array] | None = None
         self._stale, self._made = set(STAGES), Counter[str]()
         self._counters, self._counted = Counters(), 0
         self._seen = 0.0  # of ‖F‖, which more rows hardly change
@@ -274,9 +275,19 @@ class System:
             self._contacts[i] = contact
         self.change("right side")
 
-    def count_slips_from(self, u: Array) -> None:
-        """Let slips count from a displacement in primal order."""
-        self.rest = u
+    def begin_at(self, rest: Array, known: tuple[ContactRecords, Array] | None = None) -> None:
+        """Let a load step begin at a displacement in primal order.
+
+        Args:
+            rest: The displacement.
+            known: Conditions of the step before with their slips at its end: they count as long as
+                conditions stay the same.
+        """
+        self._rest, self._known_slips = rest, known
+
+    def count_slips_from(self, u: Array, known: tuple[ContactRecords, Array]) -> None:
+        """Let slips count from a displacement in primal order, with those of its conditions."""
+        self.begin_at(u, known)
         if self._has_friction:
             self.change("right side")
         elif self._gluing is not None:
@@ -407,9 +418,13 @@ class System:
     def _slip(self) -> Array:
         """Tangential v_i of all conditions where the load step begins, shape ``(n, gdim - 1)``."""
         records = self.search.records
-        if self.rest is None:
+        if self._rest is None:
             return np.zeros(records.tangents.shape[:2])
-        return slips(records, self._dofs, self.rest)
+        if self._known_slips is not None:
+            before, slip = self._known_slips
+            if not any_rank(self._dofs.comm, not records.slips_as(before)):
+                return slip
+        return slips(records, self._dofs, self._rest)
 
     def _destroy_dual(self) -> None:
         if self._dual is not None:

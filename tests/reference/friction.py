@@ -199,8 +199,11 @@ class ClampedLaw:
         self.r = 3.0 / np.linalg.norm(self.F, 2)
 
     def rest(self, u):
-        """Count slips from a displacement, sorted by point."""
-        self.c[self.m :] = (self.B @ self.own(u))[self.m :]
+        """Count slips from a displacement, sorted by point, that ``distance`` was asked of."""
+        p, T = self.lam[: self.m], self.lam[self.m :].reshape(self.gdim - 1, self.m)
+        slips = np.linalg.norm(T, axis=0) >= (1.0 - 1e-12) * self.mu * p  # what sticks stays
+        end = (self.B @ self.own(u))[self.m :].reshape(T.shape)
+        self.c[self.m :] = np.where(slips, end, self.c[self.m :].reshape(T.shape)).ravel()
 
     def own(self, u):
         """A displacement that is sorted by point, on free unknowns."""
@@ -214,7 +217,7 @@ class ClampedLaw:
         A law with a large coefficient may have several solutions: v is the one that belongs to u.
         """
         u, self.d = self.own(u), self.B @ (self.bent @ load) - self.c
-        lam = self.newton(self.B @ (self.loads @ load - self.K @ u))
+        lam = self.lam = self.newton(self.B @ (self.loads @ load - self.K @ u))
         return np.abs(self.bent @ load - self.KB @ lam - u).max() / np.abs(u).max()
 
     def natural(self, lam):

@@ -214,6 +214,20 @@ class ContactState:
         return np.einsum("nt,ntg->ng", slip, records.tangents)
 
     @cached_property
+    def slip_at_end(self) -> Array:
+        """Tangential v_i of each condition at the end of the step, shape ``(n, gdim - 1)``.
+
+        Of a node that sticks it is what it was: else a step would take the algebraic error of the
+        one before for a slip. Collective at first use.
+        """
+        gluing, rows = self.gluing, self.gluing.tangents
+        at, end = gluing.constraints.sets.tangents, slips(gluing.records, self.dofs, self.u)
+        rubs = np.any(self.lam[at] != 0.0, axis=1) & np.all(self.holding[at] | ~rows.moves, axis=1)
+        kept = np.zeros(end.shape, dtype=bool)
+        kept[rows.condition] = rubs[:, None] & rows.moves
+        return np.where(kept, gluing.slip, end)
+
+    @cached_property
     def dissipation(self) -> Array:
         """Energy that friction dissipates at each condition in this step, shape ``(n,)``.
 

@@ -81,6 +81,11 @@ class ContactRecords:
         """The a_ij of Σ_j a_ij · u_j, v_i along an axis of the frame, shape ``(k, gdim)``."""
         return self.frame[self.condition, axis] * self.weight[:, None]
 
+    def slips_as(self, other: ContactRecords) -> bool:
+        """Return whether these conditions have the same slips at any displacement as others."""
+        names = ("frame", "condition", "entry_group", "weight")
+        return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
+
 
 def concatenate(records: list[ContactRecords], gdim: int) -> ContactRecords:
     """All conditions of several contacts in one table."""

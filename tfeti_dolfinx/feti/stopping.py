@@ -393,15 +393,18 @@ class Accuracy:
         # a body that is stiff beside another has the error of the other's forces on top
         share = np.where(now.size < 1e-3 * most, 0.1, 1.0)
         most = max(most, now.begin)
-        noise = given.noise * most + given.load_noise * now.alone + at_rest
+        all_rest = at_rest.min() if len(at_rest) else 0.0  # then forces are rounding, too
+        noise = given.noise * most + given.load_noise * now.alone + all_rest
         displacement = self.rtol * share * now.size + noise
+        largest = float(displacement.max(initial=0.0))
+        displacement = np.maximum(displacement, at_rest)
         # rounding of bodies that do not deform at all: its energy, and forces that make it
         rigid = float(np.sqrt(now.stiffness @ (noise + 3.0 * given.noise * most) ** 2))
         balance = max(self.rtol, given.noise) * now.forces + rigid / np.sqrt(self.norm)
         return Tolerances(
             displacement=displacement,
-            jump=2.0 * float(displacement.max(initial=0.0)),
-            balance=balance + at_rest * now.stiffness.max(initial=0.0),
+            jump=2.0 * largest,
+            balance=balance + all_rest * now.stiffness.max(initial=0.0),
             energy=given.energy * self.rtol * now.energy + rigid,
         )
 
@@ -451,12 +454,11 @@ class Accuracy:
         """Return the longest of what rows miss, and of what closes that."""
         return max(float(self._seen.correction.max(initial=0.0)), self._seen.penetration)
 
-    def _at_rest(self) -> float:
-        """The size of displacements that are rounding of 0 where nothing is loaded, else 0."""
+    def _at_rest(self) -> Array:
+        """The size of displacements that are rounding of 0, of bodies without a load, else 0."""
         now = self._seen
         small = self._limits.load_noise * now.gap
-        unloaded = not now.alone.any() and now.size.max(initial=0.0) <= small
-        return small if unloaded else 0.0
+        return np.where((now.alone == 0.0) & (now.size <= small), small, 0.0)
 
     def _over_goal(self) -> float:
         """Return the bound at the last look over what the goal allows; 0 without a goal."""

@@ -261,7 +261,7 @@ class NonlinearContactProblem(ContactProblem):
         """Let contact and rigid motions be those of X + u. Collective."""
         places.move()
         self._system.origin = self.dofs.to_primal(self.u.x.array)
-        self._system.rest = self.dofs.to_primal(self._begin)
+        self._system.begin_at(self.dofs.to_primal(self._begin))
 
     def _set(self, u: Array) -> None:
         """Take a displacement, and what depends on it. Collective."""

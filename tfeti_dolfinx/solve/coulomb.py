@@ -11,7 +11,7 @@ from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import TINY, Array, sums
 from tfeti_dolfinx.common.logging import cite
-from tfeti_dolfinx.common.parallel import any_rank, norm_over, steering
+from tfeti_dolfinx.common.parallel import any_rank, norm_over, steering, summed
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.stopping import Accuracy, ErrorTarget
 from tfeti_dolfinx.options import Options
@@ -51,7 +51,7 @@ class CoulombParameters:
             not come to rest.
         slowest: The largest share of the change of bounds that is taken to be left of it in the
             next problem.
-        shortest: Of a step of bounds: it is halved where the change has grown, down to this.
+        shortest: Of a step towards the forces found: bounds never take less of it.
         falls: Problems in a row whose forces are less than half of their bounds: these fall to 0.
         no_force: Of all multipliers: forces of normals that rounding makes of none. As bounds they
             would be discs that bend so much that nothing else is seen beside them.
@@ -225,7 +225,7 @@ class FrictionBounds:
             lost = any_rank(self._comm, not np.all(np.isfinite(known)))
             self.now = np.maximum(start[0][self._rows], 0.0) if lost else known
         self._before, self._found = self.now, self.now
-        self._none, self._best, self._last, self._length = 0.0, np.inf, np.inf, 1.0
+        self._none, self._best, self._length = 0.0, np.inf, 1.0
         self.idle, self.body, self._falls = 0, -1, 0
         self._solved: list[tuple[Array, Array, Array]] = []
 
@@ -280,13 +280,27 @@ class FrictionBounds:
         miss = np.where(miss > least, miss, 0.0)  # less is rounding
         change = float(miss[self.body] / size[self.body])
         self.idle += 1
-        # where plain steps lead away, shorter ones of Φ, which turns back, may not
-        self._length *= 0.5 if change > self._last and self._length > parameters.shortest else 1.0
-        self._last = change
+        self._length = self._relaxation()
         self._falls = self._falls + 1 if change > 1.0 else 0
         if change <= 0.5 * self._best:
             self._best, self.idle = change, 0
         return change
+
+    def _relaxation(self) -> float:
+        """Return the share of the next step: Aitken's of the last two problems, 1 at most.
+
+        Where forces found turn to and fro as bounds change, whole steps lead away or not on
+        (Irons, Tuck, IJNME 1, 1969).
+        """
+        if len(self._solved) < 2:
+            return 1.0
+        (first, of_first, _), (now, found, _) = self._solved
+        if any_rank(self._comm, bool(np.any(np.isinf(first)))):  # all stuck
+            return 1.0
+        way, turn = now - first, (found - now) - (of_first - first)
+        along, size = summed(self._comm, np.array([-(way @ turn), turn @ turn]))
+        share = along / size if size > 0.0 else 1.0
+        return float(steering(self._comm, np.clip(share, self._parameters.shortest, 1.0))[0])
 
     def fit(self, result: QPResult, rule: Accuracy) -> bool:
         """Return whether u is right to rtol with the limits that the new forces give, too.
