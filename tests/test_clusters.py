@@ -123,17 +123,6 @@ def test_two_bodies():
     assert difference(v, u) <= 1e-7
 
 
-def test_a_new_load_and_a_second_solve():
-    p = square(8, 4, clusters=4, rtol=1e-9)
-    p.solve()
-    first = p.solution.u.copy()
-    p.solve()
-    assert p.report.factorizations == 0
-    assert p.report.F_multiplications <= 2
-    assert difference(p.solution.u, first) <= 1e-8
-    p.destroy()
-
-
 def test_a_new_stiffness():
     """Glue is made anew from the new factors."""
     found = []

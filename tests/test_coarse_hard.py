@@ -1,37 +1,18 @@
-"""GGᵀ where bodies differ by many orders of magnitude, and where rows leave motions free."""
+"""GGᵀ where rows leave motions free, and where it is indefinite."""
 
 import numpy as np
 import pytest
 import ufl
-from bodies import boxes, held, pressed, stacked, stiffer_above, two_body_problem
+from bodies import boxes, held, pressed, two_body_problem
 from dolfinx import fem
 from mpi4py import MPI
-from scipy.sparse import csr_array, diags_array
+from scipy.sparse import csr_array
 from test_solvable_lp import dual_of
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.errors import FactorError
 from tfeti_dolfinx.feti.projectors import SemidefiniteFactor
 from tfeti_dolfinx.feti.rigid_bodies import null_basis
-
-
-@pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
-def test_a_stiff_body_that_contact_with_a_soft_one_holds(cell):
-    """Gluing rows of the stiff body are 1e8 times as large as the rows that hold it."""
-    d = stacked(cell, 2, 2, 4)
-    sides = held(d, "lower bottom", "lower left", "upper left")
-    contact = tfeti.Contact("lower top", "upper bottom")
-    p = two_body_problem(d, pressed(d, 1e-4), sides, [contact], stress=stiffer_above(d, 1e16))
-    dual = dual_of(p)
-    coarse = dual.coarse
-    mu = np.random.default_rng(0).standard_normal(coarse.dimension)
-    size = np.sqrt(coarse.grams.whole.diagonal())
-    mu = coarse.null.removed(mu / np.where(size > 0.0, size, 1.0))
-    x = dual.d.duplicate()
-    coarse.combine(mu, x)
-    error = size * (coarse.coordinates(x) - mu)
-    assert np.abs(error).max() <= 1e-9 * np.abs(size * mu).max()
-    p.destroy()
 
 
 def test_a_body_that_slides_along_all_that_it_meets():
@@ -64,17 +45,6 @@ def test_gluing_far_from_the_origin_holds_nothing():
 
 NO_NULL = null_basis(np.empty(0, dtype=np.int64), csr_array((4, 0)))
 LAPLACIAN = np.diag([1.0, 2.0, 2.0, 1.0]) - np.diag(np.ones(3), 1) - np.diag(np.ones(3), -1)
-
-
-def test_a_pivot_that_is_lost_to_rounding_is_no_error():
-    """A null vector nobody knew of: solutions for right sides in the range are right still."""
-    sizes = diags_array([1e-8, 1.0, 1e5, 1e-3])
-    A = csr_array(sizes @ (LAPLACIAN - 1e-16 * np.eye(4)) @ sizes)
-    factor = SemidefiniteFactor(A, NO_NULL, MPI.COMM_WORLD, "A")
-    b = sizes @ (LAPLACIAN @ np.array([1.0, -2.0, 0.5, 3.0]))
-    left = (A @ factor.solve(b) - b) / sizes.diagonal()
-    factor.destroy()
-    assert np.abs(left).max() <= 1e-9
 
 
 def test_an_indefinite_matrix_is_named_on_all_ranks():
