@@ -8,8 +8,8 @@ from mpi4py import MPI
 from scenes import clamp, curved_obstacle, decomposed, forms, hooke, strain
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.clusters.subdomains import ClusteredSubdomains
-from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.clusters.subdomains import ClusteredSubdomains, Saddle
+from tfeti_dolfinx.errors import FactorError, InputError
 
 COMM = MPI.COMM_WORLD
 
@@ -143,3 +143,8 @@ def test_more_clusters_than_subdomains():
     with pytest.raises(InputError, match="5 clusters of 4 subdomains; expected at most"):
         p.solve()
     p.destroy()
+
+
+def test_averages_that_rounding_makes_dependent_are_named():
+    with pytest.raises(FactorError, match="-tfeti_clusters 0"):
+        Saddle(np.ones((2, 2)), np.eye(2), np.zeros((2, 0)))

@@ -11,9 +11,8 @@ from tfeti_dolfinx.subdomains.block import Block
 
 def own(options=None, **parts):
     """Solve with parts of one's own."""
-    extensions = Extensions(**parts)
     return lambda s: s.problem(
-        contacts=[s.floor], extensions=extensions, petsc_options=options
+        contacts=[s.floor], extensions=Extensions(**parts), petsc_options=options
     ).solve()
 
 
