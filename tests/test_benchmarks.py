@@ -33,10 +33,10 @@ def with_arguments(benchmark, *arguments, slow=False):
 
 START_MPIRUN = (solver_profiles, strong_scaling, subdomain_size, time_against_error, weak_scaling)
 RUNS = [
-    with_arguments(hertz_convergence),
+    with_arguments(hertz_convergence, slow=True),
     with_arguments(kplus_forms),
     with_arguments(linear_price, "--scenes", "cube_3d"),
-    with_arguments(secondary_side),
+    with_arguments(secondary_side, slow=True),
     with_arguments(spectrum),
     with_arguments(stability, "--groups", "nu"),
     with_arguments(stages, "--processor"),

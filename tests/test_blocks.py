@@ -274,3 +274,16 @@ def test_an_implementation_that_breaks_its_promises_is_named():
     with pytest.raises(ConformanceError, match="this does not hold: K⁺ is symmetric"):
         b.apply_pinv = lambda w: np.roll(w, 1)
         check_block(b, K)
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "tetrahedron"])
+def test_flat_cells_are_not_taken_for_a_form_without_energy(cell):
+    """Their softest deformations are as free as those of a wrong form, and lost by rounding."""
+    d = decomposed(cell, 2, 1, comm=MPI.COMM_SELF)
+    d.mesh.geometry.x[:, 0] *= 1e9
+    V, a, _ = forms(d.mesh, d.facet_tags, np.zeros(d.mesh.geometry.dim), d.surface("top"))
+    with pytest.raises(InputError, match="indefinite by rounding"):
+        block(
+            csr_array(assemble_csr(fem.form(a))),
+            V.tabulate_dof_coordinates()[:, : d.mesh.geometry.dim],
+        )

@@ -184,7 +184,7 @@ def cells_and_nodes(interior, d):
     return (middle[:, :gdim], stress), (x[:, :gdim], u)
 
 
-@pytest.mark.parametrize("elements", [tfeti.BoundaryElements("low"), ALL])
+@pytest.mark.parametrize("elements", [None, tfeti.BoundaryElements("low"), ALL])
 def test_constant_stresses_are_exact_everywhere(elements):
     """At nodes and points inside, on sides, corners and tears, and in fields on the mesh."""
     d, t = two_volumes(), 0.1 / (1 - 0.3**2)
@@ -230,6 +230,9 @@ def test_fields_inside_in_each_step_of_a_series(shared_tmp):
     for name in ("series.bp", "series_cells.bp"):
         assert (path.parent / name / "md.idx").stat().st_size == 64 * (1 + 3)
     assert not list(path.parent.glob(".*"))
+    series([0.5, 1.0])
+    with pytest.raises(tfeti.InputError, match="checkpoint has no field interior_displacement"):
+        series([0.5, 1.0, 1.5], resume=True, interior=True)
     p.destroy()
 
 
@@ -270,15 +273,17 @@ def test_a_change_of_modulus_and_of_load():
     """A second solve makes S anew where the form has changed, and only there."""
     d = decomposed("triangle", 6, 4)
     V, _, _ = forms(d.mesh, d.facet_tags, (0.0, 0.0), d.surface("top"))
-    elastic = tfeti.Elasticity(d, E=1.0, nu=0.3, model="plane_strain")
+    elastic = tfeti.Elasticity(d, E=1.0, nu=0.3, model="plane_stress", thickness=0.1)
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
     force = fem.Constant(d.mesh, (0.0, -0.1))
     p = tfeti.ContactProblem(
         elastic.a(u, v),
-        ufl.dot(force, v) * ufl.dx,
+        elastic.thickness * ufl.dot(force, v) * ufl.dx,
         [clamp(V, d.facets("left"))],
         [],
         d,
+        stress=elastic.stress,
+        thickness=elastic.thickness,
         petsc_options={"tfeti_rtol": 1e-10},
         boundary_elements=ALL,
     )
@@ -287,4 +292,5 @@ def test_a_change_of_modulus_and_of_load():
     assert np.allclose(p.solve().x.array, first / 2, atol=1e-9)
     force.value *= 4.0
     assert np.allclose(p.solve().x.array, 2 * first, atol=1e-8)
+    assert np.all(np.isfinite(p.solution.at([(0.3, 0.6)]).stress))
     assert p.report.factorizations == 0

@@ -1,4 +1,4 @@
-"""GGᵀ where bodies differ by many orders of magnitude, and where rows leave motions free."""
+"""GGᵀ where rows leave motions free, and where it is indefinite."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import ufl
 from bodies import boxes, held, pressed, two_body_problem
 from dolfinx import fem
 from mpi4py import MPI
-from scipy.sparse import csr_array, diags_array
+from scipy.sparse import csr_array
 from test_solvable_lp import dual_of
 
 import tfeti_dolfinx as tfeti
@@ -44,17 +44,6 @@ def test_gluing_far_from_the_origin_holds_nothing():
 
 NO_NULL = csr_array((4, 0))
 LAPLACIAN = np.diag([1.0, 2.0, 2.0, 1.0]) - np.diag(np.ones(3), 1) - np.diag(np.ones(3), -1)
-
-
-def test_a_pivot_that_is_lost_to_rounding_is_no_error():
-    """A null vector nobody knew of: solutions for right sides in the range are right still."""
-    sizes = diags_array([1e-8, 1.0, 1e5, 1e-3])
-    A = csr_array(sizes @ (LAPLACIAN - 1e-16 * np.eye(4)) @ sizes)
-    factor = SemidefiniteFactor(A, NO_NULL, MPI.COMM_WORLD, "A")
-    b = sizes @ (LAPLACIAN @ np.array([1.0, -2.0, 0.5, 3.0]))
-    left = (A @ factor.solve(b) - b) / sizes.diagonal()
-    factor.destroy()
-    assert np.abs(left).max() <= 1e-9
 
 
 def test_an_indefinite_matrix_is_named_on_all_ranks():

@@ -7,7 +7,7 @@ from dolfinx import fem
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpi4py import MPI
-from scenes import decomposed, forms, problem
+from scenes import decomposed, displacement, forms, problem
 from test_friction_fields import SCENES, floor, solved
 from test_tresca import SIDES, SOLVERS, on_the_plane, stresses, two_boxes
 
@@ -163,3 +163,18 @@ def body_of(d, surface):
     cells = [d.mesh.topology.connectivity(1, 2).links(f)[0] for f in facets]
     found = d.body_of_subdomain[d.cell_subdomain[cells]] if cells else np.array([-1])
     return comm.allreduce(int(found.max()), op=MPI.MAX)
+
+
+def test_what_sticks_where_a_wall_pushes_slips():
+    """Sticking to the floor contradicts a wall that overlaps it by 0.01: bounds hold neither."""
+    d = decomposed("quadrilateral", 4, 3)
+    law = tfeti.Coulomb(0.3)
+    wall = tfeti.Obstacle("left", tfeti.Plane((0.01, 0), (1, 0)), friction=law)
+    p = problem(d, (0.0, -0.05), [floor(2, law), wall], clamped=(), rtol=1e-8)
+    p.solve()
+    x, u = displacement(p)
+    assert u[np.isclose(x[:, 0], 0.0), 0].min() >= 0.01 - 1e-9
+    data = [p.solution.contact(k) for k in (0, 1)]
+    for one in data:
+        size = np.linalg.norm(one.tangential_traction, axis=1)
+        assert np.all(size <= 0.3 * one.pressure + 1e-8)

@@ -5,11 +5,11 @@ from functools import cache
 import numpy as np
 import pytest
 import ufl
-from bodies import gathered, searched, sided, stacked, two_body_problem
+from bodies import gathered, searched, sided
 from dolfinx import fem
 from mpi4py import MPI
 from test_contact_gaps import CELLS, ORDERS, dofs_of, shaped
-from test_mortar_cases import disc_on_block, no_load
+from test_mortar_cases import no_load
 
 import tfeti_dolfinx as tfeti
 from meshes.lug import PIN, lug
@@ -107,15 +107,6 @@ def test_facets_that_do_not_decide_are_not_warned_of(sizes, order, gap):
     assert not p.report.warnings
 
 
-def test_a_disc_on_a_block_is_not_warned_of(comm):
-    """Surfaces that do not conform: near by, the gap is soon more than coarse facets change."""
-    d, bcs = disc_on_block(comm, 24, 1, pushed=0.01)
-    p = two_body_problem(d, no_load, bcs, [sided("arc", "top", reach=0.3)])
-    p.solve()
-    assert p.report.active_contacts > 0
-    assert not any("facets" in text for text in p.report.warnings)
-
-
 @pytest.mark.parametrize("gap", ["geometry", "curved"])
 def test_facets_do_not_show_at_an_obstacle(gap):
     """Its distance is taken at the vertices, which are on the pin."""
@@ -165,11 +156,3 @@ def test_edges_are_not_rounded_off(cell, sides):
     ]
     assert len(found[0]) > 0
     assert np.allclose(*found, rtol=0.0, atol=1e-12)
-
-
-def test_flat_sides_have_the_gap_of_the_geometry():
-    d = stacked("tetrahedron", 3, 4, 4, gap=0.01)
-    found = [
-        searched([sided(*ORDERS[0], gap=gap)], dofs_of(d), d).gap for gap in ("geometry", "curved")
-    ]
-    assert np.array_equal(*found)

@@ -8,7 +8,7 @@ from dolfinx import mesh as dmesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpi4py import MPI
-from scenes import SIDES, decomposed
+from scenes import SIDES, box, decomposed
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.mesh.partition import bisect_points
@@ -68,6 +68,7 @@ def test_a_subdomain_is_on_one_rank_and_ranks_have_about_equal_shares():
     assert sorted(s for part in lists for s in part) == list(range(24))
     cells = d.comm.allgather(len(d.cell_subdomain))
     assert max(cells) <= 1.3 * min(cells)
+    assert tfeti.decompose(box("triangle", 4)[0]).num_subdomains == 1  # of about 4000 unknowns
 
 
 def test_disconnected_subdomains_are_split_and_reported(caplog):

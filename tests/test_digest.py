@@ -95,17 +95,6 @@ def test_it_is_the_same_on_any_ranks(comm):
     check_same_problem(Given(MPI.COMM_SELF, 4).digest(), Given(comm, 4).digest())
 
 
-def test_it_follows_a_series():
-    """What apply sets at a time is there again in another run."""
-    one, other = Given(), Given()
-    for t in (0.25, 0.5, 0.75):
-        one.apply(t)
-        one.problem.solve()
-        one.problem.accept()
-    other.apply(0.75)
-    check_same_problem(one.digest(), other.digest())
-
-
 def test_another_mass_is_named():
     kept, other = (Thrown(n=2, subdomains=2, mass=mass).problem.digest() for mass in (1.0, 2.0))
     with pytest.raises(tfeti.InputError, match=r"mass: constants\[0\] is 2.0, and was 1.0"):

@@ -7,6 +7,7 @@ from petsc4py import PETSc
 from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.krylov import Directions, pcpg
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, Steps, TargetRule
+from tfeti_dolfinx.qp.recycling import DirectionStore
 from tfeti_dolfinx.qp.sets import Product
 
 pytestmark = pytest.mark.usefixtures("serial_only")
@@ -61,3 +62,12 @@ def test_directions_are_conjugate():
     assert np.abs(P @ F @ P.T - np.eye(40)).max() <= 1e-6
     kept.clear()
     assert kept.images.shape == (0, n)
+
+
+def test_where_memory_does_not_last_the_oldest_goes():
+    kept = DirectionStore(3, 2)
+    for k in range(4):
+        kept.put(np.full(2, k), np.full(2, -k))
+    assert kept.count == 3
+    assert sorted(kept.directions[:, 0]) == [1, 2, 3]
+    assert np.array_equal(kept.images, -kept.directions)

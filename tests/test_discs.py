@@ -132,3 +132,10 @@ def test_the_longest_step_ends_on_the_boundary(seed):
     x, p = Ellipses(a).project(rng.standard_normal(2)), rng.standard_normal(2)
     step = Ellipses(a).max_step(x, p)
     assert level(a, x - step * p)[0] == pytest.approx(1.0, abs=1e-9)
+
+
+def test_a_point_that_cannot_move_has_no_step():
+    fixed = Ellipses(np.array([[1.0, 0.0]]))
+    assert fixed.max_step(np.zeros(2), np.array([1.0, 1.0])) == 0.0
+    assert fixed.max_step(np.zeros(2), np.array([1.0, 0.0])) == 1.0
+    assert fixed.max_step(np.zeros(2), np.zeros(2)) == np.inf

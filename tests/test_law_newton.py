@@ -130,3 +130,12 @@ def test_laws_of_both_kinds_in_one_scene():
         found.append(displacement(p)[1])
         p.destroy()
     assert np.abs(found[0] - found[1]).max() <= 1e-6 * np.abs(found[1]).max()
+
+
+def test_the_same_load_again_takes_no_step():
+    p = solved("quadrilateral", tfeti.Coulomb(0.3), (0.05, -0.05), rtol=1e-6)
+    assert p.report.friction_newton_steps > 0
+    p.solve()
+    assert p.report.friction_newton_steps == 0
+    assert p.report.F_multiplications <= 2
+    p.destroy()

@@ -185,24 +185,3 @@ def test_false_friends_are_told_apart(cell, equals):
 
 def test_shared_blocks_keep_the_promises_of_a_block(equals):
     check_kind_of_block(lambda data: SparseBlock(data, equals=equals))
-
-
-class OwnBlock(Block):
-    """K = I."""
-
-    def set_stiffness(self, K):
-        self.kernel, self.diagonal = np.zeros((K.shape[0], 0)), np.ones(K.shape[0])
-
-    def multiply(self, u):
-        return u
-
-    solve = apply_schur = multiply
-
-
-@pytest.mark.parametrize("local_type", ["implicit", "explicit"])
-def test_blocks_of_one_s_own_apply_what_they_have(local_type):
-    K, x = stiffness("triangle", 2)
-    blocks = [OwnBlock(data(K, x)) for _ in range(2)]
-    w = random(sum(len(block.trace_dofs) for block in blocks))
-    for kind in KINDS:
-        assert np.allclose(applied(GroupedOperator(blocks, kind, LocalChoice(local_type)), w), w)

@@ -10,11 +10,6 @@ HEIGHT = lambda x: x[1] + 0.01  # noqa: E731
 BOTTOM = "obstacle of surface 'bottom'"
 
 
-def list_of(contacts):
-    """The problem with these for contacts."""
-    return lambda s: s.problem(contacts=contacts)
-
-
 def surface(name):
     """Solve with an obstacle of this surface."""
     return lambda s: s.with_contacts(tfeti.Obstacle(name, tfeti.Plane((0, 0), (0, 1))))
@@ -25,18 +20,13 @@ def shape(make):
     return lambda s: make()
 
 
-def obstacle(of):
-    """Make an obstacle of something."""
-    return lambda s: tfeti.Obstacle("bottom", of)
-
-
 def distance(distance, gradient=UP):
     """Solve with an obstacle of two callables."""
     return lambda s: s.with_distance(distance, gradient)
 
 
 CONTACTS = {
-    r"contacts: expected a list, got None": list_of(None),
+    r"contacts: expected a list, got None": lambda s: s.problem(contacts=None),
     r"^joint: both are the same surface": lambda s: s.with_contacts(
         tfeti.Contact("left", "left", name="joint")
     ),
@@ -63,7 +53,7 @@ VECTORS = {
 }
 
 SHAPES = {
-    rf"{BOTTOM}: shape is None; expected a Plane": obstacle(None),
+    rf"{BOTTOM}: shape is None; expected a Plane": shape(lambda: tfeti.Obstacle("bottom", None)),
     r"distance_of is 0.1; expected a callable": shape(lambda: tfeti.SignedDistance(0.1, UP)),
     rf"{BOTTOM}: the distance at points of shape \(3, \d\) has the shape \(3, \d\)": distance(
         lambda x: x

@@ -24,19 +24,8 @@ def made(**changes):
     return lambda s: elastic(s, **{name: make(s) for name, make in changes.items()})
 
 
-def function(s, value, *element):
-    E = fem.Function(s.space(*(element or ("DG", 0))), name="stiff")
-    E.x.array[:] = value
-    return E
-
-
 def untorn(s):
     return fem.Function(s.untorn_space("DG", 0), name="stiff")
-
-
-def thick(thickness):
-    """The problem with a thickness."""
-    return lambda s: s.problem(thickness=thickness)
 
 
 MODULI = {
@@ -82,7 +71,7 @@ THICKNESS = {
     r"thickness=0.5: expected none with model='axisymmetric'": given(
         thickness=0.5, model="axisymmetric"
     ),
-    r"thickness=0: expected a positive number": thick(0),
+    r"thickness=0: expected a positive number": lambda s: s.problem(thickness=0),
 }
 
 TABLES = ("MODULI", "MODELS", "THICKNESS")

@@ -1,6 +1,7 @@
 """Mistakes in parts of one's own."""
 
 import numpy as np
+from mpi4py import MPI
 
 from mistakes.scene import raising
 from tfeti_dolfinx import Extensions
@@ -8,24 +9,16 @@ from tfeti_dolfinx.qp.sets import Bounds
 from tfeti_dolfinx.subdomains.block import Block
 
 
-def own(contact=True, options=None, **parts):
+def own(options=None, **parts):
     """Solve with parts of one's own."""
-
-    def do(s):
-        contacts, extensions = [s.floor] if contact else [], Extensions(**parts)
-        s.problem(contacts=contacts, extensions=extensions, petsc_options=options).solve()
-
-    return do
+    return lambda s: s.problem(
+        contacts=[s.floor], extensions=Extensions(**parts), petsc_options=options
+    ).solve()
 
 
-def on_the_last_rank(s, part):
-    """Solve with a part that fails on the last rank only."""
-
-    def fails(*_):
-        if s.comm.rank == s.comm.size - 1:
-            raising()
-
-    s.problem(contacts=[s.floor], extensions=Extensions(**{part: fails})).solve()
+def on_the_last_rank(*_):
+    if MPI.COMM_WORLD.rank == MPI.COMM_WORLD.size - 1:
+        raising()
 
 
 class OfThree:
@@ -57,9 +50,7 @@ RUN = {
     ),
     r"extensions: feasible_set projects vectors of shape \(\d+,\) to \(\d+,\); expected a set "
     r"on all rows of this rank": own(feasible_set=lambda constraints: OfThree()),
-    r"extensions: monitor: ZeroDivisionError: no such place": lambda s: on_the_last_rank(
-        s, "monitor"
-    ),
+    r"extensions: monitor: ZeroDivisionError: no such place": own(monitor=on_the_last_rank),
 }
 
 TABLES = ("GIVEN", "RUN")

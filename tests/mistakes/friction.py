@@ -25,6 +25,10 @@ def on_floor(make, scene=lambda s: s):
     return do
 
 
+def rough(s, bound, **given):
+    return tfeti.Obstacle("bottom", s.floor.shape, friction=tfeti.Tresca(bound), **given)
+
+
 def membrane(s):
     V = s.space("Lagrange", 1)
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
@@ -38,17 +42,6 @@ def membrane(s):
         bcs=[fem.dirichletbc(0.0, s.on(V=V), V)],
         contacts=[tfeti.Obstacle("bottom", away, friction=tfeti.Tresca(1.0), name="lid")],
     ).solve()
-
-
-def two_laws(s, first, second):
-    shape = s.floor.shape
-    one = tfeti.Obstacle("bottom", shape, friction=first, name="ice")
-    s.with_contacts(one, tfeti.Obstacle("bottom", shape, friction=second, name="sand"))
-
-
-def solved_with(s, qp_type):
-    floor = tfeti.Obstacle("bottom", s.floor.shape, friction=tfeti.Tresca(1.0))
-    s.with_contacts(floor, qp_type=qp_type)
 
 
 LAWS = {
@@ -80,10 +73,12 @@ AT_NODES = {
     ),
     r"^lid: friction on a scalar space; expected disp": membrane,
     r"^sand: the same surface has another law of friction in ice; expected one law": lambda s: (
-        two_laws(s, tfeti.Tresca(1.0), tfeti.Tresca(2.0))
+        s.with_contacts(rough(s, 1.0, name="ice"), rough(s, 2.0, name="sand"))
     ),
     r"-tfeti_qp_type pcpg: the scene has friction, \d+ tangential rows, which PCPG cannot "
-    r"keep; expected auto or smalse or newton": lambda s: solved_with(s, "pcpg"),
+    r"keep; expected auto or smalse or newton": lambda s: s.with_contacts(
+        rough(s, 1.0), qp_type="pcpg"
+    ),
 }
 
 TABLES = ("LAWS", "AT_NODES")

@@ -1,11 +1,11 @@
 """Mistakes in meshes, tags, names and subdomains that DOLFINx's mesh comes with."""
 
-import gmsh
 import numpy as np
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 
 import tfeti_dolfinx as tfeti
+from mistakes.gmsh_files import meshed, model
 from mistakes.scene import raising
 
 
@@ -81,23 +81,6 @@ MARKERS = {
 }
 
 
-def from_gmsh(s):
-    """A decomposition of a square of two triangles that gmsh made."""
-    model = None
-    if s.comm.rank == 0:
-        gmsh.initialize(interruptible=False)
-        gmsh.option.setNumber("General.Terminal", 0)
-        model = gmsh.model
-        square = model.occ.addRectangle(0, 0, 0, 1, 1)
-        model.occ.synchronize()
-        model.addPhysicalGroup(2, [square], name="steel")
-        model.mesh.generate(2)
-    d = tfeti.read_gmsh(model, s.comm, subdomains=2)
-    if s.comm.rank == 0:
-        gmsh.finalize()
-    return d
-
-
 def untorn_function(s):
     return fem.Function(s.untorn_space("Lagrange", 1))
 
@@ -116,9 +99,9 @@ ORIGINALS = {
     r"f is from .*, whose unknowns depend on the directions of edges and facets;": lambda s: (
         s.d.from_original(fem.Function(s.untorn_space("RTCF", 1)))
     ),
-    r"there is no mesh before it was torn: read_gmsh makes none; expected a": lambda s: from_gmsh(
-        s
-    ).from_original(untorn_function(s)),
+    r"there is no mesh before it was torn: read_gmsh makes none; expected a": lambda s: model(
+        meshed, 2
+    )(s).from_original(untorn_function(s)),
 }
 
 TABLES = ("MESHES", "SUBDOMAINS", "TAGS", "NAMES", "MARKERS", "ORIGINALS")

@@ -10,6 +10,9 @@ def given(**options):
 
 
 OPTIONS = {
+    r"-tfeti_coarse_pc_factor_fil: factors by .* read no such option": given(
+        coarse_pc_factor_fil=2
+    ),
     r"unknown option -tfeti_rtoll; expected -tfeti_rtol or .* perhaps": given(tfeti_rtoll=1e-6),
     r"-tfeti_wibble; expected one of -tfeti_qp_type, ": given(wibble=1),
     r"unknown option -tfeti_ksp_type; expected -tfeti_qp_type, which chooses what solves the "
