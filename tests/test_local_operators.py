@@ -10,7 +10,6 @@ from test_dual import check_operator
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.arrays import parts_of
-from tfeti_dolfinx.subdomains.block import Block
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.local_operators import GroupedOperator, LocalChoice
 from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains, SparseBlock
