@@ -124,3 +124,13 @@ def test_no_docstring_opens_with_a_relative_clause():
         if (text := ast.get_docstring(node)) and text.split(maxsplit=1)[0] in ODD
     ]
     assert not odd
+
+
+def test_class_names_are_unique():
+    names = [
+        node.name
+        for path in modules()
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.ClassDef)
+    ]
+    assert len(names) == len(set(names))

@@ -117,6 +117,20 @@ def test_notation_names_what_is_in_the_code():
     assert not missing
 
 
+def test_ci_runs_the_readme_s_test_command():
+    ci = (ROOT / ".ci/run").read_text()
+    (test_command,) = [
+        line
+        for block in blocks(ROOT / "README.md", "sh")
+        for line in block.splitlines()
+        if "pytest" in line
+    ]
+    lines = [line.strip() for line in ci.splitlines()]
+    limited = [line for line in lines if line.startswith("limit ")]  # and without input
+    for command in (test_command, test_command.replace("./run", "./run mpirun -n 2")):
+        assert any(line.endswith(f" {command}") for line in limited)
+
+
 def test_the_package_installs(serial_only, tmp_path):
     source = tmp_path / "source"
     source.mkdir()

@@ -11,7 +11,7 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.qp.coarse import HELD, imbalance
 from tfeti_dolfinx.qp.homogenised import Homogenised
-from tfeti_dolfinx.qp.newton_faces import FaceSolver, LocalProgram, Multipliers
+from tfeti_dolfinx.qp.newton_faces import DualIterate, FaceSolver, LocalProgram
 from tfeti_dolfinx.qp.parameters import NewtonParameters
 from tfeti_dolfinx.qp.problem import (
     QP,
@@ -90,7 +90,7 @@ class NewtonState:
         resume: Whether λ is where PCPG has stopped.
     """
 
-    z: Multipliers
+    z: DualIterate
     mu: Array
     s: Array
     back: Array
@@ -181,7 +181,7 @@ class _Newton:
         """
         return self.feasible.face(self.state.back, self.state.s)
 
-    def wanted_face(self) -> tuple[Multipliers, Face]:
+    def wanted_face(self) -> tuple[DualIterate, Face]:
         """Step 2: start and face of the next solve.
 
         The face is that of λ, with the rows that want to carry if the chopped gradient β dominates
@@ -211,13 +211,13 @@ class _Newton:
         state.resume = False
         return self.program.moved(z, state.back), pressed
 
-    def gain(self, to: Multipliers) -> float:
+    def gain(self, to: DualIterate) -> float:
         """Return q(λ) − q(to), without terms that Gλ = e makes constant."""
         z = self.state.z
         (double,) = self.program.dot((z.lam - to.lam, to.g - z.g + 2.0 * self.state.s))
         return 0.5 * double
 
-    def accept(self, end: Multipliers, feasible: bool) -> bool:
+    def accept(self, end: DualIterate, feasible: bool) -> bool:
         """Step 4: go where q falls enough; return whether q could be lowered.
 
         That is the end of step 3, else the projected gradient step or the part of it where q is
@@ -248,10 +248,10 @@ class _Newton:
         self.solver.directions.seen(curvature, size)
         length = min(1.0, slope / curvature) if curvature > 0.0 else 1.0
         lam = self.feasible.project(z.lam + length * p)
-        self._go(Multipliers(lam, z.g + length * Fp), 0.5 * length * slope)
+        self._go(DualIterate(lam, z.g + length * Fp), 0.5 * length * slope)
         return True
 
-    def _go(self, to: Multipliers, gain: float) -> None:
+    def _go(self, to: DualIterate, gain: float) -> None:
         """Move to a point where q is lower by ``gain``."""
         z = self.state.z
         work, load = self.program.dot((z.lam, z.g), (z.lam, self.program.qp.d.array_r))
@@ -317,7 +317,7 @@ def newton(
     steps, program = Steps(), LocalProgram(qp)
     solver = FaceSolver(program, rule, parameters, steps, max_it, monitor)
     # Step 0: a feasible start
-    z = Multipliers(np.array(homogenised.lam_bar.array_r), np.array(homogenised.gradient.array_r))
+    z = DualIterate(np.array(homogenised.lam_bar.array_r), np.array(homogenised.gradient.array_r))
     mu = np.zeros(qp.coarse.dimension) if start is None else start.mu
     state = NewtonState(z, mu, z.g, z.lam)
     method = _Newton(program, solver, parameters, state)

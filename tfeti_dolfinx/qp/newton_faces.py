@@ -32,7 +32,7 @@ from tfeti_dolfinx.qp.sets import Face, without_slip
 
 
 @dataclass(frozen=True)
-class Multipliers:
+class DualIterate:
     """Multipliers with their gradient, this rank's part.
 
     Attributes:
@@ -71,13 +71,13 @@ class LocalProgram:
         self.comm.Bcast(products, root=0)
         return [float(value) for value in products]
 
-    def moved(self, z: Multipliers, lam: Array) -> Multipliers:
+    def moved(self, z: DualIterate, lam: Array) -> DualIterate:
         """Return other multipliers with their gradient: one multiplication by F."""
-        return Multipliers(lam, z.g + self.F(lam - z.lam))
+        return DualIterate(lam, z.g + self.F(lam - z.lam))
 
-    def refreshed(self, lam: Array) -> Multipliers:
+    def refreshed(self, lam: Array) -> DualIterate:
         """Return multipliers with a gradient made anew: one multiplication by F."""
-        return Multipliers(lam, self.F(lam) - self.qp.d.array_r)
+        return DualIterate(lam, self.F(lam) - self.qp.d.array_r)
 
     def normal(self, mu: Array) -> Array:
         """Gᵀμ."""
@@ -170,8 +170,8 @@ class FaceSolver:
         return self._on_face.coarse.coordinates(self._program.vec(g))
 
     def solve(
-        self, start: Multipliers, face: Face, optimality: float, resume: bool
-    ) -> tuple[Multipliers, bool]:
+        self, start: DualIterate, face: Face, optimality: float, resume: bool
+    ) -> tuple[DualIterate, bool]:
         """Step 3: solve on a face; drop what leaves Ω, restore Gλ = e, solve again. Collective.
 
         Args:
@@ -230,7 +230,7 @@ class FaceSolver:
         self._face = face
         self._on_face = replace(self._qp, F=F, coarse=coarse, recycled=past, held=face.held)
 
-    def _restored(self, end: Multipliers) -> Multipliers:
+    def _restored(self, end: DualIterate) -> DualIterate:
         """Enter the face of P_Ω(λ), and return its point next to that with Gλ = e.
 
         Where that face holds a body no longer, the nearest feasible point names rows that do.
@@ -253,7 +253,7 @@ class FaceSolver:
             self._set_face(replace(self._face, curvature=curvature), self._on_face.coarse)
         return z
 
-    def _has_left(self, z: Multipliers) -> bool:
+    def _has_left(self, z: DualIterate) -> bool:
         """Return whether rows that do not slip are outside of Ω."""
         assert self._face is not None
         apart = self._qp.feasible.project(z.lam) - z.lam
@@ -270,7 +270,7 @@ class FaceSolver:
         own = self._qp.feasible.max_step(lam, -held)
         return float(self._program.comm.allreduce(max(own, 0.0), op=MPI.MIN))
 
-    def _along_null_space(self, z: Multipliers) -> Multipliers:
+    def _along_null_space(self, z: DualIterate) -> DualIterate:
         """Go beyond a bound along a direction without curvature, where PCPG has found one.
 
         Rows depend on each other. Where nothing ends the way, F does not see it and q falls along
@@ -285,7 +285,7 @@ class FaceSolver:
                 continue
             length = self._to_a_bound(z.lam, way)
             if np.isfinite(length):
-                return Multipliers(
+                return DualIterate(
                     z.lam + self._parameters.beyond * length * way,
                     z.g + self._parameters.beyond * length * Fw,
                 )
@@ -299,7 +299,7 @@ class FaceSolver:
             break
         return z
 
-    def _pcpg(self, z: Multipliers, optimality: float, resume: bool) -> tuple[Multipliers, bool]:
+    def _pcpg(self, z: DualIterate, optimality: float, resume: bool) -> tuple[DualIterate, bool]:
         """Run PCPG on the face entered; return its end, and whether rounding has ended it."""
         if self._preconditioner is None and self._qp.preconditioner_on is not None:
             assert self._face is not None
@@ -320,7 +320,7 @@ class FaceSolver:
         if isinstance(on_face.F, CurvedHessian):
             g -= on_face.F.bend(lam - z.lam)
             own.norm = norm  # small circles bend far more than F does
-        return Multipliers(lam, g), reason != ConvergedReason.CONVERGED_RTOL and not self._ended
+        return DualIterate(lam, g), reason != ConvergedReason.CONVERGED_RTOL and not self._ended
 
     def _leave(self) -> None:
         """Free projectors and preconditioner of the face."""
