@@ -125,7 +125,7 @@ def test_bodies_that_only_touch_do_not_push_each_other(cell, n, curvatures, side
 
 @pytest.mark.parametrize(("sides", "order"), [(("arc", "top"), 2), (("top", "arc"), 1)])
 def test_a_disc_on_a_block_does_not_push_it(comm, sides, order):
-    d, bcs = disc_on_block(comm, 24, order, pushed=0.0)
+    d, bcs = disc_on_block(comm, order, pushed=0.0)
     check_at_rest(two_body_problem(d, no_load, bcs, [sided(*sides, reach=0.3)], degree=order))
 
 

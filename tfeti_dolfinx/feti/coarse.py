@@ -21,6 +21,7 @@ from tfeti_dolfinx.feti.rigid_bodies import (
     TOLERANCES,
     Bodies,
     Motions,
+    kernel_basis,
     orthonormal_columns,
     unresisted,
 )
@@ -30,6 +31,8 @@ from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 class CoarseSpace(Projectors):
     """G, GGᵀ and what follows from them; the r-vectors are replicated on all ranks.
+
+    G = (R T)ᵀ Bᵀ, with T a basis of the kernel that has the bodies' motions as coordinates.
 
     Args:
         B: Dual rows × trace unknowns.
@@ -41,7 +44,8 @@ class CoarseSpace(Projectors):
     Attributes:
         subdomains: This rank's Blocks.
         dimension: r, the dimension of the kernel of K.
-        e: Rᵀ f, shape ``(r,)``.
+        e: (R T)ᵀ f, shape ``(r,)``.
+        motions: The bodies' motions in the basis T, scipy CSR, shape ``(r, bodies * k)``.
         Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
         bounded: Local rows with λ ≥ 0.
         rubbing: Local rows of friction.
@@ -82,14 +86,21 @@ class CoarseSpace(Projectors):
         self.free_motions = self.unresisted(~equalities)
         both = csr_array(hstack([self.free_motions.alone, self.free_motions.joint]))
         self.free_basis = bcast_from_root(comm, orthonormal_columns(both))
-        self.Gt, self.e = Gt, self._load()
-        self.null = bcast_from_root(comm, orthonormal_columns(self.bodies.motions @ both))
+        # made on one rank: processors that round differently might choose differently
+        self._basis = bcast_from_root(
+            comm, kernel_basis(self.bodies, self.unheld, self.free_motions)
+        )
+        self.motions = self._basis.coordinates(self.bodies.motions)
+        self.Gt = self._basis.rows(Gt, diags_array(self.row_size) @ self.J, equalities)
+        self.e = self._load()
+        self.null = bcast_from_root(comm, orthonormal_columns(csr_array(self.motions @ both)))
         self.grams = Grams(self.Gt, np.flatnonzero(~equalities), comm)
         self.factors = FaceFactors(comm, self.null, prefix)
         self._factor = self.factors.factor(self.grams.whole, "whole")
 
     def _load(self) -> Array:
-        return np.concatenate(self.comm.allgather(self.subdomains.kernel_load))
+        e = np.concatenate(self.comm.allgather(self.subdomains.kernel_load))
+        return self._basis.products(e)
 
     def update_load(self) -> None:
         """Replace e = Rᵀ f by that of the Blocks' present loads."""
@@ -103,7 +114,7 @@ class CoarseSpace(Projectors):
 
     def local_alpha(self, alpha: Array) -> Array:
         """Return kernel coordinates of this rank's Blocks that belong to an r-vector."""
-        return alpha[self._own]
+        return self._basis.kernel(alpha)[self._own]
 
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
         """(G_f G_fᵀ + damping·GGᵀ)⁻¹y, f a face of the rows."""

@@ -75,7 +75,7 @@ def recover(
         u = moved(u, coarse, alpha)
     gap = residual - coarse.Gt @ alpha
     if (N := coarse.free_basis).shape[1]:  # gaps do not change
-        u = moved(u, coarse, coarse.bodies.motions @ (N @ -(N.T @ coarse.bodies.part_of(u))))
+        u = moved(u, coarse, coarse.motions @ (N @ -(N.T @ coarse.bodies.part_of(u))))
     # what sticks holds, pushed or not, and so do all rows of friction that carry a force
     active = np.zeros(len(lam), dtype=bool)
     active[coarse.bounded] = (np.abs(lam) > no_effect * error)[coarse.bounded]

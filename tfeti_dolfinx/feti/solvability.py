@@ -208,7 +208,7 @@ def check_solvable(
     """
     if coarse.dimension == 0:
         return
-    load = coarse.bodies.motions.T @ coarse.e
+    load = coarse.motions.T @ coarse.e
     motion = bcast_from_root(coarse.comm, _driven(coarse.free_motions, load, coarse.bodies))
     reason = (
         "nothing resists that and the load drives it; add a Dirichlet condition, a contact or a "
@@ -271,7 +271,7 @@ def rigid_scene(coarse: CoarseSpace, constraints: Constraints, cones: bool) -> R
         return None
     normals, pressing, of_cones, of_given = zip(*ranks, strict=True)
     return RigidScene(
-        Z.T @ (coarse.bodies.motions.T @ coarse.e),
+        Z.T @ (coarse.motions.T @ coarse.e),
         bodies.negligible[body],
         body,
         csr_array(vstack(normals)),

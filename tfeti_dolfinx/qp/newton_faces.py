@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.common.parallel import any_rank, largest, summed
 from tfeti_dolfinx.qp.coarse import HELD, Coarse, imbalance
 from tfeti_dolfinx.qp.krylov import Directions, pcpg
@@ -259,13 +259,10 @@ class FaceSolver:
         apart = self._qp.feasible.project(z.lam) - z.lam
         return self._program.any(without_slip(self._face, apart) != 0.0)
 
-    def _to_a_bound(self, lam: Array, way: Array, slips: bool = False) -> float:
-        """Return the largest t with λ + t·way ∈ Ω, maybe infinite; rounding ends no way.
-
-        Rows that slip bound it only if ``slips``.
-        """
+    def _to_a_bound(self, lam: Array, way: Array) -> float:
+        """Return the largest t with λ + t·way ∈ Ω, maybe infinite; rounding ends no way."""
         assert self._face is not None
-        held, small = way if slips else without_slip(self._face, way), self._parameters.rounding
+        held, small = without_slip(self._face, way), self._parameters.rounding
         held = np.where(np.abs(held) > small * largest(self._program.comm, way), held, 0.0)
         own = self._qp.feasible.max_step(lam, -held)
         return float(self._program.comm.allreduce(max(own, 0.0), op=MPI.MIN))
@@ -273,31 +270,51 @@ class FaceSolver:
     def _along_null_space(self, z: DualIterate) -> DualIterate:
         """Go beyond a bound along a direction without curvature, where PCPG has found one.
 
-        Rows depend on each other. Where nothing ends the way, F does not see it and q falls along
-        it, they want gaps that exclude each other: ``excluding`` says so.
+        Rows depend on each other. Where no bound ends the way, neither F nor G sees it and q falls
+        along it, they want gaps that exclude each other: ``excluding`` says so.
         """
-        program, own = self._program, self.directions
+        program, own, qp, given = self._program, self.directions, self._qp, self._parameters
         for vec in (own.p, own.r):
             way = np.array(vec.array_r)
-            Fw = program.F(way)
+            size, Fw = largest(program.comm, way), program.F(way)
             curvature, square = program.dot((way, Fw), (way, way))
-            if square == 0.0 or own.seen(curvature, square):
+            if size == 0.0 or own.seen(curvature, square):
                 continue
+            way, Fw = self._unseen(way, Fw)
             length = self._to_a_bound(z.lam, way)
             if np.isfinite(length):
-                return DualIterate(
-                    z.lam + self._parameters.beyond * length * way,
-                    z.g + self._parameters.beyond * length * Fw,
-                )
-            d = self._qp.d.array_r
-            falls, size, seen = program.dot((way, d), (d, d), (Fw, Fw))
-            unseen = seen <= (self._parameters.rounding * own.norm) ** 2 * square
-            endless = np.isinf(self._to_a_bound(z.lam, way, slips=True))
-            if unseen and endless and falls > self._parameters.apart * np.sqrt(size * square):
-                most = largest(program.comm, way)
-                self.excluding = np.flatnonzero(np.abs(way) > self._parameters.takes_part * most)
+                step = given.beyond * length
+                return DualIterate(z.lam + step * way, z.g + step * Fw)
+            # Farkas: p in the cone of recession of Ω with Fp = 0, Gp = 0 and dᵀp > 0
+            p = qp.feasible.project(given.far / size * way) * (size / given.far)
+            Pp = program.vec(p)
+            qp.coarse.project(Pp)
+            Qp, d, Fp = p - Pp.array_r, qp.d.array_r, program.F(p)
+            FF, QQ, pp, pd, dd = program.dot((Fp, Fp), (Qp, Qp), (p, p), (p, d), (d, d))
+            unseen = max(FF / max(own.norm, TINY) ** 2, QQ) <= given.rounding**2 * pp
+            if pp > 0.0 and unseen and pd > given.apart * np.sqrt(dd * pp):
+                most = largest(program.comm, p)
+                self.excluding = np.flatnonzero(np.abs(p) > given.takes_part * most)
             break
         return z
+
+    def _unseen(self, way: Array, Fw: Array) -> tuple[Array, Array]:
+        """Return w − (PFP)⁺Fw by PCPG, with its image: the part of w ≠ 0 that F does not see.
+
+        What PCPG has left of the others in w is small beside it, but its bounds would end the way.
+        """
+        own, program, given = Directions(self._qp.d), self._program, self._parameters
+        on_face = replace(self._on_face, F=self._qp.F, preconditioner=self._preconditioner)
+        point = Point(self._qp.d.duplicate(), self._qp.d.duplicate())
+        point.g.array[:] = -Fw
+        (square,) = program.dot((way, way))
+        exact = TargetRule(given.unseen * self.directions.norm * float(np.sqrt(square)))
+        on_face = replace(on_face, d=-point.g, recycled=None)
+        pcpg(on_face, point, exact, Steps(), given.purifying, directions=own)
+        way, Fw = way - point.lam.array_r, -np.array(point.g.array_r)
+        for held in (own, point, on_face.d):
+            held.destroy()
+        return way, Fw
 
     def _pcpg(self, z: DualIterate, optimality: float, resume: bool) -> tuple[DualIterate, bool]:
         """Run PCPG on the face entered; return its end, and whether rounding has ended it."""

@@ -25,6 +25,9 @@ class NewtonParameters:
             to leave.
         apart: Of ‖d‖: rows that want gaps so far apart exclude each other, less may be rounding.
         takes_part: Of the largest force of such a direction: rows with less have no part in it.
+        far: How far such a direction is followed, to end in Ω's cone of recession.
+        unseen: Of ‖F‖‖w‖: what may be left of Fw where F is not to see a direction w.
+        purifying: Most steps of PCPG to that.
     """
 
     gamma: float = described(
@@ -53,6 +56,9 @@ class NewtonParameters:
     beyond: float = 10.0
     apart: float = 1e-8
     takes_part: float = 1e-3
+    far: float = 1e30
+    unseen: float = 1e-14
+    purifying: int = 200
 
 
 @dataclass(frozen=True)

@@ -151,9 +151,10 @@ def solve_with_friction(
         result, rule = solve_dual(dual, options, qp_type, law or start, monitor, exact, rtol=asked)
         iterations, looks, steps = iterations + 1, looks + rule.looks, steps.plus(result.steps)
         if result.reason <= 0:
-            if law is None:
+            if law is not None:
+                newton.give_up(bounds)
+            elif not bounds.slip(result.reason):
                 break
-            newton.give_up(bounds)
             law, holds = None, bounds.hold()
             if not holds:
                 result.reason = ConvergedReason.DIVERGED_FRICTION
@@ -217,7 +218,7 @@ class FrictionBounds:
         at = constraints.pressed
         self._rows = constraints.pressed_by[at]
         self._mu = np.linalg.norm(constraints.coefficients[at], axis=1)
-        self._stuck = False
+        self._stuck, self._slipped = False, False
         if start is None:
             self._stick()
         else:
@@ -251,6 +252,13 @@ class FrictionBounds:
             return False
         self._stick()
         self._dual.bound_friction(self.now)
+        return True
+
+    def slip(self, reason: ConvergedReason) -> bool:
+        """Let all slip where sticking contradicts itself, as beside a wall that pushes, once."""
+        if self._slipped or not self.stick or reason != ConvergedReason.DIVERGED_CONTRADICTION:
+            return False
+        self.now, self._slipped = np.zeros(len(self._rows)), True
         return True
 
     def change(self, lam: PETSc.Vec, u: Array) -> float:
