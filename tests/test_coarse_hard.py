@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import ufl
-from bodies import boxes, held, pressed, two_body_problem
+from bodies import boxes, held, pressed, stacked, stiffer_above, two_body_problem
 from dolfinx import fem
 from mpi4py import MPI
 from scipy.sparse import csr_array
@@ -12,6 +12,26 @@ from test_solvable_lp import dual_of
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.errors import FactorError
 from tfeti_dolfinx.feti.projectors import SemidefiniteFactor
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
+def test_a_stiff_body_that_contact_with_a_soft_one_holds(cell):
+    """Gluing rows of the stiff body are 1e8 times as large as the rows that hold it."""
+    d = stacked(cell, 2, 2, 4)
+    sides = held(d, "lower bottom", "lower left", "upper left")
+    contact = tfeti.Contact("lower top", "upper bottom")
+    p = two_body_problem(d, pressed(d, 1e-4), sides, [contact], stress=stiffer_above(d, 1e16))
+    dual = dual_of(p)
+    coarse = dual.coarse
+    mu = np.random.default_rng(0).standard_normal(coarse.dimension)
+    size = np.sqrt(coarse.grams.whole.diagonal())
+    mu = mu / np.where(size > 0.0, size, 1.0)
+    mu -= coarse.null @ (coarse.null.T @ mu)
+    x = dual.d.duplicate()
+    coarse.combine(mu, x)
+    error = size * (coarse.coordinates(x) - mu)
+    assert np.abs(error).max() <= 1e-9 * np.abs(size * mu).max()
+    p.destroy()
 
 
 def test_a_body_that_slides_along_all_that_it_meets():
