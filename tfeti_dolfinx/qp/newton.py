@@ -129,7 +129,11 @@ class _Newton:
             self._learn_norm()
         state.norm = self.solver.directions.norm or 1.0
         if state.resume:
-            state.mu = self.solver.multipliers(state.z.g)
+            mu = self.solver.multipliers(state.z.g)
+            s = state.z.g - program.normal(mu)
+            # of motions that the face does not see μ is rounding over rounding
+            left, size = program.dot((s, s), (state.z.g, state.z.g))
+            state.mu = mu if left <= self.parameters.unfelt**2 * size else 0.0 * mu
         # not λ − ᾱ(Fλ − d): what Gᵀμ takes from it may be large
         state.s = state.z.g - program.normal(state.mu)
         state.back, alpha, _ = program.projected(state.z.lam - state.s / state.norm)

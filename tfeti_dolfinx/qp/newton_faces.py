@@ -25,7 +25,7 @@ from tfeti_dolfinx.qp.problem import (
     StoppingRule,
     TargetRule,
 )
-from tfeti_dolfinx.qp.projection import ConvexSet, OnBoundary, project_onto_feasible
+from tfeti_dolfinx.qp.projection import ConvexSet, WithinFace, project_onto_feasible
 from tfeti_dolfinx.qp.sets import Face, without_slip
 
 # --- Points and products as numpy arrays ------------------------------------------------------
@@ -197,7 +197,7 @@ class FaceSolver:
         # Step 3c: slipping rows, which followed their tangents, come back onto their boundary
         if self._curved and not out:
             assert self._face is not None
-            boundary = OnBoundary(self._qp.feasible, self._face)
+            boundary = WithinFace(self._qp.feasible, self._face, slipping=True)
             lam, _, missing = self._program.projected(end.lam, boundary)
             end, out = self._program.moved(end, lam), missing > HELD
         return end, not out
@@ -233,17 +233,21 @@ class FaceSolver:
     def _restored(self, end: DualIterate) -> DualIterate:
         """Enter the face of P_Ω(λ), and return its point next to that with Gλ = e.
 
-        Where that face holds a body no longer, the nearest feasible point names rows that do.
+        Where that face holds a body no longer, the nearest feasible point names rows that do:
+        within the face before, so that faces shrink and steps end, or if there is none, in Ω.
         Multiplies by F once.
         """
-        qp, program = self._qp, self._program
+        qp, program, before = self._qp, self._program, self._face
+        assert before is not None
         on = qp.feasible.project(end.lam)
         self._enter(qp.feasible.face(on, end.g))
         coarse = self._on_face.coarse
         coarse.combine(coarse.solve(qp.coarse.residual(program.vec(on))), self._point.lam)
         lam = on + self._point.lam.array_r
         if imbalance(qp.coarse, program.vec(lam)) > HELD:
-            lam, *_ = program.projected(on)
+            lam, _, missing = program.projected(on, WithinFace(qp.feasible, before))
+            if missing > HELD:
+                lam, *_ = program.projected(on)
             on = 0.5 * (on + lam)
             self._enter(qp.feasible.face(on, end.g))
         z = program.refreshed(lam)

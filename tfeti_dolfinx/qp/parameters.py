@@ -17,6 +17,8 @@ class NewtonParameters:
         final: Of the rule's tolerance: what no solve goes below, as ‖g^P‖ is not quite ‖P_f g‖.
         stage: What a solve on a face that stays reduces its residual to, before step 1 looks at it.
         patience: Steps in a row that neither halve ‖g^P‖ nor lower q beyond its rounding.
+        unfelt: Of the gradient: multipliers of Gλ = e that make it longer than that are rounding of
+            motions that a face does not see.
         lost: Of ‖F‖‖λ‖: what rounding of λ − ᾱs leaves of ‖g^P‖.
         rounding: Of the largest entry of a way: less is none.
         hidden: Of the terms of q: what its differences may be wrong by.
@@ -49,6 +51,7 @@ class NewtonParameters:
     final: float = 0.9
     stage: float = 0.1
     patience: int = 10
+    unfelt: float = 1e6
     lost: float = 2e-15
     rounding: float = 1e-10
     hidden: float = 1e-15

@@ -146,28 +146,30 @@ def project_onto_feasible(
     return FeasiblePoint(trial.lam, trial.alpha, imbalance(coarse, trial.lam))
 
 
-class OnBoundary:
-    """Points of Ω whose open rows are those of a face, its slipping ones on their boundary.
-
-    They make no convex set, but what ``project_onto_feasible`` minimises is convex with any set.
+class WithinFace:
+    """Points of Ω whose open rows are those of a face, at least.
 
     Args:
         feasible: The set Ω.
         face: The face.
+        slipping: Whether its slipping rows stay on their boundary, too. They do not make a convex
+            set then, but what ``project_onto_feasible`` minimises is convex with any set.
     """
 
-    def __init__(self, feasible: FeasibleSet, face: Face) -> None:
-        self._feasible, self._kept = feasible, face
+    def __init__(self, feasible: FeasibleSet, face: Face, slipping: bool = False) -> None:
+        self._feasible, self._open = feasible, ~face.carrying
+        some = np.where(self._open, Status.OPEN, Status.FREE)
+        self._status = face.status if slipping else some
 
     def project(self, x: Array) -> Array:
         """P_Ω(x), but for the rows that stay."""
-        return self._feasible.onto(x, self._kept.status)
+        return self._feasible.onto(x, self._status)
 
     def face(self, x: Array, g: Array) -> Face:
         """Return the face of x, without the rows that stay open."""
-        face, is_open = self._feasible.face(x, g), ~self._kept.carrying
-        kept = np.flatnonzero(abs(face.Z).T @ is_open.astype(float) == 0.0)
-        status = np.where(is_open, Status.OPEN, face.status)
+        face = self._feasible.face(x, g)
+        kept = np.flatnonzero(abs(face.Z).T @ self._open.astype(float) == 0.0)
+        status = np.where(self._open, Status.OPEN, face.status)
         return Face(csr_array(face.Z[:, kept]), face.curvature[kept], status)
 
 
