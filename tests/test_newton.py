@@ -15,7 +15,7 @@ from tfeti_dolfinx.qp.krylov import solve_by_pcpg
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
 from tfeti_dolfinx.qp.problem import QP, ResidualRule, Start
 from tfeti_dolfinx.qp.projection import project_onto_feasible
-from tfeti_dolfinx.qp.sets import Product
+from tfeti_dolfinx.qp.sets import Bounds, Product
 
 
 def program(seed, kind="regular"):
@@ -164,3 +164,12 @@ def test_a_plateau_is_left_where_q_does_not_fall_either(force, reason):
     result = solve_by_pcpg(qp, homogenise(qp), ResidualRule(1e-9))
     assert result.reason.name == reason
     assert (result.steps.cg <= 1001) == (force > 1.0)
+
+
+def test_the_first_point_is_feasible_where_0_is_inside():
+    """With adhesion, λ ≥ −a, rows are free at 0, and may be pulled by more than a."""
+    coarse = DenseCoarse(np.ones((1, 3)), np.array([-1.5]))
+    feasible = Product([(np.arange(2), Bounds(np.array([-0.2, -0.2])))])
+    qp = QP(matrix(np.eye(3)), vector(np.zeros(3)), coarse, feasible)
+    lam = first_point(qp)
+    assert np.allclose(lam.array, (-0.2, -0.2, -1.1), rtol=0, atol=1e-9)

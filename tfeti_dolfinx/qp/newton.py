@@ -46,7 +46,9 @@ def first_point(qp: QP) -> PETSc.Vec:
         coarse.particular(lam)
         held = imbalance(coarse, lam) <= HELD
         coarse.destroy()
-        if held:
+        # where 0 is inside of Ω, as with adhesion, rows of contact are free and may leave it
+        out = bool(np.any(qp.feasible.project(lam.array_r) != lam.array_r))
+        if held and not any_rank(qp.d.getComm().tompi4py(), out):
             return lam
     return project_onto_feasible(qp.coarse, qp.feasible, zero).lam
 
