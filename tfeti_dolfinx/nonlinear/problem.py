@@ -212,7 +212,8 @@ class NonlinearContactProblem(ContactProblem):
             rtol = float(np.clip(tol.forcing * expected, tol.final * exact, tol.loosest))
             self._solve_linearised(rtol)
             total.add(self.report)
-            d = self.u.x.array - u
+            end = np.array(self.u.x.array)
+            d = end - u
             size = largest(comm, d)
             increment = size / max(largest(comm, self.u.x.array), TINY)
             # 2. line search
@@ -223,7 +224,7 @@ class NonlinearContactProblem(ContactProblem):
             if not self._finite:  # whose slopes do not see rotations
                 short |= t == 1.0 and tol.safety * expected <= exact
             if short and rtol <= exact:
-                self._set(u + d)
+                self._set(end)
                 return
             # 4. step
             if step == 0:  # what conditions prescribe is met from then on
