@@ -16,6 +16,7 @@ from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.duality_gap import EnergyBound, energy_bound, within
 from tfeti_dolfinx.feti.recovery import Recovered, min_norm_correction
 from tfeti_dolfinx.qp.coarse import LIGHT
+from tfeti_dolfinx.qp.homogenised import ROUNDING
 from tfeti_dolfinx.qp.problem import ConvergedReason
 from tfeti_dolfinx.qp.sets import Face
 
@@ -74,6 +75,8 @@ class Measures:
         residual: Norm of what rows miss.
         gap: Largest gap of a contact row, or overlap.
         begin: Largest slip that friction counts from.
+        rounding: What rounding leaves of the residuals of rows that the face holds, however far
+            others are open.
     """
 
     size: Array
@@ -90,6 +93,7 @@ class Measures:
     residual: float
     gap: float
     begin: float
+    rounding: float
 
     @property
     def error(self) -> float:
@@ -102,7 +106,9 @@ class Measures:
         return float(np.sqrt(max(self.energies.sum(), 0.0)))
 
 
-def measure(dual: Dual, state: Recovered, norm: float, before: Array | None = None) -> Measures:
+def measure(
+    dual: Dual, state: Recovered, face: Face, norm: float, before: Array | None = None
+) -> Measures:
     """Measure how well the displacement of an iterate fulfils the rows. Collective.
 
     1. Rows miss w: of Bu − c all of equalities and of rows that press both ways, of others where
@@ -116,6 +122,7 @@ def measure(dual: Dual, state: Recovered, norm: float, before: Array | None = No
     Args:
         dual: The dual problem.
         state: The displacement, recovered.
+        face: The face of λ.
         norm: ‖F‖, or an estimate.
         before: The displacement of an earlier iterate.
     """
@@ -136,8 +143,11 @@ def measure(dual: Dual, state: Recovered, norm: float, before: Array | None = No
         penetration, begin = max(penetration, slips[0].max()), slips[1].max()
     largest = np.array([penetration, gap, begin])
     comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
-    square = np.array([w @ w])
-    comm.Allreduce(MPI.IN_PLACE, square, op=MPI.SUM)
+    d = dual.d.array_r
+    held_d, held_F = (x[face.holding] for x in (d, state.residual + d))
+    squares = np.array([w @ w, held_d @ held_d, held_F @ held_F])
+    comm.Allreduce(MPI.IN_PLACE, squares, op=MPI.SUM)
+    residual, *sizes = np.sqrt(squares)
     # 2. its correction
     closed = np.concatenate((closed | (w[normals] != 0.0), constraints.limits.ravel() > 0.0))
     v = min_norm_correction(constraints, w, closed)
@@ -170,9 +180,10 @@ def measure(dual: Dual, state: Recovered, norm: float, before: Array | None = No
         penetration=float(largest[0]),
         balance=balance,
         forces=forces,
-        residual=float(np.sqrt(square[0])),
+        residual=float(residual),
         gap=float(largest[1]),
         begin=float(largest[2]),
+        rounding=ROUNDING * float(sum(sizes)),
     )
 
 
@@ -311,7 +322,7 @@ class Accuracy:
             return ConvergedReason.CONVERGED_ATOL
         # 2. residuals at which the next look is worth its price
         aim = 1.0 if bound >= ratio else given.aim  # a bound follows residuals
-        least = 1e-4 * self._rounding  # no residual comes down to that
+        least = 1e-4 * min(self._rounding, now.rounding)  # no residual comes down to that
         tolerance = residual * max(aim / (ratio if ratio > 1.0 else in_energy), given.leap)
         if ratio <= 1.0:
             tolerance = max(tolerance, self._small)
@@ -329,7 +340,7 @@ class Accuracy:
         """Recover the displacement of an iterate, and measure it. Collective."""
         before = None if self.recovered is None else self.recovered.u
         state = self._dual.recover(lam, gradient, face, residual / self.norm)
-        now = measure(self._dual, state, self.norm, before)
+        now = measure(self._dual, state, face, self.norm, before)
         self._before, self.recovered, self._measures = self._measures, state, now
         self.looks += 1
         if self.goal is not None:

@@ -138,27 +138,21 @@ class Scale:
     rounding: float
 
 
-def scale_at(qp: QP, start: OperatorProduct, gaps_count: bool = True) -> Scale:
-    """Return the scale of a program whose λ̄₀ is known with its image. Collective.
-
-    Args:
-        qp: The program.
-        start: λ̄₀ with its image.
-        gaps_count: Whether gaps that are open without forces count to the rounding.
-    """
-    return Scale(_projected(qp, start.Fx, qp.d), _rounding(qp, start, gaps_count))
+def scale_at(qp: QP, start: OperatorProduct) -> Scale:
+    """Return the scale of a program whose λ̄₀ is known with its image. Collective."""
+    return Scale(_projected(qp, start.Fx, qp.d), _rounding(qp, start))
 
 
-def scale_near(qp: QP, at: OperatorProduct, gaps_count: bool = True) -> Scale:
+def scale_near(qp: QP, at: OperatorProduct) -> Scale:
     """Return a scale from another solution of Gλ̄ = e, if F λ̄₀ is not known. Collective.
 
     ‖P d‖ and ‖P F λ‖ are equal at the solution, and b₀ is ‖P d‖ where e = 0; the larger one.
     """
     sizes = (_projected(qp, qp.d), _projected(qp, at.Fx))
-    return Scale(max(sizes), _rounding(qp, at, gaps_count))
+    return Scale(max(sizes), _rounding(qp, at))
 
 
-def _rounding(qp: QP, at: OperatorProduct, gaps_count: bool) -> float:
+def _rounding(qp: QP, at: OperatorProduct) -> float:
     """Estimate the rounding error of ‖g^P‖, to which open gaps, however wide, do not count."""
     s = at.Fx.copy()
     s.axpy(-1.0, qp.d)
@@ -167,10 +161,7 @@ def _rounding(qp: QP, at: OperatorProduct, gaps_count: bool) -> float:
     s.destroy()
     # P makes of gaps a gradient of rows that nothing closes yet: d is negative there
     counts = (phi != 0.0) | ((beta != 0.0) & (qp.d.array_r > 0.0))
-    Fx, d = np.abs(at.Fx.array_r), np.array(qp.d.array_r)
-    if not gaps_count:
-        gaps = np.abs(open_gaps(qp))
-        d = np.where(gaps > 0.0, np.minimum(gaps, Fx), d)
+    Fx, d = at.Fx.array_r, qp.d.array_r
     parts = (np.where(counts, x, 0.0) for x in (d, Fx))
     return ROUNDING * sum(norm_over(qp.d.getComm().tompi4py(), part) for part in parts)
 

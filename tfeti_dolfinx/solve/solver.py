@@ -184,14 +184,13 @@ def _homogenise(dual: Dual, qp: QP, solver: Solver, start: Start | None) -> Homo
         at = dual.last.image(qp.F, solver.warm(qp, start))
         _no_worse_than_nothing(qp, at, start)
         known = dual.known_image()
-        count = solver.cold is not None  # else λ̄ and rows that stay open are apart
-        scale = scale_at(qp, known, count) if known else scale_near(qp, at, count)
+        scale = scale_at(qp, known) if known else scale_near(qp, at)
     elif solver.cold is not None:
         at = operator_product(qp.F, solver.cold(qp))
         scale = scale_at(qp, at)
     else:
         image = dual.natural_image()
-        return homogenise(qp, image, scale_at(qp, image, gaps_count=False))
+        return homogenise(qp, image, scale_at(qp, image))
     homogenised = homogenise(qp, at, scale)
     at.destroy()
     return homogenised
