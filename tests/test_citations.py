@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+import tfeti_dolfinx
 from tfeti_dolfinx.common.logging import PAPERS, entry
 from tfeti_dolfinx.qp.solvers import SOLVERS
 
@@ -48,3 +49,12 @@ def test_all_solvers_have_papers_that_are_whole():
             assert paper.count("{") == paper.count("}")
             for field in ("title", "author", "year"):
                 assert f"{field} = {{" in paper
+
+
+def test_versions_and_papers_agree_with_those_of_the_package():
+    recipe = (ROOT / "environment/conda/recipe.yaml").read_text()
+    cited = (ROOT / "CITATION.cff").read_text()
+    assert f'version: "{tfeti_dolfinx.__version__}"' in recipe
+    assert f"version: {tfeti_dolfinx.__version__}" in cited
+    papers = {key for keys in PAPERS.values() for key in keys}
+    assert cited.count("  - type: ") == len(papers)
