@@ -11,7 +11,7 @@ from test_qp import matrix, random_program, vector
 from test_solvable_lp import dual_of
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
+from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.krylov import pcpg
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, ResidualRule, Steps
 from tfeti_dolfinx.qp.sets import Face, Product, Status, face_of
@@ -145,7 +145,7 @@ def test_pcpg_on_a_face(preconditioned, with_coarse):
     F, d, G, e, _ = random_program(4)
     face = pairs_and_rows()
     Z = face.Z.toarray()
-    coarse = DenseCoarse(G, e) if with_coarse else NoCoarse()
+    coarse = DenseCoarse(G, e) if with_coarse else DenseCoarse(np.zeros((0, 40)), np.zeros(0))
     qp = QP(matrix(F), vector(d), coarse, Product())
     helper = matrix(Z @ np.linalg.inv(Z.T @ F @ Z) @ Z.T) if preconditioned else None
     on_face = replace(qp, coarse=coarse.on_face(face), preconditioner=helper)

@@ -12,7 +12,7 @@ from test_mpgp import as_set
 from test_qp import matrix, vector
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse, NoOblique
+from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.friction_newton import (
     Law,
     LawPoint,
@@ -67,11 +67,11 @@ def program(seed, k, r, points=8, m=40):
 
 
 def solve(F, d, G, e, law, target=1e-10):
-    coarse = DenseCoarse(G, e) if len(e) else NoCoarse()
+    coarse = DenseCoarse(G, e)
     qp = QP(matrix(F), vector(d), coarse, law.at(np.ones(len(law.normals))))
 
     def oblique(face, C):
-        return DenseOblique(G, face, C) if len(e) else NoOblique(face)
+        return DenseOblique(G, face, C)
 
     program = LawProgram(qp, law, oblique, 3.0)
     zero = LawPoint(np.zeros(len(d)), -d, np.zeros(len(e)))

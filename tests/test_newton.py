@@ -9,7 +9,7 @@ from reference.active_set import dense_qp
 from scipy.sparse import block_diag, csr_array, diags_array
 from test_qp import Counted, bounds_on, matrix, vector
 
-from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
+from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.homogenised import homogenise, operator_product
 from tfeti_dolfinx.qp.krylov import solve_by_pcpg
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
@@ -128,7 +128,7 @@ def test_rows_that_exclude_each_other_are_named(room, solvable):
     """u ≤ −1 and −u ≤ 1 + room; with less than none q falls forever along (1, 1)."""
     F = np.array([[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     d = vector([1.0, -1.0 - room, 1.0])
-    qp = QP(matrix(F), d, NoCoarse(), bounds_on(np.arange(3)))
+    qp = QP(matrix(F), d, DenseCoarse(np.zeros((0, 3)), np.zeros(0)), bounds_on(np.arange(3)))
     start = vector([1.0, 1.0, 0.0])  # both touch
     result = newton(
         qp, homogenise(qp, operator_product(qp.F, start)), ResidualRule(1e-10), max_it=100

@@ -8,7 +8,7 @@ from reference.conic import constrained_qp
 from test_mpgp import around_circles, as_set, program
 from test_qp import matrix, vector
 
-from tfeti_dolfinx.qp.coarse import DenseCoarse, NoCoarse
+from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.homogenised import homogenise, operator_product
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, ResidualRule, Start, no_monitor
@@ -66,7 +66,7 @@ def test_where_all_points_slide_the_end_is_superlinear(seed):
         if step == "outer":
             residuals.append(projected_gradient)
 
-    qp = QP(matrix(F), vector(d), NoCoarse(), Discs(radius))
+    qp = QP(matrix(F), vector(d), DenseCoarse(np.zeros((0, len(d))), np.zeros(0)), Discs(radius))
     result = solved(qp, 1e-11 * np.linalg.norm(d), monitor)
     assert result.reason == ConvergedReason.CONVERGED_RTOL
     assert np.all(result.face.status == Status.SLIP)
@@ -123,7 +123,9 @@ def test_a_slip_ends_where_its_boundary_bends_and_is_no_contradiction(seed):
     A[:, 2:] = A[:, :2]
     F, d = A.T @ A, 3.0 * rng.standard_normal(4)
     feasible = Discs(np.array([1.0, 0.5]))
-    result = solved(QP(matrix(F), vector(d), NoCoarse(), feasible), 1e-8)
+    result = solved(
+        QP(matrix(F), vector(d), DenseCoarse(np.zeros((0, len(d))), np.zeros(0)), feasible), 1e-8
+    )
     lam = result.lam.array
     assert result.reason == ConvergedReason.CONVERGED_RTOL
     assert np.allclose(feasible.project(lam - (F @ lam - d)), lam, atol=1e-6)

@@ -11,12 +11,7 @@ from scipy.sparse import csr_array, diags_array, hstack
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root, chunk_offsets
 from tfeti_dolfinx.errors import raised_on_all_ranks
-from tfeti_dolfinx.feti.projectors import (
-    FaceFactors,
-    Grams,
-    ObliqueProjectors,
-    Projectors,
-)
+from tfeti_dolfinx.feti.projectors import FaceFactors, Grams, ObliqueProjectors
 from tfeti_dolfinx.feti.rigid_bodies import (
     TOLERANCES,
     Bodies,
@@ -25,11 +20,12 @@ from tfeti_dolfinx.feti.rigid_bodies import (
     orthonormal_columns,
     unresisted,
 )
+from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 
-class CoarseSpace(Projectors):
+class CoarseSpace(Coarse):
     """G, GGᵀ and what follows from them; the r-vectors are replicated on all ranks.
 
     G = (R T)ᵀ Bᵀ, with T a basis of the kernel that has the bodies' motions as coordinates.
@@ -96,7 +92,7 @@ class CoarseSpace(Projectors):
         self.null = bcast_from_root(comm, orthonormal_columns(csr_array(self.motions @ both)))
         self.grams = Grams(self.Gt, np.flatnonzero(~equalities), comm)
         self.factors = FaceFactors(comm, self.null, prefix)
-        self._factor = self.factors.factor(self.grams.whole, "whole")
+        self.factor = self.factors.factor(self.grams.whole, "whole")
 
     def _load(self) -> Array:
         e = np.concatenate(self.comm.allgather(self.subdomains.kernel_load))
@@ -134,7 +130,7 @@ class CoarseSpace(Projectors):
         Raises:
             FactorError: Forces on the face do not determine what balances a load.
         """
-        self.factors.count["face"] += 1
+        self.factors.count["face"] += int(self.dimension > 0)
         return ObliqueProjectors(self.Gt, self.grams, face, C, self.null, self.comm)
 
     def unresisted(
@@ -160,7 +156,7 @@ class CoarseSpace(Projectors):
         return cast(Motions, bcast_from_root(self.comm, found))
 
 
-class FaceProjectors(Projectors):
+class FaceProjectors(Coarse):
     """P and Q on a face of the rows: G_f = GZ, vectors in the layout of all rows.
 
     A face that leaves motions free that all rows hold has a G_f without full rank: harmless for
@@ -174,7 +170,7 @@ class FaceProjectors(Projectors):
     def __init__(self, whole: CoarseSpace, face: Face) -> None:
         self._whole, self._face = whole, face
         self.comm, self.Gt, self.e = whole.comm, whole.Gt, whole.e
-        self._factor = whole.factors.factor(whole.grams.of_face(face))
+        self.factor = whole.factors.factor(whole.grams.of_face(face))
 
     def restricted(self, x: Array) -> Array:
         """ZZᵀ x."""

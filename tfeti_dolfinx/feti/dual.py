@@ -27,7 +27,6 @@ from tfeti_dolfinx.feti.preconditioner import FacePreconditioner
 from tfeti_dolfinx.feti.recovery import Recovered, recover
 from tfeti_dolfinx.feti.rigid_bodies import listed
 from tfeti_dolfinx.feti.solvability import check_solvable, sliding_body
-from tfeti_dolfinx.qp.coarse import Coarse, NoCoarse
 from tfeti_dolfinx.qp.homogenised import LastProduct, OperatorProduct, natural, operator_product
 from tfeti_dolfinx.qp.krylov import estimate_norm
 from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
@@ -244,17 +243,16 @@ class Dual:
         Args:
             norm_steps: Lanczos steps that estimate ‖PFP‖, once; 0 where nobody asks for it.
         """
-        coarse: Coarse = self.coarse if self.coarse.dimension else NoCoarse()
         self.feasible = self._law(self.constraints)  # c may be another, and what the law refers to
         if norm_steps and norm_steps not in self._norms:
             with self.F.charged_to("power method"):
-                self._norms[norm_steps] = estimate_norm(self.F, coarse, self.d, norm_steps)
+                self._norms[norm_steps] = estimate_norm(self.F, self.coarse, self.d, norm_steps)
         norm = self._norms.get(norm_steps, 1.0)
         on = self._preconditioner_on if self.preconditioner is not None else None
         return QP(
             self.F,
             self.d,
-            coarse,
+            self.coarse,
             self.feasible,
             preconditioner=self._on_all_rows,
             norm=norm,

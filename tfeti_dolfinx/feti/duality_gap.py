@@ -17,7 +17,7 @@ from tfeti_dolfinx.feti.recovery import (
     min_norm_correction,
     moved,
 )
-from tfeti_dolfinx.qp.coarse import HELD, NoCoarse, imbalance
+from tfeti_dolfinx.qp.coarse import HELD, imbalance
 from tfeti_dolfinx.qp.projection import project_onto_feasible
 from tfeti_dolfinx.qp.sets import FeasibleSet
 
@@ -137,8 +137,7 @@ def _balanced(
     wanted = lam.copy()
     if norm > 0.0:
         wanted.array[:] += constraint_residual(dual.constraints, u[subdomains.trace]) / norm
-    on = coarse if coarse.dimension else NoCoarse()
-    found = project_onto_feasible(on, dual.feasible, wanted)
+    found = project_onto_feasible(coarse, dual.feasible, wanted)
     forces = np.array(found.lam.array_r)
     wanted.destroy()
     found.lam.destroy()

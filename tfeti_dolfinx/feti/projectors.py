@@ -6,15 +6,13 @@ from collections import Counter
 
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 from scipy.sparse import coo_array, csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
 
 from tfeti_dolfinx.common.arrays import TINY, Array
-from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, summed
+from tfeti_dolfinx.common.parallel import any_rank, summed
 from tfeti_dolfinx.errors import FactorError, raised_on_all_ranks
 from tfeti_dolfinx.feti.rigid_bodies import independent, parts_of_columns
-from tfeti_dolfinx.qp.coarse import NOTHING
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 
@@ -46,6 +44,8 @@ class Grams:
 
     def of_face(self, face: Face) -> csr_array:
         """GZ(GZ)ᵀ, shape ``(r, r)``; of all rows anew where a set constrains any other row."""
+        if not self._Gt.shape[1]:
+            return self.whole
         if any_rank(self._comm, bool(np.any(face.constrained[self._always]))):
             return replicated_gram(csr_array(face.Z.T @ self._Gt), self._comm)
         contact = csr_array(face.Z[self._bounded].T @ self._contact)
@@ -192,15 +192,18 @@ class ObliqueProjectors:
         part = csr_array((face.Z.T @ self._following).T @ (face.Z.T @ Gt))
         A, N = grams.of_face(face), replicated(part, comm)
         self._scale, pinned = _scaling(A, null)
-        S = diags_array(self._scale)
+        S, self._factor = diags_array(self._scale), None
         with raised_on_all_ranks(comm):
             try:
-                self._factor = splu(csc_array(S @ (A + N) @ S + diags_array(pinned)))
+                if Gt.shape[1]:
+                    self._factor = splu(csc_array(S @ (A + N) @ S + diags_array(pinned)))
             except RuntimeError as error:
                 raise FactorError(f"the coarse problem of a face with friction: {error}") from error
 
     def _solve(self, y: Array) -> Array:
         """H⁺y without null modes, for y orthogonal to them; shape ``(r,)`` or ``(r, q)``."""
+        if self._factor is None:
+            return y
         x = self._factor.solve((self._scale * _without(self._null, y).T).T)
         return _without(self._null, (self._scale * x.T).T)
 
@@ -218,98 +221,7 @@ class ObliqueProjectors:
         return self._face.restricted(self._Gt @ self._solve(y))
 
 
-# --- Orthogonal projectors, on all rows or on a face ------------------------------------------
-
-
-class Projectors:
-    """P and Q of the rows Gᵀ: what ``Coarse`` of ``qp/coarse.py`` promises, but for faces.
-
-    Attributes:
-        comm: Communicator; all methods but ``combine`` are collective.
-        Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
-        e: Right side, shape ``(r,)``.
-    """
-
-    comm: MPI.Intracomm
-    Gt: csr_array
-    e: Array
-    _factor: SemidefiniteFactor
-
-    def G(self, x: Array) -> Array:
-        """G x, shape ``(r,)``, from this rank's part of x."""
-        return summed(self.comm, self.Gt.T @ self.restricted(x))
-
-    @property
-    def dimension(self) -> int:
-        """Number r of equations."""
-        return self.Gt.shape[1]
-
-    def residual(self, x: PETSc.Vec) -> Array:
-        """e − Gx, shape ``(r,)``."""
-        return np.asarray(self.e - self.G(x.array_r))
-
-    def forces(self, x: PETSc.Vec) -> Array:
-        """Σ|G||x| + |e|, shape ``(r,)``."""
-        return self.terms(x.array_r) + np.abs(self.e)
-
-    def terms(self, x: Array) -> Array:
-        """Σ|G||x|, shape ``(r,)``."""
-        return summed(self.comm, abs(self.Gt).T @ np.abs(self.restricted(x)))
-
-    def solve(self, y: Array) -> Array:
-        """(GGᵀ)⁺ y for y in the range of G, orthogonal to the free motions."""
-        return self._factor.solve(y)
-
-    def restricted(self, x: Array) -> Array:
-        """Return the part of x in the face: all of it."""
-        return x
-
-    def project(self, x: PETSc.Vec) -> None:
-        """x ← P x."""
-        self._take_away(x, self.coordinates(x))
-
-    def project_against(
-        self, x: PETSc.Vec, y: PETSc.Vec, more: Array = NOTHING
-    ) -> tuple[float, float, Array]:
-        """x ← P x; yᵀPx and yᵀy, y in the face; and more sums. One reduction.
-
-        What rounding has left of y outside of the range of P is not taken for a part of yᵀPx.
-        """
-        own, r = self.restricted(x.array_r), self.dimension
-        products = self.Gt.T @ np.stack((own, y.array_r), axis=1)
-        scalars = (own @ y.array_r, y.array_r @ y.array_r)
-        sums = summed(self.comm, np.concatenate((products.T.ravel(), scalars, more)))
-        mu, rest = self.solve(sums[:r]), sums[2 * r :]
-        self._take_away(x, mu)
-        return float(rest[0] - sums[r : 2 * r] @ mu), float(rest[1]), rest[2:]
-
-    def _take_away(self, x: PETSc.Vec, mu: Array) -> None:
-        x.array[:] = self.restricted(x.array_r - self.Gt @ mu)
-
-    def apply_Q(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = Gᵀ(GGᵀ)⁻¹G x."""
-        self.combine(self.coordinates(x), y)
-
-    def norm_Q(self, x: PETSc.Vec) -> float:
-        """‖Q x‖; the same on all ranks, since loops end by it."""
-        Gx = self.G(x.array_r)
-        return bcast_from_root(self.comm, float(np.sqrt(max(float(Gx @ self.solve(Gx)), 0.0))))
-
-    def particular(self, x: PETSc.Vec) -> None:
-        """x = Gᵀ(GGᵀ)⁻¹e."""
-        self.combine(self.solve(self.e), x)
-
-    def coordinates(self, x: PETSc.Vec) -> Array:
-        """(GGᵀ)⁻¹G x, shape ``(r,)``."""
-        return self.solve(self.G(x.array_r))
-
-    def combine(self, mu: Array, x: PETSc.Vec) -> None:
-        """x = Gᵀ μ. Not collective."""
-        x.array[:] = self.restricted(self.Gt @ mu)
-
-    def destroy(self) -> None:
-        """Free the factor."""
-        self._factor.destroy()
+# --- Factors of faces -----------------------------------------------------------------------
 
 
 class FaceFactors:
@@ -334,6 +246,6 @@ class FaceFactors:
         Raises:
             FactorError: It could not be made.
         """
-        self.count[kind] += 1
+        self.count[kind] += int(gram.shape[0] > 0)
         what = f"GGᵀ of the {'coarse problem' if kind == 'whole' else 'rows of a face'}"
         return SemidefiniteFactor(gram, self._null, self.comm, what, self._prefix)

@@ -1,17 +1,17 @@
-"""The coarse problem as a QP solver sees it: projectors P and Q."""
+"""The coarse problem of Gλ = e: projectors P and Q, on all rows or on a face."""
 
 from __future__ import annotations
 
 from typing import Protocol
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
+from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.common.parallel import bcast_from_root, summed
 from tfeti_dolfinx.qp.sets import Face
-
-# --- The coarse space of Gλ = e ---------------------------------------------------------------
 
 # of the largest forces on an equation: those on a light one beside it count as so large at least,
 # since the rounding of the largest reaches them
@@ -23,91 +23,119 @@ HELD = 1e-9
 NOTHING: Array = np.zeros(0)
 
 
-class Coarse(Protocol):
+class GramFactor(Protocol):
+    """A generalised inverse of G_fG_fᵀ."""
+
+    def solve(self, y: Array) -> Array:
+        """(G_fG_fᵀ)⁺y, y replicated."""
+        ...
+
+    def destroy(self) -> None:
+        """Free it."""
+        ...
+
+
+class Coarse:
     """The constraint Gλ = e, λ in a face with the free directions Z.
 
     With G_f = GZ the projectors are Q = Z G_fᵀ(G_f G_fᵀ)⁺G_f Zᵀ and P = ZZᵀ − Q. Vectors keep the
-    layout of all rows. Without a face Z = I, so that P = I − Q.
+    layout of all rows. Without a face Z = I, so that P = I − Q. All methods but ``solve`` and
+    ``combine`` are collective. Without equations P = ZZᵀ, and nothing is communicated for it.
 
     Attributes:
-        dimension: Number r of equations.
+        comm: Communicator.
+        Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
         e: Right side, replicated, shape ``(r,)``.
+        factor: That of G_fG_fᵀ.
     """
+
+    comm: MPI.Intracomm
+    Gt: csr_array
+    e: Array
+    factor: GramFactor
+
+    def restricted(self, x: Array) -> Array:
+        """ZZᵀx, the part of x in the face: all of it."""
+        return x
+
+    def on_face(self, face: Face) -> Coarse:
+        """Return the same constraint on (another) face of all rows."""
+        raise NotImplementedError
+
+    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
+        """(G_f G_fᵀ + damping·GGᵀ)⁻¹y, f a face of all rows."""
+        raise NotImplementedError
 
     @property
     def dimension(self) -> int:
         """Number r of equations."""
-        ...
+        return self.Gt.shape[1]
 
-    @property
-    def e(self) -> Array:
-        """Right side, replicated, shape ``(r,)``."""
-        ...
+    def G(self, x: Array) -> Array:
+        """G_fZᵀx, replicated, from this rank's part of x."""
+        return summed(self.comm, self.Gt.T @ self.restricted(x)) if self.dimension else NOTHING
+
+    def terms(self, x: Array) -> Array:
+        """Σ|G_fZᵀ||x|, replicated, from this rank's part of x."""
+        own = abs(self.Gt).T @ np.abs(self.restricted(x))
+        return summed(self.comm, own) if self.dimension else NOTHING
 
     def residual(self, x: PETSc.Vec) -> Array:
-        """e − G_f Zᵀx, replicated, shape ``(r,)``. Collective."""
-        ...
+        """e − G_fZᵀx, replicated."""
+        return np.asarray(self.e - self.G(x.array_r))
 
     def forces(self, x: PETSc.Vec) -> Array:
-        """Return the sum of the moduli of the terms of each entry of the residual. Collective."""
-        ...
-
-    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
-        """(G_f G_fᵀ + damping·GGᵀ)⁻¹y, f a face of all rows. Collective."""
-        ...
+        """Return the sum of the moduli of the terms of each entry of the residual."""
+        return self.terms(x.array_r) + np.abs(self.e)
 
     def solve(self, y: Array) -> Array:
-        """(G_f G_fᵀ)⁺y, y replicated."""
-        ...
+        """(G_fG_fᵀ)⁺y for y in the range of G, orthogonal to the free motions."""
+        return self.factor.solve(y)
+
+    def coordinates(self, x: PETSc.Vec) -> Array:
+        """(G_fG_fᵀ)⁺G_fZᵀx, replicated."""
+        return self.solve(self.G(x.array_r))
+
+    def combine(self, mu: Array, x: PETSc.Vec) -> None:
+        """x = ZZᵀGᵀμ."""
+        x.array[:] = self.restricted(self.Gt @ mu)
 
     def project(self, x: PETSc.Vec) -> None:
-        """x ← P x. Collective."""
-        ...
+        """x ← P x."""
+        x.array[:] = self.restricted(x.array_r - self.Gt @ self.coordinates(x))
 
     def project_against(
         self, x: PETSc.Vec, y: PETSc.Vec, more: Array = NOTHING
     ) -> tuple[float, float, Array]:
-        """x ← P x; yᵀPx and yᵀy, for y in the face. Collective, one reduction.
+        """x ← P x; yᵀPx and yᵀy, y in the face, and sums over ranks of more. One reduction.
 
-        Ranks may round yᵀPx differently.
-
-        Args:
-            x: Projected in place.
-            y: In the face.
-            more: Numbers of this rank that are summed up over all ranks on the way.
-
-        Returns:
-            Both products, and the sums.
+        What rounding has left of y outside of the range of P is not taken for a part of yᵀPx, which
+        ranks may round differently.
         """
-        ...
+        own, r = self.restricted(x.array_r), self.dimension
+        products = self.Gt.T @ np.stack((own, y.array_r), axis=1)
+        scalars = (own @ y.array_r, y.array_r @ y.array_r)
+        sums = summed(self.comm, np.concatenate((products.T.ravel(), scalars, more)))
+        mu, rest = self.solve(sums[:r]), sums[2 * r :]
+        x.array[:] = self.restricted(x.array_r - self.Gt @ mu)
+        return float(rest[0] - sums[r : 2 * r] @ mu), float(rest[1]), rest[2:]
 
     def apply_Q(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = Q x. Collective."""
-        ...
+        """y = Q x."""
+        self.combine(self.coordinates(x), y)
 
     def norm_Q(self, x: PETSc.Vec) -> float:
-        """‖Q x‖, the same on all ranks. Collective."""
-        ...
+        """‖Q x‖; the same on all ranks, since loops end by it."""
+        Gx = self.G(x.array_r)
+        return bcast_from_root(self.comm, float(np.sqrt(max(float(Gx @ self.solve(Gx)), 0.0))))
 
     def particular(self, x: PETSc.Vec) -> None:
-        """x = Z G_fᵀ(G_f G_fᵀ)⁺e, the smallest Gλ = e of the face, if it has one. Collective."""
-        ...
-
-    def coordinates(self, x: PETSc.Vec) -> Array:
-        """(G_f G_fᵀ)⁺G_f Zᵀ x, replicated. Collective."""
-        ...
-
-    def combine(self, mu: Array, x: PETSc.Vec) -> None:
-        """x = ZZᵀGᵀ μ."""
-        ...
-
-    def on_face(self, face: Face) -> Coarse:
-        """Return the same constraint on (another) face of all rows. Collective."""
-        ...
+        """x = Z G_fᵀ(G_fG_fᵀ)⁺e, the smallest Gλ = e of the face, if it has one."""
+        self.combine(self.solve(self.e), x)
 
     def destroy(self) -> None:
-        """Free what a factor holds. Collective."""
-        ...
+        """Free the factor."""
+        self.factor.destroy()
 
 
 def imbalance(coarse: Coarse, x: PETSc.Vec) -> float:
@@ -118,82 +146,7 @@ def imbalance(coarse: Coarse, x: PETSc.Vec) -> float:
     return bcast_from_root(x.getComm().tompi4py(), float(own))
 
 
-def _products(x: PETSc.Vec, y: PETSc.Vec, more: Array) -> tuple[float, float, Array]:
-    """yᵀx, yᵀy, and more sums. Collective, one reduction."""
-    own = y.array_r
-    sums = summed(x.getComm().tompi4py(), np.append((own @ x.array_r, own @ own), more))
-    return float(sums[0]), float(sums[1]), sums[2:]
-
-
-class NoCoarse:
-    """No equality constraint: Q = 0, at no cost.
-
-    Args:
-        face: The face; default all rows.
-    """
-
-    dimension = 0
-
-    def __init__(self, face: Face | None = None) -> None:
-        self._face, self.e = face, np.zeros(0)
-
-    def residual(self, x: PETSc.Vec) -> Array:
-        """None."""
-        return np.zeros(0)
-
-    def forces(self, x: PETSc.Vec) -> Array:
-        """None."""
-        return np.zeros(0)
-
-    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
-        """None."""
-        return y
-
-    def solve(self, y: Array) -> Array:
-        """None."""
-        return y
-
-    def project(self, x: PETSc.Vec) -> None:
-        """x ← ZZᵀx."""
-        if self._face is not None:
-            x.array[:] = self._face.restricted(x.array_r)
-
-    def project_against(
-        self, x: PETSc.Vec, y: PETSc.Vec, more: Array = NOTHING
-    ) -> tuple[float, float, Array]:
-        """x ← ZZᵀx; yᵀx and yᵀy."""
-        self.project(x)
-        return _products(x, y, more)
-
-    def apply_Q(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = 0."""
-        y.set(0.0)
-
-    def norm_Q(self, x: PETSc.Vec) -> float:
-        """0."""
-        return 0.0
-
-    def particular(self, x: PETSc.Vec) -> None:
-        """x = 0."""
-        x.set(0.0)
-
-    def coordinates(self, x: PETSc.Vec) -> Array:
-        """None."""
-        return np.zeros(0)
-
-    def combine(self, mu: Array, x: PETSc.Vec) -> None:
-        """x = 0."""
-        x.set(0.0)
-
-    def on_face(self, face: Face) -> NoCoarse:
-        """Only masks."""
-        return NoCoarse(face)
-
-    def destroy(self) -> None:
-        """Nothing to free."""
-
-
-class DenseCoarse:
+class DenseCoarse(Coarse):
     """A constraint from a dense G, for a program on one rank.
 
     Args:
@@ -203,75 +156,42 @@ class DenseCoarse:
     """
 
     def __init__(self, G: Array, e: Array, face: Face | None = None) -> None:
-        self._G, self._face, self.e, self.dimension = G, face, e, len(e)
-        self._Gf = G if face is None else np.asarray((face.Z @ (face.Z.T @ G.T)).T)
-        self._inverse = np.linalg.pinv(self._Gf @ self._Gf.T, hermitian=True)
+        self.comm, self.Gt, self.e, self._face = MPI.COMM_SELF, csr_array(G.T), e, face
+        Gt = self.restricted(G.T)
+        self.factor = DenseFactor(Gt.T @ Gt)
 
-    def residual(self, x: PETSc.Vec) -> Array:
-        """e − G_f Zᵀx."""
-        return np.asarray(self.e - self._Gf @ x.array_r)
-
-    def forces(self, x: PETSc.Vec) -> Array:
-        """Σ|G_f Zᵀ||x| + |e|."""
-        return np.asarray(np.abs(self._Gf) @ np.abs(x.array_r) + np.abs(self.e))
+    def restricted(self, x: Array) -> Array:
+        """ZZᵀx."""
+        return x if self._face is None else self._face.restricted(x)
 
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
         """(G_f G_fᵀ + damping·GGᵀ)⁺y."""
-        GZ = (face.Z.T @ self._G.T).T
-        gram = GZ @ GZ.T + damping * self._G @ self._G.T
-        return np.asarray(np.linalg.pinv(gram, hermitian=True) @ y)
-
-    def solve(self, y: Array) -> Array:
-        """(G_f G_fᵀ)⁺y."""
-        return np.asarray(self._inverse @ y)
-
-    def project(self, x: PETSc.Vec) -> None:
-        """x ← P x."""
-        values = x.array_r if self._face is None else self._face.restricted(x.array_r)
-        x.array[:] = values - self._Gf.T @ self.coordinates(x)
-
-    def project_against(
-        self, x: PETSc.Vec, y: PETSc.Vec, more: Array = NOTHING
-    ) -> tuple[float, float, Array]:
-        """x ← P x; yᵀPx and yᵀy."""
-        self.project(x)
-        return _products(x, y, more)
-
-    def apply_Q(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = Q x."""
-        self.combine(self.coordinates(x), y)
-
-    def norm_Q(self, x: PETSc.Vec) -> float:
-        """‖Q x‖."""
-        return float(np.linalg.norm(self._Gf.T @ self.coordinates(x)))
-
-    def particular(self, x: PETSc.Vec) -> None:
-        """x = Z G_fᵀ(G_f G_fᵀ)⁺e."""
-        self.combine(self._inverse @ self.e, x)
-
-    def coordinates(self, x: PETSc.Vec) -> Array:
-        """(G_f G_fᵀ)⁺G_f Zᵀ x."""
-        return np.asarray(self._inverse @ (self._Gf @ x.array_r))
-
-    def combine(self, mu: Array, x: PETSc.Vec) -> None:
-        """x = ZZᵀGᵀ μ."""
-        x.array[:] = self._Gf.T @ mu
+        ZtGt = face.Z.T @ self.Gt
+        return DenseFactor((ZtGt.T @ ZtGt + damping * self.Gt.T @ self.Gt).toarray()).solve(y)
 
     def on_face(self, face: Face) -> DenseCoarse:
         """Return the same G on a face."""
-        return DenseCoarse(self._G, self.e, face)
+        return DenseCoarse(self.Gt.T.toarray(), self.e, face)
+
+
+class DenseFactor:
+    """A⁺ of a dense positive semidefinite A."""
+
+    def __init__(self, A: Array) -> None:
+        self._inverse = np.linalg.pinv(A, hermitian=True)
+
+    def solve(self, y: Array) -> Array:
+        """A⁺y."""
+        return np.asarray(self._inverse @ y)
 
     def destroy(self) -> None:
         """Nothing to free."""
 
 
-# --- Oblique projection of dependent multipliers ----------------------------------------------
-
-
 class Oblique(Protocol):
     """Projectors of a face Z on whose vectors u others depend: λ = (I + C)u.
 
-    With G_f = GZ and H = G(I + C)ZG_fᵀ: P = Z(I − G_fᵀH⁺G(I + C)Z)Zᵀ. Vectors are this rank's
+    With G_f = GZ and H = G(I + C)ZG_fᵀ: P = Z(I − Z G_fᵀH⁺G(I + C)Z)Zᵀ. Vectors are this rank's
     parts, in the layout of all rows.
     """
 
@@ -286,26 +206,3 @@ class Oblique(Protocol):
     def restoring(self, y: Array) -> Array:
         """Return u = ZG_fᵀH⁺y, which solves G(I + C)u = y if that is solvable. Not collective."""
         ...
-
-
-class NoOblique:
-    """Without Gλ = e: only masks.
-
-    Args:
-        face: The face.
-    """
-
-    def __init__(self, face: Face) -> None:
-        self._face = face
-
-    def coordinates(self, x: Array) -> Array:
-        """None."""
-        return np.zeros(0)
-
-    def project(self, x: Array) -> Array:
-        """ZZᵀx."""
-        return self._face.restricted(x)
-
-    def restoring(self, y: Array) -> Array:
-        """0."""
-        return np.zeros(self._face.Z.shape[0])

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from petsc4py import PETSc
-from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import TINY, Array, sums
 from tfeti_dolfinx.common.logging import cite
@@ -15,7 +14,6 @@ from tfeti_dolfinx.common.parallel import any_rank, norm_over, steering, summed
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.stopping import Accuracy, ErrorTarget
 from tfeti_dolfinx.options import Options
-from tfeti_dolfinx.qp.coarse import NoOblique, Oblique
 from tfeti_dolfinx.qp.friction_newton import (
     DEFAULT,
     FrictionParameters,
@@ -26,7 +24,6 @@ from tfeti_dolfinx.qp.friction_newton import (
     newton_on_law,
 )
 from tfeti_dolfinx.qp.problem import ConvergedReason, Monitor, QPResult, Steps
-from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.solve.solver import learn, solve_dual
 
 
@@ -444,7 +441,7 @@ class NewtonOnLaw:
         law = Law(
             dual.set_under, dual.constraints.pressed_by[at], dual.constraints.sets.tangents[at]
         )
-        program = LawProgram(qp, law, self._oblique, norm)
+        program = LawProgram(qp, law, dual.coarse.oblique, norm)
         # Step 1: the start, with its μ or that of least squares: the lesser residual
         work = qp.d.duplicate()
         work.array[:] = start[0]
@@ -481,7 +478,3 @@ class NewtonOnLaw:
         dual.last.pass_on(end.lam, Fx, parameters.newton.unseen * target / norm)
         image.destroy()
         return end.lam, end.mu
-
-    def _oblique(self, face: Face, C: csr_array) -> Oblique:
-        coarse = self._dual.coarse
-        return coarse.oblique(face, C) if coarse.dimension else NoOblique(face)
