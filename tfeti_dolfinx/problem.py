@@ -43,7 +43,7 @@ from tfeti_dolfinx.options import factor_options, parse_options
 from tfeti_dolfinx.report import Outcome, Report, SolverCounts, largest_over_ranks
 from tfeti_dolfinx.solution import SavedState, Solution, check_state
 from tfeti_dolfinx.solve.coulomb import solve_with_friction
-from tfeti_dolfinx.solve.solver import conclude, learn
+from tfeti_dolfinx.solve.solver import conclude
 from tfeti_dolfinx.subdomains.build import SubdomainMethod
 from tfeti_dolfinx.system import Settings, System
 
@@ -263,7 +263,7 @@ class ContactProblem:
         with stage("qp", seconds):
             start = None
             if self._start is not None:
-                learn(dual, options)
+                dual.learn()
                 earlier, lam, mu = self._start
                 start = gluing.multipliers(earlier, lam), mu
                 start = None if dual.is_far(*start) else start
@@ -478,7 +478,7 @@ class ContactProblem:
         dual.saw(float(state.norm))
         gluing = replace(system.gluing, slip=state.slip)
         state.check_rows(gluing)
-        learn(dual, self._settings.options)
+        dual.learn()
         if dual.recycled is not None:
             dual.recycled.take(state.directions)
         dual.last.take(self.dofs.comm, state.lam, state.image)

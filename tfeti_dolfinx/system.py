@@ -28,9 +28,8 @@ from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import Options
-from tfeti_dolfinx.qp.recycling import Recycled
 from tfeti_dolfinx.report import Sizes, StageCounts
-from tfeti_dolfinx.solve.solver import resolve_types
+from tfeti_dolfinx.solve.solver import resolved
 from tfeti_dolfinx.subdomains.block import Counters, SubdomainData, mode_names
 from tfeti_dolfinx.subdomains.build import (
     FiniteElements,
@@ -125,12 +124,12 @@ class Settings:
             FactorError: A matrix could not be factored.
         """
         rows = constraints.sets.contact_rows(dofs.comm)
-        qp_type, pc_type = resolve_types(self.options, rows, self.prefix)
+        options = resolved(self.options, rows, self.prefix)
         preconditioner = self.extensions.preconditioner
-        if preconditioner is not None and pc_type == "none":
+        if preconditioner is not None and options.pc_type == "none":
             raise InputError(
                 f"extensions: a preconditioner is given, but -{self.prefix}pc_type is none, as "
-                "auto is with smalse; expected lumped or dirichlet, whose place it takes"
+                "auto is with smalse; expected qp_type newton or pcpg, and pc_type auto"
             )
         with added_options(self.prefix, self.factor_options):
             dual = Dual(
@@ -138,15 +137,14 @@ class Settings:
                 subdomains=subdomains,
                 body_names=decomposition.body_names,
                 mode_names=mode_names(decomposition.mesh.geometry.dim, dofs.bs),
-                preconditioner=preconditioner or PRECONDITIONERS.get(pc_type),
+                preconditioner=preconditioner or PRECONDITIONERS.get(options.pc_type),
                 options_prefix=self.prefix,
                 feasible=feasible,
                 deflation=self.extensions.deflation or SoftModes,
-                without=self.options.without,
+                without=options.without,
+                recycle=options.recycle,
             )
-        if isinstance(self.options.recycle, int) and self.options.recycle:
-            dual.recycled = Recycled(self.options.recycle, dofs.comm)
-        return dual, replace(self.options, qp_type=qp_type, pc_type=pc_type)
+        return dual, options
 
 
 # --- The stages of a solve --------------------------------------------------------------------

@@ -39,7 +39,7 @@ GIVEN = {
     r"extensions: kplus is given, but only the package's own Block takes it": own(
         block=Block, kplus=raising
     ),
-    r"extensions: a preconditioner is given, but -tfeti_pc_type is none, .* expected lumped": own(
+    r"extensions: a preconditioner is given, but -tfeti_pc_type is none, .* expected qp_type": own(
         options={"qp_type": "smalse"}, preconditioner=raising
     ),
 }

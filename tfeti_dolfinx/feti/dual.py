@@ -56,12 +56,15 @@ class DualLimits:
             point.
         nearly: Motions held by less than this share of what the same contacts hold at most are
             nearly free: their contacts' normals are off by less than 6 degrees from a right angle.
+        recycled: Directions kept where options do not say how many: later ones gain hardly
+            anything, and each takes two vectors.
     """
 
     far: float = 1e3
     least: float = 1e-130
     most: float = 1e130
     nearly: float = 1e-2
+    recycled: int = 100
 
 
 LIMITS = DualLimits()
@@ -101,6 +104,7 @@ class Dual:
         options_prefix: Prefix of all PETSc options.
         feasible: Makes the set of multipliers from B and c; default ``contact_set``.
         without: Mechanisms that are switched off (``options.MECHANISMS``).
+        recycle: Most directions of earlier solves; ``"auto"``: none before ``learn``.
 
     Attributes:
         F: B K⁺ Bᵀ.
@@ -133,6 +137,7 @@ class Dual:
         feasible: FeasibleLaw = contact_set,
         deflation: MakeDeflation = SoftModes,
         without: Collection[str] = (),
+        recycle: int | str = 0,
     ) -> None:
         self.keeps_directions = "kept_directions" not in without
         self.constraints, self.subdomains = constraints, subdomains
@@ -172,6 +177,9 @@ class Dual:
         self._norms = dict[int, float]()  # of so many Lanczos steps
         self.seen, self.last = 0.0, LastProduct()
         self.recycled: Recycled | None = None
+        self._learns = recycle == "auto"
+        if isinstance(recycle, int) and recycle:
+            self.recycled = Recycled(recycle, comm)
         check_solvable(self.coarse, self._given, *self._names)
 
     def update_load(self) -> None:
@@ -186,6 +194,11 @@ class Dual:
         self._check_units(self.coarse.comm)
         self.coarse.update_load()
         check_solvable(self.coarse, self._given, *self._names)
+
+    def learn(self) -> None:
+        """Keep directions from now on, where options leave that open: more solves come."""
+        if self._learns and self.recycled is None:
+            self.recycled = Recycled(LIMITS.recycled, self.coarse.comm)
 
     @property
     def lifting(self) -> LocalOperator:

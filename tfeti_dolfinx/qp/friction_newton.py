@@ -13,7 +13,7 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import norm_over, steering, summed
 from tfeti_dolfinx.errors import FactorError
 from tfeti_dolfinx.qp.coarse import Oblique
-from tfeti_dolfinx.qp.problem import QP, Operator
+from tfeti_dolfinx.qp.problem import LocalProgram
 from tfeti_dolfinx.qp.recycling import Recycled, triangle
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
 
@@ -33,8 +33,6 @@ class FrictionParameters:
             superlinear; and of the target: no solve leaves less.
         max_directions: Most directions of one solve.
         unseen: Of the target: F of a way onto a face that is shorter, times ‖F‖, is not computed.
-        beside: Of the residual: beside a way up to which, times ‖F‖, a direction is gone for the
-            same multiplication. A longer way makes a residual of its own.
         hard: Times ‖F‖: directions that bend more are held.
         new: Of Az: what earlier directions leave of it, less is rounding.
         gain: Of the residual: what a direction takes from it, less is no gain.
@@ -55,7 +53,6 @@ class FrictionParameters:
     followed: float = 0.3
     max_directions: int = 80
     unseen: float = 0.1
-    beside: float = 2.0
     hard: float = 10.0
     new: float = 1e-7
     gain: float = 1e-8
@@ -134,21 +131,16 @@ class LawProgram:
     λ = P(y) and Gλ = e.
 
     Attributes:
-        qp: F, d and G; its set is not looked at.
+        local: F, d and G; its set is not looked at.
         law: The sets.
         oblique: Makes the projectors of a face and of what follows it.
         norm: ‖F‖, or an estimate.
     """
 
-    qp: QP
+    local: LocalProgram
     law: Law
     oblique: Callable[[Face, csr_array], Oblique]
     norm: float
-
-    @property
-    def comm(self) -> MPI.Intracomm:
-        """Communicator."""
-        return self.qp.d.getComm().tompi4py()
 
     def with_share(self, share: float) -> LawProgram:
         """Return it with this share of all coefficients; 0 is contact without friction."""
@@ -158,36 +150,11 @@ class LawProgram:
         """Ω(y_N⁺) and P(y)."""
         return self.law.nearest(at.lam - at.s / self.norm)
 
-    def apply(self, A: Operator, x: Array) -> Array:
-        """A x, between this rank's parts of vectors."""
-        x_vec, y_vec = self.qp.d.duplicate(), self.qp.d.duplicate()
-        x_vec.array[:] = x
-        A.mult(x_vec, y_vec)
-        y = np.array(y_vec.array_r)
-        x_vec.destroy()
-        y_vec.destroy()
-        return y
-
-    def imbalance(self, lam: Array) -> Array:
-        """e − Gλ, replicated."""
-        x = self.qp.d.duplicate()
-        x.array[:] = lam
-        missing = self.qp.coarse.residual(x)
-        x.destroy()
-        return missing
-
-    def normal(self, mu: Array) -> Array:
-        """Gᵀμ."""
-        x = self.qp.d.duplicate()
-        self.qp.coarse.combine(mu, x)
-        values = np.array(x.array_r)
-        x.destroy()
-        return values
-
     def missed(self, p: Array, lam: Array) -> float:
         """‖F‖ √(‖λ − p‖² + ‖Gᵀ(GGᵀ)⁻¹(e − Gλ)‖²), the same on all ranks."""
-        balancing = self.normal(self.qp.coarse.solve(self.imbalance(lam)))
-        return self.norm * norm_over(self.comm, np.concatenate((p - lam, balancing)))
+        local = self.local
+        balancing = local.normal(local.qp.coarse.solve(local.imbalance(lam)))
+        return self.norm * norm_over(local.comm, np.concatenate((p - lam, balancing)))
 
     def residual(self, at: LawPoint) -> float:
         """‖F‖ times what λ misses of the law and of Gλ = e, the same on all ranks."""
@@ -218,7 +185,7 @@ def newton_on_law(
     Returns:
         Where it has ended, None if it gave up; and the steps taken.
     """
-    length, best, idle, past = 0.0, np.inf, 0, list[float]()
+    best, idle, past = np.inf, 0, list[float]()
     for step in range(parameters.max_steps):
         # Step 1: the natural map: what a gradient step, brought back, moves, and what Gλ lacks
         feasible, p = program.nearest(at)
@@ -238,7 +205,7 @@ def newton_on_law(
         if past:
             share = min(share, parameters.followed * residual / past[-1])
         try:
-            end, length = _solved_on_face(program, on, at, length, share, target, parameters)
+            end = _solved_on_face(program, on, at, share, target, parameters)
         except FactorError:
             return None, step + 1
         # Step 4: halve the step until its residual is none of the largest; F is known on all of it
@@ -340,53 +307,44 @@ def _solved_on_face(
     program: LawProgram,
     on: OnFace,
     at: LawPoint,
-    length: float,
     share: float,
     target: float,
     parameters: FrictionParameters,
-) -> tuple[LawPoint, float]:
+) -> LawPoint:
     """Solve Zᵀ(Fλ − d − Gᵀμ) + κu = 0 and Gλ = e on a face, λ = λ₁ + (I + C)u. Collective.
 
     Args:
         program: The law.
         on: The face.
         at: The point before.
-        length: Step along a residual, preconditioned; 0: none is known.
         share: What is left of the residual.
         target: Of the whole method.
         parameters: Parameters.
-
-    Returns:
-        The solution, and the least step along a direction.
     """
-    qp, comm = program.qp, program.comm
+    local = program.local
+    qp, comm = local.qp, local.comm
     oblique = program.oblique(on.face, on.C)
     M = qp.preconditioner_on(on.face) if qp.preconditioner_on else None
 
     def apply(z: Array) -> tuple[Array, Array]:
-        Fz = program.apply(qp.F, on.followed(z))
+        Fz = local.F(on.followed(z))
         return oblique.project(Fz + on.bend(z)), Fz
 
     def precondition(r: Array) -> Array:
-        return oblique.project(on.face.restricted(r) if M is None else program.apply(M, r))
+        return oblique.project(on.face.restricted(r) if M is None else local.apply(M, r))
 
     # Step 3a: λ₁ on the face, and u that restores Gλ = e; s is of λ before
     lam, s = on.entered(at.lam), at.s
-    u = oblique.restoring(program.imbalance(lam))
+    u = oblique.restoring(local.imbalance(lam))
     way = lam + on.followed(u) - at.lam
     basis = known_on(qp.recycled, on, oblique.project)
     size = program.norm * norm_over(comm, way)
     if size > parameters.unseen * target:
-        # Step 3b: F of the way, if it can be seen. Known directions come before, for nothing, and
-        # beside a short way a first new one, for the same multiplication
+        # Step 3b: F of the way, if it can be seen; known directions come before, for nothing
         b = -oblique.project(s + on.bend(u))
-        z, image, *_ = gcr(apply, precondition, b, np.inf, basis, comm, parameters)
+        z, image, _ = gcr(apply, precondition, b, np.inf, basis, comm, parameters)
         u, s = u + z, s + image
-        b = -oblique.project(s + on.bend(u))
-        if length and size <= parameters.beside * norm_over(comm, b):
-            z = length * precondition(b)
-            u, way = u + z, way + on.followed(z)
-        image = program.apply(qp.F, way)
+        image = local.F(way)
         s = s + image
         if qp.recycled is not None and qp.coarse.dimension == 0:  # else it restores Gλ = e
             qp.recycled.keep(way, image)
@@ -394,7 +352,7 @@ def _solved_on_face(
     b = -oblique.project(s + on.bend(u))
     goal = max(share * norm_over(comm, b), parameters.followed * target)
     known = basis.shape[1]
-    z, image, basis, shortest = gcr(apply, precondition, b, goal, basis, comm, parameters)
+    z, image, basis = gcr(apply, precondition, b, goal, basis, comm, parameters)
     u, s = u + z, s + image
     if qp.recycled is not None:
         for z, image in basis[1:, known:].transpose(1, 0, 2):
@@ -402,8 +360,7 @@ def _solved_on_face(
     if M is not None:
         M.destroy()
     mu = oblique.coordinates(s + on.bend(u))
-    end = LawPoint(lam + on.followed(u), s - program.normal(mu), at.mu + mu)
-    return end, min(shortest or length, 1.0)
+    return LawPoint(lam + on.followed(u), s - local.normal(mu), at.mu + mu)
 
 
 # --- Generalised conjugate residuals ----------------------------------------------------------
@@ -417,7 +374,7 @@ def gcr(
     basis: Array,
     comm: MPI.Intracomm,
     parameters: FrictionParameters = DEFAULT,
-) -> tuple[Array, Array, Array, float]:
+) -> tuple[Array, Array, Array]:
     """Make ‖b − Au‖ least over more and more directions, from u = 0 on. Collective.
 
     Eisenstat, Elman, Schultz, SIAM J. Numer. Anal. 20 (1983) 345–357. A step multiplies by A once,
@@ -434,14 +391,13 @@ def gcr(
         parameters: Parameters.
 
     Returns:
-        u, its image, all directions, of which new ones, each for one multiplication, come last,
-        and the least step along a new one, over Mr less earlier directions; 0 without any.
+        u, its image, and all directions, of which new ones, each for one multiplication, come last.
     """
     Q, Z, images = basis
     c = summed(comm, Q @ b)
     u, image, r = c @ Z, c @ images, b - c @ Q
-    size, lengths = norm_over(comm, r), list[float]()
-    while size > target and len(lengths) < parameters.max_directions:
+    size, most = norm_over(comm, r), basis.shape[1] + parameters.max_directions
+    while size > target and basis.shape[1] < most:
         # Step 1: the preconditioned residual, made orthogonal to all before
         z = precondition(r)
         q, w = apply(z)
@@ -458,9 +414,8 @@ def gcr(
         basis = np.concatenate((basis, new[:, None]), axis=1)
         Q, Z, images = basis
         u, image, r = u + step * new[1], image + step * new[2], r - step * new[0]
-        lengths.append(step / length)
         size = after
-    return u, image, basis, max(min(lengths, default=0.0), 0.0)
+    return u, image, basis
 
 
 def known_on(

@@ -11,7 +11,7 @@ from petsc4py import PETSc
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, norm_over
 from tfeti_dolfinx.qp.coarse import Coarse
-from tfeti_dolfinx.qp.problem import QP, Operator, QPResult
+from tfeti_dolfinx.qp.problem import QP, Operator, QPResult, Start
 from tfeti_dolfinx.qp.sets import FeasibleSet
 
 # of the terms that a residual is the difference of: what rounding leaves of it at least, and
@@ -116,10 +116,10 @@ def natural(coarse: Coarse, like: PETSc.Vec) -> PETSc.Vec:
     return x
 
 
-def restored(coarse: Coarse, lam: PETSc.Vec) -> PETSc.Vec:
-    """Return the nearest solution of Gλ̄ = e to λ: λ + Gᵀ(GGᵀ)⁻¹(e − Gλ). Collective."""
-    x, fixed = lam.copy(), natural(coarse, lam)
-    coarse.project(x)
+def restored(qp: QP, start: Start) -> PETSc.Vec:
+    """Return the nearest solution of Gλ̄ = e to a start: λ + Gᵀ(GGᵀ)⁻¹(e − Gλ). Collective."""
+    x, fixed = start.lam.copy(), natural(qp.coarse, start.lam)
+    qp.coarse.project(x)
     x.axpy(1.0, fixed)
     fixed.destroy()
     return x

@@ -19,6 +19,7 @@ from tfeti_dolfinx.qp.problem import (
     Operator,
     Point,
     QPResult,
+    Start,
     Steps,
     StoppingRule,
     no_monitor,
@@ -293,8 +294,10 @@ def solve_by_pcpg(
     qp: QP,
     homogenised: Homogenised,
     rule: StoppingRule,
+    parameters: PcpgParameters = DEFAULT,
     *,
     max_it: int = 10_000,
+    start: Start | None = None,
     monitor: Monitor = no_monitor,
 ) -> QPResult:
     """Solve min ½λᵀFλ − λᵀd, Gλ = e, from λ̄ on. Collective.
@@ -319,7 +322,9 @@ def solve_by_pcpg(
         qp: The program; its feasible set is not looked at.
         homogenised: Its homogenised form, whose λ̄ is the start.
         rule: Says when ‖P(d − Fλ)‖ is small enough.
+        parameters: Tolerances.
         max_it: Most steps.
+        start: Not looked at: λ̄ is the start.
         monitor: Called after each step.
 
     Returns:

@@ -11,11 +11,13 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.qp.coarse import HELD, imbalance
 from tfeti_dolfinx.qp.homogenised import Homogenised
-from tfeti_dolfinx.qp.newton_faces import DualIterate, FaceSolver, LocalProgram
+from tfeti_dolfinx.qp.newton_faces import FaceSolver
 from tfeti_dolfinx.qp.parameters import NewtonParameters
 from tfeti_dolfinx.qp.problem import (
     QP,
     ConvergedReason,
+    DualIterate,
+    LocalProgram,
     Monitor,
     QPResult,
     Start,

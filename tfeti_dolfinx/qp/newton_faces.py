@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -10,14 +10,15 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import TINY, Array
-from tfeti_dolfinx.common.parallel import any_rank, largest, summed
+from tfeti_dolfinx.common.parallel import any_rank, largest
 from tfeti_dolfinx.qp.coarse import HELD, Coarse, imbalance
 from tfeti_dolfinx.qp.krylov import Directions, pcpg
 from tfeti_dolfinx.qp.parameters import NewtonParameters
 from tfeti_dolfinx.qp.problem import (
-    QP,
     ConvergedReason,
+    DualIterate,
     FaceOperator,
+    LocalProgram,
     Monitor,
     Operator,
     Point,
@@ -25,84 +26,10 @@ from tfeti_dolfinx.qp.problem import (
     StoppingRule,
     TargetRule,
 )
-from tfeti_dolfinx.qp.projection import ConvexSet, WithinFace, project_onto_feasible
+from tfeti_dolfinx.qp.projection import WithinFace
 from tfeti_dolfinx.qp.sets import Face, without_slip
 
-# --- Points and products as numpy arrays ------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class DualIterate:
-    """Multipliers with their gradient, this rank's part.
-
-    Attributes:
-        lam: λ, shape ``(m,)``.
-        g: Fλ − d.
-    """
-
-    lam: Array
-    g: Array
-
-
-class LocalProgram:
-    """Quadratic program on numpy arrays of this rank's rows. All methods are collective.
-
-    Args:
-        qp: The program.
-    """
-
-    def __init__(self, qp: QP) -> None:
-        self.qp, self.comm = qp, qp.d.getComm().tompi4py()
-        self._x, self._y = qp.d.duplicate(), qp.d.duplicate()
-
-    def vec(self, x: Array) -> PETSc.Vec:
-        """Return the work vector with these values, valid until the next call."""
-        self._x.array[:] = x
-        return self._x
-
-    def F(self, x: Array) -> Array:
-        """F x: one multiplication."""
-        self.qp.F.mult(self.vec(x), self._y)
-        return np.array(self._y.array_r)
-
-    def dot(self, *pairs: tuple[Array, Array]) -> list[float]:
-        """Return xᵀy of pairs of vectors, rank 0's on every rank."""
-        products = summed(self.comm, np.array([x @ y for x, y in pairs]))
-        self.comm.Bcast(products, root=0)
-        return [float(value) for value in products]
-
-    def moved(self, z: DualIterate, lam: Array) -> DualIterate:
-        """Return other multipliers with their gradient: one multiplication by F."""
-        return DualIterate(lam, z.g + self.F(lam - z.lam))
-
-    def refreshed(self, lam: Array) -> DualIterate:
-        """Return multipliers with a gradient made anew: one multiplication by F."""
-        return DualIterate(lam, self.F(lam) - self.qp.d.array_r)
-
-    def normal(self, mu: Array) -> Array:
-        """Gᵀμ."""
-        self.qp.coarse.combine(mu, self._y)
-        return np.array(self._y.array_r)
-
-    def projected(self, lam: Array, onto: ConvexSet | None = None) -> tuple[Array, Array, float]:
-        """Return the nearest point to λ of a set, by default Ω, with Gλ = e.
-
-        Returns:
-            The point λ̂ = P(λ + Gᵀα), α, and how far Gλ̂ is from e.
-        """
-        found = project_onto_feasible(self.qp.coarse, onto or self.qp.feasible, self.vec(lam))
-        values = np.array(found.lam.array_r)
-        found.lam.destroy()
-        return values, found.alpha, found.missing
-
-    def any(self, flags: Array) -> bool:
-        """Return whether a flag is set on some rank."""
-        return any_rank(self.comm, bool(np.any(flags)))
-
-    def destroy(self) -> None:
-        """Destroy the work vectors."""
-        self._x.destroy()
-        self._y.destroy()
+# --- Solves on faces --------------------------------------------------------------------------
 
 
 class CurvedHessian:
@@ -124,9 +51,6 @@ class CurvedHessian:
     def bend(self, x: Array) -> Array:
         """Z diag(κ) Zᵀx."""
         return np.asarray(self._face.Z @ (self._face.curvature * (self._face.Z.T @ x)))
-
-
-# --- Solves on faces --------------------------------------------------------------------------
 
 
 class FaceSolver:

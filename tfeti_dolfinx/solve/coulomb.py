@@ -23,8 +23,8 @@ from tfeti_dolfinx.qp.friction_newton import (
     follow_friction,
     newton_on_law,
 )
-from tfeti_dolfinx.qp.problem import ConvergedReason, Monitor, QPResult, Steps
-from tfeti_dolfinx.solve.solver import learn, solve_dual
+from tfeti_dolfinx.qp.problem import ConvergedReason, LocalProgram, Monitor, QPResult, Steps
+from tfeti_dolfinx.solve.solver import solve_dual
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def solve_with_friction(
     least = options.number if goal is None else parameters.with_target * options.friction_rtol
     tolerance = min(options.friction_rtol, parameters.beside_rtol * least)
     bounds = FrictionBounds(dual, start, parameters)
-    newton = NewtonOnLaw(dual, options, qp_type, least, parameters)
+    newton = NewtonOnLaw(dual, options, least, parameters)
     rtol, change, aim, near = parameters.first, np.inf, np.inf, False
     steps, looks, iterations = Steps(), 0, 0
     law = newton.solve(start, bounds)
@@ -386,7 +386,6 @@ class NewtonOnLaw:
     Args:
         dual: The dual problem.
         options: Options.
-        qp_type: The solver of problems with given bounds.
         rtol: Relative tolerance.
         parameters: Parameters.
 
@@ -395,11 +394,10 @@ class NewtonOnLaw:
     """
 
     def __init__(
-        self, dual: Dual, options: Options, qp_type: str, rtol: float, parameters: CoulombParameters
+        self, dual: Dual, options: Options, rtol: float, parameters: CoulombParameters
     ) -> None:
-        kind = options.friction_type
-        wanted = kind == "newton" or (kind == "auto" and qp_type == "newton")
-        self._dual, self._options, self._rtol, self._parameters = dual, options, rtol, parameters
+        wanted = options.friction_type == "newton"
+        self._dual, self._rtol, self._parameters = dual, rtol, parameters
         self._tries, self._share, self.steps = parameters.tries if wanted else 0, 1.0, 0
         self._recycled, self._rests = dual.recycled, dual.last.is_of(dual.d, dual.coarse.e)
 
@@ -436,12 +434,13 @@ class NewtonOnLaw:
             self._rests = False
             return None
         cite("newton on friction")
-        learn(dual, self._options)  # steps differ by few rows, if by any
+        dual.learn()  # steps differ by few rows, if by any
         qp, at = dual.qp(), dual.constraints.pressed
         law = Law(
             dual.set_under, dual.constraints.pressed_by[at], dual.constraints.sets.tangents[at]
         )
-        program = LawProgram(qp, law, dual.coarse.oblique, norm)
+        local = LocalProgram(qp)
+        program = LawProgram(local, law, dual.coarse.oblique, norm)
         # Step 1: the start, with its μ or that of least squares: the lesser residual
         work = qp.d.duplicate()
         work.array[:] = start[0]
@@ -467,6 +466,7 @@ class NewtonOnLaw:
                 steps += more
         self.steps, self._share = self.steps + steps, parameters.finer * self._share
         self._tries -= 1
+        local.destroy()
         if end is None:
             self._tries, dual.recycled = 0, self._recycled
             image.destroy()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from mpi4py import MPI
@@ -32,7 +33,6 @@ from tfeti_dolfinx.qp.problem import (
     Start,
     no_monitor,
 )
-from tfeti_dolfinx.qp.recycling import Recycled
 from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver
 
 
@@ -47,9 +47,6 @@ def last_look(result: QPResult, rule: Accuracy) -> None:
 
 # --- Choice and run of a solver ---------------------------------------------------------------
 
-# directions that are kept where more solves come and options do not say how many: later ones gain
-# hardly anything, and each takes two vectors
-REPEATED = 100
 EXPLANATIONS = {
     ConvergedReason.DIVERGED_ROUNDING: "; rounding does not let it come lower: expected a "
     "larger rtol, or a scene with smaller ratios of stiffness or size",
@@ -69,19 +66,8 @@ SLIDES = (
 )
 
 
-def learn(dual: Dual, options: Options) -> None:
-    """Keep directions from now on, where options leave that open: more solves come.
-
-    Args:
-        dual: The dual problem.
-        options: Options.
-    """
-    if options.recycle == "auto" and dual.recycled is None:
-        dual.recycled = Recycled(REPEATED, dual.coarse.comm)
-
-
-def resolve_types(options: Options, rows: Sequence[int], prefix: str) -> tuple[str, str]:
-    """Return the solver and the preconditioner that ``auto`` stands for.
+def resolved(options: Options, rows: Sequence[int], prefix: str) -> Options:
+    """Return options with the solver, preconditioner and friction that ``auto`` stands for.
 
     Args:
         options: Options.
@@ -111,7 +97,11 @@ def resolve_types(options: Options, rows: Sequence[int], prefix: str) -> tuple[s
             f"-{prefix}pc_type {options.pc_type}: {qp_type.upper()} takes no preconditioner; "
             "expected auto or none"
         )
-    return qp_type, own if options.pc_type == "auto" else options.pc_type
+    pc_type = own if options.pc_type == "auto" else options.pc_type
+    friction = options.friction_type
+    if friction == "auto":
+        friction = "newton" if qp_type == "newton" else "fixed_point"
+    return replace(options, qp_type=qp_type, pc_type=pc_type, friction_type=friction)
 
 
 def solve_dual(
@@ -153,7 +143,10 @@ def solve_dual(
     rtol = options.number if rtol is None else rtol
     rule = Accuracy(dual, rtol, options.atol, (scale.reference, scale.rounding), qp.norm)
     rule.goal = goal
-    result = solver.solve(qp, homogenised, rule, options, begin, monitor)
+    parameters = getattr(options, qp_type, solver.parameters)
+    result = solver.solve(
+        qp, homogenised, rule, parameters, max_it=options.max_it, start=begin, monitor=monitor
+    )
     dual.saw(result.norm)
     if (state := rule.recovered) is not None:
         dual.last.look(state.lam, state.residual)
