@@ -6,6 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.conic import constrained_qp
+from test_discs import discs
 from test_qp import matrix, to, vector
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse
@@ -17,7 +18,7 @@ from tfeti_dolfinx.qp.mprgp import (
     mprgp,
 )
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Steps
-from tfeti_dolfinx.qp.sets import Bounds, Discs, Ellipses, Product, Status
+from tfeti_dolfinx.qp.sets import Bounds, Ellipses, Product, Status
 from tfeti_dolfinx.qp.smalse import smalse
 
 
@@ -39,8 +40,8 @@ def program(seed, k, isotropic, m=40, r=4):
 
 
 def as_set(bounded, pairs, a, isotropic):
-    discs = Discs(a[:, 0], a.shape[1]) if isotropic else Ellipses(a)
-    return Product([(bounded, Bounds()), (pairs.ravel(), discs)])
+    sets = Ellipses(np.repeat(a[:, :1], a.shape[1], axis=1) if isotropic else a)
+    return Product([(bounded, Bounds()), (pairs.ravel(), sets)])
 
 
 @settings(max_examples=12)
@@ -64,9 +65,9 @@ def test_mpgp_slides_sticks_and_falls_off():
     A = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
     A[0, 1] = A[1, 0] = 0.5
     b = np.array([3.0, 1.0, 0.3, 0.4, 1.0, 1.0])
-    discs = Discs(np.array([1.0, 1.0, 0.0]))
+    around = discs([1.0, 1.0, 0.0])
     x, g, steps = vector(np.zeros(6)), vector(-b), Steps()
-    state = MprgpIterate(matrix(A), x, g, discs)
+    state = MprgpIterate(matrix(A), x, g, around)
     parameters = MprgpParameters(1.0 / 6.5)
     assert mprgp(state, parameters, lambda s: s.projected_gradient <= 1e-9, steps, 500) is None
     exact = constrained_qp(

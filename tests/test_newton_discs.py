@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from reference.conic import constrained_qp
+from test_discs import discs
 from test_mpgp import around_circles, as_set, program
 from test_qp import matrix, vector
 
@@ -15,7 +16,7 @@ from tfeti_dolfinx.qp.problem import QP, ConvergedReason, ResidualRule, Start, n
 from tfeti_dolfinx.qp.projection import (
     project_onto_feasible,
 )
-from tfeti_dolfinx.qp.sets import Discs, Status
+from tfeti_dolfinx.qp.sets import Status
 
 
 def solved(qp, tolerance, monitor=no_monitor, start=None):
@@ -66,7 +67,7 @@ def test_where_all_points_slide_the_end_is_superlinear(seed):
         if step == "outer":
             residuals.append(projected_gradient)
 
-    qp = QP(matrix(F), vector(d), DenseCoarse(np.zeros((0, len(d))), np.zeros(0)), Discs(radius))
+    qp = QP(matrix(F), vector(d), DenseCoarse(np.zeros((0, len(d))), np.zeros(0)), discs(radius))
     result = solved(qp, 1e-11 * np.linalg.norm(d), monitor)
     assert result.reason == ConvergedReason.CONVERGED_RTOL
     assert np.all(result.face.status == Status.SLIP)
@@ -110,7 +111,7 @@ def test_what_nothing_in_the_set_balances_is_said():
         matrix(np.eye(4)),
         vector(np.ones(4)),
         DenseCoarse(np.array([[1.0, 0.0, 1.0, 0.0]]), np.array([3.0])),
-        Discs(np.ones(2)),
+        discs(np.ones(2)),
     )
     assert solved(qp, 1e-9).reason == ConvergedReason.DIVERGED_STALLED
 
@@ -122,7 +123,7 @@ def test_a_slip_ends_where_its_boundary_bends_and_is_no_contradiction(seed):
     A = rng.standard_normal((2, 4))
     A[:, 2:] = A[:, :2]
     F, d = A.T @ A, 3.0 * rng.standard_normal(4)
-    feasible = Discs(np.array([1.0, 0.5]))
+    feasible = discs(np.array([1.0, 0.5]))
     result = solved(
         QP(matrix(F), vector(d), DenseCoarse(np.zeros((0, len(d))), np.zeros(0)), feasible), 1e-8
     )

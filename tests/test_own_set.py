@@ -23,15 +23,9 @@ class HalfSpaces:
         bound = self._bound(x)
         return np.where(bound, 0.0, g), np.where(bound, np.minimum(g, 0.0), 0.0)
 
-    def reduced(self, x, phi, alpha):
-        return np.minimum(phi, (x - self.b / self.a) / alpha)
-
     def max_step(self, x, p):
         down = self.a * p < 0.0
         return np.min((self.a * x - self.b)[down] / (self.a * p)[down], initial=np.inf)
-
-    def shifted(self, shift):
-        return HalfSpaces(self.a, self.b - self.a * shift)
 
     def face(self, x, g):
         off = ~self._bound(x)

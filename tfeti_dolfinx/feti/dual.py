@@ -33,7 +33,6 @@ from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
 from tfeti_dolfinx.qp.recycling import Recycled
 from tfeti_dolfinx.qp.sets import (
     Bounds,
-    Discs,
     Ellipses,
     Face,
     FeasibleSet,
@@ -77,19 +76,9 @@ FeasibleLaw = Callable[[Constraints], FeasibleSet]
 
 def contact_set(constraints: Constraints) -> FeasibleSet:
     """λ_N ≥ 0, and λ_T of each condition with friction in its disc or ellipse: no adhesion."""
-    sets, limits = constraints.sets, constraints.limits
-    normal = (sets.normals, Bounds())
-    if limits.size == 0:
-        return Product([normal])
-    round_ones = np.all(limits == limits[:, :1], axis=1)
-    discs, ellipses = sets.tangents[round_ones], sets.tangents[~round_ones]
-    return Product(
-        [
-            normal,
-            (discs.ravel(), Discs(limits[round_ones].max(axis=1, initial=0.0), limits.shape[1])),
-            (ellipses.ravel(), Ellipses(limits[~round_ones])),
-        ]
-    )
+    sets = constraints.sets
+    tangents = sets.tangents.ravel(), Ellipses(constraints.limits)
+    return Product([(sets.normals, Bounds()), tangents])
 
 
 class Dual:

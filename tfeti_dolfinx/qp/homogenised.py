@@ -12,7 +12,6 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, norm_over
 from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.problem import QP, Operator, QPResult, Start
-from tfeti_dolfinx.qp.sets import FeasibleSet
 
 # of the terms that a residual is the difference of: what rounding leaves of it at least, and
 # below how many times that rounding may be the reason of anything strange
@@ -168,20 +167,18 @@ def _rounding(qp: QP, at: OperatorProduct) -> float:
 
 @dataclass(frozen=True)
 class Homogenised:
-    """min ½xᵀPFPx − bᵀx subject to Gx = 0, x ∈ Ω − λ̄.
+    """min ½xᵀPFPx − bᵀx subject to Gx = 0, x + λ̄ ∈ Ω.
 
     Attributes:
         lam_bar: λ̄.
         gradient: F λ̄ − d.
         b: P(d − F λ̄).
-        feasible: Ω − λ̄.
         scale: Size of the residual at λ̄₀, whatever λ̄ is.
     """
 
     lam_bar: PETSc.Vec
     gradient: PETSc.Vec
     b: PETSc.Vec
-    feasible: FeasibleSet
     scale: Scale
 
     def is_rounding(self, residual: float) -> bool:
@@ -223,8 +220,7 @@ def homogenise(
     else:
         qp.coarse.project(b)
     without.destroy()
-    feasible = qp.feasible.shifted(np.array(at.x.array_r))
-    return Homogenised(at.x.copy(), gradient, b, feasible, scale or scale_at(qp, at))
+    return Homogenised(at.x.copy(), gradient, b, scale or scale_at(qp, at))
 
 
 def open_gaps(qp: QP) -> Array:

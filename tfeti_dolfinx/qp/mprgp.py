@@ -41,7 +41,7 @@ class MprgpParameters:
 
 
 class MprgpIterate:
-    """An iterate of min ½xᵀAx − bᵀx on Ω, with its gradient g = Ax − b and its parts.
+    """An iterate of min ½xᵀAx − bᵀx on Ω, with its gradient Ax − b and its parts.
 
     Args:
         A: Symmetric positive (semi)definite operator.
@@ -75,9 +75,11 @@ class MprgpIterate:
         return float((self.free_squared + self.chopped_squared) ** 0.5)
 
     def is_proportional(self, parameters: MprgpParameters) -> bool:
-        """Return whether ‖β‖² ≤ Γ² φ̃ᵀφ, φ̃ the reduced free gradient. Collective."""
-        phi = self.phi.array_r
-        own = float(self.feasible.reduced(self.x.array_r, phi, parameters.alpha_bar) @ phi)
+        """Return whether ‖β‖² ≤ Γ² φ̃ᵀφ, φ̃ = (x − P_Ω(x − ᾱφ))/ᾱ. Collective."""
+        x, phi, alpha = self.x.array_r, self.phi.array_r, parameters.alpha_bar
+        trial = x - alpha * phi
+        projected = self.feasible.project(trial)
+        own = float(np.where(projected == trial, phi, (x - projected) / alpha) @ phi)
         return bool(self.chopped_squared <= parameters.gamma**2 * self._comm.allreduce(own))
 
     def max_step(self, p: Array, x: Array | None = None) -> float:
@@ -109,12 +111,6 @@ class MprgpIterate:
         projected = self.feasible.project(target)
         self.g.array[:] += self.apply(projected - self.x.array_r)
         self.x.array[:] = projected  # x + p rounds: what is on its bound stays there
-
-    def refresh(self, linear: PETSc.Vec) -> None:
-        """g = A x + c anew, for what rounding has added up in it; multiplies by A once."""
-        self.A.mult(self.x, self.g)
-        self.g.axpy(1.0, linear)
-        self.split()
 
     def destroy(self) -> None:
         """Destroy the work vectors, not x and g. Collective."""

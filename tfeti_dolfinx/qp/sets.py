@@ -1,8 +1,8 @@
-"""Feasible sets: bounds, discs, ellipses, their products and faces."""
+"""Feasible sets: bounds, ellipses, their products and faces."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
@@ -135,16 +135,8 @@ class FeasibleSet(Protocol):
         """Free gradient φ and chopped gradient β at x ∈ Ω; φ + β is the projected gradient."""
         ...
 
-    def reduced(self, x: Array, phi: Array, alpha: float) -> Array:
-        """Reduced free gradient φ̃ = (x − P_Ω(x − α φ))/α."""
-        ...
-
     def max_step(self, x: Array, p: Array) -> float:
         """Return the largest α with x − α p ∈ Ω, maybe infinite."""
-        ...
-
-    def shifted(self, shift: Array) -> FeasibleSet:
-        """Return the set Ω − shift."""
         ...
 
     def face(self, x: Array, g: Array) -> Face:
@@ -175,18 +167,10 @@ class Bounds:
         bound = x <= self.lower
         return np.where(bound, 0.0, g), np.where(bound, np.minimum(g, 0.0), 0.0)
 
-    def reduced(self, x: Array, phi: Array, alpha: float) -> Array:
-        """φ̃_i = min((x_i − l_i)/α, φ_i)."""
-        return np.minimum((x - self.lower) / alpha, phi)
-
     def max_step(self, x: Array, p: Array) -> float:
         """min over p_i > 0 of (x_i − l_i)/p_i."""
         down = p > 0.0
         return float(np.min((x - self.lower)[down] / p[down], initial=np.inf))
-
-    def shifted(self, shift: Array) -> Bounds:
-        """Bounds l − shift."""
-        return Bounds(self.lower - shift)
 
     def face(self, x: Array, g: Array) -> Face:
         """Return the face of x: rows off their bounds are free, they touch."""
@@ -239,21 +223,10 @@ class Product:
             phi[rows], beta[rows] = factor.split(x[rows], g[rows])
         return phi, beta
 
-    def reduced(self, x: Array, phi: Array, alpha: float) -> Array:
-        """φ̃ of each set; φ on free rows."""
-        values = np.array(phi)
-        for rows, factor in self.factors:
-            values[rows] = factor.reduced(x[rows], phi[rows], alpha)
-        return values
-
     def max_step(self, x: Array, p: Array) -> float:
         """Return the least of all sets."""
         steps = [factor.max_step(x[rows], p[rows]) for rows, factor in self.factors]
         return min([float(np.inf), *steps])
-
-    def shifted(self, shift: Array) -> Product:
-        """Each set, shifted."""
-        return Product([(rows, factor.shifted(shift[rows])) for rows, factor in self.factors])
 
     def face(self, x: Array, g: Array) -> Face:
         """Free rows, then the directions of each set."""
@@ -294,21 +267,18 @@ def _joined(faces: Sequence[tuple[Array, Face]], status: Array) -> Face:
     return Face(Z, np.concatenate([face.curvature for _, face in faces]), status)
 
 
-# --- Discs and ellipses -----------------------------------------------------------------------
+# --- Ellipses ---------------------------------------------------------------------------------
 
-# Of the boundary's distance from the centre: what is so near to the boundary is on it. Projections
-# come within a few roundings of it; those of λ − λ̄ within as many of the centre, −λ̄.
-ON, SEVERAL, EPSILON = 1e-10, 8.0, 2.2e-16
-# of the centre's distance from 0: a semi-axis below it is 0, since rounding decides what is inside
-NEGLIGIBLE = 1e-11
+# of the boundary's distance from the centre: what is so near to the boundary is on it
+ON = 1e-10
 # Newton's method for the secular equation: far more steps than it takes, and where it ends
-MOST_STEPS, SOLVED = 60, 4.0 * EPSILON
+MOST_STEPS, SOLVED = 60, 9e-16
 
 
 class Ellipses:
-    """Σ_j ((x_ij − c_ij)/a_ij)² ≤ 1: points x_i of one or two neighbouring entries each.
+    """Σ_j (x_ij/a_ij)² ≤ 1: points x_i of one or two neighbouring entries each.
 
-    A semi-axis of 0 fixes its entry; with both of them 0 the set is its centre.
+    A semi-axis of 0 fixes its entry; with both of them 0 the set is 0. Equal ones make a disc.
 
     >>> slab = Ellipses(np.array([[2.0, 1.0]]))
     >>> slab.project(np.array([0.0, 3.0])).tolist(), slab.project(np.array([0.5, 0.5])).tolist()
@@ -316,29 +286,26 @@ class Ellipses:
 
     Args:
         semi_axes: The a_ij, 0 or more, shape ``(n, k)``, k = 1 or 2.
-        centre: The c_ij, of the same shape, or 0.
     """
 
-    def __init__(self, semi_axes: Array, centre: Array | float = 0.0) -> None:
+    def __init__(self, semi_axes: Array) -> None:
         self.semi_axes = np.asarray(semi_axes, dtype=float)
-        self.centre = np.broadcast_to(centre, self.semi_axes.shape)
-        self._moves = self.semi_axes > NEGLIGIBLE * np.abs(self.centre)
+        self._moves = self.semi_axes > 0.0
         self._inverse = np.divide(
             1.0, self.semi_axes, out=np.zeros(self.semi_axes.shape), where=self._moves
         )
 
     def project(self, x: Array) -> Array:
         """Return the nearest points of the ellipses."""
-        t = self._from_centre(x)
+        t = self._points(x)
         outside = self._level(t) > 1.0
         nearest = np.where(self._moves, t, 0.0)
         nearest[outside] = self._nearest(t[outside], outside)
-        # what stays where it was is not rounded
-        return np.where(nearest == t, self._points(x), self.centre + nearest).ravel()
+        return np.asarray(nearest.ravel())
 
     def split(self, x: Array, g: Array) -> tuple[Array, Array]:
         """φ = g inside; on the boundary β = g − min(nᵀg, 0)n, n its outward normal."""
-        t = self._from_centre(x)
+        t = self._points(x)
         on, normal = self._boundary(t)
         g = np.where(self._moves, self._points(g), 0.0)
         pushing = np.minimum(np.sum(normal * g, axis=1), 0.0)
@@ -346,16 +313,12 @@ class Ellipses:
         beta = np.where(on[:, None], g - pushing[:, None] * normal, 0.0)
         return phi.ravel(), beta.ravel()
 
-    def reduced(self, x: Array, phi: Array, alpha: float) -> Array:
-        """φ̃ = (x − P(x − αφ))/α, φ itself where the step stays inside."""
-        return reduced_by(self.project, x, phi, alpha)
-
     def max_step(self, x: Array, p: Array) -> float:
         """Largest α with x − αp inside: the smallest root of a quadratic equation for each."""
         p = self._points(p)
         if np.any(p[~self._moves]):
             return 0.0
-        t, p = self._from_centre(x) * self._inverse, p * self._inverse
+        t, p = self._points(x) * self._inverse, p * self._inverse
         a, b = np.sum(p * p, axis=1), np.sum(p * t, axis=1)
         moves = a > 0.0
         a, b = a[moves], b[moves]
@@ -365,13 +328,9 @@ class Ellipses:
         steps = np.where(b > 0.0, (b + root) / a, room / np.maximum(root - b, TINY))
         return float(np.min(steps, initial=np.inf))
 
-    def shifted(self, shift: Array) -> Ellipses:
-        """Ellipses around c − shift."""
-        return Ellipses(self.semi_axes, self.centre - self._points(shift))
-
     def face(self, x: Array, g: Array) -> Face:
         """Inside all directions are free: it sticks. On the boundary the tangent: it slips."""
-        t = self._from_centre(x)
+        t = self._points(x)
         on, normal = self._boundary(t)
         status = np.where(on[:, None], Status.SLIP, Status.STICK)
         status = np.where(self._moves, status, Status.OPEN)
@@ -385,17 +344,14 @@ class Ellipses:
     def onto(self, x: Array, status: Array) -> Array:
         """The nearest points of the ellipses; of their boundary, from inside too, for slip."""
         values = self._points(self.project(x)).copy()
-        t = np.where(self._moves, self._from_centre(x), 0.0)
+        t = np.where(self._moves, self._points(x), 0.0)
         slips = np.any(self._points(status) == Status.SLIP, axis=1)
         inward = slips & (self._level(t) < 1.0) & np.any(t != 0.0, axis=1)
-        values[inward] = self.centre[inward] + self._nearest(t[inward], inward)
+        values[inward] = self._nearest(t[inward], inward)
         return np.asarray(values.ravel())
 
     def _points(self, x: Array) -> Array:
         return np.asarray(x).reshape(self.semi_axes.shape)
-
-    def _from_centre(self, x: Array) -> Array:
-        return np.asarray(self._points(x) - self.centre)
 
     def _level(self, t: Array) -> Array:
         """‖t/a‖, 1 on the boundary; entries that are fixed do not count."""
@@ -403,8 +359,7 @@ class Ellipses:
 
     def _boundary(self, t: Array) -> tuple[Array, Array]:
         """Flags of what is on the boundary, and its outward normals; 0 where nothing moves."""
-        rounding = SEVERAL * EPSILON * np.max(np.abs(self.centre) * self._inverse, axis=1)
-        on = self._level(t) >= 1.0 - ON - rounding
+        on = self._level(t) >= 1.0 - ON
         steep = t * self._inverse**2
         size = np.linalg.norm(steep, axis=1, keepdims=True)
         normal = np.divide(steep, size, out=np.zeros_like(t), where=size > 0.0)
@@ -427,40 +382,6 @@ class Ellipses:
         # the last rounding of μ must not leave y off the boundary
         level = np.linalg.norm(np.divide(y, a, out=np.zeros_like(y), where=a > 0.0), axis=1)
         return np.asarray(scale * y / np.maximum(level, TINY)[:, None])
-
-
-class Discs(Ellipses):
-    """‖x_i − c_i‖ ≤ r_i; of one entry each: intervals.
-
-    >>> Discs(np.array([1.0])).project(np.array([3.0, 4.0])).tolist()
-    [0.6, 0.8]
-
-    Args:
-        radius: The r_i, 0 or more, shape ``(n,)``.
-        dimension: Entries of a point, 1 or 2.
-        centre: The c_i, shape ``(n, dimension)``, or 0.
-    """
-
-    def __init__(self, radius: Array, dimension: int = 2, centre: Array | float = 0.0) -> None:
-        radius = np.asarray(radius, dtype=float)
-        super().__init__(np.repeat(radius[:, None], dimension, axis=1), centre)
-
-    def shifted(self, shift: Array) -> Discs:
-        """Discs around c − shift."""
-        radius, dimension = self.semi_axes[:, 0], self.semi_axes.shape[1]
-        return Discs(radius, dimension, self.centre - self._points(shift))
-
-    def _nearest(self, z: Array, which: Array) -> Array:
-        """r z/‖z‖."""
-        size = np.linalg.norm(z, axis=1, keepdims=True)
-        return np.asarray(self.semi_axes[which] * (z / np.maximum(size, TINY)))
-
-
-def reduced_by(project: Callable[[Array], Array], x: Array, phi: Array, alpha: float) -> Array:
-    """φ̃ = (x − P(x − αφ))/α, φ itself where the step stays inside."""
-    trial = x - alpha * phi
-    projected = project(trial)
-    return np.where(projected == trial, phi, (x - projected) / alpha)
 
 
 def _secular(a: Array, z: Array) -> Array:

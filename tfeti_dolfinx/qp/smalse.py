@@ -77,7 +77,7 @@ class InnerTest:
 
     def __call__(self, state: MprgpIterate) -> bool:
         """Return whether the inner loop may end. Collective."""
-        equality, gradient = self._qp.coarse.norm_Q(state.x), state.projected_gradient
+        equality, gradient = self._equality_at(state), state.projected_gradient
         if max(gradient, self._qp.norm * equality) <= self._rule.tolerance:
             self.examine(state)
         if self.reason != ConvergedReason.ITERATING or self._rule.drifted:
@@ -87,12 +87,17 @@ class InnerTest:
 
     def examine(self, state: MprgpIterate) -> float:
         """Apply the stopping rule, and return the residual. Collective."""
-        equality, lam = self._qp.coarse.norm_Q(state.x), state.x.copy()
-        residual = max(state.projected_gradient, self._qp.norm * equality)
-        lam.axpy(1.0, self._homogenised.lam_bar)
-        self.reason = self._rule.examine(lam, state.g, state.face(), residual)
-        lam.destroy()
+        residual = max(state.projected_gradient, self._qp.norm * self._equality_at(state))
+        self.reason = self._rule.examine(state.x, state.g, state.face(), residual)
         return residual
+
+    def _equality_at(self, state: MprgpIterate) -> float:
+        """‖Q(λ − λ̄)‖."""
+        x = state.x.copy()
+        x.axpy(-1.0, self._homogenised.lam_bar)
+        equality = self._qp.coarse.norm_Q(x)
+        x.destroy()
+        return equality
 
     def update(self, lagrangian: float, equality: float) -> None:
         """Step 4: M after an outer step, from L(x, μ) before the multipliers' update and ‖Bx‖."""
@@ -118,7 +123,7 @@ def smalse(
     start: Start | None = None,
     monitor: Monitor = no_monitor,
 ) -> QPResult:
-    """Solve min ½xᵀFx − bᵀx, x ∈ Ω − λ̄, Gx = 0, and return λ = x + λ̄. Collective.
+    """Solve min ½xᵀFx − bᵀx, Gx = 0, where x = λ − λ̄ and λ ∈ Ω, for λ. Collective.
 
     Dostál, Optimal Quadratic Programming Algorithms, Springer 2009, chapter 6 (SMALBE-M);
     Dostál, Kozubek, Math. Program. 135 (2012) 195–220. Step numbers are those of the talk.
@@ -153,7 +158,7 @@ def smalse(
         rule: Says when ‖g^P‖ and ‖F‖‖Qx‖ are small enough; asked in the inner loop too.
         parameters: ρ, M, β, η, Γ, ᾱ.
         max_it: Most inner steps, and most outer ones.
-        start: Where to start; default x = P_Ω(0), μ = 0.
+        start: Where to start; default P_Ω(λ̄), μ = 0.
         monitor: Called after each step.
 
     Returns:
@@ -162,25 +167,28 @@ def smalse(
     b, coarse, norm, rho = homogenised.b, qp.coarse, qp.norm, parameters.rho * qp.norm
     A, steps = PenalisedOperator(qp.F, coarse, rho, b), Steps()
     test = InnerTest(qp, homogenised, rule, parameters)
-    # x = P_Ω(0), or that of a given λ − λ̄; g = Ax − b + y
-    x, g, y, Qx = (b.duplicate() for _ in range(4))
+    # λ = P_Ω(λ̄), or that of a start; x = λ − λ̄; g = Ax − b + y
+    lam, x, g, y, Qx = (b.duplicate() for _ in range(5))
     if start is not None:
-        start.lam.copy(x)
-        x.axpy(-1.0, homogenised.lam_bar)
         coarse.combine(start.mu, y)
-    x.array[:] = homogenised.feasible.project(x.array_r)
+    begin = homogenised.lam_bar if start is None else start.lam
+    lam.array[:] = qp.feasible.project(begin.array_r)
+    lam.copy(x)
+    x.axpy(-1.0, homogenised.lam_bar)
     if x.norm() > 0.0:
         A.mult(x, g)
     g.axpy(-1.0, b)
     g.axpy(1.0, y)
-    state, inner = MprgpIterate(A, x, g, homogenised.feasible), parameters.inner(norm)
+    state, inner = MprgpIterate(A, lam, g, qp.feasible), parameters.inner(norm)
     reason = ConvergedReason.ITERATING
     while reason == ConvergedReason.ITERATING:
         # Step 1: x with ‖g^P(x, μ)‖ ≤ min(M‖Bx‖, η)
         broken = mprgp(state, inner, test, steps, max_it, monitor)
         # Step 2: test
+        lam.copy(x)
+        x.axpy(-1.0, homogenised.lam_bar)
         coarse.apply_Q(x, Qx)
-        monitor(steps, "outer", x, state.projected_gradient, Qx.norm())
+        monitor(steps, "outer", lam, state.projected_gradient, Qx.norm())
         indefinite = broken == ConvergedReason.DIVERGED_INDEFINITE_MAT  # or rounding
         if indefinite and homogenised.is_rounding(test.examine(state)):
             broken = ConvergedReason.DIVERGED_ROUNDING
@@ -188,9 +196,10 @@ def smalse(
         if reason != ConvergedReason.ITERATING:
             break
         if rule.drifted:
-            y.copy(Qx)
-            Qx.axpy(-1.0, b)
-            state.refresh(Qx)
+            A.mult(x, g)
+            g.axpy(-1.0, b)
+            g.axpy(1.0, y)
+            state.split()
             rule.drifted = False
             continue
         # Step 4 needs L(x, μ) = ½xᵀAx − bᵀx + yᵀx before the update, g = Ax − b + y
@@ -207,9 +216,9 @@ def smalse(
             reason = ConvergedReason.DIVERGED_STALLED
         elif steps.outer >= max_it:
             reason = ConvergedReason.DIVERGED_ITS
-    x.array[:] = homogenised.feasible.project(x.array_r)  # rounding may leave it off its bounds
+    lam.array[:] = qp.feasible.project(lam.array_r)  # rounding may leave it off its bounds
     result = QPResult(
-        lam=x,
+        lam=lam,
         mu=coarse.coordinates(y),
         gradient=g,
         face=state.face(),
@@ -220,7 +229,6 @@ def smalse(
         norm=norm,
         steps=steps,
     )
-    x.axpy(1.0, homogenised.lam_bar)
-    for item in (A, state, y, Qx):
+    for item in (A, state, x, y, Qx):
         item.destroy()
     return result

@@ -138,7 +138,7 @@ def solve_dual(
     begin = _start(start, qp)
     homogenised = _homogenise(dual, qp, solver, begin)
     if monitor is None:
-        monitor = _monitor(dual, homogenised, options)
+        monitor = _monitor(dual, options)
     scale = homogenised.scale
     rtol = options.number if rtol is None else rtol
     rule = Accuracy(dual, rtol, options.atol, (scale.reference, scale.rounding), qp.norm)
@@ -203,10 +203,10 @@ def _no_worse_than_nothing(qp: QP, at: OperatorProduct, start: Start) -> None:
         start.mu[:] = 0.0
 
 
-def _monitor(dual: Dual, homogenised: Homogenised, options: Options) -> Monitor:
+def _monitor(dual: Dual, options: Options) -> Monitor:
     if not options.monitor:
         return no_monitor
-    comm, feasible = dual.coarse.comm, homogenised.feasible
+    comm, feasible = dual.coarse.comm, dual.feasible
 
     def touching(x: PETSc.Vec) -> int:
         face = feasible.face(x.array_r, np.zeros(x.getLocalSize()))

@@ -27,7 +27,7 @@ from tfeti_dolfinx.forms.newmark import InertialForms, check_copies, mass_form
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.problem import ContactProblem
-from tfeti_dolfinx.qp.sets import Bounds, Discs, FeasibleSet, Product
+from tfeti_dolfinx.qp.sets import Bounds, Ellipses, FeasibleSet, Product
 from tfeti_dolfinx.solution import SavedState, Solution
 from tfeti_dolfinx.solve.solver import conclude, solve_dual
 from tfeti_dolfinx.subdomains.block import Counters
@@ -211,8 +211,8 @@ class Predictor:
 def _frictionless(constraints: Constraints) -> FeasibleSet:
     """λ_N ≥ 0, and no force along tangents."""
     sets = constraints.sets
-    none, width = np.zeros(len(sets.tangents)), sets.tangents.shape[1]
-    return Product([(sets.normals, Bounds()), (sets.tangents.ravel(), Discs(none, width))])
+    none = Ellipses(np.zeros(sets.tangents.shape))
+    return Product([(sets.normals, Bounds()), (sets.tangents.ravel(), none)])
 
 
 # --- Newmark's method with contact ------------------------------------------------------------
