@@ -6,7 +6,7 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.krylov import Directions, pcpg
-from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, Steps, TargetRule
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, ResidualRule, Steps
 from tfeti_dolfinx.qp.recycling import DirectionStore
 from tfeti_dolfinx.qp.sets import Product
 
@@ -35,7 +35,7 @@ def solved(qp, directions, target, most=1000):
     point.lam.set(0.0)
     point.refresh(qp)
     target *= point.g.norm()
-    reason = pcpg(qp, point, TargetRule(target), steps, most, directions=directions)
+    reason = pcpg(qp, point, ResidualRule(target), steps, most, directions=directions)
     return reason, steps.cg, point.lam.array_r.copy()
 
 

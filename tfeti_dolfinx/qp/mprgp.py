@@ -41,13 +41,7 @@ class MprgpParameters:
 
 
 class MprgpIterate:
-    """An iterate of min ½xᵀAx − bᵀx on Ω, with its gradient Ax − b and its parts.
-
-    Args:
-        A: Symmetric positive (semi)definite operator.
-        x: Starting point in Ω; updated in place.
-        g: Its gradient; updated in place.
-        feasible: The set Ω.
+    """An iterate x ∈ Ω of min ½xᵀAx − bᵀx, with its gradient g = Ax − b and its parts; in place.
 
     Attributes:
         phi: Free gradient φ.
@@ -122,12 +116,8 @@ def step_on_face(state: MprgpIterate, parameters: MprgpParameters) -> int:
     """Newton's step on the face of x, by conjugate gradients, projected back. Collective.
 
     On the face Zt is free, and the cost of P_Ω(x + Zt) is gᵀZt + ½tᵀ(ZᵀAZ + diag κ)t to second
-    order. The residual is brought down to 0.3, or as far as t stays in the face. Multiplies
-    by A once more than there are steps.
-
-    Args:
-        state: The iterate; moved if the cost falls.
-        parameters: ᾱ, and what decides.
+    order. The residual is brought down to ``reduction``, or as far as t stays in the face.
+    Multiplies by A once more than there are steps.
 
     Returns:
         The conjugate gradient steps; 0 where little of β is tangential, or the cost does not fall.
@@ -206,17 +196,6 @@ def mprgp(
     >>> mprgp(state, MprgpParameters(0.9), lambda s: s.projected_gradient <= 1e-9, steps, 100)
     >>> x.array.round(6).tolist(), steps.inner > 0
     ([3.0, 0.0], True)
-
-    Args:
-        state: The iterate; holds the solution afterwards.
-        parameters: Step length, Γ.
-        stop: Called with the iterate before each step; True ends the loop.
-        steps: Counts the steps.
-        max_it: Most steps in ``steps``.
-        monitor: Called after each step.
-
-    Returns:
-        None if ``stop`` ended the loop, else why it could not go on.
     """
     A, alpha_bar = state.A, parameters.alpha_bar
     x, g, p, Ap, phi, beta = state.x, state.g, state.p, state.Ap, state.phi, state.beta

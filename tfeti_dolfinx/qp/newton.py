@@ -58,8 +58,7 @@ def first_point(qp: QP) -> PETSc.Vec:
 def feasible_start(qp: QP, start: Start) -> PETSc.Vec:
     """Step 0: the nearest feasible point to earlier multipliers, or the first. Collective.
 
-    From forces far beyond small discs, as the bounds of another load step are, the way to Gλ = e
-    has so many kinks that the projection may end before.
+    From forces far beyond small discs the projection's way to Gλ = e may have too many kinks.
     """
     found = project_onto_feasible(qp.coarse, qp.feasible, start.lam)
     if found.missing <= UNBALANCED:
@@ -107,14 +106,7 @@ class NewtonState:
 
 
 class _Newton:
-    """Steps 1, 2 and 4, which read and change the state. All methods are collective.
-
-    Args:
-        program: The program.
-        solver: Does step 3.
-        parameters: Tolerances.
-        state: The state.
-    """
+    """Steps 1, 2 and 4, which read and change the state; the solver does step 3. Collective."""
 
     def __init__(
         self,
@@ -205,8 +197,6 @@ class _Newton:
         beta = beta - along
         phi = phi + along
         free, chopped = self.program.dot((phi, phi), (beta, beta))
-        if state.resume:  # what PCPG has left on the face, and not what ᾱ makes of μ
-            free = self.solver.left**2
         if chopped > self.parameters.gamma**2 * free:
             moved = self.feasible.project(z.lam - beta / state.norm)
             face = self.feasible.face(0.5 * (z.lam + moved), state.s)
@@ -285,7 +275,8 @@ def newton(
 
     Iterates are feasible, and q falls in each step. A step solves on a face of Ω by PCPG, drops
     what leaves Ω, all at once, and solves again on the smaller face. The numbers of the steps are
-    those of docs/theory.md; docs/developers/implementation.md has a diagram.
+    those of docs/theory.md; docs/developers/implementation.md has a diagram. It begins at λ̄, which
+    is feasible, with the μ of ``start``.
 
     ===========================  =================================================================
     reason                       when
@@ -309,18 +300,6 @@ def newton(
     >>> result = newton(qp, start, ResidualRule(1e-10))
     >>> result.reason.name, result.lam.array.round(6).tolist()
     ('CONVERGED_RTOL', [0.6, 0.0, 0.4])
-
-    Args:
-        qp: The program; ``preconditioner_on`` makes preconditioners of faces.
-        homogenised: Its homogenised form, whose λ̄ is feasible: the start.
-        rule: Says when ‖g^P‖ is small enough.
-        parameters: Γ, what inner solves reduce, tolerances.
-        max_it: Most conjugate gradient steps, and most faces.
-        start: Its μ, where the start may be optimal.
-        monitor: Called after each step.
-
-    Returns:
-        The multipliers, their gradient s, the reason and the residuals.
     """
     steps, program = Steps(), LocalProgram(qp)
     solver = FaceSolver(program, rule, parameters, steps, max_it, monitor)

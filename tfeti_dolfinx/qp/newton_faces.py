@@ -11,7 +11,7 @@ from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.common.parallel import any_rank, largest
-from tfeti_dolfinx.qp.coarse import HELD, Coarse, imbalance
+from tfeti_dolfinx.qp.coarse import HELD, imbalance
 from tfeti_dolfinx.qp.krylov import Directions, pcpg
 from tfeti_dolfinx.qp.parameters import NewtonParameters
 from tfeti_dolfinx.qp.problem import (
@@ -22,9 +22,9 @@ from tfeti_dolfinx.qp.problem import (
     Monitor,
     Operator,
     Point,
+    ResidualRule,
     Steps,
     StoppingRule,
-    TargetRule,
 )
 from tfeti_dolfinx.qp.projection import WithinFace
 from tfeti_dolfinx.qp.sets import Face, without_slip
@@ -33,12 +33,7 @@ from tfeti_dolfinx.qp.sets import Face, without_slip
 
 
 class CurvedHessian:
-    """Hessian F + Z diag(κ) Zᵀ of q along a curved face, to second order.
-
-    Args:
-        F: The operator.
-        face: The face.
-    """
+    """Hessian F + Z diag(κ) Zᵀ of q along a curved face, to second order."""
 
     def __init__(self, F: Operator, face: Face) -> None:
         self._F, self._face = F, face
@@ -56,17 +51,8 @@ class CurvedHessian:
 class FaceSolver:
     """PCPG on faces; keeps projectors, preconditioner and directions while the face stays.
 
-    Args:
-        program: The program on all rows.
-        rule: Its tolerance bounds the target of each solve.
-        parameters: Tolerances.
-        steps: Counts.
-        max_it: Most conjugate gradient steps.
-        monitor: Called after each.
-
     Attributes:
         directions: Those of PCPG, with an estimate of ‖F‖.
-        left: ‖P_f(Fλ − d)‖ where PCPG has stopped.
         excluding: Local rows that exclude each other, if a solve has found that; else None.
     """
 
@@ -87,7 +73,7 @@ class FaceSolver:
         self._point = Point(self._qp.d.duplicate(), self._qp.d.duplicate())
         self._face: Face | None = None
         self._on_face, self._preconditioner = self._qp, cast(FaceOperator | None, None)
-        self.left, self.excluding = np.inf, cast(Array | None, None)
+        self.excluding: Array | None = None
 
     def multipliers(self, g: Array) -> Array:
         """Return the μ of the face entered: (G_fG_fᵀ)⁺G_fZᵀg, replicated. Collective."""
@@ -144,27 +130,23 @@ class FaceSolver:
             return True
         self._leave()
         self._steps.faces += not same
-        self._set_face(face, self._qp.coarse.on_face(face))
-        return same
-
-    def _set_face(self, face: Face, coarse: Coarse) -> None:
-        curved = any_rank(self._program.comm, face.curved)
+        curved, coarse = any_rank(self._program.comm, face.curved), self._qp.coarse.on_face(face)
         F = CurvedHessian(self._qp.F, face) if curved else self._qp.F
         past = None if curved else self._qp.recycled
         self._face = face
         self._on_face = replace(self._qp, F=F, coarse=coarse, recycled=past, held=face.held)
+        return same
 
     def _restored(self, end: DualIterate) -> DualIterate:
         """Enter the face of P_Ω(λ), and return its point next to that with Gλ = e.
 
         Where that face holds a body no longer, the nearest feasible point names rows that do:
         within the face before, so that faces shrink and steps end, or if there is none, in Ω.
-        Multiplies by F once.
         """
         qp, program, before = self._qp, self._program, self._face
         assert before is not None
-        on = qp.feasible.project(end.lam)
-        self._enter(qp.feasible.face(on, end.g))
+        on, s = qp.feasible.project(end.lam), end.g - program.normal(self.multipliers(end.g))
+        self._enter(qp.feasible.face(on, s))
         coarse = self._on_face.coarse
         coarse.combine(coarse.solve(qp.coarse.residual(program.vec(on))), self._point.lam)
         lam = on + self._point.lam.array_r
@@ -173,13 +155,8 @@ class FaceSolver:
             if missing > HELD:
                 lam, *_ = program.projected(on)
             on = 0.5 * (on + lam)
-            self._enter(qp.feasible.face(on, end.g))
-        z = program.refreshed(lam)
-        if self._curved and self._face is not None:
-            s = z.g - program.normal(self.multipliers(z.g))
-            curvature = qp.feasible.face(on, s).curvature
-            self._set_face(replace(self._face, curvature=curvature), self._on_face.coarse)
-        return z
+            self._enter(qp.feasible.face(on, s))
+        return program.refreshed(lam)
 
     def _has_left(self, z: DualIterate) -> bool:
         """Return whether rows that do not slip are outside of Ω."""
@@ -198,8 +175,8 @@ class FaceSolver:
     def _along_null_space(self, z: DualIterate) -> DualIterate:
         """Go beyond a bound along a direction without curvature, where PCPG has found one.
 
-        Rows depend on each other. Where no bound ends the way, neither F nor G sees it and q falls
-        along it, they want gaps that exclude each other: ``excluding`` says so.
+        Where no bound ends the way, neither F nor G sees it and q falls along it, rows that depend
+        on each other want gaps that exclude each other: ``excluding`` says so.
         """
         program, own, qp, given = self._program, self.directions, self._qp, self._parameters
         for vec in (own.p, own.r):
@@ -236,7 +213,7 @@ class FaceSolver:
         point = Point(self._qp.d.duplicate(), self._qp.d.duplicate())
         point.g.array[:] = -Fw
         (square,) = program.dot((way, way))
-        exact = TargetRule(given.unseen * self.directions.norm * float(np.sqrt(square)))
+        exact = ResidualRule(given.unseen * self.directions.norm * float(np.sqrt(square)))
         on_face = replace(on_face, d=-point.g, recycled=None)
         pcpg(on_face, point, exact, Steps(), given.purifying, directions=own)
         way, Fw = way - point.lam.array_r, -np.array(point.g.array_r)
@@ -256,11 +233,9 @@ class FaceSolver:
         on_face.coarse.project(z_residual)
         share = self._parameters.stage if resume else self._parameters.reduction
         target = share * min(float(z_residual.norm()), optimality)
-        rule = TargetRule(max(target, self._parameters.final * self._rule.aim))
+        rule = ResidualRule(max(target, self._parameters.final * self._rule.aim))
         norm = own.norm
         reason = pcpg(on_face, self._point, rule, self._steps, self._max_it, self._monitor, own)
-        (square,) = self._program.dot((own.r.array_r, own.r.array_r))
-        self.left = float(np.sqrt(square))
         lam, g = np.array(self._point.lam.array_r), np.array(self._point.g.array_r)
         if isinstance(on_face.F, CurvedHessian):
             g -= on_face.F.bend(lam - z.lam)

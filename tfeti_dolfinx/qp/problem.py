@@ -330,29 +330,14 @@ class StoppingRule(Protocol):
 
 
 class ResidualRule:
-    """Stopping rule by residuals alone, for programs without a displacement.
+    """Stopping rule by residuals alone, for parts of a solve and programs without a displacement.
 
     Args:
         tolerance: What residuals must come down to.
     """
 
     def __init__(self, tolerance: float) -> None:
-        self.tolerance, self.drifted, self.norm = tolerance, False, 1.0
-
-    @property
-    def aim(self) -> float:
-        """The tolerance."""
-        return self.tolerance
-
-    def examine(
-        self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float
-    ) -> ConvergedReason:
-        """Content."""
-        return ConvergedReason.CONVERGED_RTOL
-
-
-class TargetRule(ResidualRule):
-    """Stopping rule by a given residual, for a part of a solve."""
+        self.tolerance, self.drifted, self.norm, self.aim = tolerance, False, 1.0, tolerance
 
     def examine(
         self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float

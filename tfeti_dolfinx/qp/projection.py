@@ -96,7 +96,8 @@ def project_onto_feasible(
     It is λ(α) = P_Ω(y + Gᵀα) with Gλ(α) = e. That is where the convex function
     ½‖z‖² − ½‖z − P_Ω(z)‖² − αᵀe of z = y + Gᵀα is least, which a semismooth Newton method with a
     line search finds: each step factors G_f G_fᵀ, f the face of λ(α). Where nothing in Ω fulfils
-    Gλ = e, the cost falls without end along steps that no row stops; a few of them end it.
+    Gλ = e, the cost falls without end along steps that no row stops; a few of them end it, and
+    ``missing`` says so.
 
     >>> import numpy as np
     >>> from petsc4py import PETSc
@@ -106,16 +107,6 @@ def project_onto_feasible(
     >>> coarse = DenseCoarse(np.ones((1, 2)), np.ones(1))
     >>> project_onto_feasible(coarse, Bounds(), y).lam.array.tolist()
     [1.0, 0.0]
-
-    Args:
-        coarse: Gλ = e on all rows.
-        feasible: The set Ω.
-        y: Any point.
-        parameters: Parameters.
-
-    Returns:
-        The point; where nothing in Ω fulfils Gλ = e, or α does not converge, it misses some of e:
-        ``missing`` says so.
     """
     comm = y.getComm().tompi4py()
     trial = _trial(coarse, feasible, y, np.zeros(coarse.dimension))
@@ -149,11 +140,8 @@ def project_onto_feasible(
 class WithinFace:
     """Points of Ω whose open rows are those of a face, at least.
 
-    Args:
-        feasible: The set Ω.
-        face: The face.
-        slipping: Whether its slipping rows stay on their boundary, too. They do not make a convex
-            set then, but what ``project_onto_feasible`` minimises is convex with any set.
+    With ``slipping`` its slipping rows stay on their boundary, too. They do not make a convex set
+    then, but what ``project_onto_feasible`` minimises is convex with any set.
     """
 
     def __init__(self, feasible: FeasibleSet, face: Face, slipping: bool = False) -> None:
@@ -210,11 +198,9 @@ def _searched(
 ) -> tuple[_Trial, float, int]:
     """Halve the step until it does not raise the cost; destroys the start.
 
-    Where the cost still falls at the end of a step, it fell along all of it: it is convex. That
-    holds where rounding hides the cost's difference.
-
-    Returns:
-        The point, the step's length and how many were tried.
+    Where the cost still falls at the end of a step, it fell along all of it, as it is convex: that
+    tells where rounding hides its difference. Returns the point, the length and how many were
+    tried.
     """
     comm, length, tried = y.getComm().tompi4py(), 1.0, 0
     while True:

@@ -32,12 +32,7 @@ class RecyclingParameters:
 class DirectionStore:
     """Directions p of energy pᵀFp = 1 and their images, as rows; this rank's part.
 
-    Args:
-        capacity: Most directions; where they are more the oldest goes.
-        size: Rows of this rank.
-
-    Attributes:
-        count: Number of directions.
+    Of more than ``capacity`` directions the oldest goes; ``count`` is their number.
     """
 
     def __init__(self, capacity: int, size: int) -> None:
@@ -74,12 +69,8 @@ class Recycled(DirectionStore):
     """F-orthonormal search directions W of earlier solves, and their images FW.
 
     Farhat, Crivelli, Roux, Comput. Methods Appl. Mech. Engrg. 117 (1994) 195–209: solves with
-    other right sides begin with the best of what is known, and go F-orthogonally to it.
-
-    Args:
-        capacity: Most directions; each takes two vectors, and two more while it is new.
-        comm: Communicator.
-        parameters: Tolerances.
+    other right sides begin with the best of what is known, and go F-orthogonally to it. Each takes
+    two vectors, and two more while it is new.
     """
 
     def __init__(
@@ -97,14 +88,9 @@ class Recycled(DirectionStore):
         return self.directions.T, self.images.T
 
     def add(self, x: Array, Fx: Array, energy: float) -> None:
-        """Store a direction, made F-orthonormal to those stored. Collective, three reductions.
+        """Store x with Fx and xᵀFx > 0, made F-orthonormal to those stored. Collective.
 
-        Where images are no longer right, all that was kept is forgotten.
-
-        Args:
-            x: The direction, this rank's part.
-            Fx: What F makes of it.
-            energy: xᵀFx > 0, over all ranks.
+        Where images are no longer right, all that was kept is forgotten. Three reductions.
         """
         x, Fx = x / np.sqrt(energy), Fx / np.sqrt(energy)
         self._set_size(len(x))
@@ -161,12 +147,9 @@ class Recycled(DirectionStore):
             self.put(w, Fw)
 
     def without(self, values: Array) -> Array:
-        """Orthonormal N so that values N = 0, for values of W's columns, shape ``(count, k)``.
+        """Orthonormal N so that values N = 0, for values linear in the columns of W. Collective.
 
-        Collective.
-
-        Args:
-            values: Linear in the columns of W, this rank's part, shape ``(l, count)``.
+        ``values`` is this rank's part, shape ``(l, count)``; N has the shape ``(count, k)``.
         """
         _, sizes, Vt = np.linalg.svd(triangle(self.comm, values))
         squares = summed(self.comm, np.sum(self.directions**2, axis=1))
@@ -177,12 +160,8 @@ class Recycled(DirectionStore):
 class RecycledOnFace:
     """Directions of earlier solves that lie in a face. Creation and all methods are collective.
 
-    Args:
-        known: All directions; they must stay as they are meanwhile.
-        held: Flags of the local rows that are 0 on the face; None: no rows.
-
-    Attributes:
-        count: Number of directions.
+    ``held`` are flags of the local rows that are 0 on the face; None: no rows. ``known`` must stay
+    as it is meanwhile; ``count`` is the number of directions.
     """
 
     def __init__(self, known: Recycled, held: Array | None = None) -> None:

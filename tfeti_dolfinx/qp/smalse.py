@@ -22,14 +22,7 @@ from tfeti_dolfinx.qp.problem import (
 
 
 class PenalisedOperator:
-    """A = P F P + ρ Q.
-
-    Args:
-        F: The dual operator.
-        coarse: Its projectors.
-        rho: Penalty ρ.
-        like: A vector of the right layout.
-    """
+    """A = P F P + ρ Q."""
 
     def __init__(self, F: Operator, coarse: Coarse, rho: float, like: PETSc.Vec) -> None:
         self.F, self.coarse, self.rho = F, coarse, rho
@@ -53,12 +46,6 @@ class PenalisedOperator:
 
 class InnerTest:
     """Ends the inner loop where the rule is content, or x is exact enough for an outer step.
-
-    Args:
-        qp: The program.
-        homogenised: Its homogenised form.
-        rule: The stopping rule.
-        parameters: Parameters.
 
     Attributes:
         M: Weighs the projected gradient against ‖Bx‖.
@@ -127,7 +114,8 @@ def smalse(
 
     Dostál, Optimal Quadratic Programming Algorithms, Springer 2009, chapter 6 (SMALBE-M);
     Dostál, Kozubek, Math. Program. 135 (2012) 195–220. Step numbers are those of the talk.
-    B is an orthonormalised G, so that ‖Bx‖ = ‖Qx‖; Bᵀμ = y is kept instead of μ.
+    B is an orthonormalised G, so that ‖Bx‖ = ‖Qx‖; Bᵀμ = y is kept instead of μ. Preconditioners
+    are not used. Without a start it begins at P_Ω(λ̄) with μ = 0.
 
     ===========================  =================================================================
     reason                       when
@@ -151,18 +139,6 @@ def smalse(
     >>> result = smalse(qp, homogenise(qp), ResidualRule(1e-10))
     >>> result.reason.name, result.lam.array.round(6).tolist()
     ('CONVERGED_RTOL', [0.6, 0.0, 0.4])
-
-    Args:
-        qp: The program; parameters are relative to its norm, its preconditioners are not used.
-        homogenised: Its homogenised form.
-        rule: Says when ‖g^P‖ and ‖F‖‖Qx‖ are small enough; asked in the inner loop too.
-        parameters: ρ, M, β, η, Γ, ᾱ.
-        max_it: Most inner steps, and most outer ones.
-        start: Where to start; default P_Ω(λ̄), μ = 0.
-        monitor: Called after each step.
-
-    Returns:
-        The multipliers, their gradient, the reason and the residuals.
     """
     b, coarse, norm, rho = homogenised.b, qp.coarse, qp.norm, parameters.rho * qp.norm
     A, steps = PenalisedOperator(qp.F, coarse, rho, b), Steps()

@@ -467,14 +467,9 @@ class NewtonOnLaw:
         self.steps, self._share = self.steps + steps, parameters.finer * self._share
         self._tries -= 1
         local.destroy()
+        image.destroy()
         if end is None:
             self._tries, dual.recycled = 0, self._recycled
-            image.destroy()
             return None
         bounds.take(end.lam)
-        # F of the end stands for that of the nearest point of its set, where the problem begins
-        qp.coarse.combine(end.mu, work)
-        Fx = end.s + work.array_r + qp.d.array_r
-        dual.last.pass_on(end.lam, Fx, parameters.newton.unseen * target / norm)
-        image.destroy()
         return end.lam, end.mu
