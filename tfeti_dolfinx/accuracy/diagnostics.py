@@ -54,12 +54,7 @@ LIMITS = WarningLimits()
 class Diagnostics:
     """Diagnostics of solutions beyond residuals; a solution seen before is not examined again.
 
-    Args:
-        decomposition: The torn mesh.
-        dofs: Dof maps.
-
-    Attributes:
-        finite: Whether kinematics are not linear, so that bodies may turn.
+    With ``finite`` kinematics are not linear, so that bodies may turn.
     """
 
     def __init__(self, decomposition: Decomposition, dofs: TornDofs) -> None:
@@ -69,14 +64,7 @@ class Diagnostics:
         self._lasting: list[str] = []
 
     def found(self, dual: Dual, solution: Solution, outcome: Outcome, rtol: float) -> list[str]:
-        """Sentences, each of which names the thing. Collective.
-
-        Args:
-            dual: The dual problem.
-            solution: What was found.
-            outcome: What is known already.
-            rtol: The relative tolerance that was asked for.
-        """
+        """Sentences beside the ``outcome``, each of which names the thing. Collective."""
         if self._of is not dual:
             lasting = (self._cells(), self._locking(dual.subdomains), self._hinges())
             self._lasting, self._of = [text for texts in lasting for text in texts], dual
@@ -227,12 +215,7 @@ class Diagnostics:
 
 
 def with_estimates(report: Report, numbers: dict[str, float]) -> Report:
-    """Return a report with estimates made since, and a warning where they say nothing.
-
-    Args:
-        report: That of the solve.
-        numbers: What ``Estimates.numbers`` gives.
-    """
+    """Return a report with estimates made since, and a warning where they say nothing."""
     kept = [text for text in report.warnings if not text.startswith(ESTIMATES)]
     report = replace(report, estimates=numbers)
     return replace(report, warnings=[*kept, *_of_estimates(report)])

@@ -67,11 +67,7 @@ class Estimates:
 
 
 def estimate(system: System, solution: Solution) -> Estimates:
-    """Estimate the errors of a solution. Collective.
-
-    Args:
-        system: What the solution was found with.
-        solution: The last solution.
+    """Estimate the errors of the last solution. Collective.
 
     Raises:
         InputError: The rows are no longer those of the solution.
@@ -107,14 +103,7 @@ def estimate(system: System, solution: Solution) -> Estimates:
 def goal_of(
     stress: Stress, dofs: TornDofs, decomposition: Decomposition, thickness: Any
 ) -> ErrorTarget:
-    """From displacements in primal order to the estimate of their discretisation error. Collective.
-
-    Args:
-        stress: UFL stress of a displacement.
-        dofs: Dof maps.
-        decomposition: The torn mesh.
-        thickness: What areas of the mesh are multiplied with.
-    """
+    """From displacements in primal order to their discretisation error. Collective."""
     u = fem.Function(dofs.V)
     recovery = StressRecovery(u, checked_stress(stress, u), dofs, decomposition, thickness)
 

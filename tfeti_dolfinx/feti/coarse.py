@@ -160,11 +160,7 @@ class FaceProjectors(Coarse):
     """P and Q on a face of the rows: G_f = GZ, vectors in the layout of all rows.
 
     A face that leaves motions free that all rows hold has a G_f without full rank: harmless for
-    P and Q, since what the factor makes of such a motion G_fᵀ does not see.
-
-    Args:
-        whole: The coarse space of all rows.
-        face: The face. The constructor is collective.
+    P and Q, since what the factor makes of such a motion G_fᵀ does not see. Creation is collective.
     """
 
     def __init__(self, whole: CoarseSpace, face: Face) -> None:
@@ -173,7 +169,7 @@ class FaceProjectors(Coarse):
         self.factor = whole.factors.factor(whole.grams.of_face(face))
 
     def restricted(self, x: Array) -> Array:
-        """ZZᵀ x."""
+        """ZZᵀx."""
         return self._face.restricted(x)
 
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
@@ -188,8 +184,8 @@ class FaceProjectors(Coarse):
 def _without_rounding(J: Any) -> csr_array:
     """Return the same rows without entries that are only rounding.
 
-    Rounding of points far from the origin is more than that of motions, but all rows that do not
-    only glue act on translations with about their size.
+    Points far from the origin have more of it than motions, but all rows that do not only glue act
+    on translations with about their size.
     """
     J = csr_array(J)
     largest = abs(J).max(axis=1).toarray().ravel()

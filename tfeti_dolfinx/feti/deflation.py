@@ -66,19 +66,13 @@ class Deflation(Protocol):
 
 
 class SoftModes:
-    """Ĝ of the motions that springs hold more softly than rows would.
+    """Ĝ of the motions that springs hold more softly than rows would. Creation is collective.
 
     Such are those with R̂ᵀKR̂ < σ‖Ĝᵀ‖², σ the mean stiffness of a scaled row. They make eigenvalues
     of M_f F up to about 1 and the largest one of D⁻¹ĜM_fĜᵀ: where that is small M_f is better
     alone, and none of them is taken; some would be worse than all or none. Where every subdomain
-    has all its rigid motions in the kernel there are none, and nothing is multiplied.
-
-    Args:
-        B: Dual rows × trace unknowns.
-        coarse: The natural coarse space. The constructor is collective.
-        weights: D of the rows, on this rank's trace unknowns.
-        preconditioner: That of all rows; three multiplications where springs may be soft.
-        prefix: Prefix of the factors' PETSc options.
+    has all its rigid motions in the kernel there are none, and nothing is multiplied; else M_f is
+    three times.
 
     Attributes:
         count: Number of soft motions of all subdomains.
@@ -117,12 +111,7 @@ class SoftModes:
         self._grams = Grams(self._Gt, contact, self._comm)
 
     def balanced(self, face: Face, on_face: FaceOperator) -> FaceOperator:
-        """An approximate inverse of F on a face; M_f itself where nothing is soft. Collective.
-
-        Args:
-            face: The face.
-            on_face: M_f, which is taken over.
-        """
+        """An approximate inverse of F on a face; M_f itself where nothing is soft. Collective."""
         if self._grams is None:
             return on_face
         gram = csr_array(self._grams.of_face(face) + self._damping)
@@ -167,13 +156,7 @@ class _Springs:
 
 
 def _stands_out(M: DualOperator, Gt: csr_array, x: PETSc.Vec) -> bool:
-    """Return whether ĜMĜᵀ has a large eigenvalue, by the power method. Collective.
-
-    Args:
-        M: The preconditioner on all rows.
-        Gt: This rank's rows of Ĝᵀ, of motions of energy 1.
-        x: A vector of rows, which is freed.
-    """
+    """Return whether ĜMĜᵀ, of motions of energy 1, has a large eigenvalue. Frees x. Collective."""
     comm, y = x.getComm().tompi4py(), x.duplicate()
     v, size = np.random.default_rng(0).standard_normal(Gt.shape[1]), 0.0
     for _ in range(PARAMETERS.steps):

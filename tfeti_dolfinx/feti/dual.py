@@ -265,10 +265,7 @@ class Dual:
         )
 
     def saw(self, norm: float) -> None:
-        """Store the estimate of ‖F‖ of a solve, for the next one to begin with.
-
-        Of its start alone it might see far less, and take its multipliers for less exact.
-        """
+        """Store the estimate of ‖F‖ of a solve, for the next one, whose start may see far less."""
         self.seen = max(self.seen, norm)
 
     @property
@@ -319,10 +316,6 @@ class Dual:
         Forces and lengths both are: λ beside the least that balances the load; Fλ and Gᵀμ beside
         what drives the problem. The solution would be their small difference, with their rounding.
         Multiplies by F at most once, and not where λ is the last solution.
-
-        Args:
-            lam: λ on this rank's rows.
-            mu: Multipliers of Gλ = e.
         """
         comm, coarse, x = self.coarse.comm, self.coarse, self.d.duplicate()
         coarse.particular(x)
@@ -347,22 +340,11 @@ class Dual:
         return self._image[1]
 
     def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> Recovered:
-        """Return the displacement of multipliers; changes nothing.
-
-        Args:
-            lam: The multipliers λ.
-            gradient: Fλ − d up to the range of Gᵀ; on open rows the multiplier ν.
-            face: The face of λ: which rows carry a force.
-            error: How large multipliers may be by the solver's error alone.
-        """
+        """Return the displacement of multipliers, as ``recover`` of ``feti/recovery.py`` does."""
         return recover(self.constraints, self.coarse, lam.array_r, gradient.array_r, face, error)
 
     def nearly_free(self, active: Array) -> list[dict[str, object]]:
-        """List motions that contact rows with a force hold hardly or not, see ``listed``.
-
-        Args:
-            active: Flags of these rows, as ``Recovered`` has them.
-        """
+        """List motions that ``active`` contact rows hold hardly or not, see ``listed``."""
         motions = self.coarse.unresisted(active, below=LIMITS.nearly)
         return bcast_from_root(self.coarse.comm, listed(motions, self.coarse.bodies, *self._names))
 

@@ -40,7 +40,7 @@ class EnergyBound:
 def energy_bound(
     dual: Dual, lam: PETSc.Vec, u: Array, norm: float, balanced: float = 1e-12
 ) -> EnergyBound:
-    """Bound the algebraic error of a displacement that belongs to multipliers. Collective.
+    """Bound the algebraic error of the displacement u of λ ∈ Ω. Collective.
 
     With K u = f − Bᵀλ, λ ∈ Ω, and any admissible v
 
@@ -77,16 +77,10 @@ def admissible(
 
     1. Equality rows are closed, and those of contact where λ + (Bu − c)/‖F‖ is in Ω: where a force
        is large beside what its row misses. The least δ in D does so.
-    2. Others may open, or slip. Where they overlap then, they are closed, too.
-    3. Contact loses max μᵀq − λᵀq, μ ∈ Ω, by q = Bv − c; the maximum is at P_Ω(λ + tq), t large.
-
-    Args:
-        dual: The dual problem.
-        lam: The multipliers λ ∈ Ω, shape ``(m,)``.
-        u: Their displacement, shape ``(n,)``.
-        norm: ‖F‖, or an estimate; 0 where there is none.
-        passes: Rounds in which rows that have come to overlap are closed, too; then all are.
-        far: Of the forces: the step from λ along a gap or a slip that ends where Ω ends.
+    2. Others may open, or slip. Where they overlap then, they are closed, too; after ``passes``
+       rounds all are.
+    3. Contact loses max μᵀq − λᵀq, μ ∈ Ω, by q = Bv − c; the maximum is at P_Ω(λ + tq), t ``far``
+       beside the forces.
 
     Returns:
         δ on this rank's trace unknowns; this rank's part of what contact loses, and of what closed

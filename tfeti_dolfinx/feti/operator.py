@@ -26,9 +26,6 @@ from tfeti_dolfinx.subdomains.subdomains import Subdomains
 def near_stiffness(blocks: Sequence[SparseBlock]) -> tuple[csr_array, Array]:
     """K between the trace unknowns of each subdomain and those that share a cell with them.
 
-    Args:
-        blocks: This rank's Blocks.
-
     Returns:
         K of shape ``(t + t_n,) * 2``: on the t trace unknowns of this rank, as ``Subdomains`` has
         them, and after them on the t_n ones next to them; there the mean of the diagonal of K at
@@ -140,12 +137,9 @@ def dual_operator(B: PETSc.Mat, subdomains: Subdomains) -> DualOperator:
 def scaled_rows(B: PETSc.Mat, weights: Array) -> PETSc.Mat:
     """B_D = B D⁻¹, (B D⁻¹ Bᵀ)⁻¹ B D⁻¹ for rows that are orthonormal in D⁻¹. Collective.
 
-    With D the stiffness, preconditioners built on B_D bear jumps of stiffness between subdomains
-    (Klawonn, Widlund, Comm. Pure Appl. Math. 54, 2001, section 4).
-
-    Args:
-        B: Dual rows × trace unknowns.
-        weights: D on this rank's trace unknowns.
+    With D the stiffness, the weights on this rank's trace unknowns, preconditioners built on B_D
+    bear jumps of stiffness between subdomains (Klawonn, Widlund, Comm. Pure Appl. Math. 54, 2001,
+    section 4).
     """
     scaled, inverse = B.copy(), B.createVecRight()
     inverse.array[:] = 1.0 / weights
@@ -164,11 +158,7 @@ def dirichlet_preconditioner(
 ) -> DualOperator:
     """B S Bᵀ (Farhat, Mandel, Roux 1994), B or rather B_D; with a metric if sparse. Collective.
 
-    Args:
-        B: B_D.
-        subdomains: This rank's Blocks.
-        volume: (λ + 2μ)/μ, 20 of ν = 0.474, from which on what is inside has to follow where a
-            trace moves.
+    From (λ + 2μ)/μ of ``volume`` on, 20 of ν = 0.474, what is inside has to follow a trace.
     """
     sparse = [block for block in subdomains.blocks if isinstance(block, SparseBlock)]
     metric, comm = None, subdomains.comm

@@ -161,13 +161,8 @@ class FacePreconditioner:
 class _OnFace:
     """M_f between vectors of a face, which have the layout of all rows.
 
-    Args:
-        on_all: What all faces share.
-        face: The face.
-        Z_C: Its directions of contact rows.
-        bent: κσ of them.
-        size: σ of them.
-        factor: That of W_C + κσ; None where W_C is the identity.
+    Z_C are its directions of contact rows, ``bent`` and ``size`` κσ and σ of them, and ``factor``
+    that of W_C + κσ; None where W_C is the identity.
     """
 
     def __init__(
@@ -186,10 +181,7 @@ class _OnFace:
         self._moves, self._sizes = bent[bends], size[bends]
 
     def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = M_f x. Collective.
-
-        Displacements are those of the trace, of what is next to it, and of springs.
-        """
+        """y = M_f x: displacements of the trace, of what is next to it, of springs. Collective."""
         on, springs, moves, sizes = self._on_all, self._springs, self._moves, self._sizes
         B, w, D = on.whole.B, on.work, on.weights
         trace, size = w.getLocalSize(), len(D)
@@ -307,16 +299,7 @@ def _largest_eigenvalue(apply: Callable[[Array, Array], None], weights: Array) -
 
 
 def chebyshev(count: int, low: float, high: float) -> list[tuple[float, float]]:
-    """Return coefficients of Chebyshev steps d ← a d + b r, u ← u + d, for an interval.
-
-    Args:
-        count: Their number, at least 1.
-        low: Lower end of the interval, positive.
-        high: Upper end.
-
-    Returns:
-        a and b of each.
-    """
+    """Return a and b of ``count`` Chebyshev steps d ← a d + b r, u ← u + d, for an interval."""
     middle, half = 0.5 * (high + low), 0.5 * (high - low)
     rho = half / middle
     steps = [(0.0, 1.0 / middle)]
@@ -344,11 +327,9 @@ def smoothed(steps: list[tuple[float, float]], apply: OfArray, u: Array) -> Arra
 
 
 class ContactFactor:
-    """Cholesky factor of a matrix of contact rows, whole on each rank; it is small and sparse.
+    """Cholesky factor of an SPD matrix of contact rows, which is taken over; whole on each rank.
 
-    Args:
-        A: Symmetric positive definite, AIJ; taken over. The constructor is collective.
-        prefix: Prefix of the factor's PETSc options.
+    It is small and sparse. Creation is collective.
 
     Raises:
         FactorError: It could not be made.

@@ -23,15 +23,8 @@ class Grams:
     """GGᵀ, and GZ(GZ)ᵀ of faces; the part of gluing and Dirichlet rows is made once.
 
     An entry is stored for each pair of coordinates that meet in a row, so that storage grows with
-    the number of subdomains. A face costs what its contact rows cost.
-
-    Args:
-        Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
-        bounded: Local rows that some set may constrain.
-        comm: Communicator. The constructor and ``of_face`` are collective.
-
-    Attributes:
-        whole: GGᵀ, shape ``(r, r)``.
+    the number of subdomains. A face costs what its contact rows cost, ``bounded``, which some set
+    may constrain. Collective. ``whole`` is GGᵀ, shape ``(r, r)``.
     """
 
     def __init__(self, Gt: csr_array, bounded: Array, comm: MPI.Intracomm) -> None:
@@ -72,22 +65,12 @@ SHIFTS = (0.0, 1e-14, 1e-13, 1e-12)
 
 
 class SemidefiniteFactor:
-    """A⁺ of a sparse positive semidefinite A with a known null space, on each rank.
+    """A⁺ of a sparse positive semidefinite A, the same on all ranks, on each of them. Collective.
 
     S A S + E Eᵀ with a unit diagonal of S A S, E unit vectors of entries that determine the null
-    modes: an exact generalised inverse for right sides orthogonal to them. Where a pivot is lost a
-    small shift takes its place, made good by three steps of refinement: each divides the error in a
-    direction of eigenvalue σ by σ / shift.
-
-    Args:
-        A: scipy CSR, shape ``(r, r)``, the same on all ranks.
-        null: Its null space, orthonormal columns, shape ``(r, c)``.
-        comm: Communicator. The constructor is collective.
-        what: Name of A for messages.
-        prefix: Prefix of the factor's PETSc options.
-
-    Attributes:
-        comm: Communicator.
+    modes, the orthonormal columns ``null``: an exact generalised inverse for right sides orthogonal
+    to them. Where a pivot is lost a small shift takes its place, made good by three steps of
+    refinement: each divides the error in a direction of eigenvalue σ by σ / shift.
 
     Raises:
         FactorError: The factor could not be made.
@@ -160,19 +143,11 @@ def _without(null: csr_array, x: Array) -> Array:
 
 
 class ObliqueProjectors:
-    """P = Z(I − G_fᵀH⁺G(I + C)Z)Zᵀ with H = G(I + C)ZG_fᵀ, of a face and C.
+    """P = Z(I − G_fᵀH⁺G(I + C)Z)Zᵀ with H = G(I + C)ZG_fᵀ, of a face and C. Collective.
 
     λ = (I + C)u moves with u in the face: G(I + C)u = 0 for u = Pv, and P makes nothing of what
     G_fᵀ gives. With C = 0 it is the orthogonal projector of the face. H is G_fG_fᵀ and a part that
     has the same null space; scaled and pinned as in ``SemidefiniteFactor``.
-
-    Args:
-        Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
-        grams: G_f G_fᵀ of faces.
-        face: The face.
-        C: What follows what, on this rank, scipy CSR, shape ``(m_local, m_local)``.
-        null: null(Gᵀ).
-        comm: Communicator. The constructor is collective.
 
     Raises:
         FactorError: H is singular.
@@ -225,27 +200,14 @@ class ObliqueProjectors:
 
 
 class FaceFactors:
-    """Factors of the Gram matrices of faces, counted.
-
-    Args:
-        comm: Communicator.
-        null: What no row resists.
-        prefix: Prefix of the factors' PETSc options.
-
-    Attributes:
-        count: How many factors there were so far: of the whole, and of faces.
-    """
+    """Factors of the Gram matrices of faces; ``count``: how many, of the whole and of faces."""
 
     def __init__(self, comm: MPI.Intracomm, null: csr_array, prefix: str) -> None:
         self.comm, self._null, self._prefix = comm, null, prefix
         self.count: Counter[str] = Counter()
 
     def factor(self, gram: csr_array, kind: str = "face") -> SemidefiniteFactor:
-        """Return a factor of a Gram matrix. Collective.
-
-        Raises:
-            FactorError: It could not be made.
-        """
+        """Return a factor of a Gram matrix, or raise a FactorError. Collective."""
         self.count[kind] += int(gram.shape[0] > 0)
         what = f"GGᵀ of the {'coarse problem' if kind == 'whole' else 'rows of a face'}"
         return SemidefiniteFactor(gram, self._null, self.comm, what, self._prefix)

@@ -129,13 +129,14 @@ def min_norm_correction(
     Gluing and Dirichlet rows are orthonormal in D⁻¹, and orthogonal to contact rows: D⁻¹B_fᵀw
     closes them. Contact rows are not so to each other, and may depend on each other: conjugate
     gradients for least squares (Björck, Numerical Methods for Least Squares Problems, SIAM 1996,
-    section 7.4). With the usual eigenvalues of B_f D⁻¹ B_fᵀ, 0.6 to 2, they take about 15 steps.
+    section 7.4), to ``tol`` of the first gradient. With the usual eigenvalues of B_f D⁻¹ B_fᵀ, 0.6
+    to 2, they take about 15 steps.
 
     Args:
         constraints: B and D.
         w: What rows miss, zero on rows that are not asked about, shape ``(m,)``.
         closed: Flags of the local contact rows that are, in the order of ``sets.contact``.
-        tol: Of the first gradient, where steps end.
+        tol: Relative tolerance.
         max_it: Most steps.
 
     Returns:

@@ -67,11 +67,7 @@ TOLERANCES = MotionTolerances()
 
 
 def parts_of_columns(A: csr_array) -> Iterator[tuple[Array, Array, Array]]:
-    """Columns that meet in rows, these rows, and the dense matrix there; part by part.
-
-    Args:
-        A: Shape ``(n, c)``.
-    """
+    """Columns of A that meet in rows, these rows, and the dense matrix there; part by part."""
     columns = csc_array(A)
     columns.sort_indices()
     touched = csr_array(
@@ -158,11 +154,7 @@ def diagonal_blocks(A: csr_array, k: int) -> Array:
 
 
 def unsprung(shares: Array) -> Motions:
-    """Return motions that springs do not resist.
-
-    Args:
-        shares: Part of their squares that lies outside of the kernels, shape ``(bodies, k, k)``.
-    """
+    """Return motions that springs do not resist, from the shares of squares outside of kernels."""
     values, vectors = np.linalg.eigh(shares)
     sprung = vectors * (values > TOLERANCES.sprung)[:, None, :]
     # of the projector, whose directions are the modes' own where there are no springs
@@ -271,14 +263,7 @@ class Bodies:
         )
 
     def part_of(self, u: Array) -> Array:
-        """Return the bodies' motion in a displacement, by least squares over the nodes. Collective.
-
-        Args:
-            u: This rank's part of the displacement, shape ``(n,)``.
-
-        Returns:
-            Coordinates, shape ``(bodies * k,)``.
-        """
+        """Coordinates of the bodies' motion in u, by least squares over the nodes. Collective."""
         W, moments = self.frames, self._subdomains.moments(u)
         return np.asarray(np.einsum("bij,bi->bj", W, moments) / self.nodes[:, None]).ravel()
 
@@ -351,13 +336,7 @@ class KernelBasis:
         return csr_array(vstack([first, X[self.rest] - self.motions[self.rest] @ first]))
 
     def rows(self, Gt: csr_array, J: csr_array, equalities: Array) -> csr_array:
-        """Gᵀ T, what is known to be zero left out.
-
-        Args:
-            Gt: Gᵀ in the subdomains' coordinates.
-            J: The same rows on motions of bodies.
-            equalities: Flags of the rows.
-        """
+        """Gᵀ T from Gᵀ and its rows J on motions of bodies, what is known to be zero left out."""
         of_equalities = diags_array(equalities.astype(float)) @ J
         GtM = of_equalities @ self.combined.multiply(~self.unheld)
         GtM = GtM + (J - of_equalities) @ self.combined.multiply(~self.free)
@@ -369,11 +348,6 @@ def kernel_basis(bodies: Bodies, unheld: Motions, free: Motions) -> KernelBasis:
 
     The directions of each body are orthonormal in the kernel, each a combination of those before
     it: free ones, those that contact holds, those that equality rows hold.
-
-    Args:
-        bodies: The bodies.
-        unheld: Motions that neither springs nor equality rows resist.
-        free: Motions that nothing resists.
     """
     sprung = np.eye(bodies.k) - _projector(bodies.unsprung)
     # eigenvalues: free −2, held by contact −1, by equality rows 0, by springs 3
@@ -417,13 +391,7 @@ def _pins(motions: csc_array, body: Array) -> tuple[Array, csr_array]:
 
 
 def free_to_move(amounts: Array, body_names: Sequence[str], mode_names: Sequence[str]) -> str:
-    """Return a sentence about a motion.
-
-    Args:
-        amounts: How much of each mode is in it, shape ``(bodies, k)``.
-        body_names: Names of the bodies.
-        mode_names: Names of their modes.
-    """
+    """Return a sentence about a motion, from how much of each mode is in it."""
     moving, modes = _parts(amounts, mode_names)
     if len(moving) == 1:
         return f"{body_names[moving[0]]} is free to move ({modes})"

@@ -197,12 +197,6 @@ def check_solvable(
 ) -> None:
     """Raise if the load moves a body that neither contact nor friction can hold. Collective.
 
-    Args:
-        coarse: The coarse space.
-        constraints: Rows, limits and coefficients.
-        body_names: Names of the bodies.
-        mode_names: Names of their modes.
-
     Raises:
         NoSolutionError: Names the body, the motion, and what friction would have to hold.
     """
@@ -228,12 +222,7 @@ def check_solvable(
 
 
 def sliding_body(coarse: CoarseSpace, constraints: Constraints) -> int:
-    """Return a body that the load moves; -1: forces within the limits hold it. Collective.
-
-    Args:
-        coarse: The coarse space.
-        constraints: Rows, with the limits of friction.
-    """
+    """Return a body that the load moves; -1: forces within the limits hold it. Collective."""
     if not coarse.unheld.free.any():
         return -1
     scene, body = rigid_scene(coarse, constraints, cones=False), -1
@@ -246,11 +235,8 @@ def sliding_body(coarse: CoarseSpace, constraints: Constraints) -> int:
 def rigid_scene(coarse: CoarseSpace, constraints: Constraints, cones: bool) -> RigidScene | None:
     """Gather the rows of all ranks on rank 0; None on others. Collective.
 
-    Args:
-        coarse: The coarse space.
-        constraints: Rows, limits and coefficients.
-        cones: Whether Coulomb's law bounds friction by the forces of normals; else by the present
-            limits.
+    With ``cones`` Coulomb's law bounds friction by the forces of normals; else the present limits
+    do.
     """
     bodies, Z, sets = coarse.bodies, coarse.unheld.alone, constraints.sets
     body = np.repeat(np.arange(bodies.count), coarse.unheld.free.sum(axis=1))

@@ -92,9 +92,7 @@ class Law:
     def following(self, p: Array, face: Face) -> csr_array:
         """C: where points slip λ_T follows λ_N, λ_T = Cλ with the direction of p. Shape ``(m, m)``.
 
-        Args:
-            p: A point of Ω(p_N).
-            face: Its face.
+        p is a point of Ω(p_N), and ``face`` its face.
         """
         at = np.flatnonzero(np.any(face.status[self.tangents] == Status.SLIP, axis=1))
         rows, columns = self.tangents[at], self.normals[at]
@@ -176,14 +174,9 @@ def newton_on_law(
     J. Sci. Comput. 30 (2008). A step multiplies by F once for the way onto its face, if that can be
     seen, and once for each direction of its solve. It may fail: have something else to try.
 
-    Args:
-        program: The law.
-        at: Where to start.
-        target: Ends where the residual, ‖F‖ times what is missed, has come down to that.
-        parameters: Parameters.
-
     Returns:
-        Where it has ended, None if it gave up; and the steps taken.
+        Where the residual, ‖F‖ times what is missed, has come down to ``target``, None if it gave
+        up; and the steps taken.
     """
     best, idle, past = np.inf, 0, list[float]()
     for step in range(parameters.max_steps):
@@ -275,13 +268,7 @@ def follow_friction(
 
 @dataclass(frozen=True)
 class OnFace:
-    """Face of a Newton step, with what follows it.
-
-    Attributes:
-        face: The face.
-        C: What λ_T follows.
-        p: A point of the face.
-    """
+    """The face of a Newton step, its point p, and C: what follows it."""
 
     face: Face
     C: csr_array
@@ -313,13 +300,7 @@ def _solved_on_face(
 ) -> LawPoint:
     """Solve Zᵀ(Fλ − d − Gᵀμ) + κu = 0 and Gλ = e on a face, λ = λ₁ + (I + C)u. Collective.
 
-    Args:
-        program: The law.
-        on: The face.
-        at: The point before.
-        share: What is left of the residual.
-        target: Of the whole method.
-        parameters: Parameters.
+    ``share`` of the residual is left.
     """
     local = program.local
     qp, comm = local.qp, local.comm
@@ -391,7 +372,7 @@ def gcr(
         parameters: Parameters.
 
     Returns:
-        u, its image, and all directions, of which new ones, each for one multiplication, come last.
+        u, its image, and all directions; new ones, each for one multiplication, come last.
     """
     Q, Z, images = basis
     c = summed(comm, Q @ b)
@@ -424,13 +405,8 @@ def known_on(
     """Return known products Au = P(F(I + C)u + κu) from directions WN = (I + C)U of past solves.
 
     Farhat, Crivelli, Roux (``Recycled``); as Carvalho, Gratton, Lago, Vasseur, SIAM J. Sci.
-    Comput. 33 (2011) 2463–2490 begin residuals. Multiplies by nothing. Collective.
-
-    Args:
-        past: Directions W; None: there are none.
-        on: The face.
-        project: P, of shapes ``(m, q)``.
-        new: Of the largest image: what others leave of one, less is rounding.
+    Comput. 33 (2011) 2463–2490 begin residuals. What others leave of an image, less than ``new`` of
+    the largest, is rounding. Multiplies by nothing. Collective.
 
     Returns:
         AU, orthonormal, U, and FWN combined likewise, as rows, shape ``(3, k, m)``.

@@ -114,16 +114,7 @@ def solve_with_friction(
 
     Problems with given bounds, of which the last one has to give the forces again that its bounds
     are of. The next bounds are those of Newton's method on the law or, where that is off or fails,
-    the last forces: a fixed point iteration.
-
-    Args:
-        dual: The dual problem.
-        options: Options.
-        qp_type: A solver of ``SOLVERS``.
-        start: λ on this rank's rows, and the multipliers of Gλ = e, to start from.
-        monitor: Called after each step; default as options say.
-        goal: What bounds the algebraic error in energy has to come down to, too.
-        parameters: Parameters.
+    the last forces: a fixed point iteration. Arguments are those of ``solve_dual``.
 
     Returns:
         Multipliers, their displacement with its accuracy (of the last step; steps and looks are
@@ -196,11 +187,6 @@ class FrictionBounds:
 
     Without a start what touches sticks at first: that has a solution wherever any bounds have one.
 
-    Args:
-        dual: The dual problem, which gets the bounds.
-        start: Multipliers to start from.
-        parameters: Parameters.
-
     Attributes:
         now: The present ones, of each of ``constraints.pressed``; ∞: all points stick.
         body: The body on which they changed most at last, or that they do not hold; -1 before.
@@ -236,11 +222,7 @@ class FrictionBounds:
         return any_rank(self._comm, bool(np.any(np.isinf(self.now))))
 
     def hold(self) -> bool:
-        """Set the present bounds, or let all stick where they cannot hold the load, once.
-
-        Returns:
-            Whether what is set can hold it.
-        """
+        """Set the present bounds, else let all stick, once; return whether that holds the load."""
         self._dual.bound_friction(self.now)
         if self.stick or (sliding := self._dual.sliding) < 0:
             return True
@@ -263,10 +245,6 @@ class FrictionBounds:
 
         Body by body, as nodal forces of friction: beside forces elsewhere those on a light one
         would not be seen.
-
-        Args:
-            lam: The multipliers.
-            u: Their displacement, this rank's part.
         """
         values, parameters = lam.array_r, self._parameters
         driving = norm_over(self._comm, self._dual.driving) / (self._dual.seen or np.inf)
@@ -381,17 +359,7 @@ class FrictionBounds:
 
 
 class NewtonOnLaw:
-    """Newton's method on the law of a scene, tried until it fails. All methods are collective.
-
-    Args:
-        dual: The dual problem.
-        options: Options.
-        rtol: Relative tolerance.
-        parameters: Parameters.
-
-    Attributes:
-        steps: Steps so far.
-    """
+    """Newton's method on the law of a scene, tried until it fails. All methods are collective."""
 
     def __init__(
         self, dual: Dual, options: Options, rtol: float, parameters: CoulombParameters
@@ -419,13 +387,9 @@ class NewtonOnLaw:
     ) -> tuple[Array, Array] | None:
         """Find λ, on this rank's rows, and multipliers of Gλ = e for which the law holds.
 
-        Args:
-            start: Where to start; None: nothing is tried, nor where no solve has seen F yet.
-            bounds: Become those of λ.
-            aim: What residual an answer must have to be right, as far as a look has told.
-
-        Returns:
-            None where it is not tried, or fails.
+        ``bounds`` become those of λ; ``aim`` is what residual an answer must have to be right, as
+        far as a look has told. None where it fails, or is not tried: without a start, or a solve
+        that has seen F.
         """
         dual, parameters, norm = self._dual, self._parameters, self._dual.seen
         if start is None or self._tries == 0 or norm == 0.0 or bounds.stick:

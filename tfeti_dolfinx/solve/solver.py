@@ -69,10 +69,7 @@ SLIDES = (
 def resolved(options: Options, rows: Sequence[int], prefix: str) -> Options:
     """Return options with the solver, preconditioner and friction that ``auto`` stands for.
 
-    Args:
-        options: Options.
-        rows: Number of normal and of tangential rows of contacts, on all ranks.
-        prefix: Prefix of all options.
+    ``rows`` are the numbers of normal and of tangential rows of contacts, on all ranks.
 
     Raises:
         InputError: The scene has inequalities or friction, but a solver that does not keep them
@@ -226,14 +223,8 @@ def conclude(
 ) -> None:
     """Say why the solver stopped, and raise where it should have gone on.
 
-    Args:
-        result: What it returned.
-        rule: Its accuracy.
-        options: Options.
-        comm: Communicator.
-        excluding: Names of the contacts whose rows exclude each other.
-        restless: Name of the body on which bounds of friction change most, and whether it slides.
-        warnings: What is known to be hard about the scene; an error says it, too.
+    ``excluding`` are names of the contacts whose rows exclude each other, ``restless`` is the body
+    on which bounds of friction change most, and whether it slides; an error says ``warnings``, too.
 
     Raises:
         ConvergenceError: It stopped before its tolerance, unless options turn that off.
