@@ -328,7 +328,7 @@ class Dual:
         lengths = norm_over(comm, x.array_r)
         x.array[:] = lam
         at = self.last.image(self.F, x)
-        self.last.pass_on(np.array(lam), np.array(at.Fx.array_r))
+        self.last.pass_on(np.array(lam), np.array(at.Fx.array_r), 0.0)
         lengths += norm_over(comm, at.Fx.array_r)
         at.destroy()
         return lengths > LIMITS.far * norm_over(comm, self.driving)

@@ -53,7 +53,7 @@ class LastProduct:
     def __init__(self) -> None:
         nothing: Array = np.zeros(0)
         self._x, self._Fx, self._d, self._e = nothing, nothing, nothing, nothing
-        self._looked = nothing, nothing
+        self._looked, self._within = (nothing, nothing), 0.0
 
     def look(self, x: Array, g: Array) -> None:
         """Store a point of the program with Fx − d, as an assessment computes it."""
@@ -66,15 +66,15 @@ class LastProduct:
         """
         (x, g), by_mu = self._looked, qp.d.duplicate()
         qp.coarse.combine(result.mu, by_mu)
-        self._x = np.array(result.lam.array_r)
+        self._x, self._within = np.array(result.lam.array_r), 0.0
         other = any_rank(qp.d.getComm().tompi4py(), not np.array_equal(x, self._x))
         self._Fx = (result.gradient.array_r + by_mu.array_r if other else g) + qp.d.array_r
         self._d, self._e = np.array(qp.d.array_r), np.array(qp.coarse.e)
         by_mu.destroy()
 
-    def pass_on(self, x: Array, Fx: Array) -> None:
-        """Store another solver's x and Fx."""
-        self._x, self._Fx = x, Fx
+    def pass_on(self, x: Array, Fx: Array, within: float) -> None:
+        """Store another solver's x and Fx, to stand for all vectors within this distance."""
+        self._x, self._Fx, self._within = x, Fx, within
 
     def known(self, comm: MPI.Intracomm, x: Array) -> Array:
         """Return this rank's Fx, or an empty array if x is not the last solution. Collective."""
@@ -95,6 +95,8 @@ class LastProduct:
         """Return x with Fx; multiply by F only if x is not the last solution. Collective."""
         comm = x.getComm().tompi4py()
         known = self.known(comm, x.array_r)
+        if self._within > 0.0 and not any_rank(comm, x.array_r.shape != self._x.shape):
+            known = self._Fx if norm_over(comm, x.array_r - self._x) <= self._within else known
         if not any_rank(comm, known.size > 0):
             return operator_product(F, x)
         Fx = x.duplicate()

@@ -197,6 +197,8 @@ class _Newton:
         beta = beta - along
         phi = phi + along
         free, chopped = self.program.dot((phi, phi), (beta, beta))
+        if state.resume:  # what PCPG has left on the face, and not what ᾱ makes of μ
+            free = self.solver.left**2
         if chopped > self.parameters.gamma**2 * free:
             moved = self.feasible.project(z.lam - beta / state.norm)
             face = self.feasible.face(0.5 * (z.lam + moved), state.s)

@@ -53,6 +53,7 @@ class FaceSolver:
 
     Attributes:
         directions: Those of PCPG, with an estimate of ‖F‖.
+        left: ‖P_f(Fλ − d)‖ where PCPG has stopped.
         excluding: Local rows that exclude each other, if a solve has found that; else None.
     """
 
@@ -74,6 +75,7 @@ class FaceSolver:
         self._face: Face | None = None
         self._on_face, self._preconditioner = self._qp, cast(FaceOperator | None, None)
         self.excluding: Array | None = None
+        self.left = np.inf
 
     def multipliers(self, g: Array) -> Array:
         """Return the μ of the face entered: (G_fG_fᵀ)⁺G_fZᵀg, replicated. Collective."""
@@ -236,6 +238,8 @@ class FaceSolver:
         rule = ResidualRule(max(target, self._parameters.final * self._rule.aim))
         norm = own.norm
         reason = pcpg(on_face, self._point, rule, self._steps, self._max_it, self._monitor, own)
+        (square,) = self._program.dot((own.r.array_r, own.r.array_r))
+        self.left = float(np.sqrt(square))
         lam, g = np.array(self._point.lam.array_r), np.array(self._point.g.array_r)
         if isinstance(on_face.F, CurvedHessian):
             g -= on_face.F.bend(lam - z.lam)
