@@ -284,9 +284,8 @@ class Accuracy:
         self.recovered: Recovered | None = None
         self._measures: Measures | None = None
         self._before: Measures | None = None
-        # of a look with other multipliers: the first one's errors, and itself
+        # of a look with other multipliers: the first one's errors
         self._least: Array = np.zeros(1)
-        self._own: tuple[Recovered | None, Measures | None] = None, None
         self.goal: ErrorTarget | None = None
         self.reached: list[TargetStatus] = []
 
@@ -357,24 +356,11 @@ class Accuracy:
         Returns:
             Whether it is right to the tolerance with that set, too.
         """
-        self._least, self._own = self.errors(), (self.recovered, self._measures)
+        self._least = self.errors()
         self.look(lam, gradient, face, residual)
         self._before = None
-        return self._is_right()
-
-    def take(self, errors: Array) -> bool:
-        """Take known errors of bodies in the place of those of ``look_again``. Collective.
-
-        Args:
-            errors: Lengths, shape ``(bodies,)``.
-
-        Returns:
-            Whether they are within the tolerance.
-        """
-        if self._own[0] is not None:
-            self.recovered, self._measures = self._own
-        self._least = self._least + errors
-        return self._is_right()
+        ratio, longest = steering(self._dual.coarse.comm, self.ratio(), self._longest())
+        return bool(ratio <= 1.0 or longest <= self._atol)
 
     def accept_rounding(self) -> None:
         """Accept errors that rounding may explain, as no solver reduces them any further."""
@@ -456,10 +442,6 @@ class Accuracy:
         """Measures of the last look."""
         assert self._measures is not None, "nothing has been measured yet"
         return self._measures
-
-    def _is_right(self) -> bool:
-        ratio, longest = steering(self._dual.coarse.comm, self.ratio(), self._longest())
-        return bool(ratio <= 1.0 or longest <= self._atol)
 
     def _longest(self) -> float:
         """Return the longest of what rows miss, and of what closes that."""

@@ -45,8 +45,6 @@ class CoulombParameters:
             takes its place, since forces have to be known to that change.
         patience: Problems in a row whose change is not half of the least one before, and bounds do
             not come to rest.
-        slowest: The largest share of the change of bounds that is taken to be left of it in the
-            next problem.
         shortest: Of a step towards the forces found: bounds never take less of it.
         falls: Problems in a row whose forces are less than half of their bounds: these fall to 0.
         no_force: Of all multipliers: forces of normals that rounding makes of none. As bounds they
@@ -64,7 +62,6 @@ class CoulombParameters:
     beside_rtol: float = 100.0
     with_target: float = 0.1
     patience: int = 12
-    slowest: float = 0.9
     shortest: float = 0.125
     falls: int = 2
     no_force: float = 1e-13
@@ -148,12 +145,11 @@ def solve_with_friction(
             result.destroy()
             continue
         # Step 2: its forces of normals, beside those that the bounds are of
-        change = bounds.change(result.lam, rule.u)
+        change = bounds.change(result.lam)
         near = change <= parameters.near * tolerance
         # Step 3: where they are at rest, what they leave of the law
         if change <= tolerance and asked <= least:
-            fits = goal is not None or bounds.fit(result, rule)
-            if fits or (not newton.wanted and bounds.fit_soon(rule)):
+            if goal is not None or bounds.fit(result, rule):
                 break
             if not newton.wanted and (bounds.idle > 1 or iterations >= options.friction_max_it):
                 result.reason = ConvergedReason.CONVERGED_FRICTION_RTOL
@@ -163,7 +159,8 @@ def solve_with_friction(
         rtol *= parameters.share if result.steps.inner == 0 and law is None else 1.0
         start = law or (np.array(result.lam.array_r), result.mu)
         bounds.advance()
-        law = newton.solve(start, bounds)
+        # so near problems would follow the rounding of a method that has not come there itself
+        law = None if near and newton.steps == 0 else newton.solve(start, bounds)
         holds = law is not None or bounds.hold()
         if not holds or bounds.idle > parameters.patience or iterations >= options.friction_max_it:
             result.reason = ConvergedReason.DIVERGED_FRICTION
@@ -207,7 +204,7 @@ class FrictionBounds:
         self._before, self._found = self.now, self.now
         self._none, self._best, self._length = 0.0, np.inf, 1.0
         self.idle, self.body, self._falls = 0, -1, 0
-        self._solved: list[tuple[Array, Array, Array]] = []
+        self._solved: list[tuple[Array, Array]] = []
 
     def _stick(self) -> None:
         self.now, self._stuck = np.full(len(self._rows), np.inf), True
@@ -236,7 +233,7 @@ class FrictionBounds:
         self.now, self._slipped = np.zeros(len(self._rows)), True
         return True
 
-    def change(self, lam: PETSc.Vec, u: Array) -> float:
+    def change(self, lam: PETSc.Vec) -> float:
         """Store a solve's normal forces; return their relative distance from the bounds.
 
         Body by body, as nodal forces of friction: beside forces elsewhere those on a light one
@@ -246,7 +243,7 @@ class FrictionBounds:
         driving = norm_over(self._comm, self._dual.driving) / (self._dual.seen or np.inf)
         self._none = parameters.no_force * max(norm_over(self._comm, values), driving)
         self._found = self._forces(values)
-        self._solved = [*self._solved[-1:], (self.now, self._found, u)]
+        self._solved = [*self._solved[-1:], (self.now, self._found)]
         if self.stick:
             return float("inf")
         nothing = np.full(len(self._rows), self._none)
@@ -273,7 +270,7 @@ class FrictionBounds:
         """
         if len(self._solved) < 2:
             return 1.0
-        (first, of_first, _), (now, found, _) = self._solved
+        (first, of_first), (now, found) = self._solved
         if any_rank(self._comm, bool(np.any(np.isinf(first)))):  # all stuck
             return 1.0
         way, turn = now - first, (found - now) - (of_first - first)
@@ -292,26 +289,6 @@ class FrictionBounds:
         fits = rule.look_again(result.lam, result.gradient, result.face, residual)
         self._dual.bound_friction(self.now)
         return fits
-
-    def fit_soon(self, rule: Accuracy) -> bool:
-        """Return whether u is right to rtol, extrapolated from the last two problems.
-
-        Between them bounds and u have changed; so far as the forces are from the bounds yet, u is
-        from its limit by as much, and by what is left of a geometric series.
-        """
-        if len(self._solved) < 2:
-            return False
-        (first, of_first, v), (now, found, u) = self._solved
-        weight = self._mu * self._constraints.tangent_scale[self._constraints.pressed]
-        way, left, before = (
-            norm_over(self._comm, weight * x) for x in (now - first, found - now, of_first - first)
-        )
-        if not 0.0 < way < np.inf:
-            return False
-        rate = min(left / max(before, TINY), self._parameters.slowest)
-        subdomains = self._dual.subdomains
-        moved = subdomains.body_maxima([subdomains.sizes(u - v)])[0]
-        return rule.take(moved * (left / way / (1.0 - rate)))
 
     def advance(self) -> None:
         """Go towards the forces that were found, all of the way unless that has led away.
