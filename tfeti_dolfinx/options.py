@@ -202,12 +202,6 @@ FACTOR_NAMES = (
 )
 # words of switches
 YES, NO = ("", "1", "true", "yes", "on"), ("0", "false", "no", "off")
-# options that are gone, and what to do without them
-REMOVED = {
-    "stiffening": "flat cells are not stiffened; expected cells that are less flat",
-    "spectrum": "benchmarks/spectrum.py has these eigenvalues",
-    "bbt": "benchmarks/spectrum.py has these eigenvalues",
-}
 # what solvers of PETSc are chosen by, and this one by -qp_type
 TYPES = re.compile(r"(ksp|snes|tao|qp|qps|mat_solver)_type", re.IGNORECASE)
 
@@ -250,8 +244,6 @@ def factor_options(given: Mapping[str, Any] | None, prefix: str) -> dict[str, An
 
 def _expected(name: str, known: Mapping[str, Parameter], prefix: str) -> str:
     """Say what option an unknown name may be meant for; of all of them where none is near."""
-    if name in REMOVED:
-        return f"it is no option any more: {REMOVED[name]}"
     if TYPES.fullmatch(name):
         choices = ", ".join(known["qp_type"].description.choices)
         return (
