@@ -101,12 +101,11 @@ class Options:
         "auto",
         "subdomains",
         "how K⁺ and S of the subdomains are applied: through sparse factors, by a dense matrix for "
-        "each, or by one factor or matrix for all that are equal; auto takes what a model of "
-        "the costs says",
+        "each, or by one factor or matrix for all that are equal; auto counts operations",
         choices=LOCAL_TYPES,
     )
     local_multiplications: int = described(
-        50, "subdomains", "multiplications that this model expects", fits=FROM_0
+        50, "subdomains", "multiplications to expect, for that count", fits=FROM_0
     )
     clusters: int = described(
         0,
@@ -203,12 +202,6 @@ FACTOR_NAMES = (
 )
 # words of switches
 YES, NO = ("", "1", "true", "yes", "on"), ("0", "false", "no", "off")
-# options that are gone, and what to do without them
-REMOVED = {
-    "stiffening": "flat cells are not stiffened; expected cells that are less flat",
-    "spectrum": "benchmarks/spectrum.py has these eigenvalues",
-    "bbt": "benchmarks/spectrum.py has these eigenvalues",
-}
 # what solvers of PETSc are chosen by, and this one by -qp_type
 TYPES = re.compile(r"(ksp|snes|tao|qp|qps|mat_solver)_type", re.IGNORECASE)
 
@@ -251,8 +244,6 @@ def factor_options(given: Mapping[str, Any] | None, prefix: str) -> dict[str, An
 
 def _expected(name: str, known: Mapping[str, Parameter], prefix: str) -> str:
     """Say what option an unknown name may be meant for; of all of them where none is near."""
-    if name in REMOVED:
-        return f"it is no option any more: {REMOVED[name]}"
     if TYPES.fullmatch(name):
         choices = ", ".join(known["qp_type"].description.choices)
         return (
@@ -361,13 +352,7 @@ def _converted(option: Parameter, value: Any, prefix: str) -> Any:
 
 
 def _as_kind(kind: type, value: Any) -> Any:
-    """Return a value as a bool, a float, an int, text or a tuple of names.
-
-    Raises:
-        KeyError: It is no word of a switch.
-        TypeError: It is of another type.
-        ValueError: It is no such number.
-    """
+    """Convert a value; raise a KeyError, TypeError or ValueError where it does not fit."""
     if kind is bool:
         word = "" if value is None else str(value).lower()
         return {**dict.fromkeys(YES, True), **dict.fromkeys(NO, False)}[word]

@@ -25,7 +25,6 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.qp.problem import QPResult
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.coulomb import FixedPointStatus
-from tfeti_dolfinx.subdomains.local_operators import ModelledOperator
 
 # --- Records of stages ------------------------------------------------------------------------
 
@@ -158,7 +157,7 @@ class Outcome:
     sliding: int = 0  # those that slip
     recycled_directions: int = 0  # that the next solve begins with
     friction_last: int = 0  # multiplications by F of the last problem with given bounds
-    # of F and preconditioner: subdomains in each form, bytes, seconds predicted and measured
+    # of F and preconditioner: subdomains in each form, seconds of a multiplication
     local_operators: dict[str, float] = field(default_factory=dict)
     converged_reason: str = "NOT_SOLVED"  # a ConvergedReason, or NO_SOLUTION
     peak_memory_mb: float = 0.0  # summed over ranks
@@ -319,25 +318,26 @@ def largest_over_ranks(seconds: Mapping[str, float], comm: MPI.Intracomm) -> dic
 def _local_operators(dual: Dual) -> dict[str, float]:
     """Forms of the local operators, and what they cost."""
     found: dict[str, float] = {}
+    comm = dual.coarse.comm
     for name, operator in (("F", dual.F), ("preconditioner", dual.preconditioner)):
-        if operator is None or not isinstance(operator.local, ModelledOperator):
+        if operator is None or (own := getattr(operator.local, "forms", None)) is None:
             continue
-        forms = dual.coarse.comm.allreduce(operator.local.forms)
+        forms = comm.allreduce(own)
         found |= {f"{name}_{form}": float(forms[form]) for form in sorted(forms)}
-        found[f"{name}_bytes"] = dual.coarse.comm.allreduce(operator.local.traffic)
-        for word, value in (
-            ("predicted", operator.local.predicted),
-            ("measured", operator.local_seconds),
-        ):
-            found[f"{name}_{word}"] = dual.coarse.comm.allreduce(value, op=MPI.MAX)
+        found[f"{name}_measured"] = comm.allreduce(operator.local_seconds, op=MPI.MAX)
     return found
 
 
 def _residuals(
     solution: Solution, dual: Dual, result: QPResult, accuracy: Accuracy
 ) -> dict[str, float]:
-    reference = result.reference or 1.0
-    gap = solution.remaining_gap
+    reference, gap, rows = result.reference or 1.0, solution.remaining_gap, solution.gluing.contact
+    # of a set of one's own, as of glue that lets go, a force may pull, across a gap too
+    missing = dual.feasible.project(solution.lam) - solution.lam
+    missing = rows.scale * missing[solution.gluing.constraints.sets.normals]
+    area = solution.area[rows.condition]
+    tension = np.divide(missing, area, out=np.zeros(len(area)), where=area > 0.0)
+    closed = solution.status_of_conditions != ContactStatus.OPEN
     return {
         "projected_gradient": result.projected_gradient / reference,
         "equilibrium": result.norm * result.equality / reference,
@@ -345,8 +345,8 @@ def _residuals(
         "energy_error": accuracy.energy_error()[0],
         "gluing_jump": _largest(dual, _jumps(solution)),
         "penetration": _largest(dual, -gap),
-        "tension": _largest(dual, 0.0 - solution.contact_pressure),
-        "complementarity": _largest(dual, np.abs(solution.force * gap)),
+        "tension": _largest(dual, tension),
+        "complementarity": _largest(dual, np.abs(solution.force * gap)[closed]),
         "balance": accuracy.balance,
     }
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache
 from typing import Any
@@ -50,19 +49,6 @@ class NotPositiveDefiniteError(FactorError, ArithmeticError):
     """A matrix that should have a Cholesky factor has none."""
 
 
-@dataclass(frozen=True)
-class FactorSize:
-    """Storage of a factor.
-
-    Attributes:
-        entries: Entries of L.
-        memory: Bytes that a sweep over it reads.
-    """
-
-    entries: float
-    memory: float
-
-
 class CholeskyFactor:
     """A = L Lᵀ of a symmetric positive definite matrix on one rank.
 
@@ -94,11 +80,9 @@ class CholeskyFactor:
             matrix.destroy()
 
     @property
-    def size(self) -> FactorSize:
-        """Storage of the factor, as far as its package tells."""
-        info = self._factor.getInfo()
-        entries = max(info["nz_used"], float(self._b.getLocalSize()))
-        return FactorSize(entries, max(info["memory"], self._b.array_r.itemsize * entries))
+    def entries(self) -> float:
+        """Entries of L, as far as its package tells."""
+        return float(max(self._factor.getInfo()["nz_used"], self._b.getLocalSize()))
 
     def solve(self, b: Array) -> Array:
         """A⁻¹ b, shapes ``(n,)`` or ``(n, q)``."""
@@ -149,13 +133,10 @@ def default_solver() -> str:
 
 
 def unread_options(given: Mapping[str, Any], solver: str) -> list[str]:
-    """Return those options that a factor does not ask PETSc for, by one of a single unknown.
+    """Return those options, without a prefix, that a factor by a solver does not ask PETSc for.
 
-    None where that cannot be made, which has a cause that the factors of the problem name.
-
-    Args:
-        given: Options without a prefix.
-        solver: What makes the factor, where ``given`` does not say.
+    It is tried with a matrix of a single unknown. None where that cannot be made, which has a cause
+    that the factors of the problem name.
     """
     chosen = {"pc_factor_mat_solver_type": solver, **given}
     with added_options(TRIAL, chosen):
