@@ -1,13 +1,10 @@
-"""Seconds and memory of each stage of a solve, and bandwidth of F beside that of a copy.
+"""Seconds and memory of each stage of a solve.
 
     ./run mpirun -n 2 python3 benchmarks/stages.py [--quick | --large] [--processor]
 
 Memory is what all ranks have in use when a stage ends, and what their processes hold then: what is
-freed may stay theirs (Open MPI wants it so), and is used for what comes later. A multiplication
-by F reads each subdomain's factor twice, or its dense matrix once: if the machine's memory is what
-limits it, its bytes per second come near those of a copy of an array larger than the cache, by all
-ranks at once (reading and writing both count); its seconds are always those of the wall. Results go
-to results/stages.md, .json and .png.
+freed may stay theirs (Open MPI wants it so), and is used for what comes later. Results go to
+results/stages.md, .json and .png.
 """
 
 from __future__ import annotations
@@ -15,7 +12,6 @@ from __future__ import annotations
 import argparse
 import ctypes
 import sys
-import time
 from pathlib import Path
 from typing import ClassVar
 
@@ -24,7 +20,6 @@ import petsc4py
 if __name__ == "__main__":
     petsc4py.init(sys.argv[:1])
 
-import numpy as np
 from mpi4py import MPI
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -61,8 +56,6 @@ def sizes(default, large):
 
 
 SIZES = sizes(SMALL, MIDDLE)
-# numbers of an array that is copied; the caches of today's processors hold less
-COPIED = {True: 2**20, False: 2**25}
 STATUS = Path("/proc/self/status")
 
 
@@ -138,33 +131,6 @@ def stage_rows(seconds):
     ]
 
 
-def bandwidth_row(scene, operator, local, copy):
-    """Bytes, seconds and bandwidth of a multiplication by F or the preconditioner."""
-    rate = local[f"{operator}_bytes"] / local[f"{operator}_measured"]
-    return {
-        "scene": scene,
-        "operator": operator,
-        "MB": local[f"{operator}_bytes"] / 1e6,
-        "seconds": local[f"{operator}_measured"],
-        "predicted": local[f"{operator}_predicted"],
-        "GB/s": rate / 1e9,
-        "copy, GB/s": copy / 1e9,
-        "of copy": rate / copy,
-    }
-
-
-def copy_bandwidth(count):
-    """Bytes per second that all ranks read and write together in a copy. Collective."""
-    comm, least = MPI.COMM_WORLD, np.inf
-    source, target = np.ones(count), np.empty(count)
-    for _ in range(5):
-        comm.barrier()
-        start = time.perf_counter()
-        np.copyto(target, source)
-        least = min(least, comm.allreduce(time.perf_counter() - start, op=MPI.MAX))
-    return comm.size * 2 * source.nbytes / least
-
-
 def configure(parser):
     parser.add_argument("--large", action="store_true", help="larger scenes")
     configure_clock(parser)
@@ -172,9 +138,8 @@ def configure(parser):
 
 def draw(path, tables):
     """Seconds of stages."""
-    stages = {title: rows for title, rows in tables.items() if "stage" in rows[0]}
-    with picture(path, len(stages)) as axes:
-        for panel, (title, rows) in zip(axes, stages.items(), strict=True):
+    with picture(path, len(tables)) as axes:
+        for panel, (title, rows) in zip(axes, tables.items(), strict=True):
             stacked(panel, title.rpartition(",")[0], rows, ["seconds"])
 
 
@@ -182,18 +147,11 @@ def main(argv):
     """Run the scenes and write their tables; returns them."""
     arguments, rest = command_line(__doc__, argv, configure)
     size = "quick" if arguments.quick else "large" if arguments.large else "default"
-    comm, tables, local, unit = MPI.COMM_WORLD, {}, {}, choose_clock(arguments)
+    comm, tables, unit = MPI.COMM_WORLD, {}, choose_clock(arguments)
     for name, demo in DEMOS.items():
         report, seconds = solved(demo, SIZES[size][name], petsc_options(rest))
-        local[name] = report.local_operators
         title = f"{name}, {report.primal_dofs} unknowns, {comm.size} ranks, {unit}"
         tables[title] = stage_rows(seconds)
-    copy = copy_bandwidth(COPIED[arguments.quick])
-    tables["Local operators"] = [
-        bandwidth_row(name, operator, found, copy)
-        for name, found in local.items()
-        for operator in ("F", "preconditioner")
-    ]
     return finish(arguments, "stages", tables, draw, comm.rank)
 
 

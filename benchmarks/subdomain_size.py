@@ -5,8 +5,8 @@
 Starts mpirun itself. One mesh is cut into more and more subdomains, H/h elements along the edge of
 each (of METIS parts the cube root of their cells over 6), and their K⁺ and S are applied through
 sparse factors (`implicit`), by a dense matrix of each (`explicit`), and as the package chooses
-(`auto`). `predicted` is what the model of the costs says of the seconds of one multiplication by F
-that are spent in the subdomains, `measured` what they were. Results go to
+(`auto`). `measured` are the seconds of one multiplication by F that are spent in the subdomains.
+Results go to
 results/subdomain_size.md, .json and .png.
 """
 
@@ -70,9 +70,7 @@ def row(name, size, local_type, report):
         "without mesh": solve_seconds(report),
         "processor": report["processor"],
         "MB": report["peak_memory_mb"],
-        "F predicted": local["F_predicted"],
         "F measured": local["F_measured"],
-        "measured/predicted": local["F_measured"] / local["F_predicted"],
         "forms": ", ".join(
             word.removeprefix("F_")
             for word in local

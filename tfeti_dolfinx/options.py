@@ -101,12 +101,11 @@ class Options:
         "auto",
         "subdomains",
         "how K⁺ and S of the subdomains are applied: through sparse factors, by a dense matrix for "
-        "each, or by one factor or matrix for all that are equal; auto takes what a model of "
-        "the costs says",
+        "each, or by one factor or matrix for all that are equal; auto counts operations",
         choices=LOCAL_TYPES,
     )
     local_multiplications: int = described(
-        50, "subdomains", "multiplications that this model expects", fits=FROM_0
+        50, "subdomains", "multiplications to expect, for that count", fits=FROM_0
     )
     clusters: int = described(
         0,

@@ -25,7 +25,6 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.qp.problem import QPResult
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.coulomb import FixedPointStatus
-from tfeti_dolfinx.subdomains.local_operators import ModelledOperator
 
 # --- Records of stages ------------------------------------------------------------------------
 
@@ -158,7 +157,7 @@ class Outcome:
     sliding: int = 0  # those that slip
     recycled_directions: int = 0  # that the next solve begins with
     friction_last: int = 0  # multiplications by F of the last problem with given bounds
-    # of F and preconditioner: subdomains in each form, bytes, seconds predicted and measured
+    # of F and preconditioner: subdomains in each form, seconds of a multiplication
     local_operators: dict[str, float] = field(default_factory=dict)
     converged_reason: str = "NOT_SOLVED"  # a ConvergedReason, or NO_SOLUTION
     peak_memory_mb: float = 0.0  # summed over ranks
@@ -319,17 +318,13 @@ def largest_over_ranks(seconds: Mapping[str, float], comm: MPI.Intracomm) -> dic
 def _local_operators(dual: Dual) -> dict[str, float]:
     """Forms of the local operators, and what they cost."""
     found: dict[str, float] = {}
+    comm = dual.coarse.comm
     for name, operator in (("F", dual.F), ("preconditioner", dual.preconditioner)):
-        if operator is None or not isinstance(operator.local, ModelledOperator):
+        if operator is None or (own := getattr(operator.local, "forms", None)) is None:
             continue
-        forms = dual.coarse.comm.allreduce(operator.local.forms)
+        forms = comm.allreduce(own)
         found |= {f"{name}_{form}": float(forms[form]) for form in sorted(forms)}
-        found[f"{name}_bytes"] = dual.coarse.comm.allreduce(operator.local.traffic)
-        for word, value in (
-            ("predicted", operator.local.predicted),
-            ("measured", operator.local_seconds),
-        ):
-            found[f"{name}_{word}"] = dual.coarse.comm.allreduce(value, op=MPI.MAX)
+        found[f"{name}_measured"] = comm.allreduce(operator.local_seconds, op=MPI.MAX)
     return found
 
 

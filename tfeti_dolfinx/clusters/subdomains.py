@@ -18,7 +18,7 @@ from tfeti_dolfinx.errors import FactorError, InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.subdomains.block import OperatorKind, candidate_modes
-from tfeti_dolfinx.subdomains.local_operators import MODEL, ModelledOperator
+from tfeti_dolfinx.subdomains.local_operators import LocalOperator
 from tfeti_dolfinx.subdomains.subdomains import TOLERANCES as ROUNDING
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
@@ -310,11 +310,6 @@ class Glue:
             W = Saddle(F_c, G_c, N)
             self._of_cluster.append((np.concatenate((at, F.shape[0] + kernel)), W))
 
-    @property
-    def entries(self) -> int:
-        """Number of entries of the factors of W."""
-        return sum(W.entries for _, W in self._of_cluster)
-
     def beside(self, w: Array) -> Array:
         """(I − B_cᵀ(B_cB_cᵀ)⁻¹B_c)w, shapes ``(t,)``.
 
@@ -364,7 +359,6 @@ class Saddle:
                 "rounding makes averages of faces in a cluster depend on each other, as in thin "
                 "parts; expected -tfeti_clusters 0, thicker parts or fewer subdomains"
             ) from error
-        self.entries = self._L.size + 2 * self._M.size + self._T.size
 
     def solve(self, s: Array) -> Array:
         """W s, shapes ``(a + r,)``."""
@@ -510,7 +504,7 @@ class ClusteredSubdomains(Subdomains):
 
     # ---------------------------------------------------------------- operators
 
-    def local_operator(self, kind: OperatorKind, once: bool = False) -> ModelledOperator:
+    def local_operator(self, kind: OperatorKind, once: bool = False) -> LocalOperator:
         """K̃⁺ of the clusters, K_bb or S of their subdomains, on the trace."""
         inner = super().local_operator(kind, once)
         return ClusterPinv(self, inner) if kind == "pinv" else inner
@@ -535,14 +529,14 @@ class ClusteredSubdomains(Subdomains):
         assert self._glued is not None
         return self._glued
 
-    def glue(self, inner: ModelledOperator) -> Glue:
+    def glue(self, inner: LocalOperator) -> Glue:
         """Z and W, made with K⁺ of the subdomains on the trace."""
         B, R = csr_array(self._clusters.averages[:, self.trace]), super().kernel_rows
         Y = self._responses(B, inner)
         self._glued = Glue((B, Y, R), self.null, self._places())
         return self._glued
 
-    def _responses(self, B: csr_array, inner: ModelledOperator) -> csr_array:
+    def _responses(self, B: csr_array, inner: LocalOperator) -> csr_array:
         """K⁺B_cᵀ on the trace: the i-th average of each subdomain goes with those of all others."""
         owner = np.repeat(np.arange(len(self.blocks)), [p.stop - p.start for p in self.trace_parts])
         entries = B.tocoo()
@@ -574,18 +568,14 @@ class ClusterPinv:
         inner: K⁺ of their subdomains.
     """
 
-    def __init__(self, subdomains: ClusteredSubdomains, inner: ModelledOperator) -> None:
+    def __init__(self, subdomains: ClusteredSubdomains, inner: LocalOperator) -> None:
         self._subdomains, self._inner = subdomains, inner
-        self.predicted, self.traffic, self.forms = 0.0, 0.0, inner.forms
+        self.forms: Any = getattr(inner, "forms", None)
 
     def prepare(self) -> None:
         """Make K⁺, Z and W."""
         self._inner.prepare()
-        self._glue = glue = self._subdomains.glue(self._inner)
-        sparse, dense = MODEL.sparse(glue.Z.nnz, 1), float(MODEL.real * glue.entries)
-        self.traffic = self._inner.traffic + 2.0 * sparse.traffic + dense
-        seconds = 2.0 * sparse.seconds + dense / MODEL.bandwidth
-        self.predicted = self._inner.predicted + seconds
+        self._glue = self._subdomains.glue(self._inner)
 
     def mult(self, w: Array, out: Array) -> None:
         """out = K̃⁺w, shapes ``(t,)``."""

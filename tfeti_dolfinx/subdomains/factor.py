@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from enum import IntEnum
 from functools import cache
 from typing import Any
@@ -50,19 +49,6 @@ class NotPositiveDefiniteError(FactorError, ArithmeticError):
     """A matrix that should have a Cholesky factor has none."""
 
 
-@dataclass(frozen=True)
-class FactorSize:
-    """Storage of a factor.
-
-    Attributes:
-        entries: Entries of L.
-        memory: Bytes that a sweep over it reads.
-    """
-
-    entries: float
-    memory: float
-
-
 class CholeskyFactor:
     """A = L Lᵀ of a symmetric positive definite matrix on one rank.
 
@@ -94,11 +80,9 @@ class CholeskyFactor:
             matrix.destroy()
 
     @property
-    def size(self) -> FactorSize:
-        """Storage of the factor, as far as its package tells."""
-        info = self._factor.getInfo()
-        entries = max(info["nz_used"], float(self._b.getLocalSize()))
-        return FactorSize(entries, max(info["memory"], self._b.array_r.itemsize * entries))
+    def entries(self) -> float:
+        """Entries of L, as far as its package tells."""
+        return float(max(self._factor.getInfo()["nz_used"], self._b.getLocalSize()))
 
     def solve(self, b: Array) -> Array:
         """A⁻¹ b, shapes ``(n,)`` or ``(n, q)``."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol
 
 import numpy as np
 from scipy.linalg.blas import dsymm, dsymv
@@ -13,76 +13,29 @@ from scipy.sparse import block_diag, csr_array
 
 from tfeti_dolfinx.common.arrays import Array, parts_of
 from tfeti_dolfinx.subdomains.block import Block, OperatorKind
-from tfeti_dolfinx.subdomains.factor import FactorSize
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
 
-# --- Cost model of local operators ------------------------------------------------------------
+# --- Choice of their form ----------------------------------------------------------------------
+
+LOCAL_TYPES = ("auto", "implicit", "explicit", "shared")
 
 
 @dataclass(frozen=True)
-class Cost:
-    """Cost of a product, by the model.
+class LocalChoice:
+    """Choice of the form of local operators.
 
     Attributes:
-        seconds: Seconds.
-        traffic: Bytes that go through memory.
+        type: One of ``LOCAL_TYPES``.
+        multiplications: How many to expect.
     """
 
-    seconds: float = 0.0
-    traffic: float = 0.0
-
-    def __add__(self, other: Cost) -> Cost:
-        return Cost(self.seconds + other.seconds, self.traffic + other.traffic)
+    type: str = "auto"
+    multiplications: int = 50
 
 
-@dataclass(frozen=True)
-class CostModel:
-    """Speed of one core of a few years ago; of a faster one only ratios of times choose.
-
-    Attributes:
-        bandwidth: Bytes read from memory per second.
-        sweeps: Operations per second of sweeps over a factor.
-        products: Operations per second of dense products of matrices.
-        call: Seconds of a call that comes through Python and PETSc.
-        sparse_entry: Seconds of an entry of a sparse matrix times one number.
-        together: Right sides that go through a factor at once: enough that it is not read for
-            each, and few enough that they fit beside it into the cache.
-        real: Bytes of a number.
-        index: Bytes of a column of a sparse matrix.
-    """
-
-    bandwidth: float = 1.2e10
-    sweeps: float = 9e9
-    products: float = 1.6e10
-    call: float = 2e-5
-    sparse_entry: float = 1.2e-9
-    together: int = 32
-    real: int = 8
-    index: int = 4
-
-    def solve(self, factor: FactorSize, n: int, count: int) -> Cost:
-        """Return the cost of a solve with a factor of n unknowns and as many right sides."""
-        passes = -(-count // self.together)
-        traffic = 2.0 * passes * factor.memory + 4.0 * self.real * n * count
-        work = 4.0 * factor.entries * count / self.sweeps
-        return Cost(max(traffic / self.bandwidth, work) + self.call * passes, traffic)
-
-    def sparse(self, entries: int, count: int) -> Cost:
-        """Return the cost of products of a sparse matrix with as many vectors."""
-        seconds = self.sparse_entry * entries * count + self.call
-        return Cost(seconds, float((self.real + self.index) * entries * count))
-
-    def dense(self, t: int, count: int) -> Cost:
-        """Return the cost of a dense symmetric t × t matrix times as many vectors."""
-        if count == 1:  # half of it is read
-            traffic, work = self.real * t * t / 2.0, 0.0
-        else:
-            traffic = self.real * (t * t + 4.0 * t * count)
-            work = 2.0 * t * t * count / self.products
-        return Cost(max(traffic / self.bandwidth, work) + self.call, traffic)
-
-
-MODEL = CostModel()
+# right sides that go through a factor at once: enough that it is not read for each, and few enough
+# that they fit beside it into the cache
+TOGETHER = 32
 
 # --- Groups of Blocks with one matrix ---------------------------------------------------------
 
@@ -98,7 +51,7 @@ class Group:
         place: Where the trace unknowns go in these columns, the first column first.
         where: Where they lie among those of the rank.
         apply: A W, shapes ``(size, q)``.
-        cost: Cost of ``apply`` to so many vectors.
+        work: Operations of ``apply`` for a vector, 0 if they are not known.
         can_be_dense: Whether there is use in a dense A.
         dense: A, where that is cheaper.
     """
@@ -109,21 +62,23 @@ class Group:
     place: Array
     where: Array
     apply: Callable[[Array], Array]
-    cost: Callable[[int], Cost]
+    work: float
     can_be_dense: bool = True
     dense: Array | None = None
 
-    def prefers_dense(self, local_type: str, multiplications: int) -> bool:
-        """Return whether the group takes a dense matrix: by its type, or as the model says."""
-        if local_type == "implicit" or not self.can_be_dense:
+    def prefers_dense(self, choice: LocalChoice) -> bool:
+        """Return whether the group takes a dense matrix: by its type, or for fewer operations.
+
+        It costs as many solves as it has columns. A single right side reads the factor for itself,
+        as long as three of many take.
+        """
+        if choice.type in ("implicit", "explicit") or not self.can_be_dense:
+            return self.can_be_dense and choice.type == "explicit"
+        if choice.type == "shared" and self.columns == 1:
             return False
-        if local_type == "explicit":
-            return True
-        if local_type == "shared" and self.columns == 1:
-            return False
-        setup, once = self.cost(self.size).seconds, self.cost(self.columns).seconds
-        dense = setup + multiplications * MODEL.dense(self.size, self.columns).seconds
-        return multiplications * once > dense
+        once = self.work * (3.0 if self.columns == 1 else self.columns)
+        dense = 2.0 * self.size**2 * self.columns
+        return choice.multiplications * (once - dense) > self.work * self.size
 
     def make_dense(self) -> None:
         """Make A dense, symmetric to the last bit, by columns."""
@@ -174,28 +129,20 @@ def _pinv_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
         B[trace] = W
         return stiffness.solve(B)[trace]
 
-    def cost(count: int) -> Cost:
-        return MODEL.solve(stiffness.factor_size, stiffness.size, count)
-
     rows = [np.searchsorted(trace, block.trace_place) for block, _ in equal]
-    places = _places(rows, len(trace), [part for _, part in equal])
-    return Group(len(equal), len(trace), len(equal), *places, lambda W: _in_chunks(apply, W), cost)
+    places, work = _places(rows, len(trace), [part for _, part in equal]), 4.0 * stiffness.entries
+    return Group(len(equal), len(trace), len(equal), *places, lambda W: _in_chunks(apply, W), work)
 
 
 def _schur_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
     """S through the factor of K_ii."""
     traced = equal[0][0].traced
-
-    def cost(count: int) -> Cost:
-        products = MODEL.sparse(traced.K_bb.nnz, count)
-        if traced.inner is None:
-            return products
-        across = MODEL.sparse(2 * traced.K_ib.nnz, count)
-        return products + across + MODEL.solve(traced.inner.size, len(traced.inside), count)
-
+    work = 2.0 * traced.K_bb.nnz
+    if traced.inner is not None:
+        work += 4.0 * (traced.K_ib.nnz + traced.inner.entries)
     size, parts = len(traced.trace), [part for _, part in equal]
     places = _places([block.trace_rows for block, _ in equal], size, parts)
-    return Group(len(equal), size, len(equal), *places, traced.apply_schur, cost)
+    return Group(len(equal), size, len(equal), *places, traced.apply_schur, work)
 
 
 def _stiffness_group(blocks: Sequence[tuple[SparseBlock, slice]]) -> Group:
@@ -213,20 +160,20 @@ def _stiffness_group(blocks: Sequence[tuple[SparseBlock, slice]]) -> Group:
         len(rows),
         *_places(rows, size, parts),
         lambda W: np.asarray(K_bb @ W),
-        lambda count: MODEL.sparse(K_bb.nnz, count),
+        2.0 * K_bb.nnz,
         can_be_dense=False,
     )
 
 
 def _own_group(block: Block, kind: OperatorKind, part: slice) -> Group:
-    """A Block of another class, one vector after the other; it costs nothing known."""
+    """A Block of another class, one vector after the other."""
     apply, size = getattr(block, f"apply_{kind}"), len(block.trace_dofs)
 
     def columns(W: Array) -> Array:
         return np.stack([apply(np.ascontiguousarray(w)) for w in W.T], axis=1)
 
     places = _places([np.arange(size)], size, [part])
-    return Group(1, size, 1, *places, columns, lambda count: Cost())
+    return Group(1, size, 1, *places, columns, 0.0)
 
 
 def _places(rows: Sequence[Array], size: int, parts: Sequence[slice]) -> tuple[Array, Array]:
@@ -238,8 +185,8 @@ def _places(rows: Sequence[Array], size: int, parts: Sequence[slice]) -> tuple[A
 def _in_chunks(apply: Callable[[Array], Array], W: Array) -> Array:
     """A W, as many columns at a time as are good for the cache."""
     out = np.empty(W.shape, order="F")
-    for first in range(0, W.shape[1], MODEL.together):
-        some = slice(first, first + MODEL.together)
+    for first in range(0, W.shape[1], TOGETHER):
+        some = slice(first, first + TOGETHER)
         out[:, some] = apply(W[:, some])
     return out
 
@@ -266,27 +213,13 @@ def solved_together(blocks: Sequence[Block], parts: Sequence[slice], b: Array) -
 
 # --- Local operators of all subdomains of a rank ----------------------------------------------
 
-LOCAL_TYPES = ("auto", "implicit", "explicit", "shared")
-
-
-@dataclass(frozen=True)
-class LocalChoice:
-    """Choice of the form of local operators.
-
-    Attributes:
-        type: One of ``LOCAL_TYPES``.
-        multiplications: How many to expect.
-    """
-
-    type: str = "auto"
-    multiplications: int = 50
-
 
 class LocalOperator(Protocol):
     """diag(A_s) over the subdomains of a rank, on its t trace unknowns. Nothing is collective.
 
     One object for the whole rank, so that an implementation may treat subdomains together: solve
-    with several right sides, or share one matrix among equal subdomains.
+    with several right sides, or share one matrix among equal subdomains. It may have ``forms``,
+    the number of subdomains in each form, for the report.
     """
 
     def prepare(self) -> None:
@@ -302,21 +235,6 @@ class LocalOperator(Protocol):
         ...
 
 
-@runtime_checkable
-class ModelledOperator(LocalOperator, Protocol):
-    """A local operator that knows what it costs.
-
-    Attributes:
-        predicted: After ``prepare``: seconds of one multiplication by the model.
-        traffic: Bytes that it moves by the model.
-        forms: Number of subdomains in each form.
-    """
-
-    predicted: float
-    traffic: float
-    forms: Counter[str]
-
-
 class GroupedOperator:
     """Equal subdomains apply theirs at once, each group in the form that suits it."""
 
@@ -325,7 +243,6 @@ class GroupedOperator:
     ) -> None:
         self._blocks, self._kind, self._choice = blocks, kind, choice or LocalChoice()
         self._groups: list[Group] = []
-        self.predicted, self.traffic = 0.0, 0.0
         self.forms: Counter[str] = Counter()
 
     def prepare(self) -> None:
@@ -334,12 +251,10 @@ class GroupedOperator:
             block.prepare(self._kind)
         self._groups = groups_of(self._blocks, self._kind)
         for group in self._groups:
-            cost, form = group.cost(group.columns), "implicit"
-            if group.prefers_dense(self._choice.type, self._choice.multiplications):
+            form = "implicit"
+            if group.prefers_dense(self._choice):
                 group.make_dense()
-                cost, form = MODEL.dense(group.size, group.columns), "explicit"
-            self.predicted += cost.seconds
-            self.traffic += cost.traffic
+                form = "explicit"
             self.forms["shared_" * (group.columns > 1) + form] += group.count
 
     def mult(self, w: Array, out: Array) -> None:

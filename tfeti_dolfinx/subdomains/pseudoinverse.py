@@ -12,7 +12,6 @@ from scipy.sparse import csr_array
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.subdomains.factor import (
     CholeskyFactor,
-    FactorSize,
     NotPositiveDefiniteError,
     as_petsc_matrix,
 )
@@ -70,10 +69,9 @@ class SchurPseudoinverse(CholeskyFactor):
         return np.asarray(super().solve(b_r) + self._H @ (self._H.T @ b))
 
     @property
-    def size(self) -> FactorSize:
-        """Storage of the factor and of H, of which a sweep reads half."""
-        factor = super().size
-        return FactorSize(factor.entries + self._H.size, factor.memory + self._H.nbytes)
+    def entries(self) -> float:
+        """Entries of the factor, and half of H, of which a solve reads all once."""
+        return super().entries + self._H.size / 2.0
 
 
 def trailing_pseudoinverse(

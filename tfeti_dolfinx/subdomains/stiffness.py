@@ -14,7 +14,7 @@ from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.common.validation import check_stiffness
 from tfeti_dolfinx.errors import FactorError, InputError
 from tfeti_dolfinx.subdomains.block import TOLERANCES, candidate_modes, fixing_dofs, kernel_of
-from tfeti_dolfinx.subdomains.factor import CholeskyFactor, FactorSize, NotPositiveDefiniteError
+from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 from tfeti_dolfinx.subdomains.kplus import (
     GeneralisedInverse,
     InverseFactory,
@@ -77,11 +77,10 @@ class Stiffness:
         return stretch_over_shear(self.x, self.bs, lambda u: self.K @ u)
 
     @property
-    def factor_size(self) -> FactorSize:
-        """Storage of the factor; of an inverse that the user brings, as if it were dense."""
-        if isinstance(self._pinv, CholeskyFactor):
-            return self._pinv.size
-        return FactorSize(self.size**2 / 2.0, self.K.data.itemsize * self.size**2 / 2.0)
+    def entries(self) -> float:
+        """Entries of the factor; of an inverse that the user brings, as if it were dense."""
+        dense = self.size**2 / 2.0
+        return self._pinv.entries if isinstance(self._pinv, CholeskyFactor) else dense
 
     def on_trace(self, trace: Array) -> Traced:
         """K_bb and S on a trace, ascending, the same for all that use it."""

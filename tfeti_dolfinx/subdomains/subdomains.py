@@ -15,7 +15,7 @@ from tfeti_dolfinx.subdomains.block import Block, Counters, OperatorKind
 from tfeti_dolfinx.subdomains.local_operators import (
     GroupedOperator,
     LocalChoice,
-    ModelledOperator,
+    LocalOperator,
     solved_together,
 )
 
@@ -142,7 +142,7 @@ class Subdomains:
             for block, part in zip(self.blocks, self.dof_parts, strict=True):
                 block.update(f=f[part])
 
-    def local_operator(self, kind: OperatorKind, once: bool = False) -> ModelledOperator:
+    def local_operator(self, kind: OperatorKind, once: bool = False) -> LocalOperator:
         """K⁺, K_bb or S of all Blocks on the trace; to be made again after ``retrace``.
 
         Args:
