@@ -1,5 +1,7 @@
 """The stress harness judges rightly, and a few of its scenes are right (``benchmarks.stress``)."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -62,9 +64,8 @@ def test_a_wrong_answer_is_called_wrong(comm):
         assert judge.judged(scene, g, outcome)["class"] == "WRONG"
 
 
-def test_a_process_that_dies_is_a_row(serial_only, tmp_path):
-    rows = main(["--only", "0", "no such scene", "1", "--output", str(tmp_path), "--limit", "100"])
-    assert [row["scene"] for row in rows] == ["0", "no such scene", "1"]
-    assert rows[1]["class"] == "DEATH"
-    assert "ValueError" in rows[1]["error"]
-    assert (tmp_path / "stress.md").read_text().startswith("| class | scenes |")
+def test_the_harness_writes_a_row_for_each_scene(comm, shared_tmp):
+    rows = main(["--only", "0", "1", "--output", str(shared_tmp)])
+    if comm.rank == 0:
+        assert [row["scene"] for row in rows] == [0, 1]
+        assert json.loads((shared_tmp / "stress.json").read_text())[1]["class"] == rows[1]["class"]
