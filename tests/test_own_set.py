@@ -58,6 +58,9 @@ def test_glue_that_lets_go_at_a_limit(limit):
     force, gap = p.solution.force[rows], p.solution.remaining_gap[rows]
     assert np.all(gap >= -noise)
     assert np.allclose(force[gap > noise], -limit, rtol=1e-9)
+    residuals, allowed = p.report.residuals, p.report.tolerances
+    assert residuals["tension"] <= 1e-12 * limit
+    assert residuals["complementarity"] <= allowed["complementarity"] + noise * limit
     both = p.dofs.comm.allgather((np.any(force < -1e-12), np.any(gap > noise)))
     assert np.any(both, axis=0).tolist() == [True, limit < 1.0]
 

@@ -331,8 +331,13 @@ def _local_operators(dual: Dual) -> dict[str, float]:
 def _residuals(
     solution: Solution, dual: Dual, result: QPResult, accuracy: Accuracy
 ) -> dict[str, float]:
-    reference = result.reference or 1.0
-    gap = solution.remaining_gap
+    reference, gap, rows = result.reference or 1.0, solution.remaining_gap, solution.gluing.contact
+    # of a set of one's own, as of glue that lets go, a force may pull, across a gap too
+    missing = dual.feasible.project(solution.lam) - solution.lam
+    missing = rows.scale * missing[solution.gluing.constraints.sets.normals]
+    area = solution.area[rows.condition]
+    tension = np.divide(missing, area, out=np.zeros(len(area)), where=area > 0.0)
+    closed = solution.status_of_conditions != ContactStatus.OPEN
     return {
         "projected_gradient": result.projected_gradient / reference,
         "equilibrium": result.norm * result.equality / reference,
@@ -340,8 +345,8 @@ def _residuals(
         "energy_error": accuracy.energy_error()[0],
         "gluing_jump": _largest(dual, _jumps(solution)),
         "penetration": _largest(dual, -gap),
-        "tension": _largest(dual, 0.0 - solution.contact_pressure),
-        "complementarity": _largest(dual, np.abs(solution.force * gap)),
+        "tension": _largest(dual, tension),
+        "complementarity": _largest(dual, np.abs(solution.force * gap)[closed]),
         "balance": accuracy.balance,
     }
 

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from tfeti_dolfinx.common.arrays import Array, sum_rows
-from tfeti_dolfinx.common.parallel import summed
+from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.forces import Resultant, condition_areas, resultant
 from tfeti_dolfinx.contact.partner import ContactPartner, position_of
@@ -258,13 +257,6 @@ class ContactState:
     def condition_forces(self) -> Array:
         """Force on the node of each contact condition of this rank, shape ``(n, gdim)``."""
         return self.tangential_force - self.force[:, None] * self.gluing.records.normal
-
-    @cached_property
-    def resultant_forces(self) -> list[list[float]]:
-        """Force of each contact on its surface, as in ``ContactData.resultant``. Collective."""
-        contact, count = self.gluing.records.contact, len(self.contacts)
-        total = summed(self.dofs.comm, sum_rows(contact, self.condition_forces, count))
-        return [[float(value) for value in row] for row in total]
 
     @cached_property
     def nodal_forces(self) -> Array:

@@ -415,5 +415,6 @@ class ContactDynamics(ContactProblem):
         motion = balance(self._forms_in_time, self._system.dual, self.solution)
         if self._predictor is not None:
             motion["predictor_multiplications"] = float(self._predictor.multiplications)
-        forces = self.solution.resultant_forces
+        contacts = [self.solution.contact(i) for i in range(len(self.contacts))]
+        forces = [list(map(float, contact.resultant.force)) for contact in contacts]
         self.report.take(replace(self.report, motion=motion, contact_forces=forces))

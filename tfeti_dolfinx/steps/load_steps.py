@@ -441,8 +441,9 @@ class LoadSteps:
             self._apply(self._problem, t)
 
     def _record(self, number: int, t: float, size: float) -> StepRecord:
-        report = self._problem.report
-        lost = self._comm.allreduce(float(np.sum(self._problem.solution.dissipation)))
+        report, solution = self._problem.report, self._problem.solution
+        lost = self._comm.allreduce(float(np.sum(solution.dissipation)))
+        contacts = [solution.contact(i) for i in range(len(solution.contacts))]
         return StepRecord(
             number=number,
             time=t,
@@ -452,7 +453,7 @@ class LoadSteps:
             residuals=dict(report.residuals),
             seconds=report.seconds["total"],
             motion=dict(report.motion),
-            contact_forces=self._problem.solution.resultant_forces,
+            contact_forces=[list(map(float, contact.resultant.force)) for contact in contacts],
         )
 
     def _keep(self, place: Place, t: float) -> None:
