@@ -50,14 +50,12 @@ def start_screen() -> subprocess.Popen[bytes] | None:
 
 
 def draw(data: Mapping[str, Any], target: str) -> None:
-    """Draw a deformed mesh, coloured by a nodal field.
+    """Draw a deformed mesh, coloured by a nodal field, to a ``.png``.
 
-    Args:
-        data: Arrays ``cells``, ``types``, ``points``, ``moved``, ``values``, and scalars ``name``,
-            ``factor`` (nan: the largest displacement becomes 5 % of the scene), ``zoom``,
-            ``focus`` (nan: the centre), ``edges``, ``highest`` (nan: the largest), ``view`` (nan:
-            pyvista's), ``cut`` (nan: none).
-        target: The ``.png`` to write.
+    The data are the arrays ``cells``, ``types``, ``points``, ``moved``, ``values``, and scalars
+    ``name``, ``factor`` (nan: the largest displacement becomes 5 % of the scene), ``zoom``,
+    ``focus`` (nan: the centre), ``edges``, ``highest`` (nan: the largest), ``view`` (nan:
+    pyvista's), ``cut`` (nan: none).
     """
     import pyvista
 

@@ -109,11 +109,7 @@ def guarded(own: Extensions, options: Options, comm: MPI.Intracomm) -> Extension
 
 
 def check_method(method: Any, own: Extensions) -> None:
-    """Raise if what takes the place of finite elements does not fit what the program brings.
-
-    Raises:
-        InputError: It is something else, or there is a Block of the program's own.
-    """
+    """Raise an InputError unless it is a method, and there is no Block of the program's own."""
     expected = 'tfeti_dolfinx.BoundaryElements, say BoundaryElements("ball")'
     checked_type(method, SubdomainMethod, "boundary_elements", expected)
     if own.block is not None:

@@ -360,13 +360,7 @@ def _converted(option: Parameter, value: Any, prefix: str) -> Any:
 
 
 def _as_kind(kind: type, value: Any) -> Any:
-    """Return a value as a bool, a float, an int, text or a tuple of names.
-
-    Raises:
-        KeyError: It is no word of a switch.
-        TypeError: It is of another type.
-        ValueError: It is no such number.
-    """
+    """Convert a value; raise a KeyError, TypeError or ValueError where it does not fit."""
     if kind is bool:
         word = "" if value is None else str(value).lower()
         return {**dict.fromkeys(YES, True), **dict.fromkeys(NO, False)}[word]

@@ -142,11 +142,7 @@ def plot_pressure(
 
 
 def check_screen() -> None:
-    """Raise if there is no X server for pictures, and no Xvfb to start one.
-
-    Raises:
-        InputError: Says what to install.
-    """
+    """Raise an InputError, with what to install, where pictures find no X server and no Xvfb."""
     if not os.environ.get("DISPLAY") and shutil.which("Xvfb") is None:
         raise InputError(
             "pictures need an X server: set DISPLAY, or install Xvfb (Debian: apt-get install xvfb)"

@@ -509,11 +509,7 @@ class ContactProblem:
         return given
 
     def _check_state(self, state: SavedState) -> None:
-        """Raise unless a state may be one of this problem. Not collective.
-
-        Raises:
-            InputError: It is broken, or of something else.
-        """
+        """Raise an InputError where a state is broken, or of something else. Not collective."""
         check_state(state, self.dofs, self.decomposition, len(self.contacts))
 
     def _take_motion(self, state: SavedState) -> None:

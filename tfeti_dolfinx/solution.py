@@ -57,11 +57,7 @@ class PointValues:
 
 
 def checked_points(points: Any, gdim: int) -> Array:
-    """Return points as an array of shape ``(k, gdim)``.
-
-    Raises:
-        InputError: They are of another shape, or not finite numbers.
-    """
+    """Return finite points as an array of shape ``(k, gdim)``; raise an InputError for others."""
     try:
         found = np.array(points, dtype=float)
     except (TypeError, ValueError) as error:

@@ -278,10 +278,8 @@ class System:
     def begin_at(self, rest: Array, known: tuple[ContactRecords, Array] | None = None) -> None:
         """Let a load step begin at a displacement in primal order.
 
-        Args:
-            rest: The displacement.
-            known: Conditions of the step before with their slips at its end: they count as long as
-                conditions stay the same.
+        Conditions of the step before, with their slips at its end, count as long as conditions stay
+        the same.
         """
         self._rest, self._known_slips = rest, known
 
@@ -387,7 +385,7 @@ class System:
         scene = self._dofs, self._decomposition
         area = condition_areas(gluing.records, *scene, surfaces, self.forms.thickness)
         self._known_friction = friction = search.friction()
-        gluing.constraints.set_limits(gluing.tangents.limits(friction, area))
+        gluing.constraints.limits[:] = gluing.tangents.limits(friction, area)
         gluing.constraints.coefficients[:] = gluing.tangents.coefficients(friction)
 
     def _assemble_load(self) -> None:

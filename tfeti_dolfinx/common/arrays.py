@@ -20,16 +20,7 @@ TINY = 1e-300
 
 
 def sum_rows(row: Array, values: Array, size: int) -> Array:
-    """Return sums of the values with the same row.
-
-    Args:
-        row: Row of each value, shape ``(k,)``.
-        values: Shape ``(k, ...)``.
-        size: Number of rows.
-
-    Returns:
-        Real numbers, shape ``(size, ...)``; of nothing ``numpy.bincount`` returns integers.
-    """
+    """Sums of values, ``(k, ...)``, with the same row, ``(k,)``: floats, shape ``(size, ...)``."""
     shape = values.shape[1:]
     flat = values.reshape(len(values), math.prod(shape))
     sums = np.empty((size, flat.shape[1]))

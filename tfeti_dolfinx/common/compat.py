@@ -60,13 +60,8 @@ def cell_permutation(cell_type: dmesh.CellType, num_nodes: int) -> Array:
 def create_mesh_in_place(comm: MPI.Intracomm, cells: Array, x: Array, element: Any) -> dmesh.Mesh:
     """Return a mesh whose cells stay on the rank that gives them. Collective.
 
-    This is the one call of DOLFINx's partitioner hook.
-
-    Args:
-        comm: Communicator of the mesh.
-        cells: Global node indices of this rank's cells, shape ``(n, nodes_per_cell)``.
-        x: Coordinates of this rank's chunk of the nodes, shape ``(p, gdim)``.
-        element: Coordinate element.
+    ``cells`` are global nodes of this rank's cells, shape ``(n, nodes)``, x this rank's chunk of
+    the nodes, shape ``(p, gdim)``. It is the one call of DOLFINx's partitioner hook.
     """
 
     def stay(*_: Any) -> Any:

@@ -215,13 +215,9 @@ def check_stiffness(
 ) -> None:
     """Raise an InputError unless a stiffness is finite, symmetric and of a positive diagonal.
 
-    Args:
-        name: Whose it is.
-        K: The matrix.
-        what: What it is called.
-        form: What it should come from.
-        symmetry: Largest entry of K − Kᵀ over that of K: far above what rounding of assembly
-            leaves, far below any term of a form that matters.
+    Messages have its owner's name, what it is called and the form that is expected. ``symmetry`` is
+    the largest entry of K − Kᵀ over that of K: far above what rounding of assembly leaves, far
+    below any term of a form that matters.
     """
     if not np.all(np.isfinite(K.data)):
         raise InputError(f"{name}: {what} has entries that are not finite")

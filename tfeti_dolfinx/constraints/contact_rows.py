@@ -118,28 +118,19 @@ class TangentRows:
     normal: Array
 
     def limits(self, traction: Array, area: Array) -> Array:
-        """Return the ψ_i = traction · ∫φ_i / s_i; 0 on empty rows and under Coulomb's law.
+        """Return the ψ_i = traction · ∫φ_i / s_i, semi-axes of what λ_T may be, ``(t, gdim - 1)``.
 
-        Args:
-            traction: Largest tractions of all conditions along their tangents, shape
-                ``(n, gdim - 1)``.
-            area: ∫φ_i of all conditions, shape ``(n,)``.
-
-        Returns:
-            Semi-axes of what λ_T may be, shape ``(t, gdim - 1)``.
+        They are 0 on empty rows and under Coulomb's law. Traction, shape ``(n, gdim - 1)``, and
+        area ∫φ_i, shape ``(n,)``, are those of all conditions.
         """
         over = (area[self.condition] / self.scale)[:, None]
         given = self.moves & (self.normal < 0)[:, None]
         return np.where(given, traction[self.condition] * over, 0.0)
 
     def coefficients(self, values: Array) -> Array:
-        """Return the μ_i; 0 on rows without entries and under a given bound.
+        """Return the μ_i, semi-axes over λ_N, from those of all conditions, ``(n, gdim - 1)``.
 
-        Args:
-            values: Coefficients of all conditions along their tangents, shape ``(n, gdim - 1)``.
-
-        Returns:
-            Semi-axes over λ_N, shape ``(t, gdim - 1)``.
+        They are 0 on rows without entries and under a given bound. Shape ``(t, gdim - 1)``.
         """
         pressed = self.moves & (self.normal >= 0)[:, None]
         return np.where(pressed, values[self.condition], 0.0)
@@ -148,15 +139,10 @@ class TangentRows:
 def tangent_rows(
     dofs: TornDofs, builder: RowBuilder, normals: ContactRows
 ) -> tuple[Rows, TangentRows]:
-    """T from conditions within reach that have friction. Collective.
+    """T from conditions within reach that have friction, given their normal rows. Collective.
 
     A condition whose normal row prescribed components decide keeps its tangents under a given
     bound. Under Coulomb's law it has none: the pressure is hidden in what holds the node.
-
-    Args:
-        dofs: Dof maps.
-        builder: Coefficients of the conditions.
-        normals: The conditions of the normal rows.
     """
     records, count = builder.records, dofs.bs - 1
     if not any_rank(dofs.comm, bool(np.any(records.friction != Friction.NONE))):

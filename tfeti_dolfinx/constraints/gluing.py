@@ -57,17 +57,12 @@ class HeldRows:
 
 
 def equality_rows(dofs: TornDofs, flag: Array, weights: Array) -> tuple[Rows, HeldRows]:
-    """B_E, and which of its rows hold prescribed components.
+    """B_E, and which of its rows hold prescribed components, by flags of the groups, ``(g, bs)``.
 
-    A component that is prescribed has one row per copy and no gluing rows. The k − 1 gluing
-    rows of k copies are orthonormal in the inner product of D⁻¹, D the weights; with equal
-    weights they are (1, …, 1, −j)/√(j + j²), j = 1, …, k − 1. Differences of neighbours instead
-    would have a Gram matrix of condition O(k²).
-
-    Args:
-        dofs: Dof maps.
-        flag: Which components of the owned groups are prescribed, shape ``(g, bs)``.
-        weights: D for each copy of the owned groups, shape ``(c, bs)``.
+    A component that is prescribed has one row per copy and no gluing rows. The k − 1 gluing rows of
+    k copies are orthonormal in the inner product of D⁻¹, D the weights of all copies, shape ``(c,
+    bs)``; with equal weights they are (1, …, 1, −j)/√(j + j²), j = 1, …, k − 1. Differences of
+    neighbours instead would have a Gram matrix of condition O(k²).
     """
     multiplicities = np.unique(dofs.multiplicity)
     tables = [_glue(dofs, flag, weights, int(k)) for k in multiplicities if k > 1]
@@ -98,16 +93,10 @@ def _glue(dofs: TornDofs, flag: Array, weights: Array, k: int) -> Rows:
 
 
 def _orthonormal(weights: Array) -> Array:
-    """Return rows with zero sum, orthonormal in the inner product of diag(weights)⁻¹.
+    """Return rows with zero sum, orthonormal in diag(weights)⁻¹: ``(n, k)`` to ``(n, k - 1, k)``.
 
-    Gram–Schmidt on e_i − e_{i+1} in closed form: row j is proportional to (w_1, …, w_j, −W_j)
-    with W_j = w_1 + … + w_j.
-
-    Args:
-        weights: Positive weights, shape ``(n, k)``.
-
-    Returns:
-        Rows, shape ``(n, k - 1, k)``.
+    Gram–Schmidt on e_i − e_{i+1} in closed form: row j is proportional to (w_1, …, w_j, −W_j) with
+    W_j = w_1 + … + w_j.
     """
     k = weights.shape[1]
     sums = np.cumsum(weights, axis=1)
@@ -213,14 +202,6 @@ def check_not_on_tears(
     of these facets are of the boundary, some of tears with nodes off the boundary. So a region may
     be prescribed that has nodes inside of subdomains, and a surface inside a body in a condition of
     its own.
-
-    Args:
-        bcs: Conditions on the space of ``dofs``.
-        dofs: Dof maps.
-        decomposition: The torn mesh.
-
-    Raises:
-        InputError: A condition is.
     """
     if not bcs or not decomposition.is_torn:
         return
@@ -398,12 +379,9 @@ class Gluing:
         )
 
     def with_supports_at(self, values: Array) -> Array:
-        """Return this rank's part of c as it is, but for supports, which hold other values.
+        """Return this rank's part of c, but for supports, which hold the values, shape ``(g, bs)``.
 
         Contacts meet prescribed components where the prescribed values have them.
-
-        Args:
-            values: Values of the owned groups, shape ``(g, bs)``.
         """
         c = np.array(self.constraints.c.array_r)
         c[self.constraints.sets.equalities[self.held.row]] = self.held.right_side(values)
@@ -413,10 +391,6 @@ class Gluing:
         """Multipliers of earlier rows of the same scene on these; zero on rows that are new.
 
         Where other components are prescribed all rows of equalities are. Collective.
-
-        Args:
-            earlier: The earlier rows.
-            lam: Their multipliers on this rank.
         """
         sets, before = self.constraints.sets, earlier.constraints.sets
         start = np.zeros(sets.num_rows)

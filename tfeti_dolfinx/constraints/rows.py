@@ -109,18 +109,11 @@ class RowSets:
 
 
 def row_weights(blocks: Array, scaling: str, comm: MPI.Intracomm) -> Array:
-    """D: at each node the mean of the diagonal of K, over the smallest of them; or ones.
+    """D: at each node the mean of the diagonal of K over the smallest one, or ones. Collective.
 
-    One number for a node: then a scene that is turned has the rows of the scene, turned.
-    Collective.
-
-    Args:
-        blocks: The block of K of each local primal node, shape ``(num_nodes, bs, bs)``.
-        scaling: "stiffness", or "multiplicity" for ones.
-        comm: Communicator.
-
-    Returns:
-        One for each unknown, shape ``(num_nodes * bs,)``.
+    One number for a node: then a scene that is turned has the rows of the scene, turned. From the
+    block of K of each local primal node, ``(num_nodes, bs, bs)``, one for each unknown,
+    ``(num_nodes * bs,)``; ones for the scaling "multiplicity".
     """
     diagonals = np.diagonal(blocks, axis1=1, axis2=2)
     if scaling == "multiplicity":
@@ -178,10 +171,6 @@ class Constraints:
         """Fill c anew, with this rank's part of it, shape ``(num_rows,)``. B stays."""
         self.c.array[:] = c
 
-    def set_limits(self, limits: Array) -> None:
-        """Fill the ψ_i anew, shape ``(t, gdim - 1)``. B stays."""
-        self.limits[:] = limits
-
     @property
     def pressed(self) -> Array:
         """Positions of the points of ``sets.tangents`` with a coefficient of Coulomb's law."""
@@ -212,15 +201,10 @@ def assemble_constraints(
     tangent_scale: Array,
     pressed_by: Array,
 ) -> Constraints:
-    """Assemble B, with c = 0 and ψ = 0. Collective.
+    """Assemble B of this rank's rows, with c = 0 and ψ = 0. Collective.
 
-    Args:
-        dofs: Dof maps.
-        tables: This rank's rows: equalities, contact normals, tangents.
-        weights: D on the local primal unknowns.
-        scale: What each normal row was multiplied by.
-        tangent_scale: What the tangential rows of each condition were multiplied by.
-        pressed_by: For each of them the position of its normal row under Coulomb's law, else −1.
+    The tables are those of equalities, contact normals and tangents; the weights are D on the local
+    primal unknowns, the other arguments as in ``ContactRows`` and ``TangentRows``.
     """
     rows = stack(list(tables))
     ends = np.cumsum([len(table) for table in tables])[:-1]

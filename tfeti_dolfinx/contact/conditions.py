@@ -36,16 +36,11 @@ class Side:
 def conditions(
     dofs: TornDofs, contact: int, side: Side, integrals: MortarIntegrals
 ) -> ContactRecords:
-    """Sum the facets' contributions to each node, and divide by ∫ψ_i. Collective.
+    """Sum the contributions of facets on any rank to each node, and divide by ∫ψ_i. Collective.
 
-    A node whose covered share of ∫φ_i is below 1e-6 gets no condition. The gaps are those of the
-    geometry, all conditions are taken to be within reach, and none has friction.
-
-    Args:
-        dofs: Dof maps.
-        contact: Index of the contact.
-        side: The surface whose vertices get conditions, along its normals.
-        integrals: What facets on any rank contribute.
+    The vertices of the side get conditions along its normals, but where the covered share of ∫φ_i
+    is below 1e-6. The gaps are those of the geometry, all conditions are taken to be within reach,
+    and none has friction.
     """
     area = dofs.reduce_on_owners(integrals.vertices.ravel(), integrals.covered.ravel())
     whole = dofs.reduce_on_owners(side.facets.vertices.ravel(), side.areas.ravel())

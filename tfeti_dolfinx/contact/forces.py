@@ -43,13 +43,7 @@ class BodyForces:
 
 
 def resultant(comm: MPI.Comm, points: Array, forces: Array) -> Resultant:
-    """Return the resultant of forces at points of this rank. Collective.
-
-    Args:
-        comm: Communicator.
-        points: Shape ``(n, 3)``.
-        forces: Shape ``(n, gdim)``.
-    """
+    """Resultant of forces, ``(n, gdim)``, at points of this rank, ``(n, 3)``. Collective."""
     own = np.sum(_with_moments(points, forces), axis=0)
     comm.Allreduce(MPI.IN_PLACE, own)
     return Resultant(own[:-3], own[-3:])
@@ -69,16 +63,9 @@ def condition_areas(
     surfaces: list[str | int],
     thickness: Any = 1.0,
 ) -> Array:
-    """∫φ_i times the thickness of each condition of this rank, shape ``(n,)``. Collective.
+    """∫φ_i of each condition, ``(n,)``, times a number or a scalar in UFL. Collective.
 
     Where a pair covers a part of the node's surface, the thickness is its mean over the whole.
-
-    Args:
-        records: Conditions of this rank.
-        dofs: Dof maps.
-        decomposition: The torn mesh.
-        surfaces: The secondary surfaces.
-        thickness: A number, or a scalar in UFL.
     """
     if isinstance(thickness, float):
         return thickness * records.area
@@ -106,16 +93,8 @@ def vertex_tractions(
 ) -> tuple[Array, Array]:
     """Tractions whose moments with the hats of degree 1 are those of nodal forces. Collective.
 
-    Args:
-        forces: Nodal forces on the owned groups, shape ``(g, gdim)``.
-        dofs: Dof maps.
-        decomposition: The torn mesh.
-        names: All contact surfaces.
-        thickness: What their areas are multiplied with, as in ``hat_integrals``.
-
-    Returns:
-        Force / ∫φ_i for each owned group that is a vertex of the surfaces, else 0, shape
-        ``(g, gdim)``; and ∫φ_i, shape ``(g,)``.
+    Return force / ∫φ_i for each owned group that is a vertex of the surfaces of these names, else
+    0, shape ``(g, gdim)``; and ∫φ_i, times the thickness, shape ``(g,)``.
     """
     area = hat_integrals(dofs, decomposition, names, thickness)
     if dofs.V.element.basix_element.degree > 1:

@@ -144,12 +144,9 @@ class Coulomb(FrictionLaw):
 def with_friction(
     name: str, friction: FrictionLaw | None, records: ContactRecords, dofs: TornDofs
 ) -> ContactRecords:
-    """Return the conditions of a contact with its friction, their tangents along its direction.
+    """Give a contact's conditions its friction, and tangents along its direction. Collective.
 
-    Collective.
-
-    Raises:
-        InputError: The space is scalar, or the direction does not fit or is along a normal.
+    Raise an InputError where the space is scalar, or the direction does not fit.
     """
     if friction is None:
         return records
@@ -181,19 +178,11 @@ def with_friction(
 def friction_values(
     name: str, friction: FrictionLaw, records: ContactRecords, dofs: TornDofs
 ) -> Array:
-    """Bounds or coefficients of all conditions along their tangents. Collective.
-
-    Args:
-        name: Name of the contact, for messages.
-        friction: Its law.
-        records: Its conditions.
-        dofs: Dof maps.
-
-    Returns:
-        Shape ``(n, gdim - 1)``.
+    """Bounds or coefficients of conditions along tangents, ``(n, gdim - 1)``. Collective.
 
     Raises:
-        InputError: A value is negative or no number somewhere, or a function on another mesh.
+        InputError: A value is negative or no number somewhere, or a function on another mesh; the
+            message begins with the contact's name.
     """
     x, what = group_points(dofs)[records.group], f"{name}: {friction.what}"
     columns = []
@@ -236,16 +225,12 @@ def _at_groups(what: str, function: fem.Function, dofs: TornDofs) -> Array:
 
 
 def numbers_at(what: str, value: Any, x: Array, lowest: float = -np.inf) -> Array:
-    """Return what a user gives at points, a number for each. Not collective.
+    """Return a number for each point, shape ``(n, 3)``, from what a user gives. Not collective.
 
-    Args:
-        what: Begins messages.
-        value: A number, a function of points of shape ``(3, n)``, or an array of their values.
-        x: The points, shape ``(n, 3)``.
-        lowest: What they may not be below: 0, or −∞.
+    That is a number, a function of points of shape ``(3, n)``, or an array of their values.
 
     Raises:
-        InputError: The function fails, or a number is out of the range.
+        InputError: The function fails, or a number is not finite or below the lowest.
     """
     if callable(value):
         try:

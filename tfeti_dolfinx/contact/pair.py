@@ -208,17 +208,13 @@ class Contact(ContactPartner):
 def _ratios(
     records: ContactRecords, sides: tuple[Side, Side], dofs: TornDofs, stiffness: Array
 ) -> tuple[float, float]:
-    """Compare the sides of a pair where they meet: the first over the second. Collective.
+    """Compare sizes and stiffness of the sides where they meet, first over second. Collective.
 
     Stiffness per area is E/h of the elements at a surface: Σ n_i·K_ii n_i / Σ ∫φ_i over its
-    vertices, K_ii the block of K before anything is glued, n_i the normal. Sizes are harmonic
-    means, which a few large facets beside many small ones do not decide. The vertices that rows
-    name are taken, so that a mesh that is fine only where the bodies touch is judged there; where
-    there is no such row, all of them.
-
-    Returns:
-        Sizes of facets (roots of areas, in 2D lengths), h over h; stiffness per area, E/h over
-        E/h; the same on all ranks.
+    vertices, K_ii the block of K before anything is glued, n_i the normal. Sizes h, roots of areas,
+    are harmonic means, which a few large facets beside many small ones do not decide. The vertices
+    that rows name are taken, so that a mesh that is fine only where the bodies touch is judged
+    there; where there is no such row, all of them.
     """
     whole = dofs.reduce(stiffness.reshape(-1, dofs.bs**2), np.add, 0.0)
     blocks = whole.reshape(-1, dofs.bs, dofs.bs)

@@ -100,14 +100,9 @@ class ContactPartner:
         reach: float,
         stiffness: Array,
     ) -> tuple[ContactPartner, ContactRecords]:
-        """Return the contact with its sides decided, and its conditions; arguments as ``records``.
+        """Return the contact with its sides decided, and its conditions up to a reach, and so deep.
 
-        Args:
-            dofs: Dof maps.
-            decomposition: The torn mesh.
-            contact: Index of the contact.
-            reach: Reach, and depth.
-            stiffness: Block of K of each primal node, shape ``(num_nodes, bs, bs)``.
+        ``stiffness`` is the block of K of each primal node, shape ``(num_nodes, bs, bs)``.
         """
         return self, self.records(dofs, decomposition, contact, reach, reach)
 
@@ -162,11 +157,7 @@ class ContactPartner:
 
 
 def position_of(contacts: Sequence[ContactPartner], which: int | str) -> int:
-    """Return the position of a contact that is given by its position or its name.
-
-    Raises:
-        InputError: There is no such contact, or several have the name.
-    """
+    """Return the position of a contact, given that or its name; raise an InputError else."""
     names = [contact.name for contact in contacts]
     if is_whole(which) and 0 <= which < len(names):
         return int(which)
@@ -182,11 +173,7 @@ def position_of(contacts: Sequence[ContactPartner], which: int | str) -> int:
 def gaps_by_position(
     contacts: Sequence[ContactPartner], gaps: Mapping[int | str, Gap]
 ) -> dict[int, Gap]:
-    """Return gaps of contacts that are given by their positions or names, by position.
-
-    Raises:
-        InputError: There is no such contact, or one is there twice.
-    """
+    """Return gaps by position of contacts that are given by position or name, each once."""
     checked_type(gaps, Mapping, "gap", "a dictionary from contacts to gaps")
     found: dict[int, Gap] = {}
     for which, gap in gaps.items():
@@ -198,11 +185,7 @@ def gaps_by_position(
 
 
 def checked_contacts(contacts: Sequence[ContactPartner]) -> list[ContactPartner]:
-    """Return the contacts as a list.
-
-    Raises:
-        InputError: They are not a sequence of obstacles and pairs.
-    """
+    """Return the contacts as a list; raise an InputError unless they are obstacles and pairs."""
     if not isinstance(contacts, Sequence):
         raise InputError(f"contacts: expected a list, got {shown(contacts)}")
     for contact in contacts:
@@ -212,12 +195,7 @@ def checked_contacts(contacts: Sequence[ContactPartner]) -> list[ContactPartner]
 
 
 def check_together(contacts: Sequence[ContactPartner], decomposition: Decomposition) -> None:
-    """Raise if contacts do not go together.
-
-    Raises:
-        InputError: A pair is there twice, whose force would be shared, or a surface slides on
-            several obstacles by different laws.
-    """
+    """Raise an InputError where a pair is there twice, or a surface slides by different laws."""
     pairs, obstacles = set(), dict[int, ContactPartner]()
     for contact in contacts:
         tags = frozenset(decomposition.surface(name) for name in contact.surfaces)

@@ -102,30 +102,16 @@ def concatenate(records: list[ContactRecords], gdim: int) -> ContactRecords:
 
 
 def relative_motion(records: ContactRecords, dofs: TornDofs, values: Array) -> Array:
-    """Σ_j w_ij u_j of all conditions of this rank: the node's, less that of what it meets.
+    """Σ_j w_ij u_j of all conditions, from u of the owned groups: ``(g, gdim)`` to ``(n, gdim)``.
 
-    Collective.
-
-    Args:
-        records: The conditions.
-        dofs: Dof maps.
-        values: The u_j of the owned groups, shape ``(g, gdim)``.
-
-    Returns:
-        Lengths, shape ``(n, gdim)``.
+    It is the motion of a node, less that of what it meets. Collective.
     """
     (u,) = dofs.lookup(records.entry_group, values)
     return sum_rows(records.condition, records.weight[:, None] * u, len(records))
 
 
 def relative_displacement(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
-    """Return the v_i, shape ``(n, gdim)``. Collective.
-
-    Args:
-        records: The conditions.
-        dofs: Dof maps.
-        u: Displacement in primal order, shape ``(num_nodes * bs,)``; of torn copies the mean.
-    """
+    """The v_i, ``(n, gdim)``, from u in primal order; of torn copies the mean. Collective."""
     total = dofs.reduce(u.reshape(-1, dofs.bs), np.add, 0.0)
     return relative_motion(records, dofs, total / dofs.multiplicity[:, None])
 

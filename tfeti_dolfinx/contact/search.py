@@ -77,13 +77,9 @@ class ContactSearch:
         return concatenate(self._records, self._dofs.bs)
 
     def friction(self) -> Array:
-        """Bounds or coefficients of all conditions of this rank along their tangents.
+        """Bounds or coefficients of all conditions along their tangents, 0 without friction.
 
-        Returns:
-            Shape ``(n, gdim - 1)``; 0 where there is no friction.
-
-        Raises:
-            InputError: A value is negative or no number somewhere.
+        Shape ``(n, gdim - 1)``. Raise an InputError where one is negative or no number.
         """
         parts = [np.zeros((0, max(self._dofs.bs - 1, 0)))]
         for contact, records in zip(self.contacts, self._records, strict=True):
@@ -95,17 +91,11 @@ class ContactSearch:
         return np.concatenate(parts)
 
     def set_gaps(self, gaps: Mapping[int, Gap]) -> None:
-        """Give contacts another ``gap=``; their conditions stay, but for their gaps.
+        """Give contacts, by position, another ``gap=``; their conditions stay, but for their gaps.
 
         Conditions within reach stay those, so that rows of B stay; others are looked at by
-        ``take_in_overlapping``, as ever.
-
-        Args:
-            gaps: By position in the list: "geometry", "curved", a number, or a function of points.
-
-        Raises:
-            InputError: A gap does not fit, or that of the geometry overlaps too deep. Nothing has
-                changed.
+        ``take_in_overlapping``, as ever. Raise an InputError where a gap does not fit, or that of
+        the geometry overlaps too deep; nothing has changed then.
         """
         contacts, records = list(self.contacts), list(self._records)
         for i, gap in gaps.items():
@@ -126,16 +116,10 @@ class ContactSearch:
             self._reach[i] = max(reach[i], self._reach[i])
 
     def take_in_overlapping(self, u: Array, tolerance: float) -> int:
-        """Give rows to conditions without one that a displacement violates.
+        """Give rows to conditions without one that u, in primal order, violates by a length.
 
-        Where surfaces have moved farther than the search went, it is done again.
-
-        Args:
-            u: Displacement in primal order, shape ``(num_nodes * bs,)``.
-            tolerance: Overlaps up to this length are none.
-
-        Returns:
-            How many rows are new, on all ranks.
+        Where surfaces have moved farther than the search went, it is done again. Return how many
+        rows are new, on all ranks.
         """
         way = u if self._origin is None else u - self._origin
         count = 0
@@ -156,8 +140,7 @@ class ContactSearch:
     def widen(self) -> int:
         """Increase the reach until a condition gets a row, since far contact may hold a body.
 
-        Returns:
-            How many rows are new, on all ranks; 0 where nothing is left to find.
+        Return how many rows are new, on all ranks; 0 where nothing is left to find.
         """
         new = 0
         while new == 0 and not self.is_exhausted:

@@ -63,11 +63,7 @@ class Placed:
         self._vectors = vectors
 
     def check_dimension(self, gdim: int, whose: str) -> None:
-        """Raise if the shape is not placed in a space of this dimension.
-
-        Raises:
-            InputError: In 3D a vector has two components, or in 2D one points out of the plane.
-        """
+        """Raise an InputError where a vector is plane in 3D, or points out of the plane in 2D."""
         for what, values in self._vectors.items():
             if len(values) == 2 and gdim == 3:
                 raise InputError(f"{whose}: {what}={values}, expected three components in 3D")
@@ -203,11 +199,7 @@ class SignedDistance:
 
 
 def check_shape(shape: Any, what: str) -> None:
-    """Raise unless an object is a shape.
-
-    Raises:
-        InputError: It has not the two methods of a shape.
-    """
+    """Raise an InputError unless an object has the two methods of a shape."""
     methods = [getattr(shape, name, None) for name in ("distance", "gradient")]
     if isinstance(shape, type) or not all(callable(method) for method in methods):
         raise InputError(
@@ -217,18 +209,9 @@ def check_shape(shape: Any, what: str) -> None:
 
 
 def distance_and_gradient(shape: Shape, x: Array, what: str) -> tuple[Array, Array]:
-    """Signed distance and its gradient at points.
+    """Signed distance, ``(n,)``, and gradient, ``(n, 3)``, at points, ``(n, gdim)``.
 
-    Args:
-        shape: The shape.
-        x: Points of this rank, shape ``(n, 2)`` or ``(n, 3)``.
-        what: Begins messages.
-
-    Returns:
-        Shapes ``(n,)`` and ``(n, 3)``.
-
-    Raises:
-        InputError: A callable fails, or returns arrays of another shape.
+    Raise an InputError where a callable fails, or returns arrays of another shape.
     """
     return _values_of(shape, "distance", x, what), _values_of(shape, "gradient", x, what)
 

@@ -44,13 +44,8 @@ def displacement_space(
 def check_form(form: Any, name: str, V: fem.FunctionSpace, decomposition: Decomposition) -> None:
     """Raise an InputError if space, coefficients, geometry, measures or tags of a form do not fit.
 
-    Collective.
-
-    Args:
-        form: The form; a linear one may be zero.
-        name: ``"a"`` or ``"L"``, of nonlinear problems ``"J"`` or ``"F"``.
-        V: The space of displacements.
-        decomposition: The torn mesh.
+    Collective. Linear forms, ``"L"`` and ``"F"``, may be zero; bilinear ones are ``"a"`` and
+    ``"J"``.
     """
     if name in LINEAR:
         if is_zero(form):
@@ -67,14 +62,9 @@ def check_not_negative(
 ) -> None:
     """Raise an InputError if a scalar in UFL is negative or no number somewhere in a cell.
 
-    Collective. It is asked at the corners of each cell and at points inside.
-
-    Args:
-        value: The scalar, with its present constants and functions.
-        what: Its name in messages.
-        mesh: Its mesh.
-        degree: Of the quadrature whose points inside are taken.
-        rounding: Share of the largest value that may be missing to 0.
+    Collective. It is asked, with its present constants and functions, at the corners of each cell
+    and at the points of a quadrature of this degree; rounding is the share of the largest value
+    that may be missing to 0.
     """
     cell_type = getattr(basix.CellType, mesh.topology.cell_type.name)
     inside, _ = basix.make_quadrature(cell_type, degree)

@@ -113,15 +113,10 @@ def nodal(expression: Any, dofs: TornDofs, name: str) -> fem.Function:
 
 
 def from_vertices(dofs: TornDofs, values: Array, vertices: Array) -> fem.Function:
-    """Scalar function from values at vertices. Collective.
+    """Scalar function from values of the owned groups that are vertices, both ``(g,)``. Collective.
 
     Nodes between vertices take the value of the linear interpolant where all those vertices have
     one, else 0: a field of a surface stays on the surface.
-
-    Args:
-        dofs: Dof maps.
-        values: One value per owned group, shape ``(g,)``.
-        vertices: Which groups are vertices with a value, shape ``(g,)``.
     """
     (S, _), (W, node) = dofs.scalar, dofs.hats
     function, inside = fem.Function(S), fem.Function(S)

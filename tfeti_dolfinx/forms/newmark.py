@@ -95,9 +95,8 @@ class InertialForms(Forms):
     def take_step(self, size: float, same: float = 1e-9) -> None:
         """Let the next step have a size; another one than the last makes the matrix anew.
 
-        Args:
-            size: The size; an InputError is raised unless it is positive and on all ranks the same.
-            same: Share of it by which equal steps differ, since their times are rounded.
+        Sizes that differ by a share ``same`` are equal: their times are rounded. Raise an
+        InputError unless it is positive and on all ranks the same.
         """
         with agreeing(self._comm, "take_step") as given:
             given["step"] = size = checked_number(size, "step", STEP)
@@ -172,13 +171,10 @@ class InertialForms(Forms):
 
 
 def check_mass(M: csr_array, bs: int, rounding: float = 1e-10) -> None:
-    """Raise an InputError unless a matrix is that of a mass in every direction.
+    """Raise an InputError unless this rank's matrix is that of a mass in every direction.
 
-    Args:
-        M: This rank's matrix.
-        bs: Unknowns per node.
-        rounding: Share of the sum of the diagonal up to which the mass of a translation is 0, as
-            where M has a kernel.
+    ``rounding`` is the share of the sum of the diagonal up to which the mass of a translation is 0,
+    as where M has a kernel.
     """
     check_stiffness("mass", M, "the matrix", "a density, or a form such as ∫ρ u·v")
     for k in range(bs):
@@ -195,11 +191,8 @@ def check_mass(M: csr_array, bs: int, rounding: float = 1e-10) -> None:
 def check_copies(values: Array, dofs: TornDofs, name: str, left: float = 1e-3) -> None:
     """Raise an InputError where torn copies of a node differ, or a value is not finite. Collective.
 
-    Args:
-        values: A displacement or a velocity in DOLFINx's order.
-        dofs: Dof maps.
-        name: What it is.
-        left: Share of the largest value by which a solver may have left them apart.
+    The values are in DOLFINx's order; ``left`` is the share of the largest one by which a solver
+    may have left them apart.
     """
     primal = dofs.to_primal(np.asarray(values)).reshape(-1, dofs.bs)
     with raised_on_all_ranks(dofs.comm):
@@ -228,13 +221,9 @@ def mass_form(
 ) -> ufl.Form:
     """Return ∫ρ u·v, times the thickness. Collective.
 
-    Args:
-        density: Mass per volume: a number, a scalar in UFL, or numbers for all volumes by names.
-        V: Space of displacements.
-        decomposition: The torn mesh.
-        thickness: What the other forms were multiplied with.
-        lumped: Whether to integrate at the vertices, which makes M diagonal; an InputError is
-            raised for elements of another degree than 1.
+    The density is a number, a scalar in UFL, or numbers for all volumes by names. Lumped, it is
+    integrated at the vertices, which makes M diagonal; elements of another degree than 1 raise an
+    InputError then.
     """
     rho = in_ufl(density, decomposition, "mass", POSITIVE)
     degree = V.element.basix_element.degree

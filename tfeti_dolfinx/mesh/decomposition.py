@@ -24,12 +24,7 @@ from tfeti_dolfinx.mesh.untorn import PhysicalNames
 def check_tags(tags: Any, mesh: dmesh.Mesh, of_cells: bool, what: str, expected: str) -> None:
     """Raise an InputError unless tags are those of a mesh's cells, or of its facets.
 
-    Args:
-        tags: What was given.
-        mesh: The mesh.
-        of_cells: Whether cells are tagged, else facets.
-        what: The tags' name in messages.
-        expected: What to give instead, for messages.
+    Messages have the tags' name, and what is expected instead.
     """
     checked_type(tags, dmesh.MeshTags, what, "dolfinx.mesh.MeshTags")
     if tags.topology is not mesh.topology._cpp_object:

@@ -188,15 +188,10 @@ class TornDofs:
         return self._primal_node[dolfinx_nodes]
 
     def reduce(self, values: Array, op: np.ufunc, initial: Any) -> Array:
-        """Combine the values of all copies of a node. Collective.
+        """Combine the values of all copies of a node: ``(n, ...)`` to ``(g, ...)``. Collective.
 
-        Args:
-            values: One value (or row) per local primal node, shape ``(n, ...)``.
-            op: ``np.add``, ``np.maximum``, ``np.minimum`` or ``np.logical_or``.
-            initial: Neutral element of ``op``.
-
-        Returns:
-            One value per owned group, shape ``(g, ...)``.
+        ``op`` is ``np.add``, ``np.maximum``, ``np.minimum`` or ``np.logical_or``, ``initial`` its
+        neutral element.
         """
         out = np.full((self.num_groups, *values.shape[1:]), initial, dtype=values.dtype)
         op.at(out, self._to_owner_slot, self._to_owner.send(values))
@@ -207,31 +202,16 @@ class TornDofs:
         return self._to_owner.answer(values[self._to_owner_slot])
 
     def lookup(self, groups: Array, *tables: Array) -> tuple[Array, ...]:
-        """Return rows of tables that the owners of groups hold. Collective.
-
-        Args:
-            groups: Global groups, any of them, shape ``(k,)``.
-            tables: Arrays with one row per owned group.
-
-        Returns:
-            For each table its rows for ``groups``.
-        """
+        """Rows for any groups, ``(k,)``, of tables with a row per owned group. Collective."""
         exchange, asked = self._to_owners_of(groups)
         return tuple(exchange.answer(table[asked]) for table in tables)
 
     def reduce_on_owners(
         self, groups: Array, values: Array, op: np.ufunc = np.add, initial: Any = 0
     ) -> Array:
-        """Combine the values that all ranks give for each owned group. Collective.
+        """Combine what all ranks give for any groups: ``(k,)`` and ``(k, ...)`` to ``(g, ...)``.
 
-        Args:
-            groups: Global groups, any of them, shape ``(k,)``.
-            values: One value (or row) for each, shape ``(k, ...)``.
-            op: ``np.add``, ``np.maximum`` or ``np.minimum``.
-            initial: Neutral element of ``op``.
-
-        Returns:
-            Shape ``(g, ...)``.
+        ``op`` and ``initial`` are as in ``reduce``. Collective.
         """
         exchange, slot = self._to_owners_of(groups)
         out = np.full((self.num_groups, *values.shape[1:]), initial, dtype=values.dtype)
@@ -267,14 +247,9 @@ class TornDofs:
         return self._to_owner.send(values)[self._copy_order]
 
     def lookup_copies(self, groups: Array, *tables: Array) -> tuple[Array, ...]:
-        """All copies of groups, wherever they are owned. Collective.
+        """Find all copies of groups, ``(k,)``, and their rows of tables. Collective.
 
-        Args:
-            groups: Global groups, shape ``(k,)``.
-            tables: Arrays with one row per copy of the owned groups.
-
-        Returns:
-            Position in ``groups`` of each copy, and for ``copies`` and each table its row.
+        Return the position in ``groups`` of each copy, and for ``copies`` and each table its row.
         """
         position, columns = np.arange(len(groups)), (self.copies, *tables)
         (count,) = self.lookup(groups, self.multiplicity)

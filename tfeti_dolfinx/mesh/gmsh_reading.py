@@ -119,16 +119,9 @@ def check_shared(
     """Raise an InputError unless the files are of one mesh. Collective.
 
     Nodes of one id, and cells of the same nodes, meet on the rank that the id or key names: a node
-    may not lie at different places, nor a cell in two files.
-
-    Args:
-        mesh: The mesh joined.
-        node_ids: Ids of the nodes of each file, one file after the other, shape ``(p,)``.
-        x: Their coordinates in these files, shape ``(p, d)``.
-        extent: Length of the mesh.
-        comm: Communicator.
-        same_place: Distance over that length up to which a node's places are the same: files in
-            text keep fewer digits than gmsh has.
+    may not lie at different places, nor a cell in two files. Ids and places are those of each file,
+    one after the other; files in text keep fewer digits than gmsh has, so places are the same up to
+    a share of the mesh's extent.
     """
     exchange = exchange_by_key(comm, node_ids)
     node_ids, x = exchange.send(node_ids), exchange.send(x)
@@ -172,10 +165,8 @@ def untorn_mesh(
 ) -> tuple[UntornMesh, Array | None]:
     """Return the untorn mesh, and the partition of each cell if all cells have one. Collective.
 
-    Args:
-        contents: What this rank has read, maybe nothing.
-        comm: Communicator.
-        shared: Whether models of different ranks may have nodes and facets in common.
+    ``contents`` is what this rank has read, maybe nothing; shared models may have nodes and facets
+    in common with those of other ranks.
 
     Raises:
         InputError: There are no physical groups of cells, the cells are of several types or of

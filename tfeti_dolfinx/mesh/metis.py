@@ -16,14 +16,11 @@ from tfeti_dolfinx.mesh.untorn import UntornMesh, mix
 
 
 def metis(mesh: UntornMesh, num_parts: int, comm: MPI.Intracomm) -> Array:
-    """METIS parts of the facet graph, for a mesh that lies on one rank, made round. Collective.
+    """METIS part of each cell of a mesh that lies on one rank, by facets, made round. Collective.
 
     Each body gets a share of the parts by its number of cells, and at least one. METIS cuts few
-    facets, but leaves parts that are long, or that hang together thinly; what F makes of their
-    soft motions costs conjugate gradients many steps.
-
-    Returns:
-        Part of each local cell.
+    facets, but leaves parts that are long, or that hang together thinly; what F makes of their soft
+    motions costs conjugate gradients many steps.
     """
     with raised_on_all_ranks(comm):
         n, pairs = len(mesh.cells), mesh.neighbours()
@@ -63,21 +60,13 @@ def _shares(weights: Array, num_parts: int) -> Array:
 
 
 def compact_parts(x: Array, part: Array, num_parts: int) -> Array:
-    """Balanced k-means, begun at given parts.
+    """Balanced k-means of midpoints, ``(n, gdim)``, begun at given parts, ``(n,)``, none empty.
 
-    A point is in the part with the least ‖x − c_k‖/w_k, the centre c_k being the mean of the
-    part, and the influence w_k what gives all parts the same number of points, so that parts are
-    round where a mesh is graded, too (von Looz, Tzovas, Meyerhenke, ICPP 2018,
-    doi:10.1145/3225058.3225148).
-
-    Args:
-        x: Midpoints of cells, shape ``(n, gdim)``.
-        part: Their parts, shape ``(n,)``; none is empty.
-        num_parts: Number of parts.
-
-    Returns:
-        New parts, shape ``(n,)``; the given ones where these are small, or where the new ones are
-        not balanced.
+    A point is in the part with the least ‖x − c_k‖/w_k, the centre c_k being the mean of the part,
+    and the influence w_k what gives all parts the same number of points, so that parts are round
+    where a mesh is graded, too (von Looz, Tzovas, Meyerhenke, ICPP 2018,
+    doi:10.1145/3225058.3225148). The given parts are returned where these are small, or where the
+    new ones are not balanced.
     """
     n = len(x)
     if num_parts == 1 or n < PARTITION.fewest * num_parts:
@@ -133,15 +122,9 @@ def flatten_interfaces(mesh: UntornMesh, pairs: tuple[Array, Array], part: Array
 
     Of each part count the cells that share a vertex with a cell, once for each such vertex, and
     those that share a facet with it twelve times more. A cell that counts more of a neighbour's
-    part than of its own joins it, which takes off what sticks out of an interface.
-
-    Args:
-        mesh: A mesh that lies on this rank.
-        pairs: Its neighbours.
-        part: Part of each cell, shape ``(n,)``.
-
-    Returns:
-        New parts, shape ``(n,)``; some may no longer be connected through facets.
+    part than of its own joins it, which takes off what sticks out of an interface. Some of the new
+    parts may no longer be connected through facets. The mesh, its pairs of neighbours and the parts
+    are those of one rank.
     """
     n, k, num_parts = len(part), mesh.num_vertices, int(part.max(initial=-1)) + 1
     if num_parts < 2:

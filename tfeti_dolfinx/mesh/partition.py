@@ -88,19 +88,10 @@ def bisect_points(
 ) -> Array:
     """Recursive coordinate bisection of distributed points (Berger, Bokhari 1987). Collective.
 
-    All parts are halved at once, across the longest side of their box; neighbouring part
-    numbers are neighbours in space.
-
-    Args:
-        x: Points of this rank, shape ``(n, gdim)``.
-        num_parts: Number of parts.
-        comm: Communicator.
-        extents: Of the cells whose midpoints they are, shape ``(n, gdim)``. Where some are flat,
-            cuts lie between layers of cells, or at least between columns along the axis in which
-            they are flat, if few cells change sides by that.
-
-    Returns:
-        Part of each local point, shape ``(n,)``.
+    All parts are halved at once, across the longest side of their box; neighbouring part numbers
+    are neighbours in space. With the extents of the cells whose midpoints they are, both ``(n,
+    gdim)``, cuts lie between layers of cells where some are flat, or at least between columns along
+    the axis in which they are flat, if few cells change sides by that.
     """
     # integers on a grid, so that the parts do not depend on how ranks share the points
     low, high = box_over_ranks(comm, x)
@@ -326,12 +317,8 @@ def assign_subdomains(
 ) -> Array:
     """Subdomain of each local cell, numbered 0, 1, ... without holes. Collective.
 
-    Args:
-        mesh: The untorn mesh.
-        subdomains: Their number; or one id per local cell; or a callable that gets cell
-            midpoints, shape ``(3, n)``, and returns one id per cell.
-        comm: Communicator.
-        partition: Partitions a mesh into a number of parts.
+    Given are their number, for which ``partition`` makes parts; or one id per local cell; or a
+    callable that gets cell midpoints, shape ``(3, n)``, and returns one id per cell.
 
     Raises:
         InputError: The number is not between 1 and the number of cells, the ids are not one

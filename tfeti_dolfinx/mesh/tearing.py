@@ -31,13 +31,8 @@ from tfeti_dolfinx.mesh.untorn import (
 def deal(weights: Array, centres: Array, num_ranks: int) -> Array:
     """Return the rank of each subdomain: neighbouring subdomains in chunks of about equal weight.
 
-    Args:
-        weights: Cells of each subdomain, shape ``(N,)``.
-        centres: Centres of the subdomains, shape ``(N, gdim)``.
-        num_ranks: Number of ranks.
-
-    Returns:
-        Ranks, shape ``(N,)``; each rank has a subdomain if there are enough of them.
+    The weights are their numbers of cells, shape ``(N,)``, the centres ``(N, gdim)``. Each rank has
+    a subdomain if there are enough of them.
     """
     n = len(weights)
     order = np.argsort(bisect_points(centres, n, MPI.COMM_SELF), kind="stable")
@@ -93,16 +88,10 @@ log = logging.getLogger(__name__)
 def tear(
     untorn: UntornMesh, subdomain: Array, comm: MPI.Intracomm, absorb: bool = False
 ) -> Decomposition:
-    """Tear a mesh along the interfaces of its subdomains. Collective.
+    """Tear this rank's share of a mesh along the interfaces of its subdomains. Collective.
 
-    Args:
-        untorn: This rank's share of the mesh.
-        subdomain: Subdomain of each of its cells, numbered without holes.
-        comm: Communicator of the torn mesh.
-        absorb: Let fragments of a disconnected subdomain join a neighbour where they can.
-
-    Returns:
-        The torn mesh with its tags.
+    These are numbered without holes. ``absorb`` lets fragments of a disconnected subdomain join a
+    neighbour where they can.
     """
     share, subdomain = redistribute(untorn, subdomain, comm)
     if absorb:

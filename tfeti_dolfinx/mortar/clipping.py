@@ -41,13 +41,9 @@ class CommonParts:
         return part, self.vertices[part, place]
 
     def quadrature(self, degree: int) -> tuple[Array, Array, Array]:
-        """Quadrature points of all parts; polygons are cut into triangles at their first vertex.
+        """Quadrature of all parts that is exact to a degree; polygons are cut into triangles.
 
-        Args:
-            degree: Degree that is integrated exactly.
-
-        Returns:
-            Part of each point, points of shape ``(m, tdim)``, weights of shape ``(m,)``.
+        Return the part of each point, points of shape ``(m, tdim)``, weights of shape ``(m,)``.
         """
         y, count = self.vertices, self.count
         if y.shape[2] == 1:
@@ -68,12 +64,8 @@ class CommonParts:
 def common_parts(subject: Array, clip: Array) -> CommonParts:
     """Intersect pairs of intervals, or of convex polygons (Sutherland, Hodgman 1974).
 
-    Args:
-        subject: Vertices in order, shape ``(n, k, tdim)``.
-        clip: Vertices in order, shape ``(n, l, tdim)``.
-
-    Returns:
-        Parts of up to 2 or k + l vertices; none where they are apart or meet in a sliver only.
+    Vertices are in order, shapes ``(n, k, tdim)`` and ``(n, l, tdim)``. Parts have up to 2 or k + l
+    vertices; there are none where facets are apart or meet in a sliver only.
     """
     whole = sizes(clip)
     if subject.shape[2] == 1:
@@ -103,12 +95,7 @@ def sizes(polygon: Array) -> Array:
 
 
 def contains(polygon: Array, y: Array) -> Array:
-    """Return whether intervals or convex polygons contain a point each.
-
-    Args:
-        polygon: Vertices in order, shape ``(n, k, tdim)``.
-        y: Points, shape ``(n, tdim)``.
-    """
+    """Tell which intervals or convex polygons, ``(n, k, d)``, contain their point, ``(n, d)``."""
     if polygon.shape[2] == 1:
         return np.all((polygon.min(axis=1) < y) & (y < polygon.max(axis=1)), axis=1)
     edge = np.roll(polygon, -1, axis=1) - polygon

@@ -18,17 +18,12 @@ from tfeti_dolfinx.mortar.tolerances import SEARCH
 def with_curvature(facets: Facets, dofs: TornDofs, kind: FacetKind) -> Facets:
     """The same facets with the curvature of a smooth surface through their vertices. Collective.
 
-    At each vertex the heights of its neighbours over its tangent plane are fitted by
-    z = a·t + ½ tᵀKt, a the error of the averaged normal, by least squares of what each neighbour
-    says of the curvature. What remains of the normal equations without a is added up over the
-    vertices of a facet, so that a vertex at the rim, whose neighbours lie to one side, leaves to
-    the others what it does not know. Vertices at edges say nothing. Facets whose geometry has a
-    higher degree are curved themselves, and stay as they are.
-
-    Args:
-        facets: Facets of this rank with averaged normals.
-        dofs: Dof maps.
-        kind: Elements on the facets.
+    At each vertex the heights of its neighbours over its tangent plane are fitted by z = a·t + ½
+    tᵀKt, a the error of the averaged normal, by least squares of what each neighbour says of the
+    curvature. What remains of the normal equations without a is added up over the vertices of a
+    facet, so that a vertex at the rim, whose neighbours lie to one side, leaves to the others what
+    it does not know. Vertices at edges say nothing. Facets whose geometry has a higher degree are
+    curved themselves, and stay as they are.
     """
     normals, groups = facets.vertex_normals, facets.vertices.ravel()
     cosine = np.einsum("nvg,ng->nv", normals, facets.normal)
@@ -52,16 +47,10 @@ def with_curvature(facets: Facets, dofs: TornDofs, kind: FacetKind) -> Facets:
 
 
 def beside(kind: FacetKind, facets: Facets, rows: Array, xi: Array) -> Array:
-    """Vectors from points of facets to the smooth surface, shape ``(m, gdim)``.
+    """Vectors, ``(m, gdim)``, from points of facets, ``(m, tdim)``, to the smooth surface.
 
-    What a quadratic surface is beside its interpolant in the vertices,
-    −½ Σφ_i (x_i − x)ᵀK(x_i − x), along the facet's normal.
-
-    Args:
-        kind: Elements on the facets.
-        facets: Facets with curvature.
-        rows: Facet of each point, shape ``(m,)``.
-        xi: Reference coordinates, shape ``(m, tdim)``.
+    What a quadratic surface is beside its interpolant in the vertices, −½ Σφ_i (x_i − x)ᵀK(x_i −
+    x), along the facet's normal.
     """
     x, K = facets.x[rows], facets.curvature[rows]
     d = x[:, : kind.hats.size] - points(kind.geometry, x, xi)[:, None]
@@ -82,13 +71,10 @@ def _monomials(t: Array) -> Array:
 
 
 def _normal_equations(x: Array, normals: Array, axes: Array) -> tuple[Array, Array]:
-    """Return the least-squares equations for a and K at each vertex, from the others' positions.
+    """Return matrices and right sides of the least squares for a and K at each vertex, a first.
 
     Directions count as on the tangent plane, lengths as in space: then a circle has its own
-    curvature, however far its points are apart.
-
-    Returns:
-        Matrices and right sides, shapes ``(n, v, s, s)`` and ``(n, v, s)``, first a, then K.
+    curvature, however far its points are apart. Shapes ``(n, v, s, s)`` and ``(n, v, s)``.
     """
     d = x[:, None] - x[:, :, None]  # of vertex v to the others
     length = np.linalg.norm(d, axis=3)
@@ -132,13 +118,7 @@ def _on_facets(facets: Facets, axes: Array, S: Array, r: Array) -> Array:
 
 
 def _rotations(A: Array) -> Array:
-    """Return the rotations of tangents of one plane to those of another, from their products.
-
-    Of their projection it leaves out the strain.
-
-    Args:
-        A: Shape ``(..., 1, 1)`` or ``(..., 2, 2)``.
-    """
+    """Return the rotations of tangents of one plane to those of another, from their products."""
     if A.shape[-1] == 1:
         return np.ones_like(A)
     cosine, sine = A[..., 0, 0] + A[..., 1, 1], A[..., 1, 0] - A[..., 0, 1]

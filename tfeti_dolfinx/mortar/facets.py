@@ -75,15 +75,9 @@ def from_first(x: Array) -> Array:
 
 @cache
 def facet_dofs(cell: str, degree: int, variant: Any) -> Array:
-    """Cell unknowns of each facet, in the order of the facet's own element.
+    """Cell unknowns of a Lagrange element on each facet, in the order of the facet's own element.
 
-    Args:
-        cell: Name of the cell type.
-        degree: Degree of the Lagrange element.
-        variant: Its variant.
-
-    Returns:
-        Shape ``(facets, unknowns per facet)``.
+    Shape ``(facets, unknowns per facet)``; ``cell`` is the name of the cell type.
     """
     cell_type = getattr(basix.CellType, cell)
     points = basix.create_element(basix.ElementFamily.P, cell_type, degree, variant).points
@@ -189,13 +183,7 @@ def facet_kind(dofs: TornDofs) -> FacetKind:
 
 
 def local_facets(dofs: TornDofs, decomposition: Decomposition, facets: Array) -> Facets:
-    """Data of local boundary facets, without averaged normals.
-
-    Args:
-        dofs: Dof maps.
-        decomposition: The torn mesh.
-        facets: Local facets of the true boundary.
-    """
+    """Data of local facets of the true boundary, without averaged normals."""
     mesh = decomposition.mesh
     cell_type, gdim = mesh.topology.cell_type, mesh.geometry.dim
     cell, place = _cells_of(decomposition, facets)
@@ -276,18 +264,11 @@ def densities(element: FacetElement, x: Array, xi: Array) -> Array:
 
 
 def reference_points(element: FacetElement, nodes: Array, y: Array) -> Array:
-    """Reference coordinates of points in facets that lie in a line or a plane.
+    """Reference coordinates, ``(m, tdim)``, of points in facets that lie in a line or a plane.
 
-    Args:
-        element: Element of the facets.
-        nodes: Nodes of the facet of each point, shape ``(m, nodes, tdim)``.
-        y: The points, shape ``(m, tdim)``.
-
-    Returns:
-        Shape ``(m, tdim)``: at once where the map is affine, else by Newton's method.
-
-    Raises:
-        InputError: It does not converge, as facets are folded.
+    Each point, ``(m, tdim)``, has the nodes of its facet, ``(m, nodes, tdim)``. At once where the
+    map is affine, else by Newton's method; where that does not converge, as facets are folded,
+    raise an InputError.
     """
     origin = nodes[:, 0]
     xi = _solve((nodes[:, 1 : 1 + y.shape[1]] - origin[:, None]).transpose(0, 2, 1), y - origin)

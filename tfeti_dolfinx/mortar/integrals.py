@@ -81,14 +81,8 @@ def dual_multipliers(
 
     ψ = D_e M_e⁻¹ φ with D_e = diag ∫φ_i and M_e = ∫φ_i φ_j there. They sum up to 1, so a uniform
     pressure is met (Wohlmuth, SIAM J. Numer. Anal. 38, 2000; Cichosz, Bischoff, Comput. Methods
-    Appl. Mech. Eng. 200, 2011). A facet that is hardly covered has no share.
-
-    Args:
-        kind: Elements on the facets.
-        area: Areas of all facets.
-        facet: Facet of each point, shape ``(m,)``.
-        xi: Reference coordinates of the points, shape ``(m, tdim)``.
-        weight: Weights, shape ``(m,)``.
+    Appl. Mech. Eng. 200, 2011). A facet that is hardly covered, by its area, has no share. Points
+    have their facet, reference coordinates of shape ``(m, tdim)`` and a weight.
     """
     facets, place = np.unique(facet, return_inverse=True)
     hats = kind.hats.values(xi)
@@ -137,10 +131,7 @@ def integrate(
 def integrate_distance(kind: FacetKind, facets: Facets, distance: Array) -> MortarIntegrals:
     """Return integrals of the dual multipliers over whole facets that face an obstacle.
 
-    Args:
-        kind: Elements on the facets.
-        facets: The facets.
-        distance: Distance of the obstacle at their vertices, shape ``(n, v)``.
+    ``distance`` is that of the obstacle at their vertices, shape ``(n, v)``.
     """
     # exact for ψ_i φ_k on plane facets, and enough on curved ones
     facet, xi, weight = whole_facets(kind, facets, 4 * kind.displacement.degree)

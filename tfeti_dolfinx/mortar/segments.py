@@ -27,29 +27,19 @@ from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 
 def frames(normal: Array) -> Array:
-    """Right-handed orthonormal frames whose axis 0 is the normal.
+    """Right-handed orthonormal frames of unit normals: ``(n, gdim)`` to ``(n, gdim, gdim)``.
 
-    They depend on the normal alone, so they are the same on every rank.
-
-    Args:
-        normal: Unit vectors, shape ``(n, gdim)``.
-
-    Returns:
-        Shape ``(n, gdim, gdim)``: normal, then ``tangents``.
+    Axis 0 is the normal, then ``tangents``. They depend on the normal alone, so they are the same
+    on every rank.
     """
     return np.concatenate((normal[:, None], tangents(normal)), axis=1)
 
 
 def aligned(frame: Array, direction: Array) -> tuple[Array, Array]:
-    """Frames of space whose first tangent is along a direction, as far as it is tangential.
+    """Frames, ``(n, 3, 3)``, whose first tangent is along a unit vector, as far as it can be.
 
-    Args:
-        frame: Shape ``(n, 3, 3)``.
-        direction: Unit vector, shape ``(3,)``.
-
-    Returns:
-        The frames, and how long the direction's tangential part is, shape ``(n,)``; where it is
-        0 the frame is as it was.
+    Return them, and how long the direction's tangential part is, shape ``(n,)``; where it is 0 the
+    frame is as it was.
     """
     normal = frame[:, 0]
     first = direction - np.sum(direction * normal, axis=1, keepdims=True) * normal
@@ -63,17 +53,11 @@ def aligned(frame: Array, direction: Array) -> tuple[Array, Array]:
 
 
 def tangents(normal: Array) -> Array:
-    """Return orthonormal tangents of unit normals, as close to coordinate axes as they can be.
+    """Return orthonormal tangents of unit normals: ``(n, gdim)`` to ``(n, gdim - 1, gdim)``.
 
-    In 2D the normal turned left by a right angle. In 3D the x axis without its normal part (the
-    y axis where the normal is within 26° of the x axis), and the normal times that. They are
+    In 2D the normal turned left by a right angle. In 3D the x axis without its normal part (the y
+    axis where the normal is within 26° of the x axis), and the normal times that. They are
     continuous in the normal but for this switch. A scalar space has none.
-
-    Args:
-        normal: Unit vectors, shape ``(n, gdim)``.
-
-    Returns:
-        Shape ``(n, gdim - 1, gdim)``.
     """
     gdim = normal.shape[1]
     if gdim == 1:
@@ -94,17 +78,9 @@ def rendezvous(
 ) -> tuple[Facets, Facets]:
     """Bring facets that may meet to the same rank. Collective.
 
-    Each secondary facet goes to one rank, in chunks of equal number that are compact in space;
-    a primary facet goes to every rank whose box it comes near.
-
-    Args:
-        secondary: Secondary facets of this rank.
-        primary: Primary facets of this rank.
-        distance: How far apart facets may be, their own sizes not counted.
-        comm: Communicator.
-
-    Returns:
-        The secondary and the primary facets that have come to this rank.
+    Each secondary facet goes to one rank, in chunks of equal number that are compact in space; a
+    primary facet goes to every rank whose box it comes near, up to a distance beside their own
+    sizes.
     """
     here = secondary.sent(Exchange(comm, bisect_points(secondary.centre, comm.size, comm)))
     size = here.radius.max(initial=0.0)
@@ -125,19 +101,11 @@ def rendezvous(
 def possible_pairs(secondary: Facets, primary: Facets, distance: float) -> tuple[Array, Array]:
     """Find pairs of facets that may meet along the secondary facets' normals.
 
-    A primary facet is found if it comes within a secondary facet's radius of the line through
-    that facet's centre along its averaged normal, no farther than ``distance`` and the facets'
-    sizes from the centre. Primary facets are sorted into classes of equal size up to a factor of 2,
-    each with a tree of its own, so that a graded mesh does not make large facets meet small ones
-    in vain.
-
-    Args:
-        secondary: Secondary facets, with averaged normals.
-        primary: Primary facets.
-        distance: How far to look, to both sides.
-
-    Returns:
-        Secondary and primary facet of each pair.
+    A primary facet is found if it comes within a secondary facet's radius of the line through that
+    facet's centre along its averaged normal, no farther than ``distance``, to both sides, and the
+    facets' sizes from the centre. Primary facets are sorted into classes of equal size up to a
+    factor of 2, each with a tree of its own, so that a graded mesh does not make large facets meet
+    small ones in vain.
     """
     s_centre, s_size = secondary.centre, secondary.radius
     p_centre, p_size = primary.centre, primary.radius
@@ -169,15 +137,8 @@ def _march(
 ) -> tuple[Array, Array]:
     """Return points of a tree within a radius of line segments: steps as long as nothing is near.
 
-    Args:
-        tree: The points.
-        origin: Middle of each segment, shape ``(n, gdim)``.
-        direction: Unit vectors, shape ``(n, gdim)``.
-        radius: One per segment, shape ``(n,)``.
-        half_length: Half the length of each segment, shape ``(n,)``.
-
-    Returns:
-        Segment and point of each pair, some more than once.
+    A segment has its middle, a unit vector, a radius and half its length. Some of the pairs of a
+    segment and a point come more than once.
     """
     segments: list[Array] = [np.empty(0, dtype=np.int64)]
     points: list[Array] = [np.empty(0, dtype=np.int64)]
@@ -246,16 +207,9 @@ def find_segments(
 ) -> Segments:
     """Clip pairs of facets on the secondary facets' averaged normal planes.
 
-    Lengths are exceeded by the facets' own sizes, so that no facet within them is covered in part
-    only.
-
-    Args:
-        kind: Elements on the facets.
-        secondary: Secondary facets with averaged normals.
-        primary: Primary facets.
-        pairs: Secondary and primary facet of each pair.
-        depth: Facets that overlap by more than this along the normal do not meet.
-        height: Nor do facets farther apart than this.
+    Facets that overlap by more than the depth along the normal, or are farther apart than the
+    height, do not meet; these lengths are exceeded by the facets' own sizes, so that no facet
+    within them is covered in part only.
     """
     planes = _Planes(kind, secondary, primary)
     # 1. common parts of facets that are neither too far nor seen from the side
@@ -362,12 +316,9 @@ class _Planes:
         return first
 
     def _over(self, found: _Meetings, first: Array, second: Array) -> tuple[Array, Array]:
-        """Return pairs a whose middle another pair's primary facet lies over, and its distance.
+        """Return those of the first pairs whose middle a second one lies over, and its distance.
 
-        Args:
-            found: All pairs.
-            first: Pairs to choose a from.
-            second: The other pairs; they count where the secondary facet is the same.
+        They count where the secondary facet is the same.
         """
         ordered = second[np.argsort(found.s[second], kind="stable")]
         start = np.searchsorted(found.s[ordered], found.s[first], side="left")

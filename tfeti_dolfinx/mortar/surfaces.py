@@ -40,16 +40,10 @@ def surface_facets(decomposition: Decomposition, name: str | int) -> Array:
 def hat_integrals(
     dofs: TornDofs, decomposition: Decomposition, names: Sequence[str | int], thickness: Any = 1.0
 ) -> Array:
-    """Return integrals ∫φ_i of the hats of degree 1 over the union of surfaces. Collective.
+    """Return ∫φ_i of the hats of degree 1 over the union of surfaces, by names or tags. Collective.
 
-    Args:
-        dofs: Dof maps of the displacement space, of any degree.
-        decomposition: The torn mesh.
-        names: Names or tags of the surfaces.
-        thickness: Weight of the integrals, a number or a scalar in UFL.
-
-    Returns:
-        One integral per owned group, zero off the surfaces and off the vertices, shape ``(g,)``.
+    They are weighted by the thickness, a number or a scalar in UFL. One integral per owned group,
+    zero off the surfaces and off the vertices, shape ``(g,)``.
     """
     if not names:
         return np.zeros(dofs.num_groups)

@@ -83,16 +83,11 @@ TOLERANCES = KernelTolerances()
 
 
 def candidate_modes(x: Array, bs: int, centre: Array, length: float) -> Array:
-    """Return rigid motions for vectors of the space's dimension, constants otherwise.
+    """Return rigid motions for vectors of the space's dimension, constants otherwise, as columns.
 
-    Args:
-        x: Points of the nodes, shape ``(n, gdim)``.
-        bs: Unknowns per node.
-        centre: Point that the rotations turn about, shape ``(gdim,)``.
-        length: Length that makes rotations comparable to translations; 0 for a body of one node.
-
-    Returns:
-        Modes as columns, shape ``(n * bs, k)``; k = 3 in 2D, 6 in 3D, bs for other fields.
+    Shape ``(n * bs, k)`` at nodes x, ``(n, gdim)``: k = 3 in 2D, 6 in 3D, bs for other fields.
+    Rotations turn about the centre; the length makes them comparable to translations, 0 for a body
+    of one node.
     """
     gdim = x.shape[1]
     modes = [np.tile(np.eye(bs)[i], len(x)) for i in range(bs)]
@@ -266,7 +261,3 @@ class Block:
         full = np.zeros(len(self.load))
         full[self.trace_dofs] = w
         return full
-
-
-# its earlier name
-BlockDefaults = Block

@@ -133,13 +133,10 @@ def default_solver() -> str:
 
 
 def unread_options(given: Mapping[str, Any], solver: str) -> list[str]:
-    """Return those options that a factor does not ask PETSc for, by one of a single unknown.
+    """Return those options, without a prefix, that a factor by a solver does not ask PETSc for.
 
-    None where that cannot be made, which has a cause that the factors of the problem name.
-
-    Args:
-        given: Options without a prefix.
-        solver: What makes the factor, where ``given`` does not say.
+    It is tried with a matrix of a single unknown. None where that cannot be made, which has a cause
+    that the factors of the problem name.
     """
     chosen = {"pc_factor_mat_solver_type": solver, **given}
     with added_options(TRIAL, chosen):

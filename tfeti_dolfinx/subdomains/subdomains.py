@@ -145,9 +145,7 @@ class Subdomains:
     def local_operator(self, kind: OperatorKind, once: bool = False) -> LocalOperator:
         """K⁺, K_bb or S of all Blocks on the trace; to be made again after ``retrace``.
 
-        Args:
-            kind: Which of them.
-            once: Whether it is applied a few times only, for which no dense matrix pays.
+        Applied once, or a few times, no dense matrix pays.
         """
         choice = LocalChoice("implicit") if once else self._choice
         return GroupedOperator(self.blocks, kind, choice)
