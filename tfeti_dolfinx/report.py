@@ -196,7 +196,7 @@ class ContactSummary:
         pressure = np.maximum(extremes[0], 0.0).tolist()  # of a contact without nodes it is 0
         gaps = np.where(np.isfinite(extremes[1]), 0.0 - extremes[1], 0.0).tolist()
         names = [contact.name for contact in solution.contacts]
-        columns: list[list[Any]] = [names, *counts, forces, pressure, gaps]
+        columns: list[Any] = [names, *counts, forces, pressure, gaps]
         return [cls(*row) for row in zip(*columns, strict=True)]
 
     def __str__(self) -> str:

@@ -267,21 +267,19 @@ def _loose(outcome: Outcome) -> Iterator[str]:
 def notes_of(outcome: Outcome) -> list[str]:
     """Return what is worth knowing of an answer and needs no change: motions that are free."""
     loose = [motion for motion in outcome.nearly_free if not motion["stiffness"]]
-    if len(loose) <= outcome.free_modes:
-        loose = []
-    notes = [
-        f"{_bodies(motion)}: contacts with a force do not hold {motion['mode']}: displacements "
-        "that differ by that are as right"
-        for motion in loose[: LIMITS.listed]
+    if not loose and not outcome.free_modes:
+        return []
+    some = "; ".join(f"{_bodies(motion)}: {motion['mode']}" for motion in loose[: LIMITS.listed])
+    listed = f" ({some}{'; …' if len(loose) > LIMITS.listed else ''})" if some else ""
+    if len(loose) > outcome.free_modes:
+        return [
+            f"contacts with a force do not hold {len(loose)} rigid motions{listed}: displacements "
+            "that differ by them are as right"
+        ]
+    return [
+        f"{outcome.free_modes} rigid motions are free{listed}: nothing resists or drives them, the "
+        "smallest displacement was taken"
     ]
-    if (rest := len(loose) - LIMITS.listed) > 0:
-        notes.append(f"{rest} more motions are not held by contacts with a force")
-    if outcome.free_modes:
-        notes.append(
-            f"{outcome.free_modes} rigid motions are free: nothing resists or drives them, the "
-            "smallest displacement was taken"
-        )
-    return notes
 
 
 def _bodies(motion: dict[str, object]) -> str:
