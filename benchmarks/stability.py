@@ -8,7 +8,7 @@ programs and active sets, with friction Alart's and Curnier's method). A row has
 * ``right``: converged, and the displacement of each body in the maximum norm within 100 rtol and
   within 100 times what the report estimates its error to be, or within 100 times what rounding of
   the stiffness does to the direct solution;
-* ``warned``: converged, not that right, and ``report.warnings`` says so;
+* ``warned``: converged, not that right, and the report's warnings or notes say so;
 * ``named``: an error with its cause; ``no solution``: the same, and there is none;
 * in capitals what must not occur: ``SILENT``, a wrong answer that nobody warns of, ``WRONG
   VERDICT``, a solution where there is none or the other way round, ``CRASH``.

@@ -84,7 +84,7 @@ def test_programs_of_documents(half_cylinder, document, ranks, tmp_path):
     command = ["mpirun", "-n", str(ranks), sys.executable, str(program)]
     result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert result.returncode == 0, result.stderr
-    assert "primal_dofs" in result.stdout
+    assert "unknowns" in result.stdout
     assert "CONVERGED_RTOL" in result.stdout
 
 

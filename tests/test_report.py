@@ -45,8 +45,23 @@ def test_json_has_every_field(report, comm, shared_tmp):
     assert data["contact_rows"] == report.contact_rows
     comm.barrier()
     assert [p.name for p in path.parent.iterdir()] == ["report.json"]
-    assert all(name in str(report) for name in data if name != "errors")
+    assert all(name in report.details() for name in data if name != "errors")
     assert set(report.residuals) == {"projected_gradient", "equilibrium", *report.tolerances}
+
+
+def test_the_first_screen_is_short(report):
+    """At most ten lines, and one for each contact, with what is asked for first."""
+    lines = str(report).splitlines()
+    assert len(lines) <= 11
+    assert lines[0] == "tfeti_dolfinx: CONVERGED_RTOL"
+    (contact,) = report.contacts
+    assert (contact.nodes, contact.touching) == (49, report.active_contacts)
+    assert contact.resultant[2] > 0.0
+    assert contact.pressure > 0.0
+    assert abs(contact.gap) <= report.tolerances["penetration"]
+    assert f"{contact.touching} of 49 nodes touch" in str(report)
+    assert "displacement error" in str(report)
+    assert f"{report.F_multiplications} F" in str(report)
 
 
 def test_a_report_that_cannot_be_written_is_named_on_all_ranks(report, comm, shared_tmp):

@@ -98,8 +98,8 @@ def test_a_body_that_turns_is_named_and_one_that_moves_is_not():
 def test_motions_that_nothing_holds_are_warned_of(comm):
     row = run_scene(rung("loose stack", "triangle", 1.0), comm)
     if comm.rank == 0:
-        assert warnings_of("3 rigid motions are free", row["warnings"])
-        assert warnings_of("body 1: contacts with a force do not hold", row["warnings"])
+        (note,) = warnings_of("3 rigid motions are free", row["warnings"])
+        assert "body 1: " in note
 
 
 @pytest.mark.parametrize("slenderness", [100.0, 1e4])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import re
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import replace
@@ -11,7 +13,7 @@ import numpy as np
 import ufl
 from dolfinx import fem
 
-from tfeti_dolfinx.accuracy.diagnostics import Diagnostics, with_estimates
+from tfeti_dolfinx.accuracy.diagnostics import Diagnostics, notes_of, with_estimates
 from tfeti_dolfinx.accuracy.estimates import Estimates, estimate, goal_of, of_looks
 from tfeti_dolfinx.common.agreement import agreeing, described, fields_in, sums_of
 from tfeti_dolfinx.common.arrays import Array
@@ -46,6 +48,8 @@ from tfeti_dolfinx.solve.coulomb import solve_with_friction
 from tfeti_dolfinx.solve.solver import conclude
 from tfeti_dolfinx.subdomains.build import SubdomainMethod
 from tfeti_dolfinx.system import Settings, System
+
+log = logging.getLogger(__name__)
 
 MAX_ROUNDS = 20  # of solves with more and more contact rows
 
@@ -142,6 +146,7 @@ class ContactProblem:
             )
         self._counts, self._outcome = SolverCounts(), Outcome()
         self._in_all: dict[str, float] = {}
+        self._logged: set[str] = set()  # warnings
         self._solution: Solution | None = None
         self._start: Start | None = None
         self._accepted: tuple[Solution | None, Start | None] = (None, None)
@@ -218,9 +223,11 @@ class ContactProblem:
             self._compose_report()
             raise
         self._compose_report()
+        self._log_warnings()
         self._system.search.warn_of_unmet()
         if self.options.view and self.decomposition.comm.rank == 0:
-            print(self.options.view_text(self._settings.prefix), self.report, sep="\n", flush=True)
+            options = self.options.view_text(self._settings.prefix)
+            print(options, self.report.details(), sep="\n", flush=True)
         return self.u
 
     def _solve_in_rounds(self) -> None:
@@ -284,11 +291,20 @@ class ContactProblem:
         excluding = system.search.named(gluing.contacts_of(result.excluding))
         outcome = Outcome.of_answer(solution, dual, *solved, excluding, of_looks(accuracy.reached))
         warnings = self._diagnostics.found(dual, solution, outcome, options.number)
-        self._outcome = replace(outcome, warnings=warnings)
+        method = f"{options.qp_type} + {options.pc_type}"
+        self._outcome = replace(outcome, warnings=warnings, notes=notes_of(outcome), solver=method)
         result.destroy()
         restless = settling.restless(d.body_names)
         conclude(result, accuracy, self.options, d.comm, excluding, restless, warnings)
         return solution, accuracy.tolerances().jump
+
+    def _log_warnings(self) -> None:
+        """Log the report's warnings on rank 0, each once, whatever figures are in it."""
+        for text in self.report.warnings:
+            kind = re.sub(r"[-+.\d]+(e[-+]?\d+)?", "#", text)
+            if kind not in self._logged and self.decomposition.comm.rank == 0:
+                log.warning("%s", text)
+            self._logged.add(kind)
 
     def _compose_report(self) -> None:
         """Compose the report of a solve, from records of its stages. Collective."""

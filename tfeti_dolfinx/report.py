@@ -13,7 +13,8 @@ from typing import Any, Self
 import numpy as np
 from mpi4py import MPI
 
-from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.arrays import Array, sum_rows
+from tfeti_dolfinx.common.parallel import summed
 from tfeti_dolfinx.common.validation import named
 from tfeti_dolfinx.constraints.contact_state import ContactStatus
 from tfeti_dolfinx.constraints.gluing import Gluing
@@ -33,6 +34,7 @@ from tfeti_dolfinx.solve.coulomb import FixedPointStatus
 class Sizes:
     """Sizes of a problem, known before it is solved."""
 
+    ranks: int = 0
     primal_dofs: int = 0  # of the torn mesh; with boundary elements those on their surface
     dual_dofs: int = 0  # rows of B
     subdomains: int = 0
@@ -66,6 +68,7 @@ class Sizes:
         )
         rows, normals, candidates, far, dropped, tangents = comm.allreduce(np.array(own)).tolist()
         return cls(
+            ranks=comm.size,
             primal_dofs=int(dofs.offsets[-1]) * dofs.bs - inside,
             dual_dofs=rows,
             subdomains=decomposition.num_subdomains,
@@ -141,9 +144,77 @@ class SolverCounts:
 
 
 @dataclass
+class ContactSummary:
+    """A contact at a solution, in one line; the same on all ranks.
+
+    Attributes:
+        name: Its name.
+        nodes: Nodes of its (secondary) surface that have a condition.
+        touching: Those that touch; ``sticking`` and ``sliding`` are those of them with friction.
+        sticking: Nodes that stick.
+        sliding: Nodes that slip.
+        resultant: Force on that surface, friction included, ``gdim`` components.
+        pressure: The largest.
+        gap: The smallest, negative for an overlap.
+    """
+
+    name: str
+    nodes: int
+    touching: int
+    sticking: int
+    sliding: int
+    resultant: list[float]
+    pressure: float
+    gap: float
+
+    @classmethod
+    def of_solution(cls, solution: Solution) -> list[Self]:
+        """Sum up all contacts of a solution. Collective."""
+        comm, of, count = (
+            solution.dofs.comm,
+            solution.gluing.records.contact,
+            len(solution.contacts),
+        )
+        if count == 0:
+            return []
+        status = solution.status_of_conditions
+        kinds = (ContactStatus.STICK, ContactStatus.SLIP)
+        own = np.column_stack(
+            (
+                np.ones(len(of)),
+                status != ContactStatus.OPEN,
+                *(status == kind for kind in kinds),
+                solution.condition_forces,
+            )
+        )
+        sums = summed(comm, sum_rows(of, own, count))
+        extremes = np.full((2, count), -np.inf)
+        np.maximum.at(extremes[0], of, solution.contact_pressure)
+        np.maximum.at(extremes[1], of, -solution.remaining_gap)
+        comm.Allreduce(MPI.IN_PLACE, extremes, op=MPI.MAX)
+        counts, forces = sums[:, :4].T.astype(int).tolist(), sums[:, 4:].tolist()
+        pressure = np.maximum(extremes[0], 0.0).tolist()  # of a contact without nodes it is 0
+        gaps = np.where(np.isfinite(extremes[1]), 0.0 - extremes[1], 0.0).tolist()
+        names = [contact.name for contact in solution.contacts]
+        columns: list[Any] = [names, *counts, forces, pressure, gaps]
+        return [cls(*row) for row in zip(*columns, strict=True)]
+
+    def __str__(self) -> str:
+        force = ", ".join(f"{value:.3g}" for value in self.resultant)
+        line = (
+            f"{self.name}: {self.touching} of {self.nodes} nodes touch, force ({force}), "
+            f"pressure up to {self.pressure:.3g}, smallest gap {self.gap:.2g}"
+        )
+        rubs = self.sticking + self.sliding
+        return f"{line}, {self.sticking} stick, {self.sliding} slip" if rubs else line
+
+
+@dataclass
 class Outcome:
     """The end of a solver's last run, and diagnostics of its answer; see docs/report.md."""
 
+    solver: str = ""  # options qp_type and pc_type
+    contacts: list[ContactSummary] = field(default_factory=list)
     clusters: int = 0  # of subdomains that averages glue
     kernel_dim: int = 0  # of K
     soft_modes: int = 0  # motions that springs hold softly, or all of clusters: preconditioned
@@ -151,6 +222,7 @@ class Outcome:
     # rigid motions that contacts with a force hold hardly or not (0): bodies, mode, stiffness
     nearly_free: list[dict[str, object]] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)  # why the answer cannot be trusted
+    notes: list[str] = field(default_factory=list)  # what is worth knowing, and needs no change
     excluding_contacts: list[str] = field(default_factory=list)  # whose rows exclude each other
     active_contacts: int = 0  # rows with a positive force
     sticking: int = 0  # nodes with friction that touch and stick
@@ -186,6 +258,7 @@ class Outcome:
         recovered = accuracy.recovered
         active, sticking, sliding = dual.coarse.comm.allreduce(np.array(own)).tolist()
         return cls(
+            contacts=ContactSummary.of_solution(solution),
             clusters=dual.subdomains.num_clusters,
             kernel_dim=dual.coarse.dimension,
             soft_modes=0 if dual.soft is None else dual.soft.count,
@@ -209,6 +282,7 @@ class Outcome:
 # --- The report -------------------------------------------------------------------------------
 
 PRINTED = 10  # of a list; all of it is in the file
+SHOWN = ("displacement_error", "penetration", "balance")  # residuals of the short report
 # what adds up over solves, in ``in_all``
 COUNTERS = [f.name for kind in (SolverCounts, StageCounts) for f in fields(kind) if f.default == 0]
 
@@ -252,6 +326,50 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         return {name: getattr(self, name) for name in COUNTERS}
 
     def __str__(self) -> str:
+        bodies = f"{self.bodies} {'body' if self.bodies == 1 else 'bodies'}"
+        ranks = f"{self.ranks} {'rank' if self.ranks == 1 else 'ranks'}"
+        solves = int(self.in_all.get("solves", 0))
+        steps = f", {self.newton_steps} Newton steps" if self.newton_steps else ""
+        faces = f"{self.outer_iterations} outer and {self.cg_steps} CG steps"
+        if self.newton_faces:
+            faces = f"{self.newton_faces} faces"
+        most = sorted(self.seconds.items(), key=lambda item: -item[1])
+        stages = ", ".join(f"{k} {v:.2g}" for k, v in most if k != "total" and v >= 0.005)
+        total = self.seconds.get("total", 0.0)
+        rows = [
+            (
+                "model",
+                f"{self.primal_dofs} unknowns, {bodies}, {self.subdomains} subdomains, {ranks}",
+            ),
+            *(("contact", str(contact)) for contact in self.contacts[:PRINTED]),
+            (
+                "accuracy",
+                ", ".join(self._measured(name) for name in SHOWN if name in self.residuals),
+            ),
+            (
+                "solver",
+                f"{self.solver}: {self.F_multiplications} F, "
+                f"{self.preconditioner_multiplications} S, {faces}{steps}",
+            ),
+            ("time", f"{total:.3g} s: {stages}; {self.peak_memory_mb:.0f} MB"),
+            *(("note", text) for text in self.notes),
+            *(("warning", text) for text in self.warnings),
+        ]
+        if (rest := len(self.contacts) - PRINTED) > 0:
+            rows.insert(1 + PRINTED, ("", f"and {rest} contacts more, see details()"))
+        head = f"tfeti_dolfinx: {self.converged_reason}" + (
+            f", solve {solves}" if solves > 1 else ""
+        )
+        return "\n".join([head, *(f"  {name:<9} {text}" for name, text in rows if text)])
+
+    def _measured(self, name: str) -> str:
+        """Return a residual with its tolerance."""
+        allowed = self.tolerances.get(name)
+        text = f"{name.replace('_', ' ')} {self.residuals[name]:.1e}"
+        return text if not allowed else f"{text} (allowed {allowed:.1e})"
+
+    def details(self) -> str:
+        """Return all fields as text, one in a line."""
         lines = []
         for name, value in asdict(self).items():
             if isinstance(value, dict) and value:
@@ -292,6 +410,8 @@ def _item(item: str | list[float] | dict[str, Any]) -> str:
         return item
     if isinstance(item, list):
         return " ".join(f"{value:.6g}" for value in item)
+    if "touching" in item:
+        return str(ContactSummary(**item))
     return f"{', '.join(item['bodies'])}: {item['mode']}, stiffness {item['stiffness']:.2g}"
 
 

@@ -183,7 +183,7 @@ def _reported(problem: tfeti.ContactProblem) -> dict[str, Any]:
     report = problem.report
     return {
         "reason": report.converged_reason,
-        "warnings": report.warnings,
+        "warnings": report.warnings + report.notes,
         "F": report.F_multiplications,
         "S": report.preconditioner_multiplications,
         "qp": report.seconds.get("qp", 0.0),

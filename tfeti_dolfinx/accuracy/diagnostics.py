@@ -235,19 +235,38 @@ def _of_estimates(outcome: Outcome) -> Iterator[str]:
 
 
 def _loose(outcome: Outcome) -> Iterator[str]:
-    """Motions that are not determined, or hardly."""
-    if outcome.free_modes:
+    """Motions that contacts hardly hold."""
+    hardly = [motion for motion in outcome.nearly_free if motion["stiffness"]]
+    for motion in hardly[: LIMITS.listed]:
         yield (
-            f"{outcome.free_modes} rigid motions are free: nothing resists or drives them, the "
-            "smallest displacement was taken"
+            f"{_bodies(motion)}: contacts with a force hold hardly ({motion['stiffness']:.0e} of "
+            f"what they could) {motion['mode']}: displacements that differ by that are nearly as "
+            "right"
         )
-    for motion in outcome.nearly_free[: LIMITS.listed]:
-        bodies, mode, held = (motion[key] for key in ("bodies", "mode", "stiffness"))
-        assert isinstance(bodies, list)
-        share = f"hold hardly ({held:.0e} of what they could)" if held else "do not hold"
-        yield (
-            f"{', '.join(bodies)}: contacts with a force {share} {mode}: displacements that differ "
-            "by that are as right, or nearly so"
-        )
-    if (rest := len(outcome.nearly_free) - LIMITS.listed) > 0:
-        yield f"{rest} more motions are held hardly or not by contacts with a force"
+    if (rest := len(hardly) - LIMITS.listed) > 0:
+        yield f"{rest} more motions are held hardly by contacts with a force"
+
+
+def notes_of(outcome: Outcome) -> list[str]:
+    """Return what is worth knowing of an answer and needs no change: motions that are free."""
+    loose = [motion for motion in outcome.nearly_free if not motion["stiffness"]]
+    if not loose and not outcome.free_modes:
+        return []
+    some = "; ".join(f"{_bodies(motion)}: {motion['mode']}" for motion in loose[: LIMITS.listed])
+    listed = f" ({some}{'; …' if len(loose) > LIMITS.listed else ''})" if some else ""
+    if len(loose) > outcome.free_modes:
+        return [
+            f"contacts with a force do not hold {len(loose)} rigid motions{listed}: displacements "
+            "that differ by them are as right"
+        ]
+    return [
+        f"{outcome.free_modes} rigid motions are free{listed}: nothing resists or drives them, the "
+        "smallest displacement was taken"
+    ]
+
+
+def _bodies(motion: dict[str, object]) -> str:
+    """Return the names of the bodies of a motion."""
+    bodies = motion["bodies"]
+    assert isinstance(bodies, list)
+    return ", ".join(bodies)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import logging
 import math
 import os
 import sys
@@ -102,6 +103,8 @@ def checked_times(begin: float, times: Sequence[float]) -> list[float]:
 
 
 # --- Progress bar -----------------------------------------------------------------------------
+
+log = logging.getLogger(__name__)
 
 # called with the share of the series that is done and a few words
 Show = Callable[[float, str], None]
@@ -432,6 +435,13 @@ class LoadSteps:
                 continue
             problem.accept()
             self.records.append(self._record(place.number, t, t - begin))
+            if self._comm.rank == 0:
+                figures = self.records[-1].figures
+                log.info(
+                    "load step %d of %d, t = %.6g: %d multiplications by F, %.2g s",
+                    *(place.number + 1, len(times) - 1, t),
+                    *(figures["F_multiplications"], self.records[-1].seconds),
+                )
             place = place.ahead()
             self._keep(place, t)
         show(1.0, "done")
