@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -110,7 +111,7 @@ class IsotropicHardening:
 
 @dataclass(frozen=True)
 class Quadrature:
-    """Where a law is integrated, and the spaces of its points.
+    """Quadrature of a law, and the spaces of its points.
 
     Attributes:
         mesh: The torn mesh.
@@ -155,9 +156,10 @@ class Quadrature:
         """The measure of what resists a change of volume."""
         if not self.selective:
             return self.dx
-        points = np.full((2, self.mesh.topology.dim), 0.5) + self.beside * np.array([[-1], [1]])
+        dim = self.mesh.topology.dim
+        points = tuple((0.5 + shift,) * dim for shift in (-self.beside, self.beside))
         rule = {"quadrature_rule": "custom", "quadrature_points": points}
-        rule |= {"quadrature_weights": np.full(2, 0.5)}
+        rule |= {"quadrature_weights": (0.5, 0.5)}
         return ufl.Measure("dx", domain=self.mesh, metadata=rule)
 
     def space(self, shape: tuple[int, ...] = ()) -> fem.FunctionSpace:
@@ -167,7 +169,53 @@ class Quadrature:
         return fem.functionspace(self.mesh, element)
 
 
-class J2Plasticity:
+class Plasticity(ABC):
+    """Plasticity by von Mises with isotropic hardening, in small or in finite strain.
+
+    Creation is collective; arguments are those of ``J2Plasticity``.
+
+    Attributes:
+        hardening: The yield stress.
+        dx: The measure of cells.
+    """
+
+    def __init__(
+        self,
+        elasticity: Elasticity,
+        u: fem.Function,
+        *,
+        yield_stress: float,
+        hardening: float = 0.0,
+        saturation: float = 0.0,
+        rate: float = 0.0,
+        degree: int | None = None,
+        selective: bool = False,
+        tolerances: ReturnTolerances | None = None,
+    ) -> None:
+        check_law(elasticity, u, type(self).__name__)
+        self.hardening = IsotropicHardening(
+            yield_stress, hardening, saturation, rate, tolerances or ReturnTolerances()
+        )
+        self.elasticity, self.u = elasticity, u
+        self._at = Quadrature.of(u, degree, selective)
+        self.dx = self._at.dx
+        self._begin()
+
+    @abstractmethod
+    def _begin(self) -> None:
+        """Make functions and expressions at the quadrature points."""
+
+    @property
+    def regularisation(self) -> float:
+        """Share of the elastic moduli in the tangent; 0 where there is hardening."""
+        return self.hardening.regularisation
+
+    @property
+    def _bulk(self) -> Any:
+        return self.elasticity.E / 3 / (1 - 2 * self.elasticity.nu)
+
+
+class J2Plasticity(Plasticity):
     """Plasticity by von Mises with isotropic hardening in small strain. Creation is collective.
 
     The yield stress is σ_y(p) = yield_stress + hardening p + saturation (1 − exp(−rate p)), p the
@@ -200,27 +248,8 @@ class J2Plasticity:
         InputError: Something given does not fit; the message names it.
     """
 
-    def __init__(
-        self,
-        elasticity: Elasticity,
-        u: fem.Function,
-        *,
-        yield_stress: float,
-        hardening: float = 0.0,
-        saturation: float = 0.0,
-        rate: float = 0.0,
-        degree: int | None = None,
-        selective: bool = False,
-        tolerances: ReturnTolerances | None = None,
-    ) -> None:
-        check_law(elasticity, u, "J2Plasticity")
-        self.hardening = IsotropicHardening(
-            yield_stress, hardening, saturation, rate, tolerances or ReturnTolerances()
-        )
-        self.elasticity, self.u = elasticity, u
-        self._gdim = elasticity.mesh.geometry.dim
-        self._at = Quadrature.of(u, degree, selective)
-        self.dx = self._at.dx
+    def _begin(self) -> None:
+        self._gdim, elasticity, u = self.elasticity.mesh.geometry.dim, self.elasticity, self.u
         Q, W = self._at.space(), self._at.space((6 if self._gdim == 3 else 4,))
         self.plastic_strain = fem.Function(W, name="plastic_strain")
         self.p = fem.Function(Q, name="accumulated_plastic_strain")
@@ -234,11 +263,6 @@ class J2Plasticity:
         self._n = self._normal(u)
         new = self._tensor(self.plastic_strain) + self._dp * self._n
         self.state = {self.plastic_strain: _components(new, self._gdim), self.p: self.p + self._dp}
-
-    @property
-    def regularisation(self) -> float:
-        """Share of the elastic moduli in the tangent; 0 where there is hardening."""
-        return self.hardening.regularisation
 
     def update(self) -> None:
         """Return stresses to the yield surface where ``u`` is now. Collective."""
@@ -274,10 +298,6 @@ class J2Plasticity:
         if self.regularisation:
             deviator = deviator + 2 * mu * self.regularisation * plastic * ufl.dev(e)
         return self._integrated(ufl.tr(e), deviator, self.elasticity.strain(v))
-
-    @property
-    def _bulk(self) -> Any:
-        return self.elasticity.E / 3 / (1 - 2 * self.elasticity.nu)
 
     def _deviator(self, u: Any) -> Any:
         """Deviatoric stress, returned by what ``update`` has found."""
