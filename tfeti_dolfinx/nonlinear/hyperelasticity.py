@@ -22,8 +22,8 @@ class Hyperelasticity(ABC):
 
     A tangent has to be definite on all that stretches. Where a law loses that, its tangent gets
     2s e : e more, e = sym(∇w F⁻¹), with the least s that a bound asks for, so that it keeps a share
-    ``definite`` of the shear modulus. The term in the residual is 2s times e of E(u) − E(û), û the
-    displacement that ``update`` was called for: its derivative is there, its value is 0.
+    ``definite`` of the shear modulus. The residual has 2s e(u − û) : e(v), û the displacement that
+    ``update`` was called for, and F its gradient: its derivative is there, its value is 0.
 
     Args:
         elasticity: Moduli, and the model: in space, plane strain, or axisymmetric.
@@ -87,12 +87,12 @@ class Hyperelasticity(ABC):
         thickness, F = self.elasticity.thickness, self.deformation(self.u)
         energy = thickness * self.shape_energy(F) * self.dx
         energy += thickness * self.volumetric_energy(F) * self._at.dx_volume
-        C, here = F.T * F, self.deformation(self._here)
-        C_here = here.T * here
-        strain = ufl.derivative(0.5 * C, self.u, v)
-        inverse = ufl.inv(C_here)
-        more = ufl.inner(inverse * (C - C_here) * inverse, strain)
-        return ufl.derivative(energy, self.u, v) + thickness * self.missing(here) * more * self.dx
+        here = self.deformation(self._here)
+        inverse = ufl.inv(here)
+        rate = ufl.sym((F - here) * inverse)
+        rate_of_v = ufl.sym(displacement_gradient(self.elasticity, v) * inverse)
+        more = 2 * self.missing(here) * ufl.inner(rate, rate_of_v)
+        return ufl.derivative(energy, self.u, v) + thickness * more * self.dx
 
 
 class NeoHooke(Hyperelasticity):
