@@ -101,7 +101,10 @@ def run(argv):
     if arguments.plot:
         from tfeti_dolfinx.plot import plot_deformed
 
-        plot_deformed(demo.folder / "plastic_hertz_3d.png", problem.solution, factor=1.0)
+        look = {"cut": ((0, 0, 0), (0, -1, 0)), "view": (0.0, -1.0, -0.1)}
+        look |= {"zoom": 4.0, "focus": (0.0, 0.0, 0.15)}
+        path = demo.folder / "plastic_hertz_3d.png"
+        plot_deformed(path, problem.solution, factor=1.0, **look)
         if comm.rank == 0:
             fine = np.linspace(0.0, most, 101)
             path = (np.append(0.0, d), np.append(0.0, forces))

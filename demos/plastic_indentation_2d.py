@@ -135,7 +135,9 @@ def run(argv):
     if arguments.plot:
         from tfeti_dolfinx.plot import plot_deformed
 
-        plot_deformed(demo.folder / "plastic_indentation_2d.png", problem.solution, factor=1.0)
+        look = {"zoom": 3.5, "focus": (260.0, -200.0, 0.0), "highest": STRENGTH}
+        path = demo.folder / "plastic_indentation_2d.png"
+        plot_deformed(path, problem.solution, factor=1.0, **look)
         if comm.rank == 0:
             curves = {"TFETI": (d, forces), "slip lines": (d, SLIP_LINES * d)}
             labels = ("depth in mm", "force in N a radian")

@@ -203,6 +203,40 @@ def test_a_bar_in_finite_strain_follows_its_hardening():
         assert np.allclose(law.p.x.array, p, atol=1e-12)
 
 
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
+def test_stresses_at_nodes_are_those_of_the_points(cell, comm):
+    """Sheared by a hundredth, beyond the yield stress: von Mises' stress is σ_y(p) everywhere."""
+    mesh = dmesh.create_unit_square(comm, 3, 3, dmesh.CellType[cell])
+    facets = dmesh.locate_entities_boundary(mesh, 1, lambda x: np.full(x.shape[1], True))
+    tags = dmesh.meshtags(mesh, 1, facets, np.full_like(facets, 1))
+    decomposition = tfeti.decompose(mesh, 2, facet_tags=tags, surfaces={"side": 1})
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+    u, given = fem.Function(V), fem.Function(V)
+    v, w = ufl.TestFunction(V), ufl.TrialFunction(V)
+    given.interpolate(lambda x: (0.04 * x[1], 0.0 * x[0]))
+    dofs = fem.locate_dofs_topological(V, 1, decomposition.facets("side"))
+    elastic = tfeti.Elasticity(decomposition, E=E, nu=NU, model="plane_strain")
+    law = tfeti.J2Plasticity(elastic, u, yield_stress=0.01, hardening=0.1)
+    problem = tfeti.NonlinearContactProblem(
+        law.residual(v),
+        u,
+        [fem.dirichletbc(given, dofs)],
+        [],
+        decomposition,
+        J=law.tangent(w, v),
+        state=law.state,
+        update=law.update,
+        stress=law.stress,
+        petsc_options={"rtol": 1e-10},
+    )
+    problem.solve()
+    mu = E / 2 / (1 + NU)
+    q = np.sqrt(3.0) * mu * 0.04
+    expected = q - 3.0 * mu * (q - 0.01) / (3.0 * mu + 0.1)
+    for found in (problem.solution.von_mises, problem.solution.nodal_von_mises):
+        assert np.allclose(found.x.array, expected, rtol=1e-7, atol=0.0)
+
+
 def test_mistakes_are_named():
     u = body("plane_strain")
     sheet = tfeti.Elasticity(u.function_space.mesh, E=E, nu=NU, model="plane_stress")
