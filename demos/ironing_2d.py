@@ -63,7 +63,7 @@ def torn_mesh(size, subdomains):
 def run(argv):
     demo = Demo(__doc__, argv, configure)
     arguments, comm = demo.arguments, MPI.COMM_WORLD
-    decomposition = torn_mesh(arguments.size or (0.35 if arguments.quick else 0.12), 8)
+    decomposition = torn_mesh(arguments.size or (0.35 if arguments.quick else 0.18), 8)
 
     # ## Two bodies of one material, with moduli by their names
     V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
@@ -93,11 +93,11 @@ def run(argv):
     #
     # In a load step friction acts on what slips since its begin, along tangents that turn with
     # the surface.
-    down, along = (2, 1) if arguments.quick else (10, 20)
-    along = arguments.steps or along
+    down, along = (2, 1) if arguments.quick else (5, arguments.steps)
+    stride = WAY / (10 if arguments.quick else along)
 
     def apply(_, t):
-        place.value = (WAY / 20 * max(t - down, 0.0), -DEPTH * min(t / down, 1.0))
+        place.value = (stride * max(t - down, 0.0), -DEPTH * min(t / down, 1.0))
 
     times = np.arange(1.0, down + along + 1)
     records = tfeti.LoadSteps(problem, apply, times).run()
@@ -132,7 +132,7 @@ def main(argv):
 
 def configure(parser):
     parser.add_argument("--size", type=float, help="element size")
-    parser.add_argument("--steps", type=int, help="load steps along the slab, 0.15 each")
+    parser.add_argument("--steps", type=int, default=10, help="load steps along the slab")
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ class Hyperelasticity(ABC):
         elasticity: Moduli, and the model: in space, plane strain, or axisymmetric.
         u: The displacement.
         degree: Degree of the quadrature; default twice that of ``u``, and 2 less on simplices, at
-            least 1, and 2 more where the mesh is axisymmetric.
+            least 1.
         selective: Whether what resists a change of volume is integrated at the centre of each cell,
             on quadrilaterals and hexahedra of degree 1: rubber hardly changes its volume, and cells
             that are fully integrated, or simplices of degree 1, are too stiff for it (locking).
