@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import tfeti_dolfinx as tfeti
 from demos.demo_tools import Demo
 from demos.partial_slip import draw
-from meshes.tools import started_model
+from meshes.tools import graded_size, started_model
 
 MU, nu = 0.3, 0.3
 E = {"slab": 1.0, "die": 10.0}
@@ -42,11 +42,11 @@ def torn_mesh(size, subdomains):
         model = started_model("ironing")
         geo = model.geo
         corners = ((0, -HEIGHT), (LENGTH, -HEIGHT), (LENGTH, 0), (0, 0))
-        points = [geo.addPoint(x, y, 0.0, size) for x, y in corners]
+        points = [geo.addPoint(x, y, 0.0) for x, y in corners]
         sides = [geo.addLine(points[k], points[(k + 1) % 4]) for k in range(4)]
         slab = geo.addPlaneSurface([geo.addCurveLoop(sides)])
         ends = ((2 - R, R), (2, R), (2 + R, R), (2, 0))
-        left, centre, right, low = (geo.addPoint(x, y, 0.0, size) for x, y in ends)
+        left, centre, right, low = (geo.addPoint(x, y, 0.0) for x, y in ends)
         arcs = [geo.addCircleArc(left, centre, low), geo.addCircleArc(low, centre, right)]
         grip = geo.addLine(right, left)
         die = geo.addPlaneSurface([geo.addCurveLoop([*arcs, grip])])
@@ -56,6 +56,7 @@ def torn_mesh(size, subdomains):
         for name, curves in (("bottom", sides[:1]), ("surface", sides[2:3]), ("arc", arcs)):
             model.addPhysicalGroup(1, curves, name=name)
         model.addPhysicalGroup(1, [grip], name="grip")
+        graded_size((0.0, 0.0, 0.0), size, LENGTH, 0.0)
         gmsh.model.mesh.generate(2)
     return tfeti.read_gmsh(model, comm, subdomains)
 

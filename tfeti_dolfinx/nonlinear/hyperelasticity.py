@@ -23,7 +23,7 @@ class Hyperelasticity(ABC):
     A tangent has to be definite on all that stretches. Where a law loses that, its tangent gets
     2s e : e more, e = sym(∇w F⁻¹), with the least s that a bound asks for, so that it keeps a share
     ``definite`` of the shear modulus. The residual has 2s e(u − û) : e(v), û the displacement that
-    ``update`` was called for, and F its gradient: its derivative is there, its value is 0.
+    ``update`` was called for, F that of û: its derivative is there, its value is 0.
 
     Args:
         elasticity: Moduli, and the model: in space, plane strain, or axisymmetric.
