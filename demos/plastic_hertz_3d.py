@@ -42,7 +42,7 @@ def hertz(d):
 def run(argv):
     demo = Demo(__doc__, argv, configure)
     arguments, comm = demo.arguments, MPI.COMM_WORLD
-    size = arguments.size or (0.06 if arguments.quick else 0.02)
+    size = arguments.size or (0.06 if arguments.quick else 0.03)
     model = None
     if comm.rank == 0:
         model = build(R, fine=size, fine_radius=0.15, growth=0.5 if arguments.quick else 0.35)

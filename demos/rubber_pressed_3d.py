@@ -89,8 +89,8 @@ def run(argv):
     if arguments.plot:
         from tfeti_dolfinx.plot import plot_deformed
 
-        look = {"cut": ((0, 0, 0), (0, -1, 0)), "view": (0.3, -1.0, 0.2), "zoom": 1.3}
-        plot_deformed(demo.folder / "rubber_pressed_3d.png", problem.solution, factor=1.0, **look)
+        path, view = demo.folder / "rubber_pressed_3d.png", (0.3, -1.0, -0.4)
+        plot_deformed(path, problem.solution, factor=1.0, view=view)
         if comm.rank == 0:
             fine = np.linspace(0.0, MOST, 101)
             d = np.array([0.0, *(record.time for record in records)])
