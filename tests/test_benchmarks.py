@@ -21,6 +21,7 @@ from benchmarks import (
     talk_tables,
     time_against_error,
     tools,
+    validation,
     weak_scaling,
 )
 
@@ -70,6 +71,28 @@ def test_ablation(serial_only, tmp_path):
     assert len(tables["Multiplications"]) == len(tables["Change of u"]) == 2
     assert all(float(row["kept_directions"]) < 1e-4 for row in tables["Change of u"])
     assert "smooth_displacements" in page.read_text()
+
+
+@pytest.mark.parametrize(
+    "cases",
+    [
+        ["patches", "hemispheres", "concentric_rings", "press_fit"],
+        pytest.param(list(validation.QUICK), marks=pytest.mark.slow),
+    ],
+)
+def test_published_cases(cases, comm, shared_tmp):
+    """All within what their sources allow, and the page of the documents."""
+    page = shared_tmp / "page.md"
+    given = ["--output", str(shared_tmp), "--page", str(page), "--only", *cases]
+    rows = validation.main(["--quick", *given])["Published cases"]
+    assert len(rows) >= 2 * len(cases) - 1
+    for row in rows:
+        difference, allowed = (
+            float((row[name] or "inf %").split()[0]) for name in ("difference", "allowed")
+        )
+        assert abs(difference) <= allowed, row
+    if comm.rank == 0:
+        assert rows[0]["case"] in page.read_text()
 
 
 def test_pressures_are_compared_as_functions():

@@ -48,6 +48,8 @@ from tfeti_dolfinx.forms.elasticity import Elasticity
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dolfinx_input import decompose
 from tfeti_dolfinx.mesh.gmsh_reading import read_gmsh
+from tfeti_dolfinx.nonlinear.finite_plasticity import FiniteJ2Plasticity
+from tfeti_dolfinx.nonlinear.hyperelasticity import NeoHooke, SaintVenantKirchhoff
 from tfeti_dolfinx.nonlinear.materials import J2Plasticity
 from tfeti_dolfinx.nonlinear.problem import NewtonTolerances, NonlinearContactProblem
 from tfeti_dolfinx.options import Options
@@ -78,10 +80,12 @@ __all__ = [
     "Estimates",
     "Extensions",
     "FactorError",
+    "FiniteJ2Plasticity",
     "InputError",
     "Interior",
     "J2Plasticity",
     "LoadSteps",
+    "NeoHooke",
     "NewtonTolerances",
     "NoSolutionError",
     "NonlinearContactProblem",
@@ -90,6 +94,7 @@ __all__ = [
     "Plane",
     "PointValues",
     "Report",
+    "SaintVenantKirchhoff",
     "SignedDistance",
     "Solution",
     "Sphere",

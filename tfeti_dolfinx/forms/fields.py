@@ -80,13 +80,34 @@ def frozen(expression: Any, but: fem.Function | None = None) -> Any:
 
 
 def cellwise(expression: Any, dofs: TornDofs, name: str) -> fem.Function:
-    """A UFL expression at the nodes of each cell, discontinuous between cells. Collective."""
+    """A UFL expression at the nodes of each cell, discontinuous between cells. Collective.
+
+    What has internal variables is known at their points alone: it is fitted there, by a linear
+    function in each cell if they are enough, else by a constant.
+    """
     element = ("DG", dofs.V.element.basix_element.degree, expression.ufl_shape)
     W = fem.functionspace(dofs.V.mesh, element if expression.ufl_shape else element[:2])
     function = fem.Function(W, name=name)
-    points = interpolation_points(W)
-    function.interpolate(fem.Expression(expression, points, jit_options=JIT_OPTIONS))
+    nodes = interpolation_points(W)
+    points = quadrature_points(expression)
+    if points is None:
+        function.interpolate(fem.Expression(expression, nodes, jit_options=JIT_OPTIONS))
+        return function
+    layout, bs = np.asarray(W.dofmap.list), W.dofmap.index_map_bs
+    cells = np.arange(len(layout), dtype=np.int32)
+    there = fem.Expression(expression, points, jit_options=JIT_OPTIONS).eval(W.mesh, cells)
+    terms = slice(None) if len(points) > points.shape[1] else slice(1)
+    linear = [np.column_stack((np.ones(len(x)), x))[:, terms] for x in (nodes, points)]
+    fit = linear[0] @ np.linalg.pinv(linear[1])
+    values = np.einsum("np,cpk->cnk", fit, there.reshape(len(cells), len(points), bs))
+    function.x.array.reshape(-1, bs)[layout] = values
     return function
+
+
+def quadrature_points(expression: Any) -> Array | None:
+    """Return the points that functions on quadrature spaces in an expression have values at."""
+    elements = (f.ufl_element() for f in extract_coefficients(expression))
+    return next((e.custom_quadrature()[0] for e in elements if e.has_custom_quadrature), None)
 
 
 def nodal(expression: Any, dofs: TornDofs, name: str) -> fem.Function:

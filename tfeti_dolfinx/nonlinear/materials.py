@@ -1,7 +1,8 @@
-"""Materials for nonlinear bodies: J2 plasticity in small strain, hyperelastic laws."""
+"""Materials in small strain: J2 plasticity, and what hardens."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +13,13 @@ from dolfinx import fem
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import interpolation_points
-from tfeti_dolfinx.common.validation import FROM_0, POSITIVE, checked_number, checked_type
+from tfeti_dolfinx.common.validation import (
+    FROM_0,
+    POSITIVE,
+    checked_flag,
+    checked_number,
+    checked_type,
+)
 from tfeti_dolfinx.errors import ConvergenceError, InputError, raised_on_all_ranks
 from tfeti_dolfinx.forms.elasticity import Elasticity
 
@@ -33,10 +40,182 @@ class ReturnTolerances:
     yielding: float = 1e-10
     rtol: float = 1e-14
     max_it: int = 50
-    perfect: float = 1e-3
+    perfect: float = 1e-4
 
 
-class J2Plasticity:
+@dataclass(frozen=True)
+class IsotropicHardening:
+    """Yield stress start + modulus p + saturation (1 − exp(−rate p)), and the return to it.
+
+    Attributes:
+        start: Yield stress at the begin, a force per area, more than 0.
+        modulus: Linear hardening modulus, a force per area, 0 or more.
+        saturation: What the yield stress gains by Voce's hardening in the end, 0 or more.
+        rate: Rate of Voce's hardening, 0 or more.
+        tolerances: Those of the return.
+
+    Raises:
+        InputError: A number does not fit; the message names it.
+    """
+
+    start: float
+    modulus: float
+    saturation: float
+    rate: float
+    tolerances: ReturnTolerances
+
+    def __post_init__(self) -> None:
+        checked_number(self.start, "yield_stress", POSITIVE)
+        for name, value in (
+            ("hardening", self.modulus),
+            ("saturation", self.saturation),
+            ("rate", self.rate),
+        ):
+            checked_number(value, name, FROM_0)
+
+    @property
+    def regularisation(self) -> float:
+        """Share of the elastic moduli in the tangent; 0 where there is hardening."""
+        hardens = self.modulus or self.saturation * self.rate
+        return 0.0 if hardens else self.tolerances.perfect
+
+    def at(self, p: Array) -> tuple[Array, Array]:
+        """Return the yield stress at accumulated plastic strains, and its slope."""
+        rest = self.saturation * np.exp(-self.rate * p)
+        stress = self.start + self.modulus * p + self.saturation - rest
+        return stress, self.modulus + self.rate * rest
+
+    def returned(self, q: Array, G: Array, p: Array) -> tuple[Array, Array, bool]:
+        """Solve q − 3G Δp = σ_y(p + Δp) where q is beyond the yield stress.
+
+        Args:
+            q: Von Mises' trial stress.
+            G: Shear modulus.
+            p: Accumulated plastic strain where the load step began.
+
+        Returns:
+            Δp, 0 where a point is elastic, the slope of σ_y at p + Δp, and whether all is solved.
+        """
+        tol, dp = self.tolerances, np.zeros_like(q)
+        plastic = q > (1.0 + tol.yielding) * self.at(p)[0]
+        left = bool(np.any(plastic))
+        for _ in range(tol.max_it):  # concave in dp: Newton's method goes up monotonically
+            if not left:
+                break
+            y, slope = self.at(p + dp)
+            f = np.where(plastic, q - 3.0 * G * dp - y, 0.0)
+            dp += f / (3.0 * G + slope)
+            left = bool(np.any(np.abs(f) > tol.rtol * (q + y)))
+        return dp, self.at(p + dp)[1], not left
+
+
+@dataclass(frozen=True)
+class Quadrature:
+    """Quadrature of a law, and the spaces of its points.
+
+    Attributes:
+        mesh: The torn mesh.
+        degree: Degree of the quadrature.
+        selective: Whether what resists a change of volume is integrated at the centre of a cell.
+        beside: How far from the centre, of a reference cell of length 1, the two points of that
+            rule are: FFCx 0.9 takes values at a single point for those of other rules, too.
+    """
+
+    mesh: Any
+    degree: int
+    selective: bool
+    beside: float = 1e-3
+
+    @classmethod
+    def of(cls, u: fem.Function, degree: int | None, selective: bool) -> Quadrature:
+        """Return that of a displacement; the default degree is exact on affine cells.
+
+        Raises:
+            InputError: Selective integration does not fit the displacement.
+        """
+        V = u.function_space
+        own, cell = V.element.basix_element.degree, V.mesh.basix_cell()
+        simplex = cell in (basix.CellType.triangle, basix.CellType.tetrahedron)
+        if checked_flag(selective, "selective") and (simplex or own != 1):
+            raise InputError(
+                f"selective=True on {cell.name}s with displacements of degree {own}; expected "
+                "quadrilaterals or hexahedra of degree 1 (degree 2 does not lock)"
+            )
+        if degree is None:
+            degree = max(2 * own - (2 if simplex else 0), 1)
+        return cls(V.mesh, degree, selective)
+
+    @property
+    def dx(self) -> ufl.Measure:
+        """The measure of cells."""
+        data = {"quadrature_degree": self.degree, "quadrature_scheme": "default"}
+        return ufl.Measure("dx", domain=self.mesh, metadata=data)
+
+    @property
+    def dx_volume(self) -> ufl.Measure:
+        """The measure of what resists a change of volume."""
+        if not self.selective:
+            return self.dx
+        dim = self.mesh.topology.dim
+        points = tuple((0.5 + shift,) * dim for shift in (-self.beside, self.beside))
+        rule = {"quadrature_rule": "custom", "quadrature_points": points}
+        rule |= {"quadrature_weights": (0.5, 0.5)}
+        return ufl.Measure("dx", domain=self.mesh, metadata=rule)
+
+    def space(self, shape: tuple[int, ...] = ()) -> fem.FunctionSpace:
+        """Return the space of values at the points."""
+        cell = self.mesh.basix_cell()
+        element = basix.ufl.quadrature_element(cell, value_shape=shape, degree=self.degree)
+        return fem.functionspace(self.mesh, element)
+
+
+class Plasticity(ABC):
+    """Plasticity by von Mises with isotropic hardening, in small or in finite strain.
+
+    Creation is collective; arguments are those of ``J2Plasticity``.
+
+    Attributes:
+        hardening: The yield stress.
+        dx: The measure of cells.
+    """
+
+    def __init__(
+        self,
+        elasticity: Elasticity,
+        u: fem.Function,
+        *,
+        yield_stress: float,
+        hardening: float = 0.0,
+        saturation: float = 0.0,
+        rate: float = 0.0,
+        degree: int | None = None,
+        selective: bool = False,
+        tolerances: ReturnTolerances | None = None,
+    ) -> None:
+        check_law(elasticity, u, type(self).__name__)
+        self.hardening = IsotropicHardening(
+            yield_stress, hardening, saturation, rate, tolerances or ReturnTolerances()
+        )
+        self.elasticity, self.u = elasticity, u
+        self._at = Quadrature.of(u, degree, selective)
+        self.dx = self._at.dx
+        self._begin()
+
+    @abstractmethod
+    def _begin(self) -> None:
+        """Make functions and expressions at the quadrature points."""
+
+    @property
+    def regularisation(self) -> float:
+        """Share of the elastic moduli in the tangent; 0 where there is hardening."""
+        return self.hardening.regularisation
+
+    @property
+    def _bulk(self) -> Any:
+        return self.elasticity.E / 3 / (1 - 2 * self.elasticity.nu)
+
+
+class J2Plasticity(Plasticity):
     """Plasticity by von Mises with isotropic hardening in small strain. Creation is collective.
 
     The yield stress is σ_y(p) = yield_stress + hardening p + saturation (1 − exp(−rate p)), p the
@@ -54,6 +233,9 @@ class J2Plasticity:
         rate: Rate of Voce's hardening, 0 or more.
         degree: Degree of the quadrature, of plastic strains too; default twice that of ``u``,
             less 2, and at least 1, and 2 on quadrilaterals and hexahedra.
+        selective: Whether the change of volume is integrated at the centre of each cell, on
+            quadrilaterals and hexahedra of degree 1: plastic flow keeps the volume, and cells that
+            are fully integrated, or simplices of degree 1, are too stiff for it (locking).
         tolerances: Those of the return.
 
     Attributes:
@@ -66,50 +248,9 @@ class J2Plasticity:
         InputError: Something given does not fit; the message names it.
     """
 
-    def __init__(
-        self,
-        elasticity: Elasticity,
-        u: fem.Function,
-        *,
-        yield_stress: float,
-        hardening: float = 0.0,
-        saturation: float = 0.0,
-        rate: float = 0.0,
-        degree: int | None = None,
-        tolerances: ReturnTolerances | None = None,
-    ) -> None:
-        checked_type(elasticity, Elasticity, "elasticity", "a tfeti_dolfinx.Elasticity")
-        checked_type(u, fem.Function, "u", "a dolfinx.fem.Function")
-        if elasticity.model == "plane_stress":
-            raise InputError(
-                "J2Plasticity: plane stress is not there; expected plane strain, axisymmetric or 3d"
-            )
-        self._yield = (
-            checked_number(yield_stress, "yield_stress", POSITIVE),
-            checked_number(hardening, "hardening", FROM_0),
-            checked_number(saturation, "saturation", FROM_0),
-            checked_number(rate, "rate", FROM_0),
-        )
-        self.elasticity, self.u = elasticity, u
-        self._tolerances = ReturnTolerances() if tolerances is None else tolerances
-        mesh, V = elasticity.mesh, u.function_space
-        if V.mesh is not mesh:
-            raise InputError("J2Plasticity: u is on another mesh than the elasticity")
-        self._gdim = mesh.geometry.dim
-        cell = mesh.basix_cell()
-        if degree is None:
-            simplex = cell in (basix.CellType.triangle, basix.CellType.tetrahedron)
-            degree = max(2 * V.element.basix_element.degree - (2 if simplex else 0), 1)
-        self.dx = ufl.Measure(
-            "dx",
-            domain=mesh,
-            metadata={"quadrature_degree": degree, "quadrature_scheme": "default"},
-        )
-        scalar = basix.ufl.quadrature_element(cell, degree=degree)
-        tensor = basix.ufl.quadrature_element(
-            cell, value_shape=(6 if self._gdim == 3 else 4,), degree=degree
-        )
-        Q, W = fem.functionspace(mesh, scalar), fem.functionspace(mesh, tensor)
+    def _begin(self) -> None:
+        self._gdim, elasticity, u = self.elasticity.mesh.geometry.dim, self.elasticity, self.u
+        Q, W = self._at.space(), self._at.space((6 if self._gdim == 3 else 4,))
         self.plastic_strain = fem.Function(W, name="plastic_strain")
         self.p = fem.Function(Q, name="accumulated_plastic_strain")
         self._dp = fem.Function(Q, name="plastic_increment")  # of this load step
@@ -123,74 +264,44 @@ class J2Plasticity:
         new = self._tensor(self.plastic_strain) + self._dp * self._n
         self.state = {self.plastic_strain: _components(new, self._gdim), self.p: self.p + self._dp}
 
-    @property
-    def regularisation(self) -> float:
-        """Share of the elastic moduli in the tangent; 0 where there is hardening."""
-        _, hardening, saturation, rate = self._yield
-        return 0.0 if hardening or saturation * rate else self._tolerances.perfect
-
     def update(self) -> None:
         """Return stresses to the yield surface where ``u`` is now. Collective."""
-        tol = self._tolerances
         self._q.interpolate(self._q_of_u)
         self._G.interpolate(self._G_of_x)
-        q, G, p = self._q.x.array, self._G.x.array, self.p.x.array
-        dp = np.zeros_like(q)
+        q = self._q.x.array
         with raised_on_all_ranks(self.u.function_space.mesh.comm):
             if not np.all(np.isfinite(q)):
                 raise InputError("J2Plasticity: the stress is not finite")
-        plastic = q > (1.0 + tol.yielding) * self._yield_stress(p)[0]
-        left = bool(np.any(plastic))
-        for _ in range(tol.max_it):  # concave in dp: Newton's method goes up monotonically
-            if not left:
-                break
-            y, slope = self._yield_stress(p + dp)
-            f = np.where(plastic, q - 3.0 * G * dp - y, 0.0)
-            dp += f / (3.0 * G + slope)
-            left = bool(np.any(np.abs(f) > tol.rtol * (q + y)))
+        dp, slope, solved = self.hardening.returned(q, self._G.x.array, self.p.x.array)
         with raised_on_all_ranks(self.u.function_space.mesh.comm):
-            if left:
-                raise ConvergenceError(
-                    f"J2Plasticity: the return takes more than {tol.max_it} steps somewhere"
-                )
+            check_return(solved, self.hardening)
         self._dp.x.array[:] = dp
-        self._slope.x.array[:] = self._yield_stress(p + dp)[1]
+        self._slope.x.array[:] = slope
 
     def stress(self, u: Any) -> Any:
         """Return the stress, 3×3, of the displacement that ``update`` was called for."""
-        e, s, q = self.elasticity.strain(u), self._trial(u), self._norm(u)
-        share = 1 - 3 * self.elasticity.mu * self._dp / q
-        return self._bulk * ufl.tr(e) * ufl.Identity(3) + share * s
+        e = self.elasticity.strain(u)
+        return self._bulk * ufl.tr(e) * ufl.Identity(3) + self._deviator(u)
 
     def residual(self, v: Any) -> ufl.Form:
         """Return ∫σ(u):ε(v)."""
-        return self._times(ufl.inner(self.stress(self.u), self.elasticity.strain(v)))
+        e = self.elasticity.strain(v)
+        return self._integrated(ufl.tr(self.elasticity.strain(self.u)), self._deviator(self.u), e)
 
     def tangent(self, w: Any, v: Any) -> ufl.Form:
         """Return the derivative of ``residual`` along w, consistent with the return."""
-        e, strain = self.elasticity.strain(w), self.elasticity.strain(v)
-        mu, q, n = self.elasticity.mu, self._norm(self.u), self._n
+        e, mu, q, n = self.elasticity.strain(w), self.elasticity.mu, self._norm(self.u), self._n
         plastic = ufl.conditional(ufl.gt(self._dp, 0.0), 1.0, 0.0)
         share = 1 - 3 * mu * self._dp / q
         along = 4 * mu**2 * plastic * (1 / (3 * mu + self._slope) - self._dp / q)
-        sigma = (
-            self._bulk * ufl.tr(e) * ufl.Identity(3)
-            + 2 * mu * share * ufl.dev(e)
-            - along * ufl.inner(n, e) * n
-        )
+        deviator = 2 * mu * share * ufl.dev(e) - along * ufl.inner(n, e) * n
         if self.regularisation:
-            sigma = sigma + self.regularisation * plastic * self.elasticity.stress(w)
-        return self._times(ufl.inner(sigma, strain))
+            deviator = deviator + 2 * mu * self.regularisation * plastic * ufl.dev(e)
+        return self._integrated(ufl.tr(e), deviator, self.elasticity.strain(v))
 
-    @property
-    def _bulk(self) -> Any:
-        return self.elasticity.E / 3 / (1 - 2 * self.elasticity.nu)
-
-    def _yield_stress(self, p: Array) -> tuple[Array, Array]:
-        """Return the yield stress at accumulated plastic strains, and its slope."""
-        start, hardening, saturation, rate = self._yield
-        rest = saturation * np.exp(-rate * p)
-        return start + hardening * p + saturation - rest, hardening + rate * rest
+    def _deviator(self, u: Any) -> Any:
+        """Deviatoric stress, returned by what ``update`` has found."""
+        return (1 - 3 * self.elasticity.mu * self._dp / self._norm(u)) * self._trial(u)
 
     def _trial(self, u: Any) -> Any:
         """Deviatoric stress if the load step were elastic."""
@@ -200,7 +311,7 @@ class J2Plasticity:
     def _norm(self, u: Any) -> Any:
         """Von Mises stress of the trial stress, kept off 0."""
         s = self._trial(u)
-        tiny = (self._yield[0] * self._tolerances.yielding) ** 2
+        tiny = (self.hardening.start * self.hardening.tolerances.yielding) ** 2
         return ufl.sqrt(1.5 * ufl.inner(s, s) + tiny)
 
     def _normal(self, u: Any) -> Any:
@@ -213,8 +324,36 @@ class J2Plasticity:
             return ufl.as_matrix([[c[0], c[3], c[4]], [c[3], c[1], c[5]], [c[4], c[5], c[2]]])
         return ufl.as_matrix([[c[0], c[3], 0], [c[3], c[1], 0], [0, 0, c[2]]])
 
-    def _times(self, density: Any) -> ufl.Form:
-        return density * self.elasticity.thickness * self.dx
+    def _integrated(self, dilatation: Any, deviator: Any, strain: Any) -> ufl.Form:
+        """Integral of a stress, given in parts, times a strain."""
+        volume = self.elasticity.thickness * self._bulk * dilatation * ufl.tr(strain)
+        shape = self.elasticity.thickness * ufl.inner(deviator, strain)
+        return volume * self._at.dx_volume + shape * self.dx
+
+
+def check_law(elasticity: Any, u: Any, name: str) -> None:
+    """Raise unless a law fits a displacement.
+
+    Raises:
+        InputError: It names what does not fit.
+    """
+    checked_type(elasticity, Elasticity, "elasticity", "a tfeti_dolfinx.Elasticity")
+    checked_type(u, fem.Function, "u", "a dolfinx.fem.Function")
+    if elasticity.model == "plane_stress":
+        raise InputError(
+            f"{name}: plane stress is not there; expected plane strain, axisymmetric or 3d"
+        )
+    if u.function_space.mesh is not elasticity.mesh:
+        raise InputError(f"{name}: u is on another mesh than the elasticity")
+
+
+def check_return(solved: bool, hardening: IsotropicHardening) -> None:
+    """Raise a ConvergenceError unless all stresses have returned to the yield surface."""
+    if not solved:
+        raise ConvergenceError(
+            f"J2 plasticity: the return takes more than {hardening.tolerances.max_it} steps "
+            "somewhere"
+        )
 
 
 def _components(t: Any, gdim: int) -> Any:

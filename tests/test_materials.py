@@ -1,0 +1,255 @@
+"""Laws of nonlinear bodies: their tangents, exact paths, rotations, and what they refuse."""
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from dolfinx import mesh as dmesh
+from mpi4py import MPI
+from reference.nonlinear import neo_hooke
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.nonlinear.tangent import rotation_free_tangent
+
+E, NU = 1.0, 0.3
+PLASTIC = {"yield_stress": 0.02, "hardening": 0.1, "saturation": 0.01, "rate": 20.0}
+MODELS = ["plane_strain", "axisymmetric", "3d"]
+LAWS = {
+    "J2": (tfeti.J2Plasticity, PLASTIC),
+    "finite J2": (tfeti.FiniteJ2Plasticity, PLASTIC),
+    "neo-Hooke": (tfeti.NeoHooke, {}),
+    "St. Venant": (tfeti.SaintVenantKirchhoff, {}),
+}
+
+
+def body(model, n=1):
+    """A few cells, and a displacement on them."""
+    if model == "3d":
+        mesh = dmesh.create_box(
+            MPI.COMM_SELF, [[0.0] * 3, [1.0] * 3], [n] * 3, dmesh.CellType.tetrahedron
+        )
+    else:
+        ends = [[0.5, 0.0], [1.5, 1.0]]
+        mesh = dmesh.create_rectangle(MPI.COMM_SELF, ends, [n] * 2, dmesh.CellType.quadrilateral)
+    gdim = mesh.geometry.dim
+    mesh.geometry.x[:, :gdim] += 0.1 * np.sin(7.0 * mesh.geometry.x[:, ::-1][:, -gdim:])
+    return fem.Function(fem.functionspace(mesh, ("Lagrange", 1, (gdim,))))
+
+
+def assembled(form, u, law):
+    """Function of a displacement: the assembled form, the law up to date."""
+    compiled = fem.form(form)
+    rank = len(form.arguments())
+
+    def at(values):
+        u.x.array[:] = values
+        law.update()
+        if rank == 1:
+            return np.array(fem.assemble_vector(compiled).array)
+        return fem.assemble_matrix(compiled).to_dense()
+
+    return at
+
+
+@pytest.mark.parametrize("selective", [False, True])
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("name", LAWS)
+def test_the_tangent_is_the_derivative_of_the_residual(name, model, selective):
+    """Beyond the yield stress, in the second load step, to the error of central differences."""
+    if (selective, model) == (True, "3d"):
+        pytest.skip("as in 2D")
+    kind, given = LAWS[name]
+    u = body(model)
+    elastic = tfeti.Elasticity(u.function_space.mesh, E=E, nu=NU, model=model)
+    law = kind(elastic, u, selective=selective, **given)
+    V = u.function_space
+    v, w = ufl.TestFunction(V), ufl.TrialFunction(V)
+    F = law.residual(v)
+    J = law.tangent(w, v) if name == "J2" else ufl.derivative(F, u, w)
+    rng = np.random.default_rng(1)
+    first, way, d = (0.1 * rng.normal(size=u.x.array.size) for _ in range(3))
+    residual, tangent = assembled(F, u, law), assembled(J, u, law)
+    if given:
+        residual(0.5 * first)
+        new = {f: tfeti_value(f, value) for f, value in law.state.items()}
+        for function, value in new.items():
+            function.x.array[:] = value
+        assert np.any(law.p.x.array > 0.0)
+    at, h = first + 0.5 * way, 1e-5
+    found = tangent(at) @ d
+    if name in ("neo-Hooke", "St. Venant"):  # far from where their moduli are changed
+        at, d = 0.1 * at, d
+        found = tangent(at) @ d
+    expected = (residual(at + h * d) - residual(at - h * d)) / (2.0 * h)
+    assert np.abs(found - expected).max() < 1e-7 * np.abs(expected).max()
+    K = tangent(at)
+    assert np.abs(K - K.T).max() < 1e-12 * np.abs(K).max()
+
+
+def tfeti_value(function, value):
+    """The new value of an internal variable."""
+    if callable(value) and not isinstance(value, ufl.core.expr.Expr):
+        return value()
+    V, target = function.function_space, fem.Function(function.function_space)
+    points = V.element.interpolation_points
+    target.interpolate(fem.Expression(value, points() if callable(points) else points))
+    return target.x.array
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_a_small_displacement_is_that_of_linear_elasticity(name):
+    kind, given = LAWS[name]
+    u = body("plane_strain", 2)
+    elastic = tfeti.Elasticity(u.function_space.mesh, E=E, nu=NU, model="plane_strain")
+    law = kind(elastic, u, **given)
+    v, w = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
+    J = law.tangent(w, v) if name == "J2" else ufl.derivative(law.residual(v), u, w)
+    K = assembled(J, u, law)(np.zeros_like(u.x.array))
+    expected = fem.assemble_matrix(fem.form(elastic.a(w, v))).to_dense()
+    assert np.abs(K - expected).max() < 1e-13
+
+
+def test_neo_hooke_is_that_of_the_reference():
+    for model in ("plane_strain", "3d"):
+        u = body(model)
+        law = tfeti.NeoHooke(
+            tfeti.Elasticity(u.function_space.mesh, E=E, nu=NU, model=model), u, degree=4
+        )
+        v = ufl.TestFunction(u.function_space)
+        energy = neo_hooke(u, E, NU) * ufl.dx(metadata={"quadrature_degree": 4})
+        u.x.array[:] = 0.1 * np.random.default_rng(2).normal(size=u.x.array.size)
+        law.update()
+        found = fem.assemble_vector(fem.form(law.residual(v))).array
+        expected = fem.assemble_vector(fem.form(ufl.derivative(energy, u, v))).array
+        assert np.abs(found - expected).max() < 1e-14
+
+
+@pytest.mark.parametrize(
+    ("name", "stretch", "nu"), [("neo-Hooke", 1.6, 0.45), ("St. Venant", 0.5, 0.3)]
+)
+def test_the_tangent_stays_definite_and_the_residual_as_it_is(name, stretch, nu):
+    """Stretched to where the moduli are indefinite: all but rigid motions have energy."""
+    u = body("plane_strain")
+    V, kind = u.function_space, LAWS[name][0]
+    law = kind(tfeti.Elasticity(V.mesh, E=E, nu=nu, model="plane_strain"), u)
+    u.interpolate(lambda x: ((stretch - 1.0) * x[0], (stretch - 1.0) * x[1]))
+    v = ufl.TestFunction(V)
+    F = ufl.variable(law.deformation(u))
+    energy = law.volumetric_energy(F) + law.shape_energy(F)
+    plain = ufl.derivative(energy * law.dx, u, v)
+    least = []
+    for form in (plain, law.residual(v)):
+        K = assembled(rotation_free_tangent(form, u), u, law)(u.x.array.copy())
+        least.append(np.linalg.eigvalsh(K))
+    assert least[0][0] < -1e-3
+    assert np.all(np.abs(least[1][:3]) < 1e-12)
+    assert least[1][3] > 1e-3
+    residual = [fem.assemble_vector(fem.form(form)).array for form in (plain, law.residual(v))]
+    assert np.abs(residual[0] - residual[1]).max() < 1e-14
+
+
+def test_a_turn_does_not_change_a_finite_law():
+    """Forces turn with the body, elastic and plastic, through load steps: P(QF) = Q P(F)."""
+    angle = 1.1
+    Q = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    for name in ("finite J2", "neo-Hooke", "St. Venant"):
+        kind, given = LAWS[name]
+        forces = []
+        for turn in (np.eye(2), Q):
+            u = body("plane_strain")
+            V = u.function_space
+            law = kind(tfeti.Elasticity(V.mesh, E=E, nu=NU, model="plane_strain"), u, **given)
+            residual = assembled(law.residual(ufl.TestFunction(V)), u, law)
+            x = V.tabulate_dof_coordinates()[:, :2]
+            way = 0.1 * np.random.default_rng(3).normal(size=x.shape)
+            for share in (0.5, 1.0):
+                # half of the turn in the first step
+                half = turn if share == 1.0 else Q_half(turn)
+                f = residual(((x + share * way) @ half.T - x).ravel())
+                for function, value in getattr(law, "state", {}).items():
+                    function.x.array[:] = value()
+            forces.append(f.reshape(-1, 2) @ turn)
+        assert np.abs(forces[0] - forces[1]).max() < 1e-13
+
+
+def Q_half(turn):
+    """Half of a rotation."""
+    angle = 0.5 * np.arctan2(turn[1, 0], turn[0, 0])
+    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def test_a_bar_in_finite_strain_follows_its_hardening():
+    """Stretched to twice its length, free across: τ = σ_y(p), p = ln ℓ − τ/E."""
+    u = body("3d")
+    V = u.function_space
+    given = {"yield_stress": 0.02, "hardening": 0.1}
+    law = tfeti.FiniteJ2Plasticity(tfeti.Elasticity(V.mesh, E=E, nu=NU), u, **given)
+    total = fem.form(law.stress(u)[0, 0] * law.dx)
+    across = fem.form(law.stress(u)[1, 1] * law.dx)
+    volume = fem.assemble_scalar(fem.form(fem.Constant(V.mesh, 1.0) * law.dx))
+    for length in (1.01, 1.3, 2.0):
+        strain = np.log(length)
+        # from τ = 0.02 + 0.1 p with p = ln ℓ − τ/E
+        tau = strain * E if strain * E < 0.02 else (0.02 + 0.1 * strain) / (1 + 0.1 / E)
+        p = strain - tau / E
+        side = np.exp(-0.5 * p - NU * tau / E)
+        u.interpolate(lambda x, a=length, b=side: ((a - 1) * x[0], (b - 1) * x[1], (b - 1) * x[2]))
+        law.update()
+        J = length * side**2
+        assert J * fem.assemble_scalar(total) / volume == pytest.approx(tau, abs=1e-12)
+        assert fem.assemble_scalar(across) / volume == pytest.approx(0.0, abs=1e-12)
+        for function, value in law.state.items():
+            function.x.array[:] = value()
+        assert np.allclose(law.p.x.array, p, atol=1e-12)
+
+
+@pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
+def test_stresses_at_nodes_are_those_of_the_points(cell, comm):
+    """Sheared by a hundredth, beyond the yield stress: von Mises' stress is σ_y(p) everywhere."""
+    mesh = dmesh.create_unit_square(comm, 3, 3, dmesh.CellType[cell])
+    facets = dmesh.locate_entities_boundary(mesh, 1, lambda x: np.full(x.shape[1], True))
+    tags = dmesh.meshtags(mesh, 1, facets, np.full_like(facets, 1))
+    decomposition = tfeti.decompose(mesh, 2, facet_tags=tags, surfaces={"side": 1})
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+    u, given = fem.Function(V), fem.Function(V)
+    v, w = ufl.TestFunction(V), ufl.TrialFunction(V)
+    given.interpolate(lambda x: (0.04 * x[1], 0.0 * x[0]))
+    dofs = fem.locate_dofs_topological(V, 1, decomposition.facets("side"))
+    elastic = tfeti.Elasticity(decomposition, E=E, nu=NU, model="plane_strain")
+    law = tfeti.J2Plasticity(elastic, u, yield_stress=0.01, hardening=0.1)
+    problem = tfeti.NonlinearContactProblem(
+        law.residual(v),
+        u,
+        [fem.dirichletbc(given, dofs)],
+        [],
+        decomposition,
+        J=law.tangent(w, v),
+        state=law.state,
+        update=law.update,
+        stress=law.stress,
+        petsc_options={"rtol": 1e-10},
+    )
+    problem.solve()
+    mu = E / 2 / (1 + NU)
+    q = np.sqrt(3.0) * mu * 0.04
+    expected = q - 3.0 * mu * (q - 0.01) / (3.0 * mu + 0.1)
+    for found in (problem.solution.von_mises, problem.solution.nodal_von_mises):
+        assert np.allclose(found.x.array, expected, rtol=1e-7, atol=0.0)
+
+
+def test_mistakes_are_named():
+    u = body("plane_strain")
+    sheet = tfeti.Elasticity(u.function_space.mesh, E=E, nu=NU, model="plane_stress")
+    strain = tfeti.Elasticity(u.function_space.mesh, E=E, nu=NU, model="plane_strain")
+    for name, (kind, given) in LAWS.items():
+        with pytest.raises(tfeti.InputError, match="plane stress is not there"):
+            kind(sheet, u, **given)
+        with pytest.raises(tfeti.InputError, match="on another mesh"):
+            kind(strain, body("plane_strain"), **given)
+        second = fem.Function(fem.functionspace(u.function_space.mesh, ("Lagrange", 2, (2,))))
+        with pytest.raises(tfeti.InputError, match="selective=True on quadrilaterals"):
+            kind(strain, second, selective=True, **given)
+        if given:
+            with pytest.raises(tfeti.InputError, match="yield_stress"):
+                kind(strain, u, yield_stress=-1.0)
+        assert name

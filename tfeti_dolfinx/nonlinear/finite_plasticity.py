@@ -1,0 +1,221 @@
+"""J2 plasticity in finite strain: logarithmic strains, a return that is that of small strain."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import ufl
+from dolfinx import fem
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.compat import interpolation_points
+from tfeti_dolfinx.errors import raised_on_all_ranks
+from tfeti_dolfinx.nonlinear.hyperelasticity import displacement_gradient
+from tfeti_dolfinx.nonlinear.materials import IsotropicHardening, Plasticity, check_return
+
+# entries of the deformation gradient that a model has, and of a symmetric tensor
+ENTRIES = {
+    "3d": [(i, j) for i in range(3) for j in range(3)],
+    "plane_strain": [(0, 0), (0, 1), (1, 0), (1, 1)],
+    "axisymmetric": [(0, 0), (0, 1), (1, 0), (1, 1), (2, 2)],
+}
+SYMMETRIC = [(0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)]
+
+
+class FiniteJ2Plasticity(Plasticity):
+    """Plasticity by von Mises with isotropic hardening in finite strain. Creation is collective.
+
+    F = F_e F_p, the energy is that of Hencky in ln b_e, b_e = F_e F_eᵀ, and Kirchhoff's stress τ
+    yields as in ``J2Plasticity``. With the exponential map the return in principal axes is that of
+    small strain, and det F_p = 1 exactly (Simo, Comput. Methods Appl. Mech. Engrg. 99, 1992; de
+    Souza Neto, Perić, Owen, Computational Methods for Plasticity, 2008, chapter 14):
+
+    1. b = F C_p⁻¹ Fᵀ, its eigenvalues b_a and eigenvectors; ε_a = ½ ln b_a.
+    2. s_a = 2μ dev ε_a, q; the return gives Δp, and τ_a = (1 − 3μ Δp/q) s_a.
+    3. P = τ F⁻ᵀ, and ∂P/∂F by the derivative of an isotropic function: in principal axes
+       δτ_ab = (τ_a − τ_b)/(b_a − b_b) δb_ab, and ∂τ_a/∂ε_b of the return on the diagonal.
+    4. At the end of a load step C_p⁻¹ = F⁻¹ b_e F⁻ᵀ, ln b_e = 2(ε − 1.5 Δp s/q).
+
+    P and its derivative are numbers at quadrature points. The residual has P + ∂P : (F − F̂), F̂
+    that of the last ``update``, beside the volumetric part κ/2 ln²J in UFL.
+
+    ``NonlinearContactProblem(law.residual(v), u, ..., finite=True, state=law.state,
+    update=law.update, stress=law.stress)`` takes it.
+
+    Arguments are those of ``J2Plasticity``.
+
+    Attributes:
+        inverse_plastic: C_p⁻¹ where the load step began, components xx, yy, zz, xy, xz, yz.
+        p: Accumulated plastic strain there.
+        state: What ``NonlinearContactProblem`` takes as ``state``.
+    """
+
+    def _begin(self) -> None:
+        elasticity, u = self.elasticity, self.u
+        self._entries = ENTRIES[elasticity.model]
+        m = len(self._entries)
+        scalar, vector = self._at.space(), self._at.space((m,))
+        self.p = fem.Function(scalar, name="accumulated_plastic_strain")
+        self.inverse_plastic = fem.Function(self._at.space((6,)), name="inverse_plastic_strain")
+        self.inverse_plastic.x.array[:] = np.tile(
+            [1.0, 1.0, 1.0, 0.0, 0.0, 0.0], len(self.p.x.array)
+        )
+        self._mu, self._G = fem.Function(scalar), fem.Function(vector)
+        self._P, self._dP = fem.Function(vector), fem.Function(self._at.space((m, m)))
+        points = interpolation_points(scalar)
+        self._mu_of_x = fem.Expression(elasticity.mu, points)
+        self._G_of_u = fem.Expression(self._gradient(u), points)
+        self._new = (np.array(self.inverse_plastic.x.array), np.array(self.p.x.array))
+        self.state = {
+            self.inverse_plastic: lambda: self._new[0],
+            self.p: lambda: self._new[1],
+        }
+        self.update()
+
+    def update(self) -> None:
+        """Return stresses to the yield surface where ``u`` is now. Collective.
+
+        Where a body is turned inside out all is not a number, which no step ends with.
+        """
+        self._G.interpolate(self._G_of_u)
+        self._mu.interpolate(self._mu_of_x)
+        F = np.zeros((len(self.p.x.array), 3, 3))
+        rows, columns = np.array(self._entries).T
+        F[:, rows, columns] = self._G.x.array.reshape(len(F), -1)
+        F += np.eye(3)
+        out = ~(np.linalg.det(F) > 0.0)
+        F[out] = np.eye(3)
+        inverse_plastic = _symmetric(self.inverse_plastic.x.array.reshape(-1, 6))
+        point = _Return(F, inverse_plastic, self.p.x.array, self._mu.x.array, self.hardening)
+        with raised_on_all_ranks(self.u.function_space.mesh.comm):
+            check_return(point.solved, self.hardening)
+        P, dP = point.stress(), point.tangent(self._entries)
+        P[out] = dP[out] = np.nan
+        self._P.x.array[:] = P[:, rows, columns].ravel()
+        self._dP.x.array[:] = dP.ravel()
+        self._new = point.end()
+
+    def stress(self, u: Any) -> Any:
+        """Return Cauchy's stress, 3×3, of the displacement that ``update`` was called for."""
+        F = ufl.Identity(3) + displacement_gradient(self.elasticity, u)
+        J, P = ufl.det(F), self._tensor(self._P)
+        tau = P * F.T
+        if self.elasticity.model == "plane_strain":  # it is a deviator
+            across = ufl.as_tensor([[0, 0, 0], [0, 0, 0], [0, 0, 1]])
+            tau = tau - (tau[0, 0] + tau[1, 1]) * across
+        return (tau + self._bulk * ufl.ln(J) * ufl.Identity(3)) / J
+
+    def residual(self, v: Any) -> ufl.Form:
+        """Return ∫P:∇v, whose derivative is that of the return."""
+        thickness = self.elasticity.thickness
+        F = ufl.Identity(3) + displacement_gradient(self.elasticity, self.u)
+        energy = thickness * self._bulk / 2 * ufl.ln(ufl.det(F)) ** 2 * self._at.dx_volume
+        P = self._P + ufl.dot(self._dP, self._gradient(self.u) - self._G)
+        return (
+            ufl.derivative(energy, self.u, v) + thickness * ufl.dot(P, self._gradient(v)) * self.dx
+        )
+
+    def _gradient(self, w: Any) -> Any:
+        """Entries of ∇w that the model has."""
+        g = displacement_gradient(self.elasticity, w)
+        return ufl.as_vector([g[i, j] for i, j in self._entries])
+
+    def _tensor(self, entries: Any) -> Any:
+        """Return 3×3 tensors from the entries that the model has."""
+        place = {ij: k for k, ij in enumerate(self._entries)}
+        return ufl.as_tensor(
+            [[entries[place[i, j]] if (i, j) in place else 0 for j in range(3)] for i in range(3)]
+        )
+
+
+class _Return:
+    """The return of many points at once, in principal axes.
+
+    Args:
+        F: Deformation gradients, shape (n, 3, 3), of positive determinants.
+        inverse_plastic: C_p⁻¹, shape (n, 3, 3).
+        p: Accumulated plastic strains, shape (n,).
+        mu: Shear moduli, shape (n,).
+        hardening: The yield stress.
+    """
+
+    def __init__(
+        self, F: Array, inverse_plastic: Array, p: Array, mu: Array, hardening: IsotropicHardening
+    ) -> None:
+        self.F, self.mu, self.p = F, mu, p
+        self.F_inverse = np.linalg.inv(F)
+        self.M = inverse_plastic @ _transposed(F)
+        self.b, self.axes = np.linalg.eigh(F @ self.M)
+        self.b = np.maximum(self.b, np.finfo(float).tiny)
+        self.strain = 0.5 * np.log(self.b)
+        s = 2.0 * mu[:, None] * (self.strain - self.strain.mean(axis=1, keepdims=True))
+        q = np.sqrt(1.5 * np.sum(s**2, axis=1))
+        self.dp, self.slope, self.solved = hardening.returned(q, mu, p)
+        q = np.maximum(q, hardening.tolerances.yielding * hardening.start)
+        self.share = 1.0 - 3.0 * mu * self.dp / q
+        self.regular = hardening.regularisation * (self.dp > 0.0)
+        self.n, self.q = 1.5 * s / q[:, None], q
+        self.tau = self._turned_back(np.eye(3) * (self.share[:, None] * s)[:, None, :])
+
+    def stress(self) -> Array:
+        """Return P = τ F⁻ᵀ, shape (n, 3, 3), without its volumetric part."""
+        return np.asarray(self.tau @ _transposed(self.F_inverse))
+
+    def tangent(self, entries: list[tuple[int, int]]) -> Array:
+        """Return ∂P/∂F for some entries of both, shape (n, m, m)."""
+        rows, columns = np.array(entries).T
+        diagonal, shear = self._moduli()
+        P, turned = self.stress(), _transposed(self.axes)
+        found = np.empty((len(self.F), len(entries), len(entries)))
+        for k, (i, j) in enumerate(entries):
+            # δF = e_i e_jᵀ, so that δb has M's row j in its row i
+            half = np.zeros_like(self.F)
+            half[:, i, :] = self.M[:, j, :]
+            db = turned @ (half + _transposed(half)) @ self.axes
+            d_tau = shear * db
+            strains = np.einsum("naa->na", db) / (2.0 * self.b)
+            d_tau[:, range(3), range(3)] = np.einsum("nab,nb->na", diagonal, strains)
+            dP = self._turned_back(d_tau) @ _transposed(self.F_inverse)
+            # δ(F⁻ᵀ) = −F⁻ᵀ δFᵀ F⁻ᵀ
+            dP -= P[:, :, j, None] * self.F_inverse[:, None, :, i]
+            found[:, :, k] = dP[:, rows, columns]
+        return found
+
+    def _moduli(self) -> tuple[Array, Array]:
+        """Return ∂τ_a/∂ε_b and (τ_a − τ_b)/(b_a − b_b) off the diagonal, in principal axes."""
+        elastic = 2.0 * self.mu * (self.share + self.regular)
+        along = 1.0 / (3.0 * self.mu + self.slope) - self.dp / self.q
+        along *= 4.0 * self.mu**2 * (self.dp > 0.0)
+        deviator = np.eye(3) - 1.0 / 3.0
+        diagonal = elastic[:, None, None] * deviator
+        diagonal -= along[:, None, None] * self.n[:, :, None] * self.n[:, None, :]
+        # (ε_a − ε_b)/(b_a − b_b) = ln(1 + x)/2x b_b, x = b_a/b_b − 1, which rounding leaves alone
+        x = self.b[:, :, None] / self.b[:, None, :] - 1.0
+        small = np.abs(x) < np.finfo(float).eps
+        ratio = np.where(small, 1.0, np.log1p(x) / np.where(small, 1.0, x))
+        return diagonal, elastic[:, None, None] * ratio / (2.0 * self.b[:, None, :])
+
+    def end(self) -> tuple[Array, Array]:
+        """Return C_p⁻¹ and p at the end of the load step, as arrays of their functions."""
+        elastic = np.exp(2.0 * (self.strain - self.dp[:, None] * self.n))
+        b = self._turned_back(np.eye(3) * elastic[:, None, :])
+        new = self.F_inverse @ b @ _transposed(self.F_inverse)
+        rows, columns = np.array(SYMMETRIC).T
+        return new[:, rows, columns].ravel(), self.p + self.dp
+
+    def _turned_back(self, t: Array) -> Array:
+        """Return tensors given in principal axes."""
+        return np.asarray(self.axes @ t @ _transposed(self.axes))
+
+
+def _transposed(t: Array) -> Array:
+    return np.swapaxes(t, 1, 2)
+
+
+def _symmetric(components: Array) -> Array:
+    """Return symmetric tensors, shape (n, 3, 3), from their components."""
+    t = np.empty((len(components), 3, 3))
+    for k, (i, j) in enumerate(SYMMETRIC):
+        t[:, i, j] = t[:, j, i] = components[:, k]
+    return t
