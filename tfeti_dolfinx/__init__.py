@@ -35,6 +35,7 @@ from tfeti_dolfinx.constraints.contact_state import ContactData, ContactStatus
 from tfeti_dolfinx.contact.friction import Coulomb, Tresca
 from tfeti_dolfinx.contact.obstacle import Obstacle
 from tfeti_dolfinx.contact.pair import Contact
+from tfeti_dolfinx.contact.rigid_body import RigidBody
 from tfeti_dolfinx.contact.shapes import Cylinder, Plane, SignedDistance, Sphere
 from tfeti_dolfinx.errors import (
     ConvergenceError,
@@ -90,6 +91,7 @@ __all__ = [
     "Plane",
     "PointValues",
     "Report",
+    "RigidBody",
     "SignedDistance",
     "Solution",
     "Sphere",

@@ -22,6 +22,8 @@ class RowTolerances:
         agreement: Values that conditions prescribe at a node differ by less, relative to all.
         nothing_left: Of a row's norm: if prescribed components leave less, rounding of the normal
             has made it (ε|x|/h of a facet of size h at x), and the row is dropped.
+        rigid: D of a rigid body, over the smallest: what it resists is beyond all elastic bodies,
+            and squares of it are still numbers.
         overlap: Overlap, over the scene's length, that rounding of gaps and prescribed values may
             leave.
     """
@@ -29,6 +31,7 @@ class RowTolerances:
     agreement: float = 1e-10
     nothing_left: float = 1e-6
     overlap: float = 1e-10
+    rigid: float = 1e60
 
 
 TOLERANCES = RowTolerances()
@@ -211,6 +214,7 @@ def assemble_constraints(
     scale: Array,
     tangent_scale: Array,
     pressed_by: Array,
+    rigid: int = 0,
 ) -> Constraints:
     """Assemble B, with c = 0 and ψ = 0. Collective.
 
@@ -221,6 +225,8 @@ def assemble_constraints(
         scale: What each normal row was multiplied by.
         tangent_scale: What the tangential rows of each condition were multiplied by.
         pressed_by: For each of them the position of its normal row under Coulomb's law, else −1.
+        rigid: Unknowns of rigid bodies, on the last rank behind those of its nodes. Beside them
+            all is soft: their D is ``TOLERANCES.rigid``.
     """
     rows = stack(list(tables))
     ends = np.cumsum([len(table) for table in tables])[:-1]
@@ -229,6 +235,10 @@ def assemble_constraints(
     sets = RowSets(equalities, normals, tangents.reshape(len(tangents) // max(width, 1), width))
     # the trace: local primal unknowns that rows of any rank touch
     offsets = dofs.offsets * dofs.bs
+    if rigid:
+        offsets[-1] += rigid
+        own = rigid if dofs.comm.rank == dofs.comm.size - 1 else 0
+        weights = np.append(weights, np.full(own, TOLERANCES.rigid))
     needed, place = np.unique(rows.column, return_inverse=True)
     exchange = Exchange(dofs.comm, owner_of(offsets, needed))
     asked = exchange.send(needed) - offsets[dofs.comm.rank]

@@ -438,6 +438,7 @@ class LoadSteps:
 
     def _set(self, t: float) -> None:
         with agreeing(self._comm, "apply"):
+            self._problem.time = t
             self._apply(self._problem, t)
 
     def _record(self, number: int, t: float, size: float) -> StepRecord:
