@@ -124,9 +124,7 @@ class Settings:
             ]
         count = len(tools.free_names) if tools else 0
         with added_options(self.prefix, self.factor_options):
-            return make_subdomains(
-                data, make, decomposition, counters, choice, kind, rigid, count
-            )
+            return make_subdomains(data, make, decomposition, counters, choice, kind, rigid, count)
 
     def make_dual(
         self,

@@ -71,13 +71,13 @@ class RowBuilder:
         rigid = self._rigid
         if rigid is None:
             return of_nodes.without_zeros()
-        used = place[rigid.condition] >= 0
-        row, direction = place[rigid.condition[used]], rigid.direction[used]
-        along = np.sum(records.frame[rigid.condition[used], axis] * direction, axis=1)
+        of = np.flatnonzero(place[rigid.condition] >= 0)
+        row, normal = place[rigid.condition[of]], records.frame[rigid.condition[of], axis]
+        along = np.sum(normal * rigid.direction[of], axis=1)
         return Rows(
             group=of_nodes.group,
             row=np.concatenate((of_nodes.row, row)),
-            column=np.append(of_nodes.column, dofs.offsets[-1] * dofs.bs + rigid.unknown[used]),
+            column=np.append(of_nodes.column, dofs.offsets[-1] * dofs.bs + rigid.unknown[of]),
             value=np.append(of_nodes.value, along * scale[row]),
         ).without_zeros()
 

@@ -97,6 +97,34 @@ class ToolState:
     rotation: Array
     resultant: Resultant
 
+    def __str__(self) -> str:
+        """One line: names of what is not 0, and its numbers."""
+        parts = {"displacement": self.displacement, "rotation": self.rotation}
+        parts |= {"force": self.resultant.force, "moment": self.resultant.moment}
+        words = [
+            f"{what} ({', '.join(f'{value:.6g}' for value in values)})"
+            for what, values in parts.items()
+            if what in ("displacement", "force") or np.any(values)
+        ]
+        return f"{self.name}: {', '.join(words)}"
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """All components by name, for tables."""
+        axes = "xyz"[: len(self.displacement)]
+        turns = "xyz" if len(axes) == 3 else "z"
+        pairs = [
+            *zip([f"displacement {axis}" for axis in axes], self.displacement, strict=True),
+            *zip([f"rotation {axis}" for axis in turns], self.rotation[-len(turns) :], strict=True),
+            *zip([f"force {axis}" for axis in axes], self.resultant.force, strict=True),
+            *zip(
+                [f"moment {axis}" for axis in turns],
+                self.resultant.moment[-len(turns) :],
+                strict=True,
+            ),
+        ]
+        return {f"{self.name} {what}": float(value) for what, value in pairs}
+
 
 # --- State of contact conditions: forces, gaps, slips -----------------------------------------
 
@@ -195,6 +223,12 @@ class ContactState:
             rotation=rotation_vector(tool.motion, gdim),
             resultant=resultant(self.dofs.comm, arm, -self.condition_forces[own]),
         )
+
+    @property
+    def tool_numbers(self) -> dict[str, float]:
+        """Motion and forces of all rigid bodies by name. Collective."""
+        states = [self.tool(i) for i in range(len(self.tool_motions))]
+        return {name: value for state in states for name, value in state.numbers.items()}
 
     def reaction(self, surface: str | int) -> Resultant:
         """Return the force and moment by which Dirichlet conditions hold a surface. Collective.

@@ -486,8 +486,8 @@ def glue(
     builder = RowBuilder(dofs, prescribed.flag, D, records, rigid)
     normal_rows, contact = contact_rows(builder)
     if tools and rigid:
-        held = np.intersect1d(contact.decided, rigid.condition)
-        tools.check_nodes(records.contact[held])
+        decided = np.intersect1d(contact.decided, rigid.condition)
+        tools.check_nodes(records.contact[decided])
     sliding_rows, tangents = tangent_rows(dofs, builder, contact)
     equalities, held = equality_rows(dofs, prescribed.flag, D)
     tables = (equalities, normal_rows, sliding_rows)

@@ -57,7 +57,9 @@ class Obstacle(ContactPartner):
         check_shape(self.shape, self.name)
         if self.displacement is not None:
             if isinstance(self.shape, RigidBody):
-                raise InputError(f"{self.name}: displacement= and a RigidBody; expected one of them")
+                raise InputError(
+                    f"{self.name}: displacement= and a RigidBody; expected one of them"
+                )
             tool = RigidBody(self.shape, displacement=self.displacement, name=self.name)
             object.__setattr__(self, "shape", tool)  # it is frozen
             object.__setattr__(self, "displacement", None)

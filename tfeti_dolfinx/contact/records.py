@@ -24,8 +24,8 @@ class ContactRecords:
     """Conditions of contact nodes, one for each contact and node whose group this rank owns.
 
     With the *relative displacement* v_i = Σ_j w_ij u_j − m_i of a node against what it meets, m_i
-    the motion of a rigid body, the condition is n_i · v_i ≤ g_i, and its slip is the tangential part of v_i. A scalar space has
-    frames of shape ``(n, 1, 1)``.
+    the motion of a rigid body, the condition is n_i · v_i ≤ g_i, and its slip is the tangential
+    part of v_i. A scalar space has frames of shape ``(n, 1, 1)``.
 
     Attributes:
         contact: Index of the contact (in the list that the user gave), shape ``(n,)``.
@@ -101,7 +101,21 @@ def concatenate(records: list[ContactRecords], gdim: int) -> ContactRecords:
     frame, number, flag = np.empty((0, gdim, gdim)), np.empty(0), np.empty(0, dtype=bool)
     x = np.empty((0, gdim))
     empty = ContactRecords(
-        none, none, frame, number, number, number, flag, number, flag, none, none, number, none, x, x
+        none,
+        none,
+        frame,
+        number,
+        number,
+        number,
+        flag,
+        number,
+        flag,
+        none,
+        none,
+        number,
+        none,
+        x,
+        x,
     )
     starts = np.cumsum([0, *(len(r) for r in records)])
     moved = [replace(r, condition=r.condition + s) for r, s in zip(records, starts, strict=False)]

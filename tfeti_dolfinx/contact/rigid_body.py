@@ -51,7 +51,7 @@ def motion_fields(arm: Array) -> Array:
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a rigid body is: it takes X to p + Q(X − p) + t.
+    """Place of a rigid body, which takes X to p + Q(X − p) + t.
 
     Attributes:
         point: p, shape ``(gdim,)``.
@@ -65,7 +65,7 @@ class Pose:
 
     @property
     def centre(self) -> Array:
-        """Where the point p is."""
+        """The point p at this place."""
         return np.asarray(self.point + self.motion[: len(self.point)])
 
     @property
@@ -77,11 +77,18 @@ class Pose:
 
     def displacement(self, X: Array) -> Array:
         """Displacement of the body's points X, shape ``(n, gdim)``."""
-        return np.asarray(self.centre + (X - self.point) @ self.rotation.T - X)
+        turned = (X - self.point) @ (self.rotation - np.eye(len(self.point))).T
+        return np.asarray(self.motion[: len(self.point)] + turned)
 
     def origin(self, x: Array) -> Array:
         """Points of the body that are at x, shape ``(n, gdim)``."""
-        return np.asarray(self.point + np.linalg.solve(self.rotation, (x - self.centre).T).T)
+        return np.asarray(x - self.way_to(x))
+
+    def way_to(self, x: Array) -> Array:
+        """Displacement of the body's points that are at x, shape ``(n, gdim)``."""
+        gdim = len(self.point)
+        back = np.linalg.inv(self.rotation)
+        return np.asarray((x - self.point) @ (np.eye(gdim) - back).T + back @ self.motion[:gdim])
 
     def moved(self, step: Array) -> Pose:
         """Pose after one more motion, turns about the centre."""
@@ -243,10 +250,10 @@ class RigidBody:
         allowed = np.isin(np.arange(len(values)), self.indices(gdim)) == free
         if np.any(wrong := (values != 0.0) & ~allowed):
             motion = MOTIONS[gdim][int(np.argmax(wrong))]
+            which, state = names[motion not in "xyz"], "not free" if free else "free"
             raise InputError(
-                f"{self.name}: {names[0] if motion in 'xyz' else names[1]} along {motion}, which is "
-                + ("not free" if free else "free")
-                + f"; expected free={tuple(self.free)} to say which motions the force finds"
+                f"{self.name}: the {which} has a part along {motion}, which is {state} (free="
+                f"{self.free}); expected displacements of guided motions and forces on free ones"
             )
         return values
 

@@ -277,7 +277,7 @@ def check_placement(
     Raises:
         InputError: Says what does not fit.
     """
-    if isinstance(check := getattr(shape, "check_dimension", None), Callable):
+    if callable(check := getattr(shape, "check_dimension", None)):
         check(gdim, what)
     with raised_on_all_ranks(comm), np.errstate(invalid="ignore"):  # of what is not finite
         phi, gradient = distance_and_gradient(shape, x, what)

@@ -127,8 +127,9 @@ class Tools:
         self.mode = np.concatenate([np.zeros(0, dtype=np.int64), *free])
         turns = self.mode >= gdim
         self.scale = np.where(turns, np.array([*lengths, 1.0])[self.tool], 1.0)
-        self.law, self._loads = np.zeros((count, k)), np.zeros((count, k))
-        self.found = np.zeros((count, k))
+        self.law: Array = np.zeros((count, k))
+        self.found: Array = np.zeros((count, k))
+        self._loads: Array = np.zeros((count, k))
         self.poses = [Pose(body.centre(gdim), np.zeros(k), body.large) for body in self.bodies]
         self.begin = list(self.poses)
 
@@ -212,7 +213,8 @@ class Tools:
             self.begin = [self.pose(i) for i in range(len(self))]
         else:
             self.begin = [
-                replace(pose, motion=motion) for pose, motion in zip(self.begin, motions, strict=True)
+                replace(pose, motion=motion)
+                for pose, motion in zip(self.begin, motions, strict=True)
             ]
 
     def restore(self, motions: Array) -> None:
@@ -270,7 +272,7 @@ class Tools:
         """Return what ``motion`` is where bodies were placed."""
         motion = np.zeros_like(records.place)
         for body, own in self._conditions(records):
-            motion[own] = records.place[own] - self.poses[body].origin(records.place[own])
+            motion[own] = self.poses[body].way_to(records.place[own])
         return motion
 
     def motion_at_begin(self, records: ContactRecords) -> Array:
@@ -306,6 +308,8 @@ class Tools:
         self._comm.Allreduce(MPI.IN_PLACE, overlap, op=MPI.MAX)
         for i in np.flatnonzero(self.of_contact >= 0):
             body = int(self.of_contact[i])
+            if np.any(self.poses[body].motion):  # it is elsewhere already
+                continue
             if contacts[i].gap == GEOMETRY and overlap[i] > SEARCH.inside * self._sizes[body]:
                 raise InputError(
                     f"{self.bodies[body].name} is inside of {contacts[i].surfaces[0]!r} at the "

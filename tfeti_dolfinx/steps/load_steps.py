@@ -257,6 +257,7 @@ class StepRecord:
         motion: Energies and work, from the report, of bodies with mass.
         contact_forces: Resultant of the forces on each contact's surface, of a pair the secondary
             one; of bodies with mass their mean over the step.
+        tools: Motion and forces of rigid bodies, as the columns of ``LoadSteps.write_csv``.
     """
 
     number: int
@@ -268,6 +269,7 @@ class StepRecord:
     seconds: float
     motion: dict[str, float] = field(default_factory=dict)
     contact_forces: list[list[float]] = field(default_factory=list)
+    tools: dict[str, float] = field(default_factory=dict)
 
 
 class LoadSteps:
@@ -376,8 +378,8 @@ class LoadSteps:
     def write_csv(self, path: str | os.PathLike[str]) -> None:
         """Write a table of the steps so far, a line a step, by rank 0. Collective.
 
-        Columns: time, the force on each contact by name and axis, what friction dissipates,
-        multiplications by F, seconds.
+        Columns: time, the force on each contact by name and axis, motion and forces of each rigid
+        body, what friction dissipates, multiplications by F, seconds.
 
         Args:
             path: File, ending in ``.csv``; one that is there is replaced.
@@ -396,9 +398,11 @@ class LoadSteps:
                 with partial.open("w", newline="", encoding="utf-8") as file:
                     table = csv.writer(file)
                     forces = [f"{name} {axis}" for name in names for axis in axes]
-                    table.writerow(["time", *forces, "dissipation", "F", "seconds"])
+                    tools = list(self.records[0].tools) if self.records else []
+                    table.writerow(["time", *forces, *tools, "dissipation", "F", "seconds"])
                     for record in self.records:
                         values = [value for force in record.contact_forces for value in force]
+                        values += [record.tools[name] for name in tools]
                         count = record.figures["F_multiplications"]
                         table.writerow(
                             [record.time, *values, record.dissipation, count, record.seconds]
@@ -454,6 +458,7 @@ class LoadSteps:
             seconds=report.seconds["total"],
             motion=dict(report.motion),
             contact_forces=self._problem.solution.resultant_forces,
+            tools=self._problem.solution.tool_numbers,
         )
 
     def _keep(self, place: Place, t: float) -> None:

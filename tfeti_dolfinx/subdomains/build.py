@@ -137,7 +137,10 @@ def make_subdomains(
     say_if_not_cholmod(comm)
     with raised_on_all_ranks(comm):
         blocks = [make_block(item) for item in data]
-    bodies, count = decomposition.body_of_subdomain[decomposition.subdomains], decomposition.num_bodies
+    bodies, count = (
+        decomposition.body_of_subdomain[decomposition.subdomains],
+        decomposition.num_bodies,
+    )
     bodies = np.append(bodies, count + np.arange(len(rigid)))
     return kind([*blocks, *rigid], bodies, count + num_rigid, comm, counters, choice)
 

@@ -12,13 +12,13 @@ from scipy.sparse import block_diag, coo_array, csr_array
 from tfeti_dolfinx.common.arrays import Array, joined, node_means, parts_of
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.subdomains.block import Block, Counters, OperatorKind
-from tfeti_dolfinx.subdomains.rigid_block import RigidBlock
 from tfeti_dolfinx.subdomains.local_operators import (
     GroupedOperator,
     LocalChoice,
     ModelledOperator,
     solved_together,
 )
+from tfeti_dolfinx.subdomains.rigid_block import RigidBlock
 
 # --- Motions of subdomains that springs hold --------------------------------------------------
 
