@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
+from mpi4py import MPI
 from scenes import clamp, decomposed, hooke, strain
 
 import tfeti_dolfinx as tfeti
@@ -57,9 +58,6 @@ def same(one, other, to=1e-9):
     apart = comm.allreduce(float(np.abs(u - w).max(initial=0.0)), op=MPI.MAX)
     size = comm.allreduce(float(np.abs(u).max(initial=0.0)), op=MPI.MAX)
     return apart <= to * size
-
-
-from mpi4py import MPI  # noqa: E402
 
 
 @pytest.mark.parametrize("gdim", [2, 3])
@@ -232,18 +230,14 @@ def test_a_far_tool_falls_until_it_touches():
 def test_friction_knows_only_the_relative_motion(law):
     """A tool that is dragged along, and a block that is drawn back under it."""
     scene, ends = block(2), []
-    decomposition, V = scene["decomposition"], scene["bcs"][0].function_space
+    decomposition = scene["decomposition"]
+    W = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+    u, v = ufl.TrialFunction(W), ufl.TestFunction(W)
+    dofs = fem.locate_dofs_topological(W, 1, decomposition.facets("bottom"))
     pressed = np.array((0.0, -0.03))
     for moves in ("tool", "block"):
         way = fem.Constant(decomposition.mesh, (0.0, 0.0))
         held = fem.Constant(decomposition.mesh, (0.0, 0.0))
-        dofs = fem.locate_dofs_topological(
-            fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,))),
-            1,
-            decomposition.facets("bottom"),
-        )
-        W = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
-        u, v = ufl.TrialFunction(W), ufl.TestFunction(W)
         problem = tfeti.ContactProblem(
             ufl.inner(hooke()(u), strain(v)) * ufl.dx,
             ufl.ZeroBaseForm((v,)),
@@ -262,7 +256,6 @@ def test_friction_knows_only_the_relative_motion(law):
     (one, solution), (other, _) = ends
     assert np.abs(one - other).max(initial=0.0) <= 1e-9
     assert solution.tool(0).resultant.force[0] != 0.0
-    assert V is not None
 
 
 def test_large_motions_place_the_tool_anew():
@@ -276,29 +269,22 @@ def test_large_motions_place_the_tool_anew():
 
 
 def test_a_wheel_that_turns_drags_along():
-    """Its surface moves by the angle times the radius, however far it has turned before."""
+    """Its surface slips wherever the wheel was before; the second of two turns changes nothing."""
     scene = block(2, n=8)
-    mesh = scene["decomposition"].mesh
-    angle, push = fem.Constant(mesh, 0.0), fem.Constant(mesh, 0.0)
-    wheel = ball(2, radius=0.5)
-    problems = []
-    for law in ("turns", "slides"):
-        given = (
-            {"rotation": angle, "displacement": 0.02 * DOWN[2]}
-            if law == "turns"
-            else {"displacement": lambda t: (0.5 * t, -0.02)}
-        )
-        tool = tfeti.RigidBody(wheel, large=law == "turns", name=law, **given)
-        contact = tfeti.Obstacle("top", tool, friction=tfeti.Tresca(0.01))
-        problem = tfeti.ContactProblem(**scene, contacts=[contact], petsc_options=TIGHT)
-        for value in (0.0, 0.01, 0.02, 3.0):
-            angle.value = problem.time = value
-            problem.solve()
-            problem.accept()
-        problems.append(problem)
-    drags = [p.solution.tool(0).resultant.force[0] for p in problems]
-    assert drags[0] < 0.0 < -drags[1] or np.isclose(*drags, rtol=1e-6)
-    assert push is not None
+    angle = fem.Constant(scene["decomposition"].mesh, 0.0)
+    wheel = tfeti.RigidBody(
+        ball(2, radius=0.5), rotation=angle, displacement=0.02 * DOWN[2], large=True
+    )
+    contact = tfeti.Obstacle("top", wheel, friction=tfeti.Tresca(0.01))
+    problem, drags = tfeti.ContactProblem(**scene, contacts=[contact], petsc_options=TIGHT), []
+    for value in (0.0, 0.004, 3.0, 3.1, 3.0):
+        angle.value = value
+        problem.solve()
+        problem.accept()
+        drags.append(problem.solution.tool(0).resultant.force[0])
+    begun, all_slips, still, back = drags[1:]
+    assert all_slips < begun < 0.0 < back
+    assert np.isclose(all_slips, still)
 
 
 def test_load_steps_take_laws_of_time_and_write_a_table(tmp_path):
@@ -406,3 +392,49 @@ def test_two_tools_have_two_names():
     tools = [tfeti.RigidBody(top(2), displacement=(0, 0), name="punch") for _ in range(2)]
     with pytest.raises(tfeti.InputError, match="different"):
         solved(block(2, n=2), *(tfeti.Obstacle("top", tool) for tool in tools))
+
+
+@pytest.mark.parametrize("finite", [False, True])
+def test_nonlinear_bodies_under_a_tool_by_force_and_by_displacement(finite):
+    """Plasticity in small strain, and neo-Hooke's law in finite strain, where a tool tilts."""
+    found, force = [], None
+    for law in ("displacement", "force"):
+        decomposition = decomposed("triangle", 6, 4)
+        V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+        u, v = fem.Function(V), ufl.TestFunction(V)
+        state = {}
+        if finite:
+            F = ufl.Identity(2) + ufl.grad(u)
+            J = ufl.det(F)
+            energy = 0.4 * (ufl.tr(F.T * F) - 2 - 2 * ufl.ln(J)) + 0.3 * ufl.ln(J) ** 2
+            residual = ufl.derivative(energy * ufl.dx, u, v)
+        else:
+            elastic = tfeti.Elasticity(decomposition, E=1.0, nu=0.3, model="plane_strain")
+            steel = tfeti.J2Plasticity(elastic, u, yield_stress=0.05, hardening=0.1)
+            residual = steel.residual(v)
+            state = {"state": steel.state, "update": steel.update}
+            state["J"] = steel.tangent(ufl.TrialFunction(V), v)
+        given = {"displacement": lambda t: (0.0, -0.08 * t)}
+        if law == "force":
+            given = {"force": lambda t: (0.0, -t * force), "free": ("y", "rz")}
+        tool = tfeti.RigidBody(ball(2, radius=0.8), name="ball", point=(0.5, 1.0), **given)
+        problem = tfeti.NonlinearContactProblem(
+            residual,
+            u,
+            [clamp(V, decomposition.facets("bottom"))],
+            [tfeti.Obstacle("top", tool)],
+            decomposition,
+            finite=finite,
+            petsc_options={"rtol": 1e-9},
+            **state,
+        )
+        tfeti.LoadSteps(problem, lambda problem, t: None, [1.0]).run()
+        tool = problem.solution.tool("ball")
+        force = tool.resultant.force[1] if law == "displacement" else force
+        found.append((problem, tool))
+    (one, by_law), (other, by_force) = found
+    assert np.isclose(by_force.displacement[1], by_law.displacement[1], rtol=1e-2)
+    assert np.isclose(by_force.resultant.force[1], force, rtol=1e-7)
+    assert abs(by_force.resultant.moment[2]) <= 1e-7 * force
+    assert by_force.rotation[2] != 0.0
+    assert one.report.newton_steps and other.report.newton_steps
