@@ -33,7 +33,7 @@ R, E, nu = 1.0, 1.0, 0.3
 MODULUS = E / (1 - nu**2)
 deepest = 0.01 * R
 a = np.sqrt(R * deepest)
-size = 15 * a  # of the body
+size = 40 * a  # of the body
 
 
 def torn_mesh(arguments):
@@ -46,7 +46,7 @@ def torn_mesh(arguments):
     model = None
     if comm.rank == 0:
         middle = (0.0, 0.0, size)
-        finest = 0.25 * a * scale
+        finest = 0.2 * a * scale
         model = build(size, sizes=lambda: graded_field(middle, finest, 1.3 * a, 0.35 * scale))
     return tfeti.read_gmsh(model, comm, max(2, round(unknowns / 4000)))
 

@@ -42,6 +42,7 @@ DEMOS = [
     "tbeti_cube_3d",
     "tbeti_hertz_2d",
     "falling_balls_3d",
+    "rigid_indenter_3d",
 ]
 # rank 0 draws while the others wait: of each kind of pictures one
 DRAWN_ON_RANKS = ("hertz_2d", "hertz_3d", "bouncing_bar")

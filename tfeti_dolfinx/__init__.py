@@ -37,6 +37,7 @@ from tfeti_dolfinx.contact.obstacle import Obstacle
 from tfeti_dolfinx.contact.pair import Contact
 from tfeti_dolfinx.contact.rigid_body import RigidBody
 from tfeti_dolfinx.contact.shapes import Cylinder, Plane, SignedDistance, Sphere
+from tfeti_dolfinx.contact.surface_mesh import SurfaceMesh, read_surface
 from tfeti_dolfinx.errors import (
     ConvergenceError,
     FactorError,
@@ -96,11 +97,13 @@ __all__ = [
     "Solution",
     "Sphere",
     "StepRecord",
+    "SurfaceMesh",
     "TfetiError",
     "Tresca",
     "__version__",
     "decompose",
     "read_gmsh",
+    "read_surface",
 ]
 
 

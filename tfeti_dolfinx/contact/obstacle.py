@@ -30,8 +30,8 @@ class Obstacle(ContactPartner):
 
     Args:
         surface: Name or tag of the surface.
-        shape: A ``Plane``, ``Sphere``, ``Cylinder``, ``SignedDistance``, or anything with their
-            two methods; or a ``RigidBody``, which moves.
+        shape: A ``Plane``, ``Sphere``, ``Cylinder``, ``SignedDistance``, ``SurfaceMesh``, or
+            anything with their two methods; or a ``RigidBody``, which moves.
         displacement: Of the shape: short for a ``RigidBody`` with this law.
         gap: "geometry" for the shape's distance from the vertices, where straight facets do not
             show ("curved" is the same); or what replaces it, however far the shape is (negative:
