@@ -124,15 +124,15 @@ def run(argv):
             print("  {:.4f}  {:.6f}  {:.4f}  {:.6f}".format(*row))
         print(f"multiplications by F: {counts[0]} by displacement, {counts[1]} by force")
     if demo.arguments.plot:
-        from tfeti_dolfinx.plot import plot_deformed
+        from tfeti_dolfinx.plot import plot_pressure
 
-        cut = ((0.0, 0.0, size), (0.0, 1.0, 0.0))
-        plot_deformed(
-            demo.folder / "rigid_indenter_3d.png",
+        plot_pressure(
+            demo.folder / "rigid_indenter_3d_pressure.png",
             problem.solution,
-            zoom=5.0,
-            focus=(0.0, 0.0, size - a),
-            cut=cut,
+            lambda points: np.hypot(points[:, 0], points[:, 1]),
+            PointContact.from_half_width(at_end, R, MODULUS).pressure,
+            limit=2 * a,
+            label="r",
         )
         if comm.rank == 0:
             plot_curve(demo.folder / "rigid_indenter_3d_curve.png", d, force, way)
