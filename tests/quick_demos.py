@@ -46,6 +46,7 @@ DEMOS = [
     "plastic_hertz_3d",
     "ironing_2d",
     "rubber_pressed_3d",
+    "rigid_indenter_3d",
 ]
 # rank 0 draws while the others wait: of each kind of pictures one
 DRAWN_ON_RANKS = ("hertz_2d", "hertz_3d", "bouncing_bar")

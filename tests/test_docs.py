@@ -59,7 +59,7 @@ def test_the_main_job_leaves_pictures(serial_only, tmp_path):
     assert names == {"hertz_2d.png", "hertz_2d_contact.png", "hertz_2d_pressure.png"}
 
 
-PAGES = ("tutorial", "two_bodies", "load_steps", "dynamics", "nonlinear")
+PAGES = ("tutorial", "two_bodies", "rigid_tools", "load_steps", "dynamics", "nonlinear")
 PROGRAMS = ["README.md", *(f"docs/{name}.md" for name in PAGES)]
 ON_TWO = ("README.md", "docs/load_steps.md")
 

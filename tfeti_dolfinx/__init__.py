@@ -35,7 +35,9 @@ from tfeti_dolfinx.constraints.contact_state import ContactData, ContactStatus
 from tfeti_dolfinx.contact.friction import Coulomb, Tresca
 from tfeti_dolfinx.contact.obstacle import Obstacle
 from tfeti_dolfinx.contact.pair import Contact
+from tfeti_dolfinx.contact.rigid_body import RigidBody
 from tfeti_dolfinx.contact.shapes import Cylinder, Plane, SignedDistance, Sphere
+from tfeti_dolfinx.contact.surface_mesh import SurfaceMesh, read_surface
 from tfeti_dolfinx.errors import (
     ConvergenceError,
     FactorError,
@@ -94,16 +96,19 @@ __all__ = [
     "Plane",
     "PointValues",
     "Report",
+    "RigidBody",
     "SaintVenantKirchhoff",
     "SignedDistance",
     "Solution",
     "Sphere",
     "StepRecord",
+    "SurfaceMesh",
     "TfetiError",
     "Tresca",
     "__version__",
     "decompose",
     "read_gmsh",
+    "read_surface",
 ]
 
 

@@ -19,7 +19,7 @@ from tfeti_dolfinx.common.agreement import agreeing, described, fields_in, sums_
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import require_real_petsc
 from tfeti_dolfinx.common.logging import stage
-from tfeti_dolfinx.common.validation import checked_type
+from tfeti_dolfinx.common.validation import checked_number, checked_type
 from tfeti_dolfinx.constraints.contact_state import Multipliers
 from tfeti_dolfinx.constraints.gluing import (
     Gluing,
@@ -86,6 +86,7 @@ class ContactProblem:
         report: Sizes, counters, residuals and times of the last solve.
         options: The options.
         dofs: Dof maps.
+        time: What laws of rigid bodies are functions of; ``LoadSteps`` sets it.
 
     Raises:
         InputError: Something given does not fit; the message names it.
@@ -193,6 +194,15 @@ class ContactProblem:
         """
         return self._system.dual
 
+    @property
+    def time(self) -> float:
+        """Time of the laws of rigid bodies, 0 at first."""
+        return self._system.time
+
+    @time.setter
+    def time(self, time: float) -> None:
+        self._system.time = checked_number(time, "time")
+
     # -------------------------------------------------------------------- solve
 
     def solve(self) -> fem.Function:
@@ -283,7 +293,10 @@ class ContactProblem:
         # 2. their displacement
         with stage("recovery", seconds):
             multipliers = Multipliers(np.array(result.lam.array_r), result.face)
-            solution = self._solution = self._make_solution(accuracy.u, multipliers, gluing)
+            nodal = dual.subdomains.num_nodal
+            system.tools.take(accuracy.u[nodal:])
+            u = accuracy.u[:nodal]
+            solution = self._solution = self._make_solution(u, multipliers, gluing)
             self.u.x.array[:] = self.dofs.to_dolfinx(solution.u)
         self._start = (gluing, solution.lam, result.mu) if result.reason > 0 else None
         # 3. what the report says of it
@@ -314,6 +327,10 @@ class ContactProblem:
         self._seconds, self._in_all = {}, self.report.in_all
 
     def _make_solution(self, u: Array, multipliers: Multipliers, gluing: Gluing) -> Solution:
+        tools = self._system.tools
+        if tools:
+            records = gluing.records.at(tools.motion(gluing.records, found=True))
+            gluing = replace(gluing, records=records)
         solution = Solution(
             u=u,
             multipliers=multipliers,
@@ -324,6 +341,7 @@ class ContactProblem:
             thickness=self._thickness,
         )
         solution.boundary = self._system.elements.solved(u)
+        solution.tool_motions = tools.motions()
         return solution
 
     # ------------------------------------------------------- after a solve
@@ -433,6 +451,7 @@ class ContactProblem:
                 raise InputError("the last solve has not converged; expected one that has")
         if solution is self._accepted[0] or self._start is None:
             return
+        self._system.tools.begin_at()
         self._count_slips_from(solution)
         self._accepted = (solution, self._start)
 
@@ -447,6 +466,7 @@ class ContactProblem:
     def _return(self) -> None:
         """Return to the last accepted solution. Not collective."""
         self._solution, self._start = self._accepted
+        self._system.tools.go_back()
         last = self._solution
         self.u.x.array[:] = 0.0 if last is None else self.dofs.to_dolfinx(last.u)
 
@@ -464,6 +484,7 @@ class ContactProblem:
         assert start is not None
         (reach, _), dual = self._system.search.rows(), self._system.dual
         state = SavedState.of(solution, start[2], dual.seen, reach)
+        state = replace(state, tools=np.array([t.motion for t in solution.tool_motions]).ravel())
         if dual.constraints is not start[0].constraints:
             return state
         state = replace(state, image=dual.last.known(self.dofs.comm, start[1]))
@@ -486,8 +507,9 @@ class ContactProblem:
             self._check_state(state)
             given |= {**self._given(), "state": state.common()}
             self._look_at_stress()
-        self._take_motion(state)
         system = self._system
+        system.tools.restore(state.tools)
+        self._take_motion(state)
         system.know_rows(list(state.reach), state.groups())
         system.look_for_changes()
         dual = system.make(self._seconds)

@@ -236,6 +236,7 @@ class Outcome:
     residuals: dict[str, float] = field(default_factory=dict)
     tolerances: dict[str, float] = field(default_factory=dict)  # what they may be at most
     estimates: dict[str, float] = field(default_factory=dict)  # see ``Estimates``
+    tools: list[str] = field(default_factory=list)  # motion and forces of each rigid body
 
     @classmethod
     def of_answer(
@@ -276,6 +277,7 @@ class Outcome:
             residuals=_residuals(solution, dual, result, accuracy) | {"friction": settling.change},
             tolerances=_tolerances(solution, dual, accuracy) | {"friction": settling.tolerance},
             estimates=estimates,
+            tools=[str(solution.tool(i)) for i in range(len(solution.tool_motions))],
         )
 
 

@@ -99,6 +99,7 @@ class Solution(ContactState):
         contacts: The contacts with their sides decided: ``contacts[i].surfaces[0]`` has the
             multipliers and the pressure.
         v: Velocity in DOLFINx's order of bodies with mass, else None.
+        tool_motions: Where rigid bodies are.
     """
 
     def __init__(
@@ -362,6 +363,7 @@ class SavedState:
         size: That of the step which the matrix was made for, shape ``()``; 0 without inertia.
         directions: What ``Recycled`` keeps of earlier solves, shape ``(2, m, k)``.
         internal: Internal variables of a nonlinear problem, one after the other; else empty.
+        tools: Motions of rigid bodies, one after the other.
         image: Fλ; empty where it is not known.
         predicted_image: The same of the predictor.
     """
@@ -382,6 +384,7 @@ class SavedState:
     size: Array = field(default_factory=lambda: np.zeros(()))
     directions: Array = field(default_factory=lambda: np.zeros((2, 0, 0)))
     internal: Array = field(default_factory=lambda: np.zeros(0))
+    tools: Array = field(default_factory=lambda: np.zeros(0))
     image: Array = field(default_factory=lambda: np.zeros(0))
     predicted_image: Array = field(default_factory=lambda: np.zeros(0))
 

@@ -19,6 +19,7 @@ from tfeti_dolfinx.contact.forces import condition_areas
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap
 from tfeti_dolfinx.contact.records import ContactRecords, slips
 from tfeti_dolfinx.contact.search import ContactSearch
+from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.feti.deflation import SoftModes
@@ -43,6 +44,7 @@ from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.local_operators import LocalChoice
 from tfeti_dolfinx.subdomains.pseudoinverse import KPLUS_TYPES
+from tfeti_dolfinx.subdomains.rigid_block import RigidBlock
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # --- Settings of a solve ---------------------------------------------------------------------
@@ -91,10 +93,12 @@ class Settings:
         decomposition: Decomposition,
         counters: Counters,
         replaced: Callable[[MakeBlock], MakeBlock] | None = None,
+        tools: Tools | None = None,
     ) -> Subdomains:
         """Return all Blocks of a rank as one. Collective.
 
-        ``replaced`` takes the factory of Blocks to one that makes some of them otherwise.
+        ``replaced`` takes the factory of Blocks to one that makes some of them otherwise; ``tools``
+        are rigid bodies, of which those with free motions get Blocks.
 
         Raises:
             InputError: Stiffness or load do not fit.
@@ -105,8 +109,21 @@ class Settings:
         make = own.block or sparse_blocks(self.inverses(counters), choice)
         make = make if replaced is None else replaced(make)
         kind = Subdomains if own.subdomains is None else own.subdomains(dofs, decomposition)
+        rigid: list[RigidBlock] = []
+        if tools and own.subdomains is not None:
+            raise InputError(
+                f"{tools.free_names[0]}: a rigid body with free motions goes with no other kind of "
+                "Subdomains, as clusters are; expected a motion by a law, or none of them"
+            )
+        if tools and tools.num_local:
+            loads, modes = tools.loads, tools.mode
+            rigid = [
+                RigidBlock(tools.bodies[i].name, loads[at], modes[at], tools.law.shape[1])
+                for i, at in tools.unknowns()
+            ]
+        count = len(tools.free_names) if tools else 0
         with added_options(self.prefix, self.factor_options):
-            return make_subdomains(data, make, decomposition, counters, choice, kind)
+            return make_subdomains(data, make, decomposition, counters, choice, kind, rigid, count)
 
     def make_dual(
         self,
@@ -115,6 +132,7 @@ class Settings:
         dofs: TornDofs,
         decomposition: Decomposition,
         feasible: FeasibleLaw,
+        rigid_names: Sequence[str] = (),
     ) -> tuple[Dual, Options]:
         """Return the dual problem, and the options with what ``auto`` stands for. Collective.
 
@@ -135,7 +153,7 @@ class Settings:
             dual = Dual(
                 constraints=constraints,
                 subdomains=subdomains,
-                body_names=decomposition.body_names,
+                body_names=[*decomposition.body_names, *rigid_names],
                 mode_names=mode_names(decomposition.mesh.geometry.dim, dofs.bs),
                 preconditioner=preconditioner or PRECONDITIONERS.get(options.pc_type),
                 options_prefix=self.prefix,
@@ -168,6 +186,8 @@ class System:
         forms: The compiled forms.
         bcs: Dirichlet conditions.
         elements: Stiffness and load of subdomains, by finite elements or another method.
+        tools: The rigid bodies.
+        time: That of the rigid bodies' laws.
         origin: Displacement in primal order at which the mesh is, in finite strain; else None.
     """
 
@@ -188,6 +208,7 @@ class System:
             FiniteElements(dofs) if method is None else method.assembly(dofs, decomposition)
         )
         self.origin: Array | None = None
+        self.tools, self.time = Tools(contacts, dofs, decomposition), 0.0
         # displacement in primal order at which the load step begins; None: no displacement
         self._rest: Array | None = None
         self._known_slips: tuple[ContactRecords, Array] | None = None
@@ -240,6 +261,11 @@ class System:
         if self.forms.has_new_stiffness():
             self.change("stiffness")
         if self.forms.has_new_load():
+            self.change("load")
+        changes = self.tools.read(self.time)
+        if changes.motion:
+            self.change("places" if changes.place else "right side")
+        if changes.load:
             self.change("load")
         comm, new, old = self._dofs.comm, prescribe(self._dofs, self.bcs), self._prescribed
         self._prescribed = new
@@ -354,8 +380,13 @@ class System:
             self.change("load")
 
     def _find_contacts(self) -> None:
-        dofs, cut = self._dofs, self._decomposition
-        self._search = ContactSearch(self._contacts, dofs, cut, self._blocks, self.origin)
+        dofs, cut, tools = self._dofs, self._decomposition, self.tools
+        first = self._search is None
+        tools.place(finite=self.origin is not None)
+        contacts = tools.placed(self._contacts)
+        self._search = ContactSearch(contacts, dofs, cut, self._blocks, self.origin, tools)
+        if first:
+            tools.check_begin(contacts, self._search.records)
         if self.origin is not None:  # sides stay those of the first search
             self._contacts[:] = self._search.contacts
         if self._known_rows is not None:
@@ -365,14 +396,19 @@ class System:
     def _make_rows(self) -> None:
         if self._gluing is not None:
             self._gluing.constraints.destroy()
-        search, dofs = self.search, self._dofs
+        search, dofs, tools = self.search, self._dofs, self.tools
+        search.move()
         weights = row_weights(self._blocks, self._settings.options.scaling, dofs.comm)
         prescribed, slip = made(self._prescribed), self._slip()
-        self._gluing = glue(dofs, prescribed, search.records, search.length, weights, slip)
+        free = tools if tools.num_unknowns else None
+        given = dofs, prescribed, search.records, search.length, weights, slip
+        self._gluing = glue(*given, free)
 
     def _fill_right_side(self) -> None:
-        values, gaps = made(self._prescribed).value, self.search.records.gap
-        self._gluing = self.gluing.with_right_side(values, gaps, self._slip())
+        self.search.move()
+        values, records = made(self._prescribed).value, self.search.records
+        gluing = replace(self.gluing, records=self.gluing.records.at(records.motion))
+        self._gluing = gluing.with_right_side(values, records.gap, self._slip())
 
     def _set_friction_limits(self) -> None:
         """Fill the ψ_i of the rows, and the μ_i under Coulomb's law."""
@@ -389,7 +425,8 @@ class System:
     def _assemble_load(self) -> None:
         self._f = self.elements.load(self.forms)
         if self._subdomains is not None:
-            self._subdomains.update(f=self._dofs.to_primal(self._f))
+            loads = self.tools.loads[: self.tools.num_local]
+            self._subdomains.update(f=np.append(self._dofs.to_primal(self._f), loads))
 
     def _factor(self) -> None:
         scene, trace = (self._dofs, self._decomposition), self.gluing.constraints.trace
@@ -398,6 +435,7 @@ class System:
             *scene,
             self._counters,
             self.elements.blocks,
+            self.tools if self.tools.num_unknowns else None,
         )
         self._K = None
         self._take_trace()
@@ -408,7 +446,9 @@ class System:
     def _make_dual(self) -> None:
         settings, scene = self._settings, (self._dofs, self._decomposition)
         law = settings.extensions.feasible_set
-        self._dual = settings.make_dual(self.gluing.constraints, self.subdomains, *scene, law)
+        names = self.tools.free_names
+        parts = self.gluing.constraints, self.subdomains
+        self._dual = settings.make_dual(*parts, *scene, law, names)
         self.dual.saw(self._seen)
 
     def _slip(self) -> Array:
@@ -419,8 +459,12 @@ class System:
         if self._known_slips is not None:
             before, slip = self._known_slips
             if not any_rank(self._dofs.comm, not records.slips_as(before)):
-                return slip
-        return slips(records, self._dofs, self._rest)
+                if not self.tools:
+                    return slip
+                # of the points of rigid bodies that are there now
+                way = before.motion - self.tools.motion_at_begin(records)
+                return slip + np.einsum("ntg,ng->nt", records.tangents, way)
+        return slips(records.at(self.tools.motion_at_begin(records)), self._dofs, self._rest)
 
     def _destroy_dual(self) -> None:
         if self._dual is not None:
@@ -452,6 +496,7 @@ CHANGES = {
     "points": tuple(STAGES),
     "stiffness": ("stiffness", "rows", "friction", "factors", "trace", "coarse problem"),
     "rows": ("rows", "friction", "trace", "coarse problem"),
+    "places": ("search", "rows", "friction", "trace", "coarse problem"),
     "right side": ("right side", "linear term"),
     "friction": ("friction", "linear term"),
     "load": ("load", "linear term"),

@@ -77,7 +77,7 @@ def estimate(system: System, solution: Solution) -> Estimates:
         raise InputError(
             "estimate: the rows are no longer those of the solution; expected a call after solve()"
         )
-    dual, u = system.dual, solution.u
+    dual, u = system.dual, system.subdomains.with_rigid(solution.u)
     comm, counters = dual.coarse.comm, dual.subdomains.counters
     start, factored = perf_counter(), counters.factorizations
     lam = dual.d.duplicate()
@@ -108,7 +108,7 @@ def goal_of(
     recovery = StressRecovery(u, checked_stress(stress, u), dofs, decomposition, thickness)
 
     def error(values: Array) -> float:
-        u.x.array[:] = dofs.to_dolfinx(values)
+        u.x.array[:] = dofs.to_dolfinx(values[: dofs.num_nodes * dofs.bs])
         return recovery.error()
 
     return error

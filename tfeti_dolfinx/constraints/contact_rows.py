@@ -10,6 +10,7 @@ from tfeti_dolfinx.common.arrays import TINY, Array, sum_rows
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.constraints.rows import TOLERANCES, Rows, stack
 from tfeti_dolfinx.contact.records import ContactRecords, Friction
+from tfeti_dolfinx.contact.tools import RigidEntries
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 
@@ -25,11 +26,18 @@ class RowBuilder:
         flag: Which components of the owned groups are prescribed, shape ``(g, bs)``.
         weights: D for each copy of the owned groups, shape ``(c, bs)``.
         records: Conditions of this rank.
+        rigid: What unknowns of rigid bodies add to them; their columns are the last ones.
     """
 
     def __init__(
-        self, dofs: TornDofs, flag: Array, weights: Array, records: ContactRecords
+        self,
+        dofs: TornDofs,
+        flag: Array,
+        weights: Array,
+        records: ContactRecords,
+        rigid: RigidEntries | None = None,
     ) -> None:
+        self._rigid = rigid
         sums = np.add.reduceat(weights, dofs.copy_offsets[:-1]) if len(weights) else weights
         self.records, self._dofs, self._weights = records, dofs, weights
         self._prescribed, self._total = dofs.lookup(records.entry_group, flag, sums)
@@ -54,11 +62,23 @@ class RowBuilder:
         shares = (self._free(axis) / self._total)[used[entry]]
         values = shares * weight * scale[row][:, None]
         columns = node[:, None] * dofs.bs + np.arange(dofs.bs)
-        return Rows(
+        of_nodes = Rows(
             group=records.group[condition],
             row=np.repeat(row, dofs.bs),
             column=columns.ravel(),
             value=values.ravel(),
+        )
+        rigid = self._rigid
+        if rigid is None:
+            return of_nodes.without_zeros()
+        of = np.flatnonzero(place[rigid.condition] >= 0)
+        row, normal = place[rigid.condition[of]], records.frame[rigid.condition[of], axis]
+        along = np.sum(normal * rigid.direction[of], axis=1)
+        return Rows(
+            group=of_nodes.group,
+            row=np.concatenate((of_nodes.row, row)),
+            column=np.append(of_nodes.column, dofs.offsets[-1] * dofs.bs + rigid.unknown[of]),
+            value=np.append(of_nodes.value, along * scale[row]),
         ).without_zeros()
 
     def _free(self, axis: int) -> Array:

@@ -11,10 +11,14 @@ from typing import Any
 import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.validation import is_whole, shown
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.forces import Resultant, condition_areas, resultant
 from tfeti_dolfinx.contact.partner import ContactPartner, position_of
 from tfeti_dolfinx.contact.records import remaining_gaps, slips
+from tfeti_dolfinx.contact.rigid_body import rotation_vector
+from tfeti_dolfinx.contact.tools import ToolMotion
+from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mortar.surfaces import group_points, surface_facets, surface_nodes
 from tfeti_dolfinx.qp.sets import Face
@@ -74,6 +78,53 @@ class ContactData:
     resultant: Resultant
 
 
+@dataclass(frozen=True)
+class ToolState:
+    """A rigid body at a solution; the same on all ranks.
+
+    Attributes:
+        name: Its name.
+        displacement: Of its point, shape ``(gdim,)``.
+        rotation: Rotation vector, in radians, shape ``(3,)``; in 2D only its last component is not
+            0.
+        resultant: Force and moment of all its contacts on it, friction included; the moment about
+            its point.
+    """
+
+    name: str
+    displacement: Array
+    rotation: Array
+    resultant: Resultant
+
+    def __str__(self) -> str:
+        """One line: names of what is not 0, and its numbers."""
+        parts = {"displacement": self.displacement, "rotation": self.rotation}
+        parts |= {"force": self.resultant.force, "moment": self.resultant.moment}
+        words = [
+            f"{what} ({', '.join(f'{value:.6g}' for value in values)})"
+            for what, values in parts.items()
+            if what in ("displacement", "force") or np.any(values)
+        ]
+        return f"{self.name}: {', '.join(words)}"
+
+    @property
+    def numbers(self) -> dict[str, float]:
+        """All components by name, for tables."""
+        axes = "xyz"[: len(self.displacement)]
+        turns = "xyz" if len(axes) == 3 else "z"
+        pairs = [
+            *zip([f"displacement {axis}" for axis in axes], self.displacement, strict=True),
+            *zip([f"rotation {axis}" for axis in turns], self.rotation[-len(turns) :], strict=True),
+            *zip([f"force {axis}" for axis in axes], self.resultant.force, strict=True),
+            *zip(
+                [f"moment {axis}" for axis in turns],
+                self.resultant.moment[-len(turns) :],
+                strict=True,
+            ),
+        ]
+        return {f"{self.name} {what}": float(value) for what, value in pairs}
+
+
 # --- State of contact conditions: forces, gaps, slips -----------------------------------------
 
 
@@ -115,6 +166,7 @@ class ContactState:
         self.carrying, self.holding = multipliers.face.carrying, multipliers.face.holding
         self.decomposition, self.gluing, self.dofs = decomposition, gluing, gluing.dofs
         self.contacts, self.thickness = list(contacts), thickness
+        self.tool_motions: Sequence[ToolMotion] = ()
 
     def contact(self, which: int | str = 0) -> ContactData:
         """State of the nodes of a contact, those that this rank owns. Collective.
@@ -145,6 +197,37 @@ class ContactState:
             surface=self.contacts[position].surfaces[0],
             resultant=resultant(self.dofs.comm, points, self.condition_forces[own]),
         )
+
+    def tool(self, which: int | str = 0) -> ToolState:
+        """Return motion and forces of a rigid body. Collective.
+
+        Args:
+            which: Position among the rigid bodies, or name.
+
+        Raises:
+            InputError: There is no such body.
+        """
+        names = [tool.name for tool in self.tool_motions]
+        if which in names:
+            which = names.index(str(which))
+        if not is_whole(which) or not 0 <= which < len(names):
+            raise InputError(f"tool {shown(which)}: expected one of {names}, or its position")
+        tool, records = self.tool_motions[which], self.gluing.records
+        gdim, own = len(tool.centre), np.isin(records.contact, tool.contacts)
+        arm = np.zeros((int(np.sum(own)), 3))
+        arm[:, :gdim] = records.place[own] - tool.centre
+        return ToolState(
+            name=tool.name,
+            displacement=tool.motion[:gdim],
+            rotation=rotation_vector(tool.motion, gdim),
+            resultant=resultant(self.dofs.comm, arm, -self.condition_forces[own]),
+        )
+
+    @property
+    def tool_numbers(self) -> dict[str, float]:
+        """Motion and forces of all rigid bodies by name. Collective."""
+        states = [self.tool(i) for i in range(len(self.tool_motions))]
+        return {name: value for state in states for name, value in state.numbers.items()}
 
     def reaction(self, surface: str | int) -> Resultant:
         """Return the force and moment by which Dirichlet conditions hold a surface. Collective.
@@ -279,8 +362,9 @@ class ContactState:
         trace, rows = constraints.B.createVecs()
         rows.array[:] = self.lam
         constraints.B.multTranspose(rows, trace)
+        own = constraints.trace < len(self.u)  # those behind are of rigid bodies
         forces = np.zeros_like(self.u)
-        forces[constraints.trace] = -trace.array_r
+        forces[constraints.trace[own]] = -trace.array_r[own]
         trace.destroy()
         rows.destroy()
         total = self.dofs.reduce(forces.reshape(-1, self.dofs.bs), np.add, 0.0)

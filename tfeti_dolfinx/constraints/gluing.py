@@ -29,6 +29,7 @@ from tfeti_dolfinx.constraints.rows import (
     stack,
 )
 from tfeti_dolfinx.contact.records import ContactRecords, relative_motion
+from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.errors import InputError, NoSolutionError, TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs, component_of, described, is_same_space
@@ -341,6 +342,7 @@ class Gluing:
         sets, records = self.constraints.sets, self.records
         normals, tangents = self.contact, self.tangents
         held = relative_motion(records, self.dofs, np.where(self.prescribed.flag, values, 0.0))
+        held -= records.motion
         left = gaps - np.sum(records.normal * held, axis=1)
         self._check_decided(left[normals.decided])
         along = np.einsum("ntg,ng->nt", records.tangents, held)
@@ -434,6 +436,7 @@ def glue(
     length: float,
     weights: Array,
     slip: Array | None = None,
+    tools: Tools | None = None,
 ) -> Gluing:
     """Rows of interfaces, Dirichlet conditions and contacts, and their right sides. Collective.
 
@@ -446,18 +449,30 @@ def glue(
             are orthonormal in the inner product of D⁻¹ as far as they can be.
         slip: Where the load step begins: the tangential v_i of all conditions then, shape
             ``(n, gdim - 1)``; default 0.
+        tools: Rigid bodies with free motions, if there are any.
 
     Raises:
         NoSolutionError: Dirichlet conditions and contacts contradict each other.
+        InputError: A rigid body with free motions meets nodes that are prescribed.
     """
     D = dofs.gather_copies(weights.reshape(-1, dofs.bs))
-    builder = RowBuilder(dofs, prescribed.flag, D, records)
+    rigid = tools.entries(records) if tools else None
+    builder = RowBuilder(dofs, prescribed.flag, D, records, rigid)
     normal_rows, contact = contact_rows(builder)
+    if tools and rigid:
+        decided = np.intersect1d(contact.decided, rigid.condition)
+        tools.check_nodes(records.contact[decided])
     sliding_rows, tangents = tangent_rows(dofs, builder, contact)
     equalities, held = equality_rows(dofs, prescribed.flag, D)
     tables = (equalities, normal_rows, sliding_rows)
     constraints = assemble_constraints(
-        dofs, tables, weights, contact.scale, tangents.scale, tangents.normal
+        dofs,
+        tables,
+        weights,
+        contact.scale,
+        tangents.scale,
+        tangents.normal,
+        tools.num_unknowns if tools else 0,
     )
     slip = np.zeros(records.tangents.shape[:2]) if slip is None else slip
     gluing = Gluing(dofs, prescribed, records, held, contact, tangents, constraints, length, slip)

@@ -22,6 +22,8 @@ class RowTolerances:
         agreement: Values that conditions prescribe at a node differ by less, relative to all.
         nothing_left: Of a row's norm: if prescribed components leave less, rounding of the normal
             has made it (ε|x|/h of a facet of size h at x), and the row is dropped.
+        rigid: D of a rigid body, over the smallest: what it resists is beyond all elastic bodies,
+            and squares of it are still numbers.
         overlap: Overlap, over the scene's length, that rounding of gaps and prescribed values may
             leave.
     """
@@ -29,6 +31,7 @@ class RowTolerances:
     agreement: float = 1e-10
     nothing_left: float = 1e-6
     overlap: float = 1e-10
+    rigid: float = 1e60
 
 
 TOLERANCES = RowTolerances()
@@ -200,11 +203,14 @@ def assemble_constraints(
     scale: Array,
     tangent_scale: Array,
     pressed_by: Array,
+    rigid: int = 0,
 ) -> Constraints:
     """Assemble B of this rank's rows, with c = 0 and ψ = 0. Collective.
 
     The tables are those of equalities, contact normals and tangents; the weights are D on the local
-    primal unknowns, the other arguments as in ``ContactRows`` and ``TangentRows``.
+    primal unknowns, the other arguments as in ``ContactRows`` and ``TangentRows``. ``rigid`` counts
+    unknowns of rigid bodies, on the last rank behind those of its nodes; beside them all is soft:
+    their D is ``TOLERANCES.rigid``.
     """
     rows = stack(list(tables))
     ends = np.cumsum([len(table) for table in tables])[:-1]
@@ -213,6 +219,10 @@ def assemble_constraints(
     sets = RowSets(equalities, normals, tangents.reshape(len(tangents) // max(width, 1), width))
     # the trace: local primal unknowns that rows of any rank touch
     offsets = dofs.offsets * dofs.bs
+    if rigid:
+        offsets[-1] += rigid
+        own = rigid if dofs.comm.rank == dofs.comm.size - 1 else 0
+        weights = np.append(weights, np.full(own, TOLERANCES.rigid))
     needed, place = np.unique(rows.column, return_inverse=True)
     exchange = Exchange(dofs.comm, owner_of(offsets, needed))
     asked = exchange.send(needed) - offsets[dofs.comm.rank]

@@ -68,6 +68,8 @@ def conditions(
         entry_group=column,
         weight=value / area[slot],
         friction=np.full(len(chosen), Friction.NONE),
+        place=np.zeros((len(chosen), dofs.bs)),
+        motion=np.zeros((len(chosen), dofs.bs)),
         candidates=int(np.sum(whole > 0.0)),
     )
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.contact.conditions import Side, conditions
 from tfeti_dolfinx.contact.partner import ContactPartner
-from tfeti_dolfinx.contact.records import ContactRecords
+from tfeti_dolfinx.contact.records import ContactRecords, relative_motion
+from tfeti_dolfinx.contact.rigid_body import Law, RigidBody
 from tfeti_dolfinx.contact.shapes import Shape, check_placement, check_shape, distance_and_gradient
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -20,7 +21,7 @@ from tfeti_dolfinx.mortar.facets import (
     local_facets,
 )
 from tfeti_dolfinx.mortar.integrals import integrate_distance
-from tfeti_dolfinx.mortar.surfaces import diameter, surface_facets
+from tfeti_dolfinx.mortar.surfaces import diameter, group_points, surface_facets
 
 
 @dataclass(frozen=True)
@@ -29,8 +30,9 @@ class Obstacle(ContactPartner):
 
     Args:
         surface: Name or tag of the surface.
-        shape: A ``Plane``, ``Sphere``, ``Cylinder``, ``SignedDistance``, or anything with their
-            two methods.
+        shape: A ``Plane``, ``Sphere``, ``Cylinder``, ``SignedDistance``, ``SurfaceMesh``, or
+            anything with their two methods; or a ``RigidBody``, which moves.
+        displacement: Of the shape: short for a ``RigidBody`` with this law.
         gap: "geometry" for the shape's distance from the vertices, where straight facets do not
             show ("curved" is the same); or what replaces it, however far the shape is (negative:
             interference): a number, or a function of the vertices, shape ``(3, n)``.
@@ -48,10 +50,19 @@ class Obstacle(ContactPartner):
 
     surface: str | int
     shape: Shape
+    displacement: Law | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         self._check_data(f"obstacle of surface {self.surface!r}")
         check_shape(self.shape, self.name)
+        if self.displacement is not None:
+            if isinstance(self.shape, RigidBody):
+                raise InputError(
+                    f"{self.name}: displacement= and a RigidBody; expected one of them"
+                )
+            tool = RigidBody(self.shape, displacement=self.displacement, name=self.name)
+            object.__setattr__(self, "shape", tool)  # it is frozen
+            object.__setattr__(self, "displacement", None)
 
     @property
     def surfaces(self) -> tuple[str | int, ...]:
@@ -95,6 +106,9 @@ class Obstacle(ContactPartner):
         side = Side(facets, hat_areas(kind, facets), normals)
         integrals = integrate_distance(kind, facets, distance.reshape(facets.vertices.shape))
         found = conditions(dofs, contact, side, integrals)
+        if isinstance(self.shape, RigidBody):
+            x = group_points(dofs)[:, : dofs.bs]
+            found = replace(found, place=relative_motion(found, dofs, x))
         return self._with_gaps_and_friction(dofs, found, reach, np.inf)
 
     def _distances(self, x: Array, gdim: int) -> tuple[Array, Array]:

@@ -23,9 +23,9 @@ class Friction(IntEnum):
 class ContactRecords:
     """Conditions of contact nodes, one for each contact and node whose group this rank owns.
 
-    With the *relative displacement* v_i = Σ_j w_ij u_j of a node against what it meets, the
-    condition is n_i · v_i ≤ g_i, and its slip is the tangential part of v_i. A scalar space has
-    frames of shape ``(n, 1, 1)``.
+    With the *relative displacement* v_i = Σ_j w_ij u_j − m_i of a node against what it meets, m_i
+    the motion of a rigid body, the condition is n_i · v_i ≤ g_i, and its slip is the tangential
+    part of v_i. A scalar space has frames of shape ``(n, 1, 1)``.
 
     Attributes:
         contact: Index of the contact (in the list that the user gave), shape ``(n,)``.
@@ -46,6 +46,8 @@ class ContactRecords:
         entry_group: Global group of each weight, shape ``(k,)``.
         weight: The w_ij, without a unit, shape ``(k,)``.
         friction: ``Friction`` of each condition, shape ``(n,)``.
+        place: Σ_j w_ij x_j, where a rigid body that moves meets it, else 0, shape ``(n, gdim)``.
+        motion: Displacement of that body there, as far as it is known, shape ``(n, gdim)``.
         candidates: Nodes of the contact surface whose groups this rank owns.
     """
 
@@ -62,6 +64,8 @@ class ContactRecords:
     entry_group: Array
     weight: Array
     friction: Array
+    place: Array
+    motion: Array
     candidates: int = 0
 
     def __len__(self) -> int:
@@ -81,6 +85,10 @@ class ContactRecords:
         """The a_ij of Σ_j a_ij · u_j, v_i along an axis of the frame, shape ``(k, gdim)``."""
         return self.frame[self.condition, axis] * self.weight[:, None]
 
+    def at(self, motion: Array) -> ContactRecords:
+        """Return the same conditions with rigid bodies at another motion."""
+        return replace(self, motion=motion)
+
     def slips_as(self, other: ContactRecords) -> bool:
         """Return whether these conditions have the same slips at any displacement as others."""
         names = ("frame", "condition", "entry_group", "weight")
@@ -91,8 +99,23 @@ def concatenate(records: list[ContactRecords], gdim: int) -> ContactRecords:
     """All conditions of several contacts in one table."""
     none = np.empty(0, dtype=np.int64)
     frame, number, flag = np.empty((0, gdim, gdim)), np.empty(0), np.empty(0, dtype=bool)
+    x = np.empty((0, gdim))
     empty = ContactRecords(
-        none, none, frame, number, number, number, flag, number, flag, none, none, number, none
+        none,
+        none,
+        frame,
+        number,
+        number,
+        number,
+        flag,
+        number,
+        flag,
+        none,
+        none,
+        number,
+        none,
+        x,
+        x,
     )
     starts = np.cumsum([0, *(len(r) for r in records)])
     moved = [replace(r, condition=r.condition + s) for r, s in zip(records, starts, strict=False)]
@@ -113,7 +136,7 @@ def relative_motion(records: ContactRecords, dofs: TornDofs, values: Array) -> A
 def relative_displacement(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
     """The v_i, ``(n, gdim)``, from u in primal order; of torn copies the mean. Collective."""
     total = dofs.reduce(u.reshape(-1, dofs.bs), np.add, 0.0)
-    return relative_motion(records, dofs, total / dofs.multiplicity[:, None])
+    return relative_motion(records, dofs, total / dofs.multiplicity[:, None]) - records.motion
 
 
 def remaining_gaps(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:

@@ -19,6 +19,7 @@ from tfeti_dolfinx.contact.records import (
     relative_displacement,
     remaining_gaps,
 )
+from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import diameter, surface_nodes
@@ -40,6 +41,7 @@ class ContactSearch:
         stiffness: Block of K of each primal node, shape ``(num_nodes, bs, bs)``.
         origin: Displacement in primal order at which the mesh is; None: 0. Gaps are those of the
             total displacement.
+        tools: The rigid bodies, where they are placed.
 
     Attributes:
         contacts: The contacts with their sides decided: of a pair the secondary one comes first.
@@ -57,7 +59,9 @@ class ContactSearch:
         decomposition: Decomposition,
         stiffness: Array,
         origin: Array | None = None,
+        tools: Tools | None = None,
     ) -> None:
+        self._tools = tools
         self._dofs, self._decomposition, self._origin = dofs, decomposition, origin
         self.length = bcast_from_root(dofs.comm, diameter(decomposition))
         reach = [contact.first_reach(decomposition) for contact in contacts]
@@ -101,12 +105,20 @@ class ContactSearch:
         for i, gap in gaps.items():
             contacts[i] = contacts[i].with_gap(gap)
             values = contacts[i].gaps(self._dofs, records[i], self._depths[i])
+            if self._tools:  # at their places
+                there = self._tools.motion_there(records[i])
+                values = values - np.sum(records[i].normal * there, axis=1)
             records[i] = replace(records[i], gap=values)
         self.contacts, self._records = contacts, records
 
     def rows(self) -> tuple[list[float], list[Array]]:
         """Return the reach of each contact, and the owned groups whose nodes have rows."""
         return list(self._reach), [r.group[r.within_reach] for r in self._records]
+
+    def move(self) -> None:
+        """Let rigid bodies be where their laws have them now."""
+        if self._tools:
+            self._records = [r.at(self._tools.motion(r)) for r in self._records]
 
     def take_rows(self, reach: Sequence[float], groups: Sequence[Array]) -> None:
         """Have the rows that an earlier search of the same scene had, as ``rows`` said."""
@@ -129,7 +141,8 @@ class ContactSearch:
             if moved > self._reach[i]:
                 tried.insert(0, (self._search(i, moved), moved))
             for found, reach in tried:
-                overlaps = remaining_gaps(found, self._dofs, u) < -tolerance
+                at = found.at(self._tools.motion(found, found=True)) if self._tools else found
+                overlaps = remaining_gaps(at, self._dofs, u) < -tolerance
                 if new := self._count(overlaps & ~found.within_reach):
                     self._records[i] = replace(found, within_reach=found.within_reach | overlaps)
                     self._reach[i] = reach
@@ -213,9 +226,14 @@ class ContactSearch:
 
     def _from_origin(self, found: ContactRecords) -> ContactRecords:
         """Conditions with the gaps of the total displacement."""
-        if self._origin is None:
+        if self._tools:  # at their places
+            found = found.at(self._tools.motion_there(found))
+        if self._origin is not None:
+            way = relative_displacement(found, self._dofs, self._origin)
+        elif self._tools:
+            way = -found.motion
+        else:
             return found
-        way = relative_displacement(found, self._dofs, self._origin)
         return replace(found, gap=found.gap + np.sum(found.normal * way, axis=1))
 
     def _count(self, flags: Array) -> int:

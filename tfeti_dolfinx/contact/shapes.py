@@ -195,6 +195,12 @@ class SignedDistance:
         return gradient
 
 
+def point_of(shape: Shape) -> Array:
+    """Return the centre or the point of a shape, the origin without one, shape ``(3,)``."""
+    found = getattr(shape, "centre", getattr(shape, "point", None))
+    return np.zeros(3) if found is None or callable(found) else np.asarray(found, dtype=float)
+
+
 # --- Checks of a shape's callables ------------------------------------------------------------
 
 
@@ -254,8 +260,8 @@ def check_placement(
     Raises:
         InputError: Says what does not fit.
     """
-    if isinstance(shape, Placed):
-        shape.check_dimension(gdim, what)
+    if callable(check := getattr(shape, "check_dimension", None)):
+        check(gdim, what)
     with raised_on_all_ranks(comm), np.errstate(invalid="ignore"):  # of what is not finite
         phi, gradient = distance_and_gradient(shape, x, what)
         nearest = np.argsort(np.abs(phi))[: SEARCH.samples]

@@ -56,6 +56,8 @@ class SearchTolerances:
             wrong one is wrong nearly everywhere.
         same_direction: Cosine of 60°, up to which a gradient may be off the difference.
         same_length: Factor up to which its length may be.
+        inside: How deep a rigid body may lie in a surface at the begin, over the surface's extent:
+            facets of a curved surface reach that far into what touches it.
         along: A direction whose tangential part is shorter does not say where it points.
     """
 
@@ -90,6 +92,7 @@ class SearchTolerances:
     samples: int = 16
     same_direction: float = 0.5
     same_length: float = 100.0
+    inside: float = 0.01
     along: float = 1e-3
 
 

@@ -277,7 +277,8 @@ class NonlinearContactProblem(ContactProblem):
     def _line_search(self, u: Array, d: Array) -> tuple[float, float]:
         """Return the length t in (0, 1] of the step d from u, and |r(1)/r(0)|. Collective."""
         tol = self._tolerances
-        subdomains, primal = self._system.subdomains, self.dofs.to_primal(d)
+        subdomains = self._system.subdomains
+        primal = subdomains.with_rigid(self.dofs.to_primal(d))
         diagonal = sum(
             float(block.diagonal @ primal[part] ** 2)
             for block, part in zip(subdomains.blocks, subdomains.dof_parts, strict=True)

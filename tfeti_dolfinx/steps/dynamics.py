@@ -17,7 +17,8 @@ from tfeti_dolfinx.common.validation import checked_flag
 from tfeti_dolfinx.constraints.contact_state import Multipliers
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.constraints.rows import Constraints
-from tfeti_dolfinx.contact.partner import ContactPartner
+from tfeti_dolfinx.contact.partner import ContactPartner, checked_contacts
+from tfeti_dolfinx.contact.rigid_body import RigidBody
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import Extensions
 from tfeti_dolfinx.feti.dual import Dual
@@ -274,6 +275,7 @@ class ContactDynamics(ContactProblem):
         lumped: bool = False,
         **others: Any,
     ) -> None:
+        check_guided(contacts)
         self._stabilised, self._lumped = stabilised, lumped
         self._mass, self._velocity = mass, velocity
         self._with_thickness = others.get("thickness", 1.0)
@@ -418,3 +420,18 @@ class ContactDynamics(ContactProblem):
         contacts = [self.solution.contact(i) for i in range(len(self.contacts))]
         forces = [list(map(float, contact.resultant.force)) for contact in contacts]
         self.report.take(replace(self.report, motion=motion, contact_forces=forces))
+
+
+def check_guided(contacts: Sequence[ContactPartner]) -> None:
+    """Raise if a rigid body has free motions, for which a step would need its mass.
+
+    Raises:
+        InputError: It names the contact.
+    """
+    for contact in checked_contacts(contacts):
+        shape = getattr(contact, "shape", None)
+        if isinstance(shape, RigidBody) and shape.free:
+            raise InputError(
+                f"{contact.name}: a RigidBody with free motions in a ContactDynamics, which knows "
+                "no mass of it; expected displacement= or rotation= without free="
+            )

@@ -260,6 +260,7 @@ class StepRecord:
         motion: Energies and work, from the report, of bodies with mass.
         contact_forces: Resultant of the forces on each contact's surface, of a pair the secondary
             one; of bodies with mass their mean over the step.
+        tools: Motion and forces of rigid bodies, as the columns of ``LoadSteps.write_csv``.
     """
 
     number: int
@@ -271,6 +272,7 @@ class StepRecord:
     seconds: float
     motion: dict[str, float] = field(default_factory=dict)
     contact_forces: list[list[float]] = field(default_factory=list)
+    tools: dict[str, float] = field(default_factory=dict)
 
 
 class LoadSteps:
@@ -379,8 +381,8 @@ class LoadSteps:
     def write_csv(self, path: str | os.PathLike[str]) -> None:
         """Write a table of the steps so far, a line a step, by rank 0. Collective.
 
-        Columns: time, the force on each contact by name and axis, what friction dissipates,
-        multiplications by F, seconds.
+        Columns: time, the force on each contact by name and axis, motion and forces of each rigid
+        body, what friction dissipates, multiplications by F, seconds.
 
         Args:
             path: File, ending in ``.csv``; one that is there is replaced.
@@ -399,9 +401,11 @@ class LoadSteps:
                 with partial.open("w", newline="", encoding="utf-8") as file:
                     table = csv.writer(file)
                     forces = [f"{name} {axis}" for name in names for axis in axes]
-                    table.writerow(["time", *forces, "dissipation", "F", "seconds"])
+                    tools = list(self.records[0].tools) if self.records else []
+                    table.writerow(["time", *forces, *tools, "dissipation", "F", "seconds"])
                     for record in self.records:
                         values = [value for force in record.contact_forces for value in force]
+                        values += [record.tools[name] for name in tools]
                         count = record.figures["F_multiplications"]
                         table.writerow(
                             [record.time, *values, record.dissipation, count, record.seconds]
@@ -448,6 +452,7 @@ class LoadSteps:
 
     def _set(self, t: float) -> None:
         with agreeing(self._comm, "apply"):
+            self._problem.time = t
             self._apply(self._problem, t)
 
     def _record(self, number: int, t: float, size: float) -> StepRecord:
@@ -464,6 +469,7 @@ class LoadSteps:
             seconds=report.seconds["total"],
             motion=dict(report.motion),
             contact_forces=[list(map(float, contact.resultant.force)) for contact in contacts],
+            tools=self._problem.solution.tool_numbers,
         )
 
     def _keep(self, place: Place, t: float) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -18,6 +18,7 @@ from tfeti_dolfinx.subdomains.block import Block, Counters, SubdomainData
 from tfeti_dolfinx.subdomains.factor import say_if_not_cholmod
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.local_operators import LocalChoice
+from tfeti_dolfinx.subdomains.rigid_block import RigidBlock
 from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains, SparseBlock
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
@@ -124,17 +125,24 @@ def make_subdomains(
     counters: Counters | None = None,
     choice: LocalChoice | None = None,
     kind: Callable[..., Subdomains] = Subdomains,
+    rigid: Sequence[RigidBlock] = (),
+    num_rigid: int = 0,
 ) -> Subdomains:
     """Make a Block of each subdomain of this rank, whose data is let go then. Collective.
 
-    What ``make_block`` raises, say a class of one's own, is raised on all ranks.
+    What ``make_block`` raises, say a class of one's own, is raised on all ranks. Of ``num_rigid``
+    rigid bodies the last rank has the Blocks.
     """
     comm = decomposition.comm
     say_if_not_cholmod(comm)
     with raised_on_all_ranks(comm):
         blocks = [make_block(item) for item in data]
-    bodies = decomposition.body_of_subdomain[decomposition.subdomains]
-    return kind(blocks, bodies, decomposition.num_bodies, comm, counters, choice)
+    bodies, count = (
+        decomposition.body_of_subdomain[decomposition.subdomains],
+        decomposition.num_bodies,
+    )
+    bodies = np.append(bodies, count + np.arange(len(rigid)))
+    return kind([*blocks, *rigid], bodies, count + num_rigid, comm, counters, choice)
 
 
 def submatrix(K: Any, rows: Array, primal: Array, first: int) -> csr_array:

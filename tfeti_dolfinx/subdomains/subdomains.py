@@ -18,6 +18,7 @@ from tfeti_dolfinx.subdomains.local_operators import (
     LocalOperator,
     solved_together,
 )
+from tfeti_dolfinx.subdomains.rigid_block import RigidBlock
 
 # --- Motions of subdomains that springs hold --------------------------------------------------
 
@@ -203,6 +204,18 @@ class Subdomains:
         rows = csr_array(block_diag(trace)) if trace else csr_array((0, 0))
         return SoftMotions(rows, joined([D for _, D in found]))
 
+    # ------------------------------------------------------- rigid bodies' unknowns
+
+    @property
+    def num_nodal(self) -> int:
+        """Number of this rank's unknowns at nodes; those behind are of rigid bodies."""
+        sizes = [len(block.load) for block in self.blocks if not isinstance(block, RigidBlock)]
+        return sum(sizes)
+
+    def with_rigid(self, u: Array) -> Array:
+        """Return a displacement of nodes on all unknowns, 0 of rigid bodies, shape ``(n,)``."""
+        return np.append(u, np.zeros(_end(self.dof_parts) - len(u)))
+
     # ------------------------------------------------------------------- bodies
 
     @property
@@ -217,13 +230,16 @@ class Subdomains:
     def modes_outside(self) -> Array:
         """Σ Cᵀ(I − R Rᵀ)C / tr CᵀC over the Blocks of a body, shape ``(b, k, k)``. Collective.
 
-        What springs hold of the modes lies outside the kernels.
+        What springs hold of the modes lies outside the kernels, and what guides hold of a rigid
+        body.
         """
         found = []
         for block in self.blocks:
             inside = block.kernel.T @ block.modes
             rest = block.modes - block.kernel @ inside
             gram = rest.T @ rest
+            if isinstance(block, RigidBlock):
+                gram = np.diag(1.0 - np.diag(inside.T @ inside))
             found.append(gram / (float(np.trace(inside.T @ inside + gram)) or 1.0))
         return self._on_bodies(found, (self.num_modes, self.num_modes))
 

@@ -1,0 +1,537 @@
+"""Rigid bodies that move by a law, or under a force: closed forms, statics, and each other."""
+
+import csv
+
+import numpy as np
+import pytest
+import ufl
+from dolfinx import fem
+from mpi4py import MPI
+from scenes import clamp, decomposed, hooke, strain
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.contact.rigid_body import Pose, motion_fields
+
+CELLS = {2: "triangle", 3: "tetrahedron"}
+TIGHT = {"rtol": 1e-10}
+DOWN = {2: np.array((0.0, -1.0)), 3: np.array((0.0, 0.0, -1.0))}
+
+
+def block(gdim, degree=1, n=6, hold="clamped", nu=0.3):
+    """Unit square or cube on its bottom, elastic with E = 1."""
+    decomposition = decomposed(CELLS[gdim], n, 4)
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", degree, (gdim,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    bottom = decomposition.facets("bottom")
+    bcs = [clamp(V, bottom)]
+    if hold == "rollers":  # and one edge that keeps it from sliding and turning
+        dofs = fem.locate_dofs_topological(V.sub(gdim - 1), gdim - 1, bottom)
+        bcs = [fem.dirichletbc(0.0, dofs, V.sub(gdim - 1))]
+    stress = hooke(nu=nu)
+    a = ufl.inner(stress(u), strain(v)) * ufl.dx
+    zero = ufl.ZeroBaseForm((v,))
+    return {"a": a, "L": zero, "bcs": bcs, "decomposition": decomposition}
+
+
+def top(gdim, height=1.0):
+    """Half space that lies on the block."""
+    return tfeti.Plane(-height * DOWN[gdim], normal=tuple(DOWN[gdim]))
+
+
+def ball(gdim, radius=1.0, offset=0.0):
+    """Ball that touches the top, beside the middle."""
+    centre = np.full(gdim, 0.5)
+    centre[0], centre[-1] = 0.5 + offset, 1.0 + radius
+    return tfeti.Sphere(centre, radius)
+
+
+def solved(scene, *contacts, **options):
+    problem = tfeti.ContactProblem(**scene, contacts=contacts, petsc_options={**TIGHT, **options})
+    problem.solve()
+    return problem
+
+
+def same(one, other, to=1e-9):
+    """Whether two displacements agree, relative to the larger."""
+    u, w = one.u.x.array, other.u.x.array
+    comm = one.decomposition.comm
+    apart = comm.allreduce(float(np.abs(u - w).max(initial=0.0)), op=MPI.MAX)
+    size = comm.allreduce(float(np.abs(u).max(initial=0.0)), op=MPI.MAX)
+    return apart <= to * size
+
+
+@pytest.mark.parametrize("gdim", [2, 3])
+def test_a_tool_by_displacement_is_an_obstacle_that_lies_there(gdim):
+    scene, down = block(gdim, n=4), 0.03 * DOWN[gdim]
+    there = solved(scene, tfeti.Obstacle("top", top(gdim, 0.97)))
+    moved = solved(scene, tfeti.Obstacle("top", top(gdim), displacement=down, name="punch"))
+    assert same(there, moved, 1e-12)
+    tool, contact = moved.solution.tool("punch"), there.solution.contact(0)
+    assert np.allclose(tool.displacement, down)
+    assert np.allclose(tool.resultant.force, -contact.resultant.force, rtol=1e-11)
+    assert np.abs(moved.solution.contact(0).gap).max(initial=0.0) <= 1e-10
+    assert moved.report.tools[0].startswith("punch: displacement (")
+
+
+def test_another_displacement_needs_neither_rows_nor_factors():
+    scene = block(2)
+    way = fem.Constant(scene["decomposition"].mesh, 0.02 * DOWN[2])
+    problem = solved(scene, tfeti.Obstacle("top", ball(2), displacement=way))
+    way.value[:] = 0.03 * DOWN[2]
+    problem.solve()
+    report = problem.report
+    assert report.searches == report.gluings == report.factorizations == 0
+    assert report.coarse_factorizations == report.assemblies == 0
+    again = solved(scene, tfeti.Obstacle("top", ball(2), displacement=0.03 * DOWN[2]))
+    assert same(problem, again)
+
+
+@pytest.mark.parametrize("gdim", [2, 3])
+@pytest.mark.parametrize("friction", [None, tfeti.Coulomb(0.3)])
+def test_a_force_moves_a_tool_as_far_as_its_displacement_has_needed(gdim, friction):
+    scene, way = block(gdim), 0.03 * DOWN[gdim]
+    law = tfeti.RigidBody(ball(gdim), displacement=way, name="ball")
+    by_law = solved(scene, tfeti.Obstacle("top", law, friction=friction))
+    force = np.where(way != 0.0, -by_law.solution.tool("ball").resultant.force, 0.0)
+    axis = "xyz"[gdim - 1]
+    pressed = tfeti.RigidBody(ball(gdim), force=force, free=(axis,), name="ball")
+    by_force = solved(scene, tfeti.Obstacle("top", pressed, friction=friction))
+    assert same(by_law, by_force)
+    assert np.allclose(by_force.solution.tool("ball").displacement, way, rtol=1e-8)
+    assert by_force.report.kernel_dim == by_law.report.kernel_dim + 1
+
+
+@pytest.mark.parametrize("gdim", [2, 3])
+def test_an_eccentric_force_tilts_a_punch_as_in_closed_form(gdim):
+    """σ = E(a + bx) along z of a block on rollers: u_z = (a + bx)z, u_x = −bz²/2, without ν.
+
+    The force F at the eccentricity e within the core needs a = F/(EA) and b = Fe/(EI). Multipliers
+    have no linear pressure: an error of h².
+    """
+    scene = block(gdim, degree=2, n=8 if gdim == 2 else 4, hold="rollers", nu=0.0)
+    force, e = 0.02, 0.1
+    at = np.full(gdim, 0.5)
+    at[-1] = 1.0
+    at[0] += e
+    free = ("y", "rz") if gdim == 2 else ("z", "rx", "ry")
+    punch = tfeti.RigidBody(top(gdim), force=force * DOWN[gdim], free=free, point=at, name="punch")
+    problem = solved(scene, tfeti.Obstacle("top", punch))
+    b = 12.0 * force * e
+    tool = problem.solution.tool("punch")
+    angle = tool.rotation[2] if gdim == 2 else -tool.rotation[1]
+    assert np.isclose(angle, -b, rtol=1e-3 if gdim == 2 else 4e-3)  # of u_z = −(F + bx)z
+    assert np.isclose(tool.displacement[-1], -force - b * e, rtol=1e-3)
+    assert np.allclose(tool.resultant.force, -force * DOWN[gdim], atol=1e-9 * force)
+    assert np.abs(tool.resultant.moment).max() <= 1e-9 * force
+    by_law = solved(
+        scene,
+        tfeti.Obstacle(
+            "top",
+            tfeti.RigidBody(
+                top(gdim),
+                displacement=tool.displacement,
+                rotation=tool.rotation[2] if gdim == 2 else tool.rotation,
+                point=at,
+            ),
+        ),
+    )
+    strains = by_law.solution, problem.solution
+    forces = [s.tool(0).resultant.force[-1] for s in strains]
+    assert np.isclose(*forces, rtol=1e-9)
+    assert same(problem, by_law)
+
+
+@pytest.mark.parametrize("gdim", [2, 3])
+def test_forces_and_moments_balance(gdim):
+    scene = block(gdim)
+    load, turn = 0.01 * DOWN[gdim], ("rz",) if gdim == 2 else ("rx", "ry")
+    free = (*"xyz"[gdim - 1 :][:1], *turn)
+    middle = np.append(np.full(gdim - 1, 0.45), 2.0)
+    tool = tfeti.RigidBody(top(gdim), force=load, free=free, point=middle, name="plate")
+    solution = solved(scene, tfeti.Obstacle("top", tool)).solution
+    plate, support = solution.tool("plate"), solution.reaction("bottom")
+    size = np.linalg.norm(load)
+    assert np.allclose(plate.resultant.force, -load, atol=1e-9 * size)
+    assert np.abs(plate.resultant.moment[:2]).max() <= 1e-9 * size
+    assert np.allclose(support.force, plate.resultant.force, atol=1e-9 * size)
+    at, force = np.zeros(3), np.zeros(3)
+    at[:gdim], force[:gdim] = middle, plate.resultant.force
+    about_origin = plate.resultant.moment + np.cross(at, force)
+    assert np.allclose(support.moment, about_origin, atol=1e-8 * size)
+
+
+def test_one_tool_on_two_surfaces_has_the_statics_of_a_beam():
+    """Its force at a quarter of the way is borne by three quarters there, whatever bends."""
+    decomposition = decomposed("triangle", 8, 4)
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    a = ufl.inner(hooke()(u), strain(v)) * ufl.dx
+    bcs = [clamp(V, decomposition.facets("bottom"))]
+    shapes = tfeti.SignedDistance(
+        lambda x: (
+            np.minimum(np.hypot(x[0] - 0.0, x[1] - 1.5), np.hypot(x[0] - 1.0, x[1] - 1.5)) - 0.5
+        ),
+        lambda x: np.where(
+            x[0] < 0.5,
+            np.stack((x[0], x[1] - 1.5, 0 * x[0])),
+            np.stack((x[0] - 1.0, x[1] - 1.5, 0 * x[0])),
+        ),
+    )
+    bridge = tfeti.RigidBody(
+        shapes, force=(0, -0.01), free=("y", "rz"), point=(0.25, 1.0), name="bridge"
+    )
+    scene = {"a": a, "L": ufl.ZeroBaseForm((v,)), "bcs": bcs, "decomposition": decomposition}
+    data = solved(scene, tfeti.Obstacle("top", bridge)).solution.contact(0)
+    left = data.points[:, 0] < 0.5
+    comm = decomposition.comm
+    forces = [comm.allreduce(float(data.force[side].sum())) for side in (left, ~left)]
+    normal = data.force[:, None] * data.normal
+    moment = comm.allreduce(float(np.sum((data.points[:, 0] - 0.25) * normal[:, 1])))
+    moment -= comm.allreduce(float(np.sum((data.points[:, 1] - 1.0) * normal[:, 0])))
+    assert abs(moment) <= 1e-11
+    assert 2.5 <= forces[0] / forces[1] <= 3.5
+
+
+@pytest.mark.parametrize(
+    ("tool", "words"),
+    [
+        ({"force": (0, 1.0), "free": ("y",)}, "translation in y"),
+        ({"force": (0.1, -1.0), "free": ("x", "y")}, "translation in x"),
+        ({"moment": -1.0, "free": ("rz",), "point": (9.0, 1.0)}, "rotation in the plane"),
+    ],
+)
+def test_a_tool_that_nothing_balances_is_named(tool, words):
+    with pytest.raises(tfeti.NoSolutionError, match="punch") as caught:
+        solved(block(2, n=3), tfeti.Obstacle("top", tfeti.RigidBody(top(2), name="punch", **tool)))
+    assert words in str(caught.value)
+
+
+def test_motions_that_nothing_resists_or_drives_are_free():
+    free = tfeti.RigidBody(top(2), force=(0, -0.01), free=("x", "y"), name="punch")
+    problem = solved(block(2, n=3), tfeti.Obstacle("top", free))
+    assert problem.report.free_modes == 1
+    assert abs(problem.solution.tool(0).displacement[0]) <= 1e-14
+
+
+def test_a_far_tool_falls_until_it_touches():
+    scene = block(2)
+    near, far = ball(2), tfeti.Sphere((0.5, 2.7), 1.0)
+    given = {"force": 0.01 * DOWN[2], "free": ("y",)}
+    found = [
+        solved(scene, tfeti.Obstacle("top", tfeti.RigidBody(shape, **given)))
+        for shape in (near, far)
+    ]
+    ways = [problem.solution.tool(0).displacement[1] for problem in found]
+    assert np.isclose(ways[1], ways[0] - 0.7, rtol=1e-9)
+    assert same(*found)
+
+
+@pytest.mark.parametrize("law", [tfeti.Coulomb(0.4), tfeti.Tresca(0.003)])
+def test_friction_knows_only_the_relative_motion(law):
+    """A tool that is dragged along, and a block that is drawn back under it."""
+    scene, ends = block(2), []
+    decomposition = scene["decomposition"]
+    W = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+    u, v = ufl.TrialFunction(W), ufl.TestFunction(W)
+    dofs = fem.locate_dofs_topological(W, 1, decomposition.facets("bottom"))
+    pressed = np.array((0.0, -0.03))
+    for moves in ("tool", "block"):
+        way = fem.Constant(decomposition.mesh, (0.0, 0.0))
+        held = fem.Constant(decomposition.mesh, (0.0, 0.0))
+        problem = tfeti.ContactProblem(
+            ufl.inner(hooke()(u), strain(v)) * ufl.dx,
+            ufl.ZeroBaseForm((v,)),
+            [fem.dirichletbc(held, dofs, W)],
+            [tfeti.Obstacle("top", tfeti.RigidBody(ball(2), displacement=way), friction=law)],
+            decomposition,
+            petsc_options=TIGHT,
+        )
+        for x in (0.0, 0.002, 0.02, 0.01):
+            along = np.array((x, 0.0))
+            way.value[:] = pressed + (along if moves == "tool" else 0.0)
+            held.value[:] = -along if moves == "block" else 0.0
+            problem.solve()
+            problem.accept()
+        ends.append((problem.u.x.array.reshape(-1, 2) + held.value * -1.0, problem.solution))
+    (one, solution), (other, _) = ends
+    assert np.abs(one - other).max(initial=0.0) <= 1e-9
+    assert solution.tool(0).resultant.force[0] != 0.0
+
+
+def test_large_motions_place_the_tool_anew():
+    scene = block(2, n=8)
+    for way, turn in (((0.2, -0.03), 0.0), ((-0.25, -0.02), 0.4)):
+        shape = ball(2, radius=0.3)
+        moved = tfeti.RigidBody(shape, displacement=way, rotation=turn, large=True)
+        there = tfeti.Sphere(shape.centre[:2] + way, 0.3)
+        found = [solved(scene, tfeti.Obstacle("top", s)) for s in (moved, there)]
+        assert same(*found, 1e-11)
+
+
+def test_a_wheel_that_turns_drags_along():
+    """Its surface slips wherever the wheel was before; the second of two turns changes nothing."""
+    scene = block(2, n=8)
+    angle = fem.Constant(scene["decomposition"].mesh, 0.0)
+    wheel = tfeti.RigidBody(
+        ball(2, radius=0.5), rotation=angle, displacement=0.02 * DOWN[2], large=True
+    )
+    contact = tfeti.Obstacle("top", wheel, friction=tfeti.Tresca(0.01))
+    problem, drags = tfeti.ContactProblem(**scene, contacts=[contact], petsc_options=TIGHT), []
+    for value in (0.0, 0.004, 3.0, 3.1, 3.0):
+        angle.value = value
+        problem.solve()
+        problem.accept()
+        drags.append(problem.solution.tool(0).resultant.force[0])
+    begun, all_slips, still, back = drags[1:]
+    assert all_slips < begun < 0.0 < back
+    assert np.isclose(all_slips, still)
+
+
+def test_load_steps_take_laws_of_time_and_write_a_table(tmp_path):
+    scene = block(2)
+    comm = scene["decomposition"].comm
+    tool = tfeti.RigidBody(ball(2), displacement=lambda t: (0.0, -0.04 * t), name="ball")
+    problem = tfeti.ContactProblem(**scene, contacts=[tfeti.Obstacle("top", tool)])
+    steps = tfeti.LoadSteps(problem, lambda problem, t: None, [0.25, 0.5, 1.0])
+    records = steps.run()
+    assert [r.tools["ball displacement y"] for r in records] == [-0.01, -0.02, -0.04]
+    forces = [r.tools["ball force y"] for r in records]
+    assert forces == sorted(forces)
+    path = comm.bcast(str(tmp_path / "curve.csv"))
+    steps.write_csv(path)
+    if comm.rank == 0:
+        with open(path) as file:
+            rows = list(csv.DictReader(file))
+        assert [float(row["ball force y"]) for row in rows] == forces
+    comm.Barrier()
+    pressed = tfeti.RigidBody(
+        ball(2), force=lambda t: (0.0, -t * forces[-1]), free=("y",), name="ball"
+    )
+    problem = tfeti.ContactProblem(**scene, contacts=[tfeti.Obstacle("top", pressed)])
+    back = tfeti.LoadSteps(problem, lambda problem, t: None, [0.5, 1.0]).run()
+    assert np.isclose(back[-1].tools["ball displacement y"], -0.04, rtol=1e-5)
+
+
+def test_a_series_goes_on_from_its_checkpoint(tmp_path):
+    """The tool begins where it was, by the force that it has had: friction knows the way."""
+    scene = block(2)
+    folder = scene["decomposition"].comm.bcast(str(tmp_path / "kept"))
+    way = lambda t: (0.01 * t, 0.0)  # noqa: E731
+    ends = []
+    for times in ([1.0, 2.0, 3.0], [1.0, 2.0], [1.0, 2.0, 3.0]):
+        tool = tfeti.RigidBody(
+            ball(2), displacement=way, force=(0, -0.01), free=("y",), name="ball"
+        )
+        contact = tfeti.Obstacle("top", tool, friction=tfeti.Coulomb(0.3))
+        problem = tfeti.ContactProblem(**scene, contacts=[contact], petsc_options=TIGHT)
+        steps = tfeti.LoadSteps(
+            problem, lambda problem, t: None, times, checkpoint=folder + "_whole" * (not ends)
+        )
+        steps.run(resume=len(ends) == 2)
+        ends.append((problem, steps))
+    (whole, first), _, (resumed, second) = ends
+    assert len(second.records) == 3
+    assert same(whole, resumed)
+    for name, value in first.records[-1].tools.items():
+        assert np.isclose(second.records[-1].tools[name], value, atol=1e-11), name
+
+
+def test_a_tool_that_hits_is_a_body_that_falls():
+    """Galilei: a plane that comes with a velocity, and a square that has the opposite one."""
+    decomposition = decomposed("quadrilateral", 4, 2)
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    a, speed = ufl.inner(hooke()(u), strain(v)) * ufl.dx, 0.2
+    found = []
+    for moves in ("tool", "body"):
+        begin = fem.Function(V)
+        begin.x.array.reshape(-1, 2)[:, 1] = speed if moves == "body" else 0.0
+        law = (lambda t: (0.0, -speed * t)) if moves == "tool" else (0.0, 0.0)
+        tool = tfeti.RigidBody(top(2, 1.05), displacement=law)
+        problem = tfeti.ContactDynamics(
+            a,
+            ufl.ZeroBaseForm((v,)),
+            [],
+            [tfeti.Obstacle("top", tool)],
+            decomposition,
+            mass=1.0,
+            velocity=begin,
+            petsc_options=TIGHT,
+        )
+        records = tfeti.LoadSteps(problem, lambda problem, t: None, np.linspace(0.1, 1.0, 10)).run()
+        assert max(abs(r.tools["tool of surface 'top' force y"]) for r in records) > 0.0
+        shift = speed * 1.0 if moves == "tool" else 0.0
+        found.append(problem.u.x.array.reshape(-1, 2) + (0.0, shift))
+    assert np.abs(found[0] - found[1]).max(initial=0.0) <= 1e-9
+
+
+def test_poses_are_rigid():
+    rng = np.random.default_rng(0)
+    for gdim in (2, 3):
+        x, point = rng.standard_normal((5, gdim)), rng.standard_normal(gdim)
+        q = rng.standard_normal(3 if gdim == 2 else 6)
+        pose = Pose(point, q, finite=True)
+        moved = x + pose.displacement(x)
+        sizes = [np.linalg.norm(y[:, None] - y[None], axis=2) for y in (x, moved)]
+        assert np.allclose(*sizes)
+        assert np.allclose(pose.origin(moved), x)
+        step = 1e-7 * rng.standard_normal(len(q))
+        way = pose.moved(step).displacement(x) - pose.displacement(x)
+        fields = motion_fields(moved - pose.centre)
+        assert np.allclose(way, np.einsum("nkg,k->ng", fields, step), atol=1e-12)
+        small = Pose(point, step, finite=False).displacement(x)
+        fields = motion_fields(x - point)
+        assert np.allclose(small, np.einsum("nkg,k->ng", fields, step), rtol=1e-12, atol=1e-20)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"force": (0, -1)}, "no free motion"),
+        ({"force": (0, -1), "free": ("w",)}, "free="),
+        ({"force": (1, -1), "free": ("y",)}, "part along x"),
+        ({"displacement": (0, -1), "free": ("y",)}, "part along y"),
+        ({"displacement": (0, -1, 0)}, "2 finite"),
+        ({"displacement": lambda t: "down"}, "displacement"),
+        ({"free": ("rx",)}, "in 2D"),
+        ({"displacement": (0, np.nan)}, "2 finite"),
+        ({"point": (0, 0, 0)}, "2 components"),
+        ({"free": ("y",), "large": True}, "large=True"),
+    ],
+)
+def test_what_does_not_fit_is_named(given, words):
+    with pytest.raises(tfeti.InputError, match=words):
+        body = tfeti.RigidBody(top(2), name="punch", **given)
+        solved(block(2, n=2), tfeti.Obstacle("top", body))
+
+
+def test_a_tool_inside_of_a_body_is_named():
+    tool = tfeti.RigidBody(top(2, 0.9), displacement=(0, 0), name="punch")
+    with pytest.raises(tfeti.InputError, match="punch is inside of 'top'"):
+        solved(block(2, n=2), tfeti.Obstacle("top", tool))
+    solved(block(2, n=2), tfeti.Obstacle("top", tool, gap=-0.1))  # meant
+
+
+def test_two_tools_have_two_names():
+    tools = [tfeti.RigidBody(top(2), displacement=(0, 0), name="punch") for _ in range(2)]
+    with pytest.raises(tfeti.InputError, match="different"):
+        solved(block(2, n=2), *(tfeti.Obstacle("top", tool) for tool in tools))
+
+
+@pytest.mark.parametrize("finite", [False, True])
+def test_nonlinear_bodies_under_a_tool_by_force_and_by_displacement(finite):
+    """Plasticity in small strain, and neo-Hooke's law in finite strain."""
+    found, force = [], None
+    for law in ("displacement", "force"):
+        decomposition = decomposed("triangle", 6, 4)
+        V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+        u, v = fem.Function(V), ufl.TestFunction(V)
+        state = {}
+        if finite:
+            F = ufl.Identity(2) + ufl.grad(u)
+            J = ufl.det(F)
+            energy = 0.4 * (ufl.tr(F.T * F) - 2 - 2 * ufl.ln(J)) + 0.3 * ufl.ln(J) ** 2
+            residual = ufl.derivative(energy * ufl.dx, u, v)
+        else:
+            elastic = tfeti.Elasticity(decomposition, E=1.0, nu=0.3, model="plane_strain")
+            steel = tfeti.J2Plasticity(elastic, u, yield_stress=0.05, hardening=0.1)
+            residual = steel.residual(v)
+            state = {"state": steel.state, "update": steel.update}
+            state["J"] = steel.tangent(ufl.TrialFunction(V), v)
+        given = {"displacement": lambda t: (0.0, -0.08 * t)}
+        if law == "force":
+            given = {"force": (0.0, -force), "free": ("y",)}
+        tool = tfeti.RigidBody(ball(2, radius=0.8), name="ball", point=(0.5, 1.0), **given)
+        problem = tfeti.NonlinearContactProblem(
+            residual,
+            u,
+            [clamp(V, decomposition.facets("bottom"))],
+            [tfeti.Obstacle("top", tool)],
+            decomposition,
+            finite=finite,
+            petsc_options={"rtol": 1e-9},
+            **state,
+        )
+        tfeti.LoadSteps(problem, lambda problem, t: None, [1.0]).run()
+        tool = problem.solution.tool("ball")
+        force = tool.resultant.force[1] if law == "displacement" else force
+        found.append((problem, tool))
+    (one, by_law), (other, by_force) = found
+    assert np.isclose(by_force.displacement[1], by_law.displacement[1], rtol=1e-7)
+    assert same(one, other, 1e-6)
+    assert np.isclose(by_force.resultant.force[1], force, rtol=1e-7)
+    assert min(one.report.newton_steps, other.report.newton_steps) > 1
+
+
+def sphere_mesh(radius=1.0, n=24):
+    """Triangles of a ball about the origin, seen from outside they turn to the left."""
+    theta, phi = np.linspace(0, np.pi, n + 1), np.linspace(0, 2 * np.pi, 2 * n + 1)[:-1]
+    t, p = np.meshgrid(theta[1:-1], phi, indexing="ij")
+    rings = np.stack((np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)), axis=2)
+    points = np.vstack(([[0, 0, 1]], rings.reshape(-1, 3), [[0, 0, -1]]))
+    k, last = 2 * n, len(points) - 1
+    j, after = np.arange(k), np.roll(np.arange(k), -1)
+    caps = [np.stack((0 * j, 1 + j, 1 + after), axis=1)]
+    caps.append(np.stack((0 * j + last, last - k + after, last - k + j), axis=1))
+    bands = []
+    for i in range(n - 2):
+        a, b = 1 + i * k + j, 1 + i * k + after
+        bands += [np.stack((a, a + k, b), axis=1), np.stack((b, a + k, b + k), axis=1)]
+    return radius * points, np.vstack((*caps, *bands))
+
+
+def test_distance_from_a_mesh_is_that_of_its_body():
+    """Of a cube exactly, inside, outside, next to faces, edges and corners; of a ball with h²."""
+    rng = np.random.default_rng(0)
+    x = np.array([[a, b, c] for a in (0, 1) for b in (0, 1) for c in (0, 1)], dtype=float)
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    cube = tfeti.SurfaceMesh(x, [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+    p = rng.uniform(-0.6, 1.6, (3, 400))
+    out = np.maximum(np.maximum(-p, p - 1.0), 0.0)
+    inside = np.min(np.minimum(p, 1.0 - p), axis=0)
+    expected = np.where(inside > 0.0, -inside, np.linalg.norm(out, axis=0))
+    assert np.allclose(cube.distance(p), expected, atol=1e-12)
+    step = 1e-6
+    slope = [
+        (cube.distance(p + d) - cube.distance(p - d)) / (2 * step)
+        for d in step * np.eye(3)[:, :, None]
+    ]
+    assert np.median(np.abs(cube.gradient(p) - slope)) <= 1e-8
+    ball = tfeti.SurfaceMesh(*sphere_mesh())
+    p = rng.standard_normal((3, 200))
+    assert np.abs(ball.distance(p) - np.linalg.norm(p, axis=0) + 1.0).max() <= 0.02
+
+
+def test_a_mesh_presses_as_its_shape_does(tmp_path):
+    """A tool from an STL file, beside the sphere that it stands for."""
+    scene = block(3, n=4)
+    comm = scene["decomposition"].comm
+    points, facets = sphere_mesh(n=60)
+    points = points + (0.5, 0.5, 2.0)
+    path = comm.bcast(str(tmp_path / "ball.stl"))
+    if comm.rank == 0:
+        with open(path, "w") as file:
+            file.write("solid ball\n")
+            for triangle in points[facets]:
+                file.write("facet normal 0 0 0\nouter loop\n")
+                file.writelines("vertex {:.12g} {:.12g} {:.12g}\n".format(*v) for v in triangle)
+                file.write("endloop\nendfacet\n")
+            file.write("endsolid ball\n")
+    comm.Barrier()
+    forces = []
+    for shape in (tfeti.read_surface(path, comm), ball(3)):
+        tool = tfeti.RigidBody(shape, displacement=(0, 0, -0.05))
+        forces.append(solved(scene, tfeti.Obstacle("top", tool)).solution.tool(0).resultant.force)
+    assert np.isclose(forces[0][2], forces[1][2], rtol=0.03)
+
+
+def test_meshes_that_do_not_fit_are_named(comm):
+    for points, facets, words in (
+        ([(0, 0)], [(0, 1)], "not among 1"),
+        ([(0, 0, 0)] * 3, [(0, 1, 2)], "no extent"),
+        ([(0, 0, 0)], [(0, 1)], "expected"),
+    ):
+        with pytest.raises(tfeti.InputError, match=words):
+            tfeti.SurfaceMesh(points, facets)
+    with pytest.raises(tfeti.InputError, match="no file"):
+        tfeti.read_surface("missing.stl", comm)

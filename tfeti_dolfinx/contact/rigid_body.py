@@ -1,0 +1,277 @@
+"""Rigid bodies: shapes that move by a law, or under a force."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import KW_ONLY, dataclass, field, replace
+from typing import Any, TypeAlias
+
+import numpy as np
+from dolfinx import fem
+from scipy.spatial.transform import Rotation
+
+from tfeti_dolfinx.common.arrays import Array, ArrayLike
+from tfeti_dolfinx.common.validation import (
+    checked_flag,
+    checked_type,
+    named,
+    real_numbers,
+    shown,
+)
+from tfeti_dolfinx.contact.shapes import Placed, Point, Shape, check_shape, point_of
+from tfeti_dolfinx.errors import InputError
+
+# numbers that may change: fixed, a constant of DOLFINx, or a function of the problem's time
+Law: TypeAlias = "float | Sequence[float] | Array | fem.Constant | Callable[[float], ArrayLike]"
+
+# names of motions by dimension, in the order of a body's candidate modes
+MOTIONS = {2: ("x", "y", "rz"), 3: ("x", "y", "z", "rz", "ry", "rx")}
+
+# --- Places of a rigid body -------------------------------------------------------------------
+
+
+def motion_fields(arm: Array) -> Array:
+    """Return the displacements of points by unit translations and small unit turns.
+
+    Args:
+        arm: Points from the centre of the turns, shape ``(n, gdim)``.
+
+    Returns:
+        In the order of ``MOTIONS``, shape ``(n, k, gdim)``.
+    """
+    n, gdim = arm.shape
+    fields = np.zeros((n, len(MOTIONS[gdim]), gdim))
+    fields[:, :gdim] = np.eye(gdim)
+    if gdim == 2:
+        fields[:, 2] = np.stack((-arm[:, 1], arm[:, 0]), axis=1)
+    else:
+        fields[:, 3:] = np.cross(np.eye(3)[::-1], arm[:, None])
+    return fields
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Place of a rigid body, which takes X to p + Q(X − p) + t.
+
+    Attributes:
+        point: p, shape ``(gdim,)``.
+        motion: t and the rotation vector of Q in the order of ``MOTIONS``, shape ``(k,)``.
+        finite: Whether Q is a rotation; else the small one 1 + [θ]×.
+    """
+
+    point: Array
+    motion: Array
+    finite: bool
+
+    @property
+    def centre(self) -> Array:
+        """The point p at this place."""
+        return np.asarray(self.point + self.motion[: len(self.point)])
+
+    @property
+    def rotation(self) -> Array:
+        """Q, shape ``(gdim, gdim)``."""
+        turn = rotation_vector(self.motion, len(self.point))
+        Q = Rotation.from_rotvec(turn).as_matrix() if self.finite else np.eye(3) + _cross(turn)
+        return np.asarray(Q[: len(self.point), : len(self.point)])
+
+    def displacement(self, X: Array) -> Array:
+        """Displacement of the body's points X, shape ``(n, gdim)``."""
+        turned = (X - self.point) @ (self.rotation - np.eye(len(self.point))).T
+        return np.asarray(self.motion[: len(self.point)] + turned)
+
+    def origin(self, x: Array) -> Array:
+        """Points of the body that are at x, shape ``(n, gdim)``."""
+        return np.asarray(x - self.way_to(x))
+
+    def way_to(self, x: Array) -> Array:
+        """Displacement of the body's points that are at x, shape ``(n, gdim)``."""
+        gdim = len(self.point)
+        back = np.linalg.inv(self.rotation)
+        return np.asarray((x - self.point) @ (np.eye(gdim) - back).T + back @ self.motion[:gdim])
+
+    def moved(self, step: Array) -> Pose:
+        """Pose after one more motion, turns about the centre."""
+        motion, gdim = self.motion + step, len(self.point)
+        if self.finite and gdim == 3:
+            turns = [Rotation.from_rotvec(rotation_vector(q, 3)) for q in (step, self.motion)]
+            motion[3:] = (turns[0] * turns[1]).as_rotvec()[::-1]
+        return replace(self, motion=motion)
+
+
+def rotation_vector(motion: Array, gdim: int) -> Array:
+    """Return the rotation vector of a motion, shape ``(3,)``."""
+    return np.array((0.0, 0.0, motion[2])) if gdim == 2 else motion[:2:-1]
+
+
+def _cross(a: Array) -> Array:
+    """Return the matrix of a × ."""
+    return np.cross(a, np.eye(3)).T
+
+
+# --- Rigid bodies as a user gives them --------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class RigidBody:
+    """A rigid tool: a shape that moves by a law, or under a force.
+
+    It stands in the place of an obstacle's shape. Motions are translations ``"x"``, ``"y"``,
+    ``"z"`` and turns about axes through ``point``: ``"rz"`` in 2D, ``"rx"``, ``"ry"``, ``"rz"``.
+    Those in ``free`` are found, so that contact balances force and moment; others are those of
+    the law. Surfaces that touch it are its bearings: a tool of several obstacles is one body.
+
+    Numbers may be fixed, a ``dolfinx.fem.Constant``, or a function of ``ContactProblem.time``,
+    which ``LoadSteps`` sets. Another value needs neither rows nor factors.
+
+    Args:
+        shape: Its shape where the motion is 0: as of an ``Obstacle``.
+        displacement: Of ``point``, gdim components; default 0.
+        rotation: About ``point``: an angle in 2D, a rotation vector of three components in 3D;
+            in radians.
+        force: On the body, gdim components; with a thickness, on all of it.
+        moment: About ``point``: a number in 2D, three components in 3D.
+        free: Names of the motions that are free.
+        point: Default the centre or the point of the shape, else the origin.
+        name: For messages and ``solution.tool(name)``. Default: "tool of surface 'a'".
+        large: Whether its motion is not small beside the shape's size: then its shape is placed
+            where the law has it before each solve, and contact is searched there. Else gaps change
+            with the motion, and normals stay.
+
+    Raises:
+        InputError: Something given does not fit; the message names it.
+
+    Example:
+        >>> ball = tfeti.Sphere((0, 0, 1), radius=1.0)
+        >>> tfeti.RigidBody(ball, force=(0, 0, -2.0), free=("z",), name="indenter").name
+        'indenter'
+    """
+
+    shape: Shape
+    _: KW_ONLY
+    displacement: Law | None = None
+    rotation: Law | None = None
+    force: Law | None = None
+    moment: Law | None = None
+    free: Sequence[str] = ()
+    point: Point | None = None
+    name: str = ""
+    large: bool = False
+    _pose: Pose | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        checked_type(self.name, str, "RigidBody: name", "a text")
+        what = f"RigidBody {self.name}".rstrip()
+        if isinstance(self.shape, RigidBody):
+            raise InputError(f"{what}: shape is a RigidBody; expected its shape")
+        check_shape(self.shape, what)
+        checked_flag(self.large, f"{what}: large")
+        known = sorted({*MOTIONS[2], *MOTIONS[3]})
+        free = (self.free,) if isinstance(self.free, str) else self.free
+        if not isinstance(free, Sequence) or not set(free) <= set(known):
+            raise InputError(f"{what}: free={shown(self.free)}; expected some of {known}")
+        object.__setattr__(self, "free", tuple(dict.fromkeys(free)))  # it is frozen
+        if not self.free and (self.force is not None or self.moment is not None):
+            raise InputError(
+                f"{what}: a force or a moment, and no free motion; expected free=, as free=('z',)"
+            )
+        if self.large and self.free:
+            raise InputError(
+                f"{what}: large=True with free motions; expected a body that moves by a law alone"
+            )
+
+    def check_dimension(self, gdim: int, whose: str) -> None:
+        """Raise if shape, point or free motions are not those of a space of this dimension.
+
+        Raises:
+            InputError: It says which.
+        """
+        if isinstance(self.shape, Placed):
+            self.shape.check_dimension(gdim, whose)
+        wrong = [name for name in self.free if name not in MOTIONS[gdim]]
+        if wrong:
+            raise InputError(f"{whose}: free={wrong}; expected some of {MOTIONS[gdim]} in {gdim}D")
+        if self.point is not None and len(self.point) != gdim:
+            raise InputError(f"{whose}: point={self.point}, expected {gdim} components")
+
+    def distance(self, x: Array) -> Array:
+        """Signed distance from where it is, shape ``(n,)``."""
+        return self.shape.distance(self._back(x))
+
+    def gradient(self, x: Array) -> Array:
+        """Gradient of the signed distance, shape ``(3, n)``."""
+        gradient = self.shape.gradient(self._back(x))
+        if self._pose is not None:
+            gdim, gradient = len(self._pose.point), np.array(gradient, dtype=float)
+            gradient[:gdim] = self._pose.rotation @ gradient[:gdim]
+        return gradient
+
+    def _back(self, x: Array) -> Array:
+        """Points of the shape that are at x."""
+        if self._pose is None:
+            return x
+        gdim, origin = len(self._pose.point), np.array(x)
+        origin[:gdim] = self._pose.origin(x[:gdim].T).T
+        return origin
+
+    def placed(self, pose: Pose | None) -> RigidBody:
+        """Return the same body at a place."""
+        return replace(self, _pose=pose)
+
+    def centre(self, gdim: int) -> Array:
+        """Return the point that turns are about, shape ``(gdim,)``."""
+        found = point_of(self.shape) if self.point is None else np.asarray(self.point, dtype=float)
+        return found[:gdim]
+
+    def indices(self, gdim: int) -> Array:
+        """Return the positions of the free motions among all."""
+        return np.array([i for i, m in enumerate(MOTIONS[gdim]) if m in self.free], dtype=np.int64)
+
+    def law_motion(self, gdim: int, time: float) -> Array:
+        """Return the motion by the law, free ones 0, shape ``(k,)``.
+
+        Raises:
+            InputError: A value does not fit, or is of a free motion.
+        """
+        return self._in_order(gdim, time, ("displacement", "rotation"), free=False)
+
+    def load(self, gdim: int, time: float) -> Array:
+        """Return force and moment, shape ``(k,)``.
+
+        Raises:
+            InputError: A value does not fit, or acts on a motion that is not free.
+        """
+        return self._in_order(gdim, time, ("force", "moment"), free=True)
+
+    def _in_order(self, gdim: int, time: float, names: Sequence[str], free: bool) -> Array:
+        """Return values of two laws in the order of ``MOTIONS``."""
+        first, second = (self._value(name, gdim, time) for name in names)
+        values = np.concatenate((first, second[::-1]))
+        allowed = np.isin(np.arange(len(values)), self.indices(gdim)) == free
+        if np.any(wrong := (values != 0.0) & ~allowed):
+            motion = MOTIONS[gdim][int(np.argmax(wrong))]
+            which, state = names[motion not in "xyz"], "not free" if free else "free"
+            raise InputError(
+                f"{self.name}: the {which} has a part along {motion}, which is {state} (free="
+                f"{self.free}); expected displacements of guided motions and forces on free ones"
+            )
+        return values
+
+    def _value(self, name: str, gdim: int, time: float) -> Array:
+        """Return the value of a law at a time."""
+        given: Any = getattr(self, name)
+        turns = name in ("rotation", "moment")
+        size = (1 if gdim == 2 else 3) if turns else gdim
+        if given is None:
+            return np.zeros(size)
+        what = f"{self.name}: {name}"
+        if isinstance(given, fem.Constant):
+            given = given.value
+        elif callable(given):
+            with named(f"{what} at time {time:.6g}"):
+                given = given(time)
+        with named(what, TypeError, ValueError):
+            found = np.atleast_1d(real_numbers(given))
+        if found.shape != (size,) or not np.all(np.isfinite(found)):
+            raise InputError(f"{what} is {shown(given)}; expected {size} finite number(s)")
+        return found

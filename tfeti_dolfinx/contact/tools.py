@@ -1,0 +1,344 @@
+"""The rigid bodies of a problem: where they are, and how rows of contact know them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from mpi4py import MPI
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.parallel import bcast_from_root
+from tfeti_dolfinx.contact.obstacle import Obstacle
+from tfeti_dolfinx.contact.partner import GEOMETRY, ContactPartner
+from tfeti_dolfinx.contact.records import ContactRecords
+from tfeti_dolfinx.contact.rigid_body import MOTIONS, Pose, RigidBody, motion_fields
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.mortar.surfaces import extent, surface_facets
+from tfeti_dolfinx.mortar.tolerances import SEARCH
+
+
+@dataclass(frozen=True)
+class RigidEntries:
+    """Entries that unknowns of rigid bodies have in the v_i of conditions.
+
+    Attributes:
+        condition: Condition of each entry, shape ``(k,)``.
+        unknown: Unknown among those of all rigid bodies, shape ``(k,)``.
+        direction: What v_i changes by, shape ``(k, gdim)``.
+    """
+
+    condition: Array
+    unknown: Array
+    direction: Array
+
+
+@dataclass(frozen=True)
+class ToolChanges:
+    """Changes of laws since they were read before.
+
+    Attributes:
+        motion: Whether gaps change.
+        place: Whether a body has to be placed anew.
+        load: Whether a force or moment changes.
+    """
+
+    motion: bool
+    place: bool
+    load: bool
+
+
+@dataclass(frozen=True)
+class ToolMotion:
+    """Motion of a rigid body.
+
+    Attributes:
+        name: Its name.
+        motion: Displacement and rotation vector of its point in the order of ``MOTIONS``.
+        centre: Where the point was when contact was searched, shape ``(gdim,)``.
+        contacts: The contacts that it is in.
+    """
+
+    name: str
+    motion: Array
+    centre: Array
+    contacts: Array
+
+
+class Tools:
+    """The rigid bodies that the contacts of a problem meet.
+
+    They have one unknown for each free motion, a length: of a turn, its angle times the size of
+    the surface. All of them are on the last rank, behind the unknowns of its nodes.
+
+    Args:
+        contacts: Obstacles and pairs.
+        dofs: Dof maps.
+        decomposition: The torn mesh. The constructor is collective.
+
+    Attributes:
+        bodies: The bodies, with their names.
+        of_contact: Body of each contact, −1 without one.
+        tool, mode: Body of each unknown, and its position in ``MOTIONS``.
+        scale: What a motion of size 1 is as an unknown.
+        poses: Where each body was when contact was last searched.
+        found: Motions of each body on top of that and of its law, of the last solve, shape
+            ``(bodies, k)``; 0 but for free ones.
+        begin: Where each body was when the load step began.
+
+    Raises:
+        InputError: Bodies do not fit the space, or two have the same name.
+    """
+
+    def __init__(
+        self, contacts: Sequence[ContactPartner], dofs: TornDofs, decomposition: Decomposition
+    ) -> None:
+        self._comm = dofs.comm
+        self._gdim = gdim = decomposition.mesh.geometry.dim
+        self.bodies: list[RigidBody] = []
+        self.of_contact = np.full(len(contacts), -1)
+        known: list[RigidBody] = []
+        lengths = list[float]()
+        for i, contact in enumerate(contacts):
+            if not isinstance(contact, Obstacle) or not isinstance(contact.shape, RigidBody):
+                continue
+            tool = contact.shape
+            if dofs.bs != gdim or gdim == 1:
+                raise InputError(f"{contact.name}: a RigidBody needs displacements in 2D or 3D")
+            size = extent(decomposition, surface_facets(decomposition, contact.surface))
+            if tool not in known:
+                known.append(tool)
+                name = tool.name or f"tool of surface {contact.surface!r}"
+                self.bodies.append(replace(tool, name=name))
+                self.bodies[-1].check_dimension(gdim, name)
+                lengths.append(size)
+            self.of_contact[i] = known.index(tool)
+            lengths[known.index(tool)] = max(lengths[known.index(tool)], size)
+        names = [body.name for body in self.bodies]
+        if len(set(names)) < len(names):
+            raise InputError(f"rigid bodies have the names {names}; expected different ones")
+        self._sizes = lengths = bcast_from_root(self._comm, lengths)
+        free = [body.indices(gdim) for body in self.bodies] if self.bodies else []
+        count, k = len(self.bodies), len(MOTIONS.get(gdim, ()))
+        self.tool = np.repeat(np.arange(count), [len(own) for own in free])
+        self.mode = np.concatenate([np.zeros(0, dtype=np.int64), *free])
+        turns = self.mode >= gdim
+        self.scale = np.where(turns, np.array([*lengths, 1.0])[self.tool], 1.0)
+        self.law: Array = np.zeros((count, k))
+        self.found: Array = np.zeros((count, k))
+        self._loads: Array = np.zeros((count, k))
+        self.poses = [Pose(body.centre(gdim), np.zeros(k), body.large) for body in self.bodies]
+        self.begin = list(self.poses)
+
+    def __len__(self) -> int:
+        return len(self.bodies)
+
+    @property
+    def num_unknowns(self) -> int:
+        """Number of free motions of all bodies."""
+        return len(self.tool)
+
+    @property
+    def num_local(self) -> int:
+        """Number of unknowns on this rank: all or none."""
+        return self.num_unknowns if self._comm.rank == self._comm.size - 1 else 0
+
+    @property
+    def free_names(self) -> list[str]:
+        """Names of the bodies with free motions."""
+        return [self.bodies[i].name for i, _ in self.unknowns()]
+
+    def unknowns(self) -> list[tuple[int, Array]]:
+        """Return each body with free motions, and its unknowns."""
+        return [(int(i), np.flatnonzero(self.tool == i)) for i in np.unique(self.tool)]
+
+    @property
+    def loads(self) -> Array:
+        """Force and moment on the unknowns, shape ``(num_unknowns,)``."""
+        return self._loads[self.tool, self.mode] / self.scale
+
+    def read(self, time: float) -> ToolChanges:
+        """Take the values that laws have at a time. Collective.
+
+        Raises:
+            InputError: A value does not fit.
+        """
+        if not self.bodies:
+            return ToolChanges(False, False, False)
+        with raised_on_all_ranks(self._comm):
+            law = np.array([body.law_motion(self._gdim, time) for body in self.bodies])
+            loads = np.array([body.load(self._gdim, time) for body in self.bodies])
+        law, loads = bcast_from_root(self._comm, (law, loads))
+        moved = np.any(law != self.law, axis=1)
+        large = np.array([body.large for body in self.bodies])
+        changed = bool(np.any(loads != self._loads))
+        self.law, self._loads = law, loads
+        return ToolChanges(bool(np.any(moved)), bool(np.any(moved & large)), changed)
+
+    def place(self, finite: bool) -> None:
+        """Place bodies where they are, in finite strain all, else those of large motions."""
+        for i, body in enumerate(self.bodies):
+            if not (finite or body.large):
+                continue
+            pose = replace(self.poses[i], finite=True)
+            motion = self.pose(i).motion if finite else self.law[i]
+            self.poses[i], self.found[i] = replace(pose, motion=motion), 0.0
+            self.begin[i] = replace(self.begin[i], finite=True)
+
+    def placed(self, contacts: Sequence[ContactPartner]) -> list[ContactPartner]:
+        """Return the contacts with their bodies where they are."""
+        found = list(contacts)
+        for i in np.flatnonzero(self.of_contact >= 0):
+            body, contact = int(self.of_contact[i]), found[i]
+            assert isinstance(contact, Obstacle)
+            found[i] = replace(contact, shape=self.bodies[body].placed(self.poses[body]))
+        return found
+
+    def steps(self) -> Array:
+        """Return motions by laws since bodies were placed, shape ``(bodies, k)``."""
+        steps = self.law - np.array([pose.motion for pose in self.poses]).reshape(self.law.shape)
+        steps[self.tool, self.mode] = 0.0
+        return np.asarray(steps)
+
+    def pose(self, body: int) -> Pose:
+        """Return where a body is after the last solve."""
+        return self.poses[body].moved(self.steps()[body] + self.found[body])
+
+    def begin_at(self, motions: Array | None = None) -> None:
+        """Let a load step begin where bodies are, or at motions of shape ``(bodies, k)``."""
+        if motions is None:
+            self.begin = [self.pose(i) for i in range(len(self))]
+        else:
+            self.begin = [
+                replace(pose, motion=motion)
+                for pose, motion in zip(self.begin, motions, strict=True)
+            ]
+
+    def restore(self, motions: Array) -> None:
+        """Return to motions, of shape ``(bodies * k,)``, where a load step begins."""
+        values = motions.reshape(self.law.shape)
+        self.begin_at(values)
+        at = self.tool, self.mode
+        self.found[:] = 0.0
+        placed = np.array([pose.motion for pose in self.poses]).reshape(values.shape)
+        self.found[at] = values[at] - placed[at]
+
+    def go_back(self) -> None:
+        """Return to where the load step began."""
+        if self.bodies:
+            self.restore(np.array([pose.motion for pose in self.begin]))
+
+    def motions(self) -> list[ToolMotion]:
+        """Return where bodies are after the last solve."""
+        return [
+            ToolMotion(
+                body.name,
+                self.pose(i).motion,
+                self.poses[i].centre,
+                np.flatnonzero(self.of_contact == i),
+            )
+            for i, body in enumerate(self.bodies)
+        ]
+
+    def take(self, values: Array) -> None:
+        """Take the unknowns of a solution, those of this rank. Collective.
+
+        Args:
+            values: Shape ``(num_local,)``.
+        """
+        if self.num_unknowns:
+            values = self._comm.bcast(values, root=self._comm.size - 1)
+            self.found[:] = 0.0
+            self.found[self.tool, self.mode] = values / self.scale
+
+    def motion(self, records: ContactRecords, found: bool = False) -> Array:
+        """Return displacements of bodies at conditions, shape ``(n, gdim)``; 0 without a body.
+
+        Args:
+            records: The conditions.
+            found: Whether free motions of the last solve count.
+        """
+        steps = self.steps() + (self.found if found else 0.0)
+        motion = self.motion_there(records)
+        for body, own in self._conditions(records):
+            fields = motion_fields(records.place[own] - self.poses[body].centre)
+            motion[own] += np.einsum("nkg,k->ng", fields, steps[body])
+        return motion
+
+    def motion_there(self, records: ContactRecords) -> Array:
+        """Return what ``motion`` is where bodies were placed."""
+        motion = np.zeros_like(records.place)
+        for body, own in self._conditions(records):
+            motion[own] = self.poses[body].way_to(records.place[own])
+        return motion
+
+    def motion_at_begin(self, records: ContactRecords) -> Array:
+        """Return what ``motion`` was when the load step began, of the points that are there now."""
+        motion = np.zeros_like(records.place)
+        for body, own in self._conditions(records):
+            X = self.poses[body].origin(records.place[own])
+            motion[own] = self.begin[body].displacement(X)
+        return motion
+
+    def entries(self, records: ContactRecords) -> RigidEntries:
+        """Return entries of the unknowns in the v_i of conditions."""
+        none = np.zeros(0, dtype=np.int64)
+        rows, columns, values = [none], [none], [np.zeros((0, records.place.shape[1]))]
+        at = dict(self._conditions(records))
+        for body, unknowns in self.unknowns():
+            own = at[body]
+            fields = motion_fields(records.place[own] - self.poses[body].centre)
+            for j in unknowns:
+                rows.append(own)
+                columns.append(np.full(len(own), j))
+                values.append(-fields[:, self.mode[j]] / self.scale[j])
+        return RigidEntries(np.concatenate(rows), np.concatenate(columns), np.concatenate(values))
+
+    def check_begin(self, contacts: Sequence[ContactPartner], records: ContactRecords) -> None:
+        """Raise if a rigid body begins inside of a surface. Collective.
+
+        Raises:
+            InputError: It names the body, and says how deep.
+        """
+        overlap = np.zeros(max(len(contacts), 1))
+        np.maximum.at(overlap, records.contact, -records.geometric_gap)
+        self._comm.Allreduce(MPI.IN_PLACE, overlap, op=MPI.MAX)
+        for i in np.flatnonzero(self.of_contact >= 0):
+            body = int(self.of_contact[i])
+            if np.any(self.poses[body].motion):  # it is elsewhere already
+                continue
+            if contacts[i].gap == GEOMETRY and overlap[i] > SEARCH.inside * self._sizes[body]:
+                raise InputError(
+                    f"{self.bodies[body].name} is inside of {contacts[i].surfaces[0]!r} at the "
+                    f"begin, {overlap[i]:.4g} deep; expected a rigid body outside, or touching "
+                    "(gap= says what else is meant, as a press fit)"
+                )
+
+    def check_nodes(self, contact: Array) -> None:
+        """Raise if conditions with free motions have nothing but prescribed unknowns. Collective.
+
+        Args:
+            contact: Contact of each such condition on this rank.
+
+        Raises:
+            InputError: It names the body.
+        """
+        wrong = np.zeros(len(self.of_contact))
+        wrong[contact] = 1.0
+        self._comm.Allreduce(MPI.IN_PLACE, wrong, op=MPI.MAX)
+        if np.any(wrong):
+            body = self.bodies[self.of_contact[int(np.argmax(wrong))]]
+            raise InputError(
+                f"{body.name}: a rigid body with free motions meets nodes whose displacement along "
+                "the normal is prescribed; expected a surface without them, or a motion by a law"
+            )
+
+    def _conditions(self, records: ContactRecords) -> list[tuple[int, Array]]:
+        """Return each body with the conditions of this rank that meet it."""
+        if not self.bodies:
+            return []
+        of_condition = self.of_contact[records.contact]
+        return [(i, np.flatnonzero(of_condition == i)) for i in range(len(self))]
