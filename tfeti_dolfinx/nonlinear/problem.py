@@ -160,6 +160,7 @@ class NonlinearContactProblem(ContactProblem):
         if self.options.rtol == "auto":
             raise InputError("rtol auto: it is for linear problems; expected a number")
         self._exact = self.options.number
+        self._system.follows = True
         self._first = self._begin = np.array(u.x.array)
         self._last_increment = self._tolerances.loosest
         self._places = CurrentPlaces(u, self.dofs) if finite else None

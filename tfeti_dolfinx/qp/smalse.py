@@ -167,7 +167,8 @@ def smalse(
     if start is not None:
         start.lam.copy(x)
         x.axpy(-1.0, homogenised.lam_bar)
-        coarse.combine(start.mu, y)
+        if start.mu is not None:
+            coarse.combine(start.mu, y)
     x.array[:] = homogenised.feasible.project(x.array_r)
     if x.norm() > 0.0:
         A.mult(x, g)
