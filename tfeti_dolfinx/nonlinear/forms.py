@@ -71,6 +71,12 @@ class NewtonForms(Forms):
         owned = self._matrix.shape[1]
         return np.asarray(self._matrix @ self._u.x.array[:owned] - self.residual())
 
+    def tangent_times(self, d: Array) -> Array:
+        """Return this rank's J(u) d."""
+        with self._in_place():
+            matrix = super().stiffness()
+        return np.asarray(matrix @ d[: matrix.shape[1]])
+
     def residual(self) -> Array:
         """Return this rank's F(u)."""
         with self._in_place():

@@ -59,6 +59,11 @@ class NewtonTolerances:
         dependent: Eigenvalues of the Gram matrix of its differences below this share of the largest
             are taken for 0.
         slow: A kept model is made anew where an increment is more than this share of the last one.
+        difference: Length of the step, of the displacement, of the difference quotient that a
+            given J is compared with where Newton's method has failed.
+        another: Of J along a step: a difference beyond it is that of another tangent.
+        turned: Angle by which a body is turned to see whether F is one of finite strain.
+        alike: Of the residual of a stretch: residuals nearer to each other are the same.
         other: Anderson's acceleration begins anew where an increment is so many times the last
             one, as with rows of new places.
     """
@@ -80,6 +85,10 @@ class NewtonTolerances:
     anderson: int = 5
     dependent: float = 1e-12
     slow: float = 0.7
+    difference: float = 1e-6
+    another: float = 0.3
+    turned: float = 0.1
+    alike: float = 1e-6
     other: float = 2.0
 
 
@@ -163,6 +172,7 @@ class NonlinearContactProblem(ContactProblem):
             elif J is None:
                 J = ufl.derivative(F, u)
             checked_type(J, ufl.Form, "J", "a bilinear form")
+            check_state(update, state)
         self._tolerances = NewtonTolerances() if tolerances is None else tolerances
         self._update = update
         self._state = InternalVariables({} if state is None else state, decomposition.mesh)
@@ -176,6 +186,9 @@ class NonlinearContactProblem(ContactProblem):
         self._last_increment = self._tolerances.loosest
         self._places = CurrentPlaces(u, self.dofs) if finite else None
         self._diagnostics.finite = self._finite
+        self._has_own_tangent = J is not None and not finite
+        if finite:
+            self._check_rotations()
 
     def _forms(self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any) -> NewtonForms:
         given = (a, L, V, self.decomposition, *options)
@@ -252,9 +265,53 @@ class NonlinearContactProblem(ContactProblem):
             forms.kept = keeping.next(size, t, remainder)
         raise ConvergenceError(
             f"Newton's method: the increment is still {increment:.1e} of the displacement after "
-            f"{tol.max_it} steps; expected {exact:.0e}: smaller load steps, or a tangent J that is "
-            "the derivative of F"
+            f"{tol.max_it} steps; expected {exact:.0e}: {self._advice(d)}"
         )
+
+    def _advice(self, d: Array) -> str:
+        """Say what may help, from the derivative of F along the last step. Collective."""
+        tol, forms, u = self._tolerances, self._newton_forms, np.array(self.u.x.array)
+        h = (
+            tol.difference
+            * largest(self.decomposition.comm, u)
+            / largest(self.decomposition.comm, d)
+        )
+        before = forms.residual()
+        along = forms.tangent_times(d)
+        self._set(u + h * d)
+        apart = (forms.residual() - before) / h - along
+        off, size = np.sqrt(self._total(np.array([apart @ apart, along @ along])))
+        if self._has_own_tangent and off > tol.another * size:
+            return (
+                f"a tangent J that is the derivative of F; along the last step they differ by "
+                f"{off / size:.1e} of J"
+            )
+        return "smaller load steps"
+
+    def _check_rotations(self) -> None:
+        """Raise if F takes a rotation for a stretch, as strains of small strain do. Collective.
+
+        Raises:
+            InputError: It does.
+        """
+        u, forms = np.array(self.u.x.array), self._newton_forms
+        c, s = np.cos(self._tolerances.turned) - 1.0, np.sin(self._tolerances.turned)
+        moved, gdim, found = fem.Function(self.u.function_space), len(self.u), list[Array]()
+        for a, b in ((0.0, 0.0), (c, 0.0), (c, s)):
+            way = np.array([[a, -b, 0.0], [b, a, 0.0], [0.0, 0.0, 0.0]])[:gdim]
+            moved.interpolate(lambda x, A=way: A @ x)
+            self._set(moved.x.array)
+            found.append(forms.residual())
+        self._set(u)
+        rest, stretched, turned = found
+        own = np.array([np.sum((turned - stretched) ** 2), np.sum((stretched - rest) ** 2)])
+        apart, size = np.sqrt(self._total(own))
+        if apart <= self._tolerances.alike * size:
+            raise InputError(
+                "finite=True: the residual F takes a rotation for a stretch, as small strain does; "
+                "expected one of finite strain, for instance the derivative of an energy of "
+                "I + grad(u)"
+            )
 
     def _solve_linearised(self, rtol: float) -> None:
         """Solve the contact problem of the model at u. Collective."""
@@ -419,6 +476,24 @@ class NonlinearContactProblem(ContactProblem):
         if self._solution is None:
             self.u.x.array[:] = self._first
         self._set(self.u.x.array)
+
+
+def check_state(update: Any, state: Any) -> None:
+    """Raise if ``update`` is a method of a material whose internal variables are not in ``state``.
+
+    Raises:
+        InputError: It names the material and its variables.
+    """
+    law = getattr(update, "__self__", None)
+    variables = getattr(law, "state", None)
+    if not isinstance(variables, Mapping):
+        return
+    left = [f.name for f in variables if not any(f is g for g in (state or {}))]
+    if left:
+        raise InputError(
+            f"update is a method of {type(law).__name__}, whose internal variables "
+            f"{', '.join(left)} would never be committed; expected state=, its attribute"
+        )
 
 
 def check_gaps(contacts: Sequence[ContactPartner]) -> None:
