@@ -140,18 +140,19 @@ def test_a_turned_body_has_no_stress(comm):
         assert abs(energy) < 1e-14
 
 
-def plastic(comm, hardening=0.05, n=4, **more):
+def plastic(comm, hardening=0.05, n=4, gdim=2, **more):
     """The block of J2 material, its problem, and the constant that moves its upper side."""
-    decomposition = torn(comm, 2, n, 0.05, 3)
-    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+    decomposition = torn(comm, gdim, n, 0.05, 3)
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (gdim,)))
     u, v, du = fem.Function(V), ufl.TestFunction(V), ufl.TrialFunction(V)
-    elastic = tfeti.Elasticity(decomposition, E=E, nu=NU, model="plane_strain")
+    model = "3d" if gdim == 3 else "plane_strain"
+    elastic = tfeti.Elasticity(decomposition, E=E, nu=NU, model=model)
     law = tfeti.J2Plasticity(elastic, u, yield_stress=0.01, hardening=hardening)
     value, bc = held_top(V, decomposition)
     F, J = law.residual(v), law.tangent(du, v)
     more = {"petsc_options": {"rtol": 1e-8}, **more}
-    given = {"J": J, "state": law.state, "update": law.update}
-    problem = tfeti.NonlinearContactProblem(F, u, [bc], [plane(2)], decomposition, **given, **more)
+    given = {"J": J, "state": law.state, "update": law.update, **more}
+    problem = tfeti.NonlinearContactProblem(F, u, [bc], [plane(gdim)], decomposition, **given)
     return problem, law, value
 
 
@@ -304,6 +305,90 @@ def test_patch_of_two_finite_bodies_is_exact(comm):
     assert comm.allreduce(fem.assemble_scalar(error)) ** 0.5 < 1e-8
 
 
+@pytest.mark.slow
+def test_plasticity_in_space_is_that_of_an_active_set_method(comm):
+    """Loading, unloading and reloading of a block of hexahedra."""
+    path = [-0.05, -0.02, -0.08]
+
+    def make(u, v):
+        law = SimplePlasticity(u, E, NU, 0.01, 0.05, 2)
+        return law.residual(v), law.state
+
+    problem, _, value = plastic(comm, gdim=3, n=2, petsc_options={"rtol": 1e-9})
+    check_steps(problem, value, path, *reference(3, 2, 0.05, make, path))
+
+
+def finite(comm, gdim=2, n=4, bulge=0.2, rtol=1e-9):
+    """The block of neo-Hooke, above a plane, and the constant that moves its upper side."""
+    decomposition = torn(comm, gdim, n, bulge, 4)
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (gdim,)))
+    u = fem.Function(V)
+    value, bc = held_top(V, decomposition)
+    F = ufl.derivative(neo_hooke(u, E, NU) * ufl.dx(**DX), u, ufl.TestFunction(V))
+    options = {"petsc_options": {"rtol": rtol}}
+    contacts = [plane(gdim)]
+    problem = tfeti.NonlinearContactProblem(
+        F, u, [bc], contacts, decomposition, finite=True, **options
+    )
+    return problem, value
+
+
+def test_a_closed_elastic_cycle_ends_where_it_began(comm):
+    """Pressed by a third and taken back to a light touch: u is that of the way there."""
+    problem, value = finite(comm)
+    found = []
+    for down in (-0.1, -0.35, -0.1):
+        value.value[-1] = down
+        problem.solve()
+        problem.accept()
+        found.append(np.array(problem.u.x.array))
+    apart = np.abs(found[0] - found[2]).max(initial=0.0)
+    assert comm.allreduce(apart, op=MPI.MAX) < 1e-8
+
+
+def test_later_linearised_problems_are_cheap(comm):
+    """λ, its rows and the tangent go from one to the next: few tangents, few multiplications."""
+    problem, value = finite(comm, n=8, rtol=1e-6)
+    value.value[-1] = -0.1
+    problem.solve()
+    problem.accept()
+    value.value[-1] = -0.2
+    problem.solve()
+    report = problem.report
+    assert report.assemblies <= 5
+    assert report.assemblies == report.searches < report.newton_steps
+    assert report.F_multiplications <= 7 * report.newton_steps
+
+
+@pytest.mark.parametrize("degree", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_patch_pressed_by_a_quarter_is_exact(degree, comm):
+    """Two blocks that do not match: homogeneous strain by tight tolerances, ν = 0."""
+    decomposition = stacked("triangle", 3, 4, 4)
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", degree, (2,)))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    F = ufl.derivative(neo_hooke(u, E, 0.0) * ufl.dx(**DX), u, v)
+    value = fem.Constant(decomposition.mesh, -0.5)
+    bcs = [
+        fem.dirichletbc(
+            constant, fem.locate_dofs_topological(V.sub(i), 1, decomposition.facets(name)), V.sub(i)
+        )
+        for name, i, constant in (
+            ("upper top", 1, value),
+            ("lower bottom", 1, 0.0),
+            ("lower left", 0, 0.0),
+            ("upper left", 0, 0.0),
+        )
+    ]
+    contacts, options = [tfeti.Contact("lower top", "upper bottom")], {"rtol": 1e-10}
+    problem = tfeti.NonlinearContactProblem(
+        F, u, bcs, contacts, decomposition, finite=True, petsc_options=options
+    )
+    problem.solve()
+    exact = ufl.as_vector((0, -0.25 * (1 + ufl.SpatialCoordinate(V.mesh)[1])))
+    error = fem.form(ufl.inner(u - exact, u - exact) * ufl.dx)
+    assert comm.allreduce(fem.assemble_scalar(error)) ** 0.5 < 1e-9
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [
@@ -344,6 +429,38 @@ def test_what_a_nonlinear_problem_does_not_take_is_named(comm):
     pressed = tfeti.Obstacle("low", tfeti.Plane((0.0, 0.0), normal=(0.0, 1.0)), gap=-0.01)
     with pytest.raises(tfeti.InputError, match="a given gap with finite=True"):
         tfeti.NonlinearContactProblem(F, u, [], [pressed], decomposition, finite=True)
+
+
+def test_a_residual_of_small_strain_is_not_finite(comm):
+    decomposition = torn(comm, 2, 2, 0.05, 2)
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    F = tfeti.Elasticity(decomposition, E=E, nu=NU, model="plane_strain").a(u, v)
+    _, bc = held_top(V, decomposition)
+    with pytest.raises(tfeti.InputError, match="takes a rotation for a stretch"):
+        tfeti.NonlinearContactProblem(F, u, [bc], [plane(2)], decomposition, finite=True)
+
+
+def test_a_tangent_of_another_problem_is_named(comm):
+    decomposition = torn(comm, 2, 2, 0.05, 2)
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+    u, v, du = fem.Function(V), ufl.TestFunction(V), ufl.TrialFunction(V)
+    stiff, soft = (
+        tfeti.Elasticity(decomposition, E=e, nu=NU, model="plane_strain") for e in (E, 0.01 * E)
+    )
+    value, bc = held_top(V, decomposition)
+    F, tolerances = stiff.a(u, v), tfeti.NewtonTolerances(max_it=4)
+    problem = tfeti.NonlinearContactProblem(
+        F, u, [bc], [plane(2)], decomposition, J=soft.a(du, v), tolerances=tolerances
+    )
+    value.value[-1] = -0.1
+    with pytest.raises(tfeti.ConvergenceError, match="J that is the derivative of F; along"):
+        problem.solve()
+
+
+def test_internal_variables_that_are_not_given_are_named(comm):
+    with pytest.raises(tfeti.InputError, match="J2Plasticity, whose internal variables plastic_s"):
+        plastic(comm, state={})
 
 
 def test_a_law_that_gives_no_number_is_named(comm):

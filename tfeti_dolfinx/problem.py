@@ -53,8 +53,8 @@ log = logging.getLogger(__name__)
 
 MAX_ROUNDS = 20  # of solves with more and more contact rows
 
-# rows, their λ, and the multipliers of Gλ = e
-Start = tuple[Gluing, Array, Array]
+# rows, their λ, and the multipliers of Gλ = e with the number of the K⁺ that they are of
+Start = tuple[Gluing, Array, Array, int]
 
 
 class ContactProblem:
@@ -281,7 +281,8 @@ class ContactProblem:
             start = None
             if self._start is not None:
                 dual.learn()
-                earlier, lam, mu = self._start
+                earlier, lam, mu, inverses = self._start
+                mu = mu if inverses == system.inverses else np.zeros(0)
                 start = gluing.multipliers(earlier, lam), mu
                 start = None if dual.is_far(*start) else start
             goal = None
@@ -298,7 +299,8 @@ class ContactProblem:
             u = accuracy.u[:nodal]
             solution = self._solution = self._make_solution(u, multipliers, gluing)
             self.u.x.array[:] = self.dofs.to_dolfinx(solution.u)
-        self._start = (gluing, solution.lam, result.mu) if result.reason > 0 else None
+        end = gluing, solution.lam, result.mu, system.inverses
+        self._start = end if result.reason > 0 else None
         # 3. what the report says of it
         self._counts = self._counts.plus(SolverCounts.of_run(dual, *solved))
         excluding = system.search.named(gluing.contacts_of(result.excluding))
@@ -521,7 +523,7 @@ class ContactProblem:
             dual.recycled.take(state.directions)
         dual.last.take(self.dofs.comm, state.lam, state.image)
         solution = self._make_solution(state.u, state.multipliers(), gluing)
-        self._accepted = (solution, (gluing, state.lam, state.mu))
+        self._accepted = (solution, (gluing, state.lam, state.mu, system.inverses))
         self._return()
         self._count_slips_from(solution)
 

@@ -189,6 +189,9 @@ class System:
         tools: The rigid bodies.
         time: That of the rigid bodies' laws.
         origin: Displacement in primal order at which the mesh is, in finite strain; else None.
+        inverses: How often K⁺ was made; multipliers μ of Gλ = e belong to one of them.
+        follows: Whether each stiffness is near the one before, as in Newton's method: what is known
+            of ‖F‖ stays.
     """
 
     def __init__(
@@ -215,6 +218,7 @@ class System:
         self._stale, self._made = set(STAGES), Counter[str]()
         self._counters, self._counted = Counters(), 0
         self._seen = 0.0  # of ‖F‖, which more rows hardly change
+        self.inverses, self.follows = 0, False
         self._K: Any = None
         self._search: ContactSearch | None = None
         self._known_rows: tuple[Sequence[float], Sequence[Array]] | None = None
@@ -438,6 +442,7 @@ class System:
             self.tools if self.tools.num_unknowns else None,
         )
         self._K = None
+        self.inverses += 1
         self._take_trace()
 
     def _take_trace(self) -> None:
@@ -475,7 +480,9 @@ class System:
     def _destroy_subdomains(self) -> None:
         if self._subdomains is not None:
             self._subdomains.destroy()
-        self._subdomains, self._seen = None, 0.0
+        self._subdomains = None
+        if not self.follows:
+            self._seen = 0.0
 
 
 # in the order in which they are made, with the name that their seconds have in the report

@@ -71,6 +71,12 @@ class NewtonForms(Forms):
         owned = self._matrix.shape[1]
         return np.asarray(self._matrix @ self._u.x.array[:owned] - self.residual())
 
+    def tangent_times(self, d: Array) -> Array:
+        """Return this rank's J(u) d."""
+        with self._in_place():
+            matrix = super().stiffness()
+        return np.asarray(matrix @ d[: matrix.shape[1]])
+
     def residual(self) -> Array:
         """Return this rank's F(u)."""
         with self._in_place():
@@ -101,6 +107,7 @@ class CurrentPlaces:
     def __init__(self, u: fem.Function, dofs: TornDofs) -> None:
         V = u.function_space
         self._u, self._dofs, self._mesh = u, dofs, V.mesh
+        self._here, self._moving = np.array(u.x.array), fem.Function(V)
         self._points, self._nodes = V.mesh.geometry.x.copy(), V.tabulate_dof_coordinates()
         element = V.mesh.ufl_domain().ufl_coordinate_element()
         self._at_points = fem.Function(fem.functionspace(V.mesh, element))
@@ -111,14 +118,19 @@ class CurrentPlaces:
         self._det = fem.Expression(det, points)
         self._cells = np.arange(len(cells), dtype=np.int32)
 
+    def look(self) -> None:
+        """Take the places of u as it is now."""
+        self._here = np.array(self._u.x.array)
+
     def move(self) -> None:
-        """Put mesh and nodes to X + u, u as it is now."""
+        """Put mesh and nodes to X + u, u as ``look`` has last found it."""
         gdim = self._mesh.geometry.dim
-        self._at_points.interpolate(self._u)
+        self._moving.x.array[:] = self._here
+        self._at_points.interpolate(self._moving)
         moved = self._at_points.x.array.reshape(-1, gdim)
         self._mesh.geometry.x[self._to, :gdim] = self._points[self._to, :gdim] + moved[self._from]
         nodes = self._nodes.copy()
-        nodes[:, :gdim] += self._u.x.array.reshape(-1, gdim)
+        nodes[:, :gdim] += self._here.reshape(-1, gdim)
         self._dofs.nodes = nodes
 
     def back(self) -> None:

@@ -49,17 +49,28 @@ class NewtonTolerances:
         keeping: In small strain a tangent is kept, with its factors, where the last remainder was
             at most this: its directions of conjugate gradients then serve the next problems, too.
         settled: And where the increment was at most this share of the load step's first one.
+        frozen: In finite strain tangent and places are kept until the increment is at most this
+            share of the first one that they gave.
+        most_frozen: For so many linearised problems at most.
+        turning: Where the first increment with new places is more than this share of that with the
+            last ones, contact changes more by where bodies are than by their stresses: from then on
+            places are new for each linearised problem.
         anderson: Iterates that Anderson's acceleration combines.
         dependent: Eigenvalues of the Gram matrix of its differences below this share of the largest
             are taken for 0.
         slow: A kept model is made anew where an increment is more than this share of the last one.
+        difference: Length of the step, of the displacement, of the difference quotient that a
+            given J is compared with where Newton's method has failed.
+        another: Of J along a step: a difference beyond it is that of another tangent.
+        turned: Angle by which a body is turned to see whether F is one of finite strain.
+        alike: Of the residual of a stretch: residuals nearer to each other are the same.
         other: Anderson's acceleration begins anew where an increment is so many times the last
             one, as with rows of new places.
     """
 
     max_it: int = 50
     safety: float = 10.0
-    forcing: float = 0.1
+    forcing: float = 0.3
     loosest: float = 1e-2
     final: float = 0.2
     curvature: float = 0.5
@@ -68,9 +79,16 @@ class NewtonTolerances:
     shortest: float = 0.01
     keeping: float = 0.5
     settled: float = 0.05
+    frozen: float = 0.1
+    most_frozen: int = 4
+    turning: float = 0.03
     anderson: int = 5
     dependent: float = 1e-12
     slow: float = 0.7
+    difference: float = 1e-6
+    another: float = 0.3
+    turned: float = 0.1
+    alike: float = 1e-6
     other: float = 2.0
 
 
@@ -85,14 +103,15 @@ class NonlinearContactProblem(ContactProblem):
     Newton's method, u the iterate, û the solution of the linearised problem, d = û − u:
 
     1. *Model.* Assemble J(u); in small strain keep it, with its factors, where the last step was
-       short and in line with it. Solve the contact problem for û, to the forcing term of Eisenstat
-       and Walker.
+       short and in line with it; in finite strain, with the rows of the same places, until the
+       increments are small beside the first one, unless places matter more. Solve the contact
+       problem for û, to the forcing term of Eisenstat and Walker.
     2. *Line search.* r(t) = F(u + t d; d) + λᵀB d is the slope along d of the potential with the
        contact forces of û, and r(0) = −dᵀJ d < 0. Where r(1) is much larger than 0, the step has
        gone beyond the minimum, and t is a root of r. The modulus of r(1)/r(0) is the remainder.
-    3. *End* where ‖d‖ is at most rtol ‖u‖ in the maximum norm, in finite strain with rows of where
-       the bodies are; in small strain where the remainder times ‖d‖ is, which the next one is
-       expected to be.
+    3. *End* where ‖d‖ is at most rtol ‖u‖ in the maximum norm, in finite strain with a new model
+       of where the bodies are; in small strain where the remainder times ‖d‖ is, which the next one
+       is expected to be.
     4. *Step.* u ← u + t d; in finite strain, where J is not the derivative of F, and where J is
        kept, accelerated by Anderson's method.
 
@@ -153,6 +172,7 @@ class NonlinearContactProblem(ContactProblem):
             elif J is None:
                 J = ufl.derivative(F, u)
             checked_type(J, ufl.Form, "J", "a bilinear form")
+            check_state(update, state)
         self._tolerances = NewtonTolerances() if tolerances is None else tolerances
         self._update = update
         self._state = InternalVariables({} if state is None else state, decomposition.mesh)
@@ -160,10 +180,15 @@ class NonlinearContactProblem(ContactProblem):
         if self.options.rtol == "auto":
             raise InputError("rtol auto: it is for linear problems; expected a number")
         self._exact = self.options.number
+        self._system.follows = True
         self._first = self._begin = np.array(u.x.array)
+        self._keeping = ModelKeeping(self._tolerances, finite)
         self._last_increment = self._tolerances.loosest
         self._places = CurrentPlaces(u, self.dofs) if finite else None
         self._diagnostics.finite = self._finite
+        self._has_own_tangent = J is not None and not finite
+        if finite:
+            self._check_rotations()
 
     def _forms(self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any) -> NewtonForms:
         given = (a, L, V, self.decomposition, *options)
@@ -205,7 +230,8 @@ class NonlinearContactProblem(ContactProblem):
         tol, exact, comm = self._tolerances, self._exact, self.decomposition.comm
         forms, expected = self._newton_forms, self._last_increment
         faster = Anderson(tol, comm)
-        first = before = 0.0  # sizes of d: the load step's first one, and the last one
+        keeping = self._keeping
+        keeping.begin()
         for step in range(tol.max_it):
             u = np.array(self.u.x.array)
             # 1. model
@@ -220,7 +246,7 @@ class NonlinearContactProblem(ContactProblem):
             t, remainder = self._line_search(u, d)
             expected = min(remainder, 1.0) * increment
             # 3. end
-            short = increment <= exact
+            short = increment <= exact and not (self._finite and forms.kept)
             if not self._finite:  # whose slopes do not see rotations
                 short |= t == 1.0 and tol.safety * expected <= exact
             if short and rtol <= exact:
@@ -228,23 +254,64 @@ class NonlinearContactProblem(ContactProblem):
                 return
             # 4. step
             if step == 0:  # what conditions prescribe is met from then on
-                first, self._last_increment = size, min(increment, tol.loosest)
-            slow = forms.kept and size > tol.slow * before
-            if slow or size > tol.other * before:
+                self._last_increment = min(increment, tol.loosest)
+            if keeping.is_slow(size) or size > tol.other * keeping.before:
                 faster.forget()
             exact_model = step == 0 or not (self._finite or forms.kept)
             self._set(u + t * d if exact_model else faster.next(u, d, t))
             if self._smallest_volume() <= 0.0:
                 faster.forget()
                 self._set(u + t * d)
-            in_line = t == 1.0 and remainder <= tol.keeping and size <= tol.settled * first
-            forms.kept = in_line and not slow and not self._finite
-            before = size
+            forms.kept = keeping.next(size, t, remainder)
         raise ConvergenceError(
             f"Newton's method: the increment is still {increment:.1e} of the displacement after "
-            f"{tol.max_it} steps; expected {exact:.0e}: smaller load steps, or a tangent J that is "
-            "the derivative of F"
+            f"{tol.max_it} steps; expected {exact:.0e}: {self._advice(d)}"
         )
+
+    def _advice(self, d: Array) -> str:
+        """Say what may help, from the derivative of F along the last step. Collective."""
+        tol, forms, u = self._tolerances, self._newton_forms, np.array(self.u.x.array)
+        h = (
+            tol.difference
+            * largest(self.decomposition.comm, u)
+            / largest(self.decomposition.comm, d)
+        )
+        before = forms.residual()
+        along = forms.tangent_times(d)
+        self._set(u + h * d)
+        apart = (forms.residual() - before) / h - along
+        off, size = np.sqrt(self._total(np.array([apart @ apart, along @ along])))
+        if self._has_own_tangent and off > tol.another * size:
+            return (
+                f"a tangent J that is the derivative of F; along the last step they differ by "
+                f"{off / size:.1e} of J"
+            )
+        return "smaller load steps"
+
+    def _check_rotations(self) -> None:
+        """Raise if F takes a rotation for a stretch, as strains of small strain do. Collective.
+
+        Raises:
+            InputError: It does.
+        """
+        u, forms = np.array(self.u.x.array), self._newton_forms
+        c, s = np.cos(self._tolerances.turned) - 1.0, np.sin(self._tolerances.turned)
+        moved, gdim, found = fem.Function(self.u.function_space), len(self.u), list[Array]()
+        for a, b in ((0.0, 0.0), (c, 0.0), (c, s)):
+            way = np.array([[a, -b, 0.0], [b, a, 0.0], [0.0, 0.0, 0.0]])[:gdim]
+            moved.interpolate(lambda x, A=way: A @ x)
+            self._set(moved.x.array)
+            found.append(forms.residual())
+        self._set(u)
+        rest, stretched, turned = found
+        own = np.array([np.sum((turned - stretched) ** 2), np.sum((stretched - rest) ** 2)])
+        apart, size = np.sqrt(self._total(own))
+        if apart <= self._tolerances.alike * size:
+            raise InputError(
+                "finite=True: the residual F takes a rotation for a stretch, as small strain does; "
+                "expected one of finite strain, for instance the derivative of an energy of "
+                "I + grad(u)"
+            )
 
     def _solve_linearised(self, rtol: float) -> None:
         """Solve the contact problem of the model at u. Collective."""
@@ -260,8 +327,10 @@ class NonlinearContactProblem(ContactProblem):
 
     def _go_to_places(self, places: CurrentPlaces) -> None:
         """Let contact and rigid motions be those of X + u. Collective."""
+        if not self._newton_forms.kept:
+            places.look()
+            self._system.origin = self.dofs.to_primal(self.u.x.array)
         places.move()
-        self._system.origin = self.dofs.to_primal(self.u.x.array)
         self._system.begin_at(self.dofs.to_primal(self._begin))
 
     def _set(self, u: Array) -> None:
@@ -410,6 +479,24 @@ class NonlinearContactProblem(ContactProblem):
         self._set(self.u.x.array)
 
 
+def check_state(update: Any, state: Any) -> None:
+    """Raise if ``update`` is a method of a material whose internal variables are not in ``state``.
+
+    Raises:
+        InputError: It names the material and its variables.
+    """
+    law = getattr(update, "__self__", None)
+    variables = getattr(law, "state", None)
+    if not isinstance(variables, Mapping):
+        return
+    left = [f.name for f in variables if not any(f is g for g in (state or {}))]
+    if left:
+        raise InputError(
+            f"update is a method of {type(law).__name__}, whose internal variables "
+            f"{', '.join(left)} would never be committed; expected state=, its attribute"
+        )
+
+
 def check_gaps(contacts: Sequence[ContactPartner]) -> None:
     """Raise if a contact in finite strain has a given gap, which no place would change.
 
@@ -421,6 +508,50 @@ def check_gaps(contacts: Sequence[ContactPartner]) -> None:
             raise InputError(
                 f'{contact.name}: a given gap with finite=True; expected gap="geometry" or "curved"'
             )
+
+
+class ModelKeeping:
+    """Decides whether the next linearised problem has the model of the last one.
+
+    That is J with its factors, and in finite strain the rows of the same places, too.
+
+    Args:
+        tolerances: Those of Newton's method.
+        finite: Whether strains are finite.
+
+    Attributes:
+        kept: Whether the present model is that of the linearised problem before.
+        before: Size of the last increment.
+    """
+
+    def __init__(self, tolerances: NewtonTolerances, finite: bool) -> None:
+        self._tolerances, self._finite, self._freezes = tolerances, finite, True
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin a load step with a new model."""
+        self.kept, self.before, self._first, self._of_model, self._uses = False, 0.0, 0.0, 0.0, 0
+
+    def is_slow(self, size: float) -> bool:
+        """Return whether an increment of a kept model is hardly less than the last one."""
+        return self.kept and size > self._tolerances.slow * self.before
+
+    def next(self, size: float, t: float, remainder: float) -> bool:
+        """Return whether to keep the model after an increment, its length t and remainder."""
+        tol, slow = self._tolerances, self.is_slow(size)
+        self._first = self._first or size
+        if not self.kept:
+            turns = self._of_model > 0.0 and size > tol.turning * self._of_model
+            self._freezes = self._freezes and not turns
+            self._of_model, self._uses = size, 0
+        self._uses += 1
+        if self._finite:
+            wanted = self._uses == 1 or size > tol.frozen * self._of_model
+            good = self._freezes and wanted and self._uses <= tol.most_frozen
+        else:
+            good = remainder <= tol.keeping and size <= tol.settled * self._first
+        self.kept, self.before = good and t == 1.0 and not slow, size
+        return self.kept
 
 
 class Totals:

@@ -25,8 +25,8 @@ from tfeti_dolfinx.qp.problem import (
     StoppingRule,
     no_monitor,
 )
-from tfeti_dolfinx.qp.projection import UNBALANCED, project_onto_feasible
-from tfeti_dolfinx.qp.sets import Face, Status
+from tfeti_dolfinx.qp.projection import UNBALANCED, WithinFace, project_onto_feasible
+from tfeti_dolfinx.qp.sets import Face, Status, face_of
 
 # --- Step 0: start ----------------------------------------------------------------------------
 
@@ -58,13 +58,32 @@ def first_point(qp: QP) -> PETSc.Vec:
 def feasible_start(qp: QP, start: Start) -> PETSc.Vec:
     """Step 0: the nearest feasible point to earlier multipliers, or the first. Collective.
 
-    From forces far beyond small discs the projection's way to Gλ = e may have too many kinks.
+    What was open stays open, if the others can restore Gλ = e: else each would carry a little.
+    From forces far beyond small discs, as the bounds of another load step are, the way to Gλ = e
+    has so many kinks that the projection may end before.
     """
-    found = project_onto_feasible(qp.coarse, qp.feasible, start.lam)
-    if found.missing <= UNBALANCED:
-        return found.lam
-    found.lam.destroy()
+    on = qp.feasible.project(start.lam.array_r)
+    for within in (WithinFace(qp.feasible, qp.feasible.face(on, -on)), qp.feasible):
+        found = project_onto_feasible(qp.coarse, within, start.lam)
+        if found.missing <= UNBALANCED:
+            return found.lam
+        found.lam.destroy()
     return first_point(qp)
+
+
+def multipliers_at(qp: QP, z: DualIterate) -> Array:
+    """Return the μ of least squares at λ: that of the rows that hold what they multiply there.
+
+    Open rows and those on the boundary of a disc, which slip, do not. Collective.
+    """
+    face = qp.feasible.face(z.lam, -z.lam)
+    holds = (face.status == Status.FREE) | (face.holding & (z.lam != 0.0))
+    coarse, g = qp.coarse.on_face(face_of(holds, face.status)), qp.d.duplicate()
+    g.array[:] = z.g
+    mu = coarse.coordinates(g)
+    coarse.destroy()
+    g.destroy()
+    return mu
 
 
 def _has_friction(qp: QP, face: Face) -> bool:
@@ -308,6 +327,8 @@ def newton(
     # Step 0: a feasible start
     z = DualIterate(np.array(homogenised.lam_bar.array_r), np.array(homogenised.gradient.array_r))
     mu = np.zeros(qp.coarse.dimension) if start is None else start.mu
+    if mu is None:
+        mu = multipliers_at(qp, z)
     state = NewtonState(z, mu, z.g, z.lam)
     method = _Newton(program, solver, parameters, state)
     monitor(steps, "start", homogenised.lam_bar, homogenised.b.norm(), 0.0)

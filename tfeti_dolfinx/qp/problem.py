@@ -192,11 +192,11 @@ class Start:
 
     Attributes:
         lam: Multipliers λ.
-        mu: Multipliers of Gλ = e.
+        mu: Multipliers of Gλ = e; None: those of another K⁺, which say nothing.
     """
 
     lam: PETSc.Vec
-    mu: Array
+    mu: Array | None
 
 
 # --- Points and products as numpy arrays ------------------------------------------------------

@@ -145,7 +145,7 @@ def smalse(
     test = InnerTest(qp, homogenised, rule, parameters)
     # λ = P_Ω(λ̄), or that of a start; x = λ − λ̄; g = Ax − b + y
     lam, x, g, y, Qx = (b.duplicate() for _ in range(5))
-    if start is not None:
+    if start is not None and start.mu is not None:
         coarse.combine(start.mu, y)
     begin = homogenised.lam_bar if start is None else start.lam
     lam.array[:] = qp.feasible.project(begin.array_r)

@@ -23,7 +23,15 @@ from tfeti_dolfinx.qp.friction_newton import (
     follow_friction,
     newton_on_law,
 )
-from tfeti_dolfinx.qp.problem import ConvergedReason, LocalProgram, Monitor, QPResult, Steps
+from tfeti_dolfinx.qp.newton import multipliers_at
+from tfeti_dolfinx.qp.problem import (
+    ConvergedReason,
+    DualIterate,
+    LocalProgram,
+    Monitor,
+    QPResult,
+    Steps,
+)
 from tfeti_dolfinx.solve.solver import solve_dual
 
 
@@ -373,7 +381,9 @@ class NewtonOnLaw:
         work.array[:] = start[0]
         image, points = dual.last.image(qp.F, work), list[LawPoint]()
         image.Fx.axpy(-1.0, qp.d)
-        for mu in (start[1], qp.coarse.coordinates(image.Fx)):
+        z = DualIterate(np.array(start[0]), np.array(image.Fx.array_r))
+        known = start[1] if len(start[1]) == qp.coarse.dimension else multipliers_at(qp, z)
+        for mu in (known, qp.coarse.coordinates(image.Fx)):
             qp.coarse.combine(mu, work)
             points.append(LawPoint(np.array(start[0]), image.Fx.array_r - work.array_r, mu))
         residual, first = min(((program.residual(p), p) for p in points), key=lambda one: one[0])

@@ -158,14 +158,13 @@ def solve_dual(
 
 
 def _start(values: tuple[Array, Array] | None, qp: QP) -> Start | None:
-    """Return the solver's start, none from 0; μ is 0 if the given one is of another kernel."""
+    """Return the solver's start, none from 0; μ is None if the given one is of another kernel."""
     comm = qp.d.getComm().tompi4py()
     if values is None or not any_rank(comm, bool(np.any(values[0]))):
         return None
     lam, mu = qp.d.duplicate(), values[1]
     lam.array[:] = values[0]
-    fits = len(mu) == qp.coarse.dimension
-    return Start(lam, np.array(mu) if fits else np.zeros(qp.coarse.dimension))
+    return Start(lam, np.array(mu) if len(mu) == qp.coarse.dimension else None)
 
 
 def _homogenise(dual: Dual, qp: QP, solver: Solver, start: Start | None) -> Homogenised:
@@ -197,7 +196,8 @@ def _no_worse_than_nothing(qp: QP, at: OperatorProduct, start: Start) -> None:
     if not any_rank(comm, not may) and bcast_from_root(comm, worse):
         at.x.set(0.0)
         at.Fx.set(0.0)
-        start.mu[:] = 0.0
+        if start.mu is not None:
+            start.mu[:] = 0.0
 
 
 def _monitor(dual: Dual, options: Options) -> Monitor:
