@@ -5,8 +5,10 @@ python3 -m sphinx -W --keep-going -b html -c docs . OUT
 With ``-t online`` types of other packages link to their pages, whose lists are fetched.
 """
 
+import re
 import sys
 from pathlib import Path
+from typing import Any
 
 from sphinx.application import Sphinx
 
@@ -84,6 +86,15 @@ def write_root_page(app: Sphinx, error: Exception | None) -> None:
         )
 
 
+def shorten_aliases(*event: Any) -> tuple[str | None, str | None]:
+    """Return a signature with the names of type aliases alone."""
+    signature, returned = (
+        text and re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text) for text in event[-2:]
+    )
+    return signature, returned
+
+
 def setup(app: Sphinx) -> None:
-    """Connect what is done after a build."""
+    """Connect what is done to signatures, and after a build."""
+    app.connect("autodoc-process-signature", shorten_aliases)
     app.connect("build-finished", write_root_page)

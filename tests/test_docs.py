@@ -237,7 +237,8 @@ def test_every_page_and_every_public_name_is_in_the_documents():
         page = waiting.pop()
         seen.add(page)
         for entry in "\n".join(blocks(page, "{toctree}")).splitlines():
-            path = (page.parent / f"{entry}.md").resolve()
+            target = re.sub(r"^.* <(.*)>$", r"\1", entry)
+            path = (page.parent / f"{target}.md").resolve()
             if entry and not entry.startswith(":"):
                 assert path.exists(), f"{page.name}: {entry}"
                 waiting.append(path)
