@@ -14,7 +14,16 @@ import pytest
 import tfeti_dolfinx as tfeti
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+FOR_DEVELOPERS = ("developers/", "theory", "notation", "validation", "api")
+
+
+def for_users(path):
+    """Whether a page is read by users; API and theory are counted apart."""
+    return not str(path.relative_to(ROOT)).removeprefix("docs/").startswith(FOR_DEVELOPERS)
+
+
+USER_PAGES = [path for path in DOCUMENTS if for_users(path)]
 
 
 def blocks(path, language):
@@ -86,6 +95,55 @@ def test_programs_of_documents(half_cylinder, document, ranks, tmp_path):
     assert result.returncode == 0, result.stderr
     assert "unknowns" in result.stdout
     assert "CONVERGED_RTOL" in result.stdout
+
+
+def with_programs():
+    """User pages with a program that starts a solve, but for those that need processes."""
+    for path in USER_PAGES:
+        name = str(path.relative_to(ROOT))
+        if name not in PROGRAMS and blocks(path, "python"):
+            yield name
+
+
+def run_program(text, name):
+    exec(compile(text, name, "exec"), {"__name__": "__main__"})
+
+
+@pytest.fixture
+def own_folder(serial_only, tmp_path, monkeypatch):
+    """A folder for what programs write, and no arguments for them."""
+    (tmp_path / "results").mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["program.py"])
+
+
+@pytest.mark.parametrize("document", with_programs())
+def test_programs_of_user_pages(own_folder, document):
+    run_program("\n".join(blocks(ROOT / document, "python")), document)
+
+
+CONVERTED = ROOT / "docs/howto/linear_problem.md"
+
+
+@pytest.mark.parametrize("program", range(2), ids=["2D", "3D"])
+def test_a_linear_problem_becomes_contact_in_nine_lines(own_folder, program):
+    lines = blocks(CONVERTED, "diff")[program].splitlines()
+    assert sum(line[0] in "+-" and len(line) > 1 for line in lines) <= 9
+    before, after = ("\n".join(line[1:] for line in lines if line[0] != other) for other in "+-")
+    compile(before, "before", "exec")
+    run_program(after + "\nassert problem.solution.contact().force.sum() > 0.0", "after")
+
+
+def words(path):
+    """Of a page, but for tables that a benchmark or the code makes, and programs."""
+    text = re.sub(r"^```.*?^```", "", path.read_text(), flags=re.DOTALL | re.MULTILINE)
+    return len(re.sub(r"<!-- .*?<!-- end -->", "", text, flags=re.DOTALL).split())
+
+
+def test_user_pages_are_short():
+    assert sum(words(path) for path in USER_PAGES) <= 15000
+    for path in (ROOT / "docs/howto").glob("*.md"):
+        assert words(path) <= 400, path.name
 
 
 def test_links_lead_somewhere():
@@ -173,10 +231,18 @@ def test_the_report_s_fields_are_documented():
 
 
 def test_every_page_and_every_public_name_is_in_the_documents():
-    index, api = ((ROOT / f"docs/{page}.md").read_text() for page in ("index", "api"))
-    pages = {p.stem for p in (ROOT / "docs").glob("*.md")} - {"index"}
-    pages |= {f"developers/{p.stem}" for p in (ROOT / "docs/developers").glob("*.md")}
-    pages |= {"../README", "../CONTRIBUTING", "../CHANGELOG", "../environment/README"}
-    assert pages <= set(index.splitlines())
+    docs = ROOT / "docs"
+    api, seen, waiting = (docs / "api.md").read_text(), set(), [docs / "index.md"]
+    while waiting:  # what tables of contents reach
+        page = waiting.pop()
+        seen.add(page)
+        for entry in "\n".join(blocks(page, "{toctree}")).splitlines():
+            target = re.sub(r"^.* <(.*)>$", r"\1", entry)
+            path = (page.parent / f"{target}.md").resolve()
+            if entry and not entry.startswith(":"):
+                assert path.exists(), f"{page.name}: {entry}"
+                waiting.append(path)
+    others = ("CONTRIBUTING.md", "CHANGELOG.md", "environment/README.md")
+    assert {*DOCUMENTS, *(ROOT / name for name in others)} <= seen
     described = set(re.findall(r"^\.\. auto\w+:: (?:\w+\.)*(\w+)$", api, re.MULTILINE))
     assert set(tfeti.__all__) - {"__version__"} <= described
