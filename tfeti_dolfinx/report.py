@@ -344,6 +344,7 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
                 f"{self.primal_dofs} unknowns, {bodies}, {self.subdomains} subdomains, {ranks}",
             ),
             *(("contact", str(contact)) for contact in self.contacts[:PRINTED]),
+            *(("tool", text) for text in self.tools),
             (
                 "accuracy",
                 ", ".join(self._measured(name) for name in SHOWN if name in self.residuals),
@@ -358,7 +359,7 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
             *(("warning", text) for text in self.warnings),
         ]
         if (rest := len(self.contacts) - PRINTED) > 0:
-            rows.insert(1 + PRINTED, ("", f"and {rest} contacts more, see details()"))
+            rows.insert(1 + PRINTED, ("contacts", f"and {rest} contacts more, see details()"))
         head = f"tfeti_dolfinx: {self.converged_reason}" + (
             f", solve {solves}" if solves > 1 else ""
         )
