@@ -1,5 +1,7 @@
 """Tearing: subdomains, bodies, tags, tears; the same on any number of ranks."""
 
+from typing import NamedTuple
+
 import numpy as np
 import pytest
 import ufl
@@ -141,3 +143,58 @@ def test_bisection_cuts_between_layers():
     ).astype(int)
     found = {(int(k), int(s)) for k, s in zip(layer, d.cell_subdomain, strict=True)}
     assert len(set().union(*d.comm.allgather(found))) == 10
+
+
+def test_markers_name_surfaces_and_volumes(comm):
+    mesh = dmesh.create_unit_square(comm, 8, 8)
+    top = dmesh.locate_entities_boundary(mesh, 1, lambda x: np.isclose(x[1], 1))
+    tags = dmesh.meshtags(mesh, 1, np.sort(top), np.full_like(top, 7))
+    names = {"top": 7, "bottom": lambda x: np.isclose(x[1], 0)}
+    left = {"left half": lambda x: x[0] <= 0.5}
+    d = tfeti.decompose(mesh, 4, facet_tags=tags, surfaces=names, volumes=left)
+    assert (d.surface("top"), d.surface("bottom"), d.volume("left half")) == (7, 8, 1)
+    for name, at in (("top", 1.0), ("bottom", 0.0)):
+        facets = d.facets(name)
+        assert comm.allreduce(len(facets)) == 8
+        assert np.allclose(dmesh.compute_midpoints(d.mesh, 1, facets)[:, 1], at)
+    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+    dx = ufl.Measure("dx", domain=d.mesh, subdomain_data=d.cell_tags)
+    one = fem.Constant(d.mesh, 1.0)
+    parts = [one * ds(8), one * dx(1)]
+    found = [comm.allreduce(fem.assemble_scalar(fem.form(part))) for part in parts]
+    assert np.allclose(found, (1.0, 0.5))
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        ({"top": lambda x: x[1] > 2}, r"surfaces\['top'\]: the marker finds no facet"),
+        ({"top": lambda x: x[7] > 2}, r"surfaces\['top'\]: IndexError"),
+        (
+            {"top": lambda x: x[1] > 0.99, "right": lambda x: (x[0] > 0.99) | (x[1] > 0.99)},
+            r"surfaces\['right'\]: the marker finds some that are 'top'",
+        ),
+    ],
+)
+def test_markers_that_do_not_fit_are_named(names, message, comm):
+    with pytest.raises(tfeti.InputError, match=message):
+        tfeti.decompose(dmesh.create_unit_square(comm, 4, 4), 2, surfaces=names)
+
+
+class Data(NamedTuple):
+    """As of ``dolfinx.io.gmsh`` from DOLFINx 0.10 on."""
+
+    mesh: dmesh.Mesh
+    cell_tags: dmesh.MeshTags | None
+    facet_tags: dmesh.MeshTags | None
+    physical_groups: dict
+
+
+def test_data_of_gmsh_bring_their_names(comm):
+    mesh = dmesh.create_unit_square(comm, 4, 4)
+    top = dmesh.locate_entities_boundary(mesh, 1, lambda x: np.isclose(x[1], 1))
+    tags = dmesh.meshtags(mesh, 1, np.sort(top), np.full_like(top, 3))
+    data = Data(mesh, None, tags, {"lid": (1, 3), "corner": (0, 3)})
+    d = tfeti.decompose(data, 2)
+    assert d.surface("lid") == 3
+    assert comm.allreduce(len(d.facets("lid"))) == 4

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any, Protocol
 
 import numpy as np
 from dolfinx import mesh as dmesh
+from mpi4py import MPI
 
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import geometry_dofmap, original_cells
 from tfeti_dolfinx.common.logging import stage
-from tfeti_dolfinx.common.validation import checked_type, is_whole
+from tfeti_dolfinx.common.parallel import any_rank
+from tfeti_dolfinx.common.validation import checked_type, is_whole, named
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition, check_tags, checked_names
 from tfeti_dolfinx.mesh.partition import (
@@ -26,26 +30,42 @@ from tfeti_dolfinx.mesh.untorn import NO_TAG, PhysicalNames, UntornMesh, cell_fa
 CELL_TYPES = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
 
 
+# from coordinates, shape ``(3, n)``, to flags, as ``dolfinx.mesh.locate_entities`` takes it
+Marker = Callable[[Array], Array]
+
+
+class GmshData(Protocol):
+    """What DOLFINx 0.10's ``dolfinx.io.gmsh`` returns: a mesh with its tags and their names."""
+
+    mesh: dmesh.Mesh
+    cell_tags: dmesh.MeshTags | None
+    facet_tags: dmesh.MeshTags | None
+    physical_groups: Mapping[str, tuple[int, int]]
+
+
 def decompose(
-    mesh: dmesh.Mesh,
+    mesh: dmesh.Mesh | GmshData,
     subdomains: Subdomains | None = None,
     cell_tags: dmesh.MeshTags | None = None,
     facet_tags: dmesh.MeshTags | None = None,
     *,
-    surfaces: dict[str, int] | None = None,
-    volumes: dict[str, int] | None = None,
+    surfaces: Mapping[str, int | Marker] | None = None,
+    volumes: Mapping[str, int | Marker] | None = None,
 ) -> Decomposition:
     """Tear a DOLFINx mesh into subdomains. Collective.
 
     Args:
-        mesh: The mesh, distributed in any way.
+        mesh: The mesh, distributed in any way; or the ``MeshData`` of ``dolfinx.io.gmsh``, whose
+            tags and physical names are taken where none are given.
         subdomains: Number of subdomains (recursive coordinate bisection); or one id for each
             cell owned by this rank; or a callable that gets cell midpoints, shape ``(3, n)``,
             and returns one id per cell. Default: about 4000 unknowns per subdomain.
         cell_tags: Material tags.
         facet_tags: Surface tags.
-        surfaces: Names of surface tags; a tag that has none is named by its number.
-        volumes: Names of cell tags.
+        surfaces: Names of surface tags; a tag that has none is named by its number. In the place
+            of a tag a marker: it gets points, shape ``(3, n)``, and returns flags; the facets of
+            the boundary all of whose vertices it flags become the surface.
+        volumes: Names of cell tags, or markers of cells.
 
     Returns:
         The torn mesh. Which subdomain a cell belongs to does not depend on the number of ranks.
@@ -59,16 +79,25 @@ def decompose(
         >>> decomposition = tfeti.decompose(square, 4)
         >>> decomposition.num_subdomains, decomposition.num_bodies
         (4, 1)
+        >>> named = tfeti.decompose(square, 4, surfaces={"top": lambda x: np.isclose(x[1], 1)})
+        >>> named.surface("top")
+        1
         >>> halves = tfeti.decompose(square, lambda x: x[0] > 0.5)
         >>> halves.num_subdomains
         2
     """
-    _check_mesh(mesh)
+    if not isinstance(mesh, dmesh.Mesh) and hasattr(mesh, "physical_groups"):
+        mesh, cell_tags, facet_tags, surfaces, volumes = _of_gmsh(
+            mesh, cell_tags, facet_tags, surfaces, volumes
+        )
+    mesh = _checked_mesh(mesh)
     tagged = ((cell_tags, True, "cell_tags"), (facet_tags, False, "facet_tags"))
     with agreeing(mesh.comm, "decompose") as given:
         for tags, of_cells, what in tagged:
             if tags is not None:
                 check_tags(tags, mesh, of_cells, what, f"expected the {what} of the mesh given")
+        surfaces, facet_tags = _located(mesh, surfaces, facet_tags, "surfaces")
+        volumes, cell_tags = _located(mesh, volumes, cell_tags, "volumes")
         surfaces = checked_names(surfaces, "surfaces", facet_tags, "facet_tags")
         volumes = checked_names(volumes, "volumes", cell_tags, "cell_tags")
         number = subdomains if subdomains is None or is_whole(subdomains) else "for each cell"
@@ -82,6 +111,68 @@ def decompose(
         ours = isinstance(subdomains, (int, np.integer))
         decomposition = tear(untorn, subdomain, mesh.comm, absorb=ours)
     return replace(decomposition, seconds=seconds, untorn=mesh)
+
+
+def _of_gmsh(
+    data: GmshData,
+    cell_tags: dmesh.MeshTags | None,
+    facet_tags: dmesh.MeshTags | None,
+    surfaces: Mapping[str, int | Marker] | None,
+    volumes: Mapping[str, int | Marker] | None,
+) -> tuple[Any, ...]:
+    """Return mesh, tags and names: those given, else those of gmsh."""
+    dim = data.mesh.topology.dim
+
+    def names(of: int) -> dict[str, int] | None:
+        found = {name: tag for name, (d, tag) in data.physical_groups.items() if d == of and name}
+        return found or None
+
+    cell_tags = data.cell_tags if cell_tags is None else cell_tags
+    facet_tags = data.facet_tags if facet_tags is None else facet_tags
+    surfaces = names(dim - 1) if surfaces is None else surfaces
+    volumes = names(dim) if volumes is None else volumes
+    return data.mesh, cell_tags, facet_tags, surfaces, volumes
+
+
+def _located(
+    mesh: dmesh.Mesh, names: Any, tags: dmesh.MeshTags | None, what: str
+) -> tuple[Any, dmesh.MeshTags | None]:
+    """Give what markers locate tags of their own, above those that are there. Collective.
+
+    Raises:
+        InputError: A marker fails, finds nothing, or finds what has another tag.
+    """
+    markers = {k: v for k, v in names.items() if callable(v)} if isinstance(names, Mapping) else {}
+    if not markers:
+        return names, tags
+    facets, dim = what == "surfaces", mesh.topology.dim - (what == "surfaces")
+    mesh.topology.create_entities(dim)
+    mesh.topology.create_connectivity(dim, mesh.topology.dim)
+    sizes = mesh.topology.index_map(dim)
+    values = np.full(sizes.size_local + sizes.num_ghosts, NO_TAG, dtype=np.int32)
+    if tags is not None:
+        values[tags.indices] = tags.values
+    names, taken = dict(names), [tag for tag in names.values() if is_whole(tag)]
+    own = max([0, *taken, *([] if tags is None else tags.values.tolist())])
+    tag = int(mesh.comm.allreduce(own, op=MPI.MAX))
+    locate = dmesh.locate_entities_boundary if facets else dmesh.locate_entities
+    for name, marker in markers.items():
+        with raised_on_all_ranks(mesh.comm), named(f"{what}[{name!r}]"):
+            found = locate(mesh, dim, marker)
+        if not any_rank(mesh.comm, len(found) > 0):
+            where = "facet of the boundary" if facets else "cell"
+            raise InputError(f"{what}[{name!r}]: the marker finds no {where}")
+        others = values[found][values[found] != NO_TAG]
+        if any_rank(mesh.comm, len(others) > 0):
+            other = int(mesh.comm.allreduce(int(others.max(initial=NO_TAG)), op=MPI.MAX))
+            known = next((k for k, t in names.items() if not callable(t) and t == other), other)
+            raise InputError(
+                f"{what}[{name!r}]: the marker finds some that are {known!r}; expected each once"
+            )
+        tag += 1
+        values[found], names[name] = tag, tag
+    indices = np.flatnonzero(values != NO_TAG).astype(np.int32)
+    return names, dmesh.meshtags(mesh, dim, indices, values[indices])
 
 
 def _untorn(
@@ -114,7 +205,7 @@ def _untorn(
     )
 
 
-def _check_mesh(mesh: dmesh.Mesh) -> None:
+def _checked_mesh(mesh: Any) -> dmesh.Mesh:
     checked_type(mesh, dmesh.Mesh, "mesh", "a dolfinx.mesh.Mesh")
     topology, gdim = mesh.topology, mesh.geometry.dim
     if topology.cell_type.name not in CELL_TYPES or topology.dim != gdim:
@@ -130,6 +221,7 @@ def _check_mesh(mesh: dmesh.Mesh) -> None:
             raise InputError(f"mesh with coordinates of type {x.dtype}; expected float64")
         if not np.all(np.isfinite(x)):
             raise InputError(f"mesh with {np.sum(~np.isfinite(x))} coordinates that are not finite")
+    return mesh
 
 
 def _values(tags: dmesh.MeshTags | None, entities: Array) -> Array:
