@@ -76,9 +76,10 @@ FeasibleLaw = Callable[[Constraints], FeasibleSet]
 
 def contact_set(constraints: Constraints) -> FeasibleSet:
     """λ_N ≥ 0, and λ_T of each condition with friction in its disc or ellipse: no adhesion."""
-    sets = constraints.sets
-    tangents = sets.tangents.ravel(), Ellipses(constraints.limits)
-    return Product([(sets.normals, Bounds()), tangents])
+    sets, normals = constraints.sets, (constraints.sets.normals, Bounds())
+    if sets.tangents.size == 0:
+        return Product([normals])
+    return Product([normals, (sets.tangents.ravel(), Ellipses(constraints.limits))])
 
 
 class Dual:
