@@ -84,6 +84,8 @@ def draw(data: Mapping[str, Any], target: str) -> None:
         cmap="viridis",
         clim=None if np.isnan(data["highest"]) else [0.0, float(data["highest"])],
         lighting=not flat,
+        ambient=0.55,  # colours are read, also where no light falls
+        edge_opacity=0.3,
         show_scalar_bar=False,
     )
     plotter.add_text(f"displacement x {factor:.3g}", font_size=10)
@@ -98,7 +100,7 @@ def draw(data: Mapping[str, Any], target: str) -> None:
             plotter.camera.position = (x, y, plotter.camera.position[2])
     plotter.camera.zoom(float(data["zoom"]))
     plotter.subplot(0, 1)
-    plotter.add_scalar_bar(title=name, mapper=actor.mapper, **SCALAR_BAR)
+    plotter.add_scalar_bar(title=f"{name}\n", mapper=actor.mapper, **SCALAR_BAR)
     plotter.screenshot(target)
 
 
