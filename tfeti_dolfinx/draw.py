@@ -84,11 +84,12 @@ def draw(data: Mapping[str, Any], target: str) -> None:
         cmap="viridis",
         clim=None if np.isnan(data["highest"]) else [0.0, float(data["highest"])],
         lighting=not flat,
-        ambient=0.55,  # colours are read, also where no light falls
+        ambient=1.0 if flat else 0.55,  # colours are read, also where no light falls
+        diffuse=0.0 if flat else 0.45,
+        specular=0.0,
         edge_opacity=0.3,
         show_scalar_bar=False,
     )
-    plotter.add_text(f"displacement x {factor:.3g}", font_size=10)
     if flat:
         plotter.view_xy()
     if np.all(np.isfinite(data["view"])):
@@ -101,6 +102,7 @@ def draw(data: Mapping[str, Any], target: str) -> None:
     plotter.camera.zoom(float(data["zoom"]))
     plotter.subplot(0, 1)
     plotter.add_scalar_bar(title=f"{name}\n", mapper=actor.mapper, **SCALAR_BAR)
+    plotter.add_text(f"displacement\n× {factor:.3g}", position="lower_left", font_size=14)
     plotter.screenshot(target)
 
 
