@@ -29,7 +29,7 @@ def ball(**options):
 
 
 def multiplications(scene, cold=False, **options):
-    """Median over the steps with contact."""
+    """Mean over the steps with contact."""
     problem, size, steps = scene(**options)
     problem.take_step(size)
     counts = []
@@ -42,7 +42,7 @@ def multiplications(scene, cold=False, **options):
             counts.append(problem.report.F_multiplications)
     problem.destroy()
     assert len(counts) >= 10
-    return np.median(counts)
+    return np.mean(counts)
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def multiplications(scene, cold=False, **options):
     [(bar, 1.0, 3.0), (ball, 8.5, 14.0)],
 )
 def test_a_step_takes_two_thirds_of_one_that_begins_with_nothing(scene, most, most_cold):
-    """0 of 2 multiplications, with friction 7 of 12.5."""
+    """0 of 2 multiplications, with friction 8 of 13."""
     warm, cold = multiplications(scene), multiplications(scene, cold=True, recycle=0)
     assert warm <= 2 / 3 * cold
     assert warm <= most
