@@ -35,7 +35,7 @@ Marker = Callable[[Array], Array]
 
 
 class GmshData(Protocol):
-    """What DOLFINx 0.10's ``dolfinx.io.gmsh`` returns: a mesh with its tags and their names."""
+    """Mesh with its tags and their names, as DOLFINx 0.10's ``dolfinx.io.gmsh`` returns it."""
 
     mesh: dmesh.Mesh
     cell_tags: dmesh.MeshTags | None
