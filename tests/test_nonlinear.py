@@ -463,6 +463,11 @@ def test_internal_variables_that_are_not_given_are_named(comm):
         plastic(comm, state={})
 
 
+def test_a_law_that_is_never_updated_is_named(comm):
+    with pytest.raises(tfeti.InputError, match="state is that of a J2Plasticity, .* expected upd"):
+        plastic(comm, update=None)
+
+
 def test_a_law_that_gives_no_number_is_named(comm):
     decomposition = torn(comm, 2, 2, 0.05, 2)
     V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))

@@ -13,6 +13,7 @@ from tfeti_dolfinx.common.compat import interpolation_points
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.nonlinear.hyperelasticity import displacement_gradient
 from tfeti_dolfinx.nonlinear.materials import IsotropicHardening, Plasticity, check_return
+from tfeti_dolfinx.nonlinear.state import LawVariables
 
 # entries of the deformation gradient that a model has, and of a symmetric tensor
 ENTRIES = {
@@ -67,10 +68,8 @@ class FiniteJ2Plasticity(Plasticity):
         self._mu_of_x = fem.Expression(elasticity.mu, points)
         self._G_of_u = fem.Expression(self._gradient(u), points)
         self._new = (np.array(self.inverse_plastic.x.array), np.array(self.p.x.array))
-        self.state = {
-            self.inverse_plastic: lambda: self._new[0],
-            self.p: lambda: self._new[1],
-        }
+        values = {self.inverse_plastic: lambda: self._new[0], self.p: lambda: self._new[1]}
+        self.state = LawVariables(self, values)
         self.update()
 
     def update(self) -> None:

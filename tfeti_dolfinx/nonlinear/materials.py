@@ -22,6 +22,7 @@ from tfeti_dolfinx.common.validation import (
 )
 from tfeti_dolfinx.errors import ConvergenceError, InputError, raised_on_all_ranks
 from tfeti_dolfinx.forms.elasticity import Elasticity
+from tfeti_dolfinx.nonlinear.state import LawVariables
 
 
 @dataclass(frozen=True)
@@ -262,7 +263,8 @@ class J2Plasticity(Plasticity):
         self._G_of_x = fem.Expression(elasticity.mu, points)
         self._n = self._normal(u)
         new = self._tensor(self.plastic_strain) + self._dp * self._n
-        self.state = {self.plastic_strain: _components(new, self._gdim), self.p: self.p + self._dp}
+        values = {self.plastic_strain: _components(new, self._gdim), self.p: self.p + self._dp}
+        self.state = LawVariables(self, values)
 
     def update(self) -> None:
         """Return stresses to the yield surface where ``u`` is now. Collective."""

@@ -19,7 +19,7 @@ from tfeti_dolfinx.contact.partner import ContactPartner, Gap, checked_contacts
 from tfeti_dolfinx.errors import ConvergenceError, InputError, TfetiError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.nonlinear.forms import CurrentPlaces, NewtonForms
-from tfeti_dolfinx.nonlinear.state import InternalVariables, NewValue
+from tfeti_dolfinx.nonlinear.state import InternalVariables, LawVariables, NewValue
 from tfeti_dolfinx.nonlinear.tangent import rotation_free_tangent
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.report import COUNTERS, Report, added
@@ -480,11 +480,17 @@ class NonlinearContactProblem(ContactProblem):
 
 
 def check_state(update: Any, state: Any) -> None:
-    """Raise if ``update`` is a method of a material whose internal variables are not in ``state``.
+    """Raise if of a material either ``update`` or ``state`` is given, and not the other.
 
     Raises:
         InputError: It names the material and its variables.
     """
+    if update is None and isinstance(state, LawVariables):
+        name = type(state.law).__name__
+        raise InputError(
+            f"state is that of a {name}, whose stresses would never be returned to the yield "
+            "surface; expected update=, its method"
+        )
     law = getattr(update, "__self__", None)
     variables = getattr(law, "state", None)
     if not isinstance(variables, Mapping):

@@ -18,6 +18,18 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 NewValue = Any  # a UFL expression, or a callable that returns an array of the function's size
 
 
+class LawVariables(dict[fem.Function, NewValue]):
+    """Internal variables of a law that has to be updated: what ``state`` takes.
+
+    Attributes:
+        law: The law, whose method ``update`` the problem needs.
+    """
+
+    def __init__(self, law: Any, values: Mapping[fem.Function, NewValue]) -> None:
+        super().__init__(values)
+        self.law = law
+
+
 class InternalVariables:
     """Internal variables with what gives their values at the end of a step. Collective.
 
