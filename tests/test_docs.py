@@ -117,7 +117,7 @@ def own_folder(serial_only, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["program.py"])
 
 
-@pytest.mark.parametrize("document", with_programs())
+@pytest.mark.parametrize("document", list(with_programs()))
 def test_programs_of_user_pages(own_folder, document):
     run_program("\n".join(blocks(ROOT / document, "python")), document)
 
