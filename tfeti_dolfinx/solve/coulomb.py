@@ -41,7 +41,8 @@ class CoulombParameters:
 
     Attributes:
         newton: Those of Newton's method on the law.
-        finer: Factor on its residual: its target at most.
+        tries: How often that may end and its bounds not be at rest.
+        finer: Factor on its target each time, and at least on its residual.
         path_target: Of the first residual: what points on the path of growing friction are solved
             to.
         first: Relative tolerance of the first problem with given bounds.
@@ -62,6 +63,7 @@ class CoulombParameters:
     """
 
     newton: FrictionParameters = DEFAULT
+    tries: int = 4
     finer: float = 0.03
     path_target: float = 1e-3
     first: float = 1e-2
@@ -129,7 +131,7 @@ def solve_with_friction(
     tolerance = min(options.friction_rtol, parameters.beside_rtol * least)
     bounds = FrictionBounds(dual, start, parameters)
     newton = NewtonOnLaw(dual, options, least, parameters)
-    rtol, change, near = parameters.first, np.inf, False
+    rtol, change, aim, near = parameters.first, np.inf, np.inf, False
     steps, looks, iterations = Steps(), 0, 0
     law = newton.solve(start, bounds)
     holds = law is not None or bounds.hold()
@@ -155,11 +157,12 @@ def solve_with_friction(
         # Step 2: its forces of normals, beside those that the bounds are of
         change = bounds.change(result.lam)
         near = change <= parameters.near * tolerance
+        aim = rule.tolerance if asked <= least else np.inf  # of a coarser look nothing follows
         # Step 3: where they are at rest, what they leave of the law
         if change <= tolerance and asked <= least:
             if goal is not None or bounds.fit(result, rule):
                 break
-            if not newton.wanted and (bounds.idle > 1 or iterations >= options.friction_max_it):
+            if newton.tries == 0 and (bounds.idle > 1 or iterations >= options.friction_max_it):
                 result.reason = ConvergedReason.CONVERGED_FRICTION_RTOL
                 break
         # Step 4: the next bounds: of Newton's method on the law, or those forces
@@ -168,7 +171,7 @@ def solve_with_friction(
         start = law or (np.array(result.lam.array_r), result.mu)
         bounds.advance()
         # so near problems would follow the rounding of a method that has not come there itself
-        law = None if near and newton.steps == 0 else newton.solve(start, bounds)
+        law = None if near and newton.steps == 0 else newton.solve(start, bounds, aim)
         holds = law is not None or bounds.hold()
         if not holds or bounds.idle > parameters.patience or iterations >= options.friction_max_it:
             result.reason = ConvergedReason.DIVERGED_FRICTION
@@ -346,24 +349,26 @@ class NewtonOnLaw:
         self, dual: Dual, options: Options, rtol: float, parameters: CoulombParameters
     ) -> None:
         self._dual, self._rtol, self._parameters = dual, rtol, parameters
-        self.wanted, self.steps = options.friction_type == "newton", 0
+        self.tries = parameters.tries if options.friction_type == "newton" else 0
+        self.steps, self._share = 0, 1.0
         self._recycled, self._rests = dual.recycled, dual.last.is_of(dual.d, dual.coarse.e)
 
     def give_up(self, bounds: FrictionBounds) -> None:
-        """Restore bounds and directions from before."""
-        self._dual.recycled = self._recycled
+        """Give up, and restore bounds and directions from before the failed try."""
+        self.tries, self._dual.recycled = 0, self._recycled
         bounds.take_back()
 
     def solve(
-        self, start: tuple[Array, Array] | None, bounds: FrictionBounds
+        self, start: tuple[Array, Array] | None, bounds: FrictionBounds, aim: float = np.inf
     ) -> tuple[Array, Array] | None:
-        """Find λ, on this rank's rows, and multipliers of Gλ = e for which the law holds, once.
+        """Find λ, on this rank's rows, and multipliers of Gλ = e for which the law holds.
 
-        ``bounds`` become those of λ. None where it fails, or is not tried: without a start, or a
-        solve that has seen F.
+        ``bounds`` become those of λ; ``aim`` is what residual an answer must have to be right, as
+        far as a look has told. None where it fails, or is not tried: without a start, or a solve
+        that has seen F.
         """
         dual, parameters, norm = self._dual, self._parameters, self._dual.seen
-        if start is None or not self.wanted or norm == 0.0 or bounds.stick:
+        if start is None or self.tries == 0 or norm == 0.0 or bounds.stick:
             return None
         if self._rests:  # the same load again: the last bounds are right
             self._rests = False
@@ -392,7 +397,7 @@ class NewtonOnLaw:
         qp.coarse.project(Pd)
         size = norm_over(dual.coarse.comm, Pd.array_r)
         Pd.destroy()
-        target = min(self._rtol * size, parameters.finer * residual)
+        target = min(self._share * self._rtol * size, parameters.finer * residual, aim)
         # Step 3: Newton's method, or the path of growing friction where bodies are held
         end, steps = None, 0
         if target > parameters.rounding * norm * norm_over(dual.coarse.comm, start[0]):
@@ -401,7 +406,8 @@ class NewtonOnLaw:
                 loose = parameters.path_target * residual
                 end, more = follow_friction(program, first, target, loose, parameters.newton)
                 steps += more
-        self.steps, self.wanted = steps, False
+        self.steps, self._share = self.steps + steps, parameters.finer * self._share
+        self.tries -= 1
         local.destroy()
         if end is not None:
             # F of the end stands for that of the nearest point of its set, where the problem begins
@@ -410,7 +416,7 @@ class NewtonOnLaw:
             dual.last.pass_on(end.lam, Fx, parameters.newton.unseen * target / norm)
         image.destroy()
         if end is None:
-            dual.recycled = self._recycled
+            self.tries, dual.recycled = 0, self._recycled
             return None
         bounds.take(end.lam)
         return end.lam, end.mu
