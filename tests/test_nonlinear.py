@@ -269,13 +269,13 @@ def test_a_step_that_did_not_converge_is_not_accepted(comm):
         problem.accept()
 
 
-def test_patch_of_two_finite_bodies_is_exact(comm):
-    """Two blocks that do not match, pressed by a twentieth: homogeneous strain, ν = 0."""
+def two_blocks(degree, pressed):
+    """Two blocks of neo-Hooke that do not match, ν = 0, and what moves the upper one."""
     decomposition = stacked("triangle", 3, 4, 4)
-    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", degree, (2,)))
     u, v = fem.Function(V), ufl.TestFunction(V)
     F = ufl.derivative(neo_hooke(u, E, 0.0) * ufl.dx(**DX), u, v)
-    value = fem.Constant(decomposition.mesh, 0.0)
+    value = fem.Constant(decomposition.mesh, pressed)
     bcs = [
         fem.dirichletbc(
             constant, fem.locate_dofs_topological(V.sub(i), 1, decomposition.facets(name)), V.sub(i)
@@ -287,6 +287,12 @@ def test_patch_of_two_finite_bodies_is_exact(comm):
             ("upper left", 0, 0.0),
         )
     ]
+    return decomposition, u, F, value, bcs
+
+
+def test_patch_of_two_finite_bodies_is_exact(comm):
+    """Two blocks that do not match, pressed by a twentieth: homogeneous strain, ν = 0."""
+    decomposition, u, F, value, bcs = two_blocks(1, 0.0)
     problem = tfeti.NonlinearContactProblem(
         F,
         u,
@@ -300,7 +306,7 @@ def test_patch_of_two_finite_bodies_is_exact(comm):
         value.value = move
         problem.solve()
         problem.accept()
-    exact = ufl.as_vector((0, 0.5 * move * (1 + ufl.SpatialCoordinate(V.mesh)[1])))
+    exact = ufl.as_vector((0, 0.5 * move * (1 + ufl.SpatialCoordinate(decomposition.mesh)[1])))
     error = fem.form(ufl.inner(u - exact, u - exact) * ufl.dx)
     assert comm.allreduce(fem.assemble_scalar(error)) ** 0.5 < 1e-8
 
@@ -363,28 +369,13 @@ def test_later_linearised_problems_are_cheap(comm):
 @pytest.mark.parametrize("degree", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_patch_pressed_by_a_quarter_is_exact(degree, comm):
     """Two blocks that do not match: homogeneous strain by tight tolerances, ν = 0."""
-    decomposition = stacked("triangle", 3, 4, 4)
-    V = fem.functionspace(decomposition.mesh, ("Lagrange", degree, (2,)))
-    u, v = fem.Function(V), ufl.TestFunction(V)
-    F = ufl.derivative(neo_hooke(u, E, 0.0) * ufl.dx(**DX), u, v)
-    value = fem.Constant(decomposition.mesh, -0.5)
-    bcs = [
-        fem.dirichletbc(
-            constant, fem.locate_dofs_topological(V.sub(i), 1, decomposition.facets(name)), V.sub(i)
-        )
-        for name, i, constant in (
-            ("upper top", 1, value),
-            ("lower bottom", 1, 0.0),
-            ("lower left", 0, 0.0),
-            ("upper left", 0, 0.0),
-        )
-    ]
+    decomposition, u, F, _, bcs = two_blocks(degree, -0.5)
     contacts, options = [tfeti.Contact("lower top", "upper bottom")], {"rtol": 1e-10}
     problem = tfeti.NonlinearContactProblem(
         F, u, bcs, contacts, decomposition, finite=True, petsc_options=options
     )
     problem.solve()
-    exact = ufl.as_vector((0, -0.25 * (1 + ufl.SpatialCoordinate(V.mesh)[1])))
+    exact = ufl.as_vector((0, -0.25 * (1 + ufl.SpatialCoordinate(decomposition.mesh)[1])))
     error = fem.form(ufl.inner(u - exact, u - exact) * ufl.dx)
     assert comm.allreduce(fem.assemble_scalar(error)) ** 0.5 < 1e-9
 
