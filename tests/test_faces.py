@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from bodies import held, pressed, stacked, two_body_problem
 from scenes import decomposed, problem
-from scipy.sparse import coo_array, csr_array
 from test_qp import matrix, random_program, vector
 from test_solvable_lp import dual_of
 
@@ -52,14 +51,16 @@ def sliding(dual):
     """A face of pairs of contact rows, one direction for two rows, as slip has it."""
     m = dual.constraints.num_rows
     bounded = np.arange(m)[dual.constraints.sets.normals]
-    first, rest = np.setdiff1d(np.arange(m), bounded), len(bounded) // 2
-    angle = np.arange(rest) + 0.3
-    rows = np.concatenate((first, bounded[0 : 2 * rest : 2], bounded[1 : 2 * rest : 2]))
-    around = len(first) + np.arange(rest)
-    columns = np.concatenate((np.arange(len(first)), around, around))
-    values = np.concatenate((np.ones(len(first)), np.cos(angle), np.sin(angle)))
-    Z = coo_array((values, (rows, columns)), shape=(m, len(first) + rest))
-    return Face(csr_array(Z), np.zeros(Z.shape[1]), np.full(m, Status.SLIP))
+    free, rest = np.ones(m, dtype=bool), len(bounded) // 2
+    free[bounded] = False
+    return around(free, bounded[: 2 * rest], np.arange(rest) + 0.3, Status.SLIP)
+
+
+def around(free, rows, angle, status):
+    """A face with one direction for each two of the rows, at an angle."""
+    tangents = np.stack((np.cos(angle), np.sin(angle)), axis=1)
+    statuses = np.full(len(free), status)
+    return Face(free, statuses, rows.reshape(-1, 2), tangents, np.zeros(len(angle)))
 
 
 FACES = {
@@ -131,12 +132,7 @@ def test_the_particular_solution_of_a_face(dual, kind):
 
 def pairs_and_rows():
     """The first 20 rows, one direction in each of 5 pairs, and no rows of the last 10."""
-    angle = np.arange(5.0)
-    rows = np.concatenate((np.arange(20), np.arange(20, 30, 2), np.arange(21, 30, 2)))
-    columns = np.concatenate((np.arange(20), 20 + np.arange(5), 20 + np.arange(5)))
-    values = np.concatenate((np.ones(20), np.cos(angle), np.sin(angle)))
-    Z = csr_array(coo_array((values, (rows, columns)), shape=(40, 25)))
-    return Face(Z, np.zeros(25), np.zeros(40))
+    return around(np.arange(40) < 20, np.arange(20, 30), np.arange(5.0), Status.FREE)
 
 
 @pytest.mark.parametrize(("preconditioned", "with_coarse"), [(False, True), (True, False)])

@@ -10,7 +10,7 @@ from test_discs import discs
 
 from tfeti_dolfinx import InputError
 from tfeti_dolfinx.errors import ConformanceError
-from tfeti_dolfinx.qp.sets import Bounds, Ellipses, Product, Status, face_of
+from tfeti_dolfinx.qp.sets import Bounds, Ellipses, Face, Product, Status, face_of
 from tfeti_dolfinx.testing import check_feasible_set
 
 pytestmark = pytest.mark.usefixtures("serial_only")
@@ -106,7 +106,9 @@ class Missing(Bounds):
 class Scaled(Bounds):
     def face(self, x, g):
         face = super().face(x, g)
-        return replace(face, Z=2.0 * face.Z)
+        rows = np.flatnonzero(face.free)[:, None]
+        twice, flat = np.full(rows.shape, 2.0), np.zeros(len(rows))
+        return Face(np.zeros_like(face.free), face.status, rows, twice, flat)
 
 
 class WithoutStatus(Bounds):

@@ -15,7 +15,7 @@ from test_solvable_lp import dual_of
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.feti.preconditioner import PARAMETERS, chebyshev, smoothed
-from tfeti_dolfinx.qp.sets import Face, Status, face_of
+from tfeti_dolfinx.qp.sets import Face, Status
 from tfeti_dolfinx.subdomains.stiffness import stretch_over_shear
 
 
@@ -43,9 +43,10 @@ def face_with_springs(dual, kappa):
     sets, rows = dual.constraints.sets, dual.constraints.num_rows
     free, status = np.ones(rows, dtype=bool), np.full(rows, Status.FREE)
     free[sets.normals[::2]] = False
-    flat = face_of(free, status)
-    tangential = np.isin(np.flatnonzero(free), sets.tangents.ravel())
-    return Face(flat.Z, np.where(tangential, kappa, 0.0), status)
+    rows = sets.tangents.ravel()
+    free[rows] = False
+    ones = np.ones((len(rows), 1))
+    return Face(free, status, rows[:, None], ones, np.full(len(rows), kappa))
 
 
 def dense(operator, like):
@@ -95,7 +96,7 @@ def test_the_preconditioner_is_what_its_formula_says(dual, kappa, serial_only):
     B = c.B.convert("dense").getDenseArray().copy()
     Z, D = face.Z.toarray(), c.weights
     size = (B**2) @ (dual.subdomains.diagonal / D**2)
-    bends = face.curvature > 0.0
+    bends = face.bends > 0.0
     B_f, sigma = Z.T @ B, Z.T @ size
     root = np.sqrt(D)
     top = 1.01 * np.linalg.eigvalsh(K / np.outer(root, root))[-1]

@@ -99,11 +99,11 @@ def _close(a: Array, b: Array, share: float) -> bool:
 
 def _check_face(face: Face, size: int) -> None:
     """Shapes, and what each row's status says of the directions."""
-    k = len(face.curvature)
-    require(face.Z.shape == (size, k), "Z has a row per entry and a column per curvature")
-    require(face.status.shape == (size,), "there is a status for each row")
+    shapes = face.tangents.shape, (len(face.curvature), face.tangents.shape[-1])
+    require(face.tangent_rows.shape == shapes[0] == shapes[1], "there is a curvature per tangent")
+    require(face.free.shape == face.status.shape == (size,), "there is a status for each row")
     gram = (face.Z.T @ face.Z).toarray()
-    require(np.allclose(gram, np.eye(k), atol=1e-12), "the columns of Z are orthonormal")
+    require(np.allclose(gram, np.eye(len(gram)), atol=1e-12), "the columns of Z are orthonormal")
     require(np.all(face.curvature >= 0.0), "the curvature is 0 or more")
     free = np.asarray(face.Z.multiply(face.Z).sum(axis=1)).ravel()
     require(np.allclose(free[face.holding], 1.0), "rows that are held are free in Z")
@@ -117,8 +117,9 @@ def _check_moves(feasible: FeasibleSet, x: Array, g: Array, t: Array) -> None:
     g is a gradient that pushes against the set at x and does nothing else, t coefficients.
     """
     face, short, long = feasible.face(x, g), TOLERANCES.short, TOLERANCES.long
-    flat, pushing = face.curvature == 0.0, np.sqrt(abs(face.Z.sign()).T @ g**2)
-    radii = np.where(flat, np.inf, pushing / np.where(flat, 1.0, face.curvature))
+    kappa = face.bends
+    flat, pushing = kappa == 0.0, np.sqrt(abs(face.Z.sign()).T @ g**2)
+    radii = np.where(flat, np.inf, pushing / np.where(flat, 1.0, kappa))
     t = t * np.minimum(1.0, radii)
     step = face.Z @ t
     for sign in (short, -short):
@@ -128,7 +129,7 @@ def _check_moves(feasible: FeasibleSet, x: Array, g: Array, t: Array) -> None:
     moved = feasible.project(x + long * step)
     if np.array_equal(feasible.face(moved, g).status, face.status):  # else it met a bound
         bent = g @ (moved - x - long * step)
-        expected = 0.5 * long**2 * float(face.curvature @ t**2)
+        expected = 0.5 * long**2 * float(kappa @ t**2)
         rounding = 1e-14 * np.linalg.norm(g) * np.linalg.norm(x)
         right = abs(bent - expected) <= 0.01 * abs(expected) + rounding
         require(right, "gᵀx along Ω bends by ½ tᵀ diag(κ) t")

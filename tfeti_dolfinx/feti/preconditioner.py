@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from mpi4py import MPI
@@ -134,13 +134,14 @@ class FacePreconditioner:
         Raises:
             FactorError: W_C has no factor.
         """
-        on_contact = csr_array(face.Z[self._contact])
-        kept = np.unique(on_contact.indices)
-        Z_C, factor = csr_array(face.Z[:, kept]), None
+        free, factor = np.zeros_like(face.free), None
+        free[self._contact] = face.free[self._contact]
+        on_contact = replace(face, free=free)
+        Z_C = on_contact.Z
         size = Z_C.multiply(Z_C).T @ self._size
-        bent = face.curvature[kept] * size
+        bent = on_contact.bends * size
         if self._gram is not None:
-            part = _restricted(self._gram, csr_array(on_contact[:, kept]))
+            part = _restricted(self._gram, csr_array(Z_C[self._contact]))
             added = part.createVecLeft()
             added.array[:] = PARAMETERS.shift + bent
             part.setDiagonal(added, PETSc.InsertMode.ADD_VALUES)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 
 import numpy as np
 from mpi4py import MPI
@@ -13,7 +14,7 @@ from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.common.parallel import any_rank, summed
 from tfeti_dolfinx.errors import FactorError, raised_on_all_ranks
 from tfeti_dolfinx.feti.rigid_bodies import independent, parts_of_columns
-from tfeti_dolfinx.qp.sets import Face
+from tfeti_dolfinx.qp.sets import Face, Status
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 
 # --- Gram matrices GGᵀ ------------------------------------------------------------------------
@@ -24,25 +25,71 @@ class Grams:
 
     An entry is stored for each pair of coordinates that meet in a row, so that storage grows with
     the number of subdomains. A face costs what its contact rows cost, ``bounded``, which some set
-    may constrain. Collective. ``whole`` is GGᵀ, shape ``(r, r)``.
+    may constrain: rows of the same coordinates make a dense block, and the sum of these is reduced
+    over ranks as far as contact rows reach. Collective. ``whole`` is GGᵀ, shape ``(r, r)``.
     """
 
     def __init__(self, Gt: csr_array, bounded: Array, comm: MPI.Intracomm) -> None:
-        self._comm, self._Gt, self._bounded = comm, Gt, bounded
+        self._comm, self._Gt, size = comm, Gt, Gt.shape[1]
         self._always = np.ones(Gt.shape[0], dtype=bool)
         self._always[bounded] = False
-        self._contact = csr_array(Gt[bounded])
-        self._base = replicated_gram(csr_array(Gt[self._always]), comm)
-        self.whole = csr_array(self._base + replicated_gram(self._contact, comm))
+        base = replicated_gram(csr_array(Gt[self._always]), comm).tocoo()
+        # 1. the entries that contact rows reach, on all ranks, and those of the whole
+        parts = [(rows, G, _pairs(columns, size)) for rows, columns, G in _blocks(Gt, bounded)]
+        own = np.unique(np.concatenate([np.empty(0, np.int64), *(pairs for *_, pairs in parts)]))
+        reached = np.unique(np.concatenate(comm.allgather(own)))
+        known = base.coords[0].astype(np.int64) * size + base.coords[1]
+        entries = np.union1d(known, reached)
+        row, column = np.divmod(entries, max(size, 1))
+        # 2. where they stand
+        self._table = column, np.searchsorted(row, np.arange(size + 1))
+        self._base: Array = np.zeros(len(entries))
+        self._base[np.searchsorted(entries, known)] = base.data
+        self._reached = np.searchsorted(entries, reached)
+        self._blocks = [(rows, G, np.searchsorted(reached, pairs)) for rows, G, pairs in parts]
+        everything = np.ones(Gt.shape[0], dtype=bool)
+        self.whole = self.of_face(Face(everything, np.full(len(everything), Status.FREE)))
 
     def of_face(self, face: Face) -> csr_array:
         """GZ(GZ)ᵀ, shape ``(r, r)``; of all rows anew where a set constrains any other row."""
-        if not self._Gt.shape[1]:
-            return self.whole
-        if any_rank(self._comm, bool(np.any(face.constrained[self._always]))):
+        size = self._Gt.shape[1]
+        if not size:
+            return csr_array((0, 0))
+        sums: Array = np.zeros(len(self._reached) + 2)
+        for rows, G, places in self._blocks:
+            G_f = G[face.free[rows]]
+            sums[places] += (G_f.T @ G_f).ravel()
+        sums[-2:] = np.any(face.constrained[self._always]), len(face.tangents)
+        *_, others, tangents = summed(self._comm, sums)
+        if others:
             return replicated_gram(csr_array(face.Z.T @ self._Gt), self._comm)
-        contact = csr_array(face.Z[self._bounded].T @ self._contact)
-        return csr_array(self._base + replicated_gram(contact, self._comm))
+        data = np.array(self._base)
+        data[self._reached] += sums[:-2]
+        gram = csr_array((data, *self._table), shape=(size, size))
+        if tangents:
+            gram = gram + replicated_gram(csr_array(face.T.T @ self._Gt), self._comm)
+        return gram
+
+
+def _blocks(Gt: csr_array, some: Array) -> Iterator[tuple[Array, Array, Array]]:
+    """Rows with the same coordinates: they, these coordinates and their entries, dense."""
+    own = csr_array(Gt[some])
+    own.eliminate_zeros()
+    own.sort_indices()
+    counts = np.diff(own.indptr)
+    for count in np.unique(counts[counts > 0]):
+        at = np.flatnonzero(counts == count)
+        places = own.indptr[at][:, None] + np.arange(count)
+        found, which = np.unique(own.indices[places], axis=0, return_inverse=True)
+        for k, columns in enumerate(found):
+            rows = np.flatnonzero(which.ravel() == k)
+            yield some[at[rows]], columns, own.data[places[rows]]
+
+
+def _pairs(columns: Array, size: int) -> Array:
+    """Return numbers of the entries that columns have with each other, ascending."""
+    columns = columns.astype(np.int64)
+    return (columns[:, None] * size + columns).ravel()
 
 
 def replicated_gram(Gt: csr_array, comm: MPI.Intracomm) -> csr_array:
@@ -95,8 +142,10 @@ class SemidefiniteFactor:
             lost = False
             with raised_on_all_ranks(comm):
                 try:
-                    shifted = self._A + self._shift * eye_array(A.shape[0])
-                    self._factor = CholeskyFactor(shifted if self._shift else self._A, prefix)
+                    shifted = self._A
+                    if self._shift:
+                        shifted = csr_array(self._A + self._shift * eye_array(A.shape[0]))
+                    self._factor = CholeskyFactor(shifted, prefix)
                 except FactorError as error:
                     lost = isinstance(error, NotPositiveDefiniteError)
                     if not lost or self._shift == SHIFTS[-1]:

@@ -166,8 +166,8 @@ class DenseCoarse(Coarse):
 
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
         """(G_f G_fᵀ + damping·GGᵀ)⁺y."""
-        ZtGt = face.Z.T @ self.Gt
-        return DenseFactor((ZtGt.T @ ZtGt + damping * self.Gt.T @ self.Gt).toarray()).solve(y)
+        G_f = face.restricted(Gt := self.Gt.toarray())
+        return DenseFactor(Gt.T @ G_f + damping * Gt.T @ Gt).solve(y)
 
     def on_face(self, face: Face) -> DenseCoarse:
         """Return the same G on a face."""

@@ -192,7 +192,7 @@ def newton_on_law(
         # Step 2: the face of p, and what follows where points slip; P itself turns what bends hard
         face = feasible.face(p, at.s)
         soft = np.flatnonzero(face.curvature <= parameters.hard * program.norm)
-        on = OnFace(face.with_directions(soft), program.law.following(p, face), p)
+        on = OnFace(face.with_tangents(soft), program.law.following(p, face), p)
         # Step 3: the system there
         share = parameters.reduction
         if past:
@@ -286,8 +286,7 @@ class OnFace:
 
     def bend(self, u: Array) -> Array:
         """Return Z diag(κ) Zᵀu, shapes ``(m,)`` or ``(m, q)``."""
-        Z = self.face.Z
-        return np.asarray(Z @ (self.face.curvature * (Z.T @ u).T).T)
+        return self.face.bend(u)
 
 
 def _solved_on_face(

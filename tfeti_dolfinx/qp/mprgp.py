@@ -123,7 +123,7 @@ def step_on_face(state: MprgpIterate, parameters: MprgpParameters) -> int:
         The conjugate gradient steps; 0 where little of β is tangential, or the cost does not fall.
     """
     x, g, face = np.array(state.x.array_r), np.array(state.g.array_r), state.face()
-    Z, kappa, inside = face.Z, face.curvature, face.status != Status.SLIP
+    Z, kappa, inside = face.Z, face.bends, face.status != Status.SLIP
     on_face = Z.T @ state.beta.array_r
     if state.sums(on_face @ on_face)[0] < parameters.tangential * state.chopped_squared:
         return 0

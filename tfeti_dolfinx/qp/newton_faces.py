@@ -45,7 +45,7 @@ class CurvedHessian:
 
     def bend(self, x: Array) -> Array:
         """Z diag(κ) Zᵀx."""
-        return np.asarray(self._face.Z @ (self._face.curvature * (self._face.Z.T @ x)))
+        return self._face.bend(x)
 
 
 class FaceSolver:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
-from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root
@@ -156,9 +155,9 @@ class WithinFace:
     def face(self, x: Array, g: Array) -> Face:
         """Return the face of x, without the rows that stay open."""
         face = self._feasible.face(x, g)
-        kept = np.flatnonzero(abs(face.Z).T @ self._open.astype(float) == 0.0)
         status = np.where(self._open, Status.OPEN, face.status)
-        return Face(csr_array(face.Z[:, kept]), face.curvature[kept], status)
+        stays = np.any(self._open[face.tangent_rows] & (face.tangents != 0.0), axis=1)
+        return replace(face.with_tangents(~stays), free=face.free & ~self._open, status=status)
 
 
 @dataclass(frozen=True)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from functools import cached_property
 from typing import Protocol
 
 import numpy as np
-from scipy.sparse import csr_array, diags_array
+from scipy.sparse import csr_array, hstack
 
 from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.errors import InputError
@@ -32,29 +32,40 @@ class Status(IntEnum):
     SLIP = 4
 
 
+NO_ROWS: Array = np.zeros((0, 2), dtype=np.int64)
+NO_TANGENTS: Array = np.zeros((0, 2))
+FLAT: Array = np.zeros(0)
+
+
 @dataclass(frozen=True)
 class Face:
     """The face of a feasible set on which a point lies, on this rank's rows.
 
+    Its directions are coordinates and, on other rows, tangents of boundaries. Each of them lives on
+    this rank.
+
     Attributes:
-        Z: Free directions as orthonormal columns, scipy CSR, shape ``(m, k)``; each of them
-            lives on this rank.
-        curvature: What the set's boundary adds to the Hessian along each direction: where the
-            gradient pushes against it, moving along the set by Zt changes gᵀx by
-            gᵀZt + ½ Σ κ_j t_j². 0 where it is flat or not pushed against. Shape ``(k,)``.
+        free: Flags of the rows that move on their own, shape ``(m,)``.
         status: Status of each row, shape ``(m,)``.
+        tangent_rows: The rows of each tangent, shape ``(t, w)``.
+        tangents: Its components there, orthonormal, 0 where it has fewer; shape ``(t, w)``.
+        curvature: What the set's boundary adds to the Hessian along each tangent: where the
+            gradient pushes against it, moving along the set by Zt changes gᵀx by
+            gᵀZt + ½ Σ κ_j t_j². 0 where it is flat or not pushed against. Shape ``(t,)``.
     """
 
-    Z: csr_array
-    curvature: Array
+    free: Array
     status: Array
+    tangent_rows: Array = field(default_factory=lambda: NO_ROWS)
+    tangents: Array = field(default_factory=lambda: NO_TANGENTS)
+    curvature: Array = field(default_factory=lambda: FLAT)
 
-    @property
+    @cached_property
     def carrying(self) -> Array:
         """Rows that carry a force: all but the open ones; flags, shape ``(m,)``."""
         return np.asarray(self.status != Status.OPEN)
 
-    @property
+    @cached_property
     def holding(self) -> Array:
         """Rows that hold what they multiply, Bu = c: neither open nor slipping; flags."""
         return self.carrying & (self.status != Status.SLIP)
@@ -64,37 +75,73 @@ class Face:
         """Rows that some set constrains; flags, shape ``(m,)``."""
         return np.asarray(self.status != Status.FREE)
 
-    @property
+    @cached_property
     def held(self) -> Array:
         """Rows that no direction moves; flags."""
-        return np.asarray(np.diff(self.Z.indptr) == 0)
+        held = ~self.free
+        held[self.tangent_rows[self.tangents != 0.0]] = False
+        return held
 
     @property
     def curved(self) -> bool:
         """True if some row of this rank slips along a boundary."""
-        return bool(np.any(np.diff(self.Z.indptr)[self.status == Status.SLIP]))
+        return bool(np.any(~self.held & (self.status == Status.SLIP)))
+
+    @cached_property
+    def T(self) -> csr_array:
+        """The tangents as columns, scipy CSR, shape ``(m, t)``."""
+        count, width = self.tangents.shape
+        table = np.arange(0, count * width + 1, width or 1)[: count + 1]
+        values = self.tangents.ravel(), self.tangent_rows.ravel(), table
+        return csr_array(csr_array(values, shape=(count, len(self.free))).T)
+
+    @cached_property
+    def Z(self) -> csr_array:
+        """All directions as columns, coordinates first, scipy CSR, shape ``(m, k)``."""
+        rows, m = np.flatnonzero(self.free), len(self.free)
+        own = np.cumsum(np.append(0, self.free))
+        coordinates = csr_array((np.ones(len(rows)), np.arange(len(rows)), own), (m, len(rows)))
+        return csr_array(hstack((coordinates, self.T))) if len(self.tangents) else coordinates
+
+    @property
+    def bends(self) -> Array:
+        """The curvature along all directions of Z, shape ``(k,)``."""
+        return np.concatenate((np.zeros(int(np.sum(self.free))), self.curvature))
 
     def damped(self) -> Face:
         """Z diag(1 + κ)^{-1/2}: ZZᵀ is the derivative of P_Ω at x, P_Ω(x) − x its gradient."""
         if not np.any(self.curvature):
             return self
-        share = diags_array(1.0 / np.sqrt(1.0 + self.curvature))
-        return Face(csr_array(self.Z @ share), self.curvature, self.status)
+        return replace(self, tangents=(self.tangents.T / np.sqrt(1.0 + self.curvature)).T)
 
-    def with_directions(self, kept: Array) -> Face:
-        """Return the face with some of its directions only, the others held."""
-        return Face(csr_array(self.Z[:, kept]), self.curvature[kept], self.status)
+    def with_tangents(self, kept: Array) -> Face:
+        """Return the face with some of its tangents only, the others held."""
+        rows, tangents = self.tangent_rows[kept], self.tangents[kept]
+        return Face(self.free, self.status, rows, tangents, self.curvature[kept])
 
     def restricted(self, x: Array) -> Array:
         """Z Zᵀ x: the part of vectors, shapes ``(m,)`` or ``(m, q)``, that lies in the face."""
-        if self._of_coordinates:
-            return np.where(np.diff(self.Z.indptr) > 0, x.T, 0.0).T
-        return np.asarray(self.Z @ (self.Z.T @ x))
+        own = np.where(self.free, x.T, 0.0).T
+        return own + self._along_tangents(x, np.ones(len(self.tangents)))
 
-    @cached_property
-    def _of_coordinates(self) -> bool:
-        """True if the directions are coordinates: unit columns with one entry each."""
-        return bool(self.Z.nnz == self.Z.shape[1] and np.all(np.abs(self.Z.data) == 1.0))
+    def bend(self, x: Array) -> Array:
+        """Z diag(κ) Zᵀ x, shapes ``(m,)`` or ``(m, q)``."""
+        return self._along_tangents(x, self.curvature)
+
+    def _along_tangents(self, x: Array, weights: Array) -> Array:
+        """T diag(weights) Tᵀ x, T the tangents as columns."""
+        y = np.zeros(x.shape)
+        if len(self.tangents):
+            along = np.einsum("tw,tw...,t->t...", self.tangents, x[self.tangent_rows], weights)
+            np.add.at(y, self.tangent_rows, np.einsum("tw,t...->tw...", self.tangents, along))
+        return y
+
+    def is_like(self, other: Face) -> bool:
+        """Return whether both are flat, with the same statuses and directions."""
+        if len(self.tangents) or len(other.tangents):
+            return False
+        same = np.array_equal(self.status, other.status)
+        return same and np.array_equal(self.free, other.free)
 
 
 def without_slip(face: Face, x: Array) -> Array:
@@ -109,10 +156,7 @@ def face_of(free: Array, status: Array) -> Face:
         free: Flags of the rows that may move, shape ``(m,)``.
         status: Status of each row.
     """
-    rows = np.flatnonzero(free)
-    k, m = len(rows), len(free)
-    Z = csr_array((np.ones(k), (rows, np.arange(k))), shape=(m, k))
-    return Face(Z, np.zeros(k), status)
+    return Face(np.array(free, dtype=bool), status)
 
 
 # --- Feasible sets ----------------------------------------------------------------------------
@@ -231,12 +275,17 @@ class Product:
     def face(self, x: Array, g: Array) -> Face:
         """Free rows, then the directions of each set."""
         status, free = np.full(len(x), Status.FREE), np.ones(len(x), dtype=bool)
-        faces = []
+        found = []
         for rows, factor in self.factors:
             face = factor.face(x[rows], g[rows])
-            status[rows], free[rows] = face.status, False
-            faces.append((rows, face))
-        return _joined([(np.arange(len(x)), face_of(free, status)), *faces], status)
+            status[rows], free[rows] = face.status, face.free
+            if len(face.tangents):
+                found.append((rows[face.tangent_rows], face.tangents, face.curvature))
+        if not found:
+            return Face(free, status)
+        width = max(tangents.shape[1] for _, tangents, _ in found)
+        tables = [(_widened(rows, width), _widened(t, width), kappa) for rows, t, kappa in found]
+        return Face(free, status, *map(np.concatenate, zip(*tables, strict=True)))
 
     def onto(self, x: Array, status: Array) -> Array:
         """Each set's, x itself on free rows."""
@@ -253,18 +302,9 @@ def _indices(rows: slice | Array) -> Array:
     return np.asarray(rows, dtype=np.int64)
 
 
-def _joined(faces: Sequence[tuple[Array, Face]], status: Array) -> Face:
-    """Return the directions of several faces on their rows, one after the other."""
-    row, column, value, start = [], [], [], 0
-    for rows, face in faces:
-        Z = face.Z.tocoo()
-        row.append(rows[Z.coords[0]])
-        column.append(start + Z.coords[1])
-        value.append(Z.data)
-        start += Z.shape[1]
-    coordinates = (np.concatenate(row), np.concatenate(column))
-    Z = csr_array((np.concatenate(value), coordinates), shape=(len(status), start))
-    return Face(Z, np.concatenate([face.curvature for _, face in faces]), status)
+def _widened(table: Array, width: int) -> Array:
+    """Return a table with columns of 0 up to ``width``."""
+    return np.pad(table, ((0, 0), (0, width - table.shape[1])))
 
 
 # --- Ellipses ---------------------------------------------------------------------------------
@@ -334,12 +374,17 @@ class Ellipses:
         on, normal = self._boundary(t)
         status = np.where(on[:, None], Status.SLIP, Status.STICK)
         status = np.where(self._moves, status, Status.OPEN)
-        inside = np.flatnonzero(self._moves & ~on[:, None])
-        along = np.flatnonzero(on & self._moves.all(axis=1) & (self.semi_axes.shape[1] == 2))
-        Z = _directions(inside, along, normal, x.size)
-        curvature = self._curvature(t, np.where(self._moves, self._points(g), 0.0), normal)
-        kappa = np.concatenate((np.zeros(len(inside)), curvature[along]))
-        return Face(Z, kappa, status.ravel())
+        free = (self._moves & ~on[:, None]).ravel()
+        if self.semi_axes.shape[1] != 2:
+            return Face(free, status.ravel())
+        along = np.flatnonzero(on & self._moves.all(axis=1))
+        if not len(along):
+            return Face(free, status.ravel())
+        n = normal[along]
+        g = np.where(self._moves, self._points(g), 0.0)
+        kappa = self._curvature(t, g, normal)[along]
+        rows, tangents = 2 * along[:, None] + (0, 1), np.stack((-n[:, 1], n[:, 0]), axis=1)
+        return Face(free, status.ravel(), rows, tangents, kappa)
 
     def onto(self, x: Array, status: Array) -> Array:
         """The nearest points of the ellipses; of their boundary, from inside too, for slip."""
@@ -405,14 +450,3 @@ def _secular(a: Array, z: Array) -> Array:
         if not np.any(step > SOLVED * np.abs(mu)):
             break
     return mu
-
-
-def _directions(inside: Array, along: Array, normal: Array, size: int) -> csr_array:
-    """Z: coordinates of what is inside, then the tangents of what is on the boundary."""
-    n, k = len(inside), len(along)
-    around = n + np.arange(k)
-    rows = np.concatenate((inside, 2 * along, 2 * along + 1))
-    columns = np.concatenate((np.arange(n), around, around))
-    n_x, n_y = normal[along, 0], normal[along, -1]
-    values = np.concatenate((np.ones(n), -n_y, n_x))
-    return csr_array((values, (rows, columns)), shape=(size, n + k))
