@@ -112,7 +112,6 @@ def test_projectors_of_a_face(dual, kind):
     U = U[:, values > 1e-9 * values[0]]
     masked = gathered(dual, face.restricted(x.array_r))
     assert np.allclose(gathered(dual, Px.array_r), masked - U @ (U.T @ masked), atol=1e-8)
-    coarse.destroy()
 
 
 @pytest.mark.parametrize("kind", list(FACES))
@@ -127,7 +126,6 @@ def test_the_particular_solution_of_a_face(dual, kind):
     rank = np.linalg.matrix_rank(Gt, tol=1e-9 * np.linalg.norm(Gt, 2))
     if rank == dual.coarse.dimension - dual.coarse.num_free_motions:
         assert np.linalg.norm(left) <= 1e-9 * np.linalg.norm(dual.coarse.e)
-    coarse.destroy()
 
 
 def pairs_and_rows():

@@ -113,7 +113,6 @@ def test_the_preconditioner_is_what_its_formula_says(dual, kappa, serial_only):
     assert np.allclose(B_f @ lifting, np.eye(len(B_f)), atol=1e-5)
     expected = Z @ (lifting.T @ S @ lifting) @ Z.T
     found = dense(M, dual.d)
-    M.destroy()
     assert np.abs(found - expected).max() <= 2e-3 * np.abs(expected).max()
     assert np.allclose(found, found.T, atol=1e-10 * np.abs(found).max())
 

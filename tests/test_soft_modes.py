@@ -105,5 +105,4 @@ def test_the_preconditioner_is_symmetric_and_positive(held):
     assert np.all(Mx.array_r[~free] == 0.0)
     assert x.dot(Mx) > 0.0
     assert x.dot(Mz) == pytest.approx(z.dot(Mx), abs=1e-12 * np.sqrt(x.dot(Mx) * z.dot(Mz)))
-    M.destroy()
     p.destroy()

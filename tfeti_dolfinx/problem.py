@@ -38,7 +38,7 @@ from tfeti_dolfinx.extensions import Extensions, check_method, guarded
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.forms.checks import check_mesh, check_same_space, displacement_space
-from tfeti_dolfinx.forms.fields import Stress, checked_stress, checked_thickness
+from tfeti_dolfinx.forms.fields import Freezable, Stress, checked_stress, checked_thickness
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import factor_options, parse_options
@@ -135,7 +135,7 @@ class ContactProblem:
         self.bcs = checked_conditions(bcs, V)
         self.u = fem.Function(V, name="displacement") if u is None else self._checked_u(u, V)
         self._given_stress = stress
-        self._stress: Stress | None = None
+        self._stress: Freezable | None = None
         if stress is not None:
             with agreeing(comm, "stress(u)") as given:
                 given["stress(u)"] = sigma = self._look_at_stress()
@@ -339,7 +339,7 @@ class ContactProblem:
             decomposition=self.decomposition,
             gluing=gluing,
             contacts=list(self._system.search.contacts),
-            stress=self._stress,
+            stress=None if self._stress is None else self._stress.frozen(),
             thickness=self._thickness,
         )
         solution.boundary = self._system.elements.solved(u)
@@ -583,8 +583,9 @@ class ContactProblem:
         """
         if self._given_stress is None:
             return None
-        sigma, own = checked_stress(self._given_stress, self.u), self.u
-        self._stress = lambda u: ufl.replace(sigma, {own: u})
+        sigma = checked_stress(self._given_stress, self.u)
+        if self._stress is None or self._stress.expression is not sigma:
+            self._stress = Freezable(sigma, self.u)
         return sigma
 
     def _checked_u(self, u: fem.Function, V: fem.FunctionSpace, name: str = "u") -> fem.Function:

@@ -25,7 +25,6 @@ from tfeti_dolfinx.forms.discretisation import StressRecovery
 from tfeti_dolfinx.forms.fields import (
     Stress,
     cellwise,
-    checked_stress,
     from_vertices,
     frozen,
     nodal,
@@ -115,10 +114,7 @@ class Solution(ContactState):
         super().__init__(u, multipliers, decomposition, gluing, contacts, frozen(thickness))
         self.v: Array | None = None
         self.boundary: Any = None
-        self._stress = None
-        if stress is not None:
-            u_h = self.displacement
-            self._stress = frozen(checked_stress(stress, u_h), but=u_h)
+        self._stress_of = stress
 
     @cached_property
     def displacement(self) -> fem.Function:
@@ -190,12 +186,13 @@ class Solution(ContactState):
     @cached_property
     def interior(self) -> Any:
         """Displacement and stress on the mesh by Somigliana's identity in boundary elements."""
-        return plugin("Interior")(self.boundary, self.displacement, self._stress, self.dofs)
+        sigma = self._sigma if self.has_stress else None
+        return plugin("Interior")(self.boundary, self.displacement, sigma, self.dofs)
 
     @property
     def has_stress(self) -> bool:
         """True if the problem was given a stress."""
-        return self._stress is not None
+        return self._stress_of is not None
 
     @property
     def has_contact(self) -> bool:
@@ -210,22 +207,22 @@ class Solution(ContactState):
     @cached_property
     def stress(self) -> fem.Function:
         """Stress in the cells, 3×3, discontinuous."""
-        return cellwise(self._sigma(), self.dofs, "stress")
+        return cellwise(self._sigma, self.dofs, "stress")
 
     @cached_property
     def von_mises(self) -> fem.Function:
         """Von Mises stress in the cells, discontinuous."""
-        return cellwise(von_mises(self._sigma()), self.dofs, "von_mises")
+        return cellwise(von_mises(self._sigma), self.dofs, "von_mises")
 
     @cached_property
     def nodal_stress(self) -> fem.Function:
         """Stress averaged at the nodes, 3×3."""
-        return nodal(self._sigma(), self.dofs, "stress")
+        return nodal(self._sigma, self.dofs, "stress")
 
     @cached_property
     def nodal_von_mises(self) -> fem.Function:
         """Von Mises stress of the cells, averaged at the nodes."""
-        return nodal(von_mises(self._sigma()), self.dofs, "von_mises")
+        return nodal(von_mises(self._sigma), self.dofs, "von_mises")
 
     @cached_property
     def discretisation_error(self) -> fem.Function:
@@ -234,7 +231,7 @@ class Solution(ContactState):
         Files for ParaView have it if it has been made, as by ``ContactProblem.estimate``.
         """
         recovery = StressRecovery(
-            self.displacement, self._sigma(), self.dofs, self.decomposition, self.thickness
+            self.displacement, self._sigma, self.dofs, self.decomposition, self.thickness
         )
         function = fem.Function(recovery.cells, name="discretisation_error")
         function.x.array[recovery.cell_dof] = np.sqrt(recovery.squares())
@@ -308,10 +305,11 @@ class Solution(ContactState):
         """Resultants of the contact forces on each body. Collective at first use."""
         return body_forces(self.nodal_forces, self.dofs, self.decomposition)
 
+    @cached_property
     def _sigma(self) -> Any:
-        if self._stress is None:
+        if self._stress_of is None:
             raise InputError("no stress: give ContactProblem(..., stress=sigma)")
-        return self._stress
+        return self._stress_of(self.displacement)
 
     @property
     def _vertices(self) -> Array:

@@ -9,9 +9,14 @@ from petsc4py import PETSc
 from scipy.sparse import csr_array, diags_array, hstack
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import bcast_from_root, chunk_offsets
+from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, chunk_offsets
 from tfeti_dolfinx.errors import raised_on_all_ranks
-from tfeti_dolfinx.feti.projectors import FaceFactors, Grams, ObliqueProjectors
+from tfeti_dolfinx.feti.projectors import (
+    FaceFactors,
+    Grams,
+    ObliqueProjectors,
+    SemidefiniteFactor,
+)
 from tfeti_dolfinx.feti.rigid_bodies import (
     TOLERANCES,
     Bodies,
@@ -93,6 +98,8 @@ class CoarseSpace(Coarse):
         self.grams = Grams(self.Gt, np.flatnonzero(~equalities), comm)
         self.factors = FaceFactors(comm, self.null, prefix)
         self.factor = self.factors.factor(self.grams.whole, "whole")
+        self._on_face: FaceProjectors | None = None
+        self._damped: tuple[Face, float, SemidefiniteFactor] | None = None
 
     def _load(self) -> Array:
         e = np.concatenate(self.comm.allgather(self.subdomains.kernel_load))
@@ -114,15 +121,27 @@ class CoarseSpace(Coarse):
 
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
         """(G_f G_fᵀ + damping·GGᵀ)⁻¹y, f a face of the rows."""
-        gram = csr_array(self.grams.of_face(face) + damping * self.grams.whole)
-        factor = self.factors.factor(gram)
-        x = factor.solve(y)
-        factor.destroy()
-        return x
+        if not self.dimension:
+            return y
+        known = self._damped
+        if known is None or self._differs(known[0], face) or known[1] != damping:
+            self._damped = None
+            gram = csr_array(self.grams.of_face(face) + damping * self.grams.whole)
+            known = self._damped = (face, damping, self.factors.factor(gram))
+        return known[2].solve(y)
 
     def on_face(self, face: Face) -> FaceProjectors:
-        """Return the projectors on a face of the rows."""
-        return FaceProjectors(self, face)
+        """Return the projectors on a face of the rows, those of the last time if it is that."""
+        known = self._on_face
+        if known is None or self._differs(known.face, face):
+            self._on_face = None
+            known = self._on_face = FaceProjectors(self, face)
+        known.e = self.e
+        return known
+
+    def _differs(self, known: Face, face: Face) -> bool:
+        """Return whether a face is another one on some rank, or bends. Collective."""
+        return any_rank(self.comm, not face.is_like(known))
 
     def oblique(self, face: Face, C: csr_array) -> ObliqueProjectors:
         """Return the projectors on a face of the rows where others follow: λ = (I + C)u.
@@ -164,13 +183,14 @@ class FaceProjectors(Coarse):
     """
 
     def __init__(self, whole: CoarseSpace, face: Face) -> None:
-        self._whole, self._face = whole, face
-        self.comm, self.Gt, self.e = whole.comm, whole.Gt, whole.e
+        self._whole, self.face = whole, face
+        self.comm, self.Gt = whole.comm, whole.Gt
+        self.own, self.moduli = whole.own, whole.moduli
         self.factor = whole.factors.factor(whole.grams.of_face(face))
 
     def restricted(self, x: Array) -> Array:
         """ZZᵀx."""
-        return self._face.restricted(x)
+        return self.face.restricted(x)
 
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
         """Solve with the damped coarse matrix of all rows."""
@@ -178,7 +198,7 @@ class FaceProjectors(Coarse):
 
     def on_face(self, face: Face) -> FaceProjectors:
         """Return the projectors of another face of all rows."""
-        return FaceProjectors(self._whole, face)
+        return self._whole.on_face(face)
 
 
 def _without_rounding(J: Any) -> csr_array:

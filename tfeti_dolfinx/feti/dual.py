@@ -10,7 +10,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import bcast_from_root, largest, norm_over
+from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, largest, norm_over
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.feti.coarse import CoarseSpace
@@ -155,6 +155,8 @@ class Dual:
             self._lifting = self.preconditioner.local
         self._on_faces: FacePreconditioner | None = None
         self._on_all: FaceOperator | None = None
+        self._on_last: tuple[Face, FaceOperator] | None = None
+        self._nearly_free: tuple[Array, list[dict[str, object]]] | None = None
         normals, tangents = constraints.sets.normals, constraints.sets.tangents.ravel()
         prefix = f"{options_prefix}coarse_"
         self.coarse = CoarseSpace(B, subdomains, normals, tangents, prefix)
@@ -279,11 +281,22 @@ class Dual:
         if self._on_all is None:
             rows = self.constraints.num_rows
             face = face_of(np.ones(rows, dtype=bool), np.full(rows, Status.FREE))
-            self._on_all = self._preconditioner_on(face)
+            self._on_all = self._made_on(face)
         return self._on_all
 
     def _preconditioner_on(self, face: Face) -> FaceOperator:
-        """Return the preconditioner on a face; parts that all faces share are made once."""
+        """Return the preconditioner on a face, that of the last time if it is that face."""
+        if self._on_last is not None:
+            known, operator = self._on_last
+            if not any_rank(self.coarse.comm, not face.is_like(known)):
+                return operator
+            self._on_last = None
+            operator.destroy()
+        self._on_last = face, self._made_on(face)
+        return self._on_last[1]
+
+    def _made_on(self, face: Face) -> FaceOperator:
+        """Make the preconditioner on a face; parts that all faces share are made once."""
         assert self.preconditioner is not None
         if self._on_faces is None:
             diagonal = self.subdomains.diagonal
@@ -346,13 +359,18 @@ class Dual:
 
     def nearly_free(self, active: Array) -> list[dict[str, object]]:
         """List motions that ``active`` contact rows hold hardly or not, see ``listed``."""
-        motions = self.coarse.unresisted(active, below=LIMITS.nearly)
-        return bcast_from_root(self.coarse.comm, listed(motions, self.coarse.bodies, *self._names))
+        known, comm = self._nearly_free, self.coarse.comm
+        if known is None or any_rank(comm, not np.array_equal(active, known[0])):
+            motions = self.coarse.unresisted(active, below=LIMITS.nearly)
+            found = bcast_from_root(comm, listed(motions, self.coarse.bodies, *self._names))
+            known = self._nearly_free = (active, found)
+        return known[1]
 
     def destroy(self) -> None:
         """Destroy the PETSc objects."""
         image = self._image[1] if self._image is not None else None
-        own = (self._on_all, self._on_faces, self.soft, self.preconditioner, self._scaled)
+        last = None if self._on_last is None else self._on_last[1]
+        own = (last, self._on_all, self._on_faces, self.soft, self.preconditioner, self._scaled)
         for item in (self.F, *own, self.coarse, self.d, image):
             if item is not None:
                 item.destroy()

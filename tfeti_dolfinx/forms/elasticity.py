@@ -99,6 +99,8 @@ class Elasticity:
             nu, on, "nu", POISSON_OF_SHEETS if self.model == "plane_stress" else POISSON
         )
         self.mu = self.E / 2 / (1 + self.nu)
+        self._made_of: tuple[Any, ...] = (None,) * 4  # that of the last displacement is kept
+        self._stress: Any = None
         self.thickness: Any = 1.0
         if self.model == "axisymmetric":
             self._on_axis = self._near_axis * self._checked_radius()
@@ -141,6 +143,13 @@ class Elasticity:
         Raises:
             InputError: As ``strain``.
         """
+        made_of = (u, self.E, self.nu, self.mu)
+        if not all(a is b for a, b in zip(made_of, self._made_of, strict=True)):
+            self._made_of, self._stress = made_of, self._hooke(u)
+        return self._stress
+
+    def _hooke(self, u: Any) -> Any:
+        """Make the stress of a displacement."""
         e, E, nu, mu = self.strain(u), self.E, self.nu, self.mu
         if self.model != "plane_stress":
             lmbda = E * nu / (1 + nu) / (1 - 2 * nu)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
-from scipy.sparse import csr_array
+from scipy.sparse import csc_array, csr_array
 
 from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.common.parallel import bcast_from_root, summed
@@ -66,19 +67,30 @@ class Coarse:
         """(G_f G_fᵀ + damping·GGᵀ)⁻¹y, f a face of all rows."""
         raise NotImplementedError
 
-    @property
+    @cached_property
     def dimension(self) -> int:
         """Number r of equations."""
-        return self.Gt.shape[1]
+        return int(self.Gt.shape[1])
+
+    @cached_property
+    def own(self) -> csc_array:
+        """This rank's columns of G, shape ``(r, m_local)``."""
+        return self.Gt.T
+
+    @cached_property
+    def moduli(self) -> csc_array:
+        """The moduli of their entries."""
+        return abs(self.own)
 
     def G(self, x: Array) -> Array:
         """G_fZᵀx, replicated, from this rank's part of x."""
-        return summed(self.comm, self.Gt.T @ self.restricted(x)) if self.dimension else NOTHING
+        return summed(self.comm, self.own @ self.restricted(x)) if self.dimension else NOTHING
 
     def terms(self, x: Array) -> Array:
         """Σ|G_fZᵀ||x|, replicated, from this rank's part of x."""
-        own = abs(self.Gt).T @ np.abs(self.restricted(x))
-        return summed(self.comm, own) if self.dimension else NOTHING
+        if not self.dimension:
+            return NOTHING
+        return summed(self.comm, self.moduli @ np.abs(self.restricted(x)))
 
     def residual(self, x: PETSc.Vec) -> Array:
         """e − G_fZᵀx, replicated."""
@@ -98,11 +110,12 @@ class Coarse:
 
     def combine(self, mu: Array, x: PETSc.Vec) -> None:
         """x = ZZᵀGᵀμ."""
-        x.array[:] = self.restricted(self.Gt @ mu)
+        x.array[:] = self.restricted(self.Gt @ mu) if self.dimension else 0.0
 
     def project(self, x: PETSc.Vec) -> None:
         """x ← P x."""
-        x.array[:] = self.restricted(x.array_r - self.Gt @ self.coordinates(x))
+        away = self.Gt @ self.coordinates(x) if self.dimension else 0.0
+        x.array[:] = self.restricted(x.array_r - away)
 
     def project_against(
         self, x: PETSc.Vec, y: PETSc.Vec, more: Array = NOTHING
@@ -113,8 +126,12 @@ class Coarse:
         ranks may round differently.
         """
         own, r = self.restricted(x.array_r), self.dimension
-        products = self.Gt.T @ np.stack((own, y.array_r), axis=1)
         scalars = (own @ y.array_r, y.array_r @ y.array_r)
+        if not r:
+            rest = summed(self.comm, np.concatenate((scalars, more)))
+            x.array[:] = own
+            return float(rest[0]), float(rest[1]), rest[2:]
+        products = self.own @ np.stack((own, y.array_r), axis=1)
         sums = summed(self.comm, np.concatenate((products.T.ravel(), scalars, more)))
         mu, rest = self.solve(sums[:r]), sums[2 * r :]
         x.array[:] = self.restricted(x.array_r - self.Gt @ mu)
@@ -126,6 +143,8 @@ class Coarse:
 
     def norm_Q(self, x: PETSc.Vec) -> float:
         """‖Q x‖; the same on all ranks, since loops end by it."""
+        if not self.dimension:
+            return 0.0
         Gx = self.G(x.array_r)
         return bcast_from_root(self.comm, float(np.sqrt(max(float(Gx @ self.solve(Gx)), 0.0))))
 
@@ -140,6 +159,8 @@ class Coarse:
 
 def imbalance(coarse: Coarse, x: PETSc.Vec) -> float:
     """Return the largest entry of Gx − e over the size of its terms, at most 1. Collective."""
+    if not coarse.dimension:
+        return 0.0
     forces = coarse.forces(x)
     floor = max(LIGHT * float(forces.max(initial=0.0)), TINY)
     own = np.max(np.abs(coarse.residual(x)) / np.maximum(forces, floor), initial=0.0)

@@ -337,8 +337,6 @@ def _solved_on_face(
     if qp.recycled is not None:
         for z, image in basis[1:, known:].transpose(1, 0, 2):
             qp.recycled.keep(on.followed(z), image)
-    if M is not None:
-        M.destroy()
     mu = oblique.coordinates(s + on.bend(u))
     return LawPoint(lam + on.followed(u), s - local.normal(mu), at.mu + mu)
 

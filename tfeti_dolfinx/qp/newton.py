@@ -47,7 +47,6 @@ def first_point(qp: QP) -> PETSc.Vec:
         coarse, lam = qp.coarse.on_face(face), qp.d.duplicate()
         coarse.particular(lam)
         held = imbalance(coarse, lam) <= HELD
-        coarse.destroy()
         # where 0 is inside of Ω, as with adhesion, rows of contact are free and may leave it
         out = bool(np.any(qp.feasible.project(lam.array_r) != lam.array_r))
         if held and not any_rank(qp.d.getComm().tompi4py(), out):
@@ -81,7 +80,6 @@ def multipliers_at(qp: QP, z: DualIterate) -> Array:
     coarse, g = qp.coarse.on_face(face_of(holds, face.status)), qp.d.duplicate()
     g.array[:] = z.g
     mu = coarse.coordinates(g)
-    coarse.destroy()
     g.destroy()
     return mu
 

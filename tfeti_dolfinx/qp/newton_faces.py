@@ -247,15 +247,10 @@ class FaceSolver:
         return DualIterate(lam, g), reason != ConvergedReason.CONVERGED_RTOL and not self._ended
 
     def _leave(self) -> None:
-        """Free projectors and preconditioner of the face."""
-        if self._face is not None:
-            self._on_face.coarse.destroy()
-        if self._preconditioner is not None:
-            self._preconditioner.destroy()
+        """Forget projectors and preconditioner of the face."""
         self._face, self._preconditioner = None, None
 
     def destroy(self) -> None:
         """Free what it holds. Collective."""
-        self._leave()
         self.directions.destroy()
         self._point.destroy()

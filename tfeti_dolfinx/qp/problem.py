@@ -47,8 +47,8 @@ class QP:
         feasible: The set Ω.
         preconditioner: Approximate inverse of F, or None.
         norm: Estimate of ‖PFP‖, which step lengths are relative to; 1 where nobody asks.
-        preconditioner_on: Makes an approximate inverse of ZᵀFZ for a face Z, between vectors of
-            the face in the layout of all rows; or None.
+        preconditioner_on: Gives an approximate inverse of ZᵀFZ for a face Z, between vectors of
+            the face in the layout of all rows, until it is asked for another; or None.
         seen: Largest Rayleigh quotient of F that earlier solves have seen; 0 if there were none.
         recycled: Directions of earlier solves, which those of PCPG are made F-orthogonal to.
         held: Flags of the local rows that are 0 on the face of ``coarse``; None: of no face.

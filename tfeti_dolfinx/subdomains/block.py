@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any, Literal
 
 import numpy as np
@@ -90,15 +91,14 @@ def candidate_modes(x: Array, bs: int, centre: Array, length: float) -> Array:
     of one node.
     """
     gdim = x.shape[1]
-    modes = [np.tile(np.eye(bs)[i], len(x)) for i in range(bs)]
-    if bs == gdim and gdim > 1:
+    turns = bs == gdim and gdim > 1
+    modes = np.zeros((len(x), bs, bs + (bs * (bs - 1) // 2 if turns else 0)))
+    modes[:, :, :bs] = np.eye(bs)
+    if turns:
         y = (x - centre) / (length or 1.0)
-        for i in range(gdim):
-            for j in range(i):
-                turn = np.zeros((len(x), bs))
-                turn[:, j], turn[:, i] = -y[:, i], y[:, j]
-                modes.append(turn.ravel())
-    return np.stack(modes, axis=1)
+        for k, (j, i) in enumerate(combinations(range(gdim), 2)):
+            modes[:, j, bs + k], modes[:, i, bs + k] = -y[:, i], y[:, j]
+    return modes.reshape(len(x) * bs, -1)
 
 
 def mode_names(gdim: int, bs: int) -> tuple[str, ...]:
