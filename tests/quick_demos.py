@@ -34,6 +34,7 @@ DEMOS = [
     "belt_2d",
     "four_bodies_2d",
     "clamped_connection_3d",
+    "bolted_joint_3d",
     "cattaneo_mindlin_2d",
     "unloading_2d",
     "mindlin_3d",

@@ -149,3 +149,11 @@ def test_an_impact_of_bars_is_as_in_closed_form(quick_demo):
         "energy": 0.02,
     }
     assert all(abs(errors[f"two_{name}"]) <= bound for name, bound in most.items())
+
+
+def test_a_bolted_joint_slides_at_its_friction(quick_demo):
+    """Both sides of the pulled plate slide in the end; springs of handbooks are a rough guide."""
+    errors = quick_demo("bolted_joint_3d").report["errors"]
+    assert abs(errors["slip_of_plates"]) <= 1e-3
+    assert abs(errors["slip_of_joint"]) <= 5e-3
+    assert abs(errors["pretension_of_springs"]) <= 0.2
