@@ -17,7 +17,6 @@ from tfeti_dolfinx.mesh.diagnostics import flatness, shared_by_bodies
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.report import Outcome, Report
 from tfeti_dolfinx.solution import Solution
-from tfeti_dolfinx.subdomains.rigid_block import RigidBlock
 from tfeti_dolfinx.subdomains.stiffness import stretch_over_shear
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
@@ -103,11 +102,8 @@ class Diagnostics:
         if self._dofs.V.element.basix_element.degree > 1:
             return
         x, ratios = self._points(subdomains), []
-        for block, part in zip(subdomains.blocks, subdomains.dof_parts, strict=True):
+        for block, part in subdomains.elastic_parts():
             own = x[part.start // self._dofs.bs : part.stop // self._dofs.bs]
-            if isinstance(block, RigidBlock):
-                ratios.append(0.0)
-                continue
             ratios.append(stretch_over_shear(own, self._dofs.bs, block.multiply))
         worst = subdomains.body_maxima([ratios])[0]
         if np.any(worst > LIMITS.locks):
@@ -150,11 +146,8 @@ class Diagnostics:
         if self.finite or bs != self._decomposition.mesh.geometry.dim or bs == 1:
             return
         x, angles = self._points(subdomains), []
-        for block, part in zip(subdomains.blocks, subdomains.dof_parts, strict=True):
+        for _, part in subdomains.elastic_parts():
             rows = slice(part.start // bs, part.stop // bs)
-            if isinstance(block, RigidBlock):
-                angles.append(0.0)
-                continue
             slope = np.linalg.lstsq(x[rows], u[part].reshape(-1, bs), rcond=None)[0]
             angles.append(float(np.linalg.norm(slope - slope.T)) / 8.0**0.5)
         worst = subdomains.body_maxima([angles])[0]
@@ -181,8 +174,7 @@ class Diagnostics:
         shown = records.conforms & flat[records.contact]
         if not any_rank(comm, bool(np.any(shown))):
             return
-        blocks = [block for block in subdomains.blocks if not isinstance(block, RigidBlock)]
-        diagonal = joined([block.diagonal for block in blocks])
+        diagonal = joined([block.diagonal for block in subdomains.elastic])
         K = self._dofs.reduce(diagonal.reshape(-1, self._dofs.bs).mean(axis=1), np.add, 0.0)
         (K,) = self._dofs.lookup(records.entry_group, K)
         gives = records.area * sum_rows(records.condition, records.weight**2 / K, len(records))
@@ -209,10 +201,9 @@ class Diagnostics:
         """Return points of this rank's primal nodes, from the middle of their subdomains on."""
         gdim, bs = self._decomposition.mesh.geometry.dim, self._dofs.bs
         x = self._dofs.V.tabulate_dof_coordinates()[self._dofs.dolfinx_node, :gdim]
-        for block, part in zip(subdomains.blocks, subdomains.dof_parts, strict=True):
+        for _, part in subdomains.elastic_parts():
             rows = slice(part.start // bs, part.stop // bs)
-            if not isinstance(block, RigidBlock):
-                x[rows] -= x[rows].mean(axis=0)
+            x[rows] -= x[rows].mean(axis=0)
         return np.asarray(x)
 
     def _names(self, which: Array) -> str:

@@ -22,8 +22,6 @@ class RowTolerances:
         agreement: Values that conditions prescribe at a node differ by less, relative to all.
         nothing_left: Of a row's norm: if prescribed components leave less, rounding of the normal
             has made it (ε|x|/h of a facet of size h at x), and the row is dropped.
-        rigid: D of a rigid body, over the smallest: what it resists is beyond all elastic bodies,
-            and squares of it are still numbers.
         overlap: Overlap, over the scene's length, that rounding of gaps and prescribed values may
             leave.
     """
@@ -31,7 +29,6 @@ class RowTolerances:
     agreement: float = 1e-10
     nothing_left: float = 1e-6
     overlap: float = 1e-10
-    rigid: float = 1e60
 
 
 TOLERANCES = RowTolerances()
@@ -143,7 +140,8 @@ class Constraints:
         c: Right sides, distributed as the rows; 0 until they are set.
         sets: Which local rows are what.
         trace: Local primal unknown of each local trace unknown, ascending.
-        weights: D on the local trace unknowns: the rows are scaled with it.
+        weights: D on the local trace unknowns: the rows are scaled with it. Of rigid bodies it is
+            infinite, and D⁻¹, which is what anything is made with, 0.
         scale: The s_i of the conditions with rows, one for each of ``sets.normals``: over it what
             a row misses is a length.
         tangent_scale: The same for each point of ``sets.tangents``, shape ``(t,)``.
@@ -209,8 +207,7 @@ def assemble_constraints(
 
     The tables are those of equalities, contact normals and tangents; the weights are D on the local
     primal unknowns, the other arguments as in ``ContactRows`` and ``TangentRows``. ``rigid`` counts
-    unknowns of rigid bodies, on the last rank behind those of its nodes; beside them all is soft:
-    their D is ``TOLERANCES.rigid``.
+    unknowns of rigid bodies, on the last rank behind those of its nodes.
     """
     rows = stack(list(tables))
     ends = np.cumsum([len(table) for table in tables])[:-1]
@@ -222,7 +219,7 @@ def assemble_constraints(
     if rigid:
         offsets[-1] += rigid
         own = rigid if dofs.comm.rank == dofs.comm.size - 1 else 0
-        weights = np.append(weights, np.full(own, TOLERANCES.rigid))
+        weights = np.append(weights, np.full(own, np.inf))
     needed, place = np.unique(rows.column, return_inverse=True)
     exchange = Exchange(dofs.comm, owner_of(offsets, needed))
     asked = exchange.send(needed) - offsets[dofs.comm.rank]

@@ -17,15 +17,16 @@ from tfeti_dolfinx.common.arrays import Array, joined, node_means
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.subdomains.local_operators import LocalOperator
-from tfeti_dolfinx.subdomains.rigid_block import RigidBlock
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # --- K on the trace and next to it ------------------------------------------------------------
 
 
-def near_stiffness(blocks: Sequence[SparseBlock | RigidBlock]) -> tuple[csr_array, Array]:
+def near_stiffness(blocks: Sequence[SparseBlock], rigid: int = 0) -> tuple[csr_array, Array]:
     """K between the trace unknowns of each subdomain and those that share a cell with them.
+
+    Of ``rigid`` trace unknowns of rigid bodies, which come behind, it is 0.
 
     Returns:
         K of shape ``(t + t_n,) * 2``: on the t trace unknowns of this rank, as ``Subdomains`` has
@@ -34,14 +35,8 @@ def near_stiffness(blocks: Sequence[SparseBlock | RigidBlock]) -> tuple[csr_arra
     """
     parts, means = [], []
     places: list[Array] = [np.empty(0, dtype=np.int64)]
-    start, end = 0, sum(len(block.trace_dofs) for block in blocks)
+    start, end = 0, rigid + sum(len(block.trace_dofs) for block in blocks)
     for block in (block for block in blocks if len(block.trace_dofs)):
-        if isinstance(block, RigidBlock):
-            size = len(block.trace_dofs)
-            parts.append(csr_array((size, size)))
-            places += [start + np.arange(size)]
-            start += size
-            continue
         trace, bs, K = block.traced.trace, block.bs, block.stiffness.K
         rows = K[trace]
         rows.eliminate_zeros()  # entries between fixing nodes
@@ -53,6 +48,9 @@ def near_stiffness(blocks: Sequence[SparseBlock | RigidBlock]) -> tuple[csr_arra
         means.append(node_means(block.stiffness.diagonal, bs)[next_to])
         places += [start + np.argsort(block.trace_place), end + np.arange(len(next_to))]
         start, end = start + len(trace), end + len(next_to)
+    if rigid:
+        parts.append(csr_array((rigid, rigid)))
+        places.append(start + np.arange(rigid))
     order = np.argsort(np.concatenate(places))
     K = csr_array(block_diag(parts, format="csr")) if parts else csr_array((0, 0))
     return csr_array(K[order][:, order]), joined(means)
@@ -167,12 +165,12 @@ def dirichlet_preconditioner(
 
     From (λ + 2μ)/μ of ``volume`` on, 20 of ν = 0.474, what is inside has to follow a trace.
     """
-    known = [b for b in subdomains.blocks if isinstance(b, SparseBlock | RigidBlock)]
-    sparse = [block for block in known if isinstance(block, SparseBlock)]
+    sparse = [block for block in subdomains.elastic if isinstance(block, SparseBlock)]
     metric, comm = None, subdomains.comm
-    if not any_rank(comm, len(known) < len(subdomains.blocks)):
+    if not any_rank(comm, len(sparse) < len(subdomains.elastic)):
         stiff = [block.bs for block in sparse if block.stiffness.stretch_over_shear > volume]
-        near = partial(near_stiffness, known) if any_rank(comm, bool(stiff)) else None
+        rigid = sum(len(block.trace_dofs) for block in subdomains.blocks[len(sparse) :])
+        near = partial(near_stiffness, sparse, rigid) if any_rank(comm, bool(stiff)) else None
         hard = any_rank(comm, 3 in stiff)
         metric = Metric(subdomains.local_operator("stiffness"), near, hard)
     return DualOperator(B, subdomains.local_operator("schur"), metric)

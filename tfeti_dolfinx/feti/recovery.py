@@ -156,14 +156,20 @@ def min_norm_correction(
         z[contact] = r
         return spread(z)
 
-    def square(a: Array, weights: Array | float = 1.0) -> float:
-        return float(comm.allreduce(float(np.sum(weights * a**2))))
+    elastic = np.isfinite(D)
+    root = np.sqrt(D[elastic])
+
+    def square(a: Array) -> float:
+        return float(comm.allreduce(float(a @ a)))
+
+    def in_D(s: Array) -> float:  # ‖s‖²_D, of what does not move rigid bodies
+        return square(root * s[elastic])
 
     apart = np.array(w)
     apart[contact] = 0.0
     r = np.where(closed, w[contact], 0.0)
     x, s = spread(apart), upwards(r)
-    p, left = s.copy(), square(s, D)
+    p, left = s.copy(), in_D(s)
     enough = tol**2 * left
     for _ in range(max_it):
         if left <= enough:
@@ -176,7 +182,7 @@ def min_norm_correction(
         x += left / curvature * p
         r -= left / curvature * q
         s = upwards(r)
-        left, before = square(s, D), left
+        left, before = in_D(s), left
         p = s + left / before * p
     trace.destroy()
     rows.destroy()

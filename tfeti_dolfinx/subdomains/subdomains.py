@@ -81,7 +81,7 @@ class Subdomains:
     candidate modes of each. A rank may have no Block.
 
     Args:
-        blocks: This rank's Blocks.
+        blocks: This rank's Blocks, those of rigid bodies behind all others.
         body_of_block: Body of each.
         num_bodies: Number of bodies of all ranks.
         comm: Communicator. The constructor is collective, and what its docstring calls so.
@@ -89,6 +89,7 @@ class Subdomains:
         choice: Which form local operators take.
 
     Attributes:
+        elastic: The Blocks that have nodes, which are no rigid bodies.
         num_modes: k; num_clusters: clusters on all ranks, 0 without.
         trace: Trace unknowns among this rank's, ascending, shape ``(t,)``.
         trace_parts: Where the trace unknowns of each Block lie among the t, and dof_parts its
@@ -109,6 +110,7 @@ class Subdomains:
     ) -> None:
         self._choice = choice or LocalChoice()
         self.blocks, self.body_of_block = list(blocks), body_of_block
+        self.elastic = [block for block in self.blocks if not isinstance(block, RigidBlock)]
         self.num_bodies, self.comm = num_bodies, comm
         self.counters = Counters() if counters is None else counters
         own = max((block.modes.shape[1] for block in self.blocks), default=0)
@@ -209,8 +211,11 @@ class Subdomains:
     @property
     def num_nodal(self) -> int:
         """Number of this rank's unknowns at nodes; those behind are of rigid bodies."""
-        sizes = [len(block.load) for block in self.blocks if not isinstance(block, RigidBlock)]
-        return sum(sizes)
+        return sum(len(block.load) for block in self.elastic)
+
+    def elastic_parts(self) -> list[tuple[Block, slice]]:
+        """Return the Blocks that have nodes, each with its part of the n unknowns."""
+        return list(zip(self.elastic, self.dof_parts, strict=False))
 
     def with_rigid(self, u: Array) -> Array:
         """Return a displacement of nodes on all unknowns, 0 of rigid bodies, shape ``(n,)``."""
@@ -234,11 +239,11 @@ class Subdomains:
         body.
         """
         found = []
-        for block in self.blocks:
+        for i, block in enumerate(self.blocks):
             inside = block.kernel.T @ block.modes
             rest = block.modes - block.kernel @ inside
             gram = rest.T @ rest
-            if isinstance(block, RigidBlock):
+            if i >= len(self.elastic):
                 gram = np.diag(1.0 - np.diag(inside.T @ inside))
             found.append(gram / (float(np.trace(inside.T @ inside + gram)) or 1.0))
         return self._on_bodies(found, (self.num_modes, self.num_modes))
@@ -266,7 +271,10 @@ class Subdomains:
         )
 
     def body_sums(self, values: Sequence[Sequence[float]]) -> Array:
-        """Sums over the Blocks of each body, shape ``(q, b)``, of q values each. Collective."""
+        """Sums over the Blocks of each body, shape ``(q, b)``, of q values each. Collective.
+
+        Values may be given of elastic Blocks alone: those of rigid bodies are 0 then.
+        """
         found = np.array(values, dtype=float).T
         return np.ascontiguousarray(self._on_bodies(found, (len(values),)).T)
 
@@ -316,7 +324,8 @@ class Subdomains:
     ) -> Array:
         """Values of the Blocks, each of this shape, combined by bodies from 0 on. Collective."""
         total = np.zeros((self.num_bodies, *shape))
-        combine.at(total, self.body_of_block, np.reshape(values, (len(self.blocks), *shape)))
+        body = self.body_of_block[: len(values)]
+        combine.at(total, body, np.reshape(values, (len(values), *shape)))
         self.comm.Allreduce(MPI.IN_PLACE, total, op=op)
         return total
 
