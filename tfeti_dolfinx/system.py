@@ -161,6 +161,7 @@ class Settings:
                 deflation=self.extensions.deflation or SoftModes,
                 without=options.without,
                 recycle=options.recycle,
+                dimension=decomposition.mesh.geometry.dim,
             )
         return dual, options
 

@@ -14,7 +14,7 @@ from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, largest, no
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.feti.coarse import CoarseSpace
-from tfeti_dolfinx.feti.deflation import Deflation, MakeDeflation, SoftModes
+from tfeti_dolfinx.feti.deflation import Deflation, MakeDeflation, SoftModes, mean_stiffness
 from tfeti_dolfinx.feti.operator import (
     DualOperator,
     MakePreconditioner,
@@ -95,6 +95,7 @@ class Dual:
         feasible: Makes the set of multipliers from B and c; default ``contact_set``.
         without: Mechanisms that are switched off (``options.MECHANISMS``).
         recycle: Most directions of earlier solves; ``"auto"``: none before ``learn``.
+        dimension: That of the space.
 
     Attributes:
         F: B K⁺ Bᵀ.
@@ -128,7 +129,9 @@ class Dual:
         deflation: MakeDeflation = SoftModes,
         without: Collection[str] = (),
         recycle: int | str = 0,
+        dimension: int = 3,
     ) -> None:
+        self._dimension = dimension
         self.keeps_directions = "kept_directions" not in without
         self.constraints, self.subdomains = constraints, subdomains
         self._given = constraints
@@ -265,7 +268,18 @@ class Dual:
             seen=self.seen,
             recycled=self.recycled,
             keeps=self.keeps_directions,
+            foundation=self.foundation,
         )
+
+    def foundation(self, count: int) -> Array:
+        """Return −σc/n^(1/(d − 1)) for n rows that carry together, on local rows. Collective.
+
+        One scaled row has about the stiffness σ of its nodes. Under n neighbours that are pressed
+        alike a half space gives way by so many times as much, as their width says.
+        """
+        sigma = mean_stiffness(self.subdomains, self.constraints.weights)
+        softer = count ** (1.0 / max(self._dimension - 1, 1))
+        return np.asarray(-sigma / softer * self.constraints.c.array_r)
 
     def saw(self, norm: float) -> None:
         """Store the estimate of ‖F‖ of a solve, for the next one, whose start may see far less."""

@@ -25,14 +25,19 @@ from tfeti_dolfinx.qp.problem import (
     StoppingRule,
     no_monitor,
 )
-from tfeti_dolfinx.qp.projection import UNBALANCED, WithinFace, project_onto_feasible
+from tfeti_dolfinx.qp.projection import (
+    UNBALANCED,
+    FeasiblePoint,
+    WithinFace,
+    project_onto_feasible,
+)
 from tfeti_dolfinx.qp.sets import Face, Status, face_of
 
 # --- Step 0: start ----------------------------------------------------------------------------
 
 
 def first_point(qp: QP) -> PETSc.Vec:
-    """Step 0: the least λ with open contact if that balances the load, else the least of Ω.
+    """Step 0: the least λ with open contact if that balances the load, else that of a foundation.
 
     With friction the latter: what is open would slip far first. Where e = 0 it is 0. Collective;
     multiplies by nothing.
@@ -51,7 +56,47 @@ def first_point(qp: QP) -> PETSc.Vec:
         out = bool(np.any(qp.feasible.project(lam.array_r) != lam.array_r))
         if held and not any_rank(qp.d.getComm().tompi4py(), out):
             return lam
-    return project_onto_feasible(qp.coarse, qp.feasible, zero).lam
+    return _on_foundation(qp, project_onto_feasible(qp.coarse, qp.feasible, zero))
+
+
+@dataclass(frozen=True)
+class FoundationParameters:
+    """Parameters of the foundation that a first point balances the load on.
+
+    Attributes:
+        max_it: Most projections.
+        alike: Share by which the numbers of rows that carry may differ at the end.
+    """
+
+    max_it: int = 20
+    alike: float = 0.1
+
+
+FOUNDATION = FoundationParameters()
+
+
+def _on_foundation(qp: QP, least: FeasiblePoint) -> PETSc.Vec:
+    """Return forces of rigid bodies on springs that balance the load: which rows touch first.
+
+    It is the feasible point nearest to the forces of springs that gaps press. How many rows carry
+    depends on how soft springs are, and that on how many carry: found by turns. Where the least λ
+    of Ω, which is taken over, does not balance the load, it is that. Collective.
+    """
+    if qp.foundation is None or least.missing > UNBALANCED:
+        return least.lam
+    comm, count, point = qp.d.getComm().tompi4py(), 1, least
+    for _ in range(FOUNDATION.max_it):
+        y = qp.d.duplicate()
+        y.array[:] = qp.foundation(count)
+        point.lam.destroy()
+        point = project_onto_feasible(qp.coarse, qp.feasible, y)
+        y.destroy()
+        before, lam = count, point.lam.array_r
+        touching = qp.feasible.face(lam, -lam).status == Status.TOUCHING
+        count = max(int(comm.allreduce(int(np.sum(touching & (lam != 0.0))))), 1)
+        if abs(count - before) <= FOUNDATION.alike * before:
+            break
+    return point.lam
 
 
 def feasible_start(qp: QP, start: Start) -> PETSc.Vec:

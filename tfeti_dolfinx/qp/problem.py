@@ -53,6 +53,8 @@ class QP:
         recycled: Directions of earlier solves, which those of PCPG are made F-orthogonal to.
         held: Flags of the local rows that are 0 on the face of ``coarse``; None: of no face.
         keeps: Whether a direction of PCPG is made conjugate to all before it, not the last alone.
+        foundation: Forces of a rank's rows if each were a spring that its gap presses, as stiff as
+            bodies are where so many rows carry together; None: unknown.
     """
 
     F: Operator
@@ -66,6 +68,7 @@ class QP:
     recycled: Recycled | None = None
     held: Array | None = None
     keeps: bool = True
+    foundation: Callable[[int], Array] | None = None
 
 
 @dataclass(frozen=True)
