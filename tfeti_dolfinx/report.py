@@ -319,8 +319,7 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
 
     def take(self, other: Report) -> None:
         """Take all fields of another report: a program may hold this one over many solves."""
-        for f in fields(self):
-            setattr(self, f.name, getattr(other, f.name))
+        vars(self).update(vars(other))
 
     @property
     def counters(self) -> dict[str, int]:

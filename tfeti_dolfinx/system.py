@@ -326,9 +326,15 @@ class System:
         self.change("points")
 
     def make(self, seconds: MutableMapping[str, float]) -> Dual:
-        """Make what is out of date; the dual problem. After an error its stage stays out of date.
+        """Make what is out of date, and return the dual problem; see ``make_up_to``."""
+        self.make_up_to("linear term", seconds)
+        return self.dual
+
+    def make_up_to(self, last: str, seconds: MutableMapping[str, float]) -> None:
+        """Make what is out of date up to a stage. After an error its stage stays out of date.
 
         Args:
+            last: Name of the stage.
             seconds: Takes the seconds of each stage.
 
         Raises:
@@ -342,7 +348,8 @@ class System:
                     make(self)
                 self._stale -= {name, BRINGS.get(name, name)}
                 self._made[name] += 1
-        return self.dual
+            if name == last:
+                break
 
     def sizes(self) -> Sizes:
         """Return the sizes, 0 before there are rows."""

@@ -89,6 +89,8 @@ class Exchange:
         return answers
 
     def _travel(self, rows: Array, sent: Array, received: Array) -> Array:
+        if self._comm.size == 1:
+            return np.array(rows)
         rows = np.ascontiguousarray(rows)
         out = np.empty((int(received.sum()), *rows.shape[1:]), dtype=rows.dtype)
         width = int(np.prod(rows.shape[1:], dtype=np.int64)) * rows.dtype.itemsize

@@ -15,7 +15,7 @@ from tfeti_dolfinx.common.validation import is_whole, shown
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.forces import Resultant, condition_areas, resultant
 from tfeti_dolfinx.contact.partner import ContactPartner, position_of
-from tfeti_dolfinx.contact.records import remaining_gaps, slips
+from tfeti_dolfinx.contact.records import relative_displacement
 from tfeti_dolfinx.contact.rigid_body import rotation_vector
 from tfeti_dolfinx.contact.tools import ToolMotion
 from tfeti_dolfinx.errors import InputError
@@ -283,7 +283,18 @@ class ContactState:
     @cached_property
     def remaining_gap(self) -> Array:
         """Gap after deformation of each contact condition of this rank. Collective at first use."""
-        return remaining_gaps(self.gluing.records, self.dofs, self.u)
+        records = self.gluing.records
+        return records.gap - np.sum(records.normal * self._relative, axis=1)
+
+    @cached_property
+    def _relative(self) -> Array:
+        """The v_i of all conditions, shape ``(n, gdim)``. Collective at first use."""
+        return relative_displacement(self.gluing.records, self.dofs, self.u)
+
+    @cached_property
+    def _slips(self) -> Array:
+        """The v_i along the tangents, shape ``(n, gdim - 1)``. Collective at first use."""
+        return np.einsum("ntg,ng->nt", self.gluing.records.tangents, self._relative)
 
     @cached_property
     def slip_of_conditions(self) -> Array:
@@ -292,7 +303,7 @@ class ContactState:
         Shape ``(n, gdim)``. Collective at first use.
         """
         records = self.gluing.records
-        slip = slips(records, self.dofs, self.u) - self.gluing.slip
+        slip = self._slips - self.gluing.slip
         return np.einsum("nt,ntg->ng", slip, records.tangents)
 
     @cached_property
@@ -303,7 +314,7 @@ class ContactState:
         one before for a slip. Collective at first use.
         """
         gluing, rows = self.gluing, self.gluing.tangents
-        at, end = gluing.constraints.sets.tangents, slips(gluing.records, self.dofs, self.u)
+        at, end = gluing.constraints.sets.tangents, self._slips
         rubs = np.any(self.lam[at] != 0.0, axis=1) & np.all(self.holding[at] | ~rows.moves, axis=1)
         kept = np.zeros(end.shape, dtype=bool)
         kept[rows.condition] = rubs[:, None] & rows.moves

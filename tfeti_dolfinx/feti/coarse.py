@@ -102,6 +102,8 @@ class CoarseSpace(Coarse):
         self._damped: tuple[Face, float, SemidefiniteFactor] | None = None
 
     def _load(self) -> Array:
+        if not self.dimension:
+            return np.zeros(0)
         e = np.concatenate(self.comm.allgather(self.subdomains.kernel_load))
         return self._basis.products(e)
 
@@ -167,11 +169,12 @@ class CoarseSpace(Coarse):
             below: Motions of a single body that are held by less than this share of what the
                 same rows hold at most are taken in, too.
         """
-        grams = self.comm.gather(self.J[rows].T @ self.J[rows], root=0)
+        J = self.J[rows]
+        grams = self.comm.gather(J.T @ J, root=0)
         found: Any = None
         with raised_on_all_ranks(self.comm):
             if grams is not None:
-                found = unresisted(csr_array(sum(grams)), within or self.unheld, below)
+                found = unresisted(sum(grams[1:], grams[0]), within or self.unheld, below)
         return cast(Motions, bcast_from_root(self.comm, found))
 
 

@@ -178,18 +178,20 @@ class _OnFace:
         self._on_all, self._face, self._Z_C, self._factor = on_all, face, Z_C, factor
         bends = bent > 0.0
         self._bent, self._bends = bent, bool(np.any(bends))
-        self._springs = csr_array(Z_C[:, bends])
+        self._onto_contact, self._springs = csr_array(Z_C.T), csr_array(Z_C[:, bends])
+        self._to_springs = csr_array(self._springs.T)
         self._moves, self._sizes = bent[bends], size[bends]
 
     def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = M_f x: displacements of the trace, of what is next to it, of springs. Collective."""
         on, springs, moves, sizes = self._on_all, self._springs, self._moves, self._sizes
+        to_springs = self._to_springs
         B, w, D = on.whole.B, on.work, on.weights
         trace, size = w.getLocalSize(), len(D)
 
         def lifted() -> Array:  # B_Dᵀ y
             B.multTranspose(y, w)
-            return np.concatenate((w.array_r, np.zeros(size - trace), springs.T @ y.array_r))
+            return np.concatenate((w.array_r, np.zeros(size - trace), to_springs @ y.array_r))
 
         def put_jumps(v: Array) -> None:  # y = B_D v
             w.array[:] = v[:trace]
@@ -220,7 +222,7 @@ class _OnFace:
         values = self._face.restricted(x)
         if self._factor is None and not self._bends:
             return values
-        contact = self._Z_C.T @ values
+        contact = self._onto_contact @ values
         solved = contact / (1.0 + self._bent)
         if self._factor is not None:
             solved = self._factor.solve(contact)

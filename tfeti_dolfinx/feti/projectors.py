@@ -133,10 +133,7 @@ class SemidefiniteFactor:
     ) -> None:
         self.comm, self._null = comm, null
         self._scale, pinned = _scaling(A, null)
-        scaled = csr_array(A, copy=True)  # quicker than products of sparse matrices
-        scaled.data *= np.repeat(self._scale, np.diff(A.indptr))
-        scaled.data *= self._scale[A.indices]
-        self._A = csr_array(scaled + diags_array(pinned)) if np.any(pinned) else scaled
+        self._A = _scaled(A, self._scale, pinned)
         self._factor: CholeskyFactor | None = None
         for self._shift in SHIFTS if A.shape[0] else ():
             lost = False
@@ -183,6 +180,13 @@ def _scaling(A: csr_array, null: csr_array) -> tuple[Array, Array]:
     return scale, pinned
 
 
+def _scaled(A: csr_array, scale: Array, pinned: Array) -> csr_array:
+    """SAS + diag(pinned)."""
+    data = A.data * np.repeat(scale, np.diff(A.indptr)) * scale[A.indices]
+    scaled = csr_array((data, A.indices, A.indptr), shape=A.shape)
+    return csr_array(scaled + diags_array(pinned)) if np.any(pinned) else scaled
+
+
 def _without(null: csr_array, x: Array) -> Array:
     """x less its part in the null space."""
     return np.asarray(x - null @ (null.T @ x)) if null.shape[1] else x
@@ -194,7 +198,8 @@ def _without(null: csr_array, x: Array) -> Array:
 class ObliqueProjectors:
     """P = Z(I − G_fᵀH⁺G(I + C)Z)Zᵀ with H = G(I + C)ZG_fᵀ, of a face and C. Collective.
 
-    λ = (I + C)u moves with u in the face: G(I + C)u = 0 for u = Pv, and P makes nothing of what
+    λ = (I + C)u moves with u in the face, C led by rows that are directions of their own (normals):
+    G(I + C)u = 0 for u = Pv, and P makes nothing of what
     G_fᵀ gives. With C = 0 it is the orthogonal projector of the face. H is G_fG_fᵀ and a part that
     has the same null space; scaled and pinned as in ``SemidefiniteFactor``.
 
@@ -212,15 +217,18 @@ class ObliqueProjectors:
         comm: MPI.Intracomm,
     ) -> None:
         self._comm, self._face, self._Gt, self._null = comm, face, Gt, null
-        self._following = csr_array(C.T @ Gt)
-        part = csr_array((face.Z.T @ self._following).T @ (face.Z.T @ Gt))
+        following = csr_array(C.T @ Gt)
+        self._G = csr_array(Gt + following).T
+        led = np.flatnonzero(face.free & (np.diff(following.indptr) > 0))
+        part = csr_array(following[led].T @ Gt[led])
         A, N = grams.of_face(face), replicated(part, comm)
         self._scale, pinned = _scaling(A, null)
-        S, self._factor = diags_array(self._scale), None
+        self._factor = None
         with raised_on_all_ranks(comm):
             try:
                 if Gt.shape[1]:
-                    self._factor = splu(csc_array(S @ (A + N) @ S + diags_array(pinned)))
+                    H = _scaled(csr_array(A + N), self._scale, pinned)
+                    self._factor = splu(csc_array(H))
             except RuntimeError as error:
                 raise FactorError(f"the coarse problem of a face with friction: {error}") from error
 
@@ -234,7 +242,7 @@ class ObliqueProjectors:
     def coordinates(self, x: Array) -> Array:
         """H⁺G(I + C)ZZᵀx, replicated, shape ``(r,)`` or ``(r, q)``. Collective."""
         own = self._face.restricted(x)
-        return self._solve(summed(self._comm, self._Gt.T @ own + self._following.T @ own))
+        return self._solve(summed(self._comm, self._G @ own))
 
     def project(self, x: Array) -> Array:
         """P x, shapes ``(m_local,)`` or ``(m_local, q)``. Collective."""

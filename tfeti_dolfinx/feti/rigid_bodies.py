@@ -68,6 +68,8 @@ TOLERANCES = MotionTolerances()
 
 def parts_of_columns(A: csr_array) -> Iterator[tuple[Array, Array, Array]]:
     """Columns of A that meet in rows, these rows, and the dense matrix there; part by part."""
+    if A.shape[1] == 0:
+        return
     columns = csc_array(A)
     columns.sort_indices()
     touched = csr_array(
@@ -177,46 +179,75 @@ def unresisted(gram: csr_array, within: Motions, below: float = TOLERANCES.null)
         below: Motions of a single body held by less than this share of its stiffest motion are
             taken in too; those of several bodies must be free (and may have parts in those).
     """
-    k, null, V = within.free.shape[1], TOLERANCES.null, block_diagonal(within.single)
+    V, free, null = within.single, within.free, TOLERANCES.null
+    i, j, blocks = _blocks_of(gram, len(V), free.shape[1])
+
+    def between(U: Array, A: Array) -> Array:
+        return np.asarray(np.swapaxes(U[i], 1, 2) @ A @ U[j])
+
+    def of_bodies(A: Array) -> Array:
+        found = np.zeros(V.shape)
+        found[i[i == j]] = A[i == j]
+        return found
+
     # 1. scale; rows that hold only what is not in the space leave their rounding there
-    kept = diags_array(within.free.ravel().astype(float))
-    whole = csr_array(V.T @ gram @ V)
-    A = csr_array(kept @ whole @ kept)
+    whole = between(V, blocks)
+    A = np.where(free[i][:, :, None] & free[j][:, None, :], whole, 0.0)
     largest, at_all = (
-        np.linalg.eigvalsh(diagonal_blocks(matrix, k)).max(axis=1, initial=0.0)
-        for matrix in (A, whole)
+        np.linalg.eigvalsh(of_bodies(matrix)).max(axis=1, initial=0.0) for matrix in (A, whole)
     )
     grip = largest > null * at_all
-    scale = diags_array(np.repeat(np.where(grip, np.where(grip, largest, 1.0) ** -0.5, 0.0), k))
-    A = csr_array(scale @ A @ scale)
+    scale = np.where(grip, np.where(grip, largest, 1.0) ** -0.5, 0.0)
+    A = A * (scale[i] * scale[j])[:, None, None]
     # 2. single bodies; twice the stiffest motion keeps apart what is not in the space
-    blocks = diagonal_blocks(A, k)
-    blocks[:, np.arange(k), np.arange(k)] += np.where(within.free, 0.0, 2.0)
-    stiffness, vectors = np.linalg.eigh(blocks)
+    apart = np.where(free, 0.0, 2.0)[:, :, None] * np.eye(free.shape[1])
+    stiffness, vectors = np.linalg.eigh(of_bodies(A) + apart)
     held = (stiffness > null) & (stiffness < 1.5)
     # 3. several bodies, in coordinates in which each alone resists all its motions alike
-    U = block_diagonal(vectors * (np.where(held, stiffness, 1.0) ** -0.5)[:, None, :])
-    U = csr_array(U[:, np.flatnonzero(held.ravel())])
-    joint = scale @ (U @ _null_space(csr_array(U.T @ A @ U), np.nonzero(held)[0]))
-    single = within.single @ vectors
-    return Motions(single, stiffness <= below, np.maximum(stiffness, 0.0), csr_array(V @ joint))
+    U = vectors * np.where(held, np.where(held, stiffness, 1.0) ** -0.5, 0.0)[:, None, :]
+    way = scale[:, None, None] * (V @ U)
+    joint = [
+        ((len(free[0]) * own[:, None] + np.arange(len(free[0]))).ravel(), way[own] @ X)
+        for own, X in _null_space(between(U, A), i, j, held)
+    ]
+    parts = [(rows, X.reshape(len(rows), -1)) for rows, X in joint]
+    return Motions(
+        V @ vectors, stiffness <= below, np.maximum(stiffness, 0.0), on_rows(parts, free.size)
+    )
 
 
-def _null_space(A: csr_array, body: Array) -> csr_array:
-    """Null space of a Gram matrix with unit blocks, by components of bodies."""
-    n, parts = A.shape[0], []
-    if n == 0:
-        return csr_array((0, 0))
-    strong = csr_array((abs(A.data) > TOLERANCES.null, A.indices, A.indptr), shape=A.shape)
-    members = csr_array((np.ones(n), (body, np.arange(n))))
-    _, label = connected_components(members @ strong @ members.T, directed=False)
-    component = label[body]
-    order = np.argsort(component, kind="stable")
-    for own in np.split(order, np.flatnonzero(np.diff(component[order])) + 1):
-        if body[own[0]] != body[own[-1]]:  # of a body alone nothing is left free
-            values, vectors = np.linalg.eigh(A[own][:, own].toarray())
-            parts.append((own, vectors[:, values <= TOLERANCES.null * len(own)]))
-    return on_rows(parts, n)
+def _blocks_of(A: csr_array, n: int, k: int) -> tuple[Array, Array, Array]:
+    """Rows and columns of k × k blocks of a sparse matrix that has n of them, and the blocks."""
+    entries = A.tocoo()
+    row, column = (index.astype(np.int64) for index in entries.coords)
+    places, which = np.unique(row // k * n + column // k, return_inverse=True)
+    blocks = np.zeros((len(places), k, k))
+    np.add.at(blocks, (which, row % k, column % k), entries.data)
+    return places // max(n, 1), places % max(n, 1), blocks
+
+
+def _null_space(blocks: Array, i: Array, j: Array, held: Array) -> Iterator[tuple[Array, Array]]:
+    """Null space of a Gram matrix with unit diagonal blocks, by components of bodies.
+
+    Yields the bodies of a component, and its part of the null space, shape ``(bodies, k, c)``.
+    """
+    n, k = held.shape
+    strong = np.abs(blocks).max(axis=(1, 2), initial=0.0) > TOLERANCES.null
+    if not np.any(strong & (i != j)):
+        return
+    links = csr_array((strong[strong], (i[strong], j[strong])), shape=(n, n))
+    label = connected_components(links, directed=False)[1]
+    place = np.empty(n, dtype=np.int64)
+    for component in np.flatnonzero(np.bincount(label, minlength=1) > 1):
+        own, some = np.flatnonzero(label == component), np.flatnonzero(label[i] == component)
+        place[own] = np.arange(len(own))
+        A = np.zeros((len(own), k, len(own), k))
+        A[place[i[some]], :, place[j[some]]] = blocks[some]
+        inside = held[own].ravel()
+        values, vectors = np.linalg.eigh(A.reshape(len(inside), -1)[np.ix_(inside, inside)])
+        X = np.zeros((len(inside), len(values)))
+        X[inside] = vectors
+        yield own, X[:, values <= TOLERANCES.null * len(values)].reshape(len(own), k, -1)
 
 
 # --- Rigid motions of bodies in kernel coordinates --------------------------------------------

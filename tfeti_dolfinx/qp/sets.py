@@ -340,7 +340,8 @@ class Ellipses:
         t = self._points(x)
         outside = self._level(t) > 1.0
         nearest = np.where(self._moves, t, 0.0)
-        nearest[outside] = self._nearest(t[outside], outside)
+        if np.any(outside):
+            nearest[outside] = self._nearest(t[outside], outside)
         return np.asarray(nearest.ravel())
 
     def split(self, x: Array, g: Array) -> tuple[Array, Array]:
@@ -392,7 +393,8 @@ class Ellipses:
         t = np.where(self._moves, self._points(x), 0.0)
         slips = np.any(self._points(status) == Status.SLIP, axis=1)
         inward = slips & (self._level(t) < 1.0) & np.any(t != 0.0, axis=1)
-        values[inward] = self._nearest(t[inward], inward)
+        if np.any(inward):
+            values[inward] = self._nearest(t[inward], inward)
         return np.asarray(values.ravel())
 
     def _points(self, x: Array) -> Array:

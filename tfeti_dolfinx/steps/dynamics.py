@@ -406,10 +406,10 @@ class ContactDynamics(ContactProblem):
         """Return the displacement that contact allows the bodies without elasticity."""
         system, forms = self._system, self._forms_in_time
         system.look_for_changes()
-        system.make(self._seconds)
+        system.make_up_to("right side", self._seconds)
         if system.search.take_in_overlapping(self.dofs.to_primal(free), 0.0):
             system.change("rows")
-            system.make(self._seconds)
+            system.make_up_to("right side", self._seconds)
         return predictor.nearest(free, forms.matrices[1], system.gluing)
 
     def _look(self) -> None:

@@ -278,7 +278,7 @@ class Subdomains:
         found = np.array(values, dtype=float).T
         return np.ascontiguousarray(self._on_bodies(found, (len(values),)).T)
 
-    def body_maxima(self, values: Sequence[Sequence[float]]) -> Array:
+    def body_maxima(self, values: Sequence[Sequence[float]] | Array) -> Array:
         """Largest over the Blocks of each body, at least 0, as in ``body_sums``. Collective."""
         found = np.array(values, dtype=float).T
         return np.ascontiguousarray(self._on_bodies(found, (len(values),), np.maximum, MPI.MAX).T)
@@ -309,11 +309,16 @@ class Subdomains:
         u[self.trace] = v
         return u
 
-    def sizes(self, u: Array) -> list[float]:
-        """Longest displacement of a node in each Block, u of shape ``(n,)``."""
-        pairs = zip(self.blocks, self.dof_parts, strict=True)
-        nodes = [u[part].reshape(-1, block.bs) for block, part in pairs]
-        return [float(np.linalg.norm(x, axis=1).max(initial=0.0)) for x in nodes]
+    def body_sizes(self, displacements: Sequence[Array]) -> Array:
+        """Longest displacement of a node of each body, shape ``(q, b)``. Collective.
+
+        Of q displacements, each of shape ``(n,)``.
+        """
+        u, found = np.array(displacements), np.zeros((len(self.blocks), len(displacements)))
+        for at, (block, part) in enumerate(zip(self.blocks, self.dof_parts, strict=True)):
+            nodes = u[:, part].reshape(len(u), -1, block.bs)
+            found[at] = np.einsum("qni,qni->qn", nodes, nodes).max(axis=1, initial=0.0)
+        return self.body_maxima(np.sqrt(found).T)
 
     def _on_bodies(
         self,
