@@ -77,6 +77,22 @@ def test_rotations_beyond_linear_kinematics_are_warned_of(size):
     assert size == 0.5 or p.report.warnings == []
 
 
+def test_warnings_can_be_switched_off():
+    """Of a part that turns, and motions that a floor leaves free; the answer stays."""
+    floor = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)))
+    scenes = [{"traction": (0.0, -0.5)}, {"contacts": [floor], "clamped": ()}]
+    for found, scene in zip(("warnings", "nearly_free"), scenes, strict=True):
+        p, q = (
+            problem(decomposed("quadrilateral", 4, 4), **scene, warnings=switch)
+            for switch in ("on", "off")
+        )
+        p.solve()
+        q.solve()
+        assert getattr(p.report, found)
+        assert q.report.warnings == q.report.nearly_free == []
+        assert np.array_equal(p.u.x.array, q.u.x.array)
+
+
 def test_a_body_that_turns_is_named_and_one_that_moves_is_not():
     """Rigid motions that are prescribed: a rotation by 0.2, a translation by 5."""
     parts = [("a", (0.0, 0.0), (1.0, 1.0), (2, 2)), ("b", (3.0, 0.0), (4.0, 1.0), (2, 2))]

@@ -153,6 +153,9 @@ class Options:
     error_if_not_converged: bool = described(
         True, "all", "raise ConvergenceError where a solver stops before its tolerance"
     )
+    warnings: bool = described(
+        True, "all", "look after each solve for what makes its answer less sure, for the report"
+    )
     monitor: bool = described(False, "all", "print a line per step")
     converged_reason: bool = described(False, "all", "print why the solver stopped")
     view: bool = described(False, "all", "print the options, the sizes and the report")

@@ -304,8 +304,14 @@ class ContactProblem:
         # 3. what the report says of it
         self._counts = self._counts.plus(SolverCounts.of_run(dual, *solved))
         excluding = system.search.named(gluing.contacts_of(result.excluding))
-        outcome = Outcome.of_answer(solution, dual, *solved, excluding, of_looks(accuracy.reached))
-        warnings = self._diagnostics.found(dual, solution, outcome, options.number)
+        state, loose = accuracy.recovered, list[dict[str, object]]()
+        if options.warnings and state is not None:
+            loose = dual.nearly_free(state.active)
+        looks = of_looks(accuracy.reached)
+        outcome = Outcome.of_answer(solution, dual, *solved, excluding, looks, loose)
+        warnings = list[str]()
+        if options.warnings:
+            warnings = self._diagnostics.found(dual, solution, outcome, options.number)
         method = f"{options.qp_type} + {options.pc_type}"
         self._outcome = replace(outcome, warnings=warnings, notes=notes_of(outcome), solver=method)
         result.destroy()

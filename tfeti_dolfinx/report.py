@@ -248,6 +248,7 @@ class Outcome:
         settling: FixedPointStatus,
         excluding: list[str],
         estimates: dict[str, float],
+        nearly_free: list[dict[str, object]],
     ) -> Self:
         """Measure an answer, warnings apart. Collective."""
         status, normals = solution.status_of_conditions, solution.gluing.constraints.sets.normals
@@ -256,7 +257,6 @@ class Outcome:
             np.sum(status == ContactStatus.STICK),
             np.sum(status == ContactStatus.SLIP),
         )
-        recovered = accuracy.recovered
         active, sticking, sliding = dual.coarse.comm.allreduce(np.array(own)).tolist()
         return cls(
             contacts=ContactSummary.of_solution(solution),
@@ -264,7 +264,7 @@ class Outcome:
             kernel_dim=dual.coarse.dimension,
             soft_modes=0 if dual.soft is None else dual.soft.count,
             free_modes=dual.coarse.num_free_motions,
-            nearly_free=[] if recovered is None else dual.nearly_free(recovered.active),
+            nearly_free=nearly_free,
             excluding_contacts=excluding,
             active_contacts=active,
             sticking=sticking,
