@@ -93,27 +93,21 @@ def solved(gdim, parts, cells, boundary):
 
 def extremes_of_F(dual):
     """Least and largest eigenvalue of PFP on the range of P."""
-    x, y = dual.d.duplicate(), dual.d.duplicate()
+    size, P = len(dual.d), dual.coarse.project
 
     def projected(values, shift):
         """PFPx + shift·(I − P)x."""
-        x.array[:] = values.ravel()
-        dual.coarse.project(x)
-        kernel = shift * (values.ravel() - x.array_r) if shift else 0.0
-        dual.F.mult(x, y)
-        dual.coarse.project(y)
-        return y.array_r + kernel
+        x = P(values.ravel())
+        return P(dual.F(x)) + shift * (values.ravel() - x)
 
     def extreme(which, shift):
-        operator = LinearOperator((x.size, x.size), lambda v: projected(v, shift), dtype=float)
-        start = np.random.default_rng(0).standard_normal(x.size)
+        operator = LinearOperator((size, size), lambda v: projected(v, shift), dtype=float)
+        start = np.random.default_rng(0).standard_normal(size)
         found = eigsh(operator, 1, which=which, v0=start, tol=ACCURACY, return_eigenvectors=False)
         return float(found[0])
 
     largest = extreme("LA", 0.0)
     least = extreme("SA", largest)  # what P takes away is moved to the other end
-    x.destroy()
-    y.destroy()
     return least, largest
 
 

@@ -67,7 +67,6 @@ def exact(p):
     start = (p.solution.lam, np.zeros(p.dual.coarse.dimension))
     options = replace(p.options, rtol=1e-13, qp_type="newton", error_if_not_converged=False)
     result, rule = solve_dual(p.dual, options, "newton", start)
-    result.destroy()
     return rule.u
 
 

@@ -10,6 +10,7 @@ from test_qp import matrix, random_program, vector
 from test_solvable_lp import dual_of
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.common.parallel import dot_over, norm_over
 from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.krylov import pcpg
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Point, ResidualRule, Steps
@@ -71,11 +72,8 @@ FACES = {
 }
 
 
-def random_vec(dual, seed):
-    vec = dual.d.duplicate()
-    rng = np.random.default_rng(10 * seed + dual.coarse.comm.rank)
-    vec.array[:] = rng.standard_normal(vec.getLocalSize())
-    return vec
+def random_vector(dual, seed):
+    return np.random.default_rng(10 * seed + dual.coarse.comm.rank).standard_normal(len(dual.d))
 
 
 def gathered(dual, rows):
@@ -87,41 +85,32 @@ def gathered(dual, rows):
 def test_projectors_of_a_face(dual, kind):
     """P is idempotent, symmetric, kills Z G_fᵀ and what is not in Z, and is the dense one."""
     face = FACES[kind](dual)
-    coarse = dual.coarse.on_face(face)
-    x, y, Px, Py, Qx = (random_vec(dual, seed) for seed in range(5))
-    for vec, copy in ((x, Px), (y, Py)):
-        vec.copy(copy)
-        coarse.project(copy)
-    size = x.norm() * y.norm()
-    assert abs(Px.dot(y) - x.dot(Py)) <= 1e-10 * size
-    twice = Px.copy()
-    coarse.project(twice)
-    twice.axpy(-1.0, Px)
-    assert twice.norm() <= 1e-10 * x.norm()
-    assert np.allclose(face.restricted(Px.array_r), Px.array_r, atol=1e-10)
-    coarse.apply_Q(x, Qx)
-    assert coarse.norm_Q(x) == pytest.approx(Qx.norm(), rel=1e-8)
-    assert np.allclose(Px.array_r + Qx.array_r, face.restricted(x.array_r), atol=1e-9)
-    mu = np.random.default_rng(0).standard_normal(dual.coarse.dimension)
-    coarse.combine(mu, y)
-    size = y.norm()
-    coarse.project(y)
-    assert y.norm() <= 1e-9 * size
+    coarse, comm = dual.coarse.on_face(face), dual.coarse.comm
+    x, y = (random_vector(dual, seed) for seed in range(2))
+    Px, Py, Qx = coarse.project(x), coarse.project(y), coarse.Q(x)
+    one, other = dot_over(comm, (Px, y), (x, Py))
+    assert abs(one - other) <= 1e-10 * norm_over(comm, x) * norm_over(comm, y)
+    assert norm_over(comm, coarse.project(Px) - Px) <= 1e-10 * norm_over(comm, x)
+    assert np.allclose(face.restricted(Px), Px, atol=1e-10)
+    assert coarse.norm_Q(x) == pytest.approx(norm_over(comm, Qx), rel=1e-8)
+    assert np.allclose(Px + Qx, face.restricted(x), atol=1e-9)
+    y = coarse.combined(np.random.default_rng(0).standard_normal(dual.coarse.dimension))
+    assert norm_over(comm, coarse.project(y)) <= 1e-9 * norm_over(comm, y)
     Gt = gathered(dual, face.restricted(dual.coarse.Gt.toarray()))
     U, values, _ = np.linalg.svd(Gt, full_matrices=False)
     U = U[:, values > 1e-9 * values[0]]
-    masked = gathered(dual, face.restricted(x.array_r))
-    assert np.allclose(gathered(dual, Px.array_r), masked - U @ (U.T @ masked), atol=1e-8)
+    masked = gathered(dual, face.restricted(x))
+    assert np.allclose(gathered(dual, Px), masked - U @ (U.T @ masked), atol=1e-8)
 
 
 @pytest.mark.parametrize("kind", list(FACES))
 def test_the_particular_solution_of_a_face(dual, kind):
     """It has rows of the face alone, and Gλ = e where the face holds all bodies."""
     face = FACES[kind](dual)
-    coarse, lam = dual.coarse.on_face(face), dual.d.duplicate()
-    coarse.particular(lam)
-    assert np.allclose(face.restricted(lam.array_r), lam.array_r)
-    left = dual.coarse.e - dual.coarse.G(lam.array_r)
+    coarse = dual.coarse.on_face(face)
+    lam = coarse.particular()
+    assert np.allclose(face.restricted(lam), lam)
+    left = dual.coarse.e - dual.coarse.G(lam)
     Gt = gathered(dual, face.restricted(dual.coarse.Gt.toarray()))
     rank = np.linalg.matrix_rank(Gt, tol=1e-9 * np.linalg.norm(Gt, 2))
     if rank == dual.coarse.dimension - dual.coarse.num_free_motions:
@@ -144,14 +133,14 @@ def test_pcpg_on_a_face(preconditioned, with_coarse):
     helper = matrix(Z @ np.linalg.inv(Z.T @ F @ Z) @ Z.T) if preconditioned else None
     on_face = replace(qp, coarse=coarse.on_face(face), preconditioner=helper)
     start = np.random.default_rng(5).standard_normal(40)
-    lam, g, steps = vector(start), vector(F @ start - d), Steps()
-    reason = pcpg(on_face, Point(lam, g), ResidualRule(1e-11), steps, 100)
+    point, steps = Point(start, F @ start - d), Steps()
+    reason = pcpg(on_face, point, ResidualRule(1e-11), steps, 100)
     assert reason == ConvergedReason.CONVERGED_RTOL
     assert steps.cg <= (12 if preconditioned else 26)
-    assert np.allclose(g.array_r, F @ lam.array_r - d, atol=1e-9)
+    assert np.allclose(point.g, F @ point.lam - d, atol=1e-9)
     GZ = G @ Z if with_coarse else np.zeros((0, 25))
     r = len(GZ)
     KKT = np.block([[Z.T @ F @ Z, GZ.T], [GZ, np.zeros((r, r))]])
     right = np.concatenate((-Z.T @ (F @ start - d), np.zeros(r)))
     exact = start + Z @ np.linalg.solve(KKT, right)[:25]
-    assert np.allclose(lam.array_r, exact, atol=1e-9)
+    assert np.allclose(point.lam, exact, atol=1e-9)

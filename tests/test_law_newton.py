@@ -19,7 +19,7 @@ from tfeti_dolfinx.qp.friction_newton import (
     LawProgram,
     newton_on_law,
 )
-from tfeti_dolfinx.qp.problem import QP, LocalProgram
+from tfeti_dolfinx.qp.problem import QP
 
 SEEDS = st.integers(0, 1000)
 DIMENSIONS = st.sampled_from([1, 2])
@@ -73,7 +73,7 @@ def solve(F, d, G, e, law, target=1e-10):
     def oblique(face, C):
         return DenseOblique(G, face, C)
 
-    program = LawProgram(LocalProgram(qp), law, oblique, 3.0)
+    program = LawProgram(qp, law, oblique, 3.0)
     zero = LawPoint(np.zeros(len(d)), -d, np.zeros(len(e)))
     return program, *newton_on_law(program, zero, target)
 

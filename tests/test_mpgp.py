@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mpi4py import MPI
 from reference.conic import constrained_qp
 from test_discs import discs
 from test_qp import matrix, to, vector
@@ -50,11 +51,11 @@ def test_smalse_agrees_with_an_interior_point_method(seed, k, isotropic):
     F, d, G, e, bounded, pairs, a = program(seed, k, isotropic)
     coarse, feasible = DenseCoarse(G, e), as_set(bounded, pairs, a, isotropic)
     qp = QP(matrix(F), vector(d), coarse, feasible)
-    qp = replace(qp, norm=estimate_norm(qp.F, coarse, qp.d, 60))
+    qp = replace(qp, norm=estimate_norm(qp.F, coarse, 60))
     homogenised = homogenise(qp)
     result = smalse(qp, homogenised, to(1e-10, homogenised), max_it=20_000)
     assert result.reason == ConvergedReason.CONVERGED_RTOL
-    lam = result.lam.array
+    lam = result.lam
     exact = constrained_qp(F, d, G, e, bounded, pairs, a)
     assert np.linalg.norm(lam - exact) <= 1e-7 * np.linalg.norm(exact)
     assert np.allclose(feasible.project(lam), lam, rtol=0, atol=1e-13)
@@ -66,8 +67,8 @@ def test_mpgp_slides_sticks_and_falls_off():
     A[0, 1] = A[1, 0] = 0.5
     b = np.array([3.0, 1.0, 0.3, 0.4, 1.0, 1.0])
     around = discs([1.0, 1.0, 0.0])
-    x, g, steps = vector(np.zeros(6)), vector(-b), Steps()
-    state = MprgpIterate(matrix(A), x, g, around)
+    steps = Steps()
+    state = MprgpIterate(matrix(A), np.zeros(6), -b, around, MPI.COMM_SELF)
     parameters = MprgpParameters(1.0 / 6.5)
     assert mprgp(state, parameters, lambda s: s.projected_gradient <= 1e-9, steps, 500) is None
     exact = constrained_qp(
@@ -79,20 +80,20 @@ def test_mpgp_slides_sticks_and_falls_off():
         np.arange(6).reshape(3, 2),
         np.array([[1.0] * 2] * 2 + [[0.0] * 2]),
     )
-    assert np.allclose(x.array, exact, atol=1e-9)
+    assert np.allclose(state.x, exact, atol=1e-9)
     slip, stick, fixed = Status.SLIP, Status.STICK, Status.OPEN
-    assert state.face().status.tolist() == [slip, slip, stick, stick, fixed, fixed]
-    assert np.allclose(g.array, A @ x.array - b, atol=1e-12)
+    assert around.face(state.x, state.g).status.tolist() == [slip, slip, stick, stick, fixed, fixed]
+    assert np.allclose(state.g, A @ state.x - b, atol=1e-12)
     assert steps.proportioning > 0
 
 
 def test_the_cost_falls_in_each_step():
     F, d, _, _, bounded, pairs, a = program(3, 2, True)
-    x, costs = vector(np.zeros(40)), []
-    state = MprgpIterate(matrix(F), x, vector(-d), as_set(bounded, pairs, a, True))
+    costs, feasible = [], as_set(bounded, pairs, a, True)
+    state = MprgpIterate(matrix(F), np.zeros(40), -d, feasible, MPI.COMM_SELF)
 
     def stop(s):
-        costs.append(0.5 * float(s.x.array @ (s.g.array - d)))
+        costs.append(0.5 * float(s.x @ (s.g - d)))
         return s.projected_gradient <= 1e-10
 
     assert mprgp(state, MprgpParameters(1.0 / np.linalg.norm(F, 2)), stop, Steps(), 2000) is None

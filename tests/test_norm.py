@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_qp import matrix, vector
+from test_qp import matrix
 
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.coarse import DenseCoarse
@@ -40,7 +40,6 @@ def test_norm_of_any_spectrum(kind):
     estimate = estimate_norm(
         matrix(F),
         DenseCoarse(np.zeros((0, SIZE)), np.zeros(0)),
-        vector(np.zeros(SIZE)),
         Options().norm_steps,
     )
     holds(estimate, np.linalg.norm(F, 2))

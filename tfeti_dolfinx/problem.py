@@ -293,7 +293,7 @@ class ContactProblem:
         result, accuracy, settling = solved
         # 2. their displacement
         with stage("recovery", seconds):
-            multipliers = Multipliers(np.array(result.lam.array_r), result.face)
+            multipliers = Multipliers(result.lam.copy(), result.face)
             nodal = dual.subdomains.num_nodal
             system.tools.take(accuracy.u[nodal:])
             u = accuracy.u[:nodal]
@@ -314,7 +314,6 @@ class ContactProblem:
             warnings = self._diagnostics.found(dual, solution, outcome, options.number)
         method = f"{options.qp_type} + {options.pc_type}"
         self._outcome = replace(outcome, warnings=warnings, notes=notes_of(outcome), solver=method)
-        result.destroy()
         restless = settling.restless(d.body_names)
         conclude(result, accuracy, self.options, d.comm, excluding, restless, warnings)
         return solution, accuracy.tolerances().jump

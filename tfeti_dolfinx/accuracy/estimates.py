@@ -80,10 +80,7 @@ def estimate(system: System, solution: Solution) -> Estimates:
     dual, u = system.dual, system.subdomains.with_rigid(solution.u)
     comm, counters = dual.coarse.comm, dual.subdomains.counters
     start, factored = perf_counter(), counters.factorizations
-    lam = dual.d.duplicate()
-    lam.array[:] = solution.lam
-    bound = energy_bound(dual, lam, u, dual.seen)
-    lam.destroy()
+    bound = energy_bound(dual, solution.lam, u, dual.seen)
     squares = [float(sum(dual.subdomains.energies(u))), 0.0]
     if solution.has_stress:
         squares[1] = float(np.sum(solution.discretisation_error.x.array**2))

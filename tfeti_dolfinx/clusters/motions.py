@@ -15,11 +15,10 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import Exchange, bcast_from_root, chunk_offsets, summed
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.coarse import CoarseSpace, products, side_by_side
-from tfeti_dolfinx.feti.deflation import Deflation, SoftModes, mean_stiffness
+from tfeti_dolfinx.feti.deflation import Balanced, Deflation, SoftModes, mean_stiffness
 from tfeti_dolfinx.feti.operator import DualOperator
 from tfeti_dolfinx.feti.preconditioner import chebyshev
 from tfeti_dolfinx.feti.projectors import FaceFactors, SemidefiniteFactor, replicated
-from tfeti_dolfinx.qp.balanced import Balanced
 from tfeti_dolfinx.qp.problem import FaceOperator
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor
@@ -224,7 +223,11 @@ class ClusterMotions:
         self.factors = FaceFactors(coarse.comm, csr_array((self._width, 0)), prefix)
 
     def balanced(self, face: Face, on_face: FaceOperator) -> FaceOperator:
-        """M_f with these motions. Collective.
+        """M_f with these motions: Y = ZZᵀĜᵀ, C = XYᵀ, X of ``ClusterSteps``. Collective.
+
+        For X = (ĜĜᵀ)⁺, D = 0 that is what plain TFETI has: M_f between its projectors. Whatever X
+        is, a jump that averages allow becomes forces of a displacement that has it, R̂XĜ and what
+        M_f makes of the rest, so that no eigenvalue of M F is below 1.
 
         Args:
             face: The face.
@@ -240,7 +243,26 @@ class ClusterMotions:
             part = csr_array(self._base + _gram(contact))
         A = self._assembled(part)
         inner = ClusterSteps(self._coarse.comm, self._own, self._of_clusters(A), A, self._prefix)
-        return Balanced(on_face, _Inner(face, self._Gt, self._own.energy, inner))
+        alpha, x = self._Gt.createVecs()
+
+        def forces(c: Array) -> Array:
+            alpha.array[:] = c
+            self._Gt.mult(alpha, x)
+            return face.restricted(x.array_r)
+
+        def moved(y: Array) -> Array:
+            x.array[:] = face.restricted(y)
+            self._Gt.multTranspose(x, alpha)
+            return np.array(alpha.array_r)
+
+        return Balanced(
+            on_face,
+            self._own.energy,
+            solve=inner.solve,
+            forces=forces,
+            moved=moved,
+            owned=(inner, alpha, x),
+        )
 
     def _assembled(self, part: csr_array) -> PETSc.Mat:
         """Return the sum of all ranks' parts, and what springs add. Collective."""
@@ -290,41 +312,6 @@ def motions_for(
     if isinstance(subdomains, ClusteredSubdomains):
         return ClusterMotions(B, coarse, subdomains, weights, prefix)
     return SoftModes(B, coarse, weights, preconditioner, prefix)
-
-
-class _Inner:
-    """Y = ZZᵀĜᵀ, C = XYᵀ, X of ``ClusterSteps``.
-
-    For X = (ĜĜᵀ)⁺, D = 0 that is what plain TFETI has: M_f between its projectors. Whatever X is, a
-    jump that averages allow becomes forces of a displacement that has it, R̂XĜ and what M_f makes
-    of the rest, so that no eigenvalue of M F is below 1.
-    """
-
-    def __init__(self, face: Face, Gt: PETSc.Mat, energy: Array, inner: ClusterSteps) -> None:
-        self._face, self._Gt, self._inner, self.energy = face, Gt, inner, energy
-        self._alpha, self._x = Gt.createVecs()
-
-    def solve(self, c: Array) -> Array:
-        """X c."""
-        return self._inner.solve(c)
-
-    def forces(self, c: Array) -> Array:
-        """Y c."""
-        self._alpha.array[:] = c
-        self._Gt.mult(self._alpha, self._x)
-        return self._face.restricted(self._x.array_r)
-
-    def moved(self, y: Array) -> Array:
-        """Yᵀ y."""
-        self._x.array[:] = self._face.restricted(y)
-        self._Gt.multTranspose(self._x, self._alpha)
-        return np.array(self._alpha.array_r)
-
-    def destroy(self) -> None:
-        """Free the factors. Collective."""
-        self._inner.destroy()
-        self._alpha.destroy()
-        self._x.destroy()
 
 
 def _gram(Gt: csr_array) -> csr_array:

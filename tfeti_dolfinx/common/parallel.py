@@ -46,9 +46,15 @@ def summed(comm: MPI.Intracomm, values: Array) -> Array:
     return values
 
 
+def dot_over(comm: MPI.Intracomm, *pairs: tuple[Array, Array]) -> list[float]:
+    """xᵀy of pairs of vectors that are spread over ranks, rank 0's on each. Collective."""
+    products = summed(comm, np.array([x @ y for x, y in pairs]))
+    return [float(value) for value in steering(comm, *products)]
+
+
 def norm_over(comm: MPI.Intracomm, x: Array) -> float:
     """‖x‖ of a vector that is spread over ranks, the same on each. Collective."""
-    return float(steering(comm, np.sqrt(summed(comm, np.array([x @ x]))[0]))[0])
+    return float(np.sqrt(dot_over(comm, (x, x))[0]))
 
 
 def largest(comm: MPI.Intracomm, x: Array) -> float:

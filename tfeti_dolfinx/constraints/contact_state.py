@@ -370,13 +370,8 @@ class ContactState:
         Shape ``(g, gdim)``.
         """
         constraints = self.gluing.constraints
-        trace, rows = constraints.B.createVecs()
-        rows.array[:] = self.lam
-        constraints.B.multTranspose(rows, trace)
         own = constraints.trace < len(self.u)  # those behind are of rigid bodies
         forces = np.zeros_like(self.u)
-        forces[constraints.trace[own]] = -trace.array_r[own]
-        trace.destroy()
-        rows.destroy()
+        forces[constraints.trace[own]] = -constraints.forces(self.lam)[own]
         total = self.dofs.reduce(forces.reshape(-1, self.dofs.bs), np.add, 0.0)
         return total - self.nodal_forces

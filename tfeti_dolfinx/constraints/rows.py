@@ -168,6 +168,20 @@ class Constraints:
         """All local rows."""
         return self.sets.num_rows
 
+    def jumps(self, v: Array) -> Array:
+        """B v on this rank's rows, of displacements on this rank's trace. Collective."""
+        trace, rows = self.B.createVecs()
+        trace.array[:] = v
+        self.B.mult(trace, rows)
+        return _taken(rows, trace)
+
+    def forces(self, lam: Array) -> Array:
+        """Bᵀλ on this rank's trace, of multipliers of this rank's rows. Collective."""
+        trace, rows = self.B.createVecs()
+        rows.array[:] = lam
+        self.B.multTranspose(rows, trace)
+        return _taken(trace, rows)
+
     def set_right_side(self, c: Array) -> None:
         """Fill c anew, with this rank's part of it, shape ``(num_rows,)``. B stays."""
         self.c.array[:] = c
@@ -192,6 +206,14 @@ class Constraints:
         """Destroy the PETSc objects. Collective."""
         self.B.destroy()
         self.c.destroy()
+
+
+def _taken(result: PETSc.Vec, other: PETSc.Vec) -> Array:
+    """Return the values of a vector, and destroy both. Collective."""
+    values = np.array(result.array_r)
+    result.destroy()
+    other.destroy()
+    return values
 
 
 def assemble_constraints(

@@ -92,13 +92,14 @@ class CoarseSpace(Coarse):
             comm, kernel_basis(self.bodies, self.unheld, self.free_motions)
         )
         self.motions = self._basis.coordinates(self.bodies.motions)
-        self.Gt = self._basis.rows(Gt, diags_array(self.row_size) @ self.J, equalities)
-        self.e = self._load()
+        Gt = self._basis.rows(Gt, diags_array(self.row_size) @ self.J, equalities)
         self.null = bcast_from_root(comm, orthonormal_columns(csr_array(self.motions @ both)))
-        self.grams = Grams(self.Gt, np.flatnonzero(~equalities), comm)
+        self.grams = Grams(Gt, np.flatnonzero(~equalities), comm)
         self.factors = FaceFactors(comm, self.null, prefix)
-        self.factor = self.factors.factor(self.grams.whole, "whole")
-        self._on_face: FaceProjectors | None = None
+        factor = self.factors.factor(self.grams.whole, "whole")
+        super().__init__(comm, Gt, np.zeros(0), factor)
+        self.e = self._load()
+        self._on_face: Coarse | None = None
         self._damped: tuple[Face, float, SemidefiniteFactor] | None = None
 
     def _load(self) -> Array:
@@ -132,12 +133,18 @@ class CoarseSpace(Coarse):
             known = self._damped = (face, damping, self.factors.factor(gram))
         return known[2].solve(y)
 
-    def on_face(self, face: Face) -> FaceProjectors:
-        """Return the projectors on a face of the rows, those of the last time if it is that."""
+    def on_face(self, face: Face) -> Coarse:
+        """Return the projectors on a face of the rows, G_f = GZ; the last ones if it is that face.
+
+        A face that leaves motions free that all rows hold has a G_f without full rank: harmless
+        for P and Q, since what the factor makes of such a motion G_fᵀ does not see.
+        """
         known = self._on_face
-        if known is None or self._differs(known.face, face):
+        if known is None or known.face is None or self._differs(known.face, face):
             self._on_face = None
-            known = self._on_face = FaceProjectors(self, face)
+            factor = self.factors.factor(self.grams.of_face(face))
+            known = self._on_face = Coarse(self.comm, self.Gt, self.e, factor, face)
+            known.own, known.moduli = self.own, self.moduli
         known.e = self.e
         return known
 
@@ -176,32 +183,6 @@ class CoarseSpace(Coarse):
             if grams is not None:
                 found = unresisted(sum(grams[1:], grams[0]), within or self.unheld, below)
         return cast(Motions, bcast_from_root(self.comm, found))
-
-
-class FaceProjectors(Coarse):
-    """P and Q on a face of the rows: G_f = GZ, vectors in the layout of all rows.
-
-    A face that leaves motions free that all rows hold has a G_f without full rank: harmless for
-    P and Q, since what the factor makes of such a motion G_fᵀ does not see. Creation is collective.
-    """
-
-    def __init__(self, whole: CoarseSpace, face: Face) -> None:
-        self._whole, self.face = whole, face
-        self.comm, self.Gt = whole.comm, whole.Gt
-        self.own, self.moduli = whole.own, whole.moduli
-        self.factor = whole.factors.factor(whole.grams.of_face(face))
-
-    def restricted(self, x: Array) -> Array:
-        """ZZᵀx."""
-        return self.face.restricted(x)
-
-    def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
-        """Solve with the damped coarse matrix of all rows."""
-        return self._whole.damped_solve(face, y, damping)
-
-    def on_face(self, face: Face) -> FaceProjectors:
-        """Return the projectors of another face of all rows."""
-        return self._whole.on_face(face)
 
 
 def _without_rounding(J: Any) -> csr_array:

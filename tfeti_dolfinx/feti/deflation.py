@@ -7,11 +7,12 @@ coarse space does not know of them, and M_f is an inverse of F₀ alone.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import csr_array, diags_array, hstack, vstack
 
@@ -19,8 +20,7 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root, chunk_offsets, summed
 from tfeti_dolfinx.feti.coarse import CoarseSpace, transposed_G
 from tfeti_dolfinx.feti.operator import DualOperator
-from tfeti_dolfinx.feti.projectors import FaceFactors, Grams, SemidefiniteFactor
-from tfeti_dolfinx.qp.balanced import Balanced
+from tfeti_dolfinx.feti.projectors import FaceFactors, Grams
 from tfeti_dolfinx.qp.problem import FaceOperator
 from tfeti_dolfinx.qp.sets import Face
 from tfeti_dolfinx.subdomains.subdomains import SoftMotions, Subdomains
@@ -43,6 +43,48 @@ class SoftParameters:
 
 
 PARAMETERS = SoftParameters()
+
+
+class Balanced:
+    """M = (I − YC)ᵀ M_f (I − YC) + CᵀDC with C = XYᵀ, beside a part that is solved for apart.
+
+    Mandel, Comm. Numer. Methods Engrg. 9, 1993, 233–241. Where D = (CFCᵀ)⁻¹ and Y = FCᵀD it is the
+    inverse of F on the range of Cᵀ; what is only near to that remains positive semidefinite, and
+    definite if no x has both (I − YC)x = 0 and DCx = 0. Vectors of rows are this rank's parts;
+    coordinates may be replicated or distributed. The functions are collective.
+
+    Args:
+        on_face: M_f, which is taken over.
+        energy: D, shape of the coordinates.
+        solve: X c.
+        forces: Y c, in the face.
+        moved: Yᵀ y, y in the face.
+        owned: What is destroyed with it.
+    """
+
+    def __init__(
+        self,
+        on_face: FaceOperator,
+        energy: Array,
+        *,
+        solve: Callable[[Array], Array],
+        forces: Callable[[Array], Array],
+        moved: Callable[[Array], Array],
+        owned: Sequence[Any],
+    ) -> None:
+        self._on_face, self._energy, self._owned = on_face, energy, owned
+        self._solve, self._forces, self._moved = solve, forces, moved
+
+    def __call__(self, x: Array) -> Array:
+        """M x, x in the face. Collective."""
+        c = self._solve(self._moved(x))
+        y = self._on_face(x - self._forces(c))
+        return y - self._forces(self._solve(self._moved(y) - self._energy * c))
+
+    def destroy(self) -> None:
+        """Free what it has been given. Collective."""
+        for item in (self._on_face, *self._owned):
+            item.destroy()
 
 
 class Deflation(Protocol):
@@ -95,8 +137,7 @@ class SoftModes:
         soft = bcast_from_root(self._comm, np.flatnonzero(energy < sigma * squares))
         if len(soft):
             scale = np.sqrt(np.maximum(energy[soft], PARAMETERS.rounding * sigma * squares[soft]))
-            x = B.createVecLeft()
-            if not _stands_out(preconditioner, csr_array(Gt[:, soft] / scale), x):
+            if not _stands_out(preconditioner, csr_array(Gt[:, soft] / scale), self._comm):
                 soft = soft[:0]
         self.count = len(soft)
         null = csr_array(vstack([coarse.null, csr_array((self.count, coarse.null.shape[1]))]))
@@ -111,12 +152,23 @@ class SoftModes:
         self._grams = Grams(self._Gt, contact, self._comm)
 
     def balanced(self, face: Face, on_face: FaceOperator) -> FaceOperator:
-        """An approximate inverse of F on a face; M_f itself where nothing is soft. Collective."""
+        """An approximate inverse of F on a face; M_f itself where nothing is soft. Collective.
+
+        Y = [G; Ĝ]ᵀ, X = ([G; Ĝ][G; Ĝ]ᵀ + [0 0; 0 D/σ])⁻¹: CFCᵀ is taken for D⁻¹. Where springs
+        are soft it nearly is; where they are not, C is small. On faces [G; Ĝ] may lack rank: what
+        is left free Cᵀ does not see.
+        """
         if self._grams is None:
             return on_face
-        gram = csr_array(self._grams.of_face(face) + self._damping)
-        springs = _Springs(self._Gt, face, self.factors.factor(gram), self._energy)
-        return Balanced(on_face, springs)
+        factor = self.factors.factor(csr_array(self._grams.of_face(face) + self._damping))
+        return Balanced(
+            on_face,
+            self._energy,
+            solve=factor.solve,
+            forces=lambda c: face.restricted(self._Gt @ c),
+            moved=lambda y: summed(self._comm, self._Gt.T @ face.restricted(y)),
+            owned=[factor],
+        )
 
     def destroy(self) -> None:
         """Nothing of PETSc is kept."""
@@ -126,48 +178,14 @@ class SoftModes:
 MakeDeflation = Callable[[PETSc.Mat, CoarseSpace, Array, DualOperator, str], Deflation]
 
 
-class _Springs:
-    """Y = [G; Ĝ]ᵀ, X = ([G; Ĝ][G; Ĝ]ᵀ + [0 0; 0 D/σ])⁻¹, C = XYᵀ: CFCᵀ is taken for D⁻¹.
-
-    Where springs are soft it nearly is; where they are not, C is small. On faces [G; Ĝ] may lack
-    rank: what is left free Cᵀ does not see.
-    """
-
-    def __init__(
-        self, Gt: csr_array, face: Face, factor: SemidefiniteFactor, energy: Array
-    ) -> None:
-        self._Gt, self._face, self._factor, self.energy = Gt, face, factor, energy
-
-    def solve(self, c: Array) -> Array:
-        """X c."""
-        return self._factor.solve(c)
-
-    def forces(self, c: Array) -> Array:
-        """[G; Ĝ]ᵀ c."""
-        return self._face.restricted(self._Gt @ c)
-
-    def moved(self, y: Array) -> Array:
-        """[G; Ĝ] y."""
-        return summed(self._factor.comm, self._Gt.T @ self._face.restricted(y))
-
-    def destroy(self) -> None:
-        """Free the factor."""
-        self._factor.destroy()
-
-
-def _stands_out(M: DualOperator, Gt: csr_array, x: PETSc.Vec) -> bool:
-    """Return whether ĜMĜᵀ, of motions of energy 1, has a large eigenvalue. Frees x. Collective."""
-    comm, y = x.getComm().tompi4py(), x.duplicate()
+def _stands_out(M: DualOperator, Gt: csr_array, comm: MPI.Intracomm) -> bool:
+    """Return whether ĜMĜᵀ, of motions of energy 1, has a large eigenvalue. Collective."""
     v, size = np.random.default_rng(0).standard_normal(Gt.shape[1]), 0.0
     for _ in range(PARAMETERS.steps):
         v /= np.linalg.norm(v)
-        x.array[:] = Gt @ v
         with M.charged_to("soft motions"):
-            M.mult(x, y)
-        image = summed(comm, Gt.T @ y.array_r)
+            image = summed(comm, Gt.T @ M(Gt @ v))
         size, v = float(v @ image), image
-    for vector in (x, y):
-        vector.destroy()
     return bcast_from_root(comm, size > PARAMETERS.large)
 
 

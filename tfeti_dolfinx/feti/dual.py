@@ -19,15 +19,12 @@ from tfeti_dolfinx.feti.operator import (
     DualOperator,
     MakePreconditioner,
     dirichlet_preconditioner,
-    dual_operator,
-    linear_term,
     scaled_rows,
 )
 from tfeti_dolfinx.feti.preconditioner import FacePreconditioner
-from tfeti_dolfinx.feti.recovery import Recovered, recover
 from tfeti_dolfinx.feti.rigid_bodies import listed
-from tfeti_dolfinx.feti.solvability import check_solvable, sliding_body
-from tfeti_dolfinx.qp.homogenised import LastProduct, OperatorProduct, natural, operator_product
+from tfeti_dolfinx.feti.solvability import check_solvable
+from tfeti_dolfinx.qp.homogenised import LastProduct, OperatorProduct, operator_product
 from tfeti_dolfinx.qp.krylov import estimate_norm
 from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
 from tfeti_dolfinx.qp.recycling import Recycled
@@ -99,6 +96,7 @@ class Dual:
 
     Attributes:
         F: B K⁺ Bᵀ.
+        d: B K⁺ f − c, this rank's part.
         preconditioner: The preconditioner, or None.
         coarse: The coarse space.
         soft: Motions that springs hold softly, or of subdomains in clusters, for the
@@ -140,9 +138,9 @@ class Dual:
         self._names = body_names, mode_names
         B, comm = constraints.B, constraints.B.getComm().tompi4py()
         self._stiffness = largest(comm, subdomains.diagonal)
-        self.d = linear_term(B, constraints.c, subdomains)
+        self.d = self._linear_term()
         self._check_units(comm)
-        self.F = dual_operator(B, subdomains)
+        self.F = DualOperator(B, subdomains.local_operator("pinv"))
         self.preconditioner: DualOperator | None = None
         self._scaled: PETSc.Mat | None = None
         if preconditioner is not None:
@@ -184,11 +182,14 @@ class Dual:
             InputError: Squares of load or values leave the range of floating point.
             NoSolutionError: The load moves a body that nothing holds.
         """
-        self.d.destroy()
-        self.d = linear_term(self.constraints.B, self.constraints.c, self.subdomains)
+        self.d = self._linear_term()
         self._check_units(self.coarse.comm)
         self.coarse.update_load()
         check_solvable(self.coarse, self._given, *self._names)
+
+    def _linear_term(self) -> Array:
+        response = self.subdomains.pinv_load[self.subdomains.trace]
+        return self.constraints.jumps(response) - self.constraints.c.array_r
 
     def learn(self) -> None:
         """Keep directions from now on, where options leave that open: more solves come."""
@@ -231,11 +232,6 @@ class Dual:
         self.constraints = self._given.with_pressures(pressures)
         self.feasible = self._law(self.constraints)
 
-    @property
-    def sliding(self) -> int:
-        """The body that the load moves within the present limits of friction; -1: they hold it."""
-        return sliding_body(self.coarse, self.constraints)
-
     def forget_counts(self) -> None:
         """Count multiplications from 0 on."""
         for operator in (self.F, self.preconditioner):
@@ -254,7 +250,7 @@ class Dual:
         self.feasible = self._law(self.constraints)  # c may be another, and what the law refers to
         if norm_steps and norm_steps not in self._norms:
             with self.F.charged_to("power method"):
-                self._norms[norm_steps] = estimate_norm(self.F, self.coarse, self.d, norm_steps)
+                self._norms[norm_steps] = estimate_norm(self.F, self.coarse, norm_steps)
         norm = self._norms.get(norm_steps, 1.0)
         on = self._preconditioner_on if self.preconditioner is not None else None
         return QP(
@@ -324,9 +320,7 @@ class Dual:
         """λ̄₀ = Gᵀ(GGᵀ)⁻¹e with F λ̄₀; multiplies once for each e. Collective."""
         if (found := self.known_image()) is not None:
             return found
-        if self._image is not None:
-            self._image[1].destroy()
-        made = operator_product(self.F, natural(self.coarse, self.d))
+        made = operator_product(self.F, self.coarse.comm, self.coarse.particular())
         self._image = (self.coarse.e.copy(), made)
         return made
 
@@ -334,7 +328,7 @@ class Dual:
     def driving(self) -> Array:
         """The part of d due to load, prescribed values, slips and overlaps; local rows."""
         c, normals = self.constraints.c.array_r, self.constraints.sets.normals
-        d = np.array(self.d.array_r)
+        d = np.array(self.d)
         d[normals] += np.maximum(c[normals], 0.0)
         return d
 
@@ -345,20 +339,14 @@ class Dual:
         what drives the problem. The solution would be their small difference, with their rounding.
         Multiplies by F at most once, and not where λ is the last solution.
         """
-        comm, coarse, x = self.coarse.comm, self.coarse, self.d.duplicate()
-        coarse.particular(x)
-        forces = norm_over(comm, lam)
-        if 0.0 < forces <= LIMITS.far * norm_over(comm, x.array_r):
-            x.destroy()
+        comm, coarse = self.coarse.comm, self.coarse
+        least = coarse.particular()
+        if 0.0 < norm_over(comm, lam) <= LIMITS.far * norm_over(comm, least):
             return False
-        if len(mu) == coarse.dimension:
-            coarse.combine(mu, x)
-        lengths = norm_over(comm, x.array_r)
-        x.array[:] = lam
-        at = self.last.image(self.F, x)
-        self.last.pass_on(np.array(lam), np.array(at.Fx.array_r), 0.0)
-        lengths += norm_over(comm, at.Fx.array_r)
-        at.destroy()
+        known = coarse.combined(mu) if len(mu) == coarse.dimension else least
+        Fx = self.last.image(self.F, comm, lam).Fx
+        self.last.pass_on(lam, Fx, 0.0)
+        lengths = norm_over(comm, known) + norm_over(comm, Fx)
         return lengths > LIMITS.far * norm_over(comm, self.driving)
 
     def known_image(self) -> OperatorProduct | None:
@@ -366,10 +354,6 @@ class Dual:
         if self._image is None or not np.array_equal(self._image[0], self.coarse.e):
             return None
         return self._image[1]
-
-    def recover(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, error: float) -> Recovered:
-        """Return the displacement of multipliers, as ``recover`` of ``feti/recovery.py`` does."""
-        return recover(self.constraints, self.coarse, lam.array_r, gradient.array_r, face, error)
 
     def nearly_free(self, active: Array) -> list[dict[str, object]]:
         """List motions that ``active`` contact rows hold hardly or not, see ``listed``."""
@@ -382,9 +366,8 @@ class Dual:
 
     def destroy(self) -> None:
         """Destroy the PETSc objects."""
-        image = self._image[1] if self._image is not None else None
         last = None if self._on_last is None else self._on_last[1]
         own = (last, self._on_all, self._on_faces, self.soft, self.preconditioner, self._scaled)
-        for item in (self.F, *own, self.coarse, self.d, image):
+        for item in (self.F, *own, self.coarse):
             if item is not None:
                 item.destroy()

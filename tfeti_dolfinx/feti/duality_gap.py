@@ -5,15 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, largest, summed
+from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, dot_over, largest, summed
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.recovery import (
-    constraint_residual,
     elastic_displacement,
-    jumps,
     min_norm_correction,
     moved,
 )
@@ -38,7 +35,7 @@ class EnergyBound:
 
 
 def energy_bound(
-    dual: Dual, lam: PETSc.Vec, u: Array, norm: float, balanced: float = 1e-12
+    dual: Dual, lam: Array, u: Array, norm: float, balanced: float = 1e-12
 ) -> EnergyBound:
     """Bound the algebraic error of the displacement u of λ ∈ Ω. Collective.
 
@@ -53,7 +50,7 @@ def energy_bound(
 
     Args:
         dual: The dual problem.
-        lam: The multipliers λ ∈ Ω.
+        lam: The multipliers λ ∈ Ω on this rank.
         u: The displacement K⁺(f − Bᵀλ) + Rα on this rank, shape ``(n,)``.
         norm: ‖F‖, or an estimate; 0 where there is none.
         balanced: Worst entry of Gλ − e beside its terms from which on the forces are balanced.
@@ -88,14 +85,14 @@ def admissible(
     """
     constraints, comm = dual.constraints, dual.coarse.comm
     contact = constraints.sets.contact
-    g = constraint_residual(constraints, u[dual.subdomains.trace])
+    g = constraints.jumps(u[dual.subdomains.trace]) - constraints.c.array_r
     p = lam + g / (norm or 1.0)
     closed = (dual.feasible.project(p) == p)[contact]
     wanted = -g
     for last in (*[False] * passes, True):
         wanted[contact] = np.where(closed | last, -g[contact], 0.0)
         change = min_norm_correction(constraints, wanted, closed | last)
-        left = jumps(constraints.B, change) - wanted  # of rows that are not closed: B δ
+        left = constraints.jumps(change) - wanted  # of rows that are not closed: B δ
         q = np.where(closed | last, 0.0, (g + left)[contact])
         t = far * largest(comm, lam) / (largest(comm, q) or 1.0)
         moved_by = within(dual.feasible, lam, contact, t * q)
@@ -115,33 +112,31 @@ def within(feasible: FeasibleSet, lam: Array, rows: Array, step: Array) -> Array
 
 
 def _balanced(
-    dual: Dual, lam: PETSc.Vec, u: Array, norm: float, balanced: float
+    dual: Dual, lam: Array, u: Array, norm: float, balanced: float
 ) -> tuple[Array, Array, float]:
     """Return forces in Ω with Gλ = e, their displacement, and its distance from u in energy.
 
     Where λ does not balance the load, the nearest feasible point to λ − (Fλ − d)/‖F‖ does: that
     to λ might take a force off its bound where something opens or slips far.
     """
-    coarse, subdomains, given = dual.coarse, dual.subdomains, np.array(lam.array_r)
-    outside = float(np.sum((dual.feasible.project(given) - given) ** 2))
-    left, size = summed(coarse.comm, np.array([outside, float(given @ given)]))
-    inside = bcast_from_root(coarse.comm, bool(left <= balanced**2 * size))
+    coarse, subdomains, constraints = dual.coarse, dual.subdomains, dual.constraints
+    outside = dual.feasible.project(lam) - lam
+    left, size = dot_over(coarse.comm, (outside, outside), (lam, lam))
+    inside = left <= balanced**2 * size
     if inside and (coarse.dimension == 0 or imbalance(coarse, lam) <= balanced):
-        return given, u, 0.0
-    wanted = lam.copy()
+        return lam, u, 0.0
+    wanted = lam
     if norm > 0.0:
-        wanted.array[:] += constraint_residual(dual.constraints, u[subdomains.trace]) / norm
+        missed = constraints.jumps(u[subdomains.trace]) - constraints.c.array_r
+        wanted = lam + missed / norm
     found = project_onto_feasible(coarse, dual.feasible, wanted)
-    forces = np.array(found.lam.array_r)
-    wanted.destroy()
-    found.lam.destroy()
     if found.missing > HELD:
-        return given, u, float("inf")
+        return lam, u, float("inf")
     # −K⁺Bᵀ(λ' − λ) + Rα, α such that rows miss as much as before
-    B, zero = dual.constraints.B, np.zeros_like(u)
-    change = elastic_displacement(B, subdomains, forces - given, zero)
+    zero = np.zeros_like(u)
+    change = elastic_displacement(constraints, subdomains, found.lam - lam, zero)
     if coarse.dimension:
-        rows = jumps(B, change[subdomains.trace])
+        rows = constraints.jumps(change[subdomains.trace])
         change = moved(change, coarse, -coarse.solve(coarse.G(rows)))
     energy = summed(coarse.comm, np.array([sum(subdomains.energies(change))]))[0]
-    return forces, u + change, float(np.sqrt(max(energy, 0.0)))
+    return found.lam, u + change, float(np.sqrt(max(energy, 0.0)))

@@ -92,7 +92,8 @@ class DualOperator:
         self.B, self.local, self.metric = B, local, metric
         self.count: Counter[str] = Counter()
         self._payer, self._seconds, self._times = "solver", 0.0, 0
-        self._w, self._v = B.createVecRight(), B.createVecRight()
+        self._w, self._x = B.createVecs()
+        self._v = self._w.duplicate()
         with raised_on_all_ranks(self._w.getComm().tompi4py()):
             local.prepare()
             if metric is not None:
@@ -107,11 +108,13 @@ class DualOperator:
         finally:
             self._payer = previous
 
-    def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = B diag(A_s) Bᵀ x. Collective."""
-        self.B.multTranspose(x, self._w)
+    def __call__(self, x: Array) -> Array:
+        """B diag(A_s) Bᵀ x, from this rank's part of x to that of the product. Collective."""
+        self._x.array[:] = x
+        self.B.multTranspose(self._x, self._w)
         self.multiply(self._w.array_r, self._v.array)
-        self.B.mult(self._v, y)
+        self.B.mult(self._v, self._x)
+        return np.array(self._x.array_r)
 
     def multiply(self, w: Array, out: Array) -> None:
         """out = diag(A_s) w on this rank's trace, which counts as a multiplication."""
@@ -130,13 +133,8 @@ class DualOperator:
         self.local.destroy()
         if self.metric is not None:
             self.metric.trace.destroy()
-        self._w.destroy()
-        self._v.destroy()
-
-
-def dual_operator(B: PETSc.Mat, subdomains: Subdomains) -> DualOperator:
-    """F = B K⁺ Bᵀ. Collective."""
-    return DualOperator(B, subdomains.local_operator("pinv"))
+        for vec in (self._w, self._v, self._x):
+            vec.destroy()
 
 
 def scaled_rows(B: PETSc.Mat, weights: Array) -> PETSc.Mat:
@@ -181,13 +179,3 @@ PRECONDITIONERS: dict[str, MakePreconditioner] = {
     "lumped": lumped_preconditioner,
     "dirichlet": dirichlet_preconditioner,
 }
-
-
-def linear_term(B: PETSc.Mat, c: PETSc.Vec, subdomains: Subdomains) -> PETSc.Vec:
-    """d = B K⁺ f − c. Collective."""
-    v, d = B.createVecRight(), c.duplicate()
-    v.array[:] = subdomains.pinv_load[subdomains.trace]
-    B.mult(v, d)
-    d.axpy(-1.0, c)
-    v.destroy()
-    return d

@@ -89,7 +89,7 @@ class FacePreconditioner:
         weights: D, of the trace and of what is next to it.
         apply: K on it.
         steps: Those of p, none without a metric.
-        work: A vector of the trace.
+        work, jumps: Vectors of the trace, and of the rows.
     """
 
     apply: Callable[[Array, Array], None]
@@ -101,7 +101,7 @@ class FacePreconditioner:
         self._contact = np.concatenate((sets.normals, sets.tangents.ravel()))
         self._gram = _contact_gram(constraints.B, whole.B, self._contact)
         self._size = _diagonal(whole.B, diagonal)
-        self.work = whole.B.createVecRight()
+        self.work, self.jumps = whole.B.createVecs()
         self.weights, self.steps = constraints.weights, list[tuple[float, float]]()
         if whole.metric is not None:
             self._smooth_in(whole.metric, diagonal)
@@ -155,6 +155,7 @@ class FacePreconditioner:
     def destroy(self) -> None:
         """Destroy W_C, not the operator on all rows. Collective."""
         self.work.destroy()
+        self.jumps.destroy()
         if self._gram is not None:
             self._gram.destroy()
 
@@ -182,11 +183,11 @@ class _OnFace:
         self._to_springs = csr_array(self._springs.T)
         self._moves, self._sizes = bent[bends], size[bends]
 
-    def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = M_f x: displacements of the trace, of what is next to it, of springs. Collective."""
+    def __call__(self, x: Array) -> Array:
+        """M_f x: displacements of the trace, of what is next to it, of springs. Collective."""
         on, springs, moves, sizes = self._on_all, self._springs, self._moves, self._sizes
         to_springs = self._to_springs
-        B, w, D = on.whole.B, on.work, on.weights
+        B, w, y, D = on.whole.B, on.work, on.jumps, on.weights
         trace, size = w.getLocalSize(), len(D)
 
         def lifted() -> Array:  # B_Dᵀ y
@@ -209,13 +210,13 @@ class _OnFace:
             return out
 
         # 1. the least displacement in D with the jumps x, and smooth
-        y.array[:] = self._solved(x.array_r)
+        y.array[:] = self._solved(x)
         u = smoothed(on.steps, lambda u: without_jumps(stiff(u)), lifted())
         # 2. its forces A u, and back
         v = np.append(np.zeros(size), sizes * u[size:])
         on.whole.multiply(u[:trace], v[:trace])
         put_jumps(smoothed(on.steps, lambda v: stiff(without_jumps(v)), v))
-        y.array[:] = self._solved(y.array_r)
+        return self._solved(y.array_r)
 
     def _solved(self, x: Array) -> Array:
         """Z W_κ⁻¹ Zᵀx on this rank's rows."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.constraints.rows import Constraints
@@ -62,8 +61,8 @@ def recover(
             answer with their rounding over this share.
     """
     subdomains = coarse.subdomains
-    u = elastic_displacement(constraints.B, subdomains, lam, subdomains.pinv_load)
-    residual = -constraint_residual(constraints, u[subdomains.trace])  # = Fλ − d
+    u = elastic_displacement(constraints, subdomains, lam, subdomains.pinv_load)
+    residual = constraints.c.array_r - constraints.jumps(u[subdomains.trace])  # = Fλ − d
     alpha: Array = np.zeros(0)
     if coarse.dimension:
         held = face.holding
@@ -85,32 +84,10 @@ def recover(
 
 
 def elastic_displacement(
-    B: PETSc.Mat, subdomains: Subdomains, lam: Array, response: Array
+    constraints: Constraints, subdomains: Subdomains, lam: Array, response: Array
 ) -> Array:
     """K⁺(f − Bᵀλ), this rank's part, shape ``(n,)``, from K⁺f and λ. Collective."""
-    w, x = B.createVecs()
-    x.array[:] = lam
-    B.multTranspose(x, w)
-    u = response - subdomains.solve(subdomains.extended(w.array_r))
-    w.destroy()
-    x.destroy()
-    return np.asarray(u)
-
-
-def jumps(B: PETSc.Mat, v: Array) -> Array:
-    """B v on this rank's rows, of displacements on this rank's trace. Collective."""
-    trace, w = B.createVecs()
-    trace.array[:] = v
-    B.mult(trace, w)
-    found = np.array(w.array_r)
-    trace.destroy()
-    w.destroy()
-    return found
-
-
-def constraint_residual(constraints: Constraints, v: Array) -> Array:
-    """B v − c on this rank's rows, of displacements on this rank's trace. Collective."""
-    return np.asarray(jumps(constraints.B, v) - constraints.c.array_r)
+    return response - subdomains.solve(subdomains.extended(constraints.forces(lam)))
 
 
 def moved(u: Array, coarse: CoarseSpace, alpha: Array) -> Array:
@@ -142,19 +119,13 @@ def min_norm_correction(
     Returns:
         On this rank's trace unknowns, shape ``(Σ t_s,)``.
     """
-    B, D, contact = constraints.B, constraints.weights, constraints.sets.contact
-    comm = B.getComm().tompi4py()
-    trace, rows = B.createVecs()
-
-    def spread(z: Array) -> Array:  # D⁻¹Bᵀz
-        rows.array[:] = z
-        B.multTranspose(rows, trace)
-        return np.asarray(trace.array_r / D)
+    D, contact = constraints.weights, constraints.sets.contact
+    comm = constraints.B.getComm().tompi4py()
 
     def upwards(r: Array) -> Array:  # D⁻¹B_fᵀr
-        z = np.zeros(rows.getLocalSize())
+        z = np.zeros(len(w))
         z[contact] = r
-        return spread(z)
+        return constraints.forces(z) / D
 
     elastic = np.isfinite(D)
     root = np.sqrt(D[elastic])
@@ -168,22 +139,18 @@ def min_norm_correction(
     apart = np.array(w)
     apart[contact] = 0.0
     r = np.where(closed, w[contact], 0.0)
-    x, s = spread(apart), upwards(r)
-    p, left = s.copy(), in_D(s)
+    x, s = constraints.forces(apart) / D, upwards(r)
+    p, left = s, in_D(s)
     enough = tol**2 * left
     for _ in range(max_it):
         if left <= enough:
             break
-        trace.array[:] = p
-        B.mult(trace, rows)
-        q = np.where(closed, rows.array_r[contact], 0.0)
+        q = np.where(closed, constraints.jumps(p)[contact], 0.0)
         if (curvature := square(q)) == 0.0:
             break
-        x += left / curvature * p
-        r -= left / curvature * q
+        x = x + left / curvature * p
+        r = r - left / curvature * q
         s = upwards(r)
         left, before = in_D(s), left
         p = s + left / before * p
-    trace.destroy()
-    rows.destroy()
     return x

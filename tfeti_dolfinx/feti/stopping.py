@@ -7,14 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import TINY, Array, sums
 from tfeti_dolfinx.common.parallel import steering
 from tfeti_dolfinx.feti.coarse import CoarseSpace
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.duality_gap import EnergyBound, energy_bound, within
-from tfeti_dolfinx.feti.recovery import Recovered, min_norm_correction
+from tfeti_dolfinx.feti.recovery import Recovered, min_norm_correction, recover
 from tfeti_dolfinx.qp.coarse import LIGHT
 from tfeti_dolfinx.qp.homogenised import ROUNDING
 from tfeti_dolfinx.qp.problem import ConvergedReason
@@ -143,7 +142,7 @@ def measure(
         penetration, begin = max(penetration, slips[0].max()), slips[1].max()
     largest = np.array([penetration, gap, begin])
     comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
-    d = dual.d.array_r
+    d = dual.d
     held_d, held_F = (x[face.holding] for x in (d, state.residual + d))
     squares = np.array([w @ w, held_d @ held_d, held_F @ held_F])
     comm.Allreduce(MPI.IN_PLACE, squares, op=MPI.SUM)
@@ -294,9 +293,7 @@ class Accuracy:
         """The tolerance; 0 before the first assessment against a target, which is costly."""
         return 0.0 if self.goal is not None and self.looks == 0 else self.tolerance
 
-    def examine(
-        self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float
-    ) -> ConvergedReason:
+    def examine(self, lam: Array, gradient: Array, face: Face, residual: float) -> ConvergedReason:
         """Assess an iterate, and return why to stop, or ITERATING. Collective."""
         self.look(lam, gradient, face, residual)
         given, now, before = self._limits, self._seen, self._before
@@ -335,10 +332,12 @@ class Accuracy:
         self.tolerance, self._claimed = float(tolerance), residual
         return ConvergedReason.ITERATING
 
-    def look(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float) -> None:
+    def look(self, lam: Array, gradient: Array, face: Face, residual: float) -> None:
         """Recover the displacement of an iterate, and measure it. Collective."""
         before = None if self.recovered is None else self.recovered.u
-        state = self._dual.recover(lam, gradient, face, residual / self.norm)
+        state = recover(
+            self._dual.constraints, self._dual.coarse, lam, gradient, face, residual / self.norm
+        )
         now = measure(self._dual, state, face, self.norm, before)
         self._before, self.recovered, self._measures = self._measures, state, now
         self.looks += 1
@@ -347,7 +346,7 @@ class Accuracy:
             allowed = self._limits.target * max(goal, 1e-5 * now.energy)
             self.reached.append(TargetStatus(bound, goal, now.energy, allowed))
 
-    def look_again(self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float) -> bool:
+    def look_again(self, lam: Array, gradient: Array, face: Face, residual: float) -> bool:
         """Measure the iterate of the last look with another set of multipliers. Collective.
 
         Bounds of friction that a solve was given are not those of its forces. What the last look

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 from scipy.sparse import csc_array, csr_array
 
 from tfeti_dolfinx.common.arrays import TINY, Array
@@ -24,43 +23,29 @@ HELD = 1e-9
 NOTHING: Array = np.zeros(0)
 
 
-class GramFactor(Protocol):
-    """A generalised inverse of G_fG_fᵀ."""
-
-    def solve(self, y: Array) -> Array:
-        """(G_fG_fᵀ)⁺y, y replicated."""
-        ...
-
-    def destroy(self) -> None:
-        """Free it."""
-        ...
-
-
 class Coarse:
     """The constraint Gλ = e, λ in a face with the free directions Z.
 
-    With G_f = GZ the projectors are Q = Z G_fᵀ(G_f G_fᵀ)⁺G_f Zᵀ and P = ZZᵀ − Q. Vectors keep the
-    layout of all rows. Without a face Z = I, so that P = I − Q. All methods but ``solve`` and
-    ``combine`` are collective. Without equations P = ZZᵀ, and nothing is communicated for it.
+    With G_f = GZ the projectors are Q = Z G_fᵀ(G_f G_fᵀ)⁺G_f Zᵀ and P = ZZᵀ − Q. Vectors are this
+    rank's parts, in the layout of all rows. Without a face Z = I, so that P = I − Q. All methods
+    but ``restricted``, ``solve``, ``combined`` and ``particular`` are collective. Without
+    equations P = ZZᵀ, and nothing is communicated for it.
 
     Attributes:
         comm: Communicator.
         Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
         e: Right side, replicated, shape ``(r,)``.
-        factor: That of G_fG_fᵀ.
+        factor: (G_fG_fᵀ)⁺, with ``solve`` of a replicated vector and ``destroy``.
+        face: The face; None: all rows.
     """
 
-    comm: MPI.Intracomm
-    Gt: csr_array
-    e: Array
-    factor: GramFactor
-
-    def restricted(self, x: Array) -> Array:
-        """ZZᵀx, the part of x in the face: all of it."""
-        return x
+    def __init__(
+        self, comm: MPI.Intracomm, Gt: csr_array, e: Array, factor: Any, face: Face | None = None
+    ) -> None:
+        self.comm, self.Gt, self.e, self.factor, self.face = comm, Gt, e, factor, face
 
     def on_face(self, face: Face) -> Coarse:
-        """Return the same constraint on (another) face of all rows."""
+        """Return the constraint of all rows on a face of them."""
         raise NotImplementedError
 
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
@@ -82,89 +67,87 @@ class Coarse:
         """The moduli of their entries."""
         return abs(self.own)
 
+    def restricted(self, x: Array) -> Array:
+        """ZZᵀx, the part of x in the face."""
+        return x if self.face is None else self.face.restricted(x)
+
     def G(self, x: Array) -> Array:
-        """G_fZᵀx, replicated, from this rank's part of x."""
+        """G_fZᵀx, replicated."""
         return summed(self.comm, self.own @ self.restricted(x)) if self.dimension else NOTHING
 
+    def residual(self, x: Array) -> Array:
+        """e − G_fZᵀx, replicated."""
+        return np.asarray(self.e - self.G(x))
+
     def terms(self, x: Array) -> Array:
-        """Σ|G_fZᵀ||x|, replicated, from this rank's part of x."""
+        """Σ|G_fZᵀ||x|, replicated."""
         if not self.dimension:
             return NOTHING
         return summed(self.comm, self.moduli @ np.abs(self.restricted(x)))
 
-    def residual(self, x: PETSc.Vec) -> Array:
-        """e − G_fZᵀx, replicated."""
-        return np.asarray(self.e - self.G(x.array_r))
-
-    def forces(self, x: PETSc.Vec) -> Array:
-        """Return the sum of the moduli of the terms of each entry of the residual."""
-        return self.terms(x.array_r) + np.abs(self.e)
-
     def solve(self, y: Array) -> Array:
         """(G_fG_fᵀ)⁺y for y in the range of G, orthogonal to the free motions."""
-        return self.factor.solve(y)
+        return np.asarray(self.factor.solve(y))
 
-    def coordinates(self, x: PETSc.Vec) -> Array:
+    def coordinates(self, x: Array) -> Array:
         """(G_fG_fᵀ)⁺G_fZᵀx, replicated."""
-        return self.solve(self.G(x.array_r))
+        return self.solve(self.G(x))
 
-    def combine(self, mu: Array, x: PETSc.Vec) -> None:
-        """x = ZZᵀGᵀμ."""
-        x.array[:] = self.restricted(self.Gt @ mu) if self.dimension else 0.0
+    def combined(self, mu: Array) -> Array:
+        """ZZᵀGᵀμ."""
+        return self.restricted(self.Gt @ mu) if self.dimension else np.zeros(self.Gt.shape[0])
 
-    def project(self, x: PETSc.Vec) -> None:
-        """x ← P x."""
+    def project(self, x: Array) -> Array:
+        """P x."""
         away = self.Gt @ self.coordinates(x) if self.dimension else 0.0
-        x.array[:] = self.restricted(x.array_r - away)
+        return self.restricted(x - away)
 
     def project_against(
-        self, x: PETSc.Vec, y: PETSc.Vec, more: Array = NOTHING
-    ) -> tuple[float, float, Array]:
-        """x ← P x; yᵀPx and yᵀy, y in the face, and sums over ranks of more. One reduction.
+        self, x: Array, y: Array, more: Array = NOTHING
+    ) -> tuple[Array, float, float, Array]:
+        """P x, yᵀPx and yᵀy, y in the face, and sums over ranks of more. One reduction.
 
         What rounding has left of y outside of the range of P is not taken for a part of yᵀPx, which
         ranks may round differently.
         """
-        own, r = self.restricted(x.array_r), self.dimension
-        scalars = (own @ y.array_r, y.array_r @ y.array_r)
+        own, r = self.restricted(x), self.dimension
         if not r:
-            rest = summed(self.comm, np.concatenate((scalars, more)))
-            x.array[:] = own
-            return float(rest[0]), float(rest[1]), rest[2:]
-        products = self.own @ np.stack((own, y.array_r), axis=1)
-        sums = summed(self.comm, np.concatenate((products.T.ravel(), scalars, more)))
+            rest = summed(self.comm, np.concatenate(((own @ y, y @ y), more)))
+            return own, float(rest[0]), float(rest[1]), rest[2:]
+        products = self.own @ np.stack((own, y), axis=1)
+        sums = summed(self.comm, np.concatenate((products.T.ravel(), (own @ y, y @ y), more)))
         mu, rest = self.solve(sums[:r]), sums[2 * r :]
-        x.array[:] = self.restricted(x.array_r - self.Gt @ mu)
-        return float(rest[0] - sums[r : 2 * r] @ mu), float(rest[1]), rest[2:]
+        Px = self.restricted(x - self.Gt @ mu)
+        return Px, float(rest[0] - sums[r : 2 * r] @ mu), float(rest[1]), rest[2:]
 
-    def apply_Q(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = Q x."""
-        self.combine(self.coordinates(x), y)
+    def Q(self, x: Array) -> Array:
+        """Q x."""
+        return self.combined(self.coordinates(x))
 
-    def norm_Q(self, x: PETSc.Vec) -> float:
+    def norm_Q(self, x: Array) -> float:
         """‖Q x‖; the same on all ranks, since loops end by it."""
         if not self.dimension:
             return 0.0
-        Gx = self.G(x.array_r)
+        Gx = self.G(x)
         return bcast_from_root(self.comm, float(np.sqrt(max(float(Gx @ self.solve(Gx)), 0.0))))
 
-    def particular(self, x: PETSc.Vec) -> None:
-        """x = Z G_fᵀ(G_fG_fᵀ)⁺e, the smallest Gλ = e of the face, if it has one."""
-        self.combine(self.solve(self.e), x)
+    def particular(self) -> Array:
+        """Z G_fᵀ(G_fG_fᵀ)⁺e, the smallest solution of Gλ = e in the face, if it has one."""
+        return self.combined(self.solve(self.e))
 
     def destroy(self) -> None:
         """Free the factor."""
         self.factor.destroy()
 
 
-def imbalance(coarse: Coarse, x: PETSc.Vec) -> float:
+def imbalance(coarse: Coarse, x: Array) -> float:
     """Return the largest entry of Gx − e over the size of its terms, at most 1. Collective."""
     if not coarse.dimension:
         return 0.0
-    forces = coarse.forces(x)
+    forces = coarse.terms(x) + np.abs(coarse.e)
     floor = max(LIGHT * float(forces.max(initial=0.0)), TINY)
     own = np.max(np.abs(coarse.residual(x)) / np.maximum(forces, floor), initial=0.0)
-    return bcast_from_root(x.getComm().tompi4py(), float(own))
+    return bcast_from_root(coarse.comm, float(own))
 
 
 class DenseCoarse(Coarse):
@@ -173,57 +156,27 @@ class DenseCoarse(Coarse):
     Args:
         G: Shape ``(r, m)``.
         e: Shape ``(r,)``.
-        face: The face; default all rows.
     """
 
-    def __init__(self, G: Array, e: Array, face: Face | None = None) -> None:
-        self.comm, self.Gt, self.e, self._face = MPI.COMM_SELF, csr_array(G.T), e, face
-        Gt = self.restricted(G.T)
-        self.factor = DenseFactor(Gt.T @ Gt)
-
-    def restricted(self, x: Array) -> Array:
-        """ZZᵀx."""
-        return x if self._face is None else self._face.restricted(x)
+    def __init__(self, G: Array, e: Array) -> None:
+        super().__init__(MPI.COMM_SELF, csr_array(G.T), e, DensePinv(G @ G.T))
 
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
         """(G_f G_fᵀ + damping·GGᵀ)⁺y."""
         G_f = face.restricted(Gt := self.Gt.toarray())
-        return DenseFactor(Gt.T @ G_f + damping * Gt.T @ Gt).solve(y)
+        return DensePinv(Gt.T @ G_f + damping * Gt.T @ Gt).solve(y)
 
-    def on_face(self, face: Face) -> DenseCoarse:
+    def on_face(self, face: Face) -> Coarse:
         """Return the same G on a face."""
-        return DenseCoarse(self.Gt.T.toarray(), self.e, face)
+        G_f = face.restricted(self.Gt.toarray())
+        return Coarse(self.comm, self.Gt, self.e, DensePinv(G_f.T @ G_f), face)
 
 
-class DenseFactor:
+class DensePinv:
     """A⁺ of a dense positive semidefinite A."""
 
     def __init__(self, A: Array) -> None:
-        self._inverse = np.linalg.pinv(A, hermitian=True)
-
-    def solve(self, y: Array) -> Array:
-        """A⁺y."""
-        return np.asarray(self._inverse @ y)
+        self.solve = np.linalg.pinv(A, hermitian=True).__matmul__
 
     def destroy(self) -> None:
         """Nothing to free."""
-
-
-class Oblique(Protocol):
-    """Projectors of a face Z on whose vectors u others depend: λ = (I + C)u.
-
-    With G_f = GZ and H = G(I + C)ZG_fᵀ: P = Z(I − Z G_fᵀH⁺G(I + C)Z)Zᵀ. Vectors are this rank's
-    parts, in the layout of all rows.
-    """
-
-    def coordinates(self, x: Array) -> Array:
-        """H⁺G(I + C)ZZᵀx, replicated, shape ``(r,)``. Collective."""
-        ...
-
-    def project(self, x: Array) -> Array:
-        """P x, shapes ``(m,)`` or ``(m, q)``. Collective."""
-        ...
-
-    def restoring(self, y: Array) -> Array:
-        """Return u = ZG_fᵀH⁺y, which solves G(I + C)u = y if that is solvable. Not collective."""
-        ...

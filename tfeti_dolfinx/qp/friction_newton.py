@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -12,8 +13,7 @@ from scipy.sparse import csr_array
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import norm_over, steering, summed
 from tfeti_dolfinx.errors import FactorError
-from tfeti_dolfinx.qp.coarse import Oblique
-from tfeti_dolfinx.qp.problem import LocalProgram
+from tfeti_dolfinx.qp.problem import QP
 from tfeti_dolfinx.qp.recycling import Recycled, triangle
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
 
@@ -129,15 +129,16 @@ class LawProgram:
     λ = P(y) and Gλ = e.
 
     Attributes:
-        local: F, d and G; its set is not looked at.
+        qp: F, d and G; its set is not looked at.
         law: The sets.
-        oblique: Makes the projectors of a face and of what follows it.
+        oblique: Makes the projectors of a face and of C, what follows it: P of λ = (I + C)u with
+            ``coordinates``, ``project`` and ``restoring`` as in ``ObliqueProjectors``.
         norm: ‖F‖, or an estimate.
     """
 
-    local: LocalProgram
+    qp: QP
     law: Law
-    oblique: Callable[[Face, csr_array], Oblique]
+    oblique: Callable[[Face, csr_array], Any]
     norm: float
 
     def with_share(self, share: float) -> LawProgram:
@@ -150,9 +151,9 @@ class LawProgram:
 
     def missed(self, p: Array, lam: Array) -> float:
         """‖F‖ √(‖λ − p‖² + ‖Gᵀ(GGᵀ)⁻¹(e − Gλ)‖²), the same on all ranks."""
-        local = self.local
-        balancing = local.normal(local.qp.coarse.solve(local.imbalance(lam)))
-        return self.norm * norm_over(local.comm, np.concatenate((p - lam, balancing)))
+        coarse = self.qp.coarse
+        balancing = coarse.combined(coarse.solve(coarse.residual(lam)))
+        return self.norm * norm_over(coarse.comm, np.concatenate((p - lam, balancing)))
 
     def residual(self, at: LawPoint) -> float:
         """‖F‖ times what λ misses of the law and of Gλ = e, the same on all ranks."""
@@ -284,10 +285,6 @@ class OnFace:
         follows = np.diff(self.C.indptr) > 0
         return np.where(follows, self.C @ lam, np.where(held, self.p, lam))
 
-    def bend(self, u: Array) -> Array:
-        """Return Z diag(κ) Zᵀu, shapes ``(m,)`` or ``(m, q)``."""
-        return self.face.bend(u)
-
 
 def _solved_on_face(
     program: LawProgram,
@@ -301,35 +298,34 @@ def _solved_on_face(
 
     ``share`` of the residual is left.
     """
-    local = program.local
-    qp, comm = local.qp, local.comm
+    qp, comm = program.qp, program.qp.comm
     oblique = program.oblique(on.face, on.C)
     M = qp.preconditioner_on(on.face) if qp.preconditioner_on else None
 
     def apply(z: Array) -> tuple[Array, Array]:
-        Fz = local.F(on.followed(z))
-        return oblique.project(Fz + on.bend(z)), Fz
+        Fz = qp.F(on.followed(z))
+        return oblique.project(Fz + on.face.bend(z)), Fz
 
     def precondition(r: Array) -> Array:
-        return oblique.project(on.face.restricted(r) if M is None else local.apply(M, r))
+        return oblique.project(on.face.restricted(r) if M is None else M(r))
 
     # Step 3a: λ₁ on the face, and u that restores Gλ = e; s is of λ before
     lam, s = on.entered(at.lam), at.s
-    u = oblique.restoring(local.imbalance(lam))
+    u = oblique.restoring(qp.coarse.residual(lam))
     way = lam + on.followed(u) - at.lam
     basis = known_on(qp.recycled, on, oblique.project)
     size = program.norm * norm_over(comm, way)
     if size > parameters.unseen * target:
         # Step 3b: F of the way, if it can be seen; known directions come before, for nothing
-        b = -oblique.project(s + on.bend(u))
+        b = -oblique.project(s + on.face.bend(u))
         z, image, _ = gcr(apply, precondition, b, np.inf, basis, comm, parameters)
         u, s = u + z, s + image
-        image = local.F(way)
+        image = qp.F(way)
         s = s + image
         if qp.recycled is not None and qp.coarse.dimension == 0:  # else it restores Gλ = e
             qp.recycled.keep(way, image)
     # Step 3c: conjugate residuals
-    b = -oblique.project(s + on.bend(u))
+    b = -oblique.project(s + on.face.bend(u))
     goal = max(share * norm_over(comm, b), parameters.followed * target)
     known = basis.shape[1]
     z, image, basis = gcr(apply, precondition, b, goal, basis, comm, parameters)
@@ -337,8 +333,8 @@ def _solved_on_face(
     if qp.recycled is not None:
         for z, image in basis[1:, known:].transpose(1, 0, 2):
             qp.recycled.keep(on.followed(z), image)
-    mu = oblique.coordinates(s + on.bend(u))
-    return LawPoint(lam + on.followed(u), s - local.normal(mu), at.mu + mu)
+    mu = oblique.coordinates(s + on.face.bend(u))
+    return LawPoint(lam + on.followed(u), s - qp.coarse.combined(mu), at.mu + mu)
 
 
 # --- Generalised conjugate residuals ----------------------------------------------------------
@@ -417,7 +413,7 @@ def known_on(
     if N.shape[1] == 0:
         return nothing
     U, FU = U @ N, FW @ N
-    AU = project(FU + on.bend(U))
+    AU = project(FU + on.face.bend(U))
     _, sizes, Vt = np.linalg.svd(triangle(past.comm, AU))
     kept = sizes > new * sizes[0]
     T = Vt[kept].T / sizes[kept]

@@ -6,11 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, norm_over
-from tfeti_dolfinx.qp.coarse import Coarse
+from tfeti_dolfinx.common.parallel import any_rank, norm_over
 from tfeti_dolfinx.qp.problem import QP, Operator, QPResult, Start
 
 # of the terms that a residual is the difference of: what rounding leaves of it at least, and
@@ -22,29 +20,21 @@ FAR_OPEN = 1e-6
 
 @dataclass(frozen=True)
 class OperatorProduct:
-    """Vector x with the product Fx.
+    """Vector x with the product Fx, this rank's parts.
 
     Attributes:
         x: The vector.
         Fx: F x.
     """
 
-    x: PETSc.Vec
-    Fx: PETSc.Vec
-
-    def destroy(self) -> None:
-        """Destroy the vectors. Collective."""
-        self.x.destroy()
-        self.Fx.destroy()
+    x: Array
+    Fx: Array
 
 
-def operator_product(F: Operator, x: PETSc.Vec) -> OperatorProduct:
-    """x and F x; takes x over, and multiplies once if x ≠ 0. Collective."""
-    Fx = x.duplicate()
-    Fx.set(0.0)
-    if x.norm() > 0.0:
-        F.mult(x, Fx)
-    return OperatorProduct(x, Fx)
+def operator_product(F: Operator, comm: MPI.Intracomm, x: Array) -> OperatorProduct:
+    """x and F x; multiplies once if x ≠ 0. Collective."""
+    moves = any_rank(comm, bool(np.any(x)))
+    return OperatorProduct(x, F(x) if moves else np.zeros(len(x)))
 
 
 class LastProduct:
@@ -64,13 +54,10 @@ class LastProduct:
 
         So what steps leave out of the gradient does not grow from solve to solve.
         """
-        (x, g), by_mu = self._looked, qp.d.duplicate()
-        qp.coarse.combine(result.mu, by_mu)
-        self._x, self._within = np.array(result.lam.array_r), 0.0
-        other = any_rank(qp.d.getComm().tompi4py(), not np.array_equal(x, self._x))
-        self._Fx = (result.gradient.array_r + by_mu.array_r if other else g) + qp.d.array_r
-        self._d, self._e = np.array(qp.d.array_r), np.array(qp.coarse.e)
-        by_mu.destroy()
+        (x, g), self._x, self._within = self._looked, result.lam, 0.0
+        other = any_rank(qp.comm, not np.array_equal(x, self._x))
+        self._Fx = (result.gradient + qp.coarse.combined(result.mu) if other else g) + qp.d
+        self._d, self._e = qp.d, np.array(qp.coarse.e)
 
     def pass_on(self, x: Array, Fx: Array, within: float) -> None:
         """Store another solver's x and Fx, to stand for all vectors within this distance."""
@@ -86,38 +73,22 @@ class LastProduct:
         if any_rank(comm, Fx.size > 0):
             self._x, self._Fx = x, Fx
 
-    def is_of(self, d: PETSc.Vec, e: Array) -> bool:
+    def is_of(self, comm: MPI.Intracomm, d: Array, e: Array) -> bool:
         """Return whether it was kept from a program with this d and e. Collective."""
-        same = np.array_equal(self._d, d.array_r) and np.array_equal(self._e, e)
-        return not any_rank(d.getComm().tompi4py(), not same)
+        return not any_rank(comm, not (np.array_equal(self._d, d) and np.array_equal(self._e, e)))
 
-    def image(self, F: Operator, x: PETSc.Vec) -> OperatorProduct:
+    def image(self, F: Operator, comm: MPI.Intracomm, x: Array) -> OperatorProduct:
         """Return x with Fx; multiply by F only if x is not the last solution. Collective."""
-        comm = x.getComm().tompi4py()
-        known = self.known(comm, x.array_r)
-        if self._within > 0.0 and not any_rank(comm, x.array_r.shape != self._x.shape):
-            known = self._Fx if norm_over(comm, x.array_r - self._x) <= self._within else known
-        if not any_rank(comm, known.size > 0):
-            return operator_product(F, x)
-        Fx = x.duplicate()
-        Fx.array[:] = known
-        return OperatorProduct(x, Fx)
+        known = self.known(comm, x)
+        if self._within > 0.0 and not any_rank(comm, x.shape != self._x.shape):
+            known = self._Fx if norm_over(comm, x - self._x) <= self._within else known
+        found = any_rank(comm, known.size > 0)
+        return OperatorProduct(x, known) if found else operator_product(F, comm, x)
 
 
-def natural(coarse: Coarse, like: PETSc.Vec) -> PETSc.Vec:
-    """λ̄₀ = Gᵀ(GGᵀ)⁻¹e. Collective."""
-    x = like.duplicate()
-    coarse.particular(x)
-    return x
-
-
-def restored(qp: QP, start: Start) -> PETSc.Vec:
+def restored(qp: QP, start: Start) -> Array:
     """Return the nearest solution of Gλ̄ = e to a start: λ + Gᵀ(GGᵀ)⁻¹(e − Gλ). Collective."""
-    x, fixed = start.lam.copy(), natural(qp.coarse, start.lam)
-    qp.coarse.project(x)
-    x.axpy(1.0, fixed)
-    fixed.destroy()
-    return x
+    return qp.coarse.project(start.lam) + qp.coarse.particular()
 
 
 @dataclass(frozen=True)
@@ -135,7 +106,8 @@ class Scale:
 
 def scale_at(qp: QP, start: OperatorProduct) -> Scale:
     """Return the scale of a program whose λ̄₀ is known with its image. Collective."""
-    return Scale(_projected(qp, start.Fx, qp.d), _rounding(qp, start))
+    size = norm_over(qp.comm, qp.coarse.project(start.Fx - qp.d))
+    return Scale(size, _rounding(qp, start))
 
 
 def scale_near(qp: QP, at: OperatorProduct) -> Scale:
@@ -143,22 +115,16 @@ def scale_near(qp: QP, at: OperatorProduct) -> Scale:
 
     ‖P d‖ and ‖P F λ‖ are equal at the solution, and b₀ is ‖P d‖ where e = 0; the larger one.
     """
-    sizes = (_projected(qp, qp.d), _projected(qp, at.Fx))
+    sizes = [norm_over(qp.comm, qp.coarse.project(x)) for x in (qp.d, at.Fx)]
     return Scale(max(sizes), _rounding(qp, at))
 
 
 def _rounding(qp: QP, at: OperatorProduct) -> float:
     """Estimate the rounding error of ‖g^P‖, to which open gaps, however wide, do not count."""
-    s = at.Fx.copy()
-    s.axpy(-1.0, qp.d)
-    qp.coarse.project(s)
-    phi, beta = qp.feasible.split(qp.feasible.project(np.array(at.x.array_r)), s.array_r)
-    s.destroy()
+    phi, beta = qp.feasible.split(qp.feasible.project(at.x), qp.coarse.project(at.Fx - qp.d))
     # P makes of gaps a gradient of rows that nothing closes yet: d is negative there
-    counts = (phi != 0.0) | ((beta != 0.0) & (qp.d.array_r > 0.0))
-    Fx, d = at.Fx.array_r, qp.d.array_r
-    parts = (np.where(counts, x, 0.0) for x in (d, Fx))
-    return ROUNDING * sum(norm_over(qp.d.getComm().tompi4py(), part) for part in parts)
+    counts = (phi != 0.0) | ((beta != 0.0) & (qp.d > 0.0))
+    return ROUNDING * sum(norm_over(qp.comm, np.where(counts, x, 0.0)) for x in (qp.d, at.Fx))
 
 
 @dataclass(frozen=True)
@@ -172,19 +138,14 @@ class Homogenised:
         scale: Size of the residual at λ̄₀, whatever λ̄ is.
     """
 
-    lam_bar: PETSc.Vec
-    gradient: PETSc.Vec
-    b: PETSc.Vec
+    lam_bar: Array
+    gradient: Array
+    b: Array
     scale: Scale
 
     def is_rounding(self, residual: float) -> bool:
         """Return whether a residual is so small that its behaviour may be due to rounding."""
         return residual <= STRANGE * self.scale.rounding
-
-    def destroy(self) -> None:
-        """Destroy the vectors. Collective."""
-        for vec in (self.lam_bar, self.gradient, self.b):
-            vec.destroy()
 
 
 def homogenise(
@@ -194,44 +155,18 @@ def homogenise(
 
     Args:
         qp: The program.
-        at: A solution of Gλ̄ = e with its image, which is copied; default λ̄₀, which costs one
-            multiplication by F if e ≠ 0.
+        at: A solution of Gλ̄ = e with its image; default λ̄₀, which costs one multiplication by F if
+            e ≠ 0.
         scale: The scale of residuals; default that at λ̄.
     """
-    if at is None:
-        at = operator_product(qp.F, natural(qp.coarse, qp.d))
-        homogenised = homogenise(qp, at, scale)
-        at.destroy()
-        return homogenised
-    gradient = at.Fx.copy()
-    gradient.axpy(-1.0, qp.d)
-    b = gradient.copy()
-    b.scale(-1.0)
-    gaps, comm = open_gaps(qp), qp.d.getComm().tompi4py()
-    without = b.copy()
-    without.array[:] -= gaps
-    qp.coarse.project(without)
-    if bcast_from_root(comm, without.norm() <= FAR_OPEN * norm_over(comm, gaps)):
-        b.array[:] = without.array_r + gaps
+    at = at or operator_product(qp.F, qp.comm, qp.coarse.particular())
+    gradient = at.Fx - qp.d
+    # d on rows that are open without forces: P would spread it over all others
+    phi, beta = qp.feasible.split(qp.feasible.project(np.zeros(len(qp.d))), -qp.d)
+    gaps = np.where((phi == 0.0) & (beta == 0.0), qp.d, 0.0)
+    b = qp.coarse.project(-gradient - gaps)
+    if norm_over(qp.comm, b) <= FAR_OPEN * norm_over(qp.comm, gaps):
+        b = b + gaps
     else:
-        qp.coarse.project(b)
-    without.destroy()
-    return Homogenised(at.x.copy(), gradient, b, scale or scale_at(qp, at))
-
-
-def open_gaps(qp: QP) -> Array:
-    """The part of d on rows that are open without forces: P would spread it over all others."""
-    d = qp.d.array_r
-    phi, beta = qp.feasible.split(qp.feasible.project(np.zeros(len(d))), -d)
-    return np.where((phi == 0.0) & (beta == 0.0), d, 0.0)
-
-
-def _projected(qp: QP, x: PETSc.Vec, less: PETSc.Vec | None = None) -> float:
-    """‖P x‖, or ‖P(x − y)‖."""
-    part = x.copy()
-    if less is not None:
-        part.axpy(-1.0, less)
-    qp.coarse.project(part)
-    size: float = part.norm()
-    part.destroy()
-    return size
+        b = qp.coarse.project(-gradient)
+    return Homogenised(at.x, gradient, b, scale or scale_at(qp, at))

@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import bcast_from_root, summed
+from tfeti_dolfinx.common.parallel import bcast_from_root, dot_over, norm_over, summed
 from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.problem import (
@@ -25,7 +24,6 @@ from tfeti_dolfinx.qp.problem import (
     no_monitor,
 )
 from tfeti_dolfinx.qp.recycling import DirectionStore, RecycledOnFace
-from tfeti_dolfinx.qp.sets import Face
 
 # --- Estimate of ‖PFP‖ ------------------------------------------------------------------------
 
@@ -33,7 +31,7 @@ from tfeti_dolfinx.qp.sets import Face
 EXHAUSTED = 1e-12
 
 
-def estimate_norm(F: Operator, coarse: Coarse, like: PETSc.Vec, steps: int = 15) -> float:
+def estimate_norm(F: Operator, coarse: Coarse, steps: int = 15) -> float:
     """‖PFP‖ by Lanczos steps: the largest Ritz value, and its residual on top. Collective.
 
     The Ritz value alone is a lower bound. There is an eigenvalue within the residual of it, the
@@ -41,38 +39,26 @@ def estimate_norm(F: Operator, coarse: Coarse, like: PETSc.Vec, steps: int = 15)
     the same in every run on the same number of ranks. (Parlett, The Symmetric Eigenvalue
     Problem, SIAM 1998, section 13.2.)
     """
-    v, previous, w = (like.duplicate() for _ in range(3))
-    rng = np.random.default_rng(like.getComm().getRank())
-    v.array[:] = rng.standard_normal(v.getLocalSize())
-    coarse.project(v)
-    previous.set(0.0)
-    diagonal: list[float] = []
-    beside: list[float] = [v.norm()]
-    comm = like.getComm().tompi4py()
-    while len(diagonal) < steps and bcast_from_root(
-        comm, beside[-1] > EXHAUSTED * _size(diagonal, beside)
-    ):
-        v.scale(1.0 / beside[-1])
-        F.mult(v, w)
-        coarse.project(w)
-        diagonal.append(w.dot(v))
-        w.axpy(-diagonal[-1], v)
+    comm, size = coarse.comm, coarse.Gt.shape[0]
+    v = coarse.project(np.random.default_rng(comm.rank).standard_normal(size))
+    previous, diagonal, beside = np.zeros(size), list[float](), [norm_over(comm, v)]
+    while len(diagonal) < steps:
+        entries = max(diagonal) + max(beside[1:]) if diagonal else 0.0
+        if not beside[-1] > EXHAUSTED * entries:
+            break
+        v = v / beside[-1]
+        w = coarse.project(F(v))
+        diagonal += dot_over(comm, (w, v))
+        w = w - diagonal[-1] * v
         if len(diagonal) > 1:
-            w.axpy(-beside[-1], previous)
-        beside.append(w.norm())
-        previous, v, w = v, w, previous
-    for vec in (v, previous, w):
-        vec.destroy()
+            w -= beside[-1] * previous
+        beside.append(norm_over(comm, w))
+        previous, v = v, w
     if not diagonal:
         return 0.0
     off = np.array(beside[1:-1])
     values, vectors = np.linalg.eigh(np.diag(diagonal) + np.diag(off, 1) + np.diag(off, -1))
     return bcast_from_root(comm, float(values[-1] + beside[-1] * abs(vectors[-1, -1])))
-
-
-def _size(diagonal: list[float], beside: list[float]) -> float:
-    """Return the size of the entries so far; 0 before the first step."""
-    return max(diagonal) + max(beside[1:]) if diagonal else 0.0
 
 
 # --- Store of conjugate directions ------------------------------------------------------------
@@ -123,12 +109,12 @@ class Directions:
         helped: Largest rᵀz/rᵀr so far.
     """
 
-    def __init__(self, like: PETSc.Vec, keeps: bool = True) -> None:
-        self.r, self.p, self.Fp, self.z = (like.duplicate() for _ in range(4))
+    def __init__(self, qp: QP) -> None:
+        self.r, self.p = np.zeros(len(qp.d)), np.zeros(len(qp.d))
         self.fresh, self.norm, self.helped = True, 0.0, 0.0
-        rows = like.getComm().tompi4py().allreduce(like.getLocalSize(), op=MPI.MAX)
-        most = max(DEFAULT.numbers // (2 * max(rows, 1)), 1) if keeps else 1
-        self.kept = DirectionStore(most, like.getLocalSize())
+        rows = qp.comm.allreduce(len(qp.d), op=MPI.MAX)
+        most = max(DEFAULT.numbers // (2 * max(rows, 1)), 1) if qp.keeps else 1
+        self.kept = DirectionStore(most, len(qp.d))
 
     def seen(self, pFp: float, pp: float, short: bool = False) -> bool:
         """Update the estimate of ‖F‖; return whether pᵀFp is positive beyond rounding.
@@ -143,11 +129,6 @@ class Directions:
         """Return whether rᵀz, z the preconditioned residual, is positive beyond rounding."""
         self.helped = max(self.helped, rz / rr if rr > 0.0 else 0.0)
         return rz > DEFAULT.flat * self.helped * rr
-
-    def destroy(self) -> None:
-        """Destroy the vectors. Collective."""
-        for vec in (self.r, self.p, self.Fp, self.z):
-            vec.destroy()
 
 
 # --- Detection of stagnation ------------------------------------------------------------------
@@ -170,9 +151,9 @@ class Progress:
         """Return whether nothing has decreased for long. Collective if many steps were made."""
         if self._steps < self._most:
             return False
-        sizes = abs(point.lam.dot(point.g)) + abs(point.lam.dot(qp.d))
+        work, load = qp.dot((point.lam, point.g), (point.lam, qp.d))
         gain, self._steps, self._gain = self._gain, 0, 0.0
-        return bcast_from_root(point.lam.getComm().tompi4py(), gain <= DEFAULT.rounding * sizes)
+        return bcast_from_root(qp.comm, gain <= DEFAULT.rounding * (abs(work) + abs(load)))
 
 
 # --- PCPG: preconditioned conjugate projected gradients ---------------------------------------
@@ -207,21 +188,17 @@ def pcpg(
     ``directions``, which are updated, are what an earlier call at this point with this ``qp`` has
     left.
     """
-    own = Directions(point.lam, qp.keeps) if directions is None else directions
-    r, p, Fp, z, comm = own.r, own.p, own.Fp, own.z, point.lam.getComm().tompi4py()
+    own, comm = Directions(qp) if directions is None else directions, qp.comm
     recycled, (past, norm) = qp.recycled, _begun(qp, point, own)
     new = list[tuple[Array, Array, float]]()  # the past stays as it is during a solve
-    least = bcast_from_root(comm, DEFAULT.short**2 * point.lam.dot(point.lam))
-    progress = Progress(norm, r.getSize())
+    least = DEFAULT.short**2 * qp.dot((point.lam, point.lam))[0]
+    progress = Progress(norm, comm.allreduce(len(qp.d)))
     while True:
         # test
-        reason = (
-            _examined(qp, point, rule, norm)
-            if norm <= rule.tolerance
-            else ConvergedReason.ITERATING
-        )
+        small = norm <= rule.tolerance
+        reason = _examined(qp, point, rule, norm) if small else ConvergedReason.ITERATING
         if rule.drifted:
-            point.refresh(qp)
+            point.g = qp.at(point.lam).g
             rule.drifted, own.fresh = False, True
             past, norm = _begun(qp, point, own)
         if reason == ConvergedReason.ITERATING and progress.stagnates(qp, point):
@@ -230,39 +207,42 @@ def pcpg(
             reason = ConvergedReason.DIVERGED_ITS
         if reason != ConvergedReason.ITERATING:
             break
-        # precondition and project: z = P M r
+        # precondition and project: z = P M r, and rᵀz
         if own.fresh:
             own.kept.clear()
-        rz, products = _precondition(qp, r, z, own.kept, norm)
+        r, kept = own.r, own.kept
+        if qp.preconditioner is None:
+            z, rz, products = r, norm**2, summed(comm, kept.images @ r)
+        else:
+            z = qp.preconditioner(r)
+            z, rz, _, products = qp.coarse.project_against(z, r, kept.images @ z)
         # direction
-        p.array[:] = z.array_r - products @ own.kept.directions
+        p = z - products @ kept.directions
         if past is not None:
-            p.array[:] = past.conjugate(p.array_r)
+            p = past.conjugate(p)
         # step
-        qp.F.mult(p, Fp)
-        Fp.copy(z)
-        pFp, pp, (rp,) = qp.coarse.project_against(z, p, np.array([r.array_r @ p.array_r]))
-        PFp = np.array(z.array_r)
-        z.aypx(-rp / pFp if pFp else 0.0, r)
-        squared, rz, rp, pFp = _square(z, rz, rp, pFp)
+        Fp = qp.F(p)
+        PFp, pFp, pp, (rp,) = qp.coarse.project_against(Fp, p, np.array([r @ p]))
+        own.p, left = p, r - (rp / pFp if pFp else 0.0) * PFp
+        # ‖r‖², and rank 0's numbers, since loops end by them
+        known = (rz, rp, pFp) if comm.rank == 0 else np.zeros(3)
+        squared, rz, rp, pFp = summed(comm, np.array([left @ left, *known]))
         short = bool(pFp) and (rp / pFp) ** 2 * pp < least
         if not (own.seen(pFp, pp, short) and own.stands_out(rz, norm**2)):
             own.fresh = True
             reason = _examined(qp, point, rule, norm) or ConvergedReason.DIVERGED_INDEFINITE_MAT
             break
-        point.move(rp / pFp, p, Fp)
-        own.kept.put(p.array_r / np.sqrt(pFp), PFp / np.sqrt(pFp))
+        point.lam, point.g = point.lam + rp / pFp * p, point.g + rp / pFp * Fp
+        kept.put(p / np.sqrt(pFp), PFp / np.sqrt(pFp))
         if recycled is not None:
-            new = [*new[1 - recycled.capacity :], (p.array.copy(), Fp.array.copy(), pFp)]
-        z.copy(r)
+            new = [*new[1 - recycled.capacity :], (p, Fp, pFp)]
+        own.r = left
         own.fresh, norm = abs(rp - rz) > DEFAULT.drifted * rz, float(np.sqrt(squared))
         steps.cg += 1
         progress.step(norm, 0.5 * rp**2 / pFp)
         monitor(steps, "cg", point.lam, norm, 0.0)
-    if recycled is not None:
-        recycled.add_all(new)
-    if directions is None:
-        own.destroy()
+    for direction in new:
+        recycled.add(*direction)  # type: ignore[union-attr]
     return reason
 
 
@@ -282,95 +262,57 @@ def solve_by_pcpg(
     direction has no positive curvature. Inequalities are not looked at, nor is ``start`` beside λ̄.
 
     >>> import numpy as np
-    >>> from petsc4py import PETSc
     >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
     >>> from tfeti_dolfinx.qp.sets import Product
     >>> from tfeti_dolfinx.qp.homogenised import homogenise
     >>> from tfeti_dolfinx.qp.problem import ResidualRule
-    >>> F = PETSc.Mat().createDense((3, 3), array=np.diag([1.0, 2.0, 4.0]), comm=PETSc.COMM_SELF)
-    >>> d = PETSc.Vec().createWithArray(np.array([1.0, 1.0, 2.0]), comm=PETSc.COMM_SELF)
+    >>> F, d = np.diag([1.0, 2.0, 4.0]).__matmul__, np.array([1.0, 1.0, 2.0])
     >>> qp = QP(F, d, DenseCoarse(np.ones((1, 3)), np.ones(1)), Product())
     >>> result = solve_by_pcpg(qp, homogenise(qp), ResidualRule(1e-12))
-    >>> result.reason.name, result.lam.array.round(6).tolist()
+    >>> result.reason.name, result.lam.round(6).tolist()
     ('CONVERGED_RTOL', [0.428571, 0.214286, 0.357143])
     """
-    lam, g, steps = homogenised.lam_bar.copy(), homogenised.gradient.copy(), Steps()
-    monitor(steps, "start", lam, homogenised.b.norm(), 0.0)
-    reason = pcpg(qp, Point(lam, g), rule, steps, max_it, monitor)
-    qp.coarse.project(g)
-    norm = g.norm()
+    point, steps = Point(homogenised.lam_bar, homogenised.gradient), Steps()
+    monitor(steps, "start", point.lam, norm_over(qp.comm, homogenised.b), 0.0)
+    reason = pcpg(qp, point, rule, steps, max_it, monitor)
+    g = qp.coarse.project(point.g)
+    norm = norm_over(qp.comm, g)
     if reason == ConvergedReason.DIVERGED_INDEFINITE_MAT and homogenised.is_rounding(norm):
         reason = ConvergedReason.DIVERGED_ROUNDING
-    moved = lam.copy()
-    moved.axpy(-1.0, homogenised.lam_bar)
-    result = QPResult(
-        lam=lam,
+    return QPResult(
+        lam=point.lam,
         mu=qp.coarse.coordinates(g),
         gradient=g,
-        face=_face(qp, lam, g),
+        face=qp.feasible.face(point.lam, g),
         reason=reason,
         projected_gradient=norm,
-        equality=qp.coarse.norm_Q(moved),
+        equality=qp.coarse.norm_Q(point.lam - homogenised.lam_bar),
         reference=homogenised.scale.reference,
         norm=0.0,
         steps=steps,
     )
-    moved.destroy()
-    return result
-
-
-def _face(qp: QP, lam: PETSc.Vec, g: PETSc.Vec) -> Face:
-    """Return the face of λ."""
-    return qp.feasible.face(lam.array_r, g.array_r)
 
 
 def _examined(qp: QP, point: Point, rule: StoppingRule, norm: float) -> ConvergedReason:
     """Apply the stopping rule to the point."""
-    return rule.examine(point.lam, point.g, _face(qp, point.lam, point.g), norm)
+    face = qp.feasible.face(point.lam, point.g)
+    return rule.examine(point.lam, point.g, face, norm)
 
 
 def _begun(qp: QP, point: Point, own: Directions) -> tuple[RecycledOnFace | None, float]:
-    """Minimise q over directions of earlier solves; return these, if any, and ‖r‖."""
-    norm = _residual(qp, point.g, own.r)
-    if qp.recycled is None or qp.recycled.count == 0:
-        return None, norm
-    past = RecycledOnFace(qp.recycled, qp.held)
-    if past.count == 0:
-        return None, norm
-    own.p.array[:], image = past.least(own.r.array_r)
-    qp.coarse.project(own.p)  # rounding of many directions is none of Gλ = e
-    point.lam.axpy(1.0, own.p)
-    point.g.array[:] += image
-    own.fresh = True
-    return past, _residual(qp, point.g, own.r)
+    """Minimise q over directions of earlier solves; return these, if any, and ‖r‖, r = −P g.
 
-
-def _residual(qp: QP, g: PETSc.Vec, r: PETSc.Vec) -> float:
-    """r = −P g, and its norm.
-
-    Twice: the preconditioner does not see what G's factor leaves of Gᵀμ the first time.
+    Projected twice: the preconditioner does not see what G's factor leaves of Gᵀμ the first time.
     """
-    g.copy(r)
-    r.scale(-1.0)
-    qp.coarse.project(r)
-    qp.coarse.project(r)
-    return float(r.norm())
-
-
-def _square(x: PETSc.Vec, *known: float) -> Array:
-    """‖x‖², and rank 0's numbers, since loops end by them. Collective, one reduction."""
-    comm = x.getComm().tompi4py()
-    sums = np.array([x.array_r @ x.array_r, *(known if comm.rank == 0 else np.zeros(len(known)))])
-    return summed(comm, sums)
-
-
-def _precondition(
-    qp: QP, r: PETSc.Vec, z: PETSc.Vec, kept: DirectionStore, norm: float
-) -> tuple[float, Array]:
-    """z = P M r, M the preconditioner or the identity; rᵀz, given ‖r‖, and PFp_i·z."""
-    if qp.preconditioner is None:
-        r.copy(z)
-        return norm**2, summed(r.getComm().tompi4py(), kept.images @ z.array_r)
-    qp.preconditioner.mult(r, z)
-    rz, _, products = qp.coarse.project_against(z, r, kept.images @ z.array_r)
-    return rz, products
+    project, past = qp.coarse.project, None
+    own.r = project(project(-point.g))
+    if qp.recycled is not None and qp.recycled.count > 0:
+        past = RecycledOnFace(qp.recycled, qp.held)
+        if past.count == 0:
+            past = None
+        else:
+            way, image = past.least(own.r)
+            # rounding of many directions is none of Gλ = e
+            point.lam, point.g = point.lam + project(way), point.g + image
+            own.fresh, own.r = True, project(project(-point.g))
+    return past, norm_over(qp.comm, own.r)

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import steering, summed
+from tfeti_dolfinx.common.parallel import dot_over
 from tfeti_dolfinx.qp.problem import ConvergedReason, Monitor, Operator, Steps, no_monitor
-from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
+from tfeti_dolfinx.qp.sets import FeasibleSet, Status
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,7 @@ class MprgpParameters:
 
 
 class MprgpIterate:
-    """An iterate x ∈ Ω of min ½xᵀAx − bᵀx, with its gradient g = Ax − b and its parts; in place.
+    """An iterate x ∈ Ω of min ½xᵀAx − bᵀx, with its gradient g = Ax − b and its parts.
 
     Attributes:
         phi: Free gradient φ.
@@ -50,18 +49,17 @@ class MprgpIterate:
         chopped_squared: ‖β‖².
     """
 
-    def __init__(self, A: Operator, x: PETSc.Vec, g: PETSc.Vec, feasible: FeasibleSet) -> None:
-        self.A, self.x, self.g, self.feasible = A, x, g, feasible
-        self._comm = x.getComm().tompi4py()
-        self.phi, self.beta, self.p, self.Ap = (x.duplicate() for _ in range(4))
-        self.free_squared = self.chopped_squared = 0.0
+    def __init__(
+        self, A: Operator, x: Array, g: Array, feasible: FeasibleSet, comm: MPI.Intracomm
+    ) -> None:
+        self.A, self.x, self.g, self.feasible, self.comm = A, x, g, feasible, comm
         self.split()
 
     def split(self) -> None:
         """Find φ and β at x. Collective."""
-        self.phi.array[:], self.beta.array[:] = self.feasible.split(self.x.array_r, self.g.array_r)
-        self.free_squared = self.phi.dot(self.phi)
-        self.chopped_squared = self.beta.dot(self.beta)
+        self.phi, self.beta = self.feasible.split(self.x, self.g)
+        squares = dot_over(self.comm, (self.phi, self.phi), (self.beta, self.beta))
+        self.free_squared, self.chopped_squared = squares
 
     @property
     def projected_gradient(self) -> float:
@@ -70,46 +68,26 @@ class MprgpIterate:
 
     def is_proportional(self, parameters: MprgpParameters) -> bool:
         """Return whether ‖β‖² ≤ Γ² φ̃ᵀφ, φ̃ = (x − P_Ω(x − ᾱφ))/ᾱ. Collective."""
-        x, phi, alpha = self.x.array_r, self.phi.array_r, parameters.alpha_bar
+        x, phi, alpha = self.x, self.phi, parameters.alpha_bar
         trial = x - alpha * phi
         projected = self.feasible.project(trial)
         own = float(np.where(projected == trial, phi, (x - projected) / alpha) @ phi)
-        return bool(self.chopped_squared <= parameters.gamma**2 * self._comm.allreduce(own))
+        return bool(self.chopped_squared <= parameters.gamma**2 * self.comm.allreduce(own))
 
     def max_step(self, p: Array, x: Array | None = None) -> float:
         """Return the largest α with x − α p ∈ Ω. Collective."""
-        own = self.feasible.max_step(self.x.array_r if x is None else x, p)
-        return float(self._comm.allreduce(own, op=MPI.MIN))
+        own = self.feasible.max_step(self.x if x is None else x, p)
+        return float(self.comm.allreduce(own, op=MPI.MIN))
 
-    def sums(self, *products: float) -> Array:
-        """Return sums over all ranks, rank 0's on each. Collective."""
-        return steering(self._comm, *summed(self._comm, np.array(products)))
-
-    def apply(self, p: Array) -> Array:
-        """Return A p, and overwrite p and Ap with both; multiplies by A once. Collective."""
-        self.p.array[:] = p
-        self.A.mult(self.p, self.Ap)
-        return np.array(self.Ap.array_r)
-
-    def face(self) -> Face:
-        """Return the face of x."""
-        return self.feasible.face(self.x.array_r, self.g.array_r)
-
-    def move(self, alpha: float, p: PETSc.Vec, Ap: PETSc.Vec) -> None:
+    def move(self, alpha: float, p: Array, Ap: Array) -> None:
         """x ← x − α p and the gradient with it."""
-        self.x.axpy(-alpha, p)
-        self.g.axpy(-alpha, Ap)
+        self.x, self.g = self.x - alpha * p, self.g - alpha * Ap
 
     def move_to(self, target: Array) -> None:
-        """x ← P_Ω(target); multiplies by A once, and overwrites the direction p. Collective."""
+        """x ← P_Ω(target); multiplies by A once. Collective."""
         projected = self.feasible.project(target)
-        self.g.array[:] += self.apply(projected - self.x.array_r)
-        self.x.array[:] = projected  # x + p rounds: what is on its bound stays there
-
-    def destroy(self) -> None:
-        """Destroy the work vectors, not x and g. Collective."""
-        for vec in (self.phi, self.beta, self.p, self.Ap):
-            vec.destroy()
+        self.g = self.g + self.A(projected - self.x)
+        self.x = projected  # x + p rounds: what is on its bound stays there
 
 
 def step_on_face(state: MprgpIterate, parameters: MprgpParameters) -> int:
@@ -122,22 +100,22 @@ def step_on_face(state: MprgpIterate, parameters: MprgpParameters) -> int:
     Returns:
         The conjugate gradient steps; 0 where little of β is tangential, or the cost does not fall.
     """
-    x, g, face = np.array(state.x.array_r), np.array(state.g.array_r), state.face()
+    x, g, comm, face = state.x, state.g, state.comm, state.feasible.face(state.x, state.g)
     Z, kappa, inside = face.Z, face.bends, face.status != Status.SLIP
-    on_face = Z.T @ state.beta.array_r
-    if state.sums(on_face @ on_face)[0] < parameters.tangential * state.chopped_squared:
+    on_face = Z.T @ state.beta
+    if dot_over(comm, (on_face, on_face))[0] < parameters.tangential * state.chopped_squared:
         return 0
     # Step 1: (ZᵀAZ + diag κ)t = −Zᵀg, scaled with 1/(1 + ᾱκ)
     scale = 1.0 / (1.0 + parameters.alpha_bar * kappa)
     r, d, Ad, steps = -(Z.T @ g), np.zeros_like(x), np.zeros_like(x), 0
     t = z = scale * r
-    rz, residual = state.sums(r @ z, r @ r)
+    rz, residual = dot_over(comm, (r, z), (r, r))
     target, wanted, room = parameters.reduction**2 * residual, 0.0, np.inf
     while wanted <= room and residual > target and steps < parameters.most_steps:
         p = Z @ t
-        Ap = state.apply(p)
+        Ap = state.A(p)
         Ht = Z.T @ Ap + kappa * t
-        (curvature,) = state.sums(t @ Ht)
+        (curvature,) = dot_over(comm, (t, Ht))
         if not curvature > 0.0:
             break
         # rows that do not slip keep the face
@@ -146,18 +124,17 @@ def step_on_face(state: MprgpIterate, parameters: MprgpParameters) -> int:
         length = min(wanted, room)
         d, Ad, r = d + length * p, Ad + length * Ap, r - length * Ht
         z, before = scale * r, rz
-        rz, residual = state.sums(r @ z, r @ r)
+        rz, residual = dot_over(comm, (r, z), (r, r))
         t = z + rz / before * t
         steps += 1
     # Step 2: back to the boundary, where the cost falls
     target_x = state.feasible.project(x + d)
     step = target_x - x
-    image = Ad + state.apply(step - d)
-    slope, change, gg, xx = state.sums(g @ d, g @ step + 0.5 * (step @ image), g @ g, x @ x)
+    image = Ad + state.A(step - d)
+    slope, change, gg, xx = dot_over(comm, (g, d), (g + 0.5 * image, step), (g, g), (x, x))
     if change > parameters.enough * slope + parameters.rounding * np.sqrt(gg * xx):
         return 0
-    state.g.array[:] += image
-    state.x.array[:] = target_x
+    state.g, state.x = state.g + image, target_x
     return steps
 
 
@@ -189,16 +166,14 @@ def mprgp(
 
     >>> import numpy as np
     >>> from tfeti_dolfinx.qp.sets import Bounds
-    >>> A = PETSc.Mat().createDense((2, 2), array=np.diag([1.0, 2.0]), comm=PETSc.COMM_SELF)
-    >>> x = PETSc.Vec().createWithArray(np.zeros(2), comm=PETSc.COMM_SELF)
-    >>> g = PETSc.Vec().createWithArray(np.array([-3.0, 4.0]), comm=PETSc.COMM_SELF)  # Ax − b
-    >>> state, steps = MprgpIterate(A, x, g, Bounds()), Steps()
+    >>> A, x, g = np.diag([1.0, 2.0]).__matmul__, np.zeros(2), np.array([-3.0, 4.0])  # g = Ax − b
+    >>> state, steps = MprgpIterate(A, x, g, Bounds(), MPI.COMM_SELF), Steps()
     >>> mprgp(state, MprgpParameters(0.9), lambda s: s.projected_gradient <= 1e-9, steps, 100)
-    >>> x.array.round(6).tolist(), steps.inner > 0
+    >>> state.x.round(6).tolist(), steps.inner > 0
     ([3.0, 0.0], True)
     """
-    A, alpha_bar = state.A, parameters.alpha_bar
-    x, g, p, Ap, phi, beta = state.x, state.g, state.p, state.Ap, state.phi, state.beta
+    A, alpha_bar, comm = state.A, parameters.alpha_bar, state.comm
+    p = Ap = np.zeros_like(state.x)
     conjugate, pAp = False, 1.0
     while not stop(state):
         if steps.inner >= max_it:
@@ -206,15 +181,12 @@ def mprgp(
         # Step 1: is x strictly proportional?
         if state.is_proportional(parameters):
             # Step 2: trial conjugate gradient step
-            if conjugate:
-                p.aypx(-phi.dot(Ap) / pAp, phi)
-            else:
-                phi.copy(p)
-            A.mult(p, Ap)
-            pAp = p.dot(Ap)
+            p = state.phi - dot_over(comm, (state.phi, Ap))[0] / pAp * p if conjugate else state.phi
+            Ap = A(p)
+            pAp, gp = dot_over(comm, (p, Ap), (state.g, p))
             if not pAp > 0.0:
                 return ConvergedReason.DIVERGED_INDEFINITE_MAT
-            alpha_cg, alpha_f = g.dot(p) / pAp, state.max_step(p.array_r)
+            alpha_cg, alpha_f = gp / pAp, state.max_step(p)
             conjugate = alpha_cg <= alpha_f
             if conjugate:
                 # Step 3: conjugate gradient step
@@ -224,27 +196,28 @@ def mprgp(
             else:
                 # Step 4: expansion step: to the edge of the face, then by −ᾱφ, projected
                 state.move(alpha_f, p, Ap)
-                x.array[:] = state.feasible.project(x.array_r)
+                state.x = state.feasible.project(state.x)
                 state.split()
-                state.move_to(x.array_r - alpha_bar * phi.array_r)
+                state.move_to(state.x - alpha_bar * state.phi)
                 steps.expansion += 1
                 kind = "expansion"
         else:
             # Step 5: proportioning step
-            room, conjugate = state.max_step(beta.array_r), False
+            beta, conjugate = state.beta, False
+            room = state.max_step(beta)
             if room < alpha_bar:
                 cg = step_on_face(state, parameters)
                 steps.cg += cg
                 if cg == 0:
-                    state.move_to(x.array_r - alpha_bar * g.array_r)
+                    state.move_to(state.x - alpha_bar * state.g)
             else:
-                A.mult(beta, Ap)
-                bAb = beta.dot(Ap)
+                Ab = A(beta)
+                bAb, gb = dot_over(comm, (beta, Ab), (state.g, beta))
                 if not bAb > 0.0:
                     return ConvergedReason.DIVERGED_INDEFINITE_MAT
-                state.move(min(g.dot(beta) / bAb, room), beta, Ap)
+                state.move(min(gb / bAb, room), beta, Ab)
             steps.proportioning += 1
             kind = "proportioning"
         state.split()
-        monitor(steps, kind, x, state.projected_gradient, -1.0)
+        monitor(steps, kind, state.x, state.projected_gradient, -1.0)
     return None

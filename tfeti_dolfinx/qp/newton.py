@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import any_rank
+from tfeti_dolfinx.common.parallel import any_rank, norm_over
 from tfeti_dolfinx.qp.coarse import HELD, imbalance
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.newton_faces import FaceSolver
@@ -16,9 +15,8 @@ from tfeti_dolfinx.qp.parameters import NewtonParameters
 from tfeti_dolfinx.qp.problem import (
     QP,
     ConvergedReason,
-    DualIterate,
-    LocalProgram,
     Monitor,
+    Point,
     QPResult,
     Start,
     Steps,
@@ -36,25 +34,23 @@ from tfeti_dolfinx.qp.sets import Face, Status, face_of
 # --- Step 0: start ----------------------------------------------------------------------------
 
 
-def first_point(qp: QP) -> PETSc.Vec:
+def first_point(qp: QP) -> Array:
     """Step 0: the least λ with open contact if that balances the load, else that of a foundation.
 
     With friction the latter: what is open would slip far first. Where e = 0 it is 0. Collective;
     multiplies by nothing.
     """
-    zero = qp.d.duplicate()
-    zero.set(0.0)
-    zero.array[:] = qp.feasible.project(zero.array_r)
-    if not np.any(qp.coarse.e) and zero.norm() == 0.0:
+    zero = qp.feasible.project(np.zeros(len(qp.d)))
+    if not np.any(qp.coarse.e) and not any_rank(qp.comm, bool(np.any(zero))):
         return zero
-    face = qp.feasible.face(zero.array_r, zero.array_r)
+    face = qp.feasible.face(zero, zero)
     if not _has_friction(qp, face):
-        coarse, lam = qp.coarse.on_face(face), qp.d.duplicate()
-        coarse.particular(lam)
+        coarse = qp.coarse.on_face(face)
+        lam = coarse.particular()
         held = imbalance(coarse, lam) <= HELD
         # where 0 is inside of Ω, as with adhesion, rows of contact are free and may leave it
-        out = bool(np.any(qp.feasible.project(lam.array_r) != lam.array_r))
-        if held and not any_rank(qp.d.getComm().tompi4py(), out):
+        out = bool(np.any(qp.feasible.project(lam) != lam))
+        if held and not any_rank(qp.comm, out):
             return lam
     return _on_foundation(qp, project_onto_feasible(qp.coarse, qp.feasible, zero))
 
@@ -75,64 +71,56 @@ class FoundationParameters:
 FOUNDATION = FoundationParameters()
 
 
-def _on_foundation(qp: QP, least: FeasiblePoint) -> PETSc.Vec:
+def _on_foundation(qp: QP, least: FeasiblePoint) -> Array:
     """Return forces of rigid bodies on springs that balance the load: which rows touch first.
 
     It is the feasible point nearest to the forces of springs that gaps press. How many rows carry
     depends on how soft springs are, and that on how many carry: found by turns. Where the least λ
-    of Ω, which is taken over, does not balance the load, it is that. Collective.
+    of Ω does not balance the load, it is that. Collective.
     """
     if qp.foundation is None or least.missing > UNBALANCED:
         return least.lam
-    comm, count, point = qp.d.getComm().tompi4py(), 1, least
+    count, lam = 1, least.lam
     for _ in range(FOUNDATION.max_it):
-        y = qp.d.duplicate()
-        y.array[:] = qp.foundation(count)
-        point.lam.destroy()
-        point = project_onto_feasible(qp.coarse, qp.feasible, y)
-        y.destroy()
-        before, lam = count, point.lam.array_r
+        lam = project_onto_feasible(qp.coarse, qp.feasible, qp.foundation(count)).lam
         touching = qp.feasible.face(lam, -lam).status == Status.TOUCHING
-        count = max(int(comm.allreduce(int(np.sum(touching & (lam != 0.0))))), 1)
+        before = count
+        count = max(int(qp.comm.allreduce(int(np.sum(touching & (lam != 0.0))))), 1)
         if abs(count - before) <= FOUNDATION.alike * before:
             break
-    return point.lam
+    return lam
 
 
-def feasible_start(qp: QP, start: Start) -> PETSc.Vec:
+def feasible_start(qp: QP, start: Start) -> Array:
     """Step 0: the nearest feasible point to earlier multipliers, or the first. Collective.
 
     What was open stays open, if the others can restore Gλ = e: else each would carry a little.
     From forces far beyond small discs, as the bounds of another load step are, the way to Gλ = e
     has so many kinks that the projection may end before.
     """
-    on = qp.feasible.project(start.lam.array_r)
+    on = qp.feasible.project(start.lam)
     for within in (WithinFace(qp.feasible, qp.feasible.face(on, -on)), qp.feasible):
         found = project_onto_feasible(qp.coarse, within, start.lam)
         if found.missing <= UNBALANCED:
             return found.lam
-        found.lam.destroy()
     return first_point(qp)
 
 
-def multipliers_at(qp: QP, z: DualIterate) -> Array:
+def multipliers_at(qp: QP, z: Point) -> Array:
     """Return the μ of least squares at λ: that of the rows that hold what they multiply there.
 
     Open rows and those on the boundary of a disc, which slip, do not. Collective.
     """
     face = qp.feasible.face(z.lam, -z.lam)
     holds = (face.status == Status.FREE) | (face.holding & (z.lam != 0.0))
-    coarse, g = qp.coarse.on_face(face_of(holds, face.status)), qp.d.duplicate()
-    g.array[:] = z.g
-    mu = coarse.coordinates(g)
-    g.destroy()
-    return mu
+    coarse = qp.coarse.on_face(face_of(holds, face.status))
+    return coarse.coordinates(z.g)
 
 
 def _has_friction(qp: QP, face: Face) -> bool:
     """Return whether a row of some rank sticks or slips. Collective."""
     rubs = np.isin(face.status, (Status.STICK, Status.SLIP))
-    return any_rank(qp.d.getComm().tompi4py(), bool(np.any(rubs)))
+    return any_rank(qp.comm, bool(np.any(rubs)))
 
 
 # --- State of the iteration -------------------------------------------------------------------
@@ -155,7 +143,7 @@ class NewtonState:
         resume: Whether λ is where PCPG has stopped.
     """
 
-    z: DualIterate
+    z: Point
     mu: Array
     s: Array
     back: Array
@@ -172,45 +160,39 @@ class _Newton:
 
     def __init__(
         self,
-        program: LocalProgram,
+        qp: QP,
         solver: FaceSolver,
         parameters: NewtonParameters,
         state: NewtonState,
     ) -> None:
-        self.program, self.solver, self.parameters, self.state = program, solver, parameters, state
-        self.feasible, self.coarse = program.qp.feasible, program.qp.coarse
+        self.qp, self.solver, self.parameters, self.state = qp, solver, parameters, state
+        self.feasible, self.coarse = qp.feasible, qp.coarse
 
     def look(self) -> None:
         """Step 1: how far a gradient step, brought back to the feasible set, moves."""
-        state, program = self.state, self.program
+        state, qp, normal = self.state, self.qp, self.coarse.combined
         if self.solver.directions.norm == 0.0:
             self._learn_norm()
         state.norm = self.solver.directions.norm or 1.0
         if state.resume:
             mu = self.solver.multipliers(state.z.g)
-            s = state.z.g - program.normal(mu)
+            s = state.z.g - normal(mu)
             # of motions that the face does not see μ is rounding over rounding
-            left, size = program.dot((s, s), (state.z.g, state.z.g))
+            left, size = qp.dot((s, s), (state.z.g, state.z.g))
             state.mu = mu if left <= self.parameters.unfelt**2 * size else 0.0 * mu
         # not λ − ᾱ(Fλ − d): what Gᵀμ takes from it may be large
-        state.s = state.z.g - program.normal(state.mu)
-        state.back, alpha, _ = program.projected(state.z.lam - state.s / state.norm)
-        state.mu = state.mu + state.norm * alpha
-        state.s = state.z.g - program.normal(state.mu)
+        state.s = state.z.g - normal(state.mu)
+        wanted = state.z.lam - state.s / state.norm
+        found = project_onto_feasible(self.coarse, self.feasible, wanted)
+        state.back, state.mu = found.lam, state.mu + state.norm * found.alpha
+        state.s = state.z.g - normal(state.mu)
         moved = state.z.lam - state.back
-        square, size = program.dot((moved, moved), (state.z.lam, state.z.lam))
+        square, size = qp.dot((moved, moved), (state.z.lam, state.z.lam))
         state.residual = state.norm * np.sqrt(square)
         state.rounding = self.parameters.lost * state.norm * np.sqrt(size)
         state.idle += 1
         if state.residual <= 0.5 * state.least:
             state.least, state.idle = state.residual, 0
-
-    def vectors(self) -> tuple[PETSc.Vec, PETSc.Vec]:
-        """Return new vectors λ and s."""
-        d = self.program.qp.d
-        lam, s = d.duplicate(), d.duplicate()
-        lam.array[:], s.array[:] = self.state.z.lam, self.state.s
-        return lam, s
 
     def examine(self, rule: StoppingRule) -> ConvergedReason:
         """Apply the stopping rule where ‖g^P‖ is small enough."""
@@ -218,22 +200,16 @@ class _Newton:
         if state.residual > max(rule.tolerance, state.rounding):
             return ConvergedReason.ITERATING
         rule.norm = state.norm
-        lam, s = self.vectors()
-        reason = rule.examine(lam, s, self.pressed_face(), state.residual)
-        lam.destroy()
-        s.destroy()
-        return reason
+        return rule.examine(state.z.lam, state.s, self.pressed_face(), state.residual)
 
     def _learn_norm(self) -> None:
         """Take Rayleigh quotients of F at λ, which alone may be far below ‖F‖, and at Ps."""
-        program, z = self.program, self.state.z
-        Ps = program.vec(z.g)
-        self.coarse.project(Ps)
-        p, g_d = np.array(Ps.array_r), z.g + program.qp.d.array_r
-        energy, size, pp, gg = program.dot((z.lam, g_d), (z.lam, z.lam), (p, p), (z.g, z.g))
+        qp, z = self.qp, self.state.z
+        p, Fz = self.coarse.project(z.g), z.g + qp.d
+        energy, size, pp, gg = qp.dot((z.lam, Fz), (z.lam, z.lam), (p, p), (z.g, z.g))
         self.solver.directions.seen(energy, size)
         if pp > self.parameters.short**2 * gg:
-            (curvature,) = program.dot((p, program.F(p)))
+            (curvature,) = qp.dot((p, qp.F(p)))
             self.solver.directions.seen(curvature, pp)
 
     def pressed_face(self) -> Face:
@@ -243,7 +219,7 @@ class _Newton:
         """
         return self.feasible.face(self.state.back, self.state.s)
 
-    def wanted_face(self) -> tuple[DualIterate, Face]:
+    def wanted_face(self) -> tuple[Point, Face]:
         """Step 2: start and face of the next solve.
 
         The face is that of λ, with the rows that want to carry if the chopped gradient β dominates
@@ -258,7 +234,7 @@ class _Newton:
         along = face.restricted(beta)  # along a boundary that is curved
         beta = beta - along
         phi = phi + along
-        free, chopped = self.program.dot((phi, phi), (beta, beta))
+        free, chopped = self.qp.dot((phi, phi), (beta, beta))
         if state.resume:  # what PCPG has left on the face, and not what ᾱ makes of μ
             free = self.solver.left**2
         if chopped > self.parameters.gamma**2 * free:
@@ -266,20 +242,20 @@ class _Newton:
             face = self.feasible.face(0.5 * (z.lam + moved), state.s)
         pressed = self.pressed_face()
         early = (face.status == Status.STICK) & (pressed.status == Status.SLIP)
-        if _has_friction(self.program.qp, face):
+        if _has_friction(self.qp, face):
             early |= (face.status == Status.TOUCHING) & (pressed.status == Status.OPEN)
-        if not self.program.any(early):
+        if not any_rank(self.qp.comm, bool(np.any(early))):
             return z, face
         state.resume = False
-        return self.program.moved(z, state.back), pressed
+        return self.qp.moved(z, state.back), pressed
 
-    def gain(self, to: DualIterate) -> float:
+    def gain(self, to: Point) -> float:
         """Return q(λ) − q(to), without terms that Gλ = e makes constant."""
         z = self.state.z
-        (double,) = self.program.dot((z.lam - to.lam, to.g - z.g + 2.0 * self.state.s))
+        (double,) = self.qp.dot((z.lam - to.lam, to.g - z.g + 2.0 * self.state.s))
         return 0.5 * double
 
-    def accept(self, end: DualIterate, feasible: bool) -> bool:
+    def accept(self, end: Point, feasible: bool) -> bool:
         """Step 4: go where q falls enough; return whether q could be lowered.
 
         That is the end of step 3, else the projected gradient step or the part of it where q is
@@ -289,7 +265,7 @@ class _Newton:
         looked = np.isfinite(state.residual)
         enough = self.parameters.enough * 0.5 / state.norm * state.residual**2 if looked else 0.0
         # on circles s and λ are both large: their product's rounding hides changes of q
-        (hidden,) = self.program.dot((np.abs(state.z.lam), np.abs(state.s)))
+        (hidden,) = self.qp.dot((np.abs(state.z.lam), np.abs(state.s)))
         gain = self.gain(end)
         taken = feasible and gain >= enough - self.parameters.hidden * hidden
         state.resume = taken
@@ -303,20 +279,20 @@ class _Newton:
         """Go along λ̂ − λ; return whether q falls."""
         state, z = self.state, self.state.z
         p = state.back - z.lam
-        Fp = self.program.F(p)
-        slope, curvature, size = self.program.dot((-state.s, p), (p, Fp), (p, p))
+        Fp = self.qp.F(p)
+        slope, curvature, size = self.qp.dot((-state.s, p), (p, Fp), (p, p))
         if size <= 0.0 or slope <= 0.0:
             return False
         self.solver.directions.seen(curvature, size)
         length = min(1.0, slope / curvature) if curvature > 0.0 else 1.0
         lam = self.feasible.project(z.lam + length * p)
-        self._go(DualIterate(lam, z.g + length * Fp), 0.5 * length * slope)
+        self._go(Point(lam, z.g + length * Fp), 0.5 * length * slope)
         return True
 
-    def _go(self, to: DualIterate, gain: float) -> None:
+    def _go(self, to: Point, gain: float) -> None:
         """Move to a point where q is lower by ``gain``."""
         z = self.state.z
-        work, load = self.program.dot((z.lam, z.g), (z.lam, self.program.qp.d.array_r))
+        work, load = self.qp.dot((z.lam, z.g), (z.lam, self.qp.d))
         if gain > self.parameters.hidden * (abs(work) + abs(load)):
             self.state.idle = 0
         self.state.z = to
@@ -357,24 +333,23 @@ def newton(
     >>> from tfeti_dolfinx.qp.sets import Bounds
     >>> from tfeti_dolfinx.qp.homogenised import homogenise, operator_product
     >>> from tfeti_dolfinx.qp.problem import ResidualRule
-    >>> F = PETSc.Mat().createDense((3, 3), array=np.diag([1.0, 2.0, 4.0]), comm=PETSc.COMM_SELF)
-    >>> d = PETSc.Vec().createWithArray(np.array([1.0, -1.0, 2.0]), comm=PETSc.COMM_SELF)
+    >>> F, d = np.diag([1.0, 2.0, 4.0]).__matmul__, np.array([1.0, -1.0, 2.0])
     >>> qp = QP(F, d, DenseCoarse(np.ones((1, 3)), np.ones(1)), Bounds())
-    >>> start = homogenise(qp, operator_product(F, first_point(qp)))
+    >>> start = homogenise(qp, operator_product(F, qp.comm, first_point(qp)))
     >>> result = newton(qp, start, ResidualRule(1e-10))
-    >>> result.reason.name, result.lam.array.round(6).tolist()
+    >>> result.reason.name, result.lam.round(6).tolist()
     ('CONVERGED_RTOL', [0.6, 0.0, 0.4])
     """
-    steps, program = Steps(), LocalProgram(qp)
-    solver = FaceSolver(program, rule, parameters, steps, max_it, monitor)
+    steps = Steps()
+    solver = FaceSolver(qp, rule, parameters, steps, max_it, monitor)
     # Step 0: a feasible start
-    z = DualIterate(np.array(homogenised.lam_bar.array_r), np.array(homogenised.gradient.array_r))
+    z = Point(homogenised.lam_bar, homogenised.gradient)
     mu = np.zeros(qp.coarse.dimension) if start is None else start.mu
     if mu is None:
         mu = multipliers_at(qp, z)
     state = NewtonState(z, mu, z.g, z.lam)
-    method = _Newton(program, solver, parameters, state)
-    monitor(steps, "start", homogenised.lam_bar, homogenised.b.norm(), 0.0)
+    method = _Newton(qp, solver, parameters, state)
+    monitor(steps, "start", homogenised.lam_bar, norm_over(qp.comm, homogenised.b), 0.0)
     friction = _has_friction(qp, qp.feasible.face(z.lam, z.g))
     reason = ConvergedReason.ITERATING
     if friction and imbalance(qp.coarse, homogenised.lam_bar) > UNBALANCED:
@@ -388,10 +363,10 @@ def newton(
         if looks:
             # Step 1: optimality
             method.look()
-            monitor(steps, "outer", program.vec(state.z.lam), state.residual, 0.0)
+            monitor(steps, "outer", state.z.lam, state.residual, 0.0)
             reason = method.examine(rule)
             if rule.drifted:
-                state.z = program.refreshed(state.z.lam)
+                state.z = qp.at(state.z.lam)
                 state.resume = rule.drifted = False
                 continue
             if reason == ConvergedReason.ITERATING and max(steps.outer, steps.cg) >= max_it:
@@ -408,21 +383,17 @@ def newton(
         elif not method.accept(end, feasible) or state.idle >= parameters.patience:
             reason = ConvergedReason.DIVERGED_ROUNDING
         steps.outer, looks = steps.outer + 1, True
-    lam, s = method.vectors()
-    result = QPResult(
-        lam=lam,
+    none = np.empty(0, dtype=np.int64)
+    return QPResult(
+        lam=state.z.lam,
         mu=state.mu,
-        gradient=s,
+        gradient=state.s,
         face=method.pressed_face(),
         reason=reason,
         projected_gradient=state.residual,
-        equality=qp.coarse.norm_Q(program.vec(state.z.lam - homogenised.lam_bar.array_r)),
+        equality=qp.coarse.norm_Q(state.z.lam - homogenised.lam_bar),
         reference=homogenised.scale.reference,
         norm=state.norm,
         steps=steps,
+        excluding=none if solver.excluding is None else solver.excluding,
     )
-    if solver.excluding is not None:
-        result.excluding = solver.excluding
-    solver.destroy()
-    program.destroy()
-    return result

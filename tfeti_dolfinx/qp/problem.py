@@ -8,32 +8,44 @@ from enum import IntEnum
 from typing import Protocol
 
 import numpy as np
-from petsc4py import PETSc
+from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import any_rank, summed
+from tfeti_dolfinx.common.parallel import dot_over
 from tfeti_dolfinx.qp.coarse import Coarse
-from tfeti_dolfinx.qp.projection import ConvexSet, project_onto_feasible
 from tfeti_dolfinx.qp.recycling import Recycled
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet
 
 # --- The quadratic program and its result -----------------------------------------------------
+# Vectors are this rank's parts, in the layout of all rows, shape ``(m,)``.
+
+# A x of a symmetric A, as a new vector; collective
+Operator = Callable[[Array], Array]
 
 
-class Operator(Protocol):
-    """A linear operator; any square ``PETSc.Mat`` is one."""
-
-    def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = A x. Collective."""
-        ...
-
-
-class FaceOperator(Operator, Protocol):
+class FaceOperator(Protocol):
     """An operator that belongs to a face."""
+
+    def __call__(self, x: Array) -> Array:
+        """A x. Collective."""
+        ...
 
     def destroy(self) -> None:
         """Free what it holds. Collective."""
         ...
+
+
+@dataclass
+class Point:
+    """Multipliers and their gradient.
+
+    Attributes:
+        lam: λ.
+        g: F λ − d, on all rows.
+    """
+
+    lam: Array
+    g: Array
 
 
 @dataclass(frozen=True)
@@ -41,8 +53,8 @@ class QP:
     """min ½λᵀFλ − λᵀd subject to Gλ = e, λ ∈ Ω.
 
     Attributes:
-        F: Symmetric positive semidefinite operator, m × m.
-        d: Linear term, length m.
+        F: Symmetric positive semidefinite operator.
+        d: Linear term.
         coarse: Projectors of G, and a particular solution of Gλ = e.
         feasible: The set Ω.
         preconditioner: Approximate inverse of F, or None.
@@ -58,7 +70,7 @@ class QP:
     """
 
     F: Operator
-    d: PETSc.Vec
+    d: Array
     coarse: Coarse
     feasible: FeasibleSet
     preconditioner: Operator | None = None
@@ -70,42 +82,22 @@ class QP:
     keeps: bool = True
     foundation: Callable[[int], Array] | None = None
 
+    @property
+    def comm(self) -> MPI.Intracomm:
+        """Communicator."""
+        return self.coarse.comm
 
-@dataclass(frozen=True)
-class Point:
-    """Multipliers and their gradient.
+    def dot(self, *pairs: tuple[Array, Array]) -> list[float]:
+        """Return xᵀy of pairs of vectors, rank 0's on every rank. Collective."""
+        return dot_over(self.comm, *pairs)
 
-    Attributes:
-        lam: λ.
-        g: F λ − d, on all rows.
-    """
+    def at(self, lam: Array) -> Point:
+        """Return multipliers with their gradient: one multiplication by F. Collective."""
+        return Point(lam, self.F(lam) - self.d)
 
-    lam: PETSc.Vec
-    g: PETSc.Vec
-
-    def copy(self) -> Point:
-        """Return a point of its own."""
-        return Point(self.lam.copy(), self.g.copy())
-
-    def take(self, other: Point) -> None:
-        """Become another point."""
-        other.lam.copy(self.lam)
-        other.g.copy(self.g)
-
-    def refresh(self, qp: QP) -> None:
-        """Make the gradient anew; multiplies by F once. Collective."""
-        qp.F.mult(self.lam, self.g)
-        self.g.axpy(-1.0, qp.d)
-
-    def move(self, length: float, p: PETSc.Vec, Fp: PETSc.Vec) -> None:
-        """λ ← λ + length·p, and the gradient with it."""
-        self.lam.axpy(length, p)
-        self.g.axpy(length, Fp)
-
-    def destroy(self) -> None:
-        """Destroy the vectors. Collective."""
-        self.lam.destroy()
-        self.g.destroy()
+    def moved(self, z: Point, lam: Array) -> Point:
+        """Return other multipliers, their gradient from that of z: one multiplication by F."""
+        return Point(lam, z.g + self.F(lam - z.lam))
 
 
 class ConvergedReason(IntEnum):
@@ -171,9 +163,9 @@ class QPResult:
         excluding: Local rows that exclude each other, if that is why the solver stopped.
     """
 
-    lam: PETSc.Vec
+    lam: Array
     mu: Array
-    gradient: PETSc.Vec
+    gradient: Array
     face: Face
     reason: ConvergedReason
     projected_gradient: float
@@ -182,11 +174,6 @@ class QPResult:
     norm: float
     steps: Steps = field(default_factory=Steps)
     excluding: Array = field(default_factory=lambda: np.empty(0, dtype=np.int64))
-
-    def destroy(self) -> None:
-        """Destroy the vectors. Collective."""
-        self.lam.destroy()
-        self.gradient.destroy()
 
 
 @dataclass(frozen=True)
@@ -198,93 +185,8 @@ class Start:
         mu: Multipliers of Gλ = e; None: those of another K⁺, which say nothing.
     """
 
-    lam: PETSc.Vec
-    mu: Array | None
-
-
-# --- Points and products as numpy arrays ------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class DualIterate:
-    """Multipliers with their gradient, this rank's part.
-
-    Attributes:
-        lam: λ, shape ``(m,)``.
-        g: Fλ − d.
-    """
-
     lam: Array
-    g: Array
-
-
-class LocalProgram:
-    """Quadratic program on numpy arrays of this rank's rows. All methods are collective.
-
-    Args:
-        qp: The program.
-    """
-
-    def __init__(self, qp: QP) -> None:
-        self.qp, self.comm = qp, qp.d.getComm().tompi4py()
-        self._x, self._y = qp.d.duplicate(), qp.d.duplicate()
-
-    def vec(self, x: Array) -> PETSc.Vec:
-        """Return the work vector with these values, valid until the next call."""
-        self._x.array[:] = x
-        return self._x
-
-    def apply(self, A: Operator, x: Array) -> Array:
-        """A x."""
-        A.mult(self.vec(x), self._y)
-        return np.array(self._y.array_r)
-
-    def F(self, x: Array) -> Array:
-        """F x: one multiplication."""
-        return self.apply(self.qp.F, x)
-
-    def dot(self, *pairs: tuple[Array, Array]) -> list[float]:
-        """Return xᵀy of pairs of vectors, rank 0's on every rank."""
-        products = summed(self.comm, np.array([x @ y for x, y in pairs]))
-        self.comm.Bcast(products, root=0)
-        return [float(value) for value in products]
-
-    def moved(self, z: DualIterate, lam: Array) -> DualIterate:
-        """Return other multipliers with their gradient: one multiplication by F."""
-        return DualIterate(lam, z.g + self.F(lam - z.lam))
-
-    def refreshed(self, lam: Array) -> DualIterate:
-        """Return multipliers with a gradient made anew: one multiplication by F."""
-        return DualIterate(lam, self.F(lam) - self.qp.d.array_r)
-
-    def normal(self, mu: Array) -> Array:
-        """Gᵀμ."""
-        self.qp.coarse.combine(mu, self._y)
-        return np.array(self._y.array_r)
-
-    def imbalance(self, lam: Array) -> Array:
-        """e − Gλ, replicated."""
-        return self.qp.coarse.residual(self.vec(lam))
-
-    def projected(self, lam: Array, onto: ConvexSet | None = None) -> tuple[Array, Array, float]:
-        """Return the nearest point to λ of a set, by default Ω, with Gλ = e.
-
-        Returns:
-            The point λ̂ = P(λ + Gᵀα), α, and how far Gλ̂ is from e.
-        """
-        found = project_onto_feasible(self.qp.coarse, onto or self.qp.feasible, self.vec(lam))
-        values = np.array(found.lam.array_r)
-        found.lam.destroy()
-        return values, found.alpha, found.missing
-
-    def any(self, flags: Array) -> bool:
-        """Return whether a flag is set on some rank."""
-        return any_rank(self.comm, bool(np.any(flags)))
-
-    def destroy(self) -> None:
-        """Destroy the work vectors."""
-        self._x.destroy()
-        self._y.destroy()
+    mu: Array | None
 
 
 # --- Stopping rules ---------------------------------------------------------------------------
@@ -315,9 +217,7 @@ class StoppingRule(Protocol):
         """Lower limit of the residuals that solves on faces aim at."""
         ...
 
-    def examine(
-        self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float
-    ) -> ConvergedReason:
+    def examine(self, lam: Array, gradient: Array, face: Face, residual: float) -> ConvergedReason:
         """Examine an iterate whose residuals are small. Collective.
 
         Args:
@@ -342,9 +242,7 @@ class ResidualRule:
     def __init__(self, tolerance: float) -> None:
         self.tolerance, self.drifted, self.norm, self.aim = tolerance, False, 1.0, tolerance
 
-    def examine(
-        self, lam: PETSc.Vec, gradient: PETSc.Vec, face: Face, residual: float
-    ) -> ConvergedReason:
+    def examine(self, lam: Array, gradient: Array, face: Face, residual: float) -> ConvergedReason:
         """Content, if the residual has come down to the tolerance."""
         small = residual <= self.tolerance
         return ConvergedReason.CONVERGED_RTOL if small else ConvergedReason.ITERATING
@@ -357,22 +255,22 @@ class Monitor(Protocol):
     """Called on all ranks after each step; a monitor may communicate."""
 
     def __call__(
-        self, steps: Steps, step: str, x: PETSc.Vec, projected_gradient: float, equality: float
+        self, steps: Steps, step: str, x: Array, projected_gradient: float, equality: float
     ) -> None:
         """See a step.
 
         Args:
             steps: Steps so far.
             step: Kind of this one: start, cg, expansion, proportioning, outer.
-            x: The iterate.
+            x: The iterate, this rank's part.
             projected_gradient: ‖g^P‖ there.
-            equality: ‖Q x‖ there, how far Gλ = e is from being met.
+            equality: ‖Q x‖ there, how far Gλ = e is from being met; negative: not computed.
         """
         ...
 
 
 def no_monitor(
-    steps: Steps, step: str, x: PETSc.Vec, projected_gradient: float, equality: float
+    steps: Steps, step: str, x: Array, projected_gradient: float, equality: float
 ) -> None:
     """Say nothing."""
 
@@ -382,27 +280,25 @@ class PrintMonitor:
     """Prints a line per step on rank 0.
 
     Attributes:
-        touching: Number of free components among the bounded ones of an iterate (collective).
+        comm: Communicator.
+        touching: Number of free components among the bounded ones of an iterate on this rank.
         multiplications: Multiplications by F so far.
     """
 
-    touching: Callable[[PETSc.Vec], int]
+    comm: MPI.Intracomm
+    touching: Callable[[Array], int]
     multiplications: Callable[[], int]
 
     def __call__(
-        self, steps: Steps, step: str, x: PETSc.Vec, projected_gradient: float, equality: float
+        self, steps: Steps, step: str, x: Array, projected_gradient: float, equality: float
     ) -> None:
         """Print outer iteration, step, ‖g^P‖, ‖Qx‖ if known, touching rows, multiplications."""
-        touching = self.touching(x)
-        if x.getComm().getRank() == 0:
+        touching = self.comm.allreduce(self.touching(x))
+        if self.comm.rank == 0:
+            known = f"{equality:.4e}" if equality >= 0.0 else " " * 10
             print(
                 f"{steps.outer:4d} {step:<13s} |gP| {projected_gradient:.4e}  "
-                f"|Qx| {_known(equality)}  touching {touching:6d}  "
+                f"|Qx| {known}  touching {touching:6d}  "
                 f"multiplications {self.multiplications():5d}",
                 flush=True,
             )
-
-
-def _known(value: float) -> str:
-    """Return a norm, blank where it was not computed."""
-    return f"{value:.4e}" if value >= 0.0 else " " * 10

@@ -7,7 +7,6 @@ from typing import Protocol
 
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root
@@ -74,12 +73,12 @@ class FeasiblePoint:
     """A point of Ω, and how far it is from Gλ = e.
 
     Attributes:
-        lam: The point, the caller's own.
+        lam: The point, this rank's part.
         alpha: λ = P_Ω(y + Gᵀα), replicated.
         missing: How far Gλ is from e: the worst entry beside its terms, 1 at most.
     """
 
-    lam: PETSc.Vec
+    lam: Array
     alpha: Array
     missing: float
 
@@ -87,7 +86,7 @@ class FeasiblePoint:
 def project_onto_feasible(
     coarse: Coarse,
     feasible: ConvexSet,
-    y: PETSc.Vec,
+    y: Array,
     parameters: ProjectionParameters = DEFAULT,
 ) -> FeasiblePoint:
     """Project y onto {λ ∈ Ω, Gλ = e}, or come as close to that set as possible. Collective.
@@ -99,22 +98,20 @@ def project_onto_feasible(
     ``missing`` says so.
 
     >>> import numpy as np
-    >>> from petsc4py import PETSc
     >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
     >>> from tfeti_dolfinx.qp.sets import Bounds
-    >>> y = PETSc.Vec().createWithArray(np.array([1.0, -1.0]), comm=PETSc.COMM_SELF)
     >>> coarse = DenseCoarse(np.ones((1, 2)), np.ones(1))
-    >>> project_onto_feasible(coarse, Bounds(), y).lam.array.tolist()
+    >>> project_onto_feasible(coarse, Bounds(), np.array([1.0, -1.0])).lam.tolist()
     [1.0, 0.0]
     """
-    comm = y.getComm().tompi4py()
+    comm = coarse.comm
     trial = _trial(coarse, feasible, y, np.zeros(coarse.dimension))
     damping, trials, unmet, slowly, least = parameters.damping, 1, 0, 0, trial.left
     while trials < parameters.max_trials and unmet < parameters.patience:
-        scale = float(np.linalg.norm(coarse.forces(trial.lam)))
+        scale = float(np.linalg.norm(coarse.terms(trial.lam) + np.abs(coarse.e)))
         if bcast_from_root(comm, trial.left <= parameters.balanced * scale):
             break
-        face = feasible.face(trial.lam.array_r, trial.lam.array_r - trial.z)
+        face = feasible.face(trial.lam, trial.lam - trial.z)
         step = coarse.damped_solve(face.damped(), trial.residual, damping)
         slope = float(trial.residual @ step)
         trial, length, tried = _searched(coarse, feasible, y, trial, step, parameters)
@@ -166,7 +163,7 @@ class _Trial:
 
     alpha: Array
     z: Array
-    lam: PETSc.Vec
+    lam: Array
     residual: Array
     cost: float
 
@@ -176,38 +173,33 @@ class _Trial:
         return float(np.linalg.norm(self.residual))
 
 
-def _trial(coarse: Coarse, feasible: ConvexSet, y: PETSc.Vec, alpha: Array) -> _Trial:
-    lam = y.duplicate()
-    coarse.combine(alpha, lam)
-    z = lam.array_r + y.array_r
-    projected = feasible.project(z)
-    lam.array[:] = projected
-    own = float(z @ projected) - 0.5 * float(projected @ projected)
-    cost = y.getComm().tompi4py().allreduce(own, op=MPI.SUM) - float(alpha @ coarse.e)
+def _trial(coarse: Coarse, feasible: ConvexSet, y: Array, alpha: Array) -> _Trial:
+    z = y + coarse.combined(alpha)
+    lam = feasible.project(z)
+    own = float(z @ lam) - 0.5 * float(lam @ lam)
+    cost = coarse.comm.allreduce(own, op=MPI.SUM) - float(alpha @ coarse.e)
     return _Trial(alpha, z, lam, coarse.residual(lam), cost)
 
 
 def _searched(
     coarse: Coarse,
     feasible: ConvexSet,
-    y: PETSc.Vec,
+    y: Array,
     start: _Trial,
     step: Array,
     parameters: ProjectionParameters,
 ) -> tuple[_Trial, float, int]:
-    """Halve the step until it does not raise the cost; destroys the start.
+    """Halve the step until it does not raise the cost.
 
     Where the cost still falls at the end of a step, it fell along all of it, as it is convex: that
     tells where rounding hides its difference. Returns the point, the length and how many were
     tried.
     """
-    comm, length, tried = y.getComm().tompi4py(), 1.0, 0
+    length, tried = 1.0, 0
     while True:
         trial, tried = _trial(coarse, feasible, y, start.alpha + length * step), tried + 1
         fell = trial.cost <= start.cost + parameters.rounding * abs(start.cost)
         fell = fell or float(trial.residual @ step) >= 0.0
-        if bcast_from_root(comm, fell or length <= parameters.shortest):
-            start.lam.destroy()
+        if bcast_from_root(coarse.comm, fell or length <= parameters.shortest):
             return trial, length, tried
-        trial.lam.destroy()
         length *= 0.5

@@ -2,46 +2,23 @@
 
 from __future__ import annotations
 
-from petsc4py import PETSc
+import numpy as np
 
-from tfeti_dolfinx.qp.coarse import Coarse
-from tfeti_dolfinx.qp.homogenised import Homogenised
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.parallel import norm_over
+from tfeti_dolfinx.qp.homogenised import Homogenised, operator_product
 from tfeti_dolfinx.qp.mprgp import MprgpIterate, mprgp
 from tfeti_dolfinx.qp.parameters import SmalseParameters
 from tfeti_dolfinx.qp.problem import (
     QP,
     ConvergedReason,
     Monitor,
-    Operator,
     QPResult,
     Start,
     Steps,
     StoppingRule,
     no_monitor,
 )
-
-
-class PenalisedOperator:
-    """A = P F P + ρ Q."""
-
-    def __init__(self, F: Operator, coarse: Coarse, rho: float, like: PETSc.Vec) -> None:
-        self.F, self.coarse, self.rho = F, coarse, rho
-        self._Qx, self._work = like.duplicate(), like.duplicate()
-
-    def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = A x; multiplies by F once. Collective."""
-        self.coarse.apply_Q(x, self._Qx)
-        x.copy(self._work)
-        self._work.axpy(-1.0, self._Qx)
-        self.F.mult(self._work, y)
-        self.coarse.apply_Q(y, self._work)
-        y.axpy(-1.0, self._work)
-        y.axpy(self.rho, self._Qx)
-
-    def destroy(self) -> None:
-        """Destroy the work vectors. Collective."""
-        self._Qx.destroy()
-        self._work.destroy()
 
 
 class InnerTest:
@@ -58,7 +35,7 @@ class InnerTest:
     ) -> None:
         self._qp, self._homogenised, self._rule = qp, homogenised, rule
         self._parameters = parameters
-        self._eta = parameters.eta * homogenised.b.norm()
+        self._eta = parameters.eta * norm_over(qp.comm, homogenised.b)
         self.M, self.reason, self.idle = parameters.M * qp.norm, ConvergedReason.ITERATING, 0
         self._lagrangian, self._equality = -float("inf"), float("inf")
 
@@ -75,16 +52,13 @@ class InnerTest:
     def examine(self, state: MprgpIterate) -> float:
         """Apply the stopping rule, and return the residual. Collective."""
         residual = max(state.projected_gradient, self._qp.norm * self._equality_at(state))
-        self.reason = self._rule.examine(state.x, state.g, state.face(), residual)
+        face = state.feasible.face(state.x, state.g)
+        self.reason = self._rule.examine(state.x, state.g, face, residual)
         return residual
 
     def _equality_at(self, state: MprgpIterate) -> float:
         """‖Q(λ − λ̄)‖."""
-        x = state.x.copy()
-        x.axpy(-1.0, self._homogenised.lam_bar)
-        equality = self._qp.coarse.norm_Q(x)
-        x.destroy()
-        return equality
+        return self._qp.coarse.norm_Q(state.x - self._homogenised.lam_bar)
 
     def update(self, lagrangian: float, equality: float) -> None:
         """Step 4: M after an outer step, from L(x, μ) before the multipliers' update and ‖Bx‖."""
@@ -128,43 +102,41 @@ def smalse(
     ===========================  =================================================================
 
     >>> import numpy as np
-    >>> from petsc4py import PETSc
     >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
     >>> from tfeti_dolfinx.qp.sets import Bounds
     >>> from tfeti_dolfinx.qp.homogenised import homogenise
     >>> from tfeti_dolfinx.qp.problem import ResidualRule
-    >>> F = PETSc.Mat().createDense((3, 3), array=np.diag([1.0, 2.0, 4.0]), comm=PETSc.COMM_SELF)
-    >>> d = PETSc.Vec().createWithArray(np.array([1.0, -1.0, 2.0]), comm=PETSc.COMM_SELF)
+    >>> F, d = np.diag([1.0, 2.0, 4.0]).__matmul__, np.array([1.0, -1.0, 2.0])
     >>> qp = QP(F, d, DenseCoarse(np.ones((1, 3)), np.ones(1)), Bounds(), norm=4.0)
     >>> result = smalse(qp, homogenise(qp), ResidualRule(1e-10))
-    >>> result.reason.name, result.lam.array.round(6).tolist()
+    >>> result.reason.name, result.lam.round(6).tolist()
     ('CONVERGED_RTOL', [0.6, 0.0, 0.4])
     """
     b, coarse, norm, rho = homogenised.b, qp.coarse, qp.norm, parameters.rho * qp.norm
-    A, steps = PenalisedOperator(qp.F, coarse, rho, b), Steps()
-    test = InnerTest(qp, homogenised, rule, parameters)
+
+    def A(x: Array) -> Array:  # (P F P + ρ Q)x
+        Qx = coarse.Q(x)
+        FPx = qp.F(x - Qx)
+        return FPx - coarse.Q(FPx) + rho * Qx
+
+    test, steps = InnerTest(qp, homogenised, rule, parameters), Steps()
     # λ = P_Ω(λ̄), or that of a start; x = λ − λ̄; g = Ax − b + y
-    lam, x, g, y, Qx = (b.duplicate() for _ in range(5))
+    lam_bar, y = homogenised.lam_bar, np.zeros_like(b)
     if start is not None and start.mu is not None:
-        coarse.combine(start.mu, y)
-    begin = homogenised.lam_bar if start is None else start.lam
-    lam.array[:] = qp.feasible.project(begin.array_r)
-    lam.copy(x)
-    x.axpy(-1.0, homogenised.lam_bar)
-    if x.norm() > 0.0:
-        A.mult(x, g)
-    g.axpy(-1.0, b)
-    g.axpy(1.0, y)
-    state, inner = MprgpIterate(A, lam, g, qp.feasible), parameters.inner(norm)
+        y = coarse.combined(start.mu)
+    lam = qp.feasible.project(lam_bar if start is None else start.lam)
+    x = lam - lam_bar
+    g = operator_product(A, qp.comm, x).Fx - b + y
+    state, inner = MprgpIterate(A, lam, g, qp.feasible, qp.comm), parameters.inner(norm)
     reason = ConvergedReason.ITERATING
     while reason == ConvergedReason.ITERATING:
         # Step 1: x with ‖g^P(x, μ)‖ ≤ min(M‖Bx‖, η)
         broken = mprgp(state, inner, test, steps, max_it, monitor)
         # Step 2: test
-        lam.copy(x)
-        x.axpy(-1.0, homogenised.lam_bar)
-        coarse.apply_Q(x, Qx)
-        monitor(steps, "outer", lam, state.projected_gradient, Qx.norm())
+        x = state.x - lam_bar
+        Qx = coarse.Q(x)
+        equality = norm_over(qp.comm, Qx)
+        monitor(steps, "outer", state.x, state.projected_gradient, equality)
         indefinite = broken == ConvergedReason.DIVERGED_INDEFINITE_MAT  # or rounding
         if indefinite and homogenised.is_rounding(test.examine(state)):
             broken = ConvergedReason.DIVERGED_ROUNDING
@@ -172,39 +144,33 @@ def smalse(
         if reason != ConvergedReason.ITERATING:
             break
         if rule.drifted:
-            A.mult(x, g)
-            g.axpy(-1.0, b)
-            g.axpy(1.0, y)
+            state.g = A(x) - b + y
             state.split()
             rule.drifted = False
             continue
         # Step 4 needs L(x, μ) = ½xᵀAx − bᵀx + yᵀx before the update, g = Ax − b + y
-        lagrangian = 0.5 * (x.dot(g) - x.dot(b) + x.dot(y))
+        lagrangian = 0.5 * sum(qp.dot((x, state.g), (x, y - b)))
         # Step 3: update multipliers
-        y.axpy(rho, Qx)
-        g.axpy(rho, Qx)
+        y = y + rho * Qx
+        state.g = state.g + rho * Qx
         state.split()
         # Step 4: update M
-        test.update(lagrangian, Qx.norm())
+        test.update(lagrangian, equality)
         # Step 5
         steps.outer += 1
         if test.idle >= parameters.patience:
             reason = ConvergedReason.DIVERGED_STALLED
         elif steps.outer >= max_it:
             reason = ConvergedReason.DIVERGED_ITS
-    lam.array[:] = qp.feasible.project(lam.array_r)  # rounding may leave it off its bounds
-    result = QPResult(
-        lam=lam,
+    return QPResult(
+        lam=qp.feasible.project(state.x),  # rounding may leave it off its bounds
         mu=coarse.coordinates(y),
-        gradient=g,
-        face=state.face(),
+        gradient=state.g,
+        face=qp.feasible.face(state.x, state.g),
         reason=reason,
         projected_gradient=state.projected_gradient,
-        equality=Qx.norm(),
+        equality=equality,
         reference=homogenised.scale.reference,
         norm=norm,
         steps=steps,
     )
-    for item in (A, state, x, y, Qx):
-        item.destroy()
-    return result

@@ -6,8 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from petsc4py import PETSc
-
+from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.qp.homogenised import restored
 from tfeti_dolfinx.qp.krylov import PcpgParameters, solve_by_pcpg
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
@@ -38,8 +37,8 @@ class Solver:
     keeps_discs: bool
     pc_type: str
     relative_to_norm: bool
-    cold: Callable[[QP], PETSc.Vec] | None = None
-    warm: Callable[[QP, Start], PETSc.Vec] | None = None
+    cold: Callable[[QP], Array] | None = None
+    warm: Callable[[QP, Start], Array] | None = None
 
 
 SOLVERS = {

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import TINY, Array, sums
 from tfeti_dolfinx.common.logging import cite
 from tfeti_dolfinx.common.parallel import any_rank, norm_over, steering, summed
 from tfeti_dolfinx.feti.dual import Dual
+from tfeti_dolfinx.feti.solvability import sliding_body
 from tfeti_dolfinx.feti.stopping import Accuracy, ErrorTarget
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.friction_newton import (
@@ -26,9 +26,8 @@ from tfeti_dolfinx.qp.friction_newton import (
 from tfeti_dolfinx.qp.newton import multipliers_at
 from tfeti_dolfinx.qp.problem import (
     ConvergedReason,
-    DualIterate,
-    LocalProgram,
     Monitor,
+    Point,
     QPResult,
     Steps,
 )
@@ -152,7 +151,6 @@ def solve_with_friction(
             if not holds:
                 result.reason = ConvergedReason.DIVERGED_FRICTION
                 break
-            result.destroy()
             continue
         # Step 2: its forces of normals, beside those that the bounds are of
         change = bounds.change(result.lam)
@@ -168,7 +166,7 @@ def solve_with_friction(
         # Step 4: the next bounds: of Newton's method on the law, or those forces
         # where nothing was to do the change tells nothing of the error of bounds
         rtol *= parameters.share if result.steps.inner == 0 and law is None else 1.0
-        start = law or (np.array(result.lam.array_r), result.mu)
+        start = law or (result.lam, result.mu)
         bounds.advance()
         # so near problems would follow the rounding of a method that has not come there itself
         law = None if near and newton.steps == 0 else newton.solve(start, bounds, aim)
@@ -176,7 +174,6 @@ def solve_with_friction(
         if not holds or bounds.idle > parameters.patience or iterations >= options.friction_max_it:
             result.reason = ConvergedReason.DIVERGED_FRICTION
             break
-        result.destroy()
     result.steps, rule.looks = steps, looks
     last = dual.F.count["solver"] - before
     how = (float(change), tolerance, last, bounds.body, newton.steps, not holds)
@@ -228,7 +225,10 @@ class FrictionBounds:
     def hold(self) -> bool:
         """Set the present bounds, else let all stick, once; return whether that holds the load."""
         self._dual.bound_friction(self.now)
-        if self.stick or (sliding := self._dual.sliding) < 0:
+        if self.stick:
+            return True
+        sliding = sliding_body(self._dual.coarse, self._dual.constraints)
+        if sliding < 0:
             return True
         self.body = sliding
         if self._stuck:
@@ -244,13 +244,13 @@ class FrictionBounds:
         self.now, self._slipped = np.zeros(len(self._rows)), True
         return True
 
-    def change(self, lam: PETSc.Vec) -> float:
+    def change(self, values: Array) -> float:
         """Store a solve's normal forces; return their relative distance from the bounds.
 
         Body by body, as nodal forces of friction: beside forces elsewhere those on a light one
         would not be seen.
         """
-        values, parameters = lam.array_r, self._parameters
+        parameters = self._parameters
         driving = norm_over(self._comm, self._dual.driving) / (self._dual.seen or np.inf)
         self._none = parameters.no_force * max(norm_over(self._comm, values), driving)
         self._found = self._forces(values)
@@ -328,14 +328,10 @@ class FrictionBounds:
 
     def _on_bodies(self, pressures: Array) -> Array:
         """Return norms of the nodal forces μ times those of normals make on each body."""
-        B, subdomains = self._constraints.B, self._dual.subdomains
-        forces, trace = B.createVecLeft(), B.createVecRight()
-        forces.set(0.0)
-        forces.array[self._rows] = self._mu * pressures
-        B.multTranspose(forces, trace)
-        squares = subdomains.body_sums([sums(trace.array_r**2, subdomains.trace_parts)])[0]
-        forces.destroy()
-        trace.destroy()
+        subdomains, forces = self._dual.subdomains, np.zeros(self._constraints.num_rows)
+        forces[self._rows] = self._mu * pressures
+        squares = sums(self._constraints.forces(forces) ** 2, subdomains.trace_parts)
+        squares = subdomains.body_sums([squares])[0]
         return steering(self._comm, *np.sqrt(squares))
 
 
@@ -351,7 +347,8 @@ class NewtonOnLaw:
         self._dual, self._rtol, self._parameters = dual, rtol, parameters
         self.tries = parameters.tries if options.friction_type == "newton" else 0
         self.steps, self._share = 0, 1.0
-        self._recycled, self._rests = dual.recycled, dual.last.is_of(dual.d, dual.coarse.e)
+        self._recycled = dual.recycled
+        self._rests = dual.last.is_of(dual.coarse.comm, dual.d, dual.coarse.e)
 
     def give_up(self, bounds: FrictionBounds) -> None:
         """Give up, and restore bounds and directions from before the failed try."""
@@ -379,24 +376,18 @@ class NewtonOnLaw:
         law = Law(
             dual.set_under, dual.constraints.pressed_by[at], dual.constraints.sets.tangents[at]
         )
-        local = LocalProgram(qp)
-        program = LawProgram(local, law, dual.coarse.oblique, norm)
+        program = LawProgram(qp, law, dual.coarse.oblique, norm)
         # Step 1: the start, with its μ or that of least squares: the lesser residual
-        work = qp.d.duplicate()
-        work.array[:] = start[0]
-        image, points = dual.last.image(qp.F, work), list[LawPoint]()
-        image.Fx.axpy(-1.0, qp.d)
-        z = DualIterate(np.array(start[0]), np.array(image.Fx.array_r))
+        Fx = dual.last.image(qp.F, qp.comm, start[0]).Fx
+        z = Point(start[0], Fx - qp.d)
         known = start[1] if len(start[1]) == qp.coarse.dimension else multipliers_at(qp, z)
-        for mu in (known, qp.coarse.coordinates(image.Fx)):
-            qp.coarse.combine(mu, work)
-            points.append(LawPoint(np.array(start[0]), image.Fx.array_r - work.array_r, mu))
+        points = [
+            LawPoint(z.lam, z.g - qp.coarse.combined(mu), mu)
+            for mu in (known, qp.coarse.coordinates(z.g))
+        ]
         residual, first = min(((program.residual(p), p) for p in points), key=lambda one: one[0])
         # Step 2: the target
-        Pd = qp.d.copy()
-        qp.coarse.project(Pd)
-        size = norm_over(dual.coarse.comm, Pd.array_r)
-        Pd.destroy()
+        size = norm_over(qp.comm, qp.coarse.project(qp.d))
         target = min(self._share * self._rtol * size, parameters.finer * residual, aim)
         # Step 3: Newton's method, or the path of growing friction where bodies are held
         end, steps = None, 0
@@ -408,15 +399,11 @@ class NewtonOnLaw:
                 steps += more
         self.steps, self._share = self.steps + steps, parameters.finer * self._share
         self.tries -= 1
-        local.destroy()
-        if end is not None:
-            # F of the end stands for that of the nearest point of its set, where the problem begins
-            qp.coarse.combine(end.mu, work)
-            Fx = end.s + work.array_r + qp.d.array_r
-            dual.last.pass_on(end.lam, Fx, parameters.newton.unseen * target / norm)
-        image.destroy()
         if end is None:
             self.tries, dual.recycled = 0, self._recycled
             return None
+        # F of the end stands for that of the nearest point of its set, where the problem begins
+        Fx = end.s + qp.coarse.combined(end.mu) + qp.d
+        dual.last.pass_on(end.lam, Fx, parameters.newton.unseen * target / norm)
         bounds.take(end.lam)
         return end.lam, end.mu

@@ -7,11 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 from mpi4py import MPI
-from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.logging import cite
-from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root
+from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.errors import ConvergenceError, InputError
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.stopping import Accuracy, ErrorTarget
@@ -149,9 +148,6 @@ def solve_dual(
         dual.last.look(state.lam, state.residual)
     if dual.coarse.dimension == 0 or qp_type == "newton":
         dual.last.keep(result, qp)
-    homogenised.destroy()
-    if begin is not None:
-        begin.lam.destroy()
     if result.reason <= 0:
         last_look(result, rule)
     return result, rule
@@ -159,57 +155,41 @@ def solve_dual(
 
 def _start(values: tuple[Array, Array] | None, qp: QP) -> Start | None:
     """Return the solver's start, none from 0; μ is None if the given one is of another kernel."""
-    comm = qp.d.getComm().tompi4py()
-    if values is None or not any_rank(comm, bool(np.any(values[0]))):
+    if values is None or not any_rank(qp.comm, bool(np.any(values[0]))):
         return None
-    lam, mu = qp.d.duplicate(), values[1]
-    lam.array[:] = values[0]
+    lam, mu = values
     return Start(lam, np.array(mu) if len(mu) == qp.coarse.dimension else None)
 
 
 def _homogenise(dual: Dual, qp: QP, solver: Solver, start: Start | None) -> Homogenised:
     """Homogenise with λ̄ at the solver's start, or λ̄₀, whose image is kept."""
     if start is not None and solver.warm is not None:
-        at = dual.last.image(qp.F, solver.warm(qp, start))
-        _no_worse_than_nothing(qp, at, start)
+        at = dual.last.image(qp.F, qp.comm, solver.warm(qp, start))
+        # Begin at 0 where it is admissible and q is no less at a start, as after unloading: of what
+        # the start has and the solution has not, conjugate gradients would leave its rounding.
+        zero = np.zeros(len(qp.d))
+        may = not np.any(qp.coarse.e) and not np.any(qp.feasible.project(zero))
+        energy, work = qp.dot((at.x, at.Fx), (at.x, qp.d))
+        if not any_rank(qp.comm, not may) and 0.5 * energy >= work:
+            at = OperatorProduct(zero, zero)
+            if start.mu is not None:
+                start.mu[:] = 0.0
         known = dual.known_image()
-        scale = scale_at(qp, known) if known else scale_near(qp, at)
-    elif solver.cold is not None:
-        at = operator_product(qp.F, solver.cold(qp))
-        scale = scale_at(qp, at)
-    else:
-        image = dual.natural_image()
-        return homogenise(qp, image, scale_at(qp, image))
-    homogenised = homogenise(qp, at, scale)
-    at.destroy()
-    return homogenised
-
-
-def _no_worse_than_nothing(qp: QP, at: OperatorProduct, start: Start) -> None:
-    """Begin at 0 where it is admissible and q is no less at a start, as after unloading.
-
-    Of what the start has and the solution has not, conjugate gradients would leave its rounding.
-    """
-    comm, zero = at.x.getComm().tompi4py(), np.zeros(at.x.getLocalSize())
-    may = not np.any(qp.coarse.e) and not np.any(qp.feasible.project(zero))
-    worse = 0.5 * at.x.dot(at.Fx) >= at.x.dot(qp.d)
-    if not any_rank(comm, not may) and bcast_from_root(comm, worse):
-        at.x.set(0.0)
-        at.Fx.set(0.0)
-        if start.mu is not None:
-            start.mu[:] = 0.0
+        return homogenise(qp, at, scale_at(qp, known) if known else scale_near(qp, at))
+    if solver.cold is not None:
+        return homogenise(qp, operator_product(qp.F, qp.comm, solver.cold(qp)))
+    return homogenise(qp, dual.natural_image())
 
 
 def _monitor(dual: Dual, options: Options) -> Monitor:
     if not options.monitor:
         return no_monitor
-    comm, feasible = dual.coarse.comm, dual.feasible
 
-    def touching(x: PETSc.Vec) -> int:
-        face = feasible.face(x.array_r, np.zeros(x.getLocalSize()))
-        return int(comm.allreduce(int(np.sum(face.constrained & face.carrying))))
+    def touching(x: Array) -> int:
+        face = dual.feasible.face(x, np.zeros(len(x)))
+        return int(np.sum(face.constrained & face.carrying))
 
-    return PrintMonitor(touching=touching, multiplications=lambda: dual.F.count["solver"])
+    return PrintMonitor(dual.coarse.comm, touching, lambda: dual.F.count["solver"])
 
 
 def conclude(

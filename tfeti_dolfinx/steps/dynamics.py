@@ -80,13 +80,8 @@ def balance(forms: InertialForms, dual: Dual, solution: Solution) -> dict[str, f
 
 def _work_of_rows(dual: Dual, lam: Array, way: Array) -> list[float]:
     """−λᵀB Δu of this rank's normal, tangential and other rows. Collective."""
-    B, sets = dual.constraints.B, dual.constraints.sets
-    moved, rows = B.createVecRight(), dual.constraints.c.duplicate()
-    moved.array[:] = way[dual.subdomains.trace]
-    B.mult(moved, rows)
-    done = -lam * rows.array_r
-    moved.destroy()
-    rows.destroy()
+    sets = dual.constraints.sets
+    done = -lam * dual.constraints.jumps(way[dual.subdomains.trace])
     kinds = (sets.normals, sets.tangents.ravel(), sets.equalities)
     return [float(done[kind].sum()) for kind in kinds]
 
@@ -195,9 +190,8 @@ class Predictor:
                 dual.last.take(self._dofs.comm, self._start[1], self._image)
         self._image = np.zeros(0)  # it is of the F and the start of a restored state alone
         result, accuracy = solve_dual(dual, options, options.qp_type, start)
-        self._start = (gluing, np.array(result.lam.array_r)) if result.reason > 0 else None
+        self._start = (gluing, result.lam.copy()) if result.reason > 0 else None
         self.multiplications = dual.F.count["solver"]
-        result.destroy()
         conclude(result, accuracy, options, self._dofs.comm)
         return accuracy.u
 
