@@ -180,7 +180,7 @@ def dual_value(problem: tfeti.ContactProblem, energy: float, comm: MPI.Intracomm
     With K u = f − Bᵀλ it is ½uᵀKu − fᵀu + λᵀ(Bu − c); its error is of second order.
     """
     solution = problem.solution
-    work = comm.allreduce(float(solution.lam @ solution.gluing.constraints.c.array_r))
+    work = comm.allreduce(float(solution.lam @ solution.gluing.constraints.c))
     return -0.5 * energy**2 - work
 
 

@@ -30,8 +30,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.tools import column, command_line, curves, finish, picture
 from tfeti_dolfinx.common.compat import assemble_csr
 from tfeti_dolfinx.subdomains.block import candidate_modes, fixing_nodes, kernel_of
-from tfeti_dolfinx.subdomains.kplus import regular_matrix, regularised
-from tfeti_dolfinx.subdomains.pseudoinverse import SchurPseudoinverse, trailing_pseudoinverse
+from tfeti_dolfinx.subdomains.kplus import (
+    SchurPseudoinverse,
+    regular_matrix,
+    regularised,
+    trailing_pseudoinverse,
+)
 
 FORMS = {
     "regularized": regularised,

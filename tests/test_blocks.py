@@ -15,7 +15,7 @@ import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.compat import assemble_csr
 from tfeti_dolfinx.errors import ConformanceError, FactorError, InputError
 from tfeti_dolfinx.subdomains import factor
-from tfeti_dolfinx.subdomains import stiffness as traced
+from tfeti_dolfinx.subdomains import sparse_block as traced
 from tfeti_dolfinx.subdomains.block import (
     Counters,
     SubdomainData,

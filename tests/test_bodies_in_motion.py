@@ -48,7 +48,7 @@ def rows(problem):
     B = np.zeros((len(begins) - 1, len(problem.u.x.array)))
     unknown = problem.dofs.dolfinx_dofs()[dual.subdomains.trace]
     np.add.at(B, (row, unknown[columns]), values)
-    return B, dual.constraints.c.array.copy(), dual.constraints.sets.normals
+    return B, dual.constraints.c.copy(), dual.constraints.sets.normals
 
 
 def least(A, b, B, c, normals):

@@ -55,7 +55,7 @@ class Scene:
 
     @property
     def rhs(self):
-        return np.concatenate(self.d.comm.allgather(np.array(self.constraints.c.array_r)))
+        return np.concatenate(self.d.comm.allgather(np.array(self.constraints.c)))
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def test_a_dirichlet_value_reaches_copies_that_have_no_facet_on_the_surface():
     ones = np.ones(dofs.num_nodes * 2)
     bcs = [fem.dirichletbc(0.5, left, V.sub(1))]
     gluing = glue(dofs, prescribe(dofs, bcs), records, 1.0, ones)
-    found = d.comm.allreduce(int(np.sum(np.isclose(gluing.constraints.c.array_r, 0.5))))
+    found = d.comm.allreduce(int(np.sum(np.isclose(gluing.constraints.c, 0.5))))
     x = V.tabulate_dof_coordinates()
     assert found == d.comm.allreduce(int(np.sum(np.isclose(x[:, 0], 0))))
     assert found > d.comm.allreduce(len(left))
@@ -152,5 +152,5 @@ def test_prescribed_components_move_into_the_gap():
     bcs = [fem.dirichletbc(1.0, bottom, V.sub(0))]
     gluing = glue(dofs, prescribe(dofs, bcs), records, 1.0, np.ones(dofs.num_nodes * 3))
     rows = gluing.constraints.sets.normals
-    gap = gluing.constraints.c.array_r[rows] / gluing.contact.scale
+    gap = gluing.constraints.c[rows] / gluing.contact.scale
     assert np.allclose(gap, records.gap[gluing.contact.condition] + 0.6 * 1.0)

@@ -14,8 +14,12 @@ import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.errors import ConformanceError
 from tfeti_dolfinx.subdomains.block import candidate_modes, fixing_dofs, kernel_of
 from tfeti_dolfinx.subdomains.factor import NotPositiveDefiniteError
-from tfeti_dolfinx.subdomains.kplus import InverseFactory, regularised
-from tfeti_dolfinx.subdomains.pseudoinverse import SchurPseudoinverse, trailing_pseudoinverse
+from tfeti_dolfinx.subdomains.kplus import (
+    InverseFactory,
+    SchurPseudoinverse,
+    regularised,
+    trailing_pseudoinverse,
+)
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
 from tfeti_dolfinx.testing import check_block, check_kind_of_block, check_kind_of_inverse
 

@@ -12,7 +12,7 @@ from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.homogenised import homogenise, operator_product
 from tfeti_dolfinx.qp.krylov import solve_by_pcpg
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
-from tfeti_dolfinx.qp.problem import QP, ResidualRule, Start
+from tfeti_dolfinx.qp.problem import QP, Start, StoppingRule
 from tfeti_dolfinx.qp.projection import project_onto_feasible
 from tfeti_dolfinx.qp.sets import Bounds, Product
 
@@ -43,7 +43,7 @@ def qp_of(F, d, G, e, bounded):
 
 def solved(qp, tolerance, start=None):
     at = operator_product(qp.F, qp.comm, feasible_start(qp, start) if start else first_point(qp))
-    found = newton(qp, homogenise(qp, at), ResidualRule(tolerance), max_it=3000, start=start)
+    found = newton(qp, homogenise(qp, at), StoppingRule(tolerance), max_it=3000, start=start)
     assert found.reason > 0
     return found
 
@@ -117,7 +117,7 @@ def nearly_dependent(near=1e-6, m=60):
 def test_what_nearly_dependent_rows_of_G_leave_is_no_residual():
     """κ(GGᵀ) = 1e12: a projection leaves 1e-7 of d, which M does not see."""
     qp, F, P = nearly_dependent()
-    result = solve_by_pcpg(qp, homogenise(qp), ResidualRule(1e-9), max_it=3000)
+    result = solve_by_pcpg(qp, homogenise(qp), StoppingRule(1e-9), max_it=3000)
     assert np.linalg.norm(P @ (F @ result.lam - qp.d)) <= 2e-8
 
 
@@ -129,7 +129,7 @@ def test_rows_that_exclude_each_other_are_named(room, solvable):
     qp = QP(matrix(F), d, DenseCoarse(np.zeros((0, 3)), np.zeros(0)), bounds_on(np.arange(3)))
     start = vector([1.0, 1.0, 0.0])  # both touch
     result = newton(
-        qp, homogenise(qp, operator_product(qp.F, qp.comm, start)), ResidualRule(1e-10), max_it=100
+        qp, homogenise(qp, operator_product(qp.F, qp.comm, start)), StoppingRule(1e-10), max_it=100
     )
     if not solvable:
         assert result.reason.name == "DIVERGED_CONTRADICTION"
@@ -158,7 +158,7 @@ def string_beside(force, n=1500):
 def test_a_plateau_is_left_where_q_does_not_fall_either(force, reason):
     """500 steps, and 500 with a new gradient; beside 1e30, what they gain is rounding of q."""
     qp = string_beside(force)
-    result = solve_by_pcpg(qp, homogenise(qp), ResidualRule(1e-9))
+    result = solve_by_pcpg(qp, homogenise(qp), StoppingRule(1e-9))
     assert result.reason.name == reason
     assert (result.steps.cg <= 1001) == (force > 1.0)
 

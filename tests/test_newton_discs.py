@@ -12,7 +12,7 @@ from test_qp import matrix, vector
 from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.homogenised import homogenise, operator_product
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
-from tfeti_dolfinx.qp.problem import QP, ConvergedReason, ResidualRule, Start, no_monitor
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Start, StoppingRule, no_monitor
 from tfeti_dolfinx.qp.projection import (
     project_onto_feasible,
 )
@@ -21,7 +21,7 @@ from tfeti_dolfinx.qp.sets import Status
 
 def solved(qp, tolerance, monitor=no_monitor, start=None):
     at = operator_product(qp.F, qp.comm, feasible_start(qp, start) if start else first_point(qp))
-    rule = ResidualRule(tolerance)
+    rule = StoppingRule(tolerance)
     return newton(qp, homogenise(qp, at), rule, max_it=2000, start=start, monitor=monitor)
 
 

@@ -15,7 +15,7 @@ from tfeti_dolfinx.qp.homogenised import homogenise
 from tfeti_dolfinx.qp.krylov import estimate_norm, solve_by_pcpg
 from tfeti_dolfinx.qp.mprgp import MprgpIterate, MprgpParameters, mprgp
 from tfeti_dolfinx.qp.parameters import SmalseParameters
-from tfeti_dolfinx.qp.problem import QP, ConvergedReason, ResidualRule, Start, Steps
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Start, Steps, StoppingRule
 from tfeti_dolfinx.qp.sets import Bounds, Product
 from tfeti_dolfinx.qp.smalse import smalse
 
@@ -49,7 +49,7 @@ def bounds_on(rows):
 
 def to(rtol, homogenised):
     """Residuals down to rtol·b₀."""
-    return ResidualRule(rtol * homogenised.scale.reference)
+    return StoppingRule(rtol * homogenised.scale.reference)
 
 
 def random_program(seed, m=40, r=5, n_bounded=20):
@@ -143,8 +143,8 @@ def test_nothing_to_do_is_no_step():
     F, _, G, _, bounded = random_program(2)
     qp = QP(matrix(F), vector(np.zeros(40)), DenseCoarse(G, np.zeros(5)), bounds_on(bounded))
     homogenised = homogenise(qp)
-    assert smalse(qp, homogenised, ResidualRule(0.0)).steps.inner == 0
-    assert solve_by_pcpg(qp, homogenised, ResidualRule(0.0)).steps.cg == 0
+    assert smalse(qp, homogenised, StoppingRule(0.0)).steps.inner == 0
+    assert solve_by_pcpg(qp, homogenised, StoppingRule(0.0)).steps.cg == 0
 
 
 @pytest.mark.parametrize("M", [1e6, 1e-6])
@@ -152,7 +152,7 @@ def test_smalse_says_that_nothing_fulfils_the_equality(M):
     """λ ≥ 0 and λ_1 + λ_2 = −√2 exclude each other."""
     coarse = DenseCoarse(np.ones((1, 2)) / np.sqrt(2), np.array([-1.0]))
     qp = QP(matrix(np.eye(2)), vector([0.0, 0.0]), coarse, Bounds())
-    result = smalse(qp, homogenise(qp), ResidualRule(1e-6), SmalseParameters(M=M), max_it=5000)
+    result = smalse(qp, homogenise(qp), StoppingRule(1e-6), SmalseParameters(M=M), max_it=5000)
     assert result.reason == ConvergedReason.DIVERGED_STALLED
     assert result.steps.outer < 2000
 

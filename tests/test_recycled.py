@@ -10,7 +10,7 @@ from tfeti_dolfinx.common.parallel import norm_over
 def images(problem):
     """How far FW is from F of W, and WᵀFW from 1."""
     dual = problem.dual
-    W, FW = dual.recycled.columns
+    W, FW = dual.recycled.directions.T, dual.recycled.images.T
     comm, worst = dual.coarse.comm, 0.0
     for w, Fw in zip(W.T, FW.T, strict=True):
         Fx = dual.F(w)

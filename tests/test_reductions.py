@@ -10,7 +10,7 @@ from test_solvable_lp import dual_of
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.qp.homogenised import homogenise
 from tfeti_dolfinx.qp.krylov import pcpg
-from tfeti_dolfinx.qp.problem import ConvergedReason, Point, ResidualRule, Steps
+from tfeti_dolfinx.qp.problem import ConvergedReason, Point, Steps, StoppingRule
 from tfeti_dolfinx.qp.sets import Status, face_of
 
 COLLECTIVE = ("allreduce", "Allreduce", "reduce", "Reduce", "bcast", "Bcast", "allgather", "gather")
@@ -50,7 +50,7 @@ def count(qp, num_steps):
     start = homogenise(qp)
     point, steps = Point(start.lam_bar, start.gradient), Steps()
     before = qp.comm.calls
-    reason = pcpg(qp, point, ResidualRule(0.0), steps, num_steps)
+    reason = pcpg(qp, point, StoppingRule(0.0), steps, num_steps)
     assert reason == ConvergedReason.DIVERGED_ITS
     assert steps.cg == num_steps
     return qp.comm.calls - before

@@ -52,17 +52,17 @@ def test_other_values_and_gaps_cost_a_vector(cell, degree):
     gluing = scene.glued(old)
     B, c = gluing.constraints.B, gluing.constraints.c
     entries, state = [np.array(part) for part in B.getValuesCSR()], B.stateGet()
-    first = np.array(c.array_r)
+    first = np.array(c)
     scene.search.set_gaps({0: lambda x: 0.1 + 0.01 * x[0]})
     anew = scene.glued(new)
     values, gaps = prescribe(scene.dofs, new).value, scene.search.records.gap
-    expected = np.array(anew.constraints.c.array_r)
+    expected = np.array(anew.constraints.c)
     assert np.allclose(gluing.right_side(values, gaps), expected, rtol=1e-14, atol=1e-15)
-    assert np.array_equal(c.array_r, first)
+    assert np.array_equal(c, first)
 
     updated = gluing.with_right_side(values, gaps)
     assert updated.constraints is gluing.constraints
-    assert np.allclose(c.array_r, expected, rtol=1e-14, atol=1e-15)
+    assert np.allclose(c, expected, rtol=1e-14, atol=1e-15)
     assert MPI.COMM_WORLD.allreduce(int(np.sum(expected != first))) > 0
     assert B.stateGet() == state
     for before, now, other in zip(
@@ -94,12 +94,12 @@ def test_values_that_push_a_held_face_into_an_obstacle_leave_c_as_it_was():
         ones,
     )
     assert d.comm.allreduce(len(near.contact.decided)) == 16
-    c = np.array(near.constraints.c.array_r)
+    c = np.array(near.constraints.c)
     values = np.array(near.prescribed.value)
     values[:, 0] -= 0.75
     with pytest.raises(NoSolutionError, match=r"prescribed: .* nodes penetrate by up to 0\.25 "):
         near.with_right_side(values, near.records.gap)
-    assert np.array_equal(near.constraints.c.array_r, c)
+    assert np.array_equal(near.constraints.c, c)
     values[:, 0] += 0.5
     near.with_right_side(values, near.records.gap)
     with pytest.raises(NoSolutionError, match=r"prescribed: .* nodes penetrate by up to 1\.75 "):

@@ -16,7 +16,7 @@ from test_solvable_lp import dual_of
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.feti.preconditioner import PARAMETERS, chebyshev, smoothed
 from tfeti_dolfinx.qp.sets import Face, Status
-from tfeti_dolfinx.subdomains.stiffness import stretch_over_shear
+from tfeti_dolfinx.subdomains.sparse_block import stretch_over_shear
 
 
 @given(st.integers(1, 8), st.floats(1e-3, 1e3), st.floats(1.5, 100.0), st.integers(0, 1000))

@@ -29,8 +29,8 @@ from tfeti_dolfinx.feti.operator import PRECONDITIONERS
 from tfeti_dolfinx.qp.parameters import NewtonParameters, SmalseParameters
 from tfeti_dolfinx.qp.solvers import SOLVERS
 from tfeti_dolfinx.subdomains.factor import default_solver, has_solver, unread_options
+from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES
 from tfeti_dolfinx.subdomains.local_operators import LOCAL_TYPES
-from tfeti_dolfinx.subdomains.pseudoinverse import KPLUS_TYPES
 
 # --- Options ----------------------------------------------------------------------------------
 

@@ -31,7 +31,7 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.report import Sizes, StageCounts
 from tfeti_dolfinx.solve.solver import resolved
-from tfeti_dolfinx.subdomains.block import Counters, SubdomainData, mode_names
+from tfeti_dolfinx.subdomains.block import Counters, RigidBlock, SubdomainData, mode_names
 from tfeti_dolfinx.subdomains.build import (
     FiniteElements,
     MakeBlock,
@@ -41,10 +41,8 @@ from tfeti_dolfinx.subdomains.build import (
     subdomain_data,
 )
 from tfeti_dolfinx.subdomains.factor import added_options
-from tfeti_dolfinx.subdomains.kplus import InverseFactory
+from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, InverseFactory
 from tfeti_dolfinx.subdomains.local_operators import LocalChoice
-from tfeti_dolfinx.subdomains.pseudoinverse import KPLUS_TYPES
-from tfeti_dolfinx.subdomains.rigid_block import RigidBlock
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # --- Settings of a solve ---------------------------------------------------------------------

@@ -17,7 +17,7 @@ from tfeti_dolfinx.mesh.diagnostics import flatness, shared_by_bodies
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.report import Outcome, Report
 from tfeti_dolfinx.solution import Solution
-from tfeti_dolfinx.subdomains.stiffness import stretch_over_shear
+from tfeti_dolfinx.subdomains.sparse_block import stretch_over_shear
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # relative rounding of a stiffness

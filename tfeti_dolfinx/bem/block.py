@@ -20,8 +20,12 @@ from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.subdomains.block import Block, SubdomainData
 from tfeti_dolfinx.subdomains.build import MakeBlock, submatrix
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
-from tfeti_dolfinx.subdomains.sparse_block import TOLERANCES, SparseBlock, places_in_order
-from tfeti_dolfinx.subdomains.stiffness import Stiffness
+from tfeti_dolfinx.subdomains.sparse_block import (
+    EQUAL,
+    SparseBlock,
+    Stiffness,
+    places_in_order,
+)
 
 # --- Block of a subdomain with boundary elements ----------------------------------------------
 
@@ -246,9 +250,9 @@ def _equal(shape: SurfaceStiffness, surface: Surface, K: Any) -> bool:
     if not all(np.array_equal(one.nodes, other.nodes) for one, other in pairs):
         return False
     ours, theirs = (x - x.min(axis=0) for x in (surface.panels.x, shape.x))
-    if np.abs(ours - theirs).max() > TOLERANCES.place * theirs.max():
+    if np.abs(ours - theirs).max() > EQUAL.place * theirs.max():
         return False
-    return bool(abs(K - shape.K_fem).max() <= TOLERANCES.entry * np.abs(K.data).max())
+    return bool(abs(K - shape.K_fem).max() <= EQUAL.entry * np.abs(K.data).max())
 
 
 def _force_per_volume(name: str, volume: Array, hats: Array) -> Array:

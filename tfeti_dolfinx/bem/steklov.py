@@ -17,7 +17,7 @@ from tfeti_dolfinx.errors import FactorError, InputError, TfetiError
 from tfeti_dolfinx.subdomains.block import candidate_modes
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
-from tfeti_dolfinx.subdomains.stiffness import Stiffness
+from tfeti_dolfinx.subdomains.sparse_block import Stiffness
 
 # --- Galerkin approximation of the Steklov–Poincaré operator ----------------------------------
 

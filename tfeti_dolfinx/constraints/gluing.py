@@ -385,7 +385,7 @@ class Gluing:
 
         Contacts meet prescribed components where the prescribed values have them.
         """
-        c = np.array(self.constraints.c.array_r)
+        c = np.array(self.constraints.c)
         c[self.constraints.sets.equalities[self.held.row]] = self.held.right_side(values)
         return c
 

@@ -137,7 +137,7 @@ class Constraints:
 
     Attributes:
         B: Dual rows × trace unknowns, MPIAIJ.
-        c: Right sides, distributed as the rows; 0 until they are set.
+        c: Right sides of this rank's rows; 0 until they are set.
         sets: Which local rows are what.
         trace: Local primal unknown of each local trace unknown, ascending.
         weights: D on the local trace unknowns: the rows are scaled with it. Of rigid bodies it is
@@ -153,7 +153,7 @@ class Constraints:
     """
 
     B: PETSc.Mat
-    c: PETSc.Vec
+    c: Array
     sets: RowSets
     trace: Array
     weights: Array
@@ -184,7 +184,7 @@ class Constraints:
 
     def set_right_side(self, c: Array) -> None:
         """Fill c anew, with this rank's part of it, shape ``(num_rows,)``. B stays."""
-        self.c.array[:] = c
+        self.c[:] = c
 
     @property
     def pressed(self) -> Array:
@@ -203,9 +203,8 @@ class Constraints:
         return replace(self, limits=limits)
 
     def destroy(self) -> None:
-        """Destroy the PETSc objects. Collective."""
+        """Destroy B. Collective."""
         self.B.destroy()
-        self.c.destroy()
 
 
 def _taken(result: PETSc.Vec, other: PETSc.Vec) -> Array:
@@ -257,13 +256,11 @@ def assemble_constraints(
         csr=(indptr.astype(index), column[order].astype(index), rows.value[order]),
         comm=dofs.comm,
     )
-    c = B.createVecLeft()
-    c.set(0.0)
     shape, row = sets.tangents.shape, pressed_by.copy()
     row[row >= 0] = sets.normals[row[row >= 0]]
     return Constraints(
         B=B,
-        c=c,
+        c=np.zeros(num_rows),
         sets=sets,
         trace=trace,
         weights=weights[trace],

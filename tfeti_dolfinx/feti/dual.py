@@ -189,7 +189,7 @@ class Dual:
 
     def _linear_term(self) -> Array:
         response = self.subdomains.pinv_load[self.subdomains.trace]
-        return self.constraints.jumps(response) - self.constraints.c.array_r
+        return self.constraints.jumps(response) - self.constraints.c
 
     def learn(self) -> None:
         """Keep directions from now on, where options leave that open: more solves come."""
@@ -275,7 +275,7 @@ class Dual:
         """
         sigma = mean_stiffness(self.subdomains, self.constraints.weights)
         softer = count ** (1.0 / max(self._dimension - 1, 1))
-        return np.asarray(-sigma / softer * self.constraints.c.array_r)
+        return np.asarray(-sigma / softer * self.constraints.c)
 
     def saw(self, norm: float) -> None:
         """Store the estimate of ‖F‖ of a solve, for the next one, whose start may see far less."""
@@ -327,7 +327,7 @@ class Dual:
     @property
     def driving(self) -> Array:
         """The part of d due to load, prescribed values, slips and overlaps; local rows."""
-        c, normals = self.constraints.c.array_r, self.constraints.sets.normals
+        c, normals = self.constraints.c, self.constraints.sets.normals
         d = np.array(self.d)
         d[normals] += np.maximum(c[normals], 0.0)
         return d

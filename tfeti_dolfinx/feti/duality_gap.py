@@ -85,7 +85,7 @@ def admissible(
     """
     constraints, comm = dual.constraints, dual.coarse.comm
     contact = constraints.sets.contact
-    g = constraints.jumps(u[dual.subdomains.trace]) - constraints.c.array_r
+    g = constraints.jumps(u[dual.subdomains.trace]) - constraints.c
     p = lam + g / (norm or 1.0)
     closed = (dual.feasible.project(p) == p)[contact]
     wanted = -g
@@ -127,7 +127,7 @@ def _balanced(
         return lam, u, 0.0
     wanted = lam
     if norm > 0.0:
-        missed = constraints.jumps(u[subdomains.trace]) - constraints.c.array_r
+        missed = constraints.jumps(u[subdomains.trace]) - constraints.c
         wanted = lam + missed / norm
     found = project_onto_feasible(coarse, dual.feasible, wanted)
     if found.missing > HELD:

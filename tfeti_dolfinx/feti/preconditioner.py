@@ -15,6 +15,7 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root, largest
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import raised_on_all_ranks
+from tfeti_dolfinx.feti.coarse import side_by_side
 from tfeti_dolfinx.feti.operator import DualOperator, Metric
 from tfeti_dolfinx.qp.problem import FaceOperator
 from tfeti_dolfinx.qp.sets import Face
@@ -237,13 +238,7 @@ class _OnFace:
 
 def _restricted(gram: PETSc.Mat, Z: csr_array) -> PETSc.Mat:
     """ZᵀWZ, Z with a row for each local row of W. Collective."""
-    comm, index = gram.getComm(), PETSc.IntType
-    own = Z.shape[1]
-    start = comm.tompi4py().exscan(own) or 0
-    indices = (start + Z.indices).astype(index)
-    table = (Z.indptr.astype(index), indices, Z.data)
-    size = ((Z.shape[0], None), (own, None))
-    directions = PETSc.Mat().createAIJ(size=size, csr=table, comm=comm)
+    directions = side_by_side(Z, gram.getComm())
     part = gram.PtAP(directions)
     directions.destroy()
     return part

@@ -62,7 +62,7 @@ def recover(
     """
     subdomains = coarse.subdomains
     u = elastic_displacement(constraints, subdomains, lam, subdomains.pinv_load)
-    residual = constraints.c.array_r - constraints.jumps(u[subdomains.trace])  # = Fλ − d
+    residual = constraints.c - constraints.jumps(u[subdomains.trace])  # = Fλ − d
     alpha: Array = np.zeros(0)
     if coarse.dimension:
         held = face.holding

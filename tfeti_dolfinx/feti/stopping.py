@@ -16,7 +16,7 @@ from tfeti_dolfinx.feti.duality_gap import EnergyBound, energy_bound, within
 from tfeti_dolfinx.feti.recovery import Recovered, min_norm_correction, recover
 from tfeti_dolfinx.qp.coarse import LIGHT
 from tfeti_dolfinx.qp.homogenised import ROUNDING
-from tfeti_dolfinx.qp.problem import ConvergedReason
+from tfeti_dolfinx.qp.problem import ConvergedReason, StoppingRule
 from tfeti_dolfinx.qp.sets import Face
 
 # from the displacement on this rank to the other error, a root of an energy; collective
@@ -76,6 +76,9 @@ class Measures:
         begin: Largest slip that friction counts from.
         rounding: What rounding leaves of the residuals of rows that the face holds, however far
             others are open.
+        error: Norm of the correction in energy, over all bodies.
+        energy: ‖u‖_K.
+        longest: The longest of what rows miss, and of what closes that.
     """
 
     size: Array
@@ -93,16 +96,9 @@ class Measures:
     gap: float
     begin: float
     rounding: float
-
-    @property
-    def error(self) -> float:
-        """Norm of the correction in energy, over all bodies."""
-        return float(np.sqrt(self.correction_energies.sum()))
-
-    @property
-    def energy(self) -> float:
-        """‖u‖_K."""
-        return float(np.sqrt(max(self.energies.sum(), 0.0)))
+    error: float
+    energy: float
+    longest: float
 
 
 def measure(
@@ -127,7 +123,7 @@ def measure(
     """
     # 1. what rows miss
     constraints, sets, comm = dual.constraints, dual.constraints.sets, dual.coarse.comm
-    c, normals, tangents = constraints.c.array_r, sets.normals, sets.tangents
+    c, normals, tangents = constraints.c, sets.normals, sets.tangents
     w = -state.gap
     overlap, closed = w[normals], state.active[normals]
     # an open row whose force is not gone yet: of distance and force, as a length, the smaller
@@ -181,6 +177,9 @@ def measure(
         gap=float(largest[1]),
         begin=float(largest[2]),
         rounding=ROUNDING * float(sum(sizes)),
+        error=float(np.sqrt(correction_energies.sum())),
+        energy=float(np.sqrt(max(energies.sum(), 0.0))),
+        longest=max(float(correction.max(initial=0.0)), float(largest[0])),
     )
 
 
@@ -235,7 +234,7 @@ class Tolerances:
     energy: float
 
 
-class Accuracy:
+class Accuracy(StoppingRule):
     """Stops a solver when the displacement of each body is right to rtol, in the maximum norm.
 
     A body's error is estimated as what closes its jumps, plus what that does in energy, turned
@@ -273,11 +272,12 @@ class Accuracy:
         limits: StoppingTolerances | None = None,
     ) -> None:
         self._dual, self.rtol, self._atol = dual, rtol, atol
-        self._limits, self.norm = limits or StoppingTolerances(), norm or 1.0
+        self._limits = limits or StoppingTolerances()
         reference, self._rounding = scale
-        self.tolerance = max(rtol**0.5 * reference, atol, self._rounding)
+        super().__init__(max(rtol**0.5 * reference, atol, self._rounding))
+        self.norm = norm or 1.0
         self._small = 0.01 * max(rtol * reference, self._rounding)
-        self.drifted, self.looks, self._stalls, self._claimed = False, 0, 0, 1.0
+        self.looks, self._stalls, self._claimed = 0, 0, 1.0
         self.recovered: Recovered | None = None
         self._measures: Measures | None = None
         self._before: Measures | None = None
@@ -307,7 +307,7 @@ class Accuracy:
             self._dual.coarse.comm,
             self.ratio(),
             self.ratio(changes=False),
-            self._longest(),
+            self._seen.longest,
             now.error / max(given.energy * self.rtol * now.energy, TINY),
             self._over_goal(),
             float(stalled),
@@ -358,7 +358,7 @@ class Accuracy:
         self._least = self.errors()
         self.look(lam, gradient, face, residual)
         self._before = None
-        ratio, longest = steering(self._dual.coarse.comm, self.ratio(), self._longest())
+        ratio, longest = steering(self._dual.coarse.comm, self.ratio(), self._seen.longest)
         return bool(ratio <= 1.0 or longest <= self._atol)
 
     def accept_rounding(self) -> None:
@@ -446,10 +446,6 @@ class Accuracy:
         """Measures of the last look."""
         assert self._measures is not None, "nothing has been measured yet"
         return self._measures
-
-    def _longest(self) -> float:
-        """Return the longest of what rows miss, and of what closes that."""
-        return max(float(self._seen.correction.max(initial=0.0)), self._seen.penetration)
 
     def _at_rest(self) -> Array:
         """The size of displacements that are rounding of 0, of bodies without a load, else 0."""

@@ -46,11 +46,6 @@ class FacetElement:
         self.points = self._element.points
         self.size = self._element.dim
 
-    @property
-    def is_affine(self) -> bool:
-        """True if all maps with these basis functions are affine."""
-        return self.degree == 1 and self.facet != "quadrilateral"
-
     def values(self, xi: Array) -> Array:
         """Basis functions at reference points: shape ``(n, tdim)`` to ``(n, size)``."""
         if len(xi) == 0:
@@ -110,11 +105,6 @@ class FacetKind:
     hats: FacetElement
     displacement: FacetElement
     geometry: FacetElement
-
-    @property
-    def reference_area(self) -> float:
-        """Area of the reference facet."""
-        return 0.5 if self.facet == "triangle" else 1.0
 
 
 @dataclass(frozen=True)
@@ -198,7 +188,7 @@ def local_facets(dofs: TornDofs, decomposition: Decomposition, facets: Array) ->
     inside = mesh.geometry.x[nodes[:, : coordinate.dim // gdim]].mean(axis=1)[:, :gdim]
     hats, corners = kind.hats, x[:, : kind.hats.size]
     (normal,) = _normals(hats, corners, hats.points.mean(axis=0)[None])
-    area = kind.reference_area * np.linalg.norm(normal, axis=1)
+    area = (0.5 if kind.facet == "triangle" else 1.0) * np.linalg.norm(normal, axis=1)
     outward = np.sum(normal * (corners.mean(axis=1) - inside), axis=1)
     normal = _unit(np.where(outward < 0.0, -1.0, 1.0)[:, None] * normal)
     at_vertices = _normals(kind.geometry, x, hats.points)
@@ -272,7 +262,8 @@ def reference_points(element: FacetElement, nodes: Array, y: Array) -> Array:
     """
     origin = nodes[:, 0]
     xi = _solve((nodes[:, 1 : 1 + y.shape[1]] - origin[:, None]).transpose(0, 2, 1), y - origin)
-    if element.is_affine or len(xi) == 0:
+    affine = element.degree == 1 and element.facet != "quadrilateral"
+    if affine or len(xi) == 0:
         return xi
     size = np.ptp(nodes, axis=1).max(axis=1)
     for _ in range(SEARCH.newton_steps):

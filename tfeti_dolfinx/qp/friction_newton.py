@@ -407,7 +407,7 @@ def known_on(
     nothing = np.zeros((3, 0, len(on.p)))
     if past is None or past.count == 0:
         return nothing
-    W, FW = past.columns
+    W, FW = past.directions.T, past.images.T
     U = on.face.restricted(W - on.C @ W)
     N = past.without(W - on.followed(U))
     if N.shape[1] == 0:

@@ -265,10 +265,10 @@ def solve_by_pcpg(
     >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
     >>> from tfeti_dolfinx.qp.sets import Product
     >>> from tfeti_dolfinx.qp.homogenised import homogenise
-    >>> from tfeti_dolfinx.qp.problem import ResidualRule
+    >>> from tfeti_dolfinx.qp.problem import StoppingRule
     >>> F, d = np.diag([1.0, 2.0, 4.0]).__matmul__, np.array([1.0, 1.0, 2.0])
     >>> qp = QP(F, d, DenseCoarse(np.ones((1, 3)), np.ones(1)), Product())
-    >>> result = solve_by_pcpg(qp, homogenise(qp), ResidualRule(1e-12))
+    >>> result = solve_by_pcpg(qp, homogenise(qp), StoppingRule(1e-12))
     >>> result.reason.name, result.lam.round(6).tolist()
     ('CONVERGED_RTOL', [0.428571, 0.214286, 0.357143])
     """

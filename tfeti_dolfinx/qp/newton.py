@@ -332,11 +332,11 @@ def newton(
     >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
     >>> from tfeti_dolfinx.qp.sets import Bounds
     >>> from tfeti_dolfinx.qp.homogenised import homogenise, operator_product
-    >>> from tfeti_dolfinx.qp.problem import ResidualRule
+    >>> from tfeti_dolfinx.qp.problem import StoppingRule
     >>> F, d = np.diag([1.0, 2.0, 4.0]).__matmul__, np.array([1.0, -1.0, 2.0])
     >>> qp = QP(F, d, DenseCoarse(np.ones((1, 3)), np.ones(1)), Bounds())
     >>> start = homogenise(qp, operator_product(F, qp.comm, first_point(qp)))
-    >>> result = newton(qp, start, ResidualRule(1e-10))
+    >>> result = newton(qp, start, StoppingRule(1e-10))
     >>> result.reason.name, result.lam.round(6).tolist()
     ('CONVERGED_RTOL', [0.6, 0.0, 0.4])
     """

@@ -18,7 +18,6 @@ from tfeti_dolfinx.qp.problem import (
     FaceOperator,
     Monitor,
     Point,
-    ResidualRule,
     Steps,
     StoppingRule,
 )
@@ -189,7 +188,7 @@ class FaceSolver:
             self._on_face, F=qp.F, preconditioner=self._preconditioner, d=Fw, recycled=None
         )
         point, own = Point(np.zeros(len(way)), -Fw), Directions(replace(qp, keeps=True))
-        pcpg(program, point, ResidualRule(exact), Steps(), given.purifying, directions=own)
+        pcpg(program, point, StoppingRule(exact), Steps(), given.purifying, directions=own)
         return way - point.lam, -point.g
 
     def _pcpg(self, z: Point, optimality: float, resume: bool) -> tuple[Point, bool]:
@@ -202,7 +201,7 @@ class FaceSolver:
         own.fresh = own.fresh or not resume or self._curved
         share = given.stage if resume else given.reduction
         target = share * min(norm_over(qp.comm, on_face.coarse.project(z.g)), optimality)
-        rule = ResidualRule(max(target, given.final * self._rule.aim))
+        rule = StoppingRule(max(target, given.final * self._rule.aim))
         end, norm = Point(z.lam, z.g), own.norm
         reason = pcpg(on_face, end, rule, self._steps, self._max_it, self._monitor, own)
         self.left = norm_over(qp.comm, own.r)

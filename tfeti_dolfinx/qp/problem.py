@@ -192,30 +192,30 @@ class Start:
 # --- Stopping rules ---------------------------------------------------------------------------
 
 
-class StoppingRule(Protocol):
-    """Stopping rule for the residuals of an iterate.
+class StoppingRule:
+    """Stopping rule for the residuals of an iterate; this one is content with small residuals.
 
     A solver compares max(‖g^P‖, ‖F‖‖Qx‖) with ``tolerance`` in every step. Where it is small
     enough, the iterate is examined; an examination that is not content lowers the tolerance.
 
+    Args:
+        tolerance: What residuals must come down to.
+
     Attributes:
         tolerance: Norm of the residuals from which on an examination is worth its price.
-        aim: What solves on faces come down to at most: the tolerance, or 0 where an examination
-            is to wait until one of them is done.
         drifted: Set where an examination finds that the solver's gradient is no longer true;
             the solver makes it anew and takes the flag back.
         norm: ‖F‖, or an estimate: residuals over it are errors of multipliers. A solver that
             learns it on its way says so here.
     """
 
-    tolerance: float
-    drifted: bool
-    norm: float
+    def __init__(self, tolerance: float) -> None:
+        self.tolerance, self.drifted, self.norm = tolerance, False, 1.0
 
     @property
     def aim(self) -> float:
-        """Lower limit of the residuals that solves on faces aim at."""
-        ...
+        """What solves on faces come down to at most; 0 where an examination is to wait for one."""
+        return self.tolerance
 
     def examine(self, lam: Array, gradient: Array, face: Face, residual: float) -> ConvergedReason:
         """Examine an iterate whose residuals are small. Collective.
@@ -229,21 +229,6 @@ class StoppingRule(Protocol):
         Returns:
             Why to stop, or ITERATING; then ``tolerance`` is below ``residual``.
         """
-        ...
-
-
-class ResidualRule:
-    """Stopping rule by residuals alone, for parts of a solve and programs without a displacement.
-
-    Args:
-        tolerance: What residuals must come down to.
-    """
-
-    def __init__(self, tolerance: float) -> None:
-        self.tolerance, self.drifted, self.norm, self.aim = tolerance, False, 1.0, tolerance
-
-    def examine(self, lam: Array, gradient: Array, face: Face, residual: float) -> ConvergedReason:
-        """Content, if the residual has come down to the tolerance."""
         small = residual <= self.tolerance
         return ConvergedReason.CONVERGED_RTOL if small else ConvergedReason.ITERATING
 

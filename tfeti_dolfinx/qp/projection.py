@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from mpi4py import MPI
@@ -56,18 +55,6 @@ class ProjectionParameters:
 DEFAULT = ProjectionParameters()
 
 
-class ConvexSet(Protocol):
-    """Protocol of the set Ω to project onto; any ``FeasibleSet`` has it."""
-
-    def project(self, x: Array) -> Array:
-        """P_Ω(x)."""
-        ...
-
-    def face(self, x: Array, g: Array) -> Face:
-        """Return the face of x ∈ Ω."""
-        ...
-
-
 @dataclass(frozen=True)
 class FeasiblePoint:
     """A point of Ω, and how far it is from Gλ = e.
@@ -85,7 +72,7 @@ class FeasiblePoint:
 
 def project_onto_feasible(
     coarse: Coarse,
-    feasible: ConvexSet,
+    feasible: FeasibleSet | WithinFace,
     y: Array,
     parameters: ProjectionParameters = DEFAULT,
 ) -> FeasiblePoint:
@@ -173,7 +160,7 @@ class _Trial:
         return float(np.linalg.norm(self.residual))
 
 
-def _trial(coarse: Coarse, feasible: ConvexSet, y: Array, alpha: Array) -> _Trial:
+def _trial(coarse: Coarse, feasible: FeasibleSet | WithinFace, y: Array, alpha: Array) -> _Trial:
     z = y + coarse.combined(alpha)
     lam = feasible.project(z)
     own = float(z @ lam) - 0.5 * float(lam @ lam)
@@ -183,7 +170,7 @@ def _trial(coarse: Coarse, feasible: ConvexSet, y: Array, alpha: Array) -> _Tria
 
 def _searched(
     coarse: Coarse,
-    feasible: ConvexSet,
+    feasible: FeasibleSet | WithinFace,
     y: Array,
     start: _Trial,
     step: Array,

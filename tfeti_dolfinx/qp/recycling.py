@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,18 +81,13 @@ class Recycled(DirectionStore):
         super().__init__(capacity, 0)
         self.comm, self.parameters = comm, parameters
 
-    @property
-    def columns(self) -> tuple[Array, Array]:
-        """This rank's part of W and FW, in no order, shapes ``(m, count)``."""
-        return self.directions.T, self.images.T
-
     def add(self, x: Array, Fx: Array, energy: float) -> None:
         """Store x with Fx and xᵀFx > 0, made F-orthonormal to those stored. Collective.
 
         Where images are no longer right, all that was kept is forgotten. Three reductions.
         """
         x, Fx = x / np.sqrt(energy), Fx / np.sqrt(energy)
-        self._set_size(len(x))
+        self._rows = self._rows if self.count else np.zeros((2, 0, len(x)))
         for passed in range(2):
             W, FW = self.directions, self.images
             a, same = summed(self.comm, np.array([FW @ x, W @ Fx]))
@@ -109,11 +103,6 @@ class Recycled(DirectionStore):
         if energy >= self.parameters.new:
             self.put(x / np.sqrt(energy), Fx / np.sqrt(energy))
 
-    def add_all(self, directions: Iterable[tuple[Array, Array, float]]) -> None:
-        """Store directions with images and energies. Collective."""
-        for direction in directions:
-            self.add(*direction)
-
     def keep(self, x: Array, Fx: Array) -> None:
         """Store a direction with Fx, if its energy is positive. Collective."""
         energy = self._energy(x, Fx)
@@ -123,11 +112,6 @@ class Recycled(DirectionStore):
     def _energy(self, x: Array, Fx: Array) -> float:
         """xᵀFx, the same on all ranks. Collective."""
         return bcast_from_root(self.comm, float(summed(self.comm, np.array([x @ Fx]))[0]))
-
-    def _set_size(self, size: int) -> None:
-        """Make room for vectors of so many rows, if there is none."""
-        if not self.count and self._rows.shape[2] != size:
-            self._rows = np.zeros((2, 0, size))
 
     def in_order(self) -> Array:
         """Return this rank's part of W and FW, shape ``(2, m, count)``, the oldest direction first.
@@ -142,7 +126,7 @@ class Recycled(DirectionStore):
         """Restore another run's directions, the newest ones if they are too many."""
         newest = kept[:, :, max(kept.shape[2] - self.capacity, 0) :]
         self.clear()
-        self._set_size(newest.shape[1])
+        self._rows = np.zeros((2, 0, newest.shape[1]))
         for w, Fw in zip(newest[0].T, newest[1].T, strict=True):
             self.put(w, Fw)
 
@@ -166,13 +150,13 @@ class RecycledOnFace:
 
     def __init__(self, known: Recycled, held: Array | None = None) -> None:
         self._known, self._held = known, held
-        self._N = None if held is None else known.without(known.columns[0][held])
+        self._N = None if held is None else known.without(known.directions.T[held])
         self.count = known.count if self._N is None else self._N.shape[1]
 
     def least(self, r: Array) -> tuple[Array, Array]:
         """Return the step along W to where q is least, given r = −P(Fλ − d), and its image."""
         b = self._part(r, self._known.directions)
-        return self._combined(b), self._known.columns[1] @ b
+        return self._combined(b), self._known.images.T @ b
 
     def conjugate(self, p: Array) -> Array:
         """Return a direction made F-orthogonal to W; one reduction."""
@@ -185,7 +169,7 @@ class RecycledOnFace:
 
     def _combined(self, b: Array) -> Array:
         """W b, 0 where the face holds rows."""
-        x = self._known.columns[0] @ b
+        x = self._known.directions.T @ b
         if self._held is not None:
             x[self._held] = 0.0
         return np.asarray(x)

@@ -105,10 +105,10 @@ def smalse(
     >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
     >>> from tfeti_dolfinx.qp.sets import Bounds
     >>> from tfeti_dolfinx.qp.homogenised import homogenise
-    >>> from tfeti_dolfinx.qp.problem import ResidualRule
+    >>> from tfeti_dolfinx.qp.problem import StoppingRule
     >>> F, d = np.diag([1.0, 2.0, 4.0]).__matmul__, np.array([1.0, -1.0, 2.0])
     >>> qp = QP(F, d, DenseCoarse(np.ones((1, 3)), np.ones(1)), Bounds(), norm=4.0)
-    >>> result = smalse(qp, homogenise(qp), ResidualRule(1e-10))
+    >>> result = smalse(qp, homogenise(qp), StoppingRule(1e-10))
     >>> result.reason.name, result.lam.round(6).tolist()
     ('CONVERGED_RTOL', [0.6, 0.0, 0.4])
     """

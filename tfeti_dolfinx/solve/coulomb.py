@@ -191,6 +191,7 @@ class FrictionBounds:
     Attributes:
         now: The present ones, of each of ``constraints.pressed``; ∞: all points stick.
         body: The body on which they changed most at last, or that they do not hold; -1 before.
+        before: Those before the last try of others.
         idle: Problems in a row whose change is not half of the least one before.
     """
 
@@ -209,7 +210,7 @@ class FrictionBounds:
             known = dual.pressures[at]
             lost = any_rank(self._comm, not np.all(np.isfinite(known)))
             self.now = np.maximum(start[0][self._rows], 0.0) if lost else known
-        self._before, self._found = self.now, self.now
+        self.before, self._found = self.now, self.now
         self._none, self._best, self._length = 0.0, np.inf, 1.0
         self.idle, self.body, self._falls = 0, -1, 0
         self._solved: list[tuple[Array, Array]] = []
@@ -315,12 +316,8 @@ class FrictionBounds:
 
     def take(self, lam: Array) -> None:
         """Try the bounds of multipliers for which the law holds."""
-        self._before, self.now = self.now, self._forces(lam)
+        self.before, self.now = self.now, self._forces(lam)
         self._dual.bound_friction(self.now)
-
-    def take_back(self) -> None:
-        """Restore the bounds from before the try."""
-        self.now = self._before
 
     def _forces(self, lam: Array) -> Array:
         """Return the normal forces, those that are rounding set to 0."""
@@ -353,7 +350,7 @@ class NewtonOnLaw:
     def give_up(self, bounds: FrictionBounds) -> None:
         """Give up, and restore bounds and directions from before the failed try."""
         self.tries, self._dual.recycled = 0, self._recycled
-        bounds.take_back()
+        bounds.now = bounds.before
 
     def solve(
         self, start: tuple[Array, Array] | None, bounds: FrictionBounds, aim: float = np.inf

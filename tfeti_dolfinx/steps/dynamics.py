@@ -148,7 +148,7 @@ class Predictor:
             FactorError: M could not be factored.
         """
         dofs, constraints = self._dofs, gluing.constraints
-        before, primal = np.array(constraints.c.array_r), dofs.to_primal(w)
+        before, primal = np.array(constraints.c), dofs.to_primal(w)
         total = dofs.reduce(primal.reshape(-1, dofs.bs), np.add, 0.0)
         held = total / dofs.multiplicity[:, None]
         constraints.set_right_side(gluing.with_supports_at(held))

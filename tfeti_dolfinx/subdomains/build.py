@@ -14,11 +14,10 @@ from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.subdomains.block import Block, Counters, SubdomainData
+from tfeti_dolfinx.subdomains.block import Block, Counters, RigidBlock, SubdomainData
 from tfeti_dolfinx.subdomains.factor import say_if_not_cholmod
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.local_operators import LocalChoice
-from tfeti_dolfinx.subdomains.rigid_block import RigidBlock
 from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains, SparseBlock
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 

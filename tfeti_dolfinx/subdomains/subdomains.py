@@ -11,14 +11,13 @@ from scipy.sparse import block_diag, coo_array, csr_array
 
 from tfeti_dolfinx.common.arrays import Array, joined, node_means, parts_of
 from tfeti_dolfinx.errors import raised_on_all_ranks
-from tfeti_dolfinx.subdomains.block import Block, Counters, OperatorKind
+from tfeti_dolfinx.subdomains.block import Block, Counters, OperatorKind, RigidBlock
 from tfeti_dolfinx.subdomains.local_operators import (
     GroupedOperator,
     LocalChoice,
     LocalOperator,
     solved_together,
 )
-from tfeti_dolfinx.subdomains.rigid_block import RigidBlock
 
 # --- Motions of subdomains that springs hold --------------------------------------------------
 
@@ -92,8 +91,9 @@ class Subdomains:
         elastic: The Blocks that have nodes, which are no rigid bodies.
         num_modes: k; num_clusters: clusters on all ranks, 0 without.
         trace: Trace unknowns among this rank's, ascending, shape ``(t,)``.
-        trace_parts: Where the trace unknowns of each Block lie among the t, and dof_parts its
-            unknowns among the n.
+        size: n.
+        trace_parts: Where the trace unknowns of each Block lie among the t, dof_parts its unknowns
+            among the n, and kernel_parts its kernel coordinates among the r.
         diagonal: On the trace, the mean of the diagonal of K at each node, shape ``(t,)``.
     """
 
@@ -116,6 +116,8 @@ class Subdomains:
         own = max((block.modes.shape[1] for block in self.blocks), default=0)
         self.num_modes = int(comm.allreduce(own, op=MPI.MAX))
         self.dof_parts = parts_of([len(block.load) for block in self.blocks])
+        self.kernel_parts = parts_of([block.kernel.shape[1] for block in self.blocks])
+        self.size = sum(len(block.load) for block in self.blocks)
         self._read_trace()
         self._pinv_load: Array | None = None
 
@@ -161,14 +163,9 @@ class Subdomains:
     # ------------------------------------------------------------------ kernels
 
     @property
-    def kernel_parts(self) -> list[slice]:
-        """Slices of the kernel coordinates of each Block among the r."""
-        return parts_of([block.kernel.shape[1] for block in self.blocks])
-
-    @property
     def kernel_size(self) -> int:
         """r."""
-        return _end(self.kernel_parts)
+        return sum(block.kernel.shape[1] for block in self.blocks)
 
     @property
     def kernel_rows(self) -> csr_array:
@@ -176,7 +173,7 @@ class Subdomains:
         parts = [block.kernel[block.trace_dofs] for block in self.blocks]
         rows = [part.start for part in self.trace_parts]
         columns = [part.start for part in self.kernel_parts]
-        return _assembled(parts, rows, columns, (len(self.trace), _end(self.kernel_parts)))
+        return _assembled(parts, rows, columns, (len(self.trace), sum(p.shape[1] for p in parts)))
 
     @property
     def kernel_load(self) -> Array:
@@ -219,7 +216,7 @@ class Subdomains:
 
     def with_rigid(self, u: Array) -> Array:
         """Return a displacement of nodes on all unknowns, 0 of rigid bodies, shape ``(n,)``."""
-        return np.append(u, np.zeros(_end(self.dof_parts) - len(u)))
+        return np.append(u, np.zeros(self.size - len(u)))
 
     # ------------------------------------------------------------------- bodies
 
@@ -229,7 +226,7 @@ class Subdomains:
         parts = [block.kernel.T @ block.modes for block in self.blocks]
         rows = [part.start for part in self.kernel_parts]
         columns = [self.num_modes * int(body) for body in self.body_of_block]
-        shape = (_end(self.kernel_parts), self.num_bodies * self.num_modes)
+        shape = (sum(len(part) for part in parts), self.num_bodies * self.num_modes)
         return _assembled(parts, rows, columns, shape)
 
     def modes_outside(self) -> Array:
@@ -305,7 +302,7 @@ class Subdomains:
 
     def extended(self, v: Array) -> Array:
         """Return a trace vector, shape ``(t,)``, on all unknowns, 0 elsewhere, shape ``(n,)``."""
-        u = np.zeros(_end(self.dof_parts))
+        u = np.zeros(self.size)
         u[self.trace] = v
         return u
 
@@ -333,11 +330,6 @@ class Subdomains:
         combine.at(total, body, np.reshape(values, (len(values), *shape)))
         self.comm.Allreduce(MPI.IN_PLACE, total, op=op)
         return total
-
-
-def _end(parts: Sequence[slice]) -> int:
-    """Return the length of what parts lie in."""
-    return parts[-1].stop if parts else 0
 
 
 def _assembled(
