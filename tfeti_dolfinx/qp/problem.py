@@ -214,7 +214,7 @@ class StoppingRule:
 
     @property
     def aim(self) -> float:
-        """What solves on faces come down to at most; 0 where an examination is to wait for one."""
+        """The least that solves on faces aim at; 0 where an examination is to wait for one."""
         return self.tolerance
 
     def examine(self, lam: Array, gradient: Array, face: Face, residual: float) -> ConvergedReason:
