@@ -31,8 +31,6 @@ from dolfinx import fem, geometry
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 import tfeti_dolfinx as tfeti
 from benchmarks.error_scenes import ADAPTIVE, GRADED, SCENES, Scene
 from benchmarks.profiles import Array

@@ -10,7 +10,6 @@ go to results/kplus_forms.md, .json and .png.
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import petsc4py
 
@@ -24,8 +23,6 @@ from dolfinx import mesh as dmesh
 from mpi4py import MPI
 from scipy.linalg import eigh
 from scipy.sparse import csr_array
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.tools import column, command_line, curves, finish, picture
 from tfeti_dolfinx.common.compat import assemble_csr

@@ -24,7 +24,6 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any, TypeVar
 
 import petsc4py
@@ -34,8 +33,6 @@ if __name__ == "__main__":
 
 import numpy as np
 from mpi4py import MPI
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.stability_scenes import CELLS, beam, two_bodies, with_friction
 from benchmarks.stress import meshes

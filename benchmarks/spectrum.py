@@ -15,7 +15,6 @@ results/spectrum.md, .json and .png.
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import petsc4py
 
@@ -29,8 +28,6 @@ from dolfinx import mesh as dmesh
 from mpi4py import MPI
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator, eigsh
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import tfeti_dolfinx as tfeti
 from benchmarks.tools import column, command_line, curves, finish, picture

@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import logging
 import sys
-from pathlib import Path
 from typing import Any
 
 import petsc4py
@@ -31,8 +30,6 @@ if __name__ == "__main__":
     petsc4py.init(sys.argv[:1])
 
 from mpi4py import MPI
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.stability_scenes import CELLS, LADDERS, Ladder, label
 from benchmarks.stress.judge import run_scene

@@ -22,8 +22,6 @@ if __name__ == "__main__":
 
 from mpi4py import MPI
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 import tfeti_dolfinx as tfeti
 from benchmarks.tools import (
     STAGES,

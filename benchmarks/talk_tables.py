@@ -11,7 +11,6 @@ results/talk_tables.md, .json and .png.
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 
 import petsc4py
 
@@ -19,8 +18,6 @@ if __name__ == "__main__":
     petsc4py.init(sys.argv[:1])
 
 from mpi4py import MPI
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from benchmarks.tools import column, command_line, curves, finish, picture, solve_seconds
 from demos import cube_3d, talk_hertz_2d, tbeti_cube_3d, tresca_2d, tresca_3d

@@ -37,8 +37,6 @@ if __name__ == "__main__":
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 from benchmarks.error_case import QUADRILATERAL, TRIANGLE, Case
 from benchmarks.error_scenes import ADAPTIVE, SCENES, UNIFORM, Scene
 from benchmarks.profiles import errors

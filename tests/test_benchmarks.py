@@ -8,43 +8,45 @@ import pytest
 
 from benchmarks import (
     ablation,
-    hertz_convergence,
     kplus_forms,
     linear_price,
     profiles,
+    scaling,
     solver_profiles,
     spectrum,
     stability,
     stages,
-    strong_scaling,
-    subdomain_size,
     talk_tables,
     time_against_error,
     tools,
     validation,
-    weak_scaling,
 )
 
 
-def with_arguments(benchmark, *arguments, slow=False):
+def name_of(benchmark, arguments):
+    """Name of its tables."""
     name = benchmark.__name__.split(".")[-1]
+    return f"{name}_{arguments[0]}" if benchmark is scaling else name
+
+
+def with_arguments(benchmark, *arguments, slow=False):
+    name = name_of(benchmark, arguments)
     return pytest.param(benchmark, arguments, id=name, marks=[pytest.mark.slow] if slow else [])
 
 
-START_MPIRUN = (solver_profiles, strong_scaling, subdomain_size, time_against_error, weak_scaling)
+START_MPIRUN = (solver_profiles, scaling, time_against_error)
 RUNS = [
-    with_arguments(hertz_convergence, slow=True),
     with_arguments(kplus_forms),
     with_arguments(linear_price, "--scenes", "cube_3d"),
     with_arguments(spectrum),
     with_arguments(stability, "--groups", "nu"),
     with_arguments(stages, "--processor"),
-    with_arguments(strong_scaling, "--ranks", "2"),
+    with_arguments(scaling, "strong", "--ranks", "2"),
     with_arguments(talk_tables, "--rtol", "1e-4"),
     with_arguments(solver_profiles, "--steps", "100", slow=True),
-    with_arguments(subdomain_size, "--ranks", "1", slow=True),
+    with_arguments(scaling, "sizes", "--ranks", "1", slow=True),
     with_arguments(time_against_error, "--ranks", "1", "--scenes", "half cylinder", slow=True),
-    with_arguments(weak_scaling, slow=True),
+    with_arguments(scaling, "weak", slow=True),
 ]
 
 
@@ -57,7 +59,7 @@ def test_a_quick_run_writes_the_tables_that_it_returns(
     monkeypatch.setattr(time, "perf_counter", time.perf_counter)  # --processor changes it
     tables = benchmark.main(["--quick", "--output", str(shared_tmp), *arguments])
     comm.barrier()
-    name = benchmark.__name__.split(".")[-1]
+    name = name_of(benchmark, arguments)
     assert (shared_tmp / f"{name}.md").read_text().startswith("## ")
     assert json.loads((shared_tmp / f"{name}.json").read_text()).keys() == tables.keys()
     assert (shared_tmp / f"{name}.png").read_bytes().startswith(b"\x89PNG")

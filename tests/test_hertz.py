@@ -2,10 +2,13 @@
 
 from itertools import pairwise
 
+import numpy as np
 import pytest
+from mpi4py import MPI
 
-from benchmarks.hertz_convergence import study_2d, study_3d, study_pair, study_pair_3d
-from demos import cylinder_on_block_2d, hertz_2d, hertz_3d
+from benchmarks import profiles
+from benchmarks.tools import slope
+from demos import cylinder_on_block_2d, hertz_2d, hertz_3d, sphere_on_block_3d
 
 
 @pytest.mark.slow
@@ -17,9 +20,29 @@ def test_default_sizes_are_near_the_closed_form(demo, tolerance):
     assert abs(report.errors["peak_pressure"]) <= tolerance
 
 
+def study(demo, argument, values, sizes, half_width):
+    """Errors of the pressure of all meshes but the finest, by the closed form and by that mesh.
+
+    Returns:
+        Rows, and orders of convergence over the sizes of elements.
+    """
+    found, rows, gdim = [], [], 2 if demo in (hertz_2d, cylinder_on_block_2d) else 3
+    samples = (profiles.Samples.line if gdim == 2 else profiles.Samples.disc)(half_width)
+    for value in values:
+        solution, report = demo.run([argument, str(value), "-tfeti_rtol", "1e-8"])
+        data = solution.contact(0)
+        parts = MPI.COMM_WORLD.allgather((data.points[:, : gdim - 1], data.pressure))
+        found.append(samples.at(*(np.concatenate(part) for part in zip(*parts, strict=True))))
+        rows.append({"pressure_l2": report.errors["pressure_l2"]})
+    for row, pressure in zip(rows[:-1], found[:-1], strict=True):
+        row["pressure_l2_finer"] = profiles.errors(samples, pressure, found[-1])["pressure"]
+    names = ("pressure_l2", "pressure_l2_finer")
+    return rows[:-1], {n: slope(sizes[:-1], [row[n] for row in rows[:-1]]) for n in names}
+
+
 def falls(rows, name):
-    errors = [row[name] for row in rows]
-    return all(finer < coarser for coarser, finer in pairwise(errors))
+    values = [row[name] for row in rows]
+    return all(finer < coarser for coarser, finer in pairwise(values))
 
 
 # elements along the half width; the last solution is the reference
@@ -28,7 +51,7 @@ SIZES = [(8, 16, 32, 64), pytest.param((8, 16, 32, 128), marks=pytest.mark.slow)
 
 @pytest.mark.parametrize("sizes", SIZES)
 def test_pressure_converges_in_2d(sizes):
-    rows, slopes = study_2d(sizes)
+    rows, slopes = study(hertz_2d, "--elements", sizes, [1 / n for n in sizes], 0.04)
     assert falls(rows, "pressure_l2")
     assert falls(rows, "pressure_l2_finer")
     assert slopes["pressure_l2"] >= 0.9
@@ -37,7 +60,9 @@ def test_pressure_converges_in_2d(sizes):
 
 @pytest.mark.slow
 def test_pressure_converges_in_3d():
-    rows, slopes = study_3d((8_000, 24_000, 72_000, 250_000))
+    unknowns = (8_000, 24_000, 72_000, 250_000)
+    sizes = [n ** (-1 / 3) for n in unknowns]
+    rows, slopes = study(hertz_3d, "--unknowns", unknowns, sizes, 0.05)
     assert falls(rows, "pressure_l2")
     assert falls(rows, "pressure_l2_finer")
     assert slopes["pressure_l2_finer"] >= 0.5
@@ -65,14 +90,17 @@ def test_a_cylinder_on_a_block_is_near_the_closed_form():
 
 @pytest.mark.slow
 def test_pressure_of_a_pair_converges():
-    """A quick run, on coarser meshes, is one of ``test_benchmarks``."""
-    rows, slopes = study_pair((8, 16, 32, 128))
+    elements, a = (8, 16, 32, 128), cylinder_on_block_2d.closed_form().half_width
+    sizes = [1 / n for n in elements]
+    rows, slopes = study(cylinder_on_block_2d, "--elements", elements, sizes, a)
     assert falls(rows, "pressure_l2_finer")
     assert slopes["pressure_l2_finer"] >= 0.9
 
 
 @pytest.mark.slow
 def test_pressure_of_a_pair_converges_in_3d():
-    rows, slopes = study_pair_3d((8_000, 24_000, 72_000, 250_000))
+    unknowns = (8_000, 24_000, 72_000, 250_000)
+    sizes = [n ** (-1 / 3) for n in unknowns]
+    rows, slopes = study(sphere_on_block_3d, "--unknowns", unknowns, sizes, 0.05)
     assert falls(rows, "pressure_l2_finer")
     assert slopes["pressure_l2_finer"] >= 0.4
