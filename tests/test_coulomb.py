@@ -2,8 +2,9 @@
 
 import numpy as np
 import pytest
+import ufl
 from bodies import boxes, two_body_problem
-from dolfinx import fem
+from dolfinx import fem, mesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mpi4py import MPI
@@ -129,6 +130,50 @@ def test_a_block_that_is_drawn_along_slides_at_its_capacity(comm):
     assert np.linalg.norm(friction) == pytest.approx(capacity(along, pressed), rel=1e-3)
     normal = np.arctan2(friction[1] / MU[1] ** 2, friction[0] / MU[0] ** 2)
     assert normal == pytest.approx(np.arctan2(-np.sin(angle), -np.cos(angle)), abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("cell", "mu", "tilt", "size", "rtol", "shares"),
+    [
+        # directions of a face that holds the block by rounding alone do not balance any load
+        ("quadrilateral", 0.1, 0.1, (8, 4), 1e-6, (0.5, 0.9, 0.96, 0.97, 0.99, 0.5, 0.99)),
+        # rows that slip and stick by turns
+        ("quadrilateral", 0.05, 0.1, (12, 6), 1e-9, (0.5, 0.75, 0.589, 0.01, 0.99)),
+        ("triangle", 0.05, 0.1, (12, 6), 1e-9, (0.5, 0.75, 0.589, 0.01, 0.99)),
+    ],
+)
+def test_a_block_on_a_slope_pushed_up_and_down_near_its_limits(cell, mu, tilt, size, rtol, shares):
+    """Shares of the way from the force at which it slides down to the one at which it goes up."""
+    kind = getattr(mesh.CellType, cell)
+    whole = mesh.create_rectangle(MPI.COMM_WORLD, [(0, 0), (4, 2)], size, kind)
+    d = tfeti.decompose(whole, 2, surfaces={"bottom": lambda x: np.isclose(x[1], 0.0)})
+    c, s = np.array((1.0, tilt)) / np.hypot(1.0, tilt)
+    d.mesh.geometry.x[:, :2] = d.mesh.geometry.x[:, :2] @ np.array(((c, s), (-s, c)))
+    low, high = (tilt - mu) / (1 + mu * tilt), (mu + tilt) / (1 - mu * tilt)  # of its weight
+    elastic = tfeti.Elasticity(d, E=1e3, nu=0.3, model="plane_strain")
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    push = fem.Constant(d.mesh, (0.0, -0.125))
+
+    def solved(share, problem=None):
+        push.value[0] = 0.125 * (low + share * (high - low))
+        plane = tfeti.Plane((0, 0), normal=(-s, c))
+        floor = tfeti.Obstacle("bottom", plane, friction=tfeti.Coulomb(mu))
+        problem = problem or tfeti.ContactProblem(
+            elastic.a(u, v), ufl.inner(push, v) * ufl.dx, [], [floor], d, petsc_options=options
+        )
+        problem.solve()
+        return problem
+
+    options, warm = {"rtol": rtol}, None
+    for share in shares:
+        warm = solved(share, warm)
+        cold = solved(share)
+        missed = np.abs(warm.u.x.array - cold.u.x.array).max(initial=0.0)
+        largest = np.abs(cold.u.x.array).max(initial=0.0)
+        missed, largest = (whole.comm.allreduce(x, op=MPI.MAX) for x in (missed, largest))
+        assert missed <= 5.0 * rtol * largest
+        cold.destroy()
 
 
 def test_the_body_that_slides_without_end_is_named():

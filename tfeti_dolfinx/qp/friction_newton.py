@@ -11,8 +11,9 @@ from mpi4py import MPI
 from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import norm_over, steering, summed
+from tfeti_dolfinx.common.parallel import bcast_from_root, norm_over, steering, summed
 from tfeti_dolfinx.errors import FactorError
+from tfeti_dolfinx.qp.coarse import HELD
 from tfeti_dolfinx.qp.problem import QP
 from tfeti_dolfinx.qp.recycling import Recycled, triangle
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
@@ -331,8 +332,15 @@ def _solved_on_face(
     z, image, basis = gcr(apply, precondition, b, goal, basis, comm, parameters)
     u, s = u + z, s + image
     if qp.recycled is not None:
-        for z, image in basis[1:, known:].transpose(1, 0, 2):
-            qp.recycled.keep(on.followed(z), image)
+        _, new, images = basis[:, known:]
+        ways = on.followed(new.T)
+        # where a face holds a motion by nothing but rounding they do not keep Gλ = e
+        kept = np.ones(len(new), dtype=bool)
+        if qp.coarse.dimension:
+            missed, terms = np.abs(qp.coarse.G(ways)), qp.coarse.terms(ways)
+            kept = bcast_from_root(comm, np.all(missed <= HELD * terms.max(axis=0), axis=0))
+        for way, image in zip(ways.T[kept], images[kept], strict=True):
+            qp.recycled.keep(way, image)
     mu = oblique.coordinates(s + on.face.bend(u))
     return LawPoint(lam + on.followed(u), s - qp.coarse.combined(mu), at.mu + mu)
 

@@ -83,7 +83,9 @@ class FaceSolver:
             out, stays = self._has_left(end), False
             if not out or self._steps.cg >= self._max_it:
                 break
-            z = self._restored(end)
+            if (restored := self._restored(end)) is None:
+                break
+            z = restored
         # Step 3c: slipping rows, which followed their tangents, come back onto their boundary
         if self._curved and not out:
             assert self._face is not None
@@ -114,11 +116,11 @@ class FaceSolver:
             self._on_face = replace(self._on_face, F=bent, recycled=None)
         return same
 
-    def _restored(self, end: Point) -> Point:
+    def _restored(self, end: Point) -> Point | None:
         """Enter the face of P_Ω(λ), and return its point next to that with Gλ = e.
 
-        Where that face holds a body no longer, the nearest feasible point names rows that do:
-        within the face before, so that faces shrink and steps end, or if there is none, in Ω.
+        Where that face holds a body no longer, the nearest feasible point within the face before
+        names rows that do, so that faces shrink and steps end. None if there is none.
         """
         qp, before = self._qp, self._face
         assert before is not None
@@ -128,9 +130,10 @@ class FaceSolver:
         coarse = self._on_face.coarse
         lam = on + coarse.combined(coarse.solve(qp.coarse.residual(on)))
         if imbalance(qp.coarse, lam) > HELD:
-            found = project_onto_feasible(qp.coarse, WithinFace(qp.feasible, before), on)
+            within = WithinFace(qp.feasible, before, slipping=True)
+            found = project_onto_feasible(qp.coarse, within, on)
             if found.missing > HELD:
-                found = project_onto_feasible(qp.coarse, qp.feasible, on)
+                return None
             lam, on = found.lam, 0.5 * (on + found.lam)
             self._enter(qp.feasible.face(on, s))
         return qp.at(lam)
