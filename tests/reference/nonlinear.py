@@ -1,5 +1,7 @@
 """Nonlinear bodies above rigid planes by PETSc's active set Newton method, on the untorn mesh."""
 
+import inspect
+
 import basix.ufl
 import numpy as np
 import ufl
@@ -90,6 +92,22 @@ def above_plane(F, J, u, bcs, touching, up, starts):
         u.x.array[:] = x.x.array
         yield np.array(x.x.array.reshape(-1, bs))
     snes.destroy()
+
+
+def by_dolfinx(F, u, bcs):
+    """Return a function that solves F(u) = 0 by DOLFINx's own nonlinear problem."""
+    lu = {"ksp_type": "preonly", "pc_type": "lu"}
+    if "petsc_options_prefix" in inspect.signature(fem_petsc.NonlinearProblem).parameters:
+        exact = {"snes_rtol": 1e-12, "snes_atol": 1e-13, "snes_error_if_not_converged": None}
+        given = {"petsc_options_prefix": "reference_", "petsc_options": {**lu, **exact}}
+        return fem_petsc.NonlinearProblem(F, u, bcs=bcs, **given).solve
+    from dolfinx.nls.petsc import NewtonSolver
+
+    solver = NewtonSolver(MPI.COMM_SELF, fem_petsc.NonlinearProblem(F, u, bcs=bcs))
+    solver.rtol, solver.atol, solver.max_it = 1e-12, 1e-13, 100
+    solver.krylov_solver.setType(lu["ksp_type"])
+    solver.krylov_solver.getPC().setType(lu["pc_type"])
+    return lambda: solver.solve(u)
 
 
 def nearest_nodes(V, W):
