@@ -303,7 +303,7 @@ class Solution(ContactState):
     @cached_property
     def body_forces(self) -> BodyForces:
         """Resultants of the contact forces on each body. Collective at first use."""
-        return body_forces(self.nodal_forces, self.dofs, self.decomposition)
+        return body_forces(self.places(), self.nodal_forces, self.dofs, self.decomposition)
 
     @cached_property
     def _sigma(self) -> Any:

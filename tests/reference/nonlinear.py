@@ -10,6 +10,7 @@ from dolfinx import mesh as dmesh
 from dolfinx.fem import petsc as fem_petsc
 from mpi4py import MPI
 from petsc4py import PETSc
+from scipy.integrate import solve_bvp
 from scipy.spatial import cKDTree
 
 
@@ -169,3 +170,28 @@ def neo_hooke(u, E, nu):
     F = ufl.Identity(3) + g
     J, mu, lmbda = ufl.det(F), E / 2 / (1 + nu), E * nu / (1 + nu) / (1 - 2 * nu)
     return mu / 2 * (ufl.tr(F.T * F) - 3) - mu * ufl.ln(J) + lmbda / 2 * ufl.ln(J) ** 2
+
+
+def pressed_ring(inside, outside, widened, E, nu):
+    """Return where radii of a ring of ``neo_hooke`` are in plane strain, the inner one widened.
+
+    Balance of a ring, (R P_r)' = P_θ, P the derivatives of the energy in the stretches r' and r/R.
+    """
+    mu, lmbda = E / 2 / (1 + nu), E * nu / (1 + nu) / (1 - 2 * nu)
+
+    def stress(a, b):  # along the stretch a
+        return mu * (a - 1 / a) + lmbda * np.log(a * b) / a
+
+    def slope(R, y):  # r' = a, and a' from R dP_r/da a' = P_θ − P_r − R dP_r/db (a − b)/R
+        a, b = y[1], y[0] / R
+        of_a = mu * (1 + 1 / a**2) + lmbda * (1 - np.log(a * b)) / a**2
+        of_b = lmbda / (a * b)
+        return np.stack((a, (stress(b, a) - stress(a, b) - of_b * (a - b)) / (R * of_a)))
+
+    def ends(first, last):
+        return np.array([first[0] - widened, stress(last[1], last[0] / outside)])
+
+    R = np.linspace(inside, outside, 50)
+    found = solve_bvp(slope, ends, R, np.stack((R + widened - inside, np.ones_like(R))), tol=1e-9)
+    assert found.success
+    return lambda R: found.sol(R)[0]

@@ -151,6 +151,9 @@ class ContactState:
         gluing: Rows and contact records.
         contacts: Obstacles and pairs, the secondary surface of a pair first.
         thickness: What areas of the mesh are multiplied with, a number or a scalar in UFL.
+
+    Attributes:
+        finite: Whether forces act at X + u, as in finite strain.
     """
 
     def __init__(
@@ -167,6 +170,16 @@ class ContactState:
         self.decomposition, self.gluing, self.dofs = decomposition, gluing, gluing.dofs
         self.contacts, self.thickness = list(contacts), thickness
         self.tool_motions: Sequence[ToolMotion] = ()
+        self.finite = False
+
+    def places(self) -> Array:
+        """Points where forces on the owned groups act, shape ``(g, 3)``. Collective."""
+        points = group_points(self.dofs)
+        if self.finite and self.dofs.nodes is None:  # else nodes have moved there
+            moved = np.zeros((self.dofs.num_nodes, 3))
+            moved[:, : self.dofs.bs] = self.u.reshape(-1, self.dofs.bs)
+            points += self.dofs.reduce(moved, np.minimum, np.inf)
+        return points
 
     def contact(self, which: int | str = 0) -> ContactData:
         """State of the nodes of a contact, those that this rank owns. Collective.
@@ -179,7 +192,7 @@ class ContactState:
         """
         records, position = self.gluing.records, position_of(self.contacts, which)
         own = records.contact == position
-        points = group_points(self.dofs)[records.group[own]]
+        points, places = (x[records.group[own]] for x in (group_points(self.dofs), self.places()))
         area = self.area[:, None]
         traction = np.divide(
             self.tangential_force, area, out=0.0 * self.tangential_force, where=area > 0.0
@@ -195,7 +208,7 @@ class ContactState:
             tangential_traction=traction[own],
             slip=self.slip_of_conditions[own],
             surface=self.contacts[position].surfaces[0],
-            resultant=resultant(self.dofs.comm, points, self.condition_forces[own]),
+            resultant=resultant(self.dofs.comm, places, self.condition_forces[own]),
         )
 
     def tool(self, which: int | str = 0) -> ToolState:
@@ -246,7 +259,7 @@ class ContactState:
         member[surface_nodes(self.dofs, self.decomposition, facets)] = True
         groups = np.flatnonzero(self.dofs.reduce(member, np.logical_or, False))
         force = self.support_forces[groups]
-        return resultant(self.dofs.comm, group_points(self.dofs)[groups], force)
+        return resultant(self.dofs.comm, self.places()[groups], force)
 
     @cached_property
     def force(self) -> Array:

@@ -13,7 +13,7 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.surfaces import group_points, hat_integrals
+from tfeti_dolfinx.mortar.surfaces import hat_integrals
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,8 @@ class Resultant:
 
     Attributes:
         force: Shape ``(gdim,)``; with a thickness, that on all of it.
-        moment: About the origin, shape ``(3,)``; in 2D only its last component is not 0.
+        moment: About the origin, shape ``(3,)``; in 2D only its last component is not 0. In finite
+            strain forces act where nodes are, at X + u, else at X.
     """
 
     force: Array
@@ -73,11 +74,13 @@ def condition_areas(
     return records.area * volume / hat_integrals(dofs, decomposition, surfaces)[records.group]
 
 
-def body_forces(forces: Array, dofs: TornDofs, decomposition: Decomposition) -> BodyForces:
-    """Resultants of nodal forces, shape ``(g, gdim)``, on each body. Collective."""
+def body_forces(
+    points: Array, forces: Array, dofs: TornDofs, decomposition: Decomposition
+) -> BodyForces:
+    """Resultants of forces on the owned groups, which are at these points. Collective."""
     lowest = dofs.copy_subdomains[dofs.copy_offsets[:-1]]
     body = decomposition.body_of_subdomain[lowest]
-    terms = _with_moments(group_points(dofs), forces)
+    terms = _with_moments(points, forces)
     sums = np.zeros((decomposition.num_bodies, terms.shape[1]))
     np.add.at(sums, body, terms)
     dofs.comm.Allreduce(MPI.IN_PLACE, sums)

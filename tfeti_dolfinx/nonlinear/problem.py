@@ -15,6 +15,8 @@ from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.common.parallel import bcast_from_root, largest, summed
 from tfeti_dolfinx.common.validation import checked_callable, checked_flag, checked_type
+from tfeti_dolfinx.constraints.contact_state import Multipliers
+from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, checked_contacts
 from tfeti_dolfinx.errors import ConvergenceError, InputError, TfetiError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -23,7 +25,7 @@ from tfeti_dolfinx.nonlinear.state import InternalVariables, LawVariables, NewVa
 from tfeti_dolfinx.nonlinear.tangent import rotation_free_tangent
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.report import COUNTERS, Report, added
-from tfeti_dolfinx.solution import SavedState
+from tfeti_dolfinx.solution import SavedState, Solution
 
 
 @dataclass(frozen=True)
@@ -468,6 +470,11 @@ class NonlinearContactProblem(ContactProblem):
         self._set(self._begin)
         if self._places is not None:
             self._go_to_places(self._places)
+
+    def _make_solution(self, u: Array, multipliers: Multipliers, gluing: Gluing) -> Solution:
+        solution = super()._make_solution(u, multipliers, gluing)
+        solution.finite = self._finite
+        return solution
 
     def _known_before(self, given: dict[str, Any]) -> dict[str, Any]:
         return {name: value for name, value in given.items() if name not in NewtonForms.names}

@@ -1,0 +1,151 @@
+"""Laws of mechanics that nonlinear bodies in contact keep: objectivity, balance, energy, h²."""
+
+import numpy as np
+import ufl
+from bodies import boxes, stacked
+from dolfinx import fem
+from mpi4py import MPI
+from reference.nonlinear import neo_hooke, pressed_ring
+
+import tfeti_dolfinx as tfeti
+
+E, NU = 1.0, 0.3
+DX = {"metadata": {"quadrature_degree": 4}}
+PAIR = ("lower top", "upper bottom")
+
+
+def hyperelastic(decomposition, conditions, *contacts, rtol=1e-10):
+    """Bodies of neo-Hooke in contact, and their energy.
+
+    ``conditions`` makes surfaces from V, each with a component, None for all, and its value.
+    """
+    gdim = decomposition.mesh.geometry.dim
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (gdim,)))
+    u, bcs = fem.Function(V), []
+    for surface, i, value in conditions(V):
+        space = V if i is None else V.sub(i)
+        dofs = fem.locate_dofs_topological(space, gdim - 1, decomposition.facets(surface))
+        own = () if isinstance(value, fem.Function) else (space,)
+        bcs.append(fem.dirichletbc(value, dofs, *own))
+    energy = neo_hooke(u, E, NU) * ufl.dx(**DX)
+    F = ufl.derivative(energy, u, ufl.TestFunction(V))
+    options = {"petsc_options": {"rtol": rtol}}
+    problem = tfeti.NonlinearContactProblem(
+        F, u, bcs, contacts, decomposition, finite=True, **options
+    )
+    return problem, fem.form(energy)
+
+
+def total(comm, form):
+    return comm.allreduce(fem.assemble_scalar(form))
+
+
+def test_a_scene_that_is_turned_has_no_stress(comm):
+    """Two blocks that touch, turned by 90° in steps: strains are rounding, and so are stresses."""
+    decomposition, turned = stacked("triangle", 2, 3, 3), []
+
+    def conditions(V):
+        turned.append(fem.Function(V))
+        return [(side, None, turned[0]) for side in ("lower bottom", "upper top")]
+
+    problem, _ = hyperelastic(decomposition, conditions, tfeti.Contact(*PAIR), rtol=1e-11)
+    (turn,), u = turned, problem.u
+    F = ufl.Identity(2) + ufl.grad(u)
+    strain = F.T * F - ufl.Identity(2)
+    square = fem.form(ufl.inner(strain, strain) * ufl.dx)
+    for angle in np.linspace(0.0, np.pi / 2, 5)[1:]:
+        c, s = np.cos(angle), np.sin(angle)
+        turn.interpolate(
+            lambda x, c=c, s=s: (c * x[0] - s * x[1] - x[0], s * x[0] + c * x[1] - x[1])
+        )
+        problem.solve()
+        problem.accept()
+        assert total(comm, square) < 1e-20
+        error = np.abs(u.x.array - turn.x.array).max(initial=0.0)
+        assert comm.allreduce(error, op=MPI.MAX) < 1e-9
+
+
+def moving(decomposition, *fixed):
+    """Conditions that fix surfaces and move the upper one, and where it is moved to."""
+    way = fem.Constant(decomposition.mesh, (0.0, 0.0))
+    return way, lambda V: [("upper top", None, way), *((s, None, np.zeros(2)) for s in fixed)]
+
+
+def test_forces_balance_and_friction_only_dissipates(comm):
+    """A narrow block pressed into a wide one and drawn to and fro, by Coulomb's law."""
+    decomposition = stacked("triangle", 4, 3, 3, upper=(0.2, 0.8))
+    way, conditions = moving(decomposition, "lower bottom")
+    contact = tfeti.Contact(*PAIR, friction=tfeti.Coulomb(0.1))
+    problem, _ = hyperelastic(decomposition, conditions, contact, rtol=1e-8)
+    lost = 0.0
+    for way.value[:] in ((0.0, -0.1), (0.2, -0.12), (-0.1, -0.1), (-0.1, 0.1)):
+        problem.solve()
+        problem.accept()
+        solution = problem.solution
+        held = [solution.reaction(side) for side in ("lower bottom", "upper top")]
+        below, above = (reaction.force for reaction in held)
+        push = solution.contact(0)
+        # of the secondary side; the other one has its reaction
+        support = below if push.surface == "lower top" else above
+        size = np.linalg.norm(support) if way.value[1] < 0.0 else 1e-5
+        assert np.allclose(below, -above, rtol=0, atol=1e-9 * size)
+        assert np.allclose(push.resultant.force, -support, rtol=0, atol=1e-9 * size)
+        assert abs(held[0].moment[2] + held[1].moment[2]) < 1e-4 * size
+        assert solution.dissipation.min(initial=0.0) >= -1e-12 * E
+        lost += comm.allreduce(float(np.sum(solution.dissipation)))
+    assert lost > 1e-3
+    assert np.linalg.norm(support) < 1e-12
+
+
+def test_moments_balance_about_where_bodies_are(comm):
+    """A block drawn over a plane and turned: forces act at X + u."""
+    parts = [("upper", (0.0, 0.0), (2.0, 1.0), (6, 3))]
+    mesh, tags, names = boxes("triangle", parts, comm)
+    decomposition = tfeti.decompose(mesh, 3, facet_tags=tags, surfaces=names)
+    way, conditions = moving(decomposition)
+    plane = tfeti.Plane((0.0, 0.0), normal=(0.0, 1.0))
+    ground = tfeti.Obstacle("upper bottom", plane, friction=tfeti.Coulomb(0.3))
+    problem, _ = hyperelastic(decomposition, conditions, ground)
+    for way.value[:] in ((0.0, -0.1), (0.3, -0.2)):
+        problem.solve()
+        problem.accept()
+        held, pushed = problem.solution.reaction("upper top"), problem.solution.contact(0).resultant
+        size = np.linalg.norm(pushed.force)
+        assert np.allclose(held.force, -pushed.force, rtol=0, atol=1e-9 * size)
+        assert np.allclose(held.moment, -pushed.moment, rtol=0, atol=1e-9 * size)
+    assert abs(held.moment[2]) > 0.01
+
+
+def rings(comm, n):
+    """Quarter rings 1 to 1.5 and 1.5 to 2 that do not match."""
+    parts = [
+        ("lower", (0.0, 1.0), (np.pi / 2, 1.5), (4 * n, n)),
+        ("upper", (0.0, 1.5), (np.pi / 2, 2.0), (5 * n, n)),
+    ]
+    mesh, tags, names = boxes("quadrilateral", parts, comm)
+    angle, radius = mesh.geometry.x[:, 0].copy(), mesh.geometry.x[:, 1].copy()
+    mesh.geometry.x[:, 0], mesh.geometry.x[:, 1] = radius * np.cos(angle), radius * np.sin(angle)
+    return tfeti.decompose(mesh, 3, facet_tags=tags, surfaces=names)
+
+
+def test_a_curved_patch_is_right_to_h_squared(comm):
+    """Two rings, the inner one widened by 30 %, beside the ordinary differential equation."""
+    radius, errors, widened = pressed_ring(1.0, 2.0, 1.3, E, NU), [], 0.3
+    for n in (2, 4):
+        decomposition = rings(comm, n)
+
+        def conditions(V):
+            way = fem.Function(V)
+            way.interpolate(lambda p: widened * p[:2] / np.hypot(p[0], p[1]))
+            along = [(f"{name} left", 1, 0.0) for name in ("lower", "upper")]
+            across = [(f"{name} right", 0, 0.0) for name in ("lower", "upper")]
+            return [("lower bottom", None, way), *along, *across]
+
+        contact = tfeti.Contact(*PAIR, gap="curved")
+        problem, _ = hyperelastic(decomposition, conditions, contact, rtol=1e-8)
+        problem.solve()
+        x = problem.u.function_space.tabulate_dof_coordinates()[:, :2]
+        u, R = problem.u.x.array.reshape(-1, 2), np.linalg.norm(x, axis=1)
+        exact = (radius(R) / R - 1.0)[:, None] * x
+        errors.append(comm.allreduce(np.abs(u - exact).max(initial=0.0), op=MPI.MAX))
+    assert errors[1] < 0.3 * errors[0] < 0.01
