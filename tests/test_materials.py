@@ -77,9 +77,12 @@ def test_the_tangent_is_the_derivative_of_the_residual(name, model, selective):
         assert np.any(law.p.x.array > 0.0)
     at, h = first + 0.5 * way, 1e-5
     found = tangent(at) @ d
-    if name in ("neo-Hooke", "St. Venant"):  # far from where their moduli are changed
-        at, d = 0.1 * at, d
+    if name != "J2":  # far from where their moduli are changed
+        at *= (0.2 if model == "3d" else 0.5) if given else 0.1
         found = tangent(at) @ d
+        if given:
+            assert np.any(law._new[1] > law.p.x.array)
+            assert not np.any(law._more.x.array)
     expected = (residual(at + h * d) - residual(at - h * d)) / (2.0 * h)
     assert np.abs(found - expected).max() < 1e-7 * np.abs(expected).max()
     K = tangent(at)
@@ -146,6 +149,31 @@ def test_the_tangent_stays_definite_and_the_residual_as_it_is(name, stretch, nu)
     assert least[1][3] > 1e-3
     residual = [fem.assemble_vector(fem.form(form)).array for form in (plain, law.residual(v))]
     assert np.abs(residual[0] - residual[1]).max() < 1e-14
+
+
+def test_the_plastic_tangent_stays_definite_where_stresses_are_beyond_its_moduli():
+    """Dilated, as a step is that turns a body too far: the mean stress is beyond its hardening."""
+    u = body("plane_strain")
+    V = u.function_space
+    elastic = tfeti.Elasticity(V.mesh, E=E, nu=NU, model="plane_strain")
+    law = tfeti.FiniteJ2Plasticity(elastic, u, yield_stress=1e-3, hardening=1e-3)
+    u.interpolate(lambda x: (0.04 * x[0], 0.01 * x[1]))
+    residual = law.residual(ufl.TestFunction(V))
+    K = assembled(rotation_free_tangent(residual, u), u, law)(u.x.array.copy())
+    values = np.linalg.eigvalsh(K)
+    assert np.any(law._more.x.array > 0.0)
+    assert np.all(np.abs(values[:3]) < 1e-12)
+    assert values[3] > 1e-5 * values[-1]
+    before = fem.assemble_vector(fem.form(residual)).array
+    law._more.x.array[:] = 0.0
+    assert np.abs(fem.assemble_vector(fem.form(residual)).array - before).max() < 1e-14
+    K = assembled_now(rotation_free_tangent(residual, u))
+    assert np.linalg.eigvalsh(K)[0] < -1e-4 * values[-1]
+
+
+def assembled_now(form):
+    """The matrix of a form, with functions as they are."""
+    return fem.assemble_matrix(fem.form(form)).to_dense()
 
 
 def test_a_turn_does_not_change_a_finite_law():

@@ -41,6 +41,11 @@ class FiniteJ2Plasticity(Plasticity):
     P and its derivative are numbers at quadrature points. The residual has P + ∂P : (F − F̂), F̂
     that of the last ``update``, beside the volumetric part κ/2 ln²J in UFL.
 
+    A tangent has to be definite on all that stretches, e = sym(δF F⁻¹), and stresses near the
+    moduli, as a trial displacement may have, take e τ e from it. Where it keeps less than a share
+    of the shear modulus it gets 2s e : e more, with the least s for that: the residual has
+    2s sym((F − F̂) F̂⁻¹) beside P, which is 0 at F̂.
+
     ``NonlinearContactProblem(law.residual(v), u, ..., finite=True, state=law.state,
     update=law.update, stress=law.stress)`` takes it.
 
@@ -62,10 +67,13 @@ class FiniteJ2Plasticity(Plasticity):
         self.inverse_plastic.x.array[:] = np.tile(
             [1.0, 1.0, 1.0, 0.0, 0.0, 0.0], len(self.p.x.array)
         )
-        self._mu, self._G = fem.Function(scalar), fem.Function(vector)
+        self._mu, self._kappa, self._more = (fem.Function(scalar) for _ in range(3))
+        self._G = fem.Function(vector)
         self._P, self._dP = fem.Function(vector), fem.Function(self._at.space((m, m)))
         points = interpolation_points(scalar)
         self._mu_of_x = fem.Expression(elasticity.mu, points)
+        self._kappa_of_x = fem.Expression(self._bulk * ufl.as_ufl(1.0), points)
+        self._points = len(points)
         self._G_of_u = fem.Expression(self._gradient(u), points)
         self._new = (np.array(self.inverse_plastic.x.array), np.array(self.p.x.array))
         values = {self.inverse_plastic: lambda: self._new[0], self.p: lambda: self._new[1]}
@@ -79,6 +87,7 @@ class FiniteJ2Plasticity(Plasticity):
         """
         self._G.interpolate(self._G_of_u)
         self._mu.interpolate(self._mu_of_x)
+        self._kappa.interpolate(self._kappa_of_x)
         F = np.zeros((len(self.p.x.array), 3, 3))
         rows, columns = np.array(self._entries).T
         F[:, rows, columns] = self._G.x.array.reshape(len(F), -1)
@@ -91,6 +100,11 @@ class FiniteJ2Plasticity(Plasticity):
             check_return(point.solved, self.hardening)
         P, dP = point.stress(), point.tangent(self._entries)
         P[out] = dP[out] = np.nan
+        dilatation = np.log(np.linalg.det(F))
+        if self._at.selective:  # that of the centre of the cell, nearly
+            cells = dilatation.reshape(-1, self._points)
+            dilatation = np.repeat(cells.mean(axis=1), self._points)
+        self._more.x.array[:] = point.missing(self._kappa.x.array, dilatation)
         self._P.x.array[:] = P[:, rows, columns].ravel()
         self._dP.x.array[:] = dP.ravel()
         self._new = point.end()
@@ -110,10 +124,12 @@ class FiniteJ2Plasticity(Plasticity):
         thickness = self.elasticity.thickness
         F = ufl.Identity(3) + displacement_gradient(self.elasticity, self.u)
         energy = thickness * self._bulk / 2 * ufl.ln(ufl.det(F)) ** 2 * self._at.dx_volume
-        P = self._P + ufl.dot(self._dP, self._gradient(self.u) - self._G)
-        return (
-            ufl.derivative(energy, self.u, v) + thickness * ufl.dot(P, self._gradient(v)) * self.dx
-        )
+        way = self._gradient(self.u) - self._G
+        P = self._P + ufl.dot(self._dP, way)
+        inverse = ufl.inv(ufl.Identity(3) + self._tensor(self._G))
+        rates = [ufl.sym(self._tensor(g) * inverse) for g in (way, self._gradient(v))]
+        points = ufl.dot(P, self._gradient(v)) + 2 * self._more * ufl.inner(*rates)
+        return ufl.derivative(energy, self.u, v) + thickness * points * self.dx
 
     def _gradient(self, w: Any) -> Any:
         """Entries of ∇w that the model has."""
@@ -142,7 +158,7 @@ class _Return:
     def __init__(
         self, F: Array, inverse_plastic: Array, p: Array, mu: Array, hardening: IsotropicHardening
     ) -> None:
-        self.F, self.mu, self.p = F, mu, p
+        self.F, self.mu, self.p, self.hardening = F, mu, p, hardening
         self.F_inverse = np.linalg.inv(F)
         self.M = inverse_plastic @ _transposed(F)
         self.b, self.axes = np.linalg.eigh(F @ self.M)
@@ -154,7 +170,7 @@ class _Return:
         q = np.maximum(q, hardening.tolerances.yielding * hardening.start)
         self.share = 1.0 - 3.0 * mu * self.dp / q
         self.regular = hardening.regularisation * (self.dp > 0.0)
-        self.n, self.q = 1.5 * s / q[:, None], q
+        self.n, self.q, self.s = 1.5 * s / q[:, None], q, s
         self.tau = self._turned_back(np.eye(3) * (self.share[:, None] * s)[:, None, :])
 
     def stress(self) -> Array:
@@ -180,6 +196,26 @@ class _Return:
             dP -= P[:, :, j, None] * self.F_inverse[:, None, :, i]
             found[:, :, k] = dP[:, rows, columns]
         return found
+
+    def missing(self, kappa: Array, dilatation: Array) -> Array:
+        """Return the least s with which the tangent on stretches is definite, shape (n,).
+
+        With e in principal axes it is Σ (∂τ_a/∂ε_b + κ) e_aa e_bb − Σ τ_a e_aa² beside, for a ≠ b,
+        ((τ_a − τ_b)(b_a + b_b)/(b_a − b_b) − (τ_a + τ_b)/2) e_ab², τ with its mean κ ln J.
+
+        Args:
+            kappa: Bulk moduli, shape (n,).
+            dilatation: ln J, shape (n,).
+        """
+        diagonal, shear = self._moduli()
+        tau = self.share[:, None] * self.s + (kappa * dilatation)[:, None]
+        along = diagonal + kappa[:, None, None] - np.eye(3) * tau[:, None, :]
+        across = shear * (self.b[:, :, None] + self.b[:, None, :])
+        across -= 0.5 * (tau[:, :, None] + tau[:, None, :])
+        a, b = np.triu_indices(3, 1)
+        least = np.minimum(np.linalg.eigvalsh(along)[:, 0], across[:, a, b].min(axis=1))
+        wanted = self.hardening.tolerances.definite * self.mu
+        return np.asarray(np.maximum(wanted - least, 0.0) / 2.0)
 
     def _moduli(self) -> tuple[Array, Array]:
         """Return ∂τ_a/∂ε_b and (τ_a − τ_b)/(b_a − b_b) off the diagonal, in principal axes."""

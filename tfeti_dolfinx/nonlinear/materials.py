@@ -36,12 +36,15 @@ class ReturnTolerances:
         max_it: Most Newton steps of the return, which is exact in one where hardening is linear.
         perfect: Share of the elastic moduli that a tangent without hardening gets, so that its
             only kernel are rigid motions; the residual has none of it.
+        definite: Share of the shear modulus that a tangent of finite strain keeps on all that
+            stretches: stresses near the moduli, as a trial displacement may have, take from it.
     """
 
     yielding: float = 1e-10
     rtol: float = 1e-14
     max_it: int = 50
     perfect: float = 1e-4
+    definite: float = 1e-3
 
 
 @dataclass(frozen=True)
