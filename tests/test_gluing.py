@@ -44,7 +44,7 @@ class Scene:
     def rows(self, name):
         """Flags of a named set among all ranks' rows."""
         sets = self.constraints.sets
-        flags = np.zeros(sets.num_rows, dtype=bool)
+        flags = np.zeros(self.constraints.num_rows, dtype=bool)
         flags[getattr(sets, name)] = True
         return np.concatenate(self.d.comm.allgather(flags))
 

@@ -314,7 +314,7 @@ class ContactProblem:
             warnings = self._diagnostics.found(dual, solution, outcome, options.number)
         method = f"{options.qp_type} + {options.pc_type}"
         self._outcome = replace(outcome, warnings=warnings, notes=notes_of(outcome), solver=method)
-        restless = settling.restless(d.body_names)
+        restless = (d.body_names[settling.body], settling.slides)
         conclude(result, accuracy, self.options, d.comm, excluding, restless, warnings)
         return solution, accuracy.tolerances().jump
 

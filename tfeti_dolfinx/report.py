@@ -263,7 +263,7 @@ class Outcome:
             clusters=dual.subdomains.num_clusters,
             kernel_dim=dual.coarse.dimension,
             soft_modes=0 if dual.soft is None else dual.soft.count,
-            free_modes=dual.coarse.num_free_motions,
+            free_modes=dual.coarse.free_motions.count,
             nearly_free=nearly_free,
             excluding_contacts=excluding,
             active_contacts=active,
@@ -469,7 +469,7 @@ def _residuals(
         "penetration": _largest(dual, -gap),
         "tension": _largest(dual, tension),
         "complementarity": _largest(dual, np.abs(solution.force * gap)[closed]),
-        "balance": accuracy.balance,
+        "balance": accuracy.measures.balance,
     }
 
 

@@ -334,7 +334,7 @@ class Gluing:
             slip: Where the load step begins, as the attribute; default that.
 
         Returns:
-            Shape ``(num_rows,)``, for ``Constraints.set_right_side``.
+            Shape ``(num_rows,)``, for ``Constraints.c``.
 
         Raises:
             NoSolutionError: Prescribed components alone violate a condition.
@@ -347,7 +347,7 @@ class Gluing:
         self._check_decided(left[normals.decided])
         along = np.einsum("ntg,ng->nt", records.tangents, held)
         slips = ((self.slip if slip is None else slip) - along)[tangents.condition]
-        c = np.zeros(sets.num_rows)
+        c = np.zeros(self.constraints.num_rows)
         c[sets.equalities[self.held.row]] = self.held.right_side(values)
         c[sets.normals] = left[normals.condition] * normals.scale
         c[sets.tangents] = np.where(tangents.moves, slips * tangents.scale[:, None], 0.0)
@@ -371,7 +371,7 @@ class Gluing:
         Arguments and errors are those of ``right_side``. The constraints are shared with these
         rows: their c is the new one too. What raises leaves it as it was.
         """
-        self.constraints.set_right_side(self.right_side(values, gaps, slip))
+        self.constraints.c[:] = self.right_side(values, gaps, slip)
         flag = self.prescribed.flag
         return replace(
             self,
@@ -395,7 +395,7 @@ class Gluing:
         Where other components are prescribed all rows of equalities are. Collective.
         """
         sets, before = self.constraints.sets, earlier.constraints.sets
-        start = np.zeros(sets.num_rows)
+        start = np.zeros(self.constraints.num_rows)
         flags, flags_before = self.prescribed.flag, earlier.prescribed.flag
         if not any_rank(self.dofs.comm, not np.array_equal(flags, flags_before)):
             start[sets.equalities] = lam[before.equalities]
@@ -477,7 +477,7 @@ def glue(
     slip = np.zeros(records.tangents.shape[:2]) if slip is None else slip
     gluing = Gluing(dofs, prescribed, records, held, contact, tangents, constraints, length, slip)
     try:
-        constraints.set_right_side(gluing.right_side(prescribed.value, records.gap))
+        constraints.c[:] = gluing.right_side(prescribed.value, records.gap)
     except TfetiError:  # on all ranks
         constraints.destroy()
         raise

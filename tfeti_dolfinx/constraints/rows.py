@@ -99,11 +99,6 @@ class RowSets:
         normals, tangents = comm.allreduce(np.array([self.normals.size, self.tangents.size]))
         return int(normals), int(tangents)
 
-    @property
-    def num_rows(self) -> int:
-        """All local rows."""
-        return self.equalities.size + self.normals.size + self.tangents.size
-
 
 # --- Scaling D of rows ------------------------------------------------------------------------
 
@@ -166,7 +161,7 @@ class Constraints:
     @property
     def num_rows(self) -> int:
         """All local rows."""
-        return self.sets.num_rows
+        return len(self.c)
 
     def jumps(self, v: Array) -> Array:
         """B v on this rank's rows, of displacements on this rank's trace. Collective."""
@@ -181,10 +176,6 @@ class Constraints:
         rows.array[:] = lam
         self.B.multTranspose(rows, trace)
         return _taken(trace, rows)
-
-    def set_right_side(self, c: Array) -> None:
-        """Fill c anew, with this rank's part of it, shape ``(num_rows,)``. B stays."""
-        self.c[:] = c
 
     @property
     def pressed(self) -> Array:

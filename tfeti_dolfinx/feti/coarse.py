@@ -113,14 +113,9 @@ class CoarseSpace(Coarse):
         self.e = self._load()
         self.bodies.update_load()
 
-    @property
-    def num_free_motions(self) -> int:
-        """Number of motions that no row resists."""
-        return self.free_motions.count
-
-    def local_alpha(self, alpha: Array) -> Array:
-        """Return kernel coordinates of this rank's Blocks that belong to an r-vector."""
-        return self._basis.kernel(alpha)[self._own]
+    def kernel_motion(self, alpha: Array) -> Array:
+        """R T α of an r-vector on all unknowns of this rank, shape ``(n,)``."""
+        return self.subdomains.kernel_motion(self._basis.kernel(alpha)[self._own])
 
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
         """(G_f G_fᵀ + damping·GGᵀ)⁻¹y, f a face of the rows."""

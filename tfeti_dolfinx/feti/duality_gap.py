@@ -12,7 +12,6 @@ from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.recovery import (
     elastic_displacement,
     min_norm_correction,
-    moved,
 )
 from tfeti_dolfinx.qp.coarse import HELD, imbalance
 from tfeti_dolfinx.qp.projection import project_onto_feasible
@@ -137,6 +136,6 @@ def _balanced(
     change = elastic_displacement(constraints, subdomains, found.lam - lam, zero)
     if coarse.dimension:
         rows = constraints.jumps(change[subdomains.trace])
-        change = moved(change, coarse, -coarse.solve(coarse.G(rows)))
+        change = change - coarse.kernel_motion(coarse.solve(coarse.G(rows)))
     energy = summed(coarse.comm, np.array([sum(subdomains.energies(change))]))[0]
     return found.lam, u + change, float(np.sqrt(max(energy, 0.0)))

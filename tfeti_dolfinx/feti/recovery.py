@@ -71,10 +71,10 @@ def recover(
             left = np.where(held, residual - coarse.Gt @ alpha, 0.0)
             on_held = face_of(held, face.status)
             alpha = alpha + coarse.damped_solve(on_held, coarse.G(left), damping)
-        u = moved(u, coarse, alpha)
+        u = u + coarse.kernel_motion(alpha)
     gap = residual - coarse.Gt @ alpha
     if (N := coarse.free_basis).shape[1]:  # gaps do not change
-        u = moved(u, coarse, coarse.motions @ (N @ -(N.T @ coarse.bodies.part_of(u))))
+        u = u - coarse.kernel_motion(coarse.motions @ (N @ (N.T @ coarse.bodies.part_of(u))))
     # what sticks holds, pushed or not, and so do all rows of friction that carry a force
     active = np.zeros(len(lam), dtype=bool)
     active[coarse.bounded] = (np.abs(lam) > no_effect * error)[coarse.bounded]
@@ -88,11 +88,6 @@ def elastic_displacement(
 ) -> Array:
     """K⁺(f − Bᵀλ), this rank's part, shape ``(n,)``, from K⁺f and λ. Collective."""
     return response - subdomains.solve(subdomains.extended(constraints.forces(lam)))
-
-
-def moved(u: Array, coarse: CoarseSpace, alpha: Array) -> Array:
-    """u + Rα."""
-    return u + coarse.subdomains.kernel_motion(coarse.local_alpha(alpha))
 
 
 # --- Minimum-norm correction of constraint residuals ------------------------------------------

@@ -258,9 +258,12 @@ class Accuracy(StoppingRule):
         norm: ‖F‖, or an estimate.
         recovered: The displacement of the last look.
         looks: How many looks there were.
+        measures: What the last look has seen.
         goal: An error beside which the algebraic one has to be small, too, or None.
         reached: What looks have seen of that.
     """
+
+    measures: Measures
 
     def __init__(
         self,
@@ -279,7 +282,6 @@ class Accuracy(StoppingRule):
         self._small = 0.01 * max(rtol * reference, self._rounding)
         self.looks, self._stalls, self._claimed = 0, 0, 1.0
         self.recovered: Recovered | None = None
-        self._measures: Measures | None = None
         self._before: Measures | None = None
         # of a look, and an estimate of ‖F‖
         self._allowed: tuple[int, float, Tolerances] | None = None
@@ -296,7 +298,7 @@ class Accuracy(StoppingRule):
     def examine(self, lam: Array, gradient: Array, face: Face, residual: float) -> ConvergedReason:
         """Assess an iterate, and return why to stop, or ITERATING. Collective."""
         self.look(lam, gradient, face, residual)
-        given, now, before = self._limits, self._seen, self._before
+        given, now, before = self._limits, self.measures, self._before
         # 1. errors over their tolerances; forces of a body that falls far may be known better
         # than the rounding of its fall allows
         stalled = False
@@ -307,7 +309,7 @@ class Accuracy(StoppingRule):
             self._dual.coarse.comm,
             self.ratio(),
             self.ratio(changes=False),
-            self._seen.longest,
+            self.measures.longest,
             now.error / max(given.energy * self.rtol * now.energy, TINY),
             self._over_goal(),
             float(stalled),
@@ -339,7 +341,8 @@ class Accuracy(StoppingRule):
             self._dual.constraints, self._dual.coarse, lam, gradient, face, residual / self.norm
         )
         now = measure(self._dual, state, face, self.norm, before)
-        self._before, self.recovered, self._measures = self._measures, state, now
+        self._before = self.measures if self.looks else None
+        self.recovered, self.measures = state, now
         self.looks += 1
         if self.goal is not None:
             bound, goal = energy_bound(self._dual, lam, state.u, self.norm), self.goal(state.u)
@@ -358,7 +361,7 @@ class Accuracy(StoppingRule):
         self._least = self.errors()
         self.look(lam, gradient, face, residual)
         self._before = None
-        ratio, longest = steering(self._dual.coarse.comm, self.ratio(), self._seen.longest)
+        ratio, longest = steering(self._dual.coarse.comm, self.ratio(), self.measures.longest)
         return bool(ratio <= 1.0 or longest <= self._atol)
 
     def accept_rounding(self) -> None:
@@ -371,7 +374,7 @@ class Accuracy(StoppingRule):
         Args:
             changes: Whether what has changed since the look before it counts.
         """
-        now, before = self._seen, self._before if changes else None
+        now, before = self.measures, self._before if changes else None
         energy = np.sqrt(np.maximum(now.energies, 0.0))
         # where all is rounding, energy does not say how far anything moves
         noise = self._limits.noise * now.size.max(initial=0.0) + self._at_rest()
@@ -384,7 +387,7 @@ class Accuracy(StoppingRule):
 
     def tolerances(self) -> Tolerances:
         """Return the tolerances that the last assessment is compared with."""
-        now, given = self._seen, self._limits
+        now, given = self.measures, self._limits
         if self._allowed is not None and self._allowed[:2] == (self.looks, self.norm):
             return self._allowed[2]
         at_rest = self._at_rest()
@@ -411,7 +414,7 @@ class Accuracy(StoppingRule):
 
     def ratio(self, changes: bool = True) -> float:
         """Return the largest ratio of errors (``errors``) to their tolerances; right if ≤ 1."""
-        now, allowed = self._seen, self.tolerances()
+        now, allowed = self.measures, self.tolerances()
         errors = np.append(self.errors(changes), (now.penetration, now.balance, now.error))
         limits = np.append(allowed.displacement, (allowed.jump, allowed.balance, allowed.energy))
         return max(float(np.max(errors / np.maximum(limits, TINY))), self._over_goal())
@@ -426,14 +429,9 @@ class Accuracy(StoppingRule):
 
         Where ‖u‖_K is rounding of a rigid motion, over what rounding may leave of it.
         """
-        now, allowed = self._seen, self.tolerances().energy
+        now, allowed = self.measures, self.tolerances().energy
         size = max(now.energy, allowed, TINY)
         return now.error / size, allowed / size
-
-    @property
-    def balance(self) -> float:
-        """Largest force left on a kernel mode at the last look."""
-        return self._seen.balance
 
     @property
     def u(self) -> Array:
@@ -441,15 +439,9 @@ class Accuracy(StoppingRule):
         assert self.recovered is not None, "nothing has been measured yet"
         return self.recovered.u
 
-    @property
-    def _seen(self) -> Measures:
-        """Measures of the last look."""
-        assert self._measures is not None, "nothing has been measured yet"
-        return self._measures
-
     def _at_rest(self) -> Array:
         """The size of displacements that are rounding of 0, of bodies without a load, else 0."""
-        now = self._seen
+        now = self.measures
         small = self._limits.load_noise * now.gap
         return np.where((now.alone == 0.0) & (now.size <= small), small, 0.0)
 

@@ -116,11 +116,6 @@ class LawPoint:
     s: Array
     mu: Array
 
-    def towards(self, other: LawPoint, length: float) -> LawPoint:
-        """Return the point at this share of the way to another one."""
-        ends = (self.lam, other.lam), (self.s, other.s), (self.mu, other.mu)
-        return LawPoint(*((1.0 - length) * a + length * b for a, b in ends))
-
 
 @dataclass(frozen=True)
 class LawProgram:
@@ -146,10 +141,6 @@ class LawProgram:
         """Return it with this share of all coefficients; 0 is contact without friction."""
         return replace(self, law=replace(self.law, share=share))
 
-    def nearest(self, at: LawPoint) -> tuple[FeasibleSet, Array]:
-        """Ω(y_N⁺) and P(y)."""
-        return self.law.nearest(at.lam - at.s / self.norm)
-
     def missed(self, p: Array, lam: Array) -> float:
         """‖F‖ √(‖λ − p‖² + ‖Gᵀ(GGᵀ)⁻¹(e − Gλ)‖²), the same on all ranks."""
         coarse = self.qp.coarse
@@ -158,7 +149,7 @@ class LawProgram:
 
     def residual(self, at: LawPoint) -> float:
         """‖F‖ times what λ misses of the law and of Gλ = e, the same on all ranks."""
-        return self.missed(self.nearest(at)[1], at.lam)
+        return self.missed(self.law.nearest(at.lam - at.s / self.norm)[1], at.lam)
 
 
 # --- Newton's method --------------------------------------------------------------------------
@@ -183,7 +174,7 @@ def newton_on_law(
     best, idle, past = np.inf, 0, list[float]()
     for step in range(parameters.max_steps):
         # Step 1: the natural map: what a gradient step, brought back, moves, and what Gλ lacks
-        feasible, p = program.nearest(at)
+        feasible, p = program.law.nearest(at.lam - at.s / program.norm)
         residual = program.missed(p, at.lam)
         if residual <= target:
             return at, step
@@ -211,7 +202,8 @@ def newton_on_law(
             if part <= parameters.shortest:
                 there = end
                 break
-            there = at.towards(end, part)
+            ends = (at.lam, end.lam), (at.s, end.s), (at.mu, end.mu)
+            there = LawPoint(*((1.0 - part) * a + part * b for a, b in ends))
         at = there
     return None, parameters.max_steps
 

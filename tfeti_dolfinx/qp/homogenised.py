@@ -38,23 +38,23 @@ def operator_product(F: Operator, comm: MPI.Intracomm, x: Array) -> OperatorProd
 
 
 class LastProduct:
-    """Last solution x of a program, with the product Fx."""
+    """Last solution x of a program, with the product Fx.
+
+    Attributes:
+        looked: A point of the program with Fx − d, as an assessment computes it.
+    """
 
     def __init__(self) -> None:
         nothing: Array = np.zeros(0)
         self._x, self._Fx, self._d, self._e = nothing, nothing, nothing, nothing
-        self._looked, self._within = (nothing, nothing), 0.0
-
-    def look(self, x: Array, g: Array) -> None:
-        """Store a point of the program with Fx − d, as an assessment computes it."""
-        self._looked = (x, g)
+        self.looked, self._within = (nothing, nothing), 0.0
 
     def keep(self, result: QPResult, qp: QP) -> None:
         """Store a solution with its gradient Fx − d − Gᵀμ, or that of an assessment. Collective.
 
         So what steps leave out of the gradient does not grow from solve to solve.
         """
-        (x, g), self._x, self._within = self._looked, result.lam, 0.0
+        (x, g), self._x, self._within = self.looked, result.lam, 0.0
         other = any_rank(qp.comm, not np.array_equal(x, self._x))
         self._Fx = (result.gradient + qp.coarse.combined(result.mu) if other else g) + qp.d
         self._d, self._e = qp.d, np.array(qp.coarse.e)

@@ -45,8 +45,8 @@ class MprgpIterate:
     Attributes:
         phi: Free gradient φ.
         beta: Chopped gradient β.
-        free_squared: ‖φ‖².
         chopped_squared: ‖β‖².
+        projected_gradient: ‖g^P‖ = ‖φ + β‖.
     """
 
     def __init__(
@@ -59,12 +59,7 @@ class MprgpIterate:
         """Find φ and β at x. Collective."""
         self.phi, self.beta = self.feasible.split(self.x, self.g)
         squares = dot_over(self.comm, (self.phi, self.phi), (self.beta, self.beta))
-        self.free_squared, self.chopped_squared = squares
-
-    @property
-    def projected_gradient(self) -> float:
-        """‖g^P‖ = ‖φ + β‖."""
-        return float((self.free_squared + self.chopped_squared) ** 0.5)
+        self.chopped_squared, self.projected_gradient = squares[1], sum(squares) ** 0.5
 
     def is_proportional(self, parameters: MprgpParameters) -> bool:
         """Return whether ‖β‖² ≤ Γ² φ̃ᵀφ, φ̃ = (x − P_Ω(x − ᾱφ))/ᾱ. Collective."""

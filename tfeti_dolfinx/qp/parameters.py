@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from tfeti_dolfinx.common.validation import ABOVE_0, Range, described
-from tfeti_dolfinx.qp.mprgp import MprgpParameters
 
 
 @dataclass(frozen=True)
@@ -114,7 +113,3 @@ class SmalseParameters:
     rounding: float = 1e-14
     change: float = 1e-3
     patience: int = 1000
-
-    def inner(self, norm: float) -> MprgpParameters:
-        """Parameters of MPRGP for an operator F of this norm."""
-        return MprgpParameters(self.alpha_bar / (max(norm, self.rho * norm) or 1.0), self.gamma)

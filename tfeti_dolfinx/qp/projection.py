@@ -146,18 +146,14 @@ class WithinFace:
 
 @dataclass(frozen=True)
 class _Trial:
-    """λ(α) = P_Ω(z), e − Gλ(α) and the cost there."""
+    """λ(α) = P_Ω(z), e − Gλ(α), the cost there and ‖e − Gλ‖."""
 
     alpha: Array
     z: Array
     lam: Array
     residual: Array
     cost: float
-
-    @property
-    def left(self) -> float:
-        """‖e − Gλ‖."""
-        return float(np.linalg.norm(self.residual))
+    left: float
 
 
 def _trial(coarse: Coarse, feasible: FeasibleSet | WithinFace, y: Array, alpha: Array) -> _Trial:
@@ -165,7 +161,8 @@ def _trial(coarse: Coarse, feasible: FeasibleSet | WithinFace, y: Array, alpha: 
     lam = feasible.project(z)
     own = float(z @ lam) - 0.5 * float(lam @ lam)
     cost = coarse.comm.allreduce(own, op=MPI.SUM) - float(alpha @ coarse.e)
-    return _Trial(alpha, z, lam, coarse.residual(lam), cost)
+    residual = coarse.residual(lam)
+    return _Trial(alpha, z, lam, residual, cost, float(np.linalg.norm(residual)))
 
 
 def _searched(

@@ -7,7 +7,7 @@ import numpy as np
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import norm_over
 from tfeti_dolfinx.qp.homogenised import Homogenised, operator_product
-from tfeti_dolfinx.qp.mprgp import MprgpIterate, mprgp
+from tfeti_dolfinx.qp.mprgp import MprgpIterate, MprgpParameters, mprgp
 from tfeti_dolfinx.qp.parameters import SmalseParameters
 from tfeti_dolfinx.qp.problem import (
     QP,
@@ -127,7 +127,8 @@ def smalse(
     lam = qp.feasible.project(lam_bar if start is None else start.lam)
     x = lam - lam_bar
     g = operator_product(A, qp.comm, x).Fx - b + y
-    state, inner = MprgpIterate(A, lam, g, qp.feasible, qp.comm), parameters.inner(norm)
+    state = MprgpIterate(A, lam, g, qp.feasible, qp.comm)
+    inner = MprgpParameters(parameters.alpha_bar / (max(norm, rho) or 1.0), parameters.gamma)
     reason = ConvergedReason.ITERATING
     while reason == ConvergedReason.ITERATING:
         # Step 1: x with ‖g^P(x, μ)‖ ≤ min(M‖Bx‖, η)

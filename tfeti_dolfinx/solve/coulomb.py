@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -99,10 +98,6 @@ class FixedPointStatus:
     body: int = -1
     newton_steps: int = 0
     slides: bool = False
-
-    def restless(self, names: Sequence[str]) -> tuple[str, bool]:
-        """Return the name of the body whose bounds changed most, and whether it slides."""
-        return names[self.body], self.slides
 
 
 def solve_with_friction(

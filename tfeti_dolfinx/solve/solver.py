@@ -145,7 +145,7 @@ def solve_dual(
     )
     dual.saw(result.norm)
     if (state := rule.recovered) is not None:
-        dual.last.look(state.lam, state.residual)
+        dual.last.looked = state.lam, state.residual
     if dual.coarse.dimension == 0 or qp_type == "newton":
         dual.last.keep(result, qp)
     if result.reason <= 0:

@@ -151,12 +151,12 @@ class Predictor:
         before, primal = np.array(constraints.c), dofs.to_primal(w)
         total = dofs.reduce(primal.reshape(-1, dofs.bs), np.add, 0.0)
         held = total / dofs.multiplicity[:, None]
-        constraints.set_right_side(gluing.with_supports_at(held))
+        constraints.c[:] = gluing.with_supports_at(held)
         try:
             self._make(M, M @ w, gluing)
             return dofs.to_dolfinx(self._solve(gluing))
         finally:
-            constraints.set_right_side(before)
+            constraints.c[:] = before
 
     def _make(self, M: csr_array, f: Array, gluing: Gluing) -> None:
         """Make what is out of date."""
