@@ -1,9 +1,11 @@
-"""Global reductions of a step of conjugate gradients, counted."""
+"""Global reductions of a step of conjugate gradients, and pickled messages, counted."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 from scenes import curved_obstacle, decomposed, problem
 from test_solvable_lp import dual_of
 
@@ -12,6 +14,7 @@ from tfeti_dolfinx.qp.homogenised import homogenise
 from tfeti_dolfinx.qp.krylov import pcpg
 from tfeti_dolfinx.qp.problem import ConvergedReason, Point, Steps, StoppingRule
 from tfeti_dolfinx.qp.sets import Status, face_of
+from tfeti_dolfinx.solve.coulomb import solve_with_friction
 
 COLLECTIVE = ("allreduce", "Allreduce", "reduce", "Reduce", "bcast", "Bcast", "allgather", "gather")
 
@@ -65,3 +68,45 @@ def test_a_step_of_pcpg_makes_three_reductions(dual, on_face, preconditioned):
         qp = replace(qp, coarse=qp.coarse.on_face(face))
     qp = replace(qp, preconditioner=preconditioner if preconditioned else None)
     assert count(qp, 7) - count(qp, 2) == 5 * 3
+
+
+@pytest.fixture
+def pickled(monkeypatch):
+    """What is sent pickled while a solver runs, as lower-case calls of mpi4py do."""
+    found, runs = [], [False]
+
+    def dumps(item, *protocol):
+        if runs[0]:
+            found.append(item)
+        return pickle.dumps(item, *protocol)
+
+    def watched(*arguments, **keywords):
+        runs[0] = True
+        try:
+            return solve_with_friction(*arguments, **keywords)
+        finally:
+            runs[0] = False
+
+    monkeypatch.setattr("tfeti_dolfinx.problem.solve_with_friction", watched)
+    MPI.pickle.__init__(dumps, pickle.loads)
+    yield found
+    MPI.pickle.__init__(pickle.dumps, pickle.loads)
+
+
+@pytest.mark.parametrize("friction", [None, tfeti.Tresca(0.01), tfeti.Coulomb(0.3)])
+@pytest.mark.parametrize("qp_type", ["newton", "smalse"])
+def test_solvers_send_no_pickled_messages(pickled, qp_type, friction):
+    """Starts, looks and Newton's method on Coulomb's law are counted, too."""
+    pressed = tfeti.Obstacle("bottom", curved_obstacle(2), friction=friction)
+    p = problem(decomposed("quadrilateral", 6, 4), contacts=[pressed], qp_type=qp_type)
+    p.solve()
+    assert p.report.F_multiplications > 5
+    assert pickled == []
+
+
+def test_pickled_messages_are_seen(pickled):
+    """A monitor that sends a number, in each step."""
+    seen = tfeti.Extensions(monitor=lambda *_: MPI.COMM_WORLD.allreduce(1))
+    p = problem(decomposed("quadrilateral", 6, 4), extensions=seen)
+    p.solve()
+    assert len(pickled) > 5

@@ -6,6 +6,7 @@ import pickle
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import numpy as np
 from mpi4py import MPI
 
 
@@ -55,9 +56,10 @@ def raised_on_all_ranks(comm: MPI.Intracomm) -> Iterator[None]:
         yield
     except Exception as caught:
         error = caught
-    raiser = comm.allreduce(comm.size if error is None else comm.rank, op=MPI.MIN)
-    if raiser < comm.size:
-        raise_together(comm, error, raiser)
+    raiser = np.array([comm.size if error is None else comm.rank])
+    comm.Allreduce(MPI.IN_PLACE, raiser, op=MPI.MIN)
+    if raiser[0] < comm.size:
+        raise_together(comm, error, int(raiser[0]))
 
 
 def raise_together(comm: MPI.Intracomm, error: Exception | None, raiser: int) -> None:

@@ -59,7 +59,27 @@ def norm_over(comm: MPI.Intracomm, x: Array) -> float:
 
 def largest(comm: MPI.Intracomm, x: Array) -> float:
     """Largest modulus of a vector that is spread over ranks, 0 if it is empty. Collective."""
-    return float(comm.allreduce(float(np.abs(x).max(initial=0.0)), op=MPI.MAX))
+    found = np.array([np.abs(x).max(initial=0.0)], dtype=float)
+    comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
+    return float(found[0])
+
+
+def least(comm: MPI.Intracomm, value: float) -> float:
+    """Return the least of all ranks' values. Collective."""
+    found = np.array([value], dtype=float)
+    comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MIN)
+    return float(found[0])
+
+
+def joined_over(comm: MPI.Intracomm, own: Array) -> Array:
+    """Return the arrays of all ranks, one after the other. Collective."""
+    if comm.size == 1:
+        return own
+    sizes = np.empty(comm.size, dtype=np.int64)
+    comm.Allgather(np.array([len(own)]), sizes)
+    whole = np.empty(int(sizes.sum()), dtype=own.dtype)
+    comm.Allgatherv(np.ascontiguousarray(own), [whole, sizes.tolist()])
+    return whole
 
 
 class Exchange:

@@ -9,7 +9,7 @@ from petsc4py import PETSc
 from scipy.sparse import csr_array, diags_array, hstack
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, chunk_offsets
+from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, chunk_offsets, joined_over
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.projectors import (
     FaceFactors,
@@ -105,7 +105,7 @@ class CoarseSpace(Coarse):
     def _load(self) -> Array:
         if not self.dimension:
             return np.zeros(0)
-        e = np.concatenate(self.comm.allgather(self.subdomains.kernel_load))
+        e = joined_over(self.comm, self.subdomains.kernel_load)
         return self._basis.products(e)
 
     def update_load(self) -> None:

@@ -6,13 +6,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import bcast_from_root, largest
+from tfeti_dolfinx.common.parallel import bcast_from_root, joined_over, largest
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.coarse import side_by_side
@@ -353,14 +352,3 @@ class ContactFactor:
     def destroy(self) -> None:
         """Free the factor."""
         self._factor.destroy()
-
-
-def joined_over(comm: MPI.Intracomm, own: Array) -> Array:
-    """Return the arrays of all ranks, one after the other. Collective."""
-    if comm.size == 1:
-        return own
-    sizes = np.empty(comm.size, dtype=np.int64)
-    comm.Allgather(np.array([len(own)]), sizes)
-    whole = np.empty(int(sizes.sum()), dtype=own.dtype)
-    comm.Allgatherv(np.ascontiguousarray(own), [whole, sizes.tolist()])
-    return whole

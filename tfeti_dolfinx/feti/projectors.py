@@ -11,7 +11,7 @@ from scipy.sparse import coo_array, csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
 
 from tfeti_dolfinx.common.arrays import TINY, Array
-from tfeti_dolfinx.common.parallel import any_rank, summed
+from tfeti_dolfinx.common.parallel import any_rank, joined_over, summed
 from tfeti_dolfinx.errors import FactorError, raised_on_all_ranks
 from tfeti_dolfinx.feti.rigid_bodies import independent, parts_of_columns
 from tfeti_dolfinx.qp.sets import Face, Status
@@ -37,7 +37,7 @@ class Grams:
         # 1. the entries that contact rows reach, on all ranks, and those of the whole
         parts = [(rows, G, _pairs(columns, size)) for rows, columns, G in _blocks(Gt, bounded)]
         own = np.unique(np.concatenate([np.empty(0, np.int64), *(pairs for *_, pairs in parts)]))
-        reached = np.unique(np.concatenate(comm.allgather(own)))
+        reached = np.unique(joined_over(comm, own))
         known = base.coords[0].astype(np.int64) * size + base.coords[1]
         entries = np.union1d(known, reached)
         row, column = np.divmod(entries, max(size, 1))
@@ -100,8 +100,8 @@ def replicated_gram(Gt: csr_array, comm: MPI.Intracomm) -> csr_array:
 def replicated(part: csr_array, comm: MPI.Intracomm) -> csr_array:
     """Return the sum of all ranks' sparse matrices, on all ranks. Collective."""
     local = part.tocoo()
-    row, column = (np.concatenate(comm.allgather(index)) for index in local.coords)
-    value = np.concatenate(comm.allgather(local.data))
+    row, column = (joined_over(comm, index.astype(np.int64)) for index in local.coords)
+    value = joined_over(comm, local.data)
     return coo_array((value, (row, column)), shape=part.shape).tocsr()
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.parallel import any_rank, summed
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.feti.coarse import CoarseSpace
 from tfeti_dolfinx.qp.sets import Face, face_of
@@ -67,7 +68,7 @@ def recover(
     if coarse.dimension:
         held = face.holding
         alpha = coarse.solve(coarse.G(residual - np.where(held, 0.0, gradient)))
-        if coarse.comm.allreduce(int(np.sum(~held))):
+        if any_rank(coarse.comm, not np.all(held)):
             left = np.where(held, residual - coarse.Gt @ alpha, 0.0)
             on_held = face_of(held, face.status)
             alpha = alpha + coarse.damped_solve(on_held, coarse.G(left), damping)
@@ -126,7 +127,7 @@ def min_norm_correction(
     root = np.sqrt(D[elastic])
 
     def square(a: Array) -> float:
-        return float(comm.allreduce(float(a @ a)))
+        return float(summed(comm, np.array([a @ a]))[0])
 
     def in_D(s: Array) -> float:  # ‖s‖²_D, of what does not move rigid bodies
         return square(root * s[elastic])

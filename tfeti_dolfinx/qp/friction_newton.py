@@ -11,7 +11,7 @@ from mpi4py import MPI
 from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import bcast_from_root, norm_over, steering, summed
+from tfeti_dolfinx.common.parallel import norm_over, steering, summed
 from tfeti_dolfinx.errors import FactorError
 from tfeti_dolfinx.qp.coarse import HELD
 from tfeti_dolfinx.qp.problem import QP
@@ -327,10 +327,10 @@ def _solved_on_face(
         _, new, images = basis[:, known:]
         ways = on.followed(new.T)
         # where a face holds a motion by nothing but rounding they do not keep Gλ = e
-        kept = np.ones(len(new), dtype=bool)
+        kept: Array = np.ones(len(new), dtype=bool)
         if qp.coarse.dimension:
             missed, terms = np.abs(qp.coarse.G(ways)), qp.coarse.terms(ways)
-            kept = bcast_from_root(comm, np.all(missed <= HELD * terms.max(axis=0), axis=0))
+            kept = steering(comm, *np.all(missed <= HELD * terms.max(axis=0), axis=0)) > 0.0
         for way, image in zip(ways.T[kept], images[kept], strict=True):
             qp.recycled.keep(way, image)
     mu = oblique.coordinates(s + on.face.bend(u))

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import bcast_from_root, dot_over, norm_over, summed
+from tfeti_dolfinx.common.parallel import bcast_from_root, dot_over, largest, norm_over, summed
 from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.problem import (
@@ -112,7 +111,7 @@ class Directions:
     def __init__(self, qp: QP) -> None:
         self.r, self.p = np.zeros(len(qp.d)), np.zeros(len(qp.d))
         self.fresh, self.norm, self.helped = True, 0.0, 0.0
-        rows = qp.comm.allreduce(len(qp.d), op=MPI.MAX)
+        rows = int(largest(qp.comm, np.array([len(qp.d)])))
         most = max(DEFAULT.numbers // (2 * max(rows, 1)), 1) if qp.keeps else 1
         self.kept = DirectionStore(most, len(qp.d))
 
@@ -192,7 +191,7 @@ def pcpg(
     recycled, (past, norm) = qp.recycled, _begun(qp, point, own)
     new = list[tuple[Array, Array, float]]()  # the past stays as it is during a solve
     least = DEFAULT.short**2 * qp.dot((point.lam, point.lam))[0]
-    progress = Progress(norm, comm.allreduce(len(qp.d)))
+    progress = Progress(norm, int(summed(comm, np.array([len(qp.d)]))[0]))
     while True:
         # test
         small = norm <= rule.tolerance

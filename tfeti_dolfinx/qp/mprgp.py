@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import dot_over
+from tfeti_dolfinx.common.parallel import dot_over, least, summed
 from tfeti_dolfinx.qp.problem import ConvergedReason, Monitor, Operator, Steps, no_monitor
 from tfeti_dolfinx.qp.sets import FeasibleSet, Status
 
@@ -67,12 +67,13 @@ class MprgpIterate:
         trial = x - alpha * phi
         projected = self.feasible.project(trial)
         own = float(np.where(projected == trial, phi, (x - projected) / alpha) @ phi)
-        return bool(self.chopped_squared <= parameters.gamma**2 * self.comm.allreduce(own))
+        (square,) = summed(self.comm, np.array([own]))
+        return bool(self.chopped_squared <= parameters.gamma**2 * square)
 
     def max_step(self, p: Array, x: Array | None = None) -> float:
         """Return the largest α with x − α p ∈ Ω. Collective."""
         own = self.feasible.max_step(self.x if x is None else x, p)
-        return float(self.comm.allreduce(own, op=MPI.MIN))
+        return least(self.comm, own)
 
     def move(self, alpha: float, p: Array, Ap: Array) -> None:
         """x ← x − α p and the gradient with it."""

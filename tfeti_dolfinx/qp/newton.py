@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import any_rank, norm_over
+from tfeti_dolfinx.common.parallel import any_rank, norm_over, summed
 from tfeti_dolfinx.qp.coarse import HELD, imbalance
 from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.newton_faces import FaceSolver
@@ -85,7 +85,7 @@ def _on_foundation(qp: QP, least: FeasiblePoint) -> Array:
         lam = project_onto_feasible(qp.coarse, qp.feasible, qp.foundation(count)).lam
         touching = qp.feasible.face(lam, -lam).status == Status.TOUCHING
         before = count
-        count = max(int(qp.comm.allreduce(int(np.sum(touching & (lam != 0.0))))), 1)
+        count = max(int(summed(qp.comm, np.array([np.sum(touching & (lam != 0.0))]))[0]), 1)
         if abs(count - before) <= FOUNDATION.alike * before:
             break
     return lam

@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import TINY, Array
-from tfeti_dolfinx.common.parallel import any_rank, largest, norm_over
+from tfeti_dolfinx.common.parallel import any_rank, largest, least, norm_over
 from tfeti_dolfinx.qp.coarse import HELD, imbalance
 from tfeti_dolfinx.qp.krylov import Directions, pcpg
 from tfeti_dolfinx.qp.parameters import NewtonParameters
@@ -150,7 +149,7 @@ class FaceSolver:
         qp, held = self._qp, without_slip(self._face, way)
         small = self._parameters.rounding * largest(qp.comm, way)
         own = qp.feasible.max_step(lam, -np.where(np.abs(held) > small, held, 0.0))
-        return float(qp.comm.allreduce(max(own, 0.0), op=MPI.MIN))
+        return least(qp.comm, max(own, 0.0))
 
     def _along_null_space(self, z: Point) -> Point:
         """Go beyond a bound along a direction without curvature, where PCPG has found one.

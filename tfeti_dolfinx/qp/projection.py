@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import bcast_from_root
+from tfeti_dolfinx.common.parallel import bcast_from_root, summed
 from tfeti_dolfinx.qp.coarse import Coarse, imbalance
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
 
@@ -160,9 +159,9 @@ def _trial(coarse: Coarse, feasible: FeasibleSet | WithinFace, y: Array, alpha: 
     z = y + coarse.combined(alpha)
     lam = feasible.project(z)
     own = float(z @ lam) - 0.5 * float(lam @ lam)
-    cost = coarse.comm.allreduce(own, op=MPI.SUM) - float(alpha @ coarse.e)
-    residual = coarse.residual(lam)
-    return _Trial(alpha, z, lam, residual, cost, float(np.linalg.norm(residual)))
+    (cost,), residual = summed(coarse.comm, np.array([own])), coarse.residual(lam)
+    length = float(np.linalg.norm(residual))
+    return _Trial(alpha, z, lam, residual, float(cost - alpha @ coarse.e), length)
 
 
 def _searched(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -176,11 +177,24 @@ class RecycledOnFace:
 
 
 def triangle(comm: MPI.Intracomm, A: Array) -> Array:
-    """R of A = QR, the rows of A spread over ranks; the same on all of them. Collective."""
+    """R of A = QR, the rows of A spread over ranks; the same on all of them. Collective.
 
-    def of(rows: Array) -> Array:
-        return np.asarray(np.linalg.qr(rows, mode="r"))
+    Triangles of two ranks are made one after the other, in one reduction. Shape ``(k, k)`` for k
+    columns.
+    """
+    k = A.shape[1]
+    own, R = np.zeros((k, k)), np.linalg.qr(A, mode="r")
+    own[: len(R)] = R
+    if k == 0 or comm.size == 1:
+        return own
 
-    return bcast_from_root(
-        comm, comm.allreduce(of(A), op=lambda one, other: of(np.vstack((one, other))))
-    )
+    def of_both(given: Any, found: Any, _: MPI.Datatype) -> None:
+        one, other = (np.frombuffer(part, dtype=float).reshape(-1, k, k) for part in (given, found))
+        other[:] = np.linalg.qr(np.concatenate((one, other), axis=1), mode="r")
+
+    whole, op = MPI.DOUBLE.Create_contiguous(k * k).Commit(), MPI.Op.Create(of_both)
+    comm.Allreduce(MPI.IN_PLACE, [own, 1, whole], op=op)
+    comm.Bcast(own, root=0)
+    op.Free()
+    whole.Free()
+    return own
