@@ -14,10 +14,9 @@ from tfeti_dolfinx.qp.coarse import DenseCoarse
 from tfeti_dolfinx.qp.homogenised import homogenise
 from tfeti_dolfinx.qp.krylov import estimate_norm, solve_by_pcpg
 from tfeti_dolfinx.qp.mprgp import MprgpIterate, MprgpParameters, mprgp
-from tfeti_dolfinx.qp.parameters import SmalseParameters
 from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Start, Steps, StoppingRule
 from tfeti_dolfinx.qp.sets import Bounds, Product
-from tfeti_dolfinx.qp.smalse import smalse
+from tfeti_dolfinx.qp.smalse import SmalseParameters, smalse
 
 SELF = MPI.COMM_SELF
 

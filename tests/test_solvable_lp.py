@@ -62,6 +62,17 @@ def test_random_rigid_scenes_against_a_plain_program():
     assert 0.2 < np.mean(verdicts) < 0.8
 
 
+def test_rounding_between_pairs_of_bodies_holds_nothing():
+    """Each of two pairs moves as one, though a row of 1e-8 links a body of one to the other's."""
+    I, zero = np.eye(3), np.zeros((3, 3))
+    J = np.block([[I, zero, zero, -I], [zero, I, -I, zero], [zero, zero, 1e-8 * I, -1e-8 * I]])
+    found = unresisted(csr_array(J.T @ J), unsprung(np.zeros((4, 3, 3))))
+    assert not found.free.any()
+    joint = np.linalg.qr(found.joint.toarray())[0]
+    exact = np.block([[I, zero], [zero, I], [zero, I], [I, zero]]) / np.sqrt(2)
+    assert np.allclose(joint @ joint.T, exact @ exact.T, atol=1e-12)
+
+
 @pytest.mark.parametrize("axes", [1, 2])
 def test_a_block_on_a_plane_with_friction_slides_or_tips(axes):
     """Pressed by 1 at the corners of a square, pushed along the plane at a height: closed forms."""

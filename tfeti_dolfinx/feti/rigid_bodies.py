@@ -239,7 +239,9 @@ def _null_space(blocks: Array, i: Array, j: Array, held: Array) -> Iterator[tupl
     label = connected_components(links, directed=False)[1]
     place = np.empty(n, dtype=np.int64)
     for component in np.flatnonzero(np.bincount(label, minlength=1) > 1):
-        own, some = np.flatnonzero(label == component), np.flatnonzero(label[i] == component)
+        own = np.flatnonzero(label == component)
+        # what is rounding may link bodies of other components
+        some = np.flatnonzero((label[i] == component) & (label[j] == component))
         place[own] = np.arange(len(own))
         A = np.zeros((len(own), k, len(own), k))
         A[place[i[some]], :, place[j[some]]] = blocks[some]

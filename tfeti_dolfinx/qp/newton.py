@@ -10,8 +10,7 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import any_rank, norm_over, summed
 from tfeti_dolfinx.qp.coarse import HELD, imbalance
 from tfeti_dolfinx.qp.homogenised import Homogenised
-from tfeti_dolfinx.qp.newton_faces import FaceSolver
-from tfeti_dolfinx.qp.parameters import NewtonParameters
+from tfeti_dolfinx.qp.newton_faces import FaceSolver, NewtonParameters
 from tfeti_dolfinx.qp.problem import (
     QP,
     ConvergedReason,

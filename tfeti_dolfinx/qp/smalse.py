@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import norm_over
+from tfeti_dolfinx.common.validation import ABOVE_0, Range, described
 from tfeti_dolfinx.qp.homogenised import Homogenised, operator_product
 from tfeti_dolfinx.qp.mprgp import MprgpIterate, MprgpParameters, mprgp
-from tfeti_dolfinx.qp.parameters import SmalseParameters
 from tfeti_dolfinx.qp.problem import (
     QP,
     ConvergedReason,
@@ -19,6 +21,58 @@ from tfeti_dolfinx.qp.problem import (
     StoppingRule,
     no_monitor,
 )
+
+
+@dataclass(frozen=True)
+class SmalseParameters:
+    """Parameters of SMALSE-M and of its inner MPRGP, for F scaled to ‖PFP‖ = 1.
+
+    Attributes:
+        enough: Of the rule's tolerance: inner problems are not solved more exactly, as M may be
+            too small.
+        rounding: Of the Lagrangian: what its value may be wrong by.
+        change: Where nothing fulfils Bx = 0, ‖Bx‖ tends to a limit: a change by less than this
+            share is none; the slowest scenes change by 1e-3 a step.
+        patience: Outer steps without a change of ‖Bx‖ and M that are a stall.
+    """
+
+    rho: float = described(
+        1.0,
+        "smalse",
+        "penalty ρ in units of ‖PFP‖",
+        name="smalse_rho",
+        symbol="ρ",
+        fits=ABOVE_0,
+    )
+    M: float = described(
+        1.0, "smalse", "M₀ in units of ‖PFP‖", name="smalse_M", symbol="M", fits=ABOVE_0
+    )
+    beta: float = described(
+        0.9,
+        "smalse",
+        "factor β on M, in (0, 1)",
+        name="smalse_beta",
+        symbol="β",
+        fits=Range("between 0 and 1", lambda value: 0.0 < value < 1.0),
+    )
+    eta: float = described(
+        0.1, "smalse", "η in units of ‖b‖", name="smalse_eta", symbol="η", fits=ABOVE_0
+    )
+    gamma: float = described(
+        1.0, "mprgp", "Γ of the proportioning test", name="mpgp_gamma", symbol="Γ", fits=ABOVE_0
+    )
+    alpha_bar: float = described(
+        1.95,
+        "mprgp",
+        "step length ᾱ in units of 1/‖A‖",
+        name="mpgp_alpha",
+        symbol="ᾱ",
+        fits=Range("more than 0, at most 2", lambda value: 0.0 < value <= 2.0),
+    )
+    enough: float = 1e-3
+    rounding: float = 1e-14
+    change: float = 1e-3
+    patience: int = 1000
 
 
 class InnerTest:
@@ -104,7 +158,8 @@ def smalse(
     >>> import numpy as np
     >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
     >>> from tfeti_dolfinx.qp.sets import Bounds
-    >>> from tfeti_dolfinx.qp.homogenised import homogenise
+    >>> from tfeti_dolfinx.common.validation import ABOVE_0, Range, described
+    from tfeti_dolfinx.qp.homogenised import homogenise
     >>> from tfeti_dolfinx.qp.problem import StoppingRule
     >>> F, d = np.diag([1.0, 2.0, 4.0]).__matmul__, np.array([1.0, -1.0, 2.0])
     >>> qp = QP(F, d, DenseCoarse(np.ones((1, 3)), np.ones(1)), Bounds(), norm=4.0)

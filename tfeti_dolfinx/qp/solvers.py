@@ -10,9 +10,9 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.qp.homogenised import restored
 from tfeti_dolfinx.qp.krylov import PcpgParameters, solve_by_pcpg
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
-from tfeti_dolfinx.qp.parameters import NewtonParameters, SmalseParameters
+from tfeti_dolfinx.qp.newton_faces import NewtonParameters
 from tfeti_dolfinx.qp.problem import QP, QPResult, Start
-from tfeti_dolfinx.qp.smalse import smalse
+from tfeti_dolfinx.qp.smalse import SmalseParameters, smalse
 
 
 @dataclass(frozen=True)
