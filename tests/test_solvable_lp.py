@@ -64,12 +64,14 @@ def test_random_rigid_scenes_against_a_plain_program():
 
 def test_rounding_between_pairs_of_bodies_holds_nothing():
     """Each of two pairs moves as one, though a row of 1e-8 links a body of one to the other's."""
-    I, zero = np.eye(3), np.zeros((3, 3))
-    J = np.block([[I, zero, zero, -I], [zero, I, -I, zero], [zero, zero, 1e-8 * I, -1e-8 * I]])
+    one, zero = np.eye(3), np.zeros((3, 3))
+    J = np.block(
+        [[one, zero, zero, -one], [zero, one, -one, zero], [zero, zero, 1e-8 * one, -1e-8 * one]]
+    )
     found = unresisted(csr_array(J.T @ J), unsprung(np.zeros((4, 3, 3))))
     assert not found.free.any()
     joint = np.linalg.qr(found.joint.toarray())[0]
-    exact = np.block([[I, zero], [zero, I], [zero, I], [I, zero]]) / np.sqrt(2)
+    exact = np.block([[one, zero], [zero, one], [zero, one], [one, zero]]) / np.sqrt(2)
     assert np.allclose(joint @ joint.T, exact @ exact.T, atol=1e-12)
 
 
