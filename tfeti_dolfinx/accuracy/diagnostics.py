@@ -62,12 +62,14 @@ class Diagnostics:
         self.finite = False
         self._of: Dual | None = None
         self._lasting: list[str] = []
+        self._slopes: list[Array] = []
 
     def found(self, dual: Dual, solution: Solution, outcome: Outcome, rtol: float) -> list[str]:
         """Sentences beside the ``outcome``, each of which names the thing. Collective."""
         if self._of is not dual:
             lasting = (self._cells(), self._locking(dual.subdomains), self._hinges())
             self._lasting, self._of = [text for texts in lasting for text in texts], dual
+            self._slopes = self._make_slopes(dual.subdomains)
         u = solution.u
         return [
             *_loose(outcome),
@@ -145,10 +147,9 @@ class Diagnostics:
         bs = self._dofs.bs
         if self.finite or bs != self._decomposition.mesh.geometry.dim or bs == 1:
             return
-        x, angles = self._points(subdomains), []
-        for _, part in subdomains.elastic_parts():
-            rows = slice(part.start // bs, part.stop // bs)
-            slope = np.linalg.lstsq(x[rows], u[part].reshape(-1, bs), rcond=None)[0]
+        angles = []
+        for (_, part), slope_of in zip(subdomains.elastic_parts(), self._slopes, strict=True):
+            slope = slope_of @ u[part].reshape(-1, bs)
             angles.append(float(np.linalg.norm(slope - slope.T)) / 8.0**0.5)
         worst = subdomains.body_maxima([angles])[0]
         turned = worst > LIMITS.turns
@@ -196,6 +197,12 @@ class Diagnostics:
                     f"the largest pressure presses elements together by {largest * most[1]:.2g}; "
                     'expected gap="curved", a mesh of degree 2, or smaller facets'
                 )
+
+    def _make_slopes(self, subdomains: Subdomains) -> list[Array]:
+        """Return what gives the mean slopes of a displacement of each subdomain, (gdim, nodes)."""
+        x, bs = self._points(subdomains), self._dofs.bs
+        parts = [slice(p.start // bs, p.stop // bs) for _, p in subdomains.elastic_parts()]
+        return [np.linalg.pinv(x[part], EPSILON * len(x)) for part in parts]
 
     def _points(self, subdomains: Subdomains) -> Array:
         """Return points of this rank's primal nodes, from the middle of their subdomains on."""

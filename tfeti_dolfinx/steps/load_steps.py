@@ -464,7 +464,7 @@ class LoadSteps:
             time=t,
             size=size,
             dissipation=lost,
-            figures={k: v for k, v in asdict(report).items() if isinstance(v, (int, str))},
+            figures={k: v for k, v in vars(report).items() if isinstance(v, (int, str))},
             residuals=dict(report.residuals),
             seconds=report.seconds["total"],
             motion=dict(report.motion),
