@@ -465,6 +465,32 @@ def test_nonlinear_bodies_under_a_tool_by_force_and_by_displacement(finite):
     assert min(one.report.newton_steps, other.report.newton_steps) > 1
 
 
+def test_a_tool_that_is_lifted_leaves_an_elastic_body_at_rest():
+    """u = 0 has no size that an increment could be small beside."""
+    decomposition = decomposed("triangle", 4, 2)
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    F = ufl.Identity(2) + ufl.grad(u)
+    J = ufl.det(F)
+    energy = 0.4 * (ufl.tr(F.T * F) - 2 - 2 * ufl.ln(J)) + 0.3 * ufl.ln(J) ** 2
+    way = fem.Constant(decomposition.mesh, (0.0, 0.0))
+    tool = tfeti.RigidBody(top(2), displacement=way, name="punch")
+    problem = tfeti.NonlinearContactProblem(
+        ufl.derivative(energy * ufl.dx, u, v),
+        u,
+        [clamp(V, decomposition.facets("bottom"))],
+        [tfeti.Obstacle("top", tool, friction=tfeti.Coulomb(0.2))],
+        decomposition,
+        finite=True,
+        petsc_options={"rtol": 1e-9},
+    )
+    for way.value[:] in ((0.02, -0.08), (0.01, 1e-3)):
+        problem.solve()
+        problem.accept()
+    assert decomposition.comm.allreduce(np.abs(u.x.array).max(initial=0.0), op=MPI.MAX) < 1e-12
+    assert np.all(problem.solution.tool("punch").resultant.force == 0.0)
+
+
 def sphere_mesh(radius=1.0, n=24):
     """Triangles of a ball about the origin, seen from outside they turn to the left."""
     theta, phi = np.linspace(0, np.pi, n + 1), np.linspace(0, 2 * np.pi, 2 * n + 1)[:-1]

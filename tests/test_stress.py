@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.stability_scenes import floor, two_bodies
-from benchmarks.stress import judge, meshes
+from benchmarks.stress import judge, meshes, nonlinear
 from benchmarks.stress.__main__ import main
 from benchmarks.stress.package import solve_scene
 from benchmarks.stress.random_scenes import random_scene
@@ -16,6 +16,8 @@ from benchmarks.stress.scene import Body, Load, Scene
 SEEDS = [*range(1, 6)]
 SEEDS += [pytest.param(seed, marks=pytest.mark.slow) for seed in range(6, 40)]
 
+NONLINEAR = [1, 5, 8, 11]
+
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_random_scenes_are_right_or_named(seed, comm):
@@ -23,6 +25,27 @@ def test_random_scenes_are_right_or_named(seed, comm):
     row = judge.run_scene(random_scene(seed), comm)
     if comm.rank == 0:
         assert row["class"].islower(), row
+
+
+@pytest.mark.parametrize("seed", NONLINEAR)
+def test_random_nonlinear_scenes_are_right(seed, serial_only):
+    row = nonlinear.run_scene(nonlinear.random_scene(seed))
+    assert row["class"] == "right", row
+
+
+@pytest.mark.parametrize("kind", ["press", "pair"])
+def test_wrong_nonlinear_steps_are_found(kind, serial_only):
+    """A displacement that is a little off, and one without contact."""
+    seeds = (nonlinear.random_scene(seed) for seed in range(100))
+    scene = next(s for s in seeds if s.kind == kind and s.law == "neo-Hooke" and s.gdim == 2)
+    mesh, tags = nonlinear.blocks(scene)
+    run, none = nonlinear.posed(scene, mesh, tags), np.zeros(2)
+    run.move(0.2 * scene.path[-1])
+    run.problem.solve()
+    u = run.problem.decomposition.to_original(run.problem.u)
+    assert nonlinear.Check(scene, mesh, tags).step(u, none, None) == []
+    u.x.array[:] *= 1.0 + 1e-3 * np.arange(len(u.x.array)) / len(u.x.array)
+    assert nonlinear.Check(scene, mesh, tags).step(u, none, None)
 
 
 def answer(scene):

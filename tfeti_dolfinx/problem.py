@@ -314,7 +314,8 @@ class ContactProblem:
             warnings = self._diagnostics.found(dual, solution, outcome, options.number)
         method = f"{options.qp_type} + {options.pc_type}"
         self._outcome = replace(outcome, warnings=warnings, notes=notes_of(outcome), solver=method)
-        restless = (d.body_names[settling.body], settling.slides)
+        bodies = [*d.body_names, *self._system.tools.free_names]
+        restless = (bodies[settling.body], settling.slides)
         conclude(result, accuracy, self.options, d.comm, excluding, restless, warnings)
         return solution, accuracy.tolerances().jump
 

@@ -14,7 +14,7 @@ from tfeti_dolfinx.common.parallel import bcast_from_root
 from tfeti_dolfinx.contact.conditions import Side, conditions
 from tfeti_dolfinx.contact.partner import ContactPartner
 from tfeti_dolfinx.contact.records import ContactRecords
-from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.errors import InputError, OverlapError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.curvature import with_curvature
@@ -145,7 +145,7 @@ class Contact(ContactPartner):
         found = super().gaps(dofs, records, depth)
         deepest = -dofs.comm.allreduce(float(found.min(initial=0.0)), op=MPI.MIN)
         if isinstance(self.gap, str) and deepest > depth:
-            raise InputError(
+            raise OverlapError(
                 f"{self.name}: the surfaces overlap by up to {deepest:.6g}, more than the reach "
                 f"{depth:.6g}; expected bodies that are apart, a larger reach, or a gap="
             )

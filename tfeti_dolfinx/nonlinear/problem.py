@@ -18,7 +18,7 @@ from tfeti_dolfinx.common.validation import checked_callable, checked_flag, chec
 from tfeti_dolfinx.constraints.contact_state import Multipliers
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, checked_contacts
-from tfeti_dolfinx.errors import ConvergenceError, InputError, TfetiError
+from tfeti_dolfinx.errors import ConvergenceError, InputError, OverlapError, TfetiError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.nonlinear.forms import CurrentPlaces, NewtonForms
 from tfeti_dolfinx.nonlinear.state import InternalVariables, LawVariables, NewValue
@@ -40,6 +40,8 @@ class NewtonTolerances:
             forcing term of Eisenstat and Walker).
         loosest: Relative tolerance of a linearised problem at most: a rough displacement may open
             contacts that the next step has to close again.
+        nothing: Of the displacement where the load step began: less is rounding of 0, as of bodies
+            that are let go.
         final: Share of ``rtol`` to which the last linearised problems are solved at least, so that
             increments can fall below ``rtol``.
         curvature: A step is shortened where the residual along it, contact forces included, has
@@ -74,6 +76,7 @@ class NewtonTolerances:
     safety: float = 10.0
     forcing: float = 0.3
     loosest: float = 1e-2
+    nothing: float = 1e-12
     final: float = 0.2
     curvature: float = 0.5
     max_line_search: int = 12
@@ -231,14 +234,21 @@ class NonlinearContactProblem(ContactProblem):
     def _newton(self, total: Totals) -> None:
         tol, exact, comm = self._tolerances, self._exact, self.decomposition.comm
         forms, expected = self._newton_forms, self._last_increment
-        faster = Anderson(tol, comm)
+        faster, first = Anderson(tol, comm), largest(comm, self.u.x.array)
         keeping = self._keeping
         keeping.begin()
         for step in range(tol.max_it):
             u = np.array(self.u.x.array)
             # 1. model
             rtol = float(np.clip(tol.forcing * expected, tol.final * exact, tol.loosest))
-            self._solve_linearised(rtol)
+            try:
+                self._solve_linearised(rtol)
+            except OverlapError as error:  # that of an iterate, not of what was given
+                if step == 0:
+                    raise
+                raise ConvergenceError(
+                    f"Newton's method: after {step} steps {error}; or smaller load steps"
+                ) from error
             total.add(self.report)
             end = np.array(self.u.x.array)
             d = end - u
@@ -251,7 +261,8 @@ class NonlinearContactProblem(ContactProblem):
             short = increment <= exact and not (self._finite and forms.kept)
             if not self._finite:  # whose slopes do not see rotations
                 short |= t == 1.0 and tol.safety * expected <= exact
-            if short and rtol <= exact:
+            nothing = largest(comm, end) <= tol.nothing * first
+            if nothing or (short and rtol <= exact):
                 self._set(end)
                 return
             # 4. step

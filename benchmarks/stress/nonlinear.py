@@ -1,0 +1,535 @@
+"""Random nonlinear scenes: each accepted step is checked by laws on the untorn mesh.
+
+    ./run python3 -m benchmarks.stress.nonlinear --scenes 300 --seed 0
+
+A scene is a block on a fixed obstacle, a block under a rigid tool that moves by a law or under a
+force, or a block on another one; of neo-Hooke, St. Venant and Kirchhoff, J2 plasticity, or a law of
+total deformations; with friction or without; pressed, drawn along, let go, in 2D and 3D. A step
+that does not converge is halved. What is accepted is looked at by code that shares nothing with the
+package: the residual of the displacement, assembled by DOLFINx on the mesh as it was given,
+balances by itself but for supports and contact, and its part at contacts keeps the laws of contact
+and Coulomb at each node. Classes in capitals must not occur; ends with 1 if one did. Serial.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import signal
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import petsc4py
+
+if __name__ == "__main__":
+    petsc4py.init(sys.argv[:1])
+
+import basix.ufl
+import numpy as np
+import ufl
+from dolfinx import fem
+from dolfinx import mesh as dmesh
+from mpi4py import MPI
+
+import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.common.compat import geometry_dofmap, interpolation_points
+
+RTOL = 1e-7  # of the package
+RESIDUAL, GAP, SLIP = 1e-5, 1e-5, 1e-4  # of stiffness times displacement, and of displacement
+SECONDS, HALVINGS = 300, 5
+CELLS = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
+# how far a block is pressed at most, by law
+DEEPEST = {"neo-Hooke": 0.5, "St. Venant": 0.15, "J2": 0.08, "deformation": 0.15}
+HELD = {"press": ("top",), "tool": ("bottom",), "force": ("bottom",), "pair": ("bottom", "top")}
+MEETS = {
+    "press": ("bottom",),
+    "tool": ("top",),
+    "force": ("top",),
+    "pair": ("inner low", "inner high"),
+}
+SIDES = {"bottom": 1, "top": 2, "inner low": 3, "inner high": 4}
+
+
+@dataclass
+class Scene:
+    """A scene drawn from a seed.
+
+    Attributes:
+        kind: "press", "tool", "force" or "pair".
+        law: "neo-Hooke", "St. Venant", "J2" or "deformation".
+        cell: Name of the cell type.
+        cells: Cells along the axes of each block.
+        nu: Poisson's ratio.
+        friction: μ.
+        radius: That of a ball, or infinite of a plane.
+        path: Displacements of what moves, or in the last component its force, shape ``(s, gdim)``.
+        subdomains: How many.
+    """
+
+    kind: str
+    law: str
+    cell: str
+    cells: list[tuple[int, ...]]
+    nu: float
+    friction: float
+    radius: float
+    path: np.ndarray
+    subdomains: int
+
+    @property
+    def gdim(self) -> int:
+        """Dimension."""
+        return len(self.cells[0])
+
+    @property
+    def finite(self) -> bool:
+        """True if strains are finite."""
+        return self.law in ("neo-Hooke", "St. Venant")
+
+
+def random_scene(seed: int) -> Scene:
+    """Draw a scene."""
+    rng = np.random.default_rng(seed)
+    kind = str(rng.choice(list(HELD)))
+    law = str(rng.choice(list(DEEPEST), p=[0.4, 0.1, 0.3, 0.2]))
+    cell = str(rng.choice(CELLS, p=[0.35, 0.35, 0.15, 0.15]))
+    gdim = 2 if cell in ("triangle", "quadrilateral") else 3
+    most = 7 if gdim == 2 else 4
+    count = 2 if kind == "pair" else 1
+    cells = [tuple(int(n) for n in rng.integers(2, most, gdim)) for _ in range(count)]
+    deepest = DEEPEST[law] * float(rng.uniform(0.1, 1.0)) * (2.0 if kind == "pair" else 1.0)
+    steps = int(rng.integers(3, 7))
+    path = np.zeros((steps, gdim))
+    share = np.linspace(1.0 / steps, 1.0, steps)
+    if rng.uniform() < 0.5:  # to and fro
+        share = rng.uniform(-0.1, 1.0, steps)
+    path[:, -1] = -deepest * share
+    if rng.uniform() < 0.7:
+        path[:, 0] = deepest * np.cumsum(rng.uniform(-0.5, 0.7, steps))
+    if kind == "force":
+        path[:, -1] = -0.5 * deepest * np.clip(share, 0.05, 1.0)
+    return Scene(
+        kind=kind,
+        law=law,
+        cell=cell,
+        cells=cells,
+        nu=float(rng.uniform(0.0, 0.4)),
+        friction=float(rng.uniform(0.0, 1.0)) if rng.uniform() < 0.6 else 0.0,
+        radius=float(rng.uniform(0.6, 3.0)) if rng.uniform() < 0.6 else np.inf,
+        path=path,
+        subdomains=int(rng.integers(1, 6)),
+    )
+
+
+# --- Meshes -----------------------------------------------------------------------------------
+
+
+def blocks(scene: Scene) -> tuple[dmesh.Mesh, Any]:
+    """Unit blocks, one on the other, that share no node, and tags of ``SIDES``."""
+    kind, gdim = dmesh.to_type(scene.cell), scene.gdim
+    cells, points, start = [], [], 0
+    for i, n in enumerate(scene.cells):
+        low, high = np.zeros(gdim), np.ones(gdim)
+        low[-1], high[-1] = i, i + 1
+        make = dmesh.create_rectangle if gdim == 2 else dmesh.create_box
+        box = make(MPI.COMM_SELF, [low, high], list(n), kind)
+        cells.append(start + geometry_dofmap(box))
+        points.append(box.geometry.x[:, :gdim])
+        start += len(box.geometry.x)
+        element = box.ufl_domain().ufl_coordinate_element()
+    whole = np.concatenate(cells).astype(np.int64)
+    mesh = dmesh.create_mesh(MPI.COMM_SELF, cells=whole, x=np.concatenate(points), e=element)
+    mesh.topology.create_connectivity(gdim - 1, gdim)
+    outer = dmesh.exterior_facet_indices(mesh.topology)
+    links = mesh.topology.connectivity(gdim - 1, gdim)
+    cell = np.array([links.links(f)[0] for f in outer], dtype=np.int32)
+    height = dmesh.compute_midpoints(mesh, gdim - 1, outer)[:, gdim - 1]
+    above = dmesh.compute_midpoints(mesh, gdim, cell)[:, gdim - 1] > 1.0
+    values = np.zeros(len(outer), dtype=np.int32)
+    values[np.isclose(height, 0.0)] = SIDES["bottom"]
+    values[np.isclose(height, len(scene.cells))] = SIDES["top"]
+    if len(scene.cells) == 2:
+        inner = np.isclose(height, 1.0)
+        values[inner & ~above], values[inner & above] = SIDES["inner low"], SIDES["inner high"]
+    return mesh, dmesh.meshtags(mesh, gdim - 1, outer[values > 0], values[values > 0])
+
+
+# --- Laws -------------------------------------------------------------------------------------
+
+
+@dataclass
+class Law:
+    """Residual of a displacement on a mesh, and what has to be done at the end of a step."""
+
+    residual: Any
+    J: Any = None
+    state: Any = None
+    update: Callable[[], None] | None = None
+    commit: Callable[[], None] | None = None
+
+
+def _gradient(u: Any) -> Any:
+    g = ufl.grad(u)
+    if len(u) == 3:
+        return g
+    return ufl.as_matrix([[g[0, 0], g[0, 1], 0], [g[1, 0], g[1, 1], 0], [0, 0, 0]])
+
+
+def lame(mesh: dmesh.Mesh, nu: float) -> tuple[Any, Any]:
+    """μ and λ of E = 1."""
+    return fem.Constant(mesh, 0.5 / (1 + nu)), fem.Constant(mesh, nu / (1 + nu) / (1 - 2 * nu))
+
+
+def elastic_law(scene: Scene, u: fem.Function) -> Law:
+    """Laws with a potential; both sides of the comparison get the same from the user's hands."""
+    mesh = u.function_space.mesh
+    mu, lmbda = lame(mesh, scene.nu)
+    g = _gradient(u)
+    F, one = ufl.Identity(3) + g, ufl.Identity(3)
+    if scene.law == "neo-Hooke":
+        log = ufl.ln(ufl.det(F))
+        energy = mu / 2 * (ufl.tr(F.T * F) - 3) - mu * log + lmbda / 2 * log**2
+    elif scene.law == "St. Venant":
+        strain = (F.T * F - one) / 2
+        energy = mu * ufl.inner(strain, strain) + lmbda / 2 * ufl.tr(strain) ** 2
+    else:  # Hencky's: the modulus of shear falls with the strain
+        e = ufl.dev(ufl.sym(g))
+        bulk, limit = lmbda + 2 * mu / 3, 0.02
+        energy = bulk / 2 * ufl.tr(g) ** 2 + 2 * mu * limit**2 * (
+            0.8 * (ufl.sqrt(1 + ufl.inner(e, e) / limit**2) - 1) + 0.1 * ufl.inner(e, e) / limit**2
+        )
+    dx = ufl.dx(metadata={"quadrature_degree": 4})
+    return Law(ufl.derivative(energy * dx, u, ufl.TestFunction(u.function_space)))
+
+
+YIELD, HARDENING = 0.01, 0.1
+
+
+def package_plasticity(scene: Scene, decomposition: tfeti.Decomposition, u: fem.Function) -> Law:
+    """The package's J2."""
+    model = "plane_strain" if scene.gdim == 2 else "3d"
+    elastic = tfeti.Elasticity(decomposition, E=1.0, nu=scene.nu, model=model)
+    law = tfeti.J2Plasticity(elastic, u, yield_stress=YIELD, hardening=HARDENING)
+    v, w = ufl.TestFunction(u.function_space), ufl.TrialFunction(u.function_space)
+    return Law(law.residual(v), law.tangent(w, v), law.state, law.update)
+
+
+def own_plasticity(scene: Scene, u: fem.Function, degree: int) -> Law:
+    """J2 in UFL: the stress and the internal variables of a displacement."""
+    V = u.function_space
+    mesh = V.mesh
+    mu, lmbda = lame(mesh, scene.nu)
+    cell = mesh.basix_cell()
+    spaces = [
+        fem.functionspace(mesh, basix.ufl.quadrature_element(cell, value_shape=n, degree=degree))
+        for n in ((9,), ())
+    ]
+    plastic, p = (fem.Function(space) for space in spaces)
+    old = ufl.as_matrix([[plastic[3 * i + j] for j in range(3)] for i in range(3)])
+    strain = ufl.sym(_gradient(u))
+    s = 2 * mu * ufl.dev(strain - old)
+    q = ufl.sqrt(1.5 * ufl.inner(s, s) + 1e-26)
+    f = q - YIELD - HARDENING * p
+    dp = ufl.conditional(ufl.gt(f, 0.0), f / (3 * mu + HARDENING), 0.0)
+    stress = (lmbda + 2 * mu / 3) * ufl.tr(strain) * ufl.Identity(3) + s * (1 - 3 * mu * dp / q)
+    new = old + 1.5 * dp / q * s
+    new = ufl.as_vector([new[i, j] for i in range(3) for j in range(3)])
+    pairs = [
+        (g, fem.Expression(e, interpolation_points(W)))
+        for g, e, W in zip((plastic, p), (new, p + dp), spaces, strict=True)
+    ]
+
+    def commit() -> None:
+        found = []
+        for function, expression in pairs:
+            target = fem.Function(function.function_space)
+            target.interpolate(expression)
+            found.append(target.x.array)
+        for (function, _), values in zip(pairs, found, strict=True):
+            function.x.array[:] = values
+
+    dx = ufl.dx(domain=mesh, metadata={"quadrature_degree": degree, "quadrature_scheme": "default"})
+    return Law(ufl.inner(stress, _gradient(ufl.TestFunction(V))) * dx, commit=commit)
+
+
+# --- The package's problem ----------------------------------------------------------------------
+
+
+@dataclass
+class Run:
+    """A problem of the package, and how its scene moves."""
+
+    problem: Any
+    move: Callable[[np.ndarray], None]
+
+
+def shape_of(scene: Scene) -> Any:
+    """The obstacle: below a block that is pressed on it, above one that a tool presses."""
+    gdim = scene.gdim
+    side = -1.0 if scene.kind == "press" else 1.0
+    point = np.full(gdim, 0.45)
+    point[-1] = 0.0 if scene.kind == "press" else 1.0
+    if np.isinf(scene.radius):
+        normal = np.zeros(gdim)
+        normal[-1] = -side
+        return tfeti.Plane(point, normal)
+    point[-1] += side * scene.radius
+    return tfeti.Sphere(point, scene.radius)
+
+
+def posed(scene: Scene, mesh: dmesh.Mesh, tags: Any) -> Run:
+    """Give a scene to the package."""
+    gdim = scene.gdim
+    surfaces = {name: tag for name, tag in SIDES.items() if tag in tags.values}
+    decomposition = tfeti.decompose(mesh, scene.subdomains, facet_tags=tags, surfaces=surfaces)
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (gdim,)))
+    u = fem.Function(V, name="u")
+    law = elastic_law(scene, u)
+    if scene.law == "J2":
+        law = package_plasticity(scene, decomposition, u)
+    way, force = (fem.Constant(decomposition.mesh, np.zeros(gdim)) for _ in range(2))
+    bcs = []
+    for name, value in (("bottom", np.zeros(gdim)), ("top", way)):
+        if name in HELD[scene.kind]:
+            dofs = fem.locate_dofs_topological(V, gdim - 1, decomposition.facets(name))
+            bcs.append(fem.dirichletbc(value, dofs, V))
+
+    def move(to: np.ndarray) -> None:
+        way.value[:] = to
+        if scene.kind == "force":
+            way.value[-1], force.value[-1] = 0.0, to[-1]
+
+    given: dict[str, Any] = {"petsc_options": {"rtol": RTOL}, "finite": scene.finite}
+    if scene.law == "J2":
+        given |= {"J": law.J, "state": law.state, "update": law.update}
+    contacts = [contact_of(scene, way, force)]
+    problem = tfeti.NonlinearContactProblem(law.residual, u, bcs, contacts, decomposition, **given)
+    return Run(problem, move)
+
+
+def contact_of(scene: Scene, way: fem.Constant, force: fem.Constant) -> Any:
+    """Return the contact of a scene; a tool goes a way, or is under a force."""
+    friction = tfeti.Coulomb(scene.friction) if scene.friction else None
+    if scene.kind == "pair":
+        return tfeti.Contact("inner low", "inner high", friction=friction)
+    if scene.kind == "press":
+        return tfeti.Obstacle("bottom", shape_of(scene), friction=friction)
+    given: dict[str, Any] = {"displacement": way}
+    if scene.kind == "force":
+        given |= {"force": force, "free": ("xyz"[scene.gdim - 1],)}
+    tool = tfeti.RigidBody(shape_of(scene), name="tool", **given)
+    return tfeti.Obstacle("top", tool, friction=friction)
+
+
+# --- Checks on the mesh as it was given -----------------------------------------------------------
+
+
+class Check:
+    """Checks of accepted steps.
+
+    Args:
+        scene: The scene.
+        mesh: The mesh given to ``decompose``.
+        tags: Tags of its sides.
+    """
+
+    def __init__(self, scene: Scene, mesh: dmesh.Mesh, tags: Any) -> None:
+        self.scene, gdim = scene, scene.gdim
+        V = fem.functionspace(mesh, ("Lagrange", 1, (gdim,)))
+        self.u, self.x = fem.Function(V), V.tabulate_dof_coordinates()[:, :gdim]
+        self.law = elastic_law(scene, self.u)
+        if scene.law == "J2":
+            self.law = own_plasticity(scene, self.u, 2)
+        self._form = fem.form(self.law.residual)
+        nodes = {
+            name: fem.locate_dofs_topological(V, gdim - 1, tags.find(tag))
+            for name, tag in SIDES.items()
+        }
+        self.held = np.unique(np.concatenate([nodes[name] for name in HELD[scene.kind]]))
+        self.meets = [nodes[name] for name in MEETS[scene.kind]]
+        self.before, self.tool = np.zeros_like(self.x), np.zeros(gdim)
+        self.worst: dict[str, float] = {}
+        self._gdim, self._h = gdim, 1.0 / max(max(n) for n in scene.cells)
+
+    def step(self, u: fem.Function, tool: np.ndarray, force: float | None) -> list[str]:
+        """Return what is wrong with a step: its displacement, the tool's, the force on it."""
+        self.u.x.array[:] = u.x.array
+        r = np.array(fem.assemble_vector(self._form).array).reshape(-1, self._gdim)
+        moved = self.u.x.array.reshape(-1, self._gdim)
+        size = max(float(np.abs(moved).max()), float(np.abs(tool).max()), 1e-12)
+        unit = size * self._h ** (self._gdim - 2)  # E = 1
+        free = np.ones(len(self.x), dtype=bool)
+        free[self.held] = False
+        for nodes in self.meets:
+            free[nodes] = False
+        found = {"residual": float(np.abs(r[free]).max(initial=0.0)) / unit / RESIDUAL}
+        if self.scene.kind == "pair":
+            found |= self._pair(r, unit)
+        else:
+            found |= self._obstacle(r, moved, tool, unit, size)
+            if force is not None:
+                pushed = r[self.meets[0], -1].sum()
+                found["tool"] = abs(pushed - force) / unit / RESIDUAL
+        for name, value in found.items():
+            self.worst[name] = max(self.worst.get(name, 0.0), value)
+        if self.law.commit is not None:
+            self.law.commit()
+        self.before, self.tool = moved.copy(), tool.copy()
+        return [f"{name} {value:.1e}" for name, value in found.items() if not value <= 1.0]
+
+    def _pair(self, r: np.ndarray, unit: float) -> dict[str, float]:
+        """Action and reaction, and the upper block is pushed upwards, within Coulomb's cone."""
+        low, high = (r[nodes].sum(axis=0) for nodes in self.meets)
+        limit = RESIDUAL * unit
+        found = {"reaction": np.abs(low + high).max() / limit, "pull": -high[-1] / limit}
+        if not self.scene.finite:
+            drag = np.linalg.norm(high[:-1]) - self.scene.friction * high[-1]
+            found["cone"] = drag / limit
+        return found
+
+    def _obstacle(
+        self, r: np.ndarray, moved: np.ndarray, tool: np.ndarray, unit: float, size: float
+    ) -> dict[str, float]:
+        """Signorini's and Coulomb's laws at each node."""
+        scene, nodes = self.scene, np.setdiff1d(self.meets[0], self.held)
+        X, u, f = self.x[nodes], moved[nodes], r[nodes]
+        if scene.finite:
+            gap, normal = self._distance(X + u - tool)
+        else:
+            gap, normal = self._distance(X)
+            gap = gap + np.sum(normal * (u - tool), axis=1)
+        p = np.sum(f * normal, axis=1)
+        t = f - p[:, None] * normal
+        slip = (u - self.before[nodes]) - (tool - self.tool)
+        slip -= np.sum(slip * normal, axis=1)[:, None] * normal
+        drag, way = np.linalg.norm(t, axis=1), np.linalg.norm(slip, axis=1)
+        bound = scene.friction * np.maximum(p, 0.0)
+        limit = RESIDUAL * unit
+        sticks = drag < bound - 10 * limit
+        slips = way > SLIP * size
+        against = np.sum(t * slip, axis=1) / np.maximum(way, 1e-300) + np.minimum(drag, bound)
+        return {
+            "pull": float(np.max(-p, initial=0.0)) / limit,
+            "overlap": float(np.max(-gap, initial=0.0)) / (GAP * size),
+            "apart": float(np.max(gap[p > 10 * limit], initial=0.0)) / (GAP * size),
+            "cone": float(np.max(drag - bound, initial=0.0)) / limit,
+            "stick": float(np.max(way[sticks], initial=0.0)) / (SLIP * size),
+            "direction": float(np.max(against[slips], initial=0.0)) / (100 * limit),
+        }
+
+    def _distance(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distance from the obstacle where its motion is 0, and its normal."""
+        up = np.zeros(self._gdim)
+        side = 1.0 if self.scene.kind == "press" else -1.0
+        up[-1] = side
+        foot = np.full(self._gdim, 0.45)
+        foot[-1] = 0.0 if self.scene.kind == "press" else 1.0
+        if np.isinf(self.scene.radius):
+            return (x - foot) @ up, np.tile(up, (len(x), 1))
+        way = x - (foot - self.scene.radius * up)
+        r = np.linalg.norm(way, axis=1)
+        return r - self.scene.radius, way / r[:, None]
+
+
+# --- One scene, and all -----------------------------------------------------------------------
+
+
+def run_scene(scene: Scene) -> dict[str, Any]:
+    """Solve and check a scene; its class and figures."""
+    row: dict[str, Any] = {"kind": scene.kind, "law": scene.law, "cell": scene.cell, "halved": 0}
+    begin = time.perf_counter()
+
+    def late(*_: Any) -> None:
+        raise TimeoutError
+
+    signal.signal(signal.SIGALRM, late)
+    signal.alarm(SECONDS)
+    try:
+        row["class"] = _solved(scene, row)
+    except TimeoutError:
+        row["class"] = "SLOW"
+    except tfeti.TfetiError as error:
+        row |= {"class": "not solved", "error": f"{type(error).__name__}: {error}"}
+    except Exception as error:
+        row |= {"class": "CRASH", "error": f"{type(error).__name__}: {error}"}
+    finally:
+        signal.alarm(0)
+    return {**row, "seconds": time.perf_counter() - begin}
+
+
+def _solved(scene: Scene, row: dict[str, Any]) -> str:
+    mesh, tags = blocks(scene)
+    run, check = posed(scene, mesh, tags), Check(scene, mesh, tags)
+    problem, wrong = run.problem, list[str]()
+    row["F"] = row["newton"] = 0
+
+    def advance(start: np.ndarray, end: np.ndarray, halvings: int) -> None:
+        run.move(end)
+        try:
+            problem.solve()
+        except tfeti.ConvergenceError:
+            if halvings == HALVINGS:
+                raise
+            problem.go_back()
+            row["halved"] += 1
+            middle = 0.5 * (start + end)
+            advance(start, middle, halvings + 1)
+            advance(middle, end, halvings + 1)
+            return
+        problem.accept()
+        row["F"] += problem.report.F_multiplications
+        row["newton"] += problem.report.newton_steps
+        tool, force = np.zeros(scene.gdim), None
+        if scene.kind in ("tool", "force"):
+            tool = np.array(problem.solution.tool("tool").displacement)
+            force = float(end[-1]) if scene.kind == "force" else None
+        u = problem.decomposition.to_original(problem.u)
+        wrong.extend(check.step(u, tool, force))
+
+    start = np.zeros(scene.gdim)
+    if scene.kind == "force":
+        start[-1] = 0.1 * scene.path[0, -1]
+    for end in scene.path:
+        advance(start, end, 0)
+        start = end
+    problem.destroy()
+    row["worst"] = check.worst
+    if wrong:
+        row["error"] = "; ".join(wrong[:4])
+    return "WRONG" if wrong else "right"
+
+
+def main(argv: list[str]) -> list[dict[str, Any]]:
+    """Run scenes; returns their rows."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--scenes", type=int, default=300, help="how many random scenes")
+    parser.add_argument("--seed", type=int, default=0, help="the first seed")
+    parser.add_argument("--only", nargs="*", type=int, help="seeds of scenes")
+    parser.add_argument("--output", type=Path, default=Path("results"))
+    arguments = parser.parse_args(argv)
+    rows = list[dict[str, Any]]()
+    logging.disable(logging.WARNING)
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    for seed in arguments.only or range(arguments.seed, arguments.seed + arguments.scenes):
+        scene = random_scene(seed)
+        rows.append({"scene": seed, **run_scene(scene)})
+        text = json.dumps(rows, indent=1, default=float)
+        (arguments.output / "nonlinear.json").write_text(text + "\n")
+        if rows[-1]["class"] != "right":
+            keys = ("class", "kind", "law", "error")
+            print(seed, " ".join(str(rows[-1].get(key, "")) for key in keys)[:300], flush=True)
+    logging.disable(logging.NOTSET)
+    for name, count in Counter(row["class"] for row in rows).most_common():
+        print(f"{count:6} {name}")
+    return rows
+
+
+if __name__ == "__main__":
+    wrong = any(row["class"].isupper() for row in main(sys.argv[1:]))
+    sys.exit(int(wrong))
