@@ -563,3 +563,15 @@ def test_meshes_that_do_not_fit_are_named(comm):
             tfeti.SurfaceMesh(points, facets)
     with pytest.raises(tfeti.InputError, match="no file"):
         tfeti.read_surface("missing.stl", comm)
+
+
+def test_a_tool_whose_bounds_of_friction_do_not_come_to_rest_is_named():
+    rough, scene = tfeti.Coulomb(0.3), block(2)
+    heavy = tfeti.RigidBody(ball(2), displacement=0.03 * DOWN[2], name="heavy")
+    beside = tfeti.Sphere((2.0, 0.5), 1.0)
+    light = tfeti.RigidBody(beside, force=(-1e-3, 0.0), free=("x",), name="light")
+    contacts = [tfeti.Obstacle("top", heavy, friction=rough)]
+    contacts.append(tfeti.Obstacle("right", light, friction=rough))
+    with pytest.raises(tfeti.ConvergenceError, match="least of all on the body 'light'"):
+        solved(scene, *contacts, friction_type="fixed_point", friction_max_it=1)
+    solved(scene, *contacts)
