@@ -46,6 +46,8 @@ DEMOS = [
     "plastic_indentation_2d",
     "plastic_hertz_3d",
     "ironing_2d",
+    "ironing_3d",
+    "deep_drawing_2d",
     "rubber_pressed_3d",
     "rigid_indenter_3d",
 ]

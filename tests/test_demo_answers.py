@@ -157,3 +157,17 @@ def test_a_bolted_joint_slides_at_its_friction(quick_demo):
     assert abs(errors["slip_of_plates"]) <= 1e-3
     assert abs(errors["slip_of_joint"]) <= 5e-3
     assert abs(errors["pretension_of_springs"]) <= 0.2
+
+
+def test_forces_of_ironing_balance(quick_demo):
+    """What holds the slab takes what the die does; the die piles the slab up before it."""
+    errors = quick_demo("ironing_3d").report["errors"]
+    assert errors["balance"] <= 1e-3
+    assert 0.3 < errors["force_along_over_force_down"] < 0.4
+
+
+def test_tools_balance_and_a_drawn_sheet_springs_back(quick_demo):
+    errors = quick_demo("deep_drawing_2d").report["errors"]
+    assert abs(errors["balance_of_tools"]) <= 1e-4
+    assert abs(errors["balance_of_work"]) <= 0.25  # two steps: the work is a rough sum
+    assert 0.5 < errors["springback_degrees"] < 3.0
