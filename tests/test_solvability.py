@@ -11,6 +11,7 @@ from scenes import box, decomposed, hooke, problem, strain
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx import NoSolutionError
+from tfeti_dolfinx.feti.solvability import check_solvable
 
 
 @pytest.mark.parametrize(
@@ -46,6 +47,31 @@ def test_rows_out_of_reach_are_taken_in_before_a_body_is_called_free():
     assert p.report.contact_rows == 9
     force = d.comm.allreduce(p.solution.contact(0).force.sum())
     assert force == pytest.approx(0.05, rel=1e-4)
+
+
+def test_a_load_that_turns_is_looked_at_again_and_one_that_grows_is_not(monkeypatch):
+    """A block that a floor alone holds: pressed, three times as hard, then pulled off it."""
+    asked = []
+    monkeypatch.setattr(
+        "tfeti_dolfinx.feti.dual.check_solvable",
+        lambda *given: asked.append(check_solvable(*given)),
+    )
+    d, weight = decomposed("quadrilateral", 4, 2), (0.0, -0.05)
+    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    force = fem.Constant(d.mesh, weight)
+    floor = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)))
+    a, L = ufl.inner(hooke()(u), strain(v)) * ufl.dx, ufl.dot(force, v) * ufl.dx
+    p = tfeti.ContactProblem(a, L, [], [floor], d)
+    p.solve()
+    force.value = (0.0, -0.15)
+    before = len(asked)
+    p.solve()
+    pressed = d.comm.allreduce(p.solution.contact(0).force.sum())
+    assert (len(asked), pressed) == (before, pytest.approx(0.15, rel=1e-4))
+    force.value = (0.0, 0.05)
+    with pytest.raises(NoSolutionError, match="only contact could resist that"):
+        p.solve()
 
 
 @settings(max_examples=10)

@@ -52,6 +52,7 @@ class DualLimits:
             point.
         nearly: Motions held by less than this share of what the same contacts hold at most are
             nearly free: their contacts' normals are off by less than 6 degrees from a right angle.
+        parallel: Loads whose directions differ by less are held by the same contacts.
         recycled: Directions kept where options do not say how many: later ones gain hardly
             anything, and each takes two vectors.
     """
@@ -60,6 +61,7 @@ class DualLimits:
     least: float = 1e-130
     most: float = 1e130
     nearly: float = 1e-2
+    parallel: float = 1e-12
     recycled: int = 100
 
 
@@ -157,6 +159,7 @@ class Dual:
         self._on_faces: FacePreconditioner | None = None
         self._on_all: FaceOperator | None = None
         self._on_last: tuple[Face, FaceOperator] | None = None
+        self._held_load: Array | None = None
         self._nearly_free: tuple[Array, list[dict[str, object]]] | None = None
         normals, tangents = constraints.sets.normals, constraints.sets.tangents.ravel()
         prefix = f"{options_prefix}coarse_"
@@ -173,7 +176,7 @@ class Dual:
         self._learns = recycle == "auto"
         if isinstance(recycle, int) and recycle:
             self.recycled = Recycled(recycle, comm)
-        check_solvable(self.coarse, self._given, *self._names)
+        self._check_solvable()
 
     def update_load(self) -> None:
         """Take the Blocks' present loads and the present right sides.
@@ -185,7 +188,25 @@ class Dual:
         self.d = self._linear_term()
         self._check_units(self.coarse.comm)
         self.coarse.update_load()
-        check_solvable(self.coarse, self._given, *self._names)
+        self._check_solvable()
+
+    def _check_solvable(self) -> None:
+        """Raise where the load drives a motion that nothing holds. Collective.
+
+        What holds a load holds its multiples, but for friction with given limits.
+        """
+        coarse, comm = self.coarse, self.coarse.comm
+        load = coarse.motions.T @ coarse.e
+        known, size = self._held_load, float(np.linalg.norm(load))
+        if known is not None:
+            apart = float(np.linalg.norm(load - size * known))
+            if not any_rank(comm, apart > LIMITS.parallel * size):
+                return
+        self._held_load = None
+        check_solvable(coarse, self._given, *self._names)
+        limited = len(self._given.pressed) < len(self._given.sets.tangents)
+        if not any_rank(comm, limited or size == 0.0):
+            self._held_load = load / size
 
     def _linear_term(self) -> Array:
         response = self.subdomains.pinv_load[self.subdomains.trace]
