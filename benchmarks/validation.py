@@ -407,18 +407,28 @@ def bar_on_wall(scale: float) -> Iterator[Row]:
 
 def plastic_indentation(scale: float) -> Iterator[Row]:
     """A rigid sphere pressed into a perfectly plastic block, axisymmetric; force per radian."""
-    figures = (("slip lines", 2.038e6, 0.05), ("Code_Aster", 2.068e6, None))  # of 20 mm
-    d = indentation.torn_mesh(scale * 20.0, 240.0, 4)
-    problem, total = indentation.made(d), 0
+    figures = {  # by the depth: slip lines, Code_Aster, what it allows
+        20.0: (2.038e6, 2.068e6, 0.05),
+        40.0: (4.076e6, 4.047e6, 0.05),
+        60.0: (6.114e6, 5.827e6, 0.05),
+        80.0: (8.152e6, 7.666e6, 0.1),
+        100.0: (1.019e7, 9.119e6, 0.15),
+    }
+    d = indentation.torn_mesh(scale * 20.0, 360.0, 4)
+    problem, total, case = indentation.made(d), 0, "SSNV506, plastic indentation"
     step = 5.0 * scale
-    for depth in np.arange(step, 20.0 + 0.5 * step, step):
+    for depth in np.arange(step, max(figures) + 0.5 * step, step):
         indentation.press(problem, depth)
         problem.solve()
         problem.accept()
         total += work(problem)
-    case, force = "SSNV506, plastic indentation", contact_force(problem) / (2 * pi)
-    for name, figure, allowed in figures:
-        yield Row(case, f"force at 20, {name}", figure, force, allowed, problem, total)
+        if depth in figures:
+            slip, other, allowed = figures[depth]
+            force = contact_force(problem) / (2 * pi)
+            yield Row(
+                case, f"force at {depth:.0f}, slip lines", slip, force, allowed, problem, total
+            )
+            yield Row(case, f"force at {depth:.0f}, Code_Aster", other, force, None, problem, total)
 
 
 def thick_cylinder(scale: float) -> Iterator[Row]:
