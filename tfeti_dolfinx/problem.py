@@ -521,7 +521,7 @@ class ContactProblem:
         system.know_rows(list(state.reach), state.groups())
         system.look_for_changes()
         dual = system.make(self._seconds)
-        dual.saw(float(state.norm))
+        dual.seen = max(dual.seen, float(state.norm))
         gluing = replace(system.gluing, slip=state.slip)
         state.check_rows(gluing)
         dual.learn()

@@ -460,7 +460,7 @@ class System:
         names = self.tools.free_names
         parts = self.gluing.constraints, self.subdomains
         self._dual = settings.make_dual(*parts, *scene, law, names)
-        self.dual.saw(self._seen)
+        self.dual.seen = max(self.dual.seen, self._seen)
 
     def _slip(self) -> Array:
         """Tangential v_i of all conditions where the load step begins, shape ``(n, gdim - 1)``."""

@@ -298,10 +298,6 @@ class Dual:
         softer = count ** (1.0 / max(self._dimension - 1, 1))
         return np.asarray(-sigma / softer * self.constraints.c)
 
-    def saw(self, norm: float) -> None:
-        """Store the estimate of ‖F‖ of a solve, for the next one, whose start may see far less."""
-        self.seen = max(self.seen, norm)
-
     @property
     def _on_all_rows(self) -> Operator | None:
         """Return the preconditioner on all rows, made once."""

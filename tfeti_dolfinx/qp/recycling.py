@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import bcast_from_root, summed
+from tfeti_dolfinx.common.parallel import bcast_from_root, dot_over, summed
 
 
 @dataclass(frozen=True)
@@ -100,19 +100,15 @@ class Recycled(DirectionStore):
             if self.count == self.capacity:
                 a[self._next] = 0.0  # it goes
             x, Fx = x - a @ W, Fx - a @ FW
-        energy = self._energy(x, Fx)
+        energy = dot_over(self.comm, (x, Fx))[0]
         if energy >= self.parameters.new:
             self.put(x / np.sqrt(energy), Fx / np.sqrt(energy))
 
     def keep(self, x: Array, Fx: Array) -> None:
         """Store a direction with Fx, if its energy is positive. Collective."""
-        energy = self._energy(x, Fx)
+        energy = dot_over(self.comm, (x, Fx))[0]
         if energy > 0.0:
             self.add(x, Fx, energy)
-
-    def _energy(self, x: Array, Fx: Array) -> float:
-        """xᵀFx, the same on all ranks. Collective."""
-        return bcast_from_root(self.comm, float(summed(self.comm, np.array([x @ Fx]))[0]))
 
     def in_order(self) -> Array:
         """Return this rank's part of W and FW, shape ``(2, m, count)``, the oldest direction first.

@@ -139,7 +139,7 @@ def solve_with_friction(
         iterations, looks, steps = iterations + 1, looks + rule.looks, steps.plus(result.steps)
         if result.reason <= 0:
             if law is not None:
-                newton.give_up(bounds)
+                newton.tries, dual.recycled, bounds.now = 0, newton.recycled, bounds.before
             elif not bounds.slip(result.reason):
                 break
             law, holds = None, bounds.hold()
@@ -249,7 +249,7 @@ class FrictionBounds:
         parameters = self._parameters
         driving = norm_over(self._comm, self._dual.driving) / (self._dual.seen or np.inf)
         self._none = parameters.no_force * max(norm_over(self._comm, values), driving)
-        self._found = self._forces(values)
+        self._found = self.forces_of(values)
         self._solved = [*self._solved[-1:], (self.now, self._found)]
         if self.stick:
             return float("inf")
@@ -309,12 +309,7 @@ class FrictionBounds:
         whole = self.stick or self._length == 1.0
         self.now = self._found if whole else self.now + self._length * (self._found - self.now)
 
-    def take(self, lam: Array) -> None:
-        """Try the bounds of multipliers for which the law holds."""
-        self.before, self.now = self.now, self._forces(lam)
-        self._dual.bound_friction(self.now)
-
-    def _forces(self, lam: Array) -> Array:
+    def forces_of(self, lam: Array) -> Array:
         """Return the normal forces, those that are rounding set to 0."""
         return np.where(lam[self._rows] > self._none, lam[self._rows], 0.0)
 
@@ -339,13 +334,8 @@ class NewtonOnLaw:
         self._dual, self._rtol, self._parameters = dual, rtol, parameters
         self.tries = parameters.tries if options.friction_type == "newton" else 0
         self.steps, self._share = 0, 1.0
-        self._recycled = dual.recycled
+        self.recycled = dual.recycled
         self._rests = dual.last.is_of(dual.coarse.comm, dual.d, dual.coarse.e)
-
-    def give_up(self, bounds: FrictionBounds) -> None:
-        """Give up, and restore bounds and directions from before the failed try."""
-        self.tries, self._dual.recycled = 0, self._recycled
-        bounds.now = bounds.before
 
     def solve(
         self, start: tuple[Array, Array] | None, bounds: FrictionBounds, aim: float = np.inf
@@ -392,10 +382,12 @@ class NewtonOnLaw:
         self.steps, self._share = self.steps + steps, parameters.finer * self._share
         self.tries -= 1
         if end is None:
-            self.tries, dual.recycled = 0, self._recycled
+            self.tries, dual.recycled = 0, self.recycled
             return None
         # F of the end stands for that of the nearest point of its set, where the problem begins
         Fx = end.s + qp.coarse.combined(end.mu) + qp.d
         dual.last.pass_on(end.lam, Fx, parameters.newton.unseen * target / norm)
-        bounds.take(end.lam)
+        # the bounds of multipliers for which the law holds
+        bounds.before, bounds.now = bounds.now, bounds.forces_of(end.lam)
+        dual.bound_friction(bounds.now)
         return end.lam, end.mu

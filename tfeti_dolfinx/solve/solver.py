@@ -143,7 +143,7 @@ def solve_dual(
     result = solver.solve(
         qp, homogenised, rule, parameters, max_it=options.max_it, start=begin, monitor=monitor
     )
-    dual.saw(result.norm)
+    dual.seen = max(dual.seen, result.norm)  # the next start may see far less
     if (state := rule.recovered) is not None:
         dual.last.looked = state.lam, state.residual
     if dual.coarse.dimension == 0 or qp_type == "newton":

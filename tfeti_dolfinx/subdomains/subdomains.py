@@ -88,7 +88,8 @@ class Subdomains:
         choice: Which form local operators take.
 
     Attributes:
-        elastic: The Blocks that have nodes, which are no rigid bodies.
+        elastic: The Blocks that have nodes, which are no rigid bodies, and num_nodal the number of
+            their unknowns; those behind are of rigid bodies.
         num_modes: k; num_clusters: clusters on all ranks, 0 without.
         trace: Trace unknowns among this rank's, ascending, shape ``(t,)``.
         size: n.
@@ -111,6 +112,7 @@ class Subdomains:
         self._choice = choice or LocalChoice()
         self.blocks, self.body_of_block = list(blocks), body_of_block
         self.elastic = [block for block in self.blocks if not isinstance(block, RigidBlock)]
+        self.num_nodal = sum(len(block.load) for block in self.elastic)
         self.num_bodies, self.comm = num_bodies, comm
         self.counters = Counters() if counters is None else counters
         own = max((block.modes.shape[1] for block in self.blocks), default=0)
@@ -204,11 +206,6 @@ class Subdomains:
         return SoftMotions(rows, joined([D for _, D in found]))
 
     # ------------------------------------------------------- rigid bodies' unknowns
-
-    @property
-    def num_nodal(self) -> int:
-        """Number of this rank's unknowns at nodes; those behind are of rigid bodies."""
-        return sum(len(block.load) for block in self.elastic)
 
     def elastic_parts(self) -> list[tuple[Block, slice]]:
         """Return the Blocks that have nodes, each with its part of the n unknowns."""
