@@ -7,6 +7,7 @@ import re
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
@@ -156,6 +157,46 @@ def written(write, usual, odd, **given):
     return do
 
 
+def of_solution(usual, odd=None):
+    """Ask a solution for something, one rank for something else."""
+
+    def do(s, folder):
+        problem = s.solved(stress=hooke(), contacts=[floor(), floor(name="again")])
+        (odd if ODD and odd else usual)(problem.solution)
+
+    return do
+
+
+def on_another_mesh(s, folder):
+    other = Scene()
+    s.problem().update(stiffness=other.a if ODD else s.a)
+
+
+def a_field_on_one(s, folder):
+    problem = s.solved()
+    (s.d.to_original if ODD else s.d.locate_facets)(problem.u if ODD else of_side)
+
+
+def tagged_on_one(s, folder):
+    mesh, tags, _ = box("quadrilateral", 4)
+    tfeti.decompose(mesh, 2, facet_tags=tags if ODD else None)
+
+
+def tolerances_on_one(s, folder):
+    u, held = fem.Function(s.V), [s.held()]
+    F = ufl.action(s.a, u) - s.load()
+    steps = tfeti.NewtonTolerances(max_it=9 if ODD else 8)
+    tfeti.NonlinearContactProblem(F, u, held, [floor()], s.d, tolerances=steps).solve()
+
+
+def of_side(x):
+    return x[0] < 0.1
+
+
+def moved(t):
+    return (0.0, 0.02 if ODD else 0.01)
+
+
 COULOMB = tfeti.Coulomb(0.3)
 ON = r" on rank \d and "
 CASES = {
@@ -224,6 +265,36 @@ CASES = {
         r"rank \d has called solve where rank 0 has called accept",
     ),
     "an apply that fails before an update": (apply_that_fails_before_an_update, "no such place"),
+    "data of another contact on one": (
+        of_solution(lambda of: of.contact(0), lambda of: of.contact("again")),
+        rf"contact is 1{ON}0 on rank 0",
+    ),
+    "data of an unknown contact on one": (
+        of_solution(lambda of: of.contact(0), lambda of: of.contact(3 if ODD else 0)),
+        "contact 3: there are 2",
+    ),
+    "the reaction of another surface on one": (
+        of_solution(lambda of: of.reaction("left"), lambda of: of.reaction("right")),
+        rf"surface is \d{ON}\d on rank 0",
+    ),
+    "other points on one": (
+        of_solution(lambda of: of.at([[0.5, 0.5]]), lambda of: of.at([[0.5, 0.5], [0.6, 0.5]])),
+        rf"the number of points is 2{ON}1 on rank 0",
+    ),
+    "a form of another mesh on one": (on_another_mesh, "the space is on another mesh"),
+    "a field on one": (
+        a_field_on_one,
+        r"rank \d has called to_original where rank 0 has called locate_facets",
+    ),
+    "tags on one": (tagged_on_one, rf"facet_tags is 'given'{ON}'not given' on rank 0"),
+    "tolerances of Newton's method on one": (
+        tolerances_on_one,
+        rf"tolerances: max_it is 9{ON}8 on rank 0",
+    ),
+    "a law of another value on one": (
+        contacts(*[[floor(displacement=moved)]] * 2),
+        rf"motion and load\[0\]\[1\] is 0.02{ON}0.01 on rank 0",
+    ),
     "stabilised on one": (thrown(stabilised=(False, True)), rf"stabilised is True{ON}False"),
 }
 
@@ -248,6 +319,16 @@ def test_it_is_named_on_all_ranks(case, scene, shared_tmp, comm):
     assert all(re.search(says, text) for _, text in answers), answers
     kinds = {"InputError", "ZeroDivisionError"} if "apply" in case else {"InputError"}
     assert {kind for kind, _ in answers} <= kinds
+
+
+def test_a_call_that_differs_changes_nothing(scene, comm):
+    """Nothing was accepted, so ``go_back`` would leave no solution on its rank."""
+    problem = scene.solved(contacts=[floor()])
+    try:
+        (problem.go_back if ODD else problem.accept)()
+    except tfeti.InputError:
+        assert comm.size > 1
+    assert comm.allreduce(np.abs(problem.solution.u).max(initial=0.0), op=MPI.MAX) > 0.0
 
 
 def test_rounding_is_no_difference(comm):

@@ -72,7 +72,7 @@ def plot_deformed(
     """
     checked_type(solution, Solution, "solution", "the solution of a ContactProblem")
     comm = solution.decomposition.comm
-    with agreeing(comm, "plot_deformed"):
+    with agreeing(comm, "plot_deformed") as given:
         target = checked_path(path, ".png")
         scene = {
             "factor": np.nan if factor is None else checked_number(factor, "factor", FINITE),
@@ -83,6 +83,7 @@ def plot_deformed(
             "view": _vector(view, "view"),
             "cut": _pair(cut),
         }
+        given |= {"path": path, **scene}
     if factor is None and solution.has_contact:
         scene["factor"] = 1.0
     parts = comm.gather(_grid(solution, solution.nodal_von_mises.x.array), root=0)
@@ -123,7 +124,8 @@ def plot_pressure(
     checked_type(solution, Solution, "solution", "the solution of a ContactProblem")
     comm = solution.decomposition.comm
     with agreeing(comm, "plot_pressure") as given:
-        given["contact"] = contact
+        given |= {"path": path, "contact": contact, "closed_form": closed_form, "limit": limit}
+        given |= {"coordinate": coordinate, "label": label}
         target = checked_path(path, ".png")
         checked_callable(coordinate, "coordinate", "a callable of points of shape (n, 3)")
         if closed_form is not None:

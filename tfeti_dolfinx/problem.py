@@ -469,7 +469,8 @@ class ContactProblem:
         The next ``solve`` starts from there. Loads, values and gaps stay as they are.
         """
         with agreeing(self.decomposition.comm, "go_back"):
-            self._return()
+            pass
+        self._return()
 
     def _return(self) -> None:
         """Return to the last accepted solution. Not collective."""

@@ -12,6 +12,7 @@ import numpy as np
 from dolfinx import fem, geometry
 from mpi4py import MPI
 
+from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.common.validation import checked_type
@@ -152,7 +153,8 @@ class Solution(ContactState):
             InputError: The points are of another shape, or not finite.
         """
         mesh, u = self.decomposition.mesh, self.displacement
-        points = checked_points(points, mesh.geometry.dim)
+        with agreeing(self.dofs.comm, "at") as given:
+            points = given["points"] = checked_points(points, mesh.geometry.dim)
         (k, d), x = points.shape, in_space(points)
         # cells of this rank, each with a point by its position
         nodes = mesh.geometry.x

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.validation import is_whole, shown
 from tfeti_dolfinx.constraints.gluing import Gluing
@@ -190,7 +191,9 @@ class ContactState:
         Raises:
             InputError: There is no such contact, or several have the name.
         """
-        records, position = self.gluing.records, position_of(self.contacts, which)
+        with agreeing(self.dofs.comm, "contact") as given:
+            position = given["contact"] = position_of(self.contacts, which)
+        records = self.gluing.records
         own = records.contact == position
         points, places = (x[records.group[own]] for x in (group_points(self.dofs), self.places()))
         area = self.area[:, None]
@@ -221,10 +224,12 @@ class ContactState:
             InputError: There is no such body.
         """
         names = [tool.name for tool in self.tool_motions]
-        if which in names:
-            which = names.index(str(which))
-        if not is_whole(which) or not 0 <= which < len(names):
-            raise InputError(f"tool {shown(which)}: expected one of {names}, or its position")
+        with agreeing(self.dofs.comm, "tool") as given:
+            if which in names:
+                which = names.index(str(which))
+            if not is_whole(which) or not 0 <= which < len(names):
+                raise InputError(f"tool {shown(which)}: expected one of {names}, or its position")
+            given["tool"] = which
         tool, records = self.tool_motions[which], self.gluing.records
         gdim, own = len(tool.centre), np.isin(records.contact, tool.contacts)
         arm = np.zeros((int(np.sum(own)), 3))
@@ -254,6 +259,8 @@ class ContactState:
         Raises:
             InputError: The surface is unknown, has no facets, or lies inside a body.
         """
+        with agreeing(self.dofs.comm, "reaction") as given:
+            given["surface"] = self.decomposition.surface(surface)
         facets = surface_facets(self.decomposition, surface)
         member = np.zeros(self.dofs.num_nodes, dtype=bool)
         member[surface_nodes(self.dofs, self.decomposition, facets)] = True

@@ -8,13 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from mpi4py import MPI
 
+from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root
 from tfeti_dolfinx.contact.obstacle import Obstacle
 from tfeti_dolfinx.contact.partner import GEOMETRY, ContactPartner
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.rigid_body import MOTIONS, Pose, RigidBody, motion_fields
-from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import extent, surface_facets
@@ -168,9 +169,12 @@ class Tools:
         """
         if not self.bodies:
             return ToolChanges(False, False, False)
-        with raised_on_all_ranks(self._comm):
+        with agreeing(self._comm, "laws of rigid bodies") as given:
             law = np.array([body.law_motion(self._gdim, time) for body in self.bodies])
             loads = np.array([body.load(self._gdim, time) for body in self.bodies])
+            given["time"] = time
+            for body, *values in zip(self.bodies, law, loads, strict=True):
+                given[f"{body.name}: motion and load"] = values
         law, loads = bcast_from_root(self._comm, (law, loads))
         moved = np.any(law != self.law, axis=1)
         large = np.array([body.large for body in self.bodies])

@@ -35,8 +35,9 @@ def displacement_space(
 
     Raise an InputError unless it is bilinear on one space for displacements on the torn mesh.
     """
-    test, trial = _argument_spaces(a, name, 2)
-    check_space(test, decomposition)
+    with raised_on_all_ranks(decomposition.comm):
+        test, trial = _argument_spaces(a, name, 2)
+        check_space(test, decomposition)
     check_same_space(trial, test, f"the trial function of {name}", "that of its test function")
     return test
 
@@ -47,14 +48,18 @@ def check_form(form: Any, name: str, V: fem.FunctionSpace, decomposition: Decomp
     Collective. Linear forms, ``"L"`` and ``"F"``, may be zero; bilinear ones are ``"a"`` and
     ``"J"``.
     """
-    if name in LINEAR:
-        if is_zero(form):
-            return
-        (space,) = _argument_spaces(form, name, 1)
+    if name in LINEAR and is_zero(form):
+        return
+    with raised_on_all_ranks(decomposition.comm):
+        spaces = _argument_spaces(form, name, 1) if name in LINEAR else []
+    for space in spaces:
         check_same_space(space, V, f"the test function of {name}", f"that of {LINEAR[name]}")
+    with raised_on_all_ranks(decomposition.comm):
+        for integral in form.integrals():
+            check_mesh(integral.integrand(), name, decomposition)
+        _check_measures(form, name, decomposition)
     for integral in form.integrals():
-        check_mesh(integral.integrand(), name, decomposition)
-    _check_measures(form, name, decomposition)
+        _check_tags(integral, name, decomposition)
 
 
 def check_not_negative(
@@ -169,7 +174,6 @@ def _check_measures(form: ufl.Form, name: str, decomposition: Decomposition) -> 
             )
         if kind == "interior_facet" and decomposition.is_torn:
             raise InputError("dS has no meaning across the tears of the mesh; use dx and ds(tag)")
-        _check_tags(integral, name, decomposition)
         if data_of.setdefault(kind, data) is not data:
             raise InputError(
                 f"{name}: {KINDS[kind]} with different subdomain_data; expected one measure "

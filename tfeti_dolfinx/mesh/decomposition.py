@@ -12,6 +12,7 @@ from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
+from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array, ArrayLike
 from tfeti_dolfinx.common.validation import checked_callable, checked_type, is_whole, named, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
@@ -171,7 +172,9 @@ class Decomposition:
             >>> decomposition.comm.allreduce(len(left))
             12
         """
-        checked_callable(marker, "marker", "a function of points of shape (3, n)")
+        with agreeing(self.comm, "locate_facets") as given:
+            given["marker"] = marker
+            checked_callable(marker, "marker", "a function of points of shape (3, n)")
         fdim, facets = self.mesh.topology.dim - 1, self.boundary.astype(np.int32)
         self.mesh.topology.create_connectivity(fdim, fdim + 1)
         with raised_on_all_ranks(self.comm):
@@ -212,7 +215,8 @@ class Decomposition:
             True
         """
         expected = "the mesh that was given to decompose"
-        with raised_on_all_ranks(self.comm):
+        with agreeing(self.comm, "from_original") as given:
+            given["f"] = f
             check_function(f, self._untorn_mesh(), "f", expected)
         return carried(f, self.mesh, self._cells.to_torn)
 
@@ -229,8 +233,8 @@ class Decomposition:
         Raises:
             InputError: ``u`` is no such function, or the mesh was read by ``read_gmsh``.
         """
-        with raised_on_all_ranks(self.comm):
-            untorn = self._untorn_mesh()
+        with agreeing(self.comm, "to_original") as given:
+            given["u"], untorn = u, self._untorn_mesh()
             check_function(u, self.mesh, "u", "decomposition.mesh, the torn mesh")
         return carried(u, untorn, self._cells.to_untorn)
 

@@ -94,6 +94,7 @@ def decompose(
     tagged = ((cell_tags, True, "cell_tags"), (facet_tags, False, "facet_tags"))
     with agreeing(mesh.comm, "decompose") as given:
         for tags, of_cells, what in tagged:
+            given[what] = "not given" if tags is None else "given"
             if tags is not None:
                 check_tags(tags, mesh, of_cells, what, f"expected the {what} of the mesh given")
         surfaces, facet_tags = _located(mesh, surfaces, facet_tags, "surfaces")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -178,7 +178,11 @@ class NonlinearContactProblem(ContactProblem):
                 J = ufl.derivative(F, u)
             checked_type(J, ufl.Form, "J", "a bilinear form")
             check_state(update, state)
-        self._tolerances = NewtonTolerances() if tolerances is None else tolerances
+            given["state"] = list(state) if isinstance(state, Mapping) else []
+            tolerances = NewtonTolerances() if tolerances is None else tolerances
+            checked_type(tolerances, NewtonTolerances, "tolerances", "NewtonTolerances")
+            given["tolerances"] = asdict(tolerances)
+        self._tolerances = tolerances
         self._update = update
         self._state = InternalVariables({} if state is None else state, decomposition.mesh)
         super().__init__(J, F, bcs, contacts, decomposition, u=u, **others)
