@@ -13,7 +13,7 @@ from mpi4py import MPI
 from scenes import SIDES, box, decomposed
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.mesh.partition import bisect_points
+from tfeti_dolfinx.mesh.bisection import bisect_points
 from tfeti_dolfinx.mesh.tearing import deal
 
 CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]

@@ -33,6 +33,12 @@ def cells(s):
 
 
 MESHES = {
+    r"partitioner='metis': expected one of round, bisection": lambda s: torn(
+        s, 2, partitioner="metis"
+    ),
+    r"partitioner='bisection' with the subdomain of each cell; expected the number": lambda s: torn(
+        s, lambda x: x[0] > 0.5, partitioner="bisection"
+    ),
     r"mesh is None; expected a dolfinx.mesh.Mesh": lambda s: tfeti.decompose(None, 2),
     r"mesh of intervals in 1D: expected one of triangle": lambda s: tfeti.decompose(
         dmesh.create_unit_interval(s.comm, 4), 2

@@ -72,6 +72,26 @@ def create_mesh_in_place(comm: MPI.Intracomm, cells: Array, x: Array, element: A
     return dmesh.create_mesh(comm, cells=cells, x=x, e=element, partitioner=stay)
 
 
+def graph_partitioners() -> list[str]:
+    """Names of the graph partitioners that this DOLFINx was built with."""
+    names = ("scotch", "parmetis", "kahip")
+    return [name for name in names if hasattr(graph, f"partitioner_{name}")]
+
+
+def parts_of_graph(
+    comm: MPI.Intracomm, name: str, num_parts: int, neighbours: Array, start: Array
+) -> Array:
+    """Parts of this rank's nodes of a graph by one of DOLFINx's partitioners. Collective.
+
+    ``neighbours`` are global numbers of the neighbours of all of them, those of one from its
+    ``start`` to the next.
+    """
+    lists = graph.adjacencylist(neighbours.astype(np.int64), start.astype(np.int32))
+    partitioner = getattr(graph, f"partitioner_{name}")()
+    found = partitioner(comm, num_parts, getattr(lists, "_cpp_object", lists), False)
+    return np.asarray(found.array, dtype=np.int64)[np.asarray(found.offsets[:-1])]
+
+
 def geometry_dofmap(mesh: dmesh.Mesh) -> Array:
     """Geometry nodes of the local cells, shape ``(num_cells, nodes_per_cell)``."""
     geometry = mesh.geometry

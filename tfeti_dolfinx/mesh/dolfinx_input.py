@@ -18,13 +18,8 @@ from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.common.validation import checked_type, is_whole, named
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition, check_tags, checked_names
-from tfeti_dolfinx.mesh.partition import (
-    Subdomains,
-    assign_subdomains,
-    coordinate_bisection,
-    default_count,
-)
-from tfeti_dolfinx.mesh.tearing import tear
+from tfeti_dolfinx.mesh.partition import DEFAULT, Subdomains, check_partitioner, default_count
+from tfeti_dolfinx.mesh.tearing import decomposed
 from tfeti_dolfinx.mesh.untorn import NO_TAG, PhysicalNames, UntornMesh, cell_facets
 
 CELL_TYPES = ("triangle", "quadrilateral", "tetrahedron", "hexahedron")
@@ -51,28 +46,33 @@ def decompose(
     *,
     surfaces: Mapping[str, int | Marker] | None = None,
     volumes: Mapping[str, int | Marker] | None = None,
+    partitioner: str = DEFAULT,
 ) -> Decomposition:
     """Tear a DOLFINx mesh into subdomains. Collective.
 
     Args:
         mesh: The mesh, distributed in any way; or the ``MeshData`` of ``dolfinx.io.gmsh``, whose
             tags and physical names are taken where none are given.
-        subdomains: Number of subdomains (recursive coordinate bisection); or one id for each
-            cell owned by this rank; or a callable that gets cell midpoints, shape ``(3, n)``,
-            and returns one id per cell. Default: about 4000 unknowns per subdomain.
+        subdomains: Number of subdomains; or one id for each cell owned by this rank; or a
+            callable that gets cell midpoints, shape ``(3, n)``, and returns one id per cell.
+            Default: about 4000 unknowns per subdomain.
         cell_tags: Material tags.
         facet_tags: Surface tags.
         surfaces: Names of surface tags; a tag that has none is named by its number. In the place
             of a tag a marker: it gets points, shape ``(3, n)``, and returns flags; the facets of
             the boundary all of whose vertices it flags become the surface.
         volumes: Names of cell tags, or markers of cells.
+        partitioner: What makes a number of subdomains: ``"round"``, balanced k-means, where cells
+            are flat bisection; ``"bisection"`` along coordinates; or one of those that DOLFINx was
+            built with, ``"scotch"``, ``"parmetis"``, ``"kahip"``, whose cuts have few facets.
 
     Returns:
-        The torn mesh. Which subdomain a cell belongs to does not depend on the number of ranks.
+        The torn mesh. Which subdomain a cell belongs to does not depend on the number of ranks,
+        but with DOLFINx's partitioners.
 
     Raises:
         InputError: The cells are not triangles, quadrilaterals, tetrahedra or hexahedra, or
-            tags, names or subdomains do not fit.
+            tags, names, subdomains or the partitioner do not fit.
 
     Example:
         >>> square = dmesh.create_unit_square(MPI.COMM_WORLD, 8, 8)
@@ -93,6 +93,7 @@ def decompose(
     mesh = _checked_mesh(mesh)
     tagged = ((cell_tags, True, "cell_tags"), (facet_tags, False, "facet_tags"))
     with agreeing(mesh.comm, "decompose") as given:
+        check_partitioner(partitioner)
         for tags, of_cells, what in tagged:
             given[what] = "not given" if tags is None else "given"
             if tags is not None:
@@ -103,14 +104,13 @@ def decompose(
         volumes = checked_names(volumes, "volumes", cell_tags, "cell_tags")
         number = subdomains if subdomains is None or is_whole(subdomains) else "for each cell"
         given |= {"surfaces": surfaces, "volumes": volumes, "number of subdomains": number}
+        given["partitioner"] = partitioner
     seconds: dict[str, float] = {}
     with stage("mesh", seconds):
         untorn = _untorn(mesh, cell_tags, facet_tags, surfaces, volumes)
         if subdomains is None:
             subdomains = default_count(untorn, mesh.comm)
-        subdomain = assign_subdomains(untorn, subdomains, mesh.comm, coordinate_bisection)
-        ours = isinstance(subdomains, (int, np.integer))
-        decomposition = tear(untorn, subdomain, mesh.comm, absorb=ours)
+        decomposition = decomposed(untorn, subdomains, partitioner, mesh.comm)
     return replace(decomposition, seconds=seconds, untorn=mesh)
 
 
@@ -183,22 +183,17 @@ def _untorn(
     surfaces: dict[str, int],
     volumes: dict[str, int],
 ) -> UntornMesh:
-    topology, gdim = mesh.topology, mesh.geometry.dim
+    topology = mesh.topology
     owned = topology.index_map(topology.dim).size_local
-    nodes = geometry_dofmap(mesh)[:owned]
-    ids = np.asarray(mesh.geometry.input_global_indices)
-    used, local = np.unique(ids[nodes], return_inverse=True)
-    position = np.zeros(len(used), dtype=np.int64)
-    position[local.ravel()] = nodes.ravel()
     return UntornMesh(
         cell_type=topology.cell_type,
         element=mesh.ufl_domain().ufl_coordinate_element(),
-        cells=ids[nodes],
+        cells=geometry_dofmap(mesh)[:owned],
         cell_ids=original_cells(mesh)[:owned],
         cell_tags=_values(cell_tags, np.arange(owned)),
         facet_tags=_values(facet_tags, cell_facets(mesh)),
-        node_ids=used,
-        x=mesh.geometry.x[position, :gdim],
+        node_ids=np.asarray(mesh.geometry.input_global_indices),
+        x=mesh.geometry.x[:, : mesh.geometry.dim],
         names=PhysicalNames(
             surfaces=_names(mesh, facet_tags, surfaces),
             volumes=_names(mesh, cell_tags, volumes),

@@ -14,6 +14,7 @@ import numpy as np
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
+from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import cell_permutation
 from tfeti_dolfinx.common.logging import stage
@@ -29,14 +30,8 @@ from tfeti_dolfinx.mesh.gmsh_model import (
     physical_names,
     read_content,
 )
-from tfeti_dolfinx.mesh.metis import metis
-from tfeti_dolfinx.mesh.partition import (
-    Subdomains,
-    assign_subdomains,
-    coordinate_bisection,
-    default_count,
-)
-from tfeti_dolfinx.mesh.tearing import tear
+from tfeti_dolfinx.mesh.partition import DEFAULT, Subdomains, check_partitioner, default_count
+from tfeti_dolfinx.mesh.tearing import decomposed
 from tfeti_dolfinx.mesh.untorn import (
     NO_TAG,
     UntornMesh,
@@ -45,6 +40,7 @@ from tfeti_dolfinx.mesh.untorn import (
     exchange_by_key,
     facet_keys,
     facet_vertices,
+    places,
     set_key,
 )
 
@@ -125,7 +121,7 @@ def check_shared(
     """
     exchange = exchange_by_key(comm, node_ids)
     node_ids, x = exchange.send(node_ids), exchange.send(x)
-    keys = set_key(mesh.cells[:, : mesh.num_vertices])
+    keys = set_key(mesh.node_ids[mesh.cells[:, : mesh.num_vertices]])
     exchange = exchange_by_key(comm, keys)
     keys, cell_ids = exchange.send(keys), exchange.send(mesh.cell_ids)
     with raised_on_all_ranks(comm):
@@ -185,18 +181,18 @@ def untorn_mesh(
     nodes = none.reshape(0, element.dim // gdim)
     empty = Elements(kind, kind_name, nodes, none, none.astype(np.int32), none)
     found = concatenated([empty, *(content.elements[top] for content in with_cells)])
-    cells = found.nodes[:, cell_permutation(cell_type, found.nodes.shape[1])]
     facets = [content.elements[top - 1] for content in contents if top - 1 in content.elements]
     all_ids = np.concatenate([empty.ids, *(content.node_ids for content in with_cells)])
     all_x = np.concatenate([np.empty((0, 3)), *(content.x for content in with_cells)])
     node_ids, first = np.unique(all_ids, return_index=True)
+    cells = places(node_ids, found.nodes)[:, cell_permutation(cell_type, found.nodes.shape[1])]
     mesh = UntornMesh(
         cell_type=cell_type,
         element=element,
         cells=cells,
         cell_ids=found.ids,
         cell_tags=found.tags,
-        facet_tags=_facet_tags(cells, cell_type, facets, comm if shared else MPI.COMM_SELF),
+        facet_tags=_facet_tags(cells, node_ids, cell_type, facets, comm if shared else None),
         node_ids=node_ids,
         x=np.ascontiguousarray(all_x[first, :gdim]),
         names=physical_names(contents, top, comm),
@@ -242,27 +238,41 @@ def _checked_extent(x: Array, gdim: int, comm: MPI.Intracomm) -> float:
 
 
 def _facet_tags(
-    cells: Array, cell_type: dmesh.CellType, facets: Sequence[Elements], comm: MPI.Intracomm
+    cells: Array,
+    node_ids: Array,
+    cell_type: dmesh.CellType,
+    facets: Sequence[Elements],
+    comm: MPI.Intracomm | None,
 ) -> Array:
     """Tag of each facet of each cell, shape ``(n, facets_per_cell)``. Collective.
 
-    A facet of a cell and the element that tags it meet on the rank that their key names; of several
-    elements the first counts.
+    A facet of a cell and the element that tags it meet on the rank that their key names, without
+    a communicator here; of several elements the first counts.
     """
-    keys = facet_keys(cells, cell_type)
-    corners = facet_vertices(cell_type).shape[1]
-    tagged = [set_key(elements.nodes[:, :corners]) for elements in facets]
-    known = np.concatenate([np.empty(0, dtype=np.uint64), *tagged])
+    corners = facet_vertices(cell_type)
+    tagged = np.concatenate(
+        [
+            np.empty((0, corners.shape[1]), np.int64),
+            *(e.nodes[:, : corners.shape[1]] for e in facets),
+        ]
+    )
     tags = np.concatenate([np.empty(0, dtype=np.int32), *(elements.tags for elements in facets)])
-    asking, telling = exchange_by_key(comm, keys.ravel()), exchange_by_key(comm, known)
+    near = np.arange(len(cells))
+    if comm is None:  # few cells have a facet whose vertices all have a facet that is tagged
+        some = np.isin(node_ids, tagged)[cells[:, : corners.max() + 1]]
+        near = near[np.sum(some, axis=1) >= corners.shape[1]]
+    meeting, known = comm or MPI.COMM_SELF, set_key(tagged)
+    keys = facet_keys(cells[near], node_ids, cell_type)
+    asking, telling = exchange_by_key(meeting, keys.ravel()), exchange_by_key(meeting, known)
     asked, known, tags = asking.send(keys.ravel()), telling.send(known), telling.send(tags)
-    found = np.full(len(asked), NO_TAG, dtype=np.int32)
+    hits: Array = np.full(len(asked), NO_TAG, dtype=np.int32)
     if len(known):
         known, first = np.unique(known, return_index=True)
         position = np.minimum(np.searchsorted(known, asked), len(known) - 1)
-        hit = known[position] == asked
-        found[hit] = tags[first[position[hit]]]
-    return asking.answer(found).reshape(keys.shape)
+        hits = np.where(known[position] == asked, tags[first[position]], hits)
+    found = np.full((len(cells), len(corners)), NO_TAG, dtype=np.int32)
+    found[near] = asking.answer(hits).reshape(keys.shape)
+    return found
 
 
 # --- Meshes of gmsh: physical groups, partitions, node numbers --------------------------------
@@ -272,6 +282,8 @@ def read_gmsh(
     source: str | PathLike[str] | Any,
     comm: MPI.Intracomm,
     subdomains: Subdomains | None = None,
+    *,
+    partitioner: str = DEFAULT,
 ) -> Decomposition:
     """Read a gmsh mesh and tear it into subdomains. Collective.
 
@@ -284,12 +296,12 @@ def read_gmsh(
     Args:
         source: A ``.msh`` file, or a gmsh model (``gmsh.model``) that is meshed on rank 0.
         comm: Communicator of the torn mesh.
-        subdomains: Their number (METIS, made round; split files: coordinate bisection); or
-            one id per cell on rank 0, in gmsh's order, and empty arrays elsewhere (for split
-            files one id per cell of the files that this rank reads, in the order of the files
-            and within a file in gmsh's order, without ghost cells); or a callable of cell
-            midpoints, shape ``(3, n)``. Default: gmsh's own partitions if the mesh has them
-            (split files: one subdomain per file), else about 4000 unknowns each.
+        subdomains: Their number; or one id per cell on rank 0, in gmsh's order, and empty arrays
+            elsewhere (for split files one id per cell of the files that this rank reads, in the
+            order of the files and within a file in gmsh's order, without ghost cells); or a
+            callable of cell midpoints, shape ``(3, n)``. Default: gmsh's own partitions if the
+            mesh has them (split files: one subdomain per file), else about 4000 unknowns each.
+        partitioner: What makes a number of subdomains, as for ``decompose``.
 
     Returns:
         The torn mesh, its tags and names those of the physical groups. Split files give the
@@ -320,6 +332,9 @@ def read_gmsh(
         (3, ["body 0 (volume 'steel')"])
     """
     checked_type(comm, MPI.Intracomm, "comm", "a communicator such as MPI.COMM_WORLD")
+    with agreeing(comm, "read_gmsh") as given:
+        check_partitioner(partitioner)
+        given["partitioner"] = partitioner
     seconds: dict[str, float] = {}
     with stage("mesh", seconds):
         files, contents = find_split_files(source, comm), list[ModelContent]()
@@ -333,9 +348,5 @@ def read_gmsh(
         untorn, partitions = untorn_mesh(contents, comm, shared=bool(files))
         if subdomains is None:
             subdomains = default_count(untorn, comm) if partitions is None else partitions
-        # METIS needs the mesh on one rank
-        partitioner = coordinate_bisection if files else metis
-        subdomain = assign_subdomains(untorn, subdomains, comm, partitioner)
-        bisected = bool(files) and isinstance(subdomains, (int, np.integer))
-        decomposition = tear(untorn, subdomain, comm, absorb=bisected)
+        decomposition = decomposed(untorn, subdomains, partitioner, comm, spread=not files)
     return replace(decomposition, seconds=seconds)

@@ -8,14 +8,23 @@ from dataclasses import replace
 import numpy as np
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.common.compat import create_mesh_in_place
 from tfeti_dolfinx.common.parallel import Exchange, bcast_from_root, offset_of, summed
+from tfeti_dolfinx.common.validation import is_whole, shown
+from tfeti_dolfinx.errors import InputError
+from tfeti_dolfinx.mesh.bisection import bisect_points
+from tfeti_dolfinx.mesh.cell_graph import CellGraph
 from tfeti_dolfinx.mesh.decomposition import Decomposition
-from tfeti_dolfinx.mesh.partition import absorb_fragments, bisect_points, split_disconnected
+from tfeti_dolfinx.mesh.partition import (
+    DEFAULT,
+    Subdomains,
+    checked_number,
+    connected_parts,
+    given_subdomains,
+    make_parts,
+)
 from tfeti_dolfinx.mesh.untorn import (
     NO_TAG,
     UntornMesh,
@@ -47,37 +56,34 @@ def deal(weights: Array, centres: Array, num_ranks: int) -> Array:
     return ranks
 
 
-def redistribute(
-    mesh: UntornMesh, subdomain: Array, comm: MPI.Intracomm
+def moved(
+    mesh: UntornMesh, rank: Array, values: Array, comm: MPI.Intracomm
 ) -> tuple[UntornMesh, Array]:
-    """Send every cell to the rank of its subdomain. Collective.
-
-    Return the share after the move, cells sorted by subdomain and then original id, and their
-    subdomains, shape ``(n,)`` as before.
-    """
-    num = comm.allreduce(int(subdomain.max(initial=-1)), op=MPI.MAX) + 1
-    terms = np.column_stack((np.ones(len(subdomain)), mesh.midpoints()))
-    sums = summed(comm, sum_rows(subdomain, terms, num))
-    ranks = bcast_from_root(comm, deal(sums[:, 0], sums[:, 1:] / sums[:, :1], comm.size))
-    destination = ranks[subdomain]
-    exchange = Exchange(comm, destination)
-    per_cell = ("cells", "cell_ids", "cell_tags", "facet_tags")
-    moved = {name: exchange.send(getattr(mesh, name)) for name in per_cell}
-    subdomain = exchange.send(subdomain)
-    order = np.lexsort((moved["cell_ids"], subdomain))
-    # the nodes of the cells that arrive
-    local = np.searchsorted(mesh.node_ids, mesh.cells)
+    """Send every cell, and its row of values, to a rank: return the new share. Collective."""
+    if comm.size == 1:
+        return mesh, values
+    # nodes that go to each rank, and the places of the cells' nodes among them
     count = max(len(mesh.node_ids), 1)
-    rank, node = np.divmod(np.unique(destination[:, None].astype(np.int64) * count + local), count)
-    exchange = Exchange(comm, rank)
-    node_ids, first = np.unique(exchange.send(mesh.node_ids[node]), return_index=True)
+    nodes, place = np.unique(
+        rank[:, None].astype(np.int64) * count + mesh.cells, return_inverse=True
+    )
+    to, node = np.divmod(nodes, count)
+    place = place.reshape(mesh.cells.shape) - np.searchsorted(to, rank)[:, None]
+    of_cells, of_nodes = Exchange(comm, rank), Exchange(comm, to)
+    node_ids, first, merged = np.unique(
+        of_nodes.send(mesh.node_ids[node]), return_index=True, return_inverse=True
+    )
+    place = of_cells.send(place) + np.searchsorted(of_nodes.source, of_cells.source)[:, None]
     share = replace(
         mesh,
+        cells=merged.ravel()[place],
         node_ids=node_ids,
-        x=exchange.send(mesh.x[node])[first],
-        **{name: values[order] for name, values in moved.items()},
+        x=of_nodes.send(mesh.x[node])[first],
+        cell_ids=of_cells.send(mesh.cell_ids),
+        cell_tags=of_cells.send(mesh.cell_tags),
+        facet_tags=of_cells.send(mesh.facet_tags),
     )
-    return share, subdomain[order]
+    return share, of_cells.send(values)
 
 
 # --- Tearing ----------------------------------------------------------------------------------
@@ -85,31 +91,63 @@ def redistribute(
 log = logging.getLogger(__name__)
 
 
-def tear(
-    untorn: UntornMesh, subdomain: Array, comm: MPI.Intracomm, absorb: bool = False
+def decomposed(
+    untorn: UntornMesh,
+    subdomains: Subdomains,
+    partitioner: str,
+    comm: MPI.Intracomm,
+    spread: bool = False,
 ) -> Decomposition:
-    """Tear this rank's share of a mesh along the interfaces of its subdomains. Collective.
+    """Tear a mesh into a number of subdomains, or those given for its cells. Collective.
 
-    These are numbered without holes. ``absorb`` lets fragments of a disconnected subdomain join a
-    neighbour where they can.
+    ``spread`` shares out the cells among ranks at first, where one rank has read them.
     """
-    share, subdomain = redistribute(untorn, subdomain, comm)
-    if absorb:
-        subdomain = absorb_fragments(share, subdomain, comm)
-        share, subdomain = redistribute(share, subdomain, comm)
-    subdomain, split = split_disconnected(share, subdomain, comm)
+    number = checked_number(subdomains, untorn, comm) if is_whole(subdomains) else 0
+    if number == 0 and partitioner != DEFAULT:
+        raise InputError(
+            f"partitioner={shown(partitioner)} with the subdomain of each cell; expected the "
+            "number of subdomains that it makes"
+        )
+    subdomain = np.zeros(len(untorn.cells), dtype=np.int64)
+    if number == 0:
+        subdomain = given_subdomains(untorn, subdomains, comm)
+    if spread and comm.size > 1:
+        rank = bisect_points(untorn.midpoints(), comm.size, comm)
+        untorn, subdomain = moved(untorn, rank, subdomain, comm)
+    graph = CellGraph(untorn, comm)
+    if number:
+        subdomain = make_parts(untorn, graph, number, partitioner)
+    pieces = graph.pieces(subdomain)
+    of_piece, split, body = connected_parts(pieces, absorb=number > 0)
     if split and comm.rank == 0:
         log.warning("subdomains that were not connected have been split: %s", split)
+    return replace(
+        tear(untorn, of_piece[pieces.of_cell], comm), split=split, body_of_subdomain=body
+    )
+
+
+def tear(untorn: UntornMesh, subdomain: Array, comm: MPI.Intracomm) -> Decomposition:
+    """Tear a mesh along the interfaces of its subdomains, each on one rank then. Collective.
+
+    These are connected, and numbered without holes.
+    """
+    num = comm.allreduce(int(subdomain.max(initial=-1)), op=MPI.MAX) + 1
+    terms = np.column_stack((np.ones(len(subdomain)), untorn.midpoints()))
+    sums = summed(comm, sum_rows(subdomain, terms, num))
+    ranks = bcast_from_root(comm, deal(sums[:, 0], sums[:, 1:] / sums[:, :1], comm.size))
+    share, subdomain = moved(untorn, ranks[subdomain], subdomain, comm)
+    order = np.lexsort((share.cell_ids, subdomain))
     # nodes of the torn mesh: one copy for each subdomain
     stride = max(len(share.node_ids), 1)
-    local = np.searchsorted(share.node_ids, share.cells)
-    copies, torn = np.unique(subdomain[:, None] * stride + local, return_inverse=True)
+    copies, torn = np.unique(
+        subdomain[order, None] * stride + share.cells[order], return_inverse=True
+    )
     node, start = copies % stride, offset_of(comm, len(copies))
     cells = start + torn.reshape(share.cells.shape)
     mesh = create_mesh_in_place(comm, cells, share.x[node], share.element)
-    cell = np.asarray(mesh.topology.original_cell_index) - offset_of(comm, len(cells))
+    cell = order[np.asarray(mesh.topology.original_cell_index) - offset_of(comm, len(cells))]
     facets = cell_facets(mesh)
-    tears, boundary, pairs = _tears(mesh, facets, share, cell, subdomain[cell])
+    tears, boundary = _tears(mesh, facets, share, cell)
     tdim = mesh.topology.dim
     return Decomposition(
         mesh=mesh,
@@ -119,10 +157,10 @@ def tear(
         cell_subdomain=subdomain[cell],
         original_cells=share.cell_ids[cell],
         original_nodes=share.node_ids[node][mesh.geometry.input_global_indices - start],
-        body_of_subdomain=_bodies(pairs, subdomain, comm),
+        body_of_subdomain=np.zeros(num, dtype=np.int64),
         tears=tears,
         boundary=boundary,
-        split=split,
+        split={},
     )
 
 
@@ -137,9 +175,9 @@ def _tagged(mesh: dmesh.Mesh, dim: int, entities: Array, tags: Array, name: str)
 
 
 def _tears(
-    mesh: dmesh.Mesh, facets_of_cells: Array, share: UntornMesh, cell: Array, subdomain: Array
-) -> tuple[Array, Array, Array]:
-    """Facets on tears, facets on the true boundary, and pairs of subdomains that share a tear.
+    mesh: dmesh.Mesh, facets_of_cells: Array, share: UntornMesh, cell: Array
+) -> tuple[Array, Array]:
+    """Facets on tears, and facets on the true boundary.
 
     Keys of all exterior facets meet on the rank that the key names.
     """
@@ -148,22 +186,11 @@ def _tears(
     exterior[dmesh.exterior_facet_indices(mesh.topology)] = True
     row, local = np.nonzero(exterior[facets_of_cells])
     facets = facets_of_cells[row, local]
-    keys = facet_keys(share.cells[cell], share.cell_type)[row, local]
+    keys = facet_keys(share.cells[cell[row]], share.node_ids, share.cell_type)
+    keys = keys[np.arange(len(row)), local]
     exchange = exchange_by_key(mesh.comm, keys)
-    owner = exchange.send(subdomain[row])
-    first, second = equal_pairs(exchange.send(keys))
-    torn = np.zeros(len(owner), dtype=bool)
-    torn[first] = torn[second] = True
+    met = exchange.send(keys)
+    torn = np.zeros(len(met), dtype=bool)
+    torn[np.concatenate(equal_pairs(met))] = True
     is_tear = exchange.answer(torn)
-    pairs = np.unique(np.sort(np.stack((owner[first], owner[second]), axis=1), axis=1), axis=0)
-    return np.sort(facets[is_tear]), np.sort(facets[~is_tear]), pairs
-
-
-def _bodies(pairs: Array, subdomain: Array, comm: MPI.Intracomm) -> Array:
-    """Body of every subdomain, numbered by their lowest subdomains."""
-    n = comm.allreduce(int(subdomain.max(initial=-1)), op=MPI.MAX) + 1
-    edges = np.concatenate(comm.allgather(pairs))
-    graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(n, n))
-    _, body = connected_components(graph, directed=False)
-    _, first = np.unique(body, return_index=True)
-    return np.argsort(np.argsort(first))[body]
+    return np.sort(facets[is_tear]), np.sort(facets[~is_tear])

@@ -50,10 +50,14 @@ def facet_vertices(cell_type: dmesh.CellType) -> Array:
     return np.array(cell_entities(cell_type, cell_dim(cell_type) - 1))
 
 
-def facet_keys(cells: Array, cell_type: dmesh.CellType) -> Array:
-    """Return keys of all facets of cells, from their node ids, vertices first, ``(n, facets)``."""
-    mixed = mix(cells[:, : len(cell_entities(cell_type, 0))])
-    return mixed[:, facet_vertices(cell_type)].sum(axis=-1, dtype=np.uint64)
+def facet_keys(cells: Array, ids: Array, cell_type: dmesh.CellType) -> Array:
+    """Return keys of all facets of cells of local nodes with these ids, shape ``(n, facets)``."""
+    mixed = mix(ids)[cells[:, : len(cell_entities(cell_type, 0))]]
+    keys = np.zeros((len(cells), len(facet_vertices(cell_type))), dtype=np.uint64)
+    for key, vertices in zip(keys.T, facet_vertices(cell_type), strict=True):
+        for vertex in vertices:
+            key += mixed[:, vertex]
+    return keys
 
 
 def equal_pairs(keys: Array) -> tuple[Array, Array]:
@@ -61,6 +65,15 @@ def equal_pairs(keys: Array) -> tuple[Array, Array]:
     order = np.argsort(keys, kind="stable")
     same = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
     return order[same], order[same + 1]
+
+
+def places(known: Array, ids: Array) -> Array:
+    """Places of ids, of any shape, in an ascending array that has all of them."""
+    if len(known) and known[-1] - known[0] < 4 * ids.size:
+        table = np.empty(known[-1] - known[0] + 1, dtype=np.int64)
+        table[known - known[0]] = np.arange(len(known))
+        return table[ids - known[0]]
+    return np.searchsorted(known, ids)
 
 
 def exchange_by_key(comm: MPI.Intracomm, keys: Array) -> Exchange:
@@ -95,11 +108,12 @@ class UntornMesh:
     Attributes:
         cell_type: Type of all cells.
         element: Coordinate element (basix.ufl), the same on all ranks.
-        cells: Original node ids in DOLFINx's order, shape ``(n, nodes_per_cell)``.
+        cells: Nodes of each cell in DOLFINx's order, their places in ``node_ids``, shape
+            ``(n, nodes_per_cell)``.
         cell_ids: Original ids of the cells, shape ``(n,)``.
         cell_tags: Material tags, shape ``(n,)``, NO_TAG where there is none.
         facet_tags: Tags of the cells' facets, shape ``(n, facets_per_cell)``, NO_TAG likewise.
-        node_ids: Original ids of the nodes of these cells, ascending, shape ``(p,)``.
+        node_ids: Original ids of the nodes of these cells, each once, shape ``(p,)``.
         x: Coordinates of these nodes, shape ``(p, gdim)``.
         names: Names of the physical groups, the same on all ranks.
     """
@@ -124,21 +138,14 @@ class UntornMesh:
         """Vertices of a cell."""
         return len(cell_entities(self.cell_type, 0))
 
+    def corners(self) -> Array:
+        """Vertices of each cell, shape ``(n, vertices, gdim)``."""
+        return self.x[self.cells[:, : self.num_vertices]]
+
     def midpoints(self) -> Array:
         """Mean of each cell's vertices, shape ``(n, gdim)``."""
         return self.corners().mean(axis=1)
 
-    def corners(self) -> Array:
-        """Vertices of each cell, shape ``(n, vertices, gdim)``."""
-        vertices = np.searchsorted(self.node_ids, self.cells[:, : self.num_vertices])
-        return self.x[vertices]
-
-    def neighbours(self, colours: Array | None = None) -> tuple[Array, Array]:
-        """Return pairs of local cells that share a facet, and a colour if colours are given."""
-        keys = facet_keys(self.cells, self.cell_type)
-        first, second = equal_pairs(keys.ravel())
-        first, second = first // keys.shape[1], second // keys.shape[1]
-        if colours is None:
-            return first, second
-        same = colours[first] == colours[second]
-        return first[same], second[same]
+    def facet_keys(self) -> Array:
+        """Return keys of the cells' facets that all ranks agree on, ``(n, facets_per_cell)``."""
+        return facet_keys(self.cells, self.node_ids, self.cell_type)

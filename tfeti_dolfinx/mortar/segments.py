@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import Exchange
-from tfeti_dolfinx.mesh.partition import bisect_points
+from tfeti_dolfinx.mesh.bisection import bisect_points
 from tfeti_dolfinx.mortar.clipping import CommonParts, common_parts, contains, sizes
 from tfeti_dolfinx.mortar.facets import (
     POLYGON,

@@ -1,0 +1,249 @@
+"""Round parts of a distributed mesh: balanced k-means, then smooth interfaces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+
+from tfeti_dolfinx.common.arrays import TINY, Array, sum_rows
+from tfeti_dolfinx.common.parallel import any_rank, box_over_ranks, summed
+from tfeti_dolfinx.mesh.bisection import PARAMETERS as BISECTION
+from tfeti_dolfinx.mesh.bisection import bisect_points
+from tfeti_dolfinx.mesh.cell_graph import CellGraph, incidence
+from tfeti_dolfinx.mesh.untorn import UntornMesh, mix
+
+
+@dataclass(frozen=True)
+class RoundParameters:
+    """Parameters of round parts.
+
+    Attributes:
+        stages: Of k-means: points of each part that are looked at, rounds with them, and the share
+            of the way to the means that centres go in a round. Few points find the centres roughly,
+            more make them better, and all points find the parts.
+        influence_step: Factor by which a part's influence changes in a round at most.
+        candidates: Parts that a point may join in a round, those nearest to its own.
+        fewest: Cells of a part in the mean, below which parts are those of bisection.
+        largest: Size over the mean, above which round parts are not taken.
+        facet: Weight of a facet over that of a vertex that a cell shares with another part.
+        flattening: Rounds in which cells change sides, until interfaces are flat.
+        gains: Size over the mean, above which a part gains no cells where interfaces are flattened.
+        loses: Size over the mean, below which it loses none.
+        bits: Of the whole numbers that midpoints become along each axis.
+    """
+
+    stages: tuple[tuple[float, int, float], ...] = (
+        (300, 20, 0.0),
+        (300, 30, 0.5),
+        (1000, 10, 0.5),
+        (1000, 5, 0.0),
+        (np.inf, 3, 0.0),
+    )
+    influence_step: float = 1.1
+    candidates: int = 16
+    fewest: int = 20
+    largest: float = 1.1
+    facet: float = 12.0
+    flattening: int = 10
+    gains: float = 1.08
+    loses: float = 0.93
+    bits: int = 20
+
+
+ROUND = RoundParameters()
+
+
+def round_parts(mesh: UntornMesh, graph: CellGraph, num_parts: int) -> Array:
+    """Part of each cell, by balanced k-means with smooth interfaces. Collective.
+
+    Each body gets a share of the parts by its number of cells, and at least one. Bodies of flat
+    cells, and of few cells a part, get parts by bisection, whose cuts follow layers. Some parts may
+    not be connected. The parts do not depend on how ranks share the cells.
+    """
+    comm, bodies = graph.comm, graph.pieces(np.zeros(graph.num_cells, dtype=np.int64))
+    body, sizes = bodies.of_cell, bodies.size
+    shares = _shares(sizes, num_parts)
+    extents = np.ptp(mesh.corners(), axis=1)
+    flat = np.any(BISECTION.flat * extents <= extents.max(axis=1, initial=0.0)[:, None], axis=1)
+    boxes = 2 * _counts(comm, body[flat], len(sizes)) > sizes
+    boxes |= (sizes < ROUND.fewest * shares) | (shares == 1)
+    # integers, so that sums do not depend on how ranks share the cells
+    x = mesh.midpoints()
+    low, high = box_over_ranks(comm, x)
+    grid = np.rint((x - low) * (2.0**ROUND.bits / max(np.max(high - low), TINY)))
+    key = np.zeros(len(x), dtype=np.uint64)
+    for c in grid.T:
+        key = mix(key ^ c.astype(np.uint64))
+    home = np.repeat(np.arange(len(sizes)), shares)
+    wanted = (sizes / shares)[home]
+    part, rounded = np.zeros(len(x), dtype=np.int64), ~boxes[body]
+    if not np.all(boxes):
+        found = balanced_kmeans(grid[rounded], key[rounded], body[rounded], shares, comm)
+        size = _counts(comm, found, len(home))
+        boxes[home[(size > ROUND.largest * wanted) | (size == 0)]] = True
+        part[rounded], rounded = found, ~boxes[body]
+    part[~rounded] = bisect_points(
+        x[~rounded], shares, comm, extents[~rounded], body=body[~rounded]
+    )
+    return flatten_interfaces(graph, part, key, np.where(boxes[home], 0.0, wanted))
+
+
+def _counts(comm: MPI.Intracomm, part: Array, num_parts: int) -> Array:
+    return summed(comm, np.bincount(part, minlength=num_parts))
+
+
+def _shares(weights: Array, num_parts: int) -> Array:
+    """Split a number of parts by weights (largest remainders), at least one each."""
+    exact = weights / max(weights.sum(), 1) * num_parts
+    shares = np.maximum(np.floor(exact).astype(np.int64), 1)
+    shares[np.argsort(shares - exact, kind="stable")[: max(num_parts - shares.sum(), 0)]] += 1
+    return np.minimum(shares, weights)
+
+
+# --- Balanced k-means: parts of round shape and equal size ------------------------------------
+
+
+def balanced_kmeans(x: Array, key: Array, body: Array, shares: Array, comm: MPI.Intracomm) -> Array:
+    """Balanced k-means of points, whole numbers ``(n, gdim)``, in so many parts a body. Collective.
+
+    A point is in the part of its body with the least ‖x − c_k‖/w_k, the centre c_k being the mean
+    of the part, and the influence w_k what gives all parts the same number of points, so that parts
+    are round where a mesh is graded, too (von Looz, Tzovas, Meyerhenke, ICPP 2018,
+    doi:10.1145/3225058.3225148). Cells stay where they are: sums travel. The keys, ``(n,)``, draw
+    a sample, whose bisection is the beginning.
+    """
+    home = np.repeat(np.arange(len(shares)), shares)
+    total, (n, gdim) = int(_counts(comm, body, len(shares)).sum()), x.shape
+    centre, influence = np.zeros((len(home), gdim)), np.ones(len(home))
+    for sample, rounds, way in ROUND.stages:
+        some: Array = np.arange(n)
+        if sample * len(home) < total:
+            some = np.flatnonzero(key % np.uint64(total // (sample * len(home))) == 0)
+        y, of = x[some], body[some]
+        if np.any(centre):  # the nearest centre, of a body: they are apart along one more axis
+            apart = 2.0 ** (ROUND.bits + 2)
+            tree = cKDTree(np.column_stack((centre, apart * home)))
+            own = tree.query(np.column_stack((y, apart * of)))[1].astype(np.int64)
+            own = _nearest(y, own, centre, influence, home)
+        else:
+            own = bisect_points(y, shares, comm, body=of)
+            centre = _means(y, own, centre, comm)
+            away = np.rint(np.sqrt(_squares(y, centre[own])))
+            spread = summed(comm, np.bincount(own, away, minlength=len(home)))
+            influence = np.maximum(spread / np.maximum(_counts(comm, own, len(home)), 1), 1.0)
+        goal = (_counts(comm, of, len(shares)) / shares)[home]
+        for _ in range(rounds):
+            centre += way * (_means(y, own, centre, comm) - centre)
+            size = np.maximum(_counts(comm, own, len(home)), 1)
+            step = ROUND.influence_step
+            influence *= np.clip((goal / size) ** (1.0 / gdim), 1.0 / step, step)
+            own = _nearest(y, own, centre, influence, home)
+    return own
+
+
+def _means(x: Array, part: Array, before: Array, comm: MPI.Intracomm) -> Array:
+    """Return the means of the parts; means of empty parts do not change."""
+    terms = np.column_stack((np.ones(len(x)), x))
+    sums = summed(comm, sum_rows(part, terms, len(before)))
+    size = sums[:, :1]
+    return np.where(size > 0, sums[:, 1:] / np.maximum(size, 1.0), before)
+
+
+def _squares(x: Array, c: Array) -> Array:
+    """‖x − c‖², each in the same way wherever it stands."""
+    found = np.square(x[..., 0] - c[..., 0])
+    for k in range(1, x.shape[-1]):
+        found += np.square(x[..., k] - c[..., k])
+    return found
+
+
+def _nearest(x: Array, part: Array, centre: Array, influence: Array, home: Array) -> Array:
+    """Return the part with the least ‖x − c‖/w among those of its body near the present one."""
+    order, found = np.argsort(part, kind="stable"), part.copy()
+    size = np.bincount(part, minlength=len(centre))
+    present = np.flatnonzero(size)
+    parts = np.split(order, np.cumsum(size[present])[:-1])
+    apart = np.sqrt(_squares(centre[present][:, None], centre))
+    apart /= influence[present][:, None] + influence
+    apart[home[present][:, None] != home] = np.inf
+    near: Array = np.argsort(apart, axis=1, kind="stable")[:, : ROUND.candidates]
+    reached = np.take_along_axis(apart, near, axis=1) < np.inf
+    for own, candidates, chosen in zip(parts, near, reached, strict=True):
+        joined = candidates[chosen]
+        squares = _squares(x[own][:, None], centre[joined])
+        found[own] = joined[np.argmin(squares / influence[joined] ** 2, axis=1)]
+    return found
+
+
+# --- Smoothing of interfaces between parts ----------------------------------------------------
+
+
+def flatten_interfaces(graph: CellGraph, part: Array, key: Array, wanted: Array) -> Array:
+    """Move cells to the neighbouring part that most of their surroundings belong to. Collective.
+
+    Of each part count the cells that share a vertex with a cell, once for each such vertex, and
+    those that share a facet with it twelve times more. A cell that counts more of a neighbour's
+    part than of its own joins it, which takes off what sticks out of an interface. Some of the new
+    parts may no longer be connected through facets. ``wanted`` is the number of cells that each
+    part should have, 0 where it stays as it is; the keys of the cells, ``(n,)``, draw lots.
+    """
+    n, num_parts, comm = graph.num_cells, len(wanted), graph.comm
+    around = incidence(graph.vertices, graph.num_nodes + 1).T.tocsr()
+    beside = graph.beside()
+    first, second = graph.pairs
+    every, active = graph.with_ghosts(part.astype(np.int32)), np.ones(n, dtype=bool)
+    for turn in range(ROUND.flattening):
+        cut = every[first] != every[second]
+        at_cut = np.zeros(len(every), dtype=bool)
+        at_cut[first[cut]] = at_cut[second[cut]] = True
+        near = np.flatnonzero(at_cut[:n] & active)
+        own = every[near]
+        mine, most, best = _majority(every, graph.vertices[near], around, beside[near], own)
+        wants = (most > mine) & (wanted[own] > 0)
+        if not any_rank(comm, bool(np.any(wants))):
+            break
+        # half of those that want to move, so that neighbours do not just exchange their parts
+        lot = mix(key[near] + np.uint64(turn)) & np.uint64(1)
+        size = _counts(comm, every[:n], num_parts) / np.maximum(wanted, 1.0)
+        moving = wants & (lot == 0)
+        moving &= (size[best] < ROUND.gains) & (size[own] > ROUND.loses)
+        part = every[:n].copy()
+        part[near[moving]] = best[moving]
+        now = graph.with_ghosts(part)
+        touched = np.zeros(graph.num_nodes + 1, dtype=bool)
+        touched[graph.vertices[now != every]] = True
+        touched[-1] = False
+        active = np.any(touched[graph.vertices[:n]], axis=1)
+        active[near[wants]] = True
+        every = now
+    return every[:n]
+
+
+def _majority(
+    every: Array, corners: Array, around: csr_array, beside: csr_array, own: Array
+) -> tuple[Array, Array, Array]:
+    """Return of each cell its own part's count, and of the others' the highest and its part.
+
+    ``around`` has the cells at each node, ``beside`` each of these cells and those across a facet.
+    """
+    num_parts = int(every.max(initial=0)) + 1
+    nodes, place = np.unique(corners, return_inverse=True)
+    met = around[nodes]
+    met = csr_array((met.data, every[met.indices], met.indptr), shape=(len(nodes), num_parts))
+    shape = (len(own), num_parts)
+    facets = csr_array((beside.data, every[beside.indices], beside.indptr), shape=shape)
+    facets.sum_duplicates()
+    counted = incidence(place.reshape(corners.shape), len(nodes)) @ met
+    counted = csr_array(counted.multiply(facets > 0) + ROUND.facet * facets)
+    counted.sort_indices()
+    is_own = counted.indices == np.repeat(own, np.diff(counted.indptr))
+    mine, start = counted.data[is_own] - ROUND.facet, counted.indptr[:-1]
+    counted.data[is_own] = 0.0
+    most = np.maximum.reduceat(counted.data, start) if len(own) else mine
+    less = counted.data < np.repeat(most, np.diff(counted.indptr))
+    part = np.where(less, num_parts, counted.indices)  # of equal ones the first
+    return mine, most, np.minimum.reduceat(part, start) if len(own) else own
