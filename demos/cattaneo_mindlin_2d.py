@@ -133,7 +133,7 @@ def configure(parser):
 
 
 def configure_mesh(parser):
-    parser.add_argument("--subdomains", type=int, help="METIS parts")
+    parser.add_argument("--subdomains", type=int, help="their number")
     parser.add_argument("--refine", type=int, default=0, help="how often elements are halved")
 
 

@@ -150,7 +150,7 @@ def main(argv):
 
 def configure(parser):
     parser.add_argument("--size", type=float, help="of the hexahedra, in mm")
-    parser.add_argument("--subdomains", type=int, help="METIS parts")
+    parser.add_argument("--subdomains", type=int, help="their number")
     parser.add_argument("--friction", type=float, default=0.3, help="its coefficient")
     parser.add_argument("--load", type=float, default=LOAD, help="along the support, in N")
     parser.add_argument("--large", action="store_true", help="250 subdomains, 1.6 M unknowns")

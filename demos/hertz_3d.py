@@ -36,7 +36,7 @@ HERTZ = PointContact.from_half_width(a, R, E / (1 - nu**2))
 def torn_mesh(arguments):
     # ## Mesh
     #
-    # gmsh meshes on rank 0, `read_gmsh` partitions with METIS. All element sizes are scaled by
+    # gmsh meshes on rank 0, `read_gmsh` makes subdomains. All element sizes are scaled by
     # one factor to come near the number of unknowns that is asked for.
     comm = MPI.COMM_WORLD
     unknowns = arguments.unknowns or (6_000 if arguments.quick else 60_000)
@@ -112,7 +112,7 @@ def main(argv):
 
 def configure(parser):
     parser.add_argument("--unknowns", type=int, help="about so many unknowns")
-    parser.add_argument("--subdomains", type=int, help="METIS parts")
+    parser.add_argument("--subdomains", type=int, help="their number")
 
 
 if __name__ == "__main__":

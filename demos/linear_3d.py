@@ -34,8 +34,7 @@ def run(argv):
 
     # ## Mesh
     #
-    # A box of tetrahedra, its upper half of another material. The subdomains come from recursive
-    # bisection.
+    # A box of tetrahedra, its upper half of another material. `decompose` makes the subdomains.
     n = arguments.cells or (4 if arguments.quick else 12)
     box = dmesh.create_box(comm, [(0, 0, 0), (4, 1, 1)], [4 * n, n, n])
     cells = np.arange(box.topology.index_map(3).size_local, dtype=np.int32)
@@ -90,7 +89,7 @@ def main(argv):
 
 
 def configure(parser):
-    parser.add_argument("--subdomains", type=int, default=16, help="parts of the bisection")
+    parser.add_argument("--subdomains", type=int, default=16, help="their number")
     parser.add_argument("--cells", type=int, help="cubes along the height of the beam")
     parser.add_argument("--degree", type=int, default=1, help="of the displacement")
     parser.add_argument("--ratio", type=float, default=10.0, help="modulus of the upper half")

@@ -44,7 +44,7 @@ CLOSED = PartialSlip(HERTZ, mu)
 def torn_mesh(arguments):
     # ## Mesh
     #
-    # Two boxes that are mirror images, at first flat on each other. METIS parts them.
+    # Two boxes that are mirror images, at first flat on each other. `read_gmsh` parts them.
     comm, model = MPI.COMM_WORLD, None
     elements = arguments.elements or (4 if arguments.quick else 10)
     if comm.rank == 0:
@@ -125,7 +125,7 @@ def main(argv):
 
 
 def configure(parser):
-    parser.add_argument("--subdomains", type=int, help="METIS parts")
+    parser.add_argument("--subdomains", type=int, help="their number")
     parser.add_argument("--elements", type=int, help="elements along the radius a")
     parser.add_argument("--steps", type=int, help="load steps of Q, up to 0.8 μP")
 

@@ -108,7 +108,7 @@ def main(argv):
 
 
 def configure(parser):
-    parser.add_argument("--subdomains", type=int, default=16, help="parts of the bisection")
+    parser.add_argument("--subdomains", type=int, default=16, help="their number")
     parser.add_argument("--cells", type=int, help="cells along an edge of the block")
     parser.add_argument("--no-wall", action="store_true", help="let the block slide freely")
 

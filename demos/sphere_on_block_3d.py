@@ -34,7 +34,7 @@ def run(argv):
 
     # ## Mesh
     #
-    # gmsh meshes on rank 0, `read_gmsh` partitions with METIS. All element sizes are scaled by
+    # gmsh meshes on rank 0, `read_gmsh` makes subdomains. All element sizes are scaled by
     # one factor to come near the number of unknowns that is asked for.
     R, E, nu = 1.0, 1.0, 0.3
     a = 0.05 * R
@@ -117,7 +117,7 @@ def main(argv):
 
 def configure(parser):
     parser.add_argument("--unknowns", type=int, help="about so many unknowns")
-    parser.add_argument("--subdomains", type=int, help="METIS parts")
+    parser.add_argument("--subdomains", type=int, help="their number")
     parser.add_argument("--exchange", action="store_true", help="multipliers on the ball")
 
 

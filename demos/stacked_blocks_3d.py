@@ -101,7 +101,7 @@ def main(argv):
 
 
 def configure(parser):
-    parser.add_argument("--subdomains", type=int, default=16, help="METIS parts")
+    parser.add_argument("--subdomains", type=int, default=16, help="their number")
     parser.add_argument("--cells", type=int, help="hexahedra along an edge of a block, about")
 
 

@@ -15,9 +15,7 @@ from scenes import curved_obstacle, decomposed, displacement, forms, problem, re
 from test_gmsh import two_bodies
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.mesh import dolfinx_input
-from tfeti_dolfinx.mesh import gmsh_reading as reading
-from tfeti_dolfinx.mesh.partition import assign_subdomains
+from tfeti_dolfinx.mesh import tearing
 from tfeti_dolfinx.output import write_vtx, write_xdmf
 from tfeti_dolfinx.plot import plot_deformed, plot_pressure
 
@@ -169,12 +167,11 @@ def test_a_gmsh_mesh_with_few_partitions(comm, shared_tmp, partitions, files):
 def test_demos(name, comm, shared_tmp, monkeypatch):
     """Every subdomain that a demo asks for becomes one, or one for each body."""
 
-    def few(mesh, subdomains, comm, partition):
-        ids = assign_subdomains(mesh, subdomains, comm, partition)
-        return np.zeros_like(ids)
+    def few(mesh, *_):
+        return np.zeros(len(mesh.cells), dtype=np.int64)
 
-    for module in (dolfinx_input, reading):
-        monkeypatch.setattr(module, "assign_subdomains", few)
+    for name_of_maker in ("make_parts", "given_subdomains"):
+        monkeypatch.setattr(tearing, name_of_maker, few)
     demo = importlib.import_module(f"demos.{name}")
     report_file, folder = shared_tmp / "report.json", shared_tmp / "out"
     solution = demo.main(

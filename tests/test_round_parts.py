@@ -77,8 +77,8 @@ def cuts(graph, part):
 def test_slabs_become_round_and_stay_balanced():
     x, own = whole_midpoints(24), slice(COMM.rank, None, COMM.size)
     key, body = np.arange(len(x), dtype=np.uint64), np.zeros(len(x), dtype=np.int64)
-    found = balanced_kmeans(x[own], key[own], body[own], np.array([12]), COMM)
-    alone = balanced_kmeans(x, key, body, np.array([12]), MPI.COMM_SELF)
+    found, _ = balanced_kmeans(x[own], key[own], body[own], np.array([12]), COMM)
+    alone, _ = balanced_kmeans(x, key, body, np.array([12]), MPI.COMM_SELF)
     assert np.array_equal(found, alone[own])
     size = np.bincount(alone, minlength=12)
     assert size.min() > 0
@@ -86,7 +86,7 @@ def test_slabs_become_round_and_stay_balanced():
     assert spread(x, alone) < 0.6 * spread(x, (x[:, 0] // 2).astype(int))
     x = whole_midpoints(16)
     cubes = np.ravel_multi_index((x // 8).astype(int).T, (2, 2, 2))
-    found = balanced_kmeans(x, key[: len(x)], body[: len(x)], np.array([8]), MPI.COMM_SELF)
+    found, _ = balanced_kmeans(x, key[: len(x)], body[: len(x)], np.array([8]), MPI.COMM_SELF)
     assert len(np.unique(np.stack((cubes, found)), axis=1).T) == 8
 
 

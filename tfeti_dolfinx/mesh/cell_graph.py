@@ -1,4 +1,4 @@
-"""Which cells of an untorn mesh share facets or vertices, on any ranks; their connected pieces."""
+"""Cells of an untorn mesh that share facets or vertices, on any ranks; their connected pieces."""
 
 from __future__ import annotations
 

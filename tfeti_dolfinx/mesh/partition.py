@@ -27,8 +27,7 @@ UNKNOWNS = 4000
 
 
 def _bisection(mesh: UntornMesh, graph: CellGraph, num_parts: int) -> Array:
-    extents = np.ptp(mesh.corners(), axis=1)
-    return bisect_points(mesh.midpoints(), num_parts, graph.comm, extents)
+    return bisect_points(mesh.midpoints(), num_parts, graph.comm, mesh.extents())
 
 
 PARTITIONERS = {"round": round_parts, "bisection": _bisection}

@@ -33,6 +33,8 @@ class RoundParameters:
         flattening: Rounds in which cells change sides, until interfaces are flat.
         gains: Size over the mean, above which a part gains no cells where interfaces are flattened.
         loses: Size over the mean, below which it loses none.
+        slender: Bisection is tried where the ratio of a part's principal radii is at most so many
+            times that of round parts.
         bits: Of the whole numbers that midpoints become along each axis.
     """
 
@@ -51,6 +53,7 @@ class RoundParameters:
     flattening: int = 10
     gains: float = 1.08
     loses: float = 0.93
+    slender: float = 1.15
     bits: int = 20
 
 
@@ -61,13 +64,14 @@ def round_parts(mesh: UntornMesh, graph: CellGraph, num_parts: int) -> Array:
     """Part of each cell, by balanced k-means with smooth interfaces. Collective.
 
     Each body gets a share of the parts by its number of cells, and at least one. Bodies of flat
-    cells, and of few cells a part, get parts by bisection, whose cuts follow layers. Some parts may
-    not be connected. The parts do not depend on how ranks share the cells.
+    cells, and of few cells a part, get parts by bisection, whose cuts follow layers; and those
+    whose parts by bisection are neither more slender nor cut more facets, as boxes of a grid. Some
+    parts may not be connected. The parts do not depend on how ranks share the cells.
     """
     comm, bodies = graph.comm, graph.pieces(np.zeros(graph.num_cells, dtype=np.int64))
     body, sizes = bodies.of_cell, bodies.size
     shares = _shares(sizes, num_parts)
-    extents = np.ptp(mesh.corners(), axis=1)
+    extents = mesh.extents()
     flat = np.any(BISECTION.flat * extents <= extents.max(axis=1, initial=0.0)[:, None], axis=1)
     boxes = 2 * _counts(comm, body[flat], len(sizes)) > sizes
     boxes |= (sizes < ROUND.fewest * shares) | (shares == 1)
@@ -80,16 +84,35 @@ def round_parts(mesh: UntornMesh, graph: CellGraph, num_parts: int) -> Array:
         key = mix(key ^ c.astype(np.uint64))
     home = np.repeat(np.arange(len(sizes)), shares)
     wanted = (sizes / shares)[home]
-    part, rounded = np.zeros(len(x), dtype=np.int64), ~boxes[body]
+    rounded = ~boxes[body]
+    part: Array = np.zeros(len(x), dtype=np.int64)
+    maybe = boxes.copy()
     if not np.all(boxes):
-        found = balanced_kmeans(grid[rounded], key[rounded], body[rounded], shares, comm)
+        y, first = grid[rounded], np.cumsum(shares) - shares
+        found, begun = balanced_kmeans(y, key[rounded], body[rounded], shares, comm)
         size = _counts(comm, found, len(home))
         boxes[home[(size > ROUND.largest * wanted) | (size == 0)]] = True
-        part[rounded], rounded = found, ~boxes[body]
-    part[~rounded] = bisect_points(
-        x[~rounded], shares, comm, extents[~rounded], body=body[~rounded]
-    )
-    return flatten_interfaces(graph, part, key, np.where(boxes[home], 0.0, wanted))
+        part[rounded] = found
+        part = flatten_interfaces(graph, part, key, np.where(boxes[home], 0.0, wanted))
+        worst = np.maximum.reduceat(
+            np.stack((begun, _slenderness(y, found, len(home), comm))), first, axis=1
+        )
+        maybe = boxes | (worst[0] <= ROUND.slender * worst[1])
+    if np.any(maybe):
+        some, other = maybe[body], part.copy()
+        other[some] = bisect_points(x[some], shares, comm, extents[some], body=body[some])
+        cuts = [_cut_facets(graph, parts, body, len(sizes)) for parts in (other, part)]
+        boxes |= maybe & (cuts[0] <= cuts[1])
+        part = np.where(boxes[body], other, part)
+    return part
+
+
+def _cut_facets(graph: CellGraph, part: Array, body: Array, num_bodies: int) -> Array:
+    """Twice the number of facets between parts of each body, shape ``(num_bodies,)``."""
+    first, second = graph.pairs
+    cut = part[first] != graph.with_ghosts(part)[second]
+    sides = np.where(second < graph.num_cells, 2, 1)[cut]  # ghosts' facets count on two ranks
+    return summed(graph.comm, np.bincount(body[first[cut]], sides, minlength=num_bodies))
 
 
 def _counts(comm: MPI.Intracomm, part: Array, num_parts: int) -> Array:
@@ -107,7 +130,9 @@ def _shares(weights: Array, num_parts: int) -> Array:
 # --- Balanced k-means: parts of round shape and equal size ------------------------------------
 
 
-def balanced_kmeans(x: Array, key: Array, body: Array, shares: Array, comm: MPI.Intracomm) -> Array:
+def balanced_kmeans(
+    x: Array, key: Array, body: Array, shares: Array, comm: MPI.Intracomm
+) -> tuple[Array, Array]:
     """Balanced k-means of points, whole numbers ``(n, gdim)``, in so many parts a body. Collective.
 
     A point is in the part of its body with the least ‖x − c_k‖/w_k, the centre c_k being the mean
@@ -115,6 +140,9 @@ def balanced_kmeans(x: Array, key: Array, body: Array, shares: Array, comm: MPI.
     are round where a mesh is graded, too (von Looz, Tzovas, Meyerhenke, ICPP 2018,
     doi:10.1145/3225058.3225148). Cells stay where they are: sums travel. The keys, ``(n,)``, draw
     a sample, whose bisection is the beginning.
+
+    Returns:
+        The part of each point, and how slender those of the bisection are.
     """
     home = np.repeat(np.arange(len(shares)), shares)
     total, (n, gdim) = int(_counts(comm, body, len(shares)).sum()), x.shape
@@ -135,6 +163,7 @@ def balanced_kmeans(x: Array, key: Array, body: Array, shares: Array, comm: MPI.
             away = np.rint(np.sqrt(_squares(y, centre[own])))
             spread = summed(comm, np.bincount(own, away, minlength=len(home)))
             influence = np.maximum(spread / np.maximum(_counts(comm, own, len(home)), 1), 1.0)
+            begun = _slenderness(y, own, len(home), comm)
         goal = (_counts(comm, of, len(shares)) / shares)[home]
         for _ in range(rounds):
             centre += way * (_means(y, own, centre, comm) - centre)
@@ -142,7 +171,21 @@ def balanced_kmeans(x: Array, key: Array, body: Array, shares: Array, comm: MPI.
             step = ROUND.influence_step
             influence *= np.clip((goal / size) ** (1.0 / gdim), 1.0 / step, step)
             own = _nearest(y, own, centre, influence, home)
-    return own
+    return own, begun
+
+
+def _slenderness(x: Array, part: Array, num_parts: int, comm: MPI.Intracomm) -> Array:
+    """Ratio of the largest and the smallest principal radius of each part."""
+    gdim = x.shape[1]
+    centre = _means(x, part, np.zeros((num_parts, gdim)), comm)
+    y = x - centre[part]
+    largest = np.zeros(num_parts)
+    np.maximum.at(largest, part, np.abs(y).max(axis=1, initial=0.0))
+    comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
+    y = np.rint(y * (2.0**10 / np.maximum(largest, TINY))[part][:, None])  # sums are exact
+    squares = summed(comm, sum_rows(part, y[:, :, None] * y[:, None, :], num_parts))
+    radii = np.linalg.eigvalsh(squares)
+    return np.sqrt(radii[:, -1] / np.maximum(radii[:, 0], 2.0**-40 * radii[:, -1] + TINY))
 
 
 def _means(x: Array, part: Array, before: Array, comm: MPI.Intracomm) -> Array:
@@ -163,7 +206,8 @@ def _squares(x: Array, c: Array) -> Array:
 
 def _nearest(x: Array, part: Array, centre: Array, influence: Array, home: Array) -> Array:
     """Return the part with the least ‖x − c‖/w among those of its body near the present one."""
-    order, found = np.argsort(part, kind="stable"), part.copy()
+    found, small = part.copy(), part.astype(np.min_scalar_type(len(centre)))
+    order = np.argsort(small, kind="stable")  # of small integers by counting
     size = np.bincount(part, minlength=len(centre))
     present = np.flatnonzero(size)
     parts = np.split(order, np.cumsum(size[present])[:-1])

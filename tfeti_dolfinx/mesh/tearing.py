@@ -136,7 +136,9 @@ def tear(untorn: UntornMesh, subdomain: Array, comm: MPI.Intracomm) -> Decomposi
     sums = summed(comm, sum_rows(subdomain, terms, num))
     ranks = bcast_from_root(comm, deal(sums[:, 0], sums[:, 1:] / sums[:, :1], comm.size))
     share, subdomain = moved(untorn, ranks[subdomain], subdomain, comm)
-    order = np.lexsort((share.cell_ids, subdomain))
+    order = np.argsort(share.cell_ids)
+    small = subdomain[order].astype(np.min_scalar_type(num))  # sorted by counting
+    order = order[np.argsort(small, kind="stable")]
     # nodes of the torn mesh: one copy for each subdomain
     stride = max(len(share.node_ids), 1)
     copies, torn = np.unique(

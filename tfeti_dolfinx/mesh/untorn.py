@@ -62,9 +62,10 @@ def facet_keys(cells: Array, ids: Array, cell_type: dmesh.CellType) -> Array:
 
 def equal_pairs(keys: Array) -> tuple[Array, Array]:
     """Positions of keys that occur twice: ``keys[first] == keys[second]``, first < second."""
-    order = np.argsort(keys, kind="stable")
+    order = np.argsort(keys)
     same = np.flatnonzero(keys[order[1:]] == keys[order[:-1]])
-    return order[same], order[same + 1]
+    one, other = order[same], order[same + 1]
+    return np.minimum(one, other), np.maximum(one, other)
 
 
 def places(known: Array, ids: Array) -> Array:
@@ -138,13 +139,23 @@ class UntornMesh:
         """Vertices of a cell."""
         return len(cell_entities(self.cell_type, 0))
 
-    def corners(self) -> Array:
-        """Vertices of each cell, shape ``(n, vertices, gdim)``."""
-        return self.x[self.cells[:, : self.num_vertices]]
-
     def midpoints(self) -> Array:
         """Mean of each cell's vertices, shape ``(n, gdim)``."""
-        return self.corners().mean(axis=1)
+        vertices = self.cells[:, : self.num_vertices].T
+        total = self.x[vertices[0]]
+        for vertex in vertices[1:]:
+            total += self.x[vertex]
+        return total / len(vertices)
+
+    def extents(self) -> Array:
+        """Sides of each cell's box along the axes, shape ``(n, gdim)``."""
+        vertices = self.cells[:, : self.num_vertices].T
+        low = self.x[vertices[0]]
+        high = low.copy()
+        for vertex in vertices[1:]:
+            np.minimum(low, self.x[vertex], out=low)
+            np.maximum(high, self.x[vertex], out=high)
+        return high - low
 
     def facet_keys(self) -> Array:
         """Return keys of the cells' facets that all ranks agree on, ``(n, facets_per_cell)``."""
