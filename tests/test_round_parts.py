@@ -13,6 +13,7 @@ from tfeti_dolfinx.common.compat import geometry_dofmap, graph_partitioners
 from tfeti_dolfinx.mesh.cell_graph import CellGraph, Pieces
 from tfeti_dolfinx.mesh.partition import connected_parts, make_parts
 from tfeti_dolfinx.mesh.round_parts import ROUND, balanced_kmeans, flatten_interfaces
+from tfeti_dolfinx.mesh.tearing import moved
 from tfeti_dolfinx.mesh.untorn import PhysicalNames, UntornMesh
 
 COMM = MPI.COMM_WORLD
@@ -197,3 +198,15 @@ def test_other_partitioners_give_as_many_connected_parts(name):
     assert (d.num_subdomains, d.split) == (9, {})
     size = COMM.allreduce(np.bincount(d.cell_subdomain, minlength=9))
     assert size.max() < 1.2 * size.mean()
+
+
+@pytest.mark.parametrize("name", ["round", "bisection", *graph_partitioners()])
+def test_all_cells_on_one_rank(name):
+    """The others have neither cells nor nodes."""
+    mesh = untorn("tetrahedron", *tetrahedra(200))
+    mesh, _ = moved(mesh, np.zeros(len(mesh.cells), dtype=np.int64), mesh.cell_ids, COMM)
+    graph = CellGraph(mesh, COMM)
+    assert (graph.num_cells > 0) == (COMM.rank == 0)
+    pieces = graph.pieces(make_parts(mesh, graph, 5, name))
+    assert np.array_equal(np.unique(pieces.colour), np.arange(5))
+    assert len(everywhere(mesh, pieces.of_cell)) == pieces.size.sum()

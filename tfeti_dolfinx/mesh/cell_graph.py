@@ -91,7 +91,7 @@ class CellGraph:
         )
         row, rank = holders[place].nonzero()
         others = rank != exchange.source[row]
-        row, rank = row[others], rank[others]
+        row, rank = row[others], rank[others].astype(np.int64)  # the same type on all ranks
         exchange = Exchange(comm, exchange.source[row])
         ids, rank = exchange.send(ids[place[row]]), exchange.send(rank)
         by_id = np.argsort(mesh.node_ids)
@@ -138,7 +138,7 @@ class CellGraph:
         inside = same & own
         graph = coo_array((np.ones(inside.sum()), (first[inside], second[inside])), shape=(n, n))
         count, label = connected_components(graph, directed=False)
-        label = self.with_ghosts(label + offset_of(comm, count))
+        label = self.with_ghosts(label.astype(np.int64) + offset_of(comm, count))
         between = same & ~own
         edges = np.unique(np.stack((label[first[between]], label[second[between]])), axis=1)
         edges, total = np.concatenate(comm.allgather(edges), axis=1), comm.allreduce(count)

@@ -210,7 +210,7 @@ def _nearest(x: Array, part: Array, centre: Array, influence: Array, home: Array
     order = np.argsort(small, kind="stable")  # of small integers by counting
     size = np.bincount(part, minlength=len(centre))
     present = np.flatnonzero(size)
-    parts = np.split(order, np.cumsum(size[present])[:-1])
+    parts = np.split(order, np.cumsum(size[present]))[:-1]
     apart = np.sqrt(_squares(centre[present][:, None], centre))
     apart /= influence[present][:, None] + influence
     apart[home[present][:, None] != home] = np.inf
