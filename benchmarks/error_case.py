@@ -32,9 +32,17 @@ from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
 import tfeti_dolfinx as tfeti
-from benchmarks.error_scenes import ADAPTIVE, GRADED, SCENES, Scene
+from benchmarks.adaptive import solves
+from benchmarks.error_scenes import (
+    ADAPTIVE,
+    GRADED,
+    SCENES,
+    Scene,
+    half_ball_on_plane,
+    half_cylinder_on_plane,
+)
 from benchmarks.profiles import Array
-from demos import adaptive_2d, adaptive_3d
+from meshes import half_ball, half_cylinder
 from meshes.tools import element_options
 
 TRIANGLE, QUADRILATERAL = "triangle", "quadrilateral"
@@ -48,8 +56,22 @@ NU = 0.3  # of all scenes
 AUTO = {"tfeti_rtol": "auto"}
 # solves on meshes that follow the error
 FOLLOWED = {
-    "half cylinder": lambda goal: adaptive_2d.steps(goal, 8, AUTO),
-    "half ball": lambda goal: adaptive_3d.steps(goal, AUTO),
+    "half cylinder": lambda goal: solves(
+        lambda sizes: half_cylinder.build(1.0, fine=0.1, fine_radius=10.0, sizes=sizes),
+        half_cylinder_on_plane,
+        goal,
+        lambda nodes: 8,
+        AUTO,
+        MPI.COMM_WORLD,
+    ),
+    "half ball": lambda goal: solves(
+        lambda sizes: half_ball.build(1.0, fine=0.2, fine_radius=10.0, sizes=sizes),
+        lambda d: half_ball_on_plane(d, reach=None),
+        goal,
+        lambda nodes: max(2, round(3 * nodes / SUBDOMAIN[3])),
+        AUTO,
+        MPI.COMM_WORLD,
+    ),
 }
 
 

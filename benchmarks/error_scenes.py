@@ -1,4 +1,4 @@
-"""Scenes of ``time_against_error.py``: from the demos, with their closed forms."""
+"""Scenes of ``time_against_error.py``: those of the demos on any mesh, with their closed forms."""
 
 from __future__ import annotations
 
@@ -11,10 +11,8 @@ import ufl
 from dolfinx import fem
 
 import tfeti_dolfinx as tfeti
+from benchmarks.hertz import LineContact, PointContact
 from benchmarks.profiles import Array, Samples
-from demos import adaptive_2d, cylinder_on_block_2d, hertz_3d
-from demos import cattaneo_mindlin_2d as half_planes_2d
-from demos.partial_slip import pushed
 from meshes import cylinder_on_block, half_ball, half_cylinder, half_planes, rings
 
 UNIFORM, GRADED, ADAPTIVE = "uniform", "graded", "adaptive"
@@ -54,45 +52,107 @@ def grading(elements: float, mesh: str, a: float, rate: float) -> dict[str, floa
     return {"fine": a / elements, "fine_radius": wide * a, "growth": rate / elements}
 
 
+R, NU = 1.0, 0.3
+LINE = LineContact.from_half_width(0.04, R, 1 / (1 - NU**2))
+POINT = PointContact.from_half_width(0.05, R, 1 / (1 - NU**2))
+
+
+def half_cylinder_on_plane(
+    d: tfeti.Decomposition, degree: int = 1, reach: float | None = None
+) -> dict[str, Any]:
+    """Arguments of the problem of ``hertz_2d.py``; without a reach contact may be anywhere."""
+    elastic = tfeti.Elasticity(d, E=1.0, nu=NU, model="plane_strain")
+    V = fem.functionspace(d.mesh, ("Lagrange", degree, (2,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+    traction = fem.Constant(d.mesh, (0.0, -LINE.load / (2 * R)))
+    axis = fem.locate_dofs_topological(V.sub(0), 1, d.facets("axis"))
+    return {
+        "a": elastic.a(u, v),
+        "L": ufl.dot(traction, v) * ds(d.surface("top")),
+        "bcs": [fem.dirichletbc(0.0, axis, V.sub(0))],
+        "contacts": [tfeti.Obstacle("contact", tfeti.Plane((0, 0), (0, 1)), reach=reach)],
+        "decomposition": d,
+        "stress": elastic.stress,
+    }
+
+
+def half_ball_on_plane(
+    d: tfeti.Decomposition, degree: int = 1, reach: float | None = 2 * 0.05**2
+) -> dict[str, Any]:
+    """Arguments of the problem of ``hertz_3d.py``; without a reach contact may be anywhere."""
+    elastic = tfeti.Elasticity(d, E=1.0, nu=NU)
+    V = fem.functionspace(d.mesh, ("Lagrange", degree, (3,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    top = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)(d.surface("top"))
+    area = d.comm.allreduce(fem.assemble_scalar(fem.form(fem.Constant(d.mesh, 1.0) * top)))
+    return {
+        "a": elastic.a(u, v),
+        "L": -POINT.load / area * v[2] * top,
+        "bcs": [],
+        "contacts": [tfeti.Obstacle("contact", tfeti.Plane((0, 0, 0), (0, 0, 1)), reach=reach)],
+        "decomposition": d,
+        "stress": elastic.stress,
+    }
+
+
 def _line() -> Scene:
-    a, R = adaptive_2d.a, adaptive_2d.R
+    a = LINE.half_width
     samples = Samples.line(a)
 
     def make(d: tfeti.Decomposition, degree: int) -> dict[str, Any]:
-        """The demo's scene with the reach of ``hertz_2d.py``."""
-        plane = tfeti.Plane((0, 0), normal=(0, 1))
-        contacts = [tfeti.Obstacle("contact", plane, reach=2 * a**2 / R)]
-        return {**adaptive_2d.scene(d, degree), "contacts": contacts}
+        return half_cylinder_on_plane(d, degree, 2 * a**2 / R)
 
     return Scene(
         build=lambda n, mesh: half_cylinder.build(R, **grading(n, mesh, a, 3.6)),
         make=make,
         samples=samples,
-        exact=samples.exact(adaptive_2d.hertz.pressure),
+        exact=samples.exact(LINE.pressure),
     )
 
 
 def _ball() -> Scene:
-    a, R = hertz_3d.a, hertz_3d.R
+    a = POINT.half_width
     samples = Samples.disc(a)
     return Scene(
         build=lambda n, mesh: half_ball.build(R, **grading(n, mesh, a, 1.5)),
-        make=hertz_3d.scene,
+        make=half_ball_on_plane,
         samples=samples,
-        exact=samples.exact(hertz_3d.HERTZ.pressure),
+        exact=samples.exact(POINT.pressure),
         place=lambda points: points[:, :2],
     )
 
 
 def _cylinder() -> Scene:
-    hertz, R = cylinder_on_block_2d.closed_form(), cylinder_on_block_2d.R
-    young = cylinder_on_block_2d.young
+    radius, force, young = 50.0, 35e3, {"cylinder": 2.1e5, "block": 7e4}
+    modulus = 1 / sum((1 - NU**2) / E for E in young.values())
+    hertz = LineContact.from_load(force, radius, modulus)
     samples = Samples.line(hertz.half_width)
+
+    def make(d: tfeti.Decomposition, degree: int) -> dict[str, Any]:
+        """The problem of ``cylinder_on_block_2d.py --exchange``."""
+        elastic = tfeti.Elasticity(d, E=young, nu=NU, model="plane_strain")
+        V = fem.functionspace(d.mesh, ("Lagrange", degree, (2,)))
+        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+        ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+        traction = fem.Constant(d.mesh, (0.0, -force / (2 * radius)))
+        axis = fem.locate_dofs_topological(V.sub(0), 1, d.facets("axis"))
+        bottom = fem.locate_dofs_topological(V, 1, d.facets("bottom"))
+        reach = 0.75 * hertz.half_width**2 / radius
+        return {
+            "a": elastic.a(u, v),
+            "L": ufl.dot(traction, v) * ds(d.surface("load")),
+            "bcs": [fem.dirichletbc(0.0, axis, V.sub(0)), fem.dirichletbc(np.zeros(2), bottom, V)],
+            "contacts": [tfeti.Contact("top", "arc", secondary="top", reach=reach)],
+            "decomposition": d,
+            "stress": elastic.stress,
+        }
+
     return Scene(
         build=lambda n, mesh: cylinder_on_block.build(
-            R, 4 * R, **grading(n, mesh, hertz.half_width, 3.6)
+            radius, 4 * radius, **grading(n, mesh, hertz.half_width, 3.6)
         ),
-        make=lambda d, degree: cylinder_on_block_2d.scene(d, degree, exchange=True),
+        make=make,
         samples=samples,
         exact=samples.exact(hertz.pressure),
         young=lambda points: np.where(points[:, 1] > 0.0, young["cylinder"], young["block"]),
@@ -139,9 +199,50 @@ class RoundedPunch:
         return np.where(np.abs(x) < self.half_width, scale * value, 0.0)
 
 
-PUNCH = RoundedPunch(
-    0.5 * half_planes_2d.a, half_planes_2d.a, half_planes_2d.R, half_planes_2d.MODULUS
-)
+L, MU = 1.0, 0.3
+PAIR = LineContact.from_half_width(0.04, R, 1 / (1 - NU**2) / 2)
+PUNCH = RoundedPunch(0.02, 0.04, R, 1 / (1 - NU**2) / 2)
+
+
+def half_planes_pushed(
+    d: tfeti.Decomposition, degree: int
+) -> tuple[fem.Constant, fem.Constant, dict[str, Any]]:
+    """Forces P and Q, and arguments of the problem of ``cattaneo_mindlin_2d.py``."""
+    elastic = tfeti.Elasticity(d, E=1.0, nu=NU, model="plane_strain")
+    V = fem.functionspace(d.mesh, ("Lagrange", degree, (2,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
+    top, bottom = (ds(d.surface(name)) for name in ("top", "bottom"))
+    P, Q = fem.Constant(d.mesh, 0.0), fem.Constant(d.mesh, 0.0)
+    side = (Q * v[0] - P * v[1]) / (2 * L)
+    tilt = 1.5 / L**2 * Q * ufl.SpatialCoordinate(d.mesh)[0] * v[1]
+    middle = fem.locate_dofs_geometrical(V, lambda x: np.isclose(x[1], -L) & np.isclose(x[0], 0))
+    corner, _ = fem.locate_dofs_geometrical(
+        (V.sub(1), V.sub(1).collapse()[0]), lambda x: np.isclose(x[1], -L) & np.isclose(x[0], L)
+    )
+    contact = tfeti.Contact(
+        "upper face",
+        "lower face",
+        secondary="upper face",
+        gap=lambda x: x[0] ** 2 / (2 * R),
+        friction=tfeti.Coulomb(MU),
+        reach=1.3 * PAIR.half_width**2 / R,
+    )
+    return (
+        P,
+        Q,
+        {
+            "a": elastic.a(u, v),
+            "L": side * top - side * bottom + tilt * (top + bottom),
+            "bcs": [
+                fem.dirichletbc(np.zeros(2), middle, V),
+                fem.dirichletbc(0.0, corner, V.sub(1)),
+            ],
+            "contacts": [contact],
+            "decomposition": d,
+            "stress": elastic.stress,
+        },
+    )
 
 
 def _punch() -> Scene:
@@ -150,8 +251,8 @@ def _punch() -> Scene:
 
     def make(d: tfeti.Decomposition, degree: int) -> dict[str, Any]:
         """The identical bodies of the demo, their shape in the gap, without friction."""
-        loads, parts = half_planes_2d.scene(d, degree)
-        loads.set(PUNCH.load, 0.0)
+        P, _, parts = half_planes_pushed(d, degree)
+        P.value = PUNCH.load
         contact = tfeti.Contact(
             "upper face",
             "lower face",
@@ -162,7 +263,7 @@ def _punch() -> Scene:
         return {**parts, "contacts": [contact]}
 
     return Scene(
-        build=lambda n, mesh: half_planes.build(half_planes_2d.L, **grading(n, mesh, a, 3.6)),
+        build=lambda n, mesh: half_planes.build(L, **grading(n, mesh, a, 3.6)),
         make=make,
         samples=samples,
         exact=samples.exact(PUNCH.pressure),
@@ -175,28 +276,28 @@ PUSH = 0.5
 
 def _slip() -> Scene:
     """The demo in two steps; what friction leaves, μp − |q|, is Hertz's pressure on |x| < c."""
-    closed, loads = half_planes_2d.CLOSED, []
-    force = PUSH * closed.capacity
-    left = closed.taken(force)
+    loads: list[fem.Constant] = []
+    left = LineContact.from_half_width(PAIR.half_width * np.sqrt(1 - PUSH), R, MU / (1 - NU**2) / 2)
     samples = Samples.line(left.half_width)
 
     def make(d: tfeti.Decomposition, degree: int) -> dict[str, Any]:
-        own, parts = half_planes_2d.scene(d, degree)
-        loads[:] = [own]
+        P, Q, parts = half_planes_pushed(d, degree)
+        loads[:] = [P, Q]
         return parts
 
     def solve(problem: tfeti.ContactProblem) -> None:
-        pushed(problem, loads[0], closed, 0.0)
-        loads[0].set(closed.hertz.load, force)
+        P, Q = loads
+        P.value = PAIR.load
+        problem.solve()
+        problem.accept()
+        Q.value = PUSH * MU * PAIR.load
         problem.solve()
 
     def unused(data: Any) -> Array:
-        return closed.mu * data.pressure - np.linalg.norm(data.tangential_traction, axis=1)
+        return MU * data.pressure - np.linalg.norm(data.tangential_traction, axis=1)
 
     return Scene(
-        build=lambda n, mesh: half_planes.build(
-            half_planes_2d.L, **grading(n, mesh, closed.hertz.half_width, 3.6)
-        ),
+        build=lambda n, mesh: half_planes.build(L, **grading(n, mesh, PAIR.half_width, 3.6)),
         make=make,
         samples=samples,
         exact=samples.exact(left.pressure),

@@ -15,7 +15,6 @@ but no mesh. Results go to results/linear_price.md, .json and .png.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from contextlib import contextmanager
@@ -31,7 +30,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import tfeti_dolfinx as tfeti
-from benchmarks.stages import DEMOS, LARGE, MIDDLE, sizes
+from benchmarks.stages import DEMOS, LARGE, MIDDLE, sizes, words_of
 from benchmarks.tools import (
     choose_clock,
     command_line,
@@ -41,7 +40,7 @@ from benchmarks.tools import (
     solve_seconds,
     stacked,
 )
-from demos.demo_tools import petsc_options
+from demos import petsc_options, scene
 from tfeti_dolfinx.forms.assembly import Forms
 
 # --- The linear problem of a contact's solution on the untorn mesh ------------------------------
@@ -102,10 +101,10 @@ class Linear:
         self.b.destroy()
 
 
-def linear_problem(scene, solution):
+def linear_problem(made, solution):
     """The linear problem of a scene whose contact has been solved. Collective."""
     dofs, comm = solution.dofs, solution.decomposition.comm
-    forms = Forms(scene["a"], scene["L"], dofs.V, scene["decomposition"], {}, {})
+    forms = Forms(made["a"], made["L"], dofs.V, made["decomposition"], {}, {})
     comm.barrier()
     start = time.perf_counter()
     K, f = forms.stiffness(), forms.load()
@@ -247,10 +246,10 @@ def configure(parser):
     parser.add_argument("--no-smalse", action="store_true", help="block Newton alone")
 
 
-def contact(scene, qp_type, options):
+def contact(made, qp_type, options):
     """Solve a contact from scratch; the problem and a row."""
     types = {"tfeti_qp_type": qp_type, "tfeti_pc_type": "auto"}
-    problem = tfeti.ContactProblem(**scene, petsc_options={**options, **types})
+    problem = tfeti.ContactProblem(**made, petsc_options={**options, **types})
     problem.solve()
     report = problem.report
     seconds = report.seconds
@@ -292,10 +291,10 @@ def say(row):
 
 def study(demo, size, options, repeats, arguments):
     """A row for each solver and setting, the fastest of several runs that take turns."""
-    scene = demo.scene(demo.torn_mesh(argparse.Namespace(quick=False, **size)))
+    made = scene(demo, words_of(size))
     rtol = float(options.get("tfeti_rtol", DEFAULT_RTOL))
-    problem, row = contact(scene, "newton", options)
-    linear = linear_problem(scene, problem.solution)
+    problem, row = contact(made, "newton", options)
+    linear = linear_problem(made, problem.solution)
     problem.destroy()
     rows = [[row]]
     work = tried(linear, rtol, arguments)
@@ -305,12 +304,12 @@ def study(demo, size, options, repeats, arguments):
                 rows.append([])
             rows[i + 1].append(linear_row(linear, kind, setting, tolerance))
         if repeat + 1 < repeats:
-            problem, row = contact(scene, "newton", options)
+            problem, row = contact(made, "newton", options)
             problem.destroy()
             rows[0].append(row)
     linear.destroy()
     if not arguments.no_smalse:  # once: it takes its time
-        problem, row = contact(scene, "smalse", options)
+        problem, row = contact(made, "smalse", options)
         problem.destroy()
         rows.insert(1, [row])
     return [min(found, key=price) for found in rows], problem.report
@@ -360,7 +359,7 @@ def main(argv):
     options, comm, unit = petsc_options(rest), MPI.COMM_WORLD, choose_clock(arguments)
     tables = {}
     for name in arguments.scenes:
-        rows, report = study(DEMOS[name], SIZES[size][name], options, repeats, arguments)
+        rows, report = study(name, SIZES[size][name], options, repeats, arguments)
         sizes = f"{report.primal_dofs} unknowns, {report.subdomains} subdomains"
         tables[f"{name}: {sizes}, {comm.size} ranks, {unit}"] = with_ratios(rows)
     return finish(arguments, "linear_price", tables, draw, comm.rank)

@@ -9,7 +9,6 @@ results/stages.md, .json and .png.
 
 from __future__ import annotations
 
-import argparse
 import ctypes
 import sys
 from pathlib import Path
@@ -32,10 +31,9 @@ from benchmarks.tools import (
     picture,
     stacked,
 )
-from demos import cube_3d, hertz_3d
-from demos.demo_tools import petsc_options
+from demos import petsc_options, scene
 
-DEMOS = {"cube_3d": cube_3d, "hertz_3d": hertz_3d}
+DEMOS = ("cube_3d", "hertz_3d")
 # unknowns and subdomains of the half ball
 QUICK, SMALL, MIDDLE, LARGE = (4_000, 4), (60_000, 16), (235_000, 64), (2_090_000, 256)
 
@@ -101,11 +99,16 @@ def memory():
     return (info.uordblks + info.hblkhd) / 2**20, held
 
 
+def words_of(size):
+    """Arguments of a demo's command line."""
+    return [word for name, value in size.items() for word in (f"--{name}", value)]
+
+
 def solved(demo, size, options):
     """The report of a scene, its seconds watched."""
-    scene = demo.scene(demo.torn_mesh(argparse.Namespace(quick=False, **size)))
+    made = scene(demo, words_of(size))
     mesh = memory()
-    problem = tfeti.ContactProblem(**scene, petsc_options={"tfeti_qp_type": "newton", **options})
+    problem = tfeti.ContactProblem(**made, petsc_options={"tfeti_qp_type": "newton", **options})
     seconds = problem._seconds = Watched(problem._seconds, mesh)
     problem.solve()
     problem.destroy()
@@ -146,8 +149,8 @@ def main(argv):
     arguments, rest = command_line(__doc__, argv, configure)
     size = "quick" if arguments.quick else "large" if arguments.large else "default"
     comm, tables, unit = MPI.COMM_WORLD, {}, choose_clock(arguments)
-    for name, demo in DEMOS.items():
-        report, seconds = solved(demo, SIZES[size][name], petsc_options(rest))
+    for name in DEMOS:
+        report, seconds = solved(name, SIZES[size][name], petsc_options(rest))
         title = f"{name}, {report.primal_dofs} unknowns, {comm.size} ranks, {unit}"
         tables[title] = stage_rows(seconds)
     return finish(arguments, "stages", tables, draw, comm.rank)

@@ -8,8 +8,10 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from math import log, pi, sqrt
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import petsc4py
@@ -23,10 +25,10 @@ from dolfinx import fem
 from mpi4py import MPI
 
 import tfeti_dolfinx as tfeti
+from benchmarks.hertz import LineContact, PointContact, fit
 from benchmarks.tools import ROOT, Tables, command_line, markdown, write_tables
-from demos import plastic_indentation_2d as indentation
-from demos.hertz import LineContact, PointContact, fit
-from demos.impact_of_bars import Bars, Impact, look
+from demos import run
+from demos import scene as scene_of
 from meshes.blocks import Block
 from meshes.blocks import build as build_blocks
 from meshes.cylinder_on_block import build as build_cylinder_on_block
@@ -49,7 +51,7 @@ class Row:
         reference: The published figure, or the closed form.
         got: Ours.
         allowed: Relative difference that the source allows, or None where it is for information.
-        problem: What was solved.
+        problem: What has the report.
         multiplications: By F and S in all.
     """
 
@@ -58,7 +60,7 @@ class Row:
     reference: float
     got: float
     allowed: float | None
-    problem: tfeti.ContactProblem
+    problem: Any
     multiplications: int
 
     @property
@@ -84,6 +86,12 @@ def work(problem: tfeti.ContactProblem) -> int:
     """Multiplications of the last solve."""
     report = problem.report
     return report.F_multiplications + report.preconditioner_multiplications
+
+
+def in_all(report: tfeti.Report) -> int:
+    """Multiplications of all solves."""
+    counted = report.in_all
+    return counted["F_multiplications"] + counted["preconditioner_multiplications"]
 
 
 # --- Meshes and forms -------------------------------------------------------------------------
@@ -219,7 +227,13 @@ def point_contact(
     found = fit(COMM, data.points[:, 0], data.pressure, hertz.peak)
     for name, expected, got in zip(("a", "p₀"), (a, hertz.peak), found, strict=True):
         yield Row(
-            case, f"{name} of the force, Hertz", expected, got, allowed, problem, work(problem)
+            case,
+            f"{name} of the force, Hertz",
+            expected,
+            got,
+            allowed,
+            problem,
+            work(problem),
         )
 
 
@@ -346,7 +360,13 @@ def patches(scale: float) -> Iterator[Row]:
         worst = COMM.allreduce(worst, op=MPI.MAX)
         case = f"{'SSNP121' if gdim == 2 else 'SSNV167'}, patch test"
         yield Row(
-            case, "pressure, worst node", pressure, pressure + worst, 1e-6, problem, work(problem)
+            case,
+            "pressure, worst node",
+            pressure,
+            pressure + worst,
+            1e-6,
+            problem,
+            work(problem),
         )
 
 
@@ -389,20 +409,25 @@ def press_fit(scale: float) -> Iterator[Row]:
 
 def bar_on_wall(scale: float) -> Iterator[Row]:
     """A bar with ν = 0 hits a rigid wall (m, s, N)."""
-    impact = Impact(0.2, 0.02, 2e11, 0.0, 8000.0, 100.0, 2e-3, below=False)
-    bars = Bars(impact, round(40 / scale), True, {})
-    t, p, velocity, records = bars.run()
-    found, problem = look(bars, t, p, velocity, records), bars.problem
+    words = ["--impact", "wall", "--poisson", 0.0, "--cells", round(40 / scale)]
+    _, report = run("impact_of_bars", words)
+    found = {name.removeprefix("wall_"): value for name, value in report.errors.items()}
+    begin = 2e-5 * (1 + found["begin"])
     rows = (
-        ("begin of contact", 2e-5, 2e-5 * (1 + found["begin"])),
-        ("end of contact", 1e-4, 2e-5 * (1 + found["begin"]) + 8e-5 * (1 + found["duration"])),
+        ("begin of contact", 2e-5, begin),
+        ("end of contact", 1e-4, begin + 8e-5 * (1 + found["duration"])),
         ("stress", 4e9, 4e9 * (1 + found["pressure"])),
-        ("velocity afterwards", 100.0, float(velocity)),
+        ("velocity afterwards", 100.0, 100.0 * (1 + found["velocity"])),
     )
+    of_run = SimpleNamespace(report=report)
     for quantity, published, got in rows:
-        yield Row(
-            "SDNV100, bar on a rigid wall", quantity, published, got, 0.05, problem, found["F"]
-        )
+        case = "SDNV100, bar on a rigid wall"
+        yield Row(case, quantity, published, got, 0.05, of_run, in_all(report))
+
+
+def ball_above(radius: float, depth: float, x: np.ndarray) -> np.ndarray:
+    """Height of a ball over the points of a plane, where it is so deep in it."""
+    return radius - depth - np.sqrt(np.maximum(radius**2 - x[0] ** 2, 0.0))
 
 
 def plastic_indentation(scale: float) -> Iterator[Row]:
@@ -414,11 +439,14 @@ def plastic_indentation(scale: float) -> Iterator[Row]:
         80.0: (8.152e6, 7.666e6, 0.1),
         100.0: (1.019e7, 9.119e6, 0.15),
     }
-    d = indentation.torn_mesh(scale * 20.0, 360.0, 4)
-    problem, total, case = indentation.made(d), 0, "SSNV506, plastic indentation"
+    words = ["--size", scale * 20.0, "--near", 360.0]
+    made = scene_of("plastic_indentation_2d", words, "NonlinearContactProblem")
+    problem = tfeti.NonlinearContactProblem(**made)
+    total, case, radius = 0, "SSNV506, plastic indentation", 500.0
     step = 5.0 * scale
     for depth in np.arange(step, max(figures) + 0.5 * step, step):
-        indentation.press(problem, depth)
+        gap = partial(ball_above, radius, depth)
+        problem.update(gap={"ball": gap})
         problem.solve()
         problem.accept()
         total += work(problem)

@@ -5,90 +5,205 @@
 #
 #     ./run mpirun -n 2 python3 demos/adaptive_3d.py --error 0.2
 
-"""Hertz contact in 3D on meshes that follow the estimated error."""
-
+# +
+import argparse
 import sys
 from pathlib import Path
 
 import petsc4py
 
-if __name__ == "__main__":
-    petsc4py.init(sys.argv)  # before DOLFINx, which would initialise PETSc without options
+parser = argparse.ArgumentParser(description="A half ball on meshes that follow the error.")
+parser.add_argument("--quick", action="store_true", help="a size of a few seconds")
+parser.add_argument("--error", type=float, help="relative discretisation error in energy")
+parser.add_argument("--plot", action="store_true", help="draw pictures")
+parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
+parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
+arguments, rest = parser.parse_known_args()
+petsc4py.init([sys.argv[0], *rest])  # before DOLFINx: so PETSc's options reach the solver
 
+import gmsh
 import numpy as np
+import ufl
+from dolfinx import fem
+from dolfinx.mesh import entities_to_geometry
 from mpi4py import MPI
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 import tfeti_dolfinx as tfeti
-from demos import hertz_3d
-from demos.adaptive import last_of, solves
-from demos.demo_tools import Demo
-from demos.hertz import compare
-from demos.hertz_3d import HERTZ, R, a
-from meshes.half_ball import build
 
-# unknowns of a subdomain
-SUBDOMAIN = 4000
+# -
 
+# ## Data and closed form
+#
+# The closed form says which load; nothing else is taken from it.
 
-def scene(decomposition):
-    # ## Elasticity, load and contact
-    #
-    # As in `hertz_3d.py`. The closed form says which load; here the contact may be anywhere on the
-    # ball.
-    plane = tfeti.Plane((0, 0, 0), normal=(0, 0, 1))
-    return {**hertz_3d.scene(decomposition), "contacts": [tfeti.Obstacle("contact", plane)]}
+# +
+comm = MPI.COMM_WORLD
+R, E, nu = 1.0, 1.0, 0.3
+a = 0.05 * R
+load = 4 * E / (1 - nu**2) * a**3 / (3 * R)
+p0 = 3 * load / (2 * np.pi * a**2)
 
 
-def steps(goal, options):
-    """Solve, estimate, mesh anew, until the error is small enough. Collective."""
-
-    # ## Meshes
-    #
-    # gmsh makes them on rank 0, a coarse uniform one at first, then from the sizes that the last
-    # estimate asks for.
-    def mesh(sizes):
-        return build(R, fine=0.2 * R, fine_radius=10 * R, sizes=sizes)
-
-    def subdomains(nodes):
-        return max(2, round(3 * nodes / SUBDOMAIN))
-
-    return solves(mesh, scene, goal, subdomains, options, MPI.COMM_WORLD)
+def hertz(r):
+    return p0 * np.sqrt(np.maximum(1 - (r / a) ** 2, 0.0))
 
 
-def run(argv):
-    demo = Demo(__doc__, argv, configure)
-    goal = demo.arguments.error or (0.6 if demo.arguments.quick else 0.2)
-    problem = last_of(steps(goal, {"tfeti_rtol": "auto", **demo.petsc_options}))
+# -
 
-    contact = problem.solution.contact(0)
-    r = np.hypot(contact.points[:, 0], contact.points[:, 1])
-    problem.report.errors.update(compare(MPI.COMM_WORLD, contact, r, HERTZ))
-    if demo.arguments.plot:
-        from tfeti_dolfinx.plot import plot_deformed, plot_pressure
-
-        folder, solution = demo.folder, problem.solution
-        plot_deformed(folder / "adaptive_3d.png", solution, factor=1.0, show_edges=True)
-        plot_pressure(
-            folder / "adaptive_3d_pressure.png",
-            solution,
-            lambda points: np.hypot(points[:, 0], points[:, 1]),
-            HERTZ.pressure,
-            limit=2 * a,
-            label="r",
-        )
-    return demo.finish(problem, "adaptive_3d")
+# ## Meshes
+#
+# gmsh makes them on rank 0, a coarse uniform one at first, then from the sizes that the last
+# estimate asks for. A subdomain has about 4000 unknowns.
 
 
-def main(argv):
-    """Run the demo and return its solution."""
-    return run(argv)[0]
+# +
+def half_ball(sizes):
+    model = gmsh.model
+    model.add("half_ball")
+    ball = model.occ.addSphere(0, 0, R, R, angle1=-np.pi / 2, angle2=0)
+    model.occ.synchronize()
+    surfaces = [tag for _, tag in model.getBoundary([(3, ball)], oriented=False)]
+    top = max(surfaces, key=lambda tag: model.occ.getCenterOfMass(2, tag)[2])
+    model.addPhysicalGroup(3, [ball], name="body")
+    model.addPhysicalGroup(2, [tag for tag in surfaces if tag != top], name="contact")
+    model.addPhysicalGroup(2, [top], name="top")
+    if sizes is None:
+        size = model.mesh.field.add("MathEval")
+        model.mesh.field.setString(size, "F", f"{0.2 * R}")
+    else:
+        corners, h = sizes
+        view, count = gmsh.view.add("sizes"), h.shape[1]
+        table = np.concatenate((np.swapaxes(corners, 1, 2).reshape(-1, 3 * count), h), axis=1)
+        gmsh.view.addListData(view, {3: "ST", 4: "SS"}[count], len(table), table.ravel())
+        size = model.mesh.field.add("PostView")
+        model.mesh.field.setNumber(size, "ViewTag", view)
+    model.mesh.field.setAsBackgroundMesh(size)
+    for name in ("FromPoints", "FromCurvature", "ExtendFromBoundary"):
+        gmsh.option.setNumber(f"Mesh.MeshSize{name}", 0)
+    model.mesh.generate(3)
+    return model
 
 
-def configure(parser):
-    parser.add_argument("--error", type=float, help="relative discretisation error in energy")
+def decomposed(sizes):
+    model, nodes = None, 0
+    if comm.rank == 0:
+        model = half_ball(sizes)
+        nodes = len(model.mesh.getNodes()[0])
+    return tfeti.read_gmsh(model, comm, max(2, round(3 * comm.bcast(nodes) / 4000)))
 
 
-if __name__ == "__main__":
-    main(sys.argv[1:])
+def new_sizes(solution, wanted):
+    """Corners of all simplices, and the sizes that they ask of the next mesh, on rank 0.
+
+    In d dimensions the square of the error of an element of size h is about C h^(d+2), and the
+    fewest elements have equal errors √c: h' = h (c/η²)^(1/(d+2)), and all of them add up to wanted²
+    for c^(2/(d+2)) = wanted²/Σ(η²)^(d/(d+2)). A coarse mesh says little of where a fine one should
+    be: an element becomes at most four times smaller or twice as large at once.
+    """
+    field, mesh = solution.discretisation_error, solution.decomposition.mesh
+    d, count = mesh.topology.dim, mesh.topology.index_map(mesh.topology.dim).size_local
+    square = field.x.array[np.asarray(field.function_space.dofmap.list)[:count, 0]] ** 2
+    cells = np.arange(count, dtype=np.int32)
+    corners = mesh.geometry.x[entities_to_geometry(mesh, d, cells)]
+    h = np.abs(np.linalg.det(corners[:, 1:, :d] - corners[:, :1, :d])) ** (1 / d)
+    root = wanted**2 / comm.allreduce(float(np.sum(square ** (d / (d + 2)))))
+    factor = np.sqrt(root) / np.maximum(square, 1e-300) ** (1 / (d + 2))
+    size = h * np.clip(factor, 1 / 4, 2)
+    parts = comm.gather((corners, np.repeat(size[:, None], d + 1, axis=1)), root=0)
+    return None if parts is None else [np.concatenate(part) for part in zip(*parts, strict=True)]
+
+
+# -
+
+# ## Elasticity, load and contact
+#
+# As in `hertz_3d.py`; here the contact may be anywhere on the ball.
+
+
+# +
+def contact_problem(decomposition):
+    mesh = decomposition.mesh
+    elastic = tfeti.Elasticity(decomposition, E=E, nu=nu)
+    V = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    ds = ufl.Measure("ds", domain=mesh, subdomain_data=decomposition.facet_tags)
+    top = ds(decomposition.surface("top"))
+    area = comm.allreduce(fem.assemble_scalar(fem.form(fem.Constant(mesh, 1.0) * top)))
+    return tfeti.ContactProblem(
+        elastic.a(u, v),
+        -load / area * v[2] * top,
+        [],
+        [tfeti.Obstacle("contact", tfeti.Plane((0, 0, 0), normal=(0, 0, 1)))],
+        decomposition,
+        stress=elastic.stress,
+        petsc_options={"tfeti_rtol": "auto"},
+    )
+
+
+gmsh.initialize()
+gmsh.option.setNumber("General.Terminal", 0)
+gmsh.option.setNumber("Mesh.Algorithm3D", 10)  # HXT
+# -
+
+# ## Solve, estimate, mesh anew
+#
+# The error of all is halved at once. A mesh is coarser than what gmsh was asked for: so much more
+# is asked for the last one.
+
+# +
+goal, sizes, asked = arguments.error or (0.6 if arguments.quick else 0.2), None, np.inf
+while True:
+    decomposition = decomposed(sizes)
+    problem = contact_problem(decomposition)
+    problem.solve()
+    found = problem.estimate()
+    if comm.rank == 0:
+        unknowns = problem.report.primal_dofs
+        print(f"{unknowns} unknowns, error {found.relative_discretisation:.2%}", flush=True)
+    if found.relative_discretisation <= goal:
+        break
+    missed = min(max(1.0, found.discretisation / asked), 1.25)
+    asked = max(0.5 * found.discretisation, 0.95 * goal * found.energy / missed)
+    sizes = new_sizes(problem.solution, asked)
+    problem.destroy()
+# -
+
+gmsh.finalize()
+
+# ## Comparison with the closed form
+#
+# The squared pressures lie on a line, p² = p₀² − (p₀/a)² r², which is fitted where p > 0.3 p₀: the
+# outermost touching node would give a only up to the element size.
+
+# +
+contact = problem.solution.contact()
+r = np.hypot(contact.points[:, 0], contact.points[:, 1])
+r, p, area = (np.concatenate(comm.allgather(part)) for part in (r, contact.pressure, contact.area))
+slope, constant = np.polyfit(r[p > 0.3 * p0] ** 2, p[p > 0.3 * p0] ** 2, 1)
+area *= np.abs(r) < 0.9 * a  # the edge apart
+errors = problem.report.errors
+errors["half_width"] = float(np.sqrt(-constant / slope) / a - 1)
+errors["peak_pressure"] = float(np.sqrt(constant) / p0 - 1)
+errors["force"] = float(abs(contact.resultant.force[-1]) / load - 1)
+errors["pressure_l2"] = float(np.sqrt(area @ (p - hertz(r)) ** 2 / (area @ hertz(r) ** 2)))
+# -
+
+# ## Output
+
+if arguments.output:
+    tfeti.write_vtx(arguments.output / "adaptive_3d.bp", problem.solution)
+if arguments.plot:
+    folder = arguments.output or Path("results")
+    tfeti.plot_deformed(folder / "adaptive_3d.png", problem.solution, factor=1.0, show_edges=True)
+    tfeti.plot_pressure(
+        folder / "adaptive_3d_pressure.png",
+        problem.solution,
+        lambda x: np.hypot(x[:, 0], x[:, 1]),
+        hertz,
+        limit=2 * a,
+        label="r",
+    )
+if arguments.report:
+    problem.report.write(arguments.report, comm)
+if comm.rank == 0:
+    print(problem.report)

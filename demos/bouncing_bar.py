@@ -6,20 +6,25 @@
 #
 #     ./run mpirun -n 2 python3 demos/bouncing_bar.py --plot
 
-"""A bar that falls on a floor, in closed form: times of impacts, pressure, period, energy.
-
-Forces of the step are compared with the closed form by their sums over time up to each step, since
-a closed form that jumps inside of a step has no value there.
-"""
-
+# +
+import argparse
 import sys
 from itertools import pairwise
 from pathlib import Path
 
 import petsc4py
 
-if __name__ == "__main__":
-    petsc4py.init(sys.argv)  # before DOLFINx, which would initialise PETSc without options
+parser = argparse.ArgumentParser(description="A bar that falls on a floor, in closed form.")
+parser.add_argument("--quick", action="store_true", help="a size of a few seconds")
+parser.add_argument("--cells", type=int, help="cells along the bar")
+parser.add_argument("--step", type=float, help="step in time")
+parser.add_argument("--courant", type=float, default=1.0, help="step times c over cells")
+parser.add_argument("--plain", action="store_true", help="steps that are not stabilised")
+parser.add_argument("--plot", action="store_true", help="draw pictures")
+parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
+parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
+arguments, rest = parser.parse_known_args()
+petsc4py.init([sys.argv[0], *rest])  # before DOLFINx: so PETSc's options reach the solver
 
 import numpy as np
 import ufl
@@ -27,132 +32,132 @@ from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 import tfeti_dolfinx as tfeti
-from demos.demo_tools import Demo
-from demos.partial_slip import draw
 
-# length, modulus, density, gravity, height, with which waves have the speed 30
-L, E, RHO, G, H0 = 10.0, 900.0, 1.0, 10.0, 5.0
-C = np.sqrt(E / RHO)
-FALL, TOUCH = np.sqrt(2 * H0 / G), 2 * L / C
-V0 = G * FALL
-FIRST, SECOND = FALL, 11 / 3
-PERIOD = 16 / 3
+# -
+
+# ## Data and closed form
+#
+# Waves have the speed c = 30. The pressure of the floor grows in the first impact, and falls in the
+# second.
+
+# +
+comm = MPI.COMM_WORLD
+L, E, rho, g, height = 10.0, 900.0, 1.0, 10.0, 5.0
+c, fall = np.sqrt(E / rho), np.sqrt(2 * height / g)
+touch, speed, period = 2 * L / c, g * fall, 16 / 3
+begins = {"first": fall, "second": 11 / 3}
 
 
 def pressure(t):
-    """Pressure of the floor: it grows in the first impact, and falls in the second."""
-    first = np.where((t >= FIRST) & (t < FIRST + TOUCH), RHO * C * (V0 + G * (t - FIRST)), 0.0)
-    left = SECOND + TOUCH - t
-    return first + np.where((left > 0) & (left <= TOUCH), RHO * C * (V0 + G * left), 0.0)
+    first = (t >= begins["first"]) & (t < begins["first"] + touch)
+    left = begins["second"] + touch - t
+    second = (left > 0) & (left <= touch)
+    grown = np.where(first, speed + g * (t - begins["first"]), 0.0)
+    return rho * c * (grown + np.where(second, speed + g * left, 0.0))
 
 
-def scene(comm, cells, **keywords):
-    """A strip of square cells in four subdomains, and the floor under it."""
-    bar = dmesh.create_rectangle(
-        comm, [(0, 0), (L / cells, L)], [1, cells], dmesh.CellType.quadrilateral
-    )
-    facets = dmesh.locate_entities_boundary(bar, 1, lambda x: np.isclose(x[1], 0))
-    tags = dmesh.meshtags(bar, 1, facets, np.full_like(facets, 1))
-    decomposition = tfeti.decompose(
-        bar, lambda x: np.floor(4 * x[1] / L), facet_tags=tags, surfaces={"bottom": 1}
-    )
-    elastic = tfeti.Elasticity(decomposition, E=E, nu=0.0, model="plane_strain")
-    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    weight = fem.Constant(decomposition.mesh, (0.0, -RHO * G))
-    floor = tfeti.Plane((0, -H0), normal=(0, 1))
-    return tfeti.ContactDynamics(
+cells = arguments.cells or (16 if arguments.quick else 100)
+size = arguments.step or L / c / cells * arguments.courant
+end = begins["first"] + 1.5 * touch if arguments.quick else period
+times = size * np.arange(1, round(end / size) + 1)
+# -
+
+# ## Mesh and forms
+#
+# A strip of square cells in four subdomains.
+
+bar = dmesh.create_rectangle(
+    comm, [(0, 0), (L / cells, L)], [1, cells], dmesh.CellType.quadrilateral
+)
+decomposition = tfeti.decompose(
+    bar, lambda x: np.floor(4 * x[1] / L), surfaces={"bottom": lambda x: np.isclose(x[1], 0)}
+)
+elastic = tfeti.Elasticity(decomposition, E=E, nu=0.0, model="plane_strain")
+V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+weight = fem.Constant(decomposition.mesh, (0.0, -rho * g))
+floor = tfeti.Plane((0, -height), normal=(0, 1))
+
+# ## Motion
+#
+# With a picture plain steps are shown next to stabilised ones, of which the errors are.
+
+# +
+found = {}
+for stabilised in (False, True) if arguments.plot else (not arguments.plain,):
+    problem = tfeti.ContactDynamics(
         elastic.a(u, v),
         ufl.dot(weight, v) * ufl.dx(domain=decomposition.mesh),
         [],
-        [tfeti.Obstacle("bottom", floor, reach=2 * H0, name="floor")],
+        [tfeti.Obstacle("bottom", floor, reach=2 * height, name="floor")],
         decomposition,
-        mass=RHO,
+        mass=rho,
         stress=elastic.stress,
-        **keywords,
+        stabilised=stabilised,
+        petsc_options={"tfeti_rtol": 1e-8},
     )
+    steps = tfeti.LoadSteps(problem, lambda problem, t: None, times)
+    found["stabilised" if stabilised else "plain"] = steps.run()
+records = found["plain" if arguments.plain else "stabilised"]
+pressures = {
+    name: np.array([record.contact_forces[0][1] for record in of]) * cells / L
+    for name, of in found.items()
+}
+# -
 
+# ## Comparison with the closed form
+#
+# Mean pressures in the middle four fifths of an impact, in eight parts, and its begin and end,
+# since a closed form that jumps inside of a step has no value there.
 
-def run(argv):
-    demo = Demo(__doc__, argv, configure)
-    arguments, comm = demo.arguments, MPI.COMM_WORLD
-    cells = arguments.cells or (16 if arguments.quick else 100)
-    size = arguments.step or L / C / cells * arguments.courant
-    end = FIRST + 1.5 * TOUCH if arguments.quick else PERIOD
-    options = {"tfeti_rtol": 1e-8, **demo.petsc_options}
-
-    # ## Motion
-    #
-    # With a picture plain steps are shown beside stabilised ones, of which the errors are.
-    found = {}
-    for stabilised in (False, True) if arguments.plot else (not arguments.plain,):
-        problem = scene(comm, cells, stabilised=stabilised, petsc_options=options)
-        times = size * np.arange(1, round(end / size) + 1)
-        steps = tfeti.LoadSteps(problem, lambda problem, t: None, times)
-        found["stabilised" if stabilised else "plain"] = steps.run()
-    records = found["plain" if arguments.plain else "stabilised"]
-    t = np.array([r.time for r in records])
-    forces = pressures(records, cells)
-    problem.report.errors.update(errors(t, size, forces))
-    F = [r.figures["F_multiplications"] for r in records]
-    motion = [r.motion for r in records]
+# +
+t, p, errors = times, pressures["plain" if arguments.plain else "stabilised"], {}
+for name, begin in begins.items():
+    near = (t > begin - touch) & (t < begin + 2 * touch)
+    touching = t[near & (p > 0.05 * rho * c * speed)]
+    if len(touching) and t[-1] > begin + touch:
+        errors[f"{name}_begin"] = (touching[0] - size) / begin - 1
+        errors[f"{name}_end"] = touching[-1] / (begin + touch) - 1
+        middles, means = t - size / 2, []
+        for low, high in pairwise(begin + touch * np.linspace(0.1, 0.9, 9)):
+            inside = (middles > low) & (middles <= high)
+            means.append(np.mean(p[inside]) / np.mean(pressure(middles[inside])) - 1)
+        errors[f"{name}_pressure"] = max(means, key=abs)
+if t[-1] > begins["second"] + touch:
+    errors["period"] = np.sum(p) * size / (rho * g * L) / period - 1
+problem.report.errors.update({name: float(value) for name, value in errors.items()})
+if comm.rank == 0:
+    F = [record.figures["F_multiplications"] for record in records]
+    motion = [record.motion for record in records]
     lost = -sum(m["contact"] + m["predictor"] for m in motion) / max(m["energy"] for m in motion)
+    print(f"{len(t)} steps of {size:.4g}, multiplications {sum(F)}, at most {max(F)} in a step")
+    print(f"energy lost in impacts: {lost:.2e} of its largest")
+# -
+
+# ## Output
+
+# +
+if arguments.output:
+    tfeti.write_vtx(arguments.output / "bouncing_bar.bp", problem.solution)
+if arguments.plot:
+    folder = arguments.output or Path("results")
     if comm.rank == 0:
-        print(f"{len(t)} steps of {size:.4g}, multiplications {sum(F)}, at most {max(F)} in a step")
-        print(f"energy lost in impacts: {lost:.2e} of its largest")
-    if arguments.plot and comm.rank == 0:
-        curves = {name: (t - size / 2, pressures(of, cells)) for name, of in found.items()}
-        fine = np.linspace(0.0, end, 4001)
-        curves["closed form"] = (fine, pressure(fine))
-        totals = {name: (t, [r.motion["energy"] for r in of]) for name, of in found.items()}
-        labels = [("time", "pressure of the floor"), ("time", "kinetic and elastic energy")]
-        draw(demo.folder / "bouncing_bar.png", [(labels[0], {}, curves), (labels[1], {}, totals)])
-    return demo.finish(problem, "bouncing_bar")
+        from matplotlib.figure import Figure
 
-
-def pressures(records, cells):
-    """Mean pressure of the floor in each step."""
-    return np.array([r.contact_forces[0][1] for r in records]) * cells / L
-
-
-def errors(t, size, forces):
-    """Impact times, pressures, period against the closed form, relative."""
-    begins = {"first": FIRST, "second": SECOND}
-    impulses, errors = np.cumsum(forces) * size, {}
-    for name, begin in begins.items():
-        near = (t > begin - TOUCH) & (t < begin + 2 * TOUCH)
-        touching = t[near & (forces > 0.05 * RHO * C * V0)]
-        if len(touching) and t[-1] > begin + TOUCH:
-            errors[f"{name}_begin"] = (touching[0] - size) / begin - 1
-            errors[f"{name}_end"] = touching[-1] / (begin + TOUCH) - 1
-            errors[f"{name}_pressure"] = max(windows(t, size, forces, begin), key=abs)
-    if t[-1] > SECOND + TOUCH:
-        errors["period"] = impulses[-1] / (RHO * G * L) / PERIOD - 1
-    return {k: float(v) for k, v in errors.items()}
-
-
-def windows(t, size, forces, begin):
-    """Errors of mean pressures in the middle four fifths of an impact, eight parts."""
-    edges = begin + TOUCH * np.linspace(0.1, 0.9, 9)
-    for low, high in pairwise(edges):
-        inside = (t - size / 2 > low) & (t - size / 2 <= high)
-        yield np.mean(forces[inside]) / np.mean(pressure(t[inside] - size / 2)) - 1
-
-
-def main(argv):
-    """Run the demo and return its solution."""
-    return run(argv)[0]
-
-
-def configure(parser):
-    parser.add_argument("--cells", type=int, help="cells along the bar")
-    parser.add_argument("--step", type=float, help="step in time")
-    parser.add_argument("--courant", type=float, default=1.0, help="step times c over cells")
-    parser.add_argument("--plain", action="store_true", help="steps that are not stabilised")
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])
+        folder.mkdir(parents=True, exist_ok=True)
+        figure, fine = Figure(figsize=(8, 4), layout="constrained"), np.linspace(0.0, end, 4001)
+        left, right = figure.subplots(1, 2)
+        for name, of in found.items():
+            left.plot(t - size / 2, pressures[name], linewidth=1, label=name)
+            right.plot(t, [record.motion["energy"] for record in of], linewidth=1, label=name)
+        left.plot(fine, pressure(fine), "k--", linewidth=1, label="closed form")
+        left.set(xlabel="time", ylabel="pressure of the floor")
+        right.set(xlabel="time", ylabel="kinetic and elastic energy")
+        left.legend()
+        figure.savefig(folder / "bouncing_bar.png")
+if arguments.report:
+    problem.report.write(arguments.report, comm)
+if comm.rank == 0:
+    print(problem.report)
+# -

@@ -9,15 +9,24 @@
 #
 #     ./run mpirun -n 2 python3 demos/deep_drawing_2d.py --plot
 
-"""A sheet drawn by punch, die and blank holder, with springback; balance of forces and work."""
-
+# +
+import argparse
 import sys
 from pathlib import Path
 
 import petsc4py
 
-if __name__ == "__main__":
-    petsc4py.init(sys.argv)  # before DOLFINx, which would initialise PETSc without options
+parser = argparse.ArgumentParser(
+    description="A sheet drawn by punch, die and blank holder, with springback."
+)
+parser.add_argument("--quick", action="store_true", help="a size of a few seconds")
+parser.add_argument("--across", type=int, default=3, help="elements across the sheet")
+parser.add_argument("--steps", type=int, default=24, help="load steps of the stroke")
+parser.add_argument("--plot", action="store_true", help="draw pictures")
+parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
+parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
+arguments, rest = parser.parse_known_args()
+petsc4py.init([sys.argv[0], *rest])  # before DOLFINx: so PETSc's options reach the solver
 
 import numpy as np
 import ufl
@@ -25,18 +34,48 @@ from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 import tfeti_dolfinx as tfeti
-from demos.demo_tools import Demo
-from demos.partial_slip import draw
 
-E, nu, STRENGTH, HARDENING = 2.0e5, 0.3, 250.0, 2000.0  # stainless steel, about
-LENGTH, SHEET = 48.0, 3.0  # half the length, thickness
-PUNCH, CLEARANCE, EDGE = 20.0, 5.0, 7.0  # half the width of the punch; radius of both edges
-MU, HOLDING, STROKE = 0.1, 300.0, 18.0
+# -
+
+# ## Mesh
+#
+# The sheet, of rectangles.
+
+# +
+comm = MPI.COMM_WORLD
+length, thickness = 48.0, 3.0  # half the length
+across = 2 if arguments.quick else arguments.across
+cells = (round(length / thickness * across * 0.7), across)
+ends = [(0.0, 0.0), (length, thickness)]
+sheet = dmesh.create_rectangle(comm, ends, cells, dmesh.CellType.quadrilateral)
+sides = {
+    "axis": lambda x: np.isclose(x[0], 0.0),
+    "bottom": lambda x: np.isclose(x[1], 0.0),
+    "top": lambda x: np.isclose(x[1], thickness),
+}
+decomposition = tfeti.decompose(sheet, 4, surfaces=sides)
+# -
+
+# ## Material: stainless steel, about
+
+E, nu, strength, hardening = 2.0e5, 0.3, 250.0, 2000.0
+V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+u, v = fem.Function(V), ufl.TestFunction(V)
+elastic = tfeti.Elasticity(decomposition, E=E, nu=nu, model="plane_strain")
+steel = tfeti.FiniteJ2Plasticity(
+    elastic, u, yield_stress=strength, hardening=hardening, selective=True
+)
+axis = fem.locate_dofs_topological(V.sub(0), 1, decomposition.facets("axis"))
+
+# ## Tools
+#
+# The die stays, the punch goes down with the time, and the holder's way is found by its force.
+# Their shapes are blocks with a rounded corner: any object with a distance and its gradient is
+# one.
 
 
+# +
 class Edge:
     """A block with one rounded corner, in the quadrant of the signs ``side`` from ``corner`` on."""
 
@@ -66,182 +105,141 @@ class Edge:
         return x, y + shift
 
 
-def torn_mesh(across, subdomains):
-    """The sheet, of rectangles, so many across it: "axis", "bottom", "top"."""
-    cells = (round(LENGTH / SHEET * across * 0.7), across)
-    ends = [[0.0, 0.0], [LENGTH, SHEET]]
-    mesh = dmesh.create_rectangle(MPI.COMM_WORLD, ends, cells, dmesh.CellType.quadrilateral)
-    sides = {
-        "axis": lambda x: np.isclose(x[0], 0.0),
-        "bottom": lambda x: np.isclose(x[1], 0.0),
-        "top": lambda x: np.isclose(x[1], SHEET),
-    }
-    return tfeti.decompose(mesh, subdomains, surfaces=sides)
-
-
-def run(argv):
-    demo = Demo(__doc__, argv, configure)
-    arguments, comm = demo.arguments, MPI.COMM_WORLD
-    stroke = 2.0 if arguments.quick else STROKE
-    steps = 2 if arguments.quick else arguments.steps
-    decomposition = torn_mesh(2 if arguments.quick else arguments.across, 4)
-
-    # ## Material
-    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
-    u, v = fem.Function(V), ufl.TestFunction(V)
-    elastic = tfeti.Elasticity(decomposition, E=E, nu=nu, model="plane_strain")
-    steel = tfeti.FiniteJ2Plasticity(
-        elastic, u, yield_stress=STRENGTH, hardening=HARDENING, selective=True
+width, at, holding = 20.0, 25.0, 300.0  # half the punch; the die, a clearance of 5 from it
+punch, die, holder = (
+    tfeti.RigidBody(Edge(corner, side, radius), name=name, **motion)
+    for name, corner, side, radius, motion in (
+        ("punch", (width, thickness), (-1, 1), 7.0, {"displacement": lambda t: (0.0, -t)}),
+        ("die", (at, 0.0), (1, -1), 7.0, {}),
+        ("holder", (at, thickness), (1, 1), 1.0, {"force": (0.0, -holding), "free": ("y",)}),
     )
-    axis = fem.locate_dofs_topological(V.sub(0), 1, decomposition.facets("axis"))
+)
+contacts = [
+    tfeti.Obstacle(surface, tool, friction=tfeti.Coulomb(0.1), name=tool.name)
+    for surface, tool in (("top", punch), ("bottom", die), ("top", holder))
+]
 
-    # ## Tools
-    #
-    # The die stays, the punch goes down with the time, and the holder's way is found by its force.
-    at = PUNCH + CLEARANCE
-    punch, die, holder = (
-        tfeti.RigidBody(Edge(corner, side, radius), name=name, **motion)
-        for name, corner, side, radius, motion in (
-            ("punch", (PUNCH, SHEET), (-1, 1), EDGE, {"displacement": lambda t: (0.0, -t)}),
-            ("die", (at, 0.0), (1, -1), EDGE, {}),
-            ("holder", (at, SHEET), (1, 1), 1.0, {"force": (0.0, -HOLDING), "free": ("y",)}),
-        )
-    )
-    rough = tfeti.Coulomb(MU)
-    contacts = [
-        tfeti.Obstacle(surface, tool, friction=rough, name=tool.name)
-        for surface, tool in (("top", punch), ("bottom", die), ("top", holder))
-    ]
-    problem = tfeti.NonlinearContactProblem(
+
+def sheet_problem(bcs, contacts):
+    return tfeti.NonlinearContactProblem(
         steel.residual(v),
         u,
-        [fem.dirichletbc(0.0, axis, V.sub(0))],
+        bcs,
         contacts,
         decomposition,
         finite=True,
         state=steel.state,
         update=steel.update,
         stress=steel.stress,
-        petsc_options={"tfeti_rtol": 3e-4, **demo.petsc_options},
+        petsc_options={"tfeti_rtol": 3e-4},
     )
-    depths = stroke * np.arange(1, steps + 1) / steps
-    records = tfeti.LoadSteps(problem, lambda problem, t: None, depths).run()
 
-    # ## Balance
-    #
-    # The tools' work is a sum of trapezoids, over depths and forces that begin at 0.
-    d = np.array([0.0, *(record.time for record in records)])
-    force = np.array([0.0, *(-record.contact_forces[0][1] for record in records)])
-    lift = records[-1].tools["holder displacement y"]
-    work = float(np.sum(0.5 * (force[1:] + force[:-1]) * np.diff(d))) - HOLDING * lift
-    friction = sum(record.dissipation for record in records)
-    flow, kept = energies(steel, comm)
-    errors = problem.report.errors
-    resting = np.sum([contact[1] for contact in records[-1].contact_forces])
-    errors["balance_of_tools"] = float(resting / force[-1])
-    errors["balance_of_work"] = (friction + flow + kept) / work - 1
-    if comm.rank == 0:
-        for record, depth, own in zip(records, d[1:], force[1:], strict=True):
-            figures = record.figures
-            print(
-                f"depth {depth:5.2f}: force {own:.1f}, {figures['newton_steps']} tangents, "
-                f"{figures['F_multiplications']} F",
-                flush=True,
-            )
+
+problem = sheet_problem([fem.dirichletbc(0.0, axis, V.sub(0))], contacts)
+stroke, steps = (2.0, 2) if arguments.quick else (18.0, arguments.steps)
+depths = stroke * np.arange(1, steps + 1) / steps
+records = tfeti.LoadSteps(problem, lambda problem, t: None, depths).run()
+# -
+
+# ## Balance
+#
+# The tools' work is a sum of trapezoids, over depths and forces that begin at 0. It goes into
+# friction, plastic flow, and what the sheet keeps elastically.
+
+
+# +
+def total(form):
+    return comm.allreduce(fem.assemble_scalar(fem.form(form)))
+
+
+d = np.array([0.0, *depths])
+force = np.array([0.0, *(-record.contact_forces[0][1] for record in records)])
+lift = records[-1].tools["holder displacement y"]
+work = float(np.sum(0.5 * (force[1:] + force[:-1]) * np.diff(d))) - holding * lift
+friction = sum(record.dissipation for record in records)
+mu, kappa, s, p = E / 2 / (1 + nu), E / 3 / (1 - 2 * nu), ufl.dev(steel.stress(u)), steel.p
+flow = total((strength * p + hardening / 2 * p**2) * steel.dx)
+dilatation = ufl.ln(ufl.det(ufl.Identity(2) + ufl.grad(u)))
+centre = ufl.dx(metadata={"quadrature_degree": 1})  # of cells, where `selective` takes it
+kept = total(ufl.inner(s, s) / 4 / mu * steel.dx) + total(kappa / 2 * dilatation**2 * centre)
+errors = problem.report.errors
+resting = np.sum([contact[1] for contact in records[-1].contact_forces])
+errors["balance_of_tools"] = float(resting / force[-1])
+errors["balance_of_work"] = (friction + flow + kept) / work - 1
+if comm.rank == 0:
+    for record, own in zip(records, force[1:], strict=True):
+        done = record.figures
         print(
-            f"work {work:.0f} = friction {friction:.0f} + flow {flow:.0f} + elastic {kept:.0f} "
-            f"{errors['balance_of_work']:+.1%}"
+            f"depth {record.time:5.2f}: force {own:.1f}, {done['newton_steps']} tangents, "
+            f"{done['F_multiplications']} F"
         )
-    if arguments.plot:
-        from tfeti_dolfinx.plot import plot_deformed
-
-        path = demo.folder / "deep_drawing_2d.png"
-        plot_deformed(path, problem.solution, factor=1.0, highest=600.0, zoom=1.2)
-
-    # ## Springback
-    #
-    # Without its tools the sheet is another problem, which begins with what it has become. A point
-    # of its middle is held.
-    low = dmesh.locate_entities_boundary(
-        decomposition.mesh, 0, lambda x: np.isclose(x[0], 0.0) & np.isclose(x[1], 0.0)
+    print(
+        f"work {work:.0f} = friction {friction:.0f} + flow {flow:.0f} + elastic {kept:.0f} "
+        f"{errors['balance_of_work']:+.1%}"
     )
-    point = fem.locate_dofs_topological(V.sub(1), 0, low)
-    here = comm.allreduce(float(np.min(u.x.array[point], initial=np.inf)), op=MPI.MIN)
-    bcs = [fem.dirichletbc(0.0, axis, V.sub(0)), fem.dirichletbc(here, point, V.sub(1))]
-    free = tfeti.NonlinearContactProblem(
-        steel.residual(v),
-        u,
-        bcs,
-        [],
-        decomposition,
-        finite=True,
-        state=steel.state,
-        update=steel.update,
-        stress=steel.stress,
-        petsc_options={"tfeti_rtol": 3e-4, **demo.petsc_options},
-    )
-    pressed = [side_now(u, height, comm) for height in (0.0, SHEET)]
-    free.solve()
-    sprung = [side_now(u, height, comm) for height in (0.0, SHEET)]
-    before, after = (
-        np.max(np.arctan2(*np.diff(low, axis=0).T[::-1])) for low, _ in (pressed, sprung)
-    )
-    errors["springback_degrees"] = float(np.degrees(before - after))
-    if comm.rank == 0:
-        print(
-            f"slope of the wall {np.degrees(before):.2f}°, without tools {np.degrees(after):.2f}°"
-        )
-    if arguments.plot and comm.rank == 0:
-        curves = {
-            name: np.vstack((low, high[::-1])).T
-            for name, low, high in (("pressed", *pressed), ("without tools", *sprung))
-        }
-        curves |= {
-            "punch": punch.shape.outline(PUNCH, -stroke),
-            "die": die.shape.outline(LENGTH - at),
-            "holder": holder.shape.outline(LENGTH - at, lift),
-        }
-        labels = ("depth in mm", "force of half the punch in N a mm")
-        path = demo.folder / "deep_drawing_2d_force.png"
-        draw(path, [(labels, {}, {"punch": (d, force)}), (("x in mm", "y in mm"), {}, curves)])
-    free.destroy()
-    return demo.finish(problem, "deep_drawing_2d")
+if arguments.plot:
+    path = (arguments.output or Path("results")) / "deep_drawing_2d.png"
+    looks = {"factor": 1.0, "highest": 600.0, "zoom": 1.2, "unit": "MPa"}
+    tfeti.plot_deformed(path, problem.solution, **looks)
+# -
+
+# ## Springback
+#
+# Without its tools the sheet is another problem, which begins with what it has become. A point
+# of its middle is held.
 
 
-def energies(steel, comm):
-    """What plastic flow has dissipated, and what the sheet keeps elastically."""
-    u, p, mu, kappa = steel.u, steel.p, E / 2 / (1 + nu), E / 3 / (1 - 2 * nu)
-    s = ufl.dev(steel.stress(u))
-    dilatation = ufl.ln(ufl.det(ufl.Identity(2) + ufl.grad(u)))
-    centre = ufl.dx(metadata={"quadrature_degree": 1})  # of cells, where `selective` takes it
-    parts = (
-        (STRENGTH * p + HARDENING / 2 * p**2) * steel.dx,
-        ufl.inner(s, s) / 4 / mu * steel.dx,
-        kappa / 2 * dilatation**2 * centre,
-    )
-    flow, shape, volume = (comm.allreduce(fem.assemble_scalar(fem.form(part))) for part in parts)
-    return flow, shape + volume
-
-
-def side_now(u, height, comm):
+# +
+def side_now(height):
     """Where the sheet's nodes of a height are, from its middle on."""
-    x, moved = u.function_space.tabulate_dof_coordinates(), u.x.array.reshape(-1, 2)
+    x, moved = V.tabulate_dof_coordinates(), u.x.array.reshape(-1, 2)
     on = np.flatnonzero(np.isclose(x[: len(moved), 1], height))
-    parts = comm.allgather(np.column_stack((x[on, 0], x[on, :2] + moved[on])))
-    whole = np.concatenate(parts)
+    whole = np.concatenate(comm.allgather(np.column_stack((x[on, 0], x[on, :2] + moved[on]))))
     _, first = np.unique(whole[:, 0].round(9), return_index=True)  # torn nodes once
     return whole[first, 1:]
 
 
-def main(argv):
-    """Run the demo and return its solution."""
-    return run(argv)[0]
+low = dmesh.locate_entities_boundary(
+    decomposition.mesh, 0, lambda x: np.isclose(x[0], 0.0) & np.isclose(x[1], 0.0)
+)
+point = fem.locate_dofs_topological(V.sub(1), 0, low)
+here = comm.allreduce(float(np.min(u.x.array[point], initial=np.inf)), op=MPI.MIN)
+pressed = [side_now(height) for height in (0.0, thickness)]
+bcs = [fem.dirichletbc(0.0, axis, V.sub(0)), fem.dirichletbc(here, point, V.sub(1))]
+free = sheet_problem(bcs, [])
+free.solve()
+sprung = [side_now(height) for height in (0.0, thickness)]
+before, after = (np.max(np.arctan2(*np.diff(of[0], axis=0).T[::-1])) for of in (pressed, sprung))
+errors["springback_degrees"] = float(np.degrees(before - after))
+if comm.rank == 0:
+    print(f"slope of the wall {np.degrees(before):.2f}°, without tools {np.degrees(after):.2f}°")
+free.destroy()
+# -
 
+# ## Output
 
-def configure(parser):
-    parser.add_argument("--across", type=int, default=3, help="elements across the sheet")
-    parser.add_argument("--steps", type=int, default=24, help="load steps of the stroke")
+# +
+if arguments.output:
+    tfeti.write_vtx(arguments.output / "deep_drawing_2d.bp", problem.solution)
+if arguments.plot:
+    folder = arguments.output or Path("results")
+    if comm.rank == 0:
+        from matplotlib.figure import Figure
 
-
-if __name__ == "__main__":
-    main(sys.argv[1:])
+        figure = Figure(figsize=(10, 4), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        left.plot(d, force, "o-")
+        left.set(xlabel="depth in mm", ylabel="force of half the punch in N a mm")
+        for name, (lower, upper) in {"pressed": pressed, "without tools": sprung}.items():
+            right.plot(*np.vstack((lower, upper[::-1])).T, label=name)
+        far = length - at
+        for tool, long, shift in ((punch, width, -stroke), (die, far, 0.0), (holder, far, lift)):
+            right.plot(*tool.shape.outline(long, shift), color="grey")
+        right.set(xlabel="x in mm", ylabel="y in mm")
+        right.legend()
+        figure.savefig(folder / "deep_drawing_2d_force.png")
+if arguments.report:
+    problem.report.write(arguments.report, comm)
+if comm.rank == 0:
+    print(problem.report)
+# -

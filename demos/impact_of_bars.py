@@ -12,233 +12,189 @@
 #
 #     ./run mpirun -n 2 python3 demos/impact_of_bars.py --plot
 
-"""Impacts of elastic bars in closed form: force, duration, velocities afterwards."""
-
+# +
+import argparse
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import petsc4py
 
-if __name__ == "__main__":
-    petsc4py.init(sys.argv)  # before DOLFINx, which would initialise PETSc without options
+parser = argparse.ArgumentParser(description="Impacts of elastic bars in closed form.")
+parser.add_argument("--quick", action="store_true", help="a size of a few seconds")
+parser.add_argument("--cells", type=int, help="cells along a bar")
+parser.add_argument(
+    "--impact", action="append", choices=("two", "clamped", "wall"), help="only this one"
+)
+parser.add_argument("--plain", action="store_true", help="steps that are not stabilised")
+parser.add_argument(
+    "--poisson", type=float, default=0.3, help="Poisson's ratio of the bar on the wall"
+)
+parser.add_argument("--plot", action="store_true", help="draw pictures")
+parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
+parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
+arguments, rest = parser.parse_known_args()
+petsc4py.init([sys.argv[0], *rest])  # before DOLFINx: so PETSc's options reach the solver
 
 import numpy as np
 import ufl
 from dolfinx import fem
+from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 import tfeti_dolfinx as tfeti
-from demos.demo_tools import Demo
-from demos.partial_slip import draw, print_table
-from meshes.blocks import Block, build
+
+# -
+
+# ## Mesh
+#
+# Hexahedra, one of them across a bar. The upper bar is a gap above the lower one, or above the
+# wall. A box has two more cells, which are taken out between the bars.
+
+# +
+comm = MPI.COMM_WORLD
+cells = arguments.cells or (20 if arguments.quick else 100)
 
 
-@dataclass(frozen=True)
-class Impact:
-    """Bars above each other, of which the upper one comes down.
-
-    Attributes:
-        length: L.
-        side: Edge of the square cross section.
-        modulus: E.
-        nu: Poisson's ratio; if not 0, the bars are confined.
-        rho: Density.
-        speed: V.
-        gap: How far they are apart.
-        below: Whether there is a lower bar, else a rigid wall.
-        clamped: Whether it is clamped at its far end.
-    """
-
-    length: float = 10.0
-    side: float = 1.0
-    modulus: float = 900.0
-    nu: float = 0.0
-    rho: float = 1.0
-    speed: float = 10.0
-    gap: float = 1.0
-    below: bool = True
-    clamped: bool = False
-
-    @property
-    def c(self):
-        """Speed of waves; of a confined bar that of pressure waves."""
-        nu = self.nu
-        return np.sqrt(self.modulus * (1 - nu) / (1 + nu) / (1 - 2 * nu) / self.rho)
-
-    @property
-    def begin(self):
-        """When they meet."""
-        return self.gap / self.speed
-
-    @property
-    def duration(self):
-        """How long they touch."""
-        return (4 if self.clamped else 2) * self.length / self.c
-
-    @property
-    def pressure(self):
-        """ZV/2 of two bars, ZV on a wall."""
-        return self.rho * self.c * self.speed * (0.5 if self.below else 1.0)
-
-    @property
-    def rebound(self):
-        """Velocity of the upper bar afterwards."""
-        return 0.0 if self.below and not self.clamped else self.speed
-
-
-IMPACTS = {
-    "two": Impact(),
-    "clamped": Impact(clamped=True),
-    "wall": Impact(0.2, 0.02, 2e11, 0.3, 8000.0, 100.0, 2e-3, below=False),
-}
-
-
-class Bars:
-    """The bars of an impact, with steps of one size.
-
-    Args:
-        impact: The impact.
-        cells: Cells along a bar.
-        stabilised: Whether steps are contact-stabilised.
-        petsc_options: Options for ``ContactDynamics``.
-    """
-
-    def __init__(self, impact, cells, stabilised, petsc_options):
-        self.impact, L, a, comm = impact, impact.length, impact.side, MPI.COMM_WORLD
-        bars = [Block("upper", (0.0, 0.0, impact.gap), (a, a, L), (1, 1, cells))]
-        if impact.below:
-            bars.append(Block("lower", (0.0, 0.0, -L), (a, a, L), (1, 1, cells)))
-        model = build(bars) if comm.rank == 0 else None
-        halves = self.quarter if impact.below else self.half
-        decomposition = tfeti.read_gmsh(model, comm, halves)
-        elastic = tfeti.Elasticity(decomposition, E=impact.modulus, nu=impact.nu)
-        V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (3,)))
-        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-        down = fem.Function(V)
-        down.interpolate(lambda x: np.outer([0, 0, -impact.speed], x[2] > 0.5 * impact.gap))
-        self.problem = tfeti.ContactDynamics(
-            elastic.a(u, v),
-            ufl.ZeroBaseForm((v,)),
-            self._supports(V, decomposition),
-            [self._contact()],
-            decomposition,
-            mass=impact.rho,
-            velocity=down,
-            stabilised=stabilised,
-            stress=elastic.stress,
-            petsc_options={"tfeti_rtol": 1e-8, **petsc_options},
+def bars(length, side, gap, below):
+    """The torn mesh, each bar two subdomains."""
+    total = 2 * cells + 2 if below else cells
+    box = dmesh.create_box(
+        comm, [(0, 0, 0), (side, side, total)], [1, 1, total], dmesh.CellType.hexahedron
+    )
+    z = box.geometry.x
+    if below:
+        kept = dmesh.locate_entities(box, 3, lambda x: (x[2] < cells + 0.5) | (x[2] > cells + 1.5))
+        box = dmesh.create_submesh(box, 3, kept)[0]
+        z = box.geometry.x
+        z[:, 2] = np.interp(
+            z[:, 2], (0, cells, cells + 2, total), (-length, 0.0, gap, gap + length)
         )
-        self.size = L / cells / impact.c  # a wave runs through a cell in a step
-        dx = ufl.Measure("dx", domain=decomposition.mesh, subdomain_data=decomposition.cell_tags)
-        self._velocity = fem.Function(V)
-        upper = dx(decomposition.volume("upper"))
-        self._momentum = fem.form(self._velocity[2] * upper)
+    else:
+        z[:, 2] = gap + z[:, 2] * length / cells
+    surfaces = {"upper bottom": lambda x: np.isclose(x[2], gap)}
+    if below:
+        surfaces["lower top"] = lambda x: np.isclose(x[2], 0.0)
+        surfaces["lower bottom"] = lambda x: np.isclose(x[2], -length)
 
-    def quarter(self, x):
-        """Two subdomains in each bar."""
-        upper, L = x[2] > 0.5 * self.impact.gap, self.impact.length
-        middle = np.where(upper, self.impact.gap + L / 2, -L / 2)
-        return 2 * upper + (x[2] > middle)
+    def subdomain(x):
+        upper = x[2] > 0.5 * gap
+        return 2 * upper * below + (x[2] > np.where(upper, gap + length / 2, -length / 2))
 
-    def half(self, x):
-        """Two subdomains."""
-        return x[2] > self.impact.gap + self.impact.length / 2
-
-    def _supports(self, V, decomposition):
-        supports, mesh = [], decomposition.mesh
-        if self.impact.clamped:
-            far = fem.locate_dofs_topological(V, 2, decomposition.facets("lower bottom"))
-            supports.append(fem.dirichletbc(np.zeros(3), far, V))
-        if self.impact.nu:
-            mesh.topology.create_connectivity(3, 3)
-            cells = np.arange(mesh.topology.index_map(3).size_local, dtype=np.int32)
-            for k in (0, 1):
-                everywhere = fem.locate_dofs_topological(V.sub(k), 3, cells)
-                supports.append(fem.dirichletbc(0.0, everywhere, V.sub(k)))
-        return supports
-
-    def _contact(self):
-        reach = 2 * self.impact.gap
-        if self.impact.below:
-            return tfeti.Contact("upper bottom", "lower top", reach=reach, name="impact")
-        wall = tfeti.Plane((0, 0, 0), normal=(0, 0, 1))
-        return tfeti.Obstacle("upper bottom", wall, reach=reach, name="impact")
-
-    def run(self):
-        """Times of the ends of steps, pressures in them, and the velocity afterwards."""
-        impact, area = self.impact, self.impact.side**2
-        count = round((impact.begin + 1.4 * impact.duration) / self.size)
-        times = self.size * np.arange(1, count + 1)
-        records = tfeti.LoadSteps(self.problem, lambda problem, t: None, times).run()
-        pressures = [abs(r.contact_forces[0][2]) / area for r in records]
-        self._velocity.x.array[:] = self.problem.solution.velocity.x.array
-        momentum = MPI.COMM_WORLD.allreduce(fem.assemble_scalar(self._momentum))
-        return (
-            np.array([r.time for r in records]),
-            np.array(pressures),
-            momentum / impact.length / area,
-            records,
-        )
+    return tfeti.decompose(box, subdomain, surfaces=surfaces)
 
 
-def look(bars, t, p, velocity, records):
-    """What is compared with the closed form, relative but for multiplications."""
-    impact, F = bars.impact, [r.figures["F_multiplications"] for r in records]
-    touching = t[p > 0.5 * impact.pressure]
-    begin, end = touching[0] - bars.size, touching[-1]
-    inside = (t - bars.size > begin + 0.1 * impact.duration) & (t < end - 0.1 * impact.duration)
-    energy = [r.motion["energy"] for r in records]
-    return {
-        "steps": len(t),
-        "begin": float(begin / impact.begin - 1),
-        "duration": float((end - begin) / impact.duration - 1),
-        "pressure": float(np.mean(p[inside]) / impact.pressure - 1),
-        "oscillates": float(np.std(p[inside]) / impact.pressure),
-        "velocity": float((velocity - impact.rebound) / impact.speed),
-        "energy": float(energy[-1] / energy[0] - 1),
-        "F": sum(F),
+# -
+
+# ## Motion
+#
+# In a step a wave runs through a cell.
+
+
+# +
+def impact(name, stabilised):
+    """Run an impact: the problem, times and pressures over the closed form, errors."""
+    wall = name == "wall"
+    length, side, E, nu, rho, speed, gap = (
+        (0.2, 0.02, 2e11, arguments.poisson, 8000.0, 100.0, 2e-3)
+        if wall
+        else (10.0, 1.0, 900.0, 0.0, 1.0, 10.0, 1.0)
+    )
+    c = np.sqrt(E * (1 - nu) / (1 + nu) / (1 - 2 * nu) / rho)
+    begins, lasts = gap / speed, (4 if name == "clamped" else 2) * length / c
+    closed = rho * c * speed * (1.0 if wall else 0.5)
+    rebound = 0.0 if name == "two" else speed
+    decomposition = bars(length, side, gap, not wall)
+    mesh = decomposition.mesh
+    elastic = tfeti.Elasticity(decomposition, E=E, nu=nu)
+    V = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
+    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+    down = fem.Function(V)
+    down.interpolate(lambda x: np.outer([0, 0, -speed], x[2] > 0.5 * gap))
+    bcs = []
+    if name == "clamped":
+        far = fem.locate_dofs_topological(V, 2, decomposition.facets("lower bottom"))
+        bcs.append(fem.dirichletbc(np.zeros(3), far, V))
+    if nu:  # it cannot widen
+        everywhere = np.arange(mesh.topology.index_map(3).size_local, dtype=np.int32)
+        for k in (0, 1):
+            dofs = fem.locate_dofs_topological(V.sub(k), 3, everywhere)
+            bcs.append(fem.dirichletbc(0.0, dofs, V.sub(k)))
+    contact = tfeti.Contact("upper bottom", "lower top", reach=2 * gap, name="impact")
+    if wall:
+        plane = tfeti.Plane((0, 0, 0), normal=(0, 0, 1))
+        contact = tfeti.Obstacle("upper bottom", plane, reach=2 * gap, name="impact")
+    problem = tfeti.ContactDynamics(
+        elastic.a(u, v),
+        ufl.ZeroBaseForm((v,)),
+        bcs,
+        [contact],
+        decomposition,
+        mass=rho,
+        velocity=down,
+        stabilised=stabilised,
+        stress=elastic.stress,
+        petsc_options={"tfeti_rtol": 1e-8},
+    )
+    size = length / cells / c
+    t = size * np.arange(1, round((begins + 1.4 * lasts) / size) + 1)
+    records = tfeti.LoadSteps(problem, lambda problem, t: None, t).run()
+    p = np.array([abs(record.contact_forces[0][2]) for record in records]) / side**2
+
+    # its velocity afterwards is the mean over the upper bar
+    after = fem.Function(V)
+    after.x.array[:] = problem.solution.velocity.x.array
+    upper = ufl.conditional(ufl.gt(ufl.SpatialCoordinate(mesh)[2], 0.5 * gap), after[2], 0.0)
+    momentum = comm.allreduce(fem.assemble_scalar(fem.form(upper * ufl.dx)))
+    touching = t[p > 0.5 * closed]
+    begin, end = touching[0] - size, touching[-1]
+    inside = (t - size > begin + 0.1 * lasts) & (t < end - 0.1 * lasts)
+    energy = [record.motion["energy"] for record in records]
+    errors = {
+        "begin": begin / begins - 1,
+        "duration": (end - begin) / lasts - 1,
+        "pressure": np.mean(p[inside]) / closed - 1,
+        "oscillates": np.std(p[inside]) / closed,
+        "velocity": (momentum / length / side**2 - rebound) / speed,
+        "energy": energy[-1] / energy[0] - 1,
     }
+    if comm.rank == 0:
+        print(f"{name}, {'stabilised' if stabilised else 'plain'}, {len(t)} steps,", end=" ")
+        print(f"{sum(record.figures['F_multiplications'] for record in records)} F:", end=" ")
+        print(", ".join(f"{key} {value:.4g}" for key, value in errors.items()), flush=True)
+    return problem, t / begins, p / closed, errors
 
 
-def run(argv):
-    demo = Demo(__doc__, argv, configure)
-    arguments, comm = demo.arguments, MPI.COMM_WORLD
-    cells = arguments.cells or (20 if arguments.quick else 100)
-    names = ["two"] if arguments.quick else arguments.impact or list(IMPACTS)
-    panels, errors = [], {}
-    for name in names:
-        curves = {}
-        for stabilised in (False, True) if arguments.plot else (not arguments.plain,):
-            bars = Bars(IMPACTS[name], cells, stabilised, demo.petsc_options)
-            t, p, velocity, records = bars.run()
-            row = look(bars, t, p, velocity, records)
-            kind = "stabilised" if stabilised else "plain"
-            curves[kind] = (t / bars.impact.begin, p / bars.impact.pressure)
-            if comm.rank == 0:
-                print(f"{name}, {kind}", flush=True)
-            print_table(comm, [row])
-        labels = ("time / that of the impact", f"pressure / closed form: {name}")
-        panels.append((labels, {}, curves))
-        errors |= {f"{name}_{k}": v for k, v in row.items() if isinstance(v, float)}
-    bars.problem.report.errors.update(errors)
-    if arguments.plot and comm.rank == 0:
-        draw(demo.folder / "impact_of_bars.png", panels)
-    return demo.finish(bars.problem, "impact_of_bars")
+names = arguments.impact or (["two"] if arguments.quick else ["two", "clamped", "wall"])
+panels, errors = {}, {}
+for name in names:
+    panels[name] = {}
+    for stabilised in (False, True) if arguments.plot else (not arguments.plain,):
+        problem, t, p, found = impact(name, stabilised)
+        panels[name]["stabilised" if stabilised else "plain"] = (t, p)
+    errors |= {f"{name}_{key}": float(value) for key, value in found.items()}
+problem.report.errors.update(errors)
+# -
 
+# ## Output
 
-def main(argv):
-    """Run the demo and return its solution."""
-    return run(argv)[0]
+# +
+if arguments.output:
+    tfeti.write_vtx(arguments.output / "impact_of_bars.bp", problem.solution)
+if arguments.plot:
+    folder = arguments.output or Path("results")
+    if comm.rank == 0:
+        from matplotlib.figure import Figure
 
-
-def configure(parser):
-    parser.add_argument("--cells", type=int, help="cells along a bar")
-    parser.add_argument("--impact", action="append", choices=list(IMPACTS), help="only this one")
-    parser.add_argument("--plain", action="store_true", help="steps that are not stabilised")
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])
+        folder.mkdir(parents=True, exist_ok=True)
+        figure = Figure(figsize=(4 * len(names), 4), layout="constrained")
+        for axes, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
+            for kind, (t, p) in panels[name].items():
+                axes.plot(t, p, linewidth=1, label=kind)
+            axes.set(xlabel="time / that of the impact", ylabel=f"pressure / closed form: {name}")
+        axes.legend()
+        figure.savefig(folder / "impact_of_bars.png")
+if arguments.report:
+    problem.report.write(arguments.report, comm)
+if comm.rank == 0:
+    print(problem.report)
+# -

@@ -6,15 +6,24 @@
 #
 #     ./run mpirun -n 2 python3 demos/ironing_2d.py --plot
 
-"""A stiff half disc drawn along a soft slab with Coulomb's friction: large sliding, forces."""
-
+# +
+import argparse
 import sys
 from pathlib import Path
 
 import petsc4py
 
-if __name__ == "__main__":
-    petsc4py.init(sys.argv)  # before DOLFINx, which would initialise PETSc without options
+parser = argparse.ArgumentParser(
+    description="A stiff half disc drawn along a soft slab with Coulomb's friction."
+)
+parser.add_argument("--quick", action="store_true", help="a size of a few seconds")
+parser.add_argument("--size", type=float, help="element size")
+parser.add_argument("--steps", type=int, default=10, help="load steps along the slab")
+parser.add_argument("--plot", action="store_true", help="draw pictures")
+parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
+parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
+arguments, rest = parser.parse_known_args()
+petsc4py.init([sys.argv[0], *rest])  # before DOLFINx: so PETSc's options reach the solver
 
 import gmsh
 import numpy as np
@@ -22,119 +31,120 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 import tfeti_dolfinx as tfeti
-from demos.demo_tools import Demo
-from demos.partial_slip import draw
-from meshes.tools import graded_size, started_model
 
-MU, nu = 0.3, 0.3
-E = {"slab": 1.0, "die": 10.0}
-LENGTH, HEIGHT, R = 8.0, 2.0, 1.5
-DEPTH, WAY = 0.5, 3.0
+# -
+
+# ## Mesh
+#
+# The slab under y = 0, and a half disc on it at x = 2.
+
+# +
+comm = MPI.COMM_WORLD
+length, height, R = 8.0, 2.0, 1.5
+size = arguments.size or (0.35 if arguments.quick else 0.18)
+gmsh.initialize()
+gmsh.option.setNumber("General.Terminal", 0)
+model, geo = gmsh.model, gmsh.model.geo
+if comm.rank == 0:
+    corners = ((0, -height), (length, -height), (length, 0), (0, 0))
+    points = [geo.addPoint(x, y, 0) for x, y in corners]
+    sides = [geo.addLine(points[k], points[(k + 1) % 4]) for k in range(4)]
+    slab = geo.addPlaneSurface([geo.addCurveLoop(sides)])
+    ends = ((2 - R, R), (2, R), (2 + R, R), (2, 0))
+    left, centre, right, low = (geo.addPoint(x, y, 0) for x, y in ends)
+    arcs = [geo.addCircleArc(left, centre, low), geo.addCircleArc(low, centre, right)]
+    grip = geo.addLine(right, left)
+    die = geo.addPlaneSurface([geo.addCurveLoop([*arcs, grip])])
+    geo.synchronize()
+    model.addPhysicalGroup(2, [slab], name="slab")
+    model.addPhysicalGroup(2, [die], name="die")
+    curves = {"bottom": sides[:1], "surface": sides[2:3], "arc": arcs, "grip": [grip]}
+    for name, tags in curves.items():
+        model.addPhysicalGroup(1, tags, name=name)
+    gmsh.option.setNumber("Mesh.MeshSizeMin", size)
+    gmsh.option.setNumber("Mesh.MeshSizeMax", size)
+    model.mesh.generate(2)
+decomposition = tfeti.read_gmsh(model if comm.rank == 0 else None, comm, 8)
+gmsh.finalize()
+# -
+
+# ## Two bodies of one material, with moduli by their names
+
+# +
+V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+u, v = fem.Function(V), ufl.TestFunction(V)
+young = {"slab": 1.0, "die": 10.0}
+elastic = tfeti.Elasticity(decomposition, E=young, nu=0.3, model="plane_strain")
+rubber = tfeti.NeoHooke(elastic, u)
+place = fem.Constant(decomposition.mesh, (0.0, 0.0))
+bottom, grip = (
+    fem.locate_dofs_topological(V, 1, decomposition.facets(name)) for name in ("bottom", "grip")
+)
+problem = tfeti.NonlinearContactProblem(
+    rubber.residual(v),
+    u,
+    [fem.dirichletbc(np.zeros(2), bottom, V), fem.dirichletbc(place, grip, V)],
+    [tfeti.Contact("surface", "arc", friction=tfeti.Coulomb(0.3), name="die")],
+    decomposition,
+    finite=True,
+    update=rubber.update,
+    stress=rubber.stress,
+    petsc_options={"tfeti_rtol": 2e-5},
+)
+# -
+
+# ## Down, then along
+#
+# In a load step friction acts on what slips since its begin, along tangents that turn with
+# the surface.
+
+# +
+down, along = (2, 1) if arguments.quick else (5, arguments.steps)
+stride = 3.0 / (10 if arguments.quick else along)
 
 
-def torn_mesh(size, subdomains):
-    """The slab under y = 0, and a half disc on it at x = 2."""
-    comm, model = MPI.COMM_WORLD, None
+def move(problem, t):
+    place.value = (stride * max(t - down, 0.0), -0.5 * min(t / down, 1.0))
+
+
+records = tfeti.LoadSteps(problem, move, np.arange(1.0, down + along + 1)).run()
+# -
+
+# ## Forces on the slab
+
+# +
+forces = np.array([record.contact_forces[0] for record in records])
+problem.report.errors["force_along_over_force_down"] = float(-forces[-1, 0] / forces[-1, 1])
+if comm.rank == 0:
+    for record, force in zip(records, forces, strict=True):
+        done = record.figures
+        print(
+            f"step {record.time:4.1f}: force down {-force[1]:.4f}, along {force[0]:.4f}, "
+            f"{done['newton_steps']} tangents, {done['F_multiplications']} F"
+        )
+# -
+
+# ## Output
+
+# +
+if arguments.output:
+    tfeti.write_vtx(arguments.output / "ironing_2d.bp", problem.solution)
+if arguments.plot:
+    folder = arguments.output or Path("results")
+    tfeti.plot_deformed(folder / "ironing_2d.png", problem.solution, factor=1.0)
     if comm.rank == 0:
-        model = started_model("ironing")
-        geo = model.geo
-        corners = ((0, -HEIGHT), (LENGTH, -HEIGHT), (LENGTH, 0), (0, 0))
-        points = [geo.addPoint(x, y, 0.0) for x, y in corners]
-        sides = [geo.addLine(points[k], points[(k + 1) % 4]) for k in range(4)]
-        slab = geo.addPlaneSurface([geo.addCurveLoop(sides)])
-        ends = ((2 - R, R), (2, R), (2 + R, R), (2, 0))
-        left, centre, right, low = (geo.addPoint(x, y, 0.0) for x, y in ends)
-        arcs = [geo.addCircleArc(left, centre, low), geo.addCircleArc(low, centre, right)]
-        grip = geo.addLine(right, left)
-        die = geo.addPlaneSurface([geo.addCurveLoop([*arcs, grip])])
-        geo.synchronize()
-        for name, body in (("slab", slab), ("die", die)):
-            model.addPhysicalGroup(2, [body], name=name)
-        for name, curves in (("bottom", sides[:1]), ("surface", sides[2:3]), ("arc", arcs)):
-            model.addPhysicalGroup(1, curves, name=name)
-        model.addPhysicalGroup(1, [grip], name="grip")
-        graded_size((0.0, 0.0, 0.0), size, LENGTH, 0.0)
-        gmsh.model.mesh.generate(2)
-    return tfeti.read_gmsh(model, comm, subdomains)
+        from matplotlib.figure import Figure
 
-
-def run(argv):
-    demo = Demo(__doc__, argv, configure)
-    arguments, comm = demo.arguments, MPI.COMM_WORLD
-    decomposition = torn_mesh(arguments.size or (0.35 if arguments.quick else 0.18), 8)
-
-    # ## Two bodies of one material, with moduli by their names
-    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
-    u, v = fem.Function(V), ufl.TestFunction(V)
-    elastic = tfeti.Elasticity(decomposition, E=E, nu=nu, model="plane_strain")
-    rubber = tfeti.NeoHooke(elastic, u)
-    place = fem.Constant(decomposition.mesh, (0.0, 0.0))
-    held = fem.Constant(decomposition.mesh, (0.0, 0.0))
-    bcs = [
-        fem.dirichletbc(value, fem.locate_dofs_topological(V, 1, decomposition.facets(name)), V)
-        for name, value in (("bottom", held), ("grip", place))
-    ]
-    pair = tfeti.Contact("surface", "arc", friction=tfeti.Coulomb(MU), name="die")
-    problem = tfeti.NonlinearContactProblem(
-        rubber.residual(v),
-        u,
-        bcs,
-        [pair],
-        decomposition,
-        finite=True,
-        update=rubber.update,
-        stress=rubber.stress,
-        petsc_options={"tfeti_rtol": 2e-5, **demo.petsc_options},
-    )
-
-    # ## Down, then along
-    #
-    # In a load step friction acts on what slips since its begin, along tangents that turn with
-    # the surface.
-    down, along = (2, 1) if arguments.quick else (5, arguments.steps)
-    stride = WAY / (10 if arguments.quick else along)
-
-    def apply(_, t):
-        place.value = (stride * max(t - down, 0.0), -DEPTH * min(t / down, 1.0))
-
-    times = np.arange(1.0, down + along + 1)
-    records = tfeti.LoadSteps(problem, apply, times).run()
-    # on the slab: drawn along and pressed down
-    forces = np.array([record.contact_forces[0] for record in records])
-    ratio = forces[:, 0] / forces[:, 1]
-    problem.report.errors["force_along_over_force_down"] = float(-ratio[-1])
-    if comm.rank == 0:
-        for record, force in zip(records, forces, strict=True):
-            figures = record.figures
-            print(
-                f"step {record.time:4.1f}: force down {-force[1]:.4f}, along {force[0]:.4f}, "
-                f"{figures['newton_steps']} tangents, {figures['F_multiplications']} F",
-                flush=True,
-            )
-    if arguments.plot:
-        from tfeti_dolfinx.plot import plot_deformed
-
-        plot_deformed(demo.folder / "ironing_2d.png", problem.solution, factor=1.0)
-        if comm.rank == 0:
-            t = np.array([record.time for record in records])
-            curves = {"pressed down": (t, -forces[:, 1]), "drawn along": (t, forces[:, 0])}
-            labels = ("load step", "force on the slab")
-            draw(demo.folder / "ironing_2d_force.png", [(labels, {}, curves)])
-    return demo.finish(problem, "ironing_2d")
-
-
-def main(argv):
-    """Run the demo and return its solution."""
-    return run(argv)[0]
-
-
-def configure(parser):
-    parser.add_argument("--size", type=float, help="element size")
-    parser.add_argument("--steps", type=int, default=10, help="load steps along the slab")
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])
+        figure = Figure(layout="constrained")
+        axes = figure.subplots()
+        axes.plot(-forces[:, 1], "o-", label="pressed down")
+        axes.plot(forces[:, 0], "o-", label="drawn along")
+        axes.set(xlabel="load step", ylabel="force on the slab")
+        axes.legend()
+        figure.savefig(folder / "ironing_2d_force.png")
+if arguments.report:
+    problem.report.write(arguments.report, comm)
+if comm.rank == 0:
+    print(problem.report)
+# -

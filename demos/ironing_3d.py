@@ -8,15 +8,24 @@
 #
 #     ./run mpirun -n 2 python3 demos/ironing_3d.py --plot
 
-"""A stiff half ball drawn along a soft slab with Coulomb's friction: large sliding, forces."""
-
+# +
+import argparse
 import sys
 from pathlib import Path
 
 import petsc4py
 
-if __name__ == "__main__":
-    petsc4py.init(sys.argv)  # before DOLFINx, which would initialise PETSc without options
+parser = argparse.ArgumentParser(
+    description="A stiff half ball drawn along a soft slab with Coulomb's friction."
+)
+parser.add_argument("--quick", action="store_true", help="a size of a few seconds")
+parser.add_argument("--size", type=float, help="element size where the die passes")
+parser.add_argument("--steps", type=int, default=9, help="load steps along the slab")
+parser.add_argument("--plot", action="store_true", help="draw pictures")
+parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
+parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
+arguments, rest = parser.parse_known_args()
+petsc4py.init([sys.argv[0], *rest])  # before DOLFINx: so PETSc's options reach the solver
 
 import gmsh
 import numpy as np
@@ -24,26 +33,27 @@ import ufl
 from dolfinx import fem
 from mpi4py import MPI
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 import tfeti_dolfinx as tfeti
-from demos.demo_tools import Demo
-from demos.partial_slip import draw
-from meshes.tools import started_model
 
-MU, nu = 0.3, 0.3
-E = {"slab": 1.0, "die": 10.0}
-LENGTH, WIDTH, HEIGHT, R, BEGIN = 4.8, 1.5, 1.2, 1.0, 1.4  # half the width; where the die begins
-DEPTH, WAY = 0.3, 1.8
+# -
 
+# ## Mesh
+#
+# Surfaces are known by the body and a plane; elements are finest where the die passes.
 
-def build(size):
-    """Mesh slab and die on this rank; gmsh's model."""
-    model, occ = started_model("ironing in 3D"), gmsh.model.occ
-    ball = occ.addSphere(BEGIN, 0.0, R, R, angle1=-np.pi / 2, angle2=0.0, angle3=np.pi)
-    bodies = {"slab": occ.addBox(0.0, 0.0, -HEIGHT, LENGTH, WIDTH, HEIGHT), "die": ball}
+# +
+comm = MPI.COMM_WORLD
+length, width, height, R, begin = 4.8, 1.5, 1.2, 1.0, 1.4  # half the width; where the die begins
+size = arguments.size or (0.4 if arguments.quick else 0.16)
+gmsh.initialize()
+gmsh.option.setNumber("General.Terminal", 0)
+gmsh.option.setNumber("Mesh.Algorithm3D", 10)  # HXT
+model, occ = gmsh.model, gmsh.model.occ
+if comm.rank == 0:
+    ball = occ.addSphere(begin, 0.0, R, R, angle1=-np.pi / 2, angle2=0.0, angle3=np.pi)
+    bodies = {"slab": occ.addBox(0.0, 0.0, -height, length, width, height), "die": ball}
     occ.synchronize()
-    planes = {"bottom": ("slab", 2, -HEIGHT), "surface": ("slab", 2, 0.0), "grip": ("die", 2, R)}
+    planes = {"bottom": ("slab", 2, -height), "surface": ("slab", 2, 0.0), "grip": ("die", 2, R)}
     middle, cap = [], []
     for name, tag in bodies.items():
         model.addPhysicalGroup(3, [tag], name=name)
@@ -59,96 +69,99 @@ def build(size):
                     model.addPhysicalGroup(2, [face], name=surface)
     model.addPhysicalGroup(2, middle, name="middle")
     model.addPhysicalGroup(2, cap, name="cap")
-    field = model.mesh.field.add("MathEval")  # finest where the die passes
+    field = model.mesh.field.add("MathEval")
     model.mesh.field.setString(field, "F", f"{size} * (1 + 0.5 * Sqrt(y*y + z*z))")
     model.mesh.field.setAsBackgroundMesh(field)
     for name in ("FromPoints", "FromCurvature", "ExtendFromBoundary"):
         gmsh.option.setNumber(f"Mesh.MeshSize{name}", 0)
-    gmsh.option.setNumber("Mesh.Algorithm3D", 10)  # HXT
     model.mesh.generate(3)
-    return model
+subdomains = 4 if arguments.quick else 12
+decomposition = tfeti.read_gmsh(model if comm.rank == 0 else None, comm, subdomains)
+gmsh.finalize()
+# -
+
+# ## Two bodies of one material, with moduli by their names
+
+# +
+V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (3,)))
+u, v = fem.Function(V), ufl.TestFunction(V)
+young = {"slab": 1.0, "die": 10.0}
+rubber = tfeti.NeoHooke(tfeti.Elasticity(decomposition, E=young, nu=0.3), u)
+place = fem.Constant(decomposition.mesh, (0.0, 0.0, 0.0))
+held, grip = (
+    fem.locate_dofs_topological(V, 2, decomposition.facets(name)) for name in ("bottom", "grip")
+)
+side = fem.locate_dofs_topological(V.sub(1), 2, decomposition.facets("middle"))
+bcs = [fem.dirichletbc(np.zeros(3), held, V), fem.dirichletbc(place, grip, V)]
+bcs.append(fem.dirichletbc(0.0, side, V.sub(1)))
+law = tfeti.Coulomb(0.3)
+problem = tfeti.NonlinearContactProblem(
+    rubber.residual(v),
+    u,
+    bcs,
+    [tfeti.Contact("surface", "cap", secondary="surface", friction=law, name="die")],
+    decomposition,
+    finite=True,
+    update=rubber.update,
+    stress=rubber.stress,
+    petsc_options={"tfeti_rtol": 1e-4},
+)
+# -
+
+# ## Down, then along
+
+# +
+down, along = (1, 1) if arguments.quick else (3, arguments.steps)
+stride = 1.8 / (9 if arguments.quick else along)
 
 
-def run(argv):
-    demo = Demo(__doc__, argv, configure)
-    arguments, comm = demo.arguments, MPI.COMM_WORLD
-    size = arguments.size or (0.4 if arguments.quick else 0.16)
-    model = build(size) if comm.rank == 0 else None
-    decomposition = tfeti.read_gmsh(model, comm, 4 if arguments.quick else 12)
+def move(problem, t):
+    place.value = (stride * max(t - down, 0.0), 0.0, -0.3 * min(t / down, 1.0))
 
-    # ## Two bodies of one material, with moduli by their names
-    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (3,)))
-    u, v = fem.Function(V), ufl.TestFunction(V)
-    rubber = tfeti.NeoHooke(tfeti.Elasticity(decomposition, E=E, nu=nu), u)
-    place = fem.Constant(decomposition.mesh, (0.0, 0.0, 0.0))
-    held = fem.Constant(decomposition.mesh, (0.0, 0.0, 0.0))
-    bcs = [
-        fem.dirichletbc(value, fem.locate_dofs_topological(V, 2, decomposition.facets(name)), V)
-        for name, value in (("bottom", held), ("grip", place))
-    ]
-    side = fem.locate_dofs_topological(V.sub(1), 2, decomposition.facets("middle"))
-    bcs.append(fem.dirichletbc(0.0, side, V.sub(1)))
-    pair = tfeti.Contact(
-        "surface", "cap", secondary="surface", friction=tfeti.Coulomb(MU), name="die"
-    )
-    problem = tfeti.NonlinearContactProblem(
-        rubber.residual(v),
-        u,
-        bcs,
-        [pair],
-        decomposition,
-        finite=True,
-        update=rubber.update,
-        stress=rubber.stress,
-        petsc_options={"tfeti_rtol": 1e-4, **demo.petsc_options},
-    )
 
-    # ## Down, then along
-    down, along = (1, 1) if arguments.quick else (3, arguments.steps)
-    stride = WAY / (9 if arguments.quick else along)
+records = tfeti.LoadSteps(problem, move, np.arange(1.0, down + along + 1)).run()
+# -
 
-    def apply(_, t):
-        place.value = (stride * max(t - down, 0.0), 0.0, -DEPTH * min(t / down, 1.0))
+# ## Forces on both halves of the slab
 
-    records = tfeti.LoadSteps(problem, apply, np.arange(1.0, down + along + 1)).run()
-    # on both halves of the slab: drawn along and pressed down
-    forces = 2 * np.array([record.contact_forces[0] for record in records])
-    ratio = -forces[:, 0] / forces[:, 2]
-    base = 2 * np.array(problem.solution.reaction("bottom").force)
-    errors = problem.report.errors
-    errors["force_along_over_force_down"] = float(ratio[-1])
-    errors["balance"] = float(np.abs(forces[-1] + base)[[0, 2]].max() / -forces[-1, 2])
+# +
+forces = 2 * np.array([record.contact_forces[0] for record in records])
+ratio = -forces[-1, 0] / forces[-1, 2]
+base = 2 * np.array(problem.solution.reaction("bottom").force)
+errors = problem.report.errors
+errors["force_along_over_force_down"] = float(ratio)
+errors["balance"] = float(np.abs(forces[-1] + base)[[0, 2]].max() / -forces[-1, 2])
+if comm.rank == 0:
+    for record, force in zip(records, forces, strict=True):
+        done = record.figures
+        print(
+            f"step {record.time:4.1f}: force down {-force[2]:.4f}, along {force[0]:.4f}, "
+            f"{done['newton_steps']} tangents, {done['F_multiplications']} F"
+        )
+    print(f"along over down {ratio:.3f}, off balance {errors['balance']:.1e} of it")
+# -
+
+# ## Output
+
+# +
+if arguments.output:
+    tfeti.write_vtx(arguments.output / "ironing_3d.bp", problem.solution)
+if arguments.plot:
+    folder = arguments.output or Path("results")
+    look = {"view": (0.5, -1.0, 0.5), "factor": 1.0}
+    tfeti.plot_deformed(folder / "ironing_3d.png", problem.solution, **look)
     if comm.rank == 0:
-        for record, force in zip(records, forces, strict=True):
-            figures = record.figures
-            print(
-                f"step {record.time:4.1f}: force down {-force[2]:.4f}, along {force[0]:.4f}, "
-                f"{figures['newton_steps']} tangents, {figures['F_multiplications']} F",
-                flush=True,
-            )
-        print(f"along over down {ratio[-1]:.3f}, off balance {errors['balance']:.1e} of it")
-    if arguments.plot:
-        from tfeti_dolfinx.plot import plot_deformed
+        from matplotlib.figure import Figure
 
-        look = {"view": (0.5, -1.0, 0.5), "factor": 1.0}
-        plot_deformed(demo.folder / "ironing_3d.png", problem.solution, **look)
-        if comm.rank == 0:
-            t = np.array([record.time for record in records])
-            curves = {"pressed down": (t, -forces[:, 2]), "drawn along": (t, forces[:, 0])}
-            labels = ("load step", "force on the slab")
-            draw(demo.folder / "ironing_3d_force.png", [(labels, {}, curves)])
-    return demo.finish(problem, "ironing_3d")
-
-
-def main(argv):
-    """Run the demo and return its solution."""
-    return run(argv)[0]
-
-
-def configure(parser):
-    parser.add_argument("--size", type=float, help="element size where the die passes")
-    parser.add_argument("--steps", type=int, default=9, help="load steps along the slab")
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])
+        figure = Figure(layout="constrained")
+        axes = figure.subplots()
+        axes.plot(-forces[:, 2], "o-", label="pressed down")
+        axes.plot(forces[:, 0], "o-", label="drawn along")
+        axes.set(xlabel="load step", ylabel="force on the slab")
+        axes.legend()
+        figure.savefig(folder / "ironing_3d_force.png")
+if arguments.report:
+    problem.report.write(arguments.report, comm)
+if comm.rank == 0:
+    print(problem.report)
+# -

@@ -4,20 +4,30 @@
 # SSNV506 of Code_Aster). Once all under the ball flows, the mean pressure is that of slip lines,
 # and the force grows in proportion to the depth: 2.038e6 N a radian at 20 mm.
 #
-# Each step has to be short beside the depth, and elements beside the contact: the ring that the
-# ball touches anew in a step, or between two nodes, is pressed by less than the rest.
+# Each step has to be short compared with the depth, and elements compared with the contact: the
+# ring that the ball touches anew in a step, or between two nodes, is pressed by less than the
+# rest.
 #
 #     ./run mpirun -n 2 python3 demos/plastic_indentation_2d.py --plot
 
-"""A rigid ball pressed into a perfectly plastic block, beside the force of slip lines."""
-
+# +
+import argparse
 import sys
 from pathlib import Path
 
 import petsc4py
 
-if __name__ == "__main__":
-    petsc4py.init(sys.argv)  # before DOLFINx, which would initialise PETSc without options
+parser = argparse.ArgumentParser(description="A rigid ball pressed into a perfectly plastic block.")
+parser.add_argument("--quick", action="store_true", help="a size of a few seconds")
+parser.add_argument("--depth", type=float, help="how deep, in mm")
+parser.add_argument("--size", type=float, help="element size under the ball, in mm")
+parser.add_argument("--near", type=float, default=240.0, help="half width of the fine zone, in mm")
+parser.add_argument("--steps", type=int, help="load steps")
+parser.add_argument("--plot", action="store_true", help="draw pictures")
+parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
+parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
+arguments, rest = parser.parse_known_args()
+petsc4py.init([sys.argv[0], *rest])  # before DOLFINx: so PETSc's options reach the solver
 
 import numpy as np
 import ufl
@@ -25,136 +35,122 @@ from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-
 import tfeti_dolfinx as tfeti
-from demos.demo_tools import Demo
-from demos.partial_slip import draw
 
-R, E, nu, STRENGTH = 500.0, 2.1e5, 0.3, 50.0  # mm, N
-WIDTH, HEIGHT, GROWTH = 1920.0, 1620.0, 1.3
-SLIP_LINES = 2.038e6 / 20.0  # force a radian over depth
+# -
+
+# ## Mesh
+#
+# Rectangles, of equal size near the ball and growing away from it. Lengths are in mm, forces in N.
+
+# +
+comm = MPI.COMM_WORLD
+R, E, nu, strength = 500.0, 2.1e5, 0.3, 50.0
+fine = 20.0 if arguments.quick else arguments.size or 10.0
+near = 80.0 if arguments.quick else arguments.near
 
 
-def graded(fine, near, far):
+def graded(far):
     """Coordinates from 0 to ``far``: of equal cells up to ``near``, from there on growing."""
     x = list(np.linspace(0.0, near, round(near / fine) + 1))
     while x[-1] < far:
-        x.append(x[-1] + GROWTH * (x[-1] - x[-2]))
+        x.append(x[-1] + 1.3 * (x[-1] - x[-2]))
     x = np.array(x)
-    beyond = x > near
-    x[beyond] = near + (x[beyond] - near) * (far - near) / (x[-1] - near)
-    return x
+    return np.where(x > near, near + (x - near) * (far - near) / (x[-1] - near), x)
 
 
-def torn_mesh(fine, near, subdomains, comm=MPI.COMM_WORLD):
-    """The block, of rectangles: "axis", "bottom", "top"."""
-    r, z = graded(fine, near, WIDTH), -graded(fine, near, HEIGHT)[::-1]
-    cells = (len(r) - 1, len(z) - 1)
-    mesh = dmesh.create_rectangle(
-        comm, [[0.0, 0.0], [1.0, 1.0]], cells, dmesh.CellType.quadrilateral
-    )
-    places = (("axis", 0, 0.0), ("bottom", 1, 0.0), ("top", 1, 1.0))
-    sides = [
-        dmesh.locate_entities_boundary(mesh, 1, lambda x, k=k, at=at: np.isclose(x[k], at))
-        for _, k, at in places
-    ]
-    facets = np.concatenate(sides)
-    values = np.repeat(np.arange(1, 4, dtype=np.int32), [len(side) for side in sides])
-    order = np.argsort(facets)
-    tags = dmesh.meshtags(mesh, 1, facets[order], values[order])
-    x = mesh.geometry.x
-    for k, places_of in enumerate((r, z)):
-        x[:, k] = np.interp(x[:, k], np.linspace(0.0, 1.0, len(places_of)), places_of)
-    names = {name: tag for tag, (name, _, _) in enumerate(places, 1)}
-    return tfeti.decompose(mesh, subdomains, facet_tags=tags, surfaces=names)
+r, z = graded(1920.0), -graded(1620.0)[::-1]
+cells = (len(r) - 1, len(z) - 1)
+block = dmesh.create_rectangle(comm, [(0, 0), (1, 1)], cells, dmesh.CellType.quadrilateral)
+for k, places in enumerate((r, z)):
+    x = block.geometry.x
+    x[:, k] = np.interp(x[:, k], np.linspace(0.0, 1.0, len(places)), places)
+surfaces = {
+    "axis": lambda x: np.isclose(x[0], 0),
+    "bottom": lambda x: np.isclose(x[1], z[0]),
+    "top": lambda x: np.isclose(x[1], 0),
+}
+decomposition = tfeti.decompose(block, 2 if arguments.quick else 4, surfaces=surfaces)
+# -
 
+# ## Material and contact
+#
+# Plastic flow keeps the volume, which quadrilaterals of degree 1 can if what resists a change of
+# volume is integrated at their centres, `selective`. Axisymmetric: x is the radius. In small
+# strain slopes are small: what counts of the ball is how far it is above the block. Forces are
+# those of the whole ring.
 
-def made(decomposition, petsc_options=None):
-    """The problem; ``press`` says how deep the ball is."""
-    # ## Material
-    #
-    # Plastic flow keeps the volume, which quadrilaterals of degree 1 can if what resists a change
-    # of volume is integrated at their centres, `selective`.
-    mesh = decomposition.mesh
-    elastic = tfeti.Elasticity(decomposition, E=E, nu=nu, model="axisymmetric")
-    V = fem.functionspace(mesh, ("Lagrange", 1, (2,)))
-    u, v, du = fem.Function(V), ufl.TestFunction(V), ufl.TrialFunction(V)
-    steel = tfeti.J2Plasticity(elastic, u, yield_stress=STRENGTH, selective=True)
-    bcs = [
-        fem.dirichletbc(
-            0.0, fem.locate_dofs_topological(V.sub(k), 1, decomposition.facets(name)), V.sub(k)
-        )
-        for name, k in (("axis", 0), ("bottom", 0), ("bottom", 1))
-    ]
-    # in small strain slopes are small: what counts of the ball is how far it is above
-    ball = tfeti.Obstacle("top", tfeti.Plane((0.0, 0.0), normal=(0.0, -1.0)), name="ball")
-    return tfeti.NonlinearContactProblem(
-        steel.residual(v),
-        u,
-        bcs,
-        [ball],
-        decomposition,
-        J=steel.tangent(du, v),
-        state=steel.state,
-        update=steel.update,
-        stress=steel.stress,
-        thickness=elastic.thickness,
-        petsc_options={"tfeti_rtol": 1e-4, **(petsc_options or {})},
-    )
+# +
+elastic = tfeti.Elasticity(decomposition, E=E, nu=nu, model="axisymmetric")
+V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+u, v, du = fem.Function(V), ufl.TestFunction(V), ufl.TrialFunction(V)
+steel = tfeti.J2Plasticity(elastic, u, yield_stress=strength, selective=True)
+bcs = []
+for name, k in (("axis", 0), ("bottom", 0), ("bottom", 1)):
+    held = fem.locate_dofs_topological(V.sub(k), 1, decomposition.facets(name))
+    bcs.append(fem.dirichletbc(0.0, held, V.sub(k)))
+problem = tfeti.NonlinearContactProblem(
+    steel.residual(v),
+    u,
+    bcs,
+    [tfeti.Obstacle("top", tfeti.Plane((0.0, 0.0), normal=(0.0, -1.0)), name="ball")],
+    decomposition,
+    J=steel.tangent(du, v),
+    state=steel.state,
+    update=steel.update,
+    stress=steel.stress,
+    thickness=elastic.thickness,
+    petsc_options={"tfeti_rtol": 1e-4},
+)
 
 
 def press(problem, depth):
-    """Put the ball so deep."""
     problem.update(gap={"ball": lambda x: R - depth - np.sqrt(np.maximum(R**2 - x[0] ** 2, 0.0))})
 
 
-def run(argv):
-    demo = Demo(__doc__, argv, configure)
-    arguments, comm = demo.arguments, MPI.COMM_WORLD
-    depth = arguments.depth or (2.0 if arguments.quick else 20.0)
-    fine, near = (20.0, 80.0) if arguments.quick else (arguments.size, 240.0)
-    steps = arguments.steps or (2 if arguments.quick else 10)
-    decomposition = torn_mesh(fine, near, 2 if arguments.quick else 4)
-    problem = made(decomposition, demo.petsc_options)
+steps = arguments.steps or (2 if arguments.quick else 10)
+depths = (arguments.depth or (2.0 if arguments.quick else 20.0)) * np.arange(1, steps + 1) / steps
+records = tfeti.LoadSteps(problem, press, depths).run()
+# -
 
-    depths = depth * np.arange(1, steps + 1) / steps
-    records = tfeti.LoadSteps(problem, press, depths).run()
-    d = np.array([record.time for record in records])
-    # a ring of 2π, pressed down
-    forces = np.array([-record.contact_forces[0][1] for record in records]) / (2 * np.pi)
-    problem.report.errors["force"] = float(forces[-1] / (SLIP_LINES * d[-1]) - 1)
+# ## Comparison with slip lines
+
+# +
+forces = np.array([-record.contact_forces[0][1] for record in records]) / (2 * np.pi)
+slip_lines = 2.038e6 / 20.0 * depths  # a radian
+problem.report.errors["force"] = float(forces[-1] / slip_lines[-1] - 1)
+if comm.rank == 0:
+    for record, force, closed in zip(records, forces, slip_lines, strict=True):
+        done = record.figures
+        print(
+            f"depth {record.time:5.2f}: force a radian {force:.4g}, slip lines {closed:.4g}, "
+            f"{done['newton_steps']} tangents, {done['F_multiplications']} F"
+        )
+# -
+
+# ## Output
+
+# +
+if arguments.output:
+    tfeti.write_vtx(arguments.output / "plastic_indentation_2d.bp", problem.solution)
+if arguments.plot:
+    folder = arguments.output or Path("results")
+    look = {"zoom": 3.5, "focus": (260.0, -200.0, 0.0), "highest": strength}
+    tfeti.plot_deformed(
+        folder / "plastic_indentation_2d.png", problem.solution, unit="MPa", factor=1.0, **look
+    )
     if comm.rank == 0:
-        for record, force in zip(records, forces, strict=True):
-            print(
-                f"depth {record.time:5.2f}: force a radian {force:.4g}, slip lines "
-                f"{SLIP_LINES * record.time:.4g}, {record.figures['newton_steps']} tangents, "
-                f"{record.figures['F_multiplications']} F",
-                flush=True,
-            )
-    if arguments.plot:
-        from tfeti_dolfinx.plot import plot_deformed
+        from matplotlib.figure import Figure
 
-        look = {"zoom": 3.5, "focus": (260.0, -200.0, 0.0), "highest": STRENGTH}
-        path = demo.folder / "plastic_indentation_2d.png"
-        plot_deformed(path, problem.solution, factor=1.0, **look)
-        if comm.rank == 0:
-            curves = {"TFETI": (d, forces), "slip lines": (d, SLIP_LINES * d)}
-            labels = ("depth in mm", "force in N a radian")
-            draw(demo.folder / "plastic_indentation_2d_force.png", [(labels, {}, curves)])
-    return demo.finish(problem, "plastic_indentation_2d")
-
-
-def main(argv):
-    """Run the demo and return its solution."""
-    return run(argv)[0]
-
-
-def configure(parser):
-    parser.add_argument("--depth", type=float, help="how deep, in mm")
-    parser.add_argument("--size", type=float, default=10.0, help="element size under the ball")
-    parser.add_argument("--steps", type=int, help="load steps")
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])
+        figure = Figure(layout="constrained")
+        axes = figure.subplots()
+        axes.plot(depths, forces, "o-", label="finite elements")
+        axes.plot(depths, slip_lines, label="slip lines")
+        axes.set(xlabel="depth in mm", ylabel="force in N a radian")
+        axes.legend()
+        figure.savefig(folder / "plastic_indentation_2d_force.png")
+if arguments.report:
+    problem.report.write(arguments.report, comm)
+if comm.rank == 0:
+    print(problem.report)
+# -

@@ -1,59 +1,98 @@
 # # A cube of boundary elements on a curved obstacle
 #
 # The scene of `cube_3d.py` with boundary elements in all subdomains, each a cube of 9 × 9 × 9
-# cells: 1464 unknowns on its surface, as in the talk's table of Total BETI. S is assembled once,
-# since the subdomains are equal.
+# cells: 1464 unknowns on its surface, as in Dostál's table of Total BETI. Boundary elements read
+# their moduli from the bilinear form, and the mesh inside serves for pictures alone.
 #
 #     ./run mpirun -n 2 python3 demos/tbeti_cube_3d.py --subdomains 64
 
-"""A cube of equal subdomains with boundary elements, pressed on a curved obstacle: Total BETI."""
-
+# +
+import argparse
 import sys
 from pathlib import Path
 
 import petsc4py
 
-if __name__ == "__main__":
-    petsc4py.init(sys.argv)  # before DOLFINx, which would initialise PETSc without options
+parser = argparse.ArgumentParser(
+    description="Boundary elements: a cube of equal subdomains on a curved obstacle."
+)
+parser.add_argument("--quick", action="store_true", help="a size of a few seconds")
+parser.add_argument("--subdomains", type=int, default=8, help="their number: 8, 64, 216")
+parser.add_argument("--cells", type=int, help="hexahedra along an edge of a subdomain")
+parser.add_argument("--plot", action="store_true", help="draw pictures")
+parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
+parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
+arguments, rest = parser.parse_known_args()
+petsc4py.init([sys.argv[0], *rest])  # before DOLFINx: so PETSc's options reach the solver
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+import numpy as np
+import ufl
+from dolfinx import fem
+from dolfinx import mesh as dmesh
+from mpi4py import MPI
 
 import tfeti_dolfinx as tfeti
-from demos import cube_3d
-from demos.demo_tools import Demo
+
+# -
+
+# ## Mesh
+
+# +
+comm = MPI.COMM_WORLD
+N = round(arguments.subdomains ** (1 / 3))
+n = N * (arguments.cells or (3 if arguments.quick else 9))
+box = dmesh.create_box(comm, [(0, 0, 0), (1, 1, 1)], [n, n, n], dmesh.CellType.hexahedron)
 
 
-def run(argv):
-    demo = Demo(__doc__, argv, configure)
-    arguments = demo.arguments
-
-    # ## Mesh and forms
-    #
-    # Those of finite elements. Boundary elements read their moduli from the bilinear form, and
-    # the mesh inside serves for pictures alone.
-    arguments.cells = arguments.cells or (3 if arguments.quick else 9)
-    problem = tfeti.ContactProblem(
-        **cube_3d.scene(cube_3d.torn_mesh(arguments)),
-        petsc_options=demo.petsc_options,
-        boundary_elements=tfeti.BoundaryElements(),
-    )
-    problem.solve()
-    if arguments.plot:
-        from tfeti_dolfinx.plot import plot_deformed
-
-        plot_deformed(demo.folder / "tbeti_cube_3d.png", problem.solution, factor=1.0)
-    return demo.finish(problem, "tbeti_cube_3d")
+def subdomain(x):
+    i, j, k = np.minimum((x * N).astype(int), N - 1)
+    return i + N * j + N * N * k
 
 
-def main(argv):
-    """Run the demo and return its solution."""
-    return run(argv)[0]
+surfaces = {
+    "fixed": lambda x: np.isclose(x[0], 0),
+    "bottom": lambda x: np.isclose(x[2], 0),
+    "top": lambda x: np.isclose(x[2], 1),
+}
+decomposition = tfeti.decompose(box, subdomain, surfaces=surfaces)
+mesh = decomposition.mesh
+# -
 
+# ## Forms, load, obstacle
+#
+# Those of finite elements.
 
-def configure(parser):
-    parser.add_argument("--subdomains", type=int, default=8, help="their number: 8, 64, 216")
-    parser.add_argument("--cells", type=int, help="hexahedra along an edge of a subdomain")
+# +
+elastic = tfeti.Elasticity(decomposition, E=1.0, nu=0.3)
+V = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
+u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+ds = ufl.Measure("ds", domain=mesh, subdomain_data=decomposition.facet_tags)
+traction = fem.Constant(mesh, (0.0, 0.0, -0.05))
+fixed = fem.locate_dofs_topological(V, 2, decomposition.facets("fixed"))
+obstacle = tfeti.SignedDistance(
+    lambda x: x[2] + 0.02 + 0.1 * ((x[0] - 0.8) ** 2 + (x[1] - 0.5) ** 2),
+    lambda x: np.stack((np.zeros_like(x[0]), np.zeros_like(x[0]), np.ones_like(x[0]))),
+)
+problem = tfeti.ContactProblem(
+    elastic.a(u, v),
+    ufl.dot(traction, v) * ds(decomposition.surface("top")),
+    [fem.dirichletbc(np.zeros(3), fixed, V)],
+    [tfeti.Obstacle("bottom", obstacle, reach=np.inf)],
+    decomposition,
+    stress=elastic.stress,
+    boundary_elements=tfeti.BoundaryElements(),
+)
+problem.solve()
+# -
 
+# ## Output
 
-if __name__ == "__main__":
-    main(sys.argv[1:])
+if arguments.output:
+    tfeti.write_vtx(arguments.output / "tbeti_cube_3d.bp", problem.solution)
+if arguments.plot:
+    folder = arguments.output or Path("results")
+    tfeti.plot_deformed(folder / "tbeti_cube_3d.png", problem.solution, factor=1.0)
+if arguments.report:
+    problem.report.write(arguments.report, comm)
+if comm.rank == 0:
+    print(problem.report)

@@ -7,10 +7,12 @@ With ``-t online`` types of other packages link to their pages, whose lists are 
 
 import re
 import sys
+from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 from sphinx.application import Sphinx
+from sphinx.util.inspect import TypeAliasForwardRef
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -29,6 +31,8 @@ include_patterns = [
     "CHANGELOG.md",
     "docs/*.md",
     "docs/developers/*.md",
+    "docs/examples/*.md",
+    "docs/api/*.md",
     "docs/guide/*.md",
     "docs/howto/*.md",
     "environment/README.md",
@@ -57,6 +61,7 @@ intersphinx_mapping = {
 if not tags.has("online"):  # type: ignore[name-defined]  # noqa: F821  # Sphinx puts it here
     intersphinx_mapping = {}
 
+TypeAliasForwardRef.__repr__ = lambda self: self.name  # type: ignore[method-assign]
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 autodoc_type_aliases = {name: name for name in ("Array", "ArrayLike", "Subdomains")}
@@ -74,6 +79,105 @@ html_theme_options = {
     "show_nav_level": 2,
 }
 html_show_sourcelink = False
+html_static_path = ["static"]
+html_css_files = ["site.css"]
+
+# made here: a page for each demo, and one for each class and function
+EXAMPLES, API = ROOT / "docs" / "examples", ROOT / "docs" / "api"
+BLOCK = re.compile(r"^```\{eval-rst\}\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+ENTRY = re.compile(r"^\.\. (auto\w+):: (\S+)\n((?:   .*\n)*)", re.MULTILINE)
+PICTURE = re.compile(r"\| (?:!\[(.*?)\]\((.*?)\))? *\| \[`(\w+)\.py`\]\(.*?\): (.*?) \|")
+
+
+def cells_of(text: str) -> Iterator[tuple[bool, str]]:
+    """Yield the cells of a program in jupytext's light form: whether it is code, and its text."""
+    for block in re.split(r"^# \+\n(.*?)^# -$", text, flags=re.DOTALL | re.MULTILINE):
+        if re.match(r"(#( |$)|\n)", block) is None:
+            yield True, block.strip("\n")
+            continue
+        for part in re.split(r"\n{2,}(?=# )|\n{2,}(?=[^#\s])", block.strip("\n")):
+            lines = part.splitlines()
+            code = not all(line.startswith("#") for line in lines)
+            if lines:
+                yield code, part if code else "\n".join(line[2:] for line in lines)
+
+
+def write_examples(app: Sphinx) -> None:
+    """Write a page for each demo: its text, its program, and the pictures that it draws."""
+    EXAMPLES.mkdir(exist_ok=True)
+    for path in sorted((ROOT / "demos").glob("[a-z]*.py")):
+        title, *parts = cells_of(path.read_text())
+        page = [title[1] if not title[0] else path.stem]
+        page += [f"{{download}}`{path.name} <../../demos/{path.name}>`"]
+        page += [f"```python\n{text}\n```" if code else text for code, text in parts]
+        pictures = sorted((ROOT / "docs/pictures").glob(f"{path.stem}*"))
+        page += ["## Pictures"] * bool(pictures)
+        page += [f"![{picture.stem}](../pictures/{picture.name})" for picture in pictures]
+        write_if_new(EXAMPLES / f"{path.stem}.md", "\n\n".join(page) + "\n")
+
+
+def write_if_new(target: Path, text: str) -> None:
+    """Write a page, unless it is there already: Sphinx would read it again."""
+    if not target.exists() or target.read_text() != text:
+        target.write_text(text)
+
+
+def write_api(app: Sphinx) -> None:
+    """Write a page for each entry of the API's list."""
+    API.mkdir(exist_ok=True)
+    for block in BLOCK.findall((ROOT / "docs/api.md").read_text()):
+        for directive, name, options in ENTRY.findall(block):
+            entry = f".. currentmodule:: tfeti_dolfinx\n.. {directive}:: {name}\n{options}"
+            short = name.rpartition(".")[2]
+            write_if_new(API / f"{short}.md", f"# {short}\n\n```{{eval-rst}}\n{entry}```\n")
+
+
+def list_api(app: Sphinx, page: str, source: list[str]) -> None:
+    """Make a list with a link to each entry's page, and its first line, of the API's blocks."""
+    if page != "docs/api":
+        return
+    names: list[str] = []
+
+    def listed(block: re.Match[str]) -> str:
+        lines = []
+        for _, name, _ in ENTRY.findall(block[1]):
+            short = name.rpartition(".")[2]
+            names.append(short)
+            path = name if "." in name else f"tfeti_dolfinx.{name}"
+            module, _, attribute = path.rpartition(".")
+            text = (getattr(import_module(module), attribute).__doc__ or "").strip()
+            summary = text.split("\n\n")[0].replace("\n", " ").removesuffix(" Collective.")
+            lines.append(f"* [{short}](api/{short}.md): {' '.join(summary.split())}")
+        return "\n".join(lines)
+
+    text = BLOCK.sub(listed, source[0])
+    table = "\n".join(f"api/{name}" for name in names)
+    source[0] = f"{text}\n```{{toctree}}\n:hidden:\n\n{table}\n```\n"
+
+
+def make_cards(app: Sphinx, page: str, source: list[str]) -> None:
+    """Make cards of the gallery's tables, which lead to the pages of the demos."""
+    if page != "docs/gallery":
+        return
+    rows: list[str] = []
+    lines: list[str] = []
+    names: list[str] = []
+    for line in [*source[0].splitlines(), ""]:
+        row = PICTURE.fullmatch(line)
+        if row is not None:
+            alt, file, name, text = row.groups()
+            names.append(name)
+            image = f"[![{alt}]({file})](examples/{name}.md)\n\n" if file else ""
+            rows.append(
+                f"````{{container}} card\n{image}[{name}](examples/{name}.md): {text}\n````"
+            )
+        elif rows and not line.startswith("|"):
+            lines += ["`````{container} cards", *rows, "`````", line]
+            rows = []
+        elif not line.startswith("|"):
+            lines.append(line)
+    table = "\n".join(f"examples/{name}" for name in names)
+    source[0] = "\n".join(lines) + f"\n```{{toctree}}\n:hidden:\n\n{table}\n```\n"
 
 
 def write_root_page(app: Sphinx, error: Exception | None) -> None:
@@ -86,15 +190,10 @@ def write_root_page(app: Sphinx, error: Exception | None) -> None:
         )
 
 
-def shorten_aliases(*event: Any) -> tuple[str | None, str | None]:
-    """Return a signature with the names of type aliases alone."""
-    signature, returned = (
-        text and re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text) for text in event[-2:]
-    )
-    return signature, returned
-
-
 def setup(app: Sphinx) -> None:
-    """Connect what is done to signatures, and after a build."""
-    app.connect("autodoc-process-signature", shorten_aliases)
+    """Connect what is done before a build, to pages, and after it."""
+    app.connect("builder-inited", write_examples)
+    app.connect("builder-inited", write_api)
+    app.connect("source-read", make_cards)
+    app.connect("source-read", list_api)
     app.connect("build-finished", write_root_page)

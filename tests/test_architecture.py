@@ -46,7 +46,7 @@ APART.add(("qp", "mesh"))
 ALONE = {
     "dolfinx.__version__": {"compat"},
     "gmshio": {"compat"},
-    "pyvista": {"plot", "draw"},
+    "import pyvista": {"plot", "draw"},
 }
 # what DOLFINx 0.11 warns of: programs of ours use compat's functions, too
 OLD = ("geometry.dofmap", ".cmap")

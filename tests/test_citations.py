@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from quick_demos import alone
 
 import tfeti_dolfinx
 from tfeti_dolfinx.common.logging import PAPERS, entry
@@ -31,8 +32,11 @@ def of(*methods):
     ],
 )
 def test_citations_of_a_run(serial_only, demo, options, methods, tmp_path):
-    command = [sys.executable, ROOT / f"demos/{demo}.py", "--quick", "-citations", *options]
-    result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
+    path, environment = alone(demo, tmp_path)
+    command = [sys.executable, path, "--quick", "-citations", *options]
+    result = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=300, env=environment
+    )
     assert result.returncode == 0, result.stderr
     ours = of(*PAPERS)
     assert keys(result.stdout) & ours == of(*methods)

@@ -3,15 +3,13 @@
 import numpy as np
 import pytest
 
+import demos
 import tfeti_dolfinx as tfeti
-from demos import belt_2d
-from demos.ball_bearing_3d import contact_forces
-from demos.clamped_connection_3d import BARS, BOLT, PROFILES
-from demos.four_bodies_2d import PAIRS
-from meshes.ball_bearing import Bearing, build
-from meshes.clamped_connection import CLAMPS
 
 BOUND = 0.008  # of the friction of four bodies
+PAIRS = ("wedge left", "wedge right", "left bottom", "right bottom")
+BOLTS = 4 * 30e3  # of both clamps
+BARS = [f"{side} bar {i}" for i in (1, 2) for side in ("lower", "upper")]
 
 
 def check_friction(data, bound):
@@ -30,24 +28,22 @@ def test_forces_balance_and_the_lower_balls_carry_the_load(quick_demo):
     assert bearing.report["errors"]["ball_balance"] <= 1e-5
     assert abs(bearing.report["errors"]["force"]) <= 1e-5
     assert bearing.report["errors"]["side_force"] <= 0.02
-    inner, outer = np.linalg.norm(contact_forces(bearing.solution, 8), axis=2).T / 2500.0
+    forces = [bearing.solution.contact(i).resultant.force for i in range(16)]
+    inner, outer = np.linalg.norm(np.reshape(forces, (8, 2, 3)), axis=2).T / 2500.0
     assert 4.3 / 8 < inner[0] < 5 / 8
     assert inner[1] == pytest.approx(inner[7], rel=0.1)
     assert np.all(np.abs(inner[2:7]) <= 1e-6)
     assert outer[3:6] == pytest.approx(3.5 / 2500.0, rel=0.1)  # the centrifugal force
 
 
-def test_partitions_keep_the_names(comm):
-    model = None
-    if comm.rank == 0:
-        model = build(Bearing(balls=3), fine=1.0, growth=1.0, coarse=4.0, partitions=6)
-    d = tfeti.read_gmsh(model, comm)
-    balls = {"ball 1", "ball 2", "ball 3"}
+def test_partitions_keep_the_names(quick_demo):
+    d = quick_demo("ball_bearing_3d").solution.decomposition
+    balls = {f"ball {i}" for i in range(1, 9)}
     rings = {"inner groove", "outer groove", "bore", "outside", "mid plane"}
     assert set(d.names.volumes) == {"inner ring", "outer ring", *balls}
     assert set(d.names.surfaces) == rings | balls
-    assert d.num_bodies == 5
-    assert d.num_subdomains >= 6
+    assert d.num_bodies == 10
+    assert d.num_subdomains >= 10
 
 
 def test_the_capstan_equation_holds_and_all_of_the_belt_slips_back(quick_demo, comm):
@@ -66,7 +62,7 @@ def test_the_capstan_equation_holds_and_all_of_the_belt_slips_back(quick_demo, c
 
 @pytest.mark.slow
 def test_the_error_falls_with_the_mesh():
-    _, report = belt_2d.run([])
+    _, report = demos.run("belt_2d")
     assert abs(report.errors["capstan"]) <= 0.001
     assert abs(report.errors["capstan_hung"]) <= 0.001
 
@@ -76,16 +72,15 @@ def test_friction_holds_the_load_and_the_bolts_press(quick_demo, comm):
     solution, report = found.solution, found.report
     assert report["bodies"] == 6
     assert abs(report["errors"]["force"]) <= 1e-5
-    pressed = 2 * CLAMPS * BOLT
     for side in ("lower", "upper"):
         data = [solution.contact(f"{side} bar {i}") for i in (1, 2)]
         force = sum(float(d.force.sum()) for d in data)
-        assert comm.allreduce(force) == pytest.approx(pressed, rel=1e-5)
-    between = comm.allreduce(float(solution.contact(PROFILES[0]).force.sum()))
-    assert between == pytest.approx(pressed, rel=0.2)  # the ends bear the rest
+        assert comm.allreduce(force) == pytest.approx(BOLTS, rel=1e-5)
+    between = comm.allreduce(float(solution.contact("upper outside").force.sum()))
+    assert between == pytest.approx(BOLTS, rel=0.2)  # the ends bear the rest
     assert min(report["sticking"], report["sliding"]) > 0
     assert report["residuals"]["friction"] <= 1e-4
-    for name in (PROFILES[0], *(a for a, _ in BARS)):
+    for name in ("upper outside", *BARS):
         data = solution.contact(name)
         check_friction(data, 0.3 * data.pressure + 1e-3 * data.pressure.max(initial=0.0))
 
@@ -98,7 +93,7 @@ def test_forces_balance_and_the_bound_is_reached_where_nodes_slip(quick_demo, co
     assert abs(report["errors"]["force_wedge"]) <= 1e-5
     assert abs(report["errors"]["force_base"]) <= 1e-5
     assert report["sticking"] > 0
-    for name, _ in PAIRS:
+    for name in PAIRS:
         size, slips = check_friction(solution.contact(name), BOUND * (1.0 + 1e-9))
         assert np.allclose(size[slips], BOUND, rtol=1e-9, atol=0)
     # both sides do the same

@@ -1,11 +1,13 @@
 """Every demo runs at its quick size, serially and on ranks, with all of its outputs."""
 
-import importlib
+import re
+import subprocess
+import sys
 
 import pytest
-from quick_demos import DEMOS
+from quick_demos import DEMOS, ROOT, alone
 
-from demos import adaptive_2d, adaptive_3d
+import demos
 
 
 @pytest.mark.parametrize("name", DEMOS)
@@ -18,10 +20,37 @@ def test_quick_size(name, quick_demo, comm):
     assert ("TFETI solve CONVERGED" in found.out) == (comm.rank == 0)
 
 
+@pytest.mark.parametrize("name", DEMOS)
+def test_a_demo_imports_nothing_of_the_tree_but_the_package(name):
+    """Those of the README, of citations and of the command line are run out of the tree, too."""
+    text = (ROOT / "demos" / f"{name}.py").read_text()
+    assert not re.search(r"^\s*(from|import) (demos|meshes|benchmarks)\b", text, re.MULTILINE)
+    assert text.startswith("# # ")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DEMOS)
+def test_a_demo_runs_out_of_the_tree(serial_only, name, tmp_path):
+    path, environment = alone(name, tmp_path)
+    command = [sys.executable, path, "--quick", "--plot"]
+    subprocess.run(command, cwd=tmp_path, check=True, timeout=300, env=environment)
+    assert list((tmp_path / "results").glob(f"{name}*.png"))
+
+
+def test_help_says_nothing_of_petsc(serial_only, tmp_path):
+    path, environment = alone("hertz_2d", tmp_path)
+    command = [sys.executable, path, "--help"]
+    result = subprocess.run(
+        command, capture_output=True, text=True, timeout=100, env=environment, check=True
+    )
+    assert "--elements" in result.stdout
+    assert "WARNING" not in result.stdout + result.stderr
+
+
 def test_demos_run_with_smalse():
     """Options reach their problems."""
     options = ["-tfeti_qp_type", "smalse", "-tfeti_pc_type", "none", "-tfeti_rtol", "1e-6"]
-    _, report = importlib.import_module("demos.hertz_2d").run(["--quick", *options])
+    _, report = demos.run("hertz_2d", ["--quick", *options])
     assert report.in_all["power_method_multiplications"] == 15
     assert report.in_all["preconditioner_multiplications"] == 0
 
@@ -29,19 +58,13 @@ def test_demos_run_with_smalse():
 @pytest.mark.slow
 @pytest.mark.parametrize("name", DEMOS)
 def test_default_size(name):
-    _, report = importlib.import_module(f"demos.{name}").run([])
+    _, report = demos.run(name)
     assert report.converged_reason.startswith("CONVERGED")
-
-
-def test_unknown_arguments_are_refused():
-    demo = importlib.import_module("demos.cube_3d")
-    with pytest.raises(SystemExit):
-        demo.main(["--quick", "stray"])
 
 
 def test_a_mesh_that_follows_the_error_needs_a_tenth_of_a_uniform_one():
     """7.9 % took 38 836 unknowns of equal size, and 8 856 of hand-graded ones."""
-    solution, report = adaptive_2d.run(["--error", "0.078"])
+    solution, report = demos.run("adaptive_2d", ["--error", "0.078"])
     assert report.estimates["discretisation"] <= 0.078 * report.estimates["energy"]
     assert report.primal_dofs <= 3900
     assert report.errors["pressure_l2"] <= 0.02
@@ -51,8 +74,7 @@ def test_a_mesh_that_follows_the_error_needs_a_tenth_of_a_uniform_one():
 @pytest.mark.slow
 def test_a_bouncing_bar_comes_back_as_in_closed_form():
     """Closer to it on each finer mesh with smaller steps, and within 1 % at the default size."""
-    run = importlib.import_module("demos.bouncing_bar").run
-    found = [run(["--cells", str(cells)])[1].errors for cells in (25, 50, 100)]
+    found = [demos.run("bouncing_bar", ["--cells", n])[1].errors for n in (25, 50, 100)]
     assert set(found[-1]) >= {"second_begin", "second_end", "second_pressure", "period"}
     assert all(abs(value) <= 0.01 for value in found[-1].values())
     for name in ("first_end", "first_pressure", "second_begin", "second_pressure", "period"):
@@ -69,8 +91,7 @@ def test_a_bouncing_bar_comes_back_as_in_closed_form():
 def test_impacts_of_bars_are_as_in_closed_form(name):
     """Pressure within 1 %, duration within a step, and no force that oscillates."""
     cells = 40
-    run = importlib.import_module("demos.impact_of_bars").run
-    _, report = run(["--impact", name, "--cells", str(cells)])
+    _, report = demos.run("impact_of_bars", ["--impact", name, "--cells", cells])
     step = 1 / (4 if name == "clamped" else 2) / cells
     assert abs(report.errors[f"{name}_pressure"]) <= 0.01
     assert abs(report.errors[f"{name}_duration"]) <= 1.01 * step
@@ -83,7 +104,7 @@ def test_a_ball_hits_the_floor_as_hertz_says():
     """Where the contact is small beside the ball, a/R = 0.056, and smooth."""
     values = {"balls": 1, "modulus": 4e7, "fine": 0.015, "gap": 0.01, "end": 0.01, "steps": 30}
     arguments = [f"--{name}={value}" for name, value in values.items()]
-    _, report = importlib.import_module("demos.falling_balls_3d").run([*arguments, "--smooth"])
+    _, report = demos.run("falling_balls_3d", [*arguments, "--smooth"])
     assert abs(report.errors["force"]) <= 0.05
     assert abs(report.errors["duration"]) <= 0.05
 
@@ -91,7 +112,7 @@ def test_a_ball_hits_the_floor_as_hertz_says():
 @pytest.mark.slow
 def test_a_mesh_that_follows_the_error_is_as_good_as_a_graded_one_in_3d():
     """34.3 % took 3 435 unknowns graded by hand."""
-    solution, report = adaptive_3d.run(["--error", "0.343"])
+    solution, report = demos.run("adaptive_3d", ["--error", "0.343"])
     assert report.estimates["discretisation"] <= 0.343 * report.estimates["energy"]
     assert report.primal_dofs <= 1.5 * 3_435
     assert abs(report.errors["half_width"]) <= 0.1

@@ -137,6 +137,22 @@ def test_files_with_and_without_partitions(comm, shared_tmp, version, partitions
     assert d.num_subdomains >= (partitions or 2)
 
 
+def test_a_name_that_gmsh_loses_is_said(comm, caplog):
+    """The second group of a name has none: contact would be on the first alone."""
+    if comm.rank == 0:
+        gmsh.initialize(interruptible=False)
+        gmsh.option.setNumber("General.Terminal", 0)
+        square = gmsh.model.occ.addRectangle(0, 0, 0, 1, 1)
+        gmsh.model.occ.synchronize()
+        gmsh.model.addPhysicalGroup(2, [square], name="plate")
+        for _, side in gmsh.model.getBoundary([(2, square)], oriented=False)[:2]:
+            gmsh.model.addPhysicalGroup(1, [side], name="floor")
+        gmsh.model.mesh.generate(2)
+    tfeti.read_gmsh(gmsh.model if comm.rank == 0 else None, comm, 2)
+    said = [r for r in caplog.records if "groups of facets without a name" in r.getMessage()]
+    assert len(said) == (comm.rank == 0)
+
+
 def test_physical_groups_that_gmsh_renamed_for_its_partitions(comm):
     if ROOT:
         two_bodies()

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from petsc4py import PETSc
+from quick_demos import alone
 from scenes import decomposed, problem
 
 from tfeti_dolfinx import InputError, Options
@@ -109,16 +110,13 @@ def test_monitor_and_view_and_reason_print(capsys):
     assert (out == "") == (d.comm.rank != 0)
 
 
-def test_the_command_line_of_a_program(serial_only):
+def test_the_command_line_of_a_program(serial_only, tmp_path):
     """petsc4py.init before DOLFINx keeps the options; -log_view shows a stage per step."""
-    command = [
-        sys.executable,
-        "demos/cube_3d.py",
-        "--quick",
-        "-tfeti_converged_reason",
-        "-log_view",
-    ]
-    result = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    path, environment = alone("cube_3d", tmp_path)
+    command = [sys.executable, path, "--quick", "-tfeti_converged_reason", "-log_view"]
+    result = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, timeout=300, env=environment
+    )
     assert result.returncode == 0, result.stderr
     assert "TFETI solve CONVERGED_RTOL" in result.stdout
     for name in ("mesh", "contact", "gluing", "assembly", "subdomains", "dual", "qp", "recovery"):

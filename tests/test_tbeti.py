@@ -2,7 +2,7 @@
 
 import pytest
 
-from demos import tbeti_cube_3d, tbeti_hertz_2d
+from demos import run
 
 # the talk's multiplications for 8, 64 and 216 subdomains, and what block Newton may take
 TALK = {8: 130, 64: 137, 216: 133}
@@ -14,7 +14,7 @@ LARGE = [pytest.param(n, 9, marks=pytest.mark.slow) for n in TALK]
 def test_the_table_of_the_talk(subdomains, cells):
     for qp_type, most in (("newton", NEWTON), ("smalse", TALK[subdomains])):
         sizes = ["--subdomains", str(subdomains), "--cells", str(cells)]
-        _, report = tbeti_cube_3d.run([*sizes, "-tfeti_qp_type", qp_type])
+        _, report = run("tbeti_cube_3d", [*sizes, "-tfeti_qp_type", qp_type])
         assert report.converged_reason == "CONVERGED_RTOL"
         assert report.F_multiplications <= most
         assert report.primal_dofs == 3 * (6 * cells**2 + 2) * subdomains
@@ -26,7 +26,7 @@ def hertz():
     """Reports by the bodies that have finite elements."""
     bodies = {"none": [], "block": ["block"], "both": ["cylinder", "block"]}
     options = {name: ["--finite", *some] if some else [] for name, some in bodies.items()}
-    return {name: tbeti_hertz_2d.run(given)[1] for name, given in options.items()}
+    return {name: run("tbeti_hertz_2d", given)[1] for name, given in options.items()}
 
 
 @pytest.mark.parametrize("finite", ["none", "block", "both"])

@@ -1,7 +1,5 @@
 """Scenes whose discretisation error is known, by a closed form or by a finer mesh of the same."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import ufl
@@ -11,8 +9,8 @@ from mpi4py import MPI
 from scenes import forms, hooke, strain
 
 import tfeti_dolfinx as tfeti
-from demos import hertz_3d
-from demos.hertz import LineContact
+from benchmarks.hertz import LineContact
+from demos import scene
 from meshes.half_cylinder import build
 from meshes.rings import INNER, MIDDLE, OUTER, lame_pressure, rings
 from tfeti_dolfinx.common.compat import interpolation_points
@@ -42,8 +40,7 @@ def hertz(elements, **options):
 
 def ball(unknowns, **options):
     """The half ball of ``demos/hertz_3d.py``."""
-    chosen = SimpleNamespace(unknowns=unknowns, subdomains=None, quick=False)
-    made = hertz_3d.scene(hertz_3d.torn_mesh(chosen))
+    made = scene("hertz_3d", ["--unknowns", unknowns])
     return tfeti.ContactProblem(**made, petsc_options=options)
 
 

@@ -56,7 +56,7 @@ from tfeti_dolfinx.nonlinear.materials import J2Plasticity
 from tfeti_dolfinx.nonlinear.problem import NewtonTolerances, NonlinearContactProblem
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.output import write_vtx, write_xdmf
-from tfeti_dolfinx.plot import plot_deformed, plot_pressure
+from tfeti_dolfinx.plot import plot_deformed, plot_friction, plot_pressure
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.solution import PointValues, Solution
@@ -110,6 +110,7 @@ __all__ = [
     "__version__",
     "decompose",
     "plot_deformed",
+    "plot_friction",
     "plot_pressure",
     "read_gmsh",
     "read_surface",

@@ -23,9 +23,20 @@ SCALAR_BAR = {
     "height": 0.6,
     "width": 0.5,
     "color": "black",
-    "title_font_size": 18,
-    "label_font_size": 16,
+    "title_font_size": 26,
+    "label_font_size": 24,
+    "n_labels": 4,
+    "fmt": "%.3g",
 }
+# light maps, whose colours are read in the shade
+MAPS = {"von Mises stress": "YlGnBu", "contact pressure": "YlOrRd"}
+STATUS = {0: "whitesmoke", 1: "silver", 2: "mediumseagreen", 3: "darkorange", 4: "royalblue"}
+STATUS_NAMES = {1: "open", 2: "touching", 3: "slip", 4: "stick"}
+BODIES = ("#8dd3c7", "#fdb462", "#80b1d3", "#fb8072", "#b3de69", "#bebada", "#fccde5", "#ffed6f")
+OBSTACLE = "grey"
+WIDTH = 0.84  # share of the scene; the scale has the rest
+FEW_CELLS = 3000  # whose edges do not hide the colours
+CORNER = 30.0  # degrees between facets that meet in an edge
 
 
 def start_screen() -> subprocess.Popen[bytes] | None:
@@ -50,60 +61,130 @@ def start_screen() -> subprocess.Popen[bytes] | None:
 
 
 def draw(data: Mapping[str, Any], target: str) -> None:
-    """Draw a deformed mesh, coloured by a nodal field, to a ``.png``.
+    """Draw deformed bodies, coloured by a nodal field, and obstacles to a ``.png``.
 
-    The data are the arrays ``cells``, ``types``, ``points``, ``moved``, ``values``, and scalars
-    ``name``, ``factor`` (nan: the largest displacement becomes 5 % of the scene), ``zoom``,
-    ``focus`` (nan: the centre), ``edges``, ``highest`` (nan: the largest), ``view`` (nan:
-    pyvista's), ``cut`` (nan: none).
+    The data are the arrays ``cells``, ``types``, ``points``, ``moved``, ``values``, ``body``, and
+    ``name`` (of the field), ``unit``, ``factor`` (nan: the largest displacement becomes 5 % of the
+    scene), ``zoom``, ``focus`` (nan: the centre), ``edges`` (nan: those of few cells), ``highest``
+    (nan: the largest), ``view`` (nan: pyvista's), ``cut`` (nan: none), and of each obstacle i
+    ``obstacle_i``, its distance on a grid of ``box``, shape ``(nx, ny, nz)``.
     """
     import pyvista
 
     grid = pyvista.UnstructuredGrid(data["cells"], data["types"], data["points"])
     name, factor = str(data["name"]), float(data["factor"])
-    grid["u"], grid[name] = data["moved"], data["values"]
+    grid["u"], grid[name], grid.cell_data["body"] = data["moved"], data["values"], data["body"]
     if np.isnan(factor):
         size = np.linalg.norm(np.ptp(grid.points, axis=0))
         factor = float(0.05 * size / max(np.abs(grid["u"]).max(), 1e-300))
     point, normal = data["cut"]
     if np.all(np.isfinite(normal)):
         grid = grid.clip(normal=normal, origin=point, crinkle=True)
+    bodies = grid.warp_by_vector("u", factor=factor)
+    bodies.set_active_scalars(name)
     flat = bool(np.ptp(grid.points[:, 2]) == 0.0)
     plotter = pyvista.Plotter(
         off_screen=True,
         window_size=[1200, 900],
         shape=(1, 2),
-        col_weights=[0.86, 0.14],
+        col_weights=[WIDTH, 1 - WIDTH],
         border=False,
     )
     plotter.subplot(0, 0)
-    actor = plotter.add_mesh(
-        grid.warp_by_vector("u", factor=factor),
-        scalars=name,
-        show_edges=bool(data["edges"]),
-        cmap="viridis",
-        clim=None if np.isnan(data["highest"]) else [0.0, float(data["highest"])],
-        lighting=not flat,
-        ambient=1.0 if flat else 0.55,  # colours are read, also where no light falls
-        diffuse=0.0 if flat else 0.45,
-        specular=0.0,
-        edge_opacity=0.3,
-        show_scalar_bar=False,
+    shade = {
+        "lighting": not flat,
+        "ambient": 1.0 if flat else 0.55,  # colours are read, also where no light falls
+        "diffuse": 0.0 if flat else 0.45,
+        "specular": 0.0,
+    }
+    edges = float(data["edges"])
+    shown = grid.n_cells <= FEW_CELLS if np.isnan(edges) else bool(edges)
+    shade |= {"show_edges": shown, "edge_opacity": 0.3, "show_scalar_bar": False}
+    actor = _coloured(plotter, bodies, name, float(data["highest"]), shade)
+    outline = bodies.extract_feature_edges(
+        feature_angle=CORNER, boundary_edges=flat, non_manifold_edges=False, manifold_edges=False
     )
+    if outline.n_cells:
+        plotter.add_mesh(outline, color="black", line_width=1.5, lighting=False)
+    for i in range(len([key for key in data if str(key).startswith("obstacle_")])):
+        _add_obstacle(plotter, data["box"], data[f"obstacle_{i}"], flat)
+    _look(plotter, np.vstack((grid.points, bodies.points)), data, flat)
+    plotter.subplot(0, 1)
+    if actor is not None:
+        unit = str(data["unit"])
+        title = "\n".join([*name.split(), f"[{unit}]" * bool(unit), ""])
+        plotter.add_scalar_bar(title=title, mapper=actor.mapper, **SCALAR_BAR)
+    if factor != 1.0:
+        text = f"displacement\n× {factor:.3g}"
+        plotter.add_text(text, position="lower_left", font_size=14, color="black")
+    plotter.screenshot(target)
+
+
+def _coloured(
+    plotter: Any, bodies: Any, name: str, highest: float, shade: dict[str, Any]
+) -> Any | None:
+    """Add the bodies in the field's colours; what the scale is of, if there is one."""
+    if name in MAPS:
+        limits = None if np.isnan(highest) else [0.0, highest]
+        return plotter.add_mesh(bodies, scalars=name, cmap=MAPS[name], clim=limits, **shade)
+    surface = bodies.extract_surface().triangulate()
+    if name == "status":  # of a facet the least of its nodes
+        of_cells = surface[name][surface.faces.reshape(-1, 4)[:, 1:]].min(axis=1).astype(int)
+        colours, names = STATUS, STATUS_NAMES
+    else:
+        of_cells = surface.cell_data["body"].astype(int)
+        colours, names = {i: BODIES[i % len(BODIES)] for i in np.unique(of_cells)}, {}
+    for value, colour in colours.items():
+        part = surface.extract_cells(of_cells == value)
+        if part.n_cells:
+            plotter.add_mesh(part, color=colour, scalars=None, **shade)
+    legend = [(text, colours[value]) for value, text in names.items() if np.any(of_cells == value)]
+    if legend:
+        plotter.add_legend(legend, bcolor="white", border=True, size=(0.2, 0.05 * len(legend)))
+    return None
+
+
+def _add_obstacle(plotter: Any, box: Any, distance: Any, flat: bool) -> None:
+    """Add what is behind the zero of a distance on a grid: in 2D its inside, in 3D its surface."""
+    import pyvista
+
+    shape = np.array(distance.shape)
+    image = pyvista.ImageData(
+        dimensions=shape, spacing=(box[1] - box[0]) / np.maximum(shape - 1, 1), origin=box[0]
+    )
+    image["distance"] = distance.ravel(order="F")
+    if flat:
+        inside = image.clip_scalar(scalars="distance", value=0.0, invert=True)
+        if inside.n_cells:
+            plotter.add_mesh(inside, color="lightgrey", lighting=False, show_scalar_bar=False)
+    surface = image.contour([0.0], scalars="distance")
+    if surface.n_cells:
+        line: dict[str, Any] = {"opacity": 0.4}
+        if flat:
+            line = {"line_width": 3, "lighting": False}
+        plotter.add_mesh(surface, color=OBSTACLE, scalars=None, show_scalar_bar=False, **line)
+
+
+def _look(plotter: Any, points: Any, data: Mapping[str, Any], flat: bool) -> None:
+    """Place the camera: all bodies are seen, where they were and where they are."""
     if flat:
         plotter.view_xy()
     if np.all(np.isfinite(data["view"])):
         plotter.view_vector(data["view"], viewup=(0.0, 0.0, 1.0))
+    low, high = points.min(axis=0), points.max(axis=0)
+    plotter.reset_camera(bounds=np.stack((low, high), axis=1).ravel().tolist())
+    if flat:  # without a focus the bodies fill the picture; else zoom 1 sees the sphere around them
+        width, height = plotter.window_size
+        low, high = 1.05 * (high - low)[:2] / 2
+        plotter.enable_parallel_projection()
+        if np.any(np.isnan(data["focus"])):
+            plotter.camera.parallel_scale = max(high, low * height / (WIDTH * width))
     if np.all(np.isfinite(data["focus"])):
         plotter.set_focus(data["focus"])
         if flat:
             x, y, _ = data["focus"]
             plotter.camera.position = (x, y, plotter.camera.position[2])
     plotter.camera.zoom(float(data["zoom"]))
-    plotter.subplot(0, 1)
-    plotter.add_scalar_bar(title=f"{name}\n", mapper=actor.mapper, **SCALAR_BAR)
-    plotter.add_text(f"displacement\n× {factor:.3g}", position="lower_left", font_size=14)
-    plotter.screenshot(target)
 
 
 if __name__ == "__main__":

@@ -87,7 +87,7 @@ class Options:
     scaling: str = described(
         "stiffness",
         "all",
-        "weights of the rows of B: the diagonal of K, which suits graded meshes and jumps of "
+        "weights of the constraints: the diagonal of K, which suits graded meshes and jumps of "
         "stiffness, or one per torn copy",
         choices=("stiffness", "multiplicity"),
     )
@@ -111,16 +111,15 @@ class Options:
     clusters: int = described(
         0,
         "subdomains",
-        "about so many clusters, whose subdomains are glued by averages over their faces, so that "
-        "the coarse problem has the motions of clusters only; 0: none",
+        "number of clusters of subdomains (hybrid TFETI): a smaller coarse problem, for more than "
+        "some 2000 subdomains; 0: none",
         fits=FROM_0,
     )
     recycle: int | str = described(
         "auto",
         "pcpg, newton",
-        "so many directions of earlier solves with the same F are kept at most, which later ones "
-        "begin with; each takes two dual vectors; auto: none of a first solve, 100 from the second "
-        "on, or from Newton's method on Coulomb's law on; of bodies with mass 200",
+        "most search directions kept between solves with the same stiffness (Krylov recycling), "
+        "two vectors each; 0: none; auto: 100 from the second solve on, of bodies with mass 200",
         fits=FROM_0,
         words=("auto",),
         kind=int,
@@ -136,12 +135,15 @@ class Options:
     friction_rtol: float = described(
         1e-4,
         "coulomb",
-        "change of the bounds of Coulomb's friction, over their size, at which they are at rest; "
-        "or 100 rtol, if that is less",
+        "relative change of the friction bounds at which their iteration stops; or 100 rtol, if "
+        "that is less",
         fits=Range("0 or more, less than 1", lambda value: 0.0 <= value < 1.0),
     )
     friction_max_it: int = described(
-        50, "coulomb", "most problems with given bounds that are solved for them", fits=FROM_1
+        50,
+        "coulomb",
+        "most problems with given friction bounds that are solved for Coulomb's law",
+        fits=FROM_1,
     )
     newton: NewtonParameters = NewtonParameters()
     smalse: SmalseParameters = SmalseParameters()
@@ -155,7 +157,7 @@ class Options:
         True, "all", "raise ConvergenceError where a solver stops before its tolerance"
     )
     warnings: bool = described(
-        True, "all", "look after each solve for what makes its answer less sure, for the report"
+        True, "all", "check after each solve what makes its answer less sure, for the report"
     )
     monitor: bool = described(False, "all", "print a line per step")
     converged_reason: bool = described(False, "all", "print why the solver stopped")
@@ -172,11 +174,28 @@ class Options:
         return "\n".join(f"-{prefix}{option.name} {option.value_in(self)}" for option in known)
 
 
+# those that the first table of docs/options.md has, in words for users
+FOR_USERS = (
+    "rtol",
+    "atol",
+    "max_it",
+    "qp_type",
+    "pc_type",
+    "friction_type",
+    "error_if_not_converged",
+    "monitor",
+    "converged_reason",
+    "view",
+)
+
+
 def options_table() -> str:
-    """Return the table of docs/options.md."""
+    """Return the second table of docs/options.md, of all options that are not for users."""
     lines = ["| option | algorithm | default | effect |", "|---|---|---|---|"]
     for option in parameters_of(Options):
         about, default = option.description, option.default
+        if option.name in FOR_USERS:
+            continue
         known = (*about.choices, *(("a number", *about.words) if about.words else ()))
         values = " (" + ", ".join(known) + ")" if known else ""
         shown = str(default).lower() if isinstance(default, bool) else f"{default}"

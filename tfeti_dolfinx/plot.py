@@ -7,7 +7,8 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -28,37 +29,58 @@ from tfeti_dolfinx.common.validation import (
     named,
     shown,
 )
+from tfeti_dolfinx.constraints.contact_state import ContactStatus
+from tfeti_dolfinx.contact.obstacle import Obstacle
+from tfeti_dolfinx.contact.rigid_body import Pose, RigidBody
 from tfeti_dolfinx.errors import InputError, TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.solution import Solution
 
 SECONDS = 600
+# fields by what ``show`` calls them
+FIELDS = {
+    "von_mises": "von Mises stress",
+    "pressure": "contact pressure",
+    "status": "status",
+    "bodies": "bodies",
+}
+# around the bodies, of their size; and points along an axis, for obstacles
+MARGIN, SAMPLES = 0.08, {2: 401, 3: 61}
 
 
 def plot_deformed(
     path: str | os.PathLike[str],
     solution: Solution,
     *,
+    show: str = "von_mises",
+    unit: str = "",
     factor: float | None = None,
     zoom: float = 1.0,
     focus: tuple[float, float, float] | None = None,
-    show_edges: bool = True,
+    show_edges: bool | None = None,
+    show_obstacles: bool = True,
     highest: float | None = None,
     view: tuple[float, float, float] | None = None,
     cut: tuple[tuple[float, float, float], tuple[float, float, float]] | None = None,
 ) -> Path:
-    """Picture of the deformed bodies, coloured by von Mises stress. Collective.
+    """Picture of the deformed bodies and of rigid obstacles. Collective.
 
-    Rank 0 draws; the cells of all ranks travel there.
+    Rank 0 draws; the cells of all ranks travel there. An obstacle is drawn in grey where it is, if
+    its gap is that of its shape.
 
     Args:
         path: The ``.png`` to write.
-        solution: A solution of a problem with a stress.
+        solution: A solution.
+        show: What colours say: "von_mises", the stress, of a problem that has one; "pressure",
+            the contact pressure; "status", whether contact is open, slips or sticks; "bodies".
+        unit: Of the stress or the pressure, for the scale.
         factor: Displacements are drawn times this; default 1 where there are contacts (bodies
             would seem to enter each other), else such that the largest is 5 % of the scene.
         zoom: Camera zoom.
         focus: Point that the camera looks at.
-        show_edges: Whether to draw cell edges.
-        highest: Stress of the brightest colour; default the largest in the scene.
+        show_edges: Whether to draw cell edges; default where there are at most 3000 cells.
+        show_obstacles: Whether to draw obstacles, which may hide what is behind them.
+        highest: Value of the strongest colour; default of a stress that which 0.5 % of the nodes
+            are above, of a pressure the largest.
         view: Direction from the scene to the camera, z upwards; default pyvista's.
         cut: A point and a normal: what lies beyond that plane, before it moved, is cut away.
 
@@ -74,11 +96,17 @@ def plot_deformed(
     comm = solution.decomposition.comm
     with agreeing(comm, "plot_deformed") as given:
         target = checked_path(path, ".png")
-        scene = {
+        checked_type(unit, str, "unit", "a string")
+        if show not in FIELDS:
+            raise InputError(f"show={shown(show)}: expected one of {', '.join(FIELDS)}")
+        scene: dict[str, Any] = {
+            "name": FIELDS[show],
+            "unit": unit,
             "factor": np.nan if factor is None else checked_number(factor, "factor", FINITE),
             "zoom": checked_number(zoom, "zoom", POSITIVE),
             "focus": _vector(focus, "focus"),
-            "edges": checked_flag(show_edges, "show_edges"),
+            "edges": np.nan if show_edges is None else checked_flag(show_edges, "show_edges"),
+            "obstacles": checked_flag(show_obstacles, "show_obstacles"),
             "highest": np.nan if highest is None else checked_number(highest, "highest", POSITIVE),
             "view": _vector(view, "view"),
             "cut": _pair(cut),
@@ -86,12 +114,36 @@ def plot_deformed(
         given |= {"path": path, **scene}
     if factor is None and solution.has_contact:
         scene["factor"] = 1.0
-    parts = comm.gather(_grid(solution, solution.nodal_von_mises.x.array), root=0)
+    parts = comm.gather(_grid(solution, {"values": _values(solution, show)}), root=0)
     with raised_on_all_ranks(comm), named(f"cannot write {target}", OSError):
         if comm.rank == 0 and parts is not None:
             check_screen()
-            _draw(target, {**_joined(parts), **scene, "name": "von Mises"})
+            whole = _joined(parts)
+            if highest is None and show == "von_mises" and len(whole["values"]):
+                scene["highest"] = max(float(np.quantile(whole["values"], 0.995)), 1e-300)
+            if scene.pop("obstacles"):
+                moved = whole["moved"] * scene["factor"]
+                scene |= _obstacles(solution, whole["points"], moved)
+            _draw(target, {**whole, **scene})
     return target
+
+
+def to_pyvista(solution: Solution) -> Any:
+    """See ``Solution.to_pyvista``."""
+    import pyvista
+
+    names = [name for name in FIELDS if name != "von_mises" or solution.has_stress]
+    fields = {name: _values(solution, name) for name in names if name != "bodies"}
+    parts = solution.decomposition.comm.gather(_grid(solution, fields), root=0)
+    if parts is None:
+        return None
+    whole = _joined(parts)
+    grid = pyvista.UnstructuredGrid(whole["cells"], whole["types"], whole["points"])
+    grid["displacement"] = whole["moved"]
+    for name in fields:
+        grid[name] = whole[name]
+    grid.cell_data["body"], grid.cell_data["subdomain"] = whole["body"], whole["subdomain"]
+    return grid
 
 
 def plot_pressure(
@@ -143,6 +195,54 @@ def plot_pressure(
     return target
 
 
+def plot_friction(
+    path: str | os.PathLike[str],
+    solution: Solution,
+    contacts: Sequence[str | int] | None = None,
+    *,
+    axes: tuple[int, int] = (0, 1),
+    labels: tuple[str, str] = ("x", "y"),
+    normal: bool = False,
+) -> Path:
+    """Draw contact nodes coloured by status, with arrows of their tractions. Collective.
+
+    Args:
+        path: The ``.png`` to write, by rank 0.
+        solution: A solution with friction.
+        contacts: Names or indices of contacts; default all.
+        axes: The coordinates to look at.
+        labels: Their names.
+        normal: Whether arrows have the pressure as well as the friction.
+
+    Returns:
+        The file written.
+
+    Raises:
+        InputError: An argument does not fit.
+    """
+    checked_type(solution, Solution, "solution", "the solution of a ContactProblem")
+    comm = solution.decomposition.comm
+    with agreeing(comm, "plot_friction") as given:
+        given |= {"path": path, "contacts": contacts, "axes": axes, "labels": labels}
+        given["normal"] = normal
+        target = checked_path(path, ".png")
+        if not solution.has_friction:
+            raise InputError("plot_friction: no contact of the solution has friction")
+    chosen = contacts if contacts is not None else range(len(solution.contacts))
+    data = [solution.contact(name) for name in chosen]
+    gdim = data[0].normal.shape[1]
+    rows = [
+        (d.points[:, :gdim], d.tangential_traction - normal * d.pressure[:, None] * d.normal)
+        for d in data
+    ]
+    parts = comm.gather([(*row, d.status) for row, d in zip(rows, data, strict=True)], root=0)
+    with raised_on_all_ranks(comm), named(f"cannot write {target}"):
+        if comm.rank == 0 and parts is not None:
+            whole = [np.concatenate(part) for part in zip(*chain.from_iterable(parts), strict=True)]
+            _draw_status(target, whole[0][:, axes], whole[1][:, axes], whole[2], labels)
+    return target
+
+
 def check_screen() -> None:
     """Raise an InputError, with what to install, where pictures find no X server and no Xvfb."""
     if not os.environ.get("DISPLAY") and shutil.which("Xvfb") is None:
@@ -183,32 +283,91 @@ def _pair(cut: Any) -> Array:
     return np.stack([_vector(values, "cut") for values in cut])
 
 
-def _grid(solution: Solution, values: Array) -> tuple[Array, Array, Array, Array, Array]:
-    """Return cells, types, points, displacements and values of this rank."""
-    u = solution.displacement
-    if len(u.x.array) == 0:
-        empty = np.zeros((0, 3))
-        return np.zeros(0, np.int32), np.zeros(0, np.uint8), empty, empty, np.zeros(0)
-    cells, types, points = dplot.vtk_mesh(u.function_space)
+def _values(solution: Solution, show: str) -> Array:
+    """Return a field at the nodes of the displacement."""
+    if show == "von_mises":
+        return np.asarray(solution.nodal_von_mises.x.array)
+    if show in ("pressure", "status") and solution.has_contact:
+        return np.asarray(getattr(solution, show).x.array)
+    return np.zeros(len(solution.displacement.x.array) // solution.dofs.bs)
+
+
+def _grid(solution: Solution, fields: dict[str, Array]) -> dict[str, Array]:
+    """Return cells, types, points, displacements, nodal fields and bodies of this rank."""
+    u, decomposition = solution.displacement, solution.decomposition
+    subdomain = decomposition.cell_subdomain
+    cells, types, points = np.zeros(0, np.int32), np.zeros(0, np.uint8), np.zeros((0, 3))
+    if len(u.x.array):
+        cells, types, points = dplot.vtk_mesh(u.function_space)
     moved = np.zeros_like(points)
     bs = u.function_space.dofmap.index_map_bs
     moved[:, :bs] = u.x.array.reshape(-1, bs)
-    return cells, types, points, moved, values
+    body = decomposition.body_of_subdomain[subdomain]
+    return {
+        "cells": cells,
+        "types": types,
+        "points": points,
+        "moved": moved,
+        **fields,
+        "body": body,
+        "subdomain": subdomain,
+    }
 
 
-def _joined(parts: list[tuple[Array, ...]]) -> dict[str, Array]:
-    """One grid of the ranks' grids; VTK's cells are (count, nodes …) in one array."""
-    starts = np.cumsum([0, *(len(points) for _, _, points, _, _ in parts)])
-    shifted = []
-    for (cells, types, *_), start in zip(parts, starts, strict=False):
-        table = np.array(cells).reshape(len(types), -1) if len(types) else np.zeros((0, 1), int)
-        table[:, 1:] += start
-        shifted.append(table.ravel())
-    types, points, moved, values = (
-        np.concatenate(rows) for rows in list(zip(*parts, strict=True))[1:]
-    )
-    cells = np.concatenate(shifted)
-    return {"cells": cells, "types": types, "points": points, "moved": moved, "values": values}
+def _joined(parts: list[dict[str, Array]]) -> dict[str, Array]:
+    """Return one grid of the ranks' grids, whose tears are closed.
+
+    VTK's cells are (count, nodes …) in one array.
+    """
+    starts = np.cumsum([0, *(len(part["points"]) for part in parts)])
+    whole = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    tables = [
+        part["cells"].reshape(len(part["types"]), -1)[:, 1:] + start
+        for part, start in zip(parts, starts, strict=False)
+        if len(part["types"])
+    ]
+    if not tables:
+        return whole
+    table = np.concatenate(tables)
+    # nodes of one body at one place are one: torn copies agree
+    points, width = whole["points"], table.shape[1]
+    body = np.zeros(len(points))
+    body[table] = whole["body"][:, None]
+    size = max(float(np.ptp(points, axis=0).max()), 1e-300)
+    places = np.column_stack((body, np.round((points - points.min(axis=0)) / size * 1e9)))
+    _, first, node = np.unique(places, axis=0, return_index=True, return_inverse=True)
+    counts = np.full(len(table), width)
+    for name, values in whole.items():
+        if len(values) == len(points) and name not in ("cells", "types", "body", "subdomain"):
+            whole[name] = values[first]
+    whole["cells"] = np.column_stack((counts, node.reshape(-1)[table])).ravel()
+    return whole
+
+
+def _obstacles(solution: Solution, points: Array, moved: Array) -> dict[str, Array]:
+    """Return the distances of obstacles on a grid around the bodies, and its corners."""
+    gdim = solution.decomposition.mesh.geometry.dim
+    both = np.vstack((points, points + np.nan_to_num(moved)))
+    low, high = both.min(axis=0), both.max(axis=0)
+    margin = MARGIN * float((high - low).max())
+    box = np.stack((low, high)) + np.array([[-margin], [margin]])
+    box[:, gdim:] = low[gdim:]
+    axes = [np.linspace(start, stop, SAMPLES[gdim]) for start, stop in box.T[:gdim]]
+    axes += [low[gdim:]] * (3 - gdim)
+    grid = np.meshgrid(*axes, indexing="ij")
+    x = np.stack([coordinate.ravel() for coordinate in grid])
+    poses = {i: tool for tool in solution.tool_motions for i in tool.contacts}
+    found: dict[str, Array] = {"box": box}
+    for i, contact in enumerate(solution.contacts):
+        if not isinstance(contact, Obstacle) or not isinstance(contact.gap, str):
+            continue
+        shape = contact.shape
+        if isinstance(shape, RigidBody):
+            shape = shape.placed(Pose(shape.centre(gdim), poses[i].motion, True))
+        with named(f"distance of {contact.name} from points around the bodies"):
+            distance = np.asarray(shape.distance(x), dtype=float)
+        found[f"obstacle_{len(found) - 1}"] = distance.reshape(grid[0].shape)
+    return found
 
 
 def _draw(target: Path, data: dict[str, object]) -> None:
@@ -227,6 +386,42 @@ def _draw(target: Path, data: dict[str, object]) -> None:
     os.replace(partial, target)
 
 
+STATUS = {
+    ContactStatus.OPEN: ("open", "lightgrey"),
+    ContactStatus.SLIP: ("slip", "tab:orange"),
+    ContactStatus.STICK: ("stick", "tab:blue"),
+}
+
+
+def _draw_status(
+    target: Path, x: Array, arrows: Array, status: Array, labels: tuple[str, str]
+) -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    axes = figure.subplots()
+    size = np.quantile(np.linalg.norm(arrows, axis=1), 0.95) if len(x) else 0.0  # corners stand out
+    if size > 0.0:
+        scale = 14.0 * size / np.linalg.norm(np.ptp(x, axis=0))
+        axes.quiver(*x.T, *arrows.T, angles="xy", scale_units="xy", scale=scale, width=0.0015)
+    for value, (name, colour) in STATUS.items():
+        at = status == value
+        axes.plot(*x[at].T, "o", markersize=3, color=colour, label=f"{name}: {at.sum()}")
+    axes.set_aspect("equal")
+    axes.margins(0.15)
+    axes.set(xlabel=labels[0], ylabel=labels[1])
+    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    _save(target, figure)
+
+
+def _save(target: Path, figure: Any) -> None:
+    """Write a figure; it appears whole."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_name(f".partial-{target.name}")
+    figure.savefig(partial)
+    os.replace(partial, target)
+
+
 def _draw_curve(
     target: Path,
     x: Array,
@@ -235,7 +430,6 @@ def _draw_curve(
     limit: float | None,
     label: str,
 ) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     shown = np.abs(x) <= (limit if limit is not None else np.abs(x).max(initial=0.0))
@@ -249,7 +443,4 @@ def _draw_curve(
     axes.set_xlabel(label)
     axes.set_ylabel("contact pressure")
     axes.legend()
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(f".partial-{target.name}")
-    FigureCanvasAgg(figure).print_png(str(partial))
-    os.replace(partial, target)
+    _save(target, figure)

@@ -191,6 +191,16 @@ class Solution(ContactState):
         sigma = self._sigma if self.has_stress else None
         return plugin("Interior")(self.boundary, self.displacement, sigma, self.dofs)
 
+    def to_pyvista(self) -> Any:
+        """Return the bodies as a ``pyvista.UnstructuredGrid``, for notebooks. Collective.
+
+        Nodes have the displacement, von Mises stress, contact pressure and status (``von_mises``
+        where the problem has a stress), cells their body and subdomain; tears are closed. Rank 0
+        has the whole, other ranks None. In a notebook
+        ``solution.to_pyvista().warp_by_vector("displacement").plot(scalars="pressure")`` draws it.
+        """
+        return plugin("to_pyvista")(self)
+
     @property
     def has_stress(self) -> bool:
         """True if the problem was given a stress."""

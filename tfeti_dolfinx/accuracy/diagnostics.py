@@ -243,16 +243,16 @@ def _of_estimates(outcome: Outcome) -> Iterator[str]:
 
 
 def _loose(outcome: Outcome) -> Iterator[str]:
-    """Motions that contacts hardly hold."""
-    hardly = [motion for motion in outcome.nearly_free if motion["stiffness"]]
-    for motion in hardly[: LIMITS.listed]:
+    """Motions that contacts constrain weakly."""
+    weak = [motion for motion in outcome.nearly_free if motion["stiffness"]]
+    for motion in weak[: LIMITS.listed]:
         yield (
-            f"{_bodies(motion)}: contacts with a force hold hardly ({motion['stiffness']:.0e} of "
-            f"what they could) {motion['mode']}: displacements that differ by that are nearly as "
-            "right"
+            f"{_bodies(motion)}: active contacts constrain {motion['mode']} weakly "
+            f"({motion['stiffness']:.0e} of what they could): the displacement along it is poorly "
+            "determined; add friction, a spring or a Dirichlet condition if it matters"
         )
-    if (rest := len(hardly) - LIMITS.listed) > 0:
-        yield f"{rest} more motions are held hardly by contacts with a force"
+    if (rest := len(weak) - LIMITS.listed) > 0:
+        yield f"{rest} more motions are weakly constrained by active contacts"
 
 
 def notes_of(outcome: Outcome) -> list[str]:
@@ -264,7 +264,7 @@ def notes_of(outcome: Outcome) -> list[str]:
     listed = f" ({some}{'; …' if len(loose) > LIMITS.listed else ''})" if some else ""
     if len(loose) > outcome.free_modes:
         return [
-            f"contacts with a force do not hold {len(loose)} rigid motions{listed}: displacements "
+            f"active contacts do not hold {len(loose)} rigid motions{listed}: displacements "
             "that differ by them are as right"
         ]
     return [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -17,6 +18,8 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.validation import named, shown
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.untorn import PhysicalNames
+
+log = logging.getLogger(__name__)
 
 # --- Content of one gmsh model as arrays ------------------------------------------------------
 
@@ -221,6 +224,15 @@ def physical_names(
         _merged_names(sorted(set().union(*(names[k] for names in gathered))), top - 1 + k)
         for k in (0, 1)
     )
+    for what, names in (("facets", surfaces), ("cells", volumes)):
+        nameless = [tag for name, tag in names.items() if name == str(tag)]
+        if comm.rank == 0 and 0 < len(nameless) < len(names):
+            log.warning(
+                "physical groups of %s without a name, where others have one: %s; a name that is "
+                "given to a second group is lost in gmsh: put all entities into one group",
+                what,
+                nameless,
+            )
     return PhysicalNames(surfaces, volumes)
 
 

@@ -1,4 +1,4 @@
-"""Meshes that follow the estimated error: what the adaptive demos share."""
+"""Solves on meshes that follow the estimated error."""
 
 from __future__ import annotations
 
@@ -83,17 +83,3 @@ def solves(
         yield problem, found, meshing
         if done:
             return
-
-
-def last_of(steps: Iterator[tuple[tfeti.ContactProblem, Any, float]]) -> tfeti.ContactProblem:
-    """Print what each step has found, and return the last problem; the others are destroyed."""
-    last = None
-    for problem, found, _ in steps:
-        if problem.decomposition.comm.rank == 0:
-            unknowns = problem.report.primal_dofs
-            print(f"{unknowns} unknowns, error {found.relative_discretisation:.2%}", flush=True)
-        if last is not None:
-            last.destroy()
-        last = problem
-    assert last is not None
-    return last
