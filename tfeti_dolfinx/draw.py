@@ -101,8 +101,12 @@ def draw(data: Mapping[str, Any], target: str) -> None:
     shown = grid.n_cells <= FEW_CELLS if np.isnan(edges) else bool(edges)
     shade |= {"show_edges": shown, "edge_opacity": 0.3, "show_scalar_bar": False}
     actor = _coloured(plotter, bodies, name, float(data["highest"]), shade)
-    outline = bodies.extract_feature_edges(
-        feature_angle=CORNER, boundary_edges=flat, non_manifold_edges=False, manifold_edges=False
+    outline = bodies.extract_feature_edges(  # in 2D orientations of cells may differ
+        feature_angle=CORNER,
+        boundary_edges=flat,
+        feature_edges=not flat,
+        non_manifold_edges=False,
+        manifold_edges=False,
     )
     if outline.n_cells:
         plotter.add_mesh(outline, color="black", line_width=1.5, lighting=False)
@@ -175,7 +179,7 @@ def _look(plotter: Any, points: Any, data: Mapping[str, Any], flat: bool) -> Non
     plotter.reset_camera(bounds=np.stack((low, high), axis=1).ravel().tolist())
     if flat:  # without a focus the bodies fill the picture; else zoom 1 sees the sphere around them
         width, height = plotter.window_size
-        low, high = 1.05 * (high - low)[:2] / 2
+        low, high = 1.14 * (high - low)[:2] / 2
         plotter.enable_parallel_projection()
         if np.any(np.isnan(data["focus"])):
             plotter.camera.parallel_scale = max(high, low * height / (WIDTH * width))

@@ -334,7 +334,7 @@ def _joined(parts: list[dict[str, Array]]) -> dict[str, Array]:
     body = np.zeros(len(points))
     body[table] = whole["body"][:, None]
     size = max(float(np.ptp(points, axis=0).max()), 1e-300)
-    places = np.column_stack((body, np.round((points - points.min(axis=0)) / size * 1e9)))
+    places = np.column_stack((body, np.round((points - points.min(axis=0)) / size * 1e9) + 0.0))
     _, first, node = np.unique(places, axis=0, return_index=True, return_inverse=True)
     counts = np.full(len(table), width)
     for name, values in whole.items():
