@@ -158,8 +158,7 @@ def smalse(
     >>> import numpy as np
     >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
     >>> from tfeti_dolfinx.qp.sets import Bounds
-    >>> from tfeti_dolfinx.common.validation import ABOVE_0, Range, described
-    from tfeti_dolfinx.qp.homogenised import homogenise
+    >>> from tfeti_dolfinx.qp.homogenised import homogenise
     >>> from tfeti_dolfinx.qp.problem import StoppingRule
     >>> F, d = np.diag([1.0, 2.0, 4.0]).__matmul__, np.array([1.0, -1.0, 2.0])
     >>> qp = QP(F, d, DenseCoarse(np.ones((1, 3)), np.ones(1)), Bounds(), norm=4.0)
