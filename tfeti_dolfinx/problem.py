@@ -313,7 +313,8 @@ class ContactProblem:
         if options.warnings:
             warnings = self._diagnostics.found(dual, solution, outcome, options.number)
         method = f"{options.qp_type} + {options.pc_type}"
-        self._outcome = replace(outcome, warnings=warnings, notes=notes_of(outcome), solver=method)
+        notes = notes_of(outcome, solution)
+        self._outcome = replace(outcome, warnings=warnings, notes=notes, solver=method)
         bodies = [*d.body_names, *self._system.tools.free_names]
         restless = (bodies[settling.body], settling.slides)
         conclude(result, accuracy, self.options, d.comm, excluding, restless, warnings)

@@ -37,6 +37,9 @@ class WarningLimits:
         turns: Radians; what linear kinematics takes for strain is half the square, 0.5 %.
         facets: Of what the largest pressure presses together: gaps that straight facets change by
             as much had forces and pressures wrong by 4 to 10 %.
+        hardly_covered: Share of a node's surface that the other side of a pair covers: pressures
+            of nodes with less were 5 to 40 000 times those beside them, of blocks on flat faces.
+        stands_out: Such a pressure over the largest of other nodes; at edges they differ by less.
         listed: Bodies that a sentence names.
     """
 
@@ -45,6 +48,8 @@ class WarningLimits:
     locks: float = 50.0
     turns: float = 0.1
     facets: float = 0.5
+    hardly_covered: float = 0.02
+    stands_out: float = 2.0
     listed: int = 3
 
 
@@ -255,8 +260,43 @@ def _loose(outcome: Outcome) -> Iterator[str]:
         yield f"{rest} more motions are weakly constrained by active contacts"
 
 
-def notes_of(outcome: Outcome) -> list[str]:
-    """Return what is worth knowing of an answer and needs no change: motions that are free."""
+def notes_of(outcome: Outcome, solution: Solution) -> list[str]:
+    """Return what is worth knowing of an answer, whose displacement is right. Collective."""
+    return [*_untouched(outcome), *_hardly_covered(solution), *_free(outcome)]
+
+
+def _untouched(outcome: Outcome) -> Iterator[str]:
+    """Contacts none of which touches."""
+    if outcome.contacts and not any(contact.touching for contact in outcome.contacts):
+        gaps = [contact.gap for contact in outcome.contacts if contact.nodes]
+        nearest = f" (smallest gap {min(gaps):.2g})" if gaps else ""
+        yield f"no contact touches{nearest}: the displacement is that without contacts"
+
+
+def _hardly_covered(solution: Solution) -> Iterator[str]:
+    """Pairs whose largest pressure is on nodes that their primary side hardly covers. Collective.
+
+    A force on the common part has a right resultant, but hats on a sliver are nearly linear: the
+    forces on its vertices are large against their ∫φ_i on the sliver.
+    """
+    records, count = solution.gluing.records, len(solution.contacts)
+    if all(len(contact.surfaces) == 1 for contact in solution.contacts):
+        return
+    hardly = (records.covered < LIMITS.hardly_covered).astype(int)
+    most = np.zeros((2, count))
+    np.maximum.at(most, (hardly, records.contact), solution.contact_pressure)
+    solution.dofs.comm.Allreduce(MPI.IN_PLACE, most, op=MPI.MAX)
+    for i in np.flatnonzero(most[1] > LIMITS.stands_out * most[0]):
+        yield (
+            f"{solution.contacts[i].name}: the largest pressure, {most[1, i]:.3g}, is at nodes of "
+            f"which the other side covers less than {LIMITS.hardly_covered:.0%}, elsewhere it is "
+            f"at most {most[0, i]:.3g}; forces are right, pressures of such nodes are not: "
+            "expected the other side as the secondary one, or a node where the other side ends"
+        )
+
+
+def _free(outcome: Outcome) -> list[str]:
+    """Motions that are free."""
     loose = [motion for motion in outcome.nearly_free if not motion["stiffness"]]
     if not loose and not outcome.free_modes:
         return []

@@ -63,6 +63,7 @@ def conditions(
         curved_gap=curved_gap,
         conforms=changed > spread,
         area=areas,
+        covered=areas / whole[chosen],
         within_reach=np.ones(len(chosen), dtype=bool),
         condition=place[slot],
         entry_group=column,

@@ -40,6 +40,7 @@ class ContactRecords:
             from node to node, shape ``(n,)``.
         area: Integral ∫φ_i of the node's hat over the contact surface, of a pair over what the
             other side covers of it, shape ``(n,)``.
+        covered: The share of that integral over the whole surface, 1 at an obstacle, ``(n,)``.
         within_reach: Whether a row is made at once; a condition out of reach gets one only if
             the solution violates it, shape ``(n,)``.
         condition: Condition of each weight, shape ``(k,)``.
@@ -59,6 +60,7 @@ class ContactRecords:
     curved_gap: Array
     conforms: Array
     area: Array
+    covered: Array
     within_reach: Array
     condition: Array
     entry_group: Array
@@ -108,6 +110,7 @@ def concatenate(records: list[ContactRecords], gdim: int) -> ContactRecords:
         number,
         number,
         flag,
+        number,
         number,
         flag,
         none,

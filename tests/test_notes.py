@@ -1,0 +1,60 @@
+"""Notes of the report: what is worth knowing of an answer whose displacement is right."""
+
+import numpy as np
+import pytest
+from bodies import held, pressed, sided, stacked, two_body_problem
+from scenes import decomposed, problem
+
+import tfeti_dolfinx as tfeti
+
+
+@pytest.mark.parametrize("height", [-0.5, 0.0])
+def test_contacts_none_of_which_touches_are_said(height):
+    d = decomposed("quadrilateral", 3)
+    plane = tfeti.Plane((0, height), (0, 1))
+    p = problem(d, contacts=[tfeti.Obstacle("bottom", plane, reach=1.0)])
+    p.solve()
+    said = [note for note in p.report.notes if note.startswith("no contact touches")]
+    if height < 0.0:
+        (contact,) = p.report.contacts
+        assert contact.touching == 0
+        assert 0.0 < contact.gap < 0.5
+        assert said == [
+            f"no contact touches (smallest gap {contact.gap:.2g}): the displacement is that "
+            "without contacts"
+        ]
+        assert f"note      {said[0]}" in str(p.report)
+    else:
+        assert p.report.contacts[0].touching > 0
+        assert said == []
+
+
+def test_no_contact_is_no_contact_that_does_not_touch():
+    p = problem(decomposed("quadrilateral", 3))
+    p.solve()
+    assert p.report.notes == []
+
+
+@pytest.mark.parametrize("cell", ["quadrilateral", "hexahedron"])
+@pytest.mark.parametrize(
+    ("beyond", "secondary", "expected"),
+    [(0.03, "lower top", True), (0.5, "lower top", False), (0.03, "upper bottom", False)],
+)
+def test_pressures_of_nodes_that_are_hardly_covered(cell, beyond, secondary, expected):
+    """A block whose edge is a little beyond a node of the face on which it is pressed."""
+    width = (1.0 + beyond) / 3.0
+    d = stacked(cell, 3, 4, 4, upper=(0.0, width))
+    sides = ["lower bottom", "lower left", "upper left"]
+    sides += ["lower front", "upper front"] if cell == "hexahedron" else []
+    primary = {"lower top": "upper bottom", "upper bottom": "lower top"}[secondary]
+    contact = sided(secondary, primary, name="faces")
+    p = two_body_problem(d, pressed(d, 0.1), held(d, *sides), [contact])
+    p.solve()
+    found = [note for note in p.report.notes if note.startswith("faces: the largest pressure")]
+    (summary,) = p.report.contacts
+    load = 0.1 * width ** (d.mesh.geometry.dim - 1)
+    assert np.isclose(abs(summary.resultant[-1]), load, rtol=1e-5)
+    assert len(found) == expected
+    assert (summary.pressure > 0.5) == expected
+    if expected:
+        assert f"{summary.pressure:.3g}, is at nodes" in found[0]
