@@ -194,7 +194,9 @@ if arguments.output:
     tfeti.write_vtx(arguments.output / "adaptive_3d.bp", problem.solution)
 if arguments.plot:
     folder = arguments.output or Path("results")
-    tfeti.plot_deformed(folder / "adaptive_3d.png", problem.solution, factor=1.0, show_edges=True)
+    looks = {"view": (0.3, -1.0, -0.8), "focus": (0.0, 0.0, 0.0), "zoom": 4.0}
+    looks |= {"show": "pressure", "show_obstacles": False, "show_edges": True}
+    tfeti.plot_deformed(folder / "adaptive_3d.png", problem.solution, **looks)
     tfeti.plot_pressure(
         folder / "adaptive_3d_pressure.png",
         problem.solution,

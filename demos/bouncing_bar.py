@@ -146,7 +146,8 @@ if arguments.plot:
         from matplotlib.figure import Figure
 
         folder.mkdir(parents=True, exist_ok=True)
-        figure, fine = Figure(figsize=(8, 4), layout="constrained"), np.linspace(0.0, end, 4001)
+        figure = Figure(figsize=(8, 4), dpi=130, layout="constrained")
+        fine = np.linspace(0.0, end, 4001)
         left, right = figure.subplots(1, 2)
         for name, of in found.items():
             left.plot(t - size / 2, pressures[name], linewidth=1, label=name)
@@ -154,7 +155,7 @@ if arguments.plot:
         left.plot(fine, pressure(fine), "k--", linewidth=1, label="closed form")
         left.set(xlabel="time", ylabel="pressure of the floor")
         right.set(xlabel="time", ylabel="kinetic and elastic energy")
-        left.legend()
+        figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=3)
         figure.savefig(folder / "bouncing_bar.png")
 if arguments.report:
     problem.report.write(arguments.report, comm)

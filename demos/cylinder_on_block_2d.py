@@ -180,7 +180,8 @@ if arguments.plot:
         folder / "cylinder_on_block_2d.png", problem.solution, unit="MPa", factor=1.0, **zoom
     )
     path = folder / "cylinder_on_block_2d_pressure.png"
-    tfeti.plot_pressure(path, problem.solution, lambda x: x[:, 0], hertz, limit=2 * a)
+    units = {"label": "x [mm]", "unit": "MPa"}
+    tfeti.plot_pressure(path, problem.solution, lambda x: x[:, 0], hertz, limit=2 * a, **units)
 if arguments.report:
     problem.report.write(arguments.report, comm)
 if comm.rank == 0:

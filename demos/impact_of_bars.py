@@ -115,6 +115,7 @@ def impact(name, stabilised):
         far = fem.locate_dofs_topological(V, 2, decomposition.facets("lower bottom"))
         bcs.append(fem.dirichletbc(np.zeros(3), far, V))
     if nu:  # it cannot widen
+        mesh.topology.create_connectivity(3, 3)
         everywhere = np.arange(mesh.topology.index_map(3).size_local, dtype=np.int32)
         for k in (0, 1):
             dofs = fem.locate_dofs_topological(V.sub(k), 3, everywhere)
@@ -186,12 +187,14 @@ if arguments.plot:
         from matplotlib.figure import Figure
 
         folder.mkdir(parents=True, exist_ok=True)
-        figure = Figure(figsize=(4 * len(names), 4), layout="constrained")
+        figure = Figure(figsize=(3 * len(names), 3.2), dpi=130, layout="constrained")
         for axes, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
             for kind, (t, p) in panels[name].items():
                 axes.plot(t, p, linewidth=1, label=kind)
-            axes.set(xlabel="time / that of the impact", ylabel=f"pressure / closed form: {name}")
-        axes.legend()
+            axes.set(title=name, xlabel="time / that of the impact")
+        figure.supylabel("pressure / closed form", fontsize="medium")
+        handles, labels = axes.get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=2)
         figure.savefig(folder / "impact_of_bars.png")
 if arguments.report:
     problem.report.write(arguments.report, comm)

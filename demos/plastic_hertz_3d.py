@@ -136,7 +136,7 @@ if arguments.output:
 if arguments.plot:
     folder = arguments.output or Path("results")
     look = {"cut": ((0, 0, 0), (0, -1, 0)), "view": (0.0, -1.0, -0.1)}
-    look |= {"zoom": 4.0, "focus": (0.0, 0.0, 0.15)}
+    look |= {"zoom": 4.0, "focus": (0.0, 0.0, 0.15), "show_edges": False}
     tfeti.plot_deformed(folder / "plastic_hertz_3d.png", problem.solution, factor=1.0, **look)
     if comm.rank == 0:
         from matplotlib.figure import Figure

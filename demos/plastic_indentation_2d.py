@@ -135,7 +135,7 @@ if arguments.output:
     tfeti.write_vtx(arguments.output / "plastic_indentation_2d.bp", problem.solution)
 if arguments.plot:
     folder = arguments.output or Path("results")
-    look = {"zoom": 3.5, "focus": (260.0, -200.0, 0.0), "highest": strength}
+    look = {"zoom": 4.5, "focus": (300.0, -230.0, 0.0), "highest": strength}
     tfeti.plot_deformed(
         folder / "plastic_indentation_2d.png", problem.solution, unit="MPa", factor=1.0, **look
     )
@@ -144,9 +144,9 @@ if arguments.plot:
 
         figure = Figure(layout="constrained")
         axes = figure.subplots()
-        axes.plot(depths, forces, "o-", label="finite elements")
-        axes.plot(depths, slip_lines, label="slip lines")
-        axes.set(xlabel="depth in mm", ylabel="force in N a radian")
+        axes.plot(depths, np.array(forces) / 1e6, "o-", label="finite elements")
+        axes.plot(depths, np.array(slip_lines) / 1e6, label="slip lines")
+        axes.set(xlabel="depth in mm", ylabel="force in MN a radian")
         axes.legend()
         figure.savefig(folder / "plastic_indentation_2d_force.png")
 if arguments.report:

@@ -270,11 +270,13 @@ if arguments.plot:
         share, moved = np.array([(row["Q/(μP)"], row["moved/a"]) for row in rows]).T
         secant, fine = moved[steps - 1] / most, np.linspace(-most, most, 401)
         back = (slipped_back(fine) - slipped(most) / most * fine) / a
-        figure = Figure(figsize=(8, 4), layout="constrained")
+        way = np.concatenate((fine[200:], fine[::-1], fine))
+        first = (slipped(fine[200:]) - slipped(most) / most * fine[200:]) / a
+        slip = np.concatenate((first, back[::-1], -back[::-1]))
+        figure = Figure(figsize=(8, 4), dpi=130, layout="constrained")
         for axes, taken in zip(figure.subplots(1, 2), (0.0, secant), strict=True):
             axes.plot(moved - taken * share, share, "o", markersize=3, label="computed")
-            exact = np.concatenate((back, -back)) + (secant - taken) * np.concatenate((fine, -fine))
-            axes.plot(exact, np.concatenate((fine, -fine)), linewidth=1, label="closed form")
+            axes.plot(slip + (secant - taken) * way, way, linewidth=1, label="closed form")
             axes.set(xlabel="displacement / a" + (", less the secant" if taken else ""))
             axes.set(ylabel="Q / (μP)")
             axes.locator_params(axis="x", nbins=6)

@@ -79,7 +79,7 @@ def draw(data: Mapping[str, Any], target: str) -> None:
         factor = float(0.05 * size / max(np.abs(grid["u"]).max(), 1e-300))
     point, normal = data["cut"]
     if np.all(np.isfinite(normal)):
-        grid = grid.clip(normal=normal, origin=point, crinkle=True)
+        grid = grid.clip(normal=normal, origin=point)
     bodies = grid.warp_by_vector("u", factor=factor)
     bodies.set_active_scalars(name)
     flat = bool(np.ptp(grid.points[:, 2]) == 0.0)
@@ -117,10 +117,13 @@ def draw(data: Mapping[str, Any], target: str) -> None:
     if actor is not None:
         unit = str(data["unit"])
         title = "\n".join([*name.split(), f"[{unit}]" * bool(unit), ""])
-        plotter.add_scalar_bar(title=title, mapper=actor.mapper, **SCALAR_BAR)
+        whole = {"fmt": "%.0f"} if 1e3 <= actor.mapper.scalar_range[1] < 1e5 else {}
+        plotter.add_scalar_bar(title=title, mapper=actor.mapper, **SCALAR_BAR | whole)
     if factor != 1.0:
         text = f"displacement\n× {factor:.3g}"
         plotter.add_text(text, position="lower_left", font_size=14, color="black")
+    # lines are whole; "ssaa" would misplace the field of the scale
+    plotter.enable_anti_aliasing("fxaa", all_renderers=True)
     plotter.screenshot(target)
 
 

@@ -155,6 +155,7 @@ def plot_pressure(
     contact: int = 0,
     limit: float | None = None,
     label: str = "x",
+    unit: str = "",
 ) -> Path:
     """Contact pressure over a coordinate, with a closed form if there is one. Collective.
 
@@ -166,6 +167,7 @@ def plot_pressure(
         contact: Index of the contact.
         limit: Largest coordinate shown, in magnitude.
         label: Name of the coordinate.
+        unit: Of the pressure, for its axis.
 
     Returns:
         The file written.
@@ -177,8 +179,9 @@ def plot_pressure(
     comm = solution.decomposition.comm
     with agreeing(comm, "plot_pressure") as given:
         given |= {"path": path, "contact": contact, "closed_form": closed_form, "limit": limit}
-        given |= {"coordinate": coordinate, "label": label}
+        given |= {"coordinate": coordinate, "label": label, "unit": unit}
         target = checked_path(path, ".png")
+        checked_type(unit, str, "unit", "a string")
         checked_callable(coordinate, "coordinate", "a callable of points of shape (n, 3)")
         if closed_form is not None:
             checked_callable(closed_form, "closed_form", "a callable of coordinates of shape (n,)")
@@ -191,7 +194,8 @@ def plot_pressure(
     with raised_on_all_ranks(comm), named(f"cannot write {target}"):
         if comm.rank == 0 and parts is not None:
             x, p = (np.concatenate(rows) for rows in zip(*parts, strict=True))
-            _draw_curve(target, x, p, closed_form, limit, label)
+            labels = label, f"contact pressure [{unit}]" if unit else "contact pressure"
+            _draw_curve(target, x, p, closed_form, limit, labels)
     return target
 
 
@@ -404,6 +408,7 @@ def _draw_status(
     if size > 0.0:
         scale = 14.0 * size / np.linalg.norm(np.ptp(x, axis=0))
         axes.quiver(*x.T, *arrows.T, angles="xy", scale_units="xy", scale=scale, width=0.0015)
+        axes.update_datalim(x + arrows / scale)
     for value, (name, colour) in STATUS.items():
         at = status == value
         axes.plot(*x[at].T, "o", markersize=3, color=colour, label=f"{name}: {at.sum()}")
@@ -428,7 +433,7 @@ def _draw_curve(
     p: Array,
     closed_form: Callable[[Array], Array] | None,
     limit: float | None,
-    label: str,
+    labels: tuple[str, str],
 ) -> None:
     from matplotlib.figure import Figure
 
@@ -440,7 +445,6 @@ def _draw_curve(
     if closed_form is not None:
         fine = np.linspace(x[shown].min(), x[shown].max(), 801)
         axes.plot(fine, closed_form(fine), "-", linewidth=1, label="closed form")
-    axes.set_xlabel(label)
-    axes.set_ylabel("contact pressure")
+    axes.set(xlabel=labels[0], ylabel=labels[1])
     axes.legend()
     _save(target, figure)
