@@ -277,11 +277,17 @@ def study(name: str, arguments: argparse.Namespace, folder: Path) -> Tables:
 
 
 def draw(path, tables):
-    """Errors over seconds, on one rank."""
+    """Errors over seconds, on one rank: bands of three scenes, energy above pressure."""
     titles = [title for title in tables if title in SCENES]
-    with picture(path, len(titles), 8.6, rows=2) as axes:
+    columns = min(len(titles), 3)
+    bands = -(-len(titles) // columns)
+    with picture(path, columns, 8.6 * bands, rows=2 * bands) as axes:
+        for unused in range(len(titles), columns * bands):
+            for panel in axes[-2 * columns :][unused % columns :: columns]:
+                panel.remove()
         for k, title in enumerate(titles):
-            panels = axes[k :: len(titles)]
+            band = axes[2 * columns * (k // columns) :][: 2 * columns]
+            panels = band[k % columns :: columns]
             for panel, name in zip(panels, MEASURES, strict=True):
                 lines: dict[str, tuple[list[float], list[float]]] = {}
                 for row in tables[title]:

@@ -201,14 +201,23 @@ def slope(sizes: Sequence[float], errors: Sequence[float]) -> float:
 
 @contextmanager
 def picture(path: Path, panels: int, height: float = 3.4, rows: int = 1) -> Iterator[list[Any]]:
-    """Axes of panels side by side, row by row, written when the block ends."""
+    """Axes of panels side by side, row by row, written when the block ends.
+
+    Panels of one row that are more than three are drawn in two columns.
+    """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    count = rows * panels
+    if rows == 1 and panels > 3:
+        panels, rows = 2, -(-panels // 2)
+        height *= rows
     figure = Figure(figsize=(4.6 * panels, height), layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(rows, panels, squeeze=False)
-    yield list(axes.ravel())
+    axes = list(figure.subplots(rows, panels, squeeze=False).ravel())
+    for unused in axes[count:]:
+        unused.remove()
+    yield axes[:count]
     figure.savefig(path, dpi=120)
 
 
