@@ -146,7 +146,8 @@ for part in np.array_split(times, max(len(times) // 4, 1)):
     begin = part[-1]
     if arguments.plot:
         pictures.append(folder / f"falling_balls_3d_{len(pictures)}.png")
-        looks = {"view": (0.3, -1.0, 0.15), "highest": 0.1 * modulus}
+        looks = {"view": (0.3, -1.0, 0.15), "highest": 0.02 * modulus, "zoom": 0.9}
+        looks["focus"] = (0.0, 0.0, 0.5 * lowest[-1] + R - 0.15)
         tfeti.plot_deformed(pictures[-1], problem.solution, show_edges=False, **looks)
 # -
 
@@ -187,7 +188,8 @@ if arguments.plot:
     if comm.rank == 0:
         from PIL import Image
 
-        frames = [Image.open(path).resize((600, 450)) for path in pictures]
+        narrow = (200, 0, 1200, 900)  # of 1200 × 900
+        frames = [Image.open(path).crop(narrow).resize((500, 450)) for path in pictures]
         path = folder / "falling_balls_3d.gif"
         frames[0].save(path, save_all=True, append_images=frames[1:], duration=80, loop=0)
         pictures[-1].replace(folder / "falling_balls_3d.png")

@@ -65,6 +65,7 @@ PICTURES = {
     r"closed_form is an array of shape \(3,\); expected a callable": curve(
         lambda x: x[:, 0], np.zeros(3)
     ),
+    r"unit is 3; expected a string": curve(lambda x: x[:, 0], unit=3),
 }
 
 TABLES = ("FIELDS", "FILES", "PICTURES")
