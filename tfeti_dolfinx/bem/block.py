@@ -18,7 +18,7 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.subdomains.block import Block, SubdomainData
-from tfeti_dolfinx.subdomains.build import MakeBlock, submatrix
+from tfeti_dolfinx.subdomains.build import MakeBlock, subdomain_stiffness
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.sparse_block import (
     EQUAL,
@@ -144,7 +144,7 @@ class Parts:
             self.parts = {}
             for s, surface in self._surfaces.items():
                 own = self._unknowns(s)
-                K_s = submatrix(K, rows[own], primal, own.start)
+                K_s = subdomain_stiffness(K, rows[own], primal, own.start)
                 part = self.parts[s] = _part(self._names[s], surface, K_s, shapes, self._how)
                 own_blocks = node_blocks(part.shape.K, bs)[part.place[::bs] // bs]
                 blocks[own.start // bs : own.stop // bs] = own_blocks

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csr_array
 
 Array = np.ndarray[Any, np.dtype[Any]]
 ArrayLike = npt.ArrayLike
@@ -38,6 +39,29 @@ def parts_of(sizes: Sequence[int]) -> list[slice]:
 def joined(parts: Sequence[Array]) -> Array:
     """One float array of several, maybe none."""
     return np.concatenate([np.empty(0), *parts])
+
+
+def entries_of_rows(A: Any, rows: Array) -> tuple[Array, Array]:
+    """Return the places of these rows' entries in the arrays of a CSR matrix, and their table.
+
+    Taken there, data and column numbers are with the table the arrays of A[rows], which scipy
+    makes several matrices for.
+    """
+    counts = np.diff(A.indptr)[rows]
+    table = np.concatenate(([0], np.cumsum(counts)))
+    return np.arange(table[-1]) + np.repeat(A.indptr[rows] - table[:-1], counts), table
+
+
+def submatrix(A: Any, rows: Array, columns: Array) -> csr_array:
+    """Return A[rows][:, columns] of a CSR matrix, columns ascending."""
+    place = np.full(A.shape[1], -1, dtype=A.indices.dtype)
+    place[columns] = np.arange(len(columns))
+    entries, table = entries_of_rows(A, rows)
+    column = place[A.indices[entries]]
+    kept = column >= 0
+    table = np.concatenate(([0], np.cumsum(kept)))[table]
+    shape = len(rows), len(columns)
+    return csr_array((A.data[entries[kept]], column[kept], table), shape=shape)
 
 
 def node_blocks(K: Any, bs: int) -> Array:

@@ -222,7 +222,10 @@ def check_stiffness(
     if not np.all(np.isfinite(K.data)):
         raise InputError(f"{name}: {what} has entries that are not finite")
     scale = np.abs(K.data).max(initial=0.0)
-    skew = np.abs((K - K.T).data).max(initial=0.0)
+    transposed = K.tocsc()  # the arrays of Kᵀ by rows
+    pairs = (K.indices, transposed.indices), (K.indptr, transposed.indptr)
+    alike = all(np.array_equal(*pair) for pair in pairs)
+    skew = np.abs(K.data - transposed.data if alike else (K - K.T).data).max(initial=0.0)
     if skew > symmetry * scale:
         raise InputError(
             f"{name}: {what} is not symmetric (|K − Kᵀ| = {skew:.3g}, |K| = {scale:.3g}); "

@@ -122,7 +122,6 @@ def kernel_of(K: Any, modes: Array) -> Array:
     energy = np.sum(R * (K @ R), axis=0)
     # In flat cells entries are differences of far larger numbers, which are as large as those that
     # other unknowns of the cell have: the largest diagonal entry that a row meets bounds them.
-    K = csr_array(K)
     largest = np.maximum.reduceat(K.diagonal()[K.indices], K.indptr[:-1])
     sizes = np.sqrt(largest)[:, None] * np.abs(R)
     pattern = csr_array((np.ones_like(K.data), K.indices, K.indptr), shape=K.shape)

@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_array
 
-from tfeti_dolfinx.common.arrays import Array, node_blocks
+from tfeti_dolfinx.common.arrays import Array, entries_of_rows, node_blocks
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.mesh.decomposition import Decomposition
@@ -100,7 +100,7 @@ def subdomain_data(
         own = slice(starts[s], starts[s + 1])
         return SubdomainData(
             name=f"subdomain {dofs.subdomains[s]}",
-            K=submatrix(K, dolfinx[own], primal, starts[s]),
+            K=subdomain_stiffness(K, dolfinx[own], primal, starts[s]),
             f=loads[own],
             x=x[nodes],
             trace_dofs=trace[cuts[s] : cuts[s + 1]] - starts[s],
@@ -144,10 +144,11 @@ def make_subdomains(
     return kind([*blocks, *rigid], bodies, count + num_rigid, comm, counters, choice)
 
 
-def submatrix(K: Any, rows: Array, primal: Array, first: int) -> csr_array:
+def subdomain_stiffness(K: Any, rows: Array, primal: Array, first: int) -> csr_array:
     """Stiffness of one subdomain, in primal order."""
-    K_s = K[rows]
-    A = csr_array((K_s.data, primal[K_s.indices] - first, K_s.indptr), shape=(len(rows),) * 2)
+    entries, table = entries_of_rows(K, rows)
+    columns = primal[K.indices[entries]] - first
+    A = csr_array((K.data[entries], columns, table), shape=(len(rows),) * 2)
     A.sort_indices()
     return A
 

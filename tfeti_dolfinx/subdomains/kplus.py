@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from petsc4py import PETSc
-from scipy.sparse import coo_array, csr_array, diags_array
+from scipy.sparse import csr_array, diags_array
 
 from tfeti_dolfinx.common.arrays import TINY, Array
 from tfeti_dolfinx.subdomains.block import Counters, candidate_modes
@@ -74,16 +74,21 @@ def regularised(K: Any, R: Array, fixing_dofs: Array, prefix: str = "tfeti_sub_"
 
 
 def regular_matrix(K: Any, R: Array, fixing_dofs: Array) -> Any:
-    """K_ρ, scipy CSR; K itself where R has no columns."""
+    """K_ρ, scipy CSR as K; K itself where R has no columns. The fixing unknowns ascend."""
     if R.shape[1] == 0:
         return K
     Q, _ = np.linalg.qr(R[fixing_dofs])
     # what moves in no motion may be far stiffer
     moves = np.abs(R).max(axis=1) > TOLERANCES.still * np.abs(R).max()
     added = K.diagonal()[moves].max() * (Q @ Q.T)
-    row, column = np.meshgrid(fixing_dofs, fixing_dofs, indexing="ij")
-    places = row.ravel(), column.ravel()
-    return (K + coo_array((added.ravel(), places), shape=K.shape)).tocsr()
+    # behind the entries of these rows, and then summed up
+    count = len(fixing_dofs)
+    at = np.repeat(K.indptr[fixing_dofs + 1], count)
+    columns = np.insert(K.indices, at, np.tile(fixing_dofs, count))
+    table = K.indptr + count * np.searchsorted(fixing_dofs, np.arange(len(K.indptr)))
+    result = csr_array((np.insert(K.data, at, added.ravel()), columns, table), shape=K.shape)
+    result.sum_duplicates()
+    return result
 
 
 def solved(inverse: GeneralisedInverse, b: Array) -> Array:

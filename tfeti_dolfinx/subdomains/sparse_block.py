@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import null_space
 from scipy.sparse import csr_array
 
-from tfeti_dolfinx.common.arrays import TINY, Array
+from tfeti_dolfinx.common.arrays import TINY, Array, entries_of_rows, submatrix
 from tfeti_dolfinx.common.validation import check_stiffness
 from tfeti_dolfinx.errors import FactorError, InputError
 from tfeti_dolfinx.subdomains.block import (
@@ -118,12 +118,12 @@ class Traced:
     @cached_property
     def K_bb(self) -> Any:
         """K on the trace."""
-        return self._stiffness.K[self.trace][:, self.trace]
+        return submatrix(self._stiffness.K, self.trace, self.trace)
 
     @cached_property
     def K_ib(self) -> Any:
         """K between the inside and the trace."""
-        return self._stiffness.K[self.inside][:, self.trace]
+        return submatrix(self._stiffness.K, self.inside, self.trace)
 
     @cached_property
     def _K_bi(self) -> Any:
@@ -142,7 +142,7 @@ class Traced:
         # the triangle has the null space of the kernel's trace rows, and few rows itself
         triangle = np.linalg.qr(stiffness.kernel[self.trace], mode="r")
         R = stiffness.kernel[inside] @ null_space(triangle, rcond=TOLERANCES.on_trace)
-        how, K_ii = stiffness.how, stiffness.K[inside][:, inside]
+        how, K_ii = stiffness.how, submatrix(stiffness.K, inside, inside)
         how.counters.factorizations += 1
         try:
             fixing = fixing_dofs(stiffness.x, inside // stiffness.bs)
@@ -241,8 +241,8 @@ def _equal(K: Any, other: Stiffness, here: Array) -> bool:
     # the diagonals tell most of those apart that are not
     if not np.abs(K.diagonal() - other.diagonal[here]).max(initial=0.0) <= allowed:
         return False
-    moved = K[np.argsort(here)]
-    moved = csr_array((moved.data, here[moved.indices], moved.indptr), shape=K.shape)
+    entries, table = entries_of_rows(K, np.argsort(here))
+    moved = csr_array((K.data[entries], here[K.indices[entries]], table), shape=K.shape)
     return bool(np.abs((moved - other.K).data).max(initial=0.0) <= allowed)
 
 
