@@ -124,7 +124,7 @@ class CoarseSpace(Coarse):
         known = self._damped
         if known is None or self._differs(known[0], face) or known[1] != damping:
             self._damped = None
-            gram = csr_array(self.grams.of_face(face) + damping * self.grams.whole)
+            gram = self.grams.of_face(face, damping)
             known = self._damped = (face, damping, self.factors.factor(gram))
         return known[2].solve(y)
 

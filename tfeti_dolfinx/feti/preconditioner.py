@@ -137,11 +137,14 @@ class FacePreconditioner:
         free, factor = np.zeros_like(face.free), None
         free[self._contact] = face.free[self._contact]
         on_contact = replace(face, free=free)
-        Z_C = on_contact.Z
-        size = Z_C.multiply(Z_C).T @ self._size
+        along = np.sum(face.tangents**2 * self._size[face.tangent_rows], axis=1)
+        size = np.concatenate((self._size[free], along))
         bent = on_contact.bends * size
+        if self._gram is None and not np.any(bent):
+            return _OnFace(self, face)
+        Z_C = on_contact.Z
         if self._gram is not None:
-            part = _restricted(self._gram, csr_array(Z_C[self._contact]))
+            part = _restricted(self._gram, Z_C[self._contact])
             added = part.createVecLeft()
             added.array[:] = PARAMETERS.shift + bent
             part.setDiagonal(added, PETSc.InsertMode.ADD_VALUES)
@@ -150,7 +153,7 @@ class FacePreconditioner:
                 factor = ContactFactor(part, self._prefix)
             else:
                 part.destroy()
-        return _OnFace(self, face, Z_C, bent, size, factor)
+        return _OnFace(self, face, (Z_C, bent, size), factor)
 
     def destroy(self) -> None:
         """Destroy W_C, not the operator on all rows. Collective."""
@@ -163,41 +166,45 @@ class FacePreconditioner:
 class _OnFace:
     """M_f between vectors of a face, which have the layout of all rows.
 
-    Z_C are its directions of contact rows, ``bent`` and ``size`` κσ and σ of them, and ``factor``
-    that of W_C + κσ; None where W_C is the identity.
+    ``contact`` are Z_C, its directions of contact rows, and κσ and σ of them; None where W_κ is the
+    identity. ``factor`` is that of W_C + κσ; None where W_C is the identity.
     """
 
     def __init__(
         self,
         on_all: FacePreconditioner,
         face: Face,
-        Z_C: csr_array,
-        bent: Array,
-        size: Array,
-        factor: ContactFactor | None,
+        contact: tuple[csr_array, Array, Array] | None = None,
+        factor: ContactFactor | None = None,
     ) -> None:
-        self._on_all, self._face, self._Z_C, self._factor = on_all, face, Z_C, factor
-        bends = bent > 0.0
-        self._bent, self._bends = bent, bool(np.any(bends))
-        self._onto_contact, self._springs = csr_array(Z_C.T), csr_array(Z_C[:, bends])
-        self._to_springs = csr_array(self._springs.T)
-        self._moves, self._sizes = bent[bends], size[bends]
+        self._on_all, self._face, self._factor = on_all, face, factor
+        self._is_identity, self._bends = contact is None, False
+        self._moves = self._sizes = np.zeros(0)
+        if contact is not None:
+            self._Z_C, self._bent, size = contact
+            self._onto_contact, bends = self._Z_C.T.tocsr(), self._bent > 0.0
+            self._moves, self._sizes = self._bent[bends], size[bends]
+            self._bends = bool(np.any(bends))
+        if self._bends:
+            self._springs = self._Z_C[:, bends]
+            self._to_springs = self._springs.T.tocsr()
 
     def __call__(self, x: Array) -> Array:
         """M_f x: displacements of the trace, of what is next to it, of springs. Collective."""
-        on, springs, moves, sizes = self._on_all, self._springs, self._moves, self._sizes
-        to_springs = self._to_springs
+        on, moves, sizes = self._on_all, self._moves, self._sizes
         B, w, y, D = on.whole.B, on.work, on.jumps, on.weights
         trace, size = w.getLocalSize(), len(D)
 
         def lifted() -> Array:  # B_Dᵀ y
             B.multTranspose(y, w)
-            return np.concatenate((w.array_r, np.zeros(size - trace), to_springs @ y.array_r))
+            springs = self._to_springs @ y.array_r if self._bends else moves
+            return np.concatenate((w.array_r, np.zeros(size - trace), springs))
 
         def put_jumps(v: Array) -> None:  # y = B_D v
             w.array[:] = v[:trace]
             B.mult(w, y)
-            y.array[:] += springs @ (moves * v[size:])
+            if self._bends:
+                y.array[:] += self._springs @ (moves * v[size:])
 
         def without_jumps(v: Array) -> Array:  # H v
             put_jumps(v)
@@ -221,7 +228,7 @@ class _OnFace:
     def _solved(self, x: Array) -> Array:
         """Z W_κ⁻¹ Zᵀx on this rank's rows."""
         values = self._face.restricted(x)
-        if self._factor is None and not self._bends:
+        if self._is_identity:
             return values
         contact = self._onto_contact @ values
         solved = contact / (1.0 + self._bent)

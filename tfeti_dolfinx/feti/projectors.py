@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 from mpi4py import MPI
-from scipy.sparse import coo_array, csc_array, csr_array, diags_array, eye_array
+from scipy.sparse import coo_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
 
 from tfeti_dolfinx.common.arrays import TINY, Array
@@ -33,7 +33,7 @@ class Grams:
         self._comm, self._Gt, size = comm, Gt, Gt.shape[1]
         self._always = np.ones(Gt.shape[0], dtype=bool)
         self._always[bounded] = False
-        base = replicated_gram(csr_array(Gt[self._always]), comm).tocoo()
+        base = replicated_gram(Gt[self._always], comm).tocoo()
         # 1. the entries that contact rows reach, on all ranks, and those of the whole
         parts = [(rows, G, _pairs(columns, size)) for rows, columns, G in _blocks(Gt, bounded)]
         own = np.unique(np.concatenate([np.empty(0, np.int64), *(pairs for *_, pairs in parts)]))
@@ -50,8 +50,11 @@ class Grams:
         everything = np.ones(Gt.shape[0], dtype=bool)
         self.whole = self.of_face(Face(everything, np.full(len(everything), Status.FREE)))
 
-    def of_face(self, face: Face) -> csr_array:
-        """GZ(GZ)ᵀ, shape ``(r, r)``; of all rows anew where a set constrains any other row."""
+    def of_face(self, face: Face, damping: float = 0.0) -> csr_array:
+        """GZ(GZ)ᵀ + damping·GGᵀ, shape ``(r, r)``.
+
+        Of all rows anew where a set constrains others than ``bounded``.
+        """
         size = self._Gt.shape[1]
         if not size:
             return csr_array((0, 0))
@@ -62,18 +65,19 @@ class Grams:
         sums[-2:] = np.any(face.constrained[self._always]), len(face.tangents)
         *_, others, tangents = summed(self._comm, sums)
         if others:
-            return replicated_gram(csr_array(face.Z.T @ self._Gt), self._comm)
-        data = np.array(self._base)
+            gram = replicated_gram(face.Z.T @ self._Gt, self._comm)
+            return gram + damping * self.whole if damping else gram
+        data = self._base + damping * self.whole.data if damping else np.array(self._base)
         data[self._reached] += sums[:-2]
         gram = csr_array((data, *self._table), shape=(size, size))
         if tangents:
-            gram = gram + replicated_gram(csr_array(face.T.T @ self._Gt), self._comm)
+            gram = gram + replicated_gram(face.T.T @ self._Gt, self._comm)
         return gram
 
 
 def _blocks(Gt: csr_array, some: Array) -> Iterator[tuple[Array, Array, Array]]:
     """Rows with the same coordinates: they, these coordinates and their entries, dense."""
-    own = csr_array(Gt[some])
+    own = Gt[some]
     own.eliminate_zeros()
     own.sort_indices()
     counts = np.diff(own.indptr)
@@ -94,7 +98,7 @@ def _pairs(columns: Array, size: int) -> Array:
 
 def replicated_gram(Gt: csr_array, comm: MPI.Intracomm) -> csr_array:
     """GGᵀ from all ranks' rows of Gᵀ, shape ``(r, r)``; on all ranks. Collective."""
-    return replicated(csr_array(Gt.T @ Gt), comm)
+    return replicated(Gt.T @ Gt, comm)
 
 
 def replicated(part: csr_array, comm: MPI.Intracomm) -> csr_array:
@@ -184,7 +188,7 @@ def _scaled(A: csr_array, scale: Array, pinned: Array) -> csr_array:
     """SAS + diag(pinned)."""
     data = A.data * np.repeat(scale, np.diff(A.indptr)) * scale[A.indices]
     scaled = csr_array((data, A.indices, A.indptr), shape=A.shape)
-    return csr_array(scaled + diags_array(pinned)) if np.any(pinned) else scaled
+    return scaled + diags_array(pinned) if np.any(pinned) else scaled
 
 
 def _without(null: csr_array, x: Array) -> Array:
@@ -217,18 +221,18 @@ class ObliqueProjectors:
         comm: MPI.Intracomm,
     ) -> None:
         self._comm, self._face, self._Gt, self._null = comm, face, Gt, null
-        following = csr_array(C.T @ Gt)
-        self._G = csr_array(Gt + following).T
-        led = np.flatnonzero(face.free & (np.diff(following.indptr) > 0))
-        part = csr_array(following[led].T @ Gt[led])
-        A, N = grams.of_face(face), replicated(part, comm)
+        following = C.T.tocsr() @ Gt
+        self._G = (Gt + following).T
+        led = following.data * np.repeat(face.free, np.diff(following.indptr))
+        led = csr_array((led, following.indices, following.indptr), shape=Gt.shape)
+        A, N = grams.of_face(face), replicated(led.T @ Gt, comm)
         self._scale, pinned = _scaling(A, null)
         self._factor = None
         with raised_on_all_ranks(comm):
             try:
                 if Gt.shape[1]:
-                    H = _scaled(csr_array(A + N), self._scale, pinned)
-                    self._factor = splu(csc_array(H))
+                    H = _scaled(A + N, self._scale, pinned)
+                    self._factor = splu(H.tocsc())
             except RuntimeError as error:
                 raise FactorError(f"the coarse problem of a face with friction: {error}") from error
 

@@ -88,6 +88,7 @@ def regular_matrix(K: Any, R: Array, fixing_dofs: Array) -> Any:
     table = K.indptr + count * np.searchsorted(fixing_dofs, np.arange(len(K.indptr)))
     result = csr_array((np.insert(K.data, at, added.ravel()), columns, table), shape=K.shape)
     result.sum_duplicates()
+    result.eliminate_zeros()
     return result
 
 
