@@ -52,8 +52,15 @@ def entries_of_rows(A: Any, rows: Array) -> tuple[Array, Array]:
     return np.arange(table[-1]) + np.repeat(A.indptr[rows] - table[:-1], counts), table
 
 
-def submatrix(A: Any, rows: Array, columns: Array) -> csr_array:
+def rows_times(A: Any, factors: Array) -> csr_array:
+    """Return diag(factors) A of a CSR matrix, on the same table."""
+    data = A.data * np.repeat(factors, np.diff(A.indptr))
+    return csr_array((data, A.indices, A.indptr), shape=A.shape)
+
+
+def submatrix(A: Any, rows: Array | slice, columns: Array) -> csr_array:
     """Return A[rows][:, columns] of a CSR matrix, columns ascending."""
+    rows = np.arange(A.shape[0])[rows]
     place = np.full(A.shape[1], -1, dtype=A.indices.dtype)
     place[columns] = np.arange(len(columns))
     entries, table = entries_of_rows(A, rows)

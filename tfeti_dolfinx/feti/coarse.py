@@ -6,9 +6,9 @@ from typing import Any, cast
 
 import numpy as np
 from petsc4py import PETSc
-from scipy.sparse import csr_array, diags_array, hstack
+from scipy.sparse import csr_array, hstack
 
-from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.arrays import Array, rows_times
 from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, chunk_offsets, joined_over
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.projectors import (
@@ -80,20 +80,20 @@ class CoarseSpace(Coarse):
         Gt = transposed_G(B, subdomains.kernel_rows, dimension)
         self.row_size = _sizes(B)
         self.bodies = Bodies(subdomains, self._own.start, dimension)
-        self.J = _without_rounding(diags_array(1.0 / self.row_size) @ Gt @ self.bodies.motions)
+        self.J = _without_rounding(rows_times(Gt, 1.0 / self.row_size) @ self.bodies.motions)
         equalities = np.ones(len(self.row_size), dtype=bool)
         equalities[np.concatenate((bounded, rubbing))] = False
         self.unheld = self.unresisted(equalities, self.bodies.unsprung)
         self.free_motions = self.unresisted(~equalities)
-        both = csr_array(hstack([self.free_motions.alone, self.free_motions.joint]))
+        both = hstack([self.free_motions.alone, self.free_motions.joint], format="csr")
         self.free_basis = bcast_from_root(comm, orthonormal_columns(both))
         # made on one rank: processors that round differently might choose differently
         self._basis = bcast_from_root(
             comm, kernel_basis(self.bodies, self.unheld, self.free_motions)
         )
         self.motions = self._basis.coordinates(self.bodies.motions)
-        Gt = self._basis.rows(Gt, diags_array(self.row_size) @ self.J, equalities)
-        self.null = bcast_from_root(comm, orthonormal_columns(csr_array(self.motions @ both)))
+        Gt = self._basis.rows(Gt, rows_times(self.J, self.row_size), equalities)
+        self.null = bcast_from_root(comm, orthonormal_columns(self.motions @ both))
         self.grams = Grams(Gt, np.flatnonzero(~equalities), comm)
         self.factors = FaceFactors(comm, self.null, prefix)
         factor = self.factors.factor(self.grams.whole, "whole")
@@ -180,14 +180,14 @@ class CoarseSpace(Coarse):
         return cast(Motions, bcast_from_root(self.comm, found))
 
 
-def _without_rounding(J: Any) -> csr_array:
-    """Return the same rows without entries that are only rounding.
+def _without_rounding(J: csr_array) -> csr_array:
+    """Return the same rows, changed in place, without entries that are only rounding.
 
     Points far from the origin have more of it than motions, but all rows that do not only glue act
     on translations with about their size.
     """
-    J = csr_array(J)
-    largest = abs(J).max(axis=1).toarray().ravel()
+    largest: Array = np.zeros(J.shape[0])
+    np.maximum.at(largest, np.repeat(np.arange(len(largest)), np.diff(J.indptr)), np.abs(J.data))
     noise = np.where(largest <= TOLERANCES.gluing, TOLERANCES.gluing, TOLERANCES.no_grip)
     J.data[np.abs(J.data) <= np.repeat(noise, np.diff(J.indptr))] = 0.0
     J.eliminate_zeros()

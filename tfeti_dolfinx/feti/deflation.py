@@ -133,7 +133,8 @@ class SoftModes:
         own = coarse.subdomains.soft_motions()
         Gt, energy = _springs(B, coarse, own)
         sigma = mean_stiffness(coarse.subdomains, weights)
-        squares = summed(self._comm, np.asarray(Gt.multiply(Gt).sum(axis=0)).ravel())
+        squares = np.bincount(Gt.indices, Gt.data**2, minlength=Gt.shape[1]).astype(float)
+        squares = summed(self._comm, squares)
         soft = bcast_from_root(self._comm, np.flatnonzero(energy < sigma * squares))
         if len(soft):
             scale = np.sqrt(np.maximum(energy[soft], PARAMETERS.rounding * sigma * squares[soft]))

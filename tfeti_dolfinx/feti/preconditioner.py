@@ -179,7 +179,8 @@ class _OnFace:
     ) -> None:
         self._on_all, self._face, self._factor = on_all, face, factor
         self._is_identity, self._bends = contact is None, False
-        self._moves = self._sizes = np.zeros(0)
+        self._moves: Array = np.zeros(0)
+        self._sizes: Array = np.zeros(0)
         if contact is not None:
             self._Z_C, self._bent, size = contact
             self._onto_contact, bends = self._Z_C.T.tocsr(), self._bent > 0.0

@@ -10,7 +10,7 @@ from mpi4py import MPI
 from scipy.sparse import coo_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
 
-from tfeti_dolfinx.common.arrays import TINY, Array
+from tfeti_dolfinx.common.arrays import TINY, Array, rows_times
 from tfeti_dolfinx.common.parallel import any_rank, joined_over, summed
 from tfeti_dolfinx.errors import FactorError, raised_on_all_ranks
 from tfeti_dolfinx.feti.rigid_bodies import independent, parts_of_columns
@@ -67,8 +67,10 @@ class Grams:
         if others:
             gram = replicated_gram(face.Z.T @ self._Gt, self._comm)
             return gram + damping * self.whole if damping else gram
-        data = self._base + damping * self.whole.data if damping else np.array(self._base)
+        data = np.array(self._base)
         data[self._reached] += sums[:-2]
+        if damping:
+            data += damping * self.whole.data
         gram = csr_array((data, *self._table), shape=(size, size))
         if tangents:
             gram = gram + replicated_gram(face.T.T @ self._Gt, self._comm)
@@ -186,8 +188,8 @@ def _scaling(A: csr_array, null: csr_array) -> tuple[Array, Array]:
 
 def _scaled(A: csr_array, scale: Array, pinned: Array) -> csr_array:
     """SAS + diag(pinned)."""
-    data = A.data * np.repeat(scale, np.diff(A.indptr)) * scale[A.indices]
-    scaled = csr_array((data, A.indices, A.indptr), shape=A.shape)
+    scaled = rows_times(A, scale)
+    scaled.data *= scale[A.indices]
     return scaled + diags_array(pinned) if np.any(pinned) else scaled
 
 
@@ -223,8 +225,7 @@ class ObliqueProjectors:
         self._comm, self._face, self._Gt, self._null = comm, face, Gt, null
         following = C.T.tocsr() @ Gt
         self._G = (Gt + following).T
-        led = following.data * np.repeat(face.free, np.diff(following.indptr))
-        led = csr_array((led, following.indices, following.indptr), shape=Gt.shape)
+        led = rows_times(following, face.free)
         A, N = grams.of_face(face), replicated(led.T @ Gt, comm)
         self._scale, pinned = _scaling(A, null)
         self._factor = None

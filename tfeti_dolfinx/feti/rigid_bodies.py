@@ -5,23 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from mpi4py import MPI
 from scipy.linalg import qr
 from scipy.sparse import (
-    block_diag,
-    bsr_array,
-    coo_array,
     csc_array,
     csr_array,
-    diags_array,
     hstack,
     vstack,
 )
 from scipy.sparse.csgraph import connected_components
 
-from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.arrays import Array, submatrix
 from tfeti_dolfinx.common.parallel import bcast_from_root
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
@@ -86,12 +83,18 @@ def parts_of_columns(A: csr_array) -> Iterator[tuple[Array, Array, Array]]:
 
 def on_rows(parts: list[tuple[Array, Array]], n: int) -> csr_array:
     """Dense matrices on some of n rows each, maybe none, one beside the other."""
-    columns = [csr_array((n, 0))]
-    for rows, dense in parts:
-        width = dense.shape[1]
-        places = np.repeat(rows, width), np.tile(np.arange(width), len(rows))
-        columns.append(csr_array((dense.ravel(), places), shape=(n, width)))
-    return csr_array(hstack(columns))
+    widths = [dense.shape[1] for _, dense in parts]
+    if not sum(widths):
+        return csr_array((n, 0))
+    starts = np.cumsum([0, *widths])
+    row = np.concatenate([np.repeat(rows, dense.shape[1]) for rows, dense in parts])
+    own = [
+        (len(rows), np.arange(a, b))
+        for (rows, _), (a, b) in zip(parts, pairwise(starts), strict=True)
+    ]
+    column = np.concatenate([np.tile(columns, count) for count, columns in own])
+    values = np.concatenate([dense.ravel() for _, dense in parts])
+    return csr_array((values, (row, column)), shape=(n, int(starts[-1])))
 
 
 def orthonormal_columns(A: csr_array) -> csr_array:
@@ -130,7 +133,7 @@ class Motions:
     @cached_property
     def alone(self) -> csr_array:
         """The motions of single bodies as columns, shape ``(bodies * k, a)``."""
-        return csr_array(block_diagonal(self.single)[:, np.flatnonzero(self.free.ravel())])
+        return submatrix(block_diagonal(self.single), slice(None), np.flatnonzero(self.free))
 
     @property
     def count(self) -> int:
@@ -141,8 +144,8 @@ class Motions:
 def block_diagonal(blocks: Array) -> csr_array:
     """Square blocks of shape ``(n, k, k)`` as one sparse matrix."""
     n, k = blocks.shape[:2]
-    index = np.arange(n + 1)
-    return csr_array(bsr_array((blocks, index[:-1], index), shape=(n * k, n * k)))
+    columns = np.repeat(np.arange(n * k).reshape(n, k), k, axis=0).ravel()
+    return csr_array((blocks.ravel(), columns, k * np.arange(n * k + 1)), shape=(n * k, n * k))
 
 
 def diagonal_blocks(A: csr_array, k: int) -> Array:
@@ -284,7 +287,7 @@ class Bodies:
         shares = np.swapaxes(W, 1, 2) @ subdomains.modes_outside() @ W
         self.unsprung = bcast_from_root(comm, unsprung(shares))
         inside = _replicated(subdomains.modes_in_kernel, first, dimension, comm)
-        self.motions = csr_array(inside @ block_diagonal(self.frames))
+        self.motions = inside @ block_diagonal(self.frames)
         self.update_load()
 
     def update_load(self) -> None:
@@ -319,7 +322,7 @@ def _replicated(local: csr_array, first: int, dimension: int, comm: MPI.Intracom
     row, column = entries.coords
     every = ((first + row).astype(np.int64), column.astype(np.int64), entries.data)
     rows, columns, values = (np.concatenate(comm.allgather(part)) for part in every)
-    return csr_array(coo_array((values, (rows, columns)), shape=(dimension, local.shape[1])))
+    return csr_array((values, (rows, columns)), shape=(dimension, local.shape[1]))
 
 
 # --- Basis of the kernel with the bodies' motions ---------------------------------------------
@@ -366,14 +369,16 @@ class KernelBasis:
     def coordinates(self, X: csr_array) -> csr_array:
         """T⁻¹X."""
         first = self.inverse @ X[self.pins]
-        return csr_array(vstack([first, X[self.rest] - self.motions[self.rest] @ first]))
+        return vstack([first, X[self.rest] - self.motions[self.rest] @ first], format="csr")
 
     def rows(self, Gt: csr_array, J: csr_array, equalities: Array) -> csr_array:
         """Gᵀ T from Gᵀ and its rows J on motions of bodies, what is known to be zero left out."""
-        of_equalities = diags_array(equalities.astype(float)) @ J
-        GtM = of_equalities @ self.combined.multiply(~self.unheld)
-        GtM = GtM + (J - of_equalities) @ self.combined.multiply(~self.free)
-        return csr_array(hstack([GtM, csc_array(Gt)[:, self.rest]]))
+        GtM = J @ self.combined
+        of_equalities = np.repeat(equalities, np.diff(GtM.indptr))
+        zero = np.where(of_equalities, self.unheld[GtM.indices], self.free[GtM.indices])
+        GtM.data[zero] = 0.0
+        GtM.eliminate_zeros()
+        return hstack([GtM, submatrix(Gt, slice(None), self.rest)], format="csr")
 
 
 def kernel_basis(bodies: Bodies, unheld: Motions, free: Motions) -> KernelBasis:
@@ -386,14 +391,14 @@ def kernel_basis(bodies: Bodies, unheld: Motions, free: Motions) -> KernelBasis:
     # eigenvalues: free −2, held by contact −1, by equality rows 0, by springs 3
     values, V = np.linalg.eigh(3.0 * sprung - _projector(unheld) - _projector(free))
     kept = values < 1.5
-    size = diagonal_blocks(csr_array(bodies.motions.T @ bodies.motions), bodies.k)
+    size = diagonal_blocks(bodies.motions.T @ bodies.motions, bodies.k)
     gram = np.swapaxes(V, 1, 2) @ size @ V
     gram = np.where(kept[:, :, None] & kept[:, None, :], gram, np.eye(bodies.k))
     directions = V @ np.linalg.inv(np.swapaxes(np.linalg.cholesky(gram), 1, 2))
-    combined = csr_array(block_diagonal(directions)[:, np.flatnonzero(kept.ravel())])
-    motions = csr_array(bodies.motions @ combined)
+    combined = submatrix(block_diagonal(directions), slice(None), np.flatnonzero(kept))
+    motions = bodies.motions @ combined
     body = np.repeat(np.arange(bodies.count), kept.sum(axis=1))
-    pins, inverse = _pins(csc_array(motions), body)
+    pins, inverse = _pins(motions.tocsc(), body)
     rest = np.setdiff1d(np.arange(motions.shape[0]), pins)
     unheld_of, free_of = values[kept] < -0.5, values[kept] < -1.5
     return KernelBasis(combined, motions, pins, rest, inverse, unheld_of, free_of)
@@ -411,13 +416,15 @@ def _pins(motions: csc_array, body: Array) -> tuple[Array, csr_array]:
         return np.empty(0, dtype=np.int64), csr_array((0, 0))
     pins, inverses = [], []
     for own in np.split(np.arange(len(body)), np.flatnonzero(np.diff(body)) + 1):
-        part = csr_array(motions[:, own])
-        rows = np.flatnonzero(np.diff(part.indptr))
-        dense = part[rows].toarray()
+        entries = slice(motions.indptr[own[0]], motions.indptr[own[-1] + 1])
+        rows, row = np.unique(motions.indices[entries], return_inverse=True)
+        dense = np.zeros((len(rows), len(own)))
+        dense[row, np.repeat(own - own[0], np.diff(motions.indptr)[own])] = motions.data[entries]
         chosen = independent(dense)
         pins.append(rows[chosen])
-        inverses.append(np.linalg.inv(dense[chosen]))
-    return np.concatenate(pins), csr_array(block_diag([csr_array(X) for X in inverses]))
+        inverses.append((own, np.linalg.inv(dense[chosen])))
+    inverse = on_rows(inverses, len(body))
+    return np.concatenate(pins), inverse
 
 
 # --- Names of motions in messages -------------------------------------------------------------

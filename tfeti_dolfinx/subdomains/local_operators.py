@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 from scipy.linalg.blas import dsymm, dsymv
-from scipy.sparse import block_diag, csr_array
+from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import Array, parts_of
 from tfeti_dolfinx.subdomains.block import Block, OperatorKind
@@ -150,9 +150,13 @@ def _stiffness_group(blocks: Sequence[tuple[SparseBlock, slice]]) -> Group:
     traces = {id(block.traced): block.traced for block, _ in blocks}.values()
     rows, K_bb = [block.trace_rows for block, _ in blocks], next(iter(traces)).K_bb
     if len(traces) > 1:
-        begins = np.cumsum([0, *(len(row) for row in rows)])[:-1]
-        K_bb = csr_array(block_diag([traced.K_bb for traced in traces], format="csr"))
-        rows = [np.concatenate([a + row for a, row in zip(begins, rows, strict=True)])]
+        begins = np.cumsum([0, *(len(row) for row in rows)])
+        matrices = [traced.K_bb for traced in traces]
+        columns = [a + K.indices for a, K in zip(begins, matrices, strict=False)]
+        table = np.cumsum(np.concatenate([[0], *(np.diff(K.indptr) for K in matrices)]))
+        data = np.concatenate([K.data for K in matrices]), np.concatenate(columns), table
+        K_bb = csr_array(data, shape=(begins[-1],) * 2)
+        rows = [np.concatenate([a + row for a, row in zip(begins, rows, strict=False)])]
     size, parts = K_bb.shape[0], [part for _, part in blocks]
     return Group(
         len(blocks),

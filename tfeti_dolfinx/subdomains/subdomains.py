@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
-from scipy.sparse import block_diag, coo_array, csr_array
+from scipy.sparse import block_diag, csr_array
 
 from tfeti_dolfinx.common.arrays import Array, joined, node_means, parts_of
 from tfeti_dolfinx.errors import raised_on_all_ranks
@@ -339,4 +339,4 @@ def _assembled(
         places.append(np.stack(((row + i).ravel(), (column + j).ravel())))
         values.append(part.ravel())
     row_of, column_of = np.concatenate(places, axis=1)
-    return csr_array(coo_array((joined(values), (row_of, column_of)), shape=shape))
+    return csr_array((joined(values), (row_of, column_of)), shape=shape)
