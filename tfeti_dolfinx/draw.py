@@ -36,6 +36,7 @@ BODIES = ("#8dd3c7", "#fdb462", "#80b1d3", "#fb8072", "#b3de69", "#bebada", "#fc
 OBSTACLE = "grey"
 WIDTH = 0.84  # share of the scene; the scale has the rest
 FEW_CELLS = 3000  # whose edges do not hide the colours
+BEHIND = 1e-3  # of the scene
 CORNER = 30.0  # degrees between facets that meet in an edge
 
 
@@ -164,7 +165,9 @@ def _add_obstacle(plotter: Any, box: Any, distance: Any, flat: bool) -> None:
         inside = image.clip_scalar(scalars="distance", value=0.0, invert=True)
         if inside.n_cells:
             plotter.add_mesh(inside, color="lightgrey", lighting=False, show_scalar_bar=False)
-    surface = image.contour([0.0], scalars="distance")
+    # in 3D a little behind it, else it and a body that lies on it would hide each other in spots
+    behind = 0.0 if flat else BEHIND * float(np.max(box[1] - box[0]))
+    surface = image.contour([-behind], scalars="distance")
     if surface.n_cells:
         line: dict[str, Any] = {"opacity": 0.4}
         if flat:
