@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import linprog
-from scipy.sparse import csr_array, diags_array, hstack, vstack
+from scipy.sparse import csr_array, diags_array, vstack
 from scipy.sparse.csgraph import connected_components
 
-from tfeti_dolfinx.common.arrays import TINY, Array
+from tfeti_dolfinx.common.arrays import TINY, Array, rows_times
 from tfeti_dolfinx.common.parallel import bcast_from_root
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import NoSolutionError, TfetiError, raised_on_all_ranks
@@ -88,22 +88,24 @@ class RigidScene:
         if not scale.any():
             return None
         cones = tuple(factor * M for M in self.cones)
-        given = tuple(csr_array(factor * W @ diags_array(scale)) for W in self.given)
+        given = tuple(factor * W @ diags_array(scale) for W in self.given)
         load, noise = scale * self.load, np.where(scale > 0.0, scale * self.noise, 1.0)
-        cuts = csr_array((0, n + 1))
+        # rows of (y, t) as rows of (p, q, t)
+        cuts, own, one = csr_array((0, n + 1)), np.arange(n), np.ones(n)
+        places = np.concatenate((own, own, [n])), np.concatenate((own, n + own, [2 * n]))
+        parts = csr_array((np.concatenate((one, -one, [1.0])), places))
 
         def minimised(cost: Array, upper: float | None, **rest: Any) -> tuple[Array, float]:
             nonlocal cuts
             count, bounds = 2 * n, [(0.0, upper)] * (2 * n) + [(0.0, None)]
             for _ in range(PARAMETERS.max_programs):
-                A = csr_array(hstack([cuts[:, :n], -cuts[:, :n], cuts[:, n:]]))
-                x = minimiser(cost, A, bounds=bounds, **rest)
+                x = minimiser(cost, cuts @ parts, bounds=bounds, **rest)
                 y = x[:n] - x[n : 2 * n]
                 size = max(np.abs(y).max(initial=0.0), 1.0)
                 new = self._violated(cones, given, y / size, float(x[-1]) / size, count)
                 if new.shape[0] == 0:
                     return y, float(cost @ x)
-                cuts, count = csr_array(vstack([cuts, new])), 2 * count
+                cuts, count = vstack([cuts, new], format="csr"), 2 * count
             return np.zeros(n), 0.0
 
         # 1. the most work, less what counts as none: of heavily loaded bodies that would hide a
@@ -122,7 +124,8 @@ class RigidScene:
         """Inverse size of the load on each part that does not meet others; 0: it is rounding."""
         n = len(self.load)
         bodies = csr_array((np.ones(n), (self.body, np.arange(n))))
-        rows = abs(csr_array(vstack([self.normals, self.pressing, *self.cones, *self.given])))
+        all_rows = [self.normals, self.pressing, *self.cones, *self.given]
+        rows = abs(vstack(all_rows, format="csr"))
         links = bodies.T @ bodies + rows.T @ rows
         count, label = connected_components(links, directed=False)
         size = np.zeros(count)
@@ -149,14 +152,15 @@ class RigidScene:
             rows.append(self.pressing[cut])
             for d, M in zip(direction.T, cones, strict=True):
                 rows[-1] = rows[-1] + diags_array(d[cut]) @ M[cut]
-        flat = csr_array(vstack(rows))
-        found = [hstack([flat, csr_array((flat.shape[0], 1))])]
+        flat = vstack(rows, format="csr")
+        flat.resize(flat.shape[0], len(y) + 1)
+        found = [flat]
         if given:
             size, direction = _directions(given, y)
             if size.sum() - t > PARAMETERS.exact:
                 slope = sum(d @ W for d, W in zip(direction.T, given, strict=True))
                 found.append(csr_array(np.append(slope, -1.0)[None, :]))
-        return csr_array(vstack(found))
+        return vstack(found, format="csr")
 
 
 def _directions(rows: Sequence[csr_array], y: Array) -> tuple[Array, Array]:
@@ -240,15 +244,15 @@ def rigid_scene(coarse: CoarseSpace, constraints: Constraints, cones: bool) -> R
     """
     bodies, Z, sets = coarse.bodies, coarse.unheld.alone, constraints.sets
     body = np.repeat(np.arange(bodies.count), coarse.unheld.free.sum(axis=1))
-    J, size = csr_array(coarse.J @ Z), coarse.row_size
+    J, size = coarse.J @ Z, coarse.row_size
     pressed = constraints.pressed if cones else np.empty(0, dtype=np.int64)
     given = np.setdiff1d(np.arange(len(sets.tangents)), pressed)
     above = constraints.pressed_by[pressed]
     over = size[sets.tangents]
     mu = constraints.coefficients * (over / size[constraints.pressed_by][:, None])
     own = (
-        csr_array(J[np.setdiff1d(sets.normals, above)]),
-        csr_array(J[above]),
+        J[np.setdiff1d(sets.normals, above)],
+        J[above],
         _weighted(J, sets.tangents[pressed], mu[pressed]),
         _weighted(J, sets.tangents[given], (constraints.limits * over)[given]),
     )
@@ -260,8 +264,8 @@ def rigid_scene(coarse: CoarseSpace, constraints: Constraints, cones: bool) -> R
         Z.T @ (coarse.motions.T @ coarse.e),
         bodies.negligible[body],
         body,
-        csr_array(vstack(normals)),
-        csr_array(vstack(pressing)),
+        vstack(normals, format="csr"),
+        vstack(pressing, format="csr"),
         _stacked(of_cones),
         _stacked(of_given),
     )
@@ -270,12 +274,12 @@ def rigid_scene(coarse: CoarseSpace, constraints: Constraints, cones: bool) -> R
 def _weighted(J: csr_array, rows: Array, weight: Array) -> list[csr_array]:
     """Return rows of each axis, weighted."""
     pairs = zip(rows.T, weight.T, strict=True)
-    return [csr_array(J[row].multiply(w[:, None])) for row, w in pairs]
+    return [rows_times(J[row], w) for row, w in pairs]
 
 
 def _stacked(ranks: Sequence[list[csr_array]]) -> tuple[csr_array, ...]:
     """Return the matrices of each axis, of all ranks; nothing where no rank has rows."""
-    axes = [csr_array(vstack(axis)) for axis in zip(*ranks, strict=True)]
+    axes = [vstack(axis, format="csr") for axis in zip(*ranks, strict=True)]
     return tuple(axes) if axes and axes[0].shape[0] else ()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 from typing import Any, Literal
 
@@ -214,7 +215,7 @@ class Block:
         """S w, S the Schur complement of K on the trace, shapes ``(t,)``."""
         raise NotImplementedError("apply_schur")
 
-    @property
+    @cached_property
     def modes(self) -> Array:
         """C, the candidate modes of the whole body, shape ``(n, k)``."""
         return candidate_modes(self.x, self.bs, *self._body_frame)
@@ -276,7 +277,7 @@ class RigidBlock(Block):
         self.name, self.bs, n = name, 1, len(load)
         self.x = np.zeros((n, 1))
         self.trace_dofs = np.arange(n)
-        self._modes = np.eye(num_modes)[mode]
+        self.modes = np.eye(num_modes)[mode]
         self._node_shares = np.ones(n)
         self.update(load)
         self.set_stiffness(None)
@@ -284,11 +285,6 @@ class RigidBlock(Block):
     def set_stiffness(self, K: Any) -> None:
         """Take that there is none."""
         self.kernel, self.diagonal = np.eye(len(self.load)), np.zeros(len(self.load))
-
-    @property
-    def modes(self) -> Array:
-        """C, a unit vector for each free motion, 0 for others, shape ``(n, k)``."""
-        return self._modes
 
     def multiply(self, u: Array) -> Array:
         """0."""
