@@ -141,7 +141,9 @@ class SoftModes:
             if not _stands_out(preconditioner, csr_array(Gt[:, soft] / scale), self._comm):
                 soft = soft[:0]
         self.count = len(soft)
-        null = csr_array(vstack([coarse.null, csr_array((self.count, coarse.null.shape[1]))]))
+        null = coarse.null
+        if self.count:
+            null = vstack([null, csr_array((self.count, null.shape[1]))], format="csr")
         self.factors = FaceFactors(self._comm, null, prefix)
         self._grams: Grams | None = None
         if self.count == 0:

@@ -198,8 +198,11 @@ class _OnFace:
 
         def lifted() -> Array:  # B_Dᵀ y
             B.multTranspose(y, w)
-            springs = self._to_springs @ y.array_r if self._bends else moves
-            return np.concatenate((w.array_r, np.zeros(size - trace), springs))
+            out = np.zeros(size + len(moves))
+            out[:trace] = w.array_r
+            if self._bends:
+                out[size:] = self._to_springs @ y.array_r
+            return out
 
         def put_jumps(v: Array) -> None:  # y = B_D v
             w.array[:] = v[:trace]
@@ -210,10 +213,14 @@ class _OnFace:
         def without_jumps(v: Array) -> Array:  # H v
             put_jumps(v)
             y.array[:] = self._solved(y.array_r)
-            return np.append(v[:size] / D, v[size:]) - lifted()
+            out = -lifted()
+            out[:size] += v[:size] / D
+            out[size:] += v[size:]
+            return out
 
         def stiff(u: Array) -> Array:  # K u
-            out = np.append(np.empty(size), sizes * u[size:])
+            out = np.empty(len(u))
+            out[size:] = sizes * u[size:]
             on.apply(u[:size], out[:size])
             return out
 

@@ -124,10 +124,9 @@ class RigidScene:
         """Inverse size of the load on each part that does not meet others; 0: it is rounding."""
         n = len(self.load)
         bodies = csr_array((np.ones(n), (self.body, np.arange(n))))
-        all_rows = [self.normals, self.pressing, *self.cones, *self.given]
+        all_rows = [bodies, self.normals, self.pressing, *self.cones, *self.given]
         rows = abs(vstack(all_rows, format="csr"))
-        links = bodies.T @ bodies + rows.T @ rows
-        count, label = connected_components(links, directed=False)
+        count, label = connected_components(rows.T @ rows, directed=False)
         size = np.zeros(count)
         np.maximum.at(size, label, np.where(abs(self.load) > self.noise, abs(self.load), 0.0))
         return np.where(size > 0.0, 1.0 / np.maximum(size, TINY), 0.0)[label]
