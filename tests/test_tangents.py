@@ -92,6 +92,34 @@ def test_a_prescribed_tangent_leaves_a_row_without_entries():
     assert np.all(held.gluing.constraints.c[sets.tangents] == 0.0)
 
 
+@pytest.mark.parametrize(
+    ("cell", "counts"),
+    [("hexahedron", (4, 3)), ("hexahedron", (4, 5)), ("tetrahedron", (5, 4))],
+)
+def test_no_friction_across_a_plane_of_symmetry(cell, counts):
+    """Where both bodies are held across it the rest that other nodes leave has no row.
+
+    Where only the secondary body is held the other one slips there: rows stay.
+    """
+    d = stacked(cell, *counts, 6)
+    dofs = dofs_on(d)
+    records = searched([sided("upper bottom", "lower top", friction=COULOMB)], dofs, d)
+    V = dofs.V.sub(1)
+    upper, lower = (
+        fem.dirichletbc(0.0, fem.locate_dofs_topological(V, 2, d.facets(f"{name} front")), V)
+        for name in ("upper", "lower")
+    )
+    for bcs, kept in (([upper, lower], False), ([upper], True), ([lower], True)):
+        gluing = glue(dofs, prescribe(dofs, bcs), records, 1.0, weights_of(dofs))
+        rows = gluing.tangents
+        on_plane = np.abs(group_points(dofs)[records.group[rows.condition], 1]) < 1e-9
+        assert d.comm.allreduce(int(on_plane.sum())) > 2
+        along_y = np.abs(records.tangents[rows.condition, :, 1]) > 0.5
+        assert np.all(rows.moves[along_y & on_plane[:, None]] == kept)
+        assert np.all(rows.moves[~along_y | ~on_plane[:, None]])
+        gluing.constraints.destroy()
+
+
 def test_prescribed_values_slip():
     """Where rows see other nodes too, the slip of what is prescribed goes to their right sides."""
     d = stacked("hexahedron", 2, 3, 4)

@@ -51,6 +51,22 @@ class RowBuilder:
         )
         return after, after > TOLERANCES.nothing_left**2 * before
 
+    def free_share(self, axis: int) -> Array:
+        """Return the share of Σ_j |a_ij| along an axis that is not prescribed, shape ``(n,)``.
+
+        Rigid bodies with free motions count. It does not depend on stiffnesses.
+        """
+        records, rigid = self.records, self._rigid
+        before, after = (
+            sum_rows(records.condition, np.linalg.norm(a, axis=1), len(records))
+            for a in (records.coefficients(axis), self._free(axis))
+        )
+        if rigid is not None:
+            along = np.abs(self._along(axis))
+            np.add.at(before, rigid.condition, along)
+            np.add.at(after, rigid.condition, along)
+        return np.asarray(after / np.maximum(before, TINY))
+
     def rows(self, axis: int, condition: Array, scale: Array) -> Rows:
         """Return a row for each of these conditions along an axis, times its scale."""
         records, dofs = self.records, self._dofs
@@ -72,14 +88,19 @@ class RowBuilder:
         if rigid is None:
             return of_nodes.without_zeros()
         of = np.flatnonzero(place[rigid.condition] >= 0)
-        row, normal = place[rigid.condition[of]], records.frame[rigid.condition[of], axis]
-        along = np.sum(normal * rigid.direction[of], axis=1)
+        row, along = place[rigid.condition[of]], self._along(axis)[of]
         return Rows(
             group=of_nodes.group,
             row=np.concatenate((of_nodes.row, row)),
             column=np.append(of_nodes.column, dofs.offsets[-1] * dofs.bs + rigid.unknown[of]),
             value=np.append(of_nodes.value, along * scale[row]),
         ).without_zeros()
+
+    def _along(self, axis: int) -> Array:
+        """Coefficients of the unknowns of rigid bodies along an axis of the frames."""
+        assert self._rigid is not None
+        frame = self.records.frame[self._rigid.condition, axis]
+        return np.asarray(np.sum(frame * self._rigid.direction, axis=1))
 
     def _free(self, axis: int) -> Array:
         """Coefficients along an axis of the frames, 0 at prescribed components."""
@@ -126,8 +147,9 @@ class TangentRows:
         condition: Condition of each point of ``RowSets.tangents``, shape ``(t,)``.
         scale: The s_i of the normal row of the same condition, shape ``(t,)``; where prescribed
             components leave none, one that gives the longer tangential row unit norm.
-        moves: Whether anything of a row is left by prescribed components; rows without entries
-            stay, so that a disc stays a disc, shape ``(t, gdim - 1)``.
+        moves: Whether prescribed components leave enough of a row
+            (``RowTolerances.little_left``); rows without entries stay, so that a disc stays a
+            disc, shape ``(t, gdim - 1)``.
         normal: Under Coulomb's law the normal row of the same condition, as a position in
             ``RowSets.normals``, else −1, shape ``(t,)``.
     """
@@ -170,6 +192,8 @@ def tangent_rows(
         moves = np.empty((0, count), dtype=bool)
         return Rows(none, none, none, number), TangentRows(none, number, moves, none)
     squares, left = np.array([builder.left(1 + k) for k in range(count)]).transpose(1, 2, 0)
+    share = np.array([builder.free_share(1 + k) for k in range(count)]).T
+    left = left * (share > TOLERANCES.little_left)
     of_normal, row = np.zeros(len(records)), np.full(len(records), -1)
     of_normal[normals.condition] = normals.scale
     row[normals.condition] = np.arange(len(normals.condition))

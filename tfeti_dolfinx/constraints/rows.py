@@ -22,12 +22,17 @@ class RowTolerances:
         agreement: Values that conditions prescribe at a node differ by less, relative to all.
         nothing_left: Of a row's norm: if prescribed components leave less, rounding of the normal
             has made it (ε|x|/h of a facet of size h at x), and the row is dropped.
+        little_left: Of Σ_j |a_ij| of a tangential row: if prescribed components leave less, it is
+            dropped. On a plane of symmetry, where nothing slips across, neighbours that do not
+            match leave a rest that hardly moves but would take friction; a body that is free
+            leaves a half.
         overlap: Overlap, over the scene's length, that rounding of gaps and prescribed values may
             leave.
     """
 
     agreement: float = 1e-10
     nothing_left: float = 1e-6
+    little_left: float = 0.25
     overlap: float = 1e-10
 
 
