@@ -1,0 +1,114 @@
+"""CalculiX: face-to-face penalty contact with a block whose nodes are all fixed.
+
+    benchmarks/peers/run python3 benchmarks/peers/calculix_hertz.py MESH.npz FILE.json [K]
+
+K times E/a is the slope of pressure over overclosure. Plane strain, which CalculiX makes of one
+layer of solid elements; linear geometry, one increment, SPOOLES. The block overlaps where the
+surfaces will touch, so that the body is held. The deck stands beside FILE.json, as FILE.inp.
+"""
+
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+from judged import best, length, write
+from scipy.spatial import cKDTree
+
+FACE = np.array([2, 3, 1])  # CalculiX' face opposite of each corner
+WIDE = 4.0  # half width of the block over a
+
+
+def rows(table):
+    """Lines of numbers between commas."""
+    return "\n".join(", ".join(map(str, row)) for row in table)
+
+
+def deck(data, slope):
+    """The input of CalculiX."""
+    points, cells = data["points"], data["cells"]
+    n, m = len(points), len(cells)
+    a, R, E, nu = (float(data[name]) for name in ("a", "R", "E", "nu"))
+    up, wide = a**2 / (2 * R), WIDE * a
+    block = [(-wide, up - a), (wide, up - a), (wide, up), (-wide, up)]
+    tags, faces = np.arange(n + 1, n + 5), {}
+    for name in ("contact", "top"):
+        faces[name] = [(cell + 1, FACE[opposite]) for cell, opposite in data[f"{name} cells"]]
+    load = float(data["load"]) / length(data)
+    nodes = enumerate(np.concatenate((points, block)).tolist())
+    return f"""*NODE, NSET=ALL
+{rows((k + 1, f"{x:.12e}", f"{y:.12e}", 0.0) for k, (x, y) in nodes)}
+*ELEMENT, TYPE={"CPE3" if int(data["order"]) == 1 else "CPE6"}, ELSET=BODY
+{rows(np.column_stack((np.arange(1, m + 1), cells + 1)))}
+*ELEMENT, TYPE=CPE4, ELSET=BLOCK
+{rows([[m + 1, *tags]])}
+*SURFACE, NAME=SLAVE, TYPE=ELEMENT
+{rows((cell, f"S{face}") for cell, face in faces["contact"])}
+*SURFACE, NAME=MASTER, TYPE=ELEMENT
+{m + 1}, S3
+*MATERIAL, NAME=STUFF
+*ELASTIC
+{E}, {nu}
+*SOLID SECTION, ELSET=BODY, MATERIAL=STUFF
+1.
+*SOLID SECTION, ELSET=BLOCK, MATERIAL=STUFF
+1.
+*SURFACE INTERACTION, NAME=TOUCH
+*SURFACE BEHAVIOR, PRESSURE-OVERCLOSURE=LINEAR
+{slope * E / a:.6e}, 0.
+*CONTACT PAIR, INTERACTION=TOUCH, TYPE=SURFACE TO SURFACE
+SLAVE, MASTER
+*BOUNDARY
+{rows((node, 1, 2, 0.0) for node in tags)}
+{rows((node, 1, 1, 0.0) for node in np.unique(data["axis"]) + 1)}
+*STEP, INC=100
+*STATIC, SOLVER=SPOOLES
+1., 1.
+*DLOAD
+{rows((cell, f"P{face}", f"{load:.12e}") for cell, face in faces["top"])}
+*CONTACT FILE
+CDIS, CSTR
+*END STEP
+"""
+
+
+def solved(job):
+    """Run CalculiX on a deck; what it says."""
+    done = subprocess.run(["ccx", job.name], cwd=job.parent, capture_output=True, text=True)
+    if "Job finished" not in done.stdout:
+        raise RuntimeError(done.stdout[-2000:] + done.stderr[-500:])
+    return done.stdout
+
+
+def on_contact(data, file):
+    """Places of the contact surface and pressures there, the mean of both layers' nodes."""
+    places, pressure, block = {}, {}, None
+    for line in file.read_text().splitlines():
+        if line.startswith("    2C"):
+            block = "nodes"
+        elif line.startswith((" -4", " -3")):
+            block = line.split()[1] if line.startswith(" -4") else None
+        elif line.startswith(" -1") and block in ("nodes", "CONTACT"):
+            values = [float(line[k : k + 12]) for k in range(13, len(line.rstrip()), 12)]
+            into, value = (places, values[:2]) if block == "nodes" else (pressure, values[3])
+            into[int(line[3:13])] = value
+    x, nodes = data["points"], np.unique(data["contact"])
+    _, node = cKDTree(x).query([places[k] for k in pressure])
+    total = np.bincount(node, list(pressure.values()), len(x))
+    return x[nodes, 0], (total / np.maximum(np.bincount(node, minlength=len(x)), 1))[nodes]
+
+
+def main(argv):
+    """Write the deck, run CalculiX, and write the pressure with what it took."""
+    data, job = np.load(argv[0]), Path(argv[1]).with_suffix("")
+    job.with_suffix(".inp").write_text(deck(data, float(argv[2]) if len(argv) > 2 else 1e3))
+    run = best(lambda: solved(job), resource.RUSAGE_CHILDREN)
+    steps = run["found"].count(" iteration ")
+    run["found"] = on_contact(data, job.with_suffix(".frd"))
+    version = subprocess.run(["ccx", "-v"], capture_output=True, text=True).stdout.split()[-1]
+    write(argv[1], f"CalculiX {version}", run, data["points"].size, steps)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,63 @@
+"""What other programs are given and how they are judged; none of them has to be there."""
+
+import importlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.error_scenes import SCENES
+from benchmarks.peers import compare, mesh_file
+
+PEERS = Path(__file__).resolve().parents[1] / "benchmarks" / "peers"
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_meshes_and_decks_are_those_of_the_scene(serial_only, tmp_path, monkeypatch, order):
+    monkeypatch.syspath_prepend(str(PEERS))
+    calculix = importlib.import_module("calculix_hertz")
+    mesh_file.main(["4", str(order), str(tmp_path / "mesh.npz")])
+    data = np.load(tmp_path / "mesh.npz")
+    x, cells = data["points"], data["cells"]
+    assert np.allclose(np.linalg.norm(x[data["contact"]] - [0.0, 1.0], axis=2), 1.0, atol=1e-9)
+    assert np.allclose(x[data["top"], 1], 1.0)
+    assert np.allclose(x[data["axis"], 0], 0.0)
+    for name in ("contact", "top"):
+        cell, opposite = data[f"{name} cells"].T
+        facets = np.column_stack((data[name][:, :2], cells[cell, opposite]))
+        assert np.array_equal(np.sort(facets, axis=1), np.sort(cells[cell, :3], axis=1))
+    deck = calculix.deck(data, 1e3)
+    loads = [line.split(",") for line in deck.split("*DLOAD\n")[1].splitlines() if ", P" in line]
+    total = float(loads[0][2]) * calculix.length(data)
+    assert len(loads) == len(data["top"])
+    assert total == pytest.approx(float(data["load"]))
+    assert deck.count("\n*ELEMENT") == 2
+
+
+def test_pressures_are_judged_at_equal_errors(serial_only, tmp_path):
+    """A program with the closed form's pressure, another with a tenth more of it on fine meshes."""
+    scene, folder = SCENES["half cylinder"](), tmp_path / "peers"
+    folder.mkdir()
+    x = np.linspace(-0.06, 0.06, 4001)
+    made = {"unknowns": 1, "F": 1, "steps": 1, "MB": 1.0}
+
+    def put(name, content):
+        (folder / f"{name}.json").write_text(json.dumps({**made, **content}))
+
+    def ours(seconds, factor):
+        return {"rows": [{**made, "seconds": seconds, "profile": (factor * scene.exact).tolist()}]}
+
+    put("reference", ours(1.0, 1.0))
+    exact = np.interp(x, scene.samples.points[:, 0], scene.exact)
+    for size, error in ((6, 0.08), (12, 0.001)):
+        put(f"1_{size}_ours", ours(size / 6, 1.0 + error))
+        peer = {"program": "Peer", "seconds": 5.0 * size / 6, "points": x.tolist()}
+        put(f"1_{size}_peer", {**peer, "values": (exact * (1.0 + error)).tolist()})
+    put("2_6_peer", {"failed": "no convergence"})
+    found = compare.write(folder)
+    rows, equal = found["half cylinder"], found["half cylinder, seconds to an error"]
+    assert [row["program"] for row in rows] == [compare.NAME] * 2 + ["Peer"] * 2
+    assert [row["pressure"] for row in rows] == pytest.approx([0.08, 0.001] * 2, rel=0.02)
+    assert equal[1]["1.0%"] == pytest.approx(5.0 * equal[0]["1.0%"], rel=0.01)
+    assert (tmp_path / "peers.png").read_bytes().startswith(b"\x89PNG")
