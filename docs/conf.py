@@ -71,16 +71,18 @@ napoleon_numpy_docstring = False
 napoleon_use_ivar = True
 
 html_theme = "pydata_sphinx_theme"
-html_title = f"tfeti_dolfinx {release}"
+html_title = project
 html_theme_options = {
     "show_toc_level": 2,
     "navbar_align": "left",
-    "header_links_before_dropdown": 8,
+    "header_links_before_dropdown": 7,
     "show_nav_level": 2,
 }
 html_show_sourcelink = False
 html_static_path = ["static"]
 html_css_files = ["site.css"]
+# pages without pages below them have nothing to list beside them
+html_sidebars = {f"docs/{page}": [] for page in ("index", "install", "validation", "theory")}
 
 # made here: a page for each demo, and one for each class and function
 EXAMPLES, API = ROOT / "docs" / "examples", ROOT / "docs" / "api"

@@ -7,10 +7,12 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import test_rigid_tools
 from moving import Thrown
 from mpi4py import MPI
 from scenes import displacement
 from sheared import Driven
+from test_nonlinear import plastic
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.steps import checkpoint
@@ -51,11 +53,40 @@ DEATHS = {
 }
 
 
+class Pressed:
+    """A block of J2 material whose upper side goes to and fro."""
+
+    def __init__(self):
+        self.problem, _, self.value = plastic(MPI.COMM_WORLD, petsc_options={"rtol": 1e-11})
+
+    def apply(self, problem, t):
+        self.value.value[-1] = -0.06 * np.sin(0.6 * t)
+
+
+class Tool:
+    """A ball with a force down that is moved along a rough side."""
+
+    def __init__(self):
+        ball = test_rigid_tools.ball(2)
+        way = lambda t: (0.01 * t, 0.0)  # noqa: E731
+        tool = tfeti.RigidBody(ball, displacement=way, force=(0, -0.01), free=("y",), name="ball")
+        contact = tfeti.Obstacle("top", tool, friction=tfeti.Coulomb(0.3))
+        given = {"contacts": [contact], "petsc_options": {"rtol": 1e-12}}
+        self.problem = tfeti.ContactProblem(**test_rigid_tools.block(2), **given)
+
+    def apply(self, problem, t):
+        pass
+
+
 if __name__ == "__main__":
     scene, folder, how = sys.argv[1], Path(sys.argv[2]), sys.argv[3]
     moving = {"thrown": False, "stabilised": True}
     if scene in moving:
         driven = Thrown(weight=0.02, stabilised=moving[scene])
+    elif scene == "coulomb":
+        driven = Driven(friction=tfeti.Coulomb(0.3), rtol=1e-12)
+    elif scene in ("plastic", "tool"):
+        driven = {"plastic": Pressed, "tool": Tool}[scene]()
     else:
         driven = Driven(rough=scene == "rough")
 
@@ -84,4 +115,4 @@ if __name__ == "__main__":
         figures = np.array([[r.time, r.size, r.dissipation] for r in records])
         F = np.array([r.figures["F_multiplications"] for r in records])
         late = np.array([r.figures["late_contact_rows"] for r in records])
-        np.savez(folder / "found.npz", u=u, figures=figures, F=F, late=late, **everywhere)
+        np.savez(folder / "found.npz", x=x, u=u, figures=figures, F=F, late=late, **everywhere)

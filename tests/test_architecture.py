@@ -27,7 +27,7 @@ ROOMS = [
     ["solve"],
     ["extensions"],
     ["solution"],
-    ["report", "draw"],
+    ["report", "draw", "saved_state"],
     ["system", "output", "plot"],
     ["accuracy"],
     ["problem"],

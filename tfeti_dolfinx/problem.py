@@ -43,7 +43,8 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import factor_options, parse_options
 from tfeti_dolfinx.report import Outcome, Report, SolverCounts, largest_over_ranks
-from tfeti_dolfinx.solution import SavedState, Solution, check_state
+from tfeti_dolfinx.saved_state import SavedState, check_state
+from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.coulomb import solve_with_friction
 from tfeti_dolfinx.solve.solver import conclude
 from tfeti_dolfinx.subdomains.build import SubdomainMethod
@@ -503,7 +504,7 @@ class ContactProblem:
         return replace(state, directions=dual.recycled.in_order())
 
     def restore(self, state: SavedState) -> None:
-        """Go on where another run of the same program, on as many ranks, has been. Collective.
+        """Go on where another run of the same program has been. Collective.
 
         Constants, functions, values, gaps and points must be those that the state was found with.
 
@@ -517,15 +518,16 @@ class ContactProblem:
             self._check_state(state)
             given |= {**self._given(), "state": state.common()}
             self._look_at_stress()
+            state = state.on_nodes(self.dofs, self.decomposition)
         system = self._system
         system.tools.restore(state.tools)
         self._take_motion(state)
-        system.know_rows(list(state.reach), state.groups())
+        system.know_rows(list(state.reach), state.groups(self.dofs))
         system.look_for_changes()
         dual = system.make(self._seconds)
         dual.seen = max(dual.seen, float(state.norm))
+        state = state.on_rows(system.gluing)
         gluing = replace(system.gluing, slip=state.slip)
-        state.check_rows(gluing)
         dual.learn()
         if dual.recycled is not None:
             dual.recycled.take(state.directions)
@@ -534,6 +536,7 @@ class ContactProblem:
         self._accepted = (solution, (gluing, state.lam, state.mu, system.inverses))
         self._return()
         self._count_slips_from(solution)
+        self._go_on_from(state)
 
     def _count_slips_from(self, solution: Solution) -> None:
         known = solution.gluing.records, solution.slip_at_end
@@ -562,6 +565,9 @@ class ContactProblem:
 
     def _take_motion(self, state: SavedState) -> None:
         """Move as the bodies of a state do: without inertia not at all."""
+
+    def _go_on_from(self, state: SavedState) -> None:
+        """Take from a state what is known of its rows besides λ: without inertia nothing."""
 
     # ------------------------------------------------------------------- checks
 

@@ -1,10 +1,9 @@
-"""The solution of a problem: fields, contact data, values at points, its saved state."""
+"""The solution of a problem: fields, contact data, values at points."""
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -14,13 +13,11 @@ from mpi4py import MPI
 
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array, sum_rows
-from tfeti_dolfinx.common.parallel import any_rank
-from tfeti_dolfinx.common.validation import checked_type
 from tfeti_dolfinx.constraints.contact_state import ContactState, ContactStatus, Multipliers
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.forces import BodyForces, body_forces, vertex_tractions
 from tfeti_dolfinx.contact.partner import ContactPartner
-from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import plugin
 from tfeti_dolfinx.forms.discretisation import StressRecovery
 from tfeti_dolfinx.forms.fields import (
@@ -33,9 +30,7 @@ from tfeti_dolfinx.forms.fields import (
     von_mises,
 )
 from tfeti_dolfinx.mesh.decomposition import Decomposition
-from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import hat_integrals
-from tfeti_dolfinx.qp.sets import Status, face_of
 
 # --- Displacement and stress at given points --------------------------------------------------
 
@@ -344,172 +339,3 @@ class Solution(ContactState):
         function = from_vertices(self.dofs, values, self._vertices)
         function.name = name
         return function
-
-
-# --- Saved state of a solution ----------------------------------------------------------------
-
-# vectors of all rows that the next solve starts from, if they are known
-STARTS = ("predicted", "image", "predicted_image")
-
-
-@dataclass(frozen=True)
-class SavedState:
-    """An accepted solution on this rank, and what the next solve starts from.
-
-    Attributes:
-        layout: Checksums of this rank's part of the mesh and its unknowns, shape ``(4,)``.
-        u: Displacement in primal order.
-        lam: Multipliers λ of this rank's rows.
-        mu: Multipliers of Gλ = e.
-        norm: Estimate of ‖F‖ that solves have come to, shape ``()``.
-        status: Status of each row, see ``qp.faces``.
-        slip: Where the load step began: tangential v_i of the conditions, ``(n, gdim - 1)``.
-        reach: How far was searched in each contact.
-        contact: Contact of each condition with a row.
-        group: Owned group of each condition with a row.
-        velocity: Velocity in DOLFINx's order, empty without inertia.
-        load: Load likewise.
-        predicted: Multipliers of this rank's rows of the predictor, empty without one.
-        size: That of the step which the matrix was made for, shape ``()``; 0 without inertia.
-        directions: What ``Recycled`` keeps of earlier solves, shape ``(2, m, k)``.
-        internal: Internal variables of a nonlinear problem, one after the other; else empty.
-        tools: Motions of rigid bodies, one after the other.
-        image: Fλ; empty where it is not known.
-        predicted_image: The same of the predictor.
-    """
-
-    layout: Array
-    u: Array
-    lam: Array
-    mu: Array
-    norm: Array
-    status: Array
-    slip: Array
-    reach: Array
-    contact: Array
-    group: Array
-    velocity: Array = field(default_factory=lambda: np.zeros(0))
-    load: Array = field(default_factory=lambda: np.zeros(0))
-    predicted: Array = field(default_factory=lambda: np.zeros(0))
-    size: Array = field(default_factory=lambda: np.zeros(()))
-    directions: Array = field(default_factory=lambda: np.zeros((2, 0, 0)))
-    internal: Array = field(default_factory=lambda: np.zeros(0))
-    tools: Array = field(default_factory=lambda: np.zeros(0))
-    image: Array = field(default_factory=lambda: np.zeros(0))
-    predicted_image: Array = field(default_factory=lambda: np.zeros(0))
-
-    @classmethod
-    def of(cls, solution: Solution, mu: Array, norm: float, reach: list[float]) -> SavedState:
-        """Return the state of a solution."""
-        records, holding = solution.gluing.records, solution.holding
-        held = np.where(holding, Status.STICK, Status.SLIP)
-        return cls(
-            layout=layout_of(solution.dofs, solution.decomposition),
-            u=solution.u,
-            lam=solution.lam,
-            mu=mu,
-            norm=np.array(norm),
-            status=np.where(solution.carrying, held, Status.OPEN),
-            slip=solution.gluing.slip,
-            reach=np.array(reach, dtype=float),
-            contact=records.contact[records.within_reach],
-            group=records.group[records.within_reach],
-        )
-
-    def groups(self) -> list[Array]:
-        """Return the groups whose nodes have rows, of each contact."""
-        return [self.group[self.contact == i] for i in range(len(self.reach))]
-
-    def multipliers(self) -> Multipliers:
-        """Return the multipliers, with a face that only knows what rows do."""
-        return Multipliers(self.lam, face_of(np.zeros(len(self.lam), dtype=bool), self.status))
-
-    def common(self) -> dict[str, Any]:
-        """Return what all ranks' states must share, since searches and solves depend on it."""
-        return {
-            "reach": self.reach.tolist(),
-            "size": float(self.size),
-            "norm": float(self.norm),
-            "mu": [len(self.mu), float(self.mu.sum()), float(np.abs(self.mu).sum())],
-            "number of directions": self.directions.shape[2],
-        }
-
-    def check_rows(self, gluing: Gluing) -> None:
-        """Raise unless rows are those of the state. Collective.
-
-        Raises:
-            InputError: They are others.
-        """
-        records = gluing.records
-        sizes = (len(self.lam), len(self.slip), self.contact.tolist(), self.group.tolist())
-        kept, wide = records.within_reach, self.directions.shape
-        found = (records.contact[kept].tolist(), records.group[kept].tolist())
-        comm = gluing.dofs.comm
-        known = [name for name in STARTS if any_rank(comm, getattr(self, name).size > 0)]
-        with raised_on_all_ranks(comm):
-            rows = gluing.constraints.num_rows
-            if sizes != (rows, len(records), *found) or (wide[2] and wide[:2] != (2, rows)):
-                raise InputError(
-                    "the state has other contact rows than the problem: expected the contacts, "
-                    "conditions and data that it was found with"
-                )
-            for name in known:
-                _check_broken(name, getattr(self, name).shape == (rows,))
-
-
-def layout_of(dofs: TornDofs, decomposition: Decomposition) -> Array:
-    """Checksums of this rank's part of the mesh and its unknowns."""
-    numbers = (
-        decomposition.cell_subdomain,
-        decomposition.original_cells,
-        dofs.dolfinx_node,
-        dofs.group * dofs.bs,
-    )
-    return np.array([zlib.crc32(np.asarray(n, dtype=np.int64).tobytes()) for n in numbers])
-
-
-def check_state(
-    state: SavedState, dofs: TornDofs, decomposition: Decomposition, contacts: int
-) -> None:
-    """Raise unless a state is whole, of this mesh, on these ranks, with so many contacts.
-
-    Not collective: a rank may have a broken one.
-
-    Raises:
-        InputError: It is not.
-    """
-    checked_type(state, SavedState, "state", "what ContactProblem.state returned")
-    for f in fields(state):
-        checked_type(getattr(state, f.name), np.ndarray, f"state: {f.name}", "an array")
-    if not np.array_equal(state.layout, layout_of(dofs, decomposition)):
-        raise InputError(
-            "the state is of another mesh, or of one that was distributed in another way; "
-            "expected the same mesh on as many ranks"
-        )
-    if len(state.reach) != contacts:
-        raise InputError(
-            f"the state is of {len(state.reach)} contacts; expected those of the problem, "
-            f"{contacts}"
-        )
-    rows, unknowns = state.lam.shape, (len(dofs.dolfinx_node) * dofs.bs,)
-    axes = {"lam": 1, "mu": 1, "slip": 2, "reach": 1, "contact": 1, "directions": 3}
-    shapes: dict[str, list[tuple[int, ...]]] = {name: [(0,), rows] for name in STARTS}
-    shapes |= {"u": [unknowns], "status": [rows], "group": [state.contact.shape]}
-    shapes |= {"norm": [()], "size": [()]}
-    sizes = {"contact": contacts, "group": dofs.num_groups}
-    for f in fields(state):
-        values, name = getattr(state, f.name), f.name
-        right = name not in shapes or values.shape in shapes[name]
-        right &= values.ndim == axes.get(name, values.ndim)
-        right &= bool(np.all(np.isfinite(values)))
-        right &= name not in sizes or bool(np.all((values >= 0) & (values < sizes[name])))
-        _check_broken(name, right)
-
-
-def _check_broken(name: str, right: bool) -> None:
-    """Raise an InputError unless an array of a state is right."""
-    if not right:
-        raise InputError(
-            f"the state is broken: {name} has another shape than in any solution of the problem, "
-            "or no numbers; expected what ContactProblem.state returned"
-        )

@@ -25,7 +25,8 @@ from tfeti_dolfinx.nonlinear.state import InternalVariables, LawVariables, NewVa
 from tfeti_dolfinx.nonlinear.tangent import rotation_free_tangent
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.report import COUNTERS, Report, added
-from tfeti_dolfinx.solution import SavedState, Solution
+from tfeti_dolfinx.saved_state import SavedState, labels_of_cells
+from tfeti_dolfinx.solution import Solution
 
 
 @dataclass(frozen=True)
@@ -454,7 +455,10 @@ class NonlinearContactProblem(ContactProblem):
     def state(self) -> SavedState:
         """Return the last accepted solution, with internal variables, for ``restore``."""
         state = super().state()
-        return replace(state, internal=np.concatenate([np.zeros(0), *self._state.values()]))
+        if not self._state.functions:
+            return state
+        cells = labels_of_cells(self.decomposition)
+        return replace(state, cells=cells, internal=self._state.in_cells())
 
     def restore(self, state: SavedState) -> None:
         """Go on where another run of the same program has been.
@@ -472,15 +476,15 @@ class NonlinearContactProblem(ContactProblem):
     def _check_state(self, state: SavedState) -> None:
         super()._check_state(state)
         expected = sum(len(value) for value in self._state.values())
-        if state.internal.shape != (expected,):
+        if state.internal.size != expected or len(state.internal) != len(state.cells):
             raise InputError(
                 f"the state has {state.internal.size} values of internal variables on this rank; "
                 f"expected {expected}, those of state="
             )
 
     def _take_motion(self, state: SavedState) -> None:
-        sizes = [len(value) for value in self._state.values()]
-        self._state.set(np.split(state.internal, np.cumsum(sizes)[:-1]) if sizes else [])
+        if self._state.functions:
+            self._state.set_in_cells(state.internal)
         self._begin = self.dofs.to_dolfinx(state.u)
         self._set(self._begin)
         if self._places is not None:

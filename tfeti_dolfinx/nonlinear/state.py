@@ -77,6 +77,19 @@ class InternalVariables:
         for function, value in zip(self.functions, values, strict=True):
             function.x.array[:] = value
 
+    def in_cells(self) -> Array:
+        """Return the present values, cell by cell, shape ``(cells, w)``."""
+        return np.hstack([_of_cells(function) for function in self.functions])
+
+    def set_in_cells(self, values: Array) -> None:
+        """Set values that ``in_cells`` has returned."""
+        widths = [_of_cells(function).shape[1] for function in self.functions]
+        parts = np.split(values, np.cumsum(widths)[:-1], axis=1)
+        for function, part in zip(self.functions, parts, strict=True):
+            dofmap = function.function_space.dofmap
+            rows = function.x.array.reshape(-1, dofmap.bs)
+            rows[dofmap.list] = part.reshape(*dofmap.list.shape, dofmap.bs)
+
     def commit(self) -> None:
         """Take the values at the end of a step: all are evaluated before any is set. Collective.
 
@@ -95,6 +108,14 @@ class InternalVariables:
                     )
                 found.append(new)
         self.set(found)
+
+
+def _of_cells(function: fem.Function) -> Array:
+    """Return the values of a function whose unknowns belong to one cell each, ``(cells, w)``."""
+    dofmap = function.function_space.dofmap
+    cells, width = dofmap.list.shape
+    rows = function.x.array.reshape(-1, dofmap.bs)[dofmap.list]
+    return np.asarray(rows.reshape(cells, width * dofmap.bs))
 
 
 def _evaluated(value: Any, function: fem.Function) -> Callable[[], Array]:

@@ -9,7 +9,7 @@ import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -17,12 +17,14 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.common.validation import checked_type, named
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.solution import SavedState
+from tfeti_dolfinx.saved_state import SHIFT, SavedState, Table
 
-INDEX, RECORDS, VERSION = "checkpoint.json", "records.jsonl", 4
+INDEX, RECORDS, VERSION = "checkpoint.json", "records.jsonl", 5
 KIND = "checkpoint of tfeti_dolfinx"
+COUNTS = " of subdomains"  # behind the name of an array: how many of its rows are of each
 OF_STEP = re.compile(
     r"(?P<kind>state|fields)_(?P<number>[1-9]\d*)_(?P<rank>0|[1-9]\d*)\.npz(?P<partial>\.partial)?"
 )
@@ -34,8 +36,9 @@ class Index:
 
     Attributes:
         number: How many steps have converged; 0: the folder is taken, nothing is kept yet.
-        ranks: Number of ranks.
+        ranks: The largest number of ranks that have written here.
         states: Checksum of the state's file of each rank.
+        subdomains: Subdomains of each rank, which its file has.
         digest: Describes what the user has given, see ``Checkpoint.write``.
         about: What else is kept.
         kind: The mark of a folder that a checkpoint owns.
@@ -45,6 +48,7 @@ class Index:
     number: int
     ranks: int
     states: list[str] = field(default_factory=list)
+    subdomains: list[list[int]] = field(default_factory=list)
     digest: Any = ""
     about: dict[str, Any] = field(default_factory=dict)
     kind: str = KIND
@@ -75,17 +79,21 @@ class Kept:
         index: The step that counts.
         records: The record of each step.
         fields: Checksums of the fields' files of all ranks, of each step; empty where none are.
+        subdomains: The subdomains that each of them has.
     """
 
     index: Index
     records: list[dict[str, Any]]
     fields: list[list[str]]
+    subdomains: list[list[list[int]]]
 
 
 class Checkpoint:
     """A folder with the last converged step of a series. Creation and all methods are collective.
 
-    Each rank writes its arrays to a file of its own, with the number of the step in its name.
+    Each rank writes its arrays to a file of its own, with the number of the step in its name,
+    subdomain by subdomain. Another number of ranks reads them: each rank the files that have its
+    subdomains.
     The record of the step is a line at the end of ``records.jsonl``, with the checksums of its
     fields. When all are whole, ``checkpoint.json`` takes that number, and the checksums of states:
     it is written aside and renamed, so it names whole files at any time, and a line that is torn
@@ -98,14 +106,18 @@ class Checkpoint:
     Args:
         path: The folder; it may be there if it is empty or has a checkpoint, and nothing else.
         comm: Communicator.
+        subdomains: Those of this rank, ascending.
 
     Raises:
         InputError: The path is no folder for a checkpoint, or its index is damaged.
     """
 
-    def __init__(self, path: str | os.PathLike[str], comm: MPI.Intracomm) -> None:
+    def __init__(
+        self, path: str | os.PathLike[str], comm: MPI.Intracomm, subdomains: Array
+    ) -> None:
         checked_type(path, (str, os.PathLike), "checkpoint", "the name of a folder")
         self.path, self._comm = Path(path), comm
+        self._subdomains = [int(s) for s in subdomains]
         self._index = Index(0, comm.size)  # rank 0's counts
         with raised_on_all_ranks(comm), named(f"checkpoint {self.path}", OSError):
             if comm.rank == 0:
@@ -143,7 +155,7 @@ class Checkpoint:
         """Return what was written last, on all ranks; None if there is nothing. It is held.
 
         What a run that was killed has left beside it is removed. Raise an InputError where it is
-        damaged, or was written on another number of ranks.
+        damaged.
         """
         kept: Kept | None = None
         with raised_on_all_ranks(self._comm), named(f"cannot read {self.path}", OSError):
@@ -152,23 +164,20 @@ class Checkpoint:
                 for file in self.path.iterdir():
                     if self._index.owns(file) and not self._index.counts(file):
                         file.unlink()
+                if self._index.ranks < self._comm.size:  # before files of more ranks come
+                    self._commit(replace(self._index, ranks=self._comm.size))
         return self._comm.bcast(kept, root=0)
 
     def _read(self) -> Kept:
         """Return what rank 0 reads; what lies beyond the lines that count goes."""
         index, file = self._index, self.path / RECORDS
-        if index.ranks != self._comm.size:
-            raise InputError(
-                f"{self.path} was written on {index.ranks} ranks, this run has "
-                f"{self._comm.size}; expected the same number"
-            )
         lines = file.read_bytes().splitlines(keepends=True)[: index.number]
         found = [_unsealed(line, file, INDEX) for line in lines]
         if len(found) < index.number:
             raise damaged(file, INDEX)
         os.truncate(file, sum(len(line) for line in lines))
         fields = [record.pop("fields") for record in found]
-        return Kept(index, found, fields)
+        return Kept(index, found, fields, [record.pop("subdomains") for record in found])
 
     def write(
         self,
@@ -176,7 +185,7 @@ class Checkpoint:
         about: Mapping[str, Any],
         record: Mapping[str, Any],
         state: SavedState,
-        fields: Mapping[str, Array],
+        fields: Table,
         digest: Any = "",
     ) -> None:
         """Keep a step; the one before is replaced when this one is whole.
@@ -195,18 +204,22 @@ class Checkpoint:
         """
         comm, in_state, in_fields = self._comm, "", ""
         with raised_on_all_ranks(comm), named(f"cannot write {self.path}", OSError):
-            in_state = self._save(f"state_{number}_{comm.rank}.npz", asdict(state))
+            in_state = self._save(f"state_{number}_{comm.rank}.npz", state.table())
             if fields:
                 in_fields = self._save(f"fields_{number}_{comm.rank}.npz", fields)
-        checksums = comm.gather((in_state, in_fields), root=0)
+        checksums = comm.gather((in_state, in_fields, self._subdomains), root=0)
         with raised_on_all_ranks(comm), named(f"cannot write {self.path}", OSError):
             if checksums is not None:  # on rank 0
-                states, of_fields = (list(column) for column in zip(*checksums, strict=True))
+                states, of_fields, parts = (list(c) for c in zip(*checksums, strict=True))
                 before = self._index
+                line: dict[str, list[Any]] = {"fields": [], "subdomains": []}
+                if fields:
+                    line = {"fields": of_fields, "subdomains": parts}
                 with (self.path / RECORDS).open("ab") as file:
-                    file.write(_sealed({**record, "fields": of_fields if fields else []}))
+                    file.write(_sealed({**record, **line}))
                     _settle(file)
-                self._commit(Index(number, comm.size, states, digest, dict(about)))
+                ranks = max(before.ranks, comm.size)
+                self._commit(Index(number, ranks, states, parts, digest, dict(about)))
                 for rank in range(len(before.states)):
                     (self.path / f"state_{before.number}_{rank}.npz").unlink(missing_ok=True)
 
@@ -216,9 +229,14 @@ class Checkpoint:
         Raise an InputError where it is not what was written.
         """
         index = kept.index
-        return SavedState(**self._load("state", index.number, index.states, INDEX))
+        table = self._load("state", index.number, index.states, index.subdomains, INDEX)
+        state = SavedState.from_table(table)
+        own = index.subdomains[self._comm.rank] if self._comm.rank < len(index.states) else []
+        same = self._comm.size == len(index.states) and own == self._subdomains
+        moved = any_rank(self._comm, not same)
+        return state.of_other_ranks() if moved else state
 
-    def read_fields(self, kept: Kept, number: int) -> dict[str, Array]:
+    def read_fields(self, kept: Kept, number: int) -> Table:
         """Return the fields of a step, of those that ``read`` found, on this rank.
 
         Raise an InputError where they are not what was written, or there are none.
@@ -229,10 +247,20 @@ class Checkpoint:
                 f"checkpoint {self.path} has no fields of step {number}; expected path= as in "
                 "the run that has written it"
             )
-        return self._load("fields", number, checksums, RECORDS)
+        return self._load("fields", number, checksums, kept.subdomains[number - 1], RECORDS)
 
-    def _save(self, name: str, arrays: Mapping[str, Array]) -> str:
-        """Write arrays; return the checksum of the file's bytes."""
+    def _save(self, name: str, table: Table) -> str:
+        """Write arrays, their rows by labels, and how many each subdomain has.
+
+        Return the checksum of the file's bytes.
+        """
+        arrays: dict[str, Array] = {}
+        for column, (values, labels) in table.items():
+            arrays[column] = values
+            if labels is not None:
+                arrays[column] = values[np.argsort(labels)]
+                place = np.searchsorted(self._subdomains, labels >> SHIFT)
+                arrays[column + COUNTS] = np.bincount(place, minlength=len(self._subdomains))
         with self._replaced(name) as file:
             np.savez(file, **cast(dict[str, Any], arrays))
         return _checksum_in(self.path / name)
@@ -250,15 +278,40 @@ class Checkpoint:
             raise
         os.replace(partial, self.path / name)
 
-    def _load(self, kind: str, number: int, checksums: list[str], where: str) -> dict[str, Array]:
-        """Return arrays of this rank; nothing looks into a file that is not as it was written."""
-        file = self.path / f"{kind}_{number}_{self._comm.rank}.npz"
-        with raised_on_all_ranks(self._comm), named(f"cannot read {file}", OSError):
-            if _checksum_in(file) != checksums[self._comm.rank]:
-                raise damaged(file, where)
-            with np.load(file) as contents:
-                arrays = dict(contents)
-        return arrays
+    def _load(
+        self,
+        kind: str,
+        number: int,
+        checksums: list[str],
+        subdomains: list[list[int]],
+        where: str,
+    ) -> Table:
+        """Return what this rank's subdomains have; rows stand by labels.
+
+        Nothing looks into a file that is not as it was written.
+        """
+        rank_of = {s: rank for rank, own in enumerate(subdomains) for s in own}
+        found: dict[int, dict[str, Array]] = {}
+        with raised_on_all_ranks(self._comm), named(f"cannot read {self.path}", OSError):
+            missing = [s for s in self._subdomains if s not in rank_of]
+            if missing:
+                raise InputError(
+                    f"{self.path} has no subdomain {missing[0]}; expected the mesh in the same "
+                    "subdomains as in the run that has written it"
+                )
+            for rank in {rank_of[s] for s in self._subdomains} or {0}:
+                file = self.path / f"{kind}_{number}_{rank}.npz"
+                with named(f"cannot read {file}", OSError):
+                    if _checksum_in(file) != checksums[rank]:
+                        raise damaged(file, where)
+                    with np.load(file) as contents:
+                        found[rank] = dict(contents)
+        places = [(rank_of[s], subdomains[rank_of[s]].index(s)) for s in self._subdomains]
+        return {
+            name: _joined(name, self._subdomains, places, found)
+            for name in next(iter(found.values()))
+            if not name.endswith(COUNTS)
+        }
 
     def _commit(self, index: Index) -> None:
         """Let an index count."""
@@ -302,6 +355,29 @@ class Checkpoint:
         if found["version"] != VERSION:
             raise InputError(f"{file} is of version {found['version']}; expected {VERSION}")
         return Index(**found)
+
+
+def _joined(
+    name: str,
+    subdomains: list[int],
+    places: list[tuple[int, int]],
+    files: dict[int, dict[str, Array]],
+) -> tuple[Array, Array | None]:
+    """Return an array's rows of subdomains, each from a file and a place in it, and their labels.
+
+    Without counts of rows it is the same in all files.
+    """
+    first = next(iter(files.values()))
+    if name + COUNTS not in first:
+        return first[name], None
+    pieces = {
+        rank: np.split(arrays[name], np.cumsum(arrays[name + COUNTS])[:-1])
+        for rank, arrays in files.items()
+    }
+    rows = [pieces[rank][place] for rank, place in places]
+    labels = [(s << SHIFT) + np.arange(len(part)) for s, part in zip(subdomains, rows, strict=True)]
+    none = np.zeros(0, dtype=np.int64)
+    return np.concatenate([first[name][:0], *rows]), np.concatenate([none, *labels])
 
 
 def damaged(file: Path, where: str) -> InputError:

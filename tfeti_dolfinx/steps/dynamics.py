@@ -29,7 +29,8 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.qp.sets import Bounds, Ellipses, FeasibleSet, Product
-from tfeti_dolfinx.solution import SavedState, Solution
+from tfeti_dolfinx.saved_state import SavedState
+from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.solver import conclude, solve_dual
 from tfeti_dolfinx.subdomains.block import Counters
 from tfeti_dolfinx.subdomains.build import subdomain_data
@@ -352,21 +353,15 @@ class ContactDynamics(ContactProblem):
     def state(self) -> SavedState:
         """Return the last accepted solution as arrays of this rank, for ``restore``."""
         motion, state = self._forms_in_time.motion, super().state()
-        moving = {"velocity": motion.v, "load": motion.load, "size": np.array(motion.size)}
-        state = replace(state, **moving)
+        v, load = self.dofs.to_primal(motion.v), self.dofs.to_primal(motion.load)
+        state = replace(state, velocity=v, load=load, size=np.array(motion.size))
         if self._predictor is None:
             return state
         predicted, image = self._predictor.start
         return replace(state, predicted=predicted, predicted_image=image)
 
-    def restore(self, state: SavedState) -> None:
-        """Go on where another run of the same program has been; the step must have its size.
-
-        Raises:
-            InputError: As ``ContactProblem.restore``, or the state is of a problem without mass.
-        """
-        super().restore(state)
-        self.solution.v = state.velocity
+    def _go_on_from(self, state: SavedState) -> None:
+        self.solution.v = self.dofs.to_dolfinx(state.velocity)
         known = any_rank(self.decomposition.comm, state.predicted.size > 0)
         if self._predictor is not None and known:
             start = state.predicted, state.predicted_image
@@ -380,7 +375,7 @@ class ContactDynamics(ContactProblem):
 
     def _take_motion(self, state: SavedState) -> None:
         forms = self._forms_in_time
-        forms.move(self.dofs.to_dolfinx(state.u), state.velocity, state.load)
+        forms.move(*map(self.dofs.to_dolfinx, (state.u, state.velocity, state.load)))
         forms.motion.towards = forms.motion.free
         if state.size > 0.0:  # equal steps of a series differ by rounding, factors are of the first
             forms.motion.size = float(state.size)

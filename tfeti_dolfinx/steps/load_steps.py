@@ -45,6 +45,14 @@ from tfeti_dolfinx.output import (
     nodal_fields,
 )
 from tfeti_dolfinx.problem import ContactProblem
+from tfeti_dolfinx.saved_state import (
+    Table,
+    arranged,
+    labels_of_function,
+    labels_of_points,
+    rows_of,
+    same_labels,
+)
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.steps.checkpoint import Checkpoint
 
@@ -195,7 +203,7 @@ class Series:
                     f"the step at {time:.6g} of the checkpoint has no field {function.name}; "
                     "expected interior= as in the run that has written it"
                 )
-            function.x.array[:] = values[function.name]
+            function.x.array[:] = values[function.name].ravel()
         self._mesh.geometry.x[:] = values[POINTS]
         try:
             for file in self._growing:
@@ -238,6 +246,31 @@ def fields_of(solution: Solution, interior: bool = False) -> dict[str, Array]:
     fields = nodal_fields(solution) + of_nodes + of_cells
     values = {f.name: np.array(f.x.array) for f in fields}
     return {**values, POINTS: np.array(solution.decomposition.mesh.geometry.x)}
+
+
+def labels_of_fields(solution: Solution, interior: bool = False) -> dict[str, Array]:
+    """Return the labels of the unknowns of these fields, and of the points. Collective."""
+    of_nodes, of_cells = solution.interior.fields if interior else ([], [])
+    d = solution.decomposition
+    fields = nodal_fields(solution) + of_nodes + of_cells
+    return {**{f.name: labels_of_function(f, d) for f in fields}, POINTS: labels_of_points(d)}
+
+
+def in_order(table: Table, labels: dict[str, Array]) -> dict[str, Array]:
+    """Return fields as ``fields_of`` does, from a table whose rows have labels.
+
+    Raise an InputError where a field has other labels.
+    """
+    found = {}
+    for name, (values, kept) in table.items():
+        here = labels.get(name, kept)
+        if kept is None or here is None or not same_labels(kept, here):
+            raise InputError(
+                f"the checkpoint has other unknowns of the field {name} than the problem; expected "
+                "the spaces and the mesh that it was written with"
+            )
+        found[name] = arranged(values, kept, here)
+    return found
 
 
 # --- The series of load steps -----------------------------------------------------------------
@@ -334,7 +367,11 @@ class LoadSteps:
                 raise InputError("interior=True: expected LoadSteps(..., path=) too")
             given |= {"begin": self._times[0], "times": self._times[1:], "path": path}
             given |= {"interior": interior, "checkpoint": checkpoint, "max_halvings": max_halvings}
-        self._checkpoint = None if checkpoint is None else Checkpoint(checkpoint, self._comm)
+        self._checkpoint = (
+            None
+            if checkpoint is None
+            else Checkpoint(checkpoint, self._comm, problem.decomposition.subdomains)
+        )
         self._problem, self._apply = problem, apply
         self._max_halvings, self._progress = int(max_halvings), progress
         self._series: Series | None = None
@@ -345,8 +382,8 @@ class LoadSteps:
 
         Args:
             resume: Go on after the last step of the checkpoint, if there is one: in a new run of
-                the same program, on as many ranks. Times that were not reached yet may be others,
-                reached ones may differ by 1e-6 of the shortest step.
+                the same program, on any number of ranks. Times that were not reached yet may be
+                others, reached ones may differ by 1e-6 of the shortest step.
 
         Returns:
             The records, with those of earlier runs.
@@ -484,7 +521,12 @@ class LoadSteps:
                 about["towards"] = self._times[place.number + 1]
             record, state = asdict(self.records[-1]), self._problem.state()
             digest = self._problem.digest()
-            self._checkpoint.write(len(self.records), about, record, state, fields, digest)
+            labels = labels_of_fields(solution, self._interior) if fields else {}
+            table: Table = {
+                name: (rows_of(values, labels[name]), labels[name])
+                for name, values in fields.items()
+            }
+            self._checkpoint.write(len(self.records), about, record, state, table, digest)
         if self._path is not None:
             if self._series is None:
                 self._series = Series(self._path, solution, self._interior)
@@ -516,8 +558,10 @@ class LoadSteps:
         if self._path is not None:  # a file of ADIOS2 cannot be continued
             self._series = Series(self._path, self._problem.solution, self._interior)
             try:
+                here = labels_of_fields(self._problem.solution, self._interior)
                 for number, record in enumerate(records, start=1):
-                    self._series.write(record.time, checkpoint.read_fields(kept, number))
+                    table = checkpoint.read_fields(kept, number)
+                    self._series.write(record.time, in_order(table, here))
             except TfetiError:  # on all ranks
                 self._series.drop()
                 self._series = None

@@ -1,0 +1,413 @@
+"""Saved states: an accepted solution in arrays that do not know how subdomains lie on ranks."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+from dolfinx import fem
+
+from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.compat import geometry_dofmap
+from tfeti_dolfinx.common.parallel import any_rank
+from tfeti_dolfinx.common.validation import checked_type
+from tfeti_dolfinx.constraints.contact_state import Multipliers
+from tfeti_dolfinx.constraints.gluing import Gluing
+from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
+from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.qp.sets import Status, face_of
+from tfeti_dolfinx.solution import Solution
+
+# --- Labels: the same on any number of ranks --------------------------------------------------
+
+SHIFT = 40  # no subdomain has 2^40 of anything
+
+# an array by name, with the label of each of its rows; None: it is the same on all ranks
+Table = dict[str, tuple[Array, Array | None]]
+
+
+def numbered(subdomain: Array, *keys: Array) -> Array:
+    """Return labels: what belongs to a subdomain is numbered in the order of its keys.
+
+    They are the subdomain times 2^40, plus the number, shape ``(n,)``.
+    """
+    order = np.lexsort((*reversed(keys), subdomain))
+    ascending = subdomain[order].astype(np.int64)
+    labels = np.empty(len(order), dtype=np.int64)
+    number = np.arange(len(order)) - np.searchsorted(ascending, ascending)
+    labels[order] = (ascending << SHIFT) + number
+    return labels
+
+
+def labels_of_cells(decomposition: Decomposition) -> Array:
+    """Return labels of this rank's cells, in the order of the original cells."""
+    return numbered(decomposition.cell_subdomain, decomposition.original_cells)
+
+
+def labels_of_dofs(dofmap: Array, count: int, decomposition: Decomposition) -> Array:
+    """Return labels of what cells share: in the order of the first cell, and of places in it.
+
+    Args:
+        dofmap: Dofs, or points, of each cell, shape ``(cells, k)``; no two subdomains share one.
+        count: Their number on this rank.
+        decomposition: The decomposition.
+    """
+    ids = decomposition.original_cells
+    order = np.argsort(-ids)  # the first cell writes last
+    subdomain, cell, place = np.empty((3, count), dtype=np.int64)
+    subdomain[dofmap[order]] = decomposition.cell_subdomain[order][:, None]
+    cell[dofmap[order]] = ids[order][:, None]
+    place[dofmap[order]] = np.arange(dofmap.shape[1])
+    return numbered(subdomain, cell, place)
+
+
+def labels_of_function(f: fem.Function, decomposition: Decomposition) -> Array:
+    """Return labels of the blocks of unknowns of a function on the torn mesh."""
+    V = f.function_space
+    count = len(f.x.array) // V.dofmap.bs
+    return labels_of_dofs(np.asarray(V.dofmap.list), count, decomposition)
+
+
+def labels_of_points(decomposition: Decomposition) -> Array:
+    """Return labels of the points of the torn mesh."""
+    mesh = decomposition.mesh
+    return labels_of_dofs(geometry_dofmap(mesh), len(mesh.geometry.x), decomposition)
+
+
+def labels_of_nodes(dofs: TornDofs, decomposition: Decomposition) -> Array:
+    """Return labels of primal nodes."""
+    cells = dofs.primal_nodes(np.asarray(dofs.V.dofmap.list).ravel())
+    return labels_of_dofs(cells.reshape(dofs.V.dofmap.list.shape), dofs.num_nodes, decomposition)
+
+
+def labels_of_conditions(gluing: Gluing, of_groups: Array) -> Array:
+    """Return labels of conditions, from those of the nodes of owned groups."""
+    group = of_groups[gluing.records.group]
+    return numbered(group >> SHIFT, group, gluing.records.contact)
+
+
+def labels_of_rows(gluing: Gluing, of_groups: Array) -> Array:
+    """Return labels of rows, from those of the nodes of owned groups.
+
+    Rows of a node: equalities as they stand, of each contact that along the normal, and those along
+    the tangents.
+    """
+    dofs, sets, records = gluing.dofs, gluing.constraints.sets, gluing.records
+    copies = dofs.multiplicity[:, None]
+    count = np.sum(np.where(gluing.prescribed.flag, copies, copies - 1), axis=1)
+    labels = np.empty(gluing.constraints.num_rows, dtype=np.int64)
+    group, kind, place = np.empty_like(labels), np.empty_like(labels), np.zeros_like(labels)
+    group[sets.equalities] = np.repeat(of_groups, count)
+    kind[sets.equalities] = -1
+    place[sets.equalities] = np.arange(len(sets.equalities))
+    normal, tangent = gluing.contact.condition, gluing.tangents.condition
+    group[sets.normals] = of_groups[records.group[normal]]
+    kind[sets.normals] = 2 * records.contact[normal]
+    group[sets.tangents] = of_groups[records.group[tangent]][:, None]
+    kind[sets.tangents] = 2 * records.contact[tangent][:, None] + 1
+    place[sets.tangents] = np.arange(sets.tangents.shape[1])
+    labels[:] = numbered(group >> SHIFT, group, kind, place)
+    return labels
+
+
+def labels_of_groups(dofs: TornDofs, of_nodes: Array) -> Array:
+    """Return for owned groups the labels of their first copies, which this rank has."""
+    first = dofs.copies[dofs.copy_offsets[:-1]] - dofs.offsets[dofs.comm.rank]
+    return np.asarray(of_nodes[first])
+
+
+def same_labels(kept: Array, here: Array) -> bool:
+    """Return whether labels are the same, in any order. Not collective."""
+    return np.array_equal(np.sort(kept), np.sort(here))
+
+
+def rows_of(values: Array, labels: Array) -> Array:
+    """Return values, one after the other, as rows for labels; there may be none."""
+    return values.reshape(len(labels), values.size // max(len(labels), 1))
+
+
+def arranged(values: Array, kept: Array, here: Array) -> Array:
+    """Return rows with labels in the order of other ones, which are the same labels."""
+    out = np.empty_like(values)
+    out[np.argsort(here)] = values[np.argsort(kept)]
+    return out
+
+
+# --- Saved state of a solution ----------------------------------------------------------------
+
+# vectors of all rows that the next solve starts from, if they are known
+STARTS = ("predicted", "image", "predicted_image")
+# what the rows of an array are: labels of this name tell them apart
+OF = {
+    **dict.fromkeys(("u", "velocity", "load"), "nodes"),
+    **dict.fromkeys(("lam", "status", "directions", *STARTS), "rows"),
+    **dict.fromkeys(("slip", "contact", "group", "reached"), "conditions"),
+    "internal": "cells",
+    "layout": "subdomains",
+}
+KINDS = ("subdomains", "nodes", "cells", "rows", "conditions")
+
+
+@dataclass(frozen=True)
+class SavedState:
+    """An accepted solution on this rank, and what the next solve starts from.
+
+    Attributes:
+        subdomains: Labels of this rank's subdomains.
+        layout: Checksums of their cells and points in the mesh before it was torn.
+        nodes: Labels of primal nodes.
+        cells: Labels of cells, where there are internal variables; else empty.
+        rows: Labels of rows.
+        conditions: Labels of conditions.
+        u: Displacement in primal order.
+        lam: Multipliers λ of this rank's rows.
+        mu: Multipliers of Gλ = e; empty where they are not known.
+        norm: Estimate of ‖F‖ that solves have come to, shape ``()``.
+        status: Status of each row, see ``qp.faces``.
+        slip: Where the load step began: tangential v_i of the conditions, ``(n, gdim - 1)``.
+        reach: How far was searched in each contact.
+        contact: Contact of each condition.
+        group: Label of the node of each condition.
+        reached: Whether a condition is within reach.
+        velocity: Velocity in primal order, empty without inertia.
+        load: Load likewise.
+        predicted: Multipliers of this rank's rows of the predictor, empty without one.
+        size: That of the step which the matrix was made for, shape ``()``; 0 without inertia.
+        directions: What ``Recycled`` keeps of earlier solves, shape ``(2, m, k)``.
+        internal: Internal variables of a nonlinear problem in each cell, ``(cells, w)``; else
+            empty.
+        tools: Motions of rigid bodies, one after the other.
+        image: Fλ; empty where it is not known.
+        predicted_image: The same of the predictor.
+    """
+
+    subdomains: Array
+    layout: Array
+    nodes: Array
+    rows: Array
+    conditions: Array
+    u: Array
+    lam: Array
+    mu: Array
+    norm: Array
+    status: Array
+    slip: Array
+    reach: Array
+    contact: Array
+    group: Array
+    reached: Array
+    cells: Array = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    velocity: Array = field(default_factory=lambda: np.zeros(0))
+    load: Array = field(default_factory=lambda: np.zeros(0))
+    predicted: Array = field(default_factory=lambda: np.zeros(0))
+    size: Array = field(default_factory=lambda: np.zeros(()))
+    directions: Array = field(default_factory=lambda: np.zeros((2, 0, 0)))
+    internal: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    tools: Array = field(default_factory=lambda: np.zeros(0))
+    image: Array = field(default_factory=lambda: np.zeros(0))
+    predicted_image: Array = field(default_factory=lambda: np.zeros(0))
+
+    @classmethod
+    def of(cls, solution: Solution, mu: Array, norm: float, reach: list[float]) -> SavedState:
+        """Return the state of a solution."""
+        gluing, holding = solution.gluing, solution.holding
+        records, dofs = gluing.records, solution.dofs
+        held = np.where(holding, Status.STICK, Status.SLIP)
+        nodes = labels_of_nodes(dofs, solution.decomposition)
+        of_groups = labels_of_groups(dofs, nodes)
+        return cls(
+            subdomains=solution.decomposition.subdomains.astype(np.int64) << SHIFT,
+            layout=layout_of(solution.decomposition),
+            nodes=nodes,
+            rows=labels_of_rows(gluing, of_groups),
+            conditions=labels_of_conditions(gluing, of_groups),
+            u=solution.u,
+            lam=solution.lam,
+            mu=mu,
+            norm=np.array(norm),
+            status=np.where(solution.carrying, held, Status.OPEN),
+            slip=gluing.slip,
+            reach=np.array(reach, dtype=float),
+            contact=records.contact,
+            group=of_groups[records.group],
+            reached=records.within_reach,
+        )
+
+    @classmethod
+    def from_table(cls, table: Table) -> SavedState:
+        """Return what ``table`` has made a table of, of these or other subdomains."""
+        values = {name: array for name, (array, _) in table.items()}
+        values["directions"] = values["directions"].swapaxes(0, 1)
+        values["u"], values["velocity"], values["load"] = (
+            values[name].reshape(-1) for name in ("u", "velocity", "load")
+        )
+        for name, kind in OF.items():
+            _, labels = table[name]
+            if labels is not None:
+                values[kind] = labels
+        return cls(**values)
+
+    def table(self) -> Table:
+        """Return the arrays with the labels of their rows; those that are empty have none."""
+        found: Table = {}
+        for f in fields(self):
+            values = getattr(self, f.name)
+            if f.name in KINDS:
+                continue
+            if f.name == "directions":
+                values = values.swapaxes(0, 1)
+            if OF.get(f.name) == "nodes" and values.size:
+                values = rows_of(values, self.nodes)
+            labels = getattr(self, OF[f.name]) if f.name in OF else None
+            known = labels is not None and len(labels) == len(values)
+            found[f.name] = (values, labels if known else None)
+        return found
+
+    def of_other_ranks(self) -> SavedState:
+        """Return what counts where subdomains lie on other ranks: F may be another there.
+
+        Its value does not depend on K⁺ only up to Gᵀ.
+        """
+        nothing = np.zeros(0)
+        directions = np.zeros((2, len(self.lam), 0))
+        return replace(
+            self, mu=nothing, image=nothing, predicted_image=nothing, directions=directions
+        )
+
+    def on_nodes(self, dofs: TornDofs, decomposition: Decomposition) -> SavedState:
+        """Return the state with nodes and cells in the order of this rank. Not collective.
+
+        Raises:
+            InputError: It has other ones.
+        """
+        here = {"nodes": labels_of_nodes(dofs, decomposition)}
+        if self.internal.size:
+            here["cells"] = labels_of_cells(decomposition)
+        return self._in_order(here)
+
+    def on_rows(self, gluing: Gluing) -> SavedState:
+        """Return the state with rows and conditions in the order of a problem's. Collective.
+
+        Raises:
+            InputError: It has other ones.
+        """
+        of_groups = labels_of_groups(gluing.dofs, self.nodes)
+        here = {
+            "rows": labels_of_rows(gluing, of_groups),
+            "conditions": labels_of_conditions(gluing, of_groups),
+        }
+        records, comm = gluing.records, gluing.dofs.comm
+        known = [name for name in STARTS if any_rank(comm, getattr(self, name).size > 0)]
+        with raised_on_all_ranks(comm):
+            for name in known:
+                _check_broken(name, len(getattr(self, name)) == len(self.rows))
+            same = all(same_labels(getattr(self, kind), here[kind]) for kind in here)
+            state = self._in_order(here) if same else self
+            found = (state.contact, state.group, state.reached)
+            expected = (records.contact, of_groups[records.group], records.within_reach)
+            if not same or not all(map(np.array_equal, found, expected)):
+                raise InputError(
+                    "the state has other contact rows than the problem: expected the contacts, "
+                    "conditions and data that it was found with"
+                )
+        return state
+
+    def _in_order(self, here: dict[str, Array]) -> SavedState:
+        """Return the state with rows of these kinds in the order of these labels."""
+        changed = dict(here)
+        for name, (values, labels) in self.table().items():
+            if labels is None or OF[name] not in here:
+                continue
+            values = arranged(values, labels, here[OF[name]])
+            values = values.reshape(-1) if OF[name] == "nodes" else values
+            changed[name] = values.swapaxes(0, 1) if name == "directions" else values
+        return replace(self, **changed)
+
+    def groups(self, dofs: TornDofs) -> list[Array]:
+        """Return the owned groups whose nodes have rows, of each contact."""
+        of_groups = labels_of_groups(dofs, self.nodes)
+        order = np.argsort(of_groups)
+        own = order[np.searchsorted(of_groups, self.group, sorter=order)]
+        return [own[self.reached & (self.contact == i)] for i in range(len(self.reach))]
+
+    def multipliers(self) -> Multipliers:
+        """Return the multipliers, with a face that only knows what rows do."""
+        return Multipliers(self.lam, face_of(np.zeros(len(self.lam), dtype=bool), self.status))
+
+    def common(self) -> dict[str, Any]:
+        """Return what all ranks' states must share, since searches and solves depend on it."""
+        return {
+            "reach": self.reach.tolist(),
+            "size": float(self.size),
+            "norm": float(self.norm),
+            "mu": [len(self.mu), float(self.mu.sum()), float(np.abs(self.mu).sum())],
+            "number of directions": self.directions.shape[2],
+        }
+
+
+def layout_of(decomposition: Decomposition) -> Array:
+    """Return a checksum of each subdomain's cells and their points before the mesh was torn."""
+    order = np.lexsort((decomposition.original_cells, decomposition.cell_subdomain))
+    cells = decomposition.original_cells[order]
+    points = decomposition.original_nodes[geometry_dofmap(decomposition.mesh)[order]]
+    both = np.column_stack((cells, points)).astype(np.int64)
+    starts = np.searchsorted(decomposition.cell_subdomain[order], decomposition.subdomains)
+    parts = np.split(both, starts[1:])[: len(starts)]
+    return np.array([zlib.crc32(part.tobytes()) for part in parts], dtype=np.int64)
+
+
+def check_state(
+    state: SavedState, dofs: TornDofs, decomposition: Decomposition, contacts: int
+) -> None:
+    """Raise unless a state is whole, of this mesh, on these ranks, with so many contacts.
+
+    Not collective: a rank may have a broken one.
+
+    Raises:
+        InputError: It is not.
+    """
+    checked_type(state, SavedState, "state", "what ContactProblem.state returned")
+    for f in fields(state):
+        checked_type(getattr(state, f.name), np.ndarray, f"state: {f.name}", "an array")
+    if not np.array_equal(state.layout, layout_of(decomposition)):
+        raise InputError(
+            "the state is of another mesh, or of one that was distributed in another way; "
+            "expected the same mesh in the same subdomains"
+        )
+    if len(state.reach) != contacts:
+        raise InputError(
+            f"the state is of {len(state.reach)} contacts; expected those of the problem, "
+            f"{contacts}"
+        )
+    rows, unknowns = state.lam.shape, (len(dofs.dolfinx_node) * dofs.bs,)
+    conditions = state.conditions.shape
+    axes = {"lam": 1, "mu": 1, "slip": 2, "reach": 1, "contact": 1, "directions": 3}
+    shapes: dict[str, list[tuple[int, ...]]] = {name: [(0,), rows] for name in STARTS}
+    shapes |= {"u": [unknowns], "status": [rows], "rows": [rows], "norm": [()], "size": [()]}
+    shapes |= {name: [conditions] for name in ("contact", "group", "reached")}
+    for f in fields(state):
+        values, name = getattr(state, f.name), f.name
+        right = name not in shapes or values.shape in shapes[name]
+        right &= values.ndim == axes.get(name, values.ndim)
+        right &= bool(np.all(np.isfinite(values)))
+        _check_broken(name, right)
+    _check_broken("slip", len(state.slip) == len(state.conditions))
+    _check_broken(
+        "directions", state.directions.shape[1:] in {(0, 0), (*rows, *state.directions.shape[2:])}
+    )
+    _check_broken("nodes", same_labels(state.nodes, labels_of_nodes(dofs, decomposition)))
+    _check_broken("contact", bool(np.all((state.contact >= 0) & (state.contact < contacts))))
+    own = labels_of_groups(dofs, labels_of_nodes(dofs, decomposition))
+    _check_broken("group", bool(np.all(np.isin(state.group, own))))
+
+
+def _check_broken(name: str, right: bool) -> None:
+    """Raise an InputError unless an array of a state is right."""
+    if not right:
+        raise InputError(
+            f"the state is broken: {name} has another shape than in any solution of the problem, "
+            "or no numbers; expected what ContactProblem.state returned"
+        )
