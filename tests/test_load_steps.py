@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 from sheared import BOUND, Driven, Sheared, tops
 from steps_script import TIMES
 from test_repeated import Repeated
@@ -162,6 +163,27 @@ def test_files_of_a_series(shared_tmp):
     records = steps.run(resume=True)
     assert [r.time for r in records] == TIMES[:4]
     assert number_of_steps(path) == 4
+
+
+def test_a_series_for_pyvista_goes_on(comm, shared_tmp):
+    """Its times, and the last displacement, in one file; earlier steps come from the checkpoint."""
+    pyvista = pytest.importorskip("pyvista")
+    path, folder = shared_tmp / "series.pvd", shared_tmp / "checkpoint"
+    for number in (2, 3):
+        driven = Driven(n=3)
+        steps = tfeti.LoadSteps(
+            driven.problem, driven.apply, TIMES[:number], path=path, checkpoint=folder
+        )
+        steps.run(resume=True)
+    comm.barrier()
+    reader = pyvista.get_reader(path)
+    assert reader.time_values == TIMES[:3]
+    reader.set_active_time_value(TIMES[2])
+    found = reader.read()[0]["displacement"]
+    largest = comm.allreduce(np.abs(driven.problem.u.x.array).max(initial=0.0), op=MPI.MAX)
+    assert np.isclose(np.abs(found).max(), largest, rtol=1e-12)
+    parts = [f.name for f in shared_tmp.iterdir() if f.suffix in (".vtu", ".pvtu")]
+    assert len(parts) == 3 * (comm.size + 1)
 
 
 def run(ranks, scene, folder, how):

@@ -4,11 +4,12 @@ import dolfinx
 import numpy as np
 import pytest
 from full_disk import full, left_in
+from mpi4py import MPI
 from scenes import curved_obstacle, decomposed, problem
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx import InputError, TfetiError, draw
-from tfeti_dolfinx.output import cell_fields, nodal_fields, write_vtx, write_xdmf
+from tfeti_dolfinx.output import cell_fields, nodal_fields, write_pvd, write_vtx, write_xdmf
 from tfeti_dolfinx.plot import check_screen, plot_deformed, plot_pressure
 
 
@@ -92,6 +93,22 @@ def test_xdmf_appears_whole(solution, comm, shared_tmp):
     assert not list(shared_tmp.glob(".*"))
 
 
+def test_pvd_appears_whole(solution, comm, shared_tmp):
+    pyvista = pytest.importorskip("pyvista")
+    path = shared_tmp / f"out{solution.dofs.bs}.pvd"
+    for _ in range(2):  # the second time it replaces the first
+        files = write_pvd(path, solution, interior=True)
+    comm.barrier()
+    assert set(files) == set(shared_tmp.iterdir())
+    grid = pyvista.get_reader(path).read()[0]
+    names = {f.name for f in nodal_fields(solution)} | {"interior_displacement"}
+    assert names <= set(grid.point_data)
+    assert {"subdomain", "body", "material", "interior_stress"} <= set(grid.cell_data)
+    assert grid.n_cells == comm.allreduce(len(solution.decomposition.cell_subdomain))
+    largest = comm.allreduce(np.abs(solution.displacement.x.array).max(initial=0.0), op=MPI.MAX)
+    assert np.isclose(np.abs(grid["displacement"]).max(), largest, rtol=1e-12)
+
+
 def test_xdmf_stands_in_where_adios2_is_missing(solution, comm, shared_tmp, monkeypatch):
     monkeypatch.setattr(dolfinx, "has_adios2", False)
     files = write_vtx(shared_tmp / f"other{solution.dofs.bs}.bp", solution)
@@ -106,6 +123,7 @@ def test_files_that_cannot_be_written_are_named_on_all_ranks(solution, comm, sha
     for name, write in {
         "out.bp": lambda path: write_vtx(path, solution),
         "out.xdmf": lambda path: write_xdmf(path, solution),
+        "out.pvd": lambda path: write_pvd(path, solution),
         "deformed.png": lambda path: plot_deformed(path, solution),
         "pressure.png": lambda path: plot_pressure(path, solution, lambda x: x[:, 0]),
     }.items():
@@ -115,7 +133,8 @@ def test_files_that_cannot_be_written_are_named_on_all_ranks(solution, comm, sha
 
 def test_on_a_full_disk_nothing_is_lost(solution, comm, shared_tmp):
     """An error on all ranks, and files of an earlier run as they were."""
-    for name, write in {"out.xdmf": write_xdmf, "out.bp": write_vtx}.items():
+    writers = {"out.xdmf": write_xdmf, "out.bp": write_vtx, "out.pvd": write_pvd}
+    for name, write in writers.items():
         write(shared_tmp / name, solution)
         before = left_in(shared_tmp, comm)
         for size in (0, 20000):

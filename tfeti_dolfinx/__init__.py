@@ -55,7 +55,7 @@ from tfeti_dolfinx.nonlinear.hyperelasticity import NeoHooke, SaintVenantKirchho
 from tfeti_dolfinx.nonlinear.materials import J2Plasticity
 from tfeti_dolfinx.nonlinear.problem import NewtonTolerances, NonlinearContactProblem
 from tfeti_dolfinx.options import Options
-from tfeti_dolfinx.output import write_vtx, write_xdmf
+from tfeti_dolfinx.output import write_pvd, write_vtx, write_xdmf
 from tfeti_dolfinx.plot import plot_deformed, plot_friction, plot_pressure
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.report import Report
@@ -114,6 +114,7 @@ __all__ = [
     "plot_pressure",
     "read_gmsh",
     "read_surface",
+    "write_pvd",
     "write_vtx",
     "write_xdmf",
 ]

@@ -1,10 +1,11 @@
-"""Files for ParaView: VTX where DOLFINx has ADIOS2, else XDMF; they appear whole."""
+"""Files for ParaView: VTX where DOLFINx has ADIOS2, XDMF, PVD; they appear whole."""
 
 from __future__ import annotations
 
 import ctypes
 import errno
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -27,6 +28,7 @@ from tfeti_dolfinx.mesh.untorn import NO_TAG
 from tfeti_dolfinx.solution import Solution
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+WRITERS = {".bp": "write_vtx", ".xdmf": "write_xdmf", ".pvd": "write_pvd"}
 LITTLE = 2**14  # bytes, more than what a file without fields takes
 
 
@@ -115,6 +117,96 @@ def write_xdmf(
         end_file(folder / name.name, name, comm)
     _drop(folder, comm)
     return [target, companion]
+
+
+def write_pvd(
+    path: str | os.PathLike[str], solution: Solution, interior: bool = False
+) -> list[Path]:
+    """Write all fields of a solution for PyVista and ParaView. Collective.
+
+    All fields are in one grid, those of nodes with the displacement's degree. The file names its
+    parts, ``<stem>000000.pvtu`` and ``<stem>_p0_000000.vtu`` of each rank.
+
+    Args:
+        path: A name that ends with ``.pvd``.
+        solution: The solution.
+        interior: As for ``write_vtx``.
+
+    Returns:
+        The files written.
+
+    Raises:
+        InputError: The name does not end with ``.pvd``, or the files cannot be written there, as
+            where the disk is full; then what was there before stays.
+    """
+    target = checked_target(path, ".pvd", solution, interior)
+    of_nodes, of_cells = _fields(solution, interior)
+    file: PvdFile | None = None
+    try:
+        file = PvdFile(target, of_nodes + of_cells)
+        file.write(0.0)
+        file.close()
+    except TfetiError:  # on all ranks
+        if file is not None:
+            file.drop()
+        raise
+    return file.appear()
+
+
+class PvdFile:
+    """A PVD file with its parts, in a folder until they are whole, as ``VtxFile``.
+
+    Creation and methods are collective.
+
+    Args:
+        name: Its name once it is whole.
+        functions: What it has: on the nodes of one element, and one value a cell.
+
+    Attributes:
+        partial: The folder until then.
+
+    Raises:
+        InputError: It cannot be written, as all methods but ``drop`` say, too.
+    """
+
+    def __init__(self, name: Path, functions: Sequence[fem.Function]) -> None:
+        self._name, self._comm = name, functions[0].function_space.mesh.comm
+        self._functions = list(functions)
+        self._bytes = 3 * _bytes_of(functions)  # numbers are texts
+        self.partial = begin_file(name, self._comm, is_folder=True)
+        with raised_on_all_ranks(self._comm), named(f"cannot write {name}"):
+            self._vtk: Any = io.VTKFile(self._comm, self.partial / name.name, "w")
+
+    def write(self, time: float) -> None:
+        """Add what the functions and the mesh have; times before this one are whole."""
+        _reserve(self._name, self._comm, self._bytes)
+        with _written_by(self._vtk, self._name, self._comm):
+            self._vtk.write_function(self._functions, time)
+
+    def close(self) -> None:
+        """Write what is left: the destructor does it, and makes folders that are not there."""
+        self._vtk = None
+
+    def appear(self) -> list[Path]:
+        """Give the files their names, in the place of those of an earlier run."""
+        self._comm.barrier()
+        own = re.compile(re.escape(self._name.stem) + r"(_p\d+_)?\d{6}\.p?vtu")
+        names: list[str] = []
+        with raised_on_all_ranks(self._comm), named(f"cannot write {self._name}", OSError):
+            if self._comm.rank == 0:
+                names = sorted(file.name for file in self.partial.iterdir())
+                for file in list(self._name.parent.iterdir()):
+                    if own.fullmatch(file.name):
+                        file.unlink()
+                for part in sorted(names, key=lambda part: part == self._name.name):
+                    os.replace(self.partial / part, self._name.with_name(part))
+        _drop(self.partial, self._comm)
+        return [self._name.with_name(part) for part in self._comm.bcast(names, root=0)]
+
+    def drop(self) -> None:
+        """Remove the folder."""
+        self.close()
+        _drop(self.partial, self._comm)
 
 
 class VtxFile:
@@ -241,12 +333,11 @@ def checked_target(
 ) -> Path:
     """Return the name to write to; what stands there and beside it is replaced. Collective."""
     checked_type(solution, Solution, "solution", "the solution of a ContactProblem")
-    call = "write_vtx" if suffix == ".bp" else "write_xdmf"
-    with agreeing(solution.decomposition.comm, call) as given:
+    with agreeing(solution.decomposition.comm, WRITERS[suffix]) as given:
         given |= {"path": path, "interior": bool(interior)}
         target = checked_path(path, suffix)
-        beside = target.with_name(f"{target.stem}{'_cells.bp' if suffix == '.bp' else '.h5'}")
-        for name in (target, beside):
+        beside = {".bp": f"{target.stem}_cells.bp", ".xdmf": f"{target.stem}.h5"}
+        for name in (target, target.with_name(beside.get(suffix, target.name))):
             if name.is_dir() and any(name.iterdir()) and not (name / "md.idx").exists():
                 raise InputError(f"{name} is a directory that VTX has not written; expected a file")
     return target

@@ -93,12 +93,12 @@ def checked_callable(value: Any, what: str, expected: str) -> None:
         raise InputError(f"{what} is {shown(value)}; expected {expected}")
 
 
-def checked_path(path: Any, suffix: str) -> Path:
-    """Return a file's name with this ending; raise an InputError where it is no such name."""
-    expected = f"a name that ends with {suffix}"
+def checked_path(path: Any, *suffixes: str) -> Path:
+    """Return a file's name with one of these endings; raise an InputError where it has none."""
+    expected = f"a name that ends with {' or '.join(suffixes)}"
     checked_type(path, (str, PathLike), "path", expected)
     target = Path(path)
-    if target.suffix != suffix:
+    if target.suffix not in suffixes:
         raise InputError(f"{target}: expected {expected}")
     return target
 

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise, zip_longest
+from pathlib import PurePath
 from typing import Any
 
 import dolfinx
@@ -37,6 +38,7 @@ from tfeti_dolfinx.errors import (
     raised_on_all_ranks,
 )
 from tfeti_dolfinx.output import (
+    PvdFile,
     VtxFile,
     begin_file,
     cell_fields,
@@ -157,7 +159,8 @@ class Series:
     InputError is raised where a name does not fit, or nothing can be written there.
 
     Args:
-        path: A name that ends with ``.bp``; cell fields go to ``<stem>_cells.bp``.
+        path: A name that ends with ``.bp``, cell fields go to ``<stem>_cells.bp``; or with
+            ``.pvd``, which has all fields.
         solution: A solution of the problem: its mesh and which fields there are.
         interior: Whether the fields of ``solution.interior`` are written, too: those of cells at
             each step, other cell fields are always the same.
@@ -166,8 +169,8 @@ class Series:
     def __init__(
         self, path: str | os.PathLike[str], solution: Solution, interior: bool = False
     ) -> None:
-        target = checked_target(path, ".bp", solution)
-        self._names = [target, target.with_name(f"{target.stem}_cells.bp")]
+        target = checked_target(path, PurePath(path).suffix, solution)
+        self._names = [target]
         self._mesh = solution.decomposition.mesh
         of_nodes, of_cells = solution.interior.fields if interior else ([], [])
         nodal, cellwise = (
@@ -176,13 +179,17 @@ class Series:
         )
         self._functions = nodal + cellwise
         self._count, self._ended = 0, False
-        self._files: list[VtxFile] = []
-        contents = (nodal, cell_fields(solution) + cellwise)
+        self._files: list[VtxFile | PvdFile] = []
+        of_cells = cell_fields(solution) + cellwise
         try:
-            for name, functions in zip(self._names, contents, strict=True):
-                self._files.append(VtxFile(name, functions))
+            if target.suffix == ".pvd":
+                self._files.append(PvdFile(target, nodal + of_cells))
+            else:
+                self._names.append(target.with_name(f"{target.stem}_cells.bp"))
+                self._files += [VtxFile(target, nodal)]
+                self._files += [VtxFile(self._names[1], of_cells)]
             self._growing = self._files if cellwise else self._files[:1]
-            if not cellwise:
+            if len(self._growing) < len(self._files):
                 self._files[1].write(0.0)
                 self._files[1].close()
         except TfetiError:  # on all ranks
@@ -322,9 +329,9 @@ class LoadSteps:
             alone, not on what was set before: steps are halved, and a series goes on in a new run.
         times: Ends of the steps, increasing.
         begin: Where the first step begins.
-        path: File for ParaView with all steps, ``.bp``; None: none. It has its name when the
-            series has ended, also by an error of this package, unless that is its own, as on a
-            full disk; before that it is ``.<name>.partial`` beside it.
+        path: File for ParaView with all steps, ``.bp``, or ``.pvd`` as ``write_pvd``; None: none.
+            It has its name when the series has ended, also by an error of this package, unless
+            that is its own, as on a full disk; before that it is ``.<name>.partial`` beside it.
         interior: Whether the file has the fields of ``solution.interior``, too, as ``write_vtx``.
         checkpoint: Folder for the last converged step, with nothing else in it; None: none.
         max_halvings: How often a step may be halved.
@@ -359,9 +366,9 @@ class LoadSteps:
                     f"max_halvings={shown(max_halvings)}: expected an integer, 0 to {MOST_HALVINGS}"
                 )
             self._times = checked_times(begin, times)
-            self._path = None if path is None else checked_path(path, ".bp")
-            if path is not None and not dolfinx.has_adios2:
-                raise InputError(f"{path}: this DOLFINx has no ADIOS2, which writes steps")
+            self._path = None if path is None else checked_path(path, ".bp", ".pvd")
+            if str(path).endswith(".bp") and not dolfinx.has_adios2:
+                raise InputError(f"{path}: this DOLFINx has no ADIOS2; expected a name with .pvd")
             self._interior = checked_flag(interior, "interior")
             if self._interior and path is None:
                 raise InputError("interior=True: expected LoadSteps(..., path=) too")
