@@ -83,9 +83,10 @@ def test_three_bodies_move_as_dense_matrices_say(serial_only, case):
     """Quadratic elements, too: the reference bounds what rows bound."""
     problem, tau = falling(*case), 0.15
     stabilised, touched = case[3], set()
-    motion = problem._forms_in_time.motion
+    forms = problem._forms_in_time
+    motion = forms.inertia.motion
     u, v, load = motion.u.copy(), motion.v.copy(), motion.load.copy()
-    K, M = (matrix.toarray() for matrix in problem._forms_in_time.matrices)
+    K, M = forms.K.toarray(), forms.inertia.M.toarray()
     problem.take_step(tau)
     for _ in range(8):
         problem.solve()

@@ -83,8 +83,8 @@ def test_an_obstacle_that_moves_does_work():
 
 def mean(scene, values):
     """Mean of a field over the box, of mass 1."""
-    forms = scene.problem._forms_in_time
-    mass = (forms.matrices[1] @ values.ravel()).reshape(values.shape)
+    inertia = scene.problem._forms_in_time.inertia
+    mass = (inertia.M @ values.ravel()).reshape(values.shape)
     return scene.problem.decomposition.comm.allreduce(mass.sum(axis=0))
 
 
@@ -139,8 +139,8 @@ def test_a_step_is_newmark_s_by_dense_matrices():
     whole = Thrown("quadrilateral", 3, gap=5.0, thrown=(0.3, 0.1, 0.4), subdomains=1)
     whole.problem.take_step(0.2)
     forms = whole.problem._forms_in_time
-    u, v = np.zeros_like(forms.motion.v), forms.motion.v
-    K, M = (A.toarray() for A in forms.matrices)
+    u, v = np.zeros_like(forms.inertia.motion.v), forms.inertia.motion.v
+    K, M = forms.K.toarray(), forms.inertia.M.toarray()
     if len(u):
         for _ in range(5):
             now = np.linalg.solve(K + 4 * M / 0.04, 4 * M @ (u + 0.2 * v) / 0.04 - K @ u)

@@ -60,7 +60,7 @@ from tfeti_dolfinx.plot import plot_deformed, plot_friction, plot_pressure
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.report import Report
 from tfeti_dolfinx.solution import PointValues, Solution
-from tfeti_dolfinx.steps.dynamics import ContactDynamics
+from tfeti_dolfinx.steps.dynamics import ContactDynamics, NonlinearContactDynamics
 from tfeti_dolfinx.steps.load_steps import LoadSteps, StepRecord
 
 __version__ = "0.1.0.dev0"
@@ -92,6 +92,7 @@ __all__ = [
     "NeoHooke",
     "NewtonTolerances",
     "NoSolutionError",
+    "NonlinearContactDynamics",
     "NonlinearContactProblem",
     "Obstacle",
     "Options",

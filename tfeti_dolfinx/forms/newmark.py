@@ -10,6 +10,7 @@ It is half of what the literature has, so that λ are forces: their mean in the 
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -63,34 +64,38 @@ class Motion:
         return self.v + 2.0 / self.size * (u - self.towards)
 
 
-class InertialForms(Forms):
-    """The matrix and the load of a step. Creation and all methods are collective.
+class Inertia:
+    """Mass of the bodies, and where a time step begins. Creation and all methods are collective.
 
     Args:
         mass: Bilinear form of the mass M.
-        as_forms: Arguments of ``Forms``; L is the load as it is at the end of the step.
+        V: The space of displacements.
+        decomposition: The torn mesh.
+        compiled: Compiles the form of a name.
 
     Attributes:
         motion: Where the step begins.
+        ends: The load at its end.
     """
 
-    def __init__(self, mass: ufl.Form, *as_forms: Any) -> None:
-        super().__init__(*as_forms)
-        V, decomposition = self._V, self._decomposition
-        self._comm = decomposition.comm
+    def __init__(
+        self,
+        mass: ufl.Form,
+        V: fem.FunctionSpace,
+        decomposition: Decomposition,
+        compiled: Callable[[ufl.Form, str], fem.Form],
+    ) -> None:
+        self._V, self._comm = V, decomposition.comm
         space = displacement_space(mass, decomposition, "mass")
         check_same_space(space, V, "the trial function of mass", "that of a")
         check_form(mass, "mass", V, decomposition)
-        self._m = self._compiled(mass, "mass")
+        self._m, self._M = compiled(mass, "mass"), None
         zero = np.zeros(V.dofmap.index_map.size_local * V.dofmap.index_map_bs)
-        self.motion = motion = Motion(zero, zero, super().load())
+        self.motion, self.ends = Motion(zero, zero, zero), zero
+        motion = self.motion
         self._of_step = Data(lambda: [np.array(motion.size)], self._comm)
         self._of_m = data_of(mass, V)
-        self.given = {**self.given, "mass": mass}
         self._of_motion = Data(lambda: [motion.u, motion.load, motion.towards], self._comm)
-        self._matrices: tuple[csr_array, csr_array] | None = None
-        self._new_matrices = True
-        self._ends = self.motion.load
 
     def take_step(self, size: float, same: float = 1e-9) -> None:
         """Let the next step have a size; another one than the last makes the matrix anew.
@@ -107,43 +112,41 @@ class InertialForms(Forms):
             log.warning("the step is now %g, it was %g: all is factored anew", size, known)
         self.motion.size = size
 
-    def has_new_points(self) -> bool:
-        """Return whether the mesh has moved since the last call."""
-        if changed := super().has_new_points():
-            self._matrices = None
-        return changed
+    def has_new_matrix(self) -> bool:
+        """Return whether M or the step has changed since the last call."""
+        new_mass, new_step = self._of_m.has_changed(), self._of_step.has_changed()
+        if new_mass:
+            self.forget()
+        return new_mass or new_step
 
-    def has_new_stiffness(self) -> bool:
-        """Return whether K, M or the step has changed since the last call."""
-        changed = [super().has_new_stiffness(), self._of_m.has_changed()]
-        if any(changed):
-            self._matrices = None
-        found = self._of_step.has_changed() or any(changed)
-        self._new_matrices |= found
-        return found
+    def has_new_motion(self) -> bool:
+        """Return whether the state at the step's begin has changed since the last call."""
+        return self._of_motion.has_changed()
 
-    def has_new_load(self) -> bool:
-        """Return whether L, the state at the step's begin, K, M or the step has changed."""
-        changed = super().has_new_load() or self._new_matrices
-        self._new_matrices = False
-        return self._of_motion.has_changed() or changed
+    def forget(self) -> None:
+        """Let M be assembled anew."""
+        self._M = None
 
     @property
-    def matrices(self) -> tuple[csr_array, csr_array]:
-        """This rank's K and M in DOLFINx's numbering."""
-        if self._matrices is None:
+    def M(self) -> csr_array:
+        """This rank's M in DOLFINx's numbering."""
+        if self._M is None:
             M = assemble_csr(self._m)
             with raised_on_all_ranks(self._comm):
                 check_mass(M, self._V.dofmap.index_map_bs)
-            self._matrices = (super().stiffness(), M)
-        return self._matrices
+            self._M = M
+        return self._M
 
-    def stiffness(self) -> Any:
-        """Return this rank's K/2 + 2M/τ²."""
+    @property
+    def share(self) -> float:
+        """2/τ²."""
         if not self.motion.size:
             raise InputError("the step has no size yet; expected a call of take_step(size) before")
-        K, M = self.matrices
-        share = 2.0 / self.motion.size**2
+        return 2.0 / self.motion.size**2
+
+    def stiffness(self, K: csr_array) -> Any:
+        """Return K/2 + 2M/τ²."""
+        M, share = self.M, self.share
         if np.array_equal(K.indptr, M.indptr) and np.array_equal(K.indices, M.indices):
             made = K.copy()  # with its zeros, as K would have them
             made.data *= 0.5
@@ -151,23 +154,79 @@ class InertialForms(Forms):
             return made
         return 0.5 * K + share * M
 
-    def load(self) -> Array:
-        """Return this rank's f + 2Mw/τ² − Ku/2."""
-        K, M = self.matrices
-        motion, self._ends = self.motion, super().load()
-        pull = M @ motion.towards * (2.0 / motion.size**2)
-        return self.mean_load + pull - 0.5 * (K @ motion.u)
-
     @property
     def mean_load(self) -> Array:
         """f of the step, by the trapezoidal rule."""
-        return 0.5 * (self.motion.load + self._ends)
+        return 0.5 * (self.motion.load + self.ends)
 
     def move(self, u: Array, v: Array, load: Array | None = None) -> None:
         """Let the next step begin at a displacement and a velocity, and with the last load."""
         motion = self.motion
         motion.u, motion.v = u, v
-        motion.load = self._ends if load is None else load
+        motion.load = self.ends if load is None else load
+
+
+class InertialForms(Forms):
+    """The matrix and the load of a step. Creation and all methods are collective.
+
+    Args:
+        mass: Bilinear form of the mass M.
+        as_forms: Arguments of ``Forms``; L is the load as it is at the end of the step.
+
+    Attributes:
+        inertia: M, and where the step begins.
+    """
+
+    def __init__(self, mass: ufl.Form, *as_forms: Any) -> None:
+        super().__init__(*as_forms)
+        self.inertia = Inertia(mass, self._V, self._decomposition, self._compiled)
+        self.inertia.ends = super().load()
+        self.given = {**self.given, "mass": mass}
+        self._K: csr_array | None = None
+        self._new_matrices = True
+
+    def has_new_points(self) -> bool:
+        """Return whether the mesh has moved since the last call."""
+        if changed := super().has_new_points():
+            self._K = None
+            self.inertia.forget()
+        return changed
+
+    def has_new_stiffness(self) -> bool:
+        """Return whether K, M or the step has changed since the last call."""
+        found = self.inertia.has_new_matrix()
+        if super().has_new_stiffness():
+            self._K, found = None, True
+        self._new_matrices |= found
+        return found
+
+    def has_new_load(self) -> bool:
+        """Return whether L, the state at the step's begin, K, M or the step has changed."""
+        changed = super().has_new_load() or self._new_matrices
+        self._new_matrices = False
+        return self.inertia.has_new_motion() or changed
+
+    @property
+    def K(self) -> csr_array:
+        """This rank's K in DOLFINx's numbering."""
+        if self._K is None:
+            self._K = super().stiffness()
+        return self._K
+
+    def stiffness(self) -> Any:
+        """Return this rank's K/2 + 2M/τ²."""
+        return self.inertia.stiffness(self.K)
+
+    def load(self) -> Array:
+        """Return this rank's f + 2Mw/τ² − Ku/2."""
+        inertia = self.inertia
+        motion, inertia.ends = inertia.motion, super().load()
+        pull = inertia.M @ motion.towards * inertia.share
+        return inertia.mean_load + pull - 0.5 * (self.K @ motion.u)
+
+    def elastic(self, u: Array) -> float:
+        """Return this rank's part of uᵀKu/2."""
+        return float(0.5 * u @ (self.K @ u))
 
 
 def check_mass(M: csr_array, bs: int, rounding: float = 1e-10) -> None:

@@ -16,6 +16,7 @@ from scipy.sparse import csr_array
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import geometry_dofmap
 from tfeti_dolfinx.forms.assembly import Forms
+from tfeti_dolfinx.forms.newmark import Inertia
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
 # degree of the quadrature whose points det F is looked at
@@ -94,6 +95,76 @@ class NewtonForms(Forms):
             yield
         finally:
             self._x[:] = here
+
+
+class InertialNewtonForms(NewtonForms):
+    """Matrix and load of the linearised problem in a time step of bodies with mass.
+
+    The trapezoidal rule, with the residual F at the begin and at the end of the step τ and
+    w = u + τv, or what takes its place: R(u⁺) = (F(u) + F(u⁺))/2 + 2M(u⁺ − w)/τ², and its
+    derivative J/2 + 2M/τ². M is that of the bodies where they were. Creation and all methods are
+    collective.
+
+    Args:
+        mass: Bilinear form of the mass M.
+        as_forms: Arguments of ``NewtonForms``.
+        u: The displacement.
+        finite: As there.
+
+    Attributes:
+        inertia: M, and where the step begins; its loads are −F.
+    """
+
+    def __init__(self, mass: ufl.Form, *as_forms: Any, u: fem.Function, finite: bool) -> None:
+        super().__init__(*as_forms, u=u, finite=finite)
+        self.inertia = Inertia(mass, self._V, self._decomposition, self._compiled)
+        self.given = {**self.given, "mass": mass}
+
+    def has_new_points(self) -> bool:
+        """Return whether the mesh has moved since the last call."""
+        moved = super().has_new_points()
+        if moved and self._reference is None:
+            self.inertia.forget()
+        return moved
+
+    def has_new_stiffness(self) -> bool:
+        """Return whether J, M or the step has changed since the last call."""
+        new, changed = self.inertia.has_new_matrix(), super().has_new_stiffness()
+        self._new_matrix = new or changed
+        return self._new_matrix
+
+    def has_new_load(self) -> bool:
+        """Return whether u, the state at the step's begin, or what forms refer to has changed."""
+        new, changed = self.inertia.has_new_motion(), super().has_new_load()
+        return new or changed
+
+    def stiffness(self) -> Any:
+        """Return this rank's J/2 + 2M/τ²."""
+        J = super().stiffness()
+        with self._in_place():
+            self._matrix = self.inertia.stiffness(J)
+        return self._matrix.copy()
+
+    def tangent_times(self, d: Array) -> Array:
+        """Return this rank's (J/2 + 2M/τ²) d."""
+        return 0.5 * super().tangent_times(d) + self.inertia.share * (self.inertia.M @ d)
+
+    def residual(self) -> Array:
+        """Return this rank's R(u); F(u) before the step has a size."""
+        F, inertia, motion = super().residual(), self.inertia, self.inertia.motion
+        if not motion.size:
+            return F
+        with self._in_place():
+            pull = inertia.M @ (self._u.x.array - motion.towards)
+        return 0.5 * (F - motion.load) + inertia.share * pull
+
+    def forces(self) -> Array:
+        """Return this rank's −F(u): loads less stresses."""
+        return -super().residual()
+
+    def elastic(self, u: Array) -> float:
+        """Return 0: F need have no energy, and its work is that of the load."""
+        return 0.0
 
 
 class CurrentPlaces:

@@ -27,6 +27,8 @@ from tfeti_dolfinx.forms.elasticity import Modulus
 from tfeti_dolfinx.forms.newmark import InertialForms, check_copies, mass_form
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.nonlinear.forms import InertialNewtonForms
+from tfeti_dolfinx.nonlinear.problem import NonlinearContactProblem
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.qp.sets import Bounds, Ellipses, FeasibleSet, Product
 from tfeti_dolfinx.saved_state import SavedState
@@ -42,7 +44,9 @@ from tfeti_dolfinx.system import Settings
 NAMES = ("load", "contact", "friction", "supports", "predictor")
 
 
-def balance(forms: InertialForms, dual: Dual, solution: Solution) -> dict[str, float]:
+def balance(
+    forms: InertialForms | InertialNewtonForms, dual: Dual, solution: Solution
+) -> dict[str, float]:
     """Energies at the end of a step, and the work that has changed them. Collective.
 
     Args:
@@ -56,14 +60,15 @@ def balance(forms: InertialForms, dual: Dual, solution: Solution) -> dict[str, f
         conditions, and what jumps at tears to the tolerance), what the ``predictor`` has added,
         at most 0; and ``defect``, what all these leave of the change of the energy: rounding.
     """
-    motion, (K, M) = forms.motion, forms.matrices
+    inertia, motion = forms.inertia, forms.inertia.motion
+    M = inertia.M
     u, v = solution.displacement.x.array, solution.velocity.x.array
     kicked, way = motion.towards - motion.free, u - motion.u
     own = [
         0.5 * v @ (M @ v),
-        0.5 * u @ (K @ u),
-        0.5 * motion.v @ (M @ motion.v) + 0.5 * motion.u @ (K @ motion.u),
-        forms.mean_load @ way,
+        forms.elastic(u),
+        0.5 * motion.v @ (M @ motion.v) + forms.elastic(motion.u),
+        inertia.mean_load @ way,
         *_work_of_rows(dual, solution.lam, solution.dofs.to_primal(way)),
         -2.0 / motion.size**2 * kicked @ (M @ (u - motion.towards)),
     ]
@@ -282,7 +287,7 @@ class ContactDynamics(ContactProblem):
             v = self._checked_u(velocity, self.dofs.V, "velocity").x.array
         check_copies(self.u.x.array, self.dofs, "u, the displacement at the begin,")
         check_copies(v, self.dofs, "velocity")
-        self._forms_in_time.move(np.array(self.u.x.array), np.array(v))
+        self._forms_in_time.inertia.move(np.array(self.u.x.array), np.array(v))
         self._first = np.array(self.u.x.array)
         self._predictor: Predictor | None = None
         if self._stabilised:
@@ -295,17 +300,20 @@ class ContactDynamics(ContactProblem):
         return {**flags, "mass": self._mass, "velocity": self._velocity}
 
     def _forms(self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any) -> Forms:
+        return InertialForms(self._mass_form(V), a, L, V, self.decomposition, *options)
+
+    def _mass_form(self, V: fem.FunctionSpace) -> ufl.Form:
         mass = self._mass
         if isinstance(mass, ufl.Form) and self._lumped:
             raise InputError("lumped=True with a form of the mass; expected a density")
         if not isinstance(mass, ufl.Form):
             mass = mass_form(mass, V, self.decomposition, self._with_thickness, self._lumped)
-        return InertialForms(mass, a, L, V, self.decomposition, *options)
+        return mass
 
     @property
-    def _forms_in_time(self) -> InertialForms:
+    def _forms_in_time(self) -> InertialForms | InertialNewtonForms:
         forms = self._system.forms
-        assert isinstance(forms, InertialForms)
+        assert isinstance(forms, InertialForms | InertialNewtonForms)
         return forms
 
     def take_step(self, size: float) -> None:
@@ -314,7 +322,7 @@ class ContactDynamics(ContactProblem):
         Raises:
             InputError: It is not a positive number, or another one on another rank.
         """
-        self._forms_in_time.take_step(size)
+        self._forms_in_time.inertia.take_step(size)
 
     def solve(self) -> fem.Function:
         """Solve for the end of the step; see ``ContactProblem.solve``.
@@ -327,7 +335,7 @@ class ContactDynamics(ContactProblem):
         return self.u
 
     def _set_out(self) -> None:
-        motion = self._forms_in_time.motion
+        motion = self._forms_in_time.inertia.motion
         motion.towards = free = motion.free
         if self._predictor is not None:
             motion.towards = self._predicted(self._predictor, free)
@@ -343,7 +351,7 @@ class ContactDynamics(ContactProblem):
         if self.solution is before:
             return
         assert self.solution.v is not None
-        self._forms_in_time.move(np.array(self.u.x.array), self.solution.v)
+        self._forms_in_time.inertia.move(np.array(self.u.x.array), self.solution.v)
 
     def _return(self) -> None:
         super()._return()
@@ -352,7 +360,7 @@ class ContactDynamics(ContactProblem):
 
     def state(self) -> SavedState:
         """Return the last accepted solution as arrays of this rank, for ``restore``."""
-        motion, state = self._forms_in_time.motion, super().state()
+        motion, state = self._forms_in_time.inertia.motion, super().state()
         v, load = self.dofs.to_primal(motion.v), self.dofs.to_primal(motion.load)
         state = replace(state, velocity=v, load=load, size=np.array(motion.size))
         if self._predictor is None:
@@ -374,11 +382,12 @@ class ContactDynamics(ContactProblem):
             raise InputError("the state is of a problem without mass; expected velocities")
 
     def _take_motion(self, state: SavedState) -> None:
-        forms = self._forms_in_time
-        forms.move(*map(self.dofs.to_dolfinx, (state.u, state.velocity, state.load)))
-        forms.motion.towards = forms.motion.free
+        inertia = self._forms_in_time.inertia
+        inertia.move(*map(self.dofs.to_dolfinx, (state.u, state.velocity, state.load)))
+        inertia.motion.towards = inertia.motion.free
         if state.size > 0.0:  # equal steps of a series differ by rounding, factors are of the first
-            forms.motion.size = float(state.size)
+            inertia.motion.size = float(state.size)
+        super()._take_motion(state)
 
     def destroy(self) -> None:
         """Destroy the PETSc objects; solution and report stay."""
@@ -388,18 +397,18 @@ class ContactDynamics(ContactProblem):
 
     def _make_solution(self, u: Array, multipliers: Multipliers, gluing: Gluing) -> Solution:
         solution = super()._make_solution(u, multipliers, gluing)
-        solution.v = self._forms_in_time.motion.velocity(self.dofs.to_dolfinx(u))
+        solution.v = self._forms_in_time.inertia.motion.velocity(self.dofs.to_dolfinx(u))
         return solution
 
     def _predicted(self, predictor: Predictor, free: Array) -> Array:
         """Return the displacement that contact allows the bodies without elasticity."""
-        system, forms = self._system, self._forms_in_time
+        system = self._system
         system.look_for_changes()
         system.make_up_to("right side", self._seconds)
         if system.search.take_in_overlapping(self.dofs.to_primal(free), 0.0):
             system.change("rows")
             system.make_up_to("right side", self._seconds)
-        return predictor.nearest(free, forms.matrices[1], system.gluing)
+        return predictor.nearest(free, self._forms_in_time.inertia.M, system.gluing)
 
     def _look(self) -> None:
         """Put energies, work and forces into the report."""
@@ -409,6 +418,95 @@ class ContactDynamics(ContactProblem):
         contacts = [self.solution.contact(i) for i in range(len(self.contacts))]
         forces = [list(map(float, contact.resultant.force)) for contact in contacts]
         self.report.take(replace(self.report, motion=motion, contact_forces=forces))
+
+
+class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
+    """Nonlinear bodies with mass in contact, step by step, in small or in finite strain.
+
+    Steps are those of ``ContactDynamics``, with the residual F in the place of K: M(v⁺ − v)/τ =
+    −(F(u) + F(u⁺))/2 − Bᵀλ, u⁺ = u + τ(v + v⁺)/2. Each is solved by Newton's method with the
+    contact inside, as a load step of ``NonlinearContactProblem``. Momentum is kept to the
+    tolerance; the energy of a hyperelastic body in free flight is off by terms of τ², which do not
+    add up. In finite strain contact acts where the bodies are, and the predictor of stabilised
+    steps meets the places at the begin of the step. All is collective.
+
+    Args:
+        F: Residual F(u; v) without inertia. Internal variables are those at the begin of the step.
+        u: The displacement in F, as it is at the begin.
+        bcs: Dirichlet conditions, at the end of the step.
+        contacts: Obstacles and pairs. Friction acts on what slips in a step.
+        decomposition: The torn mesh.
+        mass: Mass per volume of the mesh as it was, or its bilinear form; see ``ContactDynamics``.
+        finite: Whether strains and displacements are finite.
+        velocity: Velocity at the begin, a function; default 0.
+        stabilised: Whether steps are contact-stabilised.
+        lumped: Whether a density is integrated at the vertices.
+        others: As for ``NonlinearContactProblem``.
+
+    ``report.motion`` is that of ``ContactDynamics``, but that ``load`` is the work of all of F,
+    inner forces included, ``elastic`` is 0, ``energy`` the kinetic one, and ``defect`` what the
+    tolerance has left.
+
+    Raises:
+        InputError: What is given does not fit; the message names it.
+    """
+
+    defaults: ClassVar[Mapping[str, Any]] = NonlinearContactProblem.defaults
+
+    def __init__(
+        self,
+        F: ufl.Form,
+        u: fem.Function,
+        bcs: Sequence[fem.DirichletBC],
+        contacts: Sequence[ContactPartner],
+        decomposition: Decomposition,
+        *,
+        mass: Modulus | ufl.Form,
+        finite: bool = False,
+        velocity: fem.Function | None = None,
+        stabilised: bool = False,
+        lumped: bool = False,
+        **others: Any,
+    ) -> None:
+        flags = {"stabilised": stabilised, "lumped": lumped, "finite": finite}
+        given = {"mass": mass, "velocity": velocity, **flags, **others}
+        super().__init__(F, u, bcs, contacts, decomposition, **given)
+        self._newton_forms.inertia.motion.load = self._newton_forms.forces()
+
+    def _forms(
+        self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any
+    ) -> InertialNewtonForms:
+        given = (self._mass_form(V), a, L, V, self.decomposition, *options)
+        return InertialNewtonForms(*given, u=self.u, finite=self._finite)
+
+    @property
+    def _newton_forms(self) -> InertialNewtonForms:
+        forms = self._system.forms
+        assert isinstance(forms, InertialNewtonForms)
+        return forms
+
+    def solve(self) -> fem.Function:
+        """Solve for the end of the step; see ``NonlinearContactProblem.solve``.
+
+        Raises:
+            InputError: As there, or the step has no size yet.
+        """
+        self._meet("solve")
+        if self._places is not None:
+            self._go_to_places(self._places)
+        try:
+            super()._set_out()
+        finally:
+            if self._places is not None:
+                self._places.back()
+        return super().solve()
+
+    def _set_out(self) -> None:
+        """Do nothing: linearised problems share the prediction of their step."""
+
+    def _look(self) -> None:
+        self._newton_forms.inertia.ends = self._newton_forms.forces()
+        super()._look()
 
 
 def check_guided(contacts: Sequence[ContactPartner]) -> None:
