@@ -104,6 +104,14 @@ def test_solvers_send_no_pickled_messages(pickled, qp_type, friction):
     assert pickled == []
 
 
+def test_clusters_send_no_pickled_messages(pickled):
+    pressed = tfeti.Obstacle("bottom", curved_obstacle(3))
+    p = problem(decomposed("hexahedron", 4, 8), contacts=[pressed], clusters=4)
+    p.solve()
+    assert p.report.F_multiplications > 5
+    assert pickled == []
+
+
 def test_pickled_messages_are_seen(pickled):
     """A monitor that sends a number, in each step."""
     seen = tfeti.Extensions(monitor=lambda *_: MPI.COMM_WORLD.allreduce(1))

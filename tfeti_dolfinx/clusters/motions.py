@@ -12,7 +12,14 @@ from scipy.sparse import coo_array, csr_array, diags_array
 
 from tfeti_dolfinx.clusters.subdomains import ClusteredSubdomains, InnerMotions
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import Exchange, bcast_from_root, chunk_offsets, summed
+from tfeti_dolfinx.common.parallel import (
+    Exchange,
+    bcast_from_root,
+    chunk_offsets,
+    joined_over,
+    steering,
+    summed,
+)
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.coarse import CoarseSpace, products, side_by_side
 from tfeti_dolfinx.feti.deflation import Balanced, Deflation, SoftModes, mean_stiffness
@@ -81,6 +88,7 @@ class ClusterSteps:
     ) -> None:
         self._comm, self._own, self._whole, self._A = comm, own, whole, A
         offsets = chunk_offsets(comm, own.whole.shape[1])
+        self._sizes = np.diff(offsets)
         self._part = slice(int(offsets[comm.rank]), int(offsets[comm.rank + 1]))
         self._x, self._y = A.createVecs()
         self._blocks: CholeskyFactor | None = None
@@ -104,7 +112,8 @@ class ClusterSteps:
 
     def _of_clusters(self, b: Array) -> Array:
         """E b."""
-        e = np.concatenate(self._comm.allgather(self._own.whole.T @ b))
+        e = np.empty(int(self._sizes.sum()))
+        self._comm.Allgatherv(self._own.whole.T @ b, [e, self._sizes.tolist()])
         return np.asarray(self._own.whole @ self._whole.solve(e)[self._part])
 
     def _solved(self, b: Array) -> Array:
@@ -136,7 +145,7 @@ class ClusterSteps:
             sizes.append(float(size))
             steps.append(float(size / curvature))
             r -= steps[-1] * Ap
-        values = bcast_from_root(comm, _ritz_values(np.array(sizes), np.array(steps)))
+        values = steering(comm, *_ritz_values(np.array(sizes), np.array(steps)))
         low, top = float(PARAMETERS.below * values[0]), float(PARAMETERS.above * values[-1])
         return min(max(low, top / PARAMETERS.widest), 0.5 * top), top
 
@@ -293,7 +302,7 @@ class ClusterMotions:
         gram.destroy()
         diagonal = whole.diagonal()
         squares, terms = self._own.whole.multiply(self._own.whole), A.getDiagonal()
-        parts = np.concatenate(self._coarse.comm.allgather(squares.T @ terms.array_r))
+        parts = joined_over(self._coarse.comm, squares.T @ terms.array_r)
         terms.destroy()
         shift = PARAMETERS.free * np.maximum(diagonal, 0.0) + PARAMETERS.rounded * parts
         return self.factors.factor(csr_array(whole + diags_array(shift)))

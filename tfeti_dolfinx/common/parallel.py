@@ -138,7 +138,9 @@ def owner_of(offsets: Array, index: Array) -> Array:
 
 def chunk_offsets(comm: MPI.Intracomm, size: int) -> Array:
     """Offsets of all ranks' chunks, shape ``(comm.size + 1,)``. Collective."""
-    return np.concatenate(([0], np.cumsum(comm.allgather(size)))).astype(np.int64)
+    sizes = np.empty(comm.size, dtype=np.int64)
+    comm.Allgather(np.array([size]), sizes)
+    return np.concatenate(([0], np.cumsum(sizes)))
 
 
 def box_over_ranks(comm: MPI.Intracomm, x: Array) -> tuple[Array, Array]:

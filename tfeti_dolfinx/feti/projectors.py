@@ -141,6 +141,7 @@ class SemidefiniteFactor:
         self._scale, pinned = _scaling(A, null)
         self._A = _scaled(A, self._scale, pinned)
         self._factor: CholeskyFactor | None = None
+        self._shift = 0.0
         for self._shift in SHIFTS if A.shape[0] else ():
             lost = False
             with raised_on_all_ranks(comm):
@@ -154,8 +155,10 @@ class SemidefiniteFactor:
                     if not lost or self._shift == SHIFTS[-1]:
                         raise type(error)(f"{what}: {error}") from error
             if not any_rank(comm, lost):
-                return
+                break
             self.destroy()
+        if not self._shift:  # only refinement needs the matrix
+            del self._A
 
     def solve(self, y: Array) -> Array:
         """A⁺ y up to null modes that are removed, y orthogonal to them."""
