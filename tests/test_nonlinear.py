@@ -185,6 +185,25 @@ def test_series_goes_on_from_its_checkpoint(comm, shared_tmp):
         assert np.abs(found - expected).max(initial=0.0) < 1e-7 * 0.06
 
 
+def test_rows_and_their_multipliers_outlive_the_tangent(comm):
+    """A state restored by another problem has the contact forces of the one that found it."""
+    problem, _, value = plastic(comm)
+    gluings = []
+    for down in (-0.02, -0.05):
+        value.value[-1] = down
+        problem.solve()
+        problem.accept()
+        gluings.append(problem.report.gluings)
+        assert problem.report.assemblies > 1
+    assert gluings == [1, 0]
+    other, _, there = plastic(comm)
+    there.value[-1] = -0.05
+    other.restore(problem.state())
+    contacts = [p.solution.contact(0) for p in (problem, other)]
+    force, expected = (contact.resultant.force for contact in reversed(contacts))
+    assert np.abs(force - expected).max() < 1e-12 * np.abs(expected).max()
+
+
 def test_a_step_that_is_given_up_leaves_no_trace(comm):
     """What was not accepted is gone after ``go_back``: displacement and internal variables."""
     problem, law, value = plastic(comm)

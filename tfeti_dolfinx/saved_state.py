@@ -142,7 +142,7 @@ def arranged(values: Array, kept: Array, here: Array) -> Array:
 STARTS = ("predicted", "image", "predicted_image")
 # what the rows of an array are: labels of this name tell them apart
 OF = {
-    **dict.fromkeys(("u", "velocity", "load"), "nodes"),
+    **dict.fromkeys(("u", "velocity", "load", "weights"), "nodes"),
     **dict.fromkeys(("lam", "status", "directions", *STARTS), "rows"),
     **dict.fromkeys(("slip", "contact", "group", "reached"), "conditions"),
     "internal": "cells",
@@ -182,6 +182,7 @@ class SavedState:
         tools: Motions of rigid bodies, one after the other.
         image: Fλ; empty where it is not known.
         predicted_image: The same of the predictor.
+        weights: D of a nonlinear problem, which rows are scaled with, in primal order; else empty.
     """
 
     subdomains: Array
@@ -209,6 +210,7 @@ class SavedState:
     tools: Array = field(default_factory=lambda: np.zeros(0))
     image: Array = field(default_factory=lambda: np.zeros(0))
     predicted_image: Array = field(default_factory=lambda: np.zeros(0))
+    weights: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def of(cls, solution: Solution, mu: Array, norm: float, reach: list[float]) -> SavedState:
@@ -241,9 +243,8 @@ class SavedState:
         """Return what ``table`` has made a table of, of these or other subdomains."""
         values = {name: array for name, (array, _) in table.items()}
         values["directions"] = values["directions"].swapaxes(0, 1)
-        values["u"], values["velocity"], values["load"] = (
-            values[name].reshape(-1) for name in ("u", "velocity", "load")
-        )
+        for name in ("u", "velocity", "load", "weights"):
+            values[name] = values[name].reshape(-1)
         for name, kind in OF.items():
             _, labels = table[name]
             if labels is not None:

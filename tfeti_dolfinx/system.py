@@ -190,7 +190,8 @@ class System:
         origin: Displacement in primal order at which the mesh is, in finite strain; else None.
         inverses: How often K⁺ was made; multipliers μ of Gλ = e belong to one of them.
         follows: Whether each stiffness is near the one before, as in Newton's method: what is known
-            of ‖F‖ stays.
+            of ‖F‖, and the weights that rows are scaled with, stay. So multipliers go on.
+        weights: Those of the last rows; None before.
     """
 
     def __init__(
@@ -218,6 +219,7 @@ class System:
         self._counters, self._counted = Counters(), 0
         self._seen = 0.0  # of ‖F‖, which more rows hardly change
         self.inverses, self.follows = 0, False
+        self.weights: Array | None = None
         self._K: Any = None
         self._search: ContactSearch | None = None
         self._known_rows: tuple[Sequence[float], Sequence[Array]] | None = None
@@ -284,6 +286,8 @@ class System:
     def change(self, what: str) -> None:
         """Say that something has changed, a key of ``CHANGES``; what is out of date is freed."""
         self._stale |= set(CHANGES[what])
+        if what == "stiffness" and not self.follows:
+            self._stale |= {"rows", "friction"}
         if "coarse problem" in self._stale:
             self._destroy_dual()
         if "factors" in self._stale:
@@ -408,10 +412,12 @@ class System:
             self._gluing.constraints.destroy()
         search, dofs, tools = self.search, self._dofs, self.tools
         search.move()
-        weights = row_weights(self._blocks, self._settings.options.scaling, dofs.comm)
+        if self.weights is None or not self.follows:
+            scaling = self._settings.options.scaling
+            self.weights = row_weights(self._blocks, scaling, dofs.comm)
         prescribed, slip = made(self._prescribed), self._slip()
         free = tools if tools.num_unknowns else None
-        given = dofs, prescribed, search.records, search.length, weights, slip
+        given = dofs, prescribed, search.records, search.length, self.weights, slip
         self._gluing = glue(*given, free)
 
     def _fill_right_side(self) -> None:
@@ -507,7 +513,7 @@ STAGES: dict[str, tuple[str, Callable[[System], None]]] = {
 # what has to be made anew where something has changed
 CHANGES = {
     "points": tuple(STAGES),
-    "stiffness": ("stiffness", "rows", "friction", "factors", "trace", "coarse problem"),
+    "stiffness": ("stiffness", "factors", "trace", "coarse problem"),  # and rows, by their scaling
     "rows": ("rows", "friction", "trace", "coarse problem"),
     "places": ("search", "rows", "friction", "trace", "coarse problem"),
     "right side": ("right side", "linear term"),

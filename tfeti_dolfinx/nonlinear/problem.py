@@ -109,9 +109,9 @@ class NonlinearContactProblem(ContactProblem):
     Newton's method, u the iterate, û the solution of the linearised problem, d = û − u:
 
     1. *Model.* Assemble J(u); in small strain keep it, with its factors, where the last step was
-       short and in line with it; in finite strain, with the rows of the same places, until the
-       increments are small beside the first one, unless places matter more. Solve the contact
-       problem for û, to the forcing term of Eisenstat and Walker.
+       short and in line with it, and from one load step to the next; in finite strain, with the
+       rows of the same places, until the increments are small beside the first one, unless places
+       matter more. Solve the contact problem for û, to the forcing term of Eisenstat and Walker.
     2. *Line search.* r(t) = F(u + t d; d) + λᵀB d is the slope along d of the potential with the
        contact forces of û, and r(0) = −dᵀJ d < 0. Where r(1) is much larger than 0, the step has
        gone beyond the minimum, and t is a root of r. The modulus of r(1)/r(0) is the remainder.
@@ -226,12 +226,14 @@ class NonlinearContactProblem(ContactProblem):
         begin, total = np.array(self.u.x.array), Totals()
         try:
             self._newton(total)
+            # loads that go on find the tangent of the last step nearer than an elastic one
+            self._newton_forms.kept = not self._finite
         except TfetiError:  # on all ranks
+            self._newton_forms.kept = False
             self._set(begin)
             self._start = None  # that of a linearised problem is no end of a load step
             raise
         finally:
-            self._newton_forms.kept = False
             self.options = replace(self.options, rtol=self._exact)
             self.report.take(total.entered(self.report))
         return self.u
@@ -453,8 +455,14 @@ class NonlinearContactProblem(ContactProblem):
             self._set(self._begin)
 
     def state(self) -> SavedState:
-        """Return the last accepted solution, with internal variables, for ``restore``."""
-        state = super().state()
+        """Return the last accepted solution, with internal variables, for ``restore``.
+
+        Products with F are of the last tangent, which the run that goes on does not have.
+        """
+        weights = self._system.weights
+        state = replace(super().state(), image=np.zeros(0), directions=np.zeros((2, 0, 0)))
+        assert weights is not None
+        state = replace(state, weights=weights)
         if not self._state.functions:
             return state
         cells = labels_of_cells(self.decomposition)
@@ -481,11 +489,14 @@ class NonlinearContactProblem(ContactProblem):
                 f"the state has {state.internal.size} values of internal variables on this rank; "
                 f"expected {expected}, those of state="
             )
+        if state.weights.shape != state.u.shape:
+            raise InputError("the state has no weights; expected that of a nonlinear problem")
 
     def _take_motion(self, state: SavedState) -> None:
         if self._state.functions:
             self._state.set_in_cells(state.internal)
-        self._begin = self.dofs.to_dolfinx(state.u)
+        self._begin, self._system.weights = self.dofs.to_dolfinx(state.u), state.weights
+        self._newton_forms.kept = False
         self._set(self._begin)
         if self._places is not None:
             self._go_to_places(self._places)
