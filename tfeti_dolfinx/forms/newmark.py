@@ -46,6 +46,7 @@ class Motion:
         load: Load.
         towards: w, where the bodies would be without forces: u + τv, or a predictor.
         size: The step τ, 0 before it is known.
+        start: Velocity that the step starts with: v, or what a predictor makes of it.
     """
 
     u: Array
@@ -53,6 +54,7 @@ class Motion:
     load: Array
     towards: Array = field(default_factory=lambda: np.zeros(0))
     size: float = 0.0
+    start: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def free(self) -> Array:
@@ -61,7 +63,7 @@ class Motion:
 
     def velocity(self, u: Array) -> Array:
         """v⁺ where the step ends at u."""
-        return self.v + 2.0 / self.size * (u - self.towards)
+        return self.start + 2.0 / self.size * (u - self.towards)
 
 
 class Inertia:
@@ -162,7 +164,7 @@ class Inertia:
     def move(self, u: Array, v: Array, load: Array | None = None) -> None:
         """Let the next step begin at a displacement and a velocity, and with the last load."""
         motion = self.motion
-        motion.u, motion.v = u, v
+        motion.u, motion.v, motion.start = u, v, v
         motion.load = self.ends if load is None else load
 
 

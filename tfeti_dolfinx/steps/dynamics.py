@@ -63,14 +63,16 @@ def balance(
     inertia, motion = forms.inertia, forms.inertia.motion
     M = inertia.M
     u, v = solution.displacement.x.array, solution.velocity.x.array
-    kicked, way = motion.towards - motion.free, u - motion.u
+    start, way = motion.start, u - motion.u
+    kicked = motion.towards - motion.u - motion.size * start
     own = [
         0.5 * v @ (M @ v),
         forms.elastic(u),
         0.5 * motion.v @ (M @ motion.v) + forms.elastic(motion.u),
         inertia.mean_load @ way,
         *_work_of_rows(dual, solution.lam, solution.dofs.to_primal(way)),
-        -2.0 / motion.size**2 * kicked @ (M @ (u - motion.towards)),
+        0.5 * (start @ (M @ start) - motion.v @ (M @ motion.v))
+        - 2.0 / motion.size**2 * kicked @ (M @ (u - motion.towards)),
     ]
     values = [float(value) for value in summed(solution.dofs.comm, np.array(own))]
     (kinetic, elastic, before), work = values[:3], values[3:]
@@ -110,6 +112,7 @@ class Predictor:
 
     Attributes:
         multiplications: By F of the mass in the last call.
+        multipliers: Of the last call: M(u − w) = −Bᵀλ.
     """
 
     def __init__(self, dofs: TornDofs, decomposition: Decomposition, settings: Settings) -> None:
@@ -123,6 +126,7 @@ class Predictor:
         self._start: tuple[Gluing, Array] | None = None
         self._image: Array = np.zeros(0)
         self.multiplications = 0
+        self.multipliers: Multipliers | None = None
 
     @property
     def start(self) -> tuple[Array, Array]:
@@ -197,6 +201,7 @@ class Predictor:
         self._image = np.zeros(0)  # it is of the F and the start of a restored state alone
         result, accuracy = solve_dual(dual, options, options.qp_type, start)
         self._start = (gluing, result.lam.copy()) if result.reason > 0 else None
+        self.multipliers = Multipliers(result.lam.copy(), result.face)
         self.multiplications = dual.F.count["solver"]
         conclude(result, accuracy, options, self._dofs.comm)
         return accuracy.u
@@ -427,8 +432,9 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
     −(F(u) + F(u⁺))/2 − Bᵀλ, u⁺ = u + τ(v + v⁺)/2. Each is solved by Newton's method with the
     contact inside, as a load step of ``NonlinearContactProblem``. Momentum is kept to the
     tolerance; the energy of a hyperelastic body in free flight is off by terms of τ², which do not
-    add up. In finite strain contact acts where the bodies are, and the predictor of stabilised
-    steps meets the places at the begin of the step. All is collective.
+    add up. In finite strain contact acts where the bodies are, and a stabilised step starts with
+    the velocity (w − u)/τ that goes to the predictor w, by the rows of the places at its begin:
+    contact takes from the nodes that hit their velocity along the normal. All is collective.
 
     Args:
         F: Residual F(u; v) without inertia. Internal variables are those at the begin of the step.
@@ -472,6 +478,7 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
         given = {"mass": mass, "velocity": velocity, **flags, **others}
         super().__init__(F, u, bcs, contacts, decomposition, **given)
         self._newton_forms.inertia.motion.load = self._newton_forms.forces()
+        self._blows: list[Array] = []
 
     def _forms(
         self, a: ufl.Form, L: ufl.Form, V: fem.FunctionSpace, *options: Any
@@ -496,10 +503,28 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
             self._go_to_places(self._places)
         try:
             super()._set_out()
+            if self._places is not None and self._newton_forms.inertia.motion.size:
+                self._project_velocity()
         finally:
             if self._places is not None:
                 self._places.back()
         return super().solve()
+
+    def _project_velocity(self) -> None:
+        """Start the step with the velocity that goes to the prediction.
+
+        What a node keeps of the velocity with which it hits would work where normals turn. What
+        contact takes of the momentum is a blow, a part of its mean force over the step.
+        """
+        motion, predictor = self._newton_forms.inertia.motion, self._predictor
+        motion.start, self._blows = motion.v, []
+        if predictor is None or predictor.multipliers is None:
+            return
+        motion.start = (motion.towards - motion.u) / motion.size
+        forces = replace(predictor.multipliers, lam=predictor.multipliers.lam / motion.size**2)
+        w = self.dofs.to_primal(motion.towards)
+        struck = ContactProblem._make_solution(self, w, forces, self._system.gluing)
+        self._blows = [struck.contact(i).resultant.force for i in range(len(self.contacts))]
 
     def _set_out(self) -> None:
         """Do nothing: linearised problems share the prediction of their step."""
@@ -507,6 +532,9 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
     def _look(self) -> None:
         self._newton_forms.inertia.ends = self._newton_forms.forces()
         super()._look()
+        forces = self.report.contact_forces
+        for i, blow in enumerate(self._blows):
+            forces[i] = [a + float(b) for a, b in zip(forces[i], blow, strict=True)]
 
 
 def check_guided(contacts: Sequence[ContactPartner]) -> None:

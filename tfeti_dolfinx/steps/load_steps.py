@@ -503,6 +503,8 @@ class LoadSteps:
         report, solution = self._problem.report, self._problem.solution
         lost = self._comm.allreduce(float(np.sum(solution.dissipation)))
         contacts = [solution.contact(i) for i in range(len(solution.contacts))]
+        # of bodies with mass they have blows, too
+        forces = report.contact_forces or [list(c.resultant.force) for c in contacts]
         return StepRecord(
             number=number,
             time=t,
@@ -512,7 +514,7 @@ class LoadSteps:
             residuals=dict(report.residuals),
             seconds=report.seconds["total"],
             motion=dict(report.motion),
-            contact_forces=[list(map(float, contact.resultant.force)) for contact in contacts],
+            contact_forces=[list(map(float, force)) for force in forces],
             tools=self._problem.solution.tool_numbers,
         )
 
