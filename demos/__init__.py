@@ -1,4 +1,4 @@
-"""Demos: each is a script to copy. ``run`` and ``scene`` are for tests and benchmarks."""
+"""Demos: each is a script to copy. The functions here are for tests and benchmarks."""
 
 from __future__ import annotations
 
@@ -24,6 +24,14 @@ def run(name: str, arguments: Sequence[object] = ()) -> tuple[Any, Any]:
     problem = _executed(name, arguments)["problem"]
     problem.destroy()
     return problem.solution, problem.report
+
+
+def steps_of(name: str, arguments: Sequence[object] = ()) -> list[tfeti.StepRecord]:
+    """Run a demo of load steps in this process; the records of its steps. Collective."""
+    names = _executed(name, arguments)
+    names["problem"].destroy()
+    found: list[tfeti.StepRecord] = names["records"]
+    return found
 
 
 def scene(

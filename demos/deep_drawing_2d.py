@@ -138,7 +138,13 @@ def sheet_problem(bcs, contacts):
 problem = sheet_problem([fem.dirichletbc(0.0, axis, V.sub(0))], contacts)
 stroke, steps = (2.0, 2) if arguments.quick else (18.0, arguments.steps)
 depths = stroke * np.arange(1, steps + 1) / steps
-records = tfeti.LoadSteps(problem, lambda problem, t: None, depths).run()
+folder, records, pictures = arguments.output or Path("results"), [], []
+for before, depth in zip([0.0, *depths], depths, strict=False):
+    records += tfeti.LoadSteps(problem, lambda problem, t: None, [depth], begin=before).run()
+    if arguments.plot:
+        pictures.append(folder / f"deep_drawing_2d_{len(pictures)}.png")
+        looks = {"factor": 1.0, "highest": 600.0, "zoom": 1.2, "unit": "MPa"}
+        tfeti.plot_deformed(pictures[-1], problem.solution, **looks)
 # -
 
 # ## Balance
@@ -152,7 +158,7 @@ def total(form):
     return comm.allreduce(fem.assemble_scalar(fem.form(form)))
 
 
-d = np.array([0.0, *depths])
+d = np.array([0.0, *(record.time for record in records)])
 force = np.array([0.0, *(-record.contact_forces[0][1] for record in records)])
 lift = records[-1].tools["holder displacement y"]
 work = float(np.sum(0.5 * (force[1:] + force[:-1]) * np.diff(d))) - holding * lift
@@ -177,10 +183,6 @@ if comm.rank == 0:
         f"work {work:.0f} = friction {friction:.0f} + flow {flow:.0f} + elastic {kept:.0f} "
         f"{errors['balance_of_work']:+.1%}"
     )
-if arguments.plot:
-    path = (arguments.output or Path("results")) / "deep_drawing_2d.png"
-    looks = {"factor": 1.0, "highest": 600.0, "zoom": 1.2, "unit": "MPa"}
-    tfeti.plot_deformed(path, problem.solution, **looks)
 # -
 
 # ## Springback
@@ -221,23 +223,29 @@ free.destroy()
 # +
 if arguments.output:
     tfeti.write_vtx(arguments.output / "deep_drawing_2d.bp", problem.solution)
-if arguments.plot:
-    folder = arguments.output or Path("results")
-    if comm.rank == 0:
-        from matplotlib.figure import Figure
+if arguments.plot and comm.rank == 0:
+    from matplotlib.figure import Figure
+    from PIL import Image
 
-        figure = Figure(figsize=(10, 4), layout="constrained")
-        left, right = figure.subplots(1, 2)
-        left.plot(d, force, "o-")
-        left.set(xlabel="depth in mm", ylabel="force of half the punch in N a mm")
-        for name, (lower, upper) in {"pressed": pressed, "without tools": sprung}.items():
-            right.plot(*np.vstack((lower, upper[::-1])).T, label=name)
-        far = length - at
-        for tool, long, shift in ((punch, width, -stroke), (die, far, 0.0), (holder, far, lift)):
-            right.plot(*tool.shape.outline(long, shift), color="grey")
-        right.set(xlabel="x in mm", ylabel="y in mm")
-        right.legend()
-        figure.savefig(folder / "deep_drawing_2d_force.png")
+    frames = [Image.open(path).resize((600, 450)) for path in pictures]
+    path, more = folder / "deep_drawing_2d.gif", frames[1:]
+    frames[0].save(path, save_all=True, append_images=more, duration=250, loop=0)
+    pictures[-1].replace(folder / "deep_drawing_2d.png")
+    for path in pictures[:-1]:
+        path.unlink()
+
+    figure = Figure(figsize=(10, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    left.plot(d, force, "o-")
+    left.set(xlabel="depth in mm", ylabel="force of half the punch in N a mm")
+    for name, (lower, upper) in {"pressed": pressed, "without tools": sprung}.items():
+        right.plot(*np.vstack((lower, upper[::-1])).T, label=name)
+    far = length - at
+    for tool, long, shift in ((punch, width, -stroke), (die, far, 0.0), (holder, far, lift)):
+        right.plot(*tool.shape.outline(long, shift), color="grey")
+    right.set(xlabel="x in mm", ylabel="y in mm")
+    right.legend()
+    figure.savefig(folder / "deep_drawing_2d_force.png")
 if arguments.report:
     problem.report.write(arguments.report, comm)
 if comm.rank == 0:

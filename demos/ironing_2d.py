@@ -97,7 +97,7 @@ problem = tfeti.NonlinearContactProblem(
 # ## Down, then along
 #
 # In a load step friction acts on what slips since its begin, along tangents that turn with
-# the surface.
+# the surface. With `--plot` a picture is drawn after every step.
 
 # +
 down, along = (2, 1) if arguments.quick else (5, arguments.steps)
@@ -108,7 +108,12 @@ def move(problem, t):
     place.value = (stride * max(t - down, 0.0), -0.5 * min(t / down, 1.0))
 
 
-records = tfeti.LoadSteps(problem, move, np.arange(1.0, down + along + 1)).run()
+folder, records, pictures = arguments.output or Path("results"), [], []
+for t in np.arange(1.0, down + along + 1):
+    records += tfeti.LoadSteps(problem, move, [t], begin=t - 1.0).run()
+    if arguments.plot:
+        pictures.append(folder / f"ironing_2d_{len(pictures)}.png")
+        tfeti.plot_deformed(pictures[-1], problem.solution, factor=1.0, highest=0.6)
 # -
 
 # ## Forces on the slab
@@ -130,19 +135,24 @@ if comm.rank == 0:
 # +
 if arguments.output:
     tfeti.write_vtx(arguments.output / "ironing_2d.bp", problem.solution)
-if arguments.plot:
-    folder = arguments.output or Path("results")
-    tfeti.plot_deformed(folder / "ironing_2d.png", problem.solution, factor=1.0)
-    if comm.rank == 0:
-        from matplotlib.figure import Figure
+if arguments.plot and comm.rank == 0:
+    from matplotlib.figure import Figure
+    from PIL import Image
 
-        figure = Figure(layout="constrained")
-        axes = figure.subplots()
-        axes.plot(-forces[:, 1], "o-", label="pressed down")
-        axes.plot(forces[:, 0], "o-", label="drawn along")
-        axes.set(xlabel="load step", ylabel="force on the slab")
-        axes.legend()
-        figure.savefig(folder / "ironing_2d_force.png")
+    frames = [Image.open(path).resize((600, 450)) for path in pictures]
+    path, more = folder / "ironing_2d.gif", frames[1:]
+    frames[0].save(path, save_all=True, append_images=more, duration=250, loop=0)
+    pictures[-1].replace(folder / "ironing_2d.png")
+    for path in pictures[:-1]:
+        path.unlink()
+
+    figure = Figure(layout="constrained")
+    axes = figure.subplots()
+    axes.plot(-forces[:, 1], "o-", label="pressed down")
+    axes.plot(forces[:, 0], "o-", label="drawn along")
+    axes.set(xlabel="load step", ylabel="force on the slab")
+    axes.legend()
+    figure.savefig(folder / "ironing_2d_force.png")
 if arguments.report:
     problem.report.write(arguments.report, comm)
 if comm.rank == 0:

@@ -115,6 +115,7 @@ lowest = moved[np.linalg.norm(x, axis=1) < 1e-8 * R, 2]
 imprint = comm.allreduce(float(lowest.min(initial=np.inf)), op=MPI.MIN)
 problem.report.errors["imprint"] = imprint / most
 forces = np.array([record.contact_forces[0][2] for record in records])
+depths = np.interp([record.time for record in records], times, depths)  # with halved steps
 hertz = 4 / 3 * modulus * np.sqrt(R) * depths**1.5
 if comm.rank == 0:
     first = np.pi**3 * R**2 * (1.6 * strength) ** 3 / (6 * modulus**2)

@@ -99,13 +99,20 @@ def press(problem, d):
 
 steps = arguments.steps or (2 if arguments.quick else 8)
 depths = 0.4 * R * np.arange(1, steps + 1) / steps
-records = tfeti.LoadSteps(problem, press, depths).run()
+folder, records, pictures = arguments.output or Path("results"), [], []
+for before, depth in zip([0.0, *depths], depths, strict=False):
+    records += tfeti.LoadSteps(problem, press, [depth], begin=before).run()
+    if arguments.plot:
+        pictures.append(folder / f"rubber_pressed_3d_{len(pictures)}.png")
+        looks = {"factor": 1.0, "view": (0.3, -1.0, -0.4), "highest": 0.4}
+        tfeti.plot_deformed(pictures[-1], problem.solution, **looks)
 # -
 
 # ## Comparison with Hertz
 
 # +
 forces = np.array([record.contact_forces[0][2] for record in records])
+depths = np.array([record.time for record in records])  # with those of halved steps
 hertz = 4 / 3 * E / (1 - nu**2) * np.sqrt(R) * depths**1.5
 problem.report.errors["force_of_the_first_step"] = float(forces[0] / hertz[0] - 1)
 if comm.rank == 0:
@@ -122,20 +129,24 @@ if comm.rank == 0:
 # +
 if arguments.output:
     tfeti.write_vtx(arguments.output / "rubber_pressed_3d.bp", problem.solution)
-if arguments.plot:
-    folder = arguments.output or Path("results")
-    path, view = folder / "rubber_pressed_3d.png", (0.3, -1.0, -0.4)
-    tfeti.plot_deformed(path, problem.solution, factor=1.0, view=view)
-    if comm.rank == 0:
-        from matplotlib.figure import Figure
+if arguments.plot and comm.rank == 0:
+    from matplotlib.figure import Figure
+    from PIL import Image
 
-        figure = Figure(layout="constrained")
-        axes = figure.subplots()
-        axes.plot([0, *depths], [0, *forces], "o-", label="neo-Hooke")
-        axes.plot([0, *depths], [0, *hertz], label="Hertz")
-        axes.set(xlabel="displacement / R", ylabel="force / E R²")
-        axes.legend()
-        figure.savefig(folder / "rubber_pressed_3d_force.png")
+    frames = [Image.open(path).resize((600, 450)) for path in pictures]
+    path, more = folder / "rubber_pressed_3d.gif", frames[1:]
+    frames[0].save(path, save_all=True, append_images=more, duration=250, loop=0)
+    pictures[-1].replace(folder / "rubber_pressed_3d.png")
+    for path in pictures[:-1]:
+        path.unlink()
+
+    figure = Figure(layout="constrained")
+    axes = figure.subplots()
+    axes.plot([0, *depths], [0, *forces], "o-", label="neo-Hooke")
+    axes.plot([0, *depths], [0, *hertz], label="Hertz")
+    axes.set(xlabel="displacement / R", ylabel="force / E R²")
+    axes.legend()
+    figure.savefig(folder / "rubber_pressed_3d_force.png")
 if arguments.report:
     problem.report.write(arguments.report, comm)
 if comm.rank == 0:

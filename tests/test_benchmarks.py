@@ -10,6 +10,7 @@ from benchmarks import (
     ablation,
     kplus_forms,
     linear_price,
+    nonlinear_steps,
     profiles,
     scaling,
     solver_profiles,
@@ -73,6 +74,15 @@ def test_ablation(serial_only, tmp_path):
     assert len(tables["Multiplications"]) == len(tables["Change of u"]) == 2
     assert all(float(row["kept_directions"]) < 1e-4 for row in tables["Change of u"])
     assert "smooth_displacements" in page.read_text()
+
+
+def test_costs_of_load_steps(comm, shared_tmp):
+    """A row of a demo, whose means are those of its steps."""
+    given = ["--quick", "--only", "ironing_2d", "--output", str(shared_tmp)]
+    (row,) = nonlinear_steps.main(given)["Load steps of nonlinear demos"]
+    assert row["load steps"] == 3
+    assert 1.0 <= float(row["tangents"]) <= float(row["Newton steps"])
+    assert 0.0 < float(row["F"]) <= row["F at most"]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,85 @@
+"""What a load step of the nonlinear demos costs: Newton steps, multiplications, factorisations.
+
+    ./run python3 -m benchmarks.nonlinear_steps [--quick] [--only DEMO ...]
+
+Results go to results/nonlinear_steps.md and .json.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import petsc4py
+
+if __name__ == "__main__":
+    petsc4py.init(sys.argv[:1])
+
+import numpy as np
+from mpi4py import MPI
+
+from benchmarks.tools import Tables, command_line, markdown, write_documents, write_tables
+from demos import steps_of
+
+DEMOS = (
+    "plastic_indentation_2d",
+    "plastic_hertz_3d",
+    "deep_drawing_2d",
+    "rubber_pressed_3d",
+    "ironing_2d",
+    "ironing_3d",
+)
+# of a step's figures: the columns of their means
+COUNTS = {
+    "newton_steps": "Newton steps",
+    "assemblies": "tangents",
+    "F_multiplications": "F",
+    "preconditioner_multiplications": "S",
+}
+
+
+def row(name: str, words: list[str]) -> dict[str, Any]:
+    """Row of a demo: means over its load steps, and the most F of one."""
+    figures = [record.figures for record in steps_of(name, words)]
+    subdomains = figures[0]["subdomains"]
+    means = {
+        column: float(np.mean([step[count] for step in figures]))
+        for count, column in COUNTS.items()
+    }
+    factors = float(np.mean([step["factorizations"] for step in figures])) / subdomains
+    return {
+        "demo": f"`{name}`",
+        "unknowns": figures[0]["primal_dofs"],
+        "subdomains": subdomains,
+        "load steps": len(figures),
+        **{column: f"{mean:.1f}" for column, mean in means.items()},
+        "F at most": max(step["F_multiplications"] for step in figures),
+        "F a Newton step": f"{means['F'] / means['Newton steps']:.1f}",
+        "factorisations a subdomain": f"{factors:.1f}",
+    }
+
+
+def main(argv: list[str]) -> Tables:
+    """Run the demos; returns their table."""
+    arguments, options = command_line(__doc__, argv, configure)
+    words = [*(["--quick"] if arguments.quick else []), *options]
+    rows = []
+    for name in arguments.only or DEMOS:
+        rows.append(row(name, words))
+        if MPI.COMM_WORLD.rank == 0:
+            print(markdown(rows[-1:]).splitlines()[-1], flush=True)
+    tables = {"Load steps of nonlinear demos": rows}
+    if MPI.COMM_WORLD.rank == 0:
+        write_tables(arguments.output, "nonlinear_steps", tables)
+        if arguments.document:
+            write_documents("nonlinear_steps", tables, arguments.document)
+    return tables
+
+
+def configure(parser: Any) -> None:
+    """Arguments of this benchmark."""
+    parser.add_argument("--only", nargs="+", choices=DEMOS, help="demos")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
