@@ -138,7 +138,7 @@ def test_on_a_full_disk_nothing_is_lost(solution, comm, shared_tmp):
         write(shared_tmp / name, solution)
         before = left_in(shared_tmp, comm)
         for size in (0, 20000):
-            with full(size), pytest.raises(InputError, match=f"cannot write .*{name}.*too large"):
+            with full(size), pytest.raises(InputError, match=r"cannot write .*out.*too large"):
                 write(shared_tmp / name, solution)
             assert left_in(shared_tmp, comm) == before
             assert not list(shared_tmp.glob(".*"))

@@ -8,8 +8,9 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,7 @@ from tfeti_dolfinx.solution import Solution
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 WRITERS = {".bp": "write_vtx", ".xdmf": "write_xdmf", ".pvd": "write_pvd"}
 LITTLE = 2**14  # bytes, more than what a file without fields takes
+POINTS = "points of the mesh"
 
 
 def write_vtx(
@@ -60,20 +62,7 @@ def write_vtx(
     target = checked_target(path, ".bp", solution, interior)
     if not dolfinx.has_adios2:
         return write_xdmf(target.with_suffix(".xdmf"), solution, interior)
-    cells = target.with_name(f"{target.stem}_cells.bp")
-    files: list[VtxFile] = []
-    try:
-        for name, functions in zip((target, cells), _fields(solution, interior), strict=True):
-            files.append(VtxFile(name, functions))
-            files[-1].write(0.0)
-            files[-1].close()
-    except TfetiError:  # on all ranks
-        for file in files:
-            file.drop()
-        raise
-    for file in files:
-        file.appear()
-    return [target, cells]
+    return _one_step(target, solution, interior)
 
 
 def write_xdmf(
@@ -97,8 +86,8 @@ def write_xdmf(
     """
     target = checked_target(path, ".xdmf", solution, interior)
     comm, mesh = solution.decomposition.comm, solution.decomposition.mesh
-    of_nodes, of_cells = _fields(solution, interior)
-    functions = [_as_geometry(f, solution.decomposition) for f in of_nodes + of_cells]
+    changing = chain(*changing_fields(solution, interior), cell_fields(solution))
+    functions = [_as_geometry(f, solution.decomposition) for f in changing]
     companion = target.with_suffix(".h5")
     folder = begin_file(target.with_name(f"{target.stem}.folder"), comm, is_folder=True)
     try:
@@ -140,17 +129,18 @@ def write_pvd(
             where the disk is full; then what was there before stays.
     """
     target = checked_target(path, ".pvd", solution, interior)
-    of_nodes, of_cells = _fields(solution, interior)
-    file: PvdFile | None = None
+    return _one_step(target, solution, interior)
+
+
+def _one_step(target: Path, solution: Solution, interior: bool) -> list[Path]:
+    """Write a series of one step; return the files."""
+    series = Series(target, solution, interior)
     try:
-        file = PvdFile(target, of_nodes + of_cells)
-        file.write(0.0)
-        file.close()
+        series.write(0.0, fields_of(solution, interior))
+        return series.close()
     except TfetiError:  # on all ranks
-        if file is not None:
-            file.drop()
+        series.drop()
         raise
-    return file.appear()
 
 
 class PvdFile:
@@ -247,9 +237,10 @@ class VtxFile:
             self._of_library(self._vtx.close)
         self._open = False
 
-    def appear(self) -> None:
+    def appear(self) -> list[Path]:
         """Give the file its name, in the place of what has it."""
         end_file(self.partial, self._name, self._comm)
+        return [self._name]
 
     def drop(self) -> None:
         """Remove the file under the name that it has until it is whole."""
@@ -265,6 +256,95 @@ class VtxFile:
         except TfetiError:
             self._open = False
             raise
+
+
+class Series:
+    """Nodal fields of steps, and cell fields beside them. Creation and all methods are collective.
+
+    Files are written under names with ``.partial`` at the end; ``close`` gives them theirs. An
+    InputError is raised where nothing can be written there.
+
+    Args:
+        target: A name that ends with ``.bp``, cell fields go to ``<stem>_cells.bp``; or with
+            ``.pvd``, which has all fields.
+        solution: A solution of the problem: its mesh and which fields there are.
+        interior: Whether the fields of ``solution.interior`` are written, too: those of cells at
+            each step, other cell fields are always the same.
+    """
+
+    def __init__(self, target: Path, solution: Solution, interior: bool = False) -> None:
+        self._name, self._mesh = target, solution.decomposition.mesh
+        nodal, cellwise = (
+            [fem.Function(f.function_space, name=f.name) for f in fields]
+            for fields in changing_fields(solution, interior)
+        )
+        self._functions = nodal + cellwise
+        self._count, self._ended = 0, False
+        self._files: list[VtxFile | PvdFile] = []
+        of_cells = cell_fields(solution) + cellwise
+        try:
+            if target.suffix == ".pvd":
+                self._files.append(PvdFile(target, nodal + of_cells))
+            else:
+                self._files.append(VtxFile(target, nodal))
+                beside = target.with_name(f"{target.stem}_cells.bp")
+                self._files.append(VtxFile(beside, of_cells))
+            self._growing = self._files if cellwise else self._files[:1]
+            if len(self._growing) < len(self._files):
+                self._files[1].write(0.0)
+                self._files[1].close()
+        except TfetiError:  # on all ranks
+            self.drop()
+            raise
+
+    def write(self, time: float, values: Mapping[str, Array]) -> None:
+        """Add a step from what ``fields_of`` returned for it, in this run or an earlier one.
+
+        Raise an InputError where a field is not there, as of an earlier run that wrote fewer, or
+        the files cannot be written: then they end, whole, with the step before, under the names
+        that they have until ``close``.
+        """
+        points = self._mesh.geometry.x.copy()
+        for function in self._functions:
+            if function.name not in values:
+                raise InputError(
+                    f"the step at {time:.6g} of the checkpoint has no field {function.name}; "
+                    "expected interior= as in the run that has written it"
+                )
+            function.x.array[:] = values[function.name].ravel()
+        self._mesh.geometry.x[:] = values[POINTS]
+        try:
+            for file in self._growing:
+                file.write(time)
+        except TfetiError as error:  # on all ranks
+            self._ended = True
+            if not self._count:
+                self.drop()
+                raise
+            for file in self._files:
+                with suppress(TfetiError):
+                    file.close()
+            error.add_note(
+                f"the {self._count} steps before are in {self._files[0].partial}; "
+                f"{self._name} is as it was"
+            )
+            raise
+        finally:
+            self._mesh.geometry.x[:] = points
+        self._count += 1
+
+    def close(self) -> list[Path]:
+        """Give the files their names, but not where they could not be written; return them."""
+        if self._ended:
+            return []
+        for file in self._files:
+            file.close()
+        return [name for file in self._files for name in file.appear()]
+
+    def drop(self) -> None:
+        """Remove the files under the names that they have until ``close``."""
+        for file in self._files:
+            file.drop()
 
 
 def nodal_fields(solution: Solution) -> list[fem.Function]:
@@ -303,10 +383,19 @@ def cell_fields(solution: Solution) -> list[fem.Function]:
     return fields
 
 
-def _fields(solution: Solution, interior: bool) -> tuple[list[fem.Function], list[fem.Function]]:
-    """Nodal fields and cell fields. Collective."""
+def changing_fields(
+    solution: Solution, interior: bool
+) -> tuple[list[fem.Function], list[fem.Function]]:
+    """Nodal fields, and those of cells that change from step to step. Collective."""
     of_nodes, of_cells = solution.interior.fields if interior else ([], [])
-    return nodal_fields(solution) + of_nodes, cell_fields(solution) + of_cells
+    return nodal_fields(solution) + of_nodes, of_cells
+
+
+def fields_of(solution: Solution, interior: bool = False) -> dict[str, Array]:
+    """Fields of a step by name, and where the mesh is. Collective."""
+    fields = chain(*changing_fields(solution, interior))
+    values = {f.name: np.array(f.x.array) for f in fields}
+    return {**values, POINTS: np.array(solution.decomposition.mesh.geometry.x)}
 
 
 def _cell_function(W: fem.FunctionSpace, name: str, values: Array) -> fem.Function:

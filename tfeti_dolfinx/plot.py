@@ -26,8 +26,11 @@ from tfeti_dolfinx.common.validation import (
     checked_number,
     checked_path,
     checked_type,
+    checked_vector,
     named,
     shown,
+    values_at,
+    written_whole,
 )
 from tfeti_dolfinx.constraints.contact_state import ContactStatus
 from tfeti_dolfinx.contact.obstacle import Obstacle
@@ -189,7 +192,7 @@ def plot_pressure(
             checked_number(limit, "limit", POSITIVE)
     data = solution.contact(contact)
     with raised_on_all_ranks(comm):
-        x = _coordinates(coordinate, data.points)
+        x = values_at(coordinate, data.points, data.pressure.shape, "coordinate of")
     parts = comm.gather((x, data.pressure), root=0)
     with raised_on_all_ranks(comm), named(f"cannot write {target}"):
         if comm.rank == 0 and parts is not None:
@@ -255,27 +258,11 @@ def check_screen() -> None:
         )
 
 
-def _coordinates(coordinate: Callable[[Array], Array], points: Array) -> Array:
-    """Return the coordinate of each point."""
-    with named(f"coordinate of points of shape {points.shape}"):
-        x = np.asarray(coordinate(points), dtype=float)
-    if x.shape != (len(points),):
-        raise InputError(
-            f"coordinate of points of shape {points.shape} has the shape {x.shape}; expected "
-            f"({len(points)},)"
-        )
-    return x
-
-
-def _vector(values: tuple[float, float, float] | None, what: str) -> Array:
+def _vector(values: Any, what: str) -> Array:
     """Three numbers, nan if they are not given."""
     if values is None:
         return np.full(3, np.nan)
-    with named(f"{what}={shown(values)}, expected three finite numbers"):
-        vector = np.array(values, dtype=float)
-    if vector.shape != (3,) or not np.all(np.isfinite(vector)):
-        raise InputError(f"{what}={shown(values)}: expected three finite numbers")
-    return vector
+    return checked_vector(values, what, [3], "three finite numbers")
 
 
 def _pair(cut: Any) -> Array:
@@ -376,18 +363,15 @@ def _obstacles(solution: Solution, points: Array, moved: Array) -> dict[str, Arr
 
 def _draw(target: Path, data: dict[str, object]) -> None:
     """Let a process of its own draw; the picture appears whole."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(f".partial-{target.name}")
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder, written_whole(target) as partial:
         file = Path(folder) / "scene.npz"
         np.savez(file, **data)  # type: ignore[arg-type]
         command = [sys.executable, draw.__file__, str(file), str(partial)]
         result = subprocess.run(
             command, capture_output=True, text=True, timeout=SECONDS, check=False
         )
-    if result.returncode != 0 or not partial.exists():
-        raise TfetiError(f"{target} could not be drawn:\n{result.stderr[-2000:]}")
-    os.replace(partial, target)
+        if result.returncode != 0 or not partial.exists():
+            raise TfetiError(f"{target} could not be drawn:\n{result.stderr[-2000:]}")
 
 
 STATUS = {
@@ -416,15 +400,8 @@ def _draw_status(
     axes.margins(0.15)
     axes.set(xlabel=labels[0], ylabel=labels[1])
     axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    _save(target, figure)
-
-
-def _save(target: Path, figure: Any) -> None:
-    """Write a figure; it appears whole."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(f".partial-{target.name}")
-    figure.savefig(partial)
-    os.replace(partial, target)
+    with written_whole(target) as partial:
+        figure.savefig(partial)
 
 
 def _draw_curve(
@@ -447,4 +424,5 @@ def _draw_curve(
         axes.plot(fine, closed_form(fine), "-", linewidth=1, label="closed form")
     axes.set(xlabel=labels[0], ylabel=labels[1])
     axes.legend()
-    _save(target, figure)
+    with written_whole(target) as partial:
+        figure.savefig(partial)

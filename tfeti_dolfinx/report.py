@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import resource
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
@@ -14,8 +13,8 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array, sum_rows
-from tfeti_dolfinx.common.parallel import summed
-from tfeti_dolfinx.common.validation import named
+from tfeti_dolfinx.common.parallel import largest, summed
+from tfeti_dolfinx.common.validation import named, written_whole
 from tfeti_dolfinx.constraints.contact_state import ContactStatus
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.errors import raised_on_all_ranks
@@ -275,7 +274,7 @@ class Outcome:
             converged_reason=result.reason.name,
             peak_memory_mb=peak_memory_mb(dual.coarse.comm),
             residuals=_residuals(solution, dual, result, accuracy) | {"friction": settling.change},
-            tolerances=_tolerances(solution, dual, accuracy) | {"friction": settling.tolerance},
+            tolerances=_tolerances(solution, accuracy) | {"friction": settling.tolerance},
             estimates=estimates,
             tools=[str(solution.tool(i)) for i in range(len(solution.tool_motions))],
         )
@@ -395,15 +394,8 @@ class Report(Outcome, SolverCounts, StageCounts, Sizes):
         """
         with raised_on_all_ranks(comm), named(f"cannot write {path}", OSError):
             if comm.rank == 0:
-                target = Path(path)
-                target.parent.mkdir(parents=True, exist_ok=True)
-                partial = target.with_name(f".{target.name}.partial")
-                partial.write_text(self.to_json() + "\n")
-                try:
-                    os.replace(partial, target)
-                except OSError:
-                    partial.unlink()
-                    raise
+                with written_whole(Path(path)) as partial:
+                    partial.write_text(self.to_json() + "\n")
 
 
 def _item(item: str | list[float] | dict[str, Any]) -> str:
@@ -453,7 +445,8 @@ def _local_operators(dual: Dual) -> dict[str, float]:
 def _residuals(
     solution: Solution, dual: Dual, result: QPResult, accuracy: Accuracy
 ) -> dict[str, float]:
-    reference, gap, rows = result.reference or 1.0, solution.remaining_gap, solution.gluing.contact
+    comm, gap, rows = solution.dofs.comm, solution.remaining_gap, solution.gluing.contact
+    reference = result.reference or 1.0
     # of a set of one's own, as of glue that lets go, a force may pull, across a gap too
     missing = dual.feasible.project(solution.lam) - solution.lam
     missing = rows.scale * missing[solution.gluing.constraints.sets.normals]
@@ -465,29 +458,25 @@ def _residuals(
         "equilibrium": result.norm * result.equality / reference,
         "displacement_error": accuracy.relative_error(),
         "energy_error": accuracy.energy_error()[0],
-        "gluing_jump": _largest(dual, _jumps(solution)),
-        "penetration": _largest(dual, -gap),
-        "tension": _largest(dual, tension),
-        "complementarity": _largest(dual, np.abs(solution.force * gap)[closed]),
+        "gluing_jump": largest(comm, _jumps(solution)),
+        "penetration": largest(comm, np.minimum(gap, 0.0)),
+        "tension": largest(comm, np.maximum(tension, 0.0)),
+        "complementarity": largest(comm, (solution.force * gap)[closed]),
         "balance": accuracy.measures.balance,
     }
 
 
-def _tolerances(solution: Solution, dual: Dual, accuracy: Accuracy) -> dict[str, float]:
-    allowed = accuracy.tolerances()
+def _tolerances(solution: Solution, accuracy: Accuracy) -> dict[str, float]:
+    comm, allowed = solution.dofs.comm, accuracy.tolerances()
     return {
         "displacement_error": accuracy.rtol,
         "energy_error": accuracy.energy_error()[1],
         "gluing_jump": allowed.jump,
         "penetration": allowed.jump,
         "tension": 0.0,
-        "complementarity": _largest(dual, solution.force) * allowed.jump,
+        "complementarity": largest(comm, np.maximum(solution.force, 0.0)) * allowed.jump,
         "balance": allowed.balance,
     }
-
-
-def _largest(dual: Dual, values: Array) -> float:
-    return float(dual.coarse.comm.allreduce(float(np.max(values, initial=0.0)), op=MPI.MAX))
 
 
 def _jumps(solution: Solution) -> Array:

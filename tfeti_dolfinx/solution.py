@@ -64,13 +64,6 @@ def checked_points(points: Any, gdim: int) -> Array:
     return found
 
 
-def in_space(points: Array) -> Array:
-    """Return points with three coordinates."""
-    x = np.zeros((len(points), 3))
-    x[:, : points.shape[1]] = points
-    return x
-
-
 def value_row(u: Array, stress: Array) -> Array:
     """Return a row for each point: 1, displacement and stress."""
     return np.column_stack((np.ones(len(u)), u, stress.reshape(len(u), u.shape[1] ** 2)))
@@ -94,6 +87,9 @@ class Solution(ContactState):
         contacts: The contacts with their sides decided: ``contacts[i].surfaces[0]`` has the
             multipliers and the pressure.
         v: Velocity in DOLFINx's order of bodies with mass, else None.
+        has_stress: True if the problem was given a stress.
+        has_contact: True if the problem has contacts.
+        has_friction: True if a contact of the problem has friction.
         tool_motions: Where rigid bodies are.
     """
 
@@ -110,7 +106,9 @@ class Solution(ContactState):
         super().__init__(u, multipliers, decomposition, gluing, contacts, frozen(thickness))
         self.v: Array | None = None
         self.boundary: Any = None
-        self._stress_of = stress
+        self._stress_of, self.has_stress = stress, stress is not None
+        self.has_contact = bool(contacts)
+        self.has_friction = any(contact.friction is not None for contact in contacts)
 
     @cached_property
     def displacement(self) -> fem.Function:
@@ -150,7 +148,7 @@ class Solution(ContactState):
         mesh, u = self.decomposition.mesh, self.displacement
         with agreeing(self.dofs.comm, "at") as given:
             points = given["points"] = checked_points(points, mesh.geometry.dim)
-        (k, d), x = points.shape, in_space(points)
+        (k, d), x = points.shape, np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
         # cells of this rank, each with a point by its position
         nodes = mesh.geometry.x
         size = float(np.ptp(nodes, axis=0).max(initial=0.0)) if len(nodes) else 0.0
@@ -195,21 +193,6 @@ class Solution(ContactState):
         ``solution.to_pyvista().warp_by_vector("displacement").plot(scalars="pressure")`` draws it.
         """
         return plugin("to_pyvista")(self)
-
-    @property
-    def has_stress(self) -> bool:
-        """True if the problem was given a stress."""
-        return self._stress_of is not None
-
-    @property
-    def has_contact(self) -> bool:
-        """True if the problem has contacts."""
-        return bool(self.contacts)
-
-    @property
-    def has_friction(self) -> bool:
-        """True if a contact of the problem has friction."""
-        return any(contact.friction is not None for contact in self.contacts)
 
     @cached_property
     def stress(self) -> fem.Function:

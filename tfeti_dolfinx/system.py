@@ -117,7 +117,7 @@ class Settings:
             loads, modes = tools.loads, tools.mode
             rigid = [
                 RigidBlock(tools.bodies[i].name, loads[at], modes[at], tools.law.shape[1])
-                for i, at in tools.unknowns()
+                for i, at in tools.unknowns.items()
             ]
         count = len(tools.free_names) if tools else 0
         with added_options(self.prefix, self.factor_options):

@@ -15,7 +15,7 @@ from tfeti_dolfinx.bem.panels import Panels
 from tfeti_dolfinx.bem.steklov import Steklov, gunter, rigid_motions
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import geometry_dofmap
-from tfeti_dolfinx.solution import in_space, value_row
+from tfeti_dolfinx.solution import value_row
 
 # --- Somigliana's identity: displacement and stress inside ------------------------------------
 
@@ -325,5 +325,6 @@ class BoundarySolution:
                 cell, at = cells[there[first]], points[own]
                 middle = mesh.geometry.x[geometry_dofmap(mesh)[cell]].mean(axis=1)[:, :d]
                 sigma = body.inside.stress(at + PARAMETERS.beside * (middle - at)) / thickness
-                total[own] += value_row(u.eval(in_space(at), cell).reshape(-1, d), sigma)
+                x = np.pad(at, ((0, 0), (0, 3 - d)))
+                total[own] += value_row(u.eval(x, cell).reshape(-1, d), sigma)
         return total

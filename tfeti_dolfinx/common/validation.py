@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
+import os
 import reprlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass
 from numbers import Integral, Real
-from os import PathLike
 from pathlib import Path
 from typing import Any, TypeGuard
 
@@ -74,6 +74,20 @@ def real_numbers(values: Any) -> Array:
     return np.asarray(array, dtype=float)
 
 
+def checked_vector(values: Any, what: str, sizes: Sequence[int], expected: str) -> Array:
+    """Return finite numbers, as many as one of the sizes; a number is one of them.
+
+    Raise ``InputError: <what>=<values>: expected <expected>`` where they are not.
+    """
+    try:
+        vector = np.atleast_1d(real_numbers(values))
+    except (TypeError, ValueError):
+        vector = np.empty((0, 0))
+    if vector.ndim != 1 or len(vector) not in sizes or not np.all(np.isfinite(vector)):
+        raise InputError(f"{what}={shown(values)}: expected {expected}")
+    return vector
+
+
 def checked_flag(value: Any, what: str) -> bool:
     """Return a boolean, or numpy's, as a boolean; raise an InputError for anything else."""
     if not isinstance(value, (bool, np.bool_)):
@@ -96,11 +110,24 @@ def checked_callable(value: Any, what: str, expected: str) -> None:
 def checked_path(path: Any, *suffixes: str) -> Path:
     """Return a file's name with one of these endings; raise an InputError where it has none."""
     expected = f"a name that ends with {' or '.join(suffixes)}"
-    checked_type(path, (str, PathLike), "path", expected)
+    checked_type(path, (str, os.PathLike), "path", expected)
     target = Path(path)
     if target.suffix not in suffixes:
         raise InputError(f"{target}: expected {expected}")
     return target
+
+
+@contextmanager
+def written_whole(target: Path) -> Iterator[Path]:
+    """Give a name to write to inside the block; a whole file has the target's. Not collective."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_name(f".partial-{target.name}")
+    try:
+        yield partial
+        os.replace(partial, target)
+    except OSError:
+        partial.unlink(missing_ok=True)
+        raise
 
 
 @contextmanager
@@ -117,6 +144,22 @@ def named(what: str, *kinds: type[Exception]) -> Iterator[None]:
         if kinds and not isinstance(error, kinds):
             raise
         raise InputError(f"{what}: {type(error).__name__}: {error}") from error
+
+
+def values_at(
+    function: Callable[[Array], Any], x: Array, size: tuple[int, ...], what: str
+) -> Array:
+    """Return what a user's function gives at points, real numbers of a shape. Not collective.
+
+    Raise an InputError, ``<what> points of shape ...``, where it fails or gives another shape.
+    """
+    what = f"{what} points of shape {x.shape}"
+    with named(what):
+        values = real_numbers(function(x))
+    try:
+        return np.broadcast_to(values, size)
+    except ValueError:
+        raise InputError(f"{what} has the shape {values.shape}; expected {size}") from None
 
 
 # --- Descriptions of parameters ---------------------------------------------------------------

@@ -15,6 +15,7 @@ from tfeti_dolfinx.common.validation import (
     FINITE,
     Range,
     checked_number,
+    checked_vector,
     real_numbers,
     shown,
 )
@@ -162,7 +163,11 @@ def with_friction(
                 f"{name}: {friction.what} has two values; expected one in the plane, where there "
                 "is one tangent"
             )
-        direction = _checked_direction(name, friction.direction)
+        expected = "three numbers, not all of them 0"
+        direction = checked_vector(friction.direction, f"{name}: direction", [3], expected)
+        if not np.any(direction):
+            raise InputError(f"{name}: direction={shown(friction.direction)}; expected {expected}")
+        direction = direction / np.linalg.norm(direction)
         with raised_on_all_ranks(dofs.comm):
             frame, left = aligned(records.frame, direction)
             if np.any(left < SEARCH.along):
@@ -194,18 +199,6 @@ def friction_values(
     if len(columns) < dofs.bs - 1:
         columns = columns * (dofs.bs - 1)
     return np.stack(columns, axis=1)
-
-
-def _checked_direction(name: str, direction: Any) -> Array:
-    try:
-        vector = np.array(direction, dtype=float)
-    except (TypeError, ValueError):
-        vector = np.empty(0)
-    if vector.shape != (3,) or not np.all(np.isfinite(vector)) or not np.any(vector):
-        raise InputError(
-            f"{name}: direction={shown(direction)}; expected three numbers, not all of them 0"
-        )
-    return np.asarray(vector / np.linalg.norm(vector))
 
 
 def _at_groups(what: str, function: fem.Function, dofs: TornDofs) -> Array:

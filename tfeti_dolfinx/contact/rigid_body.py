@@ -14,8 +14,8 @@ from tfeti_dolfinx.common.arrays import Array, ArrayLike
 from tfeti_dolfinx.common.validation import (
     checked_flag,
     checked_type,
+    checked_vector,
     named,
-    real_numbers,
     shown,
 )
 from tfeti_dolfinx.contact.shapes import Placed, Point, Shape, check_shape, point_of
@@ -72,17 +72,14 @@ class Pose:
     def rotation(self) -> Array:
         """Q, shape ``(gdim, gdim)``."""
         turn = rotation_vector(self.motion, len(self.point))
-        Q = Rotation.from_rotvec(turn).as_matrix() if self.finite else np.eye(3) + _cross(turn)
+        small = np.eye(3) + np.cross(turn, np.eye(3)).T  # a ↦ a + turn × a
+        Q = Rotation.from_rotvec(turn).as_matrix() if self.finite else small
         return np.asarray(Q[: len(self.point), : len(self.point)])
 
     def displacement(self, X: Array) -> Array:
         """Displacement of the body's points X, shape ``(n, gdim)``."""
         turned = (X - self.point) @ (self.rotation - np.eye(len(self.point))).T
         return np.asarray(self.motion[: len(self.point)] + turned)
-
-    def origin(self, x: Array) -> Array:
-        """Points of the body that are at x, shape ``(n, gdim)``."""
-        return np.asarray(x - self.way_to(x))
 
     def way_to(self, x: Array) -> Array:
         """Displacement of the body's points that are at x, shape ``(n, gdim)``."""
@@ -102,11 +99,6 @@ class Pose:
 def rotation_vector(motion: Array, gdim: int) -> Array:
     """Return the rotation vector of a motion, shape ``(3,)``."""
     return np.array((0.0, 0.0, motion[2])) if gdim == 2 else motion[:2:-1]
-
-
-def _cross(a: Array) -> Array:
-    """Return the matrix of a × ."""
-    return np.cross(a, np.eye(3)).T
 
 
 # --- Rigid bodies as a user gives them --------------------------------------------------------
@@ -211,7 +203,7 @@ class RigidBody:
         if self._pose is None:
             return x
         gdim, origin = len(self._pose.point), np.array(x)
-        origin[:gdim] = self._pose.origin(x[:gdim].T).T
+        origin[:gdim] -= self._pose.way_to(x[:gdim].T).T
         return origin
 
     def placed(self, pose: Pose | None) -> RigidBody:
@@ -227,35 +219,28 @@ class RigidBody:
         """Return the positions of the free motions among all."""
         return np.array([i for i, m in enumerate(MOTIONS[gdim]) if m in self.free], dtype=np.int64)
 
-    def law_motion(self, gdim: int, time: float) -> Array:
-        """Return the motion by the law, free ones 0, shape ``(k,)``.
+    def motion_and_load(self, gdim: int, time: float) -> tuple[Array, Array]:
+        """Return the motion by the law, free ones 0, and force and moment, both of shape ``(k,)``.
 
         Raises:
-            InputError: A value does not fit, or is of a free motion.
+            InputError: A value does not fit, a motion by the law is free, or a force acts on one
+                that is not free.
         """
-        return self._in_order(gdim, time, ("displacement", "rotation"), free=False)
-
-    def load(self, gdim: int, time: float) -> Array:
-        """Return force and moment, shape ``(k,)``.
-
-        Raises:
-            InputError: A value does not fit, or acts on a motion that is not free.
-        """
-        return self._in_order(gdim, time, ("force", "moment"), free=True)
-
-    def _in_order(self, gdim: int, time: float, names: Sequence[str], free: bool) -> Array:
-        """Return values of two laws in the order of ``MOTIONS``."""
-        first, second = (self._value(name, gdim, time) for name in names)
-        values = np.concatenate((first, second[::-1]))
-        allowed = np.isin(np.arange(len(values)), self.indices(gdim)) == free
-        if np.any(wrong := (values != 0.0) & ~allowed):
-            motion = MOTIONS[gdim][int(np.argmax(wrong))]
-            which, state = names[motion not in "xyz"], "not free" if free else "free"
-            raise InputError(
-                f"{self.name}: the {which} has a part along {motion}, which is {state} (free="
-                f"{self.free}); expected displacements of guided motions and forces on free ones"
-            )
-        return values
+        found = []
+        for names, free in ((("displacement", "rotation"), False), (("force", "moment"), True)):
+            first, second = (self._value(name, gdim, time) for name in names)
+            values = np.concatenate((first, second[::-1]))
+            allowed = np.isin(np.arange(len(values)), self.indices(gdim)) == free
+            if np.any(wrong := (values != 0.0) & ~allowed):
+                motion = MOTIONS[gdim][int(np.argmax(wrong))]
+                which, state = names[motion not in "xyz"], "not free" if free else "free"
+                raise InputError(
+                    f"{self.name}: the {which} has a part along {motion}, which is {state} (free="
+                    f"{self.free}); expected displacements of guided motions and forces on free "
+                    "ones"
+                )
+            found.append(values)
+        return found[0], found[1]
 
     def _value(self, name: str, gdim: int, time: float) -> Array:
         """Return the value of a law at a time."""
@@ -270,8 +255,4 @@ class RigidBody:
         elif callable(given):
             with named(f"{what} at time {time:.6g}"):
                 given = given(time)
-        with named(what, TypeError, ValueError):
-            found = np.atleast_1d(real_numbers(given))
-        if found.shape != (size,) or not np.all(np.isfinite(found)):
-            raise InputError(f"{what} is {shown(given)}; expected {size} finite number(s)")
-        return found
+        return checked_vector(given, what, [size], f"{size} finite number(s)")

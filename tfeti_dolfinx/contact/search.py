@@ -196,12 +196,10 @@ class ContactSearch:
         comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
         return bcast_from_root(comm, float(largest.sum()))
 
-    def _is_complete(self, i: int) -> bool:
-        """Return whether a wider search finds no more conditions: an obstacle has them all."""
-        return len(self.contacts[i].surfaces) == 1 or self._reach[i] >= self.length
-
     def _is_exhausted(self, i: int) -> bool:
-        return self._count(~self._records[i].within_reach) == 0 and self._is_complete(i)
+        """Return whether a contact has rows for all its nodes, and a wider search finds no more."""
+        has_all = len(self.contacts[i].surfaces) == 1 or self._reach[i] >= self.length
+        return has_all and self._count(~self._records[i].within_reach) == 0
 
     def _widen(self, i: int) -> int:
         """Increase the reach of one contact; return the number of new rows."""
@@ -210,7 +208,7 @@ class ContactSearch:
         found = self._records[i]
         before = self._count(found.within_reach)
         reach = max(SEARCH.wider * self._reach[i], SEARCH.least * self.length)
-        if not self._is_complete(i):
+        if len(self.contacts[i].surfaces) > 1 and self._reach[i] < self.length:
             found = self._search(i, reach)
         self._reach[i] = reach
         distance = found.gap if self._origin is None else found.geometric_gap

@@ -15,9 +15,10 @@ from tfeti_dolfinx.common.validation import (
     checked_callable,
     checked_flag,
     checked_number,
-    named,
+    checked_vector,
     real_numbers,
     shown,
+    values_at,
 )
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mortar.tolerances import SEARCH
@@ -41,10 +42,7 @@ class Shape(Protocol):
 
 def _vector(values: Point, what: str) -> Array:
     """Return a vector of three components from two or three."""
-    with named(f"{what}={values!r}, expected two or three finite numbers", TypeError, ValueError):
-        array = np.asarray(values, dtype=float)
-    if array.shape not in ((2,), (3,)) or not np.all(np.isfinite(array)):
-        raise InputError(f"{what}={values}: expected two or three finite numbers")
+    array = checked_vector(values, what, [2, 3], "two or three finite numbers")
     return np.pad(array, (0, 3 - len(array)))
 
 
@@ -219,25 +217,12 @@ def distance_and_gradient(shape: Shape, x: Array, what: str) -> tuple[Array, Arr
 
     Raise an InputError where a callable fails, or returns arrays of another shape.
     """
-    return _values_of(shape, "distance", x, what), _values_of(shape, "gradient", x, what)
-
-
-def _values_of(shape: Shape, method: str, x: Array, what: str) -> Array:
-    """Return what a method of a shape gives at points, one row for each."""
-    size = (len(x),) if method == "distance" else (3, len(x))
-    if len(x) == 0:
-        return np.zeros(size).T
-    points = np.zeros((3, len(x)))
-    points[: x.shape[1]] = x.T
-    with named(f"{what}: the {method} at points of shape {points.shape}"):
-        values = real_numbers(getattr(shape, method)(points))
-    try:
-        return np.broadcast_to(values, size).T
-    except ValueError:
-        raise InputError(
-            f"{what}: the {method} at points of shape {points.shape} has the shape "
-            f"{values.shape}; expected {size}"
-        ) from None
+    n, gdim = x.shape
+    if n == 0:
+        return np.zeros(0), np.zeros((0, 3))
+    points = np.pad(x.T, ((0, 3 - gdim), (0, 0)))
+    distance = values_at(shape.distance, points, (n,), f"{what}: the distance at")
+    return distance, values_at(shape.gradient, points, (3, n), f"{what}: the gradient at").T
 
 
 def check_placement(
@@ -267,7 +252,7 @@ def check_placement(
         nearest = np.argsort(np.abs(phi))[: SEARCH.samples]
         x, gradient, step = x[nearest], gradient[nearest, :gdim], SEARCH.difference * size
         ahead, behind = (
-            [_values_of(shape, "distance", x + shift, what) for shift in sign * np.eye(gdim)]
+            [distance_and_gradient(shape, x + shift, what)[0] for shift in sign * np.eye(gdim)]
             for sign in (step, -step)
         )
         slope = (np.array(ahead) - np.array(behind)).T / (2.0 * step)

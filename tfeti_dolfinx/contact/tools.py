@@ -85,6 +85,11 @@ class Tools:
         of_contact: Body of each contact, −1 without one.
         tool, mode: Body of each unknown, and its position in ``MOTIONS``.
         scale: What a motion of size 1 is as an unknown.
+        num_unknowns, num_local: Number of free motions of all bodies, and of those on this rank:
+            all or none.
+        unknowns: Of each body with free motions its unknowns.
+        free_names: Names of the bodies with free motions.
+        loads: Force and moment on the unknowns, shape ``(num_unknowns,)``.
         poses: Where each body was when contact was last searched.
         found: Motions of each body on top of that and of its law, of the last solve, shape
             ``(bodies, k)``; 0 but for free ones.
@@ -126,40 +131,20 @@ class Tools:
         count, k = len(self.bodies), len(MOTIONS.get(gdim, ()))
         self.tool = np.repeat(np.arange(count), [len(own) for own in free])
         self.mode = np.concatenate([np.zeros(0, dtype=np.int64), *free])
+        self.num_unknowns = len(self.tool)
+        self.num_local = self.num_unknowns if self._comm.rank == self._comm.size - 1 else 0
+        self.unknowns = {int(i): np.flatnonzero(self.tool == i) for i in np.unique(self.tool)}
+        self.free_names = [names[i] for i in self.unknowns]
         turns = self.mode >= gdim
         self.scale = np.where(turns, np.array([*lengths, 1.0])[self.tool], 1.0)
         self.law: Array = np.zeros((count, k))
         self.found: Array = np.zeros((count, k))
-        self._loads: Array = np.zeros((count, k))
+        self.loads: Array = np.zeros(self.num_unknowns)
         self.poses = [Pose(body.centre(gdim), np.zeros(k), body.large) for body in self.bodies]
         self.begin = list(self.poses)
 
     def __len__(self) -> int:
         return len(self.bodies)
-
-    @property
-    def num_unknowns(self) -> int:
-        """Number of free motions of all bodies."""
-        return len(self.tool)
-
-    @property
-    def num_local(self) -> int:
-        """Number of unknowns on this rank: all or none."""
-        return self.num_unknowns if self._comm.rank == self._comm.size - 1 else 0
-
-    @property
-    def free_names(self) -> list[str]:
-        """Names of the bodies with free motions."""
-        return [self.bodies[i].name for i, _ in self.unknowns()]
-
-    def unknowns(self) -> list[tuple[int, Array]]:
-        """Return each body with free motions, and its unknowns."""
-        return [(int(i), np.flatnonzero(self.tool == i)) for i in np.unique(self.tool)]
-
-    @property
-    def loads(self) -> Array:
-        """Force and moment on the unknowns, shape ``(num_unknowns,)``."""
-        return self._loads[self.tool, self.mode] / self.scale
 
     def read(self, time: float) -> ToolChanges:
         """Take the values that laws have at a time. Collective.
@@ -170,16 +155,16 @@ class Tools:
         if not self.bodies:
             return ToolChanges(False, False, False)
         with agreeing(self._comm, "laws of rigid bodies") as given:
-            law = np.array([body.law_motion(self._gdim, time) for body in self.bodies])
-            loads = np.array([body.load(self._gdim, time) for body in self.bodies])
+            both = [body.motion_and_load(self._gdim, time) for body in self.bodies]
             given["time"] = time
-            for body, *values in zip(self.bodies, law, loads, strict=True):
+            for body, values in zip(self.bodies, both, strict=True):
                 given[f"{body.name}: motion and load"] = values
-        law, loads = bcast_from_root(self._comm, (law, loads))
+        law, loads = bcast_from_root(self._comm, np.array(both).swapaxes(0, 1))
+        loads = loads[self.tool, self.mode] / self.scale
         moved = np.any(law != self.law, axis=1)
         large = np.array([body.large for body in self.bodies])
-        changed = bool(np.any(loads != self._loads))
-        self.law, self._loads = law, loads
+        changed = bool(np.any(loads != self.loads))
+        self.law, self.loads = law, loads
         return ToolChanges(bool(np.any(moved)), bool(np.any(moved & large)), changed)
 
     def place(self, finite: bool) -> None:
@@ -283,8 +268,8 @@ class Tools:
         """Return what ``motion`` was when the load step began, of the points that are there now."""
         motion = np.zeros_like(records.place)
         for body, own in self._conditions(records):
-            X = self.poses[body].origin(records.place[own])
-            motion[own] = self.begin[body].displacement(X)
+            x = records.place[own]
+            motion[own] = self.begin[body].displacement(x - self.poses[body].way_to(x))
         return motion
 
     def entries(self, records: ContactRecords) -> RigidEntries:
@@ -292,7 +277,7 @@ class Tools:
         none = np.zeros(0, dtype=np.int64)
         rows, columns, values = [none], [none], [np.zeros((0, records.place.shape[1]))]
         at = dict(self._conditions(records))
-        for body, unknowns in self.unknowns():
+        for body, unknowns in self.unknowns.items():
             own = at[body]
             fields = motion_fields(records.place[own] - self.poses[body].centre)
             for j in unknowns:

@@ -7,16 +7,14 @@ import logging
 import math
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
-from itertools import pairwise, zip_longest
-from pathlib import PurePath
+from itertools import chain, pairwise, zip_longest
 from typing import Any
 
 import dolfinx
 import numpy as np
-from dolfinx import fem
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.agreement import agreeing, check_same_problem
@@ -30,6 +28,7 @@ from tfeti_dolfinx.common.validation import (
     is_whole,
     named,
     shown,
+    written_whole,
 )
 from tfeti_dolfinx.errors import (
     ConvergenceError,
@@ -37,15 +36,7 @@ from tfeti_dolfinx.errors import (
     TfetiError,
     raised_on_all_ranks,
 )
-from tfeti_dolfinx.output import (
-    PvdFile,
-    VtxFile,
-    begin_file,
-    cell_fields,
-    checked_target,
-    end_file,
-    nodal_fields,
-)
+from tfeti_dolfinx.output import POINTS, Series, changing_fields, checked_target, fields_of
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.saved_state import (
     Table,
@@ -147,119 +138,12 @@ def shown_progress(comm: MPI.Intracomm, wanted: bool | None) -> Iterator[Show]:
         yield lambda share, text: bar.update(task, completed=share, said=text, refresh=True)
 
 
-# --- Output of all load steps in one file -----------------------------------------------------
-
-POINTS = "points of the mesh"
-
-
-class Series:
-    """Nodal fields of steps, and cell fields beside them. Creation and all methods are collective.
-
-    Files are written under names with ``.partial`` at the end; ``close`` gives them theirs. An
-    InputError is raised where a name does not fit, or nothing can be written there.
-
-    Args:
-        path: A name that ends with ``.bp``, cell fields go to ``<stem>_cells.bp``; or with
-            ``.pvd``, which has all fields.
-        solution: A solution of the problem: its mesh and which fields there are.
-        interior: Whether the fields of ``solution.interior`` are written, too: those of cells at
-            each step, other cell fields are always the same.
-    """
-
-    def __init__(
-        self, path: str | os.PathLike[str], solution: Solution, interior: bool = False
-    ) -> None:
-        target = checked_target(path, PurePath(path).suffix, solution)
-        self._names = [target]
-        self._mesh = solution.decomposition.mesh
-        of_nodes, of_cells = solution.interior.fields if interior else ([], [])
-        nodal, cellwise = (
-            [fem.Function(f.function_space, name=f.name) for f in fields]
-            for fields in (nodal_fields(solution) + of_nodes, of_cells)
-        )
-        self._functions = nodal + cellwise
-        self._count, self._ended = 0, False
-        self._files: list[VtxFile | PvdFile] = []
-        of_cells = cell_fields(solution) + cellwise
-        try:
-            if target.suffix == ".pvd":
-                self._files.append(PvdFile(target, nodal + of_cells))
-            else:
-                self._names.append(target.with_name(f"{target.stem}_cells.bp"))
-                self._files += [VtxFile(target, nodal)]
-                self._files += [VtxFile(self._names[1], of_cells)]
-            self._growing = self._files if cellwise else self._files[:1]
-            if len(self._growing) < len(self._files):
-                self._files[1].write(0.0)
-                self._files[1].close()
-        except TfetiError:  # on all ranks
-            self.drop()
-            raise
-
-    def write(self, time: float, values: dict[str, Array]) -> None:
-        """Add a step from what ``fields_of`` returned for it, in this run or an earlier one.
-
-        Raise an InputError where a field is not there, as of an earlier run that wrote fewer, or
-        the files cannot be written: then they end, whole, with the step before, under the names
-        that they have until ``close``.
-        """
-        points = self._mesh.geometry.x.copy()
-        for function in self._functions:
-            if function.name not in values:
-                raise InputError(
-                    f"the step at {time:.6g} of the checkpoint has no field {function.name}; "
-                    "expected interior= as in the run that has written it"
-                )
-            function.x.array[:] = values[function.name].ravel()
-        self._mesh.geometry.x[:] = values[POINTS]
-        try:
-            for file in self._growing:
-                file.write(time)
-        except TfetiError as error:  # on all ranks
-            self._ended = True
-            if not self._count:
-                self.drop()
-                raise
-            for file in self._files:
-                with suppress(TfetiError):
-                    file.close()
-            error.add_note(
-                f"the {self._count} steps before are in {self._files[0].partial}; "
-                f"{self._names[0]} is as it was"
-            )
-            raise
-        finally:
-            self._mesh.geometry.x[:] = points
-        self._count += 1
-
-    def close(self) -> None:
-        """Give the files their names, but not where they could not be written."""
-        if self._ended:
-            return
-        for file in self._files:
-            file.close()
-        for file in self._files:
-            file.appear()
-
-    def drop(self) -> None:
-        """Remove the files under the names that they have until ``close``."""
-        for file in self._files:
-            file.drop()
-
-
-def fields_of(solution: Solution, interior: bool = False) -> dict[str, Array]:
-    """Fields of a step by name, and where the mesh is. Collective."""
-    of_nodes, of_cells = solution.interior.fields if interior else ([], [])
-    fields = nodal_fields(solution) + of_nodes + of_cells
-    values = {f.name: np.array(f.x.array) for f in fields}
-    return {**values, POINTS: np.array(solution.decomposition.mesh.geometry.x)}
+# --- Fields of a step in a checkpoint ----------------------------------------------------------
 
 
 def labels_of_fields(solution: Solution, interior: bool = False) -> dict[str, Array]:
-    """Return the labels of the unknowns of these fields, and of the points. Collective."""
-    of_nodes, of_cells = solution.interior.fields if interior else ([], [])
-    d = solution.decomposition
-    fields = nodal_fields(solution) + of_nodes + of_cells
+    """Return the labels of the unknowns of ``fields_of``, and of the points. Collective."""
+    d, fields = solution.decomposition, chain(*changing_fields(solution, interior))
     return {**{f.name: labels_of_function(f, d) for f in fields}, POINTS: labels_of_points(d)}
 
 
@@ -439,22 +323,20 @@ class LoadSteps:
             target = checked_path(path, ".csv")
         axes = "xyz"[: self._problem.decomposition.mesh.geometry.dim]
         names = [contact.name for contact in self._problem.contacts]
-        partial = begin_file(target, self._comm)
         with raised_on_all_ranks(self._comm), named(f"cannot write {target}", OSError):
             if self._comm.rank == 0:
-                with partial.open("w", newline="", encoding="utf-8") as file:
-                    table = csv.writer(file)
-                    forces = [f"{name} {axis}" for name in names for axis in axes]
-                    tools = list(self.records[0].tools) if self.records else []
-                    table.writerow(["time", *forces, *tools, "dissipation", "F", "seconds"])
-                    for record in self.records:
-                        values = [value for force in record.contact_forces for value in force]
-                        values += [record.tools[name] for name in tools]
-                        count = record.figures["F_multiplications"]
-                        table.writerow(
-                            [record.time, *values, record.dissipation, count, record.seconds]
-                        )
-        end_file(partial, target, self._comm)
+                forces = [f"{name} {axis}" for name in names for axis in axes]
+                tools = list(self.records[0].tools) if self.records else []
+                table: list[list[Any]] = [["time", *forces, *tools, "dissipation", "F", "seconds"]]
+                for r in self.records:
+                    values = [*chain(*r.contact_forces), *(r.tools[name] for name in tools)]
+                    count = r.figures["F_multiplications"]
+                    table.append([r.time, *values, r.dissipation, count, r.seconds])
+                with (
+                    written_whole(target) as partial,
+                    partial.open("w", newline="", encoding="utf-8") as file,
+                ):
+                    csv.writer(file).writerows(table)
 
     def _steps(self, place: Place, show: Show) -> None:
         problem, times = self._problem, self._times
@@ -536,10 +418,17 @@ class LoadSteps:
                 for name, values in fields.items()
             }
             self._checkpoint.write(len(self.records), about, record, state, table, digest)
-        if self._path is not None:
-            if self._series is None:
-                self._series = Series(self._path, solution, self._interior)
-            self._series.write(t, fields)
+        self._write(t, fields)
+
+    def _write(self, t: float, fields: Mapping[str, Array]) -> None:
+        """Add a step to the file of all steps, if there is to be one."""
+        if self._path is None:
+            return
+        if self._series is None:
+            solution = self._problem.solution
+            target = checked_target(self._path, self._path.suffix, solution)
+            self._series = Series(target, solution, self._interior)
+        self._series.write(t, fields)
 
     def _begin(self, resume: bool) -> Place:
         """Return the place to begin at, and restore its state."""
@@ -565,14 +454,14 @@ class LoadSteps:
         self._problem.restore(checkpoint.read_state(kept))
         self.records = records
         if self._path is not None:  # a file of ADIOS2 cannot be continued
-            self._series = Series(self._path, self._problem.solution, self._interior)
             try:
                 here = labels_of_fields(self._problem.solution, self._interior)
                 for number, record in enumerate(records, start=1):
                     table = checkpoint.read_fields(kept, number)
-                    self._series.write(record.time, in_order(table, here))
+                    self._write(record.time, in_order(table, here))
             except TfetiError:  # on all ranks
-                self._series.drop()
+                if self._series is not None:
+                    self._series.drop()
                 self._series = None
                 raise
         return place
