@@ -126,13 +126,14 @@ def stiffer_above(d, ratio, nu=0.3):
 
 def pressed(d, pressure=0.1, on="upper top"):
     """Load: a uniform pressure from above."""
+    return drawn(d, on, -pressure * np.eye(d.mesh.geometry.dim)[-1])
 
-    def load(v, ds):
-        up = np.zeros(d.mesh.geometry.dim)
-        up[-1] = -pressure
-        return ufl.dot(fem.Constant(d.mesh, up), v) * ds(d.surface(on))
 
-    return load
+def drawn(d, on, traction):
+    """Load: a traction on a surface, numbers or a constant."""
+    if not isinstance(traction, fem.Constant):
+        traction = fem.Constant(d.mesh, np.array(traction, dtype=float))
+    return lambda v, ds: ufl.dot(traction, v) * ds(d.surface(on))
 
 
 def sided(secondary, primary, **changes):
@@ -151,16 +152,17 @@ def unit_blocks(dofs):
 
 
 def held(d, *sides):
-    """Conditions: no normal displacement on the sides named."""
+    """Conditions on the sides named: no normal displacement, or in a pair with a side its value."""
     gdim = d.mesh.geometry.dim
-    axis_of = {"left": 0, "right": 0, "bottom": gdim - 1, "top": gdim - 1, "front": 1, "back": 1}
+    axis_of = {"front": 1, "back": 1, "bottom": gdim - 1, "top": gdim - 1}  # others: 0
 
     def bcs(V):
         made = []
-        for side in sides:
-            axis = axis_of[side.split()[-1]]
+        for given in sides:
+            side, value = given if isinstance(given, tuple) else (given, 0.0)
+            axis = axis_of.get(side.split()[-1], 0)
             dofs = fem.locate_dofs_topological(V.sub(axis), gdim - 1, d.facets(side))
-            made.append(fem.dirichletbc(0.0, dofs, V.sub(axis)))
+            made.append(fem.dirichletbc(value, dofs, V.sub(axis)))
         return made
 
     return bcs

@@ -76,9 +76,12 @@ def forms(mesh, facet_tags, traction, top, degree=1, stress=None):
 
 
 def clamp(V, facets, value=0.0):
+    """A condition on facets: one value of all components, a vector, a constant or a function."""
     gdim = V.mesh.geometry.dim
     dofs = fem.locate_dofs_topological(V, gdim - 1, facets)
-    return fem.dirichletbc(np.full(gdim, value), dofs, V)
+    if isinstance(value, fem.Function):
+        return fem.dirichletbc(value, dofs)
+    return fem.dirichletbc(np.full(gdim, value) if np.isscalar(value) else value, dofs, V)
 
 
 def problem(

@@ -2,8 +2,9 @@
 
 import numpy as np
 import ufl
+from bodies import drawn, two_body_problem
 from dolfinx import fem
-from scenes import curved_obstacle, decomposed, hooke, strain
+from scenes import clamp, curved_obstacle, decomposed, hooke, strain
 
 import tfeti_dolfinx as tfeti
 
@@ -74,25 +75,14 @@ class Driven:
     ):
         d = decomposed(cell, n, subdomains)
         gdim = d.mesh.geometry.dim
-        V = fem.functionspace(d.mesh, ("Lagrange", 1, (gdim,)))
-        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-        ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
         self.load = fem.Constant(d.mesh, np.zeros(gdim))
-        left = fem.locate_dofs_topological(V, gdim - 1, d.facets("left"))
         if rough:
             plane = tfeti.Plane(np.zeros(gdim), np.eye(gdim)[-1])
             contact = tfeti.Obstacle("bottom", plane, friction=friction)
         else:  # rows come later
             contact = tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=0.022)
-        self.problem = tfeti.ContactProblem(
-            ufl.inner(hooke()(u), strain(v)) * ufl.dx(domain=d.mesh),
-            ufl.dot(self.load, v) * ds(d.surface("top")),
-            [fem.dirichletbc(np.zeros(gdim), left, V)],
-            [contact],
-            d,
-            stress=hooke(),
-            petsc_options=options,
-        )
+        bcs = lambda V: [clamp(V, d.facets("left"))]  # noqa: E731
+        self.problem = two_body_problem(d, drawn(d, "top", self.load), bcs, [contact], **options)
 
     def apply(self, problem, t):
         """To and fro, pressed more and more."""

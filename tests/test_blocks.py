@@ -16,12 +16,7 @@ from tfeti_dolfinx.common.compat import assemble_csr
 from tfeti_dolfinx.errors import ConformanceError, FactorError, InputError
 from tfeti_dolfinx.subdomains import factor
 from tfeti_dolfinx.subdomains import sparse_block as traced
-from tfeti_dolfinx.subdomains.block import (
-    Counters,
-    SubdomainData,
-    candidate_modes,
-    kernel_of,
-)
+from tfeti_dolfinx.subdomains.block import Counters, SubdomainData, candidate_modes, kernel_of
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock

@@ -8,7 +8,7 @@ import ufl
 from dolfinx import fem
 from moving import Thrown
 from mpi4py import MPI
-from scenes import decomposed, forms
+from scenes import clamp, decomposed, forms
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.agreement import check_same_problem
@@ -28,13 +28,12 @@ class Given:
         self.factor = fem.Constant(d.mesh, 1.0)
         v = self.a.arguments()[0]
         self.L = L + self.factor * ufl.inner(self.weight, v) * ufl.dx
-        left = fem.locate_dofs_topological(self.V, 1, d.facets("left"))
         shape = tfeti.Plane((0, -plane), (0, 1))
         contact = {"friction": tfeti.Coulomb(0.3), **contact}
         self.problem = tfeti.ContactProblem(
             self.a,
             self.L,
-            [fem.dirichletbc(self.held, left)],
+            [clamp(self.V, d.facets("left"), self.held)],
             [tfeti.Obstacle("bottom", shape, **contact)],
             d,
         )

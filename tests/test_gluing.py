@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from dolfinx import fem
-from scenes import curved_obstacle, decomposed
+from scenes import clamp, curved_obstacle, decomposed
 from scipy.sparse import csr_array
 
 import tfeti_dolfinx as tfeti
@@ -22,8 +22,7 @@ class Scene:
         self.dofs = dofs = TornDofs(V, d)
         self.bcs = []
         if clamped:
-            left = fem.locate_dofs_topological(V, gdim - 1, d.facets("left"))
-            self.bcs = [fem.dirichletbc(np.arange(1.0, gdim + 1), left, V)]
+            self.bcs = [clamp(V, d.facets("left"), np.arange(1.0, gdim + 1))]
         records = concatenate([c.records(dofs, d, i) for i, c in enumerate(contacts)], gdim)
         n_local = dofs.num_nodes * dofs.bs
         self.weights = np.ones(n_local) if weights is None else weights(dofs)

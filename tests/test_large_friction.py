@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-import ufl
+from bodies import drawn, two_body_problem
 from dolfinx import fem
 from reference.friction import ClampedLaw
-from scenes import clamp, decomposed, displacement, forms, hooke
+from scenes import clamp, decomposed, displacement
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.solve.coulomb import FrictionBounds
@@ -35,22 +35,13 @@ def steps(cell, n, subdomains, mu, accepts, clamped, loaded, gap, loads, **optio
     """Solve all steps: each has to be right to what it reports."""
     d = decomposed(cell, n, subdomains)
     gdim = d.mesh.geometry.dim
-    V, a, _ = forms(d.mesh, d.facet_tags, np.zeros(gdim), d.surface(loaded))
     t = fem.Constant(d.mesh, np.zeros(gdim))
-    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
     up = np.eye(gdim)[-1]
     floor = tfeti.Obstacle(
         "bottom", tfeti.Plane(-gap * up, up), friction=tfeti.Coulomb(mu), reach=np.inf
     )
-    p = tfeti.ContactProblem(
-        a,
-        ufl.dot(t, ufl.TestFunction(V)) * ds(d.surface(loaded)),
-        [clamp(V, d.facets(clamped))],
-        [floor],
-        d,
-        stress=hooke(),
-        petsc_options=options,
-    )
+    bcs = lambda V: [clamp(V, d.facets(clamped))]  # noqa: E731
+    p = two_body_problem(d, drawn(d, loaded, t), bcs, [floor], **options)
     law, reports = ClampedLaw(cell, n, mu, clamped, loaded, gap), []
     for load in loads:
         t.value[:] = load

@@ -13,12 +13,7 @@ from test_qp import matrix, vector
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.qp.coarse import DenseCoarse
-from tfeti_dolfinx.qp.friction_newton import (
-    Law,
-    LawPoint,
-    LawProgram,
-    newton_on_law,
-)
+from tfeti_dolfinx.qp.friction_newton import Law, LawPoint, LawProgram, newton_on_law
 from tfeti_dolfinx.qp.problem import QP
 
 SEEDS = st.integers(0, 1000)

@@ -19,7 +19,7 @@ from bodies import (
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import decomposed, problem
+from scenes import clamp, decomposed, problem
 
 import tfeti_dolfinx as tfeti
 from meshes.cylinder_on_block import build
@@ -87,10 +87,8 @@ def disc_on_block(comm, order, pushed=0.02):
     d = tfeti.read_gmsh(model, comm, 4)
 
     def bcs(V):
-        flat_dofs = fem.locate_dofs_topological(V, 1, d.facets("load"))
-        bottom = fem.locate_dofs_topological(V, 1, d.facets("bottom"))
-        down = fem.dirichletbc(np.array([0.0, -pushed]), flat_dofs, V)
-        return [down, fem.dirichletbc(np.zeros(2), bottom, V)]
+        down = clamp(V, d.facets("load"), np.array([0.0, -pushed]))
+        return [down, clamp(V, d.facets("bottom"))]
 
     return d, bcs
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import ufl
 from dolfinx import fem
-from scenes import curved_obstacle, decomposed, hooke, strain
+from scenes import clamp, curved_obstacle, decomposed, hooke, strain
 
 import tfeti_dolfinx as tfeti
 
@@ -25,11 +25,10 @@ class Repeated:
         self.E = fem.Constant(d.mesh, 1.0)
         self.load = fem.Constant(d.mesh, np.array([0.0] * (gdim - 1) + [-0.05]))
         self.held = fem.Constant(d.mesh, np.zeros(gdim))
-        left = fem.locate_dofs_topological(V, gdim - 1, d.facets("left"))
         self.problem = tfeti.ContactProblem(
             self.E * ufl.inner(hooke()(u), strain(v)) * dx,
             ufl.dot(self.load, v) * ds(d.surface("top")),
-            [fem.dirichletbc(self.held, left, V)],
+            [clamp(V, d.facets("left"), self.held)],
             [tfeti.Obstacle("bottom", curved_obstacle(gdim), reach=0.2)] if contact else [],
             d,
             petsc_options={"rtol": 1e-10, **options},
@@ -154,8 +153,7 @@ def test_other_forms_and_conditions():
     assert distance(twice, other.solve(load=-0.1)) <= 1e-8
     scene.problem.update(stiffness=2.0 * ufl.inner(hooke()(u), strain(v)) * ufl.dx)
     assert distance(scene.solve(), other.solve(load=-0.1, E=2.0)) <= 1e-8
-    right = fem.locate_dofs_topological(V, 1, d.facets("right"))
-    scene.problem.update(values=[fem.dirichletbc(scene.held, right, V)])
+    scene.problem.update(values=[clamp(V, d.facets("right"), scene.held)])
     mirrored = scene.solve()
     assert scene.problem.report.gluings == 1
     assert scene.problem.report.factorizations == 0
@@ -201,11 +199,10 @@ def test_the_stress_of_an_earlier_solution_is_that_of_its_modulus():
     thickness = fem.Constant(d.mesh, 1.0)
     elastic = tfeti.Elasticity(d, E=1.0, nu=nu, model="plane_strain", thickness=thickness)
     load = fem.Constant(d.mesh, (0.0, -0.05))
-    left = fem.locate_dofs_topological(V, 1, d.facets("left"))
     problem = tfeti.ContactProblem(
         elastic.a(u, v),
         ufl.dot(load, v) * ds(d.surface("top")),
-        [fem.dirichletbc(np.zeros(2), left, V)],
+        [clamp(V, d.facets("left"))],
         [tfeti.Obstacle("bottom", curved_obstacle(2))],
         d,
         stress=elastic.stress,

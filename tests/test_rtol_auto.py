@@ -1,7 +1,7 @@
 """-tfeti_rtol auto: as exact as the mesh is worth, for less."""
 
 import pytest
-from dolfinx import fem
+from bodies import held, pressed, two_body_problem
 from scenes import clamp, curved_obstacle, decomposed, forms, hooke, problem
 from true_errors import AGAINST_FINER, error_against, stress_of_cells
 
@@ -86,13 +86,8 @@ def test_without_contact_too():
 def test_where_the_mesh_makes_no_error_it_ends():
     """A uniform stress: the algebraic error is compared with ‖u‖_K then."""
     d = decomposed("quadrilateral", 4, 4)
-    V, a, L = forms(d.mesh, d.facet_tags, (0.0, -0.01), d.surface("top"), stress=hooke(1.0, 0.0))
-    floor = fem.locate_dofs_topological(V.sub(1), 1, d.facets("bottom"))
-    side = fem.locate_dofs_topological(V.sub(0), 1, d.facets("left"))
-    bcs = [fem.dirichletbc(0.0, floor, V.sub(1)), fem.dirichletbc(0.0, side, V.sub(0))]
-    p = tfeti.ContactProblem(
-        a, L, bcs, [], d, stress=hooke(1.0, 0.0), petsc_options={"rtol": "auto"}
-    )
+    bcs, stress = held(d, "bottom", "left"), hooke(1.0, 0.0)
+    p = two_body_problem(d, pressed(d, 0.01, "top"), bcs, [], stress=stress, rtol="auto")
     p.solve()
     found = p.report.estimates
     assert is_reached(p)

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import ufl
-from dolfinx import fem
-from scenes import curved_obstacle, decomposed, hooke, problem, strain
+from bodies import two_body_problem
+from scenes import clamp, curved_obstacle, decomposed, problem
 
 import tfeti_dolfinx as tfeti
 
@@ -73,17 +73,16 @@ LOADS = {
 def test_without_a_force_on_a_subdomain_F_is_not_applied_at_the_start(load, qp_type):
     """e = 0 also where a given stress balances itself."""
     d = decomposed("hexahedron", 4, 8)
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (3,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    dofs = fem.locate_dofs_topological(V, 2, d.facets("left"))
     down = np.array((0.0, 0.0, -0.01 if load == "none" else 0.0))
-    top = fem.locate_dofs_topological(V, 2, d.facets("right"))
-    bcs = [fem.dirichletbc(np.zeros(3), dofs, V), fem.dirichletbc(down, top, V)]
     far = [tfeti.Obstacle("bottom", tfeti.Plane((0, 0, -1), (0, 0, 1)), reach=2.0)]
     contacts = far if qp_type == "newton" else []
-    a = ufl.inner(hooke()(u), strain(v)) * ufl.dx
-    options = {"qp_type": qp_type}
-    p = tfeti.ContactProblem(a, LOADS[load](v), bcs, contacts, d, petsc_options=options)
+    p = two_body_problem(
+        d,
+        lambda v, ds: LOADS[load](v),
+        lambda V: [clamp(V, d.facets("left")), clamp(V, d.facets("right"), down)],
+        contacts,
+        qp_type=qp_type,
+    )
     p.solve()
     moves = load == "weight"
     assert np.any(p.dual.coarse.e) == moves

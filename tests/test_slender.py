@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-import ufl
-from bodies import boxes
-from dolfinx import fem
-from scenes import clamp, displacement, hooke, strain
+from bodies import boxes, pressed, two_body_problem
+from scenes import clamp, displacement, hooke
 
 import tfeti_dolfinx as tfeti
 
@@ -44,18 +42,16 @@ class Cantilever:
         other = ("other", (0.0, -1.0), (float(length), 0.0), (2 * length, 2))
         mesh, tags, names = boxes("quadrilateral", [beam, other] if stacked else [beam])
         d = tfeti.decompose(mesh, subdomains, facet_tags=tags, surfaces=names)
-        V = fem.functionspace(d.mesh, ("Lagrange", degree, (2,)))
-        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-        ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
         loaded, area = ("beam right", 1.0) if kind == "tip" else ("beam top", float(length))
         clamped = ["beam left", "other left"] if stacked else ["beam left"]
-        self.problem = tfeti.ContactProblem(
-            ufl.inner(hooke(E, NU)(u), strain(v)) * ufl.dx,
-            -LOAD / area * v[1] * ds(d.surface(loaded)),
-            [clamp(V, d.facets(side)) for side in clamped],
-            self._contacts(),
+        self.problem = two_body_problem(
             d,
-            petsc_options=options,
+            pressed(d, LOAD / area, loaded),
+            lambda V: [clamp(V, d.facets(side)) for side in clamped],
+            self._contacts(),
+            degree,
+            hooke(E, NU),
+            **options,
         )
 
     def _contacts(self):

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 import ufl
+from bodies import two_body_problem
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import box, decomposed, hooke, problem, strain
+from scenes import box, decomposed, problem
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx import NoSolutionError
@@ -57,12 +58,9 @@ def test_a_load_that_turns_is_looked_at_again_and_one_that_grows_is_not(monkeypa
         lambda *given: asked.append(check_solvable(*given)),
     )
     d, weight = decomposed("quadrilateral", 4, 2), (0.0, -0.05)
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
     force = fem.Constant(d.mesh, weight)
     floor = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)))
-    a, L = ufl.inner(hooke()(u), strain(v)) * ufl.dx, ufl.dot(force, v) * ufl.dx
-    p = tfeti.ContactProblem(a, L, [], [floor], d)
+    p = two_body_problem(d, lambda v, ds: ufl.dot(force, v) * ufl.dx, lambda V: [], [floor])
     p.solve()
     force.value = (0.0, -0.15)
     before = len(asked)
@@ -79,17 +77,16 @@ def test_a_load_that_turns_is_looked_at_again_and_one_that_grows_is_not(monkeypa
 def test_solvable_just_if_the_resultant_is_over_the_support(centre, width):
     """A block on a flat floor, loaded by a pressure around ``centre``: it stands or tips."""
     d = decomposed("quadrilateral", 4, 2)
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
     x = ufl.SpatialCoordinate(d.mesh)
     # a linear pressure on the top of resultant 1 at x = c; its first moment about 0 is c
     c = centre * width + 0.5 * (1 - width)
     at = fem.Constant(d.mesh, c)  # one form for all examples
     pressure = (4 - 6 * at) + (12 * at - 6) * x[0]
-    L = -pressure * v[1] * ds(d.surface("top"), metadata={"quadrature_degree": 3})
-    contacts = [tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)))]
-    p = tfeti.ContactProblem(ufl.inner(hooke()(u), strain(v)) * ufl.dx, L, [], contacts, d)
+    floor = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)))
+    # of two points, exact for it times a hat
+    p = two_body_problem(
+        d, lambda v, ds: -pressure * v[1] * ds(d.surface("top")), lambda V: [], [floor]
+    )
     if 1e-3 < c < 1 - 1e-3:
         p.solve()
         force = d.comm.allreduce(p.solution.contact(0).force.sum())

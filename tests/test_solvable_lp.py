@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-import ufl
-from dolfinx import fem
+from bodies import drawn, two_body_problem
 from dolfinx.mesh import meshtags
-from scenes import box, decomposed, hooke, problem, strain
+from scenes import box, decomposed, hooke, problem
 from scipy.optimize import linprog
 from scipy.sparse import csr_array
 
@@ -108,12 +107,9 @@ def block_on_floor(scale, E, load, subdomains=2):
     mesh, tags, names = box("quadrilateral", 3)
     mesh.geometry.x[:] *= scale
     d = tfeti.decompose(mesh, subdomains, facet_tags=tags, surfaces=names)
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
-    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
-    L = ufl.dot(fem.Constant(d.mesh, E * np.array(load)), v) * ds(d.surface("top"))
     floor = tfeti.Obstacle("bottom", tfeti.Plane((0, -0.01 * scale), (0, 1)))
-    return tfeti.ContactProblem(ufl.inner(hooke(E)(u), strain(v)) * ufl.dx, L, [], [floor], d)
+    load = drawn(d, "top", E * np.array(load))
+    return two_body_problem(d, load, lambda V: [], [floor], stress=hooke(E))
 
 
 @pytest.mark.parametrize(("scale", "E"), [(1e-9, 2e11), (1e6, 2e-1)])
@@ -146,13 +142,9 @@ def in_a_slot(width):
     mesh, tags, _ = box("quadrilateral", 3)
     skin = meshtags(mesh, 1, tags.indices, np.full_like(tags.values, 1))
     d = tfeti.decompose(mesh, 2, facet_tags=skin, surfaces={"skin": 1})
-    V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
-    u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
     left = tfeti.Obstacle("skin", tfeti.Plane((0.5 - width / 2, 0), (1, 0)))
     right = tfeti.Obstacle("skin", tfeti.Plane((0.5 + width / 2, 0), (-1, 0)))
-    L = ufl.dot(fem.Constant(d.mesh, np.zeros(2)), v) * ufl.dx
-    a = ufl.inner(hooke()(u), strain(v)) * ufl.dx
-    return tfeti.ContactProblem(a, L, [], [left, right], d)
+    return two_body_problem(d, drawn(d, "skin", (0, 0)), lambda V: [], [left, right])
 
 
 def test_the_solver_names_contacts_that_exclude_each_other():

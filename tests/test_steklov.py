@@ -5,17 +5,9 @@ import pytest
 from panels import PLANE, SPACE, box, kelvin, kelvin_energy, moved
 
 from tfeti_dolfinx.bem.inside import Inside, share
-from tfeti_dolfinx.bem.integrals import (
-    apart_rule,
-    touching_rule,
-)
+from tfeti_dolfinx.bem.integrals import apart_rule, touching_rule
 from tfeti_dolfinx.bem.panels import Panels
-from tfeti_dolfinx.bem.steklov import (
-    IsotropicLaw,
-    rigid_motions,
-    steklov,
-    wrong_forces,
-)
+from tfeti_dolfinx.bem.steklov import IsotropicLaw, rigid_motions, steklov, wrong_forces
 from tfeti_dolfinx.errors import FactorError, InputError
 
 LAW = IsotropicLaw(mu=0.4, nu=0.3)

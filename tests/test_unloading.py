@@ -2,8 +2,7 @@
 
 import numpy as np
 import pytest
-import ufl
-from bodies import boxes, stacked, two_body_problem
+from bodies import boxes, drawn, held, stacked, two_body_problem
 from dolfinx import fem
 from mpi4py import MPI
 from reference.friction import Untorn, in_ellipses
@@ -41,18 +40,16 @@ class Scene:
         held, loaded = KINDS[kind]
         d = decomposed(cell, *SIZES[cell])
         gdim = self.gdim = d.mesh.geometry.dim
-        V, a, _ = forms(d.mesh, d.facet_tags, (0.0,) * gdim, d.surface(loaded))
         self.traction, self.value = (fem.Constant(d.mesh, np.zeros(gdim)) for _ in range(2))
-        ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
-        L = ufl.dot(self.traction, ufl.TestFunction(V)) * ds(d.surface(loaded))
-        bc = fem.dirichletbc(
-            self.value, fem.locate_dofs_topological(V, gdim - 1, d.facets(held)), V
-        )
         given, _, _ = law(friction, gdim)
         plane = tfeti.Plane((0,) * gdim, (0,) * (gdim - 1) + (1,))
         obstacle = tfeti.Obstacle("bottom", plane, gap=gap, friction=given, reach=0.5)
-        self.problem = tfeti.ContactProblem(
-            a, L, [bc], [obstacle], d, stress=hooke(), petsc_options=options
+        self.problem = two_body_problem(
+            d,
+            drawn(d, loaded, self.traction),
+            lambda V: [clamp(V, d.facets(held), self.value)],
+            [obstacle],
+            **options,
         )
 
     def solve(self, traction, value=None):
@@ -285,7 +282,7 @@ def test_a_body_at_rest_behind_an_open_gap_does_not_limit_that_either(qp_type):
     load = fem.Constant(d.mesh, np.zeros(2))
     p = two_body_problem(
         d,
-        lambda v, ds: ufl.dot(load, v) * ds(d.surface("upper right")),
+        drawn(d, "upper right", load),
         lambda V: [clamp(V, d.facets(side)) for side in ("lower bottom", "upper top")],
         [tfeti.Contact("upper bottom", "lower top")],
         qp_type=qp_type,
@@ -305,12 +302,7 @@ def test_friction_across_an_open_gap_does_not_limit_that_either():
     parts = [("low", (0, -1), (1, 0), (5, 5)), ("high", (0, 0.05), (1, 1.05), (5, 5))]
     mesh, tags, names = boxes("triangle", parts)
     d = tfeti.decompose(mesh, lambda x: (x[1] > 0.02).astype(int), facet_tags=tags, surfaces=names)
-    V, a, _ = forms(d.mesh, d.facet_tags, (0.0, 0.0), d.surface("high right"), degree=2)
     load = fem.Constant(d.mesh, np.zeros(2))
-    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
-    L = ufl.dot(load, ufl.TestFunction(V)) * ds(d.surface("high right"))
-    held = [d.facets(name) for name in ("high top", "low bottom")]
-    bcs = [fem.dirichletbc(np.zeros(2), fem.locate_dofs_topological(V, 1, f), V) for f in held]
     pair = tfeti.Contact(
         "high bottom",
         "low top",
@@ -319,8 +311,15 @@ def test_friction_across_an_open_gap_does_not_limit_that_either():
         friction=tfeti.Tresca(6e-3),
         reach=0.5,
     )
-    options = {"qp_type": "newton", "rtol": 1e-8}
-    p = tfeti.ContactProblem(a, L, bcs, [pair], d, stress=hooke(), petsc_options=options)
+    p = two_body_problem(
+        d,
+        drawn(d, "high right", load),
+        lambda V: [clamp(V, d.facets(name)) for name in ("high top", "low bottom")],
+        [pair],
+        degree=2,
+        qp_type="newton",
+        rtol=1e-8,
+    )
     first, found = np.array([8.7e-3, -4.5e-3]), []
     for factor in (1.0, 1e-3, 2.8e-11, 1e-13):
         load.value[:] = factor * first
@@ -335,14 +334,9 @@ def test_friction_across_an_open_gap_does_not_limit_that_either():
 def test_a_body_that_contact_alone_holds_comes_to_rest():
     gap = 0.01
     d = decomposed("triangle", 6, 3)
-    V, a, _ = forms(d.mesh, d.facet_tags, (0.0, 0.0), d.surface("top"))
     load = fem.Constant(d.mesh, np.zeros(2))
-    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
-    L = ufl.dot(load, ufl.TestFunction(V)) * ds(d.surface("top"))
-    left = fem.locate_dofs_topological(V.sub(0), 1, d.facets("left"))
     plane = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)), gap=gap, reach=0.5)
-    bcs = [fem.dirichletbc(0.0, left, V.sub(0))]
-    problem = tfeti.ContactProblem(a, L, bcs, [plane], d, stress=hooke())
+    problem = two_body_problem(d, drawn(d, "top", load), held(d, "left"), [plane])
     for pressed in (0.05, 0.0, 1e-13, 0.05, 0.0):
         load.value[1] = -pressed
         problem.solve()
@@ -396,9 +390,7 @@ def test_loads_whose_squares_leave_the_range_are_named(size):
 def test_a_stiffness_whose_squares_leave_the_range_is_named():
     d = decomposed("triangle", 3, 2)
     V, a, L = forms(d.mesh, d.facet_tags, (0.0, -1e-302), d.surface("top"), stress=hooke(1e-300))
-    left = fem.locate_dofs_topological(V, 1, d.facets("left"))
-    bcs = [fem.dirichletbc(np.zeros(2), left, V)]
     plane = tfeti.Obstacle("bottom", tfeti.Plane((0, 0), (0, 1)))
-    problem = tfeti.ContactProblem(a, L, bcs, [plane], d)
+    problem = tfeti.ContactProblem(a, L, [clamp(V, d.facets("left"))], [plane], d)
     with pytest.raises(tfeti.InputError, match="stiffness of .* squares leave the range"):
         problem.solve()

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 import ufl
+from bodies import held, pressed, two_body_problem
 from dolfinx import fem, geometry
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
-from scenes import forms, hooke, strain
+from scenes import hooke, strain
 
 import tfeti_dolfinx as tfeti
 from benchmarks.hertz import LineContact
@@ -27,15 +28,10 @@ def hertz(elements, **options):
         growth = 3.6 / elements
         model = build(1.0, HALF_WIDTH / elements, 1.5 * HALF_WIDTH, growth, partitions=8)
     d = tfeti.read_gmsh(model, MPI.COMM_WORLD)
-    V, a, _ = forms(d.mesh, d.facet_tags, (0.0, 0.0), d.surface("top"))
     load = LineContact.from_half_width(HALF_WIDTH, 1.0, E / (1 - NU**2)).load
-    ds = ufl.Measure("ds", domain=d.mesh, subdomain_data=d.facet_tags)
-    traction = fem.Constant(d.mesh, (0.0, -load / 2))
-    L = ufl.dot(traction, ufl.TestFunction(V)) * ds(d.surface("top"))
-    axis = fem.locate_dofs_topological(V.sub(0), 1, d.facets("axis"))
     plane = tfeti.Obstacle("contact", tfeti.Plane((0, 0), (0, 1)), reach=2 * HALF_WIDTH**2)
-    bcs = [fem.dirichletbc(0.0, axis, V.sub(0))]
-    return tfeti.ContactProblem(a, L, bcs, [plane], d, stress=hooke(), petsc_options=options)
+    pressure = pressed(d, load / 2, "top")
+    return two_body_problem(d, pressure, held(d, "axis"), [plane], **options)
 
 
 def ball(unknowns, **options):
