@@ -1,6 +1,7 @@
 """Bad input gets a message that names it, on every rank, and nothing hangs."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from tfeti_dolfinx.errors import TfetiError, raised_on_all_ranks
 
 
 def test_a_complex_build_of_petsc(monkeypatch):
-    monkeypatch.setattr(compat, "petsc_scalar_type", lambda: np.complex128)
+    monkeypatch.setattr(compat, "PETSc", SimpleNamespace(ScalarType=np.complex128))
     with pytest.raises(InputError, match="PETSc is built for complex numbers"):
         problem(decomposed("hexahedron", 2, 2))
 

@@ -27,12 +27,7 @@ from tfeti_dolfinx.constraints.gluing import (
     checked_conditions,
     listed_conditions,
 )
-from tfeti_dolfinx.contact.partner import (
-    ContactPartner,
-    Gap,
-    checked_contacts,
-    gaps_by_position,
-)
+from tfeti_dolfinx.contact.partner import ContactPartner, Gap, checked_contacts, gaps_by_position
 from tfeti_dolfinx.errors import ConvergenceError, InputError, NoSolutionError, TfetiError
 from tfeti_dolfinx.extensions import Extensions, check_method, guarded
 from tfeti_dolfinx.feti.dual import Dual
@@ -461,7 +456,7 @@ class ContactProblem:
                 raise InputError("the last solve has not converged; expected one that has")
         if solution is self._accepted[0] or self._start is None:
             return
-        self._system.tools.begin_at()
+        self._system.tools.begin_here()
         self._count_slips_from(solution)
         self._accepted = (solution, self._start)
 
@@ -520,7 +515,7 @@ class ContactProblem:
             self._look_at_stress()
             state = state.on_nodes(self.dofs, self.decomposition)
         system = self._system
-        system.tools.restore(state.tools)
+        system.tools.go_back(state.tools)
         self._take_motion(state)
         system.know_rows(list(state.reach), state.groups(self.dofs))
         system.look_for_changes()

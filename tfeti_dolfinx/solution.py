@@ -15,7 +15,7 @@ from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.constraints.contact_state import ContactState, ContactStatus, Multipliers
 from tfeti_dolfinx.constraints.gluing import Gluing
-from tfeti_dolfinx.contact.forces import BodyForces, body_forces, vertex_tractions
+from tfeti_dolfinx.contact.forces import Resultant, body_forces, vertex_tractions
 from tfeti_dolfinx.contact.partner import ContactPartner
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import plugin
@@ -291,7 +291,7 @@ class Solution(ContactState):
         return vector_from_vertices(self.dofs, values, self._vertices, "slip")
 
     @cached_property
-    def body_forces(self) -> BodyForces:
+    def body_forces(self) -> Resultant:
         """Resultants of the contact forces on each body. Collective at first use."""
         return body_forces(self.places(), self.nodal_forces, self.dofs, self.decomposition)
 

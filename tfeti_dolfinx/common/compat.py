@@ -27,14 +27,9 @@ DOLFINX_VERSION = dolfinx.__version__  # a wheel may have another name than feni
 JIT_OPTIONS = {"timeout": 300}
 
 
-def petsc_scalar_type() -> Any:
-    """Return the numpy type of PETSc's scalars."""
-    return PETSc.ScalarType
-
-
 def require_real_petsc() -> None:
     """Raise unless PETSc was built for real numbers."""
-    if np.issubdtype(petsc_scalar_type(), np.complexfloating):
+    if np.issubdtype(PETSc.ScalarType, np.complexfloating):
         raise InputError(
             "this PETSc is built for complex numbers; contact needs a real build "
             "(Debian: python3-petsc4py-real, conda: petsc=*=real_*)"

@@ -21,22 +21,10 @@ class Resultant:
     """Resultant of forces on nodes, the same on all ranks.
 
     Attributes:
-        force: Shape ``(gdim,)``; with a thickness, that on all of it.
-        moment: About the origin, shape ``(3,)``; in 2D only its last component is not 0. In finite
-            strain forces act where nodes are, at X + u, else at X.
-    """
-
-    force: Array
-    moment: Array
-
-
-@dataclass(frozen=True)
-class BodyForces:
-    """Resultants of the contact forces on each body, the same on all ranks.
-
-    Attributes:
-        force: Shape ``(bodies, gdim)``.
-        moment: About the origin; shape ``(bodies, 3)``, in 2D only its last component is not 0.
+        force: Shape ``(gdim,)``, of each body ``(bodies, gdim)``; with a thickness, that on all of
+            it.
+        moment: About the origin, shape ``(3,)`` or ``(bodies, 3)``; in 2D only its last component
+            is not 0. In finite strain forces act where nodes are, at X + u, else at X.
     """
 
     force: Array
@@ -76,7 +64,7 @@ def condition_areas(
 
 def body_forces(
     points: Array, forces: Array, dofs: TornDofs, decomposition: Decomposition
-) -> BodyForces:
+) -> Resultant:
     """Resultants of forces on the owned groups, which are at these points. Collective."""
     lowest = dofs.copy_subdomains[dofs.copy_offsets[:-1]]
     body = decomposition.body_of_subdomain[lowest]
@@ -84,7 +72,7 @@ def body_forces(
     sums = np.zeros((decomposition.num_bodies, terms.shape[1]))
     np.add.at(sums, body, terms)
     dofs.comm.Allreduce(MPI.IN_PLACE, sums)
-    return BodyForces(sums[:, : forces.shape[1]], sums[:, forces.shape[1] :])
+    return Resultant(sums[:, : forces.shape[1]], sums[:, forces.shape[1] :])
 
 
 def vertex_tractions(

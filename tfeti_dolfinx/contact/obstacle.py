@@ -15,11 +15,7 @@ from tfeti_dolfinx.contact.shapes import Shape, check_placement, check_shape, di
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.facets import (
-    facet_kind,
-    hat_areas,
-    local_facets,
-)
+from tfeti_dolfinx.mortar.facets import facet_kind, hat_areas, local_facets
 from tfeti_dolfinx.mortar.integrals import integrate_distance
 from tfeti_dolfinx.mortar.surfaces import diameter, group_points, surface_facets
 

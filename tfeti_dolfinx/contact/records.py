@@ -19,6 +19,11 @@ class Friction(IntEnum):
     COULOMB = 2
 
 
+# tables of whole numbers, and of flags
+WHOLE = ("contact", "group", "condition", "entry_group", "friction")
+FLAGS = ("conforms", "within_reach")
+
+
 @dataclass(frozen=True)
 class ContactRecords:
     """Conditions of contact nodes, one for each contact and node whose group this rank owns.
@@ -91,39 +96,17 @@ class ContactRecords:
         """Return the same conditions with rigid bodies at another motion."""
         return replace(self, motion=motion)
 
-    def slips_as(self, other: ContactRecords) -> bool:
-        """Return whether these conditions have the same slips at any displacement as others."""
-        names = ("frame", "condition", "entry_group", "weight")
-        return all(np.array_equal(getattr(self, name), getattr(other, name)) for name in names)
-
 
 def concatenate(records: list[ContactRecords], gdim: int) -> ContactRecords:
     """All conditions of several contacts in one table."""
-    none = np.empty(0, dtype=np.int64)
-    frame, number, flag = np.empty((0, gdim, gdim)), np.empty(0), np.empty(0, dtype=bool)
-    x = np.empty((0, gdim))
-    empty = ContactRecords(
-        none,
-        none,
-        frame,
-        number,
-        number,
-        number,
-        flag,
-        number,
-        number,
-        flag,
-        none,
-        none,
-        number,
-        none,
-        x,
-        x,
-    )
     starts = np.cumsum([0, *(len(r) for r in records)])
     moved = [replace(r, condition=r.condition + s) for r, s in zip(records, starts, strict=False)]
-    names = [field.name for field in fields(ContactRecords) if field.name != "candidates"]
-    joined = {n: np.concatenate([getattr(r, n) for r in (empty, *moved)]) for n in names}
+    shapes = {"frame": (0, gdim, gdim), "place": (0, gdim), "motion": (0, gdim)}
+    joined: dict[str, Array] = {}
+    for name in (field.name for field in fields(ContactRecords) if field.name != "candidates"):
+        kind = np.int64 if name in WHOLE else np.bool_ if name in FLAGS else np.float64
+        none = np.empty(shapes.get(name, 0), dtype=kind)
+        joined[name] = np.concatenate([none, *(getattr(r, name) for r in moved)])
     return ContactRecords(**joined, candidates=sum(r.candidates for r in records))
 
 

@@ -11,14 +11,8 @@ from dolfinx import fem
 from scipy.spatial.transform import Rotation
 
 from tfeti_dolfinx.common.arrays import Array, ArrayLike
-from tfeti_dolfinx.common.validation import (
-    checked_flag,
-    checked_type,
-    checked_vector,
-    named,
-    shown,
-)
-from tfeti_dolfinx.contact.shapes import Placed, Point, Shape, check_shape, point_of
+from tfeti_dolfinx.common.validation import checked_flag, checked_type, checked_vector, named, shown
+from tfeti_dolfinx.contact.shapes import Placed, Point, Shape, check_shape
 from tfeti_dolfinx.errors import InputError
 
 # numbers that may change: fixed, a constant of DOLFINx, or a function of the problem's time
@@ -212,8 +206,11 @@ class RigidBody:
 
     def centre(self, gdim: int) -> Array:
         """Return the point that turns are about, shape ``(gdim,)``."""
-        found = point_of(self.shape) if self.point is None else np.asarray(self.point, dtype=float)
-        return found[:gdim]
+        of_shape = getattr(self.shape, "centre", getattr(self.shape, "point", None))
+        found = of_shape if self.point is None else self.point
+        if found is None or callable(found):  # whatever a shape of one's own has
+            return np.zeros(gdim)
+        return np.asarray(found, dtype=float)[:gdim]
 
     def indices(self, gdim: int) -> Array:
         """Return the positions of the free motions among all."""

@@ -193,12 +193,6 @@ class SignedDistance:
         return gradient
 
 
-def point_of(shape: Shape) -> Array:
-    """Return the centre or the point of a shape, the origin without one, shape ``(3,)``."""
-    found = getattr(shape, "centre", getattr(shape, "point", None))
-    return np.zeros(3) if found is None or callable(found) else np.asarray(found, dtype=float)
-
-
 # --- Checks of a shape's callables ------------------------------------------------------------
 
 

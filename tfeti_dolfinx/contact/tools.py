@@ -196,29 +196,22 @@ class Tools:
         """Return where a body is after the last solve."""
         return self.poses[body].moved(self.steps()[body] + self.found[body])
 
-    def begin_at(self, motions: Array | None = None) -> None:
-        """Let a load step begin where bodies are, or at motions of shape ``(bodies, k)``."""
-        if motions is None:
-            self.begin = [self.pose(i) for i in range(len(self))]
-        else:
-            self.begin = [
-                replace(pose, motion=motion)
-                for pose, motion in zip(self.begin, motions, strict=True)
-            ]
+    def begin_here(self) -> None:
+        """Let a load step begin where bodies are."""
+        self.begin = [self.pose(i) for i in range(len(self))]
 
-    def restore(self, motions: Array) -> None:
-        """Return to motions, of shape ``(bodies * k,)``, where a load step begins."""
-        values = motions.reshape(self.law.shape)
-        self.begin_at(values)
+    def go_back(self, motions: Array | None = None) -> None:
+        """Return to where the load step began, or to motions of shape ``(bodies * k,)``."""
+        if motions is not None:
+            both = zip(self.begin, motions.reshape(self.law.shape), strict=True)
+            self.begin = [replace(pose, motion=motion) for pose, motion in both]
+        began, placed = (
+            np.array([pose.motion for pose in poses]).reshape(self.law.shape)
+            for poses in (self.begin, self.poses)
+        )
         at = self.tool, self.mode
         self.found[:] = 0.0
-        placed = np.array([pose.motion for pose in self.poses]).reshape(values.shape)
-        self.found[at] = values[at] - placed[at]
-
-    def go_back(self) -> None:
-        """Return to where the load step began."""
-        if self.bodies:
-            self.restore(np.array([pose.motion for pose in self.begin]))
+        self.found[at] = began[at] - placed[at]
 
     def motions(self) -> list[ToolMotion]:
         """Return where bodies are after the last solve."""

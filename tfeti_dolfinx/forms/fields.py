@@ -8,11 +8,7 @@ from typing import Any
 import numpy as np
 import ufl
 from dolfinx import fem
-from ufl.algorithms.analysis import (
-    extract_arguments,
-    extract_coefficients,
-    extract_constants,
-)
+from ufl.algorithms.analysis import extract_arguments, extract_coefficients, extract_constants
 
 from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.common.compat import JIT_OPTIONS, interpolation_points

@@ -10,6 +10,7 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -25,6 +26,7 @@ from tfeti_dolfinx.saved_state import SHIFT, SavedState, Table
 INDEX, RECORDS, VERSION = "checkpoint.json", "records.jsonl", 5
 KIND = "checkpoint of tfeti_dolfinx"
 COUNTS = " of subdomains"  # behind the name of an array: how many of its rows are of each
+_hash: Any = partial(hashlib.blake2b, digest_size=16)
 OF_STEP = re.compile(
     r"(?P<kind>state|fields)_(?P<number>[1-9]\d*)_(?P<rank>0|[1-9]\d*)\.npz(?P<partial>\.partial)?"
 )
@@ -402,10 +404,6 @@ def _locked(folder: Path) -> int:
     except OSError:
         pass
     return lock
-
-
-def _hash(data: bytes = b"") -> Any:
-    return hashlib.blake2b(data, digest_size=16)
 
 
 def _checksum_in(file: Path) -> str:

@@ -30,12 +30,7 @@ from tfeti_dolfinx.common.validation import (
     shown,
     written_whole,
 )
-from tfeti_dolfinx.errors import (
-    ConvergenceError,
-    InputError,
-    TfetiError,
-    raised_on_all_ranks,
-)
+from tfeti_dolfinx.errors import ConvergenceError, InputError, TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.output import POINTS, Series, changing_fields, checked_target, fields_of
 from tfeti_dolfinx.problem import ContactProblem
 from tfeti_dolfinx.saved_state import (
@@ -124,12 +119,8 @@ def shown_progress(comm: MPI.Intracomm, wanted: bool | None) -> Iterator[Show]:
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
     except ImportError:  # it is optional
-
-        def say(share: float, text: str) -> None:
-            if wanted:
-                print(f"load steps {100 * share:3.0f} %: {text}", file=sys.stderr, flush=True)
-
-        yield say
+        said = "load steps {:3.0f} %: {}".format
+        yield lambda share, text: wanted and print(said(100 * share, text), file=sys.stderr)
         return
     said = TextColumn("{task.fields[said]}")
     columns = (TextColumn("load steps"), BarColumn(), TimeElapsedColumn(), said)
