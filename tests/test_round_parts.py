@@ -9,7 +9,7 @@ from scenes import box
 from scipy.spatial import Delaunay
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.common.compat import geometry_dofmap, graph_partitioners
+from tfeti_dolfinx.common.compat import GRAPH_PARTITIONERS, geometry_dofmap
 from tfeti_dolfinx.mesh.cell_graph import CellGraph, Pieces
 from tfeti_dolfinx.mesh.partition import connected_parts, make_parts
 from tfeti_dolfinx.mesh.round_parts import ROUND, balanced_kmeans, flatten_interfaces
@@ -192,7 +192,7 @@ def test_fragments_join_the_neighbour_with_most_facets():
     assert body.tolist() == [0, 0, 0, 0, 0]
 
 
-@pytest.mark.parametrize("name", ["bisection", *graph_partitioners()])
+@pytest.mark.parametrize("name", ["bisection", *GRAPH_PARTITIONERS])
 def test_other_partitioners_give_as_many_connected_parts(name):
     d = tfeti.decompose(box("tetrahedron", 8)[0], 9, partitioner=name)
     assert (d.num_subdomains, d.split) == (9, {})
@@ -200,7 +200,7 @@ def test_other_partitioners_give_as_many_connected_parts(name):
     assert size.max() < 1.2 * size.mean()
 
 
-@pytest.mark.parametrize("name", ["round", "bisection", *graph_partitioners()])
+@pytest.mark.parametrize("name", ["round", "bisection", *GRAPH_PARTITIONERS])
 def test_all_cells_on_one_rank(name):
     """The others have neither cells nor nodes."""
     mesh = untorn("tetrahedron", *tetrahedra(200))

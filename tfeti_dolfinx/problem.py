@@ -456,7 +456,8 @@ class ContactProblem:
                 raise InputError("the last solve has not converged; expected one that has")
         if solution is self._accepted[0] or self._start is None:
             return
-        self._system.tools.begin_here()
+        tools = self._system.tools
+        tools.begin = [tools.pose(i) for i in range(len(tools))]
         self._count_slips_from(solution)
         self._accepted = (solution, self._start)
 

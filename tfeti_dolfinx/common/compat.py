@@ -25,6 +25,10 @@ except ImportError:
 DOLFINX_VERSION = dolfinx.__version__  # a wheel may have another name than fenics-dolfinx
 # a compile by another rank or run may take longer than DOLFINx's 10 seconds
 JIT_OPTIONS = {"timeout": 300}
+# graph partitioners that this DOLFINx was built with
+GRAPH_PARTITIONERS = [
+    name for name in ("scotch", "parmetis", "kahip") if hasattr(graph, f"partitioner_{name}")
+]
 
 
 def require_real_petsc() -> None:
@@ -65,12 +69,6 @@ def create_mesh_in_place(comm: MPI.Intracomm, cells: Array, x: Array, element: A
         return getattr(lists, "_cpp_object", lists)
 
     return dmesh.create_mesh(comm, cells=cells, x=x, e=element, partitioner=stay)
-
-
-def graph_partitioners() -> list[str]:
-    """Names of the graph partitioners that this DOLFINx was built with."""
-    names = ("scotch", "parmetis", "kahip")
-    return [name for name in names if hasattr(graph, f"partitioner_{name}")]
 
 
 def parts_of_graph(

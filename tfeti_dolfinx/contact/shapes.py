@@ -57,8 +57,7 @@ def _direction(values: Point, what: str) -> Array:
 class Placed:
     """A shape that is placed by vectors of two or three components."""
 
-    def __init__(self, **vectors: Point) -> None:
-        self._vectors = vectors
+    _vectors: dict[str, Point]
 
     def check_dimension(self, gdim: int, whose: str) -> None:
         """Raise an InputError where a vector is plane in 3D, or points out of the plane in 2D."""
@@ -85,7 +84,7 @@ class Plane(Placed):
     def __init__(self, point: Point, normal: Point) -> None:
         self.point = _vector(point, "point")
         self.normal = _direction(normal, "normal")
-        super().__init__(point=point, normal=normal)
+        self._vectors = {"point": point, "normal": normal}
 
     def distance(self, x: Array) -> Array:
         """Signed distance, shape ``(n,)``."""
@@ -116,7 +115,7 @@ class Sphere(Placed):
         self.centre = _vector(centre, "centre")
         self.radius = checked_number(radius, "radius", POSITIVE)
         self.sign = -1.0 if checked_flag(inside, "inside") else 1.0
-        super().__init__(centre=centre)
+        self._vectors = {"centre": centre}
 
     def _offset(self, x: Array) -> Array:
         return x - self.centre[:, None]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from hashlib import blake2b
 from typing import Any, ClassVar
 
@@ -20,24 +21,27 @@ from tfeti_dolfinx.forms.checks import check_form, is_zero
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 
 
+@dataclass
 class Data:
     """Data that a user may change, with a digest of their last values.
 
-    Args:
+    Attributes:
         arrays: Gives the numbers as they are now.
         comm: Communicator.
+        seen: The digest.
     """
 
-    def __init__(self, arrays: Callable[[], list[Array]], comm: MPI.Intracomm) -> None:
-        self._arrays, self._comm, self._seen = arrays, comm, b""
+    arrays: Callable[[], list[Array]]
+    comm: MPI.Intracomm
+    seen: bytes = b""
 
     def has_changed(self) -> bool:
         """Return whether data differ from the last call's, or this is the first. Collective."""
         digest = blake2b()
-        for array in self._arrays():
+        for array in self.arrays():
             digest.update(np.ascontiguousarray(array))
-        before, self._seen = self._seen, digest.digest()
-        return any_rank(self._comm, before != self._seen)
+        before, self.seen = self.seen, digest.digest()
+        return any_rank(self.comm, before != self.seen)
 
 
 def data_of(form: ufl.Form | ufl.ZeroBaseForm, V: fem.FunctionSpace) -> Data:

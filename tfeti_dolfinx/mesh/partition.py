@@ -10,7 +10,7 @@ from scipy.sparse import coo_array, csr_array, eye_array
 from scipy.sparse.csgraph import connected_components
 
 from tfeti_dolfinx.common.arrays import Array, ArrayLike
-from tfeti_dolfinx.common.compat import graph_partitioners, parts_of_graph
+from tfeti_dolfinx.common.compat import GRAPH_PARTITIONERS, parts_of_graph
 from tfeti_dolfinx.common.validation import named, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.bisection import bisect_points
@@ -36,7 +36,7 @@ DEFAULT = "round"
 
 def check_partitioner(name: str) -> None:
     """Raise an InputError unless there is such a partitioner."""
-    known = [*PARTITIONERS, *graph_partitioners()]
+    known = [*PARTITIONERS, *GRAPH_PARTITIONERS]
     if name not in known:
         raise InputError(f"partitioner={shown(name)}: expected one of {', '.join(known)}")
 
