@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
+from scipy.linalg.lapack import dpotrf, dpotri
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import is_read
@@ -19,6 +21,7 @@ from tfeti_dolfinx.errors import FactorError
 
 log = logging.getLogger(__name__)
 
+SOLVER = "pc_factor_mat_solver_type"
 # in the order of preference
 SOLVERS = ("cholmod", "mumps", "petsc")
 # without these an indefinite matrix would pass: CHOLMOD's simplicial LDLᵀ takes pivots of any
@@ -41,6 +44,7 @@ class PetscError(IntEnum):
     OUT_OF_MEMORY = 55
     NO_SUPPORT = 56
     ZERO_PIVOT_LU = 71
+    LIBRARY = 76
     ZERO_PIVOT_CHOLESKY = 81
     MISSING_SOLVER = 92
 
@@ -112,6 +116,82 @@ class CholeskyFactor:
                 item.destroy()
 
 
+def inverse_on(A: Any, last: Array, prefix: str = "tfeti_sub_") -> Array:
+    """(A⁻¹)_bb of an SPD matrix, dense, its upper triangle: the inverse of a Schur complement.
+
+    ``last`` are b, ascending, which MUMPS eliminates last: no solves, but one factor.
+
+    Raises:
+        FactorError: It could not be made.
+    """
+    if len(last) == A.shape[0]:
+        return inverse(A.toarray(order="F"))
+    matrix, pc = as_petsc_matrix(A), PETSc.PC().create(PETSc.COMM_SELF)
+    matrix.setOption(PETSc.Mat.Option.SPD, True)
+    pc.setOptionsPrefix(prefix)
+    pc.setType(PETSc.PC.Type.CHOLESKY)
+    pc.setOperators(matrix)
+    try:
+        with added_options(prefix, {SOLVER: "mumps"}):
+            pc.setFromOptions()
+            return inverse(_schur_complement(pc, last))
+    except PETSc.Error as error:
+        raise _cause(error, "mumps", matrix) from error
+    finally:
+        pc.destroy()
+        matrix.destroy()
+
+
+def _schur_complement(pc: PETSc.PC, last: Array) -> Array:
+    """A_bb − A_bi A_ii⁻¹ A_ib of the matrix of a PC of MUMPS, which is set up, in Fortran's order.
+
+    petsc4py does not ask for it, its library does.
+    """
+    library, pointer, count = ctypes.CDLL(PETSc.__file__), ctypes.c_void_p, len(last)
+
+    def call(name: str, *given: Any) -> None:
+        if code := getattr(library, name)(*given):
+            raise PETSc.Error(code)
+
+    pc.setFactorSetUpSolverType()
+    unknowns = PETSc.IS().createGeneral(last.astype(PETSc.IntType), comm=PETSc.COMM_SELF)
+    factor, S, data = pointer(pc.getFactorMatrix().handle), pointer(), pointer()
+    call("MatFactorSetSchurIS", factor, pointer(unknowns.handle))
+    unknowns.destroy()
+    pc.setUp()
+    if reason := pc.getFailedReason():
+        no_memory = reason == PETSc.PC.FailedReason.FACTOR_OUTMEMORY
+        raise PETSc.Error(PetscError.OUT_OF_MEMORY if no_memory else PetscError.LIBRARY)
+    call("MatFactorCreateSchurComplement", factor, ctypes.byref(S), None)
+    call("MatDenseGetArrayRead", S, ctypes.byref(data))
+    entries = ctypes.cast(data, ctypes.POINTER(ctypes.c_double * count**2)).contents
+    complement = np.array(entries).reshape((count, count), order="F")
+    call("MatDestroy", ctypes.byref(S))
+    return complement
+
+
+def makes_inverse_on(prefix: str = "tfeti_sub_") -> bool:
+    """Return whether ``inverse_on`` has MUMPS, and options do not ask for another solver."""
+    return _has_mumps() and PETSc.Options(prefix).getString(SOLVER, "mumps") == "mumps"
+
+
+@cache
+def _has_mumps() -> bool:
+    return has_solver("mumps")
+
+
+def inverse(A: Array) -> Array:
+    """A⁻¹ of a dense SPD matrix by its upper triangle, which is overwritten: that of the inverse.
+
+    Raises:
+        NotPositiveDefiniteError: A is not positive definite.
+    """
+    factor, pivot = dpotrf(A, overwrite_a=True)
+    if pivot or not np.all(np.isfinite(factor.diagonal())):
+        raise NotPositiveDefiniteError("a dense matrix on a trace is not positive definite")
+    return np.asarray(dpotri(factor, overwrite_c=True)[0])
+
+
 @contextmanager
 def added_options(prefix: str, given: Mapping[str, Any]) -> Iterator[None]:
     """PETSc's options with some more in the block; those that it has already win."""
@@ -138,9 +218,9 @@ def unread_options(given: Mapping[str, Any], solver: str) -> list[str]:
     It is tried with a matrix of a single unknown. None where that cannot be made, which has a cause
     that the factors of the problem name.
     """
-    chosen = {"pc_factor_mat_solver_type": solver, **given}
+    chosen = {SOLVER: solver, **given}
     with added_options(TRIAL, chosen):
-        if not has_solver(str(chosen["pc_factor_mat_solver_type"]), TRIAL):
+        if not has_solver(str(chosen[SOLVER]), TRIAL):
             return []
         return [name for name in given if not is_read(TRIAL + name)]
 
@@ -201,7 +281,7 @@ def _factored(pc: PETSc.PC, matrix: PETSc.Mat, prefix: str) -> PETSc.Mat:
     pc.setOptionsPrefix(prefix)
     pc.setType(PETSc.PC.Type.CHOLESKY)
     pc.setOperators(matrix)
-    given = {"pc_factor_mat_solver_type": default_solver(), **DEFINITE, **QUIET}
+    given = {SOLVER: default_solver(), **DEFINITE, **QUIET}
     with added_options(prefix, given):
         pc.setFromOptions()
         pc.setUp()
