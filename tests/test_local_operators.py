@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from scenes import box, curved_obstacle, decomposed, problem
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, diags_array, eye_array
 from test_blocks import data, stiffness
 from test_dual import check_operator
 
@@ -138,6 +138,17 @@ def test_a_solver_that_is_asked_for_makes_all_factors():
     assert close(F, blockwise(subdomains.blocks, "pinv", w), d.comm)
     assert counters.factorizations == before
     p.destroy()
+
+
+@pytest.mark.parametrize("inside", [1, 2, 5, 8, 50, 499])
+def test_a_trace_of_nearly_all_unknowns_or_few(inside):
+    """MUMPS counts too little space where few are inside."""
+    n = 500
+    neighbours = diags_array([np.full(n - k, -1.0) for k in (1, 5, 25)], offsets=[1, 5, 25])
+    A = csr_array(neighbours + neighbours.T + 6.5 * eye_array(n))
+    last = np.delete(np.arange(n), np.random.default_rng(0).choice(n, inside, replace=False))
+    expected = np.linalg.inv(A.toarray())[np.ix_(last, last)]
+    assert np.allclose(np.triu(inverse_on(A, last)), np.triu(expected), atol=1e-12)
 
 
 def test_a_matrix_of_the_trace_that_is_indefinite_is_named():

@@ -31,6 +31,9 @@ DEFINITE = {
     "mat_mumps_icntl_13": "1",
     "mat_mumps_icntl_24": "1",
 }
+# per cent of space beyond what MUMPS counts, which is too little where nearly all unknowns are in a
+# Schur complement; the next is taken where one does not do
+SPACES = ("20", "200", "2000", "20000")
 # CHOLMOD would print a line of its own beside the error that is raised
 QUIET = {"mat_cholmod_print": "0"}
 # prefix of the options of a factor that is made to see what it reads
@@ -126,20 +129,26 @@ def inverse_on(A: Any, last: Array, prefix: str = "tfeti_sub_") -> Array:
     """
     if len(last) == A.shape[0]:
         return inverse(A.toarray(order="F"))
-    matrix, pc = as_petsc_matrix(A), PETSc.PC().create(PETSc.COMM_SELF)
+    matrix = as_petsc_matrix(A)
     matrix.setOption(PETSc.Mat.Option.SPD, True)
-    pc.setOptionsPrefix(prefix)
-    pc.setType(PETSc.PC.Type.CHOLESKY)
-    pc.setOperators(matrix)
     try:
-        with added_options(prefix, {SOLVER: "mumps"}):
-            pc.setFromOptions()
-            return inverse(_schur_complement(pc, last))
-    except PETSc.Error as error:
-        raise _cause(error, "mumps", matrix) from error
+        for space in SPACES:
+            pc = PETSc.PC().create(PETSc.COMM_SELF)
+            pc.setOptionsPrefix(prefix)
+            pc.setType(PETSc.PC.Type.CHOLESKY)
+            pc.setOperators(matrix)
+            try:
+                with added_options(prefix, {SOLVER: "mumps", "mat_mumps_icntl_14": space}):
+                    pc.setFromOptions()
+                    return inverse(_schur_complement(pc, last))
+            except PETSc.Error as error:
+                if error.ierr != PetscError.OUT_OF_MEMORY or space == SPACES[-1]:
+                    raise _cause(error, "mumps", matrix) from error
+            finally:
+                pc.destroy()
     finally:
-        pc.destroy()
         matrix.destroy()
+    raise AssertionError("the last space returns or raises")
 
 
 def _schur_complement(pc: PETSc.PC, last: Array) -> Array:
