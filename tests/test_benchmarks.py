@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks import (
     ablation,
+    curved_gaps,
     kplus_forms,
     linear_price,
     nonlinear_steps,
@@ -37,6 +38,7 @@ def with_arguments(benchmark, *arguments, slow=False):
 
 START_MPIRUN = (solver_profiles, scaling, time_against_error)
 RUNS = [
+    with_arguments(curved_gaps),
     with_arguments(kplus_forms),
     with_arguments(linear_price, "--scenes", "cube_3d"),
     with_arguments(spectrum),

@@ -110,7 +110,9 @@ def draw(data: Mapping[str, Any], target: str) -> None:
         manifold_edges=False,
     )
     if outline.n_cells:
-        plotter.add_mesh(outline, color="black", line_width=1.5, lighting=False)
+        lines = plotter.add_mesh(outline, color="black", line_width=1.5, lighting=False)
+        lines.mapper.SetResolveCoincidentTopologyToPolygonOffset()  # whole where bodies touch
+        lines.mapper.SetRelativeCoincidentTopologyLineOffsetParameters(-2.0, -200.0)
     for i in range(len([key for key in data if str(key).startswith("obstacle_")])):
         _add_obstacle(plotter, data["box"], data[f"obstacle_{i}"], flat)
     _look(plotter, np.vstack((grid.points, bodies.points)), data, flat)
