@@ -175,6 +175,32 @@ def test_series_goes_on_from_its_checkpoint(comm, shared_tmp):
         assert np.abs(found - expected).max(initial=0.0) < 1e-7 * 0.06
 
 
+def test_only_subdomains_with_a_new_tangent_are_factored_again(comm):
+    """Of four layers the lowest yields: each new tangent costs its two factors."""
+    mesh, tags = block(2, 8, 0.05, comm)
+    layers = {"facet_tags": tags, "surfaces": {"low": 1, "top": 2}}
+    cut = tfeti.decompose(mesh, lambda x: np.clip(4 * x[1], 0, 3).astype(int), **layers)
+    V = fem.functionspace(cut.mesh, ("Lagrange", 1, (2,)))
+    u, v = fem.Function(V), ufl.TestFunction(V)
+    strength = fem.Function(fem.functionspace(cut.mesh, ("DG", 0)))
+    strength.interpolate(lambda x: np.where(x[1] < 0.25, 0.01, 10.0))
+    law = SimplePlasticity(u, E, NU, strength, 0.05, 2)
+    value, bc = held_top(V, cut)
+    given = law.residual(v), u, [bc], [plane(2)], cut
+    problem = tfeti.NonlinearContactProblem(*given, state=law.state)
+    counts = []
+    for down in (-0.03, -0.06):
+        value.value[-1] = down
+        problem.solve()
+        problem.accept()
+        counts.append((problem.report.assemblies, problem.report.factorizations))
+    (first, all_made), (again, made_again) = counts
+    assert first > 1
+    assert again > 1
+    assert all_made == 2 * 4 + 2 * (first - 1)
+    assert made_again <= 2 * again
+
+
 def test_rows_and_their_multipliers_outlive_the_tangent(comm):
     """A state restored by another problem has the contact forces of the one that found it."""
     problem, _, value = plastic(comm)

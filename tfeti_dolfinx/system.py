@@ -37,12 +37,12 @@ from tfeti_dolfinx.subdomains.build import (
     MakeBlock,
     SubdomainMethod,
     make_subdomains,
-    sparse_blocks,
     subdomain_data,
 )
 from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, InverseFactory
 from tfeti_dolfinx.subdomains.local_operators import LocalChoice
+from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains, SparseBlock
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 # --- Settings of a solve ---------------------------------------------------------------------
@@ -92,11 +92,13 @@ class Settings:
         counters: Counters,
         replaced: Callable[[MakeBlock], MakeBlock] | None = None,
         tools: Tools | None = None,
+        equals: EqualSubdomains | None = None,
     ) -> Subdomains:
         """Return all Blocks of a rank as one. Collective.
 
         ``replaced`` takes the factory of Blocks to one that makes some of them otherwise; ``tools``
-        are rigid bodies, of which those with free motions get Blocks.
+        are rigid bodies, of which those with free motions get Blocks. Stiffnesses that ``equals``
+        knows are shared, unless the type of local operators is another.
 
         Raises:
             InputError: Stiffness or load do not fit.
@@ -104,7 +106,9 @@ class Settings:
         """
         own, options = self.extensions, self.options
         choice = LocalChoice(options.local_type, options.local_multiplications)
-        make = own.block or sparse_blocks(self.inverses(counters), choice)
+        how = self.inverses(counters)
+        found = (equals or EqualSubdomains(how)) if choice.type in ("auto", "shared") else None
+        make = own.block or (lambda item: SparseBlock(item, how, found))
         make = make if replaced is None else replaced(make)
         kind = Subdomains if own.subdomains is None else own.subdomains(dofs, decomposition)
         rigid: list[RigidBlock] = []
@@ -217,6 +221,7 @@ class System:
         self._known_slips: tuple[ContactRecords, Array] | None = None
         self._stale, self._made = set(STAGES), Counter[str]()
         self._counters, self._counted = Counters(), 0
+        self._equals = EqualSubdomains(settings.inverses(self._counters))
         self._seen = 0.0  # of ‖F‖, which more rows hardly change
         self.inverses, self.follows = 0, False
         self.weights: Array | None = None
@@ -291,6 +296,8 @@ class System:
         if "coarse problem" in self._stale:
             self._destroy_dual()
         if "factors" in self._stale:
+            if self._subdomains is not None:  # what does not change is not factored again
+                self._equals.keep(self._subdomains.blocks)
             self._destroy_subdomains()
 
     def set_gaps(self, gaps: Mapping[int, Gap]) -> None:
@@ -379,6 +386,7 @@ class System:
         """Destroy the PETSc objects; all stages are out of date."""
         self._destroy_dual()
         self._destroy_subdomains()
+        self._equals.forget()
         if self._gluing is not None:
             self._gluing.constraints.destroy()
         self._gluing = None
@@ -452,6 +460,7 @@ class System:
             self._counters,
             self.elements.blocks,
             self.tools if self.tools.num_unknowns else None,
+            self._equals,
         )
         self._K = None
         self._subdomains.retrace(trace)
@@ -464,6 +473,7 @@ class System:
         parts = self.gluing.constraints, self.subdomains
         self._dual = settings.make_dual(*parts, *scene, law, names)
         self.dual.seen = max(self.dual.seen, self._seen)
+        self._equals.forget()
 
     def _slip(self) -> Array:
         """Tangential v_i of all conditions where the load step begins, shape ``(n, gdim - 1)``."""

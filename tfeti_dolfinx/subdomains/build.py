@@ -18,7 +18,6 @@ from tfeti_dolfinx.subdomains.block import Block, Counters, RigidBlock, Subdomai
 from tfeti_dolfinx.subdomains.factor import say_if_not_cholmod
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.local_operators import LocalChoice
-from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains, SparseBlock
 from tfeti_dolfinx.subdomains.subdomains import Subdomains
 
 MakeBlock = Callable[[SubdomainData], Block]
@@ -109,12 +108,6 @@ def subdomain_data(
         )
 
     return map(data_of, range(len(dofs.subdomains)))
-
-
-def sparse_blocks(how: InverseFactory, choice: LocalChoice) -> MakeBlock:
-    """Return the factory of a rank's Blocks, which share a stiffness if the choice says so."""
-    equals = EqualSubdomains(how) if choice.type in ("auto", "shared") else None
-    return lambda data: SparseBlock(data, how, equals)
 
 
 def make_subdomains(

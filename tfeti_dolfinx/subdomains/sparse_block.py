@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -251,6 +251,20 @@ class EqualSubdomains:
     def __init__(self, how: InverseFactory) -> None:
         self._how = how
         self._of_shape: dict[bytes, WeakSet[Stiffness]] = defaultdict(WeakSet)
+        self._kept: dict[str, tuple[Stiffness, Traced | None]] = {}
+
+    def keep(self, blocks: Sequence[Block]) -> None:
+        """Hold the stiffnesses of Blocks, with their factors, for those that come after them.
+
+        One is let go as soon as the subdomain of its name has another.
+        """
+        for block in blocks:
+            if isinstance(block, SparseBlock) and block.equals is self:
+                self._kept[block.name] = (block.stiffness, block.__dict__.get("traced"))
+
+    def forget(self) -> None:
+        """Let go what ``keep`` holds."""
+        self._kept.clear()
 
     def find(self, name: str, x: Array, K: Any) -> tuple[Stiffness, Array]:
         """Return the stiffness that is equal to K, or a new one; and where K's unknowns are in it.
@@ -268,6 +282,8 @@ class EqualSubdomains:
             here = (place[:, None] * bs + np.arange(bs)).ravel().astype(np.int32)
             if _equal(K, stiffness, here):
                 return stiffness, here
+            del stiffness
+        self._kept.pop(name, None)  # its factors go before others are made
         made = Stiffness(name, x, K, self._how)
         known.add(made)
         return made, np.arange(K.shape[0], dtype=np.int32)
@@ -311,6 +327,7 @@ class SparseBlock(Block):
         equals: Finds the stiffness among those of equal subdomains; without it, it shares none.
 
     Attributes:
+        equals: As given.
         place: Unknown of the stiffness for each of its own, shape ``(n,)``.
 
     Raises:
@@ -325,7 +342,7 @@ class SparseBlock(Block):
         how: InverseFactory | None = None,
         equals: EqualSubdomains | None = None,
     ) -> None:
-        self._how, self._equals = how or InverseFactory(), equals
+        self._how, self.equals = how or InverseFactory(), equals
         super().__init__(data)
 
     def set_stiffness(self, K: Any) -> None:
@@ -336,8 +353,8 @@ class SparseBlock(Block):
 
     def _found(self, K: Any) -> tuple[Stiffness, Array]:
         """Return a Stiffness of K, and the place of each unknown in it."""
-        if self._equals is not None:
-            return self._equals.find(self.name, self.x, K)
+        if self.equals is not None:
+            return self.equals.find(self.name, self.x, K)
         return Stiffness(self.name, self.x, K, self._how), np.arange(K.shape[0])
 
     @property
