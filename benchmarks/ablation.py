@@ -20,13 +20,16 @@ import petsc4py
 
 petsc4py.init(sys.argv)
 
+from mpi4py import MPI
 from petsc4py import PETSc
 
+from benchmarks.stability_scenes import LADDERS
+from benchmarks.stress.judge import run_scene
 from benchmarks.tools import ROOT, Tables, command_line, markdown, write_tables
 from tfeti_dolfinx import ContactProblem
 from tfeti_dolfinx.options import MECHANISMS
 
-# name, demo and its arguments
+# name, demo and its arguments, or a rung of a ladder of stability.py: its name, cells and value
 SCENES = {
     "Hertz 2D": "hertz_2d",
     "cylinder on block": "cylinder_on_block_2d",
@@ -49,6 +52,10 @@ SCENES = {
     "Hertz 3D": "hertz_3d --quick",
     "bars": "impact_of_bars --quick",
     "falling balls": "falling_balls_3d --quick",
+    "springs": "linear_3d --springs 1e-4",
+    "cube on springs": "cube_3d --subdomains 64 --springs 1e-2",
+    "flat block 1 : 100": "ladder flat block, hexahedron, 100",
+    "moduli of cells 1 : 1e6": "ladder cells, hexahedron, 1e6",
 }
 QUICK = ("semicoercive", "talk's Hertz")
 PAGE = ROOT / "docs" / "developers" / "ablation.md"
@@ -88,16 +95,21 @@ def counted() -> Iterator[Counts]:
         ContactProblem.solve = solve
 
 
-def run(demo: str, without: str) -> Counts:
-    """Run a demo without a mechanism; what it raises stands among the reasons."""
-    name, *words = demo.split()
+def run(scene: str, without: str) -> Counts:
+    """Run a demo or a rung without a mechanism; what it raises stands among the reasons."""
+    name, *words = scene.split()
     options, argv = PETSc.Options(), sys.argv
     options.setValue("-tfeti_without", without)
     sys.argv = [str(ROOT / "demos" / f"{name}.py"), *words]
     try:
         with counted() as counts, contextlib.redirect_stdout(io.StringIO()):
             try:
-                runpy.run_path(sys.argv[0], run_name="__main__")
+                if name == "ladder":
+                    title, cell, value = scene.removeprefix("ladder ").split(", ")
+                    (ladder,) = (one for one in LADDERS if one.name == title)
+                    run_scene(ladder.rung(cell, float(value)), MPI.COMM_WORLD)
+                else:
+                    runpy.run_path(sys.argv[0], run_name="__main__")
             except SystemExit:
                 pass
             except Exception as error:

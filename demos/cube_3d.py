@@ -16,6 +16,7 @@ parser = argparse.ArgumentParser(description="A cube of equal subdomains on a cu
 parser.add_argument("--quick", action="store_true", help="a size of a few seconds")
 parser.add_argument("--subdomains", type=int, default=8, help="their number, a cube: 8, 64")
 parser.add_argument("--cells", type=int, help="hexahedra along an edge of a subdomain")
+parser.add_argument("--springs", type=float, default=0.0, help="in each point, that hold it softly")
 parser.add_argument("--plot", action="store_true", help="draw pictures")
 parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
 parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
@@ -64,6 +65,9 @@ mesh = decomposition.mesh
 elastic = tfeti.Elasticity(decomposition, E=1.0, nu=0.3)
 V = fem.functionspace(mesh, ("Lagrange", 1, (3,)))
 u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+a = elastic.a(u, v)
+if arguments.springs:
+    a += fem.Constant(mesh, arguments.springs) * ufl.dot(u, v) * ufl.dx
 ds = ufl.Measure("ds", domain=mesh, subdomain_data=decomposition.facet_tags)
 
 # ## Load, conditions, obstacle
@@ -78,7 +82,7 @@ obstacle = tfeti.SignedDistance(
     lambda x: np.stack((np.zeros_like(x[0]), np.zeros_like(x[0]), np.ones_like(x[0]))),
 )
 problem = tfeti.ContactProblem(
-    elastic.a(u, v),
+    a,
     ufl.dot(traction, v) * ds(decomposition.surface("top")),
     [fem.dirichletbc(np.zeros(3), fixed, V)],
     [tfeti.Obstacle("bottom", obstacle, reach=np.inf)],

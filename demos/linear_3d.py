@@ -19,6 +19,7 @@ parser.add_argument("--subdomains", type=int, default=16, help="their number")
 parser.add_argument("--cells", type=int, help="cubes along the height of the beam")
 parser.add_argument("--degree", type=int, default=1, help="of the displacement")
 parser.add_argument("--ratio", type=float, default=10.0, help="modulus of the upper half")
+parser.add_argument("--springs", type=float, default=0.0, help="in each point, that hold it softly")
 parser.add_argument("--plot", action="store_true", help="draw pictures")
 parser.add_argument("--output", type=Path, metavar="DIR", help="folder for fields")
 parser.add_argument("--report", type=Path, metavar="FILE", help="write the report as JSON")
@@ -55,10 +56,13 @@ young = {"lower": 1.0, "upper": arguments.ratio}
 elastic = tfeti.Elasticity(decomposition, E=young, nu=0.3)
 V = fem.functionspace(mesh, ("Lagrange", arguments.degree, (3,)))
 u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+a = elastic.a(u, v)
+if arguments.springs:
+    a += fem.Constant(mesh, arguments.springs) * ufl.dot(u, v) * ufl.dx
 ds = ufl.Measure("ds", domain=mesh, subdomain_data=decomposition.facet_tags)
 clamped = fem.locate_dofs_topological(V, 2, decomposition.facets("clamped"))
 problem = tfeti.ContactProblem(
-    elastic.a(u, v),
+    a,
     ufl.dot(fem.Constant(mesh, (0.0, 0.0, -1e-3)), v) * ds(decomposition.surface("loaded")),
     [fem.dirichletbc(np.zeros(3), clamped, V)],
     [],

@@ -119,7 +119,7 @@ class Options:
         "auto",
         "pcpg, newton",
         "most search directions kept between solves with the same stiffness (Krylov recycling), "
-        "two vectors each; 0: none; auto: 100 from the second solve on, of bodies with mass 200",
+        "two vectors each; 0: none; auto: 200 from the second solve on",
         fits=FROM_0,
         words=("auto",),
         kind=int,
@@ -229,21 +229,18 @@ YES, NO = ("", "1", "true", "yes", "on"), ("0", "false", "no", "off")
 TYPES = re.compile(r"(ksp|snes|tao|qp|qps|mat_solver)_type", re.IGNORECASE)
 
 
-def parse_options(
-    given: Mapping[str, Any] | None, prefix: str, defaults: Mapping[str, Any] | None = None
-) -> Options:
+def parse_options(given: Mapping[str, Any] | None, prefix: str) -> Options:
     """Options from the command line, else from a dictionary, else the defaults.
 
     Args:
         given: Options of the program, with or without the prefix.
         prefix: Prefix of all options, e.g. ``"tfeti_"``.
-        defaults: By name, those that are not the options' own.
 
     Raises:
         InputError: An option is unknown, its value does not fit, or the command line has options
             that PETSc was not given.
     """
-    named = {**(defaults or {}), **_without_prefix(given, prefix)}
+    named = _without_prefix(given, prefix)
     database = PETSc.Options(prefix)
     named |= {name: database.getString(name, "") for name in database.getAll()}
     _check_reached(named, prefix)

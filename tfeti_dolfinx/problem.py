@@ -76,7 +76,6 @@ class ContactProblem:
         boundary_elements: Which volumes get boundary elements.
 
     Attributes:
-        defaults: Options, by name, that have other defaults than their own.
         form_name: Name of the bilinear form, for messages.
         u: The displacement of the last solve.
         report: Sizes, counters, residuals and times of the last solve.
@@ -88,7 +87,6 @@ class ContactProblem:
         InputError: Something given does not fit; the message names it.
     """
 
-    defaults: ClassVar[Mapping[str, Any]] = {}
     form_name: ClassVar[str] = "a"
 
     def __init__(
@@ -115,7 +113,7 @@ class ContactProblem:
         self.decomposition, comm = decomposition, decomposition.comm
         with agreeing(comm, type(self).__name__) as given:
             require_real_petsc()
-            self.options = parse_options(petsc_options, petsc_options_prefix, self.defaults)
+            self.options = parse_options(petsc_options, petsc_options_prefix)
             extensions = Extensions() if extensions is None else extensions
             checked_type(extensions, Extensions, "extensions", "tfeti_dolfinx.Extensions")
             for_factors = factor_options(petsc_options, petsc_options_prefix)

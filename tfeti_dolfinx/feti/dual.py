@@ -62,7 +62,7 @@ class DualLimits:
     most: float = 1e130
     nearly: float = 1e-2
     parallel: float = 1e-12
-    recycled: int = 100
+    recycled: int = 200
 
 
 LIMITS = DualLimits()

@@ -39,11 +39,9 @@ class RoundParameters:
     """
 
     stages: tuple[tuple[float, int, float], ...] = (
-        (300, 20, 0.0),
-        (300, 30, 0.5),
+        (300, 50, 0.5),
         (1000, 10, 0.5),
-        (1000, 5, 0.0),
-        (np.inf, 3, 0.0),
+        (np.inf, 5, 0.0),
     )
     influence_step: float = 1.1
     candidates: int = 16
@@ -146,24 +144,24 @@ def balanced_kmeans(
     """
     home = np.repeat(np.arange(len(shares)), shares)
     total, (n, gdim) = int(_counts(comm, body, len(shares)).sum()), x.shape
-    centre, influence = np.zeros((len(home), gdim)), np.ones(len(home))
-    for sample, rounds, way in ROUND.stages:
+    centre = np.zeros((len(home), gdim))
+    for stage, (sample, rounds, way) in enumerate(ROUND.stages):
         some: Array = np.arange(n)
         if sample * len(home) < total:
             some = np.flatnonzero(key % np.uint64(total // (sample * len(home))) == 0)
         y, of = x[some], body[some]
-        if np.any(centre):  # the nearest centre, of a body: they are apart along one more axis
-            apart = 2.0 ** (ROUND.bits + 2)
-            tree = cKDTree(np.column_stack((centre, apart * home)))
-            own = tree.query(np.column_stack((y, apart * of)))[1].astype(np.int64)
-            own = _nearest(y, own, centre, influence, home)
-        else:
+        if stage == 0:
             own = bisect_points(y, shares, comm, body=of)
             centre = _means(y, own, centre, comm)
             away = np.rint(np.sqrt(_squares(y, centre[own])))
             spread = summed(comm, np.bincount(own, away, minlength=len(home)))
             influence = np.maximum(spread / np.maximum(_counts(comm, own, len(home)), 1), 1.0)
             begun = _slenderness(y, own, len(home), comm)
+        else:  # the nearest centre, of a body: they are apart along one more axis
+            apart = 2.0 ** (ROUND.bits + 2)
+            tree = cKDTree(np.column_stack((centre, apart * home)))
+            own = tree.query(np.column_stack((y, apart * of)))[1].astype(np.int64)
+            own = _nearest(y, own, centre, influence, home)
         goal = (_counts(comm, of, len(shares)) / shares)[home]
         for _ in range(rounds):
             centre += way * (_means(y, own, centre, comm) - centre)

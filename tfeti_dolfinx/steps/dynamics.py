@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import ufl
@@ -230,8 +230,8 @@ class ContactDynamics(ContactProblem):
     A step of the size τ solves one contact problem with K/2 + 2M/τ², and ends at u⁺ and v⁺. Contact
     is implicit: no node overlaps at the end of a step, and its forces, λ, are means over the step.
     ``LoadSteps`` goes through many, or by hand: ``take_step(size)``, ``solve()``, ``accept()``.
-    All is collective. Since F is that of the steps before, 200 directions of earlier steps
-    are kept, unless the option ``recycle`` is given.
+    All is collective. F is that of the steps before: their directions are kept, as the option
+    ``recycle`` says.
 
     With fixed obstacles and supports and no friction the energy E = vᵀMv/2 + uᵀKu/2 changes by the
     work of the load less λᵀ(g − Bu): contact adds none, and takes some where it closes. Forces of
@@ -263,8 +263,6 @@ class ContactDynamics(ContactProblem):
     Raises:
         InputError: What is given does not fit; the message names it.
     """
-
-    defaults: ClassVar[Mapping[str, Any]] = {"recycle": 200}
 
     def __init__(
         self,
@@ -456,8 +454,6 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
     Raises:
         InputError: What is given does not fit; the message names it.
     """
-
-    defaults: ClassVar[Mapping[str, Any]] = NonlinearContactProblem.defaults
 
     def __init__(
         self,
