@@ -46,7 +46,7 @@ class RoundParameters:
     influence_step: float = 1.1
     candidates: int = 16
     fewest: int = 20
-    largest: float = 1.1
+    largest: float = 1.5
     facet: float = 12.0
     flattening: int = 10
     gains: float = 1.08
