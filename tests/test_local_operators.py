@@ -4,14 +4,12 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from scenes import box, curved_obstacle, decomposed, problem
-from scipy.sparse import csr_array, diags_array, eye_array
+from scipy.sparse import csr_array
 from test_blocks import data, stiffness
 from test_dual import check_operator
 
 import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.common.arrays import parts_of
-from tfeti_dolfinx.errors import FactorError
-from tfeti_dolfinx.subdomains.factor import added_options, inverse_on
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.local_operators import GroupedOperator, LocalChoice
 from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains, SparseBlock
@@ -94,69 +92,6 @@ def test_all_forms_apply_the_same(cell, equal):
     check_operator(p.dual.F, d.comm, len(p.dual.d))
     for item in (p, alone):
         item.destroy()
-
-
-@pytest.mark.parametrize(("cell", "equal"), [("triangle", False), ("quadrilateral", True)])
-def test_one_factor_gives_both(cell, equal):
-    """K⁺ by a factor with the trace last, S of it; K_ii is not factored for either."""
-    d = cubes(cell, cells=6) if equal else decomposed(cell, 4, 24)
-    p, subdomains = made(d, "explicit")
-    w, counters = random(len(subdomains.trace)), subdomains.counters
-    expected = [blockwise(subdomains.blocks, kind, w) for kind in ("pinv", "schur")]
-    F = GroupedOperator(subdomains.blocks, "pinv", LocalChoice("explicit"))
-    F.prepare()
-    before = counters.factorizations
-    for block in subdomains.blocks:
-        block.traced.__dict__.pop("inner", None)
-    S = GroupedOperator(subdomains.blocks, "schur", LocalChoice("explicit"))
-    S.prepare()
-    for operator, product in zip((F, S), expected, strict=True):
-        operator.mult(w, out := np.full_like(w, np.nan))
-        assert close(out, product, d.comm)
-    assert counters.factorizations == before
-    assert not any("inner" in block.traced.__dict__ for block in subdomains.blocks)
-    # a trace that leaves a turn free, and one that K⁺ is not known on, take the factor of K_ii
-    for block in subdomains.blocks:
-        some, all_of_it = block.trace_dofs[:1], np.arange(len(block.place))
-        inside = len(block.stiffness.dense().trace) < len(all_of_it)
-        block.retrace(some)
-        assert block.traced.schur() is None
-        block.retrace(all_of_it)
-        assert (block.traced.schur() is None) == inside
-    p.destroy()
-
-
-def test_a_solver_that_is_asked_for_makes_all_factors():
-    d = decomposed("triangle", 4, 8)
-    p, subdomains = made(d, "explicit")
-    w, counters = random(len(subdomains.trace)), subdomains.counters
-    for block in subdomains.blocks:
-        block.traced.__dict__.pop("pinv", None)
-    before = counters.factorizations
-    with added_options("tfeti_sub_", {"pc_factor_mat_solver_type": "petsc"}):
-        F = applied(subdomains.local_operator("pinv"), w)
-    assert close(F, blockwise(subdomains.blocks, "pinv", w), d.comm)
-    assert counters.factorizations == before
-    p.destroy()
-
-
-@pytest.mark.parametrize("inside", [1, 2, 5, 8, 50, 499])
-def test_a_trace_of_nearly_all_unknowns_or_few(inside):
-    """MUMPS counts too little space where few are inside."""
-    n = 500
-    neighbours = diags_array([np.full(n - k, -1.0) for k in (1, 5, 25)], offsets=[1, 5, 25])
-    A = csr_array(neighbours + neighbours.T + 6.5 * eye_array(n))
-    last = np.delete(np.arange(n), np.random.default_rng(0).choice(n, inside, replace=False))
-    expected = np.linalg.inv(A.toarray())[np.ix_(last, last)]
-    assert np.allclose(np.triu(inverse_on(A, last)), np.triu(expected), atol=1e-12)
-
-
-def test_a_matrix_of_the_trace_that_is_indefinite_is_named():
-    K = csr_array(np.diag([1.0, 2.0, -1.0]))
-    with pytest.raises(FactorError, match="not positive definite"):
-        inverse_on(K, np.array([1, 2], dtype=np.int32))
-    with pytest.raises(FactorError, match="not positive definite"):
-        inverse_on(K, np.arange(3))
 
 
 def test_equal_subdomains_are_factored_once():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -13,7 +12,6 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
-from scipy.linalg.lapack import dpotrf, dpotri
 
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.compat import is_read
@@ -21,7 +19,6 @@ from tfeti_dolfinx.errors import FactorError
 
 log = logging.getLogger(__name__)
 
-SOLVER = "pc_factor_mat_solver_type"
 # in the order of preference
 SOLVERS = ("cholmod", "mumps", "petsc")
 # without these an indefinite matrix would pass: CHOLMOD's simplicial LDLᵀ takes pivots of any
@@ -31,9 +28,6 @@ DEFINITE = {
     "mat_mumps_icntl_13": "1",
     "mat_mumps_icntl_24": "1",
 }
-# per cent of space beyond what MUMPS counts, which is too little where nearly all unknowns are in a
-# Schur complement; the next is taken where one does not do
-SPACES = ("20", "200", "2000", "20000")
 # CHOLMOD would print a line of its own beside the error that is raised
 QUIET = {"mat_cholmod_print": "0"}
 # prefix of the options of a factor that is made to see what it reads
@@ -47,7 +41,6 @@ class PetscError(IntEnum):
     OUT_OF_MEMORY = 55
     NO_SUPPORT = 56
     ZERO_PIVOT_LU = 71
-    LIBRARY = 76
     ZERO_PIVOT_CHOLESKY = 81
     MISSING_SOLVER = 92
 
@@ -119,88 +112,6 @@ class CholeskyFactor:
                 item.destroy()
 
 
-def inverse_on(A: Any, last: Array, prefix: str = "tfeti_sub_") -> Array:
-    """(A⁻¹)_bb of an SPD matrix, dense, its upper triangle: the inverse of a Schur complement.
-
-    ``last`` are b, ascending, which MUMPS eliminates last: no solves, but one factor.
-
-    Raises:
-        FactorError: It could not be made.
-    """
-    if len(last) == A.shape[0]:
-        return inverse(A.toarray(order="F"))
-    matrix = as_petsc_matrix(A)
-    matrix.setOption(PETSc.Mat.Option.SPD, True)
-    try:
-        for space in SPACES:
-            pc = PETSc.PC().create(PETSc.COMM_SELF)
-            pc.setOptionsPrefix(prefix)
-            pc.setType(PETSc.PC.Type.CHOLESKY)
-            pc.setOperators(matrix)
-            try:
-                with added_options(prefix, {SOLVER: "mumps", "mat_mumps_icntl_14": space}):
-                    pc.setFromOptions()
-                    return inverse(_schur_complement(pc, last))
-            except PETSc.Error as error:
-                if error.ierr != PetscError.OUT_OF_MEMORY or space == SPACES[-1]:
-                    raise _cause(error, "mumps", matrix) from error
-            finally:
-                pc.destroy()
-    finally:
-        matrix.destroy()
-    raise AssertionError("the last space returns or raises")
-
-
-def _schur_complement(pc: PETSc.PC, last: Array) -> Array:
-    """A_bb − A_bi A_ii⁻¹ A_ib of the matrix of a PC of MUMPS, which is set up, in Fortran's order.
-
-    petsc4py does not ask for it, its library does.
-    """
-    library, pointer, count = ctypes.CDLL(PETSc.__file__), ctypes.c_void_p, len(last)
-
-    def call(name: str, *given: Any) -> None:
-        if code := getattr(library, name)(*given):
-            raise PETSc.Error(code)
-
-    pc.setFactorSetUpSolverType()
-    unknowns = PETSc.IS().createGeneral(last.astype(PETSc.IntType), comm=PETSc.COMM_SELF)
-    factor, S, data = pointer(pc.getFactorMatrix().handle), pointer(), pointer()
-    call("MatFactorSetSchurIS", factor, pointer(unknowns.handle))
-    unknowns.destroy()
-    pc.setUp()
-    if reason := pc.getFailedReason():
-        no_memory = reason == PETSc.PC.FailedReason.FACTOR_OUTMEMORY
-        raise PETSc.Error(PetscError.OUT_OF_MEMORY if no_memory else PetscError.LIBRARY)
-    call("MatFactorCreateSchurComplement", factor, ctypes.byref(S), None)
-    call("MatDenseGetArrayRead", S, ctypes.byref(data))
-    entries = ctypes.cast(data, ctypes.POINTER(ctypes.c_double * count**2)).contents
-    complement = np.array(entries).reshape((count, count), order="F")
-    call("MatDestroy", ctypes.byref(S))
-    return complement
-
-
-def makes_inverse_on(prefix: str = "tfeti_sub_") -> bool:
-    """Return whether ``inverse_on`` has MUMPS, and options do not ask for another solver."""
-    return _has_mumps() and PETSc.Options(prefix).getString(SOLVER, "mumps") == "mumps"
-
-
-@cache
-def _has_mumps() -> bool:
-    return has_solver("mumps")
-
-
-def inverse(A: Array) -> Array:
-    """A⁻¹ of a dense SPD matrix by its upper triangle, which is overwritten: that of the inverse.
-
-    Raises:
-        NotPositiveDefiniteError: A is not positive definite.
-    """
-    factor, pivot = dpotrf(A, overwrite_a=True)
-    if pivot or not np.all(np.isfinite(factor.diagonal())):
-        raise NotPositiveDefiniteError("a dense matrix on a trace is not positive definite")
-    return np.asarray(dpotri(factor, overwrite_c=True)[0])
-
-
 @contextmanager
 def added_options(prefix: str, given: Mapping[str, Any]) -> Iterator[None]:
     """PETSc's options with some more in the block; those that it has already win."""
@@ -227,9 +138,9 @@ def unread_options(given: Mapping[str, Any], solver: str) -> list[str]:
     It is tried with a matrix of a single unknown. None where that cannot be made, which has a cause
     that the factors of the problem name.
     """
-    chosen = {SOLVER: solver, **given}
+    chosen = {"pc_factor_mat_solver_type": solver, **given}
     with added_options(TRIAL, chosen):
-        if not has_solver(str(chosen[SOLVER]), TRIAL):
+        if not has_solver(str(chosen["pc_factor_mat_solver_type"]), TRIAL):
             return []
         return [name for name in given if not is_read(TRIAL + name)]
 
@@ -290,7 +201,7 @@ def _factored(pc: PETSc.PC, matrix: PETSc.Mat, prefix: str) -> PETSc.Mat:
     pc.setOptionsPrefix(prefix)
     pc.setType(PETSc.PC.Type.CHOLESKY)
     pc.setOperators(matrix)
-    given = {SOLVER: default_solver(), **DEFINITE, **QUIET}
+    given = {"pc_factor_mat_solver_type": default_solver(), **DEFINITE, **QUIET}
     with added_options(prefix, given):
         pc.setFromOptions()
         pc.setUp()

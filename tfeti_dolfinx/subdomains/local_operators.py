@@ -27,13 +27,10 @@ class LocalChoice:
     Attributes:
         type: One of ``LOCAL_TYPES``.
         multiplications: How many to expect.
-        last: Operations that a factor with the trace last takes, over those of a solve with a
-            sparse factor; the trace apart, of which it takes ``size³``.
     """
 
     type: str = "auto"
     multiplications: int = 50
-    last: float = 60.0
 
 
 # right sides that go through a factor at once: enough that it is not read for each, and few enough
@@ -56,8 +53,7 @@ class Group:
         apply: A W, shapes ``(size, q)``.
         work: Operations of ``apply`` for a vector, 0 if they are not known.
         can_be_dense: Whether there is use in a dense A.
-        dense: A, its upper triangle, where that is cheaper.
-        by_factor: Makes it by one factor, and so that S follows from K⁺, or is None.
+        dense: A, where that is cheaper.
     """
 
     count: int
@@ -69,34 +65,23 @@ class Group:
     work: float
     can_be_dense: bool = True
     dense: Array | None = None
-    by_factor: Callable[[], Array] | None = None
 
     def prefers_dense(self, choice: LocalChoice) -> bool:
         """Return whether the group takes a dense matrix: by its type, or for fewer operations.
 
-        It costs as many solves as it has columns, or one factor, which is for F and S. A single
-        right side reads the factor for itself, as long as three of many take.
+        It costs as many solves as it has columns. A single right side reads the factor for itself,
+        as long as three of many take.
         """
-        if self.dense is not None:
-            return True
         if choice.type in ("implicit", "explicit") or not self.can_be_dense:
             return self.can_be_dense and choice.type == "explicit"
         if choice.type == "shared" and self.columns == 1:
             return False
         once = self.work * (3.0 if self.columns == 1 else self.columns)
         dense = 2.0 * self.size**2 * self.columns
-        saved = choice.multiplications * (once - dense)
-        if self.by_factor is not None:
-            return 2.0 * saved > choice.last * self.work + float(self.size) ** 3
-        return saved > self.work * self.size
+        return choice.multiplications * (once - dense) > self.work * self.size
 
     def make_dense(self) -> None:
-        """Make A dense, symmetric to the last bit, by a factor or by columns."""
-        if self.dense is not None:
-            return
-        if self.by_factor is not None:
-            self.dense = self.by_factor()
-            return
+        """Make A dense, symmetric to the last bit, by columns."""
         A = _in_chunks(self.apply, np.eye(self.size, order="F"))
         A += A.T
         A *= 0.5
@@ -116,7 +101,7 @@ class Group:
         out[self.where] = product.ravel(order="F")[self.place]
 
 
-def groups_of(blocks: Sequence[Block], kind: OperatorKind, implicit: bool = False) -> list[Group]:
+def groups_of(blocks: Sequence[Block], kind: OperatorKind) -> list[Group]:
     """Return groups that are as large as possible; Blocks without a trace have nothing to apply."""
     parts = parts_of([len(block.trace_dofs) for block in blocks])
     groups = []
@@ -130,16 +115,14 @@ def groups_of(blocks: Sequence[Block], kind: OperatorKind, implicit: bool = Fals
         alone = [equal[0] for equal in members.values() if len(equal) == 1]
         shared = [equal for equal in members.values() if len(equal) > 1]
         return [*groups, *map(_stiffness_group, [alone, *shared] if alone else shared)]
-    if kind == "pinv":
-        return [*groups, *map(_pinv_group, members.values())]
-    return [*groups, *(_schur_group(equal, implicit) for equal in members.values())]
+    of_kind = _pinv_group if kind == "pinv" else _schur_group
+    return [*groups, *map(of_kind, members.values())]
 
 
 def _pinv_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
     """K⁺ on a trace that has those of all: a part of it is K⁺ on a part."""
     stiffness = equal[0][0].stiffness
     trace = np.unique(np.concatenate([block.trace_place for block, _ in equal]))
-    traced, size = stiffness.on_trace(trace), len(trace)
 
     def apply(W: Array) -> Array:
         B = np.zeros((stiffness.size, W.shape[1]), order="F")
@@ -147,24 +130,19 @@ def _pinv_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
         return stiffness.solve(B)[trace]
 
     rows = [np.searchsorted(trace, block.trace_place) for block, _ in equal]
-    places, work = _places(rows, size, [part for _, part in equal]), 4.0 * stiffness.entries
-    group = Group(len(equal), size, len(equal), *places, lambda W: _in_chunks(apply, W), work)
-    if traced.has_pinv:
-        group.by_factor = lambda: traced.pinv
-    return group
+    places, work = _places(rows, len(trace), [part for _, part in equal]), 4.0 * stiffness.entries
+    return Group(len(equal), len(trace), len(equal), *places, lambda W: _in_chunks(apply, W), work)
 
 
-def _schur_group(equal: Sequence[tuple[SparseBlock, slice]], implicit: bool) -> Group:
-    """S by a dense K⁺, or through the factor of K_ii."""
-    traced, work = equal[0][0].traced, 0.0
-    dense = None if implicit else traced.schur()
-    if dense is None:
-        work = 2.0 * traced.K_bb.nnz
-        if traced.inner is not None:
-            work += 4.0 * (traced.K_ib.nnz + traced.inner.entries)
+def _schur_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
+    """S through the factor of K_ii."""
+    traced = equal[0][0].traced
+    work = 2.0 * traced.K_bb.nnz
+    if traced.inner is not None:
+        work += 4.0 * (traced.K_ib.nnz + traced.inner.entries)
     size, parts = len(traced.trace), [part for _, part in equal]
     places = _places([block.trace_rows for block, _ in equal], size, parts)
-    return Group(len(equal), size, len(equal), *places, traced.apply_schur, work, dense=dense)
+    return Group(len(equal), size, len(equal), *places, traced.apply_schur, work)
 
 
 def _stiffness_group(blocks: Sequence[tuple[SparseBlock, slice]]) -> Group:
@@ -193,7 +171,6 @@ def _stiffness_group(blocks: Sequence[tuple[SparseBlock, slice]]) -> Group:
 
 def _own_group(block: Block, kind: OperatorKind, part: slice) -> Group:
     """A Block of another class, one vector after the other."""
-    block.prepare(kind)
     apply, size = getattr(block, f"apply_{kind}"), len(block.trace_dofs)
 
     def columns(W: Array) -> Array:
@@ -274,7 +251,9 @@ class GroupedOperator:
 
     def prepare(self) -> None:
         """Let Blocks make what they need, and make dense matrices where they are chosen."""
-        self._groups = groups_of(self._blocks, self._kind, self._choice.type == "implicit")
+        for block in self._blocks:
+            block.prepare(self._kind)
+        self._groups = groups_of(self._blocks, self._kind)
         for group in self._groups:
             form = "implicit"
             if group.prefers_dense(self._choice):

@@ -7,11 +7,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
-from weakref import ReferenceType, WeakSet, WeakValueDictionary, ref
+from weakref import WeakSet, WeakValueDictionary
 
 import numpy as np
 from scipy.linalg import null_space
-from scipy.linalg.blas import dsymm
 from scipy.sparse import csr_array
 
 from tfeti_dolfinx.common.arrays import TINY, Array, entries_of_rows, submatrix
@@ -26,18 +25,11 @@ from tfeti_dolfinx.subdomains.block import (
     fixing_dofs,
     kernel_of,
 )
-from tfeti_dolfinx.subdomains.factor import (
-    CholeskyFactor,
-    NotPositiveDefiniteError,
-    inverse,
-    inverse_on,
-    makes_inverse_on,
-)
+from tfeti_dolfinx.subdomains.factor import CholeskyFactor, NotPositiveDefiniteError
 from tfeti_dolfinx.subdomains.kplus import (
     GeneralisedInverse,
     InverseFactory,
     check_rank,
-    regular_matrix,
     regularised,
     solved,
     why_indefinite,
@@ -61,8 +53,6 @@ class Stiffness:
         K: The stiffness.
         kernel: R, shape ``(n, r)``.
         diagonal: Diagonal of K.
-        fixing: Unknowns of the nodes that regularise K.
-        dense: The trace on which K⁺ has been made dense, while it is in use.
 
     Raises:
         InputError: K is not symmetric, not finite or not positive semidefinite.
@@ -80,8 +70,7 @@ class Stiffness:
         self.diagonal = K.diagonal()
         self.kernel = R = kernel_of(K, candidate_modes(x, self.bs, centre, length))
         how.counters.factorizations += 1
-        self.fixing = fixing = fixing_dofs(x, np.arange(self.size) // self.bs)
-        self.dense: ReferenceType[Traced] | None = None
+        fixing = fixing_dofs(x, np.arange(self.size) // self.bs)
         try:
             self._pinv: GeneralisedInverse = how.kplus(K, R, fixing, how.prefix)
             if isinstance(self._pinv, CholeskyFactor):
@@ -125,45 +114,6 @@ class Traced:
         """S w = K_bb w − K_bi K_ii⁻¹ K_ib w, shapes ``(t,)`` or ``(t, q)``; K_ii factored once."""
         Kw = np.asarray(self.K_bb @ w)
         return Kw if self.inner is None else Kw - self._K_bi @ self.inner.solve(self.K_ib @ w)
-
-    @property
-    def has_pinv(self) -> bool:
-        """True if ``pinv`` can be made."""
-        how = self._stiffness.how
-        return how.kplus is regularised and makes_inverse_on(how.prefix)
-
-    @cached_property
-    def pinv(self) -> Array:
-        """(K_ρ⁻¹)_bb, the upper triangle, by a factor with the trace last.
-
-        Raises:
-            FactorError: It could not be made.
-        """
-        of = self._stiffness
-        of.how.counters.factorizations += 1
-        try:
-            made = inverse_on(regular_matrix(of.K, of.kernel, of.fixing), self.trace, of.how.prefix)
-        except FactorError as error:
-            raise FactorError(f"{of.name}: {error}") from error
-        of.dense = ref(self)
-        return made
-
-    def schur(self) -> Array | None:
-        """S, the upper triangle, by a dense K⁺ on a trace that has this one; None without it.
-
-        The Schur complement of K_ρ is S_ρ = ((K_ρ⁻¹)_bb)⁻¹, and S = S_ρ − W(R_bᵀW)⁻¹Wᵀ with
-        W = S_ρR_b, if R_b has the rank of R.
-        """
-        dense, R_b = self._stiffness.dense, self._stiffness.kernel[self.trace]
-        whole = None if dense is None else dense()
-        if whole is None or R_b.shape[1] > np.linalg.matrix_rank(R_b, tol=TOLERANCES.on_trace):
-            return None
-        at = np.searchsorted(whole.trace, self.trace)
-        if not np.array_equal(whole.trace[at % len(whole.trace)], self.trace):
-            return None
-        S = inverse(np.asfortranarray(whole.pinv[np.ix_(at, at)]))
-        W = dsymm(1.0, S, R_b)
-        return np.asfortranarray(S - W @ np.linalg.solve(R_b.T @ W, W.T))
 
     @cached_property
     def K_bb(self) -> Any:
