@@ -34,7 +34,7 @@ SCENES = {
     ("cell", "scaling", "low", "high"),
     [
         ("quadrilateral", "stiffness", 0.55, 1.4),
-        ("quadrilateral", "multiplicity", 0.5, 1.4),
+        ("quadrilateral", "multiplicity", 0.5, 1.5),
         ("hexahedron", "stiffness", 0.64, 1.8),
         ("hexahedron", "multiplicity", 0.38, 2.4),
     ],
