@@ -185,6 +185,7 @@ class PvdFile:
         with raised_on_all_ranks(self._comm), named(f"cannot write {self._name}", OSError):
             if self._comm.rank == 0:
                 names = sorted(file.name for file in self.partial.iterdir())
+                _remove(self._name)  # first: it names parts
                 for file in list(self._name.parent.iterdir()):
                     if own.fullmatch(file.name):
                         file.unlink()

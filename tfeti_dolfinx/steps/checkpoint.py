@@ -367,10 +367,10 @@ def _joined(
 ) -> tuple[Array, Array | None]:
     """Return an array's rows of subdomains, each from a file and a place in it, and their labels.
 
-    Without counts of rows it is the same in all files.
+    Without counts of rows it is the same in all files; a rank without rows has counts of nothing.
     """
     first = next(iter(files.values()))
-    if name + COUNTS not in first:
+    if any(name + COUNTS not in arrays for arrays in files.values()):
         return first[name], None
     pieces = {
         rank: np.split(arrays[name], np.cumsum(arrays[name + COUNTS])[:-1])
