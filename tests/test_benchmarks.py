@@ -13,6 +13,7 @@ from benchmarks import (
     linear_price,
     nonlinear_steps,
     profiles,
+    ranks,
     scaling,
     solver_profiles,
     spectrum,
@@ -36,11 +37,12 @@ def with_arguments(benchmark, *arguments, slow=False):
     return pytest.param(benchmark, arguments, id=name, marks=[pytest.mark.slow] if slow else [])
 
 
-START_MPIRUN = (solver_profiles, scaling, time_against_error)
+START_MPIRUN = (ranks, solver_profiles, scaling, time_against_error)
 RUNS = [
     with_arguments(curved_gaps),
     with_arguments(kplus_forms),
     with_arguments(linear_price, "--scenes", "cube_3d"),
+    with_arguments(ranks),
     with_arguments(spectrum),
     with_arguments(stability, "--groups", "nu"),
     with_arguments(stages, "--processor"),
