@@ -166,7 +166,7 @@ class SavedState:
         lam: Multipliers λ of this rank's rows.
         mu: Multipliers of Gλ = e; empty where they are not known.
         norm: Estimate of ‖F‖ that solves have come to, shape ``()``.
-        status: Status of each row, see ``qp.faces``.
+        status: Status of each row, see ``qp.sets.Status``.
         slip: Where the load step began: tangential v_i of the conditions, ``(n, gdim - 1)``.
         reach: How far was searched in each contact.
         contact: Contact of each condition.

@@ -125,9 +125,8 @@ def written_whole(target: Path) -> Iterator[Path]:
     try:
         yield partial
         os.replace(partial, target)
-    except OSError:
+    finally:
         partial.unlink(missing_ok=True)
-        raise
 
 
 @contextmanager
