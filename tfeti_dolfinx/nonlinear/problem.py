@@ -118,8 +118,8 @@ class NonlinearContactProblem(ContactProblem):
     3. *End* where ‖d‖ is at most rtol ‖u‖ in the maximum norm, in finite strain with a new model
        of where the bodies are; in small strain where the remainder times ‖d‖ is, which the next one
        is expected to be.
-    4. *Step.* u ← u + t d; in finite strain, where J is not the derivative of F, and where J is
-       kept, accelerated by Anderson's method.
+    4. *Step.* u ← u + t d; whole steps in finite strain, where J is not the derivative of F, and
+       where J is kept, are accelerated by Anderson's method. It begins anew at a shortened step.
 
     Args:
         F: Residual F(u; v), a linear form in a test function on a Lagrange space of the torn mesh.
@@ -275,10 +275,10 @@ class NonlinearContactProblem(ContactProblem):
             # 4. step
             if step == 0:  # what conditions prescribe is met from then on
                 self._last_increment = min(increment, tol.loosest)
-            if keeping.is_slow(size) or size > tol.other * keeping.before:
-                faster.forget()
-            exact_model = step == 0 or not (self._finite or forms.kept)
-            self._set(u + t * d if exact_model else faster.next(u, d, t))
+            if t < 1.0 or keeping.is_slow(size) or size > tol.other * keeping.before:
+                faster.forget()  # a model that does not hold along d tells nothing of the next
+            plain = t < 1.0 or step == 0 or not (self._finite or forms.kept)
+            self._set(u + t * d if plain else faster.next(u, d))
             if self._smallest_volume() <= 0.0:
                 faster.forget()
                 self._set(u + t * d)
@@ -633,15 +633,15 @@ class Anderson:
         self._steps: list[Array] = []
         self._places: list[Array] = []
 
-    def next(self, u: Array, d: Array, t: float) -> Array:
-        """Return the next iterate after u, whose step is t d. Collective."""
-        end = moved = u + t * d
+    def next(self, u: Array, d: Array) -> Array:
+        """Return the next iterate after u, whose step is d. Collective."""
+        end = moved = u + d
         if self._steps:
             steps = d[:, None] - np.array(self._steps).T
             gram = summed(self._comm, steps.T @ np.column_stack((steps, d)))
             gram = bcast_from_root(self._comm, gram)
             share = np.linalg.lstsq(gram[:, :-1], gram[:, -1], rcond=self._rcond)[0]
-            moved = end - (u[:, None] - np.array(self._places).T + t * steps) @ share
+            moved = end - (u[:, None] - np.array(self._places).T + steps) @ share
         self._steps = [*self._steps, d][-self._depth :]
         self._places = [*self._places, u][-self._depth :]
         return moved
