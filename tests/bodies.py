@@ -143,7 +143,7 @@ def sided(secondary, primary, **changes):
 
 def searched(contacts, dofs, d):
     """The conditions of contacts, as if all elements were equally stiff."""
-    return ContactSearch(contacts, dofs, d, unit_blocks(dofs)).records
+    return ContactSearch(contacts, dofs, unit_blocks(dofs)).records
 
 
 def unit_blocks(dofs):

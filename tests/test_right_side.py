@@ -27,7 +27,7 @@ class Scene:
         up = np.eye(gdim)[-1] + 0.3 * np.eye(gdim)[0]
         plane = tfeti.Plane(tuple(-1.1 * np.eye(gdim)[-1]), tuple(up))
         contacts = [PAIR, tfeti.Obstacle("lower bottom", plane, reach=np.inf)]
-        self.search = ContactSearch(contacts, self.dofs, d, unit_blocks(self.dofs))
+        self.search = ContactSearch(contacts, self.dofs, unit_blocks(self.dofs))
         self.weights = 1.0 + np.arange(self.dofs.num_nodes * gdim) % 5
 
     def bcs(self, side, across, top):
@@ -133,7 +133,7 @@ def test_a_geometry_that_overlaps_too_deep_is_not_gone_back_to():
     d = stacked("triangle", 3, 4, 4, gap=-0.1)
     dofs = TornDofs(fem.functionspace(d.mesh, ("Lagrange", 1, (2,))), d)
     pair = sided("upper bottom", "lower top", gap=0.0)
-    search = ContactSearch([pair], dofs, d, unit_blocks(dofs))
+    search = ContactSearch([pair], dofs, unit_blocks(dofs))
     with pytest.raises(InputError, match=r"the surfaces overlap by up to 0\.1, more than"):
         search.set_gaps({0: "geometry"})
     assert np.array_equal(search.records.gap, np.zeros(len(search.records)))

@@ -153,20 +153,13 @@ class ContactProblem:
             forms = self._forms(a, L, V, form_compiler_options, jit_options)
         with stage("gluing", self._seconds):
             self.dofs = TornDofs(V, decomposition)
-            check_not_on_tears(self.bcs, self.dofs, decomposition)
+            check_not_on_tears(self.bcs, self.dofs)
         forms.thickness = self._thickness
-        self._diagnostics = Diagnostics(decomposition, self.dofs)
+        self._diagnostics = Diagnostics(self.dofs)
         if boundary_elements is not None:
             check_method(boundary_elements, extensions)
-        self._system = System(
-            forms,
-            self.bcs,
-            self.contacts,
-            self.dofs,
-            decomposition,
-            self._settings,
-            boundary_elements,
-        )
+        scene = forms, self.bcs, self.contacts, self.dofs
+        self._system = System(*scene, self._settings, boundary_elements)
 
     @property
     def solution(self) -> Solution:
@@ -281,7 +274,7 @@ class ContactProblem:
                 start = None if dual.is_far(*start) else start
             goal = None
             if options.rtol == "auto" and self._stress is not None:
-                goal = goal_of(self._stress, self.dofs, d, self._thickness)
+                goal = goal_of(self._stress, self.dofs, self._thickness)
             own = self._settings.extensions.monitor
             solved = solve_with_friction(dual, options, options.qp_type, start, own, goal)
         result, accuracy, settling = solved
@@ -337,7 +330,6 @@ class ContactProblem:
         solution = Solution(
             u=u,
             multipliers=multipliers,
-            decomposition=self.decomposition,
             gluing=gluing,
             contacts=list(self._system.search.contacts),
             stress=None if self._stress is None else self._stress.frozen(),
@@ -397,7 +389,7 @@ class ContactProblem:
             conditions = self.bcs
         else:
             conditions = checked_conditions(conditions, V)
-            check_not_on_tears(conditions, self.dofs, self.decomposition)
+            check_not_on_tears(conditions, self.dofs)
         if stiffness is not None:
             check_same_space(displacement_space(stiffness, self.decomposition), V, "stiffness", "a")
             forms.replace_stiffness(stiffness)
@@ -512,7 +504,7 @@ class ContactProblem:
             self._check_state(state)
             given |= {**self._given(), "state": state.common()}
             self._look_at_stress()
-            state = state.on_nodes(self.dofs, self.decomposition)
+            state = state.on_nodes(self.dofs)
         system = self._system
         system.tools.go_back(state.tools)
         self._take_motion(state)
@@ -555,7 +547,7 @@ class ContactProblem:
 
     def _check_state(self, state: SavedState) -> None:
         """Raise an InputError where a state is broken, or of something else. Not collective."""
-        check_state(state, self.dofs, self.decomposition, len(self.contacts))
+        check_state(state, self.dofs, len(self.contacts))
 
     def _take_motion(self, state: SavedState) -> None:
         """Move as the bodies of a state do: without inertia not at all."""

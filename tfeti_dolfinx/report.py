@@ -20,8 +20,6 @@ from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.errors import raised_on_all_ranks
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.stopping import Accuracy
-from tfeti_dolfinx.mesh.decomposition import Decomposition
-from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.qp.problem import QPResult
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.coulomb import FixedPointStatus
@@ -47,16 +45,10 @@ class Sizes:
     tangential_rows: int = 0  # of contacts that have friction
 
     @classmethod
-    def of_rows(
-        cls,
-        dofs: TornDofs,
-        decomposition: Decomposition,
-        gluing: Gluing,
-        inside: int,
-        unmet: list[str],
-    ) -> Self:
+    def of_rows(cls, gluing: Gluing, inside: int, unmet: list[str]) -> Self:
         """Count rows and unknowns, ``inside`` of which boundary elements do without. Collective."""
-        comm, constraints, records = dofs.comm, gluing.constraints, gluing.records
+        dofs, constraints, records = gluing.dofs, gluing.constraints, gluing.records
+        comm, decomposition = dofs.comm, dofs.decomposition
         own = (
             constraints.num_rows,
             len(constraints.sets.normals),

@@ -77,10 +77,11 @@ def labels_of_points(decomposition: Decomposition) -> Array:
     return labels_of_dofs(geometry_dofmap(mesh), len(mesh.geometry.x), decomposition)
 
 
-def labels_of_nodes(dofs: TornDofs, decomposition: Decomposition) -> Array:
+def labels_of_nodes(dofs: TornDofs) -> Array:
     """Return labels of primal nodes."""
     cells = dofs.primal_nodes(np.asarray(dofs.V.dofmap.list).ravel())
-    return labels_of_dofs(cells.reshape(dofs.V.dofmap.list.shape), dofs.num_nodes, decomposition)
+    cells = cells.reshape(dofs.V.dofmap.list.shape)
+    return labels_of_dofs(cells, dofs.num_nodes, dofs.decomposition)
 
 
 def labels_of_conditions(gluing: Gluing, of_groups: Array) -> Array:
@@ -218,7 +219,7 @@ class SavedState:
         gluing, holding = solution.gluing, solution.holding
         records, dofs = gluing.records, solution.dofs
         held = np.where(holding, Status.STICK, Status.SLIP)
-        nodes = labels_of_nodes(dofs, solution.decomposition)
+        nodes = labels_of_nodes(dofs)
         of_groups = labels_of_groups(dofs, nodes)
         return cls(
             subdomains=solution.decomposition.subdomains.astype(np.int64) << SHIFT,
@@ -278,15 +279,15 @@ class SavedState:
             self, mu=nothing, image=nothing, predicted_image=nothing, directions=directions
         )
 
-    def on_nodes(self, dofs: TornDofs, decomposition: Decomposition) -> SavedState:
+    def on_nodes(self, dofs: TornDofs) -> SavedState:
         """Return the state with nodes and cells in the order of this rank. Not collective.
 
         Raises:
             InputError: It has other ones.
         """
-        here = {"nodes": labels_of_nodes(dofs, decomposition)}
+        here = {"nodes": labels_of_nodes(dofs)}
         if self.internal.size:
-            here["cells"] = labels_of_cells(decomposition)
+            here["cells"] = labels_of_cells(dofs.decomposition)
         return self._in_order(here)
 
     def on_rows(self, gluing: Gluing) -> SavedState:
@@ -360,9 +361,7 @@ def layout_of(decomposition: Decomposition) -> Array:
     return np.array([zlib.crc32(part.tobytes()) for part in parts], dtype=np.int64)
 
 
-def check_state(
-    state: SavedState, dofs: TornDofs, decomposition: Decomposition, contacts: int
-) -> None:
+def check_state(state: SavedState, dofs: TornDofs, contacts: int) -> None:
     """Raise unless a state is whole, of this mesh, on these ranks, with so many contacts.
 
     Not collective: a rank may have a broken one.
@@ -373,7 +372,7 @@ def check_state(
     checked_type(state, SavedState, "state", "what ContactProblem.state returned")
     for f in fields(state):
         checked_type(getattr(state, f.name), np.ndarray, f"state: {f.name}", "an array")
-    if not np.array_equal(state.layout, layout_of(decomposition)):
+    if not np.array_equal(state.layout, layout_of(dofs.decomposition)):
         raise InputError(
             "the state is of another mesh, or of one that was distributed in another way; "
             "expected the same mesh in the same subdomains"
@@ -399,10 +398,11 @@ def check_state(
     _check_broken(
         "directions", state.directions.shape[1:] in {(0, 0), (*rows, *state.directions.shape[2:])}
     )
-    _check_broken("nodes", same_labels(state.nodes, labels_of_nodes(dofs, decomposition)))
+    nodes = labels_of_nodes(dofs)
+    _check_broken("nodes", same_labels(state.nodes, nodes))
     _check_broken("contact", bool(np.all((state.contact >= 0) & (state.contact < contacts))))
-    own = labels_of_groups(dofs, labels_of_nodes(dofs, decomposition))
-    _check_broken("group", bool(np.all(np.isin(state.group, own))))
+    own = np.isin(state.group, labels_of_groups(dofs, nodes))
+    _check_broken("group", bool(np.all(own)))
 
 
 def _check_broken(name: str, right: bool) -> None:

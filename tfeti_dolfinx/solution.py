@@ -29,7 +29,6 @@ from tfeti_dolfinx.forms.fields import (
     vector_from_vertices,
     von_mises,
 )
-from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mortar.surfaces import hat_integrals
 
 # --- Displacement and stress at given points --------------------------------------------------
@@ -97,13 +96,12 @@ class Solution(ContactState):
         self,
         u: Array,
         multipliers: Multipliers,
-        decomposition: Decomposition,
         gluing: Gluing,
         contacts: Sequence[ContactPartner] = (),
         stress: Stress | None = None,
         thickness: Any = 1.0,
     ) -> None:
-        super().__init__(u, multipliers, decomposition, gluing, contacts, frozen(thickness))
+        super().__init__(u, multipliers, gluing, contacts, frozen(thickness))
         self.v: Array | None = None
         self.boundary: Any = None
         self._stress_of, self.has_stress = stress, stress is not None
@@ -220,9 +218,7 @@ class Solution(ContactState):
 
         Files for ParaView have it if it has been made, as by ``ContactProblem.estimate``.
         """
-        recovery = StressRecovery(
-            self.displacement, self._sigma, self.dofs, self.decomposition, self.thickness
-        )
+        recovery = StressRecovery(self.displacement, self._sigma, self.dofs, self.thickness)
         function = fem.Function(recovery.cells, name="discretisation_error")
         function.x.array[recovery.cell_dof] = np.sqrt(recovery.squares())
         return function
@@ -266,9 +262,7 @@ class Solution(ContactState):
         and reaction of two sides have the same resultant.
         """
         surfaces = [name for contact in self.contacts for name in contact.surfaces]
-        values, area = vertex_tractions(
-            self.nodal_forces, self.dofs, self.decomposition, surfaces, self.thickness
-        )
+        values, area = vertex_tractions(self.nodal_forces, self.dofs, surfaces, self.thickness)
         return vector_from_vertices(self.dofs, values, area > 0.0, "traction")
 
     @cached_property
@@ -293,7 +287,7 @@ class Solution(ContactState):
     @cached_property
     def body_forces(self) -> Resultant:
         """Resultants of the contact forces on each body. Collective at first use."""
-        return body_forces(self.places(), self.nodal_forces, self.dofs, self.decomposition)
+        return body_forces(self.places(), self.nodal_forces, self.dofs)
 
     @cached_property
     def _sigma(self) -> Any:
@@ -313,7 +307,7 @@ class Solution(ContactState):
         records, dofs = self.gluing.records, self.dofs
         total = sum_rows(records.group, force, dofs.num_groups)
         area = sum_rows(records.group, self.area, dofs.num_groups)
-        whole = hat_integrals(dofs, self.decomposition, self.secondary_surfaces, self.thickness)
+        whole = hat_integrals(dofs, self.secondary_surfaces, self.thickness)
         area = np.minimum(area, whole)[:, None]
         return np.divide(total, area, out=np.zeros_like(total), where=area > 0.0)
 

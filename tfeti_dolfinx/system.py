@@ -26,7 +26,6 @@ from tfeti_dolfinx.feti.deflation import SoftModes
 from tfeti_dolfinx.feti.dual import Dual, FeasibleLaw
 from tfeti_dolfinx.feti.operator import PRECONDITIONERS
 from tfeti_dolfinx.forms.assembly import Forms
-from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.report import Sizes, StageCounts
@@ -88,7 +87,6 @@ class Settings:
         self,
         data: Iterable[SubdomainData],
         dofs: TornDofs,
-        decomposition: Decomposition,
         counters: Counters,
         replaced: Callable[[MakeBlock], MakeBlock] | None = None,
         tools: Tools | None = None,
@@ -104,7 +102,7 @@ class Settings:
             InputError: Stiffness or load do not fit.
             FactorError: A factor could not be made.
         """
-        own, options = self.extensions, self.options
+        own, options, decomposition = self.extensions, self.options, dofs.decomposition
         choice = LocalChoice(options.local_type, options.local_multiplications)
         how = self.inverses(counters)
         found = (equals or EqualSubdomains(how)) if choice.type in ("auto", "shared") else None
@@ -132,7 +130,6 @@ class Settings:
         constraints: Constraints,
         subdomains: Subdomains,
         dofs: TornDofs,
-        decomposition: Decomposition,
         feasible: FeasibleLaw,
         rigid_names: Sequence[str] = (),
     ) -> tuple[Dual, Options]:
@@ -143,7 +140,7 @@ class Settings:
             NoSolutionError: The load moves a body that nothing holds.
             FactorError: A matrix could not be factored.
         """
-        rows = constraints.sets.contact_rows(dofs.comm)
+        rows, gdim = constraints.sets.contact_rows(dofs.comm), dofs.V.mesh.geometry.dim
         options = resolved(self.options, rows, self.prefix)
         preconditioner = self.extensions.preconditioner
         if preconditioner is not None and options.pc_type == "none":
@@ -155,15 +152,15 @@ class Settings:
             dual = Dual(
                 constraints=constraints,
                 subdomains=subdomains,
-                body_names=[*decomposition.body_names, *rigid_names],
-                mode_names=mode_names(decomposition.mesh.geometry.dim, dofs.bs),
+                body_names=[*dofs.decomposition.body_names, *rigid_names],
+                mode_names=mode_names(gdim, dofs.bs),
                 preconditioner=preconditioner or PRECONDITIONERS.get(options.pc_type),
                 options_prefix=self.prefix,
                 feasible=feasible,
                 deflation=self.extensions.deflation or SoftModes,
                 without=options.without,
                 recycle=options.recycle,
-                dimension=decomposition.mesh.geometry.dim,
+                dimension=gdim,
             )
         return dual, options
 
@@ -204,18 +201,17 @@ class System:
         bcs: Sequence[fem.DirichletBC],
         contacts: list[ContactPartner],
         dofs: TornDofs,
-        decomposition: Decomposition,
         settings: Settings,
         method: SubdomainMethod | None = None,
     ) -> None:
         self.forms, self.bcs, self._contacts = forms, bcs, contacts
-        self._dofs, self._decomposition, self._settings = dofs, decomposition, settings
+        self._dofs, self._settings = dofs, settings
         self._has_friction = any(contact.friction is not None for contact in contacts)
         self.elements = (
-            FiniteElements(dofs) if method is None else method.assembly(dofs, decomposition)
+            FiniteElements(dofs) if method is None else method.assembly(dofs, dofs.decomposition)
         )
         self.origin: Array | None = None
-        self.tools, self.time = Tools(contacts, dofs, decomposition), 0.0
+        self.tools, self.time = Tools(contacts, dofs), 0.0
         # displacement in primal order at which the load step begins; None: no displacement
         self._rest: Array | None = None
         self._known_slips: tuple[ContactRecords, Array] | None = None
@@ -365,7 +361,7 @@ class System:
         if self._gluing is None:
             return Sizes()
         inside, unmet = self.elements.inside(), self.search.unmet()
-        return Sizes.of_rows(self._dofs, self._decomposition, self._gluing, inside, unmet)
+        return Sizes.of_rows(self._gluing, inside, unmet)
 
     def take_counts(self) -> StageCounts:
         """Return how often stages were made since the last call."""
@@ -402,11 +398,11 @@ class System:
             self.change("load")
 
     def _find_contacts(self) -> None:
-        dofs, cut, tools = self._dofs, self._decomposition, self.tools
+        dofs, tools = self._dofs, self.tools
         first = self._search is None
         tools.place(finite=self.origin is not None)
         contacts = tools.placed(self._contacts)
-        self._search = ContactSearch(contacts, dofs, cut, self._blocks, self.origin, tools)
+        self._search = ContactSearch(contacts, dofs, self._blocks, self.origin, tools)
         if first:
             tools.check_begin(contacts, self._search.records)
         if self.origin is not None:  # sides stay those of the first search
@@ -440,8 +436,7 @@ class System:
             return
         search, gluing = self.search, self.gluing
         surfaces = [contact.surfaces[0] for contact in search.contacts]
-        scene = self._dofs, self._decomposition
-        area = condition_areas(gluing.records, *scene, surfaces, self.forms.thickness)
+        area = condition_areas(gluing.records, self._dofs, surfaces, self.forms.thickness)
         self._known_friction = friction = search.friction()
         gluing.constraints.limits[:] = gluing.tangents.limits(friction, area)
         gluing.constraints.coefficients[:] = gluing.tangents.coefficients(friction)
@@ -453,10 +448,10 @@ class System:
             self._subdomains.update(f=np.append(self._dofs.to_primal(self._f), loads))
 
     def _factor(self) -> None:
-        scene, trace = (self._dofs, self._decomposition), self.gluing.constraints.trace
+        dofs, trace = self._dofs, self.gluing.constraints.trace
         self._subdomains = self._settings.make_subdomains(
-            subdomain_data(*scene, self._K, self._f, trace),
-            *scene,
+            subdomain_data(dofs, dofs.decomposition, self._K, self._f, trace),
+            dofs,
             self._counters,
             self.elements.blocks,
             self.tools if self.tools.num_unknowns else None,
@@ -467,11 +462,9 @@ class System:
         self.inverses += 1
 
     def _make_dual(self) -> None:
-        settings, scene = self._settings, (self._dofs, self._decomposition)
-        law = settings.extensions.feasible_set
-        names = self.tools.free_names
-        parts = self.gluing.constraints, self.subdomains
-        self._dual = settings.make_dual(*parts, *scene, law, names)
+        law, names = self._settings.extensions.feasible_set, self.tools.free_names
+        parts = self.gluing.constraints, self.subdomains, self._dofs
+        self._dual = self._settings.make_dual(*parts, law, names)
         self.dual.seen = max(self.dual.seen, self._seen)
         self._equals.forget()
 

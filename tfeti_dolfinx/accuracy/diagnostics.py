@@ -12,7 +12,6 @@ from tfeti_dolfinx.common.arrays import Array, joined, sum_rows, sums
 from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root
 from tfeti_dolfinx.contact.partner import GEOMETRY
 from tfeti_dolfinx.feti.dual import Dual
-from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.diagnostics import flatness, shared_by_bodies
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.report import Outcome, Report
@@ -62,8 +61,8 @@ class Diagnostics:
     With ``finite`` kinematics are not linear, so that bodies may turn.
     """
 
-    def __init__(self, decomposition: Decomposition, dofs: TornDofs) -> None:
-        self._decomposition, self._dofs = decomposition, dofs
+    def __init__(self, dofs: TornDofs) -> None:
+        self._decomposition, self._dofs = dofs.decomposition, dofs
         self.finite = False
         self._of: Dual | None = None
         self._lasting: list[str] = []

@@ -18,7 +18,6 @@ from tfeti_dolfinx.feti.duality_gap import energy_bound
 from tfeti_dolfinx.feti.stopping import ErrorTarget, TargetStatus
 from tfeti_dolfinx.forms.discretisation import StressRecovery
 from tfeti_dolfinx.forms.fields import Stress, checked_stress
-from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.system import System
@@ -97,12 +96,10 @@ def estimate(system: System, solution: Solution) -> Estimates:
     )
 
 
-def goal_of(
-    stress: Stress, dofs: TornDofs, decomposition: Decomposition, thickness: Any
-) -> ErrorTarget:
+def goal_of(stress: Stress, dofs: TornDofs, thickness: Any) -> ErrorTarget:
     """From displacements in primal order to their discretisation error. Collective."""
     u = fem.Function(dofs.V)
-    recovery = StressRecovery(u, checked_stress(stress, u), dofs, decomposition, thickness)
+    recovery = StressRecovery(u, checked_stress(stress, u), dofs, thickness)
 
     def error(values: Array) -> float:
         u.x.array[:] = dofs.to_dolfinx(values[: dofs.num_nodes * dofs.bs])

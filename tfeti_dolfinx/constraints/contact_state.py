@@ -20,7 +20,6 @@ from tfeti_dolfinx.contact.records import relative_displacement
 from tfeti_dolfinx.contact.rigid_body import rotation_vector
 from tfeti_dolfinx.contact.tools import ToolMotion
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mortar.surfaces import group_points, surface_facets, surface_nodes
 from tfeti_dolfinx.qp.sets import Face
 
@@ -148,7 +147,6 @@ class ContactState:
     Args:
         u: Displacement in primal order, shape ``(num_nodes * bs,)``.
         multipliers: Multipliers of this rank's rows.
-        decomposition: The torn mesh.
         gluing: Rows and contact records.
         contacts: Obstacles and pairs, the secondary surface of a pair first.
         thickness: What areas of the mesh are multiplied with, a number or a scalar in UFL.
@@ -161,14 +159,13 @@ class ContactState:
         self,
         u: Array,
         multipliers: Multipliers,
-        decomposition: Decomposition,
         gluing: Gluing,
         contacts: Sequence[ContactPartner],
         thickness: Any,
     ) -> None:
         self.u, self.lam = u, multipliers.lam
         self.carrying, self.holding = multipliers.face.carrying, multipliers.face.holding
-        self.decomposition, self.gluing, self.dofs = decomposition, gluing, gluing.dofs
+        self.gluing, self.dofs, self.decomposition = gluing, gluing.dofs, gluing.dofs.decomposition
         self.contacts, self.thickness = list(contacts), thickness
         self.tool_motions: Sequence[ToolMotion] = ()
         self.finite = False
@@ -263,7 +260,7 @@ class ContactState:
             given["surface"] = self.decomposition.surface(surface)
         facets = surface_facets(self.decomposition, surface)
         member = np.zeros(self.dofs.num_nodes, dtype=bool)
-        member[surface_nodes(self.dofs, self.decomposition, facets)] = True
+        member[surface_nodes(self.dofs, facets)] = True
         groups = np.flatnonzero(self.dofs.reduce(member, np.logical_or, False))
         force = self.support_forces[groups]
         return resultant(self.dofs.comm, self.places()[groups], force)
@@ -297,8 +294,8 @@ class ContactState:
 
         Where a pair covers a part of the node's surface, the thickness is its mean over the whole.
         """
-        records, of = self.gluing.records, self.decomposition
-        return condition_areas(records, self.dofs, of, self.secondary_surfaces, self.thickness)
+        surfaces = self.secondary_surfaces
+        return condition_areas(self.gluing.records, self.dofs, surfaces, self.thickness)
 
     @cached_property
     def remaining_gap(self) -> Array:

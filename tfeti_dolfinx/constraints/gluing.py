@@ -31,7 +31,6 @@ from tfeti_dolfinx.constraints.rows import (
 from tfeti_dolfinx.contact.records import ContactRecords, relative_motion
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.errors import InputError, NoSolutionError, TfetiError, raised_on_all_ranks
-from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs, component_of, described, is_same_space
 from tfeti_dolfinx.mesh.untorn import cell_facets
 
@@ -192,9 +191,7 @@ def checked_conditions(
     return conditions
 
 
-def check_not_on_tears(
-    bcs: Sequence[fem.DirichletBC], dofs: TornDofs, decomposition: Decomposition
-) -> None:
+def check_not_on_tears(bcs: Sequence[fem.DirichletBC], dofs: TornDofs) -> None:
     """Raise if a condition prescribes facets of tears as if they were of the boundary. Collective.
 
     To DOLFINx tears are exterior facets, so ``exterior_facet_indices`` and
@@ -204,6 +201,7 @@ def check_not_on_tears(
     be prescribed that has nodes inside of subdomains, and a surface inside a body in a condition of
     its own.
     """
+    decomposition = dofs.decomposition
     if not bcs or not decomposition.is_torn:
         return
     tears, outer = (_facet_nodes(dofs, f) for f in (decomposition.tears, decomposition.boundary))

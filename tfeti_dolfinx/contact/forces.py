@@ -9,9 +9,9 @@ import numpy as np
 from dolfinx.fem.petsc import interpolation_matrix
 from mpi4py import MPI
 
-from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.arrays import Array, sum_rows
+from tfeti_dolfinx.common.parallel import summed
 from tfeti_dolfinx.contact.records import ContactRecords
-from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import hat_integrals
 
@@ -31,10 +31,9 @@ class Resultant:
     moment: Array
 
 
-def resultant(comm: MPI.Comm, points: Array, forces: Array) -> Resultant:
+def resultant(comm: MPI.Intracomm, points: Array, forces: Array) -> Resultant:
     """Resultant of forces, ``(n, gdim)``, at points of this rank, ``(n, 3)``. Collective."""
-    own = np.sum(_with_moments(points, forces), axis=0)
-    comm.Allreduce(MPI.IN_PLACE, own)
+    own = summed(comm, np.sum(_with_moments(points, forces), axis=0))
     return Resultant(own[:-3], own[-3:])
 
 
@@ -46,11 +45,7 @@ def _with_moments(points: Array, forces: Array) -> Array:
 
 
 def condition_areas(
-    records: ContactRecords,
-    dofs: TornDofs,
-    decomposition: Decomposition,
-    surfaces: list[str | int],
-    thickness: Any = 1.0,
+    records: ContactRecords, dofs: TornDofs, surfaces: list[str | int], thickness: Any = 1.0
 ) -> Array:
     """∫φ_i of each condition, ``(n,)``, times a number or a scalar in UFL. Collective.
 
@@ -58,36 +53,27 @@ def condition_areas(
     """
     if isinstance(thickness, float):
         return thickness * records.area
-    volume = hat_integrals(dofs, decomposition, surfaces, thickness)[records.group]
-    return records.area * volume / hat_integrals(dofs, decomposition, surfaces)[records.group]
+    volume = hat_integrals(dofs, surfaces, thickness)[records.group]
+    return records.area * volume / hat_integrals(dofs, surfaces)[records.group]
 
 
-def body_forces(
-    points: Array, forces: Array, dofs: TornDofs, decomposition: Decomposition
-) -> Resultant:
+def body_forces(points: Array, forces: Array, dofs: TornDofs) -> Resultant:
     """Resultants of forces on the owned groups, which are at these points. Collective."""
     lowest = dofs.copy_subdomains[dofs.copy_offsets[:-1]]
-    body = decomposition.body_of_subdomain[lowest]
-    terms = _with_moments(points, forces)
-    sums = np.zeros((decomposition.num_bodies, terms.shape[1]))
-    np.add.at(sums, body, terms)
-    dofs.comm.Allreduce(MPI.IN_PLACE, sums)
+    body, num_bodies = dofs.decomposition.body_of_subdomain[lowest], dofs.decomposition.num_bodies
+    sums = summed(dofs.comm, sum_rows(body, _with_moments(points, forces), num_bodies))
     return Resultant(sums[:, : forces.shape[1]], sums[:, forces.shape[1] :])
 
 
 def vertex_tractions(
-    forces: Array,
-    dofs: TornDofs,
-    decomposition: Decomposition,
-    names: list[str | int],
-    thickness: Any = 1.0,
+    forces: Array, dofs: TornDofs, names: list[str | int], thickness: Any = 1.0
 ) -> tuple[Array, Array]:
     """Tractions whose moments with the hats of degree 1 are those of nodal forces. Collective.
 
     Return force / ∫φ_i for each owned group that is a vertex of the surfaces of these names, else
     0, shape ``(g, gdim)``; and ∫φ_i, times the thickness, shape ``(g,)``.
     """
-    area = hat_integrals(dofs, decomposition, names, thickness)
+    area = hat_integrals(dofs, names, thickness)
     if dofs.V.element.basix_element.degree > 1:
         forces = _on_hats(forces, dofs)
     on_surface = (area > 0.0)[:, None]

@@ -13,7 +13,6 @@ from tfeti_dolfinx.contact.records import ContactRecords, relative_motion
 from tfeti_dolfinx.contact.rigid_body import Law, RigidBody
 from tfeti_dolfinx.contact.shapes import Shape, check_placement, check_shape, distance_and_gradient
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
-from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.facets import facet_kind, hat_areas, local_facets
 from tfeti_dolfinx.mortar.integrals import integrate_distance
@@ -68,7 +67,6 @@ class Obstacle(ContactPartner):
     def records(
         self,
         dofs: TornDofs,
-        decomposition: Decomposition,
         contact: int,
         reach: float = np.inf,
         depth: float = np.inf,
@@ -80,11 +78,11 @@ class Obstacle(ContactPartner):
         Of a displacement of degree 1 it is n·u ≤ g at the node, since ψ_i is biorthogonal to its
         hats.
         """
-        local = surface_facets(decomposition, self.surface)
-        kind, facets = facet_kind(dofs), local_facets(dofs, decomposition, local)
+        facets = local_facets(dofs, surface_facets(dofs.decomposition, self.surface))
+        kind = facet_kind(dofs)
         centres, corners = facets.corners.mean(axis=1), facets.corners
         if dofs.bs > 1:  # of a scalar space the gradient's first component counts
-            size = diameter(decomposition)
+            size = diameter(dofs.decomposition)
             check_placement(self.shape, centres, dofs.bs, self.name, size, dofs.comm)
         with raised_on_all_ranks(dofs.comm):
             _, towards = self._distances(centres, dofs.bs)

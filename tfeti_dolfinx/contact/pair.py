@@ -92,12 +92,7 @@ class Contact(ContactPartner):
         return min(super().first_reach(decomposition), diameter(decomposition))
 
     def settled(
-        self,
-        dofs: TornDofs,
-        decomposition: Decomposition,
-        contact: int,
-        reach: float,
-        stiffness: Array,
+        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array
     ) -> tuple[Contact, ContactRecords]:
         """Return the contact with its secondary side as ``a``, and its conditions. Collective.
 
@@ -105,8 +100,8 @@ class Contact(ContactPartner):
         are of one size, the softer one; of equal ones the first.
         """
         cite("mortar")
-        settled = self._named_first(decomposition)
-        sides = settled._sides(dofs, decomposition)
+        settled = self._named_first(dofs.decomposition)
+        sides = settled._sides(dofs)
         found = settled._meet(sides, dofs, contact, reach, reach)
         size, per_area = _ratios(found, sides, dofs, stiffness)
         of_one_size = max(size, 1.0 / size) <= SEARCH.same_size
@@ -128,7 +123,6 @@ class Contact(ContactPartner):
     def records(
         self,
         dofs: TornDofs,
-        decomposition: Decomposition,
         contact: int,
         reach: float = np.inf,
         depth: float = np.inf,
@@ -138,7 +132,7 @@ class Contact(ContactPartner):
         With D_i = ∫ψ_i over the covered part and n_i the averaged normal the condition is
         n_i · (Σ_k D_ik u_k − Σ_j M_ij u_j)/D_i ≤ g_i, g_i the mean gap weighted with ψ_i.
         """
-        return self._meet(self._sides(dofs, decomposition), dofs, contact, reach, depth)
+        return self._meet(self._sides(dofs), dofs, contact, reach, depth)
 
     def gaps(self, dofs: TornDofs, records: ContactRecords, depth: float = np.inf) -> Array:
         """Return gaps of its conditions; those of the geometry may not overlap too deep."""
@@ -151,16 +145,17 @@ class Contact(ContactPartner):
             )
         return found
 
-    def _sides(self, dofs: TornDofs, decomposition: Decomposition) -> tuple[Side, Side]:
+    def _sides(self, dofs: TornDofs) -> tuple[Side, Side]:
         """Facets of both surfaces, with averaged normals and curvature."""
-        if dofs.bs != decomposition.mesh.geometry.dim:
+        gdim = dofs.V.mesh.geometry.dim
+        if dofs.bs != gdim:
             raise InputError(
-                f"{self.name}: the space is scalar; expected displacements of "
-                f"{decomposition.mesh.geometry.dim} components, since surfaces meet along normals"
+                f"{self.name}: the space is scalar; expected displacements of {gdim} components, "
+                "since surfaces meet along normals"
             )
         sides, kind = [], facet_kind(dofs)
         for surface in self.surfaces:
-            facets = local_facets(dofs, decomposition, surface_facets(decomposition, surface))
+            facets = local_facets(dofs, surface_facets(dofs.decomposition, surface))
             whole = facets.radius ** (dofs.bs - 1)
             flat = int(np.sum(facets.area <= SEARCH.degenerate * whole))
             if count := dofs.comm.allreduce(flat):

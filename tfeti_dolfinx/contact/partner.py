@@ -56,7 +56,6 @@ class ContactPartner:
     def records(
         self,
         dofs: TornDofs,
-        decomposition: Decomposition,
         contact: int,
         reach: float = np.inf,
         depth: float = np.inf,
@@ -65,7 +64,6 @@ class ContactPartner:
 
         Args:
             dofs: Dof maps.
-            decomposition: The torn mesh.
             contact: Index of the contact.
             reach: Conditions with a larger gap are out of reach; those of surfaces three times as
                 far apart are not made.
@@ -93,18 +91,13 @@ class ContactPartner:
         return float(reach)
 
     def settled(
-        self,
-        dofs: TornDofs,
-        decomposition: Decomposition,
-        contact: int,
-        reach: float,
-        stiffness: Array,
+        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array
     ) -> tuple[ContactPartner, ContactRecords]:
         """Return the contact with its sides decided, and its conditions up to a reach, and so deep.
 
         ``stiffness`` is the block of K of each primal node, shape ``(num_nodes, bs, bs)``.
         """
-        return self, self.records(dofs, decomposition, contact, reach, reach)
+        return self, self.records(dofs, contact, reach, reach)
 
     def with_gap(self, gap: Gap) -> Self:
         """Return the same contact with another ``gap=``."""

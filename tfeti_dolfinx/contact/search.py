@@ -20,7 +20,6 @@ from tfeti_dolfinx.contact.records import (
     remaining_gaps,
 )
 from tfeti_dolfinx.contact.tools import Tools
-from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import diameter, surface_nodes
 from tfeti_dolfinx.mortar.tolerances import SEARCH
@@ -37,7 +36,6 @@ class ContactSearch:
     Args:
         contacts: Obstacles and pairs.
         dofs: Dof maps.
-        decomposition: The torn mesh.
         stiffness: Block of K of each primal node, shape ``(num_nodes, bs, bs)``.
         origin: Displacement in primal order at which the mesh is; None: 0. Gaps are those of the
             total displacement.
@@ -56,20 +54,19 @@ class ContactSearch:
         self,
         contacts: Sequence[ContactPartner],
         dofs: TornDofs,
-        decomposition: Decomposition,
         stiffness: Array,
         origin: Array | None = None,
         tools: Tools | None = None,
     ) -> None:
         self._tools = tools
-        self._dofs, self._decomposition, self._origin = dofs, decomposition, origin
+        self._dofs, self._origin, decomposition = dofs, origin, dofs.decomposition
         self.length = bcast_from_root(dofs.comm, diameter(decomposition))
         reach = [contact.first_reach(decomposition) for contact in contacts]
         self._depths = bcast_from_root(dofs.comm, reach)
         self._reach, self._said = list(self._depths), list[str]()
         check_together(contacts, decomposition)
         settled = [
-            contact.settled(dofs, decomposition, i, self._reach[i], stiffness)
+            contact.settled(dofs, i, self._reach[i], stiffness)
             for i, contact in enumerate(contacts)
         ]
         self.contacts = [contact for contact, _ in settled]
@@ -186,10 +183,10 @@ class ContactSearch:
 
         Largest displacements of both surfaces, against their common mean, added up.
         """
-        dofs, cut, comm = self._dofs, self._decomposition, self._dofs.comm
+        dofs, cut, comm = self._dofs, self._dofs.decomposition, self._dofs.comm
         if len(contact.surfaces) == 1:
             return 0.0
-        moved = [u[surface_nodes(dofs, cut, cut.facets(name))] for name in contact.surfaces]
+        moved = [u[surface_nodes(dofs, cut.facets(name))] for name in contact.surfaces]
         total = comm.allreduce(np.sum([part.sum(axis=0) for part in moved], axis=0))
         mean = total / comm.allreduce(sum(len(part) for part in moved))
         largest = np.array([np.linalg.norm(u - mean, axis=1).max(initial=0.0) for u in moved])
@@ -217,8 +214,8 @@ class ContactSearch:
 
     def _search(self, i: int, reach: float) -> ContactRecords:
         """Conditions up to a larger reach, of which those have rows that had them before."""
-        dofs, known, depth = self._dofs, self._records[i], self._depths[i]
-        found = self.contacts[i].records(dofs, self._decomposition, i, reach, depth)
+        known = self._records[i]
+        found = self.contacts[i].records(self._dofs, i, reach, self._depths[i])
         had_rows = np.isin(found.group, known.group[known.within_reach])
         return replace(self._from_origin(found), within_reach=had_rows)
 

@@ -16,7 +16,6 @@ from tfeti_dolfinx.contact.partner import GEOMETRY, ContactPartner
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.rigid_body import MOTIONS, Pose, RigidBody, motion_fields
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mortar.surfaces import extent, surface_facets
 from tfeti_dolfinx.mortar.tolerances import SEARCH
@@ -77,8 +76,7 @@ class Tools:
 
     Args:
         contacts: Obstacles and pairs.
-        dofs: Dof maps.
-        decomposition: The torn mesh. The constructor is collective.
+        dofs: Dof maps. The constructor is collective.
 
     Attributes:
         bodies: The bodies, with their names.
@@ -99,10 +97,8 @@ class Tools:
         InputError: Bodies do not fit the space, or two have the same name.
     """
 
-    def __init__(
-        self, contacts: Sequence[ContactPartner], dofs: TornDofs, decomposition: Decomposition
-    ) -> None:
-        self._comm = dofs.comm
+    def __init__(self, contacts: Sequence[ContactPartner], dofs: TornDofs) -> None:
+        self._comm, decomposition = dofs.comm, dofs.decomposition
         self._gdim = gdim = decomposition.mesh.geometry.dim
         self.bodies: list[RigidBody] = []
         self.of_contact = np.full(len(contacts), -1)

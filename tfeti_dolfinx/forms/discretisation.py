@@ -30,7 +30,6 @@ class StressRecovery:
         u: Displacement; later values of it are read at each call of ``squares``.
         sigma: Its stress in UFL, 3×3.
         dofs: Dof maps.
-        decomposition: The torn mesh.
         thickness: What areas of the mesh are multiplied with, a number or a scalar in UFL.
 
     Attributes:
@@ -38,17 +37,10 @@ class StressRecovery:
         cell_dof: Unknown of each local cell in it.
     """
 
-    def __init__(
-        self,
-        u: fem.Function,
-        sigma: Any,
-        dofs: TornDofs,
-        decomposition: Decomposition,
-        thickness: Any,
-    ) -> None:
+    def __init__(self, u: fem.Function, sigma: Any, dofs: TornDofs, thickness: Any) -> None:
         self._dofs, mesh, degree = dofs, dofs.V.mesh, dofs.V.element.basix_element.degree
         # the cells around each node, by body and material
-        self._layout, self._kinds = np.asarray(dofs.V.dofmap.list), _kinds(decomposition)
+        self._layout, self._kinds = np.asarray(dofs.V.dofmap.list), _kinds(dofs.decomposition)
         self._count = dofs.comm.allreduce(int(self._kinds.max(initial=0)) + 1, op=MPI.MAX)
         self._basis = np.ones((*self._layout.shape, 1))
         if degree == 1:

@@ -119,9 +119,10 @@ class TornDofs:
 
     Args:
         V: Lagrange space on the torn mesh, scalar or blocked.
-        decomposition: The decomposition that the mesh belongs to.
+        decomposition: The torn mesh.
 
     Attributes:
+        decomposition: The torn mesh.
         bs: Unknowns per node.
         subdomains: Subdomains of this rank, ascending, shape ``(S,)``.
         node_offsets: First primal node of each subdomain, shape ``(S + 1,)``.
@@ -140,8 +141,7 @@ class TornDofs:
 
     def __init__(self, V: fem.FunctionSpace, decomposition: Decomposition) -> None:
         check_space(V, decomposition)
-        self.V = V
-        self.comm = decomposition.comm
+        self.V, self.decomposition, self.comm = V, decomposition, decomposition.comm
         self.bs = V.dofmap.index_map_bs
         self._number_nodes(decomposition)
         self.nodes: Array | None = None

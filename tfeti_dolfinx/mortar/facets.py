@@ -13,7 +13,6 @@ from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.common.compat import geometry_dofmap
 from tfeti_dolfinx.common.parallel import Exchange
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.mesh.untorn import cell_facets
 from tfeti_dolfinx.mortar.tolerances import SEARCH
@@ -172,11 +171,14 @@ def facet_kind(dofs: TornDofs) -> FacetKind:
     )
 
 
-def local_facets(dofs: TornDofs, decomposition: Decomposition, facets: Array) -> Facets:
+def local_facets(dofs: TornDofs, facets: Array) -> Facets:
     """Data of local facets of the true boundary, without averaged normals."""
-    mesh = decomposition.mesh
-    cell_type, gdim = mesh.topology.cell_type, mesh.geometry.dim
-    cell, place = _cells_of(decomposition, facets)
+    mesh = dofs.V.mesh
+    cell_type, gdim, fdim = mesh.topology.cell_type, mesh.geometry.dim, mesh.topology.dim - 1
+    mesh.topology.create_connectivity(fdim, fdim + 1)
+    cells = mesh.topology.connectivity(fdim, fdim + 1)
+    cell = cells.array[cells.offsets[facets]]
+    place = np.argmax(cell_facets(mesh)[cell] == facets[:, None], axis=1)
     element = dofs.V.element.basix_element
     coordinate = mesh.ufl_domain().ufl_coordinate_element()
     on_facet = facet_dofs(cell_type.name, coordinate.degree, coordinate.lagrange_variant)[place]
@@ -213,16 +215,6 @@ def with_averaged_normals(facets: Facets, dofs: TornDofs) -> tuple[Facets, Array
     averaged = _unit(dofs.reduce_on_owners(groups, weighted.reshape(len(groups), dofs.bs)))
     (at_vertices,) = dofs.lookup(groups, averaged)
     return replace(facets, vertex_normals=at_vertices.reshape(weighted.shape)), averaged
-
-
-def _cells_of(decomposition: Decomposition, facets: Array) -> tuple[Array, Array]:
-    """Cell of each boundary facet, and its place among the cell's facets."""
-    topology = decomposition.mesh.topology
-    topology.create_connectivity(topology.dim - 1, topology.dim)
-    cells = topology.connectivity(topology.dim - 1, topology.dim)
-    cell = cells.array[cells.offsets[facets]]
-    place = np.argmax(cell_facets(decomposition.mesh)[cell] == facets[:, None], axis=1)
-    return cell, place
 
 
 def _normals(element: FacetElement, x: Array, xi: Array) -> Array:

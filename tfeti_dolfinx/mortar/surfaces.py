@@ -37,9 +37,7 @@ def surface_facets(decomposition: Decomposition, name: str | int) -> Array:
     return facets
 
 
-def hat_integrals(
-    dofs: TornDofs, decomposition: Decomposition, names: Sequence[str | int], thickness: Any = 1.0
-) -> Array:
+def hat_integrals(dofs: TornDofs, names: Sequence[str | int], thickness: Any = 1.0) -> Array:
     """Return ∫φ_i of the hats of degree 1 over the union of surfaces, by names or tags. Collective.
 
     They are weighted by the thickness, a number or a scalar in UFL. One integral per owned group,
@@ -47,7 +45,7 @@ def hat_integrals(
     """
     if not names:
         return np.zeros(dofs.num_groups)
-    W, node = dofs.hats
+    (W, node), decomposition = dofs.hats, dofs.decomposition
     tags = tuple(sorted({decomposition.surface(name) for name in names}))
     ds = ufl.Measure("ds", domain=W.mesh, subdomain_data=decomposition.facet_tags)
     weight = fem.Constant(W.mesh, thickness) if isinstance(thickness, float) else thickness
@@ -57,9 +55,9 @@ def hat_integrals(
     return dofs.reduce(per_node, np.add, 0.0)
 
 
-def surface_nodes(dofs: TornDofs, decomposition: Decomposition, facets: Array) -> Array:
+def surface_nodes(dofs: TornDofs, facets: Array) -> Array:
     """Primal nodes of local facets."""
-    fdim = decomposition.mesh.topology.dim - 1
+    fdim = dofs.V.mesh.topology.dim - 1
     nodes = fem.locate_dofs_topological(dofs.V, fdim, facets.astype(np.int32), remote=False)
     return dofs.primal_nodes(nodes)
 

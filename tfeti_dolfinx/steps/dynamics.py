@@ -107,7 +107,6 @@ class Predictor:
 
     Args:
         dofs: Dof maps.
-        decomposition: The torn mesh.
         settings: How to solve.
 
     Attributes:
@@ -115,8 +114,8 @@ class Predictor:
         multipliers: Of the last call: M(u − w) = −Bᵀλ.
     """
 
-    def __init__(self, dofs: TornDofs, decomposition: Decomposition, settings: Settings) -> None:
-        self._dofs, self._decomposition = dofs, decomposition
+    def __init__(self, dofs: TornDofs, settings: Settings) -> None:
+        self._dofs = dofs
         options = replace(settings.options, recycle=0)  # of a mass there is little to learn
         self._settings = replace(settings, extensions=Extensions(), options=options)
         self._options = options
@@ -170,24 +169,23 @@ class Predictor:
 
     def _make(self, M: csr_array, f: Array, gluing: Gluing) -> None:
         """Make what is out of date."""
-        constraints, settings = gluing.constraints, self._settings
-        scene = self._dofs, self._decomposition
+        constraints, settings, dofs = gluing.constraints, self._settings, self._dofs
         new_rows = self._dual is None or self._dual.constraints is not constraints
         if M is not self._M:
             self.destroy()
-            data = subdomain_data(*scene, M, f, constraints.trace)
-            self._subdomains = settings.make_subdomains(data, *scene, Counters())
+            data = subdomain_data(dofs, dofs.decomposition, M, f, constraints.trace)
+            self._subdomains = settings.make_subdomains(data, dofs, Counters())
             self._M, new_rows = M, True
         assert self._subdomains is not None
-        self._subdomains.update(f=self._dofs.to_primal(f))
+        self._subdomains.update(f=dofs.to_primal(f))
         if not new_rows and self._dual is not None:
             self._dual.update_load()
             return
         if self._dual is not None:
             self._dual.destroy()
             self._subdomains.retrace(constraints.trace)
-        law = _frictionless
-        self._dual, self._options = settings.make_dual(constraints, self._subdomains, *scene, law)
+        parts = constraints, self._subdomains, dofs
+        self._dual, self._options = settings.make_dual(*parts, _frictionless)
 
     def _solve(self, gluing: Gluing) -> Array:
         """Return the displacement in primal order."""
@@ -294,7 +292,7 @@ class ContactDynamics(ContactProblem):
         self._first = np.array(self.u.x.array)
         self._predictor: Predictor | None = None
         if self._stabilised:
-            self._predictor = Predictor(self.dofs, decomposition, self._settings)
+            self._predictor = Predictor(self.dofs, self._settings)
 
     def _given_besides(self) -> dict[str, Any]:
         flags = {"stabilised": self._stabilised, "lumped": self._lumped}
