@@ -38,9 +38,8 @@ import tfeti_dolfinx.problem
 from benchmarks.tools import ROOT, SHOWN, command_line, curves, finish, picture
 from demos import scene
 from tfeti_dolfinx.feti.preconditioner import PARAMETERS
-from tfeti_dolfinx.qp.homogenised import homogenise
 from tfeti_dolfinx.qp.krylov import pcpg
-from tfeti_dolfinx.qp.problem import Point, Steps, StoppingRule
+from tfeti_dolfinx.qp.problem import Point, Steps, StoppingRule, homogenise
 from tfeti_dolfinx.qp.sets import Status, face_of
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor
 

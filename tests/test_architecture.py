@@ -1,6 +1,7 @@
 """One direction of flow: a module imports only from rooms that come before its own."""
 
 import ast
+import re
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -107,7 +108,8 @@ def test_nothing_stands_twice():
     """No ten lines of code that follow each other, imports apart."""
     seen = {}
     for path in modules():
-        lines = [line.strip() for line in path.read_text().splitlines()]
+        text = re.sub(r"^from \S+ import \([^)]*\)$", "", path.read_text(), flags=re.MULTILINE)
+        lines = [line.strip() for line in text.splitlines()]
         code = [s for s in lines if s and not s.startswith(("import ", "from ", "#"))]
         for k in range(len(code) - 9):
             block = tuple(code[k : k + 10])

@@ -11,10 +11,9 @@ from test_discs import discs
 from test_qp import matrix, to, vector
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse
-from tfeti_dolfinx.qp.homogenised import homogenise
 from tfeti_dolfinx.qp.krylov import estimate_norm
 from tfeti_dolfinx.qp.mprgp import MprgpIterate, MprgpParameters, mprgp
-from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Steps
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Steps, homogenise
 from tfeti_dolfinx.qp.sets import Bounds, Ellipses, Product, Status
 from tfeti_dolfinx.qp.smalse import smalse
 

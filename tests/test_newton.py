@@ -9,10 +9,9 @@ from scipy.sparse import block_diag, csr_array, diags_array
 from test_qp import Counted, bounds_on, matrix, vector
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse
-from tfeti_dolfinx.qp.homogenised import homogenise, operator_product
 from tfeti_dolfinx.qp.krylov import solve_by_pcpg
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
-from tfeti_dolfinx.qp.problem import QP, Start, StoppingRule
+from tfeti_dolfinx.qp.problem import QP, Start, StoppingRule, homogenise, operator_product
 from tfeti_dolfinx.qp.projection import project_onto_feasible
 from tfeti_dolfinx.qp.sets import Bounds, Product
 

@@ -10,9 +10,16 @@ from test_mpgp import around_circles, as_set, program
 from test_qp import matrix, vector
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse
-from tfeti_dolfinx.qp.homogenised import homogenise, operator_product
 from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
-from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Start, StoppingRule, no_monitor
+from tfeti_dolfinx.qp.problem import (
+    QP,
+    ConvergedReason,
+    Start,
+    StoppingRule,
+    homogenise,
+    no_monitor,
+    operator_product,
+)
 from tfeti_dolfinx.qp.projection import project_onto_feasible
 from tfeti_dolfinx.qp.sets import Status
 

@@ -11,10 +11,9 @@ from reference.active_set import dense_qp
 from scipy.sparse import diags_array
 
 from tfeti_dolfinx.qp.coarse import DenseCoarse
-from tfeti_dolfinx.qp.homogenised import homogenise
 from tfeti_dolfinx.qp.krylov import estimate_norm, solve_by_pcpg
 from tfeti_dolfinx.qp.mprgp import MprgpIterate, MprgpParameters, mprgp
-from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Start, Steps, StoppingRule
+from tfeti_dolfinx.qp.problem import QP, ConvergedReason, Start, Steps, StoppingRule, homogenise
 from tfeti_dolfinx.qp.sets import Bounds, Product
 from tfeti_dolfinx.qp.smalse import SmalseParameters, smalse
 
@@ -48,7 +47,7 @@ def bounds_on(rows):
 
 def to(rtol, homogenised):
     """Residuals down to rtol·b₀."""
-    return StoppingRule(rtol * homogenised.scale.reference)
+    return StoppingRule(rtol * homogenised.reference)
 
 
 def random_program(seed, m=40, r=5, n_bounded=20):

@@ -10,9 +10,8 @@ from scenes import curved_obstacle, decomposed, problem
 from test_solvable_lp import dual_of
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.qp.homogenised import homogenise
 from tfeti_dolfinx.qp.krylov import pcpg
-from tfeti_dolfinx.qp.problem import ConvergedReason, Point, Steps, StoppingRule
+from tfeti_dolfinx.qp.problem import ConvergedReason, Point, Steps, StoppingRule, homogenise
 from tfeti_dolfinx.qp.sets import Status, face_of
 from tfeti_dolfinx.solve.coulomb import solve_with_friction
 

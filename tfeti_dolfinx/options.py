@@ -26,7 +26,7 @@ from tfeti_dolfinx.common.validation import (
 )
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.feti.operator import PRECONDITIONERS
-from tfeti_dolfinx.qp.newton_faces import NewtonParameters
+from tfeti_dolfinx.qp.newton import NewtonParameters
 from tfeti_dolfinx.qp.smalse import SmalseParameters
 from tfeti_dolfinx.qp.solvers import SOLVERS
 from tfeti_dolfinx.subdomains.factor import default_solver, has_solver, unread_options

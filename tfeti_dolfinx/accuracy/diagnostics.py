@@ -177,7 +177,7 @@ class Diagnostics:
         if not np.any(flat):
             return
         shown = records.conforms & flat[records.contact]
-        if not any_rank(comm, bool(np.any(shown))):
+        if not any_rank(comm, shown):
             return
         diagonal = joined([block.diagonal for block in subdomains.elastic])
         K = self._dofs.reduce(diagonal.reshape(-1, self._dofs.bs).mean(axis=1), np.add, 0.0)

@@ -27,7 +27,7 @@ from tfeti_dolfinx.feti.operator import DualOperator
 from tfeti_dolfinx.feti.preconditioner import chebyshev
 from tfeti_dolfinx.feti.projectors import FaceFactors, SemidefiniteFactor, replicated
 from tfeti_dolfinx.qp.problem import FaceOperator
-from tfeti_dolfinx.qp.sets import Face
+from tfeti_dolfinx.qp.sets import Face, Status
 from tfeti_dolfinx.subdomains.factor import CholeskyFactor
 
 # --- Chebyshev iteration between clusters -----------------------------------------------------
@@ -245,7 +245,7 @@ class ClusterMotions:
         Raises:
             FactorError: A factor could not be made.
         """
-        if np.any(face.constrained[self._always]):
+        if np.any(face.status[self._always] != Status.FREE):
             part = _gram(csr_array(face.Z.T @ self._rows))
         else:
             contact = csr_array(face.Z[self._contact].T @ self._rows[self._contact])

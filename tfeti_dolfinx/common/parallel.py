@@ -33,9 +33,9 @@ def steering(comm: MPI.Intracomm, *values: float) -> Array:
     return found
 
 
-def any_rank(comm: MPI.Intracomm, flag: bool) -> bool:
-    """Return whether a flag is set on some rank. Collective."""
-    found = np.array([int(flag)])
+def any_rank(comm: MPI.Intracomm, flag: bool | Array) -> bool:
+    """Return whether a flag, or an entry other than 0, is set on some rank. Collective."""
+    found = np.array([int(np.any(flag))])
     comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
     return bool(found[0])
 

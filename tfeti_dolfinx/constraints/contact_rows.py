@@ -187,7 +187,7 @@ def tangent_rows(
     bound. Under Coulomb's law it has none: the pressure is hidden in what holds the node.
     """
     records, count = builder.records, dofs.bs - 1
-    if not any_rank(dofs.comm, bool(np.any(records.friction != Friction.NONE))):
+    if not any_rank(dofs.comm, records.friction != Friction.NONE):
         none, number = np.empty(0, dtype=np.int64), np.empty(0)
         moves = np.empty((0, count), dtype=bool)
         return Rows(none, none, none, number), TangentRows(none, number, moves, none)

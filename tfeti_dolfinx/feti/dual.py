@@ -24,9 +24,15 @@ from tfeti_dolfinx.feti.operator import (
 from tfeti_dolfinx.feti.preconditioner import FacePreconditioner
 from tfeti_dolfinx.feti.rigid_bodies import listed
 from tfeti_dolfinx.feti.solvability import check_solvable
-from tfeti_dolfinx.qp.homogenised import LastProduct, OperatorProduct, operator_product
 from tfeti_dolfinx.qp.krylov import estimate_norm
-from tfeti_dolfinx.qp.problem import QP, FaceOperator, Operator
+from tfeti_dolfinx.qp.problem import (
+    QP,
+    FaceOperator,
+    LastProduct,
+    Operator,
+    OperatorProduct,
+    operator_product,
+)
 from tfeti_dolfinx.qp.recycling import Recycled
 from tfeti_dolfinx.qp.sets import (
     Bounds,
@@ -362,7 +368,7 @@ class Dual:
             return False
         known = coarse.combined(mu) if len(mu) == coarse.dimension else least
         Fx = self.last.image(self.F, comm, lam).Fx
-        self.last.pass_on(lam, Fx, 0.0)
+        self.last.x, self.last.Fx, self.last.within = lam, Fx, 0.0
         lengths = norm_over(comm, known) + norm_over(comm, Fx)
         return lengths > LIMITS.far * norm_over(comm, self.driving)
 

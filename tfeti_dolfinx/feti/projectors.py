@@ -62,7 +62,7 @@ class Grams:
         for rows, G, places in self._blocks:
             G_f = G[face.free[rows]]
             sums[places] += (G_f.T @ G_f).ravel()
-        sums[-2:] = np.any(face.constrained[self._always]), len(face.tangents)
+        sums[-2:] = np.any(face.status[self._always] != Status.FREE), len(face.tangents)
         *_, others, tangents = summed(self._comm, sums)
         if others:
             gram = replicated_gram(face.Z.T @ self._Gt, self._comm)

@@ -15,8 +15,7 @@ from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.duality_gap import EnergyBound, energy_bound, within
 from tfeti_dolfinx.feti.recovery import Recovered, min_norm_correction, recover
 from tfeti_dolfinx.qp.coarse import LIGHT
-from tfeti_dolfinx.qp.homogenised import ROUNDING
-from tfeti_dolfinx.qp.problem import ConvergedReason, StoppingRule
+from tfeti_dolfinx.qp.problem import ROUNDING, ConvergedReason, StoppingRule
 from tfeti_dolfinx.qp.sets import Face
 
 # from the displacement on this rank to the other error, a root of an energy; collective

@@ -246,7 +246,7 @@ def flatten_interfaces(graph: CellGraph, part: Array, key: Array, wanted: Array)
         own = every[near]
         mine, most, best = _majority(every, graph.vertices[near], around, beside[near], own)
         wants = (most > mine) & (wanted[own] > 0)
-        if not any_rank(comm, bool(np.any(wants))):
+        if not any_rank(comm, wants):
             break
         # half of those that want to move, so that neighbours do not just exchange their parts
         lot = mix(key[near] + np.uint64(turn)) & np.uint64(1)

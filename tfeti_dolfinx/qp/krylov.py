@@ -9,10 +9,11 @@ import numpy as np
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root, dot_over, largest, norm_over, summed
 from tfeti_dolfinx.qp.coarse import Coarse
-from tfeti_dolfinx.qp.homogenised import Homogenised
 from tfeti_dolfinx.qp.problem import (
     QP,
+    STRANGE,
     ConvergedReason,
+    Homogenised,
     Monitor,
     Operator,
     Point,
@@ -124,11 +125,6 @@ class Directions:
             self.norm = max(self.norm, pFp / pp if pp > 0.0 else 0.0)
         return pFp > DEFAULT.flat * self.norm * pp
 
-    def stands_out(self, rz: float, rr: float) -> bool:
-        """Return whether rᵀz, z the preconditioned residual, is positive beyond rounding."""
-        self.helped = max(self.helped, rz / rr if rr > 0.0 else 0.0)
-        return rz > DEFAULT.flat * self.helped * rr
-
 
 # --- Detection of stagnation ------------------------------------------------------------------
 
@@ -227,7 +223,8 @@ def pcpg(
         known = (rz, rp, pFp) if comm.rank == 0 else np.zeros(3)
         squared, rz, rp, pFp = summed(comm, np.array([left @ left, *known]))
         short = bool(pFp) and (rp / pFp) ** 2 * pp < least
-        if not (own.seen(pFp, pp, short) and own.stands_out(rz, norm**2)):
+        own.helped = max(own.helped, rz / norm**2 if norm > 0.0 else 0.0)
+        if not (own.seen(pFp, pp, short) and rz > DEFAULT.flat * own.helped * norm**2):
             own.fresh = True
             reason = _examined(qp, point, rule, norm) or ConvergedReason.DIVERGED_INDEFINITE_MAT
             break
@@ -263,8 +260,7 @@ def solve_by_pcpg(
     >>> import numpy as np
     >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
     >>> from tfeti_dolfinx.qp.sets import Product
-    >>> from tfeti_dolfinx.qp.homogenised import homogenise
-    >>> from tfeti_dolfinx.qp.problem import StoppingRule
+    >>> from tfeti_dolfinx.qp.problem import StoppingRule, homogenise
     >>> F, d = np.diag([1.0, 2.0, 4.0]).__matmul__, np.array([1.0, 1.0, 2.0])
     >>> qp = QP(F, d, DenseCoarse(np.ones((1, 3)), np.ones(1)), Product())
     >>> result = solve_by_pcpg(qp, homogenise(qp), StoppingRule(1e-12))
@@ -276,7 +272,8 @@ def solve_by_pcpg(
     reason = pcpg(qp, point, rule, steps, max_it, monitor)
     g = qp.coarse.project(point.g)
     norm = norm_over(qp.comm, g)
-    if reason == ConvergedReason.DIVERGED_INDEFINITE_MAT and homogenised.is_rounding(norm):
+    rounds = norm <= STRANGE * homogenised.rounding
+    if reason == ConvergedReason.DIVERGED_INDEFINITE_MAT and rounds:
         reason = ConvergedReason.DIVERGED_ROUNDING
     return QPResult(
         lam=point.lam,
@@ -286,7 +283,7 @@ def solve_by_pcpg(
         reason=reason,
         projected_gradient=norm,
         equality=qp.coarse.norm_Q(point.lam - homogenised.lam_bar),
-        reference=homogenised.scale.reference,
+        reference=homogenised.reference,
         norm=0.0,
         steps=steps,
     )

@@ -70,15 +70,6 @@ class MprgpIterate:
         (square,) = summed(self.comm, np.array([own]))
         return bool(self.chopped_squared <= parameters.gamma**2 * square)
 
-    def max_step(self, p: Array, x: Array | None = None) -> float:
-        """Return the largest α with x − α p ∈ Ω. Collective."""
-        own = self.feasible.max_step(self.x if x is None else x, p)
-        return least(self.comm, own)
-
-    def move(self, alpha: float, p: Array, Ap: Array) -> None:
-        """x ← x − α p and the gradient with it."""
-        self.x, self.g = self.x - alpha * p, self.g - alpha * Ap
-
     def move_to(self, target: Array) -> None:
         """x ← P_Ω(target); multiplies by A once. Collective."""
         projected = self.feasible.project(target)
@@ -115,7 +106,8 @@ def step_on_face(state: MprgpIterate, parameters: MprgpParameters) -> int:
         if not curvature > 0.0:
             break
         # rows that do not slip keep the face
-        room = state.max_step(np.where(inside, -p, 0.0), np.where(inside, x + d, x))
+        up = np.where(inside, -p, 0.0)
+        room = least(comm, state.feasible.max_step(np.where(inside, x + d, x), up))
         wanted = rz / curvature
         length = min(wanted, room)
         d, Ad, r = d + length * p, Ad + length * Ap, r - length * Ht
@@ -182,16 +174,15 @@ def mprgp(
             pAp, gp = dot_over(comm, (p, Ap), (state.g, p))
             if not pAp > 0.0:
                 return ConvergedReason.DIVERGED_INDEFINITE_MAT
-            alpha_cg, alpha_f = gp / pAp, state.max_step(p)
-            conjugate = alpha_cg <= alpha_f
+            alpha_cg, alpha_f = gp / pAp, least(comm, state.feasible.max_step(state.x, p))
+            conjugate, alpha = alpha_cg <= alpha_f, min(alpha_cg, alpha_f)
+            state.x, state.g = state.x - alpha * p, state.g - alpha * Ap
             if conjugate:
                 # Step 3: conjugate gradient step
-                state.move(alpha_cg, p, Ap)
                 steps.cg += 1
                 kind = "cg"
             else:
                 # Step 4: expansion step: to the edge of the face, then by −ᾱφ, projected
-                state.move(alpha_f, p, Ap)
                 state.x = state.feasible.project(state.x)
                 state.split()
                 state.move_to(state.x - alpha_bar * state.phi)
@@ -200,7 +191,7 @@ def mprgp(
         else:
             # Step 5: proportioning step
             beta, conjugate = state.beta, False
-            room = state.max_step(beta)
+            room = least(comm, state.feasible.max_step(state.x, beta))
             if room < alpha_bar:
                 cg = step_on_face(state, parameters)
                 steps.cg += cg
@@ -211,7 +202,8 @@ def mprgp(
                 bAb, gb = dot_over(comm, (beta, Ab), (state.g, beta))
                 if not bAb > 0.0:
                     return ConvergedReason.DIVERGED_INDEFINITE_MAT
-                state.move(min(gb / bAb, room), beta, Ab)
+                alpha = min(gb / bAb, room)
+                state.x, state.g = state.x - alpha * beta, state.g - alpha * Ab
             steps.proportioning += 1
             kind = "proportioning"
         state.split()

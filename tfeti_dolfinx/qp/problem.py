@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import astuple, dataclass, field
 from enum import IntEnum
+from functools import partial
 from typing import Protocol
 
 import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import dot_over
+from tfeti_dolfinx.common.parallel import any_rank, dot_over, norm_over
 from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.recycling import Recycled
 from tfeti_dolfinx.qp.sets import Face, FeasibleSet
@@ -75,7 +76,7 @@ class QP:
     feasible: FeasibleSet
     preconditioner: Operator | None = None
     norm: float = 1.0
-    preconditioner_on: Callable[[Face], FaceOperator] | None = None
+    preconditioner_on: Callable[[Face], Operator] | None = None
     seen: float = 0.0
     recycled: Recycled | None = None
     held: Array | None = None
@@ -187,6 +188,129 @@ class Start:
 
     lam: Array
     mu: Array | None
+
+
+# --- Homogenisation: λ = x + λ̄ with Gλ̄ = e, so that Gx = 0 --------------------------------------
+
+# of the terms that a residual is the difference of: what rounding leaves of it at least, and
+# below how many times that rounding may be the reason of anything strange
+ROUNDING, STRANGE = 1e-14, 1e8
+# of open gaps: what drives the others is less, and would be lost in what P spreads of the gaps
+FAR_OPEN = 1e-6
+
+
+@dataclass(frozen=True)
+class OperatorProduct:
+    """Vector x with the product Fx, this rank's parts."""
+
+    x: Array
+    Fx: Array
+
+
+def operator_product(F: Operator, comm: MPI.Intracomm, x: Array) -> OperatorProduct:
+    """x and F x; multiplies once if x ≠ 0. Collective."""
+    return OperatorProduct(x, F(x) if any_rank(comm, x) else np.zeros(len(x)))
+
+
+class LastProduct:
+    """Last solution x of a program, with the product Fx.
+
+    Attributes:
+        x: The solution, or another solver's.
+        Fx: F x, which stands for that of all vectors within the distance ``within``, too.
+        within: That distance.
+        d: Linear term of the program that it was kept from, and e its right side.
+        looked: A point of the program with Fx − d, as an assessment computes it.
+    """
+
+    def __init__(self) -> None:
+        nothing: Array = np.zeros(0)
+        self.x, self.Fx, self.d, self.e = nothing, nothing, nothing, nothing
+        self.looked, self.within = (nothing, nothing), 0.0
+
+    def keep(self, result: QPResult, qp: QP) -> None:
+        """Store a solution with its gradient Fx − d − Gᵀμ, or that of an assessment. Collective.
+
+        So what steps leave out of the gradient does not grow from solve to solve.
+        """
+        (x, g), self.x, self.within = self.looked, result.lam, 0.0
+        other = any_rank(qp.comm, not np.array_equal(x, self.x))
+        self.Fx = (result.gradient + qp.coarse.combined(result.mu) if other else g) + qp.d
+        self.d, self.e = qp.d, np.array(qp.coarse.e)
+
+    def known(self, comm: MPI.Intracomm, x: Array) -> Array:
+        """Return this rank's Fx, or an empty array if x is not the last solution. Collective."""
+        found = not any_rank(comm, not np.array_equal(self.x, x))
+        return np.array(self.Fx) if found else np.zeros(0)
+
+    def take(self, comm: MPI.Intracomm, x: Array, Fx: Array) -> None:
+        """Restore what ``known`` has returned in another run. Collective."""
+        if any_rank(comm, Fx.size > 0):
+            self.x, self.Fx = x, Fx
+
+    def image(self, F: Operator, comm: MPI.Intracomm, x: Array) -> OperatorProduct:
+        """Return x with Fx; multiply by F only if x is not the last solution. Collective."""
+        known = self.known(comm, x)
+        if self.within > 0.0 and not any_rank(comm, x.shape != self.x.shape):
+            known = self.Fx if norm_over(comm, x - self.x) <= self.within else known
+        found = any_rank(comm, known.size > 0)
+        return OperatorProduct(x, known) if found else operator_product(F, comm, x)
+
+
+@dataclass(frozen=True)
+class Homogenised:
+    """min ½xᵀPFPx − bᵀx subject to Gx = 0, x + λ̄ ∈ Ω.
+
+    Attributes:
+        lam_bar: λ̄.
+        gradient: F λ̄ − d.
+        b: P(d − F λ̄).
+        reference: Size of the residual at λ̄₀ = Gᵀ(GGᵀ)⁻¹e, b₀ = ‖P(d − F λ̄₀)‖, whatever λ̄ is.
+        rounding: What rounding leaves of b₀ where it should be 0.
+    """
+
+    lam_bar: Array
+    gradient: Array
+    b: Array
+    reference: float
+    rounding: float
+
+
+def homogenise(
+    qp: QP,
+    at: OperatorProduct | None = None,
+    natural: OperatorProduct | None = None,
+    warm: bool = False,
+) -> Homogenised:
+    """Homogenise a quadratic program. Collective.
+
+    Args:
+        qp: The program.
+        at: A solution of Gλ̄ = e with its image; default λ̄₀, which costs one multiplication by F if
+            e ≠ 0.
+        natural: Where the size of residuals is taken: λ̄₀ with its image; default λ̄.
+        warm: Without it: λ̄ may be the solution. ‖P d‖ and ‖P F λ‖ are equal there, and b₀ is ‖P d‖
+            where e = 0: the larger one is taken.
+    """
+    project, norm = qp.coarse.project, partial(norm_over, qp.comm)
+    at = at or operator_product(qp.F, qp.comm, qp.coarse.particular())
+    # 1. b; d on rows that are open without forces: P would spread it over all others
+    gradient = at.Fx - qp.d
+    phi, beta = qp.feasible.split(qp.feasible.project(np.zeros(len(qp.d))), -qp.d)
+    gaps = np.where((phi == 0.0) & (beta == 0.0), qp.d, 0.0)
+    b = project(-gradient - gaps)
+    b = b + gaps if norm(b) <= FAR_OPEN * norm(gaps) else project(-gradient)
+    # 2. the size of residuals, and its rounding, to which open gaps, however wide, do not count
+    sized = natural or at
+    residual = project(sized.Fx - qp.d)
+    size = norm(residual)
+    if warm and natural is None:
+        size = max(norm(project(qp.d)), norm(project(at.Fx)))
+    phi, beta = qp.feasible.split(qp.feasible.project(sized.x), residual)
+    # P makes of gaps a gradient of rows that nothing closes yet: d is negative there
+    counts = (phi != 0.0) | ((beta != 0.0) & (qp.d > 0.0))
+    rounding = ROUNDING * sum(norm(np.where(counts, x, 0.0)) for x in (qp.d, sized.Fx))
+    return Homogenised(at.x, gradient, b, size, rounding)
 
 
 # --- Stopping rules ---------------------------------------------------------------------------

@@ -70,22 +70,12 @@ class Face:
         """Rows that hold what they multiply, Bu = c: neither open nor slipping; flags."""
         return self.carrying & (self.status != Status.SLIP)
 
-    @property
-    def constrained(self) -> Array:
-        """Rows that some set constrains; flags, shape ``(m,)``."""
-        return np.asarray(self.status != Status.FREE)
-
     @cached_property
     def held(self) -> Array:
         """Rows that no direction moves; flags."""
         held = ~self.free
         held[self.tangent_rows[self.tangents != 0.0]] = False
         return held
-
-    @property
-    def curved(self) -> bool:
-        """True if some row of this rank slips along a boundary."""
-        return bool(np.any(~self.held & (self.status == Status.SLIP)))
 
     @cached_property
     def T(self) -> csr_array:
@@ -142,11 +132,6 @@ class Face:
             return False
         same = np.array_equal(self.status, other.status)
         return same and np.array_equal(self.free, other.free)
-
-
-def without_slip(face: Face, x: Array) -> Array:
-    """x, 0 where rows slip: these follow their boundary, no bound stops them."""
-    return np.where(face.status == Status.SLIP, 0.0, x)
 
 
 def face_of(free: Array, status: Array) -> Face:
@@ -284,7 +269,10 @@ class Product:
         if not found:
             return Face(free, status)
         width = max(tangents.shape[1] for _, tangents, _ in found)
-        tables = [(_widened(rows, width), _widened(t, width), kappa) for rows, t, kappa in found]
+        tables = []
+        for at, tangents, kappa in found:
+            wider = ((0, 0), (0, width - tangents.shape[1]))
+            tables.append((np.pad(at, wider), np.pad(tangents, wider), kappa))
         return Face(free, status, *map(np.concatenate, zip(*tables, strict=True)))
 
     def onto(self, x: Array, status: Array) -> Array:
@@ -300,11 +288,6 @@ def _indices(rows: slice | Array) -> Array:
     if isinstance(rows, slice):
         return np.arange(rows.start or 0, rows.stop, dtype=np.int64)
     return np.asarray(rows, dtype=np.int64)
-
-
-def _widened(table: Array, width: int) -> Array:
-    """Return a table with columns of 0 up to ``width``."""
-    return np.pad(table, ((0, 0), (0, width - table.shape[1])))
 
 
 # --- Ellipses ---------------------------------------------------------------------------------
@@ -337,7 +320,7 @@ class Ellipses:
 
     def project(self, x: Array) -> Array:
         """Return the nearest points of the ellipses."""
-        t = self._points(x)
+        t = x.reshape(self.semi_axes.shape)
         outside = self._level(t) > 1.0
         nearest = np.where(self._moves, t, 0.0)
         if np.any(outside):
@@ -346,9 +329,9 @@ class Ellipses:
 
     def split(self, x: Array, g: Array) -> tuple[Array, Array]:
         """φ = g inside; on the boundary β = g − min(nᵀg, 0)n, n its outward normal."""
-        t = self._points(x)
+        t = x.reshape(self.semi_axes.shape)
         on, normal = self._boundary(t)
-        g = np.where(self._moves, self._points(g), 0.0)
+        g = np.where(self._moves, g.reshape(self.semi_axes.shape), 0.0)
         pushing = np.minimum(np.sum(normal * g, axis=1), 0.0)
         phi = np.where(on[:, None], 0.0, g)
         beta = np.where(on[:, None], g - pushing[:, None] * normal, 0.0)
@@ -356,10 +339,10 @@ class Ellipses:
 
     def max_step(self, x: Array, p: Array) -> float:
         """Largest α with x − αp inside: the smallest root of a quadratic equation for each."""
-        p = self._points(p)
+        p = p.reshape(self.semi_axes.shape)
         if np.any(p[~self._moves]):
             return 0.0
-        t, p = self._points(x) * self._inverse, p * self._inverse
+        t, p = x.reshape(self.semi_axes.shape) * self._inverse, p * self._inverse
         a, b = np.sum(p * p, axis=1), np.sum(p * t, axis=1)
         moves = a > 0.0
         a, b = a[moves], b[moves]
@@ -371,7 +354,7 @@ class Ellipses:
 
     def face(self, x: Array, g: Array) -> Face:
         """Inside all directions are free: it sticks. On the boundary the tangent: it slips."""
-        t = self._points(x)
+        t = x.reshape(self.semi_axes.shape)
         on, normal = self._boundary(t)
         status = np.where(on[:, None], Status.SLIP, Status.STICK)
         status = np.where(self._moves, status, Status.OPEN)
@@ -382,23 +365,20 @@ class Ellipses:
         if not len(along):
             return Face(free, status.ravel())
         n = normal[along]
-        g = np.where(self._moves, self._points(g), 0.0)
+        g = np.where(self._moves, g.reshape(self.semi_axes.shape), 0.0)
         kappa = self._curvature(t, g, normal)[along]
         rows, tangents = 2 * along[:, None] + (0, 1), np.stack((-n[:, 1], n[:, 0]), axis=1)
         return Face(free, status.ravel(), rows, tangents, kappa)
 
     def onto(self, x: Array, status: Array) -> Array:
         """The nearest points of the ellipses; of their boundary, from inside too, for slip."""
-        values = self._points(self.project(x)).copy()
-        t = np.where(self._moves, self._points(x), 0.0)
-        slips = np.any(self._points(status) == Status.SLIP, axis=1)
+        values = self.project(x).reshape(self.semi_axes.shape).copy()
+        t = np.where(self._moves, x.reshape(self.semi_axes.shape), 0.0)
+        slips = np.any(status.reshape(self.semi_axes.shape) == Status.SLIP, axis=1)
         inward = slips & (self._level(t) < 1.0) & np.any(t != 0.0, axis=1)
         if np.any(inward):
             values[inward] = self._nearest(t[inward], inward)
         return np.asarray(values.ravel())
-
-    def _points(self, x: Array) -> Array:
-        return np.asarray(x).reshape(self.semi_axes.shape)
 
     def _level(self, t: Array) -> Array:
         """‖t/a‖, 1 on the boundary; entries that are fixed do not count."""

@@ -9,17 +9,19 @@ import numpy as np
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import norm_over
 from tfeti_dolfinx.common.validation import ABOVE_0, Range, described
-from tfeti_dolfinx.qp.homogenised import Homogenised, operator_product
 from tfeti_dolfinx.qp.mprgp import MprgpIterate, MprgpParameters, mprgp
 from tfeti_dolfinx.qp.problem import (
     QP,
+    STRANGE,
     ConvergedReason,
+    Homogenised,
     Monitor,
     QPResult,
     Start,
     Steps,
     StoppingRule,
     no_monitor,
+    operator_product,
 )
 
 
@@ -95,24 +97,21 @@ class InnerTest:
 
     def __call__(self, state: MprgpIterate) -> bool:
         """Return whether the inner loop may end. Collective."""
-        equality, gradient = self._equality_at(state), state.projected_gradient
+        equality = self._qp.coarse.norm_Q(state.x - self._homogenised.lam_bar)
+        gradient = state.projected_gradient
         if max(gradient, self._qp.norm * equality) <= self._rule.tolerance:
-            self.examine(state)
+            self.examine(state, equality)
         if self.reason != ConvergedReason.ITERATING or self._rule.drifted:
             return True
         wanted = max(self.M * equality, self._parameters.enough * self._rule.tolerance)
         return gradient <= min(wanted, self._eta)
 
-    def examine(self, state: MprgpIterate) -> float:
-        """Apply the stopping rule, and return the residual. Collective."""
-        residual = max(state.projected_gradient, self._qp.norm * self._equality_at(state))
+    def examine(self, state: MprgpIterate, equality: float) -> float:
+        """Apply the stopping rule, given ‖Q(λ − λ̄)‖; return the residual. Collective."""
+        residual = max(state.projected_gradient, self._qp.norm * equality)
         face = state.feasible.face(state.x, state.g)
         self.reason = self._rule.examine(state.x, state.g, face, residual)
         return residual
-
-    def _equality_at(self, state: MprgpIterate) -> float:
-        """‖Q(λ − λ̄)‖."""
-        return self._qp.coarse.norm_Q(state.x - self._homogenised.lam_bar)
 
     def update(self, lagrangian: float, equality: float) -> None:
         """Step 4: M after an outer step, from L(x, μ) before the multipliers' update and ‖Bx‖."""
@@ -158,8 +157,7 @@ def smalse(
     >>> import numpy as np
     >>> from tfeti_dolfinx.qp.coarse import DenseCoarse
     >>> from tfeti_dolfinx.qp.sets import Bounds
-    >>> from tfeti_dolfinx.qp.homogenised import homogenise
-    >>> from tfeti_dolfinx.qp.problem import StoppingRule
+    >>> from tfeti_dolfinx.qp.problem import StoppingRule, homogenise
     >>> F, d = np.diag([1.0, 2.0, 4.0]).__matmul__, np.array([1.0, -1.0, 2.0])
     >>> qp = QP(F, d, DenseCoarse(np.ones((1, 3)), np.ones(1)), Bounds(), norm=4.0)
     >>> result = smalse(qp, homogenise(qp), StoppingRule(1e-10))
@@ -193,7 +191,7 @@ def smalse(
         equality = norm_over(qp.comm, Qx)
         monitor(steps, "outer", state.x, state.projected_gradient, equality)
         indefinite = broken == ConvergedReason.DIVERGED_INDEFINITE_MAT  # or rounding
-        if indefinite and homogenised.is_rounding(test.examine(state)):
+        if indefinite and test.examine(state, equality) <= STRANGE * homogenised.rounding:
             broken = ConvergedReason.DIVERGED_ROUNDING
         reason = test.reason or broken or ConvergedReason.ITERATING
         if reason != ConvergedReason.ITERATING:
@@ -225,7 +223,7 @@ def smalse(
         reason=reason,
         projected_gradient=state.projected_gradient,
         equality=equality,
-        reference=homogenised.scale.reference,
+        reference=homogenised.reference,
         norm=norm,
         steps=steps,
     )

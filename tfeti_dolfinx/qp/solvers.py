@@ -7,10 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.qp.homogenised import restored
 from tfeti_dolfinx.qp.krylov import PcpgParameters, solve_by_pcpg
-from tfeti_dolfinx.qp.newton import feasible_start, first_point, newton
-from tfeti_dolfinx.qp.newton_faces import NewtonParameters
+from tfeti_dolfinx.qp.newton import NewtonParameters, feasible_start, first_point, newton
 from tfeti_dolfinx.qp.problem import QP, QPResult, Start
 from tfeti_dolfinx.qp.smalse import SmalseParameters, smalse
 
@@ -23,8 +21,7 @@ class Solver:
         solve: Solves a program from its homogenised form, with a stopping rule and ``parameters``;
             by name ``max_it``, ``start`` and ``monitor``, as ``newton`` does.
         parameters: Its parameters, where options have none of the solver's name.
-        keeps_bounds: Whether it keeps inequalities.
-        keeps_discs: Whether it keeps discs and ellipses.
+        keeps_sets: Whether it keeps inequalities and friction.
         pc_type: Preconditioner that ``auto`` stands for.
         relative_to_norm: Whether its steps are relative to ‖PFP‖.
         cold: Where it starts, which is its λ̄; None: λ̄₀ = Gᵀ(GGᵀ)⁻¹e.
@@ -33,8 +30,7 @@ class Solver:
 
     solve: Callable[..., QPResult]
     parameters: Any
-    keeps_bounds: bool
-    keeps_discs: bool
+    keeps_sets: bool
     pc_type: str
     relative_to_norm: bool
     cold: Callable[[QP], Array] | None = None
@@ -45,25 +41,23 @@ SOLVERS = {
     "pcpg": Solver(
         solve_by_pcpg,
         PcpgParameters(),
-        keeps_bounds=False,
-        keeps_discs=False,
+        keeps_sets=False,
         pc_type="dirichlet",
         relative_to_norm=False,
-        warm=restored,
+        # the nearest solution of Gλ̄ = e: λ + Gᵀ(GGᵀ)⁻¹(e − Gλ)
+        warm=lambda qp, start: qp.coarse.project(start.lam) + qp.coarse.particular(),
     ),
     "smalse": Solver(
         smalse,
         SmalseParameters(),
-        keeps_bounds=True,
-        keeps_discs=True,
+        keeps_sets=True,
         pc_type="none",
         relative_to_norm=True,
     ),
     "newton": Solver(
         newton,
         NewtonParameters(),
-        keeps_bounds=True,
-        keeps_discs=True,
+        keeps_sets=True,
         pc_type="dirichlet",
         relative_to_norm=False,
         cold=first_point,

@@ -53,7 +53,6 @@ class CoulombParameters:
         patience: Problems in a row whose change is not half of the least one before, and bounds do
             not come to rest.
         shortest: Of a step towards the forces found: bounds never take less of it.
-        falls: Problems in a row whose forces are less than half of their bounds: these fall to 0.
         no_force: Of all multipliers: forces of normals that rounding makes of none. As bounds they
             would be discs that bend so much that nothing else is seen beside them.
         light: Of the largest forces of normals on a body: those of a lighter one count as so large.
@@ -71,7 +70,6 @@ class CoulombParameters:
     with_target: float = 0.1
     patience: int = 12
     shortest: float = 0.125
-    falls: int = 2
     no_force: float = 1e-13
     light: float = 1e-6
     rounding: float = 2e-16
@@ -207,7 +205,7 @@ class FrictionBounds:
             self.now = np.maximum(start[0][self._rows], 0.0) if lost else known
         self.before, self._found = self.now, self.now
         self._none, self._best, self._length = 0.0, np.inf, 1.0
-        self.idle, self.body, self._falls = 0, -1, 0
+        self.idle, self.body = 0, -1
         self._solved: list[tuple[Array, Array]] = []
 
     def _stick(self) -> None:
@@ -216,7 +214,7 @@ class FrictionBounds:
     @property
     def stick(self) -> bool:
         """True if no bound is set yet, so that all points stick."""
-        return any_rank(self._comm, bool(np.any(np.isinf(self.now))))
+        return any_rank(self._comm, np.isinf(self.now))
 
     def hold(self) -> bool:
         """Set the present bounds, else let all stick, once; return whether that holds the load."""
@@ -264,7 +262,6 @@ class FrictionBounds:
         change = float(miss[self.body] / size[self.body])
         self.idle += 1
         self._length = self._relaxation()
-        self._falls = self._falls + 1 if change > 1.0 else 0
         if change <= 0.5 * self._best:
             self._best, self.idle = change, 0
         return change
@@ -278,7 +275,7 @@ class FrictionBounds:
         if len(self._solved) < 2:
             return 1.0
         (first, of_first), (now, found) = self._solved
-        if any_rank(self._comm, bool(np.any(np.isinf(first)))):  # all stuck
+        if any_rank(self._comm, np.isinf(first)):  # all stuck
             return 1.0
         way, turn = now - first, (found - now) - (of_first - first)
         along, size = summed(self._comm, np.array([-(way @ turn), turn @ turn]))
@@ -298,14 +295,7 @@ class FrictionBounds:
         return fits
 
     def advance(self) -> None:
-        """Go towards the forces that were found, all of the way unless that has led away.
-
-        Forces that fall to less than half again and again, as where slips of earlier steps alone
-        drive, make a geometric series: of its bounds the limit 0 is tried.
-        """
-        if self._falls == self._parameters.falls and not self.stick:
-            self.now = np.zeros_like(self._found)
-            return
+        """Go towards the forces that were found, all of the way unless that has led away."""
         whole = self.stick or self._length == 1.0
         self.now = self._found if whole else self.now + self._length * (self._found - self.now)
 
@@ -335,7 +325,9 @@ class NewtonOnLaw:
         self.tries = parameters.tries if options.friction_type == "newton" else 0
         self.steps, self._share = 0, 1.0
         self.recycled = dual.recycled
-        self._rests = dual.last.is_of(dual.coarse.comm, dual.d, dual.coarse.e)
+        pairs = (dual.last.d, dual.d), (dual.last.e, dual.coarse.e)
+        other = not all(np.array_equal(kept, now) for kept, now in pairs)
+        self._rests = not any_rank(dual.coarse.comm, other)
 
     def solve(
         self, start: tuple[Array, Array] | None, bounds: FrictionBounds, aim: float = np.inf
@@ -386,7 +378,8 @@ class NewtonOnLaw:
             return None
         # F of the end stands for that of the nearest point of its set, where the problem begins
         Fx = end.s + qp.coarse.combined(end.mu) + qp.d
-        dual.last.pass_on(end.lam, Fx, parameters.newton.unseen * target / norm)
+        dual.last.x, dual.last.Fx = end.lam, Fx
+        dual.last.within = parameters.newton.unseen * target / norm
         # the bounds of multipliers for which the law holds
         bounds.before, bounds.now = bounds.now, bounds.forces_of(end.lam)
         dual.bound_friction(bounds.now)

@@ -15,23 +15,20 @@ from tfeti_dolfinx.errors import ConvergenceError, InputError
 from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.stopping import Accuracy, ErrorTarget
 from tfeti_dolfinx.options import Options
-from tfeti_dolfinx.qp.homogenised import (
-    Homogenised,
-    OperatorProduct,
-    homogenise,
-    operator_product,
-    scale_at,
-    scale_near,
-)
 from tfeti_dolfinx.qp.problem import (
     QP,
     ConvergedReason,
+    Homogenised,
     Monitor,
+    OperatorProduct,
     PrintMonitor,
     QPResult,
     Start,
+    homogenise,
     no_monitor,
+    operator_product,
 )
+from tfeti_dolfinx.qp.sets import Status
 from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver
 
 
@@ -77,16 +74,14 @@ def resolved(options: Options, rows: Sequence[int], prefix: str) -> Options:
     qp_type, (num_inequalities, num_tangents) = options.qp_type, rows
     if qp_type == "auto":
         qp_type = AUTO[num_inequalities + num_tangents > 0]
-    for count, keeps, rows_of in (
-        (num_tangents, "keeps_discs", f"friction, {num_tangents} tangential rows,"),
-        (num_inequalities, "keeps_bounds", f"{num_inequalities} contact rows,"),
-    ):
-        if count and not getattr(SOLVERS[qp_type], keeps):
-            able = [name for name, solver in SOLVERS.items() if getattr(solver, keeps)]
-            raise InputError(
-                f"-{prefix}qp_type {qp_type}: the scene has {rows_of} which {qp_type.upper()} "
-                f"cannot keep; expected {' or '.join(['auto', *able])}"
-            )
+    if num_inequalities + num_tangents > 0 and not SOLVERS[qp_type].keeps_sets:
+        able = ["auto", *(name for name, solver in SOLVERS.items() if solver.keeps_sets)]
+        tangential = f"friction, {num_tangents} tangential rows,"
+        rows_of = tangential if num_tangents else f"{num_inequalities} contact rows,"
+        raise InputError(
+            f"-{prefix}qp_type {qp_type}: the scene has {rows_of} which {qp_type.upper()} "
+            f"cannot keep; expected {' or '.join(able)}"
+        )
     own = SOLVERS[qp_type].pc_type
     if own == "none" and options.pc_type not in ("auto", "none"):
         raise InputError(
@@ -135,9 +130,9 @@ def solve_dual(
     homogenised = _homogenise(dual, qp, solver, begin)
     if monitor is None:
         monitor = _monitor(dual, options)
-    scale = homogenised.scale
     rtol = options.number if rtol is None else rtol
-    rule = Accuracy(dual, rtol, options.atol, (scale.reference, scale.rounding), qp.norm)
+    scale = homogenised.reference, homogenised.rounding
+    rule = Accuracy(dual, rtol, options.atol, scale, qp.norm)
     rule.goal = goal
     parameters = getattr(options, qp_type, solver.parameters)
     result = solver.solve(
@@ -155,7 +150,7 @@ def solve_dual(
 
 def _start(values: tuple[Array, Array] | None, qp: QP) -> Start | None:
     """Return the solver's start, none from 0; μ is None if the given one is of another kernel."""
-    if values is None or not any_rank(qp.comm, bool(np.any(values[0]))):
+    if values is None or not any_rank(qp.comm, values[0]):
         return None
     lam, mu = values
     return Start(lam, np.array(mu) if len(mu) == qp.coarse.dimension else None)
@@ -174,8 +169,7 @@ def _homogenise(dual: Dual, qp: QP, solver: Solver, start: Start | None) -> Homo
             at = OperatorProduct(zero, zero)
             if start.mu is not None:
                 start.mu[:] = 0.0
-        known = dual.known_image()
-        return homogenise(qp, at, scale_at(qp, known) if known else scale_near(qp, at))
+        return homogenise(qp, at, dual.known_image(), warm=True)
     if solver.cold is not None:
         return homogenise(qp, operator_product(qp.F, qp.comm, solver.cold(qp)))
     return homogenise(qp, dual.natural_image())
@@ -187,7 +181,7 @@ def _monitor(dual: Dual, options: Options) -> Monitor:
 
     def touching(x: Array) -> int:
         face = dual.feasible.face(x, np.zeros(len(x)))
-        return int(np.sum(face.constrained & face.carrying))
+        return int(np.sum((face.status != Status.FREE) & face.carrying))
 
     return PrintMonitor(dual.coarse.comm, touching, lambda: dual.F.count["solver"])
 
