@@ -85,8 +85,8 @@ def test_it_solves_the_law(seed, k, r):
     assert np.allclose(end.s, s, rtol=0, atol=1e-11)
     assert np.allclose(G @ end.lam, e, rtol=0, atol=1e-11)
     for norm in (0.3, 3.0, 21.0):  # its zeros do not depend on the step
-        assert replace(whole, norm=norm).residual(LawPoint(end.lam, s, end.mu)) <= 1e-8
-    _, near = law.nearest(end.lam)
+        assert replace(whole, norm=norm).natural_map(LawPoint(end.lam, s, end.mu))[2] <= 1e-8
+    near = law.at(np.maximum(end.lam[law.normals], 0.0)).project(end.lam)
     assert np.allclose(near, end.lam, rtol=0, atol=1e-9)
 
 

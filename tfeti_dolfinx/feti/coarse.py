@@ -61,7 +61,7 @@ class CoarseSpace(Coarse):
         free_basis: An orthonormal basis of them, scipy CSR, shape ``(bodies * k, c)``.
         null: Orthonormal basis of null(Gᵀ), scipy CSR, shape ``(r, c)``.
         grams: GGᵀ, and those of faces.
-        factors: Makes the factors of faces, and counts them apart from that of GGᵀ.
+        factors: Makes the factors of faces, and counts them apart from that of GGᵀ, ``factor``.
     """
 
     def __init__(
@@ -96,8 +96,8 @@ class CoarseSpace(Coarse):
         self.null = bcast_from_root(comm, orthonormal_columns(self.motions @ both))
         self.grams = Grams(Gt, np.flatnonzero(~equalities), comm)
         self.factors = FaceFactors(comm, self.null, prefix)
-        factor = self.factors.factor(self.grams.whole, "whole")
-        super().__init__(comm, Gt, np.zeros(0), factor)
+        self.factor = self.factors.factor(self.grams.whole, "whole")
+        super().__init__(comm, Gt, np.zeros(0), self.factor.solve)
         self.e = self._load()
         self._on_face: Coarse | None = None
         self._damped: tuple[Face, float, SemidefiniteFactor] | None = None
@@ -138,7 +138,7 @@ class CoarseSpace(Coarse):
         if known is None or known.face is None or self._differs(known.face, face):
             self._on_face = None
             factor = self.factors.factor(self.grams.of_face(face))
-            known = self._on_face = Coarse(self.comm, self.Gt, self.e, factor, face)
+            known = self._on_face = Coarse(self.comm, self.Gt, self.e, factor.solve, face)
             known.own, known.moduli = self.own, self.moduli
         known.e = self.e
         return known

@@ -391,6 +391,6 @@ class Dual:
         """Destroy the PETSc objects."""
         last = None if self._on_last is None else self._on_last[1]
         own = (last, self._on_all, self._on_faces, self.soft, self.preconditioner, self._scaled)
-        for item in (self.F, *own, self.coarse):
+        for item in (self.F, *own):
             if item is not None:
                 item.destroy()

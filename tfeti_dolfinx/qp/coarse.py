@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from mpi4py import MPI
@@ -35,14 +35,21 @@ class Coarse:
         comm: Communicator.
         Gt: This rank's rows of Gᵀ, scipy CSR, shape ``(m_local, r)``.
         e: Right side, replicated, shape ``(r,)``.
-        factor: (G_fG_fᵀ)⁺, with ``solve`` of a replicated vector and ``destroy``.
+        solve: (G_fG_fᵀ)⁺y for a replicated y in the range of G, orthogonal to the free motions.
+        dimension: Number r of equations.
         face: The face; None: all rows.
     """
 
     def __init__(
-        self, comm: MPI.Intracomm, Gt: csr_array, e: Array, factor: Any, face: Face | None = None
+        self,
+        comm: MPI.Intracomm,
+        Gt: csr_array,
+        e: Array,
+        solve: Callable[[Array], Array],
+        face: Face | None = None,
     ) -> None:
-        self.comm, self.Gt, self.e, self.factor, self.face = comm, Gt, e, factor, face
+        self.comm, self.Gt, self.e, self.solve, self.face = comm, Gt, e, solve, face
+        self.dimension = int(Gt.shape[1])
 
     def on_face(self, face: Face) -> Coarse:
         """Return the constraint of all rows on a face of them."""
@@ -51,11 +58,6 @@ class Coarse:
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
         """(G_f G_fᵀ + damping·GGᵀ)⁻¹y, f a face of all rows."""
         raise NotImplementedError
-
-    @cached_property
-    def dimension(self) -> int:
-        """Number r of equations."""
-        return int(self.Gt.shape[1])
 
     @cached_property
     def own(self) -> csc_array:
@@ -84,10 +86,6 @@ class Coarse:
         if not self.dimension:
             return NOTHING
         return summed(self.comm, self.moduli @ np.abs(self.restricted(x)))
-
-    def solve(self, y: Array) -> Array:
-        """(G_fG_fᵀ)⁺y for y in the range of G, orthogonal to the free motions."""
-        return np.asarray(self.factor.solve(y))
 
     def coordinates(self, x: Array) -> Array:
         """(G_fG_fᵀ)⁺G_fZᵀx, replicated."""
@@ -135,10 +133,6 @@ class Coarse:
         """Z G_fᵀ(G_fG_fᵀ)⁺e, the smallest solution of Gλ = e in the face, if it has one."""
         return self.combined(self.solve(self.e))
 
-    def destroy(self) -> None:
-        """Free the factor."""
-        self.factor.destroy()
-
 
 def imbalance(coarse: Coarse, x: Array) -> float:
     """Return the largest entry of Gx − e over the size of its terms, at most 1. Collective."""
@@ -159,24 +153,16 @@ class DenseCoarse(Coarse):
     """
 
     def __init__(self, G: Array, e: Array) -> None:
-        super().__init__(MPI.COMM_SELF, csr_array(G.T), e, DensePinv(G @ G.T))
+        inverse = np.linalg.pinv(G @ G.T, hermitian=True)
+        super().__init__(MPI.COMM_SELF, csr_array(G.T), e, inverse.__matmul__)
 
     def damped_solve(self, face: Face, y: Array, damping: float) -> Array:
         """(G_f G_fᵀ + damping·GGᵀ)⁺y."""
         G_f = face.restricted(Gt := self.Gt.toarray())
-        return DensePinv(Gt.T @ G_f + damping * Gt.T @ Gt).solve(y)
+        return np.linalg.pinv(Gt.T @ G_f + damping * Gt.T @ Gt, hermitian=True) @ y
 
     def on_face(self, face: Face) -> Coarse:
         """Return the same G on a face."""
         G_f = face.restricted(self.Gt.toarray())
-        return Coarse(self.comm, self.Gt, self.e, DensePinv(G_f.T @ G_f), face)
-
-
-class DensePinv:
-    """A⁺ of a dense positive semidefinite A."""
-
-    def __init__(self, A: Array) -> None:
-        self.solve = np.linalg.pinv(A, hermitian=True).__matmul__
-
-    def destroy(self) -> None:
-        """Nothing to free."""
+        inverse = np.linalg.pinv(G_f.T @ G_f, hermitian=True)
+        return Coarse(self.comm, self.Gt, self.e, inverse.__matmul__, face)

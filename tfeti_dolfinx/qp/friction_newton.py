@@ -77,18 +77,11 @@ class Law:
         at: Makes Ω of the λ_N of all points, shape ``(p,)``.
         normals: Row of λ_N of each point, shape ``(p,)``.
         tangents: Rows of its λ_T, shape ``(p, k)``.
-        share: Of all coefficients of friction: Ω(share λ_N) is the set.
     """
 
     at: Callable[[Array], FeasibleSet]
     normals: Array
     tangents: Array
-    share: float = 1.0
-
-    def nearest(self, y: Array) -> tuple[FeasibleSet, Array]:
-        """Ω(y_N⁺), and the nearest point to y in it."""
-        feasible = self.at(self.share * np.maximum(y[self.normals], 0.0))
-        return feasible, feasible.project(y)
 
     def following(self, p: Array, face: Face) -> csr_array:
         """C: where points slip λ_T follows λ_N, λ_T = Cλ with the direction of p. Shape ``(m, m)``.
@@ -130,26 +123,26 @@ class LawProgram:
         oblique: Makes the projectors of a face and of C, what follows it: P of λ = (I + C)u with
             ``coordinates``, ``project`` and ``restoring`` as in ``ObliqueProjectors``.
         norm: ‖F‖, or an estimate.
+        share: Of all coefficients of friction: Ω(share λ_N) is the set; 0: contact without any.
     """
 
     qp: QP
     law: Law
     oblique: Callable[[Face, csr_array], Any]
     norm: float
+    share: float = 1.0
 
-    def with_share(self, share: float) -> LawProgram:
-        """Return it with this share of all coefficients; 0 is contact without friction."""
-        return replace(self, law=replace(self.law, share=share))
+    def natural_map(self, at: LawPoint) -> tuple[FeasibleSet, Array, float]:
+        """Return Ω(y_N⁺), p = P(y), and ‖F‖ times what λ misses of the law and of Gλ = e.
 
-    def missed(self, p: Array, lam: Array) -> float:
-        """‖F‖ √(‖λ − p‖² + ‖Gᵀ(GGᵀ)⁻¹(e − Gλ)‖²), the same on all ranks."""
-        coarse = self.qp.coarse
-        balancing = coarse.combined(coarse.solve(coarse.residual(lam)))
-        return self.norm * norm_over(coarse.comm, np.concatenate((p - lam, balancing)))
-
-    def residual(self, at: LawPoint) -> float:
-        """‖F‖ times what λ misses of the law and of Gλ = e, the same on all ranks."""
-        return self.missed(self.law.nearest(at.lam - at.s / self.norm)[1], at.lam)
+        That is ‖F‖ √(‖λ − p‖² + ‖Gᵀ(GGᵀ)⁻¹(e − Gλ)‖²), the same on all ranks.
+        """
+        coarse, y = self.qp.coarse, at.lam - at.s / self.norm
+        feasible = self.law.at(self.share * np.maximum(y[self.law.normals], 0.0))
+        p = feasible.project(y)
+        balancing = coarse.combined(coarse.solve(coarse.residual(at.lam)))
+        missed = norm_over(coarse.comm, np.concatenate((p - at.lam, balancing)))
+        return feasible, p, self.norm * missed
 
 
 # --- Newton's method --------------------------------------------------------------------------
@@ -174,8 +167,7 @@ def newton_on_law(
     best, idle, past = np.inf, 0, list[float]()
     for step in range(parameters.max_steps):
         # Step 1: the natural map: what a gradient step, brought back, moves, and what Gλ lacks
-        feasible, p = program.law.nearest(at.lam - at.s / program.norm)
-        residual = program.missed(p, at.lam)
+        feasible, p, residual = program.natural_map(at)
         if residual <= target:
             return at, step
         idle = 0 if residual < parameters.progress * best else idle + 1
@@ -197,7 +189,7 @@ def newton_on_law(
         # Step 4: halve the step until its residual is none of the largest; F is known on all of it
         past = [*past[1 - parameters.memory :], residual]
         part, there = 1.0, end
-        while not program.residual(there) <= max(past):
+        while not program.natural_map(there)[2] <= max(past):
             part *= 0.5
             if part <= parameters.shortest:
                 there = end
@@ -239,7 +231,7 @@ def follow_friction(
     if whole is not None:
         return whole, steps
     # Step 2: without friction
-    point, taken = newton_on_law(program.with_share(0.0), at, loose, exact)
+    point, taken = newton_on_law(replace(program, share=0.0), at, loose, exact)
     steps += taken
     # Step 3: all of it at once, or less
     share, length = 0.0, 1.0
@@ -248,7 +240,7 @@ def follow_friction(
             break
         new = min(share + length, 1.0)
         goal = target if new == 1.0 else loose
-        end, taken = newton_on_law(program.with_share(new), point, goal, short)
+        end, taken = newton_on_law(replace(program, share=new), point, goal, short)
         steps += taken
         if end is None:
             length *= 0.25

@@ -129,25 +129,33 @@ class Directions:
 # --- Detection of stagnation ------------------------------------------------------------------
 
 
+@dataclass
 class Progress:
-    """Tells when neither residuals, from ‖r‖ = ``norm`` on, nor q have decreased for long."""
+    """Tells when neither residuals nor q have decreased for long.
 
-    def __init__(self, norm: float, rows: int) -> None:
-        self._most = min(DEFAULT.plateau, 2 * rows + DEFAULT.few)
-        self._best, self._steps, self._gain = norm, 0, 0.0
+    Attributes:
+        best: The last ‖r‖ that was half of the one before.
+        most: Steps since then that are long.
+        steps: Steps since then, and gain how much lower q is.
+    """
+
+    best: float
+    most: int
+    steps: int = 0
+    gain: float = 0.0
 
     def step(self, norm: float, gain: float) -> None:
         """Record a step that lowers q by ``gain`` and ends with ‖r‖ = ``norm``."""
-        self._steps, self._gain = self._steps + 1, self._gain + gain
-        if norm <= 0.5 * self._best:
-            self._best, self._steps, self._gain = norm, 0, 0.0
+        self.steps, self.gain = self.steps + 1, self.gain + gain
+        if norm <= 0.5 * self.best:
+            self.best, self.steps, self.gain = norm, 0, 0.0
 
     def stagnates(self, qp: QP, point: Point) -> bool:
         """Return whether nothing has decreased for long. Collective if many steps were made."""
-        if self._steps < self._most:
+        if self.steps < self.most:
             return False
         work, load = qp.dot((point.lam, point.g), (point.lam, qp.d))
-        gain, self._steps, self._gain = self._gain, 0, 0.0
+        gain, self.steps, self.gain = self.gain, 0, 0.0
         return bcast_from_root(qp.comm, gain <= DEFAULT.rounding * (abs(work) + abs(load)))
 
 
@@ -187,7 +195,8 @@ def pcpg(
     recycled, (past, norm) = qp.recycled, _begun(qp, point, own)
     new = list[tuple[Array, Array, float]]()  # the past stays as it is during a solve
     least = DEFAULT.short**2 * qp.dot((point.lam, point.lam))[0]
-    progress = Progress(norm, int(summed(comm, np.array([len(qp.d)]))[0]))
+    rows = int(summed(comm, np.array([len(qp.d)]))[0])
+    progress = Progress(norm, min(DEFAULT.plateau, 2 * rows + DEFAULT.few))
     while True:
         # test
         small = norm <= rule.tolerance

@@ -174,6 +174,8 @@ class NewtonState:
         mu: Multipliers μ of Gλ = e, replicated.
         s: Multipliers of Ω, Fλ − d − Gᵀμ: 0 where λ is free, if it is optimal.
         back: λ̂, the nearest feasible point to λ − ᾱs.
+        pressed: The face of λ̂: a row that carries less than it is open by, λ_i < ᾱs_i, is open.
+            Where forces are rounding of 0 they do not say which rows touch.
         residual: ‖g^P‖, g^P = (λ − λ̂)/ᾱ.
         norm: Estimate of ‖F‖; ᾱ is its inverse.
         rounding: What rounding may make of ‖g^P‖ alone.
@@ -186,6 +188,7 @@ class NewtonState:
     mu: Array
     s: Array
     back: Array
+    pressed: Face
     residual: float = np.inf
     norm: float = 1.0
     rounding: float = 0.0
@@ -225,6 +228,7 @@ class _Newton:
         found = project_onto_feasible(self.coarse, self.feasible, wanted)
         state.back, state.mu = found.lam, state.mu + state.norm * found.alpha
         state.s = state.z.g - normal(state.mu)
+        state.pressed = self.feasible.face(state.back, state.s)
         moved = state.z.lam - state.back
         square, size = qp.dot((moved, moved), (state.z.lam, state.z.lam))
         state.residual = state.norm * np.sqrt(square)
@@ -239,7 +243,7 @@ class _Newton:
         if state.residual > max(rule.tolerance, state.rounding):
             return ConvergedReason.ITERATING
         rule.norm = state.norm
-        return rule.examine(state.z.lam, state.s, self.pressed_face(), state.residual)
+        return rule.examine(state.z.lam, state.s, state.pressed, state.residual)
 
     def _learn_norm(self) -> None:
         """Take Rayleigh quotients of F at λ, which alone may be far below ‖F‖, and at Ps."""
@@ -250,13 +254,6 @@ class _Newton:
         if pp > self.parameters.short**2 * gg:
             (curvature,) = qp.dot((p, qp.F(p)))
             self.solver.directions.seen(curvature, pp)
-
-    def pressed_face(self) -> Face:
-        """Return the face of λ̂: a row that carries less than it is open by, λ_i < ᾱs_i, is open.
-
-        Where forces are rounding of 0 they do not say which rows touch.
-        """
-        return self.feasible.face(self.state.back, self.state.s)
 
     def wanted_face(self) -> tuple[Point, Face]:
         """Step 2: start and face of the next solve.
@@ -279,14 +276,14 @@ class _Newton:
         if chopped > self.parameters.gamma**2 * free:
             moved = self.feasible.project(z.lam - beta / state.norm)
             face = self.feasible.face(0.5 * (z.lam + moved), state.s)
-        pressed = self.pressed_face()
+        pressed = state.pressed
         early = (face.status == Status.STICK) & (pressed.status == Status.SLIP)
         if any_rank(self.qp.comm, np.isin(face.status, RUBS)):
             early |= (face.status == Status.TOUCHING) & (pressed.status == Status.OPEN)
         if not any_rank(self.qp.comm, early):
             return z, face
         state.resume = False
-        return self.qp.moved(z, state.back), pressed
+        return Point(state.back, z.g + self.qp.F(state.back - z.lam)), pressed
 
     def gain(self, to: Point) -> float:
         """Return q(λ) − q(to), without terms that Gλ = e makes constant."""
@@ -401,7 +398,8 @@ class FaceSolver:
             assert self._face is not None
             boundary = WithinFace(self._qp.feasible, self._face, slipping=True)
             found = project_onto_feasible(self._qp.coarse, boundary, end.lam)
-            end, out = self._qp.moved(end, found.lam), found.missing > HELD
+            g = end.g + self._qp.F(found.lam - end.lam)
+            end, out = Point(found.lam, g), found.missing > HELD
         return end, not out
 
     def _enter(self, face: Face) -> bool:
@@ -571,10 +569,11 @@ def newton(
     mu = np.zeros(qp.coarse.dimension) if start is None else start.mu
     if mu is None:
         mu = multipliers_at(qp, z)
-    state = NewtonState(z, mu, z.g, z.lam)
+    face = qp.feasible.face(z.lam, z.g)
+    state = NewtonState(z, mu, z.g, z.lam, face)
     method = _Newton(qp, solver, parameters, state)
     monitor(steps, "start", homogenised.lam_bar, norm_over(qp.comm, homogenised.b), 0.0)
-    friction = any_rank(qp.comm, np.isin(qp.feasible.face(z.lam, z.g).status, RUBS))
+    friction = any_rank(qp.comm, np.isin(face.status, RUBS))
     reason = ConvergedReason.ITERATING
     if friction and imbalance(qp.coarse, homogenised.lam_bar) > UNBALANCED:
         # no point of Ω balances the load; without friction that is known before
@@ -612,7 +611,7 @@ def newton(
         lam=state.z.lam,
         mu=state.mu,
         gradient=state.s,
-        face=method.pressed_face(),
+        face=state.pressed,
         reason=reason,
         projected_gradient=state.residual,
         equality=qp.coarse.norm_Q(state.z.lam - homogenised.lam_bar),

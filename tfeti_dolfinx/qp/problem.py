@@ -96,10 +96,6 @@ class QP:
         """Return multipliers with their gradient: one multiplication by F. Collective."""
         return Point(lam, self.F(lam) - self.d)
 
-    def moved(self, z: Point, lam: Array) -> Point:
-        """Return other multipliers, their gradient from that of z: one multiplication by F."""
-        return Point(lam, z.g + self.F(lam - z.lam))
-
 
 class ConvergedReason(IntEnum):
     """Reasons of a solver to stop; positive: converged. Values as in KSPConvergedReason, if there.
@@ -316,14 +312,12 @@ def homogenise(
 # --- Stopping rules ---------------------------------------------------------------------------
 
 
+@dataclass
 class StoppingRule:
     """Stopping rule for the residuals of an iterate; this one is content with small residuals.
 
     A solver compares max(‖g^P‖, ‖F‖‖Qx‖) with ``tolerance`` in every step. Where it is small
     enough, the iterate is examined; an examination that is not content lowers the tolerance.
-
-    Args:
-        tolerance: What residuals must come down to.
 
     Attributes:
         tolerance: Norm of the residuals from which on an examination is worth its price.
@@ -333,8 +327,9 @@ class StoppingRule:
             learns it on its way says so here.
     """
 
-    def __init__(self, tolerance: float) -> None:
-        self.tolerance, self.drifted, self.norm = tolerance, False, 1.0
+    tolerance: float
+    drifted: bool = False
+    norm: float = 1.0
 
     @property
     def aim(self) -> float:

@@ -177,15 +177,15 @@ class FeasibleSet(Protocol):
         ...
 
 
+@dataclass(frozen=True)
 class Bounds:
     """x_i ≥ l_i.
 
-    Args:
+    Attributes:
         lower: The bounds l, shape ``(n,)``, or one for all entries.
     """
 
-    def __init__(self, lower: Array | float = 0.0) -> None:
-        self.lower = lower
+    lower: Array | float = 0.0
 
     def project(self, x: Array) -> Array:
         """max(x, l)."""

@@ -196,10 +196,9 @@ class FrictionBounds:
         at = constraints.pressed
         self._rows = constraints.pressed_by[at]
         self._mu = np.linalg.norm(constraints.coefficients[at], axis=1)
-        self._stuck, self._slipped = False, False
-        if start is None:
-            self._stick()
-        else:
+        self._stuck, self._slipped = start is None, False
+        self.now: Array = np.full(len(self._rows), np.inf)
+        if start is not None:
             known = dual.pressures[at]
             lost = any_rank(self._comm, not np.all(np.isfinite(known)))
             self.now = np.maximum(start[0][self._rows], 0.0) if lost else known
@@ -207,9 +206,6 @@ class FrictionBounds:
         self._none, self._best, self._length = 0.0, np.inf, 1.0
         self.idle, self.body = 0, -1
         self._solved: list[tuple[Array, Array]] = []
-
-    def _stick(self) -> None:
-        self.now, self._stuck = np.full(len(self._rows), np.inf), True
 
     @property
     def stick(self) -> bool:
@@ -227,7 +223,7 @@ class FrictionBounds:
         self.body = sliding
         if self._stuck:
             return False
-        self._stick()
+        self.now, self._stuck = np.full(len(self._rows), np.inf), True
         self._dual.bound_friction(self.now)
         return True
 
@@ -359,7 +355,9 @@ class NewtonOnLaw:
             LawPoint(z.lam, z.g - qp.coarse.combined(mu), mu)
             for mu in (known, qp.coarse.coordinates(z.g))
         ]
-        residual, first = min(((program.residual(p), p) for p in points), key=lambda one: one[0])
+        residuals = [program.natural_map(point)[2] for point in points]
+        residual = min(residuals)
+        first = points[residuals.index(residual)]
         # Step 2: the target
         size = norm_over(qp.comm, qp.coarse.project(qp.d))
         target = min(self._share * self._rtol * size, parameters.finer * residual, aim)
