@@ -7,7 +7,7 @@ from dolfinx import mesh as dmesh
 from mpi4py import MPI
 
 import tfeti_dolfinx as tfeti
-from tfeti_dolfinx.mortar.surfaces import group_points
+from tfeti_dolfinx.mortar.facets import group_points
 
 SIDES_2D = {"left": (0, 0.0), "right": (0, 1.0), "bottom": (1, 0.0), "top": (1, 1.0)}
 SIDES_3D = {**SIDES_2D, "bottom": (2, 0.0), "top": (2, 1.0), "front": (1, 0.0), "back": (1, 1.0)}

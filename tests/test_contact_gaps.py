@@ -12,7 +12,7 @@ from test_mortar_cases import disc_on_block, no_load
 import tfeti_dolfinx as tfeti
 from meshes.rings import MIDDLE, lame_pressure, rings
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.surfaces import group_points
+from tfeti_dolfinx.mortar.facets import group_points
 
 CELLS = ["triangle", "quadrilateral", "tetrahedron", "hexahedron"]
 ORDERS = [("upper bottom", "lower top"), ("lower top", "upper bottom")]

@@ -14,8 +14,8 @@ import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.contact.records import relative_displacement, remaining_gaps, slips
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.mortar.facets import group_points
 from tfeti_dolfinx.mortar.segments import frames
-from tfeti_dolfinx.mortar.surfaces import group_points
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 ORDERS = [("upper bottom", "lower top"), ("lower top", "upper bottom")]

@@ -12,7 +12,7 @@ import tfeti_dolfinx as tfeti
 from tfeti_dolfinx.constraints.gluing import glue, prescribe
 from tfeti_dolfinx.contact.friction import friction_values
 from tfeti_dolfinx.contact.records import slips
-from tfeti_dolfinx.mortar.surfaces import group_points
+from tfeti_dolfinx.mortar.facets import group_points
 
 TRESCA, COULOMB = tfeti.Tresca(0.1), tfeti.Coulomb(0.3)
 

@@ -33,7 +33,7 @@ from tfeti_dolfinx.common.validation import (
     written_whole,
 )
 from tfeti_dolfinx.constraints.contact_state import ContactStatus
-from tfeti_dolfinx.contact.obstacle import Obstacle
+from tfeti_dolfinx.contact.partner import Obstacle
 from tfeti_dolfinx.contact.rigid_body import Pose, RigidBody
 from tfeti_dolfinx.errors import InputError, TfetiError, raised_on_all_ranks
 from tfeti_dolfinx.solution import Solution

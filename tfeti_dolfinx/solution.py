@@ -15,13 +15,13 @@ from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.constraints.contact_state import ContactState, ContactStatus, Multipliers
 from tfeti_dolfinx.constraints.gluing import Gluing
-from tfeti_dolfinx.contact.forces import Resultant, body_forces, vertex_tractions
 from tfeti_dolfinx.contact.partner import ContactPartner
+from tfeti_dolfinx.contact.records import Resultant, body_forces, vertex_tractions
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.extensions import plugin
-from tfeti_dolfinx.forms.discretisation import StressRecovery
 from tfeti_dolfinx.forms.fields import (
     Stress,
+    StressRecovery,
     cellwise,
     from_vertices,
     frozen,
@@ -29,7 +29,7 @@ from tfeti_dolfinx.forms.fields import (
     vector_from_vertices,
     von_mises,
 )
-from tfeti_dolfinx.mortar.surfaces import hat_integrals
+from tfeti_dolfinx.mortar.facets import hat_integrals
 
 # --- Displacement and stress at given points --------------------------------------------------
 

@@ -15,9 +15,8 @@ from tfeti_dolfinx.common.logging import stage
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.constraints.gluing import Gluing, Prescribed, glue, prescribe
 from tfeti_dolfinx.constraints.rows import Constraints, row_weights
-from tfeti_dolfinx.contact.forces import condition_areas
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap
-from tfeti_dolfinx.contact.records import ContactRecords, slips
+from tfeti_dolfinx.contact.records import ContactRecords, condition_areas, slips
 from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.errors import InputError

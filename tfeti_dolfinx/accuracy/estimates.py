@@ -16,8 +16,7 @@ from tfeti_dolfinx.common.parallel import steering, summed
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.feti.duality_gap import energy_bound
 from tfeti_dolfinx.feti.stopping import ErrorTarget, TargetStatus
-from tfeti_dolfinx.forms.discretisation import StressRecovery
-from tfeti_dolfinx.forms.fields import Stress, checked_stress
+from tfeti_dolfinx.forms.fields import Stress, StressRecovery, checked_stress
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.system import System

@@ -14,13 +14,17 @@ from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.validation import is_whole, shown
 from tfeti_dolfinx.constraints.gluing import Gluing
-from tfeti_dolfinx.contact.forces import Resultant, condition_areas, resultant
 from tfeti_dolfinx.contact.partner import ContactPartner, position_of
-from tfeti_dolfinx.contact.records import relative_displacement
+from tfeti_dolfinx.contact.records import (
+    Resultant,
+    condition_areas,
+    relative_displacement,
+    resultant,
+)
 from tfeti_dolfinx.contact.rigid_body import rotation_vector
 from tfeti_dolfinx.contact.tools import ToolMotion
 from tfeti_dolfinx.errors import InputError
-from tfeti_dolfinx.mortar.surfaces import group_points, surface_facets, surface_nodes
+from tfeti_dolfinx.mortar.facets import group_points, surface_facets, surface_nodes
 from tfeti_dolfinx.qp.sets import Face
 
 # --- Status of contacts and rows --------------------------------------------------------------

@@ -22,8 +22,8 @@ from tfeti_dolfinx.common.validation import (
 from tfeti_dolfinx.contact.records import ContactRecords, Friction
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.mortar.facets import group_points
 from tfeti_dolfinx.mortar.segments import aligned
-from tfeti_dolfinx.mortar.surfaces import group_points
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 Value: TypeAlias = "float | Callable[[Array], ArrayLike] | fem.Function"

@@ -1,14 +1,24 @@
-"""Conditions of contact as tables."""
+"""Conditions of contact: their tables, how integrals make them, and their forces."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
+from dolfinx.fem.petsc import interpolation_matrix
+from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array, sum_rows
+from tfeti_dolfinx.common.parallel import Exchange, owner_of, summed
 from tfeti_dolfinx.mesh.dofs import TornDofs
+from tfeti_dolfinx.mortar.facets import Facets, hat_integrals
+from tfeti_dolfinx.mortar.integrals import GapIntegrals, MortarIntegrals, Triplets
+from tfeti_dolfinx.mortar.segments import frames
+from tfeti_dolfinx.mortar.tolerances import SEARCH
+
+# --- Tables of conditions ---------------------------------------------------------------------
 
 
 class Friction(IntEnum):
@@ -135,3 +145,186 @@ def slips(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
     """Return the v_i along the tangents of the frames, shape ``(n, gdim - 1)``. Collective."""
     v = relative_displacement(records, dofs, u)
     return np.einsum("ntg,ng->nt", records.tangents, v)
+
+
+# --- Conditions from integrals ----------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Side:
+    """A surface of a pair, or one that faces an obstacle.
+
+    Attributes:
+        facets: Its facets on this rank, those of a pair with averaged normals and curvature.
+        areas: ∫φ_i over each facet, shape ``(n, v)``.
+        normals: Direction in which each owned group may not go further: the averaged normal, at
+            an obstacle that towards the shape; 0 off the surface, shape ``(g, gdim)``.
+    """
+
+    facets: Facets
+    areas: Array
+    normals: Array
+
+
+def conditions(
+    dofs: TornDofs, contact: int, side: Side, integrals: MortarIntegrals
+) -> ContactRecords:
+    """Sum the contributions of facets on any rank to each node, and divide by ∫ψ_i. Collective.
+
+    The vertices of the side get conditions along its normals, but where the covered share of ∫φ_i
+    is below 1e-6. The gaps are those of the geometry, all conditions are taken to be within reach,
+    and none has friction.
+    """
+    area = dofs.reduce_on_owners(integrals.vertices.ravel(), integrals.covered.ravel())
+    whole = dofs.reduce_on_owners(side.facets.vertices.ravel(), side.areas.ravel())
+    chosen = np.flatnonzero(area > SEARCH.hardly_covered * whole)
+    vertices, areas = integrals.vertices, area[chosen]
+    gap, _ = _mean_gaps(dofs, vertices, integrals.gap, areas, chosen)
+    curved_gap, spread = _mean_gaps(dofs, vertices, integrals.curved_gap, areas, chosen)
+    changed = np.abs(_without_rounding(dofs, curved_gap - gap))
+    place = np.full(dofs.num_groups, -1)
+    place[chosen] = np.arange(len(chosen))
+    slot, column, value = _merged(dofs, integrals.entries)
+    kept = (place[slot] >= 0) & (np.abs(value) > SEARCH.negligible * np.maximum(area[slot], 1e-300))
+    slot, column, value = slot[kept], column[kept], value[kept]
+    return ContactRecords(
+        contact=np.full(len(chosen), contact),
+        group=chosen,
+        frame=frames(side.normals[chosen]),
+        gap=gap,
+        geometric_gap=gap,
+        curved_gap=curved_gap,
+        conforms=changed > spread,
+        area=areas,
+        covered=areas / whole[chosen],
+        within_reach=np.ones(len(chosen), dtype=bool),
+        condition=place[slot],
+        entry_group=column,
+        weight=value / area[slot],
+        friction=np.full(len(chosen), Friction.NONE),
+        place=np.zeros((len(chosen), dofs.bs)),
+        motion=np.zeros((len(chosen), dofs.bs)),
+        candidates=int(np.sum(whole > 0.0)),
+    )
+
+
+def _mean_gaps(
+    dofs: TornDofs, vertices: Array, gap: GapIntegrals, area: Array, chosen: Array
+) -> tuple[Array, Array]:
+    """∫ψ_i g / ∫ψ_i of some owned groups, and by how much g varies around them. Collective.
+
+    It is kept between the bounds on g: ψ_i is negative somewhere, and the mean would else fall
+    below the smallest gap.
+    """
+    groups = vertices.ravel()
+    total = dofs.reduce_on_owners(groups, gap.total.ravel())[chosen]
+    low = dofs.reduce_on_owners(groups, gap.lowest.ravel(), np.minimum, np.inf)[chosen]
+    high = dofs.reduce_on_owners(groups, gap.highest.ravel(), np.maximum, -np.inf)[chosen]
+    return _without_rounding(dofs, np.clip(total / area, low, high)), high - low
+
+
+def _without_rounding(dofs: TornDofs, gap: Array) -> Array:
+    """0 in the place of gaps that rounding of coordinates may have made of it. Collective."""
+    own = float(np.abs(dofs.V.mesh.geometry.x).max(initial=0.0))
+    largest = dofs.comm.allreduce(own, op=MPI.MAX)
+    return np.where(np.abs(gap) <= SEARCH.no_gap * largest, 0.0, gap)
+
+
+def _merged(dofs: TornDofs, entries: tuple[Triplets, ...]) -> Triplets:
+    """Return triplets on the ranks that own their rows (as local slots), equal ones added up."""
+    row, column, value = (np.concatenate(parts) for parts in zip(*entries, strict=True))
+    exchange = Exchange(dofs.comm, owner_of(dofs.group_offsets, row))
+    row = exchange.send(row) - dofs.group_offsets[dofs.comm.rank]
+    column, value = exchange.send(column), exchange.send(value)
+    order = np.lexsort((column, row))
+    row, column, value = row[order], column[order], value[order]
+    first = np.ones(len(row), dtype=bool)
+    first[1:] = (row[1:] != row[:-1]) | (column[1:] != column[:-1])
+    starts = np.flatnonzero(first)
+    sums = np.add.reduceat(value, starts) if len(value) else value
+    return row[first], column[first], sums
+
+
+# --- Forces on nodes, surfaces and bodies -----------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Resultant:
+    """Resultant of forces on nodes, the same on all ranks.
+
+    Attributes:
+        force: Shape ``(gdim,)``, of each body ``(bodies, gdim)``; with a thickness, that on all of
+            it.
+        moment: About the origin, shape ``(3,)`` or ``(bodies, 3)``; in 2D only its last component
+            is not 0. In finite strain forces act where nodes are, at X + u, else at X.
+    """
+
+    force: Array
+    moment: Array
+
+
+def resultant(comm: MPI.Intracomm, points: Array, forces: Array) -> Resultant:
+    """Resultant of forces, ``(n, gdim)``, at points of this rank, ``(n, 3)``. Collective."""
+    own = summed(comm, np.sum(_with_moments(points, forces), axis=0))
+    return Resultant(own[:-3], own[-3:])
+
+
+def _with_moments(points: Array, forces: Array) -> Array:
+    """Return forces and their moments about the origin, shape ``(n, gdim + 3)``."""
+    spatial = np.zeros((len(forces), 3))
+    spatial[:, : forces.shape[1]] = forces
+    return np.column_stack((forces, np.cross(points, spatial)))
+
+
+def condition_areas(
+    records: ContactRecords, dofs: TornDofs, surfaces: list[str | int], thickness: Any = 1.0
+) -> Array:
+    """∫φ_i of each condition, ``(n,)``, times a number or a scalar in UFL. Collective.
+
+    Where a pair covers a part of the node's surface, the thickness is its mean over the whole.
+    """
+    if isinstance(thickness, float):
+        return thickness * records.area
+    volume = hat_integrals(dofs, surfaces, thickness)[records.group]
+    return records.area * volume / hat_integrals(dofs, surfaces)[records.group]
+
+
+def body_forces(points: Array, forces: Array, dofs: TornDofs) -> Resultant:
+    """Resultants of forces on the owned groups, which are at these points. Collective."""
+    lowest = dofs.copy_subdomains[dofs.copy_offsets[:-1]]
+    body, num_bodies = dofs.decomposition.body_of_subdomain[lowest], dofs.decomposition.num_bodies
+    sums = summed(dofs.comm, sum_rows(body, _with_moments(points, forces), num_bodies))
+    return Resultant(sums[:, : forces.shape[1]], sums[:, forces.shape[1] :])
+
+
+def vertex_tractions(
+    forces: Array, dofs: TornDofs, names: list[str | int], thickness: Any = 1.0
+) -> tuple[Array, Array]:
+    """Tractions whose moments with the hats of degree 1 are those of nodal forces. Collective.
+
+    Return force / ∫φ_i for each owned group that is a vertex of the surfaces of these names, else
+    0, shape ``(g, gdim)``; and ∫φ_i, times the thickness, shape ``(g,)``.
+    """
+    area = hat_integrals(dofs, names, thickness)
+    if dofs.V.element.basix_element.degree > 1:
+        forces = _on_hats(forces, dofs)
+    on_surface = (area > 0.0)[:, None]
+    return np.divide(forces, area[:, None], out=np.zeros_like(forces), where=on_surface), area
+
+
+def _on_hats(forces: Array, dofs: TornDofs) -> Array:
+    """Return moments with the hats of degree 1: Πᵀf, Π the interpolation from degree 1."""
+    W, node = dofs.hats
+    S, dof = dofs.scalar
+    interpolation = interpolation_matrix(W, S)
+    interpolation.assemble()
+    source, target = interpolation.createVecLeft(), interpolation.createVecRight()
+    share = dofs.spread(forces / dofs.multiplicity[:, None])
+    result = np.zeros_like(share)
+    for component in range(forces.shape[1]):
+        source.array[dof] = share[:, component]
+        interpolation.multTranspose(source, target)
+        result[node, component] = target.array_r
+    for item in (source, target, interpolation):
+        item.destroy()
+    return dofs.reduce(result, np.add, 0.0)

@@ -21,7 +21,7 @@ from tfeti_dolfinx.contact.records import (
 )
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.surfaces import diameter, surface_nodes
+from tfeti_dolfinx.mortar.facets import diameter, surface_nodes
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 log = logging.getLogger(__name__)

@@ -11,13 +11,12 @@ from mpi4py import MPI
 from tfeti_dolfinx.common.agreement import agreeing
 from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import bcast_from_root
-from tfeti_dolfinx.contact.obstacle import Obstacle
-from tfeti_dolfinx.contact.partner import GEOMETRY, ContactPartner
+from tfeti_dolfinx.contact.partner import GEOMETRY, ContactPartner, Obstacle
 from tfeti_dolfinx.contact.records import ContactRecords
 from tfeti_dolfinx.contact.rigid_body import MOTIONS, Pose, RigidBody, motion_fields
 from tfeti_dolfinx.errors import InputError
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.mortar.surfaces import extent, surface_facets
+from tfeti_dolfinx.mortar.facets import extent, surface_facets
 from tfeti_dolfinx.mortar.tolerances import SEARCH
 
 
