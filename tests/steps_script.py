@@ -8,9 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import test_rigid_tools
+import ufl
+from bodies import held, stacked
+from dolfinx import fem
 from moving import Thrown
 from mpi4py import MPI
-from scenes import displacement
+from scenes import displacement, hooke, strain
 from sheared import Driven
 from test_nonlinear import plastic
 
@@ -78,6 +81,25 @@ class Tool:
         pass
 
 
+class Apart:
+    """A box on springs below one that is held and meets a rough plane: one rank has no rows."""
+
+    def __init__(self):
+        d = stacked("quadrilateral", 3, 4, 2, gap=0.5)
+        V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
+        u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+        self.load = fem.Constant(d.mesh, (0.0, 0.0))
+        a = ufl.inner(hooke()(u), strain(v)) * ufl.dx + ufl.dot(u, v) * ufl.dx
+        L = ufl.dot(self.load, v) * ufl.dx
+        plane = tfeti.Plane((0.0, 0.49), (0.0, 1.0))
+        contact = tfeti.Obstacle("upper bottom", plane, friction=tfeti.Coulomb(0.3))
+        given = a, L, held(d, "upper top")(V), [contact], d
+        self.problem = tfeti.ContactProblem(*given, petsc_options={"rtol": 1e-10})
+
+    def apply(self, problem, t):
+        self.load.value[:] = (0.02 * np.sin(t), -0.1)
+
+
 if __name__ == "__main__":
     scene, folder, how = sys.argv[1], Path(sys.argv[2]), sys.argv[3]
     moving = {"thrown": False, "stabilised": True}
@@ -85,8 +107,8 @@ if __name__ == "__main__":
         driven = Thrown(weight=0.02, stabilised=moving[scene])
     elif scene == "coulomb":
         driven = Driven(friction=tfeti.Coulomb(0.3), rtol=1e-12)
-    elif scene in ("plastic", "tool"):
-        driven = {"plastic": Pressed, "tool": Tool}[scene]()
+    elif scene in (others := {"plastic": Pressed, "tool": Tool, "apart": Apart}):
+        driven = others[scene]()
     else:
         driven = Driven(rough=scene == "rough")
 

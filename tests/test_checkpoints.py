@@ -5,7 +5,12 @@ import shutil
 
 import numpy as np
 import pytest
+import ufl
+from bodies import held, stacked
+from dolfinx import fem
 from full_disk import clear, fill, left_in
+from mpi4py import MPI
+from reference.nonlinear import neo_hooke
 from sheared import Driven
 
 import tfeti_dolfinx as tfeti
@@ -235,3 +240,38 @@ def test_a_series_on_a_full_disk(scene, shared_tmp, kept):
     full = False
     assert [r.time for r in series(LATER).run(resume=True)] == LATER
     assert np.allclose(driven.problem.u.x.array, scene.expected[1], rtol=0, atol=1e-6)
+
+
+class Squeezed:
+    """A block on another one in finite strain, whose equal meshes become unequal."""
+
+    def __init__(self):
+        d = stacked("triangle", 4, 4, 2)
+        V = fem.functionspace(d.mesh, ("Lagrange", 1, (2,)))
+        u, v = fem.Function(V), ufl.TestFunction(V)
+        F = ufl.derivative(neo_hooke(u, 1.0, 0.0) * ufl.dx, u, v)
+        self.down, self.aside = fem.Constant(d.mesh, 0.0), fem.Constant(d.mesh, 0.0)
+        moved = ("upper top", self.down), ("upper right", self.aside)
+        bcs = held(d, *moved, "lower bottom", "lower left", "upper left")(V)
+        contact = tfeti.Contact("upper bottom", "lower top", friction=tfeti.Coulomb(0.1))
+        options = {"finite": True, "petsc_options": {"rtol": 1e-9}}
+        self.problem = tfeti.NonlinearContactProblem(F, u, bcs, [contact], d, **options)
+
+    def apply(self, problem, t):
+        self.down.value, self.aside.value = -0.1 * t, -0.25 * t
+
+    def series(self, times, folder, resume=False):
+        steps = tfeti.LoadSteps(self.problem, self.apply, times, checkpoint=folder)
+        steps.run(resume=resume)
+        return self.problem
+
+
+def test_sides_of_a_pair_are_kept_in_finite_strain(shared_tmp, comm):
+    """Those of the bodies as they were: in a series, and where it goes on."""
+    whole = Squeezed().series([0.5, 1.0, 1.5], shared_tmp / "whole")
+    Squeezed().series([0.5, 1.0], shared_tmp / "parts")
+    resumed = Squeezed().series([0.5, 1.0, 1.5], shared_tmp / "parts", resume=True)
+    for problem in (whole, resumed):
+        assert problem.solution.contacts[0].surfaces == ("upper bottom", "lower top")
+    off = np.abs(resumed.u.x.array - whole.u.x.array).max(initial=0.0)
+    assert comm.allreduce(off, op=MPI.MAX) < 1e-8

@@ -250,6 +250,7 @@ def test_a_killed_series_goes_on_to_the_same_answer(
         ("coulomb", 2, 4),
         ("thrown", 2, 1),
         ("tool", 1, 2),
+        ("apart", 2, 1),  # one of the two has no rows
         ("plastic", 2, 4),  # one of them has no subdomain
         pytest.param("coulomb", 2, 1, marks=pytest.mark.slow),
         pytest.param("coulomb", 1, 2, marks=pytest.mark.slow),

@@ -508,7 +508,9 @@ class ContactProblem:
         system = self._system
         system.tools.go_back(state.tools)
         self._take_motion(state)
-        system.know_rows(list(state.reach), state.groups(self.dofs))
+        system.know_rows(
+            list(state.reach), state.groups(self.dofs), list(map(int, state.secondary))
+        )
         system.look_for_changes()
         dual = system.make(self._seconds)
         dual.seen = max(dual.seen, float(state.norm))

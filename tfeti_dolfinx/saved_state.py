@@ -170,6 +170,7 @@ class SavedState:
         status: Status of each row, see ``qp.sets.Status``.
         slip: Where the load step began: tangential v_i of the conditions, ``(n, gdim - 1)``.
         reach: How far was searched in each contact.
+        secondary: Tag of the surface of each contact that has its conditions.
         contact: Contact of each condition.
         group: Label of the node of each condition.
         reached: Whether a condition is within reach.
@@ -198,6 +199,7 @@ class SavedState:
     status: Array
     slip: Array
     reach: Array
+    secondary: Array
     contact: Array
     group: Array
     reached: Array
@@ -218,6 +220,7 @@ class SavedState:
         """Return the state of a solution."""
         gluing, holding = solution.gluing, solution.holding
         records, dofs = gluing.records, solution.dofs
+        tag_of = solution.decomposition.surface
         held = np.where(holding, Status.STICK, Status.SLIP)
         nodes = labels_of_nodes(dofs)
         of_groups = labels_of_groups(dofs, nodes)
@@ -234,6 +237,7 @@ class SavedState:
             status=np.where(solution.carrying, held, Status.OPEN),
             slip=gluing.slip,
             reach=np.array(reach, dtype=float),
+            secondary=np.array([tag_of(c.surfaces[0]) for c in solution.contacts], dtype=np.int64),
             contact=records.contact,
             group=of_groups[records.group],
             reached=records.within_reach,
@@ -343,6 +347,7 @@ class SavedState:
         """Return what all ranks' states must share, since searches and solves depend on it."""
         return {
             "reach": self.reach.tolist(),
+            "secondary": self.secondary.tolist(),
             "size": float(self.size),
             "norm": float(self.norm),
             "mu": [len(self.mu), float(self.mu.sum()), float(np.abs(self.mu).sum())],
@@ -384,7 +389,7 @@ def check_state(state: SavedState, dofs: TornDofs, contacts: int) -> None:
         )
     rows, unknowns = state.lam.shape, (len(dofs.dolfinx_node) * dofs.bs,)
     conditions = state.conditions.shape
-    axes = {"lam": 1, "mu": 1, "slip": 2, "reach": 1, "contact": 1, "directions": 3}
+    axes = {"lam": 1, "mu": 1, "slip": 2, "reach": 1, "secondary": 1, "contact": 1, "directions": 3}
     shapes: dict[str, list[tuple[int, ...]]] = {name: [(0,), rows] for name in STARTS}
     shapes |= {"u": [unknowns], "status": [rows], "rows": [rows], "norm": [()], "size": [()]}
     shapes |= {name: [conditions] for name in ("contact", "group", "reached")}
@@ -394,6 +399,7 @@ def check_state(state: SavedState, dofs: TornDofs, contacts: int) -> None:
         right &= values.ndim == axes.get(name, values.ndim)
         right &= bool(np.all(np.isfinite(values)))
         _check_broken(name, right)
+    _check_broken("secondary", len(state.secondary) == contacts)
     _check_broken("slip", len(state.slip) == len(state.conditions))
     _check_broken(
         "directions", state.directions.shape[1:] in {(0, 0), (*rows, *state.directions.shape[2:])}

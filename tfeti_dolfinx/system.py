@@ -15,7 +15,7 @@ from tfeti_dolfinx.common.logging import stage
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.constraints.gluing import Gluing, Prescribed, glue, prescribe
 from tfeti_dolfinx.constraints.rows import Constraints, row_weights
-from tfeti_dolfinx.contact.partner import ContactPartner, Gap
+from tfeti_dolfinx.contact.partner import Contact, ContactPartner, Gap
 from tfeti_dolfinx.contact.records import ContactRecords, condition_areas, slips
 from tfeti_dolfinx.contact.search import ContactSearch
 from tfeti_dolfinx.contact.tools import Tools
@@ -205,6 +205,7 @@ class System:
     ) -> None:
         self.forms, self.bcs, self._contacts = forms, bcs, contacts
         self._dofs, self._settings = dofs, settings
+        self._secondary: list[Any] = [getattr(contact, "secondary", None) for contact in contacts]
         self._has_friction = any(contact.friction is not None for contact in contacts)
         self.elements = (
             FiniteElements(dofs) if method is None else method.assembly(dofs, dofs.decomposition)
@@ -324,9 +325,11 @@ class System:
         elif self._gluing is not None:
             self._gluing = replace(self._gluing, slip=self._slip())
 
-    def know_rows(self, reach: Sequence[float], groups: Sequence[Array]) -> None:
-        """Let the next search end with the rows that an earlier one of the scene had."""
-        self._known_rows = (reach, groups)
+    def know_rows(
+        self, reach: Sequence[float], groups: Sequence[Array], secondary: Sequence[int]
+    ) -> None:
+        """Let the next search end with the rows and sides that an earlier one of the scene had."""
+        self._known_rows, self._secondary = (reach, groups), list(secondary)
         self.change("points")
 
     def make(self, seconds: MutableMapping[str, float]) -> Dual:
@@ -400,12 +403,17 @@ class System:
         dofs, tools = self._dofs, self.tools
         first = self._search is None
         tools.place(finite=self.origin is not None)
-        contacts = tools.placed(self._contacts)
-        self._search = ContactSearch(contacts, dofs, self._blocks, self.origin, tools)
+        contacts = [
+            replace(contact, secondary=side) if isinstance(contact, Contact) else contact
+            for contact, side in zip(tools.placed(self._contacts), self._secondary, strict=True)
+        ]
+        decided = not first or self._known_rows is not None
+        stiffness = None if decided else self._blocks
+        self._search = ContactSearch(contacts, dofs, stiffness, self.origin, tools)
         if first:
             tools.check_begin(contacts, self._search.records)
-        if self.origin is not None:  # sides stay those of the first search
-            self._contacts[:] = self._search.contacts
+        # its sides stay
+        self._secondary = [contact.surfaces[0] for contact in self._search.contacts]
         if self._known_rows is not None:
             self._search.take_rows(*self._known_rows)
             self._known_rows = None

@@ -110,11 +110,12 @@ class ContactPartner:
         return float(reach)
 
     def settled(
-        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array
+        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None
     ) -> tuple[ContactPartner, ContactRecords]:
         """Return the contact with its sides decided, and its conditions up to a reach, and so deep.
 
-        ``stiffness`` is the block of K of each primal node, shape ``(num_nodes, bs, bs)``.
+        ``stiffness`` is the block of K of each primal node, shape ``(num_nodes, bs, bs)``; None:
+        the sides are those of an earlier search.
         """
         return self, self.records(dofs, contact, reach, reach)
 
@@ -397,7 +398,7 @@ class Contact(ContactPartner):
         return min(super().first_reach(decomposition), diameter(decomposition))
 
     def settled(
-        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array
+        self, dofs: TornDofs, contact: int, reach: float, stiffness: Array | None
     ) -> tuple[Contact, ContactRecords]:
         """Return the contact with its secondary side as ``a``, and its conditions. Collective.
 
@@ -408,6 +409,8 @@ class Contact(ContactPartner):
         settled = self._named_first(dofs.decomposition)
         sides = settled._sides(dofs)
         found = settled._meet(sides, dofs, contact, reach, reach)
+        if stiffness is None:
+            return settled, found
         size, per_area = _ratios(found, sides, dofs, stiffness)
         of_one_size = max(size, 1.0 / size) <= SEARCH.same_size
         exchange = per_area > SEARCH.same_stiffness if of_one_size else size < 1.0

@@ -36,7 +36,8 @@ class ContactSearch:
     Args:
         contacts: Obstacles and pairs.
         dofs: Dof maps.
-        stiffness: Block of K of each primal node, shape ``(num_nodes, bs, bs)``.
+        stiffness: Block of K of each primal node, shape ``(num_nodes, bs, bs)``; None: sides are
+            decided.
         origin: Displacement in primal order at which the mesh is; None: 0. Gaps are those of the
             total displacement.
         tools: The rigid bodies, where they are placed.
@@ -54,7 +55,7 @@ class ContactSearch:
         self,
         contacts: Sequence[ContactPartner],
         dofs: TornDofs,
-        stiffness: Array,
+        stiffness: Array | None,
         origin: Array | None = None,
         tools: Tools | None = None,
     ) -> None:
