@@ -145,7 +145,8 @@ def chunk_offsets(comm: MPI.Intracomm, size: int) -> Array:
 
 def box_over_ranks(comm: MPI.Intracomm, x: Array) -> tuple[Array, Array]:
     """Lowest and highest coordinates of all ranks' points, shapes ``(gdim,)``. Collective."""
-    low, high = x.min(axis=0, initial=np.inf), x.max(axis=0, initial=-np.inf)
+    low = np.array([column.min(initial=np.inf) for column in x.T])
+    high = np.array([column.max(initial=-np.inf) for column in x.T])
     comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
     comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
     return low, high

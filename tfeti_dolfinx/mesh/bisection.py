@@ -94,8 +94,9 @@ def _halves(
     """Plan the halving of parts; targets: numbers of final parts in each, and in its left half."""
     (whole, left), gdim = targets, grid.shape[1]
     box = np.full((2, len(whole), gdim), np.iinfo(np.int64).max)  # of x and of -x
-    np.minimum.at(box[0], part, grid)
-    np.minimum.at(box[1], part, -grid)
+    for axis, column in enumerate(grid.T):
+        np.minimum.at(box[0, :, axis], part, column)
+        np.minimum.at(box[1, :, axis], part, -column)
     comm.Allreduce(MPI.IN_PLACE, box, op=MPI.MIN)
     count, gap = _count(part, len(whole), comm), None
     axes = (np.argmax(-box[1] - box[0], axis=1)[:, None] + np.arange(gdim)) % gdim
@@ -181,12 +182,16 @@ def _count(part: Array, num_parts: int, comm: MPI.Intracomm, chosen: Array | Non
 
 
 def _kth_smallest(key: Array, part: Array, k: Array, comm: MPI.Intracomm) -> Array:
-    """In each part the k-th smallest key, by bisection on its bits."""
+    """In each part the k-th smallest key, by bisection on the bits of keys that may be it."""
     low: Array = np.zeros(len(k), dtype=np.int64)
     high: Array = np.full(len(k), 2**62 - 1)
     while np.any(low < high):
         middle = (low + high) // 2
-        enough = _count(part, len(k), comm, key <= middle[part]) >= k
+        first = key <= middle[part]
+        count = _count(part, len(k), comm, first)
+        enough = count >= k
+        kept = first == enough[part]
+        key, part, k = key[kept], part[kept], np.where(enough, k, k - count)
         high = np.where(enough, middle, high)
         low = np.where(enough, low, np.minimum(middle + 1, high))
     return low

@@ -48,7 +48,8 @@ class CellGraph:
     Attributes:
         comm: Ranks that share the cells.
         num_cells: Cells of this rank.
-        pairs: Pairs of cells that share a facet, the first of this rank, both of shape ``(m,)``.
+        across: Cell or ghost across each facet of a cell, shape ``(n, facets_per_cell)``; the cell
+            itself where there is none.
         vertices: Vertices of cells and ghosts, shape ``(n + g, k)``; those of ghosts that no own
             cell has are ``num_nodes``.
         num_nodes: Nodes of the share.
@@ -60,19 +61,21 @@ class CellGraph:
         self._mesh, self._ghosts = mesh, Exchange(comm, np.empty(0, dtype=np.int64))
         self._sent: Array = np.empty(0, dtype=np.int64)
         keys = mesh.facet_keys()
-        per_cell, keys = keys.shape[1], keys.ravel()
+        shape, keys = keys.shape, keys.ravel()
+        across = np.repeat(np.arange(shape[0], dtype=np.int32), shape[1])
         first, second = equal_pairs(keys)
+        across[first], across[second] = across[second], across[first]
         if comm.size > 1:
-            first, second = self._across_ranks(keys, first, second)
-        self.pairs = first // per_cell, second // per_cell
+            lone = np.ones(len(keys), dtype=bool)
+            lone[first] = lone[second] = False
+            facet, ghost = self._across_ranks(keys, np.flatnonzero(lone))
+            across[facet] = ghost
+        self.across = across.reshape(shape)
 
-    def _across_ranks(self, keys: Array, first: Array, second: Array) -> tuple[Array, Array]:
-        """Find ghosts; add pairs with them to those of this rank's facets."""
+    def _across_ranks(self, keys: Array, facet: Array) -> tuple[Array, Array]:
+        """Find ghosts; return which of the facets, that no two own cells share, have which one."""
         comm, mesh, n = self.comm, self._mesh, self.num_cells
         corners = facet_vertices(mesh.cell_type)
-        lone = np.ones(len(keys), dtype=bool)
-        lone[first] = lone[second] = False
-        facet = np.flatnonzero(lone)
         cell, local = np.divmod(facet, len(corners))
         start = offset_of(comm, n)
         exchange = exchange_by_key(comm, keys[facet])
@@ -107,13 +110,7 @@ class CellGraph:
         self.vertices = np.vstack((self.vertices, np.where(known, found, self.num_nodes)))
         number = self._ghosts.send(start + self._sent)
         by_number = np.argsort(number)
-        ghost = by_number[np.searchsorted(number, partner[met], sorter=by_number)]
-        first = np.concatenate((first, facet[met]))
-        return first, np.concatenate((second, (n + ghost) * len(corners)))
-
-    def numbers(self) -> Array:
-        """Numbers of cells and ghosts over all ranks, in the ranks' order."""
-        return self.with_ghosts(offset_of(self.comm, self.num_cells) + np.arange(self.num_cells))
+        return facet[met], n + by_number[np.searchsorted(number, partner[met], sorter=by_number)]
 
     def with_ghosts(self, values: Array) -> Array:
         """Values of cells, then those of the ghosts."""
@@ -121,26 +118,17 @@ class CellGraph:
             return values
         return np.concatenate((values, self._ghosts.send(values[self._sent])))
 
-    def beside(self) -> csr_array:
-        """Return the matrix of own cells, and of each itself and those across its facets."""
-        n, (first, second) = self.num_cells, self.pairs
-        own, each = second < n, np.arange(n)
-        rows = np.concatenate((each, first, second[own]))
-        columns = np.concatenate((each, second, first[own]))
-        shape = (n, len(self.vertices))
-        return coo_array((np.ones(len(rows)), (rows, columns)), shape=shape).tocsr()
-
     def pieces(self, colour: Array) -> Pieces:
         """Find the pieces of cells with one colour, shape ``(n,)``, that hang together."""
         n, comm = self.num_cells, self.comm
-        first, second = self.pairs
-        same, own = colour[first] == self.with_ghosts(colour)[second], second < n
-        inside = same & own
-        graph = coo_array((np.ones(inside.sum()), (first[inside], second[inside])), shape=(n, n))
-        count, label = connected_components(graph, directed=False)
+        across, each = self.across, np.arange(n, dtype=np.int32)[:, None]
+        same, own = colour[:, None] == self.with_ghosts(colour)[across], across < n
+        graph = incidence(np.where(same & own, across, each), n)
+        # each of two neighbours has the other: strong components are found without a transpose
+        count, label = connected_components(graph, connection="strong")
         label = self.with_ghosts(label.astype(np.int64) + offset_of(comm, count))
-        between = same & ~own
-        edges = np.unique(np.stack((label[first[between]], label[second[between]])), axis=1)
+        cell, facet = np.nonzero(same & ~own)
+        edges = np.unique(np.stack((label[cell], label[across[cell, facet]])), axis=1)
         edges, total = np.concatenate(comm.allgather(edges), axis=1), comm.allreduce(count)
         graph = coo_array((np.ones(edges.shape[1]), tuple(edges)), shape=(total, total))
         count, merged = connected_components(graph, directed=False)
@@ -155,9 +143,8 @@ class CellGraph:
         number = np.empty(count, dtype=np.int64)
         number[order] = np.arange(count)
         piece = number[piece]
-        # facets between pieces, those inside this rank both ways
-        a, b, here = piece[first[~same]], piece[second[~same]], own[~same]
-        links = np.concatenate((a * count + b, (b * count + a)[here]))
+        cell, facet = np.nonzero(~same)
+        links = piece[cell] * count + piece[across[cell, facet]]
         links, facets = np.unique(links, return_counts=True)
         every, counts = map(np.concatenate, zip(*comm.allgather((links, facets)), strict=True))
         links, place = np.unique(every, return_inverse=True)

@@ -6,11 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 from mpi4py import MPI
-from scipy.sparse import coo_array, csr_array, eye_array
+from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from tfeti_dolfinx.common.arrays import Array, ArrayLike
 from tfeti_dolfinx.common.compat import GRAPH_PARTITIONERS, parts_of_graph
+from tfeti_dolfinx.common.parallel import offset_of
 from tfeti_dolfinx.common.validation import named, shown
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.bisection import bisect_points
@@ -45,10 +46,12 @@ def make_parts(mesh: UntornMesh, graph: CellGraph, num_parts: int, partitioner: 
     """Part of each cell by a partitioner of that name; some may not be connected. Collective."""
     if partitioner in PARTITIONERS:
         return without_holes(PARTITIONERS[partitioner](mesh, graph, num_parts), graph.comm)
-    beside, number = graph.beside(), graph.numbers()
-    beside = csr_array(beside - eye_array(*beside.shape, format="csr"))
-    lists = (number[beside.indices], beside.indptr)
-    return without_holes(parts_of_graph(graph.comm, partitioner, num_parts, *lists), graph.comm)
+    comm, n = graph.comm, graph.num_cells
+    number = graph.with_ghosts(offset_of(comm, n) + np.arange(n))
+    across = np.sort(graph.across, axis=1)
+    other = across != np.arange(n)[:, None]
+    lists = number[across[other]], np.concatenate(([0], np.cumsum(other.sum(axis=1))))
+    return without_holes(parts_of_graph(comm, partitioner, num_parts, *lists), comm)
 
 
 # --- Connected subdomains ---------------------------------------------------------------------

@@ -107,10 +107,8 @@ def round_parts(mesh: UntornMesh, graph: CellGraph, num_parts: int) -> Array:
 
 def _cut_facets(graph: CellGraph, part: Array, body: Array, num_bodies: int) -> Array:
     """Twice the number of facets between parts of each body, shape ``(num_bodies,)``."""
-    first, second = graph.pairs
-    cut = part[first] != graph.with_ghosts(part)[second]
-    sides = np.where(second < graph.num_cells, 2, 1)[cut]  # ghosts' facets count on two ranks
-    return summed(graph.comm, np.bincount(body[first[cut]], sides, minlength=num_bodies))
+    cut = np.sum(graph.with_ghosts(part)[graph.across] != part[:, None], axis=1)
+    return summed(graph.comm, np.bincount(body, cut, minlength=num_bodies))
 
 
 def _counts(comm: MPI.Intracomm, part: Array, num_parts: int) -> Array:
@@ -164,7 +162,8 @@ def balanced_kmeans(
             own = _nearest(y, own, centre, influence, home)
         goal = (_counts(comm, of, len(shares)) / shares)[home]
         for _ in range(rounds):
-            centre += way * (_means(y, own, centre, comm) - centre)
+            if way:
+                centre += way * (_means(y, own, centre, comm) - centre)
             size = np.maximum(_counts(comm, own, len(home)), 1)
             step = ROUND.influence_step
             influence *= np.clip((goal / size) ** (1.0 / gdim), 1.0 / step, step)
@@ -235,16 +234,12 @@ def flatten_interfaces(graph: CellGraph, part: Array, key: Array, wanted: Array)
     """
     n, num_parts, comm = graph.num_cells, len(wanted), graph.comm
     around = incidence(graph.vertices, graph.num_nodes + 1).T.tocsr()
-    beside = graph.beside()
-    first, second = graph.pairs
-    every, active = graph.with_ghosts(part.astype(np.int32)), np.ones(n, dtype=bool)
+    every = graph.with_ghosts(part.astype(np.int32))
+    near: Array = np.arange(n)
     for turn in range(ROUND.flattening):
-        cut = every[first] != every[second]
-        at_cut = np.zeros(len(every), dtype=bool)
-        at_cut[first[cut]] = at_cut[second[cut]] = True
-        near = np.flatnonzero(at_cut[:n] & active)
+        near = near[np.any(every[graph.across[near]] != every[near, None], axis=1)]
         own = every[near]
-        mine, most, best = _majority(every, graph.vertices[near], around, beside[near], own)
+        mine, most, best = _majority(every, graph.vertices[near], around, near, graph.across[near])
         wants = (most > mine) & (wanted[own] > 0)
         if not any_rank(comm, wants):
             break
@@ -259,25 +254,26 @@ def flatten_interfaces(graph: CellGraph, part: Array, key: Array, wanted: Array)
         touched = np.zeros(graph.num_nodes + 1, dtype=bool)
         touched[graph.vertices[now != every]] = True
         touched[-1] = False
-        active = np.any(touched[graph.vertices[:n]], axis=1)
+        active = np.zeros(len(every), dtype=bool)
+        active[around[np.flatnonzero(touched)].indices] = True
         active[near[wants]] = True
-        every = now
+        near, every = np.flatnonzero(active[:n]), now
     return every[:n]
 
 
 def _majority(
-    every: Array, corners: Array, around: csr_array, beside: csr_array, own: Array
+    every: Array, corners: Array, around: csr_array, cell: Array, across: Array
 ) -> tuple[Array, Array, Array]:
     """Return of each cell its own part's count, and of the others' the highest and its part.
 
-    ``around`` has the cells at each node, ``beside`` each of these cells and those across a facet.
+    ``around`` has the cells at each node, ``across`` those across a facet of each of these cells.
     """
-    num_parts = int(every.max(initial=0)) + 1
+    num_parts, own = int(every.max(initial=0)) + 1, every[cell]
     nodes, place = np.unique(corners, return_inverse=True)
     met = around[nodes]
     met = csr_array((met.data, every[met.indices], met.indptr), shape=(len(nodes), num_parts))
-    shape = (len(own), num_parts)
-    facets = csr_array((beside.data, every[beside.indices], beside.indptr), shape=shape)
+    facets = incidence(every[np.column_stack((cell, across))], num_parts)
+    facets.data[:] = np.column_stack((np.ones(len(cell)), across != cell[:, None])).ravel()
     facets.sum_duplicates()
     counted = incidence(place.reshape(corners.shape), len(nodes)) @ met
     counted = csr_array(counted.multiply(facets > 0) + ROUND.facet * facets)

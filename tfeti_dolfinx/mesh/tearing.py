@@ -62,13 +62,17 @@ def moved(
     """Send every cell, and its row of values, to a rank: return the new share. Collective."""
     if comm.size == 1:
         return mesh, values
-    # nodes that go to each rank, and the places of the cells' nodes among them
-    count = max(len(mesh.node_ids), 1)
-    nodes, place = np.unique(
-        rank[:, None].astype(np.int64) * count + mesh.cells, return_inverse=True
-    )
-    to, node = np.divmod(nodes, count)
-    place = place.reshape(mesh.cells.shape) - np.searchsorted(to, rank)[:, None]
+    # nodes that go to each rank, each once, and the places of the cells' nodes among them
+    place, table = np.empty_like(mesh.cells), np.empty(len(mesh.node_ids), dtype=np.int64)
+    cells = np.split(np.argsort(rank, kind="stable"), np.cumsum(np.bincount(rank))[:-1])
+    nodes = list[Array]()
+    for own in cells:
+        every = mesh.cells[own].ravel()
+        table[every] = np.arange(len(every))
+        nodes.append(every[table[every] == np.arange(len(every))])
+        table[nodes[-1]] = np.arange(len(nodes[-1]))
+        place[own] = table[mesh.cells[own]]
+    to, node = np.repeat(np.arange(len(nodes)), [len(of) for of in nodes]), np.concatenate(nodes)
     of_cells, of_nodes = Exchange(comm, rank), Exchange(comm, to)
     node_ids, first, merged = np.unique(
         of_nodes.send(mesh.node_ids[node]), return_index=True, return_inverse=True
