@@ -63,6 +63,7 @@ def solve_sliding(
     own, turned = np.sum(N**2, axis=1), np.sum(T.reshape(c, -1) ** 2, axis=1)
     moves, r = own > 0.0, 1.0 / np.where(own > 0.0, own, turned)  # r: a row's own stiffness
     saddle = np.block([[K, N.T, T.T], [np.zeros((c * (1 + t), n + c * (1 + t)))]])
+    idle = n + c + np.flatnonzero(~T.any(axis=1))  # slips that are 0
     x, load = np.zeros(len(saddle)), np.abs(f * root).max()
     for k in range(MOST):
         J, right = saddle.copy(), np.concatenate((f, np.zeros(c * (1 + t))))
@@ -90,6 +91,7 @@ def solve_sliding(
                 J[rows, n + i] -= coefficient[i] * e
                 J[rows, :n] -= coefficient[i] * r[i] * np.outer(e, N[i])
                 right[rows] -= coefficient[i] * (z[i] + r[i] * gap[i]) * e
+        J[idle], right[idle] = np.eye(len(J))[idle], 0.0
         new = _solved(J, right)
         change, x, off = np.abs(new - x), new, np.abs(J @ new - right)
         parts = slice(0, n), slice(n, len(x))
