@@ -26,8 +26,8 @@ from tfeti_dolfinx.bem.steklov import IsotropicLaw
 from tfeti_dolfinx.common.arrays import node_blocks
 from tfeti_dolfinx.common.compat import assemble_csr
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.subdomains.build import make_subdomains, subdomain_data
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
+from tfeti_dolfinx.subdomains.subdomains import make_subdomains, subdomain_data
 from tfeti_dolfinx.testing import check_block
 
 ALL = tfeti.BoundaryElements()

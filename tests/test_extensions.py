@@ -35,9 +35,6 @@ class Doubled:
         self.half.mult(w, out)
         out *= 2.0
 
-    def destroy(self):
-        self.half.destroy()
-
 
 def doubled(B, subdomains):
     return DualOperator(B, Doubled(subdomains.blocks))

@@ -47,7 +47,6 @@ def applied(operator, w):
     out = np.full_like(w, np.nan)
     operator.prepare()
     operator.mult(w, out)
-    operator.destroy()
     return out
 
 

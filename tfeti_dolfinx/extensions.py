@@ -23,9 +23,8 @@ from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.problem import Monitor
 from tfeti_dolfinx.qp.sets import FeasibleSet
 from tfeti_dolfinx.subdomains.block import PROMISED, Block, SubdomainData
-from tfeti_dolfinx.subdomains.build import SubdomainMethod
 from tfeti_dolfinx.subdomains.kplus import MakeInverse
-from tfeti_dolfinx.subdomains.subdomains import Subdomains
+from tfeti_dolfinx.subdomains.subdomains import SubdomainMethod, Subdomains
 
 # optional parts, which no other module imports: where they are, by name
 PLUGINS = {

@@ -42,7 +42,7 @@ from tfeti_dolfinx.saved_state import SavedState, check_state
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.coulomb import solve_with_friction
 from tfeti_dolfinx.solve.solver import conclude
-from tfeti_dolfinx.subdomains.build import SubdomainMethod
+from tfeti_dolfinx.subdomains.subdomains import SubdomainMethod
 from tfeti_dolfinx.system import Settings, System
 
 log = logging.getLogger(__name__)

@@ -30,18 +30,18 @@ from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.report import Sizes, StageCounts
 from tfeti_dolfinx.solve.solver import resolved
 from tfeti_dolfinx.subdomains.block import Counters, RigidBlock, SubdomainData, mode_names
-from tfeti_dolfinx.subdomains.build import (
-    FiniteElements,
-    MakeBlock,
-    SubdomainMethod,
-    make_subdomains,
-    subdomain_data,
-)
 from tfeti_dolfinx.subdomains.factor import added_options
 from tfeti_dolfinx.subdomains.kplus import KPLUS_TYPES, InverseFactory
 from tfeti_dolfinx.subdomains.local_operators import LocalChoice
 from tfeti_dolfinx.subdomains.sparse_block import EqualSubdomains, SparseBlock
-from tfeti_dolfinx.subdomains.subdomains import Subdomains
+from tfeti_dolfinx.subdomains.subdomains import (
+    FiniteElements,
+    MakeBlock,
+    SubdomainMethod,
+    Subdomains,
+    make_subdomains,
+    subdomain_data,
+)
 
 # --- Settings of a solve ---------------------------------------------------------------------
 
@@ -384,7 +384,7 @@ class System:
         """Destroy the PETSc objects; all stages are out of date."""
         self._destroy_dual()
         self._destroy_subdomains()
-        self._equals.forget()
+        self._equals.kept.clear()
         if self._gluing is not None:
             self._gluing.constraints.destroy()
         self._gluing = None
@@ -473,7 +473,7 @@ class System:
         parts = self.gluing.constraints, self.subdomains, self._dofs
         self._dual = self._settings.make_dual(*parts, law, names)
         self.dual.seen = max(self.dual.seen, self._seen)
-        self._equals.forget()
+        self._equals.kept.clear()
 
     def _slip(self) -> Array:
         """Tangential v_i of all conditions where the load step begins, shape ``(n, gdim - 1)``."""

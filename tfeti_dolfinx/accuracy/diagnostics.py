@@ -177,7 +177,7 @@ class Diagnostics:
         if self._dofs.V.element.basix_element.degree > 1:
             return
         x, ratios = self._points(subdomains), []
-        for block, part in subdomains.elastic_parts():
+        for block, part in subdomains.elastic_parts:
             own = x[part.start // self._dofs.bs : part.stop // self._dofs.bs]
             ratios.append(stretch_over_shear(own, self._dofs.bs, block.multiply))
         worst = subdomains.body_maxima([ratios])[0]
@@ -221,7 +221,7 @@ class Diagnostics:
         if self.finite or bs != self._decomposition.mesh.geometry.dim or bs == 1:
             return
         angles = []
-        for (_, part), slope_of in zip(subdomains.elastic_parts(), self._slopes, strict=True):
+        for (_, part), slope_of in zip(subdomains.elastic_parts, self._slopes, strict=True):
             slope = slope_of @ u[part].reshape(-1, bs)
             angles.append(float(np.linalg.norm(slope - slope.T)) / 8.0**0.5)
         worst = subdomains.body_maxima([angles])[0]
@@ -274,14 +274,14 @@ class Diagnostics:
     def _make_slopes(self, subdomains: Subdomains) -> list[Array]:
         """Return what gives the mean slopes of a displacement of each subdomain, (gdim, nodes)."""
         x, bs = self._points(subdomains), self._dofs.bs
-        parts = [slice(p.start // bs, p.stop // bs) for _, p in subdomains.elastic_parts()]
+        parts = [slice(p.start // bs, p.stop // bs) for _, p in subdomains.elastic_parts]
         return [np.linalg.pinv(x[part], EPSILON * len(x)) for part in parts]
 
     def _points(self, subdomains: Subdomains) -> Array:
         """Return points of this rank's primal nodes, from the middle of their subdomains on."""
         gdim, bs = self._decomposition.mesh.geometry.dim, self._dofs.bs
         x = self._dofs.V.tabulate_dof_coordinates()[self._dofs.dolfinx_node, :gdim]
-        for _, part in subdomains.elastic_parts():
+        for _, part in subdomains.elastic_parts:
             rows = slice(part.start // bs, part.stop // bs)
             x[rows] -= x[rows].mean(axis=0)
         return np.asarray(x)

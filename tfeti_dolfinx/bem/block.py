@@ -18,7 +18,6 @@ from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.subdomains.block import Block, SubdomainData
-from tfeti_dolfinx.subdomains.build import MakeBlock, subdomain_stiffness
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
 from tfeti_dolfinx.subdomains.sparse_block import (
     EQUAL,
@@ -26,6 +25,7 @@ from tfeti_dolfinx.subdomains.sparse_block import (
     Stiffness,
     places_in_order,
 )
+from tfeti_dolfinx.subdomains.subdomains import MakeBlock, subdomain_stiffness
 
 # --- Block of a subdomain with boundary elements ----------------------------------------------
 

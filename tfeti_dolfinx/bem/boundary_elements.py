@@ -17,8 +17,8 @@ from tfeti_dolfinx.forms.assembly import Forms
 from tfeti_dolfinx.forms.checks import is_zero
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
-from tfeti_dolfinx.subdomains.build import FiniteElements, MakeBlock
 from tfeti_dolfinx.subdomains.kplus import InverseFactory
+from tfeti_dolfinx.subdomains.subdomains import FiniteElements, MakeBlock
 
 
 class BoundaryElements:

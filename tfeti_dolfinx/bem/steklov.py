@@ -370,7 +370,6 @@ class SurfaceStiffness:
         K_io, factor = K[cut:, :cut].tocsc(), self._inner_factor()
         columns = [slice(k, k + TOLERANCES.together) for k in range(0, cut, TOLERANCES.together)]
         parts = [K_io.T @ factor.solve(K_io[:, some].toarray()) for some in columns]
-        factor.destroy()
         return np.hstack(parts)
 
     def _carried(self, inside: Array) -> Array:
@@ -379,7 +378,6 @@ class SurfaceStiffness:
             return np.zeros((self._cut, inside.shape[1]))
         factor = self._inner_factor()
         carried = self.K_fem[: self._cut, self._cut :] @ factor.solve(inside)
-        factor.destroy()
         return np.asarray(carried)
 
     def _inner_factor(self) -> CholeskyFactor:

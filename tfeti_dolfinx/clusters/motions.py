@@ -151,9 +151,6 @@ class ClusterSteps:
 
     def destroy(self) -> None:
         """Free A and the factors. Collective."""
-        self._whole.destroy()
-        if self._blocks is not None:
-            self._blocks.destroy()
         for item in (self._A, self._x, self._y):
             item.destroy()
 

@@ -584,10 +584,6 @@ class ClusterPinv:
         out -= self._glue.Z @ self._glue.apply(self._glue.Z.T @ w)
         out[:] = self._glue.beside(out)
 
-    def destroy(self) -> None:
-        """The factors are the Blocks'."""
-        self._inner.destroy()
-
 
 def _nulls(G: csr_array, places: list[tuple[Array, Array]]) -> csr_array:
     """null(Gᵀ) of all clusters, G of motions × averages."""

@@ -70,7 +70,7 @@ class Balanced:
         solve: Callable[[Array], Array],
         forces: Callable[[Array], Array],
         moved: Callable[[Array], Array],
-        owned: Sequence[Any],
+        owned: Sequence[Any] = (),
     ) -> None:
         self._on_face, self._energy, self._owned = on_face, energy, owned
         self._solve, self._forces, self._moved = solve, forces, moved
@@ -170,7 +170,6 @@ class SoftModes:
             solve=factor.solve,
             forces=lambda c: face.restricted(self._Gt @ c),
             moved=lambda y: summed(self._comm, self._Gt.T @ face.restricted(y)),
-            owned=[factor],
         )
 
     def destroy(self) -> None:

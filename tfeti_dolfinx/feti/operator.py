@@ -46,7 +46,7 @@ def near_stiffness(blocks: Sequence[SparseBlock], rigid: int = 0) -> tuple[csr_a
         kept = np.concatenate((trace, next_to))
         parts.append(K[kept][:, kept])
         means.append(node_means(block.stiffness.diagonal, bs)[next_to])
-        places += [start + np.argsort(block.trace_place), end + np.arange(len(next_to))]
+        places += [start + np.argsort(block.place[block.trace_dofs]), end + np.arange(len(next_to))]
         start, end = start + len(trace), end + len(next_to)
     if rigid:
         parts.append(csr_array((rigid, rigid)))
@@ -129,10 +129,7 @@ class DualOperator:
         return self._seconds / max(self._times, 1)
 
     def destroy(self) -> None:
-        """Destroy the work vectors and the local operator, not B. Collective."""
-        self.local.destroy()
-        if self.metric is not None:
-            self.metric.trace.destroy()
+        """Destroy the work vectors, not B. Collective."""
         for vec in (self._w, self._v, self._x):
             vec.destroy()
 

@@ -245,9 +245,7 @@ class _OnFace:
         return np.asarray(values + self._Z_C @ (solved - contact))
 
     def destroy(self) -> None:
-        """Free the factor. Collective."""
-        if self._factor is not None:
-            self._factor.destroy()
+        """Nothing of other ranks is kept."""
 
 
 def _restricted(gram: PETSc.Mat, Z: csr_array) -> PETSc.Mat:
@@ -363,7 +361,3 @@ class ContactFactor:
     def solve(self, b: Array) -> Array:
         """A⁻¹b, of this rank's parts. Collective."""
         return np.asarray(self._factor.solve(joined_over(self._comm, b))[self._own])
-
-    def destroy(self) -> None:
-        """Free the factor."""
-        self._factor.destroy()

@@ -156,7 +156,7 @@ class SemidefiniteFactor:
                         raise type(error)(f"{what}: {error}") from error
             if not any_rank(comm, lost):
                 break
-            self.destroy()
+            self._factor = None
         if not self._shift:  # only refinement needs the matrix
             del self._A
 
@@ -169,12 +169,6 @@ class SemidefiniteFactor:
         for _ in range(3 if self._shift else 0):
             x += self._factor.solve(b - self._A @ x)
         return _without(self._null, self._scale * x)
-
-    def destroy(self) -> None:
-        """Free the factor."""
-        if self._factor is not None:
-            self._factor.destroy()
-            self._factor = None
 
 
 def _scaling(A: csr_array, null: csr_array) -> tuple[Array, Array]:

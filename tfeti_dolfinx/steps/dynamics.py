@@ -35,8 +35,7 @@ from tfeti_dolfinx.saved_state import SavedState
 from tfeti_dolfinx.solution import Solution
 from tfeti_dolfinx.solve.solver import conclude, solve_dual
 from tfeti_dolfinx.subdomains.block import Counters
-from tfeti_dolfinx.subdomains.build import subdomain_data
-from tfeti_dolfinx.subdomains.subdomains import Subdomains
+from tfeti_dolfinx.subdomains.subdomains import Subdomains, subdomain_data
 from tfeti_dolfinx.system import Settings
 
 # --- Energies and work of a step --------------------------------------------------------------

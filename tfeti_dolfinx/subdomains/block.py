@@ -182,6 +182,7 @@ class Block:
         load: f, shape ``(n,)``.
         kernel: R, an orthonormal basis of the kernel of K, shape ``(n, r)``.
         diagonal: Diagonal of K, shape ``(n,)``.
+        shares: 1 / number of torn copies of each unknown, shape ``(n,)``.
     """
 
     kernel: Array
@@ -189,7 +190,7 @@ class Block:
 
     def __init__(self, data: SubdomainData) -> None:
         self.name, self.x, self.bs = data.name, data.x, data.bs
-        self._body_frame, self._node_shares = data.body_frame, data.node_shares
+        self._body_frame, self.shares = data.body_frame, np.repeat(data.node_shares, data.bs)
         self.trace_dofs = data.trace_dofs
         self.update(data.f)
         self.set_stiffness(data.K)
@@ -219,11 +220,6 @@ class Block:
     def modes(self) -> Array:
         """C, the candidate modes of the whole body, shape ``(n, k)``."""
         return candidate_modes(self.x, self.bs, *self._body_frame)
-
-    @property
-    def shares(self) -> Array:
-        """1 / number of torn copies of each unknown, shape ``(n,)``."""
-        return np.repeat(self._node_shares, self.bs)
 
     def apply_pinv(self, w: Array) -> Array:
         """K⁺ w on the trace for a force w on the trace, shapes ``(t,)``."""
@@ -278,7 +274,7 @@ class RigidBlock(Block):
         self.x = np.zeros((n, 1))
         self.trace_dofs = np.arange(n)
         self.modes = np.eye(num_modes)[mode]
-        self._node_shares = np.ones(n)
+        self.shares = np.ones(n)
         self.update(load)
         self.set_stiffness(None)
 

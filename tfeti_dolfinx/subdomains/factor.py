@@ -10,7 +10,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from mpi4py import MPI
 from petsc4py import PETSc
 
 from tfeti_dolfinx.common.arrays import Array
@@ -73,7 +72,7 @@ class CholeskyFactor:
         except (PETSc.Error, FactorError) as error:
             # PETSc knows no package yet where it could not read an option
             solver = pc.getFactorSolverType() or f"PETSc, with options -{prefix}...,"
-            self.destroy()
+            self._factor = None  # the error holds this object
             raise _cause(error, solver, matrix) from error
         finally:
             pc.destroy()
@@ -104,12 +103,6 @@ class CholeskyFactor:
         self._b.array[:] = b
         self._factor.solve(self._b, self._x)
         return np.array(self._x.array_r)
-
-    def destroy(self) -> None:
-        """Free the factor."""
-        for item in (self._b, self._x, self._factor):
-            if item is not None:
-                item.destroy()
 
 
 @contextmanager
@@ -168,19 +161,15 @@ def has_solver(solver: str, prefix: str = "") -> bool:
     return True
 
 
-def say_if_not_cholmod(comm: MPI.Intracomm) -> None:
-    """Log, on rank 0 and once, what factors the matrices where PETSc has no CHOLMOD."""
-    if comm.rank == 0 and default_solver() != SOLVERS[0]:
-        _say(default_solver())
-
-
 @cache
-def _say(solver: str) -> None:
-    log.warning(
-        "this PETSc is built without CHOLMOD (SuiteSparse): matrices are factored by %s, which "
-        "may be slower",
-        {"mumps": "MUMPS", "petsc": "PETSc's own Cholesky"}[solver],
-    )
+def say_if_not_cholmod() -> None:
+    """Log, once, what factors the matrices where PETSc has no CHOLMOD."""
+    if default_solver() != SOLVERS[0]:
+        log.warning(
+            "this PETSc is built without CHOLMOD (SuiteSparse): matrices are factored by %s, which "
+            "may be slower",
+            {"mumps": "MUMPS", "petsc": "PETSc's own Cholesky"}[default_solver()],
+        )
 
 
 def as_petsc_matrix(A: Any) -> PETSc.Mat:

@@ -92,13 +92,6 @@ def regular_matrix(K: Any, R: Array, fixing_dofs: Array) -> Any:
     return result
 
 
-def solved(inverse: GeneralisedInverse, b: Array) -> Array:
-    """K⁺ b, shapes ``(n,)`` or ``(n, q)``, by an inverse that may know single vectors only."""
-    if b.ndim == 1 or isinstance(inverse, CholeskyFactor):
-        return inverse.solve(b)
-    return np.stack([inverse.solve(column) for column in b.T], axis=1)
-
-
 @dataclass(frozen=True)
 class InverseFactory:
     """Factory of generalised inverses.
@@ -157,7 +150,6 @@ class SchurPseudoinverse(CholeskyFactor):
         V = np.linalg.qr(R[s], mode="complete")[0][:, R.shape[1] :]
         energies, vectors = np.linalg.eigh(V.T @ S @ V)
         if np.any(energies <= 0.0):
-            self.destroy()
             raise NotPositiveDefiniteError("the Schur complement on the fixing nodes is indefinite")
         self._H = np.asarray(E @ V @ (vectors / np.sqrt(energies)))
 
@@ -227,7 +219,6 @@ def why_indefinite(K: Any, R: Array, fixing_dofs: Array, x: Array, prefix: str) 
         return "the stiffness is not positive semidefinite; expected a linear elastic form"
     soft = _with_weakly_held(K, R, x)
     free = 0 if _may_hide_energy(K, x) else _motions_without_energy(K, soft, factor)
-    factor.destroy()
     if free:
         count = f"{'at least ' if free == TOLERANCES.counted else ''}{free} motion"
         return (

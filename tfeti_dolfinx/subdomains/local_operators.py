@@ -122,14 +122,15 @@ def groups_of(blocks: Sequence[Block], kind: OperatorKind) -> list[Group]:
 def _pinv_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
     """K⁺ on a trace that has those of all: a part of it is K⁺ on a part."""
     stiffness = equal[0][0].stiffness
-    trace = np.unique(np.concatenate([block.trace_place for block, _ in equal]))
+    traces = [block.place[block.trace_dofs] for block, _ in equal]
+    trace = np.unique(np.concatenate(traces))
 
     def apply(W: Array) -> Array:
         B = np.zeros((stiffness.size, W.shape[1]), order="F")
         B[trace] = W
         return stiffness.solve(B)[trace]
 
-    rows = [np.searchsorted(trace, block.trace_place) for block, _ in equal]
+    rows = [np.searchsorted(trace, own) for own in traces]
     places, work = _places(rows, len(trace), [part for _, part in equal]), 4.0 * stiffness.entries
     return Group(len(equal), len(trace), len(equal), *places, lambda W: _in_chunks(apply, W), work)
 
@@ -139,7 +140,7 @@ def _schur_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
     traced = equal[0][0].traced
     work = 2.0 * traced.K_bb.nnz
     if traced.inner is not None:
-        work += 4.0 * (traced.K_ib.nnz + traced.inner.entries)
+        work += 4.0 * (traced.coupling[0].nnz + traced.inner.entries)
     size, parts = len(traced.trace), [part for _, part in equal]
     places = _places([block.trace_rows for block, _ in equal], size, parts)
     return Group(len(equal), size, len(equal), *places, traced.apply_schur, work)
@@ -234,10 +235,6 @@ class LocalOperator(Protocol):
         """out = diag(A_s) w, shapes ``(t,)``; w stays as it is, all of out is set."""
         ...
 
-    def destroy(self) -> None:
-        """Free what ``prepare`` has made, but not the Blocks."""
-        ...
-
 
 class GroupedOperator:
     """Equal subdomains apply theirs at once, each group in the form that suits it."""
@@ -265,7 +262,3 @@ class GroupedOperator:
         """out = diag(A_s) w, shapes ``(t,)``."""
         for group in self._groups:
             group.mult(w, out)
-
-    def destroy(self) -> None:
-        """Let dense matrices go; the factors are the Blocks'."""
-        self._groups = []

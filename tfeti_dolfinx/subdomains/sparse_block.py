@@ -31,7 +31,6 @@ from tfeti_dolfinx.subdomains.kplus import (
     InverseFactory,
     check_rank,
     regularised,
-    solved,
     why_indefinite,
 )
 
@@ -53,6 +52,7 @@ class Stiffness:
         K: The stiffness.
         kernel: R, shape ``(n, r)``.
         diagonal: Diagonal of K.
+        entries: Entries of the factor; of an inverse that the user brings, as if it were dense.
 
     Raises:
         InputError: K is not symmetric, not finite or not positive semidefinite.
@@ -73,7 +73,9 @@ class Stiffness:
         fixing = fixing_dofs(x, np.arange(self.size) // self.bs)
         try:
             self._pinv: GeneralisedInverse = how.kplus(K, R, fixing, how.prefix)
+            self.entries = self.size**2 / 2.0
             if isinstance(self._pinv, CholeskyFactor):
+                self.entries = self._pinv.entries
                 check_rank(K, R, x, self._pinv)
         except NotPositiveDefiniteError as error:
             raise InputError(f"{name}: {why_indefinite(K, R, fixing, x, how.prefix)}") from error
@@ -82,18 +84,15 @@ class Stiffness:
 
     def solve(self, b: Array) -> Array:
         """K⁺ b on all unknowns, shapes ``(n,)`` or ``(n, q)``."""
-        return solved(self._pinv, b)
+        if b.ndim == 1 or isinstance(self._pinv, CholeskyFactor):
+            return self._pinv.solve(b)
+        # an inverse that the user brings may know single vectors only
+        return np.stack([self._pinv.solve(column) for column in b.T], axis=1)
 
     @cached_property
     def stretch_over_shear(self) -> float:
         """About (λ + 2μ)/μ, as ``stretch_over_shear`` finds it."""
         return stretch_over_shear(self.x, self.bs, lambda u: self.K @ u)
-
-    @property
-    def entries(self) -> float:
-        """Entries of the factor; of an inverse that the user brings, as if it were dense."""
-        dense = self.size**2 / 2.0
-        return self._pinv.entries if isinstance(self._pinv, CholeskyFactor) else dense
 
     def on_trace(self, trace: Array) -> Traced:
         """K_bb and S on a trace, ascending, the same for all that use it."""
@@ -113,7 +112,10 @@ class Traced:
     def apply_schur(self, w: Array) -> Array:
         """S w = K_bb w − K_bi K_ii⁻¹ K_ib w, shapes ``(t,)`` or ``(t, q)``; K_ii factored once."""
         Kw = np.asarray(self.K_bb @ w)
-        return Kw if self.inner is None else Kw - self._K_bi @ self.inner.solve(self.K_ib @ w)
+        if self.inner is None:
+            return Kw
+        K_ib, K_bi = self.coupling
+        return Kw - K_bi @ self.inner.solve(K_ib @ w)
 
     @cached_property
     def K_bb(self) -> Any:
@@ -121,14 +123,10 @@ class Traced:
         return submatrix(self._stiffness.K, self.trace, self.trace)
 
     @cached_property
-    def K_ib(self) -> Any:
-        """K between the inside and the trace."""
-        return submatrix(self._stiffness.K, self.inside, self.trace)
-
-    @cached_property
-    def _K_bi(self) -> Any:
-        """Its transpose, on the same arrays; scipy would make it anew for each product."""
-        return self.K_ib.T
+    def coupling(self) -> tuple[Any, Any]:
+        """K_ib and its transpose, on the same arrays: scipy would make it for each product."""
+        K_ib = submatrix(self._stiffness.K, self.inside, self.trace)
+        return K_ib, K_ib.T
 
     @cached_property
     def inner(self) -> CholeskyFactor | None:
@@ -196,12 +194,12 @@ EQUAL = EqualityTolerances()
 
 
 class EqualSubdomains:
-    """The stiffnesses of a rank, each held once."""
+    """The stiffnesses of a rank, each held once; ``kept`` are those that ``keep`` holds."""
 
     def __init__(self, how: InverseFactory) -> None:
         self._how = how
         self._of_shape: dict[bytes, WeakSet[Stiffness]] = defaultdict(WeakSet)
-        self._kept: dict[str, tuple[Stiffness, Traced | None]] = {}
+        self.kept: dict[str, tuple[Stiffness, Traced | None]] = {}
 
     def keep(self, blocks: Sequence[Block]) -> None:
         """Hold the stiffnesses of Blocks, with their factors, for those that come after them.
@@ -210,11 +208,7 @@ class EqualSubdomains:
         """
         for block in blocks:
             if isinstance(block, SparseBlock) and block.equals is self:
-                self._kept[block.name] = (block.stiffness, block.__dict__.get("traced"))
-
-    def forget(self) -> None:
-        """Let go what ``keep`` holds."""
-        self._kept.clear()
+                self.kept[block.name] = (block.stiffness, block.__dict__.get("traced"))
 
     def find(self, name: str, x: Array, K: Any) -> tuple[Stiffness, Array]:
         """Return the stiffness that is equal to K, or a new one; and where K's unknowns are in it.
@@ -233,7 +227,7 @@ class EqualSubdomains:
             if _equal(K, stiffness, here):
                 return stiffness, here
             del stiffness
-        self._kept.pop(name, None)  # its factors go before others are made
+        self.kept.pop(name, None)  # its factors go before others are made
         made = Stiffness(name, x, K, self._how)
         known.add(made)
         return made, np.arange(K.shape[0], dtype=np.int32)
@@ -331,7 +325,7 @@ class SparseBlock(Block):
         if kind != "pinv":
             self.traced.K_bb  # noqa: B018
         if kind == "schur":
-            self.traced.inner, self.traced.K_ib  # noqa: B018
+            self.traced.inner, self.traced.coupling  # noqa: B018
 
     def retrace(self, trace_dofs: Array) -> None:
         """Replace the trace; the factor of K_ii goes with it, that of K stays."""
@@ -347,17 +341,12 @@ class SparseBlock(Block):
     @cached_property
     def traced(self) -> Traced:
         """The stiffness on the trace, in its own numbering."""
-        return self.stiffness.on_trace(np.sort(self.trace_place))
-
-    @property
-    def trace_place(self) -> Array:
-        """Unknown of the stiffness for each trace unknown, shape ``(t,)``."""
-        return self.place[self.trace_dofs]
+        return self.stiffness.on_trace(np.sort(self.place[self.trace_dofs]))
 
     @property
     def trace_rows(self) -> Array:
         """Row of ``traced`` for each trace unknown, shape ``(t,)``."""
-        return np.searchsorted(self.traced.trace, self.trace_place)
+        return np.searchsorted(self.traced.trace, self.place[self.trace_dofs])
 
 
 def placed(x: Array, places: Array) -> Array:
