@@ -401,7 +401,10 @@ class System:
 
     def _find_contacts(self) -> None:
         dofs, tools = self._dofs, self.tools
-        first = self._search is None
+        first, said = (
+            self._search is None,
+            list[str]() if self._search is None else self._search.said,
+        )
         tools.place(finite=self.origin is not None)
         contacts = [
             replace(contact, secondary=side) if isinstance(contact, Contact) else contact
@@ -410,6 +413,7 @@ class System:
         decided = not first or self._known_rows is not None
         stiffness = None if decided else self._blocks
         self._search = ContactSearch(contacts, dofs, stiffness, self.origin, tools)
+        self._search.said = said
         if first:
             tools.check_begin(contacts, self._search.records)
         # its sides stay

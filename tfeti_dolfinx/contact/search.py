@@ -46,6 +46,7 @@ class ContactSearch:
         contacts: The contacts with their sides decided: of a pair the secondary one comes first.
         length: Length of the scene.
         records: All conditions of this rank; those ``within_reach`` get rows.
+        said: Contacts that ``warn_of_unmet`` has named last.
 
     Raises:
         InputError: A pair is there twice, or a contact raises it.
@@ -64,7 +65,7 @@ class ContactSearch:
         self.length = bcast_from_root(dofs.comm, diameter(decomposition))
         reach = [contact.first_reach(decomposition) for contact in contacts]
         self._depths = bcast_from_root(dofs.comm, reach)
-        self._reach, self._said = list(self._depths), list[str]()
+        self._reach, self.said = list(self._depths), list[str]()
         check_together(contacts, decomposition)
         settled = [
             contact.settled(dofs, i, self._reach[i], stiffness)
@@ -174,8 +175,8 @@ class ContactSearch:
 
     def warn_of_unmet(self) -> None:
         """Log on rank 0 which contacts have met nobody, once."""
-        before, self._said = self._said, self.unmet()
-        for contact in self._said:
+        before, self.said = self.said, self.unmet()
+        for contact in self.said:
             if self._dofs.comm.rank == 0 and contact not in before:
                 log.warning("contact %s has met nobody, and has no rows", contact)
 

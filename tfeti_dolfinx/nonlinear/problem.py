@@ -20,6 +20,7 @@ from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.contact.partner import ContactPartner, Gap, checked_contacts
 from tfeti_dolfinx.errors import ConvergenceError, InputError, OverlapError, TfetiError
 from tfeti_dolfinx.mesh.decomposition import Decomposition
+from tfeti_dolfinx.mortar.facets import diameter
 from tfeti_dolfinx.nonlinear.forms import CurrentPlaces, NewtonForms
 from tfeti_dolfinx.nonlinear.state import InternalVariables, LawVariables, NewValue
 from tfeti_dolfinx.nonlinear.tangent import rotation_free_tangent
@@ -43,6 +44,7 @@ class NewtonTolerances:
             contacts that the next step has to close again.
         nothing: Of the displacement where the load step began: less is rounding of 0, as of bodies
             that are let go.
+        nowhere: Of the length of the scene, in finite strain: less is rounding of where bodies are.
         final: Share of ``rtol`` to which the last linearised problems are solved at least, so that
             increments can fall below ``rtol``.
         curvature: A step is shortened where the residual along it, contact forces included, has
@@ -78,6 +80,7 @@ class NewtonTolerances:
     forcing: float = 0.3
     loosest: float = 1e-2
     nothing: float = 1e-12
+    nowhere: float = 1e-13
     final: float = 0.2
     curvature: float = 0.5
     max_line_search: int = 12
@@ -192,6 +195,8 @@ class NonlinearContactProblem(ContactProblem):
         self._exact = self.options.number
         self._system.follows = True
         self._first = self._begin = np.array(u.x.array)
+        length = bcast_from_root(decomposition.comm, diameter(decomposition))
+        self._least = self._tolerances.nowhere * length if finite else 0.0
         self._keeping = ModelKeeping(self._tolerances, finite)
         self._last_increment = self._tolerances.loosest
         self._places = CurrentPlaces(u, self.dofs) if finite else None
@@ -268,7 +273,7 @@ class NonlinearContactProblem(ContactProblem):
             short = increment <= exact and not (self._finite and forms.kept)
             if not self._finite:  # whose slopes do not see rotations
                 short |= t == 1.0 and tol.safety * expected <= exact
-            nothing = largest(comm, end) <= tol.nothing * first
+            nothing = largest(comm, end) <= max(tol.nothing * first, self._least)
             if nothing or (short and rtol <= exact):
                 self._set(end)
                 return
