@@ -239,21 +239,19 @@ class ContactProblem:
             try:
                 solution, overlap = self._solve_rows()
             except NoSolutionError as error:  # on all ranks: what is far may hold the body yet
-                if not system.search.is_exhausted:
-                    with stage("contact", self._seconds):
-                        added = system.search.widen()
-                elif unmet := system.search.unmet():
-                    text = f"{error}; of the contacts meet nobody: {', '.join(unmet)}"
-                    raise NoSolutionError(text) from error
-                else:
+                with stage("contact", self._seconds):
+                    added = system.search.widen()
+                if added == 0:
+                    if unmet := system.search.unmet():
+                        text = f"{error}; of the contacts meet nobody: {', '.join(unmet)}"
+                        raise NoSolutionError(text) from error
                     raise
             else:
                 with stage("contact", self._seconds):
                     added = system.search.take_in_overlapping(solution.u, overlap)
                 if added == 0:
                     return
-            if added:
-                system.change("rows")
+            system.change("rows")
             self._counts = self._counts.plus(SolverCounts(late_contact_rows=added))
         raise ConvergenceError(f"nodes out of reach still overlap after {MAX_ROUNDS} rounds")
 
@@ -325,8 +323,8 @@ class ContactProblem:
     def _make_solution(self, u: Array, multipliers: Multipliers, gluing: Gluing) -> Solution:
         tools = self._system.tools
         if tools:
-            records = gluing.records.at(tools.motion(gluing.records, found=True))
-            gluing = replace(gluing, records=records)
+            motion = tools.motion(gluing.records, found=True)
+            gluing = replace(gluing, records=replace(gluing.records, motion=motion))
         solution = Solution(
             u=u,
             multipliers=multipliers,

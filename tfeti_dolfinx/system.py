@@ -262,17 +262,9 @@ class System:
             InputError: Dirichlet conditions contradict each other, or a coefficient of friction
                 is negative or no number somewhere.
         """
-        if self.forms.has_new_points():
-            self.change("points")
-        if self.forms.has_new_stiffness():
-            self.change("stiffness")
-        if self.forms.has_new_load():
-            self.change("load")
-        changes = self.tools.read(self.time)
-        if changes.motion:
-            self.change("places" if changes.place else "right side")
-        if changes.load:
-            self.change("load")
+        changes = self.forms.changes() | self.tools.read(self.time)
+        for what in (name for name in CHANGES if name in changes):
+            self.change(what)
         comm, new, old = self._dofs.comm, prescribe(self._dofs, self.bcs), self._prescribed
         self._prescribed = new
         if old is None or any_rank(comm, not np.array_equal(new.flag, old.flag)):
@@ -438,7 +430,7 @@ class System:
     def _fill_right_side(self) -> None:
         self.search.move()
         values, records = made(self._prescribed).value, self.search.records
-        gluing = replace(self.gluing, records=self.gluing.records.at(records.motion))
+        gluing = replace(self.gluing, records=replace(self.gluing.records, motion=records.motion))
         self._gluing = gluing.with_right_side(values, records.gap, self._slip())
 
     def _set_friction_limits(self) -> None:
@@ -494,7 +486,8 @@ class System:
                 # of the points of rigid bodies that are there now
                 way = before.motion - self.tools.motion_at_begin(records)
                 return slip + np.einsum("ntg,ng->nt", records.tangents, way)
-        return slips(records.at(self.tools.motion_at_begin(records)), self._dofs, self._rest)
+        begun = replace(records, motion=self.tools.motion_at_begin(records))
+        return slips(begun, self._dofs, self._rest)
 
     def _destroy_dual(self) -> None:
         if self._dual is not None:

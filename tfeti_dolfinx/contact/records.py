@@ -102,10 +102,6 @@ class ContactRecords:
         """The a_ij of Σ_j a_ij · u_j, v_i along an axis of the frame, shape ``(k, gdim)``."""
         return self.frame[self.condition, axis] * self.weight[:, None]
 
-    def at(self, motion: Array) -> ContactRecords:
-        """Return the same conditions with rigid bodies at another motion."""
-        return replace(self, motion=motion)
-
 
 def concatenate(records: list[ContactRecords], gdim: int) -> ContactRecords:
     """All conditions of several contacts in one table."""
@@ -133,12 +129,6 @@ def relative_displacement(records: ContactRecords, dofs: TornDofs, u: Array) -> 
     """The v_i, ``(n, gdim)``, from u in primal order; of torn copies the mean. Collective."""
     total = dofs.reduce(u.reshape(-1, dofs.bs), np.add, 0.0)
     return relative_motion(records, dofs, total / dofs.multiplicity[:, None]) - records.motion
-
-
-def remaining_gaps(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
-    """g_i − n_i · v_i, negative where bodies overlap, shape ``(n,)``. Collective."""
-    v = relative_displacement(records, dofs, u)
-    return records.gap - np.sum(records.normal * v, axis=1)
 
 
 def slips(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:

@@ -17,7 +17,6 @@ from tfeti_dolfinx.contact.records import (
     ContactRecords,
     concatenate,
     relative_displacement,
-    remaining_gaps,
 )
 from tfeti_dolfinx.contact.tools import Tools
 from tfeti_dolfinx.mesh.dofs import TornDofs
@@ -117,7 +116,7 @@ class ContactSearch:
     def move(self) -> None:
         """Let rigid bodies be where their laws have them now."""
         if self._tools:
-            self._records = [r.at(self._tools.motion(r)) for r in self._records]
+            self._records = [replace(r, motion=self._tools.motion(r)) for r in self._records]
 
     def take_rows(self, reach: Sequence[float], groups: Sequence[Array]) -> None:
         """Have the rows that an earlier search of the same scene had, as ``rows`` said."""
@@ -140,8 +139,11 @@ class ContactSearch:
             if moved > self._reach[i]:
                 tried.insert(0, (self._search(i, moved), moved))
             for found, reach in tried:
-                at = found.at(self._tools.motion(found, found=True)) if self._tools else found
-                overlaps = remaining_gaps(at, self._dofs, u) < -tolerance
+                there = found
+                if self._tools:
+                    there = replace(found, motion=self._tools.motion(found, found=True))
+                v = relative_displacement(there, self._dofs, u)
+                overlaps = found.gap - np.sum(found.normal * v, axis=1) < -tolerance
                 if new := self._count(overlaps & ~found.within_reach):
                     self._records[i] = replace(found, within_reach=found.within_reach | overlaps)
                     self._reach[i] = reach
@@ -154,15 +156,22 @@ class ContactSearch:
 
         Return how many rows are new, on all ranks; 0 where nothing is left to find.
         """
-        new = 0
-        while new == 0 and not self.is_exhausted:
-            new = sum(self._widen(i) for i in range(len(self.contacts)))
-        return new
-
-    @property
-    def is_exhausted(self) -> bool:
-        """True if every node has its row, however far it is from the other surface."""
-        return all(self._is_exhausted(i) for i in range(len(self.contacts)))
+        while True:
+            new, left = 0, False
+            for i, contact in enumerate(self.contacts):
+                found, before = self._records[i], self._count(self._records[i].within_reach)
+                searched = len(contact.surfaces) == 1 or self._reach[i] >= self.length
+                if searched and self._count(~found.within_reach) == 0:
+                    continue  # all nodes have their rows
+                reach = max(SEARCH.wider * self._reach[i], SEARCH.least * self.length)
+                if not searched:
+                    found = self._search(i, reach)
+                distance = found.gap if self._origin is None else found.geometric_gap
+                within = found.within_reach | (distance <= reach)
+                self._reach[i], self._records[i] = reach, replace(found, within_reach=within)
+                new, left = new + self._count(within) - before, True
+            if new or not left:
+                return new
 
     def unmet(self) -> list[str]:
         """Contacts none of whose nodes has a row: position in the list, and name."""
@@ -195,25 +204,6 @@ class ContactSearch:
         comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
         return bcast_from_root(comm, float(largest.sum()))
 
-    def _is_exhausted(self, i: int) -> bool:
-        """Return whether a contact has rows for all its nodes, and a wider search finds no more."""
-        has_all = len(self.contacts[i].surfaces) == 1 or self._reach[i] >= self.length
-        return has_all and self._count(~self._records[i].within_reach) == 0
-
-    def _widen(self, i: int) -> int:
-        """Increase the reach of one contact; return the number of new rows."""
-        if self._is_exhausted(i):
-            return 0
-        found = self._records[i]
-        before = self._count(found.within_reach)
-        reach = max(SEARCH.wider * self._reach[i], SEARCH.least * self.length)
-        if len(self.contacts[i].surfaces) > 1 and self._reach[i] < self.length:
-            found = self._search(i, reach)
-        self._reach[i] = reach
-        distance = found.gap if self._origin is None else found.geometric_gap
-        self._records[i] = replace(found, within_reach=found.within_reach | (distance <= reach))
-        return self._count(self._records[i].within_reach) - before
-
     def _search(self, i: int, reach: float) -> ContactRecords:
         """Conditions up to a larger reach, of which those have rows that had them before."""
         known = self._records[i]
@@ -224,7 +214,7 @@ class ContactSearch:
     def _from_origin(self, found: ContactRecords) -> ContactRecords:
         """Conditions with the gaps of the total displacement."""
         if self._tools:  # at their places
-            found = found.at(self._tools.motion_there(found))
+            found = replace(found, motion=self._tools.motion_there(found))
         if self._origin is not None:
             way = relative_displacement(found, self._dofs, self._origin)
         elif self._tools:

@@ -36,21 +36,6 @@ class RigidEntries:
 
 
 @dataclass(frozen=True)
-class ToolChanges:
-    """Changes of laws since they were read before.
-
-    Attributes:
-        motion: Whether gaps change.
-        place: Whether a body has to be placed anew.
-        load: Whether a force or moment changes.
-    """
-
-    motion: bool
-    place: bool
-    load: bool
-
-
-@dataclass(frozen=True)
 class ToolMotion:
     """Motion of a rigid body.
 
@@ -141,14 +126,17 @@ class Tools:
     def __len__(self) -> int:
         return len(self.bodies)
 
-    def read(self, time: float) -> ToolChanges:
-        """Take the values that laws have at a time. Collective.
+    def read(self, time: float) -> set[str]:
+        """Take the values that laws have at a time; return what they change. Collective.
+
+        That is ``right side`` where gaps change, ``places`` where a body has to be placed anew, and
+        ``load`` where a force or moment changes.
 
         Raises:
             InputError: A value does not fit.
         """
         if not self.bodies:
-            return ToolChanges(False, False, False)
+            return set()
         with agreeing(self._comm, "laws of rigid bodies") as given:
             both = [body.motion_and_load(self._gdim, time) for body in self.bodies]
             given["time"] = time
@@ -157,10 +145,12 @@ class Tools:
         law, loads = bcast_from_root(self._comm, np.array(both).swapaxes(0, 1))
         loads = loads[self.tool, self.mode] / self.scale
         moved = np.any(law != self.law, axis=1)
-        large = np.array([body.large for body in self.bodies])
-        changed = bool(np.any(loads != self.loads))
+        placed = moved & np.array([body.large for body in self.bodies])
+        changed = {"load"} if np.any(loads != self.loads) else set()
         self.law, self.loads = law, loads
-        return ToolChanges(bool(np.any(moved)), bool(np.any(moved & large)), changed)
+        if np.any(moved):
+            changed.add("places" if np.any(placed) else "right side")
+        return changed
 
     def place(self, finite: bool) -> None:
         """Place bodies where they are, in finite strain all, else those of large motions."""

@@ -94,7 +94,7 @@ class Forms:
             "form_compiler_options": dict(form_compiler_options or {}),
             "jit_options": {**JIT_OPTIONS, **(jit_options or {})},
         }
-        self._points = Data(lambda: [V.mesh.geometry.x], decomposition.comm)
+        self._data = {"points": Data(lambda: [V.mesh.geometry.x], decomposition.comm)}
         self.replace_stiffness(a)
         self.replace_load(L)
 
@@ -102,7 +102,8 @@ class Forms:
         """Take another bilinear form on the same space."""
         name = self.names[0]
         check_form(a, name, self._V, self._decomposition)
-        self._a, self._of_a = self._compiled(a, name), data_of(a, self._V)
+        self._a = self._compiled(a, name)
+        self._data = {**self._data, "stiffness": data_of(a, self._V)}
         self.given = {**self.given, name: a}
 
     def replace_load(self, L: ufl.Form | ufl.ZeroBaseForm) -> None:
@@ -110,20 +111,16 @@ class Forms:
         name = self.names[1]
         check_form(L, name, self._V, self._decomposition)
         self._L = None if is_zero(L) else self._compiled(L, name)
-        self._of_L = data_of(L, self._V)
+        self._data = {**self._data, "load": data_of(L, self._V)}
         self.given = {**self.given, name: L}
 
-    def has_new_points(self) -> bool:
-        """Return whether the mesh has moved since the last call."""
-        return self._points.has_changed()
+    def changes(self, *kept: str) -> set[str]:
+        """Return which of ``points``, ``stiffness`` and ``load`` are new since they were asked for.
 
-    def has_new_stiffness(self) -> bool:
-        """Return whether a, or what it refers to, has changed since the last call."""
-        return self._of_a.has_changed()
-
-    def has_new_load(self) -> bool:
-        """Return whether L, or what it refers to, has changed since the last call."""
-        return self._of_L.has_changed()
+        Those of the mesh, and forms or what they refer to; ``kept`` ones are not asked for.
+        """
+        asked = {name: data for name, data in self._data.items() if name not in kept}
+        return {name for name, data in asked.items() if data.has_changed()}
 
     def stiffness(self) -> Any:
         """Return this rank's K in DOLFINx's numbering, scipy CSR."""

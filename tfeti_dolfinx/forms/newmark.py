@@ -114,20 +114,18 @@ class Inertia:
             log.warning("the step is now %g, it was %g: all is factored anew", size, known)
         self.motion.size = size
 
-    def has_new_matrix(self) -> bool:
-        """Return whether M or the step has changed since the last call."""
-        new_mass, new_step = self._of_m.has_changed(), self._of_step.has_changed()
-        if new_mass:
-            self.forget()
-        return new_mass or new_step
+    def changes(self, moved: bool) -> set[str]:
+        """Return which of ``stiffness`` and ``load`` are new since the last call.
 
-    def has_new_motion(self) -> bool:
-        """Return whether the state at the step's begin has changed since the last call."""
-        return self._of_motion.has_changed()
-
-    def forget(self) -> None:
-        """Let M be assembled anew."""
-        self._M = None
+        They are by M, which is assembled anew where the mesh has moved, too, by the step, and by
+        the state at its begin.
+        """
+        data = (self._of_m, self._of_step, self._of_motion)
+        new_mass, new_step, new_motion = [part.has_changed() for part in data]
+        if new_mass or moved:
+            self._M = None
+        found = {"stiffness", "load"} if new_mass or new_step else set()
+        return found | ({"load"} if new_motion else set())
 
     @property
     def M(self) -> csr_array:
@@ -156,11 +154,6 @@ class Inertia:
             return made
         return 0.5 * K + share * M
 
-    @property
-    def mean_load(self) -> Array:
-        """f of the step, by the trapezoidal rule."""
-        return 0.5 * (self.motion.load + self.ends)
-
     def move(self, u: Array, v: Array, load: Array | None = None) -> None:
         """Let the next step begin at a displacement and a velocity, and with the last load."""
         motion = self.motion
@@ -185,28 +178,14 @@ class InertialForms(Forms):
         self.inertia.ends = super().load()
         self.given = {**self.given, "mass": mass}
         self._K: csr_array | None = None
-        self._new_matrices = True
 
-    def has_new_points(self) -> bool:
-        """Return whether the mesh has moved since the last call."""
-        if changed := super().has_new_points():
+    def changes(self, *kept: str) -> set[str]:
+        """Return what is new, by inertia, too; a new matrix makes a new load."""
+        found = super().changes(*kept)
+        if found & {"points", "stiffness"}:
             self._K = None
-            self.inertia.forget()
-        return changed
-
-    def has_new_stiffness(self) -> bool:
-        """Return whether K, M or the step has changed since the last call."""
-        found = self.inertia.has_new_matrix()
-        if super().has_new_stiffness():
-            self._K, found = None, True
-        self._new_matrices |= found
-        return found
-
-    def has_new_load(self) -> bool:
-        """Return whether L, the state at the step's begin, K, M or the step has changed."""
-        changed = super().has_new_load() or self._new_matrices
-        self._new_matrices = False
-        return self.inertia.has_new_motion() or changed
+        found |= self.inertia.changes("points" in found)
+        return found | {"load"} if "stiffness" in found else found
 
     @property
     def K(self) -> csr_array:
@@ -224,7 +203,7 @@ class InertialForms(Forms):
         inertia = self.inertia
         motion, inertia.ends = inertia.motion, super().load()
         pull = inertia.M @ motion.towards * inertia.share
-        return inertia.mean_load + pull - 0.5 * (self.K @ motion.u)
+        return 0.5 * (motion.load + inertia.ends) + pull - 0.5 * (self.K @ motion.u)
 
     def elastic(self, u: Array) -> float:
         """Return this rank's part of uᵀKu/2."""

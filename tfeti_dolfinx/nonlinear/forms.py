@@ -45,20 +45,16 @@ class NewtonForms(Forms):
     def __init__(
         self, J: ufl.Form, F: ufl.Form, *as_forms: Any, u: fem.Function, finite: bool
     ) -> None:
-        self._u, self.kept, self._new_matrix = u, False, True
+        self._u, self.kept = u, False
         self._x = u.function_space.mesh.geometry.x
         self._reference = self._x.copy() if finite else None
         self._matrix: csr_array | None = None
         super().__init__(J, F, *as_forms)
 
-    def has_new_stiffness(self) -> bool:
-        """Return whether J has changed since the last call; never where it is kept."""
-        self._new_matrix = not self.kept and super().has_new_stiffness()
-        return self._new_matrix
-
-    def has_new_load(self) -> bool:
-        """Return whether u, or what F and J refer to, has changed since the last call."""
-        return super().has_new_load() or self._new_matrix
+    def changes(self, *kept: str) -> set[str]:
+        """Return what is new, of J nothing where it is kept; a new J makes a new load."""
+        found = super().changes(*kept, *(["stiffness"] if self.kept else []))
+        return found | {"load"} if "stiffness" in found else found
 
     def stiffness(self) -> Any:
         """Return this rank's J(u)."""
@@ -120,23 +116,10 @@ class InertialNewtonForms(NewtonForms):
         self.inertia = Inertia(mass, self._V, self._decomposition, self._compiled)
         self.given = {**self.given, "mass": mass}
 
-    def has_new_points(self) -> bool:
-        """Return whether the mesh has moved since the last call."""
-        moved = super().has_new_points()
-        if moved and self._reference is None:
-            self.inertia.forget()
-        return moved
-
-    def has_new_stiffness(self) -> bool:
-        """Return whether J, M or the step has changed since the last call."""
-        new, changed = self.inertia.has_new_matrix(), super().has_new_stiffness()
-        self._new_matrix = new or changed
-        return self._new_matrix
-
-    def has_new_load(self) -> bool:
-        """Return whether u, the state at the step's begin, or what forms refer to has changed."""
-        new, changed = self.inertia.has_new_motion(), super().has_new_load()
-        return new or changed
+    def changes(self, *kept: str) -> set[str]:
+        """Return what is new, by inertia, too."""
+        found = super().changes(*kept)
+        return found | self.inertia.changes("points" in found and self._reference is None)
 
     def stiffness(self) -> Any:
         """Return this rank's J/2 + 2M/τ²."""

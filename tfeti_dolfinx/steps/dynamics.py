@@ -68,7 +68,7 @@ def balance(
         0.5 * v @ (M @ v),
         forms.elastic(u),
         0.5 * motion.v @ (M @ motion.v) + forms.elastic(motion.u),
-        inertia.mean_load @ way,
+        0.5 * (motion.load + inertia.ends) @ way,
         *_work_of_rows(dual, solution.lam, solution.dofs.to_primal(way)),
         0.5 * (start @ (M @ start) - motion.v @ (M @ motion.v))
         - 2.0 / motion.size**2 * kicked @ (M @ (u - motion.towards)),
