@@ -307,7 +307,8 @@ class Solution(ContactState):
         records, dofs = self.gluing.records, self.dofs
         total = sum_rows(records.group, force, dofs.num_groups)
         area = sum_rows(records.group, self.area, dofs.num_groups)
-        whole = hat_integrals(dofs, self.secondary_surfaces, self.thickness)
+        surfaces = [contact.surfaces[0] for contact in self.contacts]
+        whole = hat_integrals(dofs, surfaces, self.thickness)
         area = np.minimum(area, whole)[:, None]
         return np.divide(total, area, out=np.zeros_like(total), where=area > 0.0)
 

@@ -298,24 +298,21 @@ class ContactState:
 
         Where a pair covers a part of the node's surface, the thickness is its mean over the whole.
         """
-        surfaces = self.secondary_surfaces
+        surfaces = [contact.surfaces[0] for contact in self.contacts]
         return condition_areas(self.gluing.records, self.dofs, surfaces, self.thickness)
 
     @cached_property
     def remaining_gap(self) -> Array:
         """Gap after deformation of each contact condition of this rank. Collective at first use."""
+        return self.gluing.records.gap - self._motion[0]
+
+    @cached_property
+    def _motion(self) -> tuple[Array, Array]:
+        """The v_i along normals, ``(n,)``, and tangents, ``(n, gdim - 1)``. Collective at first."""
         records = self.gluing.records
-        return records.gap - np.sum(records.normal * self._relative, axis=1)
-
-    @cached_property
-    def _relative(self) -> Array:
-        """The v_i of all conditions, shape ``(n, gdim)``. Collective at first use."""
-        return relative_displacement(self.gluing.records, self.dofs, self.u)
-
-    @cached_property
-    def _slips(self) -> Array:
-        """The v_i along the tangents, shape ``(n, gdim - 1)``. Collective at first use."""
-        return np.einsum("ntg,ng->nt", self.gluing.records.tangents, self._relative)
+        v = relative_displacement(records, self.dofs, self.u)
+        along = np.einsum("ntg,ng->nt", records.tangents, v)
+        return np.sum(records.normal * v, axis=1), along
 
     @cached_property
     def slip_of_conditions(self) -> Array:
@@ -324,7 +321,7 @@ class ContactState:
         Shape ``(n, gdim)``. Collective at first use.
         """
         records = self.gluing.records
-        slip = self._slips - self.gluing.slip
+        slip = self._motion[1] - self.gluing.slip
         return np.einsum("nt,ntg->ng", slip, records.tangents)
 
     @cached_property
@@ -335,7 +332,7 @@ class ContactState:
         one before for a slip. Collective at first use.
         """
         gluing, rows = self.gluing, self.gluing.tangents
-        at, end = gluing.constraints.sets.tangents, self._slips
+        at, end = gluing.constraints.sets.tangents, self._motion[1]
         rubs = np.any(self.lam[at] != 0.0, axis=1) & np.all(self.holding[at] | ~rows.moves, axis=1)
         kept = np.zeros(end.shape, dtype=bool)
         kept[rows.condition] = rubs[:, None] & rows.moves
@@ -362,11 +359,6 @@ class ContactState:
         closed = np.isin(rows.condition, np.concatenate((touching, gluing.contact.decided)))
         status[rows.condition[closed]] = rubbing[closed]
         return status
-
-    @property
-    def secondary_surfaces(self) -> list[str | int]:
-        """The surfaces whose nodes have the conditions."""
-        return [contact.surfaces[0] for contact in self.contacts]
 
     @cached_property
     def condition_forces(self) -> Array:

@@ -122,7 +122,7 @@ class CoarseSpace(Coarse):
         if not self.dimension:
             return y
         known = self._damped
-        if known is None or self._differs(known[0], face) or known[1] != damping:
+        if known is None or any_rank(self.comm, not face.is_like(known[0])) or known[1] != damping:
             self._damped = None
             gram = self.grams.of_face(face, damping)
             known = self._damped = (face, damping, self.factors.factor(gram))
@@ -135,17 +135,14 @@ class CoarseSpace(Coarse):
         for P and Q, since what the factor makes of such a motion G_fᵀ does not see.
         """
         known = self._on_face
-        if known is None or known.face is None or self._differs(known.face, face):
+        # a face that bends is like none
+        if known is None or any_rank(self.comm, known.face is None or not face.is_like(known.face)):
             self._on_face = None
             factor = self.factors.factor(self.grams.of_face(face))
             known = self._on_face = Coarse(self.comm, self.Gt, self.e, factor.solve, face)
             known.own, known.moduli = self.own, self.moduli
         known.e = self.e
         return known
-
-    def _differs(self, known: Face, face: Face) -> bool:
-        """Return whether a face is another one on some rank, or bends. Collective."""
-        return any_rank(self.comm, not face.is_like(known))
 
     def oblique(self, face: Face, C: csr_array) -> ObliqueProjectors:
         """Return the projectors on a face of the rows where others follow: λ = (I + C)u.

@@ -146,8 +146,7 @@ class Dual:
         self._names = body_names, mode_names
         B, comm = constraints.B, constraints.B.getComm().tompi4py()
         self._stiffness = largest(comm, subdomains.diagonal)
-        self.d = self._linear_term()
-        self._check_units(comm)
+        self._set_linear_term(comm)
         self.F = DualOperator(B, subdomains.local_operator("pinv"))
         self.preconditioner: DualOperator | None = None
         self._scaled: PETSc.Mat | None = None
@@ -191,8 +190,7 @@ class Dual:
             InputError: Squares of load or values leave the range of floating point.
             NoSolutionError: The load moves a body that nothing holds.
         """
-        self.d = self._linear_term()
-        self._check_units(self.coarse.comm)
+        self._set_linear_term(self.coarse.comm)
         self.coarse.update_load()
         self._check_solvable()
 
@@ -214,10 +212,6 @@ class Dual:
         if not any_rank(comm, limited or size == 0.0):
             self._held_load = load / size
 
-    def _linear_term(self) -> Array:
-        response = self.subdomains.pinv_load[self.subdomains.trace]
-        return self.constraints.jumps(response) - self.constraints.c
-
     def learn(self) -> None:
         """Keep directions from now on, where options leave that open: more solves come."""
         if self._learns and self.recycled is None:
@@ -237,7 +231,10 @@ class Dual:
             self._lifting = made
         return self._lifting
 
-    def _check_units(self, comm: MPI.Intracomm) -> None:
+    def _set_linear_term(self, comm: MPI.Intracomm) -> None:
+        """Make d = BK⁺f − c, and raise where squares leave floating point. Collective."""
+        response = self.subdomains.pinv_load[self.subdomains.trace]
+        self.d = self.constraints.jumps(response) - self.constraints.c
         length = largest(comm, self.driving)
         sizes = {"stiffness": self._stiffness, "displacements": length}
         sizes["forces"] = self._stiffness * length

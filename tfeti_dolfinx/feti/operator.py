@@ -86,12 +86,13 @@ class DualOperator:
 
     Attributes:
         count: Multiplications so far, by who they are charged to (``"solver"`` by default).
+        seconds: Seconds that diag(A_s) has taken on this rank, in ``times`` multiplications.
     """
 
     def __init__(self, B: PETSc.Mat, local: LocalOperator, metric: Metric | None = None) -> None:
         self.B, self.local, self.metric = B, local, metric
         self.count: Counter[str] = Counter()
-        self._payer, self._seconds, self._times = "solver", 0.0, 0
+        self._payer, self.seconds, self.times = "solver", 0.0, 0
         self._w, self._x = B.createVecs()
         self._v = self._w.duplicate()
         with raised_on_all_ranks(self._w.getComm().tompi4py()):
@@ -121,12 +122,7 @@ class DualOperator:
         self.count[self._payer] += 1
         start = perf_counter()
         self.local.mult(w, out)
-        self._seconds, self._times = self._seconds + perf_counter() - start, self._times + 1
-
-    @property
-    def local_seconds(self) -> float:
-        """Seconds that diag(A_s) has taken on this rank, on average of all multiplications."""
-        return self._seconds / max(self._times, 1)
+        self.seconds, self.times = self.seconds + perf_counter() - start, self.times + 1
 
     def destroy(self) -> None:
         """Destroy the work vectors, not B. Collective."""

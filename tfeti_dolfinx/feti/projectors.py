@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 
 import numpy as np
 from mpi4py import MPI
@@ -33,9 +34,10 @@ class Grams:
         self._comm, self._Gt, size = comm, Gt, Gt.shape[1]
         self._always = np.ones(Gt.shape[0], dtype=bool)
         self._always[bounded] = False
-        base = replicated_gram(Gt[self._always], comm).tocoo()
+        always = Gt[self._always]
+        base = replicated(always.T @ always, comm).tocoo()
         # 1. the entries that contact rows reach, on all ranks, and those of the whole
-        parts = [(rows, G, _pairs(columns, size)) for rows, columns, G in _blocks(Gt, bounded)]
+        parts = list(_blocks(Gt, bounded))
         own = np.unique(np.concatenate([np.empty(0, np.int64), *(pairs for *_, pairs in parts)]))
         reached = np.unique(joined_over(comm, own))
         known = base.coords[0].astype(np.int64) * size + base.coords[1]
@@ -65,7 +67,8 @@ class Grams:
         sums[-2:] = np.any(face.status[self._always] != Status.FREE), len(face.tangents)
         *_, others, tangents = summed(self._comm, sums)
         if others:
-            gram = replicated_gram(face.Z.T @ self._Gt, self._comm)
+            rows = face.Z.T @ self._Gt
+            gram = replicated(rows.T @ rows, self._comm)
             return gram + damping * self.whole if damping else gram
         data = np.array(self._base)
         data[self._reached] += sums[:-2]
@@ -73,12 +76,13 @@ class Grams:
             data += damping * self.whole.data
         gram = csr_array((data, *self._table), shape=(size, size))
         if tangents:
-            gram = gram + replicated_gram(face.T.T @ self._Gt, self._comm)
+            along = face.T.T @ self._Gt
+            gram = gram + replicated(along.T @ along, self._comm)
         return gram
 
 
 def _blocks(Gt: csr_array, some: Array) -> Iterator[tuple[Array, Array, Array]]:
-    """Rows with the same coordinates: they, these coordinates and their entries, dense."""
+    """Rows with the same coordinates, their entries, dense, and numbers of pairs of coordinates."""
     own = Gt[some]
     own.eliminate_zeros()
     own.sort_indices()
@@ -89,18 +93,9 @@ def _blocks(Gt: csr_array, some: Array) -> Iterator[tuple[Array, Array, Array]]:
         found, which = np.unique(own.indices[places], axis=0, return_inverse=True)
         for k, columns in enumerate(found):
             rows = np.flatnonzero(which.ravel() == k)
-            yield some[at[rows]], columns, own.data[places[rows]]
-
-
-def _pairs(columns: Array, size: int) -> Array:
-    """Return numbers of the entries that columns have with each other, ascending."""
-    columns = columns.astype(np.int64)
-    return (columns[:, None] * size + columns).ravel()
-
-
-def replicated_gram(Gt: csr_array, comm: MPI.Intracomm) -> csr_array:
-    """GGᵀ from all ranks' rows of Gᵀ, shape ``(r, r)``; on all ranks. Collective."""
-    return replicated(Gt.T @ Gt, comm)
+            columns = columns.astype(np.int64)
+            pairs = (columns[:, None] * Gt.shape[1] + columns).ravel()
+            yield some[at[rows]], own.data[places[rows]], pairs
 
 
 def replicated(part: csr_array, comm: MPI.Intracomm) -> csr_array:
@@ -258,15 +253,17 @@ class ObliqueProjectors:
 # --- Factors of faces -----------------------------------------------------------------------
 
 
+@dataclass
 class FaceFactors:
     """Factors of the Gram matrices of faces; ``count``: how many, of the whole and of faces."""
 
-    def __init__(self, comm: MPI.Intracomm, null: csr_array, prefix: str) -> None:
-        self.comm, self._null, self._prefix = comm, null, prefix
-        self.count: Counter[str] = Counter()
+    comm: MPI.Intracomm
+    null: csr_array
+    prefix: str
+    count: Counter[str] = field(default_factory=Counter)
 
     def factor(self, gram: csr_array, kind: str = "face") -> SemidefiniteFactor:
         """Return a factor of a Gram matrix, or raise a FactorError. Collective."""
         self.count[kind] += int(gram.shape[0] > 0)
         what = f"GGᵀ of the {'coarse problem' if kind == 'whole' else 'rows of a face'}"
-        return SemidefiniteFactor(gram, self._null, self.comm, what, self._prefix)
+        return SemidefiniteFactor(gram, self.null, self.comm, what, self.prefix)

@@ -126,11 +126,9 @@ def min_norm_correction(
     elastic = np.isfinite(D)
     root = np.sqrt(D[elastic])
 
-    def square(a: Array) -> float:
-        return float(summed(comm, np.array([a @ a]))[0])
-
     def in_D(s: Array) -> float:  # ‖s‖²_D, of what does not move rigid bodies
-        return square(root * s[elastic])
+        own = root * s[elastic]
+        return float(summed(comm, np.array([own @ own]))[0])
 
     apart = np.array(w)
     apart[contact] = 0.0
@@ -142,7 +140,7 @@ def min_norm_correction(
         if left <= enough:
             break
         q = np.where(closed, constraints.jumps(p)[contact], 0.0)
-        if (curvature := square(q)) == 0.0:
+        if (curvature := float(summed(comm, np.array([q @ q]))[0])) == 0.0:
             break
         x = x + left / curvature * p
         r = r - left / curvature * q

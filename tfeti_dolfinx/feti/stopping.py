@@ -15,7 +15,7 @@ from tfeti_dolfinx.feti.dual import Dual
 from tfeti_dolfinx.feti.duality_gap import EnergyBound, energy_bound, within
 from tfeti_dolfinx.feti.recovery import Recovered, min_norm_correction, recover
 from tfeti_dolfinx.qp.coarse import LIGHT
-from tfeti_dolfinx.qp.problem import ROUNDING, ConvergedReason, StoppingRule
+from tfeti_dolfinx.qp.problem import ROUNDING, ConvergedReason, QPResult, StoppingRule
 from tfeti_dolfinx.qp.sets import Face
 
 # from the displacement on this rank to the other error, a root of an energy; collective
@@ -289,11 +289,6 @@ class Accuracy(StoppingRule):
         self.goal: ErrorTarget | None = None
         self.reached: list[TargetStatus] = []
 
-    @property
-    def aim(self) -> float:
-        """The tolerance; 0 before the first assessment against a target, which is costly."""
-        return 0.0 if self.goal is not None and self.looks == 0 else self.tolerance
-
     def examine(self, lam: Array, gradient: Array, face: Face, residual: float) -> ConvergedReason:
         """Assess an iterate, and return why to stop, or ITERATING. Collective."""
         self.look(lam, gradient, face, residual)
@@ -342,7 +337,7 @@ class Accuracy(StoppingRule):
         now = measure(self._dual, state, face, self.norm, before)
         self._before = self.measures if self.looks else None
         self.recovered, self.measures = state, now
-        self.looks += 1
+        self.looks, self.waits = self.looks + 1, False
         if self.goal is not None:
             bound, goal = energy_bound(self._dual, lam, state.u, self.norm), self.goal(state.u)
             allowed = self._limits.target * max(goal, 1e-5 * now.energy)
@@ -363,9 +358,13 @@ class Accuracy(StoppingRule):
         ratio, longest = steering(self._dual.coarse.comm, self.ratio(), self.measures.longest)
         return bool(ratio <= 1.0 or longest <= self._atol)
 
-    def accept_rounding(self) -> None:
-        """Accept errors that rounding may explain, as no solver reduces them any further."""
+    def examine_stopped(self, result: QPResult) -> None:
+        """Assess where a solver has stopped early: errors that rounding explains are accepted."""
         self._small = float("inf")
+        residual = max(result.projected_gradient, result.norm * result.equality)
+        reason = self.examine(result.lam, result.gradient, result.face, residual)
+        if reason > 0:
+            result.reason = reason
 
     def errors(self, changes: bool = True) -> Array:
         """Estimated errors of u at the last look, a length for each body, shape ``(bodies,)``.

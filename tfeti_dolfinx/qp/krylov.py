@@ -223,7 +223,7 @@ def pcpg(
         # direction
         p = z - products @ kept.directions
         if past is not None:
-            p = past.conjugate(p)
+            p = p - past.along(p, past.known.images)[0]
         # step
         Fp = qp.F(p)
         PFp, pFp, pp, (rp,) = qp.coarse.project_against(Fp, p, np.array([r @ p]))
@@ -316,8 +316,8 @@ def _begun(qp: QP, point: Point, own: Directions) -> tuple[RecycledOnFace | None
         if past.count == 0:
             past = None
         else:
-            way, image = past.least(own.r)
+            way, b = past.along(own.r, past.known.directions)
             # rounding of many directions is none of Gλ = e
-            point.lam, point.g = point.lam + project(way), point.g + image
+            point.lam, point.g = point.lam + project(way), point.g + past.known.images.T @ b
             own.fresh, own.r = True, project(project(-point.g))
     return past, norm_over(qp.comm, own.r)

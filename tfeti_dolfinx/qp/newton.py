@@ -510,7 +510,8 @@ class FaceSolver:
         own.fresh = own.fresh or not resume or self._curved
         share = given.stage if resume else given.reduction
         target = share * min(norm_over(qp.comm, self.coarse.project(z.g)), optimality)
-        rule = StoppingRule(max(target, given.final * self._rule.aim))
+        lowest = 0.0 if self._rule.waits else given.final * self._rule.tolerance
+        rule = StoppingRule(max(target, lowest))
         end, norm = Point(z.lam, z.g), own.norm
         reason = pcpg(on_face, end, rule, self._steps, self._max_it, self._monitor, own)
         self.left = norm_over(qp.comm, own.r)

@@ -325,16 +325,13 @@ class StoppingRule:
             the solver makes it anew and takes the flag back.
         norm: ‖F‖, or an estimate: residuals over it are errors of multipliers. A solver that
             learns it on its way says so here.
+        waits: Whether an examination is to wait for solves on faces, whatever they aim at.
     """
 
     tolerance: float
     drifted: bool = False
     norm: float = 1.0
-
-    @property
-    def aim(self) -> float:
-        """The least that solves on faces aim at; 0 where an examination is to wait for one."""
-        return self.tolerance
+    waits: bool = False
 
     def examine(self, lam: Array, gradient: Array, face: Face, residual: float) -> ConvergedReason:
         """Examine an iterate whose residuals are small. Collective.

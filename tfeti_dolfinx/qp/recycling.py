@@ -146,30 +146,23 @@ class RecycledOnFace:
     """
 
     def __init__(self, known: Recycled, held: Array | None = None) -> None:
-        self._known, self._held = known, held
+        self.known, self._held = known, held
         self._N = None if held is None else known.without(known.directions.T[held])
         self.count = known.count if self._N is None else self._N.shape[1]
 
-    def least(self, r: Array) -> tuple[Array, Array]:
-        """Return the step along W to where q is least, given r = −P(Fλ − d), and its image."""
-        b = self._part(r, self._known.directions)
-        return self._combined(b), self._known.images.T @ b
+    def along(self, x: Array, rows: Array) -> tuple[Array, Array]:
+        """Return W b, 0 where the face holds rows, and b = N Nᵀ rows x; one reduction.
 
-    def conjugate(self, p: Array) -> Array:
-        """Return a direction made F-orthogonal to W; one reduction."""
-        return p - self._combined(self._part(p, self._known.images))
-
-    def _part(self, x: Array, rows: Array) -> Array:
-        """N Nᵀ times products of x with rows."""
-        a = summed(self._known.comm, rows @ x)
-        return a if self._N is None else self._N @ (self._N.T @ a)
-
-    def _combined(self, b: Array) -> Array:
-        """W b, 0 where the face holds rows."""
-        x = self._known.directions.T @ b
+        For r = −P(Fλ − d) and the directions W as rows that is the step to where q is least; p less
+        that for p and the images FW is F-orthogonal to W.
+        """
+        b = summed(self.known.comm, rows @ x)
+        if self._N is not None:
+            b = self._N @ (self._N.T @ b)
+        step = self.known.directions.T @ b
         if self._held is not None:
-            x[self._held] = 0.0
-        return np.asarray(x)
+            step[self._held] = 0.0
+        return step, b
 
 
 def triangle(comm: MPI.Intracomm, A: Array) -> Array:

@@ -31,16 +31,6 @@ from tfeti_dolfinx.qp.problem import (
 from tfeti_dolfinx.qp.sets import Status
 from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver
 
-
-def last_look(result: QPResult, rule: Accuracy) -> None:
-    """Assess the point at which a solver stopped early: it may be good enough."""
-    residual = max(result.projected_gradient, result.norm * result.equality)
-    rule.accept_rounding()
-    reason = rule.examine(result.lam, result.gradient, result.face, residual)
-    if reason > 0:
-        result.reason = reason
-
-
 # --- Choice and run of a solver ---------------------------------------------------------------
 
 EXPLANATIONS = {
@@ -133,7 +123,7 @@ def solve_dual(
     rtol = options.number if rtol is None else rtol
     scale = homogenised.reference, homogenised.rounding
     rule = Accuracy(dual, rtol, options.atol, scale, qp.norm)
-    rule.goal = goal
+    rule.goal, rule.waits = goal, goal is not None  # assessments against a target are costly
     parameters = getattr(options, qp_type, solver.parameters)
     result = solver.solve(
         qp, homogenised, rule, parameters, max_it=options.max_it, start=begin, monitor=monitor
@@ -144,7 +134,7 @@ def solve_dual(
     if dual.coarse.dimension == 0 or qp_type == "newton":
         dual.last.keep(result, qp)
     if result.reason <= 0:
-        last_look(result, rule)
+        rule.examine_stopped(result)
     return result, rule
 
 
