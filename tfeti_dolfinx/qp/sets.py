@@ -32,11 +32,6 @@ class Status(IntEnum):
     SLIP = 4
 
 
-NO_ROWS: Array = np.zeros((0, 2), dtype=np.int64)
-NO_TANGENTS: Array = np.zeros((0, 2))
-FLAT: Array = np.zeros(0)
-
-
 @dataclass(frozen=True)
 class Face:
     """The face of a feasible set on which a point lies, on this rank's rows.
@@ -56,9 +51,9 @@ class Face:
 
     free: Array
     status: Array
-    tangent_rows: Array = field(default_factory=lambda: NO_ROWS)
-    tangents: Array = field(default_factory=lambda: NO_TANGENTS)
-    curvature: Array = field(default_factory=lambda: FLAT)
+    tangent_rows: Array = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
+    tangents: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    curvature: Array = field(default_factory=lambda: np.zeros(0))
 
     @cached_property
     def carrying(self) -> Array:
