@@ -15,7 +15,7 @@ from tfeti_dolfinx.common.arrays import Array
 from tfeti_dolfinx.common.parallel import any_rank, dot_over, norm_over
 from tfeti_dolfinx.qp.coarse import Coarse
 from tfeti_dolfinx.qp.recycling import Recycled
-from tfeti_dolfinx.qp.sets import Face, FeasibleSet
+from tfeti_dolfinx.qp.sets import Face, FeasibleSet, Status
 
 # --- The quadratic program and its result -----------------------------------------------------
 # Vectors are this rank's parts, in the layout of all rows, shape ``(m,)``.
@@ -382,19 +382,21 @@ class PrintMonitor:
 
     Attributes:
         comm: Communicator.
-        touching: Number of free components among the bounded ones of an iterate on this rank.
+        feasible: The set; rows that it constrains and that carry a force are said to touch.
         multiplications: Multiplications by F so far.
     """
 
     comm: MPI.Intracomm
-    touching: Callable[[Array], int]
+    feasible: FeasibleSet
     multiplications: Callable[[], int]
 
     def __call__(
         self, steps: Steps, step: str, x: Array, projected_gradient: float, equality: float
     ) -> None:
         """Print outer iteration, step, ‖g^P‖, ‖Qx‖ if known, touching rows, multiplications."""
-        touching = self.comm.allreduce(self.touching(x))
+        face = self.feasible.face(x, np.zeros(len(x)))
+        own = int(np.sum((face.status != Status.FREE) & face.carrying))
+        touching = self.comm.allreduce(own)
         if self.comm.rank == 0:
             known = f"{equality:.4e}" if equality >= 0.0 else " " * 10
             print(

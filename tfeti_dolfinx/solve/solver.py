@@ -28,7 +28,6 @@ from tfeti_dolfinx.qp.problem import (
     no_monitor,
     operator_product,
 )
-from tfeti_dolfinx.qp.sets import Status
 from tfeti_dolfinx.qp.solvers import AUTO, SOLVERS, Solver
 
 # --- Choice and run of a solver ---------------------------------------------------------------
@@ -118,15 +117,21 @@ def solve_dual(
     qp = dual.qp(options.norm_steps if solver.relative_to_norm else 0)
     begin = _start(start, qp)
     homogenised = _homogenise(dual, qp, solver, begin)
-    if monitor is None:
-        monitor = _monitor(dual, options)
+    if monitor is None and options.monitor:
+        monitor = PrintMonitor(qp.comm, qp.feasible, lambda: dual.F.count["solver"])
     rtol = options.number if rtol is None else rtol
     scale = homogenised.reference, homogenised.rounding
     rule = Accuracy(dual, rtol, options.atol, scale, qp.norm)
     rule.goal, rule.waits = goal, goal is not None  # assessments against a target are costly
     parameters = getattr(options, qp_type, solver.parameters)
     result = solver.solve(
-        qp, homogenised, rule, parameters, max_it=options.max_it, start=begin, monitor=monitor
+        qp,
+        homogenised,
+        rule,
+        parameters,
+        max_it=options.max_it,
+        start=begin,
+        monitor=monitor or no_monitor,
     )
     dual.seen = max(dual.seen, result.norm)  # the next start may see far less
     if (state := rule.recovered) is not None:
@@ -163,17 +168,6 @@ def _homogenise(dual: Dual, qp: QP, solver: Solver, start: Start | None) -> Homo
     if solver.cold is not None:
         return homogenise(qp, operator_product(qp.F, qp.comm, solver.cold(qp)))
     return homogenise(qp, dual.natural_image())
-
-
-def _monitor(dual: Dual, options: Options) -> Monitor:
-    if not options.monitor:
-        return no_monitor
-
-    def touching(x: Array) -> int:
-        face = dual.feasible.face(x, np.zeros(len(x)))
-        return int(np.sum((face.status != Status.FREE) & face.carrying))
-
-    return PrintMonitor(dual.coarse.comm, touching, lambda: dual.F.count["solver"])
 
 
 def conclude(
