@@ -144,7 +144,10 @@ class FacePreconditioner:
             return _OnFace(self, face)
         Z_C = on_contact.Z
         if self._gram is not None:
-            part = _restricted(self._gram, Z_C[self._contact])
+            # Z_CᵀW_C Z_C, which becomes the factor's
+            directions = side_by_side(Z_C[self._contact], self._gram.getComm())
+            part = self._gram.PtAP(directions)
+            directions.destroy()
             added = part.createVecLeft()
             added.array[:] = PARAMETERS.shift + bent
             part.setDiagonal(added, PETSc.InsertMode.ADD_VALUES)
@@ -246,14 +249,6 @@ class _OnFace:
 
     def destroy(self) -> None:
         """Nothing of other ranks is kept."""
-
-
-def _restricted(gram: PETSc.Mat, Z: csr_array) -> PETSc.Mat:
-    """ZᵀWZ, Z with a row for each local row of W. Collective."""
-    directions = side_by_side(Z, gram.getComm())
-    part = gram.PtAP(directions)
-    directions.destroy()
-    return part
 
 
 def _diagonal(B: PETSc.Mat, diagonal: Array) -> Array:

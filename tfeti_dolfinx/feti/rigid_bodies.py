@@ -148,16 +148,6 @@ def block_diagonal(blocks: Array) -> csr_array:
     return csr_array((blocks.ravel(), columns, k * np.arange(n * k + 1)), shape=(n * k, n * k))
 
 
-def diagonal_blocks(A: csr_array, k: int) -> Array:
-    """Diagonal blocks of a sparse matrix, shape ``(n, k, k)``."""
-    entries, blocks = A.tocoo(), np.zeros((A.shape[0] // k, k, k))
-    row, column = entries.coords
-    inside = row // k == column // k
-    row, column = row[inside], column[inside]
-    np.add.at(blocks, (row // k, row % k, column % k), entries.data[inside])
-    return blocks
-
-
 def unsprung(shares: Array) -> Motions:
     """Return motions that springs do not resist, from the shares of squares outside of kernels."""
     values, vectors = np.linalg.eigh(shares)
@@ -292,7 +282,8 @@ class Bodies:
 
     def update_load(self) -> None:
         """Measure the Blocks' present loads. Collective."""
-        self.loads = self._subdomains.load_norms()
+        squares = [[float(block.load @ block.load) for block in self._subdomains.blocks]]
+        self.loads = np.sqrt(self._subdomains.body_sums(squares)[0])
         largest = self.loads * np.sqrt(self.nodes)
         self.negligible = np.maximum(
             TOLERANCES.balance * largest, TOLERANCES.rounding * largest.max(initial=0.0)
@@ -391,7 +382,9 @@ def kernel_basis(bodies: Bodies, unheld: Motions, free: Motions) -> KernelBasis:
     # eigenvalues: free −2, held by contact −1, by equality rows 0, by springs 3
     values, V = np.linalg.eigh(3.0 * sprung - _projector(unheld) - _projector(free))
     kept = values < 1.5
-    size = diagonal_blocks(bodies.motions.T @ bodies.motions, bodies.k)
+    i, j, blocks = _blocks_of(bodies.motions.T @ bodies.motions, bodies.count, bodies.k)
+    size = np.zeros(V.shape)
+    size[i[i == j]] = blocks[i == j]
     gram = np.swapaxes(V, 1, 2) @ size @ V
     gram = np.where(kept[:, :, None] & kept[:, None, :], gram, np.eye(bodies.k))
     directions = V @ np.linalg.inv(np.swapaxes(np.linalg.cholesky(gram), 1, 2))

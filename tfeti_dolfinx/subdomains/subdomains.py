@@ -275,12 +275,6 @@ class Subdomains:
         pairs = zip(self.blocks, self.body_of_block, strict=True)
         return joined([block.modes @ amounts[body] for block, body in pairs])
 
-    def load_norms(self) -> Array:
-        """‖f‖ of each body, shape ``(b,)``. Collective."""
-        return np.sqrt(
-            self.body_sums([[float(block.load @ block.load) for block in self.blocks]])[0]
-        )
-
     def body_sums(self, values: Sequence[Sequence[float]]) -> Array:
         """Sums over the Blocks of each body, shape ``(q, b)``, of q values each. Collective.
 
