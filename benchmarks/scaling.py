@@ -7,7 +7,8 @@ meshes on one rank, has a column of its own.
 
 weak: more subdomains of the same size, on the same ranks. A scene that scales has as many
     multiplications whatever its size, and seconds in proportion to its unknowns.
-strong: the same scene on 1, 2, 4, ... ranks; ``--ranks`` is the most to try, say the cores.
+strong: the same scene on 1, 2, 4, ... ranks; ``--ranks`` is the most to try, say the cores. Beside
+    the seconds is what memory gives as many ranks together: GB/s of y ← αx + y on long vectors.
 sizes: one mesh cut into more and more subdomains, H/h elements along the edge of each (of METIS
     parts the cube root of their cells over 6), whose K⁺ and S are applied through sparse factors
     (``implicit``), by a dense matrix of each (``explicit``), and as the package chooses (``auto``).
@@ -18,6 +19,7 @@ Results go to results/scaling_weak.md, .json and .png, and so on.
 
 from __future__ import annotations
 
+import subprocess
 import sys
 
 from benchmarks.tools import (
@@ -56,6 +58,28 @@ CELLS_PER_NODE = 5.5
 def configure(parser):
     parser.add_argument("study", choices=list(STUDIES))
     configure_runs(parser)
+
+
+TRIAD = """
+import time
+import numpy as np
+from mpi4py import MPI
+from scipy.linalg.blas import daxpy
+comm, x, y, seconds = MPI.COMM_WORLD, np.ones(2**25), np.ones(2**25), []
+for _ in range(10):
+    comm.barrier()
+    start = time.perf_counter()
+    daxpy(x, y, a=0.5)
+    seconds.append(comm.allreduce(time.perf_counter() - start, op=MPI.MAX))
+if comm.rank == 0:
+    print(3e-9 * comm.size * x.nbytes / min(seconds))
+"""
+
+
+def bandwidth(ranks):
+    """GB/s between memory and so many ranks together, the best of ten runs."""
+    words = ["mpirun", "-n", str(ranks), sys.executable, "-c", TRIAD]
+    return float(subprocess.run(words, capture_output=True, text=True, check=True).stdout)
 
 
 def costs(report):
@@ -99,14 +123,17 @@ def strong(arguments, options):
     scenes = STRONG_QUICK if arguments.quick else STRONG_LARGE if arguments.large else STRONG
     for name, words in scenes.items():
         reports = best_runs([(name, [*words, *NEWTON, *options], n) for n in counts], arguments)
+        memory = [bandwidth(n) for n in counts]
         tables[name] = [
             {
                 "ranks": n,
                 "unknowns": report["primal_dofs"],
                 **costs(report),
                 "faster": solve_seconds(reports[0]) / solve_seconds(report),
+                "GB/s": given,
+                "GB/s faster": given / memory[0],
             }
-            for n, report in zip(counts, reports, strict=True)
+            for n, report, given in zip(counts, reports, memory, strict=True)
         ]
     return tables
 
