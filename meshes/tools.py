@@ -11,12 +11,20 @@ from typing import Any
 import gmsh
 import numpy as np
 
+# gmsh's own: where the sizes of elements come from
+SIZES_FROM = {"FromPoints": 1, "FromCurvature": 0, "ExtendFromBoundary": 1}
+
 
 def started_model(name: str) -> Any:
-    """An empty gmsh model of that name, gmsh started quietly if it is not running."""
+    """An empty gmsh model of that name, gmsh started quietly if it is not running.
+
+    Element sizes come from points and boundaries, as gmsh has it, whatever the last model had.
+    """
     if not gmsh.isInitialized():
         gmsh.initialize(interruptible=False)
     gmsh.option.setNumber("General.Terminal", 0)
+    for name, value in SIZES_FROM.items():
+        gmsh.option.setNumber(f"Mesh.MeshSize{name}", value)
     gmsh.model.add(name)
     return gmsh.model
 
@@ -69,7 +77,7 @@ def use_sizes(*fields: int) -> None:
     least = gmsh.model.mesh.field.add("Min")
     gmsh.model.mesh.field.setNumbers(least, "FieldsList", list(fields))
     gmsh.model.mesh.field.setAsBackgroundMesh(least)
-    for name in ("FromPoints", "FromCurvature", "ExtendFromBoundary"):
+    for name in SIZES_FROM:
         gmsh.option.setNumber(f"Mesh.MeshSize{name}", 0)
 
 
