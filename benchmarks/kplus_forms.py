@@ -140,7 +140,6 @@ def row(kind, choice, beam, nodes):
         entry |= {"unknowns": len(S), "condition of the factor": condition(K_rr)}
         entry |= {"condition of S": condition(S, R.shape[1])}
     entry |= errors_of(pinv, beam)
-    pinv.destroy()
     return entry
 
 

@@ -168,7 +168,6 @@ def factor_entries(q):
     A = kron(touching, np.ones((6, 6))) + 200 * eye_array(6 * q**3)
     factor = CholeskyFactor(csr_array(A))
     entries = factor.entries
-    factor.destroy()
     return round(entries)
 
 
