@@ -171,7 +171,7 @@ def test_a_series_that_begins_anew_replaces_what_is_there(scene):
 def test_what_a_killed_run_has_left_goes(scene):
     """Names of the next step, and those that files have before they are whole."""
     scene.begin()
-    left = ["state_3_0.npz", "fields_3_0.npz.partial", "checkpoint.json.partial", "state_1_0.npz"]
+    left = ["state_3_0.npz", ".partial-fields_3_0.npz", ".partial-checkpoint.json", "state_1_0.npz"]
     for name in left:
         scene.on_one_rank(lambda name=name: (scene.copy / name).write_text("half"))
     assert not scene.check("")

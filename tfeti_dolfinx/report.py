@@ -13,8 +13,9 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array, sum_rows
+from tfeti_dolfinx.common.files import written_whole
 from tfeti_dolfinx.common.parallel import largest, summed
-from tfeti_dolfinx.common.validation import named, written_whole
+from tfeti_dolfinx.common.validation import named
 from tfeti_dolfinx.constraints.contact_state import ContactStatus
 from tfeti_dolfinx.constraints.gluing import Gluing
 from tfeti_dolfinx.errors import raised_on_all_ranks

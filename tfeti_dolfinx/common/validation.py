@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-import os
 import reprlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, is_dataclass
 from numbers import Integral, Real
-from pathlib import Path
 from typing import Any, TypeGuard
 
 import numpy as np
@@ -105,28 +103,6 @@ def checked_callable(value: Any, what: str, expected: str) -> None:
     """Raise an InputError unless a value can be called."""
     if not callable(value):
         raise InputError(f"{what} is {shown(value)}; expected {expected}")
-
-
-def checked_path(path: Any, *suffixes: str) -> Path:
-    """Return a file's name with one of these endings; raise an InputError where it has none."""
-    expected = f"a name that ends with {' or '.join(suffixes)}"
-    checked_type(path, (str, os.PathLike), "path", expected)
-    target = Path(path)
-    if target.suffix not in suffixes:
-        raise InputError(f"{target}: expected {expected}")
-    return target
-
-
-@contextmanager
-def written_whole(target: Path) -> Iterator[Path]:
-    """Give a name to write to inside the block; a whole file has the target's. Not collective."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(f".partial-{target.name}")
-    try:
-        yield partial
-        os.replace(partial, target)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 @contextmanager

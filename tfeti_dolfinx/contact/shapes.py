@@ -115,18 +115,17 @@ class Sphere(Placed):
         self.centre = _vector(centre, "centre")
         self.radius = checked_number(radius, "radius", POSITIVE)
         self.sign = -1.0 if checked_flag(inside, "inside") else 1.0
+        self._across = np.eye(3)  # what counts of an offset
         self._vectors = {"centre": centre}
-
-    def _offset(self, x: Array) -> Array:
-        return x - self.centre[:, None]
 
     def distance(self, x: Array) -> Array:
         """Signed distance, shape ``(n,)``."""
-        return self.sign * (np.linalg.norm(self._offset(x), axis=0) - self.radius)
+        offset = self._across @ (x - self.centre[:, None])
+        return self.sign * (np.linalg.norm(offset, axis=0) - self.radius)
 
     def gradient(self, x: Array) -> Array:
         """Gradient of the signed distance, shape ``(3, n)``; zero at the centre."""
-        offset = self._offset(x)
+        offset = self._across @ (x - self.centre[:, None])
         length = np.linalg.norm(offset, axis=0)
         return self.sign * offset / np.where(length > 0.0, length, 1.0)
 
@@ -149,11 +148,8 @@ class Cylinder(Sphere):
     def __init__(self, point: Point, axis: Point, radius: float, inside: bool = False) -> None:
         super().__init__(_vector(point, "point"), radius, inside)
         self.axis = _direction(axis, "axis")
+        self._across = np.eye(3) - np.outer(self.axis, self.axis)
         self._vectors = {"point": point, "axis": axis}
-
-    def _offset(self, x: Array) -> Array:
-        offset = super()._offset(x)
-        return offset - np.outer(self.axis, self.axis @ offset)
 
 
 @dataclass(frozen=True)

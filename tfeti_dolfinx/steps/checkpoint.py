@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import functools
 import hashlib
 import json
 import os
@@ -10,7 +11,6 @@ import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, cast
 
@@ -18,6 +18,7 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.files import PARTIAL, written_whole
 from tfeti_dolfinx.common.parallel import any_rank
 from tfeti_dolfinx.common.validation import checked_type, named
 from tfeti_dolfinx.errors import InputError, raised_on_all_ranks
@@ -26,9 +27,10 @@ from tfeti_dolfinx.saved_state import SHIFT, SavedState, Table
 INDEX, RECORDS, VERSION = "checkpoint.json", "records.jsonl", 6
 KIND = "checkpoint of tfeti_dolfinx"
 COUNTS = " of subdomains"  # behind the name of an array: how many of its rows are of each
-_hash: Any = partial(hashlib.blake2b, digest_size=16)
+_hash: Any = functools.partial(hashlib.blake2b, digest_size=16)
 OF_STEP = re.compile(
-    r"(?P<kind>state|fields)_(?P<number>[1-9]\d*)_(?P<rank>0|[1-9]\d*)\.npz(?P<partial>\.partial)?"
+    rf"(?P<partial>{re.escape(PARTIAL)})?(?P<kind>state|fields)_(?P<number>[1-9]\d*)"
+    r"_(?P<rank>0|[1-9]\d*)\.npz"
 )
 
 
@@ -60,7 +62,7 @@ class Index:
         """Return whether the checkpoint writes a file of this name up to the next step."""
         found = OF_STEP.fullmatch(file.name)
         if not file.is_file() or found is None:
-            return file.is_file() and file.name in (INDEX, f"{INDEX}.partial", RECORDS)
+            return file.is_file() and file.name in (INDEX, f"{PARTIAL}{INDEX}", RECORDS)
         return int(found["number"]) <= self.number + 1 and int(found["rank"]) < self.ranks
 
     def counts(self, file: Path) -> bool:
@@ -263,22 +265,10 @@ class Checkpoint:
                 arrays[column] = values[np.argsort(labels)]
                 place = np.searchsorted(self._subdomains, labels >> SHIFT)
                 arrays[column + COUNTS] = np.bincount(place, minlength=len(self._subdomains))
-        with self._replaced(name) as file:
+        with written_whole(self.path / name) as partial, partial.open("wb") as file:
             np.savez(file, **cast(dict[str, Any], arrays))
+            _settle(file)
         return _checksum_in(self.path / name)
-
-    @contextmanager
-    def _replaced(self, name: str) -> Iterator[BinaryIO]:
-        """Give a file to write to; when it is whole, and on the disk, it gets its name."""
-        partial = self.path / f"{name}.partial"
-        try:
-            with partial.open("wb") as file:
-                yield file
-                _settle(file)
-        except OSError:
-            partial.unlink(missing_ok=True)  # a full disk needs the place
-            raise
-        os.replace(partial, self.path / name)
 
     def _load(
         self,
@@ -317,8 +307,9 @@ class Checkpoint:
 
     def _commit(self, index: Index) -> None:
         """Let an index count."""
-        with self._replaced(INDEX) as file:
+        with written_whole(self.path / INDEX) as partial, partial.open("wb") as file:
             file.write(_sealed(asdict(index)))
+            _settle(file)
         self._index = index
 
     def _checked_folder(self) -> Index:
