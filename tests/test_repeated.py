@@ -1,5 +1,8 @@
 """Solves that repeat: only what depends on a change is made again."""
 
+import gc
+from weakref import ref
+
 import numpy as np
 import pytest
 import ufl
@@ -161,6 +164,24 @@ def test_other_forms_and_conditions():
     assert distance(mirrored, first) > 1e-2
     for item in (scene, other):
         item.problem.destroy()
+
+
+@pytest.mark.parametrize("change", [{"E": 3.0}, {}])
+def test_factors_go_at_once_with_what_needs_them(change):
+    """No collection of cycles is waited for: at most one generation of factors takes memory."""
+    scene = Repeated()
+    scene.solve()
+    gc.disable()
+    try:
+        old = [ref(block.stiffness) for block in scene.problem.dual.subdomains.blocks]
+        if change:
+            scene.solve(**change)
+        else:
+            scene.problem.destroy()
+        assert [stiffness() for stiffness in old] == [None] * len(old)
+    finally:
+        gc.enable()
+    scene.problem.destroy()
 
 
 def test_factors_that_failed_are_made_again():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from weakref import ref
 
 import basix
 import numpy as np
@@ -133,15 +134,15 @@ class Diagnostics:
     def __init__(self, dofs: TornDofs) -> None:
         self._decomposition, self._dofs = dofs.decomposition, dofs
         self.finite = False
-        self._of: Dual | None = None
+        self._of: ref[Dual] | None = None  # one that is out of date goes, with its factors
         self._lasting: list[str] = []
         self._slopes: list[Array] = []
 
     def found(self, dual: Dual, solution: Solution, outcome: Outcome, rtol: float) -> list[str]:
         """Sentences beside the ``outcome``, each of which names the thing. Collective."""
-        if self._of is not dual:
+        if self._of is None or self._of() is not dual:
             lasting = (self._cells(), self._locking(dual.subdomains), self._hinges())
-            self._lasting, self._of = [text for texts in lasting for text in texts], dual
+            self._lasting, self._of = [text for texts in lasting for text in texts], ref(dual)
             self._slopes = self._make_slopes(dual.subdomains)
         u = solution.u
         return [
