@@ -141,7 +141,7 @@ def sided(secondary, primary, **changes):
     return tfeti.Contact(secondary, primary, secondary=secondary, **changes)
 
 
-def searched(contacts, dofs, d):
+def searched(contacts, dofs):
     """The conditions of contacts, as if all elements were equally stiff."""
     return ContactSearch(contacts, dofs, unit_blocks(dofs)).records
 

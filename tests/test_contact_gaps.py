@@ -61,7 +61,7 @@ def bent(cell, n_lower, n_upper, lower, upper):
 def test_bodies_that_only_touch_have_no_overlap(cell, n, curvatures, sides):
     """Flat, convex and concave sides; a mean with ψ_i, negative somewhere, must not say more."""
     d = bent(cell, *n, *curvatures)
-    gaps = gathered(searched([sided(*sides, reach=0.5)], dofs_of(d), d).gap)
+    gaps = gathered(searched([sided(*sides, reach=0.5)], dofs_of(d)).gap)
     assert len(gaps) > 0
     assert gaps.min() > -1e-12
 
@@ -75,7 +75,7 @@ def test_a_gap_that_is_rounding_of_coordinates_is_none(size):
         d.mesh.geometry.x[:, 0] = size * (np.cos(0.3) * x - np.sin(0.3) * y)
         d.mesh.geometry.x[:, 1] = size * (np.sin(0.3) * x + np.cos(0.3) * y)
         for sides in ORDERS:
-            gaps = gathered(searched([sided(*sides)], dofs_of(d), d).gap)
+            gaps = gathered(searched([sided(*sides)], dofs_of(d)).gap)
             assert len(gaps) > 0
             assert np.allclose(gaps, gap * size, rtol=1e-2, atol=0.0)
 
@@ -150,7 +150,7 @@ def test_an_overhanging_wedge(cell, slope):
         across=(0.0, 1.15),
     )
     dofs = dofs_of(d)
-    records = searched([sided(*ORDERS[0], reach=0.5)], dofs, d)
+    records = searched([sided(*ORDERS[0], reach=0.5)], dofs)
     x = gathered(group_points(dofs)[records.group])[:, 0] - 0.5
     gaps, expected = gathered(records.gap), slope * (x - start)
     assert np.sum(x > 0.5) == n ** (gdim - 2) + (gdim - 2)
@@ -232,7 +232,7 @@ def test_the_gap_of_a_pair_is_what_is_given():
     """Also where the meshes overlap by more than the reach."""
     d = stacked("triangle", 3, 4, 4, gap=-0.1)
     dofs = dofs_of(d)
-    records = searched([sided(*ORDERS[0], gap=lambda x: x[0] - 0.5)], dofs, d)
+    records = searched([sided(*ORDERS[0], gap=lambda x: x[0] - 0.5)], dofs)
     x = group_points(dofs)[records.group]
     assert np.allclose(records.gap, x[:, 0] - 0.5)
     assert MPI.COMM_WORLD.allreduce(len(records)) == 5

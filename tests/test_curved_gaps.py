@@ -137,7 +137,7 @@ def test_curved_gaps_of_surfaces_of_degree_2(cell, sides):
     d = shaped(cell, 3, 5, height, lambda x: height(x) + 0.01)
     dofs = dofs_of(d)
     flat, curved = (
-        searched([sided(*sides, reach=0.5, gap=gap)], dofs, d) for gap in ("geometry", "curved")
+        searched([sided(*sides, reach=0.5, gap=gap)], dofs) for gap in ("geometry", "curved")
     )
     expected = 0.01 * np.abs(curved.normal[:, -1])
     flat, curved = (gathered(np.abs(records.gap - expected)).max() for records in (flat, curved))
@@ -151,7 +151,7 @@ def test_edges_are_not_rounded_off(cell, sides):
     d = shaped(cell, 4, 6, lambda x: -np.abs(x[:, 0]), lambda x: 0.01 - np.abs(x[:, 0]))
     dofs = dofs_of(d)
     found = [
-        gathered(searched([sided(*sides, reach=0.5, gap=gap)], dofs, d).gap)
+        gathered(searched([sided(*sides, reach=0.5, gap=gap)], dofs).gap)
         for gap in ("geometry", "curved")
     ]
     assert len(found[0]) > 0

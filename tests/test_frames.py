@@ -77,7 +77,7 @@ def test_slip_and_gap_of_moved_bodies(cell, sides, gap, degree):
     """One body moves by t + Ax, or both rotate: linear fields are met exactly."""
     d = stacked(cell, 3, 4, 4, gap=gap)
     dofs = dofs_on(d, degree)
-    records, gdim = searched([sided(*sides, reach=0.5)], dofs, d), dofs.bs
+    records, gdim = searched([sided(*sides, reach=0.5)], dofs), dofs.bs
     assert MPI.COMM_WORLD.allreduce(len(records)) > 0
     x = group_points(dofs)[records.group][:, :gdim]
     rng = np.random.default_rng(3)
@@ -143,4 +143,4 @@ def test_two_surfaces_of_a_scalar_space_are_an_error():
     d = stacked("quadrilateral", 3, 4, 4)
     V = fem.functionspace(d.mesh, ("Lagrange", 1))
     with pytest.raises(InputError, match="contact of .*: the space is scalar; expected displ"):
-        searched([tfeti.Contact("upper bottom", "lower top")], TornDofs(V, d), d)
+        searched([tfeti.Contact("upper bottom", "lower top")], TornDofs(V, d))

@@ -57,7 +57,7 @@ def test_matching_meshes_give_node_to_node_rows(cell):
     d = stacked(cell, 3, 3, 4)
     V = fem.functionspace(d.mesh, ("Lagrange", 1, (d.mesh.geometry.dim,)))
     dofs = TornDofs(V, d)
-    records = searched([PAIR], dofs, d)
+    records = searched([PAIR], dofs)
     order = np.argsort(records.condition, kind="stable")
     assert np.array_equal(records.condition[order], np.repeat(np.arange(len(records)), 2))
     pairs = records.coefficients(0)[order].reshape(-1, 2, d.mesh.geometry.dim)
@@ -79,7 +79,7 @@ def test_flat_sides_far_from_the_origin_have_exact_normals(cell):
     gdim = d.mesh.geometry.dim
     d.mesh.geometry.x[:, gdim - 1] += 172790.7
     dofs = TornDofs(fem.functionspace(d.mesh, ("Lagrange", 1, (gdim,))), d)
-    records = searched([PAIR], dofs, d)
+    records = searched([PAIR], dofs)
     assert np.all(np.abs(records.normal[:, : gdim - 1]) <= 1e-15)
     assert total(len(records)) > 0
 

@@ -72,7 +72,7 @@ def test_thin_plates_are_not_met_from_behind(thickness, radius):
     ]
     d = decomposed_boxes(parts, 4, groups)
     dofs = TornDofs(fem.functionspace(d.mesh, ("Lagrange", 1, (2,))), d)
-    records = searched([sided("upper faces", "lower faces", reach=radius)], dofs, d)
+    records = searched([sided("upper faces", "lower faces", reach=radius)], dofs)
     assert MPI.COMM_WORLD.allreduce(len(records)) == 9
     assert np.allclose(records.gap, 0.0, atol=1e-14)
     assert np.isclose(MPI.COMM_WORLD.allreduce(records.area.sum()), 1.0)
@@ -124,7 +124,7 @@ def test_facets_of_second_order_touch_without_overlap(comm):
         p = two_body_problem(d, no_load, bcs, [sided("arc", "top")], rtol=1e-10)
         p.solve()
         dofs = p.dofs
-        records = searched(p.contacts, dofs, d)
+        records = searched(p.contacts, dofs)
         assert records.gap.min(initial=0.0) > -1e-12
         forces.append(np.abs(p.solution.body_forces.force[:, 1]).max())
     assert np.isclose(*forces, rtol=0.03)

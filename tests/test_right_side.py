@@ -82,14 +82,14 @@ def test_values_that_push_a_held_face_into_an_obstacle_leave_c_as_it_was():
     V = fem.functionspace(d.mesh, ("Lagrange", 1, (3,)))
     dofs = TornDofs(V, d)
     wall = tfeti.Obstacle("left", tfeti.Plane((-0.5, 0, 0), (1, 0, 0)))
-    records = searched([wall], dofs, d)
+    records = searched([wall], dofs)
     held, ones = prescribe(dofs, [clamp(V, d.facets("left"))]), np.ones(dofs.num_nodes * 3)
     gluing = glue(dofs, held, records, 1.0, ones)
     assert d.comm.allreduce(len(gluing.contact.decided)) == 0
     near = glue(
         dofs,
         held,
-        searched([tfeti.Obstacle("left", wall.shape, reach=np.inf)], dofs, d),
+        searched([tfeti.Obstacle("left", wall.shape, reach=np.inf)], dofs),
         1.0,
         ones,
     )
@@ -110,7 +110,7 @@ def test_another_gap_is_that_of_a_search():
     scene = Scene("triangle")
     search = scene.search
     geometry = search.records
-    ramp = searched([sided("upper bottom", "lower top", reach=0.5, gap=0.01)], scene.dofs, scene.d)
+    ramp = searched([sided("upper bottom", "lower top", reach=0.5, gap=0.01)], scene.dofs)
     search.set_gaps({0: 0.01})
     own = search.records.contact == 0
     assert np.allclose(search.records.gap[own], ramp.gap, rtol=0, atol=1e-15)

@@ -40,7 +40,7 @@ def test_rows_measure_slips(cell, degree):
     dofs, up = dofs_on(d, degree), np.eye(d.mesh.geometry.dim)[-1]
     smooth = tfeti.Obstacle("lower bottom", tfeti.Plane(-1.01 * up, up), reach=np.inf)
     pair = sided("upper bottom", "lower top", friction=TRESCA)
-    records = searched([pair, smooth], dofs, d)
+    records = searched([pair, smooth], dofs)
     gluing = glue(dofs, prescribe(dofs, []), records, 1.0, weights_of(dofs))
     rows, sets = gluing.tangents, gluing.constraints.sets
     assert sets.tangents.shape == (len(rows.condition), dofs.bs - 1)
@@ -63,7 +63,7 @@ class Held:
         self.dofs = dofs = dofs_on(self.d)
         plane = tfeti.Plane((0, 0, -0.01), (0, 0, 1))
         contact = tfeti.Obstacle("bottom", plane, friction=law, reach=np.inf)
-        self.records = searched([contact], dofs, self.d)
+        self.records = searched([contact], dofs)
         bcs = []
         for name, (axis, value) in prescribed.items():
             V = dofs.V.sub(axis)
@@ -103,7 +103,7 @@ def test_no_friction_across_a_plane_of_symmetry(cell, counts):
     """
     d = stacked(cell, *counts, 6)
     dofs = dofs_on(d)
-    records = searched([sided("upper bottom", "lower top", friction=COULOMB)], dofs, d)
+    records = searched([sided("upper bottom", "lower top", friction=COULOMB)], dofs)
     V = dofs.V.sub(1)
     upper, lower = (
         fem.dirichletbc(0.0, fem.locate_dofs_topological(V, 2, d.facets(f"{name} front")), V)
@@ -124,7 +124,7 @@ def test_prescribed_values_slip():
     """Where rows see other nodes too, the slip of what is prescribed goes to their right sides."""
     d = stacked("hexahedron", 2, 3, 4)
     dofs = dofs_on(d)
-    records = searched([sided("upper bottom", "lower top", friction=TRESCA)], dofs, d)
+    records = searched([sided("upper bottom", "lower top", friction=TRESCA)], dofs)
     V = dofs.V.sub(0)
     at = fem.locate_dofs_topological(V, 2, d.facets("lower top"))
     bcs = [fem.dirichletbc(0.125, at, V)]
@@ -167,7 +167,7 @@ def test_the_first_tangent_follows_the_direction():
     dofs, direction = dofs_on(d), np.array([1.0, 2.0, 0.5])
     law = tfeti.Tresca((0.1, 0.2), direction=tuple(direction))
     contact = tfeti.Obstacle("bottom", curved_obstacle(3), friction=law, reach=np.inf)
-    records = searched([contact], dofs, d)
+    records = searched([contact], dofs)
     first, second = records.tangents[:, 0], records.tangents[:, 1]
     identity = np.eye(3)
     assert np.allclose(records.frame @ records.frame.transpose(0, 2, 1), identity, atol=1e-14)
@@ -184,7 +184,7 @@ def test_frames_along_a_direction_are_the_same_on_any_number_of_ranks():
         d = decomposed("tetrahedron", 4, 5, comm=comm)
         dofs = dofs_on(d)
         contact = tfeti.Obstacle("bottom", curved_obstacle(3), friction=law, reach=np.inf)
-        records = searched([contact], dofs, d)
+        records = searched([contact], dofs)
         parts = comm.allgather((group_points(dofs)[records.group], records.frame))
         x, frame = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
         found.append(frame[np.lexsort(np.round(x, 9).T)])

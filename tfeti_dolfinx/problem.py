@@ -446,7 +446,8 @@ class ContactProblem:
             return
         tools = self._system.tools
         tools.begin = [tools.pose(i) for i in range(len(tools))]
-        self._count_slips_from(solution)
+        known = solution.gluing.records, solution.slip_at_end
+        self._system.count_slips_from(solution.u, known)
         self._accepted = (solution, self._start)
 
     def go_back(self) -> None:
@@ -521,12 +522,9 @@ class ContactProblem:
         solution = self._make_solution(state.u, state.multipliers(), gluing)
         self._accepted = (solution, (gluing, state.lam, state.mu, system.inverses))
         self._return()
-        self._count_slips_from(solution)
-        self._go_on_from(state)
-
-    def _count_slips_from(self, solution: Solution) -> None:
         known = solution.gluing.records, solution.slip_at_end
         self._system.count_slips_from(solution.u, known)
+        self._go_on_from(state)
 
     # ------------------------------------- what bodies with mass and nonlinear ones add
 

@@ -249,6 +249,7 @@ class Outcome:
             np.sum(status == ContactStatus.STICK),
             np.sum(status == ContactStatus.SLIP),
         )
+        kilobytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         active, sticking, sliding = dual.coarse.comm.allreduce(np.array(own)).tolist()
         return cls(
             contacts=ContactSummary.of_solution(solution),
@@ -265,7 +266,7 @@ class Outcome:
             friction_last=settling.last,
             local_operators=_local_operators(dual),
             converged_reason=result.reason.name,
-            peak_memory_mb=peak_memory_mb(dual.coarse.comm),
+            peak_memory_mb=float(dual.coarse.comm.allreduce(kilobytes / 1024.0)),
             residuals=_residuals(solution, dual, result, accuracy) | {"friction": settling.change},
             tolerances=_tolerances(solution, accuracy) | {"friction": settling.tolerance},
             estimates=estimates,
@@ -400,11 +401,6 @@ def _item(item: str | list[float] | dict[str, Any]) -> str:
     if "touching" in item:
         return str(ContactSummary(**item))
     return f"{', '.join(item['bodies'])}: {item['mode']}, stiffness {item['stiffness']:.2g}"
-
-
-def peak_memory_mb(comm: MPI.Intracomm) -> float:
-    """Peak resident memory of all ranks in megabytes. Collective."""
-    return float(comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0))
 
 
 # --- Residuals and costs ----------------------------------------------------------------------

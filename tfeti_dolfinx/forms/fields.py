@@ -122,8 +122,9 @@ def cellwise(expression: Any, dofs: TornDofs, name: str) -> fem.Function:
     W = fem.functionspace(dofs.V.mesh, element if expression.ufl_shape else element[:2])
     function = fem.Function(W, name=name)
     nodes = interpolation_points(W)
-    points = quadrature_points(expression)
-    if points is None:
+    elements = (f.ufl_element() for f in extract_coefficients(expression))
+    internal = (e.custom_quadrature()[0] for e in elements if e.has_custom_quadrature)
+    if (points := next(internal, None)) is None:
         function.interpolate(fem.Expression(expression, nodes, jit_options=JIT_OPTIONS))
         return function
     layout, bs = np.asarray(W.dofmap.list), W.dofmap.index_map_bs
@@ -135,12 +136,6 @@ def cellwise(expression: Any, dofs: TornDofs, name: str) -> fem.Function:
     values = np.einsum("np,cpk->cnk", fit, there.reshape(len(cells), len(points), bs))
     function.x.array.reshape(-1, bs)[layout] = values
     return function
-
-
-def quadrature_points(expression: Any) -> Array | None:
-    """Return the points that functions on quadrature spaces in an expression have values at."""
-    elements = (f.ufl_element() for f in extract_coefficients(expression))
-    return next((e.custom_quadrature()[0] for e in elements if e.has_custom_quadrature), None)
 
 
 def nodal(expression: Any, dofs: TornDofs, name: str) -> fem.Function:
