@@ -169,7 +169,7 @@ class CoarseSpace(Coarse):
                 same rows hold at most are taken in, too.
         """
         J = self.J[rows]
-        grams = self.comm.gather(J.T @ J, root=0)
+        grams = self.comm.gather(J.T.tocsr() @ J, root=0)
         found: Any = None
         with raised_on_all_ranks(self.comm):
             if grams is not None:

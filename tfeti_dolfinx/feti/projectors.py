@@ -35,7 +35,7 @@ class Grams:
         self._always = np.ones(Gt.shape[0], dtype=bool)
         self._always[bounded] = False
         always = Gt[self._always]
-        base = replicated(always.T @ always, comm).tocoo()
+        base = replicated(always.T.tocsr() @ always, comm).tocoo()
         # 1. the entries that contact rows reach, on all ranks, and those of the whole
         parts = list(_blocks(Gt, bounded))
         own = np.unique(np.concatenate([np.empty(0, np.int64), *(pairs for *_, pairs in parts)]))
@@ -67,8 +67,8 @@ class Grams:
         sums[-2:] = np.any(face.status[self._always] != Status.FREE), len(face.tangents)
         *_, others, tangents = summed(self._comm, sums)
         if others:
-            rows = face.Z.T @ self._Gt
-            gram = replicated(rows.T @ rows, self._comm)
+            along = face.Z.T @ self._Gt
+            gram = replicated(along.T.tocsr() @ along, self._comm)
             return gram + damping * self.whole if damping else gram
         data = np.array(self._base)
         data[self._reached] += sums[:-2]
@@ -77,7 +77,7 @@ class Grams:
         gram = csr_array((data, *self._table), shape=(size, size))
         if tangents:
             along = face.T.T @ self._Gt
-            gram = gram + replicated(along.T @ along, self._comm)
+            gram = gram + replicated(along.T.tocsr() @ along, self._comm)
         return gram
 
 
@@ -99,10 +99,10 @@ def _blocks(Gt: csr_array, some: Array) -> Iterator[tuple[Array, Array, Array]]:
 
 
 def replicated(part: csr_array, comm: MPI.Intracomm) -> csr_array:
-    """Return the sum of all ranks' sparse matrices, on all ranks. Collective."""
-    local = part.tocoo()
-    row, column = (joined_over(comm, index.astype(np.int64)) for index in local.coords)
-    value = joined_over(comm, local.data)
+    """Return the sum of all ranks' sparse matrices, scipy CSR, on all ranks. Collective."""
+    own = np.repeat(np.arange(part.shape[0]), np.diff(part.indptr)), part.indices
+    row, column = (joined_over(comm, index.astype(np.int64)) for index in own)
+    value = joined_over(comm, part.data)
     return coo_array((value, (row, column)), shape=part.shape).tocsr()
 
 
@@ -215,10 +215,9 @@ class ObliqueProjectors:
         comm: MPI.Intracomm,
     ) -> None:
         self._comm, self._face, self._Gt, self._null = comm, face, Gt, null
-        following = C.T.tocsr() @ Gt
-        self._G = (Gt + following).T
-        led = rows_times(following, face.free)
-        A, N = grams.of_face(face), replicated(led.T @ Gt, comm)
+        self._G, self._C = Gt.T, C
+        led = csr_array((C.data * face.free[C.indices], C.indices, C.indptr), C.shape) @ Gt
+        A, N = grams.of_face(face), replicated(self._G.tocsr() @ led, comm)
         self._scale, pinned = _scaling(A, null)
         self._factor = None
         with raised_on_all_ranks(comm):
@@ -239,7 +238,7 @@ class ObliqueProjectors:
     def coordinates(self, x: Array) -> Array:
         """H⁺G(I + C)ZZᵀx, replicated, shape ``(r,)`` or ``(r, q)``. Collective."""
         own = self._face.restricted(x)
-        return self._solve(summed(self._comm, self._G @ own))
+        return self._solve(summed(self._comm, self._G @ (own + self._C @ own)))
 
     def project(self, x: Array) -> Array:
         """P x, shapes ``(m_local,)`` or ``(m_local, q)``. Collective."""

@@ -99,7 +99,10 @@ class RigidScene:
             nonlocal cuts
             count, bounds = 2 * n, [(0.0, upper)] * (2 * n) + [(0.0, None)]
             for _ in range(PARAMETERS.max_programs):
-                x = minimiser(cost, cuts @ parts, bounds=bounds, **rest)
+                if upper is not None and not cuts.shape[0]:  # no program where only bounds hold
+                    x = np.where(cost < 0.0, upper, 0.0)
+                else:
+                    x = minimiser(cost, cuts @ parts, bounds=bounds, **rest)
                 y = x[:n] - x[n : 2 * n]
                 size = max(np.abs(y).max(initial=0.0), 1.0)
                 new = self._violated(cones, given, y / size, float(x[-1]) / size, count)

@@ -26,6 +26,9 @@ from tfeti_dolfinx.mesh.untorn import cell_facets
 # linear forms, a load and a residual, and the bilinear ones beside them
 LINEAR = {"L": "a", "F": "J"}
 KINDS = {"cell": "dx", "exterior_facet": "ds", "interior_facet": "dS"}
+# signatures of forms whose terms all have the same arguments: looking takes longer than assembly
+# of some hundred unknowns, and DOLFINx needs the signature, too
+_LINEAR_IN_ALL: set[str] = set()
 
 
 def displacement_space(
@@ -155,7 +158,9 @@ def _argument_spaces(form: Any, name: str, arity: int) -> list[Any]:
             raise InputError(f"{name}: an integral has no {kind} function; expected {expected}")
     with named(f"{name} is not {expected}"):  # DOLFINx would say so on one rank only
         try:
-            compute_form_data(form)
+            if (signature := form.signature()) not in _LINEAR_IN_ALL:
+                compute_form_data(form)
+                _LINEAR_IN_ALL.add(signature)
         except ArityMismatch as error:  # a BaseException, which nobody else catches
             raise ValueError(error) from error
     return [argument.ufl_function_space() for argument in arguments]

@@ -89,10 +89,12 @@ class Law:
         p is a point of Ω(p_N), and ``face`` its face.
         """
         at = np.flatnonzero(np.any(face.status[self.tangents] == Status.SLIP, axis=1))
-        rows, columns = self.tangents[at], self.normals[at]
-        values = p[rows] / p[columns][:, None]
-        index = rows.ravel(), np.repeat(columns, rows.shape[1])
-        return csr_array((values.ravel(), index), shape=(len(p), len(p)))
+        rows = self.tangents[at].ravel()
+        columns = np.repeat(self.normals[at], self.tangents.shape[1])
+        order = np.argsort(rows)
+        table = np.searchsorted(rows[order], np.arange(len(p) + 1))
+        values = (p[rows] / p[columns])[order]
+        return csr_array((values, columns[order], table), shape=(len(p), len(p)))
 
 
 @dataclass(frozen=True)
