@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import ufl
+from bodies import boxes, held
 from dolfinx import fem
 from dolfinx import mesh as dmesh
 from mpi4py import MPI
@@ -232,6 +233,63 @@ def test_a_bar_in_finite_strain_follows_its_hardening():
         assert np.allclose(law.p.x.array, p, atol=1e-12)
 
 
+@pytest.mark.parametrize("kind", [tfeti.J2Plasticity, tfeti.FiniteJ2Plasticity])
+@pytest.mark.parametrize("form", ["volumes", "function", "UFL", "constant"])
+def test_two_steels_yield_each_by_its_own_law(kind, form, comm):
+    """Bars beside each other, pulled alike: the stress of each is that of its own hardening."""
+    parts = [
+        ("soft", (0.0,) * 3, (1.0,) * 3, (2,) * 3),
+        ("hard", (0.0, 2, 0), (1.0, 3, 1), (2,) * 3),
+    ]
+    mesh, tags, names = boxes("tetrahedron", parts, comm)
+    cells = np.arange(mesh.topology.index_map(3).size_local, dtype=np.int32)
+    middles = dmesh.compute_midpoints(mesh, 3, cells)
+    values = np.where(middles[:, 1] < 1.5, 1, 2).astype(np.int32)
+    bars = dmesh.meshtags(mesh, 3, cells, values)
+    cut = tfeti.decompose(
+        mesh, 3, facet_tags=tags, surfaces=names, cell_tags=bars, volumes={"soft": 1, "hard": 2}
+    )
+    laws = {"soft": (0.01, 0.05), "hard": (0.02, 0.2)}
+    if form == "constant":
+        laws["hard"] = laws["soft"]
+    given = {}
+    for k, name in enumerate(("yield_stress", "hardening")):
+        soft, hard = laws["soft"][k], laws["hard"][k]
+        y = ufl.SpatialCoordinate(cut.mesh)[1]
+        given[name] = {
+            "volumes": {"soft": soft, "hard": hard},
+            "UFL": ufl.conditional(ufl.lt(y, 1.5), soft, hard),
+            "constant": fem.Constant(cut.mesh, 10.0),
+        }.get(form)
+        if form == "function":
+            given[name] = fem.Function(fem.functionspace(cut.mesh, ("DG", 0)))
+            given[name].interpolate(lambda x, a=soft, b=hard: np.where(x[1] < 1.5, a, b))
+    V = fem.functionspace(cut.mesh, ("Lagrange", 1, (3,)))
+    u, v, w = fem.Function(V), ufl.TestFunction(V), ufl.TrialFunction(V)
+    law = kind(tfeti.Elasticity(cut, E=E, nu=NU), u, **given)
+    if form == "constant":  # a constant may change
+        given["yield_stress"].value, given["hardening"].value = laws["soft"]
+    pulled = fem.Constant(cut.mesh, 0.0)
+    sides = [f"{name} {side}" for name in laws for side in ("left", "front", "bottom")]
+    bcs = held(cut, *sides, *((f"{name} right", pulled) for name in laws))(V)
+    finite = kind is tfeti.FiniteJ2Plasticity
+    more = {"finite": True} if finite else {"J": law.tangent(w, v)}
+    more |= {"state": law.state, "update": law.update, "petsc_options": {"rtol": 1e-10}}
+    problem = tfeti.NonlinearContactProblem(law.residual(v), u, bcs, [], cut, **more)
+    for length in (1.03, 1.06):
+        pulled.value = length - 1.0
+        problem.solve()
+        problem.accept()
+    strain = np.log(length) if finite else length - 1.0
+    dx = law.dx(subdomain_data=cut.cell_tags)
+    F = ufl.Identity(3) + ufl.grad(u)
+    stress = law.stress(u)[0, 0] * (ufl.det(F) if finite else 1.0)
+    for name, (start, modulus) in laws.items():
+        force = fem.assemble_scalar(fem.form(stress * dx(cut.volume(name))))
+        expected = (start + modulus * strain) / (1 + modulus / E)  # p = ε − σ/E
+        assert comm.allreduce(force) == pytest.approx(expected, abs=1e-9)
+
+
 @pytest.mark.parametrize("cell", ["triangle", "quadrilateral"])
 def test_stresses_at_nodes_are_those_of_the_points(cell, comm):
     """Sheared by a hundredth, beyond the yield stress: von Mises' stress is σ_y(p) everywhere."""
@@ -280,4 +338,9 @@ def test_mistakes_are_named():
         if given:
             with pytest.raises(tfeti.InputError, match="yield_stress"):
                 kind(strain, u, yield_stress=-1.0)
+            x = ufl.SpatialCoordinate(u.function_space.mesh)
+            with pytest.raises(tfeti.InputError, match=r"hardening=-0\.\d+: expected 0 or more"):
+                kind(strain, u, yield_stress=1.0, hardening=x[0] - 1.0)
+            with pytest.raises(tfeti.InputError, match="saturation is of shape"):
+                kind(strain, u, yield_stress=1.0, saturation=x)
         assert name

@@ -241,7 +241,7 @@ def test_perfect_plasticity_keeps_the_stress_below_yield(comm):
         problem.solve()
         problem.accept()
     law.update()
-    assert law.regularisation > 0.0
+    assert float(law.hardening().regularisation) > 0.0
     assert comm.allreduce(law.p.x.array.max(initial=0.0), op=MPI.MAX) > 1e-3
     sigma = ufl.dev(law.stress(problem.u))
     beyond = ufl.conditional(ufl.gt(1.5 * ufl.inner(sigma, sigma), 0.01**2 * (1 + 1e-8)), 1.0, 0.0)

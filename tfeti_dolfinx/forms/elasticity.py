@@ -49,6 +49,7 @@ class Elasticity:
             by default 1; the bilinear form is multiplied with it.
 
     Attributes:
+        on: What was given as that.
         mesh: The mesh.
         model: The model.
         E: Young's modulus in UFL.
@@ -85,7 +86,7 @@ class Elasticity:
         thickness: Number | None = None,
     ) -> None:
         checked_type(on, (Decomposition, dmesh.Mesh), "on", "what decompose or read_gmsh return")
-        self.mesh = on.mesh if isinstance(on, Decomposition) else on
+        self.on, self.mesh = on, on.mesh if isinstance(on, Decomposition) else on
         with agreeing(self.mesh.comm, "Elasticity") as given:
             given |= {"E": E, "nu": nu, "model": model, "thickness": thickness}
             self.model = _checked_model(model, self.mesh.geometry.dim)

@@ -95,9 +95,10 @@ class FiniteJ2Plasticity(Plasticity):
         out = ~(np.linalg.det(F) > 0.0)
         F[out] = np.eye(3)
         inverse_plastic = _symmetric(self.inverse_plastic.x.array.reshape(-1, 6))
-        point = _Return(F, inverse_plastic, self.p.x.array, self._mu.x.array, self.hardening)
+        hardening = self.hardening()
+        point = _Return(F, inverse_plastic, self.p.x.array, self._mu.x.array, hardening)
         with raised_on_all_ranks(self.u.function_space.mesh.comm):
-            check_return(point.solved, self.hardening)
+            check_return(point.solved, hardening)
         P, dP = point.stress(), point.tangent(self._entries)
         P[out] = dP[out] = np.nan
         dilatation = np.log(np.linalg.det(F))
@@ -167,7 +168,7 @@ class _Return:
         s = 2.0 * mu[:, None] * (self.strain - self.strain.mean(axis=1, keepdims=True))
         q = np.sqrt(1.5 * np.sum(s**2, axis=1))
         self.dp, self.slope, self.solved = hardening.returned(q, mu, p)
-        q = np.maximum(q, hardening.tolerances.yielding * hardening.start)
+        q = np.maximum(q, hardening.tolerances.yielding * hardening.yield_stress)
         self.share = 1.0 - 3.0 * mu * self.dp / q
         self.regular = hardening.regularisation * (self.dp > 0.0)
         self.n, self.q, self.s = 1.5 * s / q[:, None], q, s

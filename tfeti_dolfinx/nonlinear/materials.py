@@ -21,7 +21,7 @@ from tfeti_dolfinx.common.validation import (
     checked_type,
 )
 from tfeti_dolfinx.errors import ConvergenceError, InputError, raised_on_all_ranks
-from tfeti_dolfinx.forms.elasticity import Elasticity
+from tfeti_dolfinx.forms.elasticity import Elasticity, Modulus, in_ufl
 from tfeti_dolfinx.nonlinear.state import LawVariables
 
 
@@ -47,47 +47,48 @@ class ReturnTolerances:
     definite: float = 1e-3
 
 
+# what hardening is given by, and its ranges
+HARDENING = {"yield_stress": POSITIVE, "hardening": FROM_0, "saturation": FROM_0, "rate": FROM_0}
+
+
 @dataclass(frozen=True)
 class IsotropicHardening:
-    """Yield stress start + modulus p + saturation (1 − exp(−rate p)), and the return to it.
+    """Yield stress σ_y(p), as ``J2Plasticity`` has it, and the return to it.
 
     Attributes:
-        start: Yield stress at the begin, a force per area, more than 0.
-        modulus: Linear hardening modulus, a force per area, 0 or more.
-        saturation: What the yield stress gains by Voce's hardening in the end, 0 or more.
-        rate: Rate of Voce's hardening, 0 or more.
+        yield_stress: Yield stress at the begin, a force per area, a number or numbers at points.
+        hardening: Linear hardening modulus, a force per area, likewise.
+        saturation: What the yield stress gains by Voce's hardening in the end, likewise.
+        rate: Rate of Voce's hardening, likewise.
         tolerances: Those of the return.
 
     Raises:
         InputError: A number does not fit; the message names it.
     """
 
-    start: float
-    modulus: float
-    saturation: float
-    rate: float
+    yield_stress: Array
+    hardening: Array
+    saturation: Array
+    rate: Array
     tolerances: ReturnTolerances
 
     def __post_init__(self) -> None:
-        checked_number(self.start, "yield_stress", POSITIVE)
-        for name, value in (
-            ("hardening", self.modulus),
-            ("saturation", self.saturation),
-            ("rate", self.rate),
-        ):
-            checked_number(value, name, FROM_0)
+        for name, expected in HARDENING.items():
+            values = getattr(self, name)
+            for number in (values.min(), values.max()) if values.size else ():
+                checked_number(number, name, expected)
 
     @property
-    def regularisation(self) -> float:
+    def regularisation(self) -> Array:
         """Share of the elastic moduli in the tangent; 0 where there is hardening."""
-        hardens = self.modulus or self.saturation * self.rate
-        return 0.0 if hardens else self.tolerances.perfect
+        hardens = self.hardening + self.saturation * self.rate > 0.0
+        return np.where(hardens, 0.0, self.tolerances.perfect)
 
     def at(self, p: Array) -> tuple[Array, Array]:
         """Return the yield stress at accumulated plastic strains, and its slope."""
         rest = self.saturation * np.exp(-self.rate * p)
-        stress = self.start + self.modulus * p + self.saturation - rest
-        return stress, self.modulus + self.rate * rest
+        stress = self.yield_stress + self.hardening * p + self.saturation - rest
+        return stress, self.hardening + self.rate * rest
 
     def returned(self, q: Array, G: Array, p: Array) -> tuple[Array, Array, bool]:
         """Solve q − 3G Δp = σ_y(p + Δp) where q is beyond the yield stress.
@@ -179,7 +180,7 @@ class Plasticity(ABC):
     Creation is collective; arguments are those of ``J2Plasticity``.
 
     Attributes:
-        hardening: The yield stress.
+        given: Yield stress, hardening modulus, saturation and rate in UFL, by their names.
         dx: The measure of cells.
     """
 
@@ -188,31 +189,58 @@ class Plasticity(ABC):
         elasticity: Elasticity,
         u: fem.Function,
         *,
-        yield_stress: float,
-        hardening: float = 0.0,
-        saturation: float = 0.0,
-        rate: float = 0.0,
+        yield_stress: Modulus,
+        hardening: Modulus = 0.0,
+        saturation: Modulus = 0.0,
+        rate: Modulus = 0.0,
         degree: int | None = None,
         selective: bool = False,
         tolerances: ReturnTolerances | None = None,
     ) -> None:
         check_law(elasticity, u, type(self).__name__)
-        self.hardening = IsotropicHardening(
-            yield_stress, hardening, saturation, rate, tolerances or ReturnTolerances()
-        )
         self.elasticity, self.u = elasticity, u
+        values = zip(HARDENING.items(), (yield_stress, hardening, saturation, rate), strict=True)
+        self.given = {
+            name: in_ufl(value, elasticity.on, name, expected) for (name, expected), value in values
+        }
+        self._tolerances = tolerances or ReturnTolerances()
         self._at = Quadrature.of(u, degree, selective)
         self.dx = self._at.dx
+        scalar = self._at.space()
+        self._value, points = fem.Function(scalar), interpolation_points(scalar)
+        self._at_points = {
+            name: value if isinstance(value, fem.Constant) else fem.Expression(value, points)
+            for name, value in self.given.items()
+        }
         self._begin()
+        self.hardening()
 
     @abstractmethod
     def _begin(self) -> None:
         """Make functions and expressions at the quadrature points."""
 
+    def hardening(self) -> IsotropicHardening:
+        """Return yield stress and hardening with their values at the quadrature points. Collective.
+
+        Raises:
+            InputError: A value does not fit; the message names it.
+        """
+        values = {}
+        for name, value in self._at_points.items():
+            if isinstance(value, fem.Constant):
+                values[name] = np.asarray(value.value)
+            else:
+                self._value.interpolate(value)
+                values[name] = self._value.x.array.copy()
+        with raised_on_all_ranks(self.u.function_space.mesh.comm):
+            return IsotropicHardening(**values, tolerances=self._tolerances)
+
     @property
-    def regularisation(self) -> float:
-        """Share of the elastic moduli in the tangent; 0 where there is hardening."""
-        return self.hardening.regularisation
+    def regularisation(self) -> Any:
+        """Share of the elastic moduli in the tangent, in UFL; 0 where there is hardening."""
+        given = self.given
+        hardens = given["hardening"] + given["saturation"] * given["rate"]
+        return ufl.conditional(ufl.gt(hardens, 0.0), 0.0, self._tolerances.perfect)
 
     @property
     def _bulk(self) -> Any:
@@ -231,7 +259,9 @@ class J2Plasticity(Plasticity):
     Args:
         elasticity: The elastic law; its moduli may differ from point to point.
         u: The displacement.
-        yield_stress: Yield stress at the begin, a force per area, more than 0.
+        yield_stress: Yield stress at the begin, a force per area, more than 0. As moduli of
+            ``elasticity`` it may be a number, one for each volume by its name, a constant, a
+            function or UFL on the torn mesh, and so may be what hardens.
         hardening: Linear hardening modulus, a force per area, 0 or more.
         saturation: What the yield stress gains by Voce's hardening in the end, 0 or more.
         rate: Rate of Voce's hardening, 0 or more.
@@ -277,9 +307,10 @@ class J2Plasticity(Plasticity):
         with raised_on_all_ranks(self.u.function_space.mesh.comm):
             if not np.all(np.isfinite(q)):
                 raise InputError("J2Plasticity: the stress is not finite")
-        dp, slope, solved = self.hardening.returned(q, self._G.x.array, self.p.x.array)
+        hardening = self.hardening()
+        dp, slope, solved = hardening.returned(q, self._G.x.array, self.p.x.array)
         with raised_on_all_ranks(self.u.function_space.mesh.comm):
-            check_return(solved, self.hardening)
+            check_return(solved, hardening)
         self._dp.x.array[:] = dp
         self._slope.x.array[:] = slope
 
@@ -300,8 +331,7 @@ class J2Plasticity(Plasticity):
         share = 1 - 3 * mu * self._dp / q
         along = 4 * mu**2 * plastic * (1 / (3 * mu + self._slope) - self._dp / q)
         deviator = 2 * mu * share * ufl.dev(e) - along * ufl.inner(n, e) * n
-        if self.regularisation:
-            deviator = deviator + 2 * mu * self.regularisation * plastic * ufl.dev(e)
+        deviator += 2 * mu * self.regularisation * plastic * ufl.dev(e)
         return self._integrated(ufl.tr(e), deviator, self.elasticity.strain(v))
 
     def _deviator(self, u: Any) -> Any:
@@ -316,7 +346,7 @@ class J2Plasticity(Plasticity):
     def _norm(self, u: Any) -> Any:
         """Von Mises stress of the trial stress, kept off 0."""
         s = self._trial(u)
-        tiny = (self.hardening.start * self.hardening.tolerances.yielding) ** 2
+        tiny = (self.given["yield_stress"] * self._tolerances.yielding) ** 2
         return ufl.sqrt(1.5 * ufl.inner(s, s) + tiny)
 
     def _normal(self, u: Any) -> Any:
