@@ -128,6 +128,64 @@ def rings(comm, n):
     return tfeti.decompose(mesh, 3, facet_tags=tags, surfaces=names)
 
 
+def unbalanced(problem):
+    """Moments of both reactions together, over their force: a length."""
+    below, above = (problem.solution.reaction(side) for side in ("lower bottom", "upper top"))
+    size = np.linalg.norm(above.force)
+    assert np.allclose(below.force, -above.force, rtol=0, atol=1e-9 * size)
+    return abs(below.moment[2] + above.moment[2]) / size, abs(above.moment[2]) / size
+
+
+def test_moments_balance_on_a_flat_interface(comm):
+    """Two blocks that do not match, of steel that yields, pressed and drawn with friction."""
+    decomposition = stacked("triangle", 4, 3, 3, upper=(0.2, 0.8))
+    way, conditions = moving(decomposition, "lower bottom")
+    V = fem.functionspace(decomposition.mesh, ("Lagrange", 1, (2,)))
+    u, v, w = fem.Function(V), ufl.TestFunction(V), ufl.TrialFunction(V)
+    bcs = [
+        fem.dirichletbc(value, fem.locate_dofs_topological(V, 1, decomposition.facets(side)), V)
+        for side, _, value in conditions(V)
+    ]
+    elastic = tfeti.Elasticity(decomposition, E=E, nu=NU, model="plane_strain")
+    steel = tfeti.J2Plasticity(elastic, u, yield_stress=0.02, hardening=0.1)
+    contact = tfeti.Contact(*PAIR, friction=tfeti.Coulomb(0.3))
+    given = {"J": steel.tangent(w, v), "state": steel.state, "update": steel.update}
+    problem = tfeti.NonlinearContactProblem(
+        steel.residual(v), u, bcs, [contact], decomposition, petsc_options={"rtol": 1e-9}, **given
+    )
+    for way.value[:] in ((0.0, -0.05), (0.03, -0.06)):
+        problem.solve()
+        problem.accept()
+        left, of = unbalanced(problem)
+        assert left < 1e-9 < 0.1 < of
+    assert comm.allreduce(steel.p.x.array.max(initial=0.0), op=MPI.MAX) > 0.01
+
+
+def test_moments_balance_to_h_squared_on_a_curved_interface(comm):
+    """Two rings that do not match, the outer one pressed on the inner one and turned, μ = 0.3."""
+    found, turn = [], 0.1
+    for n in (1, 2, 4):
+        decomposition, ways = rings(comm, n), []
+
+        def conditions(V, ways=ways):
+            ways.append(fem.Function(V))
+            return [("upper top", None, ways[0]), ("lower bottom", None, np.zeros(2))]
+
+        contact = tfeti.Contact(*PAIR, friction=tfeti.Coulomb(0.3))
+        problem, _ = hyperelastic(decomposition, conditions, contact, rtol=1e-9)
+        for k, angle in ((0.95, 0.0), (0.92, turn)):
+            c, s = k * np.cos(angle), k * np.sin(angle)
+            ways[0].interpolate(
+                lambda x, c=c, s=s: (c * x[0] - s * x[1] - x[0], s * x[0] + c * x[1] - x[1])
+            )
+            problem.solve()
+            problem.accept()
+        left, of = unbalanced(problem)
+        assert of > 0.1
+        found.append(left)
+    assert found[2] < 0.3 * found[1] < 0.3**2 * found[0] < 0.3**2 * 1e-2
+
+
 def test_a_curved_patch_is_right_to_h_squared(comm):
     """Two rings, the inner one widened by 30 %, beside the ordinary differential equation."""
     radius, errors, widened = pressed_ring(1.0, 2.0, 1.3, E, NU), [], 0.3
