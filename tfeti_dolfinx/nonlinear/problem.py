@@ -249,6 +249,7 @@ class NonlinearContactProblem(ContactProblem):
         faster, first = Anderson(tol, comm), largest(comm, self.u.x.array)
         keeping = self._keeping
         keeping.begin()
+        self._set(self.u.x.array)  # a law's numbers, or what they depend on, may have changed
         for step in range(tol.max_it):
             u = np.array(self.u.x.array)
             # 1. model
