@@ -40,8 +40,9 @@ class NewtonTolerances:
             with the tolerance.
         forcing: Share of the expected increment to which a linearised problem is solved (the
             forcing term of Eisenstat and Walker).
-        loosest: Relative tolerance of a linearised problem at most: a rough displacement may open
-            contacts that the next step has to close again.
+        loosest: Relative tolerance of a linearised problem at most.
+        rough: Of both in finite strain, where a rough displacement opens contacts that the next
+            step has to close again, and makes tangents and places anew.
         nothing: Of the displacement where the load step began: less is rounding of 0, as of bodies
             that are let go.
         nowhere: Of the length of the scene, in finite strain: less is rounding of where bodies are.
@@ -77,8 +78,9 @@ class NewtonTolerances:
 
     max_it: int = 50
     safety: float = 10.0
-    forcing: float = 0.3
-    loosest: float = 1e-2
+    forcing: float = 1.5
+    loosest: float = 0.05
+    rough: float = 0.2
     nothing: float = 1e-12
     nowhere: float = 1e-13
     final: float = 0.2
@@ -186,6 +188,10 @@ class NonlinearContactProblem(ContactProblem):
             tolerances = NewtonTolerances() if tolerances is None else tolerances
             checked_type(tolerances, NewtonTolerances, "tolerances", "NewtonTolerances")
             given["tolerances"] = asdict(tolerances)
+        if finite:
+            forcing, loosest = tolerances.forcing, tolerances.loosest
+            rough = tolerances.rough
+            tolerances = replace(tolerances, forcing=rough * forcing, loosest=rough * loosest)
         self._tolerances = tolerances
         self._update = update
         self._state = InternalVariables({} if state is None else state, decomposition.mesh)
