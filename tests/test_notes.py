@@ -29,6 +29,19 @@ def test_contacts_none_of_which_touches_are_said(height):
         assert said == []
 
 
+def test_friction_of_a_given_bound_acts_on_contacts_none_of_which_touches():
+    floor = tfeti.Plane((0, -0.5), (0, 1))
+    rubs = tfeti.Obstacle("bottom", floor, reach=1.0, friction=tfeti.Tresca(0.02))
+    p = problem(decomposed("quadrilateral", 3), contacts=[rubs], traction=(0.05, -0.05))
+    p.solve()
+    (contact,) = p.report.contacts
+    assert contact.touching == 0
+    assert contact.resultant == pytest.approx([0.02 * (1.0 - 1.0 / 6.0), 0.0])  # less the corner
+    assert p.report.notes == [
+        f"no contact touches (smallest gap {contact.gap:.2g}): forces act across open gaps"
+    ]
+
+
 def test_no_contact_is_no_contact_that_does_not_touch():
     p = problem(decomposed("quadrilateral", 3))
     p.solve()

@@ -331,15 +331,17 @@ def _loose(outcome: Outcome) -> Iterator[str]:
 
 def notes_of(outcome: Outcome, solution: Solution) -> list[str]:
     """Return what is worth knowing of an answer, whose displacement is right. Collective."""
-    return [*_untouched(outcome), *_hardly_covered(solution), *_free(outcome)]
+    return [*_untouched(outcome, solution), *_hardly_covered(solution), *_free(outcome)]
 
 
-def _untouched(outcome: Outcome) -> Iterator[str]:
-    """Contacts none of which touches."""
+def _untouched(outcome: Outcome, solution: Solution) -> Iterator[str]:
+    """Contacts none of which touches; given bounds of friction act all the same. Collective."""
     if outcome.contacts and not any(contact.touching for contact in outcome.contacts):
         gaps = [contact.gap for contact in outcome.contacts if contact.nodes]
         nearest = f" (smallest gap {min(gaps):.2g})" if gaps else ""
-        yield f"no contact touches{nearest}: the displacement is that without contacts"
+        acts = any_rank(solution.dofs.comm, solution.condition_forces)
+        without = "the displacement is that without contacts"
+        yield f"no contact touches{nearest}: {'forces act across open gaps' if acts else without}"
 
 
 def _hardly_covered(solution: Solution) -> Iterator[str]:
