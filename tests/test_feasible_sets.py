@@ -124,6 +124,30 @@ class Flat(Ellipses):
         return replace(face, curvature=0.0 * face.curvature)
 
 
+class LetsGo(Bounds):
+    def onto(self, x, status):
+        return self.project(x)
+
+
+class LeavesOmega(Bounds):
+    def onto(self, x, status):
+        return np.where(status == Status.OPEN, self.lower - 1.0, self.project(x))
+
+
+class NotProjecting(Bounds):
+    def onto(self, x, status):
+        return np.array(x)
+
+
+class LetsStick(Ellipses):
+    def onto(self, x, status):
+        return self.project(x)
+
+
+class WithoutOnto:
+    project, split, max_step, face = Bounds.project, Bounds.split, Bounds.max_step, Bounds.face
+
+
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
@@ -137,6 +161,11 @@ class Flat(Ellipses):
         (Scaled(), "columns of Z are orthonormal"),
         (WithoutStatus(), "a status for each row"),
         (Flat(np.full((5, 2), 0.05)), "bends by"),
+        (LetsGo(), "onto keeps open rows open"),
+        (LeavesOmega(), r"onto\(x, status\) ∈ Ω"),
+        (NotProjecting(), "onto without bounds is P_Ω"),
+        (LetsStick(np.full((5, 2), 1.0)), "slipping ones on their boundary"),
+        (WithoutOnto(), "a FeasibleSet has onto"),
     ],
     ids=lambda value: type(value).__name__ if not isinstance(value, str) else "",
 )

@@ -58,7 +58,8 @@ def check_feasible_set(feasible: FeasibleSet, size: int, seed: int = 0) -> None:
 
     The projection is idempotent and the nearest point; a maximal step stays in the set; the
     projected gradient is how a projected step moves; a face has orthonormal directions, along
-    which a point may move to both sides, and its curvature and its statuses are right.
+    which a point may move to both sides, and its curvature and its statuses are right; ``onto``
+    keeps open rows open and slipping ones on their boundary.
 
     Args:
         feasible: The set; an object of any class.
@@ -68,6 +69,9 @@ def check_feasible_set(feasible: FeasibleSet, size: int, seed: int = 0) -> None:
     Raises:
         ConformanceError: Something of that does not hold; the message says what.
     """
+    promised = [name for name in dir(FeasibleSet) if name[0] != "_"]
+    missing = [name for name in promised if not hasattr(feasible, name)]
+    require(not missing, f"a FeasibleSet has {', '.join(missing)}")
     rng = np.random.default_rng(seed)
     for scale in (0.1, 1.0, 10.0):
         start, other, g = scale * rng.standard_normal((3, size))
@@ -92,6 +96,15 @@ def check_feasible_set(feasible: FeasibleSet, size: int, seed: int = 0) -> None:
         _check_face(feasible.face(x, g), size)
         t = rng.standard_normal(feasible.face(x, g).Z.shape[1])
         _check_moves(feasible, x, x - start, t)
+        # open and slipping rows stay so, wherever others go
+        status = feasible.face(x, g).status
+        free = np.full(size, Status.FREE)
+        require(_close(feasible.onto(other, free), y, 1e-12), "onto without bounds is P_Ω")
+        onto = feasible.onto(other, status)
+        require(_close(feasible.project(onto), onto, 1e-12), "onto(x, status) ∈ Ω")
+        bound = np.isin(status, (Status.OPEN, Status.SLIP))
+        stays = np.array_equal(feasible.face(onto, g).status[bound], status[bound])
+        require(stays, "onto keeps open rows open and slipping ones on their boundary")
 
 
 def _close(a: Array, b: Array, share: float) -> bool:

@@ -29,7 +29,12 @@ Point = tuple[float, ...] | list[float] | Array
 
 
 class Shape(Protocol):
-    """A rigid shape. Points come as in DOLFINx, shape ``(3, n)``, in 2D with z = 0."""
+    """A rigid shape. Points come as in DOLFINx, shape ``(3, n)``, in 2D with z = 0.
+
+    A node's gap is φ/‖∇φ‖ along −∇φ, so φ may be any level function; where ‖∇φ‖ ≠ 1 the gap is the
+    distance to first order, exact where the shape is touched. Curvature is not asked for. A shape
+    may have ``check_dimension(gdim, whose)``, which raises where it is not one of that dimension.
+    """
 
     def distance(self, x: Array) -> Array:
         """Signed distance, positive on the free side, shape ``(n,)``."""
