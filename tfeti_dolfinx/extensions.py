@@ -21,7 +21,7 @@ from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 from tfeti_dolfinx.options import Options
 from tfeti_dolfinx.qp.problem import Monitor
-from tfeti_dolfinx.qp.sets import FeasibleSet
+from tfeti_dolfinx.qp.sets import FeasibleSet, Status
 from tfeti_dolfinx.subdomains.block import PROMISED, Block, SubdomainData
 from tfeti_dolfinx.subdomains.kplus import MakeInverse
 from tfeti_dolfinx.subdomains.subdomains import SubdomainMethod, Subdomains
@@ -153,6 +153,13 @@ def _on_all_rows(law: FeasibleLaw) -> FeasibleLaw:
                 f"extensions: feasible_set projects vectors of shape {zero.shape} to {projected}; "
                 "expected a set on all rows of this rank, say a Product of sets on "
                 "constraints.sets.normals"
+            )
+        tangents = constraints.sets.tangents
+        looked = tangents.size and hasattr(made, "face") and hasattr(made, "project")
+        if looked and Status.FREE in made.face(made.project(zero), zero).status[tangents]:
+            raise InputError(
+                "extensions: feasible_set leaves multipliers of friction free, which glues; "
+                "expected a set on constraints.sets.tangents, say Ellipses(constraints.limits)"
             )
         return made
 

@@ -4,8 +4,8 @@ import numpy as np
 from mpi4py import MPI
 
 from mistakes.scene import raising
-from tfeti_dolfinx import Extensions
-from tfeti_dolfinx.qp.sets import Bounds
+from tfeti_dolfinx import Extensions, Obstacle, Tresca
+from tfeti_dolfinx.qp.sets import Bounds, Product
 from tfeti_dolfinx.subdomains.block import Block
 
 
@@ -31,6 +31,13 @@ class OfThree:
         return np.zeros(len(x) + 1)
 
 
+def normals_alone(s):
+    """A set that forgets friction."""
+    rough = Obstacle("bottom", s.floor.shape, friction=Tresca(0.1))
+    parts = Extensions(feasible_set=lambda B: Product([(B.sets.normals, Bounds())]))
+    return s.problem(contacts=[rough], extensions=parts).solve()
+
+
 GIVEN = {
     r"extensions is the class Extensions; expected tfeti_dolfinx.Extensions": lambda s: s.problem(
         extensions=Extensions
@@ -50,6 +57,7 @@ RUN = {
     ),
     r"extensions: feasible_set projects vectors of shape \(\d+,\) to \(\d+,\); expected a set "
     r"on all rows of this rank": own(feasible_set=lambda constraints: OfThree()),
+    r"extensions: feasible_set leaves multipliers of friction free": normals_alone,
     r"extensions: monitor: ZeroDivisionError: no such place": own(monitor=on_the_last_rank),
 }
 
