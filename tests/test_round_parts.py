@@ -98,6 +98,23 @@ def test_slabs_become_round_and_stay_balanced():
     assert len(np.unique(np.stack((cubes, found)), axis=1).T) == 8
 
 
+@pytest.mark.parametrize("parts", [100, 200])
+def test_parts_of_a_strongly_graded_cloud_are_balanced(parts):
+    """A ball of points 30 000 times denser near its middle; no part swallows those around it."""
+    rng, r = np.random.default_rng(0), np.linspace(0.0, 1.0, 10_000)
+    share = np.cumsum(r**2 / (0.0055 + 0.2 * np.maximum(r - 0.15, 0.0)) ** 3)
+    x = rng.normal(size=(60_000, 3))
+    x *= (np.interp(rng.uniform(0, share[-1], len(x)), share, r) / np.linalg.norm(x, axis=1))[
+        :, None
+    ]
+    x = np.rint(2.0**20 * x)
+    key, body = np.arange(len(x), dtype=np.uint64), np.zeros(len(x), dtype=np.int64)
+    own = slice(COMM.rank, None, COMM.size)
+    found, _ = balanced_kmeans(x[own], key[own], body[own], np.array([parts]), COMM)
+    size = COMM.allreduce(np.bincount(found, minlength=parts))
+    assert size.max() <= 1.5 * size.mean()
+
+
 def test_what_sticks_out_of_a_flat_interface_is_taken_off():
     mesh = boxes(12)
     graph, x = CellGraph(mesh, COMM), mesh.midpoints()

@@ -134,8 +134,10 @@ def balanced_kmeans(
     A point is in the part of its body with the least ‖x − c_k‖/w_k, the centre c_k being the mean
     of the part, and the influence w_k what gives all parts the same number of points, so that parts
     are round where a mesh is graded, too (von Looz, Tzovas, Meyerhenke, ICPP 2018,
-    doi:10.1145/3225058.3225148). Cells stay where they are: sums travel. The keys, ``(n,)``, draw
-    a sample, whose bisection is the beginning.
+    doi:10.1145/3225058.3225148). It is at most the distance to the next centre: beyond that a small
+    part, whose influence grows until it has points enough, soon has those of all around it. Cells
+    stay where they are: sums travel. The keys, ``(n,)``, draw a sample, whose bisection is the
+    beginning.
 
     Returns:
         The part of each point, and how slender those of the bisection are.
@@ -143,6 +145,11 @@ def balanced_kmeans(
     home = np.repeat(np.arange(len(shares)), shares)
     total, (n, gdim) = int(_counts(comm, body, len(shares)).sum()), x.shape
     centre = np.zeros((len(home), gdim))
+    apart = 2.0 ** (ROUND.bits + 2)  # bodies are along one more axis
+
+    def centres() -> cKDTree:
+        return cKDTree(np.column_stack((centre, apart * home)))
+
     for stage, (sample, rounds, way) in enumerate(ROUND.stages):
         some: Array = np.arange(n)
         if sample * len(home) < total:
@@ -155,10 +162,8 @@ def balanced_kmeans(
             spread = summed(comm, np.bincount(own, away, minlength=len(home)))
             influence = np.maximum(spread / np.maximum(_counts(comm, own, len(home)), 1), 1.0)
             begun = _slenderness(y, own, len(home), comm)
-        else:  # the nearest centre, of a body: they are apart along one more axis
-            apart = 2.0 ** (ROUND.bits + 2)
-            tree = cKDTree(np.column_stack((centre, apart * home)))
-            own = tree.query(np.column_stack((y, apart * of)))[1].astype(np.int64)
+        else:
+            own = centres().query(np.column_stack((y, apart * of)))[1].astype(np.int64)
             own = _nearest(y, own, centre, influence, home)
         goal = (_counts(comm, of, len(shares)) / shares)[home]
         for _ in range(rounds):
@@ -167,6 +172,8 @@ def balanced_kmeans(
             size = np.maximum(_counts(comm, own, len(home)), 1)
             step = ROUND.influence_step
             influence *= np.clip((goal / size) ** (1.0 / gdim), 1.0 / step, step)
+            tree = centres()
+            influence = np.minimum(influence, np.maximum(tree.query(tree.data, k=2)[0][:, 1], 1.0))
             own = _nearest(y, own, centre, influence, home)
     return own, begun
 
