@@ -100,7 +100,8 @@ def new_sizes(solution, wanted):
     d, count = mesh.topology.dim, mesh.topology.index_map(mesh.topology.dim).size_local
     square = field.x.array[np.asarray(field.function_space.dofmap.list)[:count, 0]] ** 2
     cells = np.arange(count, dtype=np.int32)
-    corners = mesh.geometry.x[entities_to_geometry(mesh, d, cells)]
+    none = np.empty((0, d + 1), dtype=np.int32)  # DOLFINx divides by their number
+    corners = mesh.geometry.x[entities_to_geometry(mesh, d, cells) if count else none]
     h = np.abs(np.linalg.det(corners[:, 1:, :d] - corners[:, :1, :d])) ** (1 / d)
     root = wanted**2 / comm.allreduce(float(np.sum(square ** (d / (d + 2)))))
     factor = np.sqrt(root) / np.maximum(square, 1e-300) ** (1 / (d + 2))

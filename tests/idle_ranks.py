@@ -162,7 +162,7 @@ def test_a_gmsh_mesh_with_few_partitions(comm, shared_tmp, partitions, files):
 
 
 # two bodies at most; the others of the demos have more than there are ranks here
-@pytest.mark.parametrize("name", ["linear_3d", "cylinder_on_block_2d"])
+@pytest.mark.parametrize("name", ["linear_3d", "cylinder_on_block_2d", "adaptive_2d"])
 def test_demos(name, comm, shared_tmp, monkeypatch):
     """Every subdomain that a demo asks for becomes one, or one for each body."""
 
