@@ -53,6 +53,7 @@ class CoulombParameters:
         patience: Problems in a row whose change is not half of the least one before, and bounds do
             not come to rest.
         shortest: Of a step towards the forces found: bounds never take less of it.
+        falls: Problems in a row whose forces are less than half of their bounds: these fall to 0.
         no_force: Of all multipliers: forces of normals that rounding makes of none. As bounds they
             would be discs that bend so much that nothing else is seen beside them.
         light: Of the largest forces of normals on a body: those of a lighter one count as so large.
@@ -70,6 +71,7 @@ class CoulombParameters:
     with_target: float = 0.1
     patience: int = 12
     shortest: float = 0.125
+    falls: int = 2
     no_force: float = 1e-13
     light: float = 1e-6
     rounding: float = 2e-16
@@ -204,7 +206,7 @@ class FrictionBounds:
             self.now = np.maximum(start[0][self._rows], 0.0) if lost else known
         self.before, self._found = self.now, self.now
         self._none, self._best, self._length = 0.0, np.inf, 1.0
-        self.idle, self.body = 0, -1
+        self.idle, self.body, self._falls = 0, -1, 0
         self._solved: list[tuple[Array, Array]] = []
 
     @property
@@ -258,6 +260,7 @@ class FrictionBounds:
         change = float(miss[self.body] / size[self.body])
         self.idle += 1
         self._length = self._relaxation()
+        self._falls = self._falls + 1 if change > 1.0 else 0
         if change <= 0.5 * self._best:
             self._best, self.idle = change, 0
         return change
@@ -291,7 +294,14 @@ class FrictionBounds:
         return fits
 
     def advance(self) -> None:
-        """Go towards the forces that were found, all of the way unless that has led away."""
+        """Go towards the forces that were found, all of the way unless that has led away.
+
+        Forces that fall to less than half again and again, as where slips of earlier steps alone
+        drive, make a geometric series: of its bounds the limit 0 is tried.
+        """
+        if self._falls == self._parameters.falls and not self.stick:
+            self.now = np.zeros_like(self._found)
+            return
         whole = self.stick or self._length == 1.0
         self.now = self._found if whole else self.now + self._length * (self._found - self.now)
 
