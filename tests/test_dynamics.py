@@ -194,7 +194,7 @@ def test_mistakes_of_motions():
     problem = tfeti.ContactDynamics(a, L, [], [], d, mass=1.0)
     with pytest.raises(tfeti.InputError, match="the step has no size yet"):
         problem.solve()
-    for size in (0, np.nan):
+    for size in (0, np.nan, 1e-200, 1e200):
         with pytest.raises(tfeti.InputError, match="step="):
             problem.take_step(size)
 

@@ -389,7 +389,7 @@ def small(comm):
     ("change", "said"),
     [
         ({"F": "square"}, "F is not a linear form"),
-        ({"J": "skew"}, "not symmetric"),
+        ({"J": "skew"}, "not symmetric .* or the tangent of an energy"),
         ({"finite": True}, "no J"),
         ({"state": {1: 2}}, "state: a key"),
         ({"update": 3}, "update"),

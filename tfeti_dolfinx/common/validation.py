@@ -228,7 +228,7 @@ def check_stiffness(
     name: str,
     K: Any,
     what: str = "the stiffness",
-    form: str = "a linear elastic form",
+    form: str = "a linear elastic form, or the tangent of an energy",
     symmetry: float = 1e-8,
 ) -> None:
     """Raise an InputError unless a stiffness is finite, symmetric and of a positive diagonal.

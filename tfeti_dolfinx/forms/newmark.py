@@ -31,7 +31,10 @@ from tfeti_dolfinx.forms.elasticity import Modulus, in_ufl
 from tfeti_dolfinx.mesh.decomposition import Decomposition
 from tfeti_dolfinx.mesh.dofs import TornDofs
 
-STEP = Range("a positive number whose square is one, too", lambda value: min(value, value**2) > 0.0)
+STEP = Range(
+    "a positive number whose square is one, too",
+    lambda size: size > 0.0 and 0.0 < size * size < np.inf,
+)
 
 log = logging.getLogger(__name__)
 
