@@ -108,7 +108,7 @@ def round_parts(mesh: UntornMesh, graph: CellGraph, num_parts: int) -> Array:
 def _cut_facets(graph: CellGraph, part: Array, body: Array, num_bodies: int) -> Array:
     """Twice the number of facets between parts of each body, shape ``(num_bodies,)``."""
     cut = np.sum(graph.with_ghosts(part)[graph.across] != part[:, None], axis=1)
-    return summed(graph.comm, np.bincount(body, cut, minlength=num_bodies))
+    return summed(graph.comm, sum_rows(body, cut, num_bodies))
 
 
 def _counts(comm: MPI.Intracomm, part: Array, num_parts: int) -> Array:
@@ -159,7 +159,7 @@ def balanced_kmeans(
             own = bisect_points(y, shares, comm, body=of)
             centre = _means(y, own, centre, comm)
             away = np.rint(np.sqrt(_squares(y, centre[own])))
-            spread = summed(comm, np.bincount(own, away, minlength=len(home)))
+            spread = summed(comm, sum_rows(own, away, len(home)))
             influence = np.maximum(spread / np.maximum(_counts(comm, own, len(home)), 1), 1.0)
             begun = _slenderness(y, own, len(home), comm)
         else:
