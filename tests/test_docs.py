@@ -260,6 +260,16 @@ def test_a_page_says_what_the_code_takes(page, figure, value):
     assert float(said) == pytest.approx(value)
 
 
+@pytest.mark.parametrize("page", ["README.md", "docs/guide/speed.md"])
+def test_the_price_of_contact_is_that_of_the_table(page):
+    """The column *of GAMG* of contact by block Newton, of both scenes."""
+    rows = (ROOT / "docs/developers/performance.md").read_text().splitlines()
+    prices = [float(row.split("|")[-3]) for row in rows if row.startswith("| contact, newton |")]
+    assert len(prices) == 2
+    said = f"{min(prices):.1f} to {max(prices):.1f} times as much as a linear solve by multigrid"
+    assert said in (ROOT / page).read_text()
+
+
 def test_one_version():
     citation = re.search(r"^version: (.*)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE)
     changes = re.search(r"^## \[(.*?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
