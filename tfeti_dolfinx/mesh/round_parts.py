@@ -26,6 +26,7 @@ class RoundParameters:
             of the way to the means that centres go in a round. Few points find the centres roughly,
             more make them better, and all points find the parts.
         influence_step: Factor by which a part's influence changes in a round at most.
+        influence: Of the distance to the next centre, which a part's influence is at most.
         candidates: Parts that a point may join in a round, those nearest to its own.
         fewest: Cells of a part in the mean, below which parts are those of bisection.
         largest: Size over the mean, above which round parts are not taken.
@@ -44,6 +45,7 @@ class RoundParameters:
         (np.inf, 5, 0.0),
     )
     influence_step: float = 1.1
+    influence: float = 0.8
     candidates: int = 16
     fewest: int = 20
     largest: float = 1.5
@@ -134,7 +136,7 @@ def balanced_kmeans(
     A point is in the part of its body with the least ‖x − c_k‖/w_k, the centre c_k being the mean
     of the part, and the influence w_k what gives all parts the same number of points, so that parts
     are round where a mesh is graded, too (von Looz, Tzovas, Meyerhenke, ICPP 2018,
-    doi:10.1145/3225058.3225148). It is at most the distance to the next centre: beyond that a small
+    doi:10.1145/3225058.3225148). It is below the distance to the next centre: beyond that a small
     part, whose influence grows until it has points enough, soon has those of all around it. Cells
     stay where they are: sums travel. The keys, ``(n,)``, draw a sample, whose bisection is the
     beginning.
@@ -173,7 +175,8 @@ def balanced_kmeans(
             step = ROUND.influence_step
             influence *= np.clip((goal / size) ** (1.0 / gdim), 1.0 / step, step)
             tree = centres()
-            influence = np.minimum(influence, np.maximum(tree.query(tree.data, k=2)[0][:, 1], 1.0))
+            next_one = tree.query(tree.data, k=2)[0][:, 1]
+            influence = np.minimum(influence, ROUND.influence * np.maximum(next_one, 1.0))
             own = _nearest(y, own, centre, influence, home)
     return own, begun
 
