@@ -12,6 +12,7 @@ from scenes import clamp, decomposed, forms, hooke, problem, strain
 from scipy.sparse import csr_array, diags_array
 
 import tfeti_dolfinx as tfeti
+from tfeti_dolfinx.common.arrays import as_petsc_matrix
 from tfeti_dolfinx.common.compat import assemble_csr
 from tfeti_dolfinx.errors import ConformanceError, FactorError, InputError
 from tfeti_dolfinx.subdomains import factor
@@ -233,9 +234,7 @@ def test_a_factor_without_memory_is_named():
         ierr = factor.PetscError.OUT_OF_MEMORY
 
     A = csr_array(np.eye(3))
-    cause = factor._cause(
-        NoMemory(factor.PetscError.OUT_OF_MEMORY), "cholmod", factor.as_petsc_matrix(A)
-    )
+    cause = factor._cause(NoMemory(factor.PetscError.OUT_OF_MEMORY), "cholmod", as_petsc_matrix(A))
     assert "out of memory: cholmod had none for the factor of 3 unknowns with 3" in str(cause)
 
 

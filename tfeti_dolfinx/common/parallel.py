@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TypeVar, cast
+from typing import TypeVar
 
 import numpy as np
 from mpi4py import MPI
@@ -22,7 +22,7 @@ def bcast_from_root(comm: MPI.Intracomm, value: T) -> T:
     if isinstance(value, bool | float | np.bool_ | np.floating):
         number = np.array([float(value)])
         comm.Bcast(number, root=0)
-        return cast(T, type(value)(number[0]))
+        return type(value)(number[0])  # type: ignore[return-value]
     return comm.bcast(value, root=0)
 
 
@@ -35,7 +35,7 @@ def steering(comm: MPI.Intracomm, *values: float) -> Array:
 
 def any_rank(comm: MPI.Intracomm, flag: bool | Array) -> bool:
     """Return whether a flag, or an entry other than 0, is set on some rank. Collective."""
-    found = np.array([int(np.any(flag))])
+    found = np.array([np.logical_or.reduce(flag, axis=None)], dtype=int)
     comm.Allreduce(MPI.IN_PLACE, found, op=MPI.MAX)
     return bool(found[0])
 
@@ -48,8 +48,10 @@ def summed(comm: MPI.Intracomm, values: Array) -> Array:
 
 def dot_over(comm: MPI.Intracomm, *pairs: tuple[Array, Array]) -> list[float]:
     """xᵀy of pairs of vectors that are spread over ranks, rank 0's on each. Collective."""
-    products = summed(comm, np.array([x @ y for x, y in pairs]))
-    return [float(value) for value in steering(comm, *products)]
+    products = np.array([x @ y for x, y in pairs])
+    comm.Allreduce(MPI.IN_PLACE, products, op=MPI.SUM)
+    comm.Bcast(products, root=0)
+    return [float(value) for value in products]
 
 
 def norm_over(comm: MPI.Intracomm, x: Array) -> float:

@@ -140,7 +140,7 @@ class CoarseSpace(Coarse):
             self._on_face = None
             factor = self.factors.factor(self.grams.of_face(face))
             known = self._on_face = Coarse(self.comm, self.Gt, self.e, factor.solve, face)
-            known.own, known.moduli = self.own, self.moduli
+            known.rows, known.moduli = self.rows, self.moduli
         known.e = self.e
         return known
 

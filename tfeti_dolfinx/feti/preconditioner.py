@@ -229,11 +229,12 @@ class _OnFace:
 
         # 1. the least displacement in D with the jumps x, and smooth
         y.array[:] = self._solved(x)
-        u = smoothed(on.steps, lambda u: without_jumps(stiff(u)), lifted())
+        u = smoothed(on.steps, stiff, without_jumps, lifted())
         # 2. its forces A u, and back
-        v = np.append(np.zeros(size), sizes * u[size:])
+        v = np.zeros(len(u))
+        v[size:] = sizes * u[size:]
         on.whole.multiply(u[:trace], v[:trace])
-        put_jumps(smoothed(on.steps, lambda v: stiff(without_jumps(v)), v))
+        put_jumps(smoothed(on.steps, without_jumps, stiff, v))
         return self._solved(y.array_r)
 
     def _solved(self, x: Array) -> Array:
@@ -316,14 +317,15 @@ def chebyshev(count: int, low: float, high: float) -> list[tuple[float, float]]:
     return steps
 
 
-def smoothed(steps: list[tuple[float, float]], apply: OfArray, u: Array) -> Array:
-    """p(A)u, A being ``apply``, which is called once in each step; u without steps."""
+def smoothed(steps: list[tuple[float, float]], first: OfArray, then: OfArray, u: Array) -> Array:
+    """p(A)u, A being two operators, each called once in each step; u without steps."""
     if not steps:
         return u
-    change, rest = np.zeros_like(u), -apply(u)
+    rest = -then(first(u))
+    change: Array = np.zeros(u.shape)
     for k, (a, b) in enumerate(steps):
         if k:
-            rest -= apply(change)
+            rest -= then(first(change))
         change = a * change + b * rest
         u = u + change
     return u

@@ -132,7 +132,7 @@ class SemidefiniteFactor:
         what: str,
         prefix: str = "tfeti_coarse_",
     ) -> None:
-        self.comm, self._null = comm, null
+        self.comm, self._null = comm, null if null.shape[1] else None
         self._scale, pinned = _scaling(A, null)
         self._A = _scaled(A, self._scale, pinned)
         self._factor: CholeskyFactor | None = None
@@ -159,11 +159,12 @@ class SemidefiniteFactor:
         """A⁺ y up to null modes that are removed, y orthogonal to them."""
         if self._factor is None:
             return y
-        b = self._scale * _without(self._null, y)
+        null = self._null
+        b = self._scale * (y if null is None else _without(null, y))
         x = self._factor.solve(b)
         for _ in range(3 if self._shift else 0):
             x += self._factor.solve(b - self._A @ x)
-        return _without(self._null, self._scale * x)
+        return self._scale * x if null is None else _without(null, self._scale * x)
 
 
 def _scaling(A: csr_array, null: csr_array) -> tuple[Array, Array]:

@@ -69,7 +69,7 @@ def recover(
         held = face.holding
         alpha = coarse.solve(coarse.G(residual - np.where(held, 0.0, gradient)))
         if any_rank(coarse.comm, not np.all(held)):
-            left = np.where(held, residual - coarse.Gt @ alpha, 0.0)
+            left = np.where(held, residual - coarse.rows @ alpha, 0.0)
             on_held = face_of(held, face.status)
             alpha = alpha + coarse.damped_solve(on_held, coarse.G(left), damping)
         u = u + coarse.kernel_motion(alpha)

@@ -413,8 +413,8 @@ class Accuracy(StoppingRule):
     def ratio(self, changes: bool = True) -> float:
         """Return the largest ratio of errors (``errors``) to their tolerances; right if ≤ 1."""
         now, allowed = self.measures, self.tolerances()
-        errors = np.append(self.errors(changes), (now.penetration, now.balance, now.error))
-        limits = np.append(allowed.displacement, (allowed.jump, allowed.balance, allowed.energy))
+        errors = np.array([*self.errors(changes), now.penetration, now.balance, now.error])
+        limits = np.array([*allowed.displacement, allowed.jump, allowed.balance, allowed.energy])
         return max(float(np.max(errors / np.maximum(limits, TINY))), self._over_goal())
 
     def relative_error(self) -> float:

@@ -7,9 +7,9 @@ from functools import cached_property
 
 import numpy as np
 from mpi4py import MPI
-from scipy.sparse import csc_array, csr_array
+from scipy.sparse import csr_array
 
-from tfeti_dolfinx.common.arrays import TINY, Array
+from tfeti_dolfinx.common.arrays import TINY, Array, LocalMatrix
 from tfeti_dolfinx.common.parallel import bcast_from_root, summed
 from tfeti_dolfinx.qp.sets import Face
 
@@ -37,6 +37,7 @@ class Coarse:
         e: Right side, replicated, shape ``(r,)``.
         solve: (G_fG_fᵀ)⁺y for a replicated y in the range of G, orthogonal to the free motions.
         dimension: Number r of equations.
+        restricted: ZZᵀx, the part of x in the face.
         face: The face; None: all rows.
     """
 
@@ -50,6 +51,7 @@ class Coarse:
     ) -> None:
         self.comm, self.Gt, self.e, self.solve, self.face = comm, Gt, e, solve, face
         self.dimension = int(Gt.shape[1])
+        self.restricted: Callable[[Array], Array] = np.asarray if face is None else face.restricted
 
     def on_face(self, face: Face) -> Coarse:
         """Return the constraint of all rows on a face of them."""
@@ -60,22 +62,20 @@ class Coarse:
         raise NotImplementedError
 
     @cached_property
-    def own(self) -> csc_array:
-        """This rank's columns of G, shape ``(r, m_local)``."""
-        return self.Gt.T
+    def rows(self) -> LocalMatrix:
+        """Gᵀ, for products."""
+        return LocalMatrix(self.Gt)
 
     @cached_property
-    def moduli(self) -> csc_array:
-        """The moduli of their entries."""
-        return abs(self.own)
-
-    def restricted(self, x: Array) -> Array:
-        """ZZᵀx, the part of x in the face."""
-        return x if self.face is None else self.face.restricted(x)
+    def moduli(self) -> LocalMatrix:
+        """The moduli of its entries."""
+        return LocalMatrix(abs(self.Gt))
 
     def G(self, x: Array) -> Array:
         """G_fZᵀx, replicated."""
-        return summed(self.comm, self.own @ self.restricted(x)) if self.dimension else NOTHING
+        if not self.dimension:
+            return NOTHING
+        return summed(self.comm, self.rows.transposed(self.restricted(x)))
 
     def residual(self, x: Array) -> Array:
         """e − G_fZᵀx, replicated."""
@@ -85,7 +85,7 @@ class Coarse:
         """Σ|G_fZᵀ||x|, replicated."""
         if not self.dimension:
             return NOTHING
-        return summed(self.comm, self.moduli @ np.abs(self.restricted(x)))
+        return summed(self.comm, self.moduli.transposed(np.abs(self.restricted(x))))
 
     def coordinates(self, x: Array) -> Array:
         """(G_fG_fᵀ)⁺G_fZᵀx, replicated."""
@@ -93,12 +93,11 @@ class Coarse:
 
     def combined(self, mu: Array) -> Array:
         """ZZᵀGᵀμ."""
-        return self.restricted(self.Gt @ mu) if self.dimension else np.zeros(self.Gt.shape[0])
+        return self.restricted(self.rows @ mu) if self.dimension else np.zeros(self.Gt.shape[0])
 
     def project(self, x: Array) -> Array:
         """P x."""
-        away = self.Gt @ self.coordinates(x) if self.dimension else 0.0
-        return self.restricted(x - away)
+        return self.restricted(x - self.rows @ self.coordinates(x) if self.dimension else x)
 
     def project_against(
         self, x: Array, y: Array, more: Array = NOTHING
@@ -112,10 +111,10 @@ class Coarse:
         if not r:
             rest = summed(self.comm, np.concatenate(((own @ y, y @ y), more)))
             return own, float(rest[0]), float(rest[1]), rest[2:]
-        products = self.own @ np.stack((own, y), axis=1)
-        sums = summed(self.comm, np.concatenate((products.T.ravel(), (own @ y, y @ y), more)))
+        products = self.rows.transposed(own), self.rows.transposed(y), (own @ y, y @ y)
+        sums = summed(self.comm, np.concatenate((*products, more)))
         mu, rest = self.solve(sums[:r]), sums[2 * r :]
-        Px = self.restricted(x - self.Gt @ mu)
+        Px = self.restricted(x - self.rows @ mu)
         return Px, float(rest[0] - sums[r : 2 * r] @ mu), float(rest[1]), rest[2:]
 
     def Q(self, x: Array) -> Array:

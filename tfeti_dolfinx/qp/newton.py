@@ -32,8 +32,8 @@ from tfeti_dolfinx.qp.projection import (
 )
 from tfeti_dolfinx.qp.sets import Face, Status, face_of
 
-# status of rows with friction
-RUBS = (Status.STICK, Status.SLIP)
+# least status of rows with friction
+RUBS = Status.STICK
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def first_point(qp: QP) -> Array:
     if not np.any(qp.coarse.e) and not any_rank(qp.comm, zero):
         return zero
     face = qp.feasible.face(zero, zero)
-    if not any_rank(qp.comm, np.isin(face.status, RUBS)):
+    if not any_rank(qp.comm, face.status >= RUBS):
         coarse = qp.coarse.on_face(face)
         lam = coarse.particular()
         held = imbalance(coarse, lam) <= HELD
@@ -278,7 +278,7 @@ class _Newton:
             face = self.feasible.face(0.5 * (z.lam + moved), state.s)
         pressed = state.pressed
         early = (face.status == Status.STICK) & (pressed.status == Status.SLIP)
-        if any_rank(self.qp.comm, np.isin(face.status, RUBS)):
+        if any_rank(self.qp.comm, face.status >= RUBS):
             early |= (face.status == Status.TOUCHING) & (pressed.status == Status.OPEN)
         if not any_rank(self.qp.comm, early):
             return z, face
@@ -574,7 +574,7 @@ def newton(
     state = NewtonState(z, mu, z.g, z.lam, face)
     method = _Newton(qp, solver, parameters, state)
     monitor(steps, "start", homogenised.lam_bar, norm_over(qp.comm, homogenised.b), 0.0)
-    friction = any_rank(qp.comm, np.isin(face.status, RUBS))
+    friction = any_rank(qp.comm, face.status >= RUBS)
     reason = ConvergedReason.ITERATING
     if friction and imbalance(qp.coarse, homogenised.lam_bar) > UNBALANCED:
         # no point of Ω balances the load; without friction that is known before
@@ -583,7 +583,7 @@ def newton(
     # without friction and an earlier λ the first solve is on the face of the start, as it shows ‖F‖
     looks = start is not None or friction
     while reason == ConvergedReason.ITERATING:
-        first, face = state.z, qp.feasible.face(state.z.lam, state.s)
+        first = state.z
         if looks:
             # Step 1: optimality
             method.look()

@@ -90,7 +90,7 @@ class QP:
 
     def dot(self, *pairs: tuple[Array, Array]) -> list[float]:
         """Return xᵀy of pairs of vectors, rank 0's on every rank. Collective."""
-        return dot_over(self.comm, *pairs)
+        return dot_over(self.coarse.comm, *pairs)
 
     def at(self, lam: Array) -> Point:
         """Return multipliers with their gradient: one multiplication by F. Collective."""

@@ -160,7 +160,7 @@ def _trial(coarse: Coarse, feasible: FeasibleSet | WithinFace, y: Array, alpha: 
     lam = feasible.project(z)
     own = float(z @ lam) - 0.5 * float(lam @ lam)
     (cost,), residual = summed(coarse.comm, np.array([own])), coarse.residual(lam)
-    length = float(np.linalg.norm(residual))
+    length = float(np.sqrt(residual @ residual))
     return _Trial(alpha, z, lam, residual, float(cost - alpha @ coarse.e), length)
 
 

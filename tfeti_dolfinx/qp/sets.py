@@ -51,9 +51,9 @@ class Face:
 
     free: Array
     status: Array
-    tangent_rows: Array = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
-    tangents: Array = field(default_factory=lambda: np.zeros((0, 2)))
-    curvature: Array = field(default_factory=lambda: np.zeros(0))
+    tangent_rows: Array = field(default_factory=np.zeros((0, 2), dtype=np.int64).copy)
+    tangents: Array = field(default_factory=np.zeros((0, 2)).copy)
+    curvature: Array = field(default_factory=np.zeros(0).copy)
 
     @cached_property
     def carrying(self) -> Array:
@@ -106,8 +106,11 @@ class Face:
 
     def restricted(self, x: Array) -> Array:
         """Z Zᵀ x: the part of vectors, shapes ``(m,)`` or ``(m, q)``, that lies in the face."""
-        own = np.where(self.free, x.T, 0.0).T
-        return own + self._along_tangents(x, np.ones(len(self.tangents)))
+        own = np.array(x, dtype=float)
+        own[~self.free] = 0.0
+        if len(self.tangents):
+            own += self._along_tangents(x, np.ones(len(self.tangents)))
+        return own
 
     def bend(self, x: Array) -> Array:
         """Z diag(κ) Zᵀ x, shapes ``(m,)`` or ``(m, q)``."""
@@ -254,8 +257,8 @@ class Product:
 
     def face(self, x: Array, g: Array) -> Face:
         """Free rows, then the directions of each set."""
-        status, free = np.full(len(x), Status.FREE), np.ones(len(x), dtype=bool)
-        found = []
+        status, found = np.zeros(len(x), dtype=np.int64), []
+        free = status == Status.FREE
         for rows, factor in self.factors:
             face = factor.face(x[rows], g[rows])
             status[rows], free[rows] = face.status, face.free

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.arrays import Array, as_petsc_matrix
 from tfeti_dolfinx.common.compat import is_read
 from tfeti_dolfinx.errors import FactorError
 
@@ -62,6 +62,8 @@ class CholeskyFactor:
 
     def __init__(self, A: Any, prefix: str = "tfeti_sub_") -> None:
         matrix, pc = as_petsc_matrix(A), PETSc.PC().create(PETSc.COMM_SELF)
+        # not SPD, which is what the factor is to find out; MUMPS would not look at signs then
+        matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self._b, self._x = matrix.createVecs()
         self._factor: Any = None
         try:
@@ -91,10 +93,9 @@ class CholeskyFactor:
             if b.size == 0:
                 return np.array(b)
             x = np.empty(b.shape, order="F")
-            given, found = (
-                PETSc.Mat().createDense(b.shape, array=array, comm=PETSc.COMM_SELF)
-                for array in (np.asfortranarray(b), x)
-            )
+            comm = PETSc.COMM_SELF
+            given = PETSc.Mat().createDense(b.shape, array=np.asfortranarray(b), comm=comm)
+            found = PETSc.Mat().createDense(b.shape, array=x, comm=comm)
             self._factor.matSolve(given, found)
             x = np.array(found.getDenseArray(readonly=True), order="F")
             given.destroy()
@@ -170,19 +171,6 @@ def say_if_not_cholmod() -> None:
             "may be slower",
             {"mumps": "MUMPS", "petsc": "PETSc's own Cholesky"}[default_solver()],
         )
-
-
-def as_petsc_matrix(A: Any) -> PETSc.Mat:
-    """A as a matrix of PETSc, on the same arrays if they are sorted CSR of PETSc's integers."""
-    A = A.tocsr()
-    A.sort_indices()
-    indptr, indices = (array.astype(PETSc.IntType, copy=False) for array in (A.indptr, A.indices))
-    matrix = PETSc.Mat().createAIJWithArrays(
-        A.shape, (indptr, indices, A.data), comm=PETSc.COMM_SELF
-    )
-    # not SPD, which is what the factor is to find out; MUMPS would not look at signs then
-    matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-    return matrix
 
 
 def _factored(pc: PETSc.PC, matrix: PETSc.Mat, prefix: str) -> PETSc.Mat:

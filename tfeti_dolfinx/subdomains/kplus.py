@@ -11,12 +11,11 @@ import numpy as np
 from petsc4py import PETSc
 from scipy.sparse import csr_array, diags_array
 
-from tfeti_dolfinx.common.arrays import TINY, Array
+from tfeti_dolfinx.common.arrays import TINY, Array, as_petsc_matrix
 from tfeti_dolfinx.subdomains.block import Counters, candidate_modes
 from tfeti_dolfinx.subdomains.factor import (
     CholeskyFactor,
     NotPositiveDefiniteError,
-    as_petsc_matrix,
 )
 
 # --- K⁺ -----------------------------------------------------------------------------------------

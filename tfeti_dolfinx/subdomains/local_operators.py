@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg.blas import dsymm, dsymv
 from scipy.sparse import csr_array
 
-from tfeti_dolfinx.common.arrays import Array, parts_of
+from tfeti_dolfinx.common.arrays import Array, LocalMatrix, parts_of
 from tfeti_dolfinx.subdomains.block import Block, OperatorKind
 from tfeti_dolfinx.subdomains.sparse_block import SparseBlock
 
@@ -50,7 +50,7 @@ class Group:
         columns: Vectors that A is applied to at once.
         place: Where the trace unknowns go in these columns, the first column first.
         where: Where they lie among those of the rank.
-        apply: A W, shapes ``(size, q)``.
+        apply: A W, shapes ``(size,)`` or ``(size, q)``.
         work: Operations of ``apply`` for a vector, 0 if they are not known.
         can_be_dense: Whether there is use in a dense A.
         dense: A, where that is cheaper.
@@ -91,13 +91,11 @@ class Group:
         """Set this group's part of out = diag(A_s) w, shapes ``(t,)``."""
         flat = np.zeros(self.size * self.columns)
         flat[self.place] = w[self.where]
-        columns = flat.reshape((self.size, self.columns), order="F")
-        if self.dense is None:
-            product = self.apply(columns)
-        elif self.columns == 1:
-            product = dsymv(1.0, self.dense, flat)
+        if self.columns == 1:
+            product = self.apply(flat) if self.dense is None else dsymv(1.0, self.dense, flat)
         else:
-            product = dsymm(1.0, self.dense, columns)
+            columns = flat.reshape((self.size, self.columns), order="F")
+            product = self.apply(columns) if self.dense is None else dsymm(1.0, self.dense, columns)
         out[self.where] = product.ravel(order="F")[self.place]
 
 
@@ -126,7 +124,7 @@ def _pinv_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
     trace = np.unique(np.concatenate(traces))
 
     def apply(W: Array) -> Array:
-        B = np.zeros((stiffness.size, W.shape[1]), order="F")
+        B = np.zeros((stiffness.size, *W.shape[1:]), order="F")
         B[trace] = W
         return stiffness.solve(B)[trace]
 
@@ -138,9 +136,9 @@ def _pinv_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
 def _schur_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
     """S through the factor of K_ii."""
     traced = equal[0][0].traced
-    work = 2.0 * traced.K_bb.nnz
+    work = 2.0 * traced.stiffness.A.nnz
     if traced.inner is not None:
-        work += 4.0 * (traced.coupling[0].nnz + traced.inner.entries)
+        work += 4.0 * (traced.coupling.A.nnz + traced.inner.entries)
     size, parts = len(traced.trace), [part for _, part in equal]
     places = _places([block.trace_rows for block, _ in equal], size, parts)
     return Group(len(equal), size, len(equal), *places, traced.apply_schur, work)
@@ -149,23 +147,23 @@ def _schur_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
 def _stiffness_group(blocks: Sequence[tuple[SparseBlock, slice]]) -> Group:
     """K_bb of equal subdomains, or those of subdomains without equals as one sparse matrix."""
     traces = {id(block.traced): block.traced for block, _ in blocks}.values()
-    rows, K_bb = [block.trace_rows for block, _ in blocks], next(iter(traces)).K_bb
+    rows, K_bb = [block.trace_rows for block, _ in blocks], next(iter(traces)).stiffness
     if len(traces) > 1:
         begins = np.cumsum([0, *(len(row) for row in rows)])
-        matrices = [traced.K_bb for traced in traces]
+        matrices = [traced.stiffness.A for traced in traces]
         columns = [a + K.indices for a, K in zip(begins, matrices, strict=False)]
         table = np.cumsum(np.concatenate([[0], *(np.diff(K.indptr) for K in matrices)]))
         data = np.concatenate([K.data for K in matrices]), np.concatenate(columns), table
-        K_bb = csr_array(data, shape=(begins[-1],) * 2)
+        K_bb = LocalMatrix(csr_array(data, shape=(begins[-1],) * 2))
         rows = [np.concatenate([a + row for a, row in zip(begins, rows, strict=False)])]
-    size, parts = K_bb.shape[0], [part for _, part in blocks]
+    size, parts = K_bb.A.shape[0], [part for _, part in blocks]
     return Group(
         len(blocks),
         size,
         len(rows),
         *_places(rows, size, parts),
-        lambda W: np.asarray(K_bb @ W),
-        2.0 * K_bb.nnz,
+        K_bb.__matmul__,
+        2.0 * K_bb.A.nnz,
         can_be_dense=False,
     )
 
@@ -175,6 +173,8 @@ def _own_group(block: Block, kind: OperatorKind, part: slice) -> Group:
     apply, size = getattr(block, f"apply_{kind}"), len(block.trace_dofs)
 
     def columns(W: Array) -> Array:
+        if W.ndim == 1:
+            return np.asarray(apply(W))
         return np.stack([apply(np.ascontiguousarray(w)) for w in W.T], axis=1)
 
     places = _places([np.arange(size)], size, [part])
@@ -189,6 +189,8 @@ def _places(rows: Sequence[Array], size: int, parts: Sequence[slice]) -> tuple[A
 
 def _in_chunks(apply: Callable[[Array], Array], W: Array) -> Array:
     """A W, as many columns at a time as are good for the cache."""
+    if W.ndim == 1 or W.shape[1] <= TOGETHER:
+        return apply(W)
     out = np.empty(W.shape, order="F")
     for first in range(0, W.shape[1], TOGETHER):
         some = slice(first, first + TOGETHER)

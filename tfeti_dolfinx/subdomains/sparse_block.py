@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import null_space
 from scipy.sparse import csr_array
 
-from tfeti_dolfinx.common.arrays import TINY, Array, entries_of_rows, submatrix
+from tfeti_dolfinx.common.arrays import TINY, Array, LocalMatrix, entries_of_rows, submatrix
 from tfeti_dolfinx.common.validation import check_stiffness
 from tfeti_dolfinx.errors import FactorError, InputError
 from tfeti_dolfinx.subdomains.block import (
@@ -90,9 +90,14 @@ class Stiffness:
         return np.stack([self._pinv.solve(column) for column in b.T], axis=1)
 
     @cached_property
+    def product(self) -> LocalMatrix:
+        """K, for products."""
+        return LocalMatrix(self.K)
+
+    @cached_property
     def stretch_over_shear(self) -> float:
         """About (λ + 2μ)/μ, as ``stretch_over_shear`` finds it."""
-        return stretch_over_shear(self.x, self.bs, lambda u: self.K @ u)
+        return stretch_over_shear(self.x, self.bs, self.product.__matmul__)
 
     def on_trace(self, trace: Array) -> Traced:
         """K_bb and S on a trace, ascending, the same for all that use it."""
@@ -106,27 +111,25 @@ class Traced:
     """A stiffness seen from a trace, ascending; each matrix is made when it is first asked for."""
 
     def __init__(self, stiffness: Stiffness, trace: Array) -> None:
-        self._stiffness, self.trace = stiffness, trace
+        self._of, self.trace = stiffness, trace
         self.inside = np.setdiff1d(np.arange(stiffness.size), trace, assume_unique=True)
 
     def apply_schur(self, w: Array) -> Array:
         """S w = K_bb w − K_bi K_ii⁻¹ K_ib w, shapes ``(t,)`` or ``(t, q)``; K_ii factored once."""
-        Kw = np.asarray(self.K_bb @ w)
+        Kw = self.stiffness @ w
         if self.inner is None:
             return Kw
-        K_ib, K_bi = self.coupling
-        return Kw - K_bi @ self.inner.solve(K_ib @ w)
+        return Kw - self.coupling.transposed(self.inner.solve(self.coupling @ w))
 
     @cached_property
-    def K_bb(self) -> Any:
-        """K on the trace."""
-        return submatrix(self._stiffness.K, self.trace, self.trace)
+    def stiffness(self) -> LocalMatrix:
+        """K_bb, that on the trace."""
+        return LocalMatrix(submatrix(self._of.K, self.trace, self.trace))
 
     @cached_property
-    def coupling(self) -> tuple[Any, Any]:
-        """K_ib and its transpose, on the same arrays: scipy would make it for each product."""
-        K_ib = submatrix(self._stiffness.K, self.inside, self.trace)
-        return K_ib, K_ib.T
+    def coupling(self) -> LocalMatrix:
+        """K_ib."""
+        return LocalMatrix(submatrix(self._of.K, self.inside, self.trace))
 
     @cached_property
     def inner(self) -> CholeskyFactor | None:
@@ -134,7 +137,7 @@ class Traced:
 
         None where there is no inside, or no trace that would ask for it.
         """
-        stiffness, inside = self._stiffness, self.inside
+        stiffness, inside = self._of, self.inside
         if len(inside) == 0 or len(self.trace) == 0:
             return None
         # the triangle has the null space of the kernel's trace rows, and few rows itself
@@ -310,7 +313,7 @@ class SparseBlock(Block):
 
     def multiply(self, u: Array) -> Array:
         """K u on all unknowns, shapes ``(n,)``."""
-        return np.asarray((self.stiffness.K @ placed(u, self.place))[self.place])
+        return (self.stiffness.product @ placed(u, self.place))[self.place]
 
     def solve(self, b: Array) -> Array:
         """K⁺ b on all unknowns, shapes ``(n,)``."""
@@ -323,7 +326,7 @@ class SparseBlock(Block):
     def prepare(self, kind: OperatorKind) -> None:
         """Make K_bb for ``"stiffness"`` and factor K_ii for ``"schur"``."""
         if kind != "pinv":
-            self.traced.K_bb  # noqa: B018
+            self.traced.stiffness  # noqa: B018
         if kind == "schur":
             self.traced.inner, self.traced.coupling  # noqa: B018
 
@@ -351,6 +354,6 @@ class SparseBlock(Block):
 
 def placed(x: Array, places: Array) -> Array:
     """Return y with ``y[places] = x``."""
-    y = np.empty_like(x)
+    y = np.empty(x.shape)
     y[places] = x
     return y
