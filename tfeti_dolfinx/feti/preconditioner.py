@@ -10,7 +10,7 @@ from petsc4py import PETSc
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import LinearOperator, eigsh
 
-from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.arrays import Array, LocalMatrix
 from tfeti_dolfinx.common.parallel import bcast_from_root, joined_over, largest
 from tfeti_dolfinx.constraints.rows import Constraints
 from tfeti_dolfinx.errors import raised_on_all_ranks
@@ -185,26 +185,26 @@ class _OnFace:
         self._moves: Array = np.zeros(0)
         self._sizes: Array = np.zeros(0)
         if contact is not None:
-            self._Z_C, self._bent, size = contact
-            self._onto_contact, bends = self._Z_C.T.tocsr(), self._bent > 0.0
+            Z_C, self._bent, size = contact
+            self._Z_C, bends = LocalMatrix(Z_C), self._bent > 0.0
             self._moves, self._sizes = self._bent[bends], size[bends]
             self._bends = bool(np.any(bends))
-        if self._bends:
-            self._springs = self._Z_C[:, bends]
-            self._to_springs = self._springs.T.tocsr()
+            if self._bends:
+                self._springs = LocalMatrix(Z_C[:, bends])
 
     def __call__(self, x: Array) -> Array:
         """M_f x: displacements of the trace, of what is next to it, of springs. Collective."""
         on, moves, sizes = self._on_all, self._moves, self._sizes
         B, w, y, D = on.whole.B, on.work, on.jumps, on.weights
         trace, size = w.getLocalSize(), len(D)
+        solved = self._face.restricted if self._is_identity else self._solved
 
         def lifted() -> Array:  # B_Dᵀ y
             B.multTranspose(y, w)
             out = np.zeros(size + len(moves))
             out[:trace] = w.array_r
             if self._bends:
-                out[size:] = self._to_springs @ y.array_r
+                out[size:] = self._springs.transposed(y.array_r)
             return out
 
         def put_jumps(v: Array) -> None:  # y = B_D v
@@ -215,7 +215,7 @@ class _OnFace:
 
         def without_jumps(v: Array) -> Array:  # H v
             put_jumps(v)
-            y.array[:] = self._solved(y.array_r)
+            y.array[:] = solved(y.array_r)
             out = -lifted()
             out[:size] += v[:size] / D
             out[size:] += v[size:]
@@ -228,24 +228,20 @@ class _OnFace:
             return out
 
         # 1. the least displacement in D with the jumps x, and smooth
-        y.array[:] = self._solved(x)
+        y.array[:] = solved(x)
         u = smoothed(on.steps, stiff, without_jumps, lifted())
         # 2. its forces A u, and back
         v = np.zeros(len(u))
         v[size:] = sizes * u[size:]
         on.whole.multiply(u[:trace], v[:trace])
         put_jumps(smoothed(on.steps, without_jumps, stiff, v))
-        return self._solved(y.array_r)
+        return solved(y.array_r)
 
     def _solved(self, x: Array) -> Array:
-        """Z W_κ⁻¹ Zᵀx on this rank's rows."""
-        values = self._face.restricted(x)
-        if self._is_identity:
-            return values
-        contact = self._onto_contact @ values
-        solved = contact / (1.0 + self._bent)
-        if self._factor is not None:
-            solved = self._factor.solve(contact)
+        """Z W_κ⁻¹ Zᵀx on this rank's rows, where W_κ is not the identity."""
+        values, factor = self._face.restricted(x), self._factor
+        contact = self._Z_C.transposed(values)
+        solved = contact / (1.0 + self._bent) if factor is None else factor.solve(contact)
         return np.asarray(values + self._Z_C @ (solved - contact))
 
     def destroy(self) -> None:

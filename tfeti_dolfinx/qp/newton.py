@@ -16,7 +16,6 @@ from tfeti_dolfinx.qp.problem import (
     ConvergedReason,
     Homogenised,
     Monitor,
-    Operator,
     Point,
     QPResult,
     Start,
@@ -362,7 +361,6 @@ class FaceSolver:
         self.directions.norm = qp.seen
         self._face: Face | None = None
         self._on_face, self.coarse, self._curved = qp, qp.coarse, False
-        self._preconditioner: Operator | None = None
         self.excluding: Array | None = None
         self.left = np.inf
 
@@ -412,12 +410,11 @@ class FaceSolver:
         same = before is not None and not any_rank(qp.comm, face.status != before.status)
         if same and not self._curved:
             return True
-        self._preconditioner = None
         self._steps.faces += not same
         slips = ~face.held & (face.status == Status.SLIP)
         self._face, self._curved = face, any_rank(qp.comm, slips)
         self.coarse = qp.coarse.on_face(face)
-        self._on_face = replace(qp, coarse=self.coarse, held=face.held)
+        self._on_face = replace(qp, coarse=self.coarse, held=face.held, preconditioner=None)
         if self._curved:
             F, bend = qp.F, face.bend
             self._on_face = replace(self._on_face, F=lambda x: F(x) + bend(x), recycled=None)
@@ -493,9 +490,7 @@ class FaceSolver:
         """
         qp, given = self._qp, self._parameters
         exact = given.unseen * self.directions.norm * float(np.sqrt(qp.dot((way, way))[0]))
-        program = replace(
-            self._on_face, F=qp.F, preconditioner=self._preconditioner, d=Fw, recycled=None
-        )
+        program = replace(self._on_face, F=qp.F, d=Fw, recycled=None)
         point, own = Point(np.zeros(len(way)), -Fw), Directions(replace(qp, keeps=True))
         pcpg(program, point, StoppingRule(exact), Steps(), given.purifying, directions=own)
         return way - point.lam, -point.g
@@ -504,16 +499,15 @@ class FaceSolver:
         """Run PCPG on the face entered; return its end, and whether rounding has ended it."""
         qp, given, face, own = self._qp, self._parameters, self._face, self.directions
         assert face is not None
-        if self._preconditioner is None and qp.preconditioner_on is not None:
-            self._preconditioner = qp.preconditioner_on(face)
-        on_face = replace(self._on_face, preconditioner=self._preconditioner)
+        if self._on_face.preconditioner is None and qp.preconditioner_on is not None:
+            self._on_face = replace(self._on_face, preconditioner=qp.preconditioner_on(face))
         own.fresh = own.fresh or not resume or self._curved
         share = given.stage if resume else given.reduction
         target = share * min(norm_over(qp.comm, self.coarse.project(z.g)), optimality)
         lowest = 0.0 if self._rule.waits else given.final * self._rule.tolerance
         rule = StoppingRule(max(target, lowest))
         end, norm = Point(z.lam, z.g), own.norm
-        reason = pcpg(on_face, end, rule, self._steps, self._max_it, self._monitor, own)
+        reason = pcpg(self._on_face, end, rule, self._steps, self._max_it, self._monitor, own)
         self.left = norm_over(qp.comm, own.r)
         if self._curved:
             end.g = end.g - face.bend(end.lam - z.lam)

@@ -202,7 +202,7 @@ class Bounds:
     def face(self, x: Array, g: Array) -> Face:
         """Return the face of x: rows off their bounds are free, they touch."""
         off = np.asarray(x > self.lower)
-        return face_of(off, np.where(off, Status.TOUCHING, Status.OPEN))
+        return Face(off, np.where(off, Status.TOUCHING, Status.OPEN))
 
     def onto(self, x: Array, status: Array) -> Array:
         """max(x, l); l where rows are open."""

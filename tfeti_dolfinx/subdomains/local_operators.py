@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -130,7 +131,7 @@ def _pinv_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
 
     rows = [np.searchsorted(trace, own) for own in traces]
     places, work = _places(rows, len(trace), [part for _, part in equal]), 4.0 * stiffness.entries
-    return Group(len(equal), len(trace), len(equal), *places, lambda W: _in_chunks(apply, W), work)
+    return Group(len(equal), len(trace), len(equal), *places, partial(_in_chunks, apply), work)
 
 
 def _schur_group(equal: Sequence[tuple[SparseBlock, slice]]) -> Group:
