@@ -149,7 +149,7 @@ def meshed(scene: Scene, case: Case, size: float, comm: MPI.Intracomm) -> tuple[
         dim = model.getDimension()
         # of degree d, so many nodes for each one of degree 1
         nodes = len(model.mesh.getNodes()[0]) * (case.degree / case.order) ** dim
-        parts = max(2, round(dim * nodes / SUBDOMAIN[dim]))
+        parts = max(comm.size, round(dim * nodes / SUBDOMAIN[dim]))
     return model, comm.bcast(parts)
 
 

@@ -13,6 +13,7 @@ its deck is in CalculiX' seconds. Results of each run stay in DIR/peers; DIR/pee
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -134,6 +135,8 @@ def main():
     if arguments.tables:
         return write(folder, arguments.document)
     folder.mkdir(parents=True, exist_ok=True)
+    # where forms of many programs lie, to find one takes longer
+    os.environ["TFETI_JIT_CACHE"] = str(folder / "forms")
     reference = folder / "reference.json"
     finest = 12 if arguments.quick else 64
     if not reference.exists() and (said := solve_here(finest, 2, reference, rtol=1e-7)):
