@@ -144,7 +144,7 @@ def gathered(dofs, node_values):
         dofs: Dof maps.
         node_values: One row per local primal node.
     """
-    total = dofs.reduce(node_values, np.add, 0.0)
+    total = dofs.reduce(node_values, np.add)
     mean = total / dofs.multiplicity.reshape(-1, *[1] * (total.ndim - 1))
     points = np.concatenate(dofs.comm.allgather(group_points(dofs)))
     values = np.concatenate(dofs.comm.allgather(mean))

@@ -211,8 +211,8 @@ class ContactProblem:
         self._meet("solve")
         self._counts, self._outcome = SolverCounts(), Outcome()
         try:
-            self._set_out()
             self._system.look_for_changes()
+            self._set_out()
             self._solve_in_rounds()
         except TfetiError as error:  # on all ranks
             if isinstance(error, NoSolutionError):

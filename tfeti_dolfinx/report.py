@@ -473,7 +473,7 @@ def _jumps(solution: Solution) -> Array:
     """For each owned group how far its copies are apart, and from prescribed values. Collective."""
     dofs, prescribed = solution.dofs, solution.gluing.prescribed
     u = solution.u.reshape(-1, dofs.bs)
-    low, high = dofs.reduce(u, np.minimum, np.inf), dofs.reduce(u, np.maximum, -np.inf)
+    low, high = dofs.reduce(u, np.minimum), dofs.reduce(u, np.maximum)
     held_low = np.where(prescribed.flag, np.minimum(low, prescribed.value), low)
     held_high = np.where(prescribed.flag, np.maximum(high, prescribed.value), high)
     return held_high - held_low

@@ -250,7 +250,7 @@ class Diagnostics:
         if not any_rank(comm, shown):
             return
         diagonal = joined([block.diagonal for block in subdomains.elastic])
-        K = self._dofs.reduce(diagonal.reshape(-1, self._dofs.bs).mean(axis=1), np.add, 0.0)
+        K = self._dofs.reduce(diagonal.reshape(-1, self._dofs.bs).mean(axis=1), np.add)
         (K,) = self._dofs.lookup(records.entry_group, K)
         gives = records.area * sum_rows(records.condition, records.weight**2 / K, len(records))
         change = records.curved_gap - records.geometric_gap

@@ -180,7 +180,7 @@ class ContactState:
         if self.finite and self.dofs.nodes is None:  # else nodes have moved there
             moved = np.zeros((self.dofs.num_nodes, 3))
             moved[:, : self.dofs.bs] = self.u.reshape(-1, self.dofs.bs)
-            points += self.dofs.reduce(moved, np.minimum, np.inf)
+            points += self.dofs.reduce(moved, np.minimum)
         return points
 
     def contact(self, which: int | str = 0) -> ContactData:
@@ -265,7 +265,7 @@ class ContactState:
         facets = surface_facets(self.decomposition, surface)
         member = np.zeros(self.dofs.num_nodes, dtype=bool)
         member[surface_nodes(self.dofs, facets)] = True
-        groups = np.flatnonzero(self.dofs.reduce(member, np.logical_or, False))
+        groups = np.flatnonzero(self.dofs.reduce(member, np.logical_or))
         force = self.support_forces[groups]
         return resultant(self.dofs.comm, self.places()[groups], force)
 
@@ -386,5 +386,5 @@ class ContactState:
         own = constraints.trace < len(self.u)  # those behind are of rigid bodies
         forces = np.zeros_like(self.u)
         forces[constraints.trace[own]] = -constraints.forces(self.lam)[own]
-        total = self.dofs.reduce(forces.reshape(-1, self.dofs.bs), np.add, 0.0)
+        total = self.dofs.reduce(forces.reshape(-1, self.dofs.bs), np.add)
         return total - self.nodal_forces

@@ -140,15 +140,14 @@ def prescribe(dofs: TornDofs, bcs: Sequence[fem.DirichletBC]) -> Prescribed:
     """Collect Dirichlet values and spread them to all copies of their nodes. Collective.
 
     Raises:
-        InputError: Conditions do not fit V, contradict each other at a node, or are not finite.
+        InputError: Conditions contradict each other at a node, or are not finite.
     """
-    bcs = checked_conditions(bcs, dofs.V)
     size = dofs.V.dofmap.index_map.size_local * dofs.bs
     values = prescribed_values(bcs, size)
     low = np.fmin.reduce(values, axis=0, initial=np.inf)
     high = np.fmax.reduce(values, axis=0, initial=-np.inf)
-    low = dofs.reduce(dofs.to_primal(low).reshape(-1, dofs.bs), np.minimum, np.inf)
-    high = dofs.reduce(dofs.to_primal(high).reshape(-1, dofs.bs), np.maximum, -np.inf)
+    low = dofs.reduce(dofs.to_primal(low).reshape(-1, dofs.bs), np.minimum)
+    high = dofs.reduce(dofs.to_primal(high).reshape(-1, dofs.bs), np.maximum)
     flag = low <= high
     with raised_on_all_ranks(dofs.comm):
         for number, bc in enumerate(bcs):
@@ -207,7 +206,7 @@ def check_not_on_tears(bcs: Sequence[fem.DirichletBC], dofs: TornDofs) -> None:
     tears, outer = (_facet_nodes(dofs, f) for f in (decomposition.tears, decomposition.boundary))
     at_boundary = np.zeros(dofs.num_nodes, dtype=bool)
     at_boundary[outer] = True
-    at_boundary = dofs.spread(dofs.reduce(at_boundary, np.logical_or, False))
+    at_boundary = dofs.spread(dofs.reduce(at_boundary, np.logical_or))
     within = ~np.all(at_boundary[tears], axis=1)
     count = np.empty((len(bcs), 3, dofs.bs), dtype=np.int64)
     for number, bc in enumerate(bcs):

@@ -213,7 +213,7 @@ def _at_groups(what: str, function: fem.Function, dofs: TornDofs) -> Array:
         )
     on_nodes = fem.Function(S)
     on_nodes.interpolate(function)
-    total = dofs.reduce(on_nodes.x.array[dof], np.add, 0.0)
+    total = dofs.reduce(on_nodes.x.array[dof], np.add)
     return np.asarray(total / dofs.multiplicity)
 
 

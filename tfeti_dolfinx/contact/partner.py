@@ -519,7 +519,7 @@ def _ratios(
     that rows name are taken, so that a mesh that is fine only where the bodies touch is judged
     there; where there is no such row, all of them.
     """
-    whole = dofs.reduce(stiffness.reshape(-1, dofs.bs**2), np.add, 0.0)
+    whole = dofs.reduce(stiffness.reshape(-1, dofs.bs**2), np.add)
     blocks = whole.reshape(-1, dofs.bs, dofs.bs)
     named = records.entry_group[records.within_reach[records.condition]]
     meets = dofs.reduce_on_owners(named, np.ones(len(named))) > 0.0

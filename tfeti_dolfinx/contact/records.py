@@ -127,7 +127,7 @@ def relative_motion(records: ContactRecords, dofs: TornDofs, values: Array) -> A
 
 def relative_displacement(records: ContactRecords, dofs: TornDofs, u: Array) -> Array:
     """The v_i, ``(n, gdim)``, from u in primal order; of torn copies the mean. Collective."""
-    total = dofs.reduce(u.reshape(-1, dofs.bs), np.add, 0.0)
+    total = dofs.reduce(u.reshape(-1, dofs.bs), np.add)
     return relative_motion(records, dofs, total / dofs.multiplicity[:, None]) - records.motion
 
 
@@ -317,4 +317,4 @@ def _on_hats(forces: Array, dofs: TornDofs) -> Array:
         result[node, component] = target.array_r
     for item in (source, target, interpolation):
         item.destroy()
-    return dofs.reduce(result, np.add, 0.0)
+    return dofs.reduce(result, np.add)

@@ -201,6 +201,8 @@ class Dual:
         What holds a load holds its multiples, but for friction with given limits.
         """
         coarse, comm = self.coarse, self.coarse.comm
+        if not coarse.dimension:
+            return
         load = coarse.motions.T @ coarse.e
         known, size = self._held_load, float(np.linalg.norm(load))
         if known is not None:

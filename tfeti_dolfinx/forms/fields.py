@@ -156,7 +156,7 @@ def nodal(expression: Any, dofs: TornDofs, name: str) -> fem.Function:
     layout = np.asarray(in_cells.function_space.dofmap.list).ravel()
     terms = in_cells.x.array.reshape(-1, values.shape[1])[layout] * weight
     sums = sum_rows(cells.ravel(), np.hstack((terms, weight)), dofs.num_nodes)
-    sums = dofs.spread(dofs.reduce(sums[dofs.dolfinx_node], np.add, 0.0))
+    sums = dofs.spread(dofs.reduce(sums[dofs.dolfinx_node], np.add))
     values[dofs.dolfinx_node] = sums[:, :-1] / sums[:, -1:]
     return function
 
@@ -267,7 +267,7 @@ class StressRecovery:
             cells, basis = self._layout[own], self._basis[own]
             terms = np.concatenate((basis, values[own]), axis=2)[..., None, :] * basis[..., None]
             sums = sum_rows(cells.ravel(), terms.reshape(-1, size * (size + q)), dofs.num_nodes)
-            system = dofs.reduce(sums[dofs.dolfinx_node], np.add, 0.0).reshape(-1, size, size + q)
+            system = dofs.reduce(sums[dofs.dolfinx_node], np.add).reshape(-1, size, size + q)
             at_nodes = dofs.spread(_constants(system[:, :, :size], system[:, :, size:]))
             found[own] = at_nodes[dofs.primal_nodes(cells)]
         return found

@@ -241,8 +241,8 @@ def check_copies(values: Array, dofs: TornDofs, name: str, left: float = 1e-3) -
     with raised_on_all_ranks(dofs.comm):
         if not np.all(np.isfinite(primal)):
             raise InputError(f"{name} has values that are not finite numbers")
-    most = dofs.reduce(primal, np.maximum, -np.inf)
-    apart = dofs.spread(most - dofs.reduce(primal, np.minimum, np.inf)).max(axis=1, initial=0.0)
+    most = dofs.reduce(primal, np.maximum)
+    apart = dofs.spread(most - dofs.reduce(primal, np.minimum)).max(axis=1, initial=0.0)
     size = dofs.comm.allreduce(float(np.abs(primal).max(initial=0.0)), op=MPI.MAX)
     with raised_on_all_ranks(dofs.comm):
         if np.any(apart > left * size):

@@ -187,15 +187,12 @@ class TornDofs:
         """Primal nodes of DOLFINx's local nodes."""
         return self._primal_node[dolfinx_nodes]
 
-    def reduce(self, values: Array, op: np.ufunc, initial: Any) -> Array:
+    def reduce(self, values: Array, op: np.ufunc) -> Array:
         """Combine the values of all copies of a node: ``(n, ...)`` to ``(g, ...)``. Collective.
 
-        ``op`` is ``np.add``, ``np.maximum``, ``np.minimum`` or ``np.logical_or``, ``initial`` its
-        neutral element.
+        ``op`` is ``np.add``, ``np.maximum``, ``np.minimum`` or ``np.logical_or``.
         """
-        out = np.full((self.num_groups, *values.shape[1:]), initial, dtype=values.dtype)
-        op.at(out, self._to_owner_slot, self._to_owner.send(values))
-        return out
+        return np.asarray(op.reduceat(self.gather_copies(values), self.copy_offsets[:-1]))
 
     def spread(self, values: Array) -> Array:
         """Give every copy its group's value: shape ``(g, ...)`` to ``(n, ...)``. Collective."""
@@ -211,7 +208,7 @@ class TornDofs:
     ) -> Array:
         """Combine what all ranks give for any groups: ``(k,)`` and ``(k, ...)`` to ``(g, ...)``.
 
-        ``op`` and ``initial`` are as in ``reduce``. Collective.
+        ``op`` is as in ``reduce``, ``initial`` its neutral element. Collective.
         """
         exchange, slot = self._to_owners_of(groups)
         out = np.full((self.num_groups, *values.shape[1:]), initial, dtype=values.dtype)

@@ -350,7 +350,7 @@ def hat_integrals(dofs: TornDofs, names: Sequence[str | int], thickness: Any = 1
     form = fem.form(weight * ufl.TestFunction(W) * ds(tags), jit_options=JIT_OPTIONS)
     per_node = np.zeros(dofs.num_nodes)
     per_node[node] = fem.assemble_vector(form).array
-    return dofs.reduce(per_node, np.add, 0.0)
+    return dofs.reduce(per_node, np.add)
 
 
 def surface_nodes(dofs: TornDofs, facets: Array) -> Array:
@@ -362,7 +362,7 @@ def surface_nodes(dofs: TornDofs, facets: Array) -> Array:
 
 def group_points(dofs: TornDofs) -> Array:
     """Return coordinates of the owned groups, shape ``(g, 3)``. Collective."""
-    return dofs.reduce(dofs.points(), np.minimum, np.inf)
+    return dofs.reduce(dofs.points(), np.minimum)
 
 
 def extent(decomposition: Decomposition, facets: Array) -> float:

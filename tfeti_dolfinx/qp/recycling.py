@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.parallel import bcast_from_root, dot_over, summed
+from tfeti_dolfinx.common.parallel import any_rank, bcast_from_root, dot_over, summed
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,12 @@ class RecyclingParameters:
 class DirectionStore:
     """Directions p of energy pᵀFp = 1 and their images, as rows; this rank's part.
 
-    Of more than ``capacity`` directions the oldest goes; ``count`` is their number.
+    Of more than ``capacity`` directions the oldest goes; ``count`` is their number, and ``changes``
+    says how often they have changed.
     """
 
     def __init__(self, capacity: int, size: int) -> None:
-        self.capacity, self.count, self._next = capacity, 0, 0
+        self.capacity, self.count, self._next, self.changes = capacity, 0, 0, 0
         self._rows: Array = np.zeros((2, 0, size))
 
     @property
@@ -58,11 +59,11 @@ class DirectionStore:
             self._rows = np.concatenate((self._rows, more_rows), axis=1)
         self._rows[0, self._next], self._rows[1, self._next] = p, image
         self.count = max(self.count, self._next + 1)
-        self._next = (self._next + 1) % self.capacity
+        self._next, self.changes = (self._next + 1) % self.capacity, self.changes + 1
 
     def clear(self) -> None:
         """Drop all directions."""
-        self.count = self._next = 0
+        self.count, self._next, self.changes = 0, 0, self.changes + 1
 
 
 class Recycled(DirectionStore):
@@ -81,6 +82,7 @@ class Recycled(DirectionStore):
     ) -> None:
         super().__init__(capacity, 0)
         self.comm, self.parameters = comm, parameters
+        self._on_face: tuple[int, Array, Array] = (-1, np.zeros(0), np.zeros(0))
 
     def add(self, x: Array, Fx: Array, energy: float) -> None:
         """Store x with Fx and xᵀFx > 0, made F-orthonormal to those stored. Collective.
@@ -117,6 +119,7 @@ class Recycled(DirectionStore):
         """
         if self.count == self.capacity:
             self._rows, self._next = np.roll(self._rows, -self._next, axis=1), 0
+            self.changes += 1
         return np.array(self._rows[:, : self.count].transpose(0, 2, 1))
 
     def take(self, kept: Array) -> None:
@@ -137,6 +140,14 @@ class Recycled(DirectionStore):
         longest = float(np.sqrt(bcast_from_root(self.comm, float(squares.max(initial=0.0)))))
         return np.asarray(Vt[int(np.sum(sizes > self.parameters.held * longest)) :].T)
 
+    def on_face(self, held: Array) -> Array:
+        """Return ``without`` of their values on flagged rows, kept while both stay. Collective."""
+        changes, known, _ = self._on_face
+        same = changes == self.changes and np.array_equal(known, held)
+        if any_rank(self.comm, not same):
+            self._on_face = self.changes, held, self.without(self.directions.T[held])
+        return self._on_face[2]
+
 
 class RecycledOnFace:
     """Directions of earlier solves that lie in a face. Creation and all methods are collective.
@@ -147,7 +158,7 @@ class RecycledOnFace:
 
     def __init__(self, known: Recycled, held: Array | None = None) -> None:
         self.known, self._held = known, held
-        self._N = None if held is None else known.without(known.directions.T[held])
+        self._N = None if held is None else known.on_face(held)
         self.count = known.count if self._N is None else self._N.shape[1]
 
     def along(self, x: Array, rows: Array) -> tuple[Array, Array]:

@@ -11,7 +11,7 @@ import ufl
 from dolfinx import fem
 from scipy.sparse import csr_array
 
-from tfeti_dolfinx.common.arrays import Array
+from tfeti_dolfinx.common.arrays import Array, sum_rows
 from tfeti_dolfinx.common.parallel import any_rank, summed
 from tfeti_dolfinx.common.validation import checked_flag
 from tfeti_dolfinx.constraints.contact_state import Multipliers
@@ -157,7 +157,7 @@ class Predictor:
         """
         dofs, constraints = self._dofs, gluing.constraints
         before, primal = np.array(constraints.c), dofs.to_primal(w)
-        total = dofs.reduce(primal.reshape(-1, dofs.bs), np.add, 0.0)
+        total = dofs.reduce(primal.reshape(-1, dofs.bs), np.add)
         held = total / dofs.multiplicity[:, None]
         constraints.c[:] = gluing.with_supports_at(held)
         try:
@@ -339,6 +339,7 @@ class ContactDynamics(ContactProblem):
         motion.towards = free = motion.free
         if self._predictor is not None:
             motion.towards = self._predicted(self._predictor, free)
+        self._system.change("load")
 
     def accept(self) -> None:
         """Take the last solution as the end of the step: the next one begins there.
@@ -403,7 +404,6 @@ class ContactDynamics(ContactProblem):
     def _predicted(self, predictor: Predictor, free: Array) -> Array:
         """Return the displacement that contact allows the bodies without elasticity."""
         system = self._system
-        system.look_for_changes()
         system.make_up_to("right side", self._seconds)
         if system.search.take_in_overlapping(self.dofs.to_primal(free), 0.0):
             system.change("rows")
@@ -415,9 +415,10 @@ class ContactDynamics(ContactProblem):
         motion = balance(self._forms_in_time, self._system.dual, self.solution)
         if self._predictor is not None:
             motion["predictor_multiplications"] = float(self._predictor.multiplications)
-        contacts = [self.solution.contact(i) for i in range(len(self.contacts))]
-        forces = [list(map(float, contact.resultant.force)) for contact in contacts]
-        self.report.take(replace(self.report, motion=motion, contact_forces=forces))
+        contact, forces = self.solution.gluing.records.contact, self.solution.condition_forces
+        total = summed(self.dofs.comm, sum_rows(contact, forces, len(self.contacts)))
+        means = [[float(component) for component in force] for force in total]
+        self.report.take(replace(self.report, motion=motion, contact_forces=means))
 
 
 class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
@@ -495,6 +496,7 @@ class NonlinearContactDynamics(ContactDynamics, NonlinearContactProblem):
         if self._places is not None:
             self._go_to_places(self._places)
         try:
+            self._system.look_for_changes()
             super()._set_out()
             if self._places is not None and self._newton_forms.inertia.motion.size:
                 self._project_velocity()
