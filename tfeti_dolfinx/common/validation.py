@@ -221,7 +221,7 @@ def made(kind: type, values: dict[str, Any]) -> Any:
     return kind(**given)
 
 
-# --- Checks of a subdomain's stiffness and load -----------------------------------------------
+# --- Checks of a subdomain's stiffness --------------------------------------------------------
 
 
 def check_stiffness(
@@ -255,9 +255,3 @@ def check_stiffness(
             f"{name}: {what} has a diagonal entry {lowest:.3g}; "
             f"expected {form}, positive on all unknowns"
         )
-
-
-def check_load(name: str, f: Array) -> None:
-    """Raise an InputError, which counts the wrong entries, unless a load is finite."""
-    if not np.all(np.isfinite(f)):
-        raise InputError(f"{name}: the load has {np.sum(~np.isfinite(f))} entries not finite")

@@ -116,17 +116,17 @@ class ToolState:
         """All components by name, for tables."""
         axes = "xyz"[: len(self.displacement)]
         turns = "xyz" if len(axes) == 3 else "z"
-        pairs = [
-            *zip([f"displacement {axis}" for axis in axes], self.displacement, strict=True),
-            *zip([f"rotation {axis}" for axis in turns], self.rotation[-len(turns) :], strict=True),
-            *zip([f"force {axis}" for axis in axes], self.resultant.force, strict=True),
-            *zip(
-                [f"moment {axis}" for axis in turns],
-                self.resultant.moment[-len(turns) :],
-                strict=True,
-            ),
-        ]
-        return {f"{self.name} {what}": float(value) for what, value in pairs}
+        parts = {
+            "displacement": (axes, self.displacement),
+            "rotation": (turns, self.rotation[-len(turns) :]),
+            "force": (axes, self.resultant.force),
+            "moment": (turns, self.resultant.moment[-len(turns) :]),
+        }
+        return {
+            f"{self.name} {what} {axis}": float(value)
+            for what, (names, values) in parts.items()
+            for axis, value in zip(names, values, strict=True)
+        }
 
 
 # --- State of contact conditions: forces, gaps, slips -----------------------------------------
@@ -241,12 +241,6 @@ class ContactState:
             rotation=rotation_vector(tool.motion, gdim),
             resultant=resultant(self.dofs.comm, arm, -self.condition_forces[own]),
         )
-
-    @property
-    def tool_numbers(self) -> dict[str, float]:
-        """Motion and forces of all rigid bodies by name. Collective."""
-        states = [self.tool(i) for i in range(len(self.tool_motions))]
-        return {name: value for state in states for name, value in state.numbers.items()}
 
     def reaction(self, surface: str | int) -> Resultant:
         """Return the force and moment by which Dirichlet conditions hold a surface. Collective.

@@ -112,6 +112,7 @@ class Dual:
             preconditioner; None without one.
         contact_rows: Number of normal and of tangential rows on all ranks.
         seen: Largest estimate of ‖F‖ that solves have come to, 0 before.
+        law: Makes the set of multipliers from B and c.
         feasible: The set Ω of multipliers.
         pressures: The λ_N whose friction bounds Ω under Coulomb's law, of each point of
             ``constraints.sets.tangents``; nan elsewhere, and before ``bound_friction``.
@@ -174,7 +175,7 @@ class Dual:
         if self.preconditioner is not None and "soft_springs" not in without:
             self.soft = deflation(B, self.coarse, constraints.weights, self.preconditioner, prefix)
         self.contact_rows = constraints.sets.contact_rows(comm)
-        self._law, self.feasible = feasible, feasible(constraints)
+        self.law, self.feasible = feasible, feasible(constraints)
         self._image: tuple[Array, OperatorProduct] | None = None
         self._norms = dict[int, float]()  # of so many Lanczos steps
         self.seen, self.last = 0.0, LastProduct()
@@ -249,15 +250,11 @@ class Dual:
                 f"are 0 or from {LIMITS.least:g} to {LIMITS.most:g}"
             )
 
-    def set_under(self, pressures: Array) -> FeasibleSet:
-        """Return the set whose friction limits are those of λ_N of ``constraints.pressed``."""
-        return self._law(self._given.with_pressures(pressures))
-
     def bound_friction(self, pressures: Array) -> None:
         """Take λ_N of each of ``constraints.pressed`` to bound friction with; ∞ sticks."""
         self.pressures[self._given.pressed] = pressures
         self.constraints = self._given.with_pressures(pressures)
-        self.feasible = self._law(self.constraints)
+        self.feasible = self.law(self.constraints)
 
     def forget_counts(self) -> None:
         """Count multiplications from 0 on."""
@@ -274,7 +271,7 @@ class Dual:
         Args:
             norm_steps: Lanczos steps that estimate ‖PFP‖, once; 0 where nobody asks for it.
         """
-        self.feasible = self._law(self.constraints)  # c may be another, and what the law refers to
+        self.feasible = self.law(self.constraints)  # c may be another, and what the law refers to
         if norm_steps and norm_steps not in self._norms:
             with self.F.charged_to("power method"):
                 self._norms[norm_steps] = estimate_norm(self.F, self.coarse, norm_steps)

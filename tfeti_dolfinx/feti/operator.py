@@ -144,11 +144,6 @@ def scaled_rows(B: PETSc.Mat, weights: Array) -> PETSc.Mat:
     return scaled
 
 
-def lumped_preconditioner(B: PETSc.Mat, subdomains: Subdomains) -> DualOperator:
-    """B K_bb Bᵀ (Farhat, Roux 1991), B or rather B_D. Collective."""
-    return DualOperator(B, subdomains.local_operator("stiffness"))
-
-
 def dirichlet_preconditioner(
     B: PETSc.Mat, subdomains: Subdomains, volume: float = 20.0
 ) -> DualOperator:
@@ -169,6 +164,7 @@ def dirichlet_preconditioner(
 
 MakePreconditioner = Callable[[PETSc.Mat, Subdomains], DualOperator]
 PRECONDITIONERS: dict[str, MakePreconditioner] = {
-    "lumped": lumped_preconditioner,
+    # B K_bb Bᵀ (Farhat, Roux 1991), B or rather B_D
+    "lumped": lambda B, subdomains: DualOperator(B, subdomains.local_operator("stiffness")),
     "dirichlet": dirichlet_preconditioner,
 }

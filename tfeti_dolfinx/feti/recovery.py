@@ -118,23 +118,19 @@ def min_norm_correction(
     D, contact = constraints.weights, constraints.sets.contact
     comm = constraints.B.getComm().tompi4py()
 
-    def upwards(r: Array) -> Array:  # D⁻¹B_fᵀr
+    root = np.sqrt(np.where(np.isfinite(D), D, 0.0))  # rigid bodies do not move
+
+    def upwards(r: Array) -> tuple[Array, float]:  # s = D⁻¹B_fᵀr and ‖s‖²_D
         z = np.zeros(len(w))
         z[contact] = r
-        return constraints.forces(z) / D
-
-    elastic = np.isfinite(D)
-    root = np.sqrt(D[elastic])
-
-    def in_D(s: Array) -> float:  # ‖s‖²_D, of what does not move rigid bodies
-        own = root * s[elastic]
-        return float(summed(comm, np.array([own @ own]))[0])
+        s = constraints.forces(z) / D
+        return s, float(summed(comm, np.array([(root * s) @ (root * s)]))[0])
 
     apart = np.array(w)
     apart[contact] = 0.0
     r = np.where(closed, w[contact], 0.0)
-    x, s = constraints.forces(apart) / D, upwards(r)
-    p, left = s, in_D(s)
+    x, (s, left) = constraints.forces(apart) / D, upwards(r)
+    p = s
     enough = tol**2 * left
     for _ in range(max_it):
         if left <= enough:
@@ -144,7 +140,6 @@ def min_norm_correction(
             break
         x = x + left / curvature * p
         r = r - left / curvature * q
-        s = upwards(r)
-        left, before = in_D(s), left
+        before, (s, left) = left, upwards(r)
         p = s + left / before * p
     return x

@@ -378,9 +378,11 @@ def kernel_basis(bodies: Bodies, unheld: Motions, free: Motions) -> KernelBasis:
     The directions of each body are orthonormal in the kernel, each a combination of those before
     it: free ones, those that contact holds, those that equality rows hold.
     """
-    sprung = np.eye(bodies.k) - _projector(bodies.unsprung)
+    # projectors onto the motions of single bodies
+    bases = [m.single * m.free[:, None, :] for m in (bodies.unsprung, unheld, free)]
+    of_unsprung, of_unheld, of_free = (F @ np.swapaxes(F, 1, 2) for F in bases)
     # eigenvalues: free −2, held by contact −1, by equality rows 0, by springs 3
-    values, V = np.linalg.eigh(3.0 * sprung - _projector(unheld) - _projector(free))
+    values, V = np.linalg.eigh(3.0 * (np.eye(bodies.k) - of_unsprung) - of_unheld - of_free)
     kept = values < 1.5
     i, j, blocks = _blocks_of(bodies.motions.T @ bodies.motions, bodies.count, bodies.k)
     size = np.zeros(V.shape)
@@ -395,12 +397,6 @@ def kernel_basis(bodies: Bodies, unheld: Motions, free: Motions) -> KernelBasis:
     rest = np.setdiff1d(np.arange(motions.shape[0]), pins)
     unheld_of, free_of = values[kept] < -0.5, values[kept] < -1.5
     return KernelBasis(combined, motions, pins, rest, inverse, unheld_of, free_of)
-
-
-def _projector(motions: Motions) -> Array:
-    """Projectors onto the motions of single bodies, shape ``(bodies, k, k)``."""
-    F = motions.single * motions.free[:, None, :]
-    return np.asarray(F @ np.swapaxes(F, 1, 2))
 
 
 def _pins(motions: csc_array, body: Array) -> tuple[Array, csr_array]:
@@ -455,6 +451,8 @@ def listed(
     found: list[dict[str, object]] = []
 
     def add(which: Sequence[int], columns: Array, stiffness: float) -> None:
+        if stiffness == 0.0:
+            columns = columns @ np.linalg.inv(columns[np.sort(independent(columns))])
         for motion in columns.T:
             moving, mode = _parts(motion.reshape(len(which), bodies.k), mode_names)
             names = [body_names[which[b]] for b in moving]
@@ -464,7 +462,7 @@ def listed(
         vectors = bodies.frames[body] @ motions.single[body]
         own, held = motions.free[body], motions.stiffness[body]
         loose = own & (held <= TOLERANCES.null)
-        add([body], _plain(vectors[:, loose]), 0.0)
+        add([body], vectors[:, loose], 0.0)
         for j in np.flatnonzero(own & ~loose):
             add([body], vectors[:, [j]], float(held[j]))
     for _, rows, joint in parts_of_columns(motions.joint):
@@ -472,10 +470,5 @@ def listed(
         coordinates = np.zeros((len(which), bodies.k, joint.shape[1]))
         coordinates[place, rows % bodies.k] = joint
         amounts = bodies.frames[which] @ coordinates
-        add(which, _plain(amounts.reshape(-1, joint.shape[1])), 0.0)
+        add(which, amounts.reshape(-1, joint.shape[1]), 0.0)
     return found
-
-
-def _plain(columns: Array) -> Array:
-    """Return columns that span the same, each with a row that the others leave alone."""
-    return np.asarray(columns @ np.linalg.inv(columns[np.sort(independent(columns))]))

@@ -252,37 +252,27 @@ def rigid_scene(coarse: CoarseSpace, constraints: Constraints, cones: bool) -> R
     above = constraints.pressed_by[pressed]
     over = size[sets.tangents]
     mu = constraints.coefficients * (over / size[constraints.pressed_by][:, None])
-    own = (
-        J[np.setdiff1d(sets.normals, above)],
-        J[above],
-        _weighted(J, sets.tangents[pressed], mu[pressed]),
-        _weighted(J, sets.tangents[given], (constraints.limits * over)[given]),
-    )
+    along = [
+        [rows_times(J[sets.tangents[some, k]], w[some, k]) for k in range(sets.tangents.shape[1])]
+        for some, w in ((pressed, mu), (given, constraints.limits * over))
+    ]
+    own = (J[np.setdiff1d(sets.normals, above)], J[above], *along)
     ranks = coarse.comm.gather(own, root=0)
     if ranks is None:
         return None
-    normals, pressing, of_cones, of_given = zip(*ranks, strict=True)
+    normals, pressing, *tangential = zip(*ranks, strict=True)
+    axes = [[vstack(axis, format="csr") for axis in zip(*of, strict=True)] for of in tangential]
+    # nothing where no rank has rows
+    of_cones, of_given = (tuple(of) if of and of[0].shape[0] else () for of in axes)
     return RigidScene(
         Z.T @ (coarse.motions.T @ coarse.e),
         bodies.negligible[body],
         body,
         vstack(normals, format="csr"),
         vstack(pressing, format="csr"),
-        _stacked(of_cones),
-        _stacked(of_given),
+        of_cones,
+        of_given,
     )
-
-
-def _weighted(J: csr_array, rows: Array, weight: Array) -> list[csr_array]:
-    """Return rows of each axis, weighted."""
-    pairs = zip(rows.T, weight.T, strict=True)
-    return [rows_times(J[row], w) for row, w in pairs]
-
-
-def _stacked(ranks: Sequence[list[csr_array]]) -> tuple[csr_array, ...]:
-    """Return the matrices of each axis, of all ranks; nothing where no rank has rows."""
-    axes = [vstack(axis, format="csr") for axis in zip(*ranks, strict=True)]
-    return tuple(axes) if axes and axes[0].shape[0] else ()
 
 
 def _driven(free: Motions, load: Array, bodies: Bodies) -> Array | None:

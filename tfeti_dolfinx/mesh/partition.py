@@ -27,11 +27,12 @@ UNKNOWNS = 4000
 # --- Partitioners -----------------------------------------------------------------------------
 
 
-def _bisection(mesh: UntornMesh, graph: CellGraph, num_parts: int) -> Array:
-    return bisect_points(mesh.midpoints(), num_parts, graph.comm, mesh.extents())
-
-
-PARTITIONERS = {"round": round_parts, "bisection": _bisection}
+PARTITIONERS: dict[str, Callable[[UntornMesh, CellGraph, int], Array]] = {
+    "round": round_parts,
+    "bisection": lambda mesh, graph, num_parts: bisect_points(
+        mesh.midpoints(), num_parts, graph.comm, mesh.extents()
+    ),
+}
 DEFAULT = "round"
 
 

@@ -101,16 +101,11 @@ def round_parts(mesh: UntornMesh, graph: CellGraph, num_parts: int) -> Array:
     if np.any(maybe):
         some, other = maybe[body], part.copy()
         other[some] = bisect_points(x[some], shares, comm, extents[some], body=body[some])
-        cuts = [_cut_facets(graph, parts, body, len(sizes)) for parts in (other, part)]
-        boxes |= maybe & (cuts[0] <= cuts[1])
+        of_parts = [graph.with_ghosts(p)[graph.across] != p[:, None] for p in (other, part)]
+        cuts = sum_rows(body, np.column_stack([cut.sum(axis=1) for cut in of_parts]), len(sizes))
+        boxes |= maybe & (np.diff(summed(comm, cuts), axis=1)[:, 0] >= 0.0)
         part = np.where(boxes[body], other, part)
     return part
-
-
-def _cut_facets(graph: CellGraph, part: Array, body: Array, num_bodies: int) -> Array:
-    """Twice the number of facets between parts of each body, shape ``(num_bodies,)``."""
-    cut = np.sum(graph.with_ghosts(part)[graph.across] != part[:, None], axis=1)
-    return summed(graph.comm, sum_rows(body, cut, num_bodies))
 
 
 def _counts(comm: MPI.Intracomm, part: Array, num_parts: int) -> Array:

@@ -353,8 +353,11 @@ class NewtonOnLaw:
         cite("newton on friction")
         dual.learn()  # steps differ by few rows, if by any
         qp, at = dual.qp(), dual.constraints.pressed
+        rows = dual.constraints
         law = Law(
-            dual.set_under, dual.constraints.pressed_by[at], dual.constraints.sets.tangents[at]
+            lambda pressures: dual.law(rows.with_pressures(pressures)),
+            rows.pressed_by[at],
+            rows.sets.tangents[at],
         )
         program = LawProgram(qp, law, dual.coarse.oblique, norm)
         # Step 1: the start, with its μ or that of least squares: the lesser residual

@@ -377,6 +377,9 @@ class LoadSteps:
         contacts = [solution.contact(i) for i in range(len(solution.contacts))]
         # of bodies with mass they have blows, too
         forces = report.contact_forces or [list(c.resultant.force) for c in contacts]
+        tools: dict[str, float] = {}
+        for i in range(len(solution.tool_motions)):
+            tools |= solution.tool(i).numbers
         return StepRecord(
             number=number,
             time=t,
@@ -387,7 +390,7 @@ class LoadSteps:
             seconds=report.seconds["total"],
             motion=dict(report.motion),
             contact_forces=[list(map(float, force)) for force in forces],
-            tools=self._problem.solution.tool_numbers,
+            tools=tools,
         )
 
     def _keep(self, place: Place, t: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -10,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from tfeti_dolfinx.common.arrays import Array
-from tfeti_dolfinx.common.validation import check_load
+from tfeti_dolfinx.errors import InputError
 
 # --- Input and counters of Blocks -------------------------------------------------------------
 
@@ -165,9 +166,11 @@ class Block:
     """One subdomain, seen through the unknowns that rows of B touch (the *trace*).
 
     n is the number of its unknowns, t of its trace unknowns, r the dimension of its kernel.
-    Nothing here is collective. A kind of subdomain gives ``set_stiffness``, which sets ``kernel``
-    and ``diagonal``, and ``multiply``, ``solve`` and ``apply_schur``; it overrides what it can do
-    at less cost. Any class that has all of it will do; ``check_block`` tests it.
+    Nothing here is collective. A kind of subdomain gives four methods, and overrides what it can do
+    at less cost: ``set_stiffness(K)`` takes a scipy CSR matrix, sets ``kernel`` and ``diagonal``,
+    and raises an InputError where K does not fit; ``multiply(u)`` is K u and ``solve(b)`` K⁺ b on
+    all unknowns, shapes ``(n,)``, ``apply_schur(w)`` S w, S the Schur complement of K on the trace,
+    shapes ``(t,)``. Any class that has all of it will do; ``check_block`` tests it.
 
     Args:
         data: The subdomain. Its K is handed to ``set_stiffness`` and not kept.
@@ -185,6 +188,11 @@ class Block:
 
     kernel: Array
     diagonal: Array
+    # what a kind of subdomain gives
+    set_stiffness: Callable[[Any], None]
+    multiply: Callable[[Array], Array]
+    solve: Callable[[Array], Array]
+    apply_schur: Callable[[Array], Array]
 
     def __init__(self, data: SubdomainData) -> None:
         self.name, self.x, self.bs = data.name, data.x, data.bs
@@ -192,27 +200,6 @@ class Block:
         self.trace_dofs = data.trace_dofs
         self.update(data.f)
         self.set_stiffness(data.K)
-
-    def set_stiffness(self, K: Any) -> None:
-        """Take a stiffness, scipy CSR, and make what is needed of it.
-
-        Raises:
-            InputError: It does not fit.
-            FactorError: A factor could not be made.
-        """
-        raise NotImplementedError("set_stiffness")
-
-    def multiply(self, u: Array) -> Array:
-        """K u on all unknowns, shapes ``(n,)``."""
-        raise NotImplementedError("multiply")
-
-    def solve(self, b: Array) -> Array:
-        """K⁺ b on all unknowns, shapes ``(n,)``."""
-        raise NotImplementedError("solve")
-
-    def apply_schur(self, w: Array) -> Array:
-        """S w, S the Schur complement of K on the trace, shapes ``(t,)``."""
-        raise NotImplementedError("apply_schur")
 
     @cached_property
     def modes(self) -> Array:
@@ -240,7 +227,9 @@ class Block:
         Raises:
             InputError: It does not fit.
         """
-        check_load(self.name, f)
+        if not np.all(np.isfinite(f)):
+            wrong = np.sum(~np.isfinite(f))
+            raise InputError(f"{self.name}: the load has {wrong} entries not finite")
         self.load = f
 
     def retrace(self, trace_dofs: Array) -> None:
@@ -273,21 +262,10 @@ class RigidBlock(Block):
         self.trace_dofs = np.arange(n)
         self.modes = np.eye(num_modes)[mode]
         self.shares = np.ones(n)
+        self.multiply = self.solve = self.apply_schur = np.zeros_like
         self.update(load)
         self.set_stiffness(None)
 
     def set_stiffness(self, K: Any) -> None:
         """Take that there is none."""
         self.kernel, self.diagonal = np.eye(len(self.load)), np.zeros(len(self.load))
-
-    def multiply(self, u: Array) -> Array:
-        """0."""
-        return np.zeros_like(u)
-
-    def solve(self, b: Array) -> Array:
-        """0."""
-        return np.zeros_like(b)
-
-    def apply_schur(self, w: Array) -> Array:
-        """0."""
-        return np.zeros_like(w)
