@@ -164,9 +164,10 @@ def multipliers_at(qp: QP, z: Point) -> Array:
 # --- State of the iteration -------------------------------------------------------------------
 
 
-@dataclass
-class NewtonState:
-    """Feasible iterate with its optimality residuals; vectors are this rank's parts.
+class NewtonIteration:
+    """Steps 1, 2 and 4, with the feasible iterate and its residuals; step 3 is the solver's.
+
+    Creation is not collective, all methods are. Vectors are this rank's parts.
 
     Attributes:
         z: λ and Fλ − d.
@@ -183,76 +184,54 @@ class NewtonState:
         resume: Whether λ is where PCPG has stopped.
     """
 
-    z: Point
-    mu: Array
-    s: Array
-    back: Array
-    pressed: Face
-    residual: float = np.inf
-    norm: float = 1.0
-    rounding: float = 0.0
-    least: float = np.inf
-    idle: int = 0
-    resume: bool = False
-
-
-class _Newton:
-    """Steps 1, 2 and 4, which read and change the state; the solver does step 3. Collective."""
-
     def __init__(
-        self,
-        qp: QP,
-        solver: FaceSolver,
-        parameters: NewtonParameters,
-        state: NewtonState,
+        self, qp: QP, solver: FaceSolver, parameters: NewtonParameters, z: Point, mu: Array
     ) -> None:
-        self.qp, self.solver, self.parameters, self.state = qp, solver, parameters, state
+        self.qp, self.solver, self.parameters = qp, solver, parameters
         self.feasible, self.coarse = qp.feasible, qp.coarse
+        self.z, self.mu, self.s, self.back = z, mu, z.g, z.lam
+        self.pressed = qp.feasible.face(z.lam, z.g)
+        self.residual, self.least, self.norm, self.rounding = np.inf, np.inf, 1.0, 0.0
+        self.idle, self.resume = 0, False
 
     def look(self) -> None:
         """Step 1: how far a gradient step, brought back to the feasible set, moves."""
-        state, qp, normal = self.state, self.qp, self.coarse.combined
+        qp, normal, z, seen = self.qp, self.coarse.combined, self.z, self.solver.directions.seen
         if self.solver.directions.norm == 0.0:
-            self._learn_norm()
-        state.norm = self.solver.directions.norm or 1.0
-        if state.resume:
-            mu = self.solver.coarse.coordinates(state.z.g)
-            s = state.z.g - normal(mu)
+            # Rayleigh quotients of F at λ, which alone may be far below ‖F‖, and at Ps
+            p = self.coarse.project(z.g)
+            energy, size, pp, gg = qp.dot((z.lam, z.g + qp.d), (z.lam, z.lam), (p, p), (z.g, z.g))
+            seen(energy, size)
+            if pp > self.parameters.short**2 * gg:
+                seen(qp.dot((p, qp.F(p)))[0], pp)
+        self.norm = self.solver.directions.norm or 1.0
+        if self.resume:
+            mu = self.solver.coarse.coordinates(self.z.g)
+            s = self.z.g - normal(mu)
             # of motions that the face does not see μ is rounding over rounding
-            left, size = qp.dot((s, s), (state.z.g, state.z.g))
-            state.mu = mu if left <= self.parameters.unfelt**2 * size else 0.0 * mu
+            left, size = qp.dot((s, s), (self.z.g, self.z.g))
+            self.mu = mu if left <= self.parameters.unfelt**2 * size else 0.0 * mu
         # not λ − ᾱ(Fλ − d): what Gᵀμ takes from it may be large
-        state.s = state.z.g - normal(state.mu)
-        wanted = state.z.lam - state.s / state.norm
+        self.s = self.z.g - normal(self.mu)
+        wanted = self.z.lam - self.s / self.norm
         found = project_onto_feasible(self.coarse, self.feasible, wanted)
-        state.back, state.mu = found.lam, state.mu + state.norm * found.alpha
-        state.s = state.z.g - normal(state.mu)
-        state.pressed = self.feasible.face(state.back, state.s)
-        moved = state.z.lam - state.back
-        square, size = qp.dot((moved, moved), (state.z.lam, state.z.lam))
-        state.residual = state.norm * np.sqrt(square)
-        state.rounding = self.parameters.lost * state.norm * np.sqrt(size)
-        state.idle += 1
-        if state.residual <= 0.5 * state.least:
-            state.least, state.idle = state.residual, 0
+        self.back, self.mu = found.lam, self.mu + self.norm * found.alpha
+        self.s = self.z.g - normal(self.mu)
+        self.pressed = self.feasible.face(self.back, self.s)
+        moved = self.z.lam - self.back
+        square, size = qp.dot((moved, moved), (self.z.lam, self.z.lam))
+        self.residual = self.norm * np.sqrt(square)
+        self.rounding = self.parameters.lost * self.norm * np.sqrt(size)
+        self.idle += 1
+        if self.residual <= 0.5 * self.least:
+            self.least, self.idle = self.residual, 0
 
     def examine(self, rule: StoppingRule) -> ConvergedReason:
         """Apply the stopping rule where ‖g^P‖ is small enough."""
-        state = self.state
-        if state.residual > max(rule.tolerance, state.rounding):
+        if self.residual > max(rule.tolerance, self.rounding):
             return ConvergedReason.ITERATING
-        rule.norm = state.norm
-        return rule.examine(state.z.lam, state.s, state.pressed, state.residual)
-
-    def _learn_norm(self) -> None:
-        """Take Rayleigh quotients of F at λ, which alone may be far below ‖F‖, and at Ps."""
-        qp, z = self.qp, self.state.z
-        p, Fz = self.coarse.project(z.g), z.g + qp.d
-        energy, size, pp, gg = qp.dot((z.lam, Fz), (z.lam, z.lam), (p, p), (z.g, z.g))
-        self.solver.directions.seen(energy, size)
-        if pp > self.parameters.short**2 * gg:
-            (curvature,) = qp.dot((p, qp.F(p)))
-            self.solver.directions.seen(curvature, pp)
+        rule.norm = self.norm
+        return rule.examine(self.z.lam, self.s, self.pressed, self.residual)
 
     def wanted_face(self) -> tuple[Point, Face]:
         """Step 2: start and face of the next solve.
@@ -263,32 +242,26 @@ class _Newton:
         force than it is open by. Where there are any the solve begins at λ̂, on its face, for one
         multiplication by F.
         """
-        state, z = self.state, self.state.z
-        phi, beta = self.feasible.split(z.lam, state.s)
-        face = self.feasible.face(z.lam, state.s)
+        z = self.z
+        phi, beta = self.feasible.split(z.lam, self.s)
+        face = self.feasible.face(z.lam, self.s)
         along = face.restricted(beta)  # along a boundary that is curved
         beta = beta - along
         phi = phi + along
         free, chopped = self.qp.dot((phi, phi), (beta, beta))
-        if state.resume:  # what PCPG has left on the face, and not what ᾱ makes of μ
+        if self.resume:  # what PCPG has left on the face, and not what ᾱ makes of μ
             free = self.solver.left**2
         if chopped > self.parameters.gamma**2 * free:
-            moved = self.feasible.project(z.lam - beta / state.norm)
-            face = self.feasible.face(0.5 * (z.lam + moved), state.s)
-        pressed = state.pressed
-        early = (face.status == Status.STICK) & (pressed.status == Status.SLIP)
+            moved = self.feasible.project(z.lam - beta / self.norm)
+            face = self.feasible.face(0.5 * (z.lam + moved), self.s)
+        pressed = self.pressed.status
+        early = (face.status == Status.STICK) & (pressed == Status.SLIP)
         if any_rank(self.qp.comm, face.status >= RUBS):
-            early |= (face.status == Status.TOUCHING) & (pressed.status == Status.OPEN)
+            early |= (face.status == Status.TOUCHING) & (pressed == Status.OPEN)
         if not any_rank(self.qp.comm, early):
             return z, face
-        state.resume = False
-        return Point(state.back, z.g + self.qp.F(state.back - z.lam)), pressed
-
-    def gain(self, to: Point) -> float:
-        """Return q(λ) − q(to), without terms that Gλ = e makes constant."""
-        z = self.state.z
-        (double,) = self.qp.dot((z.lam - to.lam, to.g - z.g + 2.0 * self.state.s))
-        return 0.5 * double
+        self.resume = False
+        return Point(self.back, z.g + self.qp.F(self.back - z.lam)), self.pressed
 
     def accept(self, end: Point, feasible: bool) -> bool:
         """Step 4: go where q falls enough; return whether q could be lowered.
@@ -296,26 +269,28 @@ class _Newton:
         That is the end of step 3, else the projected gradient step or the part of it where q is
         least.
         """
-        state = self.state
-        looked = np.isfinite(state.residual)
-        enough = self.parameters.enough * 0.5 / state.norm * state.residual**2 if looked else 0.0
-        # on circles s and λ are both large: their product's rounding hides changes of q
-        (hidden,) = self.qp.dot((np.abs(state.z.lam), np.abs(state.s)))
-        gain = self.gain(end)
-        taken = feasible and gain >= enough - self.parameters.hidden * hidden
-        state.resume = taken
+        looked = np.isfinite(self.residual)
+        enough = self.parameters.enough * 0.5 / self.norm * self.residual**2 if looked else 0.0
+        # on circles s and λ are both large: their product's rounding hides changes of q; what falls
+        # is q without terms that Gλ = e makes constant
+        z = self.z
+        hidden, double = self.qp.dot(
+            (np.abs(z.lam), np.abs(self.s)), (z.lam - end.lam, end.g - z.g + 2.0 * self.s)
+        )
+        taken = feasible and 0.5 * double >= enough - self.parameters.hidden * hidden
+        self.resume = taken
         if taken:
-            self._go(end, gain)
+            self._go(end, 0.5 * double)
         if not taken and not looked:
             self.look()
         return taken or self._descend()
 
     def _descend(self) -> bool:
         """Go along λ̂ − λ; return whether q falls."""
-        state, z = self.state, self.state.z
-        p = state.back - z.lam
+        z = self.z
+        p = self.back - z.lam
         Fp = self.qp.F(p)
-        slope, curvature, size = self.qp.dot((-state.s, p), (p, Fp), (p, p))
+        slope, curvature, size = self.qp.dot((-self.s, p), (p, Fp), (p, p))
         if size <= 0.0 or slope <= 0.0:
             return False
         self.solver.directions.seen(curvature, size)
@@ -326,11 +301,11 @@ class _Newton:
 
     def _go(self, to: Point, gain: float) -> None:
         """Move to a point where q is lower by ``gain``."""
-        z = self.state.z
+        z = self.z
         work, load = self.qp.dot((z.lam, z.g), (z.lam, self.qp.d))
         if gain > self.parameters.hidden * (abs(work) + abs(load)):
-            self.state.idle = 0
-        self.state.z = to
+            self.idle = 0
+        self.z = to
 
 
 # --- Step 3: a solve on a face of the feasible set --------------------------------------------
@@ -564,25 +539,23 @@ def newton(
     mu = np.zeros(qp.coarse.dimension) if start is None else start.mu
     if mu is None:
         mu = multipliers_at(qp, z)
-    face = qp.feasible.face(z.lam, z.g)
-    state = NewtonState(z, mu, z.g, z.lam, face)
-    method = _Newton(qp, solver, parameters, state)
+    state = NewtonIteration(qp, solver, parameters, z, mu)
     monitor(steps, "start", homogenised.lam_bar, norm_over(qp.comm, homogenised.b), 0.0)
-    friction = any_rank(qp.comm, face.status >= RUBS)
+    friction = any_rank(qp.comm, state.pressed.status >= RUBS)
     reason = ConvergedReason.ITERATING
     if friction and imbalance(qp.coarse, homogenised.lam_bar) > UNBALANCED:
         # no point of Ω balances the load; without friction that is known before
         reason = ConvergedReason.DIVERGED_STALLED
-        method.look()
+        state.look()
     # without friction and an earlier λ the first solve is on the face of the start, as it shows ‖F‖
     looks = start is not None or friction
     while reason == ConvergedReason.ITERATING:
-        first = state.z
+        first, face = state.z, state.pressed
         if looks:
             # Step 1: optimality
-            method.look()
+            state.look()
             monitor(steps, "outer", state.z.lam, state.residual, 0.0)
-            reason = method.examine(rule)
+            reason = state.examine(rule)
             if rule.drifted:
                 state.z = qp.at(state.z.lam)
                 state.resume = rule.drifted = False
@@ -592,13 +565,13 @@ def newton(
             if reason != ConvergedReason.ITERATING:
                 break
             # Step 2: the face
-            first, face = method.wanted_face()
+            first, face = state.wanted_face()
         # Step 3: solve on the face, drop what leaves Ω, restore Gλ = e
         end, feasible = solver.solve(first, face, state.residual, state.resume)
         # Step 4: accept where q falls enough
         if solver.excluding is not None:
             reason = ConvergedReason.DIVERGED_CONTRADICTION
-        elif not method.accept(end, feasible) or state.idle >= parameters.patience:
+        elif not state.accept(end, feasible) or state.idle >= parameters.patience:
             reason = ConvergedReason.DIVERGED_ROUNDING
         steps.outer, looks = steps.outer + 1, True
     none = np.empty(0, dtype=np.int64)
